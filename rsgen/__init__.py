@@ -1,0 +1,1 @@
+"""rsgen: rolling-shutter RGB-D benchmark sequences with exact continuous-time ground truth."""

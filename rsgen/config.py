@@ -1,0 +1,221 @@
+"""The validated configuration of one sequence: a YAML file plus `--section.field value` overrides.
+
+The whole file is validated at once and errors name the field. Relative paths in a file are relative to that file,
+those of an override to the working directory.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from rsgen.errors import UserError
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter
+
+Vector3 = tuple[float, float, float]
+Vector4 = tuple[float, float, float, float]
+Matrix4 = tuple[Vector4, Vector4, Vector4, Vector4]
+Matrix34 = tuple[Vector4, Vector4, Vector4]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+# Fields that change how fast or where a sequence is made, never one byte of it.
+_NOT_CONTENT = {"backend"}
+# Fields that hold paths, by section.
+_PATHS = (("trajectory", "file"), ("scene", "file"))
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class TrajectoryConfig(_Section):
+    """Where the camera goes."""
+
+    file: Path = Field(description="recorded trajectory of the body (depth camera): TUM, ICL-NUIM or EuRoC file")
+    format: Literal["auto", "tum", "icl", "euroc"] = Field("auto", description="file format; auto: by its content")
+    icl_start: Matrix34 | None = Field(
+        None, description="pose [R|t] of frame 1 in the POV-Ray world; places ICL-NUIM's start-relative files"
+    )
+    T_world_file: Matrix4 | None = Field(None, description="rigid transform that places the trajectory in the scene")
+    knot_spacing_s: Positive = Field(0.05, description="knot spacing of the ground-truth spline, s")
+    smoothing: NonNegative = Field(0.0, description="weight of the acceleration penalty of the fit")
+
+    @field_validator("T_world_file")
+    @classmethod
+    def _is_rigid(cls, value: Matrix4 | None) -> Matrix4 | None:
+        return value if value is None else _rigid(value)
+
+
+class SceneConfig(_Section):
+    """What the camera sees."""
+
+    file: Path = Field(description="Mitsuba 3 scene .xml, or a mesh file that trimesh reads (default light added)")
+
+
+class LightConfig(_Section):
+    """How surfaces are lit."""
+
+    mode: Literal["baked", "path"] = Field("baked", description="baked irradiance (fast, clean) or path tracing")
+    texel_m: Positive = Field(0.015, description="spacing of the baked irradiance samples, m")
+    direct_samples: int = Field(64, ge=1, le=4096, description="light samples per irradiance sample")
+    gather_rays: int = Field(512, ge=16, le=16384, description="hemisphere rays per indirect sample, last bounce")
+    bounces: int = Field(8, ge=0, le=32, description="indirect diffuse bounces")
+    max_depth: int = Field(12, ge=1, le=64, description="path length of mode 'path'")
+
+
+class StreamConfig(_Section):
+    """One camera with its own clock."""
+
+    width: int = Field(640, ge=8, le=16384, description="columns, px")
+    height: int = Field(480, ge=8, le=16384, description="rows, px")
+    intrinsics: Vector4 = Field((481.2, 480.0, 319.5, 239.5), description="fx, fy, cx, cy, px; pixel centres integer")
+    model: Literal["pinhole", "radtan", "fisheye"] = Field("pinhole", description="distortion model")
+    distortion: tuple[Finite, ...] = Field((), description="radtan k1 k2 p1 p2 [k3]; fisheye k1 k2 k3 k4")
+    rate_hz: Positive = Field(30.0, description="frames per second")
+    offset_s: Finite = Field(0.0, description="stamp of the first frame after the trajectory's first pose, s")
+    readout_s: NonNegative = Field(0.028, description="time from first to one past the last line, s; 0: global shutter")
+    exposure_s: NonNegative = Field(0.0, description="exposure of each line, s; 0: no motion blur")
+    scan: Literal["top-bottom", "bottom-top", "left-right", "right-left"] = Field("top-bottom", description="scan order")
+
+    @property
+    def camera(self) -> Camera:
+        fx, fy, cx, cy = self.intrinsics
+        return Camera(self.width, self.height, fx, fy, cx, cy, self.model, tuple(self.distortion))
+
+    @property
+    def shutter(self) -> Shutter:
+        return Shutter(self.readout_s, self.exposure_s, self.scan)
+
+    @model_validator(mode="after")
+    def _geometry_is_valid(self) -> StreamConfig:
+        try:
+            _ = self.camera, self.shutter
+        except UserError as error:
+            raise ValueError(str(error)) from None
+        return self
+
+
+class ColorConfig(StreamConfig):
+    """The colour camera."""
+
+    spp: int = Field(16, ge=1, le=65536, description="samples per pixel (footprint and exposure window)")
+    exposure_gain: Positive = Field(1.0, description="factor on linear radiance before sRGB quantisation")
+
+
+class DepthConfig(StreamConfig):
+    """The depth camera: planar z through each pixel's centre, 16 bit."""
+
+    depth_scale: Positive = Field(5000.0, description="stored units per metre")
+
+
+class Config(_Section):
+    """One sequence."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9_.-]+$", description="the sequence's name, also its default folder")
+    trajectory: TrajectoryConfig
+    scene: SceneConfig
+    light: LightConfig = LightConfig()
+    color: ColorConfig = ColorConfig()
+    depth: DepthConfig = DepthConfig()
+    T_color_depth: Matrix4 = Field(
+        ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)),
+        description="depth-camera to colour-camera coordinates, m",
+    )
+    seed: int = Field(0, ge=0, lt=2**31, description="seed of every random number")
+    backend: Literal["auto", "llvm", "cuda"] = Field("auto", description="where Dr.Jit runs")
+
+    @field_validator("T_color_depth")
+    @classmethod
+    def _is_rigid(cls, value: Matrix4) -> Matrix4:
+        return _rigid(value)
+
+    def content(self) -> dict[str, Any]:
+        """Everything that decides the sequence's bytes, as plain YAML types (the trajectory and scene by file name)."""
+        content = self.model_dump(mode="json", exclude=_NOT_CONTENT)
+        for section, name in _PATHS:
+            content[section][name] = Path(content[section][name]).name
+        return content
+
+
+def _rigid(value: Matrix4) -> Matrix4:
+    T = np.asarray(value, float)
+    R = T[:3, :3]
+    ok = np.isfinite(T).all() and np.allclose(R @ R.T, np.eye(3), atol=1e-5) and math.isclose(np.linalg.det(R), 1, abs_tol=1e-4)
+    if not (ok and np.array_equal(T[3], (0, 0, 0, 1))):
+        raise ValueError("not a rigid transform: rows of an orthonormal rotation with the translation, then 0 0 0 1")
+    return value
+
+
+def load_config(path: Path, overrides: dict[str, str] | None = None) -> Config:
+    """Read and validate a YAML config with overrides `{'color.spp': '64'}` (values parsed as YAML).
+
+    Raises UserError naming the file and every wrong field on one line.
+    """
+    path = Path(path)
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not a text file"
+        raise UserError(f"config {path}: cannot be read ({reason})") from None
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" line {mark.line + 1}" if mark else ""
+        raise UserError(f"config {path}:{where} is not valid YAML ({getattr(error, 'problem', error)})") from None
+    if not isinstance(data, dict):
+        raise UserError(f"config {path}: expected a mapping of fields such as 'name:', 'trajectory:', 'scene:'")
+    for section, name in _PATHS:
+        part = data.get(section)
+        if isinstance(part, dict) and isinstance(part.get(name), str):
+            part[name] = str(path.parent / Path(part[name]).expanduser())
+    for key, text in (overrides or {}).items():
+        _set(data, key, text)
+    try:
+        return Config.model_validate(data)
+    except ValidationError as error:
+        problems = "; ".join(_problem(e) for e in error.errors())
+        raise UserError(f"config {path}: {problems}") from None
+
+
+def _set(data: dict[str, Any], key: str, text: str) -> None:
+    *sections, name = key.split(".")
+    for section in sections:
+        inner = data.setdefault(section, {})
+        if not isinstance(inner, dict):
+            raise UserError(f"override --{key}: '{section}' is not a section")
+        data = inner
+    try:
+        data[name] = yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise UserError(f"override --{key}: '{text}' is not a valid value") from None
+
+
+def _problem(error: Any) -> str:
+    where = ".".join(str(part) for part in error["loc"]) or "config"
+    message = error["msg"].removeprefix("Value error, ")
+    if error["type"] == "extra_forbidden":
+        return f"{where}: no such field (see 'rsgen render --help')"
+    if error["type"] == "missing":
+        return f"{where}: is required"
+    given = repr(error["input"])
+    return f"{where}: {message}, got {given if len(given) <= 60 else given[:57] + '...'}"
+
+
+def describe_fields(section: type[BaseModel] = Config, prefix: str = "") -> list[tuple[str, str, str]]:
+    """Rows (dotted name, default, description) of every field that a config or an override can set."""
+    rows: list[tuple[str, str, str]] = []
+    for name, field in section.model_fields.items():
+        inner = field.annotation
+        if isinstance(inner, type) and issubclass(inner, BaseModel):
+            rows += describe_fields(inner, f"{prefix}{name}.")
+        else:
+            default = "required" if field.is_required() else str(field.default)
+            rows.append((prefix + name, default, field.description or ""))
+    return rows
