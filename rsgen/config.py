@@ -6,7 +6,6 @@ those of an override to the working directory.
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -30,6 +29,8 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 _NOT_CONTENT = {"backend"}
 # Fields that hold paths, by section.
 _PATHS = (("trajectory", "file"), ("scene", "file"))
+# PyYAML lets impossible dates, endless digits and endless nesting through as these.
+_BAD_YAML = (yaml.YAMLError, ValueError, RecursionError)
 
 
 class _Section(BaseModel):
@@ -40,13 +41,17 @@ class TrajectoryConfig(_Section):
     """Where the camera goes."""
 
     file: Path = Field(description="recorded trajectory of the body (depth camera): TUM, ICL-NUIM or EuRoC file")
-    format: Literal["auto", "tum", "icl", "euroc"] = Field("auto", description="file format; auto: by its content")
-    icl_start: Matrix34 | None = Field(
-        None, description="pose [R|t] of frame 1 in the POV-Ray world; places ICL-NUIM's start-relative files"
+    format: Literal["auto", "tum", "icl", "euroc"] = Field(
+        default="auto", description="file format; auto: by its content"
     )
-    T_world_file: Matrix4 | None = Field(None, description="rigid transform that places the trajectory in the scene")
-    knot_spacing_s: Positive = Field(0.05, description="knot spacing of the ground-truth spline, s")
-    smoothing: NonNegative = Field(0.0, description="weight of the acceleration penalty of the fit")
+    icl_start: Matrix34 | None = Field(
+        default=None, description="pose [R|t] of frame 1 in the POV-Ray world; places ICL-NUIM's start-relative files"
+    )
+    T_world_file: Matrix4 | None = Field(
+        default=None, description="rigid transform that places the trajectory in the scene"
+    )
+    knot_spacing_s: Positive = Field(default=0.05, description="knot spacing of the ground-truth spline, s")
+    smoothing: NonNegative = Field(default=0.0, description="weight of the acceleration penalty of the fit")
 
     @field_validator("T_world_file")
     @classmethod
@@ -63,27 +68,37 @@ class SceneConfig(_Section):
 class LightConfig(_Section):
     """How surfaces are lit."""
 
-    mode: Literal["baked", "path"] = Field("baked", description="baked irradiance (fast, clean) or path tracing")
-    texel_m: Positive = Field(0.015, description="spacing of the baked irradiance samples, m")
-    direct_samples: int = Field(64, ge=1, le=4096, description="light samples per irradiance sample")
-    gather_rays: int = Field(512, ge=16, le=16384, description="hemisphere rays per indirect sample, last bounce")
-    bounces: int = Field(8, ge=0, le=32, description="indirect diffuse bounces")
-    max_depth: int = Field(12, ge=1, le=64, description="path length of mode 'path'")
+    mode: Literal["baked", "path"] = Field(
+        default="baked", description="baked irradiance (fast, clean) or path tracing"
+    )
+    texel_m: Positive = Field(default=0.015, description="spacing of the baked irradiance samples, m")
+    direct_samples: int = Field(default=64, ge=1, le=4096, description="light samples per irradiance sample")
+    gather_rays: int = Field(
+        default=512, ge=16, le=16384, description="hemisphere rays per indirect sample, last bounce"
+    )
+    bounces: int = Field(default=8, ge=0, le=32, description="indirect diffuse bounces")
+    max_depth: int = Field(default=12, ge=1, le=64, description="path length of mode 'path'")
 
 
 class StreamConfig(_Section):
     """One camera with its own clock."""
 
-    width: int = Field(640, ge=8, le=16384, description="columns, px")
-    height: int = Field(480, ge=8, le=16384, description="rows, px")
-    intrinsics: Vector4 = Field((481.2, 480.0, 319.5, 239.5), description="fx, fy, cx, cy, px; pixel centres integer")
-    model: Literal["pinhole", "radtan", "fisheye"] = Field("pinhole", description="distortion model")
-    distortion: tuple[Finite, ...] = Field((), description="radtan k1 k2 p1 p2 [k3]; fisheye k1 k2 k3 k4")
-    rate_hz: Positive = Field(30.0, description="frames per second")
-    offset_s: Finite = Field(0.0, description="stamp of the first frame after the trajectory's first pose, s")
-    readout_s: NonNegative = Field(0.028, description="time from first to one past the last line, s; 0: global shutter")
-    exposure_s: NonNegative = Field(0.0, description="exposure of each line, s; 0: no motion blur")
-    scan: Literal["top-bottom", "bottom-top", "left-right", "right-left"] = Field("top-bottom", description="scan order")
+    width: int = Field(default=640, ge=8, le=16384, description="columns, px")
+    height: int = Field(default=480, ge=8, le=16384, description="rows, px")
+    intrinsics: Vector4 = Field(
+        default=(481.2, 480.0, 319.5, 239.5), description="fx, fy, cx, cy, px; pixel centres integer"
+    )
+    model: Literal["pinhole", "radtan", "fisheye"] = Field(default="pinhole", description="distortion model")
+    distortion: tuple[Finite, ...] = Field(default=(), description="radtan k1 k2 p1 p2 [k3]; fisheye k1 k2 k3 k4")
+    rate_hz: Positive = Field(default=30.0, description="frames per second")
+    offset_s: Finite = Field(default=0.0, description="stamp of the first frame after the trajectory's first pose, s")
+    readout_s: NonNegative = Field(
+        default=0.028, description="time from first to one past the last line, s; 0: global shutter"
+    )
+    exposure_s: NonNegative = Field(default=0.0, description="exposure of each line, s; 0: no motion blur")
+    scan: Literal["top-bottom", "bottom-top", "left-right", "right-left"] = Field(
+        default="top-bottom", description="order in which lines are read out"
+    )
 
     @property
     def camera(self) -> Camera:
@@ -106,31 +121,33 @@ class StreamConfig(_Section):
 class ColorConfig(StreamConfig):
     """The colour camera."""
 
-    spp: int = Field(16, ge=1, le=65536, description="samples per pixel (footprint and exposure window)")
-    exposure_gain: Positive = Field(1.0, description="factor on linear radiance before sRGB quantisation")
+    spp: int = Field(default=16, ge=1, le=65536, description="samples per pixel (footprint and exposure window)")
+    exposure_gain: Positive = Field(default=1.0, description="factor on linear radiance before sRGB quantisation")
 
 
 class DepthConfig(StreamConfig):
     """The depth camera: planar z through each pixel's centre, 16 bit."""
 
-    depth_scale: Positive = Field(5000.0, description="stored units per metre")
+    depth_scale: Positive = Field(default=5000.0, description="stored units per metre")
 
 
 class Config(_Section):
     """One sequence."""
 
-    name: str = Field(pattern=r"^[A-Za-z0-9_.-]+$", description="the sequence's name, also its default folder")
+    name: str = Field(
+        pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]*$", description="the sequence's name, also its default folder"
+    )
     trajectory: TrajectoryConfig
     scene: SceneConfig
     light: LightConfig = LightConfig()
     color: ColorConfig = ColorConfig()
     depth: DepthConfig = DepthConfig()
     T_color_depth: Matrix4 = Field(
-        ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)),
+        default=((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)),
         description="depth-camera to colour-camera coordinates, m",
     )
-    seed: int = Field(0, ge=0, lt=2**31, description="seed of every random number")
-    backend: Literal["auto", "llvm", "cuda"] = Field("auto", description="where Dr.Jit runs")
+    seed: int = Field(default=0, ge=0, lt=2**31, description="seed of every random number")
+    backend: Literal["auto", "llvm", "cuda"] = Field(default="auto", description="where Dr.Jit runs")
 
     @field_validator("T_color_depth")
     @classmethod
@@ -147,8 +164,8 @@ class Config(_Section):
 
 def _rigid(value: Matrix4) -> Matrix4:
     T = np.asarray(value, float)
-    R = T[:3, :3]
-    ok = np.isfinite(T).all() and np.allclose(R @ R.T, np.eye(3), atol=1e-5) and math.isclose(np.linalg.det(R), 1, abs_tol=1e-4)
+    R = np.clip(T[:3, :3], -2, 2)  # absurd numbers stay wrong, without overflow on the way
+    ok = np.isfinite(T).all() and np.allclose(R @ R.T, np.eye(3), atol=1e-5) and np.linalg.det(R) > 0
     if not (ok and np.array_equal(T[3], (0, 0, 0, 1))):
         raise ValueError("not a rigid transform: rows of an orthonormal rotation with the translation, then 0 0 0 1")
     return value
@@ -164,24 +181,33 @@ def load_config(path: Path, overrides: dict[str, str] | None = None) -> Config:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not a text file"
-        raise UserError(f"config {path}: cannot be read ({reason})") from None
-    except yaml.YAMLError as error:
+        raise _error(f"config {path}: cannot be read ({reason})") from None
+    except _BAD_YAML as error:
         mark = getattr(error, "problem_mark", None)
         where = f" line {mark.line + 1}" if mark else ""
-        raise UserError(f"config {path}:{where} is not valid YAML ({getattr(error, 'problem', error)})") from None
+        problem = getattr(error, "problem", None) or getattr(error, "reason", None) or type(error).__name__
+        raise _error(f"config {path}:{where} is not valid YAML ({problem})") from None
     if not isinstance(data, dict):
-        raise UserError(f"config {path}: expected a mapping of fields such as 'name:', 'trajectory:', 'scene:'")
+        raise _error(f"config {path}: expected a mapping of fields such as 'name:', 'trajectory:', 'scene:'")
     for section, name in _PATHS:
         part = data.get(section)
         if isinstance(part, dict) and isinstance(part.get(name), str):
-            part[name] = str(path.parent / Path(part[name]).expanduser())
+            try:
+                part[name] = str(path.parent / Path(part[name]).expanduser())
+            except RuntimeError:
+                raise _error(f"config {path}: {section}.{name}: no such user's home, got {part[name]!r}") from None
     for key, text in (overrides or {}).items():
         _set(data, key, text)
     try:
         return Config.model_validate(data)
     except ValidationError as error:
         problems = "; ".join(_problem(e) for e in error.errors())
-        raise UserError(f"config {path}: {problems}") from None
+        raise _error(f"config {path}: {problems}") from None
+
+
+def _error(text: str) -> UserError:
+    """One printable line, whatever names and values a file holds."""
+    return UserError("".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text))
 
 
 def _set(data: dict[str, Any], key: str, text: str) -> None:
@@ -189,12 +215,13 @@ def _set(data: dict[str, Any], key: str, text: str) -> None:
     for section in sections:
         inner = data.setdefault(section, {})
         if not isinstance(inner, dict):
-            raise UserError(f"override --{key}: '{section}' is not a section")
+            raise _error(f"override --{key}: '{section}' is not a section")
         data = inner
     try:
         data[name] = yaml.safe_load(text)
-    except yaml.YAMLError:
-        raise UserError(f"override --{key}: '{text}' is not a valid value") from None
+    except _BAD_YAML:
+        shown = text if len(text) <= 60 else f"{text[:57]}..."
+        raise _error(f"override --{key}: '{shown}' is not a valid value") from None
 
 
 def _problem(error: Any) -> str:

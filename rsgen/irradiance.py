@@ -58,7 +58,7 @@ def make_lattice(scene: Any, spacing: float) -> Lattice:
         edges = np.linalg.norm(np.roll(corners, -1, axis=1) - np.roll(corners, -2, axis=1), axis=-1)
         apex = np.argmin(edges, axis=1)
         lengths = np.stack([edges.max(axis=1), edges.min(axis=1)], axis=1)
-        cells.append(np.clip(np.ceil(lengths / spacing - 1e-6), 1, _MAX_CELLS).astype(np.int64))
+        cells.append(np.clip(np.rint(lengths / spacing), 1, _MAX_CELLS).astype(np.int64))
         apexes.append(apex)
         shape_first[number] = faces_before
         faces_before += len(faces)

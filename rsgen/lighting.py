@@ -2,8 +2,9 @@
 
 1. Every lattice point of `irradiance.Lattice` (both sides of each triangle; points that coincide are one) gets direct
    light from each emitter with a stratified set of samples.
-2. Indirect light varies slowly, so it is gathered at a thinned set of points, a few texels apart, by cosine-distributed
-   rays that look the previous bounce up where they hit, and interpolated to all others in position and normal.
+   Where a mesh is finer than the texel, a thinned set of points is computed and the others are interpolated.
+2. Indirect light varies slowly, so it is gathered at a still thinner set, a few texels apart, by cosine-distributed
+   rays that look the previous bounce up where they hit, and interpolated in position and normal.
 3. Points that never get any light (buried in another object) are marked as not alive.
 
 All randomness is a fixed low-discrepancy sequence rotated by a hash of the point's number: a scene bakes to the same
@@ -28,6 +29,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from rsgen.config import LightConfig
+from rsgen.errors import UserError
 from rsgen.irradiance import IrradianceField, Lattice, lattice_barycentric, make_field, make_lattice
 
 log = logging.getLogger("rsgen")
@@ -38,12 +40,17 @@ Progress = Callable[[float, str], None]  # fraction done in [0, 1], what is bein
 _METHOD = 1
 _OFFSET_M = 2e-4  # ray origins above their surface
 _INSET_M = 2e-3  # samples on a triangle's rim move this far inwards: a corner exactly on two surfaces sees neither
-_INDIRECT_TEXELS = 3.0
-_NEIGHBOURS = 10
-_NORMAL_SCALE = 0.35  # normals this far apart count as one indirect spacing
-_COARSE_RAYS = 64
+_FINE_TEXELS = 0.9  # direct light is computed at points at least about this far apart
+_COARSE_TEXELS = 3.0  # and indirect light at these
+_NEIGHBOURS = 8
+_NORMAL_SCALE = 0.35  # normals this far apart count as much as one spacing
+_SMOOTHING = 0.3  # spacings: closer sources than this count alike
+_FIRST_LOOK_RAYS = 16
+_FIRST_LOOK_BOUNCES = 2
+_BOUNCE_RAYS = 64
 _CHUNK = 1 << 18
 _MANY_EMITTERS = 24
+_SMALL_EMITTER_M = 0.3
 
 
 @dataclass(frozen=True)
@@ -91,43 +98,43 @@ def cache_folder(scene_file: Path) -> Path:
 def bake(scene: Any, lattice: Lattice, light: LightConfig, progress: Progress) -> tuple[NDArray, NDArray]:
     """Irradiance (points, 4) float32 of the front and back sides: E_r, E_g, E_b (scene units), alive (0 or 1)."""
     points, index = _sample_points(scene, lattice)
-    n = len(points.position)
-    log.info("baking %d irradiance samples on %d triangles", n, len(lattice.first))
-    tree_points = _thin(points, light.texel_m * _INDIRECT_TEXELS)
-    share_direct = 0.5 if light.bounces else 1.0
+    fine, fine_of_point = _thin(points, light.texel_m * _FINE_TEXELS)
+    log.info("baking %d irradiance samples on %d triangles", len(fine), len(lattice.first))
+    total = np.zeros((len(fine), 3), np.float32)
 
-    # A first pass with few samples finds the points that any light reaches; only those get the full effort.
-    alive = np.ones(n, bool)
-    coarse = _direct(scene, points, np.arange(n), 4, lambda f: progress(0.05 * f, "direct light, first look"))
-    neighbours, weights = _interpolation(points, tree_points, light.texel_m * _INDIRECT_TEXELS)
-    indirect = np.zeros((n, 3), np.float32)
-    for bounce in range(3):
-        field = _field(lattice, index, coarse + indirect, alive)
-        at_tree = _gather(scene, field, points, tree_points, 16, lambda f: None)
-        indirect = _spread(at_tree, neighbours, weights)
-        progress(0.05 + 0.02 * (bounce + 1), "finding lit surfaces")
-    alive = (coarse + indirect).max(axis=1) > 0
+    # A first look with few samples finds what any light reaches; only that gets the full effort.
+    first_look = _direct(scene, points, fine, 2, _reporter(progress, 0.0, 0.05, "finding lit surfaces"))
+    for bounce in range(_FIRST_LOOK_BOUNCES):
+        field = _field(
+            lattice, index, total[fine_of_point] + first_look[fine_of_point], np.ones(len(fine_of_point), bool)
+        )
+        report = _reporter(progress, 0.05 + 0.03 * bounce, 0.03, "finding lit surfaces")
+        total = _gather(scene, field, points, fine, _FIRST_LOOK_RAYS, report)
+    alive = (first_look + total).max(axis=1) > 0
+    alive_point = alive[fine_of_point]
+    fine = fine[alive]
+    if not len(fine):
+        raise UserError("the scene is dark: no light reaches any surface; add an emitter or move it into the open")
 
-    lit = np.flatnonzero(alive)
-    direct = np.zeros((n, 3), np.float32)
-    direct[lit] = _direct(
-        scene, points, lit, light.direct_samples, lambda f: progress(0.11 + (share_direct - 0.11) * f, "direct light")
-    )
-    tree_points = tree_points[alive[tree_points]]
-    neighbours, weights = _interpolation(points, tree_points, light.texel_m * _INDIRECT_TEXELS)
+    direct = _direct(scene, points, fine, light.direct_samples, _reporter(progress, 0.11, 0.39, "direct light"))
+    lit_points = np.flatnonzero(alive_point)
+    to_point = _Interpolation.between(points, fine, lit_points, light.texel_m)
+    coarse = fine[_thin(points, light.texel_m * _COARSE_TEXELS, fine)[0]]
+    coarse_to_fine = _Interpolation.between(points, coarse, fine, light.texel_m * _COARSE_TEXELS)
+    indirect = np.zeros_like(direct)
+    values = np.zeros((len(points.position), 3), np.float32)
     for bounce in range(light.bounces):
         last = bounce == light.bounces - 1
-        rays = light.gather_rays if last else min(_COARSE_RAYS, light.gather_rays)
-        field = _field(lattice, index, direct + indirect, alive)
-        begin = share_direct + 0.2 * bounce / light.bounces
-        span = (1.0 - begin) if last else 0.2 / light.bounces
-        report = _reporter(progress, begin, span, f"indirect light, bounce {bounce + 1} of {light.bounces}")
-        indirect = _spread(_gather(scene, field, points, tree_points, rays, report), neighbours, weights)
-    total = direct + indirect * (light.bounces > 0)
-    values = np.concatenate([total, alive[:, None]], axis=1).astype(np.float32)
-    values[~alive] = 0
+        values[lit_points] = to_point(direct + indirect)
+        field = _field(lattice, index, values, alive_point)
+        begin = 0.5 + 0.3 * bounce / light.bounces
+        report = _reporter(progress, begin, 1 - begin if last else 0.3 / light.bounces, f"bounce {bounce + 1}")
+        rays = light.gather_rays if last else min(_BOUNCE_RAYS, light.gather_rays)
+        indirect = coarse_to_fine(_gather(scene, field, points, coarse, rays, report))
+    values[lit_points] = to_point(direct + indirect)
+    table = _table(values, alive_point)
     progress(1.0, "light baked")
-    return values[index[0]], values[index[1]]
+    return table[index[0]], table[index[1]]
 
 
 def _reporter(progress: Progress, begin: float, span: float, what: str) -> Callable[[float], None]:
@@ -200,40 +207,62 @@ def _surface_at(shape: Any, face: NDArray[np.uint32], uv: NDArray[np.float32]) -
     return tuple(np.array(v, np.float32).reshape(3, -1).T for v in (si.p, si.sh_frame.n, si.n))  # type: ignore[return-value]
 
 
-def _thin(points: _Points, spacing: float) -> NDArray[np.int64]:
-    """Indices of a subset with about `spacing` metres between points of like normal: the nearest to each cell's centre."""
-    scaled = points.position / spacing
+def _thin(
+    points: _Points, spacing: float, among: NDArray[np.int64] | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Of `among` (default: all points), one in each cell of `spacing` metres and of like normals: the most central one.
+
+    Returns the chosen ones as indices into `among`, and for each of `among` which of the chosen stands for it.
+    """
+    position, normal = points.position, points.normal
+    if among is not None:
+        position, normal = position[among], normal[among]
+    scaled = position / spacing
     cell = np.floor(scaled)
     off_centre = ((scaled - cell - 0.5) ** 2).sum(axis=1)
-    key = _mix(np.concatenate([cell, np.round(points.normal * 1.5)], axis=1).astype(np.int64).astype(np.uint64))
+    key = _mix(np.concatenate([cell, np.round(normal * 1.5)], axis=1).astype(np.int64).astype(np.uint64))
     order = np.lexsort((off_centre, key))
     sorted_key = key[order]
-    return np.sort(order[np.concatenate([[True], sorted_key[1:] != sorted_key[:-1]])])
+    starts = np.concatenate([[True], sorted_key[1:] != sorted_key[:-1]])
+    stands_for = np.empty(len(order), np.int64)
+    stands_for[order] = np.cumsum(starts) - 1
+    return order[starts], stands_for
 
 
-def _interpolation(points: _Points, tree_points: NDArray, spacing: float) -> tuple[NDArray, NDArray]:
-    """Neighbours (n, k) in `tree_points` and their weights (n, k), by distance in position and normal together."""
-    feature = np.concatenate([points.position / spacing, points.normal / _NORMAL_SCALE], axis=1)
-    tree = cKDTree(feature[tree_points])
-    k = min(_NEIGHBOURS, len(tree_points))
-    distance, neighbours = tree.query(feature, k=k, workers=-1, eps=0.1)
-    distance, neighbours = distance.reshape(-1, k), neighbours.reshape(-1, k)
-    # Falls to zero at the furthest neighbour, so that the interpolant is continuous as neighbours change.
-    weights = np.clip(1 - (distance / (distance[:, -1:] * 1.0001 + 1e-9)) ** 2, 0, 1) ** 2 + 1e-6
-    weights /= weights.sum(axis=1, keepdims=True)
-    return neighbours.astype(np.int32), weights.astype(np.float32)
+@dataclass(frozen=True)
+class _Interpolation:
+    """Values at some points from those at `sources`: neighbours (n, k) among the sources and weights (n, k)."""
+
+    neighbours: NDArray[np.int32]
+    weights: NDArray[np.float32]
+
+    @classmethod
+    def between(cls, points: _Points, sources: NDArray, targets: NDArray, spacing: float) -> _Interpolation:
+        """By distance in position (in units of `spacing` metres) and normal together."""
+        scaled = np.concatenate([points.position / spacing, points.normal / _NORMAL_SCALE], axis=1)
+        k = min(_NEIGHBOURS, len(sources))
+        distance, neighbours = cKDTree(scaled[sources]).query(scaled[targets], k=k, workers=-1, eps=0.2)
+        distance, neighbours = distance.reshape(-1, k), neighbours.reshape(-1, k)
+        # Falls to zero at the furthest neighbour, so that the interpolant is continuous as neighbours change, and
+        # grows without bound towards a source, so that it passes through the sources.
+        near = np.clip(1 - (distance / (distance[:, -1:] * 1.0001 + 1e-9)) ** 2, 0, 1) ** 2
+        weights = (near + 1e-6) / (distance**2 + _SMOOTHING**2)
+        weights /= weights.sum(axis=1, keepdims=True)
+        return cls(neighbours.astype(np.int32), weights.astype(np.float32))
+
+    def __call__(self, at_sources: NDArray[np.float32]) -> NDArray[np.float32]:
+        out = np.zeros((len(self.neighbours), 3), np.float32)
+        for k in range(self.neighbours.shape[1]):
+            out += self.weights[:, k, None] * at_sources[self.neighbours[:, k]]
+        return out
 
 
-def _spread(at_tree: NDArray[np.float32], neighbours: NDArray, weights: NDArray) -> NDArray[np.float32]:
-    out = np.zeros((len(neighbours), 3), np.float32)
-    for k in range(neighbours.shape[1]):
-        out += weights[:, k, None] * at_tree[neighbours[:, k]]
-    return out
+def _table(values: NDArray, alive: NDArray) -> NDArray[np.float32]:
+    return np.where(alive[:, None], np.concatenate([values, alive[:, None]], axis=1), 0).astype(np.float32)
 
 
 def _field(lattice: Lattice, index: NDArray, values: NDArray, alive: NDArray) -> IrradianceField:
-    table = np.concatenate([values, alive[:, None]], axis=1).astype(np.float32)
-    table[~alive] = 0
+    table = _table(values, alive)
     return make_field(lattice, table[index[0]], table[index[1]])
 
 
@@ -267,10 +296,17 @@ def _direct(scene: Any, points: _Points, which: NDArray, samples: int, report: C
             total = _from_emitter(scene, None, p, n, number, samples * _MANY_EMITTERS, 0)
         else:
             for k, emitter in enumerate(emitters):
-                total += _from_emitter(scene, emitter, p, n, number, samples, k)
+                total += _from_emitter(scene, emitter, p, n, number, _samples_for(emitter, samples), k)
                 dr.eval(total)
         out[begin : begin + len(part)] = np.array(total).reshape(3, -1).T
     return out
+
+
+def _samples_for(emitter: Any, samples: int) -> int:
+    """A small emitter's penumbra is narrow: a quarter of the samples serves as well."""
+    shape = emitter.get_shape()
+    small = shape is not None and dr.norm(shape.bbox().extents()) < _SMALL_EMITTER_M
+    return max(1, samples // 4) if small else samples
 
 
 @dr.syntax

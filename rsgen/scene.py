@@ -57,7 +57,9 @@ def ensure_built(path: Path) -> None:
         log.info("building %s (once)", path)
         child = subprocess.run([sys.executable, str(script)], capture_output=True, text=True)
         if child.returncode:
-            raise UserError(f"scene {path}: {script} failed ({_first_line(child.stderr.strip().rpartition(chr(10))[2])})")
+            raise UserError(
+                f"scene {path}: {script} failed ({_first_line(child.stderr.strip().rpartition(chr(10))[2])})"
+            )
     if not path.is_file():
         raise UserError(f"scene {path}: no such file: name a Mitsuba 3 .xml or a mesh file in scene.file")
 
@@ -121,7 +123,9 @@ def _load_xml(mi: Any, path: Path, scratch: Path) -> Any:
 
 def _tessellated(mi: Any, props: Any, file: Path) -> Any:
     """Properties of a `ply` shape that stands for an analytic one: same id, BSDF and emitter, triangles in `file`."""
-    to_world = np.asarray(props["to_world"].matrix, float).reshape(4, 4) if props.has_property("to_world") else np.eye(4)
+    to_world = (
+        np.asarray(props["to_world"].matrix, float).reshape(4, 4) if props.has_property("to_world") else np.eye(4)
+    )
     plugin = props.plugin_name()
     if plugin in ("sphere", "cylinder"):
         radius = float(props.get("radius", 1.0))
@@ -135,14 +139,19 @@ def _tessellated(mi: Any, props: Any, file: Path) -> Any:
             )
             local[:3, 3] = p0
         to_world = to_world @ local
-    uv_grid = {"rectangle": (1, 1), "disk": (8, _SEGMENTS), "sphere": (_SEGMENTS // 2, _SEGMENTS), "cylinder": (1, _SEGMENTS)}
+    uv_grid = {
+        "rectangle": (1, 1),
+        "disk": (8, _SEGMENTS),
+        "sphere": (_SEGMENTS // 2, _SEGMENTS),
+        "cylinder": (1, _SEGMENTS),
+    }
     position, normal, uv, faces = _parametric(plugin, *uv_grid[plugin])
     normal_matrix = np.linalg.inv(to_world[:3, :3]).T
     flip = -1.0 if bool(props.get("flip_normals", False)) else 1.0
     normal = flip * normal @ normal_matrix.T
     if (np.linalg.det(to_world[:3, :3]) < 0) != (flip < 0):
         faces = faces[:, ::-1]
-    write_ply(file, position @ to_world[:3, :3].T + to_world[:3, 3], faces, normal, uv)
+    file.write_bytes(ply_bytes(position @ to_world[:3, :3].T + to_world[:3, 3], faces, normal, uv))
     out = mi.Properties("ply")
     out.set_id(props.id())
     out["filename"] = str(file)
@@ -159,7 +168,11 @@ def _parametric(plugin: str, nu: int, nv: int) -> tuple[NDArray, NDArray, NDArra
     phi = 2 * np.pi * b
     zero, one = np.zeros_like(a), np.ones_like(a)
     if plugin == "rectangle":
-        position, normal, uv = np.stack([2 * a - 1, 2 * b - 1, zero], -1), np.stack([zero, zero, one], -1), np.stack([a, b], -1)
+        position, normal, uv = (
+            np.stack([2 * a - 1, 2 * b - 1, zero], -1),
+            np.stack([zero, zero, one], -1),
+            np.stack([a, b], -1),
+        )
     elif plugin == "disk":
         position, normal = np.stack([a * np.cos(phi), a * np.sin(phi), zero], -1), np.stack([zero, zero, one], -1)
         uv = np.stack([a, b], -1)
@@ -178,18 +191,14 @@ def _parametric(plugin: str, nu: int, nv: int) -> tuple[NDArray, NDArray, NDArra
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
     faces = faces[area > 1e-12]  # the poles' and the disk centre's degenerate halves
     corners = position[faces]
-    outward = np.einsum("ij,ij->i", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), normal[faces].sum(1))
+    outward = np.einsum(
+        "ij,ij->i", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), normal[faces].sum(1)
+    )
     faces[outward < 0] = faces[outward < 0][:, ::-1]
     return position, normal, uv, faces
 
 
-def write_ply(
-    path: Path,
-    vertices: NDArray,
-    faces: NDArray,
-    normals: NDArray | None = None,
-    uv: NDArray | None = None,
-) -> None:
+def ply_bytes(vertices: NDArray, faces: NDArray, normals: NDArray | None = None, uv: NDArray | None = None) -> bytes:
     """Binary PLY of triangles: vertices (n, 3), faces (m, 3), unit normals (n, 3) and texture coordinates (n, 2)."""
     columns = [("x", "y", "z")]
     parts = [vertices]
@@ -206,7 +215,7 @@ def write_ply(
     face_rows = np.empty(len(faces), dtype=[("n", "u1"), ("v", "<i4", 3)])
     face_rows["n"], face_rows["v"] = 3, faces
     data = np.concatenate(parts, axis=1).astype("<f4")
-    path.write_bytes("\n".join(header).encode() + data.tobytes() + face_rows.tobytes())
+    return "\n".join(header).encode() + data.tobytes() + face_rows.tobytes()
 
 
 def _mesh_scene(path: Path, scratch: Path) -> dict[str, Any]:
@@ -216,7 +225,7 @@ def _mesh_scene(path: Path, scratch: Path) -> dict[str, Any]:
         raise UserError(f"scene {path}: holds no triangles with finite vertices")
     file = scratch / "mesh.ply"
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    write_ply(file, vertices, faces)
+    file.write_bytes(ply_bytes(vertices, faces))
     return {
         "type": "scene",
         "mesh": {

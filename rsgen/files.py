@@ -1,0 +1,280 @@
+"""Whole files only: atomic writes, and images, arrays and YAML that are read back strictly or not at all.
+
+Every encoder returns the same bytes for the same data on every run, so that a resumed sequence equals an uninterrupted
+one. Every reader raises UserError naming the file if it is missing, truncated, corrupt or of another size or type;
+PNG and EXR carry checksums that are compared before any decoder sees the data, which keeps the decoders quiet too.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import struct
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import OpenEXR
+import yaml
+
+from rsgen.errors import UserError
+
+# Level 1 with run-length matching: 12 ms and 17 % smaller than the default strategy (15 ms) on a noisy 640x480 picture.
+_PNG_COLOR = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
+# Smooth 16-bit depth is the other way round: the default strategy is quicker (5 ms) and half the size.
+_PNG_DEPTH = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_DEFAULT]
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+# EXR has no checksum of its own (blocks that do not shrink are stored raw), so the file carries the CRC-32 of all its
+# bytes, taken with this field at zero, in a header attribute that other readers ignore.
+_CRC_NAME = "rsgenCrc32"
+_CRC_FIELD = _CRC_NAME.encode() + b"\0string\0\x08\0\0\0"
+_CRC_EMPTY = b"00000000"
+_EXR_MAGIC = b"\x76\x2f\x31\x01"
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# writing
+
+
+def atomic_write(path: Path, data: bytes) -> None:
+    """Write `data` to `path` so that the file is there whole or not at all, whenever the process is killed.
+
+    Raises UserError (full disk, no permission, ...); the temporary file is removed and what was there before stays.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        try:
+            with temporary.open("wb") as file:
+                file.write(data)
+            os.replace(temporary, path)  # noqa: PTH105 - one name for tests to break
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise write_error(path, error) from None
+
+
+def write_error(path: Path, error: OSError) -> UserError:
+    """The one line for a failed write."""
+    cure = {
+        errno.EACCES: "make the folder writable",
+        errno.EPERM: "make the folder writable",
+        errno.EROFS: "that disk is read-only",
+    }.get(error.errno or 0, "free space")
+    return UserError(
+        f"{path}: cannot be written ({_reason(error)}): {cure} or choose another --out, "
+        "then run the same command again to resume"
+    )
+
+
+def remove_stale_temporaries(folder: Path) -> None:
+    """Delete the temporary files that killed writers left in `folder` (those of living processes stay)."""
+    for path in folder.glob(".*.tmp"):
+        writer = path.name.split(".")[-2]
+        if writer.isdigit() and not _is_running(int(writer)):
+            path.unlink(missing_ok=True)
+
+
+def is_temporary(path: Path) -> bool:
+    """True for the names that `atomic_write` uses while it writes."""
+    return path.name.startswith(".") and path.name.endswith(".tmp")
+
+
+def encode_png(image: np.ndarray) -> bytes:
+    """PNG of an (h, w, 3) uint8 RGB or (h, w) uint16 image."""
+    if image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8:
+        ok, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), _PNG_COLOR)
+    elif image.ndim == 2 and image.dtype == np.uint16:
+        ok, data = cv2.imencode(".png", image, _PNG_DEPTH)
+    else:
+        raise ValueError(f"a PNG is written from (h, w, 3) uint8 or (h, w) uint16, not {image.shape} {image.dtype}")
+    if not ok:
+        raise ValueError("cv2 could not encode a PNG")
+    return data.tobytes()
+
+
+def encode_exr(z: np.ndarray) -> bytes:
+    """Lossless single-channel ('Z') OpenEXR of an (h, w) float32 image, with a checksum of the whole file."""
+    if z.ndim != 2 or z.dtype != np.float32:
+        raise ValueError(f"an EXR is written from (h, w) float32, not {z.shape} {z.dtype}")
+    header = {
+        "compression": OpenEXR.ZIP_COMPRESSION,  # every reader knows it; ZSTD would halve size and time
+        "type": OpenEXR.scanlineimage,
+        _CRC_NAME: _CRC_EMPTY.decode(),
+    }
+    stream = io.BytesIO()
+    with OpenEXR.File(header, {"Z": np.ascontiguousarray(z)}) as file:
+        file.write(stream)
+    data = stream.getvalue()
+    at = data.index(_CRC_FIELD) + len(_CRC_FIELD)
+    return data[:at] + b"%08x" % zlib.crc32(data) + data[at + len(_CRC_EMPTY) :]
+
+
+def encode_npy(array: np.ndarray) -> bytes:
+    """Bytes of a .npy file."""
+    stream = io.BytesIO()
+    np.save(stream, array, allow_pickle=False)
+    return stream.getvalue()
+
+
+def encode_npz(arrays: Mapping[str, np.ndarray]) -> bytes:
+    """Bytes of an uncompressed .npz file, entries dated 1980 whatever the clock says."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
+        for name, array in arrays.items():
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0)), encode_npy(np.asarray(array)))
+    return stream.getvalue()
+
+
+def encode_yaml(data: Mapping[str, Any]) -> bytes:
+    """Block-style YAML in the given order, lists of numbers on one line."""
+    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, width=120, allow_unicode=True).encode()
+
+
+class _Dumper(yaml.SafeDumper):
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def _represent_list(dumper: yaml.SafeDumper, data: list[Any]) -> yaml.Node:
+    flat = all(isinstance(item, int | float) for item in data)
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=flat)
+
+
+_Dumper.add_representer(list, _represent_list)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# reading
+
+
+def read_bytes(path: Path) -> bytes:
+    """The whole file. Raises UserError if it cannot be read or is empty."""
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({_reason(error)})") from None
+    if not data:
+        raise UserError(f"{path}: is empty")
+    return data
+
+
+def read_text(path: Path) -> str:
+    """The whole file as UTF-8. Raises UserError."""
+    try:
+        return read_bytes(path).decode("utf-8")
+    except UnicodeDecodeError:
+        raise UserError(f"{path}: is not a text file") from None
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """A YAML mapping. Raises UserError."""
+    try:
+        data = yaml.safe_load(read_text(path))
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        mark = getattr(error, "problem_mark", None)
+        raise UserError(f"{path}:{f' line {mark.line + 1}' if mark else ''} is not valid YAML") from None
+    if not isinstance(data, dict):
+        raise UserError(f"{path}: expected a mapping")
+    return data
+
+
+def read_png(path: Path, shape: tuple[int, ...], dtype: type[np.generic]) -> np.ndarray:
+    """An RGB (h, w, 3) uint8 or (h, w) uint16 PNG of exactly that shape and type. Raises UserError."""
+    data = read_bytes(path)
+    if (fault := _png_fault(data)) is not None:
+        raise _damaged(path, "PNG", fault)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise _damaged(path, "PNG", "cannot be decoded")
+    _expect(path, image, shape, dtype)
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if image.ndim == 3 else image
+
+
+def read_exr(path: Path, shape: tuple[int, int]) -> np.ndarray:
+    """Channel Z of an EXR as (h, w) float32 of exactly that shape. Raises UserError."""
+    data = read_bytes(path)
+    if not data.startswith(_EXR_MAGIC):
+        raise _damaged(path, "EXR", "wrong signature")
+    at = data.find(_CRC_FIELD) + len(_CRC_FIELD)
+    if at >= len(_CRC_FIELD):  # absent in files of other programs
+        stored, end = data[at : at + len(_CRC_EMPTY)], at + len(_CRC_EMPTY)
+        if stored != b"%08x" % zlib.crc32(data[end:], zlib.crc32(_CRC_EMPTY, zlib.crc32(data[:at]))):
+            raise _damaged(path, "EXR", "checksum differs")
+    try:
+        with OpenEXR.File(io.BytesIO(data)) as file:
+            image = np.array(file.channels()["Z"].pixels)
+    except (RuntimeError, ValueError, KeyError, TypeError, MemoryError, OSError):
+        raise _damaged(path, "EXR", "cannot be decoded") from None
+    _expect(path, image, shape, np.float32)
+    return image
+
+
+def read_npy(path: Path, shape: tuple[int, ...]) -> np.ndarray:
+    """A finite float64 .npy of exactly that shape. Raises UserError."""
+    data = read_bytes(path)
+    try:
+        array = np.load(io.BytesIO(data), allow_pickle=False)
+    except (ValueError, OSError, EOFError, MemoryError, SyntaxError, zipfile.BadZipFile):
+        raise _damaged(path, "NumPy", "cannot be decoded") from None
+    if not isinstance(array, np.ndarray):
+        raise _damaged(path, "NumPy", "holds more than one array")
+    _expect(path, array, shape, np.float64)
+    if not np.isfinite(array).all():
+        raise UserError(f"{path}: holds values that are not finite")
+    return array
+
+
+def _png_fault(data: bytes) -> str | None:
+    if not data.startswith(_PNG_SIGNATURE):
+        return "wrong signature"
+    view, at = memoryview(data), len(_PNG_SIGNATURE)
+    while at + 12 <= len(data):
+        (length,) = struct.unpack_from(">I", data, at)
+        end = at + 12 + length
+        if end > len(data):
+            break
+        if zlib.crc32(view[at + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
+            return "checksum differs"
+        if data[at + 4 : at + 8] == b"IEND":
+            return None if end == len(data) else "data after its end"
+        at = end
+    return "truncated"
+
+
+def _expect(path: Path, array: np.ndarray, shape: tuple[int, ...], dtype: type[np.generic]) -> None:
+    if array.shape != shape or array.dtype != dtype:
+        found, wanted = f"{_size(array.shape)} {array.dtype}", f"{_size(shape)} {np.dtype(dtype)}"
+        raise UserError(f"{path}: is {found}, but sequence.yaml asks for {wanted}")
+
+
+def _size(shape: tuple[int, ...]) -> str:
+    return "x".join(str(n) for n in shape)
+
+
+def _damaged(path: Path, kind: str, why: str) -> UserError:
+    return UserError(f"{path}: is not a whole {kind} file ({why}): delete it and render again")
+
+
+def _reason(error: OSError) -> str:
+    return error.strerror or type(error).__name__
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True

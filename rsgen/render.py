@@ -1,0 +1,108 @@
+"""`Renderer`: one frame of colour or depth of a scene through a `RollingShutterSensor`, in one kernel launch.
+
+Pixels are summed in a fixed order (no atomics), so the same frame is the same to the last bit each time on one backend.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter
+from rsgen.sensor import PoseFunction, RollingShutterSensor
+
+# Samples in one launch; more are rendered in several and averaged, which bounds memory.
+_LAUNCH = 1 << 24
+# Steps of the R3 low-discrepancy sequence (Roberts 2018) over footprint x, footprint y and exposure time.
+_R3 = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)
+
+
+class ColorRenderer:
+    """Linear colour frames of a scene. Holds the sensor between frames, so that kernels are compiled once."""
+
+    def __init__(self, scene: Any, integrator: Any, camera: Camera, shutter: Shutter, spp: int) -> None:
+        """`integrator`: any Mitsuba sampling integrator, e.g. `path` or `rsgen.integrator.BakedIntegrator`."""
+        self._scene = scene
+        self._integrator = integrator
+        self._spp = spp
+        self._sampler = mi.load_dict({"type": "independent"})
+        self.sensor = RollingShutterSensor(camera, shutter)
+
+    def render(self, T_world_cam: PoseFunction, stamp: float, seed: int) -> NDArray[np.float32]:
+        """Linear RGB (h, w, 3) of the frame at `stamp` (s); `seed` decides every random number of it."""
+        self.sensor.expose(T_world_cam, stamp)
+        camera = self.sensor.camera
+        pixels = camera.width * camera.height
+        per_launch = max(1, min(self._spp, _LAUNCH // pixels))
+        total = np.zeros((pixels, 3), np.float64)
+        for first in range(0, self._spp, per_launch):
+            count = min(per_launch, self._spp - first)
+            total += self._launch(pixels, first, count, seed)
+        return (total / self._spp).astype(np.float32).reshape(camera.height, camera.width, 3)
+
+    def _launch(self, pixels: int, first: int, count: int, seed: int) -> NDArray[np.float32]:
+        """Sum (pixels, 3) of samples first..first+count of every pixel."""
+        camera, shutter = self.sensor.camera, self.sensor.shutter
+        # Mixed on the host: neighbouring seeds must not give neighbouring random streams.
+        keys = np.random.SeedSequence([seed, first]).generate_state(2)
+        rotation_key, sampler_key = (dr.opaque(mi.UInt32, int(key)) for key in keys)
+        self._sampler.seed(sampler_key, pixels * count)
+        index = dr.arange(mi.UInt32, pixels * count)
+        pixel = index // count
+        sample = mi.Float(index - pixel * count + dr.opaque(mi.UInt32, first))
+        u, v, w = (_fraction(sample * step + _hash(pixel, rotation_key, k)) for k, step in enumerate(_R3))
+        x, y = mi.Float(pixel % camera.width) + u, mi.Float(pixel // camera.width) + v
+        position = mi.Point2f(x / camera.width, y / camera.height)
+        ray, _ = self.sensor.sample_ray_differential(w * shutter.exposure_s, mi.Float(0), position, mi.Point2f(0.5))
+        ray.scale_differential(1.0 / np.sqrt(self._spp))
+        radiance, _, _ = self._integrator.sample(self._scene, self._sampler, ray, None, mi.Bool(True))
+        sums = [dr.block_sum(channel, count) for channel in mi.unpolarized_spectrum(radiance)]
+        dr.eval(sums)
+        return np.stack([np.asarray(s) for s in sums], axis=1)
+
+
+class DepthRenderer:
+    """Planar depth frames: one ray through each pixel's centre at its line's mid-exposure."""
+
+    def __init__(self, scene: Any, camera: Camera, shutter: Shutter) -> None:
+        self._scene = scene
+        self.sensor = RollingShutterSensor(camera, shutter)
+        self._exposure = shutter.exposure_s
+
+    def render(self, T_world_cam: PoseFunction, stamp: float) -> NDArray[np.float32]:
+        """Planar z (h, w) float32, metres, of the frame at `stamp` (s); 0 where the ray hits nothing."""
+        self.sensor.expose(T_world_cam, stamp)
+        camera = self.sensor.camera
+        pixel = dr.arange(mi.UInt32, camera.width * camera.height)
+        u, v = mi.Float(pixel % camera.width), mi.Float(pixel // camera.width)
+        position = mi.Point2f((u + 0.5) / camera.width, (v + 0.5) / camera.height)
+        ray, _ = self.sensor.sample_ray(0.5 * self._exposure, mi.Float(0), position, mi.Point2f(0.5))
+        hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
+        z = dr.select(hit.is_valid(), hit.t * self.sensor.planar_depth_scale(u, v), 0)
+        return np.array(z, np.float32).reshape(camera.height, camera.width)
+
+
+def global_shutter(shutter: Shutter) -> Shutter:
+    """The same shutter with all lines at once."""
+    return replace(shutter, readout_s=0.0)
+
+
+def to_srgb8(linear: NDArray[np.float32], gain: float = 1.0) -> NDArray[np.uint8]:
+    """8-bit sRGB (IEC 61966-2-1) of linear values times `gain`, clipped to [0, 1]; any shape."""
+    x = np.clip(linear * np.float32(gain), 0, 1)
+    encoded = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, np.float32(1 / 2.4)) - 0.055)
+    return np.rint(255 * encoded).astype(np.uint8)
+
+
+def _fraction(x: Any) -> Any:
+    return x - dr.floor(x)
+
+
+def _hash(pixel: Any, key: Any, dimension: int) -> Any:
+    return mi.sample_tea_float32(pixel, key + dimension, 4)
