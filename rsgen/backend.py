@@ -114,3 +114,10 @@ def mitsuba(backend: Backend = "auto"):
 
     mi.set_variant(variant)
     return mi
+
+
+if __name__ == "__main__":  # run.sh asks: is there a backend that works?
+    try:
+        print(select())
+    except UserError as error:
+        sys.exit(f"rsgen: {error}")

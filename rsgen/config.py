@@ -198,11 +198,16 @@ def load_config(path: Path, overrides: dict[str, str] | None = None) -> Config:
                 raise _error(f"config {path}: {section}.{name}: no such user's home, got {part[name]!r}") from None
     for key, text in (overrides or {}).items():
         _set(data, key, text)
+    return validate_config(data, f"config {path}")
+
+
+def validate_config(data: dict[str, Any], where: str) -> Config:
+    """A config from plain YAML types; `where` begins the message. Raises UserError naming every wrong field."""
     try:
         return Config.model_validate(data)
     except ValidationError as error:
         problems = "; ".join(_problem(e) for e in error.errors())
-        raise _error(f"config {path}: {problems}") from None
+        raise _error(f"{where}: {problems}") from None
 
 
 def _error(text: str) -> UserError:

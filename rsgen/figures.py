@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib
@@ -13,15 +15,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from rsgen.files import atomic_write
+
 _DPI = 130
 
 
 def save(figure: Figure, path: Path) -> None:
     """Write a figure as PNG and close it. Raises UserError if the file cannot be written."""
-    import io
-
-    from rsgen.files import atomic_write
-
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=_DPI)
     plt.close(figure)
@@ -79,6 +79,21 @@ def preview(color: list[NDArray[np.uint8]], depth: list[NDArray[np.float32]], ti
         axis.set_yticks([])
     figure.suptitle(title)
     return figure
+
+
+def save_grid(rows: Sequence[Sequence[NDArray]], titles: Sequence[str], path: Path) -> None:
+    """Write rows of images, each (h, w, 3) in [0, 1], with a title over each column. Raises UserError."""
+    height, width = rows[0][0].shape[:2]
+    size = (4.2 * len(titles), 4.2 * height / width * len(rows) + 0.5)
+    figure, axes = plt.subplots(len(rows), len(titles), figsize=size, layout="constrained", squeeze=False)
+    for row, images in zip(axes, rows, strict=True):
+        for axis, image in zip(row, images, strict=True):
+            axis.imshow(np.clip(image, 0, 1), interpolation="nearest")
+            axis.set_xticks([])
+            axis.set_yticks([])
+    for axis, title in zip(axes[0], titles, strict=True):
+        axis.set_title(title)
+    save(figure, path)
 
 
 def _signed(figure: Figure, axis: Axes, difference: NDArray, span: float, label: str) -> None:

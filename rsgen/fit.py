@@ -112,14 +112,13 @@ def fit_spline(
 
     threshold, prior = math.inf, np.full((count - 2, 6), _WEAK_PRIOR)
     r, bend = _residuals(trajectory, spline) * scale, _second_differences(spline) * scale
-    length, damping = 1.0, 0.0
+    length = 1.0
     for iteration in range(1, _MAX_ITERATIONS + 1):
         if iteration <= _SCALE_ITERATIONS:
             # Least squares first: the start is poor at the ends, and Huber would take its poses there for outliers.
             threshold = _huber_threshold(r) if robust == "huber" and iteration > 2 else math.inf
             prior = smooth + _prior(r, bend, loose)
         bands, gradient = _data_equations(trajectory, spline, r, threshold, scale, _RADIAL if length == 1.0 else 0.0)
-        bands[0] *= 1.0 + damping
         prior_bands, prior_gradient = _prior_equations(spline, bend, prior, scale)
         try:
             step = solveh_banded(bands + prior_bands, -(gradient + prior_gradient).ravel(), lower=True).reshape(
@@ -134,9 +133,7 @@ def fit_spline(
             r, bend = _residuals(trajectory, spline) * scale, _second_differences(spline) * scale
             if _cost(r, bend, threshold, prior) <= before * (1.0 + 1e-9) + 1e-20:
                 break
-        # Levenberg-Marquardt only in trouble: rotations of a radian, by gross outliers, are beyond Gauss-Newton.
-        damping = max(10.0 * damping, 1e-3) if length < 1.0 else (0.1 * damping if damping > 1e-4 else 0.0)
-        if damping == 0.0 and length * np.abs(step).max() < _STEP_TOLERANCE and iteration > 3:
+        if length * np.abs(step).max() < _STEP_TOLERANCE and iteration > 3:
             break
     else:
         if np.abs(step).max() > 1e-5:

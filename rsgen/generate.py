@@ -1,4 +1,4 @@
-"""From a configuration to a sequence folder: read, fit, light, render, write. Can be stopped and resumed at any moment."""
+"""From a configuration to a sequence folder: read, fit, light, render, write. A run can be stopped and resumed."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from rsgen.files import atomic_write
 from rsgen.fit import FitResult, fit_spline
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
+from rsgen.inspect import write_origin
 from rsgen.sequence_format import STREAMS, stream_stamps
 from rsgen.sequence_writer import SequenceWriter
 from rsgen.trajectory import read_trajectory
@@ -120,6 +121,7 @@ def render_sequence(config: Config, out: Path, frames: slice, progress: Progress
     writer = SequenceWriter.open(
         out, config, motion.spline, stamps["color"], stamps["depth"], engine_versions(config), input_hashes(config)
     )
+    write_origin(out, config)
     todo = sorted(
         [(k, stream) for stream in STREAMS for k in _chosen(writer.missing(stream), frames, len(stamps[stream]))],
     )
@@ -143,10 +145,12 @@ def render_sequence(config: Config, out: Path, frames: slice, progress: Progress
                 progress("frames", done / len(todo), f"frame {k}")
             for write in pending:
                 write.result()
-        finally:
-            # What was rendered is listed even if the disk or the user ends the run here.
+        except (KeyboardInterrupt, SystemExit):
+            # A run that the user ends here leaves a readable, shorter sequence.
             for write in pending:
-                write.cancel()
+                write.result()
+            writer.finish()
+            raise
     writer.finish()
     return out
 

@@ -17,8 +17,8 @@ class BakedIntegrator(mi.SamplingIntegrator):
     """Radiance from baked irradiance: emission + diffuse lobe x E, and traced bounces for all other lobes.
 
     The diffuse lobe is weighted with one cosine-distributed direction, which is exact (no noise) for Lambert's law and
-    nearly so for the diffuse base of plastics. Glossy and specular lobes are sampled and traced onto the baked surfaces,
-    up to `bounces` times in a row.
+    nearly so for the diffuse base of plastics. Glossy and specular lobes are sampled and traced onto the baked
+    surfaces, up to `bounces` times in a row.
     """
 
     def __init__(self, field: IrradianceField, bounces: int = 4) -> None:

@@ -101,11 +101,12 @@ class IrradianceField:
         self.face_count = face_count
 
     def lookup(self, pi: Any, si: Any, wi_world: Any, active: Any = True) -> Any:
-        """Irradiance (Color3f, W/m² in scene units) at hits `pi`/`si`, on the side that `wi_world` points away from."""
+        """Irradiance (Color3f, W/m² in scene units) at hits `pi`/`si`, on the side that `wi_world` (towards the viewer) lies on."""
         shape = dr.reinterpret_array(mi.UInt32, si.shape)
         first_face = dr.gather(mi.Int32, self.shape_first, shape, active & si.is_valid())
         active = active & si.is_valid() & (first_face >= 0)
-        back = dr.dot(si.n, wi_world) < 0
+        # Shading decides which side is lit: meshes exist whose winding and vertex normals disagree.
+        back = dr.dot(si.n, wi_world) * dr.dot(si.n, si.sh_frame.n) < 0
         face = mi.UInt32(first_face) + pi.prim_index + dr.select(back, mi.UInt32(self.face_count), 0)
         entry = dr.gather(mi.Vector2u, self.faces, face, active)
         nu, nv, apex = entry.y & 0xFFF, (entry.y >> 12) & 0xFFF, entry.y >> 24

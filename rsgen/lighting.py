@@ -158,6 +158,8 @@ def _sample_points(scene: Any, lattice: Lattice) -> tuple[_Points, NDArray[np.in
             local = (face[part] - firsts[number]).astype(np.uint32)
             position[part], normal[part], geometric[part] = _surface_at(shape, local, uv[part])
             middle[part] = _surface_at(shape, local, centre[part])[0]
+    # The side that shading lights, where winding and vertex normals disagree.
+    geometric *= np.where(np.einsum("ij,ij->i", geometric, normal) < 0, -1, 1)[:, None].astype(np.float32)
     # Rounded positions and normals make one key: points that triangles share are computed once, so edges cannot show.
     key_parts = np.concatenate([np.round(position * 1e4), np.round(normal * 32)], axis=1).astype(np.int64)
     inward = middle - position

@@ -60,7 +60,7 @@ class ColorRenderer:
         x, y = mi.Float(pixel % camera.width) + u, mi.Float(pixel // camera.width) + v
         position = mi.Point2f(x / camera.width, y / camera.height)
         ray, _ = self.sensor.sample_ray_differential(w * shutter.exposure_s, mi.Float(0), position, mi.Point2f(0.5))
-        ray.scale_differential(1.0 / np.sqrt(self._spp))
+        ray.scale_differential(mi.Float(1.0 / np.sqrt(self._spp)))
         radiance, _, _ = self._integrator.sample(self._scene, self._sampler, ray, None, mi.Bool(True))
         sums = [dr.block_sum(channel, count) for channel in mi.unpolarized_spectrum(radiance)]
         dr.eval(sums)

@@ -62,7 +62,7 @@ def depth_points(sequence: Sequence, k: int) -> FloatArray:
     step = max(1, min(_STEP_PX, math.isqrt(camera.width * camera.height // _TARGET_PIXELS)))
     z = sequence.truth_depth(k)[::step, ::step].astype(np.float64)
     uv = camera.pixel_grid()[::step, ::step][z > 0]
-    line = np.rint(shutter.line_of_pixel(uv, camera)).astype(np.int64)
+    line = np.rint(uv[:, 1 if shutter.scan in ("top-bottom", "bottom-top") else 0]).astype(np.int64)
     return se3.transform(poses_of_rows(sequence.rows("depth")[k])[line], camera.backproject(uv, z[z > 0]))
 
 

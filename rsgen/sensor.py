@@ -14,8 +14,9 @@ Importing this module needs an active Mitsuba variant (`rsgen.backend.mitsuba()`
     image = mi.render(mi.load_file("scene.xml"), sensor=sensor, spp=16)
 
 Poses reach the device as a table of T_world_cam on a uniform time grid over the frame's whole exposure, evaluated in
-float64 by the one NumPy spline and blended linearly per ray. The grid is a quarter of a line delay or finer, so that the
-blend's error is far below a micrometre, and rolling shutter and blur together cost what a still costs.
+float64 by the one NumPy spline and blended linearly per ray. Its step is the frame's whole span over four times the
+number of lines, so that the blend's error is far below a micrometre, and rolling shutter and blur together cost what a
+still costs.
 """
 
 from __future__ import annotations
@@ -40,12 +41,12 @@ class RollingShutterSensor(mi.Sensor):
     """Pinhole sensor with distortion whose lines are exposed one after the other (DESIGN: stamp = end of line 0).
 
     Line i of h is exposed over [stamp + i·t_r/h − t_e, stamp + i·t_r/h]; every sample draws its time within its own
-    line's window through Mitsuba's shutter. Lines are rows or columns, in the order of `shutter.scan`. Rays start at the
-    pinhole. Use a `box` reconstruction filter (the default here): a wider one mixes lines of different times.
+    line's window through Mitsuba's shutter. Lines are rows or columns, in the order of `shutter.scan`. Rays start at
+    the pinhole. Use a `box` reconstruction filter (the default here): a wider one mixes lines of different times.
     """
 
     def __init__(self, camera: Camera, shutter: Shutter, film: mi.Film | None = None) -> None:
-        """`camera` in pixels, `shutter` in seconds; `film` (default: hdrfilm, box filter) must have the camera's size."""
+        """`camera` in pixels, `shutter` in seconds; `film` (default: hdrfilm, box filter) of the camera's size."""
         properties = mi.Properties()
         properties.set_plugin_name("rolling_shutter")
         properties.set_id("rolling_shutter")

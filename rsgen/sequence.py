@@ -112,8 +112,7 @@ class Sequence:
     def rows(self, stream: StreamName) -> FloatArray:
         """Poses (n, lines, 7) tx ty tz qx qy qz qw of each line's camera in the world at mid-exposure.
 
-        Lines are in the order of readout, as `Shutter.line_of_pixel` counts them: image rows from the top for a
-        top-bottom scan, from the bottom for bottom-top, columns for the sideways ones.
+        Line i is image row i, or column i for the sideways scans, whatever the order of readout.
         """
         if stream not in self._rows:
             s = self.streams[stream]

@@ -212,9 +212,11 @@ def line_poses(
 ) -> FloatArray:
     """Rows (frames, lines, 7) of T_world_cam at each line's mid-exposure; T_cam_body is the identity for depth.
 
-    Raises UserError if a line is read outside the spline's time.
+    Entry i is image row i (column i for the sideways scans), whatever the order of readout. Raises UserError if a line is read outside the spline's time.
     """
-    stamps, lines = np.asarray(stamps, float), np.arange(shutter.line_count(camera))
+    stamps = np.asarray(stamps, float)
+    places = np.arange(shutter.line_count(camera), dtype=float)
+    lines = shutter.line_of_pixel(np.stack([places, places], axis=-1), camera)
     poses = []
     for k in range(0, len(stamps), _FRAMES_AT_ONCE):
         T = spline.pose(shutter.line_mid_time(stamps[k : k + _FRAMES_AT_ONCE, None], lines, camera))

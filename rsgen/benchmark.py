@@ -1,0 +1,140 @@
+"""Measurements of the renderer: how right the baked light is, and what each mode costs. Ratios within one run."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from rsgen.config import Config
+from rsgen.errors import UserError
+from rsgen.generate import Motion, Progress, load_motion, make_integrator
+from rsgen.geometry.shutter import Shutter
+
+PSNR_FLOOR_DB = 36.0
+_REFERENCE_DEPTH = 64  # path length of the reference; Russian roulette ends most paths long before
+_REFERENCE_PASS = 64  # samples per pixel of one pass, for progress
+_BAKED_SPP = 256  # samples of the baked picture: what is compared is its light, not its noise
+_BLUR_S = 0.020
+_READOUT_S = 0.028
+
+
+def check_light(config: Config, views: int, spp: int, width: int, picture: Path | None, progress: Progress) -> str:
+    """PSNR (dB, in 8-bit-range sRGB before quantisation) of baked against path-traced global-shutter views.
+
+    The views are spread evenly over the config's trajectory and scaled to `width` pixels. Writes baked, path-traced and
+    eight times their difference as one picture if a path is given. Returns a table. Raises UserError.
+    """
+    motion = load_motion(config)
+    scene, baked, mi = _lit_scene(config, progress)
+    from rsgen.figures import save_grid
+    from rsgen.render import ColorRenderer
+
+    camera = _scaled(config, width)
+    reference = mi.load_dict({"type": "path", "max_depth": _REFERENCE_DEPTH})
+    ours = ColorRenderer(scene, baked, camera, Shutter(), _BAKED_SPP)
+    theirs = ColorRenderer(scene, reference, camera, Shutter(), _REFERENCE_PASS)
+    table = Table("view", "time, s", "PSNR, dB", "bias, %", f"at least {PSNR_FLOOR_DB:g}")
+    rows: list[list[NDArray[np.float64]]] = []
+    passes = max(1, spp // _REFERENCE_PASS)
+    for view, stamp in enumerate(_times(motion, views)):
+        ours_linear = ours.render(motion.spline.pose, float(stamp), view).astype(np.float64)
+        sums = np.zeros_like(ours_linear)
+        for k in range(passes):
+            sums += theirs.render(motion.spline.pose, float(stamp), 1000 * (view + 1) + k)
+            progress("path tracing", (view * passes + k + 1) / (views * passes), f"view {view + 1} of {views}")
+        ours_srgb, their_srgb = (_srgb(image * config.color.exposure_gain) for image in (ours_linear, sums / passes))
+        difference = ours_srgb - their_srgb
+        psnr = -10 * np.log10(np.mean(difference**2))
+        bias = 100 * (ours_linear.mean() / (sums / passes).mean() - 1)
+        table.add_row(str(view), f"{stamp:.2f}", f"{psnr:.1f}", f"{bias:+.2f}", "yes" if psnr >= PSNR_FLOOR_DB else "no")
+        rows.append([ours_srgb, their_srgb, np.clip(0.5 + 8 * difference, 0, 1)])
+    if picture is not None:
+        save_grid(rows, ["baked", f"path traced, {passes * _REFERENCE_PASS} spp", "difference x 8"], picture)
+    return _text(table)
+
+
+def time_modes(config: Config, frames: int, spp: int, progress: Progress) -> str:
+    """Median seconds a colour frame in each mode, modes taken in turn, and the ratios that the README claims."""
+    motion = load_motion(config)
+    scene, baked, mi = _lit_scene(config, progress)
+    from rsgen.render import ColorRenderer
+
+    camera = config.color.camera
+    path = mi.load_dict({"type": "path", "max_depth": config.light.max_depth})
+    path_spp = max(1, spp // 4)  # a quarter of the samples, four times the time counted: path tracing is slow
+    still, moving = Shutter(), Shutter(_READOUT_S, _BLUR_S)
+    modes: dict[str, tuple[Any, float]] = {
+        "still, baked": (ColorRenderer(scene, baked, camera, still, spp), 1.0),
+        "rolling shutter + blur, baked": (ColorRenderer(scene, baked, camera, moving, spp), 1.0),
+        "rolling shutter + blur, path": (ColorRenderer(scene, path, camera, moving, path_spp), spp / path_spp),
+    }
+    seconds: dict[str, list[float]] = {name: [] for name in modes}
+    for k, stamp in enumerate(_times(motion, frames + 1)):
+        for name, (renderer, factor) in modes.items():
+            begin = time.perf_counter()
+            renderer.render(motion.spline.pose, float(stamp), k)
+            if k > 0:  # the first frame compiles kernels
+                seconds[name].append(factor * (time.perf_counter() - begin))
+        progress("timing", (k + 1) / (frames + 1), f"{spp} spp")
+    median = {name: statistics.median(values) for name, values in seconds.items()}
+    table = Table("mode", "s a frame", "Msamples/s")
+    for name, value in median.items():
+        table.add_row(name, f"{value:.3f}", f"{camera.width * camera.height * spp / value / 1e6:.1f}")
+    still_name, moving_name, path_name = modes
+    pairs = [(b / a) for a, b in zip(seconds[still_name], seconds[moving_name], strict=True)]
+    ratios = [
+        f"rolling shutter + {1000 * _BLUR_S:g} ms blur against a still: {statistics.median(pairs):.2f}x the time",
+        f"baked against path tracing (depth {config.light.max_depth}): {median[path_name] / median[moving_name]:.1f}x faster",
+    ]
+    return _text(table) + "\n".join(ratios)
+
+
+def _lit_scene(config: Config, progress: Progress) -> tuple[Any, Any, Any]:
+    """Scene, baked integrator and the Mitsuba module of a config."""
+    from rsgen.backend import mitsuba
+
+    mi = mitsuba(config.backend)
+    from rsgen.scene import load_scene
+
+    if config.light.mode != "baked":
+        raise UserError("light.mode is 'path': these measurements are about baked light, leave it at 'baked'")
+    scene = load_scene(config.scene.file)
+    baked = make_integrator(mi, scene, config, lambda fraction, note: progress("light", fraction, note))
+    return scene, baked, mi
+
+
+def _scaled(config: Config, width: int) -> Any:
+    camera = config.color.camera
+    if not 8 <= width <= camera.width:
+        raise UserError(f"--width {width}: choose 8 to {camera.width}")
+    f = width / camera.width
+    return replace(
+        camera, width=width, height=round(camera.height * f), fx=camera.fx * f, fy=camera.fy * f,
+        cx=(camera.cx + 0.5) * f - 0.5, cy=(camera.cy + 0.5) * f - 0.5,
+    )  # fmt: skip
+
+
+def _times(motion: Motion, count: int) -> NDArray[np.float64]:
+    """`count` instants spread over the recording, its very ends left out."""
+    fraction = (np.arange(count) + 0.5) / count
+    return motion.first_stamp + fraction * (motion.last_stamp - motion.first_stamp)
+
+
+def _srgb(linear: NDArray[np.float64]) -> NDArray[np.float64]:
+    x = np.clip(linear, 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+
+
+def _text(table: Table) -> str:
+    console = Console(width=100)
+    with console.capture() as capture:
+        console.print(table)
+    return capture.get()

@@ -1,0 +1,90 @@
+"""Look at a sequence: a preview of some frames, and one frame rendered again with a global shutter beside it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsgen.config import Config, validate_config
+from rsgen.errors import UserError
+from rsgen.files import atomic_write, encode_yaml, read_yaml
+from rsgen.progress import ProgressDisplay
+from rsgen.sequence import read_sequence
+
+# What a sequence folder remembers of the machine that rendered it, for commands that render again. Not part of the
+# format: a sequence is whole without it.
+ORIGIN = "origin.yaml"
+
+
+def write_origin(out: Path, config: Config) -> None:
+    """Note where the scene and trajectory of the sequence in `out` are on this machine. Raises UserError."""
+    where = {"scene": str(config.scene.file.resolve()), "trajectory": str(config.trajectory.file.resolve())}
+    atomic_write(out / ORIGIN, encode_yaml(where))
+
+
+def preview_sequence(path: Path, out: Path | None, count: int) -> Path:
+    """Write a picture of `count` frames over the whole sequence, colour over depth; returns its path.
+
+    Raises UserError if the sequence cannot be read or the picture not be written.
+    """
+    from rsgen.figures import preview, save
+
+    sequence = read_sequence(path)
+    streams = sequence.streams
+    available = min(len(streams["color"].stamps), len(streams["depth"].stamps))
+    if available == 0 or count < 1:
+        raise UserError(f"{path}: no frames to show: render some, and ask for at least one")
+    chosen = np.linspace(0, available - 1, min(count, available)).round().astype(int)
+    shutter = streams["color"].shutter
+    title = f"{sequence.name}: frames {', '.join(map(str, chosen))} (readout {1000 * shutter.readout_s:g} ms)"
+    out = out or path / "preview.png"
+    save(preview([sequence.color(k) for k in chosen], [sequence.depth(k) for k in chosen], title), out)
+    return out
+
+
+def compare_frame(path: Path, frame: int, out: Path | None, scene: Path | None) -> Path:
+    """Write the paper's Figure 3 for one frame: global shutter, rolling shutter, signed difference; returns its path.
+
+    The global-shutter pictures are rendered at the time of the middle line. `scene` names the scene file if it is no
+    longer where it was. Raises UserError.
+    """
+    from rsgen.figures import comparison, save
+    from rsgen.generate import FrameSource
+
+    sequence = read_sequence(path)
+    color, depth = (sequence.streams[name] for name in ("color", "depth"))
+    for stream in (color, depth):
+        if frame not in stream.indices:
+            raise UserError(f"{path}: has no {stream.name} frame {frame}: choose one of {_span(stream.indices)}")
+    config = _config_of(path, sequence.meta, scene)
+    with ProgressDisplay() as progress:
+        source = FrameSource(config, progress, global_shutter=True)
+    at = {stream.name: int(np.flatnonzero(stream.indices == frame)[0]) for stream in (color, depth)}
+    middle = {s.name: float(s.stamps[at[s.name]]) + s.shutter.readout_s / 2 for s in (color, depth)}
+    colors = source.color(sequence.spline, middle["color"], frame), sequence.color(at["color"])
+    depths = source.depth(sequence.spline, middle["depth"]), sequence.truth_depth(at["depth"])
+    title = (
+        f"{sequence.name}, frame {frame}: readout {1000 * color.shutter.readout_s:g} ms (colour), "
+        f"{1000 * depth.shutter.readout_s:g} ms (depth); global shutter at the middle line's time"
+    )
+    out = out or path / f"compare_{frame:06d}.png"
+    save(comparison(colors, depths, title), out)
+    return out
+
+
+def _config_of(path: Path, meta: dict[str, Any], scene: Path | None) -> Config:
+    """The config that a sequence records, with its scene found on this machine."""
+    origin = read_yaml(path / ORIGIN) if (path / ORIGIN).is_file() else {}
+    recorded = dict(meta.get("config") or {})
+    file = scene or Path(str(origin.get("scene", "")))
+    if not file.is_file():
+        raise UserError(f"{path}: its scene '{file}' is not on this machine: name it with --scene")
+    recorded["scene"] = {"file": str(file.resolve())}
+    recorded["trajectory"] = dict(recorded.get("trajectory") or {}, file=str(origin.get("trajectory", "unused")))
+    return validate_config(recorded, f"{path}/sequence.yaml: config")
+
+
+def _span(indices: Any) -> str:
+    return f"{min(indices)} to {max(indices)}" if len(indices) else "none: it is empty"

@@ -1,0 +1,80 @@
+#!/usr/bin/env bash
+# Set-up and the two commands of this project: ./run.sh demo, ./run.sh test (and ./run.sh setup alone).
+# Installs into .venv, and a libLLVM (16 or newer) from the system's packages if there is none. A second run is quick.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")"
+
+say() { printf '%s\n' "run.sh: $*" >&2; }
+die() { say "$*"; exit 2; }
+
+as_root() {
+  if [ "$(id -u)" = 0 ]; then "$@"; elif command -v sudo >/dev/null; then sudo "$@"; else return 127; fi
+}
+
+apt_install() {
+  command -v apt-get >/dev/null || return 1
+  as_root env DEBIAN_FRONTEND=noninteractive apt-get update -qq >&2 || true
+  for package in "$@"; do
+    as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$package" >&2 && return 0
+  done
+  return 1
+}
+
+find_python() {
+  for name in python3 python3.14 python3.13 python3.12 python3.11; do
+    if command -v "$name" >/dev/null && "$name" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then
+      echo "$name"
+      return 0
+    fi
+  done
+  return 1
+}
+
+make_venv() {
+  local python
+  python=$(find_python) || die "Python 3.11 or newer is needed: install it (Debian/Ubuntu: sudo apt-get install python3 python3-venv)"
+  if ! "$python" -m venv .venv 2>/dev/null; then
+    rm -rf .venv
+    apt_install "python$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')-venv" python3-venv ||
+      die "$python cannot make virtual environments: install its venv module (Debian/Ubuntu: sudo apt-get install python3-venv)"
+    "$python" -m venv .venv
+  fi
+}
+
+setup() {
+  local stamp=.venv/.installed-from want
+  want=$(cat pyproject.toml requirements.lock | sha256sum | cut -d' ' -f1)
+  if [ ! -x .venv/bin/python ] || [ "$(cat "$stamp" 2>/dev/null)" != "$want" ]; then
+    say "installing into .venv (once)"
+    [ -x .venv/bin/python ] || make_venv
+    .venv/bin/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[test]'
+    echo "$want" >"$stamp"
+  fi
+  if ! .venv/bin/python -m rsgen.backend >/dev/null 2>&1; then
+    say "installing libLLVM from the system's packages"
+    apt_install libllvm19 libllvm20 libllvm18 libllvm17 libllvm16 || true
+    .venv/bin/python -m rsgen.backend >/dev/null || exit 2
+  fi
+}
+
+demo() {
+  .venv/bin/rsgen render configs/demo.yaml --out out/demo
+  .venv/bin/rsgen verify out/demo
+  .venv/bin/rsgen preview out/demo
+  .venv/bin/rsgen compare out/demo --frame 20
+}
+
+test_all() {
+  .venv/bin/ruff check .
+  .venv/bin/ruff format --check .
+  .venv/bin/mypy
+  # One thread per process for the small solves; two processes share the rendering cores.
+  OPENBLAS_NUM_THREADS=1 .venv/bin/python -m pytest -n 2 --dist loadfile "$@"
+}
+
+case "${1:-}" in
+  setup) setup ;;
+  demo) setup; demo ;;
+  test) shift; setup; test_all "$@" ;;
+  *) die "usage: ./run.sh demo | test [pytest arguments] | setup" ;;
+esac
