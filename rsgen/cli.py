@@ -10,11 +10,15 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
 
 # The fit's banded solves are small: threads only get in each other's way (measured, up to 1000x on a busy machine).
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from rsgen.errors import UserError
+
+if TYPE_CHECKING:
+    from rsgen.config import Config
 
 _DESCRIPTION = """\
 rsgen makes rolling-shutter RGB-D benchmark sequences with exact continuous-time ground truth.
@@ -26,46 +30,90 @@ rsgen makes rolling-shutter RGB-D benchmark sequences with exact continuous-time
 """
 
 
+class _Parser(argparse.ArgumentParser):
+    """Complains like everything else here: in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        raise UserError(f"{message} (see '{self.prog} --help')")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status: 0 done, 1 a check failed, 2 wrong input, 130 interrupted."""
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-    parser = _parser()
-    options, rest = parser.parse_known_args(arguments)
-    if rest and options.run is not _render:
-        parser.error(f"unrecognised arguments: {' '.join(rest)}")
-    options.rest = rest
     try:
-        return options.run(options)
+        options = _parser().parse_args(_joined(sys.argv[1:] if arguments is None else arguments))
+        status = options.run(options)
+        sys.stdout.flush()
     except UserError as error:
         print(f"rsgen: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except BrokenPipeError:
+        # Whoever read our output has seen enough; the interpreter would complain when it flushes the rest.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except KeyboardInterrupt:
         print("rsgen: interrupted; the same command resumes", file=sys.stderr)
         return 130
+    return status
+
+
+def _joined(words: Sequence[str]) -> list[str]:
+    """`--offset -1e-3` as `--offset=-1e-3`: argparse takes a negative number with an exponent for an option."""
+    joined: list[str] = []
+    for word in words:
+        if joined and joined[-1].startswith("--") and "=" not in joined[-1] and _is_negative(word):
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined
+
+
+def _is_negative(word: str) -> bool:
+    try:
+        return word.startswith("-") and float(word) <= 0
+    except ValueError:
+        return False
+
+
+def _count(text: str) -> int:
+    """A whole number of at least one."""
+    try:
+        number = int(text)
+    except ValueError:
+        number = 0
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, got '{text}'")
+    return number
 
 
 def _parser() -> argparse.ArgumentParser:
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser("rsgen", description=_DESCRIPTION, formatter_class=raw)
+    parser = _Parser(
+        "rsgen", description=_DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
-    def add(
-        name: str, run: Callable[[argparse.Namespace], int], help: str, epilog: str = ""
-    ) -> argparse.ArgumentParser:
-        command = commands.add_parser(name, help=help, description=help, epilog=epilog, formatter_class=raw)
+    def add(name: str, run: Callable[[argparse.Namespace], int], help: str, example: str) -> argparse.ArgumentParser:
+        command = commands.add_parser(
+            name, help=help, description=f"{help[0].upper()}{help[1:]}.", epilog=f"example: rsgen {name} {example}",
+            allow_abbrev=False,
+        )  # fmt: skip
         command.set_defaults(run=run)
         return command
 
-    render = add("render", _render, "render a sequence from a config; run again to resume", _RenderEpilog())
+    render = add(
+        "render", _render, "render a sequence from a config; run again to resume",
+        "configs/demo.yaml --out out/trial --frames 0:10 --color.spp 64 --depth.readout_s 0",
+    )  # fmt: skip
     render.add_argument("config", type=Path, help="YAML file, see configs/")
-    render.add_argument("--out", type=Path, help="folder of the sequence (default: out/NAME)")
+    render.add_argument("--out", type=Path, metavar="DIR", help="folder of the sequence (default: out/NAME)")
     render.add_argument("--frames", metavar="A:B", help="only frames A to B-1 (default: all)")
     render.add_argument("--quiet", action="store_true", help="no progress")
 
-    fit = add("fit", _fit, "fit a spline to a trajectory: residuals and motion statistics")
+    fit = add(
+        "fit", _fit, "fit a spline to a trajectory: residuals and motion statistics",
+        "my_trajectory.txt --dt 0.04 --plot fit.png",
+    )  # fmt: skip
     fit.add_argument("file", type=Path, help="TUM, ICL-NUIM (.freiburg) or EuRoC trajectory")
     fit.add_argument("--dt", type=float, default=0.05, help="knot spacing, s (default: 0.05)")
     fit.add_argument("--smoothing", type=float, default=0.0, help="weight of the acceleration penalty (default: 0)")
@@ -73,92 +121,78 @@ def _parser() -> argparse.ArgumentParser:
     fit.add_argument("--plot", type=Path, metavar="PNG", help="write residuals, speeds and accelerations as a picture")
     fit.add_argument("--json", action="store_true", help="print machine-readable figures")
 
-    info = add("info", _info, "say what a sequence folder holds")
-    info.add_argument("sequence", type=Path)
+    info = add("info", _info, "say what a sequence folder holds", "out/demo")
+    info.add_argument("sequence", type=Path, help="folder that 'rsgen render' wrote")
 
-    verify = add("verify", _verify, "read a sequence back and check it: files, stamps, rows' poses, reprojection")
-    verify.add_argument("sequence", type=Path)
-    verify.add_argument("--pairs", type=int, default=20, help="neighbouring frames to reproject (default: 20)")
+    verify = add(
+        "verify", _verify, "read a sequence back and check it: files, stamps, rows' poses, reprojection",
+        "out/demo --pairs 50",
+    )  # fmt: skip
+    verify.add_argument("sequence", type=Path, help="folder that 'rsgen render' wrote")
+    verify.add_argument("--pairs", type=_count, default=20, help="neighbouring frames to reproject (default: 20)")
 
-    compare = add("compare", _compare, "picture of one frame: global shutter, rolling shutter and their difference")
-    compare.add_argument("sequence", type=Path)
+    compare = add(
+        "compare", _compare, "picture of one frame: global shutter, rolling shutter and their difference",
+        "out/demo --frame 20",
+    )  # fmt: skip
+    compare.add_argument("sequence", type=Path, help="folder that 'rsgen render' wrote")
     compare.add_argument("--frame", type=int, required=True, help="index of the frame")
     compare.add_argument("--out", type=Path, metavar="PNG", help="picture to write (default: SEQ/compare_FRAME.png)")
     compare.add_argument("--scene", type=Path, help="scene file, if it has moved since the sequence was rendered")
 
-    preview = add("preview", _preview, "picture of some frames of a sequence with their depth")
-    preview.add_argument("sequence", type=Path)
+    preview = add("preview", _preview, "picture of some frames of a sequence with their depth", "out/demo --count 6")
+    preview.add_argument("sequence", type=Path, help="folder that 'rsgen render' wrote")
     preview.add_argument("--out", type=Path, metavar="PNG", help="picture to write (default: SEQ/preview.png)")
-    preview.add_argument("--count", type=int, default=4, help="frames to show (default: 4)")
+    preview.add_argument("--count", type=_count, default=4, help="frames to show (default: 4)")
 
     light = add(
-        "check-light", _check_light, "baked light against path tracing: PSNR of views along the config's trajectory"
+        "check-light", _check_light, "baked light against path tracing: PSNR of views along the config's trajectory",
+        "configs/demo.yaml --spp 1024 --out light.png",
+    )  # fmt: skip
+    light.add_argument("config", type=Path, help="YAML file, see configs/")
+    light.add_argument("--views", type=_count, default=5, help="views, evenly spread in time (default: 5)")
+    light.add_argument(
+        "--spp", type=_count, default=4096, help="samples per pixel of the path-traced reference (default: 4096)"
     )
-    light.add_argument("config", type=Path)
-    light.add_argument("--views", type=int, default=5, help="views, evenly spread in time (default: 5)")
-    light.add_argument("--spp", type=int, default=4096, help="samples per pixel of the path-traced reference")
-    light.add_argument("--width", type=int, default=160, help="width of the views, px (default: 160)")
+    light.add_argument("--width", type=_count, default=160, help="width of the views, px (default: 160)")
     light.add_argument("--out", type=Path, metavar="PNG", help="picture of both and eight times their difference")
 
-    bench = add("bench", _bench, "time ratios: rolling shutter and blur against a still, baked against path tracing")
-    bench.add_argument("config", type=Path)
-    bench.add_argument("--frames", type=int, default=5, help="timed frames per mode and round (default: 5)")
-    bench.add_argument("--spp", type=int, default=64, help="samples per pixel (default: 64)")
-    for command in (light, bench):
-        command.add_argument(
-            "overrides", nargs="*", metavar="FIELD=VALUE", help="config fields, as trajectory.file=PATH"
-        )
+    bench = add(
+        "bench", _bench, "time ratios: rolling shutter and blur against a still, baked against path tracing",
+        "configs/demo.yaml --spp 16",
+    )  # fmt: skip
+    bench.add_argument("config", type=Path, help="YAML file, see configs/")
+    bench.add_argument("--frames", type=_count, default=5, help="timed frames per mode and round (default: 5)")
+    bench.add_argument("--spp", type=_count, default=64, help="samples per pixel (default: 64)")
+    for command in (render, light, bench):
+        command.usage = "%(prog)s [options] [--SECTION.FIELD VALUE ...] config"
+        _add_overrides(command)
     return parser
 
 
-class _RenderEpilog(str):
-    """Text with every config field, made when help is asked for: reading the schema is not free."""
+def _add_overrides(command: argparse.ArgumentParser) -> None:
+    """One option for every field of the config, `--section.field VALUE`; the last one given counts."""
+    from rsgen.config import describe_fields
 
-    def __mod__(self, other: object) -> str:
-        return str(self)
-
-    def __str__(self) -> str:
-        from rsgen.config import describe_fields
-
-        rows = [f"  --{name:<28} {text} (default: {default})" for name, default, text in describe_fields()]
-        return "\n".join(["Any field of the config can be set, with its dotted name and a YAML value:", *rows])
+    fields = command.add_argument_group("fields of the config, which these override (values are YAML)")
+    for name, default, text in describe_fields():
+        fields.add_argument(
+            f"--{name}", dest="overrides", action="append", default=[], metavar="VALUE",
+            type=lambda value, name=name: (name, value), help=f"{text} (default: {default})".replace("%", "%%"),
+        )  # fmt: skip
 
 
-def _load(path: Path, overrides: dict[str, str]):
+def _config(options: argparse.Namespace) -> Config:
     from rsgen.config import load_config
 
-    return load_config(path, overrides)
-
-
-def _overrides(rest: Sequence[str]) -> dict[str, str]:
-    """`--a.b value` and `--a.b=value` pairs."""
-    pairs: dict[str, str] = {}
-    queue = list(rest)
-    while queue:
-        word = queue.pop(0)
-        key, equals, value = word.removeprefix("--").partition("=")
-        if not word.startswith("--") or not key:
-            raise UserError(f"unexpected argument '{word}': config fields are set as --section.field VALUE")
-        if not equals:
-            if not queue:
-                raise UserError(f"--{key} needs a value")
-            value = queue.pop(0)
-        pairs[key] = value
-    return pairs
-
-
-def _equals(words: Sequence[str]) -> dict[str, str]:
-    bad = [word for word in words if "=" not in word]
-    if bad:
-        raise UserError(f"unexpected argument '{bad[0]}': config fields are set as section.field=VALUE")
-    return dict(word.split("=", 1) for word in words)
+    return load_config(options.config, dict(options.overrides))
 
 
 def _render(options: argparse.Namespace) -> int:
     from rsgen.generate import parse_frames, render_sequence
     from rsgen.progress import ProgressDisplay
 
-    config = _load(options.config, _overrides(options.rest))
+    config = _config(options)
     frames = parse_frames(options.frames)
     out = options.out or Path("out") / config.name
     with ProgressDisplay(options.quiet) as progress:
@@ -210,7 +244,7 @@ def _check_light(options: argparse.Namespace) -> int:
     from rsgen.benchmark import check_light
     from rsgen.progress import ProgressDisplay
 
-    config = _load(options.config, _equals(options.overrides))
+    config = _config(options)
     with ProgressDisplay() as progress:
         print(check_light(config, options.views, options.spp, options.width, options.out, progress))
     return 0
@@ -220,7 +254,7 @@ def _bench(options: argparse.Namespace) -> int:
     from rsgen.benchmark import time_modes
     from rsgen.progress import ProgressDisplay
 
-    config = _load(options.config, _equals(options.overrides))
+    config = _config(options)
     with ProgressDisplay() as progress:
         print(time_modes(config, options.frames, options.spp, progress))
     return 0

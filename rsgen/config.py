@@ -80,6 +80,17 @@ class LightConfig(_Section):
     max_depth: int = Field(default=12, ge=1, le=64, description="path length of mode 'path'")
 
 
+def _pixel_without_ray(camera: Camera) -> tuple[float, float] | None:
+    """A position in the image, its outermost edges included, that the distortion sees nothing at; None if all see."""
+    u, v = np.arange(camera.width + 1) - 0.5, np.arange(camera.height + 1) - 0.5
+    rows = [np.stack([u, np.full_like(u, edge)], axis=-1) for edge in (v[0], v[-1])]
+    columns = [np.stack([np.full_like(v, edge), v], axis=-1) for edge in (u[0], u[-1])]
+    centre = np.array([[(camera.width - 1) / 2, (camera.height - 1) / 2]])
+    uv = np.concatenate([*rows, *columns, centre])
+    blind = uv[~np.isfinite(camera.unproject(uv)).all(axis=-1)]
+    return (float(blind[0, 0]), float(blind[0, 1])) if len(blind) else None
+
+
 class StreamConfig(_Section):
     """One camera with its own clock."""
 
@@ -112,9 +123,15 @@ class StreamConfig(_Section):
     @model_validator(mode="after")
     def _geometry_is_valid(self) -> StreamConfig:
         try:
-            _ = self.camera, self.shutter
+            camera, _ = self.camera, self.shutter
         except UserError as error:
             raise ValueError(str(error)) from None
+        blind = _pixel_without_ray(camera)
+        if blind is not None:
+            raise ValueError(
+                f"distortion: no ray reaches pixel {blind}, where {self.model} folds back or sees 180 degrees: "
+                "take a smaller image, longer focal lengths or other coefficients"
+            )
         return self
 
 

@@ -26,18 +26,21 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from rsgen.config import LightConfig
 from rsgen.errors import UserError
 from rsgen.irradiance import IrradianceField, Lattice, lattice_barycentric, make_field, make_lattice
+from rsgen.scene import mesh_arrays
 
 log = logging.getLogger("rsgen")
 
 Progress = Callable[[float, str], None]  # fraction done in [0, 1], what is being done
 
 # Raise when the method changes, so that older caches are not taken for new ones.
-_METHOD = 1
+_METHOD = 3
 _OFFSET_M = 2e-4  # ray origins above their surface
 _INSET_M = 2e-3  # samples on a triangle's rim move this far inwards: a corner exactly on two surfaces sees neither
 _FINE_TEXELS = 0.9  # direct light is computed at points at least about this far apart
@@ -55,11 +58,14 @@ _SMALL_EMITTER_M = 0.3
 
 @dataclass(frozen=True)
 class _Points:
-    """Unique sample points: position on the surface, shading normal and geometric normal, (n, 3) float32 each."""
+    """Unique sample points: position on the surface, shading normal, geometric normal, (n, 3) float32 each, and (n,)
+    the number of the connected piece of surface that each lies on.
+    """
 
     position: NDArray[np.float32]
     normal: NDArray[np.float32]
     geometric: NDArray[np.float32]
+    island: NDArray[np.int64]
 
 
 def baked_field(scene: Any, scene_hash: str, light: LightConfig, cache: Path, progress: Progress) -> IrradianceField:
@@ -99,7 +105,7 @@ def bake(scene: Any, lattice: Lattice, light: LightConfig, progress: Progress) -
     """Irradiance (points, 4) float32 of the front and back sides: E_r, E_g, E_b (scene units), alive (0 or 1)."""
     points, index = _sample_points(scene, lattice)
     fine, fine_of_point = _thin(points, light.texel_m * _FINE_TEXELS)
-    log.info("baking %d irradiance samples on %d triangles", len(fine), len(lattice.first))
+    log.info("baking %d irradiance samples on %d triangles (%d stored)", len(fine), len(lattice.first), len(fine_of_point))
     total = np.zeros((len(fine), 3), np.float32)
 
     # A first look with few samples finds what any light reaches; only that gets the full effort.
@@ -152,8 +158,13 @@ def _sample_points(scene: Any, lattice: Lattice) -> tuple[_Points, NDArray[np.in
     owner = np.zeros(count, np.int64)
     firsts = np.sort(lattice.shape_first[lattice.shape_first >= 0])
     owner = np.searchsorted(firsts, face, side="right") - 1
+    island = np.empty(count, np.int64)
+    islands = 0
     for number, shape in enumerate(shapes):
+        label = _islands(*mesh_arrays(shape))
         here = np.flatnonzero(owner == number)
+        island[here] = islands + label[face[here] - firsts[number]]
+        islands += int(label.max()) + 1
         for part in np.array_split(here, max(1, len(here) // (1 << 20))):
             local = (face[part] - firsts[number]).astype(np.uint32)
             position[part], normal[part], geometric[part] = _surface_at(shape, local, uv[part])
@@ -182,7 +193,18 @@ def _sample_points(scene: Any, lattice: Lattice) -> tuple[_Points, NDArray[np.in
         np.concatenate([position[front], position[back]]),
         np.concatenate([normal[front], -normal[back]]),
         np.concatenate([geometric[front], -geometric[back]]),
+        np.concatenate([island[front], island[back]]),
     ), index
+
+
+def _islands(vertices: NDArray, faces: NDArray) -> NDArray[np.int64]:
+    """(f,) label of the connected piece that each triangle of a mesh belongs to; vertices at one place are one."""
+    _, same = np.unique(np.round(vertices * 1e5).astype(np.int64), axis=0, return_inverse=True)
+    a, b, c = same.ravel()[faces.astype(np.int64)].T
+    ends = np.concatenate([a, b]), np.concatenate([b, c])
+    size = int(same.max()) + 1
+    edges = coo_array((np.ones(2 * len(a), bool), ends), shape=(size, size))
+    return connected_components(edges, directed=False)[1][a]
 
 
 def _mix(columns: NDArray[np.uint64]) -> NDArray[np.uint64]:
@@ -212,17 +234,18 @@ def _surface_at(shape: Any, face: NDArray[np.uint32], uv: NDArray[np.float32]) -
 def _thin(
     points: _Points, spacing: float, among: NDArray[np.int64] | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Of `among` (default: all points), one in each cell of `spacing` metres and of like normals: the most central one.
+    """Of `among` (default: all), one in each cell of `spacing` metres, of like normals on one piece of surface.
 
     Returns the chosen ones as indices into `among`, and for each of `among` which of the chosen stands for it.
     """
-    position, normal = points.position, points.normal
+    position, normal, island = points.position, points.normal, points.island
     if among is not None:
-        position, normal = position[among], normal[among]
+        position, normal, island = position[among], normal[among], island[among]
     scaled = position / spacing
     cell = np.floor(scaled)
     off_centre = ((scaled - cell - 0.5) ** 2).sum(axis=1)
-    key = _mix(np.concatenate([cell, np.round(normal * 1.5)], axis=1).astype(np.int64).astype(np.uint64))
+    # A buried face must not stand for a lit one just in front of it, so pieces of surface are kept apart.
+    key = _mix(np.concatenate([cell, np.round(normal), island[:, None]], axis=1).astype(np.int64).astype(np.uint64))
     order = np.lexsort((off_centre, key))
     sorted_key = key[order]
     starts = np.concatenate([[True], sorted_key[1:] != sorted_key[:-1]])

@@ -1,4 +1,4 @@
-"""`Renderer`: one frame of colour or depth of a scene through a `RollingShutterSensor`, in one kernel launch.
+"""One frame of colour or depth of a scene through a `RollingShutterSensor`: one launch for all lines.
 
 Pixels are summed in a fixed order (no atomics), so the same frame is the same to the last bit each time on one backend.
 """
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
+from rsgen.integrator import BakedIntegrator
 from rsgen.sensor import PoseFunction, RollingShutterSensor
 
 # Samples in one launch; more are rendered in several and averaged, which bounds memory.
@@ -48,23 +49,38 @@ class ColorRenderer:
 
     def _launch(self, pixels: int, first: int, count: int, seed: int) -> NDArray[np.float32]:
         """Sum (pixels, 3) of samples first..first+count of every pixel."""
-        camera, shutter = self.sensor.camera, self.sensor.shutter
-        # Mixed on the host: neighbouring seeds must not give neighbouring random streams.
-        keys = np.random.SeedSequence([seed, first]).generate_state(2)
-        rotation_key, sampler_key = (dr.opaque(mi.UInt32, int(key)) for key in keys)
-        self._sampler.seed(sampler_key, pixels * count)
+        # Mixed on the host: neighbouring seeds must not give neighbouring random streams. All launches of a frame go on
+        # with one sequence of positions and times; only the integrator's own random numbers start anew.
+        states = (np.random.SeedSequence([seed, k]).generate_state(2) for k in (0, first))
+        rotation, sampler_key = (dr.opaque(mi.UInt32, int(state[k])) for k, state in enumerate(states))
+        start = dr.opaque(mi.UInt32, first)
         index = dr.arange(mi.UInt32, pixels * count)
-        pixel = index // count
-        sample = mi.Float(index - pixel * count + dr.opaque(mi.UInt32, first))
-        u, v, w = (_fraction(sample * step + _hash(pixel, rotation_key, k)) for k, step in enumerate(_R3))
-        x, y = mi.Float(pixel % camera.width) + u, mi.Float(pixel // camera.width) + v
-        position = mi.Point2f(x / camera.width, y / camera.height)
-        ray, _ = self.sensor.sample_ray_differential(w * shutter.exposure_s, mi.Float(0), position, mi.Point2f(0.5))
-        ray.scale_differential(mi.Float(1.0 / np.sqrt(self._spp)))
-        radiance, _, _ = self._integrator.sample(self._scene, self._sampler, ray, None, mi.Bool(True))
-        sums = [dr.block_sum(channel, count) for channel in mi.unpolarized_spectrum(radiance)]
+        if isinstance(self._integrator, BakedIntegrator):
+            radiance, rest = self._integrator.matte(self._scene, mi.Ray3f(self._rays(index, count, start, rotation)))
+            dr.eval(radiance, rest)
+            index = dr.compress(rest)
+        else:
+            radiance = dr.zeros(mi.Color3f, pixels * count)
+        if dr.width(index) > 0:
+            self._sampler.seed(sampler_key, dr.width(index))
+            ray = self._rays(index, count, start, rotation)
+            ray.scale_differential(mi.Float(1.0 / np.sqrt(self._spp)))
+            traced, _, _ = self._integrator.sample(self._scene, self._sampler, ray, None, mi.Bool(True))
+            dr.scatter(radiance, mi.unpolarized_spectrum(traced), index)
+        sums = [dr.block_sum(channel, count) for channel in radiance]
         dr.eval(sums)
         return np.stack([np.asarray(s) for s in sums], axis=1)
+
+    def _rays(self, index: Any, count: int, start: Any, rotation: Any) -> Any:
+        """Camera rays of samples `index` of a launch: `count` neighbours share a pixel."""
+        camera = self.sensor.camera
+        pixel = index // count
+        sample = mi.Float(index - pixel * count + start)
+        u, v, w = (_fraction(sample * step + _hash(pixel, rotation, k)) for k, step in enumerate(_R3))
+        x, y = mi.Float(pixel % camera.width) + u, mi.Float(pixel // camera.width) + v
+        position = mi.Point2f(x / camera.width, y / camera.height)
+        time = w * self.sensor.shutter.exposure_s
+        return self.sensor.sample_ray_differential(time, mi.Float(0), position, mi.Point2f(0.5))[0]
 
 
 class DepthRenderer:

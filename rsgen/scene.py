@@ -105,6 +105,8 @@ def content_hash(path: Path) -> str:
 
 def _load_xml(mi: Any, path: Path, scratch: Path) -> Any:
     config = mi.parser.ParserConfig(mi.variant())
+    # Merging orders meshes by memory address: emitters and shapes would be numbered anew in each process.
+    config.merge_meshes = False
     state = mi.parser.parse_file(config, str(path.resolve()))
     for index, node in enumerate(state.nodes):
         if node.type != mi.ObjectType.Shape:
@@ -124,7 +126,7 @@ def _load_xml(mi: Any, path: Path, scratch: Path) -> Any:
 def _tessellated(mi: Any, props: Any, file: Path) -> Any:
     """Properties of a `ply` shape that stands for an analytic one: same id, BSDF and emitter, triangles in `file`."""
     to_world = (
-        np.asarray(props["to_world"].matrix, float).reshape(4, 4) if props.has_property("to_world") else np.eye(4)
+        np.asarray(props["to_world"].matrix, float).reshape(4, 4) if "to_world" in props else np.eye(4)
     )
     plugin = props.plugin_name()
     if plugin in ("sphere", "cylinder"):

@@ -1,7 +1,7 @@
 """Sequence folders: read one, strictly, and describe it; `SequenceWriter` and `stream_stamps` make one.
 
-    sequence = read_sequence(Path("out/lr_kt2"))
-    z, rows = sequence.depth(0), sequence.rows("depth")[0]     # metres (h, w); T_world_depth of each line (h, 7)
+sequence = read_sequence(Path("out/lr_kt2"))
+z, rows = sequence.depth(0), sequence.rows("depth")[0]     # metres (h, w); T_world_depth of each line (h, 7)
 """
 
 from __future__ import annotations

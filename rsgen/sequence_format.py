@@ -212,7 +212,8 @@ def line_poses(
 ) -> FloatArray:
     """Rows (frames, lines, 7) of T_world_cam at each line's mid-exposure; T_cam_body is the identity for depth.
 
-    Entry i is image row i (column i for the sideways scans), whatever the order of readout. Raises UserError if a line is read outside the spline's time.
+    Entry i is image row i (column i for the sideways scans), whatever the order of readout. Raises UserError if a
+    line is read outside the spline's time.
     """
     stamps = np.asarray(stamps, float)
     places = np.arange(shutter.line_count(camera), dtype=float)

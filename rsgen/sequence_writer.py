@@ -99,14 +99,16 @@ class SequenceWriter:
         text = _sequence_yaml(config, spline, streams, versions, inputs)
         _refuse_foreign_folder(out, text)
         try:
+            out.mkdir(parents=True, exist_ok=True)
+            # First of all, so that a run that ends here leaves either nothing or what it can be resumed from.
+            if not (out / "sequence.yaml").exists():
+                atomic_write(out / "sequence.yaml", encode_yaml(text))
             for folder in (*FOLDERS.values(), TRUTH_DEPTH):
                 (out / folder).mkdir(parents=True, exist_ok=True)
             for folder in ("", *FOLDERS.values(), "truth", TRUTH_DEPTH):
                 remove_stale_temporaries(out / folder)
         except OSError as error:
             raise write_error(out, error) from None
-        if not (out / "sequence.yaml").exists():
-            atomic_write(out / "sequence.yaml", encode_yaml(text))
         return cls(out, config, _stored_spline(out / "spline.npz", spline), **streams)
 
     def stamps(self, stream: StreamName) -> FloatArray:

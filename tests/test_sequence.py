@@ -342,11 +342,11 @@ def test_ground_truth_against_scipy(finished: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("scan", "lines", "line_of_row_0"), [("top-bottom", 48, 0), ("bottom-top", 48, 47), ("left-right", 64, None)]
+    ("scan", "lines", "first_read"),
+    [("top-bottom", 48, 0), ("bottom-top", 48, 47), ("left-right", 64, 0), ("right-left", 64, 63)],
 )
-def test_rows_are_each_lines_camera_at_mid_exposure(
-    tmp_path: Path, scan: str, lines: int, line_of_row_0: int | None
-) -> None:
+def test_rows_are_each_lines_camera_at_mid_exposure(tmp_path: Path, scan: str, lines: int, first_read: int) -> None:
+    """Entry i belongs to image row or column i, which is read |i - first_read| line delays after the stamp."""
     stream = {"scan": scan, "readout_s": 0.02, "exposure_s": 0.01}
     config = synthetic.make_config(color=stream, depth=stream | {"exposure_s": 0.004})
     writer = synthetic.open_writer(tmp_path / "seq", config, 2)
@@ -357,10 +357,10 @@ def test_rows_are_each_lines_camera_at_mid_exposure(
     for name, exposure, T_cam_body in (("color", 0.01, synthetic.T_COLOR_DEPTH), ("depth", 0.004, np.eye(4))):
         rows = sequence.rows(name)[0]  # type: ignore[arg-type]
         assert rows.shape == (lines, 7)
-        for line in (0, 1, lines // 2, lines - 1):
-            T_world_cam = spline.pose(line * 0.02 / lines - exposure / 2) @ np.linalg.inv(T_cam_body)
-            np.testing.assert_allclose(rows[line, :3], T_world_cam[:3, 3], atol=1e-12)
-            np.testing.assert_allclose(Rotation.from_quat(rows[line, 3:]).as_matrix(), T_world_cam[:3, :3], atol=1e-12)
+        for i in (0, 1, lines // 2, lines - 1):
+            T_world_cam = spline.pose(abs(i - first_read) * 0.02 / lines - exposure / 2) @ np.linalg.inv(T_cam_body)
+            np.testing.assert_allclose(rows[i, :3], T_world_cam[:3, 3], atol=1e-12)
+            np.testing.assert_allclose(Rotation.from_quat(rows[i, 3:]).as_matrix(), T_world_cam[:3, :3], atol=1e-12)
 
 
 def test_pose_rows_round_trip_without_sign_flips() -> None:

@@ -100,7 +100,7 @@ MATERIALS: dict[str, Material] = {
     "oak": Material(_wood(171, (0.76, 0.60, 0.42), (0.50, 0.34, 0.20), 22), (1024, 1024), (1.8, 0.9)),
     "walnut": Material(_wood(181, (0.50, 0.36, 0.26), (0.28, 0.19, 0.13), 20), (1024, 1024), (1.8, 0.9)),
     "lacquer": Material(_wood(191, (0.56, 0.40, 0.28), (0.33, 0.21, 0.14), 20), (1024, 1024), (1.8, 0.9), 0.18),
-    "picture": Material(lambda s: pictures.paintings(s, 201), (1024, 1792), alpha=0.2),
+    "picture": Material(lambda s: pictures.paintings(s, 201), (1024, 1792)),
     "book": Material(lambda s: pictures.books(s, 211), (512, 1536)),
     "pages": Material(_wood(221, (0.88, 0.84, 0.75), (0.74, 0.68, 0.57), 5), (256, 256), (0.25, 0.25)),
     "leaf": Material(lambda s: tx.leaf(s, 231), (256, 512)),
