@@ -43,11 +43,11 @@ make_venv() {
 
 setup() {
   local stamp=.venv/.installed-from want
-  want=$(cat pyproject.toml requirements.lock | sha256sum | cut -d' ' -f1)
+  want=$(cat pyproject.toml .ci/requirements.lock | sha256sum | cut -d' ' -f1)
   if [ ! -x .venv/bin/python ] || [ "$(cat "$stamp" 2>/dev/null)" != "$want" ]; then
     say "installing into .venv (once)"
     [ -x .venv/bin/python ] || make_venv
-    .venv/bin/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[test]'
+    .venv/bin/python -m pip install --quiet --disable-pip-version-check -c .ci/requirements.lock -e '.[test]'
     echo "$want" >"$stamp"
   fi
   if ! .venv/bin/python -m rsgen.backend >/dev/null 2>&1; then

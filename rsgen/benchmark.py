@@ -96,7 +96,8 @@ def time_modes(config: Config, frames: int, spp: int, progress: Progress) -> str
     pairs = [(b / a) for a, b in zip(seconds[still_name], seconds[moving_name], strict=True)]
     ratios = [
         f"rolling shutter + {1000 * _BLUR_S:g} ms blur against a still: {statistics.median(pairs):.2f}x the time",
-        f"baked against path tracing (depth {config.light.max_depth}): {median[path_name] / median[moving_name]:.1f}x faster",
+        f"baked against path tracing to depth {config.light.max_depth}: "
+        f"{median[path_name] / median[moving_name]:.1f}x faster",
     ]
     return _text(table) + "\n".join(ratios)
 

@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -178,8 +179,12 @@ def _add_overrides(command: argparse.ArgumentParser) -> None:
     for name, default, text in describe_fields():
         fields.add_argument(
             f"--{name}", dest="overrides", action="append", default=[], metavar="VALUE",
-            type=lambda value, name=name: (name, value), help=f"{text} (default: {default})".replace("%", "%%"),
+            type=partial(_pair, name), help=f"{text} (default: {default})".replace("%", "%%"),
         )  # fmt: skip
+
+
+def _pair(name: str, value: str) -> tuple[str, str]:
+    return name, value
 
 
 def _config(options: argparse.Namespace) -> Config:

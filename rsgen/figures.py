@@ -15,15 +15,19 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from rsgen.errors import UserError
 from rsgen.files import atomic_write
 
 _DPI = 130
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG and close it. Raises UserError if the file cannot be written."""
+    """Write a figure as its suffix says (.png, .jpg, .svg, .pdf) and close it. Raises UserError if that fails."""
+    kind = path.suffix.lower().removeprefix(".")
+    if kind not in figure.canvas.get_supported_filetypes():
+        raise UserError(f"{path}: pictures cannot be written as '{path.suffix}': choose .png, .jpg, .svg or .pdf")
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=_DPI)
+    figure.savefig(buffer, format=kind, dpi=_DPI)
     plt.close(figure)
     atomic_write(path, buffer.getvalue())
 
@@ -45,11 +49,10 @@ def comparison(
 
     seen = [np.where(z > 0, z, np.nan) for z in depth]
     low, high = np.nanpercentile(seen, [0.5, 99.5]) if np.isfinite(seen).any() else (0.0, 1.0)
-    shown = None
     for axis, z, name in zip(axes[1], seen, ("global shutter", "rolling shutter"), strict=False):
-        shown = axis.imshow(z, cmap="viridis", vmin=low, vmax=high)
+        axis.imshow(z, cmap="viridis", vmin=low, vmax=high)
         axis.set_title(f"depth, {name}")
-    figure.colorbar(shown, ax=axes[1, 1], label="planar depth, m", shrink=0.9)
+    figure.colorbar(axes[1, 1].images[0], ax=axes[1, 1], label="planar depth, m", shrink=0.9)
     difference = 1000 * (seen[1] - seen[0])
     finite = np.abs(difference[np.isfinite(difference)])
     # Depth edges jump by whole objects; the scale is set by surfaces.
@@ -69,11 +72,10 @@ def preview(color: list[NDArray[np.uint8]], depth: list[NDArray[np.float32]], ti
     figure, axes = plt.subplots(2, count, figsize=(3.9 * count + 0.9, 6.2), layout="constrained", squeeze=False)
     seen = [np.where(z > 0, z, np.nan) for z in depth]
     high = max(float(np.nanmax(z)) if np.isfinite(z).any() else 1.0 for z in seen)
-    shown = None
     for k in range(count):
         axes[0, k].imshow(color[k])
-        shown = axes[1, k].imshow(seen[k], cmap="viridis", vmin=0, vmax=high)
-    figure.colorbar(shown, ax=axes[1, -1], label="planar depth, m", shrink=0.9)
+        axes[1, k].imshow(seen[k], cmap="viridis", vmin=0, vmax=high)
+    figure.colorbar(axes[1, -1].images[0], ax=axes[1, -1], label="planar depth, m", shrink=0.9)
     for axis in axes.ravel():
         axis.set_xticks([])
         axis.set_yticks([])

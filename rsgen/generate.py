@@ -206,15 +206,20 @@ def engine_versions(config: Config) -> dict[str, str]:
 
 def input_hashes(config: Config) -> dict[str, str]:
     """Content hashes of the trajectory file and of the scene with all its files. Raises UserError."""
+    return {
+        "trajectory": hashlib.sha256(config.trajectory.file.read_bytes()).hexdigest(),
+        "scene": scene_hash(config),
+    }
+
+
+def scene_hash(config: Config) -> str:
+    """Content hash of the config's scene with all its files. Raises UserError."""
     from rsgen.backend import mitsuba
 
     mitsuba(config.backend)
     from rsgen.scene import content_hash
 
-    return {
-        "trajectory": hashlib.sha256(config.trajectory.file.read_bytes()).hexdigest(),
-        "scene": content_hash(config.scene.file),
-    }
+    return content_hash(config.scene.file)
 
 
 def parse_frames(text: str | None) -> slice:

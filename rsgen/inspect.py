@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_yaml, read_yaml
 from rsgen.progress import ProgressDisplay
 from rsgen.sequence import read_sequence
+
+log = logging.getLogger("rsgen")
 
 # What a sequence folder remembers of the machine that rendered it, for commands that render again. Not part of the
 # format: a sequence is whole without it.
@@ -51,7 +54,7 @@ def compare_frame(path: Path, frame: int, out: Path | None, scene: Path | None) 
     longer where it was. Raises UserError.
     """
     from rsgen.figures import comparison, save
-    from rsgen.generate import FrameSource
+    from rsgen.generate import FrameSource, scene_hash
 
     sequence = read_sequence(path)
     color, depth = (sequence.streams[name] for name in ("color", "depth"))
@@ -59,6 +62,8 @@ def compare_frame(path: Path, frame: int, out: Path | None, scene: Path | None) 
         if frame not in stream.indices:
             raise UserError(f"{path}: has no {stream.name} frame {frame}: choose one of {_span(stream.indices)}")
     config = _config_of(path, sequence.meta, scene)
+    if scene_hash(config) != _mapping(sequence.meta.get("inputs")).get("scene"):
+        log.warning("%s: the scene %s has changed since, so more than the shutter differs", path, config.scene.file)
     with ProgressDisplay() as progress:
         source = FrameSource(config, progress, global_shutter=True)
     at = {stream.name: int(np.flatnonzero(stream.indices == frame)[0]) for stream in (color, depth)}
@@ -77,13 +82,18 @@ def compare_frame(path: Path, frame: int, out: Path | None, scene: Path | None) 
 def _config_of(path: Path, meta: dict[str, Any], scene: Path | None) -> Config:
     """The config that a sequence records, with its scene found on this machine."""
     origin = read_yaml(path / ORIGIN) if (path / ORIGIN).is_file() else {}
-    recorded = dict(meta.get("config") or {})
+    recorded = _mapping(meta.get("config"))
     file = scene or Path(str(origin.get("scene", "")))
     if not file.is_file():
         raise UserError(f"{path}: its scene '{file}' is not on this machine: name it with --scene")
     recorded["scene"] = {"file": str(file.resolve())}
-    recorded["trajectory"] = dict(recorded.get("trajectory") or {}, file=str(origin.get("trajectory", "unused")))
+    recorded["trajectory"] = _mapping(recorded.get("trajectory")) | {"file": str(origin.get("trajectory", "unused"))}
     return validate_config(recorded, f"{path}/sequence.yaml: config")
+
+
+def _mapping(value: Any) -> dict[str, Any]:
+    """A copy of a YAML mapping; empty for anything else, which is for the validation to complain about."""
+    return dict(value) if isinstance(value, dict) else {}
 
 
 def _span(indices: Any) -> str:

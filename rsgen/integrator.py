@@ -18,8 +18,8 @@ _MOST_LIGHTS = 16  # light samples at a glossy hit
 class BakedIntegrator(mi.SamplingIntegrator):
     """Radiance from baked irradiance: emission + diffuse lobe x E, and traced bounces for all other lobes.
 
-    The diffuse lobe of a plastic is weighted with one cosine-distributed direction, which is nearly free of noise. Glossy
-    and specular lobes are sampled and traced onto the baked surfaces, up to `bounces` times in a row.
+    The diffuse lobe of a plastic is weighted with one cosine-distributed direction, which is nearly free of noise.
+    Glossy and specular lobes are sampled and traced onto the baked surfaces, up to `bounces` times in a row.
     """
 
     def __init__(self, field: IrradianceField, bounces: int = 4) -> None:

@@ -101,7 +101,7 @@ class IrradianceField:
         self.face_count = face_count
 
     def lookup(self, pi: Any, si: Any, wi_world: Any, active: Any = True) -> Any:
-        """Irradiance (Color3f, W/m² in scene units) at hits `pi`/`si`, on the side that `wi_world` (towards the viewer) lies on."""
+        """Irradiance (Color3f, scene units) at hits `pi`/`si`, on the side where `wi_world`, towards the viewer, is."""
         shape = dr.reinterpret_array(mi.UInt32, si.shape)
         first_face = dr.gather(mi.Int32, self.shape_first, shape, active & si.is_valid())
         active = active & si.is_valid() & (first_face >= 0)

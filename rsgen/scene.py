@@ -85,7 +85,10 @@ def mesh_arrays(shape: Any) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
 
 
 def content_hash(path: Path) -> str:
-    """SHA-256 over the scene file and every file that stands in its folder tree's scene (meshes, textures)."""
+    """SHA-256 over the scene file and every file that it includes or names (meshes, textures).
+
+    Raises UserError if one is missing or the scene file is malformed.
+    """
     ensure_built(path)
     digest = hashlib.sha256(path.read_bytes())
     if path.suffix.lower() == ".xml":
@@ -94,6 +97,8 @@ def content_hash(path: Path) -> str:
             state = mi.parser.parse_file(mi.parser.ParserConfig(mi.variant()), str(path))
         except Exception as error:
             raise UserError(f"scene {path}: {_first_line(error)}") from None
+        for included in state.files[1:]:
+            digest.update(hashlib.sha256(Path(str(included)).read_bytes()).digest())
         names = {str(n.props["filename"]) for n in state.nodes if "filename" in n.props.keys()}  # noqa: SIM118
         for name in sorted(names):
             file = path.parent / name
@@ -125,9 +130,7 @@ def _load_xml(mi: Any, path: Path, scratch: Path) -> Any:
 
 def _tessellated(mi: Any, props: Any, file: Path) -> Any:
     """Properties of a `ply` shape that stands for an analytic one: same id, BSDF and emitter, triangles in `file`."""
-    to_world = (
-        np.asarray(props["to_world"].matrix, float).reshape(4, 4) if "to_world" in props else np.eye(4)
-    )
+    to_world = np.asarray(props["to_world"].matrix, float).reshape(4, 4) if "to_world" in props else np.eye(4)
     plugin = props.plugin_name()
     if plugin in ("sphere", "cylinder"):
         radius = float(props.get("radius", 1.0))
@@ -149,9 +152,12 @@ def _tessellated(mi: Any, props: Any, file: Path) -> Any:
     }
     position, normal, uv, faces = _parametric(plugin, *uv_grid[plugin])
     normal_matrix = np.linalg.inv(to_world[:3, :3]).T
-    flip = -1.0 if bool(props.get("flip_normals", False)) else 1.0
+    mirrored = np.linalg.det(to_world[:3, :3]) < 0
+    # As Mitsuba does: mirroring turns its spheres inside out, the other shapes not.
+    turned = bool(props.get("flip_normals", False)) != (mirrored and plugin == "sphere")
+    flip = -1.0 if turned else 1.0
     normal = flip * normal @ normal_matrix.T
-    if (np.linalg.det(to_world[:3, :3]) < 0) != (flip < 0):
+    if mirrored != turned:
         faces = faces[:, ::-1]
     file.write_bytes(ply_bytes(position @ to_world[:3, :3].T + to_world[:3, 3], faces, normal, uv))
     out = mi.Properties("ply")
@@ -165,8 +171,8 @@ def _tessellated(mi: Any, props: Any, file: Path) -> Any:
 
 def _parametric(plugin: str, nu: int, nv: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Vertices, unit normals, texture coordinates and faces of Mitsuba's unit shapes on a (nu + 1) x (nv + 1) grid."""
-    a, b = np.meshgrid(np.linspace(0, 1, nu + 1), np.linspace(0, 1, nv + 1), indexing="ij")
-    a, b = a.ravel(), b.ravel()
+    grid = np.meshgrid(np.linspace(0, 1, nu + 1), np.linspace(0, 1, nv + 1), indexing="ij")
+    a, b = (axis.ravel() for axis in grid)
     phi = 2 * np.pi * b
     zero, one = np.zeros_like(a), np.ones_like(a)
     if plugin == "rectangle":
@@ -202,15 +208,14 @@ def _parametric(plugin: str, nu: int, nv: int) -> tuple[NDArray, NDArray, NDArra
 
 def ply_bytes(vertices: NDArray, faces: NDArray, normals: NDArray | None = None, uv: NDArray | None = None) -> bytes:
     """Binary PLY of triangles: vertices (n, 3), faces (m, 3), unit normals (n, 3) and texture coordinates (n, 2)."""
-    columns = [("x", "y", "z")]
+    names = ["x", "y", "z"]
     parts = [vertices]
     if normals is not None:
-        columns.append(("nx", "ny", "nz"))
+        names += ["nx", "ny", "nz"]
         parts.append(normals / np.linalg.norm(normals, axis=-1, keepdims=True))
     if uv is not None:
-        columns.append(("u", "v"))
+        names += ["u", "v"]
         parts.append(uv)
-    names = [name for group in columns for name in group]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
     header += [f"property float {name}" for name in names]
     header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]

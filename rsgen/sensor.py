@@ -22,6 +22,7 @@ still costs.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -31,7 +32,7 @@ from numpy.typing import NDArray
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 
-PoseFunction = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+PoseFunction = Callable[[Any], NDArray[np.float64]]
 
 # Newton steps for inverting the distortion on the device: quadratic convergence reaches float32's end in fewer.
 _UNDISTORT_STEPS = 8
@@ -74,7 +75,7 @@ class RollingShutterSensor(mi.Sensor):
         lines = self.shutter.line_count(self.camera)
         self._steps = 4 * lines
         self._step_s = span / self._steps if span > 0 else 1.0
-        grid = stamp - exposure + self._step_s * np.arange(self._steps + 1) * (span > 0)
+        grid = stamp - exposure + self._step_s * np.arange(self._steps + 1, dtype=np.float64) * (span > 0)
         T = T_world_cam(grid if span > 0 else grid[:1])
         T = np.broadcast_to(np.asarray(T, np.float64), (len(grid), 4, 4))
         self._table = mi.Float(np.ascontiguousarray(T[:, :3, :], dtype=np.float32).ravel())

@@ -246,3 +246,35 @@ def test_relative_config_paths_work(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.chdir(tmp_path)
     assert load_config(Path("config.yaml")).scene.file == Path("s.xml")
     assert os.fspath(load_config(Path("config.yaml")).trajectory.file) == "t.txt"
+
+
+# --- every pixel needs a ray ------------------------------------------------------------------------------------------
+
+SEEN = [
+    {"model": "radtan", "distortion": [-0.28, 0.074, 0.0002, 0.00002]},  # EuRoC's cameras
+    {"model": "fisheye", "distortion": [0.0035, 0.0007, -0.002, 0.0002]},  # TUM-VI's, its corners cropped
+    {"model": "radtan", "distortion": [0.3, 0.1, 0.0, 0.0, 0.01]},
+    {"model": "pinhole", "intrinsics": [5.0, 5.0, 319.5, 239.5]},
+]
+UNSEEN = [
+    ({"model": "radtan", "distortion": [-0.5, 0.0, 0.0, 0.0]}, "(-0.5, -0.5)"),  # folds back inside the image
+    ({"model": "fisheye", "distortion": [0.0] * 4, "intrinsics": [190.0, 190.0, 319.5, 239.5]}, "(-0.5, -0.5)"),
+    # Only one corner's outermost edge, 799.3 px from the centre, is beyond 90 degrees: f pi / 2 = 799.0 px.
+    ({"model": "fisheye", "distortion": [0.0] * 4, "intrinsics": [508.66, 508.66, 0.0, 479.0]}, "(639.5, -0.5)"),
+    # The image lies aside from the axis altogether.
+    ({"model": "fisheye", "distortion": [0.0] * 4, "intrinsics": [400.0, 400.0, -900.0, 239.5]}, "(-0.5, -0.5)"),
+]
+
+
+@pytest.mark.parametrize("stream", ["color", "depth"])
+@pytest.mark.parametrize("fields", SEEN)
+def test_usual_distortions_are_accepted(tmp_path: Path, stream: str, fields: dict[str, Any]) -> None:
+    assert getattr(load(tmp_path, MINIMAL | {stream: fields}), stream).model == fields["model"]
+
+
+@pytest.mark.parametrize("stream", ["color", "depth"])
+@pytest.mark.parametrize(("fields", "pixel"), UNSEEN)
+def test_a_pixel_that_no_ray_reaches_is_refused(
+    tmp_path: Path, stream: str, fields: dict[str, Any], pixel: str
+) -> None:
+    refused(tmp_path, MINIMAL | {stream: fields}, f"{stream}: distortion: no ray reaches pixel {pixel}")

@@ -98,6 +98,18 @@ def test_compare_needs_no_origin_if_the_scene_is_named(folder: Path, whole: Path
         (whole / "origin.yaml").write_bytes(origin)
 
 
+def test_compare_says_if_the_scene_has_changed(
+    folder: Path, whole: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    words = ["compare", str(whole), "--frame", "0", "--out", str(tmp_path / "c.png"), "--scene"]
+    with caplog.at_level(logging.WARNING, "rsgen"):
+        assert main([*words, str(folder / "scene.xml")]) == 0 and not caplog.messages
+        other = tiny.write_scene(tmp_path / "other")
+        other.write_text(other.read_text().replace("0.7, 0.3, 0.2", "0.1, 0.1, 0.9"))
+        assert main([*words, str(other)]) == 0
+    assert len(caplog.messages) == 1 and "has changed" in caplog.messages[0]
+
+
 def test_overrides_reach_the_sequence(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "here").mkdir()
     tiny.write_trajectory(tmp_path / "here/other.txt", 4)
@@ -357,3 +369,20 @@ def test_frames_are_parsed(text: str | None, expected: range) -> None:
 def test_nonsense_frames_are_refused(text: str) -> None:
     with pytest.raises(UserError, match="--frames"):
         parse_frames(text)
+
+
+# --- pictures --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shapes", [((30, 40), (30, 40)), ((30, 40), (24, 20)), ((40, 10), (10, 40))])
+@pytest.mark.parametrize("distance", [0.0, 2.0])
+def test_pictures_bear_any_sizes_and_views_of_nothing(
+    tmp_path: Path, shapes: tuple[tuple[int, int], tuple[int, int]], distance: float
+) -> None:
+    from rsgen import figures
+
+    color = [np.full((*shapes[0], 3), 90, np.uint8)] * 2
+    depth = [np.full(shapes[1], distance, np.float32)] * 2
+    figures.save(figures.preview(color, depth, "preview"), tmp_path / "p.png")
+    figures.save(figures.comparison((color[0], color[1]), (depth[0], depth[1]), "comparison"), tmp_path / "c.png")
+    assert all(cv2.imread(str(tmp_path / name)).std() > 10 for name in ("p.png", "c.png"))

@@ -196,7 +196,10 @@ DAMAGE: dict[str, tuple[Callable[[Path], Any], set[str]]] = {
     ),
     "color readout misstated": (lambda r: edit_yaml(r, "color", readout_s=0.0279), {"description", "rows color"}),
     "exposure misstated": (lambda r: edit_yaml(r, "color", exposure_s=0.001), {"description", "rows color"}),
-    "scan misstated": (lambda r: edit_yaml(r, "depth", scan="bottom-top"), {"description", "rows depth", "reprojection"}),
+    "scan misstated": (
+        lambda r: edit_yaml(r, "depth", scan="bottom-top"),
+        {"description", "rows depth", "reprojection"},
+    ),
     "intrinsics misstated": (
         lambda r: edit_yaml(r, "depth", intrinsics=[46.0, 46.0, 31.5, 23.5]),
         {"description", "scene", "reprojection"},

@@ -158,6 +158,8 @@ class Spline:
         try:
             with np.load(path, allow_pickle=False) as data:
                 return cls(data["control_points"], float(data["t0"]), float(data["dt"]))
+        except UserError as error:
+            raise UserError(f"{path}: {error}") from None
         except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise UserError(f"{path}: not a readable spline ({reason}); write it anew with rsgen") from error

@@ -1,0 +1,108 @@
+"""The directions of imports, as the design document draws them, and what every file has to begin with."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rsgen.config import load_config
+from rsgen.trajectory import read_trajectory
+
+ROOT = Path(__file__).parents[1]
+SOURCES = sorted((ROOT / "rsgen").rglob("*.py"))
+ENGINES = ("mitsuba", "drjit")
+CONFIGS = sorted((ROOT / "configs").glob("*.yaml"))
+
+
+def name(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def imports(path: Path) -> Iterator[str]:
+    """Full names of all modules that a file imports, anywhere in it."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            assert node.module is not None
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def test_there_is_something_to_check() -> None:
+    assert len(SOURCES) > 20 and ROOT / "rsgen/geometry/so3.py" in SOURCES and len(CONFIGS) >= 5
+
+
+@pytest.mark.parametrize(
+    "module",
+    [
+        "rsgen.geometry.so3", "rsgen.geometry.se3", "rsgen.geometry.spline", "rsgen.geometry.camera",
+        "rsgen.geometry.shutter", "rsgen.sequence", "rsgen.verify", "rsgen.config", "rsgen.trajectory", "rsgen.fit",
+        "rsgen.fit_report", "rsgen.backend", "rsgen.generate", "rsgen.inspect", "rsgen.cli",
+    ],
+)  # fmt: skip
+def test_no_engine_is_loaded_where_nothing_is_rendered(module: str) -> None:
+    code = f"import sys, {module}; print(*({set(ENGINES)!r} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == ""
+
+
+def test_help_and_info_load_no_engine() -> None:
+    code = (
+        "import sys\nfrom rsgen.cli import main\nfor words in (['render', '--help'], ['info', 'nowhere']):\n"
+        "    try:\n        main(words)\n    except SystemExit:\n        pass\n"
+        f"sys.exit(bool({set(ENGINES)!r} & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True).returncode == 0
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "rsgen/geometry").glob("*.py")), ids=name)
+def test_geometry_imports_numpy_and_scipy_only(path: Path) -> None:
+    allowed = ("numpy", "scipy", "rsgen.errors", "rsgen.geometry")
+    for module in imports(path):
+        known = module.split(".")[0] in sys.stdlib_module_names or module == "rsgen"
+        assert known or any(module == a or module.startswith(f"{a}.") for a in allowed), module
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=name)
+def test_nothing_in_rsgen_imports_rstrack(path: Path) -> None:
+    assert not any(module.split(".")[0] in ("rstrack", "tests", "scenes") for module in imports(path))
+
+
+@pytest.mark.parametrize(
+    "path", sorted({*SOURCES, *(ROOT / "tests").glob("*.py"), *(ROOT / "scenes").rglob("*.py")}), ids=name
+)
+def test_every_file_says_what_it_is_for(path: Path) -> None:
+    text = ast.get_docstring(ast.parse(path.read_text()))
+    assert text is not None and len(text.splitlines()[0]) > 15
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=name)
+def test_every_public_function_and_class_is_documented(path: Path) -> None:
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+            assert ast.get_docstring(node), f"{name(path)}: {node.name}"
+
+
+def test_no_path_of_one_machine_is_in_the_project() -> None:
+    here = [*SOURCES, *CONFIGS, *(ROOT / "scenes").rglob("*.py"), *(ROOT / "tests").glob("*.py"), ROOT / "run.sh"]
+    forbidden = tuple(f"/{folder}/" for folder in ("work", "root", "home"))
+    for path in here:
+        found = [line for line in path.read_text().splitlines() if any(part in line for part in forbidden)]
+        assert not found, f"{name(path)}: {found[0]}"
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=name)
+def test_every_config_is_valid(path: Path) -> None:
+    config = load_config(path)
+    assert config.name == path.stem
+    assert config.scene.file.resolve().is_relative_to(ROOT)
+    if not path.stem.startswith("lr_kt"):  # ICL-NUIM's trajectories are not part of the project
+        assert len(read_trajectory(config.trajectory.file, format=config.trajectory.format)) > 10
