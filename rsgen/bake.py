@@ -42,6 +42,9 @@ _BOUNCE_RAYS = 32
 _CHUNK = 1 << 18
 _MANY_EMITTERS = 24
 _SMALL_EMITTER_M = 0.3
+# Light sampling is trusted this much more than hemisphere rays; only where an emitter all but touches a surface, and
+# its samples' 1/d² explodes, do the rays take over.
+_LIGHT_TRUST = 64.0
 
 
 def bake(scene: Any, lattice: Lattice, light: LightConfig, progress: Progress) -> tuple[NDArray, NDArray]:
@@ -164,15 +167,25 @@ def _from_emitter(scene, emitter, p, n, number, samples, dimension):
         # Short of the emitter itself, whose surface would shadow its own sample.
         shadow = mi.Ray3f(p, ds.d, ds.dist * (1 - 1e-4) - 1e-5, 0.0, mi.Color0f())
         lit &= ~scene.ray_test(shadow, active=lit)
-        total += dr.select(lit, value * cosine, 0)
+        total += dr.select(lit, value * cosine * dr.select(ds.delta, 1, _light_share(ds.pdf, cosine)), 0)
         i += 1
     return total / mi.Float(count)
+
+
+def _light_share(light_pdf: Any, cosine: Any) -> Any:
+    """The light samples' part in the balance heuristic (Veach and Guibas 1995) with cosine-distributed rays."""
+    # Written so that a grazing emitter's infinite density gives 1, and 0 / 0 does not occur.
+    trusted = dr.maximum(_LIGHT_TRUST * light_pdf, 1e-20)
+    return dr.rcp(1 + dr.maximum(cosine, 0) * dr.inv_pi / trusted)
 
 
 def _gather(
     scene: Any, field: IrradianceField, points: Points, which: NDArray, rays: int, report: Callable[[float], None]
 ) -> NDArray:
-    """Irradiance (len(which), 3) that arrives from other surfaces, each lit as `field` says."""
+    """Irradiance (len(which), 3) that arrives from other surfaces, each lit as `field` says.
+
+    Holds also the small part of emitters' own light that `_direct` leaves out (see `_light_share`).
+    """
     out = np.zeros((len(which), 3), np.float32)
     for begin, part, p, n, number in _chunks(points, which, report):
         out[begin : begin + len(part)] = np.array(_gather_at(scene, field, p, n, number, rays)).reshape(3, -1).T
@@ -186,6 +199,10 @@ def _gather_at(scene, field, p, n, number, rays):
     lobe = _rotation(number, 103)
     count = dr.opaque(mi.UInt32, rays)
     context = mi.BSDFContext()
+    it = dr.zeros(mi.Interaction3f, dr.width(p))
+    it.p = p
+    it.n = mi.Normal3f(n)
+    many = len(scene.emitters()) > _MANY_EMITTERS
     total = mi.Color3f(0)
     i = mi.UInt32(0)
     while i < count:
@@ -195,10 +212,19 @@ def _gather_at(scene, field, p, n, number, rays):
         pi = scene.ray_intersect_preliminary(ray, coherent=False)
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
         hit = si.is_valid()
-        # The sampled weight's mean is the albedo, exactly and without noise for Lambert's law.
+        emitter = si.emitter(scene)
+        lamp = emitter != dr.zeros(mi.EmitterPtr)
+        towards = mi.DirectionSample3f(scene, si, it)
+        if dr.hint(many, mode="scalar"):
+            light_pdf = scene.pdf_emitter_direction(it, towards, lamp)
+        else:
+            light_pdf = emitter.pdf_direction(it, towards, lamp)
+        # With pdf cosθ/π, ∫ L cosθ dω is the mean of πL, and of ρE where Lambert's surface sends L = ρE/π.
+        left_out = 1 - _light_share(light_pdf, dr.dot(n, d))
+        total += dr.select(lamp, dr.pi * emitter.eval(si, lamp) * left_out, 0)
+        # The sampled weight's mean is the albedo ρ, exactly and without noise for Lambert's law.
         pick = lobe + mi.Float(i) * 0.6180339887498949
         _, albedo = si.bsdf(ray).sample(context, si, pick - dr.floor(pick), mi.Point2f(u.y, u.x), hit)
         total += dr.select(hit, albedo * field.lookup(pi, si, -d, hit), 0)
         i += 1
-    # ∫ E ρ/π cosθ dω with pdf cosθ/π: the mean of ρ E.
     return total / mi.Float(count)

@@ -251,8 +251,9 @@ def _check_light(options: argparse.Namespace) -> int:
 
     config = _config(options)
     with ProgressDisplay() as progress:
-        print(check_light(config, options.views, options.spp, options.width, options.out, progress))
-    return 0
+        report, ok = check_light(config, options.views, options.spp, options.width, options.out, progress)
+    print(report)
+    return 0 if ok else 1
 
 
 def _bench(options: argparse.Namespace) -> int:

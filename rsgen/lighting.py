@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import logging
@@ -86,4 +87,5 @@ def _store(path: Path, front: NDArray, back: NDArray) -> None:
         temporary.replace(path)
     except OSError as error:
         log.warning("light cache %s cannot be written (%s): it will be baked again next time", path, error.strerror)
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)

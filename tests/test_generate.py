@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import logging
 import os
 import signal
@@ -239,12 +240,17 @@ def test_seeds_and_frames_have_noise_of_their_own(config: Path, whole: Path) -> 
 
 
 def resident_pages() -> int:
+    """Pages in memory, after what has been freed is given back: else a leak hides in what baking left behind."""
+    ctypes.CDLL(None).malloc_trim(0)
     return int(Path("/proc/self/statm").read_text().split()[1])
 
 
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="resident memory is read from /proc")
+@pytest.mark.skipif(
+    not (Path("/proc/self/statm").exists() and hasattr(ctypes.CDLL(None), "malloc_trim")),
+    reason="resident memory is read from /proc, with glibc",
+)
 def test_memory_stays_flat(config: Path, tmp_path: Path) -> None:
-    """150 frames of both streams, all written: keeping the pictures alone (0.05 MB a frame) would take 7 MB."""
+    """150 frames of both streams, all written: keeping linear colour and depth (28 kB a frame) would take 4 MB."""
     trajectory = tiny.write_trajectory(tmp_path / "long.txt", 180)
     pages = []
     render_sequence(
@@ -253,7 +259,7 @@ def test_memory_stays_flat(config: Path, tmp_path: Path) -> None:
     )  # fmt: skip
     assert len(pages) == 360
     growth = (max(pages[-20:]) - max(pages[40:60])) * os.sysconf("SC_PAGESIZE")
-    assert growth < 2e6, f"{growth / 1e6:.1f} MB in 150 frames"
+    assert growth < 1.5e6, f"{growth / 1e6:.1f} MB in 150 frames"
 
 
 T_COLOR_DEPTH = [[0.9998, 0.0, -0.02, -0.05], [0.0, 1.0, 0.0, 0.01], [0.02, 0.0, 0.9998, 0.002], [0.0, 0.0, 0.0, 1.0]]

@@ -189,7 +189,9 @@ def test_baked_light_agrees_with_the_path_tracer(tmp_path: Path) -> None:
     T_world_cam[:3, 3] = 0, 0, -3.2
     view = constant_twist(np.zeros(6), T_world_cam)
     camera = Camera(64, 64, 70, 70, 31.5, 31.5)
-    baked = ColorRenderer(scene, BakedIntegrator(field), camera, Shutter(), 64).render(view, 0.0, 1)
+    renderer = ColorRenderer(scene, BakedIntegrator(field), camera, Shutter(), 64)
+    baked = renderer.render(view, 0.0, 1)
+    np.testing.assert_array_equal(renderer.render(view, 0.0, 1), baked)
     path = mi.load_dict({"type": "path", "max_depth": 12})
     traced = ColorRenderer(scene, path, camera, Shutter(), 2048).render(view, 0.0, 2)
     a, b = to_srgb8(baked).astype(float), to_srgb8(traced).astype(float)
