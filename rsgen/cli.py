@@ -131,6 +131,9 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     verify.add_argument("sequence", type=Path, help="folder that 'rsgen render' wrote")
     verify.add_argument("--pairs", type=_count, default=20, help="neighbouring frames to reproject (default: 20)")
+    verify.add_argument(
+        "--raycast", type=_count, default=0, metavar="N", help="cast N frames again with another ray caster (embreex)"
+    )
 
     compare = add(
         "compare", _compare, "picture of one frame: global shutter, rolling shutter and their difference",
@@ -226,7 +229,7 @@ def _info(options: argparse.Namespace) -> int:
 def _verify(options: argparse.Namespace) -> int:
     from rsgen.verify import verify_sequence
 
-    report = verify_sequence(options.sequence, pairs=options.pairs)
+    report = verify_sequence(options.sequence, pairs=options.pairs, raycast=options.raycast)
     print(report.text())
     return 0 if report.ok else 1
 

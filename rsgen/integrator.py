@@ -19,7 +19,7 @@ class BakedIntegrator(mi.SamplingIntegrator):
     """Radiance from baked irradiance: emission + diffuse lobe x E, and traced bounces for all other lobes.
 
     The diffuse lobe of a plastic is weighted with one cosine-distributed direction, which is nearly free of noise.
-    Glossy and specular lobes are sampled and traced onto the baked surfaces, up to `bounces` times in a row.
+    Glossy lobes are sampled and traced onto the baked surfaces, behind up to `bounces` mirrors.
     """
 
     def __init__(self, field: IrradianceField, bounces: int = 4) -> None:
@@ -53,9 +53,11 @@ class BakedIntegrator(mi.SamplingIntegrator):
 def trace_baked(scene, field, sampler, ray, bounces, active):
     """Radiance (Color3f) along `ray` and whether it hit a surface; see `BakedIntegrator`.
 
-    At the first hit, emitters seen in a glossy lobe are found by sampling each of them and the lobe, with the balance
-    heuristic (Veach and Guibas 1995): small bright lamps would otherwise leave sparkles.
+    A path follows mirrors and glass, then at most one glossy bounce, and ends at the next surface, where all of the
+    BSDF counts as diffuse. Emitters seen in a glossy lobe are found by sampling each of them and the lobe, with the
+    balance heuristic (Veach and Guibas 1995): small bright lamps would otherwise leave sparkles.
     """
+    everything = mi.BSDFContext()
     diffuse = mi.BSDFContext()
     diffuse.type_mask = _DIFFUSE
     specular = mi.BSDFContext()
@@ -66,16 +68,17 @@ def trace_baked(scene, field, sampler, ray, bounces, active):
     throughput = mi.Color3f(1)
     depth = mi.UInt32(0)
     valid = mi.Bool(False)
-    first = dr.zeros(mi.Interaction3f, dr.width(ray.o))
-    lobe_pdf = mi.Float(0)  # of the direction that was sampled at the first hit; 0: nothing to weigh against
+    last = mi.Bool(False)  # the path has had its glossy bounce
+    glossy_hit = dr.zeros(mi.Interaction3f, dr.width(ray.o))
+    lobe_pdf = mi.Float(1)  # of the direction sampled there
     while active:
         pi = scene.ray_intersect_preliminary(ray, coherent=depth == 0, active=active)
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
         emitter = si.emitter(scene, active)
         found = active & (emitter != dr.zeros(mi.EmitterPtr))
-        weighed = found & (depth == 1) & (lobe_pdf > 0)
-        light_pdf = scene.pdf_emitter_direction(first, mi.DirectionSample3f(scene, si, first), weighed)
-        share = dr.select(weighed, lobe_pdf / (lobe_pdf + lights * light_pdf), 1)
+        towards = mi.DirectionSample3f(scene, si, glossy_hit)
+        light_pdf = scene.pdf_emitter_direction(glossy_hit, towards, found & last)
+        share = dr.select(last, lobe_pdf / (lobe_pdf + lights * light_pdf), 1)
         radiance[found] += throughput * share * emitter.eval(si, found)
         active &= si.is_valid()
         valid |= active
@@ -83,11 +86,13 @@ def trace_baked(scene, field, sampler, ray, bounces, active):
         bsdf = si.bsdf(ray)
         wo = mi.warp.square_to_cosine_hemisphere(sampler.next_2d(active))
         wo.z *= dr.sign(si.wi.z)
-        lobe = bsdf.eval(diffuse, si, wo, active) / dr.maximum(dr.abs(wo.z), 1e-6)
-        radiance[active] += throughput * lobe * field.lookup(pi, si, -ray.d, active)
+        lobe = bsdf.eval(diffuse, si, wo, active & ~last) / dr.maximum(dr.abs(wo.z), 1e-6)
+        _, albedo = bsdf.sample(everything, si, sampler.next_1d(active), sampler.next_2d(active), active & last)
+        irradiance = field.lookup(pi, si, -ray.d, active)
+        radiance[active] += throughput * irradiance * dr.select(last, albedo * dr.inv_pi, lobe)
 
-        active &= ((bsdf.flags() & _SPECULAR) != 0) & (depth < bounces)
-        smooth = active & (depth == 0) & ((bsdf.flags() & _GLOSSY) != 0)
+        active &= ((bsdf.flags() & _SPECULAR) != 0) & ~last & (depth < bounces)
+        smooth = active & ((bsdf.flags() & _GLOSSY) != 0)
         light = mi.UInt32(0)
         while smooth & (light < lights):
             u = sampler.next_2d(smooth)
@@ -101,8 +106,9 @@ def trace_baked(scene, field, sampler, ray, bounces, active):
 
         bs, weight = bsdf.sample(specular, si, sampler.next_1d(active), sampler.next_2d(active), active)
         throughput *= weight
-        lobe_pdf = dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), 0, bs.pdf)
-        first = mi.Interaction3f(si)
+        last = (bs.sampled_type & _GLOSSY) != 0
+        lobe_pdf = bs.pdf
+        glossy_hit = mi.Interaction3f(si)
         ray = si.spawn_ray(si.to_world(bs.wo))
         active &= dr.max(throughput) > 0
         depth += 1

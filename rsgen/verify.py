@@ -76,8 +76,10 @@ class VerifyReport:
         return "\n".join([*lines, f"{self.path}: {verdict}"])
 
 
-def verify_sequence(path: Path, pairs: int = 20) -> VerifyReport:
+def verify_sequence(path: Path, pairs: int = 20, raycast: int = 0) -> VerifyReport:
     """Check the sequence at `path`, reprojecting depth between `pairs` pairs of neighbouring frames spread over it.
+
+    `raycast` frames are cast again, every pixel, with another ray caster (needs embreex).
 
     Faults in the data are failed checks, never exceptions.
     """
@@ -96,6 +98,8 @@ def verify_sequence(path: Path, pairs: int = 20) -> VerifyReport:
         ("scene", partial(_check_scene, sequence)),
         ("reprojection", partial(_check_reprojection, sequence, pairs)),
     ]
+    if raycast:
+        checks.append(("ray casting", partial(_check_raycast, sequence, raycast)))
     return VerifyReport(path, tuple(_run(name, check) for name, check in checks))
 
 
@@ -315,3 +319,10 @@ def _check_reprojection(sequence: Sequence, pairs: int) -> tuple[bool, str]:
         f"{np.quantile(size, 0.95) * 1e3:.4f} mm, {(size <= INLIER_M).mean():.2%} within {INLIER_M * 1e3:g} mm; "
         f"worst {worst[1]}"
     )
+
+
+def _check_raycast(sequence: Sequence, count: int) -> tuple[bool, str]:
+    from rsgen.raycast import raycast_sequence
+
+    report = raycast_sequence(sequence, count)
+    return report.ok, report.text()
