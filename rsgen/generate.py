@@ -83,7 +83,7 @@ def load_scene(config: Config) -> Any:
 
 
 class FrameSource:
-    """Frames of a config's two streams, rendered on demand; `shutter` None keeps the config's own."""
+    """Frames of a config's two streams, rendered on demand; with `global_shutter` all lines at once."""
 
     def __init__(
         self,

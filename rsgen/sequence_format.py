@@ -86,6 +86,7 @@ class SequenceYaml(_Yaml):
     streams: _Streams
     T_color_depth: tuple[Vector4, Vector4, Vector4, Vector4]
     noise: Any = None
+    fingerprint: str  # the file's last entry: one that was cut off has none
 
 
 class Clock(Protocol):
