@@ -210,12 +210,12 @@ def _render(options: argparse.Namespace) -> int:
 
 
 def _fit(options: argparse.Namespace) -> int:
-    from rsgen.fit_report import fit_dict, fit_report
+    from rsgen.fit_report import make_fit_report, plot_fit, report_dict, report_text
 
-    if options.json:
-        print(json.dumps(fit_dict(options.file, options.dt, options.smoothing, options.format), indent=2))
-    else:
-        print(fit_report(options.file, options.dt, options.smoothing, options.format, plot=options.plot))
+    report = make_fit_report(options.file, options.dt, options.smoothing, options.format)
+    if options.plot is not None:
+        plot_fit(report, options.plot)
+    print(json.dumps(report_dict(report), indent=2) if options.json else report_text(report))
     return 0
 
 

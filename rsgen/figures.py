@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from rsgen.errors import UserError
-from rsgen.files import atomic_write
+from rsgen.files import atomic_write, write_error
 
 _DPI = 130
 
@@ -29,6 +29,10 @@ def save(figure: Figure, path: Path) -> None:
     buffer = io.BytesIO()
     figure.savefig(buffer, format=kind, dpi=_DPI)
     plt.close(figure)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise write_error(path, error) from None
     atomic_write(path, buffer.getvalue())
 
 

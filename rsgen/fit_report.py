@@ -14,7 +14,6 @@ import numpy.typing as npt
 from rich.console import Console
 from rich.table import Table
 
-from rsgen.errors import UserError
 from rsgen.fit import FitResult, fit_spline
 from rsgen.motion_stats import MotionStatistics, motion_statistics
 from rsgen.trajectory import Trajectory, TrajectoryFormat, read_trajectory
@@ -44,36 +43,6 @@ def make_fit_report(
     fit = fit_spline(trajectory, dt=dt, smoothing=smoothing)
     statistics = motion_statistics(fit.spline, float(trajectory.stamps[0]), float(trajectory.stamps[-1]))
     return FitReport(Path(path).name, trajectory, fit, statistics)
-
-
-def fit_report(
-    path: str | Path,
-    dt: float = 0.05,
-    smoothing: float = 0.0,
-    format: TrajectoryFormat = "auto",
-    icl_start: npt.ArrayLike | None = None,
-    plot: str | Path | None = None,
-) -> str:
-    """The report of ``rsgen fit`` as text; with plot, also writes a picture (png, pdf or svg) there."""
-    report = make_fit_report(path, dt, smoothing, format, icl_start)
-    if plot is not None:
-        plot_fit(report, plot)
-    return report_text(report)
-
-
-def fit_dict(
-    path: str | Path,
-    dt: float = 0.05,
-    smoothing: float = 0.0,
-    format: TrajectoryFormat = "auto",
-    icl_start: npt.ArrayLike | None = None,
-    plot: str | Path | None = None,
-) -> dict[str, Any]:
-    """The report of ``rsgen fit --json``; with plot, also writes a picture there."""
-    report = make_fit_report(path, dt, smoothing, format, icl_start)
-    if plot is not None:
-        plot_fit(report, plot)
-    return report_dict(report)
 
 
 def report_dict(report: FitReport) -> dict[str, Any]:
@@ -146,10 +115,9 @@ def plot_fit(report: FitReport, out: str | Path) -> None:
 
     Raises UserError if the file's type is another or it cannot be written.
     """
-    out = Path(out)
-    if out.suffix.lower() not in (".png", ".pdf", ".svg"):
-        raise UserError(f"cannot draw into '{out}': use a name that ends in .png, .pdf or .svg")
     from matplotlib.figure import Figure  # half a second to import, and only this function needs it
+
+    from rsgen.figures import save
 
     figure = Figure(figsize=(12.0, 8.5), layout="constrained")
     axes = figure.subplots(3, 2, sharex=True)
@@ -167,11 +135,7 @@ def plot_fit(report: FitReport, out: str | Path) -> None:
         f"RMS {data['residual']['rms_mm']:.2f} mm and {data['residual']['rms_deg']:.3f}°",
         fontsize=13,
     )
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(out, dpi=130)
-    except OSError as error:
-        raise UserError(f"cannot write {out}: {error.strerror or error}") from None
+    save(figure, Path(out))
 
 
 # Above the axes, where no curve can run into it.

@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 
 from rsgen.config import Config
 from rsgen.errors import UserError
-from rsgen.files import atomic_write
+from rsgen.files import atomic_write, encode_yaml
 from rsgen.fit import FitResult, fit_spline
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rsgen.inspect import write_origin
 from rsgen.sequence_format import STREAMS, stream_stamps
 from rsgen.sequence_writer import SequenceWriter
 from rsgen.trajectory import read_trajectory
@@ -31,6 +30,10 @@ log = logging.getLogger("rsgen")
 _LARGEST_STAMP_S = 1e6
 # Written frames that may wait for the disk: bounds memory and how much a kill can lose.
 _WRITE_AHEAD = 4
+
+# What a sequence folder remembers of the machine that rendered it, for commands that render again. Not part of the
+# format: a sequence is whole without it.
+ORIGIN = "origin.yaml"
 
 Progress = Callable[[str, float, str], None]  # stage ("light" or "frames"), fraction done in [0, 1], note
 
@@ -194,6 +197,12 @@ def write_scene_ply(scene: Any, path: Path) -> None:
 
     vertices, faces = surface(scene)
     atomic_write(path, ply_bytes(vertices, faces))
+
+
+def write_origin(out: Path, config: Config) -> None:
+    """Note where the scene and trajectory of the sequence in `out` are on this machine. Raises UserError."""
+    where = {"scene": str(config.scene.file.resolve()), "trajectory": str(config.trajectory.file.resolve())}
+    atomic_write(out / ORIGIN, encode_yaml(where))
 
 
 def engine_versions(config: Config) -> dict[str, str]:

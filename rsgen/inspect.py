@@ -10,21 +10,12 @@ import numpy as np
 
 from rsgen.config import Config, validate_config
 from rsgen.errors import UserError
-from rsgen.files import atomic_write, encode_yaml, read_yaml
+from rsgen.files import read_yaml
+from rsgen.generate import ORIGIN, FrameSource, scene_hash
 from rsgen.progress import ProgressDisplay
 from rsgen.sequence import read_sequence
 
 log = logging.getLogger("rsgen")
-
-# What a sequence folder remembers of the machine that rendered it, for commands that render again. Not part of the
-# format: a sequence is whole without it.
-ORIGIN = "origin.yaml"
-
-
-def write_origin(out: Path, config: Config) -> None:
-    """Note where the scene and trajectory of the sequence in `out` are on this machine. Raises UserError."""
-    where = {"scene": str(config.scene.file.resolve()), "trajectory": str(config.trajectory.file.resolve())}
-    atomic_write(out / ORIGIN, encode_yaml(where))
 
 
 def preview_sequence(path: Path, out: Path | None, count: int) -> Path:
@@ -54,7 +45,6 @@ def compare_frame(path: Path, frame: int, out: Path | None, scene: Path | None) 
     longer where it was. Raises UserError.
     """
     from rsgen.figures import comparison, save
-    from rsgen.generate import FrameSource, scene_hash
 
     sequence = read_sequence(path)
     color, depth = (sequence.streams[name] for name in ("color", "depth"))
