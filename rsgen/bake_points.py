@@ -19,19 +19,20 @@ from rsgen.scene import mesh_arrays
 _INSET_M = 2e-3  # samples on a triangle's rim move this far inwards: a corner exactly on two surfaces sees neither
 _NEIGHBOURS = 8
 _NORMAL_SCALE = 0.35  # normals this far apart count as much as one spacing
+_APART = 1e4  # spacings between different pieces of surface
 _SMOOTHING = 0.3  # spacings: closer sources than this count alike
 
 
 @dataclass(frozen=True)
 class Points:
     """Unique sample points: position on the surface, shading normal, geometric normal, (n, 3) float32 each, and (n,)
-    the number of the connected piece of surface that each lies on.
+    the number of the piece of surface that each lies on: one side of a connected part of a mesh.
     """
 
     position: NDArray[np.float32]
     normal: NDArray[np.float32]
     geometric: NDArray[np.float32]
-    island: NDArray[np.int64]
+    piece: NDArray[np.int64]
 
 
 def sample_points(scene: Any, lattice: Lattice) -> tuple[Points, NDArray[np.int64]]:
@@ -76,7 +77,7 @@ def sample_points(scene: Any, lattice: Lattice) -> tuple[Points, NDArray[np.int6
         np.concatenate([position[front], position[back]]),
         np.concatenate([normal[front], -normal[back]]),
         np.concatenate([geometric[front], -geometric[back]]),
-        np.concatenate([island[front], island[back]]),
+        np.concatenate([2 * island[front], 2 * island[back] + 1]),
     ), index
 
 
@@ -121,14 +122,14 @@ def thin(
 
     Returns the chosen ones as indices into `among`, and for each of `among` which of the chosen stands for it.
     """
-    position, normal, island = points.position, points.normal, points.island
+    position, normal, piece = points.position, points.normal, points.piece
     if among is not None:
-        position, normal, island = position[among], normal[among], island[among]
+        position, normal, piece = position[among], normal[among], piece[among]
     scaled = position / spacing
     cell = np.floor(scaled)
     off_centre = ((scaled - cell - 0.5) ** 2).sum(axis=1)
     # A buried face must not stand for a lit one just in front of it, so pieces of surface are kept apart.
-    key = _mix(np.concatenate([cell, np.round(normal), island[:, None]], axis=1).astype(np.int64).astype(np.uint64))
+    key = _mix(np.concatenate([cell, np.round(normal), piece[:, None]], axis=1).astype(np.int64).astype(np.uint64))
     order = np.lexsort((off_centre, key))
     sorted_key = key[order]
     starts = np.concatenate([[True], sorted_key[1:] != sorted_key[:-1]])
@@ -146,8 +147,12 @@ class Interpolation:
 
     @classmethod
     def between(cls, points: Points, sources: NDArray, targets: NDArray, spacing: float) -> Interpolation:
-        """By distance in position (in units of `spacing` metres) and normal together."""
-        scaled = np.concatenate([points.position / spacing, points.normal / _NORMAL_SCALE], axis=1)
+        """By distance in position (in units of `spacing` metres) and normal together, within one piece of surface.
+
+        The dark inside of a thin sheet is a millimetre from its lit outside and has the normal of the other outside.
+        """
+        parts = [points.position / spacing, points.normal / _NORMAL_SCALE, _APART * points.piece[:, None]]
+        scaled = np.concatenate(parts, axis=1)
         k = min(_NEIGHBOURS, len(sources))
         distance, neighbours = cKDTree(scaled[sources]).query(scaled[targets], k=k, workers=-1, eps=0.2)
         distance, neighbours = np.reshape(distance, (-1, k)), np.reshape(neighbours, (-1, k))
