@@ -160,6 +160,6 @@ def test_icl_nuim_trajectories_keep_clear(built: Built, k: int) -> None:
     assert distances(built.triangles, p, 0.3).min() >= CLEARANCE
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.tum")), ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*_trajectory.txt")), ids=lambda p: p.stem)
 def test_own_trajectories_keep_clear(built: Built, path: Path) -> None:
     assert distances(built.triangles, np.loadtxt(path)[:, 1:4], 0.3).min() >= CLEARANCE
