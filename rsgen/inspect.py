@@ -32,7 +32,8 @@ def preview_sequence(path: Path, out: Path | None, count: int) -> Path:
         raise UserError(f"{path}: no frames to show: render some, and ask for at least one")
     chosen = np.linspace(0, available - 1, min(count, available)).round().astype(int)
     shutter = streams["color"].shutter
-    title = f"{sequence.name}: frames {', '.join(map(str, chosen))} (readout {1000 * shutter.readout_s:g} ms)"
+    numbers = ", ".join(str(k) for k in streams["color"].indices[chosen])
+    title = f"{sequence.name}: frames {numbers} (readout {1000 * shutter.readout_s:g} ms)"
     out = out or path / "preview.png"
     save(preview([sequence.color(k) for k in chosen], [sequence.depth(k) for k in chosen], title), out)
     return out
