@@ -183,8 +183,8 @@ class Spline:
         return w, dw
 
     @cached_property
-    def _left_gains(self) -> FloatArray:
-        """Jl⁻¹(Ω_j) Ad(T_{j−1}⁻¹), (m − 1, 6, 6)."""
+    def left_gains(self) -> FloatArray:
+        """Derivative Jl⁻¹(Ω_j) Ad(T_{j−1}⁻¹) (m − 1, 6, 6) of `increments` by a left increment of T_j (of T_{j−1}: its negative)."""
         return se3.left_jacobian_inv(self.increments) @ se3.adjoint(se3.inverse(self.control_points[:-1]))
 
     def _left_blocks(self, segment: npt.NDArray[np.int64], b: FloatArray) -> list[FloatArray]:
@@ -193,7 +193,7 @@ class Spline:
         for j, A in enumerate(self._factors(segment, b)):
             bj = b[..., j : j + 1]
             J = se3.left_jacobian(bj * self.increments[segment + j])
-            F.append(bj[..., None] * (se3.adjoint(T) @ J @ self._left_gains[segment + j]))
+            F.append(bj[..., None] * (se3.adjoint(T) @ J @ self.left_gains[segment + j]))
             T = T @ A
         return [F[0] - F[1], F[1] - F[2], F[2] - F[3], F[3]]
 

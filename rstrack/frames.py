@@ -1,0 +1,81 @@
+"""Images as the kernels take them: depth and inverse depth on the device, and a pyramid of intensities."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from rsgen.geometry.so3 import FloatArray
+from rstrack.engine import Engine
+from rstrack.lines import Exposure
+
+LEVELS = 3
+
+
+@dataclass(frozen=True)
+class DepthImage:
+    """A depth image: z (m, 0 missing) and 1/z on the device; rays are those of its camera (`upload_rays`)."""
+
+    exposure: Exposure
+    z: Any
+    inverse_z: Any
+    count: int
+
+
+@dataclass(frozen=True)
+class ColorImage:
+    """Intensities in [0, 1], level 0 is full size; each further level is low-passed and halved (cv2.pyrDown)."""
+
+    exposure: Exposure
+    levels: tuple[Any, ...]
+
+
+def depth_image(e: Engine, exposure: Exposure, z: npt.NDArray[Any], max_depth: float) -> DepthImage:
+    """z (h, w) in metres; what is not finite, not positive or beyond max_depth counts as missing."""
+    z = np.asarray(z, np.float32)
+    good = (z > 0.0) & (z < max_depth)
+    z = np.where(good, z, np.float32(0.0))
+    inverse = np.divide(np.float32(1.0), z, out=np.zeros_like(z), where=good)
+    return DepthImage(exposure, e.upload(z), e.upload(inverse), int(np.count_nonzero(good)))
+
+
+def intensity(color: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+    """Grey (h, w) in [0, 1] of an RGB image (h, w, 3), ITU-R BT.601 weights."""
+    return np.asarray(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), np.float32) * np.float32(1.0 / 255.0)
+
+
+def color_image(e: Engine, exposure: Exposure, color: npt.NDArray[np.uint8]) -> ColorImage:
+    """RGB (h, w, 3) uint8 to a pyramid."""
+    return ColorImage(exposure, tuple(e.upload(level) for level in pyramid(intensity(color))))
+
+
+def pyramid(image: npt.NDArray[np.float32]) -> list[npt.NDArray[np.float32]]:
+    """LEVELS levels; pixel (x, y) of a level lies at (2x, 2y) of the one below."""
+    levels = [image]
+    for _ in range(LEVELS - 1):
+        levels.append(np.asarray(cv2.pyrDown(levels[-1])))
+    return levels
+
+
+def masked_pyramid(
+    image: npt.NDArray[np.float32], valid: npt.NDArray[np.bool_]
+) -> list[tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]]:
+    """Pyramid of an image with holes, by normalised convolution; a pixel is valid where half its weight is."""
+    weight = valid.astype(np.float32)
+    value = np.where(valid, image, np.float32(0.0))
+    out = [(value, valid)]
+    for _ in range(LEVELS - 1):
+        value, weight = np.asarray(cv2.pyrDown(value)), np.asarray(cv2.pyrDown(weight))
+        out.append((value / np.maximum(weight, np.float32(1e-3)), weight > 0.5))
+    return out
+
+
+def camera_rays(exposure: Exposure) -> FloatArray:
+    """Undistorted normalised coordinates (h, w, 2) of every pixel; 0 where the lens sees nothing."""
+    camera = exposure.lens.camera
+    rays = camera.unproject(camera.pixel_grid())
+    return np.nan_to_num(rays[..., :2] / rays[..., 2:])

@@ -1,0 +1,126 @@
+"""Make keyframes: from one frame, rolling or rectified; pass on what an older keyframe knows; fuse later frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rsgen.geometry import se3
+from rsgen.geometry.so3 import FloatArray
+from rsgen.geometry.spline import Spline
+from rstrack.engine import Engine
+from rstrack.frames import ColorImage, DepthImage
+from rstrack.lines import from_base_table, to_base_table
+from rstrack.rectify import color_kernel, fuse_kernel, rectify_kernel
+from rstrack.reference import Image, Reference, depth_scaling, level_points, rectified_lens, surface_slopes
+from rstrack.warp import Lens
+
+# Metres at one metre: depths that differ by more show different surfaces.
+_AGREE = 0.03
+# Weight of a fused pixel in measurements; more would let a keyframe's first errors live for ever.
+_MOST = 30.0
+
+
+@dataclass
+class KeyframeMaker:
+    """Kernels of one rig. rays: of the depth camera (h, w, 2)."""
+
+    e: Engine
+    rays: FloatArray
+    device_rays: tuple[Any, Any]
+    _kernels: dict[Any, Any] = field(default_factory=dict)
+
+    def rolling(self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline) -> Reference:
+        """A reference that keeps its rolling shutter, for the time until it can be rectified."""
+        lens = depth.exposure.lens
+        shape = lens.camera.height, lens.camera.width
+        t = depth.exposure.mid_time
+        rho = self.e.download(depth.inverse_z, shape)
+        return self._finish(index, depth, colors, spline, t, spline.pose(t), lens, depth.inverse_z, rho, None)
+
+    def rectified(
+        self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, older: Reference | None
+    ) -> Reference:
+        """A keyframe at mid readout, in which depth that the older one has is averaged in and fills holes."""
+        e, lens = self.e, depth.exposure.lens
+        base = rectified_lens(lens.camera)
+        t = depth.exposure.mid_time
+        T_world_base = spline.pose(t)
+        to_base = e.upload(to_base_table(spline, T_world_base, depth.exposure))
+        rho, _, _ = self._kernel(rectify_kernel, lens, base)(depth.inverse_z, *self.device_rays, to_base)
+        shape = base.camera.height, base.camera.width
+        host = e.download(rho, shape)
+        made = self._finish(index, depth, colors, spline, t, T_world_base, base, rho, host, None)
+        if older is None or older.rolling is not None:
+            return made
+        T = se3.inverse(older.T_world_base) @ T_world_base
+        from_base = e.upload(np.concatenate([T[:3, :3].ravel(), T[:3, 3], np.zeros(6)]))
+        rho, weight = self._fuse(made, older.lens, older.inverse_depth, older.weight, from_base)
+        back = se3.inverse(T)
+        to_base = e.upload(np.concatenate([back[:3, :3].ravel(), back[:3, 3]]))
+        grid = self._pinhole_rays(base)
+        old, _, _ = self._kernel(rectify_kernel, older.lens, base)(older.inverse_depth, *grid, to_base)
+        host, old_host = e.download(rho, shape), e.download(old, shape)
+        holes = (host <= 0) & (old_host > 0)
+        host = np.where(holes, old_host, host)
+        weights = np.where(holes, 1.0, e.download(weight, shape))
+        return self._finish(index, depth, colors, spline, t, T_world_base, base, e.upload(host), host, weights)
+
+    def fused(self, ref: Reference, depth: DepthImage, spline: Spline) -> Reference:
+        """The keyframe with the depth of one more frame, whose poses are known, averaged in."""
+        from_base = self.e.upload(from_base_table(spline, ref.T_world_base, depth.exposure))
+        rho, weight = self._fuse(ref, depth.exposure.lens, depth.inverse_z, self._ones(depth), from_base)
+        return replace(ref, inverse_depth=rho, weight=weight)
+
+    def _fuse(self, ref: Reference, lens: Lens, source: Any, source_weight: Any, from_base: Any) -> tuple[Any, Any]:
+        constants = self.e.upload(np.array([_AGREE, _MOST]))
+        kernel = self._kernel(fuse_kernel, lens, ref.lens)
+        fused: tuple[Any, Any] = kernel(
+            ref.inverse_depth, ref.weight, ref.slope_x, ref.slope_y, source, source_weight, from_base, constants
+        )
+        return fused
+
+    def _ones(self, depth: DepthImage) -> Any:
+        camera = depth.exposure.lens.camera
+        if "ones" not in self._kernels:
+            self._kernels["ones"] = self.e.upload(np.ones(camera.height * camera.width))
+        return self._kernels["ones"]
+
+    def _pinhole_rays(self, base: Lens) -> tuple[Any, Any]:
+        if "grid" not in self._kernels:
+            rays = base.camera.unproject(base.camera.pixel_grid())
+            self._kernels["grid"] = self.e.upload(rays[..., 0]), self.e.upload(rays[..., 1])
+        grid: tuple[Any, Any] = self._kernels["grid"]
+        return grid
+
+    def _finish(
+        self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, t: float,
+        T_world_base: FloatArray, lens: Lens, device_rho: Any, rho: Image, weight: npt.NDArray[Any] | None,
+    ) -> Reference:  # fmt: skip
+        e = self.e
+        rolling = depth.exposure if lens is depth.exposure.lens and lens.lines > 1 else None
+        rays = self.rays if rolling else lens.camera.unproject(lens.camera.pixel_grid())[..., :2]
+        grid = self.device_rays if rolling else self._pinhole_rays(lens)
+        slope_x, slope_y = surface_slopes(rho, lens.camera.fx, lens.camera.fy)
+        points = ()
+        if colors:
+            color = min(colors, key=lambda c: abs(c.exposure.mid_time - t))
+            to_base = e.upload(to_base_table(spline, T_world_base, rolling) if rolling else np.zeros(12))
+            from_base = e.upload(from_base_table(spline, T_world_base, color.exposure))
+            kernel = self._kernel(color_kernel, color.exposure.lens, lens)
+            value, seen = kernel(device_rho, *grid, to_base, color.levels[0], from_base)
+            points = level_points(e, rho, rays, e.download(value, rho.shape), e.download(seen, rho.shape) > 0)
+        lever, bound = depth_scaling(rho)
+        weights = e.upload(np.where(rho > 0, 1.0, 0.0) if weight is None else weight)
+        return Reference(
+            index, depth.exposure.stamp, t, T_world_base, lens, rolling, device_rho, e.upload(slope_x),
+            e.upload(slope_y), weights, points, lever, bound,
+        )  # fmt: skip
+
+    def _kernel(self, make: Any, *key: Any) -> Any:
+        if (make, *key) not in self._kernels:
+            self._kernels[make, *key] = make(self.e, *key)
+        return self._kernels[make, *key]

@@ -1,0 +1,139 @@
+"""From per-block 6×6 systems to the control points: chain rule, motion prior, banded solve.
+
+Unknowns are left increments δ_i in se(3): T_i ← exp(δ_i) T_i in the world frame. A block of lines at time t moves by
+η = Σ J_i(t) δ_i over the four control points of its segment (DESIGN section 4), so its 6×6 system becomes 24×24.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg
+
+from rsgen.geometry import se3
+from rsgen.geometry.so3 import FloatArray
+from rsgen.geometry.spline import Spline
+from rstrack.residuals import BlockSums
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """½ δᵀ H δ + gᵀ δ over control points first, first + 1, ...: H (6k, 6k), g (6k,)."""
+
+    first: int
+    H: FloatArray
+    g: FloatArray
+
+    @property
+    def last(self) -> int:
+        """One past the last control point."""
+        return self.first + len(self.g) // 6
+
+    def moved(self, increments: FloatArray) -> Quadratic:
+        """The same model around a state that has been moved by increments (m, 6) of all control points."""
+        step = increments[self.first : self.last].ravel()
+        return replace(self, g=self.g + self.H @ step) if step.any() else self
+
+
+def line_jacobian(
+    spline: Spline, T_world_base: FloatArray, times: FloatArray, first: int, count: int
+) -> FloatArray:
+    """η in the base frame by the control points first..first+count: (n, 6, 6 count)."""
+    at, J = spline.pose_jacobian(times)
+    J = se3.adjoint(se3.inverse(T_world_base)) @ J
+    out = np.zeros((len(times), 6, count, 6))
+    rows = np.arange(len(times))
+    for i in range(4):
+        out[rows, :, at - first + i] = J[:, i]
+    return out.reshape(len(times), 6, 6 * count)
+
+
+def chain(
+    sums: BlockSums, spline: Spline, T_world_base: FloatArray, times: FloatArray, ref_times: FloatArray | None
+) -> tuple[Quadratic, FloatArray]:
+    """`sums` of blocks at `times` (n,) by the control points (of blocks of a rolling reference at `ref_times` too).
+
+    Returns the quadratic model and the derivative (n, 6, 6k) of the current blocks' twists.
+    """
+    every = times if ref_times is None else np.concatenate([times, ref_times])
+    segments, _ = spline.locate(every)
+    first, count = int(segments.min()), int(segments.max() - segments.min()) + 4
+    current = line_jacobian(spline, T_world_base, times, first, count)
+    if ref_times is None:
+        J, H, g = current, sums.H[:, 0], sums.g[:, 0]
+    else:
+        used = np.flatnonzero(np.abs(sums.H).sum(axis=(2, 3)).ravel())
+        c, r = np.divmod(used, len(ref_times))
+        J = current[c] - line_jacobian(spline, T_world_base, ref_times, first, count)[r]
+        H, g = sums.H[c, r], sums.g[c, r]
+    HJ = H @ J
+    size = 6 * count
+    dense = J.reshape(-1, size).T @ HJ.reshape(-1, size)
+    return Quadratic(first, 0.5 * (dense + dense.T), J.reshape(-1, size).T @ g.ravel()), current
+
+
+def acceleration_prior(spline: Spline, first: int, last: int, sigma: FloatArray) -> Quadratic:
+    """Ω_{i+1} − Ω_i ~ N(0, diag σ²) for the triples of control points within first..last (exclusive).
+
+    sigma (6,): m and rad per knot squared, so acceleration times dt². Derivative of Ω_j = log(T_{j−1}⁻¹ T_j) by left
+    increments: Jl⁻¹(Ω_j) Ad(T_{j−1}⁻¹) (δ_j − δ_{j−1}).
+    """
+    count = last - first
+    H, g = np.zeros((6 * count, 6 * count)), np.zeros(6 * count)
+    gains = spline.left_gains[first : last - 1]
+    omega = spline.increments[first : last - 1]
+    information = 1.0 / sigma**2
+    for i in range(count - 2):
+        r = omega[i + 1] - omega[i]
+        J = np.hstack([gains[i], -gains[i + 1] - gains[i], gains[i + 1]])
+        at = slice(6 * i, 6 * i + 18)
+        H[at, at] += J.T @ (information[:, None] * J)
+        g[at] += J.T @ (information * r)
+    return Quadratic(first, H, g)
+
+
+def pose_constraint(spline: Spline, t: float, T_world_body: FloatArray, sigma: FloatArray) -> Quadratic:
+    """T(t) = T_world_body up to sigma (6,) (m, rad): fixes the gauge while the reference's control points are free."""
+    segment, J = spline.pose_jacobian(t)
+    J = np.hstack(list(J))
+    e = se3.log(spline.pose(t) @ se3.inverse(T_world_body))
+    return Quadratic(int(segment), J.T @ (J / sigma[:, None] ** 2), J.T @ (e / sigma**2))
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Increments (n, 6) of the free control points, and the extreme eigenvalues of the scaled system's diagonal
+    blocks' condition: `weakest` (6,) is the smallest eigenvalue's direction is not resolved below 1/sqrt(value)."""
+
+    increments: FloatArray
+    condition: float
+
+
+def assemble(models: Iterable[Quadratic], first: int, last: int) -> tuple[FloatArray, FloatArray]:
+    """Sum of quadratic models restricted to the free control points first..last; the others are held fixed."""
+    size = 6 * (last - first)
+    H, g = np.zeros((size, size)), np.zeros(size)
+    for model in models:
+        low, high = max(model.first, first), min(model.last, last)
+        if low >= high:
+            continue
+        own = slice(6 * (low - model.first), 6 * (high - model.first))
+        to = slice(6 * (low - first), 6 * (high - first))
+        H[to, to] += model.H[own, own]
+        g[to] += model.g[own]
+    return H, g
+
+
+def solve(H: FloatArray, g: FloatArray, bandwidth: int = 24) -> FloatArray:
+    """−H⁻¹ g by banded Cholesky. Raises numpy.linalg.LinAlgError where H is not positive definite."""
+    size = len(g)
+    bandwidth = min(bandwidth, size)
+    # Jacobi scaling: metres, radians and barely touched control points differ by many orders of magnitude.
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-300))
+    scaled = H * scale[:, None] * scale
+    band = np.zeros((bandwidth, size))
+    for k in range(bandwidth):
+        band[k, : size - k] = np.diagonal(scaled, -k)
+    return -scale * np.asarray(scipy.linalg.solveh_banded(band, scale * g, lower=True))

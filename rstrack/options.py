@@ -1,0 +1,55 @@
+"""The tracker's settings: one set of defaults for everything."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from rsgen.backend import Backend
+from rsgen.errors import UserError
+
+Method = Literal["rs-pg", "rs-g", "rs-p", "gs-pg", "gs-g", "gs-p", "baseline"]
+METHODS: tuple[str, ...] = get_args(Method)
+
+
+@dataclass(frozen=True)
+class Options:
+    """What can be chosen. Times in seconds, lengths in metres, angles in degrees.
+
+    method: rs/gs models the rolling shutter or takes all lines at mid readout; p/g: photometric, geometric error.
+    knot_spacing_s, knot_phase: control points are spacing apart, the first knot phase · spacing before the first line.
+    keyframe_overlap: a new keyframe is made once less than this share of the depth points that the current keyframe
+      saw at first falls on it; keyframe_distance, keyframe_angle_deg: or once the camera is that far from it.
+    """
+
+    method: Method = "rs-pg"
+    knot_spacing_s: float = 0.025
+    knot_phase: float = 0.5
+    backend: Backend = "auto"
+    keyframe_overlap: float = 0.65
+    keyframe_distance: float = 0.3
+    keyframe_angle_deg: float = 20.0
+    fuse: bool = True
+    bootstrap_frames: int = 6
+    max_depth: float = 12.0
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise UserError(f"unknown method '{self.method}': choose {', '.join(METHODS)}")
+        if not 0.001 <= self.knot_spacing_s <= 1.0:
+            raise UserError(f"knot_spacing_s = {self.knot_spacing_s!r} must be between 0.001 and 1 s")
+
+    @property
+    def rolling(self) -> bool:
+        """Whether the rolling shutter is modelled."""
+        return self.method.startswith("rs")
+
+    @property
+    def geometric(self) -> bool:
+        """Whether the geometric term is used."""
+        return self.method in ("rs-pg", "rs-g", "gs-pg", "gs-g", "baseline")
+
+    @property
+    def photometric(self) -> bool:
+        """Whether the photometric term is used."""
+        return self.method in ("rs-pg", "rs-p", "gs-pg", "gs-p")

@@ -1,0 +1,45 @@
+"""What the tracker is fed: the cameras (`Rig`) and one `Frame` for each depth image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy.typing as npt
+
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter
+from rsgen.geometry.so3 import FloatArray
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The cameras: everything the tracker must know beside the images. T_color_depth (4, 4): p_color from p_depth."""
+
+    depth_camera: Camera
+    depth_shutter: Shutter
+    color_camera: Camera
+    color_shutter: Shutter
+    T_color_depth: FloatArray
+
+
+@dataclass(frozen=True)
+class Image:
+    """One image. stamp: seconds, the instant at which line 0 stops being exposed.
+
+    pixels: colour uint8 (h, w, 3) RGB; depth float32 (h, w), planar z in metres, 0 = missing.
+    """
+
+    stamp: float
+    pixels: npt.NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One depth image and the colour images that go with it, sorted by stamp.
+
+    Usually one; none where colour was dropped; two where colour is twice as fast.
+    """
+
+    depth: Image
+    colors: tuple[Image, ...]

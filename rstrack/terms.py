@@ -1,0 +1,114 @@
+"""One image against one reference: run a kernel, chain it to the control points, remember the result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.so3 import FloatArray
+from rsgen.geometry.spline import Spline
+from rstrack.engine import Engine
+from rstrack.frames import ColorImage, DepthImage
+from rstrack.lines import IDENTITY_FROM_BASE, from_base_table, to_base_table
+from rstrack.normal_equations import Quadratic, chain
+from rstrack.reference import STRIDES, Points, Reference
+from rstrack.residuals import BlockSums, Scaling, block_counts, geometric_kernel, photometric_kernel
+from rstrack.robust import scale_step
+from rstrack.warp import Lens
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """A term around a state: `model` divided by σ², and what the kernel saw.
+
+    motion (n, 6, 6k): derivative of the blocks' twists, to tell how far rows have moved since.
+    """
+
+    model: Quadratic
+    motion: FloatArray
+    sigma: float
+    next_sigma: float
+    cost: float
+    count: int
+    # Smallest eigenvalue of Σ w j jᵀ / count with rotations scaled by the scene's depth: 0 where a motion is not seen.
+    observability: float
+
+    def row_shift(self, increments: FloatArray, focal: float, depth: float) -> float:
+        """Largest movement of a block in pixels under increments (m, 6) of all control points."""
+        twist = self.motion @ increments[self.model.first : self.model.last].ravel()
+        return float((focal * (np.abs(twist[:, :3]).max(axis=1) / depth + np.abs(twist[:, 3:]).max(axis=1))).max())
+
+
+@dataclass
+class Terms:
+    """Kernels of one rig, compiled when first needed. rays: those of the depth camera, on the device."""
+
+    e: Engine
+    rays: tuple[Any, Any]
+    # Residual beyond which a pixel is an outlier for certain (m; intensity), and smallest credible σ.
+    gate_depth: float = 0.05
+    gate_intensity: float = 0.3
+    floor_depth: float = 2e-4
+    floor_intensity: float = 1.0 / 255.0
+    _kernels: dict[Any, Any] = field(default_factory=dict)
+
+    def geometric(self, image: DepthImage, ref: Reference, spline: Spline, level: int, sigma: float) -> Linearised:
+        """Depth image against the reference's depth with every STRIDES[level]-th pixel."""
+        e, lens = self.e, image.exposure.lens
+        kernel = self._kernel(geometric_kernel, lens, ref.lens, STRIDES[level])
+        to_base = e.upload(to_base_table(spline, ref.T_world_base, image.exposure))
+        gate = min(self.gate_depth, max(5.0 * sigma, 10 * self.floor_depth)) if level == 0 else self.gate_depth
+        scaling = self._scaling(ref, lens, lens.camera, ref, STRIDES[level], 1)
+        constants = e.upload(scaling.parameters(sigma, gate))
+        raw = kernel(image.z, *self.rays, to_base, ref.inverse_depth, ref.slope_x, ref.slope_y, self._seen_from(spline, ref), constants)  # fmt: skip
+        current, reference, per, ref_per = block_counts(lens, ref.lens)
+        sums = scaling.unpack(raw.numpy(), current, reference)
+        times = image.exposure.block_times(per)
+        return self._finish(sums, spline, ref, times, ref_per, sigma, self.floor_depth, ref.lever)
+
+    def photometric(self, image: ColorImage, ref: Reference, spline: Spline, level: int, sigma: float) -> Linearised:
+        """The reference's points of a level against that level of the colour image."""
+        e, lens, points = self.e, image.exposure.lens, ref.points[level]
+        kernel = self._kernel(photometric_kernel, lens, ref.lens, STRIDES[level], level)
+        from_base = e.upload(from_base_table(spline, ref.T_world_base, image.exposure))
+        to_base = e.upload(np.zeros(12) if ref.rolling is None else to_base_table(spline, ref.T_world_base, ref.rolling))
+        # Moving closer or turning packs more points into a block than its share.
+        scaling = self._scaling(points, lens, ref.lens.camera, ref, STRIDES[level], 4)
+        constants = e.upload(scaling.parameters(sigma, self.gate_intensity))
+        raw = kernel(points.x, points.y, points.z, points.intensity, points.visible, to_base, image.levels[level], from_base, constants)  # fmt: skip
+        current, reference, per, ref_per = block_counts(lens, ref.lens)
+        sums = scaling.unpack(raw.numpy(), current, reference)
+        times = image.exposure.block_times(per)
+        return self._finish(sums, spline, ref, times, ref_per, sigma, self.floor_intensity, points.lever)
+
+    def _seen_from(self, spline: Spline, ref: Reference) -> Any:
+        if ref.rolling is None:
+            return self.e.upload(IDENTITY_FROM_BASE)
+        return self.e.upload(from_base_table(spline, ref.T_world_base, ref.rolling))
+
+    @staticmethod
+    def _scaling(units: Points | Reference, lens: Lens, grid: Camera, ref: Reference, stride: int, slack: int) -> Scaling:
+        pixels = -(-grid.width // stride) * -(-grid.height // stride)
+        current = block_counts(lens, ref.lens)[0]
+        return Scaling(units.lever, units.bound, min(pixels, slack * (-(-pixels // current) + max(grid.width, grid.height))))
+
+    def _finish(
+        self, sums: BlockSums, spline: Spline, ref: Reference, times: FloatArray, ref_per: int, sigma: float,
+        floor: float, lever: float,
+    ) -> Linearised:  # fmt: skip
+        ref_times = None if ref.rolling is None else ref.rolling.block_times(ref_per)
+        model, motion = chain(sums, spline, ref.T_world_base, times, ref_times)
+        scale = 1.0 / np.array([1.0, 1.0, 1.0, lever, lever, lever])
+        total = sums.H.sum(axis=(0, 1)) * np.outer(scale, scale) / max(sums.count, 1)
+        weakest = float(np.linalg.eigvalsh(total)[0]) if sums.count else 0.0
+        scaled = Quadratic(model.first, model.H / sigma**2, model.g / sigma)
+        next_sigma = scale_step(sigma, sums.weighted, sums.count, floor)
+        return Linearised(scaled, motion, sigma, next_sigma, sums.cost, sums.count, weakest)
+
+    def _kernel(self, make: Any, *key: Any) -> Any:
+        if (make, *key) not in self._kernels:
+            self._kernels[make, *key] = make(self.e, *key)
+        return self._kernels[make, *key]
