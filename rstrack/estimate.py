@@ -1,4 +1,4 @@
-"""What a tracking run leaves behind: poses at frame stamps, a spline and run.json; other trackers' TUM files read alike.
+"""What a tracking run leaves behind: poses at frame stamps, a spline, run.json; and other trackers' TUM files.
 
 estimate = read_estimate(Path("runs/lr_kt2"))        # or Path("other_tracker.txt")
 """

@@ -7,79 +7,25 @@ print(metrics_text(metrics))
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from rsgen.errors import UserError
-from rsgen.geometry import se3, so3
-from rsgen.geometry.camera import BoolArray, Camera
-from rsgen.geometry.shutter import Shutter
+from rsgen.geometry import se3
 from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rsgen.sequence_format import associate
 from rsgen.trajectory import Trajectory
+from rstrack.compare import ASSOCIATE_WITHIN_S, IntArray, Truth, angles_deg, compare, nearest, truth_of
 from rstrack.estimate import Estimate, plain, read_estimate
 
-if TYPE_CHECKING:
-    from rstrack.dataset import Dataset
-
-IntArray = npt.NDArray[np.int64]
-
-ASSOCIATE_WITHIN_S = 0.02
-"""Stamps at most so far apart belong together: the default of TUM's associate.py."""
-
-RPE_DELTA_S = 1.0
+_RPE_DELTA_S = 1.0
 _PAIR_WITHIN_S = 0.1
 # Stamps rounded to TUM's four digits still are one second apart.
 _STAMP_ROUNDING_S = 1e-3
-_MIN_POSES = 3
-# Variance along the second principal axis, relative to the first, under which positions lie on a line; along the first,
-# m², under which they are one point.
-_LINE, _POINT = 1e-9, 1e-12
-
-
-@dataclass(frozen=True)
-class Truth:
-    """What an estimate is compared with.
-
-    motion: T_world_depth(t), or poses. frame_stamps: (n,) seconds, the sequence's depth frames. camera, shutter: of the
-    depth stream, for errors by line.
-    """
-
-    motion: Spline | Trajectory
-    frame_stamps: FloatArray
-    camera: Camera
-    shutter: Shutter
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """Poses of the estimate that have a true counterpart, k of them.
-
-    index: (k,) rows of the estimate. T_world_true, T_world_est: (k, 4, 4), the latter aligned: T_true_est (4, 4) times
-    the estimate. is_determined: False if the positions alone left the alignment's rotation open.
-    """
-
-    index: IntArray
-    T_world_true: FloatArray
-    T_world_est: FloatArray
-    T_true_est: FloatArray
-    is_determined: bool
-
-    @property
-    def position_errors_m(self) -> FloatArray:
-        """(k,) distances after alignment."""
-        return np.asarray(np.linalg.norm(self.T_world_est[:, :3, 3] - self.T_world_true[:, :3, 3], axis=1))
-
-    @property
-    def rotation_errors_deg(self) -> FloatArray:
-        """(k,) angles after alignment."""
-        return _angles_deg(self.T_world_true, self.T_world_est)
 
 
 @dataclass(frozen=True)
@@ -127,7 +73,7 @@ def evaluate(truth: Truth, estimate: Estimate, interpolate: bool = False) -> Met
     counted. True poses are associated with the nearest stamp, one to one and within 0.02 s, as TUM's associate.py does,
     or, with `interpolate`, interpolated on SE(3) where one of them is that near.
 
-    ATE (`align`): distances between positions after the rigid alignment, as in TUM's evaluate_ate.py.
+    ATE (`rstrack.compare.align`): distances between positions after the rigid alignment, as in TUM's evaluate_ate.py.
 
     RPE: E = (T_true,i⁻¹ T_true,j)⁻¹ (T_est,i⁻¹ T_est,j), RMSE of its translation and angle over the pairs (i, j) of
     `pairs_one_second_apart`; the estimate's association decides which true poses are meant.
@@ -189,46 +135,6 @@ def evaluate(truth: Truth, estimate: Estimate, interpolate: bool = False) -> Met
     )
 
 
-def compare(truth: Truth, estimate: Estimate, interpolate: bool = False) -> Comparison:
-    """Associate and align, as `evaluate` does. Raises UserError if fewer than three poses have a true counterpart."""
-    index, T_true = _true_poses(truth.motion, estimate.stamps, interpolate)
-    if len(index) < _MIN_POSES:
-        begin, end = _span(truth.motion)
-        raise UserError(
-            f"estimate: {len(index)} of {len(estimate.stamps)} poses have a true one at their stamp, at least "
-            f"{_MIN_POSES} are needed: the truth covers {begin:.3f} to {end:.3f} s; are the clocks the same?"
-        )
-    T_est = estimate.T_world_depth[index]
-    T_true_est, is_determined = align(T_true, T_est)
-    return Comparison(index, T_true, T_true_est @ T_est, T_true_est, is_determined)
-
-
-def align(T_world_true: FloatArray, T_world_est: FloatArray) -> tuple[FloatArray, bool]:
-    """T_true_est (4, 4) that moves estimated positions closest to the true ones, and whether they determine it.
-
-    Poses (k, 4, 4). Least squares without scale, closed form: Umeyama, PAMI 13(4), 1991 (Horn's method by SVD). Where
-    positions lie on a line or in one point, the rotation that they leave open is that which brings the orientations
-    closest (chordal distance), so that rotation errors mean something there too.
-    """
-    p_true, p_est = T_world_true[:, :3, 3], T_world_est[:, :3, 3]
-    mean_true, mean_est = p_true.mean(axis=0), p_est.mean(axis=0)
-    U, s, Vt = np.linalg.svd((p_true - mean_true).T @ (p_est - mean_est) / len(p_true))
-    is_determined = bool(s[1] > _LINE * s[0] and s[0] > _POINT)
-    M = np.einsum("nij,nkj->ik", T_world_true[:, :3, :3], T_world_est[:, :3, :3])
-    if s[0] <= _POINT:
-        U, _, Vt = np.linalg.svd(M)
-    R_signs = np.diag([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
-    R = U @ R_signs @ Vt
-    if s[0] > _POINT and not is_determined:
-        # R turns one line onto the other; left is the spin about it, by the angle that maximises tr(Rᵀ M).
-        m = U.T @ M @ (R_signs @ Vt).T
-        angle = math.atan2(m[2, 1] - m[1, 2], m[1, 1] + m[2, 2])
-        R = U @ so3.exp([angle, 0.0, 0.0]) @ R_signs @ Vt
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, mean_true - R @ mean_est
-    return T, is_determined
-
-
 def pairs_one_second_apart(stamps: FloatArray) -> tuple[IntArray, IntArray]:
     """Indices i, j (k,) with stamp j the nearest to stamp i + 1 s, of increasing stamps (n,) in seconds.
 
@@ -240,8 +146,8 @@ def pairs_one_second_apart(stamps: FloatArray) -> tuple[IntArray, IntArray]:
     """
     if not len(stamps):
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    target = stamps + RPE_DELTA_S
-    j = _nearest(stamps, target)
+    target = stamps + _RPE_DELTA_S
+    j = nearest(stamps, target)
     keep = (target <= stamps[-1] + _STAMP_ROUNDING_S) & (np.abs(stamps[j] - target) <= _PAIR_WITHIN_S)
     return np.flatnonzero(keep), j[keep]
 
@@ -263,14 +169,6 @@ def metrics_text(metrics: Metrics) -> str:
     lines += [f"{label:<22} {' '.join(f'{value:>10}' for value in values)}{end}" for label, values, end in table]
     lines += [f"note: {note}" for note in m.notes]
     return "\n".join(lines)
-
-
-def truth_of(dataset: Dataset) -> Truth | None:
-    """A dataset's truth, None if it has none: its spline, else the poses of its groundtruth.txt."""
-    motion = dataset.truth if dataset.truth is not None else dataset.truth_poses
-    if motion is None:
-        return None
-    return Truth(motion, dataset.stamps, dataset.rig.depth_camera, dataset.rig.depth_shutter)
 
 
 def run_evaluate(seq_path: Path, estimate_path: Path, camera_file: Path | None = None) -> Metrics:
@@ -295,25 +193,6 @@ def run_evaluate(seq_path: Path, estimate_path: Path, camera_file: Path | None =
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _true_poses(motion: Spline | Trajectory, stamps: FloatArray, interpolate: bool) -> tuple[IntArray, FloatArray]:
-    """Indices (k,) of the stamps (n,) that have a true pose, and those poses (k, 4, 4)."""
-    if isinstance(motion, Spline):
-        index = np.flatnonzero((stamps >= motion.t_begin) & (stamps <= motion.t_end))
-        return index, motion.pose(stamps[index])
-    if not interpolate:
-        pairs = np.array(associate(stamps, motion.stamps, ASSOCIATE_WITHIN_S), np.int64).reshape(-1, 2)
-        return pairs[:, 0], motion.T_world_cam[pairs[:, 1]]
-    if len(motion) < 2:
-        return np.empty(0, np.int64), np.empty((0, 4, 4))
-    near: BoolArray = np.abs(motion.stamps[_nearest(motion.stamps, stamps)] - stamps) <= ASSOCIATE_WITHIN_S
-    index = np.flatnonzero(near & (stamps >= motion.stamps[0]) & (stamps <= motion.stamps[-1]))
-    before = np.clip(np.searchsorted(motion.stamps, stamps[index], side="right") - 1, 0, len(motion) - 2)
-    T = motion.T_world_cam[before]
-    step = se3.log(se3.inverse(T) @ motion.T_world_cam[before + 1])
-    u = (stamps[index] - motion.stamps[before]) / (motion.stamps[before + 1] - motion.stamps[before])
-    return index, T @ se3.exp(u[:, None] * step)
-
-
 def _errors_by_line(
     motion: Spline | Trajectory, estimate: Estimate, T_true_est: FloatArray, t: FloatArray
 ) -> tuple[tuple[float | None, float | None], int]:
@@ -326,31 +205,13 @@ def _errors_by_line(
     return _pose_rms(motion.pose(t), T_true_est @ estimate.spline.pose(t)), t.size
 
 
-def _nearest(stamps: FloatArray, t: FloatArray) -> IntArray:
-    """Index of the stamp nearest to each time, the earlier of two; stamps increase, one at least."""
-    after = np.clip(np.searchsorted(stamps, t), 0, len(stamps) - 1)
-    before = np.maximum(after - 1, 0)
-    return np.where(np.abs(stamps[before] - t) <= np.abs(stamps[after] - t), before, after).astype(np.int64)
-
-
-def _span(motion: Spline | Trajectory) -> tuple[float, float]:
-    if isinstance(motion, Spline):
-        return motion.t_begin, motion.t_end
-    return float(motion.stamps[0]), float(motion.stamps[-1])
-
-
-def _angles_deg(T_a: FloatArray, T_b: FloatArray) -> FloatArray:
-    R = np.swapaxes(T_a[:, :3, :3], 1, 2) @ T_b[:, :3, :3]
-    return np.degrees(np.linalg.norm(so3.log(R), axis=-1))
-
-
 def _pose_rms(T_a: FloatArray, T_b: FloatArray) -> tuple[float, float]:
     """RMS of the translation, m, and the angle, degrees, of T_a⁻¹ T_b."""
     error = se3.inverse(T_a) @ T_b
-    return _rms(np.linalg.norm(error[:, :3, 3], axis=1)), _rms(_angles_deg(T_a, T_b))
+    return _rms(np.linalg.norm(error[:, :3, 3], axis=1)), _rms(angles_deg(T_a, T_b))
 
 
-def _rms(values: FloatArray | np.floating[Any]) -> float:
+def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 

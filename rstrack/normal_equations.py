@@ -77,7 +77,7 @@ def chain(
 def acceleration_prior(spline: Spline, first: int, last: int, sigma: FloatArray) -> Quadratic:
     """Ω_{i+1} − Ω_i ~ N(0, diag σ²) for the triples of control points within first..last (exclusive).
 
-    sigma (6,): m and rad per knot squared, so acceleration times dt². Derivative of Ω_j = log(T_{j−1}⁻¹ T_j) by left
+    sigma (triples, 6): m and rad per knot squared, so acceleration times dt². Derivative of Ω_j = log(T_{j−1}⁻¹ T_j) by left
     increments: Jl⁻¹(Ω_j) Ad(T_{j−1}⁻¹) (δ_j − δ_{j−1}).
     """
     count = last - first
@@ -89,8 +89,8 @@ def acceleration_prior(spline: Spline, first: int, last: int, sigma: FloatArray)
         r = omega[i + 1] - omega[i]
         J = np.hstack([gains[i], -gains[i + 1] - gains[i], gains[i + 1]])
         at = slice(6 * i, 6 * i + 18)
-        H[at, at] += J.T @ (information[:, None] * J)
-        g[at] += J.T @ (information * r)
+        H[at, at] += J.T @ (information[i, :, None] * J)
+        g[at] += J.T @ (information[i] * r)
     return Quadratic(first, H, g)
 
 

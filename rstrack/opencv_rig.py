@@ -19,6 +19,7 @@ matrix that only one camera has is the other's too. What is not known by name is
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,6 @@ _SCALARS = ("fx", "fy", "cx", "cy")
 _DISTORTION = ("distortion", "distortion_coefficients", "dist_coeffs", "d")
 _EXTRINSIC = ("t_color_depth", "t_rgb_depth", "extrinsics", "extrinsic")
 _ROTATION_TOLERANCE = 1e-3  # what printing a matrix to three or four digits loses
-_YAML_NAME = "%YAML:1.0"
 
 Values = dict[str, Any]
 Size = tuple[int, int]
@@ -54,17 +54,19 @@ class _Loader(yaml.SafeLoader):
 def _matrix(loader: yaml.SafeLoader, node: yaml.MappingNode) -> FloatArray:
     data = loader.construct_mapping(node, deep=True)
     try:
-        return np.array(data["data"], float).reshape(int(data["rows"]), int(data["cols"]))
-    except (KeyError, TypeError, ValueError):
+        shape = data["sizes"] if "sizes" in data else (data["rows"], data["cols"])
+        return np.array(data["data"], float).reshape([int(n) for n in shape])
+    except (KeyError, TypeError, ValueError, OverflowError):
         raise yaml.constructor.ConstructorError(problem="bad matrix", problem_mark=node.start_mark) from None
 
 
-_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
+for _tag in ("opencv-matrix", "opencv-nd-matrix"):
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_tag}", _matrix)
 
 
 def is_opencv(text: str) -> bool:
-    """Whether it looks like a FileStorage file: OpenCV's own header, or one of its matrices."""
-    return text.lstrip().startswith(_YAML_NAME) or "!!opencv-matrix" in text
+    """Whether it looks like a FileStorage file: its header (%YAML:1.0, since OpenCV 5 %YAML 1.2), or its matrices."""
+    return text.lstrip().startswith("%YAML") or "!!opencv-" in text
 
 
 def read_opencv_rig(path: Path, text: str, color_size: Size, depth_size: Size) -> tuple[Rig, float | None]:
@@ -168,7 +170,7 @@ class _Keys:
         numbers = _flat(told)
         if len(numbers) == 9 and numbers[1:2] + numbers[3:4] + numbers[6:] == [0, 0, 0, 0, 1]:
             numbers = [numbers[i] for i in (0, 4, 2, 5)]
-        if len(numbers) != 4:
+        if len(numbers) != 4 or np.shape(told) == (2, 2):
             raise self.fail(f"the camera matrix of {stream} is neither [fx 0 cx; 0 fy cy; 0 0 1] nor [fx, fy, cx, cy]")
         fx, fy, cx, cy = numbers
         return fx, fy, cx, cy
@@ -187,16 +189,17 @@ class _Keys:
 
 
 def _parse(path: Path, text: str) -> Values:
-    body = text.lstrip().removeprefix(_YAML_NAME)
+    # Not the YAML that its header claims to be: PyYAML would refuse the directive.
+    body = re.sub(r"\A\s*%YAML[^\n]*", "", text)
     try:
         data = yaml.load(body, Loader=_Loader)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         raise UserError(f"{path}:{f' line {mark.line + 1}' if mark else ''} is not valid OpenCV YAML") from None
-    if not isinstance(data, dict):
+    if not isinstance(data, dict | None):
         raise UserError(f"{path}: expected entries 'name: value'")
     values: Values = {}
-    _flatten("", data, values)
+    _flatten("", data or {}, values)
     return values
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 
 from rsgen.errors import UserError
@@ -41,6 +42,5 @@ def _noisy_depth(image: Image, sigma: float, rng: np.random.Generator) -> Image:
 
 def _noisy_color(image: Image, rng: np.random.Generator, sigma: float) -> Image:
     levels = np.rint(np.float32(255.0 * sigma) * rng.standard_normal(image.pixels.shape[:2], np.float32))
-    # Far beyond clipping, and no overflow.
-    levels = np.clip(levels, -255, 255).astype(np.int16)[..., None]
-    return Image(image.stamp, np.clip(image.pixels + levels, 0, 255).astype(np.uint8))
+    field = np.clip(levels, -255, 255).astype(np.int16)  # beyond these everything clips anyway
+    return Image(image.stamp, np.asarray(cv2.add(image.pixels, cv2.merge([field] * 3), dtype=cv2.CV_8U), np.uint8))

@@ -36,6 +36,8 @@ LINES_PER_PAIR_BLOCK = 32
 _SLOTS = 32
 # Relative spread of inverse depth within 2×2 pixels from which on they lie on both sides of an edge.
 EDGE = 0.03
+# Share of a pixel's weight that its curvature keeps at least.
+_CURVATURE = 0.2
 _PAIRS = [(a, b) for a in range(6) for b in range(a, 6)]
 
 
@@ -96,7 +98,10 @@ def _accumulate(
     w = dr.select(active, w * dr.minimum(1.0, bound * bound * dr.rcp(dr.maximum(norm2, 1e-12))), 0.0)
     j = [dr.select(active, c, 0.0) for c in j]
     wj = [w * c for c in j]
-    values = [wj[a] * j[b] * unit_H for a, b in _PAIRS]
+    # Newton's weight rather than that of reweighted least squares, which converges only linearly; kept positive.
+    h = unit_H * dr.maximum((NU - s * s) / (NU + s * s), _CURVATURE)
+    hj = [h * c for c in wj]
+    values = [hj[a] * j[b] for a, b in _PAIRS]
     values += [c * s * (sign * unit_g) for c in wj]
     values += [w * s * s * unit_cost, (0.5 * (NU + 1.0)) * dr.log(1.0 + s * s * (1.0 / NU)) * unit_cost]
     sums = dr.zeros(e.Int, size * _SLOTS)

@@ -32,6 +32,7 @@ from rstrack.warp import Lens
 # Motion prior: standard deviation of accelerations, m/s² and rad/s². Hand-held cameras reach 35 m/s² (DESIGN section
 # 5), so it says little where there are data, and holds the newest control points, whose weight is only u³/6.
 PRIOR_ACCELERATION = np.array([5.0, 5.0, 5.0, 10.0, 10.0, 10.0])
+NEWEST = 0.1
 # Metres and radians within which the reference's pose is held while its own control points are free.
 _GAUGE = np.full(6, 1e-6)
 # Steps at most on the pyramid's levels, finest first.
@@ -214,7 +215,10 @@ class Tracker:
 
     def _prior(self, free: tuple[int, int]) -> Extra:
         sigma = PRIOR_ACCELERATION * self.options.knot_spacing_s**2
-        return lambda spline: acceleration_prior(spline, max(0, free[0] - 2), free[1], sigma)
+        first, last = max(0, free[0] - 2), free[1]
+        sigmas = np.repeat(sigma[None], last - first - 2, axis=0)
+        sigmas[-2:] *= NEWEST
+        return lambda spline: acceleration_prior(spline, first, last, sigmas)
 
     def _optimise(
         self, fresh: list[Observation], settled: list[Observation], free: tuple[int, int], extras: list[Extra],
