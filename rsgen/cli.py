@@ -4,19 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import logging
-import os
-import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
-# The fit's banded solves are small: threads only get in each other's way (measured, up to 1000x on a busy machine).
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-from rsgen.errors import UserError
+from rsgen.command_line import Commands, Parser, count, parse_frames, run_program
 
 if TYPE_CHECKING:
     from rsgen.config import Config
@@ -31,76 +25,14 @@ rsgen makes rolling-shutter RGB-D benchmark sequences with exact continuous-time
 """
 
 
-class _Parser(argparse.ArgumentParser):
-    """Complains like everything else here: in one line."""
-
-    def error(self, message: str) -> NoReturn:
-        raise UserError(f"{message} (see '{self.prog} --help')")
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status: 0 done, 1 a check failed, 2 wrong input, 130 interrupted."""
-    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-    try:
-        options = _parser().parse_args(_joined(sys.argv[1:] if arguments is None else arguments))
-        status = options.run(options)
-        sys.stdout.flush()
-    except UserError as error:
-        print(f"rsgen: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    except BrokenPipeError:
-        # Whoever read our output has seen enough; the interpreter would complain when it flushes the rest.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
-    except KeyboardInterrupt:
-        print("rsgen: interrupted; the same command resumes", file=sys.stderr)
-        return 130
-    return status
+    return run_program("rsgen", _parser, arguments, "the same command resumes")
 
 
-def _joined(words: Sequence[str]) -> list[str]:
-    """`--offset -1e-3` as `--offset=-1e-3`: argparse takes a negative number with an exponent for an option."""
-    joined: list[str] = []
-    for word in words:
-        if joined and joined[-1].startswith("--") and "=" not in joined[-1] and _is_negative(word):
-            joined[-1] += f"={word}"
-        else:
-            joined.append(word)
-    return joined
-
-
-def _is_negative(word: str) -> bool:
-    try:
-        return word.startswith("-") and float(word) <= 0
-    except ValueError:
-        return False
-
-
-def _count(text: str) -> int:
-    """A whole number of at least one."""
-    try:
-        number = int(text)
-    except ValueError:
-        number = 0
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, got '{text}'")
-    return number
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
-        "rsgen", description=_DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-    )
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-
-    def add(name: str, run: Callable[[argparse.Namespace], int], help: str, example: str) -> argparse.ArgumentParser:
-        command = commands.add_parser(
-            name, help=help, description=f"{help[0].upper()}{help[1:]}.", epilog=f"example: rsgen {name} {example}",
-            allow_abbrev=False,
-        )  # fmt: skip
-        command.set_defaults(run=run)
-        return command
+def _parser() -> Parser:
+    commands = Commands("rsgen", _DESCRIPTION)
+    add = commands.add
 
     render = add(
         "render", _render, "render a sequence from a config; run again to resume",
@@ -130,9 +62,9 @@ def _parser() -> argparse.ArgumentParser:
         "out/demo --pairs 50",
     )  # fmt: skip
     verify.add_argument("sequence", type=Path, help="folder that 'rsgen render' wrote")
-    verify.add_argument("--pairs", type=_count, default=20, help="neighbouring frames to reproject (default: 20)")
+    verify.add_argument("--pairs", type=count, default=20, help="neighbouring frames to reproject (default: 20)")
     verify.add_argument(
-        "--raycast", type=_count, default=0, metavar="N", help="cast N frames again with another ray caster (embreex)"
+        "--raycast", type=count, default=0, metavar="N", help="cast N frames again with another ray caster (embreex)"
     )
 
     compare = add(
@@ -147,18 +79,18 @@ def _parser() -> argparse.ArgumentParser:
     preview = add("preview", _preview, "picture of some frames of a sequence with their depth", "out/demo --count 6")
     preview.add_argument("sequence", type=Path, help="folder that 'rsgen render' wrote")
     preview.add_argument("--out", type=Path, metavar="PNG", help="picture to write (default: SEQ/preview.png)")
-    preview.add_argument("--count", type=_count, default=4, help="frames to show (default: 4)")
+    preview.add_argument("--count", type=count, default=4, help="frames to show (default: 4)")
 
     light = add(
         "check-light", _check_light, "baked light against path tracing: PSNR of views along the config's trajectory",
         "configs/demo.yaml --spp 1024 --out light.png",
     )  # fmt: skip
     light.add_argument("config", type=Path, help="YAML file, see configs/")
-    light.add_argument("--views", type=_count, default=5, help="views, evenly spread in time (default: 5)")
+    light.add_argument("--views", type=count, default=5, help="views, evenly spread in time (default: 5)")
     light.add_argument(
-        "--spp", type=_count, default=4096, help="samples per pixel of the path-traced reference (default: 4096)"
+        "--spp", type=count, default=4096, help="samples per pixel of the path-traced reference (default: 4096)"
     )
-    light.add_argument("--width", type=_count, default=160, help="width of the views, px (default: 160)")
+    light.add_argument("--width", type=count, default=160, help="width of the views, px (default: 160)")
     light.add_argument("--out", type=Path, metavar="PNG", help="picture of both and eight times their difference")
 
     bench = add(
@@ -166,12 +98,12 @@ def _parser() -> argparse.ArgumentParser:
         "configs/demo.yaml --spp 16",
     )  # fmt: skip
     bench.add_argument("config", type=Path, help="YAML file, see configs/")
-    bench.add_argument("--frames", type=_count, default=5, help="timed frames per mode and round (default: 5)")
-    bench.add_argument("--spp", type=_count, default=64, help="samples per pixel (default: 64)")
+    bench.add_argument("--frames", type=count, default=5, help="timed frames per mode and round (default: 5)")
+    bench.add_argument("--spp", type=count, default=64, help="samples per pixel (default: 64)")
     for command in (render, light, bench):
         command.usage = "%(prog)s [options] [--SECTION.FIELD VALUE ...] config"
         _add_overrides(command)
-    return parser
+    return commands.parser
 
 
 def _add_overrides(command: argparse.ArgumentParser) -> None:
@@ -197,7 +129,7 @@ def _config(options: argparse.Namespace) -> Config:
 
 
 def _render(options: argparse.Namespace) -> int:
-    from rsgen.generate import parse_frames, render_sequence
+    from rsgen.generate import render_sequence
     from rsgen.progress import ProgressDisplay
 
     config = _config(options)

@@ -229,18 +229,3 @@ def scene_hash(config: Config) -> str:
     from rsgen.scene import content_hash
 
     return content_hash(config.scene.file)
-
-
-def parse_frames(text: str | None) -> slice:
-    """Frames 'A:B' (B excluded, either may be left out) or a single 'A'. Raises UserError."""
-    if text is None:
-        return slice(None)
-    begin, colon, end = text.partition(":")
-    try:
-        low = int(begin) if begin or not colon else 0
-        high = (int(end) if end else None) if colon else low + 1
-    except ValueError:
-        low, high = -1, None
-    if low < 0 or (high is not None and high <= low):
-        raise UserError(f"--frames {text}: expected A:B with 0 <= A < B, for example 0:100")
-    return slice(low, high)

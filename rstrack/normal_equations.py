@@ -74,41 +74,39 @@ def chain(
     return Quadratic(first, 0.5 * (dense + dense.T), J.reshape(-1, size).T @ g.ravel()), current
 
 
-def acceleration_prior(spline: Spline, first: int, last: int, sigma: FloatArray) -> Quadratic:
+def acceleration_prior(spline: Spline, first: int, last: int, sigma: FloatArray) -> tuple[Quadratic, float]:
     """Ω_{i+1} − Ω_i ~ N(0, diag σ²) for the triples of control points within first..last (exclusive).
 
     sigma (triples, 6): m and rad per knot squared, so acceleration times dt². Derivative of Ω_j = log(T_{j−1}⁻¹ T_j) by left
-    increments: Jl⁻¹(Ω_j) Ad(T_{j−1}⁻¹) (δ_j − δ_{j−1}).
+    increments: Jl⁻¹(Ω_j) Ad(T_{j−1}⁻¹) (δ_j − δ_{j−1}). Returns the model and the cost.
     """
     count = last - first
     H, g = np.zeros((6 * count, 6 * count)), np.zeros(6 * count)
     gains = spline.left_gains[first : last - 1]
     omega = spline.increments[first : last - 1]
-    information = 1.0 / sigma**2
+    information, cost = 1.0 / sigma**2, 0.0
     for i in range(count - 2):
         r = omega[i + 1] - omega[i]
         J = np.hstack([gains[i], -gains[i + 1] - gains[i], gains[i + 1]])
         at = slice(6 * i, 6 * i + 18)
         H[at, at] += J.T @ (information[i, :, None] * J)
         g[at] += J.T @ (information[i] * r)
-    return Quadratic(first, H, g)
+        cost += 0.5 * float(r @ (information[i] * r))
+    return Quadratic(first, H, g), cost
 
 
-def pose_constraint(spline: Spline, t: float, T_world_body: FloatArray, sigma: FloatArray) -> Quadratic:
-    """T(t) = T_world_body up to sigma (6,) (m, rad): fixes the gauge while the reference's control points are free."""
+def pose_constraint(
+    spline: Spline, t: float, T_world_body: FloatArray, sigma: FloatArray
+) -> tuple[Quadratic, float]:
+    """T(t) = T_world_body up to sigma (6,) (m, rad): fixes the gauge while the reference's control points are free.
+
+    Returns the model and the cost.
+    """
     segment, J = spline.pose_jacobian(t)
     J = np.hstack(list(J))
     e = se3.log(spline.pose(t) @ se3.inverse(T_world_body))
-    return Quadratic(int(segment), J.T @ (J / sigma[:, None] ** 2), J.T @ (e / sigma**2))
-
-
-@dataclass(frozen=True)
-class Solution:
-    """Increments (n, 6) of the free control points, and the extreme eigenvalues of the scaled system's diagonal
-    blocks' condition: `weakest` (6,) is the smallest eigenvalue's direction is not resolved below 1/sqrt(value)."""
-
-    increments: FloatArray
-    condition: float
+    model = Quadratic(int(segment), J.T @ (J / sigma[:, None] ** 2), J.T @ (e / sigma**2))
+    return model, 0.5 * float(np.sum((e / sigma) ** 2))
 
 
 def assemble(models: Iterable[Quadratic], first: int, last: int) -> tuple[FloatArray, FloatArray]:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
@@ -72,6 +71,10 @@ class SplineState:
         self._spline = None
 
 
+# A prior: its quadratic model around a spline, and its cost there.
+Extra = Callable[[Spline], tuple[Quadratic, float]]
+
+
 @dataclass
 class Observation:
     """An image against a reference, its current scale σ and its last linearisation."""
@@ -110,6 +113,13 @@ class Observation:
         assert self.lin is not None
         return self.lin.model.moved(self._since(state))
 
+    def change(self, state: SplineState) -> float:
+        """Change of the cost since the linearisation, by the quadratic model."""
+        assert self.lin is not None
+        model = self.lin.model
+        moved = self._since(state)[model.first : model.last].ravel()
+        return float(model.g @ moved + 0.5 * moved @ model.H @ moved)
+
     def _since(self, state: SplineState) -> FloatArray:
         since = state.moved.copy()
         since[: len(self.at)] -= self.at
@@ -118,61 +128,102 @@ class Observation:
 
 @dataclass
 class Solved:
-    """What an optimisation did: linearisations, steps, and the last step's largest movement of a line in pixels."""
+    """What an optimisation did: linearisations, steps, refused steps, and the last step's movement of a line in px."""
 
     evaluations: int = 0
     iterations: int = 0
+    refused: int = 0
     last_shift: float = np.inf
-    condition: float = np.inf
 
 
-Extra = Callable[[Spline], Quadratic]
+@dataclass(frozen=True)
+class Problem:
+    """Observations and priors over the free control points free[0]..free[1].
+
+    `fresh` observations go through the pyramid's levels; `settled` ones keep their models of the finest level as long
+    as these are good. `extras`: priors. `focal` in pixels, to tell how far lines move. `bandwidth`: of the system.
+    """
+
+    fresh: Sequence[Observation]
+    settled: Sequence[Observation]
+    free: tuple[int, int]
+    extras: Sequence[Extra]
+    focal: float
+    bandwidth: int = 24
 
 
 def optimise(
-    terms: Terms,
-    state: SplineState,
-    fresh: Sequence[Observation],
-    settled: Sequence[Observation],
-    free: tuple[int, int],
-    extras: Sequence[Extra],
-    levels: Sequence[int],
-    most: Sequence[int],
-    focal: float,
-    bandwidth: int = 24,
+    terms: Terms, state: SplineState, problem: Problem, levels: Sequence[int], most: Sequence[int]
 ) -> Solved:
-    """Move the control points free[0]..free[1] until no line of the fresh images moves any more.
+    """Levenberg-Marquardt on each of the pyramid's levels, coarse to fine, with at most most[level] steps.
 
-    `fresh` observations go through the pyramid's `levels`, coarse to fine, with at most most[level] steps on each;
-    `settled` ones keep their models of the finest level as long as they are good. `extras`: priors.
+    A level ends when no line of the fresh images moves any more. Steps that raise the cost are taken back and damped.
     Raises numpy.linalg.LinAlgError where the system has no solution.
     """
     done = Solved()
     for level in levels:
-        for observation in fresh:
+        for observation in problem.fresh:
             observation.lin, observation.sigma = None, 0.0 if level == levels[0] else observation.sigma
-        for _ in range(most[level]):
-            models = []
-            for observation in (*fresh, *settled):
-                is_fresh = any(observation is o for o in fresh)
-                if not is_fresh and level > 0 and observation.lin is not None:
-                    models.append(observation.model(state))
-                    continue
-                if observation.lin is None or observation.shift(state, focal) > RELINEARISE_PX * (1 + 4 * level):
-                    observation.linearise(terms, state, level if is_fresh else 0)
-                    done.evaluations += 1
-                models.append(observation.model(state))
-            models += [extra(state.spline) for extra in extras]
-            H, g = assemble(models, *free)
-            step = solve(H, g, bandwidth).reshape(-1, 6)
-            if not np.isfinite(step).all():
-                raise UserError("tracker: the normal equations gave no finite step")
-            state.apply(free[0], step)
-            done.iterations += 1
-            increments = np.zeros_like(state.moved)
-            increments[free[0] : free[0] + len(step)] = step
-            shifts = [o.lin.row_shift(increments, focal, o.ref.lever) for o in fresh if o.lin is not None]
-            done.last_shift = max(shifts, default=0.0)
-            if done.last_shift < STOP_PX[level]:
-                break
+        _optimise_level(terms, state, problem, level, most[level], done)
     return done
+
+
+def _optimise_level(
+    terms: Terms, state: SplineState, problem: Problem, level: int, most: int, done: Solved
+) -> None:  # fmt: skip
+    first, damping, cost = problem.free[0], 0.0, np.inf
+    weights: dict[int, float] = {}
+    before, step, undo = None, None, None
+    for _ in range(most):
+        done.evaluations += _linearise(terms, state, problem, level)
+        now = _cost(state, problem, weights)
+        if undo is not None and now > cost + 1e-4 * abs(cost) ** 0.5:
+            # Worse than before: back to where it was, and a shorter step from there.
+            state.apply(first, -step)
+            for observation, kept in zip((*problem.fresh, *problem.settled), undo, strict=True):
+                observation.lin, observation.sigma, observation.at = kept
+            damping = max(1e-3, 10.0 * damping)
+            done.refused += 1
+        else:
+            damping, cost = 0.1 * damping if damping > 1e-4 else 0.0, now
+        undo = [(o.lin, o.sigma, o.at) for o in (*problem.fresh, *problem.settled)]
+        models = [o.model(state) for o in (*problem.fresh, *problem.settled)]
+        models += [extra(state.spline)[0] for extra in problem.extras]
+        H, g = assemble(models, *problem.free)
+        H[np.diag_indices_from(H)] *= 1.0 + damping
+        step = solve(H, g, problem.bandwidth).reshape(-1, 6)
+        if not np.isfinite(step).all():
+            raise np.linalg.LinAlgError("the normal equations gave no finite step")
+        state.apply(first, step)
+        done.iterations += 1
+        increments = np.zeros_like(state.moved)
+        increments[first : first + len(step)] = step
+        shifts = [o.lin.row_shift(increments, problem.focal, o.ref.lever) for o in problem.fresh if o.lin is not None]
+        done.last_shift = max(shifts, default=0.0)
+        if done.last_shift < STOP_PX[level]:
+            break
+
+
+def _linearise(terms: Terms, state: SplineState, problem: Problem, level: int) -> int:
+    """Anew what has moved; returns how many that were."""
+    count = 0
+    for observation in problem.fresh:
+        if observation.lin is None or observation.shift(state, problem.focal) > RELINEARISE_PX * (1 + 4 * level):
+            observation.linearise(terms, state, level)
+            count += 1
+    for observation in problem.settled:
+        if level == 0 and observation.shift(state, problem.focal) > RELINEARISE_PX:
+            observation.linearise(terms, state, 0)
+            count += 1
+    return count
+
+
+def _cost(state: SplineState, problem: Problem, weights: dict[int, float]) -> float:
+    """Negative log-likelihood; the number of pixels of an observation counts as it was when first asked."""
+    total = sum(extra(state.spline)[1] for extra in problem.extras)
+    for observation in (*problem.fresh, *problem.settled):
+        lin = observation.lin
+        assert lin is not None
+        pixels = weights.setdefault(id(observation), float(lin.count))
+        total += pixels * (np.log(lin.sigma) + lin.cost / max(1, lin.count)) + observation.change(state)
+    return float(total)

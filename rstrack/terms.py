@@ -57,17 +57,32 @@ class Terms:
 
     def geometric(self, image: DepthImage, ref: Reference, spline: Spline, level: int, sigma: float) -> Linearised:
         """Depth image against the reference's depth with every STRIDES[level]-th pixel."""
+        to_base = to_base_table(spline, ref.T_world_base, image.exposure)
+        sums = self._geometric_sums(image, ref, to_base, self._seen_from(spline, ref), level, sigma)
+        _, _, per, ref_per = block_counts(image.exposure.lens, ref.lens)
+        times = image.exposure.block_times(per)
+        return self._finish(sums, spline, ref, times, ref_per, sigma, self.floor_depth, ref.lever)
+
+    def geometric_pose(
+        self, image: DepthImage, ref: Reference, T_base_cam: FloatArray, level: int, sigma: float
+    ) -> tuple[BlockSums, float]:
+        """The same for a global-shutter image at one pose (4, 4) against a rectified reference: sums and next σ (m)."""
+        to_base = np.concatenate([T_base_cam[:3, :3].ravel(), T_base_cam[:3, 3]])
+        sums = self._geometric_sums(image, ref, to_base, self.e.upload(IDENTITY_FROM_BASE), level, sigma)
+        return sums, scale_step(sigma, sums.weighted, sums.count, self.floor_depth)
+
+    def _geometric_sums(
+        self, image: DepthImage, ref: Reference, to_base: FloatArray, from_base: Any, level: int, sigma: float
+    ) -> BlockSums:
         e, lens = self.e, image.exposure.lens
         kernel = self._kernel(geometric_kernel, lens, ref.lens, STRIDES[level])
-        to_base = e.upload(to_base_table(spline, ref.T_world_base, image.exposure))
         gate = min(self.gate_depth, max(5.0 * sigma, 10 * self.floor_depth)) if level == 0 else self.gate_depth
         scaling = self._scaling(ref, lens, lens.camera, ref, STRIDES[level], 1)
         constants = e.upload(scaling.parameters(sigma, gate))
-        raw = kernel(image.z, *self.rays, to_base, ref.inverse_depth, ref.slope_x, ref.slope_y, self._seen_from(spline, ref), constants)  # fmt: skip
-        current, reference, per, ref_per = block_counts(lens, ref.lens)
-        sums = scaling.unpack(raw.numpy(), current, reference)
-        times = image.exposure.block_times(per)
-        return self._finish(sums, spline, ref, times, ref_per, sigma, self.floor_depth, ref.lever)
+        surface = ref.inverse_depth, ref.slope_x, ref.slope_y
+        raw = kernel(image.z, *self.rays, e.upload(to_base), *surface, from_base, constants)
+        current, reference, _, _ = block_counts(lens, ref.lens)
+        return scaling.unpack(raw.numpy(), current, reference)
 
     def photometric(self, image: ColorImage, ref: Reference, spline: Spline, level: int, sigma: float) -> Linearised:
         """The reference's points of a level against that level of the colour image."""
@@ -101,9 +116,7 @@ class Terms:
     ) -> Linearised:  # fmt: skip
         ref_times = None if ref.rolling is None else ref.rolling.block_times(ref_per)
         model, motion = chain(sums, spline, ref.T_world_base, times, ref_times)
-        scale = 1.0 / np.array([1.0, 1.0, 1.0, lever, lever, lever])
-        total = sums.H.sum(axis=(0, 1)) * np.outer(scale, scale) / max(sums.count, 1)
-        weakest = float(np.linalg.eigvalsh(total)[0]) if sums.count else 0.0
+        weakest = observability(sums, lever)
         scaled = Quadratic(model.first, model.H / sigma**2, model.g / sigma)
         next_sigma = scale_step(sigma, sums.weighted, sums.count, floor)
         return Linearised(scaled, motion, sigma, next_sigma, sums.cost, sums.count, weakest)
@@ -112,3 +125,11 @@ class Terms:
         if (make, *key) not in self._kernels:
             self._kernels[make, *key] = make(self.e, *key)
         return self._kernels[make, *key]
+
+
+def observability(sums: BlockSums, lever: float) -> float:
+    """Smallest eigenvalue of the summed H per pixel, with rotations divided by `lever` (m); 0 without pixels."""
+    if not sums.count:
+        return 0.0
+    scale = 1.0 / np.array([1.0, 1.0, 1.0, lever, lever, lever])
+    return float(np.linalg.eigvalsh(sums.H.sum(axis=(0, 1)) * np.outer(scale, scale) / sums.count)[0])

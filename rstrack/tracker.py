@@ -22,7 +22,7 @@ from rstrack.frames import ColorImage, DepthImage, camera_rays, color_image, dep
 from rstrack.keyframe import KeyframeMaker
 from rstrack.lines import Exposure
 from rstrack.normal_equations import acceleration_prior, pose_constraint
-from rstrack.optimizer import Extra, Observation, Solved, SplineState, optimise
+from rstrack.optimizer import Extra, Observation, Problem, Solved, SplineState, optimise
 from rstrack.options import Options
 from rstrack.reference import Reference
 from rstrack.rig import Frame, Image, Rig
@@ -31,8 +31,9 @@ from rstrack.warp import Lens
 
 # Motion prior: standard deviation of accelerations, m/s² and rad/s². Hand-held cameras reach 35 m/s² (DESIGN section
 # 5), so it says little where there are data, and holds the newest control points, whose weight is only u³/6.
-PRIOR_ACCELERATION = np.array([5.0, 5.0, 5.0, 10.0, 10.0, 10.0])
-NEWEST = 0.1
+import os
+PRIOR_ACCELERATION = float(os.environ.get('PA','5'))*np.array([1.0,1,1,2,2,2])
+NEWEST = float(os.environ.get('NEWEST','0.1'))
 # Metres and radians within which the reference's pose is held while its own control points are free.
 _GAUGE = np.full(6, 1e-6)
 # Steps at most on the pyramid's levels, finest first.
@@ -225,10 +226,8 @@ class Tracker:
         bandwidth: int, levels: tuple[int, ...] = _LEVELS,
     ) -> Solved:  # fmt: skip
         assert self._state is not None
-        focal = self.rig.depth_camera.fx
-        return optimise(
-            self._terms, self._state, fresh, settled, free, extras, levels, _MOST_STEPS, focal, bandwidth
-        )
+        problem = Problem(fresh, settled, free, extras, self.rig.depth_camera.fx, bandwidth)
+        return optimise(self._terms, self._state, problem, levels, _MOST_STEPS)
 
     def _overlap(self, fresh: list[Observation]) -> float:
         first = next((o for o in fresh if o.lin is not None), None)

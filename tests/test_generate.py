@@ -21,9 +21,10 @@ import yaml
 
 from rsgen.backend import mitsuba
 from rsgen.cli import main
+from rsgen.command_line import parse_frames
 from rsgen.config import load_config
 from rsgen.errors import UserError
-from rsgen.generate import FrameSource, load_motion, parse_frames, render_sequence
+from rsgen.generate import FrameSource, load_motion, render_sequence
 from rsgen.sequence import read_sequence
 from rsgen.verify import verify_sequence
 

@@ -1,0 +1,317 @@
+"""One tracking run: a dataset's frames through a tracker into a run folder.
+
+result = track(open_dataset(Path("out/lr_kt2")), Options(method="rs-pg"), Path("runs/lr_kt2"))
+print(result.text())
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+import numpy as np
+
+from rsgen.errors import UserError
+from rsgen.files import write_error
+from rsgen.geometry.shutter import Shutter
+from rsgen.geometry.so3 import FloatArray
+from rsgen.geometry.spline import Spline
+from rstrack.compare import Truth, compare, truth_of
+from rstrack.dataset import Dataset
+from rstrack.estimate import Estimate, write_estimate
+from rstrack.evaluate import Metrics, evaluate, metrics_text
+from rstrack.options import Options
+from rstrack.perturb import with_noise
+from rstrack.prefetch import prefetched
+from rstrack.rig import Frame, Rig
+
+if TYPE_CHECKING:
+    from rstrack.tracker import FrameReport
+
+Progress = Callable[[str, float, str], None]
+"""Called with a stage, the fraction done (0 to 1) and a note."""
+
+End = Literal["done", "interrupted", "broke down", "unreadable"]
+
+_TRUTH_EVERY = 30
+# Files that mark a folder as a data set, which a run folder's spline.npz must not overwrite.
+_DATASET_FILES = ("sequence.yaml", "rgb.txt", "depth.txt", "associations.txt", "groundtruth.txt")
+
+
+class AnyTracker(Protocol):
+    """What all trackers have in common. spline: None where a method has none; keyframes: their number so far."""
+
+    reports: list[FrameReport]
+    keyframes: int
+
+    @property
+    def spline(self) -> Spline | None:
+        """T_world_depth(t) so far."""
+
+    @property
+    def trajectory(self) -> tuple[FloatArray, FloatArray]:
+        """Stamps (n,) in seconds and T_world_depth (n, 4, 4) there."""
+
+    def feed(self, frame: Frame) -> FrameReport:
+        """Track one frame."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise added to the frames; see `rstrack.perturb.with_noise`."""
+
+    sigma_depth: float = 0.0
+    sigma_intensity: float = 0.0
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a run came to.
+
+    end: why it stopped; `error` says where the tracker broke down, or which image could not be read. lost: number of
+    frames. metrics: None without a truth, or with too few poses.
+    """
+
+    estimate: Estimate
+    metrics: Metrics | None
+    end: End
+    error: str
+    lost: int
+
+    def text(self) -> str:
+        """A summary of a few lines, with the metrics if there is a truth."""
+        info, times = self.estimate.info, self.estimate.info["timings"]
+        done, asked = len(info["frames"]), info["dataset"]["frames"][1] - info["dataset"]["frames"][0]
+        part = f"{done} frames" if done == asked else f"{done} of {asked} frames"
+        lost = f"{self.lost} lost" if self.lost else "none lost"
+        rate = done / times["total_s"]
+        lines = [
+            f"{info['method']} on {info['dataset']['name']}: {part}, {info['keyframes']} keyframes, {lost}",
+            f"{times['total_s']:.1f} s, {rate:.1f} frames/s on {info['backend']}; a frame takes "
+            f"{times['median_ms']:.1f} ms (median), {times['mean_ms']:.1f} (mean), {times['p95_ms']:.1f} (95 %)",
+        ]
+        return "\n".join(lines + ([] if self.metrics is None else ["", metrics_text(self.metrics)]))
+
+
+def make_tracker(rig: Rig, options: Options) -> AnyTracker:
+    """The tracker of options.method. Raises UserError if its backend cannot work on this machine."""
+    from rstrack.engine import engine
+
+    # Before anything else imports Dr.Jit, which then would choose a libLLVM itself.
+    engine(options.backend)
+    if options.method == "baseline":
+        from rstrack.baseline import BaselineTracker
+
+        return BaselineTracker(rig, options)
+    from rstrack.tracker import Tracker
+
+    return Tracker(rig, options)
+
+
+def track(
+    dataset: Dataset,
+    options: Options,
+    out: Path,
+    frames: slice = slice(None),
+    noise: Noise | None = None,
+    progress: Progress = lambda *_: None,
+) -> Result:
+    """Track frames of a dataset and write the run folder `out`: `rstrack.estimate.write_estimate` says what is in it.
+
+    Where the run stops early, because of an interrupt or an image that cannot be read, what there is gets written.
+    Raises UserError: no such frames, `out` cannot be written or is a dataset, no frame was tracked.
+    """
+    chosen = _chosen(dataset, frames)
+    truth = truth_of(dataset)
+    if truth is not None:
+        truth = dataclasses.replace(truth, frame_stamps=dataset.stamps[chosen])
+    tracker = make_tracker(dataset.rig, options)
+    _make_folder(out)
+    noise = noise or Noise()
+
+    def load(k: int) -> Frame:
+        return with_noise(dataset.frame(k), k, noise.sigma_depth, noise.sigma_intensity, noise.seed)
+
+    seconds: list[float] = []
+    end: End = "done"
+    error, note = "", ""
+    begin = time.perf_counter()
+    with _stop_flag() as stopped:
+        images = prefetched(load, chosen, 2)
+        for count, k in enumerate(chosen, 1):
+            try:
+                frame = next(images)
+            except UserError as problem:
+                end, error = "unreadable", str(problem)
+                break
+            start = time.perf_counter()
+            try:
+                tracker.feed(frame)
+            except (UserError, np.linalg.LinAlgError) as problem:
+                end, error = "broke down", f"the tracker broke down at frame {k}: {problem}"
+                break
+            seconds.append(time.perf_counter() - start)
+            if count % _TRUTH_EVERY == 0 or count == len(chosen):
+                note = _error_note(truth, _tracked(tracker, dataset.stamps[chosen]))
+            rate = count / (time.perf_counter() - begin)
+            progress("tracking", count / len(chosen), f"{rate:.1f} frames/s, {tracker.keyframes} keyframes{note}")
+            if stopped.is_set() and count < len(chosen):
+                end = "interrupted"
+                break
+        del images  # ends its thread
+    if not seconds:
+        raise UserError(error)
+    timings = _timings(time.perf_counter() - begin, seconds)
+    stamps = dataset.stamps[chosen][: len(seconds)]
+    poses = _tracked(tracker, stamps)
+    info = _settings(dataset, chosen, options, noise) | {
+        "end": end,
+        "error": error or None,
+        "keyframes": tracker.keyframes,
+        "lost": sum(report.lost for report in tracker.reports),
+        "spline_valid": _valid(dataset.rig, stamps, tracker.reports),
+        "timings": timings,
+        "frames": _diagnostics(stamps, tracker.reports),
+    }
+    estimate = Estimate(*poses, tracker.spline, info)
+    metrics = _metrics(truth, estimate)
+    info["metrics"] = None if metrics is None else metrics.as_dict()
+    write_estimate(out, estimate.stamps, estimate.T_world_depth, estimate.spline, info)
+    return Result(estimate, metrics, end, error, info["lost"])
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _chosen(dataset: Dataset, frames: slice) -> range:
+    chosen = range(len(dataset))[frames]
+    if not len(chosen):
+        raise UserError(f"{dataset.root}: has no frame {frames.start}: its frames are 0 to {len(dataset) - 1}")
+    return chosen
+
+
+def _make_folder(out: Path) -> None:
+    """Complain about the folder before minutes of work, not after."""
+    found = next((name for name in _DATASET_FILES if (out / name).exists()), None)
+    if found is not None:
+        raise UserError(f"{out}: holds a data set ({found}), which a run would overwrite: choose another --out")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        if not os.access(out, os.W_OK):
+            raise PermissionError(13, "Permission denied")
+    except OSError as error:
+        raise write_error(out, error) from None
+
+
+@contextmanager
+def _stop_flag() -> Iterator[threading.Event]:
+    """Ctrl-C sets the flag instead of breaking off in the middle of a frame; a second one breaks off."""
+    flag = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield flag  # signals are the main thread's business
+        return
+    before = signal.getsignal(signal.SIGINT)
+
+    def ask_to_stop(*_: Any) -> None:
+        flag.set()
+        signal.signal(signal.SIGINT, before)
+
+    signal.signal(signal.SIGINT, ask_to_stop)
+    try:
+        yield flag
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _tracked(tracker: AnyTracker, frame_stamps: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Stamps and poses of the frames that have a report and were not lost; `frame_stamps` may go on after them."""
+    good = [stamp for stamp, report in zip(frame_stamps, tracker.reports, strict=False) if not report.lost]
+    stamps, T_world_depth = tracker.trajectory
+    keep = np.isin(stamps, good)
+    return stamps[keep], T_world_depth[keep]
+
+
+def _error_note(truth: Truth | None, poses: tuple[FloatArray, FloatArray]) -> str:
+    if truth is None:
+        return ""
+    try:
+        errors = compare(truth, Estimate(*poses)).position_errors_m
+    except UserError:
+        return ""  # fewer than three poses
+    return f", ATE {1e3 * np.sqrt(np.mean(errors**2)):.2f} mm"
+
+
+def _metrics(truth: Truth | None, estimate: Estimate) -> Metrics | None:
+    """None also where fewer than three poses have a true counterpart."""
+    try:
+        return None if truth is None else evaluate(truth, estimate)
+    except UserError:
+        return None
+
+
+def _settings(dataset: Dataset, chosen: range, options: Options, noise: Noise) -> dict[str, Any]:
+    from rstrack.engine import engine
+
+    versions = {name: version(name) for name in ("numpy", "scipy", "drjit")}
+    return {
+        "method": options.method,
+        "options": dataclasses.asdict(options),
+        "noise": dataclasses.asdict(noise),
+        "versions": {"rstrack": version("rolling-shutter-rgbd"), **versions},
+        "backend": engine(options.backend).backend,
+        "machine": {"cpu_count": os.cpu_count()},
+        "dataset": {"name": dataset.name, "frames": [chosen.start, chosen.stop], "frames_in_all": len(dataset)},
+    }
+
+
+def _timings(total_s: float, seconds: Sequence[float]) -> dict[str, Any]:
+    """Of the tracker alone, but for the total; the first frames compile kernels."""
+    ms = 1e3 * np.array(seconds)
+    return {
+        "total_s": total_s,
+        "median_ms": float(np.median(ms)),
+        "mean_ms": float(ms.mean()),
+        "p95_ms": float(np.percentile(ms, 95)),
+        "frame_ms": np.round(ms, 3),
+    }
+
+
+def _valid(rig: Rig, stamps: FloatArray, reports: Sequence[FrameReport]) -> list[list[float]]:
+    """Times [begin, end] in s, from the first to the last line of every unbroken row of tracked frames."""
+    shutter: Shutter = rig.depth_shutter
+    ends = np.array([0, shutter.line_count(rig.depth_camera) - 1])
+    spans = shutter.line_mid_time(stamps[:, None], ends, rig.depth_camera)
+    found: list[list[float]] = []
+    was_lost = True
+    for span, report in zip(spans, reports, strict=True):
+        if not report.lost and was_lost:
+            found.append([float(span.min()), float(span.max())])
+        elif not report.lost:
+            found[-1][1] = float(span.max())
+        was_lost = report.lost
+    return found
+
+
+def _diagnostics(stamps: FloatArray, reports: Sequence[FrameReport]) -> list[dict[str, Any]]:
+    """One dict a frame for the plots: `FrameReport`, with inliers as parts of the run's largest number too."""
+    frames = [dataclasses.asdict(report) for report in reports]
+    for stamp, frame in zip(stamps, frames, strict=True):
+        frame["stamp"] = float(stamp)
+    for stream in ("depth", "color"):
+        counts = [frame[f"inliers_{stream}"] for frame in frames]
+        most = max(counts)
+        for frame, count in zip(frames, counts, strict=True):
+            # Not aligned to anything, as the first frame: no inliers to speak of.
+            frame[f"inliers_{stream}"] = count / most if most and frame["evaluations"] else None
+            frame[f"pixels_{stream}"] = count
+    return frames
