@@ -8,37 +8,39 @@ stamps, T_world_depth = tracker.trajectory
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
-from rstrack.engine import engine
-from rstrack.frames import DepthImage, camera_rays, depth_image
-from rstrack.keyframe import KeyframeMaker
-from rstrack.lines import Exposure
+from rstrack.frame_report import FrameReport
+from rstrack.frames import DepthImage
 from rstrack.optimizer import STOP_PX
 from rstrack.options import Options
+from rstrack.prepare import Prepared, Preparer
 from rstrack.reference import STRIDES, Reference
 from rstrack.rig import Frame, Rig
-from rstrack.terms import Terms, observability
-from rstrack.tracker import FrameReport
-from rstrack.warp import Lens
+from rstrack.terms import observability
 
 # Error at the start of an alignment, as σ in m; re-estimated with every step.
 _START_DEPTH = 5e-3
-# Steps at most on the pyramid's levels, finest first.
+# Smallest σ on the levels, finest first (m). A smaller one would make outliers of all that has moved by a pixel.
+_LEAST_SIGMA = (0.0, 2e-3, 5e-3)
+# Steps at most on the levels, finest first.
 _MOST_STEPS = (30, 10, 10)
 # A step is taken if it raises the image's negative log-likelihood per pixel by less, and else cut to this part.
 _SAME, _SHORTEN = 1e-5, 0.25
 # An alignment whose last step still moves lines further has not converged (pixels).
 _SETTLED_PX = 0.5
-# Part of an image's pixels that must fall on the keyframe, and frames in a row without it after which it is given up.
-_LEAST_SHARE = 0.1
+# Part of an image's pixels that must fall on the keyframe; `observability` of the motion that is seen least, below
+# which rounding decides; frames in a row without either after which the keyframe is given up.
+_LEAST_SHARE, _LEAST_SEEN = 0.1, 1e-5
 _MOST_LOST = 5
+# Seconds after which the velocity before says nothing about where the camera is.
+_GAP_S = 0.3
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,8 @@ class Alignment:
     """Where a depth image was found to be: T_base_cam (4, 4) in the keyframe's frame, and how well it fits there.
 
     sigma: scale of the residuals, m. count, share: pixels that fall on the keyframe, and their part of those looked
-    at. evaluations: linearisations, one for each step. shift: movement of the last step, pixels.
+    at. evaluations: linearisations, one for each step. shift: movement of the last step, pixels; infinite if there was
+    none to take. unlikely: negative log-likelihood per pixel.
     """
 
     T_base_cam: FloatArray
@@ -56,6 +59,7 @@ class Alignment:
     evaluations: int
     shift: float
     observability: float
+    unlikely: float
 
     @property
     def is_good(self) -> bool:
@@ -70,27 +74,21 @@ class BaselineTracker:
     """
 
     spline = None
+    spline_valid: tuple[tuple[float, float], ...] = ()
 
     def __init__(self, rig: Rig, options: Options | None = None) -> None:
         self.rig, self.options = rig, options or Options(method="baseline")
-        shutter = rig.depth_shutter
-        self._e = engine(self.options.backend)
-        self._lens = Lens(rig.depth_camera, Shutter(0.0, shutter.exposure_s, shutter.scan))
-        lines = shutter.line_count(rig.depth_camera)
-        self._to_middle = 0.5 * (lines - 1) * shutter.line_delay(rig.depth_camera)
-        rays = camera_rays(Exposure(self._lens, 0.0, np.eye(4)))
-        device_rays = self._e.upload(rays[..., 0]), self._e.upload(rays[..., 1])
-        self._terms = Terms(self._e, device_rays)
-        self._maker = KeyframeMaker(self._e, rays, device_rays)
+        self._prepare = Preparer(rig, self.options)
+        self._terms, self._maker = self._prepare.terms, self._prepare.maker
         self._reference: Reference | None = None
         self._first_count = 0
-        self._fed = 0
+        self._last_fed = -np.inf
         self._lost_in_a_row = 0
         self._stamps: list[float] = []
         self._times: list[float] = []
         self._poses: list[FloatArray] = []
-        # The pose that the next frame starts from if there is no motion to go on with.
-        self._last = np.eye(4)
+        # Times and poses that the motion is extrapolated from: two, or one after a start.
+        self._last: list[tuple[float, FloatArray]] = []
         self.reports: list[FrameReport] = []
         self.keyframes = 0
 
@@ -98,101 +96,114 @@ class BaselineTracker:
     def trajectory(self) -> tuple[FloatArray, FloatArray]:
         """Stamps (n,) of the frames that were not lost and T_world_depth (n, 4, 4) there."""
         stamps = np.array(self._stamps)
-        return stamps, interpolated(np.array(self._times), np.array(self._poses), stamps)
+        poses = np.array(self._poses).reshape(-1, 4, 4)
+        return stamps, interpolated(np.array(self._times), poses, stamps) if len(poses) else poses
 
     def feed(self, frame: Frame) -> FrameReport:
-        """Track one frame."""
-        exposure = Exposure(self._lens, frame.depth.stamp + self._to_middle, np.eye(4))
-        new = depth_image(self._e, exposure, frame.depth.pixels, self.options.max_depth)
-        self._fed += 1
-        if self._reference is None:
-            self._found(frame.depth.stamp, new, np.eye(4))
-            self._set_keyframe(new, self._last, None)
-            report = FrameReport(
-                stamp=frame.depth.stamp, sigma_depth_m=float("nan"), sigma_intensity=float("nan"), inliers_depth=0,
-                inliers_color=0, iterations=0, evaluations=0, last_shift_px=0.0, keyframe=True, lost=False,
-                observability=0.0, overlap=1.0,
-            )  # fmt: skip
-        else:
-            report = self._track(frame.depth.stamp, new, self._reference)
+        """Track one frame. Raises UserError if it is not newer than the one before, or its image is not the rig's."""
+        stamp = frame.depth.stamp
+        if not stamp > self._last_fed:
+            raise UserError(
+                f"tracker: frame stamped {stamp:.6f} s follows one stamped {self._last_fed:.6f} s: frames must come in "
+                "order of time"
+            )
+        self._last_fed = stamp
+        new = self._prepare(len(self.reports), frame)
+        report = self._start(new) if self._reference is None else self._track(new, self._reference)
         self.reports.append(report)
         return report
 
-    def _track(self, stamp: float, new: DepthImage, ref: Reference) -> FrameReport:
+    def _start(self, new: Prepared) -> FrameReport:
+        is_lost = new.depth_share < _LEAST_SHARE
+        if not is_lost:
+            self._found(new, np.eye(4))
+            self._set_keyframe(new, np.eye(4), None)
+        nowhere = Alignment(np.eye(4), float("nan"), 0, 0.0, 0, 0.0, 0.0, np.inf)
+        return _report(new, nowhere, 1.0, keyframe=not is_lost, lost=is_lost)
+
+    def _track(self, new: Prepared, ref: Reference) -> FrameReport:
         found = self._search(new, ref)
-        T_world_cam = se3.orthonormalise(ref.T_world_base @ found.T_base_cam)
+        self._first_count = max(self._first_count, found.count if found.is_good else 1)
+        overlap = found.count / self._first_count
         if found.is_good:
-            self._found(stamp, new, T_world_cam)
-            self._first_count = max(self._first_count, found.count)
-            overlap = found.count / self._first_count
-            changed = self._is_left_behind(found, overlap)
-            if changed:
+            T_world_cam = se3.orthonormalise(ref.T_world_base @ found.T_base_cam)
+            self._found(new, T_world_cam)
+            renew = self._is_left_behind(found, overlap)
+            if renew:
                 self._set_keyframe(new, T_world_cam, ref)
             elif self.options.fuse:
-                self._reference = self._maker.fused(ref, new, _still(T_world_cam, new.exposure.mid_time))
+                self._reference = self._maker.fused(ref, new.depth, _still(T_world_cam, new.depth.exposure.mid_time))
         else:
             self._lost_in_a_row += 1
-            overlap = found.count / max(1, self._first_count)
-            changed = self._lost_in_a_row >= _MOST_LOST
-            if changed:
-                self._set_keyframe(new, self._last, None)
+            renew = self._lost_in_a_row >= _MOST_LOST and new.depth_share >= _LEAST_SHARE
+            if renew:
+                self._last = [(new.depth.exposure.mid_time, self._last[-1][1])]
                 self._lost_in_a_row = 0
-        return FrameReport(
-            stamp=stamp, sigma_depth_m=found.sigma, sigma_intensity=float("nan"), inliers_depth=found.count,
-            inliers_color=0, iterations=found.evaluations, evaluations=found.evaluations, last_shift_px=found.shift,
-            keyframe=changed, lost=not found.is_good, observability=found.observability, overlap=overlap,
-        )  # fmt: skip
+                self._set_keyframe(new, self._last[-1][1], None)
+        return _report(new, found, overlap, keyframe=renew, lost=not found.is_good)
 
-    def _search(self, new: DepthImage, ref: Reference) -> Alignment:
-        """Alignment from the predicted pose or, where that fails, from the keyframe's own."""
+    def _search(self, new: Prepared, ref: Reference) -> Alignment:
+        """Alignment from the predicted pose or, where that fails, the better one of those from the last pose and the
+        keyframe's."""
         to_base = se3.inverse(ref.T_world_base)
-        found = self._align(new, ref, to_base @ self._predict(new.exposure.mid_time))
+        found = self._align(new.depth, ref, to_base @ self._predict(new.depth.exposure.mid_time))
         if found.is_good:
             return found
-        again = self._align(new, ref, np.eye(4))
-        return again if again.is_good else found
+        others = [self._align(new.depth, ref, to_base @ T) for T in (self._last[-1][1], ref.T_world_base)]
+        return min((other for other in others if other.is_good), key=lambda other: other.unlikely, default=found)
 
     def _predict(self, t: float) -> FloatArray:
-        """Constant velocity; no motion after a loss, when the velocity is old or is what misled."""
-        if self._lost_in_a_row or len(self._poses) < 2:
-            return self._last
-        T: FloatArray = interpolated(np.array(self._times[-2:]), np.array(self._poses[-2:]), np.array([t]))[0]
+        """Constant velocity, unless it is too long ago."""
+        times, poses = np.array([at for at, _ in self._last]), np.array([T for _, T in self._last])
+        if t - times[-1] > _GAP_S:
+            return self._last[-1][1]
+        T: FloatArray = interpolated(times, poses, np.array([t]))[0]
         return T
 
     def _align(self, new: DepthImage, ref: Reference, T_base_cam: FloatArray) -> Alignment:
-        """Gauss-Newton from a pose, coarse to fine; a step that makes the image less likely is shortened."""
-        camera = self.rig.depth_camera
-        sigma, evaluations, shift = _START_DEPTH, 0, np.inf
+        """Gauss-Newton from a pose, coarse to fine."""
+        found = Alignment(T_base_cam, _START_DEPTH, 0, 1.0, 0, 0.0, 0.0, np.inf)
         for level in reversed(range(len(STRIDES))):
-            looked_at = -(-camera.width // STRIDES[level]) * -(-camera.height // STRIDES[level])
-            T, least, step = T_base_cam, np.inf, np.zeros(6)
-            for _ in range(_MOST_STEPS[level]):
-                sums, next_sigma = self._terms.geometric_pose(new, ref, T, level, sigma)
-                evaluations += 1
-                share, weakest = sums.count / looked_at, observability(sums, ref.lever)
-                if share < _LEAST_SHARE or not weakest > 0.0:
-                    return Alignment(T, sigma, sums.count, share, evaluations, np.inf, weakest)
-                # Negative logarithm of the Student-t likelihood per pixel; the step of σ alone never raises it.
-                unlikely = sums.cost / sums.count + np.log(sigma)
-                if unlikely > least + _SAME:
-                    step = _SHORTEN * step
-                else:
-                    least, T_base_cam = unlikely, T
-                    step = -sigma * np.linalg.solve(sums.H[0, 0], sums.g[0, 0])
-                    sigma = next_sigma
-                T = se3.orthonormalise(se3.exp(step) @ T_base_cam)
-                shift = camera.fx * float(np.abs(step[:3]).max() / ref.lever + np.abs(step[3:]).max())
-                if shift < STOP_PX[level]:
-                    T_base_cam = T
-                    break
-        return Alignment(T_base_cam, sigma, sums.count, share, evaluations, shift, weakest)
+            if np.isfinite(found.shift):
+                found = self._descend(new, ref, found, level)
+        return found
 
-    def _found(self, stamp: float, new: DepthImage, T_world_cam: FloatArray) -> None:
+    def _descend(self, new: DepthImage, ref: Reference, start: Alignment, level: int) -> Alignment:
+        """Gauss-Newton on one level; a step that makes the image less likely is shortened.
+
+        The Hessian's curvature is that of residuals within 2 σ: where they are larger, full steps are up to five times
+        too long.
+        """
+        camera, found = self.rig.depth_camera, start
+        looked_at = -(-camera.width // STRIDES[level]) * -(-camera.height // STRIDES[level])
+        T, sigma, least, step = start.T_base_cam, start.sigma, np.inf, np.zeros(6)
+        for tried in range(1, _MOST_STEPS[level] + 1):
+            sums, next_sigma = self._terms.geometric_pose(new, ref, T, level, sigma)
+            unlikely = self._terms.negative_log_likelihood(sums, looked_at, level, sigma)
+            share, weakest = sums.count / looked_at, observability(sums, ref.lever)
+            usable = share >= _LEAST_SHARE and weakest > _LEAST_SEEN
+            if tried == 1 and not usable:
+                return Alignment(T, sigma, sums.count, share, start.evaluations + tried, np.inf, weakest, unlikely)
+            if usable and unlikely < least + _SAME:
+                least = unlikely
+                found = Alignment(T, sigma, sums.count, share, start.evaluations, np.inf, weakest, unlikely)
+                step = -sigma * np.linalg.solve(sums.H[0, 0], sums.g[0, 0])
+                sigma = max(next_sigma, _LEAST_SIGMA[level])
+            else:
+                step = _SHORTEN * step
+            T = se3.orthonormalise(se3.exp(step) @ found.T_base_cam)
+            shift = camera.fx * float(np.abs(step[:3]).max() / ref.lever + np.abs(step[3:]).max())
+            if shift < STOP_PX[level]:
+                return replace(found, T_base_cam=T, sigma=sigma, evaluations=start.evaluations + tried, shift=shift)
+        return replace(found, sigma=sigma, evaluations=start.evaluations + _MOST_STEPS[level], shift=shift)
+
+    def _found(self, new: Prepared, T_world_cam: FloatArray) -> None:
+        t = new.depth.exposure.mid_time
         self._lost_in_a_row = 0
-        self._stamps.append(stamp)
-        self._times.append(new.exposure.mid_time)
+        self._stamps.append(new.stamp)
+        self._times.append(t)
         self._poses.append(T_world_cam)
-        self._last = T_world_cam
+        self._last = [*self._last[-1:], (t, T_world_cam)]
 
     def _is_left_behind(self, found: Alignment, overlap: float) -> bool:
         """The tracker's criterion for a new keyframe."""
@@ -205,9 +216,10 @@ class BaselineTracker:
             or angle > options.keyframe_angle_deg
         )
 
-    def _set_keyframe(self, new: DepthImage, T_world_cam: FloatArray, older: Reference | None) -> None:
-        motion = _still(T_world_cam, new.exposure.mid_time)
-        self._reference = self._maker.rectified(self._fed, new, (), motion, older if self.options.fuse else None)
+    def _set_keyframe(self, new: Prepared, T_world_cam: FloatArray, older: Reference | None) -> None:
+        motion = _still(T_world_cam, new.depth.exposure.mid_time)
+        older = older if self.options.fuse else None
+        self._reference = self._maker.rectified(new.index, new.depth, (), motion, older)
         self._first_count = 0
         self.keyframes += 1
 
@@ -228,3 +240,20 @@ def interpolated(times: FloatArray, poses: FloatArray, t: FloatArray) -> FloatAr
 def _still(T_world_cam: FloatArray, t: float) -> Spline:
     """A camera that does not move around time t (s): what a global-shutter image's only line knows of its motion."""
     return Spline(np.repeat(T_world_cam[None], 4, axis=0), t - 0.5, 1.0)
+
+
+def _report(new: Prepared, found: Alignment, overlap: float, *, keyframe: bool, lost: bool) -> FrameReport:
+    return FrameReport(
+        stamp=new.stamp,
+        sigma_depth_m=found.sigma,
+        sigma_intensity=float("nan"),
+        inliers_depth=found.count,
+        inliers_color=0,
+        iterations=found.evaluations,
+        evaluations=found.evaluations,
+        last_shift_px=found.shift,
+        keyframe=keyframe,
+        lost=lost,
+        observability=found.observability,
+        overlap=overlap,
+    )

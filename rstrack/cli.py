@@ -29,8 +29,8 @@ camera.yaml or calibration.yaml inside, or in the file that --camera names.
 _STATUS = "exit status: 0 done, 1 frames were lost, 2 wrong input, 130 interrupted (what there is has been written)"
 
 HELP = {
-    "method": "rs models the rolling shutter, gs takes it for a global one; p photometric, g geometric error; baseline: "
-    "one pose a frame",
+    "method": "rs models the rolling shutter, gs takes it for a global one; p photometric, g geometric error; baseline "
+    "has one pose a frame",
     "knot_spacing_s": "time between control points of the spline, s",
     "knot_phase": "the first knot lies this part of the spacing before the first line",
     "backend": "where kernels run",

@@ -74,5 +74,6 @@ def _truth(dataset: Dataset) -> str:
     if truth is None:
         return "none: runs can be plotted but not evaluated"
     if isinstance(truth.motion, Spline):
-        return f"a spline, exact at every line: {len(truth.motion.control_points)} knots {1e3 * truth.motion.dt:g} ms apart"
+        knots = f"{len(truth.motion.control_points)} control points {1e3 * truth.motion.dt:g} ms apart"
+        return f"a spline, exact at every line: {knots}"
     return f"{len(truth.motion)} poses, {truth.motion.stamps[0]:.3f} to {truth.motion.stamps[-1]:.3f} s"

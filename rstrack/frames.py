@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.geometry.camera import Camera
 from rsgen.geometry.so3 import FloatArray
 from rstrack.engine import Engine
 from rstrack.lines import Exposure
@@ -75,7 +76,11 @@ def masked_pyramid(
 
 
 def camera_rays(exposure: Exposure) -> FloatArray:
-    """Undistorted normalised coordinates (h, w, 2) of every pixel; 0 where the lens sees nothing."""
+    """Undistorted normalised coordinates (h, w, 2) of every pixel; 0 where the lens sees nothing (`lens_sees`)."""
     camera = exposure.lens.camera
-    rays = camera.unproject(camera.pixel_grid())
-    return np.nan_to_num(rays[..., :2] / rays[..., 2:])
+    return np.nan_to_num(camera.unproject(camera.pixel_grid())[..., :2])
+
+
+def lens_sees(camera: Camera) -> npt.NDArray[np.bool_]:
+    """Pixels (h, w) through which the camera's model sees a direction."""
+    return np.asarray(np.isfinite(camera.unproject(camera.pixel_grid())).all(axis=-1))

@@ -15,7 +15,7 @@ from rstrack.engine import Engine
 from rstrack.frames import ColorImage, DepthImage
 from rstrack.lines import from_base_table, to_base_table
 from rstrack.rectify import color_kernel, fuse_kernel, rectify_kernel
-from rstrack.reference import Image, Reference, depth_scaling, level_points, rectified_lens, surface_slopes
+from rstrack.reference import STRIDES, Image, Reference, depth_scaling, level_points, rectified_lens, surface_slopes
 from rstrack.warp import Lens
 
 # Metres at one metre: depths that differ by more show different surfaces.
@@ -117,7 +117,7 @@ class KeyframeMaker:
         weights = e.upload(np.where(rho > 0, 1.0, 0.0) if weight is None else weight)
         return Reference(
             index, depth.exposure.stamp, t, T_world_base, lens, rolling, device_rho, e.upload(slope_x),
-            e.upload(slope_y), weights, points, lever, bound,
+            e.upload(slope_y), weights, points, lever, bound, int(np.count_nonzero(rho)) // STRIDES[0] ** 2,
         )  # fmt: skip
 
     def _kernel(self, make: Any, *key: Any) -> Any:

@@ -37,9 +37,7 @@ class Quadratic:
         return replace(self, g=self.g + self.H @ step) if step.any() else self
 
 
-def line_jacobian(
-    spline: Spline, T_world_base: FloatArray, times: FloatArray, first: int, count: int
-) -> FloatArray:
+def line_jacobian(spline: Spline, T_world_base: FloatArray, times: FloatArray, first: int, count: int) -> FloatArray:
     """η in the base frame by the control points first..first+count: (n, 6, 6 count)."""
     at, J = spline.pose_jacobian(times)
     J = se3.adjoint(se3.inverse(T_world_base)) @ J
@@ -77,8 +75,8 @@ def chain(
 def acceleration_prior(spline: Spline, first: int, last: int, sigma: FloatArray) -> tuple[Quadratic, float]:
     """Ω_{i+1} − Ω_i ~ N(0, diag σ²) for the triples of control points within first..last (exclusive).
 
-    sigma (triples, 6): m and rad per knot squared, so acceleration times dt². Derivative of Ω_j = log(T_{j−1}⁻¹ T_j) by left
-    increments: Jl⁻¹(Ω_j) Ad(T_{j−1}⁻¹) (δ_j − δ_{j−1}). Returns the model and the cost.
+    sigma (triples, 6): m and rad per knot squared, so acceleration times dt². Derivative of Ω_j = log(T_{j−1}⁻¹ T_j) by
+    left increments: Jl⁻¹(Ω_j) Ad(T_{j−1}⁻¹) (δ_j − δ_{j−1}). Returns the model and the cost.
     """
     count = last - first
     H, g = np.zeros((6 * count, 6 * count)), np.zeros(6 * count)
@@ -95,16 +93,14 @@ def acceleration_prior(spline: Spline, first: int, last: int, sigma: FloatArray)
     return Quadratic(first, H, g), cost
 
 
-def pose_constraint(
-    spline: Spline, t: float, T_world_body: FloatArray, sigma: FloatArray
-) -> tuple[Quadratic, float]:
+def pose_constraint(spline: Spline, t: float, T_world_body: FloatArray, sigma: FloatArray) -> tuple[Quadratic, float]:
     """T(t) = T_world_body up to sigma (6,) (m, rad): fixes the gauge while the reference's control points are free.
 
     Returns the model and the cost.
     """
     segment, J = spline.pose_jacobian(t)
-    J = np.hstack(list(J))
     e = se3.log(spline.pose(t) @ se3.inverse(T_world_body))
+    J = se3.left_jacobian_inv(e) @ np.hstack(list(J))
     model = Quadratic(int(segment), J.T @ (J / sigma[:, None] ** 2), J.T @ (e / sigma**2))
     return model, 0.5 * float(np.sum((e / sigma) ** 2))
 

@@ -6,8 +6,10 @@ fraction of a pixel the model is only shifted (g += H ε); it is linearised anew
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +25,8 @@ from rstrack.terms import Linearised, Terms
 STOP_PX = (0.01, 0.1, 0.3)
 # Lines that have moved less since a linearisation keep it.
 RELINEARISE_PX = 0.02
+# Rise of the negative log-likelihood per pixel from which on a step has made things worse: less is noise of gating.
+_WORSE = 2e-5
 # Errors at the start of a level, as σ: m and intensity; re-estimated with every linearisation.
 _START_DEPTH, _START_INTENSITY = 5e-3, 0.03
 
@@ -42,6 +46,24 @@ class SplineState:
         if self._spline is None:
             self._spline = Spline(self.points, self.t0, self.dt)
         return self._spline
+
+    def copy(self) -> SplineState:
+        """A state that can be changed without changing this one."""
+        twin = copy.copy(self)
+        twin.moved = self.moved.copy()
+        return twin
+
+    def restarted(self, end: float, first: float, last: float, T_world_body: FloatArray) -> SplineState:
+        """The same up to time `end`; from `first` to `last` standing still at T_world_body (4, 4)."""
+        keep = self.segment(end) + 4
+        twin = copy.copy(self)
+        start, stop = self.segment(first), self.segment(last) + 4
+        gap = np.repeat(self.points[keep - 1][None], max(0, start - keep), axis=0)
+        still = np.repeat(T_world_body[None], stop - start, axis=0)
+        twin.points = np.concatenate([self.points[: min(keep, start)], gap, still])
+        twin.moved = np.zeros((len(twin.points), 6))
+        twin._spline = None
+        return twin
 
     def segment(self, t: float) -> int:
         """Index of the first of the four control points that a time depends on."""
@@ -152,9 +174,7 @@ class Problem:
     bandwidth: int = 24
 
 
-def optimise(
-    terms: Terms, state: SplineState, problem: Problem, levels: Sequence[int], most: Sequence[int]
-) -> Solved:
+def optimise(terms: Terms, state: SplineState, problem: Problem, levels: Sequence[int], most: Sequence[int]) -> Solved:
     """Levenberg-Marquardt on each of the pyramid's levels, coarse to fine, with at most most[level] steps.
 
     A level ends when no line of the fresh images moves any more. Steps that raise the cost are taken back and damped.
@@ -168,16 +188,15 @@ def optimise(
     return done
 
 
-def _optimise_level(
-    terms: Terms, state: SplineState, problem: Problem, level: int, most: int, done: Solved
-) -> None:  # fmt: skip
+def _optimise_level(terms: Terms, state: SplineState, problem: Problem, level: int, most: int, done: Solved) -> None:
     first, damping, cost = problem.free[0], 0.0, np.inf
     weights: dict[int, float] = {}
-    before, step, undo = None, None, None
+    step: FloatArray | None = None
+    undo: list[Any] | None = None
     for _ in range(most):
         done.evaluations += _linearise(terms, state, problem, level)
         now = _cost(state, problem, weights)
-        if undo is not None and now > cost + 1e-4 * abs(cost) ** 0.5:
+        if undo is not None and step is not None and now > cost + _WORSE * sum(weights.values()):
             # Worse than before: back to where it was, and a shorter step from there.
             state.apply(first, -step)
             for observation, kept in zip((*problem.fresh, *problem.settled), undo, strict=True):

@@ -50,7 +50,7 @@ class Reference:
     T_world_base (4, 4) at time `t` (s): the frame in which its depth is given if it is rectified. `rolling`: the
     depth camera's exposure if it is not; the base frame is then only a frame to compute in.
     Inverse depth (1/m, 0 missing), its smoothed slopes by normalised coordinates, and fusion weights, on the device.
-    lever, bound: see `residuals.Scaling`, for the geometric term.
+    lever, bound: see `residuals.Scaling`, for the geometric term. pixels: how many of the finest level have depth.
     """
 
     index: int
@@ -66,6 +66,7 @@ class Reference:
     points: tuple[Points, ...]
     lever: float
     bound: float
+    pixels: int
 
 
 def rectified_lens(camera: Camera) -> Lens:

@@ -37,7 +37,7 @@ _SLOTS = 32
 # Relative spread of inverse depth within 2×2 pixels from which on they lie on both sides of an edge.
 EDGE = 0.03
 # Share of a pixel's weight that its curvature keeps at least.
-_CURVATURE = 0.2
+_CURVATURE = 0.5
 _PAIRS = [(a, b) for a in range(6) for b in range(a, 6)]
 
 

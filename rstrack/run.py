@@ -22,7 +22,6 @@ import numpy as np
 
 from rsgen.errors import UserError
 from rsgen.files import write_error
-from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.compare import Truth, compare, truth_of
@@ -35,7 +34,7 @@ from rstrack.prefetch import prefetched
 from rstrack.rig import Frame, Rig
 
 if TYPE_CHECKING:
-    from rstrack.tracker import FrameReport
+    from rstrack.frame_report import FrameReport
 
 Progress = Callable[[str, float, str], None]
 """Called with a stage, the fraction done (0 to 1) and a note."""
@@ -48,18 +47,22 @@ _DATASET_FILES = ("sequence.yaml", "rgb.txt", "depth.txt", "associations.txt", "
 
 
 class AnyTracker(Protocol):
-    """What all trackers have in common. spline: None where a method has none; keyframes: their number so far."""
+    """What all trackers have in common. reports: of all frames so far. keyframes: their number so far."""
 
     reports: list[FrameReport]
     keyframes: int
 
     @property
     def spline(self) -> Spline | None:
-        """T_world_depth(t) so far."""
+        """T_world_depth(t) so far, None where there is none."""
+
+    @property
+    def spline_valid(self) -> Sequence[tuple[float, float]]:
+        """Times (begin, end) in s within which the spline is an estimate."""
 
     @property
     def trajectory(self) -> tuple[FloatArray, FloatArray]:
-        """Stamps (n,) in seconds and T_world_depth (n, 4, 4) there."""
+        """Stamps (n,) in s of the frames that were not lost and T_world_depth (n, 4, 4) there."""
 
     def feed(self, frame: Frame) -> FrameReport:
         """Track one frame."""
@@ -96,7 +99,7 @@ class Result:
         lost = f"{self.lost} lost" if self.lost else "none lost"
         rate = done / times["total_s"]
         lines = [
-            f"{info['method']} on {info['dataset']['name']}: {part}, {info['keyframes']} keyframes, {lost}",
+            f"{info['method']} on {info['dataset']['name']}: {part}, {_keyframes(info['keyframes'])}, {lost}",
             f"{times['total_s']:.1f} s, {rate:.1f} frames/s on {info['backend']}; a frame takes "
             f"{times['median_ms']:.1f} ms (median), {times['mean_ms']:.1f} (mean), {times['p95_ms']:.1f} (95 %)",
         ]
@@ -162,9 +165,9 @@ def track(
                 break
             seconds.append(time.perf_counter() - start)
             if count % _TRUTH_EVERY == 0 or count == len(chosen):
-                note = _error_note(truth, _tracked(tracker, dataset.stamps[chosen]))
+                note = _error_note(truth, tracker.trajectory)
             rate = count / (time.perf_counter() - begin)
-            progress("tracking", count / len(chosen), f"{rate:.1f} frames/s, {tracker.keyframes} keyframes{note}")
+            progress("tracking", count / len(chosen), f"{rate:.1f} frames/s, {_keyframes(tracker.keyframes)}{note}")
             if stopped.is_set() and count < len(chosen):
                 end = "interrupted"
                 break
@@ -173,17 +176,16 @@ def track(
         raise UserError(error)
     timings = _timings(time.perf_counter() - begin, seconds)
     stamps = dataset.stamps[chosen][: len(seconds)]
-    poses = _tracked(tracker, stamps)
     info = _settings(dataset, chosen, options, noise) | {
         "end": end,
         "error": error or None,
         "keyframes": tracker.keyframes,
         "lost": sum(report.lost for report in tracker.reports),
-        "spline_valid": _valid(dataset.rig, stamps, tracker.reports),
+        "spline_valid": tracker.spline_valid,
         "timings": timings,
         "frames": _diagnostics(stamps, tracker.reports),
     }
-    estimate = Estimate(*poses, tracker.spline, info)
+    estimate = Estimate(*tracker.trajectory, tracker.spline, info)
     metrics = _metrics(truth, estimate)
     info["metrics"] = None if metrics is None else metrics.as_dict()
     write_estimate(out, estimate.stamps, estimate.T_world_depth, estimate.spline, info)
@@ -233,12 +235,8 @@ def _stop_flag() -> Iterator[threading.Event]:
         signal.signal(signal.SIGINT, before)
 
 
-def _tracked(tracker: AnyTracker, frame_stamps: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Stamps and poses of the frames that have a report and were not lost; `frame_stamps` may go on after them."""
-    good = [stamp for stamp, report in zip(frame_stamps, tracker.reports, strict=False) if not report.lost]
-    stamps, T_world_depth = tracker.trajectory
-    keep = np.isin(stamps, good)
-    return stamps[keep], T_world_depth[keep]
+def _keyframes(count: int) -> str:
+    return f"{count} keyframe" + ("" if count == 1 else "s")
 
 
 def _error_note(truth: Truth | None, poses: tuple[FloatArray, FloatArray]) -> str:
@@ -284,22 +282,6 @@ def _timings(total_s: float, seconds: Sequence[float]) -> dict[str, Any]:
         "p95_ms": float(np.percentile(ms, 95)),
         "frame_ms": np.round(ms, 3),
     }
-
-
-def _valid(rig: Rig, stamps: FloatArray, reports: Sequence[FrameReport]) -> list[list[float]]:
-    """Times [begin, end] in s, from the first to the last line of every unbroken row of tracked frames."""
-    shutter: Shutter = rig.depth_shutter
-    ends = np.array([0, shutter.line_count(rig.depth_camera) - 1])
-    spans = shutter.line_mid_time(stamps[:, None], ends, rig.depth_camera)
-    found: list[list[float]] = []
-    was_lost = True
-    for span, report in zip(spans, reports, strict=True):
-        if not report.lost and was_lost:
-            found.append([float(span.min()), float(span.max())])
-        elif not report.lost:
-            found[-1][1] = float(span.max())
-        was_lost = report.lost
-    return found
 
 
 def _diagnostics(stamps: FloatArray, reports: Sequence[FrameReport]) -> list[dict[str, Any]]:

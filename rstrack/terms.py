@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,7 +17,7 @@ from rstrack.lines import IDENTITY_FROM_BASE, from_base_table, to_base_table
 from rstrack.normal_equations import Quadratic, chain
 from rstrack.reference import STRIDES, Points, Reference
 from rstrack.residuals import BlockSums, Scaling, block_counts, geometric_kernel, photometric_kernel
-from rstrack.robust import scale_step
+from rstrack.robust import NU, scale_step
 from rstrack.warp import Lens
 
 
@@ -76,13 +77,23 @@ class Terms:
     ) -> BlockSums:
         e, lens = self.e, image.exposure.lens
         kernel = self._kernel(geometric_kernel, lens, ref.lens, STRIDES[level])
-        gate = min(self.gate_depth, max(5.0 * sigma, 10 * self.floor_depth)) if level == 0 else self.gate_depth
         scaling = self._scaling(ref, lens, lens.camera, ref, STRIDES[level], 1)
-        constants = e.upload(scaling.parameters(sigma, gate))
+        constants = e.upload(scaling.parameters(sigma, self._depth_gate(level, sigma)))
         surface = ref.inverse_depth, ref.slope_x, ref.slope_y
         raw = kernel(image.z, *self.rays, e.upload(to_base), *surface, from_base, constants)
         current, reference, _, _ = block_counts(lens, ref.lens)
         return scaling.unpack(raw.numpy(), current, reference)
+
+    def _depth_gate(self, level: int, sigma: float) -> float:
+        return min(self.gate_depth, max(5.0 * sigma, 10 * self.floor_depth)) if level == 0 else self.gate_depth
+
+    def negative_log_likelihood(self, sums: BlockSums, looked_at: int, level: int, sigma: float) -> float:
+        """Student t's, per pixel looked at and up to a constant; a pixel beyond the gate counts like one at the gate.
+
+        It does not fall by pushing pixels out. The step of σ alone never raises it.
+        """
+        at_gate = 0.5 * (NU + 1.0) * math.log(1.0 + (self._depth_gate(level, sigma) / sigma) ** 2 / NU)
+        return (sums.cost + (looked_at - sums.count) * at_gate) / looked_at + math.log(sigma)
 
     def photometric(self, image: ColorImage, ref: Reference, spline: Spline, level: int, sigma: float) -> Linearised:
         """The reference's points of a level against that level of the colour image."""

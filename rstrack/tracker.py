@@ -1,4 +1,4 @@
-"""The online tracker (paper, section 3.5): grow the spline, align, freeze, choose keyframes.
+"""The online tracker (paper, section 3.5): grow the spline, align, freeze, choose keyframes, fuse.
 
 tracker = Tracker(rig, Options())
 for frame in frames:
@@ -9,78 +9,38 @@ stamps, T_world_depth = tracker.trajectory
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 
+from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
-from rstrack.engine import engine
-from rstrack.frames import ColorImage, DepthImage, camera_rays, color_image, depth_image
-from rstrack.keyframe import KeyframeMaker
-from rstrack.lines import Exposure
-from rstrack.normal_equations import acceleration_prior, pose_constraint
+from rstrack.frame_report import FrameReport
+from rstrack.health import Health
+from rstrack.normal_equations import Quadratic, acceleration_prior, pose_constraint
 from rstrack.optimizer import Extra, Observation, Problem, Solved, SplineState, optimise
 from rstrack.options import Options
+from rstrack.prepare import Prepared, Preparer
 from rstrack.reference import Reference
-from rstrack.rig import Frame, Image, Rig
-from rstrack.terms import Terms
-from rstrack.warp import Lens
+from rstrack.rig import Frame, Rig
 
 # Motion prior: standard deviation of accelerations, m/s² and rad/s². Hand-held cameras reach 35 m/s² (DESIGN section
-# 5), so it says little where there are data, and holds the newest control points, whose weight is only u³/6.
-import os
-PRIOR_ACCELERATION = float(os.environ.get('PA','5'))*np.array([1.0,1,1,2,2,2])
-NEWEST = float(os.environ.get('NEWEST','0.1'))
+# 5), so it says little where there are data. The newest control points, whose weight in the newest lines is only u³/6,
+# are held a good deal tighter: small systematic errors of the lines would throw them about.
+_ACCELERATION = np.array([5.0, 5.0, 5.0, 10.0, 10.0, 10.0])
+_NEWEST_TRIPLES, _NEWEST_FACTOR = 2, 0.1
 # Metres and radians within which the reference's pose is held while its own control points are free.
 _GAUGE = np.full(6, 1e-6)
+_LEVELS = (2, 1, 0)
 # Steps at most on the pyramid's levels, finest first.
 _MOST_STEPS = (15, 8, 8)
-_LEVELS = (2, 1, 0)
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """A frame on the device."""
-
-    index: int
-    depth: DepthImage
-    colors: tuple[ColorImage, ...]
-
-    @property
-    def exposures(self) -> list[Exposure]:
-        """Of all its images."""
-        return [self.depth.exposure, *(c.exposure for c in self.colors)]
-
-    @property
-    def first_time(self) -> float:
-        """Time in s of its first line."""
-        return min(x.first_time for x in self.exposures)
-
-    @property
-    def last_time(self) -> float:
-        """Time in s of its last line."""
-        return max(x.last_time for x in self.exposures)
-
-
-@dataclass(frozen=True)
-class FrameReport:
-    """Diagnostics of one frame: scales in m and intensity, pixels used, steps, keyframe."""
-
-    stamp: float
-    sigma_depth_m: float
-    sigma_intensity: float
-    inliers_depth: int
-    inliers_color: int
-    iterations: int
-    evaluations: int
-    last_shift_px: float
-    keyframe: bool
-    lost: bool
-    observability: float
-    overlap: float
+# Seconds without a frame after which the motion before says nothing about where the camera is, and beyond which
+# frames hardly belong to one recording.
+_GAP_S, _BREAK_S = 0.3, 3600.0
+# Part of the pixels that must have depth for a frame to become a keyframe.
+_LEAST_DEPTH = 0.02
+_KEPT_KEYFRAMES = 8
 
 
 class Tracker:
@@ -88,187 +48,244 @@ class Tracker:
 
     def __init__(self, rig: Rig, options: Options | None = None) -> None:
         self.rig, self.options = rig, options or Options()
-        self._e = engine(self.options.backend)
-        rolling = self.options.rolling
-        self._depth_lens = Lens(rig.depth_camera, _seen_as(rig.depth_shutter, rolling))
-        self._color_lens = Lens(rig.color_camera, _seen_as(rig.color_shutter, rolling))
-        rays = camera_rays(Exposure(self._depth_lens, 0.0, np.eye(4)))
-        device_rays = self._e.upload(rays[..., 0]), self._e.upload(rays[..., 1])
-        self._terms = Terms(self._e, device_rays)
-        self._maker = KeyframeMaker(self._e, rays, device_rays)
+        self._prepare = Preparer(rig, self.options)
+        self._terms, self._maker = self._prepare.terms, self._prepare.maker
         self._state: SplineState | None = None
         self._reference: Reference | None = None
+        self._keyframes: deque[Reference] = deque(maxlen=_KEPT_KEYFRAMES)
+        # Frames whose control points still move, and the newest one whose do not.
         self._recent: deque[Prepared] = deque()
         self._active: list[Observation] = []
-        self._first_count = 0
+        self._health = Health()
+        self._pixels = 0
+        # First control point of the current piece of the spline: those before it belong to another, or to a gap.
+        self._piece = 0
         self._stamps: list[float] = []
+        self._last_fed = -np.inf
+        self.spline_valid: list[tuple[float, float]] = []
         self.reports: list[FrameReport] = []
         self.keyframes = 0
 
     # -- what it has found ------------------------------------------------------------------------------------------
 
     @property
-    def spline(self) -> Spline:
-        """T_world_depth(t) so far; the newest few control points still move."""
-        assert self._state is not None
-        return self._state.spline
+    def spline(self) -> Spline | None:
+        """T_world_depth(t) so far; the newest few control points still move. Meaningful within `spline_valid` (s)."""
+        return None if self._state is None else self._state.spline
 
     @property
     def trajectory(self) -> tuple[FloatArray, FloatArray]:
-        """Stamps (n,) of the frames and T_world_depth (n, 4, 4) there."""
+        """Stamps (n,) of the frames that were not lost and T_world_depth (n, 4, 4) there."""
+        if self.spline is None:
+            return np.zeros(0), np.zeros((0, 4, 4))
         stamps = np.array(self._stamps)
-        return stamps, self.spline.pose(np.maximum(stamps, self.spline.t_begin))
+        return stamps, self.spline.pose(stamps)
 
     # -- the loop ---------------------------------------------------------------------------------------------------
 
     def feed(self, frame: Frame) -> FrameReport:
-        """Track one frame."""
-        new = self._prepare(frame)
-        self._stamps.append(frame.depth.stamp)
+        """Track one frame. Raises UserError if it is not newer than the one before, or its images do not fit the rig."""
+        stamp = frame.depth.stamp
+        if not self._last_fed < stamp < max(self._last_fed, -1e300) + _BREAK_S and np.isfinite(self._last_fed):
+            raise UserError(
+                f"tracker: frame stamped {stamp:.6f} s follows one stamped {self._last_fed:.6f} s: frames must come in "
+                f"order of time and less than {_BREAK_S:.0f} s apart; cut the recording there"
+            )
+        gap, self._last_fed = stamp - self._last_fed, stamp
+        new = self._prepare(len(self.reports), frame)
         if self._state is None:
             report = self._start(new)
         elif self._reference is not None and self._reference.rolling is not None:
             report = self._bootstrap(new)
+        elif gap > _GAP_S:
+            report = self._relocalise(new)
         else:
             report = self._track(new)
         self.reports.append(report)
         return report
 
-    def _prepare(self, frame: Frame) -> Prepared:
-        depth = self._exposure(frame.depth, self._depth_lens, self.rig.depth_shutter, np.eye(4))
-        z = depth_image(self._e, depth, frame.depth.pixels, self.options.max_depth)
-        colors = []
-        if self.options.photometric:
-            for image in frame.colors:
-                exposure = self._exposure(image, self._color_lens, self.rig.color_shutter, self.rig.T_color_depth)
-                colors.append(color_image(self._e, exposure, image.pixels))
-        return Prepared(len(self._stamps), z, tuple(colors))
-
-    @staticmethod
-    def _exposure(image: Image, lens: Lens, true: Shutter, T_cam_body: FloatArray) -> Exposure:
-        """Seen as a global shutter, an image has the time of its middle line: the best that such a model can do."""
-        lines = true.line_count(lens.camera)
-        middle = 0.0 if lens.lines > 1 else 0.5 * (lines - 1) * true.line_delay(lens.camera)
-        return Exposure(lens, image.stamp + middle, T_cam_body)
-
     def _start(self, new: Prepared) -> FrameReport:
+        if new.depth_share < _LEAST_DEPTH or (self.options.photometric and not new.colors):
+            return self._report(new, lost=True)
         dt = self.options.knot_spacing_s
-        t0 = min(new.first_time, self._stamps[0]) - self.options.knot_phase * dt
-        self._state = SplineState(t0, dt, np.eye(4), 4)
+        self._state = SplineState(min(new.first_time, new.stamp) - self.options.knot_phase * dt, dt, np.eye(4), 4)
         self._state.extend(new.last_time)
         self._recent.append(new)
-        self._reference = self._maker.rolling(new.index, new.depth, new.colors, self._state.spline)
-        if self._reference.rolling is None:
-            self._reference = self._maker.rectified(new.index, new.depth, new.colors, self._state.spline, None)
-        return self._report(new.depth.exposure.stamp, [], Solved(), True)
+        if new.depth.exposure.lens.lines > 1:
+            self._reference = self._maker.rolling(new.index, new.depth, new.colors, self._state.spline)
+        else:
+            self._new_keyframe(new, None)
+        self._placed(new)
+        return self._report(new, keyframe=True)
 
     def _bootstrap(self, new: Prepared) -> FrameReport:
         """Joint alignment of the first frames with the first one, all of them rolling, from zero motion."""
-        assert self._state is not None and self._reference is not None
-        state, ref = self._state, self._reference
+        state, ref = self._known()
         state.extend(new.last_time)
         fresh = self._observe(new, ref)
         free = (0, len(state.points))
-        extras = [self._prior(free), lambda spline: pose_constraint(spline, ref.t, ref.T_world_base, _GAUGE)]
-        solved = self._optimise(fresh, self._active, free, extras, 6 * free[1])
+
+        def gauge(spline: Spline) -> tuple[Quadratic, float]:
+            return pose_constraint(spline, ref.t, ref.T_world_base, _GAUGE)
+
+        solved = self._optimise(state, fresh, self._active, free, [self._prior(free), gauge], bandwidth=6 * free[1])
+        if self._health.fault(fresh, solved, ref.pixels):
+            return self._begin_anew(new)
         self._active += fresh
         self._recent.append(new)
+        self._placed(new)
         if len(self._recent) < self.options.bootstrap_frames:
-            return self._report(new.depth.exposure.stamp, fresh, solved, False)
-        self._leave_bootstrap()
-        return self._report(new.depth.exposure.stamp, fresh, solved, True)
+            return self._report(new, fresh, solved)
+        self._leave_bootstrap(state)
+        return self._report(new, fresh, solved, keyframe=True)
 
-    def _leave_bootstrap(self) -> None:
+    def _begin_anew(self, new: Prepared) -> FrameReport:
+        """The first frames did not fit together: they are lost, and the newest is the first one."""
+        self._state, self._reference, self._active = None, None, []
+        self._stamps.clear()
+        self.spline_valid.clear()
+        self._recent.clear()
+        self.reports = [r.as_lost() for r in self.reports]
+        return self._start(new)
+
+    def _leave_bootstrap(self, state: SplineState) -> None:
         """Rectify the middle frame and align all others to it."""
-        assert self._state is not None
-        state = self._state
-        middle = self._recent[len(self._recent) // 2]
-        ref = self._maker.rectified(middle.index, middle.depth, middle.colors, state.spline, None)
-        others = [o for frame in self._recent if frame is not middle for o in self._observe(frame, ref)]
+        frames = list(self._recent)
+        middle = min(
+            (f for f in frames if f.depth_share >= _LEAST_DEPTH and (f.colors or not self.options.photometric)),
+            key=lambda f: abs(f.index - frames[len(frames) // 2].index),
+        )
+        ref = self._new_keyframe(middle, None)
+        self._active = [o for frame in frames if frame is not middle for o in self._observe(frame, ref)]
         free = (0, len(state.points))
-        self._optimise(others, [], free, [self._prior(free)], 24, levels=(0,))
-        self._set_reference(ref, others)
-
-    def _set_reference(self, ref: Reference, active: list[Observation]) -> None:
-        self._reference, self._active, self._first_count = ref, active, 0
-        self.keyframes += 1
+        self._optimise(state, self._active, [], free, [self._prior(free)], levels=(0,))
 
     def _track(self, new: Prepared) -> FrameReport:
-        assert self._state is not None and self._reference is not None
-        state, ref = self._state, self._reference
+        state, ref = self._known()
+        before = state.copy()
         state.extend(new.last_time)
-        free = (max(0, state.segment(new.first_time)), len(state.points))
-        self._active = [o for o in self._active if o.lin is None or o.lin.model.last > free[0]]
+        free = (max(self._piece, state.segment(new.first_time)), len(state.points))
+        self._active = [o for o in self._active if o.lin is not None and o.lin.model.last > free[0]]
         fresh = self._observe(new, ref)
-        solved = self._optimise(fresh, self._active, free, [self._prior(free)], 24)
+        solved = self._optimise(state, fresh, self._active, free, [self._prior(free)])
+        if self._health.fault(fresh, solved, ref.pixels):
+            self._state = before
+            return self._relocalise(new)
         self._active += fresh
         self._recent.append(new)
+        self._placed(new)
         overlap = self._overlap(fresh)
-        changed = self._maybe_new_keyframe(free[0], overlap)
-        return self._report(new.depth.exposure.stamp, fresh, solved, changed, overlap)
+        changed = self._renew_keyframe(state, free[0], overlap)
+        return self._report(new, fresh, solved, keyframe=changed, overlap=overlap)
+
+    def _relocalise(self, new: Prepared) -> FrameReport:
+        """Align a frame alone to the last keyframes, from where the track ended and from where they were taken."""
+        state, _ = self._known()
+        end = self.spline_valid[-1][1]
+        for ref in reversed(self._keyframes):
+            for T_world_body in (state.spline.pose(end), ref.T_world_base):
+                trial = state.restarted(end, new.first_time, new.last_time, T_world_body)
+                first = trial.segment(new.first_time)
+                fresh, free = self._observe(new, ref), (first, len(trial.points))
+                solved = self._optimise(trial, fresh, [], free, [self._prior(free, first)])
+                if self._health.fault(fresh, solved, ref.pixels):
+                    continue
+                self._state, self._piece, self._reference = trial, first, ref
+                self._active, self._pixels = fresh, 0
+                self._recent = deque([new])
+                self._placed(new, joined=False)
+                return self._report(new, fresh, solved, overlap=self._overlap(fresh))
+        self._active = []
+        self._recent.clear()
+        return self._report(new, lost=True)
+
+    # -- keyframes --------------------------------------------------------------------------------------------------
+
+    def _renew_keyframe(self, state: SplineState, first_free: int, overlap: float) -> bool:
+        """Fuse frames whose control points are frozen; promote the newest once the keyframe is left behind."""
+        _, ref = self._known()
+        options = self.options
+        frozen = [f for f in self._recent if state.segment(f.last_time) + 4 <= first_free]
+        for done in frozen[:-1]:
+            self._recent.popleft()
+            if options.fuse and done.index > ref.index:
+                ref = self._maker.fused(ref, done.depth, state.spline)
+                self._reference = self._keyframes[-1] = ref
+        T_base_cam = se3.inverse(ref.T_world_base) @ state.spline.pose(self._recent[-1].depth.exposure.mid_time)
+        angle = np.degrees(np.linalg.norm(se3.log(T_base_cam)[3:]))
+        far = np.linalg.norm(T_base_cam[:3, 3]) > options.keyframe_distance or angle > options.keyframe_angle_deg
+        if not (overlap < options.keyframe_overlap or far) or not frozen or frozen[-1].index <= ref.index:
+            return False
+        best = frozen[-1]
+        if best.depth_share < _LEAST_DEPTH or (options.photometric and not best.colors):
+            return False
+        self._new_keyframe(best, ref if options.fuse else None)
+        return True
+
+    def _new_keyframe(self, frame: Prepared, older: Reference | None) -> Reference:
+        state = self._state
+        assert state is not None
+        self._reference = self._maker.rectified(frame.index, frame.depth, frame.colors, state.spline, older)
+        self._keyframes.append(self._reference)
+        self._pixels = 0
+        self.keyframes += 1
+        return self._reference
+
+    def _overlap(self, fresh: list[Observation]) -> float:
+        first = next((o.lin for o in fresh if o.lin is not None and o.lin.count), None)
+        if first is None:
+            return 0.0
+        self._pixels = max(self._pixels, first.count)
+        return first.count / self._pixels
 
     # -- pieces -----------------------------------------------------------------------------------------------------
 
+    def _known(self) -> tuple[SplineState, Reference]:
+        assert self._state is not None and self._reference is not None
+        return self._state, self._reference
+
     def _observe(self, frame: Prepared, ref: Reference) -> list[Observation]:
         depth = [Observation(frame.index, frame.depth, ref)] if self.options.geometric else []
-        color = [Observation(frame.index, c, ref) for c in frame.colors] if ref.points else []
-        return depth + color
+        return depth + [Observation(frame.index, c, ref) for c in frame.colors if ref.points]
 
-    def _prior(self, free: tuple[int, int]) -> Extra:
-        sigma = PRIOR_ACCELERATION * self.options.knot_spacing_s**2
-        first, last = max(0, free[0] - 2), free[1]
-        sigmas = np.repeat(sigma[None], last - first - 2, axis=0)
-        sigmas[-2:] *= NEWEST
-        return lambda spline: acceleration_prior(spline, first, last, sigmas)
+    def _prior(self, free: tuple[int, int], piece: int | None = None) -> Extra:
+        first, last = max(self._piece if piece is None else piece, free[0] - 2), free[1]
+        sigma = np.repeat(_ACCELERATION[None] * self.options.knot_spacing_s**2, last - first - 2, axis=0)
+        sigma[-_NEWEST_TRIPLES:] *= _NEWEST_FACTOR
+        return lambda spline: acceleration_prior(spline, first, last, sigma)
 
     def _optimise(
-        self, fresh: list[Observation], settled: list[Observation], free: tuple[int, int], extras: list[Extra],
-        bandwidth: int, levels: tuple[int, ...] = _LEVELS,
+        self, state: SplineState, fresh: list[Observation], settled: list[Observation], free: tuple[int, int],
+        extras: list[Extra], bandwidth: int = 24, levels: tuple[int, ...] = _LEVELS,
     ) -> Solved:  # fmt: skip
-        assert self._state is not None
         problem = Problem(fresh, settled, free, extras, self.rig.depth_camera.fx, bandwidth)
-        return optimise(self._terms, self._state, problem, levels, _MOST_STEPS)
+        return optimise(self._terms, state, problem, levels, _MOST_STEPS)
 
-    def _overlap(self, fresh: list[Observation]) -> float:
-        first = next((o for o in fresh if o.lin is not None), None)
-        if first is None or first.lin is None:
-            return 0.0
-        self._first_count = max(self._first_count, first.lin.count)
-        return first.lin.count / max(1, self._first_count)
-
-    def _maybe_new_keyframe(self, first_free: int, overlap: float) -> bool:
-        """Promote the newest frame whose control points are all frozen, once the keyframe is left behind."""
-        assert self._state is not None and self._reference is not None
-        state, ref, options = self._state, self._reference, self.options
-        frozen = [f for f in self._recent if state.segment(f.last_time) + 4 <= first_free]
-        while len(frozen) > 1:
-            # Only the newest frozen frame is ever promoted; older ones have been fused.
-            done = frozen.pop(0)
-            self._recent.popleft()
-            if options.fuse and done.index > ref.index:
-                self._reference = ref = self._maker.fused(ref, done.depth, state.spline)
-        T = se3.inverse(ref.T_world_base) @ state.spline.pose(self._recent[-1].depth.exposure.mid_time)
-        angle = np.degrees(np.linalg.norm(se3.log(T)[3:]))
-        far = np.linalg.norm(T[:3, 3]) > options.keyframe_distance or angle > options.keyframe_angle_deg
-        if not frozen or frozen[-1].index <= ref.index or not (overlap < options.keyframe_overlap or far):
-            return False
-        best = frozen[-1]
-        made = self._maker.rectified(best.index, best.depth, best.colors, state.spline, ref if options.fuse else None)
-        self._set_reference(made, self._active)
-        return True
+    def _placed(self, new: Prepared, joined: bool = True) -> None:
+        self._stamps.append(new.stamp)
+        begin = min(new.first_time, new.stamp)
+        if joined and self.spline_valid:
+            begin = self.spline_valid.pop()[0]
+        self.spline_valid.append((begin, new.last_time))
 
     def _report(
-        self, stamp: float, fresh: list[Observation], solved: Solved, keyframe: bool, overlap: float = 1.0
-    ) -> FrameReport:
-        depth = [o.lin for o in fresh if o.is_depth and o.lin is not None]
-        color = [o.lin for o in fresh if not o.is_depth and o.lin is not None]
-        weakest = min((lin.observability for lin in depth), default=0.0)
+        self, new: Prepared, fresh: list[Observation] | None = None, solved: Solved | None = None, *,
+        keyframe: bool = False, lost: bool = False, overlap: float = 1.0,
+    ) -> FrameReport:  # fmt: skip
+        depth = [o.lin for o in fresh or [] if o.is_depth and o.lin is not None]
+        color = [o.lin for o in fresh or [] if not o.is_depth and o.lin is not None]
+        solved = solved or Solved(last_shift=0.0)
         return FrameReport(
-            stamp, depth[0].next_sigma if depth else float("nan"), color[0].next_sigma if color else float("nan"),
-            sum(lin.count for lin in depth), sum(lin.count for lin in color), solved.iterations, solved.evaluations,
-            solved.last_shift, keyframe, False, weakest, overlap,
-        )  # fmt: skip
-
-
-def _seen_as(shutter: Shutter, rolling: bool) -> Shutter:
-    return shutter if rolling else Shutter(0.0, shutter.exposure_s, shutter.scan)
+            stamp=new.stamp,
+            sigma_depth_m=depth[0].next_sigma if depth else float("nan"),
+            sigma_intensity=color[0].next_sigma if color else float("nan"),
+            inliers_depth=sum(lin.count for lin in depth),
+            inliers_color=sum(lin.count for lin in color),
+            iterations=solved.iterations,
+            evaluations=solved.evaluations,
+            last_shift_px=solved.last_shift,
+            keyframe=keyframe,
+            lost=lost,
+            observability=max((lin.observability for lin in (*depth, *color)), default=0.0),
+            overlap=overlap,
+        )

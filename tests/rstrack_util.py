@@ -90,7 +90,9 @@ def depth_of(cast: Cast, spline: Spline, image: Exposure, margin: int = 0) -> Fl
 
 def texture(p_world: FloatArray) -> FloatArray:
     """A smooth solid texture in [0, 1]; waves are a metre long and longer."""
-    waves = np.sin(p_world @ np.array([[4.0, 1.0, 0.5], [0.5, 5.0, -1.0], [-1.0, 0.5, 4.0]]) + np.array([0.3, 1.0, 2.0]))
+    waves = np.sin(
+        p_world @ np.array([[4.0, 1.0, 0.5], [0.5, 5.0, -1.0], [-1.0, 0.5, 4.0]]) + np.array([0.3, 1.0, 2.0])
+    )
     return 0.5 + 0.15 * waves.sum(axis=-1)
 
 
@@ -119,16 +121,21 @@ def maker(camera: Camera) -> KeyframeMaker:
 
 def make_terms(camera: Camera) -> Terms:
     """Terms without gates and floors, so that costs are smooth."""
-    return Terms(ENGINE, maker(camera).device_rays, gate_depth=1.0, gate_intensity=1.0, floor_depth=1e-7, floor_intensity=1e-7)
+    return Terms(
+        ENGINE, maker(camera).device_rays, gate_depth=1.0, gate_intensity=1.0, floor_depth=1e-7, floor_intensity=1e-7
+    )
 
 
-def exact_reference(cast: Cast, spline: Spline, image: Exposure) -> Reference:
-    """A reference of closed-form depth and intensities, nothing rectified or looked up: `image` (a pinhole's if it is
-    of a global shutter) is the depth camera's."""
-    depth = depth_input(cast, spline, image)
+def exact_reference(cast: Cast, spline: Spline, image: Exposure, margin: int = 0) -> Reference:
+    """A reference of closed-form depth and intensities, nothing rectified or looked up.
+
+    `image` is the depth camera's; a pinhole's if it is of a global shutter. No depth within `margin` pixels of the
+    border.
+    """
+    depth = depth_input(cast, spline, image, margin)
     camera = image.lens.camera
     ref = maker(camera).rolling(0, depth, (), spline)
-    rho = (1.0 / depth_of(cast, spline, image)).astype(np.float32)
+    rho = ENGINE.download(depth.inverse_z, (camera.height, camera.width))
     values = intensity_of(cast, spline, image).astype(np.float32)
     points = level_points(ENGINE, rho, camera_rays(image), values, np.ones(rho.shape, bool))
     return replace(ref, points=points)

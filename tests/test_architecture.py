@@ -15,6 +15,12 @@ from rsgen.trajectory import read_trajectory
 
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted((ROOT / "rsgen").rglob("*.py"))
+TRACKER = sorted((ROOT / "rstrack").rglob("*.py"))
+# What rstrack builds on; the rest of rsgen renders, or is about rendering.
+SHARED = (
+    "backend", "command_line", "errors", "figures", "files", "geometry", "progress", "sequence", "sequence_format",
+    "trajectory",
+)  # fmt: skip
 ENGINES = ("mitsuba", "drjit")
 CONFIGS = sorted((ROOT / "configs").glob("*.yaml"))
 
@@ -63,6 +69,32 @@ def test_help_and_info_load_no_engine() -> None:
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True).returncode == 0
 
 
+def test_the_tracker_loads_no_renderer() -> None:
+    modules = [name(path).removesuffix(".py").replace("/", ".").removesuffix(".__init__") for path in TRACKER]
+    assert "rstrack.cli" in modules and "rstrack.tracker" in modules
+    code = f"import sys, {', '.join(modules)}\nprint(*({{'mitsuba', 'trimesh'}} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == ""
+
+
+def test_the_trackers_help_and_info_load_no_engine() -> None:
+    code = (
+        "import sys\nfrom rstrack.cli import main\nfor words in (['track', '--help'], ['info', 'nowhere']):\n"
+        "    try:\n        main(words)\n    except SystemExit:\n        pass\n"
+        f"sys.exit(bool({set(ENGINES)!r} & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True).returncode == 0
+
+
+@pytest.mark.parametrize("path", TRACKER, ids=name)
+def test_the_tracker_imports_only_what_is_shared(path: Path) -> None:
+    for module in imports(path):
+        package, _, rest = module.partition(".")
+        assert package not in ("mitsuba", "tests", "scenes"), module
+        assert package != "rsgen" or rest.split(".")[0] in SHARED or not rest, module
+
+
 @pytest.mark.parametrize("path", sorted((ROOT / "rsgen/geometry").glob("*.py")), ids=name)
 def test_geometry_imports_numpy_and_scipy_only(path: Path) -> None:
     allowed = ("numpy", "scipy", "rsgen.errors", "rsgen.geometry")
@@ -77,14 +109,14 @@ def test_nothing_in_rsgen_imports_rstrack(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "path", sorted({*SOURCES, *(ROOT / "tests").glob("*.py"), *(ROOT / "scenes").rglob("*.py")}), ids=name
+    "path", sorted({*SOURCES, *TRACKER, *(ROOT / "tests").glob("*.py"), *(ROOT / "scenes").rglob("*.py")}), ids=name
 )
 def test_every_file_says_what_it_is_for(path: Path) -> None:
     text = ast.get_docstring(ast.parse(path.read_text()))
     assert text is not None and len(text.splitlines()[0]) > 15
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=name)
+@pytest.mark.parametrize("path", [*SOURCES, *TRACKER], ids=name)
 def test_every_public_function_and_class_is_documented(path: Path) -> None:
     for node in ast.parse(path.read_text()).body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
@@ -92,7 +124,14 @@ def test_every_public_function_and_class_is_documented(path: Path) -> None:
 
 
 def test_no_path_of_one_machine_is_in_the_project() -> None:
-    here = [*SOURCES, *CONFIGS, *(ROOT / "scenes").rglob("*.py"), *(ROOT / "tests").glob("*.py"), ROOT / "run.sh"]
+    here = [
+        *SOURCES,
+        *TRACKER,
+        *CONFIGS,
+        *(ROOT / "scenes").rglob("*.py"),
+        *(ROOT / "tests").glob("*.py"),
+        ROOT / "run.sh",
+    ]
     forbidden = tuple(f"/{folder}/" for folder in ("work", "root", "home"))
     for path in here:
         found = [line for line in path.read_text().splitlines() if any(part in line for part in forbidden)]
