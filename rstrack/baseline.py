@@ -8,7 +8,7 @@ stamps, T_world_depth = tracker.trajectory
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -27,12 +27,8 @@ from rstrack.terms import observability
 
 # Error at the start of an alignment, as σ in m; re-estimated with every step.
 _START_DEPTH = 5e-3
-# Smallest σ on the levels, finest first (m). A smaller one would make outliers of all that has moved by a pixel.
-_LEAST_SIGMA = (0.0, 2e-3, 5e-3)
 # Steps at most on the levels, finest first.
 _MOST_STEPS = (30, 10, 10)
-# A step is taken if it raises the image's negative log-likelihood per pixel by less, and else cut to this part.
-_SAME, _SHORTEN = 1e-5, 0.25
 # An alignment whose last step still moves lines further has not converged (pixels).
 _SETTLED_PX = 0.5
 # Part of an image's pixels that must fall on the keyframe; `observability` of the motion that is seen least, below
@@ -49,7 +45,7 @@ class Alignment:
 
     sigma: scale of the residuals, m. count, share: pixels that fall on the keyframe, and their part of those looked
     at. evaluations: linearisations, one for each step. shift: movement of the last step, pixels; infinite if there was
-    none to take. unlikely: negative log-likelihood per pixel.
+    none to take.
     """
 
     T_base_cam: FloatArray
@@ -59,7 +55,6 @@ class Alignment:
     evaluations: int
     shift: float
     observability: float
-    unlikely: float
 
     @property
     def is_good(self) -> bool:
@@ -118,7 +113,7 @@ class BaselineTracker:
         if not is_lost:
             self._found(new, np.eye(4))
             self._set_keyframe(new, np.eye(4), None)
-        nowhere = Alignment(np.eye(4), float("nan"), 0, 0.0, 0, 0.0, 0.0, np.inf)
+        nowhere = Alignment(np.eye(4), float("nan"), 0, 0.0, 0, 0.0, 0.0)
         return _report(new, nowhere, 1.0, keyframe=not is_lost, lost=is_lost)
 
     def _track(self, new: Prepared, ref: Reference) -> FrameReport:
@@ -150,7 +145,7 @@ class BaselineTracker:
         if found.is_good:
             return found
         others = [self._align(new.depth, ref, to_base @ T) for T in (self._last[-1][1], ref.T_world_base)]
-        return min((other for other in others if other.is_good), key=lambda other: other.unlikely, default=found)
+        return min((other for other in others if other.is_good), key=lambda other: other.sigma, default=found)
 
     def _predict(self, t: float) -> FloatArray:
         """Constant velocity, unless it is too long ago."""
@@ -162,40 +157,29 @@ class BaselineTracker:
 
     def _align(self, new: DepthImage, ref: Reference, T_base_cam: FloatArray) -> Alignment:
         """Gauss-Newton from a pose, coarse to fine."""
-        found = Alignment(T_base_cam, _START_DEPTH, 0, 1.0, 0, 0.0, 0.0, np.inf)
+        found = Alignment(T_base_cam, _START_DEPTH, 0, 1.0, 0, 0.0, 0.0)
         for level in reversed(range(len(STRIDES))):
             if np.isfinite(found.shift):
                 found = self._descend(new, ref, found, level)
         return found
 
     def _descend(self, new: DepthImage, ref: Reference, start: Alignment, level: int) -> Alignment:
-        """Gauss-Newton on one level; a step that makes the image less likely is shortened.
-
-        The Hessian's curvature is that of residuals within 2 σ: where they are larger, full steps are up to five times
-        too long.
-        """
-        camera, found = self.rig.depth_camera, start
+        camera = self.rig.depth_camera
         looked_at = -(-camera.width // STRIDES[level]) * -(-camera.height // STRIDES[level])
-        T, sigma, least, step = start.T_base_cam, start.sigma, np.inf, np.zeros(6)
-        for tried in range(1, _MOST_STEPS[level] + 1):
+        found = start
+        for _ in range(_MOST_STEPS[level]):
+            T, sigma = found.T_base_cam, found.sigma
             sums, next_sigma = self._terms.geometric_pose(new, ref, T, level, sigma)
-            unlikely = self._terms.negative_log_likelihood(sums, looked_at, level, sigma)
-            share, weakest = sums.count / looked_at, observability(sums, ref.lever)
-            usable = share >= _LEAST_SHARE and weakest > _LEAST_SEEN
-            if tried == 1 and not usable:
-                return Alignment(T, sigma, sums.count, share, start.evaluations + tried, np.inf, weakest, unlikely)
-            if usable and unlikely < least + _SAME:
-                least = unlikely
-                found = Alignment(T, sigma, sums.count, share, start.evaluations, np.inf, weakest, unlikely)
-                step = -sigma * np.linalg.solve(sums.H[0, 0], sums.g[0, 0])
-                sigma = max(next_sigma, _LEAST_SIGMA[level])
-            else:
-                step = _SHORTEN * step
-            T = se3.orthonormalise(se3.exp(step) @ found.T_base_cam)
+            share, weakest, evaluations = sums.count / looked_at, observability(sums, ref.lever), found.evaluations + 1
+            if share < _LEAST_SHARE or weakest < _LEAST_SEEN:
+                return Alignment(T, sigma, sums.count, share, evaluations, np.inf, weakest)
+            step = -sigma * np.linalg.solve(sums.H[0, 0], sums.g[0, 0])
+            T = se3.orthonormalise(se3.exp(step) @ T)
             shift = camera.fx * float(np.abs(step[:3]).max() / ref.lever + np.abs(step[3:]).max())
+            found = Alignment(T, next_sigma, sums.count, share, evaluations, shift, weakest)
             if shift < STOP_PX[level]:
-                return replace(found, T_base_cam=T, sigma=sigma, evaluations=start.evaluations + tried, shift=shift)
-        return replace(found, sigma=sigma, evaluations=start.evaluations + _MOST_STEPS[level], shift=shift)
+                break
+        return found
 
     def _found(self, new: Prepared, T_world_cam: FloatArray) -> None:
         t = new.depth.exposure.mid_time

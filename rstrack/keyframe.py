@@ -15,7 +15,16 @@ from rstrack.engine import Engine
 from rstrack.frames import ColorImage, DepthImage
 from rstrack.lines import from_base_table, to_base_table
 from rstrack.rectify import color_kernel, fuse_kernel, rectify_kernel
-from rstrack.reference import STRIDES, Image, Reference, depth_scaling, level_points, rectified_lens, surface_slopes
+from rstrack.reference import (
+    STRIDES,
+    Image,
+    Points,
+    Reference,
+    depth_scaling,
+    level_points,
+    rectified_lens,
+    surface_slopes,
+)
 from rstrack.warp import Lens
 
 # Metres at one metre: depths that differ by more show different surfaces.
@@ -105,7 +114,7 @@ class KeyframeMaker:
         rays = self.rays if rolling else lens.camera.unproject(lens.camera.pixel_grid())[..., :2]
         grid = self.device_rays if rolling else self._pinhole_rays(lens)
         slope_x, slope_y = surface_slopes(rho, lens.camera.fx, lens.camera.fy)
-        points = ()
+        points: tuple[Points, ...] = ()
         if colors:
             color = min(colors, key=lambda c: abs(c.exposure.mid_time - t))
             to_base = e.upload(to_base_table(spline, T_world_base, rolling) if rolling else np.zeros(12))

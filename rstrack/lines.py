@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from rsgen.geometry import se3
-from rsgen.geometry.so3 import FloatArray
+from rsgen.geometry.so3 import FloatArray, hat
 from rsgen.geometry.spline import Spline
 from rstrack.warp import Lens
+
+# Lines whose poses are taken from one evaluation of the spline.
+_LINES_PER_NODE = 8
 
 
 @dataclass(frozen=True)
@@ -46,15 +50,49 @@ class Exposure:
         return 0.5 * (self.first_time + self.last_time)
 
 
+@lru_cache(maxsize=64)
+def _block_motion(spline: Spline, lens: Lens, stamp: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """T_world_body (n, 4, 4), body twist (n, 6) and its derivative (n, 6) at the middles of blocks of lines.
+
+    Both terms ask for the same.
+    """
+    times = Exposure(lens, stamp, np.eye(4)).block_times(_LINES_PER_NODE)
+    T, twist = spline.pose_and_velocity(times)
+    return T, twist, np.gradient(twist, times, axis=0) if len(times) > 1 else np.zeros_like(twist)
+
+
+def line_motion(spline: Spline, exposure: Exposure) -> tuple[FloatArray, FloatArray]:
+    """T_world_body (lines, 4, 4) and body twist (lines, 6), from the middle of each line's block.
+
+    With a twist that changes linearly: over the quarter of a millisecond to a block's edge that is exact to nanometres.
+    (A constant one is wrong by a micrometre at 35 m/s², and its velocity moves what project_rolling finds by 1e-3 px.)
+    """
+    T, twist, rate = _block_motion(spline, exposure.lens, exposure.stamp)
+    lines = np.arange(exposure.lens.lines)
+    block = lines // _LINES_PER_NODE
+    dt = (exposure.times() - exposure.block_times(_LINES_PER_NODE)[block])[:, None]
+    change = rate[block] * dt
+    moved = (twist[block] + 0.5 * change) * dt
+    w = hat(moved[:, 3:])
+    # Second order of exp: R(I + w + w²/2), and t likewise.
+    out = T[block]
+    R = out[:, :3, :3].copy()
+    out[:, :3, :3] = R + R @ (w + 0.5 * (w @ w))
+    v = moved[:, :3, None]
+    out[:, :3, 3] += (R @ (v + 0.5 * (w @ v)))[..., 0]
+    return out, twist[block] + change
+
+
 def to_base_table(spline: Spline, T_world_base: FloatArray, exposure: Exposure) -> FloatArray:
     """T_base_cam of each line (lines, 12): rotation row-major, translation."""
-    T = se3.inverse(T_world_base) @ spline.pose(exposure.times()) @ se3.inverse(exposure.T_cam_body)
+    T_world_body, _ = line_motion(spline, exposure)
+    T = se3.inverse(T_world_base) @ T_world_body @ se3.inverse(exposure.T_cam_body)
     return np.concatenate([T[:, :3, :3].reshape(-1, 9), T[:, :3, 3]], axis=1)
 
 
 def from_base_table(spline: Spline, T_world_base: FloatArray, exposure: Exposure) -> FloatArray:
     """T_cam_base of each line and the camera's body twist per line delay (lines, 18)."""
-    T_world_body, twist = spline.pose_and_velocity(exposure.times())
+    T_world_body, twist = line_motion(spline, exposure)
     T = exposure.T_cam_body @ se3.inverse(T_world_body) @ T_world_base
     delay = exposure.lens.shutter.line_delay(exposure.lens.camera)
     twist_cam = delay * twist @ se3.adjoint(exposure.T_cam_body).T

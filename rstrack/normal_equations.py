@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
+import numpy.typing as npt
 import scipy.linalg
 
 from rsgen.geometry import se3
@@ -31,15 +33,25 @@ class Quadratic:
         """One past the last control point."""
         return self.first + len(self.g) // 6
 
+    def scaled(self, factor: float) -> Quadratic:
+        """The model times a factor."""
+        return self if factor == 1.0 else Quadratic(self.first, factor * self.H, factor * self.g)
+
     def moved(self, increments: FloatArray) -> Quadratic:
         """The same model around a state that has been moved by increments (m, 6) of all control points."""
         step = increments[self.first : self.last].ravel()
         return replace(self, g=self.g + self.H @ step) if step.any() else self
 
 
+@lru_cache(maxsize=64)
+def _pose_jacobian(spline: Spline, times: bytes) -> tuple[npt.NDArray[np.int64], FloatArray]:
+    """`Spline.pose_jacobian`, remembered: both terms ask for the same times."""
+    return spline.pose_jacobian(np.frombuffer(times))
+
+
 def line_jacobian(spline: Spline, T_world_base: FloatArray, times: FloatArray, first: int, count: int) -> FloatArray:
     """η in the base frame by the control points first..first+count: (n, 6, 6 count)."""
-    at, J = spline.pose_jacobian(times)
+    at, J = _pose_jacobian(spline, times.tobytes())
     J = se3.adjoint(se3.inverse(T_world_base)) @ J
     out = np.zeros((len(times), 6, count, 6))
     rows = np.arange(len(times))

@@ -18,7 +18,7 @@ from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.frames import ColorImage, DepthImage
 from rstrack.normal_equations import Quadratic, assemble, solve
-from rstrack.reference import Reference
+from rstrack.reference import STRIDES, Reference
 from rstrack.terms import Linearised, Terms
 
 # A step that moves no line further is the last one, at the coarse levels and at the finest (pixels).
@@ -28,7 +28,7 @@ RELINEARISE_PX = 0.02
 # Rise of the negative log-likelihood per pixel from which on a step has made things worse: less is noise of gating.
 _WORSE = 2e-5
 # Errors at the start of a level, as σ: m and intensity; re-estimated with every linearisation.
-_START_DEPTH, _START_INTENSITY = 5e-3, 0.03
+_START_DEPTH, _START_INTENSITY = 2e-3, 0.02
 
 
 class SplineState:
@@ -106,6 +106,7 @@ class Observation:
     ref: Reference
     sigma: float = 0.0
     lin: Linearised | None = None
+    stands_for: float = 1.0
     at: FloatArray = field(default_factory=lambda: np.zeros((0, 6)))
 
     @property
@@ -121,6 +122,8 @@ class Observation:
         else:
             self.lin = terms.photometric(image, self.ref, state.spline, level, self.sigma or _START_INTENSITY)
         self.sigma = self.lin.next_sigma
+        # A coarse level's pixels stand for those left out: the priors' share must not depend on the level.
+        self.stands_for = (STRIDES[level] / STRIDES[0]) ** 2
         self.at = state.moved.copy()
         return self.lin
 
@@ -133,14 +136,14 @@ class Observation:
     def model(self, state: SplineState) -> Quadratic:
         """Quadratic model around the current state."""
         assert self.lin is not None
-        return self.lin.model.moved(self._since(state))
+        return self.lin.model.moved(self._since(state)).scaled(self.stands_for)
 
     def change(self, state: SplineState) -> float:
         """Change of the cost since the linearisation, by the quadratic model."""
         assert self.lin is not None
         model = self.lin.model
         moved = self._since(state)[model.first : model.last].ravel()
-        return float(model.g @ moved + 0.5 * moved @ model.H @ moved)
+        return self.stands_for * float(model.g @ moved + 0.5 * moved @ model.H @ moved)
 
     def _since(self, state: SplineState) -> FloatArray:
         since = state.moved.copy()
@@ -200,12 +203,12 @@ def _optimise_level(terms: Terms, state: SplineState, problem: Problem, level: i
             # Worse than before: back to where it was, and a shorter step from there.
             state.apply(first, -step)
             for observation, kept in zip((*problem.fresh, *problem.settled), undo, strict=True):
-                observation.lin, observation.sigma, observation.at = kept
+                observation.lin, observation.sigma, observation.at, observation.stands_for = kept
             damping = max(1e-3, 10.0 * damping)
             done.refused += 1
         else:
             damping, cost = 0.1 * damping if damping > 1e-4 else 0.0, now
-        undo = [(o.lin, o.sigma, o.at) for o in (*problem.fresh, *problem.settled)]
+        undo = [(o.lin, o.sigma, o.at, o.stands_for) for o in (*problem.fresh, *problem.settled)]
         models = [o.model(state) for o in (*problem.fresh, *problem.settled)]
         models += [extra(state.spline)[0] for extra in problem.extras]
         H, g = assemble(models, *problem.free)
@@ -243,6 +246,6 @@ def _cost(state: SplineState, problem: Problem, weights: dict[int, float]) -> fl
     for observation in (*problem.fresh, *problem.settled):
         lin = observation.lin
         assert lin is not None
-        pixels = weights.setdefault(id(observation), float(lin.count))
+        pixels = weights.setdefault(id(observation), observation.stands_for * lin.count)
         total += pixels * (np.log(lin.sigma) + lin.cost / max(1, lin.count)) + observation.change(state)
     return float(total)

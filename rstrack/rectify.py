@@ -52,6 +52,15 @@ def _pose(e: Engine, lens: Lens, to_base: Any, x: Any, y: Any) -> list[Any]:
     return [dr.lerp(one, other, part) for one, other in zip(before, after, strict=True)]
 
 
+def _first_guess(e: Engine, lens: Lens, base: Lens, x: Any, y: Any) -> tuple[Any, Any]:
+    """Where a source that stood still would show the keyframe's pixel (x, y)."""
+    if lens.camera.model == "pinhole":
+        return e.Float(x), e.Float(y)
+    ray = (x - base.camera.cx) / base.camera.fx, (y - base.camera.cy) / base.camera.fy, e.Float(1.0)
+    at = project(lens.camera, ray)
+    return dr.select(at.valid, at.x, x), dr.select(at.valid, at.y, y)
+
+
 def rectify_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
     """Kernel (inverse_depth, rays_x, rays_y, to_base) → (inverse depth in the base image, source x, source y).
 
@@ -63,7 +72,7 @@ def rectify_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
     def kernel(rho: Any, rays_x: Any, rays_y: Any, to_base: Any) -> Any:
         _, px, py = grid(e, camera.width, camera.height, 1)
         goal_x, goal_y = e.Float(px), e.Float(py)
-        x, y = e.Float(goal_x), e.Float(goal_y)
+        x, y = _first_guess(e, lens, base, goal_x, goal_y)
         width, height = lens.camera.width, lens.camera.height
         value, active, miss = e.Float(0.0), e.Bool(True), e.Float(0.0)
         for _ in range(ITERATIONS):
@@ -78,10 +87,13 @@ def rectify_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
             value = dr.rcp(at.q[2])
             active &= at.valid & (miss < _SETTLED)
             ok = at.valid & dr.isfinite(dx + dy)
+            if lens.camera.model != "pinhole":
+                # A fisheye's pixels are up to twice as wide as the keyframe's: the step would overshoot and swing.
+                dx, dy = project(lens.camera, (rx, ry, e.Float(1.0))).push((dx / camera.fx, dy / camera.fy, 0.0))
             x, y = dr.select(ok, x + dr.clip(dx, -40.0, 40.0), x), dr.select(ok, y + dr.clip(dy, -40.0, 40.0), y)
         return dr.select(active, value, 0.0), x, y
 
-    return kernel  # type: ignore[no-any-return]
+    return kernel
 
 
 def color_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
@@ -105,7 +117,7 @@ def color_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
         value = dr.lerp(dr.lerp(a, b, fx), dr.lerp(c, d, fx), fy)
         return dr.select(active, value, 0.0), dr.select(active, e.Float(1.0), 0.0)
 
-    return kernel  # type: ignore[no-any-return]
+    return kernel
 
 
 def fuse_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
@@ -150,4 +162,4 @@ def fuse_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
         share = dr.select(active, w / (weight + w), 0.0)
         return dr.fma(share, dr.rcp(fused_z) - rho, rho), dr.minimum(weight + dr.select(active, w, 0.0), limit)
 
-    return kernel  # type: ignore[no-any-return]
+    return kernel

@@ -88,8 +88,8 @@ def surface_slopes(rho: Image, fx: float, fy: float) -> tuple[Image, Image]:
         if axis == 0:
             total, count = total.T, count.T
         window = (_NORMAL_WINDOW, _NORMAL_WINDOW)
-        total, count = (np.asarray(cv2.boxFilter(np.ascontiguousarray(a), -1, window)) for a in (total, count))
-        out.append((focal * total / np.maximum(count, np.float32(1e-3))).astype(np.float32))
+        mean_step, share = (np.asarray(cv2.boxFilter(np.ascontiguousarray(a), -1, window)) for a in (total, count))
+        out.append((focal * mean_step / np.maximum(share, np.float32(1e-3))).astype(np.float32))
     return out[0], out[1]
 
 

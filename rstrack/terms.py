@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,7 +16,7 @@ from rstrack.lines import IDENTITY_FROM_BASE, from_base_table, to_base_table
 from rstrack.normal_equations import Quadratic, chain
 from rstrack.reference import STRIDES, Points, Reference
 from rstrack.residuals import BlockSums, Scaling, block_counts, geometric_kernel, photometric_kernel
-from rstrack.robust import NU, scale_step
+from rstrack.robust import scale_step
 from rstrack.warp import Lens
 
 
@@ -78,33 +77,25 @@ class Terms:
         e, lens = self.e, image.exposure.lens
         kernel = self._kernel(geometric_kernel, lens, ref.lens, STRIDES[level])
         scaling = self._scaling(ref, lens, lens.camera, ref, STRIDES[level], 1)
-        constants = e.upload(scaling.parameters(sigma, self._depth_gate(level, sigma)))
+        gate = min(self.gate_depth, max(5.0 * sigma, 10 * self.floor_depth)) if level == 0 else self.gate_depth
+        constants = e.upload(scaling.parameters(sigma, gate))
         surface = ref.inverse_depth, ref.slope_x, ref.slope_y
         raw = kernel(image.z, *self.rays, e.upload(to_base), *surface, from_base, constants)
         current, reference, _, _ = block_counts(lens, ref.lens)
         return scaling.unpack(raw.numpy(), current, reference)
-
-    def _depth_gate(self, level: int, sigma: float) -> float:
-        return min(self.gate_depth, max(5.0 * sigma, 10 * self.floor_depth)) if level == 0 else self.gate_depth
-
-    def negative_log_likelihood(self, sums: BlockSums, looked_at: int, level: int, sigma: float) -> float:
-        """Student t's, per pixel looked at and up to a constant; a pixel beyond the gate counts like one at the gate.
-
-        It does not fall by pushing pixels out. The step of σ alone never raises it.
-        """
-        at_gate = 0.5 * (NU + 1.0) * math.log(1.0 + (self._depth_gate(level, sigma) / sigma) ** 2 / NU)
-        return (sums.cost + (looked_at - sums.count) * at_gate) / looked_at + math.log(sigma)
 
     def photometric(self, image: ColorImage, ref: Reference, spline: Spline, level: int, sigma: float) -> Linearised:
         """The reference's points of a level against that level of the colour image."""
         e, lens, points = self.e, image.exposure.lens, ref.points[level]
         kernel = self._kernel(photometric_kernel, lens, ref.lens, STRIDES[level], level)
         from_base = e.upload(from_base_table(spline, ref.T_world_base, image.exposure))
-        to_base = e.upload(np.zeros(12) if ref.rolling is None else to_base_table(spline, ref.T_world_base, ref.rolling))
+        rolling = ref.rolling
+        to_base = e.upload(np.zeros(12) if rolling is None else to_base_table(spline, ref.T_world_base, rolling))
         # Moving closer or turning packs more points into a block than its share.
         scaling = self._scaling(points, lens, ref.lens.camera, ref, STRIDES[level], 4)
         constants = e.upload(scaling.parameters(sigma, self.gate_intensity))
-        raw = kernel(points.x, points.y, points.z, points.intensity, points.visible, to_base, image.levels[level], from_base, constants)  # fmt: skip
+        seen_at = to_base, image.levels[level], from_base
+        raw = kernel(points.x, points.y, points.z, points.intensity, points.visible, *seen_at, constants)
         current, reference, per, ref_per = block_counts(lens, ref.lens)
         sums = scaling.unpack(raw.numpy(), current, reference)
         times = image.exposure.block_times(per)
@@ -116,10 +107,13 @@ class Terms:
         return self.e.upload(from_base_table(spline, ref.T_world_base, ref.rolling))
 
     @staticmethod
-    def _scaling(units: Points | Reference, lens: Lens, grid: Camera, ref: Reference, stride: int, slack: int) -> Scaling:
+    def _scaling(
+        units: Points | Reference, lens: Lens, grid: Camera, ref: Reference, stride: int, slack: int
+    ) -> Scaling:
         pixels = -(-grid.width // stride) * -(-grid.height // stride)
         current = block_counts(lens, ref.lens)[0]
-        return Scaling(units.lever, units.bound, min(pixels, slack * (-(-pixels // current) + max(grid.width, grid.height))))
+        per_block = -(-pixels // current) + max(grid.width, grid.height)
+        return Scaling(units.lever, units.bound, min(pixels, slack * per_block))
 
     def _finish(
         self, sums: BlockSums, spline: Spline, ref: Reference, times: FloatArray, ref_per: int, sigma: float,

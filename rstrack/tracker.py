@@ -29,7 +29,7 @@ from rstrack.rig import Frame, Rig
 # 5), so it says little where there are data. The newest control points, whose weight in the newest lines is only u³/6,
 # are held a good deal tighter: small systematic errors of the lines would throw them about.
 _ACCELERATION = np.array([5.0, 5.0, 5.0, 10.0, 10.0, 10.0])
-_NEWEST_TRIPLES, _NEWEST_FACTOR = 2, 0.1
+_NEWEST_TRIPLES, _NEWEST_FACTOR = 2, 0.3
 # Metres and radians within which the reference's pose is held while its own control points are free.
 _GAUGE = np.full(6, 1e-6)
 _LEVELS = (2, 1, 0)
@@ -53,6 +53,7 @@ class Tracker:
         self._state: SplineState | None = None
         self._reference: Reference | None = None
         self._keyframes: deque[Reference] = deque(maxlen=_KEPT_KEYFRAMES)
+        self._allkf=[]
         # Frames whose control points still move, and the newest one whose do not.
         self._recent: deque[Prepared] = deque()
         self._active: list[Observation] = []
@@ -84,7 +85,7 @@ class Tracker:
     # -- the loop ---------------------------------------------------------------------------------------------------
 
     def feed(self, frame: Frame) -> FrameReport:
-        """Track one frame. Raises UserError if it is not newer than the one before, or its images do not fit the rig."""
+        """Track one frame. Raises UserError if it is not newer than the one before or its images are not the rig's."""
         stamp = frame.depth.stamp
         if not self._last_fed < stamp < max(self._last_fed, -1e300) + _BREAK_S and np.isfinite(self._last_fed):
             raise UserError(
@@ -226,7 +227,7 @@ class Tracker:
         state = self._state
         assert state is not None
         self._reference = self._maker.rectified(frame.index, frame.depth, frame.colors, state.spline, older)
-        self._keyframes.append(self._reference)
+        self._keyframes.append(self._reference); self._allkf.append(self._reference)
         self._pixels = 0
         self.keyframes += 1
         return self._reference
@@ -259,7 +260,11 @@ class Tracker:
         extras: list[Extra], bandwidth: int = 24, levels: tuple[int, ...] = _LEVELS,
     ) -> Solved:  # fmt: skip
         problem = Problem(fresh, settled, free, extras, self.rig.depth_camera.fx, bandwidth)
-        return optimise(self._terms, state, problem, levels, _MOST_STEPS)
+        try:
+            return optimise(self._terms, state, problem, levels, _MOST_STEPS)
+        except np.linalg.LinAlgError:
+            # The images say nothing about some motion, not even with the prior: as lost as can be.
+            return Solved()
 
     def _placed(self, new: Prepared, joined: bool = True) -> None:
         self._stamps.append(new.stamp)

@@ -15,7 +15,6 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
-from rstrack import baseline
 from rstrack.baseline import BaselineTracker, interpolated
 from rstrack.engine import engine
 from rstrack.frames import camera_rays, depth_image
@@ -110,24 +109,18 @@ def test_keyframes_follow_the_options(on_global: BaselineTracker, fuse: bool) ->
         assert np.linalg.norm(p[last] - p[first]) > 0.045 > np.linalg.norm(p[last - 1] - p[first]) - 0.01
 
 
-def test_steps_that_are_too_long_are_shortened(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Full steps with the kernel's Hessian diverge in most of these jumps of 3 cm and 1.5 degrees.
-    def count_found() -> int:
-        rng, found = np.random.default_rng(0), 0
-        T = MOTION.pose(0.3)
-        for _ in range(7):
-            jump = rng.normal(size=(2, 3))
-            jump *= np.array([[0.03], [np.radians(1.5)]]) / np.linalg.norm(jump, axis=1, keepdims=True)
-            tracker = make_tracker(Shutter())
-            tracker.feed(make_frame(0.0, Shutter(), still(T)))
-            tracker.feed(make_frame(0.1, Shutter(), still(T @ se3.exp(jump.ravel()))))
-            _, T_world_depth = tracker.trajectory
-            found += np.linalg.norm((T_world_depth[-1] - se3.exp(jump.ravel()))[:3, 3]) < 1e-3
-        return found
-
-    assert count_found() == 7
-    monkeypatch.setattr(baseline, "_SAME", np.inf)
-    assert count_found() < 5
+def test_jumps_are_found() -> None:
+    # With a curvature of 0.2 in the kernel, steps were up to five times too long, and two of these jumps diverged.
+    rng = np.random.default_rng(0)
+    T = MOTION.pose(0.3)
+    for _ in range(7):
+        jump = rng.normal(size=(2, 3))
+        jump *= np.array([[0.03], [np.radians(1.5)]]) / np.linalg.norm(jump, axis=1, keepdims=True)
+        tracker = make_tracker(Shutter())
+        tracker.feed(make_frame(0.0, Shutter(), still(T)))
+        tracker.feed(make_frame(0.1, Shutter(), still(T @ se3.exp(jump.ravel()))))
+        _, T_world_depth = tracker.trajectory
+        assert np.linalg.norm((T_world_depth[-1] - se3.exp(jump.ravel()))[:3, 3]) < 1e-3
 
 
 def test_lost_frames_are_left_out_and_the_keyframe_is_tried_again() -> None:

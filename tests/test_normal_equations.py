@@ -274,3 +274,13 @@ def test_poses_stay_rotations_for_ever() -> None:
     assert len(state.points) == 1004
     assert np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max() < 1e-14
     assert np.linalg.det(R).min() > 0.0
+
+
+def test_a_long_extrapolation_stays_rotations() -> None:
+    # With the transpose taken as inverse, what is left of orthogonality would grow 2.4 times a knot.
+    state = SplineState(0.0, 0.05, np.eye(4), 4)
+    state.apply(0, np.arange(4)[:, None] * np.array([0.01, -0.02, 0.03, 0.3, -0.2, 0.25]))
+    for k in range(300):
+        state.extend(0.05 * (k + 1))
+    R = state.points[:, :3, :3]
+    assert np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max() < 1e-14

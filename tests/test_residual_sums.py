@@ -11,7 +11,7 @@ import pytest
 from rsgen.geometry import se3
 from rsgen.geometry.so3 import hat
 from rsgen.geometry.spline import Spline
-from rstrack import residuals
+from rstrack import lines, residuals
 from rstrack.frames import DepthImage
 from rstrack.lines import IDENTITY_FROM_BASE, to_base_table
 from rstrack.normal_equations import chain
@@ -33,6 +33,12 @@ from tests.rstrack_util import (
 )
 
 DEPTH = small_camera("radtan")
+
+
+def newton_weight(s: np.ndarray) -> np.ndarray:
+    """Second derivative of the cost by s where it is convex enough, otherwise a share of the weight."""
+    second = (NU + 1.0) * (NU - s**2) / (NU + s**2) ** 2
+    return np.maximum(second, residuals._CURVATURE * weight(s))
 
 
 def assert_sums(got: BlockSums, want: BlockSums, lever: float, error: tuple[float, float, float]) -> None:
@@ -60,9 +66,8 @@ class PixelTerms:
         on = self.active
         j, s, block = self.j[on], self.s[on], self.line[on] // per
         w = weight(s)
-        curvature = np.maximum((NU - s**2) / (NU + s**2), 0.2)
         H, g = np.zeros((count, 1, 6, 6)), np.zeros((count, 1, 6))
-        np.add.at(H[:, 0], block, (w * curvature)[:, None, None] * j[:, :, None] * j[:, None, :])
+        np.add.at(H[:, 0], block, newton_weight(s)[:, None, None] * j[:, :, None] * j[:, None, :])
         np.add.at(g[:, 0], block, (w * s)[:, None] * j)
         cost = 0.5 * (NU + 1.0) * np.log1p(s**2 / NU)
         return BlockSums(H, g, float((w * s**2).sum()), float(cost.sum()), int(on.sum()))
@@ -102,6 +107,12 @@ def geometric_pixels(z: np.ndarray, image: DepthImage, ref: Reference, spline: S
     edge = np.concatenate([x - np.round(x - 0.5) - 0.5, x, x - np.array([camera.width, camera.height]) + 1], axis=1)
     ambiguous = (np.abs(edge).min(axis=1) < 1e-3) | (np.abs(spread - EDGE) < 1e-4)
     return PixelTerms(line.astype(int), j, r / sigma, ambiguous & (z > 0), active)
+
+
+@pytest.fixture(autouse=True)
+def exact_poses(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every line's pose from the spline: with these small images a block of eight would take 5 ms."""
+    monkeypatch.setattr(lines, "_LINES_PER_NODE", 1)
 
 
 @pytest.fixture(scope="module")
@@ -163,19 +174,19 @@ def test_blocks_chained_to_control_points_equal_dense_pixel_jacobians(room: tupl
     as_input, ref, spline, z = room
     image = as_input(z)
     pixels = geometric_pixels(z, image, ref, spline, 0.01)
-    lines = image.exposure.lens.lines
-    model, _ = chain(pixels.blocks(lines, 1), spline, ref.T_world_base, image.exposure.block_times(1), None)
+    model, _ = chain(
+        pixels.blocks(image.exposure.lens.lines, 1), spline, ref.T_world_base, image.exposure.block_times(1), None
+    )
     # Each pixel's own time, not its line's.
     j, s, line = pixels.j[pixels.active], pixels.s[pixels.active], pixels.line[pixels.active]
     shutter = image.exposure.lens.shutter
     at, J = spline.pose_jacobian(shutter.line_mid_time(image.exposure.stamp, line, DEPTH))
-    rows = np.zeros((len(j), len(spline.control_points), 6))
+    by_point = np.zeros((len(j), len(spline.control_points), 6))
     to_base = se3.adjoint(se3.inverse(ref.T_world_base))
     for i in range(4):
-        rows[np.arange(len(j)), at + i] = np.einsum("ni,nij->nj", j @ to_base, J[:, i])
-    rows = rows[:, model.first : model.last].reshape(len(j), -1)
-    w = weight(s)
-    h = w * np.maximum((NU - s**2) / (NU + s**2), 0.2)
+        by_point[np.arange(len(j)), at + i] = np.einsum("ni,nij->nj", j @ to_base, J[:, i])
+    rows = by_point[:, model.first : model.last].reshape(len(j), -1)
+    w, h = weight(s), newton_weight(s)
     dense = rows.T @ (h[:, None] * rows)
     np.testing.assert_allclose(model.H, dense, atol=1e-9 * np.abs(dense).max())
     np.testing.assert_allclose(model.g, rows.T @ (w * s), atol=1e-9 * np.abs(model.g).max())
@@ -204,7 +215,7 @@ def dense_sums(g: np.ndarray, p: np.ndarray, r: np.ndarray, scaling: Scaling, si
     s = r / sigma
     size = np.maximum((j[:, :3] ** 2).sum(axis=1), (j[:, 3:] ** 2).sum(axis=1) / scaling.lever**2)
     w = weight(s) * np.minimum(1.0, scaling.bound**2 / size)
-    h = w * np.maximum((NU - s**2) / (NU + s**2), 0.2)
+    h = newton_weight(s) * w / weight(s)
     H, gradient = j.T @ (h[:, None] * j), j.T @ (w * s)
     cost = 0.5 * (NU + 1.0) * np.log1p(s**2 / NU)
     return BlockSums(H[None, None], gradient[None, None], float((w * s**2).sum()), float(cost.sum()), len(r))
