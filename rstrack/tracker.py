@@ -53,7 +53,6 @@ class Tracker:
         self._state: SplineState | None = None
         self._reference: Reference | None = None
         self._keyframes: deque[Reference] = deque(maxlen=_KEPT_KEYFRAMES)
-        self._allkf=[]
         # Frames whose control points still move, and the newest one whose do not.
         self._recent: deque[Prepared] = deque()
         self._active: list[Observation] = []
@@ -227,7 +226,7 @@ class Tracker:
         state = self._state
         assert state is not None
         self._reference = self._maker.rectified(frame.index, frame.depth, frame.colors, state.spline, older)
-        self._keyframes.append(self._reference); self._allkf.append(self._reference)
+        self._keyframes.append(self._reference)
         self._pixels = 0
         self.keyframes += 1
         return self._reference

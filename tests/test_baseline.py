@@ -109,6 +109,24 @@ def test_keyframes_follow_the_options(on_global: BaselineTracker, fuse: bool) ->
         assert np.linalg.norm(p[last] - p[first]) > 0.045 > np.linalg.norm(p[last - 1] - p[first]) - 0.01
 
 
+@pytest.mark.parametrize("keyframe_overlap", [0.65, 1.01])
+def test_depth_is_averaged_within_a_keyframe_and_passed_on_to_the_next(keyframe_overlap: float) -> None:
+    # With an overlap of more than one, every frame becomes a keyframe.
+    clean = make_frame(0.0, Shutter(), still(MOTION.pose(0.3))).depth.pixels
+    errors = {}
+    for fuse in (True, False):
+        rng = np.random.default_rng(1)
+        tracker = make_tracker(Shutter(), fuse=fuse, keyframe_overlap=keyframe_overlap)
+        for k in range(6):
+            noisy = clean + 2e-3 * rng.normal(size=clean.shape).astype(np.float32)
+            tracker.feed(Frame(Image(k / RATE_HZ, noisy), ()))
+        assert tracker.keyframes == (6 if keyframe_overlap > 1.0 else 1)
+        assert tracker._reference is not None
+        found = np.array(tracker._reference.inverse_depth.numpy()).reshape(clean.shape)
+        errors[fuse] = np.sqrt(np.mean((1.0 / found - clean)[10:-10, 10:-10] ** 2))
+    assert 0.3 < errors[True] / errors[False] < 0.6
+
+
 def test_jumps_are_found() -> None:
     # With a curvature of 0.2 in the kernel, steps were up to five times too long, and two of these jumps diverged.
     rng = np.random.default_rng(0)
@@ -175,6 +193,14 @@ def test_five_lost_frames_start_anew_at_the_last_pose() -> None:
     stamps, T = tracker.trajectory
     np.testing.assert_allclose(stamps, np.array([0, 1, 2, 8, 9]) / RATE_HZ)
     np.testing.assert_allclose(T[3:], np.repeat(T[2:3], 2, axis=0), atol=1e-4)
+
+
+def test_only_frames_lost_in_a_row_count() -> None:
+    tracker = make_tracker(Shutter())
+    for k in range(9):
+        frame = make_frame(k / RATE_HZ, Shutter(), still(MOTION.pose(0.3)), scale=1.0 if k in (0, 4) else 3.0)
+        assert tracker.feed(frame).lost == (k not in (0, 4))
+    assert tracker.keyframes == 1
 
 
 def test_a_single_plane_does_not_fix_a_pose() -> None:
