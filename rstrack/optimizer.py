@@ -99,11 +99,16 @@ Extra = Callable[[Spline], tuple[Quadratic, float]]
 
 @dataclass
 class Observation:
-    """An image against a reference, its current scale σ and its last linearisation."""
+    """An image against a reference, its current scale σ and its last linearisation.
+
+    occluder: the depth image that tells which points of the reference a colour image cannot see.
+    """
 
     frame: int
     image: DepthImage | ColorImage
     ref: Reference
+    occluder: DepthImage | None = None
+    visible: Any = None
     sigma: float = 0.0
     lin: Linearised | None = None
     stands_for: float = 1.0
@@ -120,7 +125,12 @@ class Observation:
         if isinstance(image, DepthImage):
             self.lin = terms.geometric(image, self.ref, state.spline, level, self.sigma or _START_DEPTH)
         else:
-            self.lin = terms.photometric(image, self.ref, state.spline, level, self.sigma or _START_INTENSITY)
+            if level == 0 and self.visible is None and self.occluder is not None:
+                # Once: the coarse levels have brought the poses close enough to tell, and a fixed set converges.
+                self.visible = terms.visible(self.occluder, self.ref, state.spline, level)
+            visible = self.visible if level == 0 else None
+            sigma = self.sigma or _START_INTENSITY
+            self.lin = terms.photometric(image, self.ref, state.spline, level, sigma, visible)
         self.sigma = self.lin.next_sigma
         # A coarse level's pixels stand for those left out: the priors' share must not depend on the level.
         self.stands_for = (STRIDES[level] / STRIDES[0]) ** 2

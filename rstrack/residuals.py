@@ -36,6 +36,8 @@ LINES_PER_PAIR_BLOCK = 32
 _SLOTS = 32
 # Relative spread of inverse depth within 2×2 pixels from which on they lie on both sides of an edge.
 EDGE = 0.03
+# Metres that a point has to lie behind what is seen there to count as hidden, beside EDGE of its depth.
+_BEHIND = 0.02
 # Share of a pixel's weight that its curvature keeps at least.
 _CURVATURE = 0.5
 _PAIRS = [(a, b) for a in range(6) for b in range(a, 6)]
@@ -227,6 +229,33 @@ def photometric_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int, level
         slot, size = _slot(seen.row, ref_line, lens, ref_lens)
         # A twist of the camera moves the point the other way.
         return _accumulate(e, g, p, -1.0, r, active, parameters, slot, size)
+
+    return kernel
+
+
+def visibility_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int) -> Callable[..., Any]:
+    """Kernel (points_x, _y, _z, to_base, depth, from_base) → 1 for points that a depth image does not hide, else 0.
+
+    Points as in `photometric_kernel`. The depth image, whose lines have their own poses in `from_base`, need not be
+    taken at the colour image's time: what hides a point hides it a few milliseconds later. Unknown counts as visible.
+    """
+    camera, ref = lens.camera, ref_lens.camera
+
+    @dr.freeze
+    def kernel(points_x: Any, points_y: Any, points_z: Any, to_base: Any, depth: Any, from_base: Any) -> Any:
+        p = points_x, points_y, points_z
+        if ref_lens.lines > 1:
+            _, x, y = grid(e, ref.width, ref.height, stride)
+            p = move(gather(to_base, _line_index(e, ref_lens, x, y), TO_BASE, stride=TO_BASE), p)
+        seen = project_rolling(lens, from_base, p, e.UInt, e.Int)
+        inside = seen.valid & (points_z > 0.0)
+        inside &= (seen.x >= 0.0) & (seen.y >= 0.0) & (seen.x < camera.width - 1.0) & (seen.y < camera.height - 1.0)
+        index = e.UInt(e.Int(dr.select(inside, seen.y + 0.5, 0.0))) * camera.width + e.UInt(
+            e.Int(dr.select(inside, seen.x + 0.5, 0.0))
+        )
+        z = dr.gather(e.Float, depth, index, inside)
+        hidden = inside & (z > 0.0) & (seen.z > z * (1.0 + EDGE) + _BEHIND)
+        return dr.select(hidden, e.Float(0.0), e.Float(1.0))
 
     return kernel
 

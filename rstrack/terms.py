@@ -15,7 +15,14 @@ from rstrack.frames import ColorImage, DepthImage
 from rstrack.lines import IDENTITY_FROM_BASE, from_base_table, to_base_table
 from rstrack.normal_equations import Quadratic, chain
 from rstrack.reference import STRIDES, Points, Reference
-from rstrack.residuals import BlockSums, Scaling, block_counts, geometric_kernel, photometric_kernel
+from rstrack.residuals import (
+    BlockSums,
+    Scaling,
+    block_counts,
+    geometric_kernel,
+    photometric_kernel,
+    visibility_kernel,
+)
 from rstrack.robust import scale_step
 from rstrack.warp import Lens
 
@@ -84,22 +91,35 @@ class Terms:
         current, reference, _, _ = block_counts(lens, ref.lens)
         return scaling.unpack(raw.numpy(), current, reference)
 
-    def photometric(self, image: ColorImage, ref: Reference, spline: Spline, level: int, sigma: float) -> Linearised:
-        """The reference's points of a level against that level of the colour image."""
+    def visible(self, depth: DepthImage, ref: Reference, spline: Spline, level: int) -> Any:
+        """Which of the reference's points of a level the depth image does not hide: 1 or 0, on the device."""
+        lens, points = depth.exposure.lens, ref.points[level]
+        kernel = self._kernel(visibility_kernel, lens, ref.lens, STRIDES[level])
+        from_base = self.e.upload(from_base_table(spline, ref.T_world_base, depth.exposure))
+        return kernel(points.x, points.y, points.z, self._ref_lines(spline, ref), depth.z, from_base)
+
+    def photometric(
+        self, image: ColorImage, ref: Reference, spline: Spline, level: int, sigma: float, visible: Any = None
+    ) -> Linearised:
+        """The reference's points of a level, those that are `visible`, against that level of the colour image."""
         e, lens, points = self.e, image.exposure.lens, ref.points[level]
         kernel = self._kernel(photometric_kernel, lens, ref.lens, STRIDES[level], level)
         from_base = e.upload(from_base_table(spline, ref.T_world_base, image.exposure))
-        rolling = ref.rolling
-        to_base = e.upload(np.zeros(12) if rolling is None else to_base_table(spline, ref.T_world_base, rolling))
         # Moving closer or turning packs more points into a block than its share.
         scaling = self._scaling(points, lens, ref.lens.camera, ref, STRIDES[level], 4)
         constants = e.upload(scaling.parameters(sigma, self.gate_intensity))
-        seen_at = to_base, image.levels[level], from_base
-        raw = kernel(points.x, points.y, points.z, points.intensity, points.visible, *seen_at, constants)
+        seen_at = self._ref_lines(spline, ref), image.levels[level], from_base
+        shown = points.visible if visible is None else visible
+        raw = kernel(points.x, points.y, points.z, points.intensity, shown, *seen_at, constants)
         current, reference, per, ref_per = block_counts(lens, ref.lens)
         sums = scaling.unpack(raw.numpy(), current, reference)
         times = image.exposure.block_times(per)
         return self._finish(sums, spline, ref, times, ref_per, sigma, self.floor_intensity, points.lever)
+
+    def _ref_lines(self, spline: Spline, ref: Reference) -> Any:
+        if ref.rolling is None:
+            return self.e.upload(np.zeros(12))
+        return self.e.upload(to_base_table(spline, ref.T_world_base, ref.rolling))
 
     def _seen_from(self, spline: Spline, ref: Reference) -> Any:
         if ref.rolling is None:

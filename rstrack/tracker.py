@@ -246,7 +246,7 @@ class Tracker:
 
     def _observe(self, frame: Prepared, ref: Reference) -> list[Observation]:
         depth = [Observation(frame.index, frame.depth, ref)] if self.options.geometric else []
-        return depth + [Observation(frame.index, c, ref) for c in frame.colors if ref.points]
+        return depth + [Observation(frame.index, c, ref, frame.depth) for c in frame.colors if ref.points]
 
     def _prior(self, free: tuple[int, int], piece: int | None = None) -> Extra:
         first, last = max(self._piece if piece is None else piece, free[0] - 2), free[1]
