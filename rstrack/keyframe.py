@@ -23,6 +23,7 @@ from rstrack.reference import (
     depth_scaling,
     level_points,
     rectified_lens,
+    surface_roughness,
     surface_slopes,
 )
 from rstrack.warp import Lens
@@ -113,7 +114,9 @@ class KeyframeMaker:
         rolling = depth.exposure if lens is depth.exposure.lens and lens.lines > 1 else None
         rays = self.rays if rolling else lens.camera.unproject(lens.camera.pixel_grid())[..., :2]
         grid = self.device_rays if rolling else self._pinhole_rays(lens)
-        slope_x, slope_y = surface_slopes(rho, lens.camera.fx, lens.camera.fy)
+        focal = lens.camera.fx, lens.camera.fy
+        slope_x, slope_y = surface_slopes(rho, *focal)
+        roughness = e.upload(surface_roughness(rho, slope_x, slope_y, *focal))
         points: tuple[Points, ...] = ()
         if colors:
             color = min(colors, key=lambda c: abs(c.exposure.mid_time - t))
@@ -126,7 +129,7 @@ class KeyframeMaker:
         weights = e.upload(np.where(rho > 0, 1.0, 0.0) if weight is None else weight)
         return Reference(
             index, depth.exposure.stamp, t, T_world_base, lens, rolling, device_rho, e.upload(slope_x),
-            e.upload(slope_y), weights, points, lever, bound, int(np.count_nonzero(rho)) // STRIDES[0] ** 2,
+            e.upload(slope_y), roughness, weights, points, lever, bound, int(np.count_nonzero(rho)) // STRIDES[0] ** 2,
         )  # fmt: skip
 
     def _kernel(self, make: Any, *key: Any) -> Any:

@@ -86,7 +86,7 @@ class Terms:
         scaling = self._scaling(ref, lens, lens.camera, ref, STRIDES[level], 1)
         gate = min(self.gate_depth, max(5.0 * sigma, 10 * self.floor_depth)) if level == 0 else self.gate_depth
         constants = e.upload(scaling.parameters(sigma, gate))
-        surface = ref.inverse_depth, ref.slope_x, ref.slope_y
+        surface = ref.inverse_depth, ref.slope_x, ref.slope_y, ref.roughness
         raw = kernel(image.z, *self.rays, e.upload(to_base), *surface, from_base, constants)
         current, reference, _, _ = block_counts(lens, ref.lens)
         return scaling.unpack(raw.numpy(), current, reference)

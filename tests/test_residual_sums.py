@@ -155,7 +155,7 @@ def block_sums(image: DepthImage, ref: Reference, spline: Spline, gate: float, s
     scaling = Scaling(ref.lever, ref.bound, camera.width * camera.height // 4)
     raw = kernel(
         image.z, *maker(DEPTH).device_rays, ENGINE.upload(to_base_table(spline, ref.T_world_base, image.exposure)),
-        ref.inverse_depth, ref.slope_x, ref.slope_y, ENGINE.upload(IDENTITY_FROM_BASE),
+        ref.inverse_depth, ref.slope_x, ref.slope_y, ref.roughness, ENGINE.upload(IDENTITY_FROM_BASE),
         ENGINE.upload(scaling.parameters(sigma, gate)),
     )  # fmt: skip
     current, reference, _, _ = residuals.block_counts(image.exposure.lens, ref.lens)
