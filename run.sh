@@ -62,6 +62,9 @@ demo() {
   .venv/bin/rsgen verify out/demo
   .venv/bin/rsgen preview out/demo
   .venv/bin/rsgen compare out/demo --frame 20
+  .venv/bin/rstrack track out/demo --out out/demo_track
+  .venv/bin/rstrack evaluate out/demo out/demo_track
+  .venv/bin/rstrack plot out/demo out/demo_track --out out/demo_track/plot.png
 }
 
 test_all() {

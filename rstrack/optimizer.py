@@ -27,8 +27,10 @@ STOP_PX = (0.01, 0.1, 0.3)
 RELINEARISE_PX = 0.02
 # Rise of the negative log-likelihood per pixel from which on a step has made things worse: less is noise of gating.
 _WORSE = 2e-5
+# Position u of the last line on its knot interval below which the last control point (weight u³/6) is mere guesswork.
+_TOLD = 0.6
 # Errors at the start of a level, as σ: m and intensity; re-estimated with every linearisation.
-_START_DEPTH, _START_INTENSITY = 2e-3, 0.02
+_START_DEPTH, _START_INTENSITY = 5e-3, 0.03
 
 
 class SplineState:
@@ -82,6 +84,19 @@ class SplineState:
         self.points = np.concatenate([self.points, np.array(new[1:])])
         self.moved = np.concatenate([self.moved, np.zeros((missing, 6))])
         self._spline = None
+
+    def smooth_end(self, t: float) -> None:
+        """Lay the last control point on with constant velocity if lines until time t (s) hardly told where it is.
+
+        It weighs u³/6 in them at most, so that a systematic error of the lines is magnified; and the next control
+        points are extrapolated from it.
+        """
+        s = (t - self.t0) / self.dt
+        if s - np.floor(s) > _TOLD or self.segment(t) + 4 != len(self.points):
+            return
+        step = se3.inverse(self.points[-3]) @ self.points[-2]
+        T = se3.orthonormalise(self.points[-2] @ step)
+        self.apply(len(self.points) - 1, se3.log(T @ se3.inverse(self.points[-1]))[None])
 
     def apply(self, first: int, increments: FloatArray) -> None:
         """T_i ← exp(δ_i) T_i for control points first, first + 1, ...; increments (n, 6)."""

@@ -29,10 +29,11 @@ from rstrack.rig import Frame, Rig
 # 5), so it says little where there are data. The newest control points, whose weight in the newest lines is only u³/6,
 # are held a good deal tighter: small systematic errors of the lines would throw them about.
 _ACCELERATION = np.array([5.0, 5.0, 5.0, 10.0, 10.0, 10.0])
-_NEWEST_TRIPLES, _NEWEST_FACTOR = 2, 0.3
+_NEWEST_TRIPLES, _NEWEST_FACTOR = 2, 0.1
 # Metres and radians within which the reference's pose is held while its own control points are free.
 _GAUGE = np.full(6, 1e-6)
-_LEVELS = (2, 1, 0)
+# Levels to go through from a prediction by constant velocity, and from anything worse.
+_TRACKING_LEVELS, _LEVELS = (1, 0), (2, 1, 0)
 # Steps at most on the pyramid's levels, finest first.
 _MOST_STEPS = (15, 8, 8)
 # Seconds without a frame after which the motion before says nothing about where the camera is, and beyond which
@@ -163,11 +164,12 @@ class Tracker:
     def _track(self, new: Prepared) -> FrameReport:
         state, ref = self._known()
         before = state.copy()
+        state.smooth_end(self.spline_valid[-1][1])
         state.extend(new.last_time)
         free = (max(self._piece, state.segment(new.first_time)), len(state.points))
         self._active = [o for o in self._active if o.lin is not None and o.lin.model.last > free[0]]
         fresh = self._observe(new, ref)
-        solved = self._optimise(state, fresh, self._active, free, [self._prior(free)])
+        solved = self._optimise(state, fresh, self._active, free, [self._prior(free)], levels=_TRACKING_LEVELS)
         if self._health.fault(fresh, solved, ref.pixels):
             self._state = before
             return self._relocalise(new)
