@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 import scipy.linalg
 
 from rsgen.geometry import se3
@@ -43,21 +42,21 @@ class Quadratic:
         return replace(self, g=self.g + self.H @ step) if step.any() else self
 
 
-@lru_cache(maxsize=64)
-def _pose_jacobian(spline: Spline, times: bytes) -> tuple[npt.NDArray[np.int64], FloatArray]:
-    """`Spline.pose_jacobian`, remembered: both terms ask for the same times."""
-    return spline.pose_jacobian(np.frombuffer(times))
-
-
 def line_jacobian(spline: Spline, T_world_base: FloatArray, times: FloatArray, first: int, count: int) -> FloatArray:
     """η in the base frame by the control points first..first+count: (n, 6, 6 count)."""
-    at, J = _pose_jacobian(spline, times.tobytes())
-    J = se3.adjoint(se3.inverse(T_world_base)) @ J
-    out = np.zeros((len(times), 6, count, 6))
-    rows = np.arange(len(times))
+    return _line_jacobian(spline, T_world_base.tobytes(), times.tobytes(), first, count)
+
+
+@lru_cache(maxsize=64)
+def _line_jacobian(spline: Spline, T_world_base: bytes, times: bytes, first: int, count: int) -> FloatArray:
+    """Remembered, because both terms and all iterations of a level ask for the same."""
+    at, J = spline.pose_jacobian(np.frombuffer(times))
+    J = se3.adjoint(se3.inverse(np.frombuffer(T_world_base).reshape(4, 4))) @ J
+    out = np.zeros((len(at), 6, count, 6))
+    rows = np.arange(len(at))
     for i in range(4):
         out[rows, :, at - first + i] = J[:, i]
-    return out.reshape(len(times), 6, 6 * count)
+    return out.reshape(len(at), 6, 6 * count)
 
 
 def chain(

@@ -22,7 +22,7 @@ from rstrack.reference import STRIDES, Reference
 from rstrack.terms import Linearised, Terms
 
 # A step that moves no line further is the last one, at the coarse levels and at the finest (pixels).
-STOP_PX = (0.01, 0.1, 0.3)
+STOP_PX = (0.02, 0.1, 0.3)
 # Lines that have moved less since a linearisation keep it.
 RELINEARISE_PX = 0.02
 # Rise of the negative log-likelihood per pixel from which on a step has made things worse: less is noise of gating.
@@ -212,7 +212,9 @@ def optimise(terms: Terms, state: SplineState, problem: Problem, levels: Sequenc
     for level in levels:
         for observation in problem.fresh:
             observation.lin, observation.sigma = None, 0.0 if level == levels[0] else observation.sigma
+        terms.derivatives_at = state.spline
         _optimise_level(terms, state, problem, level, most[level], done)
+    terms.derivatives_at = None
     return done
 
 
@@ -223,19 +225,21 @@ def _optimise_level(terms: Terms, state: SplineState, problem: Problem, level: i
     undo: list[Any] | None = None
     for _ in range(most):
         done.evaluations += _linearise(terms, state, problem, level)
-        now = _cost(state, problem, weights)
+        priors = [extra(state.spline) for extra in problem.extras]
+        now = _cost(state, problem, weights) + sum(c for _, c in priors)
         if undo is not None and step is not None and now > cost + _WORSE * sum(weights.values()):
             # Worse than before: back to where it was, and a shorter step from there.
             state.apply(first, -step)
             for observation, kept in zip((*problem.fresh, *problem.settled), undo, strict=True):
                 observation.lin, observation.sigma, observation.at, observation.stands_for = kept
+            priors = [extra(state.spline) for extra in problem.extras]
             damping = max(1e-3, 10.0 * damping)
             done.refused += 1
         else:
             damping, cost = 0.1 * damping if damping > 1e-4 else 0.0, now
         undo = [(o.lin, o.sigma, o.at, o.stands_for) for o in (*problem.fresh, *problem.settled)]
         models = [o.model(state) for o in (*problem.fresh, *problem.settled)]
-        models += [extra(state.spline)[0] for extra in problem.extras]
+        models += [prior for prior, _ in priors]
         H, g = assemble(models, *problem.free)
         H[np.diag_indices_from(H)] *= 1.0 + damping
         step = solve(H, g, problem.bandwidth).reshape(-1, 6)
@@ -266,8 +270,8 @@ def _linearise(terms: Terms, state: SplineState, problem: Problem, level: int) -
 
 
 def _cost(state: SplineState, problem: Problem, weights: dict[int, float]) -> float:
-    """Negative log-likelihood; the number of pixels of an observation counts as it was when first asked."""
-    total = sum(extra(state.spline)[1] for extra in problem.extras)
+    """Negative log-likelihood of the images; an observation's number of pixels counts as it was when first asked."""
+    total = 0.0
     for observation in (*problem.fresh, *problem.settled):
         lin = observation.lin
         assert lin is not None

@@ -60,6 +60,9 @@ class Terms:
     gate_intensity: float = 0.3
     floor_depth: float = 2e-4
     floor_intensity: float = 1.0 / 255.0
+    # Spline at which the lines' poses are differentiated by control points, if not the one that is asked for: they
+    # change by no more than the increments (relative), which a few Gauss-Newton steps do not notice.
+    derivatives_at: Spline | None = None
     _kernels: dict[Any, Any] = field(default_factory=dict)
 
     def geometric(self, image: DepthImage, ref: Reference, spline: Spline, level: int, sigma: float) -> Linearised:
@@ -140,7 +143,7 @@ class Terms:
         floor: float, lever: float,
     ) -> Linearised:  # fmt: skip
         ref_times = None if ref.rolling is None else ref.rolling.block_times(ref_per)
-        model, motion = chain(sums, spline, ref.T_world_base, times, ref_times)
+        model, motion = chain(sums, self.derivatives_at or spline, ref.T_world_base, times, ref_times)
         weakest = observability(sums, lever)
         scaled = Quadratic(model.first, model.H / sigma**2, model.g / sigma)
         next_sigma = scale_step(sigma, sums.weighted, sums.count, floor)
