@@ -116,6 +116,23 @@ def _parser() -> Parser:
         help="method to time; may be given several times (default: rs-g and rs-pg)",
     )  # fmt: skip
     _add_options(bench, leave_out=("method",))
+
+    bench = commands.add(
+        "bench-convergence", _bench_convergence, "align single frames to a keyframe from poses ever farther off",
+        "out/lr_kt2 --pairs 50 --method rs-pg",
+    )  # fmt: skip
+    _add_sequence(bench)
+    bench.add_argument("--pairs", type=count, default=50, metavar="N", help="keyframes with a frame (default: 50)")
+    _add_benchmark(bench)
+
+    bench = commands.add(
+        "bench-bootstrap", _bench_bootstrap, "start the tracker at random frames: how many starts fail, and how good "
+        "the others are", "out/lr_kt2 --starts 50 --frames 20",
+    )  # fmt: skip
+    _add_sequence(bench)
+    bench.add_argument("--starts", type=count, default=50, metavar="N", help="how many (default: 50)")
+    bench.add_argument("--frames", type=count, default=20, metavar="N", help="frames of each (default: 20)")
+    _add_benchmark(bench)
     return commands.parser
 
 
@@ -147,6 +164,12 @@ def _add_options(command: argparse.ArgumentParser, leave_out: Sequence[str] = ()
             group.add_argument(flag, choices=get_args(kind), help=text, **how)
         else:
             group.add_argument(flag, type={int: count, float: _number}[kind], metavar="X", help=text, **how)
+
+
+def _add_benchmark(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--seed", type=int, default=0, help="of the random choices (default: 0)")
+    command.add_argument("--json", action="store_true", help="print machine-readable figures")
+    _add_options(command)
 
 
 def _number(text: str) -> float:
@@ -222,6 +245,36 @@ def _bench_speed(options: argparse.Namespace) -> int:
     dataset = open_dataset(options.sequence, options.camera)
     with ProgressDisplay(quiet=options.json) as progress:
         report = time_methods(dataset, chosen, options.frames, progress)
+    print(json.dumps(report.as_dict(), indent=2) if options.json else report.text())
+    return 0
+
+
+def _bench_convergence(options: argparse.Namespace) -> int:
+    from rsgen.progress import ProgressDisplay
+    from rstrack.dataset import open_dataset
+    from rstrack.engine import engine
+
+    chosen = _options(options)
+    dataset = open_dataset(options.sequence, options.camera)
+    # Before the tracker imports Dr.Jit, which then would choose a libLLVM itself.
+    engine(chosen.backend)
+    from rstrack.convergence import convergence
+
+    with ProgressDisplay(quiet=options.json) as progress:
+        report = convergence(dataset, chosen, options.pairs, options.seed, progress)
+    print(json.dumps(report.as_dict(), indent=2) if options.json else report.text())
+    return 0
+
+
+def _bench_bootstrap(options: argparse.Namespace) -> int:
+    from rsgen.progress import ProgressDisplay
+    from rstrack.dataset import open_dataset
+    from rstrack.robustness import bootstraps
+
+    chosen = _options(options)
+    dataset = open_dataset(options.sequence, options.camera)
+    with ProgressDisplay(quiet=options.json) as progress:
+        report = bootstraps(dataset, chosen, options.starts, options.frames, options.seed, progress)
     print(json.dumps(report.as_dict(), indent=2) if options.json else report.text())
     return 0
 

@@ -17,7 +17,8 @@ class Options:
     """What can be chosen. Times in seconds, lengths in metres, angles in degrees.
 
     method: rs/gs models the rolling shutter or takes all lines at mid readout; p/g: photometric, geometric error.
-    knot_spacing_s, knot_phase: control points are spacing apart, the first knot phase · spacing before the first line.
+    knot_spacing_s, knot_phase: control points are spacing apart, the first knot phase · spacing before the first line;
+      with a global shutter they are as far apart as the frames if that is more, since each gives one pose only.
     keyframe_overlap: a new keyframe is made once less than this share of the depth points that the current keyframe
       saw at first falls on it; keyframe_distance, keyframe_angle_deg: or once the camera is that far from it.
     """

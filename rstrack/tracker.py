@@ -18,7 +18,7 @@ from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.frame_report import FrameReport
 from rstrack.health import Health
-from rstrack.normal_equations import Quadratic, acceleration_prior, pose_constraint
+from rstrack.normal_equations import acceleration_prior, pose_constraint
 from rstrack.optimizer import Extra, Observation, Problem, Solved, SplineState, optimise
 from rstrack.options import Options
 from rstrack.prepare import Prepared, Preparer
@@ -39,6 +39,8 @@ _MOST_STEPS = (15, 8, 8)
 # Seconds without a frame after which the motion before says nothing about where the camera is, and beyond which
 # frames hardly belong to one recording.
 _GAP_S, _BREAK_S = 0.3, 3600.0
+# Knots are never further apart than this many times the spacing that was asked for.
+_WIDEST = 2.0
 # Part of the pixels that must have depth for a frame to become a keyframe.
 _LEAST_DEPTH = 0.02
 _KEPT_KEYFRAMES = 8
@@ -94,6 +96,8 @@ class Tracker:
             )
         gap, self._last_fed = stamp - self._last_fed, stamp
         new = self._prepare(len(self.reports), frame)
+        if len(self._stamps) == 1:
+            self._fit_knots(gap)
         if self._state is None:
             report = self._start(new)
         elif self._reference is not None and self._reference.rolling is not None:
@@ -108,9 +112,7 @@ class Tracker:
     def _start(self, new: Prepared) -> FrameReport:
         if new.depth_share < _LEAST_DEPTH or (self.options.photometric and not new.colors):
             return self._report(new, lost=True)
-        dt = self.options.knot_spacing_s
-        self._state = SplineState(min(new.first_time, new.stamp) - self.options.knot_phase * dt, dt, np.eye(4), 4)
-        self._state.extend(new.last_time)
+        self._state = self._new_state(new, self.options.knot_spacing_s)
         self._recent.append(new)
         if new.depth.exposure.lens.lines > 1:
             self._reference = self._maker.rolling(new.index, new.depth, new.colors, self._state.spline)
@@ -119,6 +121,17 @@ class Tracker:
         self._placed(new)
         return self._report(new, keyframe=True)
 
+    def _new_state(self, first: Prepared, dt: float) -> SplineState:
+        state = SplineState(min(first.first_time, first.stamp) - self.options.knot_phase * dt, dt, np.eye(4), 4)
+        state.extend(first.last_time)
+        return state
+
+    def _fit_knots(self, gap: float) -> None:
+        """A global shutter gives one pose a frame, `gap` s apart: no more knots than that can be told."""
+        state, _ = self._known()
+        if self._recent[0].depth.exposure.lens.lines == 1 and gap > state.dt:
+            self._state = self._new_state(self._recent[0], min(gap, _WIDEST * state.dt))
+
     def _bootstrap(self, new: Prepared) -> FrameReport:
         """Joint alignment of the first frames with the first one, all of them rolling, from zero motion."""
         state, ref = self._known()
@@ -126,10 +139,8 @@ class Tracker:
         fresh = self._observe(new, ref)
         free = (0, len(state.points))
 
-        def gauge(spline: Spline) -> tuple[Quadratic, float]:
-            return pose_constraint(spline, ref.t, ref.T_world_base, _GAUGE)
-
-        solved = self._optimise(state, fresh, self._active, free, [self._prior(free), gauge], bandwidth=6 * free[1])
+        extras = [self._prior(free), _gauge(ref)]
+        solved = self._optimise(state, fresh, self._active, free, extras, bandwidth=6 * free[1])
         if self._health.fault(fresh, solved, ref.pixels):
             return self._begin_anew(new)
         self._active += fresh
@@ -169,7 +180,11 @@ class Tracker:
         free = (max(self._piece, state.segment(new.first_time)), len(state.points))
         self._active = [o for o in self._active if o.lin is not None and o.lin.model.last > free[0]]
         fresh = self._observe(new, ref)
-        solved = self._optimise(state, fresh, self._active, free, [self._prior(free)], levels=_TRACKING_LEVELS)
+        extras = [self._prior(free)]
+        if state.segment(ref.t) + 4 > free[0] and new.depth.exposure.lens.lines == 1:
+            # The first keyframe of a global shutter: no other frame tells where it was taken.
+            extras.append(_gauge(ref))
+        solved = self._optimise(state, fresh, self._active, free, extras, levels=_TRACKING_LEVELS)
         if self._health.fault(fresh, solved, ref.pixels):
             self._state = before
             return self._relocalise(new)
@@ -295,3 +310,8 @@ class Tracker:
             observability=max((lin.observability for lin in (*depth, *color)), default=0.0),
             overlap=overlap,
         )
+
+
+def _gauge(ref: Reference) -> Extra:
+    """Holds the spline to a reference's pose while its control points are free."""
+    return lambda spline: pose_constraint(spline, ref.t, ref.T_world_base, _GAUGE)
