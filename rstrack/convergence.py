@@ -81,24 +81,22 @@ class ConvergenceReport:
 
     def rows(self) -> list[dict[str, Any]]:
         """One dict for each distance, up to the first at which less than a tenth converges."""
-        rows = []
-        for factor in FACTORS:
-            trials = [t for t in self.trials if t.factor == factor]
-            share = float(np.mean([t.converged for t in trials]))
-            rows.append(
-                {
-                    "moved_m": factor * UNIT_M,
-                    "moved_deg": factor * UNIT_DEG,
-                    "converged": share,
-                    "median_error_m": float(np.median([t.error_m for t in trials])),
-                    "median_error_deg": float(np.median([t.error_deg for t in trials])),
-                    "median_steps": float(np.median([t.steps for t in trials])),
-                    "wrong_but_believed": sum(t.believed and not t.converged for t in trials),
-                }
-            )
-            if share < _FEW:
-                break
-        return rows
+        rows = [self.row(factor) for factor in FACTORS]
+        failing = [i for i, row in enumerate(rows) if row["converged"] < _FEW]
+        return rows[: failing[0] + 1] if failing else rows
+
+    def row(self, factor: float) -> dict[str, Any]:
+        """What came of the frames that were moved by a multiple of 2 cm and 1 degree."""
+        trials = [t for t in self.trials if t.factor == factor]
+        return {
+            "moved_m": factor * UNIT_M,
+            "moved_deg": factor * UNIT_DEG,
+            "converged": float(np.mean([t.converged for t in trials])),
+            "median_error_m": float(np.median([t.error_m for t in trials])),
+            "median_error_deg": float(np.median([t.error_deg for t in trials])),
+            "median_steps": float(np.median([t.steps for t in trials])),
+            "wrong_but_believed": sum(t.believed and not t.converged for t in trials),
+        }
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON; units are in the names."""
@@ -110,9 +108,9 @@ class ConvergenceReport:
 
     def text(self) -> str:
         """A table, one line for each distance."""
-        at_unit = next(row for row in self.rows() if row["moved_m"] == UNIT_M)
+        found = 100 * self.row(1.0)["converged"]
         lines = [
-            f"{self.name}, {self.method}: {100 * at_unit['converged']:.0f} % of {self.pairs} frames converge from "
+            f"{self.name}, {self.method}: {found:.0f} % of {self.pairs} frames converge from "
             f"{100 * UNIT_M:g} cm and {UNIT_DEG:g} deg, to within {1e3 * _FOUND_M:g} mm and {_FOUND_DEG:g} deg",
             f"truth resampled at knots {1e3 * self.knot_spacing_s:g} ms apart: {1e3 * self.resampling_m:.3f} mm off at "
             "most",

@@ -38,8 +38,6 @@ _SLOTS = 32
 EDGE = 0.03
 # Metres that a point has to lie behind what is seen there to count as hidden, beside EDGE of its depth.
 _BEHIND = 0.02
-# Where interpolation errs by more than this part of σ, its bias counts, not its size.
-_ROUGH = 0.25
 # Share of a pixel's weight that its curvature keeps at least.
 _CURVATURE = 0.5
 _PAIRS = [(a, b) for a in range(6) for b in range(a, 6)]
@@ -158,6 +156,7 @@ def geometric_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int) -> Call
     """Kernel (depth, rays_x, rays_y, to_base, inverse_depth, slope_x, slope_y, roughness, from_base, parameters) →
     integers.
 
+    `parameters`: those of `Scaling`, and the roughness (m) from which on a pixel of the reference is left out.
     `lens`: current depth camera. `ref_lens`: the reference's camera; global shutter if it is rectified, and then
     `from_base` is not looked at (the base frame is the reference's). `slope_*`: gradient of the reference's inverse
     depth by normalised coordinates, smoothed: it gives normals, while the residual takes inverse depth as it is.
@@ -187,7 +186,7 @@ def geometric_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int) -> Call
             e.Int(dr.select(active, seen.x + 0.5, 0.0))
         )
         mx, my = dr.gather(e.Float, slope_x, at, active), dr.gather(e.Float, slope_y, at, active)
-        active &= dr.gather(e.Float, roughness, at, active) * parameters[0] < _ROUGH
+        active &= dr.gather(e.Float, roughness, at, active) < dr.gather(e.Float, constants, e.UInt(7))
         # The plane m·q = 1 through the pixel; |m| is one over its distance.
         mz = value - mx * seen.at.xn - my * seen.at.yn
         inv_m = dr.rsqrt(mx * mx + my * my + mz * mz)

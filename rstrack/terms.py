@@ -26,6 +26,9 @@ from rstrack.residuals import (
 from rstrack.robust import scale_step
 from rstrack.warp import Lens
 
+# Smallest credible σ of depth (m): quantisation and interpolation leave about as much.
+_CREDIBLE_DEPTH = 2e-4
+
 
 @dataclass(frozen=True)
 class Linearised:
@@ -58,8 +61,10 @@ class Terms:
     # Residual beyond which a pixel is an outlier for certain (m; intensity), and smallest credible σ.
     gate_depth: float = 0.05
     gate_intensity: float = 0.3
-    floor_depth: float = 2e-4
+    floor_depth: float = _CREDIBLE_DEPTH
     floor_intensity: float = 1.0 / 255.0
+    # Where interpolation errs by more than this part of σ, its bias counts, not its size: those pixels are left out.
+    smooth: float = 0.25
     # Spline at which the lines' poses are differentiated by control points, if not the one that is asked for: they
     # change by no more than the increments (relative), which a few Gauss-Newton steps do not notice.
     derivatives_at: Spline | None = None
@@ -88,7 +93,8 @@ class Terms:
         kernel = self._kernel(geometric_kernel, lens, ref.lens, STRIDES[level])
         scaling = self._scaling(ref, lens, lens.camera, ref, STRIDES[level], 1)
         gate = min(self.gate_depth, max(5.0 * sigma, 10 * self.floor_depth)) if level == 0 else self.gate_depth
-        constants = e.upload(scaling.parameters(sigma, gate))
+        smooth = self.smooth * max(sigma, _CREDIBLE_DEPTH)
+        constants = e.upload(np.append(scaling.parameters(sigma, gate), smooth))
         surface = ref.inverse_depth, ref.slope_x, ref.slope_y, ref.roughness
         raw = kernel(image.z, *self.rays, e.upload(to_base), *surface, from_base, constants)
         current, reference, _, _ = block_counts(lens, ref.lens)

@@ -15,6 +15,7 @@ from rstrack.reference import (
     depth_scaling,
     level_points,
     on_one_surface,
+    surface_roughness,
     surface_slopes,
 )
 from rstrack.residuals import EDGE
@@ -175,5 +176,22 @@ def test_images_as_the_kernels_take_them() -> None:
     assert depth.count == 2
     np.testing.assert_allclose(download(depth.z, (2, 3)), [[0.5, 0, 0], [0, 0, 4.0]])
     np.testing.assert_allclose(download(depth.inverse_z, (2, 3)), [[2.0, 0, 0], [0, 0, 0.25]])
-    colours = np.array([[[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255]]], np.uint8)
-    np.testing.assert_allclose(intensity(colours), [[0.299, 0.587, 0.114, 1.0]], atol=2.1e-3)
+    for colour, grey in (((255, 0, 0), 0.299), ((0, 255, 0), 0.587), ((0, 0, 255), 0.114), ((255, 255, 255), 1.0)):
+        np.testing.assert_allclose(intensity(np.full((4, 5, 3), colour, np.uint8)), grey, atol=2.1e-3)
+    # The slight blur keeps the sum.
+    point = np.zeros((9, 9, 3), np.uint8)
+    point[4, 4] = 255
+    assert 0.2 < intensity(point)[4, 4] < 0.3 and abs(intensity(point).sum() - 1.0) < 1e-3
+
+
+def test_roughness_is_the_chords_error_where_walls_meet() -> None:
+    camera = Camera(160, 120, 120.0, 118.0, 79.5, 59.5)
+    x = (camera.pixel_grid()[..., 0] - camera.cx) / camera.fx
+    # Two walls m·p = 1 that meet at x = 0 and differ in slope by 0.4.
+    rho = (0.5 + np.where(x < 0, 0.1, -0.3) * x).astype(np.float32)
+    slopes = surface_slopes(rho, camera.fx, camera.fy)
+    rough = surface_roughness(rho, *slopes, camera.fx, camera.fy)
+    # Bilinear interpolation at x = 0, between pixel centres at -1/2 and 1/2 px, against the corner itself.
+    chord = 0.5 * (rho[60, 79] + rho[60, 80]) - 0.5
+    np.testing.assert_allclose(rough[60, 79:81], abs(chord) / 0.5**2 * 0.5, rtol=0.25)
+    assert rough[60, :70].max() < 1e-6 and rough[60, 90:].max() < 1e-6

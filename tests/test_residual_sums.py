@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -148,7 +148,9 @@ def test_sums_equal_those_of_a_loop_over_pixels(room: tuple) -> None:
     assert_sums(got, want, ref.lever, (2e-4, 2e-3, 1e-2))
 
 
-def block_sums(image: DepthImage, ref: Reference, spline: Spline, gate: float, sigma: float) -> BlockSums:
+def block_sums(
+    image: DepthImage, ref: Reference, spline: Spline, gate: float, sigma: float, roughness: float = np.inf
+) -> BlockSums:
     """The kernel itself, with a gate of one's own."""
     kernel = residuals.geometric_kernel(ENGINE, image.exposure.lens, ref.lens, 2)
     camera = image.exposure.lens.camera
@@ -156,7 +158,7 @@ def block_sums(image: DepthImage, ref: Reference, spline: Spline, gate: float, s
     raw = kernel(
         image.z, *maker(DEPTH).device_rays, ENGINE.upload(to_base_table(spline, ref.T_world_base, image.exposure)),
         ref.inverse_depth, ref.slope_x, ref.slope_y, ref.roughness, ENGINE.upload(IDENTITY_FROM_BASE),
-        ENGINE.upload(scaling.parameters(sigma, gate)),
+        ENGINE.upload(np.append(scaling.parameters(sigma, gate), roughness)),
     )  # fmt: skip
     current, reference, _, _ = residuals.block_counts(image.exposure.lens, ref.lens)
     return scaling.unpack(raw.numpy(), current, reference)
@@ -168,6 +170,15 @@ def test_the_gate_drops_what_lies_beyond_it(room: tuple) -> None:
     r = np.sort(np.abs(pixels.s[pixels.active]))
     gate = float(0.5 * (r[250] + r[251]))
     assert block_sums(as_input(z), ref, spline, gate, 0.01).count == 251
+
+
+def test_rough_pixels_of_the_reference_are_left_out(room: tuple) -> None:
+    as_input, ref, spline, z = room
+    rough = ENGINE.download(ref.roughness, z.shape)
+    limit = float(np.median(rough[rough > 0]))
+    smooth = replace(ref, roughness=ENGINE.upload(np.where(rough < limit, 0.0, 1.0)))
+    counts = [block_sums(as_input(z), r, spline, 10.0, 0.01, limit).count for r in (ref, smooth)]
+    assert counts[0] == counts[1] < 0.9 * block_sums(as_input(z), ref, spline, 10.0, 0.01).count
 
 
 def test_blocks_chained_to_control_points_equal_dense_pixel_jacobians(room: tuple) -> None:

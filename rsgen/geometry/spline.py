@@ -184,7 +184,7 @@ class Spline:
 
     @cached_property
     def left_gains(self) -> FloatArray:
-        """Derivative Jl⁻¹(Ω_j) Ad(T_{j−1}⁻¹) (m − 1, 6, 6) of `increments` by a left increment of T_j (of T_{j−1}: its negative)."""
+        """Derivative Jl⁻¹(Ω_j) Ad(T_{j−1}⁻¹) (m − 1, 6, 6) of `increments` by a left increment of T_j; − of T_{j−1}."""
         return se3.left_jacobian_inv(self.increments) @ se3.adjoint(se3.inverse(self.control_points[:-1]))
 
     def _left_blocks(self, segment: npt.NDArray[np.int64], b: FloatArray) -> list[FloatArray]:
