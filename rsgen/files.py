@@ -189,7 +189,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 def read_png(path: Path, shape: tuple[int, ...], dtype: type[np.generic]) -> np.ndarray:
     """An RGB (h, w, 3) uint8 or (h, w) uint16 PNG of exactly that shape and type. Raises UserError."""
     data = read_bytes(path)
-    if (fault := _png_fault(data)) is not None:
+    if (fault := png_fault(data)) is not None:
         raise _damaged(path, "PNG", fault)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -235,7 +235,7 @@ def read_npy(path: Path, shape: tuple[int, ...]) -> np.ndarray:
     return array
 
 
-def _png_fault(data: bytes) -> str | None:
+def png_fault(data: bytes) -> str | None:
     if not data.startswith(_PNG_SIGNATURE):
         return "wrong signature"
     view, at = memoryview(data), len(_PNG_SIGNATURE)

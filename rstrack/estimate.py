@@ -114,7 +114,7 @@ def read_estimate(path: Path) -> Estimate:
     path = Path(path)
     is_folder = path.is_dir()
     if is_folder and not (path / TRAJECTORY).is_file():
-        raise UserError(f"{path}: has no {TRAJECTORY}: give a folder that 'rstrack run' wrote, or a TUM file")
+        raise UserError(f"{path}: has no {TRAJECTORY}: give a folder that 'rstrack track' wrote, or a TUM file")
     file = path / TRAJECTORY if is_folder else path
     poses = read_trajectory(file, format="tum", max_gap_s=math.inf)
     spline = Spline.load(path / SPLINE) if is_folder and (path / SPLINE).exists() else None

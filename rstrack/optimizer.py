@@ -241,10 +241,7 @@ def _optimise_level(terms: Terms, state: SplineState, problem: Problem, level: i
         models = [o.model(state) for o in (*problem.fresh, *problem.settled)]
         models += [prior for prior, _ in priors]
         H, g = assemble(models, *problem.free)
-        H[np.diag_indices_from(H)] *= 1.0 + damping
-        step = solve(H, g, problem.bandwidth).reshape(-1, 6)
-        if not np.isfinite(step).all():
-            raise np.linalg.LinAlgError("the normal equations gave no finite step")
+        step = _damped_step(H, g, damping, problem.bandwidth)
         state.apply(first, step)
         done.iterations += 1
         increments = np.zeros_like(state.moved)
@@ -253,6 +250,21 @@ def _optimise_level(terms: Terms, state: SplineState, problem: Problem, level: i
         done.last_shift = max(shifts, default=0.0)
         if done.last_shift < STOP_PX[level]:
             break
+
+
+def _damped_step(H: FloatArray, g: FloatArray, damping: float, bandwidth: int) -> FloatArray:
+    """Increments (n, 6); rounding can make a system indefinite that hardly tells some motion: then damped more."""
+    while damping < 1.0:
+        damped = H.copy()
+        damped[np.diag_indices_from(H)] *= 1.0 + damping
+        try:
+            step = solve(damped, g, bandwidth)
+        except np.linalg.LinAlgError:
+            step = np.full_like(g, np.nan)
+        if np.isfinite(step).all():
+            return step.reshape(-1, 6)
+        damping = max(1e-9, 100.0 * damping)
+    raise np.linalg.LinAlgError("the normal equations have no finite solution")
 
 
 def _linearise(terms: Terms, state: SplineState, problem: Problem, level: int) -> int:

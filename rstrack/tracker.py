@@ -64,7 +64,7 @@ class Tracker:
         # First control point of the current piece of the spline: those before it belong to another, or to a gap.
         self._piece = 0
         self._stamps: list[float] = []
-        self._last_fed = -np.inf
+        self._last_fed: float | None = None
         self.spline_valid: list[tuple[float, float]] = []
         self.reports: list[FrameReport] = []
         self.keyframes = 0
@@ -89,13 +89,14 @@ class Tracker:
     def feed(self, frame: Frame) -> FrameReport:
         """Track one frame. Raises UserError if it is not newer than the one before or its images are not the rig's."""
         stamp = frame.depth.stamp
-        if not self._last_fed < stamp < max(self._last_fed, -1e300) + _BREAK_S and np.isfinite(self._last_fed):
+        gap = np.inf if self._last_fed is None else stamp - self._last_fed
+        if not np.isfinite(stamp) or (self._last_fed is not None and not 0.0 < gap < _BREAK_S):
             raise UserError(
-                f"tracker: frame stamped {stamp:.6f} s follows one stamped {self._last_fed:.6f} s: frames must come in "
+                f"tracker: frame stamped {stamp:.6f} s follows one stamped {self._last_fed} s: frames must come in "
                 f"order of time and less than {_BREAK_S:.0f} s apart; cut the recording there"
             )
-        gap, self._last_fed = stamp - self._last_fed, stamp
         new = self._prepare(len(self.reports), frame)
+        self._last_fed = stamp
         if len(self._stamps) == 1:
             self._fit_knots(gap)
         if self._state is None:

@@ -22,8 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsgen.errors import UserError
-from rsgen.files import _png_fault as png_fault
-from rsgen.files import read_bytes, read_text
+from rsgen.files import png_fault, read_bytes, read_text
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.so3 import FloatArray
 from rsgen.trajectory import ICL_RATE_HZ, Trajectory, read_trajectory
