@@ -209,12 +209,14 @@ def optimise(terms: Terms, state: SplineState, problem: Problem, levels: Sequenc
     Raises numpy.linalg.LinAlgError where the system has no solution.
     """
     done = Solved()
-    for level in levels:
-        for observation in problem.fresh:
-            observation.lin, observation.sigma = None, 0.0 if level == levels[0] else observation.sigma
-        terms.derivatives_at = state.spline
-        _optimise_level(terms, state, problem, level, most[level], done)
-    terms.derivatives_at = None
+    try:
+        for level in levels:
+            for observation in problem.fresh:
+                observation.lin, observation.sigma = None, 0.0 if level == levels[0] else observation.sigma
+            terms.derivatives_at = state.spline
+            _optimise_level(terms, state, problem, level, most[level], done)
+    finally:
+        terms.derivatives_at = None
     return done
 
 
@@ -254,7 +256,7 @@ def _optimise_level(terms: Terms, state: SplineState, problem: Problem, level: i
 
 def _damped_step(H: FloatArray, g: FloatArray, damping: float, bandwidth: int) -> FloatArray:
     """Increments (n, 6); rounding can make a system indefinite that hardly tells some motion: then damped more."""
-    while damping < 1.0:
+    for _ in range(8):
         damped = H.copy()
         damped[np.diag_indices_from(H)] *= 1.0 + damping
         try:

@@ -61,7 +61,7 @@ def test_blank_frames_are_lost_and_the_track_is_found_again() -> None:
     assert lost(tracker) == [12, 13]
     stamps, _ = tracker.trajectory
     assert len(stamps) == 20 and not np.isin(stamps, [12 / 30, 13 / 30]).any()
-    assert len(tracker.spline_valid) == 2 and tracker.spline_valid[0][1] < 12 / 30 < tracker.spline_valid[1][0]
+    assert len(tracker.spline_valid) == 1  # so short a gap the motion before carries over
     assert worst_step(tracker) < 3e-3
 
 
