@@ -236,6 +236,7 @@ def read_npy(path: Path, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def png_fault(data: bytes) -> str | None:
+    """What is wrong with a PNG's structure or checksums, None if nothing is: decoders say it on stderr, or not."""
     if not data.startswith(_PNG_SIGNATURE):
         return "wrong signature"
     view, at = memoryview(data), len(_PNG_SIGNATURE)

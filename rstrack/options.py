@@ -41,8 +41,10 @@ class Options:
             raise UserError(f"knot_spacing_s = {self.knot_spacing_s!r} must be between 0.001 and 1 s")
         if not 0.0 <= self.knot_phase <= 1.0:
             raise UserError(f"knot_phase = {self.knot_phase!r} must be between 0 and 1")
-        if not 0.0 < self.keyframe_overlap < 1.0:
-            raise UserError(f"keyframe_overlap = {self.keyframe_overlap!r} must be between 0 and 1")
+        if not 0.0 < self.keyframe_overlap < 2.0:
+            raise UserError(
+                f"keyframe_overlap = {self.keyframe_overlap!r} must be positive; 1 makes new ones all the time"
+            )
         for name in ("keyframe_distance", "keyframe_angle_deg", "max_depth"):
             if not getattr(self, name) > 0.0:
                 raise UserError(f"{name} = {getattr(self, name)!r} must be positive")

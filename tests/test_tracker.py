@@ -109,7 +109,7 @@ def test_frames_out_of_order_or_of_another_camera() -> None:
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"method": "best"}, {"knot_spacing_s": 0.0}, {"knot_phase": 2.0}, {"keyframe_overlap": 1.0}, {"max_depth": -1.0},
+    [{"method": "best"}, {"knot_spacing_s": 0.0}, {"knot_phase": 2.0}, {"keyframe_overlap": -0.5}, {"max_depth": -1.0},
      {"bootstrap_frames": 2}, {"keyframe_distance": float("nan")}],
 )  # fmt: skip
 def test_options_are_checked(wrong: dict[str, object]) -> None:
