@@ -42,6 +42,8 @@ Progress = Callable[[str, float, str], None]
 End = Literal["done", "interrupted", "broke down", "unreadable"]
 
 _TRUTH_EVERY = 30
+# Observability (see FrameReport) below which a motion is held by the prior rather than by depth.
+_WEAK = 5e-4
 # Files that mark a folder as a data set, which a run folder's spline.npz must not overwrite.
 _DATASET_FILES = ("sequence.yaml", "rgb.txt", "depth.txt", "associations.txt", "groundtruth.txt")
 
@@ -103,6 +105,9 @@ class Result:
             f"{times['total_s']:.1f} s, {rate:.1f} frames/s on {info['backend']}; a frame takes "
             f"{times['median_ms']:.1f} ms (median), {times['mean_ms']:.1f} (mean), {times['p95_ms']:.1f} (95 %)",
         ]
+        weak = sum(not f["lost"] and 0.0 < f["observability"] < _WEAK for f in info["frames"])
+        if weak and info["method"] in ("rs-g", "gs-g", "baseline"):
+            lines.append(f"in {weak} of {done} frames the geometry hardly fixes all six degrees of freedom (a wall?)")
         return "\n".join(lines + ([] if self.metrics is None else ["", metrics_text(self.metrics)]))
 
 
