@@ -224,10 +224,10 @@ def _make_folder(out: Path) -> None:
 def _stop_flag() -> Iterator[threading.Event]:
     """Ctrl-C sets the flag instead of breaking off in the middle of a frame; a second one breaks off."""
     flag = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield flag  # signals are the main thread's business
-        return
     before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or before is signal.SIG_IGN:
+        yield flag  # signals are the main thread's business; started in the background, Ctrl-C is meant for others
+        return
 
     def ask_to_stop(*_: Any) -> None:
         flag.set()

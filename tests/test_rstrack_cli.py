@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -318,6 +319,15 @@ def test_a_dataset_is_never_overwritten_by_a_run(place: Path, capfd: pytest.Capt
 # --- runs that end early or go wrong ---------------------------------------------------------------------------------
 
 
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """Ctrl-C as in a terminal: a shell starts its background jobs with SIGINT ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_writes_what_there_is(
     place: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -336,6 +346,7 @@ def test_ctrl_c_writes_what_there_is(
     assert signal.getsignal(signal.SIGINT) is before
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_a_second_ctrl_c_breaks_off(
     place: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -347,6 +358,16 @@ def test_a_second_ctrl_c_breaks_off(
     status, out, error = run(capfd, "track seq --out r --method gs-g")
     assert (status, out, error) == (130, "", "rstrack: interrupted; nothing was written\n")
     assert not Path("r/run.json").exists()
+
+
+@pytest.mark.usefixtures("interruptible")
+def test_a_background_job_leaves_ctrl_c_to_others(
+    place: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    monkeypatch.setattr(rsgen.progress.ProgressDisplay, "__call__", lambda *_: signal.raise_signal(signal.SIGINT))
+    status, out, _ = run(capfd, "track seq --out r --method gs-g")
+    assert status == 0 and "14 frames" in out and read_info("r")["end"] == "done"
 
 
 def test_lost_frames_are_left_out_and_reported(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
