@@ -23,7 +23,7 @@ from rstrack.options import Options
 from rstrack.prepare import Prepared, Preparer
 from rstrack.reference import STRIDES, Reference
 from rstrack.rig import Frame, Rig
-from rstrack.terms import observability
+from rstrack.terms import seen_motions, weakest_motion
 
 # Error at the start of an alignment, as σ in m; re-estimated with every step.
 _START_DEPTH = 5e-3
@@ -170,7 +170,11 @@ class BaselineTracker:
         for _ in range(_MOST_STEPS[level]):
             T, sigma = found.T_base_cam, found.sigma
             sums, next_sigma = self._terms.geometric_pose(new, ref, T, level, sigma)
-            share, weakest, evaluations = sums.count / looked_at, observability(sums, ref.lever), found.evaluations + 1
+            share, weakest, evaluations = (
+                sums.count / looked_at,
+                weakest_motion(seen_motions(sums, ref.lever)),
+                found.evaluations + 1,
+            )
             if share < _LEAST_SHARE or weakest < _LEAST_SEEN:
                 return Alignment(T, sigma, sums.count, share, evaluations, np.inf, weakest)
             step = -sigma * np.linalg.solve(sums.H[0, 0], sums.g[0, 0])

@@ -194,7 +194,7 @@ def _time(dataset: Dataset, options: Options, frames: int, warm_up: int, progres
                 watch.seconds.clear()
                 reading.seconds.clear()
             with reading.timed("read"):
-                frame = dataset.frame(k)
+                frame = dataset.frame(k, color=options.photometric)
             begin = time.perf_counter()
             _feed(tracker, frame, k, options)
             frame_ms.append(1e3 * (time.perf_counter() - begin))

@@ -220,14 +220,12 @@ def moved_state(spline: Spline, new: Prepared, pair: Pair, factor: float) -> Spl
     Pose at mid readout: T_world_cam D with D = (rotation about pair.axis, shift along pair.direction).
     """
     first, last = (int(spline.locate(t)[0]) for t in (new.first_time, new.last_time))
-    state = SplineState(spline.t0, spline.dt, np.eye(4), last + 4)
     D = se3.exp(np.concatenate([np.zeros(3), math.radians(factor * UNIT_DEG) * pair.axis]))
     D[:3, 3] = factor * UNIT_M * pair.direction
     T_world_cam = spline.pose(new.depth.exposure.mid_time)
     points = spline.control_points[: last + 4].copy()
     points[first:] = se3.orthonormalise(T_world_cam @ D @ se3.inverse(T_world_cam) @ points[first:])
-    state.points = points
-    return state
+    return SplineState(Spline(points, spline.t0, spline.dt))
 
 
 class _Aligner(Tracker):
@@ -246,7 +244,7 @@ class _Aligner(Tracker):
         """Move the state's control points that the frame touches; steps, and whether `health` accepts the result."""
         first, fresh = state.segment(new.first_time), self._observe(new, ref)
         free = first, len(state.points)
-        solved = self._optimise(state, fresh, [], free, [self._prior(free, first)])
+        solved = self._optimise(state, fresh, [], free, [self._prior(state, free, first)])
         return solved.iterations, not health.fault(fresh, solved, ref.pixels)
 
 

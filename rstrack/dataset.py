@@ -65,12 +65,15 @@ class Dataset:
     def __len__(self) -> int:
         return len(self.stamps)
 
-    def frame(self, k: int) -> Frame:
-        """Frame k, 0 ≤ k < len. Raises UserError naming the file that is missing, damaged or of a wrong size."""
+    def frame(self, k: int, *, color: bool = True) -> Frame:
+        """Frame k, 0 ≤ k < len, its colour images left out on request.
+
+        Raises UserError naming the file that is missing, damaged or of a wrong size.
+        """
         if not 0 <= k < len(self):
             raise IndexError(f"{self.name} has frames 0 to {len(self) - 1}, not {k}")
         depth = Image(float(self.stamps[k]), self.images.depth(k))
-        colors = tuple(Image(float(self.color_stamps[i]), self.images.color(i)) for i in self.groups[k])
+        colors = tuple(Image(float(self.color_stamps[i]), self.images.color(i)) for i in self.groups[k] if color)
         return Frame(depth, colors)
 
     def frames(self, first: int = 0, last: int | None = None, prefetch: int = 2) -> Iterator[Frame]:

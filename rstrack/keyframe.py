@@ -71,7 +71,7 @@ class KeyframeMaker:
         rho, weight = self._fuse(made, older.lens, older.inverse_depth, older.weight, from_base)
         back = se3.inverse(T)
         to_base = e.upload(np.concatenate([back[:3, :3].ravel(), back[:3, 3]]))
-        grid = self._pinhole_rays(base)
+        _, grid = self._pinhole_rays(base)
         old, _, _ = self._kernel(rectify_kernel, older.lens, base)(older.inverse_depth, *grid, to_base)
         host, old_host = e.download(rho, shape), e.download(old, shape)
         holes = (host <= 0) & (old_host > 0)
@@ -99,12 +99,13 @@ class KeyframeMaker:
             self._kernels["ones"] = self.e.upload(np.ones(camera.height * camera.width))
         return self._kernels["ones"]
 
-    def _pinhole_rays(self, base: Lens) -> tuple[Any, Any]:
+    def _pinhole_rays(self, base: Lens) -> tuple[FloatArray, tuple[Any, Any]]:
+        """Normalised coordinates (h, w, 2) of a rectified image, and the same on the device."""
         if "grid" not in self._kernels:
-            rays = base.camera.unproject(base.camera.pixel_grid())
-            self._kernels["grid"] = self.e.upload(rays[..., 0]), self.e.upload(rays[..., 1])
-        grid: tuple[Any, Any] = self._kernels["grid"]
-        return grid
+            rays = base.camera.unproject(base.camera.pixel_grid())[..., :2]
+            self._kernels["grid"] = rays, (self.e.upload(rays[..., 0]), self.e.upload(rays[..., 1]))
+        made: tuple[FloatArray, tuple[Any, Any]] = self._kernels["grid"]
+        return made
 
     def _finish(
         self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, t: float,
@@ -112,8 +113,7 @@ class KeyframeMaker:
     ) -> Reference:  # fmt: skip
         e = self.e
         rolling = depth.exposure if lens is depth.exposure.lens and lens.lines > 1 else None
-        rays = self.rays if rolling else lens.camera.unproject(lens.camera.pixel_grid())[..., :2]
-        grid = self.device_rays if rolling else self._pinhole_rays(lens)
+        rays, grid = (self.rays, self.device_rays) if rolling else self._pinhole_rays(lens)
         focal = lens.camera.fx, lens.camera.fy
         slope_x, slope_y = surface_slopes(rho, *focal)
         roughness = e.upload(surface_roughness(rho, slope_x, slope_y, *focal))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import numpy.typing as npt
 
 from rsgen.geometry import se3
 from rsgen.geometry.so3 import FloatArray, hat
@@ -50,15 +51,36 @@ class Exposure:
         return 0.5 * (self.first_time + self.last_time)
 
 
-@lru_cache(maxsize=64)
-def _block_motion(spline: Spline, lens: Lens, stamp: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """T_world_body (n, 4, 4), body twist (n, 6) and its derivative (n, 6) at the middles of blocks of lines.
+@lru_cache(maxsize=16)
+def _line_blocks(lens: Lens) -> tuple[FloatArray, npt.NDArray[np.intp], FloatArray]:
+    """Times of the blocks' middles after the stamp (s), the block of each line, and each line's time after that."""
+    at_zero = Exposure(lens, 0.0, np.eye(4))
+    middle = at_zero.block_times(_LINES_PER_NODE)
+    block = np.arange(lens.lines) // _LINES_PER_NODE
+    return middle, block, (at_zero.times() - middle[block])[:, None]
 
-    Both terms ask for the same.
-    """
-    times = Exposure(lens, stamp, np.eye(4)).block_times(_LINES_PER_NODE)
-    T, twist = spline.pose_and_velocity(times)
-    return T, twist, np.gradient(twist, times, axis=0) if len(times) > 1 else np.zeros_like(twist)
+
+@lru_cache(maxsize=64)
+def _line_motion(spline: Spline, lens: Lens, stamp: float) -> tuple[FloatArray, FloatArray]:
+    """Remembered: both terms ask for the same."""
+    middle, block, dt = _line_blocks(lens)
+    T, twist = spline.pose_and_velocity(stamp + middle)
+    if len(middle) == 1:
+        return T[block], twist[block]
+    # Central differences; a block's twist and the next one's are as far apart as their times.
+    slope = (twist[1:] - twist[:-1]) / (middle[1:] - middle[:-1])[:, None]
+    rate = np.concatenate([slope[:1], 0.5 * (slope[1:] + slope[:-1]), slope[-1:]])
+    change = rate[block] * dt
+    moved = (twist[block] + 0.5 * change) * dt
+    w = hat(moved[:, 3:])
+    # Second order of exp: R(I + w + w²/2), and t likewise.
+    out = T[block]
+    R = out[:, :3, :3].copy()
+    Rw = R @ w
+    out[:, :3, :3] = R + Rw + 0.5 * (Rw @ w)
+    v = moved[:, :3, None]
+    out[:, :3, 3] += ((R + 0.5 * Rw) @ v)[..., 0]
+    return out, twist[block] + change
 
 
 def line_motion(spline: Spline, exposure: Exposure) -> tuple[FloatArray, FloatArray]:
@@ -67,27 +89,14 @@ def line_motion(spline: Spline, exposure: Exposure) -> tuple[FloatArray, FloatAr
     With a twist that changes linearly: over the quarter of a millisecond to a block's edge that is exact to nanometres.
     (A constant one is wrong by a micrometre at 35 m/s², and its velocity moves what project_rolling finds by 1e-3 px.)
     """
-    T, twist, rate = _block_motion(spline, exposure.lens, exposure.stamp)
-    lines = np.arange(exposure.lens.lines)
-    block = lines // _LINES_PER_NODE
-    dt = (exposure.times() - exposure.block_times(_LINES_PER_NODE)[block])[:, None]
-    change = rate[block] * dt
-    moved = (twist[block] + 0.5 * change) * dt
-    w = hat(moved[:, 3:])
-    # Second order of exp: R(I + w + w²/2), and t likewise.
-    out = T[block]
-    R = out[:, :3, :3].copy()
-    out[:, :3, :3] = R + R @ (w + 0.5 * (w @ w))
-    v = moved[:, :3, None]
-    out[:, :3, 3] += (R @ (v + 0.5 * (w @ v)))[..., 0]
-    return out, twist[block] + change
+    return _line_motion(spline, exposure.lens, exposure.stamp)
 
 
 def to_base_table(spline: Spline, T_world_base: FloatArray, exposure: Exposure) -> FloatArray:
     """T_base_cam of each line (lines, 12): rotation row-major, translation."""
     T_world_body, _ = line_motion(spline, exposure)
     T = se3.inverse(T_world_base) @ T_world_body @ se3.inverse(exposure.T_cam_body)
-    return np.concatenate([T[:, :3, :3].reshape(-1, 9), T[:, :3, 3]], axis=1)
+    return _rows(T)
 
 
 def from_base_table(spline: Spline, T_world_base: FloatArray, exposure: Exposure) -> FloatArray:
@@ -96,7 +105,12 @@ def from_base_table(spline: Spline, T_world_base: FloatArray, exposure: Exposure
     T = exposure.T_cam_body @ se3.inverse(T_world_body) @ T_world_base
     delay = exposure.lens.shutter.line_delay(exposure.lens.camera)
     twist_cam = delay * twist @ se3.adjoint(exposure.T_cam_body).T
-    return np.concatenate([T[:, :3, :3].reshape(-1, 9), T[:, :3, 3], twist_cam], axis=1)
+    return np.concatenate([_rows(T), twist_cam], axis=1)
+
+
+def _rows(T: FloatArray) -> FloatArray:
+    """Poses (n, 4, 4) as (n, 12): rotation row-major, translation."""
+    return np.concatenate([T[:, :3, :3].reshape(-1, 9), T[:, :3, 3]], axis=1)
 
 
 IDENTITY_FROM_BASE = np.concatenate([np.eye(3).ravel(), np.zeros(9)])[None]

@@ -89,19 +89,19 @@ def acceleration_prior(spline: Spline, first: int, last: int, sigma: FloatArray)
     sigma (triples, 6): m and rad per knot squared, so acceleration times dt². Derivative of Ω_j = log(T_{j−1}⁻¹ T_j) by
     left increments: Jl⁻¹(Ω_j) Ad(T_{j−1}⁻¹) (δ_j − δ_{j−1}). Returns the model and the cost.
     """
-    count = last - first
-    H, g = np.zeros((6 * count, 6 * count)), np.zeros(6 * count)
     gains = spline.left_gains[first : last - 1]
     omega = spline.increments[first : last - 1]
-    information, cost = 1.0 / sigma**2, 0.0
+    r = omega[1:] - omega[:-1]
+    J = np.concatenate([gains[:-1], -gains[1:] - gains[:-1], gains[1:]], axis=2)
+    weighted = np.swapaxes(J, 1, 2) / sigma[:, None, :] ** 2
+    blocks, slopes = weighted @ J, (weighted @ r[..., None])[..., 0]
+    count = last - first
+    H, g = np.zeros((6 * count, 6 * count)), np.zeros(6 * count)
     for i in range(count - 2):
-        r = omega[i + 1] - omega[i]
-        J = np.hstack([gains[i], -gains[i + 1] - gains[i], gains[i + 1]])
         at = slice(6 * i, 6 * i + 18)
-        H[at, at] += J.T @ (information[i, :, None] * J)
-        g[at] += J.T @ (information[i] * r)
-        cost += 0.5 * float(r @ (information[i] * r))
-    return Quadratic(first, H, g), cost
+        H[at, at] += blocks[i]
+        g[at] += slopes[i]
+    return Quadratic(first, H, g), 0.5 * float(np.sum((r / sigma) ** 2))
 
 
 def pose_constraint(spline: Spline, t: float, T_world_body: FloatArray, sigma: FloatArray) -> tuple[Quadratic, float]:

@@ -1,4 +1,4 @@
-"""Gauss-Newton over the control points that are still free (equation (12)), with lazy relinearisation.
+"""Levenberg-Marquardt over the control points that are still free (equation (12)), with lazy relinearisation.
 
 Each observation keeps its quadratic model. While the increments since then have moved its lines by less than a
 fraction of a pixel the model is only shifted (g += H ε); it is linearised anew beyond that.
@@ -27,6 +27,8 @@ STOP_PX = (0.02, 0.1, 0.3)
 RELINEARISE_PX = 0.02
 # Rise of the negative log-likelihood per pixel from which on a step has made things worse: less is noise of gating.
 _WORSE = 2e-5
+# Increments of control points (m, rad) that change the derivatives of lines by less than a step's own error.
+_SAME_SLOPES = 5e-3
 # Position u of the last line on its knot interval below which the last control point (weight u³/6) is mere guesswork.
 _TOLD = 0.6
 # Errors at the start of a level, as σ: m and intensity; re-estimated with every linearisation.
@@ -36,18 +38,24 @@ _START_DEPTH, _START_INTENSITY = 5e-3, 0.03
 class SplineState:
     """The growing spline: control points (m, 4, 4) in the world and the sum of increments that each has received."""
 
-    def __init__(self, t0: float, dt: float, T_world_body: FloatArray, count: int) -> None:
-        self.t0, self.dt = t0, dt
-        self.points = np.repeat(T_world_body[None], count, axis=0)
-        self.moved = np.zeros((count, 6))
-        self._spline: Spline | None = None
+    def __init__(self, spline: Spline) -> None:
+        self.spline = spline
+        self.moved = np.zeros((len(spline.control_points), 6))
+
+    @classmethod
+    def still(cls, t0: float, dt: float, T_world_body: FloatArray, count: int = 4) -> SplineState:
+        """Control points that are all at T_world_body (4, 4), from time t0 (s) on, dt (s) apart."""
+        return cls(Spline(np.repeat(T_world_body[None], count, axis=0), t0, dt))
 
     @property
-    def spline(self) -> Spline:
-        """The spline as it is now."""
-        if self._spline is None:
-            self._spline = Spline(self.points, self.t0, self.dt)
-        return self._spline
+    def points(self) -> FloatArray:
+        """Control points (m, 4, 4)."""
+        return self.spline.control_points
+
+    @property
+    def dt(self) -> float:
+        """Seconds between knots."""
+        return self.spline.dt
 
     def copy(self) -> SplineState:
         """A state that can be changed without changing this one."""
@@ -57,33 +65,32 @@ class SplineState:
 
     def restarted(self, end: float, first: float, last: float, T_world_body: FloatArray) -> SplineState:
         """The same up to time `end`; from `first` to `last` standing still at T_world_body (4, 4)."""
+        points = self.points
         keep = self.segment(end) + 4
-        twin = copy.copy(self)
         start, stop = self.segment(first), self.segment(last) + 4
-        gap = np.repeat(self.points[keep - 1][None], max(0, start - keep), axis=0)
+        gap = np.repeat(points[keep - 1][None], max(0, start - keep), axis=0)
         still = np.repeat(T_world_body[None], stop - start, axis=0)
-        twin.points = np.concatenate([self.points[: min(keep, start)], gap, still])
-        twin.moved = np.zeros((len(twin.points), 6))
-        twin._spline = None
-        return twin
+        return SplineState(
+            Spline(np.concatenate([points[: min(keep, start)], gap, still]), self.spline.t0, self.spline.dt)
+        )
 
     def segment(self, t: float) -> int:
         """Index of the first of the four control points that a time depends on."""
-        return int(np.floor((t - self.t0) / self.dt))
+        return int(np.floor((t - self.spline.t0) / self.spline.dt))
 
     def extend(self, t: float) -> None:
         """Grow with constant velocity until time t is covered."""
-        missing = self.segment(t) + 4 - len(self.points)
+        points = self.points
+        missing = self.segment(t) + 4 - len(points)
         if missing <= 0:
             return
-        step = se3.inverse(self.points[-2]) @ self.points[-1]
-        new = [self.points[-1]]
+        step = se3.inverse(points[-2]) @ points[-1]
+        new = [points[-1]]
         for _ in range(missing):
             # Products drift away from rotations, and inverses by transposition amplify that (2.4 times a knot).
             new.append(se3.orthonormalise(new[-1] @ step))
-        self.points = np.concatenate([self.points, np.array(new[1:])])
+        self.spline = self.spline.changed(len(points), np.array(new[1:]))
         self.moved = np.concatenate([self.moved, np.zeros((missing, 6))])
-        self._spline = None
 
     def smooth_end(self, t: float) -> None:
         """Lay the last control point on with constant velocity if lines until time t (s) hardly told where it is.
@@ -91,21 +98,20 @@ class SplineState:
         It weighs u³/6 in them at most, so that a systematic error of the lines is magnified; and the next control
         points are extrapolated from it.
         """
-        s = (t - self.t0) / self.dt
-        if s - np.floor(s) > _TOLD or self.segment(t) + 4 != len(self.points):
+        points = self.points
+        s = (t - self.spline.t0) / self.spline.dt
+        if s - np.floor(s) > _TOLD or self.segment(t) + 4 != len(points):
             return
-        step = se3.inverse(self.points[-3]) @ self.points[-2]
-        T = se3.orthonormalise(self.points[-2] @ step)
-        self.apply(len(self.points) - 1, se3.log(T @ se3.inverse(self.points[-1]))[None])
+        step = se3.inverse(points[-3]) @ points[-2]
+        T = se3.orthonormalise(points[-2] @ step)
+        self.apply(len(points) - 1, se3.log(T @ se3.inverse(points[-1]))[None])
 
     def apply(self, first: int, increments: FloatArray) -> None:
         """T_i ← exp(δ_i) T_i for control points first, first + 1, ...; increments (n, 6)."""
         last = first + len(increments)
-        points = self.points.copy()
-        points[first:last] = se3.orthonormalise(se3.exp(increments) @ points[first:last])
-        self.points = points
+        points = se3.orthonormalise(se3.exp(increments) @ self.points[first:last])
+        self.spline = self.spline.changed(first, points)
         self.moved[first:last] += increments
-        self._spline = None
 
 
 # A prior: its quadratic model around a spline, and its cost there.
@@ -127,6 +133,8 @@ class Observation:
     sigma: float = 0.0
     lin: Linearised | None = None
     stands_for: float = 1.0
+    slopes_at: Spline | None = None
+    slopes_moved: FloatArray = field(default_factory=lambda: np.zeros((0, 6)))
     at: FloatArray = field(default_factory=lambda: np.zeros((0, 6)))
 
     @property
@@ -137,15 +145,16 @@ class Observation:
     def linearise(self, terms: Terms, state: SplineState, level: int) -> Linearised:
         """Around the current state; takes the σ that the one before suggested."""
         image = self.image
+        slopes_at = self._slopes(state)
         if isinstance(image, DepthImage):
-            self.lin = terms.geometric(image, self.ref, state.spline, level, self.sigma or _START_DEPTH)
+            self.lin = terms.geometric(image, self.ref, state.spline, level, self.sigma or _START_DEPTH, slopes_at)
         else:
             if level == 0 and self.visible is None and self.occluder is not None:
                 # Once: the coarse levels have brought the poses close enough to tell, and a fixed set converges.
                 self.visible = terms.visible(self.occluder, self.ref, state.spline, level)
             visible = self.visible if level == 0 else None
             sigma = self.sigma or _START_INTENSITY
-            self.lin = terms.photometric(image, self.ref, state.spline, level, sigma, visible)
+            self.lin = terms.photometric(image, self.ref, state.spline, level, sigma, slopes_at, visible)
         self.sigma = self.lin.next_sigma
         # A coarse level's pixels stand for those left out: the priors' share must not depend on the level.
         self.stands_for = (STRIDES[level] / STRIDES[0]) ** 2
@@ -169,6 +178,13 @@ class Observation:
         model = self.lin.model
         moved = self._since(state)[model.first : model.last].ravel()
         return self.stands_for * float(model.g @ moved + 0.5 * moved @ model.H @ moved)
+
+    def _slopes(self, state: SplineState) -> Spline:
+        """Where the poses of its lines are differentiated: an earlier state as long as that is as good."""
+        before = self.slopes_moved
+        if self.slopes_at is None or np.abs(state.moved[: len(before)] - before).max() > _SAME_SLOPES:
+            self.slopes_at, self.slopes_moved = state.spline, state.moved.copy()
+        return self.slopes_at
 
     def _since(self, state: SplineState) -> FloatArray:
         since = state.moved.copy()
@@ -209,14 +225,10 @@ def optimise(terms: Terms, state: SplineState, problem: Problem, levels: Sequenc
     Raises numpy.linalg.LinAlgError where the system has no solution.
     """
     done = Solved()
-    try:
-        for level in levels:
-            for observation in problem.fresh:
-                observation.lin, observation.sigma = None, 0.0 if level == levels[0] else observation.sigma
-            terms.derivatives_at = state.spline
-            _optimise_level(terms, state, problem, level, most[level], done)
-    finally:
-        terms.derivatives_at = None
+    for level in levels:
+        for observation in problem.fresh:
+            observation.lin, observation.sigma = None, 0.0 if level == levels[0] else observation.sigma
+        _optimise_level(terms, state, problem, level, most[level], done)
     return done
 
 

@@ -40,7 +40,7 @@ EDGE = 0.03
 _BEHIND = 0.02
 # Share of a pixel's weight that its curvature keeps at least.
 _CURVATURE = 0.5
-_PAIRS = [(a, b) for a in range(6) for b in range(a, 6)]
+_UPPER = np.triu_indices(6)
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Scaling:
         _, _, _, _, unit_H, unit_g, unit_cost = self.parameters(1.0, 0.0)
         scale = np.array([1.0, 1.0, 1.0, self.lever, self.lever, self.lever])
         H = np.empty((current, reference, 6, 6))
-        a, b = np.triu_indices(6)
+        a, b = _UPPER
         H[..., a, b] = H[..., b, a] = raw[..., :21] * (scale[a] * scale[b] / unit_H)
         g = raw[..., 21:27] * (scale / unit_g)
         total = raw[..., 27:30].astype(np.int64).sum(axis=(0, 1))
@@ -105,7 +105,7 @@ def _accumulate(
     # Newton's weight rather than that of reweighted least squares, which converges only linearly; kept positive.
     h = unit_H * dr.maximum((NU - s * s) / (NU + s * s), _CURVATURE)
     hj = [h * c for c in wj]
-    values = [hj[a] * j[b] for a, b in _PAIRS]
+    values = [hj[a] * j[b] for a, b in zip(*_UPPER, strict=True)]
     values += [c * s * (sign * unit_g) for c in wj]
     values += [w * s * s * unit_cost, (0.5 * (NU + 1.0)) * dr.log(1.0 + s * s * (1.0 / NU)) * unit_cost]
     sums = dr.zeros(e.Int, size * _SLOTS)

@@ -148,7 +148,9 @@ def track(
     noise = noise or Noise()
 
     def load(k: int) -> Frame:
-        return with_noise(dataset.frame(k), k, noise.sigma_depth, noise.sigma_intensity, noise.seed)
+        return with_noise(
+            dataset.frame(k, color=options.photometric), k, noise.sigma_depth, noise.sigma_intensity, noise.seed
+        )
 
     seconds: list[float] = []
     end: End = "done"

@@ -43,8 +43,13 @@ class Linearised:
     next_sigma: float
     cost: float
     count: int
-    # Smallest eigenvalue of Σ w j jᵀ / count with rotations scaled by the scene's depth: 0 where a motion is not seen.
-    observability: float
+    # Σ w j jᵀ / count (6, 6) with rotations scaled by the scene's depth.
+    seen: FloatArray
+
+    @property
+    def observability(self) -> float:
+        """Smallest eigenvalue of `seen`: 0 where a motion is not seen."""
+        return weakest_motion(self.seen)
 
     def row_shift(self, increments: FloatArray, focal: float, depth: float) -> float:
         """Largest movement of a block in pixels under increments (m, 6) of all control points."""
@@ -58,25 +63,29 @@ class Terms:
 
     e: Engine
     rays: tuple[Any, Any]
-    # Residual beyond which a pixel is an outlier for certain (m; intensity), and smallest credible σ.
-    gate_depth: float = 0.05
+    # Residual beyond which a pixel is an outlier for certain (m, by level; intensity), and smallest credible σ.
+    gate_depth: tuple[float, ...] = (0.05, 0.05, 0.3)
     gate_intensity: float = 0.3
     floor_depth: float = _CREDIBLE_DEPTH
     floor_intensity: float = 1.0 / 255.0
     # Where interpolation errs by more than this part of σ, its bias counts, not its size: those pixels are left out.
     smooth: float = 0.25
-    # Spline at which the lines' poses are differentiated by control points, if not the one that is asked for: they
-    # change by no more than the increments (relative), which a few Gauss-Newton steps do not notice.
-    derivatives_at: Spline | None = None
     _kernels: dict[Any, Any] = field(default_factory=dict)
 
-    def geometric(self, image: DepthImage, ref: Reference, spline: Spline, level: int, sigma: float) -> Linearised:
-        """Depth image against the reference's depth with every STRIDES[level]-th pixel."""
+    def geometric(
+        self, image: DepthImage, ref: Reference, spline: Spline, level: int, sigma: float,
+        slopes_at: Spline | None = None,
+    ) -> Linearised:  # fmt: skip
+        """Depth image against the reference's depth with every STRIDES[level]-th pixel.
+
+        slopes_at: spline at which the lines' poses are differentiated by control points, if not `spline`: that changes
+        by no more than the increments between the two (relative), which Gauss-Newton steps do not notice.
+        """
         to_base = to_base_table(spline, ref.T_world_base, image.exposure)
         sums = self._geometric_sums(image, ref, to_base, self._seen_from(spline, ref), level, sigma)
         _, _, per, ref_per = block_counts(image.exposure.lens, ref.lens)
         times = image.exposure.block_times(per)
-        return self._finish(sums, spline, ref, times, ref_per, sigma, self.floor_depth, ref.lever)
+        return self._finish(sums, slopes_at or spline, ref, times, ref_per, sigma, self.floor_depth, ref.lever)
 
     def geometric_pose(
         self, image: DepthImage, ref: Reference, T_base_cam: FloatArray, level: int, sigma: float
@@ -92,7 +101,8 @@ class Terms:
         e, lens = self.e, image.exposure.lens
         kernel = self._kernel(geometric_kernel, lens, ref.lens, STRIDES[level])
         scaling = self._scaling(ref, lens, lens.camera, ref, STRIDES[level], 1)
-        gate = min(self.gate_depth, max(5.0 * sigma, 10 * self.floor_depth)) if level == 0 else self.gate_depth
+        gate = self.gate_depth[level]
+        gate = min(gate, max(5.0 * sigma, 10 * self.floor_depth)) if level == 0 else gate
         smooth = self.smooth * max(sigma, _CREDIBLE_DEPTH)
         constants = e.upload(np.append(scaling.parameters(sigma, gate), smooth))
         surface = ref.inverse_depth, ref.slope_x, ref.slope_y, ref.roughness
@@ -108,8 +118,9 @@ class Terms:
         return kernel(points.x, points.y, points.z, self._ref_lines(spline, ref), depth.z, from_base)
 
     def photometric(
-        self, image: ColorImage, ref: Reference, spline: Spline, level: int, sigma: float, visible: Any = None
-    ) -> Linearised:
+        self, image: ColorImage, ref: Reference, spline: Spline, level: int, sigma: float,
+        slopes_at: Spline | None = None, visible: Any = None,
+    ) -> Linearised:  # fmt: skip
         """The reference's points of a level, those that are `visible`, against that level of the colour image."""
         e, lens, points = self.e, image.exposure.lens, ref.points[level]
         kernel = self._kernel(photometric_kernel, lens, ref.lens, STRIDES[level], level)
@@ -123,7 +134,7 @@ class Terms:
         current, reference, per, ref_per = block_counts(lens, ref.lens)
         sums = scaling.unpack(raw.numpy(), current, reference)
         times = image.exposure.block_times(per)
-        return self._finish(sums, spline, ref, times, ref_per, sigma, self.floor_intensity, points.lever)
+        return self._finish(sums, slopes_at or spline, ref, times, ref_per, sigma, self.floor_intensity, points.lever)
 
     def _ref_lines(self, spline: Spline, ref: Reference) -> Any:
         if ref.rolling is None:
@@ -149,11 +160,10 @@ class Terms:
         floor: float, lever: float,
     ) -> Linearised:  # fmt: skip
         ref_times = None if ref.rolling is None else ref.rolling.block_times(ref_per)
-        model, motion = chain(sums, self.derivatives_at or spline, ref.T_world_base, times, ref_times)
-        weakest = observability(sums, lever)
+        model, motion = chain(sums, spline, ref.T_world_base, times, ref_times)
         scaled = Quadratic(model.first, model.H / sigma**2, model.g / sigma)
         next_sigma = scale_step(sigma, sums.weighted, sums.count, floor)
-        return Linearised(scaled, motion, sigma, next_sigma, sums.cost, sums.count, weakest)
+        return Linearised(scaled, motion, sigma, next_sigma, sums.cost, sums.count, seen_motions(sums, lever))
 
     def _kernel(self, make: Any, *key: Any) -> Any:
         if (make, *key) not in self._kernels:
@@ -161,9 +171,12 @@ class Terms:
         return self._kernels[make, *key]
 
 
-def observability(sums: BlockSums, lever: float) -> float:
-    """Smallest eigenvalue of the summed H per pixel, with rotations divided by `lever` (m); 0 without pixels."""
-    if not sums.count:
-        return 0.0
+def seen_motions(sums: BlockSums, lever: float) -> FloatArray:
+    """Summed H (6, 6) per pixel, with rotations divided by `lever` (m); zero without pixels."""
     scale = 1.0 / np.array([1.0, 1.0, 1.0, lever, lever, lever])
-    return float(np.linalg.eigvalsh(sums.H.sum(axis=(0, 1)) * np.outer(scale, scale) / sums.count)[0])
+    return sums.H.sum(axis=(0, 1)) * np.outer(scale, scale) / max(1, sums.count)
+
+
+def weakest_motion(seen: FloatArray) -> float:
+    """Smallest eigenvalue of `seen_motions`: how well the motion that is seen least is seen."""
+    return float(np.linalg.eigvalsh(seen)[0])

@@ -35,7 +35,7 @@ _GAUGE = np.full(6, 1e-6)
 # Levels to go through from a prediction by constant velocity, and from anything worse.
 _TRACKING_LEVELS, _LEVELS = (1, 0), (2, 1, 0)
 # Steps at most on the pyramid's levels, finest first.
-_MOST_STEPS = (15, 8, 8)
+_MOST_STEPS = (15, 8, 30)
 # Seconds without a frame after which the motion before says nothing about where the camera is, and beyond which
 # frames hardly belong to one recording.
 _GAP_S, _BREAK_S = 0.3, 3600.0
@@ -123,7 +123,7 @@ class Tracker:
         return self._report(new, keyframe=True)
 
     def _new_state(self, first: Prepared, dt: float) -> SplineState:
-        state = SplineState(min(first.first_time, first.stamp) - self.options.knot_phase * dt, dt, np.eye(4), 4)
+        state = SplineState.still(min(first.first_time, first.stamp) - self.options.knot_phase * dt, dt, np.eye(4))
         state.extend(first.last_time)
         return state
 
@@ -140,7 +140,7 @@ class Tracker:
         fresh = self._observe(new, ref)
         free = (0, len(state.points))
 
-        extras = [self._prior(free), _gauge(ref)]
+        extras = [self._prior(state, free), _gauge(ref)]
         solved = self._optimise(state, fresh, self._active, free, extras, bandwidth=6 * free[1])
         if self._health.fault(fresh, solved, ref.pixels):
             return self._begin_anew(new)
@@ -171,7 +171,7 @@ class Tracker:
         ref = self._new_keyframe(middle, None)
         self._active = [o for frame in frames if frame is not middle for o in self._observe(frame, ref)]
         free = (0, len(state.points))
-        self._optimise(state, self._active, [], free, [self._prior(free)], levels=(0,))
+        self._optimise(state, self._active, [], free, [self._prior(state, free)], levels=(0,))
 
     def _track(self, new: Prepared) -> FrameReport:
         state, ref = self._known()
@@ -181,7 +181,7 @@ class Tracker:
         free = (max(self._piece, state.segment(new.first_time)), len(state.points))
         self._active = [o for o in self._active if o.lin is not None and o.lin.model.last > free[0]]
         fresh = self._observe(new, ref)
-        extras = [self._prior(free)]
+        extras = [self._prior(state, free)]
         if state.segment(ref.t) + 4 > free[0] and new.depth.exposure.lens.lines == 1:
             # The first keyframe of a global shutter: no other frame tells where it was taken.
             extras.append(_gauge(ref))
@@ -205,7 +205,7 @@ class Tracker:
                 trial = state.restarted(end, new.first_time, new.last_time, T_world_body)
                 first = trial.segment(new.first_time)
                 fresh, free = self._observe(new, ref), (first, len(trial.points))
-                solved = self._optimise(trial, fresh, [], free, [self._prior(free, first)])
+                solved = self._optimise(trial, fresh, [], free, [self._prior(trial, free, first)])
                 if self._health.fault(fresh, solved, ref.pixels):
                     continue
                 self._state, self._piece, self._reference = trial, first, ref
@@ -266,9 +266,9 @@ class Tracker:
         depth = [Observation(frame.index, frame.depth, ref)] if self.options.geometric else []
         return depth + [Observation(frame.index, c, ref, frame.depth) for c in frame.colors if ref.points]
 
-    def _prior(self, free: tuple[int, int], piece: int | None = None) -> Extra:
+    def _prior(self, state: SplineState, free: tuple[int, int], piece: int | None = None) -> Extra:
         first, last = max(self._piece if piece is None else piece, free[0] - 2), free[1]
-        sigma = np.repeat(_ACCELERATION[None] * self.options.knot_spacing_s**2, last - first - 2, axis=0)
+        sigma = np.repeat(_ACCELERATION[None] * state.dt**2, last - first - 2, axis=0)
         sigma[-_NEWEST_TRIPLES:] *= _NEWEST_FACTOR
         return lambda spline: acceleration_prior(spline, first, last, sigma)
 

@@ -146,7 +146,7 @@ def test_pose_constraint_is_that_of_its_cost(size: float) -> None:
 
 
 def test_a_tight_pose_constraint_is_met() -> None:
-    state = SplineState(0.3, 0.05, np.eye(4), 9)
+    state = SplineState.still(0.3, 0.05, np.eye(4), 9)
     target = se3.exp(np.array([0.02, -0.01, 0.03, 0.04, 0.01, -0.02]))
     for _ in range(4):
         prior, _ = acceleration_prior(state.spline, 0, 9, np.full((7, 6), 0.01))
@@ -226,7 +226,7 @@ def test_a_system_without_a_minimum_is_refused(least: float) -> None:
 
 def test_extension_keeps_the_velocity() -> None:
     step = np.array([0.01, -0.02, 0.03, 0.04, -0.01, 0.02])
-    state = SplineState(0.0, 0.05, np.eye(4), 4)
+    state = SplineState.still(0.0, 0.05, np.eye(4))
     state.apply(0, np.arange(4)[:, None] * step)  # exp(k ξ)
     state.extend(1.0)
     assert len(state.points) == 24 == len(state.moved)
@@ -236,7 +236,7 @@ def test_extension_keeps_the_velocity() -> None:
 
 
 def test_extension_covers_the_time_and_no_more() -> None:
-    state = SplineState(0.1, 0.05, np.eye(4), 4)
+    state = SplineState.still(0.1, 0.05, np.eye(4))
     state.extend(0.12)
     assert len(state.points) == 4
     before = state.spline
@@ -248,8 +248,7 @@ def test_extension_covers_the_time_and_no_more() -> None:
 
 def test_increments_multiply_from_the_left() -> None:
     rng, truth = np.random.default_rng(6), hand_held(3)
-    state = SplineState(truth.t0, truth.dt, np.eye(4), 15)
-    state.points = truth.control_points.copy()
+    state = SplineState(truth)
     delta, again = random_twists(rng, (2, 4), 0.3, 0.2)
     state.apply(5, delta)
     want = truth.control_points.copy()
@@ -266,7 +265,7 @@ def test_increments_multiply_from_the_left() -> None:
 
 def test_poses_stay_rotations_for_ever() -> None:
     rng = np.random.default_rng(7)
-    state = SplineState(0.0, 0.05, se3.exp(np.array([0.3, 0.1, 0.2, 0.5, -0.4, 0.8])), 4)
+    state = SplineState.still(0.0, 0.05, se3.exp(np.array([0.3, 0.1, 0.2, 0.5, -0.4, 0.8])))
     for k in range(1000):
         state.extend(0.05 * (k + 1))
         state.apply(len(state.points) - 4, random_twists(rng, (4,), 0.02, 0.01))
@@ -278,7 +277,7 @@ def test_poses_stay_rotations_for_ever() -> None:
 
 def test_a_long_extrapolation_stays_rotations() -> None:
     # With the transpose taken as inverse, what is left of orthogonality would grow 2.4 times a knot.
-    state = SplineState(0.0, 0.05, np.eye(4), 4)
+    state = SplineState.still(0.0, 0.05, np.eye(4))
     state.apply(0, np.arange(4)[:, None] * np.array([0.01, -0.02, 0.03, 0.3, -0.2, 0.25]))
     for k in range(300):
         state.extend(0.05 * (k + 1))

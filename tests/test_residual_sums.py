@@ -18,7 +18,7 @@ from rstrack.normal_equations import chain
 from rstrack.reference import Reference
 from rstrack.residuals import EDGE, BlockSums, Scaling
 from rstrack.robust import NU, weight
-from rstrack.terms import observability
+from rstrack.terms import seen_motions, weakest_motion
 from tests import synthetic
 from tests.rstrack_util import (
     ENGINE,
@@ -280,11 +280,13 @@ def test_sums_have_the_same_bits_on_every_run(room: tuple) -> None:
 
 def test_observability_is_zero_where_a_motion_is_not_seen(room: tuple) -> None:
     as_input, ref, spline, z = room
-    assert observability(block_sums(as_input(z), ref, spline, 0.1, 0.01), ref.lever) > 1e-3
+    assert weakest_motion(seen_motions(block_sums(as_input(z), ref, spline, 0.1, 0.01), ref.lever)) > 1e-3
     wall = plane_before(ref.T_world_base, (0.3, 0.2, 1.0))
     seen = depth_input(wall.cast, spline, exposure(0.30, "bottom-top", DEPTH))
     one = exact_reference(wall.cast, spline, exposure(0.25, None))
-    assert abs(observability(block_sums(seen, one, spline, 0.1, 0.01), one.lever)) < 1e-5  # rounding to fixed point
+    assert (
+        abs(weakest_motion(seen_motions(block_sums(seen, one, spline, 0.1, 0.01), one.lever))) < 1e-5
+    )  # rounding to fixed point
     alike = BlockSums(np.diag([1.0, 1.0, 1.0, 4.0, 4.0, 4.0])[None, None] * 5, np.zeros((1, 1, 6)), 0.0, 0.0, 10)
-    assert observability(alike, 2.0) == pytest.approx(0.5)
-    assert observability(BlockSums(alike.H, alike.g, 0.0, 0.0, 0), 2.0) == 0.0
+    assert weakest_motion(seen_motions(alike, 2.0)) == pytest.approx(0.5)
+    assert weakest_motion(seen_motions(BlockSums(alike.H, alike.g, 0.0, 0.0, 0), 2.0)) == 0.0

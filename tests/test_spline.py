@@ -227,3 +227,19 @@ def test_damaged_file_is_refused(tmp_path: Path, damage: str) -> None:
     with pytest.raises(UserError, match="spline") as caught:
         Spline.load(path)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("first", [0, 1, 7, 11, 12])
+@pytest.mark.parametrize("count", [1, 3])
+def test_changed_control_points_derive_what_a_new_spline_would(first: int, count: int) -> None:
+    rng = np.random.default_rng(5)
+    spline = random_spline(rng, 12)
+    points = se3.exp(0.1 * rng.standard_normal((count, 6))) @ spline.control_points[[min(first, 11)]]
+    found = spline.changed(first, points)
+    expected = Spline(found.control_points, spline.t0, spline.dt)
+    assert len(found.control_points) == max(12, first + count)
+    np.testing.assert_array_equal(found.control_points[first : first + count], points)
+    np.testing.assert_array_equal(found.control_points[:first], spline.control_points[:first])
+    np.testing.assert_array_equal(found.control_points[first + count :], spline.control_points[first + count :])
+    np.testing.assert_allclose(found.increments, expected.increments, atol=1e-14)
+    np.testing.assert_allclose(found.left_gains, expected.left_gains, atol=1e-13)

@@ -63,6 +63,27 @@ class Spline:
                 f"spline: control point {int(np.argmax(bad))} is not a rigid motion; pass it through se3.orthonormalise"
             )
 
+    def changed(self, first: int, points: FloatArray) -> Spline:
+        """The spline with control points `points` (n, 4, 4) from index `first` on; they may go beyond the end.
+
+        Derives anew only what the change touches, however long the spline is; points are trusted to be rigid.
+        """
+        last = first + len(points)
+        twin = object.__new__(Spline)
+        every = np.concatenate([self.control_points[:first], points, self.control_points[last:]])
+        every.setflags(write=False)
+        object.__setattr__(twin, "control_points", every)
+        object.__setattr__(twin, "t0", self.t0)
+        object.__setattr__(twin, "dt", self.dt)
+        pairs = slice(max(0, first - 1), min(last, len(every) - 1))
+        before, after = every[pairs], every[pairs.start + 1 : pairs.stop + 1]
+        fresh = se3.log(se3.inverse(before) @ after)
+        gains = se3.left_jacobian_inv(fresh) @ se3.adjoint(se3.inverse(before))
+        for name, new in (("increments", fresh), ("left_gains", gains)):
+            old = getattr(self, name)
+            object.__setattr__(twin, name, np.concatenate([old[: pairs.start], new, old[pairs.stop :]]))
+        return twin
+
     @property
     def t_begin(self) -> float:
         """First valid time in seconds."""
@@ -164,9 +185,13 @@ class Spline:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise UserError(f"{path}: not a readable spline ({reason}); write it anew with rsgen") from error
 
-    def _factors(self, segment: npt.NDArray[np.int64], b: FloatArray) -> list[FloatArray]:
-        """A_1..A_3, each (..., 4, 4)."""
-        return [se3.exp(b[..., j : j + 1] * self.increments[segment + j]) for j in range(3)]
+    def _parts(self, segment: npt.NDArray[np.int64], b: FloatArray) -> FloatArray:
+        """b_j Ω_j (3, ..., 6): all at once, since a call costs more than the numbers do."""
+        return np.moveaxis(b, -1, 0)[..., None] * self.increments[np.stack([segment, segment + 1, segment + 2])]
+
+    def _factors(self, segment: npt.NDArray[np.int64], b: FloatArray) -> FloatArray:
+        """A_1..A_3 (3, ..., 4, 4)."""
+        return se3.exp(self._parts(segment, b))
 
     def _motion(self, t: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         segment, u = self.locate(t)
@@ -190,10 +215,9 @@ class Spline:
     def _left_blocks(self, segment: npt.NDArray[np.int64], b: FloatArray) -> list[FloatArray]:
         T = self.control_points[segment]
         F = [np.broadcast_to(np.eye(6), (*segment.shape, 6, 6))]
+        J = se3.left_jacobian(self._parts(segment, b))
         for j, A in enumerate(self._factors(segment, b)):
-            bj = b[..., j : j + 1]
-            J = se3.left_jacobian(bj * self.increments[segment + j])
-            F.append(bj[..., None] * (se3.adjoint(T) @ J @ self.left_gains[segment + j]))
+            F.append(b[..., j, None, None] * (se3.adjoint(T) @ J[j] @ self.left_gains[segment + j]))
             T = T @ A
         return [F[0] - F[1], F[1] - F[2], F[2] - F[3], F[3]]
 
