@@ -123,7 +123,7 @@ class BaselineTracker:
         if found.is_good:
             T_world_cam = se3.orthonormalise(ref.T_world_base @ found.T_base_cam)
             self._found(new, T_world_cam)
-            renew = self._is_left_behind(found, overlap)
+            renew = self.options.left_behind(found.T_base_cam, overlap)
             if renew:
                 self._set_keyframe(new, T_world_cam, ref)
             elif self.options.fuse:
@@ -192,17 +192,6 @@ class BaselineTracker:
         self._times.append(t)
         self._poses.append(T_world_cam)
         self._last = [*self._last[-1:], (t, T_world_cam)]
-
-    def _is_left_behind(self, found: Alignment, overlap: float) -> bool:
-        """The tracker's criterion for a new keyframe."""
-        distance = np.linalg.norm(found.T_base_cam[:3, 3])
-        angle = np.degrees(np.linalg.norm(se3.log(found.T_base_cam)[3:]))
-        options = self.options
-        return bool(
-            overlap < options.keyframe_overlap
-            or distance > options.keyframe_distance
-            or angle > options.keyframe_angle_deg
-        )
 
     def _set_keyframe(self, new: Prepared, T_world_cam: FloatArray, older: Reference | None) -> None:
         motion = _still(T_world_cam, new.depth.exposure.mid_time)

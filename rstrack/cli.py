@@ -37,6 +37,7 @@ HELP = {
     "keyframe_overlap": "new keyframe once less than this part of the first points is seen",
     "keyframe_distance": "new keyframe after this distance, m",
     "keyframe_angle_deg": "new keyframe after this rotation, degrees",
+    "keyframe_strategy": "the last frame that has converged, or the newest, rolling until it has",
     "fuse": "average the depth of later frames into the keyframe",
     "bootstrap_frames": "frames that are aligned jointly at the start",
     "max_depth": "depth beyond this counts as missing, m",

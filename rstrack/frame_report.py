@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+
+from rstrack.optimizer import Solved
+from rstrack.terms import Linearised
 
 
 @dataclass(frozen=True)
@@ -32,3 +36,25 @@ class FrameReport:
     def as_lost(self) -> FrameReport:
         """The same frame, given up later on."""
         return replace(self, lost=True, keyframe=False)
+
+
+def frame_report(
+    stamp: float, depth: Sequence[Linearised], color: Sequence[Linearised], solved: Solved | None, *,
+    keyframe: bool, lost: bool, overlap: float,
+) -> FrameReport:  # fmt: skip
+    """Of a frame whose images ended with these linearisations; solved: None where nothing was optimised."""
+    solved = solved or Solved(last_shift=0.0)
+    return FrameReport(
+        stamp=stamp,
+        sigma_depth_m=depth[0].next_sigma if depth else float("nan"),
+        sigma_intensity=color[0].next_sigma if color else float("nan"),
+        inliers_depth=sum(lin.count for lin in depth),
+        inliers_color=sum(lin.count for lin in color),
+        iterations=solved.iterations,
+        evaluations=solved.evaluations,
+        last_shift_px=solved.last_shift,
+        keyframe=keyframe,
+        lost=lost,
+        observability=max((lin.observability for lin in (*depth, *color)), default=0.0),
+        overlap=overlap,
+    )

@@ -5,11 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+import numpy as np
+
 from rsgen.backend import Backend
 from rsgen.errors import UserError
+from rsgen.geometry import se3
+from rsgen.geometry.so3 import FloatArray
 
 Method = Literal["rs-pg", "rs-g", "rs-p", "gs-pg", "gs-g", "gs-p", "baseline"]
 METHODS: tuple[str, ...] = get_args(Method)
+Strategy = Literal["converged", "newest"]
+STRATEGIES: tuple[str, ...] = get_args(Strategy)
 
 
 @dataclass(frozen=True)
@@ -21,6 +27,8 @@ class Options:
       with a global shutter they are as far apart as the frames if that is more, since each gives one pose only.
     keyframe_overlap: a new keyframe is made once less than this share of the depth points that the current keyframe
       saw at first falls on it; keyframe_distance, keyframe_angle_deg: or once the camera is that far from it.
+    keyframe_strategy: which frame that is (paper, section 3.5): the last one that has converged, rectified at once; or
+      the newest, with its rolling shutter until it has converged and can be rectified.
     """
 
     method: Method = "rs-pg"
@@ -30,6 +38,7 @@ class Options:
     keyframe_overlap: float = 0.65
     keyframe_distance: float = 0.3
     keyframe_angle_deg: float = 20.0
+    keyframe_strategy: Strategy = "converged"
     fuse: bool = True
     bootstrap_frames: int = 6
     max_depth: float = 12.0
@@ -37,6 +46,8 @@ class Options:
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise UserError(f"unknown method '{self.method}': choose {', '.join(METHODS)}")
+        if self.keyframe_strategy not in STRATEGIES:
+            raise UserError(f"unknown keyframe_strategy '{self.keyframe_strategy}': choose {', '.join(STRATEGIES)}")
         if not 0.001 <= self.knot_spacing_s <= 1.0:
             raise UserError(f"knot_spacing_s = {self.knot_spacing_s!r} must be between 0.001 and 1 s")
         if not 0.0 <= self.knot_phase <= 1.0:
@@ -65,3 +76,9 @@ class Options:
     def photometric(self) -> bool:
         """Whether the photometric term is used."""
         return self.method in ("rs-pg", "rs-p", "gs-pg", "gs-p")
+
+    def left_behind(self, T_base_cam: FloatArray, overlap: float) -> bool:
+        """Whether a camera at T_base_cam (4, 4), that sees `overlap` of what the keyframe had, needs another one."""
+        distance, angle = np.linalg.norm(T_base_cam[:3, 3]), np.linalg.norm(se3.log(T_base_cam)[3:])
+        far = distance > self.keyframe_distance or np.degrees(angle) > self.keyframe_angle_deg
+        return bool(far or overlap < self.keyframe_overlap)

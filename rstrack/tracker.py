@@ -9,6 +9,7 @@ stamps, T_world_depth = tracker.trajectory
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
-from rstrack.frame_report import FrameReport
+from rstrack.frame_report import FrameReport, frame_report
 from rstrack.health import Health
 from rstrack.normal_equations import acceleration_prior, pose_constraint
 from rstrack.optimizer import Extra, Observation, Problem, Solved, SplineState, optimise
@@ -61,6 +62,8 @@ class Tracker:
         self._active: list[Observation] = []
         self._health = Health()
         self._pixels = 0
+        # The newest frame, while it is the reference and cannot be rectified yet.
+        self._unconverged: Prepared | None = None
         # First control point of the current piece of the spline: those before it belong to another, or to a gap.
         self._piece = 0
         self._stamps: list[float] = []
@@ -101,7 +104,7 @@ class Tracker:
             self._fit_knots(gap)
         if self._state is None:
             report = self._start(new)
-        elif self._reference is not None and self._reference.rolling is not None:
+        elif not self._keyframes:
             report = self._bootstrap(new)
         elif gap > _GAP_S:
             report = self._relocalise(new)
@@ -111,7 +114,7 @@ class Tracker:
         return report
 
     def _start(self, new: Prepared) -> FrameReport:
-        if new.depth_share < _LEAST_DEPTH or (self.options.photometric and not new.colors):
+        if self._unfit(new):
             return self._report(new, lost=True)
         self._state = self._new_state(new, self.options.knot_spacing_s)
         self._recent.append(new)
@@ -165,7 +168,7 @@ class Tracker:
         """Rectify the middle frame and align all others to it."""
         frames = list(self._recent)
         middle = min(
-            (f for f in frames if f.depth_share >= _LEAST_DEPTH and (f.colors or not self.options.photometric)),
+            (f for f in frames if not self._unfit(f)),
             key=lambda f: abs(f.index - frames[len(frames) // 2].index),
         )
         ref = self._new_keyframe(middle, None)
@@ -185,7 +188,9 @@ class Tracker:
         if state.segment(ref.t) + 4 > free[0] and new.depth.exposure.lens.lines == 1:
             # The first keyframe of a global shutter: no other frame tells where it was taken.
             extras.append(_gauge(ref))
-        solved = self._optimise(state, fresh, self._active, free, extras, levels=_TRACKING_LEVELS)
+        # A reference that still moves ties its own control points to those of the newest lines.
+        bandwidth = 24 if ref.rolling is None else 6 * (free[1] - free[0])
+        solved = self._optimise(state, fresh, self._active, free, extras, bandwidth, _TRACKING_LEVELS)
         if self._health.fault(fresh, solved, ref.pixels):
             self._state = before
             return self._relocalise(new)
@@ -193,7 +198,7 @@ class Tracker:
         self._recent.append(new)
         self._placed(new)
         overlap = self._overlap(fresh)
-        changed = self._renew_keyframe(state, free[0], overlap)
+        changed = self._renew_keyframe(state, new, free[0], overlap)
         return self._report(new, fresh, solved, keyframe=changed, overlap=overlap)
 
     def _relocalise(self, new: Prepared) -> FrameReport:
@@ -209,7 +214,7 @@ class Tracker:
                 if self._health.fault(fresh, solved, ref.pixels):
                     continue
                 self._state, self._piece, self._reference = trial, first, ref
-                self._active, self._pixels = fresh, 0
+                self._active, self._pixels, self._unconverged = fresh, 0, None
                 self._recent = deque([new])
                 self._placed(new, joined=False)
                 return self._report(new, fresh, solved, overlap=self._overlap(fresh))
@@ -219,33 +224,50 @@ class Tracker:
 
     # -- keyframes --------------------------------------------------------------------------------------------------
 
-    def _renew_keyframe(self, state: SplineState, first_free: int, overlap: float) -> bool:
-        """Fuse frames whose control points are frozen; promote the newest once the keyframe is left behind."""
-        _, ref = self._known()
-        options = self.options
+    def _renew_keyframe(self, state: SplineState, new: Prepared, first_free: int, overlap: float) -> bool:
+        """Fuse frames whose control points are frozen; make another frame the reference once it is left behind."""
         frozen = [f for f in self._recent if state.segment(f.last_time) + 4 <= first_free]
         for done in frozen[:-1]:
             self._recent.popleft()
-            if options.fuse and done.index > ref.index:
-                ref = self._maker.fused(ref, done.depth, state.spline)
-                self._reference = self._keyframes[-1] = ref
-        T_base_cam = se3.inverse(ref.T_world_base) @ state.spline.pose(self._recent[-1].depth.exposure.mid_time)
-        angle = np.degrees(np.linalg.norm(se3.log(T_base_cam)[3:]))
-        far = np.linalg.norm(T_base_cam[:3, 3]) > options.keyframe_distance or angle > options.keyframe_angle_deg
-        if not (overlap < options.keyframe_overlap or far) or not frozen or frozen[-1].index <= ref.index:
+            self._fuse(done, state)
+        if self._unconverged is not None:
+            if state.segment(self._unconverged.last_time) + 4 > first_free:
+                return False
+            self._new_keyframe(self._unconverged, self._keyframes[-1] if self.options.fuse else None)
+            return True
+        _, ref = self._known()
+        T_base_cam = se3.inverse(ref.T_world_base) @ state.spline.pose(new.depth.exposure.mid_time)
+        if not frozen or frozen[-1].index <= ref.index or not self.options.left_behind(T_base_cam, overlap):
             return False
-        best = frozen[-1]
-        if best.depth_share < _LEAST_DEPTH or (options.photometric and not best.colors):
+        if self.options.keyframe_strategy == "newest" and new.depth.exposure.lens.lines > 1:
+            if self._unfit(new):
+                return False
+            self._reference = self._maker.rolling(new.index, new.depth, new.colors, state.spline)
+            self._unconverged, self._pixels = new, 0
             return False
-        self._new_keyframe(best, ref if options.fuse else None)
+        if self._unfit(frozen[-1]):
+            return False
+        self._new_keyframe(frozen[-1], ref if self.options.fuse else None)
         return True
+
+    def _fuse(self, done: Prepared, state: SplineState) -> None:
+        ref = self._keyframes[-1]
+        if not self.options.fuse or done.index <= ref.index:
+            return
+        self._keyframes[-1] = self._maker.fused(ref, done.depth, state.spline)
+        if self._reference is ref:
+            self._reference = self._keyframes[-1]
+
+    def _unfit(self, frame: Prepared) -> bool:
+        """Whether a frame shows too little to align others to it."""
+        return frame.depth_share < _LEAST_DEPTH or (self.options.photometric and not frame.colors)
 
     def _new_keyframe(self, frame: Prepared, older: Reference | None) -> Reference:
         state = self._state
         assert state is not None
         self._reference = self._maker.rectified(frame.index, frame.depth, frame.colors, state.spline, older)
         self._keyframes.append(self._reference)
-        self._pixels = 0
+        self._unconverged, self._pixels = None, 0
         self.keyframes += 1
         return self._reference
 
@@ -291,26 +313,12 @@ class Tracker:
         self.spline_valid.append((begin, new.last_time))
 
     def _report(
-        self, new: Prepared, fresh: list[Observation] | None = None, solved: Solved | None = None, *,
+        self, new: Prepared, fresh: Sequence[Observation] = (), solved: Solved | None = None, *,
         keyframe: bool = False, lost: bool = False, overlap: float = 1.0,
     ) -> FrameReport:  # fmt: skip
-        depth = [o.lin for o in fresh or [] if o.is_depth and o.lin is not None]
-        color = [o.lin for o in fresh or [] if not o.is_depth and o.lin is not None]
-        solved = solved or Solved(last_shift=0.0)
-        return FrameReport(
-            stamp=new.stamp,
-            sigma_depth_m=depth[0].next_sigma if depth else float("nan"),
-            sigma_intensity=color[0].next_sigma if color else float("nan"),
-            inliers_depth=sum(lin.count for lin in depth),
-            inliers_color=sum(lin.count for lin in color),
-            iterations=solved.iterations,
-            evaluations=solved.evaluations,
-            last_shift_px=solved.last_shift,
-            keyframe=keyframe,
-            lost=lost,
-            observability=max((lin.observability for lin in (*depth, *color)), default=0.0),
-            overlap=overlap,
-        )
+        depth = [o.lin for o in fresh if o.is_depth and o.lin is not None]
+        color = [o.lin for o in fresh if not o.is_depth and o.lin is not None]
+        return frame_report(new.stamp, depth, color, solved, keyframe=keyframe, lost=lost, overlap=overlap)
 
 
 def _gauge(ref: Reference) -> Extra:

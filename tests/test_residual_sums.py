@@ -289,4 +289,4 @@ def test_observability_is_zero_where_a_motion_is_not_seen(room: tuple) -> None:
     )  # rounding to fixed point
     alike = BlockSums(np.diag([1.0, 1.0, 1.0, 4.0, 4.0, 4.0])[None, None] * 5, np.zeros((1, 1, 6)), 0.0, 0.0, 10)
     assert weakest_motion(seen_motions(alike, 2.0)) == pytest.approx(0.5)
-    assert weakest_motion(seen_motions(BlockSums(alike.H, alike.g, 0.0, 0.0, 0), 2.0)) == 0.0
+    assert weakest_motion(seen_motions(BlockSums(0.0 * alike.H, alike.g, 0.0, 0.0, 0), 2.0)) == 0.0

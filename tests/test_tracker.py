@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,8 +34,8 @@ def blank(frame: Frame) -> Frame:
     return replace(frame, depth=replace(frame.depth, pixels=np.zeros_like(frame.depth.pixels)))
 
 
-def tracker_of(method: Method, shutter: Shutter = ROLLING) -> Tracker:
-    return Tracker(Rig(CAMERA, shutter, CAMERA, shutter, synthetic.T_COLOR_DEPTH), Options(method=method))
+def tracker_of(method: Method, shutter: Shutter = ROLLING, **options: Any) -> Tracker:
+    return Tracker(Rig(CAMERA, shutter, CAMERA, shutter, synthetic.T_COLOR_DEPTH), Options(method=method, **options))
 
 
 def feed(tracker: Tracker, frames: Iterable[Frame]) -> Tracker:
@@ -96,6 +97,20 @@ def test_a_global_shutter_is_tracked_alike_by_both_models() -> None:
     np.testing.assert_array_equal(tracks["rs-pg"].trajectory[1], tracks["gs-pg"].trajectory[1])
 
 
+@pytest.mark.parametrize("method", ["rs-g", "rs-pg"])
+def test_the_newest_frame_serves_as_a_rolling_reference_until_it_is_rectified(method: Method) -> None:
+    tracker = tracker_of(method, keyframe_strategy="newest", keyframe_distance=0.03)
+    rolling = []
+    for k in range(24):
+        tracker.feed(frame_at(k))
+        assert tracker._reference is not None
+        rolling.append(tracker._reference.rolling is not None)
+    # After the start: rolling for some frames, then rectified, and so on; a keyframe each time.
+    changes = np.flatnonzero(np.diff(np.array(rolling[6:], int)) < 0)
+    assert len(changes) >= 2 and tracker.keyframes == 1 + len(changes)
+    assert lost(tracker) == [] and worst_step(tracker) < 1e-3
+
+
 def test_frames_out_of_order_or_of_another_camera() -> None:
     tracker = feed(tracker_of("rs-pg"), (frame_at(k) for k in (0, 1)))
     for stamp in (1 / 30, 0.0, 1e5, np.nan):
@@ -110,7 +125,7 @@ def test_frames_out_of_order_or_of_another_camera() -> None:
 @pytest.mark.parametrize(
     "wrong",
     [{"method": "best"}, {"knot_spacing_s": 0.0}, {"knot_phase": 2.0}, {"keyframe_overlap": -0.5}, {"max_depth": -1.0},
-     {"bootstrap_frames": 2}, {"keyframe_distance": float("nan")}],
+     {"bootstrap_frames": 2}, {"keyframe_strategy": "best"}, {"keyframe_distance": float("nan")}],
 )  # fmt: skip
 def test_options_are_checked(wrong: dict[str, object]) -> None:
     with pytest.raises(UserError, match=str(next(iter(wrong))).split("_")[0]):
