@@ -15,7 +15,8 @@ from rich.table import Table
 
 from rsgen.config import Config
 from rsgen.errors import UserError
-from rsgen.generate import Motion, Progress, load_motion, make_integrator
+from rsgen.frame_source import Progress, make_integrator
+from rsgen.generate import Motion, load_motion
 from rsgen.geometry.shutter import Shutter
 
 PSNR_FLOOR_DB = 36.0

@@ -15,6 +15,11 @@ from rsgen.command_line import Commands, Parser, count, parse_frames, run_progra
 if TYPE_CHECKING:
     from rsgen.config import Config
 
+EXPORTS = ("kalibr", "euroc", "registered", "video", "rerun")
+_EXPORT_HELP = (
+    "kalibr: camchain.yaml with line_delay, imu.yaml; euroc: mav0/ (ASL); registered: TUM folder with depth warped "
+    "into the colour camera, its rows' times lost; video: global beside rolling shutter (.mp4); rerun: .rrd recording"
+)
 _DESCRIPTION = """\
 rsgen makes rolling-shutter RGB-D benchmark sequences with exact continuous-time ground truth.
 
@@ -22,6 +27,8 @@ rsgen makes rolling-shutter RGB-D benchmark sequences with exact continuous-time
   rsgen verify out/demo                     read it back and check it against itself
   rsgen compare out/demo --frame 20         what the rolling shutter did to frame 20
   rsgen fit my_trajectory.txt               how well a spline represents a recorded trajectory
+  rsgen motion stats configs/table1.yaml    how far and how fast a config's camera moves
+  rsgen export euroc out/demo               for the tools of others: EuRoC, Kalibr, registered TUM, video, rerun
 """
 
 
@@ -54,6 +61,13 @@ def _parser() -> Parser:
     fit.add_argument("--plot", type=Path, metavar="PNG", help="write residuals, speeds and accelerations as a picture")
     fit.add_argument("--json", action="store_true", help="print machine-readable figures")
 
+    motion = add(
+        "motion", _motion, "stats: length, mean speeds and accelerations of the configs' motions, beside the paper's",
+        "stats configs/robot_t1.yaml configs/table1.yaml",
+    )  # fmt: skip
+    motion.add_argument("what", choices=("stats",), help="stats: print a table, a line a config")
+    motion.add_argument("configs", type=Path, nargs="+", metavar="config", help="YAML files")
+
     info = add("info", _info, "say what a sequence folder holds", "out/demo")
     info.add_argument("sequence", type=Path, help="folder that 'rsgen render' wrote")
 
@@ -80,6 +94,17 @@ def _parser() -> Parser:
     preview.add_argument("sequence", type=Path, help="folder that 'rsgen render' wrote")
     preview.add_argument("--out", type=Path, metavar="PNG", help="picture to write (default: SEQ/preview.png)")
     preview.add_argument("--count", type=count, default=4, help="frames to show (default: 4)")
+
+    export = add(
+        "export", _export, "write a sequence in the layout of other tools",
+        "euroc out/table1",
+    )  # fmt: skip
+    export.add_argument("to", choices=EXPORTS, metavar="|".join(EXPORTS), help=_EXPORT_HELP)
+    export.add_argument("sequence", type=Path, help="folder that 'rsgen render' wrote")
+    export.add_argument("--out", type=Path, metavar="PATH", help="where to (default: within the sequence's folder)")
+    export.add_argument("--copy", action="store_true", help="euroc, registered: copy images instead of linking them")
+    export.add_argument("--scene", type=Path, help="video: scene file, if it has moved since the sequence was rendered")
+    export.add_argument("--quiet", action="store_true", help="no progress")
 
     light = add(
         "check-light", _check_light, "baked light against path tracing: PSNR of views along the config's trajectory",
@@ -148,6 +173,31 @@ def _fit(options: argparse.Namespace) -> int:
     if options.plot is not None:
         plot_fit(report, options.plot)
     print(json.dumps(report_dict(report), indent=2) if options.json else report_text(report))
+    return 0
+
+
+def _motion(options: argparse.Namespace) -> int:
+    from rsgen.config import load_config
+    from rsgen.generate import load_motion
+    from rsgen.motion.table import stats_table
+    from rsgen.motion_stats import motion_statistics
+
+    rows = []
+    for file in options.configs:
+        config = load_config(file)
+        motion = load_motion(config)
+        rows.append((config.name, motion_statistics(motion.spline, motion.first_stamp, motion.last_stamp)))
+    print(stats_table(rows))
+    return 0
+
+
+def _export(options: argparse.Namespace) -> int:
+    from rsgen.export.all import export
+    from rsgen.progress import ProgressDisplay
+
+    with ProgressDisplay(options.quiet) as progress:
+        done = export(options.to, options.sequence, options.out, options.copy, options.scene, progress)
+    print(done)
     return 0
 
 

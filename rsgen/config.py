@@ -7,23 +7,29 @@ those of an override to the working directory.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin
 
-import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
+from rsgen.config_sections import (
+    ColorConfig,
+    DepthConfig,
+    LightConfig,
+    Matrix4,
+    SceneConfig,
+    Section,
+    StreamConfig,
+    TrajectoryConfig,
+    rigid,
+)
 from rsgen.errors import UserError
-from rsgen.geometry.camera import Camera
-from rsgen.geometry.shutter import Shutter
+from rsgen.imu import ImuConfig
+from rsgen.motion.config import MotionConfig
+from rsgen.truth.settings import TruthConfig
 
-Vector3 = tuple[float, float, float]
-Vector4 = tuple[float, float, float, float]
-Matrix4 = tuple[Vector4, Vector4, Vector4, Vector4]
-Matrix34 = tuple[Vector4, Vector4, Vector4]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+__all__ = ["Config", "StreamConfig", "describe_fields", "load_config", "validate_config"]
 
 # Fields that change how fast or where a sequence is made, never one byte of it.
 _NOT_CONTENT = {"backend"}
@@ -33,128 +39,14 @@ _PATHS = (("trajectory", "file"), ("scene", "file"))
 _BAD_YAML = (yaml.YAMLError, ValueError, RecursionError)
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class TrajectoryConfig(_Section):
-    """Where the camera goes."""
-
-    file: Path = Field(description="recorded trajectory of the body (depth camera): TUM, ICL-NUIM or EuRoC file")
-    format: Literal["auto", "tum", "icl", "euroc"] = Field(
-        default="auto", description="file format; auto: by its content"
-    )
-    icl_start: Matrix34 | None = Field(
-        default=None, description="pose [R|t] of frame 1 in the POV-Ray world; places ICL-NUIM's start-relative files"
-    )
-    T_world_file: Matrix4 | None = Field(
-        default=None, description="rigid transform that places the trajectory in the scene"
-    )
-    knot_spacing_s: Positive = Field(default=0.05, description="knot spacing of the ground-truth spline, s")
-    smoothing: NonNegative = Field(default=0.0, description="weight of the acceleration penalty of the fit")
-
-    @field_validator("T_world_file")
-    @classmethod
-    def _is_rigid(cls, value: Matrix4 | None) -> Matrix4 | None:
-        return value if value is None else _rigid(value)
-
-
-class SceneConfig(_Section):
-    """What the camera sees."""
-
-    file: Path = Field(description="Mitsuba 3 scene .xml, or a mesh file that trimesh reads (default light added)")
-
-
-class LightConfig(_Section):
-    """How surfaces are lit."""
-
-    mode: Literal["baked", "path"] = Field(
-        default="baked", description="baked irradiance (fast, clean) or path tracing"
-    )
-    texel_m: Positive = Field(default=0.015, description="spacing of the baked irradiance samples, m")
-    direct_samples: int = Field(default=64, ge=1, le=4096, description="light samples per irradiance sample")
-    gather_rays: int = Field(
-        default=512, ge=16, le=16384, description="hemisphere rays per indirect sample, last bounce"
-    )
-    bounces: int = Field(default=8, ge=0, le=32, description="indirect diffuse bounces")
-    max_depth: int = Field(default=12, ge=1, le=64, description="path length of mode 'path'")
-
-
-def _pixel_without_ray(camera: Camera) -> tuple[float, float] | None:
-    """A position in the image, its outermost edges included, that the distortion sees nothing at; None if all see."""
-    u, v = np.arange(camera.width + 1) - 0.5, np.arange(camera.height + 1) - 0.5
-    rows = [np.stack([u, np.full_like(u, edge)], axis=-1) for edge in (v[0], v[-1])]
-    columns = [np.stack([np.full_like(v, edge), v], axis=-1) for edge in (u[0], u[-1])]
-    centre = np.array([[(camera.width - 1) / 2, (camera.height - 1) / 2]])
-    uv = np.concatenate([*rows, *columns, centre])
-    blind = uv[~np.isfinite(camera.unproject(uv)).all(axis=-1)]
-    return (float(blind[0, 0]), float(blind[0, 1])) if len(blind) else None
-
-
-class StreamConfig(_Section):
-    """One camera with its own clock."""
-
-    width: int = Field(default=640, ge=8, le=16384, description="columns, px")
-    height: int = Field(default=480, ge=8, le=16384, description="rows, px")
-    intrinsics: Vector4 = Field(
-        default=(481.2, 480.0, 319.5, 239.5), description="fx, fy, cx, cy, px; pixel centres integer"
-    )
-    model: Literal["pinhole", "radtan", "fisheye"] = Field(default="pinhole", description="distortion model")
-    distortion: tuple[Finite, ...] = Field(default=(), description="radtan k1 k2 p1 p2 [k3]; fisheye k1 k2 k3 k4")
-    rate_hz: Positive = Field(default=30.0, description="frames per second")
-    offset_s: Finite = Field(default=0.0, description="stamp of the first frame after the trajectory's first pose, s")
-    readout_s: NonNegative = Field(
-        default=0.028, description="time from first to one past the last line, s; 0: global shutter"
-    )
-    exposure_s: NonNegative = Field(default=0.0, description="exposure of each line, s; 0: no motion blur")
-    scan: Literal["top-bottom", "bottom-top", "left-right", "right-left"] = Field(
-        default="top-bottom", description="order in which lines are read out"
-    )
-
-    @property
-    def camera(self) -> Camera:
-        fx, fy, cx, cy = self.intrinsics
-        return Camera(self.width, self.height, fx, fy, cx, cy, self.model, tuple(self.distortion))
-
-    @property
-    def shutter(self) -> Shutter:
-        return Shutter(self.readout_s, self.exposure_s, self.scan)
-
-    @model_validator(mode="after")
-    def _geometry_is_valid(self) -> StreamConfig:
-        try:
-            camera, _ = self.camera, self.shutter
-        except UserError as error:
-            raise ValueError(str(error)) from None
-        blind = _pixel_without_ray(camera)
-        if blind is not None:
-            raise ValueError(
-                f"distortion: no ray reaches pixel {blind}, where {self.model} folds back or sees 180 degrees: "
-                "take a smaller image, longer focal lengths or other coefficients"
-            )
-        return self
-
-
-class ColorConfig(StreamConfig):
-    """The colour camera."""
-
-    spp: int = Field(default=16, ge=1, le=65536, description="samples per pixel (footprint and exposure window)")
-    exposure_gain: Positive = Field(default=1.0, description="factor on linear radiance before sRGB quantisation")
-
-
-class DepthConfig(StreamConfig):
-    """The depth camera: planar z through each pixel's centre, 16 bit."""
-
-    depth_scale: Positive = Field(default=5000.0, description="stored units per metre")
-
-
-class Config(_Section):
+class Config(Section):
     """One sequence."""
 
     name: str = Field(
         pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]*$", description="the sequence's name, also its default folder"
     )
-    trajectory: TrajectoryConfig
+    trajectory: TrajectoryConfig = TrajectoryConfig()
+    motion: MotionConfig | None = None
     scene: SceneConfig
     light: LightConfig = LightConfig()
     color: ColorConfig = ColorConfig()
@@ -163,29 +55,30 @@ class Config(_Section):
         default=((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)),
         description="depth-camera to colour-camera coordinates, m",
     )
+    truth: TruthConfig = TruthConfig()
+    imu: ImuConfig | None = None
     seed: int = Field(default=0, ge=0, lt=2**31, description="seed of every random number")
     backend: Literal["auto", "llvm", "cuda"] = Field(default="auto", description="where Dr.Jit runs")
 
     @field_validator("T_color_depth")
     @classmethod
-    def _is_rigid(cls, value: Matrix4) -> Matrix4:
-        return _rigid(value)
+    def _isrigid(cls, value: Matrix4) -> Matrix4:
+        return rigid(value)
+
+    @model_validator(mode="after")
+    def _has_one_motion(self) -> Config:
+        if (self.trajectory.file is None) == (self.motion is None):
+            given = "one of them, not both" if self.motion else "a recorded file, or a section 'motion'"
+            raise ValueError(f"trajectory.file: is required: give {given}")
+        return self
 
     def content(self) -> dict[str, Any]:
         """Everything that decides the sequence's bytes, as plain YAML types (the trajectory and scene by file name)."""
         content = self.model_dump(mode="json", exclude=_NOT_CONTENT)
         for section, name in _PATHS:
-            content[section][name] = Path(content[section][name]).name
+            if content[section][name] is not None:
+                content[section][name] = Path(content[section][name]).name
         return content
-
-
-def _rigid(value: Matrix4) -> Matrix4:
-    T = np.asarray(value, float)
-    R = np.clip(T[:3, :3], -2, 2)  # absurd numbers stay wrong, without overflow on the way
-    ok = np.isfinite(T).all() and np.allclose(R @ R.T, np.eye(3), atol=1e-5) and np.linalg.det(R) > 0
-    if not (ok and np.array_equal(T[3], (0, 0, 0, 1))):
-        raise ValueError("not a rigid transform: rows of an orthonormal rotation with the translation, then 0 0 0 1")
-    return value
 
 
 def load_config(path: Path, overrides: dict[str, str] | None = None) -> Config:
@@ -261,7 +154,9 @@ def describe_fields(section: type[BaseModel] = Config, prefix: str = "") -> list
     """Rows (dotted name, default, description) of every field that a config or an override can set."""
     rows: list[tuple[str, str, str]] = []
     for name, field in section.model_fields.items():
-        inner = field.annotation
+        # An optional section, `Section | None`, is written like any other.
+        either = get_origin(field.annotation) in (Union, UnionType)
+        inner = next(t for t in get_args(field.annotation) if t is not NoneType) if either else field.annotation
         if isinstance(inner, type) and issubclass(inner, BaseModel):
             rows += describe_fields(inner, f"{prefix}{name}.")
         else:

@@ -100,17 +100,18 @@ def encode_png(image: np.ndarray) -> bytes:
     return data.tobytes()
 
 
-def encode_exr(z: np.ndarray) -> bytes:
-    """Lossless single-channel ('Z') OpenEXR of an (h, w) float32 image, with a checksum of the whole file."""
-    if z.ndim != 2 or z.dtype != np.float32:
-        raise ValueError(f"an EXR is written from (h, w) float32, not {z.shape} {z.dtype}")
+def encode_exr(image: np.ndarray, channels: tuple[str, ...] = ("Z",)) -> bytes:
+    """Lossless OpenEXR of a float32 image (h, w), or (h, w, n) for n channels, with a checksum of the whole file."""
+    planes = image[..., None] if image.ndim == 2 else image
+    if planes.ndim != 3 or planes.shape[2] != len(channels) or image.dtype != np.float32:
+        raise ValueError(f"an EXR of {channels} is not written from {image.shape} {image.dtype}")
     header = {
         "compression": OpenEXR.ZIP_COMPRESSION,  # every reader knows it; ZSTD would halve size and time
         "type": OpenEXR.scanlineimage,
         _CRC_NAME: _CRC_EMPTY.decode(),
     }
     stream = io.BytesIO()
-    with OpenEXR.File(header, {"Z": np.ascontiguousarray(z)}) as file:
+    with OpenEXR.File(header, {c: np.ascontiguousarray(planes[..., i]) for i, c in enumerate(channels)}) as file:
         file.write(stream)
     data = stream.getvalue()
     at = data.index(_CRC_FIELD) + len(_CRC_FIELD)
@@ -201,8 +202,8 @@ def read_png(path: Path, shape: tuple[int, ...], dtype: type[np.generic]) -> np.
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if image.ndim == 3 else image
 
 
-def read_exr(path: Path, shape: tuple[int, int]) -> np.ndarray:
-    """Channel Z of an EXR as (h, w) float32 of exactly that shape. Raises UserError."""
+def read_exr(path: Path, shape: tuple[int, int], channels: tuple[str, ...] = ("Z",)) -> np.ndarray:
+    """Channels of an EXR of exactly `shape` as float32 (h, w), or (h, w, n) if they are several. Raises UserError."""
     data = read_bytes(path)
     if not data.startswith(_EXR_MAGIC):
         raise _damaged(path, "EXR", "wrong signature")
@@ -213,11 +214,13 @@ def read_exr(path: Path, shape: tuple[int, int]) -> np.ndarray:
             raise _damaged(path, "EXR", "checksum differs")
     try:
         with OpenEXR.File(io.BytesIO(data)) as file:
-            image = np.array(file.channels()["Z"].pixels)
+            stored = file.channels()
+            planes = [np.array(stored[name].pixels) for name in channels]
     except (RuntimeError, ValueError, KeyError, TypeError, MemoryError, OSError):
         raise _damaged(path, "EXR", "cannot be decoded") from None
-    _expect(path, image, shape, np.float32)
-    return image
+    for plane in planes:
+        _expect(path, plane, shape, np.float32)
+    return planes[0] if len(planes) == 1 else np.stack(planes, axis=-1)
 
 
 def read_npy(path: Path, shape: tuple[int, ...]) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -14,15 +14,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsgen.config import Config
+from rsgen.config import Config, TrajectoryConfig
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_yaml
 from rsgen.fit import FitResult, fit_spline
-from rsgen.geometry import se3
+from rsgen.frame_source import ColorShot, DepthShot, FrameSource, Progress, load_scene, scene_hash
 from rsgen.geometry.spline import Spline
+from rsgen.motion.clearance import check_clearance
+from rsgen.motion.make import make_motion
 from rsgen.sequence_format import STREAMS, stream_stamps
 from rsgen.sequence_writer import SequenceWriter
-from rsgen.trajectory import read_trajectory
+from rsgen.trajectory import Trajectory, read_trajectory
 
 log = logging.getLogger("rsgen")
 
@@ -34,8 +36,6 @@ _WRITE_AHEAD = 4
 # What a sequence folder remembers of the machine that rendered it, for commands that render again. Not part of the
 # format: a sequence is whole without it.
 ORIGIN = "origin.yaml"
-
-Progress = Callable[[str, float, str], None]  # stage ("light" or "frames"), fraction done in [0, 1], note
 
 
 @dataclass(frozen=True)
@@ -49,16 +49,13 @@ class Motion:
 
 
 def load_motion(config: Config) -> Motion:
-    """Read, place and fit the config's trajectory; the spline covers every line of every frame.
+    """Read or make, place and fit the config's trajectory; the spline covers every line of every frame.
 
     Stamps stay those of the file unless they are too large to time a line by (Unix time): then the first becomes 0.
-    Raises UserError naming the trajectory's file and line.
+    Raises UserError naming the trajectory's file and line, or what a motion cannot meet.
     """
     settings = config.trajectory
-    trajectory = read_trajectory(settings.file, format=settings.format, icl_start=settings.icl_start)
-    if np.abs(trajectory.stamps).max() >= _LARGEST_STAMP_S:
-        log.info("%s: large stamps, so time counts from the first, %.9f s", settings.file, trajectory.stamps[0])
-        trajectory = trajectory.rebased()
+    trajectory = make_motion(config.motion, config.seed) if config.motion is not None else _recorded(settings)
     if settings.T_world_file is not None:
         trajectory = trajectory.moved(np.asarray(settings.T_world_file, float))
     streams = (config.color, config.depth)
@@ -70,73 +67,18 @@ def load_motion(config: Config) -> Motion:
     return Motion(fit.spline, fit, float(trajectory.stamps[0]), float(trajectory.stamps[-1]))
 
 
+def _recorded(settings: TrajectoryConfig) -> Trajectory:
+    assert settings.file is not None  # or there were a motion
+    trajectory = read_trajectory(settings.file, format=settings.format, icl_start=settings.icl_start)
+    if np.abs(trajectory.stamps).max() >= _LARGEST_STAMP_S:
+        log.info("%s: large stamps, so time counts from the first, %.9f s", settings.file, trajectory.stamps[0])
+        trajectory = trajectory.rebased()
+    return trajectory
+
+
 def sequence_stamps(config: Config, motion: Motion) -> dict[str, NDArray[np.float64]]:
     """Stamps (n,) in seconds of all frames of both streams."""
     return {s: stream_stamps(motion.first_stamp, motion.last_stamp, getattr(config, s)) for s in STREAMS}
-
-
-def load_scene(config: Config) -> Any:
-    """The config's Mitsuba scene. Raises UserError."""
-    from rsgen.backend import mitsuba
-
-    mitsuba(config.backend)
-    from rsgen import scene
-
-    return scene.load_scene(config.scene.file)
-
-
-class FrameSource:
-    """Frames of a config's two streams, rendered on demand; with `global_shutter` all lines at once."""
-
-    def __init__(
-        self,
-        config: Config,
-        progress: Progress = lambda *_: None,
-        global_shutter: bool = False,
-        scene: Any = None,
-    ) -> None:
-        """Load the scene, unless it is given, and its light (baked now if no cache has it). Raises UserError."""
-        from rsgen.backend import mitsuba
-
-        mi = mitsuba(config.backend)
-        from rsgen import render
-
-        self._config = config
-        self.scene = scene or load_scene(config)
-        integrator = make_integrator(mi, self.scene, config, lambda f, what: progress("light", f, what))
-        pick = render.global_shutter if global_shutter else lambda shutter: shutter
-        color, depth = config.color, config.depth
-        self._color = render.ColorRenderer(self.scene, integrator, color.camera, pick(color.shutter), color.spp)
-        self._depth = render.DepthRenderer(self.scene, depth.camera, pick(depth.shutter))
-        self._T_depth_color = se3.inverse(np.asarray(config.T_color_depth, float))
-
-    def linear_color(self, spline: Spline, stamp: float, frame: int) -> NDArray[np.float32]:
-        """Linear RGB (h, w, 3) of the colour frame at `stamp` (s); seeded by the config's seed and `frame`."""
-        seed = int(np.random.SeedSequence([self._config.seed, frame]).generate_state(1)[0])
-        return self._color.render(lambda t: spline.pose(t) @ self._T_depth_color, stamp, seed)
-
-    def color(self, spline: Spline, stamp: float, frame: int) -> NDArray[np.uint8]:
-        """8-bit sRGB (h, w, 3) of the colour frame at `stamp` (s)."""
-        from rsgen.render import to_srgb8
-
-        return to_srgb8(self.linear_color(spline, stamp, frame), self._config.color.exposure_gain)
-
-    def depth(self, spline: Spline, stamp: float) -> NDArray[np.float32]:
-        """Planar z (h, w) in metres of the depth frame at `stamp` (s); 0 where there is nothing."""
-        return self._depth.render(spline.pose, stamp)
-
-
-def make_integrator(mi: Any, scene: Any, config: Config, progress: Callable[[float, str], None]) -> Any:
-    """Mitsuba integrator of the config's light: `path`, or `BakedIntegrator` over the scene's baked irradiance."""
-    light = config.light
-    if light.mode == "path":
-        return mi.load_dict({"type": "path", "max_depth": light.max_depth})
-    from rsgen.integrator import BakedIntegrator
-    from rsgen.lighting import baked_field, cache_folder
-    from rsgen.scene import content_hash
-
-    file = config.scene.file
-    return BakedIntegrator(baked_field(scene, content_hash(file), light, cache_folder(file), progress))
 
 
 def render_sequence(config: Config, out: Path, frames: slice, progress: Progress) -> Path:
@@ -150,7 +92,11 @@ def render_sequence(config: Config, out: Path, frames: slice, progress: Progress
         raise UserError(f"--frames: the sequence has no frame {frames.start}, only 0 to {longest - 1}")
     identity = engine_versions(config), input_hashes(config)
     # In a new folder: a scene that does not load must not leave one behind that its mended self cannot continue.
-    scene = None if (out / "sequence.yaml").exists() else load_scene(config)
+    scene = None
+    if not (out / "sequence.yaml").exists():
+        scene = load_scene(config)
+        if config.motion is not None:
+            check_clearance(motion.spline, scene_triangles(scene), config.motion.clearance_m)
     writer = SequenceWriter.open(out, config, motion.spline, stamps["color"], stamps["depth"], *identity)
     write_origin(out, config)
     todo = sorted(
@@ -167,9 +113,12 @@ def render_sequence(config: Config, out: Path, frames: slice, progress: Progress
                 assert source is not None
                 stamp = float(writer.stamps(stream)[k])
                 if stream == "color":
-                    pending.append(pool.submit(writer.write_color, k, source.color(writer.spline, stamp, k)))
+                    following = writer.stamps("color")[k + 1 : k + 2].tolist()
+                    shot = source.expose_color(writer.spline, stamp, k, following[0] if following else None)
+                    pending.append(pool.submit(_write_color, writer, source, shot))
                 else:
-                    pending.append(pool.submit(writer.write_depth, k, source.depth(writer.spline, stamp)))
+                    measured = source.expose_depth(writer.spline, stamp, k)
+                    pending.append(pool.submit(_write_depth, writer, source, measured))
                 while len(pending) > _WRITE_AHEAD:
                     pending.pop(0).result()
                 done += 1
@@ -186,9 +135,25 @@ def render_sequence(config: Config, out: Path, frames: slice, progress: Progress
     return out
 
 
+def _write_color(writer: SequenceWriter, source: FrameSource, shot: ColorShot) -> None:
+    writer.write_color(shot.frame, *source.develop_color(shot))
+
+
+def _write_depth(writer: SequenceWriter, source: FrameSource, shot: DepthShot) -> None:
+    writer.write_depth(shot.frame, shot.z, source.develop_depth(shot))
+
+
 def _chosen(missing: Iterable[int], frames: slice, count: int) -> list[int]:
     wanted = set(range(*frames.indices(count)))
     return [k for k in missing if k in wanted]
+
+
+def scene_triangles(scene: Any) -> NDArray[np.float64]:
+    """Corners (m, 3, 3) of all triangles of a Mitsuba scene, world frame, metres."""
+    from rsgen.scene import surface
+
+    vertices, faces = surface(scene)
+    return np.asarray(vertices, float)[faces]
 
 
 def write_scene_ply(scene: Any, path: Path) -> None:
@@ -201,7 +166,9 @@ def write_scene_ply(scene: Any, path: Path) -> None:
 
 def write_origin(out: Path, config: Config) -> None:
     """Note where the scene and trajectory of the sequence in `out` are on this machine. Raises UserError."""
-    where = {"scene": str(config.scene.file.resolve()), "trajectory": str(config.trajectory.file.resolve())}
+    where = {"scene": str(config.scene.file.resolve())}
+    if config.trajectory.file is not None:
+        where["trajectory"] = str(config.trajectory.file.resolve())
     atomic_write(out / ORIGIN, encode_yaml(where))
 
 
@@ -214,18 +181,7 @@ def engine_versions(config: Config) -> dict[str, str]:
 
 
 def input_hashes(config: Config) -> dict[str, str]:
-    """Content hashes of the trajectory file and of the scene with all its files. Raises UserError."""
-    return {
-        "trajectory": hashlib.sha256(config.trajectory.file.read_bytes()).hexdigest(),
-        "scene": scene_hash(config),
-    }
-
-
-def scene_hash(config: Config) -> str:
-    """Content hash of the config's scene with all its files. Raises UserError."""
-    from rsgen.backend import mitsuba
-
-    mitsuba(config.backend)
-    from rsgen.scene import content_hash
-
-    return content_hash(config.scene.file)
+    """Content hashes of the trajectory file, if there is one, and of the scene with all its files. Raises UserError."""
+    file = config.trajectory.file
+    trajectory = {} if file is None else {"trajectory": hashlib.sha256(file.read_bytes()).hexdigest()}
+    return trajectory | {"scene": scene_hash(config)}

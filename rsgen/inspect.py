@@ -11,7 +11,8 @@ import numpy as np
 from rsgen.config import Config, validate_config
 from rsgen.errors import UserError
 from rsgen.files import read_yaml
-from rsgen.generate import ORIGIN, FrameSource, scene_hash
+from rsgen.frame_source import FrameSource, scene_hash
+from rsgen.generate import ORIGIN
 from rsgen.progress import ProgressDisplay
 from rsgen.sequence import read_sequence
 
@@ -52,7 +53,7 @@ def compare_frame(path: Path, frame: int, out: Path | None, scene: Path | None) 
     for stream in (color, depth):
         if frame not in stream.indices:
             raise UserError(f"{path}: has no {stream.name} frame {frame}: choose one of {_span(stream.indices)}")
-    config = _config_of(path, sequence.meta, scene)
+    config = config_of(path, sequence.meta, scene)
     if scene_hash(config) != _mapping(sequence.meta.get("inputs")).get("scene"):
         log.warning("%s: the scene %s has changed since, so more than the shutter differs", path, config.scene.file)
     with ProgressDisplay() as progress:
@@ -70,7 +71,7 @@ def compare_frame(path: Path, frame: int, out: Path | None, scene: Path | None) 
     return out
 
 
-def _config_of(path: Path, meta: dict[str, Any], scene: Path | None) -> Config:
+def config_of(path: Path, meta: dict[str, Any], scene: Path | None) -> Config:
     """The config that a sequence records, with its scene found on this machine."""
     origin = read_yaml(path / ORIGIN) if (path / ORIGIN).is_file() else {}
     recorded = _mapping(meta.get("config"))
@@ -78,7 +79,9 @@ def _config_of(path: Path, meta: dict[str, Any], scene: Path | None) -> Config:
     if not file.is_file():
         raise UserError(f"{path}: its scene '{file}' is not on this machine: name it with --scene")
     recorded["scene"] = {"file": str(file.resolve())}
-    recorded["trajectory"] = _mapping(recorded.get("trajectory")) | {"file": str(origin.get("trajectory", "unused"))}
+    if recorded.get("motion") is None:
+        trajectory = {"file": str(origin.get("trajectory", "unused"))}
+        recorded["trajectory"] = _mapping(recorded.get("trajectory")) | trajectory
     return validate_config(recorded, f"{path}/sequence.yaml: config")
 
 

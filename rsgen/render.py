@@ -109,13 +109,6 @@ def global_shutter(shutter: Shutter) -> Shutter:
     return replace(shutter, readout_s=0.0)
 
 
-def to_srgb8(linear: NDArray[np.float32], gain: float = 1.0) -> NDArray[np.uint8]:
-    """8-bit sRGB (IEC 61966-2-1) of linear values times `gain`, clipped to [0, 1]; any shape."""
-    x = np.clip(linear * np.float32(gain), 0, 1)
-    encoded = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, np.float32(1 / 2.4)) - 0.055)
-    return np.rint(255 * encoded).astype(np.uint8)
-
-
 def _fraction(x: Any) -> Any:
     return x - dr.floor(x)
 

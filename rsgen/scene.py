@@ -1,7 +1,8 @@
 """Load any Mitsuba 3 scene XML, or a mesh file through trimesh, as one Mitsuba scene made of triangles only.
 
 Rectangles, disks, spheres and cylinders become meshes on the way in, so that depth, `scene.ply` and the baked light all
-speak of the same triangles. A scene folder that holds a `build.py` but no scene yet is built first.
+speak of the same triangles. A scene folder that holds a `build.py` but no scene yet is built first; there, a scene
+x.xml with an `x.py` of its own beside it is built by that.
 """
 
 from __future__ import annotations
@@ -51,9 +52,14 @@ def load_scene(path: Path) -> Any:
 
 
 def ensure_built(path: Path) -> None:
-    """If the scene file is absent but a `build.py` stands beside it, run that; UserError if there is no scene then."""
+    """If the scene file is absent but a `build.py` stands beside it, run that, or for x.xml the `x.py` there if any.
+
+    Raises UserError if there is no scene then.
+    """
     script = path.parent / "build.py"
     if not path.is_file() and script.is_file():
+        own = path.with_suffix(".py")
+        script = own if own.is_file() else script
         log.info("building %s (once)", path)
         child = subprocess.run([sys.executable, str(script)], capture_output=True, text=True)
         if child.returncode:
@@ -123,8 +129,11 @@ def _load_xml(mi: Any, path: Path, scratch: Path) -> Any:
             node.props = _tessellated(mi, node.props, scratch / f"{index}.ply")
     resolver = mi.file_resolver()
     resolver.prepend(str(path.resolve().parent))
-    mi.parser.transform_all(config, state)
-    scene = mi.parser.instantiate(config, state)
+    try:
+        mi.parser.transform_all(config, state)
+        scene = mi.parser.instantiate(config, state)
+    finally:
+        del resolver[0]  # else the next scene would find what it lacks, an include say, in this one's folder
     return scene[0] if isinstance(scene, (list, tuple)) else scene
 
 

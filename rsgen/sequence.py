@@ -29,6 +29,7 @@ from rsgen.sequence_format import (
     Line,
     StreamName,
     StreamYaml,
+    color_truth_path,
     parse_listing,
     read_sequence_yaml,
     stream_stamps,
@@ -108,6 +109,24 @@ class Sequence:
     def truth_depth_path(self, k: int) -> Path:
         """File of `truth_depth(k)`."""
         return self.root / TRUTH_DEPTH / self.streams["depth"].paths[k].with_suffix(".exr").name
+
+    @property
+    def truth_images(self) -> dict[str, tuple[str, ...]]:
+        """Names of the exact images beside every colour frame, each with its EXR channels (none: 8-bit sRGB)."""
+        return {name: tuple(channels) for name, channels in (self.meta.get("truth") or {}).items()}
+
+    def truth(self, name: str, k: int) -> npt.NDArray[Any]:
+        """Exact image `name` of colour frame k: uint8 RGB (h, w, 3), or float32 (h, w) or (h, w, n) for n EXR channels.
+
+        Raises UserError if the sequence has none of that name, or the file is missing or damaged.
+        """
+        images, stream = self.truth_images, self.streams["color"]
+        if name not in images:
+            has = ", ".join(sorted(images)) or "none"
+            raise UserError(f"{self.root}: has no truth images '{name}' (has: {has}): render with truth.* set")
+        shape = stream.camera.height, stream.camera.width
+        path = self.root / color_truth_path(name, images[name], stream.paths[k].stem)
+        return read_exr(path, shape, images[name]) if images[name] else read_png(path, (*shape, 3), np.uint8)
 
     def rows(self, stream: StreamName) -> FloatArray:
         """Poses (n, lines, 7) tx ty tz qx qy qz qw of each line's camera in the world at mid-exposure.

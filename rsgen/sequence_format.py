@@ -6,6 +6,7 @@ The format is `rsgen-sequence/1` of the design document, section 2.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol
@@ -28,6 +29,7 @@ FOLDERS: dict[StreamName, str] = {"color": "rgb", "depth": "depth"}
 LISTINGS: dict[StreamName, str] = {"color": "rgb.txt", "depth": "depth.txt"}
 ROWS: dict[StreamName, str] = {"color": "truth/rows_color.npy", "depth": "truth/rows_depth.npy"}
 TRUTH_DEPTH = "truth/depth"
+CLEAN_COLOR = "color"  # truth/color/: what a colour camera without noise would have reported
 GROUND_TRUTH_HZ = 200.0
 STAMP_TOLERANCE_S = 1e-6
 _FRAMES_AT_ONCE = 16  # poses of so many frames' lines are evaluated together: flat memory, little overhead
@@ -86,6 +88,7 @@ class SequenceYaml(_Yaml):
     streams: _Streams
     T_color_depth: tuple[Vector4, Vector4, Vector4, Vector4]
     noise: Any = None
+    truth: dict[Annotated[str, Field(pattern=r"^[a-z_]+$")], tuple[str, ...]] = {}
     fingerprint: str  # the file's last entry: one that was cut off has none
 
 
@@ -132,6 +135,11 @@ def round_stamps(stamps: npt.ArrayLike) -> FloatArray:
 def frame_name(k: int) -> str:
     """File stem of frame k."""
     return f"{k:06d}"
+
+
+def color_truth_path(name: str, channels: Sequence[str], stem: str) -> str:
+    """File of an image of `truth/` within the folder; without EXR channels it is a PNG."""
+    return f"truth/{name}/{stem}.{'exr' if channels else 'png'}"
 
 
 def read_sequence_yaml(path: Path) -> tuple[SequenceYaml, dict[str, Any]]:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from rsgen.config import Config, StreamConfig
+from rsgen.config import Config
 from rsgen.errors import UserError
 from rsgen.files import (
     atomic_write,
@@ -21,17 +20,15 @@ from rsgen.files import (
     encode_npz,
     encode_png,
     encode_yaml,
-    is_temporary,
-    read_yaml,
     remove_stale_temporaries,
     write_error,
 )
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
+from rsgen.imu import simulate_imu, write_imu_csv
 from rsgen.sequence_format import (
     FOLDERS,
-    FORMAT,
     LISTINGS,
     ROWS,
     STREAMS,
@@ -39,11 +36,13 @@ from rsgen.sequence_format import (
     FloatArray,
     StreamName,
     associate,
+    color_truth_path,
     frame_name,
     ground_truth,
     line_poses,
     round_stamps,
 )
+from rsgen.sequence_identity import color_truth, describe, refuse_foreign_folder
 
 _SPLINE_TOLERANCE = 1e-9
 
@@ -96,16 +95,18 @@ class SequenceWriter:
         }
         for stream in streams.values():
             line_poses(spline, stream.camera, stream.shutter, stream.stamps[[0, -1]])
-        text = _sequence_yaml(config, spline, streams, versions, inputs)
-        _refuse_foreign_folder(out, text)
+        stamps = {name: stream.stamps for name, stream in streams.items()}
+        text = describe(config, spline, stamps, versions, inputs)
+        refuse_foreign_folder(out, text)
         try:
             out.mkdir(parents=True, exist_ok=True)
             # First of all, so that a run that ends here leaves either nothing or what it can be resumed from.
             if not (out / "sequence.yaml").exists():
                 atomic_write(out / "sequence.yaml", encode_yaml(text))
-            for folder in (*FOLDERS.values(), TRUTH_DEPTH):
+            folders = (*FOLDERS.values(), TRUTH_DEPTH, *(f"truth/{name}" for name in color_truth(config)))
+            for folder in folders:
                 (out / folder).mkdir(parents=True, exist_ok=True)
-            for folder in ("", *FOLDERS.values(), "truth", TRUTH_DEPTH):
+            for folder in ("", "truth", *folders):
                 remove_stale_temporaries(out / folder)
         except OSError as error:
             raise write_error(out, error) from None
@@ -119,21 +120,39 @@ class SequenceWriter:
         """Indices of the frames that are not on disk yet."""
         return [k for k in range(len(self.stamps(stream))) if not self._is_written(stream, k)]
 
-    def write_color(self, k: int, rgb: npt.NDArray[np.uint8]) -> None:
-        """Write colour frame k, sRGB (h, w, 3) uint8. Raises UserError if the disk refuses it."""
-        _expect(rgb, (self.color.camera.height, self.color.camera.width, 3), np.uint8)
+    def write_color(
+        self, k: int, rgb: npt.NDArray[np.uint8], truth: Mapping[str, npt.NDArray[Any]] = MappingProxyType({})
+    ) -> None:
+        """Write colour frame k, sRGB (h, w, 3) uint8, and its images of `color_truth`.
+
+        These are uint8 (h, w, 3), or float32 (h, w) or (h, w, n) with n EXR channels. Raises UserError if the disk
+        refuses one.
+        """
+        shape = self.color.camera.height, self.color.camera.width
+        names = color_truth(self.config)
+        if truth.keys() != names.keys():
+            raise ValueError(f"truth of a colour frame is {sorted(names)}, not {sorted(truth)}")
+        for name, channels in names.items():
+            image = truth[name]
+            planes = () if len(channels) == 1 else (len(channels) or 3,)
+            _expect(image, (*shape, *planes), np.float32 if channels else np.uint8)
+            atomic_write(
+                self._color_truth_path(name, k), encode_exr(image, channels) if channels else encode_png(image)
+            )
+        _expect(rgb, (*shape, 3), np.uint8)
         atomic_write(self._path("color", k), encode_png(rgb))
 
-    def write_depth(self, k: int, z: npt.NDArray[np.float32]) -> None:
+    def write_depth(self, k: int, z: npt.NDArray[np.float32], reported: npt.NDArray[np.float32] | None = None) -> None:
         """Write depth frame k, planar z (h, w) float32 in metres; 0, negative, inf and NaN mean nothing measured.
 
-        truth/depth/ gets it exactly, depth/ rounded to 1/depth_scale m, 0 where that leaves 16 bits.
-        Raises UserError if the disk refuses it.
+        truth/depth/ gets z exactly; depth/ gets what the camera reports (default: z), rounded to 1/depth_scale m, 0
+        where that leaves 16 bits. Raises UserError if the disk refuses it.
         """
-        _expect(z, (self.depth.camera.height, self.depth.camera.width), np.float32)
-        exact = np.where(np.isfinite(z) & (z > 0), z, np.float32(0))
-        atomic_write(self._truth_path(k), encode_exr(exact))
-        atomic_write(self._path("depth", k), encode_png(quantise(exact, self.config.depth.depth_scale)))
+        for image in (z,) if reported is None else (z, reported):
+            _expect(image, (self.depth.camera.height, self.depth.camera.width), np.float32)
+        atomic_write(self._truth_path(k), encode_exr(_positive(z)))
+        units = quantise(_positive(z if reported is None else reported), self.config.depth.depth_scale)
+        atomic_write(self._path("depth", k), encode_png(units))
 
     def finish(self) -> None:
         """Write listings of the frames that are there, pairs, ground truth and rows' poses. May be called again.
@@ -160,6 +179,10 @@ class SequenceWriter:
             T_cam_body = np.array(self.config.T_color_depth, float) if s == "color" else None
             poses = line_poses(self.spline, stream.camera, stream.shutter, stream.stamps, T_cam_body)
             atomic_write(self.out / ROWS[s], encode_npy(poses))
+        if self.config.imu is not None:
+            spline = self.spline
+            samples = simulate_imu(spline, self.config.imu, spline.t_begin, spline.t_end, self.config.seed)
+            write_imu_csv(self.out / "imu.csv", samples)
 
     def _stream(self, stream: StreamName) -> _Stream:
         return self.color if stream == "color" else self.depth
@@ -172,110 +195,27 @@ class SequenceWriter:
     def _truth_path(self, k: int) -> Path:
         return self.out / TRUTH_DEPTH / f"{frame_name(k)}.exr"
 
+    def _color_truth_path(self, name: str, k: int) -> Path:
+        return self.out / color_truth_path(name, color_truth(self.config)[name], frame_name(k))
+
     def _is_written(self, stream: StreamName, k: int) -> bool:
         # Atomic writes leave whole files only, so being there is enough; an empty one was made by something else.
-        paths = [self._path(stream, k)] + ([self._truth_path(k)] if stream == "depth" else [])
+        if stream == "depth":
+            truth = [self._truth_path(k)]
+        else:
+            truth = [self._color_truth_path(name, k) for name in color_truth(self.config)]
+        paths = [self._path(stream, k), *truth]
         return all(path.is_file() and path.stat().st_size > 0 for path in paths)
+
+
+def _positive(z: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    return np.where(np.isfinite(z) & (z > 0), z, np.float32(0))
 
 
 def quantise(z: npt.NDArray[np.float32], depth_scale: float) -> npt.NDArray[np.uint16]:
     """16-bit depth (h, w) of planar z (h, w) in metres, 0 where there is none or it does not fit."""
     units = np.rint(z.astype(np.float64) * depth_scale)
     return np.where((units > 0) & (units <= 65535), units, 0).astype(np.uint16)
-
-
-def fingerprint(content: Mapping[str, Any]) -> str:
-    """SHA-256 of canonical JSON; a number's spelling (1 or 1.0) does not matter."""
-    text = json.dumps(_canonical(content), sort_keys=True, separators=(",", ":"), allow_nan=False)
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _canonical(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _canonical(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_canonical(item) for item in value]
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value) + 0.0
-    return value
-
-
-def _sequence_yaml(
-    config: Config,
-    spline: Spline,
-    streams: Mapping[str, _Stream],
-    versions: Mapping[str, str],
-    inputs: Mapping[str, str],
-) -> dict[str, Any]:
-    identity = {"config": config.content(), "inputs": dict(inputs), "versions": dict(versions)}
-    return {
-        "format": FORMAT,
-        "name": config.name,
-        "streams": {
-            "color": _stream_yaml(config.color, streams["color"].stamps),
-            "depth": _stream_yaml(config.depth, streams["depth"].stamps) | {"depth_scale": config.depth.depth_scale},
-        },
-        "T_color_depth": [[float(value) for value in row] for row in config.T_color_depth],
-        "spline": {"knot_spacing_s": spline.dt, "t0_s": spline.t0, "control_points": len(spline.control_points)},
-        "noise": None,
-        "seed": config.seed,
-        **identity,
-        "fingerprint": fingerprint(identity),
-    }
-
-
-def _stream_yaml(stream: StreamConfig, stamps: FloatArray) -> dict[str, Any]:
-    return {
-        "size": [stream.width, stream.height],
-        "intrinsics": list(stream.intrinsics),
-        "model": stream.model,
-        "distortion": list(stream.distortion),
-        "rate_hz": stream.rate_hz,
-        "offset_s": stream.offset_s,
-        "readout_s": stream.readout_s,
-        "exposure_s": stream.exposure_s,
-        "scan": stream.scan,
-        "frames": len(stamps),
-        "first_stamp_s": float(stamps[0]),
-    }
-
-
-def _refuse_foreign_folder(out: Path, new: Mapping[str, Any]) -> None:
-    cure = "choose another --out or delete the folder"
-    try:
-        if not out.is_dir():
-            if out.exists():
-                raise UserError(f"{out}: is a file, not a folder: choose another --out")
-            return
-        names = sorted(path.name for path in out.iterdir() if not is_temporary(path))
-    except OSError as error:
-        raise UserError(f"{out}: cannot be read ({error.strerror}): choose another --out") from None
-    if not names:
-        return
-    if "sequence.yaml" not in names:
-        raise UserError(f"{out}: holds other files ({names[0]}, ...) and no sequence.yaml: {cure}")
-    old = read_yaml(out / "sequence.yaml")
-    if old.get("fingerprint") == new["fingerprint"] and old == new:
-        return
-    field, before, now = _first_difference(old, new) or ("fingerprint", old.get("fingerprint"), new["fingerprint"])
-    raise UserError(f"{out}: holds another sequence, {field} is {_short(before)} there and {_short(now)} now: {cure}")
-
-
-def _first_difference(old: Any, new: Any, name: str = "") -> tuple[str, Any, Any] | None:
-    """Name and both values of the first differing entry, what the user can change (config, inputs) before the rest."""
-    if isinstance(old, dict) and isinstance(new, dict):
-        first = [key for key in ("config", "inputs", "versions") if key in new and not name]
-        for key in [*first, *(key for key in [*new, *old] if key not in first)]:
-            inner = str(key) if name in ("", "config") else f"{name}.{key}"  # config fields as overrides name them
-            if (found := _first_difference(old.get(key), new.get(key), inner)) is not None:
-                return found
-        return None
-    return None if old == new else (name, old, new)
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 40 else f"{text[:37]}..."
 
 
 def _stored_spline(path: Path, spline: Spline) -> Spline:

@@ -32,7 +32,7 @@ from rsgen.sequence_format import (
     line_poses,
     pose_rows,
 )
-from rsgen.sequence_writer import fingerprint
+from rsgen.sequence_identity import fingerprint
 
 # Rows' poses and groundtruth.txt come from the same spline: only the rounding of stamps (5e-10 s) and digits is left.
 POSE_TOLERANCE_M = 1e-7

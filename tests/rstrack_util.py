@@ -122,8 +122,8 @@ def maker(camera: Camera) -> KeyframeMaker:
 def make_terms(camera: Camera) -> Terms:
     """Terms without gates and floors, so that costs are smooth."""
     return Terms(
-        ENGINE, maker(camera).device_rays, gate_depth=(1.0,) * 3, gate_intensity=1.0, floor_depth=1e-7, floor_intensity=1e-7,
-        smooth=1e9,
+        ENGINE, maker(camera).device_rays, gate_depth=(1.0,) * 3, gate_intensity=1.0, floor_depth=1e-7,
+        floor_intensity=1e-7, smooth=1e9,
     )  # fmt: skip
 
 

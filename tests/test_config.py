@@ -11,7 +11,7 @@ import yaml
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from rsgen.config import Config, describe_fields, load_config
+from rsgen.config import Config, describe_fields, load_config, validate_config
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
@@ -112,10 +112,19 @@ def test_a_wrong_field_is_named(tmp_path: Path, change: dict[str, Any], parts: l
     refused(tmp_path, MINIMAL | change, "config.yaml", *parts)
 
 
+def test_a_motion_or_a_file(tmp_path: Path) -> None:
+    motion = {"kind": "line", "length_m": 2.0, "mean_speed_m_s": 0.4, "mean_rotation_deg_s": 10.0,
+              "position": [0, 1, 0], "target": [0, 1, 1]}  # fmt: skip
+    made = {key: value for key, value in MINIMAL.items() if key != "trajectory"} | {"motion": motion}
+    config = load(tmp_path, made)
+    assert config.motion is not None and config.motion.kind == "line" and config.trajectory.file is None
+    assert config.content()["trajectory"]["file"] is None and validate_config(config.content(), "again") == config
+    refused(tmp_path, MINIMAL | {"motion": motion}, "trajectory.file", "not both")
+    refused(tmp_path, made | {"motion": motion | {"kind": "jump"}}, "motion.kind", "'jump'")
+
+
 def test_all_wrong_fields_are_named_at_once(tmp_path: Path) -> None:
-    refused(
-        tmp_path, {"name": "x", "scene": {}, "color": {"spp": -1}}, "trajectory: is required", "scene.file", "color.spp"
-    )
+    refused(tmp_path, {"name": "x", "scene": {}, "color": {"spp": -1}}, "scene.file: is required", "color.spp")
 
 
 @pytest.mark.parametrize(
@@ -187,7 +196,7 @@ def test_content_loads_again(tmp_path: Path) -> None:
 
 def test_every_field_is_described() -> None:
     rows = {name: (default, text) for name, default, text in describe_fields()}
-    assert rows["trajectory.file"][0] == "required" and rows["color.spp"][0] == "16"
+    assert rows["scene.file"][0] == "required" and rows["motion.kind"][0] == "required" and rows["color.spp"][0] == "16"
     assert "color.readout_s" in rows and "T_color_depth" in rows and "light.mode" in rows
     assert all(text for _, text in rows.values())
 

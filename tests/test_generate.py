@@ -24,7 +24,8 @@ from rsgen.cli import main
 from rsgen.command_line import parse_frames
 from rsgen.config import load_config
 from rsgen.errors import UserError
-from rsgen.generate import FrameSource, load_motion, render_sequence
+from rsgen.frame_source import FrameSource
+from rsgen.generate import load_motion, render_sequence
 from rsgen.sequence import read_sequence
 from rsgen.verify import verify_sequence
 
@@ -174,15 +175,15 @@ def test_a_killed_render_resumes_to_the_same_bytes(folder: Path, tmp_path: Path)
 def test_an_interrupted_render_leaves_a_readable_shorter_sequence(
     config: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    color = FrameSource.color
+    expose = FrameSource.expose_color
 
-    def interrupted(self: FrameSource, spline: Any, stamp: float, frame: int) -> Any:
+    def interrupted(self: FrameSource, spline: Any, stamp: float, frame: int, following: float | None) -> Any:
         if frame == 4:
             raise KeyboardInterrupt
-        return color(self, spline, stamp, frame)
+        return expose(self, spline, stamp, frame, following)
 
     with monkeypatch.context() as patch:
-        patch.setattr(FrameSource, "color", interrupted)
+        patch.setattr(FrameSource, "expose_color", interrupted)
         assert render(config, tmp_path / "seq") == 130
     assert capfd.readouterr().err == "rsgen: interrupted; the same command resumes\n"
     assert read_sequence(tmp_path / "seq").streams["color"].indices.tolist() == [0, 1, 2, 3]

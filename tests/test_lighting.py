@@ -18,7 +18,8 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.integrator import BakedIntegrator
 from rsgen.irradiance import IrradianceField, lattice_barycentric, make_field, make_lattice
-from rsgen.render import ColorRenderer, to_srgb8
+from rsgen.noise.response import to_srgb8
+from rsgen.render import ColorRenderer
 from rsgen.scene import load_scene, surface
 
 UP = np.array([0.0, 0.0, 1.0])

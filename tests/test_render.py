@@ -35,7 +35,8 @@ from rsgen.config import Config
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.render import ColorRenderer, DepthRenderer, global_shutter, to_srgb8
+from rsgen.noise.response import to_srgb8
+from rsgen.render import ColorRenderer, DepthRenderer, global_shutter
 from rsgen.scene import load_scene, ply_bytes
 
 STAMP = 0.31

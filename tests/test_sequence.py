@@ -23,7 +23,8 @@ from rsgen.files import encode_yaml
 from rsgen.geometry.spline import Spline
 from rsgen.sequence import SequenceWriter, read_sequence, sequence_info, stream_stamps
 from rsgen.sequence_format import FORMAT, associate, pose_rows, poses_of_rows
-from rsgen.sequence_writer import fingerprint, quantise
+from rsgen.sequence_identity import fingerprint
+from rsgen.sequence_writer import quantise
 
 FRAMES = 4
 

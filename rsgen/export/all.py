@@ -1,0 +1,52 @@
+"""One function for all exports: where each goes by default, and what it is called with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from rsgen.frame_source import Progress
+from rsgen.sequence import Sequence, read_sequence
+
+Export = Literal["kalibr", "euroc", "registered", "video", "rerun"]
+
+
+def export(to: Export, path: Path, out: Path | None, copy: bool, scene: Path | None, progress: Progress) -> str:
+    """Export the sequence at `path` and say in one line what was written. Raises UserError.
+
+    out: default kalibr/, mav0/, registered/, shutter.mp4 or NAME.rrd within the sequence's folder. copy: images, rather
+    than linking them. scene: for the video, which renders again.
+    """
+    sequence = read_sequence(path)
+    if to == "kalibr":
+        from rsgen.export.kalibr import export_kalibr
+
+        return export_kalibr(sequence, out or path / "kalibr", progress)
+    if to == "euroc":
+        from rsgen.export.euroc import export_euroc
+
+        return export_euroc(sequence, out or path, copy, progress=progress)
+    if to == "registered":
+        from rsgen.export.registered import export_registered
+
+        return export_registered(sequence, out or path / "registered", copy, progress)
+    if to == "rerun":
+        from rsgen.export.rerun import export_rerun
+
+        return export_rerun(sequence, out or path / f"{sequence.name}.rrd", progress)
+    return _export_video(sequence, out or path / "shutter.mp4", scene, progress)
+
+
+def _export_video(sequence: Sequence, out: Path, scene: Path | None, progress: Progress) -> str:
+    from rsgen.export.video import write_video
+    from rsgen.frame_source import FrameSource
+    from rsgen.inspect import config_of
+
+    stream = sequence.streams["color"]
+    source = FrameSource(config_of(sequence.root, sequence.meta, scene), progress, global_shutter=True)
+    # All lines at the middle line's time.
+    middle = 0.5 * (stream.line_count - 1) * stream.shutter.line_delay(stream.camera)
+    frames = range(len(stream.paths))
+    left = (source.color(sequence.spline, stream.stamps[k] + middle, int(stream.indices[k])) for k in frames)
+    right = (sequence.color(k) for k in frames)
+    return write_video(out, left, right, stream.rate_hz, count=len(frames), progress=progress)

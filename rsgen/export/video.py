@@ -1,0 +1,112 @@
+"""A preview video: two renderings side by side, such as global and rolling shutter."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from rsgen.errors import UserError
+from rsgen.export.folder import no_progress
+from rsgen.files import write_error
+from rsgen.frame_source import Progress
+
+# Encoders that OpenCV's own wheels bring along.
+_CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
+_GAP = 4  # black columns between the two images
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+
+Image = npt.NDArray[np.uint8]
+
+
+def write_video(
+    path: Path,
+    frames_left: Iterable[Image],
+    frames_right: Iterable[Image],
+    fps: float,
+    labels: tuple[str, str] = ("global shutter", "rolling shutter"),
+    count: int = 0,
+    progress: Progress = no_progress,
+) -> str:
+    """Write two equally long runs of sRGB images (h, w, 3) uint8, all of one size, side by side; returns one line.
+
+    path: .mp4 (MPEG-4) or .avi (Motion JPEG). fps: frames per second. labels: ASCII, drawn onto the images. count:
+    number of frames, for the progress. The file is there whole or not at all. Raises UserError if it is there already,
+    has another suffix, or cannot be written; ValueError for images of different sizes and unequal runs.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in _CODECS:
+        raise UserError(f"{path}: a video is written as {' or '.join(_CODECS)}: choose another --out")
+    if path.exists():
+        raise UserError(f"{path}: is there already: choose another --out or delete it")
+    if not path.parent.is_dir():
+        raise UserError(f"{path.parent}: no such folder: make it or choose another --out")
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    try:
+        written = _write(temporary, path, zip(frames_left, frames_right, strict=True), fps, labels, count, progress)
+        temporary.replace(path)
+    except OSError as error:
+        raise write_error(path, error) from None
+    finally:
+        temporary.unlink(missing_ok=True)
+    return f"{path}: {written} frames at {fps:g} Hz, {labels[0]} left and {labels[1]} right"
+
+
+def side_by_side(left: Image, right: Image, labels: tuple[str, str]) -> Image:
+    """Both images (h, w, 3) with their labels, even in size as encoders ask. Raises ValueError if sizes differ."""
+    if left.shape != right.shape or left.ndim != 3 or left.shape[2] != 3 or {left.dtype, right.dtype} != {_UINT8}:
+        raise ValueError(f"expected two equal (h, w, 3) uint8 images, not {left.shape} and {right.shape}")
+    height, width = left.shape[:2]
+    both = np.zeros((height + height % 2, 2 * width + _GAP, 3), np.uint8)
+    both[:height, :width], both[:height, width + _GAP :] = left, right
+    scale = max(height / 480.0, 0.3)
+    for label, x in zip(labels, (0, width + _GAP), strict=True):
+        place = (x + round(12 * scale), height - round(14 * scale))
+        for color, thickness in (((0, 0, 0), 4), ((255, 255, 255), 1)):
+            cv2.putText(both, label, place, _FONT, 0.7 * scale, color, max(1, round(thickness * scale)), cv2.LINE_AA)
+    return both
+
+
+_UINT8 = np.dtype(np.uint8)
+
+
+def _write(
+    temporary: Path,
+    path: Path,
+    pairs: Iterable[tuple[Image, Image]],
+    fps: float,
+    labels: tuple[str, str],
+    count: int,
+    progress: Progress,
+) -> int:
+    writer, shape, written = None, None, 0
+    try:
+        for left, right in pairs:
+            picture = side_by_side(left, right, labels)
+            if writer is None:
+                shape = picture.shape
+                codec = cv2.VideoWriter.fourcc(*_CODECS[path.suffix.lower()])
+                writer = cv2.VideoWriter(str(temporary), codec, fps, (shape[1], shape[0]))
+                if not writer.isOpened():
+                    raise UserError(f"{path}: OpenCV cannot write this video at {fps:g} Hz: try .avi or another --out")
+            if picture.shape != shape:
+                raise ValueError(f"image {written} is {picture.shape}, the first was {shape}")
+            writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+            written += 1
+            progress("export", min(1.0, written / count) if count else 0.0, f"frame {written - 1}")
+    finally:
+        if writer is not None:
+            writer.release()
+    if not written:
+        raise UserError(f"{path}: there is no frame to show: choose other --frames")
+    # The encoder does not say so when the disk is full.
+    reader = cv2.VideoCapture(str(temporary))
+    kept = int(reader.get(cv2.CAP_PROP_FRAME_COUNT))
+    reader.release()
+    if kept != written:
+        raise UserError(f"{path}: only {kept} of {written} frames could be written: free space or choose another --out")
+    return written

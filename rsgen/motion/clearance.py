@@ -1,0 +1,137 @@
+"""How close a camera's path comes to a scene's surfaces, and tours that keep away from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from rsgen.errors import UserError
+from rsgen.geometry.spline import Spline
+from rsgen.motion.config import Waypoint
+from rsgen.motion.paths import TourCurve
+from rsgen.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+_STEP_S = 0.02
+_STEP_M = 0.02
+_MARGIN = 1.2  # a pushed waypoint goes this much farther than it needs, as the curve between waypoints cuts corners
+_ROUNDS = 30
+_SMALLEST_M = 1e-3
+_CHUNK = 500  # points at once: bounds memory
+
+
+def nearest_surface(points: Array, triangles: Array, reach_m: float) -> tuple[Array, Array]:
+    """Exact distance (n,) of points (n, 3) to triangles (m, 3, 3), and the surface's nearest point (n, 3).
+
+    Where there is nothing within reach_m the distance is infinite and the point NaN.
+    """
+    centre = triangles.mean(axis=1)
+    radius = np.linalg.norm(triangles - centre[:, None], axis=-1).max(axis=1)
+    # Walls and leaves differ a thousandfold in size: sorted by size, each sort has a tight bound on where to look.
+    sizes = np.floor(np.log2(np.maximum(radius, _SMALLEST_M))).astype(np.int64)
+    sorts = [(np.flatnonzero(sizes == size), 2.0 ** (size + 1.0)) for size in np.unique(sizes)]
+    trees = [cKDTree(centre[members]) for members, _ in sorts]
+    to_centre = np.stack([np.asarray(tree.query(points)[0]) for tree in trees]).min(axis=0)
+    bound = np.minimum(to_centre, reach_m) * (1.0 + 1e-9)
+    distance, nearest = np.full(len(points), np.inf), np.full((len(points), 3), np.nan)
+    for (members, largest), tree in zip(sorts, trees, strict=True):
+        for chunk in np.array_split(np.arange(len(points)), max(1, len(points) // _CHUNK)):
+            hits = tree.query_ball_point(points[chunk], bound[chunk] + largest)
+            i = np.repeat(chunk, [len(h) for h in hits])
+            if not len(i):
+                continue
+            j = members[np.concatenate([np.asarray(h, dtype=np.int64) for h in hits])]
+            found = trimesh.triangles.closest_point(triangles[j], points[i])
+            d = np.linalg.norm(found - points[i], axis=1)
+            order = np.lexsort((d, i))
+            best = order[np.unique(i[order], return_index=True)[1]]
+            best = best[(d[best] <= reach_m) & (d[best] < distance[i[best]])]
+            distance[i[best]], nearest[i[best]] = d[best], found[best]
+    return distance, nearest
+
+
+def clearance(motion: Spline | Trajectory, triangles: Array, reach_m: float = 0.5) -> float:
+    """Least distance in metres of the camera's path to the triangles (m, 3, 3), world frame; inf beyond reach_m.
+
+    A spline is sampled every 20 ms, a trajectory at its poses. (trimesh: mesh.triangles; arrays: vertices[faces].)
+    """
+    return float(nearest_surface(_samples(motion)[1], triangles, reach_m)[0].min())
+
+
+def check_clearance(motion: Spline | Trajectory, triangles: Array, clearance_m: float) -> None:
+    """Raises UserError, naming time and place, if the camera comes closer than clearance_m to triangles (m, 3, 3)."""
+    times, points = _samples(motion)
+    distance, _ = nearest_surface(points, triangles, clearance_m)
+    k = int(np.argmin(distance))
+    if distance[k] < clearance_m:
+        place = ", ".join(f"{x:.2f}" for x in points[k])
+        raise UserError(
+            f"motion: comes within {distance[k]:.3f} m of a surface at {times[k]:.2f} s, at [{place}]; clearance_m is "
+            f"{clearance_m:g}: move the path away or reduce clearance_m"
+        )
+
+
+def plan_tour(
+    triangles: Array, waypoints: Sequence[Waypoint], clearance_m: float = 0.15, closed: bool = True
+) -> tuple[Waypoint, ...]:
+    """Waypoints of a tour that keeps clearance_m from triangles (m, 3, 3): those given, moved and added to as needed.
+
+    Where the curve comes too close, it is pushed straight away from the nearest surface: by moving a waypoint that is
+    near, else by a new one, whose target is the curve's. What passes *through* a surface cannot be pushed off it.
+    Raises UserError naming the waypoint after which it stays too close.
+    """
+    tour = list(waypoints)
+    for _ in range(_ROUNDS):
+        curve = TourCurve.through(tour, closed)
+        s = np.linspace(0.0, curve.length, max(2, round(curve.length / _STEP_M)) + 1)
+        points, targets = curve.at(s)
+        distance, nearest = nearest_surface(points, triangles, clearance_m)
+        close = distance < clearance_m
+        if not close.any():
+            return tuple(tour)
+        passes = curve.waypoint_distances()
+        worst = int(np.argmin(distance))
+        after = max(int(np.searchsorted(passes, s[worst] + 1e-6)) - 1, 0)
+        if distance[worst] < 1e-6:
+            break
+        # One push for each stretch that is too close, from the last to the first so that indices stay valid.
+        starts = np.flatnonzero(close & ~np.r_[False, close[:-1]])
+        for begin in starts[::-1]:
+            end = begin + int(np.argmin(np.r_[close[begin:], False]))
+            k = begin + int(np.argmin(distance[begin:end]))
+            away = (points[k] - nearest[k]) * (_MARGIN * clearance_m / max(distance[k], 1e-6) - 1.0)
+            _push(tour, passes, float(s[k]), points[k], targets[k], away)
+    raise UserError(
+        f"motion: the tour after waypoint {after} stays within {distance[worst]:.3f} m of a surface, less than "
+        f"clearance_m = {clearance_m:g}: move that waypoint or the next away, or reduce clearance_m"
+    )
+
+
+def _push(tour: list[Waypoint], passes: Array, s: float, point: Array, target: Array, away: Array) -> None:
+    """Move the waypoint at `s` metres along the tour by `away`, or insert one at `point` + `away`."""
+    gaps = np.abs(passes - s)
+    nearest = int(np.argmin(gaps))
+    if gaps[nearest] < 5.0 * _STEP_M:
+        old = tour[nearest]
+        tour[nearest] = Waypoint(position=_vector(np.asarray(old.position) + away), target=old.target)
+    else:
+        where = int(np.searchsorted(passes, s))
+        tour.insert(where, Waypoint(position=_vector(point + away), target=_vector(target)))
+
+
+def _vector(v: Array) -> tuple[float, float, float]:
+    x, y, z = np.round(v, 4).tolist()
+    return x, y, z
+
+
+def _samples(motion: Spline | Trajectory) -> tuple[Array, Array]:
+    """Times (n,) and positions (n, 3)."""
+    if isinstance(motion, Trajectory):
+        return motion.stamps, motion.positions
+    times = np.linspace(motion.t_begin, motion.t_end, max(2, round((motion.t_end - motion.t_begin) / _STEP_S)))
+    return times, motion.pose(times)[:, :3, 3]

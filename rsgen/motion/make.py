@@ -1,0 +1,96 @@
+"""From the settings of a motion to its trajectory: the size and angle that meet the targets, hand-shake included."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from scipy.optimize import brentq
+
+from rsgen.errors import UserError
+from rsgen.geometry import so3
+from rsgen.motion.config import MotionConfig
+from rsgen.motion.paths import Path, make_path, window
+from rsgen.motion.shake import band_noise
+from rsgen.motion_stats import MotionStatistics, motion_statistics
+from rsgen.trajectory import Trajectory
+
+RATE_HZ = 200.0
+"""Poses per second of a made motion: ten per 50 ms knot."""
+
+_STREAM = 0x5AE  # tells the hand-shake's random numbers from others of the same seed
+_ROUNDS = 12
+_SETTLED = 1e-4  # relative error of length and turning
+_FIRST_ANGLE = math.radians(5.0)
+
+
+def make_motion(config: MotionConfig, seed: int) -> Trajectory:
+    """The motion as poses at about 200 Hz from t = 0 on, at rest at both ends: T_world_cam of the body.
+
+    seed: of the hand-shake, where config.seed names no other. Length and mean speeds are those of the poses, chord by
+    chord, as `motion_statistics` measures them. Raises UserError if no motion of this kind meets them.
+    """
+    duration = config.duration_s
+    count = math.ceil(duration * RATE_HZ)
+    t = np.linspace(0.0, duration, count + 1)
+    path = make_path(config, t)
+    size = np.repeat([config.shake_position_m, math.radians(config.shake_rotation_deg)], 3)
+    rng = np.random.default_rng([seed if config.seed is None else config.seed, _STREAM])
+    noise = band_noise(rng, count, count / duration, config.shake_band_hz, config.shake_exponent)
+    noise = np.concatenate([noise, noise[:1]]) * size * window(t, duration, config.ramp_s)[:, None]
+    turn = so3.exp(noise[:, 3:])
+
+    def trajectory(size: float, angle: float) -> Trajectory:
+        position, R = path.poses(size, angle)
+        T = np.zeros((len(t), 4, 4))
+        T[:, :3, :3] = R @ turn
+        T[:, :3, 3] = position + (R @ noise[:, :3, None])[..., 0]
+        T[:, 3, 3] = 1.0
+        return Trajectory(t, T)
+
+    return trajectory(*_solve(config, path, lambda size, angle: motion_statistics(trajectory(size, angle))))
+
+
+def _solve(
+    config: MotionConfig, path: Path, measure: Callable[[float, float], MotionStatistics]
+) -> tuple[float, float]:
+    """Size and angle by turns, each by Brent's method: one round would do, were a tour's turning not up to its size."""
+    size, angle = path.first_size, 0.0
+
+    def turning(x: float) -> float:
+        return measure(size, x).mean_rotation_deg_s / config.mean_rotation_deg_s
+
+    def length(x: float) -> float:
+        return measure(x, angle).length_m / config.length_m
+
+    less_turning = "shake_rotation_deg, or how far the tour turns" if config.kind == "tour" else "shake_rotation_deg"
+    more_turning = "strokes" if config.kind == "roll" else "sway_hz"
+    less_length = "shake_position_m, or move waypoints together" if config.kind == "tour" else "shake_position_m"
+    more_length = "mean_rotation_deg_s" if config.kind == "roll" else "the distances between waypoints"
+    for _ in range(_ROUNDS):
+        angle = _reach(turning, 0.0, _FIRST_ANGLE, path.max_angle, "mean_rotation_deg_s", less_turning, more_turning)
+        size = _reach(length, path.min_size, path.first_size, path.max_size, "length_m", less_length, more_length)
+        if max(abs(turning(angle) - 1.0), abs(length(size) - 1.0)) < _SETTLED:
+            return size, angle
+    raise UserError(
+        f"motion: length_m {config.length_m:g} and mean_rotation_deg_s {config.mean_rotation_deg_s:g} cannot both be "
+        "met by this motion: change one of them"
+    )
+
+
+def _reach(
+    share: Callable[[float], float], low: float, first: float, high: float, name: str, less: str, more: str
+) -> float:
+    """The x in [low, high], near `first`, at which the share of target `name` that is reached, which rises, is one."""
+    least = share(low)
+    if least > 1.0 + _SETTLED:
+        raise UserError(f"motion: {name} is too small: at least {least:.4g} times as much is needed; or reduce {less}")
+    if least >= 1.0 - _SETTLED:
+        return low
+    x = min(first, high)
+    while (reached := share(x)) < 1.0:
+        if x >= high or x > 1e5 * first:
+            raise UserError(f"motion: {name} is too large: {reached:.4g} of it is reached; reduce it or raise {more}")
+        x = min(2.0 * x, high)
+    return float(brentq(lambda x: share(x) - 1.0, low, x, rtol=1e-7))

@@ -1,0 +1,38 @@
+"""From linear light to 8 bit: the tone curves of cameras and displays."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatImage = NDArray[np.float32]
+
+
+def to_srgb8(linear: FloatImage, gain: float = 1.0) -> NDArray[np.uint8]:
+    """8-bit sRGB (IEC 61966-2-1) of linear values times `gain`, clipped to [0, 1]; any shape."""
+    return quantise8(srgb(np.clip(linear * np.float32(gain), 0, 1)))
+
+
+def srgb(x: FloatImage) -> FloatImage:
+    """Non-linear sRGB (IEC 61966-2-1) in [0, 1] of linear values in [0, 1]; any shape."""
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, np.float32(1 / 2.4)) - 0.055)
+
+
+def power_law(x: FloatImage, gamma: float) -> FloatImage:
+    """x^(1/gamma) of linear values in [0, 1]; any shape."""
+    return np.power(x, np.float32(1 / gamma))
+
+
+def s_curve(y: FloatImage, contrast: float) -> FloatImage:
+    """(1 − c) y + c (3y² − 2y³) of encoded values in [0, 1]; any shape.
+
+    Keeps black, white and the middle; its slope in the middle is 1 + c/2. A stand-in for the contrast that cameras add
+    to their response (Grossberg, Nayar, Modeling the Space of Camera Response Functions, PAMI 2004, shows real ones).
+    """
+    c = np.float32(contrast)
+    return y * ((1 - c) + c * y * (3 - 2 * y))
+
+
+def quantise8(y: FloatImage) -> NDArray[np.uint8]:
+    """8-bit code of encoded values in [0, 1], rounded to the nearest; any shape."""
+    return np.rint(255 * y).astype(np.uint8)

@@ -1,0 +1,168 @@
+"""The exact images of one colour frame. One ray through each pixel's centre serves flow, normals, blur and depth.
+
+Importing this module needs an active Mitsuba variant (`rsgen.backend.mitsuba()`).
+
+A pixel stands for the surface point p that its centre's ray first meets at its line's mid-exposure, or for a point at
+infinity where it meets nothing.
+
+flow: where p is seen in the other image minus the pixel, px. Into the next frame each line has its own time: equation
+(3) of Kerl, Stückler, Cremers (ICCV 2015) is solved for every pixel. u and v are 0 where the other image does not hold
+p; valid is 1 where it does and p is not hidden there (a ray from that camera reaches p, on the side seen before).
+
+blur_length: ‖x_t − x_{t−t_e}‖ of equation (13), px: x_t is p as seen with the pose at the end of the pixel's own line's
+exposure, x_{t−t_e} with that at its begin.
+
+normals: of the triangle at p, in the camera frame of the line's mid-exposure, towards the camera; 0 at infinity.
+
+color_depth: planar z of p, m; 0 at infinity.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from rsgen.config_sections import ColorConfig
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter
+from rsgen.geometry.so3 import FloatArray
+from rsgen.noise.response import to_srgb8
+from rsgen.render import ColorRenderer
+from rsgen.sensor import PoseFunction, RollingShutterSensor
+from rsgen.truth.projection import Track, contains, line_of_pixel, to_camera
+from rsgen.truth.settings import GlobalTime, TruthConfig
+
+# Rays that ask whether a point is seen end this much short of it, as a fraction of their length: 0.1 mm at 1 m.
+_SHORT = 1e-4
+_TIMES: tuple[GlobalTime, ...] = ("first", "middle", "last")
+
+
+class TruthRenderer:
+    """Renders what a `TruthConfig` asks for. Holds its sensors between frames, so that kernels are compiled once."""
+
+    def __init__(self, scene: Any, integrator: Any, color: ColorConfig, truth: TruthConfig) -> None:
+        """`scene` and `integrator` as for `ColorRenderer`; `color` is the stream that the images belong to."""
+        self._scene, self._truth = scene, truth
+        self._camera, self._shutter = color.camera, color.shutter
+        self._gain = color.exposure_gain
+        sharp = Shutter(self._shutter.readout_s, 0.0, self._shutter.scan)
+        self._sharp = ColorRenderer(scene, integrator, self._camera, sharp, truth.spp)
+        self._global = ColorRenderer(scene, integrator, self._camera, Shutter(), truth.spp)
+        self._sensor = RollingShutterSensor(self._camera, self._shutter)
+
+    def render(
+        self, T_world_cam: PoseFunction, stamp: float, next_stamp: float | None, seed: int
+    ) -> dict[str, NDArray[Any]]:
+        """Every image of `TruthConfig.images` of the frame at `stamp` (s): uint8 sRGB (h, w, 3), or float32 (h, w, n).
+
+        n is the number of the image's EXR channels; with one channel the image is (h, w). `T_world_cam` takes times
+        (n,) s to poses (n, 4, 4) of the colour camera; UserError if it ends before a frame's last line. `next_stamp`
+        is the next frame's stamp, None after the last frame: then flow_next is 0 and nowhere valid. `seed` decides the
+        random numbers of the frame's twins.
+        """
+        truth, mid = self._truth, stamp - 0.5 * self._shutter.exposure_s
+        images: dict[str, NDArray[Any]] = {}
+        if truth.sharp:
+            images["sharp"] = to_srgb8(self._sharp.render(T_world_cam, mid, _seed(seed, 0)), self._gain)
+        for time in truth.global_shutter:
+            instant = global_instant(self._camera, self._shutter, stamp, time)
+            linear = self._global.render(T_world_cam, instant, _seed(seed, 1 + _TIMES.index(time)))
+            images[f"global_{time}"] = to_srgb8(linear, self._gain)
+        if truth.flow or truth.normals or truth.blur_length or truth.color_depth:
+            images |= self._geometry(T_world_cam, stamp, next_stamp)
+        return {name: images[name] for name in truth.images}
+
+    def _geometry(
+        self, T_world_cam: PoseFunction, stamp: float, next_stamp: float | None
+    ) -> dict[str, NDArray[np.float32]]:
+        camera, shutter, truth = self._camera, self._shutter, self._truth
+        self._sensor.expose(T_world_cam, stamp)
+        reference = np.asarray(T_world_cam(np.array([stamp])), float).reshape(4, 4)[:3, 3]
+        track = Track(camera, shutter, T_world_cam, stamp, reference)
+        seen = self._cast(track, reference)
+        images: dict[str, list[Any]] = {}
+        if truth.color_depth:
+            images["color_depth"] = [seen.z]
+        if truth.normals:
+            images["normals"] = list(seen.n_cam)
+        if truth.blur_length:
+            ends = (shutter.exposure_s + seen.begin, seen.begin)
+            (x_end, ok_end), (x_begin, ok_begin) = (track.project_at(t, seen.p, seen.w) for t in ends)
+            images["blur_length"] = [dr.select(ok_end & ok_begin, dr.norm(x_end - x_begin), 0)]
+        if "global" in truth.flow:
+            for time in truth.global_shutter:
+                instant = global_instant(camera, shutter, stamp, time)
+                still = Track(camera, Shutter(), T_world_cam, instant, reference)
+                uv, defined = still.project_at(mi.Float(0), seen.p, seen.w)
+                found = defined & contains(camera, uv)
+                images[f"flow_global_{time}"] = self._flow(seen, uv, found, still.pose(mi.Float(0))[0], reference)
+        if "next" in truth.flow and next_stamp is not None:
+            following = Track(camera, shutter, T_world_cam, next_stamp, reference)
+            uv, t, found = following.project(line_of_pixel(camera, shutter, seen.uv), seen.p, seen.w)
+            images["flow_next"] = self._flow(seen, uv, found, following.pose(t)[0], reference)
+        dr.eval(images)
+        shape = (camera.height, camera.width)
+        out = {name: np.stack([np.array(c, np.float32) for c in images[name]], axis=-1) for name in images}
+        if "next" in truth.flow and next_stamp is None:
+            out["flow_next"] = np.zeros((camera.height * camera.width, 3), np.float32)
+        return {name: a.reshape(*shape, *(a.shape[1:] if a.shape[1] > 1 else ())) for name, a in out.items()}
+
+    def _cast(self, track: Track, reference: FloatArray) -> _Seen:
+        """What the pixels' centres see at their lines' mid-exposure. The sensor must be exposed to the frame."""
+        camera, shutter = self._camera, self._shutter
+        pixel = dr.arange(mi.UInt32, camera.width * camera.height)
+        uv = mi.Point2f(pixel % camera.width, pixel // camera.width)
+        position = mi.Point2f((uv.x + 0.5) / camera.width, (uv.y + 0.5) / camera.height)
+        ray, _ = self._sensor.sample_ray(0.5 * shutter.exposure_s, mi.Float(0), position, mi.Point2f(0.5))
+        hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
+        normal = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal).n
+        normal = dr.select(hit.is_valid(), dr.select(dr.dot(normal, ray.d) < 0, normal, -normal), 0)
+        begin = line_of_pixel(camera, shutter, uv) * shutter.line_delay(camera)
+        origin, R_world_cam = track.pose(begin + 0.5 * shutter.exposure_s)
+        w = dr.select(hit.is_valid(), mi.Float(1), 0)
+        p = dr.select(hit.is_valid(), origin + hit.t * ray.d, ray.d)
+        z = dr.select(hit.is_valid(), hit.t * self._sensor.planar_depth_scale(uv.x, uv.y), 0)
+        return _Seen(uv, begin, p, w, normal, to_camera(R_world_cam, normal), z)
+
+    def _flow(self, seen: _Seen, uv: Any, found: Any, origin: Any, reference: FloatArray) -> list[Any]:
+        """u, v, valid of the flow to pixels `uv`, where `found`, of a camera then at `origin` (from the reference)."""
+        towards = seen.p - seen.w * origin
+        distance = dr.norm(towards)
+        at = mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in reference))
+        ray = mi.Ray3f(origin + at, towards / distance)
+        ray.maxt = dr.select(seen.w > 0, distance * (1 - _SHORT), dr.inf)
+        front = (seen.w == 0) | (dr.dot(seen.normal, towards) < 0)
+        valid = found & front
+        valid &= ~self._scene.ray_test(ray, coherent=True, active=valid)
+        flow = uv - seen.uv
+        keep = dr.isfinite(flow.x) & dr.isfinite(flow.y) & found
+        return [dr.select(keep, flow.x, 0), dr.select(keep, flow.y, 0), dr.select(valid, mi.Float(1), 0)]
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Per pixel, on the device: what its ray meets. Positions relative to the reference, m, world axes."""
+
+    uv: Any  # the pixel itself
+    begin: Any  # s from the first line's shutter opening to its own line's
+    p: Any  # point, or direction where w = 0
+    w: Any
+    normal: Any  # world axes, towards the camera, 0 at infinity
+    n_cam: Any
+    z: Any
+
+
+def global_instant(camera: Camera, shutter: Shutter, stamp: float, time: GlobalTime) -> float:
+    """The instant (s) of a global-shutter twin: mid-exposure of the first, the last or, between lines, the middle."""
+    line = {"first": 0.0, "middle": 0.5, "last": 1.0}[time] * (shutter.line_count(camera) - 1)
+    return float(shutter.line_mid_time(stamp, line, camera))
+
+
+def _seed(seed: int, image: int) -> int:
+    # Of its own for each image and apart from the frame's: a twin's noise tells nothing about the frame's.
+    return int(np.random.SeedSequence([seed, 1 + image]).generate_state(1)[0])
