@@ -21,7 +21,7 @@ _BLUR_PX = 0.8
 
 @dataclass(frozen=True)
 class DepthImage:
-    """A depth image: z (m, 0 missing) and 1/z on the device; rays are those of its camera (`upload_rays`)."""
+    """A depth image: z (m, 0 missing) and 1/z on the device; rays are those of its camera."""
 
     exposure: Exposure
     z: Any
@@ -44,6 +44,22 @@ def depth_image(e: Engine, exposure: Exposure, z: npt.NDArray[Any], max_depth: f
     z = np.where(good, z, np.float32(0.0))
     inverse = np.divide(np.float32(1.0), z, out=np.zeros_like(z), where=good)
     return DepthImage(exposure, e.upload(z), e.upload(inverse), int(np.count_nonzero(good)))
+
+
+def depth_resolution(z: npt.NDArray[Any]) -> float:
+    """Step δ (1/m) of a depth image (h, w): neighbouring values differ by δ z², as those of whole disparities do.
+
+    0 where depth is not quantised so that it shows: where most pixels have values of their own.
+    """
+    z = np.asarray(z)[::2, ::2]
+    values, counts = np.unique(z[(z > 0) & np.isfinite(z)], return_counts=True)
+    if len(values) < 2 or counts.sum() < 5 * len(values):
+        return 0.0
+    # As seen by the pixels: rare values in between are noise.
+    steps = np.diff(values) / values[1:] ** 2
+    order = np.argsort(steps)
+    seen = np.cumsum(counts[1:][order])
+    return float(steps[order][np.searchsorted(seen, 0.5 * seen[-1])])
 
 
 def intensity(color: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:

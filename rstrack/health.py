@@ -13,7 +13,7 @@ _LEAST_SHARE = 0.08
 _LEAST_PIXELS = 200
 # Scales that no aligned images have, and growth over the last frames' median that none shows (m; intensity).
 _WORST_DEPTH, _WORST_INTENSITY = 0.03, 0.15
-_GROWTH, _HARMLESS_DEPTH, _HARMLESS_INTENSITY = 6.0, 2e-3, 0.03
+_GROWTH, _HARMLESS_DEPTH, _HARMLESS_INTENSITY = 6.0, 1e-2, 0.03
 # Lines that still move so far (pixels) have not been found.
 _WORST_SHIFT_PX = 2.0
 _MEMORY = 30

@@ -13,13 +13,16 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.so3 import FloatArray
 from rstrack.engine import engine
-from rstrack.frames import ColorImage, DepthImage, camera_rays, color_image, depth_image, lens_sees
+from rstrack.frames import ColorImage, DepthImage, camera_rays, color_image, depth_image, depth_resolution, lens_sees
 from rstrack.keyframe import KeyframeMaker
 from rstrack.lines import Exposure
 from rstrack.options import Options
 from rstrack.rig import Frame, Image, Rig
 from rstrack.terms import Terms
 from rstrack.warp import Lens
+
+# Frames within which the depth camera's resolution is looked for: it does not change.
+_SETTLED = 3
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,8 @@ class Preparer:
         """Raises UserError if an image's size or type is not the rig's."""
         rig, options = self._rig, self._options
         z = _checked(frame.depth, rig.depth_camera, "depth", (), "float metres, 0 = missing", np.floating)
+        if self.terms.resolution == 0.0 and index < _SETTLED:
+            self.terms.resolution = depth_resolution(z)
         exposure = self._exposure(frame.depth, self._depth_lens, rig.depth_shutter, np.eye(4))
         depth = depth_image(self._e, exposure, np.where(self._seen, z, 0.0), options.max_depth)
         colors = []

@@ -15,7 +15,7 @@ from rsgen.geometry.so3 import FloatArray
 from rstrack.engine import Engine
 from rstrack.frames import LEVELS, masked_pyramid
 from rstrack.lines import Exposure
-from rstrack.residuals import EDGE
+from rstrack.residuals import EDGE, NEAREST
 from rstrack.warp import Lens
 
 # Strides of the pixels that are looked at on the pyramid's levels, finest first (DESIGN section 5: every second pixel
@@ -125,10 +125,13 @@ def on_one_surface(rho: Image) -> npt.NDArray[np.bool_]:
 
 
 def depth_scaling(rho: Image) -> tuple[float, float]:
-    """`lever` and `bound` of the geometric term: |j| is 1 for shifts and at most the largest distance for rotations."""
-    z = 1.0 / rho[rho > 0] if (rho > 0).any() else np.ones(1, np.float32)
-    lever = float(np.median(z))
-    return lever, max(1.5, 1.5 * float(z.max()) / lever)
+    """`lever` and `bound` of the geometric term.
+
+    |j| is 1 for shifts and z / lever for rotations, times the kernel's min((lever / z)², NEAREST): never above NEAREST
+    for points as far from the axis as from the camera.
+    """
+    lever = float(np.median(1.0 / rho[rho > 0])) if (rho > 0).any() else 1.0
+    return lever, 2.0 * NEAREST
 
 
 def level_points(

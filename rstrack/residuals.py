@@ -38,6 +38,8 @@ _SLOTS = 32
 EDGE = 0.03
 # Metres that a point has to lie behind what is seen there to count as hidden, beside EDGE of its depth.
 _BEHIND = 0.02
+# Largest factor by which the errors of near depth count more than those of the median depth.
+NEAREST = 2.0
 # Share of a pixel's weight that its curvature keeps at least.
 _CURVATURE = 0.5
 _UPPER = np.triu_indices(6)
@@ -173,6 +175,8 @@ def geometric_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int) -> Call
         index, px, py = grid(e, camera.width, camera.height, stride)
         z = dr.gather(e.Float, depth, index)
         active = z > 0.0
+        # Errors of depth grow with its square, in triangulating cameras and by interpolation: one σ serves all depths.
+        even = dr.minimum(dr.square(dr.rcp(dr.maximum(z * parameters[2], 1e-3))), NEAREST)
         q = dr.gather(e.Float, rays_x, index) * z, dr.gather(e.Float, rays_y, index) * z, z
         line = _line_index(e, lens, px, py)
         p = move(gather(to_base, line, TO_BASE, stride=TO_BASE), q)
@@ -189,7 +193,7 @@ def geometric_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int) -> Call
         active &= dr.gather(e.Float, roughness, at, active) < dr.gather(e.Float, constants, e.UInt(7))
         # The plane m·q = 1 through the pixel; |m| is one over its distance.
         mz = value - mx * seen.at.xn - my * seen.at.yn
-        inv_m = dr.rsqrt(mx * mx + my * my + mz * mz)
+        inv_m = even * dr.rsqrt(mx * mx + my * my + mz * mz)
         r = (1.0 - seen.z * value) * inv_m
         scale = -seen.z * inv_m
         g = seen.chain(scale * mx / ref.fx, scale * my / ref.fy, -value * inv_m)

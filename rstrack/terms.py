@@ -68,6 +68,9 @@ class Terms:
     gate_intensity: float = 0.3
     floor_depth: float = _CREDIBLE_DEPTH
     floor_intensity: float = 1.0 / 255.0
+    # Step of the depth camera (1/m), see `depth_resolution`. A camera at rest repeats its rounding, so that depth would
+    # seem far better than it is.
+    resolution: float = 0.0
     # Where interpolation errs by more than this part of σ, its bias counts, not its size: those pixels are left out.
     smooth: float = 0.25
     _kernels: dict[Any, Any] = field(default_factory=dict)
@@ -85,7 +88,8 @@ class Terms:
         sums = self._geometric_sums(image, ref, to_base, self._seen_from(spline, ref), level, sigma)
         _, _, per, ref_per = block_counts(image.exposure.lens, ref.lens)
         times = image.exposure.block_times(per)
-        return self._finish(sums, slopes_at or spline, ref, times, ref_per, sigma, self.floor_depth, ref.lever)
+        floor = self._floor_depth(ref)
+        return self._finish(sums, slopes_at or spline, ref, times, ref_per, sigma, floor, ref.lever)
 
     def geometric_pose(
         self, image: DepthImage, ref: Reference, T_base_cam: FloatArray, level: int, sigma: float
@@ -93,7 +97,7 @@ class Terms:
         """The same for a global-shutter image at one pose (4, 4) against a rectified reference: sums and next σ (m)."""
         to_base = np.concatenate([T_base_cam[:3, :3].ravel(), T_base_cam[:3, 3]])
         sums = self._geometric_sums(image, ref, to_base, self.e.upload(IDENTITY_FROM_BASE), level, sigma)
-        return sums, scale_step(sigma, sums.weighted, sums.count, self.floor_depth)
+        return sums, scale_step(sigma, sums.weighted, sums.count, self._floor_depth(ref))
 
     def _geometric_sums(
         self, image: DepthImage, ref: Reference, to_base: FloatArray, from_base: Any, level: int, sigma: float
@@ -102,13 +106,16 @@ class Terms:
         kernel = self._kernel(geometric_kernel, lens, ref.lens, STRIDES[level])
         scaling = self._scaling(ref, lens, lens.camera, ref, STRIDES[level], 1)
         gate = self.gate_depth[level]
-        gate = min(gate, max(5.0 * sigma, 10 * self.floor_depth)) if level == 0 else gate
+        gate = min(gate, max(5.0 * sigma, 10 * self._floor_depth(ref))) if level == 0 else gate
         smooth = self.smooth * max(sigma, _CREDIBLE_DEPTH)
         constants = e.upload(np.append(scaling.parameters(sigma, gate), smooth))
         surface = ref.inverse_depth, ref.slope_x, ref.slope_y, ref.roughness
         raw = kernel(image.z, *self.rays, e.upload(to_base), *surface, from_base, constants)
         current, reference, _, _ = block_counts(lens, ref.lens)
         return scaling.unpack(raw.numpy(), current, reference)
+
+    def _floor_depth(self, ref: Reference) -> float:
+        return max(self.floor_depth, self.resolution * ref.lever**2 / np.sqrt(12.0))
 
     def visible(self, depth: DepthImage, ref: Reference, spline: Spline, level: int) -> Any:
         """Which of the reference's points of a level the depth image does not hide: 1 or 0, on the device."""

@@ -141,7 +141,7 @@ def test_jumps_are_found() -> None:
         tracker.feed(make_frame(0.0, Shutter(), still(T)))
         tracker.feed(make_frame(0.1, Shutter(), still(T @ se3.exp(jump.ravel()))))
         _, T_world_depth = tracker.trajectory
-        assert np.linalg.norm((T_world_depth[-1] - se3.exp(jump.ravel()))[:3, 3]) < 1e-3
+        assert np.linalg.norm((T_world_depth[-1] - se3.exp(jump.ravel()))[:3, 3]) < 2e-3  # of 30
 
 
 def test_lost_frames_are_left_out_and_the_keyframe_is_tried_again() -> None:

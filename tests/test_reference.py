@@ -8,7 +8,7 @@ import pytest
 
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rstrack.frames import LEVELS, depth_image, intensity, masked_pyramid, pyramid
+from rstrack.frames import LEVELS, depth_image, depth_resolution, intensity, masked_pyramid, pyramid
 from rstrack.lines import Exposure
 from rstrack.reference import (
     STRIDES,
@@ -18,7 +18,7 @@ from rstrack.reference import (
     surface_roughness,
     surface_slopes,
 )
-from rstrack.residuals import EDGE
+from rstrack.residuals import EDGE, NEAREST
 from rstrack.warp import Lens
 from tests.rstrack_util import (
     ENGINE,
@@ -162,11 +162,24 @@ def test_points_of_all_levels_lie_on_the_surface() -> None:
         assert len(inner) and 0.0 < inner.min() < inner.max() < 1.0
 
 
-def test_scaling_of_depth_is_its_median_and_largest() -> None:
+def test_scaling_of_depth_is_its_median() -> None:
     rho = np.array([[0.0, 1.0, 0.5], [0.25, 0.5, 0.1]], np.float32)
     lever, bound = depth_scaling(rho)
-    assert lever == pytest.approx(2.0) and bound == pytest.approx(1.5 * 10.0 / 2.0)
-    assert depth_scaling(np.zeros((2, 2), np.float32)) == (1.0, 1.5)
+    assert lever == pytest.approx(2.0)
+    z = np.linspace(0.1, 20.0, 1000)
+    even = np.minimum((lever / z) ** 2, NEAREST)
+    assert (even * np.maximum(1.0, np.sqrt(2.0) * z / lever)).max() < bound < 4 * NEAREST
+    assert depth_scaling(np.zeros((2, 2), np.float32)) == (1.0, bound)
+
+
+def test_resolution_of_whole_disparities_is_found() -> None:
+    rng = np.random.default_rng(0)
+    z = rng.uniform(0.8, 4.0, (120, 160))
+    disparity = np.round(8 * 42.75 / z) / 8
+    assert depth_resolution((42.75 / disparity).astype(np.float32)) == pytest.approx(1 / (8 * 42.75), rel=0.02)
+    with_holes = np.where(rng.random(z.shape) < 0.3, 0.0, 42.75 / disparity).astype(np.float32)
+    assert depth_resolution(with_holes) == pytest.approx(1 / (8 * 42.75), rel=0.02)
+    assert depth_resolution(z.astype(np.float32)) == 0.0 and depth_resolution(np.zeros((8, 8), np.float32)) == 0.0
 
 
 def test_images_as_the_kernels_take_them() -> None:

@@ -100,9 +100,10 @@ def geometric_pixels(z: np.ndarray, image: DepthImage, ref: Reference, spline: S
     m = np.concatenate([m_xy, (value - (m_xy * ray).sum(axis=1))[:, None]], axis=1)
     length = np.linalg.norm(m, axis=1)
     safe = np.where(length > 0, length, 1.0)
-    r = (1.0 - p[:, 2] * value) / safe
+    even = np.minimum((ref.lever / np.where(z > 0, z, 1.0)) ** 2, residuals.NEAREST)
+    r = even * (1.0 - p[:, 2] * value) / safe
     # 1 − m·p is the error; on a plane, where m does not depend on p, its derivative by p is −m.
-    j = np.concatenate([-m, -np.einsum("ni,nij->nj", m, -hat(p))], axis=1) / safe[:, None]
+    j = np.concatenate([-m, -np.einsum("ni,nij->nj", m, -hat(p))], axis=1) * (even / safe)[:, None]
     active = inside & (near.min(0) > 0) & (spread < EDGE)
     edge = np.concatenate([x - np.round(x - 0.5) - 0.5, x, x - np.array([camera.width, camera.height]) + 1], axis=1)
     ambiguous = (np.abs(edge).min(axis=1) < 1e-3) | (np.abs(spread - EDGE) < 1e-4)
