@@ -194,7 +194,7 @@ def test_curvature_never_turns_negative() -> None:
     # What counts more for being near is further out.
     kept = residuals._CURVATURE * weight(np.array([2.4 * residuals.NEAREST, 2.0])) / weight(0.0)
     assert kept[0] < np.trace(away.model.H) / np.trace(near.model.H) < kept[1]
-    assert np.linalg.eigvalsh(away.model.H).min() > -1e-9 * np.trace(away.model.H)
+    assert np.linalg.eigvalsh(away.model.H).min() > -1e-6 * np.trace(away.model.H)  # fixed point
 
 
 def test_weight_is_the_slope_of_the_cost() -> None:
