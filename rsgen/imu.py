@@ -161,16 +161,18 @@ def simulate_imu(spline: Spline, config: ImuConfig, t_begin: float, t_end: float
 
 
 def write_imu_csv(path: Path, samples: ImuSamples, epoch_s: int = 0) -> None:
-    """Write samples as EuRoC's imu0/data.csv: whole nanoseconds, rad/s, m/s². `epoch_s` is added to all times.
+    """Write `imu_csv`. The file is there whole or not at all. Raises UserError if it cannot be written."""
+    atomic_write(path, imu_csv(samples, epoch_s).encode())
 
-    The file is there whole or not at all. Raises UserError if it cannot be written.
-    """
+
+def imu_csv(samples: ImuSamples, epoch_s: int = 0) -> str:
+    """Samples as the text of EuRoC's imu0/data.csv: whole nanoseconds, rad/s, m/s². `epoch_s` is added to all times."""
     stamps = nanoseconds(samples.t, epoch_s)
     lines = [
         ",".join([str(stamp), *(f"{value:.12g}" for value in row)])
         for stamp, row in zip(stamps, np.column_stack([samples.gyro, samples.accel]).tolist(), strict=True)
     ]
-    atomic_write(path, "\n".join([IMU_CSV_HEADER, *lines, ""]).encode())
+    return "\n".join([IMU_CSV_HEADER, *lines, ""])
 
 
 def nanoseconds(t: npt.ArrayLike, epoch_s: int = 0) -> list[int]:

@@ -33,6 +33,7 @@ from rsgen.sequence_format import (
     pose_rows,
 )
 from rsgen.sequence_identity import fingerprint
+from rsgen.verify_truth import extra_checks
 
 # Rows' poses and groundtruth.txt come from the same spline: only the rounding of stamps (5e-10 s) and digits is left.
 POSE_TOLERANCE_M = 1e-7
@@ -98,6 +99,7 @@ def verify_sequence(path: Path, pairs: int = 20, raycast: int = 0) -> VerifyRepo
         ("scene", partial(_check_scene, sequence)),
         ("reprojection", partial(_check_reprojection, sequence, pairs)),
     ]
+    checks += extra_checks(sequence)
     if raycast:
         checks.append(("ray casting", partial(_check_raycast, sequence, raycast)))
     return VerifyReport(path, tuple(_run(name, check) for name, check in checks))

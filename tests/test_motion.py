@@ -299,7 +299,7 @@ def test_the_table_shows_the_papers_figures_beside_ours() -> None:
     [
         ({**LINE, "position": None}, "needs position"),
         ({**LINE, "waypoints": RING}, "waypoints: not for kind line"),
-        ({**ROLL, "sway_hz": 0.3}, "sway_hz: not for kind roll"),
+        ({**ROLL, "sway_hz": 0.4}, "sway_hz: not for kind roll"),
         ({**CLOSED, "strokes": 3}, "strokes: not for kind tour"),
         ({**CLOSED, "waypoints": RING[:2]}, "at least 3 waypoints"),
         ({**OPEN, "waypoints": RING[:1]}, "at least 2 waypoints"),
