@@ -8,7 +8,8 @@ backends differ only by the rounding of single pixels.
 from __future__ import annotations
 
 import importlib
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
@@ -43,6 +44,21 @@ class Engine:
     def download(self, array: Any, shape: tuple[int, ...]) -> npt.NDArray[Any]:
         """NumPy copy of a device array."""
         return np.array(array.numpy().reshape(shape))
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """Kernels that have been made, so that each is compiled once: kernels(make, *what) is make(e, *what)."""
+
+    e: Engine
+    _made: dict[Any, Any] = field(default_factory=dict)
+
+    def __call__(self, make: Callable[..., Callable[..., Any]], *what: Any) -> Callable[..., Any]:
+        """The kernel, made now if it has not been."""
+        if (make, *what) not in self._made:
+            self._made[make, *what] = make(self.e, *what)
+        kernel: Callable[..., Any] = self._made[make, *what]
+        return kernel
 
 
 @cache

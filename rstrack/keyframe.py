@@ -11,7 +11,7 @@ import numpy.typing as npt
 from rsgen.geometry import se3
 from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
-from rstrack.engine import Engine
+from rstrack.engine import Engine, Kernels
 from rstrack.frames import ColorImage, DepthImage
 from rstrack.lines import from_base_table, to_base_table
 from rstrack.rectify import color_kernel, fuse_kernel, rectify_kernel
@@ -41,7 +41,12 @@ class KeyframeMaker:
     e: Engine
     rays: FloatArray
     device_rays: tuple[Any, Any]
-    _kernels: dict[Any, Any] = field(default_factory=dict)
+    _kernel: Kernels = field(init=False)
+    _one: Any = None
+    _rays: tuple[FloatArray, tuple[Any, Any]] | None = None
+
+    def __post_init__(self) -> None:
+        self._kernel = Kernels(self.e)
 
     def rolling(self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline) -> Reference:
         """A reference that keeps its rolling shutter, for the time until it can be rectified."""
@@ -94,18 +99,17 @@ class KeyframeMaker:
         return fused
 
     def _ones(self, depth: DepthImage) -> Any:
-        camera = depth.exposure.lens.camera
-        if "ones" not in self._kernels:
-            self._kernels["ones"] = self.e.upload(np.ones(camera.height * camera.width))
-        return self._kernels["ones"]
+        if self._one is None:
+            camera = depth.exposure.lens.camera
+            self._one = self.e.upload(np.ones(camera.height * camera.width))
+        return self._one
 
     def _pinhole_rays(self, base: Lens) -> tuple[FloatArray, tuple[Any, Any]]:
         """Normalised coordinates (h, w, 2) of a rectified image, and the same on the device."""
-        if "grid" not in self._kernels:
+        if self._rays is None:
             rays = base.camera.unproject(base.camera.pixel_grid())[..., :2]
-            self._kernels["grid"] = rays, (self.e.upload(rays[..., 0]), self.e.upload(rays[..., 1]))
-        made: tuple[FloatArray, tuple[Any, Any]] = self._kernels["grid"]
-        return made
+            self._rays = rays, (self.e.upload(rays[..., 0]), self.e.upload(rays[..., 1]))
+        return self._rays
 
     def _finish(
         self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, t: float,
@@ -131,8 +135,3 @@ class KeyframeMaker:
             index, depth.exposure.stamp, t, T_world_base, lens, rolling, device_rho, e.upload(slope_x),
             e.upload(slope_y), roughness, weights, points, lever, bound, int(np.count_nonzero(rho)) // STRIDES[0] ** 2,
         )  # fmt: skip
-
-    def _kernel(self, make: Any, *key: Any) -> Any:
-        if (make, *key) not in self._kernels:
-            self._kernels[make, *key] = make(self.e, *key)
-        return self._kernels[make, *key]

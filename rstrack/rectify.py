@@ -12,22 +12,13 @@ from typing import Any
 import drjit as dr
 
 from rstrack.engine import Engine
-from rstrack.residuals import EDGE, bilinear, grid
+from rstrack.residuals import bilinear, grid, nearest, surface
 from rstrack.warp import TO_BASE, Lens, gather, move, project, project_rolling
 
 # Each iteration shrinks the error by the picture's stretching, a few per cent.
 ITERATIONS = 6
 # Pixels: a fixed point that has not settled lies at an occlusion.
 _SETTLED = 0.02
-
-
-def _sample(e: Engine, lens: Lens, rho: Any, x: Any, y: Any, active: Any) -> tuple[Any, Any]:
-    """Inverse depth at (x, y), and whether it lies on one surface."""
-    a, b, c, d, fx, fy, active = bilinear(e, rho, lens.camera.width, lens.camera.height, x, y, active)
-    most, least = dr.maximum(dr.maximum(a, b), dr.maximum(c, d)), dr.minimum(dr.minimum(a, b), dr.minimum(c, d))
-    active &= (least > 0.0) & (most - least < EDGE * most)
-    top, bottom = dr.fma(b - a, fx, a), dr.fma(d - c, fx, c)
-    return dr.fma(bottom - top, fy, top), active
 
 
 def _ray(e: Engine, lens: Lens, rays: tuple[Any, Any], x: Any, y: Any, active: Any) -> tuple[Any, Any]:
@@ -77,7 +68,7 @@ def rectify_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
         value, active, miss = e.Float(0.0), e.Bool(True), e.Float(0.0)
         for _ in range(ITERATIONS):
             x, y = dr.clip(x, 0.0, width - 1.001), dr.clip(y, 0.0, height - 1.001)
-            value, active = _sample(e, lens, rho, x, y, e.Bool(True))
+            value, active = surface(e, lens.camera, rho, x, y, e.Bool(True))
             # Where there is no depth the last guess is as good as any; it may move back onto the surface.
             z = dr.rcp(dr.select(active, value, 1.0))
             rx, ry = _ray(e, lens, (rays_x, rays_y), x, y, e.Bool(True))
@@ -139,7 +130,7 @@ def fuse_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
         active = rho > 0.0
         z = dr.rcp(dr.select(active, rho, 1.0))
         seen = project_rolling(lens, from_base, (xn * z, yn * z, z), e.UInt, e.Int)
-        value, active = _sample(e, lens, source, seen.x, seen.y, active & seen.valid)
+        value, active = surface(e, lens.camera, source, seen.x, seen.y, active & seen.valid)
         z_there = dr.rcp(dr.select(active, value, 1.0))
         active &= dr.abs(z_there - seen.z) < gate * dr.maximum(1.0, z)
         # Relative change of depth: the plane m·p = 1 moves by the same distance for both cameras.
@@ -152,12 +143,7 @@ def fuse_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
         )  # fmt: skip
         ratio = dr.clip(along * z, 0.5, 2.0)
         fused_z = z + (z_there - seen.z) * ratio
-        w = dr.gather(
-            e.Float, source_weight,
-            e.UInt(e.Int(dr.select(active, seen.y + 0.5, 0.0))) * lens.camera.width
-            + e.UInt(e.Int(dr.select(active, seen.x + 0.5, 0.0))),
-            active,
-        )  # fmt: skip
+        w = dr.gather(e.Float, source_weight, nearest(e, lens.camera.width, seen.x, seen.y, active), active)
         active &= w > 0.0
         share = dr.select(active, w / (weight + w), 0.0)
         return dr.fma(share, dr.rcp(fused_z) - rho, rho), dr.minimum(weight + dr.select(active, w, 0.0), limit)

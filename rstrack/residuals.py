@@ -23,6 +23,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from rsgen.geometry.camera import Camera
 from rsgen.geometry.so3 import FloatArray
 from rstrack.engine import Engine
 from rstrack.robust import NU
@@ -141,6 +142,21 @@ def bilinear(e: Engine, image: Any, width: int, height: int, x: Any, y: Any, act
     return (*near, x - x0, y - y0, active)
 
 
+def nearest(e: Engine, width: int, x: Any, y: Any, active: Any) -> Any:
+    """Index of the pixel nearest to (x, y); 0 where not active."""
+    column, row = (e.UInt(e.Int(dr.select(active, v + 0.5, 0.0))) for v in (x, y))
+    return row * width + column
+
+
+def surface(e: Engine, camera: Camera, rho: Any, x: Any, y: Any, active: Any) -> tuple[Any, Any]:
+    """Inverse depth at (x, y), and whether it lies on one surface: bilinear, never across an edge or beside a hole."""
+    a, b, c, d, fx, fy, active = bilinear(e, rho, camera.width, camera.height, x, y, active)
+    most, least = dr.maximum(dr.maximum(a, b), dr.maximum(c, d)), dr.minimum(dr.minimum(a, b), dr.minimum(c, d))
+    active &= (least > 0.0) & (most - least < EDGE * most)
+    top, bottom = dr.fma(b - a, fx, a), dr.fma(d - c, fx, c)
+    return dr.fma(bottom - top, fy, top), active
+
+
 def grid(e: Engine, width: int, height: int, stride: int) -> tuple[Any, Any, Any]:
     """Index, x and y of every stride-th pixel of every stride-th row."""
     columns = -(-width // stride)
@@ -181,14 +197,8 @@ def geometric_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int) -> Call
         line = _line_index(e, lens, px, py)
         p = move(gather(to_base, line, TO_BASE, stride=TO_BASE), q)
         seen = project_rolling(ref_lens, from_base, p, e.UInt, e.Int)
-        a, b, c, d, fx, fy, active = bilinear(e, rho, ref.width, ref.height, seen.x, seen.y, active & seen.valid)
-        most, least = dr.maximum(dr.maximum(a, b), dr.maximum(c, d)), dr.minimum(dr.minimum(a, b), dr.minimum(c, d))
-        active &= (least > 0.0) & (most - least < EDGE * most)
-        top, bottom = dr.fma(b - a, fx, a), dr.fma(d - c, fx, c)
-        value = dr.fma(bottom - top, fy, top)
-        at = e.UInt(e.Int(dr.select(active, seen.y + 0.5, 0.0))) * ref.width + e.UInt(
-            e.Int(dr.select(active, seen.x + 0.5, 0.0))
-        )
+        value, active = surface(e, ref, rho, seen.x, seen.y, active & seen.valid)
+        at = nearest(e, ref.width, seen.x, seen.y, active)
         mx, my = dr.gather(e.Float, slope_x, at, active), dr.gather(e.Float, slope_y, at, active)
         active &= dr.gather(e.Float, roughness, at, active) < dr.gather(e.Float, constants, e.UInt(7))
         # The plane m·q = 1 through the pixel; |m| is one over its distance.
@@ -257,9 +267,7 @@ def visibility_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int) -> Cal
         seen = project_rolling(lens, from_base, p, e.UInt, e.Int)
         inside = seen.valid & (points_z > 0.0)
         inside &= (seen.x >= 0.0) & (seen.y >= 0.0) & (seen.x < camera.width - 1.0) & (seen.y < camera.height - 1.0)
-        index = e.UInt(e.Int(dr.select(inside, seen.y + 0.5, 0.0))) * camera.width + e.UInt(
-            e.Int(dr.select(inside, seen.x + 0.5, 0.0))
-        )
+        index = nearest(e, camera.width, seen.x, seen.y, inside)
         z = dr.gather(e.Float, depth, index, inside)
         hidden = inside & (z > 0.0) & (seen.z > z * (1.0 + EDGE) + _BEHIND)
         return dr.select(hidden, e.Float(0.0), e.Float(1.0))

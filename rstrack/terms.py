@@ -10,7 +10,7 @@ import numpy as np
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
-from rstrack.engine import Engine
+from rstrack.engine import Engine, Kernels
 from rstrack.frames import ColorImage, DepthImage
 from rstrack.lines import IDENTITY_FROM_BASE, from_base_table, to_base_table
 from rstrack.normal_equations import Quadratic, chain
@@ -73,7 +73,10 @@ class Terms:
     resolution: float = 0.0
     # Where interpolation errs by more than this part of σ, its bias counts, not its size: those pixels are left out.
     smooth: float = 0.25
-    _kernels: dict[Any, Any] = field(default_factory=dict)
+    _kernel: Kernels = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._kernel = Kernels(self.e)
 
     def geometric(
         self, image: DepthImage, ref: Reference, spline: Spline, level: int, sigma: float,
@@ -171,11 +174,6 @@ class Terms:
         scaled = Quadratic(model.first, model.H / sigma**2, model.g / sigma)
         next_sigma = scale_step(sigma, sums.weighted, sums.count, floor)
         return Linearised(scaled, motion, sigma, next_sigma, sums.cost, sums.count, seen_motions(sums, lever))
-
-    def _kernel(self, make: Any, *key: Any) -> Any:
-        if (make, *key) not in self._kernels:
-            self._kernels[make, *key] = make(self.e, *key)
-        return self._kernels[make, *key]
 
 
 def seen_motions(sums: BlockSums, lever: float) -> FloatArray:
