@@ -27,6 +27,7 @@ class Options:
       with a global shutter they are as far apart as the frames if that is more, since each gives one pose only.
     keyframe_overlap: a new keyframe is made once less than this share of the depth points that the current keyframe
       saw at first falls on it; keyframe_distance, keyframe_angle_deg: or once the camera is that far from it.
+    blur_sigma_px: pixels; points of a colour image that its exposure blurs count less, by equation (13); 0: all alike.
     keyframe_strategy: which frame that is (paper, section 3.5): the last one that has converged, rectified at once; or
       the newest, with its rolling shutter until it has converged and can be rectified.
     """
@@ -42,6 +43,7 @@ class Options:
     fuse: bool = True
     bootstrap_frames: int = 6
     max_depth: float = 12.0
+    blur_sigma_px: float = 0.0
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -59,6 +61,8 @@ class Options:
         for name in ("keyframe_distance", "keyframe_angle_deg", "max_depth"):
             if not getattr(self, name) > 0.0:
                 raise UserError(f"{name} = {getattr(self, name)!r} must be positive")
+        if not 0.0 <= self.blur_sigma_px < 1e3:
+            raise UserError(f"blur_sigma_px = {self.blur_sigma_px!r} must be 0 (off) or positive, in pixels")
         if self.bootstrap_frames < 3:
             raise UserError(f"bootstrap_frames = {self.bootstrap_frames!r} must be 3 or more")
 

@@ -61,7 +61,7 @@ class Preparer:
         self._color_lens = Lens(rig.color_camera, _seen_as(rig.color_shutter, options.rolling))
         rays, self._seen = camera_rays(Exposure(self._depth_lens, 0.0, np.eye(4))), lens_sees(rig.depth_camera)
         device_rays = self._e.upload(rays[..., 0]), self._e.upload(rays[..., 1])
-        self.terms = Terms(self._e, device_rays)
+        self.terms = Terms(self._e, device_rays, blur_sigma_px=options.blur_sigma_px)
         self.maker = KeyframeMaker(self._e, rays, device_rays)
 
     def __call__(self, index: int, frame: Frame) -> Prepared:

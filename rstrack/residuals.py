@@ -213,13 +213,24 @@ def geometric_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int) -> Call
     return kernel
 
 
-def photometric_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int, level: int) -> Callable[..., Any]:
+def blur_weight(lens: Lens, pixel_speed: tuple[Any, Any], sigma_px: float) -> Any:
+    """Equation (13): exp(−‖x_t − x_{t−t_e}‖ / σ²) of points that move by pixel_speed (px) per line delay."""
+    lines = lens.shutter.exposure_s / lens.shutter.line_delay(lens.camera)
+    u, v = pixel_speed
+    return dr.exp(-dr.sqrt(u * u + v * v) * (lines / sigma_px**2))
+
+
+def photometric_kernel(
+    e: Engine, lens: Lens, ref_lens: Lens, stride: int, level: int, blur_sigma_px: float = 0.0
+) -> Callable[..., Any]:
     """Kernel (points_x, _y, _z, intensity, visible, to_base, image, from_base, parameters) → integers.
 
     Points are those of the reference's every stride-th pixel, in its camera's frame, z = 0 where there is none.
     `to_base` are the reference's lines (looked at only if it is not rectified), `from_base` the colour camera's.
     `image`: intensities of pyramid level `level` (halved that often); `visible` 0 for points that are hidden.
+    `blur_sigma_px`: σ of equation (13), by which blurred points count less; 0: all alike.
     """
+    weighs_blur = blur_sigma_px > 0.0 and lens.lines > 1 and lens.shutter.exposure_s > 0.0
     camera, ref = lens.camera, ref_lens.camera
     width, height = level_size(camera.width, level), level_size(camera.height, level)
     shrink = 0.5**level
@@ -242,7 +253,12 @@ def photometric_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int, level
         top, bottom = dr.fma(b - a, fx, a), dr.fma(d - c, fx, c)
         r = dr.fma(bottom - top, fy, top) - intensity
         dx = dr.fma((d - c) - (b - a), fy, b - a) * shrink
-        g = seen.chain(dx, (bottom - top) * shrink, 0.0)
+        dy = (bottom - top) * shrink
+        if weighs_blur:
+            # Of the squared error, so that σ stays that of sharp points.
+            share = dr.sqrt(blur_weight(lens, seen.pixel_speed, blur_sigma_px))
+            r, dx, dy = r * share, dx * share, dy * share
+        g = seen.chain(dx, dy, 0.0)
         slot, size = _slot(seen.row, ref_line, lens, ref_lens)
         # A twist of the camera moves the point the other way.
         return _accumulate(e, g, p, -1.0, r, active, parameters, slot, size)

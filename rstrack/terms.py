@@ -71,6 +71,8 @@ class Terms:
     # Step of the depth camera (1/m), see `depth_resolution`. A camera at rest repeats its rounding, so that depth would
     # seem far better than it is.
     resolution: float = 0.0
+    # σ of equation (13) in the photometric term; 0: blurred points count like sharp ones.
+    blur_sigma_px: float = 0.0
     # Where interpolation errs by more than this part of σ, its bias counts, not its size: those pixels are left out.
     smooth: float = 0.25
     _kernel: Kernels = field(init=False)
@@ -133,7 +135,7 @@ class Terms:
     ) -> Linearised:  # fmt: skip
         """The reference's points of a level, those that are `visible`, against that level of the colour image."""
         e, lens, points = self.e, image.exposure.lens, ref.points[level]
-        kernel = self._kernel(photometric_kernel, lens, ref.lens, STRIDES[level], level)
+        kernel = self._kernel(photometric_kernel, lens, ref.lens, STRIDES[level], level, self.blur_sigma_px)
         from_base = e.upload(from_base_table(spline, ref.T_world_base, image.exposure))
         # Moving closer or turning packs more points into a block than its share.
         scaling = self._scaling(points, lens, ref.lens.camera, ref, STRIDES[level], 4)
