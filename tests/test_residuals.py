@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -15,7 +15,9 @@ from rstrack.frames import ColorImage, DepthImage
 from rstrack.reference import Reference
 from rstrack.robust import NU, scale_step, weight
 from rstrack.terms import Linearised, Terms
+from rstrack.warp import project_rolling
 from tests.rstrack_util import (
+    ENGINE,
     SCANS,
     T_COLOR_DEPTH,
     color_input,
@@ -231,3 +233,34 @@ def test_row_shift_is_the_movement_in_pixels() -> None:
     # Control points that the image does not depend on.
     turn[lin.model.first : lin.model.last] = 0.0
     assert lin.row_shift(turn, 48.0, 2.0) == 0.0
+
+
+@pytest.mark.parametrize("scan", ["top-bottom", "right-left"])
+def test_blur_weights_are_those_of_equation_13(scan: str) -> None:
+    s, sigma_px = setting("photometric", None, scan), 0.7
+    lens, stamp, T_cam_body = s.image.exposure.lens, s.image.exposure.stamp, s.image.exposure.T_cam_body
+    points = s.ref.points[0]
+    table = ENGINE.upload(lines.from_base_table(s.truth, s.ref.T_world_base, s.image.exposure))
+    seen = project_rolling(lens, table, (points.x, points.y, points.z), ENGINE.UInt, ENGINE.Int)
+    on = (points.z.numpy() > 0) & seen.valid.numpy()
+    found = residuals.blur_weight(lens, seen.pixel_speed, sigma_px).numpy()[on]
+    p_base = np.stack([a.numpy()[on] for a in (points.x, points.y, points.z)], axis=-1).astype(float)
+    p_world = se3.transform(s.ref.T_world_base, p_base)
+    middle = lens.shutter.line_mid_time(stamp, seen.line.numpy()[on].astype(float), lens.camera)
+    ends = [
+        lens.camera.project(se3.transform(T_cam_body @ se3.inverse(s.truth.pose(middle + dt)), p_world))[0]
+        for dt in (-0.5 * lens.shutter.exposure_s, 0.5 * lens.shutter.exposure_s)
+    ]
+    length = np.linalg.norm(ends[1] - ends[0], axis=-1)
+    assert len(length) > 300 and length.max() > 0.2
+    np.testing.assert_allclose(found, np.exp(-length / sigma_px**2), rtol=5e-3)
+
+
+def test_blurred_points_count_less() -> None:
+    plain, weighted = (
+        setting("photometric", None, "top-bottom", terms=replace(make_terms(DEPTH), blur_sigma_px=sigma))
+        for sigma in (0.0, 0.7)
+    )
+    around = disturbed(plain.truth, 5)
+    a, b = plain.term(around, 0.02), weighted.term(around, 0.02)
+    assert a.count == b.count and 0.05 < np.trace(b.model.H) / np.trace(a.model.H) < 0.9
