@@ -69,6 +69,9 @@ def run_program(name: str, parser: Callable[[], Parser], words: Sequence[str] | 
         # Whoever read our output has seen enough; the interpreter would complain when it flushes the rest.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:  # a name that is too long, a full disk: what no reader or writer has put into words
+        print(f"{name}: {str(error.filename or 'a file')[:200]}: {error.strerror or error}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print(f"{name}: interrupted; {interrupted}", file=sys.stderr)
         return 130

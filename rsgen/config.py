@@ -25,6 +25,7 @@ from rsgen.config_sections import (
     rigid,
 )
 from rsgen.errors import UserError
+from rsgen.files import parse_yaml
 from rsgen.imu import ImuConfig
 from rsgen.motion.config import MotionConfig
 from rsgen.truth.settings import TruthConfig
@@ -88,7 +89,7 @@ def load_config(path: Path, overrides: dict[str, str] | None = None) -> Config:
     """
     path = Path(path)
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        data = parse_yaml(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not a text file"
         raise _error(f"config {path}: cannot be read ({reason})") from None
@@ -133,7 +134,7 @@ def _set(data: dict[str, Any], key: str, text: str) -> None:
             raise _error(f"override --{key}: '{section}' is not a section")
         data = inner
     try:
-        data[name] = yaml.safe_load(text)
+        data[name] = parse_yaml(text)
     except _BAD_YAML:
         shown = text if len(text) <= 60 else f"{text[:57]}..."
         raise _error(f"override --{key}: '{shown}' is not a valid value") from None

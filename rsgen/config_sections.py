@@ -69,6 +69,9 @@ class LightConfig(Section):
         default=512, ge=16, le=16384, description="hemisphere rays per indirect sample, last bounce"
     )
     bounces: int = Field(default=8, ge=0, le=32, description="indirect diffuse bounces")
+    glossy_spp: int = Field(
+        default=16, ge=1, le=65536, description="samples per pixel at most where a surface is not purely diffuse"
+    )
     max_depth: int = Field(default=12, ge=1, le=64, description="path length of mode 'path'")
 
 

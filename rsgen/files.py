@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import io
+import math
 import os
 import struct
 import zipfile
@@ -36,6 +37,8 @@ _CRC_NAME = "rsgenCrc32"
 _CRC_FIELD = _CRC_NAME.encode() + b"\0string\0\x08\0\0\0"
 _CRC_EMPTY = b"00000000"
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
+
+_MOST_YAML_VALUES = 1_000_000
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -178,13 +181,41 @@ def read_text(path: Path) -> str:
 def read_yaml(path: Path) -> dict[str, Any]:
     """A YAML mapping. Raises UserError."""
     try:
-        data = yaml.safe_load(read_text(path))
+        data = parse_yaml(read_text(path))
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         mark = getattr(error, "problem_mark", None)
         raise UserError(f"{path}:{f' line {mark.line + 1}' if mark else ''} is not valid YAML") from None
     if not isinstance(data, dict):
         raise UserError(f"{path}: expected a mapping")
     return data
+
+
+def parse_yaml(text: str) -> Any:
+    """What `yaml.safe_load` returns. Raises its YAMLError, ValueError or RecursionError.
+
+    Refused as well, as a YAMLError, are aliases that stand for more than a million values or for themselves: a few
+    lines of them would keep whatever walks the data busy for ever.
+    """
+    loader = yaml.SafeLoader(text)
+    try:
+        node = loader.get_single_node()
+        if node is None:
+            return None
+        if _values(node, {}) > _MOST_YAML_VALUES:
+            raise yaml.MarkedYAMLError(problem="aliases repeat too much of it", problem_mark=node.start_mark)
+        return loader.construct_document(node)
+    finally:
+        loader.dispose()
+
+
+def _values(node: yaml.Node, known: dict[int, float]) -> float:
+    """Number of values that a node stands for, aliases written out; infinite if it holds itself."""
+    if id(node) not in known:
+        known[id(node)] = math.inf  # until it is counted: who meets it on the way meets it within itself
+        inner = [] if isinstance(node, yaml.ScalarNode) else node.value
+        parts = [part for item in inner for part in (item if isinstance(item, tuple) else (item,))]
+        known[id(node)] = 1 + sum(_values(part, known) for part in parts)
+    return known[id(node)]
 
 
 def read_png(path: Path, shape: tuple[int, ...], dtype: type[np.generic]) -> np.ndarray:

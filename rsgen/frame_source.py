@@ -130,7 +130,9 @@ def make_integrator(mi: Any, scene: Any, config: Config, progress: Callable[[flo
     from rsgen.scene import content_hash
 
     file = config.scene.file
-    return BakedIntegrator(baked_field(scene, content_hash(file), light, cache_folder(file), progress))
+    return BakedIntegrator(
+        baked_field(scene, content_hash(file), light, cache_folder(file), progress), glossy_spp=light.glossy_spp
+    )
 
 
 def load_scene(config: Config) -> Any:

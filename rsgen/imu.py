@@ -129,11 +129,10 @@ def exact_imu(
     return gyro, force
 
 
-def simulate_imu(spline: Spline, config: ImuConfig, t_begin: float, t_end: float, seed: int) -> ImuSamples:
-    """What the IMU reads from `t_begin` to `t_end` seconds, both within the spline T_world_depth(t).
+def sample_clock(config: ImuConfig, t_begin: float, t_end: float) -> tuple[float, int]:
+    """Time of the first sample, s, and the number of samples between two times in seconds.
 
-    Sample k is at t_begin + k / rate, to the nanosecond. Random numbers depend on `seed` and k alone, so that a longer
-    recording begins with the samples of a shorter one. Raises UserError for times outside the spline and absurd counts.
+    Raises UserError if there is none, or an absurd number of them.
     """
     start = math.ceil(t_begin * 1e9 - 1e-3) / 1e9
     if not math.isfinite(t_end - start) or t_end < start:
@@ -141,7 +140,17 @@ def simulate_imu(spline: Spline, config: ImuConfig, t_begin: float, t_end: float
     steps = (t_end - start) * config.rate_hz
     if steps > _MAX_SAMPLES:
         raise UserError(f"imu: {steps:.0f} samples at rate_hz {config.rate_hz:g} are too many: lower rate_hz")
-    t = round_stamps(start + np.arange(math.floor(steps + 1e-6) + 1) / config.rate_hz)
+    return start, math.floor(steps + 1e-6) + 1
+
+
+def simulate_imu(spline: Spline, config: ImuConfig, t_begin: float, t_end: float, seed: int) -> ImuSamples:
+    """What the IMU reads from `t_begin` to `t_end` seconds, both within the spline T_world_depth(t).
+
+    Sample k is at t_begin + k / rate, to the nanosecond. Random numbers depend on `seed` and k alone, so that a longer
+    recording begins with the samples of a shorter one. Raises UserError for times outside the spline and absurd counts.
+    """
+    start, count = sample_clock(config, t_begin, t_end)
+    t = round_stamps(start + np.arange(count) / config.rate_hz)
     t = np.minimum(t, t_end)  # the last one may have been rounded up
     gyro, force = exact_imu(spline, se3.inverse(config.T_depth_imu()), config.gravity, t)
     gyro_bias = _random_walk(

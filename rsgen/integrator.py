@@ -19,13 +19,15 @@ class BakedIntegrator(mi.SamplingIntegrator):
     """Radiance from baked irradiance: emission + diffuse lobe x E, and traced bounces for all other lobes.
 
     The diffuse lobe of a plastic is weighted with one cosine-distributed direction, which is nearly free of noise.
-    Glossy lobes are sampled and traced onto the baked surfaces, behind up to `bounces` mirrors.
+    Glossy lobes are sampled and traced onto the baked surfaces, behind up to `bounces` mirrors. They cost ten times as
+    much: of a pixel's samples only `glossy_spp` are traced there, the others are matte or left out.
     """
 
-    def __init__(self, field: IrradianceField, bounces: int = 4) -> None:
+    def __init__(self, field: IrradianceField, bounces: int = 4, glossy_spp: int = 16) -> None:
         super().__init__(mi.Properties())
         self._field = field
         self._bounces = bounces
+        self.glossy_spp = glossy_spp
 
     def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True):
         """Mitsuba's interface: radiance along rays, whether they hit, no AOVs."""

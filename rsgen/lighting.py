@@ -43,7 +43,7 @@ def cache_key(scene_hash: str, light: LightConfig) -> str:
     """Name of a bake: hash of the scene's files, the light's settings, this method's version and the engine's."""
     facts = {
         "scene": scene_hash,
-        "light": light.model_dump(exclude={"mode", "max_depth"}),
+        "light": light.model_dump(exclude={"mode", "max_depth", "glossy_spp"}),
         "method": METHOD,
         "mitsuba": mi.__version__,
         "variant": mi.variant(),

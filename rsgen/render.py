@@ -57,16 +57,20 @@ class ColorRenderer:
         index = dr.arange(mi.UInt32, pixels * count)
         if isinstance(self._integrator, BakedIntegrator):
             radiance, rest = self._integrator.matte(self._scene, mi.Ray3f(self._rays(index, count, start, rotation)))
+            # Evenly spread samples stand for all of them, whatever they show: no bias, but more noise.
+            step = max(1, self._spp // self._integrator.glossy_spp)
+            rest &= (index % count + start) % step == 0
+            stands_for = self._spp / len(range(0, self._spp, step))
             dr.eval(radiance, rest)
             index = dr.compress(rest)
         else:
-            radiance = dr.zeros(mi.Color3f, pixels * count)
+            radiance, stands_for = dr.zeros(mi.Color3f, pixels * count), 1.0
         if dr.width(index) > 0:
             self._sampler.seed(sampler_key, dr.width(index))
             ray = self._rays(index, count, start, rotation)
             ray.scale_differential(mi.Float(1.0 / np.sqrt(self._spp)))
             traced, _, _ = self._integrator.sample(self._scene, self._sampler, ray, None, mi.Bool(True))
-            dr.scatter(radiance, mi.unpolarized_spectrum(traced), index)
+            dr.scatter(radiance, stands_for * mi.unpolarized_spectrum(traced), index)
         sums = [dr.block_sum(channel, count) for channel in radiance]
         dr.eval(sums)
         return np.stack([np.asarray(s) for s in sums], axis=1)

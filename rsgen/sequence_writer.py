@@ -26,7 +26,7 @@ from rsgen.files import (
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
-from rsgen.imu import simulate_imu, write_imu_csv
+from rsgen.imu import sample_clock, simulate_imu, write_imu_csv
 from rsgen.sequence_format import (
     FOLDERS,
     LISTINGS,
@@ -85,8 +85,9 @@ class SequenceWriter:
         `stream_stamps` returns them. `inputs` are content hashes of the trajectory and scene files; `versions` those of
         every program that decides the bytes. sequence.yaml and spline.npz are written here.
 
-        Raises UserError if the folder holds another sequence or other files, or cannot be written, or if a line of a
-        frame is read outside the spline's time; then nothing in it has been changed.
+        Raises UserError if the folder holds another sequence or other files, or cannot be written, if a line of a frame
+        is read outside the spline's time, or if the IMU's samples are absurdly many; then nothing in it has been
+        changed.
         """
         out = Path(out)
         streams = {
@@ -95,6 +96,8 @@ class SequenceWriter:
         }
         for stream in streams.values():
             line_poses(spline, stream.camera, stream.shutter, stream.stamps[[0, -1]])
+        if config.imu is not None:
+            sample_clock(config.imu, spline.t_begin, spline.t_end)
         stamps = {name: stream.stamps for name, stream in streams.items()}
         text = describe(config, spline, stamps, versions, inputs)
         refuse_foreign_folder(out, text)

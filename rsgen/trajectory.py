@@ -156,8 +156,8 @@ def read_trajectory(
 def _text(path: Path) -> str:
     try:
         raw = path.read_bytes()
-    except OSError as error:
-        raise UserError(f"cannot read trajectory {path}: {error.strerror or error}") from None
+    except (OSError, ValueError) as error:  # ValueError: no file can have that name
+        raise UserError(f"cannot read trajectory {path}: {getattr(error, 'strerror', None) or error}") from None
     if b"\0" in raw:
         raise UserError(f"{path} is not a text file: give a TUM, ICL-NUIM or EuRoC trajectory")
     try:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from rsgen.errors import UserError
 from rsgen.files import read_text, read_yaml
@@ -71,6 +71,14 @@ class _Stream(_Section):
 
 class _DepthStream(_Stream):
     depth_scale: Annotated[float, Field(ge=1, allow_inf_nan=False)] = DEPTH_SCALE
+    # Warped into the colour camera: rows of such an image have no times of their own.
+    registered: bool = False
+
+    @model_validator(mode="after")
+    def _has_no_row_times(self) -> _DepthStream:
+        if self.registered and self.readout_s != 0.0:
+            raise ValueError("registered depth has lost its rows' times: set readout_s to 0")
+        return self
 
 
 class _CameraYaml(_Section):

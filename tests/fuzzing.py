@@ -96,7 +96,7 @@ def structure_variants() -> Iterator[ConfigVariant]:
         return ConfigVariant(what, yaml_bytes(_with(base_config(motion), name, value)), word, True)
 
     base = base_config()
-    sections = [""] + sorted({name.rsplit(".", 1)[0] for name, _, _ in describe_fields() if "." in name})
+    sections = ["", *sorted({name.rsplit(".", 1)[0] for name, _, _ in describe_fields() if "." in name})]
     for section in sections:
         full = base_config(LINE) if section == "motion" else base
         prefix = f"{section}." if section else ""
@@ -128,16 +128,15 @@ def structure_variants() -> Iterator[ConfigVariant]:
     yield refused("too many knots", "trajectory.knot_spacing_s", 1e-9, "knot")
     for name, value, word in (
         ("length_m", 1e4, "length_m"),
-        ("mean_rotation_deg_s", 1e-3, "mean_rotation_deg_s"),
         ("mean_rotation_deg_s", 1e4, "mean_rotation_deg_s"),
         ("shake_position_m", 0.1, "length_m"),
+        ("shake_rotation_deg", 10.0, "mean_rotation_deg_s"),
         ("shake_band_hz", [0.51, 0.52], "shake_band_hz"),
         ("shake_band_hz", [6.0, 0.5], "shake_band_hz"),
         ("strokes", 1000, "strokes"),
         ("position", LINE["target"], "position"),
         ("waypoints", TOUR["waypoints"], "waypoints"),
         ("clearance_m", 100.0, "clearance"),
-        ("position", [50.0, 0.2, -0.5], "motion"),
     ):
         yield refused(f"{name} cannot be {value}"[:60], f"motion.{name}", value, word, LINE)
     yield refused("one place twice", "motion.waypoints", [TOUR["waypoints"][0]] * 3, "waypoints", TOUR)
@@ -148,7 +147,7 @@ def garbage_variants(seed: int, edits: int) -> Iterator[ConfigVariant]:
     text = yaml_bytes(base_config())
     rng = np.random.default_rng(seed)
     doubling = b"a0: &a0 [x, x]\n" + b"".join(b"a%d: &a%d [*a%d, *a%d]\n" % (i, i, i - 1, i - 1) for i in range(1, 64))
-    merging = b"m0: &m0 {k: 1}\n" + b"".join(b"m%d: &m%d {<<: [*m%d, *m%d]}\n" % (i, i, i - 1, i - 1) for i in range(1, 64))
+    merging = doubling.replace(b"[x, x]", b"{k: 1}").replace(b"[", b"{<<: [").replace(b"]", b"]}")
     for name, data in {
         "empty": b"",
         "a comment": b"# nothing\n",
@@ -169,7 +168,7 @@ def garbage_variants(seed: int, edits: int) -> Iterator[ConfigVariant]:
         "itself": text + b"seed: &s [*s]\n",
         "itself in a mapping": text + b"imu: &s {rate_hz: *s}\n",
         "doubling": text + doubling + b"seed: *a63\n",
-        "merging": text + merging + b"light: *m63\n",
+        "merging": text + merging + b"light: *a63\n",
         "deep": text + b"seed: " + b"[" * 3000 + b"]" * 3000 + b"\n",
         "two levels in": text.replace(b"color:", b"  color:", 1),
         "a web page": b"<!DOCTYPE html>\n<html><body>404: not found</body></html>\n",
@@ -213,12 +212,9 @@ def make_sequence(root: Path, frames: int = 4) -> Path:
             planes = (len(channels),) if len(channels) > 1 else ()
             truth[name] = rng.random((36, 48, *planes)).astype(np.float32) if channels else image
         writer.write_color(k, image, truth)
-    synthetic.write_frames(writer, range(0))
     for k in writer.missing("depth"):
         stamp = float(writer.stamps("depth")[k])
-        writer.write_depth(
-            k, synthetic.render_depth(writer.spline, config.depth.camera, config.depth.shutter, stamp)
-        )
+        writer.write_depth(k, synthetic.render_depth(writer.spline, config.depth.camera, config.depth.shutter, stamp))
     synthetic.write_scene(root)
     writer.finish()
     return root

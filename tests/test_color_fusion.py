@@ -85,7 +85,7 @@ def planes(fused: FusedColor) -> tuple[np.ndarray, np.ndarray]:
 
 
 def twin_lookup(ref: Reference, image: Exposure, pixels: np.ndarray) -> tuple[np.ndarray, ...]:
-    """For a keyframe's points (n,): bilinear colour (n, 3), px moved in the exposure (n,), and whether it is seen."""
+    """For a keyframe's points (n,): colour (n, 3), px moved in the exposure (n,), and whether it is seen."""
     camera, shutter = image.lens.camera, image.lens.shutter
     _, p_world = points(ref)
     uv, t, valid = project_rolling(SPLINE, image.T_cam_body, camera, shutter, image.stamp, p_world)
@@ -96,10 +96,18 @@ def twin_lookup(ref: Reference, image: Exposure, pixels: np.ndarray) -> tuple[np
     for at in (t - shutter.exposure_s / 2, t + shutter.exposure_s / 2):
         ends.append(camera.project(se3.transform(image.T_cam_body @ se3.inverse(SPLINE.pose(at)), p_world))[0])
     x0, y0 = np.floor(uv).astype(int).T
-    fx, fy = (uv - np.floor(uv)).T[..., None]
-    top = pixels[y0, x0] * (1 - fx) + pixels[y0, x0 + 1] * fx
-    bottom = pixels[y0 + 1, x0] * (1 - fx) + pixels[y0 + 1, x0 + 1] * fx
-    return top * (1 - fy) + bottom * fy, np.linalg.norm(ends[1] - ends[0], axis=-1), valid
+    value = np.zeros((len(uv), 3))
+    for dy in range(-1, 3):
+        for dx in range(-1, 3):
+            at = pixels[np.clip(y0 + dy, 0, camera.height - 1), np.clip(x0 + dx, 0, camera.width - 1)]
+            value += (keys(uv[:, 0] - x0 - dx) * keys(uv[:, 1] - y0 - dy))[:, None] * at
+    return np.maximum(value, 0.0), np.linalg.norm(ends[1] - ends[0], axis=-1), valid
+
+
+def keys(d: np.ndarray) -> np.ndarray:
+    """Cubic convolution, equation (15) of Keys 1981."""
+    d = np.abs(d)
+    return np.where(d < 1, 1.5 * d**3 - 2.5 * d**2 + 1, np.where(d < 2, -0.5 * d**3 + 2.5 * d**2 - 4 * d + 2, 0.0))
 
 
 @pytest.mark.parametrize(

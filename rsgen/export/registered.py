@@ -95,7 +95,7 @@ def _camera_yaml(sequence: Sequence) -> Mapping[str, Any]:
     }
     return {
         "color": camera | {"readout_s": shutter.readout_s, "exposure_s": shutter.exposure_s, "scan": shutter.scan},
-        "depth": camera | {"readout_s": 0.0, "depth_scale": sequence.streams["depth"].depth_scale},
+        "depth": camera | {"registered": True, "readout_s": 0.0, "depth_scale": sequence.streams["depth"].depth_scale},
     }
 
 
