@@ -127,4 +127,4 @@ def _first(error: ValidationError) -> str:
     if first["type"] == "extra_forbidden":
         return f"{where}: no such entry: a camera file has {_KEYS}"
     example = f"; write e.g. '{EXAMPLE}'" if first["type"] == "missing" else ""
-    return f"{where}: {first['msg']}{example}"
+    return f"{where}: {first['msg'].removeprefix('Value error, ')}{example}"

@@ -269,6 +269,12 @@ def test_registered_folder_reads_back_as_tum(sequence: Sequence, tmp_path: Path)
     export_registered(sequence, tmp_path / "tum")
     for name in ("depth.txt", "camera.yaml"):
         assert "registered to the colour camera" in (tmp_path / "tum" / name).read_text().splitlines()[0]
+    path = tmp_path / "tum/camera.yaml"
+    stated = path.read_text()
+    path.write_text(stated.replace("registered: true\n  readout_s: 0.0", "registered: true\n  readout_s: 0.02"))
+    with pytest.raises(UserError, match="depth: registered depth has lost its rows' times"):
+        open_dataset(tmp_path / "tum")
+    path.write_text(stated)
     dataset = open_dataset(tmp_path / "tum")
     color = sequence.streams["color"]
     assert dataset.rig.color_camera == dataset.rig.depth_camera == color.camera

@@ -200,6 +200,17 @@ def test_baked_light_agrees_with_the_path_tracer(tmp_path: Path) -> None:
     assert 20 * np.log10(255) - 10 * np.log10(np.mean((a - b) ** 2)) >= 36
     assert np.abs(baked.mean(axis=(0, 1)) / traced.mean(axis=(0, 1)) - 1).max() < 0.01
 
+    # A sixth of the samples on the ball: the same on average, everything matte as before.
+    every, few = (
+        np.mean([ColorRenderer(scene, BakedIntegrator(field, glossy_spp=n), camera, Shutter(), 64).render(view, 0.0, k)
+                 for k in range(4)], axis=0)
+        for n in (64, 10)
+    )  # fmt: skip
+    ball = (every != few).any(axis=-1)
+    assert 0.01 < ball.mean() < 0.15
+    assert few[ball].mean() == pytest.approx(every[ball].mean(), rel=0.01)
+    assert few[ball].mean(axis=0) == pytest.approx(every[ball].mean(axis=0), rel=0.02)
+
 
 # --- lattice and lookup
 
