@@ -63,19 +63,25 @@ def run_program(name: str, parser: Callable[[], Parser], words: Sequence[str] | 
         status: int = options.run(options)
         sys.stdout.flush()
     except UserError as error:
-        print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"{name}: {_one_line(str(error))}", file=sys.stderr)
         return 2
     except BrokenPipeError:
         # Whoever read our output has seen enough; the interpreter would complain when it flushes the rest.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:  # a name that is too long, a full disk: what no reader or writer has put into words
-        print(f"{name}: {str(error.filename or 'a file')[:200]}: {error.strerror or error}", file=sys.stderr)
+        where = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+        print(f"{name}: {_one_line(where)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print(f"{name}: interrupted; {interrupted}", file=sys.stderr)
         return 130
     return status
+
+
+def _one_line(text: str) -> str:
+    """Printable, whatever names and values it quotes, and in one line."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in " ".join(text.split()))
 
 
 def joined(words: Sequence[str]) -> list[str]:

@@ -141,7 +141,7 @@ class ColorConfig(StreamConfig):
 class DepthConfig(StreamConfig):
     """The depth camera: planar z through each pixel's centre, 16 bit."""
 
-    depth_scale: Positive = Field(default=5000.0, description="stored units per metre")
+    depth_scale: float = Field(default=5000.0, ge=1e-3, le=1e9, description="stored units per metre")
     noise: DepthNoiseConfig = DepthNoiseConfig()
 
 

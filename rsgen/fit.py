@@ -100,11 +100,12 @@ def fit_spline(
     """
     _check(trajectory, dt, smoothing, pad_begin_s, pad_end_s, robust, metres_per_radian)
     stamps = trajectory.stamps
+    span_s = stamps[-1] + pad_end_s - stamps[0] + pad_begin_s
+    if not span_s <= MAX_CONTROL_POINTS * dt:
+        raise UserError(f"a spline of {span_s:g} s is too long for a knot spacing of {dt:g} s: raise the knot spacing")
     first = math.floor((stamps[0] - pad_begin_s) / dt + 5e-10)  # the slack that Spline allows, halved
     last = max(math.ceil((stamps[-1] + pad_end_s) / dt - 5e-10), first + 1)
     count = last - first + 3
-    if count > MAX_CONTROL_POINTS:
-        raise UserError(f"a spline of {count} control points is too long: raise the knot spacing of {dt:g} s")
     scale = np.array([1.0] * 3 + [metres_per_radian] * 3)
     smooth = smoothing * len(stamps) / ((stamps[-1] - stamps[0]) * dt**3)
     loose = _loose_knots(stamps, first * dt, dt, count)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.config_sections import rigid
 from rsgen.errors import UserError
 from rsgen.files import read_exr, read_npy, read_png, read_text
 from rsgen.geometry.camera import Camera
@@ -35,6 +36,8 @@ from rsgen.sequence_format import (
     stream_stamps,
 )
 from rsgen.sequence_writer import SequenceWriter
+
+_LONGEST_S = 1e6  # as long as stamps may grow
 
 __all__ = ["Sequence", "SequenceWriter", "Stream", "read_sequence", "sequence_info", "stream_stamps"]
 
@@ -151,17 +154,17 @@ def read_sequence(path: Path) -> Sequence:
     if not (root / "sequence.yaml").exists():
         raise UserError(f"{root}: has no sequence.yaml, so it is not a sequence that 'rsgen render' wrote")
     description, meta = read_sequence_yaml(root / "sequence.yaml")
-    T_color_depth = np.array(description.T_color_depth, float)
-    R = T_color_depth[:3, :3]
-    if not (np.allclose(R @ R.T, np.eye(3), atol=1e-5) and np.linalg.det(R) > 0):
-        raise UserError(f"{root / 'sequence.yaml'}: T_color_depth is not a rigid transform")
+    try:
+        T_color_depth = np.array(rigid(description.T_color_depth), float)
+    except ValueError as error:
+        raise UserError(f"{root / 'sequence.yaml'}: T_color_depth: {error}") from None
     if description.streams.depth.depth_scale is None:
         raise UserError(f"{root / 'sequence.yaml'}: streams.depth.depth_scale is missing")
     streams: dict[StreamName, Stream] = {
         "color": _read_stream(root, "color", description.streams.color),
         "depth": _read_stream(root, "depth", description.streams.depth),
     }
-    spline = Spline.load(root / "spline.npz")
+    spline = _read_spline(root / "spline.npz", streams)
     return Sequence(root, description.name, streams, T_color_depth, spline, meta)
 
 
@@ -184,7 +187,7 @@ def sequence_info(path: Path) -> str:
         ]
     last = max((s.stamps[-1] for s in sequence.streams.values() if len(s.stamps)), default=knots.t_begin)
     first = min((s.stamps[0] for s in sequence.streams.values() if len(s.stamps)), default=knots.t_begin)
-    times = np.linspace(first, last, max(2, round((last - first) * 1000)))
+    times = np.linspace(first, last, min(max(2, round((last - first) * 1000)), 1_000_000))
     p_world = knots.pose(np.clip(times, knots.t_begin, knots.t_end))[:, :3, 3]
     length = np.linalg.norm(np.diff(p_world, axis=0), axis=1).sum()
     size = sum(file.stat().st_size for file in sequence.root.rglob("*") if file.is_file())
@@ -203,6 +206,21 @@ def _shutter_text(shutter: Shutter, delay: float) -> str:
     else:
         readout = f"readout {shutter.readout_s * 1000:g} ms {shutter.scan}, line delay {delay * 1e6:.3f} us"
     return f"{readout}, exposure {shutter.exposure_s * 1000:g} ms"
+
+
+def _read_spline(path: Path, streams: dict[StreamName, Stream]) -> Spline:
+    """The spline, which has to cover the frames and not much more: a huge knot spacing would take all memory."""
+    spline = Spline.load(path)
+    first = min(stream.stamps[0] for stream in streams.values())
+    last = max(stream.stamps[-1] for stream in streams.values())
+    if not (spline.t_begin - STAMP_TOLERANCE_S <= first and last <= spline.t_end + STAMP_TOLERANCE_S):
+        raise UserError(
+            f"{path}: covers {spline.t_begin:g} to {spline.t_end:g} s, the frames {first:g} to {last:g} s: "
+            "restore it or render again"
+        )
+    if not spline.t_end - spline.t_begin <= _LONGEST_S:
+        raise UserError(f"{path}: lasts {spline.t_end - spline.t_begin:g} s, absurdly long: restore it or render again")
+    return spline
 
 
 def _read_stream(root: Path, name: StreamName, yaml: StreamYaml) -> Stream:

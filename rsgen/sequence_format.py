@@ -58,7 +58,7 @@ class StreamYaml(_Yaml):
     scan: Literal["top-bottom", "bottom-top", "left-right", "right-left"]
     frames: int = Field(ge=1, le=10_000_000)
     first_stamp_s: Finite
-    depth_scale: Positive | None = None
+    depth_scale: Annotated[float, Field(ge=1e-3, le=1e9)] | None = None
 
     @property
     def camera(self) -> Camera:
@@ -84,7 +84,7 @@ class SequenceYaml(_Yaml):
     """The part of sequence.yaml that a reader relies on."""
 
     format: Literal["rsgen-sequence/1"]
-    name: str
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]*$")]  # part of file names
     streams: _Streams
     T_color_depth: tuple[Vector4, Vector4, Vector4, Vector4]
     noise: Any = None

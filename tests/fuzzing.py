@@ -81,7 +81,7 @@ def config_variants(name: str, seed: int, extremes: int) -> list[ConfigVariant]:
     if isinstance(value, list) and value and name not in ("truth.global_shutter", "truth.flow", "motion.waypoints"):
         wrong += [value[:-1], [*value, value[0]], [*value[:-1], None], [*value[:-1], float("-inf")]]
     chosen = [EXTREME[i] for i in rng.permutation(len(EXTREME))[:extremes]]
-    last = name.split(".")[-1]
+    last = name.split(".")[-1] if not name.endswith("intrinsics") else name.split(".")[0]  # "color: cx must be ..."
     made = [(item, True) for item in wrong] + [(item, False) for item in chosen]
     return [
         ConfigVariant(f"{name} = {item!r}"[:80], yaml_bytes(_with(base, name, item)), last if refused else "", refused)

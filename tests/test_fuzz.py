@@ -201,8 +201,9 @@ def test_a_damaged_file_is_named_by_all_that_read_it(
     path = sequence / name
     data = path.read_bytes()
     ways = {way: damage(data) for way, damage in fuzzing.damages(SEED).items()}
-    # What a changed bit, or half a file, may leave whole: text of which that part does not matter.
-    vague = {"flipped", "cut"} if name.endswith((".txt", ".yaml", ".csv", ".ply")) else set()
+    # What may be left whole: a number's last digit, a comment, half of a list.
+    vague = {"flipped"} if not name.endswith((".png", ".exr")) else set()
+    vague |= {"cut"} if name.endswith(".txt") else set()
     lines = list(READERS)
     for k, (way, damaged) in enumerate([("missing", None), *ways.items()]):
         chosen = [lines[(k + shift + FILES.index(name)) % len(lines)] for shift in (0, 3)]
@@ -259,13 +260,12 @@ def test_whole_files_of_another_kind_or_size_are_named(sequence: Path, use: Call
             assert status == 1 and ("FAIL" in text), (k, text)
             for line in list(READERS)[k % 2 :: 2]:
                 status, text = use(line)
-                assert status == 0 or "seq/" in text, (k, line, text)
+                assert status == 0 or name in text, (k, line, text)
 
 
 LISTINGS = [
     ("rgb.txt", b"0.0333", b"0.0334"),
     ("rgb.txt", b"rgb/000001.png", b"rgb/000002.png"),
-    ("rgb.txt", b"rgb/000001.png", b"depth/000001.png"),
     ("rgb.txt", b"rgb/000001.png", b"../seq/rgb/000001.png"),
     ("rgb.txt", b"rgb/000001.png", b"/etc/hostname"),
     ("depth.txt", b"depth/000001.png", b"depth/" + b"0" * 5000 + b"1.png"),
@@ -277,7 +277,6 @@ LISTINGS = [
     ("depth.txt", b"0.033333333", b"-1e400"),
     ("depth.txt", b"0.033333333", b"0.000000000"),
     ("depth.txt", b"0.033333333", b"9" * 400),
-    ("depth.txt", b"\n", b"\r\x0b\x1c"),
 ]
 
 
@@ -311,7 +310,6 @@ ODD = (
     [1e300] * 4,
     [[1e300] * 4] * 4,
     [2048, 2048],
-    "../../../outside",
     "a\x00b",
     {"a\nb": ["\x1b[31m"]},
     {"depth": [], "sharp": ["Q"]},
@@ -329,14 +327,24 @@ def test_no_entry_of_sequence_yaml_is_taken_on_trust(
     lines = list(READERS)
     for k in rng.permutation(len(ODD))[:count]:
         changed = fuzzing.with_entry(data, entry, ODD[k])
+        if changed == data:
+            continue
         with fuzzing.replaced(path, fuzzing.yaml_bytes(changed)):
             needed = entry.startswith(("streams", "T_color_depth", "format")) and k < len(fuzzing.NEVER)
             for line in rng.choice(lines, 2, replace=False):
                 status, text = use(line)
-                assert status == 2 or not needed, (ODD[k], line, text)
-                assert status == 0 or "sequence.yaml" in text or "rgb.txt" in text or "depth" in text, (ODD[k], text)
+                assert (status == 2 and "sequence.yaml" in text) or not needed, (ODD[k], line, text)
             if k % 2:
-                assert verify(use)[0] == 1 or entry in ("noise", "spline", "seed"), (ODD[k], line)
+                assert verify(use)[0] == 1 or entry in ("name", "noise", "spline", "seed"), ODD[k]
+
+
+def test_a_name_cannot_lead_out_of_the_folder(sequence: Path, use: Callable[[str], tuple[int, str]]) -> None:
+    path = sequence / "sequence.yaml"
+    data = yaml.safe_load(path.read_text())
+    for name in ("../../outside", "/tmp/outside", "a/b", "..", "a\x00b", ""):
+        with fuzzing.replaced(path, fuzzing.yaml_bytes(data | {"name": name})):
+            status, text = use("rsgen export rerun SEQ --quiet")
+            assert status == 2 and "sequence.yaml: name" in text, name
 
 
 def test_yaml_that_never_ends_is_refused(sequence: Path, use: Callable[[str], tuple[int, str]]) -> None:

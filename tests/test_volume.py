@@ -46,7 +46,10 @@ def test_a_plane_is_seen_again_from_another_pose() -> None:
     rho, _ = filled().raycast(T, LENS)
     z, true = ENGINE.download(rho, SHAPE), depth_of(WALL, T)
     z, seen = 1.0 / np.maximum(z, 1e-6), z > 0
-    assert seen[8:-8, 8:-8].mean() > 0.99
+    uv, _ = LENS.camera.project(se3.transform(se3.inverse(POSES[0]) @ T, RAYS * true[..., None]))
+    # Four voxels (5 px) inside of what the first pose saw; others saw more.
+    inside = ((uv > 5) & (uv < np.array(SHAPE[::-1]) - 6)).all(axis=-1)
+    assert inside.mean() > 0.6 and seen[inside].all()
     assert np.abs(z - true)[seen].max() < 2e-4  # a hundredth of a voxel
 
 

@@ -34,6 +34,7 @@ def export_registered(sequence: Sequence, out: Path, copy: bool = False, progres
     of the sequence, as drivers leave them. Raises UserError if `out` is not empty, or an image cannot be read.
     """
     color, depth = sequence.streams["color"], sequence.streams["depth"]
+    sequence.depth(0)  # of the size that sequence.yaml says, or all below would take memory for another one
     new_folder(out)
     make_folders(out / "rgb", out / "depth")
     place_images(color.paths, [out / "rgb" / path.name for path in color.paths], copy, progress, (0.0, 0.1))
