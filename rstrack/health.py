@@ -13,7 +13,9 @@ _LEAST_SHARE = 0.08
 _LEAST_PIXELS = 200
 # Scales that no aligned images have, and growth over the last frames' median that none shows (m; intensity).
 _WORST_DEPTH, _WORST_INTENSITY = 0.03, 0.15
-_GROWTH, _HARMLESS_DEPTH, _HARMLESS_INTENSITY = 6.0, 1e-2, 0.03
+_GROWTH, _HARMLESS_DEPTH, _HARMLESS_INTENSITY = 6.0, 2e-3, 0.03
+# A camera at rest repeats its rounding: what counts as usual then says little. Multiple of the rounding that is fine.
+_ROUNDING = 2.5
 # Lines that still move so far (pixels) have not been found.
 _WORST_SHIFT_PX = 2.0
 _MEMORY = 30
@@ -38,6 +40,7 @@ class Health:
             history = self._depth if o.is_depth else self._intensity
             worst = _WORST_DEPTH if o.is_depth else _WORST_INTENSITY
             harmless = _HARMLESS_DEPTH if o.is_depth else _HARMLESS_INTENSITY
+            harmless = max(harmless, _ROUNDING * o.lin.floor)
             usual = median(history) if history else worst
             if o.lin.next_sigma > min(worst, max(harmless, _GROWTH * usual)):
                 return f"the {'depth' if o.is_depth else 'colour'} image does not fit"

@@ -43,6 +43,8 @@ class Linearised:
     next_sigma: float
     cost: float
     count: int
+    # Smallest credible σ of this term, this camera and this reference.
+    floor: float
     # Σ w j jᵀ / count (6, 6) with rotations scaled by the scene's depth.
     seen: FloatArray
 
@@ -175,7 +177,7 @@ class Terms:
         model, motion = chain(sums, spline, ref.T_world_base, times, ref_times)
         scaled = Quadratic(model.first, model.H / sigma**2, model.g / sigma)
         next_sigma = scale_step(sigma, sums.weighted, sums.count, floor)
-        return Linearised(scaled, motion, sigma, next_sigma, sums.cost, sums.count, seen_motions(sums, lever))
+        return Linearised(scaled, motion, sigma, next_sigma, sums.cost, sums.count, floor, seen_motions(sums, lever))
 
 
 def seen_motions(sums: BlockSums, lever: float) -> FloatArray:
