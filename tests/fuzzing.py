@@ -40,6 +40,7 @@ LINE = _PACE | {"kind": "line", "position": [0.1, 0.2, -0.5], "target": [0.0, 0.
 _AT = {"target": [0.0, 0.1, 1.0]}
 TOUR = _PACE | {
     "kind": "tour",
+    "mean_rotation_deg_s": 20.0,
     "closed": False,
     "waypoints": [_AT | {"position": [x, 0.1, -0.5]} for x in (-0.3, 0.0, 0.3)],
 }

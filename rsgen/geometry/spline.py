@@ -7,6 +7,7 @@ Derivatives after Sommer et al., CVPR 2020, and Tirado & Civera, arXiv 2201.1060
 
 from __future__ import annotations
 
+import io
 import zipfile
 from dataclasses import dataclass
 from functools import cached_property
@@ -177,7 +178,7 @@ class Spline:
     def load(cls, path: str | Path) -> Spline:
         """Read what `save` wrote. Raises UserError for a missing, damaged or foreign file."""
         try:
-            with np.load(path, allow_pickle=False) as data:
+            with np.load(io.BytesIO(Path(path).read_bytes()), allow_pickle=False) as data:
                 return cls(data["control_points"], float(data["t0"]), float(data["dt"]))
         except UserError as error:
             raise UserError(f"{path}: {error}") from None
