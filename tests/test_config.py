@@ -118,7 +118,8 @@ def test_a_motion_or_a_file(tmp_path: Path) -> None:
     made = {key: value for key, value in MINIMAL.items() if key != "trajectory"} | {"motion": motion}
     config = load(tmp_path, made)
     assert config.motion is not None and config.motion.kind == "line" and config.trajectory.file is None
-    assert config.content()["trajectory"]["file"] is None and validate_config(config.content(), "again") == config
+    again = validate_config(config.content(), "again")  # defaults written out, the scene by its name
+    assert again.model_copy(update={"scene": config.scene}) == config and again.scene.file == Path("s.xml")
     refused(tmp_path, MINIMAL | {"motion": motion}, "trajectory.file", "not both")
     refused(tmp_path, made | {"motion": motion | {"kind": "jump"}}, "motion.kind", "'jump'")
 

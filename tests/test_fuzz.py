@@ -28,7 +28,7 @@ from rstrack.estimate import write_estimate
 pytestmark = pytest.mark.filterwarnings("error")
 
 SEED = 4
-MAX_CPU_S = 5.0
+MAX_CPU_S = 10.0
 FIELDS = [name for name, _, _ in describe_fields()]
 
 Run = Callable[..., tuple[int, str, str]]
@@ -105,7 +105,7 @@ def test_what_the_variants_are_made_of_is_accepted(
 
 @pytest.mark.parametrize("field", FIELDS)
 def test_a_field_takes_no_odd_values(field: str, check: Callable[[ConfigVariant], bool]) -> None:
-    for variant in fuzzing.config_variants(field, SEED, extremes=2):
+    for variant in fuzzing.config_variants(field, SEED, extremes=1):
         check(variant)
 
 
@@ -122,7 +122,7 @@ def test_garbage_is_no_config(check: Callable[[ConfigVariant], bool]) -> None:
 def test_motion_stats_refuses_what_render_does(studio: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(studio)
     variants = [v for field in FIELDS[::9] for v in fuzzing.config_variants(field, SEED, 0)[:2]]
-    for variant in variants + [v for v in fuzzing.garbage_variants(SEED, 0)][::3]:
+    for variant in variants + list(fuzzing.garbage_variants(SEED, 0))[::4]:
         Path("fuzzed.yaml").write_bytes(variant.text)
         status, out, error = run("rsgen", "motion", "stats", "fuzzed.yaml")
         assert status == 2 and out == "" and variant.word in error, variant.name
@@ -216,7 +216,7 @@ def test_a_damaged_file_is_named_by_all_that_read_it(
                 if way not in vague or not matters:
                     assert status == (2 if matters else 0), (way, line, text)
                 assert status == 0 or name in text, (way, line, text)
-            if k % 2 == FILES.index(name) % 2:
+            if k % 3 == FILES.index(name) % 3:
                 status, text = verify(use)
                 assert (status == 1 and Path(name).name in text) or way in vague, (way, text)
 
@@ -258,7 +258,7 @@ def test_whole_files_of_another_kind_or_size_are_named(sequence: Path, use: Call
         with fuzzing.replaced(sequence / name, data):
             status, text = verify(use)
             assert status == 1 and ("FAIL" in text), (k, text)
-            for line in list(READERS)[k % 2 :: 2]:
+            for line in list(READERS)[k % 3 :: 3]:
                 status, text = use(line)
                 assert status == 0 or name in text, (k, line, text)
 
@@ -349,13 +349,14 @@ def test_a_name_cannot_lead_out_of_the_folder(sequence: Path, use: Callable[[str
 
 def test_yaml_that_never_ends_is_refused(sequence: Path, use: Callable[[str], tuple[int, str]]) -> None:
     path = sequence / "sequence.yaml"
-    for variant in fuzzing.garbage_variants(SEED, 0):
+    for k, variant in enumerate(fuzzing.garbage_variants(SEED, 0)):
         extra = variant.text.removeprefix(fuzzing.yaml_bytes(fuzzing.base_config()))
         with fuzzing.replaced(path, path.read_bytes() + extra if extra != variant.text else extra):
             status, text = use("rsgen info SEQ")
             assert status == 0 or (status == 2 and "sequence.yaml" in text), variant.name
             assert status == 2 or variant.name not in ("doubling", "merging", "itself", "deep", "noise"), variant.name
-            verify(use)
+            if k % 4 == 0:
+                assert verify(use)[0] == status // 2, variant.name
 
 
 def test_a_damaged_run_is_named(sequence: Path, use: Callable[[str], tuple[int, str]]) -> None:

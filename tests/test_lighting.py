@@ -405,7 +405,9 @@ def test_the_caches_key_depends_on_all_that_decides_the_light() -> None:
     for name, value in {"texel_m": 0.3, "direct_samples": 5, "gather_rays": 17, "bounces": 1}.items():
         keys.append(lighting.cache_key("scene", LIGHT.model_copy(update={name: value})))
     assert len(set(keys)) == len(keys)
-    assert {"texel_m", "direct_samples", "gather_rays", "bounces", "mode", "max_depth"} == set(LightConfig.model_fields)
+    content = {"texel_m", "direct_samples", "gather_rays", "bounces"}
+    assert content | {"mode", "max_depth", "glossy_spp"} == set(LightConfig.model_fields)
+    assert lighting.cache_key("scene", LIGHT.model_copy(update={"glossy_spp": 3})) == keys[0]
     # The reference integrator's settings do not touch the bake.
     assert lighting.cache_key("scene", LIGHT.model_copy(update={"max_depth": 3})) == keys[0]
     assert lighting.cache_key("scene", LIGHT) == keys[0]
