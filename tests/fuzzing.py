@@ -23,9 +23,25 @@ from rsgen.config import Config, describe_fields
 from rsgen.sequence_identity import color_truth
 
 # No field takes any of these.
-NEVER = ("no such\tthing\n\x07", float("nan"), float("inf"), {"x": 1}, [{}], b"\x00\xff")
+NEVER: tuple[Any, ...] = ("no such\tthing\n\x07", float("nan"), float("inf"), {"x": 1}, [{}], b"\x00\xff")
 # Some fields take some of these.
-EXTREME = (-1, 0, 5e-324, -1e300, 1e300, 2**70, True, None, [], [0], "", "~", [[[1]]], "2001-13-45", -(10**400))
+EXTREME: tuple[Any, ...] = (
+    -1,
+    0,
+    5e-324,
+    -1e300,
+    1e300,
+    2**70,
+    True,
+    None,
+    [],
+    [0],
+    "",
+    "~",
+    [[[1]]],
+    "2001-13-45",
+    -(10**400),
+)
 
 TRUTH = {
     "sharp": True,
@@ -38,7 +54,7 @@ TRUTH = {
 _PACE = {"length_m": 0.6, "mean_speed_m_s": 0.3, "mean_rotation_deg_s": 8.0, "ramp_s": 0.4, "clearance_m": 0.05}
 LINE = _PACE | {"kind": "line", "position": [0.1, 0.2, -0.5], "target": [0.0, 0.1, 1.0], "strokes": 2}
 _AT = {"target": [0.0, 0.1, 1.0]}
-TOUR = _PACE | {
+TOUR: dict[str, Any] = _PACE | {
     "kind": "tour",
     "mean_rotation_deg_s": 20.0,
     "closed": False,
@@ -73,7 +89,7 @@ def base_config(motion: dict[str, Any] | None = None) -> dict[str, Any]:
 
 
 def config_variants(name: str, seed: int, extremes: int) -> list[ConfigVariant]:
-    """Of one field, by its dotted name: all that never fit, and some of the values that may."""
+    """Of one field, by its dotted name: four values that never fit, and `extremes` that may."""
     rng = np.random.default_rng([seed, *name.encode()])
     motion = TOUR if name in ("motion.waypoints", "motion.closed") else LINE
     base = base_config(motion if name.startswith("motion.") else None)
@@ -83,6 +99,7 @@ def config_variants(name: str, seed: int, extremes: int) -> list[ConfigVariant]:
         wrong += [value[:-1], [*value, value[0]], [*value[:-1], None], [*value[:-1], float("-inf")]]
     chosen = [EXTREME[i] for i in rng.permutation(len(EXTREME))[:extremes]]
     last = name.split(".")[-1] if not name.endswith("intrinsics") else name.split(".")[0]  # "color: cx must be ..."
+    wrong = [wrong[i] for i in rng.permutation(len(wrong))[:4]]
     made = [(item, True) for item in wrong] + [(item, False) for item in chosen]
     return [
         ConfigVariant(f"{name} = {item!r}"[:80], yaml_bytes(_with(base, name, item)), last if refused else "", refused)
@@ -127,7 +144,7 @@ def structure_variants() -> Iterator[ConfigVariant]:
     yield refused("too late", "color.offset_s", 1e3, "offset_s")
     yield refused("too many frames", "depth.rate_hz", 1e12, "rate_hz")
     yield refused("too many knots", "trajectory.knot_spacing_s", 1e-9, "knot")
-    for name, value, word in (
+    targets: tuple[tuple[str, Any, str], ...] = (
         ("length_m", 1e4, "length_m"),
         ("mean_rotation_deg_s", 1e4, "mean_rotation_deg_s"),
         ("shake_position_m", 0.1, "length_m"),
@@ -138,7 +155,8 @@ def structure_variants() -> Iterator[ConfigVariant]:
         ("position", LINE["target"], "position"),
         ("waypoints", TOUR["waypoints"], "waypoints"),
         ("clearance_m", 100.0, "clearance"),
-    ):
+    )
+    for name, value, word in targets:
         yield refused(f"{name} cannot be {value}"[:60], f"motion.{name}", value, word, LINE)
     yield refused("one place twice", "motion.waypoints", [TOUR["waypoints"][0]] * 3, "waypoints", TOUR)
 
