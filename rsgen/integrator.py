@@ -13,6 +13,7 @@ _DIFFUSE = int(mi.BSDFFlags.DiffuseReflection) | int(mi.BSDFFlags.DiffuseTransmi
 _SPECULAR = int(mi.BSDFFlags.Glossy) | int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.Null)
 _GLOSSY = int(mi.BSDFFlags.Glossy)
 _MOST_LIGHTS = 16  # light samples at a glossy hit
+_FAINT = 0.05  # of the matte light at a hit: reflections below are cast by lot, which saves most shadow rays
 
 
 class BakedIntegrator(mi.SamplingIntegrator):
@@ -95,15 +96,20 @@ def trace_baked(scene, field, sampler, ray, bounces, active):
 
         active &= ((bsdf.flags() & _SPECULAR) != 0) & ~last & (depth < bounces)
         smooth = active & ((bsdf.flags() & _GLOSSY) != 0)
+        faint = _FAINT * dr.max(irradiance * lobe)
         light = mi.UInt32(0)
         while smooth & (light < lights):
             u = sampler.next_2d(smooth)
             u.x = (mi.Float(light) + u.x) / lights
-            ds, value = scene.sample_emitter_direction(si, u, True, smooth)
+            ds, value = scene.sample_emitter_direction(si, u, False, smooth)
             to_light = si.to_local(ds.d)
             cast, pdf = bsdf.eval_pdf(specular, si, to_light, smooth)
             share = dr.select(ds.delta, 1 / lights, dr.rcp(lights + pdf / dr.maximum(ds.pdf, 1e-20)))
-            radiance[smooth & (ds.pdf > 0)] += cast * value * share
+            gain = cast * value * share
+            chance = dr.minimum(dr.max(gain) / dr.maximum(faint, 1e-20), 1)
+            cast_shadow = smooth & (ds.pdf > 0) & (sampler.next_1d(smooth) < chance)
+            seen = cast_shadow & ~scene.ray_test(si.spawn_ray_to(ds.p), cast_shadow)
+            radiance[seen] += throughput * gain / chance
             light += 1
 
         bs, weight = bsdf.sample(specular, si, sampler.next_1d(active), sampler.next_2d(active), active)

@@ -212,6 +212,34 @@ def test_baked_light_agrees_with_the_path_tracer(tmp_path: Path) -> None:
     assert few[ball].mean(axis=0) == pytest.approx(every[ball].mean(axis=0), rel=0.02)
 
 
+def test_a_glossy_floor_in_a_dim_mirror_is_what_stands_behind_it_dimmed(tmp_path: Path) -> None:
+    """The mirror's image is the view of the mirrored camera, flipped, times the reflectance."""
+    floor = """<shape type="rectangle"><transform name="to_world"><scale value="4"/></transform>
+        <bsdf type="roughplastic"><rgb name="diffuse_reflectance" value="0.5"/><float name="alpha" value="0.2"/></bsdf>
+    </shape>"""
+    mirror = """<shape type="rectangle"><transform name="to_world"><rotate y="1" angle="-90"/><translate x="1.5"/>
+        </transform><bsdf type="conductor"><string name="material" value="none"/>
+        <rgb name="specular_reflectance" value="0.03,0.02,0.01"/></bsdf></shape>"""
+    T_world_cam = np.eye(4)  # looks along x and a little down
+    axes = np.array([[0, -1, 0], [-0.3, 0, -1], [1, 0, -0.3]])
+    T_world_cam[:3, :3] = (axes / np.linalg.norm(axes, axis=1, keepdims=True)).T
+    T_world_cam[:3, 3] = 0.0, 0.3, 0.5
+    M = np.diag([-1.0, 1, 1, 1])
+    M[0, 3] = 3.0
+    T_world_virtual = M @ T_world_cam @ np.diag([-1.0, 1, 1, 1])
+    images = []
+    for pose, elements in ((T_world_cam, (floor, QUAD, mirror)), (T_world_virtual, (floor, QUAD))):
+        scene = scene_of(tmp_path, *elements)
+        light = LightConfig(texel_m=0.05, gather_rays=256)
+        field = lighting.baked_field(scene, f"{len(elements)}", light, tmp_path / "cache", silent)
+        camera = Camera(24, 24, 30.0, 30.0, 11.5, 11.5)
+        renderer = ColorRenderer(scene, BakedIntegrator(field, glossy_spp=512), camera, Shutter(), 512)
+        images.append(renderer.render(constant_twist(np.zeros(6), pose), 0.0, 1))
+    seen, behind = images[0][5:11], images[1][5:11, ::-1]  # rows of the floor in the mirror
+    assert behind.max() > 3 * behind.min()  # the lamp's reflection among them
+    np.testing.assert_allclose(seen.mean(axis=(0, 1)), [0.03, 0.02, 0.01] * behind.mean(axis=(0, 1)), rtol=0.02)
+
+
 # --- lattice and lookup
 
 
