@@ -92,7 +92,7 @@ class BaselineTracker:
         """Stamps (n,) of the frames that were not lost and T_world_depth (n, 4, 4) there."""
         stamps = np.array(self._stamps)
         poses = np.array(self._poses).reshape(-1, 4, 4)
-        return stamps, interpolated(np.array(self._times), poses, stamps) if len(poses) else poses
+        return stamps, se3.interpolated(np.array(self._times), poses, stamps) if len(poses) else poses
 
     def feed(self, frame: Frame) -> FrameReport:
         """Track one frame. Raises UserError if it is not newer than the one before, or its image is not the rig's."""
@@ -152,7 +152,7 @@ class BaselineTracker:
         times, poses = np.array([at for at, _ in self._last]), np.array([T for _, T in self._last])
         if t - times[-1] > _GAP_S:
             return self._last[-1][1]
-        T: FloatArray = interpolated(times, poses, np.array([t]))[0]
+        T: FloatArray = se3.interpolated(times, poses, np.array([t]))[0]
         return T
 
     def _align(self, new: DepthImage, ref: Reference, T_base_cam: FloatArray) -> Alignment:
@@ -199,19 +199,6 @@ class BaselineTracker:
         self._reference = self._maker.rectified(new.index, new.depth, (), motion, older)
         self._first_count = 0
         self.keyframes += 1
-
-
-def interpolated(times: FloatArray, poses: FloatArray, t: FloatArray) -> FloatArray:
-    """Poses (m, 4, 4) at times t (m,) on the geodesics between poses (n, 4, 4) at increasing times (n,), n ≥ 1.
-
-    Times before the first pose and after the last lie on the first and the last geodesic.
-    """
-    if len(times) == 1:
-        return np.repeat(poses, len(t), axis=0)
-    i = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
-    u = (t - times[i]) / (times[i + 1] - times[i])
-    twist = se3.log(se3.inverse(poses[i]) @ poses[i + 1])
-    return np.asarray(poses[i] @ se3.exp(u[:, None] * twist))
 
 
 def _still(T_world_cam: FloatArray, t: float) -> Spline:

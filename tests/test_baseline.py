@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import scipy.linalg
 import synthetic
 
 from rsgen.errors import UserError
@@ -15,7 +14,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
-from rstrack.baseline import BaselineTracker, interpolated
+from rstrack.baseline import BaselineTracker
 from rstrack.engine import engine
 from rstrack.frames import camera_rays, depth_image
 from rstrack.keyframe import KeyframeMaker
@@ -236,18 +235,3 @@ def test_geometric_pose_is_the_geometric_term_of_a_camera_at_rest(level: int) ->
     H, g = together.T @ whole.model.H @ together, together.T @ whole.model.g
     np.testing.assert_allclose(sums.H[0, 0] / sigma**2, H, rtol=1e-9, atol=1e-9 * np.abs(H).max())
     np.testing.assert_allclose(sums.g[0, 0] / sigma, g, rtol=1e-9, atol=1e-9 * np.abs(g).max())
-
-
-def test_interpolated_follows_a_constant_twist_before_between_and_after() -> None:
-    twist = np.array([0.3, -0.2, 0.5, 0.4, 0.9, -0.3])
-    times = np.array([0.1, 0.13, 0.2])
-    t = np.array([0.05, 0.1, 0.12, 0.2, 0.26])
-    expected = np.stack([scipy.linalg.expm(x * hat(twist)) for x in t])
-    poses = np.stack([scipy.linalg.expm(x * hat(twist)) for x in times])
-    np.testing.assert_allclose(interpolated(times, poses, t), expected, atol=1e-12)
-    np.testing.assert_array_equal(interpolated(times[:1], poses[:1], t[:2]), poses[[0, 0]])
-
-
-def hat(twist: np.ndarray) -> np.ndarray:
-    x, y, z = twist[3:]
-    return np.block([[np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), twist[:3, None]], [np.zeros((1, 4))]])

@@ -19,7 +19,8 @@ import synthetic
 import rsgen.progress
 import rstrack.optimizer
 from rstrack.benchmark import Stopwatch
-from rstrack.cli import HELP, main
+from rstrack.cli import main
+from rstrack.cli_options import HELP
 from rstrack.estimate import read_estimate
 from rstrack.frame_report import FrameReport
 from rstrack.options import METHODS, Options

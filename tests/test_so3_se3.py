@@ -185,3 +185,13 @@ def test_leading_axes(shape: tuple[int, ...]) -> None:
         assert batched.shape[: xi.ndim - 1] == xi.shape[:-1]
         if single:
             np.testing.assert_allclose(batched.reshape(-1, *single[0].shape), single, rtol=0, atol=1e-15)
+
+
+def test_interpolated_follows_a_constant_twist_before_between_and_after() -> None:
+    twist = np.array([0.3, -0.2, 0.5, 0.4, 0.9, -0.3])
+    times = np.array([0.1, 0.13, 0.2])
+    t = np.array([0.05, 0.1, 0.12, 0.2, 0.26])
+    expected = np.stack([scipy.linalg.expm(x * wedge(twist)) for x in t])
+    poses = np.stack([scipy.linalg.expm(x * wedge(twist)) for x in times])
+    np.testing.assert_allclose(se3.interpolated(times, poses, t), expected, atol=1e-12)
+    np.testing.assert_array_equal(se3.interpolated(times[:1], poses[:1], t[:2]), poses[[0, 0]])

@@ -123,6 +123,19 @@ def transform(T_a_b: npt.ArrayLike, p_b: npt.ArrayLike) -> FloatArray:
     return np.asarray(np.einsum("...ij,...j->...i", T[..., :3, :3], p) + T[..., :3, 3])
 
 
+def interpolated(times: FloatArray, poses: FloatArray, t: FloatArray) -> FloatArray:
+    """Poses (m, 4, 4) at times t (m,) on the geodesics between poses (n, 4, 4) at increasing times (n,), n ≥ 1.
+
+    Times before the first pose and after the last lie on the first and the last geodesic.
+    """
+    if len(times) == 1:
+        return np.repeat(poses, len(t), axis=0)
+    i = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
+    u = (t - times[i]) / (times[i + 1] - times[i])
+    twist = log(inverse(poses[i]) @ poses[i + 1])
+    return np.asarray(poses[i] @ exp(u[:, None] * twist))
+
+
 def _upper_blocks(diagonal: FloatArray, corner: FloatArray) -> FloatArray:
     out = np.zeros((*diagonal.shape[:-2], 6, 6))
     out[..., :3, :3] = diagonal

@@ -1,0 +1,1 @@
+"""Depth and colour along a known spline: fused keyframes, a signed distance volume, meshes and their errors."""

@@ -1,0 +1,255 @@
+"""Average colour in a rectified keyframe: rolling-shutter lookup, occlusion, weights that know about motion blur.
+
+Every pixel of the keyframe with depth is a point; a frame shows it where equation (3) says, at its own line's pose of
+mid-exposure. Frames count by equation (13) (Kerl, Stückler, Cremers, ICCV 2015): w = exp(−‖x_t − x_{t−t_e}‖ / σ²) with
+the distance in px that the point moves in the image while its line is exposed.
+
+fusion = ColorFusion(engine())
+fused = fusion.start(keyframe)
+fused = fusion.add(fused, keyframe, linear_image(e, exposure, rgb), depth, spline)
+image, weight = fusion.image(fused)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+from rsgen.geometry import se3
+from rsgen.geometry.spline import Spline
+from rstrack.engine import Engine
+from rstrack.frames import DepthImage
+from rstrack.lines import Exposure, from_base_table, line_motion
+from rstrack.reference import Reference
+from rstrack.residuals import EDGE, bilinear, grid
+from rstrack.warp import Lens, Sighting, cross, gather, move, project, project_rolling
+
+SIGMA_PX = 1.0
+# Weight of the most blurred view: better than a hole, and gone as soon as there is any other.
+_LEAST = 1e-6
+# Weight of a pixel at most, in sharp views; more would let a keyframe's first errors live for ever.
+_MOST = 30.0
+# Metres that a point has to lie behind what is seen there to count as hidden, beside EDGE of its depth.
+_BEHIND = 0.02
+
+
+@dataclass(frozen=True)
+class LinearImage:
+    """A colour image as light: linear RGB in [0, 1], interleaved, on the device."""
+
+    exposure: Exposure
+    rgb: Any
+
+
+@dataclass(frozen=True)
+class FusedColor:
+    """Linear RGB and sums of weights of a keyframe's pixels, flat, on the device; weight 0: nothing seen yet."""
+
+    rgb: tuple[Any, Any, Any]
+    weight: Any
+    shape: tuple[int, int]
+
+
+def linear_from_srgb(srgb: npt.ArrayLike) -> npt.NDArray[np.float32]:
+    """sRGB (...,) in [0, 1] to light (IEC 61966-2-1)."""
+    s = np.asarray(srgb, np.float32)
+    return np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def srgb_from_linear(light: npt.ArrayLike) -> npt.NDArray[np.float32]:
+    """The inverse of `linear_from_srgb`; light is clipped to [0, 1]."""
+    x = np.clip(np.asarray(light, np.float32), 0.0, 1.0)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1.0 / 2.4) - 0.055).astype(np.float32)
+
+
+_LIGHT_OF_BYTE = linear_from_srgb(np.arange(256) / 255.0)[:, None]
+
+
+def linear_image(e: Engine, exposure: Exposure, color: npt.NDArray[np.uint8]) -> LinearImage:
+    """sRGB (h, w, 3) uint8 to the device. An exposure sums light, not code values, so that is what is averaged."""
+    return LinearImage(exposure, e.upload(cv2.LUT(color, _LIGHT_OF_BYTE)))
+
+
+def sweep_table(spline: Spline, exposure: Exposure) -> npt.NDArray[np.float64]:
+    """How each line's camera moves while the line is exposed (lines, 6): twist [m; rad] in the camera's frame."""
+    _, twist = line_motion(spline, exposure)
+    return np.asarray(exposure.lens.shutter.exposure_s * twist @ se3.adjoint(exposure.T_cam_body).T)
+
+
+@dataclass
+class ColorFusion:
+    """Kernels for one blur σ in px; None: constant weights."""
+
+    e: Engine
+    sigma_px: float | None = SIGMA_PX
+    _kernels: dict[Any, Any] = field(default_factory=dict)
+
+    def start(self, ref: Reference) -> FusedColor:
+        """Nothing but holes. `ref` is rectified."""
+        assert ref.rolling is None, "colour is fused into rectified keyframes"
+        camera = ref.lens.camera
+        zero = self.e.upload(np.zeros(camera.height * camera.width))
+        return FusedColor((zero, zero, zero), zero, (camera.height, camera.width))
+
+    def add(
+        self, fused: FusedColor, ref: Reference, image: LinearImage, depth: DepthImage, spline: Spline
+    ) -> FusedColor:
+        """With one more colour image averaged in where it shows the keyframe's points.
+
+        depth: the depth image nearest in time, which tells what hides them; what it does not know hides nothing.
+        spline: T_world_depth(t) in the world of `ref`, known over the lines of both images.
+        """
+        e = self.e
+        kernel = self._kernel(_add_kernel, image.exposure.lens, depth.exposure.lens, ref.lens)
+        tables = (
+            e.upload(from_base_table(spline, ref.T_world_base, image.exposure)),
+            e.upload(sweep_table(spline, image.exposure)),
+            e.upload(from_base_table(spline, ref.T_world_base, depth.exposure)),
+        )
+        inv_sigma2 = 0.0 if self.sigma_px is None else self.sigma_px**-2
+        constants = e.upload(np.array([inv_sigma2, _LEAST, _MOST]))
+        *rgb, weight = kernel(
+            ref.inverse_depth, *fused.rgb, fused.weight, image.rgb, depth.z, *tables, constants
+        )  # fmt: skip
+        return FusedColor((rgb[0], rgb[1], rgb[2]), weight, fused.shape)
+
+    def inherit(self, ref: Reference, older: FusedColor, older_ref: Reference) -> FusedColor:
+        """What an older keyframe knows of the colours of a new one, with its weights."""
+        T_old_new = se3.inverse(older_ref.T_world_base) @ ref.T_world_base
+        pose = self.e.upload(np.concatenate([T_old_new[:3, :3].ravel(), T_old_new[:3, 3]]))
+        kernel = self._kernel(_inherit_kernel, older_ref.lens, ref.lens)
+        *rgb, weight = kernel(ref.inverse_depth, *older.rgb, older.weight, older_ref.inverse_depth, pose)
+        camera = ref.lens.camera
+        return FusedColor((rgb[0], rgb[1], rgb[2]), weight, (camera.height, camera.width))
+
+    def image(self, fused: FusedColor) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float32]]:
+        """sRGB (h, w, 3), 0 in holes, and the sums of weights (h, w)."""
+        light = np.stack([self.e.download(plane, fused.shape) for plane in fused.rgb], axis=-1)
+        weight: npt.NDArray[np.float32] = self.e.download(fused.weight, fused.shape)
+        return np.rint(255.0 * srgb_from_linear(light)).astype(np.uint8), weight
+
+    def _kernel(self, make: Any, *key: Any) -> Any:
+        if (make, *key) not in self._kernels:
+            self._kernels[make, *key] = make(self.e, *key)
+        return self._kernels[make, *key]
+
+
+def _points(e: Engine, base: Lens, rho: Any) -> tuple[Any, tuple[Any, Any, Any]]:
+    """Which pixels have depth, and their points in the base frame."""
+    _, px, py = grid(e, base.camera.width, base.camera.height, 1)
+    active = rho > 0.0
+    z = dr.rcp(dr.select(active, rho, 1.0))
+    return active, (
+        (e.Float(px) - base.camera.cx) / base.camera.fx * z,
+        (e.Float(py) - base.camera.cy) / base.camera.fy * z,
+        z,
+    )
+
+
+def _hidden(e: Engine, lens: Lens, depth: Any, seen: Sighting, active: Any) -> Any:
+    """Points behind the nearest of the four depths around them: a pixel next to an edge shows both sides."""
+    *around, _, _, inside = bilinear(
+        e, depth, lens.camera.width, lens.camera.height, seen.x, seen.y, active & seen.valid
+    )
+    hidden = e.Bool(False)
+    for z in around:
+        hidden |= inside & (z > 0.0) & (seen.z > z * (1.0 + EDGE) + _BEHIND)
+    return hidden
+
+
+def _cubic(
+    e: Engine, planes: Sequence[Any], stride: int, width: int, height: int, x: Any, y: Any, active: Any
+) -> list[Any]:
+    """Light of three planes at positions inside the image, never below zero (Keys, IEEE TASSP 29(6), 1981, a = −1/2).
+
+    stride 3: pixel i of plane c is entry 3 i + c. Bilinear interpolation would take a third of the gradient energy of
+    sharp pictures, as some milliseconds of blur do.
+    """
+    x0, y0 = dr.floor(x), dr.floor(y)
+    taps_x, taps_y = _taps(x - x0), _taps(y - y0)
+    columns, rows = (
+        [e.UInt(e.Int(dr.clip(dr.select(active, first, 0.0) + k, 0.0, size - 1.0))) for k in (-1.0, 0.0, 1.0, 2.0)]
+        for first, size in ((x0, width), (y0, height))
+    )
+    sums = [e.Float(0.0) for _ in planes]
+    for row, tap_y in zip(rows, taps_y, strict=True):
+        for column, tap_x in zip(columns, taps_x, strict=True):
+            index, tap = (row * width + column) * stride, tap_x * tap_y
+            for c, plane in enumerate(planes):
+                at = index + c if stride > 1 else index
+                sums[c] = dr.fma(tap, dr.gather(e.Float, plane, at, active), sums[c])
+    return [dr.maximum(total, 0.0) for total in sums]
+
+
+def _taps(f: Any) -> tuple[Any, ...]:
+    """Weights of the four neighbours at a fraction f past the second."""
+    return (
+        ((1.0 - 0.5 * f) * f - 0.5) * f,
+        (1.5 * f - 2.5) * f * f + 1.0,
+        ((2.0 - 1.5 * f) * f + 0.5) * f,
+        (0.5 * f - 0.5) * f * f,
+    )
+
+
+def _add_kernel(e: Engine, lens: Lens, depth_lens: Lens, base: Lens) -> Callable[..., Any]:
+    """Kernel (inverse_depth, r, g, b, weight, image, depth, from_base, sweep, depth_from_base, constants) →
+    (r, g, b, weight).
+
+    `image` is interleaved linear RGB; `sweep`: see `sweep_table`. constants: 1/σ² (0: constant weights), least weight,
+    largest sum of weights.
+    """
+
+    @dr.freeze
+    def kernel(
+        rho: Any, r: Any, g: Any, b: Any, weight: Any, image: Any, depth: Any, from_base: Any, sweep: Any,
+        depth_from_base: Any, constants: Any,
+    ) -> Any:  # fmt: skip
+        inv_sigma2, least, most = (dr.gather(e.Float, constants, e.UInt(i)) for i in range(3))
+        active, p = _points(e, base, rho)
+        seen = project_rolling(lens, from_base, p, e.UInt, e.Int)
+        active &= seen.valid & ~_hidden(
+            e, depth_lens, depth, project_rolling(depth_lens, depth_from_base, p, e.UInt, e.Int), active
+        )
+        turn = gather(sweep, seen.row, 6, stride=6)
+        q = seen.at.q
+        omega_q = cross((turn[3], turn[4], turn[5]), q)
+        dx, dy = seen.at.push((-(turn[0] + omega_q[0]), -(turn[1] + omega_q[1]), -(turn[2] + omega_q[2])))
+        w = dr.maximum(dr.exp(-inv_sigma2 * dr.sqrt(dx * dx + dy * dy)), least)
+
+        width, height = lens.camera.width, lens.camera.height
+        active &= (seen.x >= 0.0) & (seen.y >= 0.0) & (seen.x < width - 1.0) & (seen.y < height - 1.0)
+        share = dr.select(active, w / (weight + w), 0.0)
+        values = _cubic(e, (image,) * 3, 3, width, height, seen.x, seen.y, active)
+        fused = [dr.fma(share, value - before, before) for value, before in zip(values, (r, g, b), strict=True)]
+        return *fused, dr.minimum(weight + dr.select(active, w, 0.0), most)
+
+    return kernel
+
+
+def _inherit_kernel(e: Engine, older: Lens, base: Lens) -> Callable[..., Any]:
+    """Kernel (inverse_depth, older r, g, b, weight, inverse_depth, T_old_new) → (r, g, b, weight) in the new image.
+
+    Both images are global-shutter pinholes. Nothing is inherited across holes, or where depths disagree.
+    """
+    width, height = older.camera.width, older.camera.height
+
+    @dr.freeze
+    def kernel(rho: Any, r: Any, g: Any, b: Any, weight: Any, older_rho: Any, T_old_new: Any) -> Any:
+        active, p = _points(e, base, rho)
+        at = project(older.camera, move(gather(T_old_new, e.UInt(0), 12, stride=12), p))
+        *near, _, _, active = bilinear(e, older_rho, width, height, at.x, at.y, active & at.valid)
+        for value in near:
+            active &= (value > 0.0) & (dr.abs(at.q[2] * value - 1.0) < EDGE)
+        *near, _, _, active = bilinear(e, weight, width, height, at.x, at.y, active)
+        least = dr.minimum(dr.minimum(near[0], near[1]), dr.minimum(near[2], near[3]))
+        active &= least > 0.0
+        out = [dr.select(active, value, 0.0) for value in _cubic(e, (r, g, b), 1, width, height, at.x, at.y, active)]
+        return *out, dr.select(active, least, 0.0)
+
+    return kernel

@@ -1,0 +1,242 @@
+"""From an estimate to a surface: every frame's depth, rectified line by line, goes into one signed distance volume.
+
+result = reconstruct(open_dataset(Path("out/lr_kt2")), read_estimate(Path("runs/lr_kt2")), MapOptions())
+write_ply(Path("mesh.ply"), result.surface)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from rsgen.backend import Backend
+from rsgen.errors import UserError
+from rsgen.geometry import se3
+from rsgen.geometry.shutter import Shutter
+from rsgen.geometry.so3 import FloatArray
+from rstrack.compare import compare, truth_of
+from rstrack.dataset import Dataset
+from rstrack.engine import Engine, Kernels, engine
+from rstrack.estimate import Estimate, read_estimate
+from rstrack.frames import camera_rays, depth_image, lens_sees
+from rstrack.lines import Exposure, from_base_table, to_base_table
+from rstrack.mapping.surface_mesh import Surface, extract_surface, write_ply
+from rstrack.mapping.volume import Volume
+from rstrack.mapping.volume_kernels import lookup_kernel
+from rstrack.prefetch import prefetched
+from rstrack.rectify import rectify_kernel
+from rstrack.reference import rectified_lens
+from rstrack.rig import Frame, Rig
+from rstrack.warp import Lens
+
+Progress = Callable[[str, float, str], None]
+"""Called with a stage, the fraction done (0 to 1) and a note."""
+
+# Seconds from the nearest estimated pose beyond which a frame is left out: its pose would be a guess.
+_POSE_WITHIN_S = 0.1
+
+
+@dataclass(frozen=True)
+class MapOptions:
+    """What can be chosen.
+
+    shutter: rs warps every line with its own pose, gs takes all lines at mid readout; default rs if the estimate has a
+    spline. world: the frame of the result; truth aligns the trajectories as `rstrack evaluate` does; default truth if
+    the sequence has one. voxel_m, max_depth: m. every: use every n-th frame. color: look colours up.
+    """
+
+    shutter: Literal["rs", "gs"] | None = None
+    world: Literal["truth", "estimate"] | None = None
+    voxel_m: float = 0.01
+    every: int = 1
+    color: bool = True
+    max_depth: float = 6.0
+    backend: Backend = "auto"
+
+    def __post_init__(self) -> None:
+        if self.every < 1:
+            raise UserError(f"every = {self.every!r} must be 1 or more")
+        if not self.max_depth > 0.0:
+            raise UserError(f"max_depth = {self.max_depth!r} must be positive")
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A surface and how it came about. frames: integrated; without_pose: frames left out."""
+
+    surface: Surface
+    frames: int
+    without_pose: int
+    shutter: Literal["rs", "gs"]
+    world: Literal["truth", "estimate"]
+    bytes: int
+
+    def text(self) -> str:
+        """A summary of one line."""
+        left = f", {self.without_pose} left out without a pose" if self.without_pose else ""
+        return (
+            f"{self.frames} frames ({self.shutter}){left}: {len(self.surface.vertices)} vertices, "
+            f"{len(self.surface.faces)} triangles, in the {self.world}'s world; volume of {self.bytes / 2**20:.0f} MB"
+        )
+
+
+class FrameMapper:
+    """Frames of a rig, with the motion of an estimate, into a volume."""
+
+    def __init__(self, e: Engine, rig: Rig, estimate: Estimate, shutter: Literal["rs", "gs"], volume: Volume,
+                 T_world_estimate: FloatArray, max_depth: float) -> None:  # fmt: skip
+        self._e, self._rig, self._estimate, self._rolling = e, rig, estimate, shutter == "rs"
+        self._volume, self._T_world_estimate, self._max_depth = volume, T_world_estimate, max_depth
+        self._depth_lens, self._color_lens = (
+            self._seen_as(rig.depth_camera, rig.depth_shutter),
+            self._seen_as(rig.color_camera, rig.color_shutter),
+        )
+        self.base = rectified_lens(rig.depth_camera)
+        rays = camera_rays(Exposure(self._depth_lens, 0.0, np.eye(4)))
+        self._rays, self._seen = tuple(e.upload(rays[..., i]) for i in (0, 1)), lens_sees(rig.depth_camera)
+        self._kernel = Kernels(e)
+
+    def __call__(self, frame: Frame) -> bool:
+        """Integrate one frame; False if the estimate does not cover it."""
+        e = self._e
+        exposure = Exposure(self._depth_lens, frame.depth.stamp + self._middle("depth"), np.eye(4))
+        t = exposure.mid_time
+        if not self._covered(exposure):
+            return False
+        T_estimate_base = self._pose(t)
+        z = np.where(self._seen, frame.depth.pixels, 0.0)
+        depth = depth_image(e, exposure, z, self._max_depth)
+        if self._rolling:
+            assert self._estimate.spline is not None
+            to_base = to_base_table(self._estimate.spline, T_estimate_base, exposure)
+        else:
+            to_base = np.concatenate([np.eye(3).ravel(), np.zeros(3)])
+        rho, _, _ = self._kernel(rectify_kernel, self._depth_lens, self.base)(
+            depth.inverse_z, *self._rays, e.upload(to_base)
+        )
+        self._volume.integrate(
+            rho, self._T_world_estimate @ T_estimate_base, self.base, color=self._colors(frame, rho, T_estimate_base, t)
+        )
+        return True
+
+    def _colors(self, frame: Frame, rho: Any, T_estimate_base: FloatArray, t: float) -> list[Any] | None:
+        """Red, green, blue and their weight at the rectified pixels, from the colour image nearest in time."""
+        exposures = [
+            Exposure(self._color_lens, image.stamp + self._middle("color"), self._rig.T_color_depth)
+            for image in frame.colors
+        ]
+        usable = [i for i, exposure in enumerate(exposures) if self._covered(exposure)]
+        if not usable:
+            return None
+        best = min(usable, key=lambda i: abs(exposures[i].mid_time - t))
+        exposure, e = exposures[best], self._e
+        if self._rolling:
+            assert self._estimate.spline is not None
+            from_base = from_base_table(self._estimate.spline, T_estimate_base, exposure)
+        else:
+            T = self._rig.T_color_depth @ se3.inverse(self._pose(exposure.mid_time)) @ T_estimate_base
+            from_base = np.concatenate([T[:3, :3].ravel(), T[:3, 3], np.zeros(6)])
+        planes = [e.upload(plane / np.float32(255.0)) for plane in np.moveaxis(frame.colors[best].pixels, -1, 0)]
+        out: list[Any] = self._kernel(lookup_kernel, self._color_lens, self.base)(rho, *planes, e.upload(from_base))
+        return out
+
+    def _pose(self, t: float) -> FloatArray:
+        """T_estimate_depth (4, 4) at a covered time."""
+        if self._estimate.spline is not None:
+            return np.asarray(self._estimate.spline.pose(t))
+        return se3.interpolated(self._estimate.stamps, self._estimate.T_world_depth, np.array([t]))[0]
+
+    def _covered(self, exposure: Exposure) -> bool:
+        times = np.array([exposure.first_time, exposure.last_time])
+        if self._estimate.spline is not None:
+            return bool(self._estimate.spline_covers(times).all())
+        stamps = self._estimate.stamps
+        after = int(np.searchsorted(stamps, times[0]))
+        around = stamps[[max(after - 1, 0), min(after, len(stamps) - 1)]]
+        return bool((np.abs(around - times[0]) <= _POSE_WITHIN_S).all())
+
+    def _seen_as(self, camera: Any, shutter: Shutter) -> Lens:
+        return Lens(camera, shutter if self._rolling else Shutter(0.0, shutter.exposure_s, shutter.scan))
+
+    def _middle(self, stream: Literal["color", "depth"]) -> float:
+        """Seconds from the stamp to the line whose time stands for all of them; 0 where each has its own."""
+        if self._rolling:
+            return 0.0
+        rig = self._rig
+        camera, shutter = (
+            (rig.color_camera, rig.color_shutter) if stream == "color" else (rig.depth_camera, rig.depth_shutter)
+        )
+        return 0.5 * (shutter.line_count(camera) - 1) * shutter.line_delay(camera)
+
+
+def reconstruct(
+    dataset: Dataset, estimate: Estimate, options: MapOptions | None = None, progress: Progress = lambda *_: None
+) -> Reconstruction:
+    """Fuse a sequence's frames with an estimate's motion. Raises UserError: no spline for rs, no truth for --world
+    truth, no frame with a pose, an image that cannot be read."""
+    options = options or MapOptions()
+    shutter = options.shutter or ("rs" if estimate.spline is not None else "gs")
+    if shutter == "rs" and estimate.spline is None:
+        raise UserError("map: the estimate has no spline, so lines have no poses of their own: use --shutter gs")
+    T_world_estimate, world = _world(dataset, estimate, options.world)
+    e = engine(options.backend)
+    volume = Volume(e, options.voxel_m, options.color)
+    mapper = FrameMapper(e, dataset.rig, estimate, shutter, volume, T_world_estimate, options.max_depth)
+    chosen = range(0, len(dataset), options.every)
+    done = 0
+    for count, frame in enumerate(prefetched(lambda k: dataset.frame(k, color=options.color), chosen, 2), 1):
+        done += mapper(frame)
+        progress("integrating", count / len(chosen), f"{volume.blocks} blocks, {volume.bytes / 2**20:.0f} MB")
+    if not done:
+        raise UserError(
+            f"map: none of {len(chosen)} frames has a pose: the estimate covers {estimate.stamps[0]:.3f} to "
+            f"{estimate.stamps[-1]:.3f} s, the sequence {dataset.stamps[0]:.3f} to {dataset.stamps[-1]:.3f} s"
+        )
+    progress("meshing", 0.0, "")
+    surface = extract_surface(volume.download(), options.voxel_m)
+    progress("meshing", 1.0, f"{len(surface.faces)} triangles")
+    return Reconstruction(surface, done, len(chosen) - done, shutter, world, volume.bytes)
+
+
+def run_map(
+    seq_path: Path, estimate_path: Path, out: Path, options: MapOptions, cloud: Path | None = None,
+    camera_file: Path | None = None, progress: Progress = lambda *_: None,
+) -> Reconstruction:  # fmt: skip
+    """Map a sequence folder with a run folder or TUM file: writes a mesh, and a point cloud where `cloud` says.
+
+    Arguments as in `reconstruct`, `read_estimate` and `rstrack.dataset.open_dataset`. Raises UserError.
+    """
+    from rstrack.dataset import open_dataset
+
+    for path in (out, cloud):
+        if path is not None and path.suffix.lower() != ".ply":
+            raise UserError(f"{path}: only PLY is written: give it a name that ends in .ply")
+        if path is not None and not path.parent.is_dir():
+            raise UserError(f"{path}: there is no folder {path.parent}: make it or choose another name")
+    result = reconstruct(open_dataset(seq_path, camera_file), read_estimate(estimate_path), options, progress)
+    comment = f"rstrack map, world {result.world}, shutter {result.shutter}, voxels {options.voxel_m:g} m"
+    write_ply(out, result.surface, comment)
+    if cloud is not None:
+        write_ply(cloud, result.surface, comment, cloud=True)
+    return result
+
+
+def _world(
+    dataset: Dataset, estimate: Estimate, asked: Literal["truth", "estimate"] | None
+) -> tuple[FloatArray, Literal["truth", "estimate"]]:
+    """T_world_estimate (4, 4) and what the world is."""
+    truth = truth_of(dataset)
+    if truth is None and asked == "truth":
+        raise UserError(f"{dataset.root}: has no ground truth to align with: use --world estimate")
+    if truth is None or asked == "estimate":
+        return np.eye(4), "estimate"
+    try:
+        return compare(truth, estimate).T_true_est, "truth"
+    except UserError as error:
+        if asked is None:
+            raise UserError(f"{error}; or use --world estimate") from None
+        raise
