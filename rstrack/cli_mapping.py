@@ -1,4 +1,4 @@
-"""The commands that map: map, map-eval, stress."""
+"""The commands that map: keyframes, map, map-eval, stress."""
 
 from __future__ import annotations
 
@@ -57,6 +57,19 @@ def add_mapping(commands: Commands) -> None:
     evaluate.add_argument("scene", type=Path, help="the sequence's scene.ply")
     evaluate.add_argument("--json", action="store_true", help="print machine-readable figures")
 
+    keyframes = commands.add(
+        "keyframes", _keyframes, "fuse every frame into rectified keyframes: writes a TUM RGB-D folder of them",
+        "out/table1 runs/table1 --out keyframes",
+    )  # fmt: skip
+    add_sequence(keyframes)
+    add_run(keyframes)
+    keyframes.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write")
+    keyframes.add_argument(
+        "--sigma-px", type=number, default=1.0, metavar="S",
+        help="colours count exp(-length of their blur in px / S^2), equation (13); 0: all alike (default: 1)",
+    )  # fmt: skip
+    keyframes.add_argument("--quiet", action="store_true", help="no progress")
+
     stress = commands.add(
         "stress", _stress, "blur stress test: one motion at several exposures and speeds, constant against blur-aware "
         "weights", "configs/stress.yaml --out runs/stress --frames 60",
@@ -90,6 +103,19 @@ def _map_eval(options: argparse.Namespace) -> int:
 
     report = run_map_evaluate(options.mesh, options.scene)
     print(json.dumps(report.as_dict(), indent=2) if options.json else report.text())
+    return 0
+
+
+def _keyframes(options: argparse.Namespace) -> int:
+    from rsgen.progress import ProgressDisplay
+    from rstrack.dataset import open_dataset
+    from rstrack.estimate import read_estimate
+    from rstrack.mapping.keyframe_images import write_keyframes
+
+    dataset, estimate = open_dataset(options.sequence, options.camera), read_estimate(options.run_path)
+    with ProgressDisplay(options.quiet) as progress:
+        count = write_keyframes(dataset, estimate, options.out, options.sigma_px or None, progress=progress)
+    print(f"{options.out}: {count} keyframes written")
     return 0
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import synthetic
 from rstrack_util import ENGINE, SCANS, T_COLOR_DEPTH, Cast, depth_input, maker, pixel_rays, small_camera
 
 from rsgen.geometry import se3
@@ -24,7 +25,6 @@ from rstrack.mapping.color_fusion import (
 )
 from rstrack.reference import Reference
 from rstrack.warp import Lens
-from tests import synthetic
 
 WIDTH, HEIGHT = 96, 72
 SHAPE = (HEIGHT, WIDTH)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import synthetic
 import yaml
 from scipy.ndimage import gaussian_filter
 
@@ -30,7 +31,6 @@ from rstrack.stress.cases import Case, StressOptions, render_cases
 from rstrack.stress.image_scores import gradient_energy, psnr_db, ssim
 from rstrack.stress.report import gains_db, report_text, write_report
 from rstrack.stress.run import StressReport, run_stress
-from tests import synthetic
 
 WIDTH, HEIGHT, FOCAL, FRAMES, SUBTIMES = 96, 72, 150.0, 18, 8
 # Waves per metre: about seven pixels long on the far wall.
