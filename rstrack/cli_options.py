@@ -25,6 +25,9 @@ HELP = {
     "fuse": "average the depth of later frames into the keyframe",
     "bootstrap_frames": "frames that are aligned jointly at the start",
     "max_depth": "depth beyond this counts as missing, m",
+    "reference": "what new frames are aligned to: keyframes, or a model of all that was seen, older keyframes "
+    "included: less drift where the camera comes back",
+    "voxel_m": "voxels of that model, m",
     "blur_sigma_px": "colour that motion blurs counts less, by exp(-length / this squared), px; 0: all alike",
 }
 """What the fields of Options mean, on the command line."""

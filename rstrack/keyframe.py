@@ -60,12 +60,9 @@ class KeyframeMaker:
         self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, older: Reference | None
     ) -> Reference:
         """A keyframe at mid readout, in which depth that the older one has is averaged in and fills holes."""
-        e, lens = self.e, depth.exposure.lens
-        base = rectified_lens(lens.camera)
+        e = self.e
         t = depth.exposure.mid_time
-        T_world_base = spline.pose(t)
-        to_base = e.upload(to_base_table(spline, T_world_base, depth.exposure))
-        rho, _, _ = self._kernel(rectify_kernel, lens, base)(depth.inverse_z, *self.device_rays, to_base)
+        T_world_base, base, rho = self.rectify(depth, spline)
         shape = base.camera.height, base.camera.width
         host = e.download(rho, shape)
         made = self._finish(index, depth, colors, spline, t, T_world_base, base, rho, host, None)
@@ -83,6 +80,24 @@ class KeyframeMaker:
         host = np.where(holes, old_host, host)
         weights = np.where(holes, 1.0, e.download(weight, shape))
         return self._finish(index, depth, colors, spline, t, T_world_base, base, e.upload(host), host, weights)
+
+    def rectify(self, depth: DepthImage, spline: Spline) -> tuple[FloatArray, Lens, Any]:
+        """T_world_base (4, 4) at mid readout, the lens, and inverse depth as seen from there at once, on the device."""
+        lens = depth.exposure.lens
+        base = rectified_lens(lens.camera)
+        T_world_base: FloatArray = spline.pose(depth.exposure.mid_time)
+        to_base = self.e.upload(to_base_table(spline, T_world_base, depth.exposure))
+        rho, _, _ = self._kernel(rectify_kernel, lens, base)(depth.inverse_z, *self.device_rays, to_base)
+        return T_world_base, base, rho
+
+    def synthesised(
+        self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline,
+        T_world_base: FloatArray, base: Lens, rho: Any, weight: npt.NDArray[Any],
+    ) -> Reference:  # fmt: skip
+        """A keyframe whose inverse depth is given, on the device, with its weights (h, w)."""
+        host = self.e.download(rho, (base.camera.height, base.camera.width))
+        t = depth.exposure.mid_time
+        return self._finish(index, depth, colors, spline, t, T_world_base, base, rho, host, weight)
 
     def fused(self, ref: Reference, depth: DepthImage, spline: Spline) -> Reference:
         """The keyframe with the depth of one more frame, whose poses are known, averaged in."""

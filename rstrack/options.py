@@ -16,6 +16,8 @@ Method = Literal["rs-pg", "rs-g", "rs-p", "gs-pg", "gs-g", "gs-p", "baseline"]
 METHODS: tuple[str, ...] = get_args(Method)
 Strategy = Literal["converged", "newest"]
 STRATEGIES: tuple[str, ...] = get_args(Strategy)
+Source = Literal["keyframe", "model"]
+SOURCES: tuple[str, ...] = get_args(Source)
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,9 @@ class Options:
     blur_sigma_px: pixels; points of a colour image that its exposure blurs count less, by equation (13); 0: all alike.
     keyframe_strategy: which frame that is (paper, section 3.5): the last one that has converged, rectified at once; or
       the newest, with its rolling shutter until it has converged and can be rectified.
+    reference: keyframe: new frames are aligned to one frame, with the depth of others fused in; model: that frame's
+      depth is that of a signed distance volume of all frames, with voxels of voxel_m, and a keyframe is used again when
+      the camera comes back to it.
     """
 
     method: Method = "rs-pg"
@@ -44,6 +49,8 @@ class Options:
     bootstrap_frames: int = 6
     max_depth: float = 12.0
     blur_sigma_px: float = 0.0
+    reference: Source = "keyframe"
+    voxel_m: float = 0.01
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -58,6 +65,8 @@ class Options:
             raise UserError(
                 f"keyframe_overlap = {self.keyframe_overlap!r} must be positive; 1 makes new ones all the time"
             )
+        if self.reference not in SOURCES:
+            raise UserError(f"unknown reference '{self.reference}': choose {', '.join(SOURCES)}")
         for name in ("keyframe_distance", "keyframe_angle_deg", "max_depth"):
             if not getattr(self, name) > 0.0:
                 raise UserError(f"{name} = {getattr(self, name)!r} must be positive")
@@ -72,6 +81,11 @@ class Options:
         return self.method.startswith("rs")
 
     @property
+    def models(self) -> bool:
+        """Whether references are synthesised from a model."""
+        return self.reference == "model"
+
+    @property
     def geometric(self) -> bool:
         """Whether the geometric term is used."""
         return self.method in ("rs-pg", "rs-g", "gs-pg", "gs-g", "baseline")
@@ -83,6 +97,9 @@ class Options:
 
     def left_behind(self, T_base_cam: FloatArray, overlap: float) -> bool:
         """Whether a camera at T_base_cam (4, 4), that sees `overlap` of what the keyframe had, needs another one."""
+        return self.remoteness(T_base_cam) > 1.0 or overlap < self.keyframe_overlap
+
+    def remoteness(self, T_base_cam: FloatArray) -> float:
+        """The larger of distance and angle of a camera at T_base_cam (4, 4), each over where a keyframe is left."""
         distance, angle = np.linalg.norm(T_base_cam[:3, 3]), np.linalg.norm(se3.log(T_base_cam)[3:])
-        far = distance > self.keyframe_distance or np.degrees(angle) > self.keyframe_angle_deg
-        return bool(far or overlap < self.keyframe_overlap)
+        return float(max(distance / self.keyframe_distance, np.degrees(angle) / self.keyframe_angle_deg))

@@ -19,6 +19,7 @@ from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.frame_report import FrameReport, frame_report
 from rstrack.health import Health
+from rstrack.model import SurfaceModel
 from rstrack.normal_equations import acceleration_prior, pose_constraint
 from rstrack.optimizer import Extra, Observation, Problem, Solved, SplineState, optimise
 from rstrack.options import Options
@@ -45,6 +46,9 @@ _WIDEST = 2.0
 # Part of the pixels that must have depth for a frame to become a keyframe.
 _LEAST_DEPTH = 0.02
 _KEPT_KEYFRAMES = 8
+_MODEL_KEYFRAMES = 256
+# Of the distance and angle at which a keyframe is left behind: an older one that is nearer becomes the reference again.
+_RETURN = 0.5
 
 
 class Tracker:
@@ -56,7 +60,9 @@ class Tracker:
         self._terms, self._maker = self._prepare.terms, self._prepare.maker
         self._state: SplineState | None = None
         self._reference: Reference | None = None
-        self._keyframes: deque[Reference] = deque(maxlen=_KEPT_KEYFRAMES)
+        # By when they were last the reference. A model keeps them all: it is what one comes back to.
+        self._keyframes: deque[Reference] = deque(maxlen=_MODEL_KEYFRAMES if self.options.models else _KEPT_KEYFRAMES)
+        self._model = SurfaceModel(self._maker, self.options.voxel_m) if self.options.models else None
         # Frames whose control points still move, and the newest one whose do not.
         self._recent: deque[Prepared] = deque()
         self._active: list[Observation] = []
@@ -205,7 +211,7 @@ class Tracker:
         """Align a frame alone to the last keyframes, from where the track ended and from where they were taken."""
         state, _ = self._known()
         end = self.spline_valid[-1][1]
-        for ref in reversed(self._keyframes):
+        for ref in list(self._keyframes)[: -_KEPT_KEYFRAMES - 1 : -1]:
             for T_world_body in (state.spline.pose(end), ref.T_world_base):
                 trial = state.restarted(end, new.first_time, new.last_time, T_world_body)
                 first = trial.segment(new.first_time)
@@ -245,14 +251,32 @@ class Tracker:
             self._reference = self._maker.rolling(new.index, new.depth, new.colors, state.spline)
             self._unconverged, self._pixels = new, 0
             return False
+        if self._model is not None and self._return_to(state.spline.pose(frozen[-1].depth.exposure.mid_time), ref):
+            return True
         if self._unfit(frozen[-1]):
             return False
         self._new_keyframe(frozen[-1], ref if self.options.fuse else None)
         return True
 
+    def _return_to(self, T_world_cam: FloatArray, left: Reference) -> bool:
+        """Take the nearest of the older keyframes as the reference again, if one is near enough."""
+        far = [self.options.remoteness(se3.inverse(ref.T_world_base) @ T_world_cam) for ref in self._keyframes]
+        nearest = int(np.argmin(far))
+        if far[nearest] > _RETURN or self._keyframes[nearest] is left:
+            return False
+        ref = self._keyframes[nearest]
+        del self._keyframes[nearest]
+        self._keyframes.append(ref)
+        self._reference, self._pixels = ref, 0
+        return True
+
     def _fuse(self, done: Prepared, state: SplineState) -> None:
         ref = self._keyframes[-1]
-        if not self.options.fuse or done.index <= ref.index:
+        if done.index <= ref.index:
+            return
+        if self._model is not None:
+            self._model.add(done.depth, state.spline)
+        if not self.options.fuse:
             return
         self._keyframes[-1] = self._maker.fused(ref, done.depth, state.spline)
         if self._reference is ref:
@@ -265,7 +289,11 @@ class Tracker:
     def _new_keyframe(self, frame: Prepared, older: Reference | None) -> Reference:
         state = self._state
         assert state is not None
-        self._reference = self._maker.rectified(frame.index, frame.depth, frame.colors, state.spline, older)
+        if self._model is not None:
+            self._model.add(frame.depth, state.spline)
+            self._reference = self._model.keyframe(frame.index, frame.depth, frame.colors, state.spline)
+        else:
+            self._reference = self._maker.rectified(frame.index, frame.depth, frame.colors, state.spline, older)
         self._keyframes.append(self._reference)
         self._unconverged, self._pixels = None, 0
         self.keyframes += 1
