@@ -1,6 +1,6 @@
-"""How long a frame takes, and where the time goes.
+"""How long a frame takes, and where the time goes; the same frames through other people's trackers.
 
-print(time_methods(dataset, [Options(method="rs-g")], frames=150).text())
+print(time_methods(dataset, [Options(method="rs-g")], frames=150, peers=["open3d-hybrid"]).text())
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ import numpy as np
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rstrack.dataset import Dataset
-from rstrack.options import Options
+from rstrack.options import PEERS, Options
+from rstrack.peers import PeerTracker
+from rstrack.registered import Registrar, registered_image
 from rstrack.rig import Frame
 from rstrack.run import AnyTracker, Progress, make_tracker
 
@@ -98,7 +100,8 @@ class Stopwatch:
 class MethodTimes:
     """Of one method: the tracker's milliseconds for each counted frame, and the mean of each part of them.
 
-    read_ms: mean time to read and decode a frame's images, which `rstrack track` does meanwhile in another thread.
+    read_ms: mean time to read and decode a frame's images, which `rstrack track` does meanwhile in another thread; a
+    peer's, with registering them, which drivers do for its users.
     """
 
     method: str
@@ -121,7 +124,7 @@ class MethodTimes:
 
 @dataclass(frozen=True)
 class SpeedReport:
-    """Times of some methods on the same frames."""
+    """Times of some methods, peers last, on the same frames."""
 
     name: str
     camera: Camera
@@ -129,6 +132,15 @@ class SpeedReport:
     backend: str
     cpu_count: int
     methods: tuple[MethodTimes, ...]
+
+    @property
+    def ratios(self) -> dict[str, dict[str, float]]:
+        """For each peer the median times of all methods over its own."""
+        return {
+            peer.method: {m.method: m.median_ms / peer.median_ms for m in self.methods}
+            for peer in self.methods
+            if peer.method in PEERS
+        }
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON; milliseconds a frame."""
@@ -141,7 +153,8 @@ class SpeedReport:
         }  # fmt: skip
         size = [self.camera.width, self.camera.height]
         machine = {"backend": self.backend, "cpu_count": self.cpu_count}
-        return {"dataset": self.name, "depth_size": size, "frames": list(self.counted), **machine, "methods": methods}
+        head = {"dataset": self.name, "depth_size": size, "frames": list(self.counted), **machine}
+        return head | {"methods": methods, "ratios": self.ratios}
 
     def text(self) -> str:
         """A table, one column a method."""
@@ -151,25 +164,33 @@ class SpeedReport:
             ("median", [m.median_ms for m in self.methods]),
             ("mean", [m.mean_ms for m in self.methods]),
         ]
+        rows += [(f"times {peer}", list(ratios.values())) for peer, ratios in self.ratios.items()]
         names = sorted({part for m in self.methods for part in m.parts_ms}, key=lambda name: (name == "other", name))
         rows += [(f"  {name}", [m.parts_ms.get(name, 0.0) for m in self.methods]) for name in names]
         rows.append(("reading, decoding", [m.read_ms for m in self.methods]))
         head = f"{self.name}: depth {width}x{height}, frames {first} to {last - 1}, {self.backend}"
-        lines = [
-            f"{head}, {self.cpu_count} CPUs",
-            f"{'ms a frame':<30}" + "".join(f"{m.method:>11}" for m in self.methods),
-        ]
-        lines += [f"{label:<30}" + "".join(f"{value:>11.2f}" for value in values) for label, values in rows]
+        left = max(30, *(len(label) + 1 for label, _ in rows))
+        widths = [max(11, len(m.method) + 2) for m in self.methods]
+        names_of_methods = "".join(f"{m.method:>{width}}" for m, width in zip(self.methods, widths, strict=True))
+        lines = [f"{head}, {self.cpu_count} CPUs", f"{'ms a frame':<{left}}{names_of_methods}"]
+        for label, values in rows:
+            cells = (f"{value:>{width}.2f}" for value, width in zip(values, widths, strict=True))
+            lines.append(f"{label:<{left}}" + "".join(cells))
         lines += [f"note: {m.method} lost the track on {m.lost} of the frames" for m in self.methods if m.lost]
         return "\n".join([*lines, "Reading overlaps with tracking in 'rstrack track'; here it does not."])
 
 
 def time_methods(
-    dataset: Dataset, options: Sequence[Options], frames: int, progress: Progress = lambda *_: None
+    dataset: Dataset,
+    options: Sequence[Options],
+    frames: int,
+    progress: Progress = lambda *_: None,
+    peers: Sequence[str] = (),
 ) -> SpeedReport:
-    """Track the first `frames` frames with each of the options; the first 20, at most half, are not counted.
+    """Track the first `frames` frames with each of the options and peers; the first 20, at most half, do not count.
 
-    Raises UserError: fewer than two frames, an image that cannot be read, a tracker that breaks down.
+    Raises UserError: fewer than two frames, an image that cannot be read, a tracker that breaks down, a peer that is
+    unknown or not installed.
     """
     frames = min(frames, len(dataset))
     if frames < 2:
@@ -178,9 +199,13 @@ def time_methods(
     from rstrack.engine import engine
 
     backend = engine(options[0].backend).backend
-    methods = tuple(_time(dataset, o, frames, warm_up, progress) for o in options)
+    registrar = Registrar(dataset.rig)
+    # All of them before anything is timed: what is missing is said at once.
+    others = {name: PeerTracker(name, registrar.camera) for name in peers}
+    methods = [_time(dataset, o, frames, warm_up, progress) for o in options]
+    methods += [_time_peer(dataset, name, t, registrar, frames, warm_up, progress) for name, t in others.items()]
     cpu_count = os.cpu_count() or 1
-    return SpeedReport(dataset.name, dataset.rig.depth_camera, (warm_up, frames), backend, cpu_count, methods)
+    return SpeedReport(dataset.name, dataset.rig.depth_camera, (warm_up, frames), backend, cpu_count, tuple(methods))
 
 
 def _time(dataset: Dataset, options: Options, frames: int, warm_up: int, progress: Progress) -> MethodTimes:
@@ -205,6 +230,30 @@ def _time(dataset: Dataset, options: Options, frames: int, warm_up: int, progres
     lost = sum(report.lost for report in tracker.reports[warm_up:])
     read_ms = 1e3 * reading.seconds["read"] / len(counted)
     return MethodTimes(options.method, tuple(counted), read_ms, parts, tracker.keyframes, lost)
+
+
+def _time_peer(
+    dataset: Dataset,
+    name: str,
+    tracker: PeerTracker,
+    registrar: Registrar,
+    frames: int,
+    warm_up: int,
+    progress: Progress,
+) -> MethodTimes:
+    ms = np.empty((frames, 2))  # reading, tracking
+    for k in range(frames):
+        begin = time.perf_counter()
+        image = registered_image(dataset, registrar, k)
+        read = time.perf_counter()
+        tracker.feed(float(dataset.stamps[k]), image)
+        ms[k] = 1e3 * (read - begin), 1e3 * (time.perf_counter() - read)
+        progress(name, (k + 1) / frames, f"{ms[k, 1]:.0f} ms")
+    read_ms, mean_ms = ms[warm_up:].mean(axis=0).tolist()
+    lost = sum(report.lost for report in tracker.reports[warm_up:])
+    return MethodTimes(
+        name, tuple(ms[warm_up:, 1].tolist()), read_ms, {"Open3D's odometry": mean_ms}, tracker.keyframes, lost
+    )
 
 
 def _feed(tracker: AnyTracker, frame: Frame, k: int, options: Options) -> None:

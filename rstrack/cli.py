@@ -12,6 +12,7 @@ from typing import Any
 from rsgen.command_line import Commands, Parser, parse_frames, run_program
 from rsgen.errors import UserError
 from rstrack.cli_benchmarks import add_benchmarks
+from rstrack.cli_evaluation import add_evaluation
 from rstrack.cli_mapping import add_mapping
 from rstrack.cli_options import add_options, add_run, add_sequence, number, options_of
 
@@ -23,6 +24,7 @@ rstrack estimates the continuous-time trajectory of a rolling-shutter RGB-D came
   rstrack evaluate out/demo runs/demo                  errors against the ground truth
   rstrack plot out/demo runs/demo --out demo.png       path and errors as a picture
   rstrack map out/demo runs/demo --out mesh.ply        the surfaces that it saw, as a coloured mesh
+  rstrack bench --quick                                every method on some sequences, beside the paper's figures
 
 A sequence is a folder that 'rsgen render' wrote, or a TUM RGB-D or ICL-NUIM folder; those need their cameras in a
 camera.yaml or calibration.yaml inside, or in the file that --camera names.
@@ -88,6 +90,7 @@ def _parser() -> Parser:
     add_sequence(info)
 
     add_mapping(commands)
+    add_evaluation(commands)
     add_benchmarks(commands)
     return commands.parser
 

@@ -7,7 +7,7 @@ import json
 
 from rsgen.command_line import Commands, count
 from rstrack.cli_options import add_options, add_sequence, options_of
-from rstrack.options import METHODS
+from rstrack.options import METHODS, PEERS
 
 
 def add_benchmarks(commands: Commands) -> None:
@@ -25,6 +25,10 @@ def add_benchmarks(commands: Commands) -> None:
     bench.add_argument(
         "--method", action="append", choices=METHODS, dest="methods",
         help="method to time; may be given several times (default: rs-g and rs-pg)",
+    )  # fmt: skip
+    bench.add_argument(
+        "--peer", action="append", choices=PEERS, dest="peers", default=[],
+        help="time Open3D's odometry on the same frames; may be given several times",
     )  # fmt: skip
     add_options(bench, leave_out=("method",))
 
@@ -60,7 +64,7 @@ def _bench_speed(options: argparse.Namespace) -> int:
     chosen = [options_of(options, method=method) for method in options.methods or ("rs-g", "rs-pg")]
     dataset = open_dataset(options.sequence, options.camera)
     with ProgressDisplay(quiet=options.json) as progress:
-        report = time_methods(dataset, chosen, options.frames, progress)
+        report = time_methods(dataset, chosen, options.frames, progress, options.peers)
     print(json.dumps(report.as_dict(), indent=2) if options.json else report.text())
     return 0
 

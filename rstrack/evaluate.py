@@ -76,7 +76,9 @@ def evaluate(truth: Truth, estimate: Estimate, interpolate: bool = False) -> Met
     ATE (`rstrack.compare.align`): distances between positions after the rigid alignment, as in TUM's evaluate_ate.py.
 
     RPE: E = (T_true,i⁻¹ T_true,j)⁻¹ (T_est,i⁻¹ T_est,j), RMSE of its translation and angle over the pairs (i, j) of
-    `pairs_one_second_apart`; the estimate's association decides which true poses are meant.
+    `pairs_one_second_apart`; the estimate's association decides which true poses are meant. TUM's evaluate_rpe.py
+    multiplies in the other order, seeing each step from its end: the rotation is the same, the translation that of this
+    definition with time reversed.
 
     Errors by line: positions and rotations at all depth lines' mid-exposures where both splines are known, after the
     alignment of the frames' poses.

@@ -14,6 +14,8 @@ from rsgen.geometry.so3 import FloatArray
 
 Method = Literal["rs-pg", "rs-g", "rs-p", "gs-pg", "gs-g", "gs-p", "baseline"]
 METHODS: tuple[str, ...] = get_args(Method)
+PEERS: tuple[str, ...] = ("open3d-hybrid", "open3d-icp", "open3d-hybrid-keyframe", "open3d-icp-keyframe")
+"""Open3D's joint photometric and geometric error or its point-to-plane ICP; to the frame before or to a keyframe."""
 Strategy = Literal["converged", "newest"]
 STRATEGIES: tuple[str, ...] = get_args(Strategy)
 Source = Literal["keyframe", "model"]

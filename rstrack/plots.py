@@ -108,9 +108,9 @@ def _draw_path(axis: Any, truth: Truth | None, estimate: Estimate, found: Compar
             T_true = truth.motion.pose(stamps)
         drawn.append((stamps, T_true, {"color": _TRUE, "linewidth": 2.2, "alpha": 0.45, "label": "true"}))
     drawn.append((estimate.stamps, T_est, {"color": _ESTIMATED, "linewidth": 1.1, "label": "estimated"}))
-    a, b, is_flipped = _view(T_est)
+    a, b, is_flipped = view_from_above(T_est)
     for stamps, T, style in drawn:
-        axis.plot(*_broken(stamps, T[:, a, 3], T[:, b, 3])[1:], **style)
+        axis.plot(*broken(stamps, T[:, a, 3], T[:, b, 3])[1:], **style)
     axis.plot(*T_est[0, [a, b], 3], "o", color=_ESTIMATED, markersize=5, label="first pose")
     axis.set_aspect("equal", adjustable="datalim")
     if is_flipped:
@@ -127,7 +127,7 @@ def _draw_errors(axis: Any, panel: str, stamps: FloatArray, found: Comparison) -
     is_position = panel == "position"
     values = found.position_errors_m * 1e3 if is_position else found.rotation_errors_deg
     rms = float(np.sqrt(np.mean(values**2)))
-    axis.plot(*_broken(stamps, values), color=_ESTIMATED if is_position else _ORANGE, linewidth=0.9)
+    axis.plot(*broken(stamps, values), color=_ESTIMATED if is_position else _ORANGE, linewidth=0.9)
     axis.axhline(rms, color=_GREY, linewidth=1.0, linestyle="--", label=f"RMS {rms:.3g}")
     axis.set_title("position error, mm" if is_position else "rotation error, degrees", loc="left", fontsize=10)
     axis.set_ylim(bottom=0.0)
@@ -139,7 +139,7 @@ def _draw_frames(axis: Any, frames: Sequence[dict[str, Any]]) -> None:
     for key, color, label in (("inliers_depth", _ESTIMATED, "depth"), ("inliers_color", _ORANGE, "colour")):
         values = np.array([_number(frame.get(key)) for frame in frames])
         if np.isfinite(values).any():
-            axis.plot(*_broken(stamps, 100.0 * values), color=color, linewidth=0.9, label=label)
+            axis.plot(*broken(stamps, 100.0 * values), color=color, linewidth=0.9, label=label)
     # Room below 0 % for the ticks, which no curve can run into.
     axis.set_ylim(-14.0, 103.0)
     axis.set_yticks([0, 25, 50, 75, 100])
@@ -152,7 +152,7 @@ def _draw_frames(axis: Any, frames: Sequence[dict[str, Any]]) -> None:
         axis.legend(**_LEGEND)
 
 
-def _view(T_world_depth: FloatArray) -> tuple[int, int, bool]:
+def view_from_above(T_world_depth: FloatArray) -> tuple[int, int, bool]:
     """World axes to the right and upwards of a picture from above, and whether the upward one points down there.
 
     Up is the world axis that the camera's −y is nearest to in the mean: nothing else tells which way is up.
@@ -165,7 +165,7 @@ def _view(T_world_depth: FloatArray) -> tuple[int, int, bool]:
     return a, b, bool(up[k] * towards_viewer < 0.0)
 
 
-def _broken(stamps: FloatArray, *values: FloatArray) -> tuple[FloatArray, ...]:
+def broken(stamps: FloatArray, *values: FloatArray) -> tuple[FloatArray, ...]:
     """Stamps and values (n,) with a NaN in every gap, where a line then breaks off."""
     steps = np.diff(stamps)
     gaps = np.flatnonzero(steps > _GAP_STEPS * np.median(steps)) + 1 if steps.size else np.empty(0, np.int64)

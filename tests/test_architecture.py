@@ -18,11 +18,11 @@ SOURCES = sorted((ROOT / "rsgen").rglob("*.py"))
 TRACKER = sorted((ROOT / "rstrack").rglob("*.py"))
 # What rstrack builds on; the rest of rsgen renders, or is about rendering.
 SHARED = (
-    "backend", "command_line", "errors", "figures", "files", "geometry", "progress", "sequence", "sequence_format",
-    "trajectory",
+    "backend", "command_line", "errors", "figures", "files", "geometry", "progress", "scheduler", "sequence",
+    "sequence_format", "trajectory",
 )  # fmt: skip
 ENGINES = ("mitsuba", "drjit")
-CONFIGS = sorted((ROOT / "configs").glob("*.yaml"))
+CONFIGS = sorted(path for path in (ROOT / "configs").glob("*.yaml") if path.stem != "evaluation")
 
 
 def name(path: Path) -> str:
