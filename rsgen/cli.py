@@ -10,7 +10,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rsgen.cli_pictures import add_pictures
 from rsgen.command_line import Commands, Parser, count, parse_frames, run_program
+from rsgen.scheduler import SCHEDULER_HELP, open_workers
 
 if TYPE_CHECKING:
     from rsgen.config import Config
@@ -48,6 +50,7 @@ def _parser() -> Parser:
     render.add_argument("config", type=Path, help="YAML file, see configs/")
     render.add_argument("--out", type=Path, metavar="DIR", help="folder of the sequence (default: out/NAME)")
     render.add_argument("--frames", metavar="A:B", help="only frames A to B-1 (default: all)")
+    render.add_argument("--scheduler", metavar="ADDRESS|local[:N]", help=SCHEDULER_HELP)
     render.add_argument("--quiet", action="store_true", help="no progress")
 
     fit = add(
@@ -81,19 +84,7 @@ def _parser() -> Parser:
         "--raycast", type=count, default=0, metavar="N", help="cast N frames again with another ray caster (embreex)"
     )
 
-    compare = add(
-        "compare", _compare, "picture of one frame: global shutter, rolling shutter and their difference",
-        "out/demo --frame 20",
-    )  # fmt: skip
-    compare.add_argument("sequence", type=Path, help="folder that 'rsgen render' wrote")
-    compare.add_argument("--frame", type=int, required=True, help="index of the frame")
-    compare.add_argument("--out", type=Path, metavar="PNG", help="picture to write (default: SEQ/compare_FRAME.png)")
-    compare.add_argument("--scene", type=Path, help="scene file, if it has moved since the sequence was rendered")
-
-    preview = add("preview", _preview, "picture of some frames of a sequence with their depth", "out/demo --count 6")
-    preview.add_argument("sequence", type=Path, help="folder that 'rsgen render' wrote")
-    preview.add_argument("--out", type=Path, metavar="PNG", help="picture to write (default: SEQ/preview.png)")
-    preview.add_argument("--count", type=count, default=4, help="frames to show (default: 4)")
+    add_pictures(commands)
 
     export = add(
         "export", _export, "write a sequence in the layout of other tools",
@@ -160,8 +151,8 @@ def _render(options: argparse.Namespace) -> int:
     config = _config(options)
     frames = parse_frames(options.frames)
     out = options.out or Path("out") / config.name
-    with ProgressDisplay(options.quiet) as progress:
-        render_sequence(config, out, frames, progress)
+    with ProgressDisplay(options.quiet) as progress, open_workers(options.scheduler) as workers:
+        render_sequence(config, out, frames, progress, workers if options.scheduler else None)
     print(f"{out}: written (rsgen info {out}, rsgen verify {out})")
     return 0
 
@@ -214,20 +205,6 @@ def _verify(options: argparse.Namespace) -> int:
     report = verify_sequence(options.sequence, pairs=options.pairs, raycast=options.raycast)
     print(report.text())
     return 0 if report.ok else 1
-
-
-def _compare(options: argparse.Namespace) -> int:
-    from rsgen.inspect import compare_frame
-
-    print(compare_frame(options.sequence, options.frame, options.out, options.scene))
-    return 0
-
-
-def _preview(options: argparse.Namespace) -> int:
-    from rsgen.inspect import preview_sequence
-
-    print(preview_sequence(options.sequence, options.out, options.count))
-    return 0
 
 
 def _check_light(options: argparse.Namespace) -> int:

@@ -97,7 +97,7 @@ def joined(words: Sequence[str]) -> list[str]:
 
 def _is_negative(word: str) -> bool:
     try:
-        return word.startswith("-") and float(word) <= 0
+        return word.startswith("-") and float(word.partition(",")[0]) <= 0  # or a point: -1,2,3
     except ValueError:
         return False
 

@@ -11,14 +11,17 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
+from rsgen.limits import MOST_M, limits
 from rsgen.noise.settings import ColorNoiseConfig, DepthNoiseConfig
 
+Coordinate = Annotated[float, limits(-MOST_M, MOST_M, "m")]
+Pixels = Annotated[float, limits(-1e6, 1e6, "px")]
+Seconds = Annotated[float, limits(1e-9, 3600, "s", or_zero=True)]
 Vector4 = tuple[float, float, float, float]
 Matrix4 = tuple[Vector4, Vector4, Vector4, Vector4]
-Matrix34 = tuple[Vector4, Vector4, Vector4]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+Row34 = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
+Matrix34 = tuple[Row34, Row34, Row34]
+_LEAST_FOCAL_PX = 0.01
 
 
 class Section(BaseModel):
@@ -42,8 +45,12 @@ class TrajectoryConfig(Section):
     T_world_file: Matrix4 | None = Field(
         default=None, description="rigid transform that places the trajectory in the scene"
     )
-    knot_spacing_s: Positive = Field(default=0.05, description="knot spacing of the ground-truth spline, s")
-    smoothing: NonNegative = Field(default=0.0, description="weight of the acceleration penalty of the fit")
+    knot_spacing_s: Annotated[float, limits(1e-9, 1e3, "s")] = Field(
+        default=0.05, description="knot spacing of the ground-truth spline, s"
+    )
+    smoothing: Annotated[float, limits(0, 1e6, "s^4: 1 damps all but motions slower than a second")] = Field(
+        default=0.0, description="weight of the acceleration penalty of the fit, s^4"
+    )
 
     @field_validator("T_world_file")
     @classmethod
@@ -63,7 +70,9 @@ class LightConfig(Section):
     mode: Literal["baked", "path"] = Field(
         default="baked", description="baked irradiance (fast, clean) or path tracing"
     )
-    texel_m: Positive = Field(default=0.015, description="spacing of the baked irradiance samples, m")
+    texel_m: Annotated[float, limits(1e-3, 100, "m: memory grows with 1 / texel_m^2")] = Field(
+        default=0.015, description="spacing of the baked irradiance samples, m"
+    )
     direct_samples: int = Field(default=64, ge=1, le=4096, description="light samples per irradiance sample")
     gather_rays: int = Field(
         default=512, ge=16, le=16384, description="hemisphere rays per indirect sample, last bounce"
@@ -91,17 +100,21 @@ class StreamConfig(Section):
 
     width: int = Field(default=640, ge=8, le=16384, description="columns, px")
     height: int = Field(default=480, ge=8, le=16384, description="rows, px")
-    intrinsics: Vector4 = Field(
+    intrinsics: tuple[Pixels, Pixels, Pixels, Pixels] = Field(
         default=(481.2, 480.0, 319.5, 239.5), description="fx, fy, cx, cy, px; pixel centres integer"
     )
     model: Literal["pinhole", "radtan", "fisheye"] = Field(default="pinhole", description="distortion model")
-    distortion: tuple[Finite, ...] = Field(default=(), description="radtan k1 k2 p1 p2 [k3]; fisheye k1 k2 k3 k4")
-    rate_hz: Positive = Field(default=30.0, description="frames per second")
-    offset_s: Finite = Field(default=0.0, description="stamp of the first frame after the trajectory's first pose, s")
-    readout_s: NonNegative = Field(
+    distortion: tuple[Annotated[float, limits(-1e6, 1e6, "(coefficient)")], ...] = Field(
+        default=(), description="radtan k1 k2 p1 p2 [k3]; fisheye k1 k2 k3 k4"
+    )
+    rate_hz: Annotated[float, limits(1e-4, 1e5, "Hz")] = Field(default=30.0, description="frames per second")
+    offset_s: Annotated[float, limits(-1e9, 1e9, "s")] = Field(
+        default=0.0, description="stamp of the first frame after the trajectory's first pose, s"
+    )
+    readout_s: Seconds = Field(
         default=0.028, description="time from first to one past the last line, s; 0: global shutter"
     )
-    exposure_s: NonNegative = Field(default=0.0, description="exposure of each line, s; 0: no motion blur")
+    exposure_s: Seconds = Field(default=0.0, description="exposure of each line, s; 0: no motion blur")
     scan: Literal["top-bottom", "bottom-top", "left-right", "right-left"] = Field(
         default="top-bottom", description="order in which lines are read out"
     )
@@ -121,6 +134,8 @@ class StreamConfig(Section):
             camera, _ = self.camera, self.shutter
         except UserError as error:
             raise ValueError(str(error)) from None
+        if min(self.intrinsics[:2]) < _LEAST_FOCAL_PX:
+            raise ValueError(f"intrinsics: fx and fy must be at least {_LEAST_FOCAL_PX} px")
         blind = _pixel_without_ray(camera)
         if blind is not None:
             raise ValueError(
@@ -134,22 +149,28 @@ class ColorConfig(StreamConfig):
     """The colour camera."""
 
     spp: int = Field(default=16, ge=1, le=65536, description="samples per pixel (footprint and exposure window)")
-    exposure_gain: Positive = Field(default=1.0, description="factor on linear radiance before sRGB quantisation")
+    exposure_gain: Annotated[float, limits(1e-6, 1e6, "(factor)")] = Field(
+        default=1.0, description="factor on linear radiance before sRGB quantisation"
+    )
     noise: ColorNoiseConfig = ColorNoiseConfig()
 
 
 class DepthConfig(StreamConfig):
     """The depth camera: planar z through each pixel's centre, 16 bit."""
 
-    depth_scale: float = Field(default=5000.0, ge=1e-3, le=1e9, description="stored units per metre")
+    depth_scale: Annotated[float, limits(1e-3, 1e9, "units per metre")] = Field(
+        default=5000.0, description="stored units per metre"
+    )
     noise: DepthNoiseConfig = DepthNoiseConfig()
 
 
 def rigid(value: Matrix4) -> Matrix4:
-    """The value, if it is a rigid transform. Raises ValueError."""
+    """The value, if it is a rigid transform with its translation within MOST_M. Raises ValueError."""
     T = np.asarray(value, float)
     R = np.clip(T[:3, :3], -2, 2)  # absurd numbers stay wrong, without overflow on the way
     ok = np.isfinite(T).all() and np.allclose(R @ R.T, np.eye(3), atol=1e-5) and np.linalg.det(R) > 0
     if not (ok and np.array_equal(T[3], (0, 0, 0, 1))):
         raise ValueError("not a rigid transform: rows of an orthonormal rotation with the translation, then 0 0 0 1")
+    if np.abs(T).max() > MOST_M:
+        raise ValueError(f"its translation must lie within {MOST_M:g} m")
     return value

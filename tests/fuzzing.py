@@ -23,14 +23,21 @@ from rsgen.config import Config, describe_fields
 from rsgen.sequence_identity import color_truth
 
 # No field takes any of these.
-NEVER: tuple[Any, ...] = ("no such\tthing\n\x07", float("nan"), float("inf"), {"x": 1}, [{}], b"\x00\xff")
+NEVER: tuple[Any, ...] = (
+    "no such\tthing\n\x07",
+    float("nan"),
+    float("inf"),
+    1e300,
+    -1e300,
+    {"x": 1},
+    [{}],
+    b"\x00\xff",
+)
 # Some fields take some of these.
 EXTREME: tuple[Any, ...] = (
     -1,
     0,
     5e-324,
-    -1e300,
-    1e300,
     2**70,
     True,
     None,
@@ -96,7 +103,7 @@ def config_variants(name: str, seed: int, extremes: int) -> list[ConfigVariant]:
     value = _get(base, name)
     wrong: list[Any] = list(NEVER)
     if isinstance(value, list) and value and name not in ("truth.global_shutter", "truth.flow", "motion.waypoints"):
-        wrong += [value[:-1], [*value, value[0]], [*value[:-1], None], [*value[:-1], float("-inf")]]
+        wrong += [value[:-1], [*value, value[0]], *([*value[:-1], odd] for odd in (None, float("-inf"), 1e300))]
     chosen = [EXTREME[i] for i in rng.permutation(len(EXTREME))[:extremes]]
     last = name.split(".")[-1] if not name.endswith("intrinsics") else name.split(".")[0]  # "color: cx must be ..."
     wrong = [wrong[i] for i in rng.permutation(len(wrong))[:4]]
@@ -144,6 +151,25 @@ def structure_variants() -> Iterator[ConfigVariant]:
     yield refused("too late", "color.offset_s", 1e3, "offset_s")
     yield refused("too many frames", "depth.rate_hz", 1e12, "rate_hz")
     yield refused("too many knots", "trajectory.knot_spacing_s", 1e-9, "knot")
+    limits: tuple[tuple[str, Any, str], ...] = (
+        ("light.texel_m", 1e-9, "memory grows"),
+        ("light.texel_m", 1e9, "texel_m"),
+        ("color.exposure_gain", 1e7, "exposure_gain"),
+        ("color.exposure_gain", 5e-324, "exposure_gain"),
+        ("color.readout_s", 5e-324, "readout_s"),
+        ("depth.exposure_s", 1e9, "exposure_s"),
+        ("depth.rate_hz", 5e-324, "rate_hz"),
+        ("depth.depth_scale", 1e10, "depth_scale"),
+        ("color.noise.gain", 5e-324, "gain"),
+        ("color.noise.full_well_e", 1e-9, "full_well_e"),
+        ("depth.noise.disparity_step_px", 5e-324, "disparity_step_px"),
+        ("depth.noise.lateral_sigma_px", 1e5, "lateral_sigma_px"),
+        ("depth.noise.projector_baseline_m", 5e-324, "projector_baseline_m"),
+        ("color.intrinsics", [5e-324, 36.0, 23.5, 17.5], "fx"),
+        ("trajectory.T_world_file", [[1, 0, 0, 1e9], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "T_world_file"),
+    )
+    for name, value, word in limits:
+        yield refused(f"{name} = {value}"[:60], name, value, word)
     targets: tuple[tuple[str, Any, str], ...] = (
         ("length_m", 1e4, "length_m"),
         ("mean_rotation_deg_s", 1e4, "mean_rotation_deg_s"),
@@ -152,6 +178,11 @@ def structure_variants() -> Iterator[ConfigVariant]:
         ("shake_band_hz", [0.51, 0.52], "shake_band_hz"),
         ("shake_band_hz", [6.0, 0.5], "shake_band_hz"),
         ("strokes", 1000, "strokes"),
+        ("shake_position_m", 0.2, "shake_position_m"),
+        ("shake_rotation_deg", 11.0, "shake_rotation_deg"),
+        ("shake_exponent", 1e4, "shake_exponent"),
+        ("sway_hz", 3.0, "sway_hz"),
+        ("ramp_s", 0.05, "ramp_s"),
         ("position", LINE["target"], "position"),
         ("waypoints", TOUR["waypoints"], "waypoints"),
         ("clearance_m", 100.0, "clearance"),

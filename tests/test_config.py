@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import fuzzing
 import pytest
 import yaml
 from hypothesis import HealthCheck, example, given, settings
@@ -200,6 +203,90 @@ def test_every_field_is_described() -> None:
     assert rows["scene.file"][0] == "required" and rows["motion.kind"][0] == "required" and rows["color.spp"][0] == "16"
     assert "color.readout_s" in rows and "T_color_depth" in rows and "light.mode" in rows
     assert all(text for _, text in rows.values())
+
+
+# --- limits -----------------------------------------------------------------------------------------------------------
+
+LIMITS = [
+    ("trajectory.knot_spacing_s", 1e-9, 1e3),
+    ("trajectory.smoothing", 0.0, 1e6),
+    ("light.texel_m", 1e-3, 100),
+    ("color.rate_hz", 1e-4, 1e5),
+    ("color.offset_s", -1e9, 1e9),
+    ("color.readout_s", 1e-9, 3600),
+    ("depth.exposure_s", 1e-9, 3600),
+    ("color.exposure_gain", 1e-6, 1e6),
+    ("depth.depth_scale", 1e-3, 1e9),
+    ("color.noise.exposure_ev", -16, 16),
+    ("color.noise.full_well_e", 1, 1e9),
+    ("color.noise.read_noise_e", 0, 1e9),
+    ("color.noise.gain", 1e-3, 1000),
+    ("depth.noise.axial_nearest_m", 0, 1e4),
+    ("depth.noise.projector_baseline_m", 1e-4, 100),
+    ("depth.noise.lateral_sigma_px", 0, 100),
+    ("depth.noise.disparity_step_px", 1e-6, 100),
+    ("depth.noise.axial_growth_per_m", 0, 100),
+    ("depth.noise.gaussian_per_m", 0, 100),
+    ("motion.sway_hz", 1e-6, 2),
+    ("motion.shake_position_m", 0, 0.1),
+    ("motion.shake_rotation_deg", 0, 10),
+    ("motion.shake_exponent", 0, 8),
+    ("motion.ramp_s", 0.1, 0.9),  # of 2 s
+]
+
+
+@pytest.mark.parametrize(("name", "low", "high"), LIMITS)
+def test_numbers_are_taken_up_to_their_limits(name: str, low: float, high: float) -> None:
+    base = fuzzing.base_config(fuzzing.LINE if name.startswith("motion.") else None)
+    for value in (low, high):
+        validate_config(fuzzing.with_entry(base, name, value), "here")
+    below = low * 0.99 if low > 0 else low - 0.01 * max(1, abs(low))
+    for value in (below, high * 1.3):
+        with pytest.raises(UserError, match=rf"here: .*{name.rpartition('.')[2]}") as error:
+            validate_config(fuzzing.with_entry(base, name, value), "here")
+        assert "\n" not in str(error.value)
+
+
+def test_zero_switches_off_what_else_has_a_least_value() -> None:
+    for name in ("color.readout_s", "color.exposure_s", "color.noise.gain", "depth.noise.disparity_step_px"):
+        validate_config(fuzzing.with_entry(fuzzing.base_config(), name, 0), "here")
+
+
+def test_a_limit_says_its_reason(tmp_path: Path) -> None:
+    part = "light.texel_m: must lie in 0.001 to 100 m: memory grows with 1 / texel_m^2, got 0.0001"
+    refused(tmp_path, MINIMAL, part, overrides={"light.texel_m": "0.0001"})
+
+
+def numbers(data: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Where the floats of nested mappings and lists are."""
+    items = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ()
+    for key, value in items:
+        yield from numbers(value, (*at, key))
+    if isinstance(data, float):
+        yield at
+
+
+@pytest.mark.parametrize("motion", [None, fuzzing.LINE, fuzzing.TOUR])
+def test_no_number_is_unlimited(motion: dict[str, Any] | None) -> None:
+    base = fuzzing.base_config(motion)
+    base["color"] |= {"model": "radtan", "distortion": [0.0] * 5}
+    base["imu"] |= {"gyroscope_range": 10.0, "accelerometer_range": 100.0}
+    if motion is None:
+        base["trajectory"]["T_world_file"] = [[float(i == j) for j in range(4)] for i in range(4)]
+        base["trajectory"]["icl_start"] = base["trajectory"]["T_world_file"][:3]
+    validate_config(base, "here")
+    places = list(numbers(base))
+    assert len(places) > 100 and ("color", "noise", "gain") in places and ("trajectory", "smoothing") in places
+    for place in places:
+        for value in (1e300, -1e300):
+            data = copy.deepcopy(base)
+            inner = data
+            for key in place[:-1]:
+                inner = inner[key]
+            inner[place[-1]] = value
+            with pytest.raises(UserError) as error:
+                validate_config(data, "here")
+            assert all(str(key) in str(error.value) for key in place[:2] if isinstance(key, str)), str(error.value)
 
 
 FUZZ = settings(

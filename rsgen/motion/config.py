@@ -6,10 +6,12 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-Finite = Annotated[float, Field(allow_inf_nan=False, ge=-1e4, le=1e4)]
-Positive = Annotated[float, Field(gt=0, le=1e4, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, le=1e4, allow_inf_nan=False)]
-Vector3 = tuple[Finite, Finite, Finite]
+from rsgen.limits import limits
+
+Coordinate = Annotated[float, limits(-1e4, 1e4, "m")]
+Share = Annotated[float, limits(0, 1e4, "(relative)")]
+Hertz = Annotated[float, limits(1e-6, 50, "Hz")]
+Vector3 = tuple[Coordinate, Coordinate, Coordinate]
 
 MAX_DURATION_S = 3600.0
 """Longer motions are refused: a length or speed in the wrong unit."""
@@ -38,9 +40,13 @@ class MotionConfig(BaseModel):
     kind: Literal["line", "roll", "tour"] = Field(
         description="line: to and fro along the camera's x axis; roll: to and fro about its z axis; tour: by waypoints"
     )
-    length_m: Positive = Field(description="length of the path, hand-shake included, m")
-    mean_speed_m_s: Positive = Field(description="mean translational speed, m/s; decides the duration")
-    mean_rotation_deg_s: Positive = Field(description="mean rotational speed, hand-shake included, deg/s")
+    length_m: Annotated[float, limits(1e-6, 1e4, "m")] = Field(description="length of the path, hand-shake included, m")
+    mean_speed_m_s: Annotated[float, limits(1e-6, 1e4, "m/s")] = Field(
+        description="mean translational speed, m/s; decides the duration"
+    )
+    mean_rotation_deg_s: Annotated[float, limits(1e-6, 1e4, "deg/s")] = Field(
+        description="mean rotational speed, hand-shake included, deg/s"
+    )
     position: Vector3 | None = Field(default=None, description="line, roll: first camera centre, world, m")
     target: Vector3 | None = Field(default=None, description="line, roll: first point looked at, world, m")
     strokes: int = Field(default=8, ge=1, le=1000, description="line: ways there or back; roll: swings")
@@ -49,21 +55,31 @@ class MotionConfig(BaseModel):
         default=True,
         description="tour: round and round until the length is used up; else once, scaled about the waypoints' mean",
     )
-    sway: tuple[NonNegative, NonNegative, NonNegative] = Field(
+    sway: tuple[Share, Share, Share] = Field(
         default=(0.5, 1.0, 0.5),
         description="line, tour: slow turning about the camera's x, y, z; relative, its size follows from the targets",
     )
-    sway_hz: Positive = Field(default=0.3, le=2.0, description="line, tour: frequency of the turning about y, Hz")
-    ramp_s: Positive = Field(default=1.0, ge=0.1, description="time of the smooth start, and of the stop, s")
-    shake_position_m: NonNegative = Field(default=0.0, le=0.1, description="hand-shake along each axis, RMS, m")
-    shake_rotation_deg: NonNegative = Field(default=0.0, le=10, description="hand-shake about each axis, RMS, deg")
-    shake_band_hz: tuple[Positive, Positive] = Field(
+    sway_hz: Annotated[float, limits(1e-6, 2, "Hz: 50 ms knots follow no faster turning")] = Field(
+        default=0.3, description="line, tour: frequency of the turning about y, Hz"
+    )
+    ramp_s: Annotated[float, limits(0.1, 1e4, "s")] = Field(
+        default=1.0, description="time of the smooth start, and of the stop, s"
+    )
+    shake_position_m: Annotated[float, limits(0, 0.1, "m")] = Field(
+        default=0.0, description="hand-shake along each axis, RMS, m"
+    )
+    shake_rotation_deg: Annotated[float, limits(0, 10, "deg")] = Field(
+        default=0.0, description="hand-shake about each axis, RMS, deg"
+    )
+    shake_band_hz: tuple[Hertz, Hertz] = Field(
         default=(0.5, 6.0), description="band of the hand-shake, Hz; 50 ms knots follow up to about 6 Hz"
     )
-    shake_exponent: NonNegative = Field(
-        default=3.0, le=8, description="p of the hand-shake's power spectrum f^-p within the band"
+    shake_exponent: Annotated[float, limits(0, 8, "(exponent)")] = Field(
+        default=3.0, description="p of the hand-shake's power spectrum f^-p within the band"
     )
-    clearance_m: NonNegative = Field(default=0.15, description="least distance of the path to the scene's surfaces, m")
+    clearance_m: Annotated[float, limits(0, 1e4, "m")] = Field(
+        default=0.15, description="least distance of the path to the scene's surfaces, m"
+    )
     seed: int | None = Field(
         default=None, ge=0, lt=2**31, description="seed of the hand-shake; default: the sequence's"
     )

@@ -6,8 +6,13 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+from rsgen.limits import limits
+
+Electrons = Annotated[float, limits(0, 1e9, "electrons")]
+Metres = Annotated[float, limits(0, 1e4, "m")]
+PerMetre = Annotated[float, limits(0, 100, "1/m")]
+Pixels = Annotated[float, limits(0, 100, "px")]
+Balance = Annotated[float, limits(1e-3, 1e3, "(factor)")]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Stops = Annotated[float, Field(ge=-16, le=16)]
 Angle = Annotated[float, Field(ge=0, le=90)]
@@ -27,15 +32,17 @@ class ColorNoiseConfig(_Settings):
     corner_loss: float = Field(
         default=0.25, ge=0, lt=1, description="vignetting: fraction of the light lost in the image's corners"
     )
-    full_well_e: Positive = Field(default=6000.0, description="electrons of a white pixel at gain 1")
-    read_noise_e: NonNegative = Field(default=4.0, description="read noise, electrons RMS")
-    gain: Annotated[float, Field(ge=0, le=1000)] = Field(
+    full_well_e: Annotated[float, limits(1, 1e9, "electrons")] = Field(
+        default=6000.0, description="electrons of a white pixel at gain 1"
+    )
+    read_noise_e: Electrons = Field(default=4.0, description="read noise, electrons RMS")
+    gain: Annotated[float, limits(1e-3, 1000, "(ISO / base ISO)", or_zero=True)] = Field(
         default=2.0, description="gain (ISO / base ISO): white is full_well_e / gain electrons; 0: no noise"
     )
     bayer: Literal["off", "bilinear", "edge-aware"] = Field(
         default="off", description="RGGB mosaic and how it is demosaicked; off: three values at every pixel"
     )
-    white_balance: tuple[Positive, Positive, Positive] = Field(
+    white_balance: tuple[Balance, Balance, Balance] = Field(
         default=(1.03, 1.0, 0.96), description="error of the white balance: factors on R, G, B after the noise"
     )
     response: Literal["srgb", "gamma"] = Field(default="srgb", description="tone curve, linear to 8 bit")
@@ -52,27 +59,29 @@ class DepthNoiseConfig(_Settings):
         default="none",
         description="none: exact; kinect: structured light; tof: axial noise, flying pixels; gaussian: sigma ~ z^2",
     )
-    min_range_m: NonNegative = Field(default=0.4, description="nearest depth reported, m (all models but none)")
-    max_range_m: Positive = Field(default=8.0, description="farthest depth reported, m (all models but none)")
+    min_range_m: Metres = Field(default=0.4, description="nearest depth reported, m (all models but none)")
+    max_range_m: Metres = Field(default=8.0, description="farthest depth reported, m (all models but none)")
     grazing_deg: tuple[Angle, Angle] = Field(
         default=(70.0, 82.0),
         description="kinect, tof: angles between ray and normal from which returns begin to fail, and all fail, deg",
     )
-    projector_baseline_m: Positive = Field(
+    projector_baseline_m: Annotated[float, limits(1e-4, 100, "m")] = Field(
         default=0.075, description="kinect: camera to projector along the camera's +x axis, m"
     )
     shadow: bool = Field(default=True, description="kinect: nothing where the projector's light does not reach")
-    lateral_sigma_px: NonNegative = Field(default=0.5, description="kinect: shift of the lookup in x and y, px RMS")
-    disparity_sigma_px: NonNegative = Field(default=1 / 48, description="kinect: noise of the disparity, px RMS")
-    disparity_step_px: NonNegative = Field(default=0.125, description="kinect: quantisation step, px; 0: none")
+    lateral_sigma_px: Pixels = Field(default=0.5, description="kinect: shift of the lookup in x and y, px RMS")
+    disparity_sigma_px: Pixels = Field(default=1 / 48, description="kinect: noise of the disparity, px RMS")
+    disparity_step_px: Annotated[float, limits(1e-6, 100, "px", or_zero=True)] = Field(
+        default=0.125, description="kinect: quantisation step, px; 0: none"
+    )
     edge_dropout: Fraction = Field(default=0.5, description="kinect: probability of no return beside a depth edge")
-    axial_base_m: NonNegative = Field(default=0.0012, description="tof: sigma = base + growth (z - nearest)^2; base, m")
-    axial_growth_per_m: NonNegative = Field(default=0.0019, description="tof: growth, 1/m")
-    axial_nearest_m: NonNegative = Field(default=0.4, description="tof: depth of the least noise, m")
+    axial_base_m: Metres = Field(default=0.0012, description="tof: sigma = base + growth (z - nearest)^2; base, m")
+    axial_growth_per_m: PerMetre = Field(default=0.0019, description="tof: growth, 1/m")
+    axial_nearest_m: Metres = Field(default=0.4, description="tof: depth of the least noise, m")
     flying_pixels: Fraction = Field(
         default=0.3, description="tof: probability that a pixel beside a depth edge mixes both sides"
     )
-    gaussian_per_m: NonNegative = Field(default=1.2e-3, description="gaussian: sigma / z^2, 1/m")
+    gaussian_per_m: PerMetre = Field(default=1.2e-3, description="gaussian: sigma / z^2, 1/m")
 
     @model_validator(mode="after")
     def _limits_are_ordered(self) -> DepthNoiseConfig:
