@@ -5,9 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsgen.config import Config, TrajectoryConfig
+from rsgen.distribute import engine_versions, render_blocks, render_shots
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_yaml
 from rsgen.fit import FitResult, fit_spline
-from rsgen.frame_source import ColorShot, DepthShot, FrameSource, Progress, load_scene, scene_hash
+from rsgen.frame_source import FrameSource, Progress, load_scene, scene_hash
 from rsgen.geometry.spline import Spline
 from rsgen.motion.clearance import check_clearance
 from rsgen.motion.make import make_motion
+from rsgen.scheduler import Workers
 from rsgen.sequence_format import STREAMS, stream_stamps
 from rsgen.sequence_writer import SequenceWriter
 from rsgen.trajectory import Trajectory, read_trajectory
@@ -30,8 +30,6 @@ log = logging.getLogger("rsgen")
 
 # About 12 days. Up to here a float64 tells 0.1 ns apart; in Unix time 0.24 us, half a percent of a line delay.
 _LARGEST_STAMP_S = 1e6
-# Written frames that may wait for the disk: bounds memory and how much a kill can lose.
-_WRITE_AHEAD = 4
 
 # What a sequence folder remembers of the machine that rendered it, for commands that render again. Not part of the
 # format: a sequence is whole without it.
@@ -81,8 +79,12 @@ def sequence_stamps(config: Config, motion: Motion) -> dict[str, NDArray[np.floa
     return {s: stream_stamps(motion.first_stamp, motion.last_stamp, getattr(config, s)) for s in STREAMS}
 
 
-def render_sequence(config: Config, out: Path, frames: slice, progress: Progress) -> Path:
+def render_sequence(
+    config: Config, out: Path, frames: slice, progress: Progress, workers: Workers | None = None
+) -> Path:
     """Render the missing frames among `frames` into `out` and (re)write its listings and truth; returns `out`.
+
+    workers: what renders (and bakes the light) in place of this process; the bytes are the same.
 
     Raises UserError on any bad input, or if `out` holds another sequence; nothing already written is lost.
     """
@@ -102,45 +104,20 @@ def render_sequence(config: Config, out: Path, frames: slice, progress: Progress
     todo = sorted(
         [(k, stream) for stream in STREAMS for k in _chosen(writer.missing(stream), frames, len(stamps[stream]))],
     )
-    source = FrameSource(config, progress, scene=scene) if todo or not (out / "scene.ply").is_file() else None
-    if source is not None and not (out / "scene.ply").is_file():
-        write_scene_ply(source.scene, out / "scene.ply")
-    done = 0
-    with ThreadPoolExecutor(max_workers=2) as pool:
-        pending: list[Future[None]] = []
-        try:
-            for k, stream in todo:
-                assert source is not None
-                stamp = float(writer.stamps(stream)[k])
-                if stream == "color":
-                    following = writer.stamps("color")[k + 1 : k + 2].tolist()
-                    shot = source.expose_color(writer.spline, stamp, k, following[0] if following else None)
-                    pending.append(pool.submit(_write_color, writer, source, shot))
-                else:
-                    measured = source.expose_depth(writer.spline, stamp, k)
-                    pending.append(pool.submit(_write_depth, writer, source, measured))
-                while len(pending) > _WRITE_AHEAD:
-                    pending.pop(0).result()
-                done += 1
-                progress("frames", done / len(todo), f"frame {k}")
-            for write in pending:
-                write.result()
-        except (KeyboardInterrupt, SystemExit):
-            # A run that the user ends here leaves a readable, shorter sequence.
-            for write in pending:
-                write.result()
-            writer.finish()
-            raise
+    if not (out / "scene.ply").is_file():
+        scene = scene or load_scene(config)
+        write_scene_ply(scene, out / "scene.ply")
+    try:
+        if todo and workers is not None:
+            render_blocks(writer, todo, *identity, workers, progress)
+        elif todo:
+            render_shots(writer, FrameSource(config, progress, scene=scene), todo, progress)
+    except (KeyboardInterrupt, SystemExit):
+        # A run that the user ends here leaves a readable, shorter sequence.
+        writer.finish()
+        raise
     writer.finish()
     return out
-
-
-def _write_color(writer: SequenceWriter, source: FrameSource, shot: ColorShot) -> None:
-    writer.write_color(shot.frame, *source.develop_color(shot))
-
-
-def _write_depth(writer: SequenceWriter, source: FrameSource, shot: DepthShot) -> None:
-    writer.write_depth(shot.frame, shot.z, source.develop_depth(shot))
 
 
 def _chosen(missing: Iterable[int], frames: slice, count: int) -> list[int]:
@@ -170,14 +147,6 @@ def write_origin(out: Path, config: Config) -> None:
     if config.trajectory.file is not None:
         where["trajectory"] = str(config.trajectory.file.resolve())
     atomic_write(out / ORIGIN, encode_yaml(where))
-
-
-def engine_versions(config: Config) -> dict[str, str]:
-    """Versions of the programs that decide a sequence's bytes, and the Dr.Jit variant that runs."""
-    from rsgen.backend import mitsuba
-
-    names = ("rolling-shutter-rgbd", "mitsuba", "drjit", "numpy", "scipy")
-    return {name: version(name) for name in names} | {"variant": mitsuba(config.backend).variant()}
 
 
 def input_hashes(config: Config) -> dict[str, str]:

@@ -50,7 +50,8 @@ def test_there_is_something_to_check() -> None:
     [
         "rsgen.geometry.so3", "rsgen.geometry.se3", "rsgen.geometry.spline", "rsgen.geometry.camera",
         "rsgen.geometry.shutter", "rsgen.sequence", "rsgen.verify", "rsgen.config", "rsgen.trajectory", "rsgen.fit",
-        "rsgen.fit_report", "rsgen.backend", "rsgen.generate", "rsgen.frame_source", "rsgen.inspect", "rsgen.cli",
+        "rsgen.fit_report", "rsgen.backend", "rsgen.scheduler", "rsgen.distribute",
+        "rsgen.generate", "rsgen.frame_source", "rsgen.inspect", "rsgen.cli",
         "rsgen.motion.make", "rsgen.noise.color", "rsgen.noise.depth", "rsgen.imu", "rsgen.truth.settings",
         "rsgen.export.kalibr", "rsgen.export.euroc", "rsgen.export.registered", "rsgen.export.video",
     ],
