@@ -65,9 +65,12 @@ demo() {
   .venv/bin/rstrack track out/demo --out out/demo_track
   .venv/bin/rstrack evaluate out/demo out/demo_track
   .venv/bin/rstrack plot out/demo out/demo_track --out out/demo_track/plot.png
+  .venv/bin/rstrack report out/demo_track
 }
 
 test_all() {
+  command -v chromium >/dev/null || command -v google-chrome >/dev/null || apt_install chromium ||
+    say "no chromium: the tests of the report in a browser are skipped"
   .venv/bin/ruff check .
   .venv/bin/ruff format --check .
   .venv/bin/mypy

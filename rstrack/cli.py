@@ -15,6 +15,7 @@ from rstrack.cli_benchmarks import add_benchmarks
 from rstrack.cli_evaluation import add_evaluation
 from rstrack.cli_mapping import add_mapping
 from rstrack.cli_options import add_options, add_run, add_sequence, number, options_of
+from rstrack.cli_report import add_report
 
 _DESCRIPTION = """\
 rstrack estimates the continuous-time trajectory of a rolling-shutter RGB-D camera: every line has its own pose.
@@ -23,6 +24,7 @@ rstrack estimates the continuous-time trajectory of a rolling-shutter RGB-D came
   rstrack track out/demo --out runs/demo               track it; the trajectory is in runs/demo
   rstrack evaluate out/demo runs/demo                  errors against the ground truth
   rstrack plot out/demo runs/demo --out demo.png       path and errors as a picture
+  rstrack report runs/demo                             all of it as one HTML page
   rstrack map out/demo runs/demo --out mesh.ply        the surfaces that it saw, as a coloured mesh
   rstrack bench --quick                                every method on some sequences, beside the paper's figures
 
@@ -89,6 +91,7 @@ def _parser() -> Parser:
     info = commands.add("info", _info, "say what would be tracked: cameras, shutters, frames, truth", "out/lr_kt2")
     add_sequence(info)
 
+    add_report(commands)
     add_mapping(commands)
     add_evaluation(commands)
     add_benchmarks(commands)

@@ -275,8 +275,11 @@ def _settings(dataset: Dataset, chosen: range, options: Options, noise: Noise) -
         "versions": {"rstrack": version("rolling-shutter-rgbd"), **versions},
         "backend": engine(options.backend).backend,
         "machine": {"cpu_count": os.cpu_count()},
-        "dataset": {"name": dataset.name, "frames": [chosen.start, chosen.stop], "frames_in_all": len(dataset)},
-    }
+        "dataset": {
+            "name": dataset.name, "path": str(dataset.root.resolve()),
+            "frames": [chosen.start, chosen.stop], "frames_in_all": len(dataset),
+        },
+    }  # fmt: skip
 
 
 def _timings(total_s: float, seconds: Sequence[float]) -> dict[str, Any]:

@@ -1,0 +1,60 @@
+"""`rstrack report`: which page a folder gets, and where it is written.
+
+out = write_report(Path("runs/lr_kt2"))
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from importlib.metadata import version
+from pathlib import Path
+
+from rsgen.errors import UserError
+from rsgen.files import atomic_write, write_error
+from rstrack.estimate import TRAJECTORY
+from rstrack.report.bench import bench_page
+from rstrack.report.page import Page, render
+from rstrack.report.results import RESULTS
+from rstrack.report.run import run_page
+from rstrack.run import Progress
+
+REPORT = "report.html"
+
+
+def write_report(
+    folder: Path, sequence: Path | None = None, out: Path | None = None, camera_file: Path | None = None,
+    progress: Progress = lambda *_: None,
+) -> Path:  # fmt: skip
+    """Write the page of a run folder, a TUM file with a sequence, or a benchmark's folder; returns its path.
+
+    sequence: where the run's sequence is, by default where run.json says. out: the file, by default report.html in the
+    folder. camera_file: as in `rstrack.dataset.open_dataset`. progress: called with a stage, the fraction done (0 to 1)
+    and a note. Raises UserError: `folder` is none of these, something that was named cannot be read, or the page cannot
+    be written.
+    """
+    folder = Path(folder)
+    page = dataclasses.replace(
+        _page(folder, sequence, camera_file, progress), made_with=f"rstrack {version('rolling-shutter-rgbd')}"
+    )
+    out = out or (folder / REPORT if folder.is_dir() else folder.with_suffix(".html"))
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise write_error(out, error) from None
+    atomic_write(out, render(page).encode())
+    return out
+
+
+def _page(folder: Path, sequence: Path | None, camera_file: Path | None, progress: Progress) -> Page:
+    if (folder / RESULTS).is_file():
+        if sequence is not None or camera_file is not None:
+            raise UserError(
+                f"{folder}: a benchmark names its sequences in {RESULTS}: leave --sequence and --camera out"
+            )
+        return bench_page(folder, progress)
+    if folder.is_dir() and not (folder / TRAJECTORY).is_file():
+        raise UserError(
+            f"{folder}: holds neither {TRAJECTORY} nor {RESULTS}: give a folder that 'rstrack track' or "
+            "'rstrack bench' wrote"
+        )
+    return run_page(folder, sequence, camera_file)

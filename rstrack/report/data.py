@@ -1,0 +1,125 @@
+"""What a report knows of one run: the estimate, the truth it is compared with, and errors as functions of time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsgen.errors import UserError
+from rsgen.geometry import se3
+from rsgen.geometry.so3 import FloatArray
+from rsgen.geometry.spline import Spline
+from rstrack.compare import Comparison, Truth, angles_deg, compare, truth_of
+from rstrack.dataset import Dataset, open_dataset
+from rstrack.estimate import Estimate, read_estimate
+from rstrack.evaluate import pairs_one_second_apart
+
+# Points of the true path, of which there is one at any time.
+_PATH_POINTS = 1000
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """One estimate and what it is compared with; dataset, truth, found: None where they cannot be had.
+
+    notes: why not.
+    """
+
+    estimate: Estimate
+    dataset: Dataset | None = None
+    truth: Truth | None = None
+    found: Comparison | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def path(self) -> tuple[FloatArray, FloatArray]:
+        """Stamps (n,) s and T_world_depth (n, 4, 4) of the estimate, in the truth's world where there is one."""
+        T = self.estimate.T_world_depth
+        return self.estimate.stamps, T if self.found is None else self.found.T_true_est @ T
+
+    @property
+    def frames(self) -> list[dict[str, Any]]:
+        """The tracker's diagnostics, one dict a frame."""
+        frames = self.estimate.info.get("frames")
+        if not isinstance(frames, list):
+            return []
+        return [f for f in frames if isinstance(f, dict) and isinstance(f.get("stamp"), int | float)]
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Relative pose error over one second from each of the times (k,) s on: mm (k,) and degrees (k,)."""
+
+    stamps: FloatArray
+    translation_mm: FloatArray
+    rotation_deg: FloatArray
+
+
+def load_run(
+    run: Path, sequence: Path | None = None, camera_file: Path | None = None, dataset: Dataset | None = None
+) -> Tracked:
+    """Read a run folder and compare it with the truth of its sequence.
+
+    sequence: the folder where the sequence is; by default the one that run.json names, and if that is gone there is no
+    comparison. dataset: the same, already open. Raises UserError: no run, or a given sequence cannot be read.
+    """
+    estimate = read_estimate(run)
+    notes: list[str] = []
+    if dataset is None:
+        dataset = _dataset(estimate, sequence, camera_file, notes)
+    if dataset is None:
+        return Tracked(estimate, notes=tuple(notes))
+    truth = truth_of(dataset)
+    if truth is None:
+        notes.append(f"The sequence {dataset.name} has no ground truth, so there are no errors to show.")
+        return Tracked(estimate, dataset, notes=tuple(notes))
+    try:
+        found = compare(truth, estimate)
+    except UserError as error:
+        return Tracked(estimate, dataset, truth, notes=(*notes, f"No errors: {error}."))
+    return Tracked(estimate, dataset, truth, found, tuple(notes))
+
+
+def true_path(truth: Truth, begin: float, end: float) -> tuple[FloatArray, FloatArray]:
+    """Times (n,) s within [begin, end] and poses T_world_depth (n, 4, 4) of the true path there."""
+    motion = truth.motion
+    if not isinstance(motion, Spline):
+        inside = (motion.stamps >= begin - 1e-6) & (motion.stamps <= end + 1e-6)
+        return motion.stamps[inside], motion.T_world_cam[inside]
+    t = np.linspace(max(begin, motion.t_begin), min(end, motion.t_end), _PATH_POINTS)
+    return t, motion.pose(t)
+
+
+def drift(estimate: Estimate, found: Comparison) -> Drift:
+    """The errors whose RMS `rstrack.evaluate.evaluate` gives as RPE, with the time at which each second begins."""
+    row = np.full(len(estimate.stamps), -1)
+    row[found.index] = np.arange(len(found.index))
+    i, j = pairs_one_second_apart(estimate.stamps)
+    both = (row[i] >= 0) & (row[j] >= 0)
+    stamps, i, j = estimate.stamps[i[both]], row[i[both]], row[j[both]]
+    true_step = se3.inverse(found.T_world_true[i]) @ found.T_world_true[j]
+    est_step = se3.inverse(found.T_world_est[i]) @ found.T_world_est[j]
+    error = se3.inverse(true_step) @ est_step
+    return Drift(stamps, 1e3 * np.linalg.norm(error[:, :3, 3], axis=1), angles_deg(true_step, est_step))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _dataset(estimate: Estimate, sequence: Path | None, camera_file: Path | None, notes: list[str]) -> Dataset | None:
+    if sequence is not None:
+        return open_dataset(sequence, camera_file)
+    recorded = estimate.info.get("dataset")
+    path = recorded.get("path") if isinstance(recorded, dict) else None
+    if not isinstance(path, str):
+        notes.append("The run does not say where its sequence is, so there are no errors and no images: name it with "
+                     "--sequence.")  # fmt: skip
+        return None
+    try:
+        return open_dataset(Path(path), camera_file)
+    except UserError as error:
+        notes.append(f"No errors and no images: {error}. If the sequence has moved, name it with --sequence.")
+        return None

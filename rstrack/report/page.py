@@ -1,0 +1,171 @@
+"""The page: what it is made of, and how that becomes one HTML file that loads nothing.
+
+html = render(Page("lr_kt2", "tracked with rs-pg", cards, facts, (Section("errors", "Errors", blocks),)))
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any, Literal
+
+from rstrack.estimate import plain
+
+Figure = dict[str, Any]
+"""A plotly figure as plain data: {"data": [trace, ...], "layout": {...}}."""
+
+
+@dataclass(frozen=True)
+class Card:
+    """One number that a reader wants: its value with a unit, what it is, and what to compare it with."""
+
+    value: str
+    label: str
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class CardRow:
+    """Cards side by side; title: what they have in common."""
+
+    cards: tuple[Card, ...]
+    title: str = ""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A cell of a table. note: small print below. is_best: of its row. is_worse: than the paper's."""
+
+    text: str
+    note: str = ""
+    is_best: bool = False
+    is_worse: bool = False
+
+
+@dataclass(frozen=True)
+class Table:
+    """head: the columns' headings, the first above the rows' names. rows: as long as the head."""
+
+    head: tuple[str, ...]
+    rows: tuple[tuple[Cell | str, ...], ...]
+    caption: str = ""
+    block: Literal["table"] = "table"
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A plotly figure. One in 3D is drawn from above where the browser has no WebGL."""
+
+    title: str
+    figure: Figure
+    note: str = ""
+    block: Literal["plot"] = "plot"
+
+    @property
+    def is_3d(self) -> bool:
+        """Whether it can be turned."""
+        return "scene" in self.figure["layout"]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """uri: an image as a data URI. alt: what it shows, in words."""
+
+    uri: str
+    caption: str
+    alt: str
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Pictures side by side."""
+
+    items: tuple[Picture, ...]
+    block: Literal["pictures"] = "pictures"
+
+
+@dataclass(frozen=True)
+class Slider:
+    """Two pictures of one size on top of each other; a slider uncovers the one below."""
+
+    title: str
+    before: Picture
+    after: Picture
+    note: str = ""
+    block: Literal["slider"] = "slider"
+
+
+@dataclass(frozen=True)
+class Note:
+    """A sentence or two. is_warning: something is wrong or missing."""
+
+    text: str
+    is_warning: bool = False
+    block: Literal["note"] = "note"
+
+
+Block = Table | Plot | Pictures | Slider | Note
+
+
+@dataclass(frozen=True)
+class Chooser:
+    """Of several groups of blocks, by name, one is shown at a time."""
+
+    label: str
+    options: tuple[tuple[str, tuple[Block, ...]], ...]
+    block: Literal["chooser"] = "chooser"
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the page; key: its anchor."""
+
+    key: str
+    title: str
+    blocks: tuple[Block | Chooser, ...]
+
+
+@dataclass(frozen=True)
+class Page:
+    """cards: the numbers at the top, by rows. facts: (what, value). All text is plain: the page escapes it."""
+
+    title: str
+    subtitle: str
+    cards: tuple[CardRow, ...]
+    sections: tuple[Section, ...]
+    facts: tuple[tuple[str, str], ...] = ()
+    warnings: tuple[str, ...] = ()
+    made_with: str = ""
+
+
+def render(page: Page) -> str:
+    """The page as HTML with everything in it: styles, scripts, plotly.js (once), figures and pictures."""
+    from jinja2 import Environment, StrictUndefined  # imports of a tenth of a second, which only a report needs
+    from markupsafe import Markup
+    from plotly.offline import get_plotlyjs  # type: ignore[import-untyped]
+
+    figures: list[Figure] = []
+
+    def add_figure(plot: Plot) -> int:
+        figures.append(plot.figure)
+        return len(figures) - 1
+
+    here = files("rstrack.report")
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
+    )
+    environment.globals["add_figure"] = add_figure
+    template = environment.from_string((here / "page.html").read_text("utf-8"))
+    return template.render(
+        page=page,
+        css=Markup((here / "page.css").read_text("utf-8")),
+        script=Markup((here / "page.js").read_text("utf-8")),
+        plotly=Markup(get_plotlyjs()),
+        figures=lambda: Markup(_json(figures)),
+    )
+
+
+def _json(data: Any) -> str:
+    """JSON that no text in it can end the script element early."""
+    return json.dumps(plain(data), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")

@@ -1,0 +1,118 @@
+"""Which frame a report shows, and its pictures: colour, depth, and what the rolling shutter did to it."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from rsgen.geometry.spline import Spline
+from rstrack.dataset import Dataset
+from rstrack.report.data import Tracked
+from rstrack.report.images import colored_depth, jpeg_uri, rectified
+from rstrack.report.page import Block, Note, Picture, Pictures, Slider
+
+_TWINS = {"global_middle": "middle", "global_first": "first", "global_last": "last"}
+
+
+def frame_panels(tracked: Tracked, dataset: Dataset, width: int = 640) -> tuple[Block, ...]:
+    """The frame of the fastest motion: colour and depth. Raises UserError if an image cannot be read."""
+    k = _frame_to_show(tracked, dataset)
+    frame = dataset.frame(0 if k is None else k)
+    depth, low, high = colored_depth(frame.depth.pixels)
+    at = f"frame {k or 0}"
+    items = [
+        Picture(jpeg_uri(image.pixels, width), f"Colour, {at}, {image.stamp:.3f} s", f"colour image of {at}")
+        for image in frame.colors
+    ]
+    caption = f"Depth, {at}, {frame.depth.stamp:.3f} s: {low:.2f} m (dark) to {high:.2f} m (bright); grey: not measured"
+    return (Pictures((*items, Picture(jpeg_uri(depth, width), caption, f"depth image of {at}"))),)
+
+
+def shutter_sliders(tracked: Tracked, dataset: Dataset, width: int = 640) -> tuple[Block, ...]:
+    """The frame of the fastest motion against its global-shutter twin, and against what the estimate makes of it.
+
+    Raises UserError if an image cannot be read.
+    """
+    if dataset.rig.color_shutter.readout_s == 0.0:
+        return (Note("The colour images have a global shutter: there is nothing to compare."),)
+    blocks: list[Block] = []
+    k = _frame_to_show(tracked, dataset)
+    if k is None:
+        return (Note("No frame has a colour image to compare."),)
+    i = dataset.groups[k][0]
+    at = f"frame {k}, {dataset.color_stamps[i]:.3f} s"
+    sequence = dataset.sequence
+    twin = next((name for name in _TWINS if sequence is not None and name in sequence.truth_images), None)
+    if sequence is not None and twin is not None:
+        is_sharp = "sharp" in sequence.truth_images
+        rolling = sequence.truth("sharp", i) if is_sharp else sequence.color(i)
+        kind = "Both without blur and noise." if is_sharp else "The global-shutter one has neither blur nor noise."
+        blocks.append(
+            Slider(
+                f"Rolling against global shutter, {at}",
+                Picture(jpeg_uri(rolling, width), "rolling shutter", f"{at} with a rolling shutter"),
+                Picture(jpeg_uri(sequence.truth(twin, i), width), "global shutter", f"{at} with a global shutter"),
+                f"Right: the exact twin of the renderer, all lines at the time of the {_TWINS[twin]} one. {kind}",
+            )
+        )
+    elif sequence is not None:
+        blocks.append(
+            Note("This sequence has no exact global-shutter images: render it with truth.global_shutter: [middle] in "
+                 "its config and they will be compared here.")
+        )  # fmt: skip
+    spline = tracked.estimate.spline
+    if spline is not None and _covered(tracked, dataset)[k]:
+        image = dataset.frame(k)
+        color = image.colors[0]
+        blocks.append(
+            Slider(
+                f"As recorded, and rectified with the estimated motion, {at}",
+                Picture(jpeg_uri(color.pixels, width), "as recorded", f"{at} as recorded"),
+                Picture(
+                    jpeg_uri(rectified(dataset.rig, spline, image.depth, color), width), "rectified", f"{at} rectified"
+                ),
+                "Right: the same image as a global shutter at the middle line's time would show it, from the estimated "
+                "pose of every line and the measured depth. Grey: not known.",
+            )
+        )
+    return tuple(blocks)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _frame_to_show(tracked: Tracked, dataset: Dataset) -> int | None:
+    """The fastest of the frames with a colour image, if possible one that the estimate covers."""
+    with_color = np.array([bool(group) for group in dataset.groups])
+    among = np.flatnonzero(with_color & _covered(tracked, dataset))
+    if not len(among):
+        among = np.flatnonzero(with_color)
+    motion = dataset.truth if dataset.truth is not None else tracked.estimate.spline
+    return _fastest(dataset, among, motion) if len(among) else None
+
+
+def _covered(tracked: Tracked, dataset: Dataset) -> npt.NDArray[np.bool_]:
+    """Whether the estimated spline covers the readouts of each frame (n,), its first colour image included."""
+    rig, estimate = dataset.rig, tracked.estimate
+    first = np.array(
+        [dataset.color_stamps[g[0]] if g else s for g, s in zip(dataset.groups, dataset.stamps, strict=True)]
+    )
+    covered = np.ones(len(dataset), dtype=bool)
+    for stamps, shutter in ((dataset.stamps, rig.depth_shutter), (first, rig.color_shutter)):
+        begin = stamps - 0.5 * shutter.exposure_s
+        covered &= estimate.spline_covers(begin) & estimate.spline_covers(begin + shutter.readout_s)
+    return covered
+
+
+def _fastest(dataset: Dataset, among: npt.NDArray[np.int64], motion: Spline | None) -> int:
+    """Of the frames `among` (k,), the one in which the camera turns and moves most while it is read out.
+
+    Movement counts as turning would that shifts a point at two metres as far. Without a spline: the middle one.
+    """
+    stamps = dataset.stamps[among]
+    if motion is None or not len(among):
+        return int(among[len(among) // 2]) if len(among) else 0
+    middle = np.clip(stamps + 0.5 * dataset.rig.depth_shutter.readout_s, motion.t_begin, motion.t_end)
+    velocity = motion.velocity(middle)
+    shift = np.linalg.norm(velocity[:, :3], axis=1) / 2.0 + np.linalg.norm(velocity[:, 3:], axis=1)
+    return int(among[np.argmax(shift)])
