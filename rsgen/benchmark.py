@@ -1,9 +1,7 @@
-"""Measurements of the renderer: how right the baked light is, and what each mode costs. Ratios within one run."""
+"""How right the baked light is, against path tracing; and what all measurements of the renderer start from."""
 
 from __future__ import annotations
 
-import statistics
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,9 +21,6 @@ PSNR_FLOOR_DB = 36.0
 _REFERENCE_DEPTH = 64  # path length of the reference; Russian roulette ends most paths long before
 _REFERENCE_PASS = 64  # samples per pixel of one pass, for progress
 _BAKED_SPP = 256  # samples of the baked picture: what is compared is its light, not its noise
-_BLUR_S = 0.020
-_READOUT_S = 0.028
-_ROUNDS = 4
 
 
 def check_light(
@@ -38,7 +33,7 @@ def check_light(
     PSNR_FLOOR_DB. Raises UserError.
     """
     motion = load_motion(config)
-    scene, baked, mi = _lit_scene(config, progress)
+    scene, baked, mi = lit_scene(config, progress)
     from rsgen.figures import save_grid
     from rsgen.render import ColorRenderer
 
@@ -50,7 +45,7 @@ def check_light(
     rows: list[list[NDArray[np.float64]]] = []
     psnrs: list[float] = []
     passes = max(1, spp // _REFERENCE_PASS)
-    for view, stamp in enumerate(_times(motion, views)):
+    for view, stamp in enumerate(spread_times(motion, views)):
         ours_linear = ours.render(motion.spline.pose, float(stamp), view).astype(np.float64)
         sums = np.zeros_like(ours_linear)
         for k in range(passes):
@@ -67,55 +62,11 @@ def check_light(
         rows.append([ours_srgb, their_srgb, np.clip(0.5 + 8 * difference, 0, 1)])
     if picture is not None:
         save_grid(rows, ["baked", f"path traced, {passes * _REFERENCE_PASS} spp", "difference x 8"], picture)
-    return _text(table), min(psnrs) >= PSNR_FLOOR_DB
+    return table_text(table), min(psnrs) >= PSNR_FLOOR_DB
 
 
-def time_modes(config: Config, frames: int, spp: int, progress: Progress) -> str:
-    """Median seconds a colour frame in each mode, modes taken in turn, and the ratios that the README claims."""
-    # Fitted for the shutter that is timed here, so that its lines find a pose in the shortest trajectory.
-    timed = config.color.model_copy(update={"readout_s": _READOUT_S, "exposure_s": _BLUR_S})
-    motion = load_motion(config.model_copy(update={"color": timed}))
-    scene, baked, mi = _lit_scene(config, progress)
-    from rsgen.render import ColorRenderer
-
-    camera = config.color.camera
-    path = mi.load_dict({"type": "path", "max_depth": config.light.max_depth})
-    path_spp = max(1, spp // 4)  # a quarter of the samples, four times the time counted: path tracing is slow
-    still, moving = Shutter(), Shutter(_READOUT_S, _BLUR_S)
-    renderers = {
-        "still, baked": ColorRenderer(scene, baked, camera, still, spp),
-        "rolling shutter + blur, baked": ColorRenderer(scene, baked, camera, moving, spp),
-        "rolling shutter + blur, path": ColorRenderer(scene, path, camera, moving, path_spp),
-    }
-    still_name, moving_name, path_name = renderers
-    # Rounds of both baked modes in turn: one round to warm up, since what ran before leaves caches cold.
-    order = [still_name, moving_name] * (_ROUNDS + 1) + [path_name]
-    seconds: dict[str, list[float]] = {name: [] for name in renderers}
-    for k, stamp in enumerate(_times(motion, frames + 1)):
-        for turn, name in enumerate(order):
-            begin = time.perf_counter()
-            renderers[name].render(motion.spline.pose, float(stamp), k)
-            if k > 0 and turn > 1:  # the first frame compiles kernels
-                seconds[name].append(time.perf_counter() - begin)
-        progress("timing", (k + 1) / (frames + 1), f"{spp} spp")
-    seconds[path_name] = [value * spp / path_spp for value in seconds[path_name]]
-    median = {name: statistics.median(values) for name, values in seconds.items()}
-    table = Table("mode", "s a frame", "Msamples/s")
-    for name, value in median.items():
-        table.add_row(name, f"{value:.3f}", f"{camera.width * camera.height * spp / value / 1e6:.1f}")
-    pairs = [b / a for a, b in zip(seconds[still_name], seconds[moving_name], strict=True)]
-    low, middle, high = np.quantile(pairs, [0.25, 0.5, 0.75])
-    ratios = [
-        f"rolling shutter + {1000 * _BLUR_S:g} ms blur against a still: {middle:.2f}x the time, "
-        f"half of {len(pairs)} pairs within {low:.2f} to {high:.2f}",
-        f"baked against path tracing to depth {config.light.max_depth}: "
-        f"{median[path_name] / median[moving_name]:.1f}x faster",
-    ]
-    return _text(table) + "\n".join(ratios)
-
-
-def _lit_scene(config: Config, progress: Progress) -> tuple[Any, Any, Any]:
-    """Scene, baked integrator and the Mitsuba module of a config."""
+def lit_scene(config: Config, progress: Progress) -> tuple[Any, Any, Any]:
+    """Scene, baked integrator and the Mitsuba module of a config. Raises UserError."""
     from rsgen.backend import mitsuba
 
     mi = mitsuba(config.backend)
@@ -139,7 +90,7 @@ def _scaled(config: Config, width: int) -> Any:
     )  # fmt: skip
 
 
-def _times(motion: Motion, count: int) -> NDArray[np.float64]:
+def spread_times(motion: Motion, count: int) -> NDArray[np.float64]:
     """`count` instants spread over the recording, its very ends left out."""
     fraction = (np.arange(count) + 0.5) / count
     return motion.first_stamp + fraction * (motion.last_stamp - motion.first_stamp)
@@ -150,8 +101,9 @@ def _srgb(linear: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
 
 
-def _text(table: Table) -> str:
-    console = Console(width=100)
+def table_text(table: Table) -> str:
+    """The table as plain text."""
+    console = Console(width=120)
     with console.capture() as capture:
         console.print(table)
     return capture.get()

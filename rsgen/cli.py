@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from rsgen.config import Config
 
 EXPORTS = ("kalibr", "euroc", "registered", "video", "rerun")
+BENCH_MODES = ("still", "rs-blur", "path", "rows", "averaged")
+_BLENDER_MODES = ("blender-still", "blender")  # asked for by name: they need bpy and take long
 _EXPORT_HELP = (
     "kalibr: camchain.yaml with line_delay, imu.yaml; euroc: mav0/ (ASL); registered: TUM folder with depth warped "
     "into the colour camera, its rows' times lost; video: global beside rolling shutter (.mp4); rerun: .rrd recording"
@@ -110,12 +112,17 @@ def _parser() -> Parser:
     light.add_argument("--out", type=Path, metavar="PNG", help="picture of both and eight times their difference")
 
     bench = add(
-        "bench", _bench, "time ratios: rolling shutter and blur against a still, baked against path tracing",
-        "configs/demo.yaml --spp 16",
+        "bench", _bench, "what a frame costs in each mode, and the ratios: blur, baked light, other ways to render it",
+        "configs/demo.yaml --spp 16 --mode still --mode rs-blur",
     )  # fmt: skip
     bench.add_argument("config", type=Path, help="YAML file, see configs/")
-    bench.add_argument("--frames", type=count, default=5, help="timed frames per mode and round (default: 5)")
+    bench.add_argument("--frames", type=count, default=5, help="timed frames, each in all modes (default: 5)")
     bench.add_argument("--spp", type=count, default=64, help="samples per pixel (default: 64)")
+    bench.add_argument(
+        "--mode", action="append", dest="modes", choices=(*BENCH_MODES, *_BLENDER_MODES, "all"), metavar="MODE",
+        help=f"{', '.join(BENCH_MODES)} (the default), {', '.join(_BLENDER_MODES)} (need bpy), all; may be repeated",
+    )  # fmt: skip
+    bench.add_argument("--json", action="store_true", help="print machine-readable figures")
     for command in (render, light, bench):
         command.usage = "%(prog)s [options] [--SECTION.FIELD VALUE ...] config"
         _add_overrides(command)
@@ -219,12 +226,15 @@ def _check_light(options: argparse.Namespace) -> int:
 
 
 def _bench(options: argparse.Namespace) -> int:
-    from rsgen.benchmark import time_modes
+    from rsgen.benchmark_modes import time_modes
     from rsgen.progress import ProgressDisplay
 
+    modes = options.modes or BENCH_MODES
+    modes = (*BENCH_MODES, *_BLENDER_MODES) if "all" in modes else modes
     config = _config(options)
     with ProgressDisplay() as progress:
-        print(time_modes(config, options.frames, options.spp, progress))
+        report = time_modes(config, options.frames, options.spp, modes, progress)
+    print(json.dumps(report.as_dict(), indent=2) if options.json else report.text())
     return 0
 
 
