@@ -48,7 +48,7 @@ _LEAST_DEPTH = 0.02
 _KEPT_KEYFRAMES = 8
 _MODEL_KEYFRAMES = 256
 # Of the distance and angle at which a keyframe is left behind: an older one that is nearer becomes the reference again.
-_RETURN = 0.5
+_RETURN = 0.7
 
 
 class Tracker:
@@ -259,13 +259,16 @@ class Tracker:
         return True
 
     def _return_to(self, T_world_cam: FloatArray, left: Reference) -> bool:
-        """Take the nearest of the older keyframes as the reference again, if one is near enough."""
-        far = [self.options.remoteness(se3.inverse(ref.T_world_base) @ T_world_cam) for ref in self._keyframes]
-        nearest = int(np.argmin(far))
-        if far[nearest] > _RETURN or self._keyframes[nearest] is left:
+        """Take the oldest keyframe that is near enough as the reference again: it has drifted least."""
+        near = [
+            k for k, ref in enumerate(self._keyframes)
+            if ref is not left and self.options.remoteness(se3.inverse(ref.T_world_base) @ T_world_cam) < _RETURN
+        ]  # fmt: skip
+        if not near:
             return False
-        ref = self._keyframes[nearest]
-        del self._keyframes[nearest]
+        oldest = min(near, key=lambda k: self._keyframes[k].index)
+        ref = self._keyframes[oldest]
+        del self._keyframes[oldest]
         self._keyframes.append(ref)
         self._reference, self._pixels = ref, 0
         return True
@@ -289,11 +292,12 @@ class Tracker:
     def _new_keyframe(self, frame: Prepared, older: Reference | None) -> Reference:
         state = self._state
         assert state is not None
+        if self._model is None or self._model.is_empty:
+            self._reference = self._maker.rectified(frame.index, frame.depth, frame.colors, state.spline, older)
+        else:
+            self._reference = self._model.keyframe(frame.index, frame.depth, frame.colors, state.spline)
         if self._model is not None:
             self._model.add(frame.depth, state.spline)
-            self._reference = self._model.keyframe(frame.index, frame.depth, frame.colors, state.spline)
-        else:
-            self._reference = self._maker.rectified(frame.index, frame.depth, frame.colors, state.spline, older)
         self._keyframes.append(self._reference)
         self._unconverged, self._pixels = None, 0
         self.keyframes += 1
