@@ -90,14 +90,15 @@ class KeyframeMaker:
         rho, _, _ = self._kernel(rectify_kernel, lens, base)(depth.inverse_z, *self.device_rays, to_base)
         return T_world_base, base, rho
 
-    def synthesised(
-        self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline,
-        T_world_base: FloatArray, base: Lens, rho: Any, weight: npt.NDArray[Any],
+    def with_depth(
+        self, made: Reference, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, rho: Image,
+        weight: npt.NDArray[Any],
     ) -> Reference:  # fmt: skip
-        """A keyframe whose inverse depth is given, on the device, with its weights (h, w)."""
-        host = self.e.download(rho, (base.camera.height, base.camera.width))
-        t = depth.exposure.mid_time
-        return self._finish(index, depth, colors, spline, t, T_world_base, base, rho, host, weight)
+        """A keyframe that `rectified` made of these images, with other inverse depth and weights (h, w)."""
+        on_device = self.e.upload(rho)
+        return self._finish(
+            made.index, depth, colors, spline, made.t, made.T_world_base, made.lens, on_device, rho, weight
+        )
 
     def fused(self, ref: Reference, depth: DepthImage, spline: Spline) -> Reference:
         """The keyframe with the depth of one more frame, whose poses are known, averaged in."""

@@ -19,7 +19,7 @@ from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.frame_report import FrameReport, frame_report
 from rstrack.health import Health
-from rstrack.model import SurfaceModel
+from rstrack.keyframe_set import KeyframeSet
 from rstrack.normal_equations import acceleration_prior, pose_constraint
 from rstrack.optimizer import Extra, Observation, Problem, Solved, SplineState, optimise
 from rstrack.options import Options
@@ -45,10 +45,6 @@ _GAP_S, _BREAK_S = 0.3, 3600.0
 _WIDEST = 2.0
 # Part of the pixels that must have depth for a frame to become a keyframe.
 _LEAST_DEPTH = 0.02
-_KEPT_KEYFRAMES = 8
-_MODEL_KEYFRAMES = 256
-# Of the distance and angle at which a keyframe is left behind: an older one that is nearer becomes the reference again.
-_RETURN = 0.7
 
 
 class Tracker:
@@ -60,9 +56,7 @@ class Tracker:
         self._terms, self._maker = self._prepare.terms, self._prepare.maker
         self._state: SplineState | None = None
         self._reference: Reference | None = None
-        # By when they were last the reference. A model keeps them all: it is what one comes back to.
-        self._keyframes: deque[Reference] = deque(maxlen=_MODEL_KEYFRAMES if self.options.models else _KEPT_KEYFRAMES)
-        self._model = SurfaceModel(self._maker, self.options.voxel_m) if self.options.models else None
+        self._keyframes = KeyframeSet(self._maker, self.options)
         # Frames whose control points still move, and the newest one whose do not.
         self._recent: deque[Prepared] = deque()
         self._active: list[Observation] = []
@@ -76,7 +70,6 @@ class Tracker:
         self._last_fed: float | None = None
         self.spline_valid: list[tuple[float, float]] = []
         self.reports: list[FrameReport] = []
-        self.keyframes = 0
 
     # -- what it has found ------------------------------------------------------------------------------------------
 
@@ -92,6 +85,11 @@ class Tracker:
             return np.zeros(0), np.zeros((0, 4, 4))
         stamps = np.array(self._stamps)
         return stamps, self.spline.pose(stamps)
+
+    @property
+    def keyframes(self) -> int:
+        """How many there have been."""
+        return self._keyframes.made
 
     # -- the loop ---------------------------------------------------------------------------------------------------
 
@@ -189,7 +187,9 @@ class Tracker:
         state.extend(new.last_time)
         free = (max(self._piece, state.segment(new.first_time)), len(state.points))
         self._active = [o for o in self._active if o.lin is not None and o.lin.model.last > free[0]]
-        fresh = self._observe(new, ref)
+        on_reference = self._observe(new, ref)
+        anchor = self._keyframes.anchor
+        fresh = on_reference + (self._observe(new, anchor) if anchor is not None else [])
         extras = [self._prior(state, free)]
         if state.segment(ref.t) + 4 > free[0] and new.depth.exposure.lens.lines == 1:
             # The first keyframe of a global shutter: no other frame tells where it was taken.
@@ -197,21 +197,21 @@ class Tracker:
         # A reference that still moves ties its own control points to those of the newest lines.
         bandwidth = 24 if ref.rolling is None else 6 * (free[1] - free[0])
         solved = self._optimise(state, fresh, self._active, free, extras, bandwidth, _TRACKING_LEVELS)
-        if self._health.fault(fresh, solved, ref.pixels):
+        if self._health.fault(on_reference, solved, ref.pixels):
             self._state = before
             return self._relocalise(new)
         self._active += fresh
         self._recent.append(new)
         self._placed(new)
-        overlap = self._overlap(fresh)
+        overlap = self._overlap(on_reference)
         changed = self._renew_keyframe(state, new, free[0], overlap)
-        return self._report(new, fresh, solved, keyframe=changed, overlap=overlap)
+        return self._report(new, on_reference, solved, keyframe=changed, overlap=overlap)
 
     def _relocalise(self, new: Prepared) -> FrameReport:
         """Align a frame alone to the last keyframes, from where the track ended and from where they were taken."""
         state, _ = self._known()
         end = self.spline_valid[-1][1]
-        for ref in list(self._keyframes)[: -_KEPT_KEYFRAMES - 1 : -1]:
+        for ref in self._keyframes.recent:
             for T_world_body in (state.spline.pose(end), ref.T_world_base):
                 trial = state.restarted(end, new.first_time, new.last_time, T_world_body)
                 first = trial.segment(new.first_time)
@@ -221,6 +221,7 @@ class Tracker:
                     continue
                 self._state, self._piece, self._reference = trial, first, ref
                 self._active, self._pixels, self._unconverged = fresh, 0, None
+                self._keyframes.anchor = None
                 self._recent = deque([new])
                 self._placed(new, joined=False)
                 return self._report(new, fresh, solved, overlap=self._overlap(fresh))
@@ -239,7 +240,7 @@ class Tracker:
         if self._unconverged is not None:
             if state.segment(self._unconverged.last_time) + 4 > first_free:
                 return False
-            self._new_keyframe(self._unconverged, self._keyframes[-1] if self.options.fuse else None)
+            self._new_keyframe(self._unconverged, self._keyframes.newest if self.options.fuse else None)
             return True
         _, ref = self._known()
         T_base_cam = se3.inverse(ref.T_world_base) @ state.spline.pose(new.depth.exposure.mid_time)
@@ -251,39 +252,20 @@ class Tracker:
             self._reference = self._maker.rolling(new.index, new.depth, new.colors, state.spline)
             self._unconverged, self._pixels = new, 0
             return False
-        if self._model is not None and self._return_to(state.spline.pose(frozen[-1].depth.exposure.mid_time), ref):
+        old = self._keyframes.return_to(state.spline.pose(frozen[-1].depth.exposure.mid_time), ref)
+        if old is not None:
+            self._reference, self._pixels = old, 0
             return True
         if self._unfit(frozen[-1]):
             return False
         self._new_keyframe(frozen[-1], ref if self.options.fuse else None)
         return True
 
-    def _return_to(self, T_world_cam: FloatArray, left: Reference) -> bool:
-        """Take the oldest keyframe that is near enough as the reference again: it has drifted least."""
-        near = [
-            k for k, ref in enumerate(self._keyframes)
-            if ref is not left and self.options.remoteness(se3.inverse(ref.T_world_base) @ T_world_cam) < _RETURN
-        ]  # fmt: skip
-        if not near:
-            return False
-        oldest = min(near, key=lambda k: self._keyframes[k].index)
-        ref = self._keyframes[oldest]
-        del self._keyframes[oldest]
-        self._keyframes.append(ref)
-        self._reference, self._pixels = ref, 0
-        return True
-
     def _fuse(self, done: Prepared, state: SplineState) -> None:
-        ref = self._keyframes[-1]
-        if done.index <= ref.index:
-            return
-        if self._model is not None:
-            self._model.add(done.depth, state.spline)
-        if not self.options.fuse:
-            return
-        self._keyframes[-1] = self._maker.fused(ref, done.depth, state.spline)
-        if self._reference is ref:
-            self._reference = self._keyframes[-1]
+        before = self._keyframes.newest
+        after = self._keyframes.fuse(done, state.spline)
+        if self._reference is before:
+            self._reference = after
 
     def _unfit(self, frame: Prepared) -> bool:
         """Whether a frame shows too little to align others to it."""
@@ -292,15 +274,8 @@ class Tracker:
     def _new_keyframe(self, frame: Prepared, older: Reference | None) -> Reference:
         state = self._state
         assert state is not None
-        if self._model is None or self._model.is_empty:
-            self._reference = self._maker.rectified(frame.index, frame.depth, frame.colors, state.spline, older)
-        else:
-            self._reference = self._model.keyframe(frame.index, frame.depth, frame.colors, state.spline)
-        if self._model is not None:
-            self._model.add(frame.depth, state.spline)
-        self._keyframes.append(self._reference)
+        self._reference = self._keyframes.make(frame, state.spline, older)
         self._unconverged, self._pixels = None, 0
-        self.keyframes += 1
         return self._reference
 
     def _overlap(self, fresh: list[Observation]) -> float:

@@ -77,7 +77,7 @@ def test_model_depth_is_that_of_the_walls_and_less_noisy_than_a_frame() -> None:
     for frame in frames:
         model.add(frame.depth, TRUTH)
     newest = frames[-1]
-    made = model.keyframe(newest.index, newest.depth, newest.colors, TRUTH)
+    made = model.keyframe(newest.index, newest.depth, newest.colors, TRUTH, None)
     _, _, own = prepare.maker.rectify(newest.depth, TRUTH)
     d = CAMERA.unproject(CAMERA.pixel_grid()) @ made.T_world_base[:3, :3].T
     z = synthetic.cast(np.broadcast_to(made.T_world_base[:3, 3], d.shape), d)
