@@ -49,10 +49,13 @@ _DATASET_FILES = ("sequence.yaml", "rgb.txt", "depth.txt", "associations.txt", "
 
 
 class AnyTracker(Protocol):
-    """What all trackers have in common. reports: of all frames so far. keyframes: their number so far."""
+    """What all trackers have in common. reports: of all frames so far."""
 
     reports: list[FrameReport]
-    keyframes: int
+
+    @property
+    def keyframes(self) -> int:
+        """How many there have been."""
 
     @property
     def spline(self) -> Spline | None:
