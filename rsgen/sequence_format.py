@@ -36,6 +36,7 @@ _FRAMES_AT_ONCE = 16  # poses of so many frames' lines are evaluated together: f
 
 FloatArray = npt.NDArray[np.float64]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+Seconds = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
@@ -52,12 +53,12 @@ class StreamYaml(_Yaml):
     model: Literal["pinhole", "radtan", "fisheye"]
     distortion: tuple[Finite, ...]
     rate_hz: Positive
-    offset_s: Finite
-    readout_s: Finite
-    exposure_s: Finite
+    offset_s: Seconds
+    readout_s: Seconds
+    exposure_s: Seconds
     scan: Literal["top-bottom", "bottom-top", "left-right", "right-left"]
     frames: int = Field(ge=1, le=10_000_000)
-    first_stamp_s: Finite
+    first_stamp_s: Seconds
     depth_scale: Annotated[float, Field(ge=1e-3, le=1e9)] | None = None
 
     @property

@@ -150,7 +150,8 @@ def _by_speed(report: StressReport) -> list[ColorScore]:
 def _write_panels(panels: Panels, out: Path) -> list[Path]:
     from rsgen.figures import save_grid
 
-    shade = np.repeat(np.rint(255.0 * np.clip(panels.weights, 0.0, 1.0)).astype(np.uint8)[..., None], 3, axis=-1)
+    brightest = max(float(panels.weights.max()), 1e-6)
+    shade = np.repeat(np.rint(255.0 / brightest * panels.weights).astype(np.uint8)[..., None], 3, axis=-1)
     images = {
         "registered": panels.blurred,
         "weights": shade,
@@ -163,6 +164,12 @@ def _write_panels(panels: Panels, out: Path) -> list[Path]:
     written = [folder / f"{name}.png" for name in images]
     for path, image in zip(written, images.values(), strict=True):
         atomic_write(path, encode_png(np.ascontiguousarray(image)))
-    titles = ("registered blurred input", "weights", "constant weights", "blur-aware weights", "sharp view (truth)")
+    titles = (
+        "registered blurred input",
+        f"weights (white: {brightest:.2g})",
+        "constant weights",
+        "blur-aware weights",
+        "sharp view (truth)",
+    )
     save_grid([[image / 255.0 for image in images.values()]], titles, out / "panels.png")
     return [*written, out / "panels.png"]
