@@ -132,7 +132,9 @@ def assemble(models: Iterable[Quadratic], first: int, last: int) -> tuple[FloatA
 
 
 def solve(H: FloatArray, g: FloatArray, bandwidth: int = 24) -> FloatArray:
-    """−H⁻¹ g by banded Cholesky. Raises numpy.linalg.LinAlgError where H is not positive definite."""
+    """−H⁻¹ g by banded Cholesky. Raises numpy.linalg.LinAlgError where H is not positive definite or not finite."""
+    if not (np.isfinite(H).all() and np.isfinite(g).all()):
+        raise np.linalg.LinAlgError("the normal equations are not finite")
     size = len(g)
     bandwidth = min(bandwidth, size)
     # Jacobi scaling: metres, radians and barely touched control points differ by many orders of magnitude.

@@ -283,3 +283,12 @@ def test_a_long_extrapolation_stays_rotations() -> None:
         state.extend(0.05 * (k + 1))
     R = state.points[:, :3, :3]
     assert np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max() < 1e-14
+
+
+@pytest.mark.parametrize("where", ["H", "g"])
+def test_equations_that_are_not_finite_have_no_solution(where: str) -> None:
+    """A track that runs away overflows; on lr kt0 with a global shutter it ended in a traceback."""
+    H, g = np.eye(24), np.ones(24)
+    (H if where == "H" else g)[3] = np.nan
+    with pytest.raises(np.linalg.LinAlgError):
+        solve(H, g)
