@@ -133,14 +133,16 @@ def assemble(models: Iterable[Quadratic], first: int, last: int) -> tuple[FloatA
 
 def solve(H: FloatArray, g: FloatArray, bandwidth: int = 24) -> FloatArray:
     """−H⁻¹ g by banded Cholesky. Raises numpy.linalg.LinAlgError where H is not positive definite or not finite."""
-    if not (np.isfinite(H).all() and np.isfinite(g).all()):
-        raise np.linalg.LinAlgError("the normal equations are not finite")
     size = len(g)
     bandwidth = min(bandwidth, size)
     # Jacobi scaling: metres, radians and barely touched control points differ by many orders of magnitude.
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-300))
-    scaled = H * scale[:, None] * scale
+    # A diagonal that rounding made zero or negative overflows.
+    with np.errstate(over="ignore", invalid="ignore"):
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-300))
+        scaled, right = H * scale[:, None] * scale, scale * g
+    if not (np.isfinite(scaled).all() and np.isfinite(right).all()):
+        raise np.linalg.LinAlgError("the normal equations are not finite")
     band = np.zeros((bandwidth, size))
     for k in range(bandwidth):
         band[k, : size - k] = np.diagonal(scaled, -k)
-    return -scale * np.asarray(scipy.linalg.solveh_banded(band, scale * g, lower=True))
+    return -scale * np.asarray(scipy.linalg.solveh_banded(band, right, lower=True))
