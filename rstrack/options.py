@@ -34,9 +34,9 @@ class Options:
     blur_sigma_px: pixels; points of a colour image that its exposure blurs count less, by equation (13); 0: all alike.
     keyframe_strategy: which frame that is (paper, section 3.5): the last one that has converged, rectified at once; or
       the newest, with its rolling shutter until it has converged and can be rectified.
-    reference: keyframe: new frames are aligned to one frame, with the depth of others fused in; model: that frame's
-      depth is that of a signed distance volume of all frames, with voxels of voxel_m, and a keyframe is used again when
-      the camera comes back to it.
+    reference: keyframe: new frames are aligned to one frame, with the depth of others fused in; model: its depth is
+      averaged with a signed distance volume of all frames, with voxels of voxel_m, frames are aligned to the oldest
+      keyframe in view too, and a keyframe is used again when the camera comes back to it. The baseline has no model.
     """
 
     method: Method = "rs-pg"
