@@ -12,6 +12,7 @@ from typing import Any
 import drjit as dr
 
 from rstrack.engine import Engine
+from rstrack.recording import recorded
 from rstrack.residuals import bilinear, grid, nearest, surface
 from rstrack.warp import TO_BASE, Lens, gather, move, project, project_rolling
 
@@ -59,7 +60,7 @@ def rectify_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
     """
     camera = base.camera
 
-    @dr.freeze
+    @recorded
     def kernel(rho: Any, rays_x: Any, rays_y: Any, to_base: Any) -> Any:
         _, px, py = grid(e, camera.width, camera.height, 1)
         goal_x, goal_y = e.Float(px), e.Float(py)
@@ -93,7 +94,7 @@ def color_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
     At the pixels of the reference `base`; `to_base` holds its lines' poses if it is not rectified.
     """
 
-    @dr.freeze
+    @recorded
     def kernel(rho: Any, rays_x: Any, rays_y: Any, to_base: Any, image: Any, from_base: Any) -> Any:
         active = rho > 0.0
         z = dr.rcp(dr.select(active, rho, 1.0))
@@ -119,7 +120,7 @@ def fuse_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
     largest weight. Weights count measurements of unit quality, 1/σ_z² over that of a pixel at one metre.
     """
 
-    @dr.freeze
+    @recorded
     def kernel(
         rho: Any, weight: Any, slope_x: Any, slope_y: Any, source: Any, source_weight: Any, from_base: Any,
         constants: Any,

@@ -26,6 +26,7 @@ import numpy as np
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.so3 import FloatArray
 from rstrack.engine import Engine
+from rstrack.recording import recorded
 from rstrack.robust import NU
 from rstrack.warp import TO_BASE, Lens, Vector, cross, gather, move, project_rolling
 
@@ -182,7 +183,7 @@ def geometric_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int) -> Call
     camera = lens.camera
     ref = ref_lens.camera
 
-    @dr.freeze
+    @recorded
     def kernel(
         depth: Any, rays_x: Any, rays_y: Any, to_base: Any, rho: Any, slope_x: Any, slope_y: Any, roughness: Any,
         from_base: Any, constants: Any,
@@ -235,7 +236,7 @@ def photometric_kernel(
     width, height = level_size(camera.width, level), level_size(camera.height, level)
     shrink = 0.5**level
 
-    @dr.freeze
+    @recorded
     def kernel(
         points_x: Any, points_y: Any, points_z: Any, intensity: Any, visible: Any, to_base: Any, image: Any,
         from_base: Any, constants: Any,
@@ -274,7 +275,7 @@ def visibility_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int) -> Cal
     """
     camera, ref = lens.camera, ref_lens.camera
 
-    @dr.freeze
+    @recorded
     def kernel(points_x: Any, points_y: Any, points_z: Any, to_base: Any, depth: Any, from_base: Any) -> Any:
         p = points_x, points_y, points_z
         if ref_lens.lines > 1:

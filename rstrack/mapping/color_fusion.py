@@ -26,6 +26,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.engine import Engine
 from rstrack.frames import DepthImage
 from rstrack.lines import Exposure, from_base_table, line_motion
+from rstrack.recording import recorded
 from rstrack.reference import Reference
 from rstrack.residuals import EDGE, bilinear, grid
 from rstrack.warp import Lens, Sighting, cross, gather, move, project, project_rolling
@@ -205,7 +206,7 @@ def _add_kernel(e: Engine, lens: Lens, depth_lens: Lens, base: Lens) -> Callable
     largest sum of weights.
     """
 
-    @dr.freeze
+    @recorded
     def kernel(
         rho: Any, r: Any, g: Any, b: Any, weight: Any, image: Any, depth: Any, from_base: Any, sweep: Any,
         depth_from_base: Any, constants: Any,
@@ -239,7 +240,7 @@ def _inherit_kernel(e: Engine, older: Lens, base: Lens) -> Callable[..., Any]:
     """
     width, height = older.camera.width, older.camera.height
 
-    @dr.freeze
+    @recorded
     def kernel(rho: Any, r: Any, g: Any, b: Any, weight: Any, older_rho: Any, T_old_new: Any) -> Any:
         active, p = _points(e, base, rho)
         at = project(older.camera, move(gather(T_old_new, e.UInt(0), 12, stride=12), p))

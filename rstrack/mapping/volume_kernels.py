@@ -15,6 +15,7 @@ from typing import Any
 import drjit as dr
 
 from rstrack.engine import Engine
+from rstrack.recording import recorded
 from rstrack.residuals import EDGE, bilinear, grid, nearest, surface
 from rstrack.warp import Lens, Vector, gather, move, project, project_rolling
 
@@ -47,7 +48,7 @@ def scale_kernel(e: Engine, lens: Lens) -> Callable[..., Any]:
     camera = lens.camera
     w, h = camera.width, camera.height
 
-    @dr.freeze
+    @recorded
     def kernel(rho: Any) -> Any:
         index, px, py = grid(e, w, h, 1)
         at = dr.gather(e.Float, rho, index)
@@ -78,7 +79,7 @@ def sight_kernel(e: Engine, lens: Lens, band_m: float, voxel_m: float) -> Callab
     """
     camera = lens.camera
 
-    @dr.freeze
+    @recorded
     def kernel(rho: Any, pose: Any, box: Any) -> Any:
         index, px, py = grid(e, camera.width, camera.height, _STRIDE)
         at = dr.gather(e.Float, rho, index)
@@ -109,7 +110,7 @@ def integrate(
     (9): R_cam_world, numbers on the device. image_weight: an image of weights or None; image: red, green, blue, weight,
     or none. sums: Σ w d, Σ w, and with colour Σ w red, Σ w green, Σ w blue, Σ w.
 
-    Not recorded with dr.freeze, which would copy the whole volume; and sums instead of means, because reading what is
+    Not `recorded`, which would copy the whole volume; and sums instead of means, because reading what is
     written to would copy it too. No two threads add to the same place, so the order does not matter.
     """
     camera = lens.camera
@@ -158,7 +159,7 @@ def raycast_kernel(e: Engine, lens: Lens, voxel_m: float, truncation_m: float, c
     camera = lens.camera
     per_t = truncation_m / voxel_m
 
-    @dr.freeze
+    @recorded
     def kernel(pose: Any, box: Any, near: Any, directory: Any, sums: Any) -> Any:
         _, px, py = grid(e, camera.width, camera.height, 1)
         xn, yn = (e.Float(px) - camera.cx) / camera.fx, (e.Float(py) - camera.cy) / camera.fy
@@ -230,7 +231,7 @@ def lookup_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
     """
     camera = lens.camera
 
-    @dr.freeze
+    @recorded
     def kernel(rho: Any, red: Any, green: Any, blue: Any, from_base: Any) -> Any:
         _, px, py = grid(e, base.camera.width, base.camera.height, 1)
         active = rho > 0.0
