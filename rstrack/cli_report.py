@@ -1,4 +1,4 @@
-"""The command `rstrack report`: one HTML page of a run or a benchmark."""
+"""The command `rstrack report`: one HTML page of a run, a benchmark or a stress test."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from rsgen.command_line import Commands
 def add_report(commands: Commands) -> None:
     """Add it to the parser."""
     report = commands.add(
-        "report", _report, "one HTML page of a run or a benchmark, all in it: tables, plots, the path in 3D, "
-        "rolling against global shutter", "runs/lr_kt2 --sequence out/lr_kt2",
+        "report", _report, "one HTML page of a run, a benchmark or a stress test, all in it: tables, plots, the path "
+        "in 3D, rolling against global shutter", "runs/lr_kt2 --sequence out/lr_kt2",
     )  # fmt: skip
     report.add_argument(
         "run_path", type=Path, metavar="run",
-        help="folder that 'rstrack track' or 'rstrack bench' wrote, or a TUM file with --sequence",
+        help="folder that 'rstrack track', 'rstrack bench' or 'rstrack stress' wrote, or a TUM file with --sequence",
     )  # fmt: skip
     report.add_argument("--sequence", type=Path, metavar="DIR", help="the run's sequence (default: where it was)")
     report.add_argument(

@@ -1,36 +1,40 @@
-"""The page of a run and of a benchmark: its numbers, pictures and figures, that it loads nothing, and how it behaves.
-
-The last tests open it in a headless Chromium; they are skipped where there is none, or no playwright.
-"""
+"""The page of a run and of a benchmark: its numbers, pictures and figures, and that it loads nothing."""
 
 from __future__ import annotations
 
-import base64
 import json
 import re
 import shutil
-from collections.abc import Iterator
-from dataclasses import dataclass, field
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import synthetic
+from report_util import (
+    FRAMES,
+    NASTY,
+    SPLINE,
+    WORLD,
+    Parsed,
+    global_image,
+    make_bench,
+    make_run,
+    make_sequence,
+    parse,
+    picture,
+    shown,
+)
 
 from rsgen.command_line import Commands, run_program
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.geometry.spline import Spline
-from rsgen.truth.settings import TruthConfig
 from rstrack.cli_report import add_report
 from rstrack.compare import compare, truth_of
 from rstrack.dataset import open_dataset
-from rstrack.estimate import Estimate, write_estimate
+from rstrack.estimate import Estimate
 from rstrack.evaluate import Metrics, evaluate, run_evaluate
 from rstrack.report.build import write_report
 from rstrack.report.data import drift
@@ -38,121 +42,6 @@ from rstrack.report.figures import Path3D, path_3d, upright_axes
 from rstrack.report.images import rectified
 from rstrack.report.page import Note, Page, Section, render
 from rstrack.rig import Image, Rig
-
-SPLINE = synthetic.make_spline()
-WORLD = se3.exp(np.array([3.0, -1.0, 2.0, 0.4, -0.3, 0.4]))
-FRAMES = 31
-NASTY = "</script><b>&"
-FLAGS = (
-    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync", "--enable-unsafe-swiftshader",
-)  # fmt: skip
-
-
-@dataclass
-class Parsed(HTMLParser):
-    """What a test wants to know of a page: attributes, tables as lists of rows, scripts, and the text of the rest."""
-
-    attributes: list[tuple[str, str, str]] = field(default_factory=list)
-    rows: list[list[str]] = field(default_factory=list)
-    scripts: list[str] = field(default_factory=list)
-    styles: list[str] = field(default_factory=list)
-    text: str = ""
-    figures: Any = None
-
-    def __post_init__(self) -> None:
-        super().__init__()
-        self._in: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.attributes += [(tag, name, value or "") for name, value in attrs]
-        if tag not in ("meta", "link", "img", "input", "br"):
-            self._in.append(tag)
-        if tag == "tr":
-            self.rows.append([])
-        elif tag in ("td", "th"):
-            self.rows[-1].append("")
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self._in.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        if self._in and self._in[-1] in ("script", "style"):
-            (self.scripts if self._in[-1] == "script" else self.styles).append(data)
-            return
-        self.text += data
-        if {"td", "th"} & set(self._in):
-            self.rows[-1][-1] = " ".join((self.rows[-1][-1] + " " + data).split())
-
-    def row(self, name: str) -> list[str]:
-        """The first row of a table with this heading."""
-        return next(row for row in self.rows if row[0] == name)
-
-    def uris(self) -> list[str]:
-        return [value for tag, name, value in self.attributes if (tag, name) == ("img", "src")]
-
-
-def parse(path: Path) -> Parsed:
-    parsed = Parsed()
-    parsed.feed(path.read_text("utf-8"))
-    parsed.close()
-    parsed.figures = json.loads(parsed.scripts[0])
-    return parsed
-
-
-def picture(uri: str) -> np.ndarray:
-    kind, _, data = uri.partition(",")
-    assert kind == "data:image/jpeg;base64"
-    image = cv2.imdecode(np.frombuffer(base64.b64decode(data, validate=True), np.uint8), cv2.IMREAD_COLOR)
-    assert image is not None
-    return np.asarray(image)
-
-
-def global_image(config: Any, stamp: float) -> np.ndarray:
-    """The colour image that all lines would show at the middle one's time."""
-    camera, shutter = config.color.camera, config.color.shutter
-    middle = float(shutter.line_mid_time(stamp, (shutter.line_count(camera) - 1) / 2, camera))
-    return synthetic.render_color(SPLINE, camera, Shutter(), middle, np.array(config.T_color_depth))
-
-
-def make_sequence(root: Path, *, twin: bool = False) -> Path:
-    config = synthetic.make_config()
-    if not twin:
-        return synthetic.make_sequence(root, config, FRAMES)
-    config = config.model_copy(update={"truth": TruthConfig(global_shutter=("middle",))})
-    writer = synthetic.open_writer(root, config, FRAMES)
-    for k in range(FRAMES):
-        stamp, T = float(writer.stamps("color")[k]), np.array(config.T_color_depth)
-        image = synthetic.render_color(SPLINE, config.color.camera, config.color.shutter, stamp, T)
-        writer.write_color(k, image, {"global_middle": global_image(config, stamp)})
-        writer.write_depth(k, synthetic.render_depth(SPLINE, config.depth.camera, config.depth.shutter, stamp))
-    writer.finish()
-    return root
-
-
-def make_run(run: Path, sequence: Path, seed: int = 1, error_m: float = 0.004, **info: Any) -> Path:
-    """A run folder with errors of known size; two frames are lost."""
-    stamps = open_dataset(sequence).stamps
-    rng = np.random.default_rng(seed)
-    xi = error_m * rng.normal(size=(len(SPLINE.control_points), 6))
-    spline = Spline(se3.orthonormalise(WORLD @ SPLINE.control_points @ se3.exp(xi)), SPLINE.t0, SPLINE.dt)
-    kept = np.delete(np.arange(len(stamps)), [10, 11, 12, 13])
-    frames = [
-        {"stamp": float(t), "inliers_depth": 0.8, "inliers_color": None, "keyframe": k % 8 == 0, "lost": 10 <= k < 14}
-        for k, t in enumerate(stamps)
-    ]
-    info = {
-        "method": "rs-pg", "lost": 4, "frames": frames, "options": {"method": "rs-pg", "knot_spacing_s": 0.025},
-        "timings": {"median_ms": 12.5, "frame_ms": [12.5] * len(stamps)}, "end": "done",
-        "dataset": {"name": NASTY, "frames": [0, FRAMES], "path": str(sequence)},
-    } | info  # fmt: skip
-    write_estimate(run, stamps[kept], spline.pose(stamps[kept]), spline, info)
-    return run
-
-
-def shown(value: float | None, scale: float = 1.0) -> str:
-    assert value is not None
-    return f"{value * scale:.4g}"
 
 
 @pytest.fixture(scope="module")
@@ -177,40 +66,7 @@ def report(run: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory: pytest.TempPathFactory, sequence: Path, twin: Path) -> Path:
-    """A benchmark of two sequences and three methods, one of which has failed on one of them."""
-    root = tmp_path_factory.mktemp("bench")
-    methods, errors = ("baseline", "rs-pg", "open3d-icp"), (0.02, 0.001, 0.01)
-    cells, metrics = [], {}
-    for name, path in (("a", sequence), ("b", twin)):
-        for k, method in enumerate(methods):
-            folder = f"cells/{name}/{method}"
-            cell: dict[str, Any] = {"sequence": name, "method": method, "run": folder, "frames": 31, "lost": 0}
-            if (name, method) == ("b", "open3d-icp"):
-                cell |= {"ate_m": None, "rpe_m_s": None, "rpe_deg_s": None, "seconds": None, "error": "is not here"}
-            else:
-                m = run_evaluate(path, make_run(root / folder, path, seed=k, error_m=errors[k]))
-                metrics[name, method] = m
-                cell |= {"ate_m": m.ate_rmse_m, "rpe_m_s": m.rpe_trans_rmse_m_per_s, "seconds": 3.1}
-                cell |= {"rpe_deg_s": m.rpe_rot_rmse_deg_per_s, "lost": 4, "error": None}
-            cells.append(cell)
-    groups = {"a": "living room", "b": "hand-held"}
-    averages = [
-        {"group": groups[name], "method": method, "sequences": [name], "ate_m": m.ate_rmse_m, "rpe_m_s": 1.0,
-         "rpe_deg_s": 1.0, "better_pct": {"ate_m": None if method == "baseline" else 95.0}}
-        for (name, method), m in metrics.items()
-    ]  # fmt: skip
-    paper = [
-        {"sequence": name, "method": "rs-pg", "ate_m": ate, "rpe_m_s": 1.0, "rpe_deg_s": 2.0}
-        for name, ate in (("a", 1.0), ("b", 1e-6))
-    ]
-    places = (("a", sequence), ("b", twin))
-    listed = [{"name": name, "group": groups[name], "path": str(path), "frames": FRAMES} for name, path in places]
-    results = {
-        "machine": {"cpu": "imaginary"}, "version": "0", "sequences": listed, "methods": methods, "cells": cells,
-        "averages": averages, "paper": paper,
-    }  # fmt: skip
-    (root / "results.json").write_text(json.dumps(results))
-    return root
+    return make_bench(tmp_path_factory.mktemp("bench"), sequence, twin)
 
 
 @pytest.fixture(scope="module")
@@ -398,7 +254,7 @@ def test_an_early_end_is_said_at_the_top(sequence: Path, tmp_path: Path) -> None
 
 
 def test_wrong_input_is_refused_in_one_line(sequence: Path, run: Path, bench: Path, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"neither trajectory\.txt nor results\.json"):
+    with pytest.raises(UserError, match=r"neither trajectory\.txt, results\.json nor stress\.json"):
         write_report(tmp_path)
     with pytest.raises(UserError, match="no such folder"):
         write_report(run, tmp_path / "nowhere")
@@ -454,138 +310,3 @@ def test_a_benchmark_whose_sequences_are_gone_keeps_its_tables(bench: Path, tmp_
     (tmp_path / "results.json").write_text(json.dumps(results))
     page = parse(write_report(tmp_path))
     assert "No plots and images of a" in page.text and page.row("a")[1].endswith("4 lost") and not page.uris()
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """A browser without a window. The system's own: none is downloaded."""
-    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (pip install '.[test]')")
-    found = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if found is None:
-        pytest.skip("no Chromium on this machine (Debian: apt-get install chromium)")
-    with api.sync_playwright() as playwright:
-        context = playwright.chromium.launch_persistent_context(
-            tmp_path_factory.mktemp("profile"), executable_path=found, headless=True, args=list(FLAGS), timeout=300_000
-        )
-        context.set_default_timeout(300_000)
-        yield context
-        context.close()
-
-
-@pytest.fixture
-def tab(browser: Any) -> Iterator[Any]:
-    """A page of it, whose errors and requests are collected and must be none."""
-    page, troubles = browser.new_page(), []
-    page.on("pageerror", lambda error: troubles.append(str(error)))
-    page.on("console", lambda message: troubles.append(message.text) if message.type == "error" else None)
-    page.on("request", lambda r: None if r.url.startswith(("file:", "data:", "blob:")) else troubles.append(r.url))
-    page.set_viewport_size({"width": 1000, "height": 800})
-    yield page
-    page.close()
-    assert not troubles
-
-
-DRAWN = "() => [...document.querySelectorAll('.plot')].filter(e => !e.closest('[hidden]')).every(e => e._fullLayout)"
-EYE = "e => e._fullLayout.scene._scene.getCamera().eye"
-
-
-def middle_pixels(tab: Any) -> np.ndarray:
-    """The slider's picture as it is on the screen."""
-    data = tab.locator(".stack").first.screenshot()
-    return np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)).astype(float)
-
-
-def test_the_slider_moves_the_picture_by_keyboard_mouse_and_button(tab: Any, report: Path) -> None:
-    tab.goto(report.as_uri())
-    slider, stack = tab.locator(".compare input").first, tab.locator(".stack").first
-    slider.focus()
-    tab.keyboard.press("End")
-    rolling = middle_pixels(tab)
-    tab.keyboard.press("Home")
-    still = middle_pixels(tab)
-    inner = np.s_[4:-40, 4:-4]  # without the captions and the line
-    assert np.abs(rolling - still)[inner].mean() > 3.0
-    for _ in range(50):
-        tab.keyboard.press("ArrowRight")
-    assert slider.input_value() == "50"
-    half, w = middle_pixels(tab), rolling.shape[1] // 2
-    np.testing.assert_allclose(half[4:-40, 4 : w - 6], rolling[4:-40, 4 : w - 6], atol=3)
-    np.testing.assert_allclose(half[4:-40, w + 6 : -4], still[4:-40, w + 6 : -4], atol=3)
-    tab.locator(".flip").first.click()
-    assert slider.input_value() == "0"
-    tab.locator(".flip").first.click()
-    assert slider.input_value() == "100"
-    box = stack.bounding_box()
-    tab.mouse.move(box["x"] + 0.8 * box["width"], box["y"] + 50)
-    tab.mouse.down()
-    tab.mouse.move(box["x"] + 0.25 * box["width"], box["y"] + 50)
-    tab.mouse.up()
-    assert abs(float(slider.input_value()) - 25) <= 1
-
-
-def test_the_path_is_drawn_in_3d_and_can_be_turned(tab: Any, report: Path) -> None:
-    tab.goto(report.as_uri())
-    tab.wait_for_function(DRAWN)
-    plot = tab.locator(".plot.solid")
-    plot.scroll_into_view_if_needed()
-    if not tab.evaluate("Boolean(document.createElement('canvas').getContext('webgl'))"):
-        pytest.skip("this Chromium has no WebGL")
-    assert plot.locator("canvas").count() >= 1 and tab.locator(".no-webgl").first.is_hidden()
-    tab.wait_for_timeout(500)
-    seen = cv2.imdecode(np.frombuffer(plot.screenshot(), np.uint8), cv2.IMREAD_COLOR)[80:-100]
-    assert (np.ptp(seen.astype(int), axis=-1) > 40).sum() > 100, "no coloured path"
-    before = plot.evaluate(EYE)
-    turn = tab.locator(".turn input")
-    turn.focus()
-    for _ in range(30):
-        tab.keyboard.press("ArrowRight")
-    tab.wait_for_timeout(500)
-    after = plot.evaluate(EYE)
-    angle = np.arctan2(after["y"], after["x"]) - np.arctan2(before["y"], before["x"])
-    assert np.degrees(angle) % 360 == pytest.approx(30.0, abs=1.0)
-    box = plot.bounding_box()
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    tab.mouse.move(x, y)
-    tab.mouse.down()
-    for k in range(1, 8):
-        tab.mouse.move(x + 12 * k, y)
-    tab.mouse.up()
-    tab.wait_for_timeout(500)
-    dragged = plot.evaluate(EYE)
-    assert np.hypot(dragged["x"] - after["x"], dragged["y"] - after["y"]) > 0.1
-
-
-def test_without_webgl_the_path_is_drawn_from_above(tab: Any, report: Path) -> None:
-    tab.add_init_script(
-        "const get = HTMLCanvasElement.prototype.getContext;"
-        "HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {"
-        "  return /webgl/.test(kind) ? null : get.call(this, kind, ...rest); };"
-    )
-    tab.goto(report.as_uri())
-    tab.wait_for_function(DRAWN)
-    assert tab.locator(".no-webgl").is_visible() and tab.locator(".turn").is_hidden()
-    assert tab.locator(".plot.solid .scatterlayer .trace").count() == 2
-
-
-@pytest.mark.parametrize("width", [1280, 400])
-def test_the_benchmark_fits_any_width_and_shows_one_sequence_at_a_time(
-    tab: Any, bench_report: Path, width: int
-) -> None:  # fmt: skip
-    tab.set_viewport_size({"width": width, "height": 800})
-    tab.emulate_media(color_scheme="dark" if width == 400 else "light")
-    tab.goto(bench_report.as_uri())
-    tab.wait_for_function(DRAWN)
-    assert tab.evaluate("document.documentElement.scrollWidth") <= width
-    ink = tab.evaluate("getComputedStyle(document.body).color")
-    assert ink == ("rgb(231, 234, 240)" if width == 400 else "rgb(29, 33, 41)")
-    options = tab.locator("#sequences .option")
-    assert [options.nth(k).is_visible() for k in range(2)] == [True, False]
-    tab.locator("#sequences select").select_option(label="b")
-    tab.wait_for_function(DRAWN)
-    assert [options.nth(k).is_visible() for k in range(2)] == [False, True]
-    names = options.nth(1).locator(".plot.solid").evaluate("e => e.data.map(trace => trace.name)")
-    assert names == ["true", "baseline", "rs-pg"]
-    assert options.nth(0).locator("canvas").count() == 0, "a hidden view gives its WebGL back"

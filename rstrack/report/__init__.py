@@ -1,1 +1,1 @@
-"""One self-contained HTML page of a tracking run or of a benchmark: tables, plots, pictures."""
+"""One self-contained HTML page of a tracking run, a benchmark or a stress test: tables, plots, pictures."""

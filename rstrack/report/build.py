@@ -16,7 +16,9 @@ from rstrack.report.bench import bench_page
 from rstrack.report.page import Page, render
 from rstrack.report.results import RESULTS
 from rstrack.report.run import run_page
+from rstrack.report.stress import stress_page
 from rstrack.run import Progress
+from rstrack.stress.report import STRESS
 
 REPORT = "report.html"
 
@@ -25,12 +27,12 @@ def write_report(
     folder: Path, sequence: Path | None = None, out: Path | None = None, camera_file: Path | None = None,
     progress: Progress = lambda *_: None,
 ) -> Path:  # fmt: skip
-    """Write the page of a run folder, a TUM file with a sequence, or a benchmark's folder; returns its path.
+    """Write the page of a run folder, a TUM file with a sequence, or a folder of a benchmark or of a stress test.
 
-    sequence: where the run's sequence is, by default where run.json says. out: the file, by default report.html in the
-    folder. camera_file: as in `rstrack.dataset.open_dataset`. progress: called with a stage, the fraction done (0 to 1)
-    and a note. Raises UserError: `folder` is none of these, something that was named cannot be read, or the page cannot
-    be written.
+    Returns its path. sequence: where the run's sequence is, by default where run.json says. out: the file, by default
+    report.html in the folder. camera_file: as in `rstrack.dataset.open_dataset`. progress: called with a stage, the
+    fraction done (0 to 1) and a note. Raises UserError: `folder` is none of these, something that was named cannot be
+    read, or the page cannot be written.
     """
     folder = Path(folder)
     page = dataclasses.replace(
@@ -46,15 +48,15 @@ def write_report(
 
 
 def _page(folder: Path, sequence: Path | None, camera_file: Path | None, progress: Progress) -> Page:
-    if (folder / RESULTS).is_file():
+    is_bench = (folder / RESULTS).is_file()
+    if is_bench or (folder / STRESS).is_file():
         if sequence is not None or camera_file is not None:
-            raise UserError(
-                f"{folder}: a benchmark names its sequences in {RESULTS}: leave --sequence and --camera out"
-            )
-        return bench_page(folder, progress)
+            kind = "benchmark" if is_bench else "stress test"
+            raise UserError(f"{folder}: a {kind} knows its sequences: leave --sequence and --camera out")
+        return bench_page(folder, progress) if is_bench else stress_page(folder)
     if folder.is_dir() and not (folder / TRAJECTORY).is_file():
         raise UserError(
-            f"{folder}: holds neither {TRAJECTORY} nor {RESULTS}: give a folder that 'rstrack track' or "
-            "'rstrack bench' wrote"
+            f"{folder}: holds neither {TRAJECTORY}, {RESULTS} nor {STRESS}: give a folder that 'rstrack track', "
+            "'rstrack bench' or 'rstrack stress' wrote"
         )
     return run_page(folder, sequence, camera_file)

@@ -1,4 +1,4 @@
-"""Plotly figures as plain data: the path in 3D and from above, curves over time, bars."""
+"""Plotly figures as plain data: the path in 3D and from above, curves over time or anything else, bars."""
 
 from __future__ import annotations
 
@@ -49,6 +49,17 @@ class Curve:
     color: str
     stamps: FloatArray
     values: FloatArray
+
+
+@dataclass(frozen=True)
+class Series:
+    """Values (n,) at x (n,), NaN where there is none."""
+
+    name: str
+    color: str
+    x: Sequence[float]
+    values: Sequence[float]
+    is_dashed: bool = False
 
 
 def method_colors(methods: Sequence[str]) -> dict[str, str]:
@@ -108,6 +119,20 @@ def over_time(curves: Sequence[Curve], label: str, points: int = 1500, ticks: Se
     layout = _layout(label, "time, s")
     layout["yaxis"]["rangemode"] = "normal" if ticks else "tozero"
     return {"data": data, "layout": layout}
+
+
+def against(series: Sequence[Series], x_label: str, y_label: str) -> Figure:
+    """Measured points joined by lines; labels with units."""
+    data = [
+        {
+            "type": "scatter", "mode": "lines+markers", "name": one.name, "x": _short(np.array(one.x, np.float64), 6),
+            "y": _short(np.array(one.values, np.float64), 4), "marker": {"color": one.color, "size": 7},
+            "line": {"color": one.color, "width": 2, "dash": "dash" if one.is_dashed else "solid"},
+            "hovertemplate": f"%{{y:.4g}}<extra>{one.name}</extra>",
+        }
+        for one in series
+    ]  # fmt: skip
+    return {"data": data, "layout": _layout(y_label, x_label)}
 
 
 def bars(

@@ -1,6 +1,7 @@
 """What the blur stress test found, as text, CSV, JSON, curves, and the four panels of the paper's Figure 2.
 
 write_report(report, Path("runs/stress"))
+report = read_report(Path("runs/stress"))
 """
 
 from __future__ import annotations
@@ -8,16 +9,24 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from rsgen.files import atomic_write, encode_png
+from rsgen.errors import UserError
+from rsgen.files import atomic_write, encode_png, read_png, read_text
 from rstrack.estimate import plain
-from rstrack.stress.run import ColorScore, Panels, StressReport
+from rstrack.stress.run import ColorScore, DepthScore, Panels, StressReport, TrackScore
 
+STRESS = "stress.json"
+
+# Names of the files in panels/, in the order of the paper's Figure 2.
+_PANELS = ("registered", "weights", "constant", "blur_aware", "sharp_view")
 _COLORS = ("#2a6fbb", "#d9822b", "#3a8f4d", "#8e44ad", "#c0392b")
 
 
@@ -25,9 +34,10 @@ def write_report(report: StressReport, out: Path) -> list[Path]:
     """Write stress.txt, stress.json, stress_color.csv, _depth.csv, _tracking.csv, stress.png, panels.png and the
     panels themselves in panels/; returns the files. Raises UserError if that cannot be done."""
     data = plain(report.as_dict())
+    data["panels"] = None if report.panels is None else _about(report.panels)
     files = {
         "stress.txt": report_text(report) + "\n",
-        "stress.json": json.dumps(data, indent=1, allow_nan=False) + "\n",
+        STRESS: json.dumps(data, indent=1, allow_nan=False) + "\n",
         **{f"stress_{name}.csv": _csv(data[name]) for name in ("color", "depth", "tracking")},
     }
     for name, text in files.items():
@@ -37,16 +47,41 @@ def write_report(report: StressReport, out: Path) -> list[Path]:
     return written + ([] if report.panels is None else _write_panels(report.panels, out))
 
 
+def read_report(out: Path) -> StressReport:
+    """What `write_report` has written into `out`, without the panels. Raises UserError naming the first wrong field."""
+    stored = _read(Path(out) / STRESS)
+    return StressReport(
+        stored.config,
+        tuple(ColorScore(**row.model_dump()) for row in stored.color),
+        tuple(DepthScore(**row.model_dump()) for row in stored.depth),
+        tuple(TrackScore(**row.model_dump()) for row in stored.tracking),
+        None,
+    )
+
+
+def read_panels(out: Path) -> Panels | None:
+    """The panels in `out`, weights to 1/255 of the largest; None if the test had none. Raises UserError."""
+    about, folder = _read(Path(out) / STRESS).panels, Path(out) / "panels"
+    if about is None:
+        if folder.is_dir():
+            raise UserError(f"{folder}: {STRESS} does not say what is in it: run 'rstrack stress' again")
+        return None
+    size = (about.height, about.width, 3)
+    images = {name: read_png(folder / f"{name}.png", size, np.uint8) for name in _PANELS}
+    images["weights"] = images["weights"][..., 0] * np.float32(about.white / 255.0)
+    return Panels(about.case, about.keyframe, *images.values())
+
+
 def report_text(report: StressReport) -> str:
     """Tables with units."""
     lines = [f"blur stress test of {report.config}", "", "fused colour against the sharp view (means over keyframes)"]
     head = ("sequence", "poses", "weights", "PSNR dB", "gain dB", "worst dB", "SSIM", "gradient", "keyframes")
     rows: list[tuple[str, ...]] = []
     for row in report.color:
-        base = _constant(report.color, row)
-        gain = "" if row.sigma_px is None or base is None else f"{row.psnr_db - base.psnr_db:+.2f}"
+        gain = gain_db(report.color, row)
         rows.append(
-            (row.case, row.poses, _weights(row.sigma_px), f"{row.psnr_db:.2f}", gain, f"{row.psnr_db_least:.2f}",
+            (row.case, row.poses, _weights(row.sigma_px), f"{row.psnr_db:.2f}",
+             "" if gain is None else f"{gain:+.2f}", f"{row.psnr_db_least:.2f}",
              f"{row.ssim:.4f}", f"{row.gradient:.3f}", str(row.keyframes))
         )  # fmt: skip
     lines += _table(head, rows)
@@ -63,17 +98,21 @@ def report_text(report: StressReport) -> str:
 
 def gains_db(report: StressReport, sigma_px: float = 1.0, poses: str = "true") -> dict[str, float]:
     """PSNR of blur-aware over that of constant weights in dB, by sequence."""
-    found = {}
-    for row in report.color:
-        base = _constant(report.color, row)
-        if row.sigma_px == sigma_px and row.poses == poses and base is not None:
-            found[row.case] = row.psnr_db - base.psnr_db
-    return found
+    rows = [row for row in report.color if (row.sigma_px, row.poses) == (sigma_px, poses)]
+    return {row.case: gain for row in rows if (gain := gain_db(report.color, row)) is not None}
 
 
-def _constant(rows: Sequence[ColorScore], row: ColorScore) -> ColorScore | None:
+def gain_db(rows: Sequence[ColorScore], row: ColorScore) -> float | None:
+    """PSNR of `row` over that of constant weights, among `rows`, in dB; None if it is of constant weights itself."""
     same = (r for r in rows if r.sigma_px is None and (r.case, r.poses) == (row.case, row.poses))
-    return next(same, None)
+    base = next(same, None)
+    return None if row.sigma_px is None or base is None else row.psnr_db - base.psnr_db
+
+
+def shade(weights: npt.NDArray[np.floating[Any]]) -> tuple[npt.NDArray[np.uint8], float]:
+    """Weights (h, w) as a grey picture (h, w, 3), and the weight that is white in it: the largest."""
+    white = max(float(weights.max()), 1e-6)
+    return np.repeat(np.rint(255.0 / white * weights).astype(np.uint8)[..., None], 3, axis=-1), white
 
 
 def _weights(sigma_px: float | None) -> str:
@@ -150,15 +189,9 @@ def _by_speed(report: StressReport) -> list[ColorScore]:
 def _write_panels(panels: Panels, out: Path) -> list[Path]:
     from rsgen.figures import save_grid
 
-    brightest = max(float(panels.weights.max()), 1e-6)
-    shade = np.repeat(np.rint(255.0 / brightest * panels.weights).astype(np.uint8)[..., None], 3, axis=-1)
-    images = {
-        "registered": panels.blurred,
-        "weights": shade,
-        "constant": panels.constant,
-        "blur_aware": panels.aware,
-        "sharp_view": panels.truth,
-    }
+    picture, white = shade(panels.weights)
+    shown = (panels.blurred, picture, panels.constant, panels.aware, panels.truth)
+    images = dict(zip(_PANELS, shown, strict=True))
     folder = out / "panels"
     folder.mkdir(parents=True, exist_ok=True)
     written = [folder / f"{name}.png" for name in images]
@@ -166,10 +199,85 @@ def _write_panels(panels: Panels, out: Path) -> list[Path]:
         atomic_write(path, encode_png(np.ascontiguousarray(image)))
     titles = (
         "registered blurred input",
-        f"weights (white: {brightest:.2g})",
+        f"weights (white: {white:.2g})",
         "constant weights",
         "blur-aware weights",
         "sharp view (truth)",
     )
     save_grid([[image / 255.0 for image in images.values()]], titles, out / "panels.png")
     return [*written, out / "panels.png"]
+
+
+# -- reading ----------------------------------------------------------------------------------------------------------
+
+# What JSON cannot hold (NaN, infinity) was written as null.
+_Score = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
+_Measure = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+
+
+class _Stored(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class _ColorRow(_Stored):
+    case: str
+    speed: _Measure
+    exposure_s: _Measure
+    poses: Literal["true", "estimated"]
+    sigma_px: _Measure | None
+    psnr_db: _Score
+    psnr_db_least: _Score
+    ssim: _Score
+    gradient: _Score
+    keyframes: int = Field(ge=1)
+
+
+class _DepthRow(_Stored):
+    case: str
+    poses: Literal["true", "estimated"]
+    single_m: _Score
+    fused_m: _Score
+    pixels: int = Field(ge=0)
+
+
+class _TrackRow(_Stored):
+    case: str
+    speed: _Measure
+    exposure_s: _Measure
+    variant: str
+    ate_m: _Measure | None
+    drift_m_per_s: _Measure | None
+    lost: int = Field(ge=0)
+
+
+class _AboutPanels(_Stored):
+    """white: the weight that is white in weights.png."""
+
+    case: str
+    keyframe: int = Field(ge=0)
+    width: int = Field(ge=1)
+    height: int = Field(ge=1)
+    white: _Measure
+
+
+class _StoredReport(_Stored):
+    config: str
+    color: tuple[_ColorRow, ...] = Field(min_length=1)
+    depth: tuple[_DepthRow, ...]
+    tracking: tuple[_TrackRow, ...] = Field(min_length=1)
+    panels: _AboutPanels | None = None
+
+
+def _about(panels: Panels) -> dict[str, Any]:
+    height, width = panels.weights.shape
+    white = shade(panels.weights)[1]
+    return {"case": panels.case, "keyframe": panels.index, "width": width, "height": height, "white": white}
+
+
+def _read(path: Path) -> _StoredReport:
+    try:
+        return _StoredReport.model_validate_json(read_text(path))
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise UserError(f"{path}: {where or 'the file'}: {first['msg']}: run 'rstrack stress' again") from None
