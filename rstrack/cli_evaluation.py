@@ -45,6 +45,10 @@ def add_evaluation(commands: Commands) -> None:
         "--add", action="append", default=[], metavar="NAME=DIR",
         help="a tracker of your own: DIR holds SEQUENCE.txt (TUM), or SEQUENCE/ (a run folder), for each sequence",
     )  # fmt: skip
+    bench.add_argument(
+        "--meshes", action=argparse.BooleanOptionalAction,
+        help="pictures of maps made with the trajectories, one a sequence (default: yes, but with --quick no)",
+    )  # fmt: skip
     bench.add_argument("--scheduler", metavar="ADDRESS|local[:N]", help=SCHEDULER_HELP)
     bench.add_argument("--quiet", action="store_true", help="no progress")
     add_options(bench, leave_out=("method",))
@@ -54,6 +58,7 @@ def _bench(options: argparse.Namespace) -> int:
     from rsgen.progress import ProgressDisplay
     from rstrack.evaluation.config import choose, load_bench_config
     from rstrack.evaluation.grid import run_plan
+    from rstrack.evaluation.mesh_pictures import SHOWN, draw_meshes
     from rstrack.evaluation.plan import make_plan
     from rstrack.evaluation.plots import draw_plots
     from rstrack.evaluation.tables import write_results
@@ -64,19 +69,31 @@ def _bench(options: argparse.Namespace) -> int:
         methods=options.methods, peers=options.peers,
     )  # fmt: skip
     out = options.out or Path("out/bench_quick" if options.quick else "out/bench")
+    with_meshes = not options.quick if options.meshes is None else options.meshes
+    if options.meshes and not set(SHOWN) & set(choice.methods):
+        raise UserError(f"--meshes: is for {', '.join(SHOWN)}: add one of them to --method")
     plan = make_plan(choice, options.data, out, options_of(options), dict(map(_added, options.add)))
     with ProgressDisplay(options.quiet) as progress:
         with open_workers(options.scheduler) as workers:
             results = run_plan(plan, workers, progress)
         text = write_results(results, out)
-        if not results.interrupted:
-            draw_plots(results, out, progress)
+        interrupted = results.interrupted
+        warnings: list[str] = []
+        try:
+            if not interrupted:
+                draw_plots(results, out, progress)
+                if with_meshes:
+                    draw_meshes(results, out, progress=progress, warn=warnings.append)
+        except KeyboardInterrupt:
+            interrupted = True
     print(text)
     sys.stdout.flush()
-    if results.interrupted:
+    for warning in warnings:
+        print(f"rstrack: {warning}", file=sys.stderr)
+    if interrupted:
         print(f"rstrack: interrupted; {out} holds what is finished, and the same command goes on", file=sys.stderr)
         return 130
-    print(f"\n{out}: results.txt, .md, .csv, .json, plots/*.png and cells/SEQUENCE/METHOD written")
+    print(f"\n{out}: results.txt, .md, .csv, .json, plots/* and cells/SEQUENCE/METHOD written")
     return 0 if all(cell.counts for cell in results.cells) else 1
 
 

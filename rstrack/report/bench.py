@@ -11,10 +11,11 @@ import numpy as np
 
 from rsgen.errors import UserError
 from rstrack.dataset import Dataset, open_dataset
+from rstrack.evaluation.mesh_pictures import read_picture
 from rstrack.report.data import Tracked, load_run, true_path
 from rstrack.report.figures import TRUE_COLOR, Curve, Path3D, bars, method_colors, over_time, path_3d
 from rstrack.report.page import Block, Card, CardRow, Cell, Chooser, Note, Page, Plot, Section, Table
-from rstrack.report.pictures import frame_panels, shutter_sliders
+from rstrack.report.pictures import frame_panels, map_pictures, shutter_sliders
 from rstrack.report.results import RESULTS, CellEntry, Figures, Results, read_results
 from rstrack.report.run import number
 from rstrack.run import Progress
@@ -23,7 +24,16 @@ OURS, BASELINE = "rs-pg", "baseline"
 
 # Points of a path or curve, of which a page holds a hundred or so.
 _POINTS = 350
-_IMAGE_WIDTH, _PANEL_WIDTH = 480, 300
+_IMAGE_WIDTH, _PANEL_WIDTH, _MAP_WIDTH = 480, 300, 480
+
+_MAPS = (
+    "What depth and colour add up to along each method's own path, as rstrack map fuses them, seen from above, "
+    "through ceiling and nearer walls. rs: every line is put where the camera was when it was read. gs and baseline"
+    " take the shutter for a global one: where that shows, walls and floors bend and double, edges fray, and what is "
+    "on them blurs. "
+    "Maps are aligned as for the ATE, by the camera's positions alone, so that after a short path one may be tilted"
+    " as a whole."
+)
 
 
 @dataclass(frozen=True)
@@ -62,6 +72,8 @@ def bench_page(folder: Path, progress: Progress = lambda *_: None) -> Page:
         sections.append(Section("sequences", "Sequence by sequence", (Chooser("Sequence", paths),)))
     if images:
         sections.append(Section("images", "Images", (Chooser("Sequence", images),)))
+    if maps := _maps(folder, results, warnings):
+        sections.append(Section("maps", "Maps", (Note(_MAPS), Chooser("Sequence", maps))))
     sections.append(Section("speed", "Speed", (_speed(results),)))
     machine = results.machine
     if isinstance(machine, dict):
@@ -215,6 +227,19 @@ def _sequences(
                 warnings.append(f"No images of {entry.name}: {error}.")
     progress("reading runs", 1.0, "")
     return tuple(plots), tuple(images)
+
+
+def _maps(folder: Path, results: Results, warnings: list[str]) -> tuple[tuple[str, tuple[Block, ...]], ...]:
+    """For each sequence that has a picture of meshes its maps."""
+    maps: list[tuple[str, tuple[Block, ...]]] = []
+    for entry in results.sequences:
+        picture = read_picture(folder, entry.name)
+        if picture is not None:
+            try:
+                maps.append((entry.name, map_pictures(picture, _MAP_WIDTH)))
+            except UserError as error:
+                warnings.append(f"No maps of {entry.name}: {error}.")
+    return tuple(maps)
 
 
 def _runs(

@@ -1,15 +1,24 @@
-"""Which frame a report shows, and its pictures: colour, depth, and what the rolling shutter did to it."""
+"""Which frame a report shows, and its pictures: colour, depth, what the rolling shutter did to it; and maps."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import cv2
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.errors import UserError
+from rsgen.files import read_bytes
 from rsgen.geometry.spline import Spline
 from rstrack.dataset import Dataset
+from rstrack.evaluation.mesh_pictures import MeshPicture
 from rstrack.report.data import Tracked
 from rstrack.report.images import colored_depth, jpeg_uri, rectified
 from rstrack.report.page import Block, Note, Picture, Pictures, Slider
+
+# Of maps: more than of photographs, for the differences are small.
+_MAP_WIDTH = 720
 
 _TWINS = {"global_middle": "middle", "global_first": "first", "global_last": "last"}
 
@@ -78,7 +87,38 @@ def shutter_sliders(tracked: Tracked, dataset: Dataset, width: int = 640) -> tup
     return tuple(blocks)
 
 
+def map_pictures(picture: MeshPicture, width: int) -> tuple[Block, ...]:
+    """The maps of a sequence side by side, `width` px each, and each of the others against the first.
+
+    Raises UserError if the picture cannot be read.
+    """
+    image = _read_jpeg(picture.path)
+    n, (w, h) = len(picture.methods), picture.panel_px
+    step = w if n == 1 else (image.shape[1] - w) // (n - 1)
+    panels = [image[-h:, k * step : k * step + w] for k in range(n)]
+    if any(panel.shape[:2] != (h, w) for panel in panels):
+        raise UserError(f"{picture.path}: is not of the size that was drawn: delete it and run 'rstrack bench' again")
+    named = list(zip(panels, picture.labels, strict=True))
+    blocks: list[Block] = [Pictures(tuple(_map(panel, label, width) for panel, label in named))]
+    first, *others = [_map(panel, label, _MAP_WIDTH) for panel, label in named]
+    for method, other in zip(picture.methods[1:], others, strict=True):
+        blocks.append(Slider(f"Map with {method} against {picture.methods[0]}", other, first))
+    return tuple(blocks)
+
+
 # ---------------------------------------------------------------------------------------------------------------------
+
+
+def _map(panel: npt.NDArray[np.uint8], label: str, width: int) -> Picture:
+    return Picture(jpeg_uri(panel, width), label, f"map from above, {label}")
+
+
+def _read_jpeg(path: Path) -> npt.NDArray[np.uint8]:
+    """RGB (h, w, 3). Raises UserError."""
+    image = cv2.imdecode(np.frombuffer(read_bytes(path), np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        raise UserError(f"{path}: is not a whole JPEG: delete it and run 'rstrack bench' again")
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def _frame_to_show(tracked: Tracked, dataset: Dataset) -> int | None:
