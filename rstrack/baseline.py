@@ -72,7 +72,8 @@ class BaselineTracker:
     spline_valid: tuple[tuple[float, float], ...] = ()
 
     def __init__(self, rig: Rig, options: Options | None = None) -> None:
-        self.rig, self.options = rig, options or Options(method="baseline")
+        self.rig = rig
+        self.options = (options or Options(method="baseline")).decided(rig.depth_shutter.readout_s > 0.0)
         self._prepare = Preparer(rig, self.options)
         self._terms, self._maker = self._prepare.terms, self._prepare.maker
         self._reference: Reference | None = None

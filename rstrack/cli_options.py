@@ -22,7 +22,8 @@ HELP = {
     "keyframe_distance": "new keyframe after this distance, m",
     "keyframe_angle_deg": "new keyframe after this rotation, degrees",
     "keyframe_strategy": "the last frame that has converged, or the newest, rolling until it has",
-    "fuse": "average the depth of later frames into the keyframe",
+    "fuse": "average the depth of later frames into the keyframe (default: yes, but not if a rolling shutter is taken "
+    "for a global one)",
     "bootstrap_frames": "frames that are aligned jointly at the start",
     "max_depth": "depth beyond this counts as missing, m",
     "reference": "what new frames are aligned to: keyframes, or a model of all that was seen, older keyframes "
@@ -56,8 +57,8 @@ def add_options(command: argparse.ArgumentParser, leave_out: Sequence[str] = ())
         flag, kind = f"--{field.name.replace('_', '-')}", hints[field.name]
         text = f"{HELP.get(field.name, '')} (default: {field.default})"
         how: dict[str, Any] = {"dest": field.name, "default": field.default}
-        if kind is bool:
-            text = f"{HELP.get(field.name, '')} (default: {'yes' if field.default else 'no'})"
+        if bool in (kind, *get_args(kind)):
+            text = HELP.get(field.name, "")
             group.add_argument(flag, action=argparse.BooleanOptionalAction, help=text, **how)
         elif get_args(kind):
             group.add_argument(flag, choices=get_args(kind), help=text, **how)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -34,6 +34,8 @@ class Options:
     blur_sigma_px: pixels; points of a colour image that its exposure blurs count less, by equation (13); 0: all alike.
     keyframe_strategy: which frame that is (paper, section 3.5): the last one that has converged, rectified at once; or
       the newest, with its rolling shutter until it has converged and can be rectified.
+    fuse: average the depth of later frames into the keyframe; None: where it is known when each line was taken, that is
+      if the method models the rolling shutter or there is none. Otherwise walls get steps, which attract later frames.
     reference: keyframe: new frames are aligned to one frame, with the depth of others fused in; model: its depth is
       averaged with a signed distance volume of all frames, with voxels of voxel_m, frames are aligned to the oldest
       keyframe in view too, and a keyframe is used again when the camera comes back to it. The baseline has no model.
@@ -47,7 +49,7 @@ class Options:
     keyframe_distance: float = 0.3
     keyframe_angle_deg: float = 20.0
     keyframe_strategy: Strategy = "converged"
-    fuse: bool = True
+    fuse: bool | None = None
     bootstrap_frames: int = 6
     max_depth: float = 12.0
     blur_sigma_px: float = 0.0
@@ -96,6 +98,10 @@ class Options:
     def photometric(self) -> bool:
         """Whether the photometric term is used."""
         return self.method in ("rs-pg", "rs-p", "gs-pg", "gs-p")
+
+    def decided(self, has_rolling_shutter: bool) -> Options:
+        """With `fuse` chosen for such a depth camera where it is None."""
+        return replace(self, fuse=self.rolling or not has_rolling_shutter) if self.fuse is None else self
 
     def left_behind(self, T_base_cam: FloatArray, overlap: float) -> bool:
         """Whether a camera at T_base_cam (4, 4), that sees `overlap` of what the keyframe had, needs another one."""

@@ -49,9 +49,10 @@ _DATASET_FILES = ("sequence.yaml", "rgb.txt", "depth.txt", "associations.txt", "
 
 
 class AnyTracker(Protocol):
-    """What all trackers have in common. reports: of all frames so far."""
+    """What all trackers have in common. reports: of all frames so far; options: with all that depends on the rig."""
 
     reports: list[FrameReport]
+    options: Options
 
     @property
     def keyframes(self) -> int:
@@ -186,7 +187,7 @@ def track(
         raise UserError(error)
     timings = _timings(time.perf_counter() - begin, seconds)
     stamps = dataset.stamps[chosen][: len(seconds)]
-    info = _settings(dataset, chosen, options, noise) | {
+    info = _settings(dataset, chosen, tracker.options, noise) | {
         "end": end,
         "error": error or None,
         "keyframes": tracker.keyframes,

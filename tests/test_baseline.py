@@ -21,6 +21,7 @@ from rstrack.keyframe import KeyframeMaker
 from rstrack.lines import Exposure
 from rstrack.options import Options
 from rstrack.rig import Frame, Image, Rig
+from rstrack.run import make_tracker as make_any_tracker
 from rstrack.terms import Terms
 from rstrack.warp import Lens
 
@@ -109,6 +110,18 @@ def test_keyframes_follow_the_options(on_global: BaselineTracker, fuse: bool) ->
     assert len(made) > 4 > on_global.keyframes
     for first, last in itertools.pairwise(made):
         assert np.linalg.norm(p[last] - p[first]) > 0.045 > np.linalg.norm(p[last - 1] - p[first]) - 0.01
+
+
+@pytest.mark.parametrize(
+    ("method", "shutter", "fuses"),
+    [("baseline", ROLLING, False), ("baseline", GLOBAL, True), ("gs-g", ROLLING, False), ("gs-pg", GLOBAL, True),
+     ("rs-g", ROLLING, True), ("rs-pg", GLOBAL, True)],
+)  # fmt: skip
+def test_depth_is_averaged_where_it_is_known_when_lines_were_taken(method: Any, shutter: Shutter, fuses: bool) -> None:
+    rig = make_rig(shutter)
+    assert make_any_tracker(rig, Options(method=method, backend="llvm")).options.fuse is fuses
+    for said in (True, False):
+        assert make_any_tracker(rig, Options(method=method, backend="llvm", fuse=said)).options.fuse is said
 
 
 @pytest.mark.parametrize("keyframe_overlap", [0.65, 1.01])

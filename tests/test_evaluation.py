@@ -184,6 +184,8 @@ def test_what_a_cell_depends_on(place: Path) -> None:
     assert not {job.key for job in plan(options=Options(knot_spacing_s=0.03)).jobs} & set(keys)
     assert not {job.key for job in plan(frames=slice(0, 20)).jobs} & set(keys)
     assert [job.key for job in plan(options=Options(method="gs-p"), frames=slice(0, FRAMES)).jobs] == keys
+    fused = [job.key in keys for job in plan(options=Options(fuse=True)).jobs]
+    assert fused == [job.method.startswith("rs") for job in plan().jobs]  # for which it is the default
     rgb = place / "data/lr_kt2/rgb.txt"
     rgb.write_text("# another\n" + rgb.read_text())
     assert [job.key == key for job, key in zip(plan().jobs, keys, strict=True)] == [True, True, False, False]
