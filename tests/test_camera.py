@@ -8,7 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from util import numeric_jacobian
 
@@ -144,8 +144,10 @@ def test_fisheye_fold_and_right_angle() -> None:
     assert np.isnan(rays[1, 0])
 
 
+# Newton's whole steps went round in circles at one ray of these.
+@example((0.43380560540908664, 0.214471962837414, 0.010339865489247292, 6.103515625e-05, -0.2421875))
 @given(st.tuples(*[st.floats(-0.5, 0.5)] * 2, *[st.floats(-0.05, 0.05)] * 2, st.floats(-0.5, 0.5)))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60, deadline=None, derandomize=True)
 def test_distortion_is_one_to_one_on_its_domain(distortion: tuple[float, ...]) -> None:
     camera = Camera(100, 100, 1.0, 1.0, 0.0, 0.0, "radtan", distortion)
     extent = 0.9999 * min(camera.max_radius, 2.0)

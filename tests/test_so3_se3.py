@@ -105,7 +105,7 @@ def test_jacobians_are_derivatives(angle: float) -> None:
 
 
 @given(vectors6, vectors6)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60, deadline=None, derandomize=True)
 def test_adjoints(a: np.ndarray, b: np.ndarray) -> None:
     T = se3.exp(a)
     np.testing.assert_allclose(wedge(se3.adjoint(T) @ b), T @ wedge(b) @ np.linalg.inv(T), rtol=0, atol=1e-11)
@@ -114,7 +114,7 @@ def test_adjoints(a: np.ndarray, b: np.ndarray) -> None:
 
 
 @given(vectors3, vectors3)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60, deadline=None, derandomize=True)
 def test_hat_vee_cross(a: np.ndarray, b: np.ndarray) -> None:
     np.testing.assert_allclose(so3.hat(a) @ b, np.cross(a, b), rtol=0, atol=1e-14)
     np.testing.assert_array_equal(so3.cross(a, b), np.cross(a, b))
@@ -123,7 +123,7 @@ def test_hat_vee_cross(a: np.ndarray, b: np.ndarray) -> None:
 
 
 @given(st.tuples(*[st.floats(-1.0, 1.0)] * 4).map(np.array).filter(lambda q: np.linalg.norm(q) > 1e-3))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100, deadline=None, derandomize=True)
 def test_quaternions(q: np.ndarray) -> None:
     R = so3.from_quat(q)
     np.testing.assert_allclose(R, Rotation.from_quat(q).as_matrix(), rtol=0, atol=4e-15)

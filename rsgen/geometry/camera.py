@@ -207,16 +207,22 @@ class Camera:
         limit = (1.0 - 1e-9) * self.max_radius
         scale = 1.0 + np.abs(distorted).max(axis=-1, keepdims=True)
         residual = self._distort(xy) - distorted
-        for _ in range(30):
+        share = np.ones(xy.shape[:-1])
+        for _ in range(60):
             J = self._distort_jacobian(xy)
             a, b, c = J[..., 0, 0], J[..., 0, 1], J[..., 1, 1]
             # Positive on the whole domain, which the iterates are kept in.
             determinant = a * c - b * b
-            rx, ry = residual[..., 0] / determinant, residual[..., 1] / determinant
-            xy = xy - np.stack([c * rx - b * ry, a * ry - b * rx], axis=-1)
-            radius = np.hypot(xy[..., 0], xy[..., 1])
-            xy = xy * np.minimum(1.0, limit / np.maximum(radius, 1e-300))[..., None]
-            residual = self._distort(xy) - distorted
+            rx, ry = share * residual[..., 0] / determinant, share * residual[..., 1] / determinant
+            trial = xy - np.stack([c * rx - b * ry, a * ry - b * rx], axis=-1)
+            radius = np.hypot(trial[..., 0], trial[..., 1])
+            trial = trial * np.minimum(1.0, limit / np.maximum(radius, 1e-300))[..., None]
+            error = self._distort(trial) - distorted
+            # Whole steps may go round in circles; shorter ones cannot, since they point downhill.
+            size = np.abs(error).max(axis=-1)
+            good = ((error**2).sum(axis=-1) <= (residual**2).sum(axis=-1)) | (size <= 1e-12 * scale[..., 0])
+            xy, residual = np.where(good[..., None], trial, xy), np.where(good[..., None], error, residual)
+            share = np.where(good, np.minimum(1.0, 2.0 * share), 0.5 * share)
             if not (np.abs(residual) > 1e-15 * scale).any():
                 break
         solved = (np.abs(residual) <= 1e-12 * scale).all(axis=-1)
