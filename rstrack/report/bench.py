@@ -81,7 +81,10 @@ def bench_page(folder: Path, progress: Progress = lambda *_: None) -> Page:
     facts = [("machine", str(machine or "")), ("version", results.version)]
     return Page(
         title="Tracking benchmark",
-        subtitle=f"{len(results.sequences)} sequences, {len(results.methods)} methods, {len(results.cells)} runs",
+        subtitle=", ".join(
+            _counted(len(what), noun)
+            for what, noun in ((results.sequences, "sequence"), (results.methods, "method"), (results.cells, "run"))
+        ),
         cards=_cards(results, groups),
         sections=tuple(sections),
         facts=tuple(fact for fact in facts if fact[1]),
@@ -109,12 +112,13 @@ def _cards(results: Results, groups: Sequence[str]) -> tuple[CardRow, ...]:
             theirs = results.paper_average(mean.sequences, method, q.name)
             note = "" if theirs is None else f"paper: {number(theirs, q.scale)} {q.unit}"
             cards.append(Card(f"{number(q.of(mean), q.scale)} {q.unit}", q.title, note))
-        rows.append(CardRow(tuple(cards), f"{method}, {group}: average of {_count(len(mean.sequences))}"))
+        of = _counted(len(mean.sequences), "sequence")
+        rows.append(CardRow(tuple(cards), f"{method}, {group}: average of {of}"))
     return tuple(rows)
 
 
-def _count(sequences: int) -> str:
-    return f"{sequences} sequence" + ("" if sequences == 1 else "s")
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}" + ("" if count == 1 else "s")
 
 
 def _tables(results: Results, groups: Sequence[str]) -> list[Block]:
