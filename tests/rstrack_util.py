@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from util import random_spline, random_twists
 
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
@@ -21,7 +22,6 @@ from rstrack.lines import Exposure
 from rstrack.reference import Reference, level_points
 from rstrack.terms import Terms
 from rstrack.warp import Lens
-from tests.util import random_spline, random_twists
 
 FloatArray = np.ndarray
 SCANS: tuple[Scan, ...] = ("top-bottom", "bottom-top", "left-right", "right-left")

@@ -11,13 +11,13 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from synthetic import DURATION_S, T_COLOR_DEPTH, make_config, make_sequence
 
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.sequence import read_sequence
 from rstrack.dataset import group_colors, open_dataset
 from rstrack.prefetch import prefetched
-from tests.synthetic import DURATION_S, T_COLOR_DEPTH, make_config, make_sequence
 
 WIDTH, HEIGHT = 32, 24
 STAMPS = (1305031102.1758, 1305031102.2091, 1305031102.2424, 1305031102.2757)

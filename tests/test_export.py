@@ -13,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import synthetic
 import yaml
 from evo.tools import file_interface
 from scipy.spatial.transform import Rotation
@@ -35,7 +36,6 @@ from rsgen.sequence import Sequence, read_sequence
 from rsgen.sequence_format import STREAMS
 from rsgen.trajectory import read_trajectory
 from rstrack.dataset import open_dataset
-from tests import synthetic
 
 T_IMU_DEPTH = se3.exp(np.array([0.12, -0.05, 0.07, 0.4, -1.1, 0.6]))
 IMU: dict[str, Any] = {

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from rstrack_util import hand_held, moved
+from util import numeric_jacobian, random_spline, random_twists
 
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
@@ -18,8 +20,6 @@ from rstrack.normal_equations import (
 )
 from rstrack.optimizer import SplineState
 from rstrack.residuals import BlockSums
-from tests.rstrack_util import hand_held, moved
-from tests.util import numeric_jacobian, random_spline, random_twists
 
 TIMES = np.array([0.34, 0.352, 0.41, 0.43, 0.449, 0.452])  # segments 0 (twice), 2 (three times) and 3
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rstrack_util import ENGINE
 
 from rstrack.recording import recorded
-from tests.rstrack_util import ENGINE
 
 ROOT = Path(__file__).parents[1]
 

@@ -7,22 +7,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-
-from rsgen.geometry import se3
-from rsgen.geometry.camera import Camera
-from rsgen.geometry.shutter import project_rolling
-from rsgen.geometry.spline import Spline
-from rstrack.frames import depth_image
-from rstrack.lines import Exposure, from_base_table, to_base_table
-from rstrack.rectify import color_kernel, rectify_kernel
-from rstrack.reference import (
-    STRIDES,
-    Reference,
-    rectified_lens,
-)
-from rstrack.residuals import EDGE
-from tests import synthetic
-from tests.rstrack_util import (
+import synthetic
+from rstrack_util import (
     ENGINE,
     SCANS,
     T_COLOR_DEPTH,
@@ -37,6 +23,20 @@ from tests.rstrack_util import (
     plane_before,
     small_camera,
 )
+
+from rsgen.geometry import se3
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import project_rolling
+from rsgen.geometry.spline import Spline
+from rstrack.frames import depth_image
+from rstrack.lines import Exposure, from_base_table, to_base_table
+from rstrack.rectify import color_kernel, rectify_kernel
+from rstrack.reference import (
+    STRIDES,
+    Reference,
+    rectified_lens,
+)
+from rstrack.residuals import EDGE
 
 WIDTH, HEIGHT = 160, 120
 STAMP = 0.42

@@ -5,6 +5,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from rstrack_util import (
+    ENGINE,
+    small_camera,
+    texture,
+)
 
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
@@ -20,11 +25,6 @@ from rstrack.reference import (
 )
 from rstrack.residuals import EDGE, NEAREST
 from rstrack.warp import Lens
-from tests.rstrack_util import (
-    ENGINE,
-    small_camera,
-    texture,
-)
 
 SHAPE = (120, 160)
 

@@ -7,6 +7,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+import synthetic
+from rstrack_util import (
+    ENGINE,
+    depth_input,
+    depth_of,
+    disturbed,
+    exact_reference,
+    exposure,
+    maker,
+    plane_before,
+    small_camera,
+)
 
 from rsgen.geometry import se3
 from rsgen.geometry.so3 import hat
@@ -19,18 +31,6 @@ from rstrack.reference import Reference
 from rstrack.residuals import EDGE, BlockSums, Scaling
 from rstrack.robust import NU, weight
 from rstrack.terms import seen_motions, weakest_motion
-from tests import synthetic
-from tests.rstrack_util import (
-    ENGINE,
-    depth_input,
-    depth_of,
-    disturbed,
-    exact_reference,
-    exposure,
-    maker,
-    plane_before,
-    small_camera,
-)
 
 DEPTH = small_camera("radtan")
 

@@ -6,17 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from scipy import stats
-
-from rsgen.geometry import se3
-from rsgen.geometry.spline import Spline
-from rstrack import lines, residuals
-from rstrack.frames import ColorImage, DepthImage
-from rstrack.reference import Reference
-from rstrack.robust import NU, scale_step, weight
-from rstrack.terms import Linearised, Terms
-from rstrack.warp import project_rolling
-from tests.rstrack_util import (
+from rstrack_util import (
     ENGINE,
     SCANS,
     T_COLOR_DEPTH,
@@ -31,7 +21,17 @@ from tests.rstrack_util import (
     plane_before,
     small_camera,
 )
-from tests.util import numeric_jacobian
+from scipy import stats
+from util import numeric_jacobian
+
+from rsgen.geometry import se3
+from rsgen.geometry.spline import Spline
+from rstrack import lines, residuals
+from rstrack.frames import ColorImage, DepthImage
+from rstrack.reference import Reference
+from rstrack.robust import NU, scale_step, weight
+from rstrack.terms import Linearised, Terms
+from rstrack.warp import project_rolling
 
 NORMALS = [(0.5, -0.2, 1.0), (-0.3, 0.6, 1.0), (0.1, 0.1, 1.0)]
 REF_STAMP, STAMP = 0.43, 0.465

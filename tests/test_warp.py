@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from rstrack_util import ENGINE, SCANS, T_COLOR_DEPTH, hand_held
+from util import numeric_jacobian
 
 from rsgen.geometry import se3, shutter
 from rsgen.geometry.camera import Camera
@@ -11,8 +13,6 @@ from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
 from rstrack.lines import Exposure, from_base_table, line_motion, to_base_table
 from rstrack.warp import FROM_BASE, TO_BASE, Lens, Projection, Sighting, cross, gather, move, project, project_rolling
-from tests.rstrack_util import ENGINE, SCANS, T_COLOR_DEPTH, hand_held
-from tests.util import numeric_jacobian
 
 CAMERAS = {
     "pinhole": Camera(640, 480, 525.0, 520.0, 319.5, 241.0),
