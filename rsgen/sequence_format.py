@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from rsgen.errors import UserError
+from rsgen.errors import UserError, first_problem
 from rsgen.files import read_yaml
 from rsgen.geometry import se3, so3
 from rsgen.geometry.camera import Camera
@@ -151,9 +151,7 @@ def read_sequence_yaml(path: Path) -> tuple[SequenceYaml, dict[str, Any]]:
     try:
         return SequenceYaml.model_validate(data), data
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise UserError(f"{path}: {where}: {first['msg']} ({error.error_count()} wrong in all)") from None
+        raise UserError(f"{path}: {first_problem(error)} ({error.error_count()} wrong in all)") from None
 
 
 def parse_listing(path: Path, text: str) -> list[Line]:

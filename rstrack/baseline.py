@@ -73,7 +73,7 @@ class BaselineTracker:
 
     def __init__(self, rig: Rig, options: Options | None = None) -> None:
         self.rig = rig
-        self.options = (options or Options(method="baseline")).decided(rig.depth_shutter.readout_s > 0.0)
+        self.options = (options or Options(method="baseline")).decided(rig.depth_shutter)
         self._prepare = Preparer(rig, self.options)
         self._terms, self._maker = self._prepare.terms, self._prepare.maker
         self._reference: Reference | None = None

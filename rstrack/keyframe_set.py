@@ -69,10 +69,12 @@ class KeyframeSet:
 
     def return_to(self, T_world_cam: FloatArray, left: Reference) -> Reference | None:
         """The oldest of a model's keyframes but `left` that is near a camera: it has drifted least. Now the newest."""
+        if self._model is None:
+            return None
         near = [
             ref for ref in self._kept if ref is not left and self._remoteness(ref.T_world_base, T_world_cam) < _RETURN
         ]
-        if self._model is None or not near:
+        if not near:
             return None
         oldest = min(near, key=lambda ref: ref.index)
         self._kept = deque((ref for ref in self._kept if ref is not oldest), maxlen=self._kept.maxlen)
@@ -80,9 +82,10 @@ class KeyframeSet:
 
     def _use(self, ref: Reference) -> Reference:
         self._kept.append(ref)
-        near = [k for k in self._kept if self._remoteness(ref.T_world_base, k.T_world_base) < _ANCHOR]
-        oldest = min(near, key=lambda k: k.index)
-        self.anchor = None if oldest is ref or self._model is None else oldest
+        if self._model is not None:
+            near = [k for k in self._kept if self._remoteness(ref.T_world_base, k.T_world_base) < _ANCHOR]
+            oldest = min(near, key=lambda k: k.index)
+            self.anchor = None if oldest is ref else oldest
         return ref
 
     def _remoteness(self, T_world_a: FloatArray, T_world_b: FloatArray) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 from rsgen.backend import Backend
 from rsgen.errors import UserError
 from rsgen.geometry import se3
+from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.so3 import FloatArray
 
 Method = Literal["rs-pg", "rs-g", "rs-p", "gs-pg", "gs-g", "gs-p", "baseline"]
@@ -35,7 +36,7 @@ class Options:
     keyframe_strategy: which frame that is (paper, section 3.5): the last one that has converged, rectified at once; or
       the newest, with its rolling shutter until it has converged and can be rectified.
     fuse: average the depth of later frames into the keyframe; None: where it is known when each line was taken, that is
-      if the method models the rolling shutter or there is none. Otherwise walls get steps, which attract later frames.
+      if the method models the rolling shutter or there is none. Otherwise what is averaged does not fit together.
     reference: keyframe: new frames are aligned to one frame, with the depth of others fused in; model: its depth is
       averaged with a signed distance volume of all frames, with voxels of voxel_m, frames are aligned to the oldest
       keyframe in view too, and a keyframe is used again when the camera comes back to it. The baseline has no model.
@@ -99,9 +100,9 @@ class Options:
         """Whether the photometric term is used."""
         return self.method in ("rs-pg", "rs-p", "gs-pg", "gs-p")
 
-    def decided(self, has_rolling_shutter: bool) -> Options:
+    def decided(self, depth_shutter: Shutter) -> Options:
         """With `fuse` chosen for such a depth camera where it is None."""
-        return replace(self, fuse=self.rolling or not has_rolling_shutter) if self.fuse is None else self
+        return replace(self, fuse=self.rolling or depth_shutter.readout_s == 0.0) if self.fuse is None else self
 
     def left_behind(self, T_base_cam: FloatArray, overlap: float) -> bool:
         """Whether a camera at T_base_cam (4, 4), that sees `overlap` of what the keyframe had, needs another one."""

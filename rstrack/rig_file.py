@@ -18,7 +18,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from rsgen.errors import UserError
+from rsgen.errors import UserError, first_problem
 from rsgen.files import read_text, read_yaml
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
@@ -123,8 +123,7 @@ def _camera(name: str, stream: _Stream) -> Camera:
 
 def _first(error: ValidationError) -> str:
     first = error.errors()[0]
-    where = ".".join(str(part) for part in first["loc"]) or "the file"
     if first["type"] == "extra_forbidden":
-        return f"{where}: no such entry: a camera file has {_KEYS}"
+        return f"{'.'.join(str(part) for part in first['loc'])}: no such entry: a camera file has {_KEYS}"
     example = f"; write e.g. '{EXAMPLE}'" if first["type"] == "missing" else ""
-    return f"{where}: {first['msg'].removeprefix('Value error, ')}{example}"
+    return f"{first_problem(error)}{example}"

@@ -51,7 +51,7 @@ class Tracker:
     """Estimates T_world_depth(t); the world is the depth camera's frame at the middle of the first image."""
 
     def __init__(self, rig: Rig, options: Options | None = None) -> None:
-        self.rig, self.options = rig, (options or Options()).decided(rig.depth_shutter.readout_s > 0.0)
+        self.rig, self.options = rig, (options or Options()).decided(rig.depth_shutter)
         self._prepare = Preparer(rig, self.options)
         self._terms, self._maker = self._prepare.terms, self._prepare.maker
         self._state: SplineState | None = None

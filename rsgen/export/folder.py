@@ -11,7 +11,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from rsgen.errors import UserError
+from rsgen.errors import UserError, first_problem
 from rsgen.files import atomic_write, read_bytes, write_error
 from rsgen.frame_source import Progress
 from rsgen.geometry.camera import Camera
@@ -86,9 +86,8 @@ def sequence_imu(sequence: Sequence) -> tuple[ImuConfig, ImuSamples] | None:
     try:
         imu = ImuConfig.model_validate(data)
     except ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(str(part) for part in ("config", "imu", *first["loc"]))
-        raise UserError(f"{where}: {field}: {first['msg']}: restore the file or render again") from None
+        problem = first_problem(error, "config", "imu")
+        raise UserError(f"{where}: {problem}: restore the file or render again") from None
     seed = sequence.meta.get("seed")
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise UserError(f"{where}: seed is not a whole number of 0 or more: restore the file or render again")

@@ -208,7 +208,7 @@ class Camera:
         scale = 1.0 + np.abs(distorted).max(axis=-1, keepdims=True)
         residual = self._distort(xy) - distorted
         share = np.ones(xy.shape[:-1])
-        for _ in range(60):
+        for _ in range(30):
             J = self._distort_jacobian(xy)
             a, b, c = J[..., 0, 0], J[..., 0, 1], J[..., 1, 1]
             # Positive on the whole domain, which the iterates are kept in.

@@ -14,7 +14,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from rsgen.errors import UserError
+from rsgen.errors import UserError, first_problem
 from rsgen.files import read_yaml
 from rstrack.options import METHODS, PEERS
 
@@ -81,10 +81,7 @@ def load_bench_config(path: Path) -> BenchConfig:
     try:
         config = BenchConfig.model_validate(read_yaml(path))
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "the file"
-        message = first["msg"].removeprefix("Value error, ")
-        raise UserError(f"{path}: {where}: {message} (configs/evaluation.yaml is an example)") from None
+        raise UserError(f"{path}: {first_problem(error)} (configs/evaluation.yaml is an example)") from None
     here = tuple(entry.model_copy(update={"config": path.parent / entry.config}) for entry in config.sequences)
     return config.model_copy(update={"sequences": here})
 

@@ -93,7 +93,8 @@ def make_mesh(
     """
     folder = out / "cells" / sequence.name / cell.method
     every = max(1, round(sequence.frames / _FRAMES))
-    options = MapOptions(shutter="gs" if _takes_for_global(cell.method) else None, every=every)
+    # Where there is no spline a map takes the shutter for a global one anyway.
+    options = MapOptions(shutter="gs" if cell.method.startswith("gs-") else None, every=every)
     record: dict[str, Any] = {"cell": cell.key, "options": dataclasses.asdict(options)}
     if (folder / MESH).is_file() and _read(folder / _MADE_FROM) == record:
         return record
@@ -130,10 +131,6 @@ def _report(progress: Progress, done: int, steps: int, name: str, fraction: floa
 def _cells(results: Results, sequence: str, methods: Sequence[str]) -> list[Cell]:
     found = [results.cell(sequence, method) for method in methods]
     return [cell for cell in found if cell is not None and cell.counts]
-
-
-def _takes_for_global(method: str) -> bool:
-    return method == "baseline" or method.startswith("gs-")
 
 
 def _label(cell: Cell) -> str:

@@ -90,10 +90,10 @@ def make_plan(
         chosen = _chosen(dataset, entry, data, choice)
         sequences.append(SequenceInfo(entry.name, entry.group, (data / entry.name).resolve(), len(chosen)))
         digest = _digest(data / entry.name)
-        is_rolling = dataset.rig.depth_shutter.readout_s > 0.0
         for method in methods:
-            used = Options(**dataclasses.asdict(options) | {"method": method}) if method in METHODS else None
-            used = used and used.decided(is_rolling)
+            used = None
+            if method in METHODS:
+                used = Options(**dataclasses.asdict(options) | {"method": method}).decided(dataset.rig.depth_shutter)
             estimate = _estimate_path(added[method], entry.name) if method in added else None
             depends = [digest, method, chosen.start, chosen.stop, used and dataclasses.asdict(used), package_version()]
             depends.append(_file_digest(estimate) if estimate is not None else None)

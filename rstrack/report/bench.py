@@ -27,12 +27,11 @@ _POINTS = 350
 _IMAGE_WIDTH, _PANEL_WIDTH, _MAP_WIDTH = 480, 300, 480
 
 _MAPS = (
-    "What depth and colour add up to along each method's own path, as rstrack map fuses them, seen from above, "
-    "through ceiling and nearer walls. rs: every line is put where the camera was when it was read. gs and baseline"
-    " take the shutter for a global one: where that shows, walls and floors bend and double, edges fray, and what is "
-    "on them blurs. "
-    "Maps are aligned as for the ATE, by the camera's positions alone, so that after a short path one may be tilted"
-    " as a whole."
+    "What depth and colour add up to along each method's own path, as rstrack map fuses them, seen from above, through "
+    "ceiling and nearer walls. rs: every line is put where the camera was when it was read. gs and baseline take the "
+    "shutter for a global one: where that shows, walls and floors bend and double, edges fray, and what is on them "
+    "blurs. Maps are aligned as for the ATE, by the camera's positions alone, so that after a short path one may be "
+    "tilted as a whole."
 )
 
 

@@ -17,8 +17,8 @@ from rstrack.report.data import Tracked
 from rstrack.report.images import colored_depth, jpeg_uri, rectified
 from rstrack.report.page import Block, Note, Picture, Pictures, Slider
 
-# Of maps: more than of photographs, for the differences are small.
-_MAP_WIDTH = 720
+# Of maps to be compared with a slider: more than of photographs, for the differences are small.
+_SLIDER_WIDTH = 720
 
 _TWINS = {"global_middle": "middle", "global_first": "first", "global_last": "last"}
 
@@ -100,7 +100,7 @@ def map_pictures(picture: MeshPicture, width: int) -> tuple[Block, ...]:
         raise UserError(f"{picture.path}: is not of the size that was drawn: delete it and run 'rstrack bench' again")
     named = list(zip(panels, picture.labels, strict=True))
     blocks: list[Block] = [Pictures(tuple(_map(panel, label, width) for panel, label in named))]
-    first, *others = [_map(panel, label, _MAP_WIDTH) for panel, label in named]
+    first, *others = [_map(panel, label, _SLIDER_WIDTH) for panel, label in named]
     for method, other in zip(picture.methods[1:], others, strict=True):
         blocks.append(Slider(f"Map with {method} against {picture.methods[0]}", other, first))
     return tuple(blocks)

@@ -11,7 +11,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from rsgen.errors import UserError
+from rsgen.errors import UserError, first_problem
 from rsgen.files import read_text
 
 RESULTS = "results.json"
@@ -93,6 +93,4 @@ def read_results(path: Path) -> Results:
     try:
         return Results.model_validate_json(read_text(path))
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise UserError(f"{path}: {where or 'the file'}: {first['msg']}: run 'rstrack bench' again") from None
+        raise UserError(f"{path}: {first_problem(error)}: run 'rstrack bench' again") from None

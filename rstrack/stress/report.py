@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from rsgen.errors import UserError
+from rsgen.errors import UserError, first_problem
 from rsgen.files import atomic_write, encode_png, read_png, read_text
 from rstrack.estimate import plain
 from rstrack.stress.run import ColorScore, DepthScore, Panels, StressReport, TrackScore
@@ -278,6 +278,4 @@ def _read(path: Path) -> _StoredReport:
     try:
         return _StoredReport.model_validate_json(read_text(path))
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise UserError(f"{path}: {where or 'the file'}: {first['msg']}: run 'rstrack stress' again") from None
+        raise UserError(f"{path}: {first_problem(error)}: run 'rstrack stress' again") from None
