@@ -50,10 +50,10 @@ setup() {
     .venv/bin/python -m pip install --quiet --disable-pip-version-check -c .ci/requirements.lock -e '.[test]'
     echo "$want" >"$stamp"
   fi
-  if ! .venv/bin/python -m rsgen.backend >/dev/null 2>&1; then
+  if ! .venv/bin/python -m rsgen.device.backend >/dev/null 2>&1; then
     say "installing libLLVM from the system's packages"
     apt_install libllvm19 libllvm20 libllvm18 libllvm17 libllvm16 || true
-    .venv/bin/python -m rsgen.backend >/dev/null || exit 2
+    .venv/bin/python -m rsgen.device.backend >/dev/null || exit 2
   fi
 }
 
@@ -74,6 +74,7 @@ test_all() {
   .venv/bin/ruff check .
   .venv/bin/ruff format --check .
   .venv/bin/mypy
+  .venv/bin/lint-imports --no-cache >/dev/null || .venv/bin/lint-imports --no-cache
   # One thread per process for the small solves; two processes share the rendering cores.
   OPENBLAS_NUM_THREADS=1 .venv/bin/python -m pytest -n 2 --dist loadfile "$@"
 }

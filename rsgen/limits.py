@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
+import numpy as np
 from pydantic import AfterValidator
 
 MOST_M = 1e6
 """No coordinate of a scene or a pose is larger, m: float32 places a point to 6 cm there."""
+
+Vector4 = tuple[float, float, float, float]
+Matrix4 = tuple[Vector4, Vector4, Vector4, Vector4]
 
 
 def limits(low: float, high: float, why: str, or_zero: bool = False) -> AfterValidator:
@@ -20,3 +26,19 @@ def limits(low: float, high: float, why: str, or_zero: bool = False) -> AfterVal
         return value
 
     return AfterValidator(check)
+
+
+def rigid(value: Matrix4) -> Matrix4:
+    """The value, if it is a rigid transform with its translation within MOST_M. Raises ValueError."""
+    T = np.asarray(value, float)
+    R = np.clip(T[:3, :3], -2, 2)  # absurd numbers stay wrong, without overflow on the way
+    ok = np.isfinite(T).all() and np.allclose(R @ R.T, np.eye(3), atol=1e-5) and np.linalg.det(R) > 0
+    if not (ok and np.array_equal(T[3], (0, 0, 0, 1))):
+        raise ValueError("not a rigid transform: rows of an orthonormal rotation with the translation, then 0 0 0 1")
+    if np.abs(T).max() > MOST_M:
+        raise ValueError(f"its translation must lie within {MOST_M:g} m")
+    return value
+
+
+RigidTransform = Annotated[Matrix4, AfterValidator(rigid)]
+"""A 4x4 matrix [R t; 0 0 0 1] in a configuration, translation in metres."""

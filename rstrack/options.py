@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from rsgen.backend import Backend
+from rsgen.device.backend import Backend
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.shutter import Shutter

@@ -10,17 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from rsgen.config import load_config
-from rsgen.trajectory import read_trajectory
+from rsgen.config.config import load_config
+from rsgen.sequence.trajectory import read_trajectory
 
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted((ROOT / "rsgen").rglob("*.py"))
 TRACKER = sorted((ROOT / "rstrack").rglob("*.py"))
 # What rstrack builds on; the rest of rsgen renders, or is about rendering.
-SHARED = (
-    "backend", "command_line", "errors", "figures", "files", "geometry", "progress", "scheduler", "sequence",
-    "sequence_format", "trajectory",
-)  # fmt: skip
+SHARED = ("errors", "figures", "files", "limits", "geometry", "sequence", "device", "console")
 ENGINES = ("mitsuba", "drjit")
 CONFIGS = sorted(path for path in (ROOT / "configs").glob("*.yaml") if path.stem != "evaluation")
 
@@ -49,10 +46,11 @@ def test_there_is_something_to_check() -> None:
     "module",
     [
         "rsgen.geometry.so3", "rsgen.geometry.se3", "rsgen.geometry.spline", "rsgen.geometry.camera",
-        "rsgen.geometry.shutter", "rsgen.sequence", "rsgen.verify", "rsgen.config", "rsgen.trajectory", "rsgen.fit",
-        "rsgen.fit_report", "rsgen.backend", "rsgen.scheduler", "rsgen.distribute",
-        "rsgen.generate", "rsgen.frame_source", "rsgen.inspect", "rsgen.cli",
-        "rsgen.motion.make", "rsgen.noise.color", "rsgen.noise.depth", "rsgen.imu", "rsgen.truth.settings",
+        "rsgen.geometry.shutter", "rsgen.sequence.reader", "rsgen.check.verify",
+        "rsgen.config.config", "rsgen.sequence.trajectory", "rsgen.motion.fit",
+        "rsgen.motion.fit_report", "rsgen.device.backend", "rsgen.console.scheduler", "rsgen.produce.distribute",
+        "rsgen.produce.generate", "rsgen.produce.frame_source", "rsgen.pictures.frames", "rsgen.cli.main",
+        "rsgen.motion.make", "rsgen.sensors.color", "rsgen.sensors.depth", "rsgen.sensors.imu", "rsgen.config.truth",
         "rsgen.export.kalibr", "rsgen.export.euroc", "rsgen.export.registered", "rsgen.export.video",
     ],
 )  # fmt: skip
@@ -65,7 +63,7 @@ def test_no_engine_is_loaded_where_nothing_is_rendered(module: str) -> None:
 
 def test_help_and_info_load_no_engine() -> None:
     code = (
-        "import sys\nfrom rsgen.cli import main\nfor words in (['render', '--help'], ['info', 'nowhere']):\n"
+        "import sys\nfrom rsgen.cli.main import main\nfor words in (['render', '--help'], ['info', 'nowhere']):\n"
         "    try:\n        main(words)\n    except SystemExit:\n        pass\n"
         f"sys.exit(bool({set(ENGINES)!r} & set(sys.modules)))"
     )
@@ -74,7 +72,7 @@ def test_help_and_info_load_no_engine() -> None:
 
 def test_the_tracker_loads_no_renderer() -> None:
     modules = [name(path).removesuffix(".py").replace("/", ".").removesuffix(".__init__") for path in TRACKER]
-    assert "rstrack.cli" in modules and "rstrack.tracker" in modules
+    assert "rstrack.cli.main" in modules and "rstrack.tracking.spline_tracker" in modules
     code = f"import sys, {', '.join(modules)}\nprint(*({{'mitsuba', 'trimesh'}} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -83,7 +81,7 @@ def test_the_tracker_loads_no_renderer() -> None:
 
 def test_the_trackers_help_and_info_load_no_engine() -> None:
     code = (
-        "import sys\nfrom rstrack.cli import main\nfor words in (['track', '--help'], ['info', 'nowhere']):\n"
+        "import sys\nfrom rstrack.cli.main import main\nfor words in (['track', '--help'], ['info', 'nowhere']):\n"
         "    try:\n        main(words)\n    except SystemExit:\n        pass\n"
         f"sys.exit(bool({set(ENGINES)!r} & set(sys.modules)))"
     )

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from rsgen.frame_source import Progress
-from rsgen.sequence import Sequence, read_sequence
+from rsgen.produce.frame_source import Progress
+from rsgen.sequence.reader import Sequence, read_sequence
 
 Export = Literal["kalibr", "euroc", "registered", "video", "rerun"]
 
@@ -39,8 +39,8 @@ def export(to: Export, path: Path, out: Path | None, copy: bool, scene: Path | N
 
 def _export_video(sequence: Sequence, out: Path, scene: Path | None, progress: Progress) -> str:
     from rsgen.export.video import write_video
-    from rsgen.frame_source import FrameSource
-    from rsgen.inspect import config_of
+    from rsgen.pictures.frames import config_of
+    from rsgen.produce.frame_source import FrameSource
 
     stream = sequence.streams["color"]
     source = FrameSource(config_of(sequence.root, sequence.meta, scene), progress, global_shutter=True)

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from rsgen.config.imu import ImuConfig
 from rsgen.errors import UserError
 from rsgen.export.folder import (
     four_coefficients,
@@ -28,12 +29,12 @@ from rsgen.export.folder import (
     sequence_imu,
 )
 from rsgen.files import atomic_write, encode_yaml
-from rsgen.frame_source import Progress
 from rsgen.geometry import se3
 from rsgen.geometry.so3 import FloatArray
-from rsgen.imu import ImuConfig, ImuSamples, nanoseconds, write_imu_csv
-from rsgen.sequence import Sequence, Stream
-from rsgen.sequence_format import ground_truth, pose_rows
+from rsgen.produce.frame_source import Progress
+from rsgen.sensors.imu import ImuSamples, nanoseconds, write_imu_csv
+from rsgen.sequence.format import ground_truth, pose_rows
+from rsgen.sequence.reader import Sequence, Stream
 
 EPOCH_S = 1_000_000_000
 """Added to all stamps by default: every file name then has 19 digits, as EuRoC's have, and sorts by time."""

@@ -11,13 +11,14 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from rsgen.config.imu import ImuConfig
 from rsgen.errors import UserError, first_problem
 from rsgen.files import atomic_write, read_bytes, write_error
-from rsgen.frame_source import Progress
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.imu import ImuConfig, ImuSamples, simulate_imu
-from rsgen.sequence import Sequence
+from rsgen.produce.frame_source import Progress
+from rsgen.sensors.imu import ImuSamples, simulate_imu
+from rsgen.sequence.reader import Sequence
 
 # What a hard link fails with where a copy would do: another disk, a file system without links, too many of them.
 _NO_LINK = (errno.EXDEV, errno.EPERM, errno.ENOTSUP, errno.EMLINK, errno.EACCES, errno.ENOSYS)

@@ -15,13 +15,13 @@ import numpy.typing as npt
 
 from rsgen.export.folder import make_folders, new_folder, no_progress, place_images
 from rsgen.files import atomic_write, encode_png, encode_yaml
-from rsgen.frame_source import Progress
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.so3 import FloatArray
-from rsgen.sequence import Sequence
-from rsgen.sequence_format import associate, ground_truth, pose_rows
-from rsgen.sequence_writer import quantise
+from rsgen.produce.frame_source import Progress
+from rsgen.produce.writer import quantise
+from rsgen.sequence.format import associate, ground_truth, pose_rows
+from rsgen.sequence.reader import Sequence
 
 _MARK = "registered to the colour camera: the times of depth rows are lost"
 

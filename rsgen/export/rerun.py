@@ -16,11 +16,11 @@ import numpy as np
 from rsgen.errors import UserError
 from rsgen.export.folder import no_progress, sequence_imu
 from rsgen.files import read_bytes, write_error
-from rsgen.frame_source import Progress
 from rsgen.geometry import se3
 from rsgen.geometry.so3 import FloatArray
-from rsgen.sequence import Sequence, Stream
-from rsgen.sequence_format import ground_truth
+from rsgen.produce.frame_source import Progress
+from rsgen.sequence.format import ground_truth
+from rsgen.sequence.reader import Sequence, Stream
 
 TIMELINE = "time"
 _UP = {(0, 1): "X_DOWN", (0, -1): "X_UP", (1, 1): "Y_DOWN", (1, -1): "Y_UP", (2, 1): "Z_DOWN", (2, -1): "Z_UP"}

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from rsgen.errors import UserError
 from rsgen.export.folder import no_progress
 from rsgen.files import write_error
-from rsgen.frame_source import Progress
+from rsgen.produce.frame_source import Progress
 
 # Encoders that OpenCV's own wheels bring along.
 _CODECS = {".mp4": "mp4v", ".avi": "MJPG"}

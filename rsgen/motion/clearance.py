@@ -9,11 +9,11 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from rsgen.config.motion import Waypoint
 from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
-from rsgen.motion.config import Waypoint
 from rsgen.motion.paths import TourCurve
-from rsgen.trajectory import Trajectory
+from rsgen.sequence.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 

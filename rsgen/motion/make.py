@@ -8,13 +8,13 @@ from collections.abc import Callable
 import numpy as np
 from scipy.optimize import brentq
 
+from rsgen.config.motion import MotionConfig
 from rsgen.errors import UserError
 from rsgen.geometry import so3
-from rsgen.motion.config import MotionConfig
 from rsgen.motion.paths import Path, make_path, window
 from rsgen.motion.shake import band_noise
-from rsgen.motion_stats import MotionStatistics, motion_statistics
-from rsgen.trajectory import Trajectory
+from rsgen.motion.statistics import MotionStatistics, motion_statistics
+from rsgen.sequence.trajectory import Trajectory
 
 RATE_HZ = 200.0
 """Poses per second of a made motion: ten per 50 ms knot."""

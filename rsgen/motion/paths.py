@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
+from rsgen.config.motion import MotionConfig, Waypoint
 from rsgen.errors import UserError
 from rsgen.geometry import so3
-from rsgen.motion.config import MotionConfig, Waypoint
 
 Array = NDArray[np.float64]
 

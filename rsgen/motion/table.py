@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rsgen.motion_stats import MotionStatistics
+from rsgen.motion.statistics import MotionStatistics
 
 TABLE_1: dict[str, tuple[float, float, float]] = {
     "robot_t1": (7.678, 0.356, 15.807),

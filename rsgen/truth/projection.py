@@ -1,6 +1,6 @@
 """Projection into a moving camera on the device: the twin of `rsgen.geometry.shutter.project_rolling`, per pixel.
 
-Importing this module needs an active Mitsuba variant (`rsgen.backend.mitsuba()`). Points are homogeneous, (p, w): w = 1
+Importing this module needs an active Mitsuba variant (`backend.mitsuba()`). Points are homogeneous, (p, w): w = 1
 for a point p in metres, w = 0 for a point at infinity in direction p. Positions are relative to a reference near the
 camera, so that float32 stays good to about 1e-4 px wherever the world's origin is.
 """
@@ -16,7 +16,7 @@ import numpy as np
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.so3 import FloatArray
-from rsgen.sensor import PoseFunction
+from rsgen.render.sensor import PoseFunction
 
 _MIN_DEPTH = 1e-9  # as in `Camera.project`
 # Enough where the image moves along the scan at up to half the scan's own speed (at a tenth, 3 are).

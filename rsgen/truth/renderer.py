@@ -1,6 +1,6 @@
 """The exact images of one colour frame. One ray through each pixel's centre serves flow, normals, blur and depth.
 
-Importing this module needs an active Mitsuba variant (`rsgen.backend.mitsuba()`).
+Importing this module needs an active Mitsuba variant (`rsgen.device.backend.mitsuba()`).
 
 A pixel stands for the surface point p that its centre's ray first meets at its line's mid-exposure, or for a point at
 infinity where it meets nothing.
@@ -27,15 +27,15 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from rsgen.config_sections import ColorConfig
+from rsgen.config.sections import ColorConfig
+from rsgen.config.truth import GlobalTime, TruthConfig
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.so3 import FloatArray
-from rsgen.noise.response import to_srgb8
-from rsgen.render import ColorRenderer
-from rsgen.sensor import PoseFunction, RollingShutterSensor
+from rsgen.render.images import ColorRenderer
+from rsgen.render.sensor import PoseFunction, RollingShutterSensor
+from rsgen.sensors.response import to_srgb8
 from rsgen.truth.projection import Track, contains, line_of_pixel, to_camera
-from rsgen.truth.settings import GlobalTime, TruthConfig
 
 # Rays that ask whether a point is seen end this much short of it, as a fraction of their length: 0.1 mm at 1 m.
 _SHORT = 1e-4

@@ -21,15 +21,15 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.device.arrays import Engine
+from rsgen.device.projection import Lens, Sighting, cross, gather, move, project, project_rolling
+from rsgen.device.recording import recorded
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.engine import Engine
-from rstrack.frames import DepthImage
-from rstrack.lines import Exposure, from_base_table, line_motion
-from rstrack.recording import recorded
-from rstrack.reference import Reference
-from rstrack.residuals import EDGE, bilinear, grid
-from rstrack.warp import Lens, Sighting, cross, gather, move, project, project_rolling
+from rstrack.images.line_poses import Exposure, from_base_table, line_motion
+from rstrack.images.pyramid import DepthImage
+from rstrack.images.sampling import EDGE, bilinear, grid
+from rstrack.keyframes.keyframe import Reference
 
 SIGMA_PX = 1.0
 # Weight of the most blurred view: better than a hole, and gone as soon as there is any other.

@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.device.arrays import engine
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.dataset import Dataset
-from rstrack.engine import engine
-from rstrack.frames import depth_image
+from rstrack.data.dataset import Dataset
+from rstrack.images.pyramid import depth_image
+from rstrack.keyframes.keyframe import Reference
 from rstrack.options import Options
-from rstrack.reference import Reference
 
 Sigma = float | None
 """σ of equation (13) in px; None: constant weights."""
@@ -63,10 +63,12 @@ def fused_keyframes(
     options = replace(options, method="rs-pg" if options.rolling else "gs-pg")
     e = engine(options.backend)
     # After the engine: it chooses the libLLVM that Dr.Jit loads.
+    from rstrack.images.device_frame import DeviceRig
+    from rstrack.keyframes.maker import KeyframeMaker
     from rstrack.mapping.color_fusion import SIGMA_PX, ColorFusion, FusedColor, linear_image
-    from rstrack.prepare import Preparer
 
-    prepare = Preparer(dataset.rig, options)
+    device = DeviceRig(dataset.rig, options)
+    maker = KeyframeMaker.of(device)
     fusions = {sigma: ColorFusion(e, sigma) for sigma in sigmas}
     viewer = ColorFusion(e, SIGMA_PX)
     ref: Reference | None = None
@@ -81,24 +83,24 @@ def fused_keyframes(
 
     for k in range(len(dataset)) if frames is None else frames:
         frame = dataset.frame(k)
-        new = prepare(k, frame)
+        new = device.upload(k, frame)
         if not new.colors or not all(covers(t) for t in (new.first_time, new.last_time)):
             continue
         t = new.depth.exposure.mid_time
         if ref is None or options.left_behind(se3.inverse(ref.T_world_base) @ spline.pose(t), 1.0):
             if ref is not None:
                 yield finished(ref)
-            older, ref = ref, prepare.maker.rectified(k, new.depth, (), spline, ref)
+            older, ref = ref, maker.rectified(k, new.depth, (), spline, ref)
             colors = {
                 sigma: fusion.start(ref) if older is None else fusion.inherit(ref, colors[sigma], older)
                 for sigma, fusion in fusions.items()
             }
             shape = ref.lens.camera.height, ref.lens.camera.width
-            alone = prepare.maker.rectified(k, new.depth, (), spline, None)
+            alone = maker.rectified(k, new.depth, (), spline, None)
             single = e.download(alone.inverse_depth, shape)
             count, most_blurred, least = 0, None, np.inf
         else:
-            ref = prepare.maker.fused(ref, new.depth, spline)
+            ref = maker.fused(ref, new.depth, spline)
         for image, color in zip(frame.colors, new.colors, strict=True):
             light = linear_image(e, color.exposure, image.pixels)
             colors = {
@@ -121,15 +123,16 @@ def depth_errors(dataset: Dataset, done: FusedKeyframe, options: Options | None 
     the keyframe would be without noise. Pixels that all three know and that do not lie at an edge. The dataset is an
     rsgen sequence.
     """
-    from rstrack.prepare import Preparer
-    from rstrack.reference import on_one_surface
+    from rstrack.images.device_frame import DeviceRig
+    from rstrack.keyframes.keyframe import on_one_surface
+    from rstrack.keyframes.maker import KeyframeMaker
 
     assert dataset.sequence is not None and dataset.truth is not None
     options = options or Options()
-    e, prepare = engine(options.backend), Preparer(dataset.rig, options)
-    exposure = prepare(0, dataset.frame(done.index, color=False)).depth.exposure
+    e, device = engine(options.backend), DeviceRig(dataset.rig, options)
+    exposure = device.upload(0, dataset.frame(done.index, color=False)).depth.exposure
     exact = depth_image(e, exposure, dataset.sequence.truth_depth(done.index), options.max_depth)
-    truth = prepare.maker.rectified(done.index, exact, (), dataset.truth, None)
+    truth = KeyframeMaker.of(device).rectified(done.index, exact, (), dataset.truth, None)
     rho = e.download(truth.inverse_depth, done.inverse_depth.shape)
     known = on_one_surface(rho) & (done.inverse_depth > 0) & (done.single_inverse_depth > 0)
     z = 1.0 / rho[known]

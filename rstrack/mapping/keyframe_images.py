@@ -12,11 +12,11 @@ import numpy as np
 
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_png, encode_yaml, write_error
-from rsgen.sequence_format import frame_name, pose_rows
-from rstrack.dataset import Dataset
-from rstrack.estimate import TRAJECTORY, Estimate
+from rsgen.sequence.format import frame_name, pose_rows
+from rstrack.data.camera_file import DEPTH_SCALE
+from rstrack.data.dataset import Dataset
+from rstrack.data.estimate import TRAJECTORY, Estimate
 from rstrack.options import Options
-from rstrack.rig_file import DEPTH_SCALE
 
 Progress = Callable[[str, float, str], None]
 

@@ -13,25 +13,25 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rsgen.backend import Backend
+from rsgen.device.arrays import Engine, Kernels, engine
+from rsgen.device.backend import Backend
+from rsgen.device.projection import Lens
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.so3 import FloatArray
-from rstrack.compare import compare, truth_of
-from rstrack.dataset import Dataset
-from rstrack.engine import Engine, Kernels, engine
-from rstrack.estimate import Estimate, read_estimate
-from rstrack.frames import camera_rays, depth_image, lens_sees
-from rstrack.lines import Exposure, from_base_table, to_base_table
-from rstrack.mapping.surface_mesh import Surface, extract_surface, write_ply
-from rstrack.mapping.volume import Volume
-from rstrack.mapping.volume_kernels import lookup_kernel
-from rstrack.prefetch import prefetched
-from rstrack.rectify import rectify_kernel
-from rstrack.reference import rectified_lens
-from rstrack.rig import Frame, Rig
-from rstrack.warp import Lens
+from rstrack.data.dataset import Dataset
+from rstrack.data.estimate import Estimate, read_estimate
+from rstrack.data.prefetch import prefetched
+from rstrack.data.rig import Frame, Rig
+from rstrack.images.line_poses import Exposure, from_base_table, to_base_table
+from rstrack.images.pyramid import camera_rays, depth_image, lens_sees
+from rstrack.keyframes.keyframe import rectified_lens
+from rstrack.keyframes.rectification import rectify_kernel
+from rstrack.metrics.association import compare, truth_of
+from rstrack.volume.kernels import lookup_kernel
+from rstrack.volume.mesh import Surface, extract_surface, write_ply
+from rstrack.volume.volume import Volume
 
 Progress = Callable[[str, float, str], None]
 """Called with a stage, the fraction done (0 to 1) and a note."""
@@ -208,9 +208,9 @@ def run_map(
 ) -> Reconstruction:  # fmt: skip
     """Map a sequence folder with a run folder or TUM file: writes a mesh, and a point cloud where `cloud` says.
 
-    Arguments as in `reconstruct`, `read_estimate` and `rstrack.dataset.open_dataset`. Raises UserError.
+    Arguments as in `reconstruct`, `read_estimate` and `rstrack.data.dataset.open_dataset`. Raises UserError.
     """
-    from rstrack.dataset import open_dataset
+    from rstrack.data.dataset import open_dataset
 
     for path in (out, cloud):
         if path is not None and path.suffix.lower() != ".ply":

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 
 from rsgen.errors import UserError
-from rstrack.dataset import Dataset, open_dataset
-from rstrack.evaluation.mesh_pictures import read_picture
+from rstrack.bench.methods.mesh_pictures import read_picture
+from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.report.data import Tracked, load_run, true_path
 from rstrack.report.figures import TRUE_COLOR, Curve, Path3D, bars, method_colors, over_time, path_3d
 from rstrack.report.page import Block, Card, CardRow, Cell, Chooser, Note, Page, Plot, Section, Table
 from rstrack.report.pictures import frame_panels, map_pictures, shutter_sliders
 from rstrack.report.results import RESULTS, CellEntry, Figures, Results, read_results
 from rstrack.report.run import number
-from rstrack.run import Progress
+from rstrack.tracking.run import Progress
 
 OURS, BASELINE = "rs-pg", "baseline"
 

@@ -11,14 +11,14 @@ from pathlib import Path
 
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, write_error
-from rstrack.estimate import TRAJECTORY
+from rstrack.bench.stress.tables import STRESS
+from rstrack.data.estimate import TRAJECTORY
 from rstrack.report.bench import bench_page
 from rstrack.report.page import Page, render
 from rstrack.report.results import RESULTS
 from rstrack.report.run import run_page
 from rstrack.report.stress import stress_page
-from rstrack.run import Progress
-from rstrack.stress.report import STRESS
+from rstrack.tracking.run import Progress
 
 REPORT = "report.html"
 
@@ -30,7 +30,7 @@ def write_report(
     """Write the page of a run folder, a TUM file with a sequence, or a folder of a benchmark or of a stress test.
 
     Returns its path. sequence: where the run's sequence is, by default where run.json says. out: the file, by default
-    report.html in the folder. camera_file: as in `rstrack.dataset.open_dataset`. progress: called with a stage, the
+    report.html in the folder. camera_file: as in `open_dataset`. progress: called with a stage, the
     fraction done (0 to 1) and a note. Raises UserError: `folder` is none of these, something that was named cannot be
     read, or the page cannot be written.
     """

@@ -12,10 +12,10 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
-from rstrack.compare import Comparison, Truth, angles_deg, compare, truth_of
-from rstrack.dataset import Dataset, open_dataset
-from rstrack.estimate import Estimate, read_estimate
-from rstrack.evaluate import pairs_one_second_apart
+from rstrack.data.dataset import Dataset, open_dataset
+from rstrack.data.estimate import Estimate, read_estimate
+from rstrack.metrics.association import Comparison, Truth, angles_deg, compare, truth_of
+from rstrack.metrics.evaluate import pairs_one_second_apart
 
 # Points of the true path, of which there is one at any time.
 _PATH_POINTS = 1000
@@ -94,7 +94,7 @@ def true_path(truth: Truth, begin: float, end: float) -> tuple[FloatArray, Float
 
 
 def drift(estimate: Estimate, found: Comparison) -> Drift:
-    """The errors whose RMS `rstrack.evaluate.evaluate` gives as RPE, with the time at which each second begins."""
+    """The errors whose RMS `metrics.evaluate.evaluate` gives as RPE, with the time at which each second begins."""
     row = np.full(len(estimate.stamps), -1)
     row[found.index] = np.arange(len(found.index))
     i, j = pairs_one_second_apart(estimate.stamps)

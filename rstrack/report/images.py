@@ -13,7 +13,7 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter, project_rolling
 from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
-from rstrack.rig import Image, Rig
+from rstrack.data.rig import Image, Rig
 
 _JPEG_QUALITY = 85
 # Where nothing was measured.

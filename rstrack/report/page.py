@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any, Literal
 
-from rstrack.estimate import plain
+from rstrack.data.estimate import plain
 
 Figure = dict[str, Any]
 """A plotly figure as plain data: {"data": [trace, ...], "layout": {...}}."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rsgen.errors import UserError
-from rstrack.evaluate import Metrics, evaluate
+from rstrack.metrics.evaluate import Metrics, evaluate
 from rstrack.report.data import Tracked, drift, load_run, true_path
 from rstrack.report.figures import (
     ESTIMATE_COLOR,

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rsgen.errors import UserError
+from rstrack.bench.stress.run import ColorScore, Panels, StressReport
+from rstrack.bench.stress.tables import gain_db, gains_db, read_panels, read_report, shade
 from rstrack.report.figures import ESTIMATE_COLOR, SECOND_COLOR, TRUE_COLOR, Series, against
 from rstrack.report.images import jpeg_uri
 from rstrack.report.page import (
@@ -25,8 +27,6 @@ from rstrack.report.page import (
     Table,
 )
 from rstrack.report.run import number
-from rstrack.stress.report import gain_db, gains_db, read_panels, read_report, shade
-from rstrack.stress.run import ColorScore, Panels, StressReport
 
 # σ of the headline in px: the paper's.
 _SIGMA_PX = 1.0

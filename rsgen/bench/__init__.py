@@ -1,0 +1,1 @@
+"""Timings of the generator against other ways to render the same frame."""

@@ -1,0 +1,1 @@
+"""Independent checks of what was made: sequences, truth, ray casting, reprojection, light."""

@@ -1,0 +1,109 @@
+"""How right the baked light is, against path tracing; and what all measurements of the renderer start from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from rsgen.config.config import Config
+from rsgen.errors import UserError
+from rsgen.geometry.shutter import Shutter
+from rsgen.produce.frame_source import Progress, make_integrator
+from rsgen.produce.generate import Motion, load_motion
+
+PSNR_FLOOR_DB = 36.0
+_REFERENCE_DEPTH = 64  # path length of the reference; Russian roulette ends most paths long before
+_REFERENCE_PASS = 64  # samples per pixel of one pass, for progress
+_BAKED_SPP = 256  # samples of the baked picture: what is compared is its light, not its noise
+
+
+def check_light(
+    config: Config, views: int, spp: int, width: int, picture: Path | None, progress: Progress
+) -> tuple[str, bool]:
+    """PSNR (dB, in 8-bit-range sRGB before quantisation) of baked against path-traced global-shutter views.
+
+    The views are spread evenly over the config's trajectory and scaled to `width` pixels. Writes baked, path-traced and
+    eight times their difference as one picture if a path is given. Returns a table, and whether every view reaches
+    PSNR_FLOOR_DB. Raises UserError.
+    """
+    motion = load_motion(config)
+    scene, baked, mi = lit_scene(config, progress)
+    from rsgen.figures import save_grid
+    from rsgen.render.images import ColorRenderer
+
+    camera = _scaled(config, width)
+    reference = mi.load_dict({"type": "path", "max_depth": _REFERENCE_DEPTH})
+    ours = ColorRenderer(scene, baked, camera, Shutter(), _BAKED_SPP)
+    theirs = ColorRenderer(scene, reference, camera, Shutter(), _REFERENCE_PASS)
+    table = Table("view", "time, s", "PSNR, dB", "bias, %", f"at least {PSNR_FLOOR_DB:g}")
+    rows: list[list[NDArray[np.float64]]] = []
+    psnrs: list[float] = []
+    passes = max(1, spp // _REFERENCE_PASS)
+    for view, stamp in enumerate(spread_times(motion, views)):
+        ours_linear = ours.render(motion.spline.pose, float(stamp), view).astype(np.float64)
+        sums = np.zeros_like(ours_linear)
+        for k in range(passes):
+            sums += theirs.render(motion.spline.pose, float(stamp), 1000 * (view + 1) + k)
+            progress("path tracing", (view * passes + k + 1) / (views * passes), f"view {view + 1} of {views}")
+        ours_srgb, their_srgb = (_srgb(image * config.color.exposure_gain) for image in (ours_linear, sums / passes))
+        difference = ours_srgb - their_srgb
+        psnr = float(-10 * np.log10(np.mean(difference**2)))
+        psnrs.append(psnr)
+        bias = 100 * (ours_linear.mean() / (sums / passes).mean() - 1)
+        table.add_row(
+            str(view), f"{stamp:.2f}", f"{psnr:.1f}", f"{bias:+.2f}", "yes" if psnr >= PSNR_FLOOR_DB else "no"
+        )
+        rows.append([ours_srgb, their_srgb, np.clip(0.5 + 8 * difference, 0, 1)])
+    if picture is not None:
+        save_grid(rows, ["baked", f"path traced, {passes * _REFERENCE_PASS} spp", "difference x 8"], picture)
+    return table_text(table), min(psnrs) >= PSNR_FLOOR_DB
+
+
+def lit_scene(config: Config, progress: Progress) -> tuple[Any, Any, Any]:
+    """Scene, baked integrator and the Mitsuba module of a config. Raises UserError."""
+    from rsgen.device.backend import mitsuba
+
+    mi = mitsuba(config.backend)
+    from rsgen.render.scene import load_scene
+
+    if config.light.mode != "baked":
+        raise UserError("light.mode is 'path': these measurements are about baked light, leave it at 'baked'")
+    scene = load_scene(config.scene.file)
+    baked = make_integrator(mi, scene, config, lambda fraction, note: progress("light", fraction, note))
+    return scene, baked, mi
+
+
+def _scaled(config: Config, width: int) -> Any:
+    camera = config.color.camera
+    if not 8 <= width <= camera.width:
+        raise UserError(f"--width {width}: choose 8 to {camera.width}")
+    f = width / camera.width
+    return replace(
+        camera, width=width, height=round(camera.height * f), fx=camera.fx * f, fy=camera.fy * f,
+        cx=(camera.cx + 0.5) * f - 0.5, cy=(camera.cy + 0.5) * f - 0.5,
+    )  # fmt: skip
+
+
+def spread_times(motion: Motion, count: int) -> NDArray[np.float64]:
+    """`count` instants spread over the recording, its very ends left out."""
+    fraction = (np.arange(count) + 0.5) / count
+    return motion.first_stamp + fraction * (motion.last_stamp - motion.first_stamp)
+
+
+def _srgb(linear: NDArray[np.float64]) -> NDArray[np.float64]:
+    x = np.clip(linear, 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+
+
+def table_text(table: Table) -> str:
+    """The table as plain text."""
+    console = Console(width=120)
+    with console.capture() as capture:
+        console.print(table)
+    return capture.get()

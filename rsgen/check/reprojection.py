@@ -1,0 +1,83 @@
+"""Depth of one frame carried to the next with the poses of their rows, and compared with what is seen there."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rsgen.geometry import se3
+from rsgen.geometry.shutter import project_rolling
+from rsgen.sequence.format import FloatArray, poses_of_rows
+from rsgen.sequence.reader import Sequence
+
+# Depth is interpolated bilinearly in 1/z, exact on planes. Where second differences say that this is off by more, there
+# is an edge, or a curve too tight for the pixels: such places say nothing about poses, at any resolution.
+INTERPOLATION_M = 0.0005
+# A point this much (relative to its depth) behind the surface seen at its place is hidden by that surface.
+OCCLUDED = 0.02
+_STEP_PX = 4
+_TARGET_PIXELS = 3000  # small images are sampled more densely than every fourth pixel
+
+
+@dataclass(frozen=True)
+class Reprojection:
+    """Depth of one frame in the next: predicted minus observed z (n,) in metres where both see the same surface.
+
+    `occluded` more pixels are hidden there by a nearer surface.
+    """
+
+    residual: FloatArray
+    occluded: int
+
+
+def reproject_depth(sequence: Sequence, k: int, next_k: int) -> Reprojection:
+    """Compare exact depth of listed frame k with that of frame next_k, every fourth pixel and row by row.
+
+    Pixels of frame k go to the world with their own line's pose and into the other frame with the rolling-shutter
+    projection (3); the planar z predicted there is compared with the observed one, interpolated bilinearly in inverse
+    depth. Left out: places where that is not good to 0.5 mm (edges), and points hidden by a nearer surface.
+    Raises UserError for unreadable files.
+    """
+    stream = sequence.streams["depth"]
+    p_world = depth_points(sequence, k)
+    stamp = float(stream.stamps[next_k])
+    uv_next, t, valid = project_rolling(sequence.spline, np.eye(4), stream.camera, stream.shutter, stamp, p_world)
+    uv_next, t = uv_next[valid], t[valid]
+    predicted = se3.transform(se3.inverse(sequence.spline.pose(t)), p_world[valid])[..., 2]
+    observed, smooth = _interpolate_inverse(sequence.truth_depth(next_k).astype(np.float64), uv_next)
+    predicted, observed = predicted[smooth], observed[smooth]
+    hidden = predicted - observed > OCCLUDED * predicted
+    return Reprojection((predicted - observed)[~hidden], int(hidden.sum()))
+
+
+def depth_points(sequence: Sequence, k: int) -> FloatArray:
+    """Points (n, 3) in the world that every fourth pixel of exact depth k shows, each from its own line's pose.
+
+    Raises UserError for unreadable files.
+    """
+    camera, shutter = sequence.streams["depth"].camera, sequence.streams["depth"].shutter
+    step = max(1, min(_STEP_PX, math.isqrt(camera.width * camera.height // _TARGET_PIXELS)))
+    z = sequence.truth_depth(k)[::step, ::step].astype(np.float64)
+    uv = camera.pixel_grid()[::step, ::step][z > 0]
+    line = np.rint(uv[:, 1 if shutter.scan in ("top-bottom", "bottom-top") else 0]).astype(np.int64)
+    return se3.transform(poses_of_rows(sequence.rows("depth")[k])[line], camera.backproject(uv, z[z > 0]))
+
+
+def _interpolate_inverse(z: FloatArray, uv: FloatArray) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """z (n,) at pixels uv (n, 2), bilinear in 1/z, and where that holds: inside, measured, smooth."""
+    h, w = z.shape
+    inverse = np.where(z > 0, 1 / np.where(z > 0, z, 1.0), 0.0)
+    bend = np.full((h, w), 1e9)
+    bend[1:-1, 1:-1] = np.abs(np.diff(inverse, 2, axis=1)[1:-1]) + np.abs(np.diff(inverse, 2, axis=0)[:, 1:-1])
+    smooth = bend / 8 * z**2 <= INTERPOLATION_M  # a parabola's largest distance from its chord; dz = z² d(1/z)
+    corner = np.clip(np.floor(uv).astype(np.int64), 0, (w - 2, h - 2))
+    (x, y), (a, b) = corner.T, (uv - corner).T
+    at = [(y, x), (y, x + 1), (y + 1, x), (y + 1, x + 1)]
+    inside = (a >= 0) & (a <= 1) & (b >= 0) & (b <= 1)
+    holds = inside & np.all([smooth[i] & (z[i] > 0) for i in at], axis=0)
+    weights = [(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b]
+    sum_inverse = sum(weight * inverse[i] for weight, i in zip(weights, at, strict=True))
+    return 1 / np.where(holds, sum_inverse, 1.0), holds

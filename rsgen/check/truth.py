@@ -1,0 +1,63 @@
+"""Checks of `rsgen verify` on what a sequence may carry beside its two streams: exact images and IMU samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import numpy as np
+
+from rsgen.errors import UserError
+from rsgen.export.folder import sequence_imu
+from rsgen.files import is_temporary, read_text
+from rsgen.sensors.imu import imu_csv
+from rsgen.sequence.format import color_truth_path
+from rsgen.sequence.reader import Sequence
+
+
+def check_truth_images(sequence: Sequence) -> tuple[bool, str]:
+    """Every colour frame has every exact image, all decode and are finite. Raises UserError naming the file."""
+    images = sequence.truth_images
+    paths = sequence.streams["color"].paths
+    for name, channels in images.items():
+        folder = sequence.root / "truth" / name
+        listed = {sequence.root / color_truth_path(name, channels, path.stem) for path in paths}
+        there = {path for path in folder.iterdir() if not is_temporary(path)} if folder.is_dir() else set()
+        if odd := sorted(listed ^ there):
+            what = "is missing" if odd[0] in listed else "belongs to no colour frame"
+            raise UserError(f"{odd[0]}: {what} ({len(odd)} in all): render again to complete")
+    with ThreadPoolExecutor() as pool:
+        for name in images:
+            finite = pool.map(lambda k, name=name: bool(np.isfinite(sequence.truth(name, k)).all()), range(len(paths)))
+            if not all(finite):
+                raise UserError(f"{sequence.root / 'truth' / name}: holds numbers that are not finite: render again")
+    return True, f"{', '.join(images)}: {len(paths)} each, all decode"
+
+
+def check_imu(sequence: Sequence) -> tuple[bool, str]:
+    """imu.csv is what the spline and the recorded settings give. Raises UserError."""
+    found = sequence_imu(sequence)
+    assert found is not None
+    path = sequence.root / "imu.csv"
+    try:
+        rows, expected = (np.array([line.split(",") for line in text.splitlines()[1:]], float)
+                          for text in (read_text(path), imu_csv(found[1])))  # fmt: skip
+    except ValueError:
+        raise UserError(f"{path}: expected lines of 7 numbers: render again to write it") from None
+    if rows.shape != expected.shape:
+        return False, f"{path}: {len(rows)} samples, {len(expected)} expected"
+    worst = float(np.abs(rows - expected)[:, 1:].max())
+    ok = np.array_equal(rows[:, 0], expected[:, 0]) and worst < 1e-9
+    return ok, f"{len(rows)} samples, within {worst:.1e} of what the spline gives"
+
+
+def extra_checks(sequence: Sequence) -> list[tuple[str, Callable[[], tuple[bool, str]]]]:
+    """Those of the checks that concern this sequence, by name."""
+    config = sequence.meta.get("config")
+    checks: list[tuple[str, Callable[[], tuple[bool, str]]]] = []
+    if sequence.truth_images:
+        checks.append(("truth images", partial(check_truth_images, sequence)))
+    if isinstance(config, dict) and config.get("imu") is not None:
+        checks.append(("imu", partial(check_imu, sequence)))
+    return checks

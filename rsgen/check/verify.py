@@ -1,0 +1,330 @@
+"""Check that a sequence folder is whole and agrees with itself: files, clocks, poses, and depth against depth.
+
+What has been written twice is compared (rows' poses and groundtruth.txt against the spline, 16-bit depth against the
+exact one), and neighbouring depth frames are compared through their rows' poses: that fails where images were rendered
+with other poses, times or intrinsics than those the folder states.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from rsgen.check.reprojection import depth_points, reproject_depth
+from rsgen.check.truth import extra_checks
+from rsgen.errors import UserError
+from rsgen.files import is_temporary, read_text
+from rsgen.produce.identity import fingerprint
+from rsgen.sequence.format import (
+    FOLDERS,
+    STAMP_TOLERANCE_S,
+    STREAMS,
+    TRUTH_DEPTH,
+    FloatArray,
+    StreamName,
+    associate,
+    line_poses,
+    pose_rows,
+)
+from rsgen.sequence.reader import Sequence, Stream, read_sequence
+
+# Rows' poses and groundtruth.txt come from the same spline: only the rounding of stamps (5e-10 s) and digits is left.
+POSE_TOLERANCE_M = 1e-7
+POSE_TOLERANCE_RAD = 1e-7
+# Exact depth leaves the interpolation's error: micrometres on planes, tens of them on curved things. Another frame's
+# depth or time leaves millimetres: at a walking pace of 0.5 m/s a frame is 17 mm and mid readout 7 mm.
+MEDIAN_TOLERANCE_M = 0.0002
+INLIER_M = 0.002
+INLIER_SHARE = 0.95
+MINIMUM_PIXELS = 50
+OCCLUDED_SHARE = 0.5
+_SCENE_FRAMES = 5
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that was checked: its name, whether it holds, and the figures or the first fault."""
+
+    name: str
+    ok: bool
+    detail: str
+
+
+@dataclass(frozen=True)
+class VerifyReport:
+    """All checks of a sequence."""
+
+    path: Path
+    checks: tuple[Check, ...]
+
+    @property
+    def ok(self) -> bool:
+        """True if every check holds."""
+        return all(check.ok for check in self.checks)
+
+    def text(self) -> str:
+        """One line a check and a verdict."""
+        lines = [f"{'ok' if check.ok else 'FAIL':<5}{check.name:<16}{check.detail}" for check in self.checks]
+        failed = sum(not check.ok for check in self.checks)
+        verdict = "all checks passed" if self.ok else f"{failed} of {len(self.checks)} checks failed"
+        return "\n".join([*lines, f"{self.path}: {verdict}"])
+
+
+def verify_sequence(path: Path, pairs: int = 20, raycast: int = 0) -> VerifyReport:
+    """Check the sequence at `path`, reprojecting depth between `pairs` pairs of neighbouring frames spread over it.
+
+    `raycast` frames are cast again, every pixel, with another ray caster (needs embreex).
+
+    Faults in the data are failed checks, never exceptions.
+    """
+    path = Path(path)
+    try:
+        sequence = read_sequence(path)
+    except UserError as error:
+        return VerifyReport(path, (Check("read", False, str(error)),))
+    checks: list[tuple[str, Callable[[], tuple[bool, str]]]] = [
+        ("description", partial(_check_description, sequence)),
+        ("files", partial(_check_files, sequence)),
+        ("clocks", partial(_check_clocks, sequence)),
+        ("images", partial(_check_images, sequence)),
+        *((f"rows {name}", partial(_check_rows, sequence, name)) for name in STREAMS),
+        ("ground truth", partial(_check_ground_truth, sequence)),
+        ("scene", partial(_check_scene, sequence)),
+        ("reprojection", partial(_check_reprojection, sequence, pairs)),
+    ]
+    checks += extra_checks(sequence)
+    if raycast:
+        checks.append(("ray casting", partial(_check_raycast, sequence, raycast)))
+    return VerifyReport(path, tuple(_run(name, check) for name, check in checks))
+
+
+def _run(name: str, check: Callable[[], tuple[bool, str]]) -> Check:
+    try:
+        return Check(name, *check())
+    except UserError as error:
+        return Check(name, False, str(error))
+
+
+def _check_description(sequence: Sequence) -> tuple[bool, str]:
+    """sequence.yaml is as it was written: its streams are those of its config, and the fingerprint is theirs."""
+    meta, config = sequence.meta, sequence.meta.get("config")
+    if not isinstance(config, dict):
+        return False, "sequence.yaml holds no config"
+    for name in STREAMS:
+        stated, asked = meta["streams"][name], config.get(name)
+        if not isinstance(asked, dict):
+            return False, f"config.{name} is missing in sequence.yaml"
+        asked = asked | {"size": [asked.get("width"), asked.get("height")]}
+        for field in stated.keys() & asked.keys():
+            if stated[field] != asked[field]:
+                return False, f"streams.{name}.{field} is {stated[field]}, but config says {asked[field]}"
+    if config.get("T_color_depth") != meta["T_color_depth"]:
+        return False, "T_color_depth is not that of config"
+    try:
+        found = fingerprint({key: meta.get(key) for key in ("config", "inputs", "versions")})
+    except (TypeError, ValueError):  # no numbers and words only, so not what was written
+        found = ""
+    if found != meta.get("fingerprint"):
+        return False, "sequence.yaml was edited: its fingerprint is another one"
+    return True, f"fingerprint {found[:16]}"
+
+
+def _check_files(sequence: Sequence) -> tuple[bool, str]:
+    counts = []
+    for name in STREAMS:
+        stream, folder = sequence.streams[name], sequence.root / FOLDERS[name]
+        _compare_names(folder, {path.name for path in stream.paths})
+        part = "" if len(stream.paths) == stream.frames else f" of {stream.frames} (rendered in part)"
+        counts.append(f"{len(stream.paths)} {name}{part}")
+    _compare_names(sequence.root / TRUTH_DEPTH, {f"{path.stem}.exr" for path in sequence.streams["depth"].paths})
+    pairs = _read_pairs(sequence)
+    return True, f"{', '.join(counts)}, {pairs} pairs"
+
+
+def _compare_names(folder: Path, listed: set[str]) -> None:
+    try:
+        there = {path.name for path in folder.iterdir() if not is_temporary(path)}
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be read ({error.strerror})") from None
+    if missing := sorted(listed - there):
+        raise UserError(f"{folder / missing[0]}: is missing ({len(missing)} in all): render again to complete")
+    if extra := sorted(there - listed):
+        raise UserError(f"{folder / extra[0]}: is in no listing ({len(extra)} in all): render again to list it")
+
+
+def _read_pairs(sequence: Sequence) -> int:
+    """Number of pairs in associations.txt. Raises UserError if they are not those of the listings."""
+    path = sequence.root / "associations.txt"
+    color, depth = (sequence.streams[name] for name in STREAMS)
+    expected = [
+        (*_entry(sequence, color, i), *_entry(sequence, depth, j))
+        for i, j in associate(color.stamps, depth.stamps, 0.5 / min(color.rate_hz, depth.rate_hz))
+    ]
+    found = [] if path.is_file() and not path.stat().st_size else read_text(path).splitlines()
+    for number, (line, pair) in enumerate(zip(found, expected, strict=False), 1):
+        if tuple(line.split()) != pair:
+            raise UserError(f"{path} line {number}: expected '{' '.join(pair)}', found '{line[:80]}'")
+    if len(found) != len(expected):
+        raise UserError(f"{path}: holds {len(found)} pairs, {len(expected)} expected")
+    return len(found)
+
+
+def _entry(sequence: Sequence, stream: Stream, k: int) -> tuple[str, str]:
+    return f"{stream.stamps[k]:.9f}", stream.paths[k].relative_to(sequence.root).as_posix()
+
+
+def _check_clocks(sequence: Sequence) -> tuple[bool, str]:
+    """Stamps against first stamp and rate; the reader has compared each with its frame's number already."""
+    details, ok = [], True
+    for name in STREAMS:
+        stream = sequence.streams[name]
+        error = np.abs(stream.stamps - (stream.first_stamp_s + stream.indices / stream.rate_hz)).max()
+        ok &= bool(error <= STAMP_TOLERANCE_S and (np.diff(stream.indices) > 0).all())
+        details.append(f"{name} {stream.rate_hz:g} Hz within {error * 1e9:.1f} ns")
+    return ok, ", ".join(details)
+
+
+def _check_images(sequence: Sequence) -> tuple[bool, str]:
+    color, depth = sequence.streams["color"], sequence.streams["depth"]
+    noisy = bool(sequence.meta.get("noise"))
+    with ThreadPoolExecutor() as pool:
+        for _ in pool.map(partial(_decode_color, sequence), range(len(color.paths))):
+            pass
+        units = list(pool.map(partial(_quantisation_error, sequence, noisy), range(len(depth.paths))))
+    if noisy:
+        return True, "all decode (noise is on: 16-bit depth not compared with the exact one)"
+    worst = int(np.argmax(units))
+    detail = f"all decode, 16-bit depth within {units[worst]:.3f} units of the exact one"
+    return units[worst] <= 0.5 + 1e-6, detail + (f" ({depth.paths[worst]})" if units[worst] > 0.5 + 1e-6 else "")
+
+
+def _decode_color(sequence: Sequence, k: int) -> None:
+    sequence.color(k)
+
+
+def _quantisation_error(sequence: Sequence, noisy: bool, k: int) -> float:
+    """Largest difference in stored units between depth k and exact depth k; inf where one of them is missing."""
+    units, exact = sequence.depth_units(k), sequence.truth_depth(k)
+    if noisy:
+        return 0.0
+    expected = exact.astype(np.float64) * sequence.streams["depth"].depth_scale
+    # A value that rounds to 0 or beyond 16 bits is stored as nothing.
+    storable = (expected > 0.5) & (expected < 65535.5)
+    if (units[~storable] > 0).any() or (units[storable] == 0).any():
+        return math.inf
+    return float(np.abs(units[storable] - expected[storable]).max(initial=0.0))
+
+
+def _check_rows(sequence: Sequence, name: StreamName) -> tuple[bool, str]:
+    stream = sequence.streams[name]
+    T_cam_body = sequence.T_color_depth if name == "color" else None
+    found = sequence.rows(name)
+    expected = line_poses(sequence.spline, stream.camera, stream.shutter, stream.stamps, T_cam_body)
+    ok, detail, worst = _pose_errors(found.reshape(-1, 7), expected.reshape(-1, 7))
+    frame, line = divmod(worst, stream.line_count)
+    where = "" if ok else f", worst in frame {stream.indices[frame]}, line {line}"
+    return ok, f"{found.shape[0]}x{found.shape[1]} poses, against the spline {detail}{where}"
+
+
+def _pose_errors(found: FloatArray, expected: FloatArray) -> tuple[bool, str, int]:
+    """Whether rows (n, 7) agree, the largest errors in words, and where the translation's is."""
+    metres = np.linalg.norm(found[:, :3] - expected[:, :3], axis=-1)
+    norm = np.linalg.norm(found[:, 3:], axis=-1)
+    sign = np.sign(np.einsum("ni,ni->n", found[:, 3:], expected[:, 3:]))[:, None]
+    radians = 2 * np.linalg.norm(found[:, 3:] * sign - expected[:, 3:], axis=-1)  # |2 sin(angle / 2)| for small angles
+    good = (metres <= POSE_TOLERANCE_M) & (radians <= POSE_TOLERANCE_RAD) & (np.abs(norm - 1) <= 1e-8)
+    worst = int(np.argmax(np.maximum(metres, radians)))
+    return bool(good.all()), f"max {metres.max():.1e} m, {radians.max():.1e} rad", worst
+
+
+def _check_ground_truth(sequence: Sequence) -> tuple[bool, str]:
+    path = sequence.root / "groundtruth.txt"
+    lines = [line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
+    try:
+        rows = np.array([[float(field) for field in line.split()] for line in lines])
+    except ValueError:
+        rows = np.empty(0)
+    if rows.ndim != 2 or rows.shape[1] != 8 or not np.isfinite(rows).all():
+        raise UserError(f"{path}: expected lines of 8 numbers 'stamp tx ty tz qx qy qz qw'")
+    if (np.diff(rows[:, 0]) <= 0).any():
+        raise UserError(f"{path}: stamps do not increase")
+    stamps = np.concatenate([stream.stamps for stream in sequence.streams.values()])
+    if lacking := int((~np.isin(stamps, rows[:, 0])).sum()):
+        return False, f"{lacking} of {len(stamps)} frame stamps are not in it"
+    ok, detail, _ = _pose_errors(rows[:, 1:], pose_rows(sequence.spline.pose(rows[:, 0])))
+    return ok, f"{len(rows)} poses, against the spline {detail}"
+
+
+def _check_scene(sequence: Sequence) -> tuple[bool, str]:
+    """scene.ply is whole, and what a few depth frames show lies within its bounds."""
+    path = sequence.root / "scene.ply"
+    if not path.is_file():
+        raise UserError(f"{path}: is missing")
+    try:
+        mesh = trimesh.load(path, process=False, force="mesh")
+        counts, bounds = (len(mesh.vertices), len(mesh.faces)), np.asarray(mesh.bounds, float)
+        whole = counts == _ply_counts(path) and np.isfinite(mesh.vertices).all() and mesh.faces.max() < counts[0]
+    except Exception as error:  # trimesh raises whatever its parsers run into
+        raise UserError(f"{path}: cannot be read ({type(error).__name__})") from None
+    if not whole:
+        raise UserError(f"{path}: is not a whole mesh: write it again")
+    outside = 0.0
+    for k in np.unique(np.linspace(0, len(sequence.streams["depth"].paths) - 1, _SCENE_FRAMES).round().astype(int)):
+        p_world = depth_points(sequence, int(k))
+        outside = max(outside, float(np.maximum(bounds[0] - p_world, p_world - bounds[1]).max(initial=0.0)))
+    size = " x ".join(f"{length:.2f}" for length in bounds[1] - bounds[0])
+    detail = f"{counts[1]} triangles, {size} m, depth at most {outside * 1e3:.3f} mm outside"
+    return outside <= INLIER_M, detail
+
+
+def _ply_counts(path: Path) -> tuple[int, int]:
+    """Vertices and faces that the header promises."""
+    with path.open("rb") as file:
+        header = file.read(4096).split(b"end_header")[0].decode("ascii", "replace").split()
+    elements = {header[i + 1]: int(header[i + 2]) for i in range(len(header) - 2) if header[i] == "element"}
+    return elements.get("vertex", 0), elements.get("face", 0)
+
+
+def _neighbours(sequence: Sequence, pairs: int) -> list[tuple[int, int]]:
+    """Up to `pairs` pairs of consecutive depth frames, spread evenly."""
+    first = np.flatnonzero(np.diff(sequence.streams["depth"].indices) == 1)
+    chosen = np.unique(np.linspace(0, max(len(first) - 1, 0), min(pairs, len(first))).round().astype(int))
+    return [(int(first[i]), int(first[i]) + 1) for i in chosen]
+
+
+def _check_reprojection(sequence: Sequence, pairs: int) -> tuple[bool, str]:
+    """The worst pair decides: one frame that does not fit must not drown in nineteen that do."""
+    neighbours = _neighbours(sequence, pairs)
+    if not neighbours:
+        return True, "no two neighbouring depth frames: nothing to compare"
+    sizes, worst, ok = [], (-1.0, ""), True
+    for k, next_k in neighbours:
+        result = reproject_depth(sequence, k, next_k)
+        size = np.abs(result.residual)
+        frame = f"frames {sequence.streams['depth'].indices[k]}-{sequence.streams['depth'].indices[next_k]}"
+        if len(size) < max(MINIMUM_PIXELS, OCCLUDED_SHARE * (len(size) + result.occluded)):
+            return False, f"{frame}: only {len(size)} pixels agree on a surface, {result.occluded} are hidden"
+        median, share = float(np.median(size)), float((size <= INLIER_M).mean())
+        ok &= median <= MEDIAN_TOLERANCE_M and share >= INLIER_SHARE
+        sizes.append(size)
+        worst = max(worst, (median, f"{frame}: median {median * 1e3:.4f} mm, {share:.2%} within"))
+    size = np.concatenate(sizes)
+    return ok, (
+        f"{len(neighbours)} pairs, {len(size)} pixels: median {np.median(size) * 1e3:.4f} mm, 95 % "
+        f"{np.quantile(size, 0.95) * 1e3:.4f} mm, {(size <= INLIER_M).mean():.2%} within {INLIER_M * 1e3:g} mm; "
+        f"worst {worst[1]}"
+    )
+
+
+def _check_raycast(sequence: Sequence, count: int) -> tuple[bool, str]:
+    from rsgen.check.raycast import raycast_sequence
+
+    report = raycast_sequence(sequence, count)
+    return report.ok, report.text()

@@ -1,0 +1,1 @@
+"""The configuration of a sequence, section by section, validated."""

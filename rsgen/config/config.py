@@ -1,0 +1,160 @@
+"""The validated configuration of one sequence: a YAML file plus `--section.field value` overrides.
+
+The whole file is validated at once and errors name the field. Relative paths in a file are relative to that file,
+those of an override to the working directory.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin
+
+import yaml
+from pydantic import BaseModel, Field, ValidationError, model_validator
+
+from rsgen.config.imu import ImuConfig
+from rsgen.config.motion import MotionConfig
+from rsgen.config.sections import (
+    ColorConfig,
+    DepthConfig,
+    LightConfig,
+    SceneConfig,
+    Section,
+    StreamConfig,
+    TrajectoryConfig,
+)
+from rsgen.config.truth import TruthConfig
+from rsgen.errors import UserError
+from rsgen.files import parse_yaml
+from rsgen.limits import RigidTransform
+
+__all__ = ["Config", "StreamConfig", "describe_fields", "load_config", "validate_config"]
+
+# Fields that change how fast or where a sequence is made, never one byte of it.
+_NOT_CONTENT = {"backend"}
+# Fields that hold paths, by section.
+_PATHS = (("trajectory", "file"), ("scene", "file"))
+# PyYAML lets impossible dates, endless digits and endless nesting through as these.
+_BAD_YAML = (yaml.YAMLError, ValueError, RecursionError)
+
+
+class Config(Section):
+    """One sequence."""
+
+    name: str = Field(
+        pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]*$", description="the sequence's name, also its default folder"
+    )
+    trajectory: TrajectoryConfig = TrajectoryConfig()
+    motion: MotionConfig | None = None
+    scene: SceneConfig
+    light: LightConfig = LightConfig()
+    color: ColorConfig = ColorConfig()
+    depth: DepthConfig = DepthConfig()
+    T_color_depth: RigidTransform = Field(
+        default=((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)),
+        description="depth-camera to colour-camera coordinates, m",
+    )
+    truth: TruthConfig = TruthConfig()
+    imu: ImuConfig | None = None
+    seed: int = Field(default=0, ge=0, lt=2**31, description="seed of every random number")
+    backend: Literal["auto", "llvm", "cuda"] = Field(default="auto", description="where Dr.Jit runs")
+
+    @model_validator(mode="after")
+    def _has_one_motion(self) -> Config:
+        if (self.trajectory.file is None) == (self.motion is None):
+            given = "one of them, not both" if self.motion else "a recorded file, or a section 'motion'"
+            raise ValueError(f"trajectory.file: is required: give {given}")
+        return self
+
+    def content(self) -> dict[str, Any]:
+        """Everything that decides the sequence's bytes, as plain YAML types (the trajectory and scene by file name)."""
+        content = self.model_dump(mode="json", exclude=_NOT_CONTENT)
+        for section, name in _PATHS:
+            if content[section][name] is not None:
+                content[section][name] = Path(content[section][name]).name
+        return content
+
+
+def load_config(path: Path, overrides: dict[str, str] | None = None) -> Config:
+    """Read and validate a YAML config with overrides `{'color.spp': '64'}` (values parsed as YAML).
+
+    Raises UserError naming the file and every wrong field on one line.
+    """
+    path = Path(path)
+    try:
+        data = parse_yaml(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not a text file"
+        raise _error(f"config {path}: cannot be read ({reason})") from None
+    except _BAD_YAML as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" line {mark.line + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or getattr(error, "reason", None) or type(error).__name__
+        raise _error(f"config {path}:{where} is not valid YAML ({problem})") from None
+    if not isinstance(data, dict):
+        raise _error(f"config {path}: expected a mapping of fields such as 'name:', 'trajectory:', 'scene:'")
+    for section, name in _PATHS:
+        part = data.get(section)
+        if isinstance(part, dict) and isinstance(part.get(name), str):
+            try:
+                part[name] = str(path.parent / Path(part[name]).expanduser())
+            except RuntimeError:
+                raise _error(f"config {path}: {section}.{name}: no such user's home, got {part[name]!r}") from None
+    for key, text in (overrides or {}).items():
+        _set(data, key, text)
+    return validate_config(data, f"config {path}")
+
+
+def validate_config(data: dict[str, Any], where: str) -> Config:
+    """A config from plain YAML types; `where` begins the message. Raises UserError naming every wrong field."""
+    try:
+        return Config.model_validate(data)
+    except ValidationError as error:
+        problems = "; ".join(_problem(e) for e in error.errors())
+        raise _error(f"{where}: {problems}") from None
+
+
+def _error(text: str) -> UserError:
+    """One printable line, whatever names and values a file holds."""
+    return UserError("".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text))
+
+
+def _set(data: dict[str, Any], key: str, text: str) -> None:
+    *sections, name = key.split(".")
+    for section in sections:
+        inner = data.setdefault(section, {})
+        if not isinstance(inner, dict):
+            raise _error(f"override --{key}: '{section}' is not a section")
+        data = inner
+    try:
+        data[name] = parse_yaml(text)
+    except _BAD_YAML:
+        shown = text if len(text) <= 60 else f"{text[:57]}..."
+        raise _error(f"override --{key}: '{shown}' is not a valid value") from None
+
+
+def _problem(error: Any) -> str:
+    where = ".".join(str(part) for part in error["loc"]) or "config"
+    message = error["msg"].removeprefix("Value error, ")
+    if error["type"] == "extra_forbidden":
+        return f"{where}: no such field (see 'rsgen render --help')"
+    if error["type"] == "missing":
+        return f"{where}: is required"
+    given = repr(error["input"])
+    return f"{where}: {message}, got {given if len(given) <= 60 else given[:57] + '...'}"
+
+
+def describe_fields(section: type[BaseModel] = Config, prefix: str = "") -> list[tuple[str, str, str]]:
+    """Rows (dotted name, default, description) of every field that a config or an override can set."""
+    rows: list[tuple[str, str, str]] = []
+    for name, field in section.model_fields.items():
+        # An optional section, `Section | None`, is written like any other.
+        either = get_origin(field.annotation) in (Union, UnionType)
+        inner = next(t for t in get_args(field.annotation) if t is not NoneType) if either else field.annotation
+        if isinstance(inner, type) and issubclass(inner, BaseModel):
+            rows += describe_fields(inner, f"{prefix}{name}.")
+        else:
+            default = "required" if field.is_required() else str(field.default)
+            rows.append((prefix + name, default, field.description or ""))
+    return rows

@@ -1,0 +1,1 @@
+"""What every command line shares: options and errors, progress bars, the scheduler."""

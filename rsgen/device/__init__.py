@@ -1,0 +1,1 @@
+"""What runs on the device (Dr.Jit, never Mitsuba): backend, arrays, recorded kernels, rolling-shutter projection."""

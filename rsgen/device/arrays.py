@@ -1,0 +1,70 @@
+"""The per-pixel engine: Dr.Jit's array types of one backend, and moving arrays between it and NumPy.
+
+The same kernels run on `llvm` (CPU) and `cuda`. Sums over pixels are kept in 32-bit integers (fixed point): integer
+addition does not depend on the order in which threads arrive, so a run gives the same bits every time and the two
+backends differ only by the rounding of single pixels.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rsgen.device.backend import VARIANTS, Backend, select
+
+# Dr.Jit keys recorded kernels on the alignment of the buffers it is handed.
+_ALIGNMENT = 64
+
+
+@dataclass(frozen=True)
+class Engine:
+    """Array types of one Dr.Jit backend."""
+
+    backend: str
+    Float: Any
+    UInt: Any
+    Int: Any
+    Bool: Any
+
+    def upload(self, array: npt.ArrayLike) -> Any:
+        """Flat float32 copy of `array` on the device."""
+        source = np.asarray(array)
+        raw = np.empty(source.size + _ALIGNMENT // 4, np.float32)
+        start = (-raw.ctypes.data % _ALIGNMENT) // 4
+        aligned = raw[start : start + source.size]
+        aligned.reshape(source.shape)[...] = source
+        return self.Float(aligned)
+
+    def download(self, array: Any, shape: tuple[int, ...]) -> npt.NDArray[Any]:
+        """NumPy copy of a device array."""
+        return np.array(array.numpy().reshape(shape))
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """Kernels that have been made, so that each is compiled once: kernels(make, *what) is make(e, *what)."""
+
+    e: Engine
+    _made: dict[Any, Any] = field(default_factory=dict)
+
+    def __call__(self, make: Callable[..., Callable[..., Any]], *what: Any) -> Callable[..., Any]:
+        """The kernel, made now if it has not been."""
+        if (make, *what) not in self._made:
+            self._made[make, *what] = make(self.e, *what)
+        kernel: Callable[..., Any] = self._made[make, *what]
+        return kernel
+
+
+@cache
+def engine(backend: Backend = "auto") -> Engine:
+    """The engine of a backend; `auto` takes CUDA where a device answers. Raises UserError if it cannot work here."""
+    variant = select(backend)
+    name = next(key for key, value in VARIANTS.items() if value == variant)
+    module = importlib.import_module(f"drjit.{name}")
+    return Engine(name, module.Float, module.UInt, module.Int, module.Bool)

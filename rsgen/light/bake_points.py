@@ -1,0 +1,170 @@
+"""Where light is baked: the unique sample points of a lattice, thinned sets of them, and interpolation between sets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from rsgen.render.irradiance import Lattice, lattice_barycentric
+from rsgen.render.scene import mesh_arrays
+
+_INSET_M = 2e-3  # samples on a triangle's rim move this far inwards: a corner exactly on two surfaces sees neither
+_NEIGHBOURS = 8
+_NORMAL_SCALE = 0.35  # normals this far apart count as much as one spacing
+_APART = 1e4  # spacings between different pieces of surface
+_SMOOTHING = 0.3  # spacings: closer sources than this count alike
+
+
+@dataclass(frozen=True)
+class Points:
+    """Unique sample points: position on the surface, shading normal, geometric normal, (n, 3) float32 each, and (n,)
+    the number of the piece of surface that each lies on: one side of a connected part of a mesh.
+    """
+
+    position: NDArray[np.float32]
+    normal: NDArray[np.float32]
+    geometric: NDArray[np.float32]
+    piece: NDArray[np.int64]
+
+
+def sample_points(scene: Any, lattice: Lattice) -> tuple[Points, NDArray[np.int64]]:
+    """Unique points of both sides of the lattice, and (2, points) index of each lattice point's front and back one."""
+    face, uv = lattice_barycentric(lattice)
+    count = len(face)
+    centre = np.full((count, 2), 1 / 3, np.float32)
+    position = np.empty((count, 3), np.float32)
+    normal, geometric, middle = (np.empty_like(position) for _ in range(3))
+    shapes = [s for s in scene.shapes() if s.is_mesh()]
+    firsts = np.sort(lattice.shape_first[lattice.shape_first >= 0])
+    owner = np.searchsorted(firsts, face, side="right") - 1
+    island = np.empty(count, np.int64)
+    islands = 0
+    for number, shape in enumerate(shapes):
+        label = _islands(*mesh_arrays(shape))
+        here = np.flatnonzero(owner == number)
+        island[here] = islands + label[face[here] - firsts[number]]
+        islands += int(label.max()) + 1
+        for part in np.array_split(here, max(1, len(here) // (1 << 20))):
+            local = (face[part] - firsts[number]).astype(np.uint32)
+            position[part], normal[part], geometric[part] = _surface_at(shape, local, uv[part])
+            middle[part] = _surface_at(shape, local, centre[part])[0]
+    # The side that shading lights, where winding and vertex normals disagree.
+    geometric *= np.where(np.einsum("ij,ij->i", geometric, normal) < 0, -1, 1)[:, None].astype(np.float32)
+    # Rounded positions and normals make one key: points that triangles share are computed once, so edges cannot show.
+    key_parts = np.concatenate([np.round(position * 1e4), np.round(normal * 32)], axis=1).astype(np.int64)
+    inward = middle - position
+    distance = np.linalg.norm(inward, axis=1, keepdims=True)
+    position = position + inward * np.minimum(_INSET_M / np.maximum(distance, 1e-9), 0.1)
+
+    unique_first, index = [], np.empty((2, count), np.int64)
+    offset = 0
+    for side, sign in enumerate((1, -1)):
+        key = _mix((key_parts * np.array([1, 1, 1, sign, sign, sign])).astype(np.uint64))
+        _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
+        unique_first.append(first)
+        index[side] = inverse + offset
+        offset += len(first)
+    front, back = unique_first
+    return Points(
+        np.concatenate([position[front], position[back]]),
+        np.concatenate([normal[front], -normal[back]]),
+        np.concatenate([geometric[front], -geometric[back]]),
+        np.concatenate([2 * island[front], 2 * island[back] + 1]),
+    ), index
+
+
+def _islands(vertices: NDArray, faces: NDArray) -> NDArray[np.int64]:
+    """(f,) label of the connected piece that each triangle of a mesh belongs to; vertices at one place are one."""
+    _, same = np.unique(np.round(vertices * 1e5).astype(np.int64), axis=0, return_inverse=True)
+    a, b, c = same.ravel()[faces.astype(np.int64)].T
+    ends = np.concatenate([a, b]), np.concatenate([b, c])
+    size = int(same.max()) + 1
+    edges = coo_array((np.ones(2 * len(a), bool), ends), shape=(size, size))
+    return connected_components(edges, directed=False)[1][a]
+
+
+def _mix(columns: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """One well-mixed 64-bit hash of each row (splitmix64's finaliser, chained over columns)."""
+    h = np.zeros(len(columns), np.uint64)
+    for column in columns.T:
+        h = h ^ column
+        h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        h = h ^ (h >> np.uint64(31))
+    return h
+
+
+def _surface_at(shape: Any, face: NDArray[np.uint32], uv: NDArray[np.float32]) -> tuple[NDArray, NDArray, NDArray]:
+    """Position, shading normal and geometric normal, as the renderer sees them, at barycentric `uv` of triangles."""
+    pi = dr.zeros(mi.PreliminaryIntersection3f, len(face))
+    pi.prim_index = mi.UInt32(face)
+    pi.prim_uv = mi.Point2f(uv[:, 0], uv[:, 1])
+    pi.shape = mi.ShapePtr(shape)
+    pi.valid = mi.Bool(True)
+    ray = dr.zeros(mi.Ray3f, len(face))
+    ray.d = mi.Vector3f(0, 0, 1)
+    si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
+    return tuple(np.array(v, np.float32).reshape(3, -1).T for v in (si.p, si.sh_frame.n, si.n))  # type: ignore[return-value]
+
+
+def thin(
+    points: Points, spacing: float, among: NDArray[np.int64] | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Of `among` (default: all), one in each cell of `spacing` metres, of like normals on one piece of surface.
+
+    Returns the chosen ones as indices into `among`, and for each of `among` which of the chosen stands for it.
+    """
+    position, normal, piece = points.position, points.normal, points.piece
+    if among is not None:
+        position, normal, piece = position[among], normal[among], piece[among]
+    scaled = position / spacing
+    cell = np.floor(scaled)
+    off_centre = ((scaled - cell - 0.5) ** 2).sum(axis=1)
+    # A buried face must not stand for a lit one just in front of it, so pieces of surface are kept apart.
+    key = _mix(np.concatenate([cell, np.round(normal), piece[:, None]], axis=1).astype(np.int64).astype(np.uint64))
+    order = np.lexsort((off_centre, key))
+    sorted_key = key[order]
+    starts = np.concatenate([[True], sorted_key[1:] != sorted_key[:-1]])
+    stands_for = np.empty(len(order), np.int64)
+    stands_for[order] = np.cumsum(starts) - 1
+    return order[starts], stands_for
+
+
+@dataclass(frozen=True)
+class Interpolation:
+    """Values at some points from those at `sources`: neighbours (n, k) among the sources and weights (n, k)."""
+
+    neighbours: NDArray[np.int32]
+    weights: NDArray[np.float32]
+
+    @classmethod
+    def between(cls, points: Points, sources: NDArray, targets: NDArray, spacing: float) -> Interpolation:
+        """By distance in position (in units of `spacing` metres) and normal together, within one piece of surface.
+
+        The dark inside of a thin sheet is a millimetre from its lit outside and has the normal of the other outside.
+        """
+        parts = [points.position / spacing, points.normal / _NORMAL_SCALE, _APART * points.piece[:, None]]
+        scaled = np.concatenate(parts, axis=1)
+        k = min(_NEIGHBOURS, len(sources))
+        distance, neighbours = cKDTree(scaled[sources]).query(scaled[targets], k=k, workers=-1, eps=0.2)
+        distance, neighbours = np.reshape(distance, (-1, k)), np.reshape(neighbours, (-1, k))
+        # Falls to zero at the furthest neighbour, so that the interpolant is continuous as neighbours change, and
+        # grows without bound towards a source, so that it passes through the sources.
+        near = np.clip(1 - (distance / (distance[:, -1:] * 1.0001 + 1e-9)) ** 2, 0, 1) ** 2
+        weights = (near + 1e-6) / (distance**2 + _SMOOTHING**2)
+        weights /= weights.sum(axis=1, keepdims=True)
+        return cls(neighbours.astype(np.int32), weights.astype(np.float32))
+
+    def __call__(self, at_sources: NDArray[np.float32]) -> NDArray[np.float32]:
+        out = np.zeros((len(self.neighbours), 3), np.float32)
+        for k in range(self.neighbours.shape[1]):
+            out += self.weights[:, k, None] * at_sources[self.neighbours[:, k]]
+        return out

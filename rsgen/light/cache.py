@@ -1,0 +1,91 @@
+"""A scene's baked light: from the cache if it was baked with the same inputs before, else baked now and kept."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import logging
+import os
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from rsgen.config.config import LightConfig
+from rsgen.light.bake import METHOD, Progress, bake
+from rsgen.render.irradiance import IrradianceField, Lattice, make_field, make_lattice
+
+log = logging.getLogger("rsgen")
+
+_SIDES = ("front", "back")
+
+
+def baked_field(scene: Any, scene_hash: str, light: LightConfig, cache: Path, progress: Progress) -> IrradianceField:
+    """The scene's irradiance: from `cache` (a folder) if it was baked with the same inputs before, else baked now."""
+    lattice = make_lattice(scene, light.texel_m)
+    key = cache_key(scene_hash, light)
+    path = cache / f"irradiance-{key}.npz"
+    stored = _load(path, lattice)
+    if stored is None:
+        front, back = bake(scene, lattice, light, progress)
+        _store(path, front, back)
+    else:
+        front, back = stored
+    return make_field(lattice, front, back)
+
+
+def cache_key(scene_hash: str, light: LightConfig) -> str:
+    """Name of a bake: hash of the scene's files, the light's settings, this method's version and the engine's."""
+    facts = {
+        "scene": scene_hash,
+        "light": light.model_dump(exclude={"mode", "max_depth", "glossy_spp"}),
+        "method": METHOD,
+        "mitsuba": mi.__version__,
+        "variant": mi.variant(),
+    }
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:24]
+
+
+def cache_folder(scene_file: Path) -> Path:
+    """Where a scene's bakes are kept: beside the scene if that is writable, else in the user's cache."""
+    if os.access(scene_file.parent, os.W_OK):
+        return scene_file.parent / ".rsgen-cache"
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "rsgen"
+
+
+def _load(path: Path, lattice: Lattice) -> tuple[NDArray, NDArray] | None:
+    """Both sides of a stored bake, or None if there is none that fits (a damaged file is baked again)."""
+    sides = []
+    try:
+        with np.load(path) as data:
+            for side in _SIDES:
+                alive = np.unpackbits(data[f"{side}_alive"], count=lattice.points).astype(bool)
+                values = np.zeros((lattice.points, 4), np.float32)
+                values[alive, :3] = data[side]
+                values[alive, 3] = 1
+                sides.append(values)
+    except (OSError, ValueError, KeyError, EOFError, IndexError, zipfile.BadZipFile, zlib.error):
+        return None
+    return sides[0], sides[1]
+
+
+def _store(path: Path, front: NDArray, back: NDArray) -> None:
+    """Write atomically; a cache that cannot be written only costs time, so it is no error."""
+    arrays: dict[str, NDArray] = {}
+    for side, values in zip(_SIDES, (front, back), strict=True):
+        alive = values[:, 3] > 0
+        arrays |= {side: values[alive, :3], f"{side}_alive": np.packbits(alive)}
+    temporary = path.with_suffix(f".{os.getpid()}.tmp.npz")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.savez(temporary, allow_pickle=False, **arrays)
+        temporary.replace(path)
+    except OSError as error:
+        log.warning("light cache %s cannot be written (%s): it will be baked again next time", path, error.strerror)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)

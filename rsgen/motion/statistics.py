@@ -1,0 +1,98 @@
+"""How far and how fast a camera moves: the columns of the paper's Table 1, and accelerations."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rsgen.errors import UserError
+from rsgen.geometry import se3
+from rsgen.geometry.spline import Spline
+from rsgen.sequence.trajectory import Trajectory
+
+Array = npt.NDArray[np.float64]
+
+_SAMPLES_PER_KNOT = 20
+_CHUNK = 200_000
+
+
+@dataclass(frozen=True)
+class MotionStatistics:
+    """Means are over time, not over samples; accelerations are of the body's origin in the world, gravity excluded."""
+
+    duration_s: float
+    length_m: float
+    mean_speed_m_s: float
+    max_speed_m_s: float
+    mean_rotation_deg_s: float
+    max_rotation_deg_s: float
+    mean_acceleration_m_s2: float
+    max_acceleration_m_s2: float
+
+
+def motion_statistics(
+    motion: Spline | Trajectory, begin: float | None = None, end: float | None = None
+) -> MotionStatistics:
+    """Statistics of a motion between two times (seconds; default all of it).
+
+    A Spline is evaluated analytically at 20 midpoints a knot, so that the length is the arc's. A Trajectory is taken
+    from pose to pose: chords, noise included, so that it comes out longer and jerkier than its spline.
+    Raises UserError if nothing lies between begin and end.
+    """
+    if isinstance(motion, Spline):
+        return _of_spline(motion, motion.t_begin if begin is None else begin, motion.t_end if end is None else end)
+    return _of_poses(motion, -math.inf if begin is None else begin, math.inf if end is None else end)
+
+
+def _of_spline(spline: Spline, begin: float, end: float) -> MotionStatistics:
+    if not end > begin:
+        raise UserError(f"no motion between {begin:g} and {end:g} s: the end must come after the begin")
+    count = max(1, math.ceil((end - begin) / spline.dt * _SAMPLES_PER_KNOT))
+    times = begin + (np.arange(count) + 0.5) * ((end - begin) / count)
+    parts = np.split(times, range(_CHUNK, count, _CHUNK))  # long recordings would need gigabytes at once
+    speed, rotation, acceleration = np.concatenate([_norms(spline, part) for part in parts], axis=1)
+    steps = np.full(count, (end - begin) / count)
+    return _summary(steps, speed, rotation, steps, acceleration)
+
+
+def _norms(spline: Spline, times: Array) -> Array:
+    """(3, n): speed m/s, rotation rad/s, acceleration m/s²."""
+    velocity = spline.velocity(times)
+    return np.stack(
+        [
+            np.linalg.norm(velocity[:, :3], axis=1),
+            np.linalg.norm(velocity[:, 3:], axis=1),
+            np.linalg.norm(spline.world_acceleration(times), axis=1),
+        ]
+    )
+
+
+def _of_poses(trajectory: Trajectory, begin: float, end: float) -> MotionStatistics:
+    inside = (trajectory.stamps >= begin) & (trajectory.stamps <= end)
+    if inside.sum() < 3:
+        raise UserError(f"fewer than three poses between {begin:g} and {end:g} s: widen the interval")
+    stamps, poses = trajectory.stamps[inside], trajectory.T_world_cam[inside]
+    steps = np.diff(stamps)
+    velocity = np.diff(poses[:, :3, 3], axis=0) / steps[:, None]
+    angle = np.linalg.norm(se3.log(se3.inverse(poses[:-1]) @ poses[1:])[:, 3:], axis=1)
+    spans = 0.5 * (steps[1:] + steps[:-1])
+    acceleration = np.linalg.norm(np.diff(velocity, axis=0), axis=1) / spans
+    return _summary(steps, np.linalg.norm(velocity, axis=1), angle / steps, spans, acceleration)
+
+
+def _summary(steps: Array, speed: Array, rotation: Array, spans: Array, acceleration: Array) -> MotionStatistics:
+    duration = float(steps.sum())
+    length = float(speed @ steps)
+    return MotionStatistics(
+        duration_s=duration,
+        length_m=length,
+        mean_speed_m_s=length / duration,
+        max_speed_m_s=float(speed.max()),
+        mean_rotation_deg_s=math.degrees(float(rotation @ steps) / duration),
+        max_rotation_deg_s=math.degrees(float(rotation.max())),
+        mean_acceleration_m_s2=float(acceleration @ spans / spans.sum()),
+        max_acceleration_m_s2=float(acceleration.max()),
+    )

@@ -1,0 +1,1 @@
+"""Pictures of frames, sequences and meshes."""

@@ -1,0 +1,96 @@
+"""Look at a sequence: a preview of some frames, and one frame rendered again with a global shutter beside it."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsgen.config.config import Config, validate_config
+from rsgen.console.progress import ProgressDisplay
+from rsgen.errors import UserError
+from rsgen.files import read_yaml
+from rsgen.produce.frame_source import FrameSource, scene_hash
+from rsgen.produce.generate import ORIGIN
+from rsgen.sequence.reader import read_sequence
+
+log = logging.getLogger("rsgen")
+
+
+def preview_sequence(path: Path, out: Path | None, count: int) -> Path:
+    """Write a picture of `count` frames over the whole sequence, colour over depth; returns its path.
+
+    Raises UserError if the sequence cannot be read or the picture not be written.
+    """
+    from rsgen.figures import save
+    from rsgen.pictures.figures import preview
+
+    sequence = read_sequence(path)
+    streams = sequence.streams
+    available = min(len(streams["color"].stamps), len(streams["depth"].stamps))
+    if available == 0 or count < 1:
+        raise UserError(f"{path}: no frames to show: render some, and ask for at least one")
+    chosen = np.linspace(0, available - 1, min(count, available)).round().astype(int)
+    shutter = streams["color"].shutter
+    numbers = ", ".join(str(k) for k in streams["color"].indices[chosen])
+    title = f"{sequence.name}: frames {numbers} (readout {1000 * shutter.readout_s:g} ms)"
+    out = out or path / "preview.png"
+    save(preview([sequence.color(k) for k in chosen], [sequence.depth(k) for k in chosen], title), out)
+    return out
+
+
+def compare_frame(path: Path, frame: int, out: Path | None, scene: Path | None) -> Path:
+    """Write the paper's Figure 3 for one frame: global shutter, rolling shutter, signed difference; returns its path.
+
+    The global-shutter pictures are rendered at the time of the middle line. `scene` names the scene file if it is no
+    longer where it was. Raises UserError.
+    """
+    from rsgen.figures import save
+    from rsgen.pictures.figures import comparison
+
+    sequence = read_sequence(path)
+    color, depth = (sequence.streams[name] for name in ("color", "depth"))
+    for stream in (color, depth):
+        if frame not in stream.indices:
+            raise UserError(f"{path}: has no {stream.name} frame {frame}: choose one of {_span(stream.indices)}")
+    config = config_of(path, sequence.meta, scene)
+    if scene_hash(config) != _mapping(sequence.meta.get("inputs")).get("scene"):
+        log.warning("%s: the scene %s has changed since, so more than the shutter differs", path, config.scene.file)
+    with ProgressDisplay() as progress:
+        source = FrameSource(config, progress, global_shutter=True)
+    at = {stream.name: int(np.flatnonzero(stream.indices == frame)[0]) for stream in (color, depth)}
+    middle = {s.name: float(s.stamps[at[s.name]]) + s.shutter.readout_s / 2 for s in (color, depth)}
+    colors = source.color(sequence.spline, middle["color"], frame), sequence.color(at["color"])
+    depths = source.depth(sequence.spline, middle["depth"]), sequence.truth_depth(at["depth"])
+    title = (
+        f"{sequence.name}, frame {frame}: readout {1000 * color.shutter.readout_s:g} ms (colour), "
+        f"{1000 * depth.shutter.readout_s:g} ms (depth); global shutter at the middle line's time"
+    )
+    out = out or path / f"compare_{frame:06d}.png"
+    save(comparison(colors, depths, title), out)
+    return out
+
+
+def config_of(path: Path, meta: dict[str, Any], scene: Path | None) -> Config:
+    """The config that a sequence records, with its scene found on this machine."""
+    origin = read_yaml(path / ORIGIN) if (path / ORIGIN).is_file() else {}
+    recorded = _mapping(meta.get("config"))
+    file = scene or Path(str(origin.get("scene", "")))
+    if not file.is_file():
+        raise UserError(f"{path}: its scene '{file}' is not on this machine: name it with --scene")
+    recorded["scene"] = {"file": str(file.resolve())}
+    if recorded.get("motion") is None:
+        trajectory = {"file": str(origin.get("trajectory", "unused"))}
+        recorded["trajectory"] = _mapping(recorded.get("trajectory")) | trajectory
+    return validate_config(recorded, f"{path}/sequence.yaml: config")
+
+
+def _mapping(value: Any) -> dict[str, Any]:
+    """A copy of a YAML mapping; empty for anything else, which is for the validation to complain about."""
+    return dict(value) if isinstance(value, dict) else {}
+
+
+def _span(indices: Any) -> str:
+    return f"{min(indices)} to {max(indices)}" if len(indices) else "none: it is empty"

@@ -1,0 +1,1 @@
+"""From a config to a sequence folder: frames, writer, identity, distribution over processes."""

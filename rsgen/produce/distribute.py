@@ -1,0 +1,176 @@
+"""Render the images of an open sequence: in this process, or on workers, with the same bytes.
+
+To workers go blocks of images to render, and encoded files come back. Only the process that the user started writes to
+the sequence's folder. Workers need the scene (and, to share the baked light, its cache) at the same path, nothing else
+of the disk.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from rsgen.config.config import Config
+from rsgen.console.scheduler import Progress, Workers
+from rsgen.errors import UserError
+from rsgen.files import atomic_write
+from rsgen.geometry.spline import Spline
+from rsgen.produce.frame_source import ColorShot, DepthShot, FrameSource, scene_hash
+from rsgen.produce.writer import SequenceWriter
+from rsgen.sequence.format import FloatArray, StreamName
+
+# Written frames that may wait for the disk: bounds memory and how much a kill can lose.
+_WRITE_AHEAD = 4
+# Images a job makes: a few seconds of work and some megabytes of files.
+_BLOCK = 8
+
+
+def engine_versions(config: Config) -> dict[str, str]:
+    """Versions of the programs that decide a sequence's bytes, and the Dr.Jit variant that runs."""
+    from rsgen.device.backend import mitsuba
+
+    names = ("rolling-shutter-rgbd", "mitsuba", "drjit", "numpy", "scipy")
+    return {name: version(name) for name in names} | {"variant": mitsuba(config.backend).variant()}
+
+
+def render_shots(
+    writer: SequenceWriter, source: FrameSource, shots: Sequence[tuple[int, StreamName]], progress: Progress
+) -> None:
+    """Render images (frame, stream) in order and write them; noise and encoding go on beside. Raises UserError."""
+    # However this ends, leaving the pool waits for what has been rendered to be written.
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        pending: list[Future[None]] = []
+        for done, (k, stream) in enumerate(shots, 1):
+            stamp = float(writer.stamps(stream)[k])
+            if stream == "color":
+                following = writer.stamps("color")[k + 1 : k + 2].tolist()
+                shot = source.expose_color(writer.spline, stamp, k, following[0] if following else None)
+                pending.append(pool.submit(_write_color, writer, source, shot))
+            else:
+                measured = source.expose_depth(writer.spline, stamp, k)
+                pending.append(pool.submit(_write_depth, writer, source, measured))
+            while len(pending) > _WRITE_AHEAD:
+                pending.pop(0).result()
+            progress("frames", done / len(shots), f"frame {k}")
+        for write in pending:
+            write.result()
+
+
+def _write_color(writer: SequenceWriter, source: FrameSource, shot: ColorShot) -> None:
+    writer.write_color(shot.frame, *source.develop_color(shot))
+
+
+def _write_depth(writer: SequenceWriter, source: FrameSource, shot: DepthShot) -> None:
+    writer.write_depth(shot.frame, shot.z, source.develop_depth(shot))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a worker has to know of a sequence to render any of its frames.
+
+    stamps_color (n,) and stamps_depth (m,): s, of all frames; versions, inputs: as in sequence.yaml.
+    """
+
+    config: Config
+    spline: Spline
+    stamps_color: FloatArray
+    stamps_depth: FloatArray
+    versions: Mapping[str, str]
+    inputs: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Block:
+    """Images (frame, stream) that one job renders."""
+
+    plan: Plan
+    shots: tuple[tuple[int, StreamName], ...]
+
+
+def render_blocks(
+    writer: SequenceWriter,
+    shots: Sequence[tuple[int, StreamName]],
+    versions: Mapping[str, str],
+    inputs: Mapping[str, str],
+    workers: Workers,
+    progress: Progress,
+) -> None:
+    """Render the images (frame, stream) on `workers` and write them into the writer's folder, in any order.
+
+    Raises UserError if a worker has other versions or another scene, or is lost too often; what came back is kept.
+    """
+    plan = Plan(
+        _for_other_processes(writer.config, versions),
+        writer.spline,
+        writer.stamps("color"),
+        writer.stamps("depth"),
+        versions,
+        inputs,
+    )
+    blocks = [Block(plan, tuple(shots[i : i + _BLOCK])) for i in range(0, len(shots), _BLOCK)]
+    done = 0
+    # The first one alone: it bakes the light, if need be, and the others find it in the cache.
+    for part in (blocks[:1], blocks[1:]):
+        for index, files in workers.apply(render_block, part, progress):
+            for name, data in files.items():
+                atomic_write(writer.out / name, data)
+            done += len(part[index].shots)
+            progress("frames", done / len(shots), f"{done} of {len(shots)} images")
+
+
+def render_block(block: Block, progress: Progress) -> dict[str, bytes]:
+    """On a worker: the block's files by their paths within the sequence. Raises UserError."""
+    plan = block.plan
+    source = _source(plan, progress)
+    with TemporaryDirectory(prefix="rsgen-") as folder:
+        out = Path(folder) / plan.config.name
+        stamps = plan.stamps_color, plan.stamps_depth
+        writer = SequenceWriter.open(out, plan.config, plan.spline, *stamps, plan.versions, plan.inputs)
+        before = set(out.rglob("*"))
+        render_shots(writer, source, block.shots, lambda *_: None)
+        made = sorted(path for path in set(out.rglob("*")) - before if path.is_file())
+        return {path.relative_to(out).as_posix(): path.read_bytes() for path in made}
+
+
+def _for_other_processes(config: Config, versions: Mapping[str, str]) -> Config:
+    """The config with the scene's full path and with the backend that runs here, whatever a worker has."""
+    scene = config.scene.model_copy(update={"file": config.scene.file.absolute()})
+    return config.model_copy(update={"scene": scene, "backend": versions["variant"].partition("_")[0]})
+
+
+# Scene and light that this process rendered last, by what they were made from.
+_loaded: dict[str, FrameSource] = {}
+
+
+def _source(plan: Plan, progress: Progress) -> FrameSource:
+    key = json.dumps([plan.config.model_dump_json(), dict(plan.inputs), dict(plan.versions)])
+    if key not in _loaded:
+        _loaded.clear()
+        try:
+            _check(plan)
+            _loaded[key] = FrameSource(plan.config, progress)
+        except UserError as error:
+            raise UserError(f"worker on {socket.gethostname()}: {error}") from None
+    return _loaded[key]
+
+
+def _check(plan: Plan) -> None:
+    """Raises UserError if this process would render other bytes than the one that opened the sequence."""
+    mine = engine_versions(plan.config)
+    for name, wanted in plan.versions.items():
+        if mine.get(name) != wanted:
+            raise UserError(
+                f"has {name} {mine.get(name)}, the sequence needs {wanted}: install the same on all workers"
+            )
+    if not plan.config.scene.file.exists():
+        raise UserError(
+            f"{plan.config.scene.file}: is missing: workers need the scene at the same path (a shared disk)"
+        )
+    if scene_hash(plan.config) != plan.inputs["scene"]:
+        raise UserError(f"{plan.config.scene.file}: or a file of it is another one here: copy the scene again")

@@ -1,0 +1,124 @@
+"""What tells one sequence from another: the text of sequence.yaml, its fingerprint, and whose a folder is."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rsgen.config.config import Config, StreamConfig
+from rsgen.errors import UserError
+from rsgen.files import is_temporary, read_yaml
+from rsgen.geometry.spline import Spline
+from rsgen.sequence.format import CLEAN_COLOR, FORMAT, STREAMS, FloatArray
+
+
+def fingerprint(content: Mapping[str, Any]) -> str:
+    """SHA-256 of canonical JSON; a number's spelling (1 or 1.0) does not matter."""
+    text = json.dumps(_canonical(content), sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _canonical(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _canonical(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_canonical(item) for item in value]
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value) + 0.0
+    return value
+
+
+def describe(
+    config: Config,
+    spline: Spline,
+    stamps: Mapping[str, FloatArray],
+    versions: Mapping[str, str],
+    inputs: Mapping[str, str],
+) -> dict[str, Any]:
+    """What sequence.yaml says. stamps: (n,) s of all frames of each stream."""
+    identity = {"config": config.content(), "inputs": dict(inputs), "versions": dict(versions)}
+    return {
+        "format": FORMAT,
+        "name": config.name,
+        "streams": {
+            "color": _stream_yaml(config.color, stamps["color"]),
+            "depth": _stream_yaml(config.depth, stamps["depth"]) | {"depth_scale": config.depth.depth_scale},
+        },
+        "T_color_depth": [[float(value) for value in row] for row in config.T_color_depth],
+        "spline": {"knot_spacing_s": spline.dt, "t0_s": spline.t0, "control_points": len(spline.control_points)},
+        "noise": noise_yaml(config),
+        "truth": {name: list(channels) for name, channels in color_truth(config).items()},
+        "seed": config.seed,
+        **identity,
+        "fingerprint": fingerprint(identity),
+    }
+
+
+def color_truth(config: Config) -> dict[str, tuple[str, ...]]:
+    """Images in truth/NAME/ for each colour frame with their EXR channels; no channels: an 8-bit sRGB PNG."""
+    clean: dict[str, tuple[str, ...]] = {CLEAN_COLOR: ()} if config.color.noise.model != "none" else {}
+    return clean | config.truth.images
+
+
+def noise_yaml(config: Config) -> dict[str, str] | None:
+    """Noise models of both streams; None where both are exact."""
+    models: dict[str, str] = {name: getattr(config, name).noise.model for name in STREAMS}
+    return models if set(models.values()) != {"none"} else None
+
+
+def _stream_yaml(stream: StreamConfig, stamps: FloatArray) -> dict[str, Any]:
+    return {
+        "size": [stream.width, stream.height],
+        "intrinsics": list(stream.intrinsics),
+        "model": stream.model,
+        "distortion": list(stream.distortion),
+        "rate_hz": stream.rate_hz,
+        "offset_s": stream.offset_s,
+        "readout_s": stream.readout_s,
+        "exposure_s": stream.exposure_s,
+        "scan": stream.scan,
+        "frames": len(stamps),
+        "first_stamp_s": float(stamps[0]),
+    }
+
+
+def refuse_foreign_folder(out: Path, new: Mapping[str, Any]) -> None:
+    """Raises UserError if `out` holds anything but the beginning of the sequence described by `new`."""
+    cure = "choose another --out or delete the folder"
+    try:
+        if not out.is_dir():
+            if out.exists():
+                raise UserError(f"{out}: is a file, not a folder: choose another --out")
+            return
+        names = sorted(path.name for path in out.iterdir() if not is_temporary(path))
+    except OSError as error:
+        raise UserError(f"{out}: cannot be read ({error.strerror}): choose another --out") from None
+    if not names:
+        return
+    if "sequence.yaml" not in names:
+        raise UserError(f"{out}: holds other files ({names[0]}, ...) and no sequence.yaml: {cure}")
+    old = read_yaml(out / "sequence.yaml")
+    if old.get("fingerprint") == new["fingerprint"] and old == new:
+        return
+    field, before, now = _first_difference(old, new) or ("fingerprint", old.get("fingerprint"), new["fingerprint"])
+    raise UserError(f"{out}: holds another sequence, {field} is {_short(before)} there and {_short(now)} now: {cure}")
+
+
+def _first_difference(old: Any, new: Any, name: str = "") -> tuple[str, Any, Any] | None:
+    """Name and both values of the first differing entry, what the user can change (config, inputs) before the rest."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        first = [key for key in ("config", "inputs", "versions") if key in new and not name]
+        for key in [*first, *(key for key in [*new, *old] if key not in first)]:
+            inner = str(key) if name in ("", "config") else f"{name}.{key}"  # config fields as overrides name them
+            if (found := _first_difference(old.get(key), new.get(key), inner)) is not None:
+                return found
+        return None
+    return None if old == new else (name, old, new)
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 40 else f"{text[:37]}..."

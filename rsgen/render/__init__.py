@@ -1,0 +1,1 @@
+"""Rendering with Mitsuba 3: scene, rolling-shutter sensor, images, baked light."""

@@ -1,0 +1,123 @@
+"""`BakedIntegrator`: primary rays that find their light on the surfaces, in the place of path tracing."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from rsgen.render.irradiance import IrradianceField
+
+_DIFFUSE = int(mi.BSDFFlags.DiffuseReflection) | int(mi.BSDFFlags.DiffuseTransmission)
+_SPECULAR = int(mi.BSDFFlags.Glossy) | int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.Null)
+_GLOSSY = int(mi.BSDFFlags.Glossy)
+_MOST_LIGHTS = 16  # light samples at a glossy hit
+_FAINT = 0.05  # of the matte light at a hit: reflections below are cast by lot, which saves most shadow rays
+
+
+class BakedIntegrator(mi.SamplingIntegrator):
+    """Radiance from baked irradiance: emission + diffuse lobe x E, and traced bounces for all other lobes.
+
+    The diffuse lobe of a plastic is weighted with one cosine-distributed direction, which is nearly free of noise.
+    Glossy lobes are sampled and traced onto the baked surfaces, behind up to `bounces` mirrors. They cost ten times as
+    much: of a pixel's samples only `glossy_spp` are traced there, the others are matte or left out.
+    """
+
+    def __init__(self, field: IrradianceField, bounces: int = 4, glossy_spp: int = 16) -> None:
+        super().__init__(mi.Properties())
+        self._field = field
+        self._bounces = bounces
+        self.glossy_spp = glossy_spp
+
+    def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True):
+        """Mitsuba's interface: radiance along rays, whether they hit, no AOVs."""
+        radiance, valid = trace_baked(scene, self._field, sampler, mi.Ray3f(ray), self._bounces, mi.Bool(active))
+        return radiance, valid, []
+
+    def matte(self, scene: Any, ray: Any) -> tuple[Any, Any]:
+        """Radiance where the first hit is purely diffuse (or none), exact for Lambert's law, and a mask of the rest.
+
+        Most of a scene is matte: rendering that without a loop or random numbers, and only the rest with `sample`,
+        takes half the time of `sample` for all.
+        """
+        pi = scene.ray_intersect_preliminary(ray, coherent=True)
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
+        hit = si.is_valid()
+        bsdf = si.bsdf(ray)
+        rest = hit & ((bsdf.flags() & _SPECULAR) != 0)
+        radiance = si.emitter(scene).eval(si)
+        albedo = bsdf.eval_diffuse_reflectance(si, hit & ~rest)
+        irradiance = self._field.lookup(pi, si, -ray.d, hit & ~rest)
+        return dr.select(rest, 0, radiance + dr.select(hit, albedo * irradiance * dr.inv_pi, 0)), rest
+
+
+@dr.syntax
+def trace_baked(scene, field, sampler, ray, bounces, active):
+    """Radiance (Color3f) along `ray` and whether it hit a surface; see `BakedIntegrator`.
+
+    A path follows mirrors and glass, then at most one glossy bounce, and ends at the next surface, where all of the
+    BSDF counts as diffuse. Emitters seen in a glossy lobe are found by sampling each of them and the lobe, with the
+    balance heuristic (Veach and Guibas 1995): small bright lamps would otherwise leave sparkles.
+    """
+    everything = mi.BSDFContext()
+    diffuse = mi.BSDFContext()
+    diffuse.type_mask = _DIFFUSE
+    specular = mi.BSDFContext()
+    specular.type_mask = _SPECULAR
+    lights = min(len(scene.emitters()), _MOST_LIGHTS)
+
+    radiance = mi.Color3f(0)
+    throughput = mi.Color3f(1)
+    depth = mi.UInt32(0)
+    valid = mi.Bool(False)
+    last = mi.Bool(False)  # the path has had its glossy bounce
+    glossy_hit = dr.zeros(mi.Interaction3f, dr.width(ray.o))
+    lobe_pdf = mi.Float(1)  # of the direction sampled there
+    while active:
+        pi = scene.ray_intersect_preliminary(ray, coherent=depth == 0, active=active)
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+        emitter = si.emitter(scene, active)
+        found = active & (emitter != dr.zeros(mi.EmitterPtr))
+        towards = mi.DirectionSample3f(scene, si, glossy_hit)
+        light_pdf = scene.pdf_emitter_direction(glossy_hit, towards, found & last)
+        share = dr.select(last, lobe_pdf / (lobe_pdf + lights * light_pdf), 1)
+        radiance[found] += throughput * share * emitter.eval(si, found)
+        active &= si.is_valid()
+        valid |= active
+
+        bsdf = si.bsdf(ray)
+        wo = mi.warp.square_to_cosine_hemisphere(sampler.next_2d(active))
+        wo.z *= dr.sign(si.wi.z)
+        lobe = bsdf.eval(diffuse, si, wo, active & ~last) / dr.maximum(dr.abs(wo.z), 1e-6)
+        _, albedo = bsdf.sample(everything, si, sampler.next_1d(active), sampler.next_2d(active), active & last)
+        irradiance = field.lookup(pi, si, -ray.d, active)
+        radiance[active] += throughput * irradiance * dr.select(last, albedo * dr.inv_pi, lobe)
+
+        active &= ((bsdf.flags() & _SPECULAR) != 0) & ~last & (depth < bounces)
+        smooth = active & ((bsdf.flags() & _GLOSSY) != 0)
+        faint = _FAINT * dr.max(irradiance * lobe)
+        light = mi.UInt32(0)
+        while smooth & (light < lights):
+            u = sampler.next_2d(smooth)
+            u.x = (mi.Float(light) + u.x) / lights
+            ds, value = scene.sample_emitter_direction(si, u, False, smooth)
+            to_light = si.to_local(ds.d)
+            cast, pdf = bsdf.eval_pdf(specular, si, to_light, smooth)
+            share = dr.select(ds.delta, 1 / lights, dr.rcp(lights + pdf / dr.maximum(ds.pdf, 1e-20)))
+            gain = cast * value * share
+            chance = dr.minimum(dr.max(gain) / dr.maximum(faint, 1e-20), 1)
+            cast_shadow = smooth & (ds.pdf > 0) & (sampler.next_1d(smooth) < chance)
+            seen = cast_shadow & ~scene.ray_test(si.spawn_ray_to(ds.p), cast_shadow)
+            radiance[seen] += throughput * gain / chance
+            light += 1
+
+        bs, weight = bsdf.sample(specular, si, sampler.next_1d(active), sampler.next_2d(active), active)
+        throughput *= weight
+        last = (bs.sampled_type & _GLOSSY) != 0
+        lobe_pdf = bs.pdf
+        glossy_hit = mi.Interaction3f(si)
+        ray = si.spawn_ray(si.to_world(bs.wo))
+        active &= dr.max(throughput) > 0
+        depth += 1
+    return radiance, valid

@@ -1,0 +1,150 @@
+"""Irradiance stored on the surfaces of a scene, and its lookup at a ray's hit, in Dr.Jit.
+
+Every triangle carries its own small grid of samples ("mesh colours": Yuksel, Keyser, House, ACM TOG 2010), so a scene
+needs no texture atlas. The grid spans the collapsed square of the triangle: u runs from the apex (opposite the shortest
+edge) to that edge, v along it, so that long thin triangles get samples in proportion to their area. Both sides of a
+triangle have values, since scenes are free to show either.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from rsgen.render.scene import mesh_arrays
+
+_MAX_CELLS = 4095  # cells along one grid axis: 12 bits
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Where irradiance is sampled: per triangle a grid of (cells_u + 1) x (cells_v + 1) points, row by row.
+
+    first (f,): index of each triangle's first point; cells (f, 2); apex (f,): corner 0..2; shape_first: by Dr.Jit
+    registry id, the first triangle of each shape (-1: none); points: total count.
+    """
+
+    first: NDArray[np.int64]
+    cells: NDArray[np.int64]
+    apex: NDArray[np.int64]
+    shape_first: NDArray[np.int32]
+    points: int
+
+    def packed(self) -> NDArray[np.uint32]:
+        """(f,) cells and apex of each triangle in one word for the device."""
+        return (self.cells[:, 0] | self.cells[:, 1] << 12 | self.apex << 24).astype(np.uint32)
+
+
+def registry_id(shape: Any) -> int:
+    """Dr.Jit's number of a shape, which a `ShapePtr` on the device holds."""
+    return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
+
+
+def make_lattice(scene: Any, spacing: float) -> Lattice:
+    """Lattice over all meshes of `scene` with about `spacing` metres between samples."""
+    shapes = [shape for shape in scene.shapes() if shape.is_mesh()]
+    ids = [registry_id(shape) for shape in shapes]
+    shape_first = np.full(max(ids) + 1, -1, np.int32)
+    cells, apexes, faces_before = [], [], 0
+    for shape, number in zip(shapes, ids, strict=True):
+        vertices, faces = mesh_arrays(shape)
+        corners = vertices[faces].astype(np.float64)
+        # edge k is opposite corner k
+        edges = np.linalg.norm(np.roll(corners, -1, axis=1) - np.roll(corners, -2, axis=1), axis=-1)
+        apex = np.argmin(edges, axis=1)
+        lengths = np.stack([edges.max(axis=1), edges.min(axis=1)], axis=1)
+        cells.append(np.clip(np.rint(lengths / spacing), 1, _MAX_CELLS).astype(np.int64))
+        apexes.append(apex)
+        shape_first[number] = faces_before
+        faces_before += len(faces)
+    all_cells = np.concatenate(cells)
+    counts = (all_cells + 1).prod(axis=1)
+    first = np.concatenate([[0], np.cumsum(counts)])
+    return Lattice(first[:-1], all_cells, np.concatenate(apexes).astype(np.int64), shape_first, int(first[-1]))
+
+
+def lattice_barycentric(lattice: Lattice) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Triangle index (points,) and Mitsuba's barycentric (b1, b2) (points, 2) of every lattice point."""
+    counts = (lattice.cells + 1).prod(axis=1)
+    face = np.repeat(np.arange(len(counts)), counts)
+    local = np.arange(lattice.points) - lattice.first[face]
+    row, column = np.divmod(local, lattice.cells[face, 1] + 1)
+    u = row / lattice.cells[face, 0]
+    v = column / lattice.cells[face, 1]
+    weights = np.zeros((lattice.points, 3), np.float32)
+    apex = lattice.apex[face]
+    points = np.arange(lattice.points)
+    weights[points, apex] = 1 - u
+    weights[points, (apex + 1) % 3] = u * (1 - v)
+    weights[points, (apex + 2) % 3] = u * v
+    return face, weights[:, 1:]
+
+
+class IrradianceField:
+    """Device tables for `lookup`; no dataclass, which Dr.Jit's loops would take apart as their state.
+
+    A point that no light can reach (buried in another object) is not alive and does not darken its neighbours.
+    """
+
+    def __init__(self, shape_first: Any, faces: Any, values: Any, face_count: int) -> None:
+        """`shape_first` Int32 by registry id; `faces` UInt32 pairs (first point, packed cells and apex), front sides
+        then back sides; `values` Float, (E_r, E_g, E_b, alive) per lattice point of each stored side.
+        """
+        self.shape_first = shape_first
+        self.faces = faces
+        self.values = values
+        self.face_count = face_count
+
+    def lookup(self, pi: Any, si: Any, wi_world: Any, active: Any = True) -> Any:
+        """Irradiance (Color3f, scene units) at hits `pi`/`si`, on the side where `wi_world`, towards the viewer, is."""
+        shape = dr.reinterpret_array(mi.UInt32, si.shape)
+        first_face = dr.gather(mi.Int32, self.shape_first, shape, active & si.is_valid())
+        active = active & si.is_valid() & (first_face >= 0)
+        # Shading decides which side is lit: meshes exist whose winding and vertex normals disagree.
+        back = dr.dot(si.n, wi_world) * dr.dot(si.n, si.sh_frame.n) < 0
+        face = mi.UInt32(first_face) + pi.prim_index + dr.select(back, mi.UInt32(self.face_count), 0)
+        entry = dr.gather(mi.Vector2u, self.faces, face, active)
+        nu, nv, apex = entry.y & 0xFFF, (entry.y >> 12) & 0xFFF, entry.y >> 24
+        b1, b2 = pi.prim_uv.x, pi.prim_uv.y
+        b0 = 1 - b1 - b2
+        w_apex = dr.select(apex == 0, b0, dr.select(apex == 1, b1, b2))
+        w_last = dr.select(apex == 0, b2, dr.select(apex == 1, b0, b1))
+        u = dr.clip(1 - w_apex, 0, 1)
+        v = dr.clip(w_last / dr.maximum(u, 1e-12), 0, 1)
+        x, y = u * mi.Float(nu), v * mi.Float(nv)
+        i, j = dr.minimum(mi.UInt32(x), nu - 1), dr.minimum(mi.UInt32(y), nv - 1)
+        fx, fy = x - mi.Float(i), y - mi.Float(j)
+        corner = entry.x + i * (nv + 1) + j
+        total = mi.Vector4f(0)
+        for offset, weight in (
+            (corner, (1 - fx) * (1 - fy)),
+            (corner + 1, (1 - fx) * fy),
+            (corner + nv + 1, fx * (1 - fy)),
+            (corner + nv + 2, fx * fy),
+        ):
+            value = dr.gather(mi.Vector4f, self.values, offset, active)
+            total += value * (weight * value.w)
+        return mi.Color3f(total.xyz) * dr.select(total.w > 0, dr.rcp(dr.maximum(total.w, 1e-12)), 0)
+
+
+def make_field(lattice: Lattice, front: NDArray[np.float32], back: NDArray[np.float32]) -> IrradianceField:
+    """Upload values (points, 4) of both sides; back sides that no light reaches share one dark cell."""
+    packed = lattice.packed()
+    lit = np.maximum.reduceat(back[:, 3], lattice.first) > 0
+    keep = np.repeat(lit, (lattice.cells + 1).prod(axis=1))
+    counts = np.where(lit, (lattice.cells + 1).prod(axis=1), 0)
+    dark = lattice.points  # four zero entries follow the front values
+    back_first = np.where(lit, dark + 4 + np.cumsum(counts) - counts, dark)
+    back_packed = np.where(lit, packed, np.uint32(1 | 1 << 12))
+    faces = np.stack(
+        [np.concatenate([lattice.first, back_first]), np.concatenate([packed, back_packed])], axis=1
+    ).astype(np.uint32)
+    values = np.concatenate([front, np.zeros((4, 4), np.float32), back[keep]]).astype(np.float32)
+    return IrradianceField(
+        mi.Int32(lattice.shape_first), mi.UInt32(faces.ravel()), mi.Float(values.ravel()), len(lattice.first)
+    )

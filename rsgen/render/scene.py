@@ -1,0 +1,257 @@
+"""Load any Mitsuba 3 scene XML, or a mesh file through trimesh, as one Mitsuba scene made of triangles only.
+
+Rectangles, disks, spheres and cylinders become meshes on the way in, so that depth, `scene.ply` and the baked light all
+speak of the same triangles. A scene folder that holds a `build.py` but no scene yet is built first; there, a scene
+x.xml with an `x.py` of its own beside it is built by that.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from rsgen.device.backend import mitsuba
+from rsgen.errors import UserError
+
+log = logging.getLogger("rsgen")
+
+_ANALYTIC = ("rectangle", "disk", "sphere", "cylinder")
+_UNSUPPORTED = ("instance", "shapegroup", "sdfgrid", "bsplinecurve", "linearcurve", "ellipsoids", "ellipsoidsmesh")
+_SEGMENTS = 96
+
+
+def load_scene(path: Path) -> Any:
+    """Mitsuba scene of the file at `path` (.xml, or a mesh that trimesh reads: grey, lit by a uniform sky).
+
+    Raises UserError, naming the file, if it is missing, unreadable, empty or of shapes that cannot become triangles.
+    """
+    ensure_built(path)
+    mi = mitsuba()
+    with tempfile.TemporaryDirectory(prefix="rsgen-scene-") as scratch:
+        try:
+            if path.suffix.lower() == ".xml":
+                scene = _load_xml(mi, path, Path(scratch))
+            else:
+                scene = mi.load_dict(_mesh_scene(path, Path(scratch)))
+        except UserError:
+            raise
+        except Exception as error:  # Mitsuba and trimesh raise whatever their parsers do
+            raise UserError(f"scene {path}: {_first_line(error)}") from None
+    if not any(shape.is_mesh() for shape in scene.shapes()):
+        raise UserError(f"scene {path}: has no surfaces to render: add a shape")
+    return scene
+
+
+def ensure_built(path: Path) -> None:
+    """If the scene file is absent but a `build.py` stands beside it, run that, or for x.xml the `x.py` there if any.
+
+    Raises UserError if there is no scene then.
+    """
+    script = path.parent / "build.py"
+    if not path.is_file() and script.is_file():
+        own = path.with_suffix(".py")
+        script = own if own.is_file() else script
+        log.info("building %s (once)", path)
+        child = subprocess.run([sys.executable, str(script)], capture_output=True, text=True)
+        if child.returncode:
+            raise UserError(
+                f"scene {path}: {script} failed ({_first_line(child.stderr.strip().rpartition(chr(10))[2])})"
+            )
+    if not path.is_file():
+        raise UserError(f"scene {path}: no such file: name a Mitsuba 3 .xml or a mesh file in scene.file")
+
+
+def surface(scene: Any) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    """All triangles of a scene: vertices (n, 3) in the world frame, metres, and faces (m, 3)."""
+    vertices, faces, first = [], [], 0
+    for shape in scene.shapes():
+        if not shape.is_mesh():
+            continue
+        v, f = mesh_arrays(shape)
+        vertices.append(v)
+        faces.append(f + np.uint32(first))
+        first += len(v)
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+def mesh_arrays(shape: Any) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    """Vertices (n, 3) float32 in the world frame and faces (m, 3) uint32 of one Mitsuba mesh."""
+    v = np.asarray(shape.vertex_positions_buffer(), np.float32).reshape(-1, 3)
+    f = np.asarray(shape.faces_buffer(), np.uint32).reshape(-1, 3)
+    return v, f
+
+
+def content_hash(path: Path) -> str:
+    """SHA-256 over the scene file and every file that it includes or names (meshes, textures).
+
+    Raises UserError if one is missing or the scene file is malformed.
+    """
+    ensure_built(path)
+    digest = hashlib.sha256(path.read_bytes())
+    if path.suffix.lower() == ".xml":
+        mi = mitsuba()
+        try:
+            state = mi.parser.parse_file(mi.parser.ParserConfig(mi.variant()), str(path))
+        except Exception as error:
+            raise UserError(f"scene {path}: {_first_line(error)}") from None
+        for included in state.files[1:]:
+            digest.update(hashlib.sha256(Path(str(included)).read_bytes()).digest())
+        names = {str(n.props["filename"]) for n in state.nodes if "filename" in n.props.keys()}  # noqa: SIM118
+        for name in sorted(names):
+            file = path.parent / name
+            if not file.is_file():
+                raise UserError(f"scene {path}: file '{name}' that it names is missing")
+            digest.update(name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+def _load_xml(mi: Any, path: Path, scratch: Path) -> Any:
+    config = mi.parser.ParserConfig(mi.variant())
+    # Merging orders meshes by memory address: emitters and shapes would be numbered anew in each process.
+    config.merge_meshes = False
+    state = mi.parser.parse_file(config, str(path.resolve()))
+    for index, node in enumerate(state.nodes):
+        if node.type != mi.ObjectType.Shape:
+            continue
+        plugin = node.props.plugin_name()
+        if plugin in _UNSUPPORTED:
+            raise UserError(f"scene {path}: shape '{plugin}' cannot become triangles: export it as a mesh (.ply, .obj)")
+        if plugin in _ANALYTIC:
+            node.props = _tessellated(mi, node.props, scratch / f"{index}.ply")
+    resolver = mi.file_resolver()
+    resolver.prepend(str(path.resolve().parent))
+    try:
+        mi.parser.transform_all(config, state)
+        scene = mi.parser.instantiate(config, state)
+    finally:
+        del resolver[0]  # else the next scene would find what it lacks, an include say, in this one's folder
+    return scene[0] if isinstance(scene, (list, tuple)) else scene
+
+
+def _tessellated(mi: Any, props: Any, file: Path) -> Any:
+    """Properties of a `ply` shape that stands for an analytic one: same id, BSDF and emitter, triangles in `file`."""
+    to_world = np.asarray(props["to_world"].matrix, float).reshape(4, 4) if "to_world" in props else np.eye(4)
+    plugin = props.plugin_name()
+    if plugin in ("sphere", "cylinder"):
+        radius = float(props.get("radius", 1.0))
+        local = np.diag([radius, radius, radius, 1.0])
+        if plugin == "sphere":
+            local[:3, 3] = np.asarray(props.get("center", [0, 0, 0]), float).ravel()
+        else:
+            p0, p1 = (np.asarray(props.get(k, d), float).ravel() for k, d in (("p0", [0, 0, 0]), ("p1", [0, 0, 1])))
+            local[:3, :3] = trimesh.geometry.align_vectors([0, 0, 1], p1 - p0)[:3, :3] @ np.diag(
+                [radius, radius, float(np.linalg.norm(p1 - p0))]
+            )
+            local[:3, 3] = p0
+        to_world = to_world @ local
+    uv_grid = {
+        "rectangle": (1, 1),
+        "disk": (8, _SEGMENTS),
+        "sphere": (_SEGMENTS // 2, _SEGMENTS),
+        "cylinder": (1, _SEGMENTS),
+    }
+    position, normal, uv, faces = _parametric(plugin, *uv_grid[plugin])
+    normal_matrix = np.linalg.inv(to_world[:3, :3]).T
+    mirrored = np.linalg.det(to_world[:3, :3]) < 0
+    # As Mitsuba does: mirroring turns its spheres inside out, the other shapes not.
+    turned = bool(props.get("flip_normals", False)) != (mirrored and plugin == "sphere")
+    flip = -1.0 if turned else 1.0
+    normal = flip * normal @ normal_matrix.T
+    if mirrored != turned:
+        faces = faces[:, ::-1]
+    file.write_bytes(ply_bytes(position @ to_world[:3, :3].T + to_world[:3, 3], faces, normal, uv))
+    out = mi.Properties("ply")
+    out.set_id(props.id())
+    out["filename"] = str(file)
+    for key in props.keys():  # noqa: SIM118 (Mitsuba's Properties is no dict)
+        if key not in ("to_world", "center", "radius", "p0", "p1", "flip_normals"):
+            out[key] = props[key]
+    return out
+
+
+def _parametric(plugin: str, nu: int, nv: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """Vertices, unit normals, texture coordinates and faces of Mitsuba's unit shapes on a (nu + 1) x (nv + 1) grid."""
+    grid = np.meshgrid(np.linspace(0, 1, nu + 1), np.linspace(0, 1, nv + 1), indexing="ij")
+    a, b = (axis.ravel() for axis in grid)
+    phi = 2 * np.pi * b
+    zero, one = np.zeros_like(a), np.ones_like(a)
+    if plugin == "rectangle":
+        position, normal, uv = (
+            np.stack([2 * a - 1, 2 * b - 1, zero], -1),
+            np.stack([zero, zero, one], -1),
+            np.stack([a, b], -1),
+        )
+    elif plugin == "disk":
+        position, normal = np.stack([a * np.cos(phi), a * np.sin(phi), zero], -1), np.stack([zero, zero, one], -1)
+        uv = np.stack([a, b], -1)
+    elif plugin == "sphere":
+        theta = np.pi * a
+        position = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
+        normal, uv = position, np.stack([b, a], -1)
+    else:  # cylinder
+        normal = np.stack([np.cos(phi), np.sin(phi), zero], -1)
+        position, uv = normal + np.stack([zero, zero, a], -1), np.stack([b, a], -1)
+    i, j = (k.ravel() for k in np.meshgrid(np.arange(nu), np.arange(nv), indexing="ij"))
+    p = i * (nv + 1) + j
+    q = p + nv + 1
+    faces = np.concatenate([np.stack([p, q, q + 1], -1), np.stack([p, q + 1, p + 1], -1)])
+    corners = position[faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
+    faces = faces[area > 1e-12]  # the poles' and the disk centre's degenerate halves
+    corners = position[faces]
+    outward = np.einsum(
+        "ij,ij->i", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), normal[faces].sum(1)
+    )
+    faces[outward < 0] = faces[outward < 0][:, ::-1]
+    return position, normal, uv, faces
+
+
+def ply_bytes(vertices: NDArray, faces: NDArray, normals: NDArray | None = None, uv: NDArray | None = None) -> bytes:
+    """Binary PLY of triangles: vertices (n, 3), faces (m, 3), unit normals (n, 3) and texture coordinates (n, 2)."""
+    names = ["x", "y", "z"]
+    parts = [vertices]
+    if normals is not None:
+        names += ["nx", "ny", "nz"]
+        parts.append(normals / np.linalg.norm(normals, axis=-1, keepdims=True))
+    if uv is not None:
+        names += ["u", "v"]
+        parts.append(uv)
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    header += [f"property float {name}" for name in names]
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
+    face_rows = np.empty(len(faces), dtype=[("n", "u1"), ("v", "<i4", 3)])
+    face_rows["n"], face_rows["v"] = 3, faces
+    data = np.concatenate(parts, axis=1).astype("<f4")
+    return "\n".join(header).encode() + data.tobytes() + face_rows.tobytes()
+
+
+def _mesh_scene(path: Path, scratch: Path) -> dict[str, Any]:
+    """Scene dictionary of a mesh file: grey, seen from both sides, under a uniform sky."""
+    mesh = trimesh.load(path, force="mesh")
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
+        raise UserError(f"scene {path}: holds no triangles with finite vertices")
+    file = scratch / "mesh.ply"
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    file.write_bytes(ply_bytes(vertices, faces))
+    return {
+        "type": "scene",
+        "mesh": {
+            "type": "ply", "filename": str(file), "face_normals": True,
+            "bsdf": {"type": "twosided", "inner": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.6}}},
+        },
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.8}},
+    }  # fmt: skip
+
+
+def _first_line(error: object) -> str:
+    text = " ".join(str(error).split())
+    return text if len(text) <= 300 else text[:297] + "..."

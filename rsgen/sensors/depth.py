@@ -1,0 +1,206 @@
+"""Models of depth cameras: exact planar depth to what a structured-light or time-of-flight camera reports.
+
+Depth images are (h, w) float32, planar z in metres, 0 where nothing is measured. Disparity is that of a camera and a
+projector (or second camera) at a baseline b: d = b f / z with f = fx, in px. On a plane it is affine in the pixel, so
+it is what is interpolated and searched for edges. A camera that exposes for a while is treated as if it saw the instant
+of mid-exposure only: depth is not blurred.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rsgen.config.sensors import DepthNoiseConfig
+from rsgen.geometry.camera import Camera
+
+FloatImage = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+# px. A jump of the disparity by this much within three pixels is an edge, e.g. from 2.0 to 2.05 m for a Kinect.
+_EDGE_PX = 0.5
+# Beyond, Nguyen's angular term grows without bound; no camera returns anything there.
+_STEEPEST_RAD = np.deg2rad(89.0)
+
+
+def apply_depth_noise(
+    z: FloatImage, camera: Camera, config: DepthNoiseConfig, rng: np.random.Generator, shadow: Mask | None = None
+) -> FloatImage:
+    """What the depth camera reports (h, w) for exact planar depth `z` (h, w): metres, 0 = no return.
+
+    `shadow` (h, w): where the projector's light does not reach (`rsgen.sensors.shadow`), used by the model 'kinect'.
+    `rng` decides every random number of the frame.
+    """
+    if config.model == "none":
+        return z
+    if config.model == "kinect":
+        noisy = _kinect(z, camera, config, rng)
+        if shadow is not None:
+            noisy = np.where(shadow, np.float32(0), noisy)
+    elif config.model == "tof":
+        noisy = _time_of_flight(z, camera, config, rng)
+    else:
+        noisy = z + np.float32(config.gaussian_per_m) * z * z * rng.standard_normal(z.shape, np.float32)
+    reported = (z > 0) & (noisy >= np.float32(config.min_range_m)) & (noisy <= np.float32(config.max_range_m))
+    return np.where(reported, noisy, np.float32(0))
+
+
+def _kinect(z: FloatImage, camera: Camera, config: DepthNoiseConfig, rng: np.random.Generator) -> FloatImage:
+    """Structured light: lateral shift, disparity noise and quantisation, then dropouts at edges and grazing angles."""
+    focal_baseline = config.projector_baseline_m * camera.fx
+    d = disparity(z, focal_baseline)
+    edge = disparity_edges(d)
+    noisy = shift_laterally(d, edge, config.lateral_sigma_px, rng)
+    noisy = quantise_disparity(noisy, config.disparity_sigma_px, config.disparity_step_px, rng)
+    lost = grazing_probability(incidence(d, camera), *config.grazing_deg)
+    lost = np.where(edge, 1 - (1 - lost) * np.float32(1 - config.edge_dropout), lost)
+    kept = (noisy > 0) & (rng.random(z.shape, np.float32) >= lost)
+    return np.where(kept, np.float32(focal_baseline) / np.where(kept, noisy, 1), np.float32(0))
+
+
+def _time_of_flight(z: FloatImage, camera: Camera, config: DepthNoiseConfig, rng: np.random.Generator) -> FloatImage:
+    """Axial noise, pixels at edges that mix both sides, and dropouts at grazing angles."""
+    d = disparity(z, config.projector_baseline_m * camera.fx)
+    angle = incidence(d, camera)
+    sigma = axial_sigma(z, angle, config.axial_base_m, config.axial_growth_per_m, config.axial_nearest_m)
+    mixed = mix_edges(z, disparity_edges(d), config.flying_pixels, rng)
+    kept = rng.random(z.shape, np.float32) >= grazing_probability(angle, *config.grazing_deg)
+    return np.where(kept, mixed + sigma * rng.standard_normal(z.shape, np.float32), np.float32(0))
+
+
+def disparity(z: FloatImage, focal_baseline: float) -> FloatImage:
+    """Disparity (h, w) in px of planar depth z (h, w) in m, `focal_baseline` in m·px (a Kinect's: 43); 0 of 0."""
+    return np.where(z > 0, np.float32(focal_baseline) / np.where(z > 0, z, 1), np.float32(0))
+
+
+def shift_laterally(d: FloatImage, edge: Mask, sigma_px: float, rng: np.random.Generator) -> FloatImage:
+    """Disparities (h, w) looked up at (u, v) + N(0, sigma_px² I): bilinear, beside an edge the nearest pixel's.
+
+    The lateral noise of Barron, Malik (CVPR 2013) and Handa et al. (ICRA 2014), sec. IV, sigma 1/2 px. Theirs is
+    bilinear everywhere, which leaves points afloat between near and far that structured light does not make.
+    """
+    if sigma_px == 0:
+        return d
+    height, width = d.shape
+    shift = rng.standard_normal((2, height, width), np.float32) * np.float32(sigma_px)
+    u, v = shift[0] + np.arange(width, dtype=np.float32), shift[1] + np.arange(height, dtype=np.float32)[:, None]
+    wide = cv2.dilate(edge.astype(np.uint8), np.ones((3, 3), np.uint8))
+    beside = cv2.remap(wide, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE).astype(bool)
+    smooth, nearest = (
+        cv2.remap(d, u, v, how, borderMode=cv2.BORDER_REPLICATE) for how in (cv2.INTER_LINEAR, cv2.INTER_NEAREST)
+    )
+    return np.where(beside, nearest, smooth)
+
+
+def quantise_disparity(d: FloatImage, sigma_px: float, step_px: float, rng: np.random.Generator) -> FloatImage:
+    """round((d + N(0, sigma_px²)) / step_px) · step_px of disparities (h, w) in px; 0 stays 0.
+
+    z = b f / d then has steps of z² step_px / (b f) and sigma_z = z² / (b f) · sqrt(sigma_px² + step_px² / 12), the
+    latter averaged over a step. Barron, Malik (CVPR 2013) and Handa et al. (ICRA 2014), sec. IV, write
+    z = 35130 / ⌊35130 / z + N(0, σ_d²) + ½⌋ with z in cm and σ_d = 1/6: their unit of disparity is the Kinect's step of
+    1/8 px, so b f = 35130 cm / 8 = 43.9 m·px and sigma_px = 1/48.
+    """
+    noisy = d + np.float32(sigma_px) * rng.standard_normal(d.shape, np.float32)
+    if step_px > 0:
+        noisy = np.rint(noisy * np.float32(1 / step_px)) * np.float32(step_px)
+    return np.where(d > 0, noisy, np.float32(0))
+
+
+def disparity_edges(d: FloatImage) -> Mask:
+    """Pixels (h, w) where the second difference of the disparity, along rows or columns, is half a pixel or more.
+
+    It is 0 on planes however steep and marks both sides of a jump. Where nothing is (0) counts as infinitely far. The
+    image's outermost pixels have no second difference across its border.
+    """
+    edge = np.zeros(d.shape, bool)
+    edge[:, 1:-1] = np.abs(d[:, :-2] - 2 * d[:, 1:-1] + d[:, 2:]) >= _EDGE_PX
+    edge[1:-1] |= np.abs(d[:-2] - 2 * d[1:-1] + d[2:]) >= _EDGE_PX
+    return edge
+
+
+def incidence(d: FloatImage, camera: Camera) -> FloatImage:
+    """Angle (h, w) in [0, π/2] rad between each pixel's ray and the surface's normal; π/2 where nothing is.
+
+    On a plane 1/z, so d, is A x + B y + C in normalised coordinates, and (A, B, C) is along its normal; with
+    C = d − A x − B y, cos θ = d / (|(A, B, C)| |(x, y, 1)|). Slopes are one-sided differences, of two the
+    smaller, which keeps to one side of an edge. Rows are treated as if all had one pose.
+    """
+    rays = _rays(camera)
+    slope_u, slope_v = _slope(d, 1), _slope(d, 0)
+    A = rays.u_x * slope_u + rays.v_x * slope_v
+    B = rays.u_y * slope_u + rays.v_y * slope_v
+    C = d - A * rays.x - B * rays.y
+    normal = np.sqrt(A * A + B * B + C * C)
+    cosine = np.where(d > 0, d / (np.where(d > 0, normal, 1) * rays.length), 0)
+    return np.arccos(np.minimum(cosine, 1, dtype=np.float32))
+
+
+def grazing_probability(angle: FloatImage, start_deg: float, end_deg: float) -> FloatImage:
+    """Probability (h, w) of no return at incidence angles (h, w) in rad: 0 up to start, 1 from end on, linear between.
+
+    A ramp where Nguyen, Izadi, Lovell (3DIMPVT 2012) found a Kinect's data to fail: noise soars above 60°, and there is
+    hardly a return beyond 80°.
+    """
+    start, end = np.deg2rad(start_deg), np.deg2rad(end_deg)
+    return np.clip((angle - np.float32(start)) * np.float32(1 / max(end - start, 1e-6)), 0, 1)
+
+
+def axial_sigma(z: FloatImage, angle: FloatImage, base_m: float, growth_per_m: float, nearest_m: float) -> FloatImage:
+    """Sigma (h, w) in m of depth along the optical axis at depths z (m) and incidence angles θ (rad); 0 of z = 0.
+
+    base + growth (z − nearest)² + 10⁻⁴ θ² / (√z (π/2 − θ)²), the last term beyond 60° only: Nguyen, Izadi, Lovell
+    (3DIMPVT 2012), with 0.0012 m, 0.0019 /m and 0.4 m for a Kinect.
+    """
+    theta = np.minimum(angle, np.float32(_STEEPEST_RAD))
+    steep = np.float32(1e-4) * (theta / (np.float32(np.pi / 2) - theta)) ** 2 / np.sqrt(np.where(z > 0, z, 1))
+    sigma = np.float32(base_m) + np.float32(growth_per_m) * (z - np.float32(nearest_m)) ** 2
+    return np.where(z > 0, sigma + np.where(angle > np.float32(np.pi / 3), steep, 0), 0)
+
+
+def mix_edges(z: FloatImage, edge: Mask, probability: float, rng: np.random.Generator) -> FloatImage:
+    """z (h, w) in which pixels beside an edge fly, with `probability`: a mean, weighted at random, of both its sides.
+
+    The other side is the depth in the 3×3 neighbourhood that is farthest from the pixel's own. A light pulse that
+    returns from two surfaces at once gives time-of-flight cameras a depth in between.
+    """
+    where = np.flatnonzero(edge & (z > 0) & (rng.random(z.shape, np.float32) < probability))
+    own, far = z.ravel()[where], np.float32(np.inf)
+    highest = cv2.dilate(z, np.ones((3, 3), np.uint8)).ravel()[where]
+    lowest = cv2.erode(np.where(z > 0, z, far), np.ones((3, 3), np.uint8)).ravel()[where]
+    other = np.where(highest - own > own - lowest, highest, lowest)
+    mixed = z.copy()
+    mixed.ravel()[where] = own + rng.random(len(where), np.float32) * (other - own)
+    return mixed
+
+
+@dataclass(frozen=True)
+class _Rays:
+    """Per pixel (h, w): ray (x, y, 1), its length, and the derivatives of pixel (u, v) by (x, y), px."""
+
+    x: FloatImage
+    y: FloatImage
+    length: FloatImage
+    u_x: FloatImage
+    u_y: FloatImage
+    v_x: FloatImage
+    v_y: FloatImage
+
+
+@lru_cache(maxsize=4)
+def _rays(camera: Camera) -> _Rays:
+    rays = camera.unproject(camera.pixel_grid())
+    J = camera.project_jacobian(rays)
+    parts = (rays[..., 0], rays[..., 1], np.linalg.norm(rays, axis=-1), J[..., 0, 0], J[..., 0, 1], J[..., 1, 0])
+    return _Rays(*(np.ascontiguousarray(part, np.float32) for part in (*parts, J[..., 1, 1])))
+
+
+def _slope(d: FloatImage, axis: int) -> FloatImage:
+    """Forward or backward difference (h, w) along `axis`, whichever is smaller in size."""
+    step = np.diff(d, axis=axis)
+    first, last = np.take(step, [0], axis), np.take(step, [-1], axis)
+    forward, backward = np.concatenate([step, last], axis), np.concatenate([first, step], axis)
+    return np.where(np.abs(forward) < np.abs(backward), forward, backward)

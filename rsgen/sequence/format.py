@@ -1,0 +1,242 @@
+"""What writer and reader of a sequence folder agree on: names, sequence.yaml, stamps, pairs, and poses as TUM rows.
+
+The format is `rsgen-sequence/1` of the design document, section 2.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, Protocol
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from rsgen.errors import UserError, first_problem
+from rsgen.files import read_yaml
+from rsgen.geometry import se3, so3
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter
+from rsgen.geometry.spline import Spline
+
+FORMAT = "rsgen-sequence/1"
+StreamName = Literal["color", "depth"]
+STREAMS: tuple[StreamName, StreamName] = ("color", "depth")
+FOLDERS: dict[StreamName, str] = {"color": "rgb", "depth": "depth"}
+LISTINGS: dict[StreamName, str] = {"color": "rgb.txt", "depth": "depth.txt"}
+ROWS: dict[StreamName, str] = {"color": "truth/rows_color.npy", "depth": "truth/rows_depth.npy"}
+TRUTH_DEPTH = "truth/depth"
+CLEAN_COLOR = "color"  # truth/color/: what a colour camera without noise would have reported
+GROUND_TRUTH_HZ = 200.0
+STAMP_TOLERANCE_S = 1e-6
+_FRAMES_AT_ONCE = 16  # poses of so many frames' lines are evaluated together: flat memory, little overhead
+
+FloatArray = npt.NDArray[np.float64]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Seconds = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class _Yaml(BaseModel):
+    # Later versions may add entries; a reader of this one leaves them alone.
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+
+class StreamYaml(_Yaml):
+    """One stream in sequence.yaml: camera (px), clock and shutter (s)."""
+
+    size: tuple[Annotated[int, Field(ge=1, le=16384)], Annotated[int, Field(ge=1, le=16384)]]
+    intrinsics: tuple[Finite, Finite, Finite, Finite]
+    model: Literal["pinhole", "radtan", "fisheye"]
+    distortion: tuple[Finite, ...]
+    rate_hz: Positive
+    offset_s: Seconds
+    readout_s: Seconds
+    exposure_s: Seconds
+    scan: Literal["top-bottom", "bottom-top", "left-right", "right-left"]
+    frames: int = Field(ge=1, le=10_000_000)
+    first_stamp_s: Seconds
+    depth_scale: Annotated[float, Field(ge=1e-3, le=1e9)] | None = None
+
+    @property
+    def camera(self) -> Camera:
+        """The camera. Raises UserError."""
+        fx, fy, cx, cy = self.intrinsics
+        return Camera(*self.size, fx, fy, cx, cy, self.model, self.distortion)
+
+    @property
+    def shutter(self) -> Shutter:
+        """The shutter. Raises UserError."""
+        return Shutter(self.readout_s, self.exposure_s, self.scan)
+
+
+class _Streams(_Yaml):
+    color: StreamYaml
+    depth: StreamYaml
+
+
+Vector4 = tuple[Finite, Finite, Finite, Finite]
+
+
+class SequenceYaml(_Yaml):
+    """The part of sequence.yaml that a reader relies on."""
+
+    format: Literal["rsgen-sequence/1"]
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]*$")]  # part of file names
+    streams: _Streams
+    T_color_depth: tuple[Vector4, Vector4, Vector4, Vector4]
+    noise: Any = None
+    truth: dict[Annotated[str, Field(pattern=r"^[a-z_]+$")], tuple[str, ...]] = {}
+    fingerprint: str  # the file's last entry: one that was cut off has none
+
+
+class Clock(Protocol):
+    """Anything with a stream's rate and offset, such as `rsgen.config.config.StreamConfig`."""
+
+    @property
+    def rate_hz(self) -> float: ...
+    @property
+    def offset_s(self) -> float: ...
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of a listing: its number in the file, the stamp in seconds and the path as written."""
+
+    number: int
+    stamp: float
+    path: str
+
+
+def stream_stamps(first: float, last: float, stream: Clock) -> FloatArray:
+    """Stamps (n,) of a stream over a recording from `first` to `last` seconds: first + offset + k / rate.
+
+    They are rounded to the 9 decimals that listings hold, so that file and memory agree to the last bit. Raises
+    UserError if no frame fits in or the numbers are absurd.
+    """
+    begin = first + stream.offset_s
+    count = math.floor((last + STAMP_TOLERANCE_S - begin) * stream.rate_hz) + 1
+    if count < 1:
+        raise UserError(
+            f"no frame fits between {first:g} s and {last:g} s with offset_s {stream.offset_s:g}: make offset_s smaller"
+        )
+    if count > 10_000_000:
+        raise UserError(f"{count} frames at rate_hz {stream.rate_hz:g} are too many: lower rate_hz")
+    return round_stamps(begin + np.arange(count) / stream.rate_hz)
+
+
+def round_stamps(stamps: npt.ArrayLike) -> FloatArray:
+    """Stamps as they read back from '%.9f'."""
+    return np.array([float(f"{t:.9f}") for t in np.asarray(stamps, float).ravel()])
+
+
+def frame_name(k: int) -> str:
+    """File stem of frame k."""
+    return f"{k:06d}"
+
+
+def color_truth_path(name: str, channels: Sequence[str], stem: str) -> str:
+    """File of an image of `truth/` within the folder; without EXR channels it is a PNG."""
+    return f"truth/{name}/{stem}.{'exr' if channels else 'png'}"
+
+
+def read_sequence_yaml(path: Path) -> tuple[SequenceYaml, dict[str, Any]]:
+    """sequence.yaml, validated and as it is. Raises UserError naming the wrong field."""
+    data = read_yaml(path)
+    if data.get("format") != FORMAT:
+        raise UserError(f"{path}: format is {data.get('format')!r}, this version of rsgen reads {FORMAT!r}")
+    try:
+        return SequenceYaml.model_validate(data), data
+    except ValidationError as error:
+        raise UserError(f"{path}: {first_problem(error)} ({error.error_count()} wrong in all)") from None
+
+
+def parse_listing(path: Path, text: str) -> list[Line]:
+    """Lines 'stamp path' of a TUM listing, comments skipped. Raises UserError naming the line."""
+    lines: list[Line] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        fields = line.split()
+        where = f"{path} line {number}"
+        if len(fields) != 2:
+            raise UserError(f"{where}: expected 'stamp path', found {line[:60]!r}")
+        try:
+            stamp = float(fields[0])
+        except ValueError:
+            stamp = math.nan
+        if not math.isfinite(stamp):
+            raise UserError(f"{where}: {fields[0][:40]!r} is not a time in seconds")
+        if lines and stamp <= lines[-1].stamp:
+            raise UserError(f"{where}: stamp {stamp:.9f} does not come after {lines[-1].stamp:.9f}")
+        lines.append(Line(number, stamp, fields[1]))
+    return lines
+
+
+def associate(stamps_a: npt.ArrayLike, stamps_b: npt.ArrayLike, limit_s: float) -> list[tuple[int, int]]:
+    """Index pairs (into a, into b) nearest in time, each frame once, closest pairs first, at most `limit_s` apart.
+
+    TUM's `associate.py` on neighbours only; ties (to a microsecond) go to the earlier frame, so that streams half a
+    period apart pair up in order.
+    """
+    a, b = np.asarray(stamps_a, float), np.asarray(stamps_b, float)
+    after = np.searchsorted(b, a)
+    candidates = sorted(
+        (round(abs(a[i] - b[j]), 6), i, j)
+        for i in range(len(a))
+        for j in (int(after[i]) - 1, int(after[i]))
+        if 0 <= j < len(b) and abs(a[i] - b[j]) <= limit_s + STAMP_TOLERANCE_S
+    )
+    used_a: set[int] = set()
+    used_b: set[int] = set()
+    pairs = []
+    for _, i, j in candidates:
+        if i not in used_a and j not in used_b:
+            used_a.add(i)
+            used_b.add(j)
+            pairs.append((i, j))
+    return sorted(pairs)
+
+
+def pose_rows(T: FloatArray) -> FloatArray:
+    """Rows (n, 7) tx ty tz qx qy qz qw of poses (n, 4, 4): quaternions from qw ≥ 0 on without sign flips."""
+    q = so3.to_quat(T[:, :3, :3])
+    if len(q):
+        flips = np.where(np.einsum("ni,ni->n", q[1:], q[:-1]) < 0, -1.0, 1.0)
+        q = q * np.cumprod(np.concatenate([[-1.0 if q[0, 3] < 0 else 1.0], flips]))[:, None]
+    return np.concatenate([T[:, :3, 3], q], axis=-1) + 0.0  # no negative zeros
+
+
+def poses_of_rows(rows: FloatArray) -> FloatArray:
+    """Poses (..., 4, 4) of rows (..., 7)."""
+    return se3.from_quat_trans(rows[..., 3:], rows[..., :3])
+
+
+def line_poses(
+    spline: Spline, camera: Camera, shutter: Shutter, stamps: npt.ArrayLike, T_cam_body: FloatArray | None = None
+) -> FloatArray:
+    """Rows (frames, lines, 7) of T_world_cam at each line's mid-exposure; T_cam_body is the identity for depth.
+
+    Entry i is image row i (column i for the sideways scans), whatever the order of readout. Raises UserError if a
+    line is read outside the spline's time.
+    """
+    stamps = np.asarray(stamps, float)
+    places = np.arange(shutter.line_count(camera), dtype=float)
+    lines = shutter.line_of_pixel(np.stack([places, places], axis=-1), camera)
+    poses = []
+    for k in range(0, len(stamps), _FRAMES_AT_ONCE):
+        T = spline.pose(shutter.line_mid_time(stamps[k : k + _FRAMES_AT_ONCE, None], lines, camera))
+        poses.append(T if T_cam_body is None else T @ se3.inverse(T_cam_body))
+    T = np.concatenate(poses)
+    return pose_rows(T.reshape(-1, 4, 4)).reshape(*T.shape[:2], 7)
+
+
+def ground_truth(spline: Spline, *stamps: npt.ArrayLike) -> FloatArray:
+    """Rows (n, 8) of groundtruth.txt: T_world_depth on a 200 Hz grid over the spline and at every given stamp."""
+    grid = np.arange(math.ceil(spline.t_begin * GROUND_TRUTH_HZ), math.floor(spline.t_end * GROUND_TRUTH_HZ) + 1)
+    times = np.unique(round_stamps(np.concatenate([grid / GROUND_TRUTH_HZ, *map(np.asarray, stamps)])))
+    times = times[(times >= spline.t_begin) & (times <= spline.t_end)]
+    return np.column_stack([times, pose_rows(spline.pose(times))])

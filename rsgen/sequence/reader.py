@@ -1,0 +1,264 @@
+"""Sequence folders: read one, strictly, and describe it.
+
+sequence = read_sequence(Path("out/lr_kt2"))
+z, rows = sequence.depth(0), sequence.rows("depth")[0]     # metres (h, w); T_world_depth of each line (h, 7)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rsgen.errors import UserError
+from rsgen.files import read_exr, read_npy, read_png, read_text
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter
+from rsgen.geometry.spline import Spline
+from rsgen.limits import rigid
+from rsgen.sequence.format import (
+    LISTINGS,
+    ROWS,
+    STAMP_TOLERANCE_S,
+    STREAMS,
+    TRUTH_DEPTH,
+    FloatArray,
+    Line,
+    StreamName,
+    StreamYaml,
+    color_truth_path,
+    parse_listing,
+    read_sequence_yaml,
+)
+
+_LONGEST_S = 1e6  # as long as stamps may grow
+
+
+@dataclass(frozen=True)
+class Stream:
+    """One camera's images: n of them are on disk, of `frames` in the whole sequence.
+
+    stamps (n,) s; paths n files; indices (n,) frame numbers in the whole sequence (the files' names).
+    depth_scale: stored units per metre; 0 in the colour stream.
+    """
+
+    name: StreamName
+    camera: Camera
+    shutter: Shutter
+    rate_hz: float
+    offset_s: float
+    depth_scale: float
+    frames: int
+    first_stamp_s: float
+    stamps: FloatArray
+    paths: tuple[Path, ...]
+    indices: npt.NDArray[np.int64]
+
+    @property
+    def line_count(self) -> int:
+        """Lines that are read out one after the other: image rows, or columns if it scans sideways."""
+        return self.shutter.line_count(self.camera)
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """A sequence on disk. T_color_depth (4, 4); `spline` is T_world_depth(t); `meta` is sequence.yaml as it is.
+
+    Frames are counted as listed: k-th line of rgb.txt or depth.txt. Every reading method raises UserError naming the
+    file if it is missing, damaged or of another size than sequence.yaml says.
+    """
+
+    root: Path
+    name: str
+    streams: dict[StreamName, Stream]
+    T_color_depth: FloatArray
+    spline: Spline
+    meta: dict[str, Any]
+
+    @cached_property
+    def _rows(self) -> dict[StreamName, FloatArray]:
+        return {}
+
+    def color(self, k: int) -> npt.NDArray[np.uint8]:
+        """Colour image k, sRGB (h, w, 3)."""
+        camera = self.streams["color"].camera
+        return read_png(self.streams["color"].paths[k], (camera.height, camera.width, 3), np.uint8)
+
+    def depth_units(self, k: int) -> npt.NDArray[np.uint16]:
+        """Depth image k as stored (h, w), 0 where nothing was measured."""
+        camera = self.streams["depth"].camera
+        return read_png(self.streams["depth"].paths[k], (camera.height, camera.width), np.uint16)
+
+    def depth(self, k: int) -> npt.NDArray[np.float32]:
+        """Planar z (h, w) in metres that the sensor reports, 0 where nothing was measured."""
+        return (self.depth_units(k) / self.streams["depth"].depth_scale).astype(np.float32)
+
+    def truth_depth(self, k: int) -> npt.NDArray[np.float32]:
+        """Exact planar z (h, w) in metres, noise-free, with the same rolling shutter; 0 where there is none."""
+        camera = self.streams["depth"].camera
+        z = read_exr(self.truth_depth_path(k), (camera.height, camera.width))
+        if not (np.isfinite(z).all() and (z >= 0).all()):
+            raise UserError(f"{self.truth_depth_path(k)}: holds negative or non-finite depths: render it again")
+        return z
+
+    def truth_depth_path(self, k: int) -> Path:
+        """File of `truth_depth(k)`."""
+        return self.root / TRUTH_DEPTH / self.streams["depth"].paths[k].with_suffix(".exr").name
+
+    @property
+    def truth_images(self) -> dict[str, tuple[str, ...]]:
+        """Names of the exact images beside every colour frame, each with its EXR channels (none: 8-bit sRGB)."""
+        return {name: tuple(channels) for name, channels in (self.meta.get("truth") or {}).items()}
+
+    def truth(self, name: str, k: int) -> npt.NDArray[Any]:
+        """Exact image `name` of colour frame k: uint8 RGB (h, w, 3), or float32 (h, w) or (h, w, n) for n EXR channels.
+
+        Raises UserError if the sequence has none of that name, or the file is missing or damaged.
+        """
+        images, stream = self.truth_images, self.streams["color"]
+        if name not in images:
+            has = ", ".join(sorted(images)) or "none"
+            raise UserError(f"{self.root}: has no truth images '{name}' (has: {has}): render with truth.* set")
+        shape = stream.camera.height, stream.camera.width
+        path = self.root / color_truth_path(name, images[name], stream.paths[k].stem)
+        return read_exr(path, shape, images[name]) if images[name] else read_png(path, (*shape, 3), np.uint8)
+
+    def rows(self, stream: StreamName) -> FloatArray:
+        """Poses (n, lines, 7) tx ty tz qx qy qz qw of each line's camera in the world at mid-exposure.
+
+        Line i is image row i, or column i for the sideways scans, whatever the order of readout.
+        """
+        if stream not in self._rows:
+            s = self.streams[stream]
+            self._rows[stream] = read_npy(self.root / ROWS[stream], (s.frames, s.line_count, 7))[s.indices]
+        return self._rows[stream]
+
+
+def read_sequence(path: Path) -> Sequence:
+    """Read the description, listings and spline of a sequence folder; images are read when asked for.
+
+    Raises UserError, one line, if the folder or one of its files is missing or damaged, of another format version, if a
+    listing is malformed (naming the line), its stamps do not increase, or one of its paths leaves the folder.
+    """
+    root = Path(path)
+    if not root.is_dir():
+        raise UserError(f"{root}: no such folder; expected a sequence that 'rsgen render' wrote")
+    if not (root / "sequence.yaml").exists():
+        raise UserError(f"{root}: has no sequence.yaml, so it is not a sequence that 'rsgen render' wrote")
+    description, meta = read_sequence_yaml(root / "sequence.yaml")
+    try:
+        T_color_depth = np.array(rigid(description.T_color_depth), float)
+    except ValueError as error:
+        raise UserError(f"{root / 'sequence.yaml'}: T_color_depth: {error}") from None
+    if description.streams.depth.depth_scale is None:
+        raise UserError(f"{root / 'sequence.yaml'}: streams.depth.depth_scale is missing")
+    streams: dict[StreamName, Stream] = {
+        "color": _read_stream(root, "color", description.streams.color),
+        "depth": _read_stream(root, "depth", description.streams.depth),
+    }
+    spline = _read_spline(root / "spline.npz", streams)
+    return Sequence(root, description.name, streams, T_color_depth, spline, meta)
+
+
+def sequence_info(path: Path) -> str:
+    """Text for `rsgen info`: what is in a sequence folder. Raises UserError."""
+    sequence = read_sequence(path)
+    knots = sequence.spline
+    rows = [("name", sequence.name)]
+    for name in STREAMS:
+        s = sequence.streams[name]
+        delay = s.shutter.line_delay(s.camera)
+        frames = f"{len(s.paths)} frames" if len(s.paths) == s.frames else f"{len(s.paths)} of {s.frames} frames"
+        span = f", {s.stamps[0]:.3f} to {s.stamps[-1]:.3f} s" if len(s.paths) else ""
+        scale = f", {s.depth_scale:g} units per metre" if s.depth_scale else ""
+        c = s.camera
+        rows += [
+            (name, f"{frames} at {s.rate_hz:g} Hz{span}"),
+            ("", f"{c.width}x{c.height} {c.model}, fx {c.fx:g} fy {c.fy:g} cx {c.cx:g} cy {c.cy:g}{scale}"),
+            ("", _shutter_text(s.shutter, delay)),
+        ]
+    last = max((s.stamps[-1] for s in sequence.streams.values() if len(s.stamps)), default=knots.t_begin)
+    first = min((s.stamps[0] for s in sequence.streams.values() if len(s.stamps)), default=knots.t_begin)
+    times = np.linspace(first, last, min(max(2, round((last - first) * 1000)), 1_000_000))
+    p_world = knots.pose(np.clip(times, knots.t_begin, knots.t_end))[:, :3, 3]
+    length = np.linalg.norm(np.diff(p_world, axis=0), axis=1).sum()
+    size = sum(file.stat().st_size for file in sequence.root.rglob("*") if file.is_file())
+    rows += [
+        ("duration", f"{last - first:.3f} s"),
+        ("trajectory", f"{length:.3f} m, {len(knots.control_points)} control points every {knots.dt * 1000:g} ms"),
+        ("noise", str(sequence.meta.get("noise") or "none")),
+        ("on disk", f"{size / 1e6:.1f} MB"),
+    ]
+    return "\n".join(f"{label:<11} {text}" for label, text in rows)
+
+
+def _shutter_text(shutter: Shutter, delay: float) -> str:
+    if shutter.readout_s == 0:
+        readout = "global shutter"
+    else:
+        readout = f"readout {shutter.readout_s * 1000:g} ms {shutter.scan}, line delay {delay * 1e6:.3f} us"
+    return f"{readout}, exposure {shutter.exposure_s * 1000:g} ms"
+
+
+def _read_spline(path: Path, streams: dict[StreamName, Stream]) -> Spline:
+    """The spline, which has to cover the frames and not much more: a huge knot spacing would take all memory."""
+    spline = Spline.load(path)
+    first = min(stream.stamps[0] for stream in streams.values())
+    last = max(stream.stamps[-1] for stream in streams.values())
+    if not (spline.t_begin - STAMP_TOLERANCE_S <= first and last <= spline.t_end + STAMP_TOLERANCE_S):
+        raise UserError(
+            f"{path}: covers {spline.t_begin:g} to {spline.t_end:g} s, the frames {first:g} to {last:g} s: "
+            "restore it or render again"
+        )
+    if not spline.t_end - spline.t_begin <= _LONGEST_S:
+        raise UserError(f"{path}: lasts {spline.t_end - spline.t_begin:g} s, absurdly long: restore it or render again")
+    return spline
+
+
+def _read_stream(root: Path, name: StreamName, yaml: StreamYaml) -> Stream:
+    listing = root / LISTINGS[name]
+    lines = parse_listing(listing, read_text(listing))
+    if not lines:
+        raise UserError(f"{listing}: lists no frame: run 'rsgen render' again to finish it")
+    real_root = root.resolve()
+    paths = tuple(_inside(root, real_root, listing, line) for line in lines)
+    indices = np.array([_index(listing, line, yaml) for line in lines], np.int64)
+    stamps = np.array([line.stamp for line in lines])
+    try:
+        camera, shutter = yaml.camera, yaml.shutter
+    except UserError as error:
+        raise UserError(f"{root / 'sequence.yaml'}: streams.{name}: {error}") from None
+    scale = yaml.depth_scale if name == "depth" and yaml.depth_scale is not None else 0.0
+    clock = (yaml.rate_hz, yaml.offset_s, scale, yaml.frames, yaml.first_stamp_s)
+    return Stream(name, camera, shutter, *clock, stamps, paths, indices)
+
+
+def _inside(root: Path, real_root: Path, listing: Path, line: Line) -> Path:
+    """The listed file, which has to lie in the folder even once symbolic links are followed."""
+    where = f"{listing} line {line.number}"
+    path = root / line.path
+    try:
+        real = path.resolve()
+        exists = real.is_file()
+    except (OSError, ValueError, RuntimeError):
+        raise UserError(f"{where}: {line.path[:60]!r} is not a usable path") from None
+    if Path(line.path).is_absolute() or ".." in Path(line.path).parts or not real.is_relative_to(real_root):
+        raise UserError(f"{where}: path {line.path!r} leaves the sequence's folder")
+    if not exists:
+        raise UserError(f"{where}: {path} is missing: run the same 'rsgen render' again")
+    return path
+
+
+def _index(listing: Path, line: Line, yaml: StreamYaml) -> int:
+    """Frame number of a listed file, which its name and its stamp have to agree on."""
+    where, stem = f"{listing} line {line.number}", Path(line.path).stem
+    if not (stem.isascii() and stem.isdigit() and len(stem) <= 9 and int(stem) < yaml.frames):
+        raise UserError(f"{where}: {line.path!r} is not one of the sequence's {yaml.frames} frames")
+    stamp = yaml.first_stamp_s + int(stem) / yaml.rate_hz
+    if abs(stamp - line.stamp) > STAMP_TOLERANCE_S:
+        raise UserError(f"{where}: stamp {line.stamp:.9f} is not that of frame {int(stem)}, {stamp:.9f}")
+    return int(stem)

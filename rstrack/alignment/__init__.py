@@ -1,0 +1,1 @@
+"""Dense alignment: residuals, sums over blocks, weights, normal equations, optimiser."""

@@ -1,0 +1,195 @@
+"""One image against one reference: run a kernel, chain it to the control points, remember the result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from rsgen.device.arrays import Engine, Kernels
+from rsgen.device.projection import Lens
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.so3 import FloatArray
+from rsgen.geometry.spline import Spline
+from rstrack.alignment.normal_equations import Quadratic, chain
+from rstrack.alignment.residuals import (
+    BlockSums,
+    Scaling,
+    block_counts,
+    geometric_kernel,
+    photometric_kernel,
+    visibility_kernel,
+)
+from rstrack.alignment.student_t import scale_step
+from rstrack.images.device_frame import DeviceRig
+from rstrack.images.line_poses import IDENTITY_FROM_BASE, from_base_table, to_base_table
+from rstrack.images.pyramid import ColorImage, DepthImage
+from rstrack.keyframes.keyframe import STRIDES, Points, Reference
+
+# Smallest credible σ of depth (m): quantisation and interpolation leave about as much.
+_CREDIBLE_DEPTH = 2e-4
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """A term around a state: `model` divided by σ², and what the kernel saw.
+
+    motion (n, 6, 6k): derivative of the blocks' twists, to tell how far rows have moved since.
+    """
+
+    model: Quadratic
+    motion: FloatArray
+    sigma: float
+    next_sigma: float
+    cost: float
+    count: int
+    # Smallest credible σ of this term, this camera and this reference.
+    floor: float
+    # Σ w j jᵀ / count (6, 6) with rotations scaled by the scene's depth.
+    seen: FloatArray
+
+    @property
+    def observability(self) -> float:
+        """Smallest eigenvalue of `seen`: 0 where a motion is not seen."""
+        return weakest_motion(self.seen)
+
+    def row_shift(self, increments: FloatArray, focal: float, depth: float) -> float:
+        """Largest movement of a block in pixels under increments (m, 6) of all control points."""
+        twist = self.motion @ increments[self.model.first : self.model.last].ravel()
+        return float((focal * (np.abs(twist[:, :3]).max(axis=1) / depth + np.abs(twist[:, 3:]).max(axis=1))).max())
+
+
+@dataclass
+class Terms:
+    """Kernels of one rig, compiled when first needed. rays: those of the depth camera, on the device."""
+
+    e: Engine
+    rays: tuple[Any, Any]
+    # Residual beyond which a pixel is an outlier for certain (m, by level; intensity), and smallest credible σ.
+    gate_depth: tuple[float, ...] = (0.05, 0.05, 0.3)
+    gate_intensity: float = 0.3
+    floor_depth: float = _CREDIBLE_DEPTH
+    floor_intensity: float = 1.0 / 255.0
+    # σ of equation (13) in the photometric term; 0: blurred points count like sharp ones.
+    blur_sigma_px: float = 0.0
+    # Where interpolation errs by more than this part of σ, its bias counts, not its size: those pixels are left out.
+    smooth: float = 0.25
+    _kernel: Kernels = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._kernel = Kernels(self.e)
+
+    @classmethod
+    def of(cls, device: DeviceRig, blur_sigma_px: float = 0.0) -> Terms:
+        """The terms of a rig; blur_sigma_px as in `Options`."""
+        return cls(device.e, device.device_rays, blur_sigma_px=blur_sigma_px)
+
+    def geometric(
+        self, image: DepthImage, ref: Reference, spline: Spline, level: int, sigma: float,
+        slopes_at: Spline | None = None,
+    ) -> Linearised:  # fmt: skip
+        """Depth image against the reference's depth with every STRIDES[level]-th pixel.
+
+        slopes_at: spline at which the lines' poses are differentiated by control points, if not `spline`: that changes
+        by no more than the increments between the two (relative), which Gauss-Newton steps do not notice.
+        """
+        to_base = to_base_table(spline, ref.T_world_base, image.exposure)
+        sums = self._geometric_sums(image, ref, to_base, self._seen_from(spline, ref), level, sigma)
+        _, _, per, ref_per = block_counts(image.exposure.lens, ref.lens)
+        times = image.exposure.block_times(per)
+        floor = self._floor_depth(image, ref)
+        return self._finish(sums, slopes_at or spline, ref, times, ref_per, sigma, floor, ref.lever)
+
+    def geometric_pose(
+        self, image: DepthImage, ref: Reference, T_base_cam: FloatArray, level: int, sigma: float
+    ) -> tuple[BlockSums, float]:
+        """The same for a global-shutter image at one pose (4, 4) against a rectified reference: sums and next σ (m)."""
+        to_base = np.concatenate([T_base_cam[:3, :3].ravel(), T_base_cam[:3, 3]])
+        sums = self._geometric_sums(image, ref, to_base, self.e.upload(IDENTITY_FROM_BASE), level, sigma)
+        return sums, scale_step(sigma, sums.weighted, sums.count, self._floor_depth(image, ref))
+
+    def _geometric_sums(
+        self, image: DepthImage, ref: Reference, to_base: FloatArray, from_base: Any, level: int, sigma: float
+    ) -> BlockSums:
+        e, lens = self.e, image.exposure.lens
+        kernel = self._kernel(geometric_kernel, lens, ref.lens, STRIDES[level])
+        scaling = self._scaling(ref, lens, lens.camera, ref, STRIDES[level], 1)
+        gate = self.gate_depth[level]
+        gate = min(gate, max(5.0 * sigma, 10 * self._floor_depth(image, ref))) if level == 0 else gate
+        smooth = self.smooth * max(sigma, _CREDIBLE_DEPTH)
+        constants = e.upload(np.append(scaling.parameters(sigma, gate), smooth))
+        surface = ref.inverse_depth, ref.slope_x, ref.slope_y, ref.roughness
+        raw = kernel(image.z, *self.rays, e.upload(to_base), *surface, from_base, constants)
+        current, reference, _, _ = block_counts(lens, ref.lens)
+        return scaling.unpack(raw.numpy(), current, reference)
+
+    def _floor_depth(self, image: DepthImage, ref: Reference) -> float:
+        # A camera at rest repeats its rounding, so that depth would seem far better than it is.
+        return max(self.floor_depth, image.resolution * ref.lever**2 / np.sqrt(12.0))
+
+    def visible(self, depth: DepthImage, ref: Reference, spline: Spline, level: int) -> Any:
+        """Which of the reference's points of a level the depth image does not hide: 1 or 0, on the device."""
+        lens, points = depth.exposure.lens, ref.points[level]
+        kernel = self._kernel(visibility_kernel, lens, ref.lens, STRIDES[level])
+        from_base = self.e.upload(from_base_table(spline, ref.T_world_base, depth.exposure))
+        return kernel(points.x, points.y, points.z, self._ref_lines(spline, ref), depth.z, from_base)
+
+    def photometric(
+        self, image: ColorImage, ref: Reference, spline: Spline, level: int, sigma: float,
+        slopes_at: Spline | None = None, visible: Any = None,
+    ) -> Linearised:  # fmt: skip
+        """The reference's points of a level, those that are `visible`, against that level of the colour image."""
+        e, lens, points = self.e, image.exposure.lens, ref.points[level]
+        kernel = self._kernel(photometric_kernel, lens, ref.lens, STRIDES[level], level, self.blur_sigma_px)
+        from_base = e.upload(from_base_table(spline, ref.T_world_base, image.exposure))
+        # Moving closer or turning packs more points into a block than its share.
+        scaling = self._scaling(points, lens, ref.lens.camera, ref, STRIDES[level], 4)
+        constants = e.upload(scaling.parameters(sigma, self.gate_intensity))
+        seen_at = self._ref_lines(spline, ref), image.levels[level], from_base
+        shown = points.visible if visible is None else visible
+        raw = kernel(points.x, points.y, points.z, points.intensity, shown, *seen_at, constants)
+        current, reference, per, ref_per = block_counts(lens, ref.lens)
+        sums = scaling.unpack(raw.numpy(), current, reference)
+        times = image.exposure.block_times(per)
+        return self._finish(sums, slopes_at or spline, ref, times, ref_per, sigma, self.floor_intensity, points.lever)
+
+    def _ref_lines(self, spline: Spline, ref: Reference) -> Any:
+        if ref.rolling is None:
+            return self.e.upload(np.zeros(12))
+        return self.e.upload(to_base_table(spline, ref.T_world_base, ref.rolling))
+
+    def _seen_from(self, spline: Spline, ref: Reference) -> Any:
+        if ref.rolling is None:
+            return self.e.upload(IDENTITY_FROM_BASE)
+        return self.e.upload(from_base_table(spline, ref.T_world_base, ref.rolling))
+
+    @staticmethod
+    def _scaling(
+        units: Points | Reference, lens: Lens, grid: Camera, ref: Reference, stride: int, slack: int
+    ) -> Scaling:
+        pixels = -(-grid.width // stride) * -(-grid.height // stride)
+        current = block_counts(lens, ref.lens)[0]
+        per_block = -(-pixels // current) + max(grid.width, grid.height)
+        return Scaling(units.lever, units.bound, min(pixels, slack * per_block))
+
+    def _finish(
+        self, sums: BlockSums, spline: Spline, ref: Reference, times: FloatArray, ref_per: int, sigma: float,
+        floor: float, lever: float,
+    ) -> Linearised:  # fmt: skip
+        ref_times = None if ref.rolling is None else ref.rolling.block_times(ref_per)
+        model, motion = chain(sums, spline, ref.T_world_base, times, ref_times)
+        scaled = Quadratic(model.first, model.H / sigma**2, model.g / sigma)
+        next_sigma = scale_step(sigma, sums.weighted, sums.count, floor)
+        return Linearised(scaled, motion, sigma, next_sigma, sums.cost, sums.count, floor, seen_motions(sums, lever))
+
+
+def seen_motions(sums: BlockSums, lever: float) -> FloatArray:
+    """Summed H (6, 6) per pixel, with rotations divided by `lever` (m); zero without pixels."""
+    scale = 1.0 / np.array([1.0, 1.0, 1.0, lever, lever, lever])
+    return sums.H.sum(axis=(0, 1)) * np.outer(scale, scale) / max(1, sums.count)
+
+
+def weakest_motion(seen: FloatArray) -> float:
+    """Smallest eigenvalue of `seen_motions`: how well the motion that is seen least is seen."""
+    return float(np.linalg.eigvalsh(seen)[0])

@@ -1,0 +1,148 @@
+"""From per-block 6×6 systems to the control points: chain rule, motion prior, banded solve.
+
+Unknowns are left increments δ_i in se(3): T_i ← exp(δ_i) T_i in the world frame. A block of lines at time t moves by
+η = Σ J_i(t) δ_i over the four control points of its segment (DESIGN section 4), so its 6×6 system becomes 24×24.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+import scipy.linalg
+
+from rsgen.geometry import se3
+from rsgen.geometry.so3 import FloatArray
+from rsgen.geometry.spline import Spline
+from rstrack.alignment.residuals import BlockSums
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """½ δᵀ H δ + gᵀ δ over control points first, first + 1, ...: H (6k, 6k), g (6k,)."""
+
+    first: int
+    H: FloatArray
+    g: FloatArray
+
+    @property
+    def last(self) -> int:
+        """One past the last control point."""
+        return self.first + len(self.g) // 6
+
+    def scaled(self, factor: float) -> Quadratic:
+        """The model times a factor."""
+        return self if factor == 1.0 else Quadratic(self.first, factor * self.H, factor * self.g)
+
+    def moved(self, increments: FloatArray) -> Quadratic:
+        """The same model around a state that has been moved by increments (m, 6) of all control points."""
+        step = increments[self.first : self.last].ravel()
+        return replace(self, g=self.g + self.H @ step) if step.any() else self
+
+
+def line_jacobian(spline: Spline, T_world_base: FloatArray, times: FloatArray, first: int, count: int) -> FloatArray:
+    """η in the base frame by the control points first..first+count: (n, 6, 6 count)."""
+    return _line_jacobian(spline, T_world_base.tobytes(), times.tobytes(), first, count)
+
+
+@lru_cache(maxsize=64)
+def _line_jacobian(spline: Spline, T_world_base: bytes, times: bytes, first: int, count: int) -> FloatArray:
+    """Remembered, because both terms and all iterations of a level ask for the same."""
+    at, J = spline.pose_jacobian(np.frombuffer(times))
+    J = se3.adjoint(se3.inverse(np.frombuffer(T_world_base).reshape(4, 4))) @ J
+    out = np.zeros((len(at), 6, count, 6))
+    rows = np.arange(len(at))
+    for i in range(4):
+        out[rows, :, at - first + i] = J[:, i]
+    return out.reshape(len(at), 6, 6 * count)
+
+
+def chain(
+    sums: BlockSums, spline: Spline, T_world_base: FloatArray, times: FloatArray, ref_times: FloatArray | None
+) -> tuple[Quadratic, FloatArray]:
+    """`sums` of blocks at `times` (n,) by the control points (of blocks of a rolling reference at `ref_times` too).
+
+    Returns the quadratic model and the derivative (n, 6, 6k) of the current blocks' twists.
+    """
+    every = times if ref_times is None else np.concatenate([times, ref_times])
+    segments, _ = spline.locate(every)
+    first, count = int(segments.min()), int(segments.max() - segments.min()) + 4
+    current = line_jacobian(spline, T_world_base, times, first, count)
+    if ref_times is None:
+        J, H, g = current, sums.H[:, 0], sums.g[:, 0]
+    else:
+        used = np.flatnonzero(np.abs(sums.H).sum(axis=(2, 3)).ravel())
+        c, r = np.divmod(used, len(ref_times))
+        J = current[c] - line_jacobian(spline, T_world_base, ref_times, first, count)[r]
+        H, g = sums.H[c, r], sums.g[c, r]
+    HJ = H @ J
+    size = 6 * count
+    dense = J.reshape(-1, size).T @ HJ.reshape(-1, size)
+    return Quadratic(first, 0.5 * (dense + dense.T), J.reshape(-1, size).T @ g.ravel()), current
+
+
+def acceleration_prior(spline: Spline, first: int, last: int, sigma: FloatArray) -> tuple[Quadratic, float]:
+    """Ω_{i+1} − Ω_i ~ N(0, diag σ²) for the triples of control points within first..last (exclusive).
+
+    sigma (triples, 6): m and rad per knot squared, so acceleration times dt². Derivative of Ω_j = log(T_{j−1}⁻¹ T_j) by
+    left increments: Jl⁻¹(Ω_j) Ad(T_{j−1}⁻¹) (δ_j − δ_{j−1}). Returns the model and the cost.
+    """
+    gains = spline.left_gains[first : last - 1]
+    omega = spline.increments[first : last - 1]
+    r = omega[1:] - omega[:-1]
+    J = np.concatenate([gains[:-1], -gains[1:] - gains[:-1], gains[1:]], axis=2)
+    weighted = np.swapaxes(J, 1, 2) / sigma[:, None, :] ** 2
+    blocks, slopes = weighted @ J, (weighted @ r[..., None])[..., 0]
+    count = last - first
+    H, g = np.zeros((6 * count, 6 * count)), np.zeros(6 * count)
+    for i in range(count - 2):
+        at = slice(6 * i, 6 * i + 18)
+        H[at, at] += blocks[i]
+        g[at] += slopes[i]
+    return Quadratic(first, H, g), 0.5 * float(np.sum((r / sigma) ** 2))
+
+
+def pose_constraint(spline: Spline, t: float, T_world_body: FloatArray, sigma: FloatArray) -> tuple[Quadratic, float]:
+    """T(t) = T_world_body up to sigma (6,) (m, rad): fixes the gauge while the reference's control points are free.
+
+    Returns the model and the cost.
+    """
+    segment, J = spline.pose_jacobian(t)
+    e = se3.log(spline.pose(t) @ se3.inverse(T_world_body))
+    J = se3.left_jacobian_inv(e) @ np.hstack(list(J))
+    model = Quadratic(int(segment), J.T @ (J / sigma[:, None] ** 2), J.T @ (e / sigma**2))
+    return model, 0.5 * float(np.sum((e / sigma) ** 2))
+
+
+def assemble(models: Iterable[Quadratic], first: int, last: int) -> tuple[FloatArray, FloatArray]:
+    """Sum of quadratic models restricted to the free control points first..last; the others are held fixed."""
+    size = 6 * (last - first)
+    H, g = np.zeros((size, size)), np.zeros(size)
+    for model in models:
+        low, high = max(model.first, first), min(model.last, last)
+        if low >= high:
+            continue
+        own = slice(6 * (low - model.first), 6 * (high - model.first))
+        to = slice(6 * (low - first), 6 * (high - first))
+        H[to, to] += model.H[own, own]
+        g[to] += model.g[own]
+    return H, g
+
+
+def solve(H: FloatArray, g: FloatArray, bandwidth: int = 24) -> FloatArray:
+    """−H⁻¹ g by banded Cholesky. Raises numpy.linalg.LinAlgError where H is not positive definite or not finite."""
+    size = len(g)
+    bandwidth = min(bandwidth, size)
+    # Jacobi scaling: metres, radians and barely touched control points differ by many orders of magnitude.
+    # A diagonal that rounding made zero or negative overflows.
+    with np.errstate(over="ignore", invalid="ignore"):
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-300))
+        scaled, right = H * scale[:, None] * scale, scale * g
+    if not (np.isfinite(scaled).all() and np.isfinite(right).all()):
+        raise np.linalg.LinAlgError("the normal equations are not finite")
+    band = np.zeros((bandwidth, size))
+    for k in range(bandwidth):
+        band[k, : size - k] = np.diagonal(scaled, -k)
+    return -scale * np.asarray(scipy.linalg.solveh_banded(band, right, lower=True))

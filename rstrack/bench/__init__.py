@@ -1,0 +1,1 @@
+"""Measurements of the trackers: speed, starts, convergence."""

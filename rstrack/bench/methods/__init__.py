@@ -1,0 +1,1 @@
+"""`rstrack bench`: every method on every sequence, beside the paper's figures."""

@@ -1,0 +1,212 @@
+"""The grid of `rstrack bench`: every method on every sequence, each cell a folder that is kept for the next time.
+
+plan = make_plan(choose(load_bench_config(Path("configs/evaluation.yaml"))), Path("out"), Path("out/bench"))
+results = run_plan(plan)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import platform
+import time
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsgen.console.scheduler import InProcess, Workers
+from rsgen.errors import UserError
+from rsgen.files import atomic_write, read_text
+from rstrack.bench.methods.plan import Job, Plan, SequenceInfo, package_version
+from rstrack.data.dataset import Dataset, open_dataset
+from rstrack.data.estimate import TRAJECTORY, Estimate, plain, read_estimate, write_estimate
+from rstrack.metrics.association import ASSOCIATE_WITHIN_S, truth_of
+from rstrack.metrics.evaluate import Metrics, evaluate
+from rstrack.options import METHODS
+from rstrack.tracking.run import Progress, track
+
+CELL = "cell.json"
+RPE_M, RPE_DEG = "rpe_trans_rmse_m_per_s", "rpe_rot_rmse_deg_per_s"
+
+# A track with poses for fewer of the frames says little of its error: it counts as lost.
+_LEAST_COVERAGE = 0.5
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What a job came to.
+
+    metrics: `Metrics.as_dict()`, None if fewer than three frames have a pose. frames: asked for; lost: those of them
+    without a pose. seconds: wall clock of tracking with reading, None if not known. error: why it could not be run.
+    """
+
+    key: str
+    sequence: str
+    method: str
+    metrics: dict[str, Any] | None
+    frames: int
+    lost: int
+    seconds: float | None
+    error: str | None = None
+
+    @property
+    def counts(self) -> bool:
+        """Whether its figures mean something: at least half of the frames have a pose."""
+        return self.metrics is not None and self.lost <= (1.0 - _LEAST_COVERAGE) * self.frames
+
+    def figure(self, name: str) -> float | None:
+        """A figure of `metrics` by name; None where the track is lost or lacks it."""
+        value = self.metrics.get(name) if self.metrics is not None and self.counts else None
+        return None if value is None else float(value)
+
+
+@dataclass(frozen=True)
+class Results:
+    """What there is of a plan; interrupted: some cells are missing."""
+
+    sequences: tuple[SequenceInfo, ...]
+    methods: tuple[str, ...]
+    cells: tuple[Cell, ...]
+    machine: dict[str, Any]
+    version: str
+    interrupted: bool = False
+
+    def cell(self, sequence: str, method: str) -> Cell | None:
+        """The cell, None if it was not run."""
+        return next((c for c in self.cells if (c.sequence, c.method) == (sequence, method)), None)
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """Names of the groups, in order."""
+        return tuple(dict.fromkeys(sequence.group for sequence in self.sequences))
+
+
+def run_plan(plan: Plan, workers: Workers | None = None, progress: Progress = lambda *_: None) -> Results:
+    """Run the cells that are not there yet, in this process or by `workers`, and gather all of them.
+
+    Ctrl-C ends it early: the results hold what is finished. Raises UserError if a folder cannot be written, or is not
+    shared with the workers.
+    """
+    cells = {job: cell for job in plan.jobs if (cell := read_cell(job)) is not None}
+    todo = [job for job in plan.jobs if job not in cells]
+    running: dict[str, float] = {}
+    interrupted = False
+
+    def report(name: str, fraction: float, note: str) -> None:
+        running[name] = fraction
+        done = (len(cells) + sum(tuple(running.values()))) / len(plan.jobs)
+        # What workers tell may arrive after their cell.
+        progress("cells", min(done, 1.0), f"{name}, {note}")
+
+    try:
+        for k, cell in (workers or InProcess()).apply(run_cell, todo, report):
+            job = todo[k]
+            if cell.error is None and read_cell(job) is None:
+                raise UserError(f"{job.out}: a worker has written it, but not here: choose an --out that all share")
+            cells[job] = cell
+            running.pop(_name(job), None)
+            progress("cells", len(cells) / len(plan.jobs), f"{_name(job)} done")
+    except KeyboardInterrupt:
+        interrupted = True
+    ordered = tuple(cells[job] for job in plan.jobs if job in cells)
+    return Results(plan.sequences, plan.methods, ordered, machine(), package_version(), interrupted)
+
+
+def run_cell(job: Job, progress: Progress = lambda *_: None) -> Cell:
+    """Track, evaluate, and write the cell's folder: a run as `rstrack track` writes it, and cell.json.
+
+    A track that was lost is a cell as any other, and kept. Where something is missing or cannot be read, the cell says
+    so and is tried again the next time. progress: its stage is 'SEQUENCE METHOD'. Raises KeyboardInterrupt, and
+    UserError if the folder cannot be written.
+    """
+    cell_file = job.out / CELL
+    cell_file.unlink(missing_ok=True)
+    frames = job.last - job.first
+    make = partial(Cell, job.key, job.sequence, job.method, frames=frames)
+    try:
+        dataset = open_dataset(job.data)
+        estimate, seconds = _estimate(job, dataset, lambda _, fraction, note: progress(_name(job), fraction, note))
+    except UserError as error:
+        return make(metrics=None, lost=frames, seconds=None, error=str(error))
+    metrics = _metrics(job, dataset, estimate)
+    lost = frames if metrics is None else metrics.frames - metrics.frames_tracked
+    cell = make(metrics=None if metrics is None else metrics.as_dict(), lost=lost, seconds=seconds)
+    atomic_write(cell_file, (json.dumps(plain(dataclasses.asdict(cell)), indent=1) + "\n").encode())
+    return cell
+
+
+def read_cell(job: Job) -> Cell | None:
+    """The finished cell of a job, None if there is none, or one of other inputs."""
+    try:
+        cell = Cell(**json.loads(read_text(job.out / CELL)))
+    except (UserError, ValueError, TypeError, RecursionError):
+        return None
+    return cell if cell.key == job.key and (job.out / TRAJECTORY).is_file() else None
+
+
+def machine() -> dict[str, Any]:
+    """What the figures' times were taken on."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    cpu = models[0] if models else platform.processor() or platform.machine()
+    return {
+        "cpu": cpu,
+        "cpu_count": os.cpu_count(),
+        "system": platform.system(),
+        "python": platform.python_version(),
+    }
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _name(job: Job) -> str:
+    return f"{job.sequence} {job.method}"
+
+
+def _estimate(job: Job, dataset: Dataset, progress: Progress) -> tuple[Estimate, float | None]:
+    """The trajectory, written to the cell's folder, and the seconds that it took. Raises UserError."""
+    frames = slice(job.first, job.last)
+    if job.method in METHODS:
+        result = track(dataset, job.options, job.out, frames, progress=progress)
+        if result.end == "interrupted":
+            raise KeyboardInterrupt
+        if result.end == "unreadable":
+            raise UserError(result.error)
+        return result.estimate, result.estimate.info["timings"]["total_s"]
+    seconds = None
+    if job.estimate is not None:
+        estimate = _cut(read_estimate(job.estimate), dataset.stamps[frames])
+    else:
+        from rstrack.peers.open3d import run_peer
+
+        begin = time.perf_counter()
+        estimate = run_peer(job.method, dataset, frames, progress)
+        seconds = time.perf_counter() - begin
+    info = {"dataset": {"name": dataset.name, "frames": [job.first, job.last]}} | estimate.info | {"method": job.method}
+    write_estimate(job.out, estimate.stamps, estimate.T_world_depth, estimate.spline, info)
+    return estimate, seconds
+
+
+def _cut(estimate: Estimate, stamps: np.ndarray) -> Estimate:
+    """The poses at the frames' times."""
+    kept = (estimate.stamps >= stamps[0] - ASSOCIATE_WITHIN_S) & (estimate.stamps <= stamps[-1] + ASSOCIATE_WITHIN_S)
+    return Estimate(estimate.stamps[kept], estimate.T_world_depth[kept], estimate.spline, estimate.info)
+
+
+def _metrics(job: Job, dataset: Dataset, estimate: Estimate) -> Metrics | None:
+    """Errors over the job's frames; None if fewer than three of them have a pose."""
+    truth = truth_of(dataset)
+    if truth is None:
+        return None
+    try:
+        return evaluate(dataclasses.replace(truth, frame_stamps=dataset.stamps[job.first : job.last]), estimate)
+    except UserError:
+        return None

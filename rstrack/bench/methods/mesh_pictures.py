@@ -1,0 +1,185 @@
+"""Maps of `rstrack bench`: what each method's trajectory makes of a room, side by side from above.
+
+draw_meshes(results, Path("out/bench"))
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rsgen.errors import UserError
+from rsgen.files import atomic_write, read_text, write_error
+from rstrack.bench.methods.grid import CELL, Cell, Results, SequenceInfo
+from rstrack.mapping.reconstruct import MapOptions, run_map
+from rstrack.tracking.run import Progress
+
+SHOWN = ("rs-pg", "gs-pg", "baseline")
+"""The methods whose maps are compared: ours, the same without its model of the shutter, and the usual way."""
+
+MESH = "mesh.ply"
+# Beside a mesh: what it was made from. Beside a sequence's cells: what its picture shows.
+_MADE_FROM, _PICTURED = "mesh.json", "meshes.json"
+
+# Enough to cover what a whole sequence saw; more frames cost time and change little.
+_FRAMES = 80
+_PANEL_PX = (720, 540)
+
+
+@dataclass(frozen=True)
+class MeshPicture:
+    """A sequence's picture. panel_px: width and height of each mesh's part.
+
+    methods, labels: of the parts from left to right; the labels stand above them.
+    """
+
+    path: Path
+    panel_px: tuple[int, int]
+    methods: tuple[str, ...]
+    labels: tuple[str, ...]
+
+
+def _say(text: str) -> None:
+    print(f"rstrack: {text}", file=sys.stderr)
+
+
+def draw_meshes(
+    results: Results, out: Path, methods: Sequence[str] = SHOWN, progress: Progress = lambda *_: None,
+    warn: Callable[[str], None] = _say,
+) -> list[Path]:  # fmt: skip
+    """Write cells/SEQUENCE/METHOD/mesh.ply and plots/meshes_SEQUENCE.jpg into `out`; returns the pictures.
+
+    out: the folder with the results' cells. methods: those of them whose cells count are shown, in this order. Meshes
+    of the same cells, and pictures of the same meshes, are kept. What fails is left out and said to `warn` in one line.
+    Raises KeyboardInterrupt; the same call goes on after that.
+    """
+    rows = [(sequence, _cells(results, sequence.name, methods)) for sequence in results.sequences]
+    rows = [(sequence, cells) for sequence, cells in rows if cells]
+    steps, done, pictures = sum(len(cells) + 1 for _, cells in rows), 0, []
+    for sequence, cells in rows:
+        made: list[tuple[Cell, dict[str, Any]]] = []
+        for cell in cells:
+            report = partial(_report, progress, done, steps, f"{cell.sequence} {cell.method}")
+            try:
+                made.append((cell, make_mesh(sequence, cell, out, report)))
+            except UserError as error:
+                warn(f"no mesh of {cell.method} on {cell.sequence}: {error}")
+            done += 1
+        progress("meshes", done / steps, f"{sequence.name}, drawing")
+        try:
+            if made:
+                pictures.append(_draw(sequence.name, made, out))
+        except UserError as error:
+            warn(f"no picture of the meshes of {sequence.name}: {error}")
+        done += 1
+        progress("meshes", done / steps, f"{sequence.name} done")
+    return pictures
+
+
+def make_mesh(
+    sequence: SequenceInfo, cell: Cell, out: Path, progress: Callable[[float, str], None] = lambda *_: None
+) -> dict[str, Any]:
+    """Write a cell's mesh.ply, in the truth's world, unless it is there; returns the record of what it was made from.
+
+    progress: called with the fraction done and a note. Raises UserError: a frame or the run cannot be read, or the mesh
+    not be written.
+    """
+    folder = out / "cells" / sequence.name / cell.method
+    every = max(1, round(sequence.frames / _FRAMES))
+    # Where there is no spline a map takes the shutter for a global one anyway.
+    options = MapOptions(shutter="gs" if cell.method.startswith("gs-") else None, every=every)
+    record: dict[str, Any] = {"cell": cell.key, "options": dataclasses.asdict(options)}
+    if (folder / MESH).is_file() and _read(folder / _MADE_FROM) == record:
+        return record
+    _remove(folder / _MADE_FROM)  # first: a mesh of another cell must not be taken for this one's after an interrupt
+    run_map(
+        sequence.path, folder, folder / MESH, options,
+        progress=lambda stage, fraction, note: progress(0.9 * fraction if stage == "integrating" else 0.9, stage),
+    )  # fmt: skip
+    atomic_write(folder / _MADE_FROM, _json(record))
+    return record
+
+
+def read_picture(out: Path, sequence: str) -> MeshPicture | None:
+    """What there is of a sequence; None if there is no picture, or only one of cells that have been run again since."""
+    record, path = _read(out / "cells" / sequence / _PICTURED), _picture_path(out, sequence)
+    try:
+        width, height = record["panel_px"]
+        parts = record["meshes"]
+        current = all(_read(out / "cells" / sequence / p["method"] / CELL)["key"] == p["mesh"]["cell"] for p in parts)
+        methods, labels = tuple(str(p["method"]) for p in parts), tuple(str(p["label"]) for p in parts)
+        found = MeshPicture(path, (int(width), int(height)), methods, labels)
+    except (KeyError, TypeError, ValueError):
+        return None
+    return found if methods and current and path.is_file() else None
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _report(progress: Progress, done: int, steps: int, name: str, fraction: float, note: str) -> None:
+    progress("meshes", (done + fraction) / steps, f"{name}, {note}")
+
+
+def _cells(results: Results, sequence: str, methods: Sequence[str]) -> list[Cell]:
+    found = [results.cell(sequence, method) for method in methods]
+    return [cell for cell in found if cell is not None and cell.counts]
+
+
+def _label(cell: Cell) -> str:
+    ate_m = cell.figure("ate_rmse_m")
+    return cell.method if ate_m is None else f"{cell.method}, ATE {1e3 * ate_m:.3g} mm"
+
+
+def _picture_path(out: Path, sequence: str) -> Path:
+    return out / "plots" / f"meshes_{sequence}.jpg"
+
+
+def _draw(sequence: str, made: Sequence[tuple[Cell, dict[str, Any]]], out: Path) -> Path:
+    """The picture of a sequence's meshes, drawn unless it is there. Raises UserError."""
+    path, pictured = _picture_path(out, sequence), out / "cells" / sequence / _PICTURED
+    parts: list[dict[str, Any]] = [
+        {"method": cell.method, "label": _label(cell), "mesh": record} for cell, record in made
+    ]
+    record: dict[str, Any] = {"panel_px": list(_PANEL_PX), "meshes": parts}
+    if path.is_file() and _read(pictured) == record:
+        return path
+    _remove(pictured)
+    # Mitsuba draws, which the tracker's process never loads.
+    command = [sys.executable, "-m", "rsgen.cli.main", "picture", "--quiet", f"--out={path.resolve()}"]
+    command += [f"--width={_PANEL_PX[0]}", f"--height={_PANEL_PX[1]}"]
+    command += [f"--label={part['label']}" for part in parts]
+    command += [str((out / "cells" / sequence / part["method"] / MESH).resolve()) for part in parts]
+    done = subprocess.run(command, capture_output=True, text=True, errors="replace")
+    if done.returncode != 0:
+        said = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
+        raise UserError(f"rsgen picture: {said[-1].removeprefix('rsgen: ')}")
+    atomic_write(pictured, _json(record))
+    return path
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """A JSON object, empty if there is none."""
+    try:
+        data = json.loads(read_text(path))
+    except (UserError, ValueError, RecursionError):
+        return {}
+    return data if isinstance(data, dict) else {}
+
+
+def _json(record: dict[str, Any]) -> bytes:
+    return (json.dumps(record, indent=1) + "\n").encode()
+
+
+def _remove(path: Path) -> None:
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise write_error(path, error) from None

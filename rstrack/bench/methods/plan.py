@@ -1,0 +1,149 @@
+"""The cells of `rstrack bench`: which method runs on which frames of which folder, and what its result depends on."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+from rsgen.errors import UserError
+from rstrack.bench.methods.config import Choice, SequenceEntry
+from rstrack.data.dataset import Dataset, open_dataset
+from rstrack.data.estimate import TRAJECTORY
+from rstrack.metrics.association import truth_of
+from rstrack.options import METHODS, Options
+
+# What describes a sequence, rsgen's or TUM's; the images themselves are not read for the key.
+_DESCRIPTIONS = (
+    "sequence.yaml", "rgb.txt", "depth.txt", "associations.txt", "groundtruth.txt", "camera.yaml", "calibration.yaml"
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Job:
+    """One cell to run; plain enough to be sent to another process that sees the same files.
+
+    data: the sequence's folder. frames [first, last). method: of `options` (whose own is ignored), a peer, or, with
+    `estimate` (a run folder or TUM file), another tracker. out: the cell's run folder. key: what it depends on.
+    """
+
+    sequence: str
+    method: str
+    data: Path
+    first: int
+    last: int
+    options: Options
+    estimate: Path | None
+    out: Path
+    key: str
+
+
+@dataclass(frozen=True)
+class SequenceInfo:
+    """A sequence of the grid; frames: how many of it are used."""
+
+    name: str
+    group: str
+    path: Path
+    frames: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All cells, row by row."""
+
+    sequences: tuple[SequenceInfo, ...]
+    methods: tuple[str, ...]
+    jobs: tuple[Job, ...]
+    out: Path
+
+
+def make_plan(
+    choice: Choice, data: Path, out: Path, options: Options | None = None, added: Mapping[str, Path] | None = None
+) -> Plan:
+    """Look the sequences up and list the cells.
+
+    data: folder with a folder for each sequence. added: other trackers by name, each a folder with SEQUENCE.txt (TUM)
+    or SEQUENCE/ (a run folder) inside. Raises UserError, one line, if sequences are missing or not whole, saying how to
+    make them.
+    """
+    options, added = options or Options(), added or {}
+    for name in added:
+        if name in choice.methods or name in METHODS:
+            raise UserError(f"--add {name}=...: there is a method of that name: choose another name")
+    missing = [entry for entry in choice.sequences if not (data / entry.name).is_dir()]
+    if missing:
+        commands = "; ".join(_render_command(entry, data, choice) for entry in missing)
+        names = ", ".join(entry.name for entry in missing)
+        raise UserError(f"{data}: has no {names}: leave them out with --sequence, or make them: {commands}")
+    sequences: list[SequenceInfo] = []
+    jobs: list[Job] = []
+    methods = (*choice.methods, *added)
+    for entry in choice.sequences:
+        dataset = open_dataset(data / entry.name)
+        if truth_of(dataset) is None:
+            raise UserError(f"{dataset.root}: has no ground truth to compare with: leave it out with --sequence")
+        chosen = _chosen(dataset, entry, data, choice)
+        sequences.append(SequenceInfo(entry.name, entry.group, (data / entry.name).resolve(), len(chosen)))
+        digest = _digest(data / entry.name)
+        for method in methods:
+            used = None
+            if method in METHODS:
+                used = Options(**dataclasses.asdict(options) | {"method": method}).decided(dataset.rig.depth_shutter)
+            estimate = _estimate_path(added[method], entry.name) if method in added else None
+            depends = [digest, method, chosen.start, chosen.stop, used and dataclasses.asdict(used), package_version()]
+            depends.append(_file_digest(estimate) if estimate is not None else None)
+            key = hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()
+            cell_out = (out / "cells" / entry.name / method).resolve()
+            where = (sequences[-1].path, chosen.start, chosen.stop)
+            jobs.append(Job(entry.name, method, *where, used or options, estimate, cell_out, key))
+    return Plan(tuple(sequences), methods, tuple(jobs), out)
+
+
+def package_version() -> str:
+    """Of this project."""
+    return version("rolling-shutter-rgbd")
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _render_command(entry: SequenceEntry, data: Path, choice: Choice) -> str:
+    frames = "" if choice.last is None else f" --frames {choice.first}:{choice.last}"
+    return f"rsgen render {entry.config} --out {data / entry.name}{frames}"
+
+
+def _chosen(dataset: Dataset, entry: SequenceEntry, data: Path, choice: Choice) -> range:
+    chosen = range(len(dataset))[choice.first : choice.last]
+    if dataset.sequence is not None and (choice.last is None or choice.last > len(dataset)):
+        there, in_all = min((len(s.paths), s.frames) for s in dataset.sequence.streams.values())
+        if there < in_all:
+            command = _render_command(entry, data, choice)
+            raise UserError(
+                f"{dataset.root}: {there} of {in_all} frames are rendered: finish it with '{command}', leave it out "
+                f"with --sequence, or track what there is with --frames 0:{there}"
+            )
+    if not len(chosen):
+        raise UserError(f"{dataset.root}: has no frame {choice.first}: its frames are 0 to {len(dataset) - 1}")
+    return chosen
+
+
+def _estimate_path(folder: Path, sequence: str) -> Path:
+    file, run = folder / f"{sequence}.txt", folder / sequence
+    return (run if run.is_dir() and not file.is_file() else file).resolve()
+
+
+def _digest(root: Path) -> str:
+    return ",".join(f"{name} {_file_digest(root / name)}" for name in _DESCRIPTIONS if (root / name).is_file())
+
+
+def _file_digest(path: Path) -> str | None:
+    file = path / TRAJECTORY if path.is_dir() else path
+    try:
+        return hashlib.sha256(file.read_bytes()).hexdigest()
+    except OSError:
+        return None

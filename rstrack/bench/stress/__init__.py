@@ -1,0 +1,1 @@
+"""`rstrack stress`: what blur does, and what blur-aware weights gain."""

@@ -1,0 +1,79 @@
+"""What would be tracked: the text of `rstrack info`."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+
+from rsgen.geometry import se3
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter
+from rsgen.geometry.so3 import FloatArray
+from rsgen.geometry.spline import Spline
+from rstrack.data.dataset import Dataset
+from rstrack.metrics.association import truth_of
+
+
+def describe(dataset: Dataset) -> str:
+    """Cameras, shutters, frames and truth of a dataset, a few lines."""
+    rig = dataset.rig
+    rows = [
+        ("name", dataset.name),
+        ("depth", _stream(dataset.stamps)),
+        ("", _camera(rig.depth_camera)),
+        ("", _shutter(rig.depth_shutter, rig.depth_camera)),
+        ("colour", _stream(dataset.color_stamps)),
+        ("", _camera(rig.color_camera)),
+        ("", _shutter(rig.color_shutter, rig.color_camera)),
+        ("colour", f"{_relative_pose(rig.T_color_depth)} from the depth camera"),
+        ("frames", f"{len(dataset)}, {_groups(dataset)}"),
+        ("truth", _truth(dataset)),
+    ]
+    return "\n".join(f"{label:<8} {text}" for label, text in rows)
+
+
+def _stream(stamps: FloatArray) -> str:
+    if not len(stamps):
+        return "no images"
+    rate = f" at {1.0 / np.median(np.diff(stamps)):.4g} Hz" if len(stamps) > 1 else ""
+    return f"{len(stamps)} images{rate}, {stamps[0]:.3f} to {stamps[-1]:.3f} s"
+
+
+def _camera(c: Camera) -> str:
+    return f"{c.width}x{c.height} {c.model}, fx {c.fx:g} fy {c.fy:g} cx {c.cx:g} cy {c.cy:g}"
+
+
+def _shutter(shutter: Shutter, camera: Camera) -> str:
+    exposure = f"exposure {1e3 * shutter.exposure_s:g} ms"
+    if shutter.readout_s == 0:
+        return f"global shutter, {exposure}"
+    delay = 1e6 * shutter.line_delay(camera)
+    return f"rolling shutter, readout {1e3 * shutter.readout_s:g} ms {shutter.scan}, {delay:.3f} us a line, {exposure}"
+
+
+def _relative_pose(T: FloatArray) -> str:
+    angle = np.degrees(np.linalg.norm(se3.log(T)[3:]))
+    return f"{1e3 * np.linalg.norm(T[:3, 3]):.1f} mm and {angle:.2f} degrees"
+
+
+def _groups(dataset: Dataset) -> str:
+    """How many colour images the frames have."""
+    sizes = Counter(len(group) for group in dataset.groups)
+    if len(sizes) == 1:
+        return f"each with {_images(*sizes)}"
+    return ", ".join(f"{number} with {_images(size)}" for size, number in sorted(sizes.items()))
+
+
+def _images(count: int) -> str:
+    return "one colour image" if count == 1 else f"{count or 'no'} colour images"
+
+
+def _truth(dataset: Dataset) -> str:
+    truth = truth_of(dataset)
+    if truth is None:
+        return "none: runs can be plotted but not evaluated"
+    if isinstance(truth.motion, Spline):
+        knots = f"{len(truth.motion.control_points)} control points {1e3 * truth.motion.dt:g} ms apart"
+        return f"a spline, exact at every line: {knots}"
+    return f"{len(truth.motion)} poses, {truth.motion.stamps[0]:.3f} to {truth.motion.stamps[-1]:.3f} s"

@@ -1,0 +1,1 @@
+"""Recordings: cameras, frames, camera files, noise, registration, and estimates on disk."""

@@ -1,0 +1,132 @@
+"""Datasets: rsgen sequences, and TUM RGB-D / ICL-NUIM folders, as frames of one depth image and its colour images.
+
+dataset = open_dataset(Path("out/lr_kt2"))
+for frame in dataset.frames():
+    tracker.feed(frame)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from rsgen.errors import UserError
+from rsgen.geometry.so3 import FloatArray
+from rsgen.geometry.spline import Spline
+from rsgen.sequence.format import StreamName
+from rsgen.sequence.reader import Sequence, read_sequence
+from rsgen.sequence.trajectory import Trajectory
+from rstrack.data.prefetch import prefetched
+from rstrack.data.rig import Frame, Image, Rig
+from rstrack.data.tum_folder import read_tum_folder
+
+__all__ = ["Dataset", "Frame", "Image", "Rig", "group_colors", "open_dataset"]
+
+# Streams that are half a period apart tie, whatever the last digits of their stamps say.
+_TIE_S = 1e-6
+
+
+class ImageReader(Protocol):
+    """Decodes the k-th image of a stream. Raises UserError naming the file."""
+
+    def color(self, k: int) -> npt.NDArray[np.uint8]:
+        """RGB (h, w, 3)."""
+
+    def depth(self, k: int) -> npt.NDArray[np.float32]:
+        """Planar z (h, w) in metres, 0 = missing."""
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Frames on disk with the cameras that took them.
+
+    stamps: (n,) seconds, one for each depth image, strictly increasing. color_stamps: (m,) seconds, increasing.
+    groups: for each frame the indices of its colour images.
+    truth: T_world_depth(t), of rsgen sequences. truth_poses: T_world_depth, of other folders that have it.
+    sequence: the rsgen sequence itself, where it is one.
+    """
+
+    name: str
+    root: Path
+    rig: Rig
+    stamps: FloatArray
+    color_stamps: FloatArray
+    groups: tuple[tuple[int, ...], ...]
+    images: ImageReader
+    truth: Spline | None = None
+    truth_poses: Trajectory | None = None
+    sequence: Sequence | None = None
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def frame(self, k: int, *, color: bool = True) -> Frame:
+        """Frame k, 0 ≤ k < len, its colour images left out on request.
+
+        Raises UserError naming the file that is missing, damaged or of a wrong size.
+        """
+        if not 0 <= k < len(self):
+            raise IndexError(f"{self.name} has frames 0 to {len(self) - 1}, not {k}")
+        depth = Image(float(self.stamps[k]), self.images.depth(k))
+        colors = tuple(Image(float(self.color_stamps[i]), self.images.color(i)) for i in self.groups[k] if color)
+        return Frame(depth, colors)
+
+    def frames(self, first: int = 0, last: int | None = None, prefetch: int = 2) -> Iterator[Frame]:
+        """Frames [first, last), decoded ahead in a thread that ends with the iteration, early or not.
+
+        Raises UserError as `frame` does, when it is that frame's turn.
+        """
+        return prefetched(self.frame, range(len(self))[first:last], prefetch)
+
+    def rows(self, stream: StreamName) -> FloatArray | None:
+        """True poses (images, lines, 7) tx ty tz qx qy qz qw of each line's camera in the world; None if not known.
+
+        Images are counted as in `stamps` and `color_stamps`; see `rsgen.sequence.Sequence.rows`. Raises UserError.
+        """
+        return None if self.sequence is None else self.sequence.rows(stream)
+
+
+def open_dataset(path: Path, camera_file: Path | None = None) -> Dataset:
+    """Read the description and listings of a folder; images are read when asked for.
+
+    path: a sequence that rsgen wrote (it has a sequence.yaml, which holds the cameras), or a TUM RGB-D or ICL-NUIM
+      folder: rgb.txt and depth.txt, or associations.txt; see `rstrack.data.tum_folder`.
+    camera_file: the cameras of a TUM or ICL-NUIM folder; default camera.yaml or calibration.yaml in it; see
+      `rstrack.data.camera_file`.
+    Raises UserError, one line: what is missing or wrong, where, and how to mend it.
+    """
+    root = Path(path)
+    if not root.is_dir():
+        raise UserError(f"{root}: no such folder: give an rsgen sequence or a TUM RGB-D or ICL-NUIM folder")
+    if not (root / "sequence.yaml").exists():
+        tum = read_tum_folder(root, camera_file)
+        groups = group_colors(tum.depth_stamps, tum.color_stamps)
+        stamps = (tum.depth_stamps, tum.color_stamps)
+        return Dataset(root.resolve().name, root, tum.rig, *stamps, groups, tum.images, truth_poses=tum.truth_poses)
+    if camera_file is not None:
+        raise UserError(f"{root}: its sequence.yaml holds the cameras: leave the camera file {camera_file} out")
+    sequence = read_sequence(root)
+    color, depth = sequence.streams["color"], sequence.streams["depth"]
+    rig = Rig(depth.camera, depth.shutter, color.camera, color.shutter, sequence.T_color_depth)
+    groups = group_colors(depth.stamps, color.stamps)
+    stamps = (depth.stamps, color.stamps)
+    return Dataset(sequence.name, root, rig, *stamps, groups, sequence, truth=sequence.spline, sequence=sequence)
+
+
+def group_colors(depth_stamps: npt.ArrayLike, color_stamps: npt.ArrayLike) -> tuple[tuple[int, ...], ...]:
+    """For each depth image (n,) the colour images (m,) that are nearer to it than to any other; ties: the earlier.
+
+    Stamps in seconds, both increasing. Every colour image is in exactly one group.
+    """
+    depth, color = np.asarray(depth_stamps, float), np.asarray(color_stamps, float)
+    after = np.searchsorted(depth, color)
+    later, earlier = np.minimum(after, len(depth) - 1), np.maximum(after - 1, 0)
+    is_later_nearer = np.abs(depth[later] - color) < np.abs(depth[earlier] - color) - _TIE_S
+    owner = np.where(is_later_nearer, later, earlier)
+    bounds = np.searchsorted(owner, np.arange(len(depth) + 1))
+    return tuple(tuple(range(a, b)) for a, b in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True))

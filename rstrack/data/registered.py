@@ -1,0 +1,101 @@
+"""Depth and colour as other trackers want them: pixel on pixel in one pinhole camera, under one stamp.
+
+registrar = Registrar(dataset.rig)
+image = registrar(dataset.images.depth(k), dataset.images.color(i))
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from rsgen.geometry import se3
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.so3 import FloatArray
+from rstrack.data.dataset import Dataset
+from rstrack.data.rig import Rig
+
+DepthArray = npt.NDArray[np.float32]
+ColorArray = npt.NDArray[np.uint8]
+
+# Inverse depth is linear in the pixels of a plane: second differences above this share of it are an edge.
+_EDGE = 0.02
+_BEND = np.array([[1.0, -2.0, 1.0]], np.float32)
+# Outside every image, for pixels that are seen nowhere.
+_NOWHERE = -1e4
+
+
+@dataclass(frozen=True)
+class RegisteredImage:
+    """depth: float32 (h, w), planar z in metres, 0 = missing or not seen in colour. color: uint8 (h, w, 3) RGB."""
+
+    depth: DepthArray
+    color: ColorArray
+
+
+class Registrar:
+    """Undistorts depth and takes each of its pixels' colour from where the colour camera sees that point.
+
+    That is what drivers offer as 'colour to depth'; unlike depth warped into the colour camera, it has no holes and
+    moves no depth but for the distortion. Lines' times are ignored: both images are taken for global-shutter images of
+    one instant.
+
+    camera: the pinhole that both have afterwards; it has the depth camera's size, focal lengths and centre.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        self.camera = replace(rig.depth_camera, model="pinhole", distortion=())
+        self._color_camera, self._T_color_depth = rig.color_camera, rig.T_color_depth
+        self._rays = self.camera.unproject(self.camera.pixel_grid())
+        is_straight = rig.depth_camera.model == "pinhole"
+        self._depth_map = None if is_straight else _pixel_map(rig.depth_camera, self._rays)
+        self._is_registered = rig.color_camera == self.camera and np.array_equal(rig.T_color_depth, np.eye(4))
+
+    def __call__(self, depth: DepthArray, color: ColorArray) -> RegisteredImage:
+        """depth (h, w), planar z in metres, 0 = missing; color (H, W, 3): as the two cameras took them."""
+        z = depth if self._depth_map is None else _undistorted(depth, *self._depth_map)
+        if self._is_registered:
+            return RegisteredImage(z, color)
+        is_known = z > 0
+        # A point of the median depth stands in for what was not measured, so that there is colour there too: the
+        # pyramids of a tracker would smear black holes into their neighbours.
+        elsewhere = float(np.median(z[is_known])) if is_known.any() else 1.0
+        p_color = se3.transform(self._T_color_depth, self._rays * np.where(is_known, z, elsewhere)[..., None])
+        u, v = _pixel_map(self._color_camera, p_color)
+        values = cv2.remap(color, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        is_seen = self._color_camera.contains(np.stack([u, v], axis=-1))
+        return RegisteredImage(np.where(is_seen, z, np.float32(0)), np.asarray(values, np.uint8))
+
+
+def registered_image(dataset: Dataset, registrar: Registrar, k: int) -> RegisteredImage:
+    """Frame k of a dataset with the colour image whose stamp is nearest, be it half a second off.
+
+    Raises UserError naming an image that is missing, damaged or of a wrong size.
+    """
+    nearest = int(np.argmin(np.abs(dataset.color_stamps - dataset.stamps[k])))
+    return registrar(dataset.images.depth(k), dataset.images.color(nearest))
+
+
+def _pixel_map(camera: Camera, p_cam: FloatArray) -> tuple[DepthArray, DepthArray]:
+    """Where points (h, w, 3) are in the camera's image: u and v (h, w), as OpenCV's remap takes them."""
+    uv, is_visible = camera.project(p_cam)
+    uv = np.where(is_visible[..., None], uv, _NOWHERE).astype(np.float32)
+    return np.ascontiguousarray(uv[..., 0]), np.ascontiguousarray(uv[..., 1])
+
+
+def _undistorted(z: DepthArray, u: DepthArray, v: DepthArray) -> DepthArray:
+    """Depth at pixels (u, v): its inverse is interpolated within a surface, the nearest pixel's across an edge."""
+    inverse = np.divide(1.0, z, out=np.zeros_like(z), where=z > 0)
+    bend = np.maximum(*(np.abs(cv2.filter2D(inverse, -1, kernel)) for kernel in (_BEND, _BEND.T)))
+    is_edge = cv2.dilate((bend > _EDGE * inverse).astype(np.uint8), np.ones((3, 3), np.uint8))
+
+    def at_pixels(image: Any, how: int) -> DepthArray:
+        return np.asarray(cv2.remap(image, u, v, how, borderMode=cv2.BORDER_CONSTANT, borderValue=0))
+
+    nearest = at_pixels(inverse, cv2.INTER_NEAREST)
+    found = np.where(at_pixels(is_edge, cv2.INTER_NEAREST) > 0, nearest, at_pixels(inverse, cv2.INTER_LINEAR))
+    return np.divide(1.0, found, out=np.zeros_like(found), where=found > 0)

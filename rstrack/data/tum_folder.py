@@ -1,0 +1,294 @@
+"""Folders in the layout of TUM RGB-D, among them Kerl et al.'s rolling-shutter sets, and of ICL-NUIM.
+
+    rgb.txt, depth.txt    'stamp path' lines; or associations.txt with 'stamp path stamp path', depth or colour first
+    camera.yaml           the cameras: see `camera_file`; or an OpenCV calibration.yaml: see `opencv_camera_file`
+    groundtruth.txt       optional: poses of the colour camera; ICL-NUIM's NAME.gt.freiburg also
+
+Stamps without any decimal point are frame numbers at 30 Hz, as in ICL-NUIM. Colour images are 8-bit PNG or JPEG, depth
+images 16-bit grey PNG.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from rsgen.errors import UserError
+from rsgen.files import png_fault, read_bytes, read_text
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.so3 import FloatArray
+from rsgen.sequence.trajectory import ICL_RATE_HZ, Trajectory, read_trajectory
+from rstrack.data.camera_file import EXAMPLE, RigFile, read_rig
+from rstrack.data.rig import Rig
+
+_ASSOCIATIONS = ("associations.txt", "associate.txt", "association.txt")
+_CAMERA_FILES = ("camera.yaml", "calibration.yaml")
+_MAX_STAMP_S = 1e11  # the year 5138; today in milliseconds, microseconds or nanoseconds is beyond
+_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_PNG_START = b"\x89PNG"
+
+
+@dataclass(frozen=True)
+class ImageFiles:
+    """Decodes the images of a folder, and checks that they are as large as the cameras say."""
+
+    rig: Rig
+    depth_scale: float
+    color_paths: tuple[Path, ...]
+    depth_paths: tuple[Path, ...]
+
+    def color(self, k: int) -> npt.NDArray[np.uint8]:
+        """RGB (h, w, 3) of colour image k. Raises UserError naming the file."""
+        path = self.color_paths[k]
+        image = _decode_color(path)
+        _check_size(path, image, self.rig.color_camera)
+        return image
+
+    def depth(self, k: int) -> npt.NDArray[np.float32]:
+        """Planar z (h, w) in metres of depth image k, 0 = missing. Raises UserError naming the file."""
+        path = self.depth_paths[k]
+        units = _decode_depth(path)
+        _check_size(path, units, self.rig.depth_camera)
+        return np.asarray(units / np.float32(self.depth_scale), np.float32)
+
+
+@dataclass(frozen=True)
+class TumFolder:
+    """What `read_tum_folder` finds. Stamps (n,) and (m,) in seconds, increasing; truth_poses are T_world_depth."""
+
+    rig: Rig
+    depth_stamps: FloatArray
+    color_stamps: FloatArray
+    images: ImageFiles
+    truth_poses: Trajectory | None
+
+
+def read_tum_folder(root: Path, camera_file: Path | None) -> TumFolder:
+    """Read cameras, listings and ground truth; images are decoded when asked for, but all have to be there.
+
+    camera_file: default camera.yaml, else calibration.yaml in the folder. Raises UserError, one line.
+    """
+    depth, color = _listings(root)
+    depth, color = depth.checked(), color.sorted().checked()
+    file = _rig_file(root, camera_file, color.paths[0], depth.paths[0])
+    images = ImageFiles(file.rig, file.depth_scale, color.paths, depth.paths)
+    rate = ICL_RATE_HZ if depth.has_frame_numbers and color.has_frame_numbers else 1.0
+    return TumFolder(file.rig, depth.stamps / rate, color.stamps / rate, images, _truth(root, file.rig))
+
+
+# --- listings --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """One image of a listing: number of its line, stamp and path as written."""
+
+    line: int
+    stamp: str
+    path: str
+
+
+@dataclass(frozen=True)
+class _Listing:
+    """One stream's images as listed, in the order of the file."""
+
+    root: Path
+    file: Path
+    entries: tuple[_Entry, ...]
+
+    @cached_property
+    def stamps(self) -> FloatArray:
+        """Stamps (n,) as listed: seconds, or frame numbers. Raises UserError naming the line."""
+        return np.array([self._seconds(entry) for entry in self.entries])
+
+    @property
+    def has_frame_numbers(self) -> bool:
+        """Whether it is numbered instead of stamped."""
+        return all(entry.stamp.isdigit() for entry in self.entries)
+
+    @cached_property
+    def paths(self) -> tuple[Path, ...]:
+        """The images' files, all of which exist inside the folder. Raises UserError naming the line."""
+        real_root = self.root.resolve()
+        return tuple(self._path(entry, real_root) for entry in self.entries)
+
+    def sorted(self) -> _Listing:
+        """By stamp, what is listed twice (an image that goes with two depth images) once."""
+        once = dict(zip(((e.stamp, e.path) for e in reversed(self.entries)), reversed(self.entries), strict=True))
+        entries = sorted(once.values(), key=lambda entry: (self._seconds(entry), entry.line))
+        return _Listing(self.root, self.file, tuple(entries))
+
+    def checked(self) -> _Listing:
+        """Itself. Raises UserError naming the first line whose stamp does not come after the one before."""
+        stamps = self.stamps
+        for k in np.flatnonzero(np.diff(stamps) <= 0)[:1] + 1:
+            entry, before = self.entries[k], self.entries[k - 1]
+            if stamps[k] == stamps[k - 1]:
+                raise UserError(
+                    f"{self._where(entry)}: repeats the stamp {entry.stamp} of line {before.line}: remove one"
+                )
+            raise UserError(
+                f"{self._where(entry)}: stamp {entry.stamp} does not come after {before.stamp}: sort the file by time"
+            )
+        return self
+
+    def _where(self, entry: _Entry) -> str:
+        return f"{self.file} line {entry.line}"
+
+    def _seconds(self, entry: _Entry) -> float:
+        try:
+            seconds = float(entry.stamp)
+        except ValueError:
+            seconds = math.nan
+        if not math.isfinite(seconds):
+            raise UserError(f"{self._where(entry)}: {entry.stamp[:40]!r} is not a time in seconds")
+        if abs(seconds) > _MAX_STAMP_S:
+            raise UserError(
+                f"{self._where(entry)}: stamp {entry.stamp[:40]} is absurd in seconds: divide nanoseconds by 1e9"
+            )
+        return seconds
+
+    def _path(self, entry: _Entry, real_root: Path) -> Path:
+        path = self.root / entry.path
+        try:
+            real = path.resolve()
+            exists = real.is_file()
+        except (OSError, ValueError, RuntimeError):
+            raise UserError(f"{self._where(entry)}: {entry.path[:60]!r} is not a usable path") from None
+        if Path(entry.path).is_absolute() or ".." in Path(entry.path).parts or not real.is_relative_to(real_root):
+            raise UserError(f"{self._where(entry)}: path {entry.path[:200]!r} leaves the dataset's folder")
+        if not exists:
+            raise UserError(f"{self._where(entry)}: {path} is missing: unpack the dataset again or remove the line")
+        return path
+
+
+def _listings(root: Path) -> tuple[_Listing, _Listing]:
+    """Depth and colour images that the folder lists. Raises UserError."""
+    depth_file, color_file = root / "depth.txt", root / "rgb.txt"
+    associations = next((root / name for name in _ASSOCIATIONS if (root / name).exists()), None)
+    if associations is None or (depth_file.exists() and color_file.exists()):
+        if not (depth_file.exists() or color_file.exists()):
+            raise UserError(
+                f"{root}: neither an rsgen sequence (sequence.yaml) nor a TUM or ICL-NUIM folder "
+                f"(rgb.txt and depth.txt, or {_ASSOCIATIONS[0]})"
+            )
+        return (
+            _Listing(root, depth_file, tuple(entry for (entry,) in _entries(depth_file, 1))),
+            _Listing(root, color_file, tuple(entry for (entry,) in _entries(color_file, 1))),
+        )
+    left, right = (_Listing(root, associations, entries) for entries in zip(*_entries(associations, 2), strict=True))
+    return (left, right) if _is_depth_first(left, right) else (right, left)
+
+
+def _entries(file: Path, images: int) -> list[tuple[_Entry, ...]]:
+    """The images of each line of a listing, of which there are `images`. Raises UserError."""
+    found = []
+    for number, line in enumerate(read_text(file).removeprefix("\ufeff").splitlines(), 1):
+        fields = line.split("#", 1)[0].split()
+        if not fields:
+            continue
+        if len(fields) != 2 * images:
+            raise UserError(f"{file} line {number}: expected '{'stamp path ' * images}', found {line[:60]!r}")
+        found.append(tuple(_Entry(number, *fields[i : i + 2]) for i in range(0, len(fields), 2)))
+    if not found:
+        raise UserError(f"{file}: lists no image: expected lines of 'stamp path'")
+    return found
+
+
+def _is_depth_first(left: _Listing, right: _Listing) -> bool:
+    """By what the first two files hold: published lists come both ways round."""
+    kinds = [_decode(listing.paths[0]).dtype == np.uint16 for listing in (left, right)]
+    if kinds[0] == kinds[1]:
+        what = "two depth images" if kinds[0] else "no 16-bit depth image"
+        raise UserError(f"{left._where(left.entries[0])}: has {what}: give one colour and one depth image a line")
+    return kinds[0]
+
+
+# --- cameras and truth -----------------------------------------------------------------------------------------------
+
+
+def _rig_file(root: Path, camera_file: Path | None, color: Path, depth: Path) -> RigFile:
+    file = camera_file
+    if file is None:
+        file = next((root / name for name in _CAMERA_FILES if (root / name).exists()), None)
+    if file is None:
+        raise UserError(
+            f"{root}: nothing tells the cameras: write {root / _CAMERA_FILES[0]} (or give a camera file) with "
+            f"'{EXAMPLE}' and, unless depth is registered to colour, 'depth: {{...}}' likewise"
+        )
+    return read_rig(file, _size(_decode_color(color)), _size(_decode_depth(depth)))
+
+
+def _truth(root: Path, rig: Rig) -> Trajectory | None:
+    """T_world_depth at its stamps, from a file that holds the poses of the colour camera, as TUM defines it."""
+    files: Iterable[Path] = (root / "groundtruth.txt", *sorted(root.glob("*.gt.freiburg")))
+    file = next((file for file in files if file.exists()), None)
+    if file is None:
+        return None
+    # Motion capture loses the camera now and then; what an evaluation interpolates over is its own business.
+    return read_trajectory(file, max_gap_s=math.inf).moved(T_body_cam=rig.T_color_depth)
+
+
+# --- images ----------------------------------------------------------------------------------------------------------
+
+
+def _decode(path: Path) -> npt.NDArray[Any]:
+    """A whole PNG or JPEG of 8 or 16 bits as OpenCV returns it. Raises UserError.
+
+    Files are checked first, because decoders complain on stderr, and some return half a picture.
+    """
+    data = read_bytes(path)
+    if data.startswith(_PNG_START):
+        fault = png_fault(data)
+    elif data.startswith(_JPEG_START):
+        fault = None if _JPEG_END in data[-64:] else "truncated"
+    else:
+        fault = "neither PNG nor JPEG"
+    image = None
+    if fault is None:
+        try:
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        except cv2.error:
+            fault = "cannot be decoded"
+    if image is None:
+        raise UserError(f"{path}: is not a whole image ({fault or 'cannot be decoded'}): unpack the dataset again")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise UserError(f"{path}: has pixels of type {image.dtype}, expected 8-bit colour or 16-bit depth")
+    return image
+
+
+def _decode_color(path: Path) -> npt.NDArray[np.uint8]:
+    image = _decode(path)
+    if image.dtype != np.uint8:
+        raise UserError(f"{path}: is a {_kind(image)} image, expected 8-bit colour: are the listings swapped?")
+    codes = {2: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}
+    return np.asarray(cv2.cvtColor(image, codes[2 if image.ndim == 2 else image.shape[2]]), np.uint8)
+
+
+def _decode_depth(path: Path) -> npt.NDArray[np.uint16]:
+    image = _decode(path)
+    if image.dtype != np.uint16 or image.ndim != 2:
+        raise UserError(f"{path}: is a {_kind(image)} image, expected 16-bit grey depth: are the listings swapped?")
+    return np.asarray(image, np.uint16)
+
+
+def _kind(image: npt.NDArray[np.generic]) -> str:
+    return f"{8 * image.dtype.itemsize}-bit {'grey' if image.ndim == 2 else 'colour'}"
+
+
+def _size(image: npt.NDArray[np.generic]) -> tuple[int, int]:
+    return image.shape[1], image.shape[0]
+
+
+def _check_size(path: Path, image: npt.NDArray[np.generic], camera: Camera) -> None:
+    if _size(image) != (camera.width, camera.height):
+        found, wanted = "x".join(map(str, _size(image))), f"{camera.width}x{camera.height}"
+        raise UserError(f"{path}: is {found}, but the camera is {wanted}: mend width and height in the camera file")

@@ -1,0 +1,1 @@
+"""Images as kernels take them: pyramids, poses of their lines, sampling."""

@@ -1,0 +1,114 @@
+"""A rig on the device as the chosen method sees it, and its frames there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rsgen.device.arrays import engine
+from rsgen.device.projection import Lens
+from rsgen.errors import UserError
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter
+from rsgen.geometry.so3 import FloatArray
+from rstrack.data.rig import Frame, Image, Rig
+from rstrack.images.line_poses import Exposure
+from rstrack.images.pyramid import (
+    ColorImage,
+    DepthImage,
+    camera_rays,
+    color_image,
+    depth_image,
+    depth_resolution,
+    lens_sees,
+)
+from rstrack.options import Options
+
+# Frames within which the depth camera's resolution is looked for: it does not change.
+_SETTLED = 3
+
+
+@dataclass(frozen=True)
+class DeviceFrame:
+    """A frame on the device. depth_share: part of its depth pixels that have a value."""
+
+    index: int
+    stamp: float
+    depth: DepthImage
+    colors: tuple[ColorImage, ...]
+    depth_share: float
+
+    @property
+    def exposures(self) -> list[Exposure]:
+        """Of all its images."""
+        return [self.depth.exposure, *(c.exposure for c in self.colors)]
+
+    @property
+    def first_time(self) -> float:
+        """Time in s of the first line of all its images."""
+        return min(exposure.first_time for exposure in self.exposures)
+
+    @property
+    def last_time(self) -> float:
+        """Time in s of their last line."""
+        return max(exposure.last_time for exposure in self.exposures)
+
+
+class DeviceRig:
+    """Lenses and rays of a rig as a method sees them; takes its frames to the device.
+
+    rays (h, w, 2): normalised coordinates of the depth camera's pixels; device_rays: the same on the device.
+    """
+
+    def __init__(self, rig: Rig, options: Options) -> None:
+        self._rig, self._options = rig, options
+        self.e = engine(options.backend)
+        self._depth_lens = Lens(rig.depth_camera, _seen_as(rig.depth_shutter, options.rolling))
+        self._color_lens = Lens(rig.color_camera, _seen_as(rig.color_shutter, options.rolling))
+        self._seen = lens_sees(rig.depth_camera)
+        self.rays = camera_rays(Exposure(self._depth_lens, 0.0, np.eye(4)))
+        self.device_rays = self.e.upload(self.rays[..., 0]), self.e.upload(self.rays[..., 1])
+        # Step of the depth camera (1/m), 0 until its first images have shown one.
+        self._resolution = 0.0
+
+    def upload(self, index: int, frame: Frame) -> DeviceFrame:
+        """Frame `index` of a recording. Raises UserError if an image's size or type is not the rig's."""
+        rig, options = self._rig, self._options
+        z = _checked(frame.depth, rig.depth_camera, "depth", (), "float metres, 0 = missing", np.floating)
+        if self._resolution == 0.0 and index < _SETTLED:
+            self._resolution = depth_resolution(z)
+        exposure = self._exposure(frame.depth, self._depth_lens, rig.depth_shutter, np.eye(4))
+        depth = depth_image(self.e, exposure, np.where(self._seen, z, 0.0), options.max_depth, self._resolution)
+        colors = []
+        for image in frame.colors if options.photometric else ():
+            pixels = _checked(image, rig.color_camera, "colour", (3,), "uint8 RGB", np.uint8)
+            exposure = self._exposure(image, self._color_lens, rig.color_shutter, rig.T_color_depth)
+            colors.append(color_image(self.e, exposure, pixels))
+        return DeviceFrame(index, frame.depth.stamp, depth, tuple(colors), depth.count / z.size)
+
+    @staticmethod
+    def _exposure(image: Image, lens: Lens, true: Shutter, T_cam_body: FloatArray) -> Exposure:
+        """Seen as a global shutter, an image has the time of its middle line: the best that such a model can do."""
+        lines = true.line_count(lens.camera)
+        middle = 0.0 if lens.lines > 1 else 0.5 * (lines - 1) * true.line_delay(lens.camera)
+        return Exposure(lens, image.stamp + middle, T_cam_body)
+
+
+def _checked(
+    image: Image, camera: Camera, name: str, channels: tuple[int, ...], form: str, kind: type[np.generic]
+) -> npt.NDArray[Any]:
+    shape = (camera.height, camera.width, *channels)
+    pixels = np.asarray(image.pixels)
+    if pixels.shape != shape or not np.issubdtype(pixels.dtype, kind):
+        raise UserError(
+            f"tracker: {name} image stamped {image.stamp:.6f} is {pixels.dtype} {pixels.shape}; "
+            f"the rig's camera gives {shape}, {form}"
+        )
+    return pixels
+
+
+def _seen_as(shutter: Shutter, rolling: bool) -> Shutter:
+    return shutter if rolling else Shutter(0.0, shutter.exposure_s, shutter.scan)

@@ -1,0 +1,116 @@
+"""When the lines of an image are exposed, and their poses and derivatives as tables for the kernels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from rsgen.device.projection import Lens
+from rsgen.geometry import se3
+from rsgen.geometry.so3 import FloatArray, hat
+from rsgen.geometry.spline import Spline
+
+# Lines whose poses are taken from one evaluation of the spline.
+_LINES_PER_NODE = 8
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """One image's lens, stamp (s, line 0 stops being exposed) and T_cam_body (4, 4): the body is the depth camera."""
+
+    lens: Lens
+    stamp: float
+    T_cam_body: FloatArray
+
+    def times(self) -> FloatArray:
+        """Mid-exposure times (lines,) in s; one for a global shutter."""
+        return self.lens.shutter.line_mid_time(self.stamp, np.arange(self.lens.lines), self.lens.camera)
+
+    def block_times(self, per_block: int) -> FloatArray:
+        """Times (blocks,) of the middle of each block of lines."""
+        first = np.arange(0, self.lens.lines, per_block)
+        middle = 0.5 * (first + np.minimum(first + per_block, self.lens.lines) - 1)
+        return self.lens.shutter.line_mid_time(self.stamp, middle, self.lens.camera)
+
+    @property
+    def first_time(self) -> float:
+        """Earliest time in s at which a line is exposed."""
+        return float(self.lens.shutter.line_mid_time(self.stamp, 0, self.lens.camera))
+
+    @property
+    def last_time(self) -> float:
+        """Latest such time."""
+        return float(self.lens.shutter.line_mid_time(self.stamp, self.lens.lines - 1, self.lens.camera))
+
+    @property
+    def mid_time(self) -> float:
+        """Mid readout: the reference time of a rectified image."""
+        return 0.5 * (self.first_time + self.last_time)
+
+
+@lru_cache(maxsize=16)
+def _line_blocks(lens: Lens) -> tuple[FloatArray, npt.NDArray[np.intp], FloatArray]:
+    """Times of the blocks' middles after the stamp (s), the block of each line, and each line's time after that."""
+    at_zero = Exposure(lens, 0.0, np.eye(4))
+    middle = at_zero.block_times(_LINES_PER_NODE)
+    block = np.arange(lens.lines) // _LINES_PER_NODE
+    return middle, block, (at_zero.times() - middle[block])[:, None]
+
+
+@lru_cache(maxsize=64)
+def _line_motion(spline: Spline, lens: Lens, stamp: float) -> tuple[FloatArray, FloatArray]:
+    """Remembered: both terms ask for the same."""
+    middle, block, dt = _line_blocks(lens)
+    T, twist = spline.pose_and_velocity(stamp + middle)
+    if len(middle) == 1:
+        return T[block], twist[block]
+    # Central differences; a block's twist and the next one's are as far apart as their times.
+    slope = (twist[1:] - twist[:-1]) / (middle[1:] - middle[:-1])[:, None]
+    rate = np.concatenate([slope[:1], 0.5 * (slope[1:] + slope[:-1]), slope[-1:]])
+    change = rate[block] * dt
+    moved = (twist[block] + 0.5 * change) * dt
+    w = hat(moved[:, 3:])
+    # Second order of exp: R(I + w + w²/2), and t likewise.
+    out = T[block]
+    R = out[:, :3, :3].copy()
+    Rw = R @ w
+    out[:, :3, :3] = R + Rw + 0.5 * (Rw @ w)
+    v = moved[:, :3, None]
+    out[:, :3, 3] += ((R + 0.5 * Rw) @ v)[..., 0]
+    return out, twist[block] + change
+
+
+def line_motion(spline: Spline, exposure: Exposure) -> tuple[FloatArray, FloatArray]:
+    """T_world_body (lines, 4, 4) and body twist (lines, 6), from the middle of each line's block.
+
+    With a twist that changes linearly: over the quarter of a millisecond to a block's edge that is exact to nanometres.
+    (A constant one is wrong by a micrometre at 35 m/s², and its velocity moves what project_rolling finds by 1e-3 px.)
+    """
+    return _line_motion(spline, exposure.lens, exposure.stamp)
+
+
+def to_base_table(spline: Spline, T_world_base: FloatArray, exposure: Exposure) -> FloatArray:
+    """T_base_cam of each line (lines, 12): rotation row-major, translation."""
+    T_world_body, _ = line_motion(spline, exposure)
+    T = se3.inverse(T_world_base) @ T_world_body @ se3.inverse(exposure.T_cam_body)
+    return _rows(T)
+
+
+def from_base_table(spline: Spline, T_world_base: FloatArray, exposure: Exposure) -> FloatArray:
+    """T_cam_base of each line and the camera's body twist per line delay (lines, 18)."""
+    T_world_body, twist = line_motion(spline, exposure)
+    T = exposure.T_cam_body @ se3.inverse(T_world_body) @ T_world_base
+    delay = exposure.lens.shutter.line_delay(exposure.lens.camera)
+    twist_cam = delay * twist @ se3.adjoint(exposure.T_cam_body).T
+    return np.concatenate([_rows(T), twist_cam], axis=1)
+
+
+def _rows(T: FloatArray) -> FloatArray:
+    """Poses (n, 4, 4) as (n, 12): rotation row-major, translation."""
+    return np.concatenate([T[:, :3, :3].reshape(-1, 9), T[:, :3, 3]], axis=1)
+
+
+IDENTITY_FROM_BASE = np.concatenate([np.eye(3).ravel(), np.zeros(9)])[None]

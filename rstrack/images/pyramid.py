@@ -1,0 +1,111 @@
+"""Images as the kernels take them: depth and inverse depth on the device, and a pyramid of intensities."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from rsgen.device.arrays import Engine
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.so3 import FloatArray
+from rstrack.images.line_poses import Exposure
+
+LEVELS = 3
+# Bilinear interpolation of a sharper picture is drawn to whole and half pixels, by up to 0.05 px.
+_BLUR_PX = 0.8
+
+
+@dataclass(frozen=True)
+class DepthImage:
+    """A depth image: z (m, 0 missing) and 1/z on the device; rays are those of its camera.
+
+    count: pixels that have depth. resolution: the camera's step (1/m, see `depth_resolution`), 0 where it shows none.
+    """
+
+    exposure: Exposure
+    z: Any
+    inverse_z: Any
+    count: int
+    resolution: float = 0.0
+
+
+@dataclass(frozen=True)
+class ColorImage:
+    """Intensities in [0, 1], level 0 is full size; each further level is low-passed and halved (cv2.pyrDown)."""
+
+    exposure: Exposure
+    levels: tuple[Any, ...]
+
+
+def depth_image(
+    e: Engine, exposure: Exposure, z: npt.NDArray[Any], max_depth: float, resolution: float = 0.0
+) -> DepthImage:
+    """z (h, w) in metres; what is not finite, not positive or beyond max_depth counts as missing."""
+    z = np.asarray(z, np.float32)
+    good = (z > 0.0) & (z < max_depth)
+    z = np.where(good, z, np.float32(0.0))
+    inverse = np.divide(np.float32(1.0), z, out=np.zeros_like(z), where=good)
+    return DepthImage(exposure, e.upload(z), e.upload(inverse), int(np.count_nonzero(good)), resolution)
+
+
+def depth_resolution(z: npt.NDArray[Any]) -> float:
+    """Step δ (1/m) of a depth image (h, w): neighbouring values differ by δ z², as those of whole disparities do.
+
+    0 where depth is not quantised so that it shows: where most pixels have values of their own.
+    """
+    z = np.asarray(z)[::2, ::2]
+    values, counts = np.unique(z[(z > 0) & np.isfinite(z)], return_counts=True)
+    if len(values) < 2 or counts.sum() < 5 * len(values):
+        return 0.0
+    # As seen by the pixels: rare values in between are noise.
+    steps = np.diff(values) / values[1:] ** 2
+    order = np.argsort(steps)
+    seen = np.cumsum(counts[1:][order])
+    return float(steps[order][np.searchsorted(seen, 0.5 * seen[-1])])
+
+
+def intensity(color: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+    """Grey (h, w) in [0, 1] of an RGB image (h, w, 3), ITU-R BT.601 weights, slightly blurred."""
+    grey = np.asarray(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), np.float32) * np.float32(1.0 / 255.0)
+    return np.asarray(cv2.GaussianBlur(grey, (0, 0), _BLUR_PX))
+
+
+def color_image(e: Engine, exposure: Exposure, color: npt.NDArray[np.uint8]) -> ColorImage:
+    """RGB (h, w, 3) uint8 to a pyramid."""
+    return ColorImage(exposure, tuple(e.upload(level) for level in pyramid(intensity(color))))
+
+
+def pyramid(image: npt.NDArray[np.float32]) -> list[npt.NDArray[np.float32]]:
+    """LEVELS levels; pixel (x, y) of a level lies at (2x, 2y) of the one below."""
+    levels = [image]
+    for _ in range(LEVELS - 1):
+        levels.append(np.asarray(cv2.pyrDown(levels[-1])))
+    return levels
+
+
+def masked_pyramid(
+    image: npt.NDArray[np.float32], valid: npt.NDArray[np.bool_]
+) -> list[tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]]:
+    """Pyramid of an image with holes, by normalised convolution; a pixel is valid where half its weight is."""
+    weight = valid.astype(np.float32)
+    value = np.where(valid, image, np.float32(0.0))
+    out = [(value, valid)]
+    for _ in range(LEVELS - 1):
+        value, weight = np.asarray(cv2.pyrDown(value)), np.asarray(cv2.pyrDown(weight))
+        out.append((value / np.maximum(weight, np.float32(1e-3)), weight > 0.5))
+    return out
+
+
+def camera_rays(exposure: Exposure) -> FloatArray:
+    """Undistorted normalised coordinates (h, w, 2) of every pixel; 0 where the lens sees nothing (`lens_sees`)."""
+    camera = exposure.lens.camera
+    return np.nan_to_num(camera.unproject(camera.pixel_grid())[..., :2])
+
+
+def lens_sees(camera: Camera) -> npt.NDArray[np.bool_]:
+    """Pixels (h, w) through which the camera's model sees a direction."""
+    return np.asarray(np.isfinite(camera.unproject(camera.pixel_grid())).all(axis=-1))

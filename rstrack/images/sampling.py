@@ -1,0 +1,53 @@
+"""Reading images on the device: grids of pixels, bilinear and nearest values, surfaces of inverse depth."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+
+from rsgen.device.arrays import Engine
+from rsgen.geometry.camera import Camera
+
+# Relative spread of inverse depth within 2×2 pixels from which on they lie on both sides of an edge.
+EDGE = 0.03
+# Largest factor by which the errors of near depth count more than those of the median depth.
+NEAREST = 2.0
+
+
+def grid(e: Engine, width: int, height: int, stride: int) -> tuple[Any, Any, Any]:
+    """Index, x and y of every stride-th pixel of every stride-th row."""
+    columns = -(-width // stride)
+    i = dr.arange(e.UInt, columns * -(-height // stride))
+    row = i // columns
+    x, y = (i - row * columns) * stride, row * stride
+    return y * width + x, x, y
+
+
+def bilinear(e: Engine, image: Any, width: int, height: int, x: Any, y: Any, active: Any) -> tuple[Any, ...]:
+    """Four neighbours (00, 10, 01, 11), the position between them, and whether all are inside."""
+    active = active & (x >= 0.0) & (y >= 0.0) & (x < width - 1.0) & (y < height - 1.0)
+    x0, y0 = dr.floor(x), dr.floor(y)
+    index = e.UInt(e.Int(dr.select(active, y0, 0.0))) * width + e.UInt(e.Int(dr.select(active, x0, 0.0)))
+    near = [dr.gather(e.Float, image, index + offset, active) for offset in (0, 1, width, width + 1)]
+    return (*near, x - x0, y - y0, active)
+
+
+def nearest(e: Engine, width: int, x: Any, y: Any, active: Any) -> Any:
+    """Index of the pixel nearest to (x, y); 0 where not active."""
+    column, row = (e.UInt(e.Int(dr.select(active, v + 0.5, 0.0))) for v in (x, y))
+    return row * width + column
+
+
+def surface(e: Engine, camera: Camera, rho: Any, x: Any, y: Any, active: Any) -> tuple[Any, Any]:
+    """Inverse depth at (x, y), and whether it lies on one surface: bilinear, never across an edge or beside a hole."""
+    a, b, c, d, fx, fy, active = bilinear(e, rho, camera.width, camera.height, x, y, active)
+    most, least = dr.maximum(dr.maximum(a, b), dr.maximum(c, d)), dr.minimum(dr.minimum(a, b), dr.minimum(c, d))
+    active &= (least > 0.0) & (most - least < EDGE * most)
+    top, bottom = dr.fma(b - a, fx, a), dr.fma(d - c, fx, c)
+    return dr.fma(bottom - top, fy, top), active
+
+
+def level_size(size: int, level: int) -> int:
+    """Width or height of a pyramid level: halved and rounded up, as cv2.pyrDown does."""
+    return -(-size // 2**level)

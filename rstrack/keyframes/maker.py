@@ -1,0 +1,159 @@
+"""Make keyframes: from one frame, rolling or rectified; pass on what an older keyframe knows; fuse later frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rsgen.device.arrays import Engine, Kernels
+from rsgen.device.projection import Lens
+from rsgen.geometry import se3
+from rsgen.geometry.so3 import FloatArray
+from rsgen.geometry.spline import Spline
+from rstrack.images.device_frame import DeviceRig
+from rstrack.images.line_poses import from_base_table, to_base_table
+from rstrack.images.pyramid import ColorImage, DepthImage
+from rstrack.keyframes.keyframe import (
+    STRIDES,
+    Image,
+    Points,
+    Reference,
+    depth_scaling,
+    level_points,
+    rectified_lens,
+    surface_roughness,
+    surface_slopes,
+)
+from rstrack.keyframes.rectification import color_kernel, fuse_kernel, rectify_kernel
+
+# Metres at one metre: depths that differ by more show different surfaces.
+_AGREE = 0.03
+# Weight of a fused pixel in measurements; more would let a keyframe's first errors live for ever.
+_MOST = 30.0
+
+
+@dataclass
+class KeyframeMaker:
+    """Kernels of one rig. rays: of the depth camera (h, w, 2)."""
+
+    e: Engine
+    rays: FloatArray
+    device_rays: tuple[Any, Any]
+    _kernel: Kernels = field(init=False)
+    _one: Any = None
+    _rays: tuple[FloatArray, tuple[Any, Any]] | None = None
+
+    def __post_init__(self) -> None:
+        self._kernel = Kernels(self.e)
+
+    @classmethod
+    def of(cls, device: DeviceRig) -> KeyframeMaker:
+        """The maker for a rig."""
+        return cls(device.e, device.rays, device.device_rays)
+
+    def rolling(self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline) -> Reference:
+        """A reference that keeps its rolling shutter, for the time until it can be rectified."""
+        lens = depth.exposure.lens
+        shape = lens.camera.height, lens.camera.width
+        t = depth.exposure.mid_time
+        rho = self.e.download(depth.inverse_z, shape)
+        return self._finish(index, depth, colors, spline, t, spline.pose(t), lens, depth.inverse_z, rho, None)
+
+    def rectified(
+        self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, older: Reference | None
+    ) -> Reference:
+        """A keyframe at mid readout, in which depth that the older one has is averaged in and fills holes."""
+        e = self.e
+        t = depth.exposure.mid_time
+        T_world_base, base, rho = self.rectify(depth, spline)
+        shape = base.camera.height, base.camera.width
+        host = e.download(rho, shape)
+        made = self._finish(index, depth, colors, spline, t, T_world_base, base, rho, host, None)
+        if older is None or older.rolling is not None:
+            return made
+        T = se3.inverse(older.T_world_base) @ T_world_base
+        from_base = e.upload(np.concatenate([T[:3, :3].ravel(), T[:3, 3], np.zeros(6)]))
+        rho, weight = self._fuse(made, older.lens, older.inverse_depth, older.weight, from_base)
+        back = se3.inverse(T)
+        to_base = e.upload(np.concatenate([back[:3, :3].ravel(), back[:3, 3]]))
+        _, grid = self._pinhole_rays(base)
+        old, _, _ = self._kernel(rectify_kernel, older.lens, base)(older.inverse_depth, *grid, to_base)
+        host, old_host = e.download(rho, shape), e.download(old, shape)
+        holes = (host <= 0) & (old_host > 0)
+        host = np.where(holes, old_host, host)
+        weights = np.where(holes, 1.0, e.download(weight, shape))
+        return self._finish(index, depth, colors, spline, t, T_world_base, base, e.upload(host), host, weights)
+
+    def rectify(self, depth: DepthImage, spline: Spline) -> tuple[FloatArray, Lens, Any]:
+        """T_world_base (4, 4) at mid readout, the lens, and inverse depth as seen from there at once, on the device."""
+        lens = depth.exposure.lens
+        base = rectified_lens(lens.camera)
+        T_world_base: FloatArray = spline.pose(depth.exposure.mid_time)
+        to_base = self.e.upload(to_base_table(spline, T_world_base, depth.exposure))
+        rho, _, _ = self._kernel(rectify_kernel, lens, base)(depth.inverse_z, *self.device_rays, to_base)
+        return T_world_base, base, rho
+
+    def with_depth(
+        self, made: Reference, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, rho: Image,
+        weight: npt.NDArray[Any],
+    ) -> Reference:  # fmt: skip
+        """A keyframe that `rectified` made of these images, with other inverse depth and weights (h, w)."""
+        on_device = self.e.upload(rho)
+        return self._finish(
+            made.index, depth, colors, spline, made.t, made.T_world_base, made.lens, on_device, rho, weight
+        )
+
+    def fused(self, ref: Reference, depth: DepthImage, spline: Spline) -> Reference:
+        """The keyframe with the depth of one more frame, whose poses are known, averaged in."""
+        from_base = self.e.upload(from_base_table(spline, ref.T_world_base, depth.exposure))
+        rho, weight = self._fuse(ref, depth.exposure.lens, depth.inverse_z, self._ones(depth), from_base)
+        return replace(ref, inverse_depth=rho, weight=weight)
+
+    def _fuse(self, ref: Reference, lens: Lens, source: Any, source_weight: Any, from_base: Any) -> tuple[Any, Any]:
+        constants = self.e.upload(np.array([_AGREE, _MOST]))
+        kernel = self._kernel(fuse_kernel, lens, ref.lens)
+        fused: tuple[Any, Any] = kernel(
+            ref.inverse_depth, ref.weight, ref.slope_x, ref.slope_y, source, source_weight, from_base, constants
+        )
+        return fused
+
+    def _ones(self, depth: DepthImage) -> Any:
+        if self._one is None:
+            camera = depth.exposure.lens.camera
+            self._one = self.e.upload(np.ones(camera.height * camera.width))
+        return self._one
+
+    def _pinhole_rays(self, base: Lens) -> tuple[FloatArray, tuple[Any, Any]]:
+        """Normalised coordinates (h, w, 2) of a rectified image, and the same on the device."""
+        if self._rays is None:
+            rays = base.camera.unproject(base.camera.pixel_grid())[..., :2]
+            self._rays = rays, (self.e.upload(rays[..., 0]), self.e.upload(rays[..., 1]))
+        return self._rays
+
+    def _finish(
+        self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, t: float,
+        T_world_base: FloatArray, lens: Lens, device_rho: Any, rho: Image, weight: npt.NDArray[Any] | None,
+    ) -> Reference:  # fmt: skip
+        e = self.e
+        rolling = depth.exposure if lens is depth.exposure.lens and lens.lines > 1 else None
+        rays, grid = (self.rays, self.device_rays) if rolling else self._pinhole_rays(lens)
+        focal = lens.camera.fx, lens.camera.fy
+        slope_x, slope_y = surface_slopes(rho, *focal)
+        roughness = e.upload(surface_roughness(rho, slope_x, slope_y, *focal))
+        points: tuple[Points, ...] = ()
+        if colors:
+            color = min(colors, key=lambda c: abs(c.exposure.mid_time - t))
+            to_base = e.upload(to_base_table(spline, T_world_base, rolling) if rolling else np.zeros(12))
+            from_base = e.upload(from_base_table(spline, T_world_base, color.exposure))
+            kernel = self._kernel(color_kernel, color.exposure.lens, lens)
+            value, seen = kernel(device_rho, *grid, to_base, color.levels[0], from_base)
+            points = level_points(e, rho, rays, e.download(value, rho.shape), e.download(seen, rho.shape) > 0)
+        lever, bound = depth_scaling(rho)
+        weights = e.upload(np.where(rho > 0, 1.0, 0.0) if weight is None else weight)
+        return Reference(
+            index, depth.exposure.stamp, t, T_world_base, lens, rolling, device_rho, e.upload(slope_x),
+            e.upload(slope_y), roughness, weights, points, lever, bound, int(np.count_nonzero(rho)) // STRIDES[0] ** 2,
+        )  # fmt: skip

@@ -1,0 +1,92 @@
+"""The keyframes that a tracker remembers, and which of them it aligns to."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from rsgen.geometry import se3
+from rsgen.geometry.so3 import FloatArray
+from rsgen.geometry.spline import Spline
+from rstrack.images.device_frame import DeviceFrame
+from rstrack.keyframes.keyframe import Reference
+from rstrack.keyframes.maker import KeyframeMaker
+from rstrack.keyframes.surface_model import SurfaceModel
+from rstrack.options import Options
+
+# Keyframes in which a lost track is looked for, and all that are kept where nothing comes back to them.
+_RECENT = 8
+# Keyframes that a model keeps: what a camera can come back to.
+_MODEL_KEYFRAMES = 256
+# Of the distance and angle at which a keyframe is left behind: an older one that is nearer becomes the reference again.
+_RETURN = 0.7
+# Within so many times these, frames are aligned to the oldest keyframe too: fewer hops, less drift.
+_ANCHOR = 2.0
+
+
+class KeyframeSet:
+    """Rectified keyframes in the order in which they were last the reference. made: how many there have been.
+
+    anchor: a second, older reference for the frames that are aligned to the newest; only a model has one.
+    """
+
+    def __init__(self, maker: KeyframeMaker, options: Options) -> None:
+        self._maker, self._options = maker, options
+        self._model = SurfaceModel(maker, options.voxel_m) if options.models else None
+        self._kept: deque[Reference] = deque(maxlen=_RECENT if self._model is None else _MODEL_KEYFRAMES)
+        self.anchor: Reference | None = None
+        self.made = 0
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    @property
+    def newest(self) -> Reference:
+        """The one that was the reference last."""
+        return self._kept[-1]
+
+    @property
+    def recent(self) -> list[Reference]:
+        """The last few, newest first."""
+        return list(self._kept)[: -_RECENT - 1 : -1]
+
+    def make(self, frame: DeviceFrame, spline: Spline, older: Reference | None) -> Reference:
+        """A keyframe of a frame whose poses no longer change; inherits from `older`. It is the newest."""
+        make = self._maker.rectified if self._model is None else self._model.keyframe
+        ref = make(frame.index, frame.depth, frame.colors, spline, older)
+        if self._model is not None:
+            self._model.add(frame.depth, spline)
+        self.made += 1
+        return self._use(ref)
+
+    def fuse(self, frame: DeviceFrame, spline: Spline) -> Reference:
+        """The newest keyframe with the depth of a later frame averaged in, as far as the options want that."""
+        if frame.index > self.newest.index:
+            if self._model is not None:
+                self._model.add(frame.depth, spline)
+            if self._options.fuse:
+                self._kept[-1] = self._maker.fused(self.newest, frame.depth, spline)
+        return self.newest
+
+    def return_to(self, T_world_cam: FloatArray, left: Reference) -> Reference | None:
+        """The oldest of a model's keyframes but `left` that is near a camera: it has drifted least. Now the newest."""
+        if self._model is None:
+            return None
+        near = [
+            ref for ref in self._kept if ref is not left and self._remoteness(ref.T_world_base, T_world_cam) < _RETURN
+        ]
+        if not near:
+            return None
+        oldest = min(near, key=lambda ref: ref.index)
+        self._kept = deque((ref for ref in self._kept if ref is not oldest), maxlen=self._kept.maxlen)
+        return self._use(oldest)
+
+    def _use(self, ref: Reference) -> Reference:
+        self._kept.append(ref)
+        if self._model is not None:
+            near = [k for k in self._kept if self._remoteness(ref.T_world_base, k.T_world_base) < _ANCHOR]
+            oldest = min(near, key=lambda k: k.index)
+            self.anchor = None if oldest is ref else oldest
+        return ref
+
+    def _remoteness(self, T_world_a: FloatArray, T_world_b: FloatArray) -> float:
+        return self._options.remoteness(se3.inverse(T_world_a) @ T_world_b)

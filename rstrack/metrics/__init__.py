@@ -1,0 +1,1 @@
+"""Errors against the truth: of trajectories, of maps, of images."""

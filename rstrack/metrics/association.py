@@ -1,0 +1,160 @@
+"""Which estimated pose belongs to which true one, and the rigid motion that brings the two trajectories together."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from rsgen.errors import UserError
+from rsgen.geometry import se3, so3
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter
+from rsgen.geometry.so3 import FloatArray
+from rsgen.geometry.spline import Spline
+from rsgen.sequence.format import STAMP_TOLERANCE_S, associate
+from rsgen.sequence.trajectory import Trajectory
+from rstrack.data.estimate import Estimate
+
+if TYPE_CHECKING:
+    from rstrack.data.dataset import Dataset
+
+IntArray = npt.NDArray[np.int64]
+
+ASSOCIATE_WITHIN_S = 0.02
+"""Stamps at most so far apart belong together: the default of TUM's associate.py."""
+
+_MIN_POSES = 3
+# Variance along the second principal axis, relative to the first, under which positions lie on a line; along the first,
+# m², under which they are one point.
+_LINE, _POINT = 1e-9, 1e-12
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What an estimate is compared with.
+
+    motion: T_world_depth(t), or poses. frame_stamps: (n,) seconds, the sequence's depth frames. camera, shutter: of the
+    depth stream, for errors by line.
+    """
+
+    motion: Spline | Trajectory
+    frame_stamps: FloatArray
+    camera: Camera
+    shutter: Shutter
+
+
+def truth_of(dataset: Dataset) -> Truth | None:
+    """A dataset's truth, None if it has none: its spline, else the poses of its groundtruth.txt."""
+    motion = dataset.truth if dataset.truth is not None else dataset.truth_poses
+    if motion is None:
+        return None
+    return Truth(motion, dataset.stamps, dataset.rig.depth_camera, dataset.rig.depth_shutter)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Poses of the estimate that have a true counterpart, k of them.
+
+    index: (k,) rows of the estimate. T_world_true, T_world_est: (k, 4, 4), the latter aligned: T_true_est (4, 4) times
+    the estimate. is_determined: False if the positions alone left the alignment's rotation open.
+    """
+
+    index: IntArray
+    T_world_true: FloatArray
+    T_world_est: FloatArray
+    T_true_est: FloatArray
+    is_determined: bool
+
+    @property
+    def position_errors_m(self) -> FloatArray:
+        """(k,) distances after alignment."""
+        return np.asarray(np.linalg.norm(self.T_world_est[:, :3, 3] - self.T_world_true[:, :3, 3], axis=1))
+
+    @property
+    def rotation_errors_deg(self) -> FloatArray:
+        """(k,) angles after alignment."""
+        return angles_deg(self.T_world_true, self.T_world_est)
+
+
+def compare(truth: Truth, estimate: Estimate, interpolate: bool = False) -> Comparison:
+    """Associate and align, as `evaluate` does. Raises UserError if fewer than three poses have a true counterpart."""
+    index, T_true = _true_poses(truth.motion, estimate.stamps, interpolate)
+    if len(index) < _MIN_POSES:
+        begin, end = _span(truth.motion)
+        raise UserError(
+            f"estimate: {len(index)} of {len(estimate.stamps)} poses have a true one at their stamp, at least "
+            f"{_MIN_POSES} are needed: the truth covers {begin:.3f} to {end:.3f} s; are the clocks the same?"
+        )
+    T_est = estimate.T_world_depth[index]
+    T_true_est, is_determined = align(T_true, T_est)
+    return Comparison(index, T_true, T_true_est @ T_est, T_true_est, is_determined)
+
+
+def align(T_world_true: FloatArray, T_world_est: FloatArray) -> tuple[FloatArray, bool]:
+    """T_true_est (4, 4) that moves estimated positions closest to the true ones, and whether they determine it.
+
+    Poses (k, 4, 4). Least squares without scale, closed form: Umeyama, PAMI 13(4), 1991 (Horn's method by SVD). Where
+    positions lie on a line or in one point, the rotation that they leave open is that which brings the orientations
+    closest (chordal distance), so that rotation errors mean something there too.
+    """
+    p_true, p_est = T_world_true[:, :3, 3], T_world_est[:, :3, 3]
+    mean_true, mean_est = p_true.mean(axis=0), p_est.mean(axis=0)
+    U, s, Vt = np.linalg.svd((p_true - mean_true).T @ (p_est - mean_est) / len(p_true))
+    is_determined = bool(s[1] > _LINE * s[0] and s[0] > _POINT)
+    M = np.einsum("nij,nkj->ik", T_world_true[:, :3, :3], T_world_est[:, :3, :3])
+    if s[0] <= _POINT:
+        U, _, Vt = np.linalg.svd(M)
+    R_signs = np.diag([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
+    R = U @ R_signs @ Vt
+    if s[0] > _POINT and not is_determined:
+        # R turns one line onto the other; left is the spin about it, by the angle that maximises tr(Rᵀ M).
+        m = U.T @ M @ (R_signs @ Vt).T
+        angle = math.atan2(m[2, 1] - m[1, 2], m[1, 1] + m[2, 2])
+        R = U @ so3.exp([angle, 0.0, 0.0]) @ R_signs @ Vt
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, mean_true - R @ mean_est
+    return T, is_determined
+
+
+def nearest(stamps: FloatArray, t: FloatArray) -> IntArray:
+    """Index (n,) of the stamp nearest to each time (n,), the earlier of two; stamps increase, one at least."""
+    after = np.clip(np.searchsorted(stamps, t), 0, len(stamps) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(np.abs(stamps[before] - t) <= np.abs(stamps[after] - t), before, after).astype(np.int64)
+
+
+def angles_deg(T_a: FloatArray, T_b: FloatArray) -> FloatArray:
+    """Angles (n,) between the rotations of poses (n, 4, 4), degrees."""
+    R = np.swapaxes(T_a[:, :3, :3], 1, 2) @ T_b[:, :3, :3]
+    return np.asarray(np.degrees(np.linalg.norm(so3.log(R), axis=-1)))
+
+
+def _true_poses(motion: Spline | Trajectory, stamps: FloatArray, interpolate: bool) -> tuple[IntArray, FloatArray]:
+    """Indices (k,) of the stamps (n,) that have a true pose, and those poses (k, 4, 4)."""
+    if isinstance(motion, Spline):
+        # Stamps are rounded in files: that must not push the first or last one out.
+        inside = np.clip(stamps, motion.t_begin, motion.t_end)
+        index = np.flatnonzero(np.abs(inside - stamps) <= STAMP_TOLERANCE_S)
+        return index, motion.pose(inside[index])
+    if not interpolate:
+        pairs = np.array(associate(stamps, motion.stamps, ASSOCIATE_WITHIN_S), np.int64).reshape(-1, 2)
+        return pairs[:, 0], motion.T_world_cam[pairs[:, 1]]
+    if len(motion) < 2:
+        return np.empty(0, np.int64), np.empty((0, 4, 4))
+    near = np.abs(motion.stamps[nearest(motion.stamps, stamps)] - stamps) <= ASSOCIATE_WITHIN_S
+    index = np.flatnonzero(near & (stamps >= motion.stamps[0]) & (stamps <= motion.stamps[-1]))
+    before = np.clip(np.searchsorted(motion.stamps, stamps[index], side="right") - 1, 0, len(motion) - 2)
+    T = motion.T_world_cam[before]
+    step = se3.log(se3.inverse(T) @ motion.T_world_cam[before + 1])
+    u = (stamps[index] - motion.stamps[before]) / (motion.stamps[before + 1] - motion.stamps[before])
+    return index, T @ se3.exp(u[:, None] * step)
+
+
+def _span(motion: Spline | Trajectory) -> tuple[float, float]:
+    if isinstance(motion, Spline):
+        return motion.t_begin, motion.t_end
+    return float(motion.stamps[0]), float(motion.stamps[-1])

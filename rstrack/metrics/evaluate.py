@@ -1,0 +1,221 @@
+"""How far an estimate is from the truth: ATE, drift per second, and the error of every line's pose.
+
+metrics = run_evaluate(Path("out/lr_kt2"), Path("runs/lr_kt2"))
+print(metrics_text(metrics))
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsgen.errors import UserError
+from rsgen.geometry import se3
+from rsgen.geometry.so3 import FloatArray
+from rsgen.geometry.spline import Spline
+from rsgen.sequence.format import associate
+from rsgen.sequence.trajectory import Trajectory
+from rstrack.data.estimate import Estimate, plain, read_estimate
+from rstrack.metrics.association import ASSOCIATE_WITHIN_S, IntArray, Truth, angles_deg, compare, nearest, truth_of
+
+_RPE_DELTA_S = 1.0
+_PAIR_WITHIN_S = 0.1
+# Stamps rounded to TUM's four digits still are one second apart.
+_STAMP_ROUNDING_S = 1e-3
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """Errors of one estimate; None where they cannot be had (`notes` says why).
+
+    frames, frames_tracked: of the sequence, and those among them with a pose within 0.02 s. poses, poses_compared: of
+    the estimate, and those with a true counterpart. ate_*: absolute trajectory error. rpe_*: relative pose error over
+    one second, `rpe_pairs` of them. row_*: over the depth images' lines, `rows` of them in `rows_total`.
+    """
+
+    frames: int
+    frames_tracked: int
+    poses: int
+    poses_compared: int
+    ate_rmse_m: float
+    ate_mean_m: float
+    ate_median_m: float
+    ate_std_m: float
+    ate_max_m: float
+    rpe_trans_rmse_m_per_s: float | None
+    rpe_rot_rmse_deg_per_s: float | None
+    rpe_pairs: int
+    row_rmse_m: float | None
+    row_rot_rmse_deg: float | None
+    rows: int
+    rows_total: int
+    notes: tuple[str, ...] = ()
+
+    @property
+    def coverage(self) -> float:
+        """Part of the sequence's frames that have a pose, 0 to 1."""
+        return self.frames_tracked / self.frames if self.frames else 0.0
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain numbers for JSON; units are in the names."""
+        data: dict[str, Any] = plain(dataclasses.asdict(self) | {"coverage": self.coverage})
+        return data
+
+
+def evaluate(truth: Truth, estimate: Estimate, interpolate: bool = False) -> Metrics:
+    """Compare an estimate with the truth.
+
+    Association: a spline is evaluated exactly at the estimate's stamps; stamps outside its time are left out and
+    counted. True poses are associated with the nearest stamp, one to one and within 0.02 s, as TUM's associate.py does,
+    or, with `interpolate`, interpolated on SE(3) where one of them is that near.
+
+    ATE (`association.align`): distances between positions after the rigid alignment, as in TUM's evaluate_ate.py.
+
+    RPE: E = (T_true,i⁻¹ T_true,j)⁻¹ (T_est,i⁻¹ T_est,j), RMSE of its translation and angle over the pairs (i, j) of
+    `pairs_one_second_apart`; the estimate's association decides which true poses are meant. TUM's evaluate_rpe.py
+    multiplies in the other order, seeing each step from its end: the rotation is the same, the translation that of this
+    definition with time reversed.
+
+    Errors by line: positions and rotations at all depth lines' mid-exposures where both splines are known, after the
+    alignment of the frames' poses.
+
+    Raises UserError if fewer than three poses have a true counterpart.
+    """
+    notes = []
+    found = compare(truth, estimate, interpolate)
+    missing = len(estimate.stamps) - len(found.index)
+    if missing:
+        where = "outside the truth's time" if isinstance(truth.motion, Spline) else "without a true pose within 0.02 s"
+        notes.append(f"{missing} of {len(estimate.stamps)} poses left out: {where}")
+    if not found.is_determined:
+        notes.append("positions lie on a line or in a point: what they leave open is aligned by the orientations")
+    error = found.position_errors_m
+
+    is_compared = np.zeros(len(estimate.stamps), dtype=bool)
+    is_compared[found.index] = True
+    i, j = pairs_one_second_apart(estimate.stamps)
+    both = is_compared[i] & is_compared[j]
+    row_of = np.cumsum(is_compared) - 1
+    i, j = row_of[i[both]], row_of[j[both]]
+    rpe: tuple[float | None, float | None] = None, None
+    if i.size:
+        true_step = se3.inverse(found.T_world_true[i]) @ found.T_world_true[j]
+        est_step = se3.inverse(found.T_world_est[i]) @ found.T_world_est[j]
+        rpe = _pose_rms(true_step, est_step)
+    else:
+        notes.append("no drift: no two poses are one second apart")
+
+    t = truth.shutter.line_mid_time(
+        truth.frame_stamps[:, None], np.arange(truth.shutter.line_count(truth.camera)), truth.camera
+    ).ravel()
+    rows, row_count = _errors_by_line(truth.motion, estimate, found.T_true_est, t)
+    if not row_count:
+        notes.append("no errors by line: they need a spline on both sides")
+
+    return Metrics(
+        frames=len(truth.frame_stamps),
+        frames_tracked=len(associate(truth.frame_stamps, estimate.stamps, ASSOCIATE_WITHIN_S)),
+        poses=len(estimate.stamps),
+        poses_compared=len(found.index),
+        ate_rmse_m=_rms(error),
+        ate_mean_m=float(error.mean()),
+        ate_median_m=float(np.median(error)),
+        ate_std_m=float(error.std()),
+        ate_max_m=float(error.max()),
+        rpe_trans_rmse_m_per_s=rpe[0],
+        rpe_rot_rmse_deg_per_s=rpe[1],
+        rpe_pairs=len(i),
+        row_rmse_m=rows[0],
+        row_rot_rmse_deg=rows[1],
+        rows=row_count,
+        rows_total=len(t),
+        notes=tuple(notes),
+    )
+
+
+def pairs_one_second_apart(stamps: FloatArray) -> tuple[IntArray, IntArray]:
+    """Indices i, j (k,) with stamp j the nearest to stamp i + 1 s, of increasing stamps (n,) in seconds.
+
+    The pairs of TUM's evaluate_rpe.py with --fixed_delta --delta 1 --delta_unit s --max_pairs 0 (Sturm et al., IROS
+    2012), with two differences. That script drops every pair that ends on the last pose, since all i in the last second
+    would end there; here only those whose i + 1 s lies after it (by over 1 ms) are dropped. And where the nearest pose
+    is more than 0.1 s off, in a gap, there is no pair: it might be i itself, with an error of zero. At even 30 Hz these
+    are evo's pairs for `--delta 30 --delta_unit f --all_pairs`.
+    """
+    if not len(stamps):
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    target = stamps + _RPE_DELTA_S
+    j = nearest(stamps, target)
+    keep = (target <= stamps[-1] + _STAMP_ROUNDING_S) & (np.abs(stamps[j] - target) <= _PAIR_WITHIN_S)
+    return np.flatnonzero(keep), j[keep]
+
+
+def metrics_text(metrics: Metrics) -> str:
+    """A small table with units: millimetres, degrees, and both per second."""
+    m = metrics
+    tracked = f"{m.frames_tracked} of {m.frames} ({100 * m.coverage:.1f} %)"
+    lines = [f"{'frames tracked':<22} {tracked}", f"{'poses compared':<22} {m.poses_compared} of {m.poses}", ""]
+    lines.append(f"{'':<22} {'RMSE':>10} {'mean':>10} {'median':>10} {'std':>10} {'max':>10}")
+    ate = (m.ate_rmse_m, m.ate_mean_m, m.ate_median_m, m.ate_std_m, m.ate_max_m)
+    table: list[tuple[str, list[str], str]] = [
+        ("ATE, mm", [_number(value, 1e3) for value in ate], ""),
+        ("drift, mm/s", [_number(m.rpe_trans_rmse_m_per_s, 1e3)], f"   over {m.rpe_pairs} pairs 1 s apart"),
+        ("drift, deg/s", [_number(m.rpe_rot_rmse_deg_per_s)], ""),
+        ("lines' position, mm", [_number(m.row_rmse_m, 1e3)], f"   over {m.rows} of {m.rows_total} lines"),
+        ("lines' rotation, deg", [_number(m.row_rot_rmse_deg)], ""),
+    ]
+    lines += [f"{label:<22} {' '.join(f'{value:>10}' for value in values)}{end}" for label, values, end in table]
+    lines += [f"note: {note}" for note in m.notes]
+    return "\n".join(lines)
+
+
+def run_evaluate(seq_path: Path, estimate_path: Path, camera_file: Path | None = None) -> Metrics:
+    """Evaluate a run folder or TUM file against the truth of a sequence folder.
+
+    Arguments as in `read_estimate` and `rstrack.data.dataset.open_dataset`. Raises UserError.
+    """
+    from rstrack.data.dataset import open_dataset
+
+    truth = truth_of(open_dataset(seq_path, camera_file))
+    if truth is None:
+        raise UserError(
+            f"{seq_path}: has no ground truth to compare with: add a groundtruth.txt, or only plot the estimate"
+        )
+    estimate = read_estimate(estimate_path)
+    try:
+        return evaluate(truth, estimate)
+    except UserError as error:
+        raise UserError(f"{estimate_path}: {error}") from None
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _errors_by_line(
+    motion: Spline | Trajectory, estimate: Estimate, T_true_est: FloatArray, t: FloatArray
+) -> tuple[tuple[float | None, float | None], int]:
+    """RMS position (m) and angle (deg) at those of the times (n,) where both splines are known, and their number."""
+    if not isinstance(motion, Spline) or estimate.spline is None:
+        return (None, None), 0
+    t = t[(t >= motion.t_begin) & (t <= motion.t_end) & estimate.spline_covers(t)]
+    if not t.size:
+        return (None, None), 0
+    return _pose_rms(motion.pose(t), T_true_est @ estimate.spline.pose(t)), t.size
+
+
+def _pose_rms(T_a: FloatArray, T_b: FloatArray) -> tuple[float, float]:
+    """RMS of the translation, m, and the angle, degrees, of T_a⁻¹ T_b."""
+    error = se3.inverse(T_a) @ T_b
+    return _rms(np.linalg.norm(error[:, :3, 3], axis=1)), _rms(angles_deg(T_a, T_b))
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _number(value: float | None, scale: float = 1.0) -> str:
+    return "-" if value is None else f"{value * scale:.3f}"

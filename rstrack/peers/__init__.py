@@ -1,0 +1,1 @@
+"""Trackers of others, run on the same recordings."""

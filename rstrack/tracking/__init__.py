@@ -1,0 +1,1 @@
+"""The trackers, frame by frame, and a run of one over a recording."""

@@ -1,0 +1,313 @@
+"""One tracking run: a dataset's frames through a tracker into a run folder.
+
+result = track(open_dataset(Path("out/lr_kt2")), Options(method="rs-pg"), Path("runs/lr_kt2"))
+print(result.text())
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+import numpy as np
+
+from rsgen.errors import UserError
+from rsgen.files import write_error
+from rsgen.geometry.so3 import FloatArray
+from rsgen.geometry.spline import Spline
+from rstrack.data.dataset import Dataset
+from rstrack.data.estimate import Estimate, write_estimate
+from rstrack.data.noise import with_noise
+from rstrack.data.prefetch import prefetched
+from rstrack.data.rig import Frame, Rig
+from rstrack.metrics.association import Truth, compare, truth_of
+from rstrack.metrics.evaluate import Metrics, evaluate, metrics_text
+from rstrack.options import Options
+
+if TYPE_CHECKING:
+    from rstrack.tracking.frame_report import FrameReport
+
+Progress = Callable[[str, float, str], None]
+"""Called with a stage, the fraction done (0 to 1) and a note."""
+
+End = Literal["done", "interrupted", "broke down", "unreadable"]
+
+_TRUTH_EVERY = 30
+# Observability (see FrameReport) below which a motion is held by the prior rather than by depth.
+_WEAK = 5e-4
+# Files that mark a folder as a data set, which a run folder's spline.npz must not overwrite.
+_DATASET_FILES = ("sequence.yaml", "rgb.txt", "depth.txt", "associations.txt", "groundtruth.txt")
+
+
+class AnyTracker(Protocol):
+    """What all trackers have in common. reports: of all frames so far; options: with all that depends on the rig."""
+
+    reports: list[FrameReport]
+    options: Options
+
+    @property
+    def keyframes(self) -> int:
+        """How many there have been."""
+
+    @property
+    def spline(self) -> Spline | None:
+        """T_world_depth(t) so far, None where there is none."""
+
+    @property
+    def spline_valid(self) -> Sequence[tuple[float, float]]:
+        """Times (begin, end) in s within which the spline is an estimate."""
+
+    @property
+    def trajectory(self) -> tuple[FloatArray, FloatArray]:
+        """Stamps (n,) in s of the frames that were not lost and T_world_depth (n, 4, 4) there."""
+
+    def feed(self, frame: Frame) -> FrameReport:
+        """Track one frame."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise added to the frames; see `rstrack.data.noise.with_noise`."""
+
+    sigma_depth: float = 0.0
+    sigma_intensity: float = 0.0
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a run came to.
+
+    end: why it stopped; `error` says where the tracker broke down, or which image could not be read. lost: number of
+    frames. metrics: None without a truth, or with too few poses.
+    """
+
+    estimate: Estimate
+    metrics: Metrics | None
+    end: End
+    error: str
+    lost: int
+
+    def text(self) -> str:
+        """A summary of a few lines, with the metrics if there is a truth."""
+        info, times = self.estimate.info, self.estimate.info["timings"]
+        done, asked = len(info["frames"]), info["dataset"]["frames"][1] - info["dataset"]["frames"][0]
+        part = f"{done} frames" if done == asked else f"{done} of {asked} frames"
+        lost = f"{self.lost} lost" if self.lost else "none lost"
+        rate = done / times["total_s"]
+        lines = [
+            f"{info['method']} on {info['dataset']['name']}: {part}, {_keyframes(info['keyframes'])}, {lost}",
+            f"{times['total_s']:.1f} s, {rate:.1f} frames/s on {info['backend']}; a frame takes "
+            f"{times['median_ms']:.1f} ms (median), {times['mean_ms']:.1f} (mean), {times['p95_ms']:.1f} (95 %)",
+        ]
+        weak = sum(not f["lost"] and 0.0 < f["observability"] < _WEAK for f in info["frames"])
+        if weak and info["method"] in ("rs-g", "gs-g", "baseline"):
+            lines.append(f"in {weak} of {done} frames the geometry hardly fixes all six degrees of freedom (a wall?)")
+        return "\n".join(lines + ([] if self.metrics is None else ["", metrics_text(self.metrics)]))
+
+
+def make_tracker(rig: Rig, options: Options) -> AnyTracker:
+    """The tracker of options.method. Raises UserError if its backend cannot work on this machine."""
+    from rsgen.device.arrays import engine
+
+    # Before anything else imports Dr.Jit, which then would choose a libLLVM itself.
+    engine(options.backend)
+    if options.method == "baseline":
+        from rstrack.tracking.pose_tracker import BaselineTracker
+
+        return BaselineTracker(rig, options)
+    from rstrack.tracking.spline_tracker import Tracker
+
+    return Tracker(rig, options)
+
+
+def track(
+    dataset: Dataset,
+    options: Options,
+    out: Path,
+    frames: slice = slice(None),
+    noise: Noise | None = None,
+    progress: Progress = lambda *_: None,
+) -> Result:
+    """Track frames of a dataset and write the run folder `out`: `write_estimate` says what is in it.
+
+    Where the run stops early, because of an interrupt or an image that cannot be read, what there is gets written.
+    Raises UserError: no such frames, `out` cannot be written or is a dataset, no frame was tracked.
+    """
+    chosen = _chosen(dataset, frames)
+    truth = truth_of(dataset)
+    if truth is not None:
+        truth = dataclasses.replace(truth, frame_stamps=dataset.stamps[chosen])
+    tracker = make_tracker(dataset.rig, options)
+    _make_folder(out)
+    noise = noise or Noise()
+
+    def load(k: int) -> Frame:
+        return with_noise(
+            dataset.frame(k, color=options.photometric), k, noise.sigma_depth, noise.sigma_intensity, noise.seed
+        )
+
+    seconds: list[float] = []
+    end: End = "done"
+    error, note = "", ""
+    begin = time.perf_counter()
+    with _stop_flag() as stopped:
+        images = prefetched(load, chosen, 2)
+        for count, k in enumerate(chosen, 1):
+            try:
+                frame = next(images)
+            except UserError as problem:
+                end, error = "unreadable", str(problem)
+                break
+            start = time.perf_counter()
+            try:
+                tracker.feed(frame)
+            except (UserError, np.linalg.LinAlgError) as problem:
+                end, error = "broke down", f"the tracker broke down at frame {k}: {problem}"
+                break
+            seconds.append(time.perf_counter() - start)
+            if count % _TRUTH_EVERY == 0 or count == len(chosen):
+                note = _error_note(truth, tracker.trajectory)
+            rate = count / (time.perf_counter() - begin)
+            progress("tracking", count / len(chosen), f"{rate:.1f} frames/s, {_keyframes(tracker.keyframes)}{note}")
+            if stopped.is_set() and count < len(chosen):
+                end = "interrupted"
+                break
+        del images  # ends its thread
+    if not seconds:
+        raise UserError(error)
+    timings = _timings(time.perf_counter() - begin, seconds)
+    stamps = dataset.stamps[chosen][: len(seconds)]
+    info = _settings(dataset, chosen, tracker.options, noise) | {
+        "end": end,
+        "error": error or None,
+        "keyframes": tracker.keyframes,
+        "lost": sum(report.lost for report in tracker.reports),
+        "spline_valid": tracker.spline_valid,
+        "timings": timings,
+        "frames": _diagnostics(stamps, tracker.reports),
+    }
+    estimate = Estimate(*tracker.trajectory, tracker.spline, info)
+    metrics = _metrics(truth, estimate)
+    info["metrics"] = None if metrics is None else metrics.as_dict()
+    write_estimate(out, estimate.stamps, estimate.T_world_depth, estimate.spline, info)
+    return Result(estimate, metrics, end, error, info["lost"])
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _chosen(dataset: Dataset, frames: slice) -> range:
+    chosen = range(len(dataset))[frames]
+    if not len(chosen):
+        raise UserError(f"{dataset.root}: has no frame {frames.start}: its frames are 0 to {len(dataset) - 1}")
+    return chosen
+
+
+def _make_folder(out: Path) -> None:
+    """Complain about the folder before minutes of work, not after."""
+    found = next((name for name in _DATASET_FILES if (out / name).exists()), None)
+    if found is not None:
+        raise UserError(f"{out}: holds a data set ({found}), which a run would overwrite: choose another --out")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        if not os.access(out, os.W_OK):
+            raise PermissionError(13, "Permission denied")
+    except OSError as error:
+        raise write_error(out, error) from None
+
+
+@contextmanager
+def _stop_flag() -> Iterator[threading.Event]:
+    """Ctrl-C sets the flag instead of breaking off in the middle of a frame; a second one breaks off."""
+    flag = threading.Event()
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or before is signal.SIG_IGN:
+        yield flag  # signals are the main thread's business; started in the background, Ctrl-C is meant for others
+        return
+
+    def ask_to_stop(*_: Any) -> None:
+        flag.set()
+        signal.signal(signal.SIGINT, before)
+
+    signal.signal(signal.SIGINT, ask_to_stop)
+    try:
+        yield flag
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _keyframes(count: int) -> str:
+    return f"{count} keyframe" + ("" if count == 1 else "s")
+
+
+def _error_note(truth: Truth | None, poses: tuple[FloatArray, FloatArray]) -> str:
+    if truth is None:
+        return ""
+    try:
+        errors = compare(truth, Estimate(*poses)).position_errors_m
+    except UserError:
+        return ""  # fewer than three poses
+    return f", ATE {1e3 * np.sqrt(np.mean(errors**2)):.2f} mm"
+
+
+def _metrics(truth: Truth | None, estimate: Estimate) -> Metrics | None:
+    """None also where fewer than three poses have a true counterpart."""
+    try:
+        return None if truth is None else evaluate(truth, estimate)
+    except UserError:
+        return None
+
+
+def _settings(dataset: Dataset, chosen: range, options: Options, noise: Noise) -> dict[str, Any]:
+    from rsgen.device.arrays import engine
+
+    versions = {name: version(name) for name in ("numpy", "scipy", "drjit")}
+    return {
+        "method": options.method,
+        "options": dataclasses.asdict(options),
+        "noise": dataclasses.asdict(noise),
+        "versions": {"rstrack": version("rolling-shutter-rgbd"), **versions},
+        "backend": engine(options.backend).backend,
+        "machine": {"cpu_count": os.cpu_count()},
+        "dataset": {
+            "name": dataset.name, "path": str(dataset.root.resolve()),
+            "frames": [chosen.start, chosen.stop], "frames_in_all": len(dataset),
+        },
+    }  # fmt: skip
+
+
+def _timings(total_s: float, seconds: Sequence[float]) -> dict[str, Any]:
+    """Of the tracker alone, but for the total; the first frames compile kernels."""
+    ms = 1e3 * np.array(seconds)
+    return {
+        "total_s": total_s,
+        "median_ms": float(np.median(ms)),
+        "mean_ms": float(ms.mean()),
+        "p95_ms": float(np.percentile(ms, 95)),
+        "frame_ms": np.round(ms, 3),
+    }
+
+
+def _diagnostics(stamps: FloatArray, reports: Sequence[FrameReport]) -> list[dict[str, Any]]:
+    """One dict a frame for the plots: `FrameReport`, with inliers as parts of the run's largest number too."""
+    frames = [dataclasses.asdict(report) for report in reports]
+    for stamp, frame in zip(stamps, frames, strict=True):
+        frame["stamp"] = float(stamp)
+    for stream in ("depth", "color"):
+        counts = [frame[f"inliers_{stream}"] for frame in frames]
+        most = max(counts)
+        for frame, count in zip(frames, counts, strict=True):
+            # Not aligned to anything, as the first frame: no inliers to speak of.
+            frame[f"inliers_{stream}"] = count / most if most and frame["evaluations"] else None
+            frame[f"pixels_{stream}"] = count
+    return frames

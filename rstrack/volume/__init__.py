@@ -1,0 +1,1 @@
+"""The signed distance volume and the mesh in it."""

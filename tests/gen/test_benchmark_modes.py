@@ -1,0 +1,225 @@
+"""`rsgen bench`: other ways to the same picture show the same, times are counted right, and Blender agrees with us."""
+
+from __future__ import annotations
+
+import json
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import tiny
+from rendering import CAMERA, constant_twist, emission_integrator, mi, room_xml
+
+from rsgen.bench.blender import BlenderRenderer, check_installed, export_scene, exposure
+from rsgen.bench.modes import (
+    BLENDER_MODES,
+    MODES,
+    Mode,
+    _measure,
+    render_averaged,
+    render_rows,
+    row_renderer,
+    time_modes,
+)
+from rsgen.bench.table import ModeReport, ModeTimes
+from rsgen.config.config import load_config
+from rsgen.errors import UserError
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter
+from rsgen.render.images import ColorRenderer
+from rsgen.render.scene import load_scene
+
+MOTION = constant_twist((0.5, 0.2, 0.0, 0.4, 3.0, 2.0))
+STAMP = 0.05
+needs_blender = pytest.mark.skipif(find_spec("bpy") is None, reason="needs Blender: pip install 'bpy==4.2.*'")
+
+
+def rms(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.sqrt(np.mean((a - b) ** 2)))
+
+
+@pytest.fixture(scope="module")
+def glowing(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    return load_scene(room_xml(tmp_path_factory.mktemp("glowing")))
+
+
+@pytest.fixture(scope="module")
+def lit(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    return load_scene(tiny.write_scene(tmp_path_factory.mktemp("lit")))
+
+
+def picture(scene: Any, shutter: Shutter, spp: int = 64) -> np.ndarray:
+    return ColorRenderer(scene, emission_integrator(), CAMERA, shutter, spp).render(MOTION, STAMP, 7)
+
+
+def test_a_render_for_each_row_makes_the_rolling_shutters_picture(glowing: Any) -> None:
+    shutter = Shutter(0.05)
+    renderer = row_renderer(glowing, emission_integrator(), CAMERA, 64)
+    rows = [0, 7, 8, 20, CAMERA.height - 1]
+    got = render_rows(renderer, MOTION, STAMP, shutter.line_delay(CAMERA), rows)
+    assert got.shape == (5, CAMERA.width, 3)
+    rolling, still = picture(glowing, shutter)[rows], picture(glowing, Shutter())[rows]
+    assert rms(got, rolling) < 0.01 < 0.05 < rms(got[2:], still[2:])
+    assert rms(got[0], still[0]) < 0.01  # the first row is read at the stamp
+
+
+def test_averaged_sharp_renders_make_the_blurred_picture(glowing: Any) -> None:
+    renderer = ColorRenderer(glowing, emission_integrator(), CAMERA, Shutter(), 1)
+    got = render_averaged(renderer, MOTION, STAMP, 0.04, 64)
+    blurred, late = picture(glowing, Shutter(0, 0.04)), picture(glowing, Shutter(0, 0.004))
+    assert rms(got, blurred) < 0.015 < 0.03 < rms(got, late)
+
+
+def report(**seconds: list[list[float]]) -> ModeReport:
+    modes = (ModeTimes(n.replace("_", "-"), n, 8, "all", np.array(s)) for n, s in seconds.items())
+    return ModeReport(100, 50, {"cores": 2}, tuple(modes), {"blender": "no such luck"})
+
+
+def test_ratios_are_of_the_same_round_or_else_of_the_same_frame() -> None:
+    # The machine slows down tenfold between the frames: pairs do not see it.
+    result = report(still=[[1, 2], [10, 20]], rs_blur=[[1.5, 3], [15, 30]], path=[[20.25], [202.5]])
+    ratios = {(r.mode, r.against): r for r in result.ratios()}
+    assert set(ratios) == {("rs-blur", "still"), ("path", "rs-blur")}
+    assert ratios["rs-blur", "still"].median == pytest.approx(1.5) and ratios["rs-blur", "still"].pairs == 4
+    assert ratios["path", "rs-blur"].median == pytest.approx(9.0) and ratios["path", "rs-blur"].pairs == 2
+
+
+def test_a_report_counts_samples_and_says_what_is_only_computed() -> None:
+    result = report(still=[[0.1, 0.1]], rs_blur=[[0.2, 0.2]])
+    first = json.loads(json.dumps(result.as_dict()))["modes"][0]
+    assert first["frames_per_s"] == pytest.approx(10) and first["samples_per_s"] == pytest.approx(100 * 50 * 8 / 0.1)
+    text = " ".join(result.text().split())
+    assert "computed, not measured: a whole still for each row: 5.0 s a frame, 25x" in text
+    assert "no such luck" in text
+
+
+def test_modes_take_turns_and_a_broken_one_does_not_stop_the_others() -> None:
+    calls: list[str] = []
+
+    def mode(name: str, rounds: int = 1, breaks: bool = False) -> Mode:
+        def seconds(k: int, _: float) -> float:
+            calls.append(f"{name}{k}")
+            if breaks and k == 1:
+                raise UserError("gone")
+            return 100.0 * k + len(calls)
+
+        return Mode(name, name, 1, seconds, rounds)
+
+    modes = [mode("a", 4), mode("long"), mode("b", 4), mode("bad", breaks=True)]
+    seconds, failed = _measure(modes, np.arange(3.0), lambda *_: None)
+    assert calls[:12] == [*["a0", "b0"] * 5, "long0", "bad0"]
+    assert calls[12:] == [*["a1", "b1"] * 5, "long1", "bad1", *["a2", "b2"] * 5, "long2"]
+    assert failed == {"bad": "gone"}
+    assert seconds["a"] == [[115, 117, 119, 121], [227, 229, 231, 233]]  # not the first, which warms up
+    assert seconds["long"] == [[123], [235]]
+
+
+def test_all_modes_are_timed_on_a_tiny_config(tmp_path: Path) -> None:
+    config = load_config(tiny.write_config(tmp_path))
+    result = time_modes(config, 1, 4, MODES, lambda *_: None)
+    assert [m.name for m in result.modes] == list(MODES) and not result.failed
+    times = {m.name: m for m in result.modes}
+    assert times["still"].seconds.shape == (1, 4) and times["path"].seconds.shape == (1, 1)
+    assert times["rows"].measured == f"32 of {tiny.HEIGHT} rows" and times["path"].measured == "1 of 4 spp"
+    # Many launches cannot be quicker than one of the same size.
+    assert times["rows"].median > times["still"].median and times["averaged"].median > times["still"].median
+
+
+def test_only_the_modes_asked_for_are_timed(tmp_path: Path) -> None:
+    config = load_config(tiny.write_config(tmp_path))
+    result = time_modes(config, 1, 1, ["still"], lambda *_: None)
+    assert [m.name for m in result.modes] == ["still"] and result.ratios() == []
+
+
+# --- Blender ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_scene_that_blender_gets_has_our_triangles_and_colours(lit: Any) -> None:
+    arrays, names, sky = export_scene(lit)
+    assert len(names) == 3 and sky == [0, 0, 0]
+    corners = arrays["vertices_1"][arrays["faces_1"]]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert 0.5 * np.linalg.norm(cross, axis=1).sum() == pytest.approx(np.pi, rel=2e-3)  # a ball of radius 0.5 m
+    np.testing.assert_allclose(arrays["colour_1"], [0.7, 0.3, 0.2], atol=1e-6)
+    np.testing.assert_allclose(arrays["radiance_2"], 4.0)
+    pattern = np.random.default_rng(3).integers(60, 230, (8, 8, 3), dtype=np.uint8)[..., ::-1] / 255
+    linear = ((pattern + 0.055) / 1.055) ** 2.4
+    texels = arrays["colour_0"].astype(float)
+    assert min(np.abs(texels - linear).max(), np.abs(texels[::-1] - linear).max()) < 2e-3
+
+
+def test_light_that_blender_does_not_get_is_refused(tmp_path: Path) -> None:
+    tiny.write_scene(tmp_path)
+    cv2.imwrite(str(tmp_path / "sky.png"), np.full((4, 8, 3), 200, np.uint8))
+    text = (tmp_path / "scene.xml").read_text()
+    sky = '<emitter type="envmap"><string name="filename" value="sky.png"/></emitter></scene>'
+    (tmp_path / "scene.xml").write_text(text.replace("</scene>", sky))
+    with pytest.raises(UserError, match="area lamps"):
+        export_scene(load_scene(tmp_path / "scene.xml"))
+
+
+def test_the_uniform_sky_is_handed_over(tmp_path: Path) -> None:
+    tiny.write_scene(tmp_path)
+    text = (tmp_path / "scene.xml").read_text()
+    sky = '<emitter type="constant"><rgb name="radiance" value="0.1, 0.2, 0.4"/></emitter></scene>'
+    (tmp_path / "scene.xml").write_text(text.replace("</scene>", sky))
+    assert export_scene(load_scene(tmp_path / "scene.xml"))[2] == pytest.approx([0.1, 0.2, 0.4])
+
+
+def test_an_exposure_spans_from_the_first_lines_opening_to_the_last_ones_closing() -> None:
+    got = exposure(MOTION, Shutter(0.03, 0.01), 1.0)
+    np.testing.assert_allclose(got.T_world_cam[[0, -1]], MOTION(np.array([0.99, 1.03])))
+    assert got.line_share == pytest.approx(0.25)
+    still = exposure(MOTION, Shutter(), 1.0)
+    assert still.line_share is None and len(still.T_world_cam) == 1
+    with pytest.raises(UserError, match="left-right"):
+        exposure(MOTION, Shutter(0.03, scan="left-right"), 1.0)
+
+
+def test_a_missing_blender_is_one_line_before_any_work(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("rsgen.bench.blender.find_spec", lambda _: None)
+    with pytest.raises(UserError, match="pip install") as caught:
+        check_installed()
+    assert "\n" not in str(caught.value)
+    config = load_config(tiny.write_config(tmp_path)).model_copy(update={"scene": None})
+    with pytest.raises(UserError, match="bpy is not installed"):
+        time_modes(config, 1, 1, [*MODES, *BLENDER_MODES], lambda *_: None)
+
+
+@needs_blender
+def test_blender_renders_the_same_still_and_the_same_rolling_shutter(lit: Any) -> None:
+    camera = Camera(32, 24, 24.0, 27.0, 17.3, 10.2)
+    shutters = [Shutter(), Shutter(0.05), Shutter(0.05, 0.03), Shutter(0, 0.03)]
+    path = mi.load_dict({"type": "path", "max_depth": 3})
+    ours = [ColorRenderer(lit, path, camera, s, 64).render(MOTION, STAMP, 3) for s in shutters]
+    exposures = [exposure(MOTION, s, STAMP) for s in shutters]
+    with BlenderRenderer(lit, camera, exposures, spp=64, max_depth=3) as blender:
+        # Blender keeps the scene: the order must not matter.
+        theirs = {k: blender.render(k) for k in (0, 2, 1, 3)}
+        assert blender.time(1) > 0
+    tone = [np.clip(image, 0, 1) ** (1 / 2.2) for image in ours]
+    for k in range(4):
+        distances = [rms(np.clip(theirs[k], 0, 1) ** (1 / 2.2), image) for image in tone]
+        assert distances[k] < 0.013, (k, distances)
+        assert min(d for other, d in enumerate(distances) if other != k) > 1.7 * distances[k], (k, distances)
+
+
+@needs_blender
+def test_a_blender_that_dies_is_one_line(lit: Any) -> None:
+    still = [exposure(MOTION, Shutter(), STAMP)]
+    with BlenderRenderer(lit, Camera(8, 8, 8.0, 8.0, 3.5, 3.5), still, spp=1, max_depth=2) as blender:
+        assert blender._process is not None
+        blender._process.kill()
+        with pytest.raises(UserError, match="Blender ended with status -9") as caught:
+            blender.time(0)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_lens_with_distortion_is_refused(lit: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rsgen.bench.blender.find_spec", lambda _: object())
+    camera = Camera(8, 8, 8.0, 8.0, 3.5, 3.5, "radtan", (0.1, 0, 0, 0))
+    with pytest.raises(UserError, match="without distortion"):
+        BlenderRenderer(lit, camera, [], spp=1, max_depth=2)

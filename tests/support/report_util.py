@@ -1,0 +1,198 @@
+"""What the tests of `rstrack report` share: folders to report on, and a parser that takes pages apart."""
+
+from __future__ import annotations
+
+import base64
+import json
+from dataclasses import dataclass, field
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import synthetic
+
+from rsgen.config.truth import TruthConfig
+from rsgen.geometry import se3
+from rsgen.geometry.shutter import Shutter
+from rsgen.geometry.spline import Spline
+from rstrack.bench.stress.run import ColorScore, DepthScore, Panels, StressReport, TrackScore
+from rstrack.bench.stress.tables import write_report as write_stress
+from rstrack.data.dataset import open_dataset
+from rstrack.data.estimate import write_estimate
+from rstrack.metrics.evaluate import run_evaluate
+
+SPLINE = synthetic.make_spline()
+WORLD = se3.exp(np.array([3.0, -1.0, 2.0, 0.4, -0.3, 0.4]))
+FRAMES = 31
+NASTY = "</script><b>&"
+
+
+@dataclass
+class Parsed(HTMLParser):
+    """What a test wants to know of a page: attributes, tables as lists of rows, scripts, and the text of the rest."""
+
+    attributes: list[tuple[str, str, str]] = field(default_factory=list)
+    rows: list[list[str]] = field(default_factory=list)
+    scripts: list[str] = field(default_factory=list)
+    styles: list[str] = field(default_factory=list)
+    text: str = ""
+    figures: Any = None
+
+    def __post_init__(self) -> None:
+        super().__init__()
+        self._in: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.attributes += [(tag, name, value or "") for name, value in attrs]
+        if tag not in ("meta", "link", "img", "input", "br"):
+            self._in.append(tag)
+        if tag == "tr":
+            self.rows.append([])
+        elif tag in ("td", "th"):
+            self.rows[-1].append("")
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self._in.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self._in and self._in[-1] in ("script", "style"):
+            (self.scripts if self._in[-1] == "script" else self.styles).append(data)
+            return
+        self.text += data
+        if {"td", "th"} & set(self._in):
+            self.rows[-1][-1] = " ".join((self.rows[-1][-1] + " " + data).split())
+
+    def row(self, name: str) -> list[str]:
+        """The first row of a table with this heading."""
+        return next(row for row in self.rows if row[0] == name)
+
+    def uris(self) -> list[str]:
+        return [value for tag, name, value in self.attributes if (tag, name) == ("img", "src")]
+
+
+def parse(path: Path) -> Parsed:
+    parsed = Parsed()
+    parsed.feed(path.read_text("utf-8"))
+    parsed.close()
+    parsed.figures = json.loads(parsed.scripts[0])
+    return parsed
+
+
+def picture(uri: str) -> np.ndarray:
+    kind, _, data = uri.partition(",")
+    assert kind == "data:image/jpeg;base64"
+    image = cv2.imdecode(np.frombuffer(base64.b64decode(data, validate=True), np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    return np.asarray(image)
+
+
+def global_image(config: Any, stamp: float) -> np.ndarray:
+    """The colour image that all lines would show at the middle one's time."""
+    camera, shutter = config.color.camera, config.color.shutter
+    middle = float(shutter.line_mid_time(stamp, (shutter.line_count(camera) - 1) / 2, camera))
+    return synthetic.render_color(SPLINE, camera, Shutter(), middle, np.array(config.T_color_depth))
+
+
+def make_sequence(root: Path, *, twin: bool = False) -> Path:
+    config = synthetic.make_config()
+    if not twin:
+        return synthetic.make_sequence(root, config, FRAMES)
+    config = config.model_copy(update={"truth": TruthConfig(global_shutter=("middle",))})
+    writer = synthetic.open_writer(root, config, FRAMES)
+    for k in range(FRAMES):
+        stamp, T = float(writer.stamps("color")[k]), np.array(config.T_color_depth)
+        image = synthetic.render_color(SPLINE, config.color.camera, config.color.shutter, stamp, T)
+        writer.write_color(k, image, {"global_middle": global_image(config, stamp)})
+        writer.write_depth(k, synthetic.render_depth(SPLINE, config.depth.camera, config.depth.shutter, stamp))
+    writer.finish()
+    return root
+
+
+def make_run(run: Path, sequence: Path, seed: int = 1, error_m: float = 0.004, **info: Any) -> Path:
+    """A run folder with errors of known size; two frames are lost."""
+    stamps = open_dataset(sequence).stamps
+    rng = np.random.default_rng(seed)
+    xi = error_m * rng.normal(size=(len(SPLINE.control_points), 6))
+    spline = Spline(se3.orthonormalise(WORLD @ SPLINE.control_points @ se3.exp(xi)), SPLINE.t0, SPLINE.dt)
+    kept = np.delete(np.arange(len(stamps)), [10, 11, 12, 13])
+    frames = [
+        {"stamp": float(t), "inliers_depth": 0.8, "inliers_color": None, "keyframe": k % 8 == 0, "lost": 10 <= k < 14}
+        for k, t in enumerate(stamps)
+    ]
+    info = {
+        "method": "rs-pg", "lost": 4, "frames": frames, "options": {"method": "rs-pg", "knot_spacing_s": 0.025},
+        "timings": {"median_ms": 12.5, "frame_ms": [12.5] * len(stamps)}, "end": "done",
+        "dataset": {"name": NASTY, "frames": [0, FRAMES], "path": str(sequence)},
+    } | info  # fmt: skip
+    write_estimate(run, stamps[kept], spline.pose(stamps[kept]), spline, info)
+    return run
+
+
+def shown(value: float | None, scale: float = 1.0) -> str:
+    assert value is not None
+    return f"{value * scale:.4g}"
+
+
+def make_bench(root: Path, sequence: Path, twin: Path) -> Path:
+    """A benchmark of two sequences and three methods, one of which has failed on one of them."""
+    methods, errors = ("baseline", "rs-pg", "open3d-icp"), (0.02, 0.001, 0.01)
+    cells, metrics = [], {}
+    for name, path in (("a", sequence), ("b", twin)):
+        for k, method in enumerate(methods):
+            folder = f"cells/{name}/{method}"
+            cell: dict[str, Any] = {"sequence": name, "method": method, "run": folder, "frames": 31, "lost": 0}
+            if (name, method) == ("b", "open3d-icp"):
+                cell |= {"ate_m": None, "rpe_m_s": None, "rpe_deg_s": None, "seconds": None, "error": "is not here"}
+            else:
+                m = run_evaluate(path, make_run(root / folder, path, seed=k, error_m=errors[k]))
+                metrics[name, method] = m
+                cell |= {"ate_m": m.ate_rmse_m, "rpe_m_s": m.rpe_trans_rmse_m_per_s, "seconds": 3.1}
+                cell |= {"rpe_deg_s": m.rpe_rot_rmse_deg_per_s, "lost": 4, "error": None}
+            cells.append(cell)
+    groups = {"a": "living room", "b": "hand-held"}
+    averages = [
+        {"group": groups[name], "method": method, "sequences": [name], "ate_m": m.ate_rmse_m, "rpe_m_s": 1.0,
+         "rpe_deg_s": 1.0, "better_pct": {"ate_m": None if method == "baseline" else 95.0}}
+        for (name, method), m in metrics.items()
+    ]  # fmt: skip
+    paper = [
+        {"sequence": name, "method": "rs-pg", "ate_m": ate, "rpe_m_s": 1.0, "rpe_deg_s": 2.0}
+        for name, ate in (("a", 1.0), ("b", 1e-6))
+    ]
+    places = (("a", sequence), ("b", twin))
+    listed = [{"name": name, "group": groups[name], "path": str(path), "frames": FRAMES} for name, path in places]
+    results = {
+        "machine": {"cpu": "imaginary"}, "version": "0", "sequences": listed, "methods": methods, "cells": cells,
+        "averages": averages, "paper": paper,
+    }  # fmt: skip
+    (root / "results.json").write_text(json.dumps(results))
+    return root
+
+
+def make_stress(root: Path, seed: int = 5) -> StressReport:
+    """The folder of a stress test of four sequences; the estimated path has a score that cannot be had."""
+    rng = np.random.default_rng(seed)
+    cases = [("exposure_0ms", 1.0, 0.0), ("exposure_20ms", 1.0, 0.02), ("exposure_30ms", 1.0, 0.03)]
+    cases.append(("exposure_20ms_speed_2x", 2.0, 0.02))
+    color, depth, tracking = [], [], []
+    for case, speed, exposure in cases:
+        for poses in ("true", "estimated"):
+            for sigma in (None, 0.5, 1.0):
+                psnr, least = rng.uniform(30, 35), rng.uniform(25, 30)
+                likeness = np.nan if (case, poses) == ("exposure_0ms", "estimated") else rng.uniform(0.5, 1)
+                color.append(
+                    ColorScore(case, speed, exposure, poses, sigma, psnr, least, likeness, rng.uniform(0.1, 0.9), 4)
+                )
+            depth.append(DepthScore(case, poses, rng.uniform(2e-3, 3e-3), rng.uniform(1e-3, 2e-3), 1000))
+        for variant in ("mid-exposure", "end of exposure"):
+            drift = None if speed > 1.0 else rng.uniform(1e-3, 2e-3)
+            tracking.append(TrackScore(case, speed, exposure, variant, rng.uniform(1e-4, 4e-3), drift, int(speed) - 1))
+    tracking.append(TrackScore("exposure_30ms", 1.0, 0.03, "blur weight", None, None, 31))
+    images = [cv2.blur(rng.integers(0, 256, (48, 64, 3)).astype(np.uint8), (5, 5)) for _ in range(4)]
+    weights = np.tile(np.linspace(0.0, 0.25, 64, dtype=np.float32), (48, 1))
+    panels = Panels("exposure_20ms", 12, images[0], weights, *images[1:])
+    report = StressReport(NASTY, tuple(color), tuple(depth), tuple(tracking), panels)
+    write_stress(report, root)
+    return report

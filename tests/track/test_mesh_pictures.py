@@ -1,0 +1,266 @@
+"""Maps of the whole evaluation: what is fused how, what is kept, what fails, and that the report shows them."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import synthetic
+import trimesh
+import yaml
+
+import rstrack.bench.methods.mesh_pictures as mesh_pictures
+from rsgen.console.command_line import Commands, Parser, run_program
+from rstrack.bench.methods.grid import Cell, Results
+from rstrack.bench.methods.mesh_pictures import draw_meshes, make_mesh, read_picture
+from rstrack.bench.methods.plan import SequenceInfo
+from rstrack.bench.methods.tables import write_results
+from rstrack.cli.bench_methods import add_evaluation
+from rstrack.data.estimate import write_estimate
+from rstrack.report.build import write_report
+
+FRAMES = 8
+RUN = subprocess.run
+METHODS = ("baseline", "rs-pg", "gs-g")
+ATE_M = {"baseline": 0.0123, "rs-pg": 0.00045, "gs-g": 0.006}
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """seq/, and bench/ with a cell of each method, along the true path; the baseline has no spline."""
+    folder = tmp_path_factory.mktemp("meshes")
+    synthetic.make_sequence(folder / "seq", synthetic.make_config(), FRAMES)
+    spline = synthetic.make_spline()
+    stamps = np.arange(FRAMES) / synthetic.RATE_HZ
+    for method in METHODS:
+        run = folder / "bench/cells/a" / method
+        write_estimate(run, stamps, spline.pose(stamps), None if method == "baseline" else spline, {"method": method})
+    draw_meshes(of(folder), folder / "bench")
+    return folder
+
+
+@pytest.fixture
+def place(original: Path, tmp_path: Path) -> Path:
+    """A copy of it to change."""
+    shutil.copytree(original / "bench", tmp_path / "w/bench")
+    (tmp_path / "w/seq").symlink_to(original / "seq")
+    return tmp_path / "w"
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """What is fused (the method) and drawn ('picture', grey and at once) from now on."""
+    made: list[str] = []
+    real_map = mesh_pictures.run_map
+
+    def watched_map(sequence: Path, run: Path, *rest: Any, **named: Any) -> Any:
+        made.append(run.name)
+        return real_map(sequence, run, *rest, **named)
+
+    def draw(command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
+        made.append("picture")
+        (out,) = [word.removeprefix("--out=") for word in command if word.startswith("--out=")]
+        cv2.imwrite(out, np.full((570, 720, 3), 128, np.uint8))
+        return subprocess.CompletedProcess(command, 0, "", "")
+
+    monkeypatch.setattr(mesh_pictures, "run_map", watched_map)
+    monkeypatch.setattr(subprocess, "run", draw)
+    yield made
+
+
+def of(folder: Path, **changes: Any) -> Results:
+    """Results with the cells, each with cell.json; `changes`: fields of the baseline's."""
+    cells = []
+    for method in METHODS:
+        metrics = {"ate_rmse_m": ATE_M[method], "rpe_trans_rmse_m_per_s": 0.1, "rpe_rot_rmse_deg_per_s": 1.0}
+        cell = Cell(f"key of {method}", "a", method, metrics, FRAMES, 0, 1.0)
+        if method == "baseline":
+            cell = dataclasses.replace(cell, **changes)
+        (folder / "bench/cells/a" / method / "cell.json").write_text(json.dumps(dataclasses.asdict(cell)))
+        cells.append(cell)
+    sequence = SequenceInfo("a", "hand-held", folder / "seq", FRAMES)
+    return Results((sequence,), METHODS, tuple(cells), {"cpu": "imaginary", "cpu_count": 1}, "0")
+
+
+def panel(folder: Path, k: int) -> np.ndarray:
+    """The k-th mesh of the picture (540, 720, 3), 6 px from the next and below 30 px of label."""
+    image = cv2.imread(str(folder / "bench/plots/meshes_a.jpg"))
+    assert image is not None and image.shape == (570, 2 * 720 + 6, 3)
+    return np.asarray(image[30:, k * 726 : k * 726 + 720])
+
+
+def distance_to_box(folder: Path, method: str) -> np.ndarray:
+    """How far (n,) m a map's vertices, less those of the ball and near it, are from the walls of the true room."""
+    mesh = trimesh.load(folder / "bench/cells/a" / method / "mesh.ply", process=False)
+    p = np.asarray(mesh.vertices)
+    p = p[np.linalg.norm(p - synthetic.BALL, axis=1) > 1.5 * synthetic.BALL_RADIUS]
+    return np.abs(p[:, None] - synthetic.BOX).min(axis=(1, 2))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def test_lines_have_poses_of_their_own_where_the_method_says_so(original: Path) -> None:
+    ours, baseline = distance_to_box(original, "rs-pg"), distance_to_box(original, "baseline")
+    assert np.median(ours) < 0.001 < np.median(baseline)
+    assert not (original / "bench/cells/a/gs-g/mesh.ply").exists()
+    cell = of(original).cells[2]
+    options = make_mesh(of(original).sequences[0], cell, original / "bench")["options"]
+    assert options["shutter"] == "gs", "gs-g has a spline, and takes the shutter for a global one all the same"
+    assert np.median(distance_to_box(original, "gs-g")) > 0.001
+
+
+def test_the_picture_shows_ours_first(original: Path) -> None:
+    panels = [panel(original, k) for k in range(2)]
+    assert all(p.std() > 20.0 and (p > 250).all(axis=-1).mean() < 0.96 for p in panels)
+    assert np.abs(panels[0].astype(float) - panels[1]).mean() > 0.5
+    of(original)
+    found = read_picture(original / "bench", "a")
+    assert found is not None and found.methods == ("rs-pg", "baseline")
+    assert found.labels == ("rs-pg, ATE 0.45 mm", "baseline, ATE 12.3 mm") and found.panel_px == (720, 540)
+
+
+def test_a_long_sequence_is_thinned(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[int] = []
+    monkeypatch.setattr(mesh_pictures, "run_map", lambda _, __, ___, options, **____: seen.append(options.every))
+    results = of(place)
+    for frames in (30, 80, 648, 1509):
+        shutil.rmtree(place / "bench/cells/a/gs-g", ignore_errors=True)
+        (place / "bench/cells/a/gs-g").mkdir()
+        make_mesh(dataclasses.replace(results.sequences[0], frames=frames), results.cells[2], place / "bench")
+    assert seen == [1, 1, 8, 19]
+
+
+def test_what_is_there_is_kept_and_what_changed_is_made_again(place: Path, calls: list[str]) -> None:
+    out = place / "bench"
+    assert draw_meshes(of(place), out) == [out / "plots/meshes_a.jpg"]
+    assert calls == []
+    assert draw_meshes(of(place, key="another"), out) and calls == ["baseline", "picture"]
+    calls.clear()
+    (out / "plots/meshes_a.jpg").unlink()
+    draw_meshes(of(place, key="another"), out)
+    assert calls == ["picture"] and (out / "plots/meshes_a.jpg").is_file()
+    calls.clear()
+    draw_meshes(of(place, key="another"), out, ("baseline",))
+    assert calls == ["picture"], "of fewer meshes"
+
+
+def test_an_interrupt_leaves_nothing_half_made(place: Path, calls: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    out = place / "bench"
+    with monkeypatch.context() as broken:
+
+        def interrupted(_: Any, __: Any, mesh: Path, *___: Any, **____: Any) -> None:
+            mesh.write_text("half of it")
+            raise KeyboardInterrupt
+
+        broken.setattr(mesh_pictures, "run_map", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            draw_meshes(of(place, key="another"), out)
+    # Back to the inputs of the mesh that is no longer there.
+    draw_meshes(of(place), out)
+    assert calls == ["baseline"] and np.median(distance_to_box(place, "baseline")) > 0.0
+
+
+def test_what_fails_is_said_and_the_others_are_drawn(
+    place: Path, calls: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, said = place / "bench", list[str]()
+    (out / "cells/a/baseline/trajectory.txt").write_text("not a trajectory\n")
+    draw_meshes(of(place, key="another"), out, ("baseline", "rs-pg"), warn=said.append)
+    assert len(said) == 1 and said[0].startswith("no mesh of baseline on a: ") and "trajectory.txt" in said[0]
+    found = read_picture(out, "a")
+    assert found is not None and found.methods == ("rs-pg",) and calls == ["baseline", "picture"]
+    (out / "cells/a/rs-pg/mesh.ply").write_text("no mesh")
+    said.clear()
+    assert draw_meshes(of(place), out, ("rs-pg",), warn=said.append) != [] and said == []
+    (out / "plots/meshes_a.jpg").unlink()
+    monkeypatch.setattr(subprocess, "run", RUN)
+    assert draw_meshes(of(place), out, ("rs-pg",), warn=said.append) == []
+    assert len(said) == 1 and "no picture of the meshes of a: rsgen picture: " in said[0] and "mesh.ply" in said[0]
+
+
+def test_lost_tracks_are_not_shown(place: Path, calls: list[str]) -> None:
+    draw_meshes(of(place, lost=FRAMES - 1), place / "bench")
+    found = read_picture(place / "bench", "a")
+    assert found is not None and found.methods == ("rs-pg",) and calls == ["picture"]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def test_the_report_shows_the_parts_of_the_picture(place: Path) -> None:
+    write_results(of(place), place / "bench")
+    page = write_report(place / "bench").read_text()
+    shown: dict[str, list[Any]] = {}
+    for uri, alt in re.findall(r'<img[^>]*src="data:image/jpeg;base64,([^"]+)" alt="map from above, ([^"]+)"', page):
+        shown.setdefault(alt, []).append(cv2.imdecode(np.frombuffer(base64.b64decode(uri), np.uint8), cv2.IMREAD_COLOR))
+    assert list(sorted(shown)) == ["baseline, ATE 12.3 mm", "rs-pg, ATE 0.45 mm"]
+    for k, label in enumerate(("rs-pg, ATE 0.45 mm", "baseline, ATE 12.3 mm")):
+        large, small = sorted(shown[label], key=lambda image: -image.shape[1])
+        assert large.shape == (540, 720, 3) and small.shape == (360, 480, 3)
+        assert np.abs(large.astype(float) - panel(place, k)).mean() < 3.0
+    assert "Map with baseline against rs-pg" in page
+
+
+def test_the_report_leaves_out_maps_of_cells_that_were_run_again(place: Path) -> None:
+    write_results(of(place, key="another"), place / "bench")
+    assert read_picture(place / "bench", "a") is None
+    page = write_report(place / "bench").read_text()
+    assert "map from above" not in page
+    write_results(of(place), place / "bench")
+    (place / "bench/plots/meshes_a.jpg").write_text("no JPEG")
+    page = write_report(place / "bench").read_text()
+    assert "No maps of a: " in page and "map from above" not in page
+
+
+def bench(words: str) -> int:
+    def parser() -> Parser:
+        commands = Commands("rstrack", "test")
+        add_evaluation(commands)
+        return commands.parser
+
+    return run_program("rstrack", parser, words.split(), "nothing was written")
+
+
+@pytest.mark.parametrize(
+    ("words", "drawn"), [("", True), ("--no-meshes", False), ("--quick", False), ("--quick --meshes", True)]
+)
+def test_the_command(
+    place: Path, words: str, drawn: bool, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    results, called = of(place), []
+    monkeypatch.setattr("rstrack.bench.methods.grid.run_plan", lambda *_: results)
+    monkeypatch.setattr("rstrack.bench.methods.plots.draw_plots", lambda *_: [])
+
+    def draw(given: Results, out: Path, progress: Any, warn: Any) -> list[Path]:
+        called.append((given, out))
+        warn("no mesh of this one")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(mesh_pictures, "draw_meshes", draw)
+    entry = {"name": "seq", "group": "g", "config": "seq.yaml"}
+    quick = {"sequences": ["seq"], "methods": ["rs-pg"], "frames": 10}
+    (place / "c.yaml").write_text(yaml.safe_dump({"sequences": [entry], "methods": ["rs-pg"], "quick": quick}))
+    status = bench(f"bench {place}/c.yaml --data {place} --out {place}/bench --quiet {words}")
+    out, error = capfd.readouterr()
+    assert called == ([(results, place / "bench")] if drawn else [])
+    assert status == (130 if drawn else 0) and "rs-pg" in out
+    assert ("no mesh of this one\n" in error and "the same command goes on" in error) == drawn
+
+
+def test_meshes_of_methods_that_have_none_are_refused(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    entry = {"name": "seq", "group": "g", "config": "seq.yaml"}
+    (place / "c.yaml").write_text(yaml.safe_dump({"sequences": [entry], "methods": ["rs-g"]}))
+    assert bench(f"bench {place}/c.yaml --data {place} --out {place}/new --meshes") == 2
+    assert capfd.readouterr().err == "rstrack: --meshes: is for rs-pg, gs-pg, baseline: add one of them to --method\n"
+    assert not (place / "new").exists()

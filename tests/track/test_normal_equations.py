@@ -1,0 +1,297 @@
+"""From 6×6 systems to control points, priors, banded solve and the growing spline, against dense algebra."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rstrack_util import hand_held, moved
+from util import numeric_jacobian, random_spline, random_twists
+
+from rsgen.geometry import se3
+from rsgen.geometry.spline import Spline
+from rstrack.alignment.normal_equations import (
+    Quadratic,
+    acceleration_prior,
+    assemble,
+    chain,
+    line_jacobian,
+    pose_constraint,
+    solve,
+)
+from rstrack.alignment.optimizer import SplineState
+from rstrack.alignment.residuals import BlockSums
+
+TIMES = np.array([0.34, 0.352, 0.41, 0.43, 0.449, 0.452])  # segments 0 (twice), 2 (three times) and 3
+
+
+def random_spd(rng: np.random.Generator, shape: tuple[int, ...], size: int = 6) -> np.ndarray:
+    A = rng.normal(size=(*shape, size, size + 2))
+    return A @ np.swapaxes(A, -1, -2)
+
+
+def random_sums(rng: np.random.Generator, current: int, reference: int) -> BlockSums:
+    return BlockSums(random_spd(rng, (current, reference)), rng.normal(size=(current, reference, 6)), 0.0, 0.0, 1)
+
+
+# -- chain rule ----------------------------------------------------------------------------------------------------
+
+
+def test_line_jacobian_is_the_derivative_of_the_twist_in_the_base_frame() -> None:
+    spline = random_spline(3)
+    T_world_base = se3.exp(np.array([0.4, -0.2, 0.3, 0.5, 0.1, -0.7]))
+
+    def twist(x: np.ndarray) -> np.ndarray:
+        T = moved(spline, x.reshape(-1, 6)).pose(TIMES)
+        return se3.log(se3.inverse(T_world_base) @ T @ se3.inverse(spline.pose(TIMES)) @ T_world_base)
+
+    numeric = numeric_jacobian(twist, 6 * 9)
+    J = line_jacobian(spline, T_world_base, TIMES, 0, 7)
+    np.testing.assert_allclose(J, numeric[:, :, :42], atol=1e-7)
+    assert np.abs(numeric[:, :, 42:]).max() == 0.0
+    # Control points moved alike move every line alike.
+    to_base = se3.adjoint(se3.inverse(T_world_base))
+    np.testing.assert_allclose(J.reshape(6, 6, 7, 6).sum(axis=2), np.broadcast_to(to_base, (6, 6, 6)), atol=1e-12)
+
+
+def test_chain_equals_the_sum_over_blocks() -> None:
+    rng, spline, T = np.random.default_rng(1), random_spline(4), se3.exp(np.full(6, 0.2))
+    sums = random_sums(rng, len(TIMES), 1)
+    model, motion = chain(sums, spline, T, TIMES, None)
+    assert (model.first, model.last) == (0, 7) and motion.shape == (6, 6, 42)
+    J = line_jacobian(spline, T, TIMES, 0, 7)
+    np.testing.assert_array_equal(motion, J)
+    H = sum(J[i].T @ sums.H[i, 0] @ J[i] for i in range(6))
+    g = sum(J[i].T @ sums.g[i, 0] for i in range(6))
+    np.testing.assert_allclose(model.H, H, atol=1e-11 * np.abs(H).max())
+    np.testing.assert_allclose(model.g, g, atol=1e-11 * np.abs(g).max())
+    np.testing.assert_array_equal(model.H, model.H.T)
+
+
+def test_chain_begins_at_the_first_control_point_that_is_touched() -> None:
+    rng, spline = np.random.default_rng(1), random_spline(4)
+    model, _ = chain(random_sums(rng, 2, 1), spline, np.eye(4), TIMES[-2:], None)
+    assert (model.first, model.last, model.H.shape) == (2, 7, (30, 30))
+
+
+def test_a_rolling_reference_moves_the_other_way() -> None:
+    rng, spline, T = np.random.default_rng(2), random_spline(5), se3.exp(np.full(6, -0.3))
+    times, ref_times = TIMES[3:], TIMES[:3]
+    sums = random_sums(rng, 3, 3)
+    # Pairs of blocks that no pixel connects.
+    for a, b in ((0, 2), (2, 1)):
+        sums.H[a, b], sums.g[a, b] = 0.0, 0.0
+    model, motion = chain(sums, spline, T, times, ref_times)
+    assert (model.first, model.last) == (0, 7)
+    J, K = line_jacobian(spline, T, times, 0, 7), line_jacobian(spline, T, ref_times, 0, 7)
+    np.testing.assert_array_equal(motion, J)
+    H, g = np.zeros((42, 42)), np.zeros(42)
+    for a in range(3):
+        for b in range(3):
+            H += (J[a] - K[b]).T @ sums.H[a, b] @ (J[a] - K[b])
+            g += (J[a] - K[b]).T @ sums.g[a, b]
+    np.testing.assert_allclose(model.H, H, atol=1e-11 * np.abs(H).max())
+    np.testing.assert_allclose(model.g, g, atol=1e-11 * np.abs(g).max())
+    # A motion of everything changes nothing.
+    gauge = np.tile(rng.normal(size=6), 7)
+    assert np.abs(model.H @ gauge).max() < 1e-10 * np.abs(model.H).max()
+    assert abs(model.g @ gauge) < 1e-10 * np.abs(model.g).max()
+
+
+# -- priors --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_acceleration_prior_is_that_of_its_cost(seed: int) -> None:
+    spline, rng = random_spline(seed), np.random.default_rng(seed)
+    first, last = 2, 8
+    sigma = rng.uniform(0.5, 2.0, (last - first - 2, 6))
+
+    def errors(x: np.ndarray) -> np.ndarray:
+        T = moved(spline, x.reshape(-1, 6), first).control_points[first:last]
+        omega = se3.log(np.linalg.inv(T[:-1]) @ T[1:])
+        return ((omega[1:] - omega[:-1]) / sigma).ravel()
+
+    model, cost = acceleration_prior(spline, first, last, sigma)
+    assert cost == pytest.approx(0.5 * (errors(np.zeros(36)) ** 2).sum())
+    assert (model.first, model.last) == (first, last)
+    J = numeric_jacobian(errors, 6 * (last - first))
+    np.testing.assert_allclose(model.H, J.T @ J, atol=1e-6 * np.abs(J.T @ J).max())
+    np.testing.assert_allclose(model.g, J.T @ errors(np.zeros(36)), atol=1e-7 * np.abs(model.g).max())
+    assert np.abs(model.g).max() > 0.1
+
+
+def test_acceleration_prior_asks_nothing_of_constant_velocity() -> None:
+    T = se3.exp(np.arange(8)[:, None] * np.array([0.1, -0.05, 0.2, 0.02, 0.1, -0.04]))
+    model, cost = acceleration_prior(Spline(T, 0.0, 0.05), 0, 8, np.ones((6, 6)))
+    assert cost < 1e-24
+    assert np.abs(model.g).max() < 1e-12
+    assert np.linalg.matrix_rank(model.H) == 36  # free: pose and velocity
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-6, 0.3])
+def test_pose_constraint_is_that_of_its_cost(size: float) -> None:
+    spline, t = random_spline(7), 0.43
+    sigma = np.array([0.5, 0.6, 0.7, 1.0, 1.2, 1.4])
+    target = se3.exp(random_twists(np.random.default_rng(8), (), size, size)) @ spline.pose(t)
+
+    def errors(x: np.ndarray) -> np.ndarray:
+        return se3.log(moved(spline, x.reshape(-1, 6), 2).pose(t) @ np.linalg.inv(target)) / sigma
+
+    model, cost = pose_constraint(spline, t, target, sigma)
+    assert cost == pytest.approx(0.5 * (errors(np.zeros(24)) ** 2).sum(), rel=1e-6, abs=1e-25)
+    assert (model.first, model.last) == (2, 6)
+    J = numeric_jacobian(errors, 24)
+    np.testing.assert_allclose(model.H, J.T @ J, atol=1e-6 * np.abs(J.T @ J).max())
+    np.testing.assert_allclose(model.g, J.T @ errors(np.zeros(24)), atol=1e-6 * max(size, 1e-9))
+
+
+def test_a_tight_pose_constraint_is_met() -> None:
+    state = SplineState.still(0.3, 0.05, np.eye(4), 9)
+    target = se3.exp(np.array([0.02, -0.01, 0.03, 0.04, 0.01, -0.02]))
+    for _ in range(4):
+        prior, _ = acceleration_prior(state.spline, 0, 9, np.full((7, 6), 0.01))
+        hold, _ = pose_constraint(state.spline, 0.43, target, np.full(6, 1e-6))
+        still = Quadratic(0, 1e-3 * np.eye(54), np.zeros(54))
+        H, g = assemble([prior, hold, still], 0, 9)
+        state.apply(0, solve(H, g, 54).reshape(-1, 6))
+    np.testing.assert_allclose(state.spline.pose(0.43), target, atol=1e-9)
+
+
+# -- models, assembly and solution ---------------------------------------------------------------------------------
+
+
+def test_a_moved_model_is_the_same_parabola() -> None:
+    rng = np.random.default_rng(3)
+    model = Quadratic(2, random_spd(rng, (), 18), rng.normal(size=18))
+    value = lambda m, x: 0.5 * x @ m.H @ x + m.g @ x  # noqa: E731
+    step = rng.normal(size=(8, 6))
+    there = model.moved(step)
+    own = step[2:5].ravel()
+    for x in rng.normal(size=(5, 18)):
+        assert value(there, x) + value(model, own) == pytest.approx(value(model, own + x))
+    step[2:5] = 0.0
+    assert model.moved(step) is model
+
+
+def test_assembly_restricts_to_the_free_control_points() -> None:
+    rng = np.random.default_rng(4)
+    models = [Quadratic(first, random_spd(rng, (), 24), rng.normal(size=24)) for first in (0, 2, 5, 9)]
+    total, slope = np.zeros((78, 78)), np.zeros(78)
+    for m in models:
+        at = slice(6 * m.first, 6 * m.last)
+        total[at, at] += m.H
+        slope[at] += m.g
+    for first, last in ((0, 13), (3, 8), (4, 5), (12, 13)):
+        H, g = assemble(models, first, last)
+        free = slice(6 * first, 6 * last)
+        np.testing.assert_allclose(H, total[free, free])
+        np.testing.assert_allclose(g, slope[free])
+    H, g = assemble(models[:1], 4, 6)
+    assert not H.any() and not g.any()
+
+
+@pytest.mark.parametrize("points", [1, 3, 4, 12, 40])
+def test_solution_equals_that_of_dense_algebra(points: int) -> None:
+    rng = np.random.default_rng(points)
+    size, width = 6 * points, min(points, 4)
+    H = 1e-3 * np.eye(size)
+    for first in range(points - width + 1):
+        at = slice(6 * first, 6 * (first + width))
+        H[at, at] += random_spd(rng, (), 6 * width)
+    # Units and weights that differ by many orders of magnitude.
+    scale = 10.0 ** rng.uniform(-5, 5, size)
+    H, g = H * scale[:, None] * scale, rng.normal(size=size) * scale
+    x = solve(H, g)
+    want = np.linalg.solve(H / scale[:, None] / scale, -g / scale) / scale
+    np.testing.assert_allclose(x * scale, want * scale, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(H @ x, -g, rtol=1e-6, atol=1e-9 * np.abs(g).max())
+
+
+def test_a_wider_band_is_used_where_it_is_asked_for() -> None:
+    H, g = random_spd(np.random.default_rng(5), (), 60), np.ones(60)
+    np.testing.assert_allclose(solve(H, g, 60), -np.linalg.solve(H, g), rtol=1e-6)
+    assert np.abs(solve(H + 60 * np.eye(60), g, 24) + np.linalg.solve(H + 60 * np.eye(60), g)).max() > 1e-4
+
+
+@pytest.mark.parametrize("least", [0.0, -1.0])
+def test_a_system_without_a_minimum_is_refused(least: float) -> None:
+    H = np.diag([*np.ones(11), least])
+    H[0, 1] = H[1, 0] = 0.5
+    with pytest.raises(np.linalg.LinAlgError):
+        solve(H, np.ones(12))
+
+
+# -- the growing spline --------------------------------------------------------------------------------------------
+
+
+def test_extension_keeps_the_velocity() -> None:
+    step = np.array([0.01, -0.02, 0.03, 0.04, -0.01, 0.02])
+    state = SplineState.still(0.0, 0.05, np.eye(4))
+    state.apply(0, np.arange(4)[:, None] * step)  # exp(k ξ)
+    state.extend(1.0)
+    assert len(state.points) == 24 == len(state.moved)
+    np.testing.assert_allclose(state.points, se3.exp(np.arange(24)[:, None] * step), atol=1e-12)
+    np.testing.assert_allclose(state.spline.velocity(0.97), step / 0.05, atol=1e-9)
+    assert not state.moved[4:].any()
+
+
+def test_extension_covers_the_time_and_no_more() -> None:
+    state = SplineState.still(0.1, 0.05, np.eye(4))
+    state.extend(0.12)
+    assert len(state.points) == 4
+    before = state.spline
+    assert state.spline is before
+    state.extend(0.31)
+    assert state.spline.t_end == pytest.approx(0.35) and state.spline is not before
+    assert state.segment(0.31) == 4 and state.spline.locate(0.31)[0] == 4
+
+
+def test_increments_multiply_from_the_left() -> None:
+    rng, truth = np.random.default_rng(6), hand_held(3)
+    state = SplineState(truth)
+    delta, again = random_twists(rng, (2, 4), 0.3, 0.2)
+    state.apply(5, delta)
+    want = truth.control_points.copy()
+    want[5:9] = se3.exp(delta) @ want[5:9]
+    np.testing.assert_allclose(state.spline.control_points, want, atol=1e-14)
+    state.apply(7, again)
+    want[7:11] = se3.exp(again) @ want[7:11]
+    np.testing.assert_allclose(state.spline.control_points, want, atol=1e-14)
+    total = np.zeros((15, 6))
+    total[5:9] += delta
+    total[7:11] += again
+    np.testing.assert_allclose(state.moved, total)
+
+
+def test_poses_stay_rotations_for_ever() -> None:
+    rng = np.random.default_rng(7)
+    state = SplineState.still(0.0, 0.05, se3.exp(np.array([0.3, 0.1, 0.2, 0.5, -0.4, 0.8])))
+    for k in range(1000):
+        state.extend(0.05 * (k + 1))
+        state.apply(len(state.points) - 4, random_twists(rng, (4,), 0.02, 0.01))
+    R = state.points[:, :3, :3]
+    assert len(state.points) == 1004
+    assert np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max() < 1e-14
+    assert np.linalg.det(R).min() > 0.0
+
+
+def test_a_long_extrapolation_stays_rotations() -> None:
+    # With the transpose taken as inverse, what is left of orthogonality would grow 2.4 times a knot.
+    state = SplineState.still(0.0, 0.05, np.eye(4))
+    state.apply(0, np.arange(4)[:, None] * np.array([0.01, -0.02, 0.03, 0.3, -0.2, 0.25]))
+    for k in range(300):
+        state.extend(0.05 * (k + 1))
+    R = state.points[:, :3, :3]
+    assert np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max() < 1e-14
+
+
+@pytest.mark.parametrize("broken", ["H is NaN", "g is NaN", "a diagonal is negative"])
+def test_equations_that_are_not_finite_have_no_solution(broken: str) -> None:
+    """A track that ran away, lr kt0 with a global shutter, once ended in scipy's ValueError."""
+    H, g = np.eye(24), np.ones(24)
+    if broken == "a diagonal is negative":
+        H[3, 3], H[3, 5], H[5, 3] = -1e-9, 1e200, 1e200
+    else:
+        (H if broken == "H is NaN" else g)[3] = np.nan
+    with pytest.raises(np.linalg.LinAlgError):
+        solve(H, g)

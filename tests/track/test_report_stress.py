@@ -1,0 +1,260 @@
+"""The page of a blur stress test: its numbers are those of the results file, its pictures the panels."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from report_util import NASTY, Parsed, make_stress, parse, picture
+
+from rsgen.console.command_line import Commands, run_program
+from rsgen.errors import UserError
+from rstrack.bench.stress.run import StressReport
+from rstrack.bench.stress.tables import read_panels, read_report
+from rstrack.cli.report import add_report
+from rstrack.report.build import write_report
+
+LABELS = {
+    "exposure_0ms": "0 ms", "exposure_20ms": "20 ms", "exposure_30ms": "30 ms",
+    "exposure_20ms_speed_2x": "20 ms, 2× speed",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, StressReport]:
+    root = tmp_path_factory.mktemp("stress") / "made"
+    root.mkdir()
+    return root, make_stress(root)
+
+
+@pytest.fixture(scope="module")
+def stored(made: tuple[Path, StressReport]) -> dict[str, Any]:
+    return dict(json.loads((made[0] / "stress.json").read_text()))
+
+
+@pytest.fixture(scope="module")
+def page(made: tuple[Path, StressReport]) -> Parsed:
+    return parse(write_report(made[0]))
+
+
+@pytest.fixture
+def copy(made: tuple[Path, StressReport], tmp_path: Path) -> Path:
+    """The folder, for a test to damage."""
+    return Path(shutil.copytree(made[0], tmp_path / "copy"))
+
+
+def tables(page: Parsed) -> list[list[list[str]]]:
+    """All tables in their order: heads and rows."""
+    starts = [k for k, row in enumerate(page.rows) if row[0] == "sequence"]
+    return [page.rows[a:b] for a, b in zip(starts, [*starts[1:], None], strict=True)]
+
+
+def test_what_was_written_is_read_again(made: tuple[Path, StressReport]) -> None:
+    root, report = made
+    read = read_report(root)
+    assert (read.config, read.depth, read.tracking) == (report.config, report.depth, report.tracking)
+    assert len(read.color) == len(report.color)
+    for a, b in zip(read.color, report.color, strict=True):
+        assert repr(a) == repr(b)  # NaN too
+    panels = read_panels(root)
+    assert panels is not None and report.panels is not None
+    assert (panels.case, panels.index) == ("exposure_20ms", 12)
+    np.testing.assert_allclose(panels.weights, report.panels.weights, atol=0.25 / 255)
+    for name in ("blurred", "constant", "aware", "truth"):
+        np.testing.assert_array_equal(getattr(panels, name), getattr(report.panels, name))
+
+
+def test_the_colour_tables_numbers_are_those_of_the_file(page: Parsed, stored: dict[str, Any]) -> None:
+    found = tables(page)
+    assert len(found) == 4 + 4 + 2 + 1
+    scores = (("psnr_db", 2), ("psnr_db_least", 2), ("ssim", 4), ("gradient", 3))
+    for n, poses in enumerate(("true", "estimated")):
+        for k, (name, digits) in enumerate(scores):
+            head, *rows = found[4 * n + k]
+            assert head == ["sequence", "constant", "σ 0.5 px", "σ 1 px"]
+            assert len(rows) == len(LABELS)
+            for row, (case, label) in zip(rows, LABELS.items(), strict=True):
+                values = [r[name] for r in stored["color"] if (r["case"], r["poses"]) == (case, poses)]
+                texts = ["–" if value is None else f"{value:.{digits}f}" for value in values]
+                if name == "psnr_db":
+                    label += " 4 keyframes"
+                    texts[1:] = [f"{text} {v - values[0]:+.2f}" for text, v in zip(texts[1:], values[1:], strict=True)]
+                assert row == [label, *texts]
+    assert found[6][1][1:] == ["–"] * 3, "no score, no number"
+
+
+def test_the_depth_and_tracking_tables_numbers_are_those_of_the_file(page: Parsed, stored: dict[str, Any]) -> None:
+    *_, true, estimated, tracking = tables(page)
+    for table, poses in ((true, "true"), (estimated, "estimated")):
+        rows = [r for r in stored["depth"] if r["poses"] == poses]
+        assert table[1:] == [
+            [LABELS[r["case"]], f"{1e3 * r['single_m']:.2f}", f"{1e3 * r['fused_m']:.2f}",
+             f"{r['fused_m'] / r['single_m']:.2f}"]
+            for r in rows
+        ]  # fmt: skip
+    assert tracking[0] == ["sequence", "mid-exposure", "end of exposure", "blur weight"]
+    for row, (case, label) in zip(tracking[1:], LABELS.items(), strict=True):
+        assert row[0] == label
+        runs = {r["variant"]: r for r in stored["tracking"] if r["case"] == case}
+        for text, variant in zip(row[1:], tracking[0][1:], strict=True):
+            if variant not in runs:
+                assert text == "–"
+                continue
+            r = runs[variant]
+            ate = "–" if r["ate_m"] is None else f"{1e3 * r['ate_m']:.2f}"
+            drift = "" if r["drift_m_per_s"] is None else f" {1e3 * r['drift_m_per_s']:.2f} mm/s"
+            assert text == f"{ate}{drift}" + (f" {r['lost']} lost" if r["lost"] else "")
+
+
+def test_the_best_of_a_row_is_marked(made: tuple[Path, StressReport], stored: dict[str, Any]) -> None:
+    html = write_report(made[0]).read_text("utf-8")
+    marked = re.findall(r'<td class="best">\s*([-+.\d]+)', html)
+    expected = []
+    for poses in ("true", "estimated"):
+        for name, digits in (("psnr_db", 2), ("psnr_db_least", 2), ("ssim", 4), ("gradient", 3)):
+            for case in LABELS:
+                rows = [r[name] for r in stored["color"] if (r["case"], r["poses"]) == (case, poses)]
+                expected += [f"{max(rows):.{digits}f}"] if None not in rows else []
+    for case in LABELS:
+        ate = [r["ate_m"] for r in stored["tracking"] if r["case"] == case and r["ate_m"] is not None]
+        expected.append(f"{1e3 * min(ate):.2f}")
+    assert marked == expected and len(marked) == 4 * 8 - 1 + 4
+
+
+def test_the_headline_is_of_the_longest_exposure(page: Parsed, stored: dict[str, Any]) -> None:
+    rows = [r for r in stored["color"] if (r["case"], r["poses"]) == ("exposure_30ms", "true")]
+    constant, aware = (next(r["psnr_db"] for r in rows if r["sigma_px"] == sigma) for sigma in (None, 1.0))
+    depth = next(r for r in stored["depth"] if (r["case"], r["poses"]) == ("exposure_30ms", "true"))
+    ate = next(r["ate_m"] for r in stored["tracking"] if r["case"] == "exposure_30ms")
+    top = page.text[: page.text.index("Green")]
+    for text in (
+        "30 ms exposure, true path", f"{aware - constant:+.2f} dB", f"{constant:.2f} dB with constant weights",
+        f"{1e3 * depth['fused_m']:.2f} mm", f"{1e3 * depth['single_m']:.2f} mm in one frame", f"{1e3 * ate:.2f} mm",
+        "0, 20, 30 ms, at 1×, 2× speed",
+    ):  # fmt: skip
+        assert text in top
+    assert NASTY in page.text
+
+
+def test_the_curves_are_the_gains_by_exposure_and_by_speed(page: Parsed, stored: dict[str, Any]) -> None:
+    from plotly.graph_objects import Figure  # type: ignore[import-untyped]
+
+    for figure in page.figures:
+        Figure(figure)  # raises ValueError for a wrong name or value
+    assert len(page.figures) == 3 + 3 + 1
+    psnr = {(r["case"], r["poses"], r["sigma_px"]): r["psnr_db"] for r in stored["color"]}
+
+    def gains(poses: str, sigma: float, cases: tuple[str, ...]) -> Any:
+        return pytest.approx([psnr[c, poses, sigma] - psnr[c, poses, None] for c in cases], abs=2e-3)
+
+    slow, fast = ("exposure_0ms", "exposure_20ms", "exposure_30ms"), ("exposure_20ms", "exposure_20ms_speed_2x")
+    for n, poses in enumerate(("true", "estimated")):
+        by_exposure, absolute, by_speed = page.figures[3 * n : 3 * n + 3]
+        for trace, sigma in zip(by_exposure["data"], (0.5, 1.0), strict=True):
+            assert (trace["name"], trace["x"]) == (f"σ {sigma:g} px", [0.0, 20.0, 30.0])
+            assert trace["y"] == gains(poses, sigma, slow)
+        for trace, sigma in zip(by_speed["data"], (0.5, 1.0), strict=True):
+            assert trace["x"] == [1.0, 2.0] and trace["y"] == gains(poses, sigma, fast)
+        assert [trace["name"] for trace in absolute["data"]] == ["constant", "σ 0.5 px", "σ 1 px"]
+        assert absolute["data"][0]["y"] == pytest.approx([psnr[c, poses, None] for c in slow], abs=5e-3)
+    lost = page.figures[-1]["data"][2]
+    assert lost["name"] == "blur weight" and lost["y"] == [None]
+
+
+def test_the_pictures_are_the_panels(page: Parsed, made: tuple[Path, StressReport]) -> None:
+    uris = page.uris()
+    assert len(uris) == 5 + 2
+    for uri, name in zip(uris[:5], ("registered", "weights", "constant", "blur_aware", "sharp_view"), strict=True):
+        panel = cv2.imread(str(made[0] / "panels" / f"{name}.png")).astype(float)
+        others = [picture(uri).astype(float) - panel for uri in uris[:5]]
+        errors = [np.mean(other**2) for other in others]
+        assert np.argmin(errors) == uris.index(uri)
+    assert {uris[5], uris[6]} == {uris[2], uris[3]}, "the slider's two"
+    assert "white: 0.25" in page.text and "frame 12 of the sequence 20 ms" in page.text
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (lambda d: d.pop("color"), "color: Field required"),
+        (lambda d: d.update(color=[]), "color: Tuple should have at least 1 item"),
+        (lambda d: d["color"][3].update(psnr_db="high"), "color.3.psnr_db"),
+        (lambda d: d["color"][0].update(poses="guessed"), "color.0.poses"),
+        (lambda d: d["depth"][1].update(extra=1), "depth.1.extra"),
+        (lambda d: d["tracking"][2].update(lost=-1), "tracking.2.lost"),
+        (lambda d: d["panels"].update(white=True), "panels.white"),
+        (lambda d: d["tracking"][0].update(exposure_s=float("nan")), "tracking.0.exposure_s"),
+    ],
+)
+def test_a_broken_file_is_refused_in_one_line(copy: Path, change: Any, complaint: str) -> None:
+    data = json.loads((copy / "stress.json").read_text())
+    change(data)
+    (copy / "stress.json").write_text(json.dumps(data))
+    with pytest.raises(UserError, match=rf"stress\.json: {complaint}.*: run 'rstrack stress' again$") as error:
+        write_report(copy)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"config": "\\ud800"}', "\xff"])
+def test_what_is_no_results_file_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
+    (tmp_path / "stress.json").write_bytes(text.encode("latin-1"))
+    with pytest.raises(UserError, match=r"stress\.json[^\n]*$"):
+        write_report(tmp_path)
+
+
+def test_a_missing_damaged_or_unexplained_picture_costs_the_pictures_only(copy: Path) -> None:
+    def without_pictures(why: str) -> None:
+        page = parse(write_report(copy))
+        assert "No pictures: " in page.text and why in page.text and not page.uris()
+        assert len(tables(page)) == 11
+
+    path = copy / "panels" / "constant.png"
+    path.write_bytes(path.read_bytes()[:-40])
+    without_pictures("constant.png")
+    path.unlink()
+    without_pictures("constant.png: cannot be read")
+    data = json.loads((copy / "stress.json").read_text())
+    (copy / "stress.json").write_text(json.dumps(data | {"panels": None}))
+    without_pictures("run 'rstrack stress' again")
+    shutil.rmtree(copy / "panels")
+    assert "No pictures" not in parse(write_report(copy)).text
+
+
+def test_a_test_without_depth_or_other_speeds_has_a_page(copy: Path) -> None:
+    data = json.loads((copy / "stress.json").read_text())
+    for name in ("color", "tracking"):
+        data[name] = [r for r in data[name] if r["speed"] == 1.0 and r.get("poses") != "estimated"]
+    (copy / "stress.json").write_text(json.dumps(data | {"depth": []}))
+    page = parse(write_report(copy))
+    assert len(tables(page)) == 4 + 1 and len(page.figures) == 2 + 1
+    assert "speed" not in page.text[: page.text.index("Tracking")]
+
+
+def test_the_page_loads_nothing(copy: Path) -> None:
+    out = write_report(copy)
+    page = parse(out)
+    for _, name, value in page.attributes:
+        if name in ("src", "href", "srcset", "action", "data", "poster", "background"):
+            assert value.startswith(("data:", "#"))
+    assert NASTY not in out.read_text("utf-8") and out.stat().st_size < 8e6
+
+
+def test_the_command_writes_the_page(
+    made: tuple[Path, StressReport], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def command(*words: str) -> int:
+        commands = Commands("rstrack", "")
+        add_report(commands)
+        return run_program("rstrack", lambda: commands.parser, ["report", *words], "")
+
+    assert command(str(made[0]), "--out", str(tmp_path / "page.html"), "--quiet") == 0
+    assert (tmp_path / "page.html").stat().st_size > 4e6 and "page.html: written" in capsys.readouterr().out
+    assert command(str(made[0]), "--sequence", str(tmp_path)) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "a stress test knows its sequences: leave --sequence" in said

@@ -1,0 +1,440 @@
+"""The `rstrack` command: help that teaches, runs that can be evaluated, and one line for everything that is wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import shutil
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import synthetic
+
+import rsgen.console.progress
+import rstrack.alignment.optimizer
+from rstrack.bench.speed import Stopwatch
+from rstrack.cli.main import main
+from rstrack.cli.options import HELP
+from rstrack.data.estimate import read_estimate
+from rstrack.data.rig import Frame
+from rstrack.options import METHODS, Options
+from rstrack.tracking.frame_report import FrameReport
+from rstrack.tracking.spline_tracker import Tracker
+
+COMMANDS = ("track", "evaluate", "plot", "info", "bench-speed")
+FRAMES = 14
+SPEED = 0.3  # of `synthetic`: 0.27 m/s and 0.3 rad/s
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a sequence seq/ and the default method's run of it, run/."""
+    folder = tmp_path_factory.mktemp("rstrack")
+    writer = synthetic.open_writer(
+        folder / "seq", synthetic.make_config(160, 120), FRAMES, synthetic.make_spline(SPEED)
+    )
+    synthetic.write_frames(writer)
+    synthetic.write_scene(folder / "seq")
+    writer.finish()
+    assert main(["track", str(folder / "seq"), "--out", str(folder / "run"), "--quiet"]) == 0
+    return folder
+
+
+@pytest.fixture
+def place(original: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of it to break, as the working directory."""
+    shutil.copytree(original, tmp_path / "w")
+    monkeypatch.chdir(tmp_path / "w")
+    return tmp_path / "w"
+
+
+def run(capfd: pytest.CaptureFixture[str], words: str) -> tuple[int, str, str]:
+    capfd.readouterr()
+    status = main(words.split())
+    out, error = capfd.readouterr()
+    assert "Traceback" not in error
+    return status, out, error
+
+
+def refused(capfd: pytest.CaptureFixture[str], words: str, *parts: str) -> str:
+    """Run a command line that has to fail: status 2, nothing on stdout, one line that names the culprit."""
+    status, out, error = run(capfd, words)
+    assert status == 2 and out == ""
+    assert error.startswith("rstrack: ") and error.count("\n") == 1, error
+    for part in parts:
+        assert part in error, error
+    return error
+
+
+def read_info(folder: str) -> dict[str, Any]:
+    info: dict[str, Any] = json.loads(Path(folder, "run.json").read_text())
+    return info
+
+
+def without_times(folder: str) -> list[Any]:
+    info = read_info(folder)
+    del info["timings"]
+    return [info, Path(folder, "trajectory.txt").read_bytes(), Path(folder, "spline.npz").read_bytes()]
+
+
+# --- help ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_teaches(command: str, capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit:
+        main([command, "--help"])
+    out, error = capfd.readouterr()
+    assert exit.value.code == 0 and error == ""
+    assert f"example: rstrack {command} " in out
+
+
+def test_the_main_help_lists_every_command_and_version_says_the_version(capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    text = capfd.readouterr().out
+    assert all(f"  {command}" in text for command in COMMANDS) and "rstrack track out/demo" in text
+    with pytest.raises(SystemExit) as exit:
+        main(["--version"])
+    out = capfd.readouterr().out.split()
+    assert exit.value.code == 0 and out[0] == "rstrack" and out[1][0].isdigit()
+
+
+def test_every_option_of_the_tracker_is_explained(capfd: pytest.CaptureFixture[str]) -> None:
+    names = [field.name for field in dataclasses.fields(Options)]
+    assert sorted(HELP) == sorted(names) and all(HELP.values())
+    with pytest.raises(SystemExit):
+        main(["track", "--help"])
+    text = "".join(capfd.readouterr().out.split())
+    for name in names:
+        assert f"--{name.replace('_', '-')}" in text and "".join(HELP[name].split()) in text, name
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        ("", ["COMMAND"]),
+        ("trak seq", ["trak"]),
+        ("track", ["sequence"]),
+        ("track seq", ["--out"]),
+        ("track nowhere --out r", ["nowhere", "no such folder"]),
+        ("track run --out r", ["run", "rgb.txt"]),
+        ("track seq --out r surplus", ["surplus"]),
+        ("track seq --out r --metho gs-g", ["--metho"]),
+        ("track seq --out r --method rs-x", ["rs-x", "rs-pg"]),
+        ("track seq --out r --backend opencl", ["opencl", "llvm"]),
+        ("track seq --out r --knot-spacing-s 0", ["knot_spacing_s"]),
+        ("track seq --out r --knot-spacing-s -1e-3", ["knot_spacing_s", "-0.001"]),
+        ("track seq --out r --knot-spacing-s soon", ["--knot-spacing-s", "soon"]),
+        ("track seq --out r --max-depth nan", ["--max-depth", "nan"]),
+        ("track seq --out r --bootstrap-frames 0", ["--bootstrap-frames", "0"]),
+        ("track seq --out r --frames 5:5", ["--frames 5:5"]),
+        ("track seq --out r --frames 14:20", ["seq", "14", "0 to 13"]),
+        ("track seq --out r --noise-depth -1", ["noise", "depth", "-1"]),
+        ("track seq --out r --noise-intensity inf", ["--noise-intensity", "inf"]),
+        ("track seq --out r --seed -3 --noise-depth 1e-3", ["seed", "-3"]),
+        ("track seq --out r --camera cameras.yaml", ["cameras.yaml"]),
+        ("track seq --out seq", ["seq", "--out"]),
+        ("track seq --out run/run.json", ["run.json"]),
+        ("evaluate seq", ["run"]),
+        ("evaluate seq nowhere", ["nowhere"]),
+        ("evaluate seq seq/rgb", ["seq/rgb", "trajectory.txt"]),
+        ("plot seq run", ["--out"]),
+        ("plot seq run --out run/run.json/p.png", ["run.json/p.png"]),
+        ("plot seq run --out p.docx", ["p.docx"]),
+        ("info run/run.json", ["run.json"]),
+        ("bench-speed seq --frames 0", ["--frames", "0"]),
+        ("bench-speed seq --frames 1", ["seq", "2 frames"]),
+        ("bench-speed seq --method fast", ["fast"]),
+    ],
+)  # fmt: skip
+def test_what_is_given_wrongly_is_named_in_one_line(
+    words: str, parts: list[str], place: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    before = sorted(path for path in place.rglob("*") if path.name != "r")
+    refused(capfd, words, *parts)
+    assert sorted(path for path in place.rglob("*") if path.name != "r") == before
+
+
+# --- runs ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_run_folder_holds_the_trajectory_and_what_made_it(place: Path, original: Path) -> None:
+    estimate, info = read_estimate(Path("run")), read_info("run")
+    assert len(estimate.stamps) == FRAMES and estimate.spline is not None
+    assert info["options"] == dataclasses.asdict(Options(fuse=True)) and info["method"] == "rs-pg"
+    where = str((original / "seq").resolve())
+    frames = {"frames": [0, FRAMES], "frames_in_all": FRAMES}
+    assert info["dataset"] == {"name": "synthetic", "path": where, **frames}
+    assert set(info["versions"]) == {"rstrack", "numpy", "scipy", "drjit"} and info["backend"] in ("llvm", "cuda")
+    assert (info["end"], info["error"], info["lost"]) == ("done", None, 0) and info["keyframes"] >= 1
+    times = info["timings"]
+    assert len(times["frame_ms"]) == FRAMES and times["total_s"] * 1e3 > sum(times["frame_ms"])
+    assert min(times["frame_ms"]) <= times["median_ms"] <= times["p95_ms"] <= max(times["frame_ms"])
+    np.testing.assert_allclose([frame["stamp"] for frame in info["frames"]], estimate.stamps, atol=1e-9)
+    for stream in ("depth", "color"):
+        parts = [frame[f"inliers_{stream}"] for frame in info["frames"]]
+        assert parts[0] is None and max(parts[1:]) == 1.0 and min(parts[1:]) > 0.3
+    # From the first line of the first frame to the last line of the last one.
+    np.testing.assert_allclose(info["spline_valid"], [[0.0, 13 / 30 + 0.028 * 119 / 120]], atol=1e-6)
+
+
+def test_a_run_is_accurate_and_evaluate_agrees_with_it(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    status, out, error = run(capfd, "evaluate seq run --json")
+    metrics, noted = json.loads(out), read_info("run")["metrics"]
+    assert status == 0 and error == ""
+    assert metrics["ate_rmse_m"] < 1e-3 and metrics["row_rmse_m"] < 2e-3
+    assert metrics["frames_tracked"] == metrics["frames"] == FRAMES
+    for name in ("ate_rmse_m", "row_rmse_m", "row_rot_rmse_deg"):
+        assert metrics[name] == pytest.approx(noted[name], rel=1e-3)
+    text = run(capfd, "evaluate seq run/trajectory.txt")[1]
+    assert f"{1e3 * metrics['ate_rmse_m']:.3f}" in text and "14 of 14" in text
+
+
+def test_track_sums_up_and_shows_progress_with_the_error(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    status, out, error = run(capfd, "track seq --method gs-g --out r")
+    ate = 1e3 * read_info("r")["metrics"]["ate_rmse_m"]
+    assert status == 0 and "gs-g on synthetic: 14 frames" in out and "none lost" in out
+    assert f"{ate:.3f}" in out and out.splitlines()[-1].startswith("r: written")
+    assert "tracking 100 %" in error and "frames/s" in error and f"ATE {ate:.2f} mm" in error
+    assert run(capfd, "track seq --method gs-g --out r --quiet")[2] == ""
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_runs(method: str, place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = run(capfd, f"track seq --method {method} --out r --frames 0:8 --quiet")
+    assert status in (0, 1) and f"{method} on synthetic" in out
+    assert Path("r/spline.npz").exists() == (method != "baseline")
+
+
+def test_two_runs_are_the_same_bit_by_bit_and_noise_depends_on_its_seed(
+    place: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    line = "track seq --method rs-g --frames 0:9 --quiet --noise-depth 1.2e-3 --noise-intensity 0.01 --seed"
+    for folder, seed in (("a", 1), ("b", 1), ("c", 2)):
+        assert run(capfd, f"{line} {seed} --out {folder}")[0] == 0
+    assert without_times("a") == without_times("b")
+    assert without_times("a")[1] != without_times("c")[1]
+    assert read_info("a")["noise"] == {"sigma_depth": 1.2e-3, "sigma_intensity": 0.01, "seed": 1}
+
+
+def test_options_reach_the_tracker(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    words = "track seq --out r --quiet --frames 2:9 --method gs-g --knot-spacing-s 0.04 --no-fuse --bootstrap-frames 4"
+    assert run(capfd, words)[0] == 0
+    info = read_info("r")
+    chosen = {"method": "gs-g", "knot_spacing_s": 0.04, "fuse": False, "bootstrap_frames": 4}
+    assert info["options"] == dataclasses.asdict(Options()) | chosen
+    estimate = read_estimate(Path("r"))
+    assert estimate.spline is not None and estimate.spline.dt == 0.04
+    np.testing.assert_allclose(estimate.stamps, np.arange(2, 9) / 30, atol=1e-6)
+    assert info["metrics"]["frames"] == 7 and info["dataset"]["frames"] == [2, 9]
+
+
+def test_plot_draws_runs_and_tum_files(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    for what in ("run", "run/trajectory.txt"):
+        assert run(capfd, f"plot seq {what} --out p.png")[0] == 0
+        assert cv2.imread("p.png").shape[1] == 1600
+        Path("p.png").unlink()
+
+
+def test_info_says_what_would_be_tracked(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = run(capfd, "info seq")
+    assert status == 0
+    for part in ("160x120", "14 images at 30 Hz", "readout 28 ms", "one colour image", "33 control points 50 ms apart"):
+        assert part in out, part
+    distance = 1e3 * np.linalg.norm(synthetic.T_COLOR_DEPTH[:3, 3])
+    assert f"{distance:.1f} mm" in out
+
+
+# --- what sequences may lack -----------------------------------------------------------------------------------------
+
+
+def test_a_tum_folder_without_truth_is_tracked_but_not_evaluated(
+    place: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("sequence.yaml", "spline.npz", "groundtruth.txt"):
+        Path("seq", name).unlink()
+    refused(capfd, "track seq --out r", "seq", "camera")
+    camera = "{width: 160, height: 120, intrinsics: [120.0, 120.0, 79.5, 59.5], readout_s: 0.028}"
+    T = synthetic.T_COLOR_DEPTH.tolist()
+    Path("c.yaml").write_text(f"color: {camera}\ndepth: {camera}\nT_color_depth: {T}\n")
+    assert "truth    none" in run(capfd, "info seq --camera c.yaml")[1]
+    status, out, error = run(capfd, "track seq --camera c.yaml --out r --frames 0:8")
+    assert status == 0 and "ATE" not in out + error and read_info("r")["metrics"] is None
+    refused(capfd, "evaluate seq r --camera c.yaml", "ground truth")
+    assert run(capfd, "plot seq r --camera c.yaml --out p.png")[0] == 0
+
+
+def test_one_frame_is_a_run_that_cannot_be_evaluated(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = run(capfd, "track seq --out r --frames 3 --quiet")
+    assert status == 0 and "1 frame" in out and "ATE" not in out
+    assert len(Path("r/trajectory.txt").read_text().splitlines()) == 3
+    refused(capfd, "evaluate seq r", "trajectory.txt", "1 poses")
+
+
+def test_depth_without_a_measurement_is_no_crash(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    for path in Path("seq/depth").iterdir():
+        cv2.imwrite(str(path), np.zeros((120, 160), np.uint16))
+    status, out, _ = run(capfd, "track seq --out r --method rs-g --quiet")
+    assert status == 1 and "rs-g on synthetic" in out and Path("r/run.json").exists()
+
+
+def test_a_damaged_image_is_named_and_the_frames_before_it_are_kept(
+    place: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    os.truncate("seq/depth/000007.png", 100)
+    status, out, error = run(capfd, "track seq --out r --method gs-g --quiet")
+    assert status == 2 and "7 of 14 frames" in out
+    assert error.count("\n") == 1 and "depth/000007.png" in error and "r" in error.split()
+    info = read_info("r")
+    assert info["end"] == "unreadable" and "000007.png" in info["error"]
+    assert len(read_estimate(Path("r")).stamps) == 7
+    os.truncate("seq/rgb/000000.png", 100)
+    refused(capfd, "track seq --out q --quiet", "rgb/000000.png")
+    assert not Path("q/run.json").exists()
+
+
+@pytest.mark.parametrize("content", ["", "garbage\n", "0 1 2\n" * 5, "\x00\xff" * 50, "nan 0 0 0 0 0 0 1\n" * 5])
+def test_garbage_is_no_run(content: str, place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    Path("run/trajectory.txt").write_bytes(content.encode("latin-1"))
+    refused(capfd, "evaluate seq run", "run/trajectory.txt")
+    refused(capfd, "plot seq run/trajectory.txt --out p.png", "run/trajectory.txt")
+    assert not Path("p.png").exists()
+
+
+def test_a_broken_run_json_is_named(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    Path("run/run.json").write_text("{")
+    refused(capfd, "evaluate seq run", "run.json", "JSON")
+
+
+def test_a_dataset_is_never_overwritten_by_a_run(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    before = Path("seq/spline.npz").read_bytes()
+    refused(capfd, "track seq --out seq", "seq", "sequence.yaml", "choose another --out")
+    assert Path("seq/spline.npz").read_bytes() == before
+
+
+# --- runs that end early or go wrong ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """Ctrl-C as in a terminal: a shell starts its background jobs with SIGINT ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
+def test_ctrl_c_writes_what_there_is(
+    place: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    show = rsgen.console.progress.ProgressDisplay.__call__
+
+    def press(self: rsgen.console.progress.ProgressDisplay, stage: str, fraction: float, note: str) -> None:
+        show(self, stage, fraction, note)
+        if fraction == 8 / FRAMES:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(rsgen.console.progress.ProgressDisplay, "__call__", press)
+    before = signal.getsignal(signal.SIGINT)
+    status, out, error = run(capfd, "track seq --out r --method gs-g --quiet")
+    assert status == 130 and "8 of 14 frames" in out and "interrupted" in error
+    assert read_info("r")["end"] == "interrupted" and len(read_estimate(Path("r")).stamps) == 8
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.usefixtures("interruptible")
+def test_a_second_ctrl_c_breaks_off(
+    place: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def press_twice(*_: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(rsgen.console.progress.ProgressDisplay, "__call__", press_twice)
+    status, out, error = run(capfd, "track seq --out r --method gs-g")
+    assert (status, out, error) == (130, "", "rstrack: interrupted; nothing was written\n")
+    assert not Path("r/run.json").exists()
+
+
+@pytest.mark.usefixtures("interruptible")
+def test_a_background_job_leaves_ctrl_c_to_others(
+    place: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    monkeypatch.setattr(
+        rsgen.console.progress.ProgressDisplay, "__call__", lambda *_: signal.raise_signal(signal.SIGINT)
+    )
+    status, out, _ = run(capfd, "track seq --out r --method gs-g")
+    assert status == 0 and "14 frames" in out and read_info("r")["end"] == "done"
+
+
+def test_lost_frames_are_left_out_and_reported(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    for k in (0, 1):
+        cv2.imwrite(f"seq/depth/{k:06d}.png", np.zeros((120, 160), np.uint16))
+    status, out, _ = run(capfd, "track seq --out r --method rs-g --quiet")
+    info, estimate = read_info("r"), read_estimate(Path("r"))
+    assert status == 1 and "2 lost" in out and "12 of 14" in out
+    assert [k for k, frame in enumerate(info["frames"]) if frame["lost"]] == [0, 1]
+    assert info["lost"] == 2 and info["end"] == "done" and info["metrics"]["frames_tracked"] == 12
+    np.testing.assert_allclose(estimate.stamps, np.arange(2, FRAMES) / 30, atol=1e-6)
+    assert not estimate.spline_covers(1.0 / 30) and estimate.spline_covers(5.0 / 30)
+
+
+def test_a_tracker_that_breaks_down_keeps_what_it_had(
+    place: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    feed = Tracker.feed
+
+    def fail(self: Tracker, frame: Frame) -> FrameReport:
+        if len(self.reports) == 8:
+            raise np.linalg.LinAlgError("33th leading minor not positive definite")
+        return feed(self, frame)
+
+    monkeypatch.setattr(Tracker, "feed", fail)
+    status, _, error = run(capfd, "track seq --out r --method gs-g --quiet")
+    assert status == 1 and error.count("\n") == 1 and "frame 8" in error
+    assert len(read_info("r")["timings"]["frame_ms"]) == 8 and read_info("r")["end"] == "broke down"
+
+
+# --- speed -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_speed_benchmark_accounts_for_all_time(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    solve = rstrack.alignment.optimizer.solve
+    status, out, _ = run(capfd, "bench-speed seq --frames 12 --method rs-pg --method rs-g --json")
+    report = json.loads(out)
+    assert status == 0 and report["frames"] == [6, 12] and report["depth_size"] == [160, 120]
+    for method in ("rs-pg", "rs-g"):
+        times = report["methods"][method]
+        parts = times["parts_ms"]
+        assert sum(parts.values()) == pytest.approx(times["mean_ms"])
+        needed = {f"geometric kernel, level {level}" for level in range(2)} | {"preparing images", "poses of lines"}
+        needed |= {f"linear algebra: {what}" for what in ("chain", "assemble", "solve")}
+        assert needed <= set(parts) and all(parts[name] > 0 for name in needed)
+        assert ("photometric kernel, level 0" in parts) == (method == "rs-pg")
+        assert parts["other"] < 0.5 * times["mean_ms"] and times["read_ms"] > 0
+    assert rstrack.alignment.optimizer.solve is solve
+
+
+def test_the_speed_table(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    status, out, error = run(capfd, "bench-speed seq --frames 8 --method gs-g --method baseline")
+    lines = out.splitlines()
+    assert status == 0 and "frames 4 to 7" in lines[0] and lines[1].split() == ["ms", "a", "frame", "gs-g", "baseline"]
+    median = next(line for line in lines if line.startswith("median"))
+    assert all(float(word) > 0 for word in median.split()[1:]) and "baseline 100 %" in error
+
+
+def test_a_stopwatch_counts_the_inner_function_once() -> None:
+    now = iter([0.0, 1.0, 4.0, 10.0])
+    watch = Stopwatch(clock=lambda: next(now))
+    inner = watch.wrapped(lambda x: x + 1, lambda x: f"inner {x}")
+    outer = watch.wrapped(lambda x: 2 * inner(x), "outer")
+    assert outer(3) == 8
+    assert watch.seconds == {"inner 3": 3.0, "outer": 7.0}

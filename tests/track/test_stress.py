@@ -1,0 +1,281 @@
+"""The blur stress test on a small analytic scene: sequences, scores, gain of blur-aware weights, what is written."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import synthetic
+import yaml
+from scipy.ndimage import gaussian_filter
+
+from rsgen.config.config import Config, load_config
+from rsgen.console.command_line import parse_frames
+from rsgen.errors import UserError
+from rsgen.geometry import se3
+from rsgen.geometry.spline import Spline
+from rsgen.motion.fit import fit_spline
+from rsgen.produce.writer import SequenceWriter
+from rsgen.sequence.format import stream_stamps
+from rsgen.sequence.trajectory import read_trajectory
+from rstrack.bench.stress import run as stress
+from rstrack.bench.stress.cases import Case, StressOptions, render_cases
+from rstrack.bench.stress.run import StressReport, run_stress
+from rstrack.bench.stress.tables import gains_db, report_text, write_report
+from rstrack.data.dataset import open_dataset
+from rstrack.data.estimate import Estimate
+from rstrack.mapping.color_fusion import srgb_from_linear
+from rstrack.metrics.images import gradient_energy, psnr_db, ssim
+
+WIDTH, HEIGHT, FOCAL, FRAMES, SUBTIMES = 96, 72, 150.0, 18, 8
+# Waves per metre: about seven pixels long on the far wall.
+WAVES = np.array([[6.0, 3.0, 2.0], [-4.0, 6.0, -3.0], [2.0, -2.0, 6.0]])
+T_EST_WORLD = se3.exp(np.array([0.3, -0.2, 0.1, 0.4, 0.2, -0.3]))
+
+
+def shaken() -> Spline:
+    """A camera whose shake comes and goes: up to 1.5 rad/s, and nearly at rest in between."""
+    dt, t0 = 0.05, -0.2
+    t = t0 + dt * (np.arange(40) - 1.0)
+    turn = 0.12 * np.sin(2 * np.pi * 1.7 * t)
+    xi = np.stack([0.05 * t, 0.02 * np.sin(5 * t), 0.05 * t, 0.5 * turn, turn, 0.1 * turn], axis=-1)
+    return Spline(se3.exp(xi), t0, dt)
+
+
+def light(p_world: np.ndarray) -> np.ndarray:
+    """A texture of a few pixels' wavelength, linear RGB."""
+    waves = np.sin(2.0 * np.pi * p_world @ WAVES)
+    return np.asarray(0.4 + 0.17 * (waves + waves[..., [1, 2, 0]]))
+
+
+def look(spline: Spline, config: Config, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Light (h, w, 3) and depth (h, w) of an image whose rows are taken at `times` (h,) in s."""
+    camera = config.color.camera
+    T = spline.pose(times)[:, None]
+    d = np.einsum("...ij,...j->...i", T[..., :3, :3], camera.unproject(camera.pixel_grid()))
+    p = np.broadcast_to(T[..., :3, 3], d.shape)
+    z = synthetic.cast(p, d)
+    return light(p + z[..., None] * d), z
+
+
+def srgb(image: np.ndarray) -> np.ndarray:
+    return np.rint(255.0 * srgb_from_linear(image)).astype(np.uint8)
+
+
+def write_config(path: Path, **depth: Any) -> Path:
+    camera = {"width": WIDTH, "height": HEIGHT, "intrinsics": [FOCAL, FOCAL, (WIDTH - 1) / 2, (HEIGHT - 1) / 2]}
+    camera |= {"rate_hz": 30, "readout_s": 0.028}
+    text = {
+        "name": "tiny", "trajectory": {"file": "motion.txt"}, "scene": {"file": "box.ply"}, "color": camera,
+        "depth": {**camera, "offset_s": 0.02, "noise": {"model": "gaussian"}, **depth},
+    }  # fmt: skip
+    path.write_text(yaml.safe_dump(text))
+    return path
+
+
+def render(words: Sequence[str]) -> None:
+    """What `rsgen render` does, of the box and the ball, with blur and with noise of depth."""
+    assert words[0] == "render"
+    config_file, rest = Path(words[1]), list(words[2:])
+    rest.remove("--quiet")
+    flags = {name.removeprefix("--"): value for name, value in zip(rest[::2], rest[1::2], strict=True)}
+    out, frames = Path(flags.pop("out")), parse_frames(flags.pop("frames", None))
+    config = load_config(config_file, flags)
+    spline = shaken()
+    if config.trajectory.file is not None and config.trajectory.file.exists():
+        spline = fit_spline(read_trajectory(config.trajectory.file), config.trajectory.knot_spacing_s).spline
+    stamps = [stream_stamps(0.0, 1.2, stream)[frames] for stream in (config.color, config.depth)]
+    writer = SequenceWriter.open(out, config, spline, stamps[0], stamps[1], {"synthetic": "1"}, {"scene": "box"})
+    shutter, exposure = config.color.shutter, config.color.exposure_s
+    rows = np.arange(HEIGHT)
+    for k in writer.missing("color"):
+        middle = shutter.line_mid_time(float(stamps[0][k]), rows, config.color.camera)
+        ends = (np.arange(SUBTIMES) + 0.5) / SUBTIMES - 0.5 if exposure else np.zeros(1)
+        image = np.mean([look(spline, config, middle + exposure * part)[0] for part in ends], axis=0)
+        truth = {}
+        if config.truth.global_shutter:
+            truth["global_middle"] = srgb(look(spline, config, np.full(HEIGHT, middle.mean()))[0])
+        writer.write_color(k, srgb(image), truth)
+    for k in writer.missing("depth"):
+        z = look(spline, config, config.depth.shutter.line_mid_time(float(stamps[1][k]), rows, config.depth.camera))[1]
+        noise = 1.2e-3 * z**2 * np.random.default_rng([7, k]).standard_normal(z.shape)
+        writer.write_depth(k, z.astype(np.float32), (z + noise).astype(np.float32))
+    writer.finish()
+
+
+def told_truth(dataset: Any, options: Any, out: Path, *_: Any) -> Any:
+    """A tracker that finds the truth, in a world of its own."""
+    spline = dataset.truth
+    moved = Spline(T_EST_WORLD @ spline.control_points, spline.t0, spline.dt)
+    info = {"lost": 0, "metrics": {"ate_rmse_m": 1e-3 * dataset.rig.color_shutter.exposure_s}}
+    return SimpleNamespace(estimate=Estimate(dataset.stamps, moved.pose(dataset.stamps), moved, info))
+
+
+@pytest.fixture(scope="module")
+def stressed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, StressReport]:
+    out = tmp_path_factory.mktemp("stress")
+    config = write_config(out / "tiny.yaml")
+    options = StressOptions(exposures_s=(0.0, 0.02), speeds=(), sigmas_px=(1.0, 2.0), frames=FRAMES)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stress, "track", told_truth)
+        report = run_stress(config, out / "made", options, render=render)
+    return out / "made", report
+
+
+def test_blur_aware_colour_is_better_by_two_decibels(stressed: tuple[Path, StressReport]) -> None:
+    _, report = stressed
+    gain = gains_db(report)
+    assert gain["exposure_20ms"] > 2.0
+    assert gain["exposure_0ms"] == 0.0  # nothing is blurred: all weights are 1
+    blurred = {row.sigma_px: row for row in report.color if row.case == "exposure_20ms" and row.poses == "true"}
+    sharp = {row.sigma_px: row for row in report.color if row.case == "exposure_0ms" and row.poses == "true"}
+    assert set(blurred) == {None, 1.0, 2.0}
+    assert blurred[None].gradient < blurred[1.0].gradient < 1.0 and blurred[None].ssim < blurred[1.0].ssim
+    assert sharp[None].psnr_db > blurred[1.0].psnr_db
+    assert all(row.keyframes == blurred[None].keyframes >= 1 for row in report.color)
+
+
+def test_fused_depth_has_half_the_error_of_a_frames(stressed: tuple[Path, StressReport]) -> None:
+    _, report = stressed
+    assert len(report.depth) == 4
+    for row in report.depth:
+        assert row.fused_m < 0.5 * row.single_m
+        # σ = 1.2e-3 z² with walls at 1.5 to 3 m, rectified by bilinear interpolation, which averages a little.
+        assert 1.5e-3 < row.single_m < 8e-3
+
+
+def test_scores_do_not_depend_on_the_world(stressed: tuple[Path, StressReport]) -> None:
+    _, report = stressed
+    true, found = ([r for r in report.color if r.poses == poses] for poses in ("true", "estimated"))
+    assert len(true) == len(found) == 6
+    for a, b in zip(true, found, strict=True):
+        assert (a.case, a.sigma_px, a.keyframes) == (b.case, b.sigma_px, b.keyframes)
+        assert b.psnr_db == pytest.approx(a.psnr_db, abs=0.02)
+        assert b.psnr_db_least == pytest.approx(a.psnr_db_least, abs=0.05)
+        assert (b.ssim, b.gradient) == pytest.approx((a.ssim, a.gradient), abs=2e-3)
+
+
+def test_tracking_is_compared_with_poses_at_the_end_of_exposure(stressed: tuple[Path, StressReport]) -> None:
+    _, report = stressed
+    rows = [(row.case, row.variant, row.ate_m) for row in report.tracking if "blur weight" not in row.variant]
+    assert rows == [
+        ("exposure_0ms", "mid-exposure", 0.0),
+        ("exposure_20ms", "mid-exposure", 2e-5),
+        ("exposure_20ms", "end of exposure", 0.0),  # told_truth repeats the exposure it was given
+    ]
+
+
+def test_exposures_differ_in_blur_only(stressed: tuple[Path, StressReport]) -> None:
+    out, _ = stressed
+    sharp, blurred = (open_dataset(out / "sequences" / f"exposure_{ms}ms") for ms in (0, 20))
+    np.testing.assert_allclose(sharp.rows("color"), blurred.rows("color"), atol=1e-9)  # type: ignore[arg-type]
+    assert np.array_equal(sharp.images.depth(5), blurred.images.depth(5))
+    assert not np.array_equal(sharp.images.color(5), blurred.images.color(5))
+
+
+def test_a_report_can_be_read_again(stressed: tuple[Path, StressReport]) -> None:
+    out, report = stressed
+    files = write_report(report, out)
+    assert all(path.stat().st_size > 0 for path in files) and len({*files}) == len(files) == 12
+    read = json.loads((out / "stress.json").read_text())
+    assert len(read["color"]) == len(report.color) and read["color"][0]["sigma_px"] is None
+    rows = list(csv.DictReader((out / "stress_color.csv").open()))
+    assert [float(row["psnr_db"]) for row in rows] == pytest.approx([row.psnr_db for row in report.color])
+    text = report_text(report)
+    assert f"{gains_db(report)['exposure_20ms']:+.2f}" in text and "nan" not in text
+    panels = report.panels
+    assert panels is not None and panels.case == "exposure_20ms"
+    weights = panels.weights[panels.weights > 0]
+    assert weights.min() > 0.0 and weights.max() <= 1.0 and weights.mean() < 0.2
+
+
+def test_a_faster_sequence_takes_the_same_path(tmp_path: Path) -> None:
+    config, asked = write_config(tmp_path / "tiny.yaml"), []
+
+    def record(words: Sequence[str]) -> None:
+        asked.append(list(words))
+        folder = Path(words[words.index("--out") + 1])
+        folder.mkdir(parents=True, exist_ok=True)
+        shaken().save(folder / "spline.npz")
+
+    options = StressOptions(exposures_s=(0.0,), speeds=(2.0,), frames=20)
+    folders = render_cases(config, tmp_path / "out", options, lambda *_: None, record)
+    assert [case.name for case in folders] == ["exposure_0ms", "exposure_20ms_speed_2x"]
+    fast = load_config(Path(asked[1][1]))
+    assert fast.trajectory.file is not None and fast.scene.file == (tmp_path / "box.ply").resolve()
+    spline = fit_spline(read_trajectory(fast.trajectory.file), fast.trajectory.knot_spacing_s).spline
+    slow = shaken()
+    for part in (0.1, 0.33, 0.5, 0.9):
+        want = slow.pose(slow.t_begin + part * (slow.t_end - slow.t_begin))
+        found = spline.pose(spline.t_begin + part * (spline.t_end - spline.t_begin))
+        np.testing.assert_allclose(found, want, atol=2e-6)
+    assert spline.t_end - spline.t_begin == pytest.approx(0.5 * (slow.t_end - slow.t_begin))
+    # Both carry the truth of their speed, and half the frames are as long a way.
+    assert all("[middle]" in words for words in asked)
+    assert ["0:20" in asked[0], "0:10" in asked[1]] == [True, True]
+    assert "--color.offset_s 0.03" in " ".join(asked[1]) and "--color.exposure_s 0.02" in " ".join(asked[1])
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [({"intrinsics": [140.0, 140.0, 47.5, 35.5]}, "same pinhole"), ({"readout_s": 0.02}, "same readout_s")],
+)
+def test_what_cannot_be_compared_is_refused(tmp_path: Path, change: dict[str, Any], complaint: str) -> None:
+    config = write_config(tmp_path / "tiny.yaml", **change)
+    options = StressOptions(exposures_s=(0.0,), speeds=(), frames=2)
+    with pytest.raises(UserError, match=complaint):
+        run_stress(config, tmp_path / "out", options, render=render)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"exposures_s": ()}, {"exposures_s": (-1.0,)}, {"sigmas_px": (0.0,)}, {"speeds": (np.nan,)}, {"frames": 1}],
+)
+def test_absurd_settings_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(UserError, match=r"^stress: [^\n]*$"):
+        StressOptions(**wrong)
+
+
+def test_a_failing_render_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "wrong.yaml").write_text("name: wrong\nscene: {}\n")
+    with pytest.raises(UserError, match=r"rsgen render .*wrong.yaml failed: [^\n]*$"):
+        run_stress(tmp_path / "wrong.yaml", tmp_path / "out", StressOptions(exposures_s=(0.0,), speeds=()))
+
+
+def test_cases_are_named_and_sorted() -> None:
+    options = StressOptions(exposures_s=(0.02, 0.0), speeds=(4.0, 1.0, 2.0))
+    assert options.cases == (Case(1.0, 0.0), Case(1.0, 0.02), Case(2.0, 0.02), Case(4.0, 0.02))
+    assert Case(2.5, 0.0125).name == "exposure_12.5ms_speed_2.5x"
+
+
+def test_image_scores_against_numpy_and_scipy() -> None:
+    rng = np.random.default_rng(3)
+    truth = rng.integers(0, 256, (40, 50, 3)).astype(np.uint8)
+    image = np.clip(truth + rng.normal(0, 20, truth.shape), 0, 255).astype(np.uint8)
+    known = np.ones((40, 50), bool)
+    known[:, :6] = False
+    assert psnr_db(truth, truth, known) == np.inf and ssim(truth, truth, known) == pytest.approx(1.0)
+    damaged = image.copy()
+    damaged[:, :6] = 0
+    assert psnr_db(damaged, truth, known) == psnr_db(image, truth, known)
+    assert ssim(damaged, truth, known) == pytest.approx(ssim(image, truth, known), abs=1e-12)
+    mse = np.mean((image[:, 6:].astype(float) - truth[:, 6:]) ** 2)
+    assert psnr_db(image, truth, known) == pytest.approx(20 * np.log10(255 / np.sqrt(mse)))
+
+    def blur(a: np.ndarray) -> np.ndarray:
+        return np.asarray(gaussian_filter(a, 1.5, truncate=5 / 1.5))
+
+    a, b = (i.astype(float) @ np.array([0.299, 0.587, 0.114]) for i in (image, truth))
+    numerator = (2 * blur(a) * blur(b) + 6.5025) * (2 * (blur(a * b) - blur(a) * blur(b)) + 58.5225)
+    spread = blur(a * a) - blur(a) ** 2 + blur(b * b) - blur(b) ** 2
+    want = numerator / ((blur(a) ** 2 + blur(b) ** 2 + 6.5025) * (spread + 58.5225))
+    assert ssim(image, truth, known) == pytest.approx(want[5:-5, 11:-5].mean(), rel=1e-9)
+
+    ramp = np.repeat(np.arange(50, dtype=np.uint8)[None, :, None] * 3, 40, axis=0).repeat(3, axis=2)
+    assert gradient_energy(ramp, known) == pytest.approx(9.0)

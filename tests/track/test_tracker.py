@@ -1,0 +1,132 @@
+"""The tracker when things go wrong, and with a global shutter: nothing is ever wrong without being said."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import synthetic
+
+from rsgen.errors import UserError
+from rsgen.geometry import se3
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter
+from rstrack.data.rig import Frame, Image, Rig
+from rstrack.options import Method, Options
+from rstrack.tracking.spline_tracker import Tracker
+
+CAMERA = Camera(160, 120, 120.0, 120.0, 79.5, 59.5)
+ROLLING, GLOBAL = Shutter(readout_s=0.028), Shutter()
+TRUTH = synthetic.make_spline(0.3)
+
+
+def frame_at(k: int, shutter: Shutter = ROLLING) -> Frame:
+    stamp = k / 30.0
+    depth = synthetic.render_depth(TRUTH, CAMERA, shutter, stamp)
+    color = synthetic.render_color(TRUTH, CAMERA, shutter, stamp, synthetic.T_COLOR_DEPTH)
+    return Frame(Image(stamp, depth), (Image(stamp, color),))
+
+
+def blank(frame: Frame) -> Frame:
+    return replace(frame, depth=replace(frame.depth, pixels=np.zeros_like(frame.depth.pixels)))
+
+
+def tracker_of(method: Method, shutter: Shutter = ROLLING, **options: Any) -> Tracker:
+    return Tracker(Rig(CAMERA, shutter, CAMERA, shutter, synthetic.T_COLOR_DEPTH), Options(method=method, **options))
+
+
+def feed(tracker: Tracker, frames: Iterable[Frame]) -> Tracker:
+    for frame in frames:
+        tracker.feed(frame)
+    return tracker
+
+
+def worst_step(tracker: Tracker) -> float:
+    """Largest error in m of the motions since the second frame that was found."""
+    stamps, T = tracker.trajectory
+    T_true = TRUTH.pose(stamps)
+    error = se3.inverse(se3.inverse(T_true[1]) @ T_true[1:]) @ (se3.inverse(T[1]) @ T[1:])
+    return float(np.linalg.norm(error[:, :3, 3], axis=1).max())
+
+
+def lost(tracker: Tracker) -> list[int]:
+    return [k for k, report in enumerate(tracker.reports) if report.lost]
+
+
+def test_blank_frames_are_lost_and_the_track_is_found_again() -> None:
+    tracker = tracker_of("rs-g")
+    feed(tracker, (blank(frame_at(k)) if k in (12, 13) else frame_at(k) for k in range(22)))
+    assert lost(tracker) == [12, 13]
+    stamps, _ = tracker.trajectory
+    assert len(stamps) == 20 and not np.isin(stamps, [12 / 30, 13 / 30]).any()
+    assert len(tracker.spline_valid) == 1  # so short a gap the motion before carries over
+    assert worst_step(tracker) < 3e-3
+
+
+def test_colour_carries_on_without_depth() -> None:
+    tracker = tracker_of("rs-pg")
+    feed(tracker, (blank(frame_at(k)) if k in (12, 13) else frame_at(k) for k in range(18)))
+    assert lost(tracker) == [] and worst_step(tracker) < 1e-3
+
+
+def test_a_gap_is_bridged_from_the_last_keyframes() -> None:
+    tracker = feed(tracker_of("rs-pg"), (frame_at(k) for k in (*range(12), *range(24, 30))))
+    assert lost(tracker) == [] and len(tracker.spline_valid) == 2 and worst_step(tracker) < 2e-3
+
+
+def test_nothing_but_blank_frames() -> None:
+    tracker = feed(tracker_of("rs-pg"), (blank(frame_at(k)) for k in range(3)))
+    assert lost(tracker) == [0, 1, 2] and tracker.spline is None and len(tracker.trajectory[0]) == 0
+
+
+def test_another_room_is_never_taken_for_this_one() -> None:
+    tracker = feed(tracker_of("rs-pg"), (frame_at(k) for k in range(10)))
+    rng = np.random.default_rng(0)
+    for k in range(10, 13):
+        z = rng.uniform(0.5, 5.0, (CAMERA.height, CAMERA.width)).astype(np.float32)
+        color = rng.integers(0, 256, (CAMERA.height, CAMERA.width, 3)).astype(np.uint8)
+        assert tracker.feed(Frame(Image(k / 30, z), (Image(k / 30, color),))).lost
+
+
+def test_a_global_shutter_is_tracked_alike_by_both_models() -> None:
+    tracks = {m: feed(tracker_of(m, GLOBAL), (frame_at(k, GLOBAL) for k in range(16))) for m in ("rs-pg", "gs-pg")}
+    assert worst_step(tracks["rs-pg"]) < 0.5e-3
+    np.testing.assert_array_equal(tracks["rs-pg"].trajectory[1], tracks["gs-pg"].trajectory[1])
+
+
+@pytest.mark.parametrize("method", ["rs-g", "rs-pg"])
+def test_the_newest_frame_serves_as_a_rolling_reference_until_it_is_rectified(method: Method) -> None:
+    tracker = tracker_of(method, keyframe_strategy="newest", keyframe_distance=0.03)
+    rolling = []
+    for k in range(24):
+        tracker.feed(frame_at(k))
+        assert tracker._reference is not None
+        rolling.append(tracker._reference.rolling is not None)
+    # After the start: rolling for some frames, then rectified, and so on; a keyframe each time.
+    changes = np.flatnonzero(np.diff(np.array(rolling[6:], int)) < 0)
+    assert len(changes) >= 2 and tracker.keyframes == 1 + len(changes)
+    assert lost(tracker) == [] and worst_step(tracker) < 1e-3
+
+
+def test_frames_out_of_order_or_of_another_camera() -> None:
+    tracker = feed(tracker_of("rs-pg"), (frame_at(k) for k in (0, 1)))
+    for stamp in (1 / 30, 0.0, 1e5, np.nan):
+        frame = frame_at(2)
+        with pytest.raises(UserError, match="in order of time"):
+            tracker.feed(replace(frame, depth=replace(frame.depth, stamp=stamp)))
+    with pytest.raises(UserError, match=r"depth image .* \(60, 80\)"):
+        tracker.feed(Frame(Image(0.1, np.ones((60, 80), np.float32)), ()))
+    assert not tracker.feed(frame_at(3)).lost
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"method": "best"}, {"knot_spacing_s": 0.0}, {"knot_phase": 2.0}, {"keyframe_overlap": -0.5}, {"max_depth": -1.0},
+     {"bootstrap_frames": 2}, {"keyframe_strategy": "best"}, {"keyframe_distance": float("nan")}],
+)  # fmt: skip
+def test_options_are_checked(wrong: dict[str, object]) -> None:
+    with pytest.raises(UserError, match=str(next(iter(wrong))).split("_")[0]):
+        Options(**wrong)  # type: ignore[arg-type]

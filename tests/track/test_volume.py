@@ -1,0 +1,235 @@
+"""The signed distance volume and its mesh: integrating, ray casting and meshing closed-form surfaces."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from rstrack_util import ENGINE, Plane
+
+from rsgen.errors import UserError
+from rsgen.geometry import se3
+from rsgen.geometry.camera import Camera
+from rstrack.keyframes.keyframe import rectified_lens
+from rstrack.volume.kernels import BLOCK, scale_kernel
+from rstrack.volume.mesh import extract_surface, write_ply
+from rstrack.volume.volume import Blocks, Volume
+
+LENS = rectified_lens(Camera(96, 72, 72.0, 73.0, 47.0, 36.5))
+SHAPE = LENS.camera.height, LENS.camera.width
+WALL = Plane(np.array([0.3, -0.2, 1.0]) / np.linalg.norm([0.3, -0.2, 1.0]), 1.5)
+POSES = se3.exp(np.array([[0, 0, 0, 0, 0, 0], [0.1, 0.03, -0.1, 0.05, -0.1, 0.1], [-0.1, 0.1, 0.1, -0.05, 0.1, 0.0]]))
+RAYS = LENS.camera.unproject(LENS.camera.pixel_grid())
+
+
+def depth_of(plane: Plane, T_world_cam: np.ndarray) -> np.ndarray:
+    """z (h, w) of a plane."""
+    d = RAYS @ T_world_cam[:3, :3].T
+    return (plane.offset - plane.normal @ T_world_cam[:3, 3]) / (d @ plane.normal)
+
+
+def inverse(z: np.ndarray) -> object:
+    return ENGINE.upload(np.where(z > 0, 1.0 / np.where(z > 0, z, 1.0), 0.0))
+
+
+def filled(voxel_m: float = 0.02, **kwargs: bool) -> Volume:
+    volume = Volume(ENGINE, voxel_m, **kwargs)
+    for T in POSES:
+        volume.integrate(inverse(depth_of(WALL, T)), T, LENS)
+    return volume
+
+
+def test_a_plane_is_seen_again_from_another_pose() -> None:
+    T = se3.exp(np.array([0.05, 0.0, -0.05, 0.02, 0.03, 0.2]))
+    rho, _ = filled().raycast(T, LENS)
+    z, true = ENGINE.download(rho, SHAPE), depth_of(WALL, T)
+    z, seen = 1.0 / np.maximum(z, 1e-6), z > 0
+    uv, _ = LENS.camera.project(se3.transform(se3.inverse(POSES[0]) @ T, RAYS * true[..., None]))
+    # Four voxels (5 px) inside of what the first pose saw; others saw more.
+    inside = ((uv > 5) & (uv < np.array(SHAPE[::-1]) - 6)).all(axis=-1)
+    assert inside.mean() > 0.6 and seen[inside].all()
+    assert np.abs(z - true)[seen].max() < 2e-4  # a hundredth of a voxel
+
+
+def test_nothing_is_seen_where_nothing_was() -> None:
+    assert not ENGINE.download(Volume(ENGINE).raycast(np.eye(4), LENS)[0], SHAPE).any()
+    behind = se3.exp(np.array([0, 0, 0, 0, np.pi, 0.0]))
+    assert not ENGINE.download(filled().raycast(behind, LENS)[0], SHAPE).any()
+    beyond = np.eye(4)
+    beyond[2, 3] = 4.0  # looking away from the wall, from behind it
+    assert not ENGINE.download(filled().raycast(beyond, LENS)[0], SHAPE).any()
+
+
+def test_the_distance_to_a_pixels_plane() -> None:
+    z = depth_of(WALL, POSES[1])
+    scale = ENGINE.download(scale_kernel(ENGINE, LENS)(inverse(z)), SHAPE)
+    expected = WALL.offset - WALL.normal @ POSES[1, :3, 3]
+    np.testing.assert_allclose(scale, expected, rtol=2e-5)
+    # Beside an edge the slope is not known: the plane is square to the ray.
+    z[:, 50:] += 1.0
+    scale = ENGINE.download(scale_kernel(ENGINE, LENS)(inverse(z)), SHAPE)
+    square = z * np.linalg.norm(RAYS, axis=-1)
+    np.testing.assert_allclose(scale[:, 47:53], square[:, 47:53], rtol=2e-5)
+    np.testing.assert_allclose(scale[:, :47], expected, rtol=2e-5)
+
+
+def test_depths_are_averaged_by_weight() -> None:
+    volume, ones = Volume(ENGINE, 0.02), np.ones(SHAPE)
+    for offset, weight in ((1.50, 1.0), (1.508, 3.0)):
+        z = depth_of(Plane(np.array([0.0, 0.0, 1.0]), offset), np.eye(4))
+        volume.integrate(inverse(z), np.eye(4), LENS, weight=ENGINE.upload(weight * ones))
+    seen = ENGINE.download(volume.raycast(np.eye(4), LENS)[0], SHAPE)[8:-8, 8:-8]
+    # Farther measurements are seen as squarely, so that only the weights count: (1.5 + 3 · 1.508) / 4.
+    np.testing.assert_allclose(1.0 / seen, 1.506, atol=1e-4)
+
+
+def test_near_measurements_count_more() -> None:
+    """Nguyen et al.: (σ(1 m) / σ(z))², σ = 0.0012 + 0.0019 (z − 0.4)²."""
+    weights = []
+    for z in (1.0, 2.0):
+        volume = Volume(ENGINE, 0.02)
+        volume.integrate(inverse(np.full(SHAPE, z)), np.eye(4), LENS)
+        p = np.array([0.0, 0.0, z])
+        index = np.rint(p / 0.02).astype(int)
+        found = volume.download()
+        x, y, b = index // BLOCK - found.first
+        block = found.directory[b, y, x]
+        weights.append(found.weight[block, index[2] % BLOCK, index[1] % BLOCK, index[0] % BLOCK])
+    sigma = 0.0012 + 0.0019 * (np.array([1.0, 2.0]) - 0.4) ** 2
+    assert weights[0] == pytest.approx(1.0, abs=0.01)
+    assert weights[1] == pytest.approx((sigma[0] / sigma[1]) ** 2, rel=0.01)
+
+
+def test_depth_is_not_interpolated_across_edges() -> None:
+    z = np.full(SHAPE, 2.0)
+    z[:, : SHAPE[1] // 2] = 1.0
+    volume = Volume(ENGINE, 0.02)
+    volume.integrate(inverse(z), np.eye(4), LENS)
+    found = volume.download()
+    rows = np.argwhere(found.directory >= 0)
+    tsdf = found.tsdf[found.directory[tuple(rows.T)]]
+    depth = ((rows[:, 0] + found.first[2])[:, None] * BLOCK + np.arange(BLOCK)) * 0.02
+    crossing = (tsdf <= 0) & (found.weight[found.directory[tuple(rows.T)]] > 0)
+    where = np.broadcast_to(depth[:, :, None, None], crossing.shape)[crossing]
+    # Behind a surface are only points within the truncation (0.08 m, slant included) of one of the two.
+    assert (np.minimum(np.abs(where - 1.0), np.abs(where - 2.0)) < 0.1).all() and len(where) > 100
+
+
+def test_the_same_frames_give_the_same_bits_and_no_more_blocks() -> None:
+    a, b = filled(), filled()
+    np.testing.assert_array_equal(a.download().tsdf, b.download().tsdf)
+    np.testing.assert_array_equal(a.download().weight, b.download().weight)
+    blocks, size = a.blocks, a.bytes
+    for T in POSES:
+        a.integrate(inverse(depth_of(WALL, T)), T, LENS)
+    assert (a.blocks, a.bytes) == (blocks, size)
+
+
+def test_memory_is_spent_on_the_surface_only() -> None:
+    volume = Volume(ENGINE, 0.02)
+    volume.integrate(inverse(np.full(SHAPE, 2.0)), np.eye(4), LENS)
+    edge = 0.02 * BLOCK
+    face = (2.0 * SHAPE[1] / LENS.camera.fx / edge + 2) * (2.0 * SHAPE[0] / LENS.camera.fy / edge + 2)
+    assert volume.blocks <= 2 * face
+
+
+def test_a_volume_grows_beyond_its_first_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    T = POSES[0]
+    kept, _ = filled().raycast(T, LENS)
+    monkeypatch.setattr("rstrack.volume.volume._FIRST_BLOCKS", 16)
+    volume = filled()
+    far = np.eye(4)
+    far[:3, 3] = 5.0, -3.0, 0.0  # the directory grows too
+    volume.integrate(inverse(np.full(SHAPE, 2.5)), far, LENS)
+    assert volume.blocks > 2 * 16
+    np.testing.assert_array_equal(ENGINE.download(volume.raycast(T, LENS)[0], SHAPE), ENGINE.download(kept, SHAPE))
+
+
+def test_colors_come_back() -> None:
+    volume, z = Volume(ENGINE, 0.02, color=True), depth_of(WALL, np.eye(4))
+    left = np.broadcast_to(np.arange(SHAPE[1]) < SHAPE[1] // 2, SHAPE)
+    planes = [ENGINE.upload(np.where(left, a, b)) for a, b in ((0.8, 0.1), (0.3, 0.6), (0.2, 0.9), (1.0, 1.0))]
+    volume.integrate(inverse(z), np.eye(4), LENS, color=planes)
+    _, rgb = volume.raycast(np.eye(4), LENS, color=True)
+    found = np.stack([ENGINE.download(plane, SHAPE) for plane in rgb], axis=-1)
+    np.testing.assert_allclose(found[36, 20], [0.8, 0.3, 0.2], atol=1e-3)
+    np.testing.assert_allclose(found[36, 75], [0.1, 0.6, 0.9], atol=1e-3)
+
+
+def test_what_cannot_be_is_refused() -> None:
+    for voxel_m in (0.0, 2.0, np.nan):
+        with pytest.raises(UserError, match="voxel size"):
+            Volume(ENGINE, voxel_m)
+    with pytest.raises(UserError, match="finite"):
+        Volume(ENGINE).integrate(inverse(np.ones(SHAPE)), np.full((4, 4), np.nan), LENS)
+    with pytest.raises(UserError, match="larger voxels"):
+        Volume(ENGINE, 0.001).integrate(inverse(np.full(SHAPE, 50.0)), np.eye(4), LENS)
+    empty = Volume(ENGINE)
+    empty.integrate(inverse(np.zeros(SHAPE)), np.eye(4), LENS)
+    assert empty.blocks == 0
+    with pytest.raises(UserError, match="no surface"):
+        extract_surface(empty.download(), 0.01)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def ball_blocks(radius: float, centre: np.ndarray, color: bool = False) -> Blocks:
+    """A ball's distances in 12³ blocks around the origin: more than one chunk, seams inside the ball."""
+    n = 12
+    grid = (np.arange(n * BLOCK) - n * BLOCK // 2).astype(float)
+    z, y, x = np.meshgrid(grid, grid, grid, indexing="ij")
+    tsdf = np.clip((np.sqrt((x - centre[0]) ** 2 + (y - centre[1]) ** 2 + (z - centre[2]) ** 2) - radius) / 4, -1, 1)
+
+    def packed(values: np.ndarray) -> np.ndarray:
+        return values.reshape(n, BLOCK, n, BLOCK, n, BLOCK).transpose(0, 2, 4, 1, 3, 5).reshape(-1, BLOCK, BLOCK, BLOCK)
+
+    planes = [np.clip(0.5 + x / 100, 0, 1), np.full_like(x, 0.25), np.full_like(x, 1.0), np.ones_like(x)]
+    colors = np.stack([packed(p) for p in planes], axis=-1).astype(np.float32) if color else None
+    directory = np.arange(n**3, dtype=np.int32).reshape(n, n, n)
+    one = np.ones_like(tsdf)
+    first = np.full(3, -n // 2)
+    return Blocks(first, directory, packed(tsdf).astype(np.float32), packed(one).astype(np.float32), colors)
+
+
+def test_a_ball_becomes_a_closed_mesh_without_seams() -> None:
+    centre = np.array([1.3, -2.6, 4.1])
+    surface = extract_surface(ball_blocks(30.0, centre), 0.01)
+    mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+    assert mesh.is_watertight and mesh.is_winding_consistent
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi * 0.3**3, rel=5e-3)  # positive: outside is in front
+    radius = np.linalg.norm(surface.vertices - 0.01 * centre, axis=1)
+    np.testing.assert_allclose(radius, 0.3, atol=2e-4)
+
+
+def test_points_that_were_not_seen_leave_a_hole() -> None:
+    blocks = ball_blocks(30.0, np.zeros(3))
+    whole = len(extract_surface(blocks, 0.01).faces)
+    z = (np.arange(12) - 6)[:, None, None] * BLOCK
+    weight = blocks.weight.reshape(12, 12, 12, BLOCK, BLOCK, BLOCK).copy()
+    weight[(z >= 0).ravel()] = 0.0
+    half = extract_surface(Blocks(blocks.first, blocks.directory, blocks.tsdf, weight.reshape(-1, 8, 8, 8), None), 0.01)
+    assert half.vertices[:, 2].max() <= -0.01 + 1e-9
+    assert 0.4 < len(half.faces) / whole < 0.55
+
+
+def test_vertices_have_the_lattices_colors() -> None:
+    surface = extract_surface(ball_blocks(30.0, np.zeros(3), color=True), 0.01)
+    assert surface.colors is not None
+    np.testing.assert_allclose(surface.colors[:, 0] / 255, 0.5 + surface.vertices[:, 0], atol=5e-3)
+    np.testing.assert_array_equal(surface.colors[:, 1:], [[64, 255]] * len(surface.colors))
+
+
+def test_ply_files_are_read_back(tmp_path: Path) -> None:
+    surface = extract_surface(ball_blocks(30.0, np.zeros(3), color=True), 0.01)
+    write_ply(tmp_path / "mesh.ply", surface, "made by a test")
+    mesh = trimesh.load(tmp_path / "mesh.ply", process=False)
+    np.testing.assert_allclose(mesh.vertices, surface.vertices, atol=1e-6)
+    np.testing.assert_array_equal(mesh.faces, surface.faces)
+    np.testing.assert_array_equal(mesh.visual.vertex_colors[:, :3], surface.colors)
+    assert b"comment made by a test\n" in (tmp_path / "mesh.ply").read_bytes()[:200]
+    write_ply(tmp_path / "cloud.ply", surface, cloud=True)
+    assert isinstance(cloud := trimesh.load(tmp_path / "cloud.ply"), trimesh.PointCloud)
+    assert len(cloud.vertices) == len(surface.vertices)
