@@ -23,11 +23,12 @@ from rstrack_util import (
 from rsgen.geometry import se3
 from rsgen.geometry.so3 import hat
 from rsgen.geometry.spline import Spline
-from rstrack import lines, residuals
+from rstrack.alignment import residuals
 from rstrack.alignment.linearise import seen_motions, weakest_motion
 from rstrack.alignment.normal_equations import chain
 from rstrack.alignment.residuals import BlockSums, Scaling
 from rstrack.alignment.student_t import NU, weight
+from rstrack.images import line_poses as lines
 from rstrack.images.line_poses import IDENTITY_FROM_BASE, to_base_table
 from rstrack.images.pyramid import DepthImage
 from rstrack.images.sampling import EDGE

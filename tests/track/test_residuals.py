@@ -27,9 +27,10 @@ from util import numeric_jacobian
 from rsgen.device.projection import project_rolling
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack import lines, residuals
+from rstrack.alignment import residuals
 from rstrack.alignment.linearise import Linearised, Terms
 from rstrack.alignment.student_t import NU, scale_step, weight
+from rstrack.images import line_poses as lines
 from rstrack.images.pyramid import ColorImage, DepthImage
 from rstrack.keyframes.keyframe import Reference
 
