@@ -9,10 +9,27 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable
+from dataclasses import fields
 from functools import wraps
-from typing import Any
+from typing import Any, TypeVar
 
 import drjit as dr
+
+Inputs = TypeVar("Inputs")
+
+
+def recorded_from(inputs: type[Inputs]) -> Callable[[Callable[[Inputs], Any]], Callable[[Inputs], Any]]:
+    """`recorded` for a function whose one argument is a dataclass of Dr.Jit arrays: named, not in an order to remember.
+
+    The arrays are handed over one by one: `drjit.freeze` takes 50 µs to look into a dataclass.
+    """
+    names = [field.name for field in fields(inputs)]  # type: ignore[arg-type]
+
+    def decorate(function: Callable[[Inputs], Any]) -> Callable[[Inputs], Any]:
+        frozen = recorded(lambda *arrays: function(inputs(*arrays)))
+        return lambda given: frozen(*(getattr(given, name) for name in names))
+
+    return decorate
 
 
 def recorded(function: Callable[..., Any]) -> Callable[..., Any]:

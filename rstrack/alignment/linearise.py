@@ -12,18 +12,19 @@ from rsgen.device.projection import Lens
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
+from rstrack.alignment.block_sums import BlockSums, Scaling, block_counts
 from rstrack.alignment.normal_equations import Quadratic, chain
 from rstrack.alignment.residuals import (
-    BlockSums,
-    Scaling,
-    block_counts,
+    GeometricInput,
+    PhotometricInput,
+    VisibilityInput,
     geometric_kernel,
     photometric_kernel,
     visibility_kernel,
 )
 from rstrack.alignment.student_t import scale_step
-from rstrack.images.device_frame import DeviceRig
-from rstrack.images.line_poses import IDENTITY_FROM_BASE, from_base_table, to_base_table
+from rstrack.images.device_frame import DeviceRig, Timer, untimed
+from rstrack.images.line_poses import IDENTITY_FROM_BASE, Exposure, from_base_table, to_base_table
 from rstrack.images.pyramid import ColorImage, DepthImage
 from rstrack.keyframes.keyframe import STRIDES, Points, Reference
 
@@ -75,6 +76,7 @@ class Terms:
     blur_sigma_px: float = 0.0
     # Where interpolation errs by more than this part of σ, its bias counts, not its size: those pixels are left out.
     smooth: float = 0.25
+    timer: Timer = untimed
     _kernel: Kernels = field(init=False)
 
     def __post_init__(self) -> None:
@@ -83,7 +85,7 @@ class Terms:
     @classmethod
     def of(cls, device: DeviceRig, blur_sigma_px: float = 0.0) -> Terms:
         """The terms of a rig; blur_sigma_px as in `Options`."""
-        return cls(device.e, device.device_rays, blur_sigma_px=blur_sigma_px)
+        return cls(device.e, device.device_rays, blur_sigma_px=blur_sigma_px, timer=device.timer)
 
     def geometric(
         self, image: DepthImage, ref: Reference, spline: Spline, level: int, sigma: float,
@@ -94,23 +96,23 @@ class Terms:
         slopes_at: spline at which the lines' poses are differentiated by control points, if not `spline`: that changes
         by no more than the increments between the two (relative), which Gauss-Newton steps do not notice.
         """
-        to_base = to_base_table(spline, ref.T_world_base, image.exposure)
+        to_base = self._to_base(spline, ref.T_world_base, image.exposure)
         sums = self._geometric_sums(image, ref, to_base, self._seen_from(spline, ref), level, sigma)
         _, _, per, ref_per = block_counts(image.exposure.lens, ref.lens)
         times = image.exposure.block_times(per)
         floor = self._floor_depth(image, ref)
-        return self._finish(sums, slopes_at or spline, ref, times, ref_per, sigma, floor, ref.lever)
+        return self._finish(sums, slopes_at or spline, ref, times, ref_per, sigma, floor, ref.median_depth)
 
     def geometric_pose(
         self, image: DepthImage, ref: Reference, T_base_cam: FloatArray, level: int, sigma: float
     ) -> tuple[BlockSums, float]:
         """The same for a global-shutter image at one pose (4, 4) against a rectified reference: sums and next σ (m)."""
-        to_base = np.concatenate([T_base_cam[:3, :3].ravel(), T_base_cam[:3, 3]])
+        to_base = self.e.upload(np.concatenate([T_base_cam[:3, :3].ravel(), T_base_cam[:3, 3]]))
         sums = self._geometric_sums(image, ref, to_base, self.e.upload(IDENTITY_FROM_BASE), level, sigma)
         return sums, scale_step(sigma, sums.weighted, sums.count, self._floor_depth(image, ref))
 
     def _geometric_sums(
-        self, image: DepthImage, ref: Reference, to_base: FloatArray, from_base: Any, level: int, sigma: float
+        self, image: DepthImage, ref: Reference, to_base: Any, from_base: Any, level: int, sigma: float
     ) -> BlockSums:
         e, lens = self.e, image.exposure.lens
         kernel = self._kernel(geometric_kernel, lens, ref.lens, STRIDES[level])
@@ -120,20 +122,22 @@ class Terms:
         smooth = self.smooth * max(sigma, _CREDIBLE_DEPTH)
         constants = e.upload(np.append(scaling.parameters(sigma, gate), smooth))
         surface = ref.inverse_depth, ref.slope_x, ref.slope_y, ref.roughness
-        raw = kernel(image.z, *self.rays, e.upload(to_base), *surface, from_base, constants)
+        with self.timer(f"geometric kernel, level {level}"):
+            given = GeometricInput(image.z, *self.rays, to_base, *surface, from_base, constants)
+            raw = kernel(given).numpy()
         current, reference, _, _ = block_counts(lens, ref.lens)
-        return scaling.unpack(raw.numpy(), current, reference)
+        return scaling.unpack(raw, current, reference)
 
     def _floor_depth(self, image: DepthImage, ref: Reference) -> float:
         # A camera at rest repeats its rounding, so that depth would seem far better than it is.
-        return max(self.floor_depth, image.resolution * ref.lever**2 / np.sqrt(12.0))
+        return max(self.floor_depth, image.resolution * ref.median_depth**2 / np.sqrt(12.0))
 
     def visible(self, depth: DepthImage, ref: Reference, spline: Spline, level: int) -> Any:
         """Which of the reference's points of a level the depth image does not hide: 1 or 0, on the device."""
         lens, points = depth.exposure.lens, ref.points[level]
         kernel = self._kernel(visibility_kernel, lens, ref.lens, STRIDES[level])
-        from_base = self.e.upload(from_base_table(spline, ref.T_world_base, depth.exposure))
-        return kernel(points.x, points.y, points.z, self._ref_lines(spline, ref), depth.z, from_base)
+        from_base = self._from_base(spline, ref.T_world_base, depth.exposure)
+        return kernel(VisibilityInput(points.x, points.y, points.z, self._ref_lines(spline, ref), depth.z, from_base))
 
     def photometric(
         self, image: ColorImage, ref: Reference, spline: Spline, level: int, sigma: float,
@@ -142,27 +146,39 @@ class Terms:
         """The reference's points of a level, those that are `visible`, against that level of the colour image."""
         e, lens, points = self.e, image.exposure.lens, ref.points[level]
         kernel = self._kernel(photometric_kernel, lens, ref.lens, STRIDES[level], level, self.blur_sigma_px)
-        from_base = e.upload(from_base_table(spline, ref.T_world_base, image.exposure))
+        from_base = self._from_base(spline, ref.T_world_base, image.exposure)
         # Moving closer or turning packs more points into a block than its share.
         scaling = self._scaling(points, lens, ref.lens.camera, ref, STRIDES[level], 4)
         constants = e.upload(scaling.parameters(sigma, self.gate_intensity))
         seen_at = self._ref_lines(spline, ref), image.levels[level], from_base
         shown = points.visible if visible is None else visible
-        raw = kernel(points.x, points.y, points.z, points.intensity, shown, *seen_at, constants)
+        with self.timer(f"photometric kernel, level {level}"):
+            given = PhotometricInput(points.x, points.y, points.z, points.intensity, shown, *seen_at, constants)
+            raw = kernel(given).numpy()
         current, reference, per, ref_per = block_counts(lens, ref.lens)
-        sums = scaling.unpack(raw.numpy(), current, reference)
+        sums = scaling.unpack(raw, current, reference)
         times = image.exposure.block_times(per)
-        return self._finish(sums, slopes_at or spline, ref, times, ref_per, sigma, self.floor_intensity, points.lever)
+        return self._finish(
+            sums, slopes_at or spline, ref, times, ref_per, sigma, self.floor_intensity, points.median_depth
+        )
+
+    def _to_base(self, spline: Spline, T_world_base: FloatArray, exposure: Exposure) -> Any:
+        with self.timer("poses of lines"):
+            return self.e.upload(to_base_table(spline, T_world_base, exposure))
+
+    def _from_base(self, spline: Spline, T_world_base: FloatArray, exposure: Exposure) -> Any:
+        with self.timer("poses of lines"):
+            return self.e.upload(from_base_table(spline, T_world_base, exposure))
 
     def _ref_lines(self, spline: Spline, ref: Reference) -> Any:
         if ref.rolling is None:
             return self.e.upload(np.zeros(12))
-        return self.e.upload(to_base_table(spline, ref.T_world_base, ref.rolling))
+        return self._to_base(spline, ref.T_world_base, ref.rolling)
 
     def _seen_from(self, spline: Spline, ref: Reference) -> Any:
         if ref.rolling is None:
             return self.e.upload(IDENTITY_FROM_BASE)
-        return self.e.upload(from_base_table(spline, ref.T_world_base, ref.rolling))
+        return self._from_base(spline, ref.T_world_base, ref.rolling)
 
     @staticmethod
     def _scaling(
@@ -171,22 +187,25 @@ class Terms:
         pixels = -(-grid.width // stride) * -(-grid.height // stride)
         current = block_counts(lens, ref.lens)[0]
         per_block = -(-pixels // current) + max(grid.width, grid.height)
-        return Scaling(units.lever, units.bound, min(pixels, slack * per_block))
+        return Scaling(units.median_depth, units.bound, min(pixels, slack * per_block))
 
     def _finish(
         self, sums: BlockSums, spline: Spline, ref: Reference, times: FloatArray, ref_per: int, sigma: float,
-        floor: float, lever: float,
+        floor: float, median_depth: float,
     ) -> Linearised:  # fmt: skip
         ref_times = None if ref.rolling is None else ref.rolling.block_times(ref_per)
-        model, motion = chain(sums, spline, ref.T_world_base, times, ref_times)
+        with self.timer("linear algebra: chain"):
+            model, motion = chain(sums, spline, ref.T_world_base, times, ref_times)
         scaled = Quadratic(model.first, model.H / sigma**2, model.g / sigma)
         next_sigma = scale_step(sigma, sums.weighted, sums.count, floor)
-        return Linearised(scaled, motion, sigma, next_sigma, sums.cost, sums.count, floor, seen_motions(sums, lever))
+        return Linearised(
+            scaled, motion, sigma, next_sigma, sums.cost, sums.count, floor, seen_motions(sums, median_depth)
+        )
 
 
-def seen_motions(sums: BlockSums, lever: float) -> FloatArray:
-    """Summed H (6, 6) per pixel, with rotations divided by `lever` (m); zero without pixels."""
-    scale = 1.0 / np.array([1.0, 1.0, 1.0, lever, lever, lever])
+def seen_motions(sums: BlockSums, median_depth: float) -> FloatArray:
+    """Summed H (6, 6) per pixel, with rotations divided by `median_depth` (m); zero without pixels."""
+    scale = 1.0 / np.array([1.0, 1.0, 1.0, median_depth, median_depth, median_depth])
     return sums.H.sum(axis=(0, 1)) * np.outer(scale, scale) / max(1, sums.count)
 
 

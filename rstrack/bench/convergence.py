@@ -16,18 +16,21 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
-from rstrack.alignment.optimizer import SplineState
+from rstrack.alignment.linearise import Terms
+from rstrack.alignment.spline_state import SplineState
 from rstrack.bench.bootstrap import generator
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import plain
-from rstrack.data.rig import Frame
-from rstrack.images.device_frame import DeviceFrame
+from rstrack.data.rig import Frame, Rig
+from rstrack.images.device_frame import DeviceFrame, DeviceRig
 from rstrack.keyframes.keyframe import Reference
+from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.metrics.association import angles_deg
 from rstrack.options import Options
-from rstrack.tracking.lost_track import Health
+from rstrack.tracking.lost_track import FitHistory
 from rstrack.tracking.run import Progress
-from rstrack.tracking.spline_tracker import Tracker
+from rstrack.tracking.spline_tracker import observe
+from rstrack.tracking.window import Window
 
 # What a frame is moved by, in metres and degrees, and multiples of it; 0 tells how good the truth itself is as a start.
 UNIT_M, UNIT_DEG = 0.02, 1.0
@@ -157,11 +160,11 @@ def convergence(
         t = new.depth.exposure.mid_time
         T_true = truth.pose(t)
         off_m = max(off_m, float(np.linalg.norm(spline.pose(t)[:3, 3] - T_true[:3, 3])))
-        health = Health()
+        fits = FitHistory()
         for factor in FACTORS:
             state = moved_state(spline, new, pair, factor)
             # The start from the truth itself comes first: from it the tracker knows how well frames fit as a rule.
-            steps, believed = aligner.align(new, ref, state, copy.deepcopy(health) if factor else health)
+            steps, believed = aligner.align(new, ref, state, copy.deepcopy(fits) if factor else fits)
             T = state.spline.pose(t)
             error = float(np.linalg.norm(T[:3, 3] - T_true[:3, 3])), float(angles_deg(T_true[None], T[None])[0])
             trials.append(Trial(pair.keyframe, pair.frame, factor, *error, steps, believed))
@@ -228,24 +231,30 @@ def moved_state(spline: Spline, new: DeviceFrame, pair: Pair, factor: float) -> 
     return SplineState(Spline(points, spline.t0, spline.dt))
 
 
-class _Aligner(Tracker):
-    """The tracker's own way to align one frame, without a track."""
+class _Aligner:
+    """Aligns single frames as the tracker does, without a track."""
+
+    def __init__(self, rig: Rig, options: Options) -> None:
+        self._options, self._focal = options, rig.depth_camera.fx
+        self._device = DeviceRig(rig, options)
+        self._terms = Terms.of(self._device, options.blur_sigma_px)
+        self._maker = KeyframeMaker.of(self._device)
 
     def keyframe(self, k: int, frame: Frame, motion: Spline) -> Reference:
         """A frame rectified with a known motion."""
-        new = self._device.upload(k, frame)
+        new = self.prepare(k, frame)
         return self._maker.rectified(k, new.depth, new.colors, motion, None)
 
     def prepare(self, k: int, frame: Frame) -> DeviceFrame:
         """Onto the device."""
         return self._device.upload(k, frame)
 
-    def align(self, new: DeviceFrame, ref: Reference, state: SplineState, health: Health) -> tuple[int, bool]:
-        """Move the state's control points that the frame touches; steps, and whether `health` accepts the result."""
-        first, fresh = state.segment(new.first_time), self._observe(new, ref)
-        free = first, len(state.points)
-        solved = self._optimise(state, fresh, [], free, [self._prior(state, free, first)])
-        return solved.iterations, not health.fault(fresh, solved, ref.pixels)
+    def align(self, new: DeviceFrame, ref: Reference, state: SplineState, fits: FitHistory) -> tuple[int, bool]:
+        """Move the state's control points that the frame touches; steps, and whether `fits` accepts the result."""
+        window = Window(self._terms, self._focal, state, state.segment(new.first_time))
+        fresh = observe(new, ref, self._options)
+        solved = window.solve(fresh)
+        return solved.iterations, not fits.fault(fresh, solved, ref.pixels)
 
 
 def _span(dataset: Dataset, k: int) -> tuple[float, float]:

@@ -5,16 +5,13 @@ print(time_methods(dataset, [Options(method="rs-g")], frames=150, peers=["open3d
 
 from __future__ import annotations
 
-import importlib
 import os
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import reduce
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 
@@ -30,35 +27,10 @@ from rstrack.tracking.run import AnyTracker, Progress, make_tracker
 # Frames at the start that are not counted: the first of them compile kernels.
 _WARM_UP = 20
 
-Label = str | Callable[..., str]
-
-
-def _term(name: str, position: int) -> Callable[..., str]:
-    """Label of a method of `Terms` whose argument number `position` (self is 0) is the pyramid's level."""
-    return lambda *arguments, **_: f"{name} kernel, level {arguments[position]}"
-
-
-# What is timed: module, attribute, and the part of the work that it is. Kernels run when their sums are read, inside
-# the terms; what is called from there is taken out of their time.
-_WATCHED: tuple[tuple[str, str, Label], ...] = (
-    ("rstrack.images.device_frame", "DeviceRig.upload", "preparing images"),
-    ("rstrack.alignment.linearise", "Terms.geometric", _term("geometric", 4)),
-    ("rstrack.alignment.linearise", "Terms.geometric_pose", _term("geometric", 4)),
-    ("rstrack.alignment.linearise", "Terms.photometric", _term("photometric", 4)),
-    ("rstrack.alignment.linearise", "to_base_table", "poses of lines"),
-    ("rstrack.alignment.linearise", "from_base_table", "poses of lines"),
-    ("rstrack.alignment.linearise", "chain", "linear algebra: chain"),
-    ("rstrack.alignment.optimizer", "assemble", "linear algebra: assemble"),
-    ("rstrack.alignment.optimizer", "solve", "linear algebra: solve"),
-    ("rstrack.keyframes.maker", "KeyframeMaker.rolling", "keyframes: make"),
-    ("rstrack.keyframes.maker", "KeyframeMaker.rectified", "keyframes: make"),
-    ("rstrack.keyframes.maker", "KeyframeMaker.fused", "keyframes: fuse"),
-)
-
 
 @dataclass
 class Stopwatch:
-    """Adds up the seconds spent in watched functions, each without those that it calls. For one thread."""
+    """Adds up the seconds spent in watched parts, each without those within it. For one thread."""
 
     clock: Callable[[], float] = time.perf_counter
     seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
@@ -75,25 +47,6 @@ class Stopwatch:
             elapsed = self.clock() - begin
             self.seconds[label] += elapsed - self._inner.pop()
             self._inner[-1] += elapsed
-
-    def wrapped(self, function: Callable[..., Any], label: Label) -> Callable[..., Any]:
-        """The function, timed; a label may depend on its arguments."""
-
-        def timed_function(*arguments: Any, **named: Any) -> Any:
-            with self.timed(label if isinstance(label, str) else label(*arguments, **named)):
-                return function(*arguments, **named)
-
-        return timed_function
-
-    @contextmanager
-    def watching(self, watched: Sequence[tuple[str, str, Label]] = _WATCHED) -> Iterator[None]:
-        """Time the watched functions inside the block."""
-        with ExitStack() as stack:
-            for module, attribute, label in watched:
-                *path, name = attribute.split(".")
-                owner = reduce(getattr, path, importlib.import_module(module))
-                stack.enter_context(patch.object(owner, name, self.wrapped(getattr(owner, name), label)))
-            yield
 
 
 @dataclass(frozen=True)
@@ -209,21 +162,19 @@ def time_methods(
 
 
 def _time(dataset: Dataset, options: Options, frames: int, warm_up: int, progress: Progress) -> MethodTimes:
-    tracker = make_tracker(dataset.rig, options)
-    watch = Stopwatch()
-    reading = Stopwatch()
+    watch, reading = Stopwatch(), Stopwatch()
+    tracker = make_tracker(dataset.rig, options, watch.timed)
     frame_ms: list[float] = []
-    with watch.watching():
-        for k in range(frames):
-            if k == warm_up:
-                watch.seconds.clear()
-                reading.seconds.clear()
-            with reading.timed("read"):
-                frame = dataset.frame(k, color=options.photometric)
-            begin = time.perf_counter()
-            _feed(tracker, frame, k, options)
-            frame_ms.append(1e3 * (time.perf_counter() - begin))
-            progress(options.method, (k + 1) / frames, f"{frame_ms[-1]:.0f} ms")
+    for k in range(frames):
+        if k == warm_up:
+            watch.seconds.clear()
+            reading.seconds.clear()
+        with reading.timed("read"):
+            frame = dataset.frame(k, color=options.photometric)
+        begin = time.perf_counter()
+        _feed(tracker, frame, k, options)
+        frame_ms.append(1e3 * (time.perf_counter() - begin))
+        progress(options.method, (k + 1) / frames, f"{frame_ms[-1]:.0f} ms")
     counted = frame_ms[warm_up:]
     parts = {name: 1e3 * seconds / len(counted) for name, seconds in watch.seconds.items()}
     parts["other"] = float(np.mean(counted)) - sum(parts.values())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -57,13 +59,23 @@ class DeviceFrame:
         return max(exposure.last_time for exposure in self.exposures)
 
 
+Timer = Callable[[str], AbstractContextManager[Any]]
+"""Watches a part of the work by its name: `with timer("linear algebra: solve"):`; `bench-speed` has one that counts."""
+
+
+def untimed(_: str) -> AbstractContextManager[None]:
+    """The timer that does nothing."""
+    return nullcontext()
+
+
 class DeviceRig:
     """Lenses and rays of a rig as a method sees them; takes its frames to the device.
 
     rays (h, w, 2): normalised coordinates of the depth camera's pixels; device_rays: the same on the device.
     """
 
-    def __init__(self, rig: Rig, options: Options) -> None:
+    def __init__(self, rig: Rig, options: Options, timer: Timer = untimed) -> None:
+        self.timer = timer
         self._rig, self._options = rig, options
         self.e = engine(options.backend)
         self._depth_lens = Lens(rig.depth_camera, _seen_as(rig.depth_shutter, options.rolling))
@@ -76,6 +88,10 @@ class DeviceRig:
 
     def upload(self, index: int, frame: Frame) -> DeviceFrame:
         """Frame `index` of a recording. Raises UserError if an image's size or type is not the rig's."""
+        with self.timer("preparing images"):
+            return self._upload(index, frame)
+
+    def _upload(self, index: int, frame: Frame) -> DeviceFrame:
         rig, options = self._rig, self._options
         z = _checked(frame.depth, rig.depth_camera, "depth", (), "float metres, 0 = missing", np.floating)
         if self._resolution == 0.0 and index < _SETTLED:

@@ -31,7 +31,7 @@ Image = npt.NDArray[np.float32]
 class Points:
     """Reference points of one pyramid level on the device: camera coordinates (z = 0: none), intensity, visibility.
 
-    lever, bound: see `residuals.Scaling`.
+    median_depth, bound: see `block_sums.Scaling`.
     """
 
     x: Any
@@ -39,7 +39,7 @@ class Points:
     z: Any
     intensity: Any
     visible: Any
-    lever: float
+    median_depth: float
     bound: float
 
 
@@ -51,7 +51,7 @@ class Reference:
     depth camera's exposure if it is not; the base frame is then only a frame to compute in.
     Inverse depth (1/m, 0 missing), its smoothed slopes by normalised coordinates, how far bilinear interpolation of it
     may be off (m), and fusion weights, on the device.
-    lever, bound: see `residuals.Scaling`, for the geometric term. pixels: how many of the finest level have depth.
+    median_depth, bound: see `block_sums.Scaling`, for the geometric term. pixels: of the finest level that have depth.
     """
 
     index: int
@@ -66,7 +66,7 @@ class Reference:
     roughness: Any
     weight: Any
     points: tuple[Points, ...]
-    lever: float
+    median_depth: float
     bound: float
     pixels: int
 
@@ -125,13 +125,13 @@ def on_one_surface(rho: Image) -> npt.NDArray[np.bool_]:
 
 
 def depth_scaling(rho: Image) -> tuple[float, float]:
-    """`lever` and `bound` of the geometric term.
+    """`median_depth` and `bound` of the geometric term.
 
-    |j| is 1 for shifts and z / lever for rotations, times the kernel's min((lever / z)², NEAREST): never above NEAREST
-    for points as far from the axis as from the camera.
+    |j| is 1 for shifts and z / median_depth for rotations, times the kernel's min((median_depth / z)², NEAREST): never
+    above NEAREST for points as far from the axis as from the camera.
     """
-    lever = float(np.median(1.0 / rho[rho > 0])) if (rho > 0).any() else 1.0
-    return lever, 2.0 * NEAREST
+    median_depth = float(np.median(1.0 / rho[rho > 0])) if (rho > 0).any() else 1.0
+    return median_depth, 2.0 * NEAREST
 
 
 def level_points(
@@ -150,9 +150,9 @@ def level_points(
         slope = (np.hypot(gx, gy)[::2, ::2] / 2**level * rho[pick])[z > 0]
         focal = 1.0 / max(float(np.diff(rays[0, :, 0]).mean()), 1e-9)
         bound = 2.0 * focal * float(np.percentile(slope, 99.5)) if slope.size else 1.0
-        lever = float(np.median(z[z > 0])) if (z > 0).any() else 1.0
+        median_depth = float(np.median(z[z > 0])) if (z > 0).any() else 1.0
         x, y = rays[..., 0][pick] * z, rays[..., 1][pick] * z
         on = e.upload(np.ones(z.shape))
-        out.append(Points(e.upload(x), e.upload(y), e.upload(z), e.upload(at), on, lever, max(bound, 1e-2)))
+        out.append(Points(e.upload(x), e.upload(y), e.upload(z), e.upload(at), on, median_depth, max(bound, 1e-2)))
     assert len(out) == LEVELS
     return tuple(out)

@@ -13,7 +13,7 @@ from rsgen.device.projection import Lens
 from rsgen.geometry import se3
 from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
-from rstrack.images.device_frame import DeviceRig
+from rstrack.images.device_frame import DeviceRig, Timer, untimed
 from rstrack.images.line_poses import from_base_table, to_base_table
 from rstrack.images.pyramid import ColorImage, DepthImage
 from rstrack.keyframes.keyframe import (
@@ -27,7 +27,7 @@ from rstrack.keyframes.keyframe import (
     surface_roughness,
     surface_slopes,
 )
-from rstrack.keyframes.rectification import color_kernel, fuse_kernel, rectify_kernel
+from rstrack.keyframes.rectification import ColorInput, FusionInput, color_kernel, fuse_kernel, rectify_kernel
 
 # Metres at one metre: depths that differ by more show different surfaces.
 _AGREE = 0.03
@@ -42,6 +42,7 @@ class KeyframeMaker:
     e: Engine
     rays: FloatArray
     device_rays: tuple[Any, Any]
+    timer: Timer = untimed
     _kernel: Kernels = field(init=False)
     _one: Any = None
     _rays: tuple[FloatArray, tuple[Any, Any]] | None = None
@@ -52,10 +53,14 @@ class KeyframeMaker:
     @classmethod
     def of(cls, device: DeviceRig) -> KeyframeMaker:
         """The maker for a rig."""
-        return cls(device.e, device.rays, device.device_rays)
+        return cls(device.e, device.rays, device.device_rays, device.timer)
 
     def rolling(self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline) -> Reference:
         """A reference that keeps its rolling shutter, for the time until it can be rectified."""
+        with self.timer("keyframes: make"):
+            return self._rolling(index, depth, colors, spline)
+
+    def _rolling(self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline) -> Reference:
         lens = depth.exposure.lens
         shape = lens.camera.height, lens.camera.width
         t = depth.exposure.mid_time
@@ -66,6 +71,12 @@ class KeyframeMaker:
         self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, older: Reference | None
     ) -> Reference:
         """A keyframe at mid readout, in which depth that the older one has is averaged in and fills holes."""
+        with self.timer("keyframes: make"):
+            return self._rectified(index, depth, colors, spline, older)
+
+    def _rectified(
+        self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, older: Reference | None
+    ) -> Reference:
         e = self.e
         t = depth.exposure.mid_time
         T_world_base, base, rho = self.rectify(depth, spline)
@@ -108,15 +119,18 @@ class KeyframeMaker:
 
     def fused(self, ref: Reference, depth: DepthImage, spline: Spline) -> Reference:
         """The keyframe with the depth of one more frame, whose poses are known, averaged in."""
-        from_base = self.e.upload(from_base_table(spline, ref.T_world_base, depth.exposure))
-        rho, weight = self._fuse(ref, depth.exposure.lens, depth.inverse_z, self._ones(depth), from_base)
+        with self.timer("keyframes: fuse"):
+            from_base = self.e.upload(from_base_table(spline, ref.T_world_base, depth.exposure))
+            rho, weight = self._fuse(ref, depth.exposure.lens, depth.inverse_z, self._ones(depth), from_base)
         return replace(ref, inverse_depth=rho, weight=weight)
 
     def _fuse(self, ref: Reference, lens: Lens, source: Any, source_weight: Any, from_base: Any) -> tuple[Any, Any]:
         constants = self.e.upload(np.array([_AGREE, _MOST]))
         kernel = self._kernel(fuse_kernel, lens, ref.lens)
         fused: tuple[Any, Any] = kernel(
-            ref.inverse_depth, ref.weight, ref.slope_x, ref.slope_y, source, source_weight, from_base, constants
+            FusionInput(
+                ref.inverse_depth, ref.weight, ref.slope_x, ref.slope_y, source, source_weight, from_base, constants
+            )
         )
         return fused
 
@@ -149,11 +163,12 @@ class KeyframeMaker:
             to_base = e.upload(to_base_table(spline, T_world_base, rolling) if rolling else np.zeros(12))
             from_base = e.upload(from_base_table(spline, T_world_base, color.exposure))
             kernel = self._kernel(color_kernel, color.exposure.lens, lens)
-            value, seen = kernel(device_rho, *grid, to_base, color.levels[0], from_base)
+            value, seen = kernel(ColorInput(device_rho, *grid, to_base, color.levels[0], from_base))
             points = level_points(e, rho, rays, e.download(value, rho.shape), e.download(seen, rho.shape) > 0)
-        lever, bound = depth_scaling(rho)
+        median_depth, bound = depth_scaling(rho)
+        pixels = int(np.count_nonzero(rho)) // STRIDES[0] ** 2
         weights = e.upload(np.where(rho > 0, 1.0, 0.0) if weight is None else weight)
         return Reference(
             index, depth.exposure.stamp, t, T_world_base, lens, rolling, device_rho, e.upload(slope_x),
-            e.upload(slope_y), roughness, weights, points, lever, bound, int(np.count_nonzero(rho)) // STRIDES[0] ** 2,
+            e.upload(slope_y), roughness, weights, points, median_depth, bound, pixels,
         )  # fmt: skip

@@ -7,13 +7,14 @@ the same point is found by fixed-point iteration; inverse depth is interpolated 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 
 from rsgen.device.arrays import Engine
 from rsgen.device.projection import TO_BASE, Lens, gather, move, project, project_rolling
-from rsgen.device.recording import recorded
+from rsgen.device.recording import recorded, recorded_from
 from rstrack.images.sampling import bilinear, grid, nearest, surface
 
 # Each iteration shrinks the error by the picture's stretching, a few per cent.
@@ -88,23 +89,33 @@ def rectify_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
     return kernel
 
 
-def color_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
-    """Kernel (inverse_depth, rays_x, rays_y, to_base, image, from_base) → (intensity, valid 0/1), equation (3).
+@dataclass(frozen=True)
+class ColorInput:
+    """Device arrays: the reference's inverse depth and rays, poses of its lines (if it is not rectified), the colour
+    image's intensities and the poses of its lines."""
 
-    At the pixels of the reference `base`; `to_base` holds its lines' poses if it is not rectified.
-    """
+    inverse_depth: Any
+    rays_x: Any
+    rays_y: Any
+    to_base: Any
+    image: Any
+    from_base: Any
 
-    @recorded
-    def kernel(rho: Any, rays_x: Any, rays_y: Any, to_base: Any, image: Any, from_base: Any) -> Any:
-        active = rho > 0.0
-        z = dr.rcp(dr.select(active, rho, 1.0))
-        p = rays_x * z, rays_y * z, z
+
+def color_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[[ColorInput], Any]:
+    """Kernel → (intensity, valid 0/1) at the pixels of the reference `base`, looked up by equation (3)."""
+
+    @recorded_from(ColorInput)
+    def kernel(given: ColorInput) -> Any:
+        active = given.inverse_depth > 0.0
+        z = dr.rcp(dr.select(active, given.inverse_depth, 1.0))
+        p = given.rays_x * z, given.rays_y * z, z
         if base.lines > 1:
             _, x, y = grid(e, base.camera.width, base.camera.height, 1)
-            p = move(gather(to_base, e.UInt(base.line_of(e.Int(x), e.Int(y))), TO_BASE, stride=TO_BASE), p)
-        seen = project_rolling(lens, from_base, p, e.UInt, e.Int)
+            p = move(gather(given.to_base, e.UInt(base.line_of(e.Int(x), e.Int(y))), TO_BASE, stride=TO_BASE), p)
+        seen = project_rolling(lens, given.from_base, p, e.UInt, e.Int)
         camera = lens.camera
-        near = bilinear(e, image, camera.width, camera.height, seen.x, seen.y, active & seen.valid)
+        near = bilinear(e, given.image, camera.width, camera.height, seen.x, seen.y, active & seen.valid)
         a, b, c, d, fx, fy, active = near
         value = dr.lerp(dr.lerp(a, b, fx), dr.lerp(c, d, fx), fy)
         return dr.select(active, value, 0.0), dr.select(active, e.Float(1.0), 0.0)
@@ -112,30 +123,42 @@ def color_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
     return kernel
 
 
-def fuse_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
-    """Kernel (inverse_depth, weight, slope_x, slope_y, source inverse_depth, source weight, from_base, constants) →
-    (inverse_depth, weight): weighted mean of the keyframe's depth and the source's, where they agree.
+@dataclass(frozen=True)
+class FusionInput:
+    """Device arrays: the keyframe's inverse depth, weight and slopes; the source's inverse depth and weight, and the
+    poses of its lines; constants: gate (m), largest weight."""
 
-    A depth difference at the source's pixel shifts the keyframe's local plane along its normal. constants: gate (m),
-    largest weight. Weights count measurements of unit quality, 1/σ_z² over that of a pixel at one metre.
+    inverse_depth: Any
+    weight: Any
+    slope_x: Any
+    slope_y: Any
+    source: Any
+    source_weight: Any
+    from_base: Any
+    constants: Any
+
+
+def fuse_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[[FusionInput], Any]:
+    """Kernel → (inverse depth, weight): weighted mean of the keyframe's depth and the source's, where they agree.
+
+    A depth difference at the source's pixel shifts the keyframe's local plane along its normal. Weights count
+    measurements of unit quality, 1/σ_z² over that of a pixel at one metre.
     """
 
-    @recorded
-    def kernel(
-        rho: Any, weight: Any, slope_x: Any, slope_y: Any, source: Any, source_weight: Any, from_base: Any,
-        constants: Any,
-    ) -> Any:  # fmt: skip
-        gate, limit = dr.gather(e.Float, constants, e.UInt(0)), dr.gather(e.Float, constants, e.UInt(1))
+    @recorded_from(FusionInput)
+    def kernel(given: FusionInput) -> Any:
+        rho, weight = given.inverse_depth, given.weight
+        gate, limit = dr.gather(e.Float, given.constants, e.UInt(0)), dr.gather(e.Float, given.constants, e.UInt(1))
         _, px, py = grid(e, base.camera.width, base.camera.height, 1)
         xn, yn = (e.Float(px) - base.camera.cx) / base.camera.fx, (e.Float(py) - base.camera.cy) / base.camera.fy
         active = rho > 0.0
         z = dr.rcp(dr.select(active, rho, 1.0))
-        seen = project_rolling(lens, from_base, (xn * z, yn * z, z), e.UInt, e.Int)
-        value, active = surface(e, lens.camera, source, seen.x, seen.y, active & seen.valid)
+        seen = project_rolling(lens, given.from_base, (xn * z, yn * z, z), e.UInt, e.Int)
+        value, active = surface(e, lens.camera, given.source, seen.x, seen.y, active & seen.valid)
         z_there = dr.rcp(dr.select(active, value, 1.0))
         active &= dr.abs(z_there - seen.z) < gate * dr.maximum(1.0, z)
         # Relative change of depth: the plane m·p = 1 moves by the same distance for both cameras.
-        n = slope_x, slope_y, rho - slope_x * xn - slope_y * yn
+        n = given.slope_x, given.slope_y, rho - given.slope_x * xn - given.slope_y * yn
         ray = seen.at.q[0] / seen.at.q[2], seen.at.q[1] / seen.at.q[2], e.Float(1.0)
         M = seen.M
         along = (
@@ -144,7 +167,7 @@ def fuse_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
         )  # fmt: skip
         ratio = dr.clip(along * z, 0.5, 2.0)
         fused_z = z + (z_there - seen.z) * ratio
-        w = dr.gather(e.Float, source_weight, nearest(e, lens.camera.width, seen.x, seen.y, active), active)
+        w = dr.gather(e.Float, given.source_weight, nearest(e, lens.camera.width, seen.x, seen.y, active), active)
         active &= w > 0.0
         share = dr.select(active, w / (weight + w), 0.0)
         return dr.fma(share, dr.rcp(fused_z) - rho, rho), dr.minimum(weight + dr.select(active, w, 0.0), limit)

@@ -23,7 +23,7 @@ _RETURN = 0.7
 _ANCHOR = 2.0
 
 
-class KeyframeSet:
+class KeyframeStore:
     """Rectified keyframes in the order in which they were last the reference. made: how many there have been.
 
     anchor: a second, older reference for the frames that are aligned to the newest; only a model has one.

@@ -6,7 +6,8 @@ from collections import deque
 from collections.abc import Sequence
 from statistics import median
 
-from rstrack.alignment.optimizer import Observation, Solved
+from rstrack.alignment.observation import Observation
+from rstrack.alignment.optimizer import Solved
 
 # A term has to see this share of the pixels that it saw at first, and so many at least, to count.
 _LEAST_SHARE = 0.08
@@ -21,7 +22,7 @@ _WORST_SHIFT_PX = 2.0
 _MEMORY = 30
 
 
-class Health:
+class FitHistory:
     """Remembers the scales of the last good frames."""
 
     def __init__(self) -> None:
@@ -30,13 +31,12 @@ class Health:
 
     def fault(self, fresh: Sequence[Observation], solved: Solved, expected: int) -> str:
         """Why a frame has not been found, '' if it has. expected: pixels that a whole image puts on the reference."""
-        seen = [o for o in fresh if o.lin is not None and o.lin.count >= max(_LEAST_PIXELS, _LEAST_SHARE * expected)]
+        seen = [o for o in fresh if o.is_linearised and o.lin.count >= max(_LEAST_PIXELS, _LEAST_SHARE * expected)]
         if not seen:
             return "hardly a pixel falls on the keyframe"
         if solved.last_shift > _WORST_SHIFT_PX:
             return "the alignment does not settle"
         for o in seen:
-            assert o.lin is not None
             history = self._depth if o.is_depth else self._intensity
             worst = _WORST_DEPTH if o.is_depth else _WORST_INTENSITY
             harmless = _HARMLESS_DEPTH if o.is_depth else _HARMLESS_INTENSITY
@@ -45,6 +45,5 @@ class Health:
             if o.lin.next_sigma > min(worst, max(harmless, _GROWTH * usual)):
                 return f"the {'depth' if o.is_depth else 'colour'} image does not fit"
         for o in seen:
-            assert o.lin is not None
             (self._depth if o.is_depth else self._intensity).append(o.lin.next_sigma)
         return ""

@@ -19,7 +19,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.alignment.linearise import Terms, seen_motions, weakest_motion
 from rstrack.alignment.optimizer import STOP_PX
 from rstrack.data.rig import Frame, Rig
-from rstrack.images.device_frame import DeviceFrame, DeviceRig
+from rstrack.images.device_frame import DeviceFrame, DeviceRig, Timer, untimed
 from rstrack.images.pyramid import DepthImage
 from rstrack.keyframes.keyframe import STRIDES, Reference
 from rstrack.keyframes.maker import KeyframeMaker
@@ -72,10 +72,10 @@ class BaselineTracker:
     spline = None
     spline_valid: tuple[tuple[float, float], ...] = ()
 
-    def __init__(self, rig: Rig, options: Options | None = None) -> None:
+    def __init__(self, rig: Rig, options: Options | None = None, timer: Timer = untimed) -> None:
         self.rig = rig
         self.options = (options or Options(method="baseline")).decided(rig.depth_shutter)
-        self._device = DeviceRig(rig, self.options)
+        self._device = DeviceRig(rig, self.options, timer)
         self._terms = Terms.of(self._device, self.options.blur_sigma_px)
         self._maker = KeyframeMaker.of(self._device)
         self._reference: Reference | None = None
@@ -175,14 +175,14 @@ class BaselineTracker:
             sums, next_sigma = self._terms.geometric_pose(new, ref, T, level, sigma)
             share, weakest, evaluations = (
                 sums.count / looked_at,
-                weakest_motion(seen_motions(sums, ref.lever)),
+                weakest_motion(seen_motions(sums, ref.median_depth)),
                 found.evaluations + 1,
             )
             if share < _LEAST_SHARE or weakest < _LEAST_SEEN:
                 return Alignment(T, sigma, sums.count, share, evaluations, np.inf, weakest)
             step = -sigma * np.linalg.solve(sums.H[0, 0], sums.g[0, 0])
             T = se3.orthonormalise(se3.exp(step) @ T)
-            shift = camera.fx * float(np.abs(step[:3]).max() / ref.lever + np.abs(step[3:]).max())
+            shift = camera.fx * float(np.abs(step[:3]).max() / ref.median_depth + np.abs(step[3:]).max())
             found = Alignment(T, next_sigma, sums.count, share, evaluations, shift, weakest)
             if shift < STOP_PX[level]:
                 break

@@ -34,6 +34,7 @@ from rstrack.metrics.evaluate import Metrics, evaluate, metrics_text
 from rstrack.options import Options
 
 if TYPE_CHECKING:
+    from rstrack.images.device_frame import Timer
     from rstrack.tracking.frame_report import FrameReport
 
 Progress = Callable[[str, float, str], None]
@@ -115,19 +116,25 @@ class Result:
         return "\n".join(lines + ([] if self.metrics is None else ["", metrics_text(self.metrics)]))
 
 
-def make_tracker(rig: Rig, options: Options) -> AnyTracker:
-    """The tracker of options.method. Raises UserError if its backend cannot work on this machine."""
+def make_tracker(rig: Rig, options: Options, timer: Timer | None = None) -> AnyTracker:
+    """The tracker of options.method; `timer` watches the parts of its work.
+
+    Raises UserError if its backend cannot work on this machine.
+    """
     from rsgen.device.arrays import engine
 
     # Before anything else imports Dr.Jit, which then would choose a libLLVM itself.
     engine(options.backend)
+    from rstrack.images.device_frame import untimed
+
+    timer = timer or untimed
     if options.method == "baseline":
         from rstrack.tracking.pose_tracker import BaselineTracker
 
-        return BaselineTracker(rig, options)
+        return BaselineTracker(rig, options, timer)
     from rstrack.tracking.spline_tracker import Tracker
 
-    return Tracker(rig, options)
+    return Tracker(rig, options, timer)
 
 
 def track(

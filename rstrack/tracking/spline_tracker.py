@@ -1,4 +1,4 @@
-"""The online tracker (paper, section 3.5): grow the spline, align, freeze, choose keyframes, fuse.
+"""The online tracker (paper, section 3.5): predict, observe, solve, judge, fuse, renew the keyframe.
 
 tracker = Tracker(rig, Options())
 for frame in frames:
@@ -18,28 +18,18 @@ from rsgen.geometry import se3
 from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.linearise import Terms
-from rstrack.alignment.normal_equations import acceleration_prior, pose_constraint
-from rstrack.alignment.optimizer import Extra, Observation, Problem, Solved, SplineState, optimise
+from rstrack.alignment.observation import Observation
+from rstrack.alignment.optimizer import Solved
 from rstrack.data.rig import Frame, Rig
-from rstrack.images.device_frame import DeviceFrame, DeviceRig
+from rstrack.images.device_frame import DeviceFrame, DeviceRig, Timer, untimed
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
-from rstrack.keyframes.store import KeyframeSet
+from rstrack.keyframes.store import KeyframeStore
 from rstrack.options import Options
 from rstrack.tracking.frame_report import FrameReport, frame_report
-from rstrack.tracking.lost_track import Health
+from rstrack.tracking.lost_track import FitHistory
+from rstrack.tracking.window import TRACKING_LEVELS, Window
 
-# Motion prior: standard deviation of accelerations, m/s² and rad/s². Hand-held cameras reach 35 m/s² (DESIGN section
-# 5), so it says little where there are data. The newest control points, whose weight in the newest lines is only u³/6,
-# are held a good deal tighter: small systematic errors of the lines would throw them about.
-_ACCELERATION = np.array([5.0, 5.0, 5.0, 10.0, 10.0, 10.0])
-_NEWEST_TRIPLES, _NEWEST_FACTOR = 2, 0.1
-# Metres and radians within which the reference's pose is held while its own control points are free.
-_GAUGE = np.full(6, 1e-6)
-# Levels to go through from a prediction by constant velocity, and from anything worse.
-_TRACKING_LEVELS, _LEVELS = (1, 0), (2, 1, 0)
-# Steps at most on the pyramid's levels, finest first.
-_MOST_STEPS = (15, 8, 30)
 # Seconds without a frame after which the motion before says nothing about where the camera is, and beyond which
 # frames hardly belong to one recording.
 _GAP_S, _BREAK_S = 0.3, 3600.0
@@ -52,23 +42,21 @@ _LEAST_DEPTH = 0.02
 class Tracker:
     """Estimates T_world_depth(t); the world is the depth camera's frame at the middle of the first image."""
 
-    def __init__(self, rig: Rig, options: Options | None = None) -> None:
+    def __init__(self, rig: Rig, options: Options | None = None, timer: Timer = untimed) -> None:
+        """timer: watches the parts of the work, see `Timer`."""
         self.rig, self.options = rig, (options or Options()).decided(rig.depth_shutter)
-        self._device = DeviceRig(rig, self.options)
+        self._device = DeviceRig(rig, self.options, timer)
         self._terms = Terms.of(self._device, self.options.blur_sigma_px)
         self._maker = KeyframeMaker.of(self._device)
-        self._state: SplineState | None = None
+        self._keyframes = KeyframeStore(self._maker, self.options)
+        self._window: Window | None = None
         self._reference: Reference | None = None
-        self._keyframes = KeyframeSet(self._maker, self.options)
         # Frames whose control points still move, and the newest one whose do not.
         self._recent: deque[DeviceFrame] = deque()
-        self._active: list[Observation] = []
-        self._health = Health()
+        self._fits = FitHistory()
         self._pixels = 0
         # The newest frame, while it is the reference and cannot be rectified yet.
         self._unconverged: DeviceFrame | None = None
-        # First control point of the current piece of the spline: those before it belong to another, or to a gap.
-        self._piece = 0
         self._stamps: list[float] = []
         self._last_fed: float | None = None
         self.spline_valid: list[tuple[float, float]] = []
@@ -79,7 +67,7 @@ class Tracker:
     @property
     def spline(self) -> Spline | None:
         """T_world_depth(t) so far; the newest few control points still move. Meaningful within `spline_valid` (s)."""
-        return None if self._state is None else self._state.spline
+        return None if self._window is None else self._window.spline
 
     @property
     def trajectory(self) -> tuple[FloatArray, FloatArray]:
@@ -109,7 +97,7 @@ class Tracker:
         self._last_fed = stamp
         if len(self._stamps) == 1:
             self._fit_knots(gap)
-        if self._state is None:
+        if self._window is None:
             report = self._start(new)
         elif not self._keyframes:
             report = self._bootstrap(new)
@@ -120,58 +108,77 @@ class Tracker:
         self.reports.append(report)
         return report
 
+    def _track(self, new: DeviceFrame) -> FrameReport:
+        window, ref = self._known()
+        before = window.copy()
+        window.predict(new, self.spline_valid[-1][1])
+        on_reference = self._observe(new, ref)
+        anchor = self._keyframes.anchor
+        fresh = on_reference + ([] if anchor is None else self._observe(new, anchor))
+        # The first keyframe of a global shutter: no other frame tells where it was taken.
+        gauge = ref if not window.is_frozen(ref.t) and new.depth.exposure.lens.lines == 1 else None
+        solved = window.solve(fresh, TRACKING_LEVELS, gauge, coupled=ref.rolling is not None)
+        if self._fits.fault(on_reference, solved, ref.pixels):
+            self._window = before
+            return self._relocalise(new)
+        window.keep(fresh)
+        self._recent.append(new)
+        self._placed(new)
+        overlap = self._overlap(on_reference)
+        frozen = self._fuse_frozen(window)
+        renewed = self._renew_keyframe(window, new, frozen, overlap)
+        return self._report(new, on_reference, solved, keyframe=renewed, overlap=overlap)
+
+    # -- start and restart ------------------------------------------------------------------------------------------
+
     def _start(self, new: DeviceFrame) -> FrameReport:
         if self._unfit(new):
             return self._report(new, lost=True)
-        self._state = self._new_state(new, self.options.knot_spacing_s)
+        self._window = self._new_window(new, self.options.knot_spacing_s)
         self._recent.append(new)
         if new.depth.exposure.lens.lines > 1:
-            self._reference = self._maker.rolling(new.index, new.depth, new.colors, self._state.spline)
+            self._reference = self._maker.rolling(new.index, new.depth, new.colors, self._window.spline)
         else:
             self._new_keyframe(new, None)
         self._placed(new)
         return self._report(new, keyframe=True)
 
-    def _new_state(self, first: DeviceFrame, dt: float) -> SplineState:
-        state = SplineState.still(min(first.first_time, first.stamp) - self.options.knot_phase * dt, dt, np.eye(4))
-        state.extend(first.last_time)
-        return state
+    def _new_window(self, first: DeviceFrame, dt: float) -> Window:
+        return Window.still(self._terms, self.rig.depth_camera.fx, first, dt, self.options.knot_phase)
 
     def _fit_knots(self, gap: float) -> None:
         """A global shutter gives one pose a frame, `gap` s apart: no more knots than that can be told."""
-        state, _ = self._known()
-        if self._recent[0].depth.exposure.lens.lines == 1 and gap > state.dt:
-            self._state = self._new_state(self._recent[0], min(gap, _WIDEST * state.dt))
+        window, _ = self._known()
+        dt = window.state.dt
+        if self._recent[0].depth.exposure.lens.lines == 1 and gap > dt:
+            self._window = self._new_window(self._recent[0], min(gap, _WIDEST * dt))
 
     def _bootstrap(self, new: DeviceFrame) -> FrameReport:
         """Joint alignment of the first frames with the first one, all of them rolling, from zero motion."""
-        state, ref = self._known()
-        state.extend(new.last_time)
+        window, ref = self._known()
+        window.state.extend(new.last_time)
         fresh = self._observe(new, ref)
-        free = (0, len(state.points))
-
-        extras = [self._prior(state, free), _gauge(ref)]
-        solved = self._optimise(state, fresh, self._active, free, extras, bandwidth=6 * free[1])
-        if self._health.fault(fresh, solved, ref.pixels):
+        solved = window.solve(fresh, gauge=ref, coupled=True)
+        if self._fits.fault(fresh, solved, ref.pixels):
             return self._begin_anew(new)
-        self._active += fresh
+        window.keep(fresh)
         self._recent.append(new)
         self._placed(new)
         if len(self._recent) < self.options.bootstrap_frames:
             return self._report(new, fresh, solved)
-        self._leave_bootstrap(state)
+        self._leave_bootstrap(window)
         return self._report(new, fresh, solved, keyframe=True)
 
     def _begin_anew(self, new: DeviceFrame) -> FrameReport:
         """The first frames did not fit together: they are lost, and the newest is the first one."""
-        self._state, self._reference, self._active = None, None, []
+        self._window, self._reference = None, None
         self._stamps.clear()
         self.spline_valid.clear()
         self._recent.clear()
         self.reports = [r.as_lost() for r in self.reports]
         return self._start(new)
 
-    def _leave_bootstrap(self, state: SplineState) -> None:
+    def _leave_bootstrap(self, window: Window) -> None:
         """Rectify the middle frame and align all others to it."""
         frames = list(self._recent)
         middle = min(
@@ -179,141 +186,94 @@ class Tracker:
             key=lambda f: abs(f.index - frames[len(frames) // 2].index),
         )
         ref = self._new_keyframe(middle, None)
-        self._active = [o for frame in frames if frame is not middle for o in self._observe(frame, ref)]
-        free = (0, len(state.points))
-        self._optimise(state, self._active, [], free, [self._prior(state, free)], levels=(0,))
-
-    def _track(self, new: DeviceFrame) -> FrameReport:
-        state, ref = self._known()
-        before = state.copy()
-        state.smooth_end(self.spline_valid[-1][1])
-        state.extend(new.last_time)
-        free = (max(self._piece, state.segment(new.first_time)), len(state.points))
-        self._active = [o for o in self._active if o.lin is not None and o.lin.model.last > free[0]]
-        on_reference = self._observe(new, ref)
-        anchor = self._keyframes.anchor
-        fresh = on_reference + (self._observe(new, anchor) if anchor is not None else [])
-        extras = [self._prior(state, free)]
-        if state.segment(ref.t) + 4 > free[0] and new.depth.exposure.lens.lines == 1:
-            # The first keyframe of a global shutter: no other frame tells where it was taken.
-            extras.append(_gauge(ref))
-        # A reference that still moves ties its own control points to those of the newest lines.
-        bandwidth = 24 if ref.rolling is None else 6 * (free[1] - free[0])
-        solved = self._optimise(state, fresh, self._active, free, extras, bandwidth, _TRACKING_LEVELS)
-        if self._health.fault(on_reference, solved, ref.pixels):
-            self._state = before
-            return self._relocalise(new)
-        self._active += fresh
-        self._recent.append(new)
-        self._placed(new)
-        overlap = self._overlap(on_reference)
-        changed = self._renew_keyframe(state, new, free[0], overlap)
-        return self._report(new, on_reference, solved, keyframe=changed, overlap=overlap)
+        window.active = []
+        others = [o for frame in frames if frame is not middle for o in self._observe(frame, ref)]
+        window.solve(others, levels=(0,))
+        window.keep(others)
 
     def _relocalise(self, new: DeviceFrame) -> FrameReport:
         """Align a frame alone to the last keyframes, from where the track ended and from where they were taken."""
-        state, _ = self._known()
+        window, _ = self._known()
         end = self.spline_valid[-1][1]
         for ref in self._keyframes.recent:
-            for T_world_body in (state.spline.pose(end), ref.T_world_base):
-                trial = state.restarted(end, new.first_time, new.last_time, T_world_body)
-                first = trial.segment(new.first_time)
-                fresh, free = self._observe(new, ref), (first, len(trial.points))
-                solved = self._optimise(trial, fresh, [], free, [self._prior(trial, free, first)])
-                if self._health.fault(fresh, solved, ref.pixels):
+            for T_world_body in (window.spline.pose(end), ref.T_world_base):
+                trial = window.restarted(new, end, T_world_body)
+                fresh = self._observe(new, ref)
+                solved = trial.solve(fresh)
+                if self._fits.fault(fresh, solved, ref.pixels):
                     continue
-                self._state, self._piece, self._reference = trial, first, ref
-                self._active, self._pixels, self._unconverged = fresh, 0, None
+                trial.keep(fresh)
+                self._window, self._reference = trial, ref
+                self._pixels, self._unconverged = 0, None
                 self._keyframes.anchor = None
                 self._recent = deque([new])
                 self._placed(new, joined=False)
                 return self._report(new, fresh, solved, overlap=self._overlap(fresh))
-        self._active = []
+        window.active = []
         self._recent.clear()
         return self._report(new, lost=True)
 
     # -- keyframes --------------------------------------------------------------------------------------------------
 
-    def _renew_keyframe(self, state: SplineState, new: DeviceFrame, first_free: int, overlap: float) -> bool:
-        """Fuse frames whose control points are frozen; make another frame the reference once it is left behind."""
-        frozen = [f for f in self._recent if state.segment(f.last_time) + 4 <= first_free]
+    def _fuse_frozen(self, window: Window) -> DeviceFrame | None:
+        """Fuse the frames whose control points are frozen but the newest of them, which is returned."""
+        frozen = [f for f in self._recent if window.is_frozen(f.last_time)]
         for done in frozen[:-1]:
             self._recent.popleft()
-            self._fuse(done, state)
+            before = self._keyframes.newest
+            after = self._keyframes.fuse(done, window.spline)
+            if self._reference is before:
+                self._reference = after
+        return frozen[-1] if frozen else None
+
+    def _renew_keyframe(self, window: Window, new: DeviceFrame, frozen: DeviceFrame | None, overlap: float) -> bool:
+        """Make another frame the reference once it is left behind: a frozen one, or by strategy the newest."""
         if self._unconverged is not None:
-            if state.segment(self._unconverged.last_time) + 4 > first_free:
+            if not window.is_frozen(self._unconverged.last_time):
                 return False
             self._new_keyframe(self._unconverged, self._keyframes.newest if self.options.fuse else None)
             return True
         _, ref = self._known()
-        T_base_cam = se3.inverse(ref.T_world_base) @ state.spline.pose(new.depth.exposure.mid_time)
-        if not frozen or frozen[-1].index <= ref.index or not self.options.left_behind(T_base_cam, overlap):
+        T_base_cam = se3.inverse(ref.T_world_base) @ window.spline.pose(new.depth.exposure.mid_time)
+        if frozen is None or frozen.index <= ref.index or not self.options.left_behind(T_base_cam, overlap):
             return False
         if self.options.keyframe_strategy == "newest" and new.depth.exposure.lens.lines > 1:
-            if self._unfit(new):
-                return False
-            self._reference = self._maker.rolling(new.index, new.depth, new.colors, state.spline)
-            self._unconverged, self._pixels = new, 0
+            if not self._unfit(new):
+                self._reference = self._maker.rolling(new.index, new.depth, new.colors, window.spline)
+                self._unconverged, self._pixels = new, 0
             return False
-        old = self._keyframes.return_to(state.spline.pose(frozen[-1].depth.exposure.mid_time), ref)
+        old = self._keyframes.return_to(window.spline.pose(frozen.depth.exposure.mid_time), ref)
         if old is not None:
             self._reference, self._pixels = old, 0
             return True
-        if self._unfit(frozen[-1]):
+        if self._unfit(frozen):
             return False
-        self._new_keyframe(frozen[-1], ref if self.options.fuse else None)
+        self._new_keyframe(frozen, ref if self.options.fuse else None)
         return True
-
-    def _fuse(self, done: DeviceFrame, state: SplineState) -> None:
-        before = self._keyframes.newest
-        after = self._keyframes.fuse(done, state.spline)
-        if self._reference is before:
-            self._reference = after
 
     def _unfit(self, frame: DeviceFrame) -> bool:
         """Whether a frame shows too little to align others to it."""
         return frame.depth_share < _LEAST_DEPTH or (self.options.photometric and not frame.colors)
 
     def _new_keyframe(self, frame: DeviceFrame, older: Reference | None) -> Reference:
-        state = self._state
-        assert state is not None
-        self._reference = self._keyframes.make(frame, state.spline, older)
+        assert self._window is not None
+        self._reference = self._keyframes.make(frame, self._window.spline, older)
         self._unconverged, self._pixels = None, 0
         return self._reference
 
-    def _overlap(self, fresh: list[Observation]) -> float:
-        first = next((o.lin for o in fresh if o.lin is not None and o.lin.count), None)
-        if first is None:
-            return 0.0
-        self._pixels = max(self._pixels, first.count)
-        return first.count / self._pixels
+    def _overlap(self, fresh: Sequence[Observation]) -> float:
+        count = next((o.lin.count for o in fresh if o.is_linearised and o.lin.count), 0)
+        self._pixels = max(self._pixels, count)
+        return count / self._pixels if count else 0.0
 
     # -- pieces -----------------------------------------------------------------------------------------------------
 
-    def _known(self) -> tuple[SplineState, Reference]:
-        assert self._state is not None and self._reference is not None
-        return self._state, self._reference
+    def _known(self) -> tuple[Window, Reference]:
+        assert self._window is not None and self._reference is not None
+        return self._window, self._reference
 
     def _observe(self, frame: DeviceFrame, ref: Reference) -> list[Observation]:
-        depth = [Observation(frame.index, frame.depth, ref)] if self.options.geometric else []
-        return depth + [Observation(frame.index, c, ref, frame.depth) for c in frame.colors if ref.points]
-
-    def _prior(self, state: SplineState, free: tuple[int, int], piece: int | None = None) -> Extra:
-        first, last = max(self._piece if piece is None else piece, free[0] - 2), free[1]
-        sigma = np.repeat(_ACCELERATION[None] * state.dt**2, last - first - 2, axis=0)
-        sigma[-_NEWEST_TRIPLES:] *= _NEWEST_FACTOR
-        return lambda spline: acceleration_prior(spline, first, last, sigma)
-
-    def _optimise(
-        self, state: SplineState, fresh: list[Observation], settled: list[Observation], free: tuple[int, int],
-        extras: list[Extra], bandwidth: int = 24, levels: tuple[int, ...] = _LEVELS,
-    ) -> Solved:  # fmt: skip
-        problem = Problem(fresh, settled, free, extras, self.rig.depth_camera.fx, bandwidth)
-        try:
-            return optimise(self._terms, state, problem, levels, _MOST_STEPS)
-        except np.linalg.LinAlgError:
-            # The images say nothing about some motion, not even with the prior: as lost as can be.
-            return Solved()
+        return observe(frame, ref, self.options)
 
     def _placed(self, new: DeviceFrame, joined: bool = True) -> None:
         self._stamps.append(new.stamp)
@@ -326,11 +286,12 @@ class Tracker:
         self, new: DeviceFrame, fresh: Sequence[Observation] = (), solved: Solved | None = None, *,
         keyframe: bool = False, lost: bool = False, overlap: float = 1.0,
     ) -> FrameReport:  # fmt: skip
-        depth = [o.lin for o in fresh if o.is_depth and o.lin is not None]
-        color = [o.lin for o in fresh if not o.is_depth and o.lin is not None]
+        depth = [o.lin for o in fresh if o.is_depth and o.is_linearised]
+        color = [o.lin for o in fresh if not o.is_depth and o.is_linearised]
         return frame_report(new.stamp, depth, color, solved, keyframe=keyframe, lost=lost, overlap=overlap)
 
 
-def _gauge(ref: Reference) -> Extra:
-    """Holds the spline to a reference's pose while its control points are free."""
-    return lambda spline: pose_constraint(spline, ref.t, ref.T_world_base, _GAUGE)
+def observe(frame: DeviceFrame, ref: Reference, options: Options) -> list[Observation]:
+    """What the terms of a method make of a frame against a reference: its depth image, and its colour images."""
+    depth = [Observation(frame.index, frame.depth, ref)] if options.geometric else []
+    return depth + [Observation(frame.index, c, ref, frame.depth) for c in frame.colors if ref.points]

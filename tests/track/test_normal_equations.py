@@ -9,17 +9,16 @@ from util import numeric_jacobian, random_spline, random_twists
 
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
+from rstrack.alignment.block_sums import BlockSums
 from rstrack.alignment.normal_equations import (
     Quadratic,
-    acceleration_prior,
     assemble,
     chain,
     line_jacobian,
-    pose_constraint,
     solve,
 )
-from rstrack.alignment.optimizer import SplineState
-from rstrack.alignment.residuals import BlockSums
+from rstrack.alignment.priors import acceleration_prior, pose_constraint
+from rstrack.alignment.spline_state import SplineState
 
 TIMES = np.array([0.34, 0.352, 0.41, 0.43, 0.449, 0.452])  # segments 0 (twice), 2 (three times) and 3
 

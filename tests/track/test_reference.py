@@ -153,7 +153,7 @@ def test_points_of_all_levels_lie_on_the_surface() -> None:
         np.testing.assert_allclose(((m[0] * x + m[1] * y + m[2] * z) * factor)[on], 1.0, atol=1e-5)
         uv, _ = camera.project(np.stack([x, y, z], axis=-1)[on])
         np.testing.assert_allclose(uv, camera.pixel_grid()[::stride, ::stride][on], atol=1e-3)
-        assert points.lever == pytest.approx(np.median(z[on]))
+        assert points.median_depth == pytest.approx(np.median(z[on]))
         # The bound covers the slopes of the texture.
         gy, gx = np.gradient(colour)
         steepest = camera.fx * np.percentile((np.hypot(gx, gy) * rho)[::stride, ::stride][on], 95)
@@ -164,11 +164,11 @@ def test_points_of_all_levels_lie_on_the_surface() -> None:
 
 def test_scaling_of_depth_is_its_median() -> None:
     rho = np.array([[0.0, 1.0, 0.5], [0.25, 0.5, 0.1]], np.float32)
-    lever, bound = depth_scaling(rho)
-    assert lever == pytest.approx(2.0)
+    median_depth, bound = depth_scaling(rho)
+    assert median_depth == pytest.approx(2.0)
     z = np.linspace(0.1, 20.0, 1000)
-    even = np.minimum((lever / z) ** 2, NEAREST)
-    assert (even * np.maximum(1.0, np.sqrt(2.0) * z / lever)).max() < bound < 4 * NEAREST
+    even = np.minimum((median_depth / z) ** 2, NEAREST)
+    assert (even * np.maximum(1.0, np.sqrt(2.0) * z / median_depth)).max() < bound < 4 * NEAREST
     assert depth_scaling(np.zeros((2, 2), np.float32)) == (1.0, bound)
 
 

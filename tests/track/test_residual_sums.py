@@ -23,11 +23,12 @@ from rstrack_util import (
 from rsgen.geometry import se3
 from rsgen.geometry.so3 import hat
 from rsgen.geometry.spline import Spline
+from rstrack.alignment import block_sums as block_sums_module
 from rstrack.alignment import residuals
+from rstrack.alignment.block_sums import BlockSums, Scaling, block_counts
 from rstrack.alignment.linearise import seen_motions, weakest_motion
 from rstrack.alignment.normal_equations import chain
-from rstrack.alignment.residuals import BlockSums, Scaling
-from rstrack.alignment.student_t import NU, weight
+from rstrack.alignment.student_t import LEAST_CURVATURE, NU, weight
 from rstrack.images import line_poses as lines
 from rstrack.images.line_poses import IDENTITY_FROM_BASE, to_base_table
 from rstrack.images.pyramid import DepthImage
@@ -40,12 +41,12 @@ DEPTH = small_camera("radtan")
 def newton_weight(s: np.ndarray) -> np.ndarray:
     """Second derivative of the cost by s where it is convex enough, otherwise a share of the weight."""
     second = (NU + 1.0) * (NU - s**2) / (NU + s**2) ** 2
-    return np.maximum(second, residuals._CURVATURE * weight(s))
+    return np.maximum(second, LEAST_CURVATURE * weight(s))
 
 
-def assert_sums(got: BlockSums, want: BlockSums, lever: float, error: tuple[float, float, float]) -> None:
-    """Equal to 1e-5, or up to absolute errors of H, of g (rotations divided by `lever`) and of the two scalars."""
-    scale = lever ** np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
+def assert_sums(got: BlockSums, want: BlockSums, median_depth: float, error: tuple[float, float, float]) -> None:
+    """Equal to 1e-5, or up to absolute errors of H, of g (rotations over `median_depth`) and of the two scalars."""
+    scale = median_depth ** np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
     square = np.outer(scale, scale)
     np.testing.assert_allclose(got.H / square, want.H / square, rtol=1e-5, atol=error[0])
     np.testing.assert_allclose(got.g / scale, want.g / scale, rtol=1e-5, atol=error[1])
@@ -102,7 +103,7 @@ def geometric_pixels(z: np.ndarray, image: DepthImage, ref: Reference, spline: S
     m = np.concatenate([m_xy, (value - (m_xy * ray).sum(axis=1))[:, None]], axis=1)
     length = np.linalg.norm(m, axis=1)
     safe = np.where(length > 0, length, 1.0)
-    even = np.minimum((ref.lever / np.where(z > 0, z, 1.0)) ** 2, residuals.NEAREST)
+    even = np.minimum((ref.median_depth / np.where(z > 0, z, 1.0)) ** 2, residuals.NEAREST)
     r = even * (1.0 - p[:, 2] * value) / safe
     # 1 − m·p is the error; on a plane, where m does not depend on p, its derivative by p is −m.
     j = np.concatenate([-m, -np.einsum("ni,nij->nj", m, -hat(p))], axis=1) * (even / safe)[:, None]
@@ -148,7 +149,7 @@ def test_sums_equal_those_of_a_loop_over_pixels(room: tuple) -> None:
     assert want.count > 400
     assert np.count_nonzero(pixels.active) < 0.95 * np.count_nonzero(z[::2, ::2])  # edges and borders were tried
     assert np.abs(pixels.s[pixels.active]).max() > 3.0
-    assert_sums(got, want, ref.lever, (2e-4, 2e-3, 1e-2))
+    assert_sums(got, want, ref.median_depth, (2e-4, 2e-3, 1e-2))
 
 
 def block_sums(
@@ -157,13 +158,12 @@ def block_sums(
     """The kernel itself, with a gate of one's own."""
     kernel = residuals.geometric_kernel(ENGINE, image.exposure.lens, ref.lens, 2)
     camera = image.exposure.lens.camera
-    scaling = Scaling(ref.lever, ref.bound, camera.width * camera.height // 4)
-    raw = kernel(
-        image.z, *maker(DEPTH).device_rays, ENGINE.upload(to_base_table(spline, ref.T_world_base, image.exposure)),
-        ref.inverse_depth, ref.slope_x, ref.slope_y, ref.roughness, ENGINE.upload(IDENTITY_FROM_BASE),
-        ENGINE.upload(np.append(scaling.parameters(sigma, gate), roughness)),
-    )  # fmt: skip
-    current, reference, _, _ = residuals.block_counts(image.exposure.lens, ref.lens)
+    scaling = Scaling(ref.median_depth, ref.bound, camera.width * camera.height // 4)
+    to_base = ENGINE.upload(to_base_table(spline, ref.T_world_base, image.exposure))
+    constants = ENGINE.upload(np.append(scaling.parameters(sigma, gate), roughness))
+    surface = ref.inverse_depth, ref.slope_x, ref.slope_y, ref.roughness, ENGINE.upload(IDENTITY_FROM_BASE)
+    raw = kernel(residuals.GeometricInput(image.z, *maker(DEPTH).device_rays, to_base, *surface, constants))
+    current, reference, _, _ = block_counts(image.exposure.lens, ref.lens)
     return scaling.unpack(raw.numpy(), current, reference)
 
 
@@ -216,7 +216,7 @@ def accumulate(
     """All pixels into one block."""
     constants = [ENGINE.Float(float(c)) for c in scaling.parameters(sigma, gate)]
     columns = [ENGINE.upload(c) for c in (*g.T, *p.T, r)]
-    raw = residuals._accumulate(
+    raw = block_sums_module.accumulate(
         ENGINE, tuple(columns[:3]), tuple(columns[3:6]), -1.0, columns[6], ENGINE.Bool(True), constants,
         ENGINE.UInt(0), 1,
     ).numpy()  # fmt: skip
@@ -227,7 +227,7 @@ def dense_sums(g: np.ndarray, p: np.ndarray, r: np.ndarray, scaling: Scaling, si
     """The same in float64, with the bound on |j|."""
     j = -np.concatenate([g, np.cross(p, g)], axis=1)
     s = r / sigma
-    size = np.maximum((j[:, :3] ** 2).sum(axis=1), (j[:, 3:] ** 2).sum(axis=1) / scaling.lever**2)
+    size = np.maximum((j[:, :3] ** 2).sum(axis=1), (j[:, 3:] ** 2).sum(axis=1) / scaling.median_depth**2)
     w = weight(s) * np.minimum(1.0, scaling.bound**2 / size)
     h = newton_weight(s) * w / weight(s)
     H, gradient = j.T @ (h[:, None] * j), j.T @ (w * s)
@@ -249,7 +249,7 @@ def test_full_blocks_of_the_worst_pixels_do_not_overflow(s: float, length: float
     want = dense_sums(g, p, r, scaling, sigma)
     assert np.abs(raw.astype(np.int64)).max() < 2**31 - 2**24
     # All pixels are rounded alike, by half a unit at most.
-    assert_sums(got, want, scaling.lever, tuple(count / scaling.parameters(sigma, 1.0)[4:]))
+    assert_sums(got, want, scaling.median_depth, tuple(count / scaling.parameters(sigma, 1.0)[4:]))
 
 
 def test_sums_unpack_to_float64_ones() -> None:
@@ -260,7 +260,7 @@ def test_sums_unpack_to_float64_ones() -> None:
     _, got = accumulate(g, p, r, scaling, sigma, 100.0)
     want = dense_sums(g, p, r, scaling, sigma)
     # Errors of up to half a unit for each pixel, with random signs.
-    assert_sums(got, want, scaling.lever, tuple(5 * np.sqrt(n / 12) / scaling.parameters(sigma, 1.0)[4:]))
+    assert_sums(got, want, scaling.median_depth, tuple(5 * np.sqrt(n / 12) / scaling.parameters(sigma, 1.0)[4:]))
     assert np.array_equal(got.H, np.swapaxes(got.H, -1, -2))
 
 
@@ -283,12 +283,12 @@ def test_sums_have_the_same_bits_on_every_run(room: tuple) -> None:
 
 def test_observability_is_zero_where_a_motion_is_not_seen(room: tuple) -> None:
     as_input, ref, spline, z = room
-    assert weakest_motion(seen_motions(block_sums(as_input(z), ref, spline, 0.1, 0.01), ref.lever)) > 1e-3
+    assert weakest_motion(seen_motions(block_sums(as_input(z), ref, spline, 0.1, 0.01), ref.median_depth)) > 1e-3
     wall = plane_before(ref.T_world_base, (0.3, 0.2, 1.0))
     seen = depth_input(wall.cast, spline, exposure(0.30, "bottom-top", DEPTH))
     one = exact_reference(wall.cast, spline, exposure(0.25, None))
     assert (
-        abs(weakest_motion(seen_motions(block_sums(seen, one, spline, 0.1, 0.01), one.lever))) < 1e-5
+        abs(weakest_motion(seen_motions(block_sums(seen, one, spline, 0.1, 0.01), one.median_depth))) < 1e-5
     )  # rounding to fixed point
     alike = BlockSums(np.diag([1.0, 1.0, 1.0, 4.0, 4.0, 4.0])[None, None] * 5, np.zeros((1, 1, 6)), 0.0, 0.0, 10)
     assert weakest_motion(seen_motions(alike, 2.0)) == pytest.approx(0.5)

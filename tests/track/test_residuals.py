@@ -27,9 +27,9 @@ from util import numeric_jacobian
 from rsgen.device.projection import project_rolling
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.alignment import residuals
+from rstrack.alignment import block_sums, residuals
 from rstrack.alignment.linearise import Linearised, Terms
-from rstrack.alignment.student_t import NU, scale_step, weight
+from rstrack.alignment.student_t import LEAST_CURVATURE, NU, scale_step, weight
 from rstrack.images import line_poses as lines
 from rstrack.images.pyramid import ColorImage, DepthImage
 from rstrack.keyframes.keyframe import Reference
@@ -84,8 +84,8 @@ def exact_poses(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def one_line_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every line its own block, so that nothing but rounding is approximate."""
-    monkeypatch.setattr(residuals, "LINES_PER_BLOCK", 1)
-    monkeypatch.setattr(residuals, "LINES_PER_PAIR_BLOCK", 1)
+    monkeypatch.setattr(block_sums, "LINES_PER_BLOCK", 1)
+    monkeypatch.setattr(block_sums, "LINES_PER_PAIR_BLOCK", 1)
 
 
 def settled_sigma(s: Setting, start: float) -> Linearised:
@@ -156,7 +156,7 @@ def test_blocks_of_lines_lose_little(kind: str, monkeypatch: pytest.MonkeyPatch)
     s = setting(kind, None, "top-bottom")
     around = disturbed(s.truth, 5)
     blocks = s.term(around, 0.01).model
-    monkeypatch.setattr(residuals, "LINES_PER_BLOCK", 1)
+    monkeypatch.setattr(block_sums, "LINES_PER_BLOCK", 1)
     single = setting(kind, None, "top-bottom").term(around, 0.01).model
     assert blocks.first == single.first
     for name in ("g", "H"):
@@ -195,7 +195,7 @@ def test_curvature_never_turns_negative() -> None:
     near = s.term(s.truth, sigma)
     assert away.count == near.count
     # What counts more for being near is further out.
-    kept = residuals._CURVATURE * weight(np.array([2.4 * residuals.NEAREST, 2.0])) / weight(0.0)
+    kept = LEAST_CURVATURE * weight(np.array([2.4 * residuals.NEAREST, 2.0])) / weight(0.0)
     assert kept[0] < np.trace(away.model.H) / np.trace(near.model.H) < kept[1]
     assert np.linalg.eigvalsh(away.model.H).min() > -1e-6 * np.trace(away.model.H)  # fixed point
 

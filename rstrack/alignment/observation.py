@@ -1,0 +1,120 @@
+"""An image against a reference: its scale and its last linearisation, kept as long as it is good."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from rsgen.geometry.so3 import FloatArray
+from rsgen.geometry.spline import Spline
+from rstrack.alignment.linearise import Linearised, Terms
+from rstrack.alignment.normal_equations import Quadratic
+from rstrack.alignment.spline_state import SplineState
+from rstrack.images.pyramid import ColorImage, DepthImage
+from rstrack.keyframes.keyframe import STRIDES, Reference
+
+# Increments of control points (m, rad) that change the derivatives of lines by less than a step's own error.
+_SAME_SLOPES = 5e-3
+# Errors at the start of a level, as σ: m and intensity; re-estimated with every linearisation.
+START_DEPTH, START_INTENSITY = 5e-3, 0.03
+
+
+@dataclass(frozen=True)
+class _Linearisation:
+    """What an observation knows: the model and the next σ.
+
+    at: increments (m, 6) of the control points that it was made at. stands_for: pixels of the finest level for each.
+    """
+
+    lin: Linearised | None = None
+    sigma: float = 0.0
+    at: FloatArray = field(default_factory=lambda: np.zeros((0, 6)))
+    stands_for: float = 1.0
+
+
+@dataclass
+class Observation:
+    """An image against a reference. linearisation: the last one; putting an earlier one back takes a step back.
+
+    occluder: the depth image that tells which points of the reference a colour image cannot see.
+    """
+
+    frame: int
+    image: DepthImage | ColorImage
+    ref: Reference
+    occluder: DepthImage | None = None
+    linearisation: _Linearisation = _Linearisation()
+    _visible: Any = None
+    _slopes_at: Spline | None = None
+    _slopes_moved: FloatArray = field(default_factory=lambda: np.zeros((0, 6)))
+
+    @property
+    def is_depth(self) -> bool:
+        """Whether this is the geometric term."""
+        return isinstance(self.image, DepthImage)
+
+    @property
+    def is_linearised(self) -> bool:
+        """Whether there is a linearisation."""
+        return self.linearisation.lin is not None
+
+    @property
+    def lin(self) -> Linearised:
+        """The last linearisation, of which there must be one."""
+        assert self.linearisation.lin is not None
+        return self.linearisation.lin
+
+    @property
+    def stands_for(self) -> float:
+        """Pixels of the finest level for each that was looked at."""
+        return self.linearisation.stands_for
+
+    def forget(self, keep_sigma: bool) -> None:
+        """Begin anew, as at a new level of the pyramid."""
+        kept = self.linearisation
+        self.linearisation = replace(kept, lin=None, sigma=kept.sigma if keep_sigma else 0.0)
+
+    def linearise(self, terms: Terms, state: SplineState, level: int) -> None:
+        """Around the current state; takes the σ that the one before suggested."""
+        image, sigma, slopes_at = self.image, self.linearisation.sigma, self._slopes(state)
+        if isinstance(image, DepthImage):
+            lin = terms.geometric(image, self.ref, state.spline, level, sigma or START_DEPTH, slopes_at)
+        else:
+            if level == 0 and self._visible is None and self.occluder is not None:
+                # Once: the coarse levels have brought the poses close enough to tell, and a fixed set converges.
+                self._visible = terms.visible(self.occluder, self.ref, state.spline, level)
+            visible = self._visible if level == 0 else None
+            sigma = sigma or START_INTENSITY
+            lin = terms.photometric(image, self.ref, state.spline, level, sigma, slopes_at, visible)
+        # A coarse level's pixels stand for those left out: the priors' share must not depend on the level.
+        stands_for = (STRIDES[level] / STRIDES[0]) ** 2
+        self.linearisation = _Linearisation(lin, lin.next_sigma, state.moved.copy(), stands_for)
+
+    def shift(self, state: SplineState, focal: float) -> float:
+        """Pixels that the lines have moved since the linearisation."""
+        return self.lin.row_shift(self._since(state), focal, self.ref.median_depth) if self.is_linearised else np.inf
+
+    def model(self, state: SplineState) -> Quadratic:
+        """Quadratic model around the current state."""
+        return self.lin.model.moved(self._since(state)).scaled(self.stands_for)
+
+    def change(self, state: SplineState) -> float:
+        """Change of the cost since the linearisation, by the quadratic model."""
+        model = self.lin.model
+        moved = self._since(state)[model.first : model.last].ravel()
+        return self.stands_for * float(model.g @ moved + 0.5 * moved @ model.H @ moved)
+
+    def _slopes(self, state: SplineState) -> Spline:
+        """Where the poses of its lines are differentiated: an earlier state as long as that is as good."""
+        before = self._slopes_moved
+        if self._slopes_at is None or np.abs(state.moved[: len(before)] - before).max() > _SAME_SLOPES:
+            self._slopes_at, self._slopes_moved = state.spline, state.moved.copy()
+        return self._slopes_at
+
+    def _since(self, state: SplineState) -> FloatArray:
+        since = state.moved.copy()
+        at = self.linearisation.at
+        since[: len(at)] -= at
+        return since

@@ -1,0 +1,48 @@
+"""What is known of a motion beside the images: small accelerations, and the gauge."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from rsgen.geometry import se3
+from rsgen.geometry.so3 import FloatArray
+from rsgen.geometry.spline import Spline
+from rstrack.alignment.normal_equations import Quadratic
+
+Prior = Callable[[Spline], tuple[Quadratic, float]]
+"""The quadratic model of a prior around a spline, and its cost there."""
+
+
+def acceleration_prior(spline: Spline, first: int, last: int, sigma: FloatArray) -> tuple[Quadratic, float]:
+    """Ω_{i+1} − Ω_i ~ N(0, diag σ²) for the triples of control points within first..last (exclusive).
+
+    sigma (triples, 6): m and rad per knot squared, so acceleration times dt². Derivative of Ω_j = log(T_{j−1}⁻¹ T_j) by
+    left increments: Jl⁻¹(Ω_j) Ad(T_{j−1}⁻¹) (δ_j − δ_{j−1}). Returns the model and the cost.
+    """
+    gains = spline.left_gains[first : last - 1]
+    omega = spline.increments[first : last - 1]
+    r = omega[1:] - omega[:-1]
+    J = np.concatenate([gains[:-1], -gains[1:] - gains[:-1], gains[1:]], axis=2)
+    weighted = np.swapaxes(J, 1, 2) / sigma[:, None, :] ** 2
+    blocks, slopes = weighted @ J, (weighted @ r[..., None])[..., 0]
+    count = last - first
+    H, g = np.zeros((6 * count, 6 * count)), np.zeros(6 * count)
+    for i in range(count - 2):
+        at = slice(6 * i, 6 * i + 18)
+        H[at, at] += blocks[i]
+        g[at] += slopes[i]
+    return Quadratic(first, H, g), 0.5 * float(np.sum((r / sigma) ** 2))
+
+
+def pose_constraint(spline: Spline, t: float, T_world_body: FloatArray, sigma: FloatArray) -> tuple[Quadratic, float]:
+    """T(t) = T_world_body up to sigma (6,) (m, rad): fixes the gauge while the reference's control points are free.
+
+    Returns the model and the cost.
+    """
+    segment, J = spline.pose_jacobian(t)
+    e = se3.log(spline.pose(t) @ se3.inverse(T_world_body))
+    J = se3.left_jacobian_inv(e) @ np.hstack(list(J))
+    model = Quadratic(int(segment), J.T @ (J / sigma[:, None] ** 2), J.T @ (e / sigma**2))
+    return model, 0.5 * float(np.sum((e / sigma) ** 2))

@@ -1,0 +1,113 @@
+"""The control points that still move, the images that touch them, and the problem that they make (equation (12))."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rsgen.geometry.so3 import FloatArray
+from rsgen.geometry.spline import Spline
+from rstrack.alignment.linearise import Terms
+from rstrack.alignment.observation import Observation
+from rstrack.alignment.optimizer import Problem, Solved, optimise
+from rstrack.alignment.priors import Prior, acceleration_prior, pose_constraint
+from rstrack.alignment.spline_state import SplineState
+from rstrack.images.device_frame import DeviceFrame
+from rstrack.keyframes.keyframe import Reference
+
+# Motion prior: standard deviation of accelerations, m/s² and rad/s². Hand-held cameras reach 35 m/s² (DESIGN section
+# 5), so it says little where there are data. The newest control points, whose weight in the newest lines is only u³/6,
+# are held a good deal tighter: small systematic errors of the lines would throw them about.
+_ACCELERATION = np.array([5.0, 5.0, 5.0, 10.0, 10.0, 10.0])
+_NEWEST_TRIPLES, _NEWEST_FACTOR = 2, 0.1
+# Metres and radians within which the reference's pose is held while its own control points are free.
+_GAUGE = np.full(6, 1e-6)
+# Levels to go through from a prediction by constant velocity, and from anything worse.
+TRACKING_LEVELS, LEVELS = (1, 0), (2, 1, 0)
+# Steps at most on the pyramid's levels, finest first.
+_MOST_STEPS = (15, 8, 30)
+
+
+class Window:
+    """A spline and the observations of it.
+
+    piece: first control point of the current piece of the spline; those before it belong to another, or to a gap.
+    first_free: first control point that moves when `solve` is called; all after it do. `active`: observations of
+    earlier frames that touch those. `focal`: the depth camera's, in pixels.
+    """
+
+    def __init__(self, terms: Terms, focal: float, state: SplineState, piece: int = 0) -> None:
+        self._terms, self._focal = terms, focal
+        self.state, self.piece = state, piece
+        self.first_free = piece
+        self.active: list[Observation] = []
+
+    @classmethod
+    def still(cls, terms: Terms, focal: float, first: DeviceFrame, dt: float, phase: float) -> Window:
+        """A camera at rest at the world's origin while its first frame is taken; knots dt s apart, one of them `phase`
+        knots before it."""
+        state = SplineState.still(min(first.first_time, first.stamp) - phase * dt, dt, np.eye(4))
+        state.extend(first.last_time)
+        return cls(terms, focal, state)
+
+    @property
+    def spline(self) -> Spline:
+        """T_world_depth(t) as it is now."""
+        return self.state.spline
+
+    def copy(self) -> Window:
+        """A window that can be changed without changing this one."""
+        twin = Window(self._terms, self._focal, self.state.copy(), self.piece)
+        twin.first_free, twin.active = self.first_free, list(self.active)
+        return twin
+
+    def predict(self, new: DeviceFrame, end: float) -> None:
+        """Go on with constant velocity from time `end` (s) until the frame is covered; what it touches is free."""
+        self.state.smooth_end(end)
+        self.state.extend(new.last_time)
+        self.first_free = max(self.piece, self.state.segment(new.first_time))
+        self.active = [o for o in self.active if o.is_linearised and o.lin.model.last > self.first_free]
+
+    def restarted(self, new: DeviceFrame, end: float, T_world_body: FloatArray) -> Window:
+        """The same spline up to time `end` (s), and a new piece at rest at T_world_body (4, 4) for a new frame."""
+        state = self.state.restarted(end, new.first_time, new.last_time, T_world_body)
+        return Window(self._terms, self._focal, state, state.segment(new.first_time))
+
+    def is_frozen(self, t: float) -> bool:
+        """Whether nothing that time t (s) depends on moves any more."""
+        return self.state.segment(t) + 4 <= self.first_free
+
+    def solve(
+        self, fresh: Sequence[Observation], levels: Sequence[int] = LEVELS, gauge: Reference | None = None,
+        coupled: bool = False,
+    ) -> Solved:  # fmt: skip
+        """Align fresh observations, together with the active ones, by moving the free control points.
+
+        gauge: a reference at whose pose the spline is held. coupled: lines depend on control points far apart, as those
+        against a reference that moves too. What was solved for becomes active with `keep`.
+        """
+        free = self.first_free, len(self.state.points)
+        priors = [self._motion_prior(free)] + ([] if gauge is None else [_pose_prior(gauge)])
+        bandwidth = 6 * (free[1] - free[0]) if coupled else 24
+        problem = Problem(fresh, self.active, free, priors, self._focal, bandwidth)
+        try:
+            return optimise(self._terms, self.state, problem, levels, _MOST_STEPS)
+        except np.linalg.LinAlgError:
+            # The images say nothing about some motion, not even with the prior: as lost as can be.
+            return Solved()
+
+    def keep(self, fresh: Sequence[Observation]) -> None:
+        """Fresh observations take part from now on."""
+        self.active += fresh
+
+    def _motion_prior(self, free: tuple[int, int]) -> Prior:
+        first, last = max(self.piece, free[0] - 2), free[1]
+        sigma = np.repeat(_ACCELERATION[None] * self.state.dt**2, last - first - 2, axis=0)
+        sigma[-_NEWEST_TRIPLES:] *= _NEWEST_FACTOR
+        return lambda spline: acceleration_prior(spline, first, last, sigma)
+
+
+def _pose_prior(ref: Reference) -> Prior:
+    """Holds the spline to a reference's pose while its control points are free."""
+    return lambda spline: pose_constraint(spline, ref.t, ref.T_world_base, _GAUGE)
