@@ -36,7 +36,7 @@ from rstrack.keyframes.keyframe import (
     Reference,
     rectified_lens,
 )
-from rstrack.keyframes.rectification import color_kernel, rectify_kernel
+from rstrack.keyframes.rectification import ColorInput, color_kernel, rectify_kernel
 
 WIDTH, HEIGHT = 160, 120
 STAMP = 0.42
@@ -181,7 +181,8 @@ def test_points_outside_the_colour_image_have_no_colour() -> None:
     image = color_input(plane.cast, truth, seen_at)
     grid = maker(camera).device_rays
     table = ENGINE.upload(from_base_table(truth, ref.T_world_base, seen_at))
-    value, seen = kernel(ref.inverse_depth, *grid, ENGINE.upload(np.zeros(12)), image.levels[0], table)
+    zero = ENGINE.upload(np.zeros(12))
+    value, seen = kernel(ColorInput(ref.inverse_depth, *grid, zero, image.levels[0], table))
     value, seen = download(value), download(seen)
     assert seen[1:-2, 1:78].all()
     assert not seen[:, 80:].any() and not value[:, 80:].any()
