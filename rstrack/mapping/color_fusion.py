@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from rsgen.device.arrays import Engine
 from rsgen.device.projection import Lens, Sighting, cross, gather, move, project, project_rolling
-from rsgen.device.recording import recorded
+from rsgen.device.recording import recorded, recorded_from
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.images.line_poses import Exposure, from_base_table, line_motion
@@ -116,8 +116,8 @@ class ColorFusion:
         inv_sigma2 = 0.0 if self.sigma_px is None else self.sigma_px**-2
         constants = e.upload(np.array([inv_sigma2, _LEAST, _MOST]))
         *rgb, weight = kernel(
-            ref.inverse_depth, *fused.rgb, fused.weight, image.rgb, depth.z, *tables, constants
-        )  # fmt: skip
+            _AddInput(ref.inverse_depth, *fused.rgb, fused.weight, image.rgb, depth.z, *tables, constants)
+        )
         return FusedColor((rgb[0], rgb[1], rgb[2]), weight, fused.shape)
 
     def inherit(self, ref: Reference, older: FusedColor, older_ref: Reference) -> FusedColor:
@@ -198,26 +198,39 @@ def _taps(f: Any) -> tuple[Any, ...]:
     )
 
 
-def _add_kernel(e: Engine, lens: Lens, depth_lens: Lens, base: Lens) -> Callable[..., Any]:
-    """Kernel (inverse_depth, r, g, b, weight, image, depth, from_base, sweep, depth_from_base, constants) →
-    (r, g, b, weight).
+@dataclass(frozen=True)
+class _AddInput:
+    """Device arrays: the keyframe's inverse depth, fused colour and weight; the image (interleaved linear RGB).
 
-    `image` is interleaved linear RGB; `sweep`: see `sweep_table`. constants: 1/σ² (0: constant weights), least weight,
-    largest sum of weights.
+    depth: the image that tells what is hidden. *from_base: poses of both images' lines. sweep: see `sweep_table`.
+    constants: 1/σ² (0: constant weights), least weight, largest sum of weights.
     """
 
-    @recorded
-    def kernel(
-        rho: Any, r: Any, g: Any, b: Any, weight: Any, image: Any, depth: Any, from_base: Any, sweep: Any,
-        depth_from_base: Any, constants: Any,
-    ) -> Any:  # fmt: skip
-        inv_sigma2, least, most = (dr.gather(e.Float, constants, e.UInt(i)) for i in range(3))
-        active, p = _points(e, base, rho)
-        seen = project_rolling(lens, from_base, p, e.UInt, e.Int)
+    inverse_depth: Any
+    r: Any
+    g: Any
+    b: Any
+    weight: Any
+    image: Any
+    depth: Any
+    from_base: Any
+    sweep: Any
+    depth_from_base: Any
+    constants: Any
+
+
+def _add_kernel(e: Engine, lens: Lens, depth_lens: Lens, base: Lens) -> Callable[[_AddInput], Any]:
+    """Kernel → (r, g, b, weight): the keyframe's colour with one more image in it, weighted by equation (13)."""
+
+    @recorded_from(_AddInput)
+    def kernel(given: _AddInput) -> Any:
+        inv_sigma2, least, most = (dr.gather(e.Float, given.constants, e.UInt(i)) for i in range(3))
+        active, p = _points(e, base, given.inverse_depth)
+        seen = project_rolling(lens, given.from_base, p, e.UInt, e.Int)
         active &= seen.valid & ~_hidden(
-            e, depth_lens, depth, project_rolling(depth_lens, depth_from_base, p, e.UInt, e.Int), active
+            e, depth_lens, given.depth, project_rolling(depth_lens, given.depth_from_base, p, e.UInt, e.Int), active
         )
-        turn = gather(sweep, seen.row, 6, stride=6)
+        turn = gather(given.sweep, seen.row, 6, stride=6)
         q = seen.at.q
         omega_q = cross((turn[3], turn[4], turn[5]), q)
         dx, dy = seen.at.push((-(turn[0] + omega_q[0]), -(turn[1] + omega_q[1]), -(turn[2] + omega_q[2])))
@@ -225,10 +238,11 @@ def _add_kernel(e: Engine, lens: Lens, depth_lens: Lens, base: Lens) -> Callable
 
         width, height = lens.camera.width, lens.camera.height
         active &= (seen.x >= 0.0) & (seen.y >= 0.0) & (seen.x < width - 1.0) & (seen.y < height - 1.0)
-        share = dr.select(active, w / (weight + w), 0.0)
-        values = _cubic(e, (image,) * 3, 3, width, height, seen.x, seen.y, active)
-        fused = [dr.fma(share, value - before, before) for value, before in zip(values, (r, g, b), strict=True)]
-        return *fused, dr.minimum(weight + dr.select(active, w, 0.0), most)
+        share = dr.select(active, w / (given.weight + w), 0.0)
+        values = _cubic(e, (given.image,) * 3, 3, width, height, seen.x, seen.y, active)
+        fused_before = given.r, given.g, given.b
+        fused = [dr.fma(share, value - before, before) for value, before in zip(values, fused_before, strict=True)]
+        return *fused, dr.minimum(given.weight + dr.select(active, w, 0.0), most)
 
     return kernel
 
