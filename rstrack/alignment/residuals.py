@@ -26,6 +26,7 @@ from rsgen.device.arrays import Engine
 from rsgen.device.projection import TO_BASE, Lens, gather, move, project_rolling
 from rsgen.device.recording import recorded_from
 from rstrack.alignment.block_sums import accumulate, block_slot
+from rstrack.images.blur import blur_length, blur_weight
 from rstrack.images.sampling import EDGE, NEAREST, bilinear, grid, level_size, nearest, surface
 
 # Metres that a point has to lie behind what is seen there to count as hidden, beside EDGE of its depth.
@@ -95,13 +96,6 @@ def geometric_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int) -> Call
     return kernel
 
 
-def blur_weight(lens: Lens, pixel_speed: tuple[Any, Any], sigma_px: float) -> Any:
-    """Equation (13): exp(−‖x_t − x_{t−t_e}‖ / σ²) of points that move by pixel_speed (px) per line delay."""
-    lines = lens.shutter.exposure_s / lens.shutter.line_delay(lens.camera)
-    u, v = pixel_speed
-    return dr.exp(-dr.sqrt(u * u + v * v) * (lines / sigma_px**2))
-
-
 @dataclass(frozen=True)
 class PhotometricInput:
     """Device arrays that the photometric kernel takes.
@@ -153,7 +147,7 @@ def photometric_kernel(
         dy = (bottom - top) * shrink
         if weighs_blur:
             # Of the squared error, so that σ stays that of sharp points.
-            share = dr.sqrt(blur_weight(lens, seen.pixel_speed, blur_sigma_px))
+            share = dr.sqrt(blur_weight(blur_length(lens, seen.pixel_speed), 1.0 / blur_sigma_px**2))  # (13)
             r, dx, dy = r * share, dx * share, dy * share
         g = seen.chain(dx, dy, 0.0)
         slot, size = block_slot(seen.row, ref_line, lens, ref_lens)

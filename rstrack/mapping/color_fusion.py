@@ -26,6 +26,7 @@ from rsgen.device.projection import Lens, Sighting, cross, gather, move, project
 from rsgen.device.recording import recorded, recorded_from
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
+from rstrack.images.blur import blur_weight
 from rstrack.images.line_poses import Exposure, from_base_table, line_motion
 from rstrack.images.pyramid import DepthImage
 from rstrack.images.sampling import EDGE, bilinear, grid
@@ -234,7 +235,7 @@ def _add_kernel(e: Engine, lens: Lens, depth_lens: Lens, base: Lens) -> Callable
         q = seen.at.q
         omega_q = cross((turn[3], turn[4], turn[5]), q)
         dx, dy = seen.at.push((-(turn[0] + omega_q[0]), -(turn[1] + omega_q[1]), -(turn[2] + omega_q[2])))
-        w = dr.maximum(dr.exp(-inv_sigma2 * dr.sqrt(dx * dx + dy * dy)), least)
+        w = dr.maximum(blur_weight(dr.sqrt(dx * dx + dy * dy), inv_sigma2), least)
 
         width, height = lens.camera.width, lens.camera.height
         active &= (seen.x >= 0.0) & (seen.y >= 0.0) & (seen.x < width - 1.0) & (seen.y < height - 1.0)

@@ -31,6 +31,7 @@ from rstrack.alignment import block_sums, residuals
 from rstrack.alignment.linearise import Linearised, Terms
 from rstrack.alignment.student_t import LEAST_CURVATURE, NU, scale_step, weight
 from rstrack.images import line_poses as lines
+from rstrack.images.blur import blur_length, blur_weight
 from rstrack.images.pyramid import ColorImage, DepthImage
 from rstrack.keyframes.keyframe import Reference
 
@@ -244,7 +245,7 @@ def test_blur_weights_are_those_of_equation_13(scan: str) -> None:
     table = ENGINE.upload(lines.from_base_table(s.truth, s.ref.T_world_base, s.image.exposure))
     seen = project_rolling(lens, table, (points.x, points.y, points.z), ENGINE.UInt, ENGINE.Int)
     on = (points.z.numpy() > 0) & seen.valid.numpy()
-    found = residuals.blur_weight(lens, seen.pixel_speed, sigma_px).numpy()[on]
+    found = blur_weight(blur_length(lens, seen.pixel_speed), 1.0 / sigma_px**2).numpy()[on]
     p_base = np.stack([a.numpy()[on] for a in (points.x, points.y, points.z)], axis=-1).astype(float)
     p_world = se3.transform(s.ref.T_world_base, p_base)
     middle = lens.shutter.line_mid_time(stamp, seen.line.numpy()[on].astype(float), lens.camera)
