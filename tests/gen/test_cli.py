@@ -467,7 +467,7 @@ def test_progress_is_on_stderr_and_quiet_is_quiet(place: Path, capfd: pytest.Cap
 
 
 def child(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "rsgen.cli.main", *words]
+    command = [sys.executable, "-m", "rsgen", *words]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=os.environ | environment)
 
 
@@ -480,7 +480,7 @@ def test_a_missing_libllvm_is_one_line(place: Path) -> None:
 def test_a_reader_that_goes_away_is_no_error(place: Path) -> None:
     read, write = os.pipe()
     os.close(read)
-    command = [sys.executable, "-m", "rsgen.cli.main", "info", str(place / "seq")]
+    command = [sys.executable, "-m", "rsgen", "info", str(place / "seq")]
     done = subprocess.run(command, cwd=ROOT, stdout=write, stderr=subprocess.PIPE)
     os.close(write)
     assert (done.returncode, done.stderr) == (0, b"")

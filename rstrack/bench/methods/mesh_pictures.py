@@ -153,7 +153,7 @@ def _draw(sequence: str, made: Sequence[tuple[Cell, dict[str, Any]]], out: Path)
         return path
     _remove(pictured)
     # Mitsuba draws, which the tracker's process never loads.
-    command = [sys.executable, "-m", "rsgen.cli.main", "picture", "--quiet", f"--out={path.resolve()}"]
+    command = [sys.executable, "-m", "rsgen", "picture", "--quiet", f"--out={path.resolve()}"]
     command += [f"--width={_PANEL_PX[0]}", f"--height={_PANEL_PX[1]}"]
     command += [f"--label={part['label']}" for part in parts]
     command += [str((out / "cells" / sequence / part["method"] / MESH).resolve()) for part in parts]

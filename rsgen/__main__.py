@@ -1,0 +1,7 @@
+"""`python -m rsgen` is the command `rsgen`."""
+
+import sys
+
+from rsgen.cli.main import main
+
+sys.exit(main())
