@@ -1,7 +1,7 @@
 """How far an estimate is from the truth: ATE, drift per second, and the error of every line's pose.
 
 metrics = run_evaluate(Path("out/lr_kt2"), Path("runs/lr_kt2"))
-print(metrics_text(metrics))
+print(metrics.text())
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ _RPE_DELTA_S = 1.0
 _PAIR_WITHIN_S = 0.1
 # Stamps rounded to TUM's four digits still are one second apart.
 _STAMP_ROUNDING_S = 1e-3
+_SHUTTERS = {"rs": "the rolling-shutter model", "gs": "taking the shutter for a global one"}
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,24 @@ class Metrics:
         """Plain numbers for JSON; units are in the names."""
         data: dict[str, Any] = plain(dataclasses.asdict(self) | {"coverage": self.coverage})
         return data
+
+    def text(self) -> str:
+        """A small table with units: millimetres, degrees, and both per second."""
+        m = self
+        tracked = f"{m.frames_tracked} of {m.frames} ({100 * m.coverage:.1f} %)"
+        lines = [f"{'frames tracked':<22} {tracked}", f"{'poses compared':<22} {m.poses_compared} of {m.poses}", ""]
+        lines.append(f"{'':<22} {'RMSE':>10} {'mean':>10} {'median':>10} {'std':>10} {'max':>10}")
+        ate = (m.ate_rmse_m, m.ate_mean_m, m.ate_median_m, m.ate_std_m, m.ate_max_m)
+        table: list[tuple[str, list[str], str]] = [
+            ("ATE, mm", [_number(value, 1e3) for value in ate], ""),
+            ("drift, mm/s", [_number(m.rpe_trans_rmse_m_per_s, 1e3)], f"   over {m.rpe_pairs} pairs 1 s apart"),
+            ("drift, deg/s", [_number(m.rpe_rot_rmse_deg_per_s)], ""),
+            ("lines' position, mm", [_number(m.row_rmse_m, 1e3)], f"   over {m.rows} of {m.rows_total} lines"),
+            ("lines' rotation, deg", [_number(m.row_rot_rmse_deg)], ""),
+        ]
+        lines += [f"{label:<22} {' '.join(f'{value:>10}' for value in values)}{end}" for label, values, end in table]
+        lines += [f"note: {note}" for note in m.notes]
+        return "\n".join(lines)
 
 
 def evaluate(truth: Truth, estimate: Estimate, interpolate: bool = False) -> Metrics:
@@ -154,25 +173,6 @@ def pairs_one_second_apart(stamps: FloatArray) -> tuple[IntArray, IntArray]:
     return np.flatnonzero(keep), j[keep]
 
 
-def metrics_text(metrics: Metrics) -> str:
-    """A small table with units: millimetres, degrees, and both per second."""
-    m = metrics
-    tracked = f"{m.frames_tracked} of {m.frames} ({100 * m.coverage:.1f} %)"
-    lines = [f"{'frames tracked':<22} {tracked}", f"{'poses compared':<22} {m.poses_compared} of {m.poses}", ""]
-    lines.append(f"{'':<22} {'RMSE':>10} {'mean':>10} {'median':>10} {'std':>10} {'max':>10}")
-    ate = (m.ate_rmse_m, m.ate_mean_m, m.ate_median_m, m.ate_std_m, m.ate_max_m)
-    table: list[tuple[str, list[str], str]] = [
-        ("ATE, mm", [_number(value, 1e3) for value in ate], ""),
-        ("drift, mm/s", [_number(m.rpe_trans_rmse_m_per_s, 1e3)], f"   over {m.rpe_pairs} pairs 1 s apart"),
-        ("drift, deg/s", [_number(m.rpe_rot_rmse_deg_per_s)], ""),
-        ("lines' position, mm", [_number(m.row_rmse_m, 1e3)], f"   over {m.rows} of {m.rows_total} lines"),
-        ("lines' rotation, deg", [_number(m.row_rot_rmse_deg)], ""),
-    ]
-    lines += [f"{label:<22} {' '.join(f'{value:>10}' for value in values)}{end}" for label, values, end in table]
-    lines += [f"note: {note}" for note in m.notes]
-    return "\n".join(lines)
-
-
 def run_evaluate(seq_path: Path, estimate_path: Path, camera_file: Path | None = None) -> Metrics:
     """Evaluate a run folder or TUM file against the truth of a sequence folder.
 
@@ -190,6 +190,15 @@ def run_evaluate(seq_path: Path, estimate_path: Path, camera_file: Path | None =
         return evaluate(truth, estimate)
     except UserError as error:
         raise UserError(f"{estimate_path}: {error}") from None
+
+
+def compared(run: Path, metrics: Metrics, other: Path, theirs: Metrics) -> str:
+    """One line: the ATE of a run beside that of another, by what their methods take the shutter for."""
+    names = [_SHUTTERS.get(str(read_estimate(path).info.get("method", ""))[:2], str(path)) for path in (run, other)]
+    names = names if len(set(names)) == 2 else [str(run), str(other)]
+    ours_m, theirs_m = max(metrics.ate_rmse_m, 1e-12), max(theirs.ate_rmse_m, 1e-12)
+    times = f"{max(ours_m, theirs_m) / min(ours_m, theirs_m):.3g} times {'worse' if theirs_m >= ours_m else 'better'}"
+    return f"{names[0]}: ATE {1e3 * ours_m:.3g} mm; {names[1]}: {1e3 * theirs_m:.3g} mm ({times})"
 
 
 # ---------------------------------------------------------------------------------------------------------------------

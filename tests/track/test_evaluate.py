@@ -26,7 +26,7 @@ from rsgen.geometry.spline import Spline
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.estimate import Estimate, read_estimate, write_estimate
 from rstrack.metrics.association import Truth, align, compare
-from rstrack.metrics.evaluate import Metrics, evaluate, metrics_text, pairs_one_second_apart, run_evaluate
+from rstrack.metrics.evaluate import Metrics, evaluate, pairs_one_second_apart, run_evaluate
 
 CAMERA = Camera(16, 12, 12.0, 12.0, 7.5, 5.5)
 SHUTTER = Shutter(0.028, 0.004)
@@ -209,7 +209,7 @@ def test_shorter_than_a_second_has_no_drift_but_says_so() -> None:
     assert result.rpe_trans_rmse_m_per_s is None and result.rpe_rot_rmse_deg_per_s is None
     assert any("one second apart" in note for note in result.notes)
     assert json.loads(json.dumps(result.as_dict(), allow_nan=False))["rpe_trans_rmse_m_per_s"] is None
-    assert " - " in metrics_text(result) + " "
+    assert " - " in result.text() + " "
 
 
 # --- association -----------------------------------------------------------------------------------------------------
@@ -517,7 +517,7 @@ def test_a_run_is_evaluated_against_an_rsgen_sequence(tmp_path: Path) -> None:
 def test_the_table_has_units_and_lines_up() -> None:
     ate = (0.000131, 0.0001, 0.00009, 0.00002, 0.123456)
     result = Metrics(882, 878, 878, 877, *ate, 0.0042, 0.0611, 848, 0.0002, 0.01, 421440, 423360, ("a note",))
-    text = metrics_text(result).splitlines()
+    text = result.text().splitlines()
     assert text[0].endswith("878 of 882 (99.5 %)")
     assert text[3].split() == ["RMSE", "mean", "median", "std", "max"]
     assert text[4].split() == ["ATE,", "mm", "0.131", "0.100", "0.090", "0.020", "123.456"]

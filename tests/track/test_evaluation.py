@@ -32,7 +32,7 @@ from rstrack.bench.methods.grid import Cell, Results, read_cell, run_cell, run_p
 from rstrack.bench.methods.plan import Plan, SequenceInfo, make_plan
 from rstrack.bench.methods.plots import draw_ate_bars, draw_sequence
 from rstrack.bench.methods.tables import averages, notes, results_csv, results_markdown, results_text, write_results
-from rstrack.cli.bench_methods import add_evaluation
+from rstrack.cli.bench_methods import bench
 from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.metrics.evaluate import run_evaluate
 from rstrack.options import METHODS, PEERS, Options
@@ -45,7 +45,7 @@ SPEEDS = (0.3, 0.25)
 
 def parser() -> Parser:
     commands = Commands("rstrack", "test")
-    add_evaluation(commands)
+    commands.add(bench, "")
     return commands.parser
 
 

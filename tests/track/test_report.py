@@ -31,7 +31,7 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rstrack.cli.report import add_report
+from rstrack.cli.report import report as report_command
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import Estimate
 from rstrack.data.rig import Image, Rig
@@ -272,7 +272,7 @@ def test_the_command_writes_the_page_or_one_line_of_complaint(
 ) -> None:
     def command(*words: str) -> int:
         commands = Commands("rstrack", "")
-        add_report(commands)
+        commands.add(report_command, "")
         return run_program("rstrack", lambda: commands.parser, ["report", *words], "")
 
     for folder, name in ((run, "run.html"), (bench, "bench.html")):

@@ -18,7 +18,8 @@ from typing import Any
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, read_text, write_error
 from rstrack.bench.methods.grid import CELL, Cell, Results, SequenceInfo
-from rstrack.mapping.reconstruct import MapOptions, run_map
+from rstrack.mapping.reconstruct import run_map
+from rstrack.options import MapOptions
 from rstrack.tracking.run import Progress
 
 SHOWN = ("rs-pg", "gs-pg", "baseline")
