@@ -48,6 +48,7 @@ def _kept(share: Path, cache: Path) -> Path:
     for name, data in files.items():
         # Byte by byte: in a folder copied from one that is read-only no scene could be built.
         if not (kept / name).is_file():
+            (kept / name).parent.mkdir(parents=True, exist_ok=True)
             atomic_write(kept / name, data)
     return kept
 
