@@ -21,7 +21,7 @@ from rsgen.config.config import describe_fields
 from rsgen.files import encode_npz
 
 ROOT = Path(__file__).parents[2]
-COMMANDS = ("render", "fit", "info", "verify", "compare", "preview", "check-light", "bench")
+COMMANDS = ("configs", "render", "fit", "info", "verify", "compare", "preview", "check-light", "bench")
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +86,7 @@ def test_the_main_help_lists_every_command(capfd: pytest.CaptureFixture[str]) ->
         main(["--help"])
     text = capfd.readouterr().out
     assert exit.value.code == 0 and all(f"  {command}" in text for command in COMMANDS)
-    assert "rsgen render configs/demo.yaml" in text
+    assert "rsgen render demo" in text
 
 
 # --- what is given in the wrong way ----------------------------------------------------------------------------------

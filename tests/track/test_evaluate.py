@@ -26,7 +26,7 @@ from rsgen.geometry.spline import Spline
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.estimate import Estimate, read_estimate, write_estimate
 from rstrack.metrics.association import Truth, align, compare
-from rstrack.metrics.evaluate import Metrics, evaluate, pairs_one_second_apart, run_evaluate
+from rstrack.metrics.evaluate import Metrics, compared, evaluate, pairs_one_second_apart, run_evaluate
 
 CAMERA = Camera(16, 12, 12.0, 12.0, 7.5, 5.5)
 SHUTTER = Shutter(0.028, 0.004)
@@ -525,6 +525,17 @@ def test_the_table_has_units_and_lines_up() -> None:
     assert "drift, mm/s" in text[5] and "4.200" in text[5] and text[5].index("4.200") + 5 == text[3].index("RMSE") + 4
     assert "drift, deg/s" in text[6] and "0.061" in text[6]
     assert text[-1] == "note: a note"
+
+
+def test_two_runs_are_compared_in_one_line(tmp_path: Path) -> None:
+    ours, theirs = (Metrics(9, 9, 9, 9, ate, 0, 0, 0, 0, None, None, 0, None, None, 0, 0) for ate in (0.000095, 0.0091))
+    for method in ("rs-pg", "gs-pg", "rs-g"):
+        write_estimate(tmp_path / method, FRAMES[:9], SPLINE.pose(FRAMES[:9]), None, {"method": method})
+    rs, gs, other = (tmp_path / method for method in ("rs-pg", "gs-pg", "rs-g"))
+    model, neglect = "the rolling-shutter model", "taking the shutter for a global one"
+    assert compared(rs, ours, gs, theirs) == f"{model}: ATE 0.095 mm; {neglect}: 9.1 mm (95.8 times worse)"
+    assert compared(gs, theirs, rs, ours) == f"{neglect}: ATE 9.1 mm; {model}: 0.095 mm (95.8 times better)"
+    assert compared(rs, ours, other, theirs).startswith(f"{rs}: ATE 0.095 mm; {other}: 9.1 mm")
 
 
 def test_numbers_survive_json() -> None:
