@@ -56,7 +56,7 @@ class Ratio:
 
 
 @dataclass(frozen=True)
-class ModeReport:
+class BenchTimes:
     """Times of all modes of one run; `failed`: what became of those that have none."""
 
     width: int

@@ -156,9 +156,9 @@ def verify(
     """Read a sequence back and check it: files, stamps, rows' poses, reprojection."""
     from rsgen.check.verify import verify_sequence
 
-    report = verify_sequence(sequence, pairs=pairs, raycast=raycast)
-    print(report.text())
-    return 0 if report.ok else 1
+    found = verify_sequence(sequence, pairs=pairs, raycast=raycast)
+    print(found.text())
+    return 0 if found.ok else 1
 
 
 def export(
@@ -202,8 +202,8 @@ def check_light(
 
     chosen = load_config(config, fields)
     with ProgressDisplay() as progress:
-        report, ok = check(chosen, views, spp, width, out, progress)
-    print(report)
+        table, ok = check(chosen, views, spp, width, out, progress)
+    print(table)
     return 0 if ok else 1
 
 
@@ -228,8 +228,8 @@ def bench(
     modes = (*BENCH_MODES, *_BLENDER_MODES) if "all" in (mode or ()) else mode or BENCH_MODES
     chosen = load_config(config, fields)
     with ProgressDisplay() as progress:
-        report = time_modes(chosen, frames, spp, modes, progress)
-    print_figures(report, json)
+        times = time_modes(chosen, frames, spp, modes, progress)
+    print_figures(times, json)
     return 0
 
 

@@ -41,7 +41,7 @@ class Start:
 
 
 @dataclass(frozen=True)
-class BootstrapReport:
+class Bootstraps:
     """Runs of `frames` frames each, in order of their first frame."""
 
     name: str
@@ -87,7 +87,7 @@ class BootstrapReport:
 def bootstraps(
     dataset: Dataset, options: Options, starts: int = 50, frames: int = 20, seed: int = 0,
     progress: Progress = lambda *_: None,
-) -> BootstrapReport:  # fmt: skip
+) -> Bootstraps:  # fmt: skip
     """Track `frames` frames from each of `starts` random frames (fewer if there are not so many), a new tracker each.
 
     Errors are those of positions after alignment over the run's own frames (`association.compare`). Raises
@@ -107,7 +107,7 @@ def bootstraps(
         runs.append(_run(dataset, truth, options, range(first, first + frames)))
         failed = sum(run.failed for run in runs)
         progress("starting", done / len(chosen), f"{failed} of {done} lost")
-    return BootstrapReport(dataset.name, options.method, frames, tuple(runs))
+    return Bootstraps(dataset.name, options.method, frames, tuple(runs))
 
 
 def generator(seed: int) -> np.random.Generator:

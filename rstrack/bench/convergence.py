@@ -72,7 +72,7 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class ConvergenceReport:
+class Convergence:
     """All trials. resampling_m: largest error of the spline that stands for the truth, at the middle of a readout."""
 
     name: str
@@ -132,7 +132,7 @@ class ConvergenceReport:
 
 def convergence(
     dataset: Dataset, options: Options, pairs: int = 50, seed: int = 0, progress: Progress = lambda *_: None
-) -> ConvergenceReport:
+) -> Convergence:
     """Align single frames to keyframes one to ten frames older, from poses ever farther off.
 
     The keyframe is rectified with the true motion. The frame starts with its true motion (resampled at the tracker's
@@ -171,7 +171,7 @@ def convergence(
         found = sum(trial.converged for trial in trials if trial.factor == 1.0)
         progress("aligning", done / len(chosen), f"{found} of {done} converged")
     settings = options.method, len(chosen), options.knot_spacing_s
-    return ConvergenceReport(dataset.name, *settings, off_m, tuple(trials))
+    return Convergence(dataset.name, *settings, off_m, tuple(trials))
 
 
 def choose_pairs(dataset: Dataset, truth: Spline, options: Options, count: int, seed: int) -> list[Pair]:

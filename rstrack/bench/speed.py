@@ -76,7 +76,7 @@ class MethodTimes:
 
 
 @dataclass(frozen=True)
-class SpeedReport:
+class SpeedTimes:
     """Times of some methods, peers last, on the same frames."""
 
     name: str
@@ -139,7 +139,7 @@ def time_methods(
     frames: int,
     progress: Progress = lambda *_: None,
     peers: Sequence[str] = (),
-) -> SpeedReport:
+) -> SpeedTimes:
     """Track the first `frames` frames with each of the options and peers; the first 20, at most half, do not count.
 
     Raises UserError: fewer than two frames, an image that cannot be read, a tracker that breaks down, a peer that is
@@ -158,7 +158,7 @@ def time_methods(
     methods = [_time(dataset, o, frames, warm_up, progress) for o in options]
     methods += [_time_peer(dataset, name, t, registrar, frames, warm_up, progress) for name, t in others.items()]
     cpu_count = os.cpu_count() or 1
-    return SpeedReport(dataset.name, dataset.rig.depth_camera, (warm_up, frames), backend, cpu_count, tuple(methods))
+    return SpeedTimes(dataset.name, dataset.rig.depth_camera, (warm_up, frames), backend, cpu_count, tuple(methods))
 
 
 def _time(dataset: Dataset, options: Options, frames: int, warm_up: int, progress: Progress) -> MethodTimes:

@@ -39,9 +39,9 @@ def map_eval(
     json: Json = False,
 ) -> int:
     """How far a mesh is from the scene, and how much of what was seen it has."""
-    from rstrack.metrics.map_eval import run_map_evaluate
+    from rstrack.metrics.map_eval import run_map_eval
 
-    print_figures(run_map_evaluate(mesh, scene), json)
+    print_figures(run_map_eval(mesh, scene), json)
     return 0
 
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rsgen.errors import UserError
-from rstrack.bench.stress.run import ColorScore, Panels, StressReport
-from rstrack.bench.stress.tables import gain_db, gains_db, read_panels, read_report, shade
+from rstrack.bench.stress.run import ColorScore, Panels, StressResult
+from rstrack.bench.stress.tables import gain_db, gains_db, read_panels, read_stress, shade
 from rstrack.report.figures import ESTIMATE_COLOR, SECOND_COLOR, TRUE_COLOR, Series, against
 from rstrack.report.images import jpeg_uri
 from rstrack.report.page import (
@@ -46,7 +46,7 @@ def stress_page(folder: Path) -> Page:
 
     Raises UserError: its tables cannot be read.
     """
-    report = read_report(folder)
+    report = read_stress(folder)
     labels = _labels(report)
     warnings: list[str] = []
     sections = [Section("color", "Fused colour against the sharp view", _color(report, labels))]
@@ -72,7 +72,7 @@ def stress_page(folder: Path) -> Page:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _labels(report: StressReport) -> dict[str, str]:
+def _labels(report: StressResult) -> dict[str, str]:
     """What a sequence is called on the page, by its name."""
     cases = {row.case: (row.exposure_s, row.speed) for row in report.color}
     cases |= {row.case: (row.exposure_s, row.speed) for row in report.tracking}
@@ -82,14 +82,14 @@ def _labels(report: StressReport) -> dict[str, str]:
     }
 
 
-def _subtitle(report: StressReport) -> str:
+def _subtitle(report: StressResult) -> str:
     exposures = sorted({1e3 * row.exposure_s for row in report.tracking})
     speeds = [f"{speed:g}×" for speed in sorted({row.speed for row in report.tracking})]
     among = f"exposures of {', '.join(f'{ms:g}' for ms in exposures)} ms"
     return f"One motion with {among}" + (f", at {', '.join(speeds)} speed" if len(speeds) > 1 else "")
 
 
-def _cards(report: StressReport, labels: dict[str, str]) -> CardRow:
+def _cards(report: StressResult, labels: dict[str, str]) -> CardRow:
     """The sequence of the longest exposure at the usual speed."""
     first = min(report.color, key=lambda row: (row.poses != "true", row.speed != 1.0, -row.exposure_s))
     case, poses = first.case, first.poses
@@ -113,7 +113,7 @@ def _cards(report: StressReport, labels: dict[str, str]) -> CardRow:
     return CardRow(tuple(cards), f"{labels[case]} exposure, {_POSES[poses]}")
 
 
-def _color(report: StressReport, labels: dict[str, str]) -> tuple[Block | Chooser, ...]:
+def _color(report: StressResult, labels: dict[str, str]) -> tuple[Block | Chooser, ...]:
     options = []
     for poses, name in _POSES.items():
         rows = [row for row in report.color if row.poses == poses]
@@ -194,7 +194,7 @@ def _row(
     return [Cell(text, note, is_best=differ and text == best) for text, note in zip(texts, notes, strict=True)]
 
 
-def _depth(report: StressReport, labels: dict[str, str]) -> tuple[Block, ...]:
+def _depth(report: StressResult, labels: dict[str, str]) -> tuple[Block, ...]:
     tables = []
     for poses, name in _POSES.items():
         rows = []
@@ -209,7 +209,7 @@ def _depth(report: StressReport, labels: dict[str, str]) -> tuple[Block, ...]:
     return tuple(tables)
 
 
-def _tracking(report: StressReport, labels: dict[str, str]) -> tuple[Block, ...]:
+def _tracking(report: StressResult, labels: dict[str, str]) -> tuple[Block, ...]:
     found = {(row.case, row.variant): row for row in report.tracking}
     variants = list(dict.fromkeys(row.variant for row in report.tracking))
     rows: list[tuple[Cell | str, ...]] = []

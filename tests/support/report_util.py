@@ -17,8 +17,8 @@ from rsgen.config.truth import TruthConfig
 from rsgen.geometry import se3
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
-from rstrack.bench.stress.run import ColorScore, DepthScore, Panels, StressReport, TrackScore
-from rstrack.bench.stress.tables import write_report as write_stress
+from rstrack.bench.stress.run import ColorScore, DepthScore, Panels, StressResult, TrackScore
+from rstrack.bench.stress.tables import write_tables as write_stress
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import write_estimate
 from rstrack.metrics.evaluate import run_evaluate
@@ -171,7 +171,7 @@ def make_bench(root: Path, sequence: Path, twin: Path) -> Path:
     return root
 
 
-def make_stress(root: Path, seed: int = 5) -> StressReport:
+def make_stress(root: Path, seed: int = 5) -> StressResult:
     """The folder of a stress test of four sequences; the estimated path has a score that cannot be had."""
     rng = np.random.default_rng(seed)
     cases = [("exposure_0ms", 1.0, 0.0), ("exposure_20ms", 1.0, 0.02), ("exposure_30ms", 1.0, 0.03)]
@@ -193,6 +193,6 @@ def make_stress(root: Path, seed: int = 5) -> StressReport:
     images = [cv2.blur(rng.integers(0, 256, (48, 64, 3)).astype(np.uint8), (5, 5)) for _ in range(4)]
     weights = np.tile(np.linspace(0.0, 0.25, 64, dtype=np.float32), (48, 1))
     panels = Panels("exposure_20ms", 12, images[0], weights, *images[1:])
-    report = StressReport(NASTY, tuple(color), tuple(depth), tuple(tracking), panels)
+    report = StressResult(NASTY, tuple(color), tuple(depth), tuple(tracking), panels)
     write_stress(report, root)
     return report

@@ -15,8 +15,8 @@ from report_util import NASTY, Parsed, make_stress, parse, picture
 
 from rsgen.console.command_line import Commands, run_program
 from rsgen.errors import UserError
-from rstrack.bench.stress.run import StressReport
-from rstrack.bench.stress.tables import read_panels, read_report
+from rstrack.bench.stress.run import StressResult
+from rstrack.bench.stress.tables import read_panels, read_stress
 from rstrack.cli.report import report as report_command
 from rstrack.report.build import write_report
 
@@ -27,24 +27,24 @@ LABELS = {
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, StressReport]:
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, StressResult]:
     root = tmp_path_factory.mktemp("stress") / "made"
     root.mkdir()
     return root, make_stress(root)
 
 
 @pytest.fixture(scope="module")
-def stored(made: tuple[Path, StressReport]) -> dict[str, Any]:
+def stored(made: tuple[Path, StressResult]) -> dict[str, Any]:
     return dict(json.loads((made[0] / "stress.json").read_text()))
 
 
 @pytest.fixture(scope="module")
-def page(made: tuple[Path, StressReport]) -> Parsed:
+def page(made: tuple[Path, StressResult]) -> Parsed:
     return parse(write_report(made[0]))
 
 
 @pytest.fixture
-def copy(made: tuple[Path, StressReport], tmp_path: Path) -> Path:
+def copy(made: tuple[Path, StressResult], tmp_path: Path) -> Path:
     """The folder, for a test to damage."""
     return Path(shutil.copytree(made[0], tmp_path / "copy"))
 
@@ -55,9 +55,9 @@ def tables(page: Parsed) -> list[list[list[str]]]:
     return [page.rows[a:b] for a, b in zip(starts, [*starts[1:], None], strict=True)]
 
 
-def test_what_was_written_is_read_again(made: tuple[Path, StressReport]) -> None:
+def test_what_was_written_is_read_again(made: tuple[Path, StressResult]) -> None:
     root, report = made
-    read = read_report(root)
+    read = read_stress(root)
     assert (read.config, read.depth, read.tracking) == (report.config, report.depth, report.tracking)
     assert len(read.color) == len(report.color)
     for a, b in zip(read.color, report.color, strict=True):
@@ -112,7 +112,7 @@ def test_the_depth_and_tracking_tables_numbers_are_those_of_the_file(page: Parse
             assert text == f"{ate}{drift}" + (f" {r['lost']} lost" if r["lost"] else "")
 
 
-def test_the_best_of_a_row_is_marked(made: tuple[Path, StressReport], stored: dict[str, Any]) -> None:
+def test_the_best_of_a_row_is_marked(made: tuple[Path, StressResult], stored: dict[str, Any]) -> None:
     html = write_report(made[0]).read_text("utf-8")
     marked = re.findall(r'<td class="best">\s*([-+.\d]+)', html)
     expected = []
@@ -167,7 +167,7 @@ def test_the_curves_are_the_gains_by_exposure_and_by_speed(page: Parsed, stored:
     assert lost["name"] == "blur weight" and lost["y"] == [None]
 
 
-def test_the_pictures_are_the_panels(page: Parsed, made: tuple[Path, StressReport]) -> None:
+def test_the_pictures_are_the_panels(page: Parsed, made: tuple[Path, StressResult]) -> None:
     uris = page.uris()
     assert len(uris) == 5 + 2
     for uri, name in zip(uris[:5], ("registered", "weights", "constant", "blur_aware", "sharp_view"), strict=True):
@@ -246,7 +246,7 @@ def test_the_page_loads_nothing(copy: Path) -> None:
 
 
 def test_the_command_writes_the_page(
-    made: tuple[Path, StressReport], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    made: tuple[Path, StressResult], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def command(*words: str) -> int:
         commands = Commands("rstrack", "")

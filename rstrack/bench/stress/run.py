@@ -92,7 +92,7 @@ class Panels:
 
 
 @dataclass(frozen=True)
-class StressReport:
+class StressResult:
     """Everything that was measured."""
 
     config: str
@@ -112,7 +112,7 @@ _TABLES = ("color", "depth", "tracking")
 
 def run_stress(
     config: Path, out: Path, options: StressOptions, progress: Progress = lambda *_: None, render: Render | None = None
-) -> StressReport:
+) -> StressResult:
     """Render, track, fuse and score all cases. Raises UserError: a config, a render or a folder that does not do.
 
     render: runs `rsgen` with arguments (default: in a process of its own).
@@ -138,7 +138,7 @@ def run_stress(
             depth += _depth_score(case, poses, keyframes, dataset, options.tracker)
             if poses == "true" and case.speed == 1.0 and math.isclose(case.exposure_s, options.speed_exposure_s):
                 panels = _panels(case, keyframes, truth, options)
-    return StressReport(Path(config).name, tuple(color), tuple(depth), tuple(tracking), panels)
+    return StressResult(Path(config).name, tuple(color), tuple(depth), tuple(tracking), panels)
 
 
 def check_comparable(dataset: Dataset) -> None:

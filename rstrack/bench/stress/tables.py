@@ -1,7 +1,7 @@
 """What the blur stress test found, as text, CSV, JSON, curves, and the four panels of the paper's Figure 2.
 
-write_report(report, Path("runs/stress"))
-report = read_report(Path("runs/stress"))
+write_tables(report, Path("runs/stress"))
+report = read_stress(Path("runs/stress"))
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from rsgen.errors import UserError, first_problem
 from rsgen.files import atomic_write, encode_png, read_png, read_text
-from rstrack.bench.stress.run import ColorScore, DepthScore, Panels, StressReport, TrackScore
+from rstrack.bench.stress.run import ColorScore, DepthScore, Panels, StressResult, TrackScore
 from rstrack.data.estimate import plain
 
 STRESS = "stress.json"
@@ -30,13 +30,13 @@ _PANELS = ("registered", "weights", "constant", "blur_aware", "sharp_view")
 _COLORS = ("#2a6fbb", "#d9822b", "#3a8f4d", "#8e44ad", "#c0392b")
 
 
-def write_report(report: StressReport, out: Path) -> list[Path]:
+def write_tables(report: StressResult, out: Path) -> list[Path]:
     """Write stress.txt, stress.json, stress_color.csv, _depth.csv, _tracking.csv, stress.png, panels.png and the
     panels themselves in panels/; returns the files. Raises UserError if that cannot be done."""
     data = plain(report.as_dict())
     data["panels"] = None if report.panels is None else _about(report.panels)
     files = {
-        "stress.txt": report_text(report) + "\n",
+        "stress.txt": stress_text(report) + "\n",
         STRESS: json.dumps(data, indent=1, allow_nan=False) + "\n",
         **{f"stress_{name}.csv": _csv(data[name]) for name in ("color", "depth", "tracking")},
     }
@@ -47,10 +47,10 @@ def write_report(report: StressReport, out: Path) -> list[Path]:
     return written + ([] if report.panels is None else _write_panels(report.panels, out))
 
 
-def read_report(out: Path) -> StressReport:
-    """What `write_report` has written into `out`, without the panels. Raises UserError naming the first wrong field."""
+def read_stress(out: Path) -> StressResult:
+    """What `write_tables` has written into `out`, without the panels. Raises UserError naming the first wrong field."""
     stored = _read(Path(out) / STRESS)
-    return StressReport(
+    return StressResult(
         stored.config,
         tuple(ColorScore(**row.model_dump()) for row in stored.color),
         tuple(DepthScore(**row.model_dump()) for row in stored.depth),
@@ -72,7 +72,7 @@ def read_panels(out: Path) -> Panels | None:
     return Panels(about.case, about.keyframe, *images.values())
 
 
-def report_text(report: StressReport) -> str:
+def stress_text(report: StressResult) -> str:
     """Tables with units."""
     lines = [f"blur stress test of {report.config}", "", "fused colour against the sharp view (means over keyframes)"]
     head = ("sequence", "poses", "weights", "PSNR dB", "gain dB", "worst dB", "SSIM", "gradient", "keyframes")
@@ -96,7 +96,7 @@ def report_text(report: StressReport) -> str:
     return "\n".join(lines + _table(("sequence", "photometric term", "ATE mm", "drift mm/s", "lost"), rows))
 
 
-def gains_db(report: StressReport, sigma_px: float = 1.0, poses: str = "true") -> dict[str, float]:
+def gains_db(report: StressResult, sigma_px: float = 1.0, poses: str = "true") -> dict[str, float]:
     """PSNR of blur-aware over that of constant weights in dB, by sequence."""
     rows = [row for row in report.color if (row.sigma_px, row.poses) == (sigma_px, poses)]
     return {row.case: gain for row in rows if (gain := gain_db(report.color, row)) is not None}
@@ -139,7 +139,7 @@ def _csv(rows: Sequence[dict[str, Any]]) -> str:
     return stream.getvalue()
 
 
-def _plot(report: StressReport, path: Path) -> Path:
+def _plot(report: StressResult, path: Path) -> Path:
     """PSNR and gradient energy by exposure, PSNR by speed, tracking error by exposure."""
     from matplotlib.figure import Figure  # half a second to import, and only drawing needs it
 
@@ -179,7 +179,7 @@ def _plot(report: StressReport, path: Path) -> Path:
     return path
 
 
-def _by_speed(report: StressReport) -> list[ColorScore]:
+def _by_speed(report: StressResult) -> list[ColorScore]:
     """Scores of all speeds at the exposure that the fast sequences have."""
     fast = {row.exposure_s for row in report.color if row.speed != 1.0}
     rows = [row for row in report.color if row.exposure_s in fast and row.poses == "true"]
@@ -260,7 +260,7 @@ class _AboutPanels(_Stored):
     white: _Measure
 
 
-class _StoredReport(_Stored):
+class _StoredStress(_Stored):
     config: str
     color: tuple[_ColorRow, ...] = Field(min_length=1)
     depth: tuple[_DepthRow, ...]
@@ -274,8 +274,8 @@ def _about(panels: Panels) -> dict[str, Any]:
     return {"case": panels.case, "keyframe": panels.index, "width": width, "height": height, "white": white}
 
 
-def _read(path: Path) -> _StoredReport:
+def _read(path: Path) -> _StoredStress:
     try:
-        return _StoredReport.model_validate_json(read_text(path))
+        return _StoredStress.model_validate_json(read_text(path))
     except ValidationError as error:
         raise UserError(f"{path}: {first_problem(error)}: run 'rstrack stress' again") from None
