@@ -22,7 +22,7 @@ def map_(
 ) -> int:
     """Fuse a sequence's frames along an estimate: writes a coloured mesh (PLY)."""
     from rsgen.console.progress import ProgressDisplay
-    from rstrack.mapping.reconstruct import run_map
+    from rstrack.mapping.map import run_map
 
     with ProgressDisplay(quiet) as progress:
         result = run_map(sequence, run, out, map, cloud, camera, progress)
@@ -60,7 +60,7 @@ def keyframes(
     from rsgen.console.progress import ProgressDisplay
     from rstrack.data.dataset import open_dataset
     from rstrack.data.estimate import read_estimate
-    from rstrack.mapping.keyframe_images import write_keyframes
+    from rstrack.mapping.keyframes import write_keyframes
 
     dataset, estimate = open_dataset(sequence, camera), read_estimate(run)
     with ProgressDisplay(quiet) as progress:

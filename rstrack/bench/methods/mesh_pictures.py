@@ -18,7 +18,7 @@ from typing import Any
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, read_text, write_error
 from rstrack.bench.methods.grid import CELL, Cell, Results, SequenceInfo
-from rstrack.mapping.reconstruct import run_map
+from rstrack.mapping.map import run_map
 from rstrack.options import MapOptions
 from rstrack.tracking.run import Progress
 

@@ -16,7 +16,7 @@ from rsgen.geometry.spline import Spline
 from rsgen.sequence.reader import read_sequence
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.estimate import Estimate, write_estimate
-from rstrack.mapping.reconstruct import Reconstruction, reconstruct, run_map
+from rstrack.mapping.map import Reconstruction, reconstruct, run_map
 from rstrack.metrics.map_eval import Triangles, cut, evaluate_map, run_map_eval, sample_surface, seen_surface
 from rstrack.options import MapOptions
 from rstrack.volume.mesh import write_ply
