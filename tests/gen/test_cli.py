@@ -66,7 +66,7 @@ def test_help_teaches(command: str, capfd: pytest.CaptureFixture[str]) -> None:
         main([command, "--help"])
     out, error = capfd.readouterr()
     assert exit.value.code == 0 and error == ""
-    assert f"example: rsgen {command} " in out
+    assert f"example: rsgen {command}" in out
 
 
 @pytest.mark.parametrize("command", ["render", "check-light", "bench"])
