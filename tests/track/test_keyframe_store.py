@@ -10,7 +10,7 @@ import pytest
 
 from rsgen.geometry import se3
 from rstrack.keyframes import store
-from rstrack.keyframes.store import KeyframeSet
+from rstrack.keyframes.store import KeyframeStore
 from rstrack.options import Options
 
 # 0.3 m and 20 degrees are where a keyframe is left; 70 % of that brings an older one back, twice that is the anchor's.
@@ -57,11 +57,11 @@ def models(monkeypatch: pytest.MonkeyPatch) -> list[Model]:
     return made
 
 
-def keyframes(**options: Any) -> KeyframeSet:
-    return KeyframeSet(Maker(), Options(**options))  # type: ignore[arg-type]
+def keyframes(**options: Any) -> KeyframeStore:
+    return KeyframeStore(Maker(), Options(**options))  # type: ignore[arg-type]
 
 
-def make(kept: KeyframeSet, index: int, pose: np.ndarray, older: Any = None) -> Any:
+def make(kept: KeyframeStore, index: int, pose: np.ndarray, older: Any = None) -> Any:
     return kept.make(frame(index), pose, older)  # type: ignore[arg-type]
 
 
@@ -85,7 +85,7 @@ class ByDistance(Options):
 
 
 def test_a_model_keeps_256_of_which_the_last_eight_are_recent(models: list[Model]) -> None:
-    kept = KeyframeSet(Maker(), ByDistance(reference="model"))  # type: ignore[arg-type]
+    kept = KeyframeStore(Maker(), ByDistance(reference="model"))  # type: ignore[arg-type]
     refs = [make(kept, k, at(10.0 * k)) for k in range(260)]
     assert len(kept) == 256 and kept.made == 260
     assert kept.recent == refs[:251:-1]

@@ -9,18 +9,12 @@ import numpy as np
 import pytest
 import synthetic
 
-from rsgen.device.arrays import engine
-from rsgen.device.projection import Lens
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
-from rstrack.alignment.linearise import Terms
 from rstrack.data.rig import Frame, Image, Rig
-from rstrack.images.line_poses import Exposure
-from rstrack.images.pyramid import camera_rays, depth_image
-from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.options import Options
 from rstrack.tracking.pose_tracker import BaselineTracker
 from rstrack.tracking.run import make_tracker as make_any_tracker
@@ -223,28 +217,3 @@ def test_a_single_plane_does_not_fix_a_pose() -> None:
     tracker = make_tracker(Shutter())
     tracker.feed(Frame(Image(0.0, wall), ()))
     assert tracker.feed(Frame(Image(0.1, wall), ())).lost
-
-
-@pytest.mark.parametrize("level", [0, 2])
-def test_geometric_pose_is_the_geometric_term_of_a_camera_at_rest(level: int) -> None:
-    # By four control points that move alike, increments of the spline are those of the pose, but in the world frame.
-    e = engine("llvm")
-    lens = Lens(CAMERA, Shutter())
-    rays = camera_rays(Exposure(lens, 0.0, np.eye(4)))
-    terms = Terms(e, (e.upload(rays[..., 0]), e.upload(rays[..., 1])))
-    maker = KeyframeMaker(e, rays, terms.rays)
-    T_a, T_b = MOTION.pose(0.0), MOTION.pose(0.02)
-    images = [
-        depth_image(e, Exposure(lens, t, np.eye(4)), synthetic.render_depth(MOTION, CAMERA, Shutter(), t), 12.0)
-        for t in (0.0, 0.02)
-    ]
-    ref = maker.rectified(1, images[0], (), still(T_a), None)
-    T_off = T_b @ se3.exp(np.array([1e-3, -2e-3, 1e-3, 2e-3, 1e-3, -1e-3]))
-    sigma = 2e-3
-    sums, next_sigma = terms.geometric_pose(images[1], ref, se3.inverse(T_a) @ T_off, level, sigma)
-    whole = terms.geometric(images[1], ref, still(T_off), level, sigma)
-    assert (sums.count, sums.cost, next_sigma) == (whole.count, whole.cost, whole.next_sigma)
-    together = np.tile(np.eye(6), (4, 1)) @ se3.adjoint(T_a)
-    H, g = together.T @ whole.model.H @ together, together.T @ whole.model.g
-    np.testing.assert_allclose(sums.H[0, 0] / sigma**2, H, rtol=1e-9, atol=1e-9 * np.abs(H).max())
-    np.testing.assert_allclose(sums.g[0, 0] / sigma, g, rtol=1e-9, atol=1e-9 * np.abs(g).max())
