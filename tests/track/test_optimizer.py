@@ -82,17 +82,21 @@ def test_steps_five_times_too_long_still_lead_downhill() -> None:
 
 
 def test_priors_count_when_a_step_is_judged() -> None:
-    """Their model is too flat here; the images alone would have the step pass."""
-    state = start(0.001)
+    """A prior that asks for 2 mm, with steps ten times too long; the images would have them all the way."""
+    state = SplineState(TRUTH)
 
     def prior(spline: Spline) -> tuple[Quadratic, float]:
-        e = spline.control_points[:, :3, 3] - TRUTH.control_points[:, :3, 3] - 0.02
+        e = spline.control_points[:, 0, 3] - TRUTH.control_points[:, 0, 3] - 2e-3
         g = np.zeros((15, 6))
-        g[:, :3] = 1e4 * e
+        g[:, 0] = 1e4 * e
         return Quadratic(0, 1e3 * np.eye(90), g.ravel()), 0.5e4 * float((e**2).sum())
 
-    sight = sighting(TIMES, state.spline.pose(TIMES))
-    assert optimise(PoseTerms(), state, problem([sight], state, priors=[prior]), (0,), MOST).refused > 0  # type: ignore[arg-type]
+    far = SplineState(TRUTH)
+    far.apply(0, np.tile([0.02, 0.0, 0.0, 0.0, 0.0, 0.0], (15, 1)))
+    terms = PoseTerms()
+    sight = sighting(TIMES, far.spline.pose(TIMES))
+    assert optimise(terms, state, problem([sight], state, priors=[prior]), (0,), (2, 0, 0)).refused == 1  # type: ignore[arg-type]
+    assert terms.costs[1] < terms.costs[0]
 
 
 # -- lazy relinearisation ----------------------------------------------------------------------------------------------
