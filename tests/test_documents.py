@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import io
+import pkgutil
 import re
 import shlex
 from collections.abc import Callable, Iterator
@@ -108,6 +109,15 @@ def test_python_examples_import_what_is_there(path: Path) -> None:
             if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] in PROGRAMS:
                 module = importlib.import_module(node.module or "")
                 assert all(hasattr(module, alias.name) for alias in node.names), ast.unparse(node)
+
+
+@document
+def test_names_and_files_in_the_text_exist(path: Path) -> None:
+    for word in re.findall(r"`([^`\s]+)`", prose(path)):
+        if re.fullmatch(r"(rsgen|rstrack)(\.\w+)+", word):
+            pkgutil.resolve_name(word)
+        elif re.fullmatch(r"(rsgen|rstrack|scenes|tests|configs)/[\w/.]+", word):
+            assert (ROOT / word).exists(), word
 
 
 def test_the_readmes_figures_are_measured_ones() -> None:
