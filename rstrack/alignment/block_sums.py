@@ -17,9 +17,22 @@ from rstrack.alignment.student_t import cost, curvature, weight
 LINES_PER_BLOCK = 8
 # Blocks of an unrectified reference are larger: it is bootstrapping only, and pairs of blocks are many.
 LINES_PER_PAIR_BLOCK = 32
-# Integers per block: 21 of H (upper triangle), 6 of g, sum of w s², cost, count, and padding to a power of two.
-_SLOTS = 32
+# Integers per block: 21 of H (upper triangle), 6 of g, sum of w s², cost, count, and padding; with brightness 12 of the
+# coupling, 3 of its own H and 2 of its g more.
+_SLOTS, _SLOTS_WITH_BRIGHTNESS = 32, 48
 _UPPER = np.triu_indices(6)
+
+
+@dataclass(frozen=True)
+class BrightnessSums:
+    """Sums with c, the derivative of r by a colour image's gain and offset.
+
+    coupling (nc, nr, 6, 2) = Σ w j cᵀ, H (2, 2) = Σ w c cᵀ and g (2,) = Σ w c s over all blocks.
+    """
+
+    coupling: FloatArray
+    H: FloatArray
+    g: FloatArray
 
 
 @dataclass(frozen=True)
@@ -35,6 +48,7 @@ class BlockSums:
     weighted: float
     cost: float
     count: int
+    brightness: BrightnessSums | None = None
 
 
 @dataclass(frozen=True)
@@ -57,7 +71,7 @@ class Scaling:
 
     def unpack(self, raw: FloatArray, current: int, reference: int) -> BlockSums:
         """Integers as summed on the device to `BlockSums`."""
-        raw = raw.reshape(current, reference, _SLOTS)
+        raw = raw.reshape(current, reference, -1)
         _, _, _, _, unit_H, unit_g, unit_cost = self.parameters(1.0, 0.0)
         scale = np.array([1.0, 1.0, 1.0, self.median_depth, self.median_depth, self.median_depth])
         H = np.empty((current, reference, 6, 6))
@@ -65,7 +79,16 @@ class Scaling:
         H[..., a, b] = H[..., b, a] = raw[..., :21] * (scale[a] * scale[b] / unit_H)
         g = raw[..., 21:27] * (scale / unit_g)
         total = raw[..., 27:30].astype(np.int64).sum(axis=(0, 1))
-        return BlockSums(H, g, float(total[0] / unit_cost), float(total[1] / unit_cost), int(total[2]))
+        brightness = self._brightness(raw, scale) if raw.shape[2] == _SLOTS_WITH_BRIGHTNESS else None
+        return BlockSums(H, g, float(total[0] / unit_cost), float(total[1] / unit_cost), int(total[2]), brightness)
+
+    def _brightness(self, raw: FloatArray, scale: FloatArray) -> BrightnessSums:
+        _, _, _, _, unit_H, unit_g, _ = self.parameters(1.0, 0.0)
+        # c is summed in units of `bound`, so that the same units serve.
+        coupling = np.stack([raw[..., 30:36], raw[..., 36:42]], axis=-1) * (scale[:, None] / (unit_H * self.bound))
+        aa, ab, bb, a, b = raw[..., 42:47].astype(np.int64).sum(axis=(0, 1))
+        H = np.array([[aa, ab], [ab, bb]]) / (unit_H * self.bound**2)
+        return BrightnessSums(coupling, H, np.array([a, b]) / (unit_g * self.bound))
 
 
 def block_counts(lens: Lens, ref_lens: Lens) -> tuple[int, int, int, int]:
@@ -76,17 +99,19 @@ def block_counts(lens: Lens, ref_lens: Lens) -> tuple[int, int, int, int]:
     return -(-lens.lines // per), -(-ref_lens.lines // per), per, per
 
 
-def block_slot(line: Any, ref_line: Any, lens: Lens, ref_lens: Lens) -> tuple[Any, int]:
-    """First integer of each pixel's block, or pair of blocks, and how many there are."""
+def block_slot(line: Any, ref_line: Any, lens: Lens, ref_lens: Lens, with_brightness: bool = False) -> tuple[Any, int]:
+    """First integer of each pixel's block, or pair of blocks, and how many integers there are in all."""
     current, reference, per, ref_per = block_counts(lens, ref_lens)
     block = line // per if reference == 1 else line // per * reference + ref_line // ref_per
-    return block * _SLOTS, current * reference
+    slots = _SLOTS_WITH_BRIGHTNESS if with_brightness else _SLOTS
+    return block * slots, current * reference * slots
 
 
 def accumulate(
-    e: Engine, g: Vector, p: Vector, sign: float, r: Any, active: Any, parameters: list[Any], slot: Any, size: int
-) -> Any:
-    """Σ w j jᵀ and so on into `size` integers; j = sign [g, p × g]."""
+    e: Engine, g: Vector, p: Vector, sign: float, r: Any, active: Any, parameters: list[Any], slot: Any, size: int,
+    c: tuple[Any, Any] | None = None,
+) -> Any:  # fmt: skip
+    """Σ w j jᵀ and so on into `size` integers; j = sign [g, p × g]. c: see `BrightnessSums`, each at most 1."""
     inv_sigma, gate, inv_lever, bound, unit_H, unit_g, unit_cost = parameters
     active &= dr.abs(r) < gate
     j = [*g, *cross((p[0] * inv_lever, p[1] * inv_lever, p[2] * inv_lever), g)]
@@ -103,8 +128,13 @@ def accumulate(
     values = [hj[a] * j[b] for a, b in zip(*_UPPER, strict=True)]
     values += [c * s * (sign * unit_g) for c in wj]
     values += [w * s * s * unit_cost, cost(s) * unit_cost]
-    sums = dr.zeros(e.Int, size * _SLOTS)
+    values = [e.Int(dr.round(value)) for value in values] + [e.Int(1)]
+    if c is not None:
+        c = tuple(dr.select(active, bound * column, 0.0) for column in c)
+        more = [sign * one * column for column in c for one in hj]
+        more += [h * w * c[a] * c[b] for a, b in ((0, 0), (0, 1), (1, 1))] + [w * s * unit_g * column for column in c]
+        values += [e.Int(dr.round(value)) for value in more]
+    sums = dr.zeros(e.Int, size)
     for k, value in enumerate(values):
-        dr.scatter_reduce(dr.ReduceOp.Add, sums, e.Int(dr.round(value)), slot + k, active, mode=dr.ReduceMode.Expand)
-    dr.scatter_reduce(dr.ReduceOp.Add, sums, e.Int(1), slot + len(values), active, mode=dr.ReduceMode.Expand)
+        dr.scatter_reduce(dr.ReduceOp.Add, sums, value, slot + k, active, mode=dr.ReduceMode.Expand)
     return sums

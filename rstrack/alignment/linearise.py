@@ -13,6 +13,7 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import BlockSums, Scaling, block_counts
+from rstrack.alignment.brightness import SAME, Eliminated, eliminate
 from rstrack.alignment.normal_equations import Quadratic, chain
 from rstrack.alignment.residuals import (
     GeometricInput,
@@ -49,6 +50,8 @@ class Linearised:
     floor: float
     # Σ w j jᵀ / count (6, 6) with rotations scaled by the scene's depth.
     seen: FloatArray
+    # Of a colour image: its gain and offset, which the model no longer holds.
+    brightness: Eliminated | None = None
 
     @property
     def observability(self) -> float:
@@ -141,15 +144,19 @@ class Terms:
 
     def photometric(
         self, image: ColorImage, ref: Reference, spline: Spline, level: int, sigma: float,
-        slopes_at: Spline | None = None, visible: Any = None,
+        slopes_at: Spline | None = None, visible: Any = None, brightness: FloatArray = SAME,
+        expected: FloatArray = SAME,
     ) -> Linearised:  # fmt: skip
-        """The reference's points of a level, those that are `visible`, against that level of the colour image."""
+        """The reference's points of a level, those that are `visible`, against that level of the colour image.
+
+        brightness (2,): gain and offset of the image here; expected (2,): before anything is known of it.
+        """
         e, lens, points = self.e, image.exposure.lens, ref.points[level]
         kernel = self._kernel(photometric_kernel, lens, ref.lens, STRIDES[level], level, self.blur_sigma_px)
         from_base = self._from_base(spline, ref.T_world_base, image.exposure)
         # Moving closer or turning packs more points into a block than its share.
         scaling = self._scaling(points, lens, ref.lens.camera, ref, STRIDES[level], 4)
-        constants = e.upload(scaling.parameters(sigma, self.gate_intensity))
+        constants = e.upload(np.append(scaling.parameters(sigma, self.gate_intensity), brightness))
         seen_at = self._ref_lines(spline, ref), image.levels[level], from_base
         shown = points.visible if visible is None else visible
         with self.timer(f"photometric kernel, level {level}"):
@@ -159,8 +166,9 @@ class Terms:
         sums = scaling.unpack(raw, current, reference)
         times = image.exposure.block_times(per)
         return self._finish(
-            sums, slopes_at or spline, ref, times, ref_per, sigma, self.floor_intensity, points.median_depth
-        )
+            sums, slopes_at or spline, ref, times, ref_per, sigma, self.floor_intensity, points.median_depth,
+            brightness, expected,
+        )  # fmt: skip
 
     def _to_base(self, spline: Spline, T_world_base: FloatArray, exposure: Exposure) -> Any:
         with self.timer("poses of lines"):
@@ -191,16 +199,19 @@ class Terms:
 
     def _finish(
         self, sums: BlockSums, spline: Spline, ref: Reference, times: FloatArray, ref_per: int, sigma: float,
-        floor: float, median_depth: float,
+        floor: float, median_depth: float, brightness: FloatArray = SAME, expected: FloatArray = SAME,
     ) -> Linearised:  # fmt: skip
         ref_times = None if ref.rolling is None else ref.rolling.block_times(ref_per)
         with self.timer("linear algebra: chain"):
-            model, motion = chain(sums, spline, ref.T_world_base, times, ref_times)
-        scaled = Quadratic(model.first, model.H / sigma**2, model.g / sigma)
+            model, motion, coupling = chain(sums, spline, ref.T_world_base, times, ref_times)
+        model = Quadratic(model.first, model.H / sigma**2, model.g / sigma)
+        cost, eliminated = sums.cost, None
+        if sums.brightness is not None:
+            model, eliminated, surprise = eliminate(model, coupling, sums.brightness, sigma, brightness, expected)
+            cost += surprise
         next_sigma = scale_step(sigma, sums.weighted, sums.count, floor)
-        return Linearised(
-            scaled, motion, sigma, next_sigma, sums.cost, sums.count, floor, seen_motions(sums, median_depth)
-        )
+        seen = seen_motions(sums, median_depth)
+        return Linearised(model, motion, sigma, next_sigma, cost, sums.count, floor, seen, eliminated)
 
 
 def seen_motions(sums: BlockSums, median_depth: float) -> FloatArray:

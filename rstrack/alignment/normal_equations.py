@@ -61,10 +61,11 @@ def _line_jacobian(spline: Spline, T_world_base: bytes, times: bytes, first: int
 
 def chain(
     sums: BlockSums, spline: Spline, T_world_base: FloatArray, times: FloatArray, ref_times: FloatArray | None
-) -> tuple[Quadratic, FloatArray]:
+) -> tuple[Quadratic, FloatArray, FloatArray]:
     """`sums` of blocks at `times` (n,) by the control points (of blocks of a rolling reference at `ref_times` too).
 
-    Returns the quadratic model and the derivative (n, 6, 6k) of the current blocks' twists.
+    Returns the quadratic model, the derivative (n, 6, 6k) of the current blocks' twists, and the coupling (6k, 2) of
+    the control points with the image's gain and offset ((6k, 0) for depth).
     """
     every = times if ref_times is None else np.concatenate([times, ref_times])
     segments, _ = spline.locate(every)
@@ -79,8 +80,13 @@ def chain(
         H, g = sums.H[c, r], sums.g[c, r]
     HJ = H @ J
     size = 6 * count
-    dense = J.reshape(-1, size).T @ HJ.reshape(-1, size)
-    return Quadratic(first, 0.5 * (dense + dense.T), J.reshape(-1, size).T @ g.ravel()), current
+    flat = J.reshape(-1, size).T
+    dense = flat @ HJ.reshape(-1, size)
+    coupling = np.zeros((size, 0))
+    if sums.brightness is not None:
+        blocks = sums.brightness.coupling
+        coupling = flat @ (blocks[:, 0] if ref_times is None else blocks[c, r]).reshape(-1, 2)
+    return Quadratic(first, 0.5 * (dense + dense.T), flat @ g.ravel()), current, coupling
 
 
 def assemble(models: Iterable[Quadratic], first: int, last: int) -> tuple[FloatArray, FloatArray]:

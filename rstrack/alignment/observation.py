@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
+from rstrack.alignment.brightness import SAME
 from rstrack.alignment.linearise import Linearised, Terms
 from rstrack.alignment.normal_equations import Quadratic
 from rstrack.alignment.spline_state import SplineState
@@ -17,6 +18,8 @@ from rstrack.keyframes.keyframe import STRIDES, Reference
 
 # Increments of control points (m, rad) that change the derivatives of lines by less than a step's own error.
 _SAME_SLOPES = 5e-3
+# Change of gain and offset, in σ of the intensities, that calls for a new linearisation.
+_SAME_BRIGHTNESS = 0.2
 # Errors at the start of a level, as σ: m and intensity; re-estimated with every linearisation.
 START_DEPTH, START_INTENSITY = 5e-3, 0.03
 
@@ -26,25 +29,29 @@ class _Linearisation:
     """What an observation knows: the model and the next σ.
 
     at: increments (m, 6) of the control points that it was made at. stands_for: pixels of the finest level for each.
+    brightness: gain and offset (2,) of a colour image there.
     """
 
     lin: Linearised | None = None
     sigma: float = 0.0
     at: FloatArray = field(default_factory=lambda: np.zeros((0, 6)))
     stands_for: float = 1.0
+    brightness: FloatArray | None = None
 
 
 @dataclass
 class Observation:
     """An image against a reference. linearisation: the last one; putting an earlier one back takes a step back.
 
-    occluder: the depth image that tells which points of the reference a colour image cannot see.
+    occluder: the depth image that tells which points of the reference a colour image cannot see. expected: gain and
+    offset (2,) of a colour image against the reference, as far as can be told beforehand.
     """
 
     frame: int
     image: DepthImage | ColorImage
     ref: Reference
     occluder: DepthImage | None = None
+    expected: FloatArray = field(default_factory=lambda: SAME)
     linearisation: _Linearisation = _Linearisation()
     _visible: Any = None
     _slopes_at: Spline | None = None
@@ -71,14 +78,15 @@ class Observation:
         """Pixels of the finest level for each that was looked at."""
         return self.linearisation.stands_for
 
-    def forget(self, keep_sigma: bool) -> None:
+    def forget(self, state: SplineState, keep_sigma: bool) -> None:
         """Begin anew, as at a new level of the pyramid."""
-        kept = self.linearisation
-        self.linearisation = replace(kept, lin=None, sigma=kept.sigma if keep_sigma else 0.0)
+        sigma = self.linearisation.sigma if keep_sigma else 0.0
+        self.linearisation = _Linearisation(sigma=sigma, brightness=self.brightness(state))
 
     def linearise(self, terms: Terms, state: SplineState, level: int) -> None:
         """Around the current state; takes the σ that the one before suggested."""
         image, sigma, slopes_at = self.image, self.linearisation.sigma, self._slopes(state)
+        brightness = self.brightness(state)
         if isinstance(image, DepthImage):
             lin = terms.geometric(image, self.ref, state.spline, level, sigma or START_DEPTH, slopes_at)
         else:
@@ -87,14 +95,28 @@ class Observation:
                 self._visible = terms.visible(self.occluder, self.ref, state.spline, level)
             visible = self._visible if level == 0 else None
             sigma = sigma or START_INTENSITY
-            lin = terms.photometric(image, self.ref, state.spline, level, sigma, slopes_at, visible)
+            lin = terms.photometric(
+                image, self.ref, state.spline, level, sigma, slopes_at, visible, brightness, self.expected
+            )
         # A coarse level's pixels stand for those left out: the priors' share must not depend on the level.
         stands_for = (STRIDES[level] / STRIDES[0]) ** 2
-        self.linearisation = _Linearisation(lin, lin.next_sigma, state.moved.copy(), stands_for)
+        self.linearisation = _Linearisation(lin, lin.next_sigma, state.moved.copy(), stands_for, brightness)
+
+    def brightness(self, state: SplineState) -> FloatArray:
+        """Gain and offset (2,) of a colour image in the current state; those expected where nothing is known yet."""
+        lin, before = self.linearisation.lin, self.linearisation.brightness
+        if lin is None or lin.brightness is None:
+            return self.expected if before is None else before
+        return lin.brightness.best(self._since(state)[lin.model.first : lin.model.last].ravel())
 
     def shift(self, state: SplineState, focal: float) -> float:
-        """Pixels that the lines have moved since the linearisation."""
-        return self.lin.row_shift(self._since(state), focal, self.ref.median_depth) if self.is_linearised else np.inf
+        """Pixels that the lines have moved since the linearisation; infinite where the brightness has changed too."""
+        lin, before = self.linearisation.lin, self.linearisation.brightness
+        if lin is None:
+            return np.inf
+        if before is not None and np.abs(self.brightness(state) - before).max() > _SAME_BRIGHTNESS * lin.sigma:
+            return np.inf
+        return lin.row_shift(self._since(state), focal, self.ref.median_depth)
 
     def model(self, state: SplineState) -> Quadratic:
         """Quadratic model around the current state."""

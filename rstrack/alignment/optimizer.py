@@ -61,7 +61,7 @@ def optimise(terms: Terms, state: SplineState, problem: Problem, levels: Sequenc
     done = Solved()
     for level in levels:
         for observation in problem.fresh:
-            observation.forget(keep_sigma=level != levels[0])
+            observation.forget(state, keep_sigma=level != levels[0])
         _optimise_level(terms, state, problem, level, most[level], done)
     return done
 

@@ -26,6 +26,7 @@ from rsgen.device.arrays import Engine
 from rsgen.device.projection import TO_BASE, Lens, gather, move, project_rolling
 from rsgen.device.recording import recorded_from
 from rstrack.alignment.block_sums import accumulate, block_slot
+from rstrack.alignment.brightness import MID_GREY
 from rstrack.images.blur import blur_length, blur_weight
 from rstrack.images.sampling import EDGE, NEAREST, bilinear, grid, level_size, nearest, surface
 
@@ -102,7 +103,8 @@ class PhotometricInput:
 
     x, y, z: points of the reference's every stride-th pixel in its camera's frame (m), z = 0 where there is none;
     intensity: theirs; visible: 0 for points that are hidden; to_base: its lines' poses if it is not rectified.
-    image: intensities of the pyramid's level; from_base: the colour camera's lines. constants: those of `Scaling`.
+    image: intensities of the pyramid's level, NaN where they tell nothing; from_base: the colour camera's lines.
+    constants: those of `Scaling`, and the image's gain and offset, see `alignment.brightness`.
     """
 
     x: Any
@@ -142,17 +144,21 @@ def photometric_kernel(
         u, v = seen.x * shrink, seen.y * shrink
         a, b, c, d, fx, fy, active = bilinear(e, given.image, width, height, u, v, active & seen.valid)
         top, bottom = dr.fma(b - a, fx, a), dr.fma(d - c, fx, c)
-        r = dr.fma(bottom - top, fy, top) - given.intensity  # (8)
+        gain, offset = (dr.gather(e.Float, given.constants, e.UInt(i)) for i in (7, 8))
+        contrast = given.intensity - MID_GREY
+        r = dr.fma(bottom - top, fy, top) - (given.intensity + dr.fma(gain, contrast, offset))  # (8), and brightness
+        columns = -contrast, e.Float(-1.0)
         dx = dr.fma((d - c) - (b - a), fy, b - a) * shrink
         dy = (bottom - top) * shrink
         if weighs_blur:
             # Of the squared error, so that σ stays that of sharp points.
             share = dr.sqrt(blur_weight(blur_length(lens, seen.pixel_speed), 1.0 / blur_sigma_px**2))  # (13)
             r, dx, dy = r * share, dx * share, dy * share
+            columns = columns[0] * share, columns[1] * share
         g = seen.chain(dx, dy, 0.0)
-        slot, size = block_slot(seen.row, ref_line, lens, ref_lens)
+        slot, size = block_slot(seen.row, ref_line, lens, ref_lens, with_brightness=True)
         # A twist of the camera moves the point the other way.
-        return accumulate(e, g, p, -1.0, r, active, parameters, slot, size)
+        return accumulate(e, g, p, -1.0, r, active, parameters, slot, size, columns)
 
     return kernel
 

@@ -17,6 +17,10 @@ from rstrack.images.line_poses import Exposure
 LEVELS = 3
 # Bilinear interpolation of a sharper picture is drawn to whole and half pixels, by up to 0.05 px.
 _BLUR_PX = 0.8
+# Grey levels (largest of the three channels) from which on, and up to which, a pixel's value may be clipped.
+_SATURATED, _BLACK = 250, 5
+# Pixels (a square of this size) about a clipped one that smoothing draws it into, and its share that matters.
+_MARGIN_PX, _LEAST_CLIPPED = 5, 0.2
 
 
 @dataclass(frozen=True)
@@ -35,10 +39,12 @@ class DepthImage:
 
 @dataclass(frozen=True)
 class ColorImage:
-    """Intensities in [0, 1], level 0 is full size; each further level is low-passed and halved (cv2.pyrDown)."""
+    """Intensities in [0, 1], NaN where clipped; level 0 is full size, each further one low-passed and halved
+    (cv2.pyrDown). moments (2,): mean and standard deviation of the coarsest level."""
 
     exposure: Exposure
     levels: tuple[Any, ...]
+    moments: FloatArray
 
 
 def depth_image(
@@ -75,8 +81,24 @@ def intensity(color: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
 
 
 def color_image(e: Engine, exposure: Exposure, color: npt.NDArray[np.uint8]) -> ColorImage:
-    """RGB (h, w, 3) uint8 to a pyramid."""
-    return ColorImage(exposure, tuple(e.upload(level) for level in pyramid(intensity(color))))
+    """RGB (h, w, 3) uint8 to a pyramid, NaN where a pixel or one beside it is saturated or black."""
+    levels = pyramid(intensity(color))
+    masks = _beyond_range(color)
+    moments = np.array([levels[-1].mean(), levels[-1].std()], np.float64)
+    shown = (np.where(mask, np.float32(np.nan), level) for level, mask in zip(levels, masks, strict=True))
+    return ColorImage(exposure, tuple(e.upload(level) for level in shown), moments)
+
+
+def _beyond_range(color: npt.NDArray[np.uint8]) -> list[npt.NDArray[np.bool_]]:
+    """For each level the pixels (h, w) whose intensity says nothing: clipped, or smoothed with what was."""
+    most = color.max(axis=2)
+    clipped = ((most >= _SATURATED) | (most <= _BLACK)).astype(np.uint8)
+    weight = cv2.dilate(clipped, np.ones((_MARGIN_PX, _MARGIN_PX), np.uint8)).astype(np.float32)
+    out = [weight > _LEAST_CLIPPED]
+    for _ in range(LEVELS - 1):
+        weight = np.asarray(cv2.pyrDown(weight))
+        out.append(weight > _LEAST_CLIPPED)
+    return out
 
 
 def pyramid(image: npt.NDArray[np.float32]) -> list[npt.NDArray[np.float32]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
@@ -52,6 +52,7 @@ class Reference:
     Inverse depth (1/m, 0 missing), its smoothed slopes by normalised coordinates, how far bilinear interpolation of it
     may be off (m), and fusion weights, on the device.
     median_depth, bound: see `block_sums.Scaling`, for the geometric term. pixels: of the finest level that have depth.
+    moments: of its colour image; brightness: gain and offset (2,) of that against the track's first colour image.
     """
 
     index: int
@@ -69,6 +70,8 @@ class Reference:
     median_depth: float
     bound: float
     pixels: int
+    moments: FloatArray
+    brightness: FloatArray = field(default_factory=lambda: np.zeros(2))
 
 
 def rectified_lens(camera: Camera) -> Lens:

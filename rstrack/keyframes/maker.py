@@ -158,8 +158,10 @@ class KeyframeMaker:
         slope_x, slope_y = surface_slopes(rho, *focal)
         roughness = e.upload(surface_roughness(rho, slope_x, slope_y, *focal))
         points: tuple[Points, ...] = ()
+        moments = np.zeros(2)
         if colors:
             color = min(colors, key=lambda c: abs(c.exposure.mid_time - t))
+            moments = color.moments
             to_base = e.upload(to_base_table(spline, T_world_base, rolling) if rolling else np.zeros(12))
             from_base = e.upload(from_base_table(spline, T_world_base, color.exposure))
             kernel = self._kernel(color_kernel, color.exposure.lens, lens)
@@ -170,5 +172,5 @@ class KeyframeMaker:
         weights = e.upload(np.where(rho > 0, 1.0, 0.0) if weight is None else weight)
         return Reference(
             index, depth.exposure.stamp, t, T_world_base, lens, rolling, device_rho, e.upload(slope_x),
-            e.upload(slope_y), roughness, weights, points, median_depth, bound, pixels,
+            e.upload(slope_y), roughness, weights, points, median_depth, bound, pixels, moments,
         )  # fmt: skip

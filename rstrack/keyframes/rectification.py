@@ -118,6 +118,7 @@ def color_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[[ColorInput], An
         near = bilinear(e, given.image, camera.width, camera.height, seen.x, seen.y, active & seen.valid)
         a, b, c, d, fx, fy, active = near
         value = dr.lerp(dr.lerp(a, b, fx), dr.lerp(c, d, fx), fy)
+        active &= dr.isfinite(value)  # not clipped
         return dr.select(active, value, 0.0), dr.select(active, e.Float(1.0), 0.0)
 
     return kernel

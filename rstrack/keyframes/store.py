@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 
 from rsgen.geometry import se3
 from rsgen.geometry.so3 import FloatArray
@@ -49,10 +50,13 @@ class KeyframeStore:
         """The last few, newest first."""
         return list(self._kept)[: -_RECENT - 1 : -1]
 
-    def make(self, frame: DeviceFrame, spline: Spline, older: Reference | None) -> Reference:
-        """A keyframe of a frame whose poses no longer change; inherits from `older`. It is the newest."""
+    def make(self, frame: DeviceFrame, spline: Spline, older: Reference | None, brightness: FloatArray) -> Reference:
+        """A keyframe of a frame whose poses no longer change; inherits from `older`. It is the newest.
+
+        brightness (2,): gain and offset of its colour image, see `Reference`.
+        """
         make = self._maker.rectified if self._model is None else self._model.keyframe
-        ref = make(frame.index, frame.depth, frame.colors, spline, older)
+        ref = replace(make(frame.index, frame.depth, frame.colors, spline, older), brightness=brightness)
         if self._model is not None:
             self._model.add(frame.depth, spline)
         self.made += 1

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
+from rstrack.alignment import brightness
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Solved
@@ -55,6 +57,9 @@ class Tracker:
         self._recent: deque[DeviceFrame] = deque()
         self._fits = FitHistory()
         self._pixels = 0
+        # Gain and offset against the first colour image, of the recent frames, and the newest colour image's moments.
+        self._brightness: dict[int, FloatArray] = {}
+        self._moments: FloatArray | None = None
         # The newest frame, while it is the reference and cannot be rectified yet.
         self._unconverged: DeviceFrame | None = None
         self._stamps: list[float] = []
@@ -123,7 +128,7 @@ class Tracker:
             return self._relocalise(new)
         window.keep(fresh)
         self._recent.append(new)
-        self._placed(new)
+        self._placed(new, fresh)
         overlap = self._overlap(on_reference)
         frozen = self._fuse_frozen(window)
         renewed = self._renew_keyframe(window, new, frozen, overlap)
@@ -163,7 +168,7 @@ class Tracker:
             return self._begin_anew(new)
         window.keep(fresh)
         self._recent.append(new)
-        self._placed(new)
+        self._placed(new, fresh)
         if len(self._recent) < self.options.bootstrap_frames:
             return self._report(new, fresh, solved)
         self._leave_bootstrap(window)
@@ -198,7 +203,7 @@ class Tracker:
         for ref in self._keyframes.recent:
             for T_world_body in (window.spline.pose(end), ref.T_world_base):
                 trial = window.restarted(new, end, T_world_body)
-                fresh = self._observe(new, ref)
+                fresh = observe(new, ref, self.options, _matched(new, ref))
                 solved = trial.solve(fresh)
                 if self._fits.fault(fresh, solved, ref.pixels):
                     continue
@@ -207,7 +212,7 @@ class Tracker:
                 self._pixels, self._unconverged = 0, None
                 self._keyframes.anchor = None
                 self._recent = deque([new])
-                self._placed(new, joined=False)
+                self._placed(new, fresh, joined=False)
                 return self._report(new, fresh, solved, overlap=self._overlap(fresh))
         window.active = []
         self._recent.clear()
@@ -239,7 +244,8 @@ class Tracker:
             return False
         if self.options.keyframe_strategy == "newest" and new.depth.exposure.lens.lines > 1:
             if not self._unfit(new):
-                self._reference = self._maker.rolling(new.index, new.depth, new.colors, window.spline)
+                rolling = self._maker.rolling(new.index, new.depth, new.colors, window.spline)
+                self._reference = replace(rolling, brightness=self._brightness.get(new.index, brightness.SAME))
                 self._unconverged, self._pixels = new, 0
             return False
         old = self._keyframes.return_to(window.spline.pose(frozen.depth.exposure.mid_time), ref)
@@ -257,7 +263,8 @@ class Tracker:
 
     def _new_keyframe(self, frame: DeviceFrame, older: Reference | None) -> Reference:
         assert self._window is not None
-        self._reference = self._keyframes.make(frame, self._window.spline, older)
+        bright = self._brightness.get(frame.index, brightness.SAME)
+        self._reference = self._keyframes.make(frame, self._window.spline, older, bright)
         self._unconverged, self._pixels = None, 0
         return self._reference
 
@@ -273,10 +280,25 @@ class Tracker:
         return self._window, self._reference
 
     def _observe(self, frame: DeviceFrame, ref: Reference) -> list[Observation]:
-        return observe(frame, ref, self.options)
+        """What the frame's images say against a reference; their brightness is expected to be about as before."""
+        before = self._brightness.get(frame.index)
+        if before is None and frame.colors and self._brightness and self._moments is not None:
+            newest = self._brightness[max(self._brightness)]
+            before = brightness.expected(newest, frame.colors[0].moments, self._moments)
+        expected = brightness.SAME if before is None else brightness.relative(before, ref.brightness)
+        return observe(frame, ref, self.options, expected)
 
-    def _placed(self, new: DeviceFrame, joined: bool = True) -> None:
+    def _placed(self, new: DeviceFrame, fresh: Sequence[Observation] = (), joined: bool = True) -> None:
+        """A frame has been found: its stamp, its brightness, and until when the spline is known."""
         self._stamps.append(new.stamp)
+        if new.colors:
+            color = next((o for o in fresh if not o.is_depth), None)
+            found = brightness.SAME
+            if color is not None and self._window is not None:
+                found = brightness.absolute(color.brightness(self._window.state), color.ref.brightness)
+            oldest = self._recent[0].index if self._recent else new.index
+            self._brightness = {k: b for k, b in self._brightness.items() if k >= oldest} | {new.index: found}
+            self._moments = new.colors[0].moments
         begin = min(new.first_time, new.stamp)
         if joined and self.spline_valid:
             begin = self.spline_valid.pop()[0]
@@ -291,7 +313,16 @@ class Tracker:
         return frame_report(new.stamp, depth, color, solved, keyframe=keyframe, lost=lost, overlap=overlap)
 
 
-def observe(frame: DeviceFrame, ref: Reference, options: Options) -> list[Observation]:
-    """What the terms of a method make of a frame against a reference: its depth image, and its colour images."""
+def observe(
+    frame: DeviceFrame, ref: Reference, options: Options, expected: FloatArray = brightness.SAME
+) -> list[Observation]:
+    """What the terms of a method make of a frame against a reference: its depth image, and its colour images.
+
+    expected (2,): gain and offset that the colour images are expected to have against the reference.
+    """
     depth = [Observation(frame.index, frame.depth, ref)] if options.geometric else []
-    return depth + [Observation(frame.index, c, ref, frame.depth) for c in frame.colors if ref.points]
+    return depth + [Observation(frame.index, c, ref, frame.depth, expected) for c in frame.colors if ref.points]
+
+
+def _matched(frame: DeviceFrame, ref: Reference) -> FloatArray:
+    return brightness.matched(frame.colors[0].moments, ref.moments) if frame.colors and ref.points else brightness.SAME

@@ -1,0 +1,89 @@
+"""Gain and offset of a colour image against its reference: cameras expose as they like.
+
+I_image = I_ref + gain (I_ref − ½) + offset, both unknown for every image. They are eliminated from its normal equations
+(Schur complement), so that the control points are solved for jointly with them: alternation converges slowly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rsgen.geometry.so3 import FloatArray
+from rstrack.alignment.block_sums import BrightnessSums
+from rstrack.alignment.normal_equations import Quadratic
+
+MID_GREY = 0.5
+"""Intensity about which the gain turns: gain and offset are then told apart best."""
+
+# What gain and offset may change from one frame to the next without any reason, as σ; it holds them where an image is
+# too plain to tell them apart.
+PRIOR_SIGMA = np.array([0.3, 0.15])
+# Gains and offsets that no camera shows: beyond them it is another place.
+_LEAST, _MOST = np.array([-0.7, -0.6]), np.array([2.0, 0.6])
+# Change of an image's mean or standard deviation that its moving view explains from one frame to the next.
+_STEADY = 0.03
+SAME = np.zeros(2)
+"""As bright as the reference."""
+
+
+@dataclass(frozen=True)
+class Eliminated:
+    """Gain and offset that were eliminated from a model: `at` (2,) where it was made, the best ones are `at` + step +
+    follow δ after increments δ (6k,) of its control points."""
+
+    at: FloatArray
+    step: FloatArray
+    follow: FloatArray
+
+    def best(self, increments: FloatArray) -> FloatArray:
+        """Gain and offset (2,) after increments (6k,)."""
+        return np.clip(self.at + self.step + self.follow @ increments, _LEAST, _MOST)
+
+
+def eliminate(
+    model: Quadratic, coupling: FloatArray, sums: BrightnessSums, sigma: float, at: FloatArray, expected: FloatArray
+) -> tuple[Quadratic, Eliminated, float]:
+    """The model (over σ²) without gain and offset, what was eliminated, and the cost of the prior.
+
+    coupling (6k, 2): Σ w J c of the control points; at, expected (2,): gain and offset here, and their prior's mean.
+    """
+    H = sums.H / sigma**2 + np.diag(1.0 / PRIOR_SIGMA**2)
+    off = (at - expected) / PRIOR_SIGMA
+    g = sums.g / sigma + off / PRIOR_SIGMA
+    C = coupling / sigma**2
+    solved = -np.linalg.solve(H, np.column_stack([g, C.T]))
+    step, follow = solved[:, 0], solved[:, 1:]
+    reduced = model.H + C @ follow
+    left = Quadratic(model.first, 0.5 * (reduced + reduced.T), model.g + C @ step)
+    return left, Eliminated(at, step, follow), 0.5 * float(off @ off)
+
+
+def relative(image: FloatArray, reference: FloatArray) -> FloatArray:
+    """Gain and offset (2,) of an image against a reference, from those of both against a third."""
+    gain = (1.0 + image[0]) / (1.0 + reference[0])
+    return np.array([gain - 1.0, image[1] - gain * reference[1]])
+
+
+def absolute(image: FloatArray, reference: FloatArray) -> FloatArray:
+    """Those (2,) of an image against a third, from its own against a reference and that one's against the third."""
+    gain = (1.0 + image[0]) * (1.0 + reference[0])
+    return np.array([gain - 1.0, image[1] + (1.0 + image[0]) * reference[1]])
+
+
+def expected(before: FloatArray, moments: FloatArray, moments_before: FloatArray) -> FloatArray:
+    """Gain and offset (2,) of an image against a third, from those of the one before and the moments (2,) of both.
+
+    The same as before, unless the images as a whole say otherwise.
+    """
+    if np.abs(moments - moments_before).max() < _STEADY:
+        return before
+    return absolute(matched(moments, moments_before), before)
+
+
+def matched(image: FloatArray, reference: FloatArray) -> FloatArray:
+    """Gain and offset (2,) that give a reference the mean and spread (2,) of an image of about the same view."""
+    gain = image[1] / max(reference[1], 1e-3)
+    found = np.array([gain - 1.0, image[0] - MID_GREY - gain * (reference[0] - MID_GREY)])
+    return np.clip(found, _LEAST, _MOST)
