@@ -17,9 +17,10 @@ from rstrack.alignment.student_t import cost, curvature, weight
 LINES_PER_BLOCK = 8
 # Blocks of an unrectified reference are larger: it is bootstrapping only, and pairs of blocks are many.
 LINES_PER_PAIR_BLOCK = 32
-# Integers per block: 21 of H (upper triangle), 6 of g, sum of w s², cost, count, and padding; with brightness 12 of the
-# coupling, 3 of its own H and 2 of its g more.
+# Integers per block: 21 of H (upper triangle), 6 of g, sum of w s², cost, count, compared, and padding; with brightness
+# 12 of the coupling, 3 of its own H and 2 of its g more.
 _SLOTS, _SLOTS_WITH_BRIGHTNESS = 32, 48
+_COMPARED = 30
 _UPPER = np.triu_indices(6)
 
 
@@ -40,7 +41,8 @@ class BlockSums:
     """Sums over pixels: for each block of current lines (and of reference lines, 1 if rectified).
 
     H (nc, nr, 6, 6) = Σ w j jᵀ, g (nc, nr, 6) = Σ w j s with s = r / σ and j the derivative of r by the twist
-    [m; rad] in the base frame; `weighted` = Σ w s², `cost` = Σ (ν+1)/2 log(1 + s²/ν), `count` of pixels (all blocks).
+    [m; rad] in the base frame; `weighted` = Σ w s², `cost` = Σ (ν+1)/2 log(1 + s²/ν), `count` of pixels, of
+    the `compared` ones that have a counterpart, be it beyond the gate.
     """
 
     H: FloatArray
@@ -48,6 +50,7 @@ class BlockSums:
     weighted: float
     cost: float
     count: int
+    compared: int
     brightness: BrightnessSums | None = None
 
 
@@ -78,15 +81,15 @@ class Scaling:
         a, b = _UPPER
         H[..., a, b] = H[..., b, a] = raw[..., :21] * (scale[a] * scale[b] / unit_H)
         g = raw[..., 21:27] * (scale / unit_g)
-        total = raw[..., 27:30].astype(np.int64).sum(axis=(0, 1))
+        weighted, cost, count, compared = raw[..., 27:31].astype(np.int64).sum(axis=(0, 1)).tolist()
         brightness = self._brightness(raw, scale) if raw.shape[2] == _SLOTS_WITH_BRIGHTNESS else None
-        return BlockSums(H, g, float(total[0] / unit_cost), float(total[1] / unit_cost), int(total[2]), brightness)
+        return BlockSums(H, g, weighted / unit_cost, cost / unit_cost, count, compared, brightness)
 
     def _brightness(self, raw: FloatArray, scale: FloatArray) -> BrightnessSums:
         _, _, _, _, unit_H, unit_g, _ = self.parameters(1.0, 0.0)
         # c is summed in units of `bound`, so that the same units serve.
-        coupling = np.stack([raw[..., 30:36], raw[..., 36:42]], axis=-1) * (scale[:, None] / (unit_H * self.bound))
-        aa, ab, bb, a, b = raw[..., 42:47].astype(np.int64).sum(axis=(0, 1))
+        coupling = np.stack([raw[..., 31:37], raw[..., 37:43]], axis=-1) * (scale[:, None] / (unit_H * self.bound))
+        aa, ab, bb, a, b = raw[..., 43:48].astype(np.int64).sum(axis=(0, 1))
         H = np.array([[aa, ab], [ab, bb]]) / (unit_H * self.bound**2)
         return BrightnessSums(coupling, H, np.array([a, b]) / (unit_g * self.bound))
 
@@ -113,10 +116,11 @@ def accumulate(
 ) -> Any:  # fmt: skip
     """Σ w j jᵀ and so on into `size` integers; j = sign [g, p × g]. c: see `BrightnessSums`, each at most 1."""
     inv_sigma, gate, inv_lever, bound, unit_H, unit_g, unit_cost = parameters
-    active &= dr.abs(r) < gate
+    compared = active & dr.isfinite(r)
+    active = compared & (dr.abs(r) < gate)
     j = [*g, *cross((p[0] * inv_lever, p[1] * inv_lever, p[2] * inv_lever), g)]
     norm2 = dr.maximum(j[0] * j[0] + j[1] * j[1] + j[2] * j[2], j[3] * j[3] + j[4] * j[4] + j[5] * j[5])
-    active &= dr.isfinite(norm2) & dr.isfinite(r)
+    active &= dr.isfinite(norm2)
     s = dr.select(active, r * inv_sigma, 0.0)
     w = weight(s)
     # The bound keeps the integers from overflowing; it is chosen so that only outliers reach it.
@@ -128,7 +132,7 @@ def accumulate(
     values = [hj[a] * j[b] for a, b in zip(*_UPPER, strict=True)]
     values += [c * s * (sign * unit_g) for c in wj]
     values += [w * s * s * unit_cost, cost(s) * unit_cost]
-    values = [e.Int(dr.round(value)) for value in values] + [e.Int(1)]
+    values = [e.Int(dr.round(value)) for value in values] + [e.Int(1), e.Int(1)]
     if c is not None:
         c = tuple(dr.select(active, bound * column, 0.0) for column in c)
         more = [sign * one * column for column in c for one in hj]
@@ -136,5 +140,6 @@ def accumulate(
         values += [e.Int(dr.round(value)) for value in more]
     sums = dr.zeros(e.Int, size)
     for k, value in enumerate(values):
-        dr.scatter_reduce(dr.ReduceOp.Add, sums, value, slot + k, active, mode=dr.ReduceMode.Expand)
+        which = compared if k == _COMPARED else active
+        dr.scatter_reduce(dr.ReduceOp.Add, sums, value, slot + k, which, mode=dr.ReduceMode.Expand)
     return sums

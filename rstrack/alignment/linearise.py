@@ -46,12 +46,18 @@ class Linearised:
     next_sigma: float
     cost: float
     count: int
+    compared: int
     # Smallest credible σ of this term, this camera and this reference.
     floor: float
     # Σ w j jᵀ / count (6, 6) with rotations scaled by the scene's depth.
     seen: FloatArray
     # Of a colour image: its gain and offset, which the model no longer holds.
     brightness: Eliminated | None = None
+
+    @property
+    def fit(self) -> float:
+        """Part of the pixels that were compared whose residuals are no outliers for certain."""
+        return self.count / max(1, self.compared)
 
     @property
     def observability(self) -> float:
@@ -211,7 +217,7 @@ class Terms:
             cost += surprise
         next_sigma = scale_step(sigma, sums.weighted, sums.count, floor)
         seen = seen_motions(sums, median_depth)
-        return Linearised(model, motion, sigma, next_sigma, cost, sums.count, floor, seen, eliminated)
+        return Linearised(model, motion, sigma, next_sigma, cost, sums.count, sums.compared, floor, seen, eliminated)
 
 
 def seen_motions(sums: BlockSums, median_depth: float) -> FloatArray:
