@@ -20,6 +20,8 @@ class SplineState:
     def __init__(self, spline: Spline) -> None:
         self.spline = spline
         self.moved = np.zeros((len(spline.control_points), 6))
+        # Until this time (s) the spline is what it was before it was restarted.
+        self.untouched = spline.t_end
 
     @classmethod
     def still(cls, t0: float, dt: float, T_world_body: FloatArray, count: int = 4) -> SplineState:
@@ -43,15 +45,16 @@ class SplineState:
         return twin
 
     def restarted(self, end: float, first: float, last: float, T_world_body: FloatArray) -> SplineState:
-        """The same up to time `end`; from `first` to `last` standing still at T_world_body (4, 4)."""
+        """The same up to time `end`, as far as `untouched`; from `first` to `last` at rest at T_world_body (4, 4)."""
         points = self.points
         keep = self.segment(end) + 4
         start, stop = self.segment(first), self.segment(last) + 4
         gap = np.repeat(points[keep - 1][None], max(0, start - keep), axis=0)
         still = np.repeat(T_world_body[None], stop - start, axis=0)
-        return SplineState(
-            Spline(np.concatenate([points[: min(keep, start)], gap, still]), self.spline.t0, self.spline.dt)
-        )
+        kept = points[: min(keep, start)]
+        state = SplineState(Spline(np.concatenate([kept, gap, still]), self.spline.t0, self.spline.dt))
+        state.untouched = self.spline.t0 + (len(kept) - 3) * self.dt
+        return state
 
     def segment(self, t: float) -> int:
         """Index of the first of the four control points that a time depends on."""

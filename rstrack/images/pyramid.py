@@ -21,30 +21,34 @@ _BLUR_PX = 0.8
 _SATURATED, _BLACK = 250, 5
 # Pixels (a square of this size) about a clipped one that smoothing draws it into, and its share that matters.
 _MARGIN_PX, _LEAST_CLIPPED = 5, 0.2
+_THUMBNAIL = 20, 15
 
 
 @dataclass(frozen=True)
 class DepthImage:
     """A depth image: z (m, 0 missing) and 1/z on the device; rays are those of its camera.
 
-    count: pixels that have depth. resolution: the camera's step (1/m, see `depth_resolution`), 0 where it shows none.
+    count: pixels that have depth. thumbnail (15, 20): of 1/z, 0 missing.
+    resolution: the camera's step (1/m, see `depth_resolution`), 0 where it shows none.
     """
 
     exposure: Exposure
     z: Any
     inverse_z: Any
     count: int
+    thumbnail: npt.NDArray[np.float32]
     resolution: float = 0.0
 
 
 @dataclass(frozen=True)
 class ColorImage:
     """Intensities in [0, 1], NaN where clipped; level 0 is full size, each further one low-passed and halved
-    (cv2.pyrDown). moments (2,): mean and standard deviation of the coarsest level."""
+    (cv2.pyrDown). moments (2,): mean and standard deviation of the coarsest level. thumbnail (15, 20): of it."""
 
     exposure: Exposure
     levels: tuple[Any, ...]
     moments: FloatArray
+    thumbnail: npt.NDArray[np.float32]
 
 
 def depth_image(
@@ -55,7 +59,9 @@ def depth_image(
     good = (z > 0.0) & (z < max_depth)
     z = np.where(good, z, np.float32(0.0))
     inverse = np.divide(np.float32(1.0), z, out=np.zeros_like(z), where=good)
-    return DepthImage(exposure, e.upload(z), e.upload(inverse), int(np.count_nonzero(good)), resolution)
+    return DepthImage(
+        exposure, e.upload(z), e.upload(inverse), int(np.count_nonzero(good)), thumbnail(inverse, good), resolution
+    )
 
 
 def depth_resolution(z: npt.NDArray[Any]) -> float:
@@ -74,6 +80,15 @@ def depth_resolution(z: npt.NDArray[Any]) -> float:
     return float(steps[order][np.searchsorted(seen, 0.5 * seen[-1])])
 
 
+def thumbnail(image: npt.NDArray[np.float32], known: npt.NDArray[np.bool_] | None = None) -> npt.NDArray[np.float32]:
+    """An image (h, w) in 15 rows of 20, to be recognised by; 0 where less than half of it is known."""
+    if known is None:
+        return np.asarray(cv2.resize(image, _THUMBNAIL, interpolation=cv2.INTER_AREA))
+    share = np.asarray(cv2.resize(known.astype(np.float32), _THUMBNAIL, interpolation=cv2.INTER_AREA))
+    mean = np.asarray(cv2.resize(np.where(known, image, np.float32(0.0)), _THUMBNAIL, interpolation=cv2.INTER_AREA))
+    return np.where(share > 0.5, mean / np.maximum(share, np.float32(1e-3)), np.float32(0.0)).astype(np.float32)
+
+
 def intensity(color: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
     """Grey (h, w) in [0, 1] of an RGB image (h, w, 3), ITU-R BT.601 weights, slightly blurred."""
     grey = np.asarray(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), np.float32) * np.float32(1.0 / 255.0)
@@ -86,7 +101,7 @@ def color_image(e: Engine, exposure: Exposure, color: npt.NDArray[np.uint8]) -> 
     masks = _beyond_range(color)
     moments = np.array([levels[-1].mean(), levels[-1].std()], np.float64)
     shown = (np.where(mask, np.float32(np.nan), level) for level, mask in zip(levels, masks, strict=True))
-    return ColorImage(exposure, tuple(e.upload(level) for level in shown), moments)
+    return ColorImage(exposure, tuple(e.upload(level) for level in shown), moments, thumbnail(levels[-1]))
 
 
 def _beyond_range(color: npt.NDArray[np.uint8]) -> list[npt.NDArray[np.bool_]]:

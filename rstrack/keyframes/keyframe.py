@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import cv2
@@ -53,6 +53,7 @@ class Reference:
     may be off (m), and fusion weights, on the device.
     median_depth, bound: see `block_sums.Scaling`, for the geometric term. pixels: of the finest level that have depth.
     moments: of its colour image; brightness: gain and offset (2,) of that against the track's first colour image.
+    intensity (h, w): the same on the host, NaN where unknown. *_thumbnail: see `pyramid.thumbnail`.
     """
 
     index: int
@@ -71,7 +72,16 @@ class Reference:
     bound: float
     pixels: int
     moments: FloatArray
+    intensity: Image | None
+    depth_thumbnail: Image
+    color_thumbnail: Image | None
     brightness: FloatArray = field(default_factory=lambda: np.zeros(2))
+
+    def emptied(self) -> Reference:
+        """Without what is on the device, and can be made again."""
+        return replace(
+            self, inverse_depth=None, slope_x=None, slope_y=None, roughness=None, weight=None, points=()
+        )  # fmt: skip
 
 
 def rectified_lens(camera: Camera) -> Lens:

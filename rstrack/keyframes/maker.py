@@ -15,7 +15,7 @@ from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.images.device_frame import DeviceRig, Timer, untimed
 from rstrack.images.line_poses import from_base_table, to_base_table
-from rstrack.images.pyramid import ColorImage, DepthImage
+from rstrack.images.pyramid import ColorImage, DepthImage, thumbnail
 from rstrack.keyframes.keyframe import (
     STRIDES,
     Image,
@@ -147,30 +147,45 @@ class KeyframeMaker:
             self._rays = rays, (self.e.upload(rays[..., 0]), self.e.upload(rays[..., 1]))
         return self._rays
 
+    def revived(self, small: Reference, rho: Image, weight: npt.NDArray[Any]) -> Reference:
+        """A rectified keyframe from what `Reference.emptied` left of it, its inverse depth and its weight (h, w)."""
+        return self._with_surface(small, self.e.upload(rho), rho, weight)
+
     def _finish(
         self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, t: float,
         T_world_base: FloatArray, lens: Lens, device_rho: Any, rho: Image, weight: npt.NDArray[Any] | None,
     ) -> Reference:  # fmt: skip
         e = self.e
         rolling = depth.exposure if lens is depth.exposure.lens and lens.lines > 1 else None
-        rays, grid = (self.rays, self.device_rays) if rolling else self._pinhole_rays(lens)
-        focal = lens.camera.fx, lens.camera.fy
-        slope_x, slope_y = surface_slopes(rho, *focal)
-        roughness = e.upload(surface_roughness(rho, slope_x, slope_y, *focal))
-        points: tuple[Points, ...] = ()
-        moments = np.zeros(2)
+        intensity, color_thumbnail, moments = None, None, np.zeros(2)
         if colors:
             color = min(colors, key=lambda c: abs(c.exposure.mid_time - t))
-            moments = color.moments
+            moments, color_thumbnail = color.moments, color.thumbnail
+            _, grid = (self.rays, self.device_rays) if rolling else self._pinhole_rays(lens)
             to_base = e.upload(to_base_table(spline, T_world_base, rolling) if rolling else np.zeros(12))
             from_base = e.upload(from_base_table(spline, T_world_base, color.exposure))
             kernel = self._kernel(color_kernel, color.exposure.lens, lens)
             value, seen = kernel(ColorInput(device_rho, *grid, to_base, color.levels[0], from_base))
-            points = level_points(e, rho, rays, e.download(value, rho.shape), e.download(seen, rho.shape) > 0)
+            known = e.download(seen, rho.shape) > 0
+            intensity = np.where(known, e.download(value, rho.shape), np.nan).astype(np.float32)
+        small = Reference(
+            index, depth.exposure.stamp, t, T_world_base, lens, rolling, None, None, None, None, None, (), 1.0, 1.0, 0,
+            moments, intensity, thumbnail(rho, rho > 0), color_thumbnail,
+        )  # fmt: skip
+        return self._with_surface(small, device_rho, rho, np.where(rho > 0, 1.0, 0.0) if weight is None else weight)
+
+    def _with_surface(self, small: Reference, device_rho: Any, rho: Image, weight: npt.NDArray[Any]) -> Reference:
+        e, camera = self.e, small.lens.camera
+        rays = self.rays if small.rolling else self._pinhole_rays(small.lens)[0]
+        slope_x, slope_y = surface_slopes(rho, camera.fx, camera.fy)
+        roughness = surface_roughness(rho, slope_x, slope_y, camera.fx, camera.fy)
+        points: tuple[Points, ...] = ()
+        if small.intensity is not None:
+            known = np.isfinite(small.intensity)
+            points = level_points(e, rho, rays, np.where(known, small.intensity, np.float32(0.0)), known)
         median_depth, bound = depth_scaling(rho)
-        pixels = int(np.count_nonzero(rho)) // STRIDES[0] ** 2
-        weights = e.upload(np.where(rho > 0, 1.0, 0.0) if weight is None else weight)
-        return Reference(
-            index, depth.exposure.stamp, t, T_world_base, lens, rolling, device_rho, e.upload(slope_x),
-            e.upload(slope_y), roughness, weights, points, median_depth, bound, pixels, moments,
+        return replace(
+            small, inverse_depth=device_rho, slope_x=e.upload(slope_x), slope_y=e.upload(slope_y),
+            roughness=e.upload(roughness), weight=e.upload(weight), points=points, median_depth=median_depth,
+            bound=bound, pixels=int(np.count_nonzero(rho)) // STRIDES[0] ** 2,
         )  # fmt: skip

@@ -9,14 +9,15 @@ from rsgen.geometry import se3
 from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.images.device_frame import DeviceFrame
+from rstrack.keyframes.archive import Archive
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.keyframes.surface_model import SurfaceModel
 from rstrack.options import Options
 
-# Keyframes in which a lost track is looked for, and all that are kept where nothing comes back to them.
+# Keyframes that stay on the device; all others are archived.
 _RECENT = 8
-# Keyframes that a model keeps: what a camera can come back to.
+# Keyframes that a model keeps there: what a camera can come back to.
 _MODEL_KEYFRAMES = 256
 # Of the distance and angle at which a keyframe is left behind: an older one that is nearer becomes the reference again.
 _RETURN = 0.7
@@ -34,6 +35,7 @@ class KeyframeStore:
         self._maker, self._options = maker, options
         self._model = SurfaceModel(maker, options.voxel_m) if options.models else None
         self._kept: deque[Reference] = deque(maxlen=_RECENT if self._model is None else _MODEL_KEYFRAMES)
+        self._archive = Archive(maker)
         self.anchor: Reference | None = None
         self.made = 0
 
@@ -45,10 +47,21 @@ class KeyframeStore:
         """The one that was the reference last."""
         return self._kept[-1]
 
-    @property
-    def recent(self) -> list[Reference]:
-        """The last few, newest first."""
-        return list(self._kept)[: -_RECENT - 1 : -1]
+    def candidates(self, frame: DeviceFrame, skip: int, most: int) -> list[Reference]:
+        """Keyframes, ever made, whose view resembles a frame's: `most` of them after the first `skip`, round and round.
+
+        The newest is not among them.
+        """
+        indices = self._archive.alike(frame, {self.newest.index})
+        chosen = [indices[(skip + i) % len(indices)] for i in range(min(most, len(indices)))]
+        on_device = {ref.index: ref for ref in self._kept}
+        return [on_device[k] if k in on_device else self._archive.get(k) for k in chosen]
+
+    def use(self, ref: Reference) -> None:
+        """A keyframe found again is the newest from now on."""
+        self._kept = deque((k for k in self._kept if k.index != ref.index), maxlen=self._kept.maxlen)
+        self._use(ref)
+        self.anchor = None
 
     def make(self, frame: DeviceFrame, spline: Spline, older: Reference | None, brightness: FloatArray) -> Reference:
         """A keyframe of a frame whose poses no longer change; inherits from `older`. It is the newest.
@@ -85,6 +98,8 @@ class KeyframeStore:
         return self._use(oldest)
 
     def _use(self, ref: Reference) -> Reference:
+        if self._kept:
+            self._archive.add(self.newest)  # it changes no more
         self._kept.append(ref)
         if self._model is not None:
             near = [k for k in self._kept if self._remoteness(ref.T_world_base, k.T_world_base) < _ANCHOR]

@@ -39,6 +39,8 @@ _GAP_S, _BREAK_S = 0.3, 3600.0
 _WIDEST = 2.0
 # Part of the pixels that must have depth for a frame to become a keyframe.
 _LEAST_DEPTH = 0.02
+# Starts from which a lost frame is looked for, and how many of them are followed to the end.
+_STARTS, _TRIED = 3, 1
 
 
 class Tracker:
@@ -63,6 +65,9 @@ class Tracker:
         # The newest frame, while it is the reference and cannot be rectified yet.
         self._unconverged: DeviceFrame | None = None
         self._stamps: list[float] = []
+        # Poses of the first of these: those before the current piece of the spline.
+        self._settled: list[FloatArray] = []
+        self._lost_in_a_row = 0
         self._last_fed: float | None = None
         self.spline_valid: list[tuple[float, float]] = []
         self.reports: list[FrameReport] = []
@@ -80,7 +85,8 @@ class Tracker:
         if self.spline is None:
             return np.zeros(0), np.zeros((0, 4, 4))
         stamps = np.array(self._stamps)
-        return stamps, self.spline.pose(stamps)
+        poses = self.spline.pose(stamps[len(self._settled) :])
+        return stamps, np.concatenate([*(T[None] for T in self._settled), poses])
 
     @property
     def keyframes(self) -> int:
@@ -197,26 +203,52 @@ class Tracker:
         window.keep(others)
 
     def _relocalise(self, new: DeviceFrame) -> FrameReport:
-        """Align a frame alone to the last keyframes, from where the track ended and from where they were taken."""
-        window, _ = self._known()
+        """Find a frame's place: where the track ended, or at any keyframe ever made that looks like it.
+
+        Coarse alignments from few starts, the best of which is aligned to the end and judged; others take their turn
+        with the next frame. What was reported before stays as it is.
+        """
+        window, ref = self._known()
         end = self.spline_valid[-1][1]
-        for ref in self._keyframes.recent:
-            for T_world_body in (window.spline.pose(end), ref.T_world_base):
-                trial = window.restarted(new, end, T_world_body)
-                fresh = observe(new, ref, self.options, _matched(new, ref))
-                solved = trial.solve(fresh)
-                if self._fits.fault(fresh, solved, ref.pixels):
-                    continue
-                trial.keep(fresh)
-                self._window, self._reference = trial, ref
-                self._pixels, self._unconverged = 0, None
-                self._keyframes.anchor = None
-                self._recent = deque([new])
-                self._placed(new, fresh, joined=False)
-                return self._report(new, fresh, solved, overlap=self._overlap(fresh))
+        newest = self._keyframes.newest if ref.rolling is not None else ref
+        starts = [(newest, window.spline.pose(end))]
+        skip = (self._lost_in_a_row // 2) * (_STARTS - 1)
+        others = self._keyframes.candidates(new, skip, _STARTS - 1)
+        starts += [(other, other.T_world_base) for other in others] or [(newest, newest.T_world_base)]
+        trials: list[tuple[float, int, Window, list[Observation], Reference]] = []
+        for candidate, T_world_body in starts:
+            trial = window.restarted(new, end, T_world_body)
+            fresh = observe(new, candidate, self.options, _matched(new, candidate))
+            trial.solve(fresh, levels=(2,))
+            trials.append((_promise(fresh), len(trials), trial, fresh, candidate))
+        for _, _, trial, fresh, candidate in sorted(trials, key=lambda t: t[:2])[:_TRIED]:
+            solved = trial.solve(fresh, TRACKING_LEVELS)
+            if self._fits.fault(fresh, solved, candidate.pixels):
+                continue
+            return self._resume(new, trial, fresh, solved, candidate)
         window.active = []
         self._recent.clear()
+        self._lost_in_a_row += 1
         return self._report(new, lost=True)
+
+    def _resume(
+        self, new: DeviceFrame, trial: Window, fresh: list[Observation], solved: Solved, ref: Reference
+    ) -> FrameReport:
+        """Go on from a frame that was found again, with a new piece of the spline."""
+        window, _ = self._known()
+        # The new piece may need control points of the last frames before: their poses are kept, not their spline.
+        done = np.array(self._stamps[len(self._settled) :])
+        self._settled += list(window.spline.pose(done)) if len(done) else []
+        begin, end = self.spline_valid.pop()
+        if trial.state.untouched > begin:
+            self.spline_valid.append((begin, min(end, trial.state.untouched)))
+        trial.keep(fresh)
+        self._window, self._reference = trial, ref
+        self._keyframes.use(ref)
+        self._pixels, self._unconverged, self._lost_in_a_row = 0, None, 0
+        self._recent = deque([new])
+        self._placed(new, fresh, joined=False)
+        return self._report(new, fresh, solved, overlap=self._overlap(fresh))
 
     # -- keyframes --------------------------------------------------------------------------------------------------
 
@@ -326,3 +358,9 @@ def observe(
 
 def _matched(frame: DeviceFrame, ref: Reference) -> FloatArray:
     return brightness.matched(frame.colors[0].moments, ref.moments) if frame.colors and ref.points else brightness.SAME
+
+
+def _promise(fresh: Sequence[Observation]) -> float:
+    """Smaller for a better coarse alignment: the part of the compared pixels that do not fit, over those that are."""
+    seen = [o.lin for o in fresh if o.is_linearised and o.lin.compared]
+    return min((-lin.fit * np.sqrt(lin.count) for lin in seen), default=0.0)
