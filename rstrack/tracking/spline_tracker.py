@@ -143,7 +143,8 @@ class Tracker:
     # -- start and restart ------------------------------------------------------------------------------------------
 
     def _start(self, new: DeviceFrame) -> FrameReport:
-        if self._unfit(new):
+        # Its depth is enough to begin with: the first colour image often comes a little later.
+        if new.depth_share < _LEAST_DEPTH or not (self.options.geometric or new.colors):
             return self._report(new, lost=True)
         self._window = self._new_window(new, self.options.knot_spacing_s)
         self._recent.append(new)
