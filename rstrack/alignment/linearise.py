@@ -14,6 +14,7 @@ from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import BlockSums, Scaling, block_counts
 from rstrack.alignment.brightness import SAME, Eliminated, eliminate
+from rstrack.alignment.independence import inflation
 from rstrack.alignment.normal_equations import Quadratic, chain
 from rstrack.alignment.residuals import (
     GeometricInput,
@@ -51,6 +52,8 @@ class Linearised:
     floor: float
     # Σ w j jᵀ / count (6, 6) with rotations scaled by the scene's depth.
     seen: FloatArray
+    # See `independence.inflation`.
+    inflation: float
     # Of a colour image: its gain and offset, which the model no longer holds.
     brightness: Eliminated | None = None
 
@@ -217,7 +220,8 @@ class Terms:
             cost += surprise
         next_sigma = scale_step(sigma, sums.weighted, sums.count, floor)
         seen = seen_motions(sums, median_depth)
-        return Linearised(model, motion, sigma, next_sigma, cost, sums.count, sums.compared, floor, seen, eliminated)
+        counts = sums.count, sums.compared
+        return Linearised(model, motion, sigma, next_sigma, cost, *counts, floor, seen, inflation(sums), eliminated)
 
 
 def seen_motions(sums: BlockSums, median_depth: float) -> FloatArray:

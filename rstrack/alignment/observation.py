@@ -44,7 +44,8 @@ class Observation:
     """An image against a reference. linearisation: the last one; putting an earlier one back takes a step back.
 
     occluder: the depth image that tells which points of the reference a colour image cannot see. expected: gain and
-    offset (2,) of a colour image against the reference, as far as can be told beforehand.
+    offset (2,) of a colour image against the reference, as far as can be told beforehand. independent: part of its
+    pixels that count, see `Independence`.
     """
 
     frame: int
@@ -52,6 +53,7 @@ class Observation:
     ref: Reference
     occluder: DepthImage | None = None
     expected: FloatArray = field(default_factory=lambda: SAME)
+    independent: float = 1.0
     linearisation: _Linearisation = _Linearisation()
     _visible: Any = None
     _slopes_at: Spline | None = None
@@ -75,8 +77,12 @@ class Observation:
 
     @property
     def stands_for(self) -> float:
-        """Pixels of the finest level for each that was looked at."""
-        return self.linearisation.stands_for
+        """Independent pixels of the finest level for each that was looked at."""
+        return self.independent * self.linearisation.stands_for
+
+    def see(self, ref: Reference) -> None:
+        """Take another version of the reference, nearly the same."""
+        self.ref, self._visible = ref, None
 
     def forget(self, state: SplineState, keep_sigma: bool) -> None:
         """Begin anew, as at a new level of the pyramid."""

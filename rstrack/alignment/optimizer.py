@@ -22,6 +22,8 @@ from rstrack.alignment.spline_state import SplineState
 STOP_PX = (0.02, 0.1, 0.3)
 # Lines that have moved less since a linearisation keep it.
 RELINEARISE_PX = 0.02
+# The same for noisy depth: part of what its σ moves a pixel by. (Noise-free depth is held to the pixels above.)
+_NOISE_SHARE = 0.15
 # Rise of the negative log-likelihood per pixel from which on a step has made things worse: less is noise of gating.
 _WORSE = 2e-5
 
@@ -98,7 +100,7 @@ def _optimise_level(terms: Terms, state: SplineState, problem: Problem, level: i
         increments[first : first + len(step)] = step
         shifts = [o.lin.row_shift(increments, problem.focal, o.ref.median_depth) for o in problem.fresh]
         done.last_shift = max(shifts, default=0.0)
-        if done.last_shift < STOP_PX[level]:
+        if done.last_shift < (_tolerance(problem) if level == 0 else STOP_PX[level]):
             break
 
 
@@ -120,15 +122,23 @@ def _damped_step(H: FloatArray, g: FloatArray, damping: float, bandwidth: int) -
 def _linearise(terms: Terms, state: SplineState, problem: Problem, level: int) -> int:
     """Anew what has moved; returns how many that were."""
     count = 0
+    tolerance = RELINEARISE_PX * (1 + 4 * level) if level else _tolerance(problem)
     for observation in problem.fresh:
-        if not observation.is_linearised or observation.shift(state, problem.focal) > RELINEARISE_PX * (1 + 4 * level):
+        if not observation.is_linearised or observation.shift(state, problem.focal) > tolerance:
             observation.linearise(terms, state, level)
             count += 1
     for observation in problem.settled:
-        if level == 0 and observation.shift(state, problem.focal) > RELINEARISE_PX:
+        if level == 0 and observation.shift(state, problem.focal) > tolerance:
             observation.linearise(terms, state, 0)
             count += 1
     return count
+
+
+def _tolerance(problem: Problem) -> float:
+    """Pixels that lines may move without mattering, at the finest level: less than noise moves them."""
+    depth = [o for o in problem.fresh if o.is_depth and o.is_linearised]
+    noise_px = min((problem.focal * o.lin.next_sigma / o.ref.median_depth for o in depth), default=0.0)
+    return max(RELINEARISE_PX, _NOISE_SHARE * noise_px)
 
 
 def _cost(state: SplineState, problem: Problem, weights: dict[int, float]) -> float:

@@ -19,6 +19,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.alignment import brightness
+from rstrack.alignment.independence import Independence
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Solved
@@ -58,6 +59,7 @@ class Tracker:
         # Frames whose control points still move, and the newest one whose do not.
         self._recent: deque[DeviceFrame] = deque()
         self._fits = FitHistory()
+        self._independence = Independence(), Independence()  # of depth pixels, and of colour pixels
         self._pixels = 0
         # Gain and offset against the first colour image, of the recent frames, and the newest colour image's moments.
         self._brightness: dict[int, FloatArray] = {}
@@ -133,6 +135,8 @@ class Tracker:
             self._window = before
             return self._relocalise(new)
         window.keep(fresh)
+        for is_color, term in enumerate(self._independence):
+            term.learn(o.lin.inflation for o in on_reference if o.is_depth != is_color)
         self._recent.append(new)
         self._placed(new, fresh)
         overlap = self._overlap(on_reference)
@@ -171,6 +175,12 @@ class Tracker:
         window.state.extend(new.last_time)
         fresh = self._observe(new, ref)
         solved = window.solve(fresh, gauge=ref, coupled=True)
+        if ref.points:
+            # Its colours were looked up as if the first frame stood still: again, with the motion found.
+            ref, earlier = self._recolored(window, ref, fresh), window.active
+            window.active = []
+            solved = window.solve([*earlier, *fresh], (1, 0), gauge=ref, coupled=True)
+            window.active = earlier
         if self._fits.fault(fresh, solved, ref.pixels):
             return self._begin_anew(new)
         window.keep(fresh)
@@ -180,6 +190,14 @@ class Tracker:
             return self._report(new, fresh, solved)
         self._leave_bootstrap(window)
         return self._report(new, fresh, solved, keyframe=True)
+
+    def _recolored(self, window: Window, ref: Reference, fresh: Sequence[Observation]) -> Reference:
+        first = self._recent[0]
+        again = self._maker.rolling(first.index, first.depth, first.colors, window.spline)
+        self._reference = replace(again, T_world_base=ref.T_world_base)
+        for o in (*window.active, *fresh):
+            o.see(self._reference)
+        return self._reference
 
     def _begin_anew(self, new: DeviceFrame) -> FrameReport:
         """The first frames did not fit together: they are lost, and the newest is the first one."""
@@ -319,7 +337,10 @@ class Tracker:
             newest = self._brightness[max(self._brightness)]
             before = brightness.expected(newest, frame.colors[0].moments, self._moments)
         expected = brightness.SAME if before is None else brightness.relative(before, ref.brightness)
-        return observe(frame, ref, self.options, expected)
+        observations = observe(frame, ref, self.options, expected)
+        for o in observations:
+            o.independent = 1.0 / self._independence[not o.is_depth].inflation
+        return observations
 
     def _placed(self, new: DeviceFrame, fresh: Sequence[Observation] = (), joined: bool = True) -> None:
         """A frame has been found: its stamp, its brightness, and until when the spline is known."""
