@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from rsgen.geometry import se3
 from rsgen.geometry.shutter import project_rolling
-from rsgen.sequence.format import FloatArray, poses_of_rows
+from rsgen.sequence.format import FloatArray
 from rsgen.sequence.reader import Sequence
 
 # Depth is interpolated bilinearly in 1/z, exact on planes. Where second differences say that this is off by more, there
@@ -58,12 +58,11 @@ def depth_points(sequence: Sequence, k: int) -> FloatArray:
 
     Raises UserError for unreadable files.
     """
-    camera, shutter = sequence.streams["depth"].camera, sequence.streams["depth"].shutter
+    camera = sequence.streams["depth"].camera
     step = max(1, min(_STEP_PX, math.isqrt(camera.width * camera.height // _TARGET_PIXELS)))
     z = sequence.truth_depth(k)[::step, ::step].astype(np.float64)
     uv = camera.pixel_grid()[::step, ::step][z > 0]
-    line = np.rint(uv[:, 1 if shutter.scan in ("top-bottom", "bottom-top") else 0]).astype(np.int64)
-    return se3.transform(poses_of_rows(sequence.rows("depth")[k])[line], camera.backproject(uv, z[z > 0]))
+    return se3.transform(sequence.pixel_poses("depth", k, uv), camera.backproject(uv, z[z > 0]))
 
 
 def _interpolate_inverse(z: FloatArray, uv: FloatArray) -> tuple[FloatArray, npt.NDArray[np.bool_]]:

@@ -50,9 +50,24 @@ class Shutter:
         if self.scan not in get_args(Scan):
             raise UserError(f"shutter: unknown scan {self.scan!r}; use one of {', '.join(get_args(Scan))}")
 
+    @property
+    def axis(self) -> int:
+        """Image axis that the scan runs along: 0 = u, 1 = v."""
+        return _SCANS[self.scan][0]
+
+    @property
+    def direction(self) -> float:
+        """1 if the scan runs towards larger coordinates, else −1."""
+        return _SCANS[self.scan][1]
+
+    @property
+    def by_rows(self) -> bool:
+        """Whether a line is a row of the image."""
+        return self.axis == 1
+
     def line_count(self, camera: Camera) -> int:
         """Lines of a frame: the image's height, or its width for the sideways scans."""
-        return (camera.width, camera.height)[_SCANS[self.scan][0]]
+        return (camera.width, camera.height)[self.axis]
 
     def line_delay(self, camera: Camera) -> float:
         """Seconds from one line to the next."""
@@ -60,9 +75,8 @@ class Shutter:
 
     def line_of_pixel(self, uv: npt.ArrayLike, camera: Camera) -> FloatArray:
         """Line coordinate (...,), not rounded, of pixels (..., 2)."""
-        axis, direction = _SCANS[self.scan]
-        along = np.asarray(uv, dtype=np.float64)[..., axis]
-        return np.asarray(along if direction > 0.0 else (self.line_count(camera) - 1) - along)
+        along = np.asarray(uv, dtype=np.float64)[..., self.axis]
+        return np.asarray(along if self.direction > 0.0 else (self.line_count(camera) - 1) - along)
 
     def line_end_time(self, stamp: npt.ArrayLike, line: npt.ArrayLike, camera: Camera) -> FloatArray:
         """Time in seconds at which lines (...,) of the frame(s) stamped `stamp` (...,) stop being exposed."""
@@ -145,8 +159,7 @@ def rolling_shutter_jacobian(
     else:
         dq = np.concatenate([np.broadcast_to(-np.eye(3), (*q.shape, 3)), hat(q)], axis=-1)
     x_dot = (J_body @ -(w[..., :3] + cross(w[..., 3:], q))[..., None])[..., 0]
-    axis, direction = _SCANS[shutter.scan]
-    delay = direction * shutter.line_delay(camera)
+    axis, delay = shutter.axis, shutter.direction * shutter.line_delay(camera)
     total = np.broadcast_to(np.eye(2), (*t.shape, 2, 2)).copy()
     total[..., :, axis] += x_dot * (delay / (1.0 - delay * x_dot[..., axis]))[..., None]
     return first, (total @ J_body @ dq)[..., None, :, :] @ J_pose
@@ -203,6 +216,6 @@ class _Frame:
         uv, _ = self.camera.project(p_cam)
         p_cam_dot = -(w[..., :3] + cross(w[..., 3:], q)) @ self.T_cam_body[:3, :3].T
         uv_dot = np.einsum("...ij,...j->...i", self.camera.project_jacobian(p_cam), p_cam_dot)
-        axis, direction = _SCANS[self.shutter.scan]
         mid = self.shutter.line_mid_time(stamp, self.shutter.line_of_pixel(uv, self.camera), self.camera)
-        return uv, uv_dot, mid - t, direction * self.shutter.line_delay(self.camera) * uv_dot[..., axis] - 1.0
+        rate = self.shutter.direction * self.shutter.line_delay(self.camera) * uv_dot[..., self.shutter.axis]
+        return uv, uv_dot, mid - t, rate - 1.0

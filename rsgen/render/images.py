@@ -13,10 +13,11 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from rsgen.device.pose_table import PoseFunction
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.baked import BakedIntegrator
-from rsgen.render.sensor import PoseFunction, RollingShutterSensor
+from rsgen.render.sensor import RollingShutterSensor
 
 # Samples in one launch; more are rendered in several and averaged, which bounds memory.
 _LAUNCH = 1 << 24

@@ -12,7 +12,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from rsgen.render.sensor import PoseFunction, RollingShutterSensor
+from rsgen.device.pose_table import PoseFunction
+from rsgen.render.sensor import RollingShutterSensor
 
 # Shadow rays end this much short of the surface, as a fraction of their length: 0.1 mm at 1 m. Depth is exact to 1e-6.
 _SHORT = 1e-4

@@ -32,6 +32,7 @@ from rsgen.sequence.format import (
     StreamYaml,
     color_truth_path,
     parse_listing,
+    poses_of_rows,
     read_sequence_yaml,
 )
 
@@ -137,6 +138,11 @@ class Sequence:
             self._rows[stream] = read_npy(self.root / ROWS[stream], (s.frames, s.line_count, 7))[s.indices]
         return self._rows[stream]
 
+    def pixel_poses(self, stream: StreamName, k: int, uv: npt.ArrayLike) -> FloatArray:
+        """Exact poses T_world_cam (..., 4, 4) with which image k was taken at pixels uv (..., 2): their lines'."""
+        line = np.rint(np.asarray(uv)[..., self.streams[stream].shutter.axis]).astype(np.int64)
+        return poses_of_rows(self.rows(stream)[k])[line]
+
 
 def read_sequence(path: Path) -> Sequence:
     """Read the description, listings and spline of a sequence folder; images are read when asked for.
@@ -151,7 +157,7 @@ def read_sequence(path: Path) -> Sequence:
         raise UserError(f"{root}: has no sequence.yaml, so it is not a sequence that 'rsgen render' wrote")
     description, meta = read_sequence_yaml(root / "sequence.yaml")
     try:
-        T_color_depth = np.array(rigid(description.T_color_depth), float)
+        T_color_depth = rigid(description.T_color_depth)
     except ValueError as error:
         raise UserError(f"{root / 'sequence.yaml'}: T_color_depth: {error}") from None
     if description.streams.depth.depth_scale is None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rsgen.device.arrays import Engine, Kernels
-from rsgen.device.projection import Lens
+from rsgen.device.lens import Lens
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsgen.device.arrays import engine
-from rsgen.device.projection import Lens
+from rsgen.device.lens import Lens
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from rsgen.device.projection import Lens
+from rsgen.device.lens import Lens
 from rsgen.geometry import se3
 from rsgen.geometry.so3 import FloatArray, hat
 from rsgen.geometry.spline import Spline

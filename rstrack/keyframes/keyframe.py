@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsgen.device.arrays import Engine
-from rsgen.device.projection import Lens
+from rsgen.device.lens import Lens
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.so3 import FloatArray

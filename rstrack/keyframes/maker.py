@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsgen.device.arrays import Engine, Kernels
-from rsgen.device.projection import Lens
+from rsgen.device.lens import Lens
 from rsgen.geometry import se3
 from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline

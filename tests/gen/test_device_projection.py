@@ -7,9 +7,9 @@ import pytest
 from rstrack_util import ENGINE, SCANS, T_COLOR_DEPTH, hand_held
 from util import numeric_jacobian
 
+from rsgen.device.lens import Lens
 from rsgen.device.projection import (
     TO_BASE,
-    Lens,
     Projection,
     Sighting,
     cross,

@@ -29,6 +29,9 @@ from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from rsgen.config.sections import ColorConfig
 from rsgen.config.truth import TruthConfig
+from rsgen.device.lens import Lens
+from rsgen.device.pose_table import PoseTable
+from rsgen.device.projection import MovingCamera
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
@@ -36,7 +39,6 @@ from rsgen.geometry.shutter import Shutter, project_rolling
 from rsgen.render.images import ColorRenderer, DepthRenderer
 from rsgen.render.scene import load_scene, ply_bytes
 from rsgen.sensors.response import to_srgb8
-from rsgen.truth.projection import project
 from rsgen.truth.renderer import TruthRenderer, global_instant
 
 STAMP, NEXT = 0.31, 0.31 + 1 / 30
@@ -403,11 +405,13 @@ def test_a_surfaces_other_side_is_not_the_same_point(tmp_path: Path) -> None:
 def test_projection_is_the_cameras(camera: Camera) -> None:
     rng = np.random.default_rng(2)
     p = np.concatenate([rng.normal(size=(4000, 3)) * (1, 1, 0.7), [[0, 0, 1.0], [0, 0, 0], [1e-9, 0, 1]]])
-    uv, defined = project(camera, mi.Point3f(*(mi.Float(p[:, k]) for k in range(3))))
+    still = PoseTable.of(mi.Vector4f, camera, Shutter(), lambda t: np.eye(4), 0.0)
+    points = tuple(mi.Float(p[:, k]) for k in range(3))
+    uv, defined = MovingCamera(Lens(camera, Shutter()), still).project_at(mi.Float(0), points, mi.Float(1))
     expected, valid = camera.project(p.astype(np.float32))
     assert np.mean(np.array(defined) == valid) == 1
     close = valid & (np.abs(p[:, 2]) > 0.05)
-    np.testing.assert_allclose(np.array(uv).T[close], expected[close], rtol=3e-6, atol=2e-4)
+    np.testing.assert_allclose(np.array([np.array(c) for c in uv]).T[close], expected[close], rtol=3e-6, atol=2e-4)
     assert 500 < valid.sum() < 3500
 
 
