@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from rsgen.bench.table import AVERAGED, BLUR_S, READOUT_S, BenchTimes, ModeTimes
 from rsgen.check.light import lit_scene, spread_times
 from rsgen.config.config import Config
+from rsgen.console.progress import Progress
 from rsgen.errors import UserError
 from rsgen.geometry.shutter import Shutter
-from rsgen.produce.frame_source import Progress
 from rsgen.produce.generate import engine_versions, load_motion
 
 MODES = ("still", "rs-blur", "path", "rows", "averaged")

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rsgen.export.folder import make_folders, new_folder, no_progress, place_images
+from rsgen.console.progress import Progress, no_progress
+from rsgen.export.folder import make_folders, new_folder, place_images
 from rsgen.files import atomic_write, encode_png, encode_yaml
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.so3 import FloatArray
-from rsgen.produce.frame_source import Progress
 from rsgen.produce.writer import quantise
 from rsgen.sequence.format import associate, ground_truth, pose_rows
 from rsgen.sequence.reader import Sequence

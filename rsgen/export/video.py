@@ -10,10 +10,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
-from rsgen.export.folder import no_progress
 from rsgen.files import write_error
-from rsgen.produce.frame_source import Progress
 
 # Encoders that OpenCV's own wheels bring along.
 _CODECS = {".mp4": "mp4v", ".avi": "MJPG"}

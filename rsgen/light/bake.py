@@ -23,13 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsgen.config.config import LightConfig
+from rsgen.console.progress import Progress
 from rsgen.errors import UserError
 from rsgen.light.bake_points import Interpolation, Points, sample_points, thin
 from rsgen.render.irradiance import IrradianceField, Lattice, make_field
 
 log = logging.getLogger("rsgen")
 
-Progress = Callable[[float, str], None]  # fraction done in [0, 1], what is being done
 
 # Raise when the method changes, so that older caches are not taken for new ones.
 METHOD = 1
@@ -85,12 +85,12 @@ def bake(scene: Any, lattice: Lattice, light: LightConfig, progress: Progress) -
         indirect = coarse_to_fine(_gather(scene, field, points, coarse, rays, report))
     values[lit_points] = to_point(direct + indirect)
     table = _table(values, alive_point)
-    progress(1.0, "light baked")
+    progress("light", 1.0, "light baked")
     return table[index[0]], table[index[1]]
 
 
 def _reporter(progress: Progress, begin: float, span: float, what: str) -> Callable[[float], None]:
-    return lambda fraction: progress(begin + span * fraction, what)
+    return lambda fraction: progress("light", begin + span * fraction, what)
 
 
 def _table(values: NDArray, alive: NDArray) -> NDArray[np.float32]:

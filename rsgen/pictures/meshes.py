@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsgen import srgb
+from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import read_bytes
 from rsgen.geometry.camera import Camera
@@ -28,7 +30,6 @@ from rsgen.sensors.response import to_srgb8
 
 Array = NDArray[np.float64]
 Point = tuple[float, float, float]
-Progress = Callable[[str, float, str], None]
 
 SUFFIXES = (".png", ".jpg", ".svg", ".pdf")
 MAX_SIZE_PX = 8192
@@ -84,7 +85,7 @@ def picture_meshes(
     width: int = 800,
     height: int = 600,
     grey: bool = False,
-    progress: Progress = lambda *_: None,
+    progress: Progress = no_progress,
 ) -> Path:
     """Draw each mesh of `paths`, all from the same place, write them side by side into `out` and return that.
 
@@ -145,7 +146,7 @@ def read_mesh(path: Path) -> ColoredMesh:
     faces = faces.reshape(-1, 3)
     colors = np.full((len(used), 3), _GREY, np.float32)
     if mesh.visual.kind == "vertex":
-        colors = _linear(np.asarray(mesh.visual.vertex_colors)[used, :3] / 255)
+        colors = srgb.decode(np.asarray(mesh.visual.vertex_colors)[used, :3] / 255).astype(np.float32)
     return ColoredMesh(vertices[used], faces, _vertex_normals(vertices[used], faces), colors)
 
 
@@ -301,8 +302,3 @@ def _vertex_normals(vertices: NDArray[np.float32], faces: NDArray[np.int64]) -> 
     total = np.stack(sums, axis=1)
     length = np.linalg.norm(total, axis=1, keepdims=True)
     return np.where(length > 0, total / np.where(length > 0, length, 1), (0.0, 1.0, 0.0)).astype(np.float32)
-
-
-def _linear(encoded: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Linear values of sRGB ones in [0, 1] (IEC 61966-2-1)."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4).astype(np.float32)

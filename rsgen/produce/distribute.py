@@ -17,7 +17,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from rsgen.config.config import Config
-from rsgen.console.scheduler import Progress, Workers
+from rsgen.console.progress import Progress, no_progress
+from rsgen.console.scheduler import Workers
 from rsgen.errors import UserError
 from rsgen.files import atomic_write
 from rsgen.geometry.spline import Spline
@@ -133,7 +134,7 @@ def render_block(block: Block, progress: Progress) -> dict[str, bytes]:
         stamps = plan.stamps_color, plan.stamps_depth
         writer = SequenceWriter.open(out, plan.config, plan.spline, *stamps, plan.versions, plan.inputs)
         before = set(out.rglob("*"))
-        render_shots(writer, source, block.shots, lambda *_: None)
+        render_shots(writer, source, block.shots, no_progress)
         made = sorted(path for path in set(out.rglob("*")) - before if path.is_file())
         return {path.relative_to(out).as_posix(): path.read_bytes() for path in made}
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsgen.config.config import Config
+from rsgen.console.progress import Progress, no_progress
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.sensors.color import apply_color_noise
@@ -20,8 +21,6 @@ from rsgen.sensors.depth import apply_depth_noise
 from rsgen.sensors.response import to_srgb8
 from rsgen.sensors.seed import noise_generator
 from rsgen.sequence.format import CLEAN_COLOR
-
-Progress = Callable[[str, float, str], None]  # stage ("light" or "frames"), fraction done in [0, 1], note
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ class FrameSource:
     def __init__(
         self,
         config: Config,
-        progress: Progress = lambda *_: None,
+        progress: Progress = no_progress,
         global_shutter: bool = False,
         scene: Any = None,
     ) -> None:
@@ -62,7 +61,7 @@ class FrameSource:
 
         self._config = config
         self.scene = scene or load_scene(config)
-        integrator = make_integrator(mi, self.scene, config, lambda f, what: progress("light", f, what))
+        integrator = make_integrator(mi, self.scene, config, progress)
         pick = render.global_shutter if global_shutter else lambda shutter: shutter
         color, depth = config.color, config.depth
         self._color = render.ColorRenderer(self.scene, integrator, color.camera, pick(color.shutter), color.spp)
@@ -120,7 +119,7 @@ class FrameSource:
         return int(np.random.SeedSequence([self._config.seed, frame]).generate_state(1)[0])
 
 
-def make_integrator(mi: Any, scene: Any, config: Config, progress: Callable[[float, str], None]) -> Any:
+def make_integrator(mi: Any, scene: Any, config: Config, progress: Progress) -> Any:
     """Mitsuba integrator of the config's light: `path`, or `BakedIntegrator` over the scene's baked irradiance."""
     light = config.light
     if light.mode == "path":

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsgen.config.config import Config, TrajectoryConfig
+from rsgen.console.progress import Progress
 from rsgen.console.scheduler import Workers
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_yaml
@@ -21,7 +22,7 @@ from rsgen.motion.clearance import check_clearance
 from rsgen.motion.fit import FitResult, fit_spline
 from rsgen.motion.make import make_motion
 from rsgen.produce.distribute import engine_versions, render_blocks, render_shots
-from rsgen.produce.frame_source import FrameSource, Progress, load_scene, scene_hash
+from rsgen.produce.frame_source import FrameSource, load_scene, scene_hash
 from rsgen.produce.writer import SequenceWriter
 from rsgen.sequence.format import STREAMS, stream_stamps
 from rsgen.sequence.trajectory import Trajectory, read_trajectory

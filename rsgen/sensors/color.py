@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rsgen import srgb
 from rsgen.config.sensors import ColorNoiseConfig
-from rsgen.sensors.response import FloatImage, power_law, quantise8, s_curve, srgb, to_srgb8
+from rsgen.sensors.response import FloatImage, power_law, quantise8, s_curve, to_srgb8
 
 # Codes of black and white in the 16-bit raw image. As in real raw files black is not 0, so that noise is not cut off
 # there, which would brighten the dark.
@@ -35,7 +36,7 @@ def apply_color_noise(linear: FloatImage, config: ColorNoiseConfig, rng: np.rand
         raw = add_sensor_noise(raw, config.full_well_e, config.read_noise_e, config.gain, rng)
     rgb = np.minimum(raw, 1) if config.bayer == "off" else demosaic(raw, config.bayer)
     rgb = np.clip(rgb * np.array(config.white_balance, np.float32), 0, 1)
-    encoded = srgb(rgb) if config.response == "srgb" else power_law(rgb, config.gamma)
+    encoded = srgb.encode(rgb) if config.response == "srgb" else power_law(rgb, config.gamma)
     return quantise8(s_curve(encoded, config.contrast) if config.contrast > 0 else encoded)
 
 

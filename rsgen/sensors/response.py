@@ -5,17 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from rsgen import srgb
+
 FloatImage = NDArray[np.float32]
 
 
 def to_srgb8(linear: FloatImage, gain: float = 1.0) -> NDArray[np.uint8]:
     """8-bit sRGB (IEC 61966-2-1) of linear values times `gain`, clipped to [0, 1]; any shape."""
-    return quantise8(srgb(np.clip(linear * np.float32(gain), 0, 1)))
-
-
-def srgb(x: FloatImage) -> FloatImage:
-    """Non-linear sRGB (IEC 61966-2-1) in [0, 1] of linear values in [0, 1]; any shape."""
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, np.float32(1 / 2.4)) - 0.055)
+    return quantise8(srgb.encode(np.clip(linear * np.float32(gain), 0, 1)))
 
 
 def power_law(x: FloatImage, gamma: float) -> FloatImage:

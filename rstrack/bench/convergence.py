@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.so3 import FloatArray
@@ -28,7 +29,6 @@ from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.metrics.association import angles_deg
 from rstrack.options import Options
 from rstrack.tracking.lost_track import FitHistory
-from rstrack.tracking.run import Progress
 from rstrack.tracking.spline_tracker import observe
 from rstrack.tracking.window import Window
 

@@ -19,6 +19,7 @@ from evo.tools import file_interface
 from scipy.spatial.transform import Rotation
 
 from rsgen.config.config import Config
+from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
 from rsgen.export import folder
 from rsgen.export.euroc import export_euroc
@@ -234,7 +235,7 @@ def test_images_are_copied_where_links_cannot_be(
 
     monkeypatch.setattr(folder.os, "link", no_link)
     source = plain.streams["color"].paths[0]
-    place_images([source], [tmp_path / "a.png"], False, folder.no_progress)
+    place_images([source], [tmp_path / "a.png"], False, no_progress)
     assert (tmp_path / "a.png").read_bytes() == source.read_bytes()
 
 

@@ -416,7 +416,7 @@ FAULTS: dict[str, tuple[Fault, str]] = {
     "bad distortion": (camera(model="radtan", distortion=[1.0]), "radtan takes 4 or 5"),
     "skewed extrinsics": (
         lambda root: write_camera(root, {"color": COLOR, "T_color_depth": (2 * np.eye(4)).tolist()}),
-        "T_color_depth is not a rigid transform",
+        "T_color_depth: not a rigid transform",
     ),
     "opencv, empty": (opencv(), "no camera matrix for color: add .*keys that are there: none"),
     "opencv, no readout": (opencv(K=K, foo=1.0), "no readout time for color: add 'readout_s.*are there: k, foo"),
