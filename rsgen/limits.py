@@ -8,6 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import AfterValidator
 
+from rsgen.array_types import FloatArray
+
 MOST_M = 1e6
 """No coordinate of a scene or a pose is larger, m: float32 places a point to 6 cm there."""
 
@@ -29,7 +31,7 @@ def limits(low: float, high: float, why: str, or_zero: bool = False) -> AfterVal
     return AfterValidator(check)
 
 
-def rigid(value: npt.ArrayLike, tolerance: float = 2e-5) -> npt.NDArray[np.float64]:
+def rigid(value: npt.ArrayLike, tolerance: float = 2e-5) -> FloatArray:
     """The value as an array (4, 4), if it is a rigid transform with its translation within MOST_M.
 
     tolerance: how far R Rᵀ may be from the identity. Raises ValueError.

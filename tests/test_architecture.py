@@ -17,7 +17,9 @@ ROOT = Path(__file__).parents[1]
 SOURCES = sorted((ROOT / "rsgen").rglob("*.py"))
 TRACKER = sorted((ROOT / "rstrack").rglob("*.py"))
 # What rstrack builds on; the rest of rsgen renders, or is about rendering.
-SHARED = ("errors", "figures", "files", "limits", "geometry", "sequence", "device", "console")
+SHARED = (
+    "array_types", "console", "device", "errors", "figures", "files", "geometry", "limits", "sequence", "srgb",
+)  # fmt: skip
 ENGINES = ("mitsuba", "drjit")
 CONFIGS = sorted(path for path in (ROOT / "configs").glob("*.yaml") if path.stem != "evaluation")
 

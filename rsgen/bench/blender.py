@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsgen.array_types import Float32Array, FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
@@ -43,7 +44,7 @@ class Exposure:
     line_share: each line's exposure as a share of that time; None for a still, whose path has one pose.
     """
 
-    T_world_cam: NDArray[np.float64]
+    T_world_cam: FloatArray
     line_share: float | None
 
 
@@ -121,7 +122,7 @@ class BlenderRenderer(AbstractContextManager["BlenderRenderer"]):
         """Seconds that Blender takes to render exposure `index`. Raises UserError if it fails."""
         return float(self._ask(index, None)["seconds"])
 
-    def render(self, index: int) -> NDArray[np.float32]:
+    def render(self, index: int) -> Float32Array:
         """Linear RGB (h, w, 3) of exposure `index`. Raises UserError if Blender fails."""
         import OpenEXR
 

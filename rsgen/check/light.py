@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
 from rsgen import srgb
+from rsgen.array_types import FloatArray
 from rsgen.config.config import Config
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
@@ -44,7 +44,7 @@ def check_light(
     ours = ColorRenderer(scene, baked, camera, Shutter(), _BAKED_SPP)
     theirs = ColorRenderer(scene, reference, camera, Shutter(), _REFERENCE_PASS)
     table = Table("view", "time, s", "PSNR, dB", "bias, %", f"at least {PSNR_FLOOR_DB:g}")
-    rows: list[list[NDArray[np.float64]]] = []
+    rows: list[list[FloatArray]] = []
     psnrs: list[float] = []
     passes = max(1, spp // _REFERENCE_PASS)
     for view, stamp in enumerate(spread_times(motion, views)):
@@ -93,7 +93,7 @@ def _scaled(config: Config, width: int) -> Any:
     )  # fmt: skip
 
 
-def spread_times(motion: Motion, count: int) -> NDArray[np.float64]:
+def spread_times(motion: Motion, count: int) -> FloatArray:
     """`count` instants spread over the recording, its very ends left out."""
     fraction = (np.arange(count) + 0.5) / count
     return motion.first_stamp + fraction * (motion.last_stamp - motion.first_stamp)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
+from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.sequence.reader import Sequence
@@ -60,7 +60,7 @@ def raycast_sequence(sequence: Sequence, count: int) -> RaycastErrors:
     return RaycastErrors(frames, shares, float(np.median(differences)))
 
 
-def _cast(caster: object, sequence: Sequence, k: int) -> NDArray[np.float64]:
+def _cast(caster: object, sequence: Sequence, k: int) -> FloatArray:
     """Planar z (h, w) of listed depth frame k, 0 where a ray hits nothing."""
     camera = sequence.streams["depth"].camera
     uv = camera.pixel_grid().reshape(-1, 2)

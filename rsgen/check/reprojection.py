@@ -6,11 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from rsgen.array_types import BoolArray, FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.shutter import project_rolling
-from rsgen.sequence.format import FloatArray
 from rsgen.sequence.reader import Sequence
 
 # Depth is interpolated bilinearly in 1/z, exact on planes. Where second differences say that this is off by more, there
@@ -65,7 +64,7 @@ def depth_points(sequence: Sequence, k: int) -> FloatArray:
     return se3.transform(sequence.pixel_poses("depth", k, uv), camera.backproject(uv, z[z > 0]))
 
 
-def _interpolate_inverse(z: FloatArray, uv: FloatArray) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+def _interpolate_inverse(z: FloatArray, uv: FloatArray) -> tuple[FloatArray, BoolArray]:
     """z (n,) at pixels uv (n, 2), bilinear in 1/z, and where that holds: inside, measured, smooth."""
     h, w = z.shape
     inverse = np.where(z > 0, 1 / np.where(z > 0, z, 1.0), 0.0)

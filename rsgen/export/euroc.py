@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from rsgen.array_types import FloatArray
 from rsgen.config.imu import ImuConfig
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
@@ -30,7 +31,6 @@ from rsgen.export.folder import (
 )
 from rsgen.files import atomic_write, encode_yaml
 from rsgen.geometry import se3
-from rsgen.geometry.so3 import FloatArray
 from rsgen.sensors.imu import ImuSamples, nanoseconds, write_imu_csv
 from rsgen.sequence.format import ground_truth, pose_rows
 from rsgen.sequence.reader import Sequence, Stream

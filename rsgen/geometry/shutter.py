@@ -15,10 +15,11 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.array_types import BoolArray, FloatArray, IntArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rsgen.geometry.camera import BoolArray, Camera
-from rsgen.geometry.so3 import FloatArray, cross, hat
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.so3 import cross, hat
 from rsgen.geometry.spline import Side, Spline
 
 Scan = Literal["top-bottom", "bottom-top", "left-right", "right-left"]
@@ -140,7 +141,7 @@ def rolling_shutter_jacobian(
     t: npt.ArrayLike,
     p_world: npt.ArrayLike,
     side: Side = "left",
-) -> tuple[npt.NDArray[np.int64], FloatArray]:
+) -> tuple[IntArray, FloatArray]:
     """Total derivative of `project_rolling`'s pixel by the control points, the line's own change of time included.
 
     Takes the times t (...,) that it found for points (..., 3), valid ones only. Returns the index of the first control

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import zeta
 
-FloatArray = npt.NDArray[np.float64]
+from rsgen.array_types import FloatArray
 
 # The Jacobians' coefficients divide a difference that cancels by up to theta**5. Below one radian their power series in
 # theta**2, cut off under 1e-17, is the more exact form; above it the closed form loses two digits at most.

@@ -22,6 +22,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from rsgen.array_types import Float32Array
 from rsgen.config.config import LightConfig
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
@@ -93,7 +94,7 @@ def _reporter(progress: Progress, begin: float, span: float, what: str) -> Calla
     return lambda fraction: progress("light", begin + span * fraction, what)
 
 
-def _table(values: NDArray, alive: NDArray) -> NDArray[np.float32]:
+def _table(values: NDArray, alive: NDArray) -> Float32Array:
     return np.where(alive[:, None], np.concatenate([values, alive[:, None]], axis=1), 0).astype(np.float32)
 
 

@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rsgen import srgb
+from rsgen.array_types import ByteArray, Float32Array, FloatArray, IntArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import read_bytes
@@ -28,7 +28,6 @@ from rsgen.limits import MOST_M
 from rsgen.motion.paths import look_at
 from rsgen.sensors.response import to_srgb8
 
-Array = NDArray[np.float64]
 Point = tuple[float, float, float]
 
 SUFFIXES = (".png", ".jpg", ".svg", ".pdf")
@@ -55,12 +54,12 @@ _R4 = (0.8566748838545029, 0.7338918566271260, 0.6287067210378087, 0.53859725722
 class ColoredMesh:
     """vertices (n, 3) m, world; faces (m, 3); unit normals (n, 3) smoothed over neighbours; linear colours (n, 3)."""
 
-    vertices: NDArray[np.float32]
-    faces: NDArray[np.int64]
-    normals: NDArray[np.float32]
-    colors: NDArray[np.float32]
+    vertices: Float32Array
+    faces: IntArray
+    normals: Float32Array
+    colors: Float32Array
 
-    def facing(self, eye: Array) -> ColoredMesh:
+    def facing(self, eye: FloatArray) -> ColoredMesh:
         """Only the triangles whose front (counter-clockwise) is turned to `eye` (3,), m, world."""
         corners = self.vertices[self.faces]
         to_eye = eye.astype(np.float32) - corners[:, 0]
@@ -73,7 +72,7 @@ class View:
     """A pinhole camera and its pose T_world_cam (4, 4): x right, y down, z forward."""
 
     camera: Camera
-    T_world_cam: Array
+    T_world_cam: FloatArray
 
 
 def picture_meshes(
@@ -182,7 +181,7 @@ def frame_meshes(
     return View(camera, T_world_cam)
 
 
-def render_mesh(mesh: ColoredMesh, view: View, reach: float) -> NDArray[np.uint8]:
+def render_mesh(mesh: ColoredMesh, view: View, reach: float) -> ByteArray:
     """8-bit sRGB picture (h, w, 3) of a mesh on white: every triangle of it, whichever way it faces.
 
     reach: m, within which a surface darkens its neighbours.
@@ -208,7 +207,7 @@ def render_mesh(mesh: ColoredMesh, view: View, reach: float) -> NDArray[np.uint8
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _launch(scene: Any, colors: Any, view: View, reach: float, first: int, count: int) -> Array:
+def _launch(scene: Any, colors: Any, view: View, reach: float, first: int, count: int) -> FloatArray:
     """Sum (pixels, 3), linear, of samples first..first+count of every pixel."""
     import drjit as dr
     import mitsuba as mi
@@ -271,7 +270,7 @@ def _check(
         raise UserError(f"--width {size[0]} --height {size[1]}: must lie in 16 to {MAX_SIZE_PX} px")
 
 
-def _side_by_side(images: Sequence[NDArray[np.uint8]], labels: Sequence[str]) -> Any:
+def _side_by_side(images: Sequence[ByteArray], labels: Sequence[str]) -> Any:
     """A figure of images (h, w, 3) pixel by pixel, each under its label."""
     import matplotlib.pyplot as plt
 
@@ -289,12 +288,12 @@ def _side_by_side(images: Sequence[NDArray[np.uint8]], labels: Sequence[str]) ->
     return figure
 
 
-def _face_normals(corners: NDArray[np.float32]) -> NDArray[np.float32]:
+def _face_normals(corners: Float32Array) -> Float32Array:
     """Normals (m, 3) of triangles (m, 3, 3), counter-clockwise seen from their front, as long as twice their area."""
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
-def _vertex_normals(vertices: NDArray[np.float32], faces: NDArray[np.int64]) -> NDArray[np.float32]:
+def _vertex_normals(vertices: Float32Array, faces: IntArray) -> Float32Array:
     """Unit normals (n, 3), the mean of the neighbouring triangles' by area; +y where they cancel."""
     normal = _face_normals(vertices[faces])
     corner = faces.ravel()

@@ -16,6 +16,7 @@ from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from rsgen.array_types import FloatArray
 from rsgen.config.config import Config
 from rsgen.console.progress import Progress, no_progress
 from rsgen.console.scheduler import Workers
@@ -24,7 +25,7 @@ from rsgen.files import atomic_write
 from rsgen.geometry.spline import Spline
 from rsgen.produce.frame_source import ColorShot, DepthShot, FrameSource, scene_hash
 from rsgen.produce.writer import SequenceWriter
-from rsgen.sequence.format import FloatArray, StreamName
+from rsgen.sequence.format import StreamName
 
 # Written frames that may wait for the disk: bounds memory and how much a kill can lose.
 _WRITE_AHEAD = 4

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rsgen.array_types import FloatArray
 from rsgen.config.config import Config, TrajectoryConfig
 from rsgen.console.progress import Progress
 from rsgen.console.scheduler import Workers
@@ -75,7 +75,7 @@ def _recorded(settings: TrajectoryConfig) -> Trajectory:
     return trajectory
 
 
-def sequence_stamps(config: Config, motion: Motion) -> dict[str, NDArray[np.float64]]:
+def sequence_stamps(config: Config, motion: Motion) -> dict[str, FloatArray]:
     """Stamps (n,) in seconds of all frames of both streams."""
     return {s: stream_stamps(motion.first_stamp, motion.last_stamp, getattr(config, s)) for s in STREAMS}
 
@@ -126,7 +126,7 @@ def _chosen(missing: Iterable[int], frames: slice, count: int) -> list[int]:
     return [k for k in missing if k in wanted]
 
 
-def scene_triangles(scene: Any) -> NDArray[np.float64]:
+def scene_triangles(scene: Any) -> FloatArray:
     """Corners (m, 3, 3) of all triangles of a Mitsuba scene, world frame, metres."""
     from rsgen.render.scene import surface
 

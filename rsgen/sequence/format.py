@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from rsgen.array_types import FloatArray
 from rsgen.errors import UserError, first_problem
 from rsgen.files import read_yaml
 from rsgen.geometry import se3, so3
@@ -35,7 +36,6 @@ DEPTH_SCALE = 5000.0  # units per metre of depth images, unless told otherwise: 
 STAMP_TOLERANCE_S = 1e-6
 _FRAMES_AT_ONCE = 16  # poses of so many frames' lines are evaluated together: flat memory, little overhead
 
-FloatArray = npt.NDArray[np.float64]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Seconds = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]

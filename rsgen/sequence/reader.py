@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.array_types import ByteArray, Float32Array, FloatArray, IntArray
 from rsgen.errors import UserError
 from rsgen.files import read_exr, read_npy, read_png, read_text
 from rsgen.geometry.camera import Camera
@@ -26,7 +27,6 @@ from rsgen.sequence.format import (
     STAMP_TOLERANCE_S,
     STREAMS,
     TRUTH_DEPTH,
-    FloatArray,
     Line,
     StreamName,
     StreamYaml,
@@ -57,7 +57,7 @@ class Stream:
     first_stamp_s: float
     stamps: FloatArray
     paths: tuple[Path, ...]
-    indices: npt.NDArray[np.int64]
+    indices: IntArray
 
     @property
     def line_count(self) -> int:
@@ -84,7 +84,7 @@ class Sequence:
     def _rows(self) -> dict[StreamName, FloatArray]:
         return {}
 
-    def color(self, k: int) -> npt.NDArray[np.uint8]:
+    def color(self, k: int) -> ByteArray:
         """Colour image k, sRGB (h, w, 3)."""
         camera = self.streams["color"].camera
         return read_png(self.streams["color"].paths[k], (camera.height, camera.width, 3), np.uint8)
@@ -94,11 +94,11 @@ class Sequence:
         camera = self.streams["depth"].camera
         return read_png(self.streams["depth"].paths[k], (camera.height, camera.width), np.uint16)
 
-    def depth(self, k: int) -> npt.NDArray[np.float32]:
+    def depth(self, k: int) -> Float32Array:
         """Planar z (h, w) in metres that the sensor reports, 0 where nothing was measured."""
         return (self.depth_units(k) / self.streams["depth"].depth_scale).astype(np.float32)
 
-    def truth_depth(self, k: int) -> npt.NDArray[np.float32]:
+    def truth_depth(self, k: int) -> Float32Array:
         """Exact planar z (h, w) in metres, noise-free, with the same rolling shutter; 0 where there is none."""
         camera = self.streams["depth"].camera
         z = read_exr(self.truth_depth_path(k), (camera.height, camera.width))

@@ -14,10 +14,10 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.array_types import BoolArray, FloatArray, IntArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 
-Array = npt.NDArray[np.float64]
 TrajectoryFormat = Literal["auto", "tum", "icl", "euroc"]
 
 ICL_RATE_HZ = 30.0
@@ -48,8 +48,8 @@ class Trajectory:
     right-handed, metres. (For EuRoC files the body is the IMU: apply ``moved(T_body_cam=...)``.)
     """
 
-    stamps: Array
-    T_world_cam: Array
+    stamps: FloatArray
+    T_world_cam: FloatArray
 
     def __post_init__(self) -> None:
         if self.stamps.ndim != 1 or self.T_world_cam.shape != (len(self.stamps), 4, 4):
@@ -62,11 +62,11 @@ class Trajectory:
         return len(self.stamps)
 
     @property
-    def positions(self) -> Array:
+    def positions(self) -> FloatArray:
         """(n, 3) metres: the camera's centre in the world."""
         return self.T_world_cam[:, :3, 3]
 
-    def moved(self, T_scene_world: Array | None = None, T_body_cam: Array | None = None) -> Trajectory:
+    def moved(self, T_scene_world: FloatArray | None = None, T_body_cam: FloatArray | None = None) -> Trajectory:
         """The same motion in another world frame and/or of another camera fixed to the same body; both are (4, 4)."""
         poses = self.T_world_cam
         if T_scene_world is not None:
@@ -188,7 +188,7 @@ def _detect(path: Path, records: list[tuple[int, str]]) -> Literal["tum", "icl",
     return "euroc" if comma and stamp.strip().isdigit() and len(stamp.strip()) >= 16 else "tum"
 
 
-def _table(path: Path, kind: str, records: list[tuple[int, str]]) -> Array:
+def _table(path: Path, kind: str, records: list[tuple[int, str]]) -> FloatArray:
     """(n, 8) float64: the first eight columns."""
     wanted = _FIELDS[kind]
     rows = []
@@ -212,7 +212,7 @@ def _is_number(field: str) -> bool:
     return True
 
 
-def _nanoseconds(path: Path, records: list[tuple[int, str]]) -> Array:
+def _nanoseconds(path: Path, records: list[tuple[int, str]]) -> FloatArray:
     """(n,) seconds; read as integers, since 19 digits do not fit a float64."""
     stamps = np.empty(len(records))
     for k, (line, content) in enumerate(records):
@@ -231,15 +231,15 @@ class _Checker:
     """Raises UserError for the first record whose entry in an (n,) bool array is false."""
 
     path: Path
-    lines: npt.NDArray[np.int64]
+    lines: IntArray
 
-    def __call__(self, good: npt.NDArray[np.bool_], complaint: Callable[[int], str]) -> None:
+    def __call__(self, good: BoolArray, complaint: Callable[[int], str]) -> None:
         bad = np.flatnonzero(~good)
         if bad.size:
             raise UserError(f"{self.path}:{self.lines[bad[0]]}: {complaint(int(bad[0]))}")
 
 
-def _check_stamps(check: _Checker, stamps: Array, max_gap_s: float | None) -> None:
+def _check_stamps(check: _Checker, stamps: FloatArray, max_gap_s: float | None) -> None:
     steps = np.diff(stamps, prepend=stamps[0] - 1.0)
     check(steps != 0.0, lambda i: f"repeats the stamp {stamps[i]:.9g} s of the line before: remove one of them")
     check(
@@ -259,7 +259,7 @@ def _check_stamps(check: _Checker, stamps: Array, max_gap_s: float | None) -> No
 # --- ICL-NUIM --------------------------------------------------------------------------------------------------------
 
 
-def _start_pose(icl_start: npt.ArrayLike | None) -> Array:
+def _start_pose(icl_start: npt.ArrayLike | None) -> FloatArray:
     """(4, 4) T_pov_cam of frame 1 from a 3x4 or 4x4 list; orthonormal, since published digits are rounded."""
     if icl_start is None:
         return np.eye(4)
@@ -276,7 +276,7 @@ def _start_pose(icl_start: npt.ArrayLike | None) -> Array:
     return se3.orthonormalise(T)
 
 
-def _icl_to_ours(T_relative: Array, T_pov_start: Array) -> Array:
+def _icl_to_ours(T_relative: FloatArray, T_pov_start: FloatArray) -> FloatArray:
     """(n, 4, 4) published start-relative poses to T_world_cam, given frame 1's pose in the POV-Ray world.
 
     POV-Ray's world is left-handed (x right, y up, z forward) and so is its camera, so that the rotation between them

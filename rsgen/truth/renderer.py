@@ -27,7 +27,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from rsgen.array_types import FloatArray
+from rsgen.array_types import Float32Array, FloatArray
 from rsgen.config.sections import ColorConfig
 from rsgen.config.truth import GlobalTime, TruthConfig
 from rsgen.device.lens import Lens, contains
@@ -79,9 +79,7 @@ class TruthRenderer:
             images |= self._geometry(T_world_cam, stamp, next_stamp)
         return {name: images[name] for name in truth.images}
 
-    def _geometry(
-        self, T_world_cam: PoseFunction, stamp: float, next_stamp: float | None
-    ) -> dict[str, NDArray[np.float32]]:
+    def _geometry(self, T_world_cam: PoseFunction, stamp: float, next_stamp: float | None) -> dict[str, Float32Array]:
         camera, shutter, truth = self._camera, self._shutter, self._truth
         self._sensor.expose(T_world_cam, stamp)
         reference = np.asarray(T_world_cam(np.array([stamp])), float).reshape(4, 4)[:3, 3]

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
-from rsgen.geometry.so3 import FloatArray
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate, plain
 from rstrack.metrics.association import Truth, compare, truth_of

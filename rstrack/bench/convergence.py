@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.spline_state import SplineState

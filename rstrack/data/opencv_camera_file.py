@@ -28,11 +28,11 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
+from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera, Model
 from rsgen.geometry.shutter import Shutter
-from rsgen.geometry.so3 import FloatArray
 from rsgen.limits import rigid
 from rstrack.data.rig import Rig
 

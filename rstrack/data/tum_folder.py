@@ -21,10 +21,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.files import png_fault, read_bytes, read_text
 from rsgen.geometry.camera import Camera
-from rsgen.geometry.so3 import FloatArray
 from rsgen.sequence.trajectory import ICL_RATE_HZ, Trajectory, read_trajectory
 from rstrack.data.camera_file import EXAMPLE, RigFile, read_rig
 from rstrack.data.rig import Rig

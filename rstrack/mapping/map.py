@@ -12,13 +12,13 @@ from typing import Any, Literal
 
 import numpy as np
 
+from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.device.arrays import Engine, Kernels, engine
 from rsgen.device.lens import Lens
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.shutter import Shutter
-from rsgen.geometry.so3 import FloatArray
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.data.prefetch import prefetched

@@ -14,16 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.files import read_bytes
 from rsgen.geometry import se3
-from rsgen.geometry.so3 import FloatArray
 from rsgen.sequence.reader import Sequence, read_sequence
-
-IntArray = npt.NDArray[np.int64]
 
 # Triangles are cut until no edge is longer (m): then few of them can hold a point's nearest.
 _LONGEST_EDGE = 0.04

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
-from rsgen.geometry.so3 import FloatArray
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate
 from rstrack.data.prefetch import prefetched

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
-from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.bench.methods import paper
 from rstrack.bench.methods.grid import Results, SequenceInfo
