@@ -18,7 +18,6 @@ from rsgen.sequence.format import DEPTH_SCALE
 Coordinate = Annotated[float, limits(-MOST_M, MOST_M, "m")]
 Pixels = Annotated[float, limits(-1e6, 1e6, "px")]
 Seconds = Annotated[float, limits(1e-9, 3600, "s", or_zero=True)]
-Vector4 = tuple[float, float, float, float]
 Row34 = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 Matrix34 = tuple[Row34, Row34, Row34]
 _LEAST_FOCAL_PX = 0.01

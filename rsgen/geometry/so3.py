@@ -92,14 +92,6 @@ def hat_squared(v: npt.ArrayLike) -> FloatArray:
     return out
 
 
-def vee(m: npt.ArrayLike) -> FloatArray:
-    """Inverse of `hat`: vectors (..., 3) of the skew-symmetric part of (..., 3, 3)."""
-    m = np.asarray(m, dtype=np.float64)
-    return 0.5 * np.stack(
-        [m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]], axis=-1
-    )
-
-
 def polynomial(phi: FloatArray, first: npt.ArrayLike, second: npt.ArrayLike) -> FloatArray:
     """I + first · hat(phi) + second · hat(phi)², (..., 3, 3), of vectors (..., 3) and coefficients (...,)."""
     out = np.asarray(second)[..., None, None] * hat_squared(phi)

@@ -26,7 +26,7 @@ from rsgen.array_types import Float32Array
 from rsgen.config.config import LightConfig
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
-from rsgen.light.bake_points import Interpolation, Points, sample_points, thin
+from rsgen.light.bake_points import Interpolation, SurfacePoints, sample_points, thin
 from rsgen.render.irradiance import IrradianceField, Lattice, make_field
 
 log = logging.getLogger("rsgen")
@@ -115,7 +115,7 @@ def _r2(i: Any, offset: Any) -> Any:
     return mi.Point2f(x - dr.floor(x), y - dr.floor(y))
 
 
-def _chunks(points: Points, which: NDArray, report: Callable[[float], None]):
+def _chunks(points: SurfacePoints, which: NDArray, report: Callable[[float], None]):
     for begin in range(0, len(which), _CHUNK):
         part = which[begin : begin + _CHUNK]
         p, n, g = (mi.Vector3f(a[part].T) for a in (points.position, points.normal, points.geometric))
@@ -123,7 +123,9 @@ def _chunks(points: Points, which: NDArray, report: Callable[[float], None]):
         report(min(1.0, (begin + len(part)) / len(which)))
 
 
-def _direct(scene: Any, points: Points, which: NDArray, samples: int, report: Callable[[float], None]) -> NDArray:
+def _direct(
+    scene: Any, points: SurfacePoints, which: NDArray, samples: int, report: Callable[[float], None]
+) -> NDArray:
     """Direct irradiance (len(which), 3) from all emitters, `samples` for each."""
     out = np.zeros((len(which), 3), np.float32)
     emitters = scene.emitters()
@@ -181,7 +183,12 @@ def _light_share(light_pdf: Any, cosine: Any) -> Any:
 
 
 def _gather(
-    scene: Any, field: IrradianceField, points: Points, which: NDArray, rays: int, report: Callable[[float], None]
+    scene: Any,
+    field: IrradianceField,
+    points: SurfacePoints,
+    which: NDArray,
+    rays: int,
+    report: Callable[[float], None],
 ) -> NDArray:
     """Irradiance (len(which), 3) that arrives from other surfaces, each lit as `field` says.
 

@@ -25,7 +25,7 @@ _SMOOTHING = 0.3  # spacings: closer sources than this count alike
 
 
 @dataclass(frozen=True)
-class Points:
+class SurfacePoints:
     """Unique sample points: position on the surface, shading normal, geometric normal, (n, 3) float32 each, and (n,)
     the number of the piece of surface that each lies on: one side of a connected part of a mesh.
     """
@@ -36,7 +36,7 @@ class Points:
     piece: IntArray
 
 
-def sample_points(scene: Any, lattice: Lattice) -> tuple[Points, IntArray]:
+def sample_points(scene: Any, lattice: Lattice) -> tuple[SurfacePoints, IntArray]:
     """Unique points of both sides of the lattice, and (2, points) index of each lattice point's front and back one."""
     face, uv = lattice_barycentric(lattice)
     count = len(face)
@@ -74,7 +74,7 @@ def sample_points(scene: Any, lattice: Lattice) -> tuple[Points, IntArray]:
         index[side] = inverse + offset
         offset += len(first)
     front, back = unique_first
-    return Points(
+    return SurfacePoints(
         np.concatenate([position[front], position[back]]),
         np.concatenate([normal[front], -normal[back]]),
         np.concatenate([geometric[front], -geometric[back]]),
@@ -116,7 +116,7 @@ def _surface_at(shape: Any, face: NDArray[np.uint32], uv: Float32Array) -> tuple
     return tuple(np.array(v, np.float32).reshape(3, -1).T for v in (si.p, si.sh_frame.n, si.n))  # type: ignore[return-value]
 
 
-def thin(points: Points, spacing: float, among: IntArray | None = None) -> tuple[IntArray, IntArray]:
+def thin(points: SurfacePoints, spacing: float, among: IntArray | None = None) -> tuple[IntArray, IntArray]:
     """Of `among` (default: all), one in each cell of `spacing` metres, of like normals on one piece of surface.
 
     Returns the chosen ones as indices into `among`, and for each of `among` which of the chosen stands for it.
@@ -145,7 +145,7 @@ class Interpolation:
     weights: Float32Array
 
     @classmethod
-    def between(cls, points: Points, sources: NDArray, targets: NDArray, spacing: float) -> Interpolation:
+    def between(cls, points: SurfacePoints, sources: NDArray, targets: NDArray, spacing: float) -> Interpolation:
         """By distance in position (in units of `spacing` metres) and normal together, within one piece of surface.
 
         The dark inside of a thin sheet is a millimetre from its lit outside and has the normal of the other outside.

@@ -5,7 +5,6 @@ A file is checked completely before anything is returned; each complaint is one 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -287,11 +286,3 @@ def _icl_to_ours(T_relative: FloatArray, T_pov_start: FloatArray) -> FloatArray:
     T_start_cam[:, 2, 3] -= _ICL_Z_OFFSET_M
     mirror_x, mirror_y = np.diag([-1.0, 1.0, 1.0, 1.0]), np.diag([1.0, -1.0, 1.0, 1.0])
     return mirror_x @ T_pov_start @ T_start_cam @ mirror_y
-
-
-def icl_start_from_pov_pose(line: str) -> list[list[float]]:
-    """The 3x4 ``icl_start`` in a line of a POV-Ray pose list: ``frame r00 r01 r02 tx r10 ... tz`` (frame 1's line)."""
-    values = [float(field) for field in line.split()]
-    if len(values) != 13 or not all(math.isfinite(value) for value in values):
-        raise UserError("a POV-Ray pose line has 13 numbers: frame r00 r01 r02 tx r10 r11 r12 ty r20 r21 r22 tz")
-    return [values[1:5], values[5:9], values[9:13]]

@@ -25,6 +25,7 @@ from rendering import (
     room_meshes,
     room_xml,
 )
+from shutter_reference import line_window
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from rsgen.config.sections import ColorConfig
@@ -220,7 +221,7 @@ def test_geometry_agrees_with_float64_and_an_independent_ray_caster(
     assert np.mean(np.abs(images["normals"] - n_cam).max(axis=-1)[same] < 1e-5) > 0.995
 
     # Equation (13), with the line's window from the shutter and the poses from the spline.
-    opened, closed = shutter.line_window(STAMP, shutter.line_of_pixel(grid, camera).ravel(), camera)
+    opened, closed = line_window(shutter, STAMP, shutter.line_of_pixel(grid, camera).ravel(), camera)
     x_begin, x_end = (camera.project(se3.transform(se3.inverse(motion(t)), p))[0] for t in (opened, closed))
     blur = np.linalg.norm(x_end - x_begin, axis=-1).reshape(shape)
     np.testing.assert_allclose(images["blur_length"][same], blur[same], atol=3e-4)
