@@ -22,7 +22,6 @@ from typing import Any
 
 import drjit as dr
 
-from rsgen.array_types import FloatArray
 from rsgen.device.arrays import Engine
 from rsgen.device.lens import Lens
 from rsgen.device.projection import TO_BASE, gather, move, project_rolling
