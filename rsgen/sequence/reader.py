@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from rsgen.array_types import ByteArray, Float32Array, FloatArray, IntArray
 from rsgen.errors import UserError
-from rsgen.files import read_exr, read_npy, read_png, read_text
+from rsgen.files import listed_file, read_exr, read_npy, read_png, read_text
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
@@ -231,7 +231,8 @@ def _read_stream(root: Path, name: StreamName, yaml: StreamYaml) -> Stream:
     if not lines:
         raise UserError(f"{listing}: lists no frame: run 'rsgen render' again to finish it")
     real_root = root.resolve()
-    paths = tuple(_inside(root, real_root, listing, line) for line in lines)
+    missing = "run the same 'rsgen render' again"
+    paths = tuple(listed_file(root, real_root, line.path, f"{listing} line {line.number}", missing) for line in lines)
     indices = np.array([_index(listing, line, yaml) for line in lines], np.int64)
     stamps = np.array([line.stamp for line in lines])
     try:
@@ -241,22 +242,6 @@ def _read_stream(root: Path, name: StreamName, yaml: StreamYaml) -> Stream:
     scale = yaml.depth_scale if name == "depth" and yaml.depth_scale is not None else 0.0
     clock = (yaml.rate_hz, yaml.offset_s, scale, yaml.frames, yaml.first_stamp_s)
     return Stream(name, camera, shutter, *clock, stamps, paths, indices)
-
-
-def _inside(root: Path, real_root: Path, listing: Path, line: Line) -> Path:
-    """The listed file, which has to lie in the folder even once symbolic links are followed."""
-    where = f"{listing} line {line.number}"
-    path = root / line.path
-    try:
-        real = path.resolve()
-        exists = real.is_file()
-    except (OSError, ValueError, RuntimeError):
-        raise UserError(f"{where}: {line.path[:60]!r} is not a usable path") from None
-    if Path(line.path).is_absolute() or ".." in Path(line.path).parts or not real.is_relative_to(real_root):
-        raise UserError(f"{where}: path {line.path!r} leaves the sequence's folder")
-    if not exists:
-        raise UserError(f"{where}: {path} is missing: run the same 'rsgen render' again")
-    return path
 
 
 def _index(listing: Path, line: Line, yaml: StreamYaml) -> int:

@@ -394,7 +394,7 @@ FAULTS: dict[str, tuple[Fault, str]] = {
     "missing image": (listing("depth.txt", f"0.1 {DEPTH_0}", "0.2 depth/x.png"), r"line 2: .*depth/x\.png is missing"),
     "absolute path": (listing("depth.txt", "0.1 /etc/hostname"), "line 1: path '/etc/hostname' leaves"),
     "parent path": (listing("depth.txt", "0.1 ../secret.png"), r"line 1: path '\.\./secret\.png' leaves"),
-    "link out": (outside, r"depth\.txt line 3: .*leaves the dataset"),
+    "link out": (outside, r"depth\.txt line 3: .*leaves the folder"),
     "nul in path": (listing("depth.txt", "0.1 depth/\0.png"), "line 1: .*not a usable path"),
     "truncated depth": (rewrite(DEPTH_0, lambda data: data[:-30]), rf"{DEPTH_0}: .*truncated"),
     "flipped bit": (rewrite(DEPTH_0, flip), rf"{DEPTH_0}: .*checksum"),
