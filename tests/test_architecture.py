@@ -100,7 +100,7 @@ def test_the_tracker_imports_only_what_is_shared(path: Path) -> None:
 
 @pytest.mark.parametrize("path", sorted((ROOT / "rsgen/geometry").glob("*.py")), ids=name)
 def test_geometry_imports_numpy_and_scipy_only(path: Path) -> None:
-    allowed = ("numpy", "scipy", "rsgen.errors", "rsgen.geometry")
+    allowed = ("numpy", "scipy", "rsgen.array_types", "rsgen.errors", "rsgen.geometry")
     for module in imports(path):
         known = module.split(".")[0] in sys.stdlib_module_names or module == "rsgen"
         assert known or any(module == a or module.startswith(f"{a}.") for a in allowed), module

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from rsgen.array_types import Float32Array, FloatArray
 from rsgen.bench.table import AVERAGED, BLUR_S, READOUT_S, BenchTimes, ModeTimes
 from rsgen.check.light import lit_scene, spread_times
 from rsgen.config.config import Config

@@ -87,7 +87,7 @@ class Bootstraps:
 
 def bootstraps(
     dataset: Dataset, options: Options, starts: int = 50, frames: int = 20, seed: int = 0,
-    progress: Progress = lambda *_: None,
+    progress: Progress = no_progress,
 ) -> Bootstraps:  # fmt: skip
     """Track `frames` frames from each of `starts` random frames (fewer if there are not so many), a new tracker each.
 

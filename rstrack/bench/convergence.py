@@ -131,7 +131,7 @@ class Convergence:
 
 
 def convergence(
-    dataset: Dataset, options: Options, pairs: int = 50, seed: int = 0, progress: Progress = lambda *_: None
+    dataset: Dataset, options: Options, pairs: int = 50, seed: int = 0, progress: Progress = no_progress
 ) -> Convergence:
     """Align single frames to keyframes one to ten frames older, from poses ever farther off.
 

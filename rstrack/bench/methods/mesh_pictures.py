@@ -21,7 +21,6 @@ from rsgen.files import atomic_write, read_text, write_error
 from rstrack.bench.methods.grid import CELL, Cell, Results, SequenceInfo
 from rstrack.mapping.map import run_map
 from rstrack.options import MapOptions
-from rstrack.tracking.run import Progress
 
 SHOWN = ("rs-pg", "gs-pg", "baseline")
 """The methods whose maps are compared: ours, the same without its model of the shutter, and the usual way."""

@@ -112,7 +112,7 @@ _TABLES = ("color", "depth", "tracking")
 
 
 def run_stress(
-    config: Path, out: Path, options: StressOptions, progress: Progress = lambda *_: None, render: Render | None = None
+    config: Path, out: Path, options: StressOptions, progress: Progress = no_progress, render: Render | None = None
 ) -> StressResult:
     """Render, track, fuse and score all cases. Raises UserError: a config, a render or a folder that does not do.
 
