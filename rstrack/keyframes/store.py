@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import replace
 
+from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
-from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.archive import Archive

@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
+from rsgen.array_types import FloatArray, IntArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.format import associate
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.estimate import Estimate, plain, read_estimate
-from rstrack.metrics.association import ASSOCIATE_WITHIN_S, IntArray, Truth, angles_deg, compare, nearest, truth_of
+from rstrack.metrics.association import ASSOCIATE_WITHIN_S, Truth, angles_deg, compare, nearest, truth_of
 
 _RPE_DELTA_S = 1.0
 _PAIR_WITHIN_S = 0.1

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from rsgen.geometry.so3 import FloatArray
+from rsgen.array_types import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.metrics.association import Comparison, Truth, compare, truth_of

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rstrack.bench.methods.mesh_pictures import read_picture
 from rstrack.data.dataset import Dataset, open_dataset
@@ -18,7 +19,6 @@ from rstrack.report.page import Block, Card, CardRow, Cell, Chooser, Note, Page,
 from rstrack.report.pictures import frame_panels, map_pictures, shutter_sliders
 from rstrack.report.results import RESULTS, CellEntry, Figures, Results, read_results
 from rstrack.report.run import number
-from rstrack.tracking.run import Progress
 
 OURS, BASELINE = "rs-pg", "baseline"
 
@@ -56,7 +56,7 @@ _QUANTITIES = (
 )
 
 
-def bench_page(folder: Path, progress: Progress = lambda *_: None) -> Page:
+def bench_page(folder: Path, progress: Progress = no_progress) -> Page:
     """Gather everything about a benchmark's folder; sequences that are gone are left out, with a warning.
 
     progress: called with a stage, the fraction done and a note. Raises UserError.

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rsgen.geometry.so3 import FloatArray
+from rsgen.array_types import FloatArray
 from rstrack.report.page import Figure
 
 TRUE_COLOR = "#8a919e"

@@ -14,9 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.alignment import brightness
 from rstrack.alignment.independence import Independence

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from rsgen.geometry.so3 import FloatArray
+from rsgen.array_types import FloatArray
+from rsgen.console.progress import Progress, no_progress
 from rsgen.geometry.spline import Spline
 from rstrack.bench.methods import paper
 from rstrack.bench.methods.grid import Results, SequenceInfo
@@ -15,7 +16,6 @@ from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import read_estimate
 from rstrack.metrics.association import Comparison, Truth, compare, truth_of
 from rstrack.metrics.plot import broken, view_from_above
-from rstrack.tracking.run import Progress
 
 _COLORS = {
     "baseline": "0.55", "gs-g": "#7fb3e6", "gs-p": "#8fd0c0", "gs-pg": "#2a6fbb", "rs-g": "#f0ad66", "rs-p": "#c9a0dc",
@@ -25,7 +25,7 @@ _OTHERS = ("#2e8b57", "#8e6bbf", "#8c6d3f", "#c45a9a", "#4a4a4a", "#9aa82e")
 _TRUE = "0.1"
 
 
-def draw_plots(results: Results, out: Path, progress: Progress = lambda *_: None) -> list[Path]:
+def draw_plots(results: Results, out: Path, progress: Progress = no_progress) -> list[Path]:
     """Write plots/ate.png and plots/SEQUENCE.png into `out`; returns what was written. Raises UserError."""
     count = 1 + len(results.sequences)
     written = [out / "plots" / "ate.png"]
