@@ -131,7 +131,7 @@ def _evaluate(options: argparse.Namespace) -> int:
 
 
 def _plot(options: argparse.Namespace) -> int:
-    from rstrack.metrics.plot import run_plot
+    from rstrack.charts.runs import run_plot
 
     run_plot(options.sequence, options.run_path, options.out, options.camera)
     print(f"{options.out}: written")

@@ -123,12 +123,12 @@ def _stress(options: argparse.Namespace) -> int:
     from rsgen.console.progress import ProgressDisplay
     from rstrack.bench.stress.cases import StressOptions
     from rstrack.bench.stress.run import run_stress
-    from rstrack.bench.stress.tables import report_text, write_report
+    from rstrack.bench.stress.tables import stress_text, write_stress
 
     chosen = StressOptions(frames=options.frames, tracker=options_of(options))
     with ProgressDisplay(options.quiet) as progress:
-        report = run_stress(options.config, options.out, chosen, progress)
-    written = write_report(report, options.out)
-    print(report_text(report))
+        result = run_stress(options.config, options.out, chosen, progress)
+    written = write_stress(result, options.out)
+    print(stress_text(result))
     print(f"{options.out}: {len(written)} tables and pictures written")
     return 0

@@ -26,8 +26,9 @@ from rsgen.sequence.format import stream_stamps
 from rsgen.sequence.trajectory import read_trajectory
 from rstrack.bench.stress import run as stress
 from rstrack.bench.stress.cases import Case, StressOptions, render_cases
-from rstrack.bench.stress.run import StressReport, run_stress
-from rstrack.bench.stress.tables import gains_db, report_text, write_report
+from rstrack.bench.stress.charts import gains_db
+from rstrack.bench.stress.run import StressResult, run_stress
+from rstrack.bench.stress.tables import stress_text, write_stress
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import Estimate
 from rstrack.mapping.color_fusion import srgb_from_linear
@@ -118,7 +119,7 @@ def told_truth(dataset: Any, options: Any, out: Path, *_: Any) -> Any:
 
 
 @pytest.fixture(scope="module")
-def stressed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, StressReport]:
+def stressed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, StressResult]:
     out = tmp_path_factory.mktemp("stress")
     config = write_config(out / "tiny.yaml")
     options = StressOptions(exposures_s=(0.0, 0.02), speeds=(), sigmas_px=(1.0, 2.0), frames=FRAMES)
@@ -128,7 +129,7 @@ def stressed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, StressRepo
     return out / "made", report
 
 
-def test_blur_aware_colour_is_better_by_two_decibels(stressed: tuple[Path, StressReport]) -> None:
+def test_blur_aware_colour_is_better_by_two_decibels(stressed: tuple[Path, StressResult]) -> None:
     _, report = stressed
     gain = gains_db(report)
     assert gain["exposure_20ms"] > 2.0
@@ -141,7 +142,7 @@ def test_blur_aware_colour_is_better_by_two_decibels(stressed: tuple[Path, Stres
     assert all(row.keyframes == blurred[None].keyframes >= 1 for row in report.color)
 
 
-def test_fused_depth_has_half_the_error_of_a_frames(stressed: tuple[Path, StressReport]) -> None:
+def test_fused_depth_has_half_the_error_of_a_frames(stressed: tuple[Path, StressResult]) -> None:
     _, report = stressed
     assert len(report.depth) == 4
     for row in report.depth:
@@ -150,7 +151,7 @@ def test_fused_depth_has_half_the_error_of_a_frames(stressed: tuple[Path, Stress
         assert 1.5e-3 < row.single_m < 8e-3
 
 
-def test_scores_do_not_depend_on_the_world(stressed: tuple[Path, StressReport]) -> None:
+def test_scores_do_not_depend_on_the_world(stressed: tuple[Path, StressResult]) -> None:
     _, report = stressed
     true, found = ([r for r in report.color if r.poses == poses] for poses in ("true", "estimated"))
     assert len(true) == len(found) == 6
@@ -161,7 +162,7 @@ def test_scores_do_not_depend_on_the_world(stressed: tuple[Path, StressReport]) 
         assert (b.ssim, b.gradient) == pytest.approx((a.ssim, a.gradient), abs=2e-3)
 
 
-def test_tracking_is_compared_with_poses_at_the_end_of_exposure(stressed: tuple[Path, StressReport]) -> None:
+def test_tracking_is_compared_with_poses_at_the_end_of_exposure(stressed: tuple[Path, StressResult]) -> None:
     _, report = stressed
     rows = [(row.case, row.variant, row.ate_m) for row in report.tracking if "blur weight" not in row.variant]
     assert rows == [
@@ -171,7 +172,7 @@ def test_tracking_is_compared_with_poses_at_the_end_of_exposure(stressed: tuple[
     ]
 
 
-def test_exposures_differ_in_blur_only(stressed: tuple[Path, StressReport]) -> None:
+def test_exposures_differ_in_blur_only(stressed: tuple[Path, StressResult]) -> None:
     out, _ = stressed
     sharp, blurred = (open_dataset(out / "sequences" / f"exposure_{ms}ms") for ms in (0, 20))
     np.testing.assert_allclose(sharp.rows("color"), blurred.rows("color"), atol=1e-9)  # type: ignore[arg-type]
@@ -179,15 +180,15 @@ def test_exposures_differ_in_blur_only(stressed: tuple[Path, StressReport]) -> N
     assert not np.array_equal(sharp.images.color(5), blurred.images.color(5))
 
 
-def test_a_report_can_be_read_again(stressed: tuple[Path, StressReport]) -> None:
+def test_a_report_can_be_read_again(stressed: tuple[Path, StressResult]) -> None:
     out, report = stressed
-    files = write_report(report, out)
+    files = write_stress(report, out)
     assert all(path.stat().st_size > 0 for path in files) and len({*files}) == len(files) == 12
     read = json.loads((out / "stress.json").read_text())
     assert len(read["color"]) == len(report.color) and read["color"][0]["sigma_px"] is None
     rows = list(csv.DictReader((out / "stress_color.csv").open()))
     assert [float(row["psnr_db"]) for row in rows] == pytest.approx([row.psnr_db for row in report.color])
-    text = report_text(report)
+    text = stress_text(report)
     assert f"{gains_db(report)['exposure_20ms']:+.2f}" in text and "nan" not in text
     panels = report.panels
     assert panels is not None and panels.case == "exposure_20ms"

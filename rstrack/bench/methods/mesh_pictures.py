@@ -17,7 +17,9 @@ from typing import Any
 
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, read_text, write_error
-from rstrack.bench.methods.grid import CELL, Cell, Results, SequenceInfo
+from rstrack.bench.methods.grid import CELL
+from rstrack.bench.methods.plan import SequenceInfo
+from rstrack.bench.methods.results import Cell, Results
 from rstrack.mapping.reconstruct import MapOptions, run_map
 from rstrack.tracking.run import Progress
 
