@@ -58,14 +58,15 @@ setup() {
 }
 
 demo() {
-  .venv/bin/rsgen render configs/demo.yaml --out out/demo
+  .venv/bin/rsgen render demo --out out/demo
   .venv/bin/rsgen verify out/demo
   .venv/bin/rsgen preview out/demo
   .venv/bin/rsgen compare out/demo --frame 20
   .venv/bin/rstrack track out/demo --out out/demo_track
-  .venv/bin/rstrack evaluate out/demo out/demo_track
+  .venv/bin/rstrack track out/demo --out out/demo_track_gs --method gs-pg
   .venv/bin/rstrack plot out/demo out/demo_track --out out/demo_track/plot.png
   .venv/bin/rstrack report out/demo_track
+  .venv/bin/rstrack evaluate out/demo out/demo_track --against out/demo_track_gs
 }
 
 test_all() {
@@ -74,7 +75,8 @@ test_all() {
   .venv/bin/ruff check .
   .venv/bin/ruff format --check .
   .venv/bin/mypy
-  .venv/bin/lint-imports --no-cache >/dev/null || .venv/bin/lint-imports --no-cache
+  local contracts
+  contracts=$(.venv/bin/lint-imports --no-cache) || { say "$contracts"; return 1; }
   # One thread per process for the small solves; two processes share the rendering cores.
   OPENBLAS_NUM_THREADS=1 .venv/bin/python -m pytest -n 2 --dist loadfile "$@"
 }

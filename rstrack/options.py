@@ -1,9 +1,9 @@
-"""The tracker's settings: one set of defaults for everything."""
+"""Settings of tracking and mapping: name, type, default and meaning of each, for programs and command lines alike."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 
@@ -15,7 +15,8 @@ from rsgen.geometry.so3 import FloatArray
 
 Method = Literal["rs-pg", "rs-g", "rs-p", "gs-pg", "gs-g", "gs-p", "baseline"]
 METHODS: tuple[str, ...] = get_args(Method)
-PEERS: tuple[str, ...] = ("open3d-hybrid", "open3d-icp", "open3d-hybrid-keyframe", "open3d-icp-keyframe")
+Peer = Literal["open3d-hybrid", "open3d-icp", "open3d-hybrid-keyframe", "open3d-icp-keyframe"]
+PEERS: tuple[str, ...] = get_args(Peer)
 """Open3D's joint photometric and geometric error or its point-to-plane ICP; to the frame before or to a keyframe."""
 Strategy = Literal["converged", "newest"]
 STRATEGIES: tuple[str, ...] = get_args(Strategy)
@@ -25,43 +26,52 @@ SOURCES: tuple[str, ...] = get_args(Source)
 
 @dataclass(frozen=True)
 class Options:
-    """What can be chosen. Times in seconds, lengths in metres, angles in degrees.
+    """What can be chosen for a tracker; each field's text is also the help of the option of its name."""
 
-    method: rs/gs models the rolling shutter or takes all lines at mid readout; p/g: photometric, geometric error.
-    knot_spacing_s, knot_phase: control points are spacing apart, the first knot phase · spacing before the first line;
-      with a global shutter they are as far apart as the frames if that is more, since each gives one pose only.
-    keyframe_overlap: a new keyframe is made once less than this share of the depth points that the current keyframe
-      saw at first falls on it; keyframe_distance, keyframe_angle_deg: or once the camera is that far from it.
-    blur_sigma_px: pixels; points of a colour image that its exposure blurs count less, by equation (13); 0: all alike.
-    keyframe_strategy: which frame that is (paper, section 3.5): the last one that has converged, rectified at once; or
-      the newest, with its rolling shutter until it has converged and can be rectified.
-    fuse: average the depth of later frames into the keyframe; None: where it is known when each line was taken, that is
-      if the method models the rolling shutter or there is none. Otherwise what is averaged does not fit together.
-    reference: keyframe: new frames are aligned to one frame, with the depth of others fused in; model: its depth is
-      averaged with a signed distance volume of all frames, with voxels of voxel_m, frames are aligned to the oldest
-      keyframe in view too, and a keyframe is used again when the camera comes back to it. The baseline has no model.
-    """
-
-    method: Method = "rs-pg"
-    knot_spacing_s: float = 0.025
-    knot_phase: float = 0.5
-    backend: Backend = "auto"
-    keyframe_overlap: float = 0.65
-    keyframe_distance: float = 0.3
-    keyframe_angle_deg: float = 20.0
-    keyframe_strategy: Strategy = "converged"
-    fuse: bool | None = None
-    bootstrap_frames: int = 6
-    max_depth: float = 12.0
-    blur_sigma_px: float = 0.0
-    reference: Source = "keyframe"
-    voxel_m: float = 0.01
+    method: Annotated[
+        Method,
+        "rs models the rolling shutter, gs takes all lines at mid readout; p photometric, g geometric error; baseline "
+        "has one pose a frame",
+    ] = "rs-pg"
+    knot_spacing_s: Annotated[
+        float,
+        "time between control points of the spline, s; with gs that of the frames if it is more, since each gives one "
+        "pose only",
+    ] = 0.025
+    knot_phase: Annotated[float, "the first knot lies this part of the spacing before the first line"] = 0.5
+    backend: Annotated[Backend, "where kernels run"] = "auto"
+    keyframe_overlap: Annotated[
+        float, "new keyframe once less than this part of the depth points that the current one saw at first is seen"
+    ] = 0.65
+    keyframe_distance: Annotated[float, "new keyframe after this distance, m"] = 0.3
+    keyframe_angle_deg: Annotated[float, "new keyframe after this rotation, degrees"] = 20.0
+    keyframe_strategy: Annotated[
+        Strategy,
+        "which frame that is (paper, section 3.5): the last that has converged, rectified at once, or the newest, "
+        "rolling until it has converged",
+    ] = "converged"
+    fuse: Annotated[
+        bool | None,
+        "average the depth of later frames into the keyframe (default: yes, but not if a rolling shutter is taken for "
+        "a global one, since what is averaged then does not fit together)",
+    ] = None
+    bootstrap_frames: Annotated[int, "frames that are aligned jointly at the start"] = 6
+    max_depth: Annotated[float, "depth beyond this counts as missing, m"] = 12.0
+    blur_sigma_px: Annotated[
+        float, "colour that motion blurs counts less, by exp(-length / this squared), equation (13), px; 0: all alike"
+    ] = 0.0
+    reference: Annotated[
+        Source,
+        "what new frames are aligned to: one keyframe with the depth of others fused in, or one averaged with a "
+        "distance volume of all frames, and the oldest keyframe in view: less drift where the camera comes back; not "
+        "for the baseline",
+    ] = "keyframe"
+    voxel_m: Annotated[float, "voxels of that volume, m"] = 0.01
 
     def __post_init__(self) -> None:
-        if self.method not in METHODS:
-            raise UserError(f"unknown method '{self.method}': choose {', '.join(METHODS)}")
-        if self.keyframe_strategy not in STRATEGIES:
-            raise UserError(f"unknown keyframe_strategy '{self.keyframe_strategy}': choose {', '.join(STRATEGIES)}")
+        for name, known in (("method", METHODS), ("keyframe_strategy", STRATEGIES), ("reference", SOURCES)):
+            if getattr(self, name) not in known:
+                raise UserError(f"unknown {name} '{getattr(self, name)}': choose {', '.join(known)}")
         if not 0.001 <= self.knot_spacing_s <= 1.0:
             raise UserError(f"knot_spacing_s = {self.knot_spacing_s!r} must be between 0.001 and 1 s")
         if not 0.0 <= self.knot_phase <= 1.0:
@@ -70,8 +80,6 @@ class Options:
             raise UserError(
                 f"keyframe_overlap = {self.keyframe_overlap!r} must be positive; 1 makes new ones all the time"
             )
-        if self.reference not in SOURCES:
-            raise UserError(f"unknown reference '{self.reference}': choose {', '.join(SOURCES)}")
         for name in ("keyframe_distance", "keyframe_angle_deg", "max_depth"):
             if not getattr(self, name) > 0.0:
                 raise UserError(f"{name} = {getattr(self, name)!r} must be positive")
@@ -112,3 +120,29 @@ class Options:
         """The larger of distance and angle of a camera at T_base_cam (4, 4), each over where a keyframe is left."""
         distance, angle = np.linalg.norm(T_base_cam[:3, 3]), np.linalg.norm(se3.log(T_base_cam)[3:])
         return float(max(distance / self.keyframe_distance, np.degrees(angle) / self.keyframe_angle_deg))
+
+
+@dataclass(frozen=True)
+class MapOptions:
+    """What can be chosen for a map; texts as in `Options`."""
+
+    shutter: Annotated[
+        Literal["rs", "gs"] | None,
+        "rs: every line from its own pose; gs: all from the middle line's (default: rs if the run has a spline)",
+    ] = None
+    world: Annotated[
+        Literal["truth", "estimate"] | None,
+        "frame of the mesh; truth: trajectories are aligned first, as by 'rstrack evaluate' (default: truth if the "
+        "sequence has one)",
+    ] = None
+    voxel_m: Annotated[float, "voxels of the distance volume, m", "--voxel"] = 0.01
+    every: Annotated[int, "use every N-th frame"] = 1
+    color: Annotated[bool, "colour the mesh (default: yes)"] = True
+    max_depth: Annotated[float, "depth beyond this is left out, m"] = 6.0
+    backend: Annotated[Backend, "where kernels run"] = "auto"
+
+    def __post_init__(self) -> None:
+        if self.every < 1:
+            raise UserError(f"every = {self.every!r} must be 1 or more")
+        if not self.max_depth > 0.0:
+            raise UserError(f"max_depth = {self.max_depth!r} must be positive")

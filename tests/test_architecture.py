@@ -48,7 +48,7 @@ def test_there_is_something_to_check() -> None:
         "rsgen.geometry.so3", "rsgen.geometry.se3", "rsgen.geometry.spline", "rsgen.geometry.camera",
         "rsgen.geometry.shutter", "rsgen.sequence.reader", "rsgen.check.verify",
         "rsgen.config.config", "rsgen.sequence.trajectory", "rsgen.motion.fit",
-        "rsgen.motion.fit_report", "rsgen.device.backend", "rsgen.console.scheduler", "rsgen.produce.distribute",
+        "rsgen.motion.fit_summary", "rsgen.device.backend", "rsgen.console.scheduler", "rsgen.produce.distribute",
         "rsgen.produce.generate", "rsgen.produce.frame_source", "rsgen.pictures.frames", "rsgen.cli.main",
         "rsgen.motion.make", "rsgen.sensors.color", "rsgen.sensors.depth", "rsgen.sensors.imu", "rsgen.config.truth",
         "rsgen.export.kalibr", "rsgen.export.euroc", "rsgen.export.registered", "rsgen.export.video",

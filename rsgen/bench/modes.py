@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsgen.bench.table import AVERAGED, BLUR_S, READOUT_S, ModeTable, ModeTimes
+from rsgen.bench.table import AVERAGED, BLUR_S, READOUT_S, BenchTimes, ModeTimes
 from rsgen.check.light import lit_scene, spread_times
 from rsgen.config.config import Config
 from rsgen.errors import UserError
@@ -46,7 +46,7 @@ class Mode:
     measured: str = "all"
 
 
-def time_modes(config: Config, frames: int, spp: int, modes: Sequence[str], progress: Progress) -> ModeTable:
+def time_modes(config: Config, frames: int, spp: int, modes: Sequence[str], progress: Progress) -> BenchTimes:
     """Time the modes, names of MODES and BLENDER_MODES, on `frames` frames spread over the config's trajectory.
 
     All modes render each frame before the next frame's turn comes; a frame before the first compiles kernels. spp:
@@ -74,7 +74,7 @@ def time_modes(config: Config, frames: int, spp: int, modes: Sequence[str], prog
         ModeTimes(m.name, m.title, m.spp, m.measured, np.array(seconds[m.name])) for m in chosen if m.name not in failed
     )
     machine = {"cores": os.cpu_count(), "processor": platform.machine()}
-    return ModeTable(camera.width, camera.height, machine | engine_versions(config), times, failed)
+    return BenchTimes(camera.width, camera.height, machine | engine_versions(config), times, failed)
 
 
 def row_renderer(scene: Any, integrator: Any, camera: Any, spp: int) -> Any:

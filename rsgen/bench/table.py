@@ -55,7 +55,7 @@ class Ratio:
 
 
 @dataclass(frozen=True)
-class ModeTable:
+class BenchTimes:
     """Times of all modes of one run; `failed`: what became of those that have none."""
 
     width: int

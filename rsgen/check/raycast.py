@@ -18,7 +18,7 @@ REQUIRED_SHARE = 0.999
 
 
 @dataclass(frozen=True)
-class RaycastReport:
+class RaycastErrors:
     """Share of pixels within TOLERANCE_M per frame, and the median difference of all, metres."""
 
     frames: tuple[int, ...]
@@ -38,7 +38,7 @@ class RaycastReport:
         )
 
 
-def raycast_sequence(sequence: Sequence, count: int) -> RaycastReport:
+def raycast_sequence(sequence: Sequence, count: int) -> RaycastErrors:
     """Cast every pixel of `count` depth frames, spread over the sequence, again on scene.ply and compare.
 
     Raises UserError if embreex is not installed, or scene.ply or a frame cannot be read.
@@ -58,7 +58,7 @@ def raycast_sequence(sequence: Sequence, count: int) -> RaycastReport:
     frames = tuple(int(k) for k in np.unique(np.linspace(0, total - 1, count).round().astype(int)))
     differences = [np.abs(_cast(caster, sequence, k) - sequence.truth_depth(k)) for k in frames]
     shares = tuple(float(np.mean(d <= TOLERANCE_M)) for d in differences)
-    return RaycastReport(frames, shares, float(np.median(differences)))
+    return RaycastErrors(frames, shares, float(np.median(differences)))
 
 
 def _cast(caster: object, sequence: Sequence, k: int) -> NDArray[np.float64]:

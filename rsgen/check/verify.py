@@ -58,7 +58,7 @@ class Check:
 
 
 @dataclass(frozen=True)
-class VerifyReport:
+class Verification:
     """All checks of a sequence."""
 
     path: Path
@@ -77,7 +77,7 @@ class VerifyReport:
         return "\n".join([*lines, f"{self.path}: {verdict}"])
 
 
-def verify_sequence(path: Path, pairs: int = 20, raycast: int = 0) -> VerifyReport:
+def verify_sequence(path: Path, pairs: int = 20, raycast: int = 0) -> Verification:
     """Check the sequence at `path`, reprojecting depth between `pairs` pairs of neighbouring frames spread over it.
 
     `raycast` frames are cast again, every pixel, with another ray caster (needs embreex).
@@ -88,7 +88,7 @@ def verify_sequence(path: Path, pairs: int = 20, raycast: int = 0) -> VerifyRepo
     try:
         sequence = read_sequence(path)
     except UserError as error:
-        return VerifyReport(path, (Check("read", False, str(error)),))
+        return Verification(path, (Check("read", False, str(error)),))
     checks: list[tuple[str, Callable[[], tuple[bool, str]]]] = [
         ("description", partial(_check_description, sequence)),
         ("files", partial(_check_files, sequence)),
@@ -102,7 +102,7 @@ def verify_sequence(path: Path, pairs: int = 20, raycast: int = 0) -> VerifyRepo
     checks += extra_checks(sequence)
     if raycast:
         checks.append(("ray casting", partial(_check_raycast, sequence, raycast)))
-    return VerifyReport(path, tuple(_run(name, check) for name, check in checks))
+    return Verification(path, tuple(_run(name, check) for name, check in checks))
 
 
 def _run(name: str, check: Callable[[], tuple[bool, str]]) -> Check:

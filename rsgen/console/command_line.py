@@ -6,19 +6,27 @@ Import it before NumPy: it limits OpenBLAS to one thread.
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import inspect
+import json
 import logging
+import math
 import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, NoReturn
+from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any, Literal, NoReturn, Union, get_args, get_origin, get_type_hints
 
 # The banded solves are small: threads only get in each other's way (measured, up to 1000x on a busy machine).
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from rsgen.errors import UserError
 
-Run = Callable[[argparse.Namespace], int]
+Run = Callable[..., int]
+_METAVARS: dict[Any, str] = {int: "N", float: "X"}
+_NO_MATTER = (None, "", (), False)  # defaults of which help says nothing
 
 
 class Parser(argparse.ArgumentParser):
@@ -41,14 +49,85 @@ class Commands:
         self.parser = Parser(name, description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
         self._commands = self.parser.add_subparsers(required=True, metavar="COMMAND")
 
-    def add(self, name: str, run: Run, help: str, example: str) -> argparse.ArgumentParser:
-        """A command that calls `run` and returns its exit status; example: what may follow its name."""
+    def add(self, run: Run, example: str, note: str = "") -> argparse.ArgumentParser:
+        """The command that `run` declares: its name, its docstring as help, an argument for every parameter.
+
+        A parameter is `Annotated[type, help, *more]`, an option if it is keyword-only. more: a converter of words, a
+        metavar, or another name of the option ("--voxel"). Of int (count) and float (number) those below convert; list
+        takes the option repeatedly, tuple with several words. A parameter whose type is a dataclass of such fields gets
+        an option for each that the command has not itself; **fields gets what else is added to the parser, if given.
+        example: what may follow the command's name; note: a last line of help.
+        """
+        name = run.__name__.strip("_").replace("_", "-")
+        text = " ".join(str(run.__doc__).split()).replace("%", "%%")
         command = self._commands.add_parser(
-            name, help=help, description=f"{help[0].upper()}{help[1:]}.",
-            epilog=f"example: {self.name} {name} {example}",
+            name, help=text[0].lower() + text[1:].rstrip("."), description=text,
+            epilog=f"example: {self.name} {name} {example}{note and chr(10) + note}",
+            formatter_class=argparse.RawDescriptionHelpFormatter if note else argparse.HelpFormatter,
         )  # fmt: skip
-        command.set_defaults(run=run)
+        parameters, hints = inspect.signature(run).parameters, get_type_hints(run, include_extras=True)
+        groups = {n: hints[n] for n in parameters if dataclasses.is_dataclass(hints[n])}
+        for parameter in parameters.values():
+            if parameter.name not in groups and parameter.kind is not parameter.VAR_KEYWORD:
+                _add(command, parameter.name, hints[parameter.name], parameter.default, parameter.kind)
+        own: dict[str, list[str]] = {}
+        for group, declared in groups.items():
+            fields = [field for field in dataclasses.fields(declared) if field.name not in parameters]
+            own[group] = [field.name for field in fields]
+            within = command.add_argument_group(f"the {group}")
+            meant = get_type_hints(declared, include_extras=True)
+            for field in fields:
+                _add(within, field.name, meant[field.name], field.default)
+
+        def call(given: dict[str, Any]) -> int:
+            made = {group: groups[group](**{n: given.pop(n) for n in names}) for group, names in own.items()}
+            return run(**given, **made)
+
+        command.set_defaults(call=call)
         return command
+
+
+def _add(to: Any, name: str, hint: Any, default: Any, kind: Any = inspect.Parameter.KEYWORD_ONLY) -> None:
+    """An argument of the parser or group `to`, as `Commands.add` says it."""
+    type_, text, *more = get_args(hint)
+    if get_origin(type_) in (Union, UnionType):  # ... | None
+        type_ = get_args(type_)[0]
+    many = get_origin(type_) if get_origin(type_) in (list, tuple) else None
+    type_ = get_args(type_)[0] if many else type_
+    required = default in (inspect.Parameter.empty, dataclasses.MISSING)
+    told = required or default in _NO_MATTER or "(default" in text
+    how: dict[str, Any] = {"help": (text if told else f"{text} (default: {default})").replace("%", "%%")}
+    if not required:
+        how["default"] = str(default) if isinstance(default, Path) else default  # of a word, argparse converts it
+    names = [word for word in more if isinstance(word, str) and word.startswith("--")]
+    metavar = next((word for word in more if isinstance(word, str) and word not in names), _METAVARS.get(type_))
+    convert = next((word for word in more if callable(word)), {int: count, float: number}.get(type_, type_))
+    if type_ is bool:
+        how |= {"action": "store_true" if default is False else _YesNo}
+    elif get_origin(type_) is Literal:
+        how |= {"choices": get_args(type_), "metavar": metavar}
+    else:
+        how |= {"type": convert, "metavar": metavar}
+    if kind is not inspect.Parameter.KEYWORD_ONLY:
+        to.add_argument(name, **how, **({"nargs": "+"} if many else {} if required else {"nargs": "?"}))
+        return
+    if many:
+        how |= {"action": "append"} if many is list else {"action": "extend", "nargs": "+"}
+    flag = "--" + name.strip("_").replace("_", "-")
+    to.add_argument(flag, *names, dest=name, required=required, **how)
+
+
+class _YesNo(argparse.BooleanOptionalAction):
+    """--this or --no-this; what it is without either, the help says in words."""
+
+    def __init__(self, *arguments: Any, default: Any = None, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.default = default
+
+
+def print_figures(found: Any, as_json: bool) -> None:
+    """What was measured, as its text() or as its as_dict()."""
+    print(json.dumps(found.as_dict(), indent=2) if as_json else found.text())
 
 
 def run_program(name: str, parser: Callable[[], Parser], words: Sequence[str] | None, interrupted: str) -> int:
@@ -60,7 +139,8 @@ def run_program(name: str, parser: Callable[[], Parser], words: Sequence[str] | 
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     try:
         options = parser().parse_args(joined(sys.argv[1:] if words is None else words))
-        status: int = options.run(options)
+        given = vars(options)
+        status: int = given.pop("call")(given)
         sys.stdout.flush()
     except UserError as error:
         print(f"{name}: {_one_line(str(error))}", file=sys.stderr)
@@ -113,8 +193,19 @@ def count(text: str) -> int:
     return number
 
 
+def number(text: str) -> float:
+    """A finite number."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise argparse.ArgumentTypeError(f"expected a finite number, got '{text}'")
+    return number
+
+
 def parse_frames(text: str | None) -> slice:
-    """Frames 'A:B' (B excluded, either may be left out) or a single 'A'. Raises UserError."""
+    """Frames 'A:B' (B excluded, either may be left out) or a single 'A'; None: all. Raises UserError."""
     if text is None:
         return slice(None)
     begin, colon, end = text.partition(":")
@@ -126,3 +217,8 @@ def parse_frames(text: str | None) -> slice:
     if low < 0 or (high is not None and high <= low):
         raise UserError(f"--frames {text}: expected A:B with 0 <= A < B, for example 0:100")
     return slice(low, high)
+
+
+Frames = Annotated[slice | None, "only frames A to B-1 (default: all)", "A:B", parse_frames]
+Json = Annotated[bool, "print machine-readable figures"]
+Quiet = Annotated[bool, "no progress"]

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
 from uuid import uuid4
 
 from rsgen.errors import UserError
@@ -26,10 +26,12 @@ Progress = Callable[[str, float, str], None]  # stage, fraction done in [0, 1], 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-SCHEDULER_HELP = (
+Scheduler = Annotated[
+    str | None,
     "where to work: the address of a Dask scheduler (tcp://HOST:8786), 'local' for a process on every core of this "
-    "machine, or 'local:N' for N processes (default: this process alone)"
-)
+    "machine, or 'local:N' for N processes (default: this process alone)",
+    "ADDRESS|local[:N]",
+]
 _CONNECT_S = 10
 # Tells a worker of this machine how many threads it may use.
 _THREADS = "RSGEN_WORKER_THREADS"

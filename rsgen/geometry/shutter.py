@@ -90,9 +90,9 @@ def project_rolling(
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Where and when a frame shows world points (..., 3): pixels uv (..., 2), times t (...,) in seconds, valid (...,).
 
-    Solves t = line_mid_time(stamp, line_of_pixel(π(T_cam_body T_world_body(t)⁻¹ p))) by Newton in time with the exact
-    derivative, from mid readout, and for what that misses from the first and the last line. Lines are continuous here:
-    pixel row 3.4 has a time between those of rows 3 and 4.
+    Solves t = line_mid_time(stamp, line_of_pixel(π(T_cam_body T_world_body(t)⁻¹ p))), equation (3), by Newton in time
+    with the exact derivative, from mid readout, and for what that misses from the first and the last line. Lines are
+    continuous here: pixel row 3.4 has a time between those of rows 3 and 4.
 
     Valid: in front of the camera, in the image, seen within the spline's time span. uv and t are NaN elsewhere. Where
     the image moves along the scan faster than the scan itself, a point may be seen several times or be hard to find:

@@ -117,7 +117,7 @@ class Spline:
         return segment, np.asarray(s - segment)
 
     def pose(self, t: npt.ArrayLike) -> FloatArray:
-        """T_world_body (..., 4, 4) at times (...,) in seconds."""
+        """T_world_body (..., 4, 4) at times (...,) in seconds: equation (4) with the basis of (5)."""
         t = np.asarray(t, dtype=np.float64)
         if t.size > _BLOCK:
             out = np.empty((t.size, 4, 4))

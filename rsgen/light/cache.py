@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsgen.config.config import LightConfig
+from rsgen.console.configs import user_cache
 from rsgen.light.bake import METHOD, Progress, bake
 from rsgen.render.irradiance import IrradianceField, Lattice, make_field, make_lattice
 
@@ -55,7 +56,7 @@ def cache_folder(scene_file: Path) -> Path:
     """Where a scene's bakes are kept: beside the scene if that is writable, else in the user's cache."""
     if os.access(scene_file.parent, os.W_OK):
         return scene_file.parent / ".rsgen-cache"
-    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "rsgen"
+    return user_cache()
 
 
 def _load(path: Path, lattice: Lattice) -> tuple[NDArray, NDArray] | None:

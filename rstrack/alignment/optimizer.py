@@ -53,7 +53,7 @@ class Problem:
 
 
 def optimise(terms: Terms, state: SplineState, problem: Problem, levels: Sequence[int], most: Sequence[int]) -> Solved:
-    """Levenberg-Marquardt on each of the pyramid's levels, coarse to fine, with at most most[level] steps.
+    """Minimise (12) by Levenberg-Marquardt on each of the pyramid's levels, coarse to fine, most[level] steps at most.
 
     A level ends when no line of the fresh images moves any more. Steps that raise the cost are taken back and damped.
     Raises numpy.linalg.LinAlgError where the system has no solution.

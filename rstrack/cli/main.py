@@ -1,21 +1,23 @@
-"""The `rstrack` command: thin wrappers that parse arguments, call one function each and print."""
+"""The `rstrack` command: every function here and beside is a command, its parameters are the command's arguments."""
 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
+from json import dumps
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from rsgen.console.command_line import Commands, Parser, parse_frames, run_program
+from rsgen.console.command_line import Commands, Frames, Json, Parser, Quiet, run_program
 from rsgen.errors import UserError
-from rstrack.cli.bench import add_benchmarks
-from rstrack.cli.bench_methods import add_evaluation
-from rstrack.cli.mapping import add_mapping
-from rstrack.cli.options import add_options, add_run, add_sequence, number, options_of
-from rstrack.cli.report import add_report
+from rstrack.cli.bench import bench_bootstrap, bench_convergence, bench_speed, stress
+from rstrack.cli.bench_methods import STATUS as BENCH_STATUS
+from rstrack.cli.bench_methods import bench
+from rstrack.cli.mapping import keyframes, map_, map_eval
+from rstrack.cli.options import CameraFile, Run, SequenceFolder
+from rstrack.cli.report import report
+from rstrack.options import Options
 
 _DESCRIPTION = """\
 rstrack estimates the continuous-time trajectory of a rolling-shutter RGB-D camera: every line has its own pose.
@@ -51,98 +53,112 @@ class _Version(argparse.Action):
 
 def _parser() -> Parser:
     commands = Commands("rstrack", _DESCRIPTION)
-    commands.parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
-
-    track = commands.add(
-        "track", _track, "track a sequence: writes trajectory.txt, spline.npz and run.json",
-        f"out/lr_kt2 --method rs-pg --out runs/lr_kt2 --frames 0:300 --noise-depth 1.2e-3\n{_STATUS}",
-    )  # fmt: skip
-    track.formatter_class = argparse.RawDescriptionHelpFormatter
-    add_sequence(track)
-    track.add_argument("--out", type=Path, required=True, metavar="RUN", help="folder to write")
-    track.add_argument("--frames", metavar="A:B", help="only frames A to B-1 (default: all)")
-    track.add_argument(
-        "--noise-depth", type=number, default=0.0, metavar="S",
-        help="add noise of standard deviation S z^2 to depth z in m; a Kinect has 1.2e-3 (default: 0)",
-    )  # fmt: skip
-    track.add_argument(
-        "--noise-intensity", type=number, default=0.0, metavar="S",
-        help="add noise of standard deviation S to intensities in [0, 1], for example 0.01 (default: 0)",
-    )  # fmt: skip
-    track.add_argument("--seed", type=int, default=0, help="of the noise (default: 0)")
-    track.add_argument("--quiet", action="store_true", help="no progress")
-    add_options(track)
-
-    evaluate = commands.add(
-        "evaluate", _evaluate, "errors of a run against the ground truth: ATE, drift per second, lines' poses",
-        "out/lr_kt2 runs/lr_kt2 --json",
-    )  # fmt: skip
-    add_sequence(evaluate)
-    add_run(evaluate)
-    evaluate.add_argument("--json", action="store_true", help="print machine-readable figures")
-
-    plot = commands.add(
-        "plot", _plot, "picture of a run: path, errors over time, inliers", "out/lr_kt2 runs/lr_kt2 --out lr_kt2.png"
+    commands.parser.add_argument(
+        "--version", action=_Version, nargs=0, default=argparse.SUPPRESS, help="print the version and exit"
     )
-    add_sequence(plot)
-    add_run(plot)
-    plot.add_argument("--out", type=Path, required=True, metavar="FILE", help="png, pdf or svg file to write")
-
-    info = commands.add("info", _info, "say what would be tracked: cameras, shutters, frames, truth", "out/lr_kt2")
-    add_sequence(info)
-
-    add_report(commands)
-    add_mapping(commands)
-    add_evaluation(commands)
-    add_benchmarks(commands)
+    add = commands.add
+    add(track, "out/lr_kt2 --method rs-pg --out runs/lr_kt2 --frames 0:300 --noise-depth 1.2e-3", _STATUS)
+    add(evaluate, "out/lr_kt2 runs/lr_kt2 --json")
+    add(plot, "out/lr_kt2 runs/lr_kt2 --out lr_kt2.png")
+    add(info, "out/lr_kt2")
+    add(report, "runs/lr_kt2 --sequence out/lr_kt2")
+    add(map_, "out/lr_kt2 runs/lr_kt2 --out lr_kt2.ply --every 5")
+    add(map_eval, "lr_kt2.ply out/lr_kt2/scene.ply")
+    add(keyframes, "out/table1 runs/table1 --out keyframes")
+    add(bench, "--data out --out out/bench --sequence robot_t1 robot_r1 --method baseline rs-pg", BENCH_STATUS)
+    add(bench_speed, "out/lr_kt2 --frames 150 --method rs-pg")
+    add(bench_convergence, "out/lr_kt2 --pairs 50 --method rs-pg")
+    add(bench_bootstrap, "out/lr_kt2 --starts 50 --frames 20")
+    add(stress, "stress --out runs/stress --frames 60")
     return commands.parser
 
 
-def _track(options: argparse.Namespace) -> int:
+def track(
+    sequence: SequenceFolder,
+    tracker: Options,
+    *,
+    camera: CameraFile = None,
+    out: Annotated[Path, "folder for the run, made if need be", "DIR"],
+    frames: Frames = None,
+    noise_depth: Annotated[
+        float, "add noise of standard deviation S z^2 to depth z in m; a Kinect has 1.2e-3", "S"
+    ] = 0.0,
+    noise_intensity: Annotated[
+        float, "add noise of standard deviation S to intensities in [0, 1], for example 0.01", "S"
+    ] = 0.0,
+    seed: Annotated[int, "of the noise", int] = 0,
+    quiet: Quiet = False,
+) -> int:
+    """Track a sequence: writes trajectory.txt, spline.npz and run.json."""
     from rsgen.console.progress import ProgressDisplay
     from rstrack.data.dataset import open_dataset
-    from rstrack.tracking.run import Noise, track
+    from rstrack.tracking import run
 
-    tracker_options, frames = options_of(options), parse_frames(options.frames)
-    noise = Noise(options.noise_depth, options.noise_intensity, options.seed)
-    dataset = open_dataset(options.sequence, options.camera)
-    with ProgressDisplay(options.quiet) as progress:
-        result = track(dataset, tracker_options, options.out, frames, noise, progress)
+    noise = run.Noise(noise_depth, noise_intensity, seed)
+    dataset = open_dataset(sequence, camera)
+    with ProgressDisplay(quiet) as progress:
+        result = run.track(dataset, tracker, out, frames or slice(None), noise, progress)
     print(result.text())
-    print(f"{options.out}: written (rstrack evaluate {options.sequence} {options.out}, rstrack plot ...)")
+    print(f"{out}: written (rstrack evaluate {sequence} {out}, rstrack plot ...)")
     sys.stdout.flush()
     if result.end == "interrupted":
         print("rstrack: interrupted; the frames before are in the run folder", file=sys.stderr)
         return 130
     if result.end == "unreadable":
-        raise UserError(f"{result.error}; the frames before it are in {options.out}")
+        raise UserError(f"{result.error}; the frames before it are in {out}")
     if result.end == "broke down":
-        print(f"rstrack: {result.error}; the frames before it are in {options.out}", file=sys.stderr)
+        print(f"rstrack: {result.error}; the frames before it are in {out}", file=sys.stderr)
         return 1
     return 1 if result.lost else 0
 
 
-def _evaluate(options: argparse.Namespace) -> int:
-    from rstrack.metrics.evaluate import metrics_text, run_evaluate
+def evaluate(
+    sequence: SequenceFolder,
+    run: Run,
+    *,
+    camera: CameraFile = None,
+    against: Annotated[
+        Path | None,
+        "another run of the sequence: ends with one line that compares the two, for example of gs-pg",
+        "RUN",
+    ] = None,
+    json: Json = False,
+) -> int:
+    """Errors of a run against the ground truth: ATE, drift per second, lines' poses."""
+    from rstrack.metrics.evaluate import compared, run_evaluate
 
-    metrics = run_evaluate(options.sequence, options.run_path, options.camera)
-    print(json.dumps(metrics.as_dict(), indent=2) if options.json else metrics_text(metrics))
+    metrics = run_evaluate(sequence, run, camera)
+    theirs = None if against is None else run_evaluate(sequence, against, camera)
+    if json:
+        print(dumps(metrics.as_dict() | ({"against": theirs.as_dict()} if theirs else {}), indent=2))
+    else:
+        print(metrics.text())
+        if against is not None and theirs is not None:
+            print(f"\n{compared(run, metrics, against, theirs)}")
     return 0
 
 
-def _plot(options: argparse.Namespace) -> int:
+def plot(
+    sequence: SequenceFolder,
+    run: Run,
+    *,
+    camera: CameraFile = None,
+    out: Annotated[Path, "png, pdf or svg file to write", "FILE"],
+) -> int:
+    """Picture of a run: path, errors over time, inliers."""
     from rstrack.charts.runs import run_plot
 
-    run_plot(options.sequence, options.run_path, options.out, options.camera)
-    print(f"{options.out}: written")
+    run_plot(sequence, run, out, camera)
+    print(f"{out}: written")
     return 0
 
 
-def _info(options: argparse.Namespace) -> int:
+def info(sequence: SequenceFolder, *, camera: CameraFile = None) -> int:
+    """Say what would be tracked: cameras, shutters, frames, truth."""
     from rstrack.cli.info import describe
     from rstrack.data.dataset import open_dataset
 
-    print(describe(open_dataset(options.sequence, options.camera)))
+    print(describe(open_dataset(sequence, camera)))
     return 0
 
 

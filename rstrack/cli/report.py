@@ -2,35 +2,30 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
+from typing import Annotated
 
-from rsgen.console.command_line import Commands
-
-
-def add_report(commands: Commands) -> None:
-    """Add it to the parser."""
-    report = commands.add(
-        "report", _report, "one HTML page of a run, a benchmark or a stress test, all in it: tables, plots, the path "
-        "in 3D, rolling against global shutter", "runs/lr_kt2 --sequence out/lr_kt2",
-    )  # fmt: skip
-    report.add_argument(
-        "run_path", type=Path, metavar="run",
-        help="folder that 'rstrack track', 'rstrack bench' or 'rstrack stress' wrote, or a TUM file with --sequence",
-    )  # fmt: skip
-    report.add_argument("--sequence", type=Path, metavar="DIR", help="the run's sequence (default: where it was)")
-    report.add_argument(
-        "--camera", type=Path, metavar="FILE", help="cameras of a TUM or ICL-NUIM folder (default: one inside it)"
-    )
-    report.add_argument("--out", type=Path, metavar="FILE", help="page to write (default: report.html in the folder)")
-    report.add_argument("--quiet", action="store_true", help="no progress")
+from rsgen.console.command_line import Quiet
+from rstrack.cli.options import CameraFile
 
 
-def _report(options: argparse.Namespace) -> int:
+def report(
+    run: Annotated[
+        Path, "folder that 'rstrack track', 'rstrack bench' or 'rstrack stress' wrote, or a TUM file with --sequence"
+    ],
+    *,
+    sequence: Annotated[Path | None, "the run's sequence (default: where it was)", "DIR"] = None,
+    camera: CameraFile = None,
+    out: Annotated[Path | None, "page to write (default: report.html in the folder)", "FILE"] = None,
+    quiet: Quiet = False,
+) -> int:
+    """One HTML page of a run, a benchmark or a stress test, all in it: tables, plots, the path in 3D, rolling against
+    global shutter.
+    """
     from rsgen.console.progress import ProgressDisplay
     from rstrack.report.build import write_report
 
-    with ProgressDisplay(options.quiet) as progress:
-        out = write_report(options.run_path, options.sequence, options.out, options.camera, progress)
-    print(f"{out}: written, open it in a browser")
+    with ProgressDisplay(quiet) as progress:
+        page = write_report(run, sequence, out, camera, progress)
+    print(f"{page}: written, open it in a browser")
     return 0

@@ -1,7 +1,7 @@
 """How far an estimate is from the truth: ATE, drift per second, and the error of every line's pose.
 
 metrics = run_evaluate(Path("out/lr_kt2"), Path("runs/lr_kt2"))
-print(metrics_text(metrics))
+print(metrics.text())
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ _RPE_DELTA_S = 1.0
 _PAIR_WITHIN_S = 0.1
 # Stamps rounded to TUM's four digits still are one second apart.
 _STAMP_ROUNDING_S = 1e-3
+_SHUTTERS = {"rs": "the rolling-shutter model", "gs": "taking the shutter for a global one"}
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,29 @@ class Metrics:
         """Plain numbers for JSON; units are in the names."""
         data: dict[str, Any] = plain(dataclasses.asdict(self) | {"coverage": self.coverage})
         return data
+
+    def table(self) -> Table:
+        """Errors in millimetres, degrees, and both per second."""
+        m = self
+        ate = (m.ate_rmse_m, m.ate_mean_m, m.ate_median_m, m.ate_std_m, m.ate_max_m)
+        pairs, lines = f"{m.rpe_pairs} pairs 1 s apart", f"{m.rows} of {m.rows_total} lines"
+        rows: list[tuple[str, tuple[float | None, ...], float, str]] = [
+            ("ATE, mm", ate, 1e3, f"{m.poses_compared} of {m.poses} poses"),
+            ("drift, mm/s", (m.rpe_trans_rmse_m_per_s,), 1e3, pairs),
+            ("drift, deg/s", (m.rpe_rot_rmse_deg_per_s,), 1.0, pairs),
+            ("lines' position, mm", (m.row_rmse_m,), 1e3, lines),
+            ("lines' rotation, deg", (m.row_rot_rmse_deg,), 1.0, lines),
+        ]
+        head = ("error", "RMSE", "mean", "median", "std", "max", "over")
+        texts = ((label, *(fixed(v, 3, scale) for v in values), *[""] * (5 - len(values)), over)
+                 for label, values, scale, over in rows)  # fmt: skip
+        return Table(head, tuple(texts), "Errors against the true trajectory, after rigid alignment", words=(0, 6))
+
+    def text(self) -> str:
+        """The table, what it is of, and what has to be said about it."""
+        tracked = f"{self.frames_tracked} of {self.frames} ({100 * self.coverage:.1f} %)"
+        notes = [f"note: {note}" for note in self.notes]
+        return "\n".join([f"frames tracked: {tracked}", "", self.table().text(), *notes])
 
 
 @dataclass(frozen=True)
@@ -175,30 +199,6 @@ def drift(estimate: Estimate, found: Comparison) -> Drift:
     return Drift(stamps, *_pose_errors(true_step, est_step))
 
 
-def metrics_table(m: Metrics) -> Table:
-    """Errors in millimetres, degrees, and both per second."""
-    ate = (m.ate_rmse_m, m.ate_mean_m, m.ate_median_m, m.ate_std_m, m.ate_max_m)
-    pairs, lines = f"{m.rpe_pairs} pairs 1 s apart", f"{m.rows} of {m.rows_total} lines"
-    rows: list[tuple[str, tuple[float | None, ...], float, str]] = [
-        ("ATE, mm", ate, 1e3, f"{m.poses_compared} of {m.poses} poses"),
-        ("drift, mm/s", (m.rpe_trans_rmse_m_per_s,), 1e3, pairs),
-        ("drift, deg/s", (m.rpe_rot_rmse_deg_per_s,), 1.0, pairs),
-        ("lines' position, mm", (m.row_rmse_m,), 1e3, lines),
-        ("lines' rotation, deg", (m.row_rot_rmse_deg,), 1.0, lines),
-    ]
-    head = ("error", "RMSE", "mean", "median", "std", "max", "over")
-    texts = ((label, *(fixed(v, 3, scale) for v in values), *[""] * (5 - len(values)), over)
-             for label, values, scale, over in rows)  # fmt: skip
-    return Table(head, tuple(texts), "Errors against the true trajectory, after rigid alignment", words=(0, 6))
-
-
-def metrics_text(metrics: Metrics) -> str:
-    """The table, what it is of, and what has to be said about it."""
-    tracked = f"{metrics.frames_tracked} of {metrics.frames} ({100 * metrics.coverage:.1f} %)"
-    notes = [f"note: {note}" for note in metrics.notes]
-    return "\n".join([f"frames tracked: {tracked}", "", metrics_table(metrics).text(), *notes])
-
-
 def run_evaluate(seq_path: Path, estimate_path: Path, camera_file: Path | None = None) -> Metrics:
     """Evaluate a run folder or TUM file against the truth of a sequence folder.
 
@@ -216,6 +216,15 @@ def run_evaluate(seq_path: Path, estimate_path: Path, camera_file: Path | None =
         return evaluate(truth, estimate)
     except UserError as error:
         raise UserError(f"{estimate_path}: {error}") from None
+
+
+def compared(run: Path, metrics: Metrics, other: Path, theirs: Metrics) -> str:
+    """One line: the ATE of a run beside that of another, by what their methods take the shutter for."""
+    names = [_SHUTTERS.get(str(read_estimate(path).info.get("method", ""))[:2], str(path)) for path in (run, other)]
+    names = names if len(set(names)) == 2 else [str(run), str(other)]
+    ours_m, theirs_m = max(metrics.ate_rmse_m, 1e-12), max(theirs.ate_rmse_m, 1e-12)
+    times = f"{max(ours_m, theirs_m) / min(ours_m, theirs_m):.3g} times {'worse' if theirs_m >= ours_m else 'better'}"
+    return f"{names[0]}: ATE {1e3 * ours_m:.3g} mm; {names[1]}: {1e3 * theirs_m:.3g} mm ({times})"
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -2,7 +2,7 @@
 
 In the manner of ICL-NUIM's surface evaluation (Handa et al., ICRA 2014, SurfReg), with exact distances to triangles.
 
-report = run_map_evaluate(Path("mesh.ply"), Path("out/lr_kt2/scene.ply"))
+report = run_map_eval(Path("mesh.ply"), Path("out/lr_kt2/scene.ply"))
 print(report.text())
 """
 
@@ -54,7 +54,7 @@ class Spread:
 
 
 @dataclass(frozen=True)
-class MapReport:
+class MapErrors:
     """accuracy: from the mesh to the scene. completeness: from what the depth camera saw of the scene to the mesh;
     None where the scene lies in no sequence. within_2cm: part of those points that are so near."""
 
@@ -164,7 +164,7 @@ def seen_surface(sequence: Sequence) -> FloatArray:
 
 def evaluate_map(
     mesh: FloatArray, scene: FloatArray, seen: FloatArray | None, samples: int = 50_000, seed: int = 0
-) -> MapReport:
+) -> MapErrors:
     """Compare triangles (m, 3, 3) of a mesh with the scene's (k, 3, 3), in one world frame; seen: (n, 3) points.
 
     `samples` points of each side at most, drawn with `seed`. Raises UserError if a side is empty.
@@ -174,13 +174,13 @@ def evaluate_map(
     rng = np.random.default_rng(seed)
     accuracy = Triangles(scene).distance(sample_surface(mesh, samples, rng))
     if seen is None or not len(seen):
-        return MapReport(Spread.of(accuracy), None, None)
+        return MapErrors(Spread.of(accuracy), None, None)
     some = seen if len(seen) <= samples else seen[rng.choice(len(seen), samples, replace=False)]
     missing = Triangles(mesh).distance(some)
-    return MapReport(Spread.of(accuracy), Spread.of(missing), float((missing <= 0.02).mean()))
+    return MapErrors(Spread.of(accuracy), Spread.of(missing), float((missing <= 0.02).mean()))
 
 
-def run_map_evaluate(mesh_path: Path, scene_path: Path, samples: int = 50_000, seed: int = 0) -> MapReport:
+def run_map_eval(mesh_path: Path, scene_path: Path, samples: int = 50_000, seed: int = 0) -> MapErrors:
     """Compare a mesh that `rstrack map` wrote with SEQ/scene.ply. Raises UserError, naming the file at fault."""
     mesh, scene = read_triangles(mesh_path), read_triangles(scene_path)
     folder = Path(scene_path).parent

@@ -34,7 +34,7 @@ _MOST_LOST = 5
 
 
 @dataclass(frozen=True)
-class PeerReport:
+class PeerFrame:
     """What a peer says about a frame. fitness: part of its pixels with a partner; inlier_rmse: of their residuals."""
 
     stamp: float
@@ -72,10 +72,10 @@ class PeerTracker:
         self._lost_in_a_row = 0
         self.stamps: list[float] = []
         self.poses: list[FloatArray] = []
-        self.reports: list[PeerReport] = []
+        self.reports: list[PeerFrame] = []
         self.keyframes = 0
 
-    def feed(self, stamp: float, image: RegisteredImage) -> PeerReport:
+    def feed(self, stamp: float, image: RegisteredImage) -> PeerFrame:
         """Track one frame."""
         o3d = self._o3d
         rgbd = o3d.t.geometry.RGBDImage(
@@ -85,14 +85,14 @@ class PeerTracker:
         self.reports.append(report)
         return report
 
-    def _start(self, stamp: float, rgbd: Any, image: RegisteredImage) -> PeerReport:
+    def _start(self, stamp: float, rgbd: Any, image: RegisteredImage) -> PeerFrame:
         is_lost = bool((image.depth > 0).mean() < _LEAST_FITNESS)
         if not is_lost:
             self._set_reference(rgbd, np.eye(4))
             self._found(stamp, np.eye(4))
-        return PeerReport(stamp, is_lost, not is_lost, float("nan"), float("nan"))
+        return PeerFrame(stamp, is_lost, not is_lost, float("nan"), float("nan"))
 
-    def _track(self, stamp: float, rgbd: Any) -> PeerReport:
+    def _track(self, stamp: float, rgbd: Any) -> PeerFrame:
         start = self._T_ref_last if self._to_keyframe else np.eye(4)
         T_ref_cam, fitness, rmse = self._align(rgbd, start)
         if T_ref_cam is None:
@@ -100,7 +100,7 @@ class PeerTracker:
             is_new = self._lost_in_a_row >= _MOST_LOST
             if is_new:
                 self._set_reference(rgbd, self._T_world_ref @ self._T_ref_last)
-            return PeerReport(stamp, True, is_new, fitness, rmse)
+            return PeerFrame(stamp, True, is_new, fitness, rmse)
         T_world_cam = se3.orthonormalise(self._T_world_ref @ T_ref_cam)
         self._found(stamp, T_world_cam)
         self._T_ref_last = T_ref_cam
@@ -108,7 +108,7 @@ class PeerTracker:
         is_new = not self._to_keyframe or self.options.left_behind(T_ref_cam, fitness / self._first_fitness)
         if is_new:
             self._set_reference(rgbd, T_world_cam)
-        return PeerReport(stamp, False, is_new, fitness, rmse)
+        return PeerFrame(stamp, False, is_new, fitness, rmse)
 
     def _align(self, rgbd: Any, T_ref_cam: FloatArray) -> tuple[FloatArray | None, float, float]:
         """The pose in the reference's frame from a first guess, None if there is none; fitness; RMSE."""

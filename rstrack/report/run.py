@@ -11,7 +11,7 @@ import numpy as np
 from rsgen.errors import UserError
 from rstrack.charts.chart import Chart, PathChart
 from rstrack.charts.runs import error_charts, inlier_charts, path_chart, time_charts
-from rstrack.metrics.evaluate import Metrics, evaluate, metrics_table
+from rstrack.metrics.evaluate import Metrics, evaluate
 from rstrack.metrics.tracked import Tracked, load_run
 from rstrack.report.page import Card, CardRow, Note, Page, Plot, Section
 from rstrack.report.pictures import frame_panels, shutter_sliders
@@ -25,7 +25,7 @@ def run_page(run: Path, sequence: Path | None = None, camera_file: Path | None =
     metrics = None
     if tracked.found is not None and tracked.truth is not None:
         metrics = evaluate(tracked.truth, tracked.estimate)
-        sections.insert(0, Section("errors", "Errors", (metrics_table(metrics), *_notes(metrics))))
+        sections.insert(0, Section("errors", "Errors", (metrics.table(), *_notes(metrics))))
         sections.append(Section("time", "Errors over time", plots(error_charts(tracked))))
     if charts := (*inlier_charts(tracked), *time_charts(tracked)):
         sections.append(Section("tracker", "What the tracker said", plots(charts)))

@@ -1,4 +1,4 @@
-"""What a tracker says about each frame."""
+"""What a tracker says about each frame; `FrameReport` is no HTML page, and so called since live loops read it."""
 
 from __future__ import annotations
 

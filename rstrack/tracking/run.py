@@ -30,7 +30,7 @@ from rstrack.data.noise import with_noise
 from rstrack.data.prefetch import prefetched
 from rstrack.data.rig import Frame, Rig
 from rstrack.metrics.association import Truth, compare, truth_of
-from rstrack.metrics.evaluate import Metrics, evaluate, metrics_text
+from rstrack.metrics.evaluate import Metrics, evaluate
 from rstrack.options import Options
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ class Result:
         weak = sum(not f["lost"] and 0.0 < f["observability"] < _WEAK for f in info["frames"])
         if weak and info["method"] in ("rs-g", "gs-g", "baseline"):
             lines.append(f"in {weak} of {done} frames the geometry hardly fixes all six degrees of freedom (a wall?)")
-        return "\n".join(lines + ([] if self.metrics is None else ["", metrics_text(self.metrics)]))
+        return "\n".join(lines + ([] if self.metrics is None else ["", self.metrics.text()]))
 
 
 def make_tracker(rig: Rig, options: Options, timer: Timer | None = None) -> AnyTracker:

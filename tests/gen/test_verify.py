@@ -13,7 +13,7 @@ import synthetic
 import yaml
 
 from rsgen.check.reprojection import reproject_depth
-from rsgen.check.verify import VerifyReport, verify_sequence
+from rsgen.check.verify import Verification, verify_sequence
 from rsgen.files import encode_exr, encode_npy, encode_png, encode_yaml, read_exr
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
@@ -36,7 +36,7 @@ def seq(finished: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(finished, tmp_path / "seq"))
 
 
-def failed(report: VerifyReport) -> set[str]:
+def failed(report: Verification) -> set[str]:
     assert all("\n" not in check.detail for check in report.checks)
     return {check.name for check in report.checks if not check.ok}
 

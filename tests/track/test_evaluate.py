@@ -26,7 +26,7 @@ from rsgen.geometry.spline import Spline
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.estimate import Estimate, read_estimate, write_estimate
 from rstrack.metrics.association import Truth, align, compare
-from rstrack.metrics.evaluate import Metrics, evaluate, metrics_text, pairs_one_second_apart, run_evaluate
+from rstrack.metrics.evaluate import Metrics, compared, evaluate, pairs_one_second_apart, run_evaluate
 
 CAMERA = Camera(16, 12, 12.0, 12.0, 7.5, 5.5)
 SHUTTER = Shutter(0.028, 0.004)
@@ -209,7 +209,7 @@ def test_shorter_than_a_second_has_no_drift_but_says_so() -> None:
     assert result.rpe_trans_rmse_m_per_s is None and result.rpe_rot_rmse_deg_per_s is None
     assert any("one second apart" in note for note in result.notes)
     assert json.loads(json.dumps(result.as_dict(), allow_nan=False))["rpe_trans_rmse_m_per_s"] is None
-    assert " - " in metrics_text(result) + " "
+    assert " - " in result.text() + " "
 
 
 # --- association -----------------------------------------------------------------------------------------------------
@@ -517,7 +517,7 @@ def test_a_run_is_evaluated_against_an_rsgen_sequence(tmp_path: Path) -> None:
 def test_the_table_has_units_and_lines_up() -> None:
     ate = (0.000131, 0.0001, 0.00009, 0.00002, 0.123456)
     result = Metrics(882, 878, 878, 877, *ate, 0.0042, 0.0611, 848, 0.0002, 0.01, 421440, 423360, ("a note",))
-    text = metrics_text(result).splitlines()
+    text = result.text().splitlines()
     assert text[0].endswith("878 of 882 (99.5 %)")
     assert text[2].split() == ["error", "RMSE", "mean", "median", "std", "max", "over"]
     assert text[3].split()[:7] == ["ATE,", "mm", "0.131", "0.100", "0.090", "0.020", "123.456"]
@@ -525,6 +525,17 @@ def test_the_table_has_units_and_lines_up() -> None:
     assert "drift, mm/s" in text[4] and "4.200" in text[4] and text[4].index("4.200") + 5 == text[2].index("RMSE") + 4
     assert "drift, deg/s" in text[5] and "0.061" in text[5]
     assert text[-1] == "note: a note"
+
+
+def test_two_runs_are_compared_in_one_line(tmp_path: Path) -> None:
+    ours, theirs = (Metrics(9, 9, 9, 9, ate, 0, 0, 0, 0, None, None, 0, None, None, 0, 0) for ate in (0.000095, 0.0091))
+    for method in ("rs-pg", "gs-pg", "rs-g"):
+        write_estimate(tmp_path / method, FRAMES[:9], SPLINE.pose(FRAMES[:9]), None, {"method": method})
+    rs, gs, other = (tmp_path / method for method in ("rs-pg", "gs-pg", "rs-g"))
+    model, neglect = "the rolling-shutter model", "taking the shutter for a global one"
+    assert compared(rs, ours, gs, theirs) == f"{model}: ATE 0.095 mm; {neglect}: 9.1 mm (95.8 times worse)"
+    assert compared(gs, theirs, rs, ours) == f"{neglect}: ATE 9.1 mm; {model}: 0.095 mm (95.8 times better)"
+    assert compared(rs, ours, other, theirs).startswith(f"{rs}: ATE 0.095 mm; {other}: 9.1 mm")
 
 
 def test_numbers_survive_json() -> None:

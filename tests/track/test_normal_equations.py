@@ -1,14 +1,13 @@
-"""From 6×6 systems to control points, priors, banded solve and the growing spline, against dense algebra."""
+"""From 6×6 systems to control points and the banded solve, against dense algebra."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from rstrack_util import hand_held, moved
-from util import numeric_jacobian, random_spline, random_twists
+from rstrack_util import moved
+from util import numeric_jacobian, random_spline
 
 from rsgen.geometry import se3
-from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import BlockSums
 from rstrack.alignment.normal_equations import (
     Quadratic,
@@ -17,8 +16,6 @@ from rstrack.alignment.normal_equations import (
     line_jacobian,
     solve,
 )
-from rstrack.alignment.priors import acceleration_prior, pose_constraint
-from rstrack.alignment.spline_state import SplineState
 
 TIMES = np.array([0.34, 0.352, 0.41, 0.43, 0.449, 0.452])  # segments 0 (twice), 2 (three times) and 3
 
@@ -96,66 +93,6 @@ def test_a_rolling_reference_moves_the_other_way() -> None:
     assert abs(model.g @ gauge) < 1e-10 * np.abs(model.g).max()
 
 
-# -- priors --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_acceleration_prior_is_that_of_its_cost(seed: int) -> None:
-    spline, rng = random_spline(seed), np.random.default_rng(seed)
-    first, last = 2, 8
-    sigma = rng.uniform(0.5, 2.0, (last - first - 2, 6))
-
-    def errors(x: np.ndarray) -> np.ndarray:
-        T = moved(spline, x.reshape(-1, 6), first).control_points[first:last]
-        omega = se3.log(np.linalg.inv(T[:-1]) @ T[1:])
-        return ((omega[1:] - omega[:-1]) / sigma).ravel()
-
-    model, cost = acceleration_prior(spline, first, last, sigma)
-    assert cost == pytest.approx(0.5 * (errors(np.zeros(36)) ** 2).sum())
-    assert (model.first, model.last) == (first, last)
-    J = numeric_jacobian(errors, 6 * (last - first))
-    np.testing.assert_allclose(model.H, J.T @ J, atol=1e-6 * np.abs(J.T @ J).max())
-    np.testing.assert_allclose(model.g, J.T @ errors(np.zeros(36)), atol=1e-7 * np.abs(model.g).max())
-    assert np.abs(model.g).max() > 0.1
-
-
-def test_acceleration_prior_asks_nothing_of_constant_velocity() -> None:
-    T = se3.exp(np.arange(8)[:, None] * np.array([0.1, -0.05, 0.2, 0.02, 0.1, -0.04]))
-    model, cost = acceleration_prior(Spline(T, 0.0, 0.05), 0, 8, np.ones((6, 6)))
-    assert cost < 1e-24
-    assert np.abs(model.g).max() < 1e-12
-    assert np.linalg.matrix_rank(model.H) == 36  # free: pose and velocity
-
-
-@pytest.mark.parametrize("size", [0.0, 1e-6, 0.3])
-def test_pose_constraint_is_that_of_its_cost(size: float) -> None:
-    spline, t = random_spline(7), 0.43
-    sigma = np.array([0.5, 0.6, 0.7, 1.0, 1.2, 1.4])
-    target = se3.exp(random_twists(np.random.default_rng(8), (), size, size)) @ spline.pose(t)
-
-    def errors(x: np.ndarray) -> np.ndarray:
-        return se3.log(moved(spline, x.reshape(-1, 6), 2).pose(t) @ np.linalg.inv(target)) / sigma
-
-    model, cost = pose_constraint(spline, t, target, sigma)
-    assert cost == pytest.approx(0.5 * (errors(np.zeros(24)) ** 2).sum(), rel=1e-6, abs=1e-25)
-    assert (model.first, model.last) == (2, 6)
-    J = numeric_jacobian(errors, 24)
-    np.testing.assert_allclose(model.H, J.T @ J, atol=1e-6 * np.abs(J.T @ J).max())
-    np.testing.assert_allclose(model.g, J.T @ errors(np.zeros(24)), atol=1e-6 * max(size, 1e-9))
-
-
-def test_a_tight_pose_constraint_is_met() -> None:
-    state = SplineState.still(0.3, 0.05, np.eye(4), 9)
-    target = se3.exp(np.array([0.02, -0.01, 0.03, 0.04, 0.01, -0.02]))
-    for _ in range(4):
-        prior, _ = acceleration_prior(state.spline, 0, 9, np.full((7, 6), 0.01))
-        hold, _ = pose_constraint(state.spline, 0.43, target, np.full(6, 1e-6))
-        still = Quadratic(0, 1e-3 * np.eye(54), np.zeros(54))
-        H, g = assemble([prior, hold, still], 0, 9)
-        state.apply(0, solve(H, g, 54).reshape(-1, 6))
-    np.testing.assert_allclose(state.spline.pose(0.43), target, atol=1e-9)
-
-
 # -- models, assembly and solution ---------------------------------------------------------------------------------
 
 
@@ -218,70 +155,6 @@ def test_a_system_without_a_minimum_is_refused(least: float) -> None:
     H[0, 1] = H[1, 0] = 0.5
     with pytest.raises(np.linalg.LinAlgError):
         solve(H, np.ones(12))
-
-
-# -- the growing spline --------------------------------------------------------------------------------------------
-
-
-def test_extension_keeps_the_velocity() -> None:
-    step = np.array([0.01, -0.02, 0.03, 0.04, -0.01, 0.02])
-    state = SplineState.still(0.0, 0.05, np.eye(4))
-    state.apply(0, np.arange(4)[:, None] * step)  # exp(k ξ)
-    state.extend(1.0)
-    assert len(state.points) == 24 == len(state.moved)
-    np.testing.assert_allclose(state.points, se3.exp(np.arange(24)[:, None] * step), atol=1e-12)
-    np.testing.assert_allclose(state.spline.velocity(0.97), step / 0.05, atol=1e-9)
-    assert not state.moved[4:].any()
-
-
-def test_extension_covers_the_time_and_no_more() -> None:
-    state = SplineState.still(0.1, 0.05, np.eye(4))
-    state.extend(0.12)
-    assert len(state.points) == 4
-    before = state.spline
-    assert state.spline is before
-    state.extend(0.31)
-    assert state.spline.t_end == pytest.approx(0.35) and state.spline is not before
-    assert state.segment(0.31) == 4 and state.spline.locate(0.31)[0] == 4
-
-
-def test_increments_multiply_from_the_left() -> None:
-    rng, truth = np.random.default_rng(6), hand_held(3)
-    state = SplineState(truth)
-    delta, again = random_twists(rng, (2, 4), 0.3, 0.2)
-    state.apply(5, delta)
-    want = truth.control_points.copy()
-    want[5:9] = se3.exp(delta) @ want[5:9]
-    np.testing.assert_allclose(state.spline.control_points, want, atol=1e-14)
-    state.apply(7, again)
-    want[7:11] = se3.exp(again) @ want[7:11]
-    np.testing.assert_allclose(state.spline.control_points, want, atol=1e-14)
-    total = np.zeros((15, 6))
-    total[5:9] += delta
-    total[7:11] += again
-    np.testing.assert_allclose(state.moved, total)
-
-
-def test_poses_stay_rotations_for_ever() -> None:
-    rng = np.random.default_rng(7)
-    state = SplineState.still(0.0, 0.05, se3.exp(np.array([0.3, 0.1, 0.2, 0.5, -0.4, 0.8])))
-    for k in range(1000):
-        state.extend(0.05 * (k + 1))
-        state.apply(len(state.points) - 4, random_twists(rng, (4,), 0.02, 0.01))
-    R = state.points[:, :3, :3]
-    assert len(state.points) == 1004
-    assert np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max() < 1e-14
-    assert np.linalg.det(R).min() > 0.0
-
-
-def test_a_long_extrapolation_stays_rotations() -> None:
-    # With the transpose taken as inverse, what is left of orthogonality would grow 2.4 times a knot.
-    state = SplineState.still(0.0, 0.05, np.eye(4))
-    state.apply(0, np.arange(4)[:, None] * np.array([0.01, -0.02, 0.03, 0.3, -0.2, 0.25]))
-    for k in range(300):
-        state.extend(0.05 * (k + 1))
-    R = state.points[:, :3, :3]
-    assert np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max() < 1e-14
 
 
 @pytest.mark.parametrize("broken", ["H is NaN", "g is NaN", "a diagonal is negative"])

@@ -36,12 +36,12 @@ from rstrack.bench.methods import paper
 from rstrack.bench.methods.results import QUANTITIES, read_results, results_dict
 from rstrack.bench.methods.tables import results_text
 from rstrack.charts.chart import CameraPath, PathChart, upright_axes
-from rstrack.cli.report import add_report
+from rstrack.cli.report import report as report_command
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import Estimate
 from rstrack.data.rig import Image, Rig
 from rstrack.metrics.association import compare, truth_of
-from rstrack.metrics.evaluate import Metrics, drift, evaluate, metrics_table, run_evaluate
+from rstrack.metrics.evaluate import Metrics, drift, evaluate, run_evaluate
 from rstrack.report.build import write_report
 from rstrack.report.images import rectified
 from rstrack.report.page import Note, Page, Section, render
@@ -84,7 +84,7 @@ def bench_report(bench: Path) -> Path:
 
 def test_the_tables_numbers_are_those_of_evaluate(report: Path, run: Path, twin: Path) -> None:
     m, page = run_evaluate(twin, run), parse(report)
-    for row in metrics_table(m).rows:
+    for row in m.table().rows:
         assert page.row(str(row[0])) == [str(entry) for entry in row]
     top = page.text[: page.text.index("Errors against")]
     for number in (
@@ -279,7 +279,7 @@ def test_the_command_writes_the_page_or_one_line_of_complaint(
 ) -> None:
     def command(*words: str) -> int:
         commands = Commands("rstrack", "")
-        add_report(commands)
+        commands.add(report_command, "")
         return run_program("rstrack", lambda: commands.parser, ["report", *words], "")
 
     for folder, name in ((run, "run.html"), (bench, "bench.html")):

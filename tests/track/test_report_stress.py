@@ -17,7 +17,7 @@ from rsgen.console.command_line import Commands, run_program
 from rsgen.errors import UserError
 from rstrack.bench.stress.run import StressResult
 from rstrack.bench.stress.tables import read_panels, read_stress
-from rstrack.cli.report import add_report
+from rstrack.cli.report import report as report_command
 from rstrack.report.build import write_report
 
 LABELS = {
@@ -250,7 +250,7 @@ def test_the_command_writes_the_page(
 ) -> None:
     def command(*words: str) -> int:
         commands = Commands("rstrack", "")
-        add_report(commands)
+        commands.add(report_command, "")
         return run_program("rstrack", lambda: commands.parser, ["report", *words], "")
 
     assert command(str(made[0]), "--out", str(tmp_path / "page.html"), "--quiet") == 0

@@ -10,13 +10,11 @@ import pytest
 import synthetic
 from rstrack_util import (
     ENGINE,
-    depth_input,
     depth_of,
     disturbed,
     exact_reference,
     exposure,
     maker,
-    plane_before,
     small_camera,
 )
 
@@ -26,7 +24,6 @@ from rsgen.geometry.spline import Spline
 from rstrack.alignment import block_sums as block_sums_module
 from rstrack.alignment import residuals
 from rstrack.alignment.block_sums import BlockSums, Scaling, block_counts
-from rstrack.alignment.linearise import seen_motions, weakest_motion
 from rstrack.alignment.normal_equations import chain
 from rstrack.alignment.student_t import LEAST_CURVATURE, NU, weight
 from rstrack.images import line_poses as lines
@@ -279,17 +276,3 @@ def test_sums_have_the_same_bits_on_every_run(room: tuple) -> None:
     for other in runs[1:]:
         assert np.array_equal(runs[0].H, other.H) and np.array_equal(runs[0].g, other.g)
         assert (runs[0].cost, runs[0].weighted, runs[0].count) == (other.cost, other.weighted, other.count)
-
-
-def test_observability_is_zero_where_a_motion_is_not_seen(room: tuple) -> None:
-    as_input, ref, spline, z = room
-    assert weakest_motion(seen_motions(block_sums(as_input(z), ref, spline, 0.1, 0.01), ref.median_depth)) > 1e-3
-    wall = plane_before(ref.T_world_base, (0.3, 0.2, 1.0))
-    seen = depth_input(wall.cast, spline, exposure(0.30, "bottom-top", DEPTH))
-    one = exact_reference(wall.cast, spline, exposure(0.25, None))
-    assert (
-        abs(weakest_motion(seen_motions(block_sums(seen, one, spline, 0.1, 0.01), one.median_depth))) < 1e-5
-    )  # rounding to fixed point
-    alike = BlockSums(np.diag([1.0, 1.0, 1.0, 4.0, 4.0, 4.0])[None, None] * 5, np.zeros((1, 1, 6)), 0.0, 0.0, 10)
-    assert weakest_motion(seen_motions(alike, 2.0)) == pytest.approx(0.5)
-    assert weakest_motion(seen_motions(BlockSums(0.0 * alike.H, alike.g, 0.0, 0.0, 0), 2.0)) == 0.0

@@ -2,91 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from rstrack_util import (
     ENGINE,
-    SCANS,
-    T_COLOR_DEPTH,
-    color_input,
-    depth_input,
     disturbed,
-    exact_reference,
-    exposure,
-    hand_held,
     make_terms,
     moved,
     plane_before,
-    small_camera,
 )
 from scipy import stats
-from util import numeric_jacobian
+from term_setting import CASES, DEPTH, NORMALS, REF_STAMP, Setting, setting
 
 from rsgen.device.projection import project_rolling
 from rsgen.geometry import se3
-from rsgen.geometry.spline import Spline
-from rstrack.alignment import block_sums, residuals
-from rstrack.alignment.linearise import Linearised, Terms
+from rstrack.alignment import residuals
+from rstrack.alignment.linearise import Linearised
 from rstrack.alignment.student_t import LEAST_CURVATURE, NU, scale_step, weight
 from rstrack.images import line_poses as lines
 from rstrack.images.blur import blur_length, blur_weight
-from rstrack.images.pyramid import ColorImage, DepthImage
-from rstrack.keyframes.keyframe import Reference
-
-NORMALS = [(0.5, -0.2, 1.0), (-0.3, 0.6, 1.0), (0.1, 0.1, 1.0)]
-REF_STAMP, STAMP = 0.43, 0.465
-DEPTH, COLOR = small_camera("radtan"), small_camera("fisheye", 72, 54)
-# Scan of the reference: None if it is rectified.
-CASES = [*[(None, scan) for scan in SCANS], ("top-bottom", "top-bottom"), ("right-left", "left-right")]
-
-
-@dataclass(frozen=True)
-class Setting:
-    """A plane, its reference and one image of it; `term` linearises around a spline with scale σ."""
-
-    truth: Spline
-    ref: Reference
-    image: DepthImage | ColorImage
-    terms: Terms
-
-    def term(self, spline: Spline, sigma: float, level: int = 0) -> Linearised:
-        if isinstance(self.image, DepthImage):
-            return self.terms.geometric(self.image, self.ref, spline, level, sigma)
-        return self.terms.photometric(self.image, self.ref, spline, level, sigma)
-
-
-def setting(
-    kind: str, ref_scan: str | None, scan: str, normal: tuple[float, float, float] = NORMALS[0],
-    terms: Terms | None = None,
-) -> Setting:  # fmt: skip
-    """Points that are looked at lie far enough from all borders for the same ones to count wherever images move."""
-    truth = hand_held(1)
-    plane = plane_before(truth.pose(REF_STAMP), normal)
-    geometric = kind == "geometric"
-    # Only a reference that is not rectified may be distorted.
-    ref_image = exposure(REF_STAMP, ref_scan, DEPTH if ref_scan else small_camera())  # type: ignore[arg-type]
-    ref = exact_reference(plane.cast, truth, ref_image, 0 if geometric else 8)
-    image: DepthImage | ColorImage
-    if geometric:
-        image = depth_input(plane.cast, truth, exposure(STAMP, scan, DEPTH), 8)  # type: ignore[arg-type]
-    else:
-        image = color_input(plane.cast, truth, exposure(STAMP + 0.007, scan, COLOR, T_COLOR_DEPTH, 0.02))  # type: ignore[arg-type]
-    return Setting(truth, ref, image, terms or make_terms(DEPTH))
 
 
 @pytest.fixture(autouse=True)
 def exact_poses(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every line's pose from the spline: with these small images a block of eight would take 5 ms."""
     monkeypatch.setattr(lines, "_LINES_PER_NODE", 1)
-
-
-@pytest.fixture
-def one_line_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every line its own block, so that nothing but rounding is approximate."""
-    monkeypatch.setattr(block_sums, "LINES_PER_BLOCK", 1)
-    monkeypatch.setattr(block_sums, "LINES_PER_PAIR_BLOCK", 1)
 
 
 def settled_sigma(s: Setting, start: float) -> Linearised:
@@ -108,84 +50,6 @@ def test_errors_vanish_at_the_true_spline(ref_scan: str | None, scan: str) -> No
     assert color.next_sigma < 1e-3
     wrong = setting("geometric", ref_scan, scan, terms=terms)
     assert wrong.term(disturbed(wrong.truth, 3), 1e-2).next_sigma > 1e-3
-
-
-@pytest.mark.parametrize("kind", ["geometric", "photometric"])
-@pytest.mark.parametrize(("ref_scan", "scan"), CASES)
-def test_gradient_is_that_of_the_cost(kind: str, ref_scan: str | None, scan: str, one_line_blocks: None) -> None:
-    terms = make_terms(DEPTH)
-    sigma = 0.01 if kind == "geometric" else 0.02
-    # The geometric term sees three motions of a plane; one plane more lets all six be seen.
-    normals = NORMALS[:2] if kind == "geometric" and ref_scan is None else NORMALS[:1]
-    for normal in normals:
-        s = setting(kind, ref_scan, scan, normal, terms)
-        around = disturbed(s.truth, 5)
-        lin = s.term(around, sigma)
-        numeric, counts = cost_gradient(s, around, lin, sigma)
-        assert counts == {lin.count}, "the mask is not fixed"
-        scale = np.abs(numeric).max()
-        assert scale > 100.0
-        # Kinks of bilinear interpolation, and of normals that change from pixel to pixel, leave the rest.
-        limit = 2e-4 if kind == "geometric" and ref_scan is None else 5e-3
-        np.testing.assert_allclose(lin.model.g, numeric, atol=limit * scale)
-
-
-def cost_gradient(
-    s: Setting, around: Spline, lin: Linearised, sigma: float, level: int = 0
-) -> tuple[np.ndarray, set[int]]:
-    """Derivative of the cost by left increments of the model's control points, and the counts of pixels that it saw."""
-    counts = set()
-
-    def cost(x: np.ndarray) -> np.ndarray:
-        there = s.term(moved(around, x.reshape(-1, 6), lin.model.first), sigma, level)
-        counts.add(there.count)
-        return np.array(there.cost)
-
-    return numeric_jacobian(cost, len(lin.model.g)), counts
-
-
-def test_gradient_at_a_coarser_level() -> None:
-    s = setting("photometric", None, "top-bottom")
-    around = disturbed(s.truth, 5)
-    lin = s.term(around, 0.02, 1)
-    numeric, _ = cost_gradient(s, around, lin, 0.02, 1)
-    np.testing.assert_allclose(lin.model.g, numeric, atol=0.02 * np.abs(numeric).max())
-
-
-@pytest.mark.parametrize("kind", ["geometric", "photometric"])
-def test_blocks_of_lines_lose_little(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    s = setting(kind, None, "top-bottom")
-    around = disturbed(s.truth, 5)
-    blocks = s.term(around, 0.01).model
-    monkeypatch.setattr(block_sums, "LINES_PER_BLOCK", 1)
-    single = setting(kind, None, "top-bottom").term(around, 0.01).model
-    assert blocks.first == single.first
-    for name in ("g", "H"):
-        exact = getattr(single, name)
-        # Here a block takes 5 ms; at 480 lines it takes 0.5.
-        np.testing.assert_allclose(getattr(blocks, name), exact, atol=0.02 * np.abs(exact).max())
-
-
-@pytest.mark.parametrize("kind", ["geometric", "photometric"])
-def test_curvature_is_that_of_the_cost(kind: str, one_line_blocks: None) -> None:
-    s = setting(kind, None, "left-right")
-    # With residuals of zero H is exact, apart from the curvature of the pixel's path, times zero.
-    lin = s.term(s.truth, 0.01)
-    numeric = numeric_jacobian(
-        lambda x: s.term(moved(s.truth, x.reshape(-1, 6), lin.model.first), 0.01).model.g, len(lin.model.g), 3e-4
-    )
-    np.testing.assert_allclose(lin.model.H, numeric, atol=0.01 * np.abs(numeric).max())
-    # Away from it, Newton's weight rather than the one of reweighted least squares: here errors are about σ/2, and the
-    # factor (ν − s²)/(ν + s²) takes off a tenth.
-    around = disturbed(s.truth, 5)
-    sigma = 2.0 * s.term(around, 0.01).next_sigma
-    H = s.term(around, sigma).model.H
-    lin = s.term(around, sigma)
-    numeric = numeric_jacobian(
-        lambda x: s.term(moved(around, x.reshape(-1, 6), lin.model.first), sigma).model.g, len(lin.model.g), 3e-4
-    )
-    limit = 0.01 if kind == "geometric" else 0.05
-    np.testing.assert_allclose(H, numeric, atol=limit * np.abs(numeric).max())
 
 
 def test_curvature_never_turns_negative() -> None:
@@ -220,21 +84,6 @@ def test_scale_converges_to_that_of_the_distribution() -> None:
     assert sigma == pytest.approx(likelihood, rel=1e-4) and sigma == pytest.approx(0.013, rel=0.02)
     assert scale_step(0.5, 0.0, 0, 1e-4) == 0.5
     assert scale_step(0.5, 1e-12, 10, 1e-4) == 1e-4
-
-
-def test_row_shift_is_the_movement_in_pixels() -> None:
-    s = setting("geometric", None, "top-bottom")
-    lin = s.term(s.truth, 0.01)
-    R = s.ref.T_world_base[:3, :3]
-    count = len(s.truth.control_points)
-    sideways, turn = np.tile([*(R @ [0.01, 0.0, 0.0]), 0, 0, 0], (count, 1)), np.zeros((count, 6))
-    assert lin.row_shift(sideways, 48.0, 2.0) == pytest.approx(48.0 * 0.01 / 2.0)
-    # A turn about the base frame's own y axis, through its own origin.
-    turn[:] = se3.adjoint(s.ref.T_world_base) @ [0.0, 0.0, 0.0, 0.0, 0.005, 0.0]
-    assert lin.row_shift(turn, 48.0, 2.0) == pytest.approx(48.0 * 0.005)
-    # Control points that the image does not depend on.
-    turn[lin.model.first : lin.model.last] = 0.0
-    assert lin.row_shift(turn, 48.0, 2.0) == 0.0
 
 
 @pytest.mark.parametrize("scan", ["top-bottom", "right-left"])

@@ -20,7 +20,8 @@ from rsgen.files import atomic_write, read_text, write_error
 from rstrack.bench.methods.grid import CELL
 from rstrack.bench.methods.plan import SequenceInfo
 from rstrack.bench.methods.results import Cell, Results
-from rstrack.mapping.reconstruct import MapOptions, run_map
+from rstrack.mapping.map import run_map
+from rstrack.options import MapOptions
 from rstrack.tracking.run import Progress
 
 SHOWN = ("rs-pg", "gs-pg", "baseline")
@@ -155,7 +156,7 @@ def _draw(sequence: str, made: Sequence[tuple[Cell, dict[str, Any]]], out: Path)
         return path
     _remove(pictured)
     # Mitsuba draws, which the tracker's process never loads.
-    command = [sys.executable, "-m", "rsgen.cli.main", "picture", "--quiet", f"--out={path.resolve()}"]
+    command = [sys.executable, "-m", "rsgen", "picture", "--quiet", f"--out={path.resolve()}"]
     command += [f"--width={_PANEL_PX[0]}", f"--height={_PANEL_PX[1]}"]
     command += [f"--label={part['label']}" for part in parts]
     command += [str((out / "cells" / sequence / part["method"] / MESH).resolve()) for part in parts]

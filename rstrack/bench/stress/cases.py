@@ -129,7 +129,7 @@ def _sped_up(config: Path, text: dict[str, Any], speed: float, slow: Path, out: 
 def run_rsgen(words: Sequence[str]) -> None:
     """Run `rsgen` with these arguments in a process of its own. Raises UserError if it fails."""
     # The tracker's process must not load the renderer.
-    done = subprocess.run([sys.executable, "-m", "rsgen.cli.main", *words], capture_output=True, text=True, check=False)
+    done = subprocess.run([sys.executable, "-m", "rsgen", *words], capture_output=True, text=True, check=False)
     if done.returncode:
         said = (done.stderr.strip() or done.stdout.strip() or f"exit status {done.returncode}").splitlines()
         raise UserError(f"stress: rsgen {words[0]} {words[1]} failed: {said[-1]}")

@@ -9,18 +9,12 @@ import numpy as np
 import pytest
 import synthetic
 
-from rsgen.device.arrays import engine
-from rsgen.device.projection import Lens
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
-from rstrack.alignment.linearise import Terms
 from rstrack.data.rig import Frame, Image, Rig
-from rstrack.images.line_poses import Exposure
-from rstrack.images.pyramid import camera_rays, depth_image
-from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.options import Options
 from rstrack.tracking.pose_tracker import BaselineTracker
 from rstrack.tracking.run import make_tracker as make_any_tracker
@@ -41,6 +35,15 @@ def make_frame(stamp: float, shutter: Shutter, motion: Spline = MOTION, scale: f
     return Frame(Image(stamp, depth * np.float32(scale)), ())
 
 
+def noisy(frame: Frame, rng: np.random.Generator) -> Frame:
+    """With noise of 3 mm, as a depth camera's.
+
+    Without any, σ falls so fast that hardly a pixel is smooth enough to count: starts from further off are then lost.
+    """
+    z = frame.depth.pixels + 3e-3 * rng.standard_normal(frame.depth.pixels.shape, np.float32)
+    return Frame(Image(frame.depth.stamp, z), ())
+
+
 def still(T_world_depth: np.ndarray) -> Spline:
     return Spline(np.repeat(T_world_depth[None], 5, axis=0), -1.0, 2.0)
 
@@ -50,10 +53,7 @@ def blank(stamp: float) -> Frame:
 
 
 def make_tracker(shutter: Shutter, **options: Any) -> BaselineTracker:
-    tracker = BaselineTracker(make_rig(shutter), Options(method="baseline", backend="llvm", **options))
-    # In images as small as these every corner of the room is rough, and hardly a pixel is left.
-    tracker._terms.smooth = 1e9
-    return tracker
+    return BaselineTracker(make_rig(shutter), Options(method="baseline", backend="llvm", **options))
 
 
 def track(shutter: Shutter, frames: int = 16, **options: Any) -> BaselineTracker:
@@ -150,15 +150,16 @@ def test_jumps_are_found() -> None:
         jump = rng.normal(size=(2, 3))
         jump *= np.array([[0.03], [np.radians(1.5)]]) / np.linalg.norm(jump, axis=1, keepdims=True)
         tracker = make_tracker(Shutter())
-        tracker.feed(make_frame(0.0, Shutter(), still(T)))
-        tracker.feed(make_frame(0.1, Shutter(), still(T @ se3.exp(jump.ravel()))))
+        tracker.feed(noisy(make_frame(0.0, Shutter(), still(T)), rng))
+        assert not tracker.feed(noisy(make_frame(0.1, Shutter(), still(T @ se3.exp(jump.ravel()))), rng)).lost
         _, T_world_depth = tracker.trajectory
         assert np.linalg.norm((T_world_depth[-1] - se3.exp(jump.ravel()))[:3, 3]) < 2e-3  # of 30
 
 
 def test_lost_frames_are_left_out_and_the_keyframe_is_tried_again() -> None:
     tracker = make_tracker(Shutter())
-    frames = [make_frame(k / RATE_HZ, Shutter()) for k in range(9)]
+    rng = np.random.default_rng(0)
+    frames = [noisy(make_frame(k / RATE_HZ, Shutter()), rng) for k in range(9)]
     for k in (3, 4, 5):
         frames[k] = blank(k / RATE_HZ)
     reports = [tracker.feed(frame) for frame in frames]
@@ -223,28 +224,3 @@ def test_a_single_plane_does_not_fix_a_pose() -> None:
     tracker = make_tracker(Shutter())
     tracker.feed(Frame(Image(0.0, wall), ()))
     assert tracker.feed(Frame(Image(0.1, wall), ())).lost
-
-
-@pytest.mark.parametrize("level", [0, 2])
-def test_geometric_pose_is_the_geometric_term_of_a_camera_at_rest(level: int) -> None:
-    # By four control points that move alike, increments of the spline are those of the pose, but in the world frame.
-    e = engine("llvm")
-    lens = Lens(CAMERA, Shutter())
-    rays = camera_rays(Exposure(lens, 0.0, np.eye(4)))
-    terms = Terms(e, (e.upload(rays[..., 0]), e.upload(rays[..., 1])))
-    maker = KeyframeMaker(e, rays, terms.rays)
-    T_a, T_b = MOTION.pose(0.0), MOTION.pose(0.02)
-    images = [
-        depth_image(e, Exposure(lens, t, np.eye(4)), synthetic.render_depth(MOTION, CAMERA, Shutter(), t), 12.0)
-        for t in (0.0, 0.02)
-    ]
-    ref = maker.rectified(1, images[0], (), still(T_a), None)
-    T_off = T_b @ se3.exp(np.array([1e-3, -2e-3, 1e-3, 2e-3, 1e-3, -1e-3]))
-    sigma = 2e-3
-    sums, next_sigma = terms.geometric_pose(images[1], ref, se3.inverse(T_a) @ T_off, level, sigma)
-    whole = terms.geometric(images[1], ref, still(T_off), level, sigma)
-    assert (sums.count, sums.cost, next_sigma) == (whole.count, whole.cost, whole.next_sigma)
-    together = np.tile(np.eye(6), (4, 1)) @ se3.adjoint(T_a)
-    H, g = together.T @ whole.model.H @ together, together.T @ whole.model.g
-    np.testing.assert_allclose(sums.H[0, 0] / sigma**2, H, rtol=1e-9, atol=1e-9 * np.abs(H).max())
-    np.testing.assert_allclose(sums.g[0, 0] / sigma, g, rtol=1e-9, atol=1e-9 * np.abs(g).max())

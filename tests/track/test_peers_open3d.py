@@ -258,39 +258,54 @@ def test_without_open3d_there_is_one_line_that_helps(
 
 
 @pytest.fixture(scope="module")
-def slow(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    """Twelve global-shutter frames at 0.13 m/s and 0.15 rad/s, colour beside depth."""
+def moving(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """Twelve global-shutter frames at 0.5 m/s and 0.6 rad/s, colour beside depth."""
     root = tmp_path_factory.mktemp("peers") / "seq"
     still = {"readout_s": 0.0}
     config = synthetic.make_config(160, 120, still, still)
-    writer = synthetic.open_writer(root, config, 12, synthetic.make_spline(0.15))
+    writer = synthetic.open_writer(root, config, 12, synthetic.make_spline(0.6))
     synthetic.write_frames(writer)
     synthetic.write_scene(root)
     writer.finish()
     return open_dataset(root)
 
 
+def ends(dataset: Dataset, T_world_depth: np.ndarray) -> tuple[float, float]:
+    """Error (m, degrees) of the motion from the first to the last frame, without any alignment."""
+    assert dataset.truth is not None
+    motion = se3.inverse(dataset.truth.pose(dataset.stamps[0])) @ dataset.truth.pose(dataset.stamps[-1])
+    error = se3.log(se3.inverse(motion) @ se3.inverse(T_world_depth[0]) @ T_world_depth[-1])
+    return float(np.linalg.norm(error[:3])), float(np.degrees(np.linalg.norm(error[3:])))
+
+
+# Most that ATE (m) and the error of the whole way (m, degrees) may be: about three times what they are with 0.19.
 # Hybrid looks colours and depths up at the nearest pixel, so it is off by up to half a pixel (here 9 mm) to each frame.
+LIMITS = {
+    "open3d-icp": (0.0025, 0.008, 0.2),
+    "open3d-icp-keyframe": (0.001, 0.001, 0.03),
+    "open3d-hybrid": (0.012, 0.04, 2.0),
+    "open3d-hybrid-keyframe": (0.008, 0.02, 0.4),
+}
+
+
+def test_a_camera_that_never_moves_is_beyond_all_limits(moving: Dataset) -> None:
+    truth = truth_of(moving)
+    assert truth is not None
+    still = np.repeat(np.eye(4)[None], 12, axis=0)
+    found = evaluate(truth, Estimate(moving.stamps, still)).ate_rmse_m, *ends(moving, still)
+    assert (np.array(found) > 4.0 * np.array(list(LIMITS.values()))).all()
+
+
 @needs_open3d
-@pytest.mark.parametrize(("name", "ate_m", "end_m", "end_deg"), [
-    ("open3d-icp", 0.003, 0.02, 0.6), ("open3d-icp-keyframe", 0.0015, 0.003, 0.1),
-    ("open3d-hybrid", 0.03, 0.09, 3.0), ("open3d-hybrid-keyframe", 0.008, 0.01, 0.4),
-])  # fmt: skip
-def test_a_slow_global_shutter_sequence_is_tracked(
-    name: str, ate_m: float, end_m: float, end_deg: float, slow: Dataset, tmp_path: Path
-) -> None:
-    estimate = run_peer(name, slow)
-    truth = truth_of(slow)
-    assert truth is not None and slow.truth is not None
+@pytest.mark.parametrize("name", LIMITS)
+def test_a_global_shutter_sequence_is_tracked(name: str, moving: Dataset, tmp_path: Path) -> None:
+    estimate = run_peer(name, moving)
+    truth = truth_of(moving)
+    assert truth is not None
     metrics = evaluate(truth, estimate)
     assert metrics.frames_tracked == 12 and estimate.info["lost"] == 0
-    assert metrics.ate_rmse_m < ate_m
-    # From the first to the last frame, without any alignment: backwards would be twice the whole way wrong.
-    motion = se3.inverse(slow.truth.pose(slow.stamps[0])) @ slow.truth.pose(slow.stamps[-1])
-    found = se3.inverse(estimate.T_world_depth[0]) @ estimate.T_world_depth[-1]
-    error = se3.log(se3.inverse(motion) @ found)
-    assert np.linalg.norm(motion[:3, 3]) > 0.05 and np.linalg.norm(error[:3]) < end_m
-    assert np.degrees(np.linalg.norm(error[3:])) < end_deg
+    found = metrics.ate_rmse_m, *ends(moving, estimate.T_world_depth)
+    assert (np.array(found) < LIMITS[name]).all(), found
 
     write_estimate(tmp_path / "run", estimate.stamps, estimate.T_world_depth, estimate.spline, estimate.info)
     written = read_estimate(tmp_path / "run")
@@ -317,15 +332,15 @@ def test_the_speed_table_has_ratios_to_every_peer() -> None:
     assert SpeedResult("x", PLAIN, (20, 23), "llvm", 2, methods[:1]).as_dict()["ratios"] == {}
 
 
-def test_a_peer_is_timed_on_the_same_frames(slow: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_peer_is_timed_on_the_same_frames(moving: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rstrack.peers.open3d, "open3d", lambda: stand_in(Script([(STEP, 0.9)] * 5)))
     fed: list[float] = []
     feed = PeerTracker.feed
     monkeypatch.setattr(PeerTracker, "feed", lambda self, t, image: (fed.append(t), feed(self, t, image))[1])
     monkeypatch.setattr(rstrack.bench.speed, "_time", lambda d, o, *_: times(o.method, (2.0,) * 3))
     options = rstrack.bench.speed.Options(method="rs-g")
-    report = rstrack.bench.speed.time_methods(slow, [options], 6, peers=["open3d-icp"])
-    assert [m.method for m in report.methods] == ["rs-g", "open3d-icp"] and fed == slow.stamps[:6].tolist()
+    report = rstrack.bench.speed.time_methods(moving, [options], 6, peers=["open3d-icp"])
+    assert [m.method for m in report.methods] == ["rs-g", "open3d-icp"] and fed == moving.stamps[:6].tolist()
     peer = report.methods[1]
     assert len(peer.frame_ms) == 3 and sum(peer.parts_ms.values()) == pytest.approx(peer.mean_ms) and peer.read_ms > 0
 

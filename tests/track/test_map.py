@@ -16,8 +16,9 @@ from rsgen.geometry.spline import Spline
 from rsgen.sequence.reader import read_sequence
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.estimate import Estimate, write_estimate
-from rstrack.mapping.reconstruct import MapOptions, Reconstruction, reconstruct, run_map
-from rstrack.metrics.map_eval import Triangles, cut, evaluate_map, run_map_evaluate, sample_surface, seen_surface
+from rstrack.mapping.map import Reconstruction, reconstruct, run_map
+from rstrack.metrics.map_eval import Triangles, cut, evaluate_map, run_map_eval, sample_surface, seen_surface
+from rstrack.options import MapOptions
 from rstrack.volume.mesh import write_ply
 
 OPTIONS = MapOptions(voxel_m=0.03, backend="llvm")
@@ -110,7 +111,7 @@ def test_the_estimates_own_world(dataset: Dataset, root: Path, tmp_path: Path) -
     np.testing.assert_array_less(np.median(to_room(found.surface.vertices - [0, 0, 5.0])), 5e-4)
     write_ply(tmp_path / "mesh.ply", found.surface, f"world {found.world}")
     with pytest.raises(UserError, match="--world truth"):
-        run_map_evaluate(tmp_path / "mesh.ply", root / "scene.ply")
+        run_map_eval(tmp_path / "mesh.ply", root / "scene.ply")
 
 
 def test_from_folder_to_figures(dataset: Dataset, root: Path, tmp_path: Path) -> None:
@@ -123,7 +124,7 @@ def test_from_folder_to_figures(dataset: Dataset, root: Path, tmp_path: Path) ->
     )  # fmt: skip
     assert stages[-1] == ("meshing", 1.0) and ("integrating", 1.0) in stages
     assert len(trimesh.load(tmp_path / "cloud.ply").vertices) == len(result.surface.vertices)
-    report = run_map_evaluate(tmp_path / "mesh.ply", root / "scene.ply", samples=2000)
+    report = run_map_eval(tmp_path / "mesh.ply", root / "scene.ply", samples=2000)
     assert report.completeness is not None and report.within_2cm is not None
     # The scene's ball is an icosphere: up to 6 mm off the one that was seen.
     assert report.accuracy.mean_m < 2e-3 and report.accuracy.median_m < 5e-4
@@ -184,4 +185,4 @@ def test_wrong_files_are_named(root: Path, tmp_path: Path) -> None:
     (tmp_path / "bad.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 9\n")
     for name in ("bad.ply", "none.ply"):
         with pytest.raises(UserError, match=name):
-            run_map_evaluate(tmp_path / name, root / "scene.ply")
+            run_map_eval(tmp_path / name, root / "scene.ply")

@@ -18,7 +18,7 @@ from rsgen.sequence.trajectory import Trajectory, TrajectoryFormat, read_traject
 
 
 @dataclass(frozen=True)
-class FitReport:
+class FitSummary:
     """A trajectory, its spline and the motion between its first and last stamp."""
 
     name: str
@@ -26,85 +26,83 @@ class FitReport:
     fit: FitResult
     statistics: MotionStatistics
 
+    def as_dict(self) -> dict[str, Any]:
+        """It as plain numbers for JSON; units are in the names."""
+        fit, stamps = self.fit, self.trajectory.stamps
+        trans, rot = fit.residual_trans_m, fit.residual_rot_rad
+        worst_trans, worst_rot = int(trans.argmax()), int(rot.argmax())
+        return {
+            "file": self.name,
+            "poses": len(stamps),
+            "first_stamp_s": float(stamps[0]),
+            "last_stamp_s": float(stamps[-1]),
+            "knot_spacing_s": fit.spline.dt,
+            "control_points": len(fit.spline.control_points),
+            "iterations": fit.iterations,
+            "downweighted_poses": int((fit.weights < 1.0).sum()),
+            "residual": {
+                "rms_mm": fit.rms_trans_m * 1e3,
+                "median_mm": float(np.median(trans)) * 1e3,
+                "max_mm": float(trans[worst_trans]) * 1e3,
+                "max_mm_pose": worst_trans,
+                "max_mm_stamp_s": float(stamps[worst_trans]),
+                "rms_deg": math.degrees(fit.rms_rot_rad),
+                "median_deg": math.degrees(float(np.median(rot))),
+                "max_deg": math.degrees(float(rot[worst_rot])),
+                "max_deg_pose": worst_rot,
+                "max_deg_stamp_s": float(stamps[worst_rot]),
+            },
+            "motion": dataclasses.asdict(self.statistics),
+        }
 
-def make_fit_report(
+    def text(self) -> str:
+        """It as plain text with tables."""
+        data = self.as_dict()
+        residual, motion = data["residual"], self.statistics
+        rate = (data["poses"] - 1) / (data["last_stamp_s"] - data["first_stamp_s"])
+        residuals = tuple(
+            (
+                label,
+                *(fixed(residual[f"{kind}_{unit}"], digits) for kind in ("rms", "median", "max")),
+                str(residual[f"max_{unit}_pose"]),
+                fixed(residual[f"max_{unit}_stamp_s"], 3),
+            )
+            for label, unit, digits in (("position, mm", "mm", 3), ("rotation, degrees", "deg", 4))
+        )
+        speeds = (
+            ("translation, m/s", fixed(motion.mean_speed_m_s, 3), fixed(motion.max_speed_m_s, 3)),
+            ("rotation, degrees/s", fixed(motion.mean_rotation_deg_s, 2), fixed(motion.max_rotation_deg_s, 2)),
+            ("acceleration, m/s²", fixed(motion.mean_acceleration_m_s2, 2), fixed(motion.max_acceleration_m_s2, 2)),
+        )
+        lines = (
+            f"{data['file']}: {data['poses']} poses, {motion.duration_s:.2f} s, {rate:.1f} a second",
+            f"cubic B-spline on SE(3): knots {data['knot_spacing_s']:g} s apart, {data['control_points']} control "
+            f"points, {data['iterations']} iterations, {data['downweighted_poses']} poses downweighted",
+            "",
+            Table(("residuals", "RMS", "median", "max", "worst pose", "at s"), residuals).text(),
+            "",
+            Table(("motion of the spline", "mean", "max"), speeds).text(),
+            "",
+            f"length {motion.length_m:.3f} m",
+        )
+        return "\n".join(lines)
+
+
+def summarise_fit(
     path: str | Path,
     dt: float = 0.05,
     smoothing: float = 0.0,
     format: TrajectoryFormat = "auto",
     icl_start: npt.ArrayLike | None = None,
-) -> FitReport:
+) -> FitSummary:
     """Read and fit a trajectory file; parameters and errors as in `read_trajectory` and `fit_spline`."""
     trajectory = read_trajectory(path, format=format, icl_start=icl_start)
     fit = fit_spline(trajectory, dt=dt, smoothing=smoothing)
     statistics = motion_statistics(fit.spline, float(trajectory.stamps[0]), float(trajectory.stamps[-1]))
-    return FitReport(Path(path).name, trajectory, fit, statistics)
+    return FitSummary(Path(path).name, trajectory, fit, statistics)
 
 
-def report_dict(report: FitReport) -> dict[str, Any]:
-    """The report as plain numbers for JSON; units are in the names."""
-    fit, stamps = report.fit, report.trajectory.stamps
-    trans, rot = fit.residual_trans_m, fit.residual_rot_rad
-    worst_trans, worst_rot = int(trans.argmax()), int(rot.argmax())
-    return {
-        "file": report.name,
-        "poses": len(stamps),
-        "first_stamp_s": float(stamps[0]),
-        "last_stamp_s": float(stamps[-1]),
-        "knot_spacing_s": fit.spline.dt,
-        "control_points": len(fit.spline.control_points),
-        "iterations": fit.iterations,
-        "downweighted_poses": int((fit.weights < 1.0).sum()),
-        "residual": {
-            "rms_mm": fit.rms_trans_m * 1e3,
-            "median_mm": float(np.median(trans)) * 1e3,
-            "max_mm": float(trans[worst_trans]) * 1e3,
-            "max_mm_pose": worst_trans,
-            "max_mm_stamp_s": float(stamps[worst_trans]),
-            "rms_deg": math.degrees(fit.rms_rot_rad),
-            "median_deg": math.degrees(float(np.median(rot))),
-            "max_deg": math.degrees(float(rot[worst_rot])),
-            "max_deg_pose": worst_rot,
-            "max_deg_stamp_s": float(stamps[worst_rot]),
-        },
-        "motion": dataclasses.asdict(report.statistics),
-    }
-
-
-def report_text(report: FitReport) -> str:
-    """The report as plain text with tables."""
-    data = report_dict(report)
-    residual, motion = data["residual"], report.statistics
-    rate = (data["poses"] - 1) / (data["last_stamp_s"] - data["first_stamp_s"])
-    residuals = tuple(
-        (
-            label,
-            *(fixed(residual[f"{kind}_{unit}"], digits) for kind in ("rms", "median", "max")),
-            str(residual[f"max_{unit}_pose"]),
-            fixed(residual[f"max_{unit}_stamp_s"], 3),
-        )
-        for label, unit, digits in (("position, mm", "mm", 3), ("rotation, degrees", "deg", 4))
-    )
-    speeds = (
-        ("translation, m/s", fixed(motion.mean_speed_m_s, 3), fixed(motion.max_speed_m_s, 3)),
-        ("rotation, degrees/s", fixed(motion.mean_rotation_deg_s, 2), fixed(motion.max_rotation_deg_s, 2)),
-        ("acceleration, m/s²", fixed(motion.mean_acceleration_m_s2, 2), fixed(motion.max_acceleration_m_s2, 2)),
-    )
-    lines = (
-        f"{data['file']}: {data['poses']} poses, {motion.duration_s:.2f} s, {rate:.1f} a second",
-        f"cubic B-spline on SE(3): knots {data['knot_spacing_s']:g} s apart, {data['control_points']} control points, "
-        f"{data['iterations']} iterations, {data['downweighted_poses']} poses downweighted",
-        "",
-        Table(("residuals", "RMS", "median", "max", "worst pose", "at s"), residuals).text(),
-        "",
-        Table(("motion of the spline", "mean", "max"), speeds).text(),
-        "",
-        f"length {motion.length_m:.3f} m",
-    )
-    return "\n".join(lines)
-
-
-def plot_fit(report: FitReport, out: str | Path) -> None:
+def plot_fit(fitted: FitSummary, out: str | Path) -> None:
     """Draw residuals, positions, speeds and acceleration over time into a png, pdf or svg file.
 
     Raises UserError if the file's type is another or it cannot be written.
@@ -115,15 +113,15 @@ def plot_fit(report: FitReport, out: str | Path) -> None:
 
     figure = Figure(figsize=(12.0, 8.5), layout="constrained")
     axes = figure.subplots(3, 2, sharex=True)
-    _draw_residuals(axes[0], report)
-    _draw_motion(axes[1:], report)
+    _draw_residuals(axes[0], fitted)
+    _draw_motion(axes[1:], fitted)
     for axis in axes.flat:
         axis.grid(True, color="0.9", linewidth=0.6)
         axis.spines[["top", "right"]].set_visible(False)
         axis.margins(x=0.0)
     for axis in axes[-1]:
         axis.set_xlabel("time, s")
-    data = report_dict(report)
+    data = fitted.as_dict()
     figure.suptitle(
         f"{data['file']}: spline with knots {data['knot_spacing_s'] * 1e3:g} ms apart, "
         f"RMS {data['residual']['rms_mm']:.2f} mm and {data['residual']['rms_deg']:.3f}°",
@@ -139,8 +137,8 @@ _LEGEND: Any = dict(
 _BLUE, _ORANGE, _GREEN, _RED, _GREY = "#2a6fbb", "#d9822b", "#3a9d5d", "#c0392b", "0.45"
 
 
-def _draw_residuals(axes: Any, report: FitReport) -> None:
-    stamps, fit = report.trajectory.stamps, report.fit
+def _draw_residuals(axes: Any, fitted: FitSummary) -> None:
+    stamps, fit = fitted.trajectory.stamps, fitted.fit
     limited = fit.weights < 1.0
     for axis, values, label in (
         (axes[0], fit.residual_trans_m * 1e3, "position residual, mm"),
@@ -157,14 +155,14 @@ def _draw_residuals(axes: Any, report: FitReport) -> None:
         axis.legend(handles[start:], labels[start:], **_LEGEND)
 
 
-def _draw_motion(axes: Any, report: FitReport) -> None:
-    stamps, spline = report.trajectory.stamps, report.fit.spline
+def _draw_motion(axes: Any, fitted: FitSummary) -> None:
+    stamps, spline = fitted.trajectory.stamps, fitted.fit.spline
     # Eight samples a knot show every wiggle; a picture has no use for more than 200,000.
     count = int(min(math.ceil((stamps[-1] - stamps[0]) / spline.dt * 8) + 1, 200_000))
     times = np.linspace(stamps[0], stamps[-1], count)
     positions, velocity = spline.pose(times)[:, :3, 3], spline.velocity(times)
     for k, color in enumerate((_RED, _GREEN, _BLUE)):
-        axes[0, 0].plot(stamps, report.trajectory.positions[:, k], ".", color=color, markersize=2.5, alpha=0.35)
+        axes[0, 0].plot(stamps, fitted.trajectory.positions[:, k], ".", color=color, markersize=2.5, alpha=0.35)
         axes[0, 0].plot(times, positions[:, k], color=color, linewidth=1.1, label="xyz"[k])
     axes[0, 0].set_title("position in the world, m", loc="left", fontsize=10)
     axes[0, 0].legend(**_LEGEND)

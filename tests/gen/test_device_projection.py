@@ -8,7 +8,6 @@ from rstrack_util import ENGINE, SCANS, T_COLOR_DEPTH, hand_held
 from util import numeric_jacobian
 
 from rsgen.device.projection import (
-    FROM_BASE,
     TO_BASE,
     Lens,
     Projection,
@@ -23,7 +22,7 @@ from rsgen.geometry import se3, shutter
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
-from rstrack.images.line_poses import Exposure, from_base_table, line_motion, to_base_table
+from rstrack.images.line_poses import Exposure, from_base_table
 
 CAMERAS = {
     "pinhole": Camera(640, 480, 525.0, 520.0, 319.5, 241.0),
@@ -244,58 +243,6 @@ def test_a_picture_that_outruns_the_shutter_is_refused() -> None:
     ahead = se3.transform(spline.pose(image.mid_time) @ se3.inverse(T_COLOR_DEPTH), np.array([[0.0, 0.0, 2.0]]))
     table = ENGINE.upload(from_base_table(spline, np.eye(4), image))
     assert not host(project_rolling(image.lens, table, device(ahead), ENGINE.UInt, ENGINE.Int).valid).any()
-
-
-@pytest.mark.parametrize("scan", SCANS)
-def test_lines_of_pixels_and_their_poses(scan: Scan) -> None:
-    spline, image = hand_held(6), exposure(CAMERAS["pinhole"], scan)
-    camera, curtain = image.lens.camera, image.lens.shutter
-    uv = np.array([[0.0, 0.0], [639.0, 479.0], [12.5, 400.25]])
-    line = curtain.line_of_pixel(uv, camera)
-    np.testing.assert_allclose(host(image.lens.line_of(*(ENGINE.upload(c) for c in uv.T)))[:, 0], line)
-    assert len(image.times()) == image.lens.lines == (480 if scan in ("top-bottom", "bottom-top") else 640)
-    assert (image.first_time, image.last_time) == pytest.approx((image.times()[0], image.times()[-1]))
-    assert image.mid_time == pytest.approx(image.times().mean())
-    np.testing.assert_allclose(image.block_times(8), image.times().reshape(-1, 8).mean(axis=1))
-    T_world_base = spline.pose(0.40)
-    k = 137
-    to_base = to_base_table(spline, T_world_base, image)[k]
-    from_base = from_base_table(spline, T_world_base, image)[k]
-    assert len(to_base) == TO_BASE and len(from_base) == FROM_BASE
-    T_world_cam = spline.pose(image.times()[k]) @ np.linalg.inv(T_COLOR_DEPTH)
-    T_base_cam = np.linalg.inv(T_world_base) @ T_world_cam
-    np.testing.assert_allclose(to_base, [*T_base_cam[:3, :3].ravel(), *T_base_cam[:3, 3]], atol=1e-8)
-    T_cam_base = np.linalg.inv(T_base_cam)
-    np.testing.assert_allclose(from_base[:12], [*T_cam_base[:3, :3].ravel(), *T_cam_base[:3, 3]], atol=1e-8)
-    # The camera's own twist per line: T_world_cam(t + h) = T_world_cam(t) exp(h · twist).
-    delay = curtain.line_delay(camera)
-    later = spline.pose(image.times()[k] + np.array([-0.5, 0.5]) * delay) @ np.linalg.inv(T_COLOR_DEPTH)
-    np.testing.assert_allclose(from_base[12:], se3.log(np.linalg.inv(later[0]) @ later[1]), atol=1e-9)
-
-
-@pytest.mark.parametrize("scan", SCANS)
-def test_lines_between_the_evaluations_of_the_spline(scan: Scan) -> None:
-    for seed in range(4):
-        spline, image = hand_held(seed), exposure(CAMERAS["pinhole"], scan)
-        T, twist = line_motion(spline, image)
-        T_exact, twist_exact = spline.pose_and_velocity(image.times())
-        # 20 m/s² and 40 rad/s², which change within a knot. 1e-8 rad are 5e-6 px.
-        np.testing.assert_allclose(T[:, :3, 3], T_exact[:, :3, 3], atol=1e-8)
-        np.testing.assert_allclose(T[:, :3, :3], T_exact[:, :3, :3], atol=2e-8)
-        np.testing.assert_allclose(twist, twist_exact, atol=3e-4)
-
-
-def test_a_single_line_is_evaluated_as_it_is() -> None:
-    spline, image = hand_held(1), Exposure(Lens(CAMERAS["pinhole"], Shutter(0.0, 0.004)), STAMP, np.eye(4))
-    T, twist = line_motion(spline, image)
-    T_exact, twist_exact = spline.pose_and_velocity(np.array([STAMP - 0.002]))
-    np.testing.assert_allclose(T, T_exact, atol=1e-15)
-    np.testing.assert_allclose(twist, twist_exact, atol=1e-15)
-
-
-def test_blocks_that_do_not_fill_up_have_their_middle() -> None:
-    image = Exposure(Lens(Camera(30, 20, 30.0, 30.0, 15.0, 10.0), Shutter(0.02)), 0.0, np.eye(4))
-    np.testing.assert_allclose(image.block_times(8), np.array([3.5, 11.5, 17.5]) * 0.001)
 
 
 def test_projection_of_a_pinhole_has_constant_slopes() -> None:

@@ -14,7 +14,6 @@ from typing import Any, Literal
 import numpy as np
 
 from rsgen.device.arrays import Engine, Kernels, engine
-from rsgen.device.backend import Backend
 from rsgen.device.projection import Lens
 from rsgen.errors import UserError
 from rsgen.geometry import se3
@@ -29,6 +28,7 @@ from rstrack.images.pyramid import camera_rays, depth_image, lens_sees
 from rstrack.keyframes.keyframe import rectified_lens
 from rstrack.keyframes.rectification import rectify_kernel
 from rstrack.metrics.association import compare, truth_of
+from rstrack.options import MapOptions
 from rstrack.volume.kernels import lookup_kernel
 from rstrack.volume.mesh import Surface, extract_surface, write_ply
 from rstrack.volume.volume import Volume
@@ -38,30 +38,6 @@ Progress = Callable[[str, float, str], None]
 
 # Seconds from the nearest estimated pose beyond which a frame is left out: its pose would be a guess.
 _POSE_WITHIN_S = 0.1
-
-
-@dataclass(frozen=True)
-class MapOptions:
-    """What can be chosen.
-
-    shutter: rs warps every line with its own pose, gs takes all lines at mid readout; default rs if the estimate has a
-    spline. world: the frame of the result; truth aligns the trajectories as `rstrack evaluate` does; default truth if
-    the sequence has one. voxel_m, max_depth: m. every: use every n-th frame. color: look colours up.
-    """
-
-    shutter: Literal["rs", "gs"] | None = None
-    world: Literal["truth", "estimate"] | None = None
-    voxel_m: float = 0.01
-    every: int = 1
-    color: bool = True
-    max_depth: float = 6.0
-    backend: Backend = "auto"
-
-    def __post_init__(self) -> None:
-        if self.every < 1:
-            raise UserError(f"every = {self.every!r} must be 1 or more")
-        if not self.max_depth > 0.0:
-            raise UserError(f"max_depth = {self.max_depth!r} must be positive")
 
 
 @dataclass(frozen=True)

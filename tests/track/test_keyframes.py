@@ -13,7 +13,7 @@ from rsgen.geometry import se3
 from rstrack.cli.main import main
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import Estimate, write_estimate
-from rstrack.mapping.keyframe_images import write_keyframes
+from rstrack.mapping.keyframes import write_keyframes
 
 
 @pytest.fixture(scope="module")

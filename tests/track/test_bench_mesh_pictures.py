@@ -25,7 +25,7 @@ from rstrack.bench.methods.grid import Cell, Results
 from rstrack.bench.methods.mesh_pictures import draw_meshes, make_mesh, read_picture
 from rstrack.bench.methods.plan import SequenceInfo
 from rstrack.bench.methods.tables import write_results
-from rstrack.cli.bench_methods import add_evaluation
+from rstrack.cli import bench_methods
 from rstrack.data.estimate import write_estimate
 from rstrack.report.build import write_report
 
@@ -226,7 +226,7 @@ def test_the_report_leaves_out_maps_of_cells_that_were_run_again(place: Path) ->
 def bench(words: str) -> int:
     def parser() -> Parser:
         commands = Commands("rstrack", "test")
-        add_evaluation(commands)
+        commands.add(bench_methods.bench, "")
         return commands.parser
 
     return run_program("rstrack", parser, words.split(), "nothing was written")

@@ -294,7 +294,7 @@ _OTHER_PROCESS = """
 import sys
 sys.path[:0] = sys.argv[1], sys.argv[1] + "/../gen"
 from pathlib import Path
-import test_render as t
+import test_render_images as t
 scene = t.load_scene(Path(sys.argv[2]))
 shutter = t.Shutter(0.028, 0.01)
 print(t.digest(t.path_color(scene, shutter).render(t.MOTION, t.STAMP, 7)))

@@ -157,7 +157,7 @@ def test_one_deleted_frame_is_rendered_again_to_the_same_bytes(config: Path, who
 def test_a_killed_render_resumes_to_the_same_bytes(folder: Path, tmp_path: Path) -> None:
     """SIGKILL with some frames on disk, then with some more, then the rest; against one go in another process."""
     config, out = tiny.write_config(folder / "killed", 60), tmp_path / "killed"
-    command = [sys.executable, "-m", "rsgen.cli.main", "render", str(config), "--out", str(out), "--quiet"]
+    command = [sys.executable, "-m", "rsgen", "render", str(config), "--out", str(out), "--quiet"]
     written = 0
     for _ in range(2):
         child, before = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL), written

@@ -24,7 +24,7 @@ from rsgen.bench.modes import (
     row_renderer,
     time_modes,
 )
-from rsgen.bench.table import ModeTable, ModeTimes
+from rsgen.bench.table import BenchTimes, ModeTimes
 from rsgen.config.config import load_config
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
@@ -73,9 +73,9 @@ def test_averaged_sharp_renders_make_the_blurred_picture(glowing: Any) -> None:
     assert rms(got, blurred) < 0.015 < 0.03 < rms(got, late)
 
 
-def report(**seconds: list[list[float]]) -> ModeTable:
+def report(**seconds: list[list[float]]) -> BenchTimes:
     modes = (ModeTimes(n.replace("_", "-"), n, 8, "all", np.array(s)) for n, s in seconds.items())
-    return ModeTable(100, 50, {"cores": 2}, tuple(modes), {"blender": "no such luck"})
+    return BenchTimes(100, 50, {"cores": 2}, tuple(modes), {"blender": "no such luck"})
 
 
 def test_ratios_are_of_the_same_round_or_else_of_the_same_frame() -> None:

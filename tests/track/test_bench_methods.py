@@ -35,7 +35,7 @@ from rstrack.bench.methods.results import Cell, Results, averages
 from rstrack.bench.methods.tables import notes, results_csv, results_markdown, results_text, write_results
 from rstrack.charts.to_file import write_charts
 from rstrack.charts.to_page import figure_of
-from rstrack.cli.bench_methods import add_evaluation
+from rstrack.cli.bench_methods import bench
 from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.metrics.evaluate import run_evaluate
 from rstrack.options import METHODS, PEERS, Options
@@ -48,7 +48,7 @@ SPEEDS = (0.3, 0.25)
 
 def parser() -> Parser:
     commands = Commands("rstrack", "test")
-    add_evaluation(commands)
+    commands.add(bench, "")
     return commands.parser
 
 

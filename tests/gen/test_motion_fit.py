@@ -14,7 +14,7 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.motion.fit import FitResult, fit_spline
-from rsgen.motion.fit_report import make_fit_report, plot_fit, report_dict, report_text
+from rsgen.motion.fit_summary import plot_fit, summarise_fit
 from rsgen.motion.statistics import motion_statistics
 from rsgen.sequence.trajectory import Trajectory, read_trajectory
 
@@ -330,10 +330,10 @@ def tum_file(tmp_path: Path) -> Path:
 def test_report_says_what_the_fit_says(tmp_path: Path) -> None:
     path = tum_file(tmp_path)
     plot = tmp_path / "figures" / "fit.png"
-    report = make_fit_report(path)
+    report = summarise_fit(path)
     plot_fit(report, plot)
-    text = report_text(report)
-    data = json.loads(json.dumps(report_dict(report)))
+    text = report.text()
+    data = json.loads(json.dumps(report.as_dict()))
     assert data["poses"] == 121
     assert data["residual"]["rms_mm"] == pytest.approx(report.fit.rms_trans_m * 1e3)
     assert data["residual"]["max_mm"] == pytest.approx(
@@ -347,7 +347,7 @@ def test_report_says_what_the_fit_says(tmp_path: Path) -> None:
 
 
 def test_report_complains_about_the_plots_name(tmp_path: Path) -> None:
-    report = make_fit_report(tum_file(tmp_path))
+    report = summarise_fit(tum_file(tmp_path))
     with pytest.raises(UserError, match=r"\.png"):
         plot_fit(report, tmp_path / "fit.xyz")
     (tmp_path / "file").write_text("in the way")

@@ -1,0 +1,305 @@
+"""One image against one reference: what is summed, chained to the control points, gated, floored and hidden."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import synthetic
+from rstrack_util import (
+    ENGINE,
+    depth_input,
+    disturbed,
+    exact_reference,
+    exposure,
+    make_terms,
+    maker,
+    moved,
+    plane_before,
+    small_camera,
+)
+from term_setting import CASES, DEPTH, NORMALS, REF_STAMP, Setting, setting
+from util import numeric_jacobian
+
+from rsgen.geometry import se3
+from rsgen.geometry.spline import Spline
+from rstrack.alignment import block_sums
+from rstrack.alignment.block_sums import BlockSums
+from rstrack.alignment.linearise import Linearised, Terms, seen_motions, weakest_motion
+from rstrack.images import line_poses as lines
+from rstrack.images.pyramid import ColorImage, DepthImage
+
+
+@pytest.fixture(autouse=True)
+def exact_poses(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every line's pose from the spline: with these small images a block of eight would take 5 ms."""
+    monkeypatch.setattr(lines, "_LINES_PER_NODE", 1)
+
+
+@pytest.fixture
+def one_line_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every line its own block, so that nothing but rounding is approximate."""
+    monkeypatch.setattr(block_sums, "LINES_PER_BLOCK", 1)
+    monkeypatch.setattr(block_sums, "LINES_PER_PAIR_BLOCK", 1)
+
+
+# -- the chain to the control points ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["geometric", "photometric"])
+@pytest.mark.parametrize(("ref_scan", "scan"), CASES)
+def test_gradient_is_that_of_the_cost(kind: str, ref_scan: str | None, scan: str, one_line_blocks: None) -> None:
+    terms = make_terms(DEPTH)
+    sigma = 0.01 if kind == "geometric" else 0.02
+    # The geometric term sees three motions of a plane; one plane more lets all six be seen.
+    normals = NORMALS[:2] if kind == "geometric" and ref_scan is None else NORMALS[:1]
+    for normal in normals:
+        s = setting(kind, ref_scan, scan, normal, terms)
+        around = disturbed(s.truth, 5)
+        lin = s.term(around, sigma)
+        numeric, counts = cost_gradient(s, around, lin, sigma)
+        assert counts == {lin.count}, "the mask is not fixed"
+        scale = np.abs(numeric).max()
+        assert scale > 100.0
+        # Kinks of bilinear interpolation, and of normals that change from pixel to pixel, leave the rest.
+        limit = 2e-4 if kind == "geometric" and ref_scan is None else 5e-3
+        np.testing.assert_allclose(lin.model.g, numeric, atol=limit * scale)
+
+
+def cost_gradient(
+    s: Setting, around: Spline, lin: Linearised, sigma: float, level: int = 0
+) -> tuple[np.ndarray, set[int]]:
+    """Derivative of the cost by left increments of the model's control points, and the counts of pixels that it saw."""
+    counts = set()
+
+    def cost(x: np.ndarray) -> np.ndarray:
+        there = s.term(moved(around, x.reshape(-1, 6), lin.model.first), sigma, level)
+        counts.add(there.count)
+        return np.array(there.cost)
+
+    return numeric_jacobian(cost, len(lin.model.g)), counts
+
+
+def test_gradient_at_a_coarser_level() -> None:
+    s = setting("photometric", None, "top-bottom")
+    around = disturbed(s.truth, 5)
+    lin = s.term(around, 0.02, 1)
+    numeric, _ = cost_gradient(s, around, lin, 0.02, 1)
+    np.testing.assert_allclose(lin.model.g, numeric, atol=0.02 * np.abs(numeric).max())
+
+
+@pytest.mark.parametrize("kind", ["geometric", "photometric"])
+def test_blocks_of_lines_lose_little(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    s = setting(kind, None, "top-bottom")
+    around = disturbed(s.truth, 5)
+    blocks = s.term(around, 0.01).model
+    monkeypatch.setattr(block_sums, "LINES_PER_BLOCK", 1)
+    single = setting(kind, None, "top-bottom").term(around, 0.01).model
+    assert blocks.first == single.first
+    for name in ("g", "H"):
+        exact = getattr(single, name)
+        # Here a block takes 5 ms; at 480 lines it takes 0.5.
+        np.testing.assert_allclose(getattr(blocks, name), exact, atol=0.02 * np.abs(exact).max())
+
+
+@pytest.mark.parametrize("kind", ["geometric", "photometric"])
+def test_curvature_is_that_of_the_cost(kind: str, one_line_blocks: None) -> None:
+    s = setting(kind, None, "left-right")
+    # With residuals of zero H is exact, apart from the curvature of the pixel's path, times zero.
+    lin = s.term(s.truth, 0.01)
+    numeric = numeric_jacobian(
+        lambda x: s.term(moved(s.truth, x.reshape(-1, 6), lin.model.first), 0.01).model.g, len(lin.model.g), 3e-4
+    )
+    np.testing.assert_allclose(lin.model.H, numeric, atol=0.01 * np.abs(numeric).max())
+    # Away from it, Newton's weight rather than the one of reweighted least squares: here errors are about σ/2, and the
+    # factor (ν − s²)/(ν + s²) takes off a tenth.
+    around = disturbed(s.truth, 5)
+    sigma = 2.0 * s.term(around, 0.01).next_sigma
+    H = s.term(around, sigma).model.H
+    lin = s.term(around, sigma)
+    numeric = numeric_jacobian(
+        lambda x: s.term(moved(around, x.reshape(-1, 6), lin.model.first), sigma).model.g, len(lin.model.g), 3e-4
+    )
+    limit = 0.01 if kind == "geometric" else 0.05
+    np.testing.assert_allclose(H, numeric, atol=limit * np.abs(numeric).max())
+
+
+def test_row_shift_is_the_movement_in_pixels() -> None:
+    s = setting("geometric", None, "top-bottom")
+    lin = s.term(s.truth, 0.01)
+    R = s.ref.T_world_base[:3, :3]
+    count = len(s.truth.control_points)
+    sideways, turn = np.tile([*(R @ [0.01, 0.0, 0.0]), 0, 0, 0], (count, 1)), np.zeros((count, 6))
+    assert lin.row_shift(sideways, 48.0, 2.0) == pytest.approx(48.0 * 0.01 / 2.0)
+    # A turn about the base frame's own y axis, through its own origin.
+    turn[:] = se3.adjoint(s.ref.T_world_base) @ [0.0, 0.0, 0.0, 0.0, 0.005, 0.0]
+    assert lin.row_shift(turn, 48.0, 2.0) == pytest.approx(48.0 * 0.005)
+    # Control points that the image does not depend on.
+    turn[lin.model.first : lin.model.last] = 0.0
+    assert lin.row_shift(turn, 48.0, 2.0) == 0.0
+
+
+# -- one pose ---------------------------------------------------------------------------------------------------------
+
+
+def still(T_world_depth: np.ndarray) -> Spline:
+    return Spline(np.repeat(T_world_depth[None], 5, axis=0), -1.0, 2.0)
+
+
+@pytest.mark.parametrize("level", [0, 2])
+def test_geometric_pose_is_the_geometric_term_of_a_camera_at_rest(level: int) -> None:
+    # By four control points that move alike, increments of the spline are those of the pose, but in the world frame.
+    motion, image = synthetic.make_spline(0.7), exposure(0.02, None)
+    terms, T_a, T_b = shipped(), motion.pose(0.0), motion.pose(0.02)
+    seen = depth_input(synthetic.cast, still(T_b), image)
+    ref = maker(image.lens.camera).rectified(1, depth_input(synthetic.cast, still(T_a), image), (), still(T_a), None)
+    T_off = T_b @ se3.exp(np.array([1e-3, -2e-3, 1e-3, 2e-3, 1e-3, -1e-3]))
+    sigma = 2e-3
+    sums, next_sigma = terms.geometric_pose(seen, ref, se3.inverse(T_a) @ T_off, level, sigma)
+    whole = terms.geometric(seen, ref, still(T_off), level, sigma)
+    assert (sums.count, sums.cost, next_sigma) == (whole.count, whole.cost, whole.next_sigma)
+    together = np.tile(np.eye(6), (4, 1)) @ se3.adjoint(T_a)
+    H, g = together.T @ whole.model.H @ together, together.T @ whole.model.g
+    np.testing.assert_allclose(sums.H[0, 0] / sigma**2, H, rtol=1e-9, atol=1e-9 * np.abs(H).max())
+    np.testing.assert_allclose(sums.g[0, 0] / sigma, g, rtol=1e-9, atol=1e-9 * np.abs(g).max())
+
+
+# -- gates, floors and what is left out -----------------------------------------------------------------------------
+
+
+def shipped(**settings: float) -> Terms:
+    """The terms as the trackers have them."""
+    return Terms(ENGINE, maker(small_camera()).device_rays, **settings)  # type: ignore[arg-type]
+
+
+def frontal(kind: str = "geometric", terms: Terms | None = None) -> Setting:
+    """A wall at 2 m across the camera's axis, with the gates and floors that the trackers have."""
+    return setting(kind, None, "top-bottom", (0.0, 0.0, 1.0), terms or shipped(), small_camera())
+
+
+def off_by(s: Setting, distance: float) -> Spline:
+    """The true spline, moved towards the wall."""
+    n = plane_before(s.truth.pose(REF_STAMP), (0.0, 0.0, 1.0)).normal
+    return moved(s.truth, np.tile([*(distance * n), 0.0, 0.0, 0.0], (len(s.truth.control_points), 1)))
+
+
+@pytest.mark.parametrize(
+    ("level", "sigma", "gate"),
+    [
+        (0, 1e-3, 5e-3),  # five σ
+        (0, 1e-4, 2e-3),  # but at least ten times the smallest credible σ
+        (0, 0.02, 0.05),  # and at most as on the level above
+        (1, 1e-3, 0.05),
+        (2, 1e-3, 0.3),
+    ],
+)
+def test_depth_beyond_the_gate_is_left_out(level: int, sigma: float, gate: float) -> None:
+    s = frontal()
+    everything = s.term(s.truth, sigma, level).count
+    assert everything > 700 / 4**level / 2
+    # (median depth / z)² of the wall differs by a few percent, and so do the residuals.
+    assert s.term(off_by(s, 0.9 * gate), sigma, level).count == everything
+    assert s.term(off_by(s, 1.1 * gate), sigma, level).count == 0
+
+
+def test_intensities_beyond_the_gate_are_left_out() -> None:
+    s = frontal("photometric")
+    assert isinstance(s.image, ColorImage)
+    everything = s.term(s.truth, 0.02).count
+    for off, count in ((0.29, everything), (0.31, 0)):
+        brighter = replace(s.image, levels=tuple(ENGINE.Float(level) + off for level in s.image.levels))
+        assert replace(s, image=brighter).term(s.truth, 0.02).count == count
+
+
+@pytest.mark.parametrize(("sigma", "limit"), [(4e-3, 1e-3), (1e-4, 5e-5)])
+def test_pixels_whose_interpolation_errs_by_a_quarter_of_sigma_are_left_out(sigma: float, limit: float) -> None:
+    s = frontal()
+    everything = s.term(s.truth, sigma).count
+    rough = np.zeros((48, 64))
+    for part, count in ((0.99, everything), (1.01, 0)):
+        there = replace(s.ref, roughness=ENGINE.upload(np.full(rough.shape, part * limit)))
+        assert replace(s, ref=there).term(s.truth, sigma).count == count
+    # Pixel by pixel: the wall's left half.
+    rough[:, :32] = 1.01 * limit
+    half = replace(s, ref=replace(s.ref, roughness=ENGINE.upload(rough))).term(s.truth, sigma).count
+    assert 0.3 * everything < half < 0.7 * everything
+
+
+def test_scales_have_floors() -> None:
+    depth, color = frontal(), frontal("photometric")
+    for s, floor, sigma in ((depth, 2e-4, 1e-3), (color, 1.0 / 255.0, 0.02)):
+        lin = s.term(s.truth, sigma)
+        assert lin.floor == floor
+        for _ in range(5):
+            lin = s.term(s.truth, lin.next_sigma)
+        assert lin.next_sigma == floor  # errors are smaller than that
+        worse = s.term(disturbed(s.truth, 3, 0.01), sigma).next_sigma
+        assert worse > 2.0 * floor
+
+
+def test_rounding_of_depth_is_a_floor_too() -> None:
+    s = frontal()
+    assert isinstance(s.image, DepthImage)
+    median_depth = s.ref.median_depth
+    for step in (1e-4, 1e-3):  # 1/m
+        coarse = replace(s, image=replace(s.image, resolution=step))
+        want = max(2e-4, step * median_depth**2 / np.sqrt(12.0))
+        lin = coarse.term(s.truth, 1e-3)
+        assert lin.floor == pytest.approx(want) and lin.next_sigma >= want
+        _, next_sigma = s.terms.geometric_pose(coarse.image, s.ref, np.eye(4), 0, 1e-3)  # type: ignore[arg-type]
+        assert next_sigma >= want
+    assert want > 1e-3  # the second one counted, the first did not
+
+
+@pytest.mark.parametrize(("share", "shown"), [(0.97, True), (0.955, False), (0.0, True)])
+def test_points_behind_what_a_depth_image_shows_are_hidden(share: float, shown: bool) -> None:
+    # 2 m away, what is seen has to be 3 % and 2 cm nearer, that is at 1.922 m; what is not known hides nothing.
+    wall = frontal()
+    color = frontal("photometric", wall.terms)
+    assert isinstance(wall.image, DepthImage) and isinstance(color.image, ColorImage)
+    seen = ENGINE.download(wall.image.z, (48, 64))
+    nearer = np.where(np.arange(64) < 32, share, 1.0) * seen
+    occluder = replace(wall.image, z=ENGINE.upload(nearer))
+    for level in (0, 1):
+        visible = wall.terms.visible(occluder, color.ref, color.truth, level)
+        lin = wall.terms.photometric(color.image, color.ref, color.truth, level, 0.02, None, visible)
+        everything = color.term(color.truth, 0.02, level).count
+        assert everything > 30
+        assert lin.count == everything if shown else 0.3 * everything < lin.count < 0.7 * everything
+
+
+def test_slopes_of_an_earlier_state_change_the_model_but_not_what_is_seen() -> None:
+    s = setting("geometric", None, "top-bottom")
+    around = disturbed(s.truth, 5)
+    assert isinstance(s.image, DepthImage)
+    own, same, other = (
+        s.terms.geometric(s.image, s.ref, around, 0, 0.01, slopes_at) for slopes_at in (None, around, s.truth)
+    )
+    np.testing.assert_array_equal(own.model.H, same.model.H)
+    assert (own.cost, own.count, own.next_sigma) == (other.cost, other.count, other.next_sigma)
+    # By no more than the increments between the two, 4 mrad.
+    off = np.abs(other.model.g - own.model.g).max() / np.abs(own.model.g).max()
+    assert 0.0 < off < 0.02
+
+
+# -- motions that are seen --------------------------------------------------------------------------------------------
+
+
+def test_observability_is_zero_where_a_motion_is_not_seen() -> None:
+    truth, image = synthetic.make_spline(), exposure(0.30, "bottom-top", small_camera())
+    terms = replace(shipped(), smooth=1e9)  # in images as small as these every corner of the room is rough
+    for cast, least, most in (
+        (synthetic.cast, 1e-3, 1.0),
+        (plane_before(truth.pose(0.25), (0.3, 0.2, 1.0)).cast, 0.0, 1e-5),  # rounding to fixed point
+    ):
+        ref = exact_reference(cast, truth, exposure(0.25, None))
+        lin = terms.geometric(depth_input(cast, truth, image), ref, truth, 0, 0.01)
+        assert lin.count > 400 and least <= abs(lin.observability) < most
+
+
+def test_rotations_are_seen_by_the_scenes_depth() -> None:
+    alike = BlockSums(np.diag([1.0, 1.0, 1.0, 4.0, 4.0, 4.0])[None, None] * 5, np.zeros((1, 1, 6)), 0.0, 0.0, 10)
+    np.testing.assert_allclose(seen_motions(alike, 2.0), 0.5 * np.eye(6))
+    assert weakest_motion(seen_motions(alike, 2.0)) == pytest.approx(0.5)
+    assert weakest_motion(seen_motions(BlockSums(0.0 * alike.H, alike.g, 0.0, 0.0, 0), 2.0)) == 0.0

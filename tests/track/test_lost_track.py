@@ -1,0 +1,113 @@
+"""Every reason for which a frame counts as lost, and each limit from both sides."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from rstrack.alignment.optimizer import Solved
+from rstrack.tracking.lost_track import FitHistory
+
+FEW, UNSETTLED = "hardly a pixel falls on the keyframe", "the alignment does not settle"
+DEPTH, COLOR = "the depth image does not fit", "the colour image does not fit"
+
+
+def term(kind: str, sigma: float, count: int = 5000, floor: float = 0.0) -> Any:
+    """An observation of a linearised image: its scale, pixels, and smallest credible scale."""
+    lin = SimpleNamespace(count=count, next_sigma=sigma, floor=floor)
+    return SimpleNamespace(is_depth=kind == "depth", is_linearised=True, lin=lin)
+
+
+def fault(history: FitHistory, terms: Iterable[Any], shift: float = 0.05, expected: int = 5000) -> str:
+    return history.fault(list(terms), Solved(last_shift=shift), expected)
+
+
+def after(kind: str, sigmas: Iterable[float]) -> FitHistory:
+    """With frames of such scales behind it."""
+    history = FitHistory()
+    for sigma in sigmas:
+        assert fault(history, [term(kind, sigma)]) == ""
+    return history
+
+
+def test_a_frame_without_images_is_lost() -> None:
+    assert fault(FitHistory(), []) == FEW
+    assert fault(FitHistory(), [SimpleNamespace(is_depth=True, is_linearised=False)]) == FEW
+
+
+@pytest.mark.parametrize(("expected", "least"), [(0, 200), (2500, 200), (10_000, 800), (76_800, 6144)])
+def test_a_term_needs_200_pixels_and_8_percent_of_what_is_expected(expected: int, least: int) -> None:
+    assert fault(FitHistory(), [term("depth", 1e-3, least)], expected=expected) == ""
+    assert fault(FitHistory(), [term("depth", 1e-3, least - 1)], expected=expected) == FEW
+    # One term is enough, and one that hardly sees anything is neither judged nor remembered.
+    history = FitHistory()
+    assert fault(history, [term("depth", 9.0, least - 1), term("color", 0.01, least)], expected=expected) == ""
+    assert fault(history, [term("depth", 0.03, least)], expected=expected) == ""
+
+
+def test_lines_that_still_move_by_more_than_two_pixels_have_not_been_found() -> None:
+    assert fault(FitHistory(), [term("depth", 1e-3)], shift=2.0) == ""
+    assert fault(FitHistory(), [term("depth", 1e-3)], shift=2.001) == UNSETTLED
+    assert fault(FitHistory(), [term("depth", 1e-3)], shift=float("inf")) == UNSETTLED
+
+
+@pytest.mark.parametrize(
+    ("kind", "usual", "limit"),
+    [
+        ("depth", None, 0.03),  # nothing to compare with: what no aligned images have
+        ("depth", 0.02, 0.03),  # nor after frames that fit badly
+        ("depth", 1e-3, 6e-3),  # six times the usual
+        ("depth", 1e-4, 2e-3),  # but two millimetres are always fine
+        ("color", None, 0.15),
+        ("color", 0.1, 0.15),
+        ("color", 0.01, 0.06),
+        ("color", 0.001, 0.03),
+    ],
+)
+def test_errors_are_compared_with_those_of_frames_before(kind: str, usual: float | None, limit: float) -> None:
+    says = DEPTH if kind == "depth" else COLOR
+    before = [] if usual is None else [usual] * 3
+    assert fault(after(kind, before), [term(kind, 0.999 * limit)]) == ""
+    assert fault(after(kind, before), [term(kind, 1.001 * limit)]) == says
+    # The other term does not make up for it.
+    other = term("color" if kind == "depth" else "depth", 1e-4)
+    for terms in ((other, term(kind, 1.001 * limit)), (term(kind, 1.001 * limit), other)):
+        assert fault(after(kind, before), terms) == says
+
+
+def test_a_camera_that_repeats_its_rounding_may_err_by_two_and_a_half_times_that() -> None:
+    # At rest its errors are far smaller than the rounding of its depth, of 4 mm here.
+    for sigma, says in ((0.0099, ""), (0.0101, DEPTH)):
+        assert fault(after("depth", [1e-4] * 5), [term("depth", sigma, floor=4e-3)]) == says
+    # Not beyond what no aligned images have.
+    assert fault(FitHistory(), [term("depth", 0.0301, floor=0.02)]) == DEPTH
+
+
+def test_the_usual_is_the_median_of_the_last_thirty_good_frames() -> None:
+    history = after("depth", [1e-3] * 7 + [5e-3] * 4)
+    assert fault(history, [term("depth", 6.1e-3)]) == DEPTH and fault(history, [term("depth", 5.9e-3)]) == ""
+    # Half of the last thirty are of one kind, half of the other: one more or less, and either would be the median.
+    for sigma, says in ((8.9e-3, ""), (9.1e-3, DEPTH)):
+        assert fault(after("depth", [1e-3] * 16 + [2e-3] * 15), [term("depth", sigma)]) == says
+
+
+def test_lost_frames_are_not_what_is_usual() -> None:
+    history = after("depth", [1e-3] * 3)
+    for _ in range(50):
+        assert fault(history, [term("depth", 7e-3)]) == DEPTH
+        # Neither are those whose colour did not fit, or that did not settle.
+        assert fault(history, [term("depth", 5e-3), term("color", 0.2)]) == COLOR
+        assert fault(history, [term("depth", 5e-3)], shift=3.0) == UNSETTLED
+    assert fault(history, [term("depth", 6.1e-3)]) == DEPTH
+
+
+def test_depth_and_colour_are_remembered_apart() -> None:
+    history = FitHistory()
+    for _ in range(5):
+        assert fault(history, [term("depth", 1e-3), term("color", 0.02)]) == ""
+    assert fault(history, [term("depth", 1e-3), term("color", 0.119)]) == ""
+    assert fault(history, [term("depth", 1e-3), term("color", 0.121)]) == COLOR
+    assert fault(history, [term("depth", 6.1e-3), term("color", 0.02)]) == DEPTH
