@@ -313,3 +313,22 @@ def _is_running(process: int) -> bool:
     except OSError:
         return True
     return True
+
+
+def listed_file(root: Path, real_root: Path, path: str, where: str, missing: str) -> Path:
+    """The file `path` that a listing names, which has to lie in `root` even once symbolic links are followed.
+
+    real_root: root, resolved. where: the listing's line, missing: what to do if there is no such file, for messages.
+    Raises UserError.
+    """
+    file = root / path
+    try:
+        real = file.resolve()
+        exists = real.is_file()
+    except (OSError, ValueError, RuntimeError):
+        raise UserError(f"{where}: {path[:60]!r} is not a usable path") from None
+    if Path(path).is_absolute() or ".." in Path(path).parts or not real.is_relative_to(real_root):
+        raise UserError(f"{where}: path {path[:200]!r} leaves the folder")
+    if not exists:
+        raise UserError(f"{where}: {file} is missing: {missing}")
+    return file

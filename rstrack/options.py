@@ -7,11 +7,11 @@ from typing import Annotated, Literal, get_args
 
 import numpy as np
 
+from rsgen.array_types import FloatArray
 from rsgen.device.backend import Backend
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.shutter import Shutter
-from rsgen.geometry.so3 import FloatArray
 
 Method = Literal["rs-pg", "rs-g", "rs-p", "gs-pg", "gs-g", "gs-p", "baseline"]
 METHODS: tuple[str, ...] = get_args(Method)

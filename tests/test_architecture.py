@@ -17,7 +17,9 @@ ROOT = Path(__file__).parents[1]
 SOURCES = sorted((ROOT / "rsgen").rglob("*.py"))
 TRACKER = sorted((ROOT / "rstrack").rglob("*.py"))
 # What rstrack builds on; the rest of rsgen renders, or is about rendering.
-SHARED = ("errors", "figures", "files", "limits", "geometry", "sequence", "device", "console")
+SHARED = (
+    "array_types", "console", "device", "errors", "figures", "files", "geometry", "limits", "sequence", "srgb",
+)  # fmt: skip
 ENGINES = ("mitsuba", "drjit")
 CONFIGS = sorted(path for path in (ROOT / "configs").glob("*.yaml") if path.stem != "evaluation")
 
@@ -98,7 +100,7 @@ def test_the_tracker_imports_only_what_is_shared(path: Path) -> None:
 
 @pytest.mark.parametrize("path", sorted((ROOT / "rsgen/geometry").glob("*.py")), ids=name)
 def test_geometry_imports_numpy_and_scipy_only(path: Path) -> None:
-    allowed = ("numpy", "scipy", "rsgen.errors", "rsgen.geometry")
+    allowed = ("numpy", "scipy", "rsgen.array_types", "rsgen.errors", "rsgen.geometry")
     for module in imports(path):
         known = module.split(".")[0] in sys.stdlib_module_names or module == "rsgen"
         assert known or any(module == a or module.startswith(f"{a}.") for a in allowed), module

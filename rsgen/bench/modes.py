@@ -17,14 +17,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rsgen.array_types import Float32Array, FloatArray
 from rsgen.bench.table import AVERAGED, BLUR_S, READOUT_S, BenchTimes, ModeTimes
 from rsgen.check.light import lit_scene, spread_times
 from rsgen.config.config import Config
+from rsgen.console.progress import Progress
 from rsgen.errors import UserError
 from rsgen.geometry.shutter import Shutter
-from rsgen.produce.frame_source import Progress
 from rsgen.produce.generate import engine_versions, load_motion
 
 MODES = ("still", "rs-blur", "path", "rows", "averaged")
@@ -98,7 +98,7 @@ def row_renderer(scene: Any, integrator: Any, camera: Any, spp: int) -> Any:
     return renderer
 
 
-def render_rows(renderer: Any, pose: Any, stamp: float, delay: float, rows: Sequence[int]) -> NDArray[np.float32]:
+def render_rows(renderer: Any, pose: Any, stamp: float, delay: float, rows: Sequence[int]) -> Float32Array:
     """Linear RGB (n, w, 3) of n rows, a render for each, row r at stamp + r · delay (s): sharp, rolling shutter."""
     import drjit as dr
     import mitsuba as mi
@@ -110,7 +110,7 @@ def render_rows(renderer: Any, pose: Any, stamp: float, delay: float, rows: Sequ
     return np.concatenate(images)
 
 
-def render_averaged(renderer: Any, pose: Any, stamp: float, exposure_s: float, count: int) -> NDArray[np.float32]:
+def render_averaged(renderer: Any, pose: Any, stamp: float, exposure_s: float, count: int) -> Float32Array:
     """Linear RGB (h, w, 3): mean of `count` sharp global-shutter renders over the exposure that ends at `stamp` (s)."""
     times = stamp - exposure_s * (1 - (np.arange(count) + 0.5) / count)
     return np.mean([renderer.render(pose, float(t), k) for k, t in enumerate(times)], axis=0)
@@ -150,7 +150,7 @@ def _our_modes(config: Config, scene: Any, baked: Any, mi: Any, pose: Any, spp: 
 
 
 def _blender_modes(
-    config: Config, scene: Any, pose: Any, stamps: NDArray[np.float64], spp: int, names: Sequence[str], stack: ExitStack
+    config: Config, scene: Any, pose: Any, stamps: FloatArray, spp: int, names: Sequence[str], stack: ExitStack
 ) -> list[Mode]:
     """Blender's modes; the process lives as long as the stack. Frame k's exposure in mode i is number k · modes + i."""
     from rsgen.bench.blender import BlenderRenderer, exposure
@@ -171,7 +171,7 @@ def _blender_modes(
 
 
 def _measure(
-    modes: Sequence[Mode], stamps: NDArray[np.float64], progress: Progress
+    modes: Sequence[Mode], stamps: FloatArray, progress: Progress
 ) -> tuple[dict[str, list[list[float]]], dict[str, str]]:
     """Seconds by mode, frame and round, the first frame left out; and why a mode failed, by name."""
     seconds: dict[str, list[list[float]]] = {m.name: [] for m in modes}

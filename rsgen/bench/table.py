@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rsgen.array_types import FloatArray
 from rsgen.console.tables import Table, fixed
 
 BLUR_S = 0.020
@@ -34,7 +34,7 @@ class ModeTimes:
     title: str
     spp: int
     measured: str
-    seconds: NDArray[np.float64]
+    seconds: FloatArray
 
     @property
     def median(self) -> float:
@@ -127,7 +127,7 @@ class BenchTimes:
         ]
 
 
-def _ratio(mode: str, against: str, text: str, a: NDArray[np.float64], b: NDArray[np.float64]) -> Ratio:
+def _ratio(mode: str, against: str, text: str, a: FloatArray, b: FloatArray) -> Ratio:
     """Round by round where both have as many, else the frames' medians."""
     pairs = (a / b).ravel() if a.shape == b.shape else np.median(a, axis=1) / np.median(b, axis=1)
     low, middle, high = np.quantile(pairs, [0.25, 0.5, 0.75])

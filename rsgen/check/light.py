@@ -7,13 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rsgen import srgb
+from rsgen.array_types import FloatArray
 from rsgen.config.config import Config
+from rsgen.console.progress import Progress
 from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
 from rsgen.geometry.shutter import Shutter
-from rsgen.produce.frame_source import Progress, make_integrator
+from rsgen.produce.frame_source import make_integrator
 from rsgen.produce.generate import Motion, load_motion
 
 PSNR_FLOOR_DB = 36.0
@@ -41,7 +43,7 @@ def check_light(
     ours = ColorRenderer(scene, baked, camera, Shutter(), _BAKED_SPP)
     theirs = ColorRenderer(scene, reference, camera, Shutter(), _REFERENCE_PASS)
     table: list[tuple[str, ...]] = []
-    rows: list[list[NDArray[np.float64]]] = []
+    rows: list[list[FloatArray]] = []
     psnrs: list[float] = []
     passes = max(1, spp // _REFERENCE_PASS)
     for view, stamp in enumerate(spread_times(motion, views)):
@@ -50,7 +52,8 @@ def check_light(
         for k in range(passes):
             sums += theirs.render(motion.spline.pose, float(stamp), 1000 * (view + 1) + k)
             progress("path tracing", (view * passes + k + 1) / (views * passes), f"view {view + 1} of {views}")
-        ours_srgb, their_srgb = (_srgb(image * config.color.exposure_gain) for image in (ours_linear, sums / passes))
+        exposed = (np.clip(image * config.color.exposure_gain, 0, 1) for image in (ours_linear, sums / passes))
+        ours_srgb, their_srgb = map(srgb.encode, exposed)
         difference = ours_srgb - their_srgb
         psnr = float(-10 * np.log10(np.mean(difference**2)))
         psnrs.append(psnr)
@@ -74,7 +77,7 @@ def lit_scene(config: Config, progress: Progress) -> tuple[Any, Any, Any]:
     if config.light.mode != "baked":
         raise UserError("light.mode is 'path': these measurements are about baked light, leave it at 'baked'")
     scene = load_scene(config.scene.file)
-    baked = make_integrator(mi, scene, config, lambda fraction, note: progress("light", fraction, note))
+    baked = make_integrator(mi, scene, config, progress)
     return scene, baked, mi
 
 
@@ -89,12 +92,7 @@ def _scaled(config: Config, width: int) -> Any:
     )  # fmt: skip
 
 
-def spread_times(motion: Motion, count: int) -> NDArray[np.float64]:
+def spread_times(motion: Motion, count: int) -> FloatArray:
     """`count` instants spread over the recording, its very ends left out."""
     fraction = (np.arange(count) + 0.5) / count
     return motion.first_stamp + fraction * (motion.last_stamp - motion.first_stamp)
-
-
-def _srgb(linear: NDArray[np.float64]) -> NDArray[np.float64]:
-    x = np.clip(linear, 0, 1)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
+from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rsgen.sequence.format import poses_of_rows
 from rsgen.sequence.reader import Sequence
 
 TOLERANCE_M = 1e-4
@@ -61,13 +60,11 @@ def raycast_sequence(sequence: Sequence, count: int) -> RaycastErrors:
     return RaycastErrors(frames, shares, float(np.median(differences)))
 
 
-def _cast(caster: object, sequence: Sequence, k: int) -> NDArray[np.float64]:
+def _cast(caster: object, sequence: Sequence, k: int) -> FloatArray:
     """Planar z (h, w) of listed depth frame k, 0 where a ray hits nothing."""
-    stream = sequence.streams["depth"]
-    camera = stream.camera
+    camera = sequence.streams["depth"].camera
     uv = camera.pixel_grid().reshape(-1, 2)
-    line = uv[:, 1 if stream.shutter.scan in ("top-bottom", "bottom-top") else 0].astype(int)
-    T_world_depth = poses_of_rows(sequence.rows("depth")[k])[line]
+    T_world_depth = sequence.pixel_poses("depth", k, uv)
     origin = T_world_depth[:, :3, 3]
     direction = np.einsum("nij,nj->ni", T_world_depth[:, :3, :3], camera.unproject(uv))
     _, ray, p_world = caster.intersects_id(  # type: ignore[attr-defined]

@@ -6,11 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from rsgen.array_types import BoolArray, FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.shutter import project_rolling
-from rsgen.sequence.format import FloatArray, poses_of_rows
 from rsgen.sequence.reader import Sequence
 
 # Depth is interpolated bilinearly in 1/z, exact on planes. Where second differences say that this is off by more, there
@@ -58,15 +57,14 @@ def depth_points(sequence: Sequence, k: int) -> FloatArray:
 
     Raises UserError for unreadable files.
     """
-    camera, shutter = sequence.streams["depth"].camera, sequence.streams["depth"].shutter
+    camera = sequence.streams["depth"].camera
     step = max(1, min(_STEP_PX, math.isqrt(camera.width * camera.height // _TARGET_PIXELS)))
     z = sequence.truth_depth(k)[::step, ::step].astype(np.float64)
     uv = camera.pixel_grid()[::step, ::step][z > 0]
-    line = np.rint(uv[:, 1 if shutter.scan in ("top-bottom", "bottom-top") else 0]).astype(np.int64)
-    return se3.transform(poses_of_rows(sequence.rows("depth")[k])[line], camera.backproject(uv, z[z > 0]))
+    return se3.transform(sequence.pixel_poses("depth", k, uv), camera.backproject(uv, z[z > 0]))
 
 
-def _interpolate_inverse(z: FloatArray, uv: FloatArray) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+def _interpolate_inverse(z: FloatArray, uv: FloatArray) -> tuple[FloatArray, BoolArray]:
     """z (n,) at pixels uv (n, 2), bilinear in 1/z, and where that holds: inside, measured, smooth."""
     h, w = z.shape
     inverse = np.where(z > 0, 1 / np.where(z > 0, z, 1.0), 0.0)

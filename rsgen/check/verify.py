@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from rsgen.array_types import FloatArray
 from rsgen.check.reprojection import depth_points, reproject_depth
 from rsgen.check.truth import extra_checks
 from rsgen.errors import UserError
@@ -27,7 +28,6 @@ from rsgen.sequence.format import (
     STAMP_TOLERANCE_S,
     STREAMS,
     TRUTH_DEPTH,
-    FloatArray,
     StreamName,
     associate,
     line_poses,

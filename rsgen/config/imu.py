@@ -6,8 +6,8 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
-from rsgen.geometry.so3 import FloatArray
 from rsgen.limits import Matrix4, RigidTransform
 
 # Bounded so that products of two stay far from overflow.

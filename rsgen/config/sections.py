@@ -10,14 +10,14 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from rsgen.config.sensors import ColorNoiseConfig, DepthNoiseConfig
 from rsgen.errors import UserError
-from rsgen.geometry.camera import Camera
-from rsgen.geometry.shutter import Shutter
+from rsgen.geometry.camera import Camera, Model
+from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.limits import MOST_M, RigidTransform, limits
+from rsgen.sequence.format import DEPTH_SCALE
 
 Coordinate = Annotated[float, limits(-MOST_M, MOST_M, "m")]
 Pixels = Annotated[float, limits(-1e6, 1e6, "px")]
 Seconds = Annotated[float, limits(1e-9, 3600, "s", or_zero=True)]
-Vector4 = tuple[float, float, float, float]
 Row34 = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 Matrix34 = tuple[Row34, Row34, Row34]
 _LEAST_FOCAL_PX = 0.01
@@ -97,7 +97,7 @@ class StreamConfig(Section):
     intrinsics: tuple[Pixels, Pixels, Pixels, Pixels] = Field(
         default=(481.2, 480.0, 319.5, 239.5), description="fx, fy, cx, cy, px; pixel centres integer"
     )
-    model: Literal["pinhole", "radtan", "fisheye"] = Field(default="pinhole", description="distortion model")
+    model: Model = Field(default="pinhole", description="distortion model")
     distortion: tuple[Annotated[float, limits(-1e6, 1e6, "(coefficient)")], ...] = Field(
         default=(), description="radtan k1 k2 p1 p2 [k3]; fisheye k1 k2 k3 k4"
     )
@@ -109,9 +109,7 @@ class StreamConfig(Section):
         default=0.028, description="time from first to one past the last line, s; 0: global shutter"
     )
     exposure_s: Seconds = Field(default=0.0, description="exposure of each line, s; 0: no motion blur")
-    scan: Literal["top-bottom", "bottom-top", "left-right", "right-left"] = Field(
-        default="top-bottom", description="order in which lines are read out"
-    )
+    scan: Scan = Field(default="top-bottom", description="order in which lines are read out")
 
     @property
     def camera(self) -> Camera:
@@ -153,6 +151,6 @@ class DepthConfig(StreamConfig):
     """The depth camera: planar z through each pixel's centre, 16 bit."""
 
     depth_scale: Annotated[float, limits(1e-3, 1e9, "units per metre")] = Field(
-        default=5000.0, description="stored units per metre"
+        default=DEPTH_SCALE, description="stored units per metre"
     )
     noise: DepthNoiseConfig = DepthNoiseConfig()

@@ -3,27 +3,36 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from types import TracebackType
+from typing import Any
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+Progress = Callable[[str, float, str], None]
+"""Called with a stage, the fraction of it that is done in [0, 1], and a note."""
 
 _TITLES = {"light": "baking light", "frames": "rendering"}
 
 
+def no_progress(stage: str, fraction: float, note: str) -> None:
+    """A `Progress` that shows nothing."""
+
+
 class ProgressDisplay(AbstractContextManager["ProgressDisplay"]):
-    """Callable (stage, fraction done, note) that shows each stage as a bar."""
+    """A `Progress` that shows each stage as a bar."""
 
     def __init__(self, quiet: bool = False) -> None:
+        from rich import progress as rich
+        from rich.console import Console
+
         self._console = Console(stderr=True, quiet=quiet)
         self._live = self._console.is_terminal
-        self._bars = Progress(
-            TextColumn("{task.description:<13}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"),
-            TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[note]}"),
-            console=self._console,
+        self._bars = rich.Progress(
+            rich.TextColumn("{task.description:<13}"), rich.BarColumn(), rich.TextColumn("{task.percentage:>3.0f} %"),
+            rich.TimeElapsedColumn(), rich.TextColumn("left"), rich.TimeRemainingColumn(),
+            rich.TextColumn("{task.fields[note]}"), console=self._console,
         )  # fmt: skip
-        self._tasks: dict[str, TaskID] = {}
+        self._tasks: dict[str, Any] = {}
         self._started: dict[str, float] = {}
         self._tenths: dict[str, int] = {}
 

@@ -15,6 +15,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
 from uuid import uuid4
 
+from rsgen.console.progress import Progress
 from rsgen.errors import UserError
 
 if TYPE_CHECKING:
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("rsgen")
 
-Progress = Callable[[str, float, str], None]  # stage, fraction done in [0, 1], note
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 

@@ -1,7 +1,8 @@
-"""Projection on the device: camera models with their derivatives, and the rolling-shutter projection of equation (3).
+"""Projection on the device, with derivatives, and the rolling-shutter projection of equation (3), in two ways.
 
-The twin of rsgen.geometry.camera and rsgen.geometry.shutter for millions of points in float32; the tests compare them.
-Vectors are tuples of device floats. Poses of an image's lines come as flat tables with one entry per line.
+`project_rolling` is the tracker's: few steps, from flat tables with one pose per line, differentiable. `MovingCamera`
+is the truth's: to convergence, from a table of poses in time. Vectors are tuples of device floats. Twins of
+rsgen.geometry.camera and rsgen.geometry.shutter; the tests compare them.
 """
 
 from __future__ import annotations
@@ -11,8 +12,9 @@ from typing import Any
 
 import drjit as dr
 
+from rsgen.device.lens import Lens, contains, distort
+from rsgen.device.pose_table import PoseTable
 from rsgen.geometry.camera import Camera
-from rsgen.geometry.shutter import Shutter
 
 Vector = tuple[Any, Any, Any]
 
@@ -21,28 +23,12 @@ FROM_BASE = 18
 # Floats per line: rotation and translation from camera to base.
 TO_BASE = 12
 _MIN_DEPTH = 0.05
-
-
-@dataclass(frozen=True)
-class Lens:
-    """What a kernel needs to know of a camera and its shutter; all of it is compiled in."""
-
-    camera: Camera
-    shutter: Shutter
-
-    @property
-    def lines(self) -> int:
-        """Lines of an image; 1 stands for all of them with a global shutter."""
-        return self.shutter.line_count(self.camera) if self.shutter.readout_s > 0.0 else 1
-
-    def line_of(self, x: Any, y: Any) -> Any:
-        """Line coordinate of a pixel, 0 first read."""
-        if self.lines == 1:
-            return dr.zeros(type(x), 1)
-        last = self.lines - 1
-        scan = self.shutter.scan
-        along = y if scan in ("top-bottom", "bottom-top") else x
-        return along if scan in ("top-bottom", "left-right") else last - along
+_TRUTHS_MIN_DEPTH = 1e-9  # as in `Camera.project`
+# Enough where the image moves along the scan at up to half the scan's own speed (at a tenth, 3 are).
+_SECANT_STEPS = 6
+# Lines. Below the first, rounding of float32 would spoil the secant; beyond the second, the line was not found.
+_SECANT_FROM = 0.05
+_FOUND_WITHIN = 0.005
 
 
 @dataclass(frozen=True)
@@ -74,37 +60,22 @@ class Projection:
 
 
 def project(camera: Camera, q: Vector) -> Projection:
-    """Pinhole, radial-tangential or fisheye projection of points in the camera's frame."""
-    valid = q[2] > _MIN_DEPTH
+    """Pixels of points in the camera's frame."""
+    xn, yn, inv_z, valid = _normalised(camera, q, _MIN_DEPTH)
+    d = distort(camera, xn, yn)
+    x, y = camera.fx * d.x + camera.cx, camera.fy * d.y + camera.cy
+    du, dv = (camera.fx * d.dxx, camera.fx * d.dxy), (camera.fy * d.dxy, camera.fy * d.dyy)
+    return Projection(q, x, y, valid, du, dv, inv_z, xn, yn)
+
+
+def _normalised(camera: Camera, q: Vector, min_depth: float) -> tuple[Any, Any, Any, Any]:
+    """x/z, y/z and 1/z of points in the camera's frame, and whether the camera is defined there."""
+    valid = q[2] > min_depth
     inv_z = dr.rcp(dr.select(valid, q[2], 1.0))
     xn, yn = q[0] * inv_z, q[1] * inv_z
-    if camera.model == "pinhole":
-        x, y = camera.fx * xn + camera.cx, camera.fy * yn + camera.cy
-        return Projection(q, x, y, valid, (camera.fx, 0.0), (0.0, camera.fy), inv_z, xn, yn)
-    r2 = xn * xn + yn * yn
-    valid &= r2 < camera.max_radius**2
-    if camera.model == "radtan":
-        k1, k2, p1, p2, k3 = (*camera.distortion, 0.0)[:5]
-        scale = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        slope = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * (3.0 * k3)))
-        xd = xn * scale + 2.0 * p1 * xn * yn + p2 * (r2 + 2.0 * xn * xn)
-        yd = yn * scale + p1 * (r2 + 2.0 * yn * yn) + 2.0 * p2 * xn * yn
-        dxx = scale + slope * xn * xn + 2.0 * p1 * yn + 6.0 * p2 * xn
-        dyy = scale + slope * yn * yn + 6.0 * p1 * yn + 2.0 * p2 * xn
-        dxy = slope * xn * yn + 2.0 * p1 * xn + 2.0 * p2 * yn
-    else:
-        k1, k2, k3, k4 = camera.distortion
-        r = dr.sqrt(dr.maximum(r2, 1e-12))
-        angle = dr.atan(r)
-        a2 = angle * angle
-        scale = angle * (1.0 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4)))) / r
-        rate = 1.0 + a2 * (3.0 * k1 + a2 * (5.0 * k2 + a2 * (7.0 * k3 + a2 * 9.0 * k4)))
-        slope = (rate / (1.0 + r2) - scale) / dr.maximum(r2, 1e-12)
-        xd, yd = xn * scale, yn * scale
-        dxx, dyy, dxy = scale + slope * xn * xn, scale + slope * yn * yn, slope * xn * yn
-    x, y = camera.fx * xd + camera.cx, camera.fy * yd + camera.cy
-    du, dv = (camera.fx * dxx, camera.fx * dxy), (camera.fy * dxy, camera.fy * dyy)
-    return Projection(q, x, y, valid, du, dv, inv_z, xn, yn)
+    if camera.model != "pinhole":
+        valid &= xn * xn + yn * yn < camera.max_radius**2
+    return xn, yn, inv_z, valid
 
 
 def gather(table: Any, entry: Any, count: int, first: int = 0, stride: int = FROM_BASE) -> list[Any]:
@@ -154,7 +125,7 @@ class Sighting:
         bz = bz + az
         if self.lens.lines > 1:
             rate = (ax * self.pixel_speed[0] + ay * self.pixel_speed[1] + az * self.speed[2]) * self.gain
-            lx, ly, lz = self.at.pull(*_line_gradient(self.lens))
+            lx, ly, lz = self.at.pull(*self.lens.line_gradient)
             bx, by, bz = bx + rate * lx, by + rate * ly, bz + rate * lz
         M = self.M
         return (
@@ -162,11 +133,6 @@ class Sighting:
             M[1] * bx + M[4] * by + M[7] * bz,
             M[2] * bx + M[5] * by + M[8] * bz,
         )
-
-
-def _line_gradient(lens: Lens) -> tuple[float, float]:
-    sign = 1.0 if lens.shutter.scan in ("top-bottom", "left-right") else -1.0
-    return (0.0, sign) if lens.shutter.scan in ("top-bottom", "bottom-top") else (sign, 0.0)
 
 
 def project_rolling(lens: Lens, table: Any, p_base: Vector, UInt: Any, Int: Any) -> Sighting:
@@ -207,5 +173,60 @@ def _look(
     omega_q = cross((M[15], M[16], M[17]), at.q)
     speed = (-(M[12] + omega_q[0]), -(M[13] + omega_q[1]), -(M[14] + omega_q[2]))
     pixel_speed = at.push(speed)
-    gx, gy = _line_gradient(lens)
+    gx, gy = lens.line_gradient
     return at, M, speed, pixel_speed, gx * pixel_speed[0] + gy * pixel_speed[1]
+
+
+@dataclass(frozen=True)
+class MovingCamera:
+    """A camera that moves while it exposes one frame. Times are seconds after the first line's shutter opened.
+
+    Points are homogeneous, (p, w): w = 1 for a point p in metres, w = 0 for a point at infinity in direction p. Give
+    positions relative to a reference near the camera, the table's: float32 then stays good to about 1e-4 px wherever
+    the world's origin is.
+    """
+
+    lens: Lens
+    poses: PoseTable
+
+    def pose(self, t: Any) -> tuple[Vector, tuple[Vector, Vector, Vector]]:
+        """The camera's position and the rows of its rotation R_world_cam."""
+        r0, r1, r2 = self.poses.at(t, beyond=True)  # half a line at most
+        return (r0.w, r1.w, r2.w), ((r0.x, r0.y, r0.z), (r1.x, r1.y, r1.z), (r2.x, r2.y, r2.z))
+
+    def project_at(self, t: Any, p: Vector, w: Any) -> tuple[tuple[Any, Any], Any]:
+        """Pixels of points seen at times t, and where that is defined (see `Camera.project`)."""
+        camera = self.lens.camera
+        origin, R_world_cam = self.pose(t)
+        q = rotated_back(R_world_cam, (p[0] - w * origin[0], p[1] - w * origin[1], p[2] - w * origin[2]))
+        xn, yn, _, valid = _normalised(camera, q, _TRUTHS_MIN_DEPTH)
+        d = distort(camera, xn, yn)
+        return (dr.fma(d.x, camera.fx, camera.cx), dr.fma(d.y, camera.fy, camera.cy)), valid
+
+    def project(self, start: Any, p: Vector, w: Any) -> tuple[tuple[Any, Any], Any, Any]:
+        """Where and when the frame's lines at mid-exposure show points: pixels, times and whether found.
+
+        Solves line(π(T(t)⁻¹ p)) = line, equation (3), by the secant method in lines, beginning at `start` (lines, any
+        reals). Lines are continuous. Found: in front of the camera, in the image, and the line converged.
+        """
+        lens = self.lens
+        delay, last = lens.shutter.line_delay(lens.camera), lens.lines - 1.0
+        half = 0.5 * lens.shutter.exposure_s
+        line = dr.clip(start, -0.5, last + 0.5)
+        error = lens.line_of(*self.project_at(half + line * delay, p, w)[0]) - line
+        slope = type(line)(-1.0)
+        for _ in range(_SECANT_STEPS):
+            new = dr.clip(line - error / slope, -0.5, last + 0.5)
+            (x, y), defined = self.project_at(half + new * delay, p, w)
+            new_error, step = lens.line_of(x, y) - new, new - line
+            secant = (new_error - error) / step
+            slope = dr.select((dr.abs(step) > _SECANT_FROM) & (secant < 0), secant, slope)
+            line, error = new, new_error
+        found = defined & contains(lens.camera, x, y) & (dr.abs(error) < _FOUND_WITHIN)
+        return (x, y), half + line * delay, found
+
+
+def rotated_back(R: tuple[Vector, Vector, Vector], v: Vector) -> Vector:
+    """Rᵀ v, given the rotation's rows."""
+    x, y, z = (R[0][k] * v[0] + R[1][k] * v[1] + R[2][k] * v[2] for k in range(3))
+    return x, y, z

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from rsgen.produce.frame_source import Progress
+from rsgen.console.progress import Progress
 from rsgen.sequence.reader import Sequence, read_sequence
 
 Export = Literal["kalibr", "euroc", "registered", "video", "rerun"]

@@ -18,20 +18,19 @@ from typing import Any
 
 import numpy as np
 
+from rsgen.array_types import FloatArray
 from rsgen.config.imu import ImuConfig
+from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.export.folder import (
     four_coefficients,
     make_folders,
     new_folder,
-    no_progress,
     place_images,
     sequence_imu,
 )
 from rsgen.files import atomic_write, encode_yaml
 from rsgen.geometry import se3
-from rsgen.geometry.so3 import FloatArray
-from rsgen.produce.frame_source import Progress
 from rsgen.sensors.imu import ImuSamples, nanoseconds, write_imu_csv
 from rsgen.sequence.format import ground_truth, pose_rows
 from rsgen.sequence.reader import Sequence, Stream

@@ -12,20 +12,16 @@ from typing import Any
 from pydantic import ValidationError
 
 from rsgen.config.imu import ImuConfig
+from rsgen.console.progress import Progress
 from rsgen.errors import UserError, first_problem
 from rsgen.files import atomic_write, read_bytes, write_error
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.produce.frame_source import Progress
 from rsgen.sensors.imu import ImuSamples, simulate_imu
 from rsgen.sequence.reader import Sequence
 
 # What a hard link fails with where a copy would do: another disk, a file system without links, too many of them.
 _NO_LINK = (errno.EXDEV, errno.EPERM, errno.ENOTSUP, errno.EMLINK, errno.EACCES, errno.ENOSYS)
-
-
-def no_progress(stage: str, fraction: float, note: str) -> None:
-    """A `Progress` that shows nothing."""
 
 
 def new_folder(out: Path) -> Path:
@@ -107,7 +103,7 @@ def row_clock(name: str, camera: Camera, shutter: Shutter) -> RowClock:
     """The rows' times of a camera called `name`. Raises UserError for one that is read column by column."""
     if shutter.readout_s == 0.0:
         return RowClock(-0.5 * shutter.exposure_s, 0.0)
-    if shutter.scan not in ("top-bottom", "bottom-top"):
+    if not shutter.by_rows:
         raise UserError(
             f"{name}: scan {shutter.scan} reads columns, but a line_delay belongs to rows: render with top-bottom"
         )

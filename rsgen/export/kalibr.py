@@ -8,12 +8,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from rsgen.array_types import FloatArray
 from rsgen.config.imu import ImuConfig
-from rsgen.export.folder import four_coefficients, new_folder, no_progress, row_clock, sequence_imu
+from rsgen.console.progress import Progress, no_progress
+from rsgen.export.folder import four_coefficients, new_folder, row_clock, sequence_imu
 from rsgen.files import atomic_write, encode_yaml
 from rsgen.geometry import se3
-from rsgen.geometry.so3 import FloatArray
-from rsgen.produce.frame_source import Progress
 from rsgen.sequence.reader import Sequence, Stream
 
 COLOR_TOPIC, DEPTH_TOPIC, IMU_TOPIC = "/cam0/image_raw", "/cam1/image_raw", "/imu0"

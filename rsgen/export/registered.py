@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rsgen.export.folder import make_folders, new_folder, no_progress, place_images
+from rsgen.array_types import Float32Array, FloatArray
+from rsgen.console.progress import Progress, no_progress
+from rsgen.export.folder import make_folders, new_folder, place_images
 from rsgen.files import atomic_write, encode_png, encode_yaml
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
-from rsgen.geometry.so3 import FloatArray
-from rsgen.produce.frame_source import Progress
 from rsgen.produce.writer import quantise
 from rsgen.sequence.format import associate, ground_truth, pose_rows
 from rsgen.sequence.reader import Sequence
@@ -64,8 +64,8 @@ def export_registered(sequence: Sequence, out: Path, copy: bool = False, progres
 
 
 def register_depth(
-    rays_depth: FloatArray, z: npt.NDArray[np.float32], color: Camera, T_color_depth: npt.ArrayLike
-) -> npt.NDArray[np.float32]:
+    rays_depth: FloatArray, z: Float32Array, color: Camera, T_color_depth: npt.ArrayLike
+) -> Float32Array:
     """Depth as the colour camera sees it: planar z (H, W) in metres of its pixels, 0 where no point falls.
 
     Each depth pixel's point goes to the nearest colour pixel; of several the nearest point stays (z-buffer). Depth

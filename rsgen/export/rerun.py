@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from rsgen.array_types import FloatArray
+from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
-from rsgen.export.folder import no_progress, sequence_imu
+from rsgen.export.folder import sequence_imu
 from rsgen.files import read_bytes, write_error
 from rsgen.geometry import se3
-from rsgen.geometry.so3 import FloatArray
-from rsgen.produce.frame_source import Progress
 from rsgen.sequence.format import ground_truth
 from rsgen.sequence.reader import Sequence, Stream
 

@@ -8,25 +8,22 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from rsgen.array_types import ByteArray
+from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
-from rsgen.export.folder import no_progress
 from rsgen.files import write_error
-from rsgen.produce.frame_source import Progress
 
 # Encoders that OpenCV's own wheels bring along.
 _CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
 _GAP = 4  # black columns between the two images
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
-Image = npt.NDArray[np.uint8]
-
 
 def write_video(
     path: Path,
-    frames_left: Iterable[Image],
-    frames_right: Iterable[Image],
+    frames_left: Iterable[ByteArray],
+    frames_right: Iterable[ByteArray],
     fps: float,
     labels: tuple[str, str] = ("global shutter", "rolling shutter"),
     count: int = 0,
@@ -56,7 +53,7 @@ def write_video(
     return f"{path}: {written} frames at {fps:g} Hz, {labels[0]} left and {labels[1]} right"
 
 
-def side_by_side(left: Image, right: Image, labels: tuple[str, str]) -> Image:
+def side_by_side(left: ByteArray, right: ByteArray, labels: tuple[str, str]) -> ByteArray:
     """Both images (h, w, 3) with their labels, even in size as encoders ask. Raises ValueError if sizes differ."""
     if left.shape != right.shape or left.ndim != 3 or left.shape[2] != 3 or {left.dtype, right.dtype} != {_UINT8}:
         raise ValueError(f"expected two equal (h, w, 3) uint8 images, not {left.shape} and {right.shape}")
@@ -77,7 +74,7 @@ _UINT8 = np.dtype(np.uint8)
 def _write(
     temporary: Path,
     path: Path,
-    pairs: Iterable[tuple[Image, Image]],
+    pairs: Iterable[tuple[ByteArray, ByteArray]],
     fps: float,
     labels: tuple[str, str],
     count: int,

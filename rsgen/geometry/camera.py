@@ -19,10 +19,9 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.array_types import BoolArray, FloatArray
 from rsgen.errors import UserError
-from rsgen.geometry.so3 import FloatArray
 
-BoolArray = npt.NDArray[np.bool_]
 Model = Literal["pinhole", "radtan", "fisheye"]
 
 _COEFFICIENTS: dict[str, tuple[int, ...]] = {"pinhole": (0,), "radtan": (4, 5), "fisheye": (4,)}

@@ -12,8 +12,9 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.array_types import FloatArray
 from rsgen.geometry import so3
-from rsgen.geometry.so3 import FloatArray, coefficient, cross, exp_coefficients, hat
+from rsgen.geometry.so3 import coefficient, cross, exp_coefficients, hat
 
 # Power series of c1..c4 in theta^2; see so3.coefficient for where they replace the closed forms.
 _TERMS = range(11)

@@ -15,11 +15,12 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.array_types import BoolArray, FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rsgen.geometry.camera import BoolArray, Camera
-from rsgen.geometry.so3 import FloatArray, cross, hat
-from rsgen.geometry.spline import Side, Spline
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.so3 import cross
+from rsgen.geometry.spline import Spline
 
 Scan = Literal["top-bottom", "bottom-top", "left-right", "right-left"]
 # Image axis that a scan runs along (0 = u, 1 = v) and its direction.
@@ -50,9 +51,24 @@ class Shutter:
         if self.scan not in get_args(Scan):
             raise UserError(f"shutter: unknown scan {self.scan!r}; use one of {', '.join(get_args(Scan))}")
 
+    @property
+    def axis(self) -> int:
+        """Image axis that the scan runs along: 0 = u, 1 = v."""
+        return _SCANS[self.scan][0]
+
+    @property
+    def direction(self) -> float:
+        """1 if the scan runs towards larger coordinates, else −1."""
+        return _SCANS[self.scan][1]
+
+    @property
+    def by_rows(self) -> bool:
+        """Whether a line is a row of the image."""
+        return self.axis == 1
+
     def line_count(self, camera: Camera) -> int:
         """Lines of a frame: the image's height, or its width for the sideways scans."""
-        return (camera.width, camera.height)[_SCANS[self.scan][0]]
+        return (camera.width, camera.height)[self.axis]
 
     def line_delay(self, camera: Camera) -> float:
         """Seconds from one line to the next."""
@@ -60,9 +76,8 @@ class Shutter:
 
     def line_of_pixel(self, uv: npt.ArrayLike, camera: Camera) -> FloatArray:
         """Line coordinate (...,), not rounded, of pixels (..., 2)."""
-        axis, direction = _SCANS[self.scan]
-        along = np.asarray(uv, dtype=np.float64)[..., axis]
-        return np.asarray(along if direction > 0.0 else (self.line_count(camera) - 1) - along)
+        along = np.asarray(uv, dtype=np.float64)[..., self.axis]
+        return np.asarray(along if self.direction > 0.0 else (self.line_count(camera) - 1) - along)
 
     def line_end_time(self, stamp: npt.ArrayLike, line: npt.ArrayLike, camera: Camera) -> FloatArray:
         """Time in seconds at which lines (...,) of the frame(s) stamped `stamp` (...,) stop being exposed."""
@@ -72,11 +87,6 @@ class Shutter:
     def line_mid_time(self, stamp: npt.ArrayLike, line: npt.ArrayLike, camera: Camera) -> FloatArray:
         """Mid-exposure time in seconds of lines (...,): the time of a line's pose."""
         return np.asarray(self.line_end_time(stamp, line, camera) - 0.5 * self.exposure_s)
-
-    def line_window(self, stamp: npt.ArrayLike, line: npt.ArrayLike, camera: Camera) -> tuple[FloatArray, FloatArray]:
-        """Times in seconds at which lines (...,) start and stop being exposed."""
-        end = self.line_end_time(stamp, line, camera)
-        return np.asarray(end - self.exposure_s), end
 
 
 def project_rolling(
@@ -116,40 +126,6 @@ def project_rolling(
     uv[~valid], t[~valid] = np.nan, np.nan
     shape = p_world.shape[:-1]
     return uv.reshape(*shape, 2), t.reshape(shape), valid.reshape(shape)
-
-
-def rolling_shutter_jacobian(
-    spline: Spline,
-    T_cam_body: npt.ArrayLike,
-    camera: Camera,
-    shutter: Shutter,
-    t: npt.ArrayLike,
-    p_world: npt.ArrayLike,
-    side: Side = "left",
-) -> tuple[npt.NDArray[np.int64], FloatArray]:
-    """Total derivative of `project_rolling`'s pixel by the control points, the line's own change of time included.
-
-    Takes the times t (...,) that it found for points (..., 3), valid ones only. Returns the index of the first control
-    point (...,) and J (..., 4, 2, 6): pixels per metre and per radian of the increments that `Spline.pose_jacobian`
-    defines for the same side.
-    """
-    t, p_world = np.asarray(t, dtype=np.float64), np.asarray(p_world, dtype=np.float64)
-    R_cam_body = np.asarray(T_cam_body, dtype=np.float64)[:3, :3]
-    first, J_pose = spline.pose_jacobian(t, side)
-    T_world_body, w = spline.pose_and_velocity(t)
-    q = se3.transform(se3.inverse(T_world_body), p_world)
-    J_body = camera.project_jacobian(se3.transform(T_cam_body, q)) @ R_cam_body
-    if side == "left":
-        R_body_world = np.swapaxes(T_world_body[..., :3, :3], -1, -2)
-        dq = np.concatenate([-R_body_world, R_body_world @ hat(p_world)], axis=-1)
-    else:
-        dq = np.concatenate([np.broadcast_to(-np.eye(3), (*q.shape, 3)), hat(q)], axis=-1)
-    x_dot = (J_body @ -(w[..., :3] + cross(w[..., 3:], q))[..., None])[..., 0]
-    axis, direction = _SCANS[shutter.scan]
-    delay = direction * shutter.line_delay(camera)
-    total = np.broadcast_to(np.eye(2), (*t.shape, 2, 2)).copy()
-    total[..., :, axis] += x_dot * (delay / (1.0 - delay * x_dot[..., axis]))[..., None]
-    return first, (total @ J_body @ dq)[..., None, :, :] @ J_pose
 
 
 @dataclass(frozen=True)
@@ -203,6 +179,6 @@ class _Frame:
         uv, _ = self.camera.project(p_cam)
         p_cam_dot = -(w[..., :3] + cross(w[..., 3:], q)) @ self.T_cam_body[:3, :3].T
         uv_dot = np.einsum("...ij,...j->...i", self.camera.project_jacobian(p_cam), p_cam_dot)
-        axis, direction = _SCANS[self.shutter.scan]
         mid = self.shutter.line_mid_time(stamp, self.shutter.line_of_pixel(uv, self.camera), self.camera)
-        return uv, uv_dot, mid - t, direction * self.shutter.line_delay(self.camera) * uv_dot[..., axis] - 1.0
+        rate = self.shutter.direction * self.shutter.line_delay(self.camera) * uv_dot[..., self.shutter.axis]
+        return uv, uv_dot, mid - t, rate - 1.0

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import zeta
 
-FloatArray = npt.NDArray[np.float64]
+from rsgen.array_types import FloatArray
 
 # The Jacobians' coefficients divide a difference that cancels by up to theta**5. Below one radian their power series in
 # theta**2, cut off under 1e-17, is the more exact form; above it the closed form loses two digits at most.
@@ -90,14 +90,6 @@ def hat_squared(v: npt.ArrayLike) -> FloatArray:
     for i in range(3):
         out[..., i, i] -= n2
     return out
-
-
-def vee(m: npt.ArrayLike) -> FloatArray:
-    """Inverse of `hat`: vectors (..., 3) of the skew-symmetric part of (..., 3, 3)."""
-    m = np.asarray(m, dtype=np.float64)
-    return 0.5 * np.stack(
-        [m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]], axis=-1
-    )
 
 
 def polynomial(phi: FloatArray, first: npt.ArrayLike, second: npt.ArrayLike) -> FloatArray:

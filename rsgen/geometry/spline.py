@@ -17,9 +17,10 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.array_types import FloatArray, IntArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rsgen.geometry.so3 import FloatArray, cross
+from rsgen.geometry.so3 import cross
 
 Side = Literal["left", "right"]
 
@@ -100,7 +101,7 @@ class Spline:
         """Twists (m − 1, 6) between neighbouring control points: log(T_i⁻¹ T_{i+1})."""
         return se3.log(se3.inverse(self.control_points[:-1]) @ self.control_points[1:])
 
-    def locate(self, t: npt.ArrayLike) -> tuple[npt.NDArray[np.int64], FloatArray]:
+    def locate(self, t: npt.ArrayLike) -> tuple[IntArray, FloatArray]:
         """Segment (...,) and position on it u (...,) in [0, 1] of times (...,) in seconds; UserError outside."""
         t = np.asarray(t, dtype=np.float64)
         s = (t - self.t0) / self.dt
@@ -158,7 +159,7 @@ class Spline:
         body = dw[..., :3] + cross(w[..., 3:], w[..., :3])
         return np.asarray((self.pose(t)[..., :3, :3] @ body[..., None])[..., 0])
 
-    def pose_jacobian(self, t: npt.ArrayLike, side: Side = "left") -> tuple[npt.NDArray[np.int64], FloatArray]:
+    def pose_jacobian(self, t: npt.ArrayLike, side: Side = "left") -> tuple[IntArray, FloatArray]:
         """Derivative of the pose by its four control points.
 
         Returns the index of the first of them (...,) and J (..., 4, 6, 6). side "left": T_i ← exp(δ_i) T_i moves
@@ -186,11 +187,11 @@ class Spline:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise UserError(f"{path}: not a readable spline ({reason}); write it anew with rsgen") from error
 
-    def _parts(self, segment: npt.NDArray[np.int64], b: FloatArray) -> FloatArray:
+    def _parts(self, segment: IntArray, b: FloatArray) -> FloatArray:
         """b_j Ω_j (3, ..., 6): all at once, since a call costs more than the numbers do."""
         return np.moveaxis(b, -1, 0)[..., None] * self.increments[np.stack([segment, segment + 1, segment + 2])]
 
-    def _factors(self, segment: npt.NDArray[np.int64], b: FloatArray) -> FloatArray:
+    def _factors(self, segment: IntArray, b: FloatArray) -> FloatArray:
         """A_1..A_3 (3, ..., 4, 4)."""
         return se3.exp(self._parts(segment, b))
 
@@ -213,7 +214,7 @@ class Spline:
         """Derivative Jl⁻¹(Ω_j) Ad(T_{j−1}⁻¹) (m − 1, 6, 6) of `increments` by a left increment of T_j; − of T_{j−1}."""
         return se3.left_jacobian_inv(self.increments) @ se3.adjoint(se3.inverse(self.control_points[:-1]))
 
-    def _left_blocks(self, segment: npt.NDArray[np.int64], b: FloatArray) -> list[FloatArray]:
+    def _left_blocks(self, segment: IntArray, b: FloatArray) -> list[FloatArray]:
         T = self.control_points[segment]
         F = [np.broadcast_to(np.eye(6), (*segment.shape, 6, 6))]
         J = se3.left_jacobian(self._parts(segment, b))
@@ -222,7 +223,7 @@ class Spline:
             T = T @ A
         return [F[0] - F[1], F[1] - F[2], F[2] - F[3], F[3]]
 
-    def _right_blocks(self, segment: npt.NDArray[np.int64], b: FloatArray) -> list[FloatArray]:
+    def _right_blocks(self, segment: IntArray, b: FloatArray) -> list[FloatArray]:
         P = np.broadcast_to(np.eye(6), (*segment.shape, 6, 6))
         A = self._factors(segment, b)
         D, E = [P] * 3, [P] * 3

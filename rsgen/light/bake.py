@@ -22,14 +22,15 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from rsgen.array_types import Float32Array
 from rsgen.config.config import LightConfig
+from rsgen.console.progress import Progress
 from rsgen.errors import UserError
-from rsgen.light.bake_points import Interpolation, Points, sample_points, thin
+from rsgen.light.bake_points import Interpolation, SurfacePoints, sample_points, thin
 from rsgen.render.irradiance import IrradianceField, Lattice, make_field
 
 log = logging.getLogger("rsgen")
 
-Progress = Callable[[float, str], None]  # fraction done in [0, 1], what is being done
 
 # Raise when the method changes, so that older caches are not taken for new ones.
 METHOD = 1
@@ -85,15 +86,15 @@ def bake(scene: Any, lattice: Lattice, light: LightConfig, progress: Progress) -
         indirect = coarse_to_fine(_gather(scene, field, points, coarse, rays, report))
     values[lit_points] = to_point(direct + indirect)
     table = _table(values, alive_point)
-    progress(1.0, "light baked")
+    progress("light", 1.0, "light baked")
     return table[index[0]], table[index[1]]
 
 
 def _reporter(progress: Progress, begin: float, span: float, what: str) -> Callable[[float], None]:
-    return lambda fraction: progress(begin + span * fraction, what)
+    return lambda fraction: progress("light", begin + span * fraction, what)
 
 
-def _table(values: NDArray, alive: NDArray) -> NDArray[np.float32]:
+def _table(values: NDArray, alive: NDArray) -> Float32Array:
     return np.where(alive[:, None], np.concatenate([values, alive[:, None]], axis=1), 0).astype(np.float32)
 
 
@@ -114,7 +115,7 @@ def _r2(i: Any, offset: Any) -> Any:
     return mi.Point2f(x - dr.floor(x), y - dr.floor(y))
 
 
-def _chunks(points: Points, which: NDArray, report: Callable[[float], None]):
+def _chunks(points: SurfacePoints, which: NDArray, report: Callable[[float], None]):
     for begin in range(0, len(which), _CHUNK):
         part = which[begin : begin + _CHUNK]
         p, n, g = (mi.Vector3f(a[part].T) for a in (points.position, points.normal, points.geometric))
@@ -122,7 +123,9 @@ def _chunks(points: Points, which: NDArray, report: Callable[[float], None]):
         report(min(1.0, (begin + len(part)) / len(which)))
 
 
-def _direct(scene: Any, points: Points, which: NDArray, samples: int, report: Callable[[float], None]) -> NDArray:
+def _direct(
+    scene: Any, points: SurfacePoints, which: NDArray, samples: int, report: Callable[[float], None]
+) -> NDArray:
     """Direct irradiance (len(which), 3) from all emitters, `samples` for each."""
     out = np.zeros((len(which), 3), np.float32)
     emitters = scene.emitters()
@@ -180,7 +183,12 @@ def _light_share(light_pdf: Any, cosine: Any) -> Any:
 
 
 def _gather(
-    scene: Any, field: IrradianceField, points: Points, which: NDArray, rays: int, report: Callable[[float], None]
+    scene: Any,
+    field: IrradianceField,
+    points: SurfacePoints,
+    which: NDArray,
+    rays: int,
+    report: Callable[[float], None],
 ) -> NDArray:
     """Irradiance (len(which), 3) that arrives from other surfaces, each lit as `field` says.
 

@@ -13,6 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from rsgen.array_types import Float32Array, IntArray
 from rsgen.render.irradiance import Lattice, lattice_barycentric
 from rsgen.render.scene import mesh_arrays
 
@@ -24,18 +25,18 @@ _SMOOTHING = 0.3  # spacings: closer sources than this count alike
 
 
 @dataclass(frozen=True)
-class Points:
+class SurfacePoints:
     """Unique sample points: position on the surface, shading normal, geometric normal, (n, 3) float32 each, and (n,)
     the number of the piece of surface that each lies on: one side of a connected part of a mesh.
     """
 
-    position: NDArray[np.float32]
-    normal: NDArray[np.float32]
-    geometric: NDArray[np.float32]
-    piece: NDArray[np.int64]
+    position: Float32Array
+    normal: Float32Array
+    geometric: Float32Array
+    piece: IntArray
 
 
-def sample_points(scene: Any, lattice: Lattice) -> tuple[Points, NDArray[np.int64]]:
+def sample_points(scene: Any, lattice: Lattice) -> tuple[SurfacePoints, IntArray]:
     """Unique points of both sides of the lattice, and (2, points) index of each lattice point's front and back one."""
     face, uv = lattice_barycentric(lattice)
     count = len(face)
@@ -73,7 +74,7 @@ def sample_points(scene: Any, lattice: Lattice) -> tuple[Points, NDArray[np.int6
         index[side] = inverse + offset
         offset += len(first)
     front, back = unique_first
-    return Points(
+    return SurfacePoints(
         np.concatenate([position[front], position[back]]),
         np.concatenate([normal[front], -normal[back]]),
         np.concatenate([geometric[front], -geometric[back]]),
@@ -81,7 +82,7 @@ def sample_points(scene: Any, lattice: Lattice) -> tuple[Points, NDArray[np.int6
     ), index
 
 
-def _islands(vertices: NDArray, faces: NDArray) -> NDArray[np.int64]:
+def _islands(vertices: NDArray, faces: NDArray) -> IntArray:
     """(f,) label of the connected piece that each triangle of a mesh belongs to; vertices at one place are one."""
     _, same = np.unique(np.round(vertices * 1e5).astype(np.int64), axis=0, return_inverse=True)
     a, b, c = same.ravel()[faces.astype(np.int64)].T
@@ -102,7 +103,7 @@ def _mix(columns: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return h
 
 
-def _surface_at(shape: Any, face: NDArray[np.uint32], uv: NDArray[np.float32]) -> tuple[NDArray, NDArray, NDArray]:
+def _surface_at(shape: Any, face: NDArray[np.uint32], uv: Float32Array) -> tuple[NDArray, NDArray, NDArray]:
     """Position, shading normal and geometric normal, as the renderer sees them, at barycentric `uv` of triangles."""
     pi = dr.zeros(mi.PreliminaryIntersection3f, len(face))
     pi.prim_index = mi.UInt32(face)
@@ -115,9 +116,7 @@ def _surface_at(shape: Any, face: NDArray[np.uint32], uv: NDArray[np.float32]) -
     return tuple(np.array(v, np.float32).reshape(3, -1).T for v in (si.p, si.sh_frame.n, si.n))  # type: ignore[return-value]
 
 
-def thin(
-    points: Points, spacing: float, among: NDArray[np.int64] | None = None
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def thin(points: SurfacePoints, spacing: float, among: IntArray | None = None) -> tuple[IntArray, IntArray]:
     """Of `among` (default: all), one in each cell of `spacing` metres, of like normals on one piece of surface.
 
     Returns the chosen ones as indices into `among`, and for each of `among` which of the chosen stands for it.
@@ -143,10 +142,10 @@ class Interpolation:
     """Values at some points from those at `sources`: neighbours (n, k) among the sources and weights (n, k)."""
 
     neighbours: NDArray[np.int32]
-    weights: NDArray[np.float32]
+    weights: Float32Array
 
     @classmethod
-    def between(cls, points: Points, sources: NDArray, targets: NDArray, spacing: float) -> Interpolation:
+    def between(cls, points: SurfacePoints, sources: NDArray, targets: NDArray, spacing: float) -> Interpolation:
         """By distance in position (in units of `spacing` metres) and normal together, within one piece of surface.
 
         The dark inside of a thin sheet is a millimetre from its lit outside and has the normal of the other outside.
@@ -163,7 +162,7 @@ class Interpolation:
         weights /= weights.sum(axis=1, keepdims=True)
         return cls(neighbours.astype(np.int32), weights.astype(np.float32))
 
-    def __call__(self, at_sources: NDArray[np.float32]) -> NDArray[np.float32]:
+    def __call__(self, at_sources: Float32Array) -> Float32Array:
         out = np.zeros((len(self.neighbours), 3), np.float32)
         for k in range(self.neighbours.shape[1]):
             out += self.weights[:, k, None] * at_sources[self.neighbours[:, k]]

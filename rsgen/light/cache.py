@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from rsgen.config.config import LightConfig
 from rsgen.console.configs import user_cache
-from rsgen.light.bake import METHOD, Progress, bake
+from rsgen.console.progress import Progress
+from rsgen.light.bake import METHOD, bake
 from rsgen.render.irradiance import IrradianceField, Lattice, make_field, make_lattice
 
 log = logging.getLogger("rsgen")

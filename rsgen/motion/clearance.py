@@ -6,16 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from rsgen.array_types import FloatArray
 from rsgen.config.motion import Waypoint
 from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
 from rsgen.motion.paths import TourCurve
 from rsgen.sequence.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 _STEP_S = 0.02
 _STEP_M = 0.02
@@ -25,7 +23,7 @@ _SMALLEST_M = 1e-3
 _CHUNK = 500  # points at once: bounds memory
 
 
-def nearest_surface(points: Array, triangles: Array, reach_m: float) -> tuple[Array, Array]:
+def nearest_surface(points: FloatArray, triangles: FloatArray, reach_m: float) -> tuple[FloatArray, FloatArray]:
     """Exact distance (n,) of points (n, 3) to triangles (m, 3, 3), and the surface's nearest point (n, 3).
 
     Where there is nothing within reach_m the distance is infinite and the point NaN.
@@ -55,7 +53,7 @@ def nearest_surface(points: Array, triangles: Array, reach_m: float) -> tuple[Ar
     return distance, nearest
 
 
-def clearance(motion: Spline | Trajectory, triangles: Array, reach_m: float = 0.5) -> float:
+def clearance(motion: Spline | Trajectory, triangles: FloatArray, reach_m: float = 0.5) -> float:
     """Least distance in metres of the camera's path to the triangles (m, 3, 3), world frame; inf beyond reach_m.
 
     A spline is sampled every 20 ms, a trajectory at its poses. (trimesh: mesh.triangles; arrays: vertices[faces].)
@@ -63,7 +61,7 @@ def clearance(motion: Spline | Trajectory, triangles: Array, reach_m: float = 0.
     return float(nearest_surface(_samples(motion)[1], triangles, reach_m)[0].min())
 
 
-def check_clearance(motion: Spline | Trajectory, triangles: Array, clearance_m: float) -> None:
+def check_clearance(motion: Spline | Trajectory, triangles: FloatArray, clearance_m: float) -> None:
     """Raises UserError, naming time and place, if the camera comes closer than clearance_m to triangles (m, 3, 3)."""
     times, points = _samples(motion)
     distance, _ = nearest_surface(points, triangles, clearance_m)
@@ -77,7 +75,7 @@ def check_clearance(motion: Spline | Trajectory, triangles: Array, clearance_m: 
 
 
 def plan_tour(
-    triangles: Array, waypoints: Sequence[Waypoint], clearance_m: float = 0.15, closed: bool = True
+    triangles: FloatArray, waypoints: Sequence[Waypoint], clearance_m: float = 0.15, closed: bool = True
 ) -> tuple[Waypoint, ...]:
     """Waypoints of a tour that keeps clearance_m from triangles (m, 3, 3): those given, moved and added to as needed.
 
@@ -112,7 +110,9 @@ def plan_tour(
     )
 
 
-def _push(tour: list[Waypoint], passes: Array, s: float, point: Array, target: Array, away: Array) -> None:
+def _push(
+    tour: list[Waypoint], passes: FloatArray, s: float, point: FloatArray, target: FloatArray, away: FloatArray
+) -> None:
     """Move the waypoint at `s` metres along the tour by `away`, or insert one at `point` + `away`."""
     gaps = np.abs(passes - s)
     nearest = int(np.argmin(gaps))
@@ -124,12 +124,12 @@ def _push(tour: list[Waypoint], passes: Array, s: float, point: Array, target: A
         tour.insert(where, Waypoint(position=_vector(point + away), target=_vector(target)))
 
 
-def _vector(v: Array) -> tuple[float, float, float]:
+def _vector(v: FloatArray) -> tuple[float, float, float]:
     x, y, z = np.round(v, 4).tolist()
     return x, y, z
 
 
-def _samples(motion: Spline | Trajectory) -> tuple[Array, Array]:
+def _samples(motion: Spline | Trajectory) -> tuple[FloatArray, FloatArray]:
     """Times (n,) and positions (n, 3)."""
     if isinstance(motion, Trajectory):
         return motion.stamps, motion.positions

@@ -15,17 +15,16 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import numpy as np
-import numpy.typing as npt
 from scipy.interpolate import BSpline
 from scipy.linalg import LinAlgError, solveh_banded
 from scipy.sparse import diags_array
 
+from rsgen.array_types import BoolArray, FloatArray, IntArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.trajectory import MIN_POSES, Trajectory
 
-Array = npt.NDArray[np.float64]
 Robust = Literal["huber", "none"]
 
 MAX_CONTROL_POINTS = 1_000_000
@@ -52,9 +51,9 @@ class FitResult:
     """
 
     spline: Spline
-    residual_trans_m: Array
-    residual_rot_rad: Array
-    weights: Array
+    residual_trans_m: FloatArray
+    residual_rot_rad: FloatArray
+    weights: FloatArray
     iterations: int
 
     @property
@@ -151,19 +150,19 @@ def fit_spline(
 # --- the terms -------------------------------------------------------------------------------------------------------
 
 
-def _residuals(trajectory: Trajectory, spline: Spline) -> Array:
+def _residuals(trajectory: Trajectory, spline: Spline) -> FloatArray:
     """(n, 6) log(T_k⁻¹ T(t_k)), metres and radians, in the measured camera's frame."""
     return se3.log(se3.inverse(trajectory.T_world_cam) @ spline.pose(trajectory.stamps))
 
 
-def _second_differences(spline: Spline) -> Array:
+def _second_differences(spline: Spline) -> FloatArray:
     """(m − 2, 6) Ω_{i+1} − Ω_i = dt² times the body acceleration at the knots, to first order in Ω."""
     return spline.increments[1:] - spline.increments[:-1]
 
 
 def _data_equations(
-    trajectory: Trajectory, spline: Spline, r: Array, threshold: float, scale: Array, newton: float
-) -> tuple[Array, Array]:
+    trajectory: Trajectory, spline: Spline, r: FloatArray, threshold: float, scale: FloatArray, newton: float
+) -> tuple[FloatArray, FloatArray]:
     first, J = spline.pose_jacobian(trajectory.stamps, side="right")
     J = scale[:, None] * (se3.right_jacobian_inv(r / scale)[:, None] @ J)
     norm = np.linalg.norm(r, axis=1)
@@ -177,7 +176,9 @@ def _data_equations(
     return _accumulate(first, J, WJ, weights[:, None] * r, len(spline.control_points))
 
 
-def _prior_equations(spline: Spline, bend: Array, prior: Array, scale: Array) -> tuple[Array, Array]:
+def _prior_equations(
+    spline: Spline, bend: FloatArray, prior: FloatArray, scale: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     # log(exp(−δ) exp(Ω) exp(δ')) = Ω − Jl⁻¹ δ + Jr⁻¹ δ' for right increments of both control points.
     Jl, Jr = se3.left_jacobian_inv(spline.increments), se3.right_jacobian_inv(spline.increments)
     J = scale[:, None] * np.stack([Jl[:-1], -Jr[:-1] - Jl[1:], Jr[1:]], axis=1)
@@ -185,7 +186,9 @@ def _prior_equations(spline: Spline, bend: Array, prior: Array, scale: Array) ->
     return _accumulate(np.arange(count - 2), J, prior[:, None, :, None] * J, prior * bend, count)
 
 
-def _accumulate(first: npt.NDArray[np.int64], J: Array, WJ: Array, Wr: Array, count: int) -> tuple[Array, Array]:
+def _accumulate(
+    first: IntArray, J: FloatArray, WJ: FloatArray, Wr: FloatArray, count: int
+) -> tuple[FloatArray, FloatArray]:
     """Normal equations in LAPACK's lower band storage (24, 6 count), and the gradient (count, 6).
 
     first (n,): each term's first control point, ascending. J, WJ (n, k, 6, 6): Jacobians by its k ≤ 4 control points,
@@ -207,7 +210,7 @@ def _accumulate(first: npt.NDArray[np.int64], J: Array, WJ: Array, Wr: Array, co
     return bands.reshape(_ROWS, 6 * count), gradient
 
 
-def _cost(r: Array, bend: Array, threshold: float, prior: Array) -> float:
+def _cost(r: FloatArray, bend: FloatArray, threshold: float, prior: FloatArray) -> float:
     norm = np.linalg.norm(r, axis=1)
     limit = np.minimum(norm, threshold)  # Huber: norm² below the threshold, its tangent above
     return float((limit * (2.0 * norm - limit)).sum() + (prior * bend**2).sum())
@@ -216,15 +219,15 @@ def _cost(r: Array, bend: Array, threshold: float, prior: Array) -> float:
 # --- weights ---------------------------------------------------------------------------------------------------------
 
 
-def _huber_threshold(r: Array) -> float:
+def _huber_threshold(r: FloatArray) -> float:
     return max(HUBER_FACTOR * float(np.median(np.linalg.norm(r, axis=1))), 1e-6)
 
 
-def _huber_weights(norm: Array, threshold: float) -> Array:
+def _huber_weights(norm: FloatArray, threshold: float) -> FloatArray:
     return np.minimum(1.0, threshold / np.maximum(norm, 1e-300))
 
 
-def _loose_knots(stamps: Array, t0: float, dt: float, count: int) -> npt.NDArray[np.bool_]:
+def _loose_knots(stamps: FloatArray, t0: float, dt: float, count: int) -> BoolArray:
     """(count − 2,) True where the poses alone leave the acceleration at knot t0 + i dt open.
 
     That is so at the ends, in padding, around gaps and wherever poses are sparser than knots. Least squares lets
@@ -246,7 +249,7 @@ def _loose_knots(stamps: Array, t0: float, dt: float, count: int) -> npt.NDArray
     return np.abs(variance) > _LOOSE_VARIANCE
 
 
-def _prior(r: Array, bend: Array, loose: npt.NDArray[np.bool_]) -> Array:
+def _prior(r: FloatArray, bend: FloatArray, loose: BoolArray) -> FloatArray:
     """(m − 2, 6) weights of the second differences.
 
     A loose knot's acceleration is expected to be like those inside: the weight is the one of a Gaussian prior of their
@@ -268,7 +271,7 @@ def _prior(r: Array, bend: Array, loose: npt.NDArray[np.bool_]) -> Array:
 # --- start and checks ------------------------------------------------------------------------------------------------
 
 
-def _interpolate(trajectory: Trajectory, times: Array) -> Array:
+def _interpolate(trajectory: Trajectory, times: FloatArray) -> FloatArray:
     """(m, 4, 4) poses at (m,) times by constant twist between neighbours, at rest outside the stamps."""
     stamps, T = trajectory.stamps, trajectory.T_world_cam
     times = np.clip(times, stamps[0], stamps[-1])

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
-
-Array = NDArray[np.float64]
 
 
 def band_noise(
     rng: np.random.Generator, count: int, rate_hz: float, band_hz: tuple[float, float], exponent: float
-) -> Array:
+) -> FloatArray:
     """(count, 6) samples at `rate_hz` of six independent signals, each with an RMS of exactly one and a mean of zero.
 
     Their power spectral density is f^-exponent within band_hz = (low, high) and zero outside; Fourier coefficients are

@@ -6,14 +6,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.trajectory import Trajectory
-
-Array = npt.NDArray[np.float64]
 
 _SAMPLES_PER_KNOT = 20
 _CHUNK = 200_000
@@ -58,7 +56,7 @@ def _of_spline(spline: Spline, begin: float, end: float) -> MotionStatistics:
     return _summary(steps, speed, rotation, steps, acceleration)
 
 
-def _norms(spline: Spline, times: Array) -> Array:
+def _norms(spline: Spline, times: FloatArray) -> FloatArray:
     """(3, n): speed m/s, rotation rad/s, acceleration m/s²."""
     velocity = spline.velocity(times)
     return np.stack(
@@ -83,7 +81,9 @@ def _of_poses(trajectory: Trajectory, begin: float, end: float) -> MotionStatist
     return _summary(steps, np.linalg.norm(velocity, axis=1), angle / steps, spans, acceleration)
 
 
-def _summary(steps: Array, speed: Array, rotation: Array, spans: Array, acceleration: Array) -> MotionStatistics:
+def _summary(
+    steps: FloatArray, speed: FloatArray, rotation: FloatArray, spans: FloatArray, acceleration: FloatArray
+) -> MotionStatistics:
     duration = float(steps.sum())
     length = float(speed @ steps)
     return MotionStatistics(

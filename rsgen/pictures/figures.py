@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import matplotlib
 
+from rsgen.array_types import ByteArray, Float32Array
+
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
@@ -13,8 +15,8 @@ from numpy.typing import NDArray
 
 
 def comparison(
-    color: tuple[NDArray[np.uint8], NDArray[np.uint8]],
-    depth: tuple[NDArray[np.float32], NDArray[np.float32]],
+    color: tuple[ByteArray, ByteArray],
+    depth: tuple[Float32Array, Float32Array],
     title: str,
 ) -> Figure:
     """Figure 3 of the paper. `color` (h, w, 3) sRGB and `depth` (h, w) metres, each (global, rolling shutter)."""
@@ -46,7 +48,7 @@ def comparison(
     return figure
 
 
-def preview(color: list[NDArray[np.uint8]], depth: list[NDArray[np.float32]], title: str) -> Figure:
+def preview(color: list[ByteArray], depth: list[Float32Array], title: str) -> Figure:
     """Frames of a sequence over their depth: images (h, w, 3) sRGB, planar z (h, w) in metres, equally many."""
     count = len(color)
     figure, axes = plt.subplots(2, count, figsize=(3.9 * count + 0.9, 6.2), layout="constrained", squeeze=False)

@@ -11,14 +11,16 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rsgen import srgb
+from rsgen.array_types import ByteArray, Float32Array, FloatArray, IntArray
+from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import read_bytes
 from rsgen.geometry.camera import Camera
@@ -26,9 +28,7 @@ from rsgen.limits import MOST_M
 from rsgen.motion.paths import look_at
 from rsgen.sensors.response import to_srgb8
 
-Array = NDArray[np.float64]
 Point = tuple[float, float, float]
-Progress = Callable[[str, float, str], None]
 
 SUFFIXES = (".png", ".jpg", ".svg", ".pdf")
 MAX_SIZE_PX = 8192
@@ -54,12 +54,12 @@ _R4 = (0.8566748838545029, 0.7338918566271260, 0.6287067210378087, 0.53859725722
 class ColoredMesh:
     """vertices (n, 3) m, world; faces (m, 3); unit normals (n, 3) smoothed over neighbours; linear colours (n, 3)."""
 
-    vertices: NDArray[np.float32]
-    faces: NDArray[np.int64]
-    normals: NDArray[np.float32]
-    colors: NDArray[np.float32]
+    vertices: Float32Array
+    faces: IntArray
+    normals: Float32Array
+    colors: Float32Array
 
-    def facing(self, eye: Array) -> ColoredMesh:
+    def facing(self, eye: FloatArray) -> ColoredMesh:
         """Only the triangles whose front (counter-clockwise) is turned to `eye` (3,), m, world."""
         corners = self.vertices[self.faces]
         to_eye = eye.astype(np.float32) - corners[:, 0]
@@ -72,7 +72,7 @@ class View:
     """A pinhole camera and its pose T_world_cam (4, 4): x right, y down, z forward."""
 
     camera: Camera
-    T_world_cam: Array
+    T_world_cam: FloatArray
 
 
 def picture_meshes(
@@ -84,7 +84,7 @@ def picture_meshes(
     width: int = 800,
     height: int = 600,
     grey: bool = False,
-    progress: Progress = lambda *_: None,
+    progress: Progress = no_progress,
 ) -> Path:
     """Draw each mesh of `paths`, all from the same place, write them side by side into `out` and return that.
 
@@ -145,7 +145,7 @@ def read_mesh(path: Path) -> ColoredMesh:
     faces = faces.reshape(-1, 3)
     colors = np.full((len(used), 3), _GREY, np.float32)
     if mesh.visual.kind == "vertex":
-        colors = _linear(np.asarray(mesh.visual.vertex_colors)[used, :3] / 255)
+        colors = srgb.decode(np.asarray(mesh.visual.vertex_colors)[used, :3] / 255).astype(np.float32)
     return ColoredMesh(vertices[used], faces, _vertex_normals(vertices[used], faces), colors)
 
 
@@ -181,7 +181,7 @@ def frame_meshes(
     return View(camera, T_world_cam)
 
 
-def render_mesh(mesh: ColoredMesh, view: View, reach: float) -> NDArray[np.uint8]:
+def render_mesh(mesh: ColoredMesh, view: View, reach: float) -> ByteArray:
     """8-bit sRGB picture (h, w, 3) of a mesh on white: every triangle of it, whichever way it faces.
 
     reach: m, within which a surface darkens its neighbours.
@@ -207,7 +207,7 @@ def render_mesh(mesh: ColoredMesh, view: View, reach: float) -> NDArray[np.uint8
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _launch(scene: Any, colors: Any, view: View, reach: float, first: int, count: int) -> Array:
+def _launch(scene: Any, colors: Any, view: View, reach: float, first: int, count: int) -> FloatArray:
     """Sum (pixels, 3), linear, of samples first..first+count of every pixel."""
     import drjit as dr
     import mitsuba as mi
@@ -270,7 +270,7 @@ def _check(
         raise UserError(f"--width {size[0]} --height {size[1]}: must lie in 16 to {MAX_SIZE_PX} px")
 
 
-def _side_by_side(images: Sequence[NDArray[np.uint8]], labels: Sequence[str]) -> Any:
+def _side_by_side(images: Sequence[ByteArray], labels: Sequence[str]) -> Any:
     """A figure of images (h, w, 3) pixel by pixel, each under its label."""
     import matplotlib.pyplot as plt
 
@@ -288,12 +288,12 @@ def _side_by_side(images: Sequence[NDArray[np.uint8]], labels: Sequence[str]) ->
     return figure
 
 
-def _face_normals(corners: NDArray[np.float32]) -> NDArray[np.float32]:
+def _face_normals(corners: Float32Array) -> Float32Array:
     """Normals (m, 3) of triangles (m, 3, 3), counter-clockwise seen from their front, as long as twice their area."""
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
-def _vertex_normals(vertices: NDArray[np.float32], faces: NDArray[np.int64]) -> NDArray[np.float32]:
+def _vertex_normals(vertices: Float32Array, faces: IntArray) -> Float32Array:
     """Unit normals (n, 3), the mean of the neighbouring triangles' by area; +y where they cancel."""
     normal = _face_normals(vertices[faces])
     corner = faces.ravel()
@@ -301,8 +301,3 @@ def _vertex_normals(vertices: NDArray[np.float32], faces: NDArray[np.int64]) -> 
     total = np.stack(sums, axis=1)
     length = np.linalg.norm(total, axis=1, keepdims=True)
     return np.where(length > 0, total / np.where(length > 0, length, 1), (0.0, 1.0, 0.0)).astype(np.float32)
-
-
-def _linear(encoded: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Linear values of sRGB ones in [0, 1] (IEC 61966-2-1)."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4).astype(np.float32)

@@ -16,14 +16,16 @@ from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from rsgen.array_types import FloatArray
 from rsgen.config.config import Config
-from rsgen.console.scheduler import Progress, Workers
+from rsgen.console.progress import Progress, no_progress
+from rsgen.console.scheduler import Workers
 from rsgen.errors import UserError
 from rsgen.files import atomic_write
 from rsgen.geometry.spline import Spline
 from rsgen.produce.frame_source import ColorShot, DepthShot, FrameSource, scene_hash
 from rsgen.produce.writer import SequenceWriter
-from rsgen.sequence.format import FloatArray, StreamName
+from rsgen.sequence.format import StreamName
 
 # Written frames that may wait for the disk: bounds memory and how much a kill can lose.
 _WRITE_AHEAD = 4
@@ -71,7 +73,7 @@ def _write_depth(writer: SequenceWriter, source: FrameSource, shot: DepthShot) -
 
 
 @dataclass(frozen=True)
-class Plan:
+class SequenceRecipe:
     """What a worker has to know of a sequence to render any of its frames.
 
     stamps_color (n,) and stamps_depth (m,): s, of all frames; versions, inputs: as in sequence.yaml.
@@ -86,10 +88,10 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Block:
+class RenderJob:
     """Images (frame, stream) that one job renders."""
 
-    plan: Plan
+    plan: SequenceRecipe
     shots: tuple[tuple[int, StreamName], ...]
 
 
@@ -105,7 +107,7 @@ def render_blocks(
 
     Raises UserError if a worker has other versions or another scene, or is lost too often; what came back is kept.
     """
-    plan = Plan(
+    plan = SequenceRecipe(
         _for_other_processes(writer.config, versions),
         writer.spline,
         writer.stamps("color"),
@@ -113,7 +115,7 @@ def render_blocks(
         versions,
         inputs,
     )
-    blocks = [Block(plan, tuple(shots[i : i + _BLOCK])) for i in range(0, len(shots), _BLOCK)]
+    blocks = [RenderJob(plan, tuple(shots[i : i + _BLOCK])) for i in range(0, len(shots), _BLOCK)]
     done = 0
     # The first one alone: it bakes the light, if need be, and the others find it in the cache.
     for part in (blocks[:1], blocks[1:]):
@@ -124,7 +126,7 @@ def render_blocks(
             progress("frames", done / len(shots), f"{done} of {len(shots)} images")
 
 
-def render_block(block: Block, progress: Progress) -> dict[str, bytes]:
+def render_block(block: RenderJob, progress: Progress) -> dict[str, bytes]:
     """On a worker: the block's files by their paths within the sequence. Raises UserError."""
     plan = block.plan
     source = _source(plan, progress)
@@ -133,7 +135,7 @@ def render_block(block: Block, progress: Progress) -> dict[str, bytes]:
         stamps = plan.stamps_color, plan.stamps_depth
         writer = SequenceWriter.open(out, plan.config, plan.spline, *stamps, plan.versions, plan.inputs)
         before = set(out.rglob("*"))
-        render_shots(writer, source, block.shots, lambda *_: None)
+        render_shots(writer, source, block.shots, no_progress)
         made = sorted(path for path in set(out.rglob("*")) - before if path.is_file())
         return {path.relative_to(out).as_posix(): path.read_bytes() for path in made}
 
@@ -148,7 +150,7 @@ def _for_other_processes(config: Config, versions: Mapping[str, str]) -> Config:
 _loaded: dict[str, FrameSource] = {}
 
 
-def _source(plan: Plan, progress: Progress) -> FrameSource:
+def _source(plan: SequenceRecipe, progress: Progress) -> FrameSource:
     key = json.dumps([plan.config.model_dump_json(), dict(plan.inputs), dict(plan.versions)])
     if key not in _loaded:
         _loaded.clear()
@@ -160,7 +162,7 @@ def _source(plan: Plan, progress: Progress) -> FrameSource:
     return _loaded[key]
 
 
-def _check(plan: Plan) -> None:
+def _check(plan: SequenceRecipe) -> None:
     """Raises UserError if this process would render other bytes than the one that opened the sequence."""
     mine = engine_versions(plan.config)
     for name, wanted in plan.versions.items():

@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rsgen.array_types import BoolArray, ByteArray, Float32Array, FloatArray
 from rsgen.config.config import Config
+from rsgen.console.progress import Progress, no_progress
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.sensors.color import apply_color_noise
@@ -21,15 +23,13 @@ from rsgen.sensors.response import to_srgb8
 from rsgen.sensors.seed import noise_generator
 from rsgen.sequence.format import CLEAN_COLOR
 
-Progress = Callable[[str, float, str], None]  # stage ("light" or "frames"), fraction done in [0, 1], note
-
 
 @dataclass(frozen=True)
 class ColorShot:
     """Colour frame `frame` before the sensor: linear radiance (h, w, 3), and what `truth` asks for beside it."""
 
     frame: int
-    linear: NDArray[np.float32]
+    linear: Float32Array
     truth: Mapping[str, NDArray[Any]]
 
 
@@ -38,8 +38,8 @@ class DepthShot:
     """Depth frame `frame`: exact planar z (h, w) in m, and the pixels that the projector does not light, if asked."""
 
     frame: int
-    z: NDArray[np.float32]
-    shadow: NDArray[np.bool_] | None
+    z: Float32Array
+    shadow: BoolArray | None
 
 
 class FrameSource:
@@ -48,7 +48,7 @@ class FrameSource:
     def __init__(
         self,
         config: Config,
-        progress: Progress = lambda *_: None,
+        progress: Progress = no_progress,
         global_shutter: bool = False,
         scene: Any = None,
     ) -> None:
@@ -62,7 +62,7 @@ class FrameSource:
 
         self._config = config
         self.scene = scene or load_scene(config)
-        integrator = make_integrator(mi, self.scene, config, lambda f, what: progress("light", f, what))
+        integrator = make_integrator(mi, self.scene, config, progress)
         pick = render.global_shutter if global_shutter else lambda shutter: shutter
         color, depth = config.color, config.depth
         self._color = render.ColorRenderer(self.scene, integrator, color.camera, pick(color.shutter), color.spp)
@@ -80,7 +80,7 @@ class FrameSource:
         truth = self._truth.render(self._pose(spline), stamp, next_stamp, self._seed(frame))
         return ColorShot(frame, linear, truth)
 
-    def develop_color(self, shot: ColorShot) -> tuple[NDArray[np.uint8], dict[str, NDArray[Any]]]:
+    def develop_color(self, shot: ColorShot) -> tuple[ByteArray, dict[str, NDArray[Any]]]:
         """8-bit RGB (h, w, 3) that the camera reports, and the images of `color_truth`."""
         color, truth = self._config.color, dict(shot.truth)
         linear = shot.linear * np.float32(color.exposure_gain)
@@ -96,31 +96,31 @@ class FrameSource:
         shadow = None if self._projector is None else ~self._projector.lights(z, spline.pose, stamp)
         return DepthShot(frame, z, shadow)
 
-    def develop_depth(self, shot: DepthShot) -> NDArray[np.float32]:
+    def develop_depth(self, shot: DepthShot) -> Float32Array:
         """Planar z (h, w) in m that the camera reports; 0 where it reports nothing."""
         depth, rng = self._config.depth, noise_generator(self._config.seed, "depth", shot.frame)
         return apply_depth_noise(shot.z, depth.camera, depth.noise, rng, shot.shadow)
 
-    def linear_color(self, spline: Spline, stamp: float, frame: int) -> NDArray[np.float32]:
+    def linear_color(self, spline: Spline, stamp: float, frame: int) -> Float32Array:
         """Linear RGB (h, w, 3) of the colour frame at `stamp` (s); seeded by the config's seed and `frame`."""
         return self._color.render(self._pose(spline), stamp, self._seed(frame))
 
-    def color(self, spline: Spline, stamp: float, frame: int) -> NDArray[np.uint8]:
+    def color(self, spline: Spline, stamp: float, frame: int) -> ByteArray:
         """8-bit RGB (h, w, 3), as the camera reports it, of the colour frame at `stamp` (s)."""
         return self.develop_color(ColorShot(frame, self.linear_color(spline, stamp, frame), {}))[0]
 
-    def depth(self, spline: Spline, stamp: float) -> NDArray[np.float32]:
+    def depth(self, spline: Spline, stamp: float) -> Float32Array:
         """Exact planar z (h, w) in metres of the depth frame at `stamp` (s); 0 where there is nothing."""
         return self._depth.render(spline.pose, stamp)
 
-    def _pose(self, spline: Spline) -> Callable[[Any], NDArray[np.float64]]:
+    def _pose(self, spline: Spline) -> Callable[[Any], FloatArray]:
         return lambda t: spline.pose(t) @ self._T_depth_color
 
     def _seed(self, frame: int) -> int:
         return int(np.random.SeedSequence([self._config.seed, frame]).generate_state(1)[0])
 
 
-def make_integrator(mi: Any, scene: Any, config: Config, progress: Callable[[float, str], None]) -> Any:
+def make_integrator(mi: Any, scene: Any, config: Config, progress: Progress) -> Any:
     """Mitsuba integrator of the config's light: `path`, or `BakedIntegrator` over the scene's baked irradiance."""
     light = config.light
     if light.mode == "path":

@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rsgen.array_types import FloatArray
 from rsgen.config.config import Config, TrajectoryConfig
+from rsgen.console.progress import Progress
 from rsgen.console.scheduler import Workers
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_yaml
@@ -21,7 +22,7 @@ from rsgen.motion.clearance import check_clearance
 from rsgen.motion.fit import FitResult, fit_spline
 from rsgen.motion.make import make_motion
 from rsgen.produce.distribute import engine_versions, render_blocks, render_shots
-from rsgen.produce.frame_source import FrameSource, Progress, load_scene, scene_hash
+from rsgen.produce.frame_source import FrameSource, load_scene, scene_hash
 from rsgen.produce.writer import SequenceWriter
 from rsgen.sequence.format import STREAMS, stream_stamps
 from rsgen.sequence.trajectory import Trajectory, read_trajectory
@@ -74,7 +75,7 @@ def _recorded(settings: TrajectoryConfig) -> Trajectory:
     return trajectory
 
 
-def sequence_stamps(config: Config, motion: Motion) -> dict[str, NDArray[np.float64]]:
+def sequence_stamps(config: Config, motion: Motion) -> dict[str, FloatArray]:
     """Stamps (n,) in seconds of all frames of both streams."""
     return {s: stream_stamps(motion.first_stamp, motion.last_stamp, getattr(config, s)) for s in STREAMS}
 
@@ -125,7 +126,7 @@ def _chosen(missing: Iterable[int], frames: slice, count: int) -> list[int]:
     return [k for k in missing if k in wanted]
 
 
-def scene_triangles(scene: Any) -> NDArray[np.float64]:
+def scene_triangles(scene: Any) -> FloatArray:
     """Corners (m, 3, 3) of all triangles of a Mitsuba scene, world frame, metres."""
     from rsgen.render.scene import surface
 

@@ -8,11 +8,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from rsgen.array_types import FloatArray
 from rsgen.config.config import Config, StreamConfig
 from rsgen.errors import UserError
 from rsgen.files import is_temporary, read_yaml
 from rsgen.geometry.spline import Spline
-from rsgen.sequence.format import CLEAN_COLOR, FORMAT, STREAMS, FloatArray
+from rsgen.sequence.format import CLEAN_COLOR, FORMAT, STREAMS
 
 
 def fingerprint(content: Mapping[str, Any]) -> str:

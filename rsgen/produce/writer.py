@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.array_types import ByteArray, Float32Array, FloatArray
 from rsgen.config.config import Config
 from rsgen.errors import UserError
 from rsgen.files import (
@@ -34,7 +35,6 @@ from rsgen.sequence.format import (
     ROWS,
     STREAMS,
     TRUTH_DEPTH,
-    FloatArray,
     StreamName,
     associate,
     color_truth_path,
@@ -123,9 +123,7 @@ class SequenceWriter:
         """Indices of the frames that are not on disk yet."""
         return [k for k in range(len(self.stamps(stream))) if not self._is_written(stream, k)]
 
-    def write_color(
-        self, k: int, rgb: npt.NDArray[np.uint8], truth: Mapping[str, npt.NDArray[Any]] = MappingProxyType({})
-    ) -> None:
+    def write_color(self, k: int, rgb: ByteArray, truth: Mapping[str, npt.NDArray[Any]] = MappingProxyType({})) -> None:
         """Write colour frame k, sRGB (h, w, 3) uint8, and its images of `color_truth`.
 
         These are uint8 (h, w, 3), or float32 (h, w) or (h, w, n) with n EXR channels. Raises UserError if the disk
@@ -145,7 +143,7 @@ class SequenceWriter:
         _expect(rgb, (*shape, 3), np.uint8)
         atomic_write(self._path("color", k), encode_png(rgb))
 
-    def write_depth(self, k: int, z: npt.NDArray[np.float32], reported: npt.NDArray[np.float32] | None = None) -> None:
+    def write_depth(self, k: int, z: Float32Array, reported: Float32Array | None = None) -> None:
         """Write depth frame k, planar z (h, w) float32 in metres; 0, negative, inf and NaN mean nothing measured.
 
         truth/depth/ gets z exactly; depth/ gets what the camera reports (default: z), rounded to 1/depth_scale m, 0
@@ -211,11 +209,11 @@ class SequenceWriter:
         return all(path.is_file() and path.stat().st_size > 0 for path in paths)
 
 
-def _positive(z: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+def _positive(z: Float32Array) -> Float32Array:
     return np.where(np.isfinite(z) & (z > 0), z, np.float32(0))
 
 
-def quantise(z: npt.NDArray[np.float32], depth_scale: float) -> npt.NDArray[np.uint16]:
+def quantise(z: Float32Array, depth_scale: float) -> npt.NDArray[np.uint16]:
     """16-bit depth (h, w) of planar z (h, w) in metres, 0 where there is none or it does not fit."""
     units = np.rint(z.astype(np.float64) * depth_scale)
     return np.where((units > 0) & (units <= 65535), units, 0).astype(np.uint16)

@@ -11,12 +11,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
+from rsgen.array_types import Float32Array
+from rsgen.device.pose_table import PoseFunction
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.baked import BakedIntegrator
-from rsgen.render.sensor import PoseFunction, RollingShutterSensor
+from rsgen.render.sensor import RollingShutterSensor
 
 # Samples in one launch; more are rendered in several and averaged, which bounds memory.
 _LAUNCH = 1 << 24
@@ -35,7 +36,7 @@ class ColorRenderer:
         self._sampler = mi.load_dict({"type": "independent"})
         self.sensor = RollingShutterSensor(camera, shutter)
 
-    def render(self, T_world_cam: PoseFunction, stamp: float, seed: int) -> NDArray[np.float32]:
+    def render(self, T_world_cam: PoseFunction, stamp: float, seed: int) -> Float32Array:
         """Linear RGB (h, w, 3) of the frame at `stamp` (s); `seed` decides every random number of it."""
         self.sensor.expose(T_world_cam, stamp)
         camera = self.sensor.camera
@@ -47,7 +48,7 @@ class ColorRenderer:
             total += self._launch(pixels, first, count, seed)
         return (total / self._spp).astype(np.float32).reshape(camera.height, camera.width, 3)
 
-    def _launch(self, pixels: int, first: int, count: int, seed: int) -> NDArray[np.float32]:
+    def _launch(self, pixels: int, first: int, count: int, seed: int) -> Float32Array:
         """Sum (pixels, 3) of samples first..first+count of every pixel."""
         # Mixed on the host: neighbouring seeds must not give neighbouring random streams. All launches of a frame go on
         # with one sequence of positions and times; only the integrator's own random numbers start anew.
@@ -95,7 +96,7 @@ class DepthRenderer:
         self.sensor = RollingShutterSensor(camera, shutter)
         self._exposure = shutter.exposure_s
 
-    def render(self, T_world_cam: PoseFunction, stamp: float) -> NDArray[np.float32]:
+    def render(self, T_world_cam: PoseFunction, stamp: float) -> Float32Array:
         """Planar z (h, w) float32, metres, of the frame at `stamp` (s); 0 where the ray hits nothing."""
         self.sensor.expose(T_world_cam, stamp)
         camera = self.sensor.camera

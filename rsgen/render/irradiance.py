@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from rsgen.array_types import Float32Array, IntArray
 from rsgen.render.scene import mesh_arrays
 
 _MAX_CELLS = 4095  # cells along one grid axis: 12 bits
@@ -29,9 +30,9 @@ class Lattice:
     registry id, the first triangle of each shape (-1: none); points: total count.
     """
 
-    first: NDArray[np.int64]
-    cells: NDArray[np.int64]
-    apex: NDArray[np.int64]
+    first: IntArray
+    cells: IntArray
+    apex: IntArray
     shape_first: NDArray[np.int32]
     points: int
 
@@ -68,7 +69,7 @@ def make_lattice(scene: Any, spacing: float) -> Lattice:
     return Lattice(first[:-1], all_cells, np.concatenate(apexes).astype(np.int64), shape_first, int(first[-1]))
 
 
-def lattice_barycentric(lattice: Lattice) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+def lattice_barycentric(lattice: Lattice) -> tuple[IntArray, Float32Array]:
     """Triangle index (points,) and Mitsuba's barycentric (b1, b2) (points, 2) of every lattice point."""
     counts = (lattice.cells + 1).prod(axis=1)
     face = np.repeat(np.arange(len(counts)), counts)
@@ -132,7 +133,7 @@ class IrradianceField:
         return mi.Color3f(total.xyz) * dr.select(total.w > 0, dr.rcp(dr.maximum(total.w, 1e-12)), 0)
 
 
-def make_field(lattice: Lattice, front: NDArray[np.float32], back: NDArray[np.float32]) -> IrradianceField:
+def make_field(lattice: Lattice, front: Float32Array, back: Float32Array) -> IrradianceField:
     """Upload values (points, 4) of both sides; back sides that no light reaches share one dark cell."""
     packed = lattice.packed()
     lit = np.maximum.reduceat(back[:, 3], lattice.first) > 0

@@ -19,6 +19,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from rsgen.array_types import Float32Array
 from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
 
@@ -70,7 +71,7 @@ def ensure_built(path: Path) -> None:
         raise UserError(f"scene {path}: no such file: name a Mitsuba 3 .xml or a mesh file in scene.file")
 
 
-def surface(scene: Any) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+def surface(scene: Any) -> tuple[Float32Array, NDArray[np.uint32]]:
     """All triangles of a scene: vertices (n, 3) in the world frame, metres, and faces (m, 3)."""
     vertices, faces, first = [], [], 0
     for shape in scene.shapes():
@@ -83,7 +84,7 @@ def surface(scene: Any) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
     return np.concatenate(vertices), np.concatenate(faces)
 
 
-def mesh_arrays(shape: Any) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+def mesh_arrays(shape: Any) -> tuple[Float32Array, NDArray[np.uint32]]:
     """Vertices (n, 3) float32 in the world frame and faces (m, 3) uint32 of one Mitsuba mesh."""
     v = np.asarray(shape.vertex_positions_buffer(), np.float32).reshape(-1, 3)
     f = np.asarray(shape.faces_buffer(), np.uint32).reshape(-1, 3)

@@ -9,10 +9,11 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from rsgen import srgb
+from rsgen.array_types import ByteArray, Float32Array
 from rsgen.config.sensors import ColorNoiseConfig
-from rsgen.sensors.response import FloatImage, power_law, quantise8, s_curve, srgb, to_srgb8
+from rsgen.sensors.response import power_law, quantise8, s_curve, to_srgb8
 
 # Codes of black and white in the 16-bit raw image. As in real raw files black is not 0, so that noise is not cut off
 # there, which would brighten the dark.
@@ -20,7 +21,7 @@ _BLACK, _WHITE = 4096, 65535
 _DEMOSAIC = {"bilinear": cv2.COLOR_BayerRGGB2RGB, "edge-aware": cv2.COLOR_BayerRGGB2RGB_EA}
 
 
-def apply_color_noise(linear: FloatImage, config: ColorNoiseConfig, rng: np.random.Generator) -> NDArray[np.uint8]:
+def apply_color_noise(linear: Float32Array, config: ColorNoiseConfig, rng: np.random.Generator) -> ByteArray:
     """8-bit RGB (h, w, 3) that the camera makes of linear RGB (h, w, 3), 1 = white; `rng` decides all of its noise.
 
     Exposure error and vignetting act on the light, then come the mosaic, shot and read noise, saturation, demosaicking,
@@ -35,12 +36,12 @@ def apply_color_noise(linear: FloatImage, config: ColorNoiseConfig, rng: np.rand
         raw = add_sensor_noise(raw, config.full_well_e, config.read_noise_e, config.gain, rng)
     rgb = np.minimum(raw, 1) if config.bayer == "off" else demosaic(raw, config.bayer)
     rgb = np.clip(rgb * np.array(config.white_balance, np.float32), 0, 1)
-    encoded = srgb(rgb) if config.response == "srgb" else power_law(rgb, config.gamma)
+    encoded = srgb.encode(rgb) if config.response == "srgb" else power_law(rgb, config.gamma)
     return quantise8(s_curve(encoded, config.contrast) if config.contrast > 0 else encoded)
 
 
 @lru_cache(maxsize=4)
-def vignetting(width: int, height: int, corner_loss: float) -> FloatImage:
+def vignetting(width: int, height: int, corner_loss: float) -> Float32Array:
     """Fraction (h, w) of the light that reaches each pixel: 1 in the centre, 1 − corner_loss at the corner pixels.
 
     The cos⁴ law of a lens, cos⁴ θ = 1 / (1 + tan² θ)² with tan θ ∝ radius, scaled to the given loss: real lenses lose
@@ -55,8 +56,8 @@ def vignetting(width: int, height: int, corner_loss: float) -> FloatImage:
 
 
 def add_sensor_noise(
-    signal: FloatImage, full_well_e: float, read_noise_e: float, gain: float, rng: np.random.Generator
-) -> FloatImage:
+    signal: Float32Array, full_well_e: float, read_noise_e: float, gain: float, rng: np.random.Generator
+) -> Float32Array:
     """`signal` (any shape, 1 = white) with shot and read noise; not clipped.
 
     White is N = full_well_e / gain electrons. Of x N electrons the shot noise has the variance x N (Poisson) and the
@@ -73,7 +74,7 @@ def add_sensor_noise(
     return sigma
 
 
-def mosaic(rgb: FloatImage) -> FloatImage:
+def mosaic(rgb: Float32Array) -> Float32Array:
     """What a sensor under an RGGB colour filter array keeps (h, w) of RGB (h, w, 3): red at even row, even column."""
     raw = np.array(rgb[..., 1])
     raw[0::2, 0::2] = rgb[0::2, 0::2, 0]
@@ -81,7 +82,7 @@ def mosaic(rgb: FloatImage) -> FloatImage:
     return raw
 
 
-def demosaic(raw: FloatImage, method: str) -> FloatImage:
+def demosaic(raw: Float32Array, method: str) -> Float32Array:
     """RGB (h, w, 3) in about [0, 1] from an RGGB mosaic (h, w), 1 = white; through 16 bits, as a raw file would.
 
     `method`: 'bilinear' or 'edge-aware' (OpenCV's `demosaicing`). The zippers and false colours at edges are the point.

@@ -13,13 +13,10 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from rsgen.array_types import BoolArray, Float32Array
 from rsgen.config.sensors import DepthNoiseConfig
 from rsgen.geometry.camera import Camera
-
-FloatImage = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 # px. A jump of the disparity by this much within three pixels is an edge, e.g. from 2.0 to 2.05 m for a Kinect.
 _EDGE_PX = 0.5
@@ -28,8 +25,8 @@ _STEEPEST_RAD = np.deg2rad(89.0)
 
 
 def apply_depth_noise(
-    z: FloatImage, camera: Camera, config: DepthNoiseConfig, rng: np.random.Generator, shadow: Mask | None = None
-) -> FloatImage:
+    z: Float32Array, camera: Camera, config: DepthNoiseConfig, rng: np.random.Generator, shadow: BoolArray | None = None
+) -> Float32Array:
     """What the depth camera reports (h, w) for exact planar depth `z` (h, w): metres, 0 = no return.
 
     `shadow` (h, w): where the projector's light does not reach (`rsgen.sensors.shadow`), used by the model 'kinect'.
@@ -49,7 +46,7 @@ def apply_depth_noise(
     return np.where(reported, noisy, np.float32(0))
 
 
-def _kinect(z: FloatImage, camera: Camera, config: DepthNoiseConfig, rng: np.random.Generator) -> FloatImage:
+def _kinect(z: Float32Array, camera: Camera, config: DepthNoiseConfig, rng: np.random.Generator) -> Float32Array:
     """Structured light: lateral shift, disparity noise and quantisation, then dropouts at edges and grazing angles."""
     focal_baseline = config.projector_baseline_m * camera.fx
     d = disparity(z, focal_baseline)
@@ -62,7 +59,9 @@ def _kinect(z: FloatImage, camera: Camera, config: DepthNoiseConfig, rng: np.ran
     return np.where(kept, np.float32(focal_baseline) / np.where(kept, noisy, 1), np.float32(0))
 
 
-def _time_of_flight(z: FloatImage, camera: Camera, config: DepthNoiseConfig, rng: np.random.Generator) -> FloatImage:
+def _time_of_flight(
+    z: Float32Array, camera: Camera, config: DepthNoiseConfig, rng: np.random.Generator
+) -> Float32Array:
     """Axial noise, pixels at edges that mix both sides, and dropouts at grazing angles."""
     d = disparity(z, config.projector_baseline_m * camera.fx)
     angle = incidence(d, camera)
@@ -72,12 +71,12 @@ def _time_of_flight(z: FloatImage, camera: Camera, config: DepthNoiseConfig, rng
     return np.where(kept, mixed + sigma * rng.standard_normal(z.shape, np.float32), np.float32(0))
 
 
-def disparity(z: FloatImage, focal_baseline: float) -> FloatImage:
+def disparity(z: Float32Array, focal_baseline: float) -> Float32Array:
     """Disparity (h, w) in px of planar depth z (h, w) in m, `focal_baseline` in m·px (a Kinect's: 43); 0 of 0."""
     return np.where(z > 0, np.float32(focal_baseline) / np.where(z > 0, z, 1), np.float32(0))
 
 
-def shift_laterally(d: FloatImage, edge: Mask, sigma_px: float, rng: np.random.Generator) -> FloatImage:
+def shift_laterally(d: Float32Array, edge: BoolArray, sigma_px: float, rng: np.random.Generator) -> Float32Array:
     """Disparities (h, w) looked up at (u, v) + N(0, sigma_px² I): bilinear, beside an edge the nearest pixel's.
 
     The lateral noise of Barron, Malik (CVPR 2013) and Handa et al. (ICRA 2014), sec. IV, sigma 1/2 px. Theirs is
@@ -96,7 +95,7 @@ def shift_laterally(d: FloatImage, edge: Mask, sigma_px: float, rng: np.random.G
     return np.where(beside, nearest, smooth)
 
 
-def quantise_disparity(d: FloatImage, sigma_px: float, step_px: float, rng: np.random.Generator) -> FloatImage:
+def quantise_disparity(d: Float32Array, sigma_px: float, step_px: float, rng: np.random.Generator) -> Float32Array:
     """round((d + N(0, sigma_px²)) / step_px) · step_px of disparities (h, w) in px; 0 stays 0.
 
     z = b f / d then has steps of z² step_px / (b f) and sigma_z = z² / (b f) · sqrt(sigma_px² + step_px² / 12), the
@@ -110,7 +109,7 @@ def quantise_disparity(d: FloatImage, sigma_px: float, step_px: float, rng: np.r
     return np.where(d > 0, noisy, np.float32(0))
 
 
-def disparity_edges(d: FloatImage) -> Mask:
+def disparity_edges(d: Float32Array) -> BoolArray:
     """Pixels (h, w) where the second difference of the disparity, along rows or columns, is half a pixel or more.
 
     It is 0 on planes however steep and marks both sides of a jump. Where nothing is (0) counts as infinitely far. The
@@ -122,7 +121,7 @@ def disparity_edges(d: FloatImage) -> Mask:
     return edge
 
 
-def incidence(d: FloatImage, camera: Camera) -> FloatImage:
+def incidence(d: Float32Array, camera: Camera) -> Float32Array:
     """Angle (h, w) in [0, π/2] rad between each pixel's ray and the surface's normal; π/2 where nothing is.
 
     On a plane 1/z, so d, is A x + B y + C in normalised coordinates, and (A, B, C) is along its normal; with
@@ -139,7 +138,7 @@ def incidence(d: FloatImage, camera: Camera) -> FloatImage:
     return np.arccos(np.minimum(cosine, 1, dtype=np.float32))
 
 
-def grazing_probability(angle: FloatImage, start_deg: float, end_deg: float) -> FloatImage:
+def grazing_probability(angle: Float32Array, start_deg: float, end_deg: float) -> Float32Array:
     """Probability (h, w) of no return at incidence angles (h, w) in rad: 0 up to start, 1 from end on, linear between.
 
     A ramp where Nguyen, Izadi, Lovell (3DIMPVT 2012) found a Kinect's data to fail: noise soars above 60°, and there is
@@ -149,7 +148,9 @@ def grazing_probability(angle: FloatImage, start_deg: float, end_deg: float) -> 
     return np.clip((angle - np.float32(start)) * np.float32(1 / max(end - start, 1e-6)), 0, 1)
 
 
-def axial_sigma(z: FloatImage, angle: FloatImage, base_m: float, growth_per_m: float, nearest_m: float) -> FloatImage:
+def axial_sigma(
+    z: Float32Array, angle: Float32Array, base_m: float, growth_per_m: float, nearest_m: float
+) -> Float32Array:
     """Sigma (h, w) in m of depth along the optical axis at depths z (m) and incidence angles θ (rad); 0 of z = 0.
 
     base + growth (z − nearest)² + 10⁻⁴ θ² / (√z (π/2 − θ)²), the last term beyond 60° only: Nguyen, Izadi, Lovell
@@ -161,7 +162,7 @@ def axial_sigma(z: FloatImage, angle: FloatImage, base_m: float, growth_per_m: f
     return np.where(z > 0, sigma + np.where(angle > np.float32(np.pi / 3), steep, 0), 0)
 
 
-def mix_edges(z: FloatImage, edge: Mask, probability: float, rng: np.random.Generator) -> FloatImage:
+def mix_edges(z: Float32Array, edge: BoolArray, probability: float, rng: np.random.Generator) -> Float32Array:
     """z (h, w) in which pixels beside an edge fly, with `probability`: a mean, weighted at random, of both its sides.
 
     The other side is the depth in the 3×3 neighbourhood that is farthest from the pixel's own. A light pulse that
@@ -181,13 +182,13 @@ def mix_edges(z: FloatImage, edge: Mask, probability: float, rng: np.random.Gene
 class _Rays:
     """Per pixel (h, w): ray (x, y, 1), its length, and the derivatives of pixel (u, v) by (x, y), px."""
 
-    x: FloatImage
-    y: FloatImage
-    length: FloatImage
-    u_x: FloatImage
-    u_y: FloatImage
-    v_x: FloatImage
-    v_y: FloatImage
+    x: Float32Array
+    y: Float32Array
+    length: Float32Array
+    u_x: Float32Array
+    u_y: Float32Array
+    v_x: Float32Array
+    v_y: Float32Array
 
 
 @lru_cache(maxsize=4)
@@ -198,7 +199,7 @@ def _rays(camera: Camera) -> _Rays:
     return _Rays(*(np.ascontiguousarray(part, np.float32) for part in (*parts, J[..., 1, 1])))
 
 
-def _slope(d: FloatImage, axis: int) -> FloatImage:
+def _slope(d: Float32Array, axis: int) -> Float32Array:
     """Forward or backward difference (h, w) along `axis`, whichever is smaller in size."""
     step = np.diff(d, axis=axis)
     first, last = np.take(step, [0], axis), np.take(step, [-1], axis)

@@ -16,11 +16,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.array_types import FloatArray
 from rsgen.config.imu import ImuConfig, Vector3
 from rsgen.errors import UserError
 from rsgen.files import atomic_write
 from rsgen.geometry import se3
-from rsgen.geometry.so3 import FloatArray, cross
+from rsgen.geometry.so3 import cross
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.format import round_stamps
 

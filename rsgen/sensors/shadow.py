@@ -10,9 +10,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
-from rsgen.render.sensor import PoseFunction, RollingShutterSensor
+from rsgen.array_types import BoolArray, Float32Array
+from rsgen.device.pose_table import PoseFunction
+from rsgen.render.sensor import RollingShutterSensor
 
 # Shadow rays end this much short of the surface, as a fraction of their length: 0.1 mm at 1 m. Depth is exact to 1e-6.
 _SHORT = 1e-4
@@ -33,7 +34,7 @@ class Projector:
         self._left, self._right = camera.unproject(edges)[:, 0]
         self._x = camera.unproject(camera.pixel_grid())[..., 0].astype(np.float32)
 
-    def lights(self, z: NDArray[np.float32], T_world_cam: PoseFunction, stamp: float) -> NDArray[np.bool_]:
+    def lights(self, z: Float32Array, T_world_cam: PoseFunction, stamp: float) -> BoolArray:
         """Whether the pattern reaches the surface at each pixel (h, w) of a depth frame; False where z = 0 (nothing).
 
         `z` (h, w): its exact planar depth, m. The camera's sensor must still be exposed to that frame, of `stamp` (s)

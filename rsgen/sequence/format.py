@@ -15,11 +15,12 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from rsgen.array_types import FloatArray
 from rsgen.errors import UserError, first_problem
 from rsgen.files import read_yaml
 from rsgen.geometry import se3, so3
-from rsgen.geometry.camera import Camera
-from rsgen.geometry.shutter import Shutter
+from rsgen.geometry.camera import Camera, Model
+from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
 
 FORMAT = "rsgen-sequence/1"
@@ -31,10 +32,10 @@ ROWS: dict[StreamName, str] = {"color": "truth/rows_color.npy", "depth": "truth/
 TRUTH_DEPTH = "truth/depth"
 CLEAN_COLOR = "color"  # truth/color/: what a colour camera without noise would have reported
 GROUND_TRUTH_HZ = 200.0
+DEPTH_SCALE = 5000.0  # units per metre of depth images, unless told otherwise: as TUM's and ICL-NUIM's
 STAMP_TOLERANCE_S = 1e-6
 _FRAMES_AT_ONCE = 16  # poses of so many frames' lines are evaluated together: flat memory, little overhead
 
-FloatArray = npt.NDArray[np.float64]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Seconds = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -50,13 +51,13 @@ class StreamYaml(_Yaml):
 
     size: tuple[Annotated[int, Field(ge=1, le=16384)], Annotated[int, Field(ge=1, le=16384)]]
     intrinsics: tuple[Finite, Finite, Finite, Finite]
-    model: Literal["pinhole", "radtan", "fisheye"]
+    model: Model
     distortion: tuple[Finite, ...]
     rate_hz: Positive
     offset_s: Seconds
     readout_s: Seconds
     exposure_s: Seconds
-    scan: Literal["top-bottom", "bottom-top", "left-right", "right-left"]
+    scan: Scan
     frames: int = Field(ge=1, le=10_000_000)
     first_stamp_s: Seconds
     depth_scale: Annotated[float, Field(ge=1e-3, le=1e9)] | None = None

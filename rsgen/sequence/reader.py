@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.array_types import ByteArray, Float32Array, FloatArray, IntArray
 from rsgen.errors import UserError
-from rsgen.files import read_exr, read_npy, read_png, read_text
+from rsgen.files import listed_file, read_exr, read_npy, read_png, read_text
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
@@ -26,12 +27,12 @@ from rsgen.sequence.format import (
     STAMP_TOLERANCE_S,
     STREAMS,
     TRUTH_DEPTH,
-    FloatArray,
     Line,
     StreamName,
     StreamYaml,
     color_truth_path,
     parse_listing,
+    poses_of_rows,
     read_sequence_yaml,
 )
 
@@ -56,7 +57,7 @@ class Stream:
     first_stamp_s: float
     stamps: FloatArray
     paths: tuple[Path, ...]
-    indices: npt.NDArray[np.int64]
+    indices: IntArray
 
     @property
     def line_count(self) -> int:
@@ -83,7 +84,7 @@ class Sequence:
     def _rows(self) -> dict[StreamName, FloatArray]:
         return {}
 
-    def color(self, k: int) -> npt.NDArray[np.uint8]:
+    def color(self, k: int) -> ByteArray:
         """Colour image k, sRGB (h, w, 3)."""
         camera = self.streams["color"].camera
         return read_png(self.streams["color"].paths[k], (camera.height, camera.width, 3), np.uint8)
@@ -93,11 +94,11 @@ class Sequence:
         camera = self.streams["depth"].camera
         return read_png(self.streams["depth"].paths[k], (camera.height, camera.width), np.uint16)
 
-    def depth(self, k: int) -> npt.NDArray[np.float32]:
+    def depth(self, k: int) -> Float32Array:
         """Planar z (h, w) in metres that the sensor reports, 0 where nothing was measured."""
         return (self.depth_units(k) / self.streams["depth"].depth_scale).astype(np.float32)
 
-    def truth_depth(self, k: int) -> npt.NDArray[np.float32]:
+    def truth_depth(self, k: int) -> Float32Array:
         """Exact planar z (h, w) in metres, noise-free, with the same rolling shutter; 0 where there is none."""
         camera = self.streams["depth"].camera
         z = read_exr(self.truth_depth_path(k), (camera.height, camera.width))
@@ -137,6 +138,11 @@ class Sequence:
             self._rows[stream] = read_npy(self.root / ROWS[stream], (s.frames, s.line_count, 7))[s.indices]
         return self._rows[stream]
 
+    def pixel_poses(self, stream: StreamName, k: int, uv: npt.ArrayLike) -> FloatArray:
+        """Exact poses T_world_cam (..., 4, 4) with which image k was taken at pixels uv (..., 2): their lines'."""
+        line = np.rint(np.asarray(uv)[..., self.streams[stream].shutter.axis]).astype(np.int64)
+        return poses_of_rows(self.rows(stream)[k])[line]
+
 
 def read_sequence(path: Path) -> Sequence:
     """Read the description, listings and spline of a sequence folder; images are read when asked for.
@@ -151,7 +157,7 @@ def read_sequence(path: Path) -> Sequence:
         raise UserError(f"{root}: has no sequence.yaml, so it is not a sequence that 'rsgen render' wrote")
     description, meta = read_sequence_yaml(root / "sequence.yaml")
     try:
-        T_color_depth = np.array(rigid(description.T_color_depth), float)
+        T_color_depth = rigid(description.T_color_depth)
     except ValueError as error:
         raise UserError(f"{root / 'sequence.yaml'}: T_color_depth: {error}") from None
     if description.streams.depth.depth_scale is None:
@@ -225,7 +231,8 @@ def _read_stream(root: Path, name: StreamName, yaml: StreamYaml) -> Stream:
     if not lines:
         raise UserError(f"{listing}: lists no frame: run 'rsgen render' again to finish it")
     real_root = root.resolve()
-    paths = tuple(_inside(root, real_root, listing, line) for line in lines)
+    missing = "run the same 'rsgen render' again"
+    paths = tuple(listed_file(root, real_root, line.path, f"{listing} line {line.number}", missing) for line in lines)
     indices = np.array([_index(listing, line, yaml) for line in lines], np.int64)
     stamps = np.array([line.stamp for line in lines])
     try:
@@ -235,22 +242,6 @@ def _read_stream(root: Path, name: StreamName, yaml: StreamYaml) -> Stream:
     scale = yaml.depth_scale if name == "depth" and yaml.depth_scale is not None else 0.0
     clock = (yaml.rate_hz, yaml.offset_s, scale, yaml.frames, yaml.first_stamp_s)
     return Stream(name, camera, shutter, *clock, stamps, paths, indices)
-
-
-def _inside(root: Path, real_root: Path, listing: Path, line: Line) -> Path:
-    """The listed file, which has to lie in the folder even once symbolic links are followed."""
-    where = f"{listing} line {line.number}"
-    path = root / line.path
-    try:
-        real = path.resolve()
-        exists = real.is_file()
-    except (OSError, ValueError, RuntimeError):
-        raise UserError(f"{where}: {line.path[:60]!r} is not a usable path") from None
-    if Path(line.path).is_absolute() or ".." in Path(line.path).parts or not real.is_relative_to(real_root):
-        raise UserError(f"{where}: path {line.path!r} leaves the sequence's folder")
-    if not exists:
-        raise UserError(f"{where}: {path} is missing: run the same 'rsgen render' again")
-    return path
 
 
 def _index(listing: Path, line: Line, yaml: StreamYaml) -> int:

@@ -5,7 +5,6 @@ A file is checked completely before anything is returned; each complaint is one 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +13,10 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.array_types import BoolArray, FloatArray, IntArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 
-Array = npt.NDArray[np.float64]
 TrajectoryFormat = Literal["auto", "tum", "icl", "euroc"]
 
 ICL_RATE_HZ = 30.0
@@ -48,8 +47,8 @@ class Trajectory:
     right-handed, metres. (For EuRoC files the body is the IMU: apply ``moved(T_body_cam=...)``.)
     """
 
-    stamps: Array
-    T_world_cam: Array
+    stamps: FloatArray
+    T_world_cam: FloatArray
 
     def __post_init__(self) -> None:
         if self.stamps.ndim != 1 or self.T_world_cam.shape != (len(self.stamps), 4, 4):
@@ -62,11 +61,11 @@ class Trajectory:
         return len(self.stamps)
 
     @property
-    def positions(self) -> Array:
+    def positions(self) -> FloatArray:
         """(n, 3) metres: the camera's centre in the world."""
         return self.T_world_cam[:, :3, 3]
 
-    def moved(self, T_scene_world: Array | None = None, T_body_cam: Array | None = None) -> Trajectory:
+    def moved(self, T_scene_world: FloatArray | None = None, T_body_cam: FloatArray | None = None) -> Trajectory:
         """The same motion in another world frame and/or of another camera fixed to the same body; both are (4, 4)."""
         poses = self.T_world_cam
         if T_scene_world is not None:
@@ -188,7 +187,7 @@ def _detect(path: Path, records: list[tuple[int, str]]) -> Literal["tum", "icl",
     return "euroc" if comma and stamp.strip().isdigit() and len(stamp.strip()) >= 16 else "tum"
 
 
-def _table(path: Path, kind: str, records: list[tuple[int, str]]) -> Array:
+def _table(path: Path, kind: str, records: list[tuple[int, str]]) -> FloatArray:
     """(n, 8) float64: the first eight columns."""
     wanted = _FIELDS[kind]
     rows = []
@@ -212,7 +211,7 @@ def _is_number(field: str) -> bool:
     return True
 
 
-def _nanoseconds(path: Path, records: list[tuple[int, str]]) -> Array:
+def _nanoseconds(path: Path, records: list[tuple[int, str]]) -> FloatArray:
     """(n,) seconds; read as integers, since 19 digits do not fit a float64."""
     stamps = np.empty(len(records))
     for k, (line, content) in enumerate(records):
@@ -231,15 +230,15 @@ class _Checker:
     """Raises UserError for the first record whose entry in an (n,) bool array is false."""
 
     path: Path
-    lines: npt.NDArray[np.int64]
+    lines: IntArray
 
-    def __call__(self, good: npt.NDArray[np.bool_], complaint: Callable[[int], str]) -> None:
+    def __call__(self, good: BoolArray, complaint: Callable[[int], str]) -> None:
         bad = np.flatnonzero(~good)
         if bad.size:
             raise UserError(f"{self.path}:{self.lines[bad[0]]}: {complaint(int(bad[0]))}")
 
 
-def _check_stamps(check: _Checker, stamps: Array, max_gap_s: float | None) -> None:
+def _check_stamps(check: _Checker, stamps: FloatArray, max_gap_s: float | None) -> None:
     steps = np.diff(stamps, prepend=stamps[0] - 1.0)
     check(steps != 0.0, lambda i: f"repeats the stamp {stamps[i]:.9g} s of the line before: remove one of them")
     check(
@@ -259,7 +258,7 @@ def _check_stamps(check: _Checker, stamps: Array, max_gap_s: float | None) -> No
 # --- ICL-NUIM --------------------------------------------------------------------------------------------------------
 
 
-def _start_pose(icl_start: npt.ArrayLike | None) -> Array:
+def _start_pose(icl_start: npt.ArrayLike | None) -> FloatArray:
     """(4, 4) T_pov_cam of frame 1 from a 3x4 or 4x4 list; orthonormal, since published digits are rounded."""
     if icl_start is None:
         return np.eye(4)
@@ -276,7 +275,7 @@ def _start_pose(icl_start: npt.ArrayLike | None) -> Array:
     return se3.orthonormalise(T)
 
 
-def _icl_to_ours(T_relative: Array, T_pov_start: Array) -> Array:
+def _icl_to_ours(T_relative: FloatArray, T_pov_start: FloatArray) -> FloatArray:
     """(n, 4, 4) published start-relative poses to T_world_cam, given frame 1's pose in the POV-Ray world.
 
     POV-Ray's world is left-handed (x right, y up, z forward) and so is its camera, so that the rotation between them
@@ -287,11 +286,3 @@ def _icl_to_ours(T_relative: Array, T_pov_start: Array) -> Array:
     T_start_cam[:, 2, 3] -= _ICL_Z_OFFSET_M
     mirror_x, mirror_y = np.diag([-1.0, 1.0, 1.0, 1.0]), np.diag([1.0, -1.0, 1.0, 1.0])
     return mirror_x @ T_pov_start @ T_start_cam @ mirror_y
-
-
-def icl_start_from_pov_pose(line: str) -> list[list[float]]:
-    """The 3x4 ``icl_start`` in a line of a POV-Ray pose list: ``frame r00 r01 r02 tx r10 ... tz`` (frame 1's line)."""
-    values = [float(field) for field in line.split()]
-    if len(values) != 13 or not all(math.isfinite(value) for value in values):
-        raise UserError("a POV-Ray pose line has 13 numbers: frame r00 r01 r02 tx r10 r11 r12 ty r20 r21 r22 tz")
-    return [values[1:5], values[5:9], values[9:13]]

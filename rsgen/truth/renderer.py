@@ -27,15 +27,17 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from rsgen.array_types import Float32Array, FloatArray
 from rsgen.config.sections import ColorConfig
 from rsgen.config.truth import GlobalTime, TruthConfig
+from rsgen.device.lens import Lens, contains
+from rsgen.device.pose_table import PoseFunction, PoseTable
+from rsgen.device.projection import MovingCamera, Vector, rotated_back
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.geometry.so3 import FloatArray
 from rsgen.render.images import ColorRenderer
-from rsgen.render.sensor import PoseFunction, RollingShutterSensor
+from rsgen.render.sensor import RollingShutterSensor
 from rsgen.sensors.response import to_srgb8
-from rsgen.truth.projection import Track, contains, line_of_pixel, to_camera
 
 # Rays that ask whether a point is seen end this much short of it, as a fraction of their length: 0.1 mm at 1 m.
 _SHORT = 1e-4
@@ -77,14 +79,12 @@ class TruthRenderer:
             images |= self._geometry(T_world_cam, stamp, next_stamp)
         return {name: images[name] for name in truth.images}
 
-    def _geometry(
-        self, T_world_cam: PoseFunction, stamp: float, next_stamp: float | None
-    ) -> dict[str, NDArray[np.float32]]:
+    def _geometry(self, T_world_cam: PoseFunction, stamp: float, next_stamp: float | None) -> dict[str, Float32Array]:
         camera, shutter, truth = self._camera, self._shutter, self._truth
         self._sensor.expose(T_world_cam, stamp)
         reference = np.asarray(T_world_cam(np.array([stamp])), float).reshape(4, 4)[:3, 3]
-        track = Track(camera, shutter, T_world_cam, stamp, reference)
-        seen = self._cast(track, reference)
+        now = _moving(camera, shutter, T_world_cam, stamp, reference)
+        seen = self._cast(now)
         images: dict[str, list[Any]] = {}
         if truth.color_depth:
             images["color_depth"] = [seen.z]
@@ -92,18 +92,19 @@ class TruthRenderer:
             images["normals"] = list(seen.n_cam)
         if truth.blur_length:
             ends = (shutter.exposure_s + seen.begin, seen.begin)
-            (x_end, ok_end), (x_begin, ok_begin) = (track.project_at(t, seen.p, seen.w) for t in ends)
-            images["blur_length"] = [dr.select(ok_end & ok_begin, dr.norm(x_end - x_begin), 0)]
+            (x_end, ok_end), (x_begin, ok_begin) = (now.project_at(t, seen.p, seen.w) for t in ends)
+            length = dr.norm(mi.Point2f(x_end) - mi.Point2f(x_begin))
+            images["blur_length"] = [dr.select(ok_end & ok_begin, length, 0)]
         if "global" in truth.flow:
             for time in truth.global_shutter:
                 instant = global_instant(camera, shutter, stamp, time)
-                still = Track(camera, Shutter(), T_world_cam, instant, reference)
+                still = _moving(camera, Shutter(), T_world_cam, instant, reference)
                 uv, defined = still.project_at(mi.Float(0), seen.p, seen.w)
-                found = defined & contains(camera, uv)
+                found = defined & contains(camera, *uv)
                 images[f"flow_global_{time}"] = self._flow(seen, uv, found, still.pose(mi.Float(0))[0], reference)
         if "next" in truth.flow and next_stamp is not None:
-            following = Track(camera, shutter, T_world_cam, next_stamp, reference)
-            uv, t, found = following.project(line_of_pixel(camera, shutter, seen.uv), seen.p, seen.w)
+            following = _moving(camera, shutter, T_world_cam, next_stamp, reference)
+            uv, t, found = following.project(following.lens.line_of(*seen.uv), seen.p, seen.w)
             images["flow_next"] = self._flow(seen, uv, found, following.pose(t)[0], reference)
         dr.eval(images)
         shape = (camera.height, camera.width)
@@ -112,7 +113,7 @@ class TruthRenderer:
             out["flow_next"] = np.zeros((camera.height * camera.width, 3), np.float32)
         return {name: a.reshape(*shape, *(a.shape[1:] if a.shape[1] > 1 else ())) for name, a in out.items()}
 
-    def _cast(self, track: Track, reference: FloatArray) -> _Seen:
+    def _cast(self, now: MovingCamera) -> _Seen:
         """What the pixels' centres see at their lines' mid-exposure. The sensor must be exposed to the frame."""
         camera, shutter = self._camera, self._shutter
         pixel = dr.arange(mi.UInt32, camera.width * camera.height)
@@ -122,26 +123,36 @@ class TruthRenderer:
         hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
         normal = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal).n
         normal = dr.select(hit.is_valid(), dr.select(dr.dot(normal, ray.d) < 0, normal, -normal), 0)
-        begin = line_of_pixel(camera, shutter, uv) * shutter.line_delay(camera)
-        origin, R_world_cam = track.pose(begin + 0.5 * shutter.exposure_s)
+        begin = now.lens.line_of(*uv) * shutter.line_delay(camera)
+        origin, R_world_cam = now.pose(begin + 0.5 * shutter.exposure_s)
         w = dr.select(hit.is_valid(), mi.Float(1), 0)
-        p = dr.select(hit.is_valid(), origin + hit.t * ray.d, ray.d)
+        p = dr.select(hit.is_valid(), mi.Point3f(origin) + hit.t * ray.d, ray.d)
         z = dr.select(hit.is_valid(), hit.t * self._sensor.planar_depth_scale(uv.x, uv.y), 0)
-        return _Seen(uv, begin, p, w, normal, to_camera(R_world_cam, normal), z)
+        return _Seen(uv, begin, p, w, normal, rotated_back(R_world_cam, normal), z)
 
-    def _flow(self, seen: _Seen, uv: Any, found: Any, origin: Any, reference: FloatArray) -> list[Any]:
+    def _flow(self, seen: _Seen, uv: tuple[Any, Any], found: Any, origin: Vector, reference: FloatArray) -> list[Any]:
         """u, v, valid of the flow to pixels `uv`, where `found`, of a camera then at `origin` (from the reference)."""
-        towards = seen.p - seen.w * origin
+        camera = mi.Point3f(origin)
+        towards = seen.p - seen.w * camera
         distance = dr.norm(towards)
         at = mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in reference))
-        ray = mi.Ray3f(origin + at, towards / distance)
+        ray = mi.Ray3f(camera + at, towards / distance)
         ray.maxt = dr.select(seen.w > 0, distance * (1 - _SHORT), dr.inf)
         front = (seen.w == 0) | (dr.dot(seen.normal, towards) < 0)
         valid = found & front
         valid &= ~self._scene.ray_test(ray, coherent=True, active=valid)
-        flow = uv - seen.uv
+        flow = mi.Point2f(uv) - seen.uv
         keep = dr.isfinite(flow.x) & dr.isfinite(flow.y) & found
         return [dr.select(keep, flow.x, 0), dr.select(keep, flow.y, 0), dr.select(valid, mi.Float(1), 0)]
+
+
+def _moving(
+    camera: Camera, shutter: Shutter, T_world_cam: PoseFunction, stamp: float, reference: FloatArray
+) -> MovingCamera:
+    """The camera of the frame at `stamp` (s), positions relative to `reference` (3,), world, m."""
+    return MovingCamera(
+        Lens(camera, shutter), PoseTable.of(mi.Vector4f, camera, shutter, T_world_cam, stamp, reference)
+    )
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,10 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from rsgen.array_types import FloatArray
 from rsgen.device.arrays import Engine
-from rsgen.device.projection import Lens, Vector, cross
-from rsgen.geometry.so3 import FloatArray
+from rsgen.device.lens import Lens
+from rsgen.device.projection import Vector, cross
 from rstrack.alignment.student_t import cost, curvature, weight
 
 # Lines that share one linearisation by the control points (DESIGN section 5: eight lose nothing).

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from rsgen.array_types import FloatArray
 from rsgen.device.arrays import Engine, Kernels
-from rsgen.device.projection import Lens
+from rsgen.device.lens import Lens
 from rsgen.geometry.camera import Camera
-from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import BlockSums, Scaling, block_counts
 from rstrack.alignment.normal_equations import Quadratic, chain

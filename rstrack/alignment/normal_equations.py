@@ -13,8 +13,8 @@ from functools import lru_cache
 import numpy as np
 import scipy.linalg
 
+from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
-from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import BlockSums
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rsgen.geometry.so3 import FloatArray
+from rsgen.array_types import FloatArray
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.normal_equations import assemble, solve
 from rstrack.alignment.observation import Observation

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
-from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.normal_equations import Quadratic
 

@@ -23,7 +23,8 @@ from typing import Any
 import drjit as dr
 
 from rsgen.device.arrays import Engine
-from rsgen.device.projection import TO_BASE, Lens, gather, move, project_rolling
+from rsgen.device.lens import Lens
+from rsgen.device.projection import TO_BASE, gather, move, project_rolling
 from rsgen.device.recording import recorded_from
 from rstrack.alignment.block_sums import accumulate, block_slot
 from rstrack.images.blur import blur_length, blur_weight

@@ -6,8 +6,8 @@ import copy
 
 import numpy as np
 
+from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
-from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 
 # Position u of the last line on its knot interval below which the last control point (weight u³/6) is mere guesswork.

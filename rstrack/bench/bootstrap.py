@@ -11,14 +11,15 @@ from typing import Any
 
 import numpy as np
 
+from rsgen.array_types import FloatArray
+from rsgen.console.progress import Progress, no_progress
 from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
-from rsgen.geometry.so3 import FloatArray
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate, plain
 from rstrack.metrics.association import Truth, compare, truth_of
 from rstrack.options import Options
-from rstrack.tracking.run import Progress, make_tracker
+from rstrack.tracking.run import make_tracker
 
 _LIMITS_M = (1e-3, 5e-3)
 _MIN_POSES = 3
@@ -89,7 +90,7 @@ class BootstrapResult:
 
 def bootstraps(
     dataset: Dataset, options: Options, starts: int = 50, frames: int = 20, seed: int = 0,
-    progress: Progress = lambda *_: None,
+    progress: Progress = no_progress,
 ) -> BootstrapResult:  # fmt: skip
     """Track `frames` frames from each of `starts` random frames (fewer if there are not so many), a new tracker each.
 

@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from rsgen.array_types import FloatArray
+from rsgen.console.progress import Progress, no_progress
 from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.spline_state import SplineState
@@ -29,7 +30,6 @@ from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.metrics.association import angles_deg
 from rstrack.options import Options
 from rstrack.tracking.lost_track import FitHistory
-from rstrack.tracking.run import Progress
 from rstrack.tracking.spline_tracker import observe
 from rstrack.tracking.window import Window
 
@@ -136,7 +136,7 @@ class ConvergenceResult:
 
 
 def convergence(
-    dataset: Dataset, options: Options, pairs: int = 50, seed: int = 0, progress: Progress = lambda *_: None
+    dataset: Dataset, options: Options, pairs: int = 50, seed: int = 0, progress: Progress = no_progress
 ) -> ConvergenceResult:
     """Align single frames to keyframes one to ten frames older, from poses ever farther off.
 

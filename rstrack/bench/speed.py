@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from rsgen.console.progress import Progress, no_progress
 from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
@@ -23,7 +24,7 @@ from rstrack.data.registered import Registrar, registered_image
 from rstrack.data.rig import Frame
 from rstrack.options import PEERS, Options
 from rstrack.peers.open3d import PeerTracker
-from rstrack.tracking.run import AnyTracker, Progress, make_tracker
+from rstrack.tracking.run import AnyTracker, make_tracker
 
 # Frames at the start that are not counted: the first of them compile kernels.
 _WARM_UP = 20
@@ -135,7 +136,7 @@ def time_methods(
     dataset: Dataset,
     options: Sequence[Options],
     frames: int,
-    progress: Progress = lambda *_: None,
+    progress: Progress = no_progress,
     peers: Sequence[str] = (),
 ) -> SpeedResult:
     """Track the first `frames` frames with each of the options and peers; the first 20, at most half, do not count.

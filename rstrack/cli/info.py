@@ -6,10 +6,10 @@ from collections import Counter
 
 import numpy as np
 
+from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.data.dataset import Dataset
 from rstrack.metrics.association import truth_of

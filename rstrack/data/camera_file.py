@@ -13,20 +13,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from rsgen.errors import UserError, first_problem
 from rsgen.files import read_text, read_yaml
-from rsgen.geometry.camera import Camera
-from rsgen.geometry.shutter import Shutter
-from rstrack.data.opencv_camera_file import check_fy, is_opencv, read_opencv_rig, rigid
+from rsgen.geometry.camera import Camera, Model
+from rsgen.geometry.shutter import Scan, Shutter
+from rsgen.sequence.format import DEPTH_SCALE
+from rstrack.data.opencv_camera_file import check_fy, extrinsic, is_opencv, read_opencv_rig
 from rstrack.data.rig import Rig
-
-DEPTH_SCALE = 5000.0
-"""Units per metre of TUM's and ICL-NUIM's depth images."""
 
 EXAMPLE = "color: {width: 640, height: 480, intrinsics: [fx, fy, cx, cy], readout_s: 0.028}"
 _KEYS = "color, depth, T_color_depth, each camera with width, height, intrinsics, readout_s"
@@ -54,11 +52,11 @@ class _Stream(_Section):
     width: Pixels
     height: Pixels
     intrinsics: Vector4
-    model: Literal["pinhole", "radtan", "fisheye"] = "pinhole"
+    model: Model = "pinhole"
     distortion: tuple[Finite, ...] = ()
     readout_s: NonNegative
     exposure_s: NonNegative = 0.0
-    scan: Literal["top-bottom", "bottom-top", "left-right", "right-left"] = "top-bottom"
+    scan: Scan = "top-bottom"
 
     @property
     def camera(self) -> Camera:
@@ -105,7 +103,7 @@ def read_rig(path: Path, color_size: Size, depth_size: Size) -> RigFile:
     try:
         color_camera = _camera("color", data.color)
         depth_camera = color_camera if depth is None else _camera("depth", depth)
-        T_color_depth = rigid(np.eye(4) if data.T_color_depth is None else data.T_color_depth, "T_color_depth")
+        T_color_depth = extrinsic(np.eye(4) if data.T_color_depth is None else data.T_color_depth, "T_color_depth")
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
     depth_shutter = Shutter() if depth is None else depth.shutter

@@ -15,8 +15,8 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
-from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.format import StreamName
 from rsgen.sequence.reader import Sequence, read_sequence

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_npz, read_text, write_error
-from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.format import pose_rows
 from rsgen.sequence.trajectory import read_trajectory

@@ -28,11 +28,12 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
+from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera, Model
 from rsgen.geometry.shutter import Shutter
-from rsgen.geometry.so3 import FloatArray
+from rsgen.limits import rigid
 from rstrack.data.rig import Rig
 
 _STREAMS = {"color": ("color", "rgb"), "depth": ("depth",)}
@@ -80,7 +81,7 @@ def read_opencv_rig(path: Path, text: str, color_size: Size, depth_size: Size) -
     color_shutter, depth_shutter = keys.shutter("color"), keys.shutter("depth")
     T_color_depth = keys.first(_EXTRINSIC)
     try:
-        T = rigid(np.eye(4) if T_color_depth is None else T_color_depth, "T_color_depth")
+        T = extrinsic(np.eye(4) if T_color_depth is None else T_color_depth, "T_color_depth")
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
     scale = keys.first(("depth_scale",))
@@ -90,17 +91,12 @@ def read_opencv_rig(path: Path, text: str, color_size: Size, depth_size: Size) -
     return rig, None if scale is None else _number(scale)
 
 
-def rigid(T: npt.ArrayLike, name: str) -> FloatArray:
+def extrinsic(T: npt.ArrayLike, name: str) -> FloatArray:
     """T (4, 4), its rotation made orthonormal to the last digit. Raises UserError if it is not a rigid transform."""
     try:
-        matrix = np.array(T, float)
-    except (TypeError, ValueError):
-        matrix = np.empty(0)
-    good = matrix.shape == (4, 4) and bool(np.isfinite(matrix).all()) and np.allclose(matrix[3], [0, 0, 0, 1])
-    R = matrix[:3, :3] if good else np.zeros((3, 3))
-    if np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
-        raise UserError(f"{name} is not a rigid transform: give 4x4 [R t; 0 0 0 1], translations in metres")
-    return se3.orthonormalise(matrix)
+        return se3.orthonormalise(rigid(T, _ROTATION_TOLERANCE))
+    except ValueError as error:
+        raise UserError(f"{name}: {error}") from None
 
 
 def check_fy(fy: float, where: str) -> None:

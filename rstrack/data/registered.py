@@ -11,16 +11,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from rsgen.array_types import ByteArray, Float32Array, FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
-from rsgen.geometry.so3 import FloatArray
 from rstrack.data.dataset import Dataset
 from rstrack.data.rig import Rig
-
-DepthArray = npt.NDArray[np.float32]
-ColorArray = npt.NDArray[np.uint8]
 
 # Inverse depth is linear in the pixels of a plane: second differences above this share of it are an edge.
 _EDGE = 0.02
@@ -33,8 +29,8 @@ _NOWHERE = -1e4
 class RegisteredImage:
     """depth: float32 (h, w), planar z in metres, 0 = missing or not seen in colour. color: uint8 (h, w, 3) RGB."""
 
-    depth: DepthArray
-    color: ColorArray
+    depth: Float32Array
+    color: ByteArray
 
 
 class Registrar:
@@ -55,7 +51,7 @@ class Registrar:
         self._depth_map = None if is_straight else _pixel_map(rig.depth_camera, self._rays)
         self._is_registered = rig.color_camera == self.camera and np.array_equal(rig.T_color_depth, np.eye(4))
 
-    def __call__(self, depth: DepthArray, color: ColorArray) -> RegisteredImage:
+    def __call__(self, depth: Float32Array, color: ByteArray) -> RegisteredImage:
         """depth (h, w), planar z in metres, 0 = missing; color (H, W, 3): as the two cameras took them."""
         z = depth if self._depth_map is None else _undistorted(depth, *self._depth_map)
         if self._is_registered:
@@ -80,20 +76,20 @@ def registered_image(dataset: Dataset, registrar: Registrar, k: int) -> Register
     return registrar(dataset.images.depth(k), dataset.images.color(nearest))
 
 
-def _pixel_map(camera: Camera, p_cam: FloatArray) -> tuple[DepthArray, DepthArray]:
+def _pixel_map(camera: Camera, p_cam: FloatArray) -> tuple[Float32Array, Float32Array]:
     """Where points (h, w, 3) are in the camera's image: u and v (h, w), as OpenCV's remap takes them."""
     uv, is_visible = camera.project(p_cam)
     uv = np.where(is_visible[..., None], uv, _NOWHERE).astype(np.float32)
     return np.ascontiguousarray(uv[..., 0]), np.ascontiguousarray(uv[..., 1])
 
 
-def _undistorted(z: DepthArray, u: DepthArray, v: DepthArray) -> DepthArray:
+def _undistorted(z: Float32Array, u: Float32Array, v: Float32Array) -> Float32Array:
     """Depth at pixels (u, v): its inverse is interpolated within a surface, the nearest pixel's across an edge."""
     inverse = np.divide(1.0, z, out=np.zeros_like(z), where=z > 0)
     bend = np.maximum(*(np.abs(cv2.filter2D(inverse, -1, kernel)) for kernel in (_BEND, _BEND.T)))
     is_edge = cv2.dilate((bend > _EDGE * inverse).astype(np.uint8), np.ones((3, 3), np.uint8))
 
-    def at_pixels(image: Any, how: int) -> DepthArray:
+    def at_pixels(image: Any, how: int) -> Float32Array:
         return np.asarray(cv2.remap(image, u, v, how, borderMode=cv2.BORDER_CONSTANT, borderValue=0))
 
     nearest = at_pixels(inverse, cv2.INTER_NEAREST)

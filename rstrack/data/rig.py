@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy.typing as npt
 
+from rsgen.array_types import FloatArray
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.geometry.so3 import FloatArray
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
-from rsgen.files import png_fault, read_bytes, read_text
+from rsgen.files import listed_file, png_fault, read_bytes, read_text
 from rsgen.geometry.camera import Camera
-from rsgen.geometry.so3 import FloatArray
 from rsgen.sequence.trajectory import ICL_RATE_HZ, Trajectory, read_trajectory
 from rstrack.data.camera_file import EXAMPLE, RigFile, read_rig
 from rstrack.data.rig import Rig
@@ -157,17 +157,8 @@ class _Listing:
         return seconds
 
     def _path(self, entry: _Entry, real_root: Path) -> Path:
-        path = self.root / entry.path
-        try:
-            real = path.resolve()
-            exists = real.is_file()
-        except (OSError, ValueError, RuntimeError):
-            raise UserError(f"{self._where(entry)}: {entry.path[:60]!r} is not a usable path") from None
-        if Path(entry.path).is_absolute() or ".." in Path(entry.path).parts or not real.is_relative_to(real_root):
-            raise UserError(f"{self._where(entry)}: path {entry.path[:200]!r} leaves the dataset's folder")
-        if not exists:
-            raise UserError(f"{self._where(entry)}: {path} is missing: unpack the dataset again or remove the line")
-        return path
+        missing = "unpack the dataset again or remove the line"
+        return listed_file(self.root, real_root, entry.path, self._where(entry), missing)
 
 
 def _listings(root: Path) -> tuple[_Listing, _Listing]:

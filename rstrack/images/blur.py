@@ -6,7 +6,7 @@ from typing import Any
 
 import drjit as dr
 
-from rsgen.device.projection import Lens
+from rsgen.device.lens import Lens
 
 
 def blur_weight(length_px: Any, inv_sigma2: Any) -> Any:

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.array_types import FloatArray
 from rsgen.device.arrays import engine
-from rsgen.device.projection import Lens
+from rsgen.device.lens import Lens
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.geometry.so3 import FloatArray
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.images.line_poses import Exposure
 from rstrack.images.pyramid import (

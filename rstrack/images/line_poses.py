@@ -8,9 +8,10 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from rsgen.device.projection import Lens
+from rsgen.array_types import FloatArray
+from rsgen.device.lens import Lens
 from rsgen.geometry import se3
-from rsgen.geometry.so3 import FloatArray, hat
+from rsgen.geometry.so3 import hat
 from rsgen.geometry.spline import Spline
 
 # Lines whose poses are taken from one evaluation of the spline.

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.array_types import FloatArray
 from rsgen.device.arrays import Engine
 from rsgen.geometry.camera import Camera
-from rsgen.geometry.so3 import FloatArray
 from rstrack.images.line_poses import Exposure
 
 LEVELS = 3

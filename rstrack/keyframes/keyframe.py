@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.array_types import FloatArray
 from rsgen.device.arrays import Engine
-from rsgen.device.projection import Lens
+from rsgen.device.lens import Lens
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.geometry.so3 import FloatArray
 from rstrack.images.line_poses import Exposure
 from rstrack.images.pyramid import LEVELS, masked_pyramid
 from rstrack.images.sampling import EDGE, NEAREST

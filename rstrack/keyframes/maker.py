@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.array_types import FloatArray
 from rsgen.device.arrays import Engine, Kernels
-from rsgen.device.projection import Lens
+from rsgen.device.lens import Lens
 from rsgen.geometry import se3
-from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.images.device_frame import DeviceRig, Timer, untimed
 from rstrack.images.line_poses import from_base_table, to_base_table

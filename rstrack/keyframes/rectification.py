@@ -13,7 +13,8 @@ from typing import Any
 import drjit as dr
 
 from rsgen.device.arrays import Engine
-from rsgen.device.projection import TO_BASE, Lens, gather, move, project, project_rolling
+from rsgen.device.lens import Lens
+from rsgen.device.projection import TO_BASE, gather, move, project, project_rolling
 from rsgen.device.recording import recorded, recorded_from
 from rstrack.images.sampling import bilinear, grid, nearest, surface
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections import deque
 
+from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
-from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference

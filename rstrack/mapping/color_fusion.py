@@ -21,8 +21,10 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from rsgen.device.arrays import Engine
-from rsgen.device.projection import Lens, Sighting, cross, gather, move, project, project_rolling
+from rsgen import srgb
+from rsgen.device.arrays import Engine, Kernels
+from rsgen.device.lens import Lens
+from rsgen.device.projection import Sighting, cross, gather, move, project, project_rolling
 from rsgen.device.recording import recorded, recorded_from
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
@@ -58,19 +60,7 @@ class FusedColor:
     shape: tuple[int, int]
 
 
-def linear_from_srgb(srgb: npt.ArrayLike) -> npt.NDArray[np.float32]:
-    """sRGB (...,) in [0, 1] to light (IEC 61966-2-1)."""
-    s = np.asarray(srgb, np.float32)
-    return np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-def srgb_from_linear(light: npt.ArrayLike) -> npt.NDArray[np.float32]:
-    """The inverse of `linear_from_srgb`; light is clipped to [0, 1]."""
-    x = np.clip(np.asarray(light, np.float32), 0.0, 1.0)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1.0 / 2.4) - 0.055).astype(np.float32)
-
-
-_LIGHT_OF_BYTE = linear_from_srgb(np.arange(256) / 255.0)[:, None]
+_LIGHT_OF_BYTE = srgb.decode(np.arange(256, dtype=np.float32) / np.float32(255))[:, None]
 
 
 def linear_image(e: Engine, exposure: Exposure, color: npt.NDArray[np.uint8]) -> LinearImage:
@@ -90,7 +80,10 @@ class ColorFusion:
 
     e: Engine
     sigma_px: float | None = SIGMA_PX
-    _kernels: dict[Any, Any] = field(default_factory=dict)
+    _kernel: Kernels = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._kernel = Kernels(self.e)
 
     def start(self, ref: Reference) -> FusedColor:
         """Nothing but holes. `ref` is rectified."""
@@ -134,12 +127,7 @@ class ColorFusion:
         """sRGB (h, w, 3), 0 in holes, and the sums of weights (h, w)."""
         light = np.stack([self.e.download(plane, fused.shape) for plane in fused.rgb], axis=-1)
         weight: npt.NDArray[np.float32] = self.e.download(fused.weight, fused.shape)
-        return np.rint(255.0 * srgb_from_linear(light)).astype(np.uint8), weight
-
-    def _kernel(self, make: Any, *key: Any) -> Any:
-        if (make, *key) not in self._kernels:
-            self._kernels[make, *key] = make(self.e, *key)
-        return self._kernels[make, *key]
+        return np.rint(255.0 * srgb.encode(np.clip(light, 0.0, 1.0))).astype(np.uint8), weight
 
 
 def _points(e: Engine, base: Lens, rho: Any) -> tuple[Any, tuple[Any, Any, Any]]:

@@ -5,20 +5,17 @@ write_keyframes(open_dataset(Path("out/table1")), read_estimate(Path("runs/table
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
+from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_png, encode_yaml, write_error
-from rsgen.sequence.format import frame_name, pose_rows
-from rstrack.data.camera_file import DEPTH_SCALE
+from rsgen.sequence.format import DEPTH_SCALE, frame_name, pose_rows
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import TRAJECTORY, Estimate
 from rstrack.options import Options
-
-Progress = Callable[[str, float, str], None]
 
 _WEIGHT_SCALE = 1000.0
 _FOLDERS = ("rgb", "depth", "weight")
@@ -26,7 +23,7 @@ _FOLDERS = ("rgb", "depth", "weight")
 
 def write_keyframes(
     dataset: Dataset, estimate: Estimate, out: Path, sigma_px: float | None = 1.0, options: Options | None = None,
-    progress: Progress = lambda *_: None,
+    progress: Progress = no_progress,
 ) -> int:  # fmt: skip
     """Write rgb/, depth/, weight/, rgb.txt, depth.txt, trajectory.txt and camera.yaml; returns how many keyframes.
 

@@ -6,19 +6,19 @@ write_ply(Path("mesh.ply"), result.surface)
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
+from rsgen.array_types import FloatArray
+from rsgen.console.progress import Progress, no_progress
 from rsgen.device.arrays import Engine, Kernels, engine
-from rsgen.device.projection import Lens
+from rsgen.device.lens import Lens
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.shutter import Shutter
-from rsgen.geometry.so3 import FloatArray
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.data.prefetch import prefetched
@@ -32,9 +32,6 @@ from rstrack.options import MapOptions
 from rstrack.volume.kernels import lookup_kernel
 from rstrack.volume.mesh import Surface, extract_surface, write_ply
 from rstrack.volume.volume import Volume
-
-Progress = Callable[[str, float, str], None]
-"""Called with a stage, the fraction done (0 to 1) and a note."""
 
 # Seconds from the nearest estimated pose beyond which a frame is left out: its pose would be a guess.
 _POSE_WITHIN_S = 0.1
@@ -150,7 +147,7 @@ class FrameMapper:
 
 
 def reconstruct(
-    dataset: Dataset, estimate: Estimate, options: MapOptions | None = None, progress: Progress = lambda *_: None
+    dataset: Dataset, estimate: Estimate, options: MapOptions | None = None, progress: Progress = no_progress
 ) -> Reconstruction:
     """Fuse a sequence's frames with an estimate's motion. Raises UserError: no spline for rs, no truth for --world
     truth, no frame with a pose, an image that cannot be read."""
@@ -180,7 +177,7 @@ def reconstruct(
 
 def run_map(
     seq_path: Path, estimate_path: Path, out: Path, options: MapOptions, cloud: Path | None = None,
-    camera_file: Path | None = None, progress: Progress = lambda *_: None,
+    camera_file: Path | None = None, progress: Progress = no_progress,
 ) -> Reconstruction:  # fmt: skip
     """Map a sequence folder with a run folder or TUM file: writes a mesh, and a point cloud where `cloud` says.
 

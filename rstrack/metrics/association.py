@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
+from rsgen.array_types import FloatArray, IntArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3, so3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.format import STAMP_TOLERANCE_S, associate
 from rsgen.sequence.trajectory import Trajectory
@@ -22,7 +21,6 @@ from rstrack.data.estimate import Estimate
 if TYPE_CHECKING:
     from rstrack.data.dataset import Dataset
 
-IntArray = npt.NDArray[np.int64]
 
 ASSOCIATE_WITHIN_S = 0.02
 """Stamps at most so far apart belong together: the default of TUM's associate.py."""

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from rsgen.array_types import FloatArray, IntArray
 from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.format import associate
 from rsgen.sequence.trajectory import Trajectory
@@ -24,7 +24,6 @@ from rstrack.data.estimate import Estimate, plain, read_estimate
 from rstrack.metrics.association import (
     ASSOCIATE_WITHIN_S,
     Comparison,
-    IntArray,
     Truth,
     angles_deg,
     compare,

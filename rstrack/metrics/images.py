@@ -8,22 +8,21 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-Image = npt.NDArray[np.uint8]
-Mask = npt.NDArray[np.bool_]
+from rsgen.array_types import BoolArray, ByteArray
 
 # Wang, Bovik, Sheikh, Simoncelli, IEEE TIP 13(4), 2004: window of 11 px with σ = 1.5 px, constants for 8 bit.
 _WINDOW, _SIGMA = (11, 11), 1.5
 _C1, _C2 = (0.01 * 255.0) ** 2, (0.03 * 255.0) ** 2
 
 
-def psnr_db(image: Image, truth: Image, known: Mask) -> float:
+def psnr_db(image: ByteArray, truth: ByteArray, known: BoolArray) -> float:
     """Peak signal-to-noise ratio in dB of sRGB code values (h, w, 3) over the known pixels (h, w); inf if equal."""
     error = image[known].astype(np.float64) - truth[known]
     mean = float(np.mean(error**2)) if error.size else math.nan
     return math.inf if mean == 0.0 else 10.0 * math.log10(255.0**2 / mean)
 
 
-def ssim(image: Image, truth: Image, known: Mask) -> float:
+def ssim(image: ByteArray, truth: ByteArray, known: BoolArray) -> float:
     """Mean structural similarity of the grey images over pixels whose whole window is known; NaN if there are none."""
     a, b = _grey(image), _grey(truth)
     mean_a, mean_b = _blur(a), _blur(b)
@@ -34,7 +33,7 @@ def ssim(image: Image, truth: Image, known: Mask) -> float:
     return _mean(likeness, _eroded(known, _WINDOW[0] // 2))
 
 
-def gradient_energy(image: Image, known: Mask) -> float:
+def gradient_energy(image: ByteArray, known: BoolArray) -> float:
     """Mean squared gradient of the grey image, (code values / px)², where both neighbours on each axis are known."""
     grey = _grey(image)
     energy = np.zeros_like(grey)
@@ -43,7 +42,7 @@ def gradient_energy(image: Image, known: Mask) -> float:
     return _mean(energy, _eroded(known, 1))
 
 
-def _grey(image: Image) -> npt.NDArray[np.float64]:
+def _grey(image: ByteArray) -> npt.NDArray[np.float64]:
     return np.asarray(image.astype(np.float64) @ (0.299, 0.587, 0.114))
 
 
@@ -51,12 +50,12 @@ def _blur(image: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     return np.asarray(cv2.GaussianBlur(image, _WINDOW, _SIGMA))
 
 
-def _eroded(known: Mask, reach: int) -> Mask:
+def _eroded(known: BoolArray, reach: int) -> BoolArray:
     """Pixels (h, w) whose square neighbourhood lies within the image and is known."""
     padded = cv2.copyMakeBorder(known.astype(np.uint8), *(reach,) * 4, cv2.BORDER_CONSTANT, value=0)
     kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     return np.asarray(cv2.erode(padded, kernel)[reach:-reach, reach:-reach] > 0)
 
 
-def _mean(values: npt.NDArray[np.float64], where: Mask) -> float:
+def _mean(values: npt.NDArray[np.float64], where: BoolArray) -> float:
     return float(values[where].mean()) if where.any() else math.nan

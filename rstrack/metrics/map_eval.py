@@ -14,18 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from rsgen.array_types import FloatArray
 from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
 from rsgen.files import read_bytes
 from rsgen.geometry import se3
-from rsgen.geometry.so3 import FloatArray
-from rsgen.sequence.format import poses_of_rows
 from rsgen.sequence.reader import Sequence, read_sequence
-
-IntArray = npt.NDArray[np.int64]
 
 # Triangles are cut until no edge is longer (m): then few of them can hold a point's nearest.
 _LONGEST_EDGE = 0.04
@@ -151,13 +147,11 @@ def seen_surface(sequence: Sequence) -> FloatArray:
     stream = sequence.streams["depth"]
     uv = stream.camera.pixel_grid()
     rays = np.nan_to_num(stream.camera.unproject(uv))
-    axis = 1 if stream.shutter.scan in ("top-bottom", "bottom-top") else 0
-    rows, pick = sequence.rows("depth"), (slice(None, None, _STRIDE), slice(None, None, _STRIDE))
+    pick = slice(None, None, _STRIDE), slice(None, None, _STRIDE)
     points = np.empty((0, 3))
     for k in np.unique(np.linspace(0, len(stream.paths) - 1, min(_FRAMES, len(stream.paths))).astype(int)):
         z = sequence.truth_depth(int(k))[pick]
-        T = poses_of_rows(rows[k])[np.rint(uv[..., axis]).astype(int)[pick]]
-        p = se3.transform(T, rays[pick] * z[..., None])[z > 0.0]
+        p = se3.transform(sequence.pixel_poses("depth", int(k), uv[pick]), rays[pick] * z[..., None])[z > 0.0]
         points = _thinned(np.concatenate([points, p]))
     return points
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import version
@@ -15,17 +14,16 @@ from typing import Any
 
 import numpy as np
 
+from rsgen.array_types import FloatArray
+from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
-from rsgen.geometry.so3 import FloatArray
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate
 from rstrack.data.prefetch import prefetched
 from rstrack.data.registered import RegisteredImage, Registrar, registered_image
 from rstrack.options import PEERS, Options
-
-Progress = Callable[[str, float, str], None]
 
 _KEYFRAME = "-keyframe"
 # Part of the pixels that must have found a partner, and frames in a row without, after which the reference is given up.
@@ -139,9 +137,7 @@ class PeerTracker:
         return self._o3d.core.Tensor(np.ascontiguousarray(array))
 
 
-def run_peer(
-    name: str, dataset: Dataset, frames: slice = slice(None), progress: Progress = lambda *_: None
-) -> Estimate:
+def run_peer(name: str, dataset: Dataset, frames: slice = slice(None), progress: Progress = no_progress) -> Estimate:
     """Track frames of a dataset with one of PEERS; its poses at the depth frames' stamps.
 
     Its input is registered by `rstrack.data.registered`. A pose is taken for that of the middle of the depth image's

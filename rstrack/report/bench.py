@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from rsgen.console.progress import Progress, no_progress
 from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
 from rstrack.bench.methods import paper
@@ -17,7 +18,6 @@ from rstrack.metrics.tracked import Tracked, load_run
 from rstrack.report.page import Block, Card, CardRow, Chooser, Note, Page, Plot, Section
 from rstrack.report.pictures import frame_panels, map_pictures, shutter_sliders
 from rstrack.report.run import number, plots
-from rstrack.tracking.run import Progress
 
 OURS = "rs-pg"
 _TITLES = {"ate_m": "position error (ATE)", "rpe_m_s": "drift in translation", "rpe_deg_s": "drift in rotation"}
@@ -35,7 +35,7 @@ _MAPS = (
 )
 
 
-def bench_page(folder: Path, progress: Progress = lambda *_: None) -> Page:
+def bench_page(folder: Path, progress: Progress = no_progress) -> Page:
     """Gather everything about a benchmark's folder; sequences that are gone are left out, with a warning.
 
     progress: called with a stage, the fraction done and a note. Raises UserError.

@@ -9,6 +9,7 @@ import dataclasses
 from importlib.metadata import version
 from pathlib import Path
 
+from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, write_error
 from rstrack.bench.methods.results import RESULTS
@@ -18,14 +19,13 @@ from rstrack.report.bench import bench_page
 from rstrack.report.page import Page, render
 from rstrack.report.run import run_page
 from rstrack.report.stress import stress_page
-from rstrack.tracking.run import Progress
 
 REPORT = "report.html"
 
 
 def write_report(
     folder: Path, sequence: Path | None = None, out: Path | None = None, camera_file: Path | None = None,
-    progress: Progress = lambda *_: None,
+    progress: Progress = no_progress,
 ) -> Path:  # fmt: skip
     """Write the page of a run folder, a TUM file with a sequence, or a folder of a benchmark or of a stress test.
 

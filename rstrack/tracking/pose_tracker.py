@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.linearise import Terms, seen_motions, weakest_motion
 from rstrack.alignment.optimizer import STOP_PX

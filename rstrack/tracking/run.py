@@ -11,7 +11,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -20,9 +20,10 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 
+from rsgen.array_types import FloatArray
+from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import write_error
-from rsgen.geometry.so3 import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate, write_estimate
@@ -37,8 +38,6 @@ if TYPE_CHECKING:
     from rstrack.images.device_frame import Timer
     from rstrack.tracking.frame_report import FrameReport
 
-Progress = Callable[[str, float, str], None]
-"""Called with a stage, the fraction done (0 to 1) and a note."""
 
 End = Literal["done", "interrupted", "broke down", "unreadable"]
 
@@ -143,7 +142,7 @@ def track(
     out: Path,
     frames: slice = slice(None),
     noise: Noise | None = None,
-    progress: Progress = lambda *_: None,
+    progress: Progress = no_progress,
 ) -> Result:
     """Track frames of a dataset and write the run folder `out`: `write_estimate` says what is in it.
 

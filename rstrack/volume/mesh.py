@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
+from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.errors import UserError
 from rsgen.files import atomic_write
-from rsgen.geometry.so3 import FloatArray
 from rstrack.volume.kernels import BLOCK
 from rstrack.volume.volume import Blocks
 
@@ -21,9 +21,6 @@ from rstrack.volume.volume import Blocks
 _CHUNK = 8
 # Vertices of neighbouring chunks that are so near (voxels) are one.
 _WELD = 1e-3
-
-IntArray = npt.NDArray[np.int64]
-ImageArray = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -80,7 +77,7 @@ def write_ply(path: Path, surface: Surface, comment: str = "", cloud: bool = Fal
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _chunks(blocks: Blocks) -> Iterator[tuple[IntArray, ImageArray, ImageArray, ImageArray | None]]:
+def _chunks(blocks: Blocks) -> Iterator[tuple[IntArray, Float32Array, Float32Array, Float32Array | None]]:
     """First lattice point (x y z), distance and weight (axes z y x) and colour (..., 4) of each chunk with blocks.
 
     A chunk ends with the lattice points with which the next begins.
@@ -94,7 +91,7 @@ def _chunks(blocks: Blocks) -> Iterator[tuple[IntArray, ImageArray, ImageArray, 
         yield first, _dense(blocks.tsdf, rows), _dense(blocks.weight, rows), color
 
 
-def _dense(values: ImageArray, rows: npt.NDArray[np.int32]) -> ImageArray:
+def _dense(values: Float32Array, rows: npt.NDArray[np.int32]) -> Float32Array:
     """Values (n, 8, 8, 8, ...) of the blocks `rows` (9, 9, 9) at a chunk's lattice points (65, 65, 65, ...)."""
     picked = values[np.maximum(rows, 0)]
     picked[rows < 0] = 0
@@ -103,7 +100,7 @@ def _dense(values: ImageArray, rows: npt.NDArray[np.int32]) -> ImageArray:
     return spread.reshape(*(n * BLOCK for n in rows.shape), *picked.shape[6:])[:edge, :edge, :edge]
 
 
-def _march(tsdf: ImageArray, known: npt.NDArray[np.bool_]) -> tuple[ImageArray, IntArray] | None:
+def _march(tsdf: Float32Array, known: npt.NDArray[np.bool_]) -> tuple[Float32Array, IntArray] | None:
     """Vertices (n, 3) z y x and triangles (m, 3) of a chunk; None where there are none."""
     from skimage.measure import marching_cubes
 
@@ -126,7 +123,7 @@ def _march(tsdf: ImageArray, known: npt.NDArray[np.bool_]) -> tuple[ImageArray, 
     return vertices, np.asarray(faces, np.int64)
 
 
-def _colors_at(color: ImageArray, zyx: ImageArray) -> npt.NDArray[np.uint8]:
+def _colors_at(color: Float32Array, zyx: Float32Array) -> npt.NDArray[np.uint8]:
     """Colours (n, 3), trilinear among those lattice points that have one; grey where none has."""
     weight = color[..., 3]
     planes = *(color[..., i] * weight for i in range(3)), weight

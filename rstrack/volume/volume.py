@@ -17,11 +17,11 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.array_types import FloatArray, IntArray
 from rsgen.device.arrays import Engine, Kernels
-from rsgen.device.projection import Lens
+from rsgen.device.lens import Lens
 from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rsgen.geometry.so3 import FloatArray
 from rstrack.volume.kernels import (
     BLOCK,
     POINTS,
@@ -40,8 +40,6 @@ _MOST_ENTRIES = 2**24
 # Blocks around what was seen that the directory covers when it grows.
 _MARGIN = 8
 _NEAR_M = 0.05
-
-IntArray = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)

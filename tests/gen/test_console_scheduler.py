@@ -22,7 +22,7 @@ from rsgen.config.config import Config, load_config
 from rsgen.console import scheduler
 from rsgen.console.scheduler import DaskWorkers, InProcess, open_workers
 from rsgen.errors import UserError
-from rsgen.produce.distribute import Block, Plan, engine_versions, render_block
+from rsgen.produce.distribute import RenderJob, SequenceRecipe, engine_versions, render_block
 from rsgen.produce.generate import input_hashes, load_motion, render_sequence, sequence_stamps
 from rsgen.sequence.reader import read_sequence
 
@@ -170,16 +170,18 @@ def allow_failures(count: int, dask_scheduler: Any) -> int:
 
 
 @pytest.fixture(scope="module")
-def plan(config: Config) -> Plan:
+def plan(config: Config) -> SequenceRecipe:
     motion = load_motion(config)
     stamps = sequence_stamps(config, motion)
-    return Plan(config, motion.spline, stamps["color"], stamps["depth"], engine_versions(config), input_hashes(config))
+    return SequenceRecipe(
+        config, motion.spline, stamps["color"], stamps["depth"], engine_versions(config), input_hashes(config)
+    )
 
 
-def test_a_worker_that_would_render_something_else_says_so(plan: Plan, tmp_path: Path) -> None:
-    def complaint(plan: Plan) -> str:
+def test_a_worker_that_would_render_something_else_says_so(plan: SequenceRecipe, tmp_path: Path) -> None:
+    def complaint(plan: SequenceRecipe) -> str:
         with pytest.raises(UserError) as caught:
-            render_block(Block(plan, ((0, "color"),)), silent)
+            render_block(RenderJob(plan, ((0, "color"),)), silent)
         return str(caught.value)
 
     assert "has mitsuba 3." in complaint(replace(plan, versions=dict(plan.versions) | {"mitsuba": "2.0"}))

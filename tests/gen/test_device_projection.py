@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from rstrack_util import ENGINE, SCANS, T_COLOR_DEPTH, hand_held
+from shutter_reference import rolling_shutter_jacobian
 from util import numeric_jacobian
 
+from rsgen.device.lens import Lens
 from rsgen.device.projection import (
     TO_BASE,
-    Lens,
     Projection,
     Sighting,
     cross,
@@ -172,7 +173,7 @@ def test_chain_is_the_total_derivative(name: str, scan: Scan) -> None:
     T_world_base = spline.pose(0.40)
     seen = look(spline, image, T_world_base, p)
     # All control points moved alike move the world the other way: x(exp(δ) T, p) = x(T, exp(−δ) p).
-    _, J = shutter.rolling_shutter_jacobian(spline, T_COLOR_DEPTH, camera, curtain, t, p)
+    _, J = rolling_shutter_jacobian(spline, T_COLOR_DEPTH, camera, curtain, t, p)
     by_world = -J.sum(axis=1)[..., :3]
     by_base = by_world @ T_world_base[:3, :3]
     a = rng.normal(size=(len(p), 2))

@@ -17,8 +17,10 @@ import synthetic
 import yaml
 from evo.tools import file_interface
 from scipy.spatial.transform import Rotation
+from shutter_reference import line_window
 
 from rsgen.config.config import Config
+from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
 from rsgen.export import folder
 from rsgen.export.euroc import export_euroc
@@ -113,7 +115,7 @@ def test_kalibrs_two_numbers_give_every_rows_time(scan: Scan) -> None:
     camera, shutter = Camera(64, 48, 50, 50, 31.5, 23.5), Shutter(0.028, 0.01, scan)
     clock = row_clock("color", camera, shutter)
     for v in (0, 1, 20, 47):
-        start, end = shutter.line_window(3.0, shutter.line_of_pixel([5, v], camera), camera)
+        start, end = line_window(shutter, 3.0, shutter.line_of_pixel([5, v], camera), camera)
         assert 3.0 + clock.first_s + v * clock.delay_s == pytest.approx((start + end) / 2, abs=1e-15)
     assert (clock.delay_s < 0) == (scan == "bottom-top")
 
@@ -234,7 +236,7 @@ def test_images_are_copied_where_links_cannot_be(
 
     monkeypatch.setattr(folder.os, "link", no_link)
     source = plain.streams["color"].paths[0]
-    place_images([source], [tmp_path / "a.png"], False, folder.no_progress)
+    place_images([source], [tmp_path / "a.png"], False, no_progress)
     assert (tmp_path / "a.png").read_bytes() == source.read_bytes()
 
 

@@ -471,7 +471,7 @@ def test_progress_grows_to_one(tmp_path: Path) -> None:
     scene = scene_of(tmp_path, FLOOR, POINT)
     seen: list[float] = []
     light = LIGHT.model_copy(update={"bounces": 3})
-    lighting.bake(scene, make_lattice(scene, 0.1), light, lambda fraction, what: seen.append(fraction))
+    lighting.bake(scene, make_lattice(scene, 0.1), light, lambda stage, fraction, note: seen.append(fraction))
     assert seen == sorted(seen) and seen[0] >= 0 and seen[-1] == 1.0
 
 

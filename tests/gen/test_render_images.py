@@ -28,6 +28,7 @@ from rendering import (
     room_meshes,
     room_xml,
 )
+from shutter_reference import line_window
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from rsgen.config.config import Config
@@ -264,7 +265,7 @@ def test_samples_fill_every_pixels_footprint_and_window_evenly(scene: Any, scan:
     still = constant_twist(np.zeros(6))
     renderer.render(still, STAMP, seed=3)
     grid = CAMERA.pixel_grid()
-    opened, _ = shutter.line_window(0.0, shutter.line_of_pixel(grid, CAMERA), CAMERA)
+    opened, _ = line_window(shutter, 0.0, shutter.line_of_pixel(grid, CAMERA), CAMERA)
     within = (probe.time.reshape(-1, spp) - opened.reshape(-1, 1)) / shutter.exposure_s
     ray = probe.direction / probe.direction[:, 2:]
     uv = ray[:, :2] * (CAMERA.fx, CAMERA.fy) + (CAMERA.cx, CAMERA.cy)

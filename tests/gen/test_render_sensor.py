@@ -24,6 +24,7 @@ from rendering import (
     pixel_rays,
     room_xml,
 )
+from shutter_reference import line_window
 
 from rsgen.errors import UserError
 from rsgen.geometry import se3
@@ -121,7 +122,7 @@ def test_positions_within_a_pixel_share_its_lines_window(scan: Any) -> None:
     for offset in (-0.499, 0.499):
         for begin in (0.0, shutter.exposure_s):
             _, _, time, _ = sensor_rays(sensor, grid + offset, begin)
-            opened, closed = shutter.line_window(0.0, shutter.line_of_pixel(grid, CAMERA), CAMERA)
+            opened, closed = line_window(shutter, 0.0, shutter.line_of_pixel(grid, CAMERA), CAMERA)
             np.testing.assert_allclose(time, (closed if begin else opened).ravel(), atol=1e-8)
 
 
@@ -149,7 +150,7 @@ def test_the_pose_tables_blend_is_exact_to_a_micrometre_under_fast_motion() -> N
     uv = CAMERA.pixel_grid().reshape(-1, 2)
     within = rng.uniform(0, shutter.exposure_s, len(uv))
     origin, direction, _, _ = sensor_rays(sensor, uv, within)
-    T = motion(shutter.line_window(STAMP, shutter.line_of_pixel(uv, CAMERA), CAMERA)[0] + within)
+    T = motion(line_window(shutter, STAMP, shutter.line_of_pixel(uv, CAMERA), CAMERA)[0] + within)
     d = np.einsum("nij,nj->ni", T[:, :3, :3], CAMERA.unproject(uv))
     np.testing.assert_allclose(origin, T[:, :3, 3], atol=1e-6)
     np.testing.assert_allclose(direction, d / np.linalg.norm(d, axis=-1, keepdims=True), atol=1e-6)

@@ -8,12 +8,13 @@ import cv2
 import numpy as np
 import pytest
 from scipy.optimize import brentq
+from shutter_reference import line_window, rolling_shutter_jacobian
 from util import numeric_jacobian, random_spline, random_twists
 
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
-from rsgen.geometry.shutter import Shutter, project_rolling, rolling_shutter_jacobian
+from rsgen.geometry.shutter import Shutter, project_rolling
 from rsgen.geometry.spline import Spline
 
 pytestmark = pytest.mark.filterwarnings("error")
@@ -247,7 +248,7 @@ def test_timing_by_hand(scan: str, count: int, uv: tuple[float, float], line: fl
     lines = np.array([0.0, count / 2.0])
     np.testing.assert_allclose(shutter.line_end_time(5.0, lines, PINHOLE), [5.0, 5.012], rtol=0, atol=1e-14)
     np.testing.assert_allclose(shutter.line_mid_time(5.0, lines, PINHOLE), [4.995, 5.007], rtol=0, atol=1e-14)
-    opened, closed = shutter.line_window(np.array([[5.0], [6.0]]), lines, PINHOLE)
+    opened, closed = line_window(shutter, np.array([[5.0], [6.0]]), lines, PINHOLE)
     np.testing.assert_allclose(opened, [[4.99, 5.002], [5.99, 6.002]], rtol=0, atol=1e-14)
     np.testing.assert_allclose(closed, [[5.0, 5.012], [6.0, 6.012]], rtol=0, atol=1e-14)
 

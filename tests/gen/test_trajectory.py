@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rsgen.errors import UserError
-from rsgen.sequence.trajectory import Trajectory, icl_start_from_pov_pose, read_trajectory
+from rsgen.sequence.trajectory import Trajectory, read_trajectory
 
 ICL = Path(__file__).resolve().parents[3] / "shared" / "data" / "icl_nuim_livingroom"
 needs_icl = pytest.mark.skipif(not ICL.is_dir(), reason="ICL-NUIM data (../shared/data/icl_nuim_livingroom) not here")
@@ -157,6 +157,12 @@ def test_icl_wants_frame_indices(tmp_path: Path) -> None:
         read_trajectory(write(tmp_path, TUM), format="icl")
 
 
+def icl_start_from_pov_pose(line: str) -> list[list[float]]:
+    """The 3x4 ``icl_start`` in a line of a POV-Ray pose list: ``frame r00 r01 r02 tx r10 ... tz`` (frame 1's line)."""
+    values = [float(field) for field in line.split()]
+    return [values[1:5], values[5:9], values[9:13]]
+
+
 @needs_icl
 @pytest.mark.parametrize("k", range(4))
 def test_published_icl_files_equal_the_poses_that_rendered_the_images(k: int) -> None:
@@ -235,5 +241,3 @@ def test_unknown_format_and_mismatched_arrays(tmp_path: Path) -> None:
         read_trajectory(write(tmp_path, TUM), format="kitti")  # type: ignore[arg-type]
     with pytest.raises(UserError, match="do not match"):
         Trajectory(np.arange(3.0), np.eye(4)[None])
-    with pytest.raises(UserError, match="13 numbers"):
-        icl_start_from_pov_pose("1 0 0 0")

@@ -25,10 +25,14 @@ from rendering import (
     room_meshes,
     room_xml,
 )
+from shutter_reference import line_window
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from rsgen.config.sections import ColorConfig
 from rsgen.config.truth import TruthConfig
+from rsgen.device.lens import Lens
+from rsgen.device.pose_table import PoseTable
+from rsgen.device.projection import MovingCamera
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
@@ -36,7 +40,6 @@ from rsgen.geometry.shutter import Shutter, project_rolling
 from rsgen.render.images import ColorRenderer, DepthRenderer
 from rsgen.render.scene import load_scene, ply_bytes
 from rsgen.sensors.response import to_srgb8
-from rsgen.truth.projection import project
 from rsgen.truth.renderer import TruthRenderer, global_instant
 
 STAMP, NEXT = 0.31, 0.31 + 1 / 30
@@ -218,7 +221,7 @@ def test_geometry_agrees_with_float64_and_an_independent_ray_caster(
     assert np.mean(np.abs(images["normals"] - n_cam).max(axis=-1)[same] < 1e-5) > 0.995
 
     # Equation (13), with the line's window from the shutter and the poses from the spline.
-    opened, closed = shutter.line_window(STAMP, shutter.line_of_pixel(grid, camera).ravel(), camera)
+    opened, closed = line_window(shutter, STAMP, shutter.line_of_pixel(grid, camera).ravel(), camera)
     x_begin, x_end = (camera.project(se3.transform(se3.inverse(motion(t)), p))[0] for t in (opened, closed))
     blur = np.linalg.norm(x_end - x_begin, axis=-1).reshape(shape)
     np.testing.assert_allclose(images["blur_length"][same], blur[same], atol=3e-4)
@@ -403,11 +406,13 @@ def test_a_surfaces_other_side_is_not_the_same_point(tmp_path: Path) -> None:
 def test_projection_is_the_cameras(camera: Camera) -> None:
     rng = np.random.default_rng(2)
     p = np.concatenate([rng.normal(size=(4000, 3)) * (1, 1, 0.7), [[0, 0, 1.0], [0, 0, 0], [1e-9, 0, 1]]])
-    uv, defined = project(camera, mi.Point3f(*(mi.Float(p[:, k]) for k in range(3))))
+    still = PoseTable.of(mi.Vector4f, camera, Shutter(), lambda t: np.eye(4), 0.0)
+    points = tuple(mi.Float(p[:, k]) for k in range(3))
+    uv, defined = MovingCamera(Lens(camera, Shutter()), still).project_at(mi.Float(0), points, mi.Float(1))
     expected, valid = camera.project(p.astype(np.float32))
     assert np.mean(np.array(defined) == valid) == 1
     close = valid & (np.abs(p[:, 2]) > 0.05)
-    np.testing.assert_allclose(np.array(uv).T[close], expected[close], rtol=3e-6, atol=2e-4)
+    np.testing.assert_allclose(np.array([np.array(c) for c in uv]).T[close], expected[close], rtol=3e-6, atol=2e-4)
     assert 500 < valid.sum() < 3500
 
 

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import synthetic
 import trimesh
 
+from rsgen.array_types import FloatArray
 from rsgen.device.backend import mitsuba
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
@@ -25,7 +25,6 @@ import drjit as dr  # noqa: E402
 
 __all__ = ["dr", "mi"]
 
-FloatArray = npt.NDArray[np.float64]
 Motion = Callable[[FloatArray], FloatArray]
 SCANS = ("top-bottom", "bottom-top", "left-right", "right-left")
 CAMERA = Camera(40, 30, 31.0, 30.0, 18.3, 15.2)

@@ -12,7 +12,7 @@ import numpy as np
 from util import random_spline, random_twists
 
 from rsgen.device.arrays import engine
-from rsgen.device.projection import Lens
+from rsgen.device.lens import Lens
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter

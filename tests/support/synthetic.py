@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
+from rsgen.array_types import FloatArray
 from rsgen.config.config import Config
 from rsgen.files import atomic_write
 from rsgen.geometry import se3
@@ -21,7 +22,6 @@ from rsgen.geometry.spline import Spline
 from rsgen.produce.writer import SequenceWriter
 from rsgen.sequence.format import stream_stamps
 
-FloatArray = npt.NDArray[np.float64]
 BOX = np.array([[-2.0, -1.2, -1.5], [2.2, 1.3, 2.5]])  # lower and upper corner, m
 BALL, BALL_RADIUS = np.array([0.35, 0.25, 1.5]), 0.35
 T_COLOR_DEPTH = se3.exp(np.array([-0.05, 0.004, 0.002, 0.01, -0.02, 0.015]))

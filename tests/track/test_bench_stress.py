@@ -24,6 +24,7 @@ from rsgen.motion.fit import fit_spline
 from rsgen.produce.writer import SequenceWriter
 from rsgen.sequence.format import stream_stamps
 from rsgen.sequence.trajectory import read_trajectory
+from rsgen.srgb import encode
 from rstrack.bench.stress import run as stress
 from rstrack.bench.stress.cases import Case, StressOptions, render_cases
 from rstrack.bench.stress.charts import gains_db
@@ -31,7 +32,6 @@ from rstrack.bench.stress.run import StressResult, run_stress
 from rstrack.bench.stress.tables import stress_text, write_stress
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import Estimate
-from rstrack.mapping.color_fusion import srgb_from_linear
 from rstrack.metrics.images import gradient_energy, psnr_db, ssim
 
 WIDTH, HEIGHT, FOCAL, FRAMES, SUBTIMES = 96, 72, 150.0, 18, 8
@@ -66,7 +66,7 @@ def look(spline: Spline, config: Config, times: np.ndarray) -> tuple[np.ndarray,
 
 
 def srgb(image: np.ndarray) -> np.ndarray:
-    return np.rint(255.0 * srgb_from_linear(image)).astype(np.uint8)
+    return np.rint(255.0 * encode(np.clip(image, 0.0, 1.0))).astype(np.uint8)
 
 
 def write_config(path: Path, **depth: Any) -> Path:

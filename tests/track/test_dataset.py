@@ -394,7 +394,7 @@ FAULTS: dict[str, tuple[Fault, str]] = {
     "missing image": (listing("depth.txt", f"0.1 {DEPTH_0}", "0.2 depth/x.png"), r"line 2: .*depth/x\.png is missing"),
     "absolute path": (listing("depth.txt", "0.1 /etc/hostname"), "line 1: path '/etc/hostname' leaves"),
     "parent path": (listing("depth.txt", "0.1 ../secret.png"), r"line 1: path '\.\./secret\.png' leaves"),
-    "link out": (outside, r"depth\.txt line 3: .*leaves the dataset"),
+    "link out": (outside, r"depth\.txt line 3: .*leaves the folder"),
     "nul in path": (listing("depth.txt", "0.1 depth/\0.png"), "line 1: .*not a usable path"),
     "truncated depth": (rewrite(DEPTH_0, lambda data: data[:-30]), rf"{DEPTH_0}: .*truncated"),
     "flipped bit": (rewrite(DEPTH_0, flip), rf"{DEPTH_0}: .*checksum"),
@@ -416,7 +416,7 @@ FAULTS: dict[str, tuple[Fault, str]] = {
     "bad distortion": (camera(model="radtan", distortion=[1.0]), "radtan takes 4 or 5"),
     "skewed extrinsics": (
         lambda root: write_camera(root, {"color": COLOR, "T_color_depth": (2 * np.eye(4)).tolist()}),
-        "T_color_depth is not a rigid transform",
+        "T_color_depth: not a rigid transform",
     ),
     "opencv, empty": (opencv(), "no camera matrix for color: add .*keys that are there: none"),
     "opencv, no readout": (opencv(K=K, foo=1.0), "no readout time for color: add 'readout_s.*are there: k, foo"),

@@ -11,7 +11,7 @@ from rstrack_util import (
     texture,
 )
 
-from rsgen.device.projection import Lens
+from rsgen.device.lens import Lens
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rstrack.images.line_poses import Exposure

@@ -9,10 +9,10 @@ import numpy.typing as npt
 import pytest
 import synthetic
 
+from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.geometry.so3 import FloatArray
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.options import Options
 from rstrack.tracking.spline_tracker import Tracker

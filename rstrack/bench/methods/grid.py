@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from rsgen.console.progress import Progress, no_progress
 from rsgen.console.scheduler import InProcess, Workers
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, read_text
@@ -27,12 +28,12 @@ from rstrack.data.estimate import TRAJECTORY, Estimate, plain, read_estimate, wr
 from rstrack.metrics.association import ASSOCIATE_WITHIN_S, truth_of
 from rstrack.metrics.evaluate import Metrics, evaluate
 from rstrack.options import METHODS
-from rstrack.tracking.run import Progress, track
+from rstrack.tracking.run import track
 
 CELL = "cell.json"
 
 
-def run_plan(plan: Plan, workers: Workers | None = None, progress: Progress = lambda *_: None) -> Results:
+def run_plan(plan: Plan, workers: Workers | None = None, progress: Progress = no_progress) -> Results:
     """Run the cells that are not there yet, in this process or by `workers`, and gather all of them.
 
     Ctrl-C ends it early: the results hold what is finished. Raises UserError if a folder cannot be written, or is not
@@ -63,7 +64,7 @@ def run_plan(plan: Plan, workers: Workers | None = None, progress: Progress = la
     return Results(plan.sequences, plan.methods, ordered, machine(), package_version(), interrupted)
 
 
-def run_cell(job: Job, progress: Progress = lambda *_: None) -> Cell:
+def run_cell(job: Job, progress: Progress = no_progress) -> Cell:
     """Track, evaluate, and write the cell's folder: a run as `rstrack track` writes it, and cell.json.
 
     A track that was lost is a cell as any other, and kept. Where something is missing or cannot be read, the cell says

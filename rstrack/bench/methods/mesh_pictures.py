@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, read_text, write_error
 from rstrack.bench.methods.grid import CELL
@@ -22,7 +23,6 @@ from rstrack.bench.methods.plan import SequenceInfo
 from rstrack.bench.methods.results import Cell, Results
 from rstrack.mapping.map import run_map
 from rstrack.options import MapOptions
-from rstrack.tracking.run import Progress
 
 SHOWN = ("rs-pg", "gs-pg", "baseline")
 """The methods whose maps are compared: ours, the same without its model of the shutter, and the usual way."""
@@ -54,7 +54,7 @@ def _say(text: str) -> None:
 
 
 def draw_meshes(
-    results: Results, out: Path, methods: Sequence[str] = SHOWN, progress: Progress = lambda *_: None,
+    results: Results, out: Path, methods: Sequence[str] = SHOWN, progress: Progress = no_progress,
     warn: Callable[[str], None] = _say,
 ) -> list[Path]:  # fmt: skip
     """Write cells/SEQUENCE/METHOD/mesh.ply and plots/meshes_SEQUENCE.jpg into `out`; returns the pictures.

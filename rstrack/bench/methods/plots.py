@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from rsgen.console.progress import Progress, no_progress
 from rstrack.bench.methods import paper
 from rstrack.bench.methods.plan import SequenceInfo
 from rstrack.bench.methods.results import QUANTITIES, Results
@@ -12,10 +13,9 @@ from rstrack.charts.runs import compared_errors, path_chart
 from rstrack.charts.to_file import write_charts
 from rstrack.data.dataset import open_dataset
 from rstrack.metrics.tracked import load_run
-from rstrack.tracking.run import Progress
 
 
-def draw_plots(results: Results, out: Path, progress: Progress = lambda *_: None) -> list[Path]:
+def draw_plots(results: Results, out: Path, progress: Progress = no_progress) -> list[Path]:
     """Write plots/ate.png and plots/SEQUENCE.png into `out`; returns what was written. Raises UserError."""
     count = 1 + len(results.sequences)
     written = [out / "plots" / "ate.png"]

@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
+from rsgen.console.progress import Progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_yaml, read_yaml
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.format import pose_rows
 from rstrack.options import Options
-from rstrack.tracking.run import Progress
 
 # Samples of the sped-up path per knot: the fit through them, in phase, gives the spline back.
 _SAMPLES_PER_KNOT = 8

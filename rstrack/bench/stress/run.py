@@ -19,6 +19,7 @@ import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 
+from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
@@ -28,7 +29,7 @@ from rstrack.data.estimate import INFO, Estimate, read_estimate
 from rstrack.mapping.fused_keyframes import FusedKeyframe, Sigma, depth_errors, fused_keyframes
 from rstrack.metrics.images import gradient_energy, psnr_db, ssim
 from rstrack.options import Options
-from rstrack.tracking.run import Progress, track
+from rstrack.tracking.run import track
 
 # Seconds within which a keyframe and the sharp truth are of the same instant.
 _SAME_INSTANT_S = 1e-4
@@ -121,7 +122,7 @@ _TABLES = ("color", "depth", "tracking")
 
 
 def run_stress(
-    config: Path, out: Path, options: StressOptions, progress: Progress = lambda *_: None, render: Render | None = None
+    config: Path, out: Path, options: StressOptions, progress: Progress = no_progress, render: Render | None = None
 ) -> StressResult:
     """Render, track, fuse and score all cases. Raises UserError: a config, a render or a folder that does not do.
 
