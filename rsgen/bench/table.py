@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 from rsgen.array_types import FloatArray
-from rsgen.check.light import table_text
+from rsgen.console.tables import Table, fixed
 
 BLUR_S = 0.020
 READOUT_S = 0.028
@@ -98,18 +97,19 @@ class BenchTimes:
 
     def text(self) -> str:
         """A table and the ratios below it."""
-        table = Table("mode", "what it is", "s a frame", "frames/s", "Msamples/s", "spp", "measured")
-        for m in self.modes:
-            speed = self._samples(m) / m.median / 1e6
-            table.add_row(
-                m.name, m.title, f"{m.median:.3f}", f"{1 / m.median:.3g}", f"{speed:.3g}", str(m.spp), m.measured
-            )
+        rows = tuple(
+            (m.name, m.title, fixed(m.median, 3), f"{1 / m.median:.3g}", f"{self._samples(m) / m.median / 1e6:.3g}",
+             str(m.spp), m.measured)
+            for m in self.modes
+        )  # fmt: skip
+        head = ("mode", "what it is", "s a frame", "frames/s", "Msamples/s", "spp", "measured")
+        table = Table(head, rows, words=(0, 1, 6)).text()
         lines = [f"{r.text}: {r.median:.2f}x the time, {_spread(r)}" for r in self.ratios()]
         lines += self._computed()
         lines += [f"{name}: {why}" for name, why in self.failed.items()]
         machine = ", ".join(f"{key} {value}" for key, value in self.machine.items())
         size = f"{self.width}x{self.height}, readout {1000 * READOUT_S:g} ms, exposure {1000 * BLUR_S:g} ms"
-        return table_text(table) + "\n".join([*lines, f"{size}; {machine}"])
+        return "\n".join([table, "", *lines, f"{size}; {machine}"])
 
     def _samples(self, mode: ModeTimes) -> int:
         return self.width * self.height * mode.spp

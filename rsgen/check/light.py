@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from rsgen import srgb
 from rsgen.array_types import FloatArray
 from rsgen.config.config import Config
 from rsgen.console.progress import Progress
+from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
 from rsgen.geometry.shutter import Shutter
 from rsgen.produce.frame_source import make_integrator
@@ -43,7 +42,7 @@ def check_light(
     reference = mi.load_dict({"type": "path", "max_depth": _REFERENCE_DEPTH})
     ours = ColorRenderer(scene, baked, camera, Shutter(), _BAKED_SPP)
     theirs = ColorRenderer(scene, reference, camera, Shutter(), _REFERENCE_PASS)
-    table = Table("view", "time, s", "PSNR, dB", "bias, %", f"at least {PSNR_FLOOR_DB:g}")
+    table: list[tuple[str, ...]] = []
     rows: list[list[FloatArray]] = []
     psnrs: list[float] = []
     passes = max(1, spp // _REFERENCE_PASS)
@@ -59,13 +58,13 @@ def check_light(
         psnr = float(-10 * np.log10(np.mean(difference**2)))
         psnrs.append(psnr)
         bias = 100 * (ours_linear.mean() / (sums / passes).mean() - 1)
-        table.add_row(
-            str(view), f"{stamp:.2f}", f"{psnr:.1f}", f"{bias:+.2f}", "yes" if psnr >= PSNR_FLOOR_DB else "no"
-        )
+        reached = "yes" if psnr >= PSNR_FLOOR_DB else "no"
+        table.append((str(view), fixed(stamp, 2), fixed(psnr, 1), fixed(bias, 2, sign="+"), reached))
         rows.append([ours_srgb, their_srgb, np.clip(0.5 + 8 * difference, 0, 1)])
     if picture is not None:
         save_grid(rows, ["baked", f"path traced, {passes * _REFERENCE_PASS} spp", "difference x 8"], picture)
-    return table_text(table), min(psnrs) >= PSNR_FLOOR_DB
+    head = ("view", "time, s", "PSNR, dB", "bias, %", f"at least {PSNR_FLOOR_DB:g}")
+    return Table(head, tuple(table)).text(), min(psnrs) >= PSNR_FLOOR_DB
 
 
 def lit_scene(config: Config, progress: Progress) -> tuple[Any, Any, Any]:
@@ -97,11 +96,3 @@ def spread_times(motion: Motion, count: int) -> FloatArray:
     """`count` instants spread over the recording, its very ends left out."""
     fraction = (np.arange(count) + 0.5) / count
     return motion.first_stamp + fraction * (motion.last_stamp - motion.first_stamp)
-
-
-def table_text(table: Table) -> str:
-    """The table as plain text."""
-    console = Console(width=120)
-    with console.capture() as capture:
-        console.print(table)
-    return capture.get()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,14 +10,11 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from rich.console import Console
-from rich.table import Table
 
+from rsgen.console.tables import Table, fixed
 from rsgen.motion.fit import FitResult, fit_spline
 from rsgen.motion.statistics import MotionStatistics, motion_statistics
 from rsgen.sequence.trajectory import Trajectory, TrajectoryFormat, read_trajectory
-
-_WIDTH = 96
 
 
 @dataclass(frozen=True)
@@ -64,35 +60,32 @@ class FitSummary:
         data = self.as_dict()
         residual, motion = data["residual"], self.statistics
         rate = (data["poses"] - 1) / (data["last_stamp_s"] - data["first_stamp_s"])
-        console = Console(file=io.StringIO(), width=_WIDTH, color_system=None, highlight=False, markup=False)
-        console.print(f"{data['file']}: {data['poses']} poses, {motion.duration_s:.2f} s, {rate:.1f} a second")
-        console.print(
+        residuals = tuple(
+            (
+                label,
+                *(fixed(residual[f"{kind}_{unit}"], digits) for kind in ("rms", "median", "max")),
+                str(residual[f"max_{unit}_pose"]),
+                fixed(residual[f"max_{unit}_stamp_s"], 3),
+            )
+            for label, unit, digits in (("position, mm", "mm", 3), ("rotation, degrees", "deg", 4))
+        )
+        speeds = (
+            ("translation, m/s", fixed(motion.mean_speed_m_s, 3), fixed(motion.max_speed_m_s, 3)),
+            ("rotation, degrees/s", fixed(motion.mean_rotation_deg_s, 2), fixed(motion.max_rotation_deg_s, 2)),
+            ("acceleration, m/s²", fixed(motion.mean_acceleration_m_s2, 2), fixed(motion.max_acceleration_m_s2, 2)),
+        )
+        lines = (
+            f"{data['file']}: {data['poses']} poses, {motion.duration_s:.2f} s, {rate:.1f} a second",
             f"cubic B-spline on SE(3): knots {data['knot_spacing_s']:g} s apart, {data['control_points']} control "
             f"points, {data['iterations']} iterations, {data['downweighted_poses']} poses downweighted",
-            soft_wrap=True,
+            "",
+            Table(("residuals", "RMS", "median", "max", "worst pose", "at s"), residuals).text(),
+            "",
+            Table(("motion of the spline", "mean", "max"), speeds).text(),
+            "",
+            f"length {motion.length_m:.3f} m",
         )
-        residuals = Table(title="residuals", title_justify="left")
-        for heading in ("", "RMS", "median", "max", "worst pose", "at s"):
-            residuals.add_column(heading, justify="left" if heading == "" else "right")
-        for label, unit, digits in (("position, mm", "mm", 3), ("rotation, degrees", "deg", 4)):
-            residuals.add_row(
-                label,
-                *(f"{residual[f'{kind}_{unit}']:.{digits}f}" for kind in ("rms", "median", "max")),
-                str(residual[f"max_{unit}_pose"]),
-                f"{residual[f'max_{unit}_stamp_s']:.3f}",
-            )
-        console.print(residuals)
-        table = Table(title="motion of the spline", title_justify="left")
-        for heading in ("", "mean", "max"):
-            table.add_column(heading, justify="left" if heading == "" else "right")
-        table.add_row("translation, m/s", f"{motion.mean_speed_m_s:.3f}", f"{motion.max_speed_m_s:.3f}")
-        table.add_row("rotation, degrees/s", f"{motion.mean_rotation_deg_s:.2f}", f"{motion.max_rotation_deg_s:.2f}")
-        acceleration = motion.mean_acceleration_m_s2, motion.max_acceleration_m_s2
-        table.add_row("acceleration, m/s²", *(f"{value:.2f}" for value in acceleration))
-        console.print(table)
-        console.print(f"length {motion.length_m:.3f} m")
-        assert isinstance(console.file, io.StringIO)
-        return "\n".join(line.rstrip() for line in console.file.getvalue().splitlines())
+        return "\n".join(lines)
 
 
 def summarise_fit(

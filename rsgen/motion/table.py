@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from rsgen.console.tables import Table
 from rsgen.motion.statistics import MotionStatistics
 
 TABLE_1: dict[str, tuple[float, float, float]] = {
@@ -22,17 +23,8 @@ _HEAD_PAPER = ("Table 1: m", "m/s", "deg/s")
 
 def stats_table(motions: Sequence[tuple[str, MotionStatistics]]) -> str:
     """Lines of aligned columns for named motions; the paper's six get its figures and our deviation in %."""
-    rows = [_row(name, stats) for name, stats in motions]
-    if any(name in TABLE_1 for name, _ in motions):
-        rows = [(*_HEAD, *_HEAD_PAPER), *rows]
-    else:
-        rows = [_HEAD, *(row[: len(_HEAD)] for row in rows)]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = []
-    for name, *figures in rows:
-        cells = (cell.rjust(width) for cell, width in zip(figures, widths[1:], strict=True))
-        lines.append("  ".join([name.ljust(widths[0]), *cells]).rstrip())
-    return "\n".join(lines)
+    head = _HEAD + (_HEAD_PAPER if any(name in TABLE_1 for name, _ in motions) else ())
+    return Table(head, tuple(_row(name, stats)[: len(head)] for name, stats in motions)).text()
 
 
 def _row(name: str, stats: MotionStatistics) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
+from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate, plain
@@ -40,9 +41,15 @@ class Start:
         """Whether any frame was lost."""
         return bool(self.lost or self.error)
 
+    @property
+    def fate(self) -> str:
+        """What became of it, in words; empty if nothing went wrong."""
+        lost = [f"lost: {_numbers(self.lost)}"] if self.lost else []
+        return "  ".join(lost + ([f"broke down: {self.error}"] if self.error else []))
+
 
 @dataclass(frozen=True)
-class Bootstraps:
+class BootstrapResult:
     """Runs of `frames` frames each, in order of their first frame."""
 
     name: str
@@ -63,10 +70,11 @@ class Bootstraps:
 
     def text(self) -> str:
         """A line for each run, worst last, and a summary."""
-        lines = [f"{'start':>6} {'ATE, mm':>9} {'max, mm':>9} {'keyframes':>10}"]
-        for s in sorted(self.starts, key=lambda s: (s.failed, s.ate_m or 0.0)):
-            values = " ".join("-".rjust(9) if v is None else f"{1e3 * v:>9.3f}" for v in (s.ate_m, s.worst_m))
-            lines.append(f"{s.frame:>6} {values} {s.keyframes:>10}{self._fate(s)}")
+        rows = tuple(
+            (str(s.frame), fixed(s.ate_m, 3, 1e3), fixed(s.worst_m, 3, 1e3), str(s.keyframes), s.fate)
+            for s in sorted(self.starts, key=lambda s: (s.failed, s.ate_m or 0.0))
+        )
+        lines = [Table(("start", "ATE, mm", "max, mm", "keyframes", ""), rows, words=(4,)).text()]
         ate = self._ate()
         lost = sum(s.failed for s in self.starts)
         lines += ["", f"{self.name}, {self.method}: {len(self.starts)} starts, {self.frames} frames each: {lost} lost"]
@@ -79,16 +87,11 @@ class Bootstraps:
     def _ate(self) -> FloatArray:
         return np.array([s.ate_m for s in self.starts if not s.failed and s.ate_m is not None])
 
-    @staticmethod
-    def _fate(start: Start) -> str:
-        lost = "" if not start.lost else f"  lost: {_numbers(start.lost)}"
-        return lost + (f"  broke down: {start.error}" if start.error else "")
-
 
 def bootstraps(
     dataset: Dataset, options: Options, starts: int = 50, frames: int = 20, seed: int = 0,
     progress: Progress = no_progress,
-) -> Bootstraps:  # fmt: skip
+) -> BootstrapResult:  # fmt: skip
     """Track `frames` frames from each of `starts` random frames (fewer if there are not so many), a new tracker each.
 
     Errors are those of positions after alignment over the run's own frames (`association.compare`). Raises
@@ -108,7 +111,7 @@ def bootstraps(
         runs.append(_run(dataset, truth, options, range(first, first + frames)))
         failed = sum(run.failed for run in runs)
         progress("starting", done / len(chosen), f"{failed} of {done} lost")
-    return Bootstraps(dataset.name, options.method, frames, tuple(runs))
+    return BootstrapResult(dataset.name, options.method, frames, tuple(runs))
 
 
 def generator(seed: int) -> np.random.Generator:

@@ -14,6 +14,7 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
+from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
@@ -72,7 +73,7 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class Convergence:
+class ConvergenceResult:
     """All trials. resampling_m: largest error of the spline that stands for the truth, at the middle of a readout."""
 
     name: str
@@ -112,27 +113,31 @@ class Convergence:
     def text(self) -> str:
         """A table, one line for each distance."""
         found = 100 * self.row(1.0)["converged"]
-        lines = [
+        rows = tuple(
+            (
+                f"{100 * row['moved_m']:g} cm, {row['moved_deg']:g} deg",
+                f"{100 * row['converged']:.0f} %",
+                f"{fixed(row['median_error_m'], 3, 1e3)} mm, {fixed(row['median_error_deg'], 4)} deg",
+                fixed(row["median_steps"], 0),
+                str(row["wrong_but_believed"]),
+            )
+            for row in self.rows()
+        )
+        head = ("moved by", "converged", "median error", "steps", "wrong, not noticed")
+        lines = (
             f"{self.name}, {self.method}: {found:.0f} % of {self.pairs} frames converge from "
             f"{100 * UNIT_M:g} cm and {UNIT_DEG:g} deg, to within {1e3 * _FOUND_M:g} mm and {_FOUND_DEG:g} deg",
             f"truth resampled at knots {1e3 * self.knot_spacing_s:g} ms apart: {1e3 * self.resampling_m:.3f} mm off at "
             "most",
             "",
-            f"{'moved by':>18} {'converged':>10} {'median error':>24} {'steps':>6} {'wrong, not noticed':>19}",
-        ]
-        for row in self.rows():
-            moved = f"{100 * row['moved_m']:g} cm, {row['moved_deg']:g} deg"
-            error = f"{1e3 * row['median_error_m']:.3f} mm, {row['median_error_deg']:.4f} deg"
-            lines.append(
-                f"{moved:>18} {100 * row['converged']:>8.0f} % {error:>24} {row['median_steps']:>6.0f} "
-                f"{row['wrong_but_believed']:>19}"
-            )
+            Table(head, rows, words=()).text(),
+        )
         return "\n".join(lines)
 
 
 def convergence(
     dataset: Dataset, options: Options, pairs: int = 50, seed: int = 0, progress: Progress = no_progress
-) -> Convergence:
+) -> ConvergenceResult:
     """Align single frames to keyframes one to ten frames older, from poses ever farther off.
 
     The keyframe is rectified with the true motion. The frame starts with its true motion (resampled at the tracker's
@@ -171,7 +176,7 @@ def convergence(
         found = sum(trial.converged for trial in trials if trial.factor == 1.0)
         progress("aligning", done / len(chosen), f"{found} of {done} converged")
     settings = options.method, len(chosen), options.knot_spacing_s
-    return Convergence(dataset.name, *settings, off_m, tuple(trials))
+    return ConvergenceResult(dataset.name, *settings, off_m, tuple(trials))
 
 
 def choose_pairs(dataset: Dataset, truth: Spline, options: Options, count: int, seed: int) -> list[Pair]:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from rsgen.console.progress import Progress, no_progress
+from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rstrack.data.dataset import Dataset
@@ -77,7 +78,7 @@ class MethodTimes:
 
 
 @dataclass(frozen=True)
-class SpeedTimes:
+class SpeedResult:
     """Times of some methods, peers last, on the same frames."""
 
     name: str
@@ -122,14 +123,11 @@ class SpeedTimes:
         names = sorted({part for m in self.methods for part in m.parts_ms}, key=lambda name: (name == "other", name))
         rows += [(f"  {name}", [m.parts_ms.get(name, 0.0) for m in self.methods]) for name in names]
         rows.append(("reading, decoding", [m.read_ms for m in self.methods]))
-        head = f"{self.name}: depth {width}x{height}, frames {first} to {last - 1}, {self.backend}"
-        left = max(30, *(len(label) + 1 for label, _ in rows))
-        widths = [max(11, len(m.method) + 2) for m in self.methods]
-        names_of_methods = "".join(f"{m.method:>{width}}" for m, width in zip(self.methods, widths, strict=True))
-        lines = [f"{head}, {self.cpu_count} CPUs", f"{'ms a frame':<{left}}{names_of_methods}"]
-        for label, values in rows:
-            cells = (f"{value:>{width}.2f}" for value, width in zip(values, widths, strict=True))
-            lines.append(f"{label:<{left}}" + "".join(cells))
+        texts = tuple((label, *(fixed(value, 2) for value in values)) for label, values in rows)
+        lines = [
+            f"{self.name}: depth {width}x{height}, frames {first} to {last - 1}, {self.backend}, {self.cpu_count} CPUs",
+            Table(("ms a frame", *(m.method for m in self.methods)), texts).text(),
+        ]
         lines += [f"note: {m.method} lost the track on {m.lost} of the frames" for m in self.methods if m.lost]
         return "\n".join([*lines, "Reading overlaps with tracking in 'rstrack track'; here it does not."])
 
@@ -140,7 +138,7 @@ def time_methods(
     frames: int,
     progress: Progress = no_progress,
     peers: Sequence[str] = (),
-) -> SpeedTimes:
+) -> SpeedResult:
     """Track the first `frames` frames with each of the options and peers; the first 20, at most half, do not count.
 
     Raises UserError: fewer than two frames, an image that cannot be read, a tracker that breaks down, a peer that is
@@ -159,7 +157,7 @@ def time_methods(
     methods = [_time(dataset, o, frames, warm_up, progress) for o in options]
     methods += [_time_peer(dataset, name, t, registrar, frames, warm_up, progress) for name, t in others.items()]
     cpu_count = os.cpu_count() or 1
-    return SpeedTimes(dataset.name, dataset.rig.depth_camera, (warm_up, frames), backend, cpu_count, tuple(methods))
+    return SpeedResult(dataset.name, dataset.rig.depth_camera, (warm_up, frames), backend, cpu_count, tuple(methods))
 
 
 def _time(dataset: Dataset, options: Options, frames: int, warm_up: int, progress: Progress) -> MethodTimes:

@@ -100,11 +100,11 @@ def stress(
     from rsgen.console.progress import ProgressDisplay
     from rstrack.bench.stress.cases import StressOptions
     from rstrack.bench.stress.run import run_stress
-    from rstrack.bench.stress.tables import stress_text, write_tables
+    from rstrack.bench.stress.tables import stress_text, write_stress
 
     with ProgressDisplay(quiet) as progress:
         result = run_stress(config, out, StressOptions(frames=frames, tracker=tracker), progress)
-    written = write_tables(result, out)
+    written = write_stress(result, out)
     print(stress_text(result))
     print(f"{out}: {len(written)} tables and pictures written")
     return 0

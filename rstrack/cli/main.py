@@ -146,7 +146,7 @@ def plot(
     out: Annotated[Path, "png, pdf or svg file to write", "FILE"],
 ) -> int:
     """Picture of a run: path, errors over time, inliers."""
-    from rstrack.metrics.plot import run_plot
+    from rstrack.charts.runs import run_plot
 
     run_plot(sequence, run, out, camera)
     print(f"{out}: written")

@@ -14,13 +14,22 @@ from typing import Any
 import numpy as np
 
 from rsgen.array_types import FloatArray, IntArray
+from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.format import associate
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.estimate import Estimate, plain, read_estimate
-from rstrack.metrics.association import ASSOCIATE_WITHIN_S, Truth, angles_deg, compare, nearest, truth_of
+from rstrack.metrics.association import (
+    ASSOCIATE_WITHIN_S,
+    Comparison,
+    Truth,
+    angles_deg,
+    compare,
+    nearest,
+    truth_of,
+)
 
 _RPE_DELTA_S = 1.0
 _PAIR_WITHIN_S = 0.1
@@ -66,23 +75,37 @@ class Metrics:
         data: dict[str, Any] = plain(dataclasses.asdict(self) | {"coverage": self.coverage})
         return data
 
-    def text(self) -> str:
-        """A small table with units: millimetres, degrees, and both per second."""
+    def table(self) -> Table:
+        """Errors in millimetres, degrees, and both per second."""
         m = self
-        tracked = f"{m.frames_tracked} of {m.frames} ({100 * m.coverage:.1f} %)"
-        lines = [f"{'frames tracked':<22} {tracked}", f"{'poses compared':<22} {m.poses_compared} of {m.poses}", ""]
-        lines.append(f"{'':<22} {'RMSE':>10} {'mean':>10} {'median':>10} {'std':>10} {'max':>10}")
         ate = (m.ate_rmse_m, m.ate_mean_m, m.ate_median_m, m.ate_std_m, m.ate_max_m)
-        table: list[tuple[str, list[str], str]] = [
-            ("ATE, mm", [_number(value, 1e3) for value in ate], ""),
-            ("drift, mm/s", [_number(m.rpe_trans_rmse_m_per_s, 1e3)], f"   over {m.rpe_pairs} pairs 1 s apart"),
-            ("drift, deg/s", [_number(m.rpe_rot_rmse_deg_per_s)], ""),
-            ("lines' position, mm", [_number(m.row_rmse_m, 1e3)], f"   over {m.rows} of {m.rows_total} lines"),
-            ("lines' rotation, deg", [_number(m.row_rot_rmse_deg)], ""),
+        pairs, lines = f"{m.rpe_pairs} pairs 1 s apart", f"{m.rows} of {m.rows_total} lines"
+        rows: list[tuple[str, tuple[float | None, ...], float, str]] = [
+            ("ATE, mm", ate, 1e3, f"{m.poses_compared} of {m.poses} poses"),
+            ("drift, mm/s", (m.rpe_trans_rmse_m_per_s,), 1e3, pairs),
+            ("drift, deg/s", (m.rpe_rot_rmse_deg_per_s,), 1.0, pairs),
+            ("lines' position, mm", (m.row_rmse_m,), 1e3, lines),
+            ("lines' rotation, deg", (m.row_rot_rmse_deg,), 1.0, lines),
         ]
-        lines += [f"{label:<22} {' '.join(f'{value:>10}' for value in values)}{end}" for label, values, end in table]
-        lines += [f"note: {note}" for note in m.notes]
-        return "\n".join(lines)
+        head = ("error", "RMSE", "mean", "median", "std", "max", "over")
+        texts = ((label, *(fixed(v, 3, scale) for v in values), *[""] * (5 - len(values)), over)
+                 for label, values, scale, over in rows)  # fmt: skip
+        return Table(head, tuple(texts), "Errors against the true trajectory, after rigid alignment", words=(0, 6))
+
+    def text(self) -> str:
+        """The table, what it is of, and what has to be said about it."""
+        tracked = f"{self.frames_tracked} of {self.frames} ({100 * self.coverage:.1f} %)"
+        notes = [f"note: {note}" for note in self.notes]
+        return "\n".join([f"frames tracked: {tracked}", "", self.table().text(), *notes])
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Relative pose errors over one second, from each of the times (k,) s on: m (k,) and degrees (k,)."""
+
+    stamps: FloatArray
+    translation_m: FloatArray
+    rotation_deg: FloatArray
 
 
 def evaluate(truth: Truth, estimate: Estimate, interpolate: bool = False) -> Metrics:
@@ -114,18 +137,8 @@ def evaluate(truth: Truth, estimate: Estimate, interpolate: bool = False) -> Met
         notes.append("positions lie on a line or in a point: what they leave open is aligned by the orientations")
     error = found.position_errors_m
 
-    is_compared = np.zeros(len(estimate.stamps), dtype=bool)
-    is_compared[found.index] = True
-    i, j = pairs_one_second_apart(estimate.stamps)
-    both = is_compared[i] & is_compared[j]
-    row_of = np.cumsum(is_compared) - 1
-    i, j = row_of[i[both]], row_of[j[both]]
-    rpe: tuple[float | None, float | None] = None, None
-    if i.size:
-        true_step = se3.inverse(found.T_world_true[i]) @ found.T_world_true[j]
-        est_step = se3.inverse(found.T_world_est[i]) @ found.T_world_est[j]
-        rpe = _pose_rms(true_step, est_step)
-    else:
+    step = drift(estimate, found)
+    if not len(step.stamps):
         notes.append("no drift: no two poses are one second apart")
 
     t = truth.shutter.line_mid_time(
@@ -145,9 +158,9 @@ def evaluate(truth: Truth, estimate: Estimate, interpolate: bool = False) -> Met
         ate_median_m=float(np.median(error)),
         ate_std_m=float(error.std()),
         ate_max_m=float(error.max()),
-        rpe_trans_rmse_m_per_s=rpe[0],
-        rpe_rot_rmse_deg_per_s=rpe[1],
-        rpe_pairs=len(i),
+        rpe_trans_rmse_m_per_s=_rms(step.translation_m) if len(step.stamps) else None,
+        rpe_rot_rmse_deg_per_s=_rms(step.rotation_deg) if len(step.stamps) else None,
+        rpe_pairs=len(step.stamps),
         row_rmse_m=rows[0],
         row_rot_rmse_deg=rows[1],
         rows=row_count,
@@ -171,6 +184,18 @@ def pairs_one_second_apart(stamps: FloatArray) -> tuple[IntArray, IntArray]:
     j = nearest(stamps, target)
     keep = (target <= stamps[-1] + _STAMP_ROUNDING_S) & (np.abs(stamps[j] - target) <= _PAIR_WITHIN_S)
     return np.flatnonzero(keep), j[keep]
+
+
+def drift(estimate: Estimate, found: Comparison) -> Drift:
+    """The relative pose errors whose RMS `evaluate` gives, with the time at which each second begins."""
+    row = np.full(len(estimate.stamps), -1)
+    row[found.index] = np.arange(len(found.index))
+    i, j = pairs_one_second_apart(estimate.stamps)
+    both = (row[i] >= 0) & (row[j] >= 0)
+    stamps, i, j = estimate.stamps[i[both]], row[i[both]], row[j[both]]
+    true_step = se3.inverse(found.T_world_true[i]) @ found.T_world_true[j]
+    est_step = se3.inverse(found.T_world_est[i]) @ found.T_world_est[j]
+    return Drift(stamps, *_pose_errors(true_step, est_step))
 
 
 def run_evaluate(seq_path: Path, estimate_path: Path, camera_file: Path | None = None) -> Metrics:
@@ -213,18 +238,14 @@ def _errors_by_line(
     t = t[(t >= motion.t_begin) & (t <= motion.t_end) & estimate.spline_covers(t)]
     if not t.size:
         return (None, None), 0
-    return _pose_rms(motion.pose(t), T_true_est @ estimate.spline.pose(t)), t.size
+    position, angle = _pose_errors(motion.pose(t), T_true_est @ estimate.spline.pose(t))
+    return (_rms(position), _rms(angle)), t.size
 
 
-def _pose_rms(T_a: FloatArray, T_b: FloatArray) -> tuple[float, float]:
-    """RMS of the translation, m, and the angle, degrees, of T_a⁻¹ T_b."""
-    error = se3.inverse(T_a) @ T_b
-    return _rms(np.linalg.norm(error[:, :3, 3], axis=1)), _rms(angles_deg(T_a, T_b))
+def _pose_errors(T_a: FloatArray, T_b: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Translations (n,), m, and angles (n,), degrees, of T_a⁻¹ T_b, both (n, 4, 4)."""
+    return np.linalg.norm((se3.inverse(T_a) @ T_b)[:, :3, 3], axis=1), angles_deg(T_a, T_b)
 
 
 def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
-
-
-def _number(value: float | None, scale: float = 1.0) -> str:
-    return "-" if value is None else f"{value * scale:.3f}"

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rsgen.array_types import FloatArray
+from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
 from rsgen.files import read_bytes
 from rsgen.geometry import se3
@@ -63,16 +64,15 @@ class MapErrors:
 
     def text(self) -> str:
         """A small table in millimetres."""
-        lines = [f"{'':<22} {'mean':>10} {'median':>10} {'std':>10} {'90 %':>10} {'points':>10}"]
-        for label, spread in (("accuracy, mm", self.accuracy), ("completeness, mm", self.completeness)):
-            if spread is not None:
-                values = (spread.mean_m, spread.median_m, spread.std_m, spread.p90_m)
-                lines.append(f"{label:<22} " + " ".join(f"{1e3 * v:>10.3f}" for v in values) + f" {spread.points:>10}")
-        if self.within_2cm is None:
-            lines.append("note: no completeness: what was seen is known of a scene.ply in its sequence's folder")
-        else:
-            lines.append(f"{100 * self.within_2cm:.1f} % of what was seen is within 20 mm of the mesh")
-        return "\n".join(lines)
+        rows = tuple(
+            (label, *(fixed(v, 3, 1e3) for v in (s.mean_m, s.median_m, s.std_m, s.p90_m)), str(s.points))
+            for label, s in (("accuracy, mm", self.accuracy), ("completeness, mm", self.completeness))
+            if s is not None
+        )
+        note = "note: no completeness: what was seen is known of a scene.ply in its sequence's folder"
+        if self.within_2cm is not None:
+            note = f"{100 * self.within_2cm:.1f} % of what was seen is within 20 mm of the mesh"
+        return Table(("", "mean", "median", "std", "90 %", "points"), rows).text() + f"\n{note}"
 
 
 class Triangles:

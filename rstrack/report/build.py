@@ -12,11 +12,11 @@ from pathlib import Path
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, write_error
+from rstrack.bench.methods.results import RESULTS
 from rstrack.bench.stress.tables import STRESS
 from rstrack.data.estimate import TRAJECTORY
 from rstrack.report.bench import bench_page
 from rstrack.report.page import Page, render
-from rstrack.report.results import RESULTS
 from rstrack.report.run import run_page
 from rstrack.report.stress import stress_page
 

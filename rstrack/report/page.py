@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any, Literal
 
+from rsgen.console.tables import Table
+from rstrack.charts.chart import Chart, PathChart
+from rstrack.charts.to_page import Figure, figure_of
 from rstrack.data.estimate import plain
-
-Figure = dict[str, Any]
-"""A plotly figure as plain data: {"data": [trace, ...], "layout": {...}}."""
 
 
 @dataclass(frozen=True)
@@ -34,38 +34,17 @@ class CardRow:
 
 
 @dataclass(frozen=True)
-class Cell:
-    """A cell of a table. note: small print below. is_best: of its row. is_worse: than the paper's."""
-
-    text: str
-    note: str = ""
-    is_best: bool = False
-    is_worse: bool = False
-
-
-@dataclass(frozen=True)
-class Table:
-    """head: the columns' headings, the first above the rows' names. rows: as long as the head."""
-
-    head: tuple[str, ...]
-    rows: tuple[tuple[Cell | str, ...], ...]
-    caption: str = ""
-    block: Literal["table"] = "table"
-
-
-@dataclass(frozen=True)
 class Plot:
-    """A plotly figure. One in 3D is drawn from above where the browser has no WebGL."""
+    """A chart of at most so many points a line. Paths are drawn from above where the browser has no WebGL."""
 
-    title: str
-    figure: Figure
-    note: str = ""
+    chart: Chart | PathChart
+    points: int = 1500
     block: Literal["plot"] = "plot"
 
     @property
     def is_3d(self) -> bool:
         """Whether it can be turned."""
-        return "scene" in self.figure["layout"]
+        return isinstance(self.chart, PathChart)
 
 
 @dataclass(frozen=True)
@@ -148,7 +127,7 @@ def render(page: Page) -> str:
     figures: list[Figure] = []
 
     def add_figure(plot: Plot) -> int:
-        figures.append(plot.figure)
+        figures.append(figure_of(plot.chart, plot.points))
         return len(figures) - 1
 
     here = files("rstrack.report")

@@ -13,7 +13,7 @@ from rsgen.files import read_bytes
 from rsgen.geometry.spline import Spline
 from rstrack.bench.methods.mesh_pictures import MeshPicture
 from rstrack.data.dataset import Dataset
-from rstrack.report.data import Tracked
+from rstrack.metrics.tracked import Tracked
 from rstrack.report.images import colored_depth, jpeg_uri, rectified
 from rstrack.report.page import Block, Note, Picture, Pictures, Slider
 

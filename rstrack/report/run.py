@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rsgen.errors import UserError
+from rstrack.charts.chart import Chart, PathChart
+from rstrack.charts.runs import error_charts, inlier_charts, path_chart, time_charts
 from rstrack.metrics.evaluate import Metrics, evaluate
-from rstrack.report.data import Tracked, drift, load_run, true_path
-from rstrack.report.figures import (
-    ESTIMATE_COLOR,
-    LOST_COLOR,
-    SECOND_COLOR,
-    TRUE_COLOR,
-    Curve,
-    Path3D,
-    over_time,
-    path_3d,
-)
-from rstrack.report.page import Block, Card, CardRow, Note, Page, Plot, Section, Table
+from rstrack.metrics.tracked import Tracked, load_run
+from rstrack.report.page import Card, CardRow, Note, Page, Plot, Section
 from rstrack.report.pictures import frame_panels, shutter_sliders
 
 
@@ -28,14 +21,14 @@ def run_page(run: Path, sequence: Path | None = None, camera_file: Path | None =
     """Gather everything about a run folder, or a TUM file with a sequence. Raises UserError."""
     tracked = load_run(run, sequence, camera_file)
     info = tracked.estimate.info
-    sections = [Section("path", "Path", (path_plot(tracked),))]
+    sections = [Section("path", "Path", (Plot(path_chart({"estimated": tracked})),))]
     metrics = None
     if tracked.found is not None and tracked.truth is not None:
         metrics = evaluate(tracked.truth, tracked.estimate)
-        sections.insert(0, Section("errors", "Errors", (metrics_table(metrics), *_notes(metrics))))
-        sections.append(Section("time", "Errors over time", error_plots(tracked)))
-    if tracked.frames:
-        sections.append(Section("tracker", "What the tracker said", _diagnostics(tracked)))
+        sections.insert(0, Section("errors", "Errors", (metrics.table(), *_notes(metrics))))
+        sections.append(Section("time", "Errors over time", plots(error_charts(tracked))))
+    if charts := (*inlier_charts(tracked), *time_charts(tracked)):
+        sections.append(Section("tracker", "What the tracker said", plots(charts)))
     warnings = list(tracked.notes)
     if tracked.dataset is not None:
         try:
@@ -56,55 +49,9 @@ def run_page(run: Path, sequence: Path | None = None, camera_file: Path | None =
     )
 
 
-def metrics_table(m: Metrics) -> Table:
-    """What `rstrack evaluate` prints."""
-    ate = (m.ate_rmse_m, m.ate_mean_m, m.ate_median_m, m.ate_std_m, m.ate_max_m)
-    rows = (
-        ("position (ATE), mm", *(number(value, 1e3) for value in ate), f"{m.poses_compared} of {m.poses} poses"),
-        ("drift, mm/s", number(m.rpe_trans_rmse_m_per_s, 1e3), *[""] * 4, f"{m.rpe_pairs} pairs 1 s apart"),
-        ("drift, °/s", number(m.rpe_rot_rmse_deg_per_s), *[""] * 4, f"{m.rpe_pairs} pairs 1 s apart"),
-        ("lines' position, mm", number(m.row_rmse_m, 1e3), *[""] * 4, f"{m.rows} of {m.rows_total} lines"),
-        ("lines' rotation, °", number(m.row_rot_rmse_deg), *[""] * 4, f"{m.rows} of {m.rows_total} lines"),
-    )
-    head = ("error after rigid alignment", "RMSE", "mean", "median", "std", "max", "over")
-    return Table(head, rows, "Errors against the true trajectory")
-
-
-def path_plot(tracked: Tracked) -> Plot:
-    """The path in 3D, coloured by its error where the truth is known."""
-    stamps, T_est = tracked.path
-    paths, note = [], "Drag to turn, scroll to zoom; the slider turns it too."
-    if tracked.found is not None and tracked.truth is not None:
-        paths.append(Path3D("true", TRUE_COLOR, *true_path(tracked.truth, stamps[0], stamps[-1])))
-        index = tracked.found.index
-        errors = tracked.found.position_errors_m * 1e3
-        paths.append(Path3D("estimated", ESTIMATE_COLOR, stamps[index], T_est[index], errors))
-        note += " The grey path is the true one; the colour of the estimated one is its distance from it."
-    else:
-        paths.append(Path3D("estimated", ESTIMATE_COLOR, stamps, T_est))
-    return Plot("Path of the depth camera", path_3d(paths), note)
-
-
-def error_plots(tracked: Tracked) -> tuple[Block, ...]:
-    """Errors of position and rotation, and drift over a second, as functions of time; none without a truth."""
-    found = tracked.found
-    if found is None:
-        return ()
-    stamps = tracked.estimate.stamps[found.index]
-    plots = [
-        _curve("Position error after alignment", "mm", stamps, found.position_errors_m * 1e3, ESTIMATE_COLOR),
-        _curve("Rotation error after alignment", "degrees", stamps, found.rotation_errors_deg, SECOND_COLOR),
-    ]
-    per_second = drift(tracked.estimate, found)
-    if len(per_second.stamps):
-        t, note = per_second.stamps, "At the time at which the second begins."
-        plots.append(
-            _curve("Drift in translation over one second", "mm/s", t, per_second.translation_mm, ESTIMATE_COLOR, note)
-        )
-        plots.append(
-            _curve("Drift in rotation over one second", "degrees/s", t, per_second.rotation_deg, SECOND_COLOR, note)
-        )
-    return tuple(plots)
+def plots(charts: Sequence[Chart | PathChart], points: int = 1500) -> tuple[Plot, ...]:
+    """A block for each chart."""
+    return tuple(Plot(chart, points) for chart in charts)
 
 
 def number(value: float | None, scale: float = 1.0) -> str:
@@ -161,45 +108,6 @@ def _notes(metrics: Metrics) -> tuple[Note, ...]:
     return tuple(Note(f"{note[0].upper()}{note[1:]}.") for note in metrics.notes)
 
 
-def _curve(title: str, unit: str, stamps: Any, values: Any, color: str, note: str = "") -> Plot:
-    rms = float(np.sqrt(np.mean(np.square(values))))
-    figure = over_time((Curve(title.lower(), color, stamps, values),), unit)
-    figure["layout"]["showlegend"] = False
-    line = {"color": TRUE_COLOR, "dash": "dash", "width": 1}
-    figure["layout"]["shapes"] = [
-        {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": rms, "y1": rms, "line": line}
-    ]
-    return Plot(f"{title}, {unit}", figure, f"Dashed: RMS {number(rms)}. {note}".strip())
-
-
-def _diagnostics(tracked: Tracked) -> tuple[Block, ...]:
-    frames = tracked.frames
-    stamps = np.array([float(frame["stamp"]) for frame in frames])
-    curves = []
-    for key, color, name in (("inliers_depth", ESTIMATE_COLOR, "depth"), ("inliers_color", SECOND_COLOR, "colour")):
-        values = 100.0 * np.array([_number(frame.get(key)) for frame in frames])
-        if np.isfinite(values).any():
-            curves.append(Curve(name, color, stamps, values))
-    ticks = [
-        Curve(name, color, stamps[[bool(frame.get(key)) for frame in frames]], np.empty(0))
-        for key, color, name in (("keyframe", TRUE_COLOR, "keyframe"), ("lost", LOST_COLOR, "lost"))
-    ]
-    blocks: list[Block] = []
-    if curves:
-        note = "Pixels that counted, as part of the run's largest number; ticks: keyframes, and frames that were lost."
-        blocks.append(Plot("Inliers", over_time(curves, "%", ticks=ticks), note))
-    ms = _of(tracked.estimate.info, "timings").get("frame_ms")
-    if isinstance(ms, list) and len(ms) == len(stamps):
-        times = np.array([_number(value) for value in ms])
-        # The first frames compile kernels, which would flatten all others.
-        top = 1.5 * float(np.nanpercentile(times, 99)) if np.isfinite(times).any() else 1.0
-        figure = over_time((Curve("time", ESTIMATE_COLOR, stamps, times),), "ms")
-        figure["layout"]["showlegend"] = False
-        figure["layout"]["yaxis"]["range"] = [0.0, top]
-        blocks.append(Plot("Time to track a frame, ms", figure, "The first frames compile kernels and may lie above."))
-    return tuple(blocks)
-
-
 def _facts(info: dict[str, Any]) -> tuple[tuple[str, str], ...]:
     """Settings, machine and versions as run.json has them."""
     dataset, noise = _of(info, "dataset"), _of(info, "noise")
@@ -223,7 +131,3 @@ def _listed(values: dict[str, Any]) -> str:
 def _of(info: dict[str, Any], key: str) -> dict[str, Any]:
     value = info.get(key)
     return value if isinstance(value, dict) else {}
-
-
-def _number(value: Any) -> float:
-    return float(value) if isinstance(value, int | float) else float("nan")

@@ -17,8 +17,11 @@ from rsgen.config.truth import TruthConfig
 from rsgen.geometry import se3
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
+from rstrack.bench.methods.plan import SequenceInfo
+from rstrack.bench.methods.results import Cell, Results
+from rstrack.bench.methods.tables import write_results
 from rstrack.bench.stress.run import ColorScore, DepthScore, Panels, StressResult, TrackScore
-from rstrack.bench.stress.tables import write_tables as write_stress
+from rstrack.bench.stress.tables import write_stress
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import write_estimate
 from rstrack.metrics.evaluate import run_evaluate
@@ -135,40 +138,20 @@ def shown(value: float | None, scale: float = 1.0) -> str:
     return f"{value * scale:.4g}"
 
 
-def make_bench(root: Path, sequence: Path, twin: Path) -> Path:
+def make_bench(root: Path, sequence: Path, twin: Path) -> Results:
     """A benchmark of two sequences and three methods, one of which has failed on one of them."""
-    methods, errors = ("baseline", "rs-pg", "open3d-icp"), (0.02, 0.001, 0.01)
-    cells, metrics = [], {}
-    for name, path in (("a", sequence), ("b", twin)):
+    methods, errors, cells = ("baseline", "rs-pg", "open3d-icp"), (0.05, 0.001, 0.01), []
+    infos = SequenceInfo("robot_t1", "hand-held", sequence, FRAMES), SequenceInfo("lr_kt2", "living room", twin, FRAMES)
+    for info in infos:
         for k, method in enumerate(methods):
-            folder = f"cells/{name}/{method}"
-            cell: dict[str, Any] = {"sequence": name, "method": method, "run": folder, "frames": 31, "lost": 0}
-            if (name, method) == ("b", "open3d-icp"):
-                cell |= {"ate_m": None, "rpe_m_s": None, "rpe_deg_s": None, "seconds": None, "error": "is not here"}
-            else:
-                m = run_evaluate(path, make_run(root / folder, path, seed=k, error_m=errors[k]))
-                metrics[name, method] = m
-                cell |= {"ate_m": m.ate_rmse_m, "rpe_m_s": m.rpe_trans_rmse_m_per_s, "seconds": 3.1}
-                cell |= {"rpe_deg_s": m.rpe_rot_rmse_deg_per_s, "lost": 4, "error": None}
-            cells.append(cell)
-    groups = {"a": "living room", "b": "hand-held"}
-    averages = [
-        {"group": groups[name], "method": method, "sequences": [name], "ate_m": m.ate_rmse_m, "rpe_m_s": 1.0,
-         "rpe_deg_s": 1.0, "better_pct": {"ate_m": None if method == "baseline" else 95.0}}
-        for (name, method), m in metrics.items()
-    ]  # fmt: skip
-    paper = [
-        {"sequence": name, "method": "rs-pg", "ate_m": ate, "rpe_m_s": 1.0, "rpe_deg_s": 2.0}
-        for name, ate in (("a", 1.0), ("b", 1e-6))
-    ]
-    places = (("a", sequence), ("b", twin))
-    listed = [{"name": name, "group": groups[name], "path": str(path), "frames": FRAMES} for name, path in places]
-    results = {
-        "machine": {"cpu": "imaginary"}, "version": "0", "sequences": listed, "methods": methods, "cells": cells,
-        "averages": averages, "paper": paper,
-    }  # fmt: skip
-    (root / "results.json").write_text(json.dumps(results))
-    return root
+            if (info.name, method) == ("lr_kt2", "open3d-icp"):
+                cells.append(Cell("k", info.name, method, None, FRAMES, FRAMES, None, "is not here"))
+                continue
+            run = make_run(root / "cells" / info.name / method, info.path, seed=k, error_m=errors[k])
+            cells.append(Cell("k", info.name, method, run_evaluate(info.path, run).as_dict(), FRAMES, 4, 3.1))
+    results = Results(infos, methods, tuple(cells), {"cpu": "imaginary"}, "0")
+    write_results(results, root)
+    return results
 
 
 def make_stress(root: Path, seed: int = 5) -> StressResult:

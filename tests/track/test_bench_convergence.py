@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.bench import convergence as conv
-from rstrack.bench.bootstrap import Bootstraps, Start, bootstraps
+from rstrack.bench.bootstrap import BootstrapResult, Start, bootstraps
 from rstrack.cli.main import main
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.rig import Frame
@@ -49,7 +49,7 @@ def truth_of(dataset: Dataset) -> Spline:
 
 
 @pytest.fixture(scope="module")
-def report(dataset: Dataset) -> conv.Convergence:
+def report(dataset: Dataset) -> conv.ConvergenceResult:
     return conv.convergence(dataset, OPTIONS, pairs=3, seed=2)
 
 
@@ -113,7 +113,7 @@ def test_pairs_are_random_repeatable_and_within_the_truth(dataset: Dataset) -> N
     assert any(a.keyframe != b.keyframe for a, b in zip(pairs, other, strict=True))
 
 
-def test_near_starts_converge_and_far_ones_do_not(report: conv.Convergence) -> None:
+def test_near_starts_converge_and_far_ones_do_not(report: conv.ConvergenceResult) -> None:
     rows = {row["moved_m"]: row for row in report.rows()}
     assert rows[0.02]["converged"] == 1.0 and rows[0.02]["median_error_m"] < 1e-3
     assert rows[0.02]["median_steps"] > rows[0.0]["median_steps"] > 0
@@ -254,7 +254,7 @@ def test_the_summary_leaves_lost_runs_out() -> None:
         return Start(k, lost, None if ate_mm is None else 1e-3 * ate_mm, None, 1, "")
 
     starts = start(7, 0.2), start(1, 6.0), start(3, 2.0), start(4, 900.0, 4, 5, 6, 9), start(5, None, 5)
-    report = Bootstraps("seq", "rs-pg", 20, starts)
+    report = BootstrapResult("seq", "rs-pg", 20, starts)
     data = report.as_dict()
     assert data["lost"] == 2 and data["median_ate_m"] == 2e-3 and data["worst_ate_m"] == 6e-3
     assert data["over_1_mm"] == 2 and data["over_5_mm"] == 1

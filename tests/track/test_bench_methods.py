@@ -28,10 +28,13 @@ from rsgen.geometry import se3
 from rsgen.sequence.format import pose_rows
 from rstrack.bench.methods import paper
 from rstrack.bench.methods.config import choose, load_bench_config
-from rstrack.bench.methods.grid import Cell, Results, read_cell, run_cell, run_plan
+from rstrack.bench.methods.grid import read_cell, run_cell, run_plan
 from rstrack.bench.methods.plan import Plan, SequenceInfo, make_plan
-from rstrack.bench.methods.plots import draw_ate_bars, draw_sequence
-from rstrack.bench.methods.tables import averages, notes, results_csv, results_markdown, results_text, write_results
+from rstrack.bench.methods.plots import ate_chart, draw_sequence
+from rstrack.bench.methods.results import Cell, Results, averages
+from rstrack.bench.methods.tables import notes, results_csv, results_markdown, results_text, write_results
+from rstrack.charts.to_file import write_charts
+from rstrack.charts.to_page import figure_of
 from rstrack.cli.bench_methods import bench
 from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.metrics.evaluate import run_evaluate
@@ -520,7 +523,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
 
 
 def test_bars(drawn: list[Figure]) -> None:
-    draw_ate_bars(made_up(), Path("x.png"))
+    write_charts([ate_chart(made_up())], Path("x.png"))
     (axis,) = drawn[0].axes
     heights = [[bar.get_height() for bar in bars] for bars in axis.containers]
     np.testing.assert_allclose(heights[0], [10, 20, 30, 1266.9])
@@ -529,6 +532,8 @@ def test_bars(drawn: list[Figure]) -> None:
     lines = [line for collection in axis.collections for line in collection.get_segments()]  # type: ignore[attr-defined]
     marks = [line[:, 1] for line in lines if len(line) and np.isfinite(line).all()]
     np.testing.assert_allclose(marks, [[12.9, 12.9], [9.2, 9.2]])
+    data = figure_of(ate_chart(made_up()), 9)["data"]
+    assert data[1]["y"] == [1.0, None, 4.0, 0.1234] and data[3]["y"] == [None, None, None, 12.9]
 
 
 def test_paths_and_errors(place: Path, drawn: list[Figure]) -> None:

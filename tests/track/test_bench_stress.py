@@ -27,8 +27,9 @@ from rsgen.sequence.trajectory import read_trajectory
 from rsgen.srgb import encode
 from rstrack.bench.stress import run as stress
 from rstrack.bench.stress.cases import Case, StressOptions, render_cases
+from rstrack.bench.stress.charts import gains_db
 from rstrack.bench.stress.run import StressResult, run_stress
-from rstrack.bench.stress.tables import gains_db, stress_text, write_tables
+from rstrack.bench.stress.tables import stress_text, write_stress
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import Estimate
 from rstrack.metrics.images import gradient_energy, psnr_db, ssim
@@ -181,7 +182,7 @@ def test_exposures_differ_in_blur_only(stressed: tuple[Path, StressResult]) -> N
 
 def test_a_report_can_be_read_again(stressed: tuple[Path, StressResult]) -> None:
     out, report = stressed
-    files = write_tables(report, out)
+    files = write_stress(report, out)
     assert all(path.stat().st_size > 0 for path in files) and len({*files}) == len(files) == 12
     read = json.loads((out / "stress.json").read_text())
     assert len(read["color"]) == len(report.color) and read["color"][0]["sigma_px"] is None

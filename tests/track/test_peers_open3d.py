@@ -24,7 +24,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.sequence.trajectory import Trajectory
-from rstrack.bench.speed import MethodTimes, SpeedTimes
+from rstrack.bench.speed import MethodTimes, SpeedResult
 from rstrack.cli.main import main
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.estimate import Estimate, read_estimate, write_estimate
@@ -322,14 +322,14 @@ def times(method: str, ms: tuple[float, ...]) -> MethodTimes:
 
 def test_the_speed_table_has_ratios_to_every_peer() -> None:
     methods = (times("rs-pg", (30.0, 31.0, 29.0)), times("open3d-hybrid-keyframe", (60.0, 59.0, 80.0)))
-    report = SpeedTimes("x", PLAIN, (20, 23), "llvm", 2, methods)
+    report = SpeedResult("x", PLAIN, (20, 23), "llvm", 2, methods)
     assert report.as_dict()["ratios"] == {"open3d-hybrid-keyframe": {"rs-pg": 0.5, "open3d-hybrid-keyframe": 1.0}}
     lines = report.text().splitlines()
     table = lines[1:-1]
     assert len({len(line) for line in table}) == 1
     ratio = next(line for line in table if line.startswith("times open3d-hybrid-keyframe"))
     assert ratio.split()[-2:] == ["0.50", "1.00"]
-    assert SpeedTimes("x", PLAIN, (20, 23), "llvm", 2, methods[:1]).as_dict()["ratios"] == {}
+    assert SpeedResult("x", PLAIN, (20, 23), "llvm", 2, methods[:1]).as_dict()["ratios"] == {}
 
 
 def test_a_peer_is_timed_on_the_same_frames(moving: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:

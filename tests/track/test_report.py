@@ -27,19 +27,22 @@ from report_util import (
 )
 
 from rsgen.console.command_line import Commands, run_program
+from rsgen.console.tables import fixed, significant
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
+from rstrack.bench.methods import paper
+from rstrack.bench.methods.results import QUANTITIES, read_results, results_dict
+from rstrack.bench.methods.tables import results_text
+from rstrack.charts.chart import CameraPath, PathChart, upright_axes
 from rstrack.cli.report import report as report_command
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import Estimate
 from rstrack.data.rig import Image, Rig
 from rstrack.metrics.association import compare, truth_of
-from rstrack.metrics.evaluate import Metrics, evaluate, run_evaluate
+from rstrack.metrics.evaluate import Metrics, drift, evaluate, run_evaluate
 from rstrack.report.build import write_report
-from rstrack.report.data import drift
-from rstrack.report.figures import Path3D, path_3d, upright_axes
 from rstrack.report.images import rectified
 from rstrack.report.page import Note, Page, Section, render
 
@@ -66,7 +69,9 @@ def report(run: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory: pytest.TempPathFactory, sequence: Path, twin: Path) -> Path:
-    return make_bench(tmp_path_factory.mktemp("bench"), sequence, twin)
+    root = tmp_path_factory.mktemp("bench")
+    make_bench(root, sequence, twin)
+    return root
 
 
 @pytest.fixture(scope="module")
@@ -79,14 +84,16 @@ def bench_report(bench: Path) -> Path:
 
 def test_the_tables_numbers_are_those_of_evaluate(report: Path, run: Path, twin: Path) -> None:
     m, page = run_evaluate(twin, run), parse(report)
-    ate = [shown(v, 1e3) for v in (m.ate_rmse_m, m.ate_mean_m, m.ate_median_m, m.ate_std_m, m.ate_max_m)]
-    assert page.row("position (ATE), mm")[1:6] == ate
-    assert page.row("drift, mm/s")[1] == shown(m.rpe_trans_rmse_m_per_s, 1e3)
-    assert page.row("drift, °/s")[1] == shown(m.rpe_rot_rmse_deg_per_s)
-    assert page.row("lines' position, mm")[1] == shown(m.row_rmse_m, 1e3)
-    assert page.row("lines' rotation, °")[1] == shown(m.row_rot_rmse_deg)
+    for row in m.table().rows:
+        assert page.row(str(row[0])) == [str(entry) for entry in row]
     top = page.text[: page.text.index("Errors against")]
-    for number in (f"{ate[0]} mm", f"{shown(m.rpe_rot_rmse_deg_per_s)} °/s", "27 of 31", "12.5 ms", "4 lost"):
+    for number in (
+        f"{shown(m.ate_rmse_m, 1e3)} mm",
+        f"{shown(m.rpe_rot_rmse_deg_per_s)} °/s",
+        "27 of 31",
+        "12.5 ms",
+        "4 lost",
+    ):
         assert number in top
 
 
@@ -98,7 +105,7 @@ def test_the_drift_that_is_drawn_is_the_one_of_evaluate(sequence: Path) -> None:
     estimate = Estimate(stamps, se3.orthonormalise(WORLD @ SPLINE.pose(stamps) @ se3.exp(xi)))
     found, metrics = drift(estimate, compare(truth, estimate)), evaluate(truth, estimate)
     assert len(found.stamps) == metrics.rpe_pairs > 5
-    assert np.sqrt(np.mean(found.translation_mm**2)) == pytest.approx(1e3 * (metrics.rpe_trans_rmse_m_per_s or 0))
+    assert np.sqrt(np.mean(found.translation_m**2)) == pytest.approx(metrics.rpe_trans_rmse_m_per_s)
     assert np.sqrt(np.mean(found.rotation_deg**2)) == pytest.approx(metrics.rpe_rot_rmse_deg_per_s)
     assert np.isin(found.stamps, stamps).all() and (found.stamps <= stamps[-1] - 0.9).all()
 
@@ -153,7 +160,7 @@ def test_the_plot_points_upwards_in_any_world_and_is_no_mirror_image(axis: int, 
     z = np.eye(3)[(axis + 1) % 3]
     T = np.eye(4)[None].copy()
     T[0, :3, :3] = np.stack([np.cross(y, z), y, z], axis=-1)
-    axes = np.stack([(-1.0 if sign else 1.0) * np.eye(3)[k] for k, sign in upright_axes(T)])
+    axes = np.stack([sign * np.eye(3)[k] for k, sign in upright_axes(T)])
     assert np.linalg.det(axes) == pytest.approx(1.0)
     np.testing.assert_array_equal(axes[2], -y)
 
@@ -163,9 +170,9 @@ def test_a_path_that_runs_away_does_not_shrink_the_others() -> None:
     T = SPLINE.pose(stamps)
     lost = T.copy()
     lost[-1, :3, 3] += 1e4
-    scene = path_3d([Path3D("true", "#000", stamps, T), Path3D("lost", "#000", stamps, lost)])["layout"]["scene"]
+    paths = (CameraPath("true", "#000", stamps, T, is_true=True), CameraPath("lost", "#000", stamps, lost))
     size = np.ptp(T[:, :3, 3], axis=0).max()
-    assert all(np.ptp(scene[f"{a}axis"]["range"]) < 3 * size for a in "xyz")
+    assert all(high - low < 3 * size for low, high in PathChart("Paths", paths).ranges)
 
 
 @pytest.mark.parametrize("scan", ["top-bottom", "left-right"])
@@ -233,10 +240,10 @@ def test_names_cannot_break_the_page() -> None:
 def test_a_sequence_that_has_moved_is_found_where_it_is_said_to_be(sequence: Path, tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", sequence, dataset={"name": "s", "path": str(tmp_path / "gone")})
     page = parse(write_report(run))
-    assert "--sequence" in page.text and "position (ATE), mm" not in page.text and not page.uris()
+    assert "--sequence" in page.text and "ATE, mm" not in page.text and not page.uris()
     assert [f for f in page.figures if "scene" in f["layout"]]
     out = write_report(run, sequence, tmp_path / "new" / "page.html")
-    assert out == tmp_path / "new" / "page.html" and "position (ATE), mm" in parse(out).text
+    assert out == tmp_path / "new" / "page.html" and "ATE, mm" in parse(out).text
 
 
 def test_other_trackers_files_have_a_report_too(run: Path, sequence: Path, tmp_path: Path) -> None:
@@ -244,7 +251,7 @@ def test_other_trackers_files_have_a_report_too(run: Path, sequence: Path, tmp_p
     out = write_report(tmp_path / "other.txt", sequence)
     assert out == tmp_path / "other.html"
     m: Metrics = run_evaluate(sequence, tmp_path / "other.txt")
-    assert parse(out).row("position (ATE), mm")[1] == shown(m.ate_rmse_m, 1e3)
+    assert parse(out).row("ATE, mm")[1] == fixed(m.ate_rmse_m, 3, 1e3)
 
 
 def test_an_early_end_is_said_at_the_top(sequence: Path, tmp_path: Path) -> None:
@@ -283,24 +290,32 @@ def test_the_command_writes_the_page_or_one_line_of_complaint(
 
 
 def test_the_benchmarks_tables(bench: Path, bench_report: Path) -> None:
-    page, results = parse(bench_report), json.loads((bench / "results.json").read_text())
-    ate = {(c["sequence"], c["method"]): c["ate_m"] for c in results["cells"]}
-    row = page.row("a")
-    assert row[1] == f"{shown(ate['a', 'baseline'], 1e3)} 4 lost"
-    assert row[2] == f"{shown(ate['a', 'rs-pg'], 1e3)} paper 1000, 4 lost"
-    worse = page.row("b")
-    assert worse[2] == f"{shown(ate['b', 'rs-pg'], 1e3)} ▲ paper 0.001, 4 lost" and worse[3] == "failed"
-    assert "▲" not in " ".join(row)
-    assert page.row("better than baseline by")[1:] == ["–", "95 %", "95 %"]
-    assert page.row("a, 31 frames")[1:] == ["100"] * 3 and page.row("b, 31 frames")[3] == "–"
+    page, results = parse(bench_report), read_results(bench / "results.json")
+    for name in ("robot_t1", "lr_kt2"):
+        paired = zip(results.methods, page.row(name)[1:], strict=True)
+        for method, text in paired:
+            ate, theirs = results.figure(name, method, QUANTITIES[0]), paper.FIGURES.get((name, method))
+            note = "" if theirs is None else f" {1e3 * theirs.ate_m:.1f}"
+            mark = "" if ate is None or theirs is None or ate < theirs.ate_m else " ▲"
+            assert text == ("failed" if ate is None else f"{significant(ate, 3, 1e3)}†{mark}{note}")
+    better = page.row("better by")
+    assert better[1] == "" and better[2].split()[1] == "%" and better[2].endswith("29 %") and better[3].endswith("%")
+    assert page.row("robot_t1, 31 frames")[1:] == ["100"] * 3 and page.row("lr_kt2, 31 frames")[3] == "-"
     top = page.text[: page.text.index("Small print")]
-    assert f"{shown(ate['a', 'rs-pg'], 1e3)} mm" in top and "paper: 1000 mm" in top and "imaginary" in page.text
+    ate = results.figure("robot_t1", "rs-pg", QUANTITIES[0])
+    assert f"{shown(ate, 1e3)} mm" in top and "paper: 9.2 mm" in top and "imaginary" in page.text
     bars = next(f for f in page.figures if f["data"][0]["type"] == "bar")
     ours = next(t for t in bars["data"] if t["name"] == "rs-pg")
-    assert ours["x"] == ["a", "b"]
-    assert ours["y"] == pytest.approx([1e3 * ate["a", "rs-pg"], 1e3 * ate["b", "rs-pg"]])
+    assert ours["x"] == ["robot_t1", "lr_kt2"]
+    figures = [results.figure(name, "rs-pg", QUANTITIES[0]) for name in ours["x"]]
+    assert ours["y"] == pytest.approx([1e3 * (figure or 0.0) for figure in figures], rel=1e-3)
     names = [[t["name"] for t in f["data"]] for f in page.figures if "scene" in f["layout"]]
     assert names == [["true", "baseline", "rs-pg", "open3d-icp"], ["true", "baseline", "rs-pg"]]
+
+
+def test_results_are_read_as_they_were_written(bench: Path) -> None:
+    read, stored = read_results(bench / "results.json"), json.loads((bench / "results.json").read_text())
+    assert results_dict(read) == stored and results_text(read) == (bench / "results.txt").read_text()[:-1]
 
 
 def test_a_benchmark_whose_sequences_are_gone_keeps_its_tables(bench: Path, tmp_path: Path) -> None:
@@ -309,4 +324,4 @@ def test_a_benchmark_whose_sequences_are_gone_keeps_its_tables(bench: Path, tmp_
         entry["path"] = str(tmp_path / "gone")
     (tmp_path / "results.json").write_text(json.dumps(results))
     page = parse(write_report(tmp_path))
-    assert "No plots and images of a" in page.text and page.row("a")[1].endswith("4 lost") and not page.uris()
+    assert "No plots and images of robot_t1" in page.text and "†" in page.row("robot_t1")[1] and not page.uris()

@@ -33,7 +33,9 @@ def report(tmp_path_factory: pytest.TempPathFactory, twin: Path) -> Path:
 @pytest.fixture(scope="module")
 def bench_report(tmp_path_factory: pytest.TempPathFactory, twin: Path) -> Path:
     plain = make_sequence(tmp_path_factory.mktemp("sequence") / "plain")
-    return write_report(make_bench(tmp_path_factory.mktemp("bench"), plain, twin))
+    root = tmp_path_factory.mktemp("bench")
+    make_bench(root, plain, twin)
+    return write_report(root)
 
 
 @pytest.fixture(scope="module")
@@ -167,7 +169,7 @@ def test_the_benchmark_fits_any_width_and_shows_one_sequence_at_a_time(
     assert ink == ("rgb(231, 234, 240)" if width == 400 else "rgb(29, 33, 41)")
     options = tab.locator("#sequences .option")
     assert [options.nth(k).is_visible() for k in range(2)] == [True, False]
-    tab.locator("#sequences select").select_option(label="b")
+    tab.locator("#sequences select").select_option(label="lr_kt2")
     tab.wait_for_function(DRAWN)
     assert [options.nth(k).is_visible() for k in range(2)] == [False, True]
     names = options.nth(1).locator(".plot.solid").evaluate("e => e.data.map(trace => trace.name)")

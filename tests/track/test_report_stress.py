@@ -81,12 +81,12 @@ def test_the_colour_tables_numbers_are_those_of_the_file(page: Parsed, stored: d
             assert len(rows) == len(LABELS)
             for row, (case, label) in zip(rows, LABELS.items(), strict=True):
                 values = [r[name] for r in stored["color"] if (r["case"], r["poses"]) == (case, poses)]
-                texts = ["–" if value is None else f"{value:.{digits}f}" for value in values]
+                texts = ["-" if value is None else f"{value:.{digits}f}" for value in values]
                 if name == "psnr_db":
                     label += " 4 keyframes"
                     texts[1:] = [f"{text} {v - values[0]:+.2f}" for text, v in zip(texts[1:], values[1:], strict=True)]
                 assert row == [label, *texts]
-    assert found[6][1][1:] == ["–"] * 3, "no score, no number"
+    assert found[6][1][1:] == ["-"] * 3, "no score, no number"
 
 
 def test_the_depth_and_tracking_tables_numbers_are_those_of_the_file(page: Parsed, stored: dict[str, Any]) -> None:
@@ -104,10 +104,10 @@ def test_the_depth_and_tracking_tables_numbers_are_those_of_the_file(page: Parse
         runs = {r["variant"]: r for r in stored["tracking"] if r["case"] == case}
         for text, variant in zip(row[1:], tracking[0][1:], strict=True):
             if variant not in runs:
-                assert text == "–"
+                assert text == "-"
                 continue
             r = runs[variant]
-            ate = "–" if r["ate_m"] is None else f"{1e3 * r['ate_m']:.2f}"
+            ate = "-" if r["ate_m"] is None else f"{1e3 * r['ate_m']:.2f}"
             drift = "" if r["drift_m_per_s"] is None else f" {1e3 * r['drift_m_per_s']:.2f} mm/s"
             assert text == f"{ate}{drift}" + (f" {r['lost']} lost" if r["lost"] else "")
 
@@ -147,7 +147,7 @@ def test_the_curves_are_the_gains_by_exposure_and_by_speed(page: Parsed, stored:
 
     for figure in page.figures:
         Figure(figure)  # raises ValueError for a wrong name or value
-    assert len(page.figures) == 3 + 3 + 1
+    assert len(page.figures) == 4 + 4 + 1
     psnr = {(r["case"], r["poses"], r["sigma_px"]): r["psnr_db"] for r in stored["color"]}
 
     def gains(poses: str, sigma: float, cases: tuple[str, ...]) -> Any:
@@ -155,7 +155,7 @@ def test_the_curves_are_the_gains_by_exposure_and_by_speed(page: Parsed, stored:
 
     slow, fast = ("exposure_0ms", "exposure_20ms", "exposure_30ms"), ("exposure_20ms", "exposure_20ms_speed_2x")
     for n, poses in enumerate(("true", "estimated")):
-        by_exposure, absolute, by_speed = page.figures[3 * n : 3 * n + 3]
+        by_exposure, absolute, _, by_speed = page.figures[4 * n : 4 * n + 4]
         for trace, sigma in zip(by_exposure["data"], (0.5, 1.0), strict=True):
             assert (trace["name"], trace["x"]) == (f"σ {sigma:g} px", [0.0, 20.0, 30.0])
             assert trace["y"] == gains(poses, sigma, slow)
@@ -232,7 +232,7 @@ def test_a_test_without_depth_or_other_speeds_has_a_page(copy: Path) -> None:
         data[name] = [r for r in data[name] if r["speed"] == 1.0 and r.get("poses") != "estimated"]
     (copy / "stress.json").write_text(json.dumps(data | {"depth": []}))
     page = parse(write_report(copy))
-    assert len(tables(page)) == 4 + 1 and len(page.figures) == 2 + 1
+    assert len(tables(page)) == 4 + 1 and len(page.figures) == 3 + 1
     assert "speed" not in page.text[: page.text.index("Tracking")]
 
 

@@ -11,7 +11,6 @@ import json
 import os
 import platform
 import time
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,8 @@ from rsgen.console.progress import Progress, no_progress
 from rsgen.console.scheduler import InProcess, Workers
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, read_text
-from rstrack.bench.methods.plan import Job, Plan, SequenceInfo, package_version
+from rstrack.bench.methods.plan import Job, Plan, package_version
+from rstrack.bench.methods.results import Cell, Results
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.estimate import TRAJECTORY, Estimate, plain, read_estimate, write_estimate
 from rstrack.metrics.association import ASSOCIATE_WITHIN_S, truth_of
@@ -31,59 +31,6 @@ from rstrack.options import METHODS
 from rstrack.tracking.run import track
 
 CELL = "cell.json"
-RPE_M, RPE_DEG = "rpe_trans_rmse_m_per_s", "rpe_rot_rmse_deg_per_s"
-
-# A track with poses for fewer of the frames says little of its error: it counts as lost.
-_LEAST_COVERAGE = 0.5
-
-
-@dataclass(frozen=True)
-class Cell:
-    """What a job came to.
-
-    metrics: `Metrics.as_dict()`, None if fewer than three frames have a pose. frames: asked for; lost: those of them
-    without a pose. seconds: wall clock of tracking with reading, None if not known. error: why it could not be run.
-    """
-
-    key: str
-    sequence: str
-    method: str
-    metrics: dict[str, Any] | None
-    frames: int
-    lost: int
-    seconds: float | None
-    error: str | None = None
-
-    @property
-    def counts(self) -> bool:
-        """Whether its figures mean something: at least half of the frames have a pose."""
-        return self.metrics is not None and self.lost <= (1.0 - _LEAST_COVERAGE) * self.frames
-
-    def figure(self, name: str) -> float | None:
-        """A figure of `metrics` by name; None where the track is lost or lacks it."""
-        value = self.metrics.get(name) if self.metrics is not None and self.counts else None
-        return None if value is None else float(value)
-
-
-@dataclass(frozen=True)
-class Results:
-    """What there is of a plan; interrupted: some cells are missing."""
-
-    sequences: tuple[SequenceInfo, ...]
-    methods: tuple[str, ...]
-    cells: tuple[Cell, ...]
-    machine: dict[str, Any]
-    version: str
-    interrupted: bool = False
-
-    def cell(self, sequence: str, method: str) -> Cell | None:
-        """The cell, None if it was not run."""
-        return next((c for c in self.cells if (c.sequence, c.method) == (sequence, method)), None)
-
-    @property
-    def groups(self) -> tuple[str, ...]:
-        """Names of the groups, in order."""
-        return tuple(dict.fromkeys(sequence.group for sequence in self.sequences))
 
 
 def run_plan(plan: Plan, workers: Workers | None = None, progress: Progress = no_progress) -> Results:

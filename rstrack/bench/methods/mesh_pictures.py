@@ -18,7 +18,9 @@ from typing import Any
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, read_text, write_error
-from rstrack.bench.methods.grid import CELL, Cell, Results, SequenceInfo
+from rstrack.bench.methods.grid import CELL
+from rstrack.bench.methods.plan import SequenceInfo
+from rstrack.bench.methods.results import Cell, Results
 from rstrack.mapping.map import run_map
 from rstrack.options import MapOptions
 

@@ -2,91 +2,28 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
-import math
 from collections import defaultdict
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from rsgen.console.tables import NOTHING, Entry, Table, best_marked, csv_text, fixed, significant
 from rsgen.files import atomic_write
 from rstrack.bench.methods import paper
-from rstrack.bench.methods.grid import Cell, Results
-from rstrack.data.estimate import plain
-from rstrack.options import METHODS
-
-BASELINE = "baseline"
-
-# Characters: all tables are aligned alike.
-_LABEL = 26
-
-
-@dataclass(frozen=True)
-class Quantity:
-    """A column of the results. name: in files, with its unit; metric: in `Metrics`; the rest is for reading."""
-
-    name: str
-    metric: str
-    title: str
-    unit: str
-    scale: float
-    paper_digits: int
-
-
-QUANTITIES = (
-    Quantity("ate_m", "ate_rmse_m", "ATE", "mm", 1e3, 1),
-    Quantity("rpe_m_s", "rpe_trans_rmse_m_per_s", "drift", "mm/s", 1e3, 1),
-    Quantity("rpe_deg_s", "rpe_rot_rmse_deg_per_s", "drift", "deg/s", 1.0, 3),
+from rstrack.bench.methods.results import (
+    BASELINE,
+    QUANTITIES,
+    RESULTS,
+    Cell,
+    Quantity,
+    Results,
+    averaged_sequences,
+    averages,
+    better_pct,
+    results_dict,
 )
-"""RMSE all of them; drift is the relative pose error over one second."""
-
-
-@dataclass(frozen=True)
-class Average:
-    """Of one method over the sequences of a group; None where it lacks one of them.
-
-    better_pct: how much smaller than the baseline's, in per cent; None without a baseline.
-    """
-
-    group: str
-    method: str
-    sequences: tuple[str, ...]
-    values: dict[str, float | None]
-    better_pct: dict[str, float | None]
-
-
-def averaged_sequences(results: Results, group: str) -> tuple[str, ...]:
-    """The sequences of a group on which every one of our methods kept the track: those that averages are over.
-
-    Other trackers are averaged over the same ones, or not at all, so that they cannot change ours.
-    """
-    ours = [method for method in results.methods if method in METHODS] or list(results.methods)
-    names = [sequence.name for sequence in results.sequences if sequence.group == group]
-    return tuple(name for name in names if all(_counts(results.cell(name, method)) for method in ours))
-
-
-def averages(results: Results) -> list[Average]:
-    """All groups' averages of all methods."""
-    found = []
-    for group in results.groups:
-        names = averaged_sequences(results, group)
-        values = {
-            method: {q.name: _mean([_figure(results, name, method, q) for name in names]) for q in QUANTITIES}
-            for method in results.methods
-        }
-        for method in results.methods:
-            base = values.get(BASELINE, {})
-            better = {q.name: better_pct(values[method][q.name], base.get(q.name)) for q in QUANTITIES}
-            found.append(Average(group, method, names, values[method], better))
-    return found
-
-
-def better_pct(value: float | None, baseline: float | None) -> float | None:
-    """How much smaller the value is, per cent of the baseline's; negative if it is larger."""
-    return None if value is None or not baseline else 100.0 * (1.0 - value / baseline)
 
 
 def write_results(results: Results, out: Path) -> str:
@@ -96,94 +33,64 @@ def write_results(results: Results, out: Path) -> str:
     atomic_write(out / "results.csv", results_csv(results).encode())
     atomic_write(out / "results.md", results_markdown(results).encode())
     atomic_write(out / "results.txt", (text + "\n").encode())
-    atomic_write(out / "results.json", (json.dumps(results_dict(results, out), indent=1) + "\n").encode())
+    atomic_write(out / RESULTS, (json.dumps(results_dict(results), indent=1) + "\n").encode())
     return text
-
-
-def results_dict(results: Results, out: Path) -> dict[str, Any]:
-    """For results.json: metres, m/s, deg/s; `run` is relative to `out`."""
-    names = [sequence.name for sequence in results.sequences]
-    data = {
-        "machine": results.machine,
-        "version": results.version,
-        "sequences": [
-            {"name": s.name, "group": s.group, "path": str(s.path), "frames": s.frames} for s in results.sequences
-        ],
-        "methods": list(results.methods),
-        "cells": [
-            {"sequence": c.sequence, "method": c.method, "run": f"cells/{c.sequence}/{c.method}"}
-            | {q.name: c.figure(q.metric) for q in QUANTITIES}
-            | {"frames": c.frames, "lost": c.lost, "seconds": c.seconds, "error": c.error}
-            for c in results.cells
-        ],
-        "averages": [
-            {"group": a.group, "method": a.method, "sequences": a.sequences, **a.values, "better_pct": a.better_pct}
-            for a in averages(results)
-        ],
-        "paper": [
-            {"sequence": name, "method": method} | {q.name: getattr(figures, q.name) for q in QUANTITIES}
-            for (name, method), figures in paper.FIGURES.items()
-            if name in names and method in results.methods
-        ],
-    }
-    plain_data: dict[str, Any] = plain(data)
-    return plain_data
 
 
 def results_csv(results: Results) -> str:
     """One line a cell, then one an average; better_*_pct: how much smaller than the baseline's, per cent."""
-    names = [q.name for q in QUANTITIES]
-    head = ["group", "sequence", "method", *names, *(f"better_{name}_pct" for name in names)]
-    head += ["frames", "lost", "seconds", "error", *(f"paper_{name}" for name in names)]
-    stream = io.StringIO()
-    write = csv.writer(stream, lineterminator="\n").writerow
-    write(head)
     groups = {sequence.name: sequence.group for sequence in results.sequences}
-    for cell in results.cells:
-        values = [cell.figure(q.metric) for q in QUANTITIES]
-        base = [_figure(results, cell.sequence, BASELINE, q) for q in QUANTITIES]
-        better = [better_pct(value, b) for value, b in zip(values, base, strict=True)]
-        figures = paper.FIGURES.get((cell.sequence, cell.method))
-        rest = [cell.frames, cell.lost, cell.seconds, cell.error]
-        write([groups[cell.sequence], cell.sequence, cell.method, *values, *better, *rest, *_of_paper(figures)])
+    records: list[dict[str, Any]] = []
+    for c in results.cells:
+        values = {q.name: c.figure(q.metric) for q in QUANTITIES}
+        base = {q.name: results.figure(c.sequence, BASELINE, q) for q in QUANTITIES}
+        records.append(
+            {"group": groups[c.sequence], "sequence": c.sequence, "method": c.method, **values}
+            | {f"better_{name}_pct": better_pct(value, base[name]) for name, value in values.items()}
+            | {"frames": c.frames, "lost": c.lost, "seconds": c.seconds, "error": c.error}
+            | _of_paper(paper.FIGURES.get((c.sequence, c.method)))
+        )
     for a in averages(results):
-        rest = ["", "", "", ""]
-        figures = paper.average(a.sequences, a.method)
-        write([a.group, "average", a.method, *a.values.values(), *a.better_pct.values(), *rest, *_of_paper(figures)])
-    return stream.getvalue()
+        records.append(
+            {"group": a.group, "sequence": "average", "method": a.method, **a.values}
+            | {f"better_{name}_pct": value for name, value in a.better_pct.items()}
+            | dict.fromkeys(("frames", "lost", "seconds", "error"))
+            | _of_paper(paper.average(a.sequences, a.method))
+        )
+    return csv_text(records)
 
 
 def results_text(results: Results) -> str:
     """Tables for the terminal: a table for each group and quantity, the paper's line under ours."""
-    blocks = []
-    for group in results.groups:
-        for quantity in QUANTITIES:
-            header, rows = _table(results, group, quantity)
-            lines = [[f"{group}, {quantity.title}, {quantity.unit}", *header]]
-            for row in rows:
-                lines.append([row.method, *row.ours])
-                if any(row.paper):
-                    lines.append([f"  paper: {paper.NAMES[row.method]}", *row.paper])
-            widths = [max(_LABEL, *(len(line[0]) for line in lines))]
-            widths += [max(9, *(len(line[k]) for line in lines)) + 1 for k in range(1, len(lines[0]))]
-            blocks.append("\n".join(_aligned(line, widths) for line in lines))
+    tables = [method_table(results, group, quantity) for group in results.groups for quantity in QUANTITIES]
+    blocks = [replace(table, head=(table.title, *table.head[1:])).text() for table in tables]
     return "\n\n".join([*blocks, "\n".join(notes(results))])
 
 
 def results_markdown(results: Results) -> str:
     """The same tables, ours (the paper's in brackets), the best of ours in bold."""
-    parts = []
-    for group in results.groups:
-        for quantity in QUANTITIES:
-            header, rows = _table(results, group, quantity, mark_best=lambda text: f"**{text}**")
-            lines = [["method", *header], ["---", *("---:" for _ in header)]]
-            for row in rows:
-                both = [f"{a} ({b})" if b else a for a, b in zip(row.ours, row.paper, strict=True)]
-                lines.append([f"`{row.method}`", *both])
-            table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-            parts.append(f"**{group[0].upper()}{group[1:]}: {quantity.title}, {quantity.unit}**\n\n{table}")
+    tables = [method_table(results, group, quantity) for group in results.groups for quantity in QUANTITIES]
+    parts = [f"**{table.title[0].upper()}{table.title[1:]}**\n\n{table.markdown()}" for table in tables]
     listed = "\n".join(f"- {note}" for note in notes(results))
     return "\n\n".join([*parts, listed]) + "\n"
+
+
+def method_table(results: Results, group: str, quantity: Quantity) -> Table:
+    """A row for each method, a column for each sequence of a group; notes: the paper's figures."""
+    columns = _columns(results, group, quantity)
+    rows: list[tuple[Entry, ...]] = []
+    for k, method in enumerate(results.methods):
+        entries = [column[k] for column in columns.values()]
+        with_paper = any(entry.note for entry in entries)
+        rows.append((Entry(method, note=f"paper: {paper.NAMES[method]}" if with_paper else ""), *entries))
+    return Table(("method", *columns), tuple(rows), _title(group, quantity))
+
+
+def sequence_table(results: Results, group: str, quantity: Quantity) -> Table:
+    """The same with a row for each sequence and a column for each method."""
+    columns = _columns(results, group, quantity)
+    rows: tuple[tuple[Entry | str, ...], ...] = tuple((name, *entries) for name, entries in columns.items())
+    return Table(("sequence", *results.methods), rows, _title(group, quantity))
 
 
 def notes(results: Results) -> list[str]:
@@ -205,7 +112,7 @@ def notes(results: Results) -> list[str]:
         lines.append("not run yet (-): the same command goes on where this one ended")
     for group in results.groups:
         names = averaged_sequences(results, group)
-        if len(names) < sum(sequence.group == group for sequence in results.sequences):
+        if len(names) < len(results.names(group)):
             over = f"only over {', '.join(names)}: the others lack" if names else "none: each sequence lacks"
             lines.append(f"average of {group}: {over} figures of one of our methods at least")
     if any((s.name, method) in paper.FIGURES for s in results.sequences for method in results.methods):
@@ -222,95 +129,61 @@ def notes(results: Results) -> list[str]:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Row:
-    """Of a table, one text a column; the paper's are empty where it has none."""
-
-    method: str
-    ours: list[str]
-    paper: list[str]
+def _title(group: str, quantity: Quantity) -> str:
+    return f"{group}, {quantity.title}, {quantity.unit}"
 
 
-def _table(
-    results: Results, group: str, quantity: Quantity, mark_best: Callable[[str], str] = str
-) -> tuple[list[str], list[_Row]]:
-    """Titles of the columns, and the rows, of one group and quantity."""
-    names = [sequence.name for sequence in results.sequences if sequence.group == group]
-    mean = {a.method: a for a in averages(results) if a.group == group}
-    over = averaged_sequences(results, group)
-    with_baseline = BASELINE in results.methods and len(results.methods) > 1
-    numbers = {
-        method: [*(_figure(results, name, method, quantity) for name in names), mean[method].values[quantity.name]]
-        for method in results.methods
-    }
-    best = [min((v for v in column if v is not None), default=None) for column in zip(*numbers.values(), strict=True)]
-    base = paper.average(over, BASELINE)
-    rows = []
-    for method in results.methods:
-        cells = [results.cell(name, method) for name in names]
-        words = [_word(cell, value, quantity) for cell, value in zip(cells, numbers[method], strict=False)]
-        words.append(_digits(numbers[method][-1], quantity))
-        for k, value in enumerate(numbers[method]):
-            if value is not None and value == best[k] and len(numbers) > 1:
-                words[k] = mark_best(words[k])
-        figures = [*(paper.FIGURES.get((name, method)) for name in names), paper.average(over, method)]
-        theirs = [_paper_digits(f, quantity) for f in figures]
-        if with_baseline:
-            is_baseline = method == BASELINE
-            words.append("" if is_baseline else _percent(mean[method].better_pct[quantity.name]))
-            known = not is_baseline and figures[-1] is not None and base is not None
-            theirs.append(
-                _percent(better_pct(getattr(figures[-1], quantity.name), getattr(base, quantity.name))) if known else ""
-            )
-        rows.append(_Row(method, words, theirs))
-    return [*names, "average", *(["better by"] if with_baseline else [])], rows
+def _columns(results: Results, group: str, quantity: Quantity) -> dict[str, list[Entry]]:
+    """By heading, sequences first, an entry for each method; its note is the paper's figure."""
+    columns = {}
+    for name in results.names(group):
+        cells = [results.cell(name, method) for method in results.methods]
+        values = [results.figure(name, method, quantity) for method in results.methods]
+        theirs = [paper.FIGURES.get((name, method)) for method in results.methods]
+        entries = _entries(quantity, values, theirs)
+        entries = [_marked(entry, cell) for entry, cell in zip(entries, cells, strict=True)]
+        columns[name] = best_marked(entries, values)
+    mean = [a for a in averages(results) if a.group == group]
+    values = [a.values[quantity.name] for a in mean]
+    theirs = [paper.average(a.sequences, a.method) for a in mean]
+    columns["average"] = best_marked(_entries(quantity, values, theirs), values)
+    if BASELINE in results.methods and len(results.methods) > 1:
+        base = paper.average(averaged_sequences(results, group), BASELINE)
+        columns["better by"] = [
+            Entry("")
+            if a.method == BASELINE
+            else Entry(_percent(a.better_pct[quantity.name]), note=_better_in_paper(figures, base, quantity))
+            for a, figures in zip(mean, theirs, strict=True)
+        ]
+    return columns
 
 
-def _word(cell: Cell | None, value: float | None, quantity: Quantity) -> str:
-    if cell is None:
-        return "-"
-    if not cell.counts:
-        return "lost" if cell.error is None else "failed"
-    return _digits(value, quantity) + ("†" if cell.lost else "")
+def _entries(quantity: Quantity, values: Sequence[float | None], theirs: Sequence[paper.Figures | None]) -> list[Entry]:
+    entries = []
+    for value, figures in zip(values, theirs, strict=True):
+        of_paper = None if figures is None else getattr(figures, quantity.name)
+        note = "" if figures is None else fixed(of_paper, quantity.paper_digits, quantity.scale)
+        is_worse = value is not None and of_paper is not None and value > of_paper
+        entries.append(Entry(significant(value, 3, quantity.scale), note=note, is_worse=is_worse))
+    return entries
 
 
-def _digits(value: float | None, quantity: Quantity) -> str:
-    """Three of them, without an exponent."""
-    if value is None:
-        return "-"
-    shown = quantity.scale * value
-    decimals = 2 - math.floor(math.log10(shown)) if shown > 0.0 else 0
-    return f"{shown:.{min(max(decimals, 0), 6)}f}"
+def _marked(entry: Entry, cell: Cell | None) -> Entry:
+    """With what became of the cell."""
+    if cell is not None and not cell.counts:
+        return replace(entry, text="lost" if cell.error is None else "failed")
+    return replace(entry, mark="†" if cell is not None and cell.lost else "")
 
 
-def _paper_digits(figures: paper.Figures | None, quantity: Quantity) -> str:
-    if figures is None:
+def _better_in_paper(figures: paper.Figures | None, base: paper.Figures | None, quantity: Quantity) -> str:
+    if figures is None or base is None:
         return ""
-    return f"{quantity.scale * getattr(figures, quantity.name):.{quantity.paper_digits}f}"
+    return _percent(better_pct(getattr(figures, quantity.name), getattr(base, quantity.name)))
 
 
 def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{value:.0f} %"
+    return NOTHING if value is None else f"{value:.0f} %"
 
 
-def _aligned(line: Sequence[str], widths: Sequence[int]) -> str:
-    cells = [text.rjust(width) for text, width in zip(line[1:], widths[1:], strict=True)]
-    return (line[0].ljust(widths[0]) + " " + " ".join(cells)).rstrip()
-
-
-def _counts(cell: Cell | None) -> bool:
-    return cell is not None and cell.counts
-
-
-def _figure(results: Results, sequence: str, method: str, quantity: Quantity) -> float | None:
-    cell = results.cell(sequence, method)
-    return None if cell is None else cell.figure(quantity.metric)
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    there = [value for value in values if value is not None]
-    return sum(there) / len(there) if there and len(there) == len(values) else None
-
-
-def _of_paper(figures: paper.Figures | None) -> list[float | None]:
-    return [None if figures is None else getattr(figures, q.name) for q in QUANTITIES]
+def _of_paper(figures: paper.Figures | None) -> dict[str, Any]:
+    return {f"paper_{q.name}": None if figures is None else getattr(figures, q.name) for q in QUANTITIES}

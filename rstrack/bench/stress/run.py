@@ -1,6 +1,6 @@
 """The blur stress test: one motion at several exposures and speeds; what blur-aware weights are worth on each.
 
-report = run_stress(Path("configs/stress.yaml"), Path("runs/stress"), StressOptions())
+result = run_stress(Path("configs/stress.yaml"), Path("runs/stress"), StressOptions())
 
 Sequences are rendered by `rsgen render` into OUT/sequences/ and tracked into OUT/runs/; what is there is not made
 again.
@@ -13,9 +13,11 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import BeforeValidator, ConfigDict, Field
+from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
@@ -36,7 +38,15 @@ _TRUTH = "global_middle"
 _SIGMA_PX = 1.0
 
 
-@dataclass(frozen=True)
+STORED = ConfigDict(extra="forbid", strict=True)
+"""Scores are checked when they are read again; see `rstrack.bench.stress.tables`."""
+Measure = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+# What JSON cannot hold (NaN, infinity) was written as null.
+_Score = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
+_Poses = Literal["true", "estimated"]
+
+
+@pydantic_dataclass(frozen=True, config=STORED)
 class ColorScore:
     """Means over a case's keyframes, poses 'true' or 'estimated', for one σ (None: constant weights).
 
@@ -44,39 +54,39 @@ class ColorScore:
     """
 
     case: str
-    speed: float
-    exposure_s: float
-    poses: str
-    sigma_px: Sigma
-    psnr_db: float
-    psnr_db_least: float
-    ssim: float
-    gradient: float
-    keyframes: int
+    speed: Measure
+    exposure_s: Measure
+    poses: _Poses
+    sigma_px: Measure | None
+    psnr_db: _Score
+    psnr_db_least: _Score
+    ssim: _Score
+    gradient: _Score
+    keyframes: int = Field(ge=1)
 
 
-@dataclass(frozen=True)
+@pydantic_dataclass(frozen=True, config=STORED)
 class DepthScore:
     """RMSE in m over a case's keyframes: one frame's depth, and the fused keyframes'."""
 
     case: str
-    poses: str
-    single_m: float
-    fused_m: float
-    pixels: int
+    poses: _Poses
+    single_m: _Score
+    fused_m: _Score
+    pixels: int = Field(ge=0)
 
 
-@dataclass(frozen=True)
+@pydantic_dataclass(frozen=True, config=STORED)
 class TrackScore:
     """Tracking errors of a case. variant: which photometric term."""
 
     case: str
-    speed: float
-    exposure_s: float
+    speed: Measure
+    exposure_s: Measure
     variant: str
-    ate_m: float | None
-    drift_m_per_s: float | None
-    lost: int
+    ate_m: Measure | None
+    drift_m_per_s: Measure | None
+    lost: int = Field(ge=0)
 
 
 @dataclass(frozen=True)
@@ -198,10 +208,10 @@ def _tracked(dataset: Dataset, options: Options, folder: Path) -> Estimate | Non
     return result.estimate if len(result.estimate.stamps) > 2 else None
 
 
-def _splines(dataset: Dataset, estimate: Estimate | None) -> list[tuple[str, Spline, Callable[[float], bool]]]:
+def _splines(dataset: Dataset, estimate: Estimate | None) -> list[tuple[_Poses, Spline, Callable[[float], bool]]]:
     assert dataset.truth is not None
     spline = dataset.truth
-    known: list[tuple[str, Spline, Callable[[float], bool]]] = [
+    known: list[tuple[_Poses, Spline, Callable[[float], bool]]] = [
         ("true", spline, lambda t: spline.t_begin <= t <= spline.t_end)
     ]
     if estimate is not None and estimate.spline is not None:
@@ -227,7 +237,7 @@ def _sharp_view(truth: Dataset, done: FusedKeyframe) -> Any:
     return truth.sequence.truth(_TRUTH, k)
 
 
-def _color_scores(case: Case, poses: str, keyframes: Sequence[FusedKeyframe], truth: Dataset) -> list[ColorScore]:
+def _color_scores(case: Case, poses: _Poses, keyframes: Sequence[FusedKeyframe], truth: Dataset) -> list[ColorScore]:
     sums: dict[Sigma, list[tuple[float, float, float]]] = {}
     for done in keyframes:
         sharp = _sharp_view(truth, done)
@@ -250,7 +260,7 @@ def _color_scores(case: Case, poses: str, keyframes: Sequence[FusedKeyframe], tr
 
 
 def _depth_score(
-    case: Case, poses: str, keyframes: Sequence[FusedKeyframe], dataset: Dataset, options: Options
+    case: Case, poses: _Poses, keyframes: Sequence[FusedKeyframe], dataset: Dataset, options: Options
 ) -> list[DepthScore]:
     """Over keyframes of more than one frame: there is nothing fused in the others."""
     errors = [depth_errors(dataset, done, options) for done in keyframes if done.frames > 1]

@@ -1,62 +1,56 @@
 """What the blur stress test found, as text, CSV, JSON, curves, and the four panels of the paper's Figure 2.
 
-write_tables(report, Path("runs/stress"))
-report = read_stress(Path("runs/stress"))
+write_stress(result, Path("runs/stress"))
+result = read_stress(Path("runs/stress"))
 """
 
 from __future__ import annotations
 
-import csv
-import io
 import json
-import math
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
+from rsgen.console.tables import Table, csv_text, fixed
 from rsgen.errors import UserError, first_problem
 from rsgen.files import atomic_write, encode_png, read_png, read_text
-from rstrack.bench.stress.run import ColorScore, DepthScore, Panels, StressResult, TrackScore
+from rstrack.bench.stress.charts import color_charts, gain_db, tracking_chart, weights_name
+from rstrack.bench.stress.run import STORED, ColorScore, DepthScore, Measure, Panels, StressResult, TrackScore
+from rstrack.charts.to_file import write_charts
 from rstrack.data.estimate import plain
 
 STRESS = "stress.json"
 
 # Names of the files in panels/, in the order of the paper's Figure 2.
 _PANELS = ("registered", "weights", "constant", "blur_aware", "sharp_view")
-_COLORS = ("#2a6fbb", "#d9822b", "#3a8f4d", "#8e44ad", "#c0392b")
 
 
-def write_tables(report: StressResult, out: Path) -> list[Path]:
+def write_stress(result: StressResult, out: Path) -> list[Path]:
     """Write stress.txt, stress.json, stress_color.csv, _depth.csv, _tracking.csv, stress.png, panels.png and the
     panels themselves in panels/; returns the files. Raises UserError if that cannot be done."""
-    data = plain(report.as_dict())
-    data["panels"] = None if report.panels is None else _about(report.panels)
+    data = plain(result.as_dict())
+    data["panels"] = None if result.panels is None else _about(result.panels)
     files = {
-        "stress.txt": stress_text(report) + "\n",
+        "stress.txt": stress_text(result) + "\n",
         STRESS: json.dumps(data, indent=1, allow_nan=False) + "\n",
-        **{f"stress_{name}.csv": _csv(data[name]) for name in ("color", "depth", "tracking")},
+        **{f"stress_{name}.csv": csv_text(data[name]) for name in ("color", "depth", "tracking")},
     }
     for name, text in files.items():
         atomic_write(out / name, text.encode())
     written = [out / name for name in files]
-    written.append(_plot(report, out / "stress.png"))
-    return written + ([] if report.panels is None else _write_panels(report.panels, out))
+    title = f"{result.config}: fused colour along the true path, and tracking"
+    write_charts([*color_charts(result, "true"), tracking_chart(result)], out / "stress.png", title)
+    written.append(out / "stress.png")
+    return written + ([] if result.panels is None else _write_panels(result.panels, out))
 
 
 def read_stress(out: Path) -> StressResult:
-    """What `write_tables` has written into `out`, without the panels. Raises UserError naming the first wrong field."""
+    """What `write_stress` has written into `out`, without the panels. Raises UserError naming the first wrong field."""
     stored = _read(Path(out) / STRESS)
-    return StressResult(
-        stored.config,
-        tuple(ColorScore(**row.model_dump()) for row in stored.color),
-        tuple(DepthScore(**row.model_dump()) for row in stored.depth),
-        tuple(TrackScore(**row.model_dump()) for row in stored.tracking),
-        None,
-    )
+    return StressResult(stored.config, stored.color, stored.depth, stored.tracking, None)
 
 
 def read_panels(out: Path) -> Panels | None:
@@ -72,118 +66,38 @@ def read_panels(out: Path) -> Panels | None:
     return Panels(about.case, about.keyframe, *images.values())
 
 
-def stress_text(report: StressResult) -> str:
+def stress_text(result: StressResult) -> str:
     """Tables with units."""
-    lines = [f"blur stress test of {report.config}", "", "fused colour against the sharp view (means over keyframes)"]
     head = ("sequence", "poses", "weights", "PSNR dB", "gain dB", "worst dB", "SSIM", "gradient", "keyframes")
-    rows: list[tuple[str, ...]] = []
-    for row in report.color:
-        gain = gain_db(report.color, row)
-        rows.append(
-            (row.case, row.poses, _weights(row.sigma_px), f"{row.psnr_db:.2f}",
-             "" if gain is None else f"{gain:+.2f}", f"{row.psnr_db_least:.2f}",
-             f"{row.ssim:.4f}", f"{row.gradient:.3f}", str(row.keyframes))
-        )  # fmt: skip
-    lines += _table(head, rows)
-    lines += ["gradient: energy over that of the sharp view; gain: over constant weights", ""]
-    lines += ["depth of keyframes, RMSE against the noise-free depth"]
-    rows = [
-        (d.case, d.poses, f"{1e3 * d.single_m:.2f}", f"{1e3 * d.fused_m:.2f}", f"{d.fused_m / d.single_m:.2f}")
-        for d in report.depth
-    ]
-    lines += [*_table(("sequence", "poses", "one frame mm", "fused mm", "ratio"), rows), "", "tracking"]
-    rows = [(t.case, t.variant, _mm(t.ate_m), _mm(t.drift_m_per_s), str(t.lost)) for t in report.tracking]
-    return "\n".join(lines + _table(("sequence", "photometric term", "ATE mm", "drift mm/s", "lost"), rows))
-
-
-def gains_db(report: StressResult, sigma_px: float = 1.0, poses: str = "true") -> dict[str, float]:
-    """PSNR of blur-aware over that of constant weights in dB, by sequence."""
-    rows = [row for row in report.color if (row.sigma_px, row.poses) == (sigma_px, poses)]
-    return {row.case: gain for row in rows if (gain := gain_db(report.color, row)) is not None}
-
-
-def gain_db(rows: Sequence[ColorScore], row: ColorScore) -> float | None:
-    """PSNR of `row` over that of constant weights, among `rows`, in dB; None if it is of constant weights itself."""
-    same = (r for r in rows if r.sigma_px is None and (r.case, r.poses) == (row.case, row.poses))
-    base = next(same, None)
-    return None if row.sigma_px is None or base is None else row.psnr_db - base.psnr_db
+    color = tuple(
+        (row.case, row.poses, weights_name(row.sigma_px), fixed(row.psnr_db, 2),
+         fixed(gain_db(result.color, row), 2, sign="+"), fixed(row.psnr_db_least, 2), fixed(row.ssim, 4),
+         fixed(row.gradient, 3), str(row.keyframes))
+        for row in result.color
+    )  # fmt: skip
+    depth = tuple(
+        (d.case, d.poses, *(fixed(v, 2, 1e3) for v in (d.single_m, d.fused_m)), fixed(d.fused_m / d.single_m, 2))
+        for d in result.depth
+    )
+    tracking = tuple(
+        (t.case, t.variant, fixed(t.ate_m, 2, 1e3), fixed(t.drift_m_per_s, 2, 1e3), str(t.lost))
+        for t in result.tracking
+    )
+    tables = (
+        Table(head, color, "fused colour against the sharp view (means over keyframes)", words=(0, 1, 2)),
+        Table(("sequence", "poses", "one frame mm", "fused mm", "ratio"), depth,
+              "depth of keyframes, RMSE against the noise-free depth", words=(0, 1)),
+        Table(("sequence", "photometric term", "ATE mm", "drift mm/s", "lost"), tracking, "tracking", words=(0, 1)),
+    )  # fmt: skip
+    colors, *others = (f"{table.title}\n{table.text()}" for table in tables)
+    about = "gradient: energy over that of the sharp view; gain: over constant weights"
+    return "\n\n".join((f"blur stress test of {result.config}", f"{colors}\n{about}", *others))
 
 
 def shade(weights: npt.NDArray[np.floating[Any]]) -> tuple[npt.NDArray[np.uint8], float]:
     """Weights (h, w) as a grey picture (h, w, 3), and the weight that is white in it: the largest."""
     white = max(float(weights.max()), 1e-6)
     return np.repeat(np.rint(255.0 / white * weights).astype(np.uint8)[..., None], 3, axis=-1), white
-
-
-def _weights(sigma_px: float | None) -> str:
-    return "constant" if sigma_px is None else f"sigma {sigma_px:g} px"
-
-
-def _mm(value: float | None) -> str:
-    return "-" if value is None else f"{1e3 * value:.2f}"
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
-    return [
-        "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in [head, *rows]
-    ]
-
-
-def _csv(rows: Sequence[dict[str, Any]]) -> str:
-    stream = io.StringIO()
-    if rows:
-        writer = csv.DictWriter(stream, fieldnames=list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    return stream.getvalue()
-
-
-def _plot(report: StressResult, path: Path) -> Path:
-    """PSNR and gradient energy by exposure, PSNR by speed, tracking error by exposure."""
-    from matplotlib.figure import Figure  # half a second to import, and only drawing needs it
-
-    from rsgen.figures import save
-
-    figure = Figure(figsize=(12.5, 7.6), layout="constrained")
-    axes = figure.subplots(2, 2)
-    slow = [row for row in report.color if row.speed == 1.0 and row.poses == "true"]
-    by_speed = _by_speed(report)
-    panels = (
-        (axes[0, 0], slow, "exposure_ms", "psnr_db", "PSNR, dB", "exposure, ms"),
-        (axes[0, 1], slow, "exposure_ms", "gradient", "gradient energy / sharp view's", "exposure, ms"),
-        (axes[1, 0], by_speed, "speed", "psnr_db", "PSNR, dB", "speed, times"),
-    )
-    for axis, rows, along, value, label, below in panels:
-        for n, sigma in enumerate(dict.fromkeys(row.sigma_px for row in rows)):
-            mine = [row for row in rows if row.sigma_px == sigma]
-            x = [1e3 * row.exposure_s if along == "exposure_ms" else row.speed for row in mine]
-            color = "0.3" if sigma is None else _COLORS[(n - 1) % len(_COLORS)]
-            style = "--" if sigma is None else "-"
-            axis.plot(x, [getattr(row, value) for row in mine], f"o{style}", color=color, label=_weights(sigma), ms=4)
-        axis.set_xlabel(below)
-        axis.set_ylabel(label)
-        axis.grid(alpha=0.3)
-    axes[0, 0].legend(frameon=False, fontsize=9)
-    for n, variant in enumerate(dict.fromkeys(row.variant for row in report.tracking)):
-        found = [t for t in report.tracking if t.variant == variant and t.speed == 1.0 and t.ate_m is not None]
-        x, y = [1e3 * t.exposure_s for t in found], [1e3 * (t.ate_m or 0.0) for t in found]
-        axes[1, 1].plot(x, y, "o-", color=_COLORS[n % len(_COLORS)], label=variant, ms=4)
-    axes[1, 1].set_xlabel("exposure, ms")
-    axes[1, 1].set_ylabel("ATE, mm")
-    axes[1, 1].grid(alpha=0.3)
-    if axes[1, 1].lines:
-        axes[1, 1].legend(frameon=False, fontsize=9)
-    figure.suptitle(f"{report.config}: fused colour along the true path, and tracking")
-    save(figure, path)
-    return path
-
-
-def _by_speed(report: StressResult) -> list[ColorScore]:
-    """Scores of all speeds at the exposure that the fast sequences have."""
-    fast = {row.exposure_s for row in report.color if row.speed != 1.0}
-    rows = [row for row in report.color if row.exposure_s in fast and row.poses == "true"]
-    return sorted(rows, key=lambda row: row.speed)
 
 
 def _write_panels(panels: Panels, out: Path) -> list[Path]:
@@ -210,61 +124,26 @@ def _write_panels(panels: Panels, out: Path) -> list[Path]:
 
 # -- reading ----------------------------------------------------------------------------------------------------------
 
-# What JSON cannot hold (NaN, infinity) was written as null.
-_Score = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
-_Measure = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
-
-class _Stored(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
-
-
-class _ColorRow(_Stored):
-    case: str
-    speed: _Measure
-    exposure_s: _Measure
-    poses: Literal["true", "estimated"]
-    sigma_px: _Measure | None
-    psnr_db: _Score
-    psnr_db_least: _Score
-    ssim: _Score
-    gradient: _Score
-    keyframes: int = Field(ge=1)
-
-
-class _DepthRow(_Stored):
-    case: str
-    poses: Literal["true", "estimated"]
-    single_m: _Score
-    fused_m: _Score
-    pixels: int = Field(ge=0)
-
-
-class _TrackRow(_Stored):
-    case: str
-    speed: _Measure
-    exposure_s: _Measure
-    variant: str
-    ate_m: _Measure | None
-    drift_m_per_s: _Measure | None
-    lost: int = Field(ge=0)
-
-
-class _AboutPanels(_Stored):
+class _AboutPanels(BaseModel):
     """white: the weight that is white in weights.png."""
+
+    model_config = STORED
 
     case: str
     keyframe: int = Field(ge=0)
     width: int = Field(ge=1)
     height: int = Field(ge=1)
-    white: _Measure
+    white: Measure
 
 
-class _StoredStress(_Stored):
+class _Stored(BaseModel):
+    model_config = STORED
+
     config: str
-    color: tuple[_ColorRow, ...] = Field(min_length=1)
-    depth: tuple[_DepthRow, ...]
-    tracking: tuple[_TrackRow, ...] = Field(min_length=1)
+    color: tuple[ColorScore, ...] = Field(min_length=1)
+    depth: tuple[DepthScore, ...]
+    tracking: tuple[TrackScore, ...] = Field(min_length=1)
     panels: _AboutPanels | None = None
 
 
@@ -274,8 +153,8 @@ def _about(panels: Panels) -> dict[str, Any]:
     return {"case": panels.case, "keyframe": panels.index, "width": width, "height": height, "white": white}
 
 
-def _read(path: Path) -> _StoredStress:
+def _read(path: Path) -> _Stored:
     try:
-        return _StoredStress.model_validate_json(read_text(path))
+        return _Stored.model_validate_json(read_text(path))
     except ValidationError as error:
         raise UserError(f"{path}: {first_problem(error)}: run 'rstrack stress' again") from None

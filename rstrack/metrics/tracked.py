@@ -1,4 +1,4 @@
-"""What a report knows of one run: the estimate, the truth it is compared with, and errors as functions of time."""
+"""A run beside the truth of its sequence: what pictures and pages of it are made from."""
 
 from __future__ import annotations
 
@@ -10,12 +10,10 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
-from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.estimate import Estimate, read_estimate
-from rstrack.metrics.association import Comparison, Truth, angles_deg, compare, truth_of
-from rstrack.metrics.evaluate import pairs_one_second_apart
+from rstrack.metrics.association import Comparison, Truth, compare, truth_of
 
 # Points of the true path, of which there is one at any time.
 _PATH_POINTS = 1000
@@ -47,15 +45,6 @@ class Tracked:
         if not isinstance(frames, list):
             return []
         return [f for f in frames if isinstance(f, dict) and isinstance(f.get("stamp"), int | float)]
-
-
-@dataclass(frozen=True)
-class Drift:
-    """Relative pose error over one second from each of the times (k,) s on: mm (k,) and degrees (k,)."""
-
-    stamps: FloatArray
-    translation_mm: FloatArray
-    rotation_deg: FloatArray
 
 
 def load_run(
@@ -91,19 +80,6 @@ def true_path(truth: Truth, begin: float, end: float) -> tuple[FloatArray, Float
         return motion.stamps[inside], motion.T_world_cam[inside]
     t = np.linspace(max(begin, motion.t_begin), min(end, motion.t_end), _PATH_POINTS)
     return t, motion.pose(t)
-
-
-def drift(estimate: Estimate, found: Comparison) -> Drift:
-    """The errors whose RMS `metrics.evaluate.evaluate` gives as RPE, with the time at which each second begins."""
-    row = np.full(len(estimate.stamps), -1)
-    row[found.index] = np.arange(len(found.index))
-    i, j = pairs_one_second_apart(estimate.stamps)
-    both = (row[i] >= 0) & (row[j] >= 0)
-    stamps, i, j = estimate.stamps[i[both]], row[i[both]], row[j[both]]
-    true_step = se3.inverse(found.T_world_true[i]) @ found.T_world_true[j]
-    est_step = se3.inverse(found.T_world_est[i]) @ found.T_world_est[j]
-    error = se3.inverse(true_step) @ est_step
-    return Drift(stamps, 1e3 * np.linalg.norm(error[:, :3, 3], axis=1), angles_deg(true_step, est_step))
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -19,10 +19,14 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.trajectory import Trajectory
+from rstrack.charts.chart import Chart, Line, PathChart, Ticks
+from rstrack.charts.runs import error_charts, inlier_charts, path_chart, run_plot
+from rstrack.charts.to_file import write_charts
+from rstrack.charts.to_page import figure_of
 from rstrack.data.estimate import Estimate, write_estimate
-from rstrack.metrics.association import Truth
+from rstrack.metrics.association import Truth, compare
 from rstrack.metrics.evaluate import evaluate
-from rstrack.metrics.plot import plot_run, run_plot
+from rstrack.metrics.tracked import Tracked
 
 SPLINE = synthetic.make_spline()
 STAMPS = np.arange(39) / 30.0
@@ -50,6 +54,11 @@ def estimate(kept: np.ndarray | None = None, **info: Any) -> Estimate:
     return Estimate(stamps, se3.orthonormalise(WORLD @ SPLINE.pose(stamps) @ se3.exp(xi)), None, info)
 
 
+def charts(of: Truth | None, run: Estimate) -> list[Chart | PathChart]:
+    tracked = Tracked(run, None, of, None if of is None else compare(of, run))
+    return [path_chart({"estimated": tracked}), *error_charts(tracked)[:2], *inlier_charts(tracked)]
+
+
 @pytest.fixture
 def drawn(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Figure]:
     """Draws a run and returns the figure instead of writing it."""
@@ -57,7 +66,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Figure]:
     monkeypatch.setattr(rsgen.figures, "save", lambda figure, path: figures.append(figure))
 
     def draw(of: Truth | None, run: Estimate) -> Figure:
-        plot_run(of, run, None if of is None else evaluate(of, run), Path("x.png"), "seq")
+        write_charts(charts(of, run), Path("x.png"), "a run")
         figures[-1].draw_without_rendering()
         return figures[-1]
 
@@ -79,7 +88,8 @@ def test_panels_and_their_values(drawn: Callable[..., Figure]) -> None:
     assert position.lines[1].get_ydata()[0] == pytest.approx(1e3 * metrics.ate_rmse_m)
     assert 0.1 < np.max(rotation.lines[0].get_ydata()) < 3.0
     assert [axis.get_title(loc="left") for axis in figure.axes] == [
-        "path from above", "position error, mm", "rotation error, degrees", "inliers, %",
+        "Path from above", "Position error after alignment, mm", "Rotation error after alignment, degrees",
+        "Inliers, %",
     ]  # fmt: skip
     assert all(position.get_shared_x_axes().joined(position, axis) for axis in (rotation, frames))
     assert frames.get_xlabel() == "time, s" and path.get_aspect() == 1.0
@@ -88,42 +98,15 @@ def test_panels_and_their_values(drawn: Callable[..., Figure]) -> None:
     ticks = {c.get_label(): [s[0, 0] for s in c.get_segments()] for c in frames.collections}
     np.testing.assert_allclose(ticks["keyframe"], STAMPS[4::10])
     np.testing.assert_allclose(ticks["lost"], STAMPS[20:22])
-    assert (
-        f"ATE {1e3 * metrics.ate_rmse_m:.2f} mm" in figure.get_suptitle() and "seq: 39 of 39" in figure.get_suptitle()
-    )
 
 
 def test_the_path_is_aligned_and_seen_from_above(drawn: Callable[..., Figure]) -> None:
     # The synthetic camera looks along z with y down: from above, x is to the right and z upwards, not mirrored.
     path = drawn(truth(), estimate()).axes[0]
-    assert (path.get_xlabel(), path.get_ylabel()) == ("x, m", "z, m") and not path.yaxis_inverted()
+    assert (path.get_xlabel(), path.get_ylabel()) == ("x, m", "z, m")
     np.testing.assert_allclose(line(path, "estimated"), SPLINE.pose(STAMPS)[:, [0, 2], 3], atol=0.02)
     true = line(path, "true")
     np.testing.assert_allclose(true[[0, -1]], SPLINE.pose(STAMPS[[0, -1]])[:, [0, 2], 3], atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("turn", "labels", "is_flipped"),
-    [
-        ([np.pi, 0, 0], ("x, m", "z, m"), True),  # y up
-        ([-np.pi / 2, 0, 0], ("x, m", "y, m"), False),  # z up
-        ([np.pi / 2, 0, 0], ("x, m", "y, m"), True),  # z down
-        ([0, 0, np.pi / 2], ("y, m", "z, m"), False),  # x up
-        ([0, 0, -np.pi / 2], ("y, m", "z, m"), True),  # x down
-    ],
-)
-def test_the_view_is_from_above_in_any_world(
-    drawn: Callable[..., Figure], turn: list[float], labels: tuple[str, str], is_flipped: bool
-) -> None:
-    T = se3.exp([0, 0, 0, *turn])
-    run = Estimate(STAMPS, se3.orthonormalise(T @ SPLINE.pose(STAMPS)))
-    path = drawn(None, run).axes[0]
-    assert (path.get_xlabel(), path.get_ylabel()) == labels and path.yaxis_inverted() == is_flipped
-    # Right × up on the page points up in the world: against the camera's y.
-    axes = np.eye(3)
-    right, upwards = (axes["xyz".index(label[0])] for label in labels)
-    towards_viewer = np.cross(right, -upwards if is_flipped else upwards)
-    assert towards_viewer @ (T[:3, :3] @ [0, -1, 0]) == pytest.approx(1.0)
 
 
 def test_lines_break_off_where_the_track_was_lost(drawn: Callable[..., Figure]) -> None:
@@ -135,8 +118,7 @@ def test_lines_break_off_where_the_track_was_lost(drawn: Callable[..., Figure]) 
 
 def test_without_truth_there_are_no_errors(drawn: Callable[..., Figure]) -> None:
     figure = drawn(None, estimate(frames=diagnostics(STAMPS)))
-    assert [axis.get_title(loc="left") for axis in figure.axes] == ["path from above", "inliers, %"]
-    assert "39 poses" in figure.get_suptitle()
+    assert [axis.get_title(loc="left") for axis in figure.axes] == ["Path from above", "Inliers, %"]
     assert len(drawn(None, estimate()).axes) == 1
 
 
@@ -161,18 +143,46 @@ def test_no_text_overlaps(drawn: Callable[..., Figure], with_truth: bool) -> Non
 
 def test_a_png_is_1600_pixels_wide_and_a_pdf_is_a_pdf(tmp_path: Path) -> None:
     run = estimate(frames=diagnostics(STAMPS))
-    plot_run(truth(Trajectory(STAMPS, SPLINE.pose(STAMPS))), run, None, tmp_path / "run.png")
+    write_charts(charts(truth(Trajectory(STAMPS, SPLINE.pose(STAMPS))), run), tmp_path / "run.png")
     picture = cv2.imread(str(tmp_path / "run.png"))
     assert picture is not None and picture.shape[1] == 1600
-    plot_run(None, run, None, tmp_path / "new" / "run.pdf")
+    write_charts(charts(None, run), tmp_path / "new" / "run.pdf")
     assert (tmp_path / "new" / "run.pdf").read_bytes().startswith(b"%PDF")
     with pytest.raises(UserError, match="cannot be written as"):
-        plot_run(None, run, None, tmp_path / "run.xyz")
+        write_charts(charts(None, run), tmp_path / "run.xyz")
 
 
-def test_a_run_is_plotted_from_folders(tmp_path: Path) -> None:
+def test_a_run_is_plotted_from_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     root = synthetic.make_sequence(tmp_path / "seq", frames=6)
     write_estimate(tmp_path / "run", STAMPS[:6], SPLINE.pose(STAMPS[:6]), SPLINE, {"frames": diagnostics(STAMPS[:6])})
     run_plot(root, tmp_path / "run", tmp_path / "a.png")
     run_plot(None, tmp_path / "run", tmp_path / "b.png")
     assert (tmp_path / "a.png").stat().st_size > (tmp_path / "b.png").stat().st_size > 10_000
+    titles: list[str] = []
+    monkeypatch.setattr("rstrack.charts.runs.write_charts", lambda charts, out, title: titles.append(title))
+    run_plot(root, tmp_path / "run", tmp_path / "a.png")
+    run_plot(None, tmp_path / "run", tmp_path / "b.png")
+    assert titles[0].endswith(": 6 of 6 frames tracked, ATE 0.00 mm") and titles[1] == "run: 6 poses"
+
+
+def test_both_drawers_draw_the_same_numbers(drawn: Callable[..., Figure]) -> None:
+    run = estimate(np.r_[0:15, 25:39], frames=diagnostics(STAMPS))
+    axes = drawn(truth(), run).axes
+    paths, *others = charts(truth(), run)
+    for axis, chart in zip(axes[1:], others, strict=True):
+        traces = figure_of(chart, 1500)["data"]
+        for line, trace in zip(axis.lines, traces, strict=False):
+            assert line.get_label() == trace["name"]
+            y = np.array(trace["y"], np.float64)
+            np.testing.assert_allclose(np.asarray(line.get_ydata(), float), y, rtol=1e-3)
+    for line, trace in zip(axes[0].lines, figure_of(paths, 1500)["data"], strict=False):
+        in_space = np.array([trace["x"], trace["y"]], np.float64).T
+        np.testing.assert_allclose(np.asarray(line.get_xydata(), float), in_space, atol=1e-4)
+
+
+def test_a_line_of_many_points_is_thinned_on_the_page() -> None:
+    t = np.arange(10_000) / 100.0
+    chart = Chart("a", "mm", lines=(Line("b", "#000000", t, np.sin(t)),), ticks=(Ticks("c", "#000000", t[:3]),))
+    line, ticks = figure_of(chart, 50)["data"]
+    assert len(line["x"]) == 50 and line["x"][0] == 0.0 and line["x"][-1] == pytest.approx(99.99)
+    assert ticks["y"] == [pytest.approx(-0.06, rel=1e-3)] * 3
