@@ -22,8 +22,9 @@ from rstrack.alignment.spline_state import SplineState
 STOP_PX = (0.02, 0.1, 0.3)
 # Lines that have moved less since a linearisation keep it.
 RELINEARISE_PX = 0.02
-# The same for noisy depth: part of what its σ moves a pixel by. (Noise-free depth is held to the pixels above.)
-_NOISE_SHARE = 0.15
+# The same for noisy depth: part of what its σ moves a pixel by. (Noise-free depth is held to the pixels above,
+# and what does not fit must not end early for it.)
+_NOISE_SHARE, _MOST_TOLERANCE_PX = 0.1, 0.08
 # Rise of the negative log-likelihood per pixel from which on a step has made things worse: less is noise of gating.
 _WORSE = 2e-5
 
@@ -138,7 +139,7 @@ def _tolerance(problem: Problem) -> float:
     """Pixels that lines may move without mattering, at the finest level: less than noise moves them."""
     depth = [o for o in problem.fresh if o.is_depth and o.is_linearised]
     noise_px = min((problem.focal * o.lin.next_sigma / o.ref.median_depth for o in depth), default=0.0)
-    return max(RELINEARISE_PX, _NOISE_SHARE * noise_px)
+    return min(max(RELINEARISE_PX, _NOISE_SHARE * noise_px), _MOST_TOLERANCE_PX)
 
 
 def _cost(state: SplineState, problem: Problem, weights: dict[int, float]) -> float:

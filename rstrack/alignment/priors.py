@@ -36,6 +36,25 @@ def acceleration_prior(spline: Spline, first: int, last: int, sigma: FloatArray)
     return Quadratic(first, H, g), 0.5 * float(np.sum((r / sigma) ** 2))
 
 
+def velocity_prior(spline: Spline, first: int, last: int, sigma: FloatArray) -> tuple[Quadratic, float]:
+    """Ω_i ~ N(0, diag σ²) for the pairs of control points within first..last (exclusive): hardly anything moves faster.
+
+    sigma (6,): m and rad per knot, so velocity times dt. Returns the model and the cost.
+    """
+    gains = spline.left_gains[first : last - 1]
+    r = spline.increments[first : last - 1]
+    J = np.concatenate([-gains, gains], axis=2)
+    weighted = np.swapaxes(J, 1, 2) / sigma**2
+    blocks, slopes = weighted @ J, (weighted @ r[..., None])[..., 0]
+    count = last - first
+    H, g = np.zeros((6 * count, 6 * count)), np.zeros(6 * count)
+    for i in range(count - 1):
+        at = slice(6 * i, 6 * i + 12)
+        H[at, at] += blocks[i]
+        g[at] += slopes[i]
+    return Quadratic(first, H, g), 0.5 * float(np.sum((r / sigma) ** 2))
+
+
 def pose_constraint(spline: Spline, t: float, T_world_body: FloatArray, sigma: FloatArray) -> tuple[Quadratic, float]:
     """T(t) = T_world_body up to sigma (6,) (m, rad): fixes the gauge while the reference's control points are free.
 

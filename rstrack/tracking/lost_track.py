@@ -1,49 +1,95 @@
-"""Tell a lost track from a good one, by pixels that still fit and by how well."""
+"""Tell a lost track from a good one: every term is judged on its own, and the motion with them."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from statistics import median
 
+import numpy as np
+
+from rsgen.array_types import FloatArray
+from rsgen.geometry import se3
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Solved
 
-# A term has to see this share of the pixels that it saw at first, and so many at least, to count.
+# A term has to see this share of the reference's pixels, and so many at least, to say anything.
 _LEAST_SHARE = 0.08
-_LEAST_PIXELS = 200
+_LEAST_PIXELS = 60
+# Part of the compared pixels that must not be outliers for certain.
+_LEAST_FIT_DEPTH, _LEAST_FIT_COLOR = 0.5, 0.6
 # Scales that no aligned images have, and growth over the last frames' median that none shows (m; intensity).
-_WORST_DEPTH, _WORST_INTENSITY = 0.03, 0.15
+_WORST_DEPTH, _WORST_INTENSITY = 0.03, 0.12
 _GROWTH, _HARMLESS_DEPTH, _HARMLESS_INTENSITY = 6.0, 2e-3, 0.03
+# What counts as usual grows no further than this over the best that was usual: bad must not become usual.
+_DECAY = 3.0
 # A camera at rest repeats its rounding: what counts as usual then says little. Multiple of the rounding that is fine.
 _ROUNDING = 2.5
 # Lines that still move so far (pixels) have not been found.
 _WORST_SHIFT_PX = 2.0
+# Changes of velocity that no hand makes, m/s² and rad/s² (hand-held cameras reach 35 m/s²), and what is always allowed.
+_MOST_ACCELERATION = np.array([100.0, 200.0])
+_ALWAYS = np.array([0.05, np.radians(4.0)])
 _MEMORY = 30
 
 
+@dataclass
+class _Usual:
+    """Scales of one term in the last good frames."""
+
+    worst: float
+    harmless: float
+    recent: deque[float] = field(default_factory=lambda: deque(maxlen=_MEMORY))
+    best: float = np.inf
+
+    def limit(self, floor: float) -> float:
+        """Scale beyond which a frame does not fit."""
+        usual = min(median(self.recent), _DECAY * self.best) if self.recent else self.worst
+        return min(self.worst, max(self.harmless, _ROUNDING * floor, _GROWTH * usual))
+
+    def learn(self, sigma: float) -> None:
+        self.recent.append(sigma)
+        if len(self.recent) == _MEMORY:
+            self.best = min(self.best, median(self.recent))
+
+
 class FitHistory:
-    """Remembers the scales of the last good frames."""
+    """Remembers how well the last good frames fitted."""
 
     def __init__(self) -> None:
-        self._depth: deque[float] = deque(maxlen=_MEMORY)
-        self._intensity: deque[float] = deque(maxlen=_MEMORY)
+        self._depth = _Usual(_WORST_DEPTH, _HARMLESS_DEPTH)
+        self._color = _Usual(_WORST_INTENSITY, _HARMLESS_INTENSITY)
+
+    def misfits(self, fresh: Sequence[Observation], expected: int) -> list[tuple[Observation, str]]:
+        """Observations that do not fit, and why. expected: pixels that a whole image puts on the reference."""
+        return [(o, why) for o in fresh if (why := self._misfit(o, expected))]
 
     def fault(self, fresh: Sequence[Observation], solved: Solved, expected: int) -> str:
-        """Why a frame has not been found, '' if it has. expected: pixels that a whole image puts on the reference."""
-        seen = [o for o in fresh if o.is_linearised and o.lin.count >= max(_LEAST_PIXELS, _LEAST_SHARE * expected)]
-        if not seen:
+        """Why a frame has not been found, '' if it has: then it is learnt from."""
+        if not fresh or not any(o.is_linearised for o in fresh):
             return "hardly a pixel falls on the keyframe"
         if solved.last_shift > _WORST_SHIFT_PX:
             return "the alignment does not settle"
-        for o in seen:
-            history = self._depth if o.is_depth else self._intensity
-            worst = _WORST_DEPTH if o.is_depth else _WORST_INTENSITY
-            harmless = _HARMLESS_DEPTH if o.is_depth else _HARMLESS_INTENSITY
-            harmless = max(harmless, _ROUNDING * o.lin.floor)
-            usual = median(history) if history else worst
-            if o.lin.next_sigma > min(worst, max(harmless, _GROWTH * usual)):
-                return f"the {'depth' if o.is_depth else 'colour'} image does not fit"
-        for o in seen:
-            (self._depth if o.is_depth else self._intensity).append(o.lin.next_sigma)
+        misfits = self.misfits(fresh, expected)
+        if misfits:
+            return misfits[0][1]
+        for o in fresh:
+            (self._depth if o.is_depth else self._color).learn(o.lin.next_sigma)
         return ""
+
+    def _misfit(self, o: Observation, expected: int) -> str:
+        name, usual = ("depth", self._depth) if o.is_depth else ("colour", self._color)
+        if not o.is_linearised or o.lin.count < max(_LEAST_PIXELS, _LEAST_SHARE * expected):
+            return f"hardly a pixel of the {name} image falls on the keyframe"
+        if o.lin.fit < (_LEAST_FIT_DEPTH if o.is_depth else _LEAST_FIT_COLOR):
+            return f"the {name} image shows something else"
+        if o.lin.next_sigma > usual.limit(o.lin.floor):
+            return f"the {name} image does not fit"
+        return ""
+
+
+def implausible(T_predicted: FloatArray, T_found: FloatArray, dt: float) -> bool:
+    """Whether a pose (4, 4) is further from the one predicted (4, 4) dt seconds ahead than a hand could move it."""
+    off = se3.log(se3.inverse(T_predicted) @ T_found)
+    return bool((np.linalg.norm(off.reshape(2, 3), axis=1) > _ALWAYS + _MOST_ACCELERATION * dt**2).any())

@@ -25,13 +25,14 @@ from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Solved
 from rstrack.data.rig import Frame, Rig
 from rstrack.images.device_frame import DeviceFrame, DeviceRig, Timer, untimed
+from rstrack.images.pyramid import DepthImage
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.keyframes.store import KeyframeStore
 from rstrack.options import Options
 from rstrack.tracking.frame_report import FrameReport, frame_report
-from rstrack.tracking.lost_track import FitHistory
-from rstrack.tracking.window import TRACKING_LEVELS, Window
+from rstrack.tracking.lost_track import FitHistory, implausible
+from rstrack.tracking.window import LEVELS, TRACKING_LEVELS, Window
 
 # Seconds without a frame after which the motion before says nothing about where the camera is, and beyond which
 # frames hardly belong to one recording.
@@ -40,6 +41,8 @@ _GAP_S, _BREAK_S = 0.3, 3600.0
 _WIDEST = 2.0
 # Part of the pixels that must have depth for a frame to become a keyframe.
 _LEAST_DEPTH = 0.02
+# Frames of a new piece that are aligned jointly: fewer do not tell its velocity.
+_YOUNG = 4
 # Starts from which a lost frame is looked for, and how many of them are followed to the end.
 _STARTS, _TRIED = 3, 1
 
@@ -117,23 +120,35 @@ class Tracker:
         elif gap > _GAP_S:
             report = self._relocalise(new)
         else:
-            report = self._track(new)
+            report = self._track(new, gap)
         self.reports.append(report)
         return report
 
-    def _track(self, new: DeviceFrame) -> FrameReport:
+    def _track(self, new: DeviceFrame, gap: float) -> FrameReport:
         window, ref = self._known()
         before = window.copy()
-        window.predict(new, self.spline_valid[-1][1])
+        young = window.piece > 0 and len(self._recent) < _YOUNG
+        window.predict(new, self.spline_valid[-1][1], young)
         on_reference = self._observe(new, ref)
         anchor = self._keyframes.anchor
         fresh = on_reference + ([] if anchor is None else self._observe(new, anchor))
         # The first keyframe of a global shutter: no other frame tells where it was taken.
         gauge = ref if not window.is_frozen(ref.t) and new.depth.exposure.lens.lines == 1 else None
-        solved = window.solve(fresh, TRACKING_LEVELS, gauge, coupled=ref.rolling is not None)
-        if self._fits.fault(on_reference, solved, ref.pixels):
+        mid, T_predicted = new.depth.exposure.mid_time, window.spline.pose(new.depth.exposure.mid_time)
+        coupled = ref.rolling is not None
+        levels = LEVELS if young else TRACKING_LEVELS
+        solved = window.solve(fresh, levels, gauge, coupled)
+        fitting = self._without_misfits(fresh, on_reference, ref)
+        if len(fitting) < len(fresh):
+            window = before.copy()
+            window.predict(new, self.spline_valid[-1][1], young)
+            fresh, on_reference = fitting, [o for o in fitting if o.ref is ref]
+            solved = window.solve(fresh, levels, gauge, coupled)
+        fault = self._fits.fault(on_reference, solved, ref.pixels)
+        if fault or implausible(T_predicted, window.spline.pose(mid), gap):
             self._window = before
             return self._relocalise(new)
+        self._window = window
         window.keep(fresh)
         for is_color, term in enumerate(self._independence):
             term.learn(o.lin.inflation for o in on_reference if o.is_depth != is_color)
@@ -143,6 +158,19 @@ class Tracker:
         frozen = self._fuse_frozen(window)
         renewed = self._renew_keyframe(window, new, frozen, overlap)
         return self._report(new, on_reference, solved, keyframe=renewed, overlap=overlap)
+
+    def _without_misfits(
+        self, fresh: list[Observation], on_reference: list[Observation], ref: Reference
+    ) -> list[Observation]:
+        """What is left to align by if a frame's colour images do not fit but its depth does, or has none to show."""
+        misfits = [o for o, _ in self._fits.misfits(on_reference, ref.pixels)]
+        empty = [o for o in fresh if isinstance(o.image, DepthImage) and o.image.count == 0]
+        odd_colors = [o for o in misfits if not o.is_depth]
+        if len(odd_colors) == len(misfits) and len(misfits) < len(on_reference):
+            return [o for o in fresh if all(o.image is not odd.image for odd in odd_colors)]
+        if empty and len(misfits) == 1 and misfits[0].is_depth:
+            return [o for o in fresh if not o.is_depth]
+        return fresh
 
     # -- start and restart ------------------------------------------------------------------------------------------
 
@@ -237,7 +265,7 @@ class Tracker:
         trials: list[tuple[float, int, Window, list[Observation], Reference]] = []
         for candidate, T_world_body in starts:
             trial = window.restarted(new, end, T_world_body)
-            fresh = observe(new, candidate, self.options, _matched(new, candidate))
+            fresh = self._observe(new, candidate, _matched(new, candidate))
             trial.solve(fresh, levels=(2,))
             trials.append((_promise(fresh), len(trials), trial, fresh, candidate))
         for _, _, trial, fresh, candidate in sorted(trials, key=lambda t: t[:2])[:_TRIED]:
@@ -330,13 +358,17 @@ class Tracker:
         assert self._window is not None and self._reference is not None
         return self._window, self._reference
 
-    def _observe(self, frame: DeviceFrame, ref: Reference) -> list[Observation]:
-        """What the frame's images say against a reference; their brightness is expected to be about as before."""
-        before = self._brightness.get(frame.index)
-        if before is None and frame.colors and self._brightness and self._moments is not None:
-            newest = self._brightness[max(self._brightness)]
-            before = brightness.expected(newest, frame.colors[0].moments, self._moments)
-        expected = brightness.SAME if before is None else brightness.relative(before, ref.brightness)
+    def _observe(self, frame: DeviceFrame, ref: Reference, expected: FloatArray | None = None) -> list[Observation]:
+        """What the frame's images say against a reference, as far as their pixels are independent.
+
+        expected (2,): gain and offset of its colours; by default about as before.
+        """
+        if expected is None:
+            before = self._brightness.get(frame.index)
+            if before is None and frame.colors and self._brightness and self._moments is not None:
+                newest = self._brightness[max(self._brightness)]
+                before = brightness.expected(newest, frame.colors[0].moments, self._moments)
+            expected = brightness.SAME if before is None else brightness.relative(before, ref.brightness)
         observations = observe(frame, ref, self.options, expected)
         for o in observations:
             o.independent = 1.0 / self._independence[not o.is_depth].inflation

@@ -11,7 +11,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Problem, Solved, optimise
-from rstrack.alignment.priors import Prior, acceleration_prior, pose_constraint
+from rstrack.alignment.priors import Prior, acceleration_prior, pose_constraint, velocity_prior
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference
@@ -21,6 +21,8 @@ from rstrack.keyframes.keyframe import Reference
 # are held a good deal tighter: small systematic errors of the lines would throw them about.
 _ACCELERATION = np.array([5.0, 5.0, 5.0, 10.0, 10.0, 10.0])
 _NEWEST_TRIPLES, _NEWEST_FACTOR = 2, 0.1
+# And of velocities, m/s and rad/s, where a lost track begins anew: one frame's lines hardly tell.
+_VELOCITY = np.array([0.5, 0.5, 0.5, 1.0, 1.0, 1.0])
 # Metres and radians within which the reference's pose is held while its own control points are free.
 _GAUGE = np.full(6, 1e-6)
 # Levels to go through from a prediction by constant velocity, and from anything worse.
@@ -62,11 +64,14 @@ class Window:
         twin.first_free, twin.active = self.first_free, list(self.active)
         return twin
 
-    def predict(self, new: DeviceFrame, end: float) -> None:
-        """Go on with constant velocity from time `end` (s) until the frame is covered; what it touches is free."""
+    def predict(self, new: DeviceFrame, end: float, young: bool = False) -> None:
+        """Go on with constant velocity from time `end` (s) until the frame is covered; what it touches is free.
+
+        young: the piece's first frame alone does not tell its velocity; all of the piece stays free.
+        """
         self.state.smooth_end(end)
         self.state.extend(new.last_time)
-        self.first_free = max(self.piece, self.state.segment(new.first_time))
+        self.first_free = self.piece if young else max(self.piece, self.state.segment(new.first_time))
         self.active = [o for o in self.active if o.is_linearised and o.lin.model.last > self.first_free]
 
     def restarted(self, new: DeviceFrame, end: float, T_world_body: FloatArray) -> Window:
@@ -89,6 +94,8 @@ class Window:
         """
         free = self.first_free, len(self.state.points)
         priors = [self._motion_prior(free)] + ([] if gauge is None else [_pose_prior(gauge)])
+        if self.piece > 0 and self.first_free == self.piece:
+            priors.append(self._velocity_prior(free))
         bandwidth = 6 * (free[1] - free[0]) if coupled else 24
         problem = Problem(fresh, self.active, free, priors, self._focal, bandwidth)
         try:
@@ -106,6 +113,11 @@ class Window:
         sigma = np.repeat(_ACCELERATION[None] * self.state.dt**2, last - first - 2, axis=0)
         sigma[-_NEWEST_TRIPLES:] *= _NEWEST_FACTOR
         return lambda spline: acceleration_prior(spline, first, last, sigma)
+
+    def _velocity_prior(self, free: tuple[int, int]) -> Prior:
+        """What is known of the motion of a piece that has just begun."""
+        sigma = _VELOCITY * self.state.dt
+        return lambda spline: velocity_prior(spline, *free, sigma)
 
 
 def _pose_prior(ref: Reference) -> Prior:
