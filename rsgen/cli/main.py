@@ -7,7 +7,6 @@ in boxes, pydantic-settings in tracebacks, and to mend that would take as much c
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal, get_args
@@ -231,7 +230,3 @@ def bench(
         times = time_modes(chosen, frames, spp, modes, progress)
     print_figures(times, json)
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -108,12 +108,13 @@ class Terms:
         slopes_at: spline at which the lines' poses are differentiated by control points, if not `spline`: that changes
         by no more than the increments between the two (relative), which Gauss-Newton steps do not notice.
         """
-        to_base = self._to_base(spline, ref.T_world_base, image.exposure)
-        sums = self._geometric_sums(image, ref, to_base, self._seen_from(spline, ref), level, sigma)
-        _, _, per, ref_per = block_counts(image.exposure.lens, ref.lens)
-        times = image.exposure.block_times(per)
-        floor = self._floor_depth(image, ref)
-        return self._finish(sums, slopes_at or spline, ref, times, ref_per, sigma, floor, ref.median_depth)
+        with self.timer(f"geometric kernel, level {level}"):
+            to_base = self._to_base(spline, ref.T_world_base, image.exposure)
+            sums = self._geometric_sums(image, ref, to_base, self._seen_from(spline, ref), level, sigma)
+            _, _, per, ref_per = block_counts(image.exposure.lens, ref.lens)
+            times = image.exposure.block_times(per)
+            floor = self._floor_depth(image, ref)
+            return self._finish(sums, slopes_at or spline, ref, times, ref_per, sigma, floor, ref.median_depth)
 
     def geometric_pose(
         self, image: DepthImage, ref: Reference, T_base_cam: FloatArray, level: int, sigma: float
@@ -160,24 +161,24 @@ class Terms:
 
         brightness (2,): gain and offset of the image here; expected (2,): before anything is known of it.
         """
-        e, lens, points = self.e, image.exposure.lens, ref.points[level]
-        kernel = self._kernel(photometric_kernel, lens, ref.lens, STRIDES[level], level, self.blur_sigma_px)
-        from_base = self._from_base(spline, ref.T_world_base, image.exposure)
-        # Moving closer or turning packs more points into a block than its share.
-        scaling = self._scaling(points, lens, ref.lens.camera, ref, STRIDES[level], 4)
-        constants = e.upload(np.append(scaling.parameters(sigma, self.gate_intensity), brightness))
-        seen_at = self._ref_lines(spline, ref), image.levels[level], from_base
-        shown = points.visible if visible is None else visible
         with self.timer(f"photometric kernel, level {level}"):
+            e, lens, points = self.e, image.exposure.lens, ref.points[level]
+            kernel = self._kernel(photometric_kernel, lens, ref.lens, STRIDES[level], level, self.blur_sigma_px)
+            from_base = self._from_base(spline, ref.T_world_base, image.exposure)
+            # Moving closer or turning packs more points into a block than its share.
+            scaling = self._scaling(points, lens, ref.lens.camera, ref, STRIDES[level], 4)
+            constants = e.upload(np.append(scaling.parameters(sigma, self.gate_intensity), brightness))
+            seen_at = self._ref_lines(spline, ref), image.levels[level], from_base
+            shown = points.visible if visible is None else visible
             given = PhotometricInput(points.x, points.y, points.z, points.intensity, shown, *seen_at, constants)
             raw = kernel(given).numpy()
-        current, reference, per, ref_per = block_counts(lens, ref.lens)
-        sums = scaling.unpack(raw, current, reference)
-        times = image.exposure.block_times(per)
-        return self._finish(
-            sums, slopes_at or spline, ref, times, ref_per, sigma, self.floor_intensity, points.median_depth,
-            brightness, expected,
-        )  # fmt: skip
+            current, reference, per, ref_per = block_counts(lens, ref.lens)
+            sums = scaling.unpack(raw, current, reference)
+            times = image.exposure.block_times(per)
+            return self._finish(
+                sums, slopes_at or spline, ref, times, ref_per, sigma, self.floor_intensity, points.median_depth,
+                brightness, expected,
+            )  # fmt: skip
 
     def _to_base(self, spline: Spline, T_world_base: FloatArray, exposure: Exposure) -> Any:
         with self.timer("poses of lines"):

@@ -160,7 +160,3 @@ def info(sequence: SequenceFolder, *, camera: CameraFile = None) -> int:
 
     print(describe(open_dataset(sequence, camera)))
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

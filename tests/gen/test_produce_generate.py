@@ -387,10 +387,11 @@ def test_nonsense_frames_are_refused(text: str) -> None:
 def test_pictures_bear_any_sizes_and_views_of_nothing(
     tmp_path: Path, shapes: tuple[tuple[int, int], tuple[int, int]], distance: float
 ) -> None:
-    from rsgen import figures
+    from rsgen.figures import save
+    from rsgen.pictures.figures import comparison, preview
 
     color = [np.full((*shapes[0], 3), 90, np.uint8)] * 2
     depth = [np.full(shapes[1], distance, np.float32)] * 2
-    figures.save(figures.preview(color, depth, "preview"), tmp_path / "p.png")
-    figures.save(figures.comparison((color[0], color[1]), (depth[0], depth[1]), "comparison"), tmp_path / "c.png")
+    save(preview(color, depth, "preview"), tmp_path / "p.png")
+    save(comparison((color[0], color[1]), (depth[0], depth[1]), "comparison"), tmp_path / "c.png")
     assert all(cv2.imread(str(tmp_path / name)).std() > 10 for name in ("p.png", "c.png"))
