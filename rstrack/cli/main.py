@@ -15,7 +15,7 @@ from rstrack.cli.bench import bench_bootstrap, bench_convergence, bench_speed, s
 from rstrack.cli.bench_methods import STATUS as BENCH_STATUS
 from rstrack.cli.bench_methods import bench
 from rstrack.cli.mapping import keyframes, map_, map_eval
-from rstrack.cli.options import CameraFile, Run, SequenceFolder
+from rstrack.cli.options import CameraFile, Run, SequenceFolder, TruthOffset
 from rstrack.cli.report import report
 from rstrack.options import Options
 
@@ -113,10 +113,11 @@ def track(
 
 
 def evaluate(
-    sequence: SequenceFolder,
+    sequence: Annotated[Path, "rsgen sequence, TUM RGB-D or ICL-NUIM folder; or a TUM file of true poses"],
     run: Run,
     *,
     camera: CameraFile = None,
+    truth_offset: TruthOffset = None,
     against: Annotated[
         Path | None,
         "another run of the sequence: ends with one line that compares the two, for example of gs-pg",
@@ -125,16 +126,17 @@ def evaluate(
     json: Json = False,
 ) -> int:
     """Errors of a run against the ground truth: ATE, drift per second, lines' poses."""
-    from rstrack.metrics.evaluate import compared, run_evaluate
+    from rstrack.metrics.evaluate import compared
+    from rstrack.metrics.run_evaluate import run_evaluate
 
-    metrics = run_evaluate(sequence, run, camera)
-    theirs = None if against is None else run_evaluate(sequence, against, camera)
+    ours = run_evaluate(sequence, run, camera, truth_offset)
+    theirs = None if against is None else run_evaluate(sequence, against, camera, truth_offset)
     if json:
-        print(dumps(metrics.as_dict() | ({"against": theirs.as_dict()} if theirs else {}), indent=2))
+        print(dumps(ours.as_dict() | ({"against": theirs.as_dict()} if theirs else {}), indent=2))
     else:
-        print(metrics.text())
+        print(ours.text())
         if against is not None and theirs is not None:
-            print(f"\n{compared(run, metrics, against, theirs)}")
+            print(f"\n{compared(run, ours.chosen, against, theirs.chosen)}")
     return 0
 
 
@@ -143,12 +145,13 @@ def plot(
     run: Run,
     *,
     camera: CameraFile = None,
+    truth_offset: TruthOffset = None,
     out: Annotated[Path, "png, pdf or svg file to write", "FILE"],
 ) -> int:
     """Picture of a run: path, errors over time, inliers."""
     from rstrack.charts.runs import run_plot
 
-    run_plot(sequence, run, out, camera)
+    run_plot(sequence, run, out, camera, truth_offset)
     print(f"{out}: written")
     return 0
 

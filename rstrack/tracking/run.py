@@ -31,7 +31,8 @@ from rstrack.data.noise import with_noise
 from rstrack.data.prefetch import prefetched
 from rstrack.data.rig import Frame, Rig
 from rstrack.metrics.association import Truth, compare, truth_of
-from rstrack.metrics.evaluate import Metrics, evaluate
+from rstrack.metrics.evaluate import Metrics
+from rstrack.metrics.run_evaluate import Evaluation, evaluate_clocks
 from rstrack.options import Options
 
 if TYPE_CHECKING:
@@ -88,14 +89,19 @@ class Result:
     """What a run came to.
 
     end: why it stopped; `error` says where the tracker broke down, or which image could not be read. lost: number of
-    frames. metrics: None without a truth, or with too few poses.
+    frames. evaluation: None without a truth, or with too few poses.
     """
 
     estimate: Estimate
-    metrics: Metrics | None
+    evaluation: Evaluation | None
     end: End
     error: str
     lost: int
+
+    @property
+    def metrics(self) -> Metrics | None:
+        """Errors with the truth's clock as it is."""
+        return None if self.evaluation is None else self.evaluation.metrics
 
     def text(self) -> str:
         """A summary of a few lines, with the metrics if there is a truth."""
@@ -112,7 +118,7 @@ class Result:
         weak = sum(not f["lost"] and 0.0 < f["observability"] < _WEAK for f in info["frames"])
         if weak and info["method"] in ("rs-g", "gs-g", "baseline"):
             lines.append(f"in {weak} of {done} frames the geometry hardly fixes all six degrees of freedom (a wall?)")
-        return "\n".join(lines + ([] if self.metrics is None else ["", self.metrics.text()]))
+        return "\n".join(lines + ([] if self.evaluation is None else ["", self.evaluation.text()]))
 
 
 def make_tracker(rig: Rig, options: Options, timer: Timer | None = None) -> AnyTracker:
@@ -203,10 +209,11 @@ def track(
         "frames": _diagnostics(stamps, tracker.reports),
     }
     estimate = Estimate(*tracker.trajectory, tracker.spline, info)
-    metrics = _metrics(truth, estimate)
-    info["metrics"] = None if metrics is None else metrics.as_dict()
+    evaluation = _evaluation(truth, estimate)
+    info["metrics"] = None if evaluation is None else evaluation.metrics.as_dict()
+    info["truth_offset"] = None if evaluation is None else evaluation.truth_offset
     write_estimate(out, estimate.stamps, estimate.T_world_depth, estimate.spline, info)
-    return Result(estimate, metrics, end, error, info["lost"])
+    return Result(estimate, evaluation, end, error, info["lost"])
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -266,10 +273,10 @@ def _error_note(truth: Truth | None, poses: tuple[FloatArray, FloatArray]) -> st
     return f", ATE {1e3 * np.sqrt(np.mean(errors**2)):.2f} mm"
 
 
-def _metrics(truth: Truth | None, estimate: Estimate) -> Metrics | None:
+def _evaluation(truth: Truth | None, estimate: Estimate) -> Evaluation | None:
     """None also where fewer than three poses have a true counterpart."""
     try:
-        return None if truth is None else evaluate(truth, estimate)
+        return None if truth is None else evaluate_clocks(truth, estimate)
     except UserError:
         return None
 
