@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from rsgen.console.command_line import Commands, Frames, Json, Parser, Quiet, run_program
-from rsgen.errors import UserError
 from rstrack.cli.bench import bench_bootstrap, bench_convergence, bench_speed, stress
 from rstrack.cli.bench_methods import STATUS as BENCH_STATUS
 from rstrack.cli.bench_methods import bench
@@ -30,10 +29,13 @@ rstrack estimates the continuous-time trajectory of a rolling-shutter RGB-D came
   rstrack map out/demo runs/demo --out mesh.ply        the surfaces that it saw, as a coloured mesh
   rstrack bench --quick                                every method on some sequences, beside the paper's figures
 
-A sequence is a folder that 'rsgen render' wrote, or a TUM RGB-D or ICL-NUIM folder; those need their cameras in a
-camera.yaml or calibration.yaml inside, or in the file that --camera names.
+A sequence is a folder that 'rsgen render' wrote, or a TUM RGB-D, ICL-NUIM or 7-Scenes folder; the first two of those
+need their cameras in a camera.yaml or calibration.yaml inside, or in the file that --camera names.
 """
-_STATUS = "exit status: 0 done, 1 frames were lost, 2 wrong input, 130 interrupted (what there is has been written)"
+_STATUS = (
+    "exit status: 0 done, 1 frames were lost or cannot be read, 2 wrong input, 130 interrupted (what there is has been "
+    "written)"
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -104,16 +106,14 @@ def track(
     if result.end == "interrupted":
         print("rstrack: interrupted; the frames before are in the run folder", file=sys.stderr)
         return 130
-    if result.end == "unreadable":
-        raise UserError(f"{result.error}; the frames before it are in {out}")
     if result.end == "broke down":
         print(f"rstrack: {result.error}; the frames before it are in {out}", file=sys.stderr)
         return 1
-    return 1 if result.lost else 0
+    return 1 if result.lost or result.unreadable else 0
 
 
 def evaluate(
-    sequence: Annotated[Path, "rsgen sequence, TUM RGB-D or ICL-NUIM folder; or a TUM file of true poses"],
+    sequence: Annotated[Path, "rsgen sequence, TUM RGB-D, ICL-NUIM or 7-Scenes folder; or a TUM file of true poses"],
     run: Run,
     *,
     camera: CameraFile = None,

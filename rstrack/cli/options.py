@@ -5,8 +5,8 @@ from typing import Annotated, Literal
 
 from rsgen.console.command_line import number
 
-SequenceFolder = Annotated[Path, "rsgen sequence, TUM RGB-D or ICL-NUIM folder"]
-CameraFile = Annotated[Path | None, "cameras of a TUM or ICL-NUIM folder (default: one inside it)", "FILE"]
+SequenceFolder = Annotated[Path, "rsgen sequence, TUM RGB-D, ICL-NUIM or 7-Scenes folder"]
+CameraFile = Annotated[Path | None, "cameras of a folder that is no rsgen sequence (default: one inside it)", "FILE"]
 
 
 def truth_offset(text: str) -> float | Literal["auto"]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -86,18 +87,18 @@ def fit_clock(truth: Truth, estimate: Estimate, seed: int = 0) -> ClockFit:
     errors = _Errors.of(truth, estimate)
     coarse = _steps(SEARCH_S, _COARSE_S)
     curves = np.stack([errors.drift(tau).mean(axis=-1) for tau in coarse])
-    least: dict[Criterion, float] = {}
+    least: dict[str, float] = {}
     for c, name in enumerate(CRITERIA):
         k = int(np.argmin(curves[:, c]))
         if 0 < k < len(coarse) - 1:
-            least[name] = _brent(lambda tau, c=c: float(errors.drift(tau)[c].mean()), coarse, k)
+            least[name] = _brent(partial(errors.mean_drift, c), coarse, k)
     if not least:
         raise UserError(
             f"estimate: its errors have no minimum within {1e3 * SEARCH_S:g} ms of clock offset: give the offset in "
             "seconds, or mend the track first"
         )
-    sigma = {name: errors.deviation(CRITERIA.index(name), tau, seed) for name, tau in least.items()}
-    best = min(least, key=lambda name: sigma[name])
+    sigma = {name: errors.deviation(c, least[name], seed) for c, name in enumerate(CRITERIA) if name in least}
+    best = min((name for name in CRITERIA if name in least), key=lambda name: sigma[name])
     trajectory = [errors.trajectory(tau) for tau in coarse]
     k = int(np.clip(np.argmin(trajectory), 1, len(coarse) - 2))
     return ClockFit(least[best], sigma[best], best, {**least, "trajectory": _brent(errors.trajectory, coarse, k)})
@@ -148,6 +149,10 @@ class _Errors:
         distance = np.linalg.norm((se3.inverse(true_step) @ est_step)[:, :3, 3], axis=1)
         return np.stack([angles_deg(true_step, est_step), distance])
 
+    def mean_drift(self, criterion: int, tau: float) -> float:
+        """Mean of a row of `drift`."""
+        return float(self.drift(tau)[criterion].mean())
+
     def trajectory(self, tau: float) -> float:
         """Mean distance after alignment, m."""
         T_true = self.true_poses(tau)
@@ -174,7 +179,7 @@ class _Errors:
 
 def _steps(reach: float, step: float) -> FloatArray:
     count = round(reach / step)
-    return np.arange(-count, count + 1) * step
+    return np.asarray(np.arange(-count, count + 1) * step, np.float64)
 
 
 def _brent(cost: Callable[[float], float], grid: FloatArray, k: int) -> float:
