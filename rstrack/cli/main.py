@@ -16,6 +16,7 @@ from rstrack.cli.bench_methods import bench
 from rstrack.cli.mapping import keyframes, map_, map_eval
 from rstrack.cli.options import CameraFile, Run, SequenceFolder, TruthOffset
 from rstrack.cli.report import report
+from rstrack.cli.sensitivity import sensitivity
 from rstrack.options import Options
 
 _DESCRIPTION = """\
@@ -71,6 +72,7 @@ def _parser() -> Parser:
     add(bench_speed, "out/lr_kt2 --frames 150 --method rs-pg")
     add(bench_convergence, "out/lr_kt2 --pairs 50 --method rs-pg")
     add(bench_bootstrap, "out/lr_kt2 --starts 50 --frames 20")
+    add(sensitivity, "out/demo --method rs-pg --frames 0:60 --out sensitivity.json")
     add(stress, "stress --out runs/stress --frames 60")
     return commands.parser
 
