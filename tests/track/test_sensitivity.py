@@ -276,7 +276,7 @@ def test_a_table_of_every_case_that_resumes(
     words = [
         "sensitivity",
         str(sequence),
-        *["--method", "gs-g", "--quiet", "--frames", "1:8", "--out"],
+        *["--method", "baseline", "--quiet", "--frames", "1:8", "--out"],
         str(tmp_path / "t.md"),
     ]
     assert main(words) == 130 and len(json.loads((tmp_path / "t.json").read_text())["scores"]) == 3
