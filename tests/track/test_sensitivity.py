@@ -255,7 +255,7 @@ def test_kinds_are_drawn_and_short_recordings_refused(dataset: Dataset) -> None:
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("table")
-    writer = synthetic.open_writer(folder / "seq", synthetic.make_config(80, 60), 8, synthetic.make_spline(0.3))
+    writer = synthetic.open_writer(folder / "seq", synthetic.make_config(160, 120), 8, synthetic.make_spline(0.3))
     synthetic.write_frames(writer)
     writer.finish()
     return folder / "seq"
@@ -276,7 +276,7 @@ def test_a_table_of_every_case_that_resumes(
     words = [
         "sensitivity",
         str(sequence),
-        *["--method", "baseline", "--quiet", "--frames", "1:8", "--out"],
+        *["--method", "rs-g", "--quiet", "--frames", "1:8", "--out"],
         str(tmp_path / "t.md"),
     ]
     assert main(words) == 130 and len(json.loads((tmp_path / "t.json").read_text())["scores"]) == 3
@@ -284,7 +284,7 @@ def test_a_table_of_every_case_that_resumes(
     assert main(words) == 0 and len(tracked) == 4 + 15
     out = capfd.readouterr().out.splitlines()
     scores = json.loads((tmp_path / "t.json").read_text())["scores"]
-    assert out[0] == "baseline on synthetic, frames 1 to 7" and out[2].split()[:2] == ["case", "ATE,"]
+    assert out[0] == "rs-g on synthetic, frames 1 to 7" and out[2].split()[:2] == ["case", "ATE,"]
     assert len(out) == 3 + len(scores) == 21 and scores[0]["case"] == "untouched"
     assert out[3].split()[-2:] == [str(scores[0]["lost"]), "7"] and out[3].split()[2] == "1.000"
     assert f"{1e3 * scores[5]['ate_m']:.3f}" in out[8]
