@@ -11,10 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rsgen.array_types import ByteArray, Float32Array, FloatArray
 from rsgen.geometry.shutter import Shutter
 from rstrack.bench.sensitivity.changes import (
-    Color,
-    Depth,
     reduced,
     reordered,
     with_color,
@@ -72,7 +71,7 @@ def color_late(dataset: Dataset, seconds: float) -> Dataset:
 def jittered(dataset: Dataset, rms_s: float, seed: int) -> Dataset:
     """Stamps of both streams with independent Gaussian errors; none passes another: at most 0.4 of the least step."""
 
-    def noise(stamps: np.ndarray, stream: int) -> np.ndarray:
+    def noise(stamps: FloatArray, stream: int) -> FloatArray:
         most = 0.4 * float(np.diff(stamps).min(initial=np.inf)) if len(stamps) > 1 else np.inf
         errors = np.random.default_rng([seed, stream]).normal(0.0, rms_s, len(stamps))
         return np.asarray(stamps + np.clip(errors, -most, most))
@@ -90,7 +89,7 @@ def readout_told(dataset: Dataset, shift_s: float = 0.0, factor: float = 1.0) ->
 
 
 def depth_told_global(dataset: Dataset) -> Dataset:
-    """Depth taken to be of its stamp, as registered depth was without times of its rows."""
+    """Float32Array taken to be of its stamp, as registered depth was without times of its rows."""
     shutter = dataset.rig.depth_shutter
     return replace(dataset, rig=replace(dataset.rig, depth_shutter=Shutter(0.0, shutter.exposure_s, shutter.scan)))
 
@@ -98,7 +97,7 @@ def depth_told_global(dataset: Dataset) -> Dataset:
 def depth_in_blocks(dataset: Dataset, seed: int) -> Dataset:
     """Every block of depth missing with a chance of one half, others in every frame."""
 
-    def holed(k: int, z: Depth) -> Depth:
+    def holed(k: int, z: Float32Array) -> Float32Array:
         size = max(1, round(_BLOCK * z.shape[1]))
         shape = -(-z.shape[0] // size), -(-z.shape[1] // size)
         kept = np.random.default_rng([seed, k, 2]).random(shape) < 0.5
@@ -117,12 +116,12 @@ def swinging_gain(dataset: Dataset, swing: float, period_s: float = 1.0) -> Data
     """Colours times 1 + swing · sin(2π t / period), t from the first image's stamp."""
     stamps = dataset.color_stamps
 
-    def change(k: int, pixels: Color) -> Color:
+    def change(k: int, pixels: ByteArray) -> ByteArray:
         return gained(pixels, 1.0 + swing * float(np.sin(2.0 * np.pi * (stamps[k] - stamps[0]) / period_s)))
 
     return with_color(dataset, change)
 
 
-def gained(pixels: Color, gain: float) -> Color:
+def gained(pixels: ByteArray, gain: float) -> ByteArray:
     """Grey values times a gain, rounded and saturated."""
     return np.clip(np.rint(pixels * np.float32(gain)), 0, 255).astype(np.uint8)

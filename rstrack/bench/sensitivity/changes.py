@@ -12,21 +12,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from rsgen.array_types import ByteArray, Float32Array, FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.geometry.so3 import FloatArray
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.dataset import Dataset, ImageReader, group_colors
 from rstrack.data.rig import Rig
 from rstrack.metrics.association import true_poses, truth_of
 
-Color = npt.NDArray[np.uint8]
-Depth = npt.NDArray[np.float32]
-ColorChange = Callable[[int, Color], Color]
-DepthChange = Callable[[int, Depth], Depth]
+ColorChange = Callable[[int, ByteArray], ByteArray]
+DepthChange = Callable[[int, Float32Array], Float32Array]
 
 
 @dataclass(frozen=True)
@@ -39,18 +36,18 @@ class _Changed:
     shown_color: tuple[int, ...]
     shown_depth: tuple[int, ...]
 
-    def color(self, k: int) -> Color:
+    def color(self, k: int) -> ByteArray:
         return self.change_color(k, self.source.color(self.shown_color[k]))
 
-    def depth(self, k: int) -> Depth:
+    def depth(self, k: int) -> Float32Array:
         return self.change_depth(k, self.source.depth(self.shown_depth[k]))
 
 
-def _same_color(_: int, pixels: Color) -> Color:
+def _same_color(_: int, pixels: ByteArray) -> ByteArray:
     return pixels
 
 
-def _same_depth(_: int, z: Depth) -> Depth:
+def _same_depth(_: int, z: Float32Array) -> Float32Array:
     return z
 
 
@@ -123,10 +120,10 @@ def reduced(dataset: Dataset, factor: int) -> Dataset:
     depth_camera, depth_shutter, depth_late = _reduced(rig.depth_camera, rig.depth_shutter, factor, 0.0)
     color_camera, color_shutter, color_late = _reduced(rig.color_camera, rig.color_shutter, factor, centre)
 
-    def fewer(_: int, z: Depth) -> Depth:
+    def fewer(_: int, z: Float32Array) -> Float32Array:
         return np.ascontiguousarray(z[::factor, ::factor][: depth_camera.height, : depth_camera.width])
 
-    def mean(_: int, pixels: Color) -> Color:
+    def mean(_: int, pixels: ByteArray) -> ByteArray:
         h, w = color_camera.height, color_camera.width
         blocks = pixels[: h * factor, : w * factor].reshape(h, factor, w, factor, 3)
         return np.rint(blocks.mean(axis=(1, 3), dtype=np.float32)).astype(np.uint8)

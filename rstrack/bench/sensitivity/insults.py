@@ -14,8 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rsgen.array_types import ByteArray, Float32Array
 from rsgen.errors import UserError
-from rstrack.bench.sensitivity.changes import Color, Depth, reordered, with_color, with_depth
+from rstrack.bench.sensitivity.changes import reordered, with_color, with_depth
 from rstrack.data.dataset import Dataset
 
 # Frames before the first insult, for the tracker to begin with, and after the last one, to be found again.
@@ -96,12 +97,12 @@ def bare_wall(dataset: Dataset, first: int, count: int) -> Dataset:
     """A wall in front of the camera in frames [first, first + count): one depth and one colour, their medians."""
     _check(dataset, first, count)
 
-    def flat(k: int, z: Depth) -> Depth:
+    def flat(k: int, z: Float32Array) -> Float32Array:
         if not (first <= k < first + count and (z > 0).any()):
             return z
         return np.where(z > 0, np.float32(np.median(z[z > 0])), np.float32(0))
 
-    def plain(pixels: Color) -> Color:
+    def plain(pixels: ByteArray) -> ByteArray:
         return np.broadcast_to(np.median(pixels, axis=(0, 1)).astype(np.uint8), pixels.shape).copy()
 
     return with_depth(_with_colors(dataset, first, count, plain), flat)
@@ -159,7 +160,7 @@ def _check(dataset: Dataset, first: int, count: int) -> None:
         )
 
 
-def _with_colors(dataset: Dataset, first: int, count: int, change: Callable[[Color], Color]) -> Dataset:
+def _with_colors(dataset: Dataset, first: int, count: int, change: Callable[[ByteArray], ByteArray]) -> Dataset:
     """With the colour images of frames [first, first + count) changed."""
     _check(dataset, first, count)
     touched = frozenset(i for group in dataset.groups[first : first + count] for i in group)
