@@ -89,7 +89,7 @@ def readout_told(dataset: Dataset, shift_s: float = 0.0, factor: float = 1.0) ->
 
 
 def depth_told_global(dataset: Dataset) -> Dataset:
-    """Float32Array taken to be of its stamp, as registered depth was without times of its rows."""
+    """Depth taken to be of its stamp, as registered depth was without times of its rows."""
     shutter = dataset.rig.depth_shutter
     return replace(dataset, rig=replace(dataset.rig, depth_shutter=Shutter(0.0, shutter.exposure_s, shutter.scan)))
 
