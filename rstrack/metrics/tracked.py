@@ -57,7 +57,7 @@ def load_run(
 
     sequence: the folder where the sequence is; by default the one that run.json names, and if that is gone there is no
     comparison. dataset: the same, already open. truth_offset: of the truth's clock, see `run_evaluate.aligned_clock`.
-    Raises UserError: no run, or a given sequence cannot be read.
+    Raises UserError: no run, a given sequence cannot be read, no such offset is found.
     """
     estimate = read_estimate(run)
     notes: list[str] = []
@@ -69,8 +69,8 @@ def load_run(
     if truth is None:
         notes.append(f"The sequence {dataset.name} has no ground truth, so there are no errors to show.")
         return Tracked(estimate, dataset, notes=tuple(notes))
+    truth = aligned_clock(truth, estimate, truth_offset)
     try:
-        truth = aligned_clock(truth, estimate, truth_offset)
         found = compare(truth, estimate)
     except UserError as error:
         return Tracked(estimate, dataset, truth, notes=(*notes, f"No errors: {error}."))

@@ -286,10 +286,10 @@ def test_a_table_of_every_case_that_resumes(
     scores = json.loads((tmp_path / "t.json").read_text())["scores"]
     assert out[0] == "rs-g on synthetic, frames 1 to 7" and out[2].split()[:2] == ["case", "ATE,"]
     assert len(out) == 3 + len(scores) == 21 and scores[0]["case"] == "untouched"
-    assert out[3].split()[-2:] == [str(scores[0]["lost"]), "7"] and out[3].split()[2] == "1.000"
+    assert out[3].split()[-2:] == [str(scores[0]["lost"]), "7"] and out[3].split()[2] == "1.00"
     assert f"{1e3 * scores[5]['ate_m']:.3f}" in out[8]
     table = (tmp_path / "t.md").read_text().splitlines()
-    assert table[3].count("|") == table[4].count("|") == 8 and len(table) == 4 + len(scores)
+    assert table[2].count("|") == table[3].count("|") == 8 and len(table) == 4 + len(scores)
     # Other settings begin anew, other files stay.
     assert len(run_sensitivity(open_dataset(sequence), Options(method="baseline"), slice(0, 4)).scores) == 18
     (tmp_path / "t.json").write_text("{}")

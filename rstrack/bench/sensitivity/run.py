@@ -9,12 +9,13 @@ from __future__ import annotations
 import dataclasses
 import json
 import tempfile
-from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from rsgen.console.progress import Progress, no_progress
+from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
 from rsgen.files import atomic_write
 from rstrack.bench.sensitivity.cases import Case, cases
@@ -23,7 +24,7 @@ from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import plain
 from rstrack.metrics.association import truth_of
 from rstrack.options import Options
-from rstrack.tracking.run import Progress, track
+from rstrack.tracking.run import track
 
 _HEAD = ("case", "ATE, mm", "x untouched", "drift, mm/s", "drift, deg/s", "lost", "of frames")
 
@@ -53,23 +54,19 @@ class Sensitivity:
 
     def text(self) -> str:
         """A table for the screen."""
-        rows = self._rows()
-        left = max(len(row[0]) for row in rows)
-        lines = ["".join([f"{row[0]:<{left}}", *(f"{value:>14}" for value in row[1:])]) for row in rows]
-        return "\n".join([self._title(), "", *lines])
+        return f"{self._title()}\n\n{self._table().text()}"
 
     def markdown(self) -> str:
         """The same table."""
-        head, *rows = ["| " + " | ".join(row) + " |" for row in self._rows()]
-        return "\n".join([f"# {self._title()}", "", head, "|---|" + "---:|" * (len(_HEAD) - 1), *rows]) + "\n"
+        return f"# {self._title()}\n\n{self._table().markdown()}\n"
 
     def _title(self) -> str:
         begin, end = self.settings["frames"]
         return f"{self.settings['options']['method']} on {self.settings['dataset']}, frames {begin} to {end - 1}"
 
-    def _rows(self) -> list[tuple[str, ...]]:
+    def _table(self) -> Table:
         base = self.scores[0].ate_m if self.scores else None
-        return [_HEAD, *(_row(score, base) for score in self.scores)]
+        return Table(_HEAD, tuple(_row(score, base) for score in self.scores))
 
 
 def run_sensitivity(
@@ -78,7 +75,7 @@ def run_sensitivity(
     frames: slice = slice(None),
     seed: int = 0,
     out: Path | None = None,
-    progress: Progress = lambda *_: None,
+    progress: Progress = no_progress,
 ) -> Sensitivity:
     """Track every case of `cases` over some frames.
 
@@ -152,9 +149,5 @@ def _kept(path: Path, settings: dict[str, Any]) -> dict[str, Score]:
 
 def _row(score: Score, base: float | None) -> tuple[str, ...]:
     ratio = score.ate_m / base if score.ate_m is not None and base else None
-    values = _numbers((score.ate_m, 1e3), (ratio, 1.0), (score.drift_m_per_s, 1e3), (score.drift_deg_per_s, 1.0))
-    return (score.case, *values, str(score.lost), str(score.frames))
-
-
-def _numbers(*values: tuple[float | None, float]) -> Sequence[str]:
-    return ["-" if value is None else f"{value * scale:.3f}" for value, scale in values]
+    drift = fixed(score.drift_m_per_s, 3, 1e3), fixed(score.drift_deg_per_s, 3)
+    return (score.case, fixed(score.ate_m, 3, 1e3), fixed(ratio, 2), *drift, str(score.lost), str(score.frames))
