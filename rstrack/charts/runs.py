@@ -25,19 +25,23 @@ from rstrack.charts.chart import (
     method_colors,
 )
 from rstrack.charts.to_file import write_charts
+from rstrack.metrics.clock import TruthOffset
 from rstrack.metrics.evaluate import drift, evaluate
 from rstrack.metrics.tracked import Tracked, load_run, true_path
 
 BLUE, ORANGE = COLORS[:2]
 
 
-def run_plot(seq_path: Path | None, run: Path, out: Path, camera_file: Path | None = None) -> None:
+def run_plot(
+    seq_path: Path | None, run: Path, out: Path, camera_file: Path | None = None,
+    truth_offset: TruthOffset | None = None,
+) -> None:  # fmt: skip
     """Draw a run folder or TUM file into a png, pdf or svg file, against the truth where there is a sequence with one.
 
     Always: the path seen from above. With a truth: the true path too, and errors after alignment. With frames in
-    run.json: inliers, keyframes and lost frames. Arguments as in `read_estimate` and `open_dataset`. Raises UserError.
+    run.json: inliers, keyframes and lost frames. Arguments as in `load_run`. Raises UserError.
     """
-    tracked = load_run(run, seq_path, camera_file)
+    tracked = load_run(run, seq_path, camera_file, truth_offset=truth_offset)
     name = Path(run).resolve().stem if tracked.dataset is None else tracked.dataset.name
     charts: list[Chart | PathChart] = [
         path_chart({"estimated": tracked}),

@@ -29,6 +29,7 @@ def describe(dataset: Dataset) -> str:
         ("colour", f"{_relative_pose(rig.T_color_depth)} from the depth camera"),
         ("frames", f"{len(dataset)}, {_groups(dataset)}"),
         ("truth", _truth(dataset)),
+        *(("note", note) for note in dataset.notes),
     ]
     return "\n".join(f"{label:<8} {text}" for label, text in rows)
 

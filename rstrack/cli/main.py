@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from rsgen.console.command_line import Commands, Frames, Json, Parser, Quiet, run_program
-from rsgen.errors import UserError
 from rstrack.cli.bench import bench_bootstrap, bench_convergence, bench_speed, stress
 from rstrack.cli.bench_methods import STATUS as BENCH_STATUS
 from rstrack.cli.bench_methods import bench
 from rstrack.cli.mapping import keyframes, map_, map_eval
-from rstrack.cli.options import CameraFile, Run, SequenceFolder
+from rstrack.cli.options import CameraFile, Run, SequenceFolder, TruthOffset
 from rstrack.cli.report import report
+from rstrack.cli.sensitivity import sensitivity
 from rstrack.options import Options
 
 _DESCRIPTION = """\
@@ -30,10 +30,13 @@ rstrack estimates the continuous-time trajectory of a rolling-shutter RGB-D came
   rstrack map out/demo runs/demo --out mesh.ply        the surfaces that it saw, as a coloured mesh
   rstrack bench --quick                                every method on some sequences, beside the paper's figures
 
-A sequence is a folder that 'rsgen render' wrote, or a TUM RGB-D or ICL-NUIM folder; those need their cameras in a
-camera.yaml or calibration.yaml inside, or in the file that --camera names.
+A sequence is a folder that 'rsgen render' wrote, or a TUM RGB-D, ICL-NUIM or 7-Scenes folder; the first two of those
+need their cameras in a camera.yaml or calibration.yaml inside, or in the file that --camera names.
 """
-_STATUS = "exit status: 0 done, 1 frames were lost, 2 wrong input, 130 interrupted (what there is has been written)"
+_STATUS = (
+    "exit status: 0 done, 1 frames were lost or cannot be read, 2 wrong input, 130 interrupted (what there is has been "
+    "written)"
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -69,6 +72,7 @@ def _parser() -> Parser:
     add(bench_speed, "out/lr_kt2 --frames 150 --method rs-pg")
     add(bench_convergence, "out/lr_kt2 --pairs 50 --method rs-pg")
     add(bench_bootstrap, "out/lr_kt2 --starts 50 --frames 20")
+    add(sensitivity, "out/demo --method rs-pg --frames 0:60 --out sensitivity.json")
     add(stress, "stress --out runs/stress --frames 60")
     return commands.parser
 
@@ -104,19 +108,18 @@ def track(
     if result.end == "interrupted":
         print("rstrack: interrupted; the frames before are in the run folder", file=sys.stderr)
         return 130
-    if result.end == "unreadable":
-        raise UserError(f"{result.error}; the frames before it are in {out}")
     if result.end == "broke down":
         print(f"rstrack: {result.error}; the frames before it are in {out}", file=sys.stderr)
         return 1
-    return 1 if result.lost else 0
+    return 1 if result.lost or result.unreadable else 0
 
 
 def evaluate(
-    sequence: SequenceFolder,
+    sequence: Annotated[Path, "rsgen sequence, TUM RGB-D, ICL-NUIM or 7-Scenes folder; or a TUM file of true poses"],
     run: Run,
     *,
     camera: CameraFile = None,
+    truth_offset: TruthOffset = None,
     against: Annotated[
         Path | None,
         "another run of the sequence: ends with one line that compares the two, for example of gs-pg",
@@ -125,16 +128,17 @@ def evaluate(
     json: Json = False,
 ) -> int:
     """Errors of a run against the ground truth: ATE, drift per second, lines' poses."""
-    from rstrack.metrics.evaluate import compared, run_evaluate
+    from rstrack.metrics.evaluate import compared
+    from rstrack.metrics.run_evaluate import run_evaluate
 
-    metrics = run_evaluate(sequence, run, camera)
-    theirs = None if against is None else run_evaluate(sequence, against, camera)
+    ours = run_evaluate(sequence, run, camera, truth_offset)
+    theirs = None if against is None else run_evaluate(sequence, against, camera, truth_offset)
     if json:
-        print(dumps(metrics.as_dict() | ({"against": theirs.as_dict()} if theirs else {}), indent=2))
+        print(dumps(ours.as_dict() | ({"against": theirs.as_dict()} if theirs else {}), indent=2))
     else:
-        print(metrics.text())
+        print(ours.text())
         if against is not None and theirs is not None:
-            print(f"\n{compared(run, metrics, against, theirs)}")
+            print(f"\n{compared(run, ours.chosen, against, theirs.chosen)}")
     return 0
 
 
@@ -143,12 +147,13 @@ def plot(
     run: Run,
     *,
     camera: CameraFile = None,
+    truth_offset: TruthOffset = None,
     out: Annotated[Path, "png, pdf or svg file to write", "FILE"],
 ) -> int:
     """Picture of a run: path, errors over time, inliers."""
     from rstrack.charts.runs import run_plot
 
-    run_plot(sequence, run, out, camera)
+    run_plot(sequence, run, out, camera, truth_offset)
     print(f"{out}: written")
     return 0
 

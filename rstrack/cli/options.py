@@ -1,8 +1,24 @@
 """Arguments that several `rstrack` commands share."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
-SequenceFolder = Annotated[Path, "rsgen sequence, TUM RGB-D or ICL-NUIM folder"]
-CameraFile = Annotated[Path | None, "cameras of a TUM or ICL-NUIM folder (default: one inside it)", "FILE"]
+from rsgen.console.command_line import number
+
+SequenceFolder = Annotated[Path, "rsgen sequence, TUM RGB-D, ICL-NUIM or 7-Scenes folder"]
+CameraFile = Annotated[Path | None, "cameras of a folder that is no rsgen sequence (default: one inside it)", "FILE"]
+
+
+def truth_offset(text: str) -> float | Literal["auto"]:
+    """A number of seconds, or 'auto'."""
+    return "auto" if text == "auto" else number(text)
+
+
+TruthOffset = Annotated[
+    float | Literal["auto"] | None,
+    "seconds after a stamp that the truth is looked up, or auto: those at which the drift is least, for a truth with a "
+    "clock of its own (default: the same clock)",
+    "auto|S",
+    truth_offset,
+]
 Run = Annotated[Path, "folder that 'rstrack track' wrote, or a TUM file"]

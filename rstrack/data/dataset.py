@@ -1,4 +1,4 @@
-"""Datasets: rsgen sequences, and TUM RGB-D / ICL-NUIM folders, as frames of one depth image and its colour images.
+"""Datasets: rsgen sequences, TUM RGB-D, ICL-NUIM and 7-Scenes folders, as frames of a depth image and its colours.
 
 dataset = open_dataset(Path("out/lr_kt2"))
 for frame in dataset.frames():
@@ -7,10 +7,10 @@ for frame in dataset.frames():
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +23,7 @@ from rsgen.sequence.reader import Sequence, read_sequence
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.prefetch import prefetched
 from rstrack.data.rig import Frame, Image, Rig
+from rstrack.data.seven_scenes import is_seven_scenes, read_seven_scenes
 from rstrack.data.tum_folder import read_tum_folder
 
 __all__ = ["Dataset", "Frame", "Image", "Rig", "group_colors", "open_dataset"]
@@ -48,7 +49,7 @@ class Dataset:
     stamps: (n,) seconds, one for each depth image, strictly increasing. color_stamps: (m,) seconds, increasing.
     groups: for each frame the indices of its colour images.
     truth: T_world_depth(t), of rsgen sequences. truth_poses: T_world_depth, of other folders that have it.
-    sequence: the rsgen sequence itself, where it is one.
+    sequence: the rsgen sequence itself, where it is one. notes: what had to be assumed when it was read.
     """
 
     name: str
@@ -61,6 +62,7 @@ class Dataset:
     truth: Spline | None = None
     truth_poses: Trajectory | None = None
     sequence: Sequence | None = None
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -75,6 +77,27 @@ class Dataset:
         depth = Image(float(self.stamps[k]), self.images.depth(k))
         colors = tuple(Image(float(self.color_stamps[i]), self.images.color(i)) for i in self.groups[k] if color)
         return Frame(depth, colors)
+
+    def readable_frame(self, k: int, *, color: bool = True) -> tuple[Frame | None, tuple[str, ...]]:
+        """Frame k without those of its images that cannot be read, and what is wrong with them, one line each.
+
+        Without its depth image it is no frame: None.
+        """
+        problems: list[str] = []
+
+        def image(stamp: float, read: Callable[[int], npt.NDArray[Any]], i: int) -> list[Image]:
+            try:
+                return [Image(float(stamp), read(i))]
+            except UserError as error:
+                problems.append(str(error))
+                return []
+
+        depth = image(self.stamps[k], self.images.depth, k)
+        if not depth:
+            return None, tuple(problems)
+        group = self.groups[k] if color else ()
+        colors = [found for i in group for found in image(self.color_stamps[i], self.images.color, i)]
+        return Frame(depth[0], tuple(colors)), tuple(problems)
 
     def frames(self, first: int = 0, last: int | None = None, prefetch: int = 2) -> Iterator[Frame]:
         """Frames [first, last), decoded ahead in a thread that ends with the iteration, early or not.
@@ -95,19 +118,22 @@ def open_dataset(path: Path, camera_file: Path | None = None) -> Dataset:
     """Read the description and listings of a folder; images are read when asked for.
 
     path: a sequence that rsgen wrote (it has a sequence.yaml, which holds the cameras), or a TUM RGB-D or ICL-NUIM
-      folder: rgb.txt and depth.txt, or associations.txt; see `rstrack.data.tum_folder`.
-    camera_file: the cameras of a TUM or ICL-NUIM folder; default camera.yaml or calibration.yaml in it; see
+      folder: rgb.txt and depth.txt, or associations.txt; see `rstrack.data.tum_folder`; or one in the layout of
+      7-Scenes: frame-000000.depth.png and so on; see `rstrack.data.seven_scenes`.
+    camera_file: the cameras of a folder that is no rsgen sequence; default camera.yaml or calibration.yaml in it; see
       `rstrack.data.camera_file`.
     Raises UserError, one line: what is missing or wrong, where, and how to mend it.
     """
     root = Path(path)
     if not root.is_dir():
-        raise UserError(f"{root}: no such folder: give an rsgen sequence or a TUM RGB-D or ICL-NUIM folder")
+        raise UserError(f"{root}: no such folder: give an rsgen sequence or a TUM RGB-D, ICL-NUIM or 7-Scenes folder")
     if not (root / "sequence.yaml").exists():
-        tum = read_tum_folder(root, camera_file)
-        groups = group_colors(tum.depth_stamps, tum.color_stamps)
-        stamps = (tum.depth_stamps, tum.color_stamps)
-        return Dataset(root.resolve().name, root, tum.rig, *stamps, groups, tum.images, truth_poses=tum.truth_poses)
+        folder = (read_seven_scenes if is_seven_scenes(root) else read_tum_folder)(root, camera_file)
+        groups = group_colors(folder.depth_stamps, folder.color_stamps)
+        return Dataset(
+            root.resolve().name, root, folder.rig, folder.depth_stamps, folder.color_stamps, groups, folder.images,
+            truth_poses=folder.truth_poses, notes=folder.notes,
+        )  # fmt: skip
     if camera_file is not None:
         raise UserError(f"{root}: its sequence.yaml holds the cameras: leave the camera file {camera_file} out")
     sequence = read_sequence(root)

@@ -11,64 +11,39 @@ images 16-bit grey PNG.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
-import numpy.typing as npt
 
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
-from rsgen.files import listed_file, png_fault, read_bytes, read_text
-from rsgen.geometry.camera import Camera
+from rsgen.files import listed_file, read_text
 from rsgen.sequence.trajectory import ICL_RATE_HZ, Trajectory, read_trajectory
 from rstrack.data.camera_file import EXAMPLE, RigFile, read_rig
+from rstrack.data.image_files import ImageFiles, decode_color, decode_depth, decode_image, first_size
 from rstrack.data.rig import Rig
 
 _ASSOCIATIONS = ("associations.txt", "associate.txt", "association.txt")
 _CAMERA_FILES = ("camera.yaml", "calibration.yaml")
 _MAX_STAMP_S = 1e11  # the year 5138; today in milliseconds, microseconds or nanoseconds is beyond
-_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
-_PNG_START = b"\x89PNG"
-
-
-@dataclass(frozen=True)
-class ImageFiles:
-    """Decodes the images of a folder, and checks that they are as large as the cameras say."""
-
-    rig: Rig
-    depth_scale: float
-    color_paths: tuple[Path, ...]
-    depth_paths: tuple[Path, ...]
-
-    def color(self, k: int) -> npt.NDArray[np.uint8]:
-        """RGB (h, w, 3) of colour image k. Raises UserError naming the file."""
-        path = self.color_paths[k]
-        image = _decode_color(path)
-        _check_size(path, image, self.rig.color_camera)
-        return image
-
-    def depth(self, k: int) -> npt.NDArray[np.float32]:
-        """Planar z (h, w) in metres of depth image k, 0 = missing. Raises UserError naming the file."""
-        path = self.depth_paths[k]
-        units = _decode_depth(path)
-        _check_size(path, units, self.rig.depth_camera)
-        return np.asarray(units / np.float32(self.depth_scale), np.float32)
 
 
 @dataclass(frozen=True)
 class TumFolder:
-    """What `read_tum_folder` finds. Stamps (n,) and (m,) in seconds, increasing; truth_poses are T_world_depth."""
+    """What is found in a folder. Stamps (n,) and (m,) in seconds, increasing; truth_poses are T_world_depth.
+
+    notes: what nothing in the folder says and had to be assumed, each in one line.
+    """
 
     rig: Rig
     depth_stamps: FloatArray
     color_stamps: FloatArray
     images: ImageFiles
     truth_poses: Trajectory | None
+    notes: tuple[str, ...] = ()
 
 
 def read_tum_folder(root: Path, camera_file: Path | None) -> TumFolder:
@@ -78,7 +53,7 @@ def read_tum_folder(root: Path, camera_file: Path | None) -> TumFolder:
     """
     depth, color = _listings(root)
     depth, color = depth.checked(), color.sorted().checked()
-    file = _rig_file(root, camera_file, color.paths[0], depth.paths[0])
+    file = _rig_file(root, camera_file, color.paths, depth.paths)
     images = ImageFiles(file.rig, file.depth_scale, color.paths, depth.paths)
     rate = ICL_RATE_HZ if depth.has_frame_numbers and color.has_frame_numbers else 1.0
     return TumFolder(file.rig, depth.stamps / rate, color.stamps / rate, images, _truth(root, file.rig))
@@ -196,7 +171,7 @@ def _entries(file: Path, images: int) -> list[tuple[_Entry, ...]]:
 
 def _is_depth_first(left: _Listing, right: _Listing) -> bool:
     """By what the first two files hold: published lists come both ways round."""
-    kinds = [_decode(listing.paths[0]).dtype == np.uint16 for listing in (left, right)]
+    kinds = [decode_image(listing.paths[0]).dtype == np.uint16 for listing in (left, right)]
     if kinds[0] == kinds[1]:
         what = "two depth images" if kinds[0] else "no 16-bit depth image"
         raise UserError(f"{left._where(left.entries[0])}: has {what}: give one colour and one depth image a line")
@@ -206,16 +181,21 @@ def _is_depth_first(left: _Listing, right: _Listing) -> bool:
 # --- cameras and truth -----------------------------------------------------------------------------------------------
 
 
-def _rig_file(root: Path, camera_file: Path | None, color: Path, depth: Path) -> RigFile:
-    file = camera_file
-    if file is None:
-        file = next((root / name for name in _CAMERA_FILES if (root / name).exists()), None)
+def find_camera_file(root: Path, camera_file: Path | None) -> Path | None:
+    """The given one, else that in the folder, None without any."""
+    if camera_file is not None:
+        return camera_file
+    return next((root / name for name in _CAMERA_FILES if (root / name).exists()), None)
+
+
+def _rig_file(root: Path, camera_file: Path | None, color: Sequence[Path], depth: Sequence[Path]) -> RigFile:
+    file = find_camera_file(root, camera_file)
     if file is None:
         raise UserError(
             f"{root}: nothing tells the cameras: write {root / _CAMERA_FILES[0]} (or give a camera file) with "
             f"'{EXAMPLE}' and, unless depth is registered to colour, 'depth: {{...}}' likewise"
         )
-    return read_rig(file, _size(_decode_color(color)), _size(_decode_depth(depth)))
+    return read_rig(file, first_size(color, decode_color), first_size(depth, decode_depth))
 
 
 def _truth(root: Path, rig: Rig) -> Trajectory | None:
@@ -226,60 +206,3 @@ def _truth(root: Path, rig: Rig) -> Trajectory | None:
         return None
     # Motion capture loses the camera now and then; what an evaluation interpolates over is its own business.
     return read_trajectory(file, max_gap_s=math.inf).moved(T_body_cam=rig.T_color_depth)
-
-
-# --- images ----------------------------------------------------------------------------------------------------------
-
-
-def _decode(path: Path) -> npt.NDArray[Any]:
-    """A whole PNG or JPEG of 8 or 16 bits as OpenCV returns it. Raises UserError.
-
-    Files are checked first, because decoders complain on stderr, and some return half a picture.
-    """
-    data = read_bytes(path)
-    if data.startswith(_PNG_START):
-        fault = png_fault(data)
-    elif data.startswith(_JPEG_START):
-        fault = None if _JPEG_END in data[-64:] else "truncated"
-    else:
-        fault = "neither PNG nor JPEG"
-    image = None
-    if fault is None:
-        try:
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        except cv2.error:
-            fault = "cannot be decoded"
-    if image is None:
-        raise UserError(f"{path}: is not a whole image ({fault or 'cannot be decoded'}): unpack the dataset again")
-    if image.dtype not in (np.uint8, np.uint16):
-        raise UserError(f"{path}: has pixels of type {image.dtype}, expected 8-bit colour or 16-bit depth")
-    return image
-
-
-def _decode_color(path: Path) -> npt.NDArray[np.uint8]:
-    image = _decode(path)
-    if image.dtype != np.uint8:
-        raise UserError(f"{path}: is a {_kind(image)} image, expected 8-bit colour: are the listings swapped?")
-    codes = {2: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}
-    return np.asarray(cv2.cvtColor(image, codes[2 if image.ndim == 2 else image.shape[2]]), np.uint8)
-
-
-def _decode_depth(path: Path) -> npt.NDArray[np.uint16]:
-    image = _decode(path)
-    if image.dtype != np.uint16 or image.ndim != 2:
-        raise UserError(f"{path}: is a {_kind(image)} image, expected 16-bit grey depth: are the listings swapped?")
-    return np.asarray(image, np.uint16)
-
-
-def _kind(image: npt.NDArray[np.generic]) -> str:
-    return f"{8 * image.dtype.itemsize}-bit {'grey' if image.ndim == 2 else 'colour'}"
-
-
-def _size(image: npt.NDArray[np.generic]) -> tuple[int, int]:
-    return image.shape[1], image.shape[0]
-
-
-def _check_size(path: Path, image: npt.NDArray[np.generic], camera: Camera) -> None:
-    if _size(image) != (camera.width, camera.height):
-        found, wanted = "x".join(map(str, _size(image))), f"{camera.width}x{camera.height}"
-        raise UserError(f"{path}: is {found}, but the camera is {wanted}: mend width and height in the camera file")

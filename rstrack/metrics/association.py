@@ -35,14 +35,24 @@ _LINE, _POINT = 1e-9, 1e-12
 class Truth:
     """What an estimate is compared with.
 
-    motion: T_world_depth(t), or poses. frame_stamps: (n,) seconds, the sequence's depth frames. camera, shutter: of the
-    depth stream, for errors by line.
+    motion: T_world_depth(t), or poses. frame_stamps: (n,) seconds, the sequence's depth frames; none where the truth is
+    a mere file of poses. camera, shutter: of the depth stream, for errors by line. interpolate: poses are interpolated
+    on SE(3) where one of them is within 0.02 s of a stamp; else the nearest is taken, as TUM's associate.py does.
     """
 
     motion: Spline | Trajectory
     frame_stamps: FloatArray
-    camera: Camera
-    shutter: Shutter
+    camera: Camera | None = None
+    shutter: Shutter | None = None
+    interpolate: bool = False
+
+    @property
+    def line_times(self) -> FloatArray:
+        """Mid-exposures (n,) in s of all lines of all depth images."""
+        if self.camera is None or self.shutter is None:
+            return np.empty(0)
+        lines = np.arange(self.shutter.line_count(self.camera))
+        return self.shutter.line_mid_time(self.frame_stamps[:, None], lines, self.camera).ravel()
 
 
 def truth_of(dataset: Dataset) -> Truth | None:
@@ -78,9 +88,9 @@ class Comparison:
         return angles_deg(self.T_world_true, self.T_world_est)
 
 
-def compare(truth: Truth, estimate: Estimate, interpolate: bool = False) -> Comparison:
+def compare(truth: Truth, estimate: Estimate) -> Comparison:
     """Associate and align, as `evaluate` does. Raises UserError if fewer than three poses have a true counterpart."""
-    index, T_true = _true_poses(truth.motion, estimate.stamps, interpolate)
+    index, T_true = true_poses(truth.motion, estimate.stamps, truth.interpolate)
     if len(index) < _MIN_POSES:
         begin, end = _span(truth.motion)
         raise UserError(
@@ -131,8 +141,8 @@ def angles_deg(T_a: FloatArray, T_b: FloatArray) -> FloatArray:
     return np.asarray(np.degrees(np.linalg.norm(so3.log(R), axis=-1)))
 
 
-def _true_poses(motion: Spline | Trajectory, stamps: FloatArray, interpolate: bool) -> tuple[IntArray, FloatArray]:
-    """Indices (k,) of the stamps (n,) that have a true pose, and those poses (k, 4, 4)."""
+def true_poses(motion: Spline | Trajectory, stamps: FloatArray, interpolate: bool) -> tuple[IntArray, FloatArray]:
+    """Indices (k,) of the stamps (n,) that have a true pose, and those poses (k, 4, 4); see `Truth.interpolate`."""
     if isinstance(motion, Spline):
         # Stamps are rounded in files: that must not push the first or last one out.
         inside = np.clip(stamps, motion.t_begin, motion.t_end)

@@ -1,6 +1,6 @@
 """How far an estimate is from the truth: ATE, drift per second, and the error of every line's pose.
 
-metrics = run_evaluate(Path("out/lr_kt2"), Path("runs/lr_kt2"))
+metrics = evaluate(truth_of(dataset), read_estimate(Path("runs/lr_kt2")))
 print(metrics.text())
 """
 
@@ -15,7 +15,6 @@ import numpy as np
 
 from rsgen.array_types import FloatArray, IntArray
 from rsgen.console.tables import Table, fixed
-from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.format import associate
@@ -28,7 +27,6 @@ from rstrack.metrics.association import (
     angles_deg,
     compare,
     nearest,
-    truth_of,
 )
 
 _RPE_DELTA_S = 1.0
@@ -95,8 +93,9 @@ class Metrics:
     def text(self) -> str:
         """The table, what it is of, and what has to be said about it."""
         tracked = f"{self.frames_tracked} of {self.frames} ({100 * self.coverage:.1f} %)"
+        head = [f"frames tracked: {tracked}", ""] if self.frames else []
         notes = [f"note: {note}" for note in self.notes]
-        return "\n".join([f"frames tracked: {tracked}", "", self.table().text(), *notes])
+        return "\n".join([*head, self.table().text(), *notes])
 
 
 @dataclass(frozen=True)
@@ -108,12 +107,12 @@ class Drift:
     rotation_deg: FloatArray
 
 
-def evaluate(truth: Truth, estimate: Estimate, interpolate: bool = False) -> Metrics:
+def evaluate(truth: Truth, estimate: Estimate) -> Metrics:
     """Compare an estimate with the truth.
 
     Association: a spline is evaluated exactly at the estimate's stamps; stamps outside its time are left out and
     counted. True poses are associated with the nearest stamp, one to one and within 0.02 s, as TUM's associate.py does,
-    or, with `interpolate`, interpolated on SE(3) where one of them is that near.
+    or, with `Truth.interpolate`, interpolated on SE(3) where one of them is that near.
 
     ATE (`association.align`): distances between positions after the rigid alignment, as in TUM's evaluate_ate.py.
 
@@ -128,7 +127,7 @@ def evaluate(truth: Truth, estimate: Estimate, interpolate: bool = False) -> Met
     Raises UserError if fewer than three poses have a true counterpart.
     """
     notes = []
-    found = compare(truth, estimate, interpolate)
+    found = compare(truth, estimate)
     missing = len(estimate.stamps) - len(found.index)
     if missing:
         where = "outside the truth's time" if isinstance(truth.motion, Spline) else "without a true pose within 0.02 s"
@@ -141,9 +140,7 @@ def evaluate(truth: Truth, estimate: Estimate, interpolate: bool = False) -> Met
     if not len(step.stamps):
         notes.append("no drift: no two poses are one second apart")
 
-    t = truth.shutter.line_mid_time(
-        truth.frame_stamps[:, None], np.arange(truth.shutter.line_count(truth.camera)), truth.camera
-    ).ravel()
+    t = truth.line_times
     rows, row_count = _errors_by_line(truth.motion, estimate, found.T_true_est, t)
     if not row_count:
         notes.append("no errors by line: they need a spline on both sides")
@@ -196,25 +193,6 @@ def drift(estimate: Estimate, found: Comparison) -> Drift:
     true_step = se3.inverse(found.T_world_true[i]) @ found.T_world_true[j]
     est_step = se3.inverse(found.T_world_est[i]) @ found.T_world_est[j]
     return Drift(stamps, *_pose_errors(true_step, est_step))
-
-
-def run_evaluate(seq_path: Path, estimate_path: Path, camera_file: Path | None = None) -> Metrics:
-    """Evaluate a run folder or TUM file against the truth of a sequence folder.
-
-    Arguments as in `read_estimate` and `rstrack.data.dataset.open_dataset`. Raises UserError.
-    """
-    from rstrack.data.dataset import open_dataset
-
-    truth = truth_of(open_dataset(seq_path, camera_file))
-    if truth is None:
-        raise UserError(
-            f"{seq_path}: has no ground truth to compare with: add a groundtruth.txt, or only plot the estimate"
-        )
-    estimate = read_estimate(estimate_path)
-    try:
-        return evaluate(truth, estimate)
-    except UserError as error:
-        raise UserError(f"{estimate_path}: {error}") from None
 
 
 def compared(run: Path, metrics: Metrics, other: Path, theirs: Metrics) -> str:

@@ -14,6 +14,8 @@ from rsgen.geometry.spline import Spline
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.metrics.association import Comparison, Truth, compare, truth_of
+from rstrack.metrics.clock import TruthOffset
+from rstrack.metrics.run_evaluate import aligned_clock
 
 # Points of the true path, of which there is one at any time.
 _PATH_POINTS = 1000
@@ -48,12 +50,14 @@ class Tracked:
 
 
 def load_run(
-    run: Path, sequence: Path | None = None, camera_file: Path | None = None, dataset: Dataset | None = None
-) -> Tracked:
+    run: Path, sequence: Path | None = None, camera_file: Path | None = None, dataset: Dataset | None = None,
+    truth_offset: TruthOffset | None = None,
+) -> Tracked:  # fmt: skip
     """Read a run folder and compare it with the truth of its sequence.
 
     sequence: the folder where the sequence is; by default the one that run.json names, and if that is gone there is no
-    comparison. dataset: the same, already open. Raises UserError: no run, or a given sequence cannot be read.
+    comparison. dataset: the same, already open. truth_offset: of the truth's clock, see `run_evaluate.aligned_clock`.
+    Raises UserError: no run, a given sequence cannot be read, no such offset is found.
     """
     estimate = read_estimate(run)
     notes: list[str] = []
@@ -65,6 +69,7 @@ def load_run(
     if truth is None:
         notes.append(f"The sequence {dataset.name} has no ground truth, so there are no errors to show.")
         return Tracked(estimate, dataset, notes=tuple(notes))
+    truth = aligned_clock(truth, estimate, truth_offset)
     try:
         found = compare(truth, estimate)
     except UserError as error:

@@ -11,7 +11,8 @@ import numpy as np
 from rsgen.errors import UserError
 from rstrack.charts.chart import Chart, PathChart
 from rstrack.charts.runs import error_charts, inlier_charts, path_chart, time_charts
-from rstrack.metrics.evaluate import Metrics, evaluate
+from rstrack.metrics.evaluate import Metrics
+from rstrack.metrics.run_evaluate import evaluate_clocks
 from rstrack.metrics.tracked import Tracked, load_run
 from rstrack.report.page import Card, CardRow, Note, Page, Plot, Section
 from rstrack.report.pictures import frame_panels, shutter_sliders
@@ -22,14 +23,15 @@ def run_page(run: Path, sequence: Path | None = None, camera_file: Path | None =
     tracked = load_run(run, sequence, camera_file)
     info = tracked.estimate.info
     sections = [Section("path", "Path", (Plot(path_chart({"estimated": tracked})),))]
-    metrics = None
+    metrics, hint = None, None
     if tracked.found is not None and tracked.truth is not None:
-        metrics = evaluate(tracked.truth, tracked.estimate)
+        evaluation = evaluate_clocks(tracked.truth, tracked.estimate)
+        metrics, hint = evaluation.metrics, evaluation.hint
         sections.insert(0, Section("errors", "Errors", (metrics.table(), *_notes(metrics))))
         sections.append(Section("time", "Errors over time", plots(error_charts(tracked))))
     if charts := (*inlier_charts(tracked), *time_charts(tracked)):
         sections.append(Section("tracker", "What the tracker said", plots(charts)))
-    warnings = list(tracked.notes)
+    warnings = list(tracked.notes) + ([hint] if hint else [])
     if tracked.dataset is not None:
         try:
             blocks = (*frame_panels(tracked, tracked.dataset), *shutter_sliders(tracked, tracked.dataset))

@@ -31,7 +31,8 @@ from rstrack.data.noise import with_noise
 from rstrack.data.prefetch import prefetched
 from rstrack.data.rig import Frame, Rig
 from rstrack.metrics.association import Truth, compare, truth_of
-from rstrack.metrics.evaluate import Metrics, evaluate
+from rstrack.metrics.evaluate import Metrics
+from rstrack.metrics.run_evaluate import Evaluation, evaluate_clocks
 from rstrack.options import Options
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
     from rstrack.tracking.frame_report import FrameReport
 
 
-End = Literal["done", "interrupted", "broke down", "unreadable"]
+End = Literal["done", "interrupted", "broke down"]
 
 _TRUTH_EVERY = 30
 # Observability (see FrameReport) below which a motion is held by the prior rather than by depth.
@@ -87,15 +88,22 @@ class Noise:
 class Result:
     """What a run came to.
 
-    end: why it stopped; `error` says where the tracker broke down, or which image could not be read. lost: number of
-    frames. metrics: None without a truth, or with too few poses.
+    end: why it stopped; `error` says where the tracker broke down. evaluation: None without a truth, or with too few
+    poses. lost: number of frames. unreadable: what was wrong with each image that was left out; where that was a depth
+    image, its frame was.
     """
 
     estimate: Estimate
-    metrics: Metrics | None
+    evaluation: Evaluation | None
     end: End
     error: str
     lost: int
+    unreadable: tuple[str, ...] = ()
+
+    @property
+    def metrics(self) -> Metrics | None:
+        """Errors with the truth's clock as it is."""
+        return None if self.evaluation is None else self.evaluation.metrics
 
     def text(self) -> str:
         """A summary of a few lines, with the metrics if there is a truth."""
@@ -112,7 +120,11 @@ class Result:
         weak = sum(not f["lost"] and 0.0 < f["observability"] < _WEAK for f in info["frames"])
         if weak and info["method"] in ("rs-g", "gs-g", "baseline"):
             lines.append(f"in {weak} of {done} frames the geometry hardly fixes all six degrees of freedom (a wall?)")
-        return "\n".join(lines + ([] if self.metrics is None else ["", self.metrics.text()]))
+        if self.unreadable:
+            images = "1 image" if len(self.unreadable) == 1 else f"{len(self.unreadable)} images"
+            lines.append(f"left out: {images} that cannot be read, first {self.unreadable[0]}")
+        lines += [f"assumed: {note}" for note in info["dataset"].get("notes", ())]
+        return "\n".join(lines + ([] if self.evaluation is None else ["", self.evaluation.text()]))
 
 
 def make_tracker(rig: Rig, options: Options, timer: Timer | None = None) -> AnyTracker:
@@ -146,8 +158,9 @@ def track(
 ) -> Result:
     """Track frames of a dataset and write the run folder `out`: `write_estimate` says what is in it.
 
-    Where the run stops early, because of an interrupt or an image that cannot be read, what there is gets written.
-    Raises UserError: no such frames, `out` cannot be written or is a dataset, no frame was tracked.
+    Images that cannot be read are left out, and their frame with them if they are depth images. Where the run stops
+    early, because of an interrupt, what there is gets written. Raises UserError: no such frames, `out` cannot be
+    written or is a dataset, no frame was tracked.
     """
     chosen = _chosen(dataset, frames)
     truth = truth_of(dataset)
@@ -157,30 +170,32 @@ def track(
     _make_folder(out)
     noise = noise or Noise()
 
-    def load(k: int) -> Frame:
-        return with_noise(
-            dataset.frame(k, color=options.photometric), k, noise.sigma_depth, noise.sigma_intensity, noise.seed
-        )
+    def load(k: int) -> tuple[Frame | None, tuple[str, ...]]:
+        frame, problems = dataset.readable_frame(k, color=options.photometric)
+        if frame is not None:
+            frame = with_noise(frame, k, noise.sigma_depth, noise.sigma_intensity, noise.seed)
+        return frame, problems
 
     seconds: list[float] = []
+    fed: list[int] = []
+    unreadable: list[tuple[int, str]] = []
     end: End = "done"
     error, note = "", ""
     begin = time.perf_counter()
     with _stop_flag() as stopped:
         images = prefetched(load, chosen, 2)
         for count, k in enumerate(chosen, 1):
-            try:
-                frame = next(images)
-            except UserError as problem:
-                end, error = "unreadable", str(problem)
-                break
-            start = time.perf_counter()
-            try:
-                tracker.feed(frame)
-            except (UserError, np.linalg.LinAlgError) as problem:
-                end, error = "broke down", f"the tracker broke down at frame {k}: {problem}"
-                break
-            seconds.append(time.perf_counter() - start)
+            frame, problems = next(images)
+            unreadable += [(k, problem) for problem in problems]
+            if frame is not None:
+                start = time.perf_counter()
+                try:
+                    tracker.feed(frame)
+                except (UserError, np.linalg.LinAlgError) as problem:
+                    end, error = "broke down", f"the tracker broke down at frame {k}: {problem}"
+                    break
+                seconds.append(time.perf_counter() - start)
+                fed.append(k)
             if count % _TRUTH_EVERY == 0 or count == len(chosen):
                 note = _error_note(truth, tracker.trajectory)
             rate = count / (time.perf_counter() - begin)
@@ -190,23 +205,24 @@ def track(
                 break
         del images  # ends its thread
     if not seconds:
-        raise UserError(error)
+        raise UserError(error or f"{unreadable[0][1]}; no other frame of the {len(chosen)} can be read either")
     timings = _timings(time.perf_counter() - begin, seconds)
-    stamps = dataset.stamps[chosen][: len(seconds)]
     info = _settings(dataset, chosen, tracker.options, noise) | {
         "end": end,
         "error": error or None,
         "keyframes": tracker.keyframes,
+        "unreadable": [{"frame": k, "error": problem} for k, problem in unreadable],
         "lost": sum(report.lost for report in tracker.reports),
         "spline_valid": tracker.spline_valid,
         "timings": timings,
-        "frames": _diagnostics(stamps, tracker.reports),
+        "frames": _diagnostics(dataset.stamps[fed], tracker.reports),
     }
     estimate = Estimate(*tracker.trajectory, tracker.spline, info)
-    metrics = _metrics(truth, estimate)
-    info["metrics"] = None if metrics is None else metrics.as_dict()
+    evaluation = _evaluation(truth, estimate)
+    info["metrics"] = None if evaluation is None else evaluation.metrics.as_dict()
+    info["truth_offset"] = None if evaluation is None else evaluation.truth_offset
     write_estimate(out, estimate.stamps, estimate.T_world_depth, estimate.spline, info)
-    return Result(estimate, metrics, end, error, info["lost"])
+    return Result(estimate, evaluation, end, error, info["lost"], tuple(problem for _, problem in unreadable))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -266,10 +282,10 @@ def _error_note(truth: Truth | None, poses: tuple[FloatArray, FloatArray]) -> st
     return f", ATE {1e3 * np.sqrt(np.mean(errors**2)):.2f} mm"
 
 
-def _metrics(truth: Truth | None, estimate: Estimate) -> Metrics | None:
+def _evaluation(truth: Truth | None, estimate: Estimate) -> Evaluation | None:
     """None also where fewer than three poses have a true counterpart."""
     try:
-        return None if truth is None else evaluate(truth, estimate)
+        return None if truth is None else evaluate_clocks(truth, estimate)
     except UserError:
         return None
 
@@ -277,6 +293,7 @@ def _metrics(truth: Truth | None, estimate: Estimate) -> Metrics | None:
 def _settings(dataset: Dataset, chosen: range, options: Options, noise: Noise) -> dict[str, Any]:
     from rsgen.device.arrays import engine
 
+    notes = {"notes": list(dataset.notes)} if dataset.notes else {}
     versions = {name: version(name) for name in ("numpy", "scipy", "drjit")}
     return {
         "method": options.method,
@@ -287,7 +304,7 @@ def _settings(dataset: Dataset, chosen: range, options: Options, noise: Noise) -
         "machine": {"cpu_count": os.cpu_count()},
         "dataset": {
             "name": dataset.name, "path": str(dataset.root.resolve()),
-            "frames": [chosen.start, chosen.stop], "frames_in_all": len(dataset),
+            "frames": [chosen.start, chosen.stop], "frames_in_all": len(dataset), **notes,
         },
     }  # fmt: skip
 

@@ -24,7 +24,7 @@ from rstrack.bench.stress.run import ColorScore, DepthScore, Panels, StressResul
 from rstrack.bench.stress.tables import write_stress
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import write_estimate
-from rstrack.metrics.evaluate import run_evaluate
+from rstrack.metrics.run_evaluate import run_evaluate
 
 SPLINE = synthetic.make_spline()
 WORLD = se3.exp(np.array([3.0, -1.0, 2.0, 0.4, -0.3, 0.4]))
@@ -148,7 +148,7 @@ def make_bench(root: Path, sequence: Path, twin: Path) -> Results:
                 cells.append(Cell("k", info.name, method, None, FRAMES, FRAMES, None, "is not here"))
                 continue
             run = make_run(root / "cells" / info.name / method, info.path, seed=k, error_m=errors[k])
-            cells.append(Cell("k", info.name, method, run_evaluate(info.path, run).as_dict(), FRAMES, 4, 3.1))
+            cells.append(Cell("k", info.name, method, run_evaluate(info.path, run).metrics.as_dict(), FRAMES, 4, 3.1))
     results = Results(infos, methods, tuple(cells), {"cpu": "imaginary"}, "0")
     write_results(results, root)
     return results

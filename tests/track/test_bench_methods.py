@@ -37,7 +37,7 @@ from rstrack.charts.to_file import write_charts
 from rstrack.charts.to_page import figure_of
 from rstrack.cli.bench_methods import bench
 from rstrack.data.estimate import Estimate, read_estimate
-from rstrack.metrics.evaluate import run_evaluate
+from rstrack.metrics.run_evaluate import run_evaluate
 from rstrack.options import METHODS, PEERS, Options
 
 ROOT = Path(__file__).parents[2]
@@ -126,7 +126,7 @@ def test_figures_are_those_of_evaluate(original: Path) -> None:
         (name, method) for name in NAMES for method in ("gs-g", "rs-g")
     ]
     for cell in data["cells"]:
-        metrics = run_evaluate(original / "data" / cell["sequence"], original / "bench" / cell["run"])
+        metrics = run_evaluate(original / "data" / cell["sequence"], original / "bench" / cell["run"]).metrics
         assert cell["ate_m"] == pytest.approx(metrics.ate_rmse_m, rel=1e-4)
         assert cell["rpe_m_s"] == pytest.approx(metrics.rpe_trans_rmse_m_per_s, rel=1e-4)
         assert cell["rpe_deg_s"] == pytest.approx(metrics.rpe_rot_rmse_deg_per_s, rel=1e-4)
@@ -260,7 +260,7 @@ def test_a_tracker_of_ones_own(place: Path, capfd: pytest.CaptureFixture[str]) -
     assert error == "" and "failed: mine on lr_kt2" in out and "lr_kt2.txt" in out
     data = json.loads((place / "bench/results.json").read_text())
     mine = [c for c in data["cells"] if c["method"] == "mine"]
-    metrics = run_evaluate(place / "data/robot_t1", place / "mine/robot_t1.txt")
+    metrics = run_evaluate(place / "data/robot_t1", place / "mine/robot_t1.txt").metrics
     assert mine[0]["ate_m"] == pytest.approx(metrics.ate_rmse_m, rel=1e-9) and mine[1]["ate_m"] is None
     write_tum(place / "mine/lr_kt2.txt", "lr_kt2")
     assert main(words) == 0

@@ -26,7 +26,8 @@ from rsgen.geometry.spline import Spline
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.estimate import Estimate, read_estimate, write_estimate
 from rstrack.metrics.association import Truth, align, compare
-from rstrack.metrics.evaluate import Metrics, compared, evaluate, pairs_one_second_apart, run_evaluate
+from rstrack.metrics.evaluate import Metrics, compared, evaluate, pairs_one_second_apart
+from rstrack.metrics.run_evaluate import run_evaluate
 
 CAMERA = Camera(16, 12, 12.0, 12.0, 7.5, 5.5)
 SHUTTER = Shutter(0.028, 0.004)
@@ -48,8 +49,8 @@ def noisy(T: np.ndarray, seed: int, sigma: float = 0.01) -> np.ndarray:
     return se3.orthonormalise(T @ se3.exp(xi))
 
 
-def truth(motion: Spline | Trajectory, stamps: np.ndarray = FRAMES) -> Truth:
-    return Truth(motion, stamps, CAMERA, SHUTTER)
+def truth(motion: Spline | Trajectory, stamps: np.ndarray = FRAMES, interpolate: bool = False) -> Truth:
+    return Truth(motion, stamps, CAMERA, SHUTTER, interpolate)
 
 
 def moved(spline: Spline, T: np.ndarray) -> Spline:
@@ -246,12 +247,12 @@ def test_interpolated_truth_is_scipys_in_rotation_and_exact_on_a_screw() -> None
     true = Trajectory(knots, se3.exp(knots[:, None] * twist))
     stamps = np.linspace(0.0, knots[-1], 71)
     est = Estimate(stamps, se3.exp(stamps[:, None] * twist))
-    found = compare(truth(true), est, interpolate=True)
+    found = compare(truth(true, interpolate=True), est)
     assert len(found.index) == 71
     np.testing.assert_allclose(found.T_world_true, est.T_world_depth, atol=1e-12)
     slerp = Slerp(knots, Rotation.from_matrix(true.T_world_cam[:, :3, :3]))
     np.testing.assert_allclose(found.T_world_true[:, :3, :3], slerp(stamps).as_matrix(), atol=1e-12)
-    assert evaluate(truth(true), est, interpolate=True).ate_max_m < 1e-12
+    assert evaluate(truth(true, interpolate=True), est).ate_max_m < 1e-12
     assert evaluate(truth(true), est).ate_max_m > 1e-3
 
 
@@ -259,7 +260,7 @@ def test_interpolated_rotations_are_scipys_slerp_between_any_poses() -> None:
     knots = np.cumsum(np.random.default_rng(1).uniform(0.01, 0.035, 40))
     true = Trajectory(knots, walk(12, 40, 0.5))
     stamps = np.linspace(knots[0], knots[-1], 97)
-    found = compare(truth(true), Estimate(stamps, walk(13, 97)), interpolate=True)
+    found = compare(truth(true, interpolate=True), Estimate(stamps, walk(13, 97)))
     assert len(found.index) == 97
     slerp = Slerp(knots, Rotation.from_matrix(true.T_world_cam[:, :3, :3]))
     np.testing.assert_allclose(found.T_world_true[:, :3, :3], slerp(stamps).as_matrix(), atol=1e-9)
@@ -268,7 +269,7 @@ def test_interpolated_rotations_are_scipys_slerp_between_any_poses() -> None:
 def test_interpolation_stays_out_of_gaps() -> None:
     true = Trajectory(np.array([0.0, 0.03, 0.06, 1.0, 1.03]), walk(1, 5))
     stamps = np.array([0.01, 0.04, 0.07, 0.5, 0.97, 0.99, 1.01, 1.04])
-    found = compare(truth(true), Estimate(stamps, walk(2, 8)), interpolate=True)
+    found = compare(truth(true, interpolate=True), Estimate(stamps, walk(2, 8)))
     assert found.index.tolist() == [0, 1, 2, 5, 6]
 
 
@@ -503,7 +504,7 @@ def test_a_run_is_evaluated_against_an_rsgen_sequence(tmp_path: Path) -> None:
     root = synthetic.make_sequence(tmp_path / "seq", frames=6)
     stamps = np.arange(6) / 30.0
     write_estimate(tmp_path / "run", stamps, SPLINE.pose(stamps), SPLINE, {})
-    result = run_evaluate(root, tmp_path / "run")
+    result = run_evaluate(root, tmp_path / "run").metrics
     assert (result.frames, result.frames_tracked, result.poses_compared) == (6, 6, 6)
     assert result.ate_rmse_m < 1e-8 and result.rows == 6 * 48
     assert result.row_rmse_m is not None and result.row_rmse_m < 1e-6

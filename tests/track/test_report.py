@@ -41,7 +41,8 @@ from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import Estimate
 from rstrack.data.rig import Image, Rig
 from rstrack.metrics.association import compare, truth_of
-from rstrack.metrics.evaluate import Metrics, drift, evaluate, run_evaluate
+from rstrack.metrics.evaluate import Metrics, drift, evaluate
+from rstrack.metrics.run_evaluate import run_evaluate
 from rstrack.report.build import write_report
 from rstrack.report.images import rectified
 from rstrack.report.page import Note, Page, Section, render
@@ -83,7 +84,7 @@ def bench_report(bench: Path) -> Path:
 
 
 def test_the_tables_numbers_are_those_of_evaluate(report: Path, run: Path, twin: Path) -> None:
-    m, page = run_evaluate(twin, run), parse(report)
+    m, page = run_evaluate(twin, run).metrics, parse(report)
     for row in m.table().rows:
         assert page.row(str(row[0])) == [str(entry) for entry in row]
     top = page.text[: page.text.index("Errors against")]
@@ -250,7 +251,7 @@ def test_other_trackers_files_have_a_report_too(run: Path, sequence: Path, tmp_p
     shutil.copy(run / "trajectory.txt", tmp_path / "other.txt")
     out = write_report(tmp_path / "other.txt", sequence)
     assert out == tmp_path / "other.html"
-    m: Metrics = run_evaluate(sequence, tmp_path / "other.txt")
+    m: Metrics = run_evaluate(sequence, tmp_path / "other.txt").metrics
     assert parse(out).row("ATE, mm")[1] == fixed(m.ate_rmse_m, 3, 1e3)
 
 

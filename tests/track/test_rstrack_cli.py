@@ -283,19 +283,35 @@ def test_depth_without_a_measurement_is_no_crash(place: Path, capfd: pytest.Capt
     assert status == 1 and "rs-g on synthetic" in out and Path("r/run.json").exists()
 
 
-def test_a_damaged_image_is_named_and_the_frames_before_it_are_kept(
-    place: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_damaged_images_are_left_out_counted_and_named(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
     os.truncate("seq/depth/000007.png", 100)
-    status, out, error = run(capfd, "track seq --out r --method gs-g --quiet")
-    assert status == 2 and "7 of 14 frames" in out
-    assert error.count("\n") == 1 and "depth/000007.png" in error and "r" in error.split()
+    os.truncate("seq/rgb/000009.png", 100)
+    status, out, error = run(capfd, "track seq --out r --method gs-pg --quiet")
+    assert status == 1 and error == "" and "13 of 14 frames" in out and "none lost" in out
+    assert "left out: 2 images that cannot be read, first seq/depth/000007.png: is not a whole PNG" in out
     info = read_info("r")
-    assert info["end"] == "unreadable" and "000007.png" in info["error"]
-    assert len(read_estimate(Path("r")).stamps) == 7
-    os.truncate("seq/rgb/000000.png", 100)
-    refused(capfd, "track seq --out q --quiet", "rgb/000000.png")
-    assert not Path("q/run.json").exists()
+    assert info["end"] == "done" and info["lost"] == 0
+    assert [(left["frame"], left["error"].split(":")[0]) for left in info["unreadable"]] == [
+        (7, "seq/depth/000007.png"), (9, "seq/rgb/000009.png"),
+    ]  # fmt: skip
+    kept = [k / 30 for k in range(FRAMES) if k != 7]
+    np.testing.assert_allclose(read_estimate(Path("r")).stamps, kept, atol=1e-6)
+    assert [frame["stamp"] for frame in info["frames"]] == pytest.approx(kept)
+    assert info["frames"][8]["pixels_color"] == 0 < info["frames"][9]["pixels_color"]
+    assert info["metrics"]["frames_tracked"] == 13 and info["metrics"]["ate_rmse_m"] < 0.02
+
+
+def test_a_first_image_that_is_damaged_costs_one_frame_only(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    os.truncate("seq/depth/000000.png", 100)
+    assert run(capfd, "track seq --out r --method gs-g --quiet")[0] == 1
+    assert read_info("r")["timings"]["frame_ms"][13:] == [] and len(read_info("r")["frames"]) == 13
+
+
+def test_nothing_but_damaged_images_is_no_run(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    for path in Path("seq/depth").iterdir():
+        os.truncate(path, 100)
+    refused(capfd, "track seq --out r --quiet", "depth/000000.png", "no other frame of the 14")
+    assert not Path("r/run.json").exists()
 
 
 @pytest.mark.parametrize("content", ["", "garbage\n", "0 1 2\n" * 5, "\x00\xff" * 50, "nan 0 0 0 0 0 0 1\n" * 5])

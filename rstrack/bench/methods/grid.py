@@ -126,8 +126,8 @@ def _estimate(job: Job, dataset: Dataset, progress: Progress) -> tuple[Estimate,
         result = track(dataset, job.options, job.out, frames, progress=progress)
         if result.end == "interrupted":
             raise KeyboardInterrupt
-        if result.end == "unreadable":
-            raise UserError(result.error)
+        if result.unreadable:
+            raise UserError(result.unreadable[0])
         return result.estimate, result.estimate.info["timings"]["total_s"]
     seconds = None
     if job.estimate is not None:

@@ -1,0 +1,128 @@
+"""Folders in the layout of 7-Scenes (Shotton et al., CVPR 2013), which other recorders write too.
+
+    frame-000000.color.png    8-bit colour, or .jpg
+    frame-000000.depth.png    16-bit grey, millimetres; 0 and 65535: nothing measured
+    frame-000000.pose.txt     optional: T_world_camera, 4x4; what is not finite is no pose
+    camera.yaml               optional: see `camera_file`; depth is in millimetres whatever it says
+
+Nothing there tells times, cameras or shutters. Frames are taken to be 1/30 s apart by their numbers, so that a number
+left out is a gap; without a camera file both cameras are the one that the data set's authors recommend, and global
+shutter. What is assumed is in `TumFolder.notes`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from rsgen.array_types import FloatArray
+from rsgen.errors import UserError
+from rsgen.files import listed_file, read_text
+from rsgen.geometry import se3
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter
+from rsgen.sequence.trajectory import Trajectory
+from rstrack.data.camera_file import read_rig
+from rstrack.data.image_files import ImageFiles, decode_color, decode_depth, first_size
+from rstrack.data.rig import Rig
+from rstrack.data.tum_folder import TumFolder, find_camera_file
+
+_NAME = re.compile(r"frame-(\d{1,9})\.(color\.png|color\.jpg|color\.jpeg|depth\.png|pose\.txt)")
+_RATE_HZ = 30.0
+_SIZE, _INTRINSICS = (640, 480), (585.0, 585.0, 320.0, 240.0)
+_UNITS_PER_M, _MISSING = 1000.0, 65535
+# Largest deviation of Rᵀ R from the identity that is rounded away.
+_SKEW = 1e-2
+
+
+def is_seven_scenes(root: Path) -> bool:
+    """Whether a folder has this layout, and no listings, which would say more."""
+    if (root / "depth.txt").exists() or (root / "rgb.txt").exists():
+        return False
+    return any(_NAME.fullmatch(path.name) for path in root.glob("frame-*"))
+
+
+def read_seven_scenes(root: Path, camera_file: Path | None) -> TumFolder:
+    """Read names, poses and cameras; images are decoded when asked for.
+
+    camera_file: default camera.yaml, else calibration.yaml in the folder. Poses are taken for the depth camera's, which
+    tracked them. Raises UserError, one line.
+    """
+    color, depth, poses = (_numbered(root, kind) for kind in ("color", "depth", "pose"))
+    for name, found in (("colour", color), ("depth", depth)):
+        if not found:
+            raise UserError(f"{root}: has no {name} image frame-NNNNNN.{name.replace('u', '')}.png: unpack it again")
+    color_paths, depth_paths = tuple(color.values()), tuple(depth.values())
+    rig, notes = _rig(root, camera_file, color_paths, depth_paths)
+    images = ImageFiles(rig, _UNITS_PER_M, color_paths, depth_paths, _MISSING)
+    truth, without = _truth(poses)
+    notes = (f"frames are taken to be 1/{_RATE_HZ:g} s apart: nothing in {root} stamps them", *notes)
+    if without:
+        notes = (*notes, f"{without} of {len(poses)} pose files hold no finite pose: there is no truth at these frames")
+    return TumFolder(rig, _stamps(list(depth)), _stamps(list(color)), images, truth, notes)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _numbered(root: Path, kind: str) -> dict[int, Path]:
+    """Files of a kind by frame number, in order. Raises UserError: a number twice, a file outside the folder."""
+    real_root = root.resolve()
+    found: dict[int, Path] = {}
+    for path in sorted(root.glob("frame-*")):
+        match = _NAME.fullmatch(path.name)
+        if match is None or not match[2].startswith(kind):
+            continue
+        if int(match[1]) in found:
+            raise UserError(f"{path}: frame {int(match[1])} has {found[int(match[1])].name} already: remove one")
+        found[int(match[1])] = listed_file(root, real_root, path.name, str(root), "unpack the dataset again")
+    return dict(sorted(found.items()))
+
+
+def _stamps(numbers: Sequence[int]) -> FloatArray:
+    return np.array(numbers, np.float64) / _RATE_HZ
+
+
+def _rig(
+    root: Path, camera_file: Path | None, color: Sequence[Path], depth: Sequence[Path]
+) -> tuple[Rig, tuple[str, ...]]:
+    sizes = first_size(color, decode_color), first_size(depth, decode_depth)
+    file = find_camera_file(root, camera_file)
+    if file is not None:
+        return read_rig(file, *sizes).rig, ()
+    if sizes != (_SIZE, _SIZE):
+        shown = " and ".join("x".join(map(str, size)) for size in sizes)
+        raise UserError(f"{root}: images are {shown}, and nothing tells the cameras: write {root / 'camera.yaml'}")
+    camera = Camera(*_SIZE, *_INTRINSICS)
+    fx, fy, cx, cy = _INTRINSICS
+    note = (
+        f"both cameras are taken for one global-shutter pinhole, fx {fx:g} fy {fy:g} cx {cx:g} cy {cy:g}: write "
+        f"{root / 'camera.yaml'} if you know them"
+    )
+    return Rig(camera, Shutter(), camera, Shutter(), np.eye(4)), (note,)
+
+
+def _truth(paths: dict[int, Path]) -> tuple[Trajectory | None, int]:
+    """Poses where there are any, and the number of files without one."""
+    poses = {k: T for k, path in paths.items() if (T := _pose(path)) is not None}
+    if not poses:
+        return None, len(paths)
+    T = se3.orthonormalise(np.stack(list(poses.values())))
+    return Trajectory(_stamps(list(poses)), T), len(paths) - len(poses)
+
+
+def _pose(path: Path) -> FloatArray | None:
+    """(4, 4), None if it is not finite. Raises UserError."""
+    try:
+        T = np.array(read_text(path).split(), np.float64).reshape(4, 4)
+    except ValueError:
+        raise UserError(f"{path}: expected the 16 numbers of a 4x4 pose") from None
+    if not np.isfinite(T).all():
+        return None
+    R = T[:3, :3]
+    if np.abs(R.T @ R - np.eye(3)).max() > _SKEW or np.linalg.det(R) < 0 or np.abs(T[3] - (0, 0, 0, 1)).max() > 1e-6:
+        raise UserError(f"{path}: is not a rigid motion: expected camera-to-world, rotation and translation in metres")
+    return T

@@ -1,0 +1,188 @@
+"""The clock of the truth against the images': motion capture has its own, and a driver's stamps are late or early.
+
+fit = fit_clock(truth, estimate)
+metrics = evaluate(shifted(truth, fit.offset_s), estimate)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from rsgen.array_types import FloatArray
+from rsgen.errors import UserError
+from rsgen.geometry import se3
+from rsgen.geometry.spline import Spline
+from rsgen.sequence.trajectory import Trajectory
+from rstrack.data.estimate import Estimate
+from rstrack.metrics.association import Truth, align, angles_deg, true_poses
+from rstrack.metrics.evaluate import pairs_one_second_apart
+
+TruthOffset = float | Literal["auto"]
+"""Seconds after a stamp that the truth is looked up, or 'auto': those at which the errors are least."""
+Criterion = Literal["rotational drift", "translational drift"]
+CRITERIA: tuple[Criterion, ...] = ("rotational drift", "translational drift")
+
+SEARCH_S = 0.1
+"""Offsets are sought within ± this."""
+
+_COARSE_S, _FINE_S, _FINE_REACH_S = 4e-3, 1e-3, 20e-3
+# Pairs of poses one second apart below which nothing is said.
+_LEAST_PAIRS = 30
+# Resampled curves, and the length of what is resampled as one piece: errors of overlapping seconds are alike.
+_RESAMPLES, _BLOCK_S = 200, 2.0
+
+
+@dataclass(frozen=True)
+class ClockFit:
+    """Offset at which an estimate fits the truth best: the pose stamped t belongs to the truth at t + offset_s.
+
+    sigma_s: standard deviation of that, from a block bootstrap over the recording's time. criterion: the error that was
+    minimised. least_s: where each of the errors is least, the trajectory error among them: they should agree.
+    """
+
+    offset_s: float
+    sigma_s: float
+    criterion: Criterion
+    least_s: dict[str, float]
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the clocks differ by more than 2 ms and more than two standard deviations."""
+        return abs(self.offset_s) > max(2e-3, 2.0 * self.sigma_s)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain numbers for JSON."""
+        return dataclasses.asdict(self)
+
+
+def shifted(truth: Truth, offset_s: float) -> Truth:
+    """The truth on the images' clock, where its own is ahead by offset_s; poses are interpolated from then on."""
+    motion: Spline | Trajectory
+    if isinstance(truth.motion, Spline):
+        motion = Spline(truth.motion.control_points, truth.motion.t0 - offset_s, truth.motion.dt)
+    else:
+        motion = Trajectory(truth.motion.stamps - offset_s, truth.motion.T_world_cam)
+    return dataclasses.replace(truth, motion=motion, interpolate=True)
+
+
+def fit_clock(truth: Truth, estimate: Estimate, seed: int = 0) -> ClockFit:
+    """Find the offset within ±0.1 s at which the drift per second is least.
+
+    Minimised is the mean absolute error of relative poses over one second (`evaluate`'s RPE, but not squared, so that a
+    stretch where the track was lost does not decide): a scan in steps of 4 ms, then Brent's method. Rotation is
+    sharper than translation but for motions without any; whichever has the smaller standard deviation is taken.
+    Only poses that have a truth at all offsets count, the same ones at each.
+
+    Standard deviation: half the central 68 % of the minima of 200 curves, resampled in blocks of 2 s.
+
+    Raises UserError: too few poses, or no minimum within the range.
+    """
+    errors = _Errors.of(truth, estimate)
+    coarse = _steps(SEARCH_S, _COARSE_S)
+    curves = np.stack([errors.drift(tau).mean(axis=-1) for tau in coarse])
+    least: dict[str, float] = {}
+    for c, name in enumerate(CRITERIA):
+        k = int(np.argmin(curves[:, c]))
+        if 0 < k < len(coarse) - 1:
+            least[name] = _brent(partial(errors.mean_drift, c), coarse, k)
+    if not least:
+        raise UserError(
+            f"estimate: its errors have no minimum within {1e3 * SEARCH_S:g} ms of clock offset: give the offset in "
+            "seconds, or mend the track first"
+        )
+    sigma = {name: errors.deviation(c, least[name], seed) for c, name in enumerate(CRITERIA) if name in least}
+    best = min((name for name in CRITERIA if name in least), key=lambda name: sigma[name])
+    trajectory = [errors.trajectory(tau) for tau in coarse]
+    k = int(np.clip(np.argmin(trajectory), 1, len(coarse) - 2))
+    return ClockFit(least[best], sigma[best], best, {**least, "trajectory": _brent(errors.trajectory, coarse, k)})
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Errors:
+    """Errors of one estimate as functions of the offset.
+
+    stamps (n,), T_est (n, 4, 4): poses that have a truth at all offsets. i, j: (k,) pairs one second apart.
+    """
+
+    motion: Spline | Trajectory
+    stamps: FloatArray
+    T_est: FloatArray
+    i: Any
+    j: Any
+
+    @classmethod
+    def of(cls, truth: Truth, estimate: Estimate) -> _Errors:
+        # Also half a coarse step outside, where Brent's method may look.
+        offsets = _steps(SEARCH_S + _FINE_REACH_S, 5e-3)
+        known = np.zeros(len(estimate.stamps), int)
+        for tau in offsets:
+            known[true_poses(truth.motion, estimate.stamps + tau, interpolate=True)[0]] += 1
+        kept = known == len(offsets)
+        stamps, T_est = estimate.stamps[kept], estimate.T_world_depth[kept]
+        i, j = pairs_one_second_apart(stamps)
+        if len(i) < _LEAST_PAIRS:
+            raise UserError(
+                f"estimate: {len(i)} pairs of poses one second apart have a truth within {1e3 * SEARCH_S:g} ms, a "
+                f"clock offset needs {_LEAST_PAIRS}"
+            )
+        return cls(truth.motion, stamps, T_est, i, j)
+
+    def true_poses(self, tau: float) -> FloatArray:
+        """(n, 4, 4) at the stamps + tau."""
+        return true_poses(self.motion, self.stamps + tau, interpolate=True)[1]
+
+    def drift(self, tau: float) -> FloatArray:
+        """Angles, degrees, and distances, m, of the relative poses' errors (2, k)."""
+        T_true = self.true_poses(tau)
+        true_step = se3.inverse(T_true[self.i]) @ T_true[self.j]
+        est_step = se3.inverse(self.T_est[self.i]) @ self.T_est[self.j]
+        distance = np.linalg.norm((se3.inverse(true_step) @ est_step)[:, :3, 3], axis=1)
+        return np.stack([angles_deg(true_step, est_step), distance])
+
+    def mean_drift(self, criterion: int, tau: float) -> float:
+        """Mean of a row of `drift`."""
+        return float(self.drift(tau)[criterion].mean())
+
+    def trajectory(self, tau: float) -> float:
+        """Mean distance after alignment, m."""
+        T_true = self.true_poses(tau)
+        T_true_est, _ = align(T_true, self.T_est)
+        aligned = se3.transform(T_true_est, self.T_est[:, :3, 3])
+        return float(np.linalg.norm(aligned - T_true[:, :3, 3], axis=1).mean())
+
+    def deviation(self, criterion: int, tau: float, seed: int) -> float:
+        """Standard deviation of the least point of a drift curve that is least at tau, seconds."""
+        offsets = tau + _steps(_FINE_REACH_S, _FINE_S)
+        curves = np.stack([self.drift(float(at))[criterion] for at in np.clip(offsets, -SEARCH_S, SEARCH_S)], axis=1)
+        count = len(curves)
+        per_second = count / (self.stamps[self.i[-1]] - self.stamps[self.i[0]])
+        length = int(np.clip(_BLOCK_S * per_second, 1, count // 4))
+        starts = np.random.default_rng(seed).integers(0, count, (_RESAMPLES, -(-count // length)))
+        minima = []
+        for blocks in starts:
+            drawn = (blocks[:, None] + np.arange(length)) % count  # circular: both ends count as often as the middle
+            minima.append(offsets[int(np.argmin(curves[drawn.ravel()].mean(axis=0)))])
+        low, high = np.quantile(minima, [0.16, 0.84])
+        # Minima are found on a grid: no finer than its rounding error.
+        return float(np.hypot(0.5 * (high - low), _FINE_S / np.sqrt(12.0)))
+
+
+def _steps(reach: float, step: float) -> FloatArray:
+    count = round(reach / step)
+    return np.asarray(np.arange(-count, count + 1) * step, np.float64)
+
+
+def _brent(cost: Callable[[float], float], grid: FloatArray, k: int) -> float:
+    """Where a function is least between the neighbours of the k-th of some points."""
+    found = minimize_scalar(cost, bounds=(grid[k - 1], grid[k + 1]), method="bounded", options={"xatol": 1e-6})
+    return float(found.x)

@@ -1,0 +1,150 @@
+"""`rstrack evaluate`: an estimate against a sequence's truth or a file of poses, and what a clock offset changes.
+
+evaluation = run_evaluate(Path("fr1_rpy"), Path("runs/fr1_rpy"), truth_offset="auto")
+print(evaluation.text())
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsgen.errors import UserError
+from rsgen.geometry.spline import Spline
+from rsgen.sequence.trajectory import read_trajectory
+from rstrack.data.dataset import open_dataset
+from rstrack.data.estimate import Estimate, read_estimate
+from rstrack.metrics.association import Truth, truth_of
+from rstrack.metrics.clock import ClockFit, TruthOffset, fit_clock, shifted
+from rstrack.metrics.evaluate import Metrics, evaluate
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Errors with the clocks as they are, and with the truth `offset_s` after the stamps.
+
+    moved: errors there; None with offset_s where nothing was asked and nothing was found. fit: how the offset was
+    found; None if it was given. asked: whether it was asked for; else it is a hint.
+    """
+
+    metrics: Metrics
+    offset_s: float | None = None
+    moved: Metrics | None = None
+    fit: ClockFit | None = None
+    asked: bool = False
+
+    @property
+    def chosen(self) -> Metrics:
+        """The errors that were asked for."""
+        return self.moved if self.asked and self.moved is not None else self.metrics
+
+    @property
+    def truth_offset(self) -> dict[str, Any] | None:
+        """For JSON: offset, how it was found, and the errors there; None without one."""
+        if self.moved is None:
+            return None
+        how = {"sigma_s": None, "criterion": None, "least_s": None} if self.fit is None else self.fit.as_dict()
+        return how | {"offset_s": self.offset_s, "metrics": self.moved.as_dict()}
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON: the errors with the clocks as they are, and under `truth_offset` those with the offset."""
+        return self.metrics.as_dict() | {"truth_offset": self.truth_offset}
+
+    @property
+    def hint(self) -> str | None:
+        """One line on an offset that nobody asked for; None without one."""
+        if self.moved is None or self.asked:
+            return None
+        return f"errors are least with {self._clock()}: {_short(self.moved)} (rstrack evaluate ... --truth-offset auto)"
+
+    def text(self) -> str:
+        """Tables; a mere hint is one line under them."""
+        if self.moved is None or self.offset_s is None:
+            return self.metrics.text()
+        if self.hint is not None:
+            return f"{self.metrics.text()}\nhint: {self.hint}"
+        lines = [f"clocks as they are: {_short(self.metrics)}", f"{self._clock()}: {_short(self.moved)}"]
+        if self.fit is not None:
+            where = ", ".join(f"{name} {1e3 * tau:+.1f}" for name, tau in self.fit.least_s.items())
+            lines.append(f"least by {self.fit.criterion}; each error is least at, ms: {where}")
+        return "\n".join([*lines, "", self.moved.text()])
+
+    def _clock(self) -> str:
+        assert self.offset_s is not None
+        size, side = f"{abs(1e3 * self.offset_s):.1f}", "after" if self.offset_s > 0 else "before"
+        spread = f" ± {1e3 * self.fit.sigma_s:.1f}" if self.fit else ""
+        return f"the truth {size}{spread} ms {side} the stamps"
+
+
+def evaluate_clocks(truth: Truth, estimate: Estimate, offset: TruthOffset | None = None) -> Evaluation:
+    """Evaluate with the clocks as they are, and with an offset: given, found, or None.
+
+    None: a truth of poses, which may have a clock of its own, is tried with the best offset, and the result kept if it
+    is clear (`ClockFit.is_clear`). A spline is of the same clock as the images. Raises UserError, for an offset only
+    if it was asked for.
+    """
+    metrics = evaluate(truth, estimate)
+    if offset is None:
+        fit = None if isinstance(truth.motion, Spline) else _fit_or_none(truth, estimate)
+        if fit is None or not fit.is_clear:
+            return Evaluation(metrics)
+        return Evaluation(metrics, fit.offset_s, evaluate(shifted(truth, fit.offset_s), estimate), fit)
+    fit = fit_clock(truth, estimate) if offset == "auto" else None
+    tau = float(offset) if fit is None else fit.offset_s
+    return Evaluation(metrics, tau, evaluate(shifted(truth, tau), estimate), fit, asked=True)
+
+
+def aligned_clock(truth: Truth, estimate: Estimate, offset: TruthOffset | None) -> Truth:
+    """The truth with an offset given or found; None: as it is. Raises UserError."""
+    if offset is None:
+        return truth
+    return shifted(truth, fit_clock(truth, estimate).offset_s if offset == "auto" else float(offset))
+
+
+def run_evaluate(
+    truth_path: Path, estimate_path: Path, camera_file: Path | None = None, truth_offset: TruthOffset | None = None
+) -> Evaluation:
+    """Evaluate a run folder or TUM file against the truth of a sequence folder, or against another TUM file.
+
+    Arguments as in `read_estimate`, `rstrack.data.dataset.open_dataset` and `evaluate_clocks`. Raises UserError.
+    """
+    truth = _truth(truth_path, camera_file)
+    estimate = read_estimate(estimate_path)
+    try:
+        return evaluate_clocks(truth, estimate, truth_offset)
+    except UserError as error:
+        raise UserError(f"{estimate_path}: {error}") from None
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _truth(path: Path, camera_file: Path | None) -> Truth:
+    if Path(path).is_file():
+        if camera_file is not None:
+            raise UserError(f"{path}: a file of poses needs no cameras: leave the camera file {camera_file} out")
+        return Truth(read_trajectory(path, max_gap_s=math.inf), np.empty(0))
+    truth = truth_of(open_dataset(path, camera_file))
+    if truth is None:
+        raise UserError(
+            f"{path}: has no ground truth to compare with: add a groundtruth.txt, or only plot the estimate"
+        )
+    return truth
+
+
+def _fit_or_none(truth: Truth, estimate: Estimate) -> ClockFit | None:
+    try:
+        return fit_clock(truth, estimate)
+    except UserError:
+        return None
+
+
+def _short(m: Metrics) -> str:
+    parts = [f"ATE {1e3 * m.ate_rmse_m:.2f} mm"]
+    if m.rpe_trans_rmse_m_per_s is not None and m.rpe_rot_rmse_deg_per_s is not None:
+        parts += [f"{1e3 * m.rpe_trans_rmse_m_per_s:.2f} mm/s", f"{m.rpe_rot_rmse_deg_per_s:.3f} deg/s"]
+    return ", ".join(parts)
