@@ -30,6 +30,8 @@ def describe(dataset: Dataset) -> str:
         ("frames", f"{len(dataset)}, {_groups(dataset)}"),
         ("truth", _truth(dataset)),
     ]
+    if dataset.timing is not None:
+        rows += [("clocks" if i == 0 else "", line) for i, line in enumerate(dataset.timing.lines())]
     return "\n".join(f"{label:<8} {text}" for label, text in rows)
 
 

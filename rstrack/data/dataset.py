@@ -8,9 +8,9 @@ for frame in dataset.frames():
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +23,8 @@ from rsgen.sequence.reader import Sequence, read_sequence
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.prefetch import prefetched
 from rstrack.data.rig import Frame, Image, Rig
-from rstrack.data.tum_folder import read_tum_folder
+from rstrack.data.timing import Timing, stream_timing
+from rstrack.data.tum_folder import TumFolder, read_tum_folder
 
 __all__ = ["Dataset", "Frame", "Image", "Rig", "group_colors", "open_dataset"]
 
@@ -48,7 +49,7 @@ class Dataset:
     stamps: (n,) seconds, one for each depth image, strictly increasing. color_stamps: (m,) seconds, increasing.
     groups: for each frame the indices of its colour images.
     truth: T_world_depth(t), of rsgen sequences. truth_poses: T_world_depth, of other folders that have it.
-    sequence: the rsgen sequence itself, where it is one.
+    sequence: the rsgen sequence itself, where it is one. timing: of recordings, how their stamps came about.
     """
 
     name: str
@@ -61,6 +62,7 @@ class Dataset:
     truth: Spline | None = None
     truth_poses: Trajectory | None = None
     sequence: Sequence | None = None
+    timing: Timing | None = None
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -83,6 +85,24 @@ class Dataset:
         """
         return prefetched(self.frame, range(len(self))[first:last], prefetch)
 
+    def with_color_offset(self, offset_s: float, note: str = "") -> Dataset:
+        """The same recording with `offset_s` added to the stamps that colour would have without any offset.
+
+        note: for the screen, where the offset comes from.
+        """
+        if self.timing is None:
+            return self
+        color_stamps = self.timing.color.used + offset_s
+        notes = (*self.timing.notes, note) if note else self.timing.notes
+        timing = replace(self.timing, color_offset_s=offset_s, notes=notes)
+        return replace(self, color_stamps=color_stamps, groups=group_colors(self.stamps, color_stamps), timing=timing)
+
+    def timed_as(self, info: dict[str, Any]) -> Dataset:
+        """The same recording with colour's offset as a run had it, whose run.json holds `info`."""
+        clocks = info.get("clocks")
+        offset_s = clocks.get("color_offset_s") if isinstance(clocks, dict) else None
+        return self.with_color_offset(float(offset_s)) if isinstance(offset_s, float | int) else self
+
     def rows(self, stream: StreamName) -> FloatArray | None:
         """True poses (images, lines, 7) tx ty tz qx qy qz qw of each line's camera in the world; None if not known.
 
@@ -104,10 +124,7 @@ def open_dataset(path: Path, camera_file: Path | None = None) -> Dataset:
     if not root.is_dir():
         raise UserError(f"{root}: no such folder: give an rsgen sequence or a TUM RGB-D or ICL-NUIM folder")
     if not (root / "sequence.yaml").exists():
-        tum = read_tum_folder(root, camera_file)
-        groups = group_colors(tum.depth_stamps, tum.color_stamps)
-        stamps = (tum.depth_stamps, tum.color_stamps)
-        return Dataset(root.resolve().name, root, tum.rig, *stamps, groups, tum.images, truth_poses=tum.truth_poses)
+        return _of_tum(root, read_tum_folder(root, camera_file))
     if camera_file is not None:
         raise UserError(f"{root}: its sequence.yaml holds the cameras: leave the camera file {camera_file} out")
     sequence = read_sequence(root)
@@ -116,6 +133,23 @@ def open_dataset(path: Path, camera_file: Path | None = None) -> Dataset:
     groups = group_colors(depth.stamps, color.stamps)
     stamps = (depth.stamps, color.stamps)
     return Dataset(sequence.name, root, rig, *stamps, groups, sequence, truth=sequence.spline, sequence=sequence)
+
+
+def _of_tum(root: Path, tum: TumFolder) -> Dataset:
+    """A recording with its stamps as its camera file wants them. Raises UserError."""
+    file = tum.file
+    try:
+        depth = stream_timing("depth", tum.depth_stamps, file.stamps, file.depth_offset_s)
+        color = stream_timing("colour", tum.color_stamps, file.stamps, 0.0)
+    except UserError as error:
+        raise UserError(f"{root}: {error}") from None
+    timing = Timing(depth, color, file.color_offset_s, file.notes)
+    color_stamps = color.used + (file.color_offset_s or 0.0)
+    groups = group_colors(depth.used, color_stamps)
+    return Dataset(
+        root.resolve().name, root, file.rig, depth.used, color_stamps, groups, tum.images,
+        truth_poses=tum.truth_poses, timing=timing,
+    )  # fmt: skip
 
 
 def group_colors(depth_stamps: npt.ArrayLike, color_stamps: npt.ArrayLike) -> tuple[tuple[int, ...], ...]:

@@ -62,9 +62,10 @@ class ImageFiles:
 
 @dataclass(frozen=True)
 class TumFolder:
-    """What `read_tum_folder` finds. Stamps (n,) and (m,) in seconds, increasing; truth_poses are T_world_depth."""
+    """What `read_tum_folder` finds. Stamps as listed (n,) and (m,) in seconds, increasing; file: the camera file's
+    content; truth_poses are T_world_depth."""
 
-    rig: Rig
+    file: RigFile
     depth_stamps: FloatArray
     color_stamps: FloatArray
     images: ImageFiles
@@ -81,7 +82,7 @@ def read_tum_folder(root: Path, camera_file: Path | None) -> TumFolder:
     file = _rig_file(root, camera_file, color.paths[0], depth.paths[0])
     images = ImageFiles(file.rig, file.depth_scale, color.paths, depth.paths)
     rate = ICL_RATE_HZ if depth.has_frame_numbers and color.has_frame_numbers else 1.0
-    return TumFolder(file.rig, depth.stamps / rate, color.stamps / rate, images, _truth(root, file.rig))
+    return TumFolder(file, depth.stamps / rate, color.stamps / rate, images, _truth(root, file.rig))
 
 
 # --- listings --------------------------------------------------------------------------------------------------------

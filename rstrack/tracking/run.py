@@ -30,6 +30,7 @@ from rstrack.data.estimate import Estimate, write_estimate
 from rstrack.data.noise import with_noise
 from rstrack.data.prefetch import prefetched
 from rstrack.data.rig import Frame, Rig
+from rstrack.data.timing import Timing
 from rstrack.metrics.association import Truth, compare, truth_of
 from rstrack.metrics.evaluate import Metrics, evaluate
 from rstrack.options import Options
@@ -88,7 +89,7 @@ class Result:
     """What a run came to.
 
     end: why it stopped; `error` says where the tracker broke down, or which image could not be read. lost: number of
-    frames. metrics: None without a truth, or with too few poses.
+    frames. metrics: None without a truth, or with too few poses. timing: of recordings, how stamps came about.
     """
 
     estimate: Estimate
@@ -96,6 +97,7 @@ class Result:
     end: End
     error: str
     lost: int
+    timing: Timing | None = None
 
     def text(self) -> str:
         """A summary of a few lines, with the metrics if there is a truth."""
@@ -112,6 +114,7 @@ class Result:
         weak = sum(not f["lost"] and 0.0 < f["observability"] < _WEAK for f in info["frames"])
         if weak and info["method"] in ("rs-g", "gs-g", "baseline"):
             lines.append(f"in {weak} of {done} frames the geometry hardly fixes all six degrees of freedom (a wall?)")
+        lines += [] if self.timing is None else self.timing.lines()
         return "\n".join(lines + ([] if self.metrics is None else ["", self.metrics.text()]))
 
 
@@ -150,6 +153,7 @@ def track(
     Raises UserError: no such frames, `out` cannot be written or is a dataset, no frame was tracked.
     """
     chosen = _chosen(dataset, frames)
+    dataset = _with_color_timed(dataset, chosen, options, progress)
     truth = truth_of(dataset)
     if truth is not None:
         truth = dataclasses.replace(truth, frame_stamps=dataset.stamps[chosen])
@@ -192,7 +196,7 @@ def track(
     if not seconds:
         raise UserError(error)
     timings = _timings(time.perf_counter() - begin, seconds)
-    stamps = dataset.stamps[chosen][: len(seconds)]
+    used = chosen[: len(seconds)]
     info = _settings(dataset, chosen, tracker.options, noise) | {
         "end": end,
         "error": error or None,
@@ -200,13 +204,15 @@ def track(
         "lost": sum(report.lost for report in tracker.reports),
         "spline_valid": tracker.spline_valid,
         "timings": timings,
-        "frames": _diagnostics(stamps, tracker.reports),
+        "frames": _diagnostics(dataset, used, tracker.reports),
     }
+    if dataset.timing is not None:
+        info["clocks"] = dataset.timing.as_dict()
     estimate = Estimate(*tracker.trajectory, tracker.spline, info)
     metrics = _metrics(truth, estimate)
     info["metrics"] = None if metrics is None else metrics.as_dict()
     write_estimate(out, estimate.stamps, estimate.T_world_depth, estimate.spline, info)
-    return Result(estimate, metrics, end, error, info["lost"])
+    return Result(estimate, metrics, end, error, info["lost"], dataset.timing)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -217,6 +223,16 @@ def _chosen(dataset: Dataset, frames: slice) -> range:
     if not len(chosen):
         raise UserError(f"{dataset.root}: has no frame {frames.start}: its frames are 0 to {len(dataset) - 1}")
     return chosen
+
+
+def _with_color_timed(dataset: Dataset, chosen: range, options: Options, progress: Progress) -> Dataset:
+    """The dataset with its colour stamps' offset found, where it is not known, may not be 0 and matters."""
+    if dataset.timing is None or not dataset.timing.wants_color_offset or not options.photometric:
+        return dataset
+    from rstrack.tracking.color_offset import estimate_color_offset
+
+    found = estimate_color_offset(dataset, chosen, options, progress)
+    return dataset.with_color_offset(found.offset_s, found.text())
 
 
 def _make_folder(out: Path) -> None:
@@ -304,11 +320,16 @@ def _timings(total_s: float, seconds: Sequence[float]) -> dict[str, Any]:
     }
 
 
-def _diagnostics(stamps: FloatArray, reports: Sequence[FrameReport]) -> list[dict[str, Any]]:
-    """One dict a frame for the plots: `FrameReport`, with inliers as parts of the run's largest number too."""
+def _diagnostics(dataset: Dataset, used: range, reports: Sequence[FrameReport]) -> list[dict[str, Any]]:
+    """One dict a frame for the plots: `FrameReport`, with inliers as parts of the run's largest number too.
+
+    listed_stamp: as the recording has it, where it was tracked at another one.
+    """
     frames = [dataclasses.asdict(report) for report in reports]
-    for stamp, frame in zip(stamps, frames, strict=True):
-        frame["stamp"] = float(stamp)
+    for k, frame in zip(used, frames, strict=True):
+        frame["stamp"] = float(dataset.stamps[k])
+        if dataset.timing is not None:
+            frame["listed_stamp"] = float(dataset.timing.depth.listed[k])
     for stream in ("depth", "color"):
         counts = [frame[f"inliers_{stream}"] for frame in frames]
         most = max(counts)
