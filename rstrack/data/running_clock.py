@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-# Stamps that pass unchanged before there is a line; seconds after which a stamp counts 1/e; stamps in a row that are
-# off the line by more than a third of a period, after which the rate has changed; a pause that ends the line.
-_FIRST, _MEMORY_S, _MOST_OFF, _PAUSE_S = 12, 20.0, 8, 2.0
+# Stamps that pass unchanged before there is a line; seconds after which a stamp counts 1/e; a pause that ends the line.
+_FIRST, _MEMORY_S, _PAUSE_S = 12, 20.0, 2.0
+# Part of the last ten or so stamps off the line by more than a third of a period, from which on the rate has changed.
+_MOST_OFF = 0.4
 # Least step between two stamps given, in periods.
 _LEAST_STEP = 0.05
 
@@ -28,7 +29,7 @@ class RunningClock:
     _sums: np.ndarray = field(default_factory=lambda: np.zeros(5))
     _base: float = 0.0
     _scale: float = 0.0
-    _off: int = 0
+    _off: float = 0.0
     _last: float = -math.inf
 
     def feed(self, stamp: float) -> float:
@@ -40,7 +41,7 @@ class RunningClock:
         return self._last
 
     def _restart(self) -> None:
-        self._recent, self._period, self._off = [], 0.0, 0
+        self._recent, self._period, self._off = [], 0.0, 0.0
 
     def _collect(self, stamp: float) -> float:
         self._recent.append(stamp)
@@ -59,8 +60,8 @@ class RunningClock:
         level, period = self._line()
         count = max(round((stamp - self._base - level) / period), 1)
         residual = stamp - self._base - level - count * period
-        self._off = self._off + 1 if abs(residual) > period / 3.0 else 0
-        if self._off >= _MOST_OFF:
+        self._off += 0.1 * (float(abs(residual) > period / 3.0) - self._off)
+        if self._off > _MOST_OFF:
             self._restart()
             return self._collect(stamp)
         self._shift(count, count * period + level)

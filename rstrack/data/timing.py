@@ -24,7 +24,7 @@ StampsMode = Literal["auto", "raw", "regular"]
 
 @dataclass(frozen=True)
 class StreamTiming:
-    """One stream's stamps (n,) in seconds, as listed and as used, and its clock. is_even: those used are the clock's."""
+    """One stream's stamps (n,) in seconds, as listed and as used, and its clock. is_even: used are the clock's."""
 
     clock: Clock
     listed: FloatArray

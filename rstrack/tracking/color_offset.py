@@ -34,6 +34,8 @@ Progress = Callable[[str, float, str], None]
 
 # Offsets looked at (s): coarse ones, then fine ones about the best.
 _MOST_S, _COARSE_S, _FINE_S = 0.06, 0.01, 0.0025
+# Fine offsets on each side of the best one through which a parabola is laid.
+_NEAR = 2
 # Frames that are tracked; of these, every so manieth has its depth looked up in pairs of images so many frames apart.
 _TRACKED, _EVERY, _APART = 60, 4, (4, 8)
 # Depth images as wide as that are thinned out: a short track needs no more, and it takes most of the time.
@@ -41,12 +43,14 @@ _LARGE = 480
 # Windows of the recording of which the one that moves most is taken, and the shift (part of the width, a frame) that is
 # enough: images that move faster are blurred.
 _WINDOWS, _ENOUGH = 8, 0.015
-# Depth pixels looked up: every so manieth; and the fewest a pair may share.
-_STRIDE, _FEWEST = 6, 400
+# Depth pixels looked up in a line; and the fewest a pair may share.
+_ACROSS, _FEWEST = 106, 400
 # 8-bit values that are clipped, and their neighbours.
 _BLACK, _WHITE = 4, 250
 # The offset is taken for determined if its standard error is below this, and it lies inside of what was looked at.
 _MOST_SIGMA_S = 5e-3
+# Noise of colour images against each other, over their contrast, above which the track is not to be believed.
+_MOST_NOISE = 0.25
 _ROUNDS = 3
 
 
@@ -88,20 +92,25 @@ def estimate_color_offset(
     if len(pairs) < 6:
         return ColorOffset(0.0, np.inf, len(pairs), "too few images overlap")
     coarse = np.arange(-_MOST_S, _MOST_S + 1e-9, _COARSE_S)
-    costs = _costs(dataset, spline, pairs, coarse, progress)
-    costs = costs[np.isfinite(costs).all(axis=1)]
+    costs, noise = _costs(dataset, spline, pairs, coarse, progress)
     if len(costs) < 6:
         return ColorOffset(0.0, np.inf, len(costs), "too few images overlap")
+    if np.median(noise) > _MOST_NOISE:
+        return ColorOffset(0.0, np.inf, len(costs), "colour does not fit the track that depth alone gives")
     best = int(np.argmin(costs.sum(axis=0)))
     if best in (0, len(coarse) - 1):
         return ColorOffset(0.0, np.inf, len(costs), f"it would be beyond {1e3 * _MOST_S:.0f} ms")
-    fine = coarse[best] + np.arange(-4, 5) * _FINE_S
-    costs = _costs(dataset, spline, pairs, fine, progress)
-    return _minimum(fine, costs[np.isfinite(costs).all(axis=1)])
+    fine = coarse[best] + np.arange(-5, 6) * _FINE_S
+    return _minimum(fine, _costs(dataset, spline, pairs, fine, progress)[0])
 
 
 def _minimum(offsets: FloatArray, costs: FloatArray) -> ColorOffset:
     """Minimum over offsets (m,) of the summed costs (pairs, m), its error from leaving tenths of the pairs out."""
+    if not len(costs):
+        return ColorOffset(0.0, np.inf, 0, "too few images overlap")
+    best = int(np.argmin(costs.sum(axis=0)))
+    near = slice(max(best - _NEAR, 0), best + _NEAR + 1)
+    offsets, costs = offsets[near], costs[:, near]
     offset, bend = _parabola(offsets, costs.sum(axis=0))
     parts = np.array_split(np.arange(len(costs)), min(10, len(costs)))
     without = [_parabola(offsets, np.delete(costs, part, axis=0).sum(axis=0)) for part in parts]
@@ -200,25 +209,27 @@ def _pairs(dataset: Dataset, frames: range, begin: float, end: float) -> list[tu
 
 def _costs(
     dataset: Dataset, spline: Spline, pairs: Sequence[tuple[int, int, int]], offsets: FloatArray, progress: Progress
-) -> FloatArray:
-    """Costs (pairs, m) of the offsets (m,), each pair's over its noise; not finite where a pair shares too little."""
+) -> tuple[FloatArray, FloatArray]:
+    """Costs (k, m) of the offsets (m,) of the k pairs that share enough, and their noise (k,) over the contrast."""
     points = lru_cache(maxsize=2)(lambda k: _points(dataset, spline, k))
     images = lru_cache(maxsize=16)(lambda i: _image(dataset.images.color(i)))
-    out = np.full((len(pairs), len(offsets)), np.inf)
+    found = [(np.empty((0, len(offsets))), np.empty(0))]
     for n, (k, i, j) in enumerate(pairs):
         a, b = (_looked_up(dataset, spline, images(m), points(k), dataset.color_stamps[m] + offsets) for m in (i, j))
         good = np.isfinite(a).all(axis=0) & np.isfinite(b).all(axis=0)
         if np.count_nonzero(good) >= _FEWEST:
-            out[n] = _disagreement(a[:, good], b[:, good])
+            cost, noise = _disagreement(a[:, good], b[:, good])
+            found.append((cost[None], np.array([noise])))
         progress("colour's clock", 0.7 + 0.3 * (n + 1) / len(pairs), "comparing colour images")
-    return out
+    return np.concatenate([costs for costs, _ in found]), np.concatenate([noise for _, noise in found])
 
 
 def _points(dataset: Dataset, spline: Spline, k: int) -> FloatArray:
     """Points (n, 3) in the world of frame k's depth, each line with its own pose."""
     camera, shutter = dataset.rig.depth_camera, dataset.rig.depth_shutter
-    pixels = camera.pixel_grid()[::_STRIDE, ::_STRIDE].reshape(-1, 2)
-    z = dataset.images.depth(k)[::_STRIDE, ::_STRIDE].reshape(-1)
+    step = max(camera.width // _ACROSS, 1)
+    pixels = camera.pixel_grid()[::step, ::step].reshape(-1, 2)
+    z = dataset.images.depth(k)[::step, ::step].reshape(-1)
     rays = camera.unproject(pixels)
     known = (z > 0.0) & np.isfinite(rays).all(axis=1)
     lines = shutter.line_of_pixel(pixels[known], camera)
@@ -258,14 +269,16 @@ def _looked_up(
     return out
 
 
-def _disagreement(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Student-t cost (m,) of intensities b (m, n) against gain · a + offset, fitted to each of the m.
+def _disagreement(a: FloatArray, b: FloatArray) -> tuple[FloatArray, float]:
+    """Student-t cost (m,) of intensities b (m, n) against gain · a + offset, fitted to each of the m; and its σ over
+    that of b.
 
     One σ for all, from where they agree best: the costs are log-likelihoods up to a constant, for n independent points.
     """
     errors = np.array([_residuals(x, y) for x, y in zip(a, b, strict=True)])
     sigma = max(float(np.min(1.4826 * np.median(np.abs(errors), axis=1))), 1e-3)
-    return np.asarray(3.0 * np.log1p((errors / sigma) ** 2 / 5.0).sum(axis=1))
+    contrast = max(1.4826 * float(np.median(np.abs(b - np.median(b)))), 1e-3)
+    return np.asarray(3.0 * np.log1p((errors / sigma) ** 2 / 5.0).sum(axis=1)), sigma / contrast
 
 
 def _residuals(x: FloatArray, y: FloatArray) -> FloatArray:
