@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,9 +12,13 @@ import synthetic
 
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
+from rsgen.sequence.format import StreamName
 from rstrack.data.dataset import Dataset, group_colors, open_dataset
+from rstrack.data.estimate import read_estimate
+from rstrack.options import Options
 from rstrack.tracking import color_offset
 from rstrack.tracking.color_offset import estimate_color_offset
+from rstrack.tracking.run import track
 
 WRONG_S = 0.0173
 RPY = Path(__file__).resolve().parents[3] / "shared/data/tum_fr1_rpy"
@@ -121,3 +126,32 @@ class _Same:
 def test_stamps_of_a_sequence_are_no_guess(shaken: Dataset) -> None:
     assert shaken.timing is None and shaken.with_color_offset(0.1) is shaken
     assert Path(shaken.root, "sequence.yaml").exists()
+
+
+def test_a_run_says_and_holds_the_clocks(shaken: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recording that arrives up to 3 ms late, its colour stamped too early, tracked for a few frames."""
+    assert shaken.sequence is not None
+    root = tmp_path / "tum"
+    root.mkdir()
+    rng = np.random.default_rng(1)
+    stamps = {}
+    streams: tuple[tuple[str, StreamName, float], ...] = (("depth", "depth", 0.0), ("rgb", "color", WRONG_S))
+    for name, stream, early in streams:
+        shutil.copytree(Path(shaken.root) / name, root / name)
+        images = shaken.sequence.streams[stream]
+        stamps[name] = images.stamps + rng.uniform(0.0, 3e-3, len(images.paths)) - early
+        lines = [f"{t:.6f} {name}/{p.name}" for t, p in zip(stamps[name], images.paths, strict=True)]
+        (root / f"{name}.txt").write_text("\n".join(lines) + "\n")
+    camera = "{width: 160, height: 120, intrinsics: [120.0, 120.0, 79.5, 59.5], readout_s: 0.028}"
+    (root / "camera.yaml").write_text(f"color: {camera}\ndepth: {camera}\n")
+    found = color_offset.ColorOffset(0.0171, 0.001, 12)
+    monkeypatch.setattr(color_offset, "estimate_color_offset", lambda *_: found)
+    result = track(open_dataset(root), Options(method="rs-pg"), tmp_path / "run", slice(0, 4))
+    info = read_estimate(tmp_path / "run").info
+    assert info["clocks"]["color_offset_s"] == 0.0171 and info["clocks"]["depth"]["verdict"] == "jittered"
+    np.testing.assert_allclose([frame["listed_stamp"] for frame in info["frames"]], stamps["depth"][:4], atol=1e-6)
+    assert np.ptp(np.diff([frame["stamp"] for frame in info["frames"]])) < 1e-6
+    assert "RMS straightened" in result.text() and "+17.1 ms added" in result.text()
+    # Geometry needs no colour: nothing is looked for.
+    result = track(open_dataset(root), Options(method="rs-g"), tmp_path / "run", slice(0, 4))
+    assert result.timing is not None and result.timing.color_offset_s is None
