@@ -1,7 +1,7 @@
-"""Registered depth, as drivers deliver it: warped into the colour camera, each depth row's own time ignored.
+"""Registered depth, as drivers deliver it: warped into the colour camera by geometry alone, motion ignored.
 
-Writes a plain TUM RGB-D folder. This is what the paper says destroys the rows' times: a row of a registered image mixes
-pixels of many depth rows. It is here to measure what that costs, not to track with.
+Writes a plain TUM RGB-D folder. A row of a registered image mixes pixels of neighbouring depth rows; where the cameras
+lie beside each other their order hardly changes, and camera.yaml says whose lines' times they have.
 """
 
 from __future__ import annotations
@@ -19,19 +19,20 @@ from rsgen.export.folder import make_folders, new_folder, place_images
 from rsgen.files import atomic_write, encode_png, encode_yaml
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter
 from rsgen.produce.writer import quantise
 from rsgen.sequence.format import associate, ground_truth, pose_rows
 from rsgen.sequence.reader import Sequence
 
-_MARK = "registered to the colour camera: the times of depth rows are lost"
+_MARK = "registered to the colour camera"
 
 
 def export_registered(sequence: Sequence, out: Path, copy: bool = False, progress: Progress = no_progress) -> str:
     """Write the new folder `out` in TUM's layout with registered depth; returns one line.
 
     rgb/ holds hard links where the disk allows, or copies with `copy`. camera.yaml (as rstrack reads it) says that
-    depth has the colour camera and a global shutter; groundtruth.txt holds poses of the colour camera. Stamps are those
-    of the sequence, as drivers leave them. Raises UserError if `out` is not empty, or an image cannot be read.
+    depth has the colour camera, and which camera with which shutter it was warped from; groundtruth.txt holds poses of
+    the colour camera. Stamps are the sequence's. Raises UserError if `out` is not empty, or an image cannot be read.
     """
     color, depth = sequence.streams["color"], sequence.streams["depth"]
     sequence.depth(0)  # of the size that sequence.yaml says, or all below would take memory for another one
@@ -86,18 +87,28 @@ def register_depth(
 
 
 def _camera_yaml(sequence: Sequence) -> Mapping[str, Any]:
-    color, shutter = sequence.streams["color"].camera, sequence.streams["color"].shutter
-    camera = {
-        "width": color.width,
-        "height": color.height,
-        "intrinsics": [color.fx, color.fy, color.cx, color.cy],
-        "model": color.model,
-        "distortion": list(color.distortion),
-    }
+    color, depth = sequence.streams["color"], sequence.streams["depth"]
+    sensor = _camera(depth.camera) | {"T_color_sensor": sequence.T_color_depth.tolist()}
+    warped = {"registered": True, "sensor": sensor, "depth_scale": depth.depth_scale}
     return {
-        "color": camera | {"readout_s": shutter.readout_s, "exposure_s": shutter.exposure_s, "scan": shutter.scan},
-        "depth": camera | {"registered": True, "readout_s": 0.0, "depth_scale": sequence.streams["depth"].depth_scale},
+        "stamps": "raw",
+        "color": _camera(color.camera) | _shutter(color.shutter) | {"offset_s": 0.0},
+        "depth": _camera(color.camera) | _shutter(depth.shutter) | warped,
     }
+
+
+def _camera(camera: Camera) -> dict[str, Any]:
+    return {
+        "width": camera.width,
+        "height": camera.height,
+        "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
+        "model": camera.model,
+        "distortion": list(camera.distortion),
+    }
+
+
+def _shutter(shutter: Shutter) -> dict[str, Any]:
+    return {"readout_s": shutter.readout_s, "exposure_s": shutter.exposure_s, "scan": shutter.scan}
 
 
 def _write(path: Path, lines: list[str]) -> None:

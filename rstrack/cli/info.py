@@ -31,6 +31,8 @@ def describe(dataset: Dataset) -> str:
         ("truth", _truth(dataset)),
         *(("note", note) for note in dataset.notes),
     ]
+    if dataset.timing is not None:
+        rows += [("clocks" if i == 0 else "", line) for i, line in enumerate(dataset.timing.lines())]
     return "\n".join(f"{label:<8} {text}" for label, text in rows)
 
 

@@ -62,7 +62,8 @@ def keyframes(
     from rstrack.data.estimate import read_estimate
     from rstrack.mapping.keyframes import write_keyframes
 
-    dataset, estimate = open_dataset(sequence, camera), read_estimate(run)
+    estimate = read_estimate(run)
+    dataset = open_dataset(sequence, camera).timed_as(estimate.info)
     with ProgressDisplay(quiet) as progress:
         count = write_keyframes(dataset, estimate, out, sigma_px or None, progress=progress)
     print(f"{out}: {count} keyframes written")

@@ -1,19 +1,22 @@
 """The cameras of folders that are no rsgen sequence: our camera.yaml, or a calibration.yaml of OpenCV's FileStorage.
 
-camera.yaml (depth left out: the same camera as colour, registered to it, global shutter, 5000 units per metre):
+camera.yaml (depth left out: registered to colour, read out as colour is, 5000 units per metre):
 
-    color: {width: 640, height: 480, intrinsics: [481.2, 480.0, 319.5, 239.5], readout_s: 0.028}
+    color: {width: 640, height: 480, intrinsics: [481.2, 480.0, 319.5, 239.5], readout_s: 0.028, offset_s: 0.02}
     depth: {width: 640, height: 480, intrinsics: [481.2, 480.0, 319.5, 239.5], readout_s: 0.028, depth_scale: 5000}
+    stamps: auto
 
 Each may have model (pinhole, radtan, fisheye), distortion, exposure_s and scan as in rsgen's configs. T_color_depth
-(4x4) is the identity where it is left out. calibration.yaml: see `rstrack.data.opencv_camera_file`.
+(4x4) is the identity where it is left out. color.offset_s: seconds added to colour's stamps; auto: see
+`rstrack.data.timing`. stamps: auto, raw or regular, see there too. depth.registered: warped into the colour camera, see
+`rstrack.data.registered_rows`. calibration.yaml: see `rstrack.data.opencv_camera_file`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -24,24 +27,35 @@ from rsgen.geometry.camera import Camera, Model
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.sequence.format import DEPTH_SCALE
 from rstrack.data.opencv_camera_file import check_fy, extrinsic, is_opencv, read_opencv_rig
+from rstrack.data.registered_rows import DepthSensor, registered_shutter
 from rstrack.data.rig import Rig
+from rstrack.data.timing import StampsMode
 
 EXAMPLE = "color: {width: 640, height: 480, intrinsics: [fx, fy, cx, cy], readout_s: 0.028}"
-_KEYS = "color, depth, T_color_depth, each camera with width, height, intrinsics, readout_s"
+_KEYS = "color, depth, T_color_depth and stamps, each camera with width, height, intrinsics, readout_s"
 
 Size = tuple[int, int]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Pixels = Annotated[int, Field(ge=1, le=16384)]
 Vector4 = tuple[Finite, Finite, Finite, Finite]
+Matrix4 = tuple[Vector4, Vector4, Vector4, Vector4]
 
 
 @dataclass(frozen=True)
 class RigFile:
-    """The cameras and the depth images' units per metre."""
+    """The cameras, the depth images' units per metre, and what is to be done with the stamps.
+
+    depth_offset_s: to be added to depth's stamps, so that they belong to the first row of the image as it is.
+    color_offset_s: to be added to colour's; None: to be found. notes: what was assumed, for the screen.
+    """
 
     rig: Rig
     depth_scale: float
+    stamps: StampsMode = "auto"
+    depth_offset_s: float = 0.0
+    color_offset_s: float | None = None
+    notes: tuple[str, ...] = ()
 
 
 class _Section(BaseModel):
@@ -67,22 +81,37 @@ class _Stream(_Section):
         return Shutter(self.readout_s, self.exposure_s, self.scan)
 
 
+class _ColorStream(_Stream):
+    offset_s: Finite | Literal["auto"] = "auto"
+
+
+class _Sensor(_Section):
+    width: Pixels
+    height: Pixels
+    intrinsics: Vector4
+    model: Model = "pinhole"
+    distortion: tuple[Finite, ...] = ()
+    T_color_sensor: Matrix4 | None = None
+
+
 class _DepthStream(_Stream):
     depth_scale: Annotated[float, Field(ge=1, allow_inf_nan=False)] = DEPTH_SCALE
-    # Warped into the colour camera: rows of such an image have no times of their own.
+    # Warped into the colour camera; sensor: the camera it was warped from, whose lines readout_s and scan are about.
     registered: bool = False
+    sensor: _Sensor | None = None
 
     @model_validator(mode="after")
-    def _has_no_row_times(self) -> _DepthStream:
-        if self.registered and self.readout_s != 0.0:
-            raise ValueError("registered depth has lost its rows' times: set readout_s to 0")
+    def _only_registered_has_a_sensor(self) -> _DepthStream:
+        if self.sensor is not None and not self.registered:
+            raise ValueError("sensor is the camera that registered depth was warped from: add 'registered: true'")
         return self
 
 
 class _CameraYaml(_Section):
-    color: _Stream
+    color: _ColorStream
     depth: _DepthStream | None = None
-    T_color_depth: tuple[Vector4, Vector4, Vector4, Vector4] | None = None
+    T_color_depth: Matrix4 | None = None
+    stamps: StampsMode = "auto"
 
 
 def read_rig(path: Path, color_size: Size, depth_size: Size) -> RigFile:
@@ -106,9 +135,39 @@ def read_rig(path: Path, color_size: Size, depth_size: Size) -> RigFile:
         T_color_depth = extrinsic(np.eye(4) if data.T_color_depth is None else data.T_color_depth, "T_color_depth")
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
-    depth_shutter = Shutter() if depth is None else depth.shutter
-    rig = Rig(depth_camera, depth_shutter, color_camera, data.color.shutter, T_color_depth)
-    return RigFile(rig, DEPTH_SCALE if depth is None else depth.depth_scale)
+    color_shutter = data.color.shutter
+    try:
+        depth_shutter, depth_offset_s, notes = _depth_shutter(depth, depth_camera, color_shutter)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from None
+    return RigFile(
+        Rig(depth_camera, depth_shutter, color_camera, color_shutter, T_color_depth),
+        DEPTH_SCALE if depth is None else depth.depth_scale,
+        data.stamps,
+        depth_offset_s,
+        None if data.color.offset_s == "auto" else data.color.offset_s,
+        notes,
+    )
+
+
+def _depth_shutter(
+    depth: _DepthStream | None, camera: Camera, color: Shutter
+) -> tuple[Shutter, float, tuple[str, ...]]:
+    """Shutter of the depth images as they are, seconds to add to their stamps, and what was assumed."""
+    if depth is None:
+        if color.readout_s == 0.0:
+            return Shutter(), 0.0, ()
+        shutter = Shutter(color.readout_s, 0.0, color.scan)
+        return shutter, 0.0, (f"registered depth taken as read out like colour, {1e3 * color.readout_s:g} ms",)
+    if depth.registered and depth.readout_s == 0.0 and color.readout_s > 0.0:
+        note = "registered depth without a readout: taken at mid readout of colour"
+        return depth.shutter, 0.5 * color.readout_s, (note,)
+    if depth.sensor is None:
+        return depth.shutter, 0.0, ()
+    sensor = depth.sensor
+    given = Camera(sensor.width, sensor.height, *sensor.intrinsics, sensor.model, sensor.distortion)
+    T = extrinsic(np.eye(4) if sensor.T_color_sensor is None else sensor.T_color_sensor, "depth.sensor.T_color_sensor")
+    return *registered_shutter(camera, DepthSensor(given, depth.shutter, T)), ()
 
 
 def _camera(name: str, stream: _Stream) -> Camera:

@@ -8,7 +8,7 @@ for frame in dataset.frames():
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -24,7 +24,8 @@ from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.prefetch import prefetched
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.data.seven_scenes import is_seven_scenes, read_seven_scenes
-from rstrack.data.tum_folder import read_tum_folder
+from rstrack.data.timing import Timing, stream_timing
+from rstrack.data.tum_folder import TumFolder, read_tum_folder
 
 __all__ = ["Dataset", "Frame", "Image", "Rig", "group_colors", "open_dataset"]
 
@@ -49,7 +50,8 @@ class Dataset:
     stamps: (n,) seconds, one for each depth image, strictly increasing. color_stamps: (m,) seconds, increasing.
     groups: for each frame the indices of its colour images.
     truth: T_world_depth(t), of rsgen sequences. truth_poses: T_world_depth, of other folders that have it.
-    sequence: the rsgen sequence itself, where it is one. notes: what had to be assumed when it was read.
+    sequence: the rsgen sequence itself, where it is one. notes: what had to be assumed when it was read. timing: of
+    recordings, how their stamps came about.
     """
 
     name: str
@@ -63,6 +65,7 @@ class Dataset:
     truth_poses: Trajectory | None = None
     sequence: Sequence | None = None
     notes: tuple[str, ...] = ()
+    timing: Timing | None = None
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -106,6 +109,24 @@ class Dataset:
         """
         return prefetched(self.frame, range(len(self))[first:last], prefetch)
 
+    def with_color_offset(self, offset_s: float, note: str = "") -> Dataset:
+        """The same recording with `offset_s` added to the stamps that colour would have without any offset.
+
+        note: for the screen, where the offset comes from.
+        """
+        if self.timing is None:
+            return self
+        color_stamps = self.timing.color.used + offset_s
+        notes = (*self.timing.notes, note) if note else self.timing.notes
+        timing = replace(self.timing, color_offset_s=offset_s, notes=notes)
+        return replace(self, color_stamps=color_stamps, groups=group_colors(self.stamps, color_stamps), timing=timing)
+
+    def timed_as(self, info: dict[str, Any]) -> Dataset:
+        """The same recording with colour's offset as a run had it, whose run.json holds `info`."""
+        clocks = info.get("clocks")
+        offset_s = clocks.get("color_offset_s") if isinstance(clocks, dict) else None
+        return self.with_color_offset(float(offset_s)) if isinstance(offset_s, float | int) else self
+
     def rows(self, stream: StreamName) -> FloatArray | None:
         """True poses (images, lines, 7) tx ty tz qx qy qz qw of each line's camera in the world; None if not known.
 
@@ -128,12 +149,8 @@ def open_dataset(path: Path, camera_file: Path | None = None) -> Dataset:
     if not root.is_dir():
         raise UserError(f"{root}: no such folder: give an rsgen sequence or a TUM RGB-D, ICL-NUIM or 7-Scenes folder")
     if not (root / "sequence.yaml").exists():
-        folder = (read_seven_scenes if is_seven_scenes(root) else read_tum_folder)(root, camera_file)
-        groups = group_colors(folder.depth_stamps, folder.color_stamps)
-        return Dataset(
-            root.resolve().name, root, folder.rig, folder.depth_stamps, folder.color_stamps, groups, folder.images,
-            truth_poses=folder.truth_poses, notes=folder.notes,
-        )  # fmt: skip
+        read = read_seven_scenes if is_seven_scenes(root) else read_tum_folder
+        return _of_tum(root, read(root, camera_file))
     if camera_file is not None:
         raise UserError(f"{root}: its sequence.yaml holds the cameras: leave the camera file {camera_file} out")
     sequence = read_sequence(root)
@@ -142,6 +159,23 @@ def open_dataset(path: Path, camera_file: Path | None = None) -> Dataset:
     groups = group_colors(depth.stamps, color.stamps)
     stamps = (depth.stamps, color.stamps)
     return Dataset(sequence.name, root, rig, *stamps, groups, sequence, truth=sequence.spline, sequence=sequence)
+
+
+def _of_tum(root: Path, tum: TumFolder) -> Dataset:
+    """A recording with its stamps as its camera file wants them. Raises UserError."""
+    file = tum.file
+    try:
+        depth = stream_timing("depth", tum.depth_stamps, file.stamps, file.depth_offset_s)
+        color = stream_timing("colour", tum.color_stamps, file.stamps, 0.0)
+    except UserError as error:
+        raise UserError(f"{root}: {error}") from None
+    timing = Timing(depth, color, file.color_offset_s, file.notes)
+    color_stamps = color.used + (file.color_offset_s or 0.0)
+    groups = group_colors(depth.used, color_stamps)
+    return Dataset(
+        root.resolve().name, root, file.rig, depth.used, color_stamps, groups, tum.images,
+        truth_poses=tum.truth_poses, notes=tum.notes, timing=timing,
+    )  # fmt: skip
 
 
 def group_colors(depth_stamps: npt.ArrayLike, color_stamps: npt.ArrayLike) -> tuple[tuple[int, ...], ...]:

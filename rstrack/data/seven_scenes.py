@@ -25,7 +25,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.sequence.trajectory import Trajectory
-from rstrack.data.camera_file import read_rig
+from rstrack.data.camera_file import RigFile, read_rig
 from rstrack.data.image_files import ImageFiles, decode_color, decode_depth, first_size
 from rstrack.data.rig import Rig
 from rstrack.data.tum_folder import TumFolder, find_camera_file
@@ -56,13 +56,13 @@ def read_seven_scenes(root: Path, camera_file: Path | None) -> TumFolder:
         if not found:
             raise UserError(f"{root}: has no {name} image frame-NNNNNN.{name.replace('u', '')}.png: unpack it again")
     color_paths, depth_paths = tuple(color.values()), tuple(depth.values())
-    rig, notes = _rig(root, camera_file, color_paths, depth_paths)
-    images = ImageFiles(rig, _UNITS_PER_M, color_paths, depth_paths, _MISSING)
+    file, notes = _cameras(root, camera_file, color_paths, depth_paths)
+    images = ImageFiles(file.rig, _UNITS_PER_M, color_paths, depth_paths, _MISSING)
     truth, without = _truth(poses)
     notes = (f"frames are taken to be 1/{_RATE_HZ:g} s apart: nothing in {root} stamps them", *notes)
     if without:
         notes = (*notes, f"{without} of {len(poses)} pose files hold no finite pose: there is no truth at these frames")
-    return TumFolder(rig, _stamps(list(depth)), _stamps(list(color)), images, truth, notes)
+    return TumFolder(file, _stamps(list(depth)), _stamps(list(color)), images, truth, notes)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -86,13 +86,13 @@ def _stamps(numbers: Sequence[int]) -> FloatArray:
     return np.array(numbers, np.float64) / _RATE_HZ
 
 
-def _rig(
+def _cameras(
     root: Path, camera_file: Path | None, color: Sequence[Path], depth: Sequence[Path]
-) -> tuple[Rig, tuple[str, ...]]:
+) -> tuple[RigFile, tuple[str, ...]]:
     sizes = first_size(color, decode_color), first_size(depth, decode_depth)
     file = find_camera_file(root, camera_file)
     if file is not None:
-        return read_rig(file, *sizes).rig, ()
+        return read_rig(file, *sizes), ()
     if sizes != (_SIZE, _SIZE):
         shown = " and ".join("x".join(map(str, size)) for size in sizes)
         raise UserError(f"{root}: images are {shown}, and nothing tells the cameras: write {root / 'camera.yaml'}")
@@ -102,7 +102,8 @@ def _rig(
         f"both cameras are taken for one global-shutter pinhole, fx {fx:g} fy {fy:g} cx {cx:g} cy {cy:g}: write "
         f"{root / 'camera.yaml'} if you know them"
     )
-    return Rig(camera, Shutter(), camera, Shutter(), np.eye(4)), (note,)
+    rig = Rig(camera, Shutter(), camera, Shutter(), np.eye(4))
+    return RigFile(rig, _UNITS_PER_M, color_offset_s=0.0), (note,)
 
 
 def _truth(paths: dict[int, Path]) -> tuple[Trajectory | None, int]:

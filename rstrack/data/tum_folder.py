@@ -33,12 +33,12 @@ _MAX_STAMP_S = 1e11  # the year 5138; today in milliseconds, microseconds or nan
 
 @dataclass(frozen=True)
 class TumFolder:
-    """What is found in a folder. Stamps (n,) and (m,) in seconds, increasing; truth_poses are T_world_depth.
+    """What is found in a folder. Stamps as listed (n,) and (m,) in seconds, increasing; truth_poses are T_world_depth.
 
-    notes: what nothing in the folder says and had to be assumed, each in one line.
+    file: the camera file's content. notes: what had to be assumed, each in one line.
     """
 
-    rig: Rig
+    file: RigFile
     depth_stamps: FloatArray
     color_stamps: FloatArray
     images: ImageFiles
@@ -56,7 +56,7 @@ def read_tum_folder(root: Path, camera_file: Path | None) -> TumFolder:
     file = _rig_file(root, camera_file, color.paths, depth.paths)
     images = ImageFiles(file.rig, file.depth_scale, color.paths, depth.paths)
     rate = ICL_RATE_HZ if depth.has_frame_numbers and color.has_frame_numbers else 1.0
-    return TumFolder(file.rig, depth.stamps / rate, color.stamps / rate, images, _truth(root, file.rig))
+    return TumFolder(file, depth.stamps / rate, color.stamps / rate, images, _truth(root, file.rig))
 
 
 # --- listings --------------------------------------------------------------------------------------------------------

@@ -190,7 +190,9 @@ def run_map(
             raise UserError(f"{path}: only PLY is written: give it a name that ends in .ply")
         if path is not None and not path.parent.is_dir():
             raise UserError(f"{path}: there is no folder {path.parent}: make it or choose another name")
-    result = reconstruct(open_dataset(seq_path, camera_file), read_estimate(estimate_path), options, progress)
+    estimate = read_estimate(estimate_path)
+    dataset = open_dataset(seq_path, camera_file).timed_as(estimate.info)
+    result = reconstruct(dataset, estimate, options, progress)
     comment = f"rstrack map, world {result.world}, shutter {result.shutter}, voxels {options.voxel_m:g} m"
     write_ply(out, result.surface, comment)
     if cloud is not None:

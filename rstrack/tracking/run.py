@@ -30,6 +30,7 @@ from rstrack.data.estimate import Estimate, write_estimate
 from rstrack.data.noise import with_noise
 from rstrack.data.prefetch import prefetched
 from rstrack.data.rig import Frame, Rig
+from rstrack.data.timing import Timing
 from rstrack.metrics.association import Truth, compare, truth_of
 from rstrack.metrics.evaluate import Metrics
 from rstrack.metrics.run_evaluate import Evaluation, evaluate_clocks
@@ -90,7 +91,7 @@ class Result:
 
     end: why it stopped; `error` says where the tracker broke down. evaluation: None without a truth, or with too few
     poses. lost: number of frames. unreadable: what was wrong with each image that was left out; where that was a depth
-    image, its frame was.
+    image, its frame was. timing: of recordings, how stamps came about.
     """
 
     estimate: Estimate
@@ -99,6 +100,7 @@ class Result:
     error: str
     lost: int
     unreadable: tuple[str, ...] = ()
+    timing: Timing | None = None
 
     @property
     def metrics(self) -> Metrics | None:
@@ -124,6 +126,7 @@ class Result:
             images = "1 image" if len(self.unreadable) == 1 else f"{len(self.unreadable)} images"
             lines.append(f"left out: {images} that cannot be read, first {self.unreadable[0]}")
         lines += [f"assumed: {note}" for note in info["dataset"].get("notes", ())]
+        lines += [] if self.timing is None else self.timing.lines()
         return "\n".join(lines + ([] if self.evaluation is None else ["", self.evaluation.text()]))
 
 
@@ -163,6 +166,7 @@ def track(
     written or is a dataset, no frame was tracked.
     """
     chosen = _chosen(dataset, frames)
+    dataset = _with_color_timed(dataset, chosen, options, progress)
     truth = truth_of(dataset)
     if truth is not None:
         truth = dataclasses.replace(truth, frame_stamps=dataset.stamps[chosen])
@@ -215,14 +219,17 @@ def track(
         "lost": sum(report.lost for report in tracker.reports),
         "spline_valid": tracker.spline_valid,
         "timings": timings,
-        "frames": _diagnostics(dataset.stamps[fed], tracker.reports),
+        "frames": _diagnostics(dataset, fed, tracker.reports),
     }
+    if dataset.timing is not None:
+        info["clocks"] = dataset.timing.as_dict()
     estimate = Estimate(*tracker.trajectory, tracker.spline, info)
     evaluation = _evaluation(truth, estimate)
     info["metrics"] = None if evaluation is None else evaluation.metrics.as_dict()
     info["truth_offset"] = None if evaluation is None else evaluation.truth_offset
     write_estimate(out, estimate.stamps, estimate.T_world_depth, estimate.spline, info)
-    return Result(estimate, evaluation, end, error, info["lost"], tuple(problem for _, problem in unreadable))
+    left_out = tuple(problem for _, problem in unreadable)
+    return Result(estimate, evaluation, end, error, info["lost"], left_out, dataset.timing)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -233,6 +240,16 @@ def _chosen(dataset: Dataset, frames: slice) -> range:
     if not len(chosen):
         raise UserError(f"{dataset.root}: has no frame {frames.start}: its frames are 0 to {len(dataset) - 1}")
     return chosen
+
+
+def _with_color_timed(dataset: Dataset, chosen: range, options: Options, progress: Progress) -> Dataset:
+    """The dataset with its colour stamps' offset found, where it is not known, may not be 0 and matters."""
+    if dataset.timing is None or not dataset.timing.wants_color_offset or not options.photometric:
+        return dataset
+    from rstrack.tracking.color_offset import estimate_color_offset
+
+    found = estimate_color_offset(dataset, chosen, options, progress)
+    return dataset.with_color_offset(found.offset_s, found.text())
 
 
 def _make_folder(out: Path) -> None:
@@ -321,11 +338,16 @@ def _timings(total_s: float, seconds: Sequence[float]) -> dict[str, Any]:
     }
 
 
-def _diagnostics(stamps: FloatArray, reports: Sequence[FrameReport]) -> list[dict[str, Any]]:
-    """One dict a frame for the plots: `FrameReport`, with inliers as parts of the run's largest number too."""
+def _diagnostics(dataset: Dataset, used: Sequence[int], reports: Sequence[FrameReport]) -> list[dict[str, Any]]:
+    """One dict a frame for the plots: `FrameReport`, with inliers as parts of the run's largest number too.
+
+    listed_stamp: as the recording has it, where it was tracked at another one.
+    """
     frames = [dataclasses.asdict(report) for report in reports]
-    for stamp, frame in zip(stamps, frames, strict=True):
-        frame["stamp"] = float(stamp)
+    for k, frame in zip(used, frames, strict=True):
+        frame["stamp"] = float(dataset.stamps[k])
+        if dataset.timing is not None:
+            frame["listed_stamp"] = float(dataset.timing.depth.listed[k])
     for stream in ("depth", "color"):
         counts = [frame[f"inliers_{stream}"] for frame in frames]
         most = max(counts)

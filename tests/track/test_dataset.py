@@ -15,6 +15,7 @@ from synthetic import DURATION_S, T_COLOR_DEPTH, make_config, make_sequence
 
 from rsgen.errors import UserError
 from rsgen.geometry import se3
+from rsgen.geometry.shutter import Shutter
 from rsgen.sequence.reader import read_sequence
 from rstrack.data.dataset import group_colors, open_dataset
 from rstrack.data.prefetch import prefetched
@@ -191,7 +192,8 @@ def test_tum_folder_with_colour_only_in_camera_yaml(tmp_path: Path) -> None:
     rig = dataset.rig
     assert dataset.name == "fr1_desk" and dataset.truth is None and dataset.truth_poses is None
     assert rig.depth_camera == rig.color_camera and rig.color_camera.fy == 25.0
-    assert (rig.color_shutter.readout_s, rig.depth_shutter.readout_s) == (0.028, 0.0)
+    assert rig.color_shutter.readout_s == rig.depth_shutter.readout_s == 0.028, "registered: rows keep their times"
+    assert dataset.timing is not None and "read out like colour, 28 ms" in dataset.timing.notes[0]
     np.testing.assert_array_equal(rig.T_color_depth, np.eye(4))
     for k, frame in enumerate(dataset.frames()):
         np.testing.assert_array_equal(frame.depth.pixels, (depth_units(k) / 5000).astype(np.float32))
@@ -217,6 +219,83 @@ def test_tum_folder_with_everything_told_and_truth_of_the_colour_camera(tmp_path
     assert dataset.truth_poses is not None
     np.testing.assert_allclose(dataset.truth_poses.T_world_cam[0], T_color_depth, atol=1e-12)
     assert dataset.truth_poses.positions[3, 0] == pytest.approx(3 + T_color_depth[0, 3])
+
+
+REGISTERED = COLOR | {"registered": True}
+
+
+def test_registered_depth_keeps_its_rows_times(tmp_path: Path) -> None:
+    root = make_tum(tmp_path / "tum", {"color": COLOR, "depth": REGISTERED | {"readout_s": 0.02, "scan": "bottom-top"}})
+    dataset = open_dataset(root)
+    assert dataset.rig.depth_shutter == Shutter(0.02, 0.0, "bottom-top")
+    np.testing.assert_array_equal(dataset.stamps, STAMPS)
+    # No readout: the whole image at mid readout of colour.
+    write_camera(root, {"color": COLOR, "depth": REGISTERED | {"readout_s": 0.0}})
+    dataset = open_dataset(root)
+    assert dataset.rig.depth_shutter == Shutter()
+    np.testing.assert_allclose(dataset.stamps - STAMPS, 0.014, atol=1e-6)
+    # A sensor of 48 lines, twice as fine and seven lines off: of its 0.03 s the 24 rows see every second line.
+    sensor = {"width": 64, "height": 48, "intrinsics": [48.0, 50.0, 31.0, 16.0]}
+    write_camera(root, {"color": COLOR, "depth": REGISTERED | {"readout_s": 0.03, "sensor": sensor}})
+    dataset = open_dataset(root)
+    assert dataset.rig.depth_shutter.readout_s == pytest.approx(0.03, rel=1e-9)
+    np.testing.assert_allclose(dataset.stamps - STAMPS, (16.0 - 2 * 11.5) * 0.03 / 48, atol=1e-6)
+
+
+def test_a_sensor_without_registration_or_sight_is_refused(tmp_path: Path) -> None:
+    sensor = {"width": 64, "height": 48, "intrinsics": [48.0, 50.0, 31.0, 23.0]}
+    root = make_tum(tmp_path / "tum", {"color": COLOR, "depth": COLOR | {"sensor": sensor}})
+    with pytest.raises(UserError, match=r"add 'registered: true'"):
+        open_dataset(root)
+    behind = np.diag([-1.0, 1.0, -1.0, 1.0]).tolist()
+    write_camera(root, {"color": COLOR, "depth": REGISTERED | {"sensor": sensor | {"T_color_sensor": behind}}})
+    with pytest.raises(UserError, match=r"camera\.yaml: depth\.sensor: does not see"):
+        open_dataset(root)
+
+
+def jittered_tum(root: Path, **camera: Any) -> tuple[np.ndarray, np.ndarray]:
+    """40 images a stream that arrive up to 4 ms late, colour said 10 ms too early; true depth and colour times."""
+    make_tum(root, {"color": COLOR | {"offset_s": 0.01}} | camera)
+    rng = np.random.default_rng(11)
+    depth = 1305031102.0 + np.arange(40) / 30
+    color = depth + 0.012
+    for name, times in (("depth", depth), ("rgb", color - 0.01)):
+        stamps = times + rng.uniform(0.0, 4e-3, 40)
+        write_listing(root / f"{name}.txt", [f"{t:.6f} {name}/{STAMPS[0]:.4f}.png" for t in stamps])
+    return depth, color
+
+
+def test_arrival_times_are_straightened_and_colour_is_shifted_and_grouped(tmp_path: Path) -> None:
+    depth, color = jittered_tum(tmp_path / "tum")
+    dataset = open_dataset(tmp_path / "tum")
+    timing = dataset.timing
+    assert timing is not None and timing.depth.is_even and timing.color.is_even and not timing.wants_color_offset
+    for found, true in ((dataset.stamps, depth), (dataset.color_stamps, color)):
+        assert (found - true).std() < 0.5e-3 and np.abs(np.mean(found - true) - 2e-3) < 1e-3
+    assert dataset.groups == tuple((k,) for k in range(40))
+    shifted = dataset.with_color_offset(0.01 + 1 / 30)
+    assert shifted.groups[:2] == ((), (0,)) and shifted.timing is not None
+    np.testing.assert_allclose(shifted.color_stamps - dataset.color_stamps, 1 / 30, atol=1e-6)
+    assert dataset.timed_as({"clocks": {"color_offset_s": 0.02}}).color_stamps[0] > dataset.color_stamps[0]
+    assert dataset.timed_as({"clocks": None}) is dataset
+    text = "\n".join(timing.lines())
+    assert "depth: 33.3" in text and "RMS straightened" in text and "+10.0 ms added" in text
+
+
+def test_stamps_raw_regular_and_auto(tmp_path: Path) -> None:
+    root = tmp_path / "tum"
+    jittered_tum(root, stamps="raw")
+    dataset = open_dataset(root)
+    listed = [float(line.split()[0]) for line in (root / "depth.txt").read_text().splitlines()[2:]]
+    np.testing.assert_array_equal(dataset.stamps, listed)
+    steps = np.random.default_rng(12).uniform(0.02, 0.06, 40)
+    write_listing(root / "depth.txt", [f"{t:.6f} depth/{STAMPS[0]:.4f}.png" for t in np.cumsum(steps)])
+    write_camera(root, {"color": COLOR, "stamps": "auto"})
+    timing = open_dataset(root).timing
+    assert timing is not None and not timing.depth.is_even and "no steady clock" in timing.lines()[0]
+    write_camera(root, {"color": COLOR, "stamps": "regular"})
+    with pytest.raises(UserError, match=r"tum: depth stamps follow no steady clock"):
+        open_dataset(root)
 
 
 @pytest.mark.parametrize("depth_first", [True, False])

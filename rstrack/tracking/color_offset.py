@@ -1,0 +1,294 @@
+"""How much later than its stamps say colour was taken, against depth: from the recording itself.
+
+found = estimate_color_offset(dataset)
+dataset = dataset.with_color_offset(found.offset_s)
+
+A few seconds with motion are tracked by geometry alone, which leaves colour out. Points of depth images are then looked
+up in pairs of colour images a few frames apart, with the poses that the track has at the colour lines' times plus an
+offset; at the right offset both images show the same intensity there, up to a gain and an offset of brightness each
+pair has. What tells is that the camera turns differently at the two times: steady motion tells nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from rsgen.array_types import FloatArray
+from rsgen.errors import UserError
+from rsgen.geometry import se3
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.spline import Spline
+from rstrack.data.dataset import Dataset
+from rstrack.data.rig import Frame, Image
+from rstrack.images.pyramid import intensity
+from rstrack.options import Options
+
+BoolArray = npt.NDArray[np.bool_]
+Progress = Callable[[str, float, str], None]
+
+# Offsets looked at (s): coarse ones, then fine ones about the best.
+_MOST_S, _COARSE_S, _FINE_S = 0.06, 0.01, 0.0025
+# Fine offsets on each side of the best one through which a parabola is laid.
+_NEAR = 2
+# Frames that are tracked; of these, every so manieth has its depth looked up in pairs of images so many frames apart.
+_TRACKED, _EVERY, _APART = 60, 4, (4, 8)
+# Depth images as wide as that are thinned out: a short track needs no more, and it takes most of the time.
+_LARGE = 480
+# Windows of the recording of which the one that moves most is taken, and the shift (part of the width, a frame) that is
+# enough: images that move faster are blurred.
+_WINDOWS, _ENOUGH = 8, 0.015
+# Depth pixels looked up in a line; and the fewest a pair may share.
+_ACROSS, _FEWEST = 106, 400
+# 8-bit values that are clipped, and their neighbours.
+_BLACK, _WHITE = 4, 250
+# The offset is taken for determined if its standard error is below this, and it lies inside of what was looked at.
+_MOST_SIGMA_S = 5e-3
+# Noise of colour images against each other, over their contrast, above which the track is not to be believed.
+_MOST_NOISE = 0.25
+_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class ColorOffset:
+    """offset_s: to be added to colour's stamps, 0 if not determined. sigma_s: its standard error, as far as the pairs
+    of images differ (what the track has wrong in all of them is not in it). pairs: of images compared. reason: why it
+    is not determined, empty if it is.
+    """
+
+    offset_s: float
+    sigma_s: float
+    pairs: int
+    reason: str = ""
+
+    def text(self) -> str:
+        """One line for the screen."""
+        if self.reason:
+            return f"no offset of colour against depth found ({self.reason}): used as stamped"
+        return (
+            f"that offset was found from {self.pairs} pairs of images, to {1e3 * self.sigma_s:.1f} ms; "
+            "color.offset_s in the camera file fixes it"
+        )
+
+
+def estimate_color_offset(
+    dataset: Dataset, frames: range | None = None, options: Options | None = None, progress: Progress = lambda *_: None
+) -> ColorOffset:
+    """Seconds to add to a dataset's colour stamps.
+
+    frames: those to look at, default all. options: say which backend to use. Raises UserError: an image that
+    cannot be read.
+    """
+    chosen = _moving_part(dataset, range(len(dataset)) if frames is None else frames)
+    spline, begin, end = _geometric_track(dataset, chosen, options or Options(), progress)
+    if spline is None:
+        return ColorOffset(0.0, np.inf, 0, "the geometry alone gives no track")
+    pairs = _pairs(dataset, chosen, begin + _MOST_S, end - _MOST_S)
+    if len(pairs) < 6:
+        return ColorOffset(0.0, np.inf, len(pairs), "too few images overlap")
+    coarse = np.arange(-_MOST_S, _MOST_S + 1e-9, _COARSE_S)
+    costs, noise = _costs(dataset, spline, pairs, coarse, progress)
+    if len(costs) < 6:
+        return ColorOffset(0.0, np.inf, len(costs), "too few images overlap")
+    if np.median(noise) > _MOST_NOISE:
+        return ColorOffset(0.0, np.inf, len(costs), "colour does not fit the track that depth alone gives")
+    best = int(np.argmin(costs.sum(axis=0)))
+    if best in (0, len(coarse) - 1):
+        return ColorOffset(0.0, np.inf, len(costs), f"it would be beyond {1e3 * _MOST_S:.0f} ms")
+    fine = coarse[best] + np.arange(-5, 6) * _FINE_S
+    return _minimum(fine, _costs(dataset, spline, pairs, fine, progress)[0])
+
+
+def _minimum(offsets: FloatArray, costs: FloatArray) -> ColorOffset:
+    """Minimum over offsets (m,) of the summed costs (pairs, m), its error from leaving tenths of the pairs out."""
+    if not len(costs):
+        return ColorOffset(0.0, np.inf, 0, "too few images overlap")
+    best = int(np.argmin(costs.sum(axis=0)))
+    near = slice(max(best - _NEAR, 0), best + _NEAR + 1)
+    offsets, costs = offsets[near], costs[:, near]
+    offset, bend = _parabola(offsets, costs.sum(axis=0))
+    parts = np.array_split(np.arange(len(costs)), min(10, len(costs)))
+    without = [_parabola(offsets, np.delete(costs, part, axis=0).sum(axis=0)) for part in parts]
+    n = len(parts)
+    sigma = float(np.sqrt((n - 1) / n * np.sum((np.array([o for o, _ in without]) - offset) ** 2)))
+    if bend <= 0.0 or any(b <= 0.0 for _, b in without):
+        return ColorOffset(0.0, np.inf, len(costs), "the camera moves too evenly")
+    if not sigma < _MOST_SIGMA_S or not offsets[0] < offset < offsets[-1]:
+        return ColorOffset(0.0, sigma, len(costs), "the camera moves too little or too evenly")
+    return ColorOffset(offset, sigma, len(costs))
+
+
+def _parabola(x: FloatArray, y: FloatArray) -> tuple[float, float]:
+    """Where a parabola through y (m,) at x (m,) is least, and its bend; NaN and 0 or less where it has no minimum."""
+    middle = x.mean()
+    a, b, _ = np.polyfit(x - middle, y, 2)
+    return (float(middle - 0.5 * b / a) if a > 0.0 else float("nan")), float(a)
+
+
+# --- what to look at -------------------------------------------------------------------------------------------------
+
+
+def _moving_part(dataset: Dataset, frames: range) -> range:
+    """The frames to track: those of the window that moves most, though no more than is enough."""
+    if len(frames) <= _TRACKED:
+        return frames
+    starts = np.linspace(0, len(frames) - _TRACKED, _WINDOWS).round().astype(int)
+    motion = [min(_shift(dataset, frames[int(s) : int(s) + _TRACKED]), _ENOUGH) for s in starts]
+    start = int(starts[int(np.argmax(motion))])
+    return frames[start : start + _TRACKED]
+
+
+def _shift(dataset: Dataset, frames: range) -> float:
+    """Mean shift from one colour image to the next, as a part of the width, of three pairs in these frames."""
+    shifts = []
+    for k in frames[len(frames) // 6 :: len(frames) // 3]:
+        i = [i for group in dataset.groups[k : k + 3] for i in group][:2]
+        if len(i) == 2:
+            a, b = (cv2.resize(dataset.images.color(n), (96, 72), interpolation=cv2.INTER_AREA) for n in i)
+            window = cv2.createHanningWindow((96, 72), cv2.CV_32F)
+            a, b = (np.asarray(cv2.cvtColor(x, cv2.COLOR_RGB2GRAY), np.float32) for x in (a, b))
+            (du, dv), _ = cv2.phaseCorrelate(a, b, window)
+            shifts.append(float(np.hypot(du, dv)) / 96)
+    return float(np.mean(shifts)) if shifts else 0.0
+
+
+def _geometric_track(
+    dataset: Dataset, frames: range, options: Options, progress: Progress
+) -> tuple[Spline | None, float, float]:
+    """T_world_depth(t) of the frames from depth alone, and the longest time (begin, end) in s that it covers."""
+    from rstrack.tracking.run import make_tracker
+
+    step = 2 if dataset.rig.depth_camera.width >= _LARGE else 1
+    rig = replace(dataset.rig, depth_camera=_thinned(dataset.rig.depth_camera, step))
+    tracker = make_tracker(rig, Options(method="rs-g", backend=options.backend))
+    for count, k in enumerate(frames, 1):
+        try:
+            depth = Image(float(dataset.stamps[k]), np.ascontiguousarray(dataset.images.depth(k)[::step, ::step]))
+            tracker.feed(Frame(depth, ()))
+        except (UserError, np.linalg.LinAlgError):
+            break
+        progress("colour's clock", 0.7 * count / len(frames), "tracking depth")
+    if not tracker.spline_valid or tracker.spline is None:
+        return None, 0.0, 0.0
+    begin, end = max(tracker.spline_valid, key=lambda span: span[1] - span[0])
+    return tracker.spline, begin, end
+
+
+def _thinned(camera: Camera, step: int) -> Camera:
+    """The camera whose pixels are every step-th of a camera's, from the first."""
+    fx, fy, cx, cy = (value / step for value in (camera.fx, camera.fy, camera.cx, camera.cy))
+    width, height = -(-camera.width // step), -(-camera.height // step)
+    return replace(camera, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
+
+
+def _pairs(dataset: Dataset, frames: range, begin: float, end: float) -> list[tuple[int, int, int]]:
+    """(frame, colour image, colour image) whose lines lie in [begin, end] seconds."""
+    readout = max(dataset.rig.depth_shutter.readout_s, dataset.rig.color_shutter.readout_s)
+    latest = end - readout
+
+    def color(k: int) -> int | None:
+        group = dataset.groups[k] if k in frames else ()
+        return next((i for i in group if begin <= dataset.color_stamps[i] <= latest), None)
+
+    pairs = []
+    for k in frames[::_EVERY]:
+        for apart in _APART:
+            i, j = color(k), color(k + apart)
+            if i is not None and j is not None and begin <= dataset.stamps[k] <= latest:
+                pairs.append((k, i, j))
+    return pairs
+
+
+# --- how well images agree -------------------------------------------------------------------------------------------
+
+
+def _costs(
+    dataset: Dataset, spline: Spline, pairs: Sequence[tuple[int, int, int]], offsets: FloatArray, progress: Progress
+) -> tuple[FloatArray, FloatArray]:
+    """Costs (k, m) of the offsets (m,) of the k pairs that share enough, and their noise (k,) over the contrast."""
+    points = lru_cache(maxsize=2)(lambda k: _points(dataset, spline, k))
+    images = lru_cache(maxsize=16)(lambda i: _image(dataset.images.color(i)))
+    found = [(np.empty((0, len(offsets))), np.empty(0))]
+    for n, (k, i, j) in enumerate(pairs):
+        a, b = (_looked_up(dataset, spline, images(m), points(k), dataset.color_stamps[m] + offsets) for m in (i, j))
+        good = np.isfinite(a).all(axis=0) & np.isfinite(b).all(axis=0)
+        if np.count_nonzero(good) >= _FEWEST:
+            cost, noise = _disagreement(a[:, good], b[:, good])
+            found.append((cost[None], np.array([noise])))
+        progress("colour's clock", 0.7 + 0.3 * (n + 1) / len(pairs), "comparing colour images")
+    return np.concatenate([costs for costs, _ in found]), np.concatenate([noise for _, noise in found])
+
+
+def _points(dataset: Dataset, spline: Spline, k: int) -> FloatArray:
+    """Points (n, 3) in the world of frame k's depth, each line with its own pose."""
+    camera, shutter = dataset.rig.depth_camera, dataset.rig.depth_shutter
+    step = max(camera.width // _ACROSS, 1)
+    pixels = camera.pixel_grid()[::step, ::step].reshape(-1, 2)
+    z = dataset.images.depth(k)[::step, ::step].reshape(-1)
+    rays = camera.unproject(pixels)
+    known = (z > 0.0) & np.isfinite(rays).all(axis=1)
+    lines = shutter.line_of_pixel(pixels[known], camera)
+    T = spline.pose(shutter.line_mid_time(dataset.stamps[k], np.arange(shutter.line_count(camera)), camera))
+    return se3.transform(T[lines.astype(np.int64)], rays[known] * z[known, None])
+
+
+def _image(color: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+    """Intensities (h/2, w/2), NaN near clipped pixels."""
+    grey = np.asarray(cv2.pyrDown(intensity(color)))
+    clipped = ((color.max(axis=2) >= _WHITE) | (color.max(axis=2) <= _BLACK)).astype(np.uint8)
+    near = cv2.dilate(clipped, np.ones((7, 7), np.uint8))[::2, ::2]
+    return np.where(near > 0, np.float32(np.nan), grey)
+
+
+def _looked_up(
+    dataset: Dataset, spline: Spline, image: npt.NDArray[np.float32], p_world: FloatArray, stamps: FloatArray
+) -> FloatArray:
+    """Intensities (m, n) at points (n, 3) of an image stamped `stamps` (m,); NaN where not seen or clipped.
+
+    Equation (3) by fixed-point iteration, with the pose of the nearest line: a hundredth of a pixel.
+    """
+    camera, shutter, T_color_depth = dataset.rig.color_camera, dataset.rig.color_shutter, dataset.rig.T_color_depth
+    lines = np.arange(shutter.line_count(camera))
+    out = np.full((len(stamps), len(p_world)), np.nan)
+    for m, stamp in enumerate(stamps):
+        T = T_color_depth @ se3.inverse(spline.pose(shutter.line_mid_time(stamp, lines, camera)))
+        line = np.full(len(p_world), len(lines) // 2)
+        for _ in range(_ROUNDS):
+            uv, _ = camera.project(se3.transform(T[line], p_world))
+            at = np.nan_to_num(shutter.line_of_pixel(uv, camera))
+            line = np.clip(np.rint(at), 0, len(lines) - 1).astype(np.int64)
+        uv = np.where(camera.contains(uv)[:, None], 0.5 * uv, -10.0).astype(np.float32)
+        border = cv2.BORDER_CONSTANT
+        u, v = (np.ascontiguousarray(x)[:, None] for x in uv.T)
+        out[m] = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=border, borderValue=float("nan"))[:, 0]
+    return out
+
+
+def _disagreement(a: FloatArray, b: FloatArray) -> tuple[FloatArray, float]:
+    """Student-t cost (m,) of intensities b (m, n) against gain · a + offset, fitted to each of the m; and its σ over
+    that of b.
+
+    One σ for all, from where they agree best: the costs are log-likelihoods up to a constant, for n independent points.
+    """
+    errors = np.array([_residuals(x, y) for x, y in zip(a, b, strict=True)])
+    sigma = max(float(np.min(1.4826 * np.median(np.abs(errors), axis=1))), 1e-3)
+    contrast = max(1.4826 * float(np.median(np.abs(b - np.median(b)))), 1e-3)
+    return np.asarray(3.0 * np.log1p((errors / sigma) ** 2 / 5.0).sum(axis=1)), sigma / contrast
+
+
+def _residuals(x: FloatArray, y: FloatArray) -> FloatArray:
+    """y − gain · x − offset (n,), fitted with Student-t weights (ν = 5); closed form in every round."""
+    w = np.ones(len(x))
+    for _ in range(4):
+        mean_x, mean_y = np.average(x, weights=w), np.average(y, weights=w)
+        spread = np.average((x - mean_x) ** 2, weights=w)
+        gain = np.average((x - mean_x) * (y - mean_y), weights=w) / max(float(spread), 1e-12)
+        r = y - mean_y - gain * (x - mean_x)
+        sigma = max(1.4826 * float(np.median(np.abs(r))), 1e-3)
+        w = 6.0 / (5.0 + (r / sigma) ** 2)
+    return r
