@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -10,10 +10,11 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.device.arrays import Engine, Kernels
 from rsgen.device.lens import Lens
+from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import BlockSums, Scaling, block_counts
-from rstrack.alignment.brightness import SAME, Eliminated, eliminate
+from rstrack.alignment.brightness import SAME, Eliminated, eliminate, with_lateness
 from rstrack.alignment.independence import inflation
 from rstrack.alignment.normal_equations import Quadratic, chain
 from rstrack.alignment.residuals import (
@@ -29,9 +30,12 @@ from rstrack.images.device_frame import DeviceRig, Timer, untimed
 from rstrack.images.line_poses import IDENTITY_FROM_BASE, Exposure, from_base_table, to_base_table
 from rstrack.images.pyramid import ColorImage, DepthImage
 from rstrack.keyframes.keyframe import STRIDES, Points, Reference
+from rstrack.options import Options
 
 # Smallest credible σ of depth (m): quantisation and interpolation leave about as much.
 _CREDIBLE_DEPTH = 2e-4
+# How late a colour image may be beyond what the images before were, as σ in s, where that is followed.
+_LATE_SIGMA_S = 1e-3
 
 
 @dataclass(frozen=True)
@@ -88,6 +92,8 @@ class Terms:
     blur_sigma_px: float = 0.0
     # Where interpolation errs by more than this part of σ, its bias counts, not its size: those pixels are left out.
     smooth: float = 0.25
+    # σ of how late colour images may be (s), 0 where their stamps are right.
+    late_sigma_s: float = 0.0
     timer: Timer = untimed
     _kernel: Kernels = field(init=False)
 
@@ -95,9 +101,13 @@ class Terms:
         self._kernel = Kernels(self.e)
 
     @classmethod
-    def of(cls, device: DeviceRig, blur_sigma_px: float = 0.0) -> Terms:
-        """The terms of a rig; blur_sigma_px as in `Options`."""
-        return cls(device.e, device.device_rays, blur_sigma_px=blur_sigma_px, timer=device.timer)
+    def of(cls, device: DeviceRig, options: Options) -> Terms:
+        """The terms of a rig as a method has them."""
+        late_sigma_s = _LATE_SIGMA_S if options.follow_color_clock else 0.0
+        return cls(
+            device.e, device.device_rays, blur_sigma_px=options.blur_sigma_px, late_sigma_s=late_sigma_s,
+            timer=device.timer,
+        )  # fmt: skip
 
     def geometric(
         self, image: DepthImage, ref: Reference, spline: Spline, level: int, sigma: float,
@@ -159,22 +169,23 @@ class Terms:
     ) -> Linearised:  # fmt: skip
         """The reference's points of a level, those that are `visible`, against that level of the colour image.
 
-        brightness (2,): gain and offset of the image here; expected (2,): before anything is known of it.
+        brightness (3,): gain, offset and lateness of the image here; expected (3,): before anything is known of it.
         """
         with self.timer(f"photometric kernel, level {level}"):
             e, lens, points = self.e, image.exposure.lens, ref.points[level]
             kernel = self._kernel(photometric_kernel, lens, ref.lens, STRIDES[level], level, self.blur_sigma_px)
-            from_base = self._from_base(spline, ref.T_world_base, image.exposure)
+            exposure = replace(image.exposure, stamp=image.exposure.stamp + float(brightness[2]))
+            from_base = self._from_base(spline, ref.T_world_base, exposure)
             # Moving closer or turning packs more points into a block than its share.
             scaling = self._scaling(points, lens, ref.lens.camera, ref, STRIDES[level], 4)
-            constants = e.upload(np.append(scaling.parameters(sigma, self.gate_intensity), brightness))
+            constants = e.upload(np.append(scaling.parameters(sigma, self.gate_intensity), brightness[:2]))
             seen_at = self._ref_lines(spline, ref), image.levels[level], from_base
             shown = points.visible if visible is None else visible
             given = PhotometricInput(points.x, points.y, points.z, points.intensity, shown, *seen_at, constants)
             raw = kernel(given).numpy()
             current, reference, per, ref_per = block_counts(lens, ref.lens)
             sums = scaling.unpack(raw, current, reference)
-            times = image.exposure.block_times(per)
+            times = exposure.block_times(per)
             return self._finish(
                 sums, slopes_at or spline, ref, times, ref_per, sigma, self.floor_intensity, points.median_depth,
                 brightness, expected,
@@ -213,16 +224,26 @@ class Terms:
     ) -> Linearised:  # fmt: skip
         ref_times = None if ref.rolling is None else ref.rolling.block_times(ref_per)
         with self.timer("linear algebra: chain"):
-            model, motion, coupling = chain(sums, spline, ref.T_world_base, times, ref_times)
+            own = None if sums.brightness is None else with_lateness(sums, _velocity(spline, ref, times))
+            chained = chain(sums, spline, ref.T_world_base, times, ref_times, own and own[0])
+        model, motion, coupling = chained
         model = Quadratic(model.first, model.H / sigma**2, model.g / sigma)
         cost, eliminated = sums.cost, None
-        if sums.brightness is not None:
-            model, eliminated, surprise = eliminate(model, coupling, sums.brightness, sigma, brightness, expected)
+        if own is not None:
+            scaled = coupling / sigma**2, own[1] / sigma**2, own[2] / sigma
+            model, eliminated, surprise = eliminate(model, *scaled, brightness, expected, self.late_sigma_s)
             cost += surprise
         next_sigma = scale_step(sigma, sums.weighted, sums.count, floor)
         seen = seen_motions(sums, median_depth)
         counts = sums.count, sums.compared
         return Linearised(model, motion, sigma, next_sigma, cost, *counts, floor, seen, inflation(sums), eliminated)
+
+
+def _velocity(spline: Spline, ref: Reference, times: FloatArray) -> FloatArray:
+    """Twist per second (n, 6) of the camera at `times`, in the reference's base frame."""
+    T_world_body, twist = spline.pose_and_velocity(times)
+    to_base = se3.adjoint(se3.inverse(ref.T_world_base) @ T_world_body)
+    return np.asarray((to_base @ twist[..., None])[..., 0])
 
 
 def seen_motions(sums: BlockSums, median_depth: float) -> FloatArray:

@@ -60,12 +60,13 @@ def _line_jacobian(spline: Spline, T_world_base: bytes, times: bytes, first: int
 
 
 def chain(
-    sums: BlockSums, spline: Spline, T_world_base: FloatArray, times: FloatArray, ref_times: FloatArray | None
-) -> tuple[Quadratic, FloatArray, FloatArray]:
+    sums: BlockSums, spline: Spline, T_world_base: FloatArray, times: FloatArray, ref_times: FloatArray | None,
+    coupling: FloatArray | None = None,
+) -> tuple[Quadratic, FloatArray, FloatArray]:  # fmt: skip
     """`sums` of blocks at `times` (n,) by the control points (of blocks of a rolling reference at `ref_times` too).
 
-    Returns the quadratic model, the derivative (n, 6, 6k) of the current blocks' twists, and the coupling (6k, 2) of
-    the control points with the image's gain and offset ((6k, 0) for depth).
+    coupling (nc, nr, 6, m): of the blocks' twists with unknowns of the image. Returns the quadratic model, the
+    derivative (n, 6, 6k) of the current blocks' twists, and the coupling (6k, m) of the control points.
     """
     every = times if ref_times is None else np.concatenate([times, ref_times])
     segments, _ = spline.locate(every)
@@ -82,11 +83,11 @@ def chain(
     size = 6 * count
     flat = J.reshape(-1, size).T
     dense = flat @ HJ.reshape(-1, size)
-    coupling = np.zeros((size, 0))
-    if sums.brightness is not None:
-        blocks = sums.brightness.coupling
-        coupling = flat @ (blocks[:, 0] if ref_times is None else blocks[c, r]).reshape(-1, 2)
-    return Quadratic(first, 0.5 * (dense + dense.T), flat @ g.ravel()), current, coupling
+    if coupling is None:
+        return Quadratic(first, 0.5 * (dense + dense.T), flat @ g.ravel()), current, np.zeros((size, 0))
+    blocks = coupling[:, 0] if ref_times is None else coupling[c, r]
+    of_points = flat @ blocks.reshape(-1, blocks.shape[-1])
+    return Quadratic(first, 0.5 * (dense + dense.T), flat @ g.ravel()), current, of_points
 
 
 def assemble(models: Iterable[Quadratic], first: int, last: int) -> tuple[FloatArray, FloatArray]:

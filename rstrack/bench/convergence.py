@@ -242,7 +242,7 @@ class _Aligner:
     def __init__(self, rig: Rig, options: Options) -> None:
         self._options, self._focal = options, rig.depth_camera.fx
         self._device = DeviceRig(rig, options)
-        self._terms = Terms.of(self._device, options.blur_sigma_px)
+        self._terms = Terms.of(self._device, options)
         self._maker = KeyframeMaker.of(self._device)
 
     def keyframe(self, k: int, frame: Frame, motion: Spline) -> Reference:

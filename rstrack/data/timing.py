@@ -60,7 +60,12 @@ class Timing:
     @property
     def wants_color_offset(self) -> bool:
         """Whether colour's stamps may be off against depth's by more than they say."""
-        return self.color_offset_s is None and "jittered" in (self.depth.clock.verdict, self.color.clock.verdict)
+        return self.color_offset_s is None and self.is_jittered
+
+    @property
+    def is_jittered(self) -> bool:
+        """Whether stamps are arrival times."""
+        return "jittered" in (self.depth.clock.verdict, self.color.clock.verdict)
 
     def lines(self) -> list[str]:
         """For the screen: one line a stream, one for the offset between them, and what was assumed."""

@@ -76,7 +76,7 @@ class BaselineTracker:
         self.rig = rig
         self.options = (options or Options(method="baseline")).decided(rig.depth_shutter)
         self._device = DeviceRig(rig, self.options, timer)
-        self._terms = Terms.of(self._device, self.options.blur_sigma_px)
+        self._terms = Terms.of(self._device, self.options)
         self._maker = KeyframeMaker.of(self._device)
         self._reference: Reference | None = None
         self._first_count = 0

@@ -41,6 +41,8 @@ _GAP_S, _BREAK_S = 0.3, 3600.0
 _WIDEST = 2.0
 # Part of the pixels that must have depth for a frame to become a keyframe.
 _LEAST_DEPTH = 0.02
+# Share of a new image's lateness in what is expected of the next.
+_LATE_SHARE = 0.1
 # Frames of a new piece that are aligned jointly: fewer do not tell its velocity.
 _YOUNG = 4
 # Starts from which a lost frame is looked for, and how many of them are followed to the end.
@@ -54,7 +56,7 @@ class Tracker:
         """timer: watches the parts of the work, see `Timer`."""
         self.rig, self.options = rig, (options or Options()).decided(rig.depth_shutter)
         self._device = DeviceRig(rig, self.options, timer)
-        self._terms = Terms.of(self._device, self.options.blur_sigma_px)
+        self._terms = Terms.of(self._device, self.options)
         self._maker = KeyframeMaker.of(self._device)
         self._keyframes = KeyframeStore(self._maker, self.options)
         self._window: Window | None = None
@@ -67,6 +69,8 @@ class Tracker:
         # Gain and offset against the first colour image, of the recent frames, and the newest colour image's moments.
         self._brightness: dict[int, FloatArray] = {}
         self._moments: FloatArray | None = None
+        # How late colour images were of late (s).
+        self._late_s = 0.0
         # The newest frame, while it is the reference and cannot be rectified yet.
         self._unconverged: DeviceFrame | None = None
         self._stamps: list[float] = []
@@ -324,7 +328,7 @@ class Tracker:
         if self.options.keyframe_strategy == "newest" and new.depth.exposure.lens.lines > 1:
             if not self._unfit(new):
                 rolling = self._maker.rolling(new.index, new.depth, new.colors, window.spline)
-                self._reference = replace(rolling, brightness=self._brightness.get(new.index, brightness.SAME))
+                self._reference = replace(rolling, brightness=self._brightness.get(new.index, brightness.SAME[:2]))
                 self._unconverged, self._pixels = new, 0
             return False
         old = self._keyframes.return_to(window.spline.pose(frozen.depth.exposure.mid_time), ref)
@@ -342,7 +346,7 @@ class Tracker:
 
     def _new_keyframe(self, frame: DeviceFrame, older: Reference | None) -> Reference:
         assert self._window is not None
-        bright = self._brightness.get(frame.index, brightness.SAME)
+        bright = self._brightness.get(frame.index, brightness.SAME[:2])
         self._reference = self._keyframes.make(frame, self._window.spline, older, bright)
         self._unconverged, self._pixels = None, 0
         return self._reference
@@ -368,8 +372,8 @@ class Tracker:
             if before is None and frame.colors and self._brightness and self._moments is not None:
                 newest = self._brightness[max(self._brightness)]
                 before = brightness.expected(newest, frame.colors[0].moments, self._moments)
-            expected = brightness.SAME if before is None else brightness.relative(before, ref.brightness)
-        observations = observe(frame, ref, self.options, expected)
+            expected = brightness.SAME[:2] if before is None else brightness.relative(before, ref.brightness)
+        observations = observe(frame, ref, self.options, np.append(expected[:2], self._late_s))
         for o in observations:
             o.independent = 1.0 / self._independence[not o.is_depth].inflation
         return observations
@@ -379,9 +383,11 @@ class Tracker:
         self._stamps.append(new.stamp)
         if new.colors:
             color = next((o for o in fresh if not o.is_depth), None)
-            found = brightness.SAME
+            found = brightness.SAME[:2]
             if color is not None and self._window is not None:
-                found = brightness.absolute(color.brightness(self._window.state), color.ref.brightness)
+                own = color.brightness(self._window.state)
+                found = brightness.absolute(own, color.ref.brightness)
+                self._late_s += _LATE_SHARE * (float(own[2]) - self._late_s)
             oldest = self._recent[0].index if self._recent else new.index
             self._brightness = {k: b for k, b in self._brightness.items() if k >= oldest} | {new.index: found}
             self._moments = new.colors[0].moments
@@ -404,7 +410,7 @@ def observe(
 ) -> list[Observation]:
     """What the terms of a method make of a frame against a reference: its depth image, and its colour images.
 
-    expected (2,): gain and offset that the colour images are expected to have against the reference.
+    expected (3,): gain, offset and lateness that the colour images are expected to have against the reference.
     """
     depth = [Observation(frame.index, frame.depth, ref)] if options.geometric else []
     return depth + [Observation(frame.index, c, ref, frame.depth, expected) for c in frame.colors if ref.points]
