@@ -35,7 +35,7 @@ from rstrack.options import Options
 # Smallest credible σ of depth (m): quantisation and interpolation leave about as much.
 _CREDIBLE_DEPTH = 2e-4
 # How late a colour image may be beyond what the images before were, as σ in s, where that is followed.
-_LATE_SIGMA_S = 1e-3
+_LATE_SIGMA_S = 2e-3
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ _WIDEST = 2.0
 # Part of the pixels that must have depth for a frame to become a keyframe.
 _LEAST_DEPTH = 0.02
 # Share of a new image's lateness in what is expected of the next.
-_LATE_SHARE = 0.1
+_LATE_SHARE = 0.2
 # Frames of a new piece that are aligned jointly: fewer do not tell its velocity.
 _YOUNG = 4
 # Starts from which a lost frame is looked for, and how many of them are followed to the end.
