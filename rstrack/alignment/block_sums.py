@@ -51,7 +51,7 @@ class BlockSums:
     weighted: float
     cost: float
     count: int
-    compared: int
+    compared: int = 0
     brightness: BrightnessSums | None = None
 
 
@@ -115,7 +115,10 @@ def accumulate(
     e: Engine, g: Vector, p: Vector, sign: float, r: Any, active: Any, parameters: list[Any], slot: Any, size: int,
     c: tuple[Any, Any] | None = None,
 ) -> Any:  # fmt: skip
-    """Σ w j jᵀ and so on into `size` integers; j = sign [g, p × g]. c: see `BrightnessSums`, each at most 1."""
+    """Σ w j jᵀ and so on into `size` integers, from `slot` on (`block_slot`); j = sign [g, p × g].
+
+    c: see `BrightnessSums`, each at most 1.
+    """
     inv_sigma, gate, inv_lever, bound, unit_H, unit_g, unit_cost = parameters
     compared = active & dr.isfinite(r)
     active = compared & (dr.abs(r) < gate)
@@ -137,7 +140,9 @@ def accumulate(
     if c is not None:
         c = tuple(dr.select(active, bound * column, 0.0) for column in c)
         more = [sign * one * column for column in c for one in hj]
-        more += [h * w * c[a] * c[b] for a, b in ((0, 0), (0, 1), (1, 1))] + [w * s * unit_g * column for column in c]
+        # Their own curvature is that of reweighted least squares: Newton's would overshoot a large step of brightness.
+        more += [unit_H * w * c[a] * c[b] for a, b in ((0, 0), (0, 1), (1, 1))]
+        more += [w * s * unit_g * column for column in c]
         values += [e.Int(dr.round(value)) for value in more]
     sums = dr.zeros(e.Int, size)
     for k, value in enumerate(values):

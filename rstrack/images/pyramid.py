@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
@@ -36,7 +36,7 @@ class DepthImage:
     z: Any
     inverse_z: Any
     count: int
-    thumbnail: npt.NDArray[np.float32]
+    thumbnail: npt.NDArray[np.float32] = field(default_factory=lambda: np.zeros(_THUMBNAIL[::-1], np.float32))
     resolution: float = 0.0
 
 
@@ -47,8 +47,8 @@ class ColorImage:
 
     exposure: Exposure
     levels: tuple[Any, ...]
-    moments: FloatArray
-    thumbnail: npt.NDArray[np.float32]
+    moments: FloatArray = field(default_factory=lambda: np.zeros(2))
+    thumbnail: npt.NDArray[np.float32] = field(default_factory=lambda: np.zeros(_THUMBNAIL[::-1], np.float32))
 
 
 def depth_image(

@@ -22,7 +22,7 @@ from rstrack.keyframes.keyframe import Reference
 _ACCELERATION = np.array([5.0, 5.0, 5.0, 10.0, 10.0, 10.0])
 _NEWEST_TRIPLES, _NEWEST_FACTOR = 2, 0.1
 # And of velocities, m/s and rad/s, where a lost track begins anew: one frame's lines hardly tell.
-_VELOCITY = np.array([0.5, 0.5, 0.5, 1.0, 1.0, 1.0])
+_VELOCITY = np.array([1.5, 1.5, 1.5, 3.0, 3.0, 3.0])
 # Metres and radians within which the reference's pose is held while its own control points are free.
 _GAUGE = np.full(6, 1e-6)
 # Levels to go through from a prediction by constant velocity, and from anything worse.

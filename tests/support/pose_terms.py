@@ -50,8 +50,9 @@ class PoseTerms:
         return "some"
 
     def photometric(
-        self, image: Any, ref: Any, spline: Spline, level: int, sigma: float, slopes_at: Spline, visible: Any = None
-    ) -> Linearised:
+        self, image: Any, ref: Any, spline: Spline, level: int, sigma: float, slopes_at: Spline, visible: Any = None,
+        *_: Any,
+    ) -> Linearised:  # fmt: skip
         """The poses that the image saw."""
         self.calls.append((level, sigma))
         self.slopes.append(slopes_at)
@@ -68,7 +69,7 @@ class PoseTerms:
         cost = 0.5 * float((e**2).sum())
         self.costs.append(cost)
         model = Quadratic(first, H, np.einsum("nia,ni->a", rows, e))
-        return Linearised(model, motion, 1.0, self.next_sigma, cost, len(at), 0.0, np.eye(6))
+        return Linearised(model, motion, 1.0, self.next_sigma, cost, len(at), len(at), 0.0, np.eye(6), float("nan"))
 
 
 def sighting(times: np.ndarray, T_world_body: np.ndarray) -> Observation:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,6 +16,7 @@ from rstrack.options import Options
 
 # 0.3 m and 20 degrees are where a keyframe is left; 70 % of that brings an older one back, twice that is the anchor's.
 NEAR_M, NEAR_DEG, ANCHOR_M = 0.21, 14.0, 0.6
+BRIGHTNESS = np.array([0.1, -0.02])
 
 
 def at(x: float, degrees: float = 0.0) -> np.ndarray:
@@ -25,14 +27,26 @@ def frame(index: int) -> Any:
     return SimpleNamespace(index=index, depth=f"depth {index}", colors=())
 
 
+@dataclass(frozen=True, eq=False)
+class Stub:
+    """A keyframe that knows only its frame, its pose, what it inherited and what was fused into it."""
+
+    index: int
+    T_world_base: np.ndarray
+    depth: str
+    older: Any
+    made_by: str
+    brightness: Any = None
+
+
 class Maker:
-    """Keyframes that know only their frame, their pose, what they inherited and what was fused into them."""
+    """Makes them."""
 
     def rectified(self, index: int, depth: str, colors: Any, pose: np.ndarray, older: Any) -> Any:
-        return SimpleNamespace(index=index, T_world_base=pose, depth=depth, older=older, made_by="maker")
+        return Stub(index, pose, depth, older, "maker")
 
     def fused(self, ref: Any, depth: str, pose: np.ndarray) -> Any:
-        return SimpleNamespace(**{**vars(ref), "depth": f"{ref.depth}, {depth}"})
+        return replace(ref, depth=f"{ref.depth}, {depth}")
 
 
 class Model:
@@ -46,7 +60,28 @@ class Model:
 
     def keyframe(self, *made_of: Any) -> Any:
         assert made_of[1] not in self.added, "a keyframe would be averaged with its own depth"
-        return SimpleNamespace(**{**vars(self.maker.rectified(*made_of)), "made_by": "model"})
+        return replace(self.maker.rectified(*made_of), made_by="model")
+
+
+class Shelf:
+    """In place of the archive: which keyframes it has."""
+
+    def __init__(self, maker: Maker) -> None:
+        self.kept: dict[int, Any] = {}
+
+    def add(self, ref: Any) -> None:
+        self.kept[ref.index] = ref
+
+    def get(self, index: int) -> Any:
+        return self.kept[index]
+
+    def alike(self, frame: Any, without: set[int]) -> list[int]:
+        return [k for k in self.kept if k not in without]
+
+
+@pytest.fixture(autouse=True)
+def shelves(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store, "Archive", Shelf)
 
 
 @pytest.fixture
@@ -62,19 +97,36 @@ def keyframes(**options: Any) -> KeyframeStore:
 
 
 def make(kept: KeyframeStore, index: int, pose: np.ndarray, older: Any = None) -> Any:
-    return kept.make(frame(index), pose, older)  # type: ignore[arg-type]
+    return kept.make(frame(index), pose, older, BRIGHTNESS)  # type: ignore[arg-type]
+
+
+def recent(kept: KeyframeStore) -> list[Any]:
+    """The last eight, newest first."""
+    return list(kept._kept)[:-9:-1]
 
 
 def test_without_a_model_the_last_eight_are_kept_and_none_is_returned_to() -> None:
     kept = keyframes()
-    assert len(kept) == 0 and kept.recent == []
+    assert len(kept) == 0 and recent(kept) == []
     refs = []
     for k in range(11):
         refs.append(make(kept, k, np.eye(4), refs[-1] if refs else None))
         assert kept.newest is refs[-1] and kept.made == k + 1 and len(kept) == min(k + 1, 8)
         assert refs[-1].older is (refs[-2] if k else None)
-    assert kept.recent == refs[:2:-1]
+    assert recent(kept) == refs[:2:-1]
     assert kept.return_to(np.eye(4), refs[-1]) is None and kept.anchor is None
+
+
+def test_any_keyframe_can_be_found_again_in_turn() -> None:
+    kept = keyframes()
+    refs = [make(kept, k, np.eye(4)) for k in range(12)]
+    assert all(ref.brightness is BRIGHTNESS for ref in refs)
+    # All but the newest, round and round, and what is still at hand is not taken from the archive.
+    for skip, found in ((0, [0, 1]), (4, [4, 5]), (10, [10, 0])):
+        assert [ref.index for ref in kept.candidates(frame(20), skip, 2)] == found
+    assert kept.candidates(frame(20), 6, 1)[0] is refs[6]
+    kept.use(refs[2])
+    assert kept.newest is refs[2] and recent(kept)[1] is refs[11] and kept.made == 12
 
 
 class ByDistance(Options):
@@ -88,7 +140,7 @@ def test_a_model_keeps_256_of_which_the_last_eight_are_recent(models: list[Model
     kept = KeyframeStore(Maker(), ByDistance(reference="model"))  # type: ignore[arg-type]
     refs = [make(kept, k, at(10.0 * k)) for k in range(260)]
     assert len(kept) == 256 and kept.made == 260
-    assert kept.recent == refs[:251:-1]
+    assert recent(kept) == refs[:251:-1]
     assert all(ref.made_by == "model" for ref in refs) and models[0].added == [f"depth {k}" for k in range(260)]
     # The first four are forgotten.
     assert kept.return_to(at(30.0), refs[-1]) is None and kept.return_to(at(40.0), refs[-1]) is refs[4]
@@ -108,7 +160,7 @@ def test_a_keyframe_is_returned_to_at_70_percent_of_where_it_is_left(
     first, last = make(kept, 0, np.eye(4)), make(kept, 9, at(5.0))
     assert (kept.return_to(pose, last) is first) == is_near
     # The one that is returned to is the newest, and no other is lost.
-    assert kept.recent == ([first, last] if is_near else [last, first])
+    assert recent(kept) == ([first, last] if is_near else [last, first])
     assert len(kept) == 2 and kept.made == 2
 
 
@@ -116,7 +168,7 @@ def test_the_oldest_that_is_near_is_returned_to_but_not_the_one_that_was_left(mo
     kept = keyframes(reference="model")
     refs = [make(kept, k, at(x)) for k, x in enumerate((0.0, 0.1, 5.0, 0.05))]
     assert kept.return_to(at(0.02), refs[3]) is refs[0]
-    assert kept.recent == [refs[k] for k in (0, 3, 2, 1)]
+    assert recent(kept) == [refs[k] for k in (0, 3, 2, 1)]
     # Oldest by its frame, not by its last use.
     assert kept.return_to(at(0.02), refs[0]) is refs[1] and kept.return_to(at(0.02), refs[1]) is refs[0]
     assert kept.return_to(at(5.0), refs[2]) is None
@@ -132,7 +184,7 @@ def test_the_anchor_is_the_oldest_within_twice_where_a_keyframe_is_left(models: 
     second = make(kept, 2, at(0.99 * ANCHOR_M))
     assert kept.anchor is first
     third = make(kept, 3, at(1.01 * ANCHOR_M))
-    assert kept.anchor is kept.recent[2] and kept.anchor.index == 1
+    assert kept.anchor is recent(kept)[2] and kept.anchor.index == 1
     make(kept, 4, at(5.0))
     assert kept.anchor is None
     # A return has its own.
@@ -151,6 +203,6 @@ def test_later_frames_are_fused_as_the_options_want(reference: str, fuse: bool, 
     after = kept.fuse(frame(4), np.eye(4))
     assert after is kept.newest and (after is ref) != fuse
     assert after.depth == ("depth 3, depth 4" if fuse else "depth 3")
-    assert len(kept) == 2 and kept.recent[1].depth == "depth 2" and kept.made == 2
+    assert len(kept) == 2 and recent(kept)[1].depth == "depth 2" and kept.made == 2
     # A model has every frame once.
     assert [model.added for model in models] == ([["depth 2", "depth 3", "depth 4"]] if reference == "model" else [])

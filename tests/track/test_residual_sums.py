@@ -185,7 +185,7 @@ def test_blocks_chained_to_control_points_equal_dense_pixel_jacobians(room: tupl
     as_input, ref, spline, z = room
     image = as_input(z)
     pixels = geometric_pixels(z, image, ref, spline, 0.01)
-    model, _ = chain(
+    model, _, _ = chain(
         pixels.blocks(image.exposure.lens.lines, 1), spline, ref.T_world_base, image.exposure.block_times(1), None
     )
     # Each pixel's own time, not its line's.
@@ -215,7 +215,7 @@ def accumulate(
     columns = [ENGINE.upload(c) for c in (*g.T, *p.T, r)]
     raw = block_sums_module.accumulate(
         ENGINE, tuple(columns[:3]), tuple(columns[3:6]), -1.0, columns[6], ENGINE.Bool(True), constants,
-        ENGINE.UInt(0), 1,
+        ENGINE.UInt(0), 32,
     ).numpy()  # fmt: skip
     return raw, scaling.unpack(raw, 1, 1)
 

@@ -1,0 +1,85 @@
+"""Gain, offset and lateness of colour images: eliminated exactly, found where known, chained over keyframes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rstrack_util import ENGINE
+from term_setting import setting
+
+from rstrack.alignment import brightness
+from rstrack.alignment.normal_equations import Quadratic
+from rstrack.images.pyramid import ColorImage
+
+
+def test_what_is_eliminated_is_what_a_joint_solution_gives() -> None:
+    rng = np.random.default_rng(3)
+    A = rng.normal(size=(40, 15))
+    H, g = A.T @ A, rng.normal(size=15)
+    at, expected, late = np.array([0.1, -0.05, 1e-3]), np.array([0.02, 0.01, 0.0]), 2e-3
+    prior = 1.0 / np.array([0.3, 0.15, late]) ** 2
+    joint, right = H.copy(), g.copy()
+    joint[12:, 12:] += np.diag(prior)
+    right[12:] += prior * (at - expected)
+    x = -np.linalg.solve(joint, right)
+    model = Quadratic(4, H[:12, :12], g[:12])
+    left, gone, cost = brightness.eliminate(model, H[:12, 12:], H[12:, 12:], g[12:], at, expected, late)
+    np.testing.assert_allclose(-np.linalg.solve(left.H, left.g), x[:12], rtol=1e-8)
+    np.testing.assert_allclose(gone.at + gone.step + gone.follow @ x[:12], at + x[12:], rtol=1e-8)
+    assert cost == pytest.approx(0.5 * float(((at - expected) ** 2 * prior).sum())) and left.first == 4
+
+
+def brighter(image: ColorImage, gain: float, offset: float) -> ColorImage:
+    levels = (level + (gain * (level - 0.5) + offset) for level in image.levels)
+    return replace(image, levels=tuple(ENGINE.Float(level) for level in levels))
+
+
+@pytest.mark.parametrize(("gain", "offset"), [(0.0, 0.0), (0.2, 0.05), (-0.3, -0.1)])
+@pytest.mark.parametrize("ref_scan", [None, "top-bottom"])
+def test_gain_and_offset_of_an_image_are_found(gain: float, offset: float, ref_scan: str | None) -> None:
+    s = setting("photometric", ref_scan, "top-bottom")
+    image, at, sigma = brighter(s.image, gain, offset), np.zeros(3), 0.05
+    for _ in range(5):
+        # The prior is centred on the truth, so that it does not pull; the start is not.
+        known = np.array([gain, offset, 0.0])
+        lin = s.terms.photometric(image, s.ref, s.truth, 0, sigma, brightness=at, expected=known)
+        assert lin.brightness is not None
+        at, sigma = lin.brightness.best(np.zeros(len(lin.model.g))), lin.next_sigma
+    # Interpolation of such small images leaves errors of 2e-4 in intensity, which the gain takes for contrast.
+    np.testing.assert_allclose(at, [gain, offset, 0.0], atol=3e-3)
+
+
+@pytest.mark.parametrize("late", [0.003, -0.002])
+def test_a_late_image_is_known_by_the_motion(late: float) -> None:
+    s = setting("photometric", None, "top-bottom")
+    terms = replace(s.terms, late_sigma_s=0.02)
+    stamped = replace(s.image, exposure=replace(s.image.exposure, stamp=s.image.exposure.stamp - late))
+    at = np.zeros(3)
+    for _ in range(4):
+        lin = terms.photometric(stamped, s.ref, s.truth, 0, 0.02, brightness=at)
+        assert lin.brightness is not None
+        at = lin.brightness.best(np.zeros(len(lin.model.g)))
+    assert at[2] == pytest.approx(late, abs=2e-4)
+
+
+def test_brightness_is_chained_over_keyframes() -> None:
+    a, b = np.array([0.2, 0.05]), np.array([-0.1, 0.02])
+    light = np.linspace(0.1, 0.9, 5)
+
+    def seen(x: np.ndarray, of: np.ndarray) -> np.ndarray:
+        return x + of[0] * (x - 0.5) + of[1]
+
+    np.testing.assert_allclose(seen(light, brightness.absolute(a, b)), seen(seen(light, b), a))
+    np.testing.assert_allclose(brightness.relative(brightness.absolute(a, b), b), a, atol=1e-12)
+
+
+def test_moments_match_and_small_changes_of_the_view_are_none() -> None:
+    before = np.array([0.4, 0.2])
+    after = np.array([0.4 * 0.7 + 0.1, 0.2 * 0.7])
+    gain, offset = brightness.matched(after, before)
+    np.testing.assert_allclose([0.5 + (1 + gain) * (0.4 - 0.5) + offset, (1 + gain) * 0.2], after)
+    known = np.array([0.05, 0.01])
+    assert brightness.expected(known, before + 0.02, before) is known
+    assert np.abs(brightness.expected(known, after, before) - known).max() > 0.05
