@@ -396,4 +396,5 @@ def test_tracking_names_what_it_cannot_read(sequence: Path, use: Callable[[str],
         path = sequence / name
         with fuzzing.replaced(path, fuzzing.damages(SEED)[way](path.read_bytes())):
             status, text = use("rstrack track SEQ --out OUT --quiet --method rs-pg")
-            assert status == 2 and name in text, (name, text)
+            # One image that cannot be read costs its frame, or itself; without a listing or cameras there is no track.
+            assert status == (1 if name.endswith(".png") else 2) and name in text, (name, text)
