@@ -115,7 +115,7 @@ class Tracker:
             )
         new = self._device.upload(len(self.reports), frame)
         self._last_fed = stamp
-        if len(self._stamps) == 1:
+        if len(self._stamps) == 1 and self._recent:
             self._fit_knots(gap)
         if self._window is None:
             report = self._start(new)
