@@ -25,15 +25,7 @@ def acceleration_prior(spline: Spline, first: int, last: int, sigma: FloatArray)
     omega = spline.increments[first : last - 1]
     r = omega[1:] - omega[:-1]
     J = np.concatenate([gains[:-1], -gains[1:] - gains[:-1], gains[1:]], axis=2)
-    weighted = np.swapaxes(J, 1, 2) / sigma[:, None, :] ** 2
-    blocks, slopes = weighted @ J, (weighted @ r[..., None])[..., 0]
-    count = last - first
-    H, g = np.zeros((6 * count, 6 * count)), np.zeros(6 * count)
-    for i in range(count - 2):
-        at = slice(6 * i, 6 * i + 18)
-        H[at, at] += blocks[i]
-        g[at] += slopes[i]
-    return Quadratic(first, H, g), 0.5 * float(np.sum((r / sigma) ** 2))
+    return _summed(first, last, J, r, sigma)
 
 
 def velocity_prior(spline: Spline, first: int, last: int, sigma: FloatArray) -> tuple[Quadratic, float]:
@@ -44,15 +36,7 @@ def velocity_prior(spline: Spline, first: int, last: int, sigma: FloatArray) -> 
     gains = spline.left_gains[first : last - 1]
     r = spline.increments[first : last - 1]
     J = np.concatenate([-gains, gains], axis=2)
-    weighted = np.swapaxes(J, 1, 2) / sigma**2
-    blocks, slopes = weighted @ J, (weighted @ r[..., None])[..., 0]
-    count = last - first
-    H, g = np.zeros((6 * count, 6 * count)), np.zeros(6 * count)
-    for i in range(count - 1):
-        at = slice(6 * i, 6 * i + 12)
-        H[at, at] += blocks[i]
-        g[at] += slopes[i]
-    return Quadratic(first, H, g), 0.5 * float(np.sum((r / sigma) ** 2))
+    return _summed(first, last, J, r, np.broadcast_to(sigma, r.shape))
 
 
 def pose_constraint(spline: Spline, t: float, T_world_body: FloatArray, sigma: FloatArray) -> tuple[Quadratic, float]:
@@ -65,3 +49,16 @@ def pose_constraint(spline: Spline, t: float, T_world_body: FloatArray, sigma: F
     J = se3.left_jacobian_inv(e) @ np.hstack(list(J))
     model = Quadratic(int(segment), J.T @ (J / sigma[:, None] ** 2), J.T @ (e / sigma**2))
     return model, 0.5 * float(np.sum((e / sigma) ** 2))
+
+
+def _summed(first: int, last: int, J: FloatArray, r: FloatArray, sigma: FloatArray) -> tuple[Quadratic, float]:
+    """Model and cost of residuals r (n, 6) ~ N(0, diag sigma²), the i-th with derivative J[i] by control points from
+    first + i on."""
+    weighted = np.swapaxes(J, 1, 2) / sigma[:, None, :] ** 2
+    blocks, slopes = weighted @ J, (weighted @ r[..., None])[..., 0]
+    H, g = np.zeros((6 * (last - first),) * 2), np.zeros(6 * (last - first))
+    for i in range(len(r)):
+        at = slice(6 * i, 6 * i + J.shape[2])
+        H[at, at] += blocks[i]
+        g[at] += slopes[i]
+    return Quadratic(first, H, g), 0.5 * float(np.sum((r / sigma) ** 2))

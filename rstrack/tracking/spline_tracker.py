@@ -220,6 +220,8 @@ class Tracker:
         self._placed(new, fresh)
         if len(self._recent) < self.options.bootstrap_frames:
             return self._report(new, fresh, solved)
+        if all(self._unfit(f) for f in self._recent):
+            return self._begin_anew(new)  # none of them has a colour image to go on with
         self._leave_bootstrap(window)
         return self._report(new, fresh, solved, keyframe=True)
 

@@ -10,7 +10,7 @@ from util import numeric_jacobian, random_spline, random_twists
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.normal_equations import Quadratic, assemble, solve
-from rstrack.alignment.priors import acceleration_prior, pose_constraint
+from rstrack.alignment.priors import acceleration_prior, pose_constraint, velocity_prior
 from rstrack.alignment.spline_state import SplineState
 
 
@@ -40,6 +40,22 @@ def test_acceleration_prior_asks_nothing_of_constant_velocity() -> None:
     assert cost < 1e-24
     assert np.abs(model.g).max() < 1e-12
     assert np.linalg.matrix_rank(model.H) == 36  # free: pose and velocity
+
+
+def test_velocity_prior_is_that_of_its_cost() -> None:
+    spline, first, last = random_spline(1), 2, 8
+    sigma = np.array([0.5, 0.6, 0.7, 1.0, 1.2, 1.4])
+
+    def errors(x: np.ndarray) -> np.ndarray:
+        T = moved(spline, x.reshape(-1, 6), first).control_points[first:last]
+        return (se3.log(np.linalg.inv(T[:-1]) @ T[1:]) / sigma).ravel()
+
+    model, cost = velocity_prior(spline, first, last, sigma)
+    assert cost == pytest.approx(0.5 * (errors(np.zeros(36)) ** 2).sum())
+    assert (model.first, model.last) == (first, last)
+    J = numeric_jacobian(errors, 6 * (last - first))
+    np.testing.assert_allclose(model.H, J.T @ J, atol=1e-6 * np.abs(J.T @ J).max())
+    np.testing.assert_allclose(model.g, J.T @ errors(np.zeros(36)), atol=1e-7 * np.abs(model.g).max())
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-6, 0.3])

@@ -77,6 +77,14 @@ def test_a_gap_is_bridged_from_the_last_keyframes() -> None:
     assert lost(tracker) == [] and len(tracker.spline_valid) == 2 and worst_step(tracker) < 2e-3
 
 
+def test_colour_may_come_late_but_there_is_no_keyframe_without_it() -> None:
+    def frames(first_color: int) -> Iterable[Frame]:
+        return (frame_at(k) if k >= first_color else replace(frame_at(k), colors=()) for k in range(14))
+
+    assert lost(feed(tracker_of("rs-pg"), frames(1))) == []
+    assert lost(feed(tracker_of("rs-pg"), frames(7))) == [0, 1, 2, 3, 4]
+
+
 def test_nothing_but_blank_frames() -> None:
     tracker = feed(tracker_of("rs-pg"), (blank(frame_at(k)) for k in range(3)))
     assert lost(tracker) == [0, 1, 2] and tracker.spline is None and len(tracker.trajectory[0]) == 0
