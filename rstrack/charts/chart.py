@@ -139,8 +139,11 @@ class PathChart:
 
 def method_colors(methods: Iterable[str]) -> dict[str, str]:
     """A colour for each method, always the same for ours."""
-    others = [method for method in methods if method not in _METHOD_COLORS]
-    return _METHOD_COLORS | {method: _OTHER_COLORS[k % len(_OTHER_COLORS)] for k, method in enumerate(others)}
+    names = list(methods)
+    # The setting of a method that 'rstrack bench' shows in its place.
+    fused = {name: _METHOD_COLORS[plain] for name in names if (plain := name.removesuffix(" --fuse")) in _METHOD_COLORS}
+    others = [name for name in names if name not in fused]
+    return _METHOD_COLORS | fused | {name: _OTHER_COLORS[k % len(_OTHER_COLORS)] for k, name in enumerate(others)}
 
 
 def numbers(values: Sequence[float | None], scale: float = 1.0) -> FloatArray:

@@ -10,6 +10,7 @@ from rsgen.console.command_line import Frames, Quiet
 from rsgen.console.configs import ConfigFile
 from rsgen.console.scheduler import Scheduler, open_workers
 from rsgen.errors import UserError
+from rstrack.cli.options import TruthOffset
 from rstrack.options import Options
 
 STATUS = "exit status: 0 done, 1 a track was lost or failed, 2 wrong input, 130 interrupted (the same command resumes)"
@@ -43,13 +44,18 @@ def bench(
         "NAME=DIR",
         _added,
     ] = None,
+    truth_offset: TruthOffset = None,
     meshes: Annotated[
         bool | None, "pictures of maps made with the trajectories, one a sequence (default: yes, but with --quick no)"
     ] = None,
     scheduler: Scheduler = None,
     quiet: Quiet = False,
 ) -> int:
-    """Every method on every sequence against the truth, the paper's figures beside: tables, plots."""
+    """Every method on every sequence against the truth, the paper's figures beside: tables, plots.
+
+    Each of our methods runs with fused keyframes and without, unless --fuse or --no-fuse says which. Tables show the
+    better of the two for baseline and gs-*, and both for rs-*.
+    """
     from rsgen.console.progress import ProgressDisplay
     from rstrack.bench.methods.config import choose, load_bench_config
     from rstrack.bench.methods.grid import run_plan
@@ -66,7 +72,7 @@ def bench(
     with_meshes = not quick if meshes is None else meshes
     if meshes and not set(SHOWN) & set(choice.methods):
         raise UserError(f"--meshes: is for {', '.join(SHOWN)}: add one of them to --method")
-    plan = make_plan(choice, data, out, tracker, dict(add or ()))
+    plan = make_plan(choice, data, out, tracker, dict(add or ()), truth_offset)
     with ProgressDisplay(quiet) as progress:
         with open_workers(scheduler) as workers:
             results = run_plan(plan, workers, progress)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from rsgen.console.command_line import Quiet
-from rstrack.cli.options import CameraFile
+from rstrack.cli.options import CameraFile, TruthOffset
 
 
 def report(
@@ -16,6 +16,7 @@ def report(
     *,
     sequence: Annotated[Path | None, "the run's sequence (default: where it was)", "DIR"] = None,
     camera: CameraFile = None,
+    truth_offset: TruthOffset = None,
     out: Annotated[Path | None, "page to write (default: report.html in the folder)", "FILE"] = None,
     quiet: Quiet = False,
 ) -> int:
@@ -26,6 +27,6 @@ def report(
     from rstrack.report.build import write_report
 
     with ProgressDisplay(quiet) as progress:
-        page = write_report(run, sequence, out, camera, progress)
+        page = write_report(run, sequence, out, camera, progress, truth_offset)
     print(f"{page}: written, open it in a browser")
     return 0

@@ -67,11 +67,18 @@ class Evaluation:
             return self.metrics.text()
         if self.hint is not None:
             return f"{self.metrics.text()}\nhint: {self.hint}"
+        return "\n".join([*self.clocks, "", self.moved.text()])
+
+    @property
+    def clocks(self) -> tuple[str, ...]:
+        """Where an offset was asked for: errors with and without it, and how it was found, one line each."""
+        if self.moved is None or not self.asked:
+            return ()
         lines = [f"clocks as they are: {_short(self.metrics)}", f"{self._clock()}: {_short(self.moved)}"]
         if self.fit is not None:
             where = ", ".join(f"{name} {1e3 * tau:+.1f}" for name, tau in self.fit.least_s.items())
             lines.append(f"least by {self.fit.criterion}; each error is least at, ms: {where}")
-        return "\n".join([*lines, "", self.moved.text()])
+        return tuple(lines)
 
     def _clock(self) -> str:
         assert self.offset_s is not None

@@ -9,6 +9,7 @@ from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
 from rstrack.bench.methods import paper
 from rstrack.bench.methods.mesh_pictures import read_picture
+from rstrack.bench.methods.plan import SequenceInfo
 from rstrack.bench.methods.plots import ate_chart
 from rstrack.bench.methods.results import QUANTITIES, RESULTS, Results, averages, read_results
 from rstrack.bench.methods.tables import notes, sequence_table
@@ -120,7 +121,7 @@ def _sequences(
         except UserError as error:
             warnings.append(f"No plots and images of {entry.name}: {error}.")
             continue
-        runs = _runs(folder, results, entry.name, dataset, warnings)
+        runs = _runs(folder, results, entry, dataset, warnings)
         if runs:
             charts.append((entry.name, _sequence_plots(runs)))
         best = runs.get(_shown(results)) or next(iter(runs.values()), None)
@@ -148,17 +149,17 @@ def _maps(folder: Path, results: Results, warnings: list[str]) -> tuple[tuple[st
 
 
 def _runs(
-    folder: Path, results: Results, name: str, dataset: Dataset, warnings: list[str]
+    folder: Path, results: Results, entry: SequenceInfo, dataset: Dataset, warnings: list[str]
 ) -> dict[str, Tracked]:  # fmt: skip
-    """The runs of a sequence by method, in the order of the methods."""
+    """The runs of a sequence that the tables show, by name, in the order of the tables."""
     runs = {}
-    for method in results.methods:
-        for cell in results.cells:
-            if (cell.sequence, cell.method) == (name, method) and cell.error is None:
-                try:
-                    runs[method] = load_run(folder / cell.folder, dataset=dataset)
-                except UserError as error:
-                    warnings.append(f"No plots of {method} on {name}: {error}.")
+    for method in results.shown(entry.group).values():
+        cell = results.cell(entry.name, method)
+        if cell is not None and cell.error is None:
+            try:
+                runs[method] = load_run(folder / cell.folder, dataset=dataset, truth_offset=cell.truth_offset_s)
+            except UserError as error:
+                warnings.append(f"No plots of {method} on {entry.name}: {error}.")
     return runs
 
 

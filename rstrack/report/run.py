@@ -11,6 +11,7 @@ import numpy as np
 from rsgen.errors import UserError
 from rstrack.charts.chart import Chart, PathChart
 from rstrack.charts.runs import error_charts, inlier_charts, path_chart, time_charts
+from rstrack.metrics.clock import TruthOffset
 from rstrack.metrics.evaluate import Metrics
 from rstrack.metrics.run_evaluate import evaluate_clocks
 from rstrack.metrics.tracked import Tracked, load_run
@@ -18,16 +19,28 @@ from rstrack.report.page import Card, CardRow, Note, Page, Plot, Section
 from rstrack.report.pictures import frame_panels, shutter_sliders
 
 
-def run_page(run: Path, sequence: Path | None = None, camera_file: Path | None = None) -> Page:
-    """Gather everything about a run folder, or a TUM file with a sequence. Raises UserError."""
+def run_page(
+    run: Path, sequence: Path | None = None, camera_file: Path | None = None, truth_offset: TruthOffset | None = None
+) -> Page:
+    """Gather everything about a run folder, or a TUM file with a sequence; arguments as in `load_run`.
+
+    Raises UserError, for the offset only if it was asked for.
+    """
     tracked = load_run(run, sequence, camera_file)
+    if truth_offset is not None and tracked.truth is None:
+        raise UserError(f"{run}: there is no truth whose clock could be moved: name its --sequence, or leave "
+                        "--truth-offset out")  # fmt: skip
     info = tracked.estimate.info
-    sections = [Section("path", "Path", (Plot(path_chart({"estimated": tracked})),))]
-    metrics, hint = None, None
-    if tracked.found is not None and tracked.truth is not None:
-        evaluation = evaluate_clocks(tracked.truth, tracked.estimate)
-        metrics, hint = evaluation.metrics, evaluation.hint
-        sections.insert(0, Section("errors", "Errors", (metrics.table(), *_notes(metrics))))
+    sections, metrics, hint = [], None, None
+    if tracked.truth is not None and (tracked.found is not None or truth_offset is not None):
+        evaluation = evaluate_clocks(tracked.truth, tracked.estimate, truth_offset)
+        metrics, hint = evaluation.chosen, evaluation.hint
+        clocks = (Note(f"{line[0].upper()}{line[1:]}.") for line in evaluation.clocks)
+        sections.append(Section("errors", "Errors", (metrics.table(), *clocks, *_notes(metrics))))
+        if evaluation.asked:
+            tracked = load_run(run, dataset=tracked.dataset, truth_offset=evaluation.offset_s)
+    sections.append(Section("path", "Path", (Plot(path_chart({"estimated": tracked})),)))
+    if metrics is not None:
         sections.append(Section("time", "Errors over time", plots(error_charts(tracked))))
     if charts := (*inlier_charts(tracked), *time_charts(tracked)):
         sections.append(Section("tracker", "What the tracker said", plots(charts)))

@@ -44,6 +44,7 @@ ROOT = Path(__file__).parents[2]
 FRAMES = 31
 NAMES = ("robot_t1", "lr_kt2")
 SPEEDS = (0.3, 0.25)
+VARIANTS = ("gs-g", "gs-g --fuse", "rs-g", "rs-g --no-fuse")
 
 
 def parser() -> Parser:
@@ -87,12 +88,12 @@ def place(original: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
 
 @pytest.fixture
 def tracked(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
-    """What is tracked from now on, as 'SEQUENCE METHOD'."""
+    """What is tracked from now on, as 'SEQUENCE METHOD', and '+' where depth is fused."""
     calls: list[str] = []
     real = rstrack.bench.methods.grid.track
 
     def watched(dataset: Any, options: Options, *rest: Any, **named: Any) -> Any:
-        calls.append(f"{dataset.root.name} {options.method}")
+        calls.append(f"{dataset.root.name} {options.method}{'+' if options.fuse else ''}")
         return real(dataset, options, *rest, **named)
 
     monkeypatch.setattr(rstrack.bench.methods.grid, "track", watched)
@@ -123,7 +124,7 @@ def write_tum(path: Path, sequence: str, kept: Sequence[int] | range = range(FRA
 def test_figures_are_those_of_evaluate(original: Path) -> None:
     data = json.loads((original / "bench/results.json").read_text())
     assert [(c["sequence"], c["method"]) for c in data["cells"]] == [
-        (name, method) for name in NAMES for method in ("gs-g", "rs-g")
+        (name, method) for name in NAMES for method in VARIANTS
     ]
     for cell in data["cells"]:
         metrics = run_evaluate(original / "data" / cell["sequence"], original / "bench" / cell["run"]).metrics
@@ -134,14 +135,15 @@ def test_figures_are_those_of_evaluate(original: Path) -> None:
         kept = json.loads((original / "bench" / cell["run"] / "cell.json").read_text())
         assert kept["metrics"]["ate_rmse_m"] == cell["ate_m"] and len(kept["key"]) == 64
         info = read_estimate(original / "bench" / cell["run"]).info
-        assert info["method"] == cell["method"] and len(info["frames"]) == FRAMES
+        assert info["method"] == cell["method"].partition(" ")[0] and len(info["frames"]) == FRAMES
+        assert info["options"]["fuse"] == cell["fuse"] == (cell["method"] in ("gs-g --fuse", "rs-g"))
     by = {(c["sequence"], c["method"]): c["ate_m"] for c in data["cells"]}
     assert by["robot_t1", "rs-g"] < by["robot_t1", "gs-g"]
     (entry, _) = data["sequences"]
     assert entry == {
         "name": "robot_t1", "group": "hand-held", "path": str((original / "data/robot_t1").resolve()), "frames": FRAMES,
     }  # fmt: skip
-    assert data["methods"] == ["gs-g", "rs-g"] and data["machine"]["cpu_count"] >= 1 and data["version"]
+    assert data["methods"] == list(VARIANTS) and data["machine"]["cpu_count"] >= 1 and data["version"]
     assert {"sequence": "lr_kt2", "method": "rs-g", "ate_m": 0.0109, "rpe_m_s": 0.0044, "rpe_deg_s": 0.0723} in data[
         "paper"
     ]
@@ -152,13 +154,15 @@ def test_what_is_written(original: Path) -> None:
     text = (original / "bench/results.txt").read_text()
     data = json.loads((original / "bench/results.json").read_text())
     ate = {(c["sequence"], c["method"]): c["ate_m"] for c in data["cells"]}
-    (line,) = [line for line in text.split("\n\n")[0].splitlines() if line.startswith("rs-g")]
+    (line,) = [line for line in text.split("\n\n")[0].splitlines() if line.startswith("rs-g ") and "--" not in line]
     shown = line.split()
     assert float(shown[1]) == pytest.approx(1e3 * ate["robot_t1", "rs-g"], rel=6e-3) and shown[1] == shown[2]
     assert "hand-held, ATE, mm" in text and "living room, drift, deg/s" in text
     rows = list(csv.DictReader(io.StringIO((original / "bench/results.csv").read_text())))
-    assert len(rows) == 4 + 4 and float(rows[1]["ate_m"]) == ate["robot_t1", "rs-g"]
-    assert rows[1]["better_ate_m_pct"] == "" and rows[1]["paper_ate_m"] == "0.0129"  # no baseline
+    assert len(rows) == 8 + 8 and float(rows[2]["ate_m"]) == ate["robot_t1", "rs-g"]
+    assert rows[2]["better_ate_m_pct"] == "" and rows[2]["paper_ate_m"] == "0.0129"  # no baseline
+    assert [row["paper_ate_m"] for row in rows[:4]] == ["0.0169", "0.0169", "0.0129", ""]  # the paper fuses
+    assert [row["fuse"] for row in rows[:4]] == ["False", "True", "True", "False"]
     assert "| `rs-g` | **" in (original / "bench/results.md").read_text()
     for name in ("ate", *NAMES):
         picture = cv2.imread(str(original / f"bench/plots/{name}.png"))
@@ -176,30 +180,66 @@ def test_finished_cells_are_kept(place: Path, tracked: list[str], capfd: pytest.
     (place / "bench/cells/robot_t1/rs-g/trajectory.txt").unlink()
     (place / "bench/cells/robot_t1/gs-g/cell.json").write_text("{")
     assert main("bench bench.yaml --data data --out bench --quiet --sequence lr_kt2") == 0
-    assert tracked == ["lr_kt2 rs-g"]
+    assert tracked == ["lr_kt2 rs-g+"]
     plan_now = plan()
-    assert [read_cell(job) is None for job in plan_now.jobs] == [True, True, False, False]
+    assert [read_cell(job) is None for job in plan_now.jobs] == [True, False, True, False] + 4 * [False]
 
 
 def test_what_a_cell_depends_on(place: Path) -> None:
     keys = [job.key for job in plan().jobs]
-    assert len(set(keys)) == 4
+    assert len(set(keys)) == 8
     assert not {job.key for job in plan(options=Options(knot_spacing_s=0.03)).jobs} & set(keys)
     assert not {job.key for job in plan(frames=slice(0, 20)).jobs} & set(keys)
     assert [job.key for job in plan(options=Options(method="gs-p"), frames=slice(0, FRAMES)).jobs] == keys
-    fused = [job.key in keys for job in plan(options=Options(fuse=True)).jobs]
-    assert fused == [job.method.startswith("rs") for job in plan().jobs]  # for which it is the default
+    # One setting that is asked for is that of a cell of its own, and the other one is not run.
+    for fuse, names in ((True, ["gs-g --fuse", "rs-g"]), (False, ["gs-g", "rs-g --no-fuse"])):
+        jobs = plan(options=Options(fuse=fuse), sequences=["robot_t1"]).jobs
+        assert [job.method for job in jobs] == names
+        assert [job.key for job in jobs] == [keys[VARIANTS.index(name)] for name in names]
     rgb = place / "data/lr_kt2/rgb.txt"
     rgb.write_text("# another\n" + rgb.read_text())
-    assert [job.key == key for job, key in zip(plan().jobs, keys, strict=True)] == [True, True, False, False]
+    assert [job.key == key for job, key in zip(plan().jobs, keys, strict=True)] == 4 * [True] + 4 * [False]
+
+
+def test_another_clock_of_the_truth_is_only_evaluated(place: Path, tracked: list[str]) -> None:
+    # Poses of the colour camera, as TUM has them, on a clock that is 12 ms ahead of the images'.
+    t = np.arange(-19, 121) / 100.0
+    T_world_color = synthetic.make_spline(SPEEDS[0]).pose(t) @ se3.inverse(synthetic.T_COLOR_DEPTH)
+    rows = np.column_stack([t + 0.012, pose_rows(T_world_color)])
+    root = place / "data/robot_t1"
+    (root / "groundtruth.txt").write_text("".join(" ".join(f"{v:.9f}" for v in row) + "\n" for row in rows))
+    camera = {"width": 112, "height": 84, "intrinsics": [84.0, 84.0, 55.5, 41.5], "readout_s": 0.028}
+    cameras = {"color": camera, "depth": camera, "T_color_depth": synthetic.T_COLOR_DEPTH.tolist()}
+    (root / "camera.yaml").write_text(yaml.safe_dump(cameras))
+    (root / "sequence.yaml").unlink()
+    how: dict[str, Any] = {"sequences": ["robot_t1"], "methods": ["rs-g"], "options": Options(fuse=True)}
+    (before,) = run_plan(plan(**how)).cells
+    assert tracked == ["robot_t1 rs-g+"] and before.truth_offset_s is None
+    moved = plan(**how, truth_offset=0.012)
+    assert read_cell(moved.jobs[0]) is None
+    results = run_plan(moved)
+    (after,) = results.cells
+    assert tracked == ["robot_t1 rs-g+"] and after == read_cell(moved.jobs[0]) and after.seconds == before.seconds
+    asked = run_evaluate(root, before_run := place / "bench" / before.folder, truth_offset=0.012)
+    assert after.truth_offset_s == 0.012 and after.metrics is not None
+    assert after.metrics["ate_rmse_m"] == pytest.approx(asked.chosen.ate_rmse_m, rel=1e-6)
+    assert before.metrics is not None and after.metrics["ate_rmse_m"] < 0.3 * before.metrics["ate_rmse_m"]
+    assert "0.012 s after the stamps" in results_text(results) and before_run.is_dir()
+    # A second of poses has too few pairs one second apart to find it: clocks as they are, and that is said.
+    sought = run_plan(plan(**how, truth_offset="auto"))
+    assert sought.cells[0].figure("ate_rmse_m") == pytest.approx(before.figure("ate_rmse_m"), rel=1e-6)
+    assert sought.cells[0].truth_offset_s is None
+    assert "no offset of the truth's clock was found" in results_text(sought)
 
 
 def test_quick_is_a_subset_and_words_beat_it(place: Path) -> None:
-    (job,) = plan(quick=True).jobs
-    assert (job.sequence, job.method, job.first, job.last) == ("lr_kt2", "rs-g", 0, 12)
+    jobs = plan(quick=True).jobs
+    assert [(j.sequence, j.method, j.first, j.last) for j in jobs] == [("lr_kt2", m, 0, 12) for m in VARIANTS[2:]]
     jobs = plan(quick=True, methods=["gs-pg", "rs-g"], frames=slice(3, 9)).jobs
-    assert [(j.sequence, j.method, j.first, j.last) for j in jobs] == [("lr_kt2", m, 3, 9) for m in ("gs-pg", "rs-g")]
-    assert jobs[0].options.method == "gs-pg"
+    names = ("gs-pg", "gs-pg --fuse", "rs-g", "rs-g --no-fuse")
+    assert [(j.sequence, j.method, j.first, j.last) for j in jobs] == [("lr_kt2", m, 3, 9) for m in names]
+    assert [(j.options.method, j.options.fuse) for j in jobs[:2]] == [("gs-pg", False), ("gs-pg", True)]
+    assert [j.out.name for j in jobs] == ["gs-pg", "gs-pg_fuse", "rs-g", "rs-g_no-fuse"]
 
 
 def test_an_interrupt_keeps_what_is_finished(
@@ -215,7 +255,7 @@ def test_an_interrupt_keeps_what_is_finished(
     out, error = capfd.readouterr()
     assert "the same command" in error and "not run yet (-)" in out
     data = json.loads((place / "bench/results.json").read_text())
-    assert [c["sequence"] for c in data["cells"]] == ["robot_t1", "robot_t1"]
+    assert [c["sequence"] for c in data["cells"]] == 4 * ["robot_t1"]
 
 
 def test_cells_can_run_elsewhere(place: Path) -> None:
@@ -228,7 +268,8 @@ def test_cells_can_run_elsewhere(place: Path) -> None:
                 yield k, pickle.loads(pickle.dumps(sent(received[k], progress)))
 
     write_tum(place / "mine/lr_kt2.txt", "lr_kt2")
-    made = plan(sequences=["lr_kt2"], methods=["gs-g"], frames=slice(0, 14), added={"mine": Path("mine")})
+    how = {"added": {"mine": Path("mine")}, "options": Options(fuse=False)}
+    made = plan(sequences=["lr_kt2"], methods=["gs-g"], frames=slice(0, 14), **how)
     seen: list[tuple[float, str]] = []
     results = run_plan(made, Elsewhere(), lambda _, fraction, note: seen.append((fraction, note)))
     assert [c.method for c in results.cells] == ["gs-g", "mine"]
@@ -264,9 +305,9 @@ def test_a_tracker_of_ones_own(place: Path, capfd: pytest.CaptureFixture[str]) -
     assert mine[0]["ate_m"] == pytest.approx(metrics.ate_rmse_m, rel=1e-9) and mine[1]["ate_m"] is None
     write_tum(place / "mine/lr_kt2.txt", "lr_kt2")
     assert main(words) == 0
-    before = plan(added={"mine": Path("mine")}).jobs[2]
+    before = plan(added={"mine": Path("mine")}).jobs[4]
     write_tum(place / "mine/robot_t1.txt", "robot_t1", error_m=0.002)
-    after = plan(added={"mine": Path("mine")}).jobs[2]
+    after = plan(added={"mine": Path("mine")}).jobs[4]
     assert before.key != after.key and read_cell(before) is not None and read_cell(after) is None
 
 
@@ -333,10 +374,10 @@ def test_peers_are_methods(place: Path, monkeypatch: pytest.MonkeyPatch) -> None
 
     monkeypatch.setattr(peers, "run_peer", run_peer)
     made = plan(sequences=["robot_t1"], methods=["gs-g"], peers=True)
-    assert made.methods == ("gs-g", *PEERS)
-    cell = run_cell(made.jobs[1])
+    assert made.methods == ("gs-g", "gs-g --fuse", *PEERS)
+    cell = run_cell(made.jobs[2])
     assert cell.metrics is not None and cell.metrics["ate_rmse_m"] < 1e-9 and cell.seconds is not None
-    assert read_estimate(made.jobs[1].out).info["method"] == PEERS[0]
+    assert read_estimate(made.jobs[2].out).info["method"] == PEERS[0]
 
 
 @pytest.mark.parametrize(
@@ -447,6 +488,39 @@ def test_averages_by_hand() -> None:
     assert by["two", "rs-pg"].values["ate_m"] == 0.0001234 and by["two", "theirs"].values["ate_m"] is None
 
 
+def test_the_better_setting_is_shown_and_the_other_one_kept() -> None:
+    """Group one: fusing helps the baseline on two of three, and loses gs-g's track on c; group two: it harms both."""
+    infos = (("a", "one"), ("b", "one"), ("c", "one"), ("robot_t1", "two"))
+    ate = {
+        "baseline": (0.01, 0.02, 0.03, 0.05), "baseline --fuse": (0.012, 0.001, 0.02, 0.06),
+        "gs-g": (0.02, 0.02, 0.02, 0.02), "gs-g --fuse": (0.001, 0.001, 0.001, 0.03),
+        "rs-g": (0.001, 0.001, 0.001, 0.001), "rs-g --no-fuse": (0.0005, 0.0005, 0.0005, 0.0005),
+    }  # fmt: skip
+    cells = [cell(infos[k][0], name, value) for name, values in ate.items() for k, value in enumerate(values)]
+    cells[14] = cell("c", "gs-g --fuse", 0.001, lost=80)
+    sequences = tuple(SequenceInfo(name, group, Path("/x") / name, 100) for name, group in infos)
+    results = Results(sequences, tuple(ate), tuple(cells), {}, "1")
+    assert list(results.shown("one").items()) == [
+        ("baseline", "baseline --fuse"), ("gs-g", "gs-g"), ("rs-g", "rs-g"), ("rs-g --no-fuse", "rs-g --no-fuse"),
+    ]  # fmt: skip
+    assert list(results.shown("two").values()) == ["baseline", "gs-g", "rs-g", "rs-g --no-fuse"]
+    by = {(a.group, a.method): a for a in averages(results)}
+    assert by["one", "baseline --fuse"].values["ate_m"] == pytest.approx(0.011)
+    assert by["one", "gs-g"].sequences == ("a", "b", "c") and by["one", "gs-g --fuse"].values["ate_m"] is None
+    assert by["one", "rs-g"].better_pct["ate_m"] == pytest.approx(100 * (1 - 0.001 / 0.011))
+    lines = [line.split() for line in results_text(results).split("\n\n")[3].splitlines()]
+    assert lines[1:] == [
+        ["baseline", "50.0", "50.0"], ["paper:", "Baseline", "12.9", "12.9"],
+        ["gs-g", "20.0", "20.0", "60", "%"], ["paper:", "Spline", "GS", "G", "16.9", "16.9", "-31", "%"],
+        ["rs-g", "1.00", "1.00", "98", "%"], ["paper:", "Spline", "RS", "G", "12.9", "12.9", "0", "%"],
+        ["rs-g", "--no-fuse", "0.500", "0.500", "99", "%"],
+    ]  # fmt: skip
+    said = "\n".join(notes(results))
+    assert "the other one: baseline 20.0, gs-g --fuse -" in said and "baseline --fuse 60.0, gs-g --fuse 30.0" in said
+    bars = {bar.name: list(bar.values) for bar in ate_chart(results).bars}
+    assert bars["baseline"] == pytest.approx([12.0, 1.0, 20.0, 50.0]) and len(bars) == 4
+
+
 def test_text_by_hand() -> None:
     blocks = results_text(made_up()).split("\n\n")
     lines = [line.split() for line in blocks[0].splitlines()]
@@ -542,10 +616,12 @@ def test_paths_and_errors(place: Path, drawn: list[Figure]) -> None:
     results = run_plan(made)
     assert draw_sequence(results, made.sequences[0], Path("bench"), Path("x.png"))
     path, errors = drawn[0].axes
-    assert [line.get_label() for line in errors.lines] == ["gs-g", "rs-g", "mine"] and len(path.lines) == 4
-    for line, done in zip(errors.lines, results.cells, strict=True):
+    shown = list(results.shown("hand-held").values())
+    assert shown[1:] == ["rs-g", "rs-g --no-fuse", "mine"]
+    assert [line.get_label() for line in errors.lines] == shown and len(path.lines) == 5
+    for line, done in zip(errors.lines, [results.cell("robot_t1", name) for name in shown], strict=True):
         values = np.asarray(line.get_ydata(), float)
-        assert done.metrics is not None
+        assert done is not None and done.metrics is not None
         assert np.sqrt(np.mean(values**2)) == pytest.approx(1e3 * done.metrics["ate_rmse_m"], rel=1e-4)
     true = synthetic.make_spline(SPEEDS[0]).pose(np.array([0.0, 1.0]))[:, [0, 2], 3]
     np.testing.assert_allclose(np.asarray(path.lines[0].get_xydata())[[0, -1]], true, atol=1e-6)

@@ -38,7 +38,7 @@ from rstrack.bench.methods.tables import results_text
 from rstrack.charts.chart import CameraPath, PathChart, upright_axes
 from rstrack.cli.report import report as report_command
 from rstrack.data.dataset import open_dataset
-from rstrack.data.estimate import Estimate
+from rstrack.data.estimate import Estimate, write_estimate
 from rstrack.data.rig import Image, Rig
 from rstrack.metrics.association import compare, truth_of
 from rstrack.metrics.evaluate import Metrics, drift, evaluate
@@ -255,6 +255,27 @@ def test_other_trackers_files_have_a_report_too(run: Path, sequence: Path, tmp_p
     assert parse(out).row("ATE, mm")[1] == fixed(m.ate_rmse_m, 3, 1e3)
 
 
+def test_the_truths_clock_can_be_moved(sequence: Path, tmp_path: Path) -> None:
+    """An estimate whose stamps are 20 ms late: without the offset, with it, and with a wrong one of words."""
+    run = make_run(tmp_path / "run", sequence, error_m=1e-4)
+    rows = np.loadtxt(run / "trajectory.txt")
+    rows[:, 0] += 0.02
+    np.savetxt(tmp_path / "late.txt", rows, fmt="%.9f")
+    plain = parse(write_report(tmp_path / "late.txt", sequence, tmp_path / "plain.html"))
+    moved = parse(write_report(tmp_path / "late.txt", sequence, tmp_path / "moved.html", truth_offset=-0.02))
+    asked = run_evaluate(sequence, tmp_path / "late.txt", truth_offset=-0.02)
+    assert moved.row("ATE, mm")[1] == fixed(asked.chosen.ate_rmse_m, 3, 1e3)
+    assert float(moved.row("ATE, mm")[1]) < 0.2 * float(plain.row("ATE, mm")[1])
+    assert asked.clocks and all(f"{line[0].upper()}{line[1:]}." in moved.text for line in asked.clocks)
+    assert "Clocks as they are" not in plain.text
+    # The curves are those of the moved clock too.
+    curves = [np.array(f["data"][0]["y"], float) for f in moved.figures if "scene" not in f["layout"]]
+    assert np.sqrt(np.nanmean(curves[0] ** 2)) == pytest.approx(1e3 * asked.chosen.ate_rmse_m, rel=0.02)
+    write_estimate(tmp_path / "alone", rows[:, 0], SPLINE.pose(rows[:, 0]), None, {})
+    with pytest.raises(UserError, match="there is no truth whose clock could be moved"):
+        write_report(tmp_path / "alone", truth_offset=0.0)
+
+
 def test_an_early_end_is_said_at_the_top(sequence: Path, tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", sequence, end="unreadable", error="depth/000031.png: is empty")
     text = parse(write_report(run)).text
@@ -268,6 +289,8 @@ def test_wrong_input_is_refused_in_one_line(sequence: Path, run: Path, bench: Pa
         write_report(run, tmp_path / "nowhere")
     with pytest.raises(UserError, match="leave --sequence"):
         write_report(bench, sequence)
+    with pytest.raises(UserError, match=r"leave --truth-offset out \(give it to 'rstrack bench'\)"):
+        write_report(bench, truth_offset=0.01)
     for text, complaint in (("{", "Invalid JSON"), ('{"sequences": [{}], "methods": [], "cells": []}', "sequences.0")):
         (tmp_path / "results.json").write_text(text)
         with pytest.raises(UserError, match=complaint) as error:

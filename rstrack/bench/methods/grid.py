@@ -23,10 +23,12 @@ from rsgen.errors import UserError
 from rsgen.files import atomic_write, read_text
 from rstrack.bench.methods.plan import Job, Plan, package_version
 from rstrack.bench.methods.results import Cell, Results
+from rstrack.bench.methods.variants import method_of
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.estimate import TRAJECTORY, Estimate, plain, read_estimate, write_estimate
 from rstrack.metrics.association import ASSOCIATE_WITHIN_S, truth_of
 from rstrack.metrics.evaluate import Metrics, evaluate
+from rstrack.metrics.run_evaluate import evaluate_clocks
 from rstrack.options import METHODS
 from rstrack.tracking.run import track
 
@@ -68,32 +70,34 @@ def run_cell(job: Job, progress: Progress = no_progress) -> Cell:
     """Track, evaluate, and write the cell's folder: a run as `rstrack track` writes it, and cell.json.
 
     A track that was lost is a cell as any other, and kept. Where something is missing or cannot be read, the cell says
-    so and is tried again the next time. progress: its stage is 'SEQUENCE METHOD'. Raises KeyboardInterrupt, and
-    UserError if the folder cannot be written.
+    so and is tried again the next time. Of a trajectory that is there already only the errors are computed. progress:
+    its stage is 'SEQUENCE METHOD'. Raises KeyboardInterrupt, and UserError if the folder cannot be written.
     """
     cell_file = job.out / CELL
-    cell_file.unlink(missing_ok=True)
     frames = job.last - job.first
-    make = partial(Cell, job.key, job.sequence, job.method, frames=frames)
+    make = partial(Cell, job.key, job.sequence, job.method, frames=frames, truth_offset=job.truth_offset)
+    there = _read(job)
     try:
         dataset = open_dataset(job.data)
-        estimate, seconds = _estimate(job, dataset, lambda _, fraction, note: progress(_name(job), fraction, note))
+        if there is not None:
+            estimate, seconds = read_estimate(job.out), there.seconds
+        else:
+            cell_file.unlink(missing_ok=True)
+            estimate, seconds = _estimate(job, dataset, lambda _, fraction, note: progress(_name(job), fraction, note))
     except UserError as error:
         return make(metrics=None, lost=frames, seconds=None, error=str(error))
-    metrics = _metrics(job, dataset, estimate)
+    metrics, offset_s = _metrics(job, dataset, estimate)
     lost = frames if metrics is None else metrics.frames - metrics.frames_tracked
-    cell = make(metrics=None if metrics is None else metrics.as_dict(), lost=lost, seconds=seconds)
+    found = None if metrics is None else metrics.as_dict()
+    cell = make(metrics=found, lost=lost, seconds=seconds, truth_offset_s=offset_s)
     atomic_write(cell_file, (json.dumps(plain(dataclasses.asdict(cell)), indent=1) + "\n").encode())
     return cell
 
 
 def read_cell(job: Job) -> Cell | None:
     """The finished cell of a job, None if there is none, or one of other inputs."""
-    try:
-        cell = Cell(**json.loads(read_text(job.out / CELL)))
-    except (UserError, ValueError, TypeError, RecursionError):
-        return None
-    return cell if cell.key == job.key and (job.out / TRAJECTORY).is_file() else None
+    cell = _read(job)
+    return cell if cell is not None and cell.truth_offset == job.truth_offset else None
 
 
 def machine() -> dict[str, Any]:
@@ -115,6 +119,15 @@ def machine() -> dict[str, Any]:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
+def _read(job: Job) -> Cell | None:
+    """The cell with the job's trajectory, whichever the truth's clock was; None if there is none."""
+    try:
+        cell = Cell(**json.loads(read_text(job.out / CELL)))
+    except (UserError, ValueError, TypeError, RecursionError):
+        return None
+    return cell if cell.key == job.key and (job.out / TRAJECTORY).is_file() else None
+
+
 def _name(job: Job) -> str:
     return f"{job.sequence} {job.method}"
 
@@ -122,7 +135,7 @@ def _name(job: Job) -> str:
 def _estimate(job: Job, dataset: Dataset, progress: Progress) -> tuple[Estimate, float | None]:
     """The trajectory, written to the cell's folder, and the seconds that it took. Raises UserError."""
     frames = slice(job.first, job.last)
-    if job.method in METHODS:
+    if method_of(job.method) in METHODS:
         result = track(dataset, job.options, job.out, frames, progress=progress)
         if result.end == "interrupted":
             raise KeyboardInterrupt
@@ -149,12 +162,24 @@ def _cut(estimate: Estimate, stamps: np.ndarray) -> Estimate:
     return Estimate(estimate.stamps[kept], estimate.T_world_depth[kept], estimate.spline, estimate.info)
 
 
-def _metrics(job: Job, dataset: Dataset, estimate: Estimate) -> Metrics | None:
-    """Errors over the job's frames; None if fewer than three of them have a pose."""
+def _metrics(job: Job, dataset: Dataset, estimate: Estimate) -> tuple[Metrics | None, float | None]:
+    """Errors over the job's frames, and the offset of the truth's clock that they are for, s.
+
+    Errors are None if fewer than three of the frames have a pose. Where an offset is asked for and not found, clocks
+    are as they are, and the offset is None: one track too short or too bad for it must not spoil the others' tables.
+    """
     truth = truth_of(dataset)
     if truth is None:
-        return None
+        return None, None
+    truth = dataclasses.replace(truth, frame_stamps=dataset.stamps[job.first : job.last])
     try:
-        return evaluate(dataclasses.replace(truth, frame_stamps=dataset.stamps[job.first : job.last]), estimate)
+        metrics = evaluate(truth, estimate)
     except UserError:
-        return None
+        return None, None
+    if job.truth_offset is None:
+        return metrics, None
+    try:
+        evaluation = evaluate_clocks(truth, estimate, job.truth_offset)
+    except UserError:
+        return metrics, None
+    return evaluation.chosen, evaluation.offset_s

@@ -21,6 +21,7 @@ from rsgen.files import atomic_write, read_text, write_error
 from rstrack.bench.methods.grid import CELL
 from rstrack.bench.methods.plan import SequenceInfo
 from rstrack.bench.methods.results import Cell, Results
+from rstrack.bench.methods.variants import folder_of, method_of
 from rstrack.mapping.map import run_map
 from rstrack.options import MapOptions
 
@@ -59,11 +60,11 @@ def draw_meshes(
 ) -> list[Path]:  # fmt: skip
     """Write cells/SEQUENCE/METHOD/mesh.ply and plots/meshes_SEQUENCE.jpg into `out`; returns the pictures.
 
-    out: the folder with the results' cells. methods: those of them whose cells count are shown, in this order. Meshes
-    of the same cells, and pictures of the same meshes, are kept. What fails is left out and said to `warn` in one line.
-    Raises KeyboardInterrupt; the same call goes on after that.
+    out: the folder with the results' cells. methods: those of them whose cells count are shown, in this order, each
+    with the setting that the tables show. Meshes of the same cells, and pictures of the same meshes, are kept. What
+    fails is left out and said to `warn` in one line. Raises KeyboardInterrupt; the same call goes on after that.
     """
-    rows = [(sequence, _cells(results, sequence.name, methods)) for sequence in results.sequences]
+    rows = [(sequence, _cells(results, sequence, methods)) for sequence in results.sequences]
     rows = [(sequence, cells) for sequence, cells in rows if cells]
     steps, done, pictures = sum(len(cells) + 1 for _, cells in rows), 0, []
     for sequence, cells in rows:
@@ -94,10 +95,10 @@ def make_mesh(
     progress: called with the fraction done and a note. Raises UserError: a frame or the run cannot be read, or the mesh
     not be written.
     """
-    folder = out / "cells" / sequence.name / cell.method
+    folder = out / cell.folder
     every = max(1, round(sequence.frames / _FRAMES))
     # Where there is no spline a map takes the shutter for a global one anyway.
-    options = MapOptions(shutter="gs" if cell.method.startswith("gs-") else None, every=every)
+    options = MapOptions(shutter="gs" if method_of(cell.method).startswith("gs-") else None, every=every)
     record: dict[str, Any] = {"cell": cell.key, "options": dataclasses.asdict(options)}
     if (folder / MESH).is_file() and _read(folder / _MADE_FROM) == record:
         return record
@@ -116,7 +117,9 @@ def read_picture(out: Path, sequence: str) -> MeshPicture | None:
     try:
         width, height = record["panel_px"]
         parts = record["meshes"]
-        current = all(_read(out / "cells" / sequence / p["method"] / CELL)["key"] == p["mesh"]["cell"] for p in parts)
+        current = all(
+            _read(out / "cells" / sequence / folder_of(p["method"]) / CELL)["key"] == p["mesh"]["cell"] for p in parts
+        )
         methods, labels = tuple(str(p["method"]) for p in parts), tuple(str(p["label"]) for p in parts)
         found = MeshPicture(path, (int(width), int(height)), methods, labels)
     except (KeyError, TypeError, ValueError):
@@ -131,8 +134,9 @@ def _report(progress: Progress, done: int, steps: int, name: str, fraction: floa
     progress("meshes", (done + fraction) / steps, f"{name}, {note}")
 
 
-def _cells(results: Results, sequence: str, methods: Sequence[str]) -> list[Cell]:
-    found = [results.cell(sequence, method) for method in methods]
+def _cells(results: Results, sequence: SequenceInfo, methods: Sequence[str]) -> list[Cell]:
+    shown = results.shown(sequence.group)
+    found = [results.cell(sequence.name, shown[method]) for method in methods if method in shown]
     return [cell for cell in found if cell is not None and cell.counts]
 
 
@@ -159,7 +163,7 @@ def _draw(sequence: str, made: Sequence[tuple[Cell, dict[str, Any]]], out: Path)
     command = [sys.executable, "-m", "rsgen", "picture", "--quiet", f"--out={path.resolve()}"]
     command += [f"--width={_PANEL_PX[0]}", f"--height={_PANEL_PX[1]}"]
     command += [f"--label={part['label']}" for part in parts]
-    command += [str((out / "cells" / sequence / part["method"] / MESH).resolve()) for part in parts]
+    command += [str((out / "cells" / sequence / folder_of(part["method"]) / MESH).resolve()) for part in parts]
     done = subprocess.run(command, capture_output=True, text=True, errors="replace")
     if done.returncode != 0:
         said = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]

@@ -12,9 +12,11 @@ from pathlib import Path
 
 from rsgen.errors import UserError
 from rstrack.bench.methods.config import Choice, SequenceEntry
+from rstrack.bench.methods.variants import folder_of, fuses, method_of, variants
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.estimate import TRAJECTORY
 from rstrack.metrics.association import truth_of
+from rstrack.metrics.clock import TruthOffset
 from rstrack.options import METHODS, Options
 
 # What describes a sequence, rsgen's or TUM's; the images themselves are not read for the key.
@@ -27,8 +29,9 @@ _DESCRIPTIONS = (
 class Job:
     """One cell to run; plain enough to be sent to another process that sees the same files.
 
-    data: the sequence's folder. frames [first, last). method: of `options` (whose own is ignored), a peer, or, with
-    `estimate` (a run folder or TUM file), another tracker. out: the cell's run folder. key: what it depends on.
+    data: the sequence's folder. frames [first, last). method: a variant (`variants`), `options` those of it; a peer;
+    or, with `estimate` (a run folder or TUM file), another tracker. out: the cell's run folder. key: what the
+    trajectory depends on. truth_offset: of the truth's clock, see `run_evaluate.evaluate_clocks`.
     """
 
     sequence: str
@@ -40,6 +43,7 @@ class Job:
     estimate: Path | None
     out: Path
     key: str
+    truth_offset: TruthOffset | None = None
 
 
 @dataclass(frozen=True)
@@ -63,13 +67,16 @@ class Plan:
 
 
 def make_plan(
-    choice: Choice, data: Path, out: Path, options: Options | None = None, added: Mapping[str, Path] | None = None
-) -> Plan:
+    choice: Choice, data: Path, out: Path, options: Options | None = None, added: Mapping[str, Path] | None = None,
+    truth_offset: TruthOffset | None = None,
+) -> Plan:  # fmt: skip
     """Look the sequences up and list the cells.
 
+    Each of our methods is run with and without fusion, unless `options.fuse` says which.
+
     data: folder with a folder for each sequence. added: other trackers by name, each a folder with SEQUENCE.txt (TUM)
-    or SEQUENCE/ (a run folder) inside. Raises UserError, one line, if sequences are missing or not whole, saying how to
-    make them.
+    or SEQUENCE/ (a run folder) inside. truth_offset: as in `Job`. Raises UserError, one line, if sequences are missing
+    or not whole, saying how to make them.
     """
     options, added = options or Options(), added or {}
     for name in added:
@@ -82,7 +89,7 @@ def make_plan(
         raise UserError(f"{data}: has no {names}: leave them out with --sequence, or make them: {commands}")
     sequences: list[SequenceInfo] = []
     jobs: list[Job] = []
-    methods = (*choice.methods, *added)
+    methods = (*(name for method in choice.methods for name in variants(method, options.fuse)), *added)
     for entry in choice.sequences:
         dataset = open_dataset(data / entry.name)
         if truth_of(dataset) is None:
@@ -92,15 +99,15 @@ def make_plan(
         digest = _digest(data / entry.name)
         for method in methods:
             used = None
-            if method in METHODS:
-                used = Options(**dataclasses.asdict(options) | {"method": method}).decided(dataset.rig.depth_shutter)
+            if method_of(method) in METHODS:
+                used = Options(**dataclasses.asdict(options) | {"method": method_of(method), "fuse": fuses(method)})
             estimate = _estimate_path(added[method], entry.name) if method in added else None
             depends = [digest, method, chosen.start, chosen.stop, used and dataclasses.asdict(used), package_version()]
             depends.append(_file_digest(estimate) if estimate is not None else None)
             key = hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()
-            cell_out = (out / "cells" / entry.name / method).resolve()
+            cell_out = (out / "cells" / entry.name / folder_of(method)).resolve()
             where = (sequences[-1].path, chosen.start, chosen.stop)
-            jobs.append(Job(entry.name, method, *where, used or options, estimate, cell_out, key))
+            jobs.append(Job(entry.name, method, *where, used or options, estimate, cell_out, key, truth_offset))
     return Plan(tuple(sequences), methods, tuple(jobs), out)
 
 

@@ -31,23 +31,31 @@ def draw_plots(results: Results, out: Path, progress: Progress = no_progress) ->
 
 def ate_chart(results: Results) -> Chart:
     """The ATE of every cell as a bar on a logarithmic scale, the paper's as a mark on it."""
-    names, colors, ate = [s.name for s in results.sequences], method_colors(results.methods), QUANTITIES[0]
-    bars = []
-    for method in results.methods:
-        ours = [results.figure(name, method, ate) for name in names]
-        figures = [paper.FIGURES.get((name, method)) for name in names]
+    names, ate, bars = [s.name for s in results.sequences], QUANTITIES[0], []
+    shown = [results.shown(s.group) for s in results.sequences]
+    rows = list(dict.fromkeys(row for variants in shown for row in variants))
+    colors = method_colors(rows)
+    for row in rows:
+        ours = [results.figure(name, variants[row], ate) for name, variants in zip(names, shown, strict=True)]
+        figures = [paper.FIGURES.get((name, row)) for name in names]
         theirs = numbers([None if f is None else f.ate_m for f in figures], ate.scale)
-        bars.append(Bars(method, colors[method], numbers(ours, ate.scale), theirs))
+        bars.append(Bars(row, colors[row], numbers(ours, ate.scale), theirs))
     note = "Logarithmic. Marks on the bars: the paper's figures for that method, in its own rooms."
+    if any(row != name for variants in shown for row, name in variants.items()):
+        note += " Without a model of the shutter: with or without fused keyframes, whichever is better in the group."
     return Chart("ATE (RMSE) by sequence and method", ate.unit, bars=tuple(bars), groups=tuple(names), is_log=True,
                  note=note)  # fmt: skip
 
 
 def draw_sequence(results: Results, sequence: SequenceInfo, out: Path, path: Path) -> bool:
-    """Paths from above and position errors over time of all methods on one sequence; False if there is none to draw."""
+    """Paths from above and errors over time of what the tables show of one sequence; False if there is none to draw."""
     dataset = open_dataset(sequence.path)
-    cells = [results.cell(sequence.name, method) for method in results.methods]
-    runs = {c.method: load_run(out / c.folder, dataset=dataset) for c in cells if c is not None and c.metrics}
+    cells = [results.cell(sequence.name, variant) for variant in results.shown(sequence.group).values()]
+    runs = {
+        c.method: load_run(out / c.folder, dataset=dataset, truth_offset=c.truth_offset_s)
+        for c in cells
+        if c is not None and c.metrics
+    }
     runs = {method: run for method, run in runs.items() if run.found is not None}
     if runs:
         write_charts([path_chart(runs), compared_errors(runs)], path, sequence.name)

@@ -13,7 +13,9 @@ from rsgen.errors import UserError, first_problem
 from rsgen.files import read_text
 from rstrack.bench.methods import paper
 from rstrack.bench.methods.plan import SequenceInfo
+from rstrack.bench.methods.variants import folder_of, fuses, method_of, row_of
 from rstrack.data.estimate import plain
+from rstrack.metrics.clock import TruthOffset
 from rstrack.options import METHODS
 
 RESULTS = "results.json"
@@ -47,8 +49,10 @@ QUANTITIES = (
 class Cell:
     """What a job came to.
 
-    metrics: `Metrics.as_dict()`, None if fewer than three frames have a pose. frames: asked for; lost: those of them
-    without a pose. seconds: wall clock of tracking with reading, None if not known. error: why it could not be run.
+    method: a variant, see `variants`. metrics: `Metrics.as_dict()`, None if fewer than three frames have a pose.
+    frames: asked for; lost: those of them without a pose. seconds: wall clock of tracking with reading, None if not
+    known. error: why it could not be run. truth_offset: of the truth's clock, as it was asked for; truth_offset_s: that
+    of the metrics, None for clocks as they are.
     """
 
     key: str
@@ -59,6 +63,8 @@ class Cell:
     lost: int
     seconds: float | None
     error: str | None = None
+    truth_offset: TruthOffset | None = None
+    truth_offset_s: float | None = None
 
     @property
     def counts(self) -> bool:
@@ -68,7 +74,7 @@ class Cell:
     @property
     def folder(self) -> Path:
         """Of its run, relative to that of the results."""
-        return Path("cells", self.sequence, self.method)
+        return Path("cells", self.sequence, folder_of(self.method))
 
     def figure(self, name: str) -> float | None:
         """A figure of `metrics` by name; None where the track is lost or lacks it."""
@@ -78,7 +84,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Results:
-    """What there is of a plan; interrupted: some cells are missing."""
+    """What there is of a plan. methods: variants of all methods; interrupted: some cells are missing."""
 
     sequences: tuple[SequenceInfo, ...]
     methods: tuple[str, ...]
@@ -105,12 +111,32 @@ class Results:
         """The sequences of a group."""
         return [sequence.name for sequence in self.sequences if sequence.group == group]
 
+    def shown(self, group: str) -> dict[str, str]:
+        """What the tables of a group show: a variant for each of their lines (`variants.row_of`).
+
+        Of two settings, that which keeps the track on more sequences, and then that of the smaller mean ATE over those
+        where both do: one setting for the whole group and all quantities, not the luckier one of every cell.
+        """
+        lines: dict[str, list[str]] = {}
+        for name in self.methods:
+            lines.setdefault(row_of(name), []).append(name)
+        return {row: self._best(self.names(group), names) for row, names in lines.items()}
+
+    def _best(self, sequences: Sequence[str], names: Sequence[str]) -> str:
+        ate = {name: [self.figure(sequence, name, QUANTITIES[0]) for sequence in sequences] for name in names}
+        common = [k for k in range(len(sequences)) if all(ate[name][k] is not None for name in names)]
+
+        def badness(name: str) -> tuple[int, float]:
+            return sum(a is None for a in ate[name]), sum(ate[name][k] or 0.0 for k in common)
+
+        return min(names, key=badness)
+
 
 @dataclass(frozen=True)
 class Average:
-    """Of one method over the sequences of a group; None where it lacks one of them.
+    """Of one variant over the sequences of a group; None where it lacks one of them.
 
-    better_pct: how much smaller than the baseline's, in per cent; None without a baseline.
+    better_pct: how much smaller than that of the baseline that is shown, in per cent; None without a baseline.
     """
 
     group: str
@@ -121,17 +147,18 @@ class Average:
 
 
 def averaged_sequences(results: Results, group: str) -> tuple[str, ...]:
-    """The sequences of a group on which every one of our methods kept the track: those that averages are over.
+    """The sequences of a group on which every one of our methods that are shown kept the track: averages are over them.
 
-    Other trackers are averaged over the same ones, or not at all, so that they cannot change ours.
+    Other trackers and settings are averaged over the same ones, or not at all, so that they cannot change ours.
     """
-    ours = [method for method in results.methods if method in METHODS] or list(results.methods)
+    shown = list(results.shown(group).values())
+    ours = [name for name in shown if method_of(name) in METHODS] or shown
     cells = {name: [results.cell(name, method) for method in ours] for name in results.names(group)}
     return tuple(name for name, row in cells.items() if all(cell is not None and cell.counts for cell in row))
 
 
 def averages(results: Results) -> list[Average]:
-    """All groups' averages of all methods."""
+    """All groups' averages of all variants."""
     found = []
     for group in results.groups:
         names = averaged_sequences(results, group)
@@ -139,8 +166,8 @@ def averages(results: Results) -> list[Average]:
             method: {q.name: _mean([results.figure(name, method, q) for name in names]) for q in QUANTITIES}
             for method in results.methods
         }
+        base = values.get(results.shown(group).get(BASELINE, ""), {})
         for method in results.methods:
-            base = values.get(BASELINE, {})
             better = {q.name: better_pct(values[method][q.name], base.get(q.name)) for q in QUANTITIES}
             found.append(Average(group, method, names, values[method], better))
     return found
@@ -160,11 +187,13 @@ def results_dict(results: Results) -> dict[str, Any]:
         "sequences": [vars(sequence) for sequence in results.sequences],
         "methods": list(results.methods),
         "cells": [
-            {"sequence": c.sequence, "method": c.method, "run": c.folder.as_posix()}
+            {"sequence": c.sequence, "method": c.method, "fuse": fuses(c.method), "run": c.folder.as_posix()}
             | {q.name: c.figure(q.metric) for q in QUANTITIES}
             | {"frames": c.frames, "lost": c.lost, "seconds": c.seconds, "error": c.error}
+            | {"truth_offset": c.truth_offset, "truth_offset_s": c.truth_offset_s}
             for c in results.cells
         ],
+        "shown": {group: list(results.shown(group).values()) for group in results.groups},
         "averages": [
             {"group": a.group, "method": a.method, "sequences": a.sequences, **a.values, "better_pct": a.better_pct}
             for a in averages(results)
@@ -172,7 +201,7 @@ def results_dict(results: Results) -> dict[str, Any]:
         "paper": [
             {"sequence": name, "method": method} | {q.name: getattr(figures, q.name) for q in QUANTITIES}
             for (name, method), figures in paper.FIGURES.items()
-            if name in names and method in results.methods
+            if name in names and method in {row_of(variant) for variant in results.methods}
         ],
     }
     plain_data: dict[str, Any] = plain(data)
@@ -191,11 +220,14 @@ class _StoredCell(BaseModel):
     lost: int
     seconds: float | None = None
     error: str | None = None
+    truth_offset: TruthOffset | None = None
+    truth_offset_s: float | None = None
 
     def cell(self) -> Cell:
         figures = {q.metric: getattr(self, q.name) for q in QUANTITIES}
         metrics = None if self.ate_m is None else figures
-        return Cell("", self.sequence, self.method, metrics, self.frames, self.lost, self.seconds, self.error)
+        clock = (self.truth_offset, self.truth_offset_s)
+        return Cell("", self.sequence, self.method, metrics, self.frames, self.lost, self.seconds, self.error, *clock)
 
 
 class _StoredResults(BaseModel):

@@ -24,6 +24,7 @@ from rstrack.bench.methods.results import (
     better_pct,
     results_dict,
 )
+from rstrack.bench.methods.variants import fuses, row_of
 
 
 def write_results(results: Results, out: Path) -> str:
@@ -43,19 +44,21 @@ def results_csv(results: Results) -> str:
     records: list[dict[str, Any]] = []
     for c in results.cells:
         values = {q.name: c.figure(q.metric) for q in QUANTITIES}
-        base = {q.name: results.figure(c.sequence, BASELINE, q) for q in QUANTITIES}
+        baseline = results.shown(groups[c.sequence]).get(BASELINE, "")
+        base = {q.name: results.figure(c.sequence, baseline, q) for q in QUANTITIES}
         records.append(
-            {"group": groups[c.sequence], "sequence": c.sequence, "method": c.method, **values}
+            {"group": groups[c.sequence], "sequence": c.sequence, "method": c.method, "fuse": fuses(c.method), **values}
             | {f"better_{name}_pct": better_pct(value, base[name]) for name, value in values.items()}
             | {"frames": c.frames, "lost": c.lost, "seconds": c.seconds, "error": c.error}
-            | _of_paper(paper.FIGURES.get((c.sequence, c.method)))
+            | {"truth_offset_s": c.truth_offset_s}
+            | _of_paper(paper.FIGURES.get((c.sequence, row_of(c.method))))
         )
     for a in averages(results):
         records.append(
-            {"group": a.group, "sequence": "average", "method": a.method, **a.values}
+            {"group": a.group, "sequence": "average", "method": a.method, "fuse": fuses(a.method), **a.values}
             | {f"better_{name}_pct": value for name, value in a.better_pct.items()}
-            | dict.fromkeys(("frames", "lost", "seconds", "error"))
-            | _of_paper(paper.average(a.sequences, a.method))
+            | dict.fromkeys(("frames", "lost", "seconds", "error", "truth_offset_s"))
+            | _of_paper(paper.average(a.sequences, row_of(a.method)))
         )
     return csv_text(records)
 
@@ -76,13 +79,13 @@ def results_markdown(results: Results) -> str:
 
 
 def method_table(results: Results, group: str, quantity: Quantity) -> Table:
-    """A row for each method, a column for each sequence of a group; notes: the paper's figures."""
+    """A row for each method shown, a column for each sequence of a group; notes: the paper's figures."""
     columns = _columns(results, group, quantity)
     rows: list[tuple[Entry, ...]] = []
-    for k, method in enumerate(results.methods):
+    for k, (row, name) in enumerate(results.shown(group).items()):
         entries = [column[k] for column in columns.values()]
         with_paper = any(entry.note for entry in entries)
-        rows.append((Entry(method, note=f"paper: {paper.NAMES[method]}" if with_paper else ""), *entries))
+        rows.append((Entry(name, note=f"paper: {paper.NAMES[row]}" if with_paper else ""), *entries))
     return Table(("method", *columns), tuple(rows), _title(group, quantity))
 
 
@@ -90,7 +93,7 @@ def sequence_table(results: Results, group: str, quantity: Quantity) -> Table:
     """The same with a row for each sequence and a column for each method."""
     columns = _columns(results, group, quantity)
     rows: tuple[tuple[Entry | str, ...], ...] = tuple((name, *entries) for name, entries in columns.items())
-    return Table(("sequence", *results.methods), rows, _title(group, quantity))
+    return Table(("sequence", *results.shown(group).values()), rows, _title(group, quantity))
 
 
 def notes(results: Results) -> list[str]:
@@ -115,7 +118,9 @@ def notes(results: Results) -> list[str]:
         if len(names) < len(results.names(group)):
             over = f"only over {', '.join(names)}: the others lack" if names else "none: each sequence lacks"
             lines.append(f"average of {group}: {over} figures of one of our methods at least")
-    if any((s.name, method) in paper.FIGURES for s in results.sequences for method in results.methods):
+    lines += _settings(results)
+    lines += _clocks(results)
+    if any((s.name, row_of(name)) in paper.FIGURES for s in results.sequences for name in results.methods):
         lines.append(
             "lines 'paper:', or figures in brackets: Kerl, Stückler, Cremers, ICCV 2015, Tables 2 and 3, on their own "
             "recordings and renderings of such motions; rooms and images differ: compare the orders, not the digits"
@@ -129,6 +134,36 @@ def notes(results: Results) -> list[str]:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
+def _settings(results: Results) -> list[str]:
+    """Which of two settings is shown, and what the other one comes to, a line for each group."""
+    lines, ate = [], QUANTITIES[0]
+    by = {(a.group, a.method): a.values[ate.name] for a in averages(results)}
+    for group in results.groups:
+        shown = set(results.shown(group).values())
+        others = [name for name in results.methods if name not in shown]
+        if others:
+            listed = ", ".join(f"{name} {significant(by[group, name], 3, ate.scale)}" for name in others)
+            lines.append(
+                f"{group}: methods that take the rolling shutter for a global one are shown with or without fused "
+                f"keyframes, whichever is better (average {ate.title}, {ate.unit}; the other one: {listed})"
+            )
+    return lines
+
+
+def _clocks(results: Results) -> list[str]:
+    """What was asked for of the truth's clock, and where no offset was found."""
+    asked = [c for c in results.cells if c.truth_offset is not None]
+    if not asked:
+        return []
+    offset = asked[0].truth_offset
+    how = "the offset of least drift, for each cell" if offset == "auto" else f"looked up {offset:g} s after the stamps"
+    lines = [f"the truth's clock: {how} (truth_offset_s in results.csv)"]
+    without = ", ".join(f"{c.method} on {c.sequence}" for c in asked if c.counts and c.truth_offset_s is None)
+    if without:
+        lines.append(f"no offset of the truth's clock was found, errors are those of the clocks as they are: {without}")
+    return lines
+
+
 def _title(group: str, quantity: Quantity) -> str:
     return f"{group}, {quantity.title}, {quantity.unit}"
 
@@ -136,22 +171,24 @@ def _title(group: str, quantity: Quantity) -> str:
 def _columns(results: Results, group: str, quantity: Quantity) -> dict[str, list[Entry]]:
     """By heading, sequences first, an entry for each method; its note is the paper's figure."""
     columns = {}
+    shown = results.shown(group)
     for name in results.names(group):
-        cells = [results.cell(name, method) for method in results.methods]
-        values = [results.figure(name, method, quantity) for method in results.methods]
-        theirs = [paper.FIGURES.get((name, method)) for method in results.methods]
+        cells = [results.cell(name, variant) for variant in shown.values()]
+        values = [results.figure(name, variant, quantity) for variant in shown.values()]
+        theirs = [paper.FIGURES.get((name, row)) for row in shown]
         entries = _entries(quantity, values, theirs)
         entries = [_marked(entry, cell) for entry, cell in zip(entries, cells, strict=True)]
         columns[name] = best_marked(entries, values)
-    mean = [a for a in averages(results) if a.group == group]
+    by_name = {a.method: a for a in averages(results) if a.group == group}
+    mean = [by_name[variant] for variant in shown.values()]
     values = [a.values[quantity.name] for a in mean]
-    theirs = [paper.average(a.sequences, a.method) for a in mean]
+    theirs = [paper.average(a.sequences, row) for a, row in zip(mean, shown, strict=True)]
     columns["average"] = best_marked(_entries(quantity, values, theirs), values)
-    if BASELINE in results.methods and len(results.methods) > 1:
+    if BASELINE in shown and len(shown) > 1:
         base = paper.average(averaged_sequences(results, group), BASELINE)
         columns["better by"] = [
             Entry("")
-            if a.method == BASELINE
+            if a.method == shown[BASELINE]
             else Entry(_percent(a.better_pct[quantity.name]), note=_better_in_paper(figures, base, quantity))
             for a, figures in zip(mean, theirs, strict=True)
         ]
