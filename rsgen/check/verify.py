@@ -22,6 +22,7 @@ from rsgen.check.reprojection import depth_points, reproject_depth
 from rsgen.check.truth import extra_checks
 from rsgen.errors import UserError
 from rsgen.files import is_temporary, read_text
+from rsgen.geometry import se3
 from rsgen.produce.identity import fingerprint
 from rsgen.sequence.format import (
     FOLDERS,
@@ -165,7 +166,7 @@ def _read_pairs(sequence: Sequence) -> int:
     color, depth = (sequence.streams[name] for name in STREAMS)
     expected = [
         (*_entry(sequence, color, i), *_entry(sequence, depth, j))
-        for i, j in associate(color.stamps, depth.stamps, 0.5 / min(color.rate_hz, depth.rate_hz))
+        for i, j in associate(color.listed, depth.listed, 0.5 / min(color.rate_hz, depth.rate_hz))
     ]
     found = [] if path.is_file() and not path.stat().st_size else read_text(path).splitlines()
     for number, (line, pair) in enumerate(zip(found, expected, strict=False), 1):
@@ -177,29 +178,32 @@ def _read_pairs(sequence: Sequence) -> int:
 
 
 def _entry(sequence: Sequence, stream: Stream, k: int) -> tuple[str, str]:
-    return f"{stream.stamps[k]:.9f}", stream.paths[k].relative_to(sequence.root).as_posix()
+    return f"{stream.listed[k]:.9f}", stream.paths[k].relative_to(sequence.root).as_posix()
 
 
 def _check_clocks(sequence: Sequence) -> tuple[bool, str]:
-    """Stamps against first stamp and rate; the reader has compared each with its frame's number already."""
+    """True stamps against first stamp and rate; the reader has compared the listed ones with what they should be."""
     details, ok = [], True
     for name in STREAMS:
         stream = sequence.streams[name]
-        error = np.abs(stream.stamps - (stream.first_stamp_s + stream.indices / stream.rate_hz)).max()
+        shows = stream.indices if stream.table is None else stream.table.shows
+        error = np.abs(stream.stamps - (stream.first_stamp_s + shows / stream.rate_hz)).max()
         ok &= bool(error <= STAMP_TOLERANCE_S and (np.diff(stream.indices) > 0).all())
-        details.append(f"{name} {stream.rate_hz:g} Hz within {error * 1e9:.1f} ns")
+        late = 1e3 * (stream.listed - stream.stamps)
+        listed = f", listed {late.mean():+.1f} ms, {late.std():.1f} ms RMS" if late.any() else ""
+        details.append(f"{name} {stream.rate_hz:g} Hz within {error * 1e9:.1f} ns{listed}")
     return ok, ", ".join(details)
 
 
 def _check_images(sequence: Sequence) -> tuple[bool, str]:
     color, depth = sequence.streams["color"], sequence.streams["depth"]
-    noisy = bool(sequence.meta.get("noise"))
+    noisy = bool(sequence.meta.get("noise")) or depth.registered
     with ThreadPoolExecutor() as pool:
         for _ in pool.map(partial(_decode_color, sequence), range(len(color.paths))):
             pass
         units = list(pool.map(partial(_quantisation_error, sequence, noisy), range(len(depth.paths))))
     if noisy:
-        return True, "all decode (noise is on: 16-bit depth not compared with the exact one)"
+        return True, "all decode (noise or registration is on: 16-bit depth not compared with the exact one)"
     worst = int(np.argmax(units))
     detail = f"all decode, 16-bit depth within {units[worst]:.3f} units of the exact one"
     return units[worst] <= 0.5 + 1e-6, detail + (f" ({depth.paths[worst]})" if units[worst] > 0.5 + 1e-6 else "")
@@ -226,7 +230,8 @@ def _check_rows(sequence: Sequence, name: StreamName) -> tuple[bool, str]:
     stream = sequence.streams[name]
     T_cam_body = sequence.T_color_depth if name == "color" else None
     found = sequence.rows(name)
-    expected = line_poses(sequence.spline, stream.camera, stream.shutter, stream.stamps, T_cam_body)
+    exposure_s = None if stream.table is None else stream.table.exposure_s
+    expected = line_poses(sequence.spline, stream.camera, stream.shutter, stream.stamps, T_cam_body, exposure_s)
     ok, detail, worst = _pose_errors(found.reshape(-1, 7), expected.reshape(-1, 7))
     frame, line = divmod(worst, stream.line_count)
     where = "" if ok else f", worst in frame {stream.indices[frame]}, line {line}"
@@ -258,7 +263,8 @@ def _check_ground_truth(sequence: Sequence) -> tuple[bool, str]:
     stamps = np.concatenate([stream.stamps for stream in sequence.streams.values()])
     if lacking := int((~np.isin(stamps, rows[:, 0])).sum()):
         return False, f"{lacking} of {len(stamps)} frame stamps are not in it"
-    ok, detail, _ = _pose_errors(rows[:, 1:], pose_rows(sequence.spline.pose(rows[:, 0])))
+    T = sequence.spline.pose(rows[:, 0]) @ se3.inverse(sequence.T_image_depth)
+    ok, detail, _ = _pose_errors(rows[:, 1:], pose_rows(T))
     return ok, f"{len(rows)} poses, against the spline {detail}"
 
 

@@ -14,7 +14,8 @@ import yaml
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from rsgen.config.imu import ImuConfig
-from rsgen.config.motion import MotionConfig
+from rsgen.config.motion import MotionConfig, TremorConfig
+from rsgen.config.presets import Preset, with_preset
 from rsgen.config.sections import (
     ColorConfig,
     DepthConfig,
@@ -45,8 +46,13 @@ class Config(Section):
     name: str = Field(
         pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]*$", description="the sequence's name, also its default folder"
     )
+    preset: Preset | None = Field(
+        default=None,
+        description="kinect_v1: cameras, noise, exposure, driver, tremor of a hand-held Kinect; other fields override",
+    )
     trajectory: TrajectoryConfig = TrajectoryConfig()
     motion: MotionConfig | None = None
+    tremor: TremorConfig | None = None
     scene: SceneConfig
     light: LightConfig = LightConfig()
     color: ColorConfig = ColorConfig()
@@ -109,7 +115,7 @@ def load_config(path: Path, overrides: dict[str, str] | None = None) -> Config:
 def validate_config(data: dict[str, Any], where: str) -> Config:
     """A config from plain YAML types; `where` begins the message. Raises UserError naming every wrong field."""
     try:
-        return Config.model_validate(data)
+        return Config.model_validate(with_preset(data))
     except ValidationError as error:
         problems = "; ".join(_problem(e) for e in error.errors())
         raise _error(f"{where}: {problems}") from None
@@ -153,6 +159,9 @@ def describe_fields(section: type[BaseModel] = Config, prefix: str = "") -> list
         either = get_origin(field.annotation) in (Union, UnionType)
         inner = next(t for t in get_args(field.annotation) if t is not NoneType) if either else field.annotation
         if isinstance(inner, type) and issubclass(inner, BaseModel):
+            if either:
+                what = str(inner.__doc__).partition("\n")[0].rstrip(".")
+                rows.append((prefix + name, "none", f"{what}: {{}} for all defaults, null for none"))
             rows += describe_fields(inner, f"{prefix}{name}.")
         else:
             default = "required" if field.is_required() else str(field.default)

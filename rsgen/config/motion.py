@@ -32,6 +32,23 @@ class Waypoint(BaseModel):
     target: Vector3 = Field(description="point in the middle of the image, world, m")
 
 
+class TremorConfig(BaseModel):
+    """The hand's tremor, added to any trajectory, recorded or made; the ground truth gets knots fine enough for it."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    position_m: Annotated[float, limits(0, 0.1, "m")] = Field(default=0.0003, description="along each axis, RMS, m")
+    rotation_deg: Annotated[float, limits(0, 10, "deg")] = Field(default=0.05, description="about each axis, RMS, deg")
+    band_hz: tuple[Hertz, Hertz] = Field(default=(8.0, 12.0), description="band of the tremor, Hz")
+    seed: int | None = Field(default=None, ge=0, lt=2**31, description="seed of the tremor; default: the sequence's")
+
+    @model_validator(mode="after")
+    def _band_rises(self) -> TremorConfig:
+        if not self.band_hz[0] < self.band_hz[1]:
+            raise ValueError("band_hz: low and high must rise")
+        return self
+
+
 class MotionConfig(BaseModel):
     """A motion of the body (depth camera), in place of a recorded trajectory. World: y up, metres."""
 

@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from rsgen.config.adaptation import AutoExposureConfig, AutoWhiteBalanceConfig
+from rsgen.config.driver import DriverConfig
 from rsgen.config.sensors import ColorNoiseConfig, DepthNoiseConfig
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera, Model
@@ -110,6 +112,7 @@ class StreamConfig(Section):
     )
     exposure_s: Seconds = Field(default=0.0, description="exposure of each line, s; 0: no motion blur")
     scan: Scan = Field(default="top-bottom", description="order in which lines are read out")
+    driver: DriverConfig | None = None
 
     @property
     def camera(self) -> Camera:
@@ -119,6 +122,16 @@ class StreamConfig(Section):
     @property
     def shutter(self) -> Shutter:
         return Shutter(self.readout_s, self.exposure_s, self.scan)
+
+    @property
+    def longest_exposure_s(self) -> float:
+        """Of any frame, s."""
+        return self.exposure_s
+
+    @property
+    def has_frame_table(self) -> bool:
+        """Whether stamps or exposures of single frames are another matter than the clock and the shutter."""
+        return self.driver is not None
 
     @model_validator(mode="after")
     def _geometry_is_valid(self) -> StreamConfig:
@@ -145,6 +158,27 @@ class ColorConfig(StreamConfig):
         default=1.0, description="factor on linear radiance before sRGB quantisation"
     )
     noise: ColorNoiseConfig = ColorNoiseConfig()
+    auto_exposure: AutoExposureConfig | None = None
+    auto_white_balance: AutoWhiteBalanceConfig | None = None
+
+    @property
+    def adapts(self) -> bool:
+        """Whether exposure, gain or white balance change from frame to frame."""
+        return self.auto_exposure is not None or self.auto_white_balance is not None
+
+    @property
+    def longest_exposure_s(self) -> float:
+        return self.exposure_s if self.auto_exposure is None else self.auto_exposure.exposure_s[1]
+
+    @property
+    def has_frame_table(self) -> bool:
+        return self.driver is not None or self.adapts
+
+    @model_validator(mode="after")
+    def _has_a_reference(self) -> ColorConfig:
+        if self.auto_exposure is not None and self.exposure_s == 0:
+            raise ValueError("auto_exposure: exposure_s must be above 0: at that exposure exposure_gain holds")
+        return self
 
 
 class DepthConfig(StreamConfig):
@@ -154,3 +188,19 @@ class DepthConfig(StreamConfig):
         default=DEPTH_SCALE, description="stored units per metre"
     )
     noise: DepthNoiseConfig = DepthNoiseConfig()
+    blur_samples: int = Field(
+        default=1,
+        ge=1,
+        le=64,
+        description="instants of each line's exposure that a reported depth mixes; 1: its middle",
+    )
+    registered: bool = Field(
+        default=False,
+        description="warp reported depth into the colour camera, as drivers do; truth/depth stays as it is",
+    )
+
+    @model_validator(mode="after")
+    def _has_an_exposure_to_mix(self) -> DepthConfig:
+        if self.blur_samples > 1 and self.exposure_s == 0:
+            raise ValueError("blur_samples: exposure_s must be above 0 to be mixed over")
+        return self

@@ -81,6 +81,18 @@ class DepthNoiseConfig(_Settings):
     flying_pixels: Fraction = Field(
         default=0.3, description="tof: probability that a pixel beside a depth edge mixes both sides"
     )
+    scale_error: Annotated[float, Field(ge=-0.5, le=0.5)] = Field(
+        default=0.0, description="relative error of all depths (all models but none)"
+    )
+    distortion_px: Pixels = Field(
+        default=0.0, description="fixed bends of the disparity over the image, px RMS (all models but none)"
+    )
+    distortion_period_px: Annotated[float, limits(8, 1e5, "px")] = Field(
+        default=320.0, description="about how far the bends' hills are apart, px"
+    )
+    pattern_px: Pixels = Field(
+        default=0.0, description="fixed error of each pixel's disparity, px RMS (all models but none)"
+    )
     gaussian_per_m: PerMetre = Field(default=1.2e-3, description="gaussian: sigma / z^2, 1/m")
 
     @model_validator(mode="after")

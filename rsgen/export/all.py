@@ -40,13 +40,17 @@ def export(to: Export, path: Path, out: Path | None, copy: bool, scene: Path | N
 def _export_video(sequence: Sequence, out: Path, scene: Path | None, progress: Progress) -> str:
     from rsgen.export.video import write_video
     from rsgen.pictures.frames import config_of
-    from rsgen.produce.frame_source import FrameSource
+    from rsgen.produce.frame_source import FrameSource, setting_of
 
     stream = sequence.streams["color"]
-    source = FrameSource(config_of(sequence.root, sequence.meta, scene), progress, global_shutter=True)
+    config = config_of(sequence.root, sequence.meta, scene)
+    source = FrameSource(config, progress, global_shutter=True)
     # All lines at the middle line's time.
     middle = 0.5 * (stream.line_count - 1) * stream.shutter.line_delay(stream.camera)
     frames = range(len(stream.paths))
-    left = (source.color(sequence.spline, stream.stamps[k] + middle, int(stream.indices[k])) for k in frames)
+    left = (
+        source.color(sequence.spline, stamp + middle, int(k), setting_of(config, stream.table, i))
+        for i, (stamp, k) in enumerate(zip(stream.stamps, stream.indices, strict=True))
+    )
     right = (sequence.color(k) for k in frames)
     return write_video(out, left, right, stream.rate_hz, count=len(frames), progress=progress)

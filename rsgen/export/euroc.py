@@ -24,6 +24,7 @@ from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.export.folder import (
     four_coefficients,
+    image_streams,
     make_folders,
     new_folder,
     place_images,
@@ -59,12 +60,10 @@ def export_euroc(
     imu = sequence_imu(sequence)
     T_depth_body = imu[0].T_depth_imu() if imu else np.eye(4)
     root = Path(out) / "mav0"
-    sensors = {
-        "cam0": (sequence.streams["color"], se3.inverse(sequence.T_color_depth @ T_depth_body)),
-        "depth0": (sequence.streams["depth"], se3.inverse(T_depth_body)),
-    }
+    streams = zip(("cam0", "depth0"), image_streams(sequence), strict=True)
+    sensors = {name: (stream, se3.inverse(T @ T_depth_body)) for name, (stream, T) in streams}
     described = {name: _camera_yaml(stream, T_BS) for name, (stream, T_BS) in sensors.items()}
-    stamps = {name: nanoseconds(stream.stamps, epoch_s) for name, (stream, _) in sensors.items()}
+    stamps = {name: nanoseconds(stream.listed, epoch_s) for name, (stream, _) in sensors.items()}
     times = imu[1].t if imu else ground_truth(sequence.spline)[:, 0]
     if min(*(ns[0] for ns in stamps.values()), nanoseconds(times[:1], epoch_s)[0]) < 0:
         raise UserError(f"{out}: EuRoC's stamps cannot be negative: give an epoch of a second or more")

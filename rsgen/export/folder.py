@@ -5,12 +5,13 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import Sequence as Items
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
+from rsgen.array_types import FloatArray
 from rsgen.config.imu import ImuConfig
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError, first_problem
@@ -18,7 +19,7 @@ from rsgen.files import atomic_write, read_bytes, write_error
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.sensors.imu import ImuSamples, simulate_imu
-from rsgen.sequence.reader import Sequence
+from rsgen.sequence.reader import Sequence, Stream
 
 # What a hard link fails with where a copy would do: another disk, a file system without links, too many of them.
 _NO_LINK = (errno.EXDEV, errno.EPERM, errno.ENOTSUP, errno.EMLINK, errno.EACCES, errno.ENOSYS)
@@ -89,6 +90,17 @@ def sequence_imu(sequence: Sequence) -> tuple[ImuConfig, ImuSamples] | None:
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise UserError(f"{where}: seed is not a whole number of 0 or more: restore the file or render again")
     return imu, simulate_imu(sequence.spline, imu, sequence.spline.t_begin, sequence.spline.t_end, seed)
+
+
+def image_streams(sequence: Sequence) -> tuple[tuple[Stream, FloatArray], tuple[Stream, FloatArray]]:
+    """Colour and depth streams, each with the camera of its images and its T_cam_depth (4, 4).
+
+    Registered depth has the colour camera and keeps the sensor's shutter, row for row.
+    """
+    color, depth = sequence.streams["color"], sequence.streams["depth"]
+    return (color, sequence.T_color_depth), (
+        replace(depth, camera=sequence.depth_image_camera), sequence.T_image_depth,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
-from rsgen.export.folder import sequence_imu
+from rsgen.export.folder import image_streams, sequence_imu
 from rsgen.files import read_bytes, write_error
 from rsgen.geometry import se3
 from rsgen.sequence.format import ground_truth
@@ -80,9 +80,9 @@ def _log(rr: Any, recording: Any, sequence: Sequence, progress: Progress) -> Non
             times = [rr.TimeColumn(TIMELINE, duration=imu[1].t)]
             recording.send_columns(f"imu/{name}", times, rr.Scalars.columns(scalars=getattr(imu[1], name)))
 
-    color, depth = sequence.streams["color"], sequence.streams["depth"]
-    count = len(color.paths) + len(depth.paths)
-    for stream, T_cam_depth, first in ((color, sequence.T_color_depth, 0), (depth, np.eye(4), len(color.paths))):
+    color, depth = image_streams(sequence)
+    count = len(color[0].paths) + len(depth[0].paths)
+    for (stream, T_cam_depth), first in ((color, 0), (depth, len(color[0].paths))):
         where, camera = f"world/{stream.name}", stream.camera
         pinhole = rr.Pinhole(
             image_from_camera=camera.K,

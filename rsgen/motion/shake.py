@@ -19,8 +19,7 @@ def band_noise(
 
     A model, not a fit to recordings: exponent 2 makes the velocity white (a random walk held in place), larger
     exponents put the motion into slow sway and leave less for what is above 3 Hz. The hand's tremor proper, of about
-    8 to 12 Hz (modelled by Gavant et al., "A physiological camera shake model for image stabilization systems", IEEE
-    Sensors 2011), is left out: a spline with 50 ms knots cannot follow it.
+    8 to 12 Hz, is faster than a spline with 50 ms knots can follow: see `rsgen.motion.tremor`.
     Raises UserError if the band holds no frequency.
     """
     frequencies = np.fft.rfftfreq(count, 1.0 / rate_hz)

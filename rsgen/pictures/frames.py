@@ -12,7 +12,7 @@ from rsgen.config.config import Config, validate_config
 from rsgen.console.progress import ProgressDisplay
 from rsgen.errors import UserError
 from rsgen.files import read_yaml
-from rsgen.produce.frame_source import FrameSource, scene_hash
+from rsgen.produce.frame_source import FrameSource, scene_hash, setting_of
 from rsgen.produce.generate import ORIGIN
 from rsgen.sequence.reader import read_sequence
 
@@ -62,7 +62,8 @@ def compare_frame(path: Path, frame: int, out: Path | None, scene: Path | None) 
         source = FrameSource(config, progress, global_shutter=True)
     at = {stream.name: int(np.flatnonzero(stream.indices == frame)[0]) for stream in (color, depth)}
     middle = {s.name: float(s.stamps[at[s.name]]) + s.shutter.readout_s / 2 for s in (color, depth)}
-    colors = source.color(sequence.spline, middle["color"], frame), sequence.color(at["color"])
+    setting = setting_of(config, color.table, at["color"])
+    colors = source.color(sequence.spline, middle["color"], frame, setting), sequence.color(at["color"])
     depths = source.depth(sequence.spline, middle["depth"]), sequence.truth_depth(at["depth"])
     title = (
         f"{sequence.name}, frame {frame}: readout {1000 * color.shutter.readout_s:g} ms (colour), "

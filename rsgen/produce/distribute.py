@@ -25,6 +25,7 @@ from rsgen.files import atomic_write
 from rsgen.geometry.spline import Spline
 from rsgen.produce.frame_source import ColorShot, DepthShot, FrameSource, scene_hash
 from rsgen.produce.writer import SequenceWriter
+from rsgen.sensors.adaptation import Setting
 from rsgen.sequence.format import StreamName
 
 # Written frames that may wait for the disk: bounds memory and how much a kill can lose.
@@ -49,14 +50,17 @@ def render_shots(
     with ThreadPoolExecutor(max_workers=2) as pool:
         pending: list[Future[None]] = []
         for done, (k, stream) in enumerate(shots, 1):
-            stamp = float(writer.stamps(stream)[k])
+            shown = writer.shows(stream, k)
+            stamp = float(writer.stamps(stream)[shown])
             if stream == "color":
-                following = writer.stamps("color")[k + 1 : k + 2].tolist()
-                shot = source.expose_color(writer.spline, stamp, k, following[0] if following else None)
-                pending.append(pool.submit(_write_color, writer, source, shot))
+                after = writer.next_color(k)
+                next_stamp = None if after is None else float(writer.stamps("color")[after])
+                settings = (None if frame is None else writer.setting(frame) for frame in (shown, after))
+                shot = source.expose_color(writer.spline, stamp, shown, next_stamp, *settings)
+                pending.append(pool.submit(_write_color, writer, source, k, shot))
             else:
-                measured = source.expose_depth(writer.spline, stamp, k)
-                pending.append(pool.submit(_write_depth, writer, source, measured))
+                measured = source.expose_depth(writer.spline, stamp, shown)
+                pending.append(pool.submit(_write_depth, writer, source, k, measured))
             while len(pending) > _WRITE_AHEAD:
                 pending.pop(0).result()
             progress("frames", done / len(shots), f"frame {k}")
@@ -64,19 +68,20 @@ def render_shots(
             write.result()
 
 
-def _write_color(writer: SequenceWriter, source: FrameSource, shot: ColorShot) -> None:
-    writer.write_color(shot.frame, *source.develop_color(shot))
+def _write_color(writer: SequenceWriter, source: FrameSource, k: int, shot: ColorShot) -> None:
+    writer.write_color(k, *source.develop_color(shot))
 
 
-def _write_depth(writer: SequenceWriter, source: FrameSource, shot: DepthShot) -> None:
-    writer.write_depth(shot.frame, shot.z, source.develop_depth(shot))
+def _write_depth(writer: SequenceWriter, source: FrameSource, k: int, shot: DepthShot) -> None:
+    writer.write_depth(k, shot.z, source.develop_depth(shot))
 
 
 @dataclass(frozen=True)
 class SequenceRecipe:
     """What a worker has to know of a sequence to render any of its frames.
 
-    stamps_color (n,) and stamps_depth (m,): s, of all frames; versions, inputs: as in sequence.yaml.
+    stamps_color (n,) and stamps_depth (m,): s, of all frames; versions, inputs: as in sequence.yaml. settings: of the
+    automatic camera, of all colour frames; empty without one.
     """
 
     config: Config
@@ -85,6 +90,7 @@ class SequenceRecipe:
     stamps_depth: FloatArray
     versions: Mapping[str, str]
     inputs: Mapping[str, str]
+    settings: tuple[Setting, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -114,6 +120,7 @@ def render_blocks(
         writer.stamps("depth"),
         versions,
         inputs,
+        writer.settings,
     )
     blocks = [RenderJob(plan, tuple(shots[i : i + _BLOCK])) for i in range(0, len(shots), _BLOCK)]
     done = 0
@@ -134,6 +141,7 @@ def render_block(block: RenderJob, progress: Progress) -> dict[str, bytes]:
         out = Path(folder) / plan.config.name
         stamps = plan.stamps_color, plan.stamps_depth
         writer = SequenceWriter.open(out, plan.config, plan.spline, *stamps, plan.versions, plan.inputs)
+        writer = writer.adapted(plan.settings) if plan.settings else writer
         before = set(out.rglob("*"))
         render_shots(writer, source, block.shots, no_progress)
         made = sorted(path for path in set(out.rglob("*")) - before if path.is_file())

@@ -6,7 +6,7 @@ Exposing a frame uses the renderer and belongs into one thread; developing it is
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,30 +16,46 @@ from rsgen.array_types import BoolArray, ByteArray, Float32Array, FloatArray
 from rsgen.config.config import Config
 from rsgen.console.progress import Progress, no_progress
 from rsgen.geometry import se3
+from rsgen.geometry.camera import Camera
 from rsgen.geometry.spline import Spline
-from rsgen.sensors.color import apply_color_noise
+from rsgen.sensors.adaptation import Meter, Reading, Setting, reading
+from rsgen.sensors.color import apply_color_noise, apply_setting
 from rsgen.sensors.depth import apply_depth_noise
+from rsgen.sensors.depth_errors import mixed_depth, with_fixed_errors
+from rsgen.sensors.registration import register_depth
 from rsgen.sensors.response import to_srgb8
 from rsgen.sensors.seed import noise_generator
 from rsgen.sequence.format import CLEAN_COLOR
+from rsgen.sequence.frame_table import FrameTable
+
+# Light meters of cameras see no more than this of a picture.
+_METER_WIDTH, _METER_SPP = 64, 4
 
 
 @dataclass(frozen=True)
 class ColorShot:
-    """Colour frame `frame` before the sensor: linear radiance (h, w, 3), and what `truth` asks for beside it."""
+    """Colour frame `frame` before the sensor: linear radiance (h, w, 3), and what `truth` asks for beside it.
+
+    setting: how an automatic camera takes it; None where there is none.
+    """
 
     frame: int
     linear: Float32Array
     truth: Mapping[str, NDArray[Any]]
+    setting: Setting | None = None
 
 
 @dataclass(frozen=True)
 class DepthShot:
-    """Depth frame `frame`: exact planar z (h, w) in m, and the pixels that the projector does not light, if asked."""
+    """Depth frame `frame`: exact planar z (h, w) in m, and the pixels that the projector does not light, if asked.
+
+    blurred: z as the line's whole exposure gives it; None where its middle stands for it.
+    """
 
     frame: int
     z: Float32Array
     shadow: BoolArray | None
+    blurred: Float32Array | None = None
 
 
 class FrameSource:
@@ -57,57 +73,108 @@ class FrameSource:
 
         mi = mitsuba(config.backend)
         from rsgen.render import images as render
+
+        self._render = render
         from rsgen.sensors.shadow import Projector
         from rsgen.truth.renderer import TruthRenderer
 
         self._config = config
         self.scene = scene or load_scene(config)
-        integrator = make_integrator(mi, self.scene, config, progress)
+        self._integrator = integrator = make_integrator(mi, self.scene, config, progress)
         pick = render.global_shutter if global_shutter else lambda shutter: shutter
         color, depth = config.color, config.depth
         self._color = render.ColorRenderer(self.scene, integrator, color.camera, pick(color.shutter), color.spp)
         self._depth = render.DepthRenderer(self.scene, depth.camera, pick(depth.shutter))
+        self._instant = render.DepthRenderer(self.scene, depth.camera, replace(pick(depth.shutter), exposure_s=0.0))
+        self._rays = depth.camera.unproject(depth.camera.pixel_grid()) if depth.registered else np.empty(0)
         self._truth = TruthRenderer(self.scene, integrator, color, config.truth) if config.truth.images else None
         lit = depth.noise.model == "kinect" and depth.noise.shadow
         self._projector = Projector(self.scene, self._depth.sensor, depth.noise.projector_baseline_m) if lit else None
         self._T_depth_color = se3.inverse(np.asarray(config.T_color_depth, float))
 
-    def expose_color(self, spline: Spline, stamp: float, frame: int, next_stamp: float | None = None) -> ColorShot:
-        """Render the colour frame at `stamp` (s) with its truth; next_stamp: of the frame after it, if there is one."""
-        linear = self.linear_color(spline, stamp, frame)
+    def expose_color(
+        self, spline: Spline, stamp: float, frame: int, next_stamp: float | None = None,
+        setting: Setting | None = None, next_setting: Setting | None = None,
+    ) -> ColorShot:  # fmt: skip
+        """Render the colour frame at `stamp` (s) with its truth; next_stamp: of the frame after it, if there is one.
+
+        setting, next_setting: how an automatic camera takes the two.
+        """
+        linear = self.linear_color(spline, stamp, frame, None if setting is None else setting.exposure_s)
         if self._truth is None:
-            return ColorShot(frame, linear, {})
-        truth = self._truth.render(self._pose(spline), stamp, next_stamp, self._seed(frame))
-        return ColorShot(frame, linear, truth)
+            return ColorShot(frame, linear, {}, setting)
+        how: dict[str, Any] = {}
+        if setting is not None:
+            exposures = setting.exposure_s, (next_setting or setting).exposure_s
+            how = {"exposure_s": exposures, "brightness": setting.brightness}
+        truth = self._truth.render(self._pose(spline), stamp, next_stamp, self._seed(frame), **how)
+        return ColorShot(frame, linear, truth, setting)
 
     def develop_color(self, shot: ColorShot) -> tuple[ByteArray, dict[str, NDArray[Any]]]:
         """8-bit RGB (h, w, 3) that the camera reports, and the images of `color_truth`."""
         color, truth = self._config.color, dict(shot.truth)
-        linear = shot.linear * np.float32(color.exposure_gain)
-        if color.noise.model != "none":
+        linear, noise = shot.linear * np.float32(color.exposure_gain), color.noise
+        if shot.setting is not None:
+            linear, noise = apply_setting(linear, noise, shot.setting)
+        if noise.model != "none":
             truth[CLEAN_COLOR] = to_srgb8(linear)
         rng = noise_generator(self._config.seed, "color", shot.frame)
-        return apply_color_noise(linear, color.noise, rng), truth
+        return apply_color_noise(linear, noise, rng), truth
 
     def expose_depth(self, spline: Spline, stamp: float, frame: int) -> DepthShot:
         """Cast the depth frame at `stamp` (s)."""
         z = self.depth(spline, stamp)
         # The projector takes the depth sensor as it is now: exposed to this frame.
         shadow = None if self._projector is None else ~self._projector.lights(z, spline.pose, stamp)
-        return DepthShot(frame, z, shadow)
+        depth = self._config.depth
+        if depth.blur_samples == 1:
+            return DepthShot(frame, z, shadow)
+        share = (np.arange(depth.blur_samples) + 0.5) / depth.blur_samples
+        instants = stamp - depth.exposure_s * (1 - share)
+        samples = [self._instant.render(spline.pose, float(t)) for t in instants]
+        return DepthShot(frame, z, shadow, mixed_depth(samples, depth.noise.model == "tof"))
 
     def develop_depth(self, shot: DepthShot) -> Float32Array:
-        """Planar z (h, w) in m that the camera reports; 0 where it reports nothing."""
-        depth, rng = self._config.depth, noise_generator(self._config.seed, "depth", shot.frame)
-        return apply_depth_noise(shot.z, depth.camera, depth.noise, rng, shot.shadow)
+        """Planar z (h, w) in m that the camera reports, 0 where nothing; of colour's size where registered."""
+        depth, seed = self._config.depth, self._config.seed
+        z = shot.z if shot.blurred is None else shot.blurred
+        if depth.noise.model != "none":
+            z = with_fixed_errors(z, depth.camera, depth.noise, seed)
+        z = apply_depth_noise(z, depth.camera, depth.noise, noise_generator(seed, "depth", shot.frame), shot.shadow)
+        if not depth.registered:
+            return z
+        return register_depth(self._rays, z, self._config.color.camera, self._config.T_color_depth)
 
-    def linear_color(self, spline: Spline, stamp: float, frame: int) -> Float32Array:
-        """Linear RGB (h, w, 3) of the colour frame at `stamp` (s); seeded by the config's seed and `frame`."""
-        return self._color.render(self._pose(spline), stamp, self._seed(frame))
+    def linear_color(self, spline: Spline, stamp: float, frame: int, exposure_s: float | None = None) -> Float32Array:
+        """Linear RGB (h, w, 3) of the colour frame at `stamp` (s); seeded by the config's seed and `frame`.
 
-    def color(self, spline: Spline, stamp: float, frame: int) -> ByteArray:
-        """8-bit RGB (h, w, 3), as the camera reports it, of the colour frame at `stamp` (s)."""
-        return self.develop_color(ColorShot(frame, self.linear_color(spline, stamp, frame), {}))[0]
+        exposure_s: where it is another one than the stream's.
+        """
+        return self._color.render(self._pose(spline), stamp, self._seed(frame), exposure_s)
+
+    def light_meter(self, spline: Spline, stamps: FloatArray) -> Meter:
+        """What an automatic camera sees of the frames at `stamps` (n,), s: small and sharp pictures of them."""
+        color = self._config.color
+        camera, shutter = small_camera(color.camera, _METER_WIDTH), replace(color.shutter, exposure_s=0.0)
+        small = self._render.ColorRenderer(self.scene, self._integrator, camera, shutter, _METER_SPP)
+        noiseless = color.noise.model_copy(update={"gain": 0.0, "bayer": "off"})
+
+        def read(frame: int, setting: Setting) -> Reading:
+            # A sharp picture at mid-exposure shows what the blurred one does in the mean.
+            instant = float(stamps[frame]) - 0.5 * setting.exposure_s
+            linear = small.render(self._pose(spline), instant, self._seed(frame)) * np.float32(color.exposure_gain)
+            seen = apply_color_noise(*apply_setting(linear, noiseless, setting), np.random.default_rng(0))
+            return reading(seen, linear * np.float32(setting.brightness))
+
+        return read
+
+    def color(self, spline: Spline, stamp: float, frame: int, setting: Setting | None = None) -> ByteArray:
+        """8-bit RGB (h, w, 3), as the camera reports it, of the colour frame at `stamp` (s).
+
+        setting: how an automatic camera took it.
+        """
+        linear = self.linear_color(spline, stamp, frame, None if setting is None else setting.exposure_s)
+        return self.develop_color(ColorShot(frame, linear, {}, setting))[0]
 
     def depth(self, spline: Spline, stamp: float) -> Float32Array:
         """Exact planar z (h, w) in metres of the depth frame at `stamp` (s); 0 where there is nothing."""
@@ -153,3 +220,20 @@ def scene_hash(config: Config) -> str:
     from rsgen.render.scene import content_hash
 
     return content_hash(config.scene.file)
+
+
+def setting_of(config: Config, table: FrameTable | None, k: int) -> Setting | None:
+    """How an automatic camera took the k-th image of its frame table; None where nothing is automatic."""
+    if table is None or not config.color.adapts:
+        return None
+    red, green, blue = table.balance[k].tolist()
+    return Setting(float(table.exposure_s[k]), float(table.gain[k]), float(table.brightness[k]), (red, green, blue))
+
+
+def small_camera(camera: Camera, width: int) -> Camera:
+    """The same camera with pixels so large that there are about `width` columns; none wider than it was."""
+    columns = min(width, camera.width)
+    rows = max(1, round(camera.height * columns / camera.width))
+    x, y = columns / camera.width, rows / camera.height
+    cx, cy = (camera.cx + 0.5) * x - 0.5, (camera.cy + 0.5) * y - 0.5
+    return replace(camera, width=columns, height=rows, fx=camera.fx * x, fy=camera.fy * y, cx=cx, cy=cy)

@@ -21,9 +21,11 @@ from rsgen.geometry.spline import Spline
 from rsgen.motion.clearance import check_clearance
 from rsgen.motion.fit import FitResult, fit_spline
 from rsgen.motion.make import make_motion
+from rsgen.motion.tremor import with_tremor
 from rsgen.produce.distribute import engine_versions, render_blocks, render_shots
 from rsgen.produce.frame_source import FrameSource, load_scene, scene_hash
 from rsgen.produce.writer import SequenceWriter
+from rsgen.sensors.adaptation import Reading, Setting, adapt
 from rsgen.sequence.format import STREAMS, stream_stamps
 from rsgen.sequence.trajectory import Trajectory, read_trajectory
 
@@ -57,12 +59,17 @@ def load_motion(config: Config) -> Motion:
     trajectory = make_motion(config.motion, config.seed) if config.motion is not None else _recorded(settings)
     if settings.T_world_file is not None:
         trajectory = trajectory.moved(np.asarray(settings.T_world_file, float))
+    spacing = settings.knot_spacing_s
+    if config.tremor is not None:
+        smooth = fit_spline(trajectory, dt=spacing, smoothing=settings.smoothing).spline
+        trajectory, spacing = with_tremor(smooth, config.tremor, config.seed, trajectory.stamps[[0, -1]])
     streams = (config.color, config.depth)
-    before = max(s.exposure_s - min(s.offset_s, 0.0) for s in streams)
+    before = max(s.longest_exposure_s - min(s.offset_s, 0.0) for s in streams)
     after = max(s.readout_s for s in streams)
     fit = fit_spline(
-        trajectory, dt=settings.knot_spacing_s, smoothing=settings.smoothing, pad_begin_s=before, pad_end_s=after
-    )
+        trajectory, dt=spacing, smoothing=0.0 if config.tremor else settings.smoothing, pad_begin_s=before,
+        pad_end_s=after,
+    )  # fmt: skip
     return Motion(fit.spline, fit, float(trajectory.stamps[0]), float(trajectory.stamps[-1]))
 
 
@@ -102,6 +109,10 @@ def render_sequence(
             check_clearance(motion.spline, scene_triangles(scene), config.motion.clearance_m)
     writer = SequenceWriter.open(out, config, motion.spline, stamps["color"], stamps["depth"], *identity)
     write_origin(out, config)
+    source = None
+    if config.color.adapts:
+        source = FrameSource(config, progress, scene=scene)
+        writer = writer.adapted(automatic_settings(config, source, writer, progress))
     todo = sorted(
         [(k, stream) for stream in STREAMS for k in _chosen(writer.missing(stream), frames, len(stamps[stream]))],
     )
@@ -112,13 +123,29 @@ def render_sequence(
         if todo and workers is not None:
             render_blocks(writer, todo, *identity, workers, progress)
         elif todo:
-            render_shots(writer, FrameSource(config, progress, scene=scene), todo, progress)
+            render_shots(writer, source or FrameSource(config, progress, scene=scene), todo, progress)
     except (KeyboardInterrupt, SystemExit):
         # A run that the user ends here leaves a readable, shorter sequence.
         writer.finish()
         raise
     writer.finish()
     return out
+
+
+def automatic_settings(
+    config: Config, source: FrameSource, writer: SequenceWriter, progress: Progress
+) -> list[Setting]:
+    """How the automatic camera takes all colour frames of its clock, also those that a driver loses."""
+    color, stamps = config.color, writer.stamps("color")
+    gain = color.noise.gain if color.noise.model == "camera" and color.noise.gain > 0 else 1.0
+    meter = source.light_meter(writer.spline, stamps)
+
+    def watched(frame: int, setting: Setting) -> Reading:
+        progress("metering", (frame + 1) / len(stamps), f"frame {frame}")
+        return meter(frame, setting)
+
+    reference = Setting(color.exposure_s, gain)
+    return adapt(watched, len(stamps), reference, color.auto_exposure, color.auto_white_balance)
 
 
 def _chosen(missing: Iterable[int], frames: slice, count: int) -> list[int]:

@@ -40,13 +40,16 @@ def describe(
     inputs: Mapping[str, str],
 ) -> dict[str, Any]:
     """What sequence.yaml says. stamps: (n,) s of all frames of each stream."""
+    registered = {"registered": True} if config.depth.registered else {}
     identity = {"config": config.content(), "inputs": dict(inputs), "versions": dict(versions)}
     return {
         "format": FORMAT,
         "name": config.name,
         "streams": {
             "color": _stream_yaml(config.color, stamps["color"]),
-            "depth": _stream_yaml(config.depth, stamps["depth"]) | {"depth_scale": config.depth.depth_scale},
+            "depth": _stream_yaml(config.depth, stamps["depth"])
+            | {"depth_scale": config.depth.depth_scale}
+            | registered,
         },
         "T_color_depth": [[float(value) for value in row] for row in config.T_color_depth],
         "spline": {"knot_spacing_s": spline.dt, "t0_s": spline.t0, "control_points": len(spline.control_points)},
@@ -71,6 +74,7 @@ def noise_yaml(config: Config) -> dict[str, str] | None:
 
 
 def _stream_yaml(stream: StreamConfig, stamps: FloatArray) -> dict[str, Any]:
+    table = {"frame_table": True} if stream.has_frame_table else {}
     return {
         "size": [stream.width, stream.height],
         "intrinsics": list(stream.intrinsics),
@@ -83,6 +87,7 @@ def _stream_yaml(stream: StreamConfig, stamps: FloatArray) -> dict[str, Any]:
         "scan": stream.scan,
         "frames": len(stamps),
         "first_stamp_s": float(stamps[0]),
+        **table,
     }
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rsgen.array_types import ByteArray, Float32Array, FloatArray
-from rsgen.config.config import Config
+from rsgen.array_types import BoolArray, ByteArray, Float32Array, FloatArray
+from rsgen.config.config import Config, StreamConfig
 from rsgen.errors import UserError
 from rsgen.files import (
     atomic_write,
@@ -28,9 +28,12 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rsgen.produce.identity import color_truth, describe, refuse_foreign_folder
+from rsgen.sensors.adaptation import Setting
+from rsgen.sensors.driver import deliver
 from rsgen.sensors.imu import sample_clock, simulate_imu, write_imu_csv
 from rsgen.sequence.format import (
     FOLDERS,
+    FRAME_TABLES,
     LISTINGS,
     ROWS,
     STREAMS,
@@ -43,15 +46,40 @@ from rsgen.sequence.format import (
     line_poses,
     round_stamps,
 )
+from rsgen.sequence.frame_table import FrameTable
 
 _SPLINE_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
 class _Stream:
+    """One stream; stamps (n,): true ones of all frames of its clock; table: what each of them shows, and when."""
+
     camera: Camera
     shutter: Shutter
     stamps: FloatArray
+    table: FrameTable
+    is_delivered: BoolArray
+    writes_table: bool
+
+    @classmethod
+    def of(cls, stream: StreamConfig, name: StreamName, stamps: npt.ArrayLike, seed: int) -> _Stream:
+        stamps = round_stamps(stamps)
+        came = deliver(stamps, stream.driver, seed, name)
+        ones = np.ones(len(stamps))
+        table = FrameTable(
+            np.arange(len(stamps)), came.shows, stamps[came.shows], came.listed, stream.exposure_s * ones,
+            ones, ones, np.ones((len(stamps), 3)),
+        )  # fmt: skip
+        return cls(stream.camera, stream.shutter, stamps, table, came.is_delivered, stream.has_frame_table)
+
+    def line_poses(self, spline: Spline, T_cam_body: FloatArray | None = None) -> FloatArray:
+        """Rows (frames, lines, 7), as in truth/rows_STREAM.npy. Raises UserError."""
+        table = self.table
+        return line_poses(
+            spline, self.camera, self.shutter, table.taken_s, T_cam_body,
+            table.exposure_s if self.writes_table else None,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -59,7 +87,7 @@ class SequenceWriter:
     """An open sequence folder; make one with `open`.
 
     Render from `spline` and `stamps`, not from what was handed to `open`: when a run is resumed, `spline` is the one on
-    disk, which may differ from a new fit in its last bits.
+    disk, which may differ from a new fit in its last bits. settings: see `adapted`; empty without an automatic camera.
     """
 
     out: Path
@@ -67,6 +95,7 @@ class SequenceWriter:
     spline: Spline
     color: _Stream
     depth: _Stream
+    settings: tuple[Setting, ...] = ()
 
     @classmethod
     def open(
@@ -91,8 +120,8 @@ class SequenceWriter:
         """
         out = Path(out)
         streams = {
-            "color": _Stream(config.color.camera, config.color.shutter, round_stamps(stamps_color)),
-            "depth": _Stream(config.depth.camera, config.depth.shutter, round_stamps(stamps_depth)),
+            "color": _Stream.of(config.color, "color", stamps_color, config.seed),
+            "depth": _Stream.of(config.depth, "depth", stamps_depth, config.seed),
         }
         for stream in streams.values():
             line_poses(spline, stream.camera, stream.shutter, stream.stamps[[0, -1]])
@@ -113,15 +142,41 @@ class SequenceWriter:
                 remove_stale_temporaries(out / folder)
         except OSError as error:
             raise write_error(out, error) from None
-        return cls(out, config, _stored_spline(out / "spline.npz", spline), **streams)
+        return cls(out, config, _stored_spline(out / "spline.npz", spline), streams["color"], streams["depth"])
 
     def stamps(self, stream: StreamName) -> FloatArray:
-        """Stamps (n,) of all frames of a stream, s."""
+        """True stamps (n,) of all frames of a stream, s."""
         return self._stream(stream).stamps
 
+    def shows(self, stream: StreamName, k: int) -> int:
+        """The frame that image k shows: k, unless a driver delivered an earlier one again."""
+        return int(self._stream(stream).table.shows[k])
+
+    def next_color(self, k: int) -> int | None:
+        """The frame that the colour image listed after image k shows; None after the last one."""
+        later = np.flatnonzero(self.color.is_delivered[k + 1 :])
+        return self.shows("color", k + 1 + int(later[0])) if len(later) else None
+
+    def setting(self, k: int) -> Setting | None:
+        """How the automatic camera takes colour frame k; None where nothing is automatic."""
+        return self.settings[k] if self.settings else None
+
+    def adapted(self, settings: Sequence[Setting]) -> SequenceWriter:
+        """The same with the automatic camera's settings of all colour frames of its clock."""
+        shown = [settings[k] for k in self.color.table.shows]
+        table = replace(
+            self.color.table,
+            exposure_s=np.array([s.exposure_s for s in shown]),
+            gain=np.array([s.gain for s in shown]),
+            brightness=np.array([s.brightness for s in shown]),
+            balance=np.array([s.balance for s in shown]),
+        )
+        return replace(self, color=replace(self.color, table=table), settings=tuple(settings))
+
     def missing(self, stream: StreamName) -> list[int]:
-        """Indices of the frames that are not on disk yet."""
-        return [k for k in range(len(self.stamps(stream))) if not self._is_written(stream, k)]
+        """Indices of the frames that are delivered and not on disk yet."""
+        delivered = np.flatnonzero(self._stream(stream).is_delivered).tolist()
+        return [k for k in delivered if not self._is_written(stream, k)]
 
     def write_color(self, k: int, rgb: ByteArray, truth: Mapping[str, npt.NDArray[Any]] = MappingProxyType({})) -> None:
         """Write colour frame k, sRGB (h, w, 3) uint8, and its images of `color_truth`.
@@ -146,11 +201,13 @@ class SequenceWriter:
     def write_depth(self, k: int, z: Float32Array, reported: Float32Array | None = None) -> None:
         """Write depth frame k, planar z (h, w) float32 in metres; 0, negative, inf and NaN mean nothing measured.
 
-        truth/depth/ gets z exactly; depth/ gets what the camera reports (default: z), rounded to 1/depth_scale m, 0
-        where that leaves 16 bits. Raises UserError if the disk refuses it.
+        truth/depth/ gets z exactly; depth/ gets what the camera reports (default: z; of the colour camera's size where
+        depth is registered), rounded to 1/depth_scale m, 0 where that leaves 16 bits. Raises UserError if the disk
+        refuses it.
         """
-        for image in (z,) if reported is None else (z, reported):
-            _expect(image, (self.depth.camera.height, self.depth.camera.width), np.float32)
+        _expect(z, (self.depth.camera.height, self.depth.camera.width), np.float32)
+        camera = self.color.camera if self.config.depth.registered else self.depth.camera
+        _expect(z if reported is None else reported, (camera.height, camera.width), np.float32)
         atomic_write(self._truth_path(k), encode_exr(_positive(z)))
         units = quantise(_positive(z if reported is None else reported), self.config.depth.depth_scale)
         atomic_write(self._path("depth", k), encode_png(units))
@@ -161,25 +218,29 @@ class SequenceWriter:
         Raises UserError if the disk refuses them.
         """
         written = {s: [k for k in range(len(self.stamps(s))) if self._is_written(s, k)] for s in STREAMS}
-        entries = {
-            s: [f"{self.stamps(s)[k]:.9f} {FOLDERS[s]}/{frame_name(k)}.png" for k in written[s]] for s in STREAMS
-        }
+        listed = {s: self._stream(s).table.listed_s for s in STREAMS}
+        entries = {s: [f"{listed[s][k]:.9f} {FOLDERS[s]}/{frame_name(k)}.png" for k in written[s]] for s in STREAMS}
         for s in STREAMS:
             header = [f"# {s} images of {self.config.name}", "# stamp path"]
             _write_lines(self.out / LISTINGS[s], header + entries[s])
-        color, depth = (self.stamps(s)[written[s]] for s in STREAMS)
+        color, depth = (listed[s][written[s]] for s in STREAMS)
         limit = 0.5 / min(self.config.color.rate_hz, self.config.depth.rate_hz)
         pairs = [f"{entries['color'][i]} {entries['depth'][j]}" for i, j in associate(color, depth, limit)]
         _write_lines(self.out / "associations.txt", pairs)
-        rows = ground_truth(self.spline, self.color.stamps, self.depth.stamps)
+        T_image_depth = np.array(self.config.T_color_depth, float) if self.config.depth.registered else None
+        rows = ground_truth(self.spline, self.color.stamps, self.depth.stamps, T_cam_body=T_image_depth)
         lines = [f"{row[0]:.9f} " + " ".join(f"{value:.12f}" for value in row[1:]) for row in rows]
-        header = [f"# ground truth of {self.config.name}: T_world_depth", "# stamp tx ty tz qx qy qz qw"]
+        camera = "T_world_depth" if T_image_depth is None else "T_world_color, depth being registered"
+        header = [f"# ground truth of {self.config.name}: {camera}", "# stamp tx ty tz qx qy qz qw"]
         _write_lines(self.out / "groundtruth.txt", header + lines)
         for s in STREAMS:
             stream = self._stream(s)
             T_cam_body = np.array(self.config.T_color_depth, float) if s == "color" else None
-            poses = line_poses(self.spline, stream.camera, stream.shutter, stream.stamps, T_cam_body)
+            poses = stream.line_poses(self.spline, T_cam_body)
             atomic_write(self.out / ROWS[s], encode_npy(poses))
+            if stream.writes_table:
+                table = stream.table.of(np.flatnonzero(stream.is_delivered))
+                atomic_write(self.out / FRAME_TABLES[s], table.text().encode())
         if self.config.imu is not None:
             spline = self.spline
             samples = simulate_imu(spline, self.config.imu, spline.t_begin, spline.t_end, self.config.seed)

@@ -36,9 +36,14 @@ class ColorRenderer:
         self._sampler = mi.load_dict({"type": "independent"})
         self.sensor = RollingShutterSensor(camera, shutter)
 
-    def render(self, T_world_cam: PoseFunction, stamp: float, seed: int) -> Float32Array:
-        """Linear RGB (h, w, 3) of the frame at `stamp` (s); `seed` decides every random number of it."""
-        self.sensor.expose(T_world_cam, stamp)
+    def render(
+        self, T_world_cam: PoseFunction, stamp: float, seed: int, exposure_s: float | None = None
+    ) -> Float32Array:
+        """Linear RGB (h, w, 3) of the frame at `stamp` (s); `seed` decides every random number of it.
+
+        exposure_s: as in `RollingShutterSensor.expose`; the light is averaged over it, not summed.
+        """
+        self.sensor.expose(T_world_cam, stamp, exposure_s)
         camera = self.sensor.camera
         pixels = camera.width * camera.height
         per_launch = max(1, min(self._spp, _LAUNCH // pixels))

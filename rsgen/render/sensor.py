@@ -16,6 +16,8 @@ Importing this module needs an active Mitsuba variant (`rsgen.device.backend.mit
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -51,11 +53,14 @@ class RollingShutterSensor(mi.Sensor):
         self._lens = Lens(camera, shutter)
         self.expose(lambda t: np.broadcast_to(np.eye(4), (*np.shape(t), 4, 4)), 0.0)
 
-    def expose(self, T_world_cam: PoseFunction, stamp: float) -> None:
+    def expose(self, T_world_cam: PoseFunction, stamp: float, exposure_s: float | None = None) -> None:
         """Take the next frame at `stamp` (s) along `T_world_cam`: times (n,) s → (n, 4, 4), e.g. `Spline.pose`.
 
-        Times from stamp − t_e to stamp + t_r are asked for; that may raise UserError if the trajectory ends before.
+        exposure_s: t_e from this frame on, where it is another one (kernels are compiled once for each). Times from
+        stamp − t_e to stamp + t_r are asked for; that may raise UserError if the trajectory ends before.
         """
+        if exposure_s is not None:
+            self.shutter = replace(self.shutter, exposure_s=exposure_s)
         self._poses = PoseTable.of(mi.Vector4f, self.camera, self.shutter, T_world_cam, stamp)
 
     def sample_ray(self, time, sample1, sample2, sample3, active=True):

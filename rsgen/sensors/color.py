@@ -13,12 +13,29 @@ import numpy as np
 from rsgen import srgb
 from rsgen.array_types import ByteArray, Float32Array
 from rsgen.config.sensors import ColorNoiseConfig
+from rsgen.sensors.adaptation import Setting
 from rsgen.sensors.response import power_law, quantise8, s_curve, to_srgb8
 
 # Codes of black and white in the 16-bit raw image. As in real raw files black is not 0, so that noise is not cut off
 # there, which would brighten the dark.
 _BLACK, _WHITE = 4096, 65535
 _DEMOSAIC = {"bilinear": cv2.COLOR_BayerRGGB2RGB, "edge-aware": cv2.COLOR_BayerRGGB2RGB_EA}
+
+
+def apply_setting(
+    linear: Float32Array, config: ColorNoiseConfig, setting: Setting
+) -> tuple[Float32Array, ColorNoiseConfig]:
+    """Light (h, w, 3) and camera as an automatic camera has set them: what `apply_color_noise` takes.
+
+    `linear`: at the reference exposure and gain. The balance acts after the noise, as the camera's own error of it
+    does; without noise it acts on the light.
+    """
+    linear = linear * np.float32(setting.brightness)
+    if config.model == "none":
+        return linear * np.array(setting.balance, np.float32), config
+    balance = tuple(own * factor for own, factor in zip(config.white_balance, setting.balance, strict=True))
+    gain = setting.gain if config.gain > 0 else 0.0
+    return linear, config.model_copy(update={"white_balance": balance, "gain": gain})
 
 
 def apply_color_noise(linear: Float32Array, config: ColorNoiseConfig, rng: np.random.Generator) -> ByteArray:

@@ -2,8 +2,8 @@
 
 Depth images are (h, w) float32, planar z in metres, 0 where nothing is measured. Disparity is that of a camera and a
 projector (or second camera) at a baseline b: d = b f / z with f = fx, in px. On a plane it is affine in the pixel, so
-it is what is interpolated and searched for edges. A camera that exposes for a while is treated as if it saw the instant
-of mid-exposure only: depth is not blurred.
+it is what is interpolated and searched for edges. What an exposure, or a faulty device, does to depth comes before all
+this: `rsgen.sensors.depth_errors`.
 """
 
 from __future__ import annotations

@@ -29,6 +29,7 @@ STREAMS: tuple[StreamName, StreamName] = ("color", "depth")
 FOLDERS: dict[StreamName, str] = {"color": "rgb", "depth": "depth"}
 LISTINGS: dict[StreamName, str] = {"color": "rgb.txt", "depth": "depth.txt"}
 ROWS: dict[StreamName, str] = {"color": "truth/rows_color.npy", "depth": "truth/rows_depth.npy"}
+FRAME_TABLES: dict[StreamName, str] = {"color": "truth/frames_color.txt", "depth": "truth/frames_depth.txt"}
 TRUTH_DEPTH = "truth/depth"
 CLEAN_COLOR = "color"  # truth/color/: what a colour camera without noise would have reported
 GROUND_TRUTH_HZ = 200.0
@@ -61,6 +62,8 @@ class StreamYaml(_Yaml):
     frames: int = Field(ge=1, le=10_000_000)
     first_stamp_s: Seconds
     depth_scale: Annotated[float, Field(ge=1e-3, le=1e9)] | None = None
+    registered: bool = False  # depth/ holds images warped into the colour camera
+    frame_table: bool = False  # stamps, exposure or gain of each image are in FRAME_TABLES
 
     @property
     def camera(self) -> Camera:
@@ -217,14 +220,17 @@ def poses_of_rows(rows: FloatArray) -> FloatArray:
 
 
 def line_poses(
-    spline: Spline, camera: Camera, shutter: Shutter, stamps: npt.ArrayLike, T_cam_body: FloatArray | None = None
-) -> FloatArray:
+    spline: Spline, camera: Camera, shutter: Shutter, stamps: npt.ArrayLike, T_cam_body: FloatArray | None = None,
+    exposure_s: FloatArray | None = None,
+) -> FloatArray:  # fmt: skip
     """Rows (frames, lines, 7) of T_world_cam at each line's mid-exposure; T_cam_body is the identity for depth.
 
-    Entry i is image row i (column i for the sideways scans), whatever the order of readout. Raises UserError if a
-    line is read outside the spline's time.
+    exposure_s (frames,): of each frame, where it is not the shutter's. Entry i is image row i (column i for the
+    sideways scans), whatever the order of readout. Raises UserError if a line is read outside the spline's time.
     """
     stamps = np.asarray(stamps, float)
+    if exposure_s is not None:
+        stamps = stamps - 0.5 * (exposure_s - shutter.exposure_s)
     places = np.arange(shutter.line_count(camera), dtype=float)
     lines = shutter.line_of_pixel(np.stack([places, places], axis=-1), camera)
     poses = []
@@ -235,9 +241,13 @@ def line_poses(
     return pose_rows(T.reshape(-1, 4, 4)).reshape(*T.shape[:2], 7)
 
 
-def ground_truth(spline: Spline, *stamps: npt.ArrayLike) -> FloatArray:
-    """Rows (n, 8) of groundtruth.txt: T_world_depth on a 200 Hz grid over the spline and at every given stamp."""
+def ground_truth(spline: Spline, *stamps: npt.ArrayLike, T_cam_body: FloatArray | None = None) -> FloatArray:
+    """Rows (n, 8) of groundtruth.txt: T_world_depth on a 200 Hz grid over the spline and at every given stamp.
+
+    T_cam_body: of the camera whose poses they are, where it is not the body.
+    """
     grid = np.arange(math.ceil(spline.t_begin * GROUND_TRUTH_HZ), math.floor(spline.t_end * GROUND_TRUTH_HZ) + 1)
     times = np.unique(round_stamps(np.concatenate([grid / GROUND_TRUTH_HZ, *map(np.asarray, stamps)])))
     times = times[(times >= spline.t_begin) & (times <= spline.t_end)]
-    return np.column_stack([times, pose_rows(spline.pose(times))])
+    T = spline.pose(times)
+    return np.column_stack([times, pose_rows(T if T_cam_body is None else T @ se3.inverse(T_cam_body))])

@@ -22,6 +22,7 @@ from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rsgen.limits import rigid
 from rsgen.sequence.format import (
+    FRAME_TABLES,
     LISTINGS,
     ROWS,
     STAMP_TOLERANCE_S,
@@ -35,6 +36,7 @@ from rsgen.sequence.format import (
     poses_of_rows,
     read_sequence_yaml,
 )
+from rsgen.sequence.frame_table import FrameTable, read_frame_table
 
 _LONGEST_S = 1e6  # as long as stamps may grow
 
@@ -43,8 +45,10 @@ _LONGEST_S = 1e6  # as long as stamps may grow
 class Stream:
     """One camera's images: n of them are on disk, of `frames` in the whole sequence.
 
-    stamps (n,) s; paths n files; indices (n,) frame numbers in the whole sequence (the files' names).
-    depth_scale: stored units per metre; 0 in the colour stream.
+    stamps (n,) s, true ones; listed (n,): those of the listing, which a driver may have made; paths n files; indices
+    (n,) frame numbers in the whole sequence (the files' names). depth_scale: stored units per metre; 0 in the colour
+    stream. registered: the images were warped into the colour camera; camera and shutter are those of the sensor that
+    they were warped from. table: what was true of each image, where listing, clock and shutter do not tell it.
     """
 
     name: StreamName
@@ -56,8 +60,11 @@ class Stream:
     frames: int
     first_stamp_s: float
     stamps: FloatArray
+    listed: FloatArray
     paths: tuple[Path, ...]
     indices: IntArray
+    registered: bool = False
+    table: FrameTable | None = None
 
     @property
     def line_count(self) -> int:
@@ -80,6 +87,16 @@ class Sequence:
     spline: Spline
     meta: dict[str, Any]
 
+    @property
+    def depth_image_camera(self) -> Camera:
+        """The camera of the images in depth/: the colour camera where they are registered, else the depth sensor."""
+        return self.streams["color" if self.streams["depth"].registered else "depth"].camera
+
+    @property
+    def T_image_depth(self) -> FloatArray:
+        """(4, 4) from the depth sensor's coordinates to those of the camera of the images in depth/."""
+        return self.T_color_depth if self.streams["depth"].registered else np.eye(4)
+
     @cached_property
     def _rows(self) -> dict[StreamName, FloatArray]:
         return {}
@@ -91,7 +108,7 @@ class Sequence:
 
     def depth_units(self, k: int) -> npt.NDArray[np.uint16]:
         """Depth image k as stored (h, w), 0 where nothing was measured."""
-        camera = self.streams["depth"].camera
+        camera = self.depth_image_camera
         return read_png(self.streams["depth"].paths[k], (camera.height, camera.width), np.uint16)
 
     def depth(self, k: int) -> Float32Array:
@@ -233,23 +250,36 @@ def _read_stream(root: Path, name: StreamName, yaml: StreamYaml) -> Stream:
     real_root = root.resolve()
     missing = "run the same 'rsgen render' again"
     paths = tuple(listed_file(root, real_root, line.path, f"{listing} line {line.number}", missing) for line in lines)
-    indices = np.array([_index(listing, line, yaml) for line in lines], np.int64)
-    stamps = np.array([line.stamp for line in lines])
+    indices = np.array([_frame_number(listing, line, yaml) for line in lines], np.int64)
+    listed = np.array([line.stamp for line in lines])
+    table = _table_of(root, name, indices) if yaml.frame_table else None
+    expected = yaml.first_stamp_s + indices / yaml.rate_hz if table is None else table.listed_s
+    for k in np.flatnonzero(np.abs(listed - expected) > STAMP_TOLERANCE_S)[:1]:
+        raise UserError(
+            f"{listing} line {lines[k].number}: stamp {listed[k]:.9f} is not that of frame {indices[k]}, "
+            f"{expected[k]:.9f}"
+        )
+    stamps = listed if table is None else table.taken_s
     try:
         camera, shutter = yaml.camera, yaml.shutter
     except UserError as error:
         raise UserError(f"{root / 'sequence.yaml'}: streams.{name}: {error}") from None
     scale = yaml.depth_scale if name == "depth" and yaml.depth_scale is not None else 0.0
     clock = (yaml.rate_hz, yaml.offset_s, scale, yaml.frames, yaml.first_stamp_s)
-    return Stream(name, camera, shutter, *clock, stamps, paths, indices)
+    return Stream(name, camera, shutter, *clock, stamps, listed, paths, indices, yaml.registered, table)
 
 
-def _index(listing: Path, line: Line, yaml: StreamYaml) -> int:
-    """Frame number of a listed file, which its name and its stamp have to agree on."""
+def _table_of(root: Path, name: StreamName, indices: IntArray) -> FrameTable:
+    """The frame table's lines of these frames. Raises UserError."""
+    table = read_frame_table(root, name)
+    if absent := sorted(set(indices.tolist()) - set(table.frame.tolist())):
+        raise UserError(f"{root / FRAME_TABLES[name]}: has no frame {absent[0]}: render again to write it")
+    return table.of(indices)
+
+
+def _frame_number(listing: Path, line: Line, yaml: StreamYaml) -> int:
+    """Frame number of a listed file, which its name tells."""
     where, stem = f"{listing} line {line.number}", Path(line.path).stem
     if not (stem.isascii() and stem.isdigit() and len(stem) <= 9 and int(stem) < yaml.frames):
         raise UserError(f"{where}: {line.path!r} is not one of the sequence's {yaml.frames} frames")
-    stamp = yaml.first_stamp_s + int(stem) / yaml.rate_hz
-    if abs(stamp - line.stamp) > STAMP_TOLERANCE_S:
-        raise UserError(f"{where}: stamp {line.stamp:.9f} is not that of frame {int(stem)}, {stamp:.9f}")
     return int(stem)

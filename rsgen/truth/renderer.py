@@ -19,7 +19,7 @@ color_depth: planar z of p, m; 0 at infinity.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -58,33 +58,42 @@ class TruthRenderer:
         self._sensor = RollingShutterSensor(self._camera, self._shutter)
 
     def render(
-        self, T_world_cam: PoseFunction, stamp: float, next_stamp: float | None, seed: int
-    ) -> dict[str, NDArray[Any]]:
+        self, T_world_cam: PoseFunction, stamp: float, next_stamp: float | None, seed: int,
+        exposure_s: tuple[float, float] | None = None, brightness: float = 1.0,
+    ) -> dict[str, NDArray[Any]]:  # fmt: skip
         """Every image of `TruthConfig.images` of the frame at `stamp` (s): uint8 sRGB (h, w, 3), or float32 (h, w, n).
 
         n is the number of the image's EXR channels; with one channel the image is (h, w). `T_world_cam` takes times
         (n,) s to poses (n, 4, 4) of the colour camera; UserError if it ends before a frame's last line. `next_stamp`
         is the next frame's stamp, None after the last frame: then flow_next is 0 and nowhere valid. `seed` decides the
-        random numbers of the frame's twins.
+        random numbers of the frame's twins. exposure_s: of this frame and the next, where they are others than the
+        stream's. brightness: factor on the light of the 8-bit images.
         """
-        truth, mid = self._truth, stamp - 0.5 * self._shutter.exposure_s
+        if exposure_s is not None:
+            shutters = [replace(self._shutter, exposure_s=each) for each in exposure_s]
+        else:
+            shutters = [self._shutter, self._shutter]
+        shutter, gain = shutters[0], self._gain * brightness
+        truth, mid = self._truth, stamp - 0.5 * shutter.exposure_s
         images: dict[str, NDArray[Any]] = {}
         if truth.sharp:
-            images["sharp"] = to_srgb8(self._sharp.render(T_world_cam, mid, _seed(seed, 0)), self._gain)
+            images["sharp"] = to_srgb8(self._sharp.render(T_world_cam, mid, _seed(seed, 0)), gain)
         for time in truth.global_shutter:
-            instant = global_instant(self._camera, self._shutter, stamp, time)
+            instant = global_instant(self._camera, shutter, stamp, time)
             linear = self._global.render(T_world_cam, instant, _seed(seed, 1 + _TIMES.index(time)))
-            images[f"global_{time}"] = to_srgb8(linear, self._gain)
+            images[f"global_{time}"] = to_srgb8(linear, gain)
         if truth.flow or truth.normals or truth.blur_length or truth.color_depth:
-            images |= self._geometry(T_world_cam, stamp, next_stamp)
+            images |= self._geometry(T_world_cam, stamp, next_stamp, *shutters)
         return {name: images[name] for name in truth.images}
 
-    def _geometry(self, T_world_cam: PoseFunction, stamp: float, next_stamp: float | None) -> dict[str, Float32Array]:
-        camera, shutter, truth = self._camera, self._shutter, self._truth
-        self._sensor.expose(T_world_cam, stamp)
+    def _geometry(
+        self, T_world_cam: PoseFunction, stamp: float, next_stamp: float | None, shutter: Shutter, next_shutter: Shutter
+    ) -> dict[str, Float32Array]:
+        camera, truth = self._camera, self._truth
+        self._sensor.expose(T_world_cam, stamp, shutter.exposure_s)
         reference = np.asarray(T_world_cam(np.array([stamp])), float).reshape(4, 4)[:3, 3]
         now = _moving(camera, shutter, T_world_cam, stamp, reference)
-        seen = self._cast(now)
+        seen = self._cast(now, shutter)
         images: dict[str, list[Any]] = {}
         if truth.color_depth:
             images["color_depth"] = [seen.z]
@@ -103,7 +112,7 @@ class TruthRenderer:
                 found = defined & contains(camera, *uv)
                 images[f"flow_global_{time}"] = self._flow(seen, uv, found, still.pose(mi.Float(0))[0], reference)
         if "next" in truth.flow and next_stamp is not None:
-            following = _moving(camera, shutter, T_world_cam, next_stamp, reference)
+            following = _moving(camera, next_shutter, T_world_cam, next_stamp, reference)
             uv, t, found = following.project(following.lens.line_of(*seen.uv), seen.p, seen.w)
             images["flow_next"] = self._flow(seen, uv, found, following.pose(t)[0], reference)
         dr.eval(images)
@@ -113,9 +122,9 @@ class TruthRenderer:
             out["flow_next"] = np.zeros((camera.height * camera.width, 3), np.float32)
         return {name: a.reshape(*shape, *(a.shape[1:] if a.shape[1] > 1 else ())) for name, a in out.items()}
 
-    def _cast(self, now: MovingCamera) -> _Seen:
+    def _cast(self, now: MovingCamera, shutter: Shutter) -> _Seen:
         """What the pixels' centres see at their lines' mid-exposure. The sensor must be exposed to the frame."""
-        camera, shutter = self._camera, self._shutter
+        camera = self._camera
         pixel = dr.arange(mi.UInt32, camera.width * camera.height)
         uv = mi.Point2f(pixel % camera.width, pixel // camera.width)
         position = mi.Point2f((uv.x + 0.5) / camera.width, (uv.y + 0.5) / camera.height)

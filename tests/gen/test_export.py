@@ -26,7 +26,7 @@ from rsgen.export import folder
 from rsgen.export.euroc import export_euroc
 from rsgen.export.folder import place_images, row_clock, sequence_imu
 from rsgen.export.kalibr import export_kalibr
-from rsgen.export.registered import export_registered, register_depth
+from rsgen.export.registered import export_registered
 from rsgen.export.rerun import export_rerun
 from rsgen.export.video import write_video
 from rsgen.geometry import se3
@@ -34,6 +34,7 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import exact_imu
+from rsgen.sensors.registration import register_depth
 from rsgen.sequence.format import STREAMS
 from rsgen.sequence.reader import Sequence, read_sequence
 from rsgen.sequence.trajectory import read_trajectory

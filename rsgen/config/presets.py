@@ -1,0 +1,64 @@
+"""Cameras by name: `preset: kinect_v1` in a config fills in whatever the config does not say itself."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, get_args
+
+Preset = Literal["kinect_v1"]
+
+# A Microsoft Kinect of 2010 under OpenNI, hand-held, as TUM's fr1 sequences have it. Colour: the benchmark's own
+# calibration (Sturm et al., IROS 2012). Infrared camera: focal length and centre as published by N. Burrus, its
+# projector 7.5 cm beside it, the colour camera 2.5 cm, between the two. Periods, grid and jitter of stamps, brightness
+# and its steps as measured on fr1_rpy (docs/measured.md, a real recording). Nobody has published its readout.
+_KINECT_V1: dict[str, Any] = {
+    "color": {
+        "width": 640,
+        "height": 480,
+        "intrinsics": [517.3, 516.5, 318.6, 255.3],
+        "model": "radtan",
+        "distortion": [0.2624, -0.9531, -0.0054, 0.0026, 1.1633],
+        "rate_hz": 29.998,
+        "offset_s": 0.011,
+        "readout_s": 0.028,
+        "exposure_s": 0.015,
+        "noise": {"model": "camera", "gain": 3.0, "bayer": "bilinear", "corner_loss": 0.2},
+        "auto_exposure": {},
+        "auto_white_balance": {},
+        "driver": {"offset_s": 0.020, "jitter_s": 0.0016, "grid_s": 0.004, "dropped": 0.002, "repeated": 0.001},
+    },
+    "depth": {
+        "width": 640,
+        "height": 480,
+        "intrinsics": [594.2, 591.0, 339.3, 242.7],
+        "rate_hz": 29.968,
+        "readout_s": 0.028,
+        "exposure_s": 0.010,
+        "blur_samples": 5,
+        "registered": True,
+        "noise": {
+            "model": "kinect",
+            "scale_error": 0.005,
+            "distortion_px": 0.08,
+            "pattern_px": 0.03,
+        },
+        "driver": {"offset_s": 0.042, "drift_ppm": 0.0, "jitter_s": 0.0016, "grid_s": 0.004, "dropped": 0.002},
+    },
+    "T_color_depth": [[1, 0, 0, -0.025], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
+    "tremor": {"rotation_deg": 0.03, "position_m": 0.0002},
+}
+_PRESETS: dict[str, dict[str, Any]] = {"kinect_v1": _KINECT_V1}
+assert set(_PRESETS) == set(get_args(Preset))
+
+
+def with_preset(data: dict[str, Any]) -> dict[str, Any]:
+    """A config's data with what its `preset` says wherever the data say nothing; null switches a section off."""
+    name = data.get("preset")
+    return _merged(_PRESETS[name], data) if isinstance(name, str) and name in _PRESETS else data
+
+
+def _merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    both = below | above
+    for key in below.keys() & above.keys():
+        if isinstance(below[key], dict) and isinstance(above[key], dict):
+            both[key] = _merged(below[key], above[key])
+    return both

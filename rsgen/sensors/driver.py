@@ -1,0 +1,55 @@
+"""A driver's listing of a stream: stamps of arrival on a computer's clock, images lost, images delivered twice."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rsgen.array_types import BoolArray, FloatArray, IntArray
+from rsgen.config.driver import DriverConfig
+from rsgen.sensors.seed import driver_generator
+from rsgen.sequence.format import StreamName, round_stamps
+
+# Listings must rise; two images that arrive at once are stamped this far apart where no grid keeps them apart.
+_LEAST_STEP_S = 1e-6
+
+
+@dataclass(frozen=True)
+class Delivery:
+    """What a driver makes of a stream's n frames.
+
+    listed (n,): stamps it gives, s, rising. shows (n,): the frame whose image it delivers as frame k, k itself or an
+    earlier one. is_delivered (n,): False where the image was lost.
+    """
+
+    listed: FloatArray
+    shows: IntArray
+    is_delivered: BoolArray
+
+
+def deliver(stamps: FloatArray, config: DriverConfig | None, seed: int, stream: StreamName) -> Delivery:
+    """What the driver makes of frames whose true stamps are `stamps` (n,), s, rising; without a config: all as it is.
+
+    listed = ⌈t + (t − t_0) drift + offset + N(0, jitter²)⌉ to the grid, less half a grid's step so that the mean delay
+    stays `offset_s`; where that does not rise, the later image waits for the next step of the grid. Each frame's random
+    numbers depend on the seed, the stream and the frame's number alone. The first frame is always delivered.
+    """
+    count = len(stamps)
+    frames = np.arange(count)
+    if config is None:
+        return Delivery(stamps, frames, np.ones(count, bool))
+    jitter, fate = (driver_generator(seed, stream, part) for part in ("jitter", "fate"))
+    arrival = stamps + (stamps - stamps[0]) * (1e-6 * config.drift_ppm) + config.offset_s
+    arrival = arrival + config.jitter_s * jitter.standard_normal(count)
+    step = config.grid_s or _LEAST_STEP_S
+    tick = arrival / step
+    if config.grid_s:
+        tick = np.ceil(tick - 0.5)
+    tick = np.maximum.accumulate(tick - frames) + frames
+    drawn = fate.random(count)
+    is_delivered = (drawn >= config.dropped) | (frames == 0)
+    is_repeated = is_delivered & (drawn < config.dropped + config.repeated) & (frames > 0)
+    # A repetition shows the last image that came itself.
+    shows = np.maximum.accumulate(np.where(is_delivered & ~is_repeated, frames, 0))
+    return Delivery(round_stamps(tick * step), np.where(is_delivered, shows, frames), is_delivered)
