@@ -21,6 +21,7 @@ from rsgen.geometry.spline import Spline
 from rsgen.sequence.format import StreamName
 from rsgen.sequence.reader import Sequence, read_sequence
 from rsgen.sequence.trajectory import Trajectory
+from rstrack.data.generated import as_recorded, is_exact
 from rstrack.data.prefetch import prefetched
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.data.seven_scenes import is_seven_scenes, read_seven_scenes
@@ -49,9 +50,9 @@ class Dataset:
 
     stamps: (n,) seconds, one for each depth image, strictly increasing. color_stamps: (m,) seconds, increasing.
     groups: for each frame the indices of its colour images.
-    truth: T_world_depth(t), of rsgen sequences. truth_poses: T_world_depth, of other folders that have it.
-    sequence: the rsgen sequence itself, where it is one. notes: what had to be assumed when it was read. timing: of
-    recordings, how their stamps came about.
+    truth: T_world_depth(t), of exact rsgen sequences. truth_poses: T_world_depth, of others that have it.
+    sequence: the rsgen sequence itself, where it is an exact one (`rstrack.data.generated`). notes: what had to be
+    assumed when it was read. timing: of recordings, how their stamps came about.
     """
 
     name: str
@@ -154,11 +155,27 @@ def open_dataset(path: Path, camera_file: Path | None = None) -> Dataset:
     if camera_file is not None:
         raise UserError(f"{root}: its sequence.yaml holds the cameras: leave the camera file {camera_file} out")
     sequence = read_sequence(root)
+    if not is_exact(sequence):
+        return _of_recorded(root, sequence)
     color, depth = sequence.streams["color"], sequence.streams["depth"]
     rig = Rig(depth.camera, depth.shutter, color.camera, color.shutter, sequence.T_color_depth)
     groups = group_colors(depth.stamps, color.stamps)
     stamps = (depth.stamps, color.stamps)
     return Dataset(sequence.name, root, rig, *stamps, groups, sequence, truth=sequence.spline, sequence=sequence)
+
+
+def _of_recorded(root: Path, sequence: Sequence) -> Dataset:
+    """A sequence with a driver's stamps or registered depth. Raises UserError."""
+    try:
+        found = as_recorded(sequence)
+    except UserError as error:
+        raise UserError(f"{root}: {error}") from None
+    stamps, color_stamps = found.timing.depth.used, found.timing.color.used
+    groups = group_colors(stamps, color_stamps)
+    return Dataset(
+        sequence.name, root, found.rig, stamps, color_stamps, groups, sequence, truth_poses=found.truth_poses,
+        timing=found.timing,
+    )  # fmt: skip
 
 
 def _of_tum(root: Path, tum: TumFolder) -> Dataset:

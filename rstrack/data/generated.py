@@ -1,0 +1,55 @@
+"""Sequences of rsgen as a tracker gets them: exact, or as what a driver and a registration leave of them.
+
+Where a sequence's listed stamps are a driver's, or its depth is registered, it is a recording like any other: cameras
+as sequence.yaml tells them, stamps that are arrival times (`rstrack.data.timing`), colour's offset not known. Its truth
+is the pose of each depth frame when it was taken, under the stamp at which it is tracked.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rsgen.geometry import se3
+from rsgen.sequence.reader import Sequence
+from rsgen.sequence.trajectory import Trajectory
+from rstrack.data.registered_rows import DepthSensor, registered_shutter
+from rstrack.data.rig import Rig
+from rstrack.data.timing import StampsMode, Timing, stream_timing
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What a sequence is to a tracker; truth_poses: T_world_depth of the depth images' camera, at timing's stamps."""
+
+    rig: Rig
+    timing: Timing
+    truth_poses: Trajectory
+
+
+def is_exact(sequence: Sequence) -> bool:
+    """Whether listed stamps are the true ones and depth is the sensor's own."""
+    streams = sequence.streams.values()
+    return not any(s.registered or (s.listed != s.stamps).any() for s in streams)
+
+
+def as_recorded(sequence: Sequence) -> Recorded:
+    """The sequence as a recording. Raises UserError where registered depth's rows have no order."""
+    color, depth = sequence.streams["color"], sequence.streams["depth"]
+    shutter, late_s, T_color_depth = depth.shutter, 0.0, sequence.T_color_depth
+    if depth.registered:
+        sensor = DepthSensor(depth.camera, depth.shutter, sequence.T_color_depth)
+        shutter, late_s = registered_shutter(color.camera, sensor)
+        T_color_depth = np.eye(4)
+    rig = Rig(sequence.depth_image_camera, shutter, color.camera, color.shutter, T_color_depth)
+    has_driver = any((s.listed != s.stamps).any() for s in (color, depth))
+    mode: StampsMode = "auto" if has_driver else "raw"
+    timing = Timing(
+        stream_timing("depth", depth.listed, mode, late_s),
+        stream_timing("colour", color.listed, mode, 0.0),
+        None if has_driver else 0.0,
+    )
+    T_world_depth = sequence.spline.pose(np.clip(depth.stamps + late_s, sequence.spline.t_begin, sequence.spline.t_end))
+    poses = T_world_depth @ se3.inverse(sequence.T_image_depth)
+    return Recorded(rig, timing, Trajectory(timing.depth.used, poses))
