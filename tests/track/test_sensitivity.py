@@ -20,6 +20,7 @@ from rstrack.bench.sensitivity.cases import (
     darkened,
     depth_in_blocks,
     depth_told_global,
+    flashed,
     gained,
     jittered,
     readout_told,
@@ -135,6 +136,8 @@ def test_what_the_cases_change(dataset: Dataset) -> None:
     assert gained(grey, 1.35).tolist() == [[[0, 135, 255]]] and gained(grey, 0.924).tolist() == [[[0, 92, 231]]]
     dark = colors(darkened(dataset)) / np.maximum(colors(dataset), 1)
     assert (dark[:10] == 1).mean() > 0.99 and np.median(dark[10:]) == pytest.approx(0.92, abs=0.01)
+    lit = colors(flashed(with_color(dataset, lambda _, p: np.full_like(p, 100))))[:, 0, 0, 0]
+    np.testing.assert_array_equal(lit, np.where(np.isin(np.arange(FRAMES), [8, 17, 26]), 200, 100))
     swung = with_color(swinging_gain(with_color(dataset, lambda _, p: np.full_like(p, 100)), 0.35), lambda _, p: p)
     expected = 100 * (1 + 0.35 * np.sin(2 * np.pi * np.arange(FRAMES) / 30.0))
     np.testing.assert_allclose(colors(swung)[:, 0, 0, 0], expected, atol=0.51)
@@ -166,7 +169,7 @@ def test_half_the_depth_is_missing_in_blocks(dataset: Dataset) -> None:
 
 def test_a_global_shutter_is_not_told_readouts(dataset: Dataset) -> None:
     names = [case.name for case in cases(dataset)]
-    assert names[0] == "untouched" and len(set(names)) == len(names) == 18
+    assert names[0] == "untouched" and len(set(names)) == len(names) == 21
     still = [case.name for case in cases(readout_told(dataset, factor=0.0))]
     assert [name for name in names if name not in still] == [n for n in names if "readout" in n or "global" in n]
 
@@ -281,17 +284,17 @@ def test_a_table_of_every_case_that_resumes(
     ]
     assert main(words) == 130 and len(json.loads((tmp_path / "t.json").read_text())["scores"]) == 3
     capfd.readouterr()
-    assert main(words) == 0 and len(tracked) == 4 + 15
+    assert main(words) == 0 and len(tracked) == 4 + 18
     out = capfd.readouterr().out.splitlines()
     scores = json.loads((tmp_path / "t.json").read_text())["scores"]
     assert out[0] == "rs-g on synthetic, frames 1 to 7" and out[2].split()[:2] == ["case", "ATE,"]
-    assert len(out) == 3 + len(scores) == 21 and scores[0]["case"] == "untouched"
+    assert len(out) == 3 + len(scores) == 24 and scores[0]["case"] == "untouched"
     assert out[3].split()[-2:] == [str(scores[0]["lost"]), "7"] and out[3].split()[2] == "1.00"
     assert f"{1e3 * scores[5]['ate_m']:.3f}" in out[8]
     table = (tmp_path / "t.md").read_text().splitlines()
     assert table[2].count("|") == table[3].count("|") == 8 and len(table) == 4 + len(scores)
     # Other settings begin anew, other files stay.
-    assert len(run_sensitivity(open_dataset(sequence), Options(method="baseline"), slice(0, 4)).scores) == 18
+    assert len(run_sensitivity(open_dataset(sequence), Options(method="baseline"), slice(0, 4)).scores) == 21
     (tmp_path / "t.json").write_text("{}")
     assert main(words) == 2 and "t.json: is no table" in capfd.readouterr().err
 

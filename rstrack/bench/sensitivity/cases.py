@@ -56,7 +56,8 @@ def cases(dataset: Dataset, seed: int = 0) -> tuple[Case, ...]:
         Case("depth only to 2 m", lambda d: with_depth(d, lambda _, z: np.where(z > 2.0, np.float32(0), z))),
         Case("every second frame", lambda d: reordered(d, range(0, len(d), 2), d.stamps[::2])),
         Case("half the depth missing in blocks", lambda d: depth_in_blocks(d, seed)),
-        Case("colours x 0.92 after a third", darkened),
+        *(Case(f"colours x {g:g} after a third", lambda d, g=g: darkened(d, g)) for g in (0.92, 0.5, 2.0)),
+        Case("a flash x 2 on every ninth image", flashed),
         Case("gain +-35 % in a second's sinus", lambda d: swinging_gain(d, 0.35)),
         Case("1/2 of the resolution", lambda d: reduced(d, 2)),
         Case("1/4 of the resolution", lambda d: reduced(d, 4)),
@@ -110,6 +111,11 @@ def darkened(dataset: Dataset, factor: float = 0.92, after: float = 1 / 3) -> Da
     """Colours times a factor after a part of the colour images."""
     first = round(after * len(dataset.color_stamps))
     return with_color(dataset, lambda k, pixels: gained(pixels, factor) if k >= first else pixels)
+
+
+def flashed(dataset: Dataset, gain: float = 2.0, every: int = 9) -> Dataset:
+    """Colours times a gain in the last image of every `every`."""
+    return with_color(dataset, lambda k, pixels: gained(pixels, gain) if k % every == every - 1 else pixels)
 
 
 def swinging_gain(dataset: Dataset, swing: float, period_s: float = 1.0) -> Dataset:

@@ -17,6 +17,7 @@ import numpy as np
 from rsgen.array_types import ByteArray, Float32Array
 from rsgen.errors import UserError
 from rstrack.bench.sensitivity.changes import reordered, with_color, with_depth
+from rstrack.bench.sensitivity.vibration import vibrating
 from rstrack.data.dataset import Dataset
 
 # Frames before the first insult, for the tracker to begin with, and after the last one, to be found again.
@@ -108,6 +109,15 @@ def bare_wall(dataset: Dataset, first: int, count: int) -> Dataset:
     return with_depth(_with_colors(dataset, first, count, plain), flat)
 
 
+def shaken(dataset: Dataset, first: int, count: int, seed: int) -> Dataset:
+    """Vibration at 12 to 40 Hz by 0.05 to 0.5 degrees about any axis in frames [first, first + count)."""
+    _check(dataset, first, count)
+    rng = np.random.default_rng(seed)
+    axis = rng.normal(size=3)
+    swing = np.radians(rng.uniform(0.05, 0.5)) * axis / np.linalg.norm(axis)
+    return vibrating(dataset, first, count, swing, float(rng.uniform(12.0, 40.0)))
+
+
 def random_insult(dataset: Dataset, seed: int, kind: str | None = None) -> Insult:
     """An insult of a random kind (or a given one of `KINDS`), place, length and strength, by its seed alone.
 
@@ -144,6 +154,7 @@ KINDS: dict[str, Make] = {
     "shuffled": lambda d, first, count, rng: shuffled(d, first, count, int(rng.integers(2**31))),
     "mismatched": _mismatched,
     "sped up": lambda d, first, count, _: sped_up(d, first, count),
+    "shaken": lambda d, first, count, rng: shaken(d, first, count, int(rng.integers(2**31))),
     "bare wall": lambda d, first, count, _: bare_wall(d, first, count),
 }
 """Kinds of insults, made of a dataset, a first frame, a number of frames and a generator for what else is random."""

@@ -10,7 +10,6 @@ import dataclasses
 import json
 import tempfile
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +19,8 @@ from rsgen.errors import UserError
 from rsgen.files import atomic_write
 from rstrack.bench.sensitivity.cases import Case, cases
 from rstrack.bench.sensitivity.changes import reordered
+from rstrack.bench.sensitivity.settings import kept_results, settings_of
 from rstrack.data.dataset import Dataset
-from rstrack.data.estimate import plain
-from rstrack.metrics.association import truth_of
 from rstrack.options import Options
 from rstrack.tracking.run import track
 
@@ -83,25 +81,9 @@ def run_sensitivity(
     Raises UserError: no truth, no such frames, images that cannot be read, a file that is none of ours;
     KeyboardInterrupt once a case that was interrupted has ended.
     """
-    if seed < 0:
-        raise UserError(f"sensitivity: seed = {seed} must be 0 or more")
-    if truth_of(dataset) is None:
-        raise UserError(f"{dataset.root}: has no ground truth to compare with: add a groundtruth.txt")
-    chosen = range(len(dataset))[frames]
-    if not chosen:
-        raise UserError(f"{dataset.root}: has no frame {frames.start}: its frames are 0 to {len(dataset) - 1}")
+    settings, chosen = settings_of(dataset, options, frames, seed)
     cut = reordered(dataset, chosen, dataset.stamps[frames])
-    settings = plain(
-        {
-            "dataset": dataset.name,
-            "path": dataset.root.resolve(),
-            "frames": [chosen.start, chosen.stop],
-            "options": dataclasses.asdict(options),
-            "seed": seed,
-            "version": version("rolling-shutter-rgbd"),
-        }
-    )
-    kept = {} if out is None else _kept(out, settings)
+    kept = {score["case"]: Score(**score) for score in kept_results(out, settings, "scores")}
     report = Sensitivity(settings, ())
     asked = cases(cut, seed)
     for n, case in enumerate(asked):
@@ -133,18 +115,6 @@ def _score(case: Case, dataset: Dataset, options: Options, progress: Progress) -
     if m is None:
         return Score(case.name, None, None, None, lost, len(changed))
     return Score(case.name, m.ate_rmse_m, m.rpe_trans_rmse_m_per_s, m.rpe_rot_rmse_deg_per_s, lost, len(changed))
-
-
-def _kept(path: Path, settings: dict[str, Any]) -> dict[str, Score]:
-    """Scores in a file by case, none if they were made with other settings. Raises UserError: it is not one of ours."""
-    if not path.exists():
-        return {}
-    try:
-        data = json.loads(path.read_text())
-        scores = {score["case"]: Score(**score) for score in data["scores"]}
-        return scores if data["settings"] == settings else {}
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        raise UserError(f"{path}: is no table of 'rstrack sensitivity': remove it or choose another --out") from None
 
 
 def _row(score: Score, base: float | None) -> tuple[str, ...]:
