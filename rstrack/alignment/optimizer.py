@@ -6,7 +6,7 @@ fraction of a pixel the model is only shifted (g += H ε); it is linearised anew
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,10 +55,14 @@ class Problem:
     bandwidth: int = 24
 
 
-def optimise(terms: Terms, state: SplineState, problem: Problem, levels: Sequence[int], most: Sequence[int]) -> Solved:
+def optimise(
+    terms: Terms, state: SplineState, problem: Problem, levels: Sequence[int], most: Sequence[int],
+    hopeless: Callable[[Sequence[Observation]], bool] | None = None,
+) -> Solved:  # fmt: skip
     """Minimise (12) by Levenberg-Marquardt on each of the pyramid's levels, coarse to fine, most[level] steps at most.
 
     A level ends when no line of the fresh images moves any more. Steps that raise the cost are taken back and damped.
+    hopeless: told the fresh observations after each level; the finer ones are spared where it says so.
     Raises numpy.linalg.LinAlgError where the system has no solution.
     """
     done = Solved()
@@ -66,6 +70,8 @@ def optimise(terms: Terms, state: SplineState, problem: Problem, levels: Sequenc
         for observation in problem.fresh:
             observation.forget(state, keep_sigma=level != levels[0])
         _optimise_level(terms, state, problem, level, most[level], done)
+        if hopeless is not None and hopeless(problem.fresh):
+            break
     return done
 
 

@@ -13,6 +13,7 @@ from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Solved
+from rstrack.alignment.pull import Pulls
 
 # A term has to see this share of the reference's pixels, and so many at least, to say anything.
 _LEAST_SHARE = 0.08
@@ -32,6 +33,10 @@ _WORST_SHIFT_PX = 2.0
 _MOST_ACCELERATION = np.array([100.0, 200.0])
 _ALWAYS = np.array([0.05, np.radians(4.0)])
 _MEMORY = 30
+# How far a frame's images, or one term alone, may pull (see `alignment.pull`): so many times the usual, and always so
+# many metres. In the first frames nothing is usual yet.
+_PULL_GROWTH, _PULL_WHOLE, _PULL_ALONE = 8.0, 2e-3, 1e-2
+_FEW = 10
 
 
 @dataclass
@@ -60,33 +65,66 @@ class FitHistory:
     def __init__(self) -> None:
         self._depth = _Usual(_WORST_DEPTH, _HARMLESS_DEPTH)
         self._color = _Usual(_WORST_INTENSITY, _HARMLESS_INTENSITY)
+        self._pulls: deque[Pulls] = deque(maxlen=_MEMORY)
 
     def misfits(self, fresh: Sequence[Observation], expected: int) -> list[tuple[Observation, str]]:
         """Observations that do not fit, and why. expected: pixels that a whole image puts on the reference."""
         return [(o, why) for o in fresh if (why := self._misfit(o, expected))]
 
-    def fault(self, fresh: Sequence[Observation], solved: Solved, expected: int) -> str:
-        """Why a frame has not been found, '' if it has: then it is learnt from."""
+    def fault(self, fresh: Sequence[Observation], solved: Solved, expected: int, pulls: Pulls | None = None) -> str:
+        """Why a frame has not been found, '' if it has: then it is learnt from.
+
+        expected: as in `misfits`. pulls: of `fresh`, where they are judged.
+        """
         if not fresh or not any(o.is_linearised for o in fresh):
             return "hardly a pixel falls on the keyframe"
-        if solved.last_shift > _WORST_SHIFT_PX:
+        if not is_settled(solved):
             return "the alignment does not settle"
         misfits = self.misfits(fresh, expected)
         if misfits:
             return misfits[0][1]
+        if pulls is not None:
+            torn = self._torn(pulls)
+            if torn:
+                return torn
+            self._pulls.append(pulls)
         for o in fresh:
             (self._depth if o.is_depth else self._color).learn(o.lin.next_sigma)
         return ""
+
+    def _torn(self, now: Pulls) -> str:
+        names = "whole", "depth", "color"
+        if any(getattr(now, name) > self._most_pull(name) for name in names[1:]):
+            return "depth and colour do not agree"
+        return "the images do not agree with the motion" if now.whole > self._most_pull(names[0]) else ""
+
+    def _most_pull(self, name: str) -> float:
+        usual = [pull for before in self._pulls if np.isfinite(pull := getattr(before, name))]
+        always = _PULL_WHOLE if name == "whole" else _PULL_ALONE
+        return max(always, _PULL_GROWTH * median(usual)) if len(usual) >= _FEW else np.inf
+
+    def is_hopeless(self, fresh: Sequence[Observation]) -> bool:
+        """Whether no term of a frame, aligned at a coarse level, fits a part of its pixels that a finer one could."""
+        return not any(o.is_linearised and o.lin.fit >= _least_fit(o) for o in fresh)
 
     def _misfit(self, o: Observation, expected: int) -> str:
         name, usual = ("depth", self._depth) if o.is_depth else ("colour", self._color)
         if not o.is_linearised or o.lin.count < max(_LEAST_PIXELS, _LEAST_SHARE * expected):
             return f"hardly a pixel of the {name} image falls on the keyframe"
-        if o.lin.fit < (_LEAST_FIT_DEPTH if o.is_depth else _LEAST_FIT_COLOR):
+        if o.lin.fit < _least_fit(o):
             return f"the {name} image shows something else"
         if o.lin.next_sigma > usual.limit(o.lin.floor):
             return f"the {name} image does not fit"
         return ""
+
+
+def _least_fit(o: Observation) -> float:
+    return _LEAST_FIT_DEPTH if o.is_depth else _LEAST_FIT_COLOR
+
+
+def is_settled(solved: Solved) -> bool:
+    """Whether the last step hardly moved a line."""
+    return solved.last_shift <= _WORST_SHIFT_PX
 
 
 def implausible(T_predicted: FloatArray, T_found: FloatArray, dt: float) -> bool:

@@ -23,6 +23,7 @@ from rstrack.alignment.independence import Independence
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Solved
+from rstrack.alignment.pull import pulls
 from rstrack.data.rig import Frame, Rig
 from rstrack.images.device_frame import DeviceFrame, DeviceRig, Timer, untimed
 from rstrack.images.pyramid import DepthImage
@@ -30,8 +31,9 @@ from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.keyframes.store import KeyframeStore
 from rstrack.options import Options
+from rstrack.tracking import coarse_search
 from rstrack.tracking.frame_report import FrameReport, frame_report
-from rstrack.tracking.lost_track import FitHistory, implausible
+from rstrack.tracking.lost_track import FitHistory, implausible, is_settled
 from rstrack.tracking.window import LEVELS, TRACKING_LEVELS, Window
 
 # Seconds without a frame after which the motion before says nothing about where the camera is, and beyond which
@@ -45,8 +47,8 @@ _LEAST_DEPTH = 0.02
 _LATE_SHARE = 0.2
 # Frames of a new piece that are aligned jointly: fewer do not tell its velocity.
 _YOUNG = 4
-# Starts from which a lost frame is looked for, and how many of them are followed to the end.
-_STARTS, _TRIED = 3, 1
+# Keyframes at which a lost frame is looked for, at once.
+_PLACES = 3
 
 
 class Tracker:
@@ -121,7 +123,7 @@ class Tracker:
             report = self._start(new)
         elif not self._keyframes:
             report = self._bootstrap(new)
-        elif gap > _GAP_S:
+        elif stamp - self._stamps[-1] > _GAP_S:
             report = self._relocalise(new)
         else:
             report = self._track(new, gap)
@@ -141,14 +143,17 @@ class Tracker:
         mid, T_predicted = new.depth.exposure.mid_time, window.spline.pose(new.depth.exposure.mid_time)
         coupled = ref.rolling is not None
         levels = LEVELS if young else TRACKING_LEVELS
-        solved = window.solve(fresh, levels, gauge, coupled)
+        solved = window.solve(fresh, levels, gauge, coupled, self._fits.is_hopeless)
+        if not is_settled(solved) and not self._fits.is_hopeless(fresh):
+            # Its steps went to and fro; that says nothing against the place.
+            solved = window.solve(fresh, (0,), gauge, coupled)
         fitting = self._without_misfits(fresh, on_reference, ref)
         if len(fitting) < len(fresh):
             window = before.copy()
             window.predict(new, self.spline_valid[-1][1], young)
             fresh, on_reference = fitting, [o for o in fitting if o.ref is ref]
             solved = window.solve(fresh, levels, gauge, coupled)
-        fault = self._fits.fault(on_reference, solved, ref.pixels)
+        fault = self._fits.fault(on_reference, solved, ref.pixels, pulls(on_reference, window.state))
         if fault or implausible(T_predicted, window.spline.pose(mid), gap):
             self._window = before
             return self._relocalise(new)
@@ -258,30 +263,29 @@ class Tracker:
     def _relocalise(self, new: DeviceFrame) -> FrameReport:
         """Find a frame's place: where the track ended, or at any keyframe ever made that looks like it.
 
-        Coarse alignments from few starts, the best of which is aligned to the end and judged; others take their turn
+        Small images are aligned to some of them, and the whole one from the best of these poses; others take their turn
         with the next frame. What was reported before stays as it is.
         """
         window, ref = self._known()
         end = self.spline_valid[-1][1]
         newest = self._keyframes.newest if ref.rolling is not None else ref
-        starts = [(newest, window.spline.pose(end))]
-        skip = (self._lost_in_a_row // 2) * (_STARTS - 1)
-        others = self._keyframes.candidates(new, skip, _STARTS - 1)
-        starts += [(other, other.T_world_base) for other in others] or [(newest, newest.T_world_base)]
-        trials: list[tuple[float, int, Window, list[Observation], Reference]] = []
-        for candidate, T_world_body in starts:
-            trial = window.restarted(new, end, T_world_body)
-            fresh = self._observe(new, candidate, _matched(new, candidate))
-            trial.solve(fresh, levels=(2,))
-            trials.append((_promise(fresh), len(trials), trial, fresh, candidate))
-        for _, _, trial, fresh, candidate in sorted(trials, key=lambda t: t[:2])[:_TRIED]:
-            solved = trial.solve(fresh, TRACKING_LEVELS)
-            if self._fits.fault(fresh, solved, candidate.pixels):
-                continue
-            return self._resume(new, trial, fresh, solved, candidate)
-        window.active = []
-        self._recent.clear()
+        skip = (self._lost_in_a_row // 2) * (_PLACES - 1)
+        places = [newest, *self._keyframes.candidates(new, skip, _PLACES - 1)]
+        T_ends = [window.spline.pose(end), *(place.T_world_base for place in places[1:])]
+        found = coarse_search.ranked(
+            coarse_search.small_frame(new, self.rig, self.options.geometric),
+            [(coarse_search.small_keyframe(ref), se3.inverse(ref.T_world_base) @ T)
+             for ref, T in zip(places, T_ends, strict=True)],
+        )  # fmt: skip
         self._lost_in_a_row += 1
+        if found:
+            chosen, T_ref_cam = found[(self._lost_in_a_row - 1) % len(found)]
+            candidate = places[chosen]
+            trial = window.restarted(new, end, candidate.T_world_base @ T_ref_cam)
+            fresh = self._observe(new, candidate, _matched(new, candidate))
+            solved = trial.solve(fresh, LEVELS, hopeless=self._fits.is_hopeless)
+            if not self._fits.fault(fresh, solved, candidate.pixels, pulls(fresh, trial.state)):
+                return self._resume(new, trial, fresh, solved, candidate)
         return self._report(new, lost=True)
 
     def _resume(
@@ -420,9 +424,3 @@ def observe(
 
 def _matched(frame: DeviceFrame, ref: Reference) -> FloatArray:
     return brightness.matched(frame.colors[0].moments, ref.moments) if frame.colors and ref.points else brightness.SAME
-
-
-def _promise(fresh: Sequence[Observation]) -> float:
-    """Smaller for a better coarse alignment: the part of the compared pixels that do not fit, over those that are."""
-    seen = [o.lin for o in fresh if o.is_linearised and o.lin.compared]
-    return min((-lin.fit * np.sqrt(lin.count) for lin in seen), default=0.0)

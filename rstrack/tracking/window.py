@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -85,12 +85,13 @@ class Window:
 
     def solve(
         self, fresh: Sequence[Observation], levels: Sequence[int] = LEVELS, gauge: Reference | None = None,
-        coupled: bool = False,
+        coupled: bool = False, hopeless: Callable[[Sequence[Observation]], bool] | None = None,
     ) -> Solved:  # fmt: skip
         """Align fresh observations, together with the active ones, by moving the free control points.
 
         gauge: a reference at whose pose the spline is held. coupled: lines depend on control points far apart, as those
-        against a reference that moves too. What was solved for becomes active with `keep`.
+        against a reference that moves too. hopeless: whether to end before the finest level, see `optimise`. What was
+        solved for becomes active with `keep`.
         """
         free = self.first_free, len(self.state.points)
         priors = [self._motion_prior(free)] + ([] if gauge is None else [_pose_prior(gauge)])
@@ -99,7 +100,7 @@ class Window:
         bandwidth = 6 * (free[1] - free[0]) if coupled else 24
         problem = Problem(fresh, self.active, free, priors, self._focal, bandwidth)
         try:
-            return optimise(self._terms, self.state, problem, levels, _MOST_STEPS)
+            return optimise(self._terms, self.state, problem, levels, _MOST_STEPS, hopeless)
         except np.linalg.LinAlgError:
             # The images say nothing about some motion, not even with the prior: as lost as can be.
             return Solved()

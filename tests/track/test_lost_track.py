@@ -11,6 +11,7 @@ import pytest
 
 from rsgen.geometry import se3
 from rstrack.alignment.optimizer import Solved
+from rstrack.alignment.pull import Pulls
 from rstrack.tracking.lost_track import FitHistory, implausible
 
 NOTHING, UNSETTLED = "hardly a pixel falls on the keyframe", "the alignment does not settle"
@@ -35,8 +36,10 @@ def term(kind: str, sigma: float, count: int = 5000, floor: float = 0.0, fit: fl
     return SimpleNamespace(is_depth=kind == "depth", is_linearised=True, lin=lin)
 
 
-def fault(history: FitHistory, terms: Iterable[Any], shift: float = 0.05, expected: int = 5000) -> str:
-    return history.fault(list(terms), Solved(last_shift=shift), expected)
+def fault(
+    history: FitHistory, terms: Iterable[Any], shift: float = 0.05, expected: int = 5000, pulled: Pulls | None = None
+) -> str:
+    return history.fault(list(terms), Solved(last_shift=shift), expected, pulled)
 
 
 def after(kind: str, sigmas: Iterable[float]) -> FitHistory:
@@ -139,6 +142,38 @@ def test_depth_and_colour_are_remembered_apart() -> None:
 def test_all_misfits_are_named() -> None:
     bad, good = term("color", 0.5), term("depth", 1e-3)
     assert FitHistory().misfits([good, bad], 5000) == [(bad, odd("color"))]
+
+
+@pytest.mark.parametrize(
+    ("name", "usual", "limit", "says"),
+    [
+        ("whole", 1e-3, 8e-3, "the images do not agree with the motion"),
+        ("whole", 1e-5, 2e-3, "the images do not agree with the motion"),
+        ("depth", 2e-3, 16e-3, "depth and colour do not agree"),
+        ("color", 1e-4, 1e-2, "depth and colour do not agree"),
+    ],
+)
+def test_images_that_pull_much_more_than_usual_are_elsewhere(name: str, usual: float, limit: float, says: str) -> None:
+    def pulled(metres: float) -> Pulls:
+        return Pulls(**({"whole": 0.0, "depth": 0.0, "color": 0.0} | {name: metres}))
+
+    history, good = FitHistory(), [term("depth", 1e-3)]
+    for k in range(10):
+        # Nothing is usual yet: the first few may pull as they like.
+        assert fault(history, good, pulled=pulled(1.0 if k == 4 else usual)) == ""
+    for _ in range(20):
+        assert fault(history, good, pulled=pulled(1.01 * limit)) == says
+    assert fault(history, good, pulled=pulled(0.99 * limit)) == ""
+    # What is not there does not pull, and where it is not judged nothing is said or learnt.
+    assert fault(history, good, pulled=pulled(float("nan"))) == fault(history, good) == ""
+
+
+def test_a_coarse_level_is_hopeless_where_neither_term_fits() -> None:
+    bad, good = term("depth", 1e-3, fit=0.49), term("color", 1e-3, fit=0.61)
+    history = FitHistory()
+    assert history.is_hopeless([bad]) and history.is_hopeless([]) and not history.is_hopeless([bad, good])
+    assert history.is_hopeless([bad, term("color", 1e-3, fit=0.59)])
+    assert history.is_hopeless([SimpleNamespace(is_linearised=False)])  # type: ignore[list-item]
 
 
 @pytest.mark.parametrize(("axis", "limit"), [(0, 0.15), (2, 0.15), (4, np.radians(4.0) + 0.2)])

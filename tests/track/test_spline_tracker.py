@@ -77,6 +77,34 @@ def test_a_gap_is_bridged_from_the_last_keyframes() -> None:
     assert lost(tracker) == [] and len(tracker.spline_valid) == 2 and worst_step(tracker) < 2e-3
 
 
+def shown_at(shown: int, k: int) -> Frame:
+    """Frame `shown` under the stamp of frame k."""
+    frame, late = frame_at(shown), (k - shown) / 30.0
+    colors = tuple(replace(c, stamp=c.stamp + late) for c in frame.colors)
+    return replace(frame, depth=replace(frame.depth, stamp=k / 30.0), colors=colors)
+
+
+def test_a_camera_that_was_carried_away_is_found_at_once_and_what_was_said_stays() -> None:
+    """Frames are missing, time goes on without a gap; then a frame alone between lost ones."""
+    tracker = tracker_of("rs-pg")
+    shown = [*range(12), 28, None, 29, None, 12, 13]
+    at_once = []
+    for k, source in enumerate(shown):
+        frame = blank(frame_at(k)) if source is None else shown_at(source, k)
+        black = tuple(replace(c, pixels=np.zeros_like(c.pixels)) for c in frame.colors)
+        tracker.feed(replace(frame, colors=black) if source is None else frame)
+        at_once.append(tracker.trajectory[1][-1])
+    assert lost(tracker) == [13, 15]
+    found = [(k, source) for k, source in enumerate(shown) if source is not None]
+    T = tracker.trajectory[1]
+    T_true = TRUTH.pose(np.array([source / 30.0 for _, source in found]))
+    T_end = np.linalg.inv(T_true[1]) @ T_true
+    for i, (k, source) in enumerate(found[9:], 9):
+        assert np.linalg.norm((se3.inverse(T[1]) @ T[i])[:3, 3] - T_end[i][:3, 3]) < 4e-3, (k, source)
+        if k >= 12:
+            assert np.linalg.norm(T[i][:3, 3] - at_once[k][:3, 3]) < 3e-3
+
+
 def test_colour_may_come_late_but_there_is_no_keyframe_without_it() -> None:
     def frames(first_color: int) -> Iterable[Frame]:
         return (frame_at(k) if k >= first_color else replace(frame_at(k), colors=()) for k in range(14))

@@ -1,0 +1,73 @@
+"""How far images pull: rigid motions of known size, balance, and what is not seen."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from pose_terms import DEPTH_M, PoseTerms, sighting
+from rstrack_util import hand_held
+
+from rsgen.array_types import FloatArray
+from rsgen.geometry import se3
+from rstrack.alignment.observation import Observation
+from rstrack.alignment.pull import pulls
+from rstrack.alignment.spline_state import SplineState
+
+TRUTH = hand_held(3)
+TIMES = np.linspace(0.40, 0.43, 9)
+MID = float(TIMES.mean())
+
+
+class OfDepth(Observation):
+    """A sighting that counts as a depth image."""
+
+    @property
+    def is_depth(self) -> bool:
+        return True
+
+
+def sight(v: Any = (0, 0, 0), phi: Any = (0, 0, 0), weight: float = 1e6, kind: type[Observation] = Observation) -> Any:
+    """An image that saw the camera shifted by v (m) and turned by phi (rad) about where it is at mid readout."""
+    about = np.eye(4)
+    about[:3, 3] = TRUTH.pose(MID)[:3, 3]
+    T = about @ se3.exp(np.array([*v, *phi])) @ se3.inverse(about)
+    made = sighting(TIMES, T @ TRUTH.pose(TIMES))
+    made.image.exposure = SimpleNamespace(mid_time=MID)  # type: ignore[attr-defined]
+    made = kind(0, made.image, made.ref, independent=weight)
+    made.linearise(PoseTerms(), SplineState(TRUTH), 0)  # type: ignore[arg-type]
+    return made
+
+
+@pytest.mark.parametrize(
+    ("v", "phi", "metres"),
+    [
+        ((3e-3, 0, 0), (0, 0, 0), 3e-3),
+        ((0, -1e-3, 2e-3), (0, 0, 0), np.sqrt(5) * 1e-3),
+        ((0, 0, 0), (0, 2e-3, 0), 2e-3 * DEPTH_M),
+        ((4e-3, 0, 0), (0, 0, -1e-3), 4e-3 + 1e-3 * DEPTH_M),
+    ],
+)
+def test_a_frame_that_was_seen_elsewhere_pulls_there(v: FloatArray, phi: FloatArray, metres: float) -> None:
+    found = pulls([sight(v, phi)], SplineState(TRUTH))
+    assert found.whole == found.color == pytest.approx(metres, rel=0.02) and np.isnan(found.depth)
+
+
+def test_images_that_disagree_balance_each_other_but_pull_alone() -> None:
+    found = pulls([sight((2e-3, 0, 0), kind=OfDepth), sight((-2e-3, 0, 0))], SplineState(TRUTH))
+    assert found.whole < 1e-5
+    assert found.depth == pytest.approx(2e-3, rel=0.01) and found.color == pytest.approx(2e-3, rel=0.01)
+
+
+def test_what_is_hardly_seen_hardly_pulls_and_what_was_not_seen_at_all() -> None:
+    assert pulls([sight((2e-3, 0, 0), weight=0.1)], SplineState(TRUTH)).whole < 2e-5
+    none = pulls([sighting(TIMES, TRUTH.pose(TIMES))], SplineState(TRUTH))
+    assert np.isnan([none.whole, none.depth, none.color]).all()
+
+
+def test_they_are_those_of_the_state_not_of_the_linearisation() -> None:
+    state, one = SplineState(TRUTH), sight((2e-3, 0, 0))
+    state.apply(0, np.tile([2e-3, 0.0, 0.0, 0.0, 0.0, 0.0], (len(state.points), 1)))
+    assert pulls([one], state).whole < 2e-5
