@@ -67,7 +67,7 @@ def small_frame(frame: DeviceFrame, rig: Rig, geometric: bool) -> SmallFrame:
     """A frame as the search takes it. geometric: whether its depth is looked at."""
     depth = frame.depth.thumbnail
     inverse_depth = _pinhole(np.where(depth > 0, depth, np.nan), rig.depth_camera) if geometric else None
-    intensity = _pinhole(frame.colors[0].thumbnail, rig.color_camera) if frame.colors else None
+    intensity = _pinhole(np.asarray(frame.colors[0].thumbnail, float), rig.color_camera) if frame.colors else None
     return SmallFrame(inverse_depth, intensity, rig.T_color_depth)
 
 

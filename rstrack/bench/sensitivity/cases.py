@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -56,7 +57,7 @@ def cases(dataset: Dataset, seed: int = 0) -> tuple[Case, ...]:
         Case("depth only to 2 m", lambda d: with_depth(d, lambda _, z: np.where(z > 2.0, np.float32(0), z))),
         Case("every second frame", lambda d: reordered(d, range(0, len(d), 2), d.stamps[::2])),
         Case("half the depth missing in blocks", lambda d: depth_in_blocks(d, seed)),
-        *(Case(f"colours x {g:g} after a third", lambda d, g=g: darkened(d, g)) for g in (0.92, 0.5, 2.0)),
+        *(Case(f"colours x {g:g} after a third", partial(darkened, factor=g)) for g in (0.92, 0.5, 2.0)),
         Case("a flash x 2 on every ninth image", flashed),
         Case("gain +-35 % in a second's sinus", lambda d: swinging_gain(d, 0.35)),
         Case("1/2 of the resolution", lambda d: reduced(d, 2)),
