@@ -67,11 +67,6 @@ class Options:
         "for the baseline",
     ] = "keyframe"
     voxel_m: Annotated[float, "voxels of that volume, m"] = 0.01
-    follow_color_clock: Annotated[
-        bool | None,
-        "estimate how late every colour image is against its stamp (default: yes where stamps are jittered arrival "
-        "times, no for rendered sequences)",
-    ] = None
 
     def __post_init__(self) -> None:
         for name, known in (("method", METHODS), ("keyframe_strategy", STRATEGIES), ("reference", SOURCES)):

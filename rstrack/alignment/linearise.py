@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -10,11 +10,10 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.device.arrays import Engine, Kernels
 from rsgen.device.lens import Lens
-from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import BlockSums, Scaling, block_counts
-from rstrack.alignment.brightness import SAME, Eliminated, eliminate, with_lateness
+from rstrack.alignment.brightness import SAME, Eliminated, eliminate
 from rstrack.alignment.independence import inflation
 from rstrack.alignment.normal_equations import Quadratic, chain
 from rstrack.alignment.residuals import (
@@ -34,8 +33,6 @@ from rstrack.options import Options
 
 # Smallest credible σ of depth (m): quantisation and interpolation leave about as much.
 _CREDIBLE_DEPTH = 2e-4
-# How late a colour image may be beyond what the images before were, as σ in s, where that is followed.
-_LATE_SIGMA_S = 2e-3
 
 
 @dataclass(frozen=True)
@@ -83,7 +80,8 @@ class Terms:
 
     e: Engine
     rays: tuple[Any, Any]
-    # Residual beyond which a pixel is an outlier for certain (m, by level; intensity), and smallest credible σ.
+    # Residual beyond which a pixel is an outlier for certain (m up to a distance of 1 m and growing with it, by level;
+    # intensity), and smallest credible σ.
     gate_depth: tuple[float, ...] = (0.05, 0.05, 0.3)
     gate_intensity: float = 0.3
     floor_depth: float = _CREDIBLE_DEPTH
@@ -92,8 +90,6 @@ class Terms:
     blur_sigma_px: float = 0.0
     # Where interpolation errs by more than this part of σ, its bias counts, not its size: those pixels are left out.
     smooth: float = 0.25
-    # σ of how late colour images may be (s), 0 where their stamps are right.
-    late_sigma_s: float = 0.0
     timer: Timer = untimed
     _kernel: Kernels = field(init=False)
 
@@ -103,11 +99,7 @@ class Terms:
     @classmethod
     def of(cls, device: DeviceRig, options: Options) -> Terms:
         """The terms of a rig as a method has them."""
-        late_sigma_s = _LATE_SIGMA_S if options.follow_color_clock else 0.0
-        return cls(
-            device.e, device.device_rays, blur_sigma_px=options.blur_sigma_px, late_sigma_s=late_sigma_s,
-            timer=device.timer,
-        )  # fmt: skip
+        return cls(device.e, device.device_rays, blur_sigma_px=options.blur_sigma_px, timer=device.timer)
 
     def geometric(
         self, image: DepthImage, ref: Reference, spline: Spline, level: int, sigma: float,
@@ -140,7 +132,7 @@ class Terms:
         e, lens = self.e, image.exposure.lens
         kernel = self._kernel(geometric_kernel, lens, ref.lens, STRIDES[level])
         scaling = self._scaling(ref, lens, lens.camera, ref, STRIDES[level], 1)
-        gate = self.gate_depth[level]
+        gate = self.gate_depth[level] * max(1.0, ref.median_depth)
         gate = min(gate, max(5.0 * sigma, 10 * self._floor_depth(image, ref))) if level == 0 else gate
         smooth = self.smooth * max(sigma, _CREDIBLE_DEPTH)
         constants = e.upload(np.append(scaling.parameters(sigma, gate), smooth))
@@ -169,23 +161,22 @@ class Terms:
     ) -> Linearised:  # fmt: skip
         """The reference's points of a level, those that are `visible`, against that level of the colour image.
 
-        brightness (3,): gain, offset and lateness of the image here; expected (3,): before anything is known of it.
+        brightness (2,): gain and offset of the image here; expected (2,): before anything is known of it.
         """
         with self.timer(f"photometric kernel, level {level}"):
             e, lens, points = self.e, image.exposure.lens, ref.points[level]
             kernel = self._kernel(photometric_kernel, lens, ref.lens, STRIDES[level], level, self.blur_sigma_px)
-            exposure = replace(image.exposure, stamp=image.exposure.stamp + float(brightness[2]))
-            from_base = self._from_base(spline, ref.T_world_base, exposure)
+            from_base = self._from_base(spline, ref.T_world_base, image.exposure)
             # Moving closer or turning packs more points into a block than its share.
             scaling = self._scaling(points, lens, ref.lens.camera, ref, STRIDES[level], 4)
-            constants = e.upload(np.append(scaling.parameters(sigma, self.gate_intensity), brightness[:2]))
+            constants = e.upload(np.append(scaling.parameters(sigma, self.gate_intensity), brightness))
             seen_at = self._ref_lines(spline, ref), image.levels[level], from_base
             shown = points.visible if visible is None else visible
             given = PhotometricInput(points.x, points.y, points.z, points.intensity, shown, *seen_at, constants)
             raw = kernel(given).numpy()
             current, reference, per, ref_per = block_counts(lens, ref.lens)
             sums = scaling.unpack(raw, current, reference)
-            times = exposure.block_times(per)
+            times = image.exposure.block_times(per)
             return self._finish(
                 sums, slopes_at or spline, ref, times, ref_per, sigma, self.floor_intensity, points.median_depth,
                 brightness, expected,
@@ -224,26 +215,19 @@ class Terms:
     ) -> Linearised:  # fmt: skip
         ref_times = None if ref.rolling is None else ref.rolling.block_times(ref_per)
         with self.timer("linear algebra: chain"):
-            own = None if sums.brightness is None else with_lateness(sums, _velocity(spline, ref, times))
-            chained = chain(sums, spline, ref.T_world_base, times, ref_times, own and own[0])
+            own = sums.brightness
+            chained = chain(sums, spline, ref.T_world_base, times, ref_times, None if own is None else own.coupling)
         model, motion, coupling = chained
         model = Quadratic(model.first, model.H / sigma**2, model.g / sigma)
         cost, eliminated = sums.cost, None
         if own is not None:
-            scaled = coupling / sigma**2, own[1] / sigma**2, own[2] / sigma
-            model, eliminated, surprise = eliminate(model, *scaled, brightness, expected, self.late_sigma_s)
+            scaled = coupling / sigma**2, own.H / sigma**2, own.g / sigma
+            model, eliminated, surprise = eliminate(model, *scaled, brightness, expected)
             cost += surprise
         next_sigma = scale_step(sigma, sums.weighted, sums.count, floor)
         seen = seen_motions(sums, median_depth)
         counts = sums.count, sums.compared
         return Linearised(model, motion, sigma, next_sigma, cost, *counts, floor, seen, inflation(sums), eliminated)
-
-
-def _velocity(spline: Spline, ref: Reference, times: FloatArray) -> FloatArray:
-    """Twist per second (n, 6) of the camera at `times`, in the reference's base frame."""
-    T_world_body, twist = spline.pose_and_velocity(times)
-    to_base = se3.adjoint(se3.inverse(ref.T_world_base) @ T_world_body)
-    return np.asarray((to_base @ twist[..., None])[..., 0])
 
 
 def seen_motions(sums: BlockSums, median_depth: float) -> FloatArray:

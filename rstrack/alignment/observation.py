@@ -18,8 +18,8 @@ from rstrack.keyframes.keyframe import STRIDES, Reference
 
 # Increments of control points (m, rad) that change the derivatives of lines by less than a step's own error.
 _SAME_SLOPES = 5e-3
-# Change of gain and offset, in σ of the intensities, and of lateness (s) that calls for a new linearisation.
-_SAME = np.array([0.2, 0.2, 2e-4])
+# Change of gain and offset, in σ of the intensities, that calls for a new linearisation.
+_SAME = 0.2
 # Errors at the start of a level, as σ: m and intensity; re-estimated with every linearisation.
 START_DEPTH, START_INTENSITY = 5e-3, 0.03
 
@@ -29,7 +29,7 @@ class _Linearisation:
     """What an observation knows: the model and the next σ.
 
     at: increments (m, 6) of the control points that it was made at. stands_for: pixels of the finest level for each.
-    brightness: gain, offset and lateness (3,) of a colour image there.
+    brightness: gain and offset (2,) of a colour image there.
     """
 
     lin: Linearised | None = None
@@ -43,8 +43,8 @@ class _Linearisation:
 class Observation:
     """An image against a reference. linearisation: the last one; putting an earlier one back takes a step back.
 
-    occluder: the depth image that tells which points of the reference a colour image cannot see. expected: gain,
-    offset and lateness (3,) of a colour image against the reference, as far as can be told beforehand.
+    occluder: the depth image that tells which points of the reference a colour image cannot see. expected: gain and
+    offset (2,) of a colour image against the reference, as far as can be told beforehand.
     independent: part of its pixels that count, see `Independence`.
     """
 
@@ -109,7 +109,7 @@ class Observation:
         self.linearisation = _Linearisation(lin, lin.next_sigma, state.moved.copy(), stands_for, brightness)
 
     def brightness(self, state: SplineState) -> FloatArray:
-        """Gain, offset and lateness (3,) of a colour image in the current state; at first those expected."""
+        """Gain and offset (2,) of a colour image in the current state; at first those expected."""
         lin, before = self.linearisation.lin, self.linearisation.brightness
         if lin is None or lin.brightness is None:
             return self.expected if before is None else before
@@ -120,7 +120,7 @@ class Observation:
         lin, before = self.linearisation.lin, self.linearisation.brightness
         if lin is None:
             return np.inf
-        if before is not None and (np.abs(self.brightness(state) - before) > _SAME * [lin.sigma, lin.sigma, 1.0]).any():
+        if before is not None and (np.abs(self.brightness(state) - before) > _SAME * lin.sigma).any():
             return np.inf
         return lin.row_shift(self._since(state), focal, self.ref.median_depth)
 
@@ -133,6 +133,12 @@ class Observation:
         model = self.lin.model
         moved = self._since(state)[model.first : model.last].ravel()
         return self.stands_for * float(model.g @ moved + 0.5 * moved @ model.H @ moved)
+
+    def distance(self, state: SplineState) -> float:
+        """How far the state is from that of the linearisation, squared, in σ of what this image tells."""
+        model = self.lin.model
+        moved = self._since(state)[model.first : model.last].ravel()
+        return self.stands_for * float(moved @ model.H @ moved)
 
     def _slopes(self, state: SplineState) -> Spline:
         """Where the poses of its lines are differentiated: an earlier state as long as that is as good."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rsgen.array_types import FloatArray
+from rstrack.alignment.acceleration import Acceleration
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.normal_equations import assemble, solve
 from rstrack.alignment.observation import Observation
@@ -25,6 +26,9 @@ RELINEARISE_PX = 0.02
 # The same for noisy depth: part of what its σ moves a pixel by. (Noise-free depth is held to the pixels above,
 # and what does not fit must not end early for it.)
 _NOISE_SHARE, _MOST_TOLERANCE_PX = 0.1, 0.08
+# Where noise, not rounding, is what limits: σ over the smallest credible one. A step shorter than so many σ of the
+# result, squared, is the last one there, and what has moved less keeps its linearisation.
+_NOISY, _MATTERS = 2.0, 0.1
 # Rise of the negative log-likelihood per pixel from which on a step has made things worse: less is noise of gating.
 _WORSE = 2e-5
 
@@ -80,6 +84,7 @@ def _optimise_level(terms: Terms, state: SplineState, problem: Problem, level: i
     every = (*problem.fresh, *problem.settled)
     weights: dict[int, float] = {}
     step: FloatArray | None = None
+    acceleration, is_plain = Acceleration(), True
     before = [o.linearisation for o in every]
     for _ in range(most):
         done.evaluations += _linearise(terms, state, problem, level)
@@ -91,7 +96,8 @@ def _optimise_level(terms: Terms, state: SplineState, problem: Problem, level: i
             for observation, kept in zip(every, before, strict=True):
                 observation.linearisation = kept
             priors = [prior(state.spline) for prior in problem.priors]
-            damping = max(1e-3, 10.0 * damping)
+            damping = max(1e-3, 10.0 * damping) if is_plain else damping
+            acceleration.forget()
             done.refused += 1
         else:
             damping, cost = 0.1 * damping if damping > 1e-4 else 0.0, now
@@ -100,15 +106,25 @@ def _optimise_level(terms: Terms, state: SplineState, problem: Problem, level: i
         with terms.timer("linear algebra: assemble"):
             H, g = assemble(models, *problem.free)
         with terms.timer("linear algebra: solve"):
-            step = _damped_step(H, g, damping, problem.bandwidth)
+            plain = _damped_step(H, g, damping, problem.bandwidth)
+            at = state.moved[first : first + len(plain)].ravel()
+            step = acceleration.extrapolated(at, plain.ravel(), H).reshape(-1, 6)
+            is_plain = bool((step == plain).all())
         state.apply(first, step)
         done.iterations += 1
-        increments = np.zeros_like(state.moved)
-        increments[first : first + len(step)] = step
-        shifts = [o.lin.row_shift(increments, problem.focal, o.ref.median_depth) for o in problem.fresh]
-        done.last_shift = max(shifts, default=0.0)
+        done.last_shift = max(_shift(problem, first, step, state), _shift(problem, first, plain, state))
         if done.last_shift < (_tolerance(problem) if level == 0 else STOP_PX[level]):
             break
+        if -float(g @ plain.ravel()) < _MATTERS and all(_is_noisy(o) for o in problem.fresh):
+            break
+
+
+def _shift(problem: Problem, first: int, step: FloatArray, state: SplineState) -> float:
+    """Pixels by which a step (n, 6) of the control points from `first` on moves the lines of the fresh images."""
+    increments = np.zeros_like(state.moved)
+    increments[first : first + len(step)] = step
+    shifts = [o.lin.row_shift(increments, problem.focal, o.ref.median_depth) for o in problem.fresh]
+    return max(shifts, default=0.0)
 
 
 def _damped_step(H: FloatArray, g: FloatArray, damping: float, bandwidth: int) -> FloatArray:
@@ -131,14 +147,26 @@ def _linearise(terms: Terms, state: SplineState, problem: Problem, level: int) -
     count = 0
     tolerance = RELINEARISE_PX * (1 + 4 * level) if level else _tolerance(problem)
     for observation in problem.fresh:
-        if not observation.is_linearised or observation.shift(state, problem.focal) > tolerance:
+        if not observation.is_linearised or _has_moved(observation, state, problem.focal, tolerance):
             observation.linearise(terms, state, level)
             count += 1
     for observation in problem.settled:
-        if level == 0 and observation.shift(state, problem.focal) > tolerance:
+        if level == 0 and _has_moved(observation, state, problem.focal, tolerance):
             observation.linearise(terms, state, 0)
             count += 1
     return count
+
+
+def _has_moved(observation: Observation, state: SplineState, focal: float, tolerance: float) -> bool:
+    """Whether a linearisation is no longer good: its lines have moved by pixels, and by more than they are known to."""
+    shift = observation.shift(state, focal)
+    if shift <= tolerance:
+        return False
+    return not np.isfinite(shift) or not _is_noisy(observation) or observation.distance(state) > _MATTERS
+
+
+def _is_noisy(observation: Observation) -> bool:
+    return observation.lin.sigma > _NOISY * observation.lin.floor
 
 
 def _tolerance(problem: Problem) -> float:

@@ -32,23 +32,16 @@ from rstrack.options import Options
 # Frames within which the depth camera's resolution is looked for: it does not change.
 _SETTLED = 3
 
-MOST_LATE_S = 0.008
-"""How late or early a colour image may be beyond its stamp, where that is estimated, s."""
-
 
 @dataclass(frozen=True)
 class DeviceFrame:
-    """A frame on the device. depth_share: part of its depth pixels that have a value.
-
-    late_s: colour images may be so much later, or earlier, than their stamps say.
-    """
+    """A frame on the device. depth_share: part of its depth pixels that have a value."""
 
     index: int
     stamp: float
     depth: DepthImage
     colors: tuple[ColorImage, ...]
     depth_share: float
-    late_s: float = 0.0
 
     @property
     def exposures(self) -> list[Exposure]:
@@ -58,12 +51,12 @@ class DeviceFrame:
     @property
     def first_time(self) -> float:
         """Time in s of the first line of all its images."""
-        return min(exposure.first_time for exposure in self.exposures) - self.late_s
+        return min(exposure.first_time for exposure in self.exposures)
 
     @property
     def last_time(self) -> float:
         """Time in s of their last line."""
-        return max(exposure.last_time for exposure in self.exposures) + self.late_s
+        return max(exposure.last_time for exposure in self.exposures)
 
 
 Timer = Callable[[str], AbstractContextManager[Any]]
@@ -110,8 +103,7 @@ class DeviceRig:
             pixels = _checked(image, rig.color_camera, "colour", (3,), "uint8 RGB", np.uint8)
             exposure = self._exposure(image, self._color_lens, rig.color_shutter, rig.T_color_depth)
             colors.append(color_image(self.e, exposure, pixels))
-        late_s = MOST_LATE_S if options.follow_color_clock and colors else 0.0
-        return DeviceFrame(index, frame.depth.stamp, depth, tuple(colors), depth.count / z.size, late_s)
+        return DeviceFrame(index, frame.depth.stamp, depth, tuple(colors), depth.count / z.size)
 
     @staticmethod
     def _exposure(image: Image, lens: Lens, true: Shutter, T_cam_body: FloatArray) -> Exposure:

@@ -20,7 +20,8 @@ _LEAST_SHARE = 0.08
 _LEAST_PIXELS = 60
 # Part of the compared pixels that must not be outliers for certain.
 _LEAST_FIT_DEPTH, _LEAST_FIT_COLOR = 0.5, 0.6
-# Scales that no aligned images have, and growth over the last frames' median that none shows (m; intensity).
+# Scales that no aligned images have, and growth over the last frames' median that none shows (m at up to one metre,
+# growing with the distance; intensity).
 _WORST_DEPTH, _WORST_INTENSITY = 0.03, 0.12
 _GROWTH, _HARMLESS_DEPTH, _HARMLESS_INTENSITY = 6.0, 2e-3, 0.03
 # What counts as usual grows no further than this over the best that was usual: bad must not become usual.
@@ -41,20 +42,22 @@ _FEW = 10
 
 @dataclass
 class _Usual:
-    """Scales of one term in the last good frames."""
+    """Scales of one term in the last good frames, those of depth as they would be at one metre."""
 
     worst: float
     harmless: float
     recent: deque[float] = field(default_factory=lambda: deque(maxlen=_MEMORY))
     best: float = np.inf
 
-    def limit(self, floor: float) -> float:
-        """Scale beyond which a frame does not fit."""
-        usual = min(median(self.recent), _DECAY * self.best) if self.recent else self.worst
-        return min(self.worst, max(self.harmless, _ROUNDING * floor, _GROWTH * usual))
+    def limit(self, floor: float, distance: float = 1.0) -> float:
+        """Scale beyond which a frame does not fit. distance (m): of what is seen; the noise of depth grows with its
+        square."""
+        worst = self.worst * max(1.0, distance)
+        usual = distance**2 * min(median(self.recent), _DECAY * self.best) if self.recent else worst
+        return min(worst, max(self.harmless, _ROUNDING * floor, _GROWTH * usual))
 
-    def learn(self, sigma: float) -> None:
-        self.recent.append(sigma)
+    def learn(self, sigma: float, distance: float = 1.0) -> None:
+        self.recent.append(sigma / distance**2)
         if len(self.recent) == _MEMORY:
             self.best = min(self.best, median(self.recent))
 
@@ -89,7 +92,10 @@ class FitHistory:
                 return torn
             self._pulls.append(pulls)
         for o in fresh:
-            (self._depth if o.is_depth else self._color).learn(o.lin.next_sigma)
+            if o.is_depth:
+                self._depth.learn(o.lin.next_sigma, o.ref.median_depth)
+            else:
+                self._color.learn(o.lin.next_sigma)
         return ""
 
     def _torn(self, now: Pulls) -> str:
@@ -108,12 +114,14 @@ class FitHistory:
         return not any(o.is_linearised and o.lin.fit >= _least_fit(o) for o in fresh)
 
     def _misfit(self, o: Observation, expected: int) -> str:
-        name, usual = ("depth", self._depth) if o.is_depth else ("colour", self._color)
+        name = "depth" if o.is_depth else "colour"
         if not o.is_linearised or o.lin.count < max(_LEAST_PIXELS, _LEAST_SHARE * expected):
             return f"hardly a pixel of the {name} image falls on the keyframe"
         if o.lin.fit < _least_fit(o):
             return f"the {name} image shows something else"
-        if o.lin.next_sigma > usual.limit(o.lin.floor):
+        floor = o.lin.floor
+        limit = self._depth.limit(floor, o.ref.median_depth) if o.is_depth else self._color.limit(floor)
+        if o.lin.next_sigma > limit:
             return f"the {name} image does not fit"
         return ""
 

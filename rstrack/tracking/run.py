@@ -170,8 +170,6 @@ def track(
     truth = truth_of(dataset)
     if truth is not None:
         truth = dataclasses.replace(truth, frame_stamps=dataset.stamps[chosen])
-    if options.follow_color_clock is None and dataset.timing is not None and dataset.timing.is_jittered:
-        options = dataclasses.replace(options, follow_color_clock=True)
     tracker = make_tracker(dataset.rig, options)
     _make_folder(out)
     noise = noise or Noise()

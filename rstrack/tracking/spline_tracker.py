@@ -43,8 +43,6 @@ _GAP_S, _BREAK_S = 0.3, 3600.0
 _WIDEST = 2.0
 # Part of the pixels that must have depth for a frame to become a keyframe.
 _LEAST_DEPTH = 0.02
-# Share of a new image's lateness in what is expected of the next.
-_LATE_SHARE = 0.2
 # Frames of a new piece that are aligned jointly: fewer do not tell its velocity.
 _YOUNG = 4
 # Keyframes at which a lost frame is looked for, at once.
@@ -71,8 +69,6 @@ class Tracker:
         # Gain and offset against the first colour image, of the recent frames, and the newest colour image's moments.
         self._brightness: dict[int, FloatArray] = {}
         self._moments: FloatArray | None = None
-        # How late colour images were of late (s).
-        self._late_s = 0.0
         # The newest frame, while it is the reference and cannot be rectified yet.
         self._unconverged: DeviceFrame | None = None
         self._stamps: list[float] = []
@@ -334,7 +330,7 @@ class Tracker:
         if self.options.keyframe_strategy == "newest" and new.depth.exposure.lens.lines > 1:
             if not self._unfit(new):
                 rolling = self._maker.rolling(new.index, new.depth, new.colors, window.spline)
-                self._reference = replace(rolling, brightness=self._brightness.get(new.index, brightness.SAME[:2]))
+                self._reference = replace(rolling, brightness=self._brightness.get(new.index, brightness.SAME))
                 self._unconverged, self._pixels = new, 0
             return False
         old = self._keyframes.return_to(window.spline.pose(frozen.depth.exposure.mid_time), ref)
@@ -352,7 +348,7 @@ class Tracker:
 
     def _new_keyframe(self, frame: DeviceFrame, older: Reference | None) -> Reference:
         assert self._window is not None
-        bright = self._brightness.get(frame.index, brightness.SAME[:2])
+        bright = self._brightness.get(frame.index, brightness.SAME)
         self._reference = self._keyframes.make(frame, self._window.spline, older, bright)
         self._unconverged, self._pixels = None, 0
         return self._reference
@@ -378,8 +374,8 @@ class Tracker:
             if before is None and frame.colors and self._brightness and self._moments is not None:
                 newest = self._brightness[max(self._brightness)]
                 before = brightness.expected(newest, frame.colors[0].moments, self._moments)
-            expected = brightness.SAME[:2] if before is None else brightness.relative(before, ref.brightness)
-        observations = observe(frame, ref, self.options, np.append(expected[:2], self._late_s))
+            expected = brightness.SAME if before is None else brightness.relative(before, ref.brightness)
+        observations = observe(frame, ref, self.options, expected)
         for o in observations:
             o.independent = 1.0 / self._independence[not o.is_depth].inflation
         return observations
@@ -389,11 +385,10 @@ class Tracker:
         self._stamps.append(new.stamp)
         if new.colors:
             color = next((o for o in fresh if not o.is_depth), None)
-            found = brightness.SAME[:2]
+            found = brightness.SAME
             if color is not None and self._window is not None:
                 own = color.brightness(self._window.state)
                 found = brightness.absolute(own, color.ref.brightness)
-                self._late_s += _LATE_SHARE * (float(own[2]) - self._late_s)
             oldest = self._recent[0].index if self._recent else new.index
             self._brightness = {k: b for k, b in self._brightness.items() if k >= oldest} | {new.index: found}
             self._moments = new.colors[0].moments
@@ -416,7 +411,7 @@ def observe(
 ) -> list[Observation]:
     """What the terms of a method make of a frame against a reference: its depth image, and its colour images.
 
-    expected (3,): gain, offset and lateness that the colour images are expected to have against the reference.
+    expected (2,): gain and offset that the colour images are expected to have against the reference.
     """
     depth = [Observation(frame.index, frame.depth, ref)] if options.geometric else []
     return depth + [Observation(frame.index, c, ref, frame.depth, expected) for c in frame.colors if ref.points]

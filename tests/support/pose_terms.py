@@ -30,11 +30,12 @@ class PoseTerms:
     """½ Σ ‖log(T(t) T_seen⁻¹)‖² over the times of an `image`, as a term of scale 1 would be.
 
     curvature: factor on H; below 1 steps are too long. next_sigma: what each linearisation suggests for the next.
-    calls: (level, σ) of each linearisation.
+    floor: smallest credible σ. calls: (level, σ) of each linearisation.
     """
 
     curvature: float = 1.0
     next_sigma: float = 0.7
+    floor: float = 1.0
     calls: list[tuple[int, float]] = field(default_factory=list)
     costs: list[float] = field(default_factory=list)
     slopes: list[Spline] = field(default_factory=list)
@@ -69,7 +70,9 @@ class PoseTerms:
         cost = 0.5 * float((e**2).sum())
         self.costs.append(cost)
         model = Quadratic(first, H, np.einsum("nia,ni->a", rows, e))
-        return Linearised(model, motion, 1.0, self.next_sigma, cost, len(at), len(at), 0.0, np.eye(6), float("nan"))
+        return Linearised(
+            model, motion, 1.0, self.next_sigma, cost, len(at), len(at), self.floor, np.eye(6), float("nan")
+        )
 
 
 def sighting(times: np.ndarray, T_world_body: np.ndarray) -> Observation:

@@ -1,4 +1,4 @@
-"""Gain, offset and lateness of colour images: eliminated exactly, found where known, chained over keyframes."""
+"""Gain and offset of colour images: eliminated exactly, found where known, chained over keyframes."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from rstrack.images.pyramid import ColorImage
 
 def test_what_is_eliminated_is_what_a_joint_solution_gives() -> None:
     rng = np.random.default_rng(3)
-    A = rng.normal(size=(40, 15))
-    H, g = A.T @ A, rng.normal(size=15)
-    at, expected, late = np.array([0.1, -0.05, 1e-3]), np.array([0.02, 0.01, 0.0]), 2e-3
-    prior = 1.0 / np.array([0.3, 0.15, late]) ** 2
+    A = rng.normal(size=(40, 14))
+    H, g = A.T @ A, rng.normal(size=14)
+    at, expected = np.array([0.1, -0.05]), np.array([0.02, 0.01])
+    prior = 1.0 / np.array([0.3, 0.15]) ** 2
     joint, right = H.copy(), g.copy()
     joint[12:, 12:] += np.diag(prior)
     right[12:] += prior * (at - expected)
     x = -np.linalg.solve(joint, right)
     model = Quadratic(4, H[:12, :12], g[:12])
-    left, gone, cost = brightness.eliminate(model, H[:12, 12:], H[12:, 12:], g[12:], at, expected, late)
+    left, gone, cost = brightness.eliminate(model, H[:12, 12:], H[12:, 12:], g[12:], at, expected)
     np.testing.assert_allclose(-np.linalg.solve(left.H, left.g), x[:12], rtol=1e-8)
     np.testing.assert_allclose(gone.at + gone.step + gone.follow @ x[:12], at + x[12:], rtol=1e-8)
     assert cost == pytest.approx(0.5 * float(((at - expected) ** 2 * prior).sum())) and left.first == 4
@@ -40,28 +40,15 @@ def brighter(image: ColorImage, gain: float, offset: float) -> ColorImage:
 @pytest.mark.parametrize("ref_scan", [None, "top-bottom"])
 def test_gain_and_offset_of_an_image_are_found(gain: float, offset: float, ref_scan: str | None) -> None:
     s = setting("photometric", ref_scan, "top-bottom")
-    image, at, sigma = brighter(s.image, gain, offset), np.zeros(3), 0.05
+    image, at, sigma = brighter(s.image, gain, offset), np.zeros(2), 0.05
     for _ in range(5):
         # The prior is centred on the truth, so that it does not pull; the start is not.
-        known = np.array([gain, offset, 0.0])
+        known = np.array([gain, offset])
         lin = s.terms.photometric(image, s.ref, s.truth, 0, sigma, brightness=at, expected=known)
         assert lin.brightness is not None
         at, sigma = lin.brightness.best(np.zeros(len(lin.model.g))), lin.next_sigma
     # Interpolation of such small images leaves errors of 2e-4 in intensity, which the gain takes for contrast.
-    np.testing.assert_allclose(at, [gain, offset, 0.0], atol=3e-3)
-
-
-@pytest.mark.parametrize("late", [0.003, -0.002])
-def test_a_late_image_is_known_by_the_motion(late: float) -> None:
-    s = setting("photometric", None, "top-bottom")
-    terms = replace(s.terms, late_sigma_s=0.02)
-    stamped = replace(s.image, exposure=replace(s.image.exposure, stamp=s.image.exposure.stamp - late))
-    at = np.zeros(3)
-    for _ in range(4):
-        lin = terms.photometric(stamped, s.ref, s.truth, 0, 0.02, brightness=at)
-        assert lin.brightness is not None
-        at = lin.brightness.best(np.zeros(len(lin.model.g)))
-    assert at[2] == pytest.approx(late, abs=2e-4)
+    np.testing.assert_allclose(at, [gain, offset], atol=3e-3)
 
 
 def test_brightness_is_chained_over_keyframes() -> None:

@@ -30,10 +30,15 @@ def odd(kind: str) -> str:
     return f"the {NAMES[kind]} image does not fit"
 
 
-def term(kind: str, sigma: float, count: int = 5000, floor: float = 0.0, fit: float = 1.0) -> Any:
-    """An observation of a linearised image: its scale, pixels, smallest credible scale, and part that fits."""
+def term(
+    kind: str, sigma: float, count: int = 5000, floor: float = 0.0, fit: float = 1.0, distance: float = 1.0
+) -> Any:
+    """An observation of a linearised image: its scale, pixels, smallest credible scale, part that fits, and how far
+    away (m) what it shows is."""
     lin = SimpleNamespace(count=count, next_sigma=sigma, floor=floor, fit=fit)
-    return SimpleNamespace(is_depth=kind == "depth", is_linearised=True, lin=lin)
+    return SimpleNamespace(
+        is_depth=kind == "depth", is_linearised=True, lin=lin, ref=SimpleNamespace(median_depth=distance)
+    )
 
 
 def fault(
