@@ -214,3 +214,12 @@ def test_a_system_that_is_not_finite_is_refused(broken: str) -> None:
     with pytest.raises(np.linalg.LinAlgError, match="no finite solution"):
         run(Broken(), state, [sighting(TIMES, TRUTH.pose(TIMES))], state)
     assert not state.moved.any()
+
+
+def test_where_noise_limits_a_step_much_shorter_than_the_errors_is_the_last() -> None:
+    done = []
+    for floor in (1.0, 0.0):
+        state = start()
+        sight = sighting(TIMES, TRUTH.pose(TIMES))  # poses with σ = 1 m: any start is as good as the truth
+        done.append(optimise(PoseTerms(curvature=2.0, floor=floor), state, problem([sight], state), (0,), MOST))
+    assert done[1].iterations == 1 < done[0].iterations
