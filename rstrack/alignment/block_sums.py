@@ -14,14 +14,16 @@ from rsgen.device.lens import Lens
 from rsgen.device.projection import Vector, cross
 from rstrack.alignment.student_t import cost, curvature, weight
 
-# Lines that share one linearisation by the control points (DESIGN section 5: eight lose nothing).
-LINES_PER_BLOCK = 8
-# Blocks of an unrectified reference are larger: it is bootstrapping only, and pairs of blocks are many.
-LINES_PER_PAIR_BLOCK = 32
+# Blocks of lines that share one linearisation by the control points: half of a millisecond (DESIGN section 5: eight of
+# 480 lines lose nothing).
+BLOCKS = 60
+# Those of an unrectified reference are larger: it is bootstrapping only, and pairs of blocks are many.
+PAIR_BLOCKS = 15
 # Integers per block: 21 of H (upper triangle), 6 of g, sum of w s², cost, count, compared, and padding; with brightness
 # 12 of the coupling, 3 of its own H and 2 of its g more.
 _SLOTS, _SLOTS_WITH_BRIGHTNESS = 32, 48
 _COMPARED = 30
+_JUDGED = (27, 29, _COMPARED)
 _UPPER = np.triu_indices(6)
 
 
@@ -97,10 +99,9 @@ class Scaling:
 
 def block_counts(lens: Lens, ref_lens: Lens) -> tuple[int, int, int, int]:
     """Blocks of current lines and of reference lines (1 if rectified), and lines per block of each."""
-    if ref_lens.lines == 1:
-        return -(-lens.lines // LINES_PER_BLOCK), 1, LINES_PER_BLOCK, 1
-    per = LINES_PER_PAIR_BLOCK
-    return -(-lens.lines // per), -(-ref_lens.lines // per), per, per
+    blocks = BLOCKS if ref_lens.lines == 1 else PAIR_BLOCKS
+    per, ref_per = max(1, lens.lines // blocks), max(1, ref_lens.lines // blocks)
+    return -(-lens.lines // per), -(-ref_lens.lines // ref_per), per, ref_per
 
 
 def block_slot(line: Any, ref_line: Any, lens: Lens, ref_lens: Lens, with_brightness: bool = False) -> tuple[Any, int]:
@@ -113,11 +114,12 @@ def block_slot(line: Any, ref_line: Any, lens: Lens, ref_lens: Lens, with_bright
 
 def accumulate(
     e: Engine, g: Vector, p: Vector, sign: float, r: Any, active: Any, parameters: list[Any], slot: Any, size: int,
-    c: tuple[Any, Any] | None = None,
+    c: tuple[Any, Any] | None = None, judged: Any = True,
 ) -> Any:  # fmt: skip
     """Σ w j jᵀ and so on into `size` integers, from `slot` on (`block_slot`); j = sign [g, p × g].
 
-    c: see `BrightnessSums`, each at most 1.
+    c: see `BrightnessSums`, each at most 1. judged: pixels that σ is told by and that are counted; all others only add to
+    the system and the cost.
     """
     inv_sigma, gate, inv_lever, bound, unit_H, unit_g, unit_cost = parameters
     compared = active & dr.isfinite(r)
@@ -147,5 +149,6 @@ def accumulate(
     sums = dr.zeros(e.Int, size)
     for k, value in enumerate(values):
         which = compared if k == _COMPARED else active
+        which = which & judged if judged is not True and k in _JUDGED else which
         dr.scatter_reduce(dr.ReduceOp.Add, sums, value, slot + k, which, mode=dr.ReduceMode.Expand)
     return sums

@@ -14,7 +14,7 @@ import numpy as np
 
 from rstrack.alignment.block_sums import BlockSums
 
-# Blocks of lines (of 8) over which errors may be correlated: 7 reach over 56 lines.
+# Blocks of lines over which errors may be correlated: 7 reach over an eighth of the image.
 _REACH = 7
 # Pixels below which nothing can be said.
 _LEAST_PIXELS = 500

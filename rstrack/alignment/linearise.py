@@ -28,11 +28,12 @@ from rstrack.alignment.student_t import scale_step
 from rstrack.images.device_frame import DeviceRig, Timer, untimed
 from rstrack.images.line_poses import IDENTITY_FROM_BASE, Exposure, from_base_table, to_base_table
 from rstrack.images.pyramid import ColorImage, DepthImage
-from rstrack.keyframes.keyframe import STRIDES, Points, Reference
+from rstrack.keyframes.keyframe import Points, Reference, strides
 from rstrack.options import Options
 
-# Smallest credible σ of depth (m): quantisation and interpolation leave about as much.
-_CREDIBLE_DEPTH = 2e-4
+# Smallest credible σ of depth (m): quantisation and interpolation leave about as much; the latter more, by the square of
+# their size, where pixels are larger than those of this focal length (320×240).
+_CREDIBLE_DEPTH, _FINE_FOCAL = 2e-4, 240.0
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ class Terms:
     floor_intensity: float = 1.0 / 255.0
     # σ of equation (13) in the photometric term; 0: blurred points count like sharp ones.
     blur_sigma_px: float = 0.0
-    # Where interpolation errs by more than this part of σ, its bias counts, not its size: those pixels are left out.
+    # Part of σ by which interpolation may err before a pixel counts less.
     smooth: float = 0.25
     timer: Timer = untimed
     _kernel: Kernels = field(init=False)
@@ -105,7 +106,7 @@ class Terms:
         self, image: DepthImage, ref: Reference, spline: Spline, level: int, sigma: float,
         slopes_at: Spline | None = None,
     ) -> Linearised:  # fmt: skip
-        """Depth image against the reference's depth with every STRIDES[level]-th pixel.
+        """Depth image against the reference's depth with the pixels of a level (`strides`).
 
         slopes_at: spline at which the lines' poses are differentiated by control points, if not `spline`: that changes
         by no more than the increments between the two (relative), which Gauss-Newton steps do not notice.
@@ -130,11 +131,12 @@ class Terms:
         self, image: DepthImage, ref: Reference, to_base: Any, from_base: Any, level: int, sigma: float
     ) -> BlockSums:
         e, lens = self.e, image.exposure.lens
-        kernel = self._kernel(geometric_kernel, lens, ref.lens, STRIDES[level])
-        scaling = self._scaling(ref, lens, lens.camera, ref, STRIDES[level], 1)
+        stride = _stride(lens, level)
+        kernel = self._kernel(geometric_kernel, lens, ref.lens, stride)
+        scaling = self._scaling(ref, lens, lens.camera, ref, stride, 1)
         gate = self.gate_depth[level] * max(1.0, ref.median_depth)
         gate = min(gate, max(5.0 * sigma, 10 * self._floor_depth(image, ref))) if level == 0 else gate
-        smooth = self.smooth * max(sigma, _CREDIBLE_DEPTH)
+        smooth = self.smooth * max(sigma, _CREDIBLE_DEPTH * max(1.0, _FINE_FOCAL / ref.lens.camera.fx) ** 2)
         constants = e.upload(np.append(scaling.parameters(sigma, gate), smooth))
         surface = ref.inverse_depth, ref.slope_x, ref.slope_y, ref.roughness
         with self.timer(f"geometric kernel, level {level}"):
@@ -150,7 +152,7 @@ class Terms:
     def visible(self, depth: DepthImage, ref: Reference, spline: Spline, level: int) -> Any:
         """Which of the reference's points of a level the depth image does not hide: 1 or 0, on the device."""
         lens, points = depth.exposure.lens, ref.points[level]
-        kernel = self._kernel(visibility_kernel, lens, ref.lens, STRIDES[level])
+        kernel = self._kernel(visibility_kernel, lens, ref.lens, _stride(ref.lens, level))
         from_base = self._from_base(spline, ref.T_world_base, depth.exposure)
         return kernel(VisibilityInput(points.x, points.y, points.z, self._ref_lines(spline, ref), depth.z, from_base))
 
@@ -159,18 +161,19 @@ class Terms:
         slopes_at: Spline | None = None, visible: Any = None, brightness: FloatArray = SAME,
         expected: FloatArray = SAME,
     ) -> Linearised:  # fmt: skip
-        """The reference's points of a level, those that are `visible`, against that level of the colour image.
+        """The reference's points of a level, those that are `visible`, against the colour image low-passed alike.
 
         brightness (2,): gain and offset of the image here; expected (2,): before anything is known of it.
         """
         with self.timer(f"photometric kernel, level {level}"):
             e, lens, points = self.e, image.exposure.lens, ref.points[level]
-            kernel = self._kernel(photometric_kernel, lens, ref.lens, STRIDES[level], level, self.blur_sigma_px)
+            stride, own_level = _stride(ref.lens, level), image.level(level)
+            kernel = self._kernel(photometric_kernel, lens, ref.lens, stride, own_level, self.blur_sigma_px)
             from_base = self._from_base(spline, ref.T_world_base, image.exposure)
             # Moving closer or turning packs more points into a block than its share.
-            scaling = self._scaling(points, lens, ref.lens.camera, ref, STRIDES[level], 4)
+            scaling = self._scaling(points, lens, ref.lens.camera, ref, stride, 4)
             constants = e.upload(np.append(scaling.parameters(sigma, self.gate_intensity), brightness))
-            seen_at = self._ref_lines(spline, ref), image.levels[level], from_base
+            seen_at = self._ref_lines(spline, ref), image.levels[own_level], from_base
             shown = points.visible if visible is None else visible
             given = PhotometricInput(points.x, points.y, points.z, points.intensity, shown, *seen_at, constants)
             raw = kernel(given).numpy()
@@ -228,6 +231,10 @@ class Terms:
         seen = seen_motions(sums, median_depth)
         counts = sums.count, sums.compared
         return Linearised(model, motion, sigma, next_sigma, cost, *counts, floor, seen, inflation(sums), eliminated)
+
+
+def _stride(lens: Lens, level: int) -> int:
+    return strides(lens.camera.width, lens.camera.height)[level]
 
 
 def seen_motions(sums: BlockSums, median_depth: float) -> FloatArray:

@@ -14,7 +14,7 @@ from rstrack.alignment.linearise import Linearised, Terms
 from rstrack.alignment.normal_equations import Quadratic
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.pyramid import ColorImage, DepthImage
-from rstrack.keyframes.keyframe import STRIDES, Reference
+from rstrack.keyframes.keyframe import Reference
 
 # Increments of control points (m, rad) that change the derivatives of lines by less than a step's own error.
 _SAME_SLOPES = 5e-3
@@ -105,7 +105,7 @@ class Observation:
                 image, self.ref, state.spline, level, sigma, slopes_at, visible, brightness, self.expected
             )
         # A coarse level's pixels stand for those left out: the priors' share must not depend on the level.
-        stands_for = (STRIDES[level] / STRIDES[0]) ** 2
+        stands_for = 4.0**level
         self.linearisation = _Linearisation(lin, lin.next_sigma, state.moved.copy(), stands_for, brightness)
 
     def brightness(self, state: SplineState) -> FloatArray:

@@ -46,7 +46,7 @@ class GeometricInput:
     depth: z (m) of the current image, every pixel; rays_*: its normalised coordinates; to_base: its lines' poses.
     inverse_depth, roughness (m): the reference's; slope_*: gradient of its inverse depth by normalised coordinates,
     smoothed: it gives normals, while the residual takes inverse depth as it is; from_base: its lines' poses if it is
-    not rectified. constants: those of `Scaling`, and the roughness from which on a pixel of the reference is left out.
+    not rectified. constants: those of `Scaling`, and the roughness from which on a pixel of the reference counts less.
     """
 
     depth: Any
@@ -84,16 +84,21 @@ def geometric_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int) -> Call
         value, active = surface(e, ref, given.inverse_depth, seen.x, seen.y, active & seen.valid)
         at = nearest(e, ref.width, seen.x, seen.y, active)
         mx, my = dr.gather(e.Float, given.slope_x, at, active), dr.gather(e.Float, given.slope_y, at, active)
-        active &= dr.gather(e.Float, given.roughness, at, active) < dr.gather(e.Float, given.constants, e.UInt(7))
+        # Where interpolation errs, its bias counts, not its size: such pixels weigh less the more so they are, and hold
+        # what nothing else does. Without them coarse images, half of whose pixels are such, would slide. They do not
+        # tell how good depth is.
+        limit = dr.gather(e.Float, given.constants, e.UInt(7))
+        rough = dr.gather(e.Float, given.roughness, at, active)
+        share = dr.square(dr.minimum(1.0, limit * dr.rcp(dr.maximum(rough, 1e-9))))
         # The plane m·q = 1 through the pixel; |m| is one over its distance.
         mz = value - mx * seen.at.xn - my * seen.at.yn
-        inv_m = even * dr.rsqrt(mx * mx + my * my + mz * mz)
+        inv_m = share * even * dr.rsqrt(mx * mx + my * my + mz * mz)
         # (6): the distance to the plane that inverse depth, bilinearly interpolated, has there.
         r = (1.0 - seen.z * value) * inv_m
         scale = -seen.z * inv_m
         g = seen.chain(scale * mx / ref.fx, scale * my / ref.fy, -value * inv_m)
         slot, size = block_slot(line, seen.row, lens, ref_lens)
-        return accumulate(e, g, p, 1.0, r, active, parameters, slot, size)
+        return accumulate(e, g, p, 1.0, r, active, parameters, slot, size, judged=rough <= limit)
 
     return kernel
 

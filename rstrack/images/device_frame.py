@@ -26,6 +26,7 @@ from rstrack.images.pyramid import (
     depth_image,
     depth_resolution,
     lens_sees,
+    octaves_finer,
 )
 from rstrack.options import Options
 
@@ -81,6 +82,7 @@ class DeviceRig:
         self._depth_lens = Lens(rig.depth_camera, _seen_as(rig.depth_shutter, options.rolling))
         self._color_lens = Lens(rig.color_camera, _seen_as(rig.color_shutter, options.rolling))
         self._seen = lens_sees(rig.depth_camera)
+        self._finer = octaves_finer(rig.color_camera, rig.depth_camera)
         self.rays = camera_rays(Exposure(self._depth_lens, 0.0, np.eye(4)))
         self.device_rays = self.e.upload(self.rays[..., 0]), self.e.upload(self.rays[..., 1])
         # Step of the depth camera (1/m), 0 until its first images have shown one.
@@ -102,7 +104,7 @@ class DeviceRig:
         for image in frame.colors if options.photometric else ():
             pixels = _checked(image, rig.color_camera, "colour", (3,), "uint8 RGB", np.uint8)
             exposure = self._exposure(image, self._color_lens, rig.color_shutter, rig.T_color_depth)
-            colors.append(color_image(self.e, exposure, pixels))
+            colors.append(color_image(self.e, exposure, pixels, self._finer))
         return DeviceFrame(index, frame.depth.stamp, depth, tuple(colors), depth.count / z.size)
 
     @staticmethod

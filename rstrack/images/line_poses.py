@@ -14,8 +14,8 @@ from rsgen.geometry import se3
 from rsgen.geometry.so3 import hat
 from rsgen.geometry.spline import Spline
 
-# Lines whose poses are taken from one evaluation of the spline.
-_LINES_PER_NODE = 8
+# Evaluations of the spline that the poses of an image's lines are taken from: about every half of a millisecond.
+_NODES = 60
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,9 @@ class Exposure:
 def _line_blocks(lens: Lens) -> tuple[FloatArray, npt.NDArray[np.intp], FloatArray]:
     """Times of the blocks' middles after the stamp (s), the block of each line, and each line's time after that."""
     at_zero = Exposure(lens, 0.0, np.eye(4))
-    middle = at_zero.block_times(_LINES_PER_NODE)
-    block = np.arange(lens.lines) // _LINES_PER_NODE
+    per_node = max(1, lens.lines // _NODES)
+    middle = at_zero.block_times(per_node)
+    block = np.arange(lens.lines) // per_node
     return middle, block, (at_zero.times() - middle[block])[:, None]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -43,12 +44,26 @@ class DepthImage:
 @dataclass(frozen=True)
 class ColorImage:
     """Intensities in [0, 1], NaN where clipped; level 0 is full size, each further one low-passed and halved
-    (cv2.pyrDown). moments (2,): mean and standard deviation of the coarsest level. thumbnail (15, 20): of it."""
+    (cv2.pyrDown). moments (2,): mean and standard deviation of the coarsest level. thumbnail (15, 20): of it. finer: by
+    how many halvings its pixels are smaller than those of the depth images, negative if they are larger."""
 
     exposure: Exposure
     levels: tuple[Any, ...]
     moments: FloatArray = field(default_factory=lambda: np.zeros(2))
     thumbnail: npt.NDArray[np.float32] = field(default_factory=lambda: np.zeros(_THUMBNAIL[::-1], np.float32))
+    finer: int = 0
+
+    def level(self, level: int) -> int:
+        """Its level that is low-passed as a reference's is, whose pixels are those of depth images.
+
+        At the finest one both are as sharp as they come, at 0: points are exact whatever lies between them.
+        """
+        return max(0, level + self.finer) if level else 0
+
+
+def octaves_finer(color: Camera, depth: Camera) -> int:
+    """`ColorImage.finer` of two cameras."""
+    return round(math.log2(color.fx / depth.fx))
 
 
 def depth_image(
@@ -95,31 +110,32 @@ def intensity(color: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
     return np.asarray(cv2.GaussianBlur(grey, (0, 0), _BLUR_PX))
 
 
-def color_image(e: Engine, exposure: Exposure, color: npt.NDArray[np.uint8]) -> ColorImage:
-    """RGB (h, w, 3) uint8 to a pyramid, NaN where a pixel or one beside it is saturated or black."""
-    levels = pyramid(intensity(color))
-    masks = _beyond_range(color)
+def color_image(e: Engine, exposure: Exposure, color: npt.NDArray[np.uint8], finer: int = 0) -> ColorImage:
+    """RGB (h, w, 3) uint8 to a pyramid, NaN where a pixel or one beside it is saturated or black; see `ColorImage`."""
+    count = LEVELS + max(0, finer)
+    levels = pyramid(intensity(color), count)
+    masks = _beyond_range(color, count)
     moments = np.array([levels[-1].mean(), levels[-1].std()], np.float64)
     shown = (np.where(mask, np.float32(np.nan), level) for level, mask in zip(levels, masks, strict=True))
-    return ColorImage(exposure, tuple(e.upload(level) for level in shown), moments, thumbnail(levels[-1]))
+    return ColorImage(exposure, tuple(e.upload(level) for level in shown), moments, thumbnail(levels[-1]), finer)
 
 
-def _beyond_range(color: npt.NDArray[np.uint8]) -> list[npt.NDArray[np.bool_]]:
+def _beyond_range(color: npt.NDArray[np.uint8], count: int) -> list[npt.NDArray[np.bool_]]:
     """For each level the pixels (h, w) whose intensity says nothing: clipped, or smoothed with what was."""
     most = color.max(axis=2)
     clipped = ((most >= _SATURATED) | (most <= _BLACK)).astype(np.uint8)
     weight = cv2.dilate(clipped, np.ones((_MARGIN_PX, _MARGIN_PX), np.uint8)).astype(np.float32)
     out = [weight > _LEAST_CLIPPED]
-    for _ in range(LEVELS - 1):
+    for _ in range(count - 1):
         weight = np.asarray(cv2.pyrDown(weight))
         out.append(weight > _LEAST_CLIPPED)
     return out
 
 
-def pyramid(image: npt.NDArray[np.float32]) -> list[npt.NDArray[np.float32]]:
-    """LEVELS levels; pixel (x, y) of a level lies at (2x, 2y) of the one below."""
+def pyramid(image: npt.NDArray[np.float32], count: int = LEVELS) -> list[npt.NDArray[np.float32]]:
+    """`count` levels; pixel (x, y) of a level lies at (2x, 2y) of the one below."""
     levels = [image]
-    for _ in range(LEVELS - 1):
+    for _ in range(count - 1):
         levels.append(np.asarray(cv2.pyrDown(levels[-1])))
     return levels
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -18,9 +19,9 @@ from rstrack.images.line_poses import Exposure
 from rstrack.images.pyramid import LEVELS, masked_pyramid
 from rstrack.images.sampling import EDGE, NEAREST
 
-# Strides of the pixels that are looked at on the pyramid's levels, finest first (DESIGN section 5: every second pixel
-# loses nothing).
-STRIDES = (2, 4, 8)
+# Pixels of the smallest image of which every second one, in every second row, is enough, and of the largest one:
+# 320×240 and 640×480 lose nothing by that (DESIGN section 5), while 160×120 has none to spare.
+_SPARE_PX, _PLENTY_PX = 320 * 240, 640 * 480
 # Normals come from a window of this many pixels; the residual itself is not smoothed.
 _NORMAL_WINDOW = 5
 
@@ -54,6 +55,8 @@ class Reference:
     median_depth, bound: see `block_sums.Scaling`, for the geometric term. pixels: of the finest level that have depth.
     moments: of its colour image; brightness: gain and offset (2,) of that against the track's first colour image.
     intensity (h, w): the same on the host, NaN where unknown. *_thumbnail: see `pyramid.thumbnail`.
+    coarse_intensity (h, w): what the coarser levels are made from where colour is finer than depth, low-passed to the
+    depth camera's pixels; None where `intensity` is that.
     """
 
     index: int
@@ -76,6 +79,7 @@ class Reference:
     depth_thumbnail: Image
     color_thumbnail: Image | None
     brightness: FloatArray = field(default_factory=lambda: np.zeros(2))
+    coarse_intensity: Image | None = None
 
     def emptied(self) -> Reference:
         """Without what is on the device, and can be made again."""
@@ -87,6 +91,13 @@ class Reference:
 def rectified_lens(camera: Camera) -> Lens:
     """Global-shutter pinhole of the same size and focal lengths: what rectified images are made for."""
     return Lens(Camera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy), Shutter())
+
+
+def strides(width: int, height: int) -> tuple[int, ...]:
+    """Strides of the pixels of a depth image that are looked at on the pyramid's levels, finest first."""
+    pixels = width * height
+    finest = 1 if pixels < _SPARE_PX else 2 * max(1, math.isqrt(pixels // _PLENTY_PX))
+    return tuple(finest * 2**level for level in range(LEVELS))
 
 
 def surface_slopes(rho: Image, fx: float, fy: float) -> tuple[Image, Image]:
@@ -148,24 +159,33 @@ def depth_scaling(rho: Image) -> tuple[float, float]:
 
 
 def level_points(
-    e: Engine, rho: Image, rays: FloatArray, intensity: Image, seen: npt.NDArray[np.bool_]
+    e: Engine, rho: Image, rays: FloatArray, intensity: Image, coarse: Image | None = None
 ) -> tuple[Points, ...]:
-    """Points of all levels. rays (h, w, 2): normalised coordinates; intensity (h, w), known where `seen`."""
+    """Points of all levels. rays (h, w, 2): normalised coordinates; intensity, coarse (h, w): see `Reference`."""
     whole = on_one_surface(rho)
+    height, width = rho.shape
+    images = _intensities(intensity, rho)
+    if coarse is not None:
+        images[1:] = _intensities(coarse, rho)[1:]
     out = []
-    for level, (image, known) in enumerate(masked_pyramid(intensity, seen & (rho > 0))):
-        stride = STRIDES[level]
+    for level, stride in enumerate(strides(width, height)):
+        image, known = images[level]
         pick = (slice(None, None, stride), slice(None, None, stride))
-        # A level's pixels are 2^level apart, the points twice that.
-        at = image[::2, ::2]
-        z = np.where(whole[pick] & known[::2, ::2], 1.0 / np.maximum(rho[pick], 1e-6), 0.0)
+        # A level's pixels are 2^level apart.
+        on_level = (slice(None, None, stride // 2**level), slice(None, None, stride // 2**level))
+        at = image[on_level]
+        z = np.where(whole[pick] & known[on_level], 1.0 / np.maximum(rho[pick], 1e-6), 0.0)
         gy, gx = np.gradient(image)
-        slope = (np.hypot(gx, gy)[::2, ::2] / 2**level * rho[pick])[z > 0]
+        slope = (np.hypot(gx, gy)[on_level] / 2**level * rho[pick])[z > 0]
         focal = 1.0 / max(float(np.diff(rays[0, :, 0]).mean()), 1e-9)
         bound = 2.0 * focal * float(np.percentile(slope, 99.5)) if slope.size else 1.0
         median_depth = float(np.median(z[z > 0])) if (z > 0).any() else 1.0
         x, y = rays[..., 0][pick] * z, rays[..., 1][pick] * z
         on = e.upload(np.ones(z.shape))
         out.append(Points(e.upload(x), e.upload(y), e.upload(z), e.upload(at), on, median_depth, max(bound, 1e-2)))
-    assert len(out) == LEVELS
     return tuple(out)
+
+
+def _intensities(intensity: Image, rho: Image) -> list[tuple[Image, npt.NDArray[np.bool_]]]:
+    known = np.isfinite(intensity)
+    return masked_pyramid(np.where(known, intensity, np.float32(0.0)), known & (rho > 0))

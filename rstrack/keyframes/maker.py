@@ -17,13 +17,13 @@ from rstrack.images.device_frame import DeviceRig, Timer, untimed
 from rstrack.images.line_poses import from_base_table, to_base_table
 from rstrack.images.pyramid import ColorImage, DepthImage, thumbnail
 from rstrack.keyframes.keyframe import (
-    STRIDES,
     Image,
     Points,
     Reference,
     depth_scaling,
     level_points,
     rectified_lens,
+    strides,
     surface_roughness,
     surface_slopes,
 )
@@ -157,20 +157,26 @@ class KeyframeMaker:
     ) -> Reference:  # fmt: skip
         e = self.e
         rolling = depth.exposure if lens is depth.exposure.lens and lens.lines > 1 else None
-        intensity, color_thumbnail, moments = None, None, np.zeros(2)
+        intensity, coarse, color_thumbnail, moments = None, None, None, np.zeros(2)
         if colors:
             color = min(colors, key=lambda c: abs(c.exposure.mid_time - t))
             moments, color_thumbnail = color.moments, color.thumbnail
             _, grid = (self.rays, self.device_rays) if rolling else self._pinhole_rays(lens)
             to_base = e.upload(to_base_table(spline, T_world_base, rolling) if rolling else np.zeros(12))
             from_base = e.upload(from_base_table(spline, T_world_base, color.exposure))
-            kernel = self._kernel(color_kernel, color.exposure.lens, lens)
-            value, seen = kernel(ColorInput(device_rho, *grid, to_base, color.levels[0], from_base))
-            known = e.download(seen, rho.shape) > 0
-            intensity = np.where(known, e.download(value, rho.shape), np.nan).astype(np.float32)
+
+            def look_up(level: int) -> Image:
+                kernel = self._kernel(color_kernel, color.exposure.lens, lens, level)
+                value, seen = kernel(ColorInput(device_rho, *grid, to_base, color.levels[level], from_base))
+                known = e.download(seen, rho.shape) > 0
+                return np.where(known, e.download(value, rho.shape), np.nan).astype(np.float32)
+
+            intensity = look_up(0)
+            if color.finer > 0:
+                coarse = look_up(color.finer)
         small = Reference(
             index, depth.exposure.stamp, t, T_world_base, lens, rolling, None, None, None, None, None, (), 1.0, 1.0, 0,
-            moments, intensity, thumbnail(rho, rho > 0), color_thumbnail,
+            moments, intensity, thumbnail(rho, rho > 0), color_thumbnail, coarse_intensity=coarse,
         )  # fmt: skip
         return self._with_surface(small, device_rho, rho, np.where(rho > 0, 1.0, 0.0) if weight is None else weight)
 
@@ -181,11 +187,10 @@ class KeyframeMaker:
         roughness = surface_roughness(rho, slope_x, slope_y, camera.fx, camera.fy)
         points: tuple[Points, ...] = ()
         if small.intensity is not None:
-            known = np.isfinite(small.intensity)
-            points = level_points(e, rho, rays, np.where(known, small.intensity, np.float32(0.0)), known)
+            points = level_points(e, rho, rays, small.intensity, small.coarse_intensity)
         median_depth, bound = depth_scaling(rho)
         return replace(
             small, inverse_depth=device_rho, slope_x=e.upload(slope_x), slope_y=e.upload(slope_y),
             roughness=e.upload(roughness), weight=e.upload(weight), points=points, median_depth=median_depth,
-            bound=bound, pixels=int(np.count_nonzero(rho)) // STRIDES[0] ** 2,
+            bound=bound, pixels=int(np.count_nonzero(rho)) // strides(camera.width, camera.height)[0] ** 2,
         )  # fmt: skip

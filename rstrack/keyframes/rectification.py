@@ -16,7 +16,7 @@ from rsgen.device.arrays import Engine
 from rsgen.device.lens import Lens
 from rsgen.device.projection import TO_BASE, gather, move, project, project_rolling
 from rsgen.device.recording import recorded, recorded_from
-from rstrack.images.sampling import bilinear, grid, nearest, surface
+from rstrack.images.sampling import bilinear, grid, level_size, nearest, surface
 
 # Each iteration shrinks the error by the picture's stretching, a few per cent.
 ITERATIONS = 6
@@ -103,8 +103,11 @@ class ColorInput:
     from_base: Any
 
 
-def color_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[[ColorInput], Any]:
-    """Kernel → (intensity, valid 0/1) at the pixels of the reference `base`, looked up by equation (3)."""
+def color_kernel(e: Engine, lens: Lens, base: Lens, level: int = 0) -> Callable[[ColorInput], Any]:
+    """Kernel → (intensity, valid 0/1) at the pixels of the reference `base`, looked up by equation (3) in the image's
+    pyramid at `level`."""
+    width, height = level_size(lens.camera.width, level), level_size(lens.camera.height, level)
+    shrink = 0.5**level
 
     @recorded_from(ColorInput)
     def kernel(given: ColorInput) -> Any:
@@ -115,9 +118,8 @@ def color_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[[ColorInput], An
             _, x, y = grid(e, base.camera.width, base.camera.height, 1)
             p = move(gather(given.to_base, e.UInt(base.line_of(e.Int(x), e.Int(y))), TO_BASE, stride=TO_BASE), p)
         seen = project_rolling(lens, given.from_base, p, e.UInt, e.Int)
-        camera = lens.camera
-        near = bilinear(e, given.image, camera.width, camera.height, seen.x, seen.y, active & seen.valid)
-        a, b, c, d, fx, fy, active = near
+        u, v = seen.x * shrink, seen.y * shrink
+        a, b, c, d, fx, fy, active = bilinear(e, given.image, width, height, u, v, active & seen.valid)
         value = dr.lerp(dr.lerp(a, b, fx), dr.lerp(c, d, fx), fy)
         active &= dr.isfinite(value)  # not clipped
         return dr.select(active, value, 0.0), dr.select(active, e.Float(1.0), 0.0)

@@ -20,8 +20,8 @@ from rstrack.alignment.linearise import Terms, seen_motions, weakest_motion
 from rstrack.alignment.optimizer import STOP_PX
 from rstrack.data.rig import Frame, Rig
 from rstrack.images.device_frame import DeviceFrame, DeviceRig, Timer, untimed
-from rstrack.images.pyramid import DepthImage
-from rstrack.keyframes.keyframe import STRIDES, Reference
+from rstrack.images.pyramid import LEVELS, DepthImage
+from rstrack.keyframes.keyframe import Reference, strides
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.options import Options
 from rstrack.tracking.frame_report import FrameReport
@@ -161,14 +161,15 @@ class BaselineTracker:
     def _align(self, new: DepthImage, ref: Reference, T_base_cam: FloatArray) -> Alignment:
         """Gauss-Newton from a pose, coarse to fine."""
         found = Alignment(T_base_cam, _START_DEPTH, 0, 1.0, 0, 0.0, 0.0)
-        for level in reversed(range(len(STRIDES))):
+        for level in reversed(range(LEVELS)):
             if np.isfinite(found.shift):
                 found = self._descend(new, ref, found, level)
         return found
 
     def _descend(self, new: DepthImage, ref: Reference, start: Alignment, level: int) -> Alignment:
         camera = self.rig.depth_camera
-        looked_at = -(-camera.width // STRIDES[level]) * -(-camera.height // STRIDES[level])
+        stride = strides(camera.width, camera.height)[level]
+        looked_at = -(-camera.width // stride) * -(-camera.height // stride)
         found = start
         for _ in range(_MOST_STEPS[level]):
             T, sigma = found.T_base_cam, found.sigma

@@ -138,7 +138,7 @@ def exact_reference(cast: Cast, spline: Spline, image: Exposure, margin: int = 0
     ref = maker(camera).rolling(0, depth, (), spline)
     rho = ENGINE.download(depth.inverse_z, (camera.height, camera.width))
     values = intensity_of(cast, spline, image).astype(np.float32)
-    points = level_points(ENGINE, rho, camera_rays(image), values, np.ones(rho.shape, bool))
+    points = level_points(ENGINE, rho, camera_rays(image), values)
     return replace(ref, points=points)
 
 

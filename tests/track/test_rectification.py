@@ -32,9 +32,9 @@ from rstrack.images.line_poses import Exposure, from_base_table, to_base_table
 from rstrack.images.pyramid import depth_image
 from rstrack.images.sampling import EDGE
 from rstrack.keyframes.keyframe import (
-    STRIDES,
     Reference,
     rectified_lens,
+    strides,
 )
 from rstrack.keyframes.rectification import ColorInput, color_kernel, rectify_kernel
 
@@ -166,7 +166,7 @@ def test_registered_colour_is_the_texture_there(ref_scan: str | None, scan: str)
 
 def interior(flat: np.ndarray, level: int) -> np.ndarray:
     """Points of a level away from the border of what is known, where a pyramid mixes different neighbours."""
-    stride = STRIDES[level]
+    stride = strides(WIDTH, HEIGHT)[level]
     grid = flat.reshape(-(-HEIGHT // stride), -(-WIDTH // stride)).astype(np.uint8)
     return cv2.erode(grid, np.ones((5, 5)), borderValue=0).astype(bool).ravel()
 

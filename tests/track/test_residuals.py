@@ -28,7 +28,7 @@ from rstrack.images.blur import blur_length, blur_weight
 @pytest.fixture(autouse=True)
 def exact_poses(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every line's pose from the spline: with these small images a block of eight would take 5 ms."""
-    monkeypatch.setattr(lines, "_LINES_PER_NODE", 1)
+    monkeypatch.setattr(lines, "_NODES", 10**6)
 
 
 def settled_sigma(s: Setting, start: float) -> Linearised:
