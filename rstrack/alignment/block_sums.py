@@ -118,8 +118,8 @@ def accumulate(
 ) -> Any:  # fmt: skip
     """Σ w j jᵀ and so on into `size` integers, from `slot` on (`block_slot`); j = sign [g, p × g].
 
-    c: see `BrightnessSums`, each at most 1. judged: pixels that σ is told by and that are counted; all others only add to
-    the system and the cost.
+    c: see `BrightnessSums`, each at most 1. judged: pixels that tell σ and are counted; others only add to the system
+    and the cost.
     """
     inv_sigma, gate, inv_lever, bound, unit_H, unit_g, unit_cost = parameters
     compared = active & dr.isfinite(r)

@@ -31,8 +31,8 @@ from rstrack.images.pyramid import ColorImage, DepthImage
 from rstrack.keyframes.keyframe import Points, Reference, strides
 from rstrack.options import Options
 
-# Smallest credible σ of depth (m): quantisation and interpolation leave about as much; the latter more, by the square of
-# their size, where pixels are larger than those of this focal length (320×240).
+# Smallest credible σ of depth (m): quantisation and interpolation leave about as much. Where pixels are larger than
+# those of this focal length (320×240) interpolation errs more, by the square of their size.
 _CREDIBLE_DEPTH, _FINE_FOCAL = 2e-4, 240.0
 
 
@@ -89,7 +89,7 @@ class Terms:
     floor_intensity: float = 1.0 / 255.0
     # σ of equation (13) in the photometric term; 0: blurred points count like sharp ones.
     blur_sigma_px: float = 0.0
-    # Part of σ by which interpolation may err before a pixel counts less.
+    # Part of σ by which interpolation may err: beyond that pixels are left out, or weigh less in coarse images.
     smooth: float = 0.25
     timer: Timer = untimed
     _kernel: Kernels = field(init=False)
@@ -136,8 +136,9 @@ class Terms:
         scaling = self._scaling(ref, lens, lens.camera, ref, stride, 1)
         gate = self.gate_depth[level] * max(1.0, ref.median_depth)
         gate = min(gate, max(5.0 * sigma, 10 * self._floor_depth(image, ref))) if level == 0 else gate
-        smooth = self.smooth * max(sigma, _CREDIBLE_DEPTH * max(1.0, _FINE_FOCAL / ref.lens.camera.fx) ** 2)
-        constants = e.upload(np.append(scaling.parameters(sigma, gate), smooth))
+        larger = max(1.0, _FINE_FOCAL / ref.lens.camera.fx) ** 2
+        smooth = self.smooth * max(sigma, _CREDIBLE_DEPTH * larger)
+        constants = e.upload(np.append(scaling.parameters(sigma, gate), [smooth, min(1.0, larger - 1.0)]))
         surface = ref.inverse_depth, ref.slope_x, ref.slope_y, ref.roughness
         with self.timer(f"geometric kernel, level {level}"):
             given = GeometricInput(image.z, *self.rays, to_base, *surface, from_base, constants)

@@ -46,7 +46,8 @@ class GeometricInput:
     depth: z (m) of the current image, every pixel; rays_*: its normalised coordinates; to_base: its lines' poses.
     inverse_depth, roughness (m): the reference's; slope_*: gradient of its inverse depth by normalised coordinates,
     smoothed: it gives normals, while the residual takes inverse depth as it is; from_base: its lines' poses if it is
-    not rectified. constants: those of `Scaling`, and the roughness from which on a pixel of the reference counts less.
+    not rectified. constants: those of `Scaling`; the roughness beyond which a pixel of the reference
+    is no smooth one; and 0 to leave those out, 1 to weigh them by the fourth power of how much too rough they are.
     """
 
     depth: Any
@@ -84,12 +85,11 @@ def geometric_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int) -> Call
         value, active = surface(e, ref, given.inverse_depth, seen.x, seen.y, active & seen.valid)
         at = nearest(e, ref.width, seen.x, seen.y, active)
         mx, my = dr.gather(e.Float, given.slope_x, at, active), dr.gather(e.Float, given.slope_y, at, active)
-        # Where interpolation errs, its bias counts, not its size: such pixels weigh less the more so they are, and hold
-        # what nothing else does. Without them coarse images, half of whose pixels are such, would slide. They do not
-        # tell how good depth is.
-        limit = dr.gather(e.Float, given.constants, e.UInt(7))
+        # Where interpolation errs, its bias counts, not its size: such pixels do not tell how good depth is. In coarse
+        # images, of which they are half, they weigh less the more so they are: without them the flat ones would slide.
+        limit, coarse = (dr.gather(e.Float, given.constants, e.UInt(i)) for i in (7, 8))
         rough = dr.gather(e.Float, given.roughness, at, active)
-        share = dr.square(dr.minimum(1.0, limit * dr.rcp(dr.maximum(rough, 1e-9))))
+        share = dr.select(rough <= limit, 1.0, coarse * dr.square(limit * dr.rcp(dr.maximum(rough, 1e-9))))
         # The plane m·q = 1 through the pixel; |m| is one over its distance.
         mz = value - mx * seen.at.xn - my * seen.at.yn
         inv_m = share * even * dr.rsqrt(mx * mx + my * my + mz * mz)

@@ -151,14 +151,15 @@ def test_sums_equal_those_of_a_loop_over_pixels(room: tuple, monkeypatch: pytest
 
 
 def block_sums(
-    image: DepthImage, ref: Reference, spline: Spline, gate: float, sigma: float, roughness: float = np.inf
-) -> BlockSums:
+    image: DepthImage, ref: Reference, spline: Spline, gate: float, sigma: float, roughness: float = np.inf,
+    coarse: float = 1.0,
+) -> BlockSums:  # fmt: skip
     """The kernel itself, with a gate of one's own."""
     kernel = residuals.geometric_kernel(ENGINE, image.exposure.lens, ref.lens, 2)
     camera = image.exposure.lens.camera
     scaling = Scaling(ref.median_depth, ref.bound, camera.width * camera.height // 4)
     to_base = ENGINE.upload(to_base_table(spline, ref.T_world_base, image.exposure))
-    constants = ENGINE.upload(np.append(scaling.parameters(sigma, gate), roughness))
+    constants = ENGINE.upload(np.append(scaling.parameters(sigma, gate), [roughness, coarse]))
     surface = ref.inverse_depth, ref.slope_x, ref.slope_y, ref.roughness, ENGINE.upload(IDENTITY_FROM_BASE)
     raw = kernel(residuals.GeometricInput(image.z, *maker(DEPTH).device_rays, to_base, *surface, constants))
     current, reference, _, _ = block_counts(image.exposure.lens, ref.lens)
@@ -173,17 +174,23 @@ def test_the_gate_drops_what_lies_beyond_it(room: tuple) -> None:
     assert block_sums(as_input(z), ref, spline, gate, 0.01).count == 251
 
 
-def test_rough_pixels_of_the_reference_count_less(room: tuple) -> None:
+def test_rough_pixels_of_the_reference_weigh_less_or_are_left_out(room: tuple) -> None:
     as_input, ref, spline, z = room
     rough = ENGINE.download(ref.roughness, z.shape)
     limit = float(np.median(rough[rough > 0]))
-    sums = [
-        block_sums(as_input(z), replace(ref, roughness=ENGINE.upload(r)), spline, 10.0, 0.01, limit)
-        for r in (0.0 * rough, rough, np.where(rough < limit, rough, 1e6))
-    ]
-    traces = [float(np.trace(s.H.sum(axis=(0, 1)))) for s in sums]
-    assert traces[2] < 0.99 * traces[1] < 0.9 * traces[0]  # little is not nothing
-    assert sums[0].count == sums[1].count == sums[2].count
+
+    def sums(roughness: np.ndarray, coarse: float) -> BlockSums:
+        there = replace(ref, roughness=ENGINE.upload(roughness))
+        return block_sums(as_input(z), there, spline, 10.0, 0.01, limit, coarse)
+
+    smooth, soft, without = sums(0.0 * rough, 1.0), sums(rough, 1.0), sums(rough, 0.0)
+    far = sums(np.where(rough <= limit, rough, 1e6), 1.0)
+    traces = [float(np.trace(s.H.sum(axis=(0, 1)))) for s in (without, soft, smooth)]
+    assert 0 < traces[0] < 0.99 * traces[1] < 0.9 * traces[2]
+    np.testing.assert_allclose(far.H, without.H, atol=1e-6 * np.abs(without.H).max())  # weight fades out
+    # σ and what is counted are those of the smooth ones alone, however many others there are.
+    assert without.count == soft.count == far.count < 0.9 * smooth.count and soft.compared == soft.count
+    assert soft.weighted == without.weighted < smooth.weighted and soft.cost > without.cost
 
 
 def test_blocks_chained_to_control_points_equal_dense_pixel_jacobians(room: tuple) -> None:
