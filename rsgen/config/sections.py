@@ -49,6 +49,9 @@ class TrajectoryConfig(Section):
     knot_spacing_s: Annotated[float, limits(1e-9, 1e3, "s")] = Field(
         default=0.05, description="knot spacing of the ground-truth spline, s"
     )
+    clearance_m: Annotated[float, limits(0, 1e4, "m")] | None = Field(
+        default=None, description="least distance of a recorded path to the scene's surfaces, m; null: not checked"
+    )
     smoothing: Annotated[float, limits(0, 1e6, "s^4: 1 damps all but motions slower than a second")] = Field(
         default=0.0, description="weight of the acceleration penalty of the fit, s^4"
     )

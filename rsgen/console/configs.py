@@ -25,7 +25,7 @@ def config_file(name: str) -> Path:
 def configs_text() -> str:
     """Names of all configs, each with the first line of its comment."""
     files = sorted(configs_folder().glob("*.yaml"))
-    rows = [f"{file.stem:<12}{file.read_text(encoding='utf-8').partition(chr(10))[0].lstrip('# ')}" for file in files]
+    rows = [f"{file.stem:<14}{file.read_text(encoding='utf-8').partition(chr(10))[0].lstrip('# ')}" for file in files]
     return "\n".join([*rows, f"in {configs_folder()}"])
 
 

@@ -105,8 +105,9 @@ def render_sequence(
     scene = None
     if not (out / "sequence.yaml").exists():
         scene = load_scene(config)
-        if config.motion is not None:
-            check_clearance(motion.spline, scene_triangles(scene), config.motion.clearance_m)
+        least = config.trajectory.clearance_m if config.motion is None else config.motion.clearance_m
+        if least is not None:
+            check_clearance(motion.spline, scene_triangles(scene), least)
     writer = SequenceWriter.open(out, config, motion.spline, stamps["color"], stamps["depth"], *identity)
     write_origin(out, config)
     source = None

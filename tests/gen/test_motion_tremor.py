@@ -9,6 +9,7 @@ import pytest
 import tiny
 from pydantic import ValidationError
 
+from rsgen.cli.main import main
 from rsgen.config.config import load_config, validate_config
 from rsgen.config.motion import TremorConfig
 from rsgen.errors import UserError
@@ -18,6 +19,7 @@ from rsgen.motion.fit import fit_spline
 from rsgen.motion.tremor import with_tremor
 from rsgen.produce.generate import load_motion
 
+ROOT = Path(__file__).parents[2]
 SECONDS = 8.0
 SMOOTH = Spline(se3.exp(np.cumsum(np.full((170, 6), 0.01), axis=0)), -0.05, 0.05)
 RATE = 1000.0
@@ -63,6 +65,23 @@ def test_a_band_that_falls_and_a_moment_too_short_for_it_are_refused() -> None:
         TremorConfig(band_hz=(12.0, 8.0))
     with pytest.raises(UserError, match="holds no multiple"):
         with_tremor(SMOOTH, TremorConfig(), 0, np.array([0.0, 0.07]))
+
+
+def test_a_recorded_path_that_meets_a_wall_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    config = tiny.write_config(tmp_path, 6)
+    for least, status in (("0.5", 0), ("1.4", 2)):
+        words = ["render", str(config), "--out", str(tmp_path / least), "--frames", "0:1", "--quiet"]
+        assert main([*words, "--trajectory.clearance_m", least]) == status
+    assert "clearance_m is 1.4" in capfd.readouterr().err and not (tmp_path / "1.4").exists()
+
+
+@pytest.mark.parametrize("name", ["wild1", "wild2", "wild3", "twin_fr1_rpy"])
+def test_configs_of_real_motions_stand_upright_and_check_their_way(name: str) -> None:
+    config = load_config(ROOT / f"configs/{name}.yaml")
+    T = np.array(config.trajectory.T_world_file)
+    assert T[1, :3].tolist() == [0, 0, 1] and np.linalg.det(T[:3, :3]) == pytest.approx(1)  # their z is our y
+    assert config.preset == "kinect_v1" and config.trajectory.clearance_m == 0.3
+    assert config.color.driver is not None and config.color.auto_exposure is not None and config.depth.registered
 
 
 # --- the preset
