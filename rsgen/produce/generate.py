@@ -41,7 +41,10 @@ ORIGIN = "origin.yaml"
 
 @dataclass(frozen=True)
 class Motion:
-    """The ground truth of a config: fitted spline of the body (depth camera), what the fit missed, recorded stamps."""
+    """The ground truth of a config: fitted spline of the body (depth camera), recorded stamps, and `fit`.
+
+    fit: of the recorded or made trajectory, before any tremor: what it missed.
+    """
 
     spline: Spline
     fit: FitResult
@@ -60,17 +63,18 @@ def load_motion(config: Config) -> Motion:
     if settings.T_world_file is not None:
         trajectory = trajectory.moved(np.asarray(settings.T_world_file, float))
     spacing = settings.knot_spacing_s
+    recorded = None
     if config.tremor is not None:
-        smooth = fit_spline(trajectory, dt=spacing, smoothing=settings.smoothing).spline
-        trajectory, spacing = with_tremor(smooth, config.tremor, config.seed, trajectory.stamps[[0, -1]])
+        recorded = fit_spline(trajectory, dt=spacing, smoothing=settings.smoothing)
+        trajectory, spacing = with_tremor(recorded.spline, config.tremor, config.seed, trajectory.stamps[[0, -1]])
     streams = (config.color, config.depth)
     before = max(s.longest_exposure_s - min(s.offset_s, 0.0) for s in streams)
     after = max(s.readout_s for s in streams)
     fit = fit_spline(
-        trajectory, dt=spacing, smoothing=0.0 if config.tremor else settings.smoothing, pad_begin_s=before,
+        trajectory, dt=spacing, smoothing=settings.smoothing if recorded is None else 0.0, pad_begin_s=before,
         pad_end_s=after,
     )  # fmt: skip
-    return Motion(fit.spline, fit, float(trajectory.stamps[0]), float(trajectory.stamps[-1]))
+    return Motion(fit.spline, recorded or fit, float(trajectory.stamps[0]), float(trajectory.stamps[-1]))
 
 
 def _recorded(settings: TrajectoryConfig) -> Trajectory:
