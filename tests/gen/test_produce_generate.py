@@ -177,10 +177,10 @@ def test_an_interrupted_render_leaves_a_readable_shorter_sequence(
 ) -> None:
     expose = FrameSource.expose_color
 
-    def interrupted(self: FrameSource, spline: Any, stamp: float, frame: int, following: float | None) -> Any:
+    def interrupted(self: FrameSource, spline: Any, stamp: float, frame: int, *more: Any) -> Any:
         if frame == 4:
             raise KeyboardInterrupt
-        return expose(self, spline, stamp, frame, following)
+        return expose(self, spline, stamp, frame, *more)
 
     with monkeypatch.context() as patch:
         patch.setattr(FrameSource, "expose_color", interrupted)
