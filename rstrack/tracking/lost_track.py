@@ -36,7 +36,7 @@ _ALWAYS = np.array([0.05, np.radians(4.0)])
 _MEMORY = 30
 # How far a frame's images, or one term alone, may pull (see `alignment.pull`): so many times the usual, and always so
 # many metres. In the first frames nothing is usual yet.
-_PULL_GROWTH, _PULL_WHOLE, _PULL_ALONE = 8.0, 2e-3, 1e-2
+_PULL_WHOLE, _PULL_ALONE = (4.0, 2e-3), (8.0, 1e-2)
 _FEW = 10
 
 
@@ -106,8 +106,8 @@ class FitHistory:
 
     def _most_pull(self, name: str) -> float:
         usual = [pull for before in self._pulls if np.isfinite(pull := getattr(before, name))]
-        always = _PULL_WHOLE if name == "whole" else _PULL_ALONE
-        return max(always, _PULL_GROWTH * median(usual)) if len(usual) >= _FEW else np.inf
+        growth, always = _PULL_WHOLE if name == "whole" else _PULL_ALONE
+        return max(always, growth * median(usual)) if len(usual) >= _FEW else np.inf
 
     def is_hopeless(self, fresh: Sequence[Observation]) -> bool:
         """Whether no term of a frame, aligned at a coarse level, fits a part of its pixels that a finer one could."""

@@ -152,7 +152,7 @@ def test_all_misfits_are_named() -> None:
 @pytest.mark.parametrize(
     ("name", "usual", "limit", "says"),
     [
-        ("whole", 1e-3, 8e-3, "the images do not agree with the motion"),
+        ("whole", 1e-3, 4e-3, "the images do not agree with the motion"),
         ("whole", 1e-5, 2e-3, "the images do not agree with the motion"),
         ("depth", 2e-3, 16e-3, "depth and colour do not agree"),
         ("color", 1e-4, 1e-2, "depth and colour do not agree"),
