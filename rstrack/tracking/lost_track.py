@@ -37,7 +37,7 @@ _MEMORY = 30
 # How far a frame's images, or one term alone, may pull (see `alignment.pull`): so many times the usual, and always so
 # many metres. In the first frames nothing is usual yet.
 _PULL_WHOLE, _PULL_ALONE = (4.0, 2e-3), (8.0, 1e-2)
-_FEW = 10
+_FEW = 5
 
 
 @dataclass
