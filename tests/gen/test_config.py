@@ -248,8 +248,10 @@ def test_numbers_are_taken_up_to_their_limits(name: str, low: float, high: float
 
 
 def test_zero_switches_off_what_else_has_a_least_value() -> None:
-    for name in ("color.readout_s", "color.exposure_s", "color.noise.gain", "depth.noise.disparity_step_px"):
-        validate_config(fuzzing.with_entry(fuzzing.base_config(), name, 0), "here")
+    base = fuzzing.with_entry(fuzzing.base_config(), "color.auto_exposure", None)  # it needs an exposure to begin with
+    names = ("color.readout_s", "color.exposure_s", "color.noise.gain", "depth.noise.disparity_step_px")
+    for name in (*names, "color.driver.grid_s"):
+        validate_config(fuzzing.with_entry(base, name, 0), "here")
 
 
 def test_a_limit_says_its_reason(tmp_path: Path) -> None:

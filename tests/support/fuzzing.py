@@ -85,8 +85,11 @@ def base_config(motion: dict[str, Any] | None = None) -> dict[str, Any]:
         "name": "fuzzed",
         "scene": {"file": "scene.xml"},
         "light": tiny.QUICK_LIGHT,
-        "color": tiny.CAMERA | {"spp": 1, "exposure_s": 0.005, "noise": {"model": "camera"}},
-        "depth": tiny.CAMERA | {"noise": {"model": "kinect"}},
+        "color": tiny.CAMERA
+        | {"spp": 1, "exposure_s": 0.005, "noise": {"model": "camera"}, "driver": {}}
+        | {"auto_exposure": {}, "auto_white_balance": {}},
+        "depth": tiny.CAMERA | {"noise": {"model": "kinect"}, "driver": {}},
+        "tremor": {},
         "truth": TRUTH,
         "imu": {},
     }
