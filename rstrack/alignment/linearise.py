@@ -28,7 +28,7 @@ from rstrack.alignment.student_t import scale_step
 from rstrack.images.device_frame import DeviceRig, Timer, untimed
 from rstrack.images.line_poses import IDENTITY_FROM_BASE, Exposure, from_base_table, to_base_table
 from rstrack.images.pyramid import ColorImage, DepthImage
-from rstrack.keyframes.keyframe import Points, Reference, strides
+from rstrack.keyframes.keyframe import Points, Reference, pyramid_level, strides
 from rstrack.options import Options
 
 # Smallest credible σ of depth (m): quantisation and interpolation leave about as much. Where pixels are larger than
@@ -106,7 +106,7 @@ class Terms:
         self, image: DepthImage, ref: Reference, spline: Spline, level: int, sigma: float,
         slopes_at: Spline | None = None,
     ) -> Linearised:  # fmt: skip
-        """Depth image against the reference's depth with the pixels of a level (`strides`).
+        """Depth image against the reference's depth with the pixels of a level (`strides`), or `THINNED`.
 
         slopes_at: spline at which the lines' poses are differentiated by control points, if not `spline`: that changes
         by no more than the increments between the two (relative), which Gauss-Newton steps do not notice.
@@ -134,8 +134,9 @@ class Terms:
         stride = _stride(lens, level)
         kernel = self._kernel(geometric_kernel, lens, ref.lens, stride)
         scaling = self._scaling(ref, lens, lens.camera, ref, stride, 1)
-        gate = self.gate_depth[level] * max(1.0, ref.median_depth)
-        gate = min(gate, max(5.0 * sigma, 10 * self._floor_depth(image, ref))) if level == 0 else gate
+        gate = self.gate_depth[pyramid_level(level)] * max(1.0, ref.median_depth)
+        if pyramid_level(level) == 0:
+            gate = min(gate, max(5.0 * sigma, 10 * self._floor_depth(image, ref)))
         larger = max(1.0, _FINE_FOCAL / ref.lens.camera.fx) ** 2
         smooth = self.smooth * max(sigma, _CREDIBLE_DEPTH * larger)
         constants = e.upload(np.append(scaling.parameters(sigma, gate), [smooth, min(1.0, larger - 1.0)]))
@@ -168,7 +169,7 @@ class Terms:
         """
         with self.timer(f"photometric kernel, level {level}"):
             e, lens, points = self.e, image.exposure.lens, ref.points[level]
-            stride, own_level = _stride(ref.lens, level), image.level(level)
+            stride, own_level = _stride(ref.lens, level), image.level(pyramid_level(level))
             kernel = self._kernel(photometric_kernel, lens, ref.lens, stride, own_level, self.blur_sigma_px)
             from_base = self._from_base(spline, ref.T_world_base, image.exposure)
             # Moving closer or turning packs more points into a block than its share.

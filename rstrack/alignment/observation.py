@@ -14,12 +14,14 @@ from rstrack.alignment.linearise import Linearised, Terms
 from rstrack.alignment.normal_equations import Quadratic
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.pyramid import ColorImage, DepthImage
-from rstrack.keyframes.keyframe import Reference
+from rstrack.keyframes.keyframe import THINNED, Reference
 
 # Increments of control points (m, rad) that change the derivatives of lines by less than a step's own error.
 _SAME_SLOPES = 5e-3
 # Change of gain and offset, in σ of the intensities, that calls for a new linearisation.
 _SAME = 0.2
+# Part of the pixels that count below which a quarter of them tells as much as all.
+THIN_BELOW = 1.0 / 16.0
 # Errors at the start of a level, as σ: m and intensity; re-estimated with every linearisation.
 START_DEPTH, START_INTENSITY = 5e-3, 0.03
 
@@ -76,6 +78,16 @@ class Observation:
         return self.linearisation.lin
 
     @property
+    def pixels(self) -> int:
+        """Pixels of the finest level that count, if all of them were looked at."""
+        return round(self.linearisation.stands_for * self.lin.count)
+
+    @property
+    def inflation(self) -> float:
+        """That of the linearisation, by pixels of the finest level; see `independence.inflation`."""
+        return self.linearisation.stands_for * self.lin.inflation
+
+    @property
     def stands_for(self) -> float:
         """Independent pixels of the finest level for each that was looked at."""
         return self.independent * self.linearisation.stands_for
@@ -92,20 +104,22 @@ class Observation:
     def linearise(self, terms: Terms, state: SplineState, level: int) -> None:
         """Around the current state; takes the σ that the one before suggested."""
         image, sigma, slopes_at = self.image, self.linearisation.sigma, self._slopes(state)
+        is_finest = level == 0
+        level = THINNED if is_finest and self.independent < THIN_BELOW else level
         brightness = self.brightness(state)
         if isinstance(image, DepthImage):
             lin = terms.geometric(image, self.ref, state.spline, level, sigma or START_DEPTH, slopes_at)
         else:
-            if level == 0 and self._visible is None and self.occluder is not None:
+            if is_finest and self._visible is None and self.occluder is not None:
                 # Once: the coarse levels have brought the poses close enough to tell, and a fixed set converges.
                 self._visible = terms.visible(self.occluder, self.ref, state.spline, level)
-            visible = self._visible if level == 0 else None
+            visible = self._visible if is_finest else None
             sigma = sigma or START_INTENSITY
             lin = terms.photometric(
                 image, self.ref, state.spline, level, sigma, slopes_at, visible, brightness, self.expected
             )
         # A coarse level's pixels stand for those left out: the priors' share must not depend on the level.
-        stands_for = 4.0**level
+        stands_for = 4.0 ** (1 if level == THINNED else level)
         self.linearisation = _Linearisation(lin, lin.next_sigma, state.moved.copy(), stands_for, brightness)
 
     def brightness(self, state: SplineState) -> FloatArray:

@@ -26,9 +26,9 @@ RELINEARISE_PX = 0.02
 # The same for noisy depth: part of what its σ moves a pixel by. (Noise-free depth is held to the pixels above,
 # and what does not fit must not end early for it.)
 _NOISE_SHARE, _MOST_TOLERANCE_PX = 0.1, 0.08
-# Where noise, not rounding, is what limits: σ over the smallest credible one. A step shorter than so many σ of the
-# result, squared, is the last one there, and what has moved less keeps its linearisation.
-_NOISY, _MATTERS = 2.0, 0.1
+# Where noise, not rounding, is what limits (σ over the smallest credible one): a step shorter than so many σ of the
+# result, squared, is the last one of a level, finest first, and what has moved by less keeps its linearisation.
+_NOISY, _LAST, _MATTERS = 2.0, (0.3, 5.0, 5.0), 1.0
 # Rise of the negative log-likelihood per pixel from which on a step has made things worse: less is noise of gating.
 _WORSE = 2e-5
 
@@ -115,7 +115,7 @@ def _optimise_level(terms: Terms, state: SplineState, problem: Problem, level: i
         done.last_shift = max(_shift(problem, first, step, state), _shift(problem, first, plain, state))
         if done.last_shift < (_tolerance(problem) if level == 0 else STOP_PX[level]):
             break
-        if -float(g @ plain.ravel()) < _MATTERS and all(_is_noisy(o) for o in problem.fresh):
+        if -float(g @ plain.ravel()) < _LAST[level] and all(_is_noisy(o) for o in problem.fresh):
             break
 
 

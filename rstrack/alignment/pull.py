@@ -44,13 +44,13 @@ def _pull(observations: Sequence[Observation], state: SplineState) -> float:
         return float("nan")
     H, g = np.diag(1.0 / _PRIOR**2), np.zeros(6)
     for o in observations:
-        own = _rigid(o, state)
+        own = rigid(o, state)
         H, g = H + own[0], g + own[1]
     twist = np.linalg.solve(H, g)
     return float(np.linalg.norm(twist[:3]) + observations[0].ref.median_depth * np.linalg.norm(twist[3:]))
 
 
-def _rigid(o: Observation, state: SplineState) -> tuple[FloatArray, FloatArray]:
+def rigid(o: Observation, state: SplineState) -> tuple[FloatArray, FloatArray]:
     """H (6, 6) and g (6,) of a twist of all lines at once, in the world's axes about the camera at mid readout.
 
     All control points moved by one left increment move every pose by it.

@@ -22,6 +22,8 @@ from rstrack.images.sampling import EDGE, NEAREST
 # Pixels of the smallest image of which every second one, in every second row, is enough, and of the largest one:
 # 320×240 and 640×480 lose nothing by that (DESIGN section 5), while 160×120 has none to spare.
 _SPARE_PX, _PLENTY_PX = 320 * 240, 640 * 480
+THINNED = LEVELS
+"""Beside the pyramid's levels: the finest with every second of its pixels, for where a good many err alike."""
 # Normals come from a window of this many pixels; the residual itself is not smoothed.
 _NORMAL_WINDOW = 5
 
@@ -94,10 +96,10 @@ def rectified_lens(camera: Camera) -> Lens:
 
 
 def strides(width: int, height: int) -> tuple[int, ...]:
-    """Strides of the pixels of a depth image that are looked at on the pyramid's levels, finest first."""
+    """Strides of the pixels of a depth image that are looked at on the pyramid's levels, finest first, and `THINNED`."""
     pixels = width * height
     finest = 1 if pixels < _SPARE_PX else 2 * max(1, math.isqrt(pixels // _PLENTY_PX))
-    return tuple(finest * 2**level for level in range(LEVELS))
+    return *(finest * 2**level for level in range(LEVELS)), 2 * finest
 
 
 def surface_slopes(rho: Image, fx: float, fy: float) -> tuple[Image, Image]:
@@ -148,6 +150,11 @@ def on_one_surface(rho: Image) -> npt.NDArray[np.bool_]:
     return valid
 
 
+def pyramid_level(sampling: int) -> int:
+    """Level of the pyramid that the pixels of a sampling, a level or `THINNED`, are taken from."""
+    return 0 if sampling == THINNED else sampling
+
+
 def depth_scaling(rho: Image) -> tuple[float, float]:
     """`median_depth` and `bound` of the geometric term.
 
@@ -161,14 +168,18 @@ def depth_scaling(rho: Image) -> tuple[float, float]:
 def level_points(
     e: Engine, rho: Image, rays: FloatArray, intensity: Image, coarse: Image | None = None
 ) -> tuple[Points, ...]:
-    """Points of all levels. rays (h, w, 2): normalised coordinates; intensity, coarse (h, w): see `Reference`."""
+    """Points of all levels, and of `THINNED`.
+
+    rays (h, w, 2): normalised coordinates; intensity, coarse (h, w): see `Reference`.
+    """
     whole = on_one_surface(rho)
     height, width = rho.shape
     images = _intensities(intensity, rho)
     if coarse is not None:
         images[1:] = _intensities(coarse, rho)[1:]
     out = []
-    for level, stride in enumerate(strides(width, height)):
+    for sampling, stride in enumerate(strides(width, height)):
+        level = pyramid_level(sampling)
         image, known = images[level]
         pick = (slice(None, None, stride), slice(None, None, stride))
         # A level's pixels are 2^level apart.

@@ -28,6 +28,7 @@ from rstrack.metrics.association import (
     compare,
     nearest,
 )
+from rstrack.metrics.consistency import covariances, step_nees
 
 _RPE_DELTA_S = 1.0
 _PAIR_WITHIN_S = 0.1
@@ -42,7 +43,8 @@ class Metrics:
 
     frames, frames_tracked: of the sequence, and those among them with a pose within 0.02 s. poses, poses_compared: of
     the estimate, and those with a true counterpart. ate_*: absolute trajectory error. rpe_*: relative pose error over
-    one second, `rpe_pairs` of them. row_*: over the depth images' lines, `rows` of them in `rows_total`.
+    one second, `rpe_pairs` of them. row_*: over the depth images' lines, `rows` of them in `rows_total`. nees: mean of
+    those relative errors squared, normalised by the run's covariances, over 6: 1 if these are right.
     """
 
     frames: int
@@ -62,6 +64,7 @@ class Metrics:
     rows: int
     rows_total: int
     notes: tuple[str, ...] = ()
+    nees: float | None = None
 
     @property
     def coverage(self) -> float:
@@ -95,7 +98,8 @@ class Metrics:
         tracked = f"{self.frames_tracked} of {self.frames} ({100 * self.coverage:.1f} %)"
         head = [f"frames tracked: {tracked}", ""] if self.frames else []
         notes = [f"note: {note}" for note in self.notes]
-        return "\n".join([*head, self.table().text(), *notes])
+        sure = "" if self.nees is None else f"covariances: NEES/6 {self.nees:.2f} over 1 s (1: as large as errors are)"
+        return "\n".join([*head, self.table().text(), *([sure] if sure else []), *notes])
 
 
 @dataclass(frozen=True)
@@ -137,6 +141,7 @@ def evaluate(truth: Truth, estimate: Estimate) -> Metrics:
     error = found.position_errors_m
 
     step = drift(estimate, found)
+    nees = _nees(estimate, found)
     if not len(step.stamps):
         notes.append("no drift: no two poses are one second apart")
 
@@ -163,6 +168,7 @@ def evaluate(truth: Truth, estimate: Estimate) -> Metrics:
         rows=row_count,
         rows_total=len(t),
         notes=tuple(notes),
+        nees=nees,
     )
 
 
@@ -185,14 +191,29 @@ def pairs_one_second_apart(stamps: FloatArray) -> tuple[IntArray, IntArray]:
 
 def drift(estimate: Estimate, found: Comparison) -> Drift:
     """The relative pose errors whose RMS `evaluate` gives, with the time at which each second begins."""
+    stamps, i, j = _pairs(estimate, found)
+    true_step = se3.inverse(found.T_world_true[i]) @ found.T_world_true[j]
+    est_step = se3.inverse(found.T_world_est[i]) @ found.T_world_est[j]
+    return Drift(stamps, *_pose_errors(true_step, est_step))
+
+
+def _pairs(estimate: Estimate, found: Comparison) -> tuple[FloatArray, IntArray, IntArray]:
+    """Stamps (k,) at which pairs one second apart begin, and their indices (k,) among the poses that were compared."""
     row = np.full(len(estimate.stamps), -1)
     row[found.index] = np.arange(len(found.index))
     i, j = pairs_one_second_apart(estimate.stamps)
     both = (row[i] >= 0) & (row[j] >= 0)
-    stamps, i, j = estimate.stamps[i[both]], row[i[both]], row[j[both]]
-    true_step = se3.inverse(found.T_world_true[i]) @ found.T_world_true[j]
-    est_step = se3.inverse(found.T_world_est[i]) @ found.T_world_est[j]
-    return Drift(stamps, *_pose_errors(true_step, est_step))
+    return estimate.stamps[i[both]], row[i[both]], row[j[both]]
+
+
+def _nees(estimate: Estimate, found: Comparison) -> float | None:
+    """Mean of `step_nees` over the pairs whose covariances are known; None without any."""
+    pose, drifts = (c[found.index] for c in covariances(estimate))
+    _, i, j = _pairs(estimate, found)
+    known = np.isfinite(pose[i] + pose[j]).all(axis=(1, 2))
+    if not known.any():
+        return None
+    return float(step_nees(found.T_world_true, found.T_world_est, pose, drifts, i[known], j[known]).mean())
 
 
 def compared(run: Path, metrics: Metrics, other: Path, theirs: Metrics) -> str:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from rstrack.alignment.linearise import Linearised
+from rsgen.array_types import FloatArray
+from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Solved
 
 
@@ -18,6 +19,10 @@ class FrameReport:
     step still moved a line. keyframe: a new one was made; lost: no pose was found, and none is given.
     observability: smallest eigenvalue of Σ w j jᵀ per pixel, rotations scaled by the scene's depth; near 0 where the
     images leave a motion open. overlap: pixels that fall on the keyframe, against the first frame after it was made.
+    covariance: of the pose against its keyframe, (6, 6) [m; rad] in the depth camera's frame at mid readout; drift:
+    what the errors of the keyframes before add to that against the first frame; None where there are none: of lost
+    frames, and with the baseline. held_by_motion: largest part (0..1) that the motion before, not the images, has in
+    what is known of any direction.
     """
 
     stamp: float
@@ -32,29 +37,33 @@ class FrameReport:
     lost: bool
     observability: float
     overlap: float
+    covariance: FloatArray | None = None
+    drift: FloatArray | None = None
+    held_by_motion: float = float("nan")
 
     def as_lost(self) -> FrameReport:
         """The same frame, given up later on."""
-        return replace(self, lost=True, keyframe=False)
+        return replace(self, lost=True, keyframe=False, covariance=None, drift=None)
 
 
 def frame_report(
-    stamp: float, depth: Sequence[Linearised], color: Sequence[Linearised], solved: Solved | None, *,
-    keyframe: bool, lost: bool, overlap: float,
-) -> FrameReport:  # fmt: skip
-    """Of a frame whose images ended with these linearisations; solved: None where nothing was optimised."""
+    stamp: float, fresh: Sequence[Observation], solved: Solved | None, *, keyframe: bool, lost: bool, overlap: float
+) -> FrameReport:
+    """Of a frame with these observations; solved: None where nothing was optimised."""
     solved = solved or Solved(last_shift=0.0)
+    depth = [o for o in fresh if o.is_depth and o.is_linearised]
+    color = [o for o in fresh if not o.is_depth and o.is_linearised]
     return FrameReport(
         stamp=stamp,
-        sigma_depth_m=depth[0].next_sigma if depth else float("nan"),
-        sigma_intensity=color[0].next_sigma if color else float("nan"),
-        inliers_depth=sum(lin.count for lin in depth),
-        inliers_color=sum(lin.count for lin in color),
+        sigma_depth_m=depth[0].lin.next_sigma if depth else float("nan"),
+        sigma_intensity=color[0].lin.next_sigma if color else float("nan"),
+        inliers_depth=sum(o.pixels for o in depth),
+        inliers_color=sum(o.pixels for o in color),
         iterations=solved.iterations,
         evaluations=solved.evaluations,
         last_shift_px=solved.last_shift,
         keyframe=keyframe,
         lost=lost,
-        observability=max((lin.observability for lin in (*depth, *color)), default=0.0),
+        observability=max((o.lin.observability for o in (*depth, *color)), default=0.0),
         overlap=overlap,
     )

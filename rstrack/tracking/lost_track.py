@@ -115,7 +115,7 @@ class FitHistory:
 
     def _misfit(self, o: Observation, expected: int) -> str:
         name = "depth" if o.is_depth else "colour"
-        if not o.is_linearised or o.lin.count < max(_LEAST_PIXELS, _LEAST_SHARE * expected):
+        if not o.is_linearised or o.pixels < max(_LEAST_PIXELS, _LEAST_SHARE * expected):
             return f"hardly a pixel of the {name} image falls on the keyframe"
         if o.lin.fit < _least_fit(o):
             return f"the {name} image shows something else"

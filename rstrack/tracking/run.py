@@ -341,10 +341,11 @@ def _timings(total_s: float, seconds: Sequence[float]) -> dict[str, Any]:
 def _diagnostics(dataset: Dataset, used: Sequence[int], reports: Sequence[FrameReport]) -> list[dict[str, Any]]:
     """One dict a frame for the plots: `FrameReport`, with inliers as parts of the run's largest number too.
 
-    listed_stamp: as the recording has it, where it was tracked at another one.
+    listed_stamp: as the recording has it, where it was tracked at another one. Of covariances the upper triangle.
     """
     frames = [dataclasses.asdict(report) for report in reports]
     for k, frame in zip(used, frames, strict=True):
+        frame |= {name: _upper(frame[name]) for name in ("covariance", "drift")}
         frame["stamp"] = float(dataset.stamps[k])
         if dataset.timing is not None:
             frame["listed_stamp"] = float(dataset.timing.depth.listed[k])
@@ -356,3 +357,8 @@ def _diagnostics(dataset: Dataset, used: Sequence[int], reports: Sequence[FrameR
             frame[f"inliers_{stream}"] = count / most if most and frame["evaluations"] else None
             frame[f"pixels_{stream}"] = count
     return frames
+
+
+def _upper(covariance: FloatArray | None) -> FloatArray | None:
+    """The upper triangle (21,) of a covariance (6, 6), row by row."""
+    return None if covariance is None else covariance[np.triu_indices(6)]

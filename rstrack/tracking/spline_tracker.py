@@ -34,6 +34,7 @@ from rstrack.options import Options
 from rstrack.tracking import coarse_search
 from rstrack.tracking.frame_report import FrameReport, frame_report
 from rstrack.tracking.lost_track import FitHistory, implausible, is_settled
+from rstrack.tracking.uncertainty import Uncertainty, information
 from rstrack.tracking.window import LEVELS, TRACKING_LEVELS, Window
 
 # Seconds without a frame after which the motion before says nothing about where the camera is, and beyond which
@@ -65,6 +66,9 @@ class Tracker:
         self._recent: deque[DeviceFrame] = deque()
         self._fits = FitHistory()
         self._independence = Independence(), Independence()  # of depth pixels, and of colour pixels
+        # Of the newest frame, and of the recent ones: keyframe and covariance against it.
+        self._uncertainty = Uncertainty()
+        self._covariances: dict[int, tuple[int, FloatArray]] = {}
         self._pixels = 0
         # Gain and offset against the first colour image, of the recent frames, and the newest colour image's moments.
         self._brightness: dict[int, FloatArray] = {}
@@ -150,13 +154,19 @@ class Tracker:
             fresh, on_reference = fitting, [o for o in fitting if o.ref is ref]
             solved = window.solve(fresh, levels, gauge, coupled)
         fault = self._fits.fault(on_reference, solved, ref.pixels, pulls(on_reference, window.state))
-        if fault or implausible(T_predicted, window.spline.pose(mid), gap):
+        if ref.rolling is None:
+            # A rolling reference moves with what is aligned to it, which tells nothing of the two together.
+            seen = information(on_reference, window.state)
+            uncertainty = self._uncertainty.after(new.stamp - self._stamps[-1], seen)
+        else:
+            uncertainty = self._uncertainty
+        if fault or implausible(T_predicted, window.spline.pose(mid), gap) or not uncertainty.is_known:
             self._window = before
             return self._relocalise(new)
-        self._window = window
+        self._window, self._uncertainty = window, uncertainty
         window.keep(fresh)
         for is_color, term in enumerate(self._independence):
-            term.learn(o.lin.inflation for o in on_reference if o.is_depth != is_color)
+            term.learn(o.inflation for o in on_reference if o.is_depth != is_color)
         self._recent.append(new)
         self._placed(new, fresh)
         overlap = self._overlap(on_reference)
@@ -255,6 +265,16 @@ class Tracker:
         others = [o for frame in frames if frame is not middle for o in self._observe(frame, ref)]
         window.solve(others, levels=(0,))
         window.keep(others)
+        for frame in frames:
+            own = information([o for o in others if o.frame == frame.index], window.state)
+            self._uncertainty = self._uncertainty.found_anew(own)
+            if frame is not middle:
+                self._covariances[frame.index] = ref.index, self._covariance(ref)
+        first = self._covariances.get(frames[0].index, (ref.index, np.zeros((6, 6))))
+        T_world_first = window.spline.pose(frames[0].depth.exposure.mid_time)
+        self._uncertainty = self._uncertainty.with_keyframe(ref.index, -1, T_world_first, first[1])
+        for frame in frames[:-1]:
+            self.reports[frame.index] = self._with_covariance(self.reports[frame.index], frame)
 
     def _relocalise(self, new: DeviceFrame) -> FrameReport:
         """Find a frame's place: where the track ended, or at any keyframe ever made that looks like it.
@@ -297,6 +317,7 @@ class Tracker:
             self.spline_valid.append((begin, min(end, trial.state.untouched)))
         trial.keep(fresh)
         self._window, self._reference = trial, ref
+        self._uncertainty = self._uncertainty.found_anew(information(fresh, trial.state))
         self._keyframes.use(ref)
         self._pixels, self._unconverged, self._lost_in_a_row = 0, None, 0
         self._recent = deque([new])
@@ -350,11 +371,15 @@ class Tracker:
         assert self._window is not None
         bright = self._brightness.get(frame.index, brightness.SAME)
         self._reference = self._keyframes.make(frame, self._window.spline, older, bright)
+        if frame.index in self._covariances:
+            before, pose = self._covariances[frame.index]
+            T_world_depth = self._reference.T_world_base
+            self._uncertainty = self._uncertainty.with_keyframe(frame.index, before, T_world_depth, pose)
         self._unconverged, self._pixels = None, 0
         return self._reference
 
     def _overlap(self, fresh: Sequence[Observation]) -> float:
-        count = next((o.lin.count for o in fresh if o.is_linearised and o.lin.count), 0)
+        count = next((o.pixels for o in fresh if o.is_linearised and o.lin.count), 0)
         self._pixels = max(self._pixels, count)
         return count / self._pixels if count else 0.0
 
@@ -392,6 +417,10 @@ class Tracker:
             oldest = self._recent[0].index if self._recent else new.index
             self._brightness = {k: b for k, b in self._brightness.items() if k >= oldest} | {new.index: found}
             self._moments = new.colors[0].moments
+        if self._reference is not None and self._reference.rolling is None:
+            oldest = self._recent[0].index if self._recent else new.index
+            kept = {k: c for k, c in self._covariances.items() if k >= oldest}
+            self._covariances = kept | {new.index: (self._reference.index, self._covariance(self._reference))}
         begin = min(new.first_time, new.stamp)
         if joined and self.spline_valid:
             begin = self.spline_valid.pop()[0]
@@ -401,9 +430,24 @@ class Tracker:
         self, new: DeviceFrame, fresh: Sequence[Observation] = (), solved: Solved | None = None, *,
         keyframe: bool = False, lost: bool = False, overlap: float = 1.0,
     ) -> FrameReport:  # fmt: skip
-        depth = [o.lin for o in fresh if o.is_depth and o.is_linearised]
-        color = [o.lin for o in fresh if not o.is_depth and o.is_linearised]
-        return frame_report(new.stamp, depth, color, solved, keyframe=keyframe, lost=lost, overlap=overlap)
+        report = frame_report(new.stamp, fresh, solved, keyframe=keyframe, lost=lost, overlap=overlap)
+        if lost or new.index not in self._covariances:
+            return report
+        report = self._with_covariance(report, new)
+        if not fresh or any(o.ref.rolling is not None for o in fresh):
+            return report
+        held = self._uncertainty.held_by_motion(information(fresh, self._known()[0].state))
+        return replace(report, held_by_motion=held)
+
+    def _covariance(self, ref: Reference) -> FloatArray:
+        return self._uncertainty.covariance(self.rig.depth_camera.fx, ref.median_depth)
+
+    def _with_covariance(self, report: FrameReport, frame: DeviceFrame) -> FrameReport:
+        """A frame's report with its covariance, where it has one."""
+        window, ref = self._known()
+        at, pose = self._covariances.get(frame.index, (ref.index, np.zeros((6, 6))))
+        drift = self._uncertainty.drift_of(at, window.spline.pose(frame.depth.exposure.mid_time))
+        return replace(report, covariance=pose, drift=drift)
 
 
 def observe(

@@ -37,7 +37,7 @@ def term(
     away (m) what it shows is."""
     lin = SimpleNamespace(count=count, next_sigma=sigma, floor=floor, fit=fit)
     return SimpleNamespace(
-        is_depth=kind == "depth", is_linearised=True, lin=lin, ref=SimpleNamespace(median_depth=distance)
+        is_depth=kind == "depth", is_linearised=True, lin=lin, pixels=count, ref=SimpleNamespace(median_depth=distance)
     )
 
 
@@ -45,6 +45,16 @@ def fault(
     history: FitHistory, terms: Iterable[Any], shift: float = 0.05, expected: int = 5000, pulled: Pulls | None = None
 ) -> str:
     return history.fault(list(terms), Solved(last_shift=shift), expected, pulled)
+
+
+def test_errors_of_depth_may_grow_with_the_square_of_the_distance() -> None:
+    history = FitHistory()
+    for _ in range(5):
+        assert fault(history, [term("depth", 3e-3)]) == ""
+    assert fault(history, [term("depth", 0.015)]) == ""
+    assert fault(history, [term("depth", 0.02)]) == odd("depth")
+    assert fault(history, [term("depth", 0.06, distance=3.0)]) == ""
+    assert fault(history, [term("depth", 0.10, distance=3.0)]) == odd("depth")  # three times what is worst at a metre
 
 
 def after(kind: str, sigmas: Iterable[float]) -> FitHistory:

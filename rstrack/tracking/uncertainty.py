@@ -1,0 +1,106 @@
+"""How far off a pose may be: its covariance against the keyframe that it was found at, and the keyframe's own.
+
+A frame's images give an information matrix, that of the normal equations with pixels counted as far as they are
+independent; what they leave open, the motion before holds, ever less (a Kalman filter over pose and velocity with white
+acceleration). What all pixels have in common, and no scatter of theirs shows, is added as a hundredth of a pixel. Where
+a frame becomes a keyframe its covariance is added to all that follows: drift.
+
+Increments are [m; rad] in the depth camera's own frame at mid readout, T_world_depth exp(ξ), unless named otherwise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from rsgen.array_types import FloatArray
+from rsgen.geometry import se3
+from rstrack.alignment.observation import Observation
+from rstrack.alignment.pull import rigid
+from rstrack.alignment.spline_state import SplineState
+
+# σ of accelerations, m/s² and rad/s² (the motion prior's), and of velocities where nothing is known, m/s and rad/s.
+_ACCELERATION = np.array([5.0, 5.0, 5.0, 10.0, 10.0, 10.0])
+_VELOCITY = np.array([1.5, 1.5, 1.5, 3.0, 3.0, 3.0])
+# Systematic error of a pose in pixels of the depth camera, σ: steps not taken to the end, interpolation, knots.
+# Measured on hand-held renderings with noise (docs/measured.md).
+_SYSTEMATIC_PX = 0.01
+# σ (m, rad) above which a pose is not known.
+_WORST = np.array([0.02, np.radians(2.0)])
+# A pose that nothing tells, m and rad.
+_NOWHERE = np.array([10.0, 10.0, 10.0, 3.0, 3.0, 3.0])
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Of the newest frame. state (12, 12): covariance of pose and velocity against the keyframe `at`.
+
+    drift: for each keyframe by its index the covariance (6, 6) of its pose, as left increments in the world.
+    """
+
+    state: FloatArray = field(default_factory=lambda: _lost())
+    drift: dict[int, FloatArray] = field(default_factory=dict)
+
+    @property
+    def pose(self) -> FloatArray:
+        """Covariance (6, 6) of the pose against the keyframe."""
+        return self.state[:6, :6]
+
+    def covariance(self, focal_px: float, depth_m: float) -> FloatArray:
+        """The same with what is systematic, for a depth camera of such a focal length and things so far away."""
+        turn = _SYSTEMATIC_PX / focal_px
+        return np.asarray(self.pose + np.diag(np.repeat([turn * depth_m, turn], 3) ** 2))
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the pose is known better than to 20 mm and 2° in every direction."""
+        sigmas = [np.sqrt(np.linalg.eigvalsh(self.pose[part, part])[-1]) for part in (slice(3), slice(3, 6))]
+        return bool((np.array(sigmas) < _WORST).all())
+
+    def held_by_motion(self, information: FloatArray) -> float:
+        """Largest part that the motion before has in what is known of any direction, where images gave (6, 6)."""
+        return float(np.clip(1.0 - np.linalg.eigvals(self.pose @ information).real.min(), 0.0, 1.0))
+
+    def after(self, seconds: float, information: FloatArray) -> Uncertainty:
+        """So many seconds later, with what the images (6, 6) say."""
+        F = np.eye(12)
+        F[:6, 6:] = seconds * np.eye(6)
+        gain = np.concatenate([0.5 * seconds**2 * np.eye(6), seconds * np.eye(6)])
+        predicted = F @ self.state @ F.T + gain @ np.diag(_ACCELERATION**2) @ gain.T
+        # P − P E (H⁻¹ + Eᵀ P E)⁻¹ Eᵀ P without the inverse of H, which may be singular.
+        solved = np.linalg.solve(np.eye(6) + information @ predicted[:6, :6], information)
+        updated = predicted - predicted[:, :6] @ solved @ predicted[:6]
+        return replace(self, state=0.5 * (updated + updated.T))
+
+    def found_anew(self, information: FloatArray) -> Uncertainty:
+        """Of a frame of which nothing is known but what its images (6, 6) say."""
+        return replace(self, state=_lost()).after(0.0, information)
+
+    def with_keyframe(self, index: int, before: int, T_world_depth: FloatArray, pose: FloatArray) -> Uncertainty:
+        """With a keyframe made of a frame at T_world_depth (4, 4), whose covariance was `pose` against another one."""
+        Ad = se3.adjoint(T_world_depth)
+        drift = self.drift.get(before, np.zeros((6, 6))) + Ad @ pose @ Ad.T
+        return replace(self, drift=self.drift | {index: drift})
+
+    def drift_of(self, index: int, T_world_depth: FloatArray) -> FloatArray:
+        """Covariance (6, 6) that a keyframe's own error gives the pose T_world_depth (4, 4)."""
+        Ad = se3.adjoint(se3.inverse(T_world_depth))
+        return np.asarray(Ad @ self.drift.get(index, np.zeros((6, 6))) @ Ad.T)
+
+
+def _lost() -> FloatArray:
+    return np.diag(np.concatenate([_NOWHERE, _VELOCITY]) ** 2)
+
+
+def information(fresh: Sequence[Observation], state: SplineState) -> FloatArray:
+    """What a frame's observations say of its pose (6, 6), all lines moved at once."""
+    total = np.zeros((6, 6))
+    for o in fresh:
+        if o.is_linearised:
+            H, _ = rigid(o, state)
+            R = state.spline.pose(o.image.exposure.mid_time)[:3, :3]
+            turn = np.kron(np.eye(2), R)
+            total += turn.T @ H @ turn
+    return total

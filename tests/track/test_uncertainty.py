@@ -1,0 +1,114 @@
+"""Covariances of poses: the filter against least squares over the whole motion, drift and errors by simulation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rsgen.geometry import se3
+from rstrack.data.estimate import Estimate
+from rstrack.metrics.consistency import covariances, step_nees
+from rstrack.tracking.uncertainty import Uncertainty
+
+DT = 1.0 / 30.0
+
+
+def seen(rng: np.random.Generator, sigma: float = 1e-3) -> np.ndarray:
+    A = rng.normal(size=(6, 6)) + 3.0 * np.eye(6)
+    return A @ A.T / (9.0 * sigma**2)
+
+
+def test_the_filter_is_least_squares_over_the_whole_motion() -> None:
+    rng = np.random.default_rng(2)
+    images = [seen(rng) for _ in range(5)]
+    uncertainty = Uncertainty()
+    start = uncertainty.state.copy()
+    for H in images:
+        uncertainty = uncertainty.after(DT, H)
+    # Unknowns: pose and velocity at the start, and the acceleration of each interval.
+    n = 12 + 6 * len(images)
+    A = np.zeros((n, n))
+    A[:12, :12] = np.linalg.inv(start)
+    for k in range(len(images)):
+        at = slice(12 + 6 * k, 18 + 6 * k)
+        A[at, at] = np.diag(1.0 / np.array([5.0, 5.0, 5.0, 10.0, 10.0, 10.0]) ** 2)
+    rows = np.zeros((6, n))
+    rows[:, :6] = np.eye(6)
+    speed = np.zeros((6, n))
+    speed[:, 6:12] = np.eye(6)
+    for k, H in enumerate(images):
+        at = slice(12 + 6 * k, 18 + 6 * k)
+        rows = rows + DT * speed
+        rows[:, at] += 0.5 * DT**2 * np.eye(6)
+        speed[:, at] += DT * np.eye(6)
+        A += rows.T @ H @ rows
+    np.testing.assert_allclose(uncertainty.pose, rows @ np.linalg.solve(A, rows.T), rtol=1e-6, atol=1e-15)
+
+
+def test_a_motion_that_no_image_shows_is_known_ever_less_until_it_is_unknown() -> None:
+    H = seen(np.random.default_rng(3), 1e-4)
+    uncertainty = Uncertainty().found_anew(H)
+    for _ in range(5):
+        uncertainty = uncertainty.after(DT, H)
+    assert uncertainty.is_known and uncertainty.held_by_motion(H) < 0.05
+    wall = np.diag([0.0, 1e8, 1e8, 1e8, 1e8, 1e8])  # nothing tells how it moves along x
+    sigmas = []
+    while uncertainty.is_known:
+        uncertainty = uncertainty.after(DT, wall)
+        sigmas.append(np.sqrt(uncertainty.pose[0, 0]))
+        assert uncertainty.held_by_motion(wall) == pytest.approx(1.0, abs=1e-6)
+        assert len(sigmas) < 60
+    assert len(sigmas) > 3 and (np.diff(sigmas) > 0).all() and np.sqrt(uncertainty.pose[1, 1]) < 2e-4
+
+
+def test_what_is_systematic_is_a_part_of_a_pixel() -> None:
+    H = 1e20 * np.eye(6)
+    sigma = np.sqrt(np.diag(Uncertainty().found_anew(H).covariance(500.0, 2.0)))
+    np.testing.assert_allclose(sigma, [4e-5] * 3 + [2e-5] * 3, rtol=1e-3)
+
+
+def test_errors_of_a_chain_of_keyframes_are_as_large_as_their_covariances() -> None:
+    """Poses found at keyframes that were found at others: NEES/6 of the motion between them is 1 in the mean."""
+    rng = np.random.default_rng(5)
+    true = se3.exp(np.cumsum(rng.normal(size=(9, 6)) * 0.3, axis=0))
+    noise = [np.linalg.inv(seen(rng, 2e-4)) for _ in range(9)]
+    uncertainty, pose, drift = Uncertainty(), np.zeros((9, 6, 6)), np.zeros((9, 6, 6))
+    keyframe = [0, 0, 0, 2, 2, 2, 5, 5, 5]
+    for k in range(9):
+        pose[k] = noise[k] if k else 0.0
+        drift[k] = uncertainty.drift_of(keyframe[k], true[k])
+        if k in (2, 5):
+            uncertainty = uncertainty.with_keyframe(k, keyframe[k], true[k], pose[k])
+    i, j = np.array([1, 1, 4]), np.array([4, 7, 8])
+    found = []
+    for _ in range(1500):
+        off = [rng.multivariate_normal(np.zeros(6), C) for C in pose]
+        # A keyframe's own error moves all that was found at it.
+        world = {0: np.eye(4)}
+        est = np.empty_like(true)
+        for k in range(9):
+            est[k] = world[keyframe[k]] @ true[k] @ se3.exp(off[k])
+            if k in (2, 5):
+                world[k] = est[k] @ se3.inverse(true[k])
+        found.append(step_nees(true, est, pose, drift, i, j))
+    # Of 6 degrees of freedom: σ of the mean over 1500 is 0.015.
+    np.testing.assert_allclose(np.mean(found, axis=0), 1.0, atol=0.06)
+
+
+def test_covariances_are_read_from_a_runs_frames() -> None:
+    C = np.arange(36.0).reshape(6, 6)
+    C = C + C.T
+    upper = C[np.triu_indices(6)].tolist()
+    frames = [
+        {"stamp": 1.0, "covariance": upper, "drift": upper},
+        {"stamp": 2.0, "covariance": None, "drift": None},
+    ]
+    estimate = Estimate(np.array([1.0, 2.0, 3.0]), np.tile(np.eye(4), (3, 1, 1)), None, {"frames": frames})
+    pose, drift = covariances(estimate)
+    np.testing.assert_array_equal(pose[0], C)
+    np.testing.assert_array_equal(drift[0], C)
+    assert np.isnan(pose[1:]).all()
+    nothing, _ = covariances(replace(estimate, info={}))
+    assert np.isnan(nothing).all()
