@@ -96,7 +96,7 @@ def rectified_lens(camera: Camera) -> Lens:
 
 
 def strides(width: int, height: int) -> tuple[int, ...]:
-    """Strides of the pixels of a depth image that are looked at on the pyramid's levels, finest first, and `THINNED`."""
+    """Strides of the pixels of a depth image that are looked at on the levels, finest first, and with `THINNED`."""
     pixels = width * height
     finest = 1 if pixels < _SPARE_PX else 2 * max(1, math.isqrt(pixels // _PLENTY_PX))
     return *(finest * 2**level for level in range(LEVELS)), 2 * finest
