@@ -28,19 +28,23 @@ RELINEARISE_PX = 0.02
 _NOISE_SHARE, _MOST_TOLERANCE_PX = 0.1, 0.08
 # Where noise, not rounding, is what limits (σ over the smallest credible one): a step shorter than so many σ of the
 # result, squared, is the last one of a level, finest first, and what has moved by less keeps its linearisation.
-_NOISY, _LAST, _MATTERS = 2.0, (0.3, 5.0, 5.0), 1.0
+_NOISY, _LAST, _MATTERS = 2.0, (1.0, 10.0, 10.0), 1.0
 # Rise of the negative log-likelihood per pixel from which on a step has made things worse: less is noise of gating.
 _WORSE = 2e-5
 
 
 @dataclass
 class Solved:
-    """What an optimisation did: linearisations, steps, refused steps, and the last step's movement of a line in px."""
+    """What an optimisation did: linearisations, steps, refused steps, and the last step's movement of a line in px.
+
+    is_within_noise: that step was shorter than what noise leaves open.
+    """
 
     evaluations: int = 0
     iterations: int = 0
     refused: int = 0
     last_shift: float = np.inf
+    is_within_noise: bool = False
 
 
 @dataclass(frozen=True)
@@ -113,9 +117,8 @@ def _optimise_level(terms: Terms, state: SplineState, problem: Problem, level: i
         state.apply(first, step)
         done.iterations += 1
         done.last_shift = max(_shift(problem, first, step, state), _shift(problem, first, plain, state))
-        if done.last_shift < (_tolerance(problem) if level == 0 else STOP_PX[level]):
-            break
-        if -float(g @ plain.ravel()) < _LAST[level] and all(_is_noisy(o) for o in problem.fresh):
+        done.is_within_noise = -float(g @ plain.ravel()) < _LAST[level] and all(_is_noisy(o) for o in problem.fresh)
+        if done.is_within_noise or done.last_shift < (_tolerance(problem) if level == 0 else STOP_PX[level]):
             break
 
 

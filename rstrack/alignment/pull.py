@@ -8,7 +8,7 @@ motion, or depth pulls against colour, though each may fit its neighbourhood wel
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,30 +24,37 @@ _PRIOR = np.array([0.05, 0.05, 0.05, *np.radians([3.0, 3.0, 3.0])])
 class Pulls:
     """Metres by which points at the median depth would move: by all of a frame's images, by depth and by colour alone.
 
-    NaN where there is no such image.
+    NaN where there is no such image. sigmas: how many σ of what these images know each of the three is.
     """
 
     whole: float
     depth: float
     color: float
+    sigmas: tuple[float, float, float] = (np.inf, np.inf, np.inf)
+
+    def scaled(self, factor: float) -> Pulls:
+        """All of them, in metres, times a factor."""
+        return replace(self, whole=factor * self.whole, depth=factor * self.depth, color=factor * self.color)
 
 
 def pulls(fresh: Sequence[Observation], state: SplineState) -> Pulls:
     """Of a frame's observations in the current state."""
     seen = [o for o in fresh if o.is_linearised]
     depth, color = [o for o in seen if o.is_depth], [o for o in seen if not o.is_depth]
-    return Pulls(*(_pull(some, state) for some in (seen, depth, color)))
+    (whole, a), (depth_alone, b), (color_alone, c) = (_pull(some, state) for some in (seen, depth, color))
+    return Pulls(whole, depth_alone, color_alone, (a, b, c))
 
 
-def _pull(observations: Sequence[Observation], state: SplineState) -> float:
+def _pull(observations: Sequence[Observation], state: SplineState) -> tuple[float, float]:
     if not observations:
-        return float("nan")
+        return float("nan"), float("nan")
     H, g = np.diag(1.0 / _PRIOR**2), np.zeros(6)
     for o in observations:
         own = rigid(o, state)
         H, g = H + own[0], g + own[1]
     twist = np.linalg.solve(H, g)
-    return float(np.linalg.norm(twist[:3]) + observations[0].ref.median_depth * np.linalg.norm(twist[3:]))
+    metres = np.linalg.norm(twist[:3]) + observations[0].ref.median_depth * np.linalg.norm(twist[3:])
+    return float(metres), float(np.sqrt(max(0.0, float(g @ twist))))
 
 
 def rigid(o: Observation, state: SplineState) -> tuple[FloatArray, FloatArray]:

@@ -35,8 +35,10 @@ _MOST_ACCELERATION = np.array([100.0, 200.0])
 _ALWAYS = np.array([0.05, np.radians(4.0)])
 _MEMORY = 30
 # How far a frame's images, or one term alone, may pull (see `alignment.pull`): so many times the usual, and always so
-# many metres. In the first frames nothing is usual yet.
-_PULL_WHOLE, _PULL_ALONE = (4.0, 2e-3), (8.0, 1e-2)
+# many metres, at up to one metre's distance. Less than so many σ of what they tell is noise. In the first frames
+# nothing is usual yet.
+_PULLS = "whole", "depth", "color"
+_PULL_WHOLE, _PULL_ALONE, _PULL_SIGMAS = (4.0, 2e-3), (8.0, 2e-2), 5.0
 _FEW = 5
 
 
@@ -87,10 +89,11 @@ class FitHistory:
         if misfits:
             return misfits[0][1]
         if pulls is not None:
-            torn = self._torn(pulls)
+            distance = max(1.0, fresh[0].ref.median_depth)
+            torn = self._torn(pulls, distance)
             if torn:
                 return torn
-            self._pulls.append(pulls)
+            self._pulls.append(pulls.scaled(distance**-2))
         for o in fresh:
             if o.is_depth:
                 self._depth.learn(o.lin.next_sigma, o.ref.median_depth)
@@ -98,16 +101,20 @@ class FitHistory:
                 self._color.learn(o.lin.next_sigma)
         return ""
 
-    def _torn(self, now: Pulls) -> str:
-        names = "whole", "depth", "color"
-        if any(getattr(now, name) > self._most_pull(name) for name in names[1:]):
+    def _torn(self, now: Pulls, distance: float) -> str:
+        """distance (m), 1 at least: of what is seen; where noise grows with its square, so do pulls."""
+        far = [
+            pull > self._most_pull(name, distance) and sigmas > _PULL_SIGMAS
+            for name, pull, sigmas in zip(_PULLS, (now.whole, now.depth, now.color), now.sigmas, strict=True)
+        ]
+        if any(far[1:]):
             return "depth and colour do not agree"
-        return "the images do not agree with the motion" if now.whole > self._most_pull(names[0]) else ""
+        return "the images do not agree with the motion" if far[0] else ""
 
-    def _most_pull(self, name: str) -> float:
+    def _most_pull(self, name: str, distance: float) -> float:
         usual = [pull for before in self._pulls if np.isfinite(pull := getattr(before, name))]
         growth, always = _PULL_WHOLE if name == "whole" else _PULL_ALONE
-        return max(always, growth * median(usual)) if len(usual) >= _FEW else np.inf
+        return max(always * distance, growth * distance**2 * median(usual)) if len(usual) >= _FEW else np.inf
 
     def is_hopeless(self, fresh: Sequence[Observation]) -> bool:
         """Whether no term of a frame, aligned at a coarse level, fits a part of its pixels that a finer one could."""
@@ -131,8 +138,8 @@ def _least_fit(o: Observation) -> float:
 
 
 def is_settled(solved: Solved) -> bool:
-    """Whether the last step hardly moved a line."""
-    return solved.last_shift <= _WORST_SHIFT_PX
+    """Whether the last step hardly moved a line, or by no more than noise does."""
+    return solved.is_within_noise or solved.last_shift <= _WORST_SHIFT_PX
 
 
 def implausible(T_predicted: FloatArray, T_found: FloatArray, dt: float) -> bool:

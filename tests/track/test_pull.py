@@ -71,3 +71,9 @@ def test_they_are_those_of_the_state_not_of_the_linearisation() -> None:
     state, one = SplineState(TRUTH), sight((2e-3, 0, 0))
     state.apply(0, np.tile([2e-3, 0.0, 0.0, 0.0, 0.0, 0.0], (len(state.points), 1)))
     assert pulls([one], state).whole < 2e-5
+
+
+def test_pulls_are_counted_in_sigmas_of_what_the_images_tell() -> None:
+    found = pulls([sight((3e-3, 0, 0), kind=OfDepth), sight((-2e-3, 0, 0))], SplineState(TRUTH))
+    one = 1e-3 / np.sqrt(len(TIMES))  # σ of nine lines, each known to 1 m and counted a million times
+    np.testing.assert_allclose(found.sigmas, [0.5e-3 / one * np.sqrt(2), 3e-3 / one, 2e-3 / one], rtol=0.01)
