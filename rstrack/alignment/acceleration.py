@@ -15,7 +15,7 @@ import numpy as np
 from rsgen.array_types import FloatArray
 
 # Steps that are remembered, and how many times as far as the plain step one goes at most.
-_MEMORY, _FURTHEST = 4, 8.0
+_MEMORY, _FURTHEST = 3, 4.0
 # A step this part of the one before, or less, shows that Gauss-Newton needs no help.
 _FAST = 0.3
 

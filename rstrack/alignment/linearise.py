@@ -91,6 +91,8 @@ class Terms:
     blur_sigma_px: float = 0.0
     # Part of σ by which interpolation may err: beyond that pixels are left out, or weigh less in coarse images.
     smooth: float = 0.25
+    # Whether what large pixels bend counts, by little: smooth ones alone would let the camera slide. Colour holds it.
+    counts_rough: bool = True
     timer: Timer = untimed
     _kernel: Kernels = field(init=False)
 
@@ -100,7 +102,10 @@ class Terms:
     @classmethod
     def of(cls, device: DeviceRig, options: Options) -> Terms:
         """The terms of a rig as a method has them."""
-        return cls(device.e, device.device_rays, blur_sigma_px=options.blur_sigma_px, timer=device.timer)
+        return cls(
+            device.e, device.device_rays, blur_sigma_px=options.blur_sigma_px, counts_rough=not options.photometric,
+            timer=device.timer,
+        )  # fmt: skip
 
     def geometric(
         self, image: DepthImage, ref: Reference, spline: Spline, level: int, sigma: float,
@@ -139,7 +144,8 @@ class Terms:
             gate = min(gate, max(5.0 * sigma, 10 * self._floor_depth(image, ref)))
         larger = max(1.0, _FINE_FOCAL / ref.lens.camera.fx) ** 2
         smooth = self.smooth * max(sigma, _CREDIBLE_DEPTH * larger)
-        constants = e.upload(np.append(scaling.parameters(sigma, gate), [smooth, min(1.0, larger - 1.0)]))
+        rough = min(1.0, larger - 1.0) if self.counts_rough else 0.0
+        constants = e.upload(np.append(scaling.parameters(sigma, gate), [smooth, rough]))
         surface = ref.inverse_depth, ref.slope_x, ref.slope_y, ref.roughness
         with self.timer(f"geometric kernel, level {level}"):
             given = GeometricInput(image.z, *self.rays, to_base, *surface, from_base, constants)

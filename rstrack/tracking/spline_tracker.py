@@ -153,13 +153,14 @@ class Tracker:
             window.predict(new, self.spline_valid[-1][1], young)
             fresh, on_reference = fitting, [o for o in fitting if o.ref is ref]
             solved = window.solve(fresh, levels, gauge, coupled)
-        fault = self._fits.fault(on_reference, solved, ref.pixels, pulls(on_reference, window.state))
-        if ref.rolling is None:
-            # A rolling reference moves with what is aligned to it, which tells nothing of the two together.
-            seen = information(on_reference, window.state)
-            uncertainty = self._uncertainty.after(new.stamp - self._stamps[-1], seen)
-        else:
-            uncertainty = self._uncertainty
+        with self._terms.timer("judgement"):
+            fault = self._fits.fault(on_reference, solved, ref.pixels, pulls(on_reference, window.state))
+            if ref.rolling is None:
+                # A rolling reference moves with what is aligned to it, which tells nothing of the two together.
+                seen = information(on_reference, window.state)
+                uncertainty = self._uncertainty.after(new.stamp - self._stamps[-1], seen)
+            else:
+                uncertainty = self._uncertainty
         if fault or implausible(T_predicted, window.spline.pose(mid), gap) or not uncertainty.is_known:
             self._window = before
             return self._relocalise(new)

@@ -100,7 +100,8 @@ class Window:
         bandwidth = 6 * (free[1] - free[0]) if coupled else 24
         problem = Problem(fresh, self.active, free, priors, self._focal, bandwidth)
         try:
-            return optimise(self._terms, self.state, problem, levels, _MOST_STEPS, hopeless)
+            with self._terms.timer("optimiser"):
+                return optimise(self._terms, self.state, problem, levels, _MOST_STEPS, hopeless)
         except np.linalg.LinAlgError:
             # The images say nothing about some motion, not even with the prior: as lost as can be.
             return Solved()

@@ -31,8 +31,8 @@ def test_a_hessian_that_is_too_large_costs_a_third_of_the_steps() -> None:
 
 def test_one_slow_motion_is_found_in_two_more_steps() -> None:
     d = np.linalg.eigh(TRUE)[1][:, 0]
-    slow = TRUE + 0.5 * np.outer(d, d)
-    assert iterations(slow, accelerated=False) > 30
+    slow = TRUE + 0.25 * np.outer(d, d)
+    assert iterations(slow, accelerated=False) > 20
     assert iterations(slow, accelerated=True) <= 4
 
 
@@ -43,11 +43,11 @@ def test_fast_steps_stay_as_they_are() -> None:
     assert acceleration.extrapolated(step, shorter, TRUE) is shorter
 
 
-def test_it_goes_eight_times_as_far_as_the_plain_step_at_most() -> None:
+def test_it_goes_four_times_as_far_as_the_plain_step_at_most() -> None:
     acceleration, step = Acceleration(), np.full(12, 0.5)
     acceleration.extrapolated(np.zeros(12), step, TRUE)
     further = acceleration.extrapolated(step, 0.99 * step, TRUE)
-    np.testing.assert_allclose(further, 8.0 * 0.99 * step)
+    np.testing.assert_allclose(further, 4.0 * 0.99 * step)
 
 
 def test_what_is_forgotten_is_not_extrapolated_from() -> None:
