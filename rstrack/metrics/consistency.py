@@ -11,6 +11,9 @@ from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rstrack.data.estimate import Estimate
 
+# Part of the drift by which it may seem to be less later on.
+_SAME = 0.02
+
 
 def covariances(estimate: Estimate) -> tuple[FloatArray, FloatArray]:
     """Of each pose against its keyframe, and of the keyframe's drift (n, 6, 6) each; NaN where none is known.
@@ -34,14 +37,19 @@ def step_nees(
 
     T_true, T_est (n, 4, 4); pose, drift (n, 6, 6): see `covariances`. Of the motion's covariance the two poses' own are
     parts, and the drift that comes in between. (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking
-    and Navigation, 2001, section 5.4.)
+    and Navigation, 2001, section 5.4.) NaN where the drift is less at the end: the track has gone back to an older
+    keyframe, and what the two have in common is not known.
     """
     step = se3.inverse(T_est[i]) @ T_est[j]
     error = se3.log(se3.inverse(se3.inverse(T_true[i]) @ T_true[j]) @ step)
     Ad = se3.adjoint(se3.inverse(step))
-    before = Ad @ (pose[i] - drift[i]) @ np.swapaxes(Ad, 1, 2)
-    weighted = np.linalg.solve(pose[j] + drift[j] + before, error[..., None])[..., 0]
-    return np.asarray(np.einsum("ka,ka->k", error, weighted) / 6.0)
+    turned = np.swapaxes(Ad, 1, 2)
+    between = drift[j] - Ad @ drift[i] @ turned
+    weighted = np.linalg.solve(pose[j] + between + Ad @ pose[i] @ turned, error[..., None])[..., 0]
+    # Drift is given at mid readout, poses at stamps: what the camera moves by in between is no less drift.
+    parts = [np.trace(c[:, at, at], axis1=1, axis2=2) for at in (slice(3), slice(3, 6)) for c in (between, drift[j])]
+    is_more = (parts[0] >= -_SAME * parts[1]) & (parts[2] >= -_SAME * parts[3])
+    return np.where(is_more, np.einsum("ka,ka->k", error, weighted) / 6.0, np.nan)
 
 
 def _full(upper: npt.ArrayLike) -> FloatArray:

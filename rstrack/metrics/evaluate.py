@@ -211,9 +211,8 @@ def _nees(estimate: Estimate, found: Comparison) -> float | None:
     pose, drifts = (c[found.index] for c in covariances(estimate))
     _, i, j = _pairs(estimate, found)
     known = np.isfinite(pose[i] + pose[j]).all(axis=(1, 2))
-    if not known.any():
-        return None
-    return float(step_nees(found.T_world_true, found.T_world_est, pose, drifts, i[known], j[known]).mean())
+    nees = step_nees(found.T_world_true, found.T_world_est, pose, drifts, i[known], j[known])
+    return float(np.nanmean(nees)) if np.isfinite(nees).any() else None
 
 
 def compared(run: Path, metrics: Metrics, other: Path, theirs: Metrics) -> str:

@@ -9,6 +9,7 @@ from rstrack_util import disturbed, hand_held
 
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.spline_state import SplineState
+from rstrack.keyframes.keyframe import THINNED
 
 TRUTH = hand_held(3)
 TIMES = np.linspace(0.4, 0.5, 20)
@@ -31,6 +32,20 @@ def test_a_coarse_levels_pixels_stand_for_those_left_out(level: int, pixels: flo
     assert sight.is_linearised and sight.stands_for == pixels and sight.shift(state, 500.0) == 0.0
     np.testing.assert_allclose(sight.model(state).H, pixels * sight.lin.model.H)
     np.testing.assert_allclose(sight.model(state).g, pixels * sight.lin.model.g)
+
+
+@pytest.mark.parametrize(("counted", "is_thinned"), [(1 / 15, False), (1 / 17, True)])
+def test_where_few_pixels_count_a_quarter_of_them_is_looked_at(
+    counted: float, is_thinned: bool, state: SplineState
+) -> None:
+    sight, terms = seen(), PoseTerms()
+    sight.independent = counted
+    for level in (2, 1, 0):
+        sight.linearise(terms, state, level)  # type: ignore[arg-type]
+    assert [level for level, _ in terms.calls] == [2, 1, THINNED if is_thinned else 0]
+    quarter = 4.0 if is_thinned else 1.0
+    assert sight.pixels == quarter * len(TIMES) and sight.stands_for == quarter * counted
+    np.testing.assert_allclose(sight.model(state).H, quarter * counted * sight.lin.model.H)
 
 
 def test_its_model_is_moved_along_with_the_state(state: SplineState) -> None:

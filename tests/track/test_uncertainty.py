@@ -93,6 +93,8 @@ def test_errors_of_a_chain_of_keyframes_are_as_large_as_their_covariances() -> N
             if k in (2, 5):
                 world[k] = est[k] @ se3.inverse(true[k])
         found.append(step_nees(true, est, pose, drift, i, j))
+    back = step_nees(true, est, pose, drift, j, i)
+    assert np.isnan(back[1:]).all()  # from a later keyframe to an earlier one
     # Of 6 degrees of freedom: σ of the mean over 1500 is 0.015.
     np.testing.assert_allclose(np.mean(found, axis=0), 1.0, atol=0.06)
 
