@@ -39,21 +39,20 @@ class Pulls:
 
 def pulls(fresh: Sequence[Observation], state: SplineState) -> Pulls:
     """Of a frame's observations in the current state."""
-    seen = [o for o in fresh if o.is_linearised]
-    depth, color = [o for o in seen if o.is_depth], [o for o in seen if not o.is_depth]
-    (whole, a), (depth_alone, b), (color_alone, c) = (_pull(some, state) for some in (seen, depth, color))
+    seen = [(o, *rigid(o, state)) for o in fresh if o.is_linearised]
+    depth, color = [s for s in seen if s[0].is_depth], [s for s in seen if not s[0].is_depth]
+    (whole, a), (depth_alone, b), (color_alone, c) = (_pull(some) for some in (seen, depth, color))
     return Pulls(whole, depth_alone, color_alone, (a, b, c))
 
 
-def _pull(observations: Sequence[Observation], state: SplineState) -> tuple[float, float]:
-    if not observations:
+def _pull(seen: Sequence[tuple[Observation, FloatArray, FloatArray]]) -> tuple[float, float]:
+    """Metres and σ that observations pull by, each with its H (6, 6) and g (6,) of a rigid motion; NaN without any."""
+    if not seen:
         return float("nan"), float("nan")
-    H, g = np.diag(1.0 / _PRIOR**2), np.zeros(6)
-    for o in observations:
-        own = rigid(o, state)
-        H, g = H + own[0], g + own[1]
+    H = np.diag(1.0 / _PRIOR**2) + sum(own for _, own, _ in seen)
+    g = np.sum([own for _, _, own in seen], axis=0)
     twist = np.linalg.solve(H, g)
-    metres = np.linalg.norm(twist[:3]) + observations[0].ref.median_depth * np.linalg.norm(twist[3:])
+    metres = np.linalg.norm(twist[:3]) + seen[0][0].ref.median_depth * np.linalg.norm(twist[3:])
     return float(metres), float(np.sqrt(max(0.0, float(g @ twist))))
 
 

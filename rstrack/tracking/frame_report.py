@@ -43,7 +43,7 @@ class FrameReport:
 
     def as_lost(self) -> FrameReport:
         """The same frame, given up later on."""
-        return replace(self, lost=True, keyframe=False, covariance=None, drift=None)
+        return replace(self, lost=True, keyframe=False, covariance=None, drift=None, held_by_motion=float("nan"))
 
 
 def frame_report(

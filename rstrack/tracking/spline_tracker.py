@@ -251,6 +251,8 @@ class Tracker:
         self._stamps.clear()
         self.spline_valid.clear()
         self._recent.clear()
+        self._uncertainty = Uncertainty()
+        self._covariances.clear()
         self.reports = [r.as_lost() for r in self.reports]
         return self._start(new)
 
@@ -301,7 +303,10 @@ class Tracker:
             trial = window.restarted(new, end, candidate.T_world_base @ T_ref_cam)
             fresh = self._observe(new, candidate, _matched(new, candidate))
             solved = trial.solve(fresh, LEVELS, hopeless=self._fits.is_hopeless)
-            if not self._fits.fault(fresh, solved, candidate.pixels, pulls(fresh, trial.state)):
+            uncertainty = self._uncertainty.found_anew(information(fresh, trial.state))
+            fault = self._fits.fault(fresh, solved, candidate.pixels, pulls(fresh, trial.state))
+            if not fault and uncertainty.is_known:
+                self._uncertainty = uncertainty
                 return self._resume(new, trial, fresh, solved, candidate)
         return self._report(new, lost=True)
 
@@ -318,7 +323,6 @@ class Tracker:
             self.spline_valid.append((begin, min(end, trial.state.untouched)))
         trial.keep(fresh)
         self._window, self._reference = trial, ref
-        self._uncertainty = self._uncertainty.found_anew(information(fresh, trial.state))
         self._keyframes.use(ref)
         self._pixels, self._unconverged, self._lost_in_a_row = 0, None, 0
         self._recent = deque([new])
@@ -437,8 +441,7 @@ class Tracker:
         report = self._with_covariance(report, new)
         if not fresh or any(o.ref.rolling is not None for o in fresh):
             return report
-        held = self._uncertainty.held_by_motion(information(fresh, self._known()[0].state))
-        return replace(report, held_by_motion=held)
+        return replace(report, held_by_motion=self._uncertainty.held_by_motion)
 
     def _covariance(self, ref: Reference) -> FloatArray:
         return self._uncertainty.covariance(self.rig.depth_camera.fx, ref.median_depth)

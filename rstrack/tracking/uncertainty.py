@@ -35,12 +35,14 @@ _NOWHERE = np.array([10.0, 10.0, 10.0, 3.0, 3.0, 3.0])
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Of the newest frame. state (12, 12): covariance of pose and velocity against the keyframe `at`.
+    """Of the newest frame. state (12, 12): covariance of pose and velocity against its keyframe.
 
-    drift: for each keyframe by its index the covariance (6, 6) of its pose, as left increments in the world.
+    seen (6, 6): what its images say of its pose, the information. drift: for each keyframe by its index the covariance
+    (6, 6) of its pose, as left increments in the world.
     """
 
     state: FloatArray = field(default_factory=lambda: _lost())
+    seen: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
     drift: dict[int, FloatArray] = field(default_factory=dict)
 
     @property
@@ -59,24 +61,25 @@ class Uncertainty:
         sigmas = [np.sqrt(np.linalg.eigvalsh(self.pose[part, part])[-1]) for part in (slice(3), slice(3, 6))]
         return bool((np.array(sigmas) < _WORST).all())
 
-    def held_by_motion(self, information: FloatArray) -> float:
-        """Largest part that the motion before has in what is known of any direction, where images gave (6, 6)."""
-        return float(np.clip(1.0 - np.linalg.eigvals(self.pose @ information).real.min(), 0.0, 1.0))
+    @property
+    def held_by_motion(self) -> float:
+        """Largest part, 0 to 1, that the motion before, not the images, has in what is known of any direction."""
+        return float(np.clip(1.0 - np.linalg.eigvals(self.pose @ self.seen).real.min(), 0.0, 1.0))
 
-    def after(self, seconds: float, information: FloatArray) -> Uncertainty:
-        """So many seconds later, with what the images (6, 6) say."""
+    def after(self, seconds: float, seen: FloatArray) -> Uncertainty:
+        """So many seconds later, with what the images then say (6, 6)."""
         F = np.eye(12)
         F[:6, 6:] = seconds * np.eye(6)
         gain = np.concatenate([0.5 * seconds**2 * np.eye(6), seconds * np.eye(6)])
         predicted = F @ self.state @ F.T + gain @ np.diag(_ACCELERATION**2) @ gain.T
         # P − P E (H⁻¹ + Eᵀ P E)⁻¹ Eᵀ P without the inverse of H, which may be singular.
-        solved = np.linalg.solve(np.eye(6) + information @ predicted[:6, :6], information)
+        solved = np.linalg.solve(np.eye(6) + seen @ predicted[:6, :6], seen)
         updated = predicted - predicted[:, :6] @ solved @ predicted[:6]
-        return replace(self, state=0.5 * (updated + updated.T))
+        return replace(self, state=0.5 * (updated + updated.T), seen=seen)
 
-    def found_anew(self, information: FloatArray) -> Uncertainty:
+    def found_anew(self, seen: FloatArray) -> Uncertainty:
         """Of a frame of which nothing is known but what its images (6, 6) say."""
-        return replace(self, state=_lost()).after(0.0, information)
+        return replace(self, state=_lost()).after(0.0, seen)
 
     def with_keyframe(self, index: int, before: int, T_world_depth: FloatArray, pose: FloatArray) -> Uncertainty:
         """With a keyframe made of a frame at T_world_depth (4, 4), whose covariance was `pose` against another one."""
