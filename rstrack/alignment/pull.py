@@ -2,7 +2,9 @@
 
 At the solution of (12) everything that is summed there is in balance. Where a frame has been found, its images are in
 balance by themselves too, but for noise. Where it has not, they pull against the frames before and the prior of the
-motion, or depth pulls against colour, though each may fit its neighbourhood well enough.
+motion, or depth pulls against colour, though each may fit its neighbourhood well enough. So they do where the spline
+cannot follow the motion within an image: they are asked for a shift and turn of all lines and for one that grows from
+the first line to the last.
 """
 
 from __future__ import annotations
@@ -16,15 +18,16 @@ from rsgen.array_types import FloatArray
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.spline_state import SplineState
 
-# σ of a rigid shift (m) and turn (rad) before anything is known of a frame: what its images do not see pulls nowhere.
-_PRIOR = np.array([0.05, 0.05, 0.05, *np.radians([3.0, 3.0, 3.0])])
+# σ of a shift (m) and turn (rad) before anything is known of a frame: what its images do not see pulls nowhere.
+_PRIOR = np.tile([0.05, 0.05, 0.05, *np.radians([3.0, 3.0, 3.0])], 2)
 
 
 @dataclass(frozen=True)
 class Pulls:
     """Metres by which points at the median depth would move: by all of a frame's images, by depth and by colour alone.
 
-    NaN where there is no such image. sigmas: how many σ of what these images know each of the three is.
+    In the line that moves furthest; NaN where there is no such image. sigmas: how many σ of what these images know each
+    of the three is.
     """
 
     whole: float
@@ -39,32 +42,44 @@ class Pulls:
 
 def pulls(fresh: Sequence[Observation], state: SplineState) -> Pulls:
     """Of a frame's observations in the current state."""
-    seen = [(o, *rigid(o, state)) for o in fresh if o.is_linearised]
+    seen = [(o, *steady(o, state)) for o in fresh if o.is_linearised]
     depth, color = [s for s in seen if s[0].is_depth], [s for s in seen if not s[0].is_depth]
     (whole, a), (depth_alone, b), (color_alone, c) = (_pull(some) for some in (seen, depth, color))
     return Pulls(whole, depth_alone, color_alone, (a, b, c))
 
 
 def _pull(seen: Sequence[tuple[Observation, FloatArray, FloatArray]]) -> tuple[float, float]:
-    """Metres and σ that observations pull by, each with its H (6, 6) and g (6,) of a rigid motion; NaN without any."""
+    """Metres and σ that observations pull by, each with its H (12, 12) and g (12,) as of `steady`; NaN without any."""
     if not seen:
         return float("nan"), float("nan")
     H = np.diag(1.0 / _PRIOR**2) + sum(own for _, own, _ in seen)
     g = np.sum([own for _, _, own in seen], axis=0)
     twist = np.linalg.solve(H, g)
-    metres = np.linalg.norm(twist[:3]) + seen[0][0].ref.median_depth * np.linalg.norm(twist[3:])
+    distance = seen[0][0].ref.median_depth
+    ends = (twist[:6] - twist[6:], twist[:6] + twist[6:])
+    metres = max(np.linalg.norm(end[:3]) + distance * np.linalg.norm(end[3:]) for end in ends)
     return float(metres), float(np.sqrt(max(0.0, float(g @ twist))))
 
 
-def rigid(o: Observation, state: SplineState) -> tuple[FloatArray, FloatArray]:
-    """H (6, 6) and g (6,) of a twist of all lines at once, in the world's axes about the camera at mid readout.
+def steady(o: Observation, state: SplineState) -> tuple[FloatArray, FloatArray]:
+    """H (12, 12) and g (12,) of two twists of an image's lines, in the world's axes about the camera at mid readout.
 
-    All control points moved by one left increment move every pose by it.
+    The first six move all lines, the others as much as a line is after mid readout: the last by all of it, the first by
+    its opposite (no line if all are exposed at once). All control points moved by one left increment move every pose by
+    it; by one that grows with their times (Greville), by one that grows with the pose's, to first order.
     """
-    model = o.model(state)
-    n = len(model.g) // 6
-    H, g = model.H.reshape(n, 6, n, 6).sum(axis=(0, 2)), model.g.reshape(n, 6).sum(axis=0)
-    x, y, z = state.spline.pose(o.image.exposure.mid_time)[:3, 3]
+    model, exposure = o.model(state), o.image.exposure
+    mid, half = exposure.mid_time, 0.5 * (exposure.last_time - exposure.first_time)
+    at = state.spline.t0 + (np.arange(model.first, model.last) - 1) * state.dt
+    after = (at - mid) / half if half > 0.0 else np.zeros(len(at))
+    x, y, z = state.spline.pose(mid)[:3, 3]
     about = np.eye(6)
     about[:3, 3:] = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
-    return about.T @ H @ about, about.T @ g
+    basis = np.kron(np.stack([np.ones(len(at)), after], axis=1), about)
+    return basis.T @ model.H @ basis, basis.T @ model.g
+
+
+def rigid(o: Observation, state: SplineState) -> tuple[FloatArray, FloatArray]:
+    """H (6, 6) and g (6,) of the first of these: all lines moved at once."""
+    H, g = steady(o, state)
+    return H[:6, :6], g[:6]

@@ -35,11 +35,12 @@ _MOST_ACCELERATION = np.array([100.0, 200.0])
 _ALWAYS = np.array([0.05, np.radians(4.0)])
 _MEMORY = 30
 # How far a frame's images, or one term alone, may pull (see `alignment.pull`): so many times the usual, and always so
-# many metres, at up to one metre's distance. Less than so many σ of what they tell is noise. In the first frames
-# nothing is usual yet.
+# many metres, at up to one metre's distance; and so many times the usual number of σ, and always so many. Further in
+# both is too far. Usual is what a quarter of the last frames stays below, lest bad becomes usual; in the first frames
+# nothing is.
 _PULLS = "whole", "depth", "color"
-_PULL_WHOLE, _PULL_ALONE, _PULL_SIGMAS = (4.0, 2e-3), (8.0, 2e-2), 5.0
-_FEW = 5
+_PULL_WHOLE, _PULL_ALONE, _PULL_SIGMAS = (4.0, 5e-3), (7.0, 1e-2), (4.0, 5.0)
+_USUAL, _FEW = 0.25, 5
 
 
 @dataclass
@@ -103,18 +104,23 @@ class FitHistory:
 
     def _torn(self, now: Pulls, distance: float) -> str:
         """distance (m), 1 at least: of what is seen; where noise grows with its square, so do pulls."""
-        far = [
-            pull > self._most_pull(name, distance) and sigmas > _PULL_SIGMAS
-            for name, pull, sigmas in zip(_PULLS, (now.whole, now.depth, now.color), now.sigmas, strict=True)
-        ]
+        if len(self._pulls) < _FEW:
+            return ""
+        far = [self._is_far(name, n, now, distance) for n, name in enumerate(_PULLS)]
         if any(far[1:]):
             return "depth and colour do not agree"
         return "the images do not agree with the motion" if far[0] else ""
 
-    def _most_pull(self, name: str, distance: float) -> float:
-        usual = [pull for before in self._pulls if np.isfinite(pull := getattr(before, name))]
-        growth, always = _PULL_WHOLE if name == "whole" else _PULL_ALONE
-        return max(always * distance, growth * distance**2 * median(usual)) if len(usual) >= _FEW else np.inf
+    def _is_far(self, name: str, n: int, now: Pulls, distance: float) -> bool:
+        """Of the pull of that name, the nth: whether it is too far."""
+        usual = [(pull, before.sigmas[n]) for before in self._pulls if np.isfinite(pull := getattr(before, name))]
+        pull, sigmas = getattr(now, name), now.sigmas[n]
+        if len(usual) < _FEW or not np.isfinite(pull):
+            return False
+        metres, known = np.quantile(usual, _USUAL, axis=0)
+        (growth, always), (times, least) = _PULL_WHOLE if name == "whole" else _PULL_ALONE, _PULL_SIGMAS
+        is_odd = sigmas > max(least, times * known)
+        return bool(is_odd and pull > max(always * distance, growth * distance**2 * metres))
 
     def is_hopeless(self, fresh: Sequence[Observation]) -> bool:
         """Whether no term of a frame, aligned at a coarse level, fits a part of its pixels that a finer one could."""

@@ -162,47 +162,63 @@ def test_all_misfits_are_named() -> None:
 @pytest.mark.parametrize(
     ("name", "usual", "limit", "says"),
     [
-        ("whole", 1e-3, 4e-3, "the images do not agree with the motion"),
-        ("whole", 1e-5, 2e-3, "the images do not agree with the motion"),
-        ("depth", 3e-3, 24e-3, "depth and colour do not agree"),
-        ("color", 1e-4, 2e-2, "depth and colour do not agree"),
+        ("whole", 2e-3, 8e-3, "the images do not agree with the motion"),
+        ("whole", 1e-5, 5e-3, "the images do not agree with the motion"),
+        ("depth", 3e-3, 21e-3, "depth and colour do not agree"),
+        ("color", 1e-4, 1e-2, "depth and colour do not agree"),
     ],
 )
 def test_images_that_pull_much_more_than_usual_are_elsewhere(name: str, usual: float, limit: float, says: str) -> None:
-    def pulled(metres: float) -> Pulls:
-        return Pulls(**({"whole": 0.0, "depth": 0.0, "color": 0.0} | {name: metres}))
+    def pulled(metres: float, sigmas: float) -> Pulls:
+        return Pulls(**({"whole": 0.0, "depth": 0.0, "color": 0.0} | {name: metres}), sigmas=(sigmas,) * 3)
 
     history, good = FitHistory(), [term("depth", 1e-3)]
     for k in range(10):
         # Nothing is usual yet: the first few may pull as they like.
-        assert fault(history, good, pulled=pulled(1.0 if k == 4 else usual)) == ""
+        assert fault(history, good, pulled=pulled(1.0 if k == 4 else usual, 2.0)) == ""
     for _ in range(20):
-        assert fault(history, good, pulled=pulled(1.01 * limit)) == says
-    assert fault(history, good, pulled=pulled(0.99 * limit)) == ""
+        assert fault(history, good, pulled=pulled(1.01 * limit, 50.0)) == says
+    assert fault(history, good, pulled=pulled(0.99 * limit, 50.0)) == ""
     # What is not there does not pull, and where it is not judged nothing is said or learnt.
-    assert fault(history, good, pulled=pulled(float("nan"))) == fault(history, good) == ""
+    assert fault(history, good, pulled=pulled(float("nan"), 50.0)) == fault(history, good) == ""
 
 
-def test_pulls_within_noise_and_of_what_is_far_away_may_be_larger() -> None:
-    usual = Pulls(1e-3, 3e-3, 3e-3)
+def pulled_before(frames: int = 10, sigmas: float = 1.0) -> FitHistory:
+    """The usual at one metre: a millimetre for the whole, three for depth and for colour alone."""
+    made = FitHistory()
+    for _ in range(frames):
+        assert fault(made, [term("depth", 1e-3)], pulled=Pulls(1e-3, 3e-3, 3e-3, (sigmas,) * 3)) == ""
+    return made
+
+
+@pytest.mark.parametrize(("usual", "limit"), [(1.0, 5.0), (3.0, 12.0)])
+def test_pulls_within_noise_or_as_far_from_it_as_usual_are_none(usual: float, limit: float) -> None:
+    for sigmas, says in ((0.98 * limit, ""), (1.02 * limit, "the images do not agree with the motion")):
+        pulled = Pulls(0.04, 3e-3, 3e-3, (sigmas,) * 3)
+        assert fault(pulled_before(sigmas=usual), [term("depth", 1e-3)], pulled=pulled) == says
+
+
+def test_pulls_of_what_is_far_away_may_be_larger() -> None:
     far = [term("depth", 1e-3, distance=3.0)]
-
-    def history() -> FitHistory:
-        made = FitHistory()
-        for _ in range(10):
-            assert fault(made, [term("depth", 1e-3)], pulled=usual) == ""
-        return made
-
-    for sigmas, says in ((4.9, ""), (5.1, "the images do not agree with the motion")):
-        assert fault(history(), far, pulled=Pulls(0.04, 3e-3, 3e-3, (sigmas,) * 3)) == says
     # Four times the usual at one metre, nine times that at three.
-    assert fault(history(), far, pulled=Pulls(0.035, 3e-3, 3e-3)) == ""
+    for metres, says in ((0.035, ""), (0.037, "the images do not agree with the motion")):
+        assert fault(pulled_before(), far, pulled=Pulls(metres, 3e-3, 3e-3, (50.0,) * 3)) == says
     # It is learnt as it would be at one metre.
-    learnt = history()
+    learnt, usual = pulled_before(), Pulls(2e-3, 3e-3, 3e-3, (1.0,) * 3)
     for _ in range(30):
         assert fault(learnt, far, pulled=usual.scaled(9.0)) == ""
-    assert fault(learnt, [term("depth", 1e-3)], pulled=usual.scaled(3.9)) == ""
-    assert fault(learnt, [term("depth", 1e-3)], pulled=usual.scaled(4.1)) != ""
+    for factor, says in ((3.9, ""), (4.1, "the images do not agree with the motion")):
+        pulled = Pulls(factor * 2e-3, 3e-3, 3e-3, (50.0,) * 3)
+        assert fault(learnt, [term("depth", 1e-3)], pulled=pulled) == says
+
+
+def test_what_three_quarters_of_the_frames_do_not_show_does_not_become_usual() -> None:
+    odd_one = Pulls(0.1, 3e-3, 3e-3, (4.9,) * 3)  # far, but within noise
+    for share, says in ((21, "the images do not agree with the motion"), (23, "")):
+        history = pulled_before(30 - share)
+        for _ in range(share):
+            assert fault(history, [term("depth", 1e-3)], pulled=odd_one) == ""
+        assert fault(history, [term("depth", 1e-3)], pulled=Pulls(0.05, 3e-3, 3e-3, (15.0,) * 3)) == says
 
 
 def test_an_alignment_that_noise_ended_is_settled_however_far_its_last_step_went() -> None:

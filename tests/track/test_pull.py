@@ -29,13 +29,20 @@ class OfDepth(Observation):
         return True
 
 
-def sight(v: Any = (0, 0, 0), phi: Any = (0, 0, 0), weight: float = 1e6, kind: type[Observation] = Observation) -> Any:
-    """An image that saw the camera shifted by v (m) and turned by phi (rad) about where it is at mid readout."""
+def sight(
+    v: Any = (0, 0, 0), phi: Any = (0, 0, 0), weight: float = 1e6, kind: type[Observation] = Observation,
+    growing: bool = False,
+) -> Any:  # fmt: skip
+    """An image that saw the camera shifted by v (m) and turned by phi (rad) about where it is at mid readout.
+
+    growing: by that in the last line, by its opposite in the first, and linearly between them.
+    """
     about = np.eye(4)
     about[:3, 3] = TRUTH.pose(MID)[:3, 3]
-    T = about @ se3.exp(np.array([*v, *phi])) @ se3.inverse(about)
+    share = np.linspace(-1.0, 1.0, len(TIMES)) if growing else np.ones(len(TIMES))
+    T = about @ se3.exp(share[:, None] * np.array([*v, *phi])) @ se3.inverse(about)
     made = sighting(TIMES, T @ TRUTH.pose(TIMES))
-    made.image.exposure = SimpleNamespace(mid_time=MID)  # type: ignore[attr-defined]
+    made.image.exposure = SimpleNamespace(first_time=TIMES[0], mid_time=MID, last_time=TIMES[-1])  # type: ignore[attr-defined]
     made = kind(0, made.image, made.ref, independent=weight)
     made.linearise(PoseTerms(), SplineState(TRUTH), 0)  # type: ignore[arg-type]
     return made
@@ -53,6 +60,22 @@ def sight(v: Any = (0, 0, 0), phi: Any = (0, 0, 0), weight: float = 1e6, kind: t
 def test_a_frame_that_was_seen_elsewhere_pulls_there(v: FloatArray, phi: FloatArray, metres: float) -> None:
     found = pulls([sight(v, phi)], SplineState(TRUTH))
     assert found.whole == found.color == pytest.approx(metres, rel=0.02) and np.isnan(found.depth)
+
+
+@pytest.mark.parametrize(
+    ("v", "phi", "metres"), [((3e-3, 0, 0), (0, 0, 0), 3e-3), ((0, 0, 0), (0, 2e-3, 0), 2e-3 * DEPTH_M)]
+)
+def test_lines_that_were_seen_ever_further_off_pull_by_as_much_as_the_last(
+    v: FloatArray, phi: FloatArray, metres: float
+) -> None:
+    found = pulls([sight(v, phi, growing=True)], SplineState(TRUTH))
+    assert found.whole == pytest.approx(metres, rel=0.03)
+
+
+def test_lines_that_are_exposed_at_once_have_no_first_and_last() -> None:
+    one = sight((3e-3, 0, 0), growing=True)
+    one.image.exposure = SimpleNamespace(first_time=MID, mid_time=MID, last_time=MID)
+    assert pulls([one], SplineState(TRUTH)).whole < 1e-4
 
 
 def test_images_that_disagree_balance_each_other_but_pull_alone() -> None:
