@@ -21,9 +21,11 @@ from rsgen.array_types import FloatArray
 from rsgen.check.reprojection import depth_points, reproject_depth
 from rsgen.check.truth import extra_checks
 from rsgen.errors import UserError
+from rsgen.export.folder import sequence_mocap
 from rsgen.files import is_temporary, read_text
 from rsgen.geometry import se3
 from rsgen.produce.identity import fingerprint
+from rsgen.sensors.mocap import reported_poses
 from rsgen.sequence.format import (
     FOLDERS,
     STAMP_TOLERANCE_S,
@@ -260,6 +262,12 @@ def _check_ground_truth(sequence: Sequence) -> tuple[bool, str]:
         raise UserError(f"{path}: expected lines of 8 numbers 'stamp tx ty tz qx qy qz qw'")
     if (np.diff(rows[:, 0]) <= 0).any():
         raise UserError(f"{path}: stamps do not increase")
+    if (mocap := sequence_mocap(sequence)) is not None:
+        expected = reported_poses(sequence.spline, *mocap, sequence.T_image_depth)
+        if len(rows) != len(expected) or np.abs(rows[:, 0] - expected[:, 0]).max() > STAMP_TOLERANCE_S:
+            return False, "its stamps are not those of the motion capture in config.mocap"
+        ok, detail, _ = _pose_errors(rows[:, 1:], expected[:, 1:])
+        return ok, f"{len(rows)} poses, against what config.mocap makes of the spline {detail}"
     stamps = np.concatenate([stream.stamps for stream in sequence.streams.values()])
     if lacking := int((~np.isin(stamps, rows[:, 0])).sum()):
         return False, f"{lacking} of {len(stamps)} frame stamps are not in it"

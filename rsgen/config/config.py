@@ -14,6 +14,7 @@ import yaml
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from rsgen.config.imu import ImuConfig
+from rsgen.config.mocap import MocapConfig
 from rsgen.config.motion import MotionConfig, TremorConfig
 from rsgen.config.presets import Preset, with_preset
 from rsgen.config.sections import (
@@ -63,6 +64,7 @@ class Config(Section):
     )
     truth: TruthConfig = TruthConfig()
     imu: ImuConfig | None = None
+    mocap: MocapConfig | None = None
     seed: int = Field(default=0, ge=0, lt=2**31, description="seed of every random number")
     backend: Literal["auto", "llvm", "cuda"] = Field(default="auto", description="where Dr.Jit runs")
 

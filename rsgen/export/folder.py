@@ -7,12 +7,13 @@ import os
 from collections.abc import Sequence as Items
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from rsgen.array_types import FloatArray
 from rsgen.config.imu import ImuConfig
+from rsgen.config.mocap import MocapConfig
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError, first_problem
 from rsgen.files import atomic_write, read_bytes, write_error
@@ -20,6 +21,8 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.sensors.imu import ImuSamples, simulate_imu
 from rsgen.sequence.reader import Sequence, Stream
+
+SectionT = TypeVar("SectionT", bound=BaseModel)
 
 # What a hard link fails with where a copy would do: another disk, a file system without links, too many of them.
 _NO_LINK = (errno.EXDEV, errno.EPERM, errno.ENOTSUP, errno.EMLINK, errno.EACCES, errno.ENOSYS)
@@ -76,20 +79,37 @@ def sequence_imu(sequence: Sequence) -> tuple[ImuConfig, ImuSamples] | None:
 
     Equal to what imu.csv was written from. Raises UserError if sequence.yaml's config.imu is not one.
     """
+    found = _section(sequence, "imu", ImuConfig)
+    if found is None:
+        return None
+    imu, seed = found
+    return imu, simulate_imu(sequence.spline, imu, sequence.spline.t_begin, sequence.spline.t_end, seed)
+
+
+def sequence_mocap(sequence: Sequence) -> tuple[MocapConfig, int] | None:
+    """The motion capture of a sequence's groundtruth.txt and the sequence's seed; None where the poses are exact.
+
+    Raises UserError if sequence.yaml's config.mocap is not one.
+    """
+    return _section(sequence, "mocap", MocapConfig)
+
+
+def _section(sequence: Sequence, name: str, model: type[SectionT]) -> tuple[SectionT, int] | None:
+    """A section of the config in sequence.yaml, and the seed; None where there is no such section. Raises UserError."""
     where = sequence.root / "sequence.yaml"
     config: Any = sequence.meta.get("config")
-    data = config.get("imu") if isinstance(config, dict) else None
+    data = config.get(name) if isinstance(config, dict) else None
     if data is None:
         return None
     try:
-        imu = ImuConfig.model_validate(data)
+        section = model.model_validate(data)
     except ValidationError as error:
-        problem = first_problem(error, "config", "imu")
+        problem = first_problem(error, "config", name)
         raise UserError(f"{where}: {problem}: restore the file or render again") from None
     seed = sequence.meta.get("seed")
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise UserError(f"{where}: seed is not a whole number of 0 or more: restore the file or render again")
-    return imu, simulate_imu(sequence.spline, imu, sequence.spline.t_begin, sequence.spline.t_end, seed)
+    return section, seed
 
 
 def image_streams(sequence: Sequence) -> tuple[tuple[Stream, FloatArray], tuple[Stream, FloatArray]]:

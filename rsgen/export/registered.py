@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import Any
 
 from rsgen.console.progress import Progress, no_progress
-from rsgen.export.folder import make_folders, new_folder, place_images
+from rsgen.export.folder import make_folders, new_folder, place_images, sequence_mocap
 from rsgen.files import atomic_write, encode_png, encode_yaml
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.produce.writer import quantise
+from rsgen.sensors.mocap import reported_poses
 from rsgen.sensors.registration import register_depth
-from rsgen.sequence.format import associate, ground_truth
+from rsgen.sequence.format import associate, ground_truth, pose_lines
 from rsgen.sequence.reader import Sequence
 
 _MARK = "registered to the colour camera"
@@ -28,8 +29,9 @@ def export_registered(sequence: Sequence, out: Path, copy: bool = False, progres
 
     rgb/ holds hard links where the disk allows, or copies with `copy`. camera.yaml (as rstrack reads it) says that
     depth has the colour camera, and which camera with which shutter it was warped from; groundtruth.txt holds poses of
-    the colour camera at true times. Stamps are the sequence's listed ones; depth that is registered already is linked
-    like colour. Raises UserError if `out` is not empty, or an image cannot be read.
+    the colour camera at true times, or what the sequence's motion capture reports of it. Stamps are the sequence's
+    listed ones; depth that is registered already is linked like colour. Raises UserError if `out` is not empty, or an
+    image cannot be read.
     """
     color, depth = sequence.streams["color"], sequence.streams["depth"]
     sequence.depth(0)  # of the size that sequence.yaml says, or all below would take memory for another one
@@ -56,10 +58,13 @@ def export_registered(sequence: Sequence, out: Path, copy: bool = False, progres
     _write(out / "depth.txt", [f"# depth images of {sequence.name}, {_MARK}", "# stamp path", *entries["depth"]])
     pairs = associate(color.listed, depth.listed, 0.5 / min(color.rate_hz, depth.rate_hz))
     _write(out / "associations.txt", [f"{entries['rgb'][i]} {entries['depth'][j]}" for i, j in pairs])
-    rows = ground_truth(sequence.spline, color.stamps, depth.stamps, T_cam_body=sequence.T_color_depth)
-    poses = [f"{row[0]:.9f} " + " ".join(f"{value:.12f}" for value in row[1:]) for row in rows]
-    header = [f"# ground truth of {sequence.name}: T_world_color", "# stamp tx ty tz qx qy qz qw"]
-    _write(out / "groundtruth.txt", header + poses)
+    title = f"ground truth of {sequence.name}: T_world_color"
+    if (mocap := sequence_mocap(sequence)) is None:
+        rows = ground_truth(sequence.spline, color.stamps, depth.stamps, T_cam_body=sequence.T_color_depth)
+    else:
+        rows = reported_poses(sequence.spline, *mocap, sequence.T_color_depth)
+        title += ", as a motion capture reports it"
+    _write(out / "groundtruth.txt", pose_lines(title, rows))
     atomic_write(out / "camera.yaml", f"# depth is {_MARK}\n".encode() + encode_yaml(_camera_yaml(sequence)))
     return f"{out}: {len(depth.paths)} depth images {_MARK}; {100 * filled:.0f} % of pixels have depth"
 

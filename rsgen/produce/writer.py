@@ -31,6 +31,7 @@ from rsgen.produce.identity import color_truth, describe, refuse_foreign_folder
 from rsgen.sensors.adaptation import Setting
 from rsgen.sensors.driver import deliver
 from rsgen.sensors.imu import sample_clock, simulate_imu, write_imu_csv
+from rsgen.sensors.mocap import reported_poses
 from rsgen.sequence.format import (
     FOLDERS,
     FRAME_TABLES,
@@ -44,6 +45,7 @@ from rsgen.sequence.format import (
     frame_name,
     ground_truth,
     line_poses,
+    pose_lines,
     round_stamps,
 )
 from rsgen.sequence.frame_table import FrameTable
@@ -228,11 +230,14 @@ class SequenceWriter:
         pairs = [f"{entries['color'][i]} {entries['depth'][j]}" for i, j in associate(color, depth, limit)]
         _write_lines(self.out / "associations.txt", pairs)
         T_image_depth = np.array(self.config.T_color_depth, float) if self.config.depth.registered else None
-        rows = ground_truth(self.spline, self.color.stamps, self.depth.stamps, T_cam_body=T_image_depth)
-        lines = [f"{row[0]:.9f} " + " ".join(f"{value:.12f}" for value in row[1:]) for row in rows]
         camera = "T_world_depth" if T_image_depth is None else "T_world_color, depth being registered"
-        header = [f"# ground truth of {self.config.name}: {camera}", "# stamp tx ty tz qx qy qz qw"]
-        _write_lines(self.out / "groundtruth.txt", header + lines)
+        mocap = self.config.mocap
+        if mocap is None:
+            rows = ground_truth(self.spline, self.color.stamps, self.depth.stamps, T_cam_body=T_image_depth)
+        else:
+            rows = reported_poses(self.spline, mocap, self.config.seed, T_image_depth)
+            camera += ", as a motion capture reports it"
+        _write_lines(self.out / "groundtruth.txt", pose_lines(f"ground truth of {self.config.name}: {camera}", rows))
         for s in STREAMS:
             stream = self._stream(s)
             T_cam_body = np.array(self.config.T_color_depth, float) if s == "color" else None

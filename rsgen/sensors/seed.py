@@ -10,6 +10,7 @@ import numpy as np
 _NOISE = 0x6E6F6973
 _STREAMS = {"color": 0, "depth": 1}
 _DRIVER, _DEVICE = 0x64726976, 0x64657663  # "driv", "devc"
+_MOCAP = 0x6D6F6361  # "moca"
 _PARTS = {"jitter": 0, "fate": 1}
 
 
@@ -28,3 +29,8 @@ def driver_generator(
 def device_generator(seed: int) -> np.random.Generator:
     """The generator of the faults that a depth camera has once and for all."""
     return np.random.default_rng([_DEVICE, seed])
+
+
+def mocap_generator(seed: int) -> np.random.Generator:
+    """The generator of the noise of a motion capture's poses, drawn in their order."""
+    return np.random.default_rng([_MOCAP, seed])

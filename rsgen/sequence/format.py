@@ -214,6 +214,12 @@ def pose_rows(T: FloatArray) -> FloatArray:
     return np.concatenate([T[:, :3, 3], q], axis=-1) + 0.0  # no negative zeros
 
 
+def pose_lines(title: str, rows: FloatArray) -> list[str]:
+    """Lines of a TUM file of poses: comments, then rows (n, 8), stamp tx ty tz qx qy qz qw."""
+    lines = [f"{row[0]:.9f} " + " ".join(f"{value:.12f}" for value in row[1:]) for row in rows]
+    return [f"# {title}", "# stamp tx ty tz qx qy qz qw", *lines]
+
+
 def poses_of_rows(rows: FloatArray) -> FloatArray:
     """Poses (..., 4, 4) of rows (..., 7)."""
     return se3.from_quat_trans(rows[..., 3:], rows[..., :3])

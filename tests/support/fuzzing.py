@@ -92,6 +92,7 @@ def base_config(motion: dict[str, Any] | None = None) -> dict[str, Any]:
         "tremor": {},
         "truth": TRUTH,
         "imu": {},
+        "mocap": {},
     }
     data |= {"motion": motion} if motion else {"trajectory": {"file": "motion.txt"}}
     every: dict[str, Any] = Config.model_validate(data).model_dump(mode="json")
