@@ -14,7 +14,7 @@ from rstrack.cli.bench import bench_bootstrap, bench_convergence, bench_speed, s
 from rstrack.cli.bench_methods import STATUS as BENCH_STATUS
 from rstrack.cli.bench_methods import bench
 from rstrack.cli.mapping import keyframes, map_, map_eval
-from rstrack.cli.options import CameraFile, Run, SequenceFolder, TruthOffset
+from rstrack.cli.options import CameraFile, Run, SequenceFolder, TruthExtrinsics, TruthOffset
 from rstrack.cli.report import report
 from rstrack.cli.sensitivity import sensitivity
 from rstrack.options import Options
@@ -120,6 +120,7 @@ def evaluate(
     *,
     camera: CameraFile = None,
     truth_offset: TruthOffset = None,
+    truth_extrinsics: TruthExtrinsics = None,
     against: Annotated[
         Path | None,
         "another run of the sequence: ends with one line that compares the two, for example of gs-pg",
@@ -131,8 +132,9 @@ def evaluate(
     from rstrack.metrics.evaluate import compared
     from rstrack.metrics.run_evaluate import run_evaluate
 
-    ours = run_evaluate(sequence, run, camera, truth_offset)
-    theirs = None if against is None else run_evaluate(sequence, against, camera, truth_offset)
+    how = camera, truth_offset, truth_extrinsics
+    ours = run_evaluate(sequence, run, *how)
+    theirs = None if against is None else run_evaluate(sequence, against, *how)
     if json:
         print(dumps(ours.as_dict() | ({"against": theirs.as_dict()} if theirs else {}), indent=2))
     else:

@@ -21,4 +21,10 @@ TruthOffset = Annotated[
     "auto|S",
     truth_offset,
 ]
+TruthExtrinsics = Annotated[
+    Literal["auto"] | None,
+    "auto: errors also with the truth's poses moved by the one rigid transform on their right that fits best, for a "
+    "truth of a body that is not quite the camera (default: it is)",
+    "auto",
+]
 Run = Annotated[Path, "folder that 'rstrack track' wrote, or a TUM file"]

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from rsgen.array_types import FloatArray
+from rsgen.array_types import FloatArray, IntArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
@@ -33,8 +33,9 @@ SEARCH_S = 0.1
 """Offsets are sought within ± this."""
 
 _COARSE_S, _FINE_S, _FINE_REACH_S = 4e-3, 1e-3, 20e-3
-# Pairs of poses one second apart below which nothing is said.
-_LEAST_PAIRS = 30
+LEAST_PAIRS = 30
+"""Pairs of poses one second apart below which nothing is said."""
+
 # Resampled curves, and the length of what is resampled as one piece: errors of overlapping seconds are alike.
 _RESAMPLES, _BLOCK_S = 200, 2.0
 
@@ -104,6 +105,16 @@ def fit_clock(truth: Truth, estimate: Estimate, seed: int = 0) -> ClockFit:
     return ClockFit(least[best], sigma[best], best, {**least, "trajectory": _brent(errors.trajectory, coarse, k)})
 
 
+def resampled_blocks(stamps: FloatArray, seed: int) -> list[IntArray]:
+    """Indices of 200 resamples of what happens at times (n,), s, of a recording: blocks of 2 s, with replacement."""
+    count = len(stamps)
+    per_second = count / (stamps[-1] - stamps[0])
+    length = int(np.clip(_BLOCK_S * per_second, 1, count // 4))
+    starts = np.random.default_rng(seed).integers(0, count, (_RESAMPLES, -(-count // length)))
+    # Circular: both ends count as often as the middle.
+    return [((blocks[:, None] + np.arange(length)) % count).ravel() for blocks in starts]
+
+
 # ---------------------------------------------------------------------------------------------------------------------
 
 
@@ -130,10 +141,10 @@ class _Errors:
         kept = known == len(offsets)
         stamps, T_est = estimate.stamps[kept], estimate.T_world_depth[kept]
         i, j = pairs_one_second_apart(stamps)
-        if len(i) < _LEAST_PAIRS:
+        if len(i) < LEAST_PAIRS:
             raise UserError(
                 f"estimate: {len(i)} pairs of poses one second apart have a truth within {1e3 * SEARCH_S:g} ms, a "
-                f"clock offset needs {_LEAST_PAIRS}"
+                f"clock offset needs {LEAST_PAIRS}"
             )
         return cls(truth.motion, stamps, T_est, i, j)
 
@@ -164,14 +175,8 @@ class _Errors:
         """Standard deviation of the least point of a drift curve that is least at tau, seconds."""
         offsets = tau + _steps(_FINE_REACH_S, _FINE_S)
         curves = np.stack([self.drift(float(at))[criterion] for at in np.clip(offsets, -SEARCH_S, SEARCH_S)], axis=1)
-        count = len(curves)
-        per_second = count / (self.stamps[self.i[-1]] - self.stamps[self.i[0]])
-        length = int(np.clip(_BLOCK_S * per_second, 1, count // 4))
-        starts = np.random.default_rng(seed).integers(0, count, (_RESAMPLES, -(-count // length)))
-        minima = []
-        for blocks in starts:
-            drawn = (blocks[:, None] + np.arange(length)) % count  # circular: both ends count as often as the middle
-            minima.append(offsets[int(np.argmin(curves[drawn.ravel()].mean(axis=0)))])
+        drawn = resampled_blocks(self.stamps[self.i], seed)
+        minima = [offsets[int(np.argmin(curves[k].mean(axis=0)))] for k in drawn]
         low, high = np.quantile(minima, [0.16, 0.84])
         # Minima are found on a grid: no finer than its rounding error.
         return float(np.hypot(0.5 * (high - low), _FINE_S / np.sqrt(12.0)))

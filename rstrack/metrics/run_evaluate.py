@@ -1,4 +1,4 @@
-"""`rstrack evaluate`: an estimate against a sequence's truth or a file of poses, and what a clock offset changes.
+"""`rstrack evaluate`: an estimate against a sequence's truth or a file of poses, and what clock and extrinsics change.
 
 evaluation = run_evaluate(Path("fr1_rpy"), Path("runs/fr1_rpy"), truth_offset="auto")
 print(evaluation.text())
@@ -7,7 +7,7 @@ print(evaluation.text())
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.metrics.association import Truth, truth_of
 from rstrack.metrics.clock import ClockFit, TruthOffset, fit_clock, shifted
 from rstrack.metrics.evaluate import Metrics, evaluate
+from rstrack.metrics.extrinsics import ExtrinsicsFit, TruthExtrinsics, fit_extrinsics, mounted
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,8 @@ class Evaluation:
     """Errors with the clocks as they are, and with the truth `offset_s` after the stamps.
 
     moved: errors there; None with offset_s where nothing was asked and nothing was found. fit: how the offset was
-    found; None if it was given. asked: whether it was asked for; else it is a hint.
+    found; None if it was given. asked: whether it was asked for; else it is a hint. mount, mounted: the truth's
+    extrinsics and the errors with them, at the offset where one was asked for; None where they were not.
     """
 
     metrics: Metrics
@@ -36,10 +38,16 @@ class Evaluation:
     moved: Metrics | None = None
     fit: ClockFit | None = None
     asked: bool = False
+    mount: ExtrinsicsFit | None = None
+    mounted: Metrics | None = None
 
     @property
     def chosen(self) -> Metrics:
         """The errors that were asked for."""
+        return self.mounted or self._on_the_clock
+
+    @property
+    def _on_the_clock(self) -> Metrics:
         return self.moved if self.asked and self.moved is not None else self.metrics
 
     @property
@@ -50,9 +58,18 @@ class Evaluation:
         how = {"sigma_s": None, "criterion": None, "least_s": None} if self.fit is None else self.fit.as_dict()
         return how | {"offset_s": self.offset_s, "metrics": self.moved.as_dict()}
 
+    @property
+    def truth_extrinsics(self) -> dict[str, Any] | None:
+        """For JSON: extrinsics and the errors with them; None where they were not asked for."""
+        if self.mount is None or self.mounted is None:
+            return None
+        return self.mount.as_dict() | {"metrics": self.mounted.as_dict()}
+
     def as_dict(self) -> dict[str, Any]:
-        """For JSON: the errors with the clocks as they are, and under `truth_offset` those with the offset."""
-        return self.metrics.as_dict() | {"truth_offset": self.truth_offset}
+        """For JSON: the errors with the truth as it is, and beside them those with its offset and its extrinsics."""
+        return self.metrics.as_dict() | {
+            "truth_offset": self.truth_offset, "truth_extrinsics": self.truth_extrinsics
+        }  # fmt: skip
 
     @property
     def hint(self) -> str | None:
@@ -63,11 +80,12 @@ class Evaluation:
 
     def text(self) -> str:
         """Tables; a mere hint is one line under them."""
-        if self.moved is None or self.offset_s is None:
-            return self.metrics.text()
-        if self.hint is not None:
-            return f"{self.metrics.text()}\nhint: {self.hint}"
-        return "\n".join([*self.clocks, "", self.moved.text()])
+        before = [*self.clocks]
+        if self.mount is not None and self.mounted is not None:
+            before += [] if before else [f"the truth as it is: {_short(self.metrics)}"]
+            before.append(f"{self.mount.text()}: {_short(self.mounted)}")
+        hint = [f"hint: {self.hint}"] if self.hint is not None else []
+        return "\n".join([*before, *([""] if before else []), self.chosen.text(), *hint])
 
     @property
     def clocks(self) -> tuple[str, ...]:
@@ -105,6 +123,18 @@ def evaluate_clocks(truth: Truth, estimate: Estimate, offset: TruthOffset | None
     return Evaluation(metrics, tau, evaluate(shifted(truth, tau), estimate), fit, asked=True)
 
 
+def evaluate_extrinsics(truth: Truth, estimate: Estimate, offset: TruthOffset | None = None) -> Evaluation:
+    """As `evaluate_clocks`, and with the truth's extrinsics, found at the offset that was asked for. Raises UserError.
+
+    They change the clock by less than its standard deviation: it is not fitted again.
+    """
+    clocks = evaluate_clocks(truth, estimate, offset)
+    if clocks.asked and clocks.offset_s is not None:
+        truth = shifted(truth, clocks.offset_s)
+    fit = fit_extrinsics(truth, estimate)
+    return replace(clocks, mount=fit, mounted=evaluate(mounted(truth, fit.T_body_camera), estimate))
+
+
 def aligned_clock(truth: Truth, estimate: Estimate, offset: TruthOffset | None) -> Truth:
     """The truth with an offset given or found; None: as it is. Raises UserError."""
     if offset is None:
@@ -113,16 +143,19 @@ def aligned_clock(truth: Truth, estimate: Estimate, offset: TruthOffset | None) 
 
 
 def run_evaluate(
-    truth_path: Path, estimate_path: Path, camera_file: Path | None = None, truth_offset: TruthOffset | None = None
-) -> Evaluation:
+    truth_path: Path, estimate_path: Path, camera_file: Path | None = None, truth_offset: TruthOffset | None = None,
+    truth_extrinsics: TruthExtrinsics | None = None,
+) -> Evaluation:  # fmt: skip
     """Evaluate a run folder or TUM file against the truth of a sequence folder, or against another TUM file.
 
-    Arguments as in `read_estimate`, `rstrack.data.dataset.open_dataset` and `evaluate_clocks`. Raises UserError.
+    Arguments as in `read_estimate`, `rstrack.data.dataset.open_dataset`, `evaluate_clocks` and `evaluate_extrinsics`.
+    Raises UserError.
     """
     truth = _truth(truth_path, camera_file)
     estimate = read_estimate(estimate_path)
     try:
-        return evaluate_clocks(truth, estimate, truth_offset)
+        how = evaluate_clocks if truth_extrinsics is None else evaluate_extrinsics
+        return how(truth, estimate, truth_offset)
     except UserError as error:
         raise UserError(f"{estimate_path}: {error}") from None
 
