@@ -85,7 +85,7 @@ def drift_ppm(clock: Clock, other: Clock) -> float | None:
 
     Rates may be multiples of each other (15 and 30 Hz). None where they are not, within 1 %, or one is not known.
     """
-    if min(clock.period_s, other.period_s) <= 0.0 or "irregular" in (clock.verdict, other.verdict):
+    if min(clock.period_s, other.period_s) <= 0.0 or {"irregular", "too short"} & {clock.verdict, other.verdict}:
         return None
     ratio = other.period_s / clock.period_s
     nominal = round(ratio) if ratio >= 1.0 else 1.0 / round(1.0 / ratio)

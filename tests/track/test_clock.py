@@ -131,6 +131,8 @@ def test_drift_against_another_clock() -> None:
     assert drift_ppm(clock(1 / 60), depth) == pytest.approx(0, abs=0.1)
     assert drift_ppm(clock(1 / 45), depth) is None
     assert drift_ppm(estimate_clock([1.0]), depth) is None
+    # A few stamps have a period, but tell no rate.
+    assert drift_ppm(estimate_clock(true_times(9, (1 / 30) / (1 + 990e-6))), depth) is None
 
 
 @pytest.mark.parametrize("seed", range(3))
