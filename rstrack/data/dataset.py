@@ -186,6 +186,8 @@ def _of_tum(root: Path, tum: TumFolder) -> Dataset:
         color = stream_timing("colour", tum.color_stamps, file.stamps, 0.0)
     except UserError as error:
         raise UserError(f"{root}: {error}") from None
+    if tum.depth_numbers is not None:
+        depth = replace(depth, listed=tum.depth_numbers)
     timing = Timing(depth, color, file.color_offset_s, file.notes)
     color_stamps = color.used + (file.color_offset_s or 0.0)
     groups = group_colors(depth.used, color_stamps)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,8 @@ _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 _PNG_START = b"\x89PNG"
 # Damaged images at the start of a recording before it is given up.
 _TRIED = 10
+# Repeats in a row beyond which a camera is taken to be at rest in a world without noise.
+_AT_REST = 30
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,26 @@ def first_size(paths: Sequence[Path], decode: Callable[[Path], npt.NDArray[Any]]
         else:
             return image.shape[1], image.shape[0]
     raise problem or UserError("no image: give one at least")
+
+
+def repeated(paths: Sequence[Path]) -> npt.NDArray[np.bool_]:
+    """Which images (n,) are the one before again, byte for byte: the recorder asked more often than the camera gave.
+
+    No two images of a real sensor are the same, moving or not. More than a few in a row are left alone: rendered.
+    """
+    same = np.array([False, *(_same_bytes(a, b) for a, b in pairwise(paths))], bool)[: len(paths)]
+    runs = np.split(np.arange(len(same)), np.flatnonzero(~same))
+    for run in runs:
+        if len(run) > _AT_REST + 1:
+            same[run] = False
+    return same
+
+
+def _same_bytes(a: Path, b: Path) -> bool:
+    try:
+        return a.stat().st_size == b.stat().st_size and a.read_bytes() == b.read_bytes()
+    except OSError:
+        return False  # said when it is decoded
 
 
 def decode_image(path: Path) -> npt.NDArray[Any]:

@@ -6,8 +6,10 @@
     camera.yaml               optional: see `camera_file`; depth is in millimetres whatever it says
 
 Nothing there tells times, cameras or shutters. Frames are taken to be 1/30 s apart by their numbers, so that a number
-left out is a gap; without a camera file both cameras are the one that the data set's authors recommend, and global
-shutter. What is assumed is in `TumFolder.notes`.
+left out is a gap. An image that is the one before again is left out, and a number at which both cameras have nothing
+new takes no time: recorders that were faster than the camera wrote those (91 of the 1000 frames of one of 7-Scenes').
+Without a camera file depth has the intrinsics that the data set's authors recommend, colour and the pose between them
+are a Kinect's as those who use the data set have it, and shutters are global. What is assumed is in `TumFolder.notes`.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
@@ -26,13 +29,22 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.camera_file import RigFile, read_rig
-from rstrack.data.image_files import ImageFiles, decode_color, decode_depth, first_size
+from rstrack.data.image_files import ImageFiles, decode_color, decode_depth, first_size, repeated
 from rstrack.data.rig import Rig
-from rstrack.data.tum_folder import TumFolder, find_camera_file
+from rstrack.data.tum_folder import TumFolder, find_camera_file, repeats_note
+
+IntArray = npt.NDArray[np.int64]
 
 _NAME = re.compile(r"frame-(\d{1,9})\.(color\.png|color\.jpg|color\.jpeg|depth\.png|pose\.txt)")
 _RATE_HZ = 30.0
-_SIZE, _INTRINSICS = (640, 480), (585.0, 585.0, 320.0, 240.0)
+_SIZE, _DEPTH, _COLOR = (640, 480), (585.0, 585.0, 320.0, 240.0), (525.0, 525.0, 320.0, 240.0)
+# 7-Scenes' colour is not registered to its depth, and was not calibrated. This is a Kinect's.
+_T_COLOR_DEPTH = np.array([
+    [0.99996518, 0.00267651, -0.00790410, -0.02555894],
+    [-0.00274093, 0.99996303, -0.00815045, 0.00010110],
+    [0.00788199, 0.00817183, 0.99993554, 0.00203183],
+    [0.0, 0.0, 0.0, 1.0],
+])  # fmt: skip
 _UNITS_PER_M, _MISSING = 1000.0, 65535
 # Largest deviation of Rᵀ R from the identity that is rounded away.
 _SKEW = 1e-2
@@ -55,14 +67,21 @@ def read_seven_scenes(root: Path, camera_file: Path | None) -> TumFolder:
     for name, found in (("colour", color), ("depth", depth)):
         if not found:
             raise UserError(f"{root}: has no {name} image frame-NNNNNN.{name.replace('u', '')}.png: unpack it again")
-    color_paths, depth_paths = tuple(color.values()), tuple(depth.values())
-    file, notes = _cameras(root, camera_file, color_paths, depth_paths)
-    images = ImageFiles(file.rig, _UNITS_PER_M, color_paths, depth_paths, _MISSING)
-    truth, without = _truth(poses)
+    file, notes = _cameras(root, camera_file, tuple(color.values()), tuple(depth.values()))
     notes = (f"frames are taken to be 1/{_RATE_HZ:g} s apart: nothing in {root} stamps them", *notes)
+    numbers = list(color), list(depth)
+    color_again, depth_again = repeated(list(color.values())), repeated(list(depth.values()))
+    idle = _idle(*(np.array(n)[again] for n, again in zip(numbers, (color_again, depth_again), strict=True)))
+    color, depth = _without(color, color_again), _without(depth, depth_again)
+    notes += tuple(
+        repeats_note(name, again) for name, again in (("depth", depth_again), ("colour", color_again)) if again.any()
+    )
+    images = ImageFiles(file.rig, _UNITS_PER_M, tuple(color.values()), tuple(depth.values()), _MISSING)
+    truth, without = _truth({k: path for k, path in poses.items() if k in depth or k not in numbers[1]}, idle)
     if without:
         notes = (*notes, f"{without} of {len(poses)} pose files hold no finite pose: there is no truth at these frames")
-    return TumFolder(file, _stamps(list(depth)), _stamps(list(color)), images, truth, notes)
+    stamps = _stamps(list(depth), idle), _stamps(list(color), idle)
+    return TumFolder(file, *stamps, images, truth, notes, _stamps(list(depth)))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -82,8 +101,29 @@ def _numbered(root: Path, kind: str) -> dict[int, Path]:
     return dict(sorted(found.items()))
 
 
-def _stamps(numbers: Sequence[int]) -> FloatArray:
-    return np.array(numbers, np.float64) / _RATE_HZ
+def _stamps(numbers: Sequence[int], idle: Sequence[int] = ()) -> FloatArray:
+    """Seconds (n,) at which frames were taken. idle: numbers that take no time, increasing."""
+    k = np.array(numbers, np.int64)
+    return np.asarray(k - np.searchsorted(idle, k, side="right"), np.float64) / _RATE_HZ
+
+
+def _idle(color: IntArray, depth: IntArray) -> list[int]:
+    """Numbers at which neither camera has anything new. color (n,), depth (m,): those at which one repeats.
+
+    Images of the two arrive apart, so that one may repeat a number before the other.
+    """
+    found: list[int] = []
+    left = set(color.tolist())
+    for k in depth.tolist():
+        partner = next((i for i in (k, k - 1, k + 1) if i in left), None)
+        if partner is not None:
+            left.remove(partner)
+            found.append(max(k, partner))
+    return sorted(found)
+
+
+def _without(files: dict[int, Path], again: npt.NDArray[np.bool_]) -> dict[int, Path]:
+    return {k: path for (k, path), is_repeat in zip(files.items(), again, strict=True) if not is_repeat}
 
 
 def _cameras(
@@ -96,23 +136,22 @@ def _cameras(
     if sizes != (_SIZE, _SIZE):
         shown = " and ".join("x".join(map(str, size)) for size in sizes)
         raise UserError(f"{root}: images are {shown}, and nothing tells the cameras: write {root / 'camera.yaml'}")
-    camera = Camera(*_SIZE, *_INTRINSICS)
-    fx, fy, cx, cy = _INTRINSICS
     note = (
-        f"both cameras are taken for one global-shutter pinhole, fx {fx:g} fy {fy:g} cx {cx:g} cy {cy:g}: write "
-        f"{root / 'camera.yaml'} if you know them"
+        f"the cameras are taken for 7-Scenes', global shutters, depth with fx {_DEPTH[0]:g}, colour with fx "
+        f"{_COLOR[0]:g} and not registered: write {root / 'camera.yaml'} if you know them"
     )
-    rig = Rig(camera, Shutter(), camera, Shutter(), np.eye(4))
+    depth_camera, color_camera = (Camera(*_SIZE, *intrinsics) for intrinsics in (_DEPTH, _COLOR))
+    rig = Rig(depth_camera, Shutter(), color_camera, Shutter(), se3.orthonormalise(_T_COLOR_DEPTH))
     return RigFile(rig, _UNITS_PER_M, color_offset_s=0.0), (note,)
 
 
-def _truth(paths: dict[int, Path]) -> tuple[Trajectory | None, int]:
-    """Poses where there are any, and the number of files without one."""
+def _truth(paths: dict[int, Path], idle: Sequence[int]) -> tuple[Trajectory | None, int]:
+    """Poses where there are any, and the number of files without one. idle: see `_stamps`."""
     poses = {k: T for k, path in paths.items() if (T := _pose(path)) is not None}
     if not poses:
         return None, len(paths)
     T = se3.orthonormalise(np.stack(list(poses.values())))
-    return Trajectory(_stamps(list(poses)), T), len(paths) - len(poses)
+    return Trajectory(_stamps(list(poses), idle), T), len(paths) - len(poses)
 
 
 def _pose(path: Path) -> FloatArray | None:

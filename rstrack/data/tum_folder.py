@@ -5,7 +5,7 @@
     groundtruth.txt       optional: poses of the colour camera; ICL-NUIM's NAME.gt.freiburg also
 
 Stamps without any decimal point are frame numbers at 30 Hz, as in ICL-NUIM. Colour images are 8-bit PNG or JPEG, depth
-images 16-bit grey PNG.
+images 16-bit grey PNG. One that is the one before again is left out: it was not taken when its stamp says.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.files import listed_file, read_text
 from rsgen.sequence.trajectory import ICL_RATE_HZ, Trajectory, read_trajectory
 from rstrack.data.camera_file import EXAMPLE, RigFile, read_rig
-from rstrack.data.image_files import ImageFiles, decode_color, decode_depth, decode_image, first_size
+from rstrack.data.image_files import ImageFiles, decode_color, decode_depth, decode_image, first_size, repeated
 from rstrack.data.rig import Rig
 
 _ASSOCIATIONS = ("associations.txt", "associate.txt", "association.txt")
@@ -35,7 +36,8 @@ _MAX_STAMP_S = 1e11  # the year 5138; today in milliseconds, microseconds or nan
 class TumFolder:
     """What is found in a folder. Stamps as listed (n,) and (m,) in seconds, increasing; truth_poses are T_world_depth.
 
-    file: the camera file's content. notes: what had to be assumed, each in one line.
+    file: the camera file's content. notes: what had to be assumed, each in one line. depth_numbers: of frames that are
+    numbered, the seconds (n,) that their numbers alone would tell.
     """
 
     file: RigFile
@@ -44,6 +46,7 @@ class TumFolder:
     images: ImageFiles
     truth_poses: Trajectory | None
     notes: tuple[str, ...] = ()
+    depth_numbers: FloatArray | None = None
 
 
 def read_tum_folder(root: Path, camera_file: Path | None) -> TumFolder:
@@ -52,11 +55,14 @@ def read_tum_folder(root: Path, camera_file: Path | None) -> TumFolder:
     camera_file: default camera.yaml, else calibration.yaml in the folder. Raises UserError, one line.
     """
     depth, color = _listings(root)
-    depth, color = depth.checked(), color.sorted().checked()
+    (depth, depth_note), (color, color_note) = (
+        listing.without_repeats(name) for name, listing in (("depth", depth), ("colour", color.sorted()))
+    )
     file = _rig_file(root, camera_file, color.paths, depth.paths)
     images = ImageFiles(file.rig, file.depth_scale, color.paths, depth.paths)
     rate = ICL_RATE_HZ if depth.has_frame_numbers and color.has_frame_numbers else 1.0
-    return TumFolder(file, depth.stamps / rate, color.stamps / rate, images, _truth(root, file.rig))
+    stamps = depth.stamps / rate, color.stamps / rate
+    return TumFolder(file, *stamps, images, _truth(root, file.rig), (*depth_note, *color_note))
 
 
 # --- listings --------------------------------------------------------------------------------------------------------
@@ -115,6 +121,15 @@ class _Listing:
             )
         return self
 
+    def without_repeats(self, name: str) -> tuple[_Listing, tuple[str, ...]]:
+        """Without images that are the one before again, and what there is to say of that. Raises UserError: see
+        `checked`."""
+        again = repeated(self.checked().paths)
+        if not again.any():
+            return self, ()
+        new = tuple(entry for entry, is_repeat in zip(self.entries, again, strict=True) if not is_repeat)
+        return _Listing(self.root, self.file, new), (repeats_note(name, again),)
+
     def _where(self, entry: _Entry) -> str:
         return f"{self.file} line {entry.line}"
 
@@ -134,6 +149,14 @@ class _Listing:
     def _path(self, entry: _Entry, real_root: Path) -> Path:
         missing = "unpack the dataset again or remove the line"
         return listed_file(self.root, real_root, entry.path, self._where(entry), missing)
+
+
+def repeats_note(name: str, again: npt.NDArray[np.bool_]) -> str:
+    """For the screen. again (n,): which images of a stream are the one before again."""
+    return (
+        f"{np.count_nonzero(again)} of {len(again)} {name} images are the one before again, byte for byte: they were "
+        "not taken anew, and are left out"
+    )
 
 
 def _listings(root: Path) -> tuple[_Listing, _Listing]:

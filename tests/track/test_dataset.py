@@ -18,6 +18,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.shutter import Shutter
 from rsgen.sequence.reader import read_sequence
 from rstrack.data.dataset import group_colors, open_dataset
+from rstrack.data.image_files import repeated
 from rstrack.data.prefetch import prefetched
 
 WIDTH, HEIGHT = 32, 24
@@ -326,6 +327,28 @@ def test_an_image_associated_twice_is_read_once(tmp_path: Path) -> None:
     dataset = open_dataset(root)
     assert dataset.groups == ((0,), (1,), (2,), ())
     np.testing.assert_array_equal(dataset.frame(2).colors[0].pixels, color_pixels(2))
+
+
+def test_images_that_are_the_one_before_again_are_left_out(tmp_path: Path) -> None:
+    root = make_tum(tmp_path / "tum")
+    first, second, *_ = (root / f"depth/{t:.4f}.png" for t in STAMPS)
+    second.write_bytes(first.read_bytes())
+    dataset = open_dataset(root)
+    assert dataset.stamps.tolist() == [STAMPS[0], *STAMPS[2:]] and len(dataset.color_stamps) == 4
+    np.testing.assert_allclose(dataset.frame(1).depth.pixels, depth_units(2) / 5000.0, rtol=1e-6)
+    assert dataset.notes == (
+        "1 of 4 depth images are the one before again, byte for byte: they were not taken anew, and are left out",
+    )
+
+
+def test_a_long_row_of_the_same_image_is_a_camera_at_rest(tmp_path: Path) -> None:
+    paths = [tmp_path / f"{k}.png" for k in range(80)]
+    for k, path in enumerate(paths):
+        path.write_bytes(b"rest" if 10 <= k < 60 else b"a new one" if k == 70 else bytes([k // 2]))
+    again = repeated([*paths, tmp_path / "missing.png"])
+    assert np.flatnonzero(again[:10]).tolist() == [1, 3, 5, 7, 9] and not again[10:60].any()
+    assert np.flatnonzero(again[60:]).tolist() == [1, 3, 5, 7, 9, 13, 15, 17, 19]
+    assert repeated([]).shape == (0,)
 
 
 def test_grey_alpha_and_jpeg_colour_images_become_rgb(tmp_path: Path) -> None:

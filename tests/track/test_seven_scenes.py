@@ -74,12 +74,14 @@ def test_what_is_assumed_is_said(tmp_path: Path) -> None:
     root = tmp_path / "s"
     root.mkdir()
     for k in range(2):
-        cv2.imwrite(str(root / f"frame-{k:06d}.color.png"), np.zeros((480, 640, 3), np.uint8))
-        cv2.imwrite(str(root / f"frame-{k:06d}.depth.png"), np.zeros((480, 640), np.uint16))
+        cv2.imwrite(str(root / f"frame-{k:06d}.color.png"), np.full((480, 640, 3), k, np.uint8))
+        cv2.imwrite(str(root / f"frame-{k:06d}.depth.png"), np.full((480, 640), k, np.uint16))
     dataset = open_dataset(root)
-    camera = dataset.rig.depth_camera
-    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (585.0, 585.0, 320.0, 240.0)
-    assert camera == dataset.rig.color_camera and dataset.rig.depth_shutter.readout_s == 0.0
+    depth, color = dataset.rig.depth_camera, dataset.rig.color_camera
+    assert (depth.fx, depth.fy, depth.cx, depth.cy) == (585.0, 585.0, 320.0, 240.0)
+    assert (color.fx, color.fy, color.cx, color.cy) == (525.0, 525.0, 320.0, 240.0)
+    assert 0.02 < np.linalg.norm(dataset.rig.T_color_depth[:3, 3]) < 0.03
+    assert dataset.rig.depth_shutter.readout_s == dataset.rig.color_shutter.readout_s == 0.0
     assert dataset.truth_poses is None
     text = describe(dataset)
     assert "note     frames are taken to be 1/30 s apart" in text and "fx 585" in text.split("note")[2]
@@ -93,6 +95,37 @@ def test_poses_that_are_not_finite_are_no_truth(tmp_path: Path) -> None:
     assert dataset.truth_poses is not None
     np.testing.assert_allclose(dataset.truth_poses.stamps, np.array([0, 1, 3]) / 30.0)
     assert "1 of 4 pose files hold no finite pose" in dataset.notes[-1]
+
+
+def test_numbers_at_which_nothing_is_new_take_no_time(tmp_path: Path) -> None:
+    root = make(tmp_path / "s")
+    repeat(root, "depth", 2)
+    repeat(root, "color", 1)  # its images arrive a little earlier
+    dataset = open_dataset(root)
+    np.testing.assert_allclose(dataset.stamps, np.array([0, 1, 2, 3]) / 30.0)
+    np.testing.assert_allclose(dataset.color_stamps, np.array([0, 1, 2, 3]) / 30.0)
+    assert dataset.truth_poses is not None and dataset.timing is not None
+    np.testing.assert_allclose(dataset.truth_poses.stamps, dataset.stamps)
+    np.testing.assert_allclose(dataset.truth_poses.T_world_cam[2], pose(3), atol=1e-12)
+    np.testing.assert_allclose(dataset.timing.depth.listed, np.array([0, 1, 3, 4]) / 30.0)
+    np.testing.assert_array_equal(dataset.frame(2).colors[0].pixels, pixels(3))
+    assert any("1 of 5 depth images are the one before again" in note for note in dataset.notes)
+
+
+def test_a_slower_camera_repeats_without_the_other_and_numbers_are_times(tmp_path: Path) -> None:
+    root = make(tmp_path / "s")
+    for k in (1, 3):
+        repeat(root, "depth", k)
+    dataset = open_dataset(root)
+    np.testing.assert_allclose(dataset.stamps, np.array([0, 2, 4]) / 30.0)
+    np.testing.assert_allclose(dataset.color_stamps, np.arange(5) / 30.0)
+    assert sum(len(group) for group in dataset.groups) == 5
+
+
+def repeat(root: Path, kind: str, k: int) -> None:
+    """Frame k's image is the one before."""
+    before = root / f"frame-{k - 1:06d}.{kind}.png"
+    (root / f"frame-{k:06d}.{kind}.png").write_bytes(before.read_bytes())
 
 
 def test_listings_say_more_and_go_first(tmp_path: Path) -> None:
