@@ -14,14 +14,20 @@ import numpy.typing as npt
 
 from rsgen.array_types import FloatArray
 from rsgen.geometry import so3
-from rsgen.geometry.so3 import coefficient, cross, exp_coefficients, hat
+from rsgen.geometry.so3 import coefficients, cross, exp_coefficients, hat
 
-# Power series of c1..c4 in theta^2; see so3.coefficient for where they replace the closed forms.
-_TERMS = range(11)
-_C1_SERIES = tuple((-1.0) ** (k + 1) * (k - 1) / math.factorial(2 * k + 2) for k in _TERMS)
-_C2_SERIES = tuple((-1.0) ** (k + 1) * (k - 1) / math.factorial(2 * k + 3) for k in _TERMS)
-_C3_SERIES = tuple((-1.0) ** k * (k + 1) / math.factorial(2 * k + 4) for k in _TERMS)
-_C4_SERIES = tuple((-1.0) ** k * (k + 1) / math.factorial(2 * k + 5) for k in _TERMS)
+# Power series of c1..c4 in theta^2; see so3.coefficients for where they replace the closed forms.
+_C_SERIES = np.array(
+    [
+        [
+            (-1.0) ** (k + 1) * (k - 1) / math.factorial(2 * k + 2),
+            (-1.0) ** (k + 1) * (k - 1) / math.factorial(2 * k + 3),
+            (-1.0) ** k * (k + 1) / math.factorial(2 * k + 4),
+            (-1.0) ** k * (k + 1) / math.factorial(2 * k + 5),
+        ]
+        for k in range(11)
+    ]
+)
 
 
 def exp(xi: npt.ArrayLike) -> FloatArray:
@@ -148,14 +154,20 @@ def _upper_blocks(diagonal: FloatArray, corner: FloatArray) -> FloatArray:
 def _jacobian_corner(xi: FloatArray) -> FloatArray:
     """Top-right block Q (..., 3, 3) of the left Jacobian: Σ c_k times the top-right blocks of ad^k."""
     theta2 = so3.squared_norm(xi[..., 3:])
-    c1 = coefficient(theta2, _C1_SERIES, lambda x: (4.0 - x * np.sin(x) - 4.0 * np.cos(x)) / (2.0 * x**2))
-    c2 = coefficient(theta2, _C2_SERIES, lambda x: (4.0 * x - 5.0 * np.sin(x) + x * np.cos(x)) / (2.0 * x**3))
-    c3 = coefficient(theta2, _C3_SERIES, lambda x: (2.0 - x * np.sin(x) - 2.0 * np.cos(x)) / (2.0 * x**4))
-    c4 = coefficient(theta2, _C4_SERIES, lambda x: (2.0 * x - 3.0 * np.sin(x) + x * np.cos(x)) / (2.0 * x**5))
+    c = coefficients(theta2, _C_SERIES, _corner_coefficients)[..., None, None, :]
     rho_hat, phi_hat, phi_hat2 = hat(xi[..., :3]), hat(xi[..., 3:]), so3.hat_squared(xi[..., 3:])
     # ad^(k+1) = ad ad^k: corner_(k+1) = phi^ corner_k + rho^ phi^^k, and phi^³ = −θ² phi^.
     corner2 = phi_hat @ rho_hat + rho_hat @ phi_hat
     corner3 = phi_hat @ corner2 + rho_hat @ phi_hat2
     corner4 = phi_hat @ corner3 - theta2[..., None, None] * (rho_hat @ phi_hat)
-    scale = (c[..., None, None] for c in (c1, c2, c3, c4))
-    return np.asarray(sum(s * corner for s, corner in zip(scale, (rho_hat, corner2, corner3, corner4), strict=True)))
+    return np.asarray(c[..., 0] * rho_hat + c[..., 1] * corner2 + c[..., 2] * corner3 + c[..., 3] * corner4)
+
+
+def _corner_coefficients(x: FloatArray) -> tuple[FloatArray, ...]:
+    sin, cos = np.sin(x), np.cos(x)
+    return (
+        (4.0 - x * sin - 4.0 * cos) / (2.0 * x**2),
+        (4.0 * x - 5.0 * sin + x * cos) / (2.0 * x**3),
+        (2.0 - x * sin - 2.0 * cos) / (2.0 * x**4),
+        (2.0 * x - 3.0 * sin + x * cos) / (2.0 * x**5),
+    )

@@ -8,7 +8,7 @@ Formulas after Barfoot, "State Estimation for Robotics", 2017, section 7.1.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -20,29 +20,31 @@ from rsgen.array_types import FloatArray
 # theta**2, cut off under 1e-17, is the more exact form; above it the closed form loses two digits at most.
 _SERIES_BELOW = 1.0
 
-# sum_k (-1)^k theta^2k / (2k + 3)!  =  (theta - sin theta) / theta^3
-_C_SERIES = tuple((-1.0) ** k / math.factorial(2 * k + 3) for k in range(9))
+# sin θ / θ, (1 − cos θ) / θ² and (θ − sin θ) / θ³: sum_k (−1)^k θ^2k / (2k + 1)!, … / (2k + 2)!, … / (2k + 3)!
+_EXP_SERIES = np.array([[(-1.0) ** k / math.factorial(2 * k + n) for n in (1, 2, 3)] for k in range(10)])
 # sum_n |B_2n| theta^(2n - 2) / (2n)!  =  (1 - theta/2 cot theta/2) / theta^2;  |B_2n| / (2n)! = 2 zeta(2n) / (2 pi)^2n
-_D_SERIES = tuple(2.0 * float(zeta(2 * n)) / (2.0 * math.pi) ** (2 * n) for n in range(1, 12))
+_D_SERIES = np.array([[2.0 * float(zeta(2 * n)) / (2.0 * math.pi) ** (2 * n)] for n in range(1, 12)])
 
 
-def coefficient(
-    theta2: FloatArray, series: tuple[float, ...], closed_form: Callable[[FloatArray], FloatArray]
+def coefficients(
+    theta2: FloatArray, series: FloatArray, closed_forms: Callable[[FloatArray], Sequence[FloatArray]]
 ) -> FloatArray:
-    """An even function of angles given as theta2 = theta^2 (...,).
+    """Even functions (..., k) of angles given as theta2 = theta² (...,).
 
-    Below one radian its power series in theta2, lowest order first, is used; above, `closed_form(theta)`.
+    Below one radian their power series (n, k) in theta2, lowest order first, are used; above, `closed_forms(theta)`.
     """
-    clipped = np.minimum(theta2, _SERIES_BELOW**2)
-    value = np.full_like(theta2, series[-1])
-    for factor in reversed(series[:-1]):
-        value = value * clipped + factor
+    value = powers(np.minimum(theta2, _SERIES_BELOW**2), len(series)) @ series
     large = theta2 > _SERIES_BELOW**2
     if np.any(large):
-        # Boolean indexing needs an array: 0-d inputs give NumPy scalars above.
-        value = np.asarray(value)
-        value[large] = closed_form(np.sqrt(theta2[large]))
+        value[large] = np.stack(closed_forms(np.sqrt(np.asarray(theta2)[large])), axis=-1)
     return np.asarray(value)
+
+
+def powers(x: FloatArray, n: int) -> FloatArray:
+    """1, x, x², ... (..., n) of numbers (...,)."""
+    out = np.empty((*x.shape, n))
+    out[..., 0], out[..., 1:] = 1.0, x[..., None]
+    return np.asarray(np.multiply.accumulate(out, axis=-1, out=out))
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -62,11 +64,11 @@ def squared_norm(v: FloatArray) -> FloatArray:
 
 def exp_coefficients(theta2: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """sin θ / θ, (1 − cos θ) / θ² and (θ − sin θ) / θ³ of squared angles (...,)."""
-    half = np.sqrt(theta2) * (0.5 / np.pi)
-    a = np.sinc(2.0 * half)
-    b = 0.5 * np.sinc(half) ** 2  # 2 sin²(θ/2) / θ²: free of cancellation
-    c = coefficient(theta2, _C_SERIES, lambda x: (x - np.sin(x)) / x**3)
-    return np.asarray(a), np.asarray(b), c
+    # 2 sin²(θ/2) is 1 − cos θ free of cancellation.
+    found = coefficients(
+        theta2, _EXP_SERIES, lambda x: (np.sin(x) / x, 2.0 * (np.sin(0.5 * x) / x) ** 2, (x - np.sin(x)) / x**3)
+    )
+    return found[..., 0], found[..., 1], found[..., 2]
 
 
 def hat(v: npt.ArrayLike) -> FloatArray:
@@ -138,8 +140,8 @@ def left_jacobian(phi: npt.ArrayLike) -> FloatArray:
 def left_jacobian_inv(phi: npt.ArrayLike) -> FloatArray:
     """Inverse left Jacobians (..., 3, 3) of rotation vectors (..., 3), |phi| < 2π."""
     phi = np.asarray(phi, dtype=np.float64)
-    d = coefficient(squared_norm(phi), _D_SERIES, lambda x: (1.0 - 0.5 * x / np.tan(0.5 * x)) / (x * x))
-    return polynomial(phi, -0.5, d)
+    d = coefficients(squared_norm(phi), _D_SERIES, lambda x: [(1.0 - 0.5 * x / np.tan(0.5 * x)) / (x * x)])
+    return polynomial(phi, -0.5, d[..., 0])
 
 
 def right_jacobian(phi: npt.ArrayLike) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,7 +16,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import BlockSums, Scaling, block_counts
 from rstrack.alignment.brightness import SAME, Eliminated, eliminate
 from rstrack.alignment.independence import inflation
-from rstrack.alignment.normal_equations import Quadratic, chain
+from rstrack.alignment.normal_equations import Quadratic, Slopes, chain
 from rstrack.alignment.residuals import (
     GeometricInput,
     PhotometricInput,
@@ -75,6 +76,11 @@ class Linearised:
         return float((focal * (np.abs(twist[:, :3]).max(axis=1) / depth + np.abs(twist[:, 3:]).max(axis=1))).max())
 
 
+# A linearisation whose kernel runs: calling it waits for the sums and chains them. What does not need them is done
+# before, while the device works.
+Started = Callable[[], Linearised]
+
+
 @dataclass
 class Terms:
     """Kernels of one rig, compiled when first needed. rays: those of the depth camera, on the device."""
@@ -110,7 +116,7 @@ class Terms:
     def geometric(
         self, image: DepthImage, ref: Reference, spline: Spline, level: int, sigma: float,
         slopes_at: Spline | None = None,
-    ) -> Linearised:  # fmt: skip
+    ) -> Started:  # fmt: skip
         """Depth image against the reference's depth with the pixels of a level (`strides`), or `THINNED`.
 
         slopes_at: spline at which the lines' poses are differentiated by control points, if not `spline`: that changes
@@ -119,22 +125,25 @@ class Terms:
         with self.timer(f"geometric kernel, level {level}"):
             to_base = self._to_base(spline, ref.T_world_base, image.exposure)
             sums = self._geometric_sums(image, ref, to_base, self._seen_from(spline, ref), level, sigma)
-            _, _, per, ref_per = block_counts(image.exposure.lens, ref.lens)
-            times = image.exposure.block_times(per)
-            floor = self._floor_depth(image, ref)
-            return self._finish(sums, slopes_at or spline, ref, times, ref_per, sigma, floor, ref.median_depth)
+        slopes, floor = self._slopes(slopes_at or spline, image.exposure, ref), self._floor_depth(image, ref)
+
+        def finish() -> Linearised:
+            with self.timer(f"geometric kernel, level {level}"):
+                return self._finish(sums(), slopes, sigma, floor, ref.median_depth)
+
+        return finish
 
     def geometric_pose(
         self, image: DepthImage, ref: Reference, T_base_cam: FloatArray, level: int, sigma: float
     ) -> tuple[BlockSums, float]:
         """The same for a global-shutter image at one pose (4, 4) against a rectified reference: sums and next σ (m)."""
         to_base = self.e.upload(np.concatenate([T_base_cam[:3, :3].ravel(), T_base_cam[:3, 3]]))
-        sums = self._geometric_sums(image, ref, to_base, self.e.upload(IDENTITY_FROM_BASE), level, sigma)
+        sums = self._geometric_sums(image, ref, to_base, self.e.upload(IDENTITY_FROM_BASE), level, sigma)()
         return sums, scale_step(sigma, sums.weighted, sums.count, self._floor_depth(image, ref))
 
     def _geometric_sums(
         self, image: DepthImage, ref: Reference, to_base: Any, from_base: Any, level: int, sigma: float
-    ) -> BlockSums:
+    ) -> Callable[[], BlockSums]:
         e, lens = self.e, image.exposure.lens
         stride = _stride(lens, level)
         kernel = self._kernel(geometric_kernel, lens, ref.lens, stride)
@@ -147,11 +156,9 @@ class Terms:
         rough = min(1.0, larger - 1.0) if self.counts_rough else 0.0
         constants = e.upload(np.append(scaling.parameters(sigma, gate), [smooth, rough]))
         surface = ref.inverse_depth, ref.slope_x, ref.slope_y, ref.roughness
-        with self.timer(f"geometric kernel, level {level}"):
-            given = GeometricInput(image.z, *self.rays, to_base, *surface, from_base, constants)
-            raw = kernel(given).numpy()
+        raw = kernel(GeometricInput(image.z, *self.rays, to_base, *surface, from_base, constants))
         current, reference, _, _ = block_counts(lens, ref.lens)
-        return scaling.unpack(raw, current, reference)
+        return lambda: scaling.unpack(raw.numpy(), current, reference)
 
     def _floor_depth(self, image: DepthImage, ref: Reference) -> float:
         # A camera at rest repeats its rounding, so that depth would seem far better than it is.
@@ -168,7 +175,7 @@ class Terms:
         self, image: ColorImage, ref: Reference, spline: Spline, level: int, sigma: float,
         slopes_at: Spline | None = None, visible: Any = None, brightness: FloatArray = SAME,
         expected: FloatArray = SAME,
-    ) -> Linearised:  # fmt: skip
+    ) -> Started:  # fmt: skip
         """The reference's points of a level, those that are `visible`, against the colour image low-passed alike.
 
         brightness (2,): gain and offset of the image here; expected (2,): before anything is known of it.
@@ -184,14 +191,24 @@ class Terms:
             seen_at = self._ref_lines(spline, ref), image.levels[own_level], from_base
             shown = points.visible if visible is None else visible
             given = PhotometricInput(points.x, points.y, points.z, points.intensity, shown, *seen_at, constants)
-            raw = kernel(given).numpy()
-            current, reference, per, ref_per = block_counts(lens, ref.lens)
-            sums = scaling.unpack(raw, current, reference)
-            times = image.exposure.block_times(per)
-            return self._finish(
-                sums, slopes_at or spline, ref, times, ref_per, sigma, self.floor_intensity, points.median_depth,
-                brightness, expected,
-            )  # fmt: skip
+            raw = kernel(given)
+        slopes = self._slopes(slopes_at or spline, image.exposure, ref)
+
+        def finish() -> Linearised:
+            with self.timer(f"photometric kernel, level {level}"):
+                current, reference, _, _ = block_counts(lens, ref.lens)
+                sums = scaling.unpack(raw.numpy(), current, reference)
+                return self._finish(
+                    sums, slopes, sigma, self.floor_intensity, points.median_depth, brightness, expected
+                )
+
+        return finish
+
+    def _slopes(self, spline: Spline, exposure: Exposure, ref: Reference) -> Slopes:
+        with self.timer("poses of lines"):
+            _, _, per, ref_per = block_counts(exposure.lens, ref.lens)
+            ref_times = None if ref.rolling is None else ref.rolling.block_times(ref_per)
+            return Slopes.of(spline, ref.T_world_base, exposure.block_times(per), ref_times)
 
     def _to_base(self, spline: Spline, T_world_base: FloatArray, exposure: Exposure) -> Any:
         with self.timer("poses of lines"):
@@ -221,14 +238,12 @@ class Terms:
         return Scaling(units.median_depth, units.bound, min(pixels, slack * per_block))
 
     def _finish(
-        self, sums: BlockSums, spline: Spline, ref: Reference, times: FloatArray, ref_per: int, sigma: float,
-        floor: float, median_depth: float, brightness: FloatArray = SAME, expected: FloatArray = SAME,
+        self, sums: BlockSums, slopes: Slopes, sigma: float, floor: float, median_depth: float,
+        brightness: FloatArray = SAME, expected: FloatArray = SAME,
     ) -> Linearised:  # fmt: skip
-        ref_times = None if ref.rolling is None else ref.rolling.block_times(ref_per)
         with self.timer("linear algebra: chain"):
             own = sums.brightness
-            chained = chain(sums, spline, ref.T_world_base, times, ref_times, None if own is None else own.coupling)
-        model, motion, coupling = chained
+            model, coupling = chain(sums, slopes, None if own is None else own.coupling)
         model = Quadratic(model.first, model.H / sigma**2, model.g / sigma)
         cost, eliminated = sums.cost, None
         if own is not None:
@@ -238,7 +253,9 @@ class Terms:
         next_sigma = scale_step(sigma, sums.weighted, sums.count, floor)
         seen = seen_motions(sums, median_depth)
         counts = sums.count, sums.compared
-        return Linearised(model, motion, sigma, next_sigma, cost, *counts, floor, seen, inflation(sums), eliminated)
+        return Linearised(
+            model, slopes.current, sigma, next_sigma, cost, *counts, floor, seen, inflation(sums), eliminated
+        )
 
 
 def _stride(lens: Lens, level: int) -> int:

@@ -59,35 +59,46 @@ def _line_jacobian(spline: Spline, T_world_base: bytes, times: bytes, first: int
     return out.reshape(len(at), 6, 6 * count)
 
 
-def chain(
-    sums: BlockSums, spline: Spline, T_world_base: FloatArray, times: FloatArray, ref_times: FloatArray | None,
-    coupling: FloatArray | None = None,
-) -> tuple[Quadratic, FloatArray, FloatArray]:  # fmt: skip
-    """`sums` of blocks at `times` (n,) by the control points (of blocks of a rolling reference at `ref_times` too).
+@dataclass(frozen=True)
+class Slopes:
+    """η of an image's blocks of lines and of a rolling reference's, by control points from `first` on: (n, 6, 6k)."""
 
-    coupling (nc, nr, 6, m): of the blocks' twists with unknowns of the image. Returns the quadratic model, the
-    derivative (n, 6, 6k) of the current blocks' twists, and the coupling (6k, m) of the control points.
+    first: int
+    current: FloatArray
+    reference: FloatArray | None
+
+    @classmethod
+    def of(cls, spline: Spline, T_world_base: FloatArray, times: FloatArray, ref_times: FloatArray | None) -> Slopes:
+        """Blocks at `times` (n,) and, of a rolling reference, at `ref_times`."""
+        every = times if ref_times is None else np.concatenate([times, ref_times])
+        segments, _ = spline.locate(every)
+        first, count = int(segments.min()), int(segments.max() - segments.min()) + 4
+        current = line_jacobian(spline, T_world_base, times, first, count)
+        reference = None if ref_times is None else line_jacobian(spline, T_world_base, ref_times, first, count)
+        return cls(first, current, reference)
+
+
+def chain(sums: BlockSums, slopes: Slopes, coupling: FloatArray | None = None) -> tuple[Quadratic, FloatArray]:
+    """`sums` of blocks by the control points.
+
+    coupling (nc, nr, 6, m): of the blocks' twists with unknowns of the image. Returns the quadratic model and the
+    coupling (6k, m) of the control points.
     """
-    every = times if ref_times is None else np.concatenate([times, ref_times])
-    segments, _ = spline.locate(every)
-    first, count = int(segments.min()), int(segments.max() - segments.min()) + 4
-    current = line_jacobian(spline, T_world_base, times, first, count)
-    if ref_times is None:
-        J, H, g = current, sums.H[:, 0], sums.g[:, 0]
+    first, size = slopes.first, slopes.current.shape[-1]
+    if slopes.reference is None:
+        J, H, g = slopes.current, sums.H[:, 0], sums.g[:, 0]
     else:
         used = np.flatnonzero(np.abs(sums.H).sum(axis=(2, 3)).ravel())
-        c, r = np.divmod(used, len(ref_times))
-        J = current[c] - line_jacobian(spline, T_world_base, ref_times, first, count)[r]
+        c, r = np.divmod(used, len(slopes.reference))
+        J = slopes.current[c] - slopes.reference[r]
         H, g = sums.H[c, r], sums.g[c, r]
     HJ = H @ J
-    size = 6 * count
     flat = J.reshape(-1, size).T
     dense = flat @ HJ.reshape(-1, size)
     if coupling is None:
-        return Quadratic(first, 0.5 * (dense + dense.T), flat @ g.ravel()), current, np.zeros((size, 0))
-    blocks = coupling[:, 0] if ref_times is None else coupling[c, r]
-    of_points = flat @ blocks.reshape(-1, blocks.shape[-1])
-    return Quadratic(first, 0.5 * (dense + dense.T), flat @ g.ravel()), current, of_points
+        return Quadratic(first, 0.5 * (dense + dense.T), flat @ g.ravel()), np.zeros((size, 0))
+    blocks = coupling[:, 0] if slopes.reference is None else coupling[c, r]
+    return Quadratic(first, 0.5 * (dense + dense.T), flat @ g.ravel()), flat @ blocks.reshape(-1, blocks.shape[-1])
 
 
 def assemble(models: Iterable[Quadratic], first: int, last: int) -> tuple[FloatArray, FloatArray]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,7 +18,7 @@ from rstrack.images.pyramid import ColorImage, DepthImage
 from rstrack.keyframes.keyframe import THINNED, Reference
 
 # Increments of control points (m, rad) that change the derivatives of lines by less than a step's own error.
-_SAME_SLOPES = 5e-3
+_SAME_SLOPES = 2e-2
 # Change of gain and offset, in σ of the intensities, that calls for a new linearisation.
 _SAME = 0.2
 # Part of the pixels that count below which a quarter of them tells as much as all.
@@ -103,24 +104,33 @@ class Observation:
 
     def linearise(self, terms: Terms, state: SplineState, level: int) -> None:
         """Around the current state; takes the σ that the one before suggested."""
+        self.start(terms, state, level)()
+
+    def start(self, terms: Terms, state: SplineState, level: int) -> Callable[[], None]:
+        """The same in two steps: the device works until what this returns is called."""
         image, sigma, slopes_at = self.image, self.linearisation.sigma, self._slopes(state)
         is_finest = level == 0
         level = THINNED if is_finest and self.independent < THIN_BELOW else level
-        brightness = self.brightness(state)
+        brightness, moved = self.brightness(state), state.moved.copy()
         if isinstance(image, DepthImage):
-            lin = terms.geometric(image, self.ref, state.spline, level, sigma or START_DEPTH, slopes_at)
+            started = terms.geometric(image, self.ref, state.spline, level, sigma or START_DEPTH, slopes_at)
         else:
             if is_finest and self._visible is None and self.occluder is not None:
                 # Once: the coarse levels have brought the poses close enough to tell, and a fixed set converges.
                 self._visible = terms.visible(self.occluder, self.ref, state.spline, level)
             visible = self._visible if is_finest else None
             sigma = sigma or START_INTENSITY
-            lin = terms.photometric(
+            started = terms.photometric(
                 image, self.ref, state.spline, level, sigma, slopes_at, visible, brightness, self.expected
             )
         # A coarse level's pixels stand for those left out: the priors' share must not depend on the level.
         stands_for = 4.0 ** (1 if level == THINNED else level)
-        self.linearisation = _Linearisation(lin, lin.next_sigma, state.moved.copy(), stands_for, brightness)
+
+        def finish() -> None:
+            lin = started()
+            self.linearisation = _Linearisation(lin, lin.next_sigma, moved, stands_for, brightness)
+
+        return finish
 
     def brightness(self, state: SplineState) -> FloatArray:
         """Gain and offset (2,) of a colour image in the current state; at first those expected."""

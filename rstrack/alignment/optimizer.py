@@ -147,17 +147,12 @@ def _damped_step(H: FloatArray, g: FloatArray, damping: float, bandwidth: int) -
 
 def _linearise(terms: Terms, state: SplineState, problem: Problem, level: int) -> int:
     """Anew what has moved; returns how many that were."""
-    count = 0
     tolerance = RELINEARISE_PX * (1 + 4 * level) if level else _tolerance(problem)
-    for observation in problem.fresh:
-        if not observation.is_linearised or _has_moved(observation, state, problem.focal, tolerance):
-            observation.linearise(terms, state, level)
-            count += 1
-    for observation in problem.settled:
-        if level == 0 and _has_moved(observation, state, problem.focal, tolerance):
-            observation.linearise(terms, state, 0)
-            count += 1
-    return count
+    fresh = [o for o in problem.fresh if not o.is_linearised or _has_moved(o, state, problem.focal, tolerance)]
+    settled = [o for o in problem.settled if level == 0 and _has_moved(o, state, problem.focal, tolerance)]
+    for finish in [o.start(terms, state, level) for o in (*fresh, *settled)]:
+        finish()
+    return len(fresh) + len(settled)
 
 
 def _has_moved(observation: Observation, state: SplineState, focal: float, tolerance: float) -> bool:

@@ -16,7 +16,7 @@ import numpy as np
 
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.alignment.linearise import Linearised
+from rstrack.alignment.linearise import Linearised, Started
 from rstrack.alignment.normal_equations import Quadratic
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Problem
@@ -53,7 +53,7 @@ class PoseTerms:
     def photometric(
         self, image: Any, ref: Any, spline: Spline, level: int, sigma: float, slopes_at: Spline, visible: Any = None,
         *_: Any,
-    ) -> Linearised:  # fmt: skip
+    ) -> Started:  # fmt: skip
         """The poses that the image saw."""
         self.calls.append((level, sigma))
         self.slopes.append(slopes_at)
@@ -70,9 +70,10 @@ class PoseTerms:
         cost = 0.5 * float((e**2).sum())
         self.costs.append(cost)
         model = Quadratic(first, H, np.einsum("nia,ni->a", rows, e))
-        return Linearised(
+        found = Linearised(
             model, motion, 1.0, self.next_sigma, cost, len(at), len(at), self.floor, np.eye(6), float("nan")
         )
+        return lambda: found
 
 
 def sighting(times: np.ndarray, T_world_body: np.ndarray) -> Observation:

@@ -42,8 +42,8 @@ class Setting:
     def term(self, spline: Spline, sigma: float, level: int = 0) -> Linearised:
         """The image against the reference."""
         if isinstance(self.image, DepthImage):
-            return self.terms.geometric(self.image, self.ref, spline, level, sigma)
-        return self.terms.photometric(self.image, self.ref, spline, level, sigma)
+            return self.terms.geometric(self.image, self.ref, spline, level, sigma)()
+        return self.terms.photometric(self.image, self.ref, spline, level, sigma)()
 
 
 def setting(

@@ -44,7 +44,7 @@ def test_gain_and_offset_of_an_image_are_found(gain: float, offset: float, ref_s
     for _ in range(5):
         # The prior is centred on the truth, so that it does not pull; the start is not.
         known = np.array([gain, offset])
-        lin = s.terms.photometric(image, s.ref, s.truth, 0, sigma, brightness=at, expected=known)
+        lin = s.terms.photometric(image, s.ref, s.truth, 0, sigma, brightness=at, expected=known)()
         assert lin.brightness is not None
         at, sigma = lin.brightness.best(np.zeros(len(lin.model.g))), lin.next_sigma
     # Interpolation of such small images leaves errors of 2e-4 in intensity, which the gain takes for contrast.

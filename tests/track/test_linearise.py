@@ -165,7 +165,7 @@ def test_geometric_pose_is_the_geometric_term_of_a_camera_at_rest(level: int) ->
     T_off = T_b @ se3.exp(np.array([1e-3, -2e-3, 1e-3, 2e-3, 1e-3, -1e-3]))
     sigma = 2e-3
     sums, next_sigma = terms.geometric_pose(seen, ref, se3.inverse(T_a) @ T_off, level, sigma)
-    whole = terms.geometric(seen, ref, still(T_off), level, sigma)
+    whole = terms.geometric(seen, ref, still(T_off), level, sigma)()
     assert (sums.count, sums.cost, next_sigma) == (whole.count, whole.cost, whole.next_sigma)
     together = np.tile(np.eye(6), (4, 1)) @ se3.adjoint(T_a)
     H, g = together.T @ whole.model.H @ together, together.T @ whole.model.g
@@ -277,7 +277,7 @@ def test_points_behind_what_a_depth_image_shows_are_hidden(share: float, shown: 
     occluder = replace(wall.image, z=ENGINE.upload(nearer))
     for level in (0, 1):
         visible = wall.terms.visible(occluder, color.ref, color.truth, level)
-        lin = wall.terms.photometric(color.image, color.ref, color.truth, level, 0.02, None, visible)
+        lin = wall.terms.photometric(color.image, color.ref, color.truth, level, 0.02, None, visible)()
         everything = color.term(color.truth, 0.02, level).count
         assert everything > 30
         assert lin.count == everything if shown else 0.3 * everything < lin.count < 0.7 * everything
@@ -288,7 +288,7 @@ def test_slopes_of_an_earlier_state_change_the_model_but_not_what_is_seen() -> N
     around = disturbed(s.truth, 5)
     assert isinstance(s.image, DepthImage)
     own, same, other = (
-        s.terms.geometric(s.image, s.ref, around, 0, 0.01, slopes_at) for slopes_at in (None, around, s.truth)
+        s.terms.geometric(s.image, s.ref, around, 0, 0.01, slopes_at)() for slopes_at in (None, around, s.truth)
     )
     np.testing.assert_array_equal(own.model.H, same.model.H)
     assert (own.cost, own.count, own.next_sigma) == (other.cost, other.count, other.next_sigma)
@@ -308,7 +308,7 @@ def test_observability_is_zero_where_a_motion_is_not_seen() -> None:
         (plane_before(truth.pose(0.25), (0.3, 0.2, 1.0)).cast, 0.0, 1e-5),  # rounding to fixed point
     ):
         ref = exact_reference(cast, truth, exposure(0.25, None))
-        lin = terms.geometric(depth_input(cast, truth, image), ref, truth, 0, 0.01)
+        lin = terms.geometric(depth_input(cast, truth, image), ref, truth, 0, 0.01)()
         assert lin.count > 400 and least <= abs(lin.observability) < most
 
 

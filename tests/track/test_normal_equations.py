@@ -11,6 +11,7 @@ from rsgen.geometry import se3
 from rstrack.alignment.block_sums import BlockSums
 from rstrack.alignment.normal_equations import (
     Quadratic,
+    Slopes,
     assemble,
     chain,
     line_jacobian,
@@ -52,10 +53,11 @@ def test_line_jacobian_is_the_derivative_of_the_twist_in_the_base_frame() -> Non
 def test_chain_equals_the_sum_over_blocks() -> None:
     rng, spline, T = np.random.default_rng(1), random_spline(4), se3.exp(np.full(6, 0.2))
     sums = random_sums(rng, len(TIMES), 1)
-    model, motion, coupling = chain(sums, spline, T, TIMES, None)
-    assert (model.first, model.last) == (0, 7) and motion.shape == (6, 6, 42) and coupling.shape == (42, 0)
+    slopes = Slopes.of(spline, T, TIMES, None)
+    model, coupling = chain(sums, slopes)
+    assert (model.first, model.last) == (0, 7) and slopes.current.shape == (6, 6, 42) and coupling.shape == (42, 0)
     J = line_jacobian(spline, T, TIMES, 0, 7)
-    np.testing.assert_array_equal(motion, J)
+    np.testing.assert_array_equal(slopes.current, J)
     H = sum(J[i].T @ sums.H[i, 0] @ J[i] for i in range(6))
     g = sum(J[i].T @ sums.g[i, 0] for i in range(6))
     np.testing.assert_allclose(model.H, H, atol=1e-11 * np.abs(H).max())
@@ -66,14 +68,14 @@ def test_chain_equals_the_sum_over_blocks() -> None:
 def test_the_coupling_is_chained_as_the_gradient_is() -> None:
     rng, spline, T = np.random.default_rng(3), random_spline(4), se3.exp(np.full(6, 0.2))
     sums, own = random_sums(rng, len(TIMES), 1), rng.normal(size=(len(TIMES), 1, 6, 3))
-    _, _, coupling = chain(sums, spline, T, TIMES, None, own)
+    _, coupling = chain(sums, Slopes.of(spline, T, TIMES, None), own)
     J = line_jacobian(spline, T, TIMES, 0, 7)
     np.testing.assert_allclose(coupling, sum(J[i].T @ own[i, 0] for i in range(6)), atol=1e-9)
 
 
 def test_chain_begins_at_the_first_control_point_that_is_touched() -> None:
     rng, spline = np.random.default_rng(1), random_spline(4)
-    model, _, _ = chain(random_sums(rng, 2, 1), spline, np.eye(4), TIMES[-2:], None)
+    model, _ = chain(random_sums(rng, 2, 1), Slopes.of(spline, np.eye(4), TIMES[-2:], None))
     assert (model.first, model.last, model.H.shape) == (2, 7, (30, 30))
 
 
@@ -84,10 +86,11 @@ def test_a_rolling_reference_moves_the_other_way() -> None:
     # Pairs of blocks that no pixel connects.
     for a, b in ((0, 2), (2, 1)):
         sums.H[a, b], sums.g[a, b] = 0.0, 0.0
-    model, motion, _ = chain(sums, spline, T, times, ref_times)
+    slopes = Slopes.of(spline, T, times, ref_times)
+    model, _ = chain(sums, slopes)
     assert (model.first, model.last) == (0, 7)
     J, K = line_jacobian(spline, T, times, 0, 7), line_jacobian(spline, T, ref_times, 0, 7)
-    np.testing.assert_array_equal(motion, J)
+    np.testing.assert_array_equal(slopes.current, J)
     H, g = np.zeros((42, 42)), np.zeros(42)
     for a in range(3):
         for b in range(3):

@@ -60,7 +60,7 @@ def test_a_step_that_raises_the_cost_is_taken_back_and_damped() -> None:
     assert (done.iterations, done.refused, done.evaluations) == (2, 1, 2)
     assert terms.costs[1] > terms.costs[0] and sight.lin.cost == terms.costs[0]
     # From where it was, with the diagonal raised by a thousandth.
-    model = PoseTerms(curvature=0.2).photometric(sight.image, None, Spline(before, 0.3, 0.05), 0, 1.0, start().spline)
+    model = PoseTerms(curvature=0.2).photometric(sight.image, None, Spline(before, 0.3, 0.05), 0, 1.0, start().spline)()
     H, g = assemble([model.model], 0, len(before))
     H[np.diag_indices_from(H)] *= 1.001
     want = solve(H, g).reshape(-1, 6)
@@ -206,9 +206,9 @@ def test_motions_that_nothing_tells_are_damped() -> None:
 def test_a_system_that_is_not_finite_is_refused(broken: str) -> None:
     class Broken(PoseTerms):
         def photometric(self, *given: Any) -> Any:
-            lin = super().photometric(*given)
+            lin = super().photometric(*given)()
             spoilt = np.full_like(getattr(lin.model, broken), np.nan)
-            return replace(lin, model=replace(lin.model, **{broken: spoilt}))
+            return lambda: replace(lin, model=replace(lin.model, **{broken: spoilt}))
 
     state = start()
     with pytest.raises(np.linalg.LinAlgError, match="no finite solution"):

@@ -24,7 +24,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.alignment import block_sums as block_sums_module
 from rstrack.alignment import residuals
 from rstrack.alignment.block_sums import BlockSums, Scaling, block_counts
-from rstrack.alignment.normal_equations import chain
+from rstrack.alignment.normal_equations import Slopes, chain
 from rstrack.alignment.student_t import LEAST_CURVATURE, NU, weight
 from rstrack.images import line_poses as lines
 from rstrack.images.line_poses import IDENTITY_FROM_BASE, to_base_table
@@ -197,9 +197,8 @@ def test_blocks_chained_to_control_points_equal_dense_pixel_jacobians(room: tupl
     as_input, ref, spline, z = room
     image = as_input(z)
     pixels = geometric_pixels(z, image, ref, spline, 0.01)
-    model, _, _ = chain(
-        pixels.blocks(image.exposure.lens.lines, 1), spline, ref.T_world_base, image.exposure.block_times(1), None
-    )
+    slopes = Slopes.of(spline, ref.T_world_base, image.exposure.block_times(1), None)
+    model, _ = chain(pixels.blocks(image.exposure.lens.lines, 1), slopes)
     # Each pixel's own time, not its line's.
     j, s, line = pixels.j[pixels.active], pixels.s[pixels.active], pixels.line[pixels.active]
     shutter = image.exposure.lens.shutter

@@ -100,7 +100,7 @@ def test_both_sides_of_the_photometric_term_are_low_passed_alike(
         color = color_image(ENGINE, seen_at, rgb, octaves)
         ref = maker(depth_camera).rectified(0, depth, (color,), spline, None)
         # With so large a σ the next one is the residuals' RMS.
-        rms[octaves] = [terms.photometric(color, ref, spline, level, 1.0).next_sigma for level in range(LEVELS)]
+        rms[octaves] = [terms.photometric(color, ref, spline, level, 1.0)().next_sigma for level in range(LEVELS)]
     assert rms[finer][0] < 1e-6
     for alike, as_they_are in zip(rms[finer][1:], rms[0][1:], strict=True):
         assert alike < max(1e-6, left * as_they_are)
