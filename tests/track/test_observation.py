@@ -68,11 +68,11 @@ def test_its_model_is_moved_along_with_the_state(state: SplineState) -> None:
     assert sight.change(state) == pytest.approx(really, rel=0.02)
 
 
-def test_slopes_are_kept_until_control_points_have_moved_by_five_millimetres(state: SplineState) -> None:
+def test_slopes_are_kept_until_control_points_have_moved_by_two_centimetres(state: SplineState) -> None:
     sight, terms = seen(), PoseTerms()
     sight.linearise(terms, state, 0)  # type: ignore[arg-type]
     there = state.spline
-    for step, is_kept in ((4e-3, True), (0.9e-3, True), (0.2e-3, False)):
+    for step, is_kept in ((16e-3, True), (3.6e-3, True), (0.8e-3, False)):
         state.apply(3, np.array([[0.0, step, 0.0, 0.0, 0.0, 0.0]]))
         sight.linearise(terms, state, 0)  # type: ignore[arg-type]
         assert (terms.slopes[-1] is there) == is_kept
