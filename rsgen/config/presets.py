@@ -7,10 +7,11 @@ from typing import Any, Literal, get_args
 Preset = Literal["kinect_v1"]
 
 # A Microsoft Kinect of 2010 under OpenNI, hand-held, as TUM's fr1 sequences have it. Colour: the benchmark's own
-# calibration (Sturm et al., IROS 2012). Infrared camera: focal length and centre as published by N. Burrus, its
-# projector 7.5 cm beside it, the colour camera 2.5 cm, between the two. Periods, grid, jitter and delays of stamps,
-# brightness and its steps as measured on fr1_rpy (docs/measured.md); readouts within the 15 to 30 ms that trials on it
-# allow. Lasting depth errors and tremor are assumed; with them its twin is about as hard to track.
+# calibration (Sturm et al., IROS 2012). Infrared camera: OpenNI's nominal lens, which seen through that colour lens has
+# the borders of fr1_rpy's registered depth to 10 px; its projector, of a wider field of view, is 7.5 cm beside it, the
+# colour camera 2.5 cm, between the two. Periods, grid, jitter and delays of stamps, brightness and its steps as
+# measured on fr1_rpy (docs/measured.md); readouts within the 15 to 30 ms that trials on it allow. Lasting depth errors
+# and tremor are assumed; with them its twin is about as hard to track.
 _KINECT_V1: dict[str, Any] = {
     "color": {
         "width": 640,
@@ -37,7 +38,7 @@ _KINECT_V1: dict[str, Any] = {
     "depth": {
         "width": 640,
         "height": 480,
-        "intrinsics": [594.2, 591.0, 339.3, 242.7],
+        "intrinsics": [575.8, 575.8, 319.5, 239.5],
         "rate_hz": 29.968,
         "readout_s": 0.030,
         "exposure_s": 0.010,
@@ -45,6 +46,7 @@ _KINECT_V1: dict[str, Any] = {
         "registered": True,
         "noise": {
             "model": "kinect",
+            "projector_width": 1.3,
             "edge_dropout": 0.0,
             "grazing_deg": [80.0, 87.0],
             "lateral_sigma_px": 0.2,

@@ -68,6 +68,9 @@ class DepthNoiseConfig(_Settings):
     projector_baseline_m: Annotated[float, limits(1e-4, 100, "m")] = Field(
         default=0.075, description="kinect: camera to projector along the camera's +x axis, m"
     )
+    projector_width: Annotated[float, limits(0.1, 10, "(factor)")] = Field(
+        default=1.0, description="kinect: width of the pattern, in widths of the camera's field of view"
+    )
     shadow: bool = Field(default=True, description="kinect: nothing where the projector's light does not reach")
     lateral_sigma_px: Pixels = Field(default=0.5, description="kinect: shift of the lookup in x and y, px RMS")
     disparity_sigma_px: Pixels = Field(default=1 / 48, description="kinect: noise of the disparity, px RMS")

@@ -89,7 +89,8 @@ class FrameSource:
         self._rays = depth.camera.unproject(depth.camera.pixel_grid()) if depth.registered else np.empty(0)
         self._truth = TruthRenderer(self.scene, integrator, color, config.truth) if config.truth.images else None
         lit = depth.noise.model == "kinect" and depth.noise.shadow
-        self._projector = Projector(self.scene, self._depth.sensor, depth.noise.projector_baseline_m) if lit else None
+        pattern = depth.noise.projector_baseline_m, depth.noise.projector_width
+        self._projector = Projector(self.scene, self._depth.sensor, *pattern) if lit else None
         self._T_depth_color = se3.inverse(np.asarray(config.T_color_depth, float))
 
     def expose_color(

@@ -22,8 +22,11 @@ _SHORT = 1e-4
 class Projector:
     """A pattern projector beside a depth camera, at (baseline, 0, 0) in its frame, moving with it line by line."""
 
-    def __init__(self, scene: Any, sensor: RollingShutterSensor, baseline_m: float) -> None:
-        """`sensor`: the depth camera's (`DepthRenderer.sensor`). A positive baseline casts shadows to objects' left."""
+    def __init__(self, scene: Any, sensor: RollingShutterSensor, baseline_m: float, width: float = 1.0) -> None:
+        """`sensor`: the depth camera's (`DepthRenderer.sensor`). A positive baseline casts shadows to objects' left.
+
+        width: of the pattern, in widths of the camera's field of view.
+        """
         self._scene = scene
         self._camera = sensor
         self._emitter = RollingShutterSensor(sensor.camera, sensor.shutter)
@@ -31,7 +34,7 @@ class Projector:
         self._T_camera_projector[0, 3] = baseline_m
         camera = sensor.camera
         edges = np.array([[-0.5, camera.cy], [camera.width - 0.5, camera.cy]])
-        self._left, self._right = camera.unproject(edges)[:, 0]
+        self._left, self._right = camera.unproject(edges)[:, 0] * width
         self._x = camera.unproject(camera.pixel_grid())[..., 0].astype(np.float32)
 
     def lights(self, z: Float32Array, T_world_cam: PoseFunction, stamp: float) -> BoolArray:
@@ -39,7 +42,7 @@ class Projector:
 
         `z` (h, w): its exact planar depth, m. The camera's sensor must still be exposed to that frame, of `stamp` (s)
         along `T_world_cam`; each line's projector is where the camera's motion takes it at that line's mid-exposure.
-        The pattern spans the camera's own field of view, moved by the baseline.
+        The pattern spans the camera's own field of view, or `width` times that, moved by the baseline.
         """
         self._emitter.expose(lambda t: T_world_cam(t) @ self._T_camera_projector, stamp)
         camera = self._camera.camera

@@ -294,6 +294,9 @@ def test_width_and_side_of_the_shadow(scene: Any) -> None:
     assert lit[row, board].all() and lit[row, board[-1] + 1 :].all()
     above = 2  # the wall above the board: no shadow
     assert z[above].min() > 2 and lit[above, int(strip) + 1 :].all()
+    # A pattern that is wider by that strip on either side reaches all of the wall, and the shadow stays.
+    wide = Projector(scene, renderer.sensor, BASELINE, 1.0 + 2.05 * strip / SMALL.width).lights(z, still, 0.0)
+    assert wide[above].all() and np.flatnonzero(~wide[row]).tolist() == shadow.tolist()
 
 
 @pytest.mark.parametrize("scan", SCANS)
