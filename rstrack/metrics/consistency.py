@@ -45,10 +45,13 @@ def step_nees(
     Ad = se3.adjoint(se3.inverse(step))
     turned = np.swapaxes(Ad, 1, 2)
     between = drift[j] - Ad @ drift[i] @ turned
-    weighted = np.linalg.solve(pose[j] + between + Ad @ pose[i] @ turned, error[..., None])[..., 0]
+    motion = pose[j] + between + Ad @ pose[i] @ turned
+    weighted = np.linalg.solve(motion, error[..., None])[..., 0]
     # Drift is given at mid readout, poses at stamps: what the camera moves by in between is no less drift.
     parts = [np.trace(c[:, at, at], axis1=1, axis2=2) for at in (slice(3), slice(3, 6)) for c in (between, drift[j])]
     is_more = (parts[0] >= -_SAME * parts[1]) & (parts[2] >= -_SAME * parts[3])
+    # Less in one direction, though not in all together, leaves no covariance either.
+    is_more &= np.linalg.eigvalsh(motion)[:, 0] > 0
     return np.where(is_more, np.einsum("ka,ka->k", error, weighted) / 6.0, np.nan)
 
 

@@ -99,6 +99,15 @@ def test_errors_of_a_chain_of_keyframes_are_as_large_as_their_covariances() -> N
     np.testing.assert_allclose(np.mean(found, axis=0), 1.0, atol=0.06)
 
 
+def test_motions_whose_drift_shrinks_in_one_direction_alone_are_left_out() -> None:
+    T, one, two = np.tile(np.eye(4), (2, 1, 1)), np.array([0]), np.array([1])
+    pose, drift = np.tile(1e-4 * np.eye(6), (2, 1, 1)), np.tile(1e-2 * np.eye(6), (2, 1, 1))
+    drift[1] = np.diag([3e-2, 3e-2, 1e-3, 3e-2, 3e-2, 3e-2])
+    assert np.isnan(step_nees(T, T, pose, drift, one, two)).all()
+    drift[1] = 3e-2 * np.eye(6)
+    assert step_nees(T, T, pose, drift, one, two).tolist() == [0.0]
+
+
 def test_covariances_are_read_from_a_runs_frames() -> None:
     C = np.arange(36.0).reshape(6, 6)
     C = C + C.T
