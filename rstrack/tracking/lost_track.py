@@ -20,7 +20,7 @@ _LEAST_SHARE = 0.08
 _LEAST_PIXELS = 60
 # Part of the compared pixels that must not be outliers for certain.
 _LEAST_FIT_DEPTH, _LEAST_FIT_COLOR = 0.5, 0.6
-# Scales that no aligned images have, and growth over the last frames' median that none shows (m at up to one metre,
+# Scales that no aligned images have, and growth over the last frames' median that none shows (m at one metre,
 # growing with the distance; intensity).
 _WORST_DEPTH, _WORST_INTENSITY = 0.03, 0.12
 _GROWTH, _HARMLESS_DEPTH, _HARMLESS_INTENSITY = 6.0, 2e-3, 0.03
@@ -30,17 +30,20 @@ _DECAY = 3.0
 _ROUNDING = 2.5
 # Lines that still move so far (pixels) have not been found.
 _WORST_SHIFT_PX = 2.0
-# Changes of velocity that no hand makes, m/s² and rad/s² (hand-held cameras reach 35 m/s²), and what is always allowed.
-_MOST_ACCELERATION = np.array([100.0, 200.0])
+# Changes of velocity that no hand makes, m/s² and rad/s² (hand-held cameras reach 35 m/s²), nor over a longer time, m/s
+# and rad/s, and what is always allowed.
+_MOST_ACCELERATION, _MOST_VELOCITY = np.array([100.0, 200.0]), np.array([4.0, 8.0])
 _ALWAYS = np.array([0.05, np.radians(4.0)])
 _MEMORY = 30
 # How far a frame's images, or one term alone, may pull (see `alignment.pull`): so many times the usual, and always so
-# many metres, at up to one metre's distance; and so many times the usual number of σ, and always so many. Further in
+# many metres, at one metre's distance; and so many times the usual number of σ, and always so many. Further in
 # both is too far. Usual is what a quarter of the last frames stays below, lest bad becomes usual; in the first frames
 # nothing is.
 _PULLS = "whole", "depth", "color"
 _PULL_WHOLE, _PULL_ALONE, _PULL_SIGMAS = (4.0, 5e-3), (7.0, 1e-2), (4.0, 5.0)
 _USUAL, _FEW = 0.25, 5
+# Frames from which on their median says what is best, and the distance (m) below which limits shrink no further.
+_SETTLED, _CLOSE = 15, 0.5
 
 
 @dataclass
@@ -55,13 +58,13 @@ class _Usual:
     def limit(self, floor: float, distance: float = 1.0) -> float:
         """Scale beyond which a frame does not fit. distance (m): of what is seen; the noise of depth grows with its
         square."""
-        worst = self.worst * max(1.0, distance)
+        worst = self.worst * max(_CLOSE, distance)
         usual = distance**2 * min(median(self.recent), _DECAY * self.best) if self.recent else worst
         return min(worst, max(self.harmless, _ROUNDING * floor, _GROWTH * usual))
 
     def learn(self, sigma: float, distance: float = 1.0) -> None:
         self.recent.append(sigma / distance**2)
-        if len(self.recent) == _MEMORY:
+        if len(self.recent) >= _SETTLED:
             self.best = min(self.best, median(self.recent))
 
 
@@ -90,7 +93,7 @@ class FitHistory:
         if misfits:
             return misfits[0][1]
         if pulls is not None:
-            distance = max(1.0, fresh[0].ref.median_depth)
+            distance = max(_CLOSE, fresh[0].ref.median_depth)
             torn = self._torn(pulls, distance)
             if torn:
                 return torn
@@ -103,7 +106,7 @@ class FitHistory:
         return ""
 
     def _torn(self, now: Pulls, distance: float) -> str:
-        """distance (m), 1 at least: of what is seen; where noise grows with its square, so do pulls."""
+        """distance (m), `_CLOSE` at least: of what is seen; where noise grows with its square, so do pulls."""
         if len(self._pulls) < _FEW:
             return ""
         far = [self._is_far(name, n, now, distance) for n, name in enumerate(_PULLS)]
@@ -151,4 +154,5 @@ def is_settled(solved: Solved) -> bool:
 def implausible(T_predicted: FloatArray, T_found: FloatArray, dt: float) -> bool:
     """Whether a pose (4, 4) is further from the one predicted (4, 4) dt seconds ahead than a hand could move it."""
     off = se3.log(se3.inverse(T_predicted) @ T_found)
-    return bool((np.linalg.norm(off.reshape(2, 3), axis=1) > _ALWAYS + _MOST_ACCELERATION * dt**2).any())
+    most = _ALWAYS + np.minimum(_MOST_ACCELERATION * dt**2, _MOST_VELOCITY * dt)
+    return bool((np.linalg.norm(off.reshape(2, 3), axis=1) > most).any())

@@ -46,6 +46,8 @@ _WIDEST = 2.0
 _LEAST_DEPTH = 0.02
 # Frames of a new piece that are aligned jointly: fewer do not tell its velocity.
 _YOUNG = 4
+# Frames in a row whose colours do not fit the keyframe's after which it is the keyframe's that are wrong.
+_COLORLESS = 5
 # Keyframes at which a lost frame is looked for, at once.
 _PLACES = 3
 
@@ -79,6 +81,8 @@ class Tracker:
         # Poses of the first of these: those before the current piece of the spline.
         self._settled: list[FloatArray] = []
         self._lost_in_a_row = 0
+        # Frames of the current piece of the spline, and frames in a row whose colours did not fit the keyframe's.
+        self._age, self._colorless = 0, 0
         self._last_fed: float | None = None
         self.spline_valid: list[tuple[float, float]] = []
         self.reports: list[FrameReport] = []
@@ -133,7 +137,7 @@ class Tracker:
     def _track(self, new: DeviceFrame, gap: float) -> FrameReport:
         window, ref = self._known()
         before = window.copy()
-        young = window.piece > 0 and len(self._recent) < _YOUNG
+        young = window.piece > 0 and self._age < _YOUNG
         window.predict(new, self.spline_valid[-1][1], young)
         on_reference = self._observe(new, ref)
         anchor = self._keyframes.anchor
@@ -170,6 +174,8 @@ class Tracker:
             term.learn(o.inflation for o in on_reference if o.is_depth != is_color)
         self._recent.append(new)
         self._placed(new, fresh)
+        is_colorless = bool(new.colors) and bool(ref.points) and all(o.is_depth for o in on_reference)
+        self._age, self._colorless = self._age + 1, self._colorless + 1 if is_colorless else 0
         overlap = self._overlap(on_reference)
         frozen = self._fuse_frozen(window)
         renewed = self._renew_keyframe(window, new, frozen, overlap)
@@ -178,11 +184,14 @@ class Tracker:
     def _without_misfits(
         self, fresh: list[Observation], on_reference: list[Observation], ref: Reference
     ) -> list[Observation]:
-        """What is left to align by if a frame's colour images do not fit but its depth does, or has none to show."""
+        """What is left to align by if a frame's colour images do not fit, or its depth has none to show.
+
+        Where depth does not fit either, the colours may be what drew it away.
+        """
         misfits = [o for o, _ in self._fits.misfits(on_reference, ref.pixels)]
         empty = [o for o in fresh if isinstance(o.image, DepthImage) and o.image.count == 0]
         odd_colors = [o for o in misfits if not o.is_depth]
-        if len(odd_colors) == len(misfits) and len(misfits) < len(on_reference):
+        if odd_colors and len(odd_colors) < len(on_reference) and not empty:
             return [o for o in fresh if all(o.image is not odd.image for odd in odd_colors)]
         if empty and len(misfits) == 1 and misfits[0].is_depth:
             return [o for o in fresh if not o.is_depth]
@@ -303,6 +312,10 @@ class Tracker:
             trial = window.restarted(new, end, candidate.T_world_base @ T_ref_cam)
             fresh = self._observe(new, candidate, _matched(new, candidate))
             solved = trial.solve(fresh, LEVELS, hopeless=self._fits.is_hopeless)
+            fitting = self._without_misfits(fresh, fresh, candidate)
+            if len(fitting) < len(fresh):
+                trial, fresh = window.restarted(new, end, candidate.T_world_base @ T_ref_cam), fitting
+                solved = trial.solve(fresh, LEVELS, hopeless=self._fits.is_hopeless)
             uncertainty = self._uncertainty.found_anew(information(fresh, trial.state))
             fault = self._fits.fault(fresh, solved, candidate.pixels, pulls(fresh, trial.state))
             if not fault and uncertainty.is_known:
@@ -325,6 +338,7 @@ class Tracker:
         self._window, self._reference = trial, ref
         self._keyframes.use(ref)
         self._pixels, self._unconverged, self._lost_in_a_row = 0, None, 0
+        self._age, self._colorless = 1, 0
         self._recent = deque([new])
         self._placed(new, fresh, joined=False)
         return self._report(new, fresh, solved, overlap=self._overlap(fresh))
@@ -351,7 +365,8 @@ class Tracker:
             return True
         _, ref = self._known()
         T_base_cam = se3.inverse(ref.T_world_base) @ window.spline.pose(new.depth.exposure.mid_time)
-        if frozen is None or frozen.index <= ref.index or not self.options.left_behind(T_base_cam, overlap):
+        is_behind = self.options.left_behind(T_base_cam, overlap) or self._colorless >= _COLORLESS
+        if frozen is None or frozen.index <= ref.index or not is_behind:
             return False
         if self.options.keyframe_strategy == "newest" and new.depth.exposure.lens.lines > 1:
             if not self._unfit(new):

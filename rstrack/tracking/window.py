@@ -18,9 +18,9 @@ from rstrack.keyframes.keyframe import Reference
 
 # Motion prior: standard deviation of accelerations, m/s² and rad/s². Hand-held cameras reach 35 m/s² (DESIGN section
 # 5), so it says little where there are data. The newest control points, whose weight in the newest lines is only u³/6,
-# are held a good deal tighter: small systematic errors of the lines would throw them about.
+# are held a good deal tighter: small systematic errors of the lines would throw them about. So are a piece's first.
 _ACCELERATION = np.array([5.0, 5.0, 5.0, 10.0, 10.0, 10.0])
-_NEWEST_TRIPLES, _NEWEST_FACTOR = 2, 0.1
+_END_TRIPLES, _END_FACTOR = 2, 0.1
 # And of velocities, m/s and rad/s, where a lost track begins anew: one frame's lines hardly tell.
 _VELOCITY = np.array([1.5, 1.5, 1.5, 3.0, 3.0, 3.0])
 # Metres and radians within which the reference's pose is held while its own control points are free.
@@ -113,7 +113,9 @@ class Window:
     def _motion_prior(self, free: tuple[int, int]) -> Prior:
         first, last = max(self.piece, free[0] - 2), free[1]
         sigma = np.repeat(_ACCELERATION[None] * self.state.dt**2, last - first - 2, axis=0)
-        sigma[-_NEWEST_TRIPLES:] *= _NEWEST_FACTOR
+        sigma[-_END_TRIPLES:] *= _END_FACTOR
+        if free[0] == self.piece:
+            sigma[: max(0, min(_END_TRIPLES, len(sigma) - _END_TRIPLES))] *= _END_FACTOR
         return lambda spline: acceleration_prior(spline, first, last, sigma)
 
     def _velocity_prior(self, free: tuple[int, int]) -> Prior:

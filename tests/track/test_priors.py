@@ -72,7 +72,7 @@ def test_pose_constraint_is_that_of_its_cost(size: float) -> None:
     assert (model.first, model.last) == (2, 6)
     J = numeric_jacobian(errors, 24)
     np.testing.assert_allclose(model.H, J.T @ J, atol=1e-6 * np.abs(J.T @ J).max())
-    np.testing.assert_allclose(model.g, J.T @ errors(np.zeros(24)), atol=1e-6 * max(size, 1e-9))
+    np.testing.assert_allclose(model.g, J.T @ errors(np.zeros(24)), atol=1e-6 * max(size, 1e-8))
 
 
 def test_a_tight_pose_constraint_is_met() -> None:
