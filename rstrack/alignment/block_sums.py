@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -56,6 +56,14 @@ class BlockSums:
     compared: int = 0
     brightness: BrightnessSums | None = None
 
+    def summed(self) -> BlockSums:
+        """The same of all current lines at once."""
+        own = self.brightness
+        if own is not None:
+            own = replace(own, coupling=own.coupling.sum(axis=0, keepdims=True))
+        H, g = self.H.sum(axis=0, keepdims=True), self.g.sum(axis=0, keepdims=True)
+        return replace(self, H=H, g=g, brightness=own)
+
 
 @dataclass(frozen=True)
 class Scaling:
@@ -98,15 +106,31 @@ class Scaling:
 
 
 def block_counts(lens: Lens, ref_lens: Lens) -> tuple[int, int, int, int]:
-    """Blocks of current lines and of reference lines (1 if rectified), and lines per block of each."""
+    """Blocks of current lines and of reference lines (1 if rectified), and lines per block of each.
+
+    Sums of an image whose lines are exposed at once are kept apart too: their scatter says how far its pixels are
+    independent (`BlockSums.summed` is what they come to).
+    """
     blocks = BLOCKS if ref_lens.lines == 1 else PAIR_BLOCKS
-    per, ref_per = max(1, lens.lines // blocks), max(1, ref_lens.lines // blocks)
-    return -(-lens.lines // per), -(-ref_lens.lines // ref_per), per, ref_per
+    lines = lens.camera.height if _is_global(lens, ref_lens) else lens.lines
+    per, ref_per = max(1, lines // blocks), max(1, ref_lens.lines // blocks)
+    return -(-lines // per), -(-ref_lens.lines // ref_per), per, ref_per
 
 
-def block_slot(line: Any, ref_line: Any, lens: Lens, ref_lens: Lens, with_brightness: bool = False) -> tuple[Any, int]:
-    """First integer of each pixel's block, or pair of blocks, and how many integers there are in all."""
+def _is_global(lens: Lens, ref_lens: Lens) -> bool:
+    return lens.lines == 1 and ref_lens.lines == 1
+
+
+def block_slot(
+    line: Any, ref_line: Any, lens: Lens, ref_lens: Lens, y: Any, with_brightness: bool = False
+) -> tuple[Any, int]:
+    """First integer of each pixel's block, or pair of blocks, and how many integers there are in all.
+
+    y: the pixel's own, which is its line where all are exposed at once.
+    """
     current, reference, per, ref_per = block_counts(lens, ref_lens)
+    if _is_global(lens, ref_lens):
+        line = type(line)(dr.clip(y, 0, lens.camera.height - 1))
     block = line // per if reference == 1 else line // per * reference + ref_line // ref_per
     slots = _SLOTS_WITH_BRIGHTNESS if with_brightness else _SLOTS
     return block * slots, current * reference * slots

@@ -138,7 +138,7 @@ class Terms:
     ) -> tuple[BlockSums, float]:
         """The same for a global-shutter image at one pose (4, 4) against a rectified reference: sums and next σ (m)."""
         to_base = self.e.upload(np.concatenate([T_base_cam[:3, :3].ravel(), T_base_cam[:3, 3]]))
-        sums = self._geometric_sums(image, ref, to_base, self.e.upload(IDENTITY_FROM_BASE), level, sigma)()
+        sums = self._geometric_sums(image, ref, to_base, self.e.upload(IDENTITY_FROM_BASE), level, sigma)().summed()
         return sums, scale_step(sigma, sums.weighted, sums.count, self._floor_depth(image, ref))
 
     def _geometric_sums(
@@ -241,6 +241,9 @@ class Terms:
         self, sums: BlockSums, slopes: Slopes, sigma: float, floor: float, median_depth: float,
         brightness: FloatArray = SAME, expected: FloatArray = SAME,
     ) -> Linearised:  # fmt: skip
+        scatter = inflation(sums)
+        if len(sums.H) > len(slopes.current):
+            sums = sums.summed()  # of lines that are exposed at once
         with self.timer("linear algebra: chain"):
             own = sums.brightness
             model, coupling = chain(sums, slopes, None if own is None else own.coupling)
@@ -253,9 +256,7 @@ class Terms:
         next_sigma = scale_step(sigma, sums.weighted, sums.count, floor)
         seen = seen_motions(sums, median_depth)
         counts = sums.count, sums.compared
-        return Linearised(
-            model, slopes.current, sigma, next_sigma, cost, *counts, floor, seen, inflation(sums), eliminated
-        )
+        return Linearised(model, slopes.current, sigma, next_sigma, cost, *counts, floor, seen, scatter, eliminated)
 
 
 def _stride(lens: Lens, level: int) -> int:

@@ -97,7 +97,7 @@ def geometric_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int) -> Call
         r = (1.0 - seen.z * value) * inv_m
         scale = -seen.z * inv_m
         g = seen.chain(scale * mx / ref.fx, scale * my / ref.fy, -value * inv_m)
-        slot, size = block_slot(line, seen.row, lens, ref_lens)
+        slot, size = block_slot(line, seen.row, lens, ref_lens, py)
         return accumulate(e, g, p, 1.0, r, active, parameters, slot, size, judged=rough <= limit)
 
     return kernel
@@ -162,7 +162,7 @@ def photometric_kernel(
             r, dx, dy = r * share, dx * share, dy * share
             columns = columns[0] * share, columns[1] * share
         g = seen.chain(dx, dy, 0.0)
-        slot, size = block_slot(seen.row, ref_line, lens, ref_lens, with_brightness=True)
+        slot, size = block_slot(seen.row, ref_line, lens, ref_lens, seen.y, with_brightness=True)
         # A twist of the camera moves the point the other way.
         return accumulate(e, g, p, -1.0, r, active, parameters, slot, size, columns)
 

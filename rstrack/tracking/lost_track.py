@@ -18,14 +18,16 @@ from rstrack.alignment.pull import Pulls
 # A term has to see this share of the reference's pixels, and so many at least, to say anything.
 _LEAST_SHARE = 0.08
 _LEAST_PIXELS = 60
-# Part of the compared pixels that must not be outliers for certain.
-_LEAST_FIT_DEPTH, _LEAST_FIT_COLOR = 0.5, 0.6
+# Part of the compared pixels that must not be outliers for certain (real recordings: 0.88 and 0.98 at least).
+_LEAST_FIT_DEPTH, _LEAST_FIT_COLOR = 0.65, 0.8
 # Scales that no aligned images have, and growth over the last frames' median that none shows (m at one metre,
 # growing with the distance; intensity).
 _WORST_DEPTH, _WORST_INTENSITY = 0.03, 0.12
 _GROWTH, _HARMLESS_DEPTH, _HARMLESS_INTENSITY = 6.0, 2e-3, 0.03
+# At coarse levels, before all is aligned, scales are up to 1.3 times these limits, and 2 to 50 where nothing fits.
+_HOPELESS = 2.0
 # What counts as usual grows no further than this over the best that was usual: bad must not become usual.
-_DECAY = 3.0
+_DECAY = 2.0
 # A camera at rest repeats its rounding: what counts as usual then says little. Multiple of the rounding that is fine.
 _ROUNDING = 2.5
 # Lines that still move so far (pixels) have not been found.
@@ -36,11 +38,10 @@ _MOST_ACCELERATION, _MOST_VELOCITY = np.array([100.0, 200.0]), np.array([4.0, 8.
 _ALWAYS = np.array([0.05, np.radians(4.0)])
 _MEMORY = 30
 # How far a frame's images, or one term alone, may pull (see `alignment.pull`): so many times the usual, and always so
-# many metres, at one metre's distance; and so many times the usual number of σ, and always so many. Further in
-# both is too far. Usual is what a quarter of the last frames stays below, lest bad becomes usual; in the first frames
-# nothing is.
+# many metres; and so many times the usual number of σ, and always so many. Further in both is too far. Usual is what a
+# quarter of the last frames stays below, lest bad becomes usual; in the first frames nothing is.
 _PULLS = "whole", "depth", "color"
-_PULL_WHOLE, _PULL_ALONE, _PULL_SIGMAS = (4.0, 5e-3), (7.0, 1e-2), (4.0, 5.0)
+_PULL_WHOLE, _PULL_ALONE, _PULL_SIGMAS = (4.0, 1.5e-2), (7.0, 2e-2), (4.0, 5.0)
 _USUAL, _FEW = 0.25, 5
 # Frames from which on their median says what is best, and the distance (m) below which limits shrink no further.
 _SETTLED, _CLOSE = 15, 0.5
@@ -123,11 +124,14 @@ class FitHistory:
         metres, known = np.quantile(usual, _USUAL, axis=0)
         (growth, always), (times, least) = _PULL_WHOLE if name == "whole" else _PULL_ALONE, _PULL_SIGMAS
         is_odd = sigmas > max(least, times * known)
-        return bool(is_odd and pull > max(always * distance, growth * distance**2 * metres))
+        return bool(is_odd and pull > max(always, growth * distance**2 * metres))
 
     def is_hopeless(self, fresh: Sequence[Observation]) -> bool:
-        """Whether no term of a frame, aligned at a coarse level, fits a part of its pixels that a finer one could."""
-        return not any(o.is_linearised and o.lin.fit >= _least_fit(o) for o in fresh)
+        """Whether no term of a frame, aligned at a coarse level, fits so far that it could at a finer one."""
+        return not any(
+            o.is_linearised and o.lin.fit >= _least_fit(o) and o.lin.next_sigma <= _HOPELESS * self._limit(o)
+            for o in fresh
+        )
 
     def _misfit(self, o: Observation, expected: int) -> str:
         name = "depth" if o.is_depth else "colour"
@@ -135,11 +139,11 @@ class FitHistory:
             return f"hardly a pixel of the {name} image falls on the keyframe"
         if o.lin.fit < _least_fit(o):
             return f"the {name} image shows something else"
+        return f"the {name} image does not fit" if o.lin.next_sigma > self._limit(o) else ""
+
+    def _limit(self, o: Observation) -> float:
         floor = o.lin.floor
-        limit = self._depth.limit(floor, o.ref.median_depth) if o.is_depth else self._color.limit(floor)
-        if o.lin.next_sigma > limit:
-            return f"the {name} image does not fit"
-        return ""
+        return self._depth.limit(floor, o.ref.median_depth) if o.is_depth else self._color.limit(floor)
 
 
 def _least_fit(o: Observation) -> float:

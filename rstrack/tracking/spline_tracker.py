@@ -26,14 +26,13 @@ from rstrack.alignment.optimizer import Solved
 from rstrack.alignment.pull import pulls
 from rstrack.data.rig import Frame, Rig
 from rstrack.images.device_frame import DeviceFrame, DeviceRig, Timer, untimed
-from rstrack.images.pyramid import DepthImage
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.keyframes.store import KeyframeStore
 from rstrack.options import Options
-from rstrack.tracking import coarse_search
 from rstrack.tracking.frame_report import FrameReport, frame_report
 from rstrack.tracking.lost_track import FitHistory, implausible, is_settled
+from rstrack.tracking.relocalise import Relocaliser, without_misfits
 from rstrack.tracking.uncertainty import Uncertainty, information
 from rstrack.tracking.window import LEVELS, TRACKING_LEVELS, Window
 
@@ -48,8 +47,6 @@ _LEAST_DEPTH = 0.02
 _YOUNG = 4
 # Frames in a row whose colours do not fit the keyframe's after which it is the keyframe's that are wrong.
 _COLORLESS = 5
-# Keyframes at which a lost frame is looked for, at once.
-_PLACES = 3
 
 
 class Tracker:
@@ -80,7 +77,7 @@ class Tracker:
         self._stamps: list[float] = []
         # Poses of the first of these: those before the current piece of the spline.
         self._settled: list[FloatArray] = []
-        self._lost_in_a_row = 0
+        self._relocaliser = Relocaliser(rig, self.options, self._keyframes, self._fits, self._observe)
         # Frames of the current piece of the spline, and frames in a row whose colours did not fit the keyframe's.
         self._age, self._colorless = 0, 0
         self._last_fed: float | None = None
@@ -151,17 +148,18 @@ class Tracker:
         if not is_settled(solved) and not self._fits.is_hopeless(fresh):
             # Its steps went to and fro; that says nothing against the place.
             solved = window.solve(fresh, (0,), gauge, coupled)
-        fitting = self._without_misfits(fresh, on_reference, ref)
-        if len(fitting) < len(fresh):
+        fitting = without_misfits(self._fits, fresh, on_reference, ref)
+        if len(fitting) < len(fresh) and not self._fits.is_hopeless(on_reference):
             window = before.copy()
             window.predict(new, self.spline_valid[-1][1], young)
             fresh, on_reference = fitting, [o for o in fitting if o.ref is ref]
             solved = window.solve(fresh, levels, gauge, coupled)
         with self._terms.timer("judgement"):
-            fault = self._fits.fault(on_reference, solved, ref.pixels, pulls(on_reference, window.state))
+            pulled = pulls(on_reference, window.state)
+            fault = self._fits.fault(on_reference, solved, ref.pixels, pulled)
             if ref.rolling is None:
                 # A rolling reference moves with what is aligned to it, which tells nothing of the two together.
-                seen = information(on_reference, window.state)
+                seen = information(on_reference, window.state) / pulled.excess**2
                 uncertainty = self._uncertainty.after(new.stamp - self._stamps[-1], seen)
             else:
                 uncertainty = self._uncertainty
@@ -181,22 +179,6 @@ class Tracker:
         renewed = self._renew_keyframe(window, new, frozen, overlap)
         return self._report(new, on_reference, solved, keyframe=renewed, overlap=overlap)
 
-    def _without_misfits(
-        self, fresh: list[Observation], on_reference: list[Observation], ref: Reference
-    ) -> list[Observation]:
-        """What is left to align by if a frame's colour images do not fit, or its depth has none to show.
-
-        Where depth does not fit either, the colours may be what drew it away.
-        """
-        misfits = [o for o, _ in self._fits.misfits(on_reference, ref.pixels)]
-        empty = [o for o in fresh if isinstance(o.image, DepthImage) and o.image.count == 0]
-        odd_colors = [o for o in misfits if not o.is_depth]
-        if odd_colors and len(odd_colors) < len(on_reference) and not empty:
-            return [o for o in fresh if all(o.image is not odd.image for odd in odd_colors)]
-        if empty and len(misfits) == 1 and misfits[0].is_depth:
-            return [o for o in fresh if not o.is_depth]
-        return fresh
-
     # -- start and restart ------------------------------------------------------------------------------------------
 
     def _start(self, new: DeviceFrame) -> FrameReport:
@@ -209,6 +191,7 @@ class Tracker:
             self._reference = self._maker.rolling(new.index, new.depth, new.colors, self._window.spline)
         else:
             self._new_keyframe(new, None)
+            self._uncertainty = Uncertainty.of_first()
         self._placed(new)
         return self._report(new, keyframe=True)
 
@@ -289,59 +272,25 @@ class Tracker:
             self.reports[frame.index] = self._with_covariance(self.reports[frame.index], frame)
 
     def _relocalise(self, new: DeviceFrame) -> FrameReport:
-        """Find a frame's place: where the track ended, or at any keyframe ever made that looks like it.
-
-        Small images are aligned to some of them, and the whole one from the best of these poses; others take their turn
-        with the next frame. What was reported before stays as it is.
-        """
+        """Find a frame again and go on with a new piece of the spline; what was reported before stays as it is."""
         window, ref = self._known()
-        end = self.spline_valid[-1][1]
-        newest = self._keyframes.newest if ref.rolling is not None else ref
-        skip = (self._lost_in_a_row // 2) * (_PLACES - 1)
-        places = [newest, *self._keyframes.candidates(new, skip, _PLACES - 1)]
-        T_ends = [window.spline.pose(end), *(place.T_world_base for place in places[1:])]
-        found = coarse_search.ranked(
-            coarse_search.small_frame(new, self.rig, self.options.geometric),
-            [(coarse_search.small_keyframe(ref), se3.inverse(ref.T_world_base) @ T)
-             for ref, T in zip(places, T_ends, strict=True)],
-        )  # fmt: skip
-        self._lost_in_a_row += 1
-        if found:
-            chosen, T_ref_cam = found[(self._lost_in_a_row - 1) % len(found)]
-            candidate = places[chosen]
-            trial = window.restarted(new, end, candidate.T_world_base @ T_ref_cam)
-            fresh = self._observe(new, candidate, _matched(new, candidate))
-            solved = trial.solve(fresh, LEVELS, hopeless=self._fits.is_hopeless)
-            fitting = self._without_misfits(fresh, fresh, candidate)
-            if len(fitting) < len(fresh):
-                trial, fresh = window.restarted(new, end, candidate.T_world_base @ T_ref_cam), fitting
-                solved = trial.solve(fresh, LEVELS, hopeless=self._fits.is_hopeless)
-            uncertainty = self._uncertainty.found_anew(information(fresh, trial.state))
-            fault = self._fits.fault(fresh, solved, candidate.pixels, pulls(fresh, trial.state))
-            if not fault and uncertainty.is_known:
-                self._uncertainty = uncertainty
-                return self._resume(new, trial, fresh, solved, candidate)
-        return self._report(new, lost=True)
-
-    def _resume(
-        self, new: DeviceFrame, trial: Window, fresh: list[Observation], solved: Solved, ref: Reference
-    ) -> FrameReport:
-        """Go on from a frame that was found again, with a new piece of the spline."""
-        window, _ = self._known()
+        found = self._relocaliser.find(new, window, ref, self.spline_valid[-1][1], self._uncertainty)
+        if found is None:
+            return self._report(new, lost=True)
         # The new piece may need control points of the last frames before: their poses are kept, not their spline.
         done = np.array(self._stamps[len(self._settled) :])
         self._settled += list(window.spline.pose(done)) if len(done) else []
         begin, end = self.spline_valid.pop()
-        if trial.state.untouched > begin:
-            self.spline_valid.append((begin, min(end, trial.state.untouched)))
-        trial.keep(fresh)
-        self._window, self._reference = trial, ref
-        self._keyframes.use(ref)
-        self._pixels, self._unconverged, self._lost_in_a_row = 0, None, 0
-        self._age, self._colorless = 1, 0
+        if found.window.state.untouched > begin:
+            self.spline_valid.append((begin, min(end, found.window.state.untouched)))
+        found.window.keep(found.fresh)
+        self._window, self._reference, self._uncertainty = found.window, found.ref, found.uncertainty
+        self._keyframes.use(found.ref)
+        self._relocaliser.forget()
+        self._pixels, self._unconverged, self._age, self._colorless = 0, None, 1, 0
         self._recent = deque([new])
-        self._placed(new, fresh, joined=False)
-        return self._report(new, fresh, solved, overlap=self._overlap(fresh))
+        self._placed(new, found.fresh, joined=False)
+        return self._report(new, found.fresh, found.solved, overlap=self._overlap(found.fresh))
 
     # -- keyframes --------------------------------------------------------------------------------------------------
 
@@ -478,7 +427,3 @@ def observe(
     """
     depth = [Observation(frame.index, frame.depth, ref)] if options.geometric else []
     return depth + [Observation(frame.index, c, ref, frame.depth, expected) for c in frame.colors if ref.points]
-
-
-def _matched(frame: DeviceFrame, ref: Reference) -> FloatArray:
-    return brightness.matched(frame.colors[0].moments, ref.moments) if frame.colors and ref.points else brightness.SAME

@@ -77,6 +77,11 @@ class Uncertainty:
         updated = predicted - predicted[:, :6] @ solved @ predicted[:6]
         return replace(self, state=0.5 * (updated + updated.T), seen=seen)
 
+    @classmethod
+    def of_first(cls) -> Uncertainty:
+        """Of the frame that the world is taken from, which may move."""
+        return cls(np.diag(np.concatenate([np.zeros(6), _VELOCITY]) ** 2))
+
     def found_anew(self, seen: FloatArray) -> Uncertainty:
         """Of a frame of which nothing is known but what its images (6, 6) say."""
         return replace(self, state=_lost()).after(0.0, seen)

@@ -348,6 +348,7 @@ def test_a_long_row_of_the_same_image_is_a_camera_at_rest(tmp_path: Path) -> Non
     again = repeated([*paths, tmp_path / "missing.png"])
     assert np.flatnonzero(again[:10]).tolist() == [1, 3, 5, 7, 9] and not again[10:60].any()
     assert np.flatnonzero(again[60:]).tolist() == [1, 3, 5, 7, 9, 13, 15, 17, 19]
+    assert not repeated(paths[20:24]).any()
     assert repeated([]).shape == (0,)
 
 

@@ -10,6 +10,7 @@ import synthetic
 from rstrack_util import (
     ENGINE,
     depth_input,
+    depth_of,
     disturbed,
     exact_reference,
     exposure,
@@ -28,7 +29,7 @@ from rstrack.alignment import block_sums, brightness
 from rstrack.alignment.block_sums import BlockSums
 from rstrack.alignment.linearise import Linearised, Terms, seen_motions, weakest_motion
 from rstrack.images import line_poses as lines
-from rstrack.images.pyramid import ColorImage, DepthImage
+from rstrack.images.pyramid import ColorImage, DepthImage, depth_image
 
 
 @pytest.fixture(autouse=True)
@@ -171,6 +172,22 @@ def test_geometric_pose_is_the_geometric_term_of_a_camera_at_rest(level: int) ->
     H, g = together.T @ whole.model.H @ together, together.T @ whole.model.g
     np.testing.assert_allclose(sums.H[0, 0] / sigma**2, H, rtol=1e-9, atol=1e-9 * np.abs(H).max())
     np.testing.assert_allclose(sums.g[0, 0] / sigma, g, rtol=1e-9, atol=1e-9 * np.abs(g).max())
+
+
+@pytest.mark.parametrize(("rows", "least", "most"), [(1, 0.3, 2.5), (8, 3.0, 40.0)])
+def test_errors_of_neighbouring_lines_are_seen_where_all_are_exposed_at_once_too(
+    rows: int, least: float, most: float
+) -> None:
+    camera = small_camera(width=160, height=120)
+    T, image = synthetic.make_spline(0.7).pose(0.0), exposure(0.02, None, camera)
+    z = depth_of(synthetic.cast, still(T), image)
+    ref = maker(camera).rectified(1, depth_image(ENGINE, image, z, 100.0), (), still(T), None)
+    # Errors that are the same over an eighth of an image's width, and over so many lines.
+    noise = np.random.default_rng(2).normal(0.0, 2e-3, (camera.height // rows, 160 if rows == 1 else 8))
+    noise = noise.repeat(rows, axis=0).repeat(camera.width // noise.shape[1], axis=1)
+    terms = Terms(ENGINE, maker(camera).device_rays)
+    lin = terms.geometric(depth_image(ENGINE, image, z + noise, 100.0), ref, still(T), 0, 2e-3)()
+    assert least < lin.inflation < most
 
 
 # -- gates, floors and what is left out -----------------------------------------------------------------------------

@@ -78,7 +78,7 @@ def test_every_term_needs_60_pixels_and_8_percent_of_what_is_expected(kind: str,
     assert fault(FitHistory(), [good, term(kind, 1e-3, least - 1)], expected=expected) == few(kind)
 
 
-@pytest.mark.parametrize(("kind", "least"), [("depth", 0.5), ("color", 0.6)])
+@pytest.mark.parametrize(("kind", "least"), [("depth", 0.65), ("color", 0.8)])
 def test_most_of_what_is_compared_has_to_fit(kind: str, least: float) -> None:
     assert fault(FitHistory(), [term(kind, 1e-3, fit=least)]) == ""
     assert fault(FitHistory(), [term(kind, 1e-3, fit=least - 0.001)]) == other(kind)
@@ -130,9 +130,9 @@ def test_the_usual_is_the_median_of_the_last_thirty_good_frames() -> None:
 
 
 def test_bad_does_not_become_usual() -> None:
-    # Each step is allowed by the one before; three times the best that was usual is as far as it goes.
+    # Each step is allowed by the one before; twice the best that was usual is as far as it goes.
     history = after("depth", [1e-3] * 30 + [2.5e-3] * 30 + [6e-3] * 40)
-    assert fault(history, [term("depth", 17e-3)]) == "" and fault(history, [term("depth", 19e-3)]) == odd("depth")
+    assert fault(history, [term("depth", 11.9e-3)]) == "" and fault(history, [term("depth", 12.1e-3)]) == odd("depth")
 
 
 def test_lost_frames_are_not_what_is_usual() -> None:
@@ -162,10 +162,10 @@ def test_all_misfits_are_named() -> None:
 @pytest.mark.parametrize(
     ("name", "usual", "limit", "says"),
     [
-        ("whole", 2e-3, 8e-3, "the images do not agree with the motion"),
-        ("whole", 1e-5, 5e-3, "the images do not agree with the motion"),
+        ("whole", 4e-3, 16e-3, "the images do not agree with the motion"),
+        ("whole", 1e-5, 15e-3, "the images do not agree with the motion"),
         ("depth", 3e-3, 21e-3, "depth and colour do not agree"),
-        ("color", 1e-4, 1e-2, "depth and colour do not agree"),
+        ("color", 1e-4, 2e-2, "depth and colour do not agree"),
     ],
 )
 def test_images_that_pull_much_more_than_usual_are_elsewhere(name: str, usual: float, limit: float, says: str) -> None:
@@ -184,10 +184,10 @@ def test_images_that_pull_much_more_than_usual_are_elsewhere(name: str, usual: f
 
 
 def pulled_before(frames: int = 10, sigmas: float = 1.0) -> FitHistory:
-    """The usual at one metre: a millimetre for the whole, three for depth and for colour alone."""
+    """The usual at one metre: three millimetres each."""
     made = FitHistory()
     for _ in range(frames):
-        assert fault(made, [term("depth", 1e-3)], pulled=Pulls(1e-3, 3e-3, 3e-3, (sigmas,) * 3)) == ""
+        assert fault(made, [term("depth", 1e-3)], pulled=Pulls(3e-3, 3e-3, 3e-3, (sigmas,) * 3)) == ""
     return made
 
 
@@ -201,14 +201,14 @@ def test_pulls_within_noise_or_as_far_from_it_as_usual_are_none(usual: float, li
 def test_pulls_of_what_is_far_away_may_be_larger() -> None:
     far = [term("depth", 1e-3, distance=3.0)]
     # Four times the usual at one metre, nine times that at three.
-    for metres, says in ((0.035, ""), (0.037, "the images do not agree with the motion")):
+    for metres, says in ((0.107, ""), (0.109, "the images do not agree with the motion")):
         assert fault(pulled_before(), far, pulled=Pulls(metres, 3e-3, 3e-3, (50.0,) * 3)) == says
     # It is learnt as it would be at one metre.
-    learnt, usual = pulled_before(), Pulls(2e-3, 3e-3, 3e-3, (1.0,) * 3)
+    learnt, usual = pulled_before(), Pulls(4e-3, 3e-3, 3e-3, (1.0,) * 3)
     for _ in range(30):
         assert fault(learnt, far, pulled=usual.scaled(9.0)) == ""
     for factor, says in ((3.9, ""), (4.1, "the images do not agree with the motion")):
-        pulled = Pulls(factor * 2e-3, 3e-3, 3e-3, (50.0,) * 3)
+        pulled = Pulls(factor * 4e-3, 3e-3, 3e-3, (50.0,) * 3)
         assert fault(learnt, [term("depth", 1e-3)], pulled=pulled) == says
 
 
@@ -226,10 +226,10 @@ def test_an_alignment_that_noise_ended_is_settled_however_far_its_last_step_went
 
 
 def test_a_coarse_level_is_hopeless_where_neither_term_fits() -> None:
-    bad, good = term("depth", 1e-3, fit=0.49), term("color", 1e-3, fit=0.61)
+    bad, good = term("depth", 1e-3, fit=0.64), term("color", 1e-3, fit=0.81)
     history = FitHistory()
     assert history.is_hopeless([bad]) and history.is_hopeless([]) and not history.is_hopeless([bad, good])
-    assert history.is_hopeless([bad, term("color", 1e-3, fit=0.59)])
+    assert history.is_hopeless([bad, term("color", 1e-3, fit=0.79)])
     assert history.is_hopeless([SimpleNamespace(is_linearised=False)])  # type: ignore[list-item]
 
 
@@ -239,3 +239,10 @@ def test_no_hand_moves_so_fast(axis: int, limit: float, share: float) -> None:
     dt = np.sqrt(1e-3)
     T = se3.exp(np.array([0.3, -0.2, 0.1, 0.5, 0.4, -0.3]))
     assert implausible(T, T @ se3.exp(share * limit * np.eye(6)[axis]), dt) == (share > 1.0)
+
+
+def test_a_coarse_level_is_hopeless_where_neither_term_is_near_its_limit() -> None:
+    history = after("depth", [1e-3] * 10)
+    near, far = term("depth", 11.9e-3), term("depth", 12.1e-3)
+    assert history.is_hopeless([far]) and not history.is_hopeless([near])
+    assert not history.is_hopeless([far, term("color", 0.1)]) and history.is_hopeless([far, term("color", 0.3)])

@@ -13,7 +13,7 @@ from rstrack_util import hand_held
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rstrack.alignment.observation import Observation
-from rstrack.alignment.pull import pulls
+from rstrack.alignment.pull import Pulls, pulls
 from rstrack.alignment.spline_state import SplineState
 
 TRUTH = hand_held(3)
@@ -100,3 +100,11 @@ def test_pulls_are_counted_in_sigmas_of_what_the_images_tell() -> None:
     found = pulls([sight((3e-3, 0, 0), kind=OfDepth), sight((-2e-3, 0, 0))], SplineState(TRUTH))
     one = 1e-3 / np.sqrt(len(TIMES))  # σ of nine lines, each known to 1 m and counted a million times
     np.testing.assert_allclose(found.sigmas, [0.5e-3 / one * np.sqrt(2), 3e-3 / one, 2e-3 / one], rtol=0.01)
+
+
+def test_sigmas_are_too_small_by_as_much_as_images_pull_further_than_noise() -> None:
+    nan = float("nan")
+    # Twelve numbers: χ² is about that.
+    assert Pulls(0.1, 0.1, nan, (3.0, 2.0, nan)).excess == Pulls(nan, nan, nan, (nan,) * 3).excess == 1.0
+    assert Pulls(0.1, 0.2, 0.3, (1.0, 12.0, 5.0)).excess == pytest.approx(12.0 / np.sqrt(12.0))
+    assert Pulls(0.1, 0.2, nan).excess == 1.0  # nobody told

@@ -84,7 +84,7 @@ def shown_at(shown: int, k: int) -> Frame:
     return replace(frame, depth=replace(frame.depth, stamp=k / 30.0), colors=colors)
 
 
-def test_a_camera_that_was_carried_away_is_found_at_once_and_what_was_said_stays() -> None:
+def test_a_camera_that_was_carried_away_is_found_at_the_second_look_and_what_was_said_stays() -> None:
     """Frames are missing, time goes on without a gap; then a frame alone between lost ones."""
     tracker = tracker_of("rs-pg")
     shown = [*range(12), 28, None, 29, None, 12, 13]
@@ -94,8 +94,9 @@ def test_a_camera_that_was_carried_away_is_found_at_once_and_what_was_said_stays
         black = tuple(replace(c, pixels=np.zeros_like(c.pixels)) for c in frame.colors)
         tracker.feed(replace(frame, colors=black) if source is None else frame)
         at_once.append(tracker.trajectory[1][-1])
-    assert lost(tracker) == [13, 15]
-    found = [(k, source) for k, source in enumerate(shown) if source is not None]
+    # Nobody carries it so far in a thirtieth of a second; it may be there once it could be.
+    assert lost(tracker) == [12, 13, 15]
+    found = [(k, source) for k, source in enumerate(shown) if k not in (12, 13, 15)]
     T = tracker.trajectory[1]
     T_true = TRUTH.pose(np.array([source / 30.0 for _, source in found]))
     T_end = np.linalg.inv(T_true[1]) @ T_true

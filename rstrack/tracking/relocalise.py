@@ -1,0 +1,155 @@
+"""Find a lost frame: where the track ended, or at any keyframe ever made that looks like it, and make sure of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rsgen.array_types import FloatArray
+from rsgen.geometry import se3
+from rstrack.alignment import brightness
+from rstrack.alignment.observation import Observation
+from rstrack.alignment.optimizer import Solved
+from rstrack.alignment.pull import pulls
+from rstrack.data.rig import Rig
+from rstrack.images.device_frame import DeviceFrame
+from rstrack.images.pyramid import DepthImage
+from rstrack.keyframes.keyframe import Reference
+from rstrack.keyframes.store import KeyframeStore
+from rstrack.options import Options
+from rstrack.tracking import coarse_search
+from rstrack.tracking.lost_track import FitHistory, implausible
+from rstrack.tracking.uncertainty import Uncertainty, information
+from rstrack.tracking.window import LEVELS, Window
+
+# Keyframes at which a lost frame is looked for, at once.
+_PLACES = 3
+# Part of the pixels that must fit where a place is recognised by depth though the colours say otherwise.
+_SURE_FIT = 0.9
+
+
+@dataclass(frozen=True)
+class Found:
+    """A frame that was found again: a window with a new piece of the spline, and what says so."""
+
+    window: Window
+    fresh: list[Observation]
+    solved: Solved
+    ref: Reference
+    uncertainty: Uncertainty
+
+
+@dataclass(frozen=True)
+class _Jump:
+    """A pose further from the last than a hand moves a camera: at a keyframe, at a time (s). To be confirmed."""
+
+    ref: Reference
+    T_ref_cam: FloatArray
+    time: float
+
+
+class Relocaliser:
+    """Remembers what was tried for the frames that are lost in a row.
+
+    observe: what a frame's images say against a reference, given gain and offset (2,) that are expected.
+    """
+
+    def __init__(
+        self, rig: Rig, options: Options, keyframes: KeyframeStore, fits: FitHistory,
+        observe: Callable[[DeviceFrame, Reference, FloatArray], list[Observation]],
+    ) -> None:  # fmt: skip
+        self._rig, self._options, self._keyframes, self._fits, self._observe = rig, options, keyframes, fits, observe
+        self._lost_in_a_row = 0
+        self._jump: _Jump | None = None
+
+    def forget(self) -> None:
+        """The camera has been found."""
+        self._lost_in_a_row, self._jump = 0, None
+
+    def find(
+        self, new: DeviceFrame, window: Window, ref: Reference, end: float, uncertainty: Uncertainty
+    ) -> Found | None:
+        """Where a frame was taken, if that can be told; the track ended at time `end` (s).
+
+        Small images are aligned to some keyframes, and the whole one from the best of these poses; others take their
+        turn with the next frame. A pose that no hand can have brought the camera to is none until the next frame is
+        found beside it.
+        """
+        jump, self._jump = self._jump, None
+        start = (jump.ref, jump.T_ref_cam) if jump else self._searched(new, window, ref, end)
+        self._lost_in_a_row += 1
+        found = self._aligned(new, window, end, *start, uncertainty) if start else None
+        if found is None:
+            return None
+        mid = new.depth.exposure.mid_time
+        T_found = found.window.spline.pose(mid)
+        near = [(window.spline.pose(end), end)]
+        if jump:
+            near.append((jump.ref.T_world_base @ jump.T_ref_cam, jump.time))
+        if all(implausible(T, T_found, mid - time) for T, time in near):
+            self._jump = _Jump(found.ref, se3.inverse(found.ref.T_world_base) @ T_found, mid)
+            return None
+        return found
+
+    def _searched(
+        self, new: DeviceFrame, window: Window, ref: Reference, end: float
+    ) -> tuple[Reference, FloatArray] | None:
+        """The keyframe and T_ref_cam (4, 4) whose turn it is."""
+        newest = self._keyframes.newest if ref.rolling is not None else ref
+        skip = (self._lost_in_a_row // 2) * (_PLACES - 1)
+        places = [newest, *self._keyframes.candidates(new, skip, _PLACES - 1)]
+        T_ends = [window.spline.pose(end), *(place.T_world_base for place in places[1:])]
+        ranked = coarse_search.ranked(
+            coarse_search.small_frame(new, self._rig, self._options.geometric),
+            [(coarse_search.small_keyframe(place), se3.inverse(place.T_world_base) @ T)
+             for place, T in zip(places, T_ends, strict=True)],
+        )  # fmt: skip
+        if not ranked:
+            return None
+        chosen, T_ref_cam = ranked[self._lost_in_a_row % len(ranked)]
+        return places[chosen], T_ref_cam
+
+    def _aligned(
+        self, new: DeviceFrame, window: Window, end: float, ref: Reference, T_ref_cam: FloatArray, before: Uncertainty
+    ) -> Found | None:
+        def restarted() -> Window:
+            return window.restarted(new, end, ref.T_world_base @ T_ref_cam)
+
+        trial, fresh = restarted(), self._observe(new, ref, _matched(new, ref))
+        solved = trial.solve(fresh, LEVELS, hopeless=self._fits.is_hopeless)
+        fitting = without_misfits(self._fits, fresh, fresh, ref)
+        if len(fitting) < len(fresh) and not self._fits.is_hopeless(fresh):
+            trial, fresh = restarted(), fitting
+            solved = trial.solve(fresh, LEVELS, hopeless=self._fits.is_hopeless)
+        pulled = pulls(fresh, trial.state)
+        uncertainty = before.found_anew(information(fresh, trial.state) / pulled.excess**2)
+        # Depth alone is much alike in many places.
+        is_sure = len(fresh) > 1 or not (new.colors and ref.points) or fresh[0].lin.fit >= _SURE_FIT
+        if self._fits.fault(fresh, solved, ref.pixels, pulled) or not (is_sure and uncertainty.is_known):
+            return None
+        return Found(trial, fresh, solved, ref, uncertainty)
+
+
+def without_misfits(
+    fits: FitHistory, fresh: list[Observation], on_reference: Sequence[Observation], ref: Reference
+) -> list[Observation]:
+    """What is left to align by if a frame's colour images do not fit, or its depth has none to show.
+
+    Where depth does not fit either, the colours may be what drew it away.
+    """
+    misfits = [o for o, _ in fits.misfits(on_reference, ref.pixels)]
+    empty = [o for o in fresh if isinstance(o.image, DepthImage) and o.image.count == 0]
+    odd_colors = [o for o in misfits if not o.is_depth]
+    if odd_colors and len(odd_colors) < len(on_reference) and not empty:
+        return [o for o in fresh if all(o.image is not odd.image for odd in odd_colors)]
+    if empty and len(misfits) == 1 and misfits[0].is_depth:
+        return [o for o in fresh if not o.is_depth]
+    return fresh
+
+
+def _matched(frame: DeviceFrame, ref: Reference) -> FloatArray:
+    if not (frame.colors and ref.points):
+        return np.asarray(brightness.SAME)
+    return np.asarray(brightness.matched(frame.colors[0].moments, ref.moments))

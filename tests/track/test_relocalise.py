@@ -1,0 +1,96 @@
+"""What is left of a frame's images where some do not fit, and jumps that need a second look."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from rstrack_util import hand_held
+
+from rsgen.geometry import se3
+from rstrack.alignment.optimizer import Solved
+from rstrack.images.pyramid import DepthImage
+from rstrack.tracking.lost_track import FitHistory
+from rstrack.tracking.relocalise import Found, Relocaliser, without_misfits
+from rstrack.tracking.uncertainty import Uncertainty
+
+REF: Any = SimpleNamespace(pixels=5000, T_world_base=np.eye(4), median_depth=1.0)
+
+
+def seen(kind: str, fit: float = 1.0) -> Any:
+    lin = SimpleNamespace(fit=fit, next_sigma=1e-3, floor=0.0, count=5000)
+    image = object() if kind == "color" else DepthImage.__new__(DepthImage)
+    if kind == "depth":
+        object.__setattr__(image, "count", 5000)
+    return SimpleNamespace(is_depth=kind == "depth", is_linearised=True, lin=lin, pixels=5000, ref=REF, image=image)
+
+
+@pytest.mark.parametrize("depth_fit", [1.0, 0.3])
+def test_colours_that_do_not_fit_are_left_out_whatever_depth_does(depth_fit: float) -> None:
+    depth, odd, good = seen("depth", depth_fit), seen("color", 0.1), seen("color")
+    assert without_misfits(FitHistory(), [depth, odd, good], [depth, odd, good], REF) == [depth, good]
+
+
+def test_what_fits_and_what_stands_alone_stays() -> None:
+    depth, color = seen("depth"), seen("color")
+    assert without_misfits(FitHistory(), [depth, color], [depth, color], REF) == [depth, color]
+    odd = seen("color", 0.1)
+    assert without_misfits(FitHistory(), [odd], [odd], REF) == [odd]
+
+
+class Sees(Relocaliser):
+    """Finds each frame where it is told."""
+
+    def __init__(self, T_found: list[np.ndarray | None]) -> None:
+        super().__init__(*[None] * 5)  # type: ignore[arg-type]
+        self.T_found, self.started = list(T_found), []
+
+    def _searched(self, *_: Any) -> Any:
+        return REF, np.eye(4)
+
+    def _aligned(self, new: Any, window: Any, end: float, ref: Any, T_ref_cam: np.ndarray, before: Any) -> Any:
+        self.started.append(T_ref_cam)
+        T = self.T_found.pop(0)
+        if T is None:
+            return None
+        spline = SimpleNamespace(pose=lambda _: T)
+        return Found(SimpleNamespace(spline=spline), [], Solved(), REF, before)  # type: ignore[arg-type]
+
+
+def frame(time: float) -> Any:
+    return SimpleNamespace(depth=SimpleNamespace(exposure=SimpleNamespace(mid_time=time)))
+
+
+TRUTH = hand_held(3)
+AT_END = SimpleNamespace(spline=TRUTH)
+
+
+def away(metres: float) -> np.ndarray:
+    return np.asarray(TRUTH.pose(0.5) @ se3.exp([metres, 0.0, 0.0, 0.0, 0.0, 0.0]))
+
+
+def looked(relocaliser: Relocaliser, time: float) -> bool:
+    return relocaliser.find(frame(time), AT_END, REF, 0.5, Uncertainty()) is not None  # type: ignore[arg-type]
+
+
+def test_near_the_end_of_the_track_one_look_is_enough() -> None:
+    assert looked(Sees([away(0.1)]), 0.533)
+
+
+def test_a_jump_needs_a_second_look_at_the_same_place() -> None:
+    relocaliser = Sees([away(2.0), away(2.02)])
+    assert not looked(relocaliser, 0.533) and looked(relocaliser, 0.567)
+    # The second begins where the first ended.
+    np.testing.assert_allclose(relocaliser.started[1], away(2.0), atol=1e-12)
+
+
+@pytest.mark.parametrize("second", [None, away(-2.0)])
+def test_a_jump_that_is_not_confirmed_is_none(second: np.ndarray | None) -> None:
+    relocaliser = Sees([away(2.0), second, away(2.04)])
+    assert [looked(relocaliser, t) for t in (0.533, 0.567, 0.6)] == [False] * 3
+
+
+def test_given_time_a_camera_may_be_anywhere() -> None:
+    assert looked(Sees([away(2.0)]), 1.1)
