@@ -71,7 +71,7 @@ def first_size(paths: Sequence[Path], decode: Callable[[Path], npt.NDArray[Any]]
 def repeated(paths: Sequence[Path]) -> npt.NDArray[np.bool_]:
     """Which images (n,) are the one before again, byte for byte: the recorder asked more often than the camera gave.
 
-    No two images of a real sensor are the same, moving or not. More than a few in a row, or all, are left alone: rendered.
+    No two images of a real sensor are the same, moving or not. Many in a row, or all, are left alone: rendered.
     """
     same = np.array([False, *(_same_bytes(a, b) for a, b in pairwise(paths))], bool)[: len(paths)]
     runs = np.split(np.arange(len(same)), np.flatnonzero(~same))
