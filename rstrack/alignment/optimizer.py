@@ -27,8 +27,8 @@ RELINEARISE_PX = 0.02
 # and what does not fit must not end early for it.)
 _NOISE_SHARE, _MOST_TOLERANCE_PX = 0.1, 0.08
 # Where noise, not rounding, is what limits (σ over the smallest credible one): a step shorter than so many σ of the
-# result, squared, is the last one of a level, finest first, and what has moved by less keeps its linearisation.
-_NOISY, _LAST, _MATTERS = 2.0, (1.0, 10.0, 10.0), 1.0
+# result, squared, is the last one of a level, finest first, and what has moved by so many keeps its linearisation.
+_NOISY, _LAST, _MATTERS = 2.0, (1.0, 10.0, 10.0), 2.0
 # Rise of the negative log-likelihood per pixel from which on a step has made things worse: less is noise of gating.
 _WORSE = 2e-5
 
