@@ -108,8 +108,6 @@ class FitHistory:
 
     def _torn(self, now: Pulls, distance: float) -> str:
         """distance (m), `_CLOSE` at least: of what is seen; where noise grows with its square, so do pulls."""
-        if len(self._pulls) < _FEW:
-            return ""
         far = [self._is_far(name, n, now, distance) for n, name in enumerate(_PULLS)]
         if any(far[1:]):
             return "depth and colour do not agree"

@@ -325,7 +325,7 @@ class Tracker:
             return False
         old = self._keyframes.return_to(window.spline.pose(frozen.depth.exposure.mid_time), ref)
         if old is not None:
-            self._reference, self._pixels = old, 0
+            self._reference, self._pixels, self._colorless = old, 0, 0
             return True
         if self._unfit(frozen):
             return False
@@ -344,7 +344,7 @@ class Tracker:
             before, pose = self._covariances[frame.index]
             T_world_depth = self._reference.T_world_base
             self._uncertainty = self._uncertainty.with_keyframe(frame.index, before, T_world_depth, pose)
-        self._unconverged, self._pixels = None, 0
+        self._unconverged, self._pixels, self._colorless = None, 0, 0
         return self._reference
 
     def _overlap(self, fresh: Sequence[Observation]) -> float:

@@ -114,6 +114,17 @@ def test_colour_may_come_late_but_there_is_no_keyframe_without_it() -> None:
     assert lost(feed(tracker_of("rs-pg"), frames(7))) == [0, 1, 2, 3, 4]
 
 
+def test_a_keyframe_whose_colours_are_another_places_is_left() -> None:
+    """A global shutter's first frame is the keyframe at once; its colours fit none that come after it."""
+    tracker, odd = tracker_of("gs-pg", GLOBAL), np.random.default_rng(0)
+    first = frame_at(0, GLOBAL)
+    colors = tuple(replace(c, pixels=odd.integers(0, 256, c.pixels.shape).astype(np.uint8)) for c in first.colors)
+    feed(tracker, [replace(first, colors=colors), *(frame_at(k, GLOBAL) for k in range(1, 16))])
+    used = [report.inliers_color > 0 for report in tracker.reports]
+    assert lost(tracker) == [] and not any(used[1:5]) and all(used[10:])
+    assert tracker.keyframes == 2 and worst_step(tracker) < 3e-3
+
+
 def test_nothing_but_blank_frames() -> None:
     tracker = feed(tracker_of("rs-pg"), (blank(frame_at(k)) for k in range(3)))
     assert lost(tracker) == [0, 1, 2] and tracker.spline is None and len(tracker.trajectory[0]) == 0

@@ -129,7 +129,7 @@ def run_insults(
         kind = kinds[n % len(kinds)]
         outcome = known.get(seed + n) or judged(random_insult(cut, seed + n, kind), options, seed + n)
         report = dataclasses.replace(report, outcomes=(*report.outcomes, outcome))
-        if out is not None:
+        if out is not None and seed + n not in known:
             atomic_write(out, (json.dumps(report.as_dict(), indent=1) + "\n").encode())
         wrong = sum(bool(o.silent) for o in report.outcomes)
         progress("insults", (n + 1) / count, f"{kind}, {wrong} wrong without a word")

@@ -93,7 +93,7 @@ def run_sensitivity(
 
         score = kept.get(case.name) or _score(case, cut, options, tell)
         report = dataclasses.replace(report, scores=(*report.scores, score))
-        if out is not None:
+        if out is not None and case.name not in kept:
             atomic_write(out, (json.dumps(report.as_dict(), indent=2) + "\n").encode())
     return report
 
