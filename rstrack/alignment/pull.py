@@ -10,7 +10,7 @@ the first line to the last.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -27,13 +27,15 @@ class Pulls:
     """Metres by which points at the median depth would move: by all of a frame's images, by depth and by colour alone.
 
     In the line that moves furthest; NaN where there is no such image. sigmas: how many σ of what these images know each
-    of the three is.
+    of the three is. told (6, 6): what the normal equations say that all of them know of the pose, all lines moved at
+    once, as increments [m; rad] in the depth camera's axes at mid readout.
     """
 
     whole: float
     depth: float
     color: float
     sigmas: tuple[float, float, float] = (np.inf, np.inf, np.inf)
+    told: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
 
     @property
     def excess(self) -> float:
@@ -43,6 +45,11 @@ class Pulls:
         """
         told = [sigmas for sigmas in self.sigmas if np.isfinite(sigmas)]
         return max(1.0, max(told, default=0.0) / np.sqrt(len(_PRIOR)))
+
+    @property
+    def information(self) -> FloatArray:
+        """What the images know of the pose (6, 6), as far as they agree with what it was found to be."""
+        return self.told / self.excess**2
 
     def scaled(self, factor: float) -> Pulls:
         """All of them, in metres, times a factor."""
@@ -54,7 +61,16 @@ def pulls(fresh: Sequence[Observation], state: SplineState) -> Pulls:
     seen = [(o, *steady(o, state)) for o in fresh if o.is_linearised]
     depth, color = [s for s in seen if s[0].is_depth], [s for s in seen if not s[0].is_depth]
     (whole, a), (depth_alone, b), (color_alone, c) = (_pull(some) for some in (seen, depth, color))
-    return Pulls(whole, depth_alone, color_alone, (a, b, c))
+    return Pulls(whole, depth_alone, color_alone, (a, b, c), _told(seen, state))
+
+
+def _told(seen: Sequence[tuple[Observation, FloatArray, FloatArray]], state: SplineState) -> FloatArray:
+    """`Pulls.told`, of observations, each with its H (12, 12) and g of `steady`."""
+    total = np.zeros((6, 6))
+    for o, H, _ in seen:
+        turn = np.kron(np.eye(2), state.spline.pose(o.image.exposure.mid_time)[:3, :3])
+        total += turn.T @ H[:6, :6] @ turn
+    return total
 
 
 def _pull(seen: Sequence[tuple[Observation, FloatArray, FloatArray]]) -> tuple[float, float]:
@@ -86,9 +102,3 @@ def steady(o: Observation, state: SplineState) -> tuple[FloatArray, FloatArray]:
     about[:3, 3:] = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
     basis = np.kron(np.stack([np.ones(len(at)), after], axis=1), about)
     return basis.T @ model.H @ basis, basis.T @ model.g
-
-
-def rigid(o: Observation, state: SplineState) -> tuple[FloatArray, FloatArray]:
-    """H (6, 6) and g (6,) of the first of these: all lines moved at once."""
-    H, g = steady(o, state)
-    return H[:6, :6], g[:6]

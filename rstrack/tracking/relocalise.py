@@ -21,7 +21,7 @@ from rstrack.keyframes.store import KeyframeStore
 from rstrack.options import Options
 from rstrack.tracking import coarse_search
 from rstrack.tracking.lost_track import FitHistory, implausible
-from rstrack.tracking.uncertainty import Uncertainty, information
+from rstrack.tracking.uncertainty import Uncertainty
 from rstrack.tracking.window import LEVELS, Window
 
 # Keyframes at which a lost frame is looked for, at once.
@@ -124,7 +124,7 @@ class Relocaliser:
             trial, fresh = restarted(), fitting
             solved = trial.solve(fresh, LEVELS, hopeless=self._fits.is_hopeless)
         pulled = pulls(fresh, trial.state)
-        uncertainty = before.found_anew(information(fresh, trial.state) / pulled.excess**2)
+        uncertainty = before.found_anew(pulled.information)
         # Depth alone is much alike in many places.
         is_sure = len(fresh) > 1 or not (new.colors and ref.points) or fresh[0].lin.fit >= _SURE_FIT
         if self._fits.fault(fresh, solved, ref.pixels, pulled) or not (is_sure and uncertainty.is_known):

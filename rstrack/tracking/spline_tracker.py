@@ -33,7 +33,7 @@ from rstrack.options import Options
 from rstrack.tracking.frame_report import FrameReport, frame_report
 from rstrack.tracking.lost_track import FitHistory, implausible, is_settled
 from rstrack.tracking.relocalise import Relocaliser, without_misfits
-from rstrack.tracking.uncertainty import Uncertainty, information
+from rstrack.tracking.uncertainty import Uncertainty
 from rstrack.tracking.window import LEVELS, TRACKING_LEVELS, Window
 
 # Seconds without a frame after which the motion before says nothing about where the camera is, and beyond which
@@ -159,8 +159,7 @@ class Tracker:
             fault = self._fits.fault(on_reference, solved, ref.pixels, pulled)
             if ref.rolling is None:
                 # A rolling reference moves with what is aligned to it, which tells nothing of the two together.
-                seen = information(on_reference, window.state) / pulled.excess**2
-                uncertainty = self._uncertainty.after(new.stamp - self._stamps[-1], seen)
+                uncertainty = self._uncertainty.after(new.stamp - self._stamps[-1], pulled.information)
             else:
                 uncertainty = self._uncertainty
         if fault or implausible(T_predicted, window.spline.pose(mid), gap) or not uncertainty.is_known:
@@ -261,8 +260,8 @@ class Tracker:
         window.solve(others, levels=(0,))
         window.keep(others)
         for frame in frames:
-            own = information([o for o in others if o.frame == frame.index], window.state)
-            self._uncertainty = self._uncertainty.found_anew(own)
+            own = pulls([o for o in others if o.frame == frame.index], window.state)
+            self._uncertainty = self._uncertainty.found_anew(own.information)
             if frame is not middle:
                 self._covariances[frame.index] = ref.index, self._covariance(ref)
         first = self._covariances.get(frames[0].index, (ref.index, np.zeros((6, 6))))

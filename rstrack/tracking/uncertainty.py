@@ -10,16 +10,12 @@ Increments are [m; rad] in the depth camera's own frame at mid readout, T_world_
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
-from rstrack.alignment.observation import Observation
-from rstrack.alignment.pull import rigid
-from rstrack.alignment.spline_state import SplineState
 
 # σ of accelerations, m/s² and rad/s² (the motion prior's), and of velocities where nothing is known, m/s and rad/s.
 _ACCELERATION = np.array([5.0, 5.0, 5.0, 10.0, 10.0, 10.0])
@@ -100,15 +96,3 @@ class Uncertainty:
 
 def _lost() -> FloatArray:
     return np.diag(np.concatenate([_NOWHERE, _VELOCITY]) ** 2)
-
-
-def information(fresh: Sequence[Observation], state: SplineState) -> FloatArray:
-    """What a frame's observations say of its pose (6, 6), all lines moved at once."""
-    total = np.zeros((6, 6))
-    for o in fresh:
-        if o.is_linearised:
-            H, _ = rigid(o, state)
-            R = state.spline.pose(o.image.exposure.mid_time)[:3, :3]
-            turn = np.kron(np.eye(2), R)
-            total += turn.T @ H @ turn
-    return total

@@ -102,6 +102,21 @@ def test_pulls_are_counted_in_sigmas_of_what_the_images_tell() -> None:
     np.testing.assert_allclose(found.sigmas, [0.5e-3 / one * np.sqrt(2), 3e-3 / one, 2e-3 / one], rtol=0.01)
 
 
+def test_what_images_tell_of_the_pose_is_what_all_their_lines_do() -> None:
+    # Every line's twist in the world is known to 1 m and 1 rad; an increment of the pose at mid readout moves them all.
+    Ad = se3.adjoint(TRUTH.pose(MID))
+    found = pulls([sight()], SplineState(TRUTH))
+    H = 1e6 * len(TIMES) * Ad.T @ Ad
+    np.testing.assert_allclose(found.told, H, rtol=1e-3, atol=1e-6 * H.max())
+    assert (found.information == found.told).all()
+
+
+def test_images_that_pull_further_than_noise_tell_less() -> None:
+    found = pulls([sight((3e-3, 0, 0), weight=1e8)], SplineState(TRUTH))
+    assert found.excess > 5.0
+    np.testing.assert_allclose(found.information * found.excess**2, found.told)
+
+
 def test_sigmas_are_too_small_by_as_much_as_images_pull_further_than_noise() -> None:
     nan = float("nan")
     # Twelve numbers: χ² is about that.
