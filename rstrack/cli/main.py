@@ -13,6 +13,8 @@ from rsgen.console.command_line import Commands, Frames, Json, Parser, Quiet, ru
 from rstrack.cli.bench import bench_bootstrap, bench_convergence, bench_speed, stress
 from rstrack.cli.bench_methods import STATUS as BENCH_STATUS
 from rstrack.cli.bench_methods import bench
+from rstrack.cli.calibrate import STATUS as CALIBRATE_STATUS
+from rstrack.cli.calibrate import calibrate
 from rstrack.cli.mapping import keyframes, map_, map_eval
 from rstrack.cli.options import CameraFile, Run, SequenceFolder, TruthExtrinsics, TruthOffset
 from rstrack.cli.report import report
@@ -24,6 +26,7 @@ rstrack estimates the continuous-time trajectory of a rolling-shutter RGB-D came
 
   rstrack info out/demo                                what would be tracked
   rstrack track out/demo --out runs/demo               track it; the trajectory is in runs/demo
+  rstrack calibrate out/demo --out camera.yaml         readouts, clocks and extrinsics out of the recording itself
   rstrack evaluate out/demo runs/demo                  errors against the ground truth
   rstrack plot out/demo runs/demo --out demo.png       path and errors as a picture
   rstrack report runs/demo                             all of it as one HTML page
@@ -61,6 +64,7 @@ def _parser() -> Parser:
     )
     add = commands.add
     add(track, "out/lr_kt2 --method rs-pg --out runs/lr_kt2 --frames 0:300 --noise-depth 1.2e-3", _STATUS)
+    add(calibrate, "recording --out camera.yaml", CALIBRATE_STATUS)
     add(evaluate, "out/lr_kt2 runs/lr_kt2 --json")
     add(plot, "out/lr_kt2 runs/lr_kt2 --out lr_kt2.png")
     add(info, "out/lr_kt2")

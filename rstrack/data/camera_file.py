@@ -8,8 +8,10 @@ camera.yaml (depth left out: registered to colour, read out as colour is, 5000 u
 
 Each may have model (pinhole, radtan, fisheye), distortion, exposure_s and scan as in rsgen's configs. T_color_depth
 (4x4) is the identity where it is left out. color.offset_s: seconds added to colour's stamps; auto: see
-`rstrack.data.timing`. stamps: auto, raw or regular, see there too. depth.registered: warped into the colour camera, see
-`rstrack.data.registered_rows`. calibration.yaml: see `rstrack.data.opencv_camera_file`.
+`rstrack.data.timing`; color.drift_ppm: millionths by which that grows over the recording, in whose middle it holds;
+both are what `rstrack calibrate` finds, which writes such a file. stamps: auto, raw or regular, see there too.
+depth.registered: warped into the colour camera, see `rstrack.data.registered_rows`. calibration.yaml: see
+`rstrack.data.opencv_camera_file`.
 """
 
 from __future__ import annotations
@@ -47,7 +49,8 @@ class RigFile:
     """The cameras, the depth images' units per metre, and what is to be done with the stamps.
 
     depth_offset_s: to be added to depth's stamps, so that they belong to the first row of the image as it is.
-    color_offset_s: to be added to colour's; None: to be found. notes: what was assumed, for the screen.
+    color_offset_s: to be added to colour's; None: to be found. color_drift: what that grows by, s/s. scan_named:
+    whether it says which way images are read. notes: what was assumed, for the screen.
     """
 
     rig: Rig
@@ -55,6 +58,8 @@ class RigFile:
     stamps: StampsMode = "auto"
     depth_offset_s: float = 0.0
     color_offset_s: float | None = None
+    color_drift: float = 0.0
+    scan_named: bool = True
     notes: tuple[str, ...] = ()
 
 
@@ -83,6 +88,7 @@ class _Stream(_Section):
 
 class _ColorStream(_Stream):
     offset_s: Finite | Literal["auto"] = "auto"
+    drift_ppm: Annotated[float, Field(ge=-1e4, le=1e4, allow_inf_nan=False)] = 0.0
 
 
 class _Sensor(_Section):
@@ -146,6 +152,8 @@ def read_rig(path: Path, color_size: Size, depth_size: Size) -> RigFile:
         data.stamps,
         depth_offset_s,
         None if data.color.offset_s == "auto" else data.color.offset_s,
+        1e-6 * data.color.drift_ppm,
+        any("scan" in stream.model_fields_set for stream in (data.color, depth) if stream is not None),
         notes,
     )
 

@@ -18,9 +18,10 @@ import numpy.typing as npt
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
-from rsgen.sequence.format import StreamName
+from rsgen.sequence.format import DEPTH_SCALE, StreamName
 from rsgen.sequence.reader import Sequence, read_sequence
 from rsgen.sequence.trajectory import Trajectory
+from rstrack.data.camera_file import read_rig
 from rstrack.data.generated import as_recorded, is_exact
 from rstrack.data.prefetch import prefetched
 from rstrack.data.rig import Frame, Image, Rig
@@ -52,7 +53,9 @@ class Dataset:
     groups: for each frame the indices of its colour images.
     truth: T_world_depth(t), of exact rsgen sequences. truth_poses: T_world_depth, of others that have it.
     sequence: the rsgen sequence itself, where it is an exact one (`rstrack.data.generated`). notes: what had to be
-    assumed when it was read. timing: of recordings, how their stamps came about.
+    assumed when it was read. timing: of recordings, how their stamps came about. color_drift: seconds a second that
+    colour's offset grows by, see `with_color_offset`. scan_named: whether the cameras' description says which way
+    images are read. depth_scale: units per metre of the depth images.
     """
 
     name: str
@@ -67,6 +70,9 @@ class Dataset:
     sequence: Sequence | None = None
     notes: tuple[str, ...] = ()
     timing: Timing | None = None
+    color_drift: float = 0.0
+    scan_named: bool = True
+    depth_scale: float = DEPTH_SCALE
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -110,22 +116,31 @@ class Dataset:
         """
         return prefetched(self.frame, range(len(self))[first:last], prefetch)
 
-    def with_color_offset(self, offset_s: float, note: str = "") -> Dataset:
+    @property
+    def middle(self) -> float:
+        """The stamp in s at which colour's offset is what it is called, whatever it grows by."""
+        return float(self.stamps[len(self) // 2])
+
+    def with_color_offset(self, offset_s: float, note: str = "", drift: float | None = None) -> Dataset:
         """The same recording with `offset_s` added to the stamps that colour would have without any offset.
 
-        note: for the screen, where the offset comes from.
+        note: for the screen, where the offset comes from. drift: what it grows by, s/s, if not as it did. Without a
+        `timing` it is added to the stamps as they are.
         """
-        if self.timing is None:
-            return self
-        color_stamps = self.timing.color.used + offset_s
-        notes = (*self.timing.notes, note) if note else self.timing.notes
-        timing = replace(self.timing, color_offset_s=offset_s, notes=notes)
-        return replace(self, color_stamps=color_stamps, groups=group_colors(self.stamps, color_stamps), timing=timing)
+        drift = self.color_drift if drift is None else drift
+        before = self.color_stamps if self.timing is None else self.timing.color.used
+        color_stamps = before + offset_s + drift * (before - self.middle)
+        timing = self.timing
+        if timing is not None:
+            notes = (*timing.notes, note) if note else timing.notes
+            timing = replace(timing, color_offset_s=offset_s, notes=notes)
+        groups = group_colors(self.stamps, color_stamps)
+        return replace(self, color_stamps=color_stamps, groups=groups, timing=timing, color_drift=drift)
 
     def timed_as(self, info: dict[str, Any]) -> Dataset:
         """The same recording with colour's offset as a run had it, whose run.json holds `info`."""
         clocks = info.get("clocks")
-        offset_s = clocks.get("color_offset_s") if isinstance(clocks, dict) else None
+        offset_s = clocks.get("color_offset_s") if self.timing is not None and isinstance(clocks, dict) else None
         return self.with_color_offset(float(offset_s)) if isinstance(offset_s, float | int) else self
 
     def rows(self, stream: StreamName) -> FloatArray | None:
@@ -142,8 +157,8 @@ def open_dataset(path: Path, camera_file: Path | None = None) -> Dataset:
     path: a sequence that rsgen wrote (it has a sequence.yaml, which holds the cameras), or a TUM RGB-D or ICL-NUIM
       folder: rgb.txt and depth.txt, or associations.txt; see `rstrack.data.tum_folder`; or one in the layout of
       7-Scenes: frame-000000.depth.png and so on; see `rstrack.data.seven_scenes`.
-    camera_file: the cameras of a folder that is no rsgen sequence; default camera.yaml or calibration.yaml in it; see
-      `rstrack.data.camera_file`.
+    camera_file: the cameras, instead of those that a sequence.yaml, or a camera.yaml or calibration.yaml in the folder,
+      tells; see `rstrack.data.camera_file`.
     Raises UserError, one line: what is missing or wrong, where, and how to mend it.
     """
     root = Path(path)
@@ -152,9 +167,31 @@ def open_dataset(path: Path, camera_file: Path | None = None) -> Dataset:
     if not (root / "sequence.yaml").exists():
         read = read_seven_scenes if is_seven_scenes(root) else read_tum_folder
         return _of_tum(root, read(root, camera_file))
-    if camera_file is not None:
-        raise UserError(f"{root}: its sequence.yaml holds the cameras: leave the camera file {camera_file} out")
-    sequence = read_sequence(root)
+    dataset = _of_generated(root, read_sequence(root))
+    return dataset if camera_file is None else _seen_as(dataset, camera_file)
+
+
+def _seen_as(dataset: Dataset, camera_file: Path) -> Dataset:
+    """A generated sequence with other cameras than it was taken with. Raises UserError: not of its images' size."""
+    sizes = [(c.width, c.height) for c in (dataset.rig.color_camera, dataset.rig.depth_camera)]
+    file = read_rig(camera_file, *sizes)
+    found = [(c.width, c.height) for c in (file.rig.color_camera, file.rig.depth_camera)]
+    if found != sizes:
+        shown = [" and ".join(f"{w}x{h}" for w, h in pair) for pair in (found, sizes)]
+        raise UserError(f"{camera_file}: cameras (colour and depth) of {shown[0]} pixels, but images are {shown[1]}")
+    timing = dataset.timing
+    if timing is None:
+        depth = stream_timing("depth", dataset.stamps, "raw", 0.0)
+        timing = Timing(depth, stream_timing("colour", dataset.color_stamps, "raw", 0.0), 0.0)
+    notes = (*dataset.notes, *file.notes)
+    seen = replace(dataset, rig=file.rig, notes=notes, scan_named=file.scan_named, timing=timing)
+    if file.color_offset_s is None:
+        return replace(seen, color_drift=file.color_drift)
+    return seen.with_color_offset(file.color_offset_s, drift=file.color_drift)
+
+
+def _of_generated(root: Path, sequence: Sequence) -> Dataset:
+    """A sequence of rsgen. Raises UserError."""
     if not is_exact(sequence):
         return _of_recorded(root, sequence)
     color, depth = sequence.streams["color"], sequence.streams["depth"]
@@ -189,12 +226,12 @@ def _of_tum(root: Path, tum: TumFolder) -> Dataset:
     if tum.depth_numbers is not None:
         depth = replace(depth, listed=tum.depth_numbers)
     timing = Timing(depth, color, file.color_offset_s, file.notes)
-    color_stamps = color.used + (file.color_offset_s or 0.0)
-    groups = group_colors(depth.used, color_stamps)
-    return Dataset(
-        root.resolve().name, root, file.rig, depth.used, color_stamps, groups, tum.images,
-        truth_poses=tum.truth_poses, notes=tum.notes, timing=timing,
+    dataset = Dataset(
+        root.resolve().name, root, file.rig, depth.used, color.used, (), tum.images, truth_poses=tum.truth_poses,
+        notes=tum.notes, timing=timing, scan_named=file.scan_named, depth_scale=file.depth_scale,
     )  # fmt: skip
+    found = dataset.with_color_offset(file.color_offset_s or 0.0, drift=file.color_drift)
+    return replace(found, timing=timing)
 
 
 def group_colors(depth_stamps: npt.ArrayLike, color_stamps: npt.ArrayLike) -> tuple[tuple[int, ...], ...]:

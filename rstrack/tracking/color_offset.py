@@ -164,7 +164,7 @@ def _geometric_track(
     from rstrack.tracking.run import make_tracker
 
     step = 2 if dataset.rig.depth_camera.width >= _LARGE else 1
-    rig = replace(dataset.rig, depth_camera=_thinned(dataset.rig.depth_camera, step))
+    rig = replace(dataset.rig, depth_camera=thinned(dataset.rig.depth_camera, step))
     tracker = make_tracker(rig, Options(method="rs-g", backend=options.backend))
     for count, k in enumerate(frames, 1):
         try:
@@ -179,7 +179,7 @@ def _geometric_track(
     return tracker.spline, begin, end
 
 
-def _thinned(camera: Camera, step: int) -> Camera:
+def thinned(camera: Camera, step: int) -> Camera:
     """The camera whose pixels are every step-th of a camera's, from the first."""
     fx, fy, cx, cy = (value / step for value in (camera.fx, camera.fy, camera.cx, camera.cy))
     width, height = -(-camera.width // step), -(-camera.height // step)

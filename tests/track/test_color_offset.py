@@ -124,7 +124,10 @@ class _Same:
 
 
 def test_stamps_of_a_sequence_are_no_guess(shaken: Dataset) -> None:
-    assert shaken.timing is None and shaken.with_color_offset(0.1) is shaken
+    assert shaken.timing is None
+    later = shaken.with_color_offset(0.1, drift=1e-4)
+    expected = shaken.color_stamps + 0.1 + 1e-4 * (shaken.color_stamps - shaken.stamps[len(shaken) // 2])
+    np.testing.assert_allclose(later.color_stamps, expected, atol=1e-12)
     assert Path(shaken.root, "sequence.yaml").exists()
 
 

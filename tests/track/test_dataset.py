@@ -128,9 +128,23 @@ def test_a_range_of_frames_and_single_frames(uneven: Path) -> None:
             dataset.frame(k)
 
 
-def test_a_camera_file_for_a_sequence_is_refused(uneven: Path) -> None:
-    with pytest.raises(UserError, match=r"sequence\.yaml holds the cameras"):
-        open_dataset(uneven, uneven / "camera.yaml")
+def test_a_camera_file_for_a_sequence_stands_in_for_its_cameras(uneven: Path, tmp_path: Path) -> None:
+    plain, file = open_dataset(uneven), tmp_path / "camera.yaml"
+    depth, color = plain.rig.depth_camera, plain.rig.color_camera
+    sizes = [f"width: {c.width}, height: {c.height}, intrinsics: [50, 50, 31, 23]" for c in (depth, color)]
+    file.write_text(
+        f"depth: {{{sizes[0]}, readout_s: 0.01}}\ncolor: {{{sizes[1]}, readout_s: 0.02, offset_s: 0.003, drift_ppm: 200}}"
+    )
+    told = open_dataset(uneven, file)
+    assert told.rig.depth_camera.fx == 50.0 and told.rig.color_shutter.readout_s == 0.02 and not told.scan_named
+    expected = plain.color_stamps + 0.003 + 2e-4 * (plain.color_stamps - plain.stamps[len(plain) // 2])
+    np.testing.assert_allclose(told.color_stamps, expected, atol=1e-12)
+    assert told.truth is not None and (told.stamps == plain.stamps).all()
+    file.write_text("color: {width: 8, height: 6, intrinsics: [5, 5, 3, 2], readout_s: 0.01}")
+    with pytest.raises(
+        UserError, match=r"camera\.yaml: cameras \(colour and depth\) of 8x6 and 8x6 pixels, but images"
+    ):
+        open_dataset(uneven, file)
 
 
 # --- reading ahead ---------------------------------------------------------------------------------------------------

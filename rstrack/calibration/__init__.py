@@ -1,0 +1,1 @@
+"""Self-calibration: readouts, clocks and extrinsics out of an ordinary recording."""

@@ -1,0 +1,105 @@
+"""Stretches of a recording on the device, with the spline of a track of it to begin with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from rsgen.array_types import FloatArray
+from rsgen.device.arrays import Engine
+from rsgen.geometry import se3
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter
+from rsgen.geometry.spline import Spline
+from rstrack.calibration.images import Taken, pair_lens, span
+from rstrack.calibration.pair_terms import PairTerms, averaged, intensity_bound, surface_of
+from rstrack.calibration.parameters import Parameters
+from rstrack.calibration.stretch import Stretch, View
+from rstrack.data.dataset import Dataset
+from rstrack.images.line_poses import Exposure
+from rstrack.images.pyramid import camera_rays, color_image
+from rstrack.options import Options
+
+# Seconds before the first and after the last line for which a stretch has spline: times move while they are estimated.
+_MARGIN_S = 0.03
+# What the colour camera may be further away than the file says, m.
+_BASELINE_M = 0.01
+# References of a stretch: at these parts of it.
+_REFERENCES = (1.0 / 6.0, 0.5, 5.0 / 6.0)
+_ROUNDS = 6
+
+
+def pair_terms(e: Engine, dataset: Dataset) -> PairTerms:
+    """The kernels of a dataset's rig."""
+    rig = dataset.rig
+    rays = _rays(rig.depth_camera)
+    on_device = e.upload(rays[..., 0]), e.upload(rays[..., 1])
+    depth, color = pair_lens(rig.depth_camera, rig.depth_shutter), pair_lens(rig.color_camera, rig.color_shutter)
+    return PairTerms(e, depth, color, on_device)
+
+
+def load_stretch(
+    terms: PairTerms, dataset: Dataset, frames: Sequence[int], track: Spline, p: Parameters, options: Options
+) -> Stretch:
+    """Frames of a dataset, with a spline like that of the track but with knots as the options want them.
+
+    Raises UserError: an image that cannot be read.
+    """
+    references = tuple(sorted({min(len(frames) - 1, int(part * len(frames))) for part in _REFERENCES}))
+    views = [_view(terms, dataset, k, i in references, options.max_depth) for i, k in enumerate(frames)]
+    begin, end = span([taken for v in views for taken in (v.depth, v.color) if taken is not None], p)
+    knot_s = options.knot_spacing_s
+    t0 = begin - _MARGIN_S - options.knot_phase * knot_s
+    count = int(np.ceil((end + _MARGIN_S - t0) / knot_s)) + 3
+    return Stretch(views, references, like(track, t0, knot_s, count))
+
+
+def like(track: Spline, t0: float, dt: float, count: int) -> Spline:
+    """A spline of `count` control points through the poses of another, which goes on with constant velocity."""
+    knots = t0 + (np.arange(count) - 1) * dt
+    inside = np.clip(knots, track.t_begin, track.t_end)
+    poses, velocity = track.pose_and_velocity(inside)
+    return through(poses @ se3.exp((knots - inside)[:, None] * velocity), t0, dt)
+
+
+def through(poses: FloatArray, t0: float, dt: float) -> Spline:
+    """The spline that passes at its knots through poses (n, 4, 4), but for the first and the last.
+
+    Cubic B-splines blur a little what their control points are laid through: a few rounds of correction.
+    """
+    wanted = se3.orthonormalise(poses)
+    points = wanted
+    knots = t0 + (np.arange(len(poses))[1:-1] - 1) * dt
+    for _ in range(_ROUNDS):
+        off = se3.log(wanted[1:-1] @ se3.inverse(Spline(points, t0, dt).pose(knots)))
+        points = np.concatenate([wanted[:1], se3.orthonormalise(se3.exp(off) @ points[1:-1]), wanted[-1:]])
+    return Spline(points, t0, dt)
+
+
+def _view(terms: PairTerms, dataset: Dataset, k: int, is_reference: bool, max_depth: float) -> View:
+    e, rig = terms.e, dataset.rig
+    z = dataset.images.depth(k)
+    rho = averaged(np.divide(np.float32(1.0), z, out=np.zeros_like(z), where=(z > 0.0) & (z < max_depth)))
+    z = np.divide(np.float32(1.0), rho, out=np.zeros_like(z), where=rho > 0.0)
+    depth = Taken(terms.depth, float(dataset.stamps[k]), rig.depth_shutter.exposure_s, True)
+    view = View(depth, e.upload(z))
+    if dataset.groups[k]:
+        i = dataset.groups[k][0]
+        color = dataset.images.color(i)
+        exposure = Exposure(terms.color, 0.0, np.eye(4))
+        levels = color_image(e, exposure, color).levels
+        view.color = Taken(terms.color, float(dataset.color_stamps[i]), rig.color_shutter.exposure_s, False)
+        view.levels = levels
+    if is_reference:
+        camera, baseline = rig.depth_camera, _BASELINE_M + float(np.linalg.norm(rig.T_color_depth[:3, 3]))
+        view.surface = surface_of(e, rho, _rays(camera), camera.fx, camera.fy, baseline)
+        if view.color is not None:
+            grey = np.asarray(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), np.float32) / np.float32(255.0)
+            view.bound = intensity_bound(grey, rig.color_camera.fx, view.surface.median_depth)
+    return view
+
+
+def _rays(camera: Camera) -> FloatArray:
+    return camera_rays(Exposure(pair_lens(camera, Shutter()), 0.0, np.eye(4)))

@@ -1,0 +1,226 @@
+"""What a calibration found: as text, as JSON, and as a camera file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from rsgen.array_types import BoolArray, FloatArray
+from rsgen.geometry import se3
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Scan, Shutter
+from rsgen.geometry.spline import Spline
+from rstrack.calibration.parameters import NAMES, Parameters
+from rstrack.calibration.solve import Solution
+from rstrack.data.dataset import Dataset
+
+_OPPOSITE: dict[str, Scan] = {
+    "top-bottom": "bottom-top", "bottom-top": "top-bottom", "left-right": "right-left", "right-left": "left-right",
+}  # fmt: skip
+# Name on the screen, unit and factor of each unknown.
+_SHOWN = (
+    ("depth readout", "ms", 1e3), ("colour readout", "ms", 1e3), ("colour offset", "ms", 1e3),
+    ("colour drift", "ppm", 1e6), *((f"colour from depth, {axis}", "mm", 1e3) for axis in "xyz"),
+    *((f"colour from depth, about {axis}", "deg", float(np.degrees(1.0))) for axis in "xyz"),
+)  # fmt: skip
+# What each needs to be told.
+_NEEDS = (
+    "turning and shaking in front of surfaces that lie at many angles", "turning and shaking in front of texture",
+    "motion that changes", "some ten seconds of motion that changes",
+    *(("turning about two axes in front of near and far texture",) * 3), *(("turning about two axes",) * 3),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Mean speeds in the stretches that were used, m/s and rad/s, and the changes of the latter, rad/s²."""
+
+    speed: float
+    rotation: float
+    change: float
+
+    def text(self) -> str:
+        """In plain words."""
+        return (
+            f"this recording moves at {self.speed:.2f} m/s and turns at {np.degrees(self.rotation):.1f} deg/s, which "
+            f"changes by {np.degrees(self.change):.0f} deg/s a second"
+        )
+
+
+def motion_of(dataset: Dataset, parts: Sequence[range], track: Spline) -> Motion:
+    """Of the stretches of frames that were used, by the track."""
+    stamps = np.concatenate([dataset.stamps[part.start : part.stop] for part in parts])
+    v, a = track.velocity(stamps), track.acceleration(stamps)
+    means = [float(np.linalg.norm(x, axis=1).mean()) for x in (v[:, :3], v[:, 3:], a[:, 3:])]
+    return Motion(*means)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """start: the values before; asked (10,): which might change; parts: the stretches of frames that told."""
+
+    dataset: Dataset
+    start: Parameters
+    solution: Solution
+    asked: BoolArray
+    parts: tuple[range, ...]
+    motion: Motion
+    seconds: float
+
+    @property
+    def undetermined(self) -> BoolArray:
+        """Which (10,) were asked for but are not told by this recording: they have the values that they had."""
+        return self.asked & ~self.solution.free
+
+    @property
+    def values(self) -> Parameters:
+        """The values found."""
+        return self.solution.values
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """Their standard errors (10,); NaN where undetermined, 0 where not asked for."""
+        return np.where(self.undetermined, np.nan, self.solution.sigmas)
+
+    def calibrated(self) -> Dataset:
+        """The dataset with these cameras."""
+        found, rig = self._upright(), self.dataset.rig
+        scans = self._scans()
+        rig = replace(
+            rig,
+            depth_shutter=replace(rig.depth_shutter, readout_s=found.depth_readout_s, scan=scans[0]),
+            color_shutter=replace(rig.color_shutter, readout_s=found.color_readout_s, scan=scans[1]),
+            T_color_depth=found.T_color_depth,
+        )
+        return replace(self.dataset, rig=rig).with_color_offset(found.color_offset_s, drift=found.color_drift)
+
+    def text(self) -> str:
+        """A table of the values with their σ, what could not be told and why, and what comes with it."""
+        moved, sigmas = self.values.since(self.start), self.sigmas
+        absolute = _absolute(self.values)
+        lines = [f"{'':<28}{'found':>10}   {'2 sigma':>9}   {'from':>10}"]
+        for i, (name, unit, factor) in enumerate(_SHOWN):
+            if not self.asked[i]:
+                continue
+            before = factor * (absolute[i] - moved[i]) if i < 4 else factor * _absolute(self.start)[i]
+            if self.undetermined[i]:
+                lines.append(f"{name:<28}{factor * absolute[i]:>10.3f}   undetermined: needs {_NEEDS[i]}")
+            else:
+                found = f"{factor * absolute[i]:>10.3f} ± {2.0 * factor * sigmas[i]:>9.3f}"
+                lines.append(f"{name:<28}{found}   {before:>10.3f} {unit}")
+        if self.undetermined.any():
+            lines.append(self.motion.text())
+        lines += self._notes()
+        lines.append(
+            f"from {len(self.parts)} stretches of {len(self.parts[0])} frames in {self.seconds:.0f} s; residuals "
+            f"{1e3 * self.solution.sigma_depth_m:.2f} mm and {self.solution.sigma_intensity:.4f} of intensity"
+        )
+        return "\n".join(lines)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON: values in SI units; sigma None where undetermined."""
+        sigmas = self.sigmas
+        absolute, before = _absolute(self.values), _absolute(self.start)
+        shares = self.solution.shares
+        return {
+            "parameters": {
+                name: {
+                    "value": float(absolute[i]), "start": float(before[i]),
+                    "sigma": None if np.isnan(sigmas[i]) else float(sigmas[i]),
+                    "state": "undetermined" if self.undetermined[i] else "found",
+                    "told_by_stretch": np.round(shares[:, i], 4).tolist(),
+                }
+                for i, name in enumerate(NAMES) if self.asked[i]
+            },
+            "T_color_depth": self.values.T_color_depth.tolist(),
+            "stretches": [[part.start, part.stop] for part in self.parts],
+            "motion": {"m_s": self.motion.speed, "rad_s": self.motion.rotation, "rad_s2": self.motion.change},
+            "sigma_depth_m": self.solution.sigma_depth_m, "sigma_intensity": self.solution.sigma_intensity,
+            "finished": self.solution.finished, "seconds": self.seconds,
+            "camera_file": self.camera_file(),
+        }  # fmt: skip
+
+    def camera_file(self) -> str:
+        """A camera.yaml that `rstrack track` takes, with 2 σ beside each value."""
+        rig, found, scans = self.dataset.rig, self._upright(), self._scans()
+        sigmas = self.sigmas
+        names = [f"# rstrack calibrate {self.dataset.name}, {len(self.parts)} stretches; ± is 2 sigma"]
+        names += [f"# {note}" for note in self._notes()]
+        drift = f"\n  drift_ppm: {1e6 * found.color_drift:.3f}{self._beside(3, 1e6, 'ppm', sigmas)}"
+        color = _stream("color", rig.color_camera, rig.color_shutter, found.color_readout_s, scans[1])
+        color += self._beside(1, 1e3, "ms", sigmas)
+        color += f"\n  offset_s: {found.color_offset_s:.7f}{self._beside(2, 1e3, 'ms', sigmas)}"
+        depth = _stream("depth", rig.depth_camera, rig.depth_shutter, found.depth_readout_s, scans[0])
+        depth += self._beside(0, 1e3, "ms", sigmas)
+        scale = self.dataset.depth_scale
+        rows = ["  - [" + ", ".join(f"{x:.12g}" for x in row) + "]" for row in found.T_color_depth]
+        beside = ""
+        if self.asked[4:].any():
+            shown = [f"{_SHOWN[i][0].split(', ')[1]}{self._beside(i, _SHOWN[i][2], _SHOWN[i][1], sigmas)[3:]}"
+                     for i in range(4, 10)]  # fmt: skip
+            beside = "  # " + ", ".join(shown)
+        return "\n".join([
+            *names, color + (drift if found.color_drift else ""), depth + f"\n  depth_scale: {scale:g}",
+            f"T_color_depth:{beside}", *rows, "",
+        ])  # fmt: skip
+
+    def _beside(self, i: int, factor: float, unit: str, sigmas: FloatArray) -> str:
+        if not self.asked[i]:
+            return ""
+        if self.undetermined[i]:
+            return "  # undetermined, kept"
+        return f"  # ± {2.0 * factor * sigmas[i]:.3g} {unit}"
+
+    def _scans(self) -> tuple[Scan, Scan]:
+        """Of depth and colour; the opposite of what was assumed where the readout turned out negative."""
+        rig, p = self.dataset.rig, self.values
+        pairs = (rig.depth_shutter, p.depth_readout_s), (rig.color_shutter, p.color_readout_s)
+        depth, color = (_OPPOSITE[s.scan] if readout < 0.0 else s.scan for s, readout in pairs)
+        return depth, color
+
+    def _upright(self) -> Parameters:
+        """The values for `_scans`: stamps belong to the line that is read first."""
+        p, rig = self.values, self.dataset.rig
+        last = [1.0 - 1.0 / s.line_count(c) for s, c in ((rig.depth_shutter, rig.depth_camera),
+                                                       (rig.color_shutter, rig.color_camera))]  # fmt: skip
+        late = min(0.0, p.color_readout_s) * last[1] - min(0.0, p.depth_readout_s) * last[0]
+        return replace(
+            p, depth_readout_s=abs(p.depth_readout_s), color_readout_s=abs(p.color_readout_s),
+            color_offset_s=p.color_offset_s + late,
+        )  # fmt: skip
+
+    def _notes(self) -> list[str]:
+        """What a user should know of the clocks and the directions."""
+        notes = []
+        for name, scan, before, readout, sigma in zip(
+            ("depth", "colour"), self._scans(), (self.dataset.rig.depth_shutter, self.dataset.rig.color_shutter),
+            (self.values.depth_readout_s, self.values.color_readout_s), self.sigmas[:2], strict=True,
+        ):  # fmt: skip
+            if scan != before.scan:
+                notes.append(f"{name} is read {scan}, not {before.scan}")
+            elif sigma > 0.0 and abs(readout) < 2.0 * sigma:
+                notes.append(f"{name} has a global shutter, as far as can be told")
+        if self.asked[2]:
+            notes.append("a delay of both streams alike cannot be told from images: offsets are against depth's stamps")
+        if not self.solution.finished:
+            notes.append("interrupted before it had converged")
+        return notes
+
+
+def _absolute(p: Parameters) -> FloatArray:
+    """The values (10,) as they are shown: the extrinsics by position and rotation vector of T_color_depth."""
+    T = p.T_color_depth
+    clocks = p.depth_readout_s, p.color_readout_s, p.color_offset_s, p.color_drift
+    return np.concatenate([clocks, T[:3, 3], se3.log(T)[3:]])
+
+
+def _stream(name: str, camera: Camera, shutter: Shutter, readout_s: float, scan: Scan) -> str:
+    K = ", ".join(f"{x:.10g}" for x in (camera.fx, camera.fy, camera.cx, camera.cy))
+    lines = [f"{name}:", f"  width: {camera.width}", f"  height: {camera.height}", f"  intrinsics: [{K}]"]
+    if camera.model != "pinhole":
+        lines += [f"  model: {camera.model}", f"  distortion: [{', '.join(f'{x:.10g}' for x in camera.distortion)}]"]
+    lines += [f"  exposure_s: {shutter.exposure_s:g}", f"  scan: {scan}", f"  readout_s: {readout_s:.7f}"]
+    return "\n".join(lines)

@@ -1,0 +1,189 @@
+"""Calibrate a recording's cameras from the recording itself.
+
+found = calibrate(open_dataset(Path("recording")))
+print(found.text())
+found.write(Path("camera.yaml"))
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from rsgen.array_types import BoolArray
+from rsgen.console.progress import Progress, no_progress
+from rsgen.device.arrays import engine
+from rsgen.errors import UserError
+from rsgen.geometry.shutter import Scan
+from rsgen.geometry.spline import Spline
+from rstrack.calibration.first_track import Track, first_track
+from rstrack.calibration.load import load_stretch, pair_terms
+from rstrack.calibration.pair_terms import PairTerms
+from rstrack.calibration.parameters import GROUPS, USEFUL, Parameters, free_of
+from rstrack.calibration.result import Calibration, motion_of
+from rstrack.calibration.solve import Solution, solve
+from rstrack.calibration.stretch import Stretch
+from rstrack.data.dataset import Dataset
+from rstrack.options import Options
+
+# Frames of a stretch, the fewest that one may have, and how many stretches there are at least and at most.
+_FRAMES, _FEWEST_FRAMES, _FEWEST, _MOST = 30, 14, 3, 12
+# Seconds over which colour's clock must be seen for its drift to be asked for.
+_DRIFT_S = 4.0
+# Stretches that short recordings are cut into.
+_SEVERAL = 6
+# Part of the largest σ, over what is of use, from which on parameters are held together.
+_DRAGS = 0.5
+_LEVELS = (2, 1, 0)
+# Ways in which images may be read, and stretches with which they are tried.
+_AXES: tuple[Scan, ...] = ("top-bottom", "left-right")
+_TRIED = 4
+# For the progress bar.
+_ABOUT_STEPS = 20
+
+
+def calibrate(
+    dataset: Dataset, groups: Sequence[str] | None = None, frames: slice = slice(None), options: Options | None = None,
+    progress: Progress = no_progress,
+) -> Calibration:  # fmt: skip
+    """Readouts, colour's clock and extrinsics of a dataset, from the values of its cameras on.
+
+    groups: of GROUPS, what may change; all by default, but extrinsics where depth is registered to colour. Where Ctrl-C
+    is pressed, the best so far is returned, marked so. Raises UserError: too few frames, no track by depth alone,
+    unknown groups, an image that cannot be read.
+    """
+    begun = time.perf_counter()
+    options = options or Options()
+    groups = _usual(dataset) if groups is None else groups
+    _check(dataset, groups, frames)
+    chosen = range(len(dataset))[frames]
+    engine(options.backend)  # before anything else imports Dr.Jit, which then would choose a libLLVM itself
+    start = parameters_of(dataset)
+    track = first_track(dataset, chosen, options, progress)
+    parts = _stretches(dataset, chosen, track)
+    free = _free(dataset, groups, parts)
+    if not dataset.scan_named and "readout" in groups:
+        dataset = _oriented(dataset, parts, track.spline, start, options, progress)
+    terms, stretches = _loaded(dataset, parts, track.spline, start, options, progress)
+    solution = _solved(stretches, terms, start, free, progress)
+    motion = motion_of(dataset, parts, track.spline)
+    return Calibration(dataset, start, solution, free, tuple(parts), motion, time.perf_counter() - begun)
+
+
+def _loaded(
+    dataset: Dataset, parts: Sequence[range], track: Spline, start: Parameters, options: Options, progress: Progress
+) -> tuple[PairTerms, list[Stretch]]:
+    base = dataset.with_color_offset(0.0, drift=0.0)
+    terms, stretches = pair_terms(engine(options.backend), base), []
+    for n, part in enumerate(parts):
+        progress("calibrating", 0.15 * n / len(parts), "reading images")
+        stretches.append(load_stretch(terms, base, part, track, start, options))
+    return terms, stretches
+
+
+def _oriented(
+    dataset: Dataset, parts: Sequence[range], track: Spline, start: Parameters, options: Options, progress: Progress
+) -> Dataset:
+    """The dataset with images that are read by rows or by columns, whichever fits better.
+
+    Which of the two ways round is told by the readout's sign.
+    """
+    few = parts[:: -(-len(parts) // _TRIED)]
+    free, found = free_of(("readout", "offset")), []
+    free[3] = False
+    for count, scan in enumerate(_AXES):
+        progress("scan direction", count / len(_AXES), scan)
+        rig = dataset.rig
+        shutters = [replace(shutter, scan=scan) for shutter in (rig.depth_shutter, rig.color_shutter)]
+        turned = replace(dataset, rig=replace(rig, depth_shutter=shutters[0], color_shutter=shutters[1]))
+        terms, stretches = _loaded(turned, few, track, start, options, no_progress)
+        found.append((solve(stretches, terms, start, free, _LEVELS[:-1]).cost, turned))
+    progress("scan direction", 1.0, "")
+    return min(found, key=lambda each: each[0])[1]
+
+
+def parameters_of(dataset: Dataset) -> Parameters:
+    """The values that a dataset's camera file has."""
+    rig = dataset.rig
+    offset = 0.0 if dataset.timing is None else dataset.timing.color_offset_s or 0.0
+    readouts = rig.depth_shutter.readout_s, rig.color_shutter.readout_s
+    return Parameters(*readouts, offset, dataset.color_drift, rig.T_color_depth, dataset.middle)
+
+
+def _solved(
+    stretches: Sequence[Stretch], terms: PairTerms, file: Parameters, free: BoolArray, progress: Progress
+) -> Solution:
+    """From the file's values on. With all that may change; then without what this recording turns out not to tell, until
+    the rest is told."""
+    levels: Sequence[int] = _LEVELS
+    start, done = file, 0
+
+    def watch(level: int, _: int, p: Parameters) -> None:
+        nonlocal done
+        done += 1
+        note = f"readouts {1e3 * p.depth_readout_s:.2f} and {1e3 * p.color_readout_s:.2f} ms"
+        progress("calibrating", min(0.98, 0.15 + 0.85 * done / _ABOUT_STEPS), note)
+
+    while True:
+        solution = solve(stretches, terms, start, free, levels, watch)
+        unsure = solution.sigmas / USEFUL
+        if unsure.max() <= 1.0 or not solution.finished:
+            progress("calibrating", 1.0, "done")
+            return solution
+        # What is told least drags others along: they may be told once it is held.
+        free = free & (unsure <= max(1.0, _DRAGS * unsure.max()))
+        start = file.moved(np.where(free, solution.values.since(file), 0.0))
+        levels = (0,)
+
+
+def _stretches(dataset: Dataset, chosen: range, track: Track) -> list[range]:
+    """Frames in a row that were followed, with colour images; of many those that move most."""
+    runs = track.frames(dataset, chosen)
+    total = sum(len(run) for run in runs)
+    size = min(_FRAMES, max(_FEWEST_FRAMES, total // _SEVERAL))
+    parts = [run[i : i + size] for run in runs for i in range(0, len(run) - size + 1, size)]
+    parts = [part for part in parts if sum(bool(dataset.groups[k]) for k in part) >= _FEWEST_FRAMES // 2]
+    if len(parts) < _FEWEST:
+        raise UserError(
+            f"{dataset.root}: {total} frames only can be followed in a row, too few to calibrate from: choose --frames "
+            "with more to see"
+        )
+    by_motion = sorted(parts, key=lambda part: _motion(dataset, part, track.spline), reverse=True)
+    return sorted(by_motion[:_MOST], key=lambda part: part.start)
+
+
+def _motion(dataset: Dataset, part: range, track: Spline) -> float:
+    """How fast points a metre and a half away move, m/s, in the mean."""
+    twist = track.velocity(dataset.stamps[part.start : part.stop])
+    return float((np.linalg.norm(twist[:, :3], axis=1) + 1.5 * np.linalg.norm(twist[:, 3:], axis=1)).mean())
+
+
+def _free(dataset: Dataset, groups: Sequence[str], parts: Sequence[range]) -> BoolArray:
+    """What may change (10,): drift only where colour's clock is seen for long enough."""
+    free = free_of(groups)
+    free[3] &= dataset.stamps[parts[-1].stop - 1] - dataset.stamps[parts[0].start] >= _DRIFT_S
+    return free
+
+
+def _usual(dataset: Dataset) -> tuple[str, ...]:
+    """What can be told of a recording: of registered depth, which the driver has moved, nothing about where it was."""
+    rig = dataset.rig
+    is_registered = rig.depth_camera == rig.color_camera and bool((rig.T_color_depth == np.eye(4)).all())
+    return GROUPS[:2] if is_registered else GROUPS
+
+
+def _check(dataset: Dataset, groups: Sequence[str], frames: slice) -> None:
+    unknown = [group for group in groups if group not in GROUPS]
+    if unknown or not groups:
+        raise UserError(f"--free {','.join(unknown)}: choose one or more of {', '.join(GROUPS)}")
+    count = len(range(len(dataset))[frames])
+    needed = _FEWEST * _FEWEST_FRAMES
+    if count < needed:
+        raise UserError(
+            f"{dataset.root}: {count} frames are too few to calibrate from: {needed} or more are needed, 300 are good"
+        )
+    if not any(dataset.groups[k] for k in range(len(dataset))[frames]):
+        raise UserError(f"{dataset.root}: these frames have no colour images, which clocks and extrinsics are told by")

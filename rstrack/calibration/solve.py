@@ -1,0 +1,129 @@
+"""The joint solution: parameters that all stretches share, control points of each its own, and how sure that is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import stats
+
+from rsgen.array_types import BoolArray, FloatArray
+from rstrack.alignment.acceleration import Acceleration
+from rstrack.calibration.pair_terms import PairTerms
+from rstrack.calibration.parameters import COUNT, PRIOR, Parameters
+from rstrack.calibration.stretch import Stretch, Sums
+
+# Steps at most on the pyramid's levels, finest first, and part of the formal σ that ends a level.
+_MOST_STEPS, _SMALL = (8, 10, 15), (1.0, 5.0, 10.0)
+# About how many times too large the normal equations' information is: a frame counts in several pairs, and pixels are
+# not independent. For the prior's share only; what is said of σ is measured.
+_COUNTED = 25.0
+# Stretches that what is known of all unknowns together counts for, beside the scatter of one.
+_POOLED = 4.0
+# Times that the scales of errors are estimated before the first step, at the coarsest level; once at the others.
+_ROUNDS = 3
+
+Watch = Callable[[int, int, Parameters], None]
+"""Told the level, the step and the values; may raise KeyboardInterrupt."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """values; normal equations of the free parameters at them: A (s, n, n), b (s, n) of the s stretches, free (10,).
+
+    cost: negative log-likelihood a pixel. sigma_depth_m, sigma_intensity: of the residuals, medians.
+    """
+
+    values: Parameters
+    free: BoolArray
+    A: FloatArray
+    b: FloatArray
+    cost: float
+    sigma_depth_m: float
+    sigma_intensity: float
+    finished: bool = True
+    start: Parameters | None = field(default=None, repr=False)
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """Standard errors (10,) as the scatter of the stretches shows them; 0 of what is not free.
+
+        At the solution the stretches' gradients add up to nothing; how far each is from nothing tells how far the next
+        recording's solution may lie (the "sandwich" of White, Econometrica 1980, by clusters, of which a stretch is
+        one). With few stretches one parameter's scatter says little, so that of all counts too, and Student's factor
+        makes two of these σ hold 95 %.
+        """
+        count, n = self.b.shape
+        inverse = np.linalg.pinv(self.A.sum(axis=0), hermitian=True)
+        formal = np.maximum(np.diag(inverse), 0.0)
+        scatter = self.b - self.b.mean(axis=0)
+        spread = np.diag(inverse @ (scatter.T @ scatter) @ inverse) * count / max(1, count - 1)
+        ratio = np.divide(spread, formal, out=np.ones(n), where=formal > 0.0)
+        all_of_them = np.exp(np.mean(np.log(np.maximum(ratio, 1e-6)))) if n else 1.0
+        dof = max(1.0, count - 1.0)
+        inflation = np.maximum((_POOLED * all_of_them + dof * ratio) / (_POOLED + dof), 1.0)
+        factor = float(stats.t.ppf(0.975, dof + _POOLED)) / 1.96
+        sigmas = np.zeros(COUNT)
+        sigmas[self.free] = factor * np.sqrt(formal * inflation)
+        return sigmas
+
+    @property
+    def shares(self) -> FloatArray:
+        """Part (s, 10) of what is known of each parameter that each stretch tells, all others known."""
+        own = np.einsum("snn->sn", self.A)
+        shares = np.zeros((len(own), COUNT))
+        shares[:, self.free] = own / np.maximum(own.sum(axis=0), 1e-300)
+        return shares
+
+
+def solve(
+    stretches: Sequence[Stretch], terms: PairTerms, start: Parameters, free: BoolArray, levels: Sequence[int],
+    watch: Watch = lambda *_: None,
+) -> Solution:  # fmt: skip
+    """Parameters and all control points jointly, coarse to fine; the stretches' splines are moved.
+
+    free (10,): which parameters may change; the others stay at `start`, to which weak ones are held by PRIOR. Where
+    `watch` raises KeyboardInterrupt, what has been found so far is returned, `finished` False. Raises
+    numpy.linalg.LinAlgError where images say nothing at all.
+    """
+    p, acceleration, finished = start, Acceleration(), True
+    try:
+        for level in levels:
+            for stretch in stretches:
+                for _ in range(_ROUNDS if level else 1):
+                    stretch.sums(terms, p, level)
+            acceleration.forget()
+            for n in range(_MOST_STEPS[level]):
+                watch(level, n, p)
+                sums = [stretch.sums(terms, p, level) for stretch in stretches]
+                step, information = _step(sums, p, start, free, acceleration)
+                for stretch, one in zip(stretches, sums, strict=True):
+                    stretch.move(one.points_step(step))
+                p = p.moved(step)
+                if (step[free] ** 2 * np.diag(information) < _SMALL[level] ** 2).all():
+                    break
+    except KeyboardInterrupt:
+        finished = False
+    sums = [stretch.sums(terms, p, levels[-1]) for stretch in stretches]
+    reduced = [one.reduced() for one in sums]
+    A = np.array([one[np.ix_(free, free)] for one, _ in reduced])
+    depth, intensity = np.median([stretch.sigma for stretch in stretches], axis=0)
+    cost = sum(one.cost for one in sums) / max(1, sum(one.pixels for one in sums))
+    b = np.array([one[free] for _, one in reduced])
+    return Solution(p, free, A, b, cost, float(depth), float(intensity), finished, start)
+
+
+def _step(
+    sums: Sequence[Sums], p: Parameters, start: Parameters, free: BoolArray, acceleration: Acceleration
+) -> tuple[FloatArray, FloatArray]:
+    """The step (10,) of the parameters, and what is known of the free ones."""
+    reduced = [one.reduced() for one in sums]
+    prior = _COUNTED / PRIOR[free] ** 2
+    at = p.since(start)[free]
+    information = np.sum([A for A, _ in reduced], axis=0)[np.ix_(free, free)] + np.diag(prior)
+    gradient = np.sum([b for _, b in reduced], axis=0)[free] + prior * at
+    step = np.zeros(COUNT)
+    if free.any():
+        step[free] = acceleration.extrapolated(at, -np.linalg.solve(information, gradient), information)
+    return step, information

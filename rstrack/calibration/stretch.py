@@ -1,0 +1,199 @@
+"""One stretch of a recording: its own piece of spline, and what its images say of that and of the parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from rsgen.array_types import FloatArray
+from rsgen.geometry import se3
+from rsgen.geometry.spline import Spline
+from rstrack.alignment.block_sums import BlockSums, BrightnessSums
+from rstrack.alignment.brightness import SAME
+from rstrack.alignment.priors import acceleration_prior, pose_constraint
+from rstrack.alignment.student_t import scale_step
+from rstrack.calibration.images import Lines, Taken, lines_of
+from rstrack.calibration.pair_terms import FLOOR_DEPTH, FLOOR_INTENSITY, PairTerms, Surface
+from rstrack.calibration.parameters import COUNT, Parameters
+
+# σ of accelerations (m/s², rad/s²): the tracker's, see `tracking.window`; the ends, which few lines touch, are held
+# more tightly.
+_ACCELERATION = np.array([15.0, 15.0, 15.0, 30.0, 30.0, 30.0])
+_ENDS, _END_FACTOR = 2, 0.1
+_GAUGE = np.full(6, 1e-6)
+# σ at the start, m and intensity, and of gain and offset of an image against another.
+START_DEPTH, START_INTENSITY = 5e-3, 0.03
+_BRIGHTNESS = np.array([0.3, 0.15])
+
+
+@dataclass
+class View:
+    """A frame on the device: its depth, the colour image that goes with it (if any), and as a reference its surface.
+
+    levels: intensities of the pyramid's levels, NaN where they tell nothing. bound: see `intensity_bound`.
+    """
+
+    depth: Taken
+    z: object
+    color: Taken | None = None
+    levels: tuple[object, ...] = ()
+    surface: Surface | None = None
+    bound: float = 1.0
+
+
+@dataclass(frozen=True)
+class Sums:
+    """What a stretch says at some spline and parameters, as least squares: H, g over [control points, parameters].
+
+    cost: negative log-likelihood but for its constant; pixels: that were compared.
+    """
+
+    H: FloatArray
+    g: FloatArray
+    cost: float
+    pixels: int
+
+    def reduced(self) -> tuple[FloatArray, FloatArray]:
+        """A (10, 10) and b (10,) of the parameters alone: the control points are what the images then make of them."""
+        x = len(self.g) - COUNT
+        solved = np.linalg.solve(self.H[:x, :x], np.column_stack([self.H[:x, x:], self.g[:x]]))
+        A = self.H[x:, x:] - self.H[x:, :x] @ solved[:, :COUNT]
+        b = self.g[x:] - self.H[x:, :x] @ solved[:, COUNT]
+        return np.asarray(0.5 * (A + A.T)), b
+
+    def points_step(self, step: FloatArray) -> FloatArray:
+        """Increments (k, 6) of the control points that go with a step (10,) of the parameters."""
+        x = len(self.g) - COUNT
+        moved = np.linalg.solve(self.H[:x, :x], self.g[:x] + self.H[:x, x:] @ step)
+        return np.asarray(-moved.reshape(-1, 6))
+
+
+@dataclass
+class Stretch:
+    """Views in order of time, those that are references, and the spline T_world_depth(t) that covers them all.
+
+    sigma: of depth (m) and of intensity. brightness: gain and offset of each pair (view, reference).
+    """
+
+    views: list[View]
+    references: tuple[int, ...]
+    spline: Spline
+    sigma: tuple[float, float] = (START_DEPTH, START_INTENSITY)
+    brightness: dict[tuple[int, int], FloatArray] = field(default_factory=dict)
+
+    def sums(self, terms: PairTerms, p: Parameters, level: int) -> Sums:
+        """Around the current spline; re-estimates σ and brightness on the way."""
+        size = 6 * len(self.spline.control_points) + COUNT
+        H, g = np.zeros((size, size)), np.zeros(size)
+        depths = [lines_of(view.depth, self.spline, p) for view in self.views]
+        colors = [None if view.color is None else lines_of(view.color, self.spline, p) for view in self.views]
+        weighted, counted, cost = np.zeros(2), np.zeros(2, int), 0.0
+        for kind, pair, sums, current, reference, T_base_world in self._pairs(terms, p, level, depths, colors):
+            sigma = self.sigma[kind]
+            J, used = _slopes(sums, current, reference, T_base_world)
+            flat = J.reshape(-1, J.shape[2])
+            own = flat.T @ (sums.H[used] @ J).reshape(-1, J.shape[2]) / sigma**2
+            own_g = flat.T @ sums.g[used].ravel() / sigma
+            if sums.brightness is not None:
+                coupling = flat.T @ sums.brightness.coupling[used].reshape(len(flat), 2) / sigma**2
+                own, own_g = self._without_brightness(pair, sums.brightness, own, own_g, coupling, sigma)
+            _add(H, g, own, own_g, current, reference)
+            weighted[kind] += sums.weighted
+            counted[kind] += sums.count
+            cost += sums.cost + sums.count * np.log(sigma)
+        self._add_priors(H, g, p)
+        floors = FLOOR_DEPTH, FLOOR_INTENSITY
+        found = [scale_step(self.sigma[k], weighted[k], int(counted[k]), floors[k]) for k in range(2)]
+        self.sigma = found[0], found[1]
+        return Sums(H, g, cost, int(counted.sum()))
+
+    def move(self, increments: FloatArray) -> None:
+        """T_i ← exp(δ_i) T_i for increments (k, 6) of all control points."""
+        points = se3.orthonormalise(se3.exp(increments) @ self.spline.control_points)
+        self.spline = Spline(points, self.spline.t0, self.spline.dt)
+
+    def _pairs(
+        self, terms: PairTerms, p: Parameters, level: int, depths: Sequence[Lines], colors: Sequence[Lines | None]
+    ) -> Iterator[tuple[int, tuple[int, int], BlockSums, Lines, Lines, FloatArray]]:
+        """Kind (0 depth, 1 colour), pair, sums, lines of the current image and the reference's, T_base_world."""
+        waiting = []
+        for r in self.references:
+            ref, surface = self.views[r], self.views[r].surface
+            assert surface is not None
+            T_base_world = se3.inverse(self.spline.pose(ref.depth.mid_time(p)))
+            ref_to_base, ref_from_base = depths[r].to_base(T_base_world), depths[r].from_base(T_base_world)
+            ref_color = colors[r]
+            color_from_base = None if ref_color is None else ref_color.from_base(T_base_world)
+            for k, view in enumerate(self.views):
+                if k == r:
+                    continue
+                to_base = depths[k].to_base(T_base_world)
+                started = terms.by_depth(view.z, surface, to_base, ref_from_base, self.sigma[0], level)
+                waiting.append((0, (k, r), started, depths[k], depths[r], T_base_world))
+                color = colors[k]
+                if color is None or ref_color is None or color_from_base is None:
+                    continue
+                started = terms.by_color(
+                    (view.levels[level], ref.levels[level]), surface, ref_to_base, color.from_base(T_base_world),
+                    color_from_base, ref.bound, self.brightness.get((k, r), SAME), self.sigma[1], level,
+                )  # fmt: skip
+                waiting.append((1, (k, r), started, color, ref_color, T_base_world))
+            # A few at a time: the device works ahead while their sums are chained.
+            for kind, pair, started, current, reference, T in waiting:
+                yield kind, pair, started(), current, reference, T
+            waiting.clear()
+
+    def _without_brightness(
+        self, pair: tuple[int, int], sums: BrightnessSums, H: FloatArray, g: FloatArray, coupling: FloatArray,
+        sigma: float,
+    ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+        """The system without this pair's gain and offset, which take their next values; coupling (m, 2)."""
+        at, prior = self.brightness.get(pair, SAME), 1.0 / _BRIGHTNESS**2
+        own, own_g = sums.H / sigma**2 + np.diag(prior), sums.g / sigma + prior * at
+        solved = np.linalg.solve(own, np.column_stack([own_g, coupling.T]))
+        self.brightness[pair] = np.clip(at - solved[:, 0], -0.7, 2.0)
+        return H - coupling @ solved[:, 1:], g - coupling @ solved[:, 0]
+
+    def _add_priors(self, H: FloatArray, g: FloatArray, p: Parameters) -> None:
+        count = len(self.spline.control_points)
+        sigma = np.repeat(_ACCELERATION[None] * self.spline.dt**2, count - 2, axis=0)
+        sigma[:_ENDS] *= _END_FACTOR
+        sigma[-_ENDS:] *= _END_FACTOR
+        t = self.views[self.references[len(self.references) // 2]].depth.mid_time(p)
+        for model, _ in (
+            acceleration_prior(self.spline, 0, count, sigma),
+            pose_constraint(self.spline, t, self.spline.pose(t), _GAUGE),
+        ):
+            at = slice(6 * model.first, 6 * model.last)
+            H[at, at] += model.H
+            g[at] += model.g
+
+
+def _slopes(
+    sums: BlockSums, current: Lines, reference: Lines, T_base_world: FloatArray
+) -> tuple[FloatArray, tuple[npt.NDArray[np.intp], ...]]:
+    """Derivatives (n, 6, m) of the relative twists of those pairs of blocks that have pixels, and these pairs.
+
+    m: control points of the current image, of the reference, parameters.
+    """
+    used = np.nonzero(np.abs(sums.H).sum(axis=(2, 3)))
+    Ad = se3.adjoint(T_base_world)
+    c, r = (Ad @ lines.by_points for lines in (current, reference))
+    q = Ad @ current.by_parameters, Ad @ reference.by_parameters
+    return np.concatenate([c[used[0]], -r[used[1]], q[0][used[0]] - q[1][used[1]]], axis=2), used
+
+
+def _add(H: FloatArray, g: FloatArray, own: FloatArray, own_g: FloatArray, current: Lines, reference: Lines) -> None:
+    """Add a pair's system, in the columns of `_slopes`, to that of all unknowns."""
+    a, b = current.by_points.shape[2], reference.by_points.shape[2]
+    to = [slice(6 * current.first, 6 * current.first + a), slice(6 * reference.first, 6 * reference.first + b),
+          slice(len(g) - COUNT, len(g))]  # fmt: skip
+    of = [slice(0, a), slice(a, a + b), slice(a + b, a + b + COUNT)]
+    # Images close in time share control points: part by part, since an index that occurs twice is added once only.
+    for i, rows in zip(to, of, strict=True):
+        g[i] += own_g[rows]
+        for j, columns in zip(to, of, strict=True):
+            H[i, j] += own[rows, columns]

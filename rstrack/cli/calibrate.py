@@ -1,0 +1,53 @@
+"""The command `rstrack calibrate`."""
+
+from __future__ import annotations
+
+import sys
+from json import dumps
+from pathlib import Path
+from typing import Annotated
+
+from rsgen.console.command_line import Frames, Json, Quiet
+from rsgen.device.backend import Backend
+from rstrack.cli.options import CameraFile, SequenceFolder
+
+STATUS = "exit status: 0 done, 1 some values are not told by the recording, 2 wrong input, 130 interrupted"
+
+
+def calibrate(
+    sequence: SequenceFolder,
+    *,
+    camera: CameraFile = None,
+    free: Annotated[
+        str | None,
+        "what to estimate, of readout, offset, extrinsics (default: all; depth that is registered to colour has no "
+        "extrinsics)",
+        "NAMES",
+    ] = None,
+    frames: Frames = None,
+    backend: Annotated[Backend, "where kernels run"] = "auto",
+    out: Annotated[Path | None, "camera file to write, for rstrack track --camera", "FILE"] = None,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> int:
+    """Readouts, clocks and extrinsics of a recording's cameras, from the recording alone, with their errors."""
+    from rsgen.console.progress import ProgressDisplay
+    from rsgen.files import atomic_write
+    from rstrack.calibration.run import calibrate as run
+    from rstrack.data.dataset import open_dataset
+    from rstrack.options import Options
+
+    dataset = open_dataset(sequence, camera)
+    with ProgressDisplay(quiet) as progress:
+        groups = None if free is None else tuple(name.strip() for name in free.split(",") if name.strip())
+        found = run(dataset, groups, frames or slice(None), Options(backend=backend), progress)
+    if out is not None:
+        atomic_write(out, found.camera_file().encode())
+    print(dumps(found.as_dict(), indent=2) if json else found.text())
+    if out is not None and not json:
+        print(f"{out}: written (rstrack track {sequence} --camera {out} --out RUN)")
+    sys.stdout.flush()
+    if not found.solution.finished:
+        print("rstrack: interrupted; this is the best so far", file=sys.stderr)
+        return 130
+    return 1 if found.undetermined.any() else 0

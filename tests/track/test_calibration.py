@@ -1,0 +1,292 @@
+"""Calibration out of recordings: derivatives, wrong starts, what is not told, and the file that comes of it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.optimize
+import synthetic
+
+from rsgen.device.arrays import engine
+from rsgen.device.lens import Lens
+from rsgen.errors import UserError
+from rsgen.geometry import se3
+from rsgen.geometry.shutter import Scan, Shutter
+from rsgen.geometry.spline import Spline
+from rstrack.calibration import run as calibration_run
+from rstrack.calibration.images import Taken, lines_of
+from rstrack.calibration.load import like, load_stretch, pair_terms
+from rstrack.calibration.parameters import COUNT, NAMES, PRIOR, Parameters, free_of
+from rstrack.calibration.result import Calibration
+from rstrack.calibration.run import calibrate, parameters_of
+from rstrack.calibration.solve import Solution, solve
+from rstrack.cli.main import main
+from rstrack.data.dataset import Dataset, open_dataset
+from rstrack.options import Options
+
+READOUT_S, RATE_HZ, FRAMES = 0.014, 60.0, 60
+CORNER = se3.exp(np.array([-0.3, -0.1, 0.2, -0.4, 0.65, 0.1]))
+OPTIONS = Options(backend="llvm")
+
+
+def shaking() -> Spline:
+    """T_world_depth over [-0.2, 1.3] s: turned and moved to and fro about all axes, before a corner of the room."""
+    dt, t0 = 0.05, -0.2
+    t = t0 + dt * (np.arange(33) - 1.0)
+    turns = [0.07 * np.sin(9.0 * t), 0.08 * np.cos(11.0 * t), 0.06 * np.sin(13.0 * t)]
+    moves = [0.05 * np.sin(7.0 * t), 0.05 * np.cos(5.0 * t), 0.04 * np.sin(6.0 * t)]
+    return Spline(CORNER @ se3.exp(np.stack([*moves, *turns], axis=-1)), t0, dt)
+
+
+def recording(root: Path, spline: Spline, readout_s: float = READOUT_S, scan: Scan = "top-bottom") -> Dataset:
+    stream = {"rate_hz": RATE_HZ, "readout_s": readout_s, "scan": scan}
+    config = synthetic.make_config(width=160, height=120, color=stream, depth=stream)
+    writer = synthetic.open_writer(root, config, FRAMES, spline)
+    synthetic.write_frames(writer)
+    writer.finish()
+    return open_dataset(root)
+
+
+@pytest.fixture(scope="module")
+def shaken(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return recording(tmp_path_factory.mktemp("calibration") / "seq", shaking())
+
+
+def told(dataset: Dataset, readout_s: float, late_s: float, moved: np.ndarray, scan: Scan = "top-bottom") -> Dataset:
+    """The dataset with cameras of which these are wrong."""
+    rig = dataset.rig
+    rig = replace(
+        rig, depth_shutter=Shutter(readout_s, 0.0, scan), color_shutter=Shutter(readout_s, 0.0, scan),
+        T_color_depth=se3.exp(moved) @ rig.T_color_depth,
+    )  # fmt: skip
+    return replace(dataset, rig=rig, color_stamps=dataset.color_stamps + late_s)
+
+
+# --- derivatives -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("is_depth", [True, False])
+@pytest.mark.parametrize("scan", ["top-bottom", "right-left"])
+def test_lines_move_with_every_parameter_and_control_point_as_finite_differences_say(
+    is_depth: bool, scan: Scan
+) -> None:
+    camera = synthetic.make_config(width=16, height=12).color.camera
+    taken = Taken(Lens(camera, Shutter(1.0, 0.0, scan)), 0.4, 0.006, is_depth)
+    p = Parameters(0.017, 0.021, 0.004, 2e-4, synthetic.T_COLOR_DEPTH, epoch_s=0.1)
+    spline = shaking()
+    lines = lines_of(taken, spline, p)
+    # One line a block: 12 or 16 lines are fewer than there are blocks.
+    assert len(lines.by_parameters) == taken.lens.lines == len(lines.T_world_cam)
+
+    def moved(by: Parameters, along: Spline) -> np.ndarray:
+        return se3.log(lines_of(taken, along, by).T_world_cam @ se3.inverse(lines.T_world_cam))
+
+    for i in range(COUNT):
+        step = np.zeros(COUNT)
+        step[i] = 1e-6
+        numeric = (moved(p.moved(step), spline) - moved(p.moved(-step), spline)) / 2e-6
+        np.testing.assert_allclose(lines.by_parameters[..., i], numeric, atol=1e-6, err_msg=NAMES[i])
+    for column in range(lines.by_points.shape[2]):
+        delta = np.zeros(6)
+        delta[column % 6] = 1e-6
+        at = lines.first + column // 6
+        ends = []
+        for sign in (1.0, -1.0):
+            points = spline.control_points.copy()
+            points[at] = se3.exp(sign * delta) @ points[at]
+            ends.append(moved(p, Spline(points, spline.t0, spline.dt)))
+        np.testing.assert_allclose(lines.by_points[..., column], (ends[0] - ends[1]) / 2e-6, atol=1e-7)
+
+
+def test_the_gradient_changes_along_every_parameter_as_the_normal_equations_say(shaken: Dataset) -> None:
+    terms, p = pair_terms(engine("llvm"), shaken), parameters_of(shaken)
+    assert shaken.truth is not None
+    stretch = load_stretch(terms, shaken, range(4, 20), shaken.truth, p, OPTIONS)
+    for _ in range(4):
+        stretch.sums(terms, p, 0)
+    sigma = stretch.sigma
+    at = stretch.sums(terms, p, 0)
+    for i in (0, 1, 2, 4, 5, 6, 7, 8, 9):
+        step = np.zeros(COUNT)
+        step[i] = 3.0 / np.sqrt(at.H[-COUNT + i, -COUNT + i])
+        ends = []
+        for sign in (1.0, -1.0):
+            stretch.sigma, stretch.brightness = sigma, dict.fromkeys(stretch.brightness, np.zeros(2))
+            ends.append(stretch.sums(terms, p.moved(sign * step), 0))
+        bend = (ends[0].g - ends[1].g)[-COUNT + i] / (2.0 * step[i])
+        assert bend == pytest.approx(at.H[-COUNT + i, -COUNT + i], rel=0.25), NAMES[i]
+
+
+def test_scipy_finds_the_same_offset_by_the_cost_alone(shaken: Dataset) -> None:
+    terms, p = pair_terms(engine("llvm"), shaken), parameters_of(shaken)
+    assert shaken.truth is not None
+    stretches = [load_stretch(terms, shaken, range(4, 20), shaken.truth, p, OPTIONS)]
+    ours = solve(stretches, terms, p, np.arange(COUNT) == 2, (0,))
+    sigma = stretches[0].sigma
+
+    def cost(offset_ms: float) -> float:
+        stretches[0].sigma = sigma
+        tried = replace(p, color_offset_s=1e-3 * offset_ms)
+        return solve(stretches, terms, tried, np.zeros(COUNT, bool), (0,)).cost
+
+    found = scipy.optimize.minimize_scalar(cost, bounds=(-0.4, 0.4), method="bounded", options={"xatol": 2e-3})
+    assert 1e-3 * found.x == pytest.approx(ours.values.color_offset_s, abs=2.5e-5)
+
+
+# --- recordings ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("factor", "late_s"), [(0.0, 0.008), (1.5, -0.008)])
+def test_wrong_cameras_are_put_right(shaken: Dataset, factor: float, late_s: float) -> None:
+    moved = np.array([3e-3, -3e-3, 2e-3, 0.005, -0.004, 0.004])
+    wrong = told(shaken, factor * READOUT_S, late_s, moved)
+    found = calibrate(wrong, options=OPTIONS)
+    p, true = found.values, shaken.rig
+    assert not found.undetermined[[0, 1, 2, 4, 5, 6, 7, 8, 9]].any() and found.solution.finished
+    assert p.depth_readout_s == pytest.approx(READOUT_S, abs=1.5e-4)
+    assert p.color_readout_s == pytest.approx(READOUT_S, abs=1.5e-4)
+    assert p.color_offset_s == pytest.approx(-late_s, abs=1.5e-4)
+    off = se3.log(p.T_color_depth @ se3.inverse(true.T_color_depth))
+    assert np.abs(off[:3]).max() < 1.5e-3 and np.degrees(np.abs(off[3:])).max() < 0.06
+    errors = p.depth_readout_s - READOUT_S, p.color_readout_s - READOUT_S, p.color_offset_s + late_s
+    assert (np.abs(errors) < 5.0 * found.sigmas[:3]).all() and (found.sigmas[:3] < 3e-4).all()
+    assert "±" in found.text() and "undetermined" not in found.text()
+
+
+def test_lines_that_are_read_the_other_way_are_seen_to_be(tmp_path: Path) -> None:
+    upward = recording(tmp_path / "seq", shaking(), scan="bottom-top")
+    found = calibrate(told(upward, 0.004, 0.0, np.zeros(6)), options=OPTIONS)
+    assert found.values.depth_readout_s < 0.0 and found.values.color_readout_s < 0.0
+    right = found.calibrated()
+    for shutter in (right.rig.depth_shutter, right.rig.color_shutter):
+        assert shutter.scan == "bottom-top" and shutter.readout_s == pytest.approx(READOUT_S, abs=2e-4)
+    # Stamps of both streams are those of the line that was thought to be first: alike for both, no offset.
+    assert right.color_stamps == pytest.approx(upward.color_stamps, abs=2e-4)
+    assert "depth is read bottom-top, not top-bottom" in found.text()
+
+
+def test_columns_are_told_from_rows_where_nobody_names_them(tmp_path: Path) -> None:
+    sideways = recording(tmp_path / "seq", shaking(), scan="right-left")
+    found = calibrate(replace(told(sideways, 0.0, 0.0, np.zeros(6)), scan_named=False), ("readout",), options=OPTIONS)
+    for shutter in (found.calibrated().rig.depth_shutter, found.calibrated().rig.color_shutter):
+        assert shutter.scan == "right-left" and shutter.readout_s == pytest.approx(READOUT_S, abs=2e-4)
+
+
+def test_an_image_exposed_at_once_has_no_readout(tmp_path: Path) -> None:
+    at_once = recording(tmp_path / "seq", shaking(), readout_s=0.0)
+    found = calibrate(told(at_once, 0.012, 0.0, np.zeros(6)), ("readout",), options=OPTIONS)
+    sigmas = found.sigmas
+    for i, readout_s in enumerate((found.values.depth_readout_s, found.values.color_readout_s)):
+        assert abs(readout_s) < min(4.0 * sigmas[i], 3e-4)
+
+
+def test_a_camera_at_rest_tells_nothing_and_that_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    spline = shaking()
+    still = Spline(np.broadcast_to(CORNER, spline.control_points.shape).copy(), spline.t0, spline.dt)
+    rest = recording(tmp_path / "seq", still)
+    found = calibrate(rest, options=OPTIONS)
+    assert found.undetermined[found.asked].all()
+    assert found.values.since(found.start) == pytest.approx(np.zeros(COUNT), abs=1e-12)
+    assert "undetermined: needs turning" in found.text() and "turns at 0.0 deg/s" in found.text()
+    assert main(["calibrate", str(tmp_path / "seq"), "--quiet", "--backend", "llvm"]) == 1
+    assert "undetermined" in capsys.readouterr().out
+
+
+def test_too_little_to_go_by_is_said_in_one_line(shaken: Dataset) -> None:
+    with pytest.raises(UserError, match="20 frames are too few to calibrate from: 42 or more"):
+        calibrate(shaken, frames=slice(0, 20), options=OPTIONS)
+    with pytest.raises(UserError, match="--free lens: choose one or more of readout, offset, extrinsics"):
+        calibrate(shaken, ("readout", "lens"), options=OPTIONS)
+    blind = replace(shaken, groups=((),) * len(shaken))
+    with pytest.raises(UserError, match="no colour images"):
+        calibrate(blind, options=OPTIONS)
+
+
+def test_ctrl_c_keeps_what_there_is(shaken: Dataset) -> None:
+    calls: list[str] = []
+
+    def progress(stage: str, _: float, note: str) -> None:
+        calls.append(stage)
+        if note.startswith("readouts") and sum(stage == "calibrating" for stage in calls) > 6:
+            raise KeyboardInterrupt
+
+    found = calibrate(told(shaken, 0.012, 0.0, np.zeros(6)), options=OPTIONS, progress=progress)
+    assert not found.solution.finished and "interrupted" in found.text()
+    assert abs(found.values.color_readout_s - READOUT_S) < abs(0.012 - READOUT_S)
+
+
+# --- what is said of it ----------------------------------------------------------------------------------------------
+
+
+def test_sigmas_are_those_of_the_scatter() -> None:
+    rng = np.random.default_rng(5)
+    free = free_of(("readout",))
+    A = np.array([np.diag([4e10, 1e10])] * 12) * rng.uniform(0.5, 1.5, (12, 1, 1))
+    # Gradients three times as large as the normal equations say: so are σ.
+    b = 3.0 * rng.standard_normal((12, 2)) * np.sqrt(np.einsum("snn->sn", A))
+    p = Parameters(0.02, 0.02, 0.0, 0.0, np.eye(4))
+    sigmas = Solution(p, free, A, b - b.mean(axis=0), 0.0, 1e-3, 1e-2).sigmas
+    formal = 1.0 / np.sqrt(np.einsum("snn->n", A))
+    assert (sigmas[:2] / formal > 2.0).all() and (sigmas[:2] / formal < 4.6).all() and not sigmas[2:].any()
+
+
+def test_a_spline_like_another_passes_through_its_poses() -> None:
+    track = shaking()
+    made = like(track, -0.013, 0.025, 44)
+    through = Spline(track.pose(np.clip(-0.013 + 0.025 * (np.arange(44) - 1), track.t_begin, None)), -0.013, 0.025)
+    t = np.linspace(0.05, 0.95, 200)
+    off, plain = (np.abs(se3.log(se3.inverse(s.pose(t)) @ track.pose(t))).max() for s in (made, through))
+    assert off < 1e-4 and off < 0.1 * plain
+
+
+def test_the_camera_file_says_what_was_found(shaken: Dataset, tmp_path: Path) -> None:
+    start = parameters_of(shaken)
+    found = start.moved(np.array([-0.02, 2e-3, -1.5e-3, 1e-5, 1e-3, 0, 0, 0, 0.01, 0]))
+    free = np.ones(COUNT, bool)
+    free[5] = False
+    A = np.array([np.diag(1.0 / (1e-3 * PRIOR[free]) ** 2)] * 3)
+    solution = Solution(found, free, A, np.zeros((3, 9)), 0.0, 1e-3, 1e-2)
+    motion = calibration_run.motion_of(shaken, [range(30)], shaking())
+    made = Calibration(shaken, start, solution, np.ones(COUNT, bool), (range(30),), motion, 1.0)
+    (tmp_path / "camera.yaml").write_text(made.camera_file())
+    again = open_dataset(shaken.root, tmp_path / "camera.yaml")
+    expected = made.calibrated()
+    for ours, theirs in zip(
+        (again.rig.depth_shutter, again.rig.color_shutter), (expected.rig.depth_shutter, expected.rig.color_shutter),
+        strict=True,
+    ):  # fmt: skip
+        assert ours.scan == theirs.scan and ours.readout_s == pytest.approx(theirs.readout_s, abs=1e-7)
+    assert again.rig.depth_shutter.scan == "bottom-top"
+    np.testing.assert_allclose(again.rig.T_color_depth, expected.rig.T_color_depth, atol=1e-10)
+    np.testing.assert_allclose(again.color_stamps, expected.color_stamps, atol=2e-7)
+    text = (tmp_path / "camera.yaml").read_text()
+    assert "±" in text and "undetermined, kept" in text
+    parameters = made.as_dict()["parameters"]
+    assert parameters["T_color_depth.y"]["sigma"] is None and parameters["color.offset_s"]["sigma"] > 0.0
+
+
+def test_a_sequence_is_calibrated_and_tracked_by_command(
+    shaken: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wrong = tmp_path / "wrong.yaml"
+    K = [120.0, 120.0, 79.5, 59.5]
+    T = shaken.rig.T_color_depth.tolist()
+    stream = f"width: 160, height: 120, intrinsics: {K}, scan: top-bottom"
+    wrong.write_text(
+        f"color: {{{stream}, readout_s: 0.0, offset_s: 0.006}}\ndepth: {{{stream}, readout_s: 0.0}}\n"
+        f"T_color_depth: {T}\n"
+    )
+    right, run = tmp_path / "right.yaml", tmp_path / "run"
+    arguments = ["--camera", str(wrong), "--free", "readout,offset", "--out", str(right), "--quiet", "--json"]
+    assert main(["calibrate", str(shaken.root), *arguments, "--backend", "llvm"]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["parameters"]["color.offset_s"]["value"] == pytest.approx(0.0, abs=2e-4)
+    assert main(["track", str(shaken.root), "--camera", str(right), "--out", str(run), "--quiet"]) == 0
+    assert main(["evaluate", str(shaken.root), str(run), "--json"]) == 0
+    out = capsys.readouterr().out
+    errors = json.loads(out[out.index("{\n") :])
+    assert errors["ate_rmse_m"] < 2e-3
