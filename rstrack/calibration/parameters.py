@@ -26,7 +26,7 @@ _GROUP_OF: tuple[Group, ...] = ("readout", "readout", "offset", "offset", *(("ex
 # What is known of each beforehand (σ): s, s, s, s/s, m, rad.
 PRIOR = np.array([0.03, 0.03, 0.05, 5e-4, *(0.05,) * 3, *np.radians((5.0,) * 3)])
 # σ above which a value is of no use: it is called undetermined and keeps what it was.
-USEFUL = np.array([1e-3, 1e-3, 1e-3, 5e-5, *(5e-3,) * 3, *np.radians((0.3,) * 3)])
+USEFUL = np.array([2e-3, 2e-3, 2e-3, 5e-5, *(5e-3,) * 3, *np.radians((0.3,) * 3)])
 
 
 @dataclass(frozen=True)

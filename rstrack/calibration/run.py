@@ -28,6 +28,7 @@ from rstrack.calibration.solve import Solution, solve
 from rstrack.calibration.stretch import Stretch
 from rstrack.data.dataset import Dataset
 from rstrack.options import Options
+from rstrack.tracking.color_offset import estimate_color_offset
 
 # Frames of a stretch, the fewest that one may have, and how many stretches there are at least and at most.
 _FRAMES, _FEWEST_FRAMES, _FEWEST, _MOST = 30, 14, 3, 12
@@ -62,6 +63,8 @@ def calibrate(
     chosen = range(len(dataset))[frames]
     engine(options.backend)  # before anything else imports Dr.Jit, which then would choose a libLLVM itself
     start = parameters_of(dataset)
+    if dataset.timing is not None and dataset.timing.wants_color_offset and "offset" in groups:
+        start = replace(start, color_offset_s=estimate_color_offset(dataset, chosen, options, progress).offset_s)
     track = first_track(dataset, chosen, options, progress)
     parts = _stretches(dataset, chosen, track)
     free = _free(dataset, groups, parts)
@@ -116,8 +119,7 @@ def parameters_of(dataset: Dataset) -> Parameters:
 def _solved(
     stretches: Sequence[Stretch], terms: PairTerms, file: Parameters, free: BoolArray, progress: Progress
 ) -> Solution:
-    """From the file's values on. With all that may change; then without what this recording turns out not to tell, until
-    the rest is told."""
+    """From the file's values on: with all that may change, then without what this recording turns out not to tell."""
     levels: Sequence[int] = _LEVELS
     start, done = file, 0
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from json import dumps
 from pathlib import Path
 from typing import Annotated
 
 from rsgen.console.command_line import Frames, Json, Quiet
 from rsgen.device.backend import Backend
-from rstrack.cli.options import CameraFile, SequenceFolder
+from rstrack.cli.options import CameraFile, NoiseDepth, NoiseIntensity, Seed, SequenceFolder
 
 STATUS = "exit status: 0 done, 1 some values are not told by the recording, 2 wrong input, 130 interrupted"
 
@@ -26,6 +27,9 @@ def calibrate(
     ] = None,
     frames: Frames = None,
     backend: Annotated[Backend, "where kernels run"] = "auto",
+    noise_depth: NoiseDepth = 0.0,
+    noise_intensity: NoiseIntensity = 0.0,
+    seed: Seed = 0,
     out: Annotated[Path | None, "camera file to write, for rstrack track --camera", "FILE"] = None,
     json: Json = False,
     quiet: Quiet = False,
@@ -35,9 +39,12 @@ def calibrate(
     from rsgen.files import atomic_write
     from rstrack.calibration.run import calibrate as run
     from rstrack.data.dataset import open_dataset
+    from rstrack.data.noise import NoisyImages
     from rstrack.options import Options
 
     dataset = open_dataset(sequence, camera)
+    if noise_depth or noise_intensity:
+        dataset = replace(dataset, images=NoisyImages(dataset.images, noise_depth, noise_intensity, seed))
     with ProgressDisplay(quiet) as progress:
         groups = None if free is None else tuple(name.strip() for name in free.split(",") if name.strip())
         found = run(dataset, groups, frames or slice(None), Options(backend=backend), progress)

@@ -16,7 +16,16 @@ from rstrack.cli.bench_methods import bench
 from rstrack.cli.calibrate import STATUS as CALIBRATE_STATUS
 from rstrack.cli.calibrate import calibrate
 from rstrack.cli.mapping import keyframes, map_, map_eval
-from rstrack.cli.options import CameraFile, Run, SequenceFolder, TruthExtrinsics, TruthOffset
+from rstrack.cli.options import (
+    CameraFile,
+    NoiseDepth,
+    NoiseIntensity,
+    Run,
+    Seed,
+    SequenceFolder,
+    TruthExtrinsics,
+    TruthOffset,
+)
 from rstrack.cli.report import report
 from rstrack.cli.sensitivity import sensitivity
 from rstrack.options import Options
@@ -88,24 +97,32 @@ def track(
     camera: CameraFile = None,
     out: Annotated[Path, "folder for the run, made if need be", "DIR"],
     frames: Frames = None,
-    noise_depth: Annotated[
-        float, "add noise of standard deviation S z^2 to depth z in m; a Kinect has 1.2e-3", "S"
-    ] = 0.0,
-    noise_intensity: Annotated[
-        float, "add noise of standard deviation S to intensities in [0, 1], for example 0.01", "S"
-    ] = 0.0,
-    seed: Annotated[int, "of the noise", int] = 0,
+    noise_depth: NoiseDepth = 0.0,
+    noise_intensity: NoiseIntensity = 0.0,
+    seed: Seed = 0,
+    calibrate: Annotated[
+        bool, "estimate readouts, colour's clock and extrinsics first, as 'rstrack calibrate' does, and track with them"
+    ] = False,
     quiet: Quiet = False,
 ) -> int:
-    """Track a sequence: writes trajectory.txt, spline.npz and run.json."""
+    """Track a sequence: writes trajectory.txt, spline.npz and run.json; with --calibrate camera.yaml too."""
     from rsgen.console.progress import ProgressDisplay
+    from rsgen.files import atomic_write
+    from rstrack.calibration.run import calibrate as run_calibration
     from rstrack.data.dataset import open_dataset
     from rstrack.tracking import run
 
     noise = run.Noise(noise_depth, noise_intensity, seed)
     dataset = open_dataset(sequence, camera)
     with ProgressDisplay(quiet) as progress:
+        found = None
+        if calibrate:
+            found = run_calibration(dataset, None, frames or slice(None), tracker, progress)
+            dataset = found.calibrated()
         result = run.track(dataset, tracker, out, frames or slice(None), noise, progress)
+    if found is not None:
+        atomic_write(out / "camera.yaml", found.camera_file().encode())
+        print(found.text())
     print(result.text())
     print(f"{out}: written (rstrack evaluate {sequence} {out}, rstrack plot ...)")
     sys.stdout.flush()

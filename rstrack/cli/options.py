@@ -14,6 +14,11 @@ def truth_offset(text: str) -> float | Literal["auto"]:
     return "auto" if text == "auto" else number(text)
 
 
+NoiseDepth = Annotated[float, "add noise of standard deviation S z^2 to depth z in m; a Kinect has 1.2e-3", "S"]
+NoiseIntensity = Annotated[
+    float, "add noise of standard deviation S to intensities in [0, 1], for example 0.01", "S"
+]  # fmt: skip
+Seed = Annotated[int, "of the noise", int]
 TruthOffset = Annotated[
     float | Literal["auto"] | None,
     "seconds after a stamp that the truth is looked up, or auto: those at which the drift is least, for a truth with a "

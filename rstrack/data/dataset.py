@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +23,7 @@ from rsgen.sequence.reader import Sequence, read_sequence
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.camera_file import read_rig
 from rstrack.data.generated import as_recorded, is_exact
+from rstrack.data.noise import ImageReader
 from rstrack.data.prefetch import prefetched
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.data.seven_scenes import is_seven_scenes, read_seven_scenes
@@ -33,16 +34,6 @@ __all__ = ["Dataset", "Frame", "Image", "Rig", "group_colors", "open_dataset"]
 
 # Streams that are half a period apart tie, whatever the last digits of their stamps say.
 _TIE_S = 1e-6
-
-
-class ImageReader(Protocol):
-    """Decodes the k-th image of a stream. Raises UserError naming the file."""
-
-    def color(self, k: int) -> npt.NDArray[np.uint8]:
-        """RGB (h, w, 3)."""
-
-    def depth(self, k: int) -> npt.NDArray[np.float32]:
-        """Planar z (h, w) in metres, 0 = missing."""
 
 
 @dataclass(frozen=True)

@@ -3,12 +3,25 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
 
+from rsgen.array_types import ByteArray, Float32Array
 from rsgen.errors import UserError
 from rstrack.data.rig import Frame, Image
+
+
+class ImageReader(Protocol):
+    """Decodes the k-th image of a stream. Raises UserError naming the file."""
+
+    def color(self, k: int) -> ByteArray:
+        """RGB (h, w, 3)."""
+
+    def depth(self, k: int) -> Float32Array:
+        """Planar z (h, w) in metres, 0 = missing."""
 
 
 def with_noise(frame: Frame, k: int, sigma_depth: float, sigma_intensity: float, seed: int) -> Frame:
@@ -32,6 +45,27 @@ def with_noise(frame: Frame, k: int, sigma_depth: float, sigma_intensity: float,
         generators = (np.random.default_rng([seed, k, stream]) for stream in range(1, 1 + len(colors)))
         colors = tuple(_noisy_color(*pair, sigma_intensity) for pair in zip(colors, generators, strict=True))
     return Frame(depth, colors)
+
+
+@dataclass(frozen=True)
+class NoisyImages:
+    """The images of a dataset with such noise, the k-th of each stream as in frame k."""
+
+    images: ImageReader
+    sigma_depth: float
+    sigma_intensity: float
+    seed: int
+
+    def color(self, k: int) -> ByteArray:
+        """RGB (h, w, 3)."""
+        image = Image(0.0, self.images.color(k))
+        frame = Frame(Image(0.0, np.zeros((1, 1), np.float32)), (image,))
+        return np.asarray(with_noise(frame, k, 0.0, self.sigma_intensity, self.seed).colors[0].pixels, np.uint8)
+
+    def depth(self, k: int) -> Float32Array:
+        """Planar z (h, w) in metres, 0 = missing."""
+        frame = Frame(Image(0.0, self.images.depth(k)), ())
+        return np.asarray(with_noise(frame, k, self.sigma_depth, 0.0, self.seed).depth.pixels, np.float32)
 
 
 def _noisy_depth(image: Image, sigma: float, rng: np.random.Generator) -> Image:

@@ -26,6 +26,7 @@ from rstrack.calibration.run import calibrate, parameters_of
 from rstrack.calibration.solve import Solution, solve
 from rstrack.cli.main import main
 from rstrack.data.dataset import Dataset, open_dataset
+from rstrack.data.noise import NoisyImages, with_noise
 from rstrack.options import Options
 
 READOUT_S, RATE_HZ, FRAMES = 0.014, 60.0, 60
@@ -206,6 +207,16 @@ def test_too_little_to_go_by_is_said_in_one_line(shaken: Dataset) -> None:
         calibrate(blind, options=OPTIONS)
 
 
+def test_noise_is_that_of_track_and_makes_sigmas_grow(shaken: Dataset) -> None:
+    noisy = replace(shaken, images=NoisyImages(shaken.images, 2e-3, 0.02, 7))
+    frame = with_noise(shaken.frame(9), 9, 2e-3, 0.02, 7)
+    np.testing.assert_array_equal(noisy.images.depth(9), frame.depth.pixels)
+    np.testing.assert_array_equal(noisy.images.color(9), frame.colors[0].pixels)
+    plain, grown = (calibrate(each, ("readout",), options=OPTIONS) for each in (shaken, noisy))
+    assert (grown.sigmas[:2] > 2.0 * plain.sigmas[:2]).all()
+    assert (np.abs(grown.values.since(grown.start)[:2]) < 5.0 * grown.sigmas[:2]).all()
+
+
 def test_ctrl_c_keeps_what_there_is(shaken: Dataset) -> None:
     calls: list[str] = []
 
@@ -290,3 +301,6 @@ def test_a_sequence_is_calibrated_and_tracked_by_command(
     out = capsys.readouterr().out
     errors = json.loads(out[out.index("{\n") :])
     assert errors["ate_rmse_m"] < 2e-3
+    more = ["--camera", str(wrong), "--calibrate", "--out", str(tmp_path / "again"), "--frames", "0:50", "--quiet"]
+    assert main(["track", str(shaken.root), *more]) in (0, 1)
+    assert (tmp_path / "again/camera.yaml").read_text().startswith("# rstrack calibrate synthetic")

@@ -132,9 +132,8 @@ def test_a_camera_file_for_a_sequence_stands_in_for_its_cameras(uneven: Path, tm
     plain, file = open_dataset(uneven), tmp_path / "camera.yaml"
     depth, color = plain.rig.depth_camera, plain.rig.color_camera
     sizes = [f"width: {c.width}, height: {c.height}, intrinsics: [50, 50, 31, 23]" for c in (depth, color)]
-    file.write_text(
-        f"depth: {{{sizes[0]}, readout_s: 0.01}}\ncolor: {{{sizes[1]}, readout_s: 0.02, offset_s: 0.003, drift_ppm: 200}}"
-    )
+    clock = "offset_s: 0.003, drift_ppm: 200"
+    file.write_text(f"depth: {{{sizes[0]}, readout_s: 0.01}}\ncolor: {{{sizes[1]}, readout_s: 0.02, {clock}}}")
     told = open_dataset(uneven, file)
     assert told.rig.depth_camera.fx == 50.0 and told.rig.color_shutter.readout_s == 0.02 and not told.scan_named
     expected = plain.color_stamps + 0.003 + 2e-4 * (plain.color_stamps - plain.stamps[len(plain) // 2])
