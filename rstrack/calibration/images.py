@@ -81,7 +81,7 @@ def lines_of(taken: Taken, spline: Spline, p: Parameters) -> Lines:
     first, readout = taken.begin(p)
     count = taken.lens.lines
     share = np.arange(count) / count
-    T_world_body, velocity = spline.pose_and_velocity(first + readout * share)
+    T_world_body, velocity = spline.pose_and_velocity(_within(spline, first + readout * share))
     T_cam_body = np.eye(4) if taken.is_depth else p.T_color_depth
     T_world_cam = T_world_body @ se3.inverse(T_cam_body)
     twist = readout / count * velocity @ se3.adjoint(T_cam_body).T
@@ -89,8 +89,9 @@ def lines_of(taken: Taken, spline: Spline, p: Parameters) -> Lines:
     blocks, _, per, _ = block_counts(taken.lens, taken.lens)
     start = np.arange(blocks) * per
     middle = 0.5 * (start + np.minimum(start + per, count) - 1) / count
-    at, J = spline.pose_jacobian(first + readout * middle)
-    T, w = spline.pose_and_velocity(first + readout * middle)
+    t = _within(spline, first + readout * middle)
+    at, J = spline.pose_jacobian(t)
+    T, w = spline.pose_and_velocity(t)
     Ad = se3.adjoint(T)
     w_world = (Ad @ w[..., None])[..., 0]
     low = int(at.min())
@@ -106,6 +107,11 @@ def lines_of(taken: Taken, spline: Spline, p: Parameters) -> Lines:
         by_parameters[..., 3] = w_world * (taken.stamp - p.epoch_s)
         by_parameters[..., 4:] = -Ad @ se3.adjoint(se3.inverse(T_cam_body))
     return Lines(T_world_cam, twist, low, by_points.reshape(blocks, 6, -1), by_parameters)
+
+
+def _within(spline: Spline, t: FloatArray) -> FloatArray:
+    """Times (n,) that a step too far has led out of the spline are brought back: the next one leads back."""
+    return np.clip(t, spline.t_begin, spline.t_end)
 
 
 def span(images: Sequence[Taken], p: Parameters) -> tuple[float, float]:

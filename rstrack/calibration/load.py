@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -23,11 +24,9 @@ from rstrack.images.pyramid import camera_rays, color_image
 from rstrack.options import Options
 
 # Seconds before the first and after the last line for which a stretch has spline: times move while they are estimated.
-_MARGIN_S = 0.03
+_MARGIN_S = 0.08
 # What the colour camera may be further away than the file says, m.
 _BASELINE_M = 0.01
-# References of a stretch: at these parts of it.
-_REFERENCES = (1.0 / 6.0, 0.5, 5.0 / 6.0)
 _ROUNDS = 6
 
 
@@ -47,13 +46,12 @@ def load_stretch(
 
     Raises UserError: an image that cannot be read.
     """
-    references = tuple(sorted({min(len(frames) - 1, int(part * len(frames))) for part in _REFERENCES}))
-    views = [_view(terms, dataset, k, i in references, options.max_depth) for i, k in enumerate(frames)]
+    views = [_view(terms, dataset, k, options.max_depth) for k in frames]
     begin, end = span([taken for v in views for taken in (v.depth, v.color) if taken is not None], p)
     knot_s = options.knot_spacing_s
     t0 = begin - _MARGIN_S - options.knot_phase * knot_s
     count = int(np.ceil((end + _MARGIN_S - t0) / knot_s)) + 3
-    return Stretch(views, references, like(track, t0, knot_s, count))
+    return Stretch(views, like(track, t0, knot_s, count))
 
 
 def like(track: Spline, t0: float, dt: float, count: int) -> Spline:
@@ -78,28 +76,24 @@ def through(poses: FloatArray, t0: float, dt: float) -> Spline:
     return Spline(points, t0, dt)
 
 
-def _view(terms: PairTerms, dataset: Dataset, k: int, is_reference: bool, max_depth: float) -> View:
+def _view(terms: PairTerms, dataset: Dataset, k: int, max_depth: float) -> View:
     e, rig = terms.e, dataset.rig
     z = dataset.images.depth(k)
     rho = averaged(np.divide(np.float32(1.0), z, out=np.zeros_like(z), where=(z > 0.0) & (z < max_depth)))
     z = np.divide(np.float32(1.0), rho, out=np.zeros_like(z), where=rho > 0.0)
     depth = Taken(terms.depth, float(dataset.stamps[k]), rig.depth_shutter.exposure_s, True)
-    view = View(depth, e.upload(z))
+    camera, baseline = rig.depth_camera, _BASELINE_M + float(np.linalg.norm(rig.T_color_depth[:3, 3]))
+    view = View(depth, e.upload(z), surface_of(e, rho, _rays(camera), camera.fx, camera.fy, baseline))
     if dataset.groups[k]:
         i = dataset.groups[k][0]
         color = dataset.images.color(i)
-        exposure = Exposure(terms.color, 0.0, np.eye(4))
-        levels = color_image(e, exposure, color).levels
         view.color = Taken(terms.color, float(dataset.color_stamps[i]), rig.color_shutter.exposure_s, False)
-        view.levels = levels
-    if is_reference:
-        camera, baseline = rig.depth_camera, _BASELINE_M + float(np.linalg.norm(rig.T_color_depth[:3, 3]))
-        view.surface = surface_of(e, rho, _rays(camera), camera.fx, camera.fy, baseline)
-        if view.color is not None:
-            grey = np.asarray(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), np.float32) / np.float32(255.0)
-            view.bound = intensity_bound(grey, rig.color_camera.fx, view.surface.median_depth)
+        view.levels = color_image(e, Exposure(terms.color, 0.0, np.eye(4)), color).levels
+        grey = np.asarray(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), np.float32) / np.float32(255.0)
+        view.bound = intensity_bound(grey, rig.color_camera.fx, view.surface.median_depth)
     return view
 
 
+@lru_cache(maxsize=2)
 def _rays(camera: Camera) -> FloatArray:
     return camera_rays(Exposure(pair_lens(camera, Shutter()), 0.0, np.eye(4)))

@@ -152,7 +152,8 @@ class Calibration:
         drift = f"\n  drift_ppm: {1e6 * found.color_drift:.3f}{self._beside(3, 1e6, 'ppm', sigmas)}"
         color = _stream("color", rig.color_camera, rig.color_shutter, found.color_readout_s, scans[1])
         color += self._beside(1, 1e3, "ms", sigmas)
-        color += f"\n  offset_s: {found.color_offset_s:.7f}{self._beside(2, 1e3, 'ms', sigmas)}"
+        offset_s = found.color_offset_s - self.dataset.depth_offset_s
+        color += f"\n  offset_s: {offset_s:.7f}{self._beside(2, 1e3, 'ms', sigmas)}"
         depth = _stream("depth", rig.depth_camera, rig.depth_shutter, found.depth_readout_s, scans[0])
         depth += self._beside(0, 1e3, "ms", sigmas)
         scale = self.dataset.depth_scale
@@ -207,6 +208,8 @@ class Calibration:
             notes.append("a delay of both streams alike cannot be told from images: offsets are against depth's stamps")
         if not self.solution.finished:
             notes.append("interrupted before it had converged")
+        elif not self.solution.is_settled:
+            notes.append("NOT CONVERGED: the last step still moved values by more than their error: do not use them")
         return notes
 
 

@@ -21,7 +21,9 @@ _MOST_STEPS, _SMALL = (8, 10, 15), (1.0, 5.0, 10.0)
 _COUNTED = 25.0
 # Stretches that what is known of all unknowns together counts for, beside the scatter of one.
 _POOLED = 4.0
-# Times that the scales of errors are estimated before the first step, at the coarsest level; once at the others.
+# Systematic error of the colour camera's pose, px, σ: interpolation, spline, surfaces. Seen on renderings.
+_BLIND_PX = 0.08
+# Times that the scales of errors are estimated before the first step of a level; once at the finest.
 _ROUNDS = 3
 
 Watch = Callable[[int, int, Parameters], None]
@@ -32,7 +34,8 @@ Watch = Callable[[int, int, Parameters], None]
 class Solution:
     """values; normal equations of the free parameters at them: A (s, n, n), b (s, n) of the s stretches, free (10,).
 
-    cost: negative log-likelihood a pixel. sigma_depth_m, sigma_intensity: of the residuals, medians.
+    cost: negative log-likelihood a pixel. sigma_depth_m, sigma_intensity: of the residuals, medians. last_step (10,):
+    the last one that was taken. blind (10,): σ of what no scatter shows. finished: nobody interrupted it.
     """
 
     values: Parameters
@@ -42,8 +45,14 @@ class Solution:
     cost: float
     sigma_depth_m: float
     sigma_intensity: float
+    last_step: FloatArray = field(default_factory=lambda: np.zeros(COUNT))
+    blind: FloatArray = field(default_factory=lambda: np.zeros(COUNT))
     finished: bool = True
-    start: Parameters | None = field(default=None, repr=False)
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether the last step was within what is not known anyway."""
+        return bool((np.abs(self.last_step) <= self.sigmas).all())
 
     @property
     def sigmas(self) -> FloatArray:
@@ -65,7 +74,7 @@ class Solution:
         inflation = np.maximum((_POOLED * all_of_them + dof * ratio) / (_POOLED + dof), 1.0)
         factor = float(stats.t.ppf(0.975, dof + _POOLED)) / 1.96
         sigmas = np.zeros(COUNT)
-        sigmas[self.free] = factor * np.sqrt(formal * inflation)
+        sigmas[self.free] = np.hypot(factor * np.sqrt(formal * inflation), self.blind[self.free])
         return sigmas
 
     @property
@@ -87,7 +96,7 @@ def solve(
     `watch` raises KeyboardInterrupt, what has been found so far is returned, `finished` False. Raises
     numpy.linalg.LinAlgError where images say nothing at all.
     """
-    p, acceleration, finished = start, Acceleration(), True
+    p, acceleration, finished, step = start, Acceleration(), True, np.zeros(COUNT)
     try:
         for level in levels:
             for stretch in stretches:
@@ -111,7 +120,14 @@ def solve(
     depth, intensity = np.median([stretch.sigma for stretch in stretches], axis=0)
     cost = sum(one.cost for one in sums) / max(1, sum(one.pixels for one in sums))
     b = np.array([one[free] for _, one in reduced])
-    return Solution(p, free, A, b, cost, float(depth), float(intensity), finished, start)
+    return Solution(p, free, A, b, cost, float(depth), float(intensity), step, _blind(stretches, terms), finished)
+
+
+def _blind(stretches: Sequence[Stretch], terms: PairTerms) -> FloatArray:
+    """σ (10,) of what all stretches have in common: of the extrinsics, so many pixels as an angle and as a shift."""
+    turn = _BLIND_PX / terms.color.camera.fx
+    depth = float(np.median([view.surface.median_depth for stretch in stretches for view in stretch.views]))
+    return np.concatenate([np.zeros(4), np.full(3, turn * depth), np.full(3, turn)])
 
 
 def _step(

@@ -24,6 +24,8 @@ from rstrack.calibration.parameters import COUNT, Parameters
 _ACCELERATION = np.array([15.0, 15.0, 15.0, 30.0, 30.0, 30.0])
 _ENDS, _END_FACTOR = 2, 0.1
 _GAUGE = np.full(6, 1e-6)
+# Frames between those that are compared: near ones tell the clocks, far ones the extrinsics.
+_APART = (1, 4, 9, 16)
 # σ at the start, m and intensity, and of gain and offset of an image against another.
 START_DEPTH, START_INTENSITY = 5e-3, 0.03
 _BRIGHTNESS = np.array([0.3, 0.15])
@@ -31,16 +33,16 @@ _BRIGHTNESS = np.array([0.3, 0.15])
 
 @dataclass
 class View:
-    """A frame on the device: its depth, the colour image that goes with it (if any), and as a reference its surface.
+    """A frame on the device: its depth, as z (m) and as a surface, and the colour image that goes with it, if any.
 
     levels: intensities of the pyramid's levels, NaN where they tell nothing. bound: see `intensity_bound`.
     """
 
     depth: Taken
     z: object
+    surface: Surface
     color: Taken | None = None
     levels: tuple[object, ...] = ()
-    surface: Surface | None = None
     bound: float = 1.0
 
 
@@ -73,13 +75,12 @@ class Sums:
 
 @dataclass
 class Stretch:
-    """Views in order of time, those that are references, and the spline T_world_depth(t) that covers them all.
+    """Views in order of time, and the spline T_world_depth(t) that covers them all.
 
     sigma: of depth (m) and of intensity. brightness: gain and offset of each pair (view, reference).
     """
 
     views: list[View]
-    references: tuple[int, ...]
     spline: Spline
     sigma: tuple[float, float] = (START_DEPTH, START_INTENSITY)
     brightness: dict[tuple[int, int], FloatArray] = field(default_factory=dict)
@@ -120,16 +121,14 @@ class Stretch:
     ) -> Iterator[tuple[int, tuple[int, int], BlockSums, Lines, Lines, FloatArray]]:
         """Kind (0 depth, 1 colour), pair, sums, lines of the current image and the reference's, T_base_world."""
         waiting = []
-        for r in self.references:
+        for r, others in enumerate(partners(len(self.views))):
             ref, surface = self.views[r], self.views[r].surface
-            assert surface is not None
             T_base_world = se3.inverse(self.spline.pose(ref.depth.mid_time(p)))
             ref_to_base, ref_from_base = depths[r].to_base(T_base_world), depths[r].from_base(T_base_world)
             ref_color = colors[r]
             color_from_base = None if ref_color is None else ref_color.from_base(T_base_world)
-            for k, view in enumerate(self.views):
-                if k == r:
-                    continue
+            for k in others:
+                view = self.views[k]
                 to_base = depths[k].to_base(T_base_world)
                 started = terms.by_depth(view.z, surface, to_base, ref_from_base, self.sigma[0], level)
                 waiting.append((0, (k, r), started, depths[k], depths[r], T_base_world))
@@ -162,7 +161,7 @@ class Stretch:
         sigma = np.repeat(_ACCELERATION[None] * self.spline.dt**2, count - 2, axis=0)
         sigma[:_ENDS] *= _END_FACTOR
         sigma[-_ENDS:] *= _END_FACTOR
-        t = self.views[self.references[len(self.references) // 2]].depth.mid_time(p)
+        t = self.views[len(self.views) // 2].depth.mid_time(p)
         for model, _ in (
             acceleration_prior(self.spline, 0, count, sigma),
             pose_constraint(self.spline, t, self.spline.pose(t), _GAUGE),
@@ -170,6 +169,20 @@ class Stretch:
             at = slice(6 * model.first, 6 * model.last)
             H[at, at] += model.H
             g[at] += model.g
+
+
+def partners(count: int) -> list[list[int]]:
+    """For each of `count` views as a reference the views that are compared with it.
+
+    Every view is a reference as often as any other: the noise of a few would be in all that is compared with them. Of a
+    pair the earlier and the later one take turns.
+    """
+    found: list[list[int]] = [[] for _ in range(count)]
+    for n, apart in enumerate(_APART):
+        for k in range(count - apart):
+            a, b = (k, k + apart) if (k + n) % 2 else (k + apart, k)
+            found[a].append(b)
+    return found
 
 
 def _slopes(

@@ -12,7 +12,9 @@ from rsgen.console.command_line import Frames, Json, Quiet
 from rsgen.device.backend import Backend
 from rstrack.cli.options import CameraFile, NoiseDepth, NoiseIntensity, Seed, SequenceFolder
 
-STATUS = "exit status: 0 done, 1 some values are not told by the recording, 2 wrong input, 130 interrupted"
+STATUS = (
+    "exit status: 0 done, 1 some values are not told by the recording, or not converged, 2 wrong input, 130 interrupted"
+)
 
 
 def calibrate(
@@ -57,4 +59,4 @@ def calibrate(
     if not found.solution.finished:
         print("rstrack: interrupted; this is the best so far", file=sys.stderr)
         return 130
-    return 1 if found.undetermined.any() else 0
+    return 1 if found.undetermined.any() or not found.solution.is_settled else 0

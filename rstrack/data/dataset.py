@@ -46,7 +46,8 @@ class Dataset:
     sequence: the rsgen sequence itself, where it is an exact one (`rstrack.data.generated`). notes: what had to be
     assumed when it was read. timing: of recordings, how their stamps came about. color_drift: seconds a second that
     colour's offset grows by, see `with_color_offset`. scan_named: whether the cameras' description says which way
-    images are read. depth_scale: units per metre of the depth images.
+    images are read. depth_scale: units per metre of the depth images. depth_offset_s: what has been added to the stamps
+    of registered depth, see `rstrack.data.camera_file`.
     """
 
     name: str
@@ -64,6 +65,7 @@ class Dataset:
     color_drift: float = 0.0
     scan_named: bool = True
     depth_scale: float = DEPTH_SCALE
+    depth_offset_s: float = 0.0
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -220,6 +222,7 @@ def _of_tum(root: Path, tum: TumFolder) -> Dataset:
     dataset = Dataset(
         root.resolve().name, root, file.rig, depth.used, color.used, (), tum.images, truth_poses=tum.truth_poses,
         notes=tum.notes, timing=timing, scan_named=file.scan_named, depth_scale=file.depth_scale,
+        depth_offset_s=file.depth_offset_s,
     )  # fmt: skip
     found = dataset.with_color_offset(file.color_offset_s or 0.0, drift=file.color_drift)
     return replace(found, timing=timing)
