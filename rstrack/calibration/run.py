@@ -172,9 +172,7 @@ def _free(dataset: Dataset, groups: Sequence[str], parts: Sequence[range]) -> Bo
 
 def _usual(dataset: Dataset) -> tuple[str, ...]:
     """What can be told of a recording: of registered depth, which the driver has moved, nothing about where it was."""
-    rig = dataset.rig
-    is_registered = rig.depth_camera == rig.color_camera and bool((rig.T_color_depth == np.eye(4)).all())
-    return GROUPS[:2] if is_registered else GROUPS
+    return GROUPS[:2] if dataset.rig.is_registered else GROUPS
 
 
 def _check(dataset: Dataset, groups: Sequence[str], frames: slice) -> None:

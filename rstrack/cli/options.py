@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from rsgen.console.command_line import number
 
 SequenceFolder = Annotated[Path, "rsgen sequence, TUM RGB-D, ICL-NUIM or 7-Scenes folder"]
-CameraFile = Annotated[Path | None, "cameras of a folder that is no rsgen sequence (default: one inside it)", "FILE"]
+CameraFile = Annotated[Path | None, "camera file to go by instead of what the folder tells of its cameras", "FILE"]
 
 
 def truth_offset(text: str) -> float | Literal["auto"]:

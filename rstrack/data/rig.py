@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 
 from rsgen.array_types import FloatArray
@@ -21,6 +22,11 @@ class Rig:
     color_camera: Camera
     color_shutter: Shutter
     T_color_depth: FloatArray
+
+    @property
+    def is_registered(self) -> bool:
+        """Whether depth images have been warped into the colour camera."""
+        return self.depth_camera == self.color_camera and bool((self.T_color_depth == np.eye(4)).all())
 
 
 @dataclass(frozen=True)
