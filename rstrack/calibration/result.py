@@ -206,9 +206,8 @@ class Calibration:
                 notes.append(f"{name} has a global shutter, as far as can be told")
         readout, sigma = abs(self.values.depth_readout_s), self.sigmas[0]
         if self.dataset.rig.is_registered and sigma > 0.0 and readout > 2.0 * sigma:
-            notes.append(
-                f"registered depth has kept its rows' times: one time for all is {readout / sigma:.0f} sigma off"
-            )
+            far = f"{readout / sigma:.0f} sigma"
+            notes.append(f"registered depth has kept its rows' times: one time for all of them is {far} off")
         if self.asked[2]:
             notes.append("a delay of both streams alike cannot be told from images: offsets are against depth's stamps")
         if not self.solution.finished:
