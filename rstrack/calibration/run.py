@@ -22,7 +22,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.calibration.first_track import Track, first_track
 from rstrack.calibration.load import load_stretch, pair_terms
 from rstrack.calibration.pair_terms import PairTerms
-from rstrack.calibration.parameters import GROUPS, USEFUL, Parameters, free_of
+from rstrack.calibration.parameters import COUNT, GROUPS, USEFUL, Parameters, free_of
 from rstrack.calibration.result import Calibration, motion_of
 from rstrack.calibration.solve import Solution, solve
 from rstrack.calibration.stretch import Stretch
@@ -72,6 +72,11 @@ def calibrate(
         dataset = _oriented(dataset, parts, track.spline, start, options, progress)
     terms, stretches = _loaded(dataset, parts, track.spline, start, options, progress)
     solution = _solved(stretches, terms, start, free, progress)
+    if solution.free[3] and abs(solution.values.color_drift - start.color_drift) < 2.0 * solution.sigmas[3]:
+        # No drift to speak of: one found all the same would take colour away at both ends of the recording.
+        free = free & (np.arange(COUNT) != 3)
+        kept = start.moved(np.where(free & solution.free, solution.values.since(start), 0.0))
+        solution = solve(stretches, terms, kept, free & solution.free, (0,))
     motion = motion_of(dataset, parts, track.spline)
     return Calibration(dataset, start, solution, free, tuple(parts), motion, time.perf_counter() - begun)
 

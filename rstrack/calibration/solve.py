@@ -23,6 +23,8 @@ _COUNTED = 25.0
 _POOLED = 4.0
 # Systematic error of the colour camera's pose, px, σ: interpolation, spline, surfaces. Seen on renderings.
 _BLIND_PX = 0.08
+# And of colour's offset in one part of a recording against another, s.
+_BLIND_S = 3e-5
 # Times that the scales of errors are estimated before the first step of a level; once at the finest.
 _ROUNDS = 3
 
@@ -124,10 +126,15 @@ def solve(
 
 
 def _blind(stretches: Sequence[Stretch], terms: PairTerms) -> FloatArray:
-    """σ (10,) of what all stretches have in common: of the extrinsics, so many pixels as an angle and as a shift."""
+    """σ (10,) of what no disagreement shows.
+
+    Of the extrinsics, so many pixels as an angle and as a shift; of the drift, so many seconds from the middle to an end.
+    """
     turn = _BLIND_PX / terms.color.camera.fx
     depth = float(np.median([view.surface.median_depth for stretch in stretches for view in stretch.views]))
-    return np.concatenate([np.zeros(4), np.full(3, turn * depth), np.full(3, turn)])
+    stamps = [view.depth.stamp for stretch in stretches for view in stretch.views]
+    drift = _BLIND_S / max(0.5 * (max(stamps) - min(stamps)), 1e-3)
+    return np.concatenate([np.zeros(3), [drift], np.full(3, turn * depth), np.full(3, turn)])
 
 
 def _step(
