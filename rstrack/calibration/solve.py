@@ -128,7 +128,8 @@ def solve(
 def _blind(stretches: Sequence[Stretch], terms: PairTerms) -> FloatArray:
     """σ (10,) of what no disagreement shows.
 
-    Of the extrinsics, so many pixels as an angle and as a shift; of the drift, so many seconds from the middle to an end.
+    Of the extrinsics, so many pixels as an angle and as a shift; of the drift, so many seconds from the middle to an
+    end.
     """
     turn = _BLIND_PX / terms.color.camera.fx
     depth = float(np.median([view.surface.median_depth for stretch in stretches for view in stretch.views]))
