@@ -74,7 +74,7 @@ class Solution:
         all_of_them = np.exp(np.mean(np.log(np.maximum(ratio, 1e-6)))) if n else 1.0
         dof = max(1.0, count - 1.0)
         inflation = np.maximum((_POOLED * all_of_them + dof * ratio) / (_POOLED + dof), 1.0)
-        factor = float(stats.t.ppf(0.975, dof + _POOLED)) / 1.96
+        factor = float(stats.t.ppf(0.975, dof)) / 1.96
         sigmas = np.zeros(COUNT)
         sigmas[self.free] = np.hypot(factor * np.sqrt(formal * inflation), self.blind[self.free])
         return sigmas
