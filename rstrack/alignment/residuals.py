@@ -29,7 +29,7 @@ from rsgen.device.recording import recorded_from
 from rstrack.alignment.block_sums import accumulate, block_slot
 from rstrack.alignment.brightness import MID_GREY
 from rstrack.images.blur import blur_length, blur_weight
-from rstrack.images.sampling import EDGE, NEAREST, bilinear, grid, level_size, nearest, surface
+from rstrack.images.sampling import EDGE, NEAREST, grid, level_size, nearest, surface, value_and_slope
 
 # Metres that a point has to lie behind what is seen there to count as hidden, beside EDGE of its depth.
 _BEHIND = 0.02
@@ -148,14 +148,12 @@ def photometric_kernel(
             p = move(gather(given.to_base, ref_line, TO_BASE, stride=TO_BASE), p)
         seen = project_rolling(lens, given.from_base, p, e.UInt, e.Int)
         u, v = seen.x * shrink, seen.y * shrink
-        a, b, c, d, fx, fy, active = bilinear(e, given.image, width, height, u, v, active & seen.valid)
-        top, bottom = dr.fma(b - a, fx, a), dr.fma(d - c, fx, c)
+        value, dx, dy, active = value_and_slope(e, given.image, width, height, u, v, active & seen.valid)
+        dx, dy = dx * shrink, dy * shrink
         gain, offset = (dr.gather(e.Float, given.constants, e.UInt(i)) for i in (7, 8))
         contrast = given.intensity - MID_GREY
-        r = dr.fma(bottom - top, fy, top) - (given.intensity + dr.fma(gain, contrast, offset))  # (8), and brightness
+        r = value - (given.intensity + dr.fma(gain, contrast, offset))  # (8), and brightness
         columns = -contrast, e.Float(-1.0)
-        dx = dr.fma((d - c) - (b - a), fy, b - a) * shrink
-        dy = (bottom - top) * shrink
         if weighs_blur:
             # Of the squared error, so that σ stays that of sharp points.
             share = dr.sqrt(blur_weight(blur_length(lens, seen.pixel_speed), 1.0 / blur_sigma_px**2))  # (13)

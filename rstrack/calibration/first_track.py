@@ -12,18 +12,14 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.calibration.load import through
 from rstrack.data.dataset import Dataset
-from rstrack.data.rig import Frame, Image
 from rstrack.options import Method, Options
-from rstrack.tracking.color_offset import thinned
-from rstrack.tracking.run import make_tracker
+from rstrack.tracking.rough_track import rough_track
 
 # How frames are followed. The second is rougher, but takes more: where the readout is far off, what the first makes of
 # depth does not fit together. The third needs colour's clock to be about right, but no shapes. Part of the time that
 # must be followed.
 _METHODS: tuple[Method, ...] = ("rs-g", "baseline", "rs-pg")
 _LONG_ENOUGH = 0.9
-# Depth images as wide as that are thinned out: a rough track is enough.
-_LARGE = 480
 # Periods between frames from which on they are not in a row.
 _GAP = 2.5
 
@@ -59,7 +55,7 @@ class Track:
 
 
 def first_track(dataset: Dataset, chosen: range, options: Options, progress: Progress) -> Track:
-    """Of the frames of a dataset, by its depth. Raises UserError: nothing can be followed, an unreadable image."""
+    """Of the frames of a dataset. Raises UserError: nothing can be followed."""
     whole, best = dataset.stamps[chosen[-1]] - dataset.stamps[chosen[0]], None
     for method in _METHODS:
         found = _tracked(dataset, chosen, replace(options, method=method), progress)
@@ -73,26 +69,13 @@ def first_track(dataset: Dataset, chosen: range, options: Options, progress: Pro
 
 
 def _tracked(dataset: Dataset, chosen: range, options: Options, progress: Progress) -> Track | None:
-    has_color = options.photometric
-    step = 2 if dataset.rig.depth_camera.width >= _LARGE and not has_color else 1
-    rig = replace(dataset.rig, depth_camera=thinned(dataset.rig.depth_camera, step))
-    tracker = make_tracker(rig, options)
-    found: list[float] = []
-    for count, k in enumerate(chosen, 1):
-        stamp = float(dataset.stamps[k])
-        depth = Image(stamp, np.ascontiguousarray(dataset.images.depth(k)[::step, ::step]))
-        frame = dataset.frame(k) if has_color else Frame(depth, ())
-        try:
-            if not tracker.feed(frame).lost:
-                found.append(stamp)
-        except (UserError, np.linalg.LinAlgError):
-            break
-        progress(f"first track ({options.method})", count / len(chosen), f"{tracker.keyframes} keyframes")
+    tracker = rough_track(dataset, chosen, options, lambda done: progress(f"first track ({options.method})", done, ""))
     if tracker.spline is not None and tracker.spline_valid:
         return Track(tracker.spline, tuple(tracker.spline_valid))
     stamps, poses = tracker.trajectory
-    if options.method != "baseline" or len(stamps) < 2:
+    if len(stamps) < 2:
         return None
+    # A pose a frame: the baseline's.
     period = float(np.median(np.diff(dataset.stamps)))
     dt = min(options.knot_spacing_s, period)
     t0 = float(stamps[0]) - dt

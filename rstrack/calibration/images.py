@@ -14,7 +14,9 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import block_counts
-from rstrack.calibration.parameters import COUNT, Parameters
+from rstrack.alignment.normal_equations import Slopes
+from rstrack.calibration.parameters import COUNT, DRIFT, Parameters
+from rstrack.images.line_poses import rows_of
 
 
 def pair_lens(camera: Camera, shutter: Shutter) -> Lens:
@@ -65,11 +67,11 @@ class Lines:
 
     def to_base(self, T_base_world: FloatArray) -> FloatArray:
         """T_base_cam of each line (lines, 12): rotation row-major, translation."""
-        return _rows(T_base_world @ self.T_world_cam)
+        return rows_of(T_base_world @ self.T_world_cam)
 
     def from_base(self, T_base_world: FloatArray) -> FloatArray:
         """T_cam_base of each line and the camera's twist per line delay (lines, 18)."""
-        return np.concatenate([_rows(se3.inverse(T_base_world @ self.T_world_cam)), self.twist], axis=1)
+        return np.concatenate([rows_of(se3.inverse(T_base_world @ self.T_world_cam)), self.twist], axis=1)
 
 
 def lines_of(taken: Taken, spline: Spline, p: Parameters) -> Lines:
@@ -90,23 +92,19 @@ def lines_of(taken: Taken, spline: Spline, p: Parameters) -> Lines:
     start = np.arange(blocks) * per
     middle = 0.5 * (start + np.minimum(start + per, count) - 1) / count
     t = _within(spline, first + readout * middle)
-    at, J = spline.pose_jacobian(t)
+    slopes = Slopes.of(spline, np.eye(4), t, None)
     T, w = spline.pose_and_velocity(t)
     Ad = se3.adjoint(T)
     w_world = (Ad @ w[..., None])[..., 0]
-    low = int(at.min())
-    by_points = np.zeros((blocks, 6, int(at.max()) - low + 4, 6))
-    for i in range(4):
-        by_points[np.arange(blocks), :, at - low + i] = J[:, i]
     by_parameters = np.zeros((blocks, 6, COUNT))
     if taken.is_depth:
         by_parameters[..., 0] = w_world * middle[:, None]
     else:
         by_parameters[..., 1] = w_world * middle[:, None]
         by_parameters[..., 2] = w_world
-        by_parameters[..., 3] = w_world * (taken.stamp - p.epoch_s)
+        by_parameters[..., DRIFT] = w_world * (taken.stamp - p.epoch_s)
         by_parameters[..., 4:] = -Ad @ se3.adjoint(se3.inverse(T_cam_body))
-    return Lines(T_world_cam, twist, low, by_points.reshape(blocks, 6, -1), by_parameters)
+    return Lines(T_world_cam, twist, slopes.first, slopes.current, by_parameters)
 
 
 def _within(spline: Spline, t: FloatArray) -> FloatArray:
@@ -118,7 +116,3 @@ def span(images: Sequence[Taken], p: Parameters) -> tuple[float, float]:
     """Times (s) within which the lines of all images lie."""
     spans = [image.span(p) for image in images]
     return min(begin for begin, _ in spans), max(end for _, end in spans)
-
-
-def _rows(T: FloatArray) -> FloatArray:
-    return np.concatenate([T[:, :3, :3].reshape(-1, 9), T[:, :3, 3]], axis=1)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import lru_cache
 
-import cv2
 import numpy as np
 
 from rsgen.array_types import FloatArray
@@ -20,13 +19,14 @@ from rstrack.calibration.parameters import Parameters
 from rstrack.calibration.stretch import Stretch, View
 from rstrack.data.dataset import Dataset
 from rstrack.images.line_poses import Exposure
-from rstrack.images.pyramid import camera_rays, color_image
+from rstrack.images.pyramid import camera_rays, color_image, intensity
 from rstrack.options import Options
 
 # Seconds before the first and after the last line for which a stretch has spline: times move while they are estimated.
 _MARGIN_S = 0.08
 # What the colour camera may be further away than the file says, m.
 _BASELINE_M = 0.01
+# Rounds of correction of a spline that is to pass through poses.
 _ROUNDS = 6
 
 
@@ -89,8 +89,7 @@ def _view(terms: PairTerms, dataset: Dataset, k: int, max_depth: float) -> View:
         color = dataset.images.color(i)
         view.color = Taken(terms.color, float(dataset.color_stamps[i]), rig.color_shutter.exposure_s, False)
         view.levels = color_image(e, Exposure(terms.color, 0.0, np.eye(4)), color).levels
-        grey = np.asarray(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), np.float32) / np.float32(255.0)
-        view.bound = intensity_bound(grey, rig.color_camera.fx, view.surface.median_depth)
+        view.bound = intensity_bound(intensity(color), rig.color_camera.fx, view.surface.median_depth)
     return view
 
 

@@ -27,8 +27,8 @@ from rsgen.device.recording import recorded_from
 from rstrack.alignment.block_sums import BlockSums, Scaling, accumulate, block_counts, block_slot
 from rstrack.alignment.brightness import MID_GREY
 from rstrack.alignment.residuals import GeometricInput, geometric_kernel
-from rstrack.images.sampling import EDGE, bilinear, grid, level_size
-from rstrack.keyframes.keyframe import depth_scaling, strides, surface_slopes
+from rstrack.images.sampling import EDGE, grid, level_size, value_and_slope
+from rstrack.keyframes.keyframe import depth_scaling, strides, surface_bends, surface_slopes
 
 # Part of the width over which inverse depth is averaged, to either side.
 _WINDOW = 1.0 / 160.0
@@ -37,7 +37,6 @@ _GATE_SIGMAS, _GATE_INTENSITY = 5.0, 0.3
 FLOOR_DEPTH, FLOOR_INTENSITY = 2e-4, 1.0 / 255.0
 # Part of σ by which the averaging may have bent a pixel's surface.
 _SMOOTH = 0.25
-
 # Inverse depth larger by this part may hide a point from the colour camera.
 _HIDES = 0.2
 
@@ -70,10 +69,9 @@ def surface_of(
     height, width = rho.shape
     slope_x, slope_y = surface_slopes(rho, fx, fy)
     z = np.divide(np.float32(1.0), rho, out=np.zeros_like(rho), where=rho > 0)
-    bend = np.zeros_like(rho)
-    bend[:, 1:-1] += np.abs(slope_x[:, 2:] - slope_x[:, :-2]) / np.float32(2.0 * fx)
-    bend[1:-1] += np.abs(slope_y[2:] - slope_y[:-2]) / np.float32(2.0 * fy)
-    roughness = (_window(width) ** 2 - 1) / 24.0 * z * z * bend  # a parabola's mean over the window is off by that
+    bend_x, bend_y = surface_bends(slope_x, slope_y, fx, fy)
+    # A parabola's mean over the window is off by that.
+    roughness = (_window(width) ** 2 - 1) / 24.0 * z * z * (bend_x + bend_y)
     reach = max(1, math.ceil(baseline_m * fx * float(np.percentile(rho[rho > 0], 90.0)))) if (rho > 0).any() else 1
     nearest = np.asarray(cv2.dilate(rho, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)))
     z = np.where((z > 0) & (nearest < np.float32(1.0 + _HIDES) * rho), z, np.float32(0.0))
@@ -90,7 +88,7 @@ def averaged(rho: Float32Image) -> Float32Image:
     """Inverse depth (h, w) averaged over windows on one surface, 0 elsewhere: exact on planes, where it is affine.
 
     Noise of single pixels bends surfaces, and steps of the camera's resolution move with it, not with the scene: raw
-    depth gives readouts of a Kinect's images five times as badly.
+    depth gives readouts of a Kinect's images four times as badly.
     """
     window = _window(rho.shape[1])
     size = np.ones((window, window), np.uint8)
@@ -133,11 +131,9 @@ def color_pair_kernel(e: Engine, color: Lens, depth: Lens, stride: int, level: i
     shrink = 0.5**level
 
     def looked_up(image: Any, seen: Any, active: Any) -> tuple[Any, Any, Any, Any]:
-        u, v = seen.x * shrink, seen.y * shrink
-        a, b, c, d, fx, fy, active = bilinear(e, image, width, height, u, v, active & seen.valid)
-        top, bottom = dr.fma(b - a, fx, a), dr.fma(d - c, fx, c)
-        slope_x, slope_y = dr.fma((d - c) - (b - a), fy, b - a) * shrink, (bottom - top) * shrink
-        return dr.fma(bottom - top, fy, top), slope_x, slope_y, active
+        x, y = seen.x * shrink, seen.y * shrink
+        value, dx, dy, active = value_and_slope(e, image, width, height, x, y, active & seen.valid)
+        return value, dx * shrink, dy * shrink, active
 
     @recorded_from(ColorPairInput)
     def kernel(given: ColorPairInput) -> Any:

@@ -21,6 +21,7 @@ NAMES = (
 )  # fmt: skip
 """The unknowns, in the order of their vectors. Extrinsics: T_color_depth ← exp(ε) T_color_depth, ε in colour's axes."""
 COUNT = len(NAMES)
+DRIFT = NAMES.index("color.drift")
 
 _GROUP_OF: tuple[Group, ...] = ("readout", "readout", "offset", "offset", *(("extrinsics",) * 6))
 # What is known of each beforehand (σ): s, s, s, s/s, m, rad.

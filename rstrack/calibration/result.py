@@ -13,7 +13,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
-from rstrack.calibration.parameters import NAMES, Parameters
+from rstrack.calibration.parameters import COUNT, DRIFT, NAMES, Parameters
 from rstrack.calibration.solve import Solution
 from rstrack.data.dataset import Dataset
 
@@ -99,18 +99,16 @@ class Calibration:
 
     def text(self) -> str:
         """A table of the values with their σ, what could not be told and why, and what comes with it."""
-        moved, sigmas = self.values.since(self.start), self.sigmas
-        absolute = _absolute(self.values)
+        sigmas, absolute, before = self.sigmas, _absolute(self.values), _absolute(self.start)
         lines = [f"{'':<28}{'found':>10}   {'2 sigma':>9}   {'from':>10}"]
         for i, (name, unit, factor) in enumerate(_SHOWN):
             if not self.asked[i]:
                 continue
-            before = factor * (absolute[i] - moved[i]) if i < 4 else factor * _absolute(self.start)[i]
             if self.undetermined[i]:
                 lines.append(f"{name:<28}{factor * absolute[i]:>10.3f}   undetermined: needs {_NEEDS[i]}")
             else:
                 found = f"{factor * absolute[i]:>10.3f} ± {2.0 * factor * sigmas[i]:>9.3f}"
-                lines.append(f"{name:<28}{found}   {before:>10.3f} {unit}")
+                lines.append(f"{name:<28}{found}   {factor * before[i]:>10.3f} {unit}")
         if self.undetermined.any():
             lines.append(self.motion.text())
         lines += self._notes()
@@ -139,41 +137,44 @@ class Calibration:
             "stretches": [[part.start, part.stop] for part in self.parts],
             "motion": {"m_s": self.motion.speed, "rad_s": self.motion.rotation, "rad_s2": self.motion.change},
             "sigma_depth_m": self.solution.sigma_depth_m, "sigma_intensity": self.solution.sigma_intensity,
-            "finished": self.solution.finished, "seconds": self.seconds,
+            "finished": self.solution.finished, "converged": self.solution.is_settled, "seconds": self.seconds,
             "camera_file": self.camera_file(),
         }  # fmt: skip
 
     def camera_file(self) -> str:
         """A camera.yaml that `rstrack track` takes, with 2 σ beside each value."""
         rig, found, scans = self.dataset.rig, self._upright(), self._scans()
-        sigmas = self.sigmas
+        beside = self._beside()
         names = [f"# rstrack calibrate {self.dataset.name}, {len(self.parts)} stretches; ± is 2 sigma"]
         names += [f"# {note}" for note in self._notes()]
-        drift = f"\n  drift_ppm: {1e6 * found.color_drift:.3f}{self._beside(3, 1e6, 'ppm', sigmas)}"
+        drift = f"\n  drift_ppm: {1e6 * found.color_drift:.3f}{beside[DRIFT]}"
         color = _stream("color", rig.color_camera, rig.color_shutter, found.color_readout_s, scans[1])
-        color += self._beside(1, 1e3, "ms", sigmas)
+        color += beside[1]
         offset_s = found.color_offset_s - self.dataset.depth_offset_s
-        color += f"\n  offset_s: {offset_s:.7f}{self._beside(2, 1e3, 'ms', sigmas)}"
+        color += f"\n  offset_s: {offset_s:.7f}{beside[2]}"
         depth = _stream("depth", rig.depth_camera, rig.depth_shutter, found.depth_readout_s, scans[0])
-        depth += self._beside(0, 1e3, "ms", sigmas)
-        scale = self.dataset.depth_scale
+        depth += beside[0]
         rows = ["  - [" + ", ".join(f"{x:.12g}" for x in row) + "]" for row in found.T_color_depth]
-        beside = ""
-        if self.asked[4:].any():
-            shown = [f"{_SHOWN[i][0].split(', ')[1]}{self._beside(i, _SHOWN[i][2], _SHOWN[i][1], sigmas)[3:]}"
-                     for i in range(4, 10)]  # fmt: skip
-            beside = "  # " + ", ".join(shown)
+        shown = [f"{_SHOWN[i][0].split(', ')[1]}{beside[i][3:]}" for i in range(DRIFT + 1, COUNT)]
+        timing = self.dataset.timing
+        mode = "auto" if timing is None else timing.mode
         return "\n".join([
-            *names, color + (drift if found.color_drift else ""), depth + f"\n  depth_scale: {scale:g}",
-            f"T_color_depth:{beside}", *rows, "",
+            *names, *(() if mode == "auto" else (f"stamps: {mode}",)), color + (drift if found.color_drift else ""),
+            depth + f"\n  depth_scale: {self.dataset.depth_scale:g}",
+            "T_color_depth:" + ("  # " + ", ".join(shown) if self.asked[DRIFT + 1 :].any() else ""), *rows, "",
         ])  # fmt: skip
 
-    def _beside(self, i: int, factor: float, unit: str, sigmas: FloatArray) -> str:
-        if not self.asked[i]:
-            return ""
-        if self.undetermined[i]:
-            return "  # undetermined, kept"
-        return f"  # ± {2.0 * factor * sigmas[i]:.3g} {unit}"
+    def _beside(self) -> list[str]:
+        """For each of the unknowns the comment beside its value in the camera file."""
+
+        def comment(i: int) -> str:
+            _, unit, factor = _SHOWN[i]
+            if self.undetermined[i]:
+                return "  # undetermined, kept"
+            return f"  # ± {2.0 * factor * sigmas[i]:.3g} {unit}" if self.asked[i] else ""
+
+        sigmas = self.sigmas
+        return [comment(i) for i in range(COUNT)]
 
     def _scans(self) -> tuple[Scan, Scan]:
         """Of depth and colour; the opposite of what was assumed where the readout turned out negative."""

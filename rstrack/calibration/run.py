@@ -2,7 +2,7 @@
 
 found = calibrate(open_dataset(Path("recording")))
 print(found.text())
-found.write(Path("camera.yaml"))
+Path("camera.yaml").write_text(found.camera_file())
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.calibration.first_track import Track, first_track
 from rstrack.calibration.load import load_stretch, pair_terms
 from rstrack.calibration.pair_terms import PairTerms
-from rstrack.calibration.parameters import COUNT, GROUPS, USEFUL, Parameters, free_of
+from rstrack.calibration.parameters import COUNT, DRIFT, GROUPS, USEFUL, Parameters, free_of
 from rstrack.calibration.result import Calibration, motion_of
 from rstrack.calibration.solve import Solution, solve
 from rstrack.calibration.stretch import Stretch
@@ -53,8 +53,8 @@ def calibrate(
     """Readouts, colour's clock and extrinsics of a dataset, from the values of its cameras on.
 
     groups: of GROUPS, what may change; all by default, but extrinsics where depth is registered to colour. Where Ctrl-C
-    is pressed, the best so far is returned, marked so. Raises UserError: too few frames, no track by depth alone,
-    unknown groups, an image that cannot be read.
+    is pressed while it solves, the best so far is returned, marked so. Raises UserError: too few frames, or too few
+    that can be followed; unknown groups; an image that cannot be read.
     """
     begun = time.perf_counter()
     options = options or Options()
@@ -71,12 +71,8 @@ def calibrate(
     if not dataset.scan_named and "readout" in groups:
         dataset = _oriented(dataset, parts, track.spline, start, options, progress)
     terms, stretches = _loaded(dataset, parts, track.spline, start, options, progress)
-    solution = _solved(stretches, terms, start, free, progress)
-    if solution.free[3] and abs(solution.values.color_drift - start.color_drift) < 2.0 * solution.sigmas[3]:
-        # No drift to speak of: one found all the same would take colour away at both ends of the recording.
-        free = free & (np.arange(COUNT) != 3)
-        kept = start.moved(np.where(free & solution.free, solution.values.since(start), 0.0))
-        solution = solve(stretches, terms, kept, free & solution.free, (0,))
+    solution, drifts = _solved(stretches, terms, start, free, progress)
+    free[DRIFT] &= drifts
     motion = motion_of(dataset, parts, track.spline)
     return Calibration(dataset, start, solution, free, tuple(parts), motion, time.perf_counter() - begun)
 
@@ -101,7 +97,7 @@ def _oriented(
     """
     few = parts[:: -(-len(parts) // _TRIED)]
     free, found = free_of(("readout", "offset")), []
-    free[3] = False
+    free[DRIFT] = False
     for count, scan in enumerate(_AXES):
         progress("scan direction", count / len(_AXES), scan)
         rig = dataset.rig
@@ -123,10 +119,14 @@ def parameters_of(dataset: Dataset) -> Parameters:
 
 def _solved(
     stretches: Sequence[Stretch], terms: PairTerms, file: Parameters, free: BoolArray, progress: Progress
-) -> Solution:
-    """From the file's values on: with all that may change, then without what this recording turns out not to tell."""
+) -> tuple[Solution, bool]:
+    """From the file's values on: with all that may change, then without what this recording turns out not to tell.
+
+    And whether colour's clock may drift: one that is within its error of the file's is held there, since it would take
+    colour away at both ends of the recording.
+    """
     levels: Sequence[int] = _LEVELS
-    start, done = file, 0
+    start, done, drifts = file, 0, True
 
     def watch(level: int, _: int, p: Parameters) -> None:
         nonlocal done
@@ -136,12 +136,16 @@ def _solved(
 
     while True:
         solution = solve(stretches, terms, start, free, levels, watch)
-        unsure = solution.sigmas / USEFUL
-        if unsure.max() <= 1.0 or not solution.finished:
+        sigmas = solution.sigmas
+        unsure, drift = sigmas / USEFUL, abs(solution.values.color_drift - file.color_drift)
+        if solution.finished and unsure.max() > 1.0:
+            # What is told least drags others along: they may be told once it is held.
+            free = free & (unsure <= max(1.0, _DRAGS * unsure.max()))
+        elif solution.finished and free[DRIFT] and drift < 2.0 * sigmas[DRIFT]:
+            drifts, free = False, free & (np.arange(COUNT) != DRIFT)
+        else:
             progress("calibrating", 1.0, "done")
-            return solution
-        # What is told least drags others along: they may be told once it is held.
-        free = free & (unsure <= max(1.0, _DRAGS * unsure.max()))
+            return solution, drifts
         start = file.moved(np.where(free, solution.values.since(file), 0.0))
         levels = (0,)
 
@@ -171,7 +175,7 @@ def _motion(dataset: Dataset, part: range, track: Spline) -> float:
 def _free(dataset: Dataset, groups: Sequence[str], parts: Sequence[range]) -> BoolArray:
     """What may change (10,): drift only where colour's clock is seen for long enough."""
     free = free_of(groups)
-    free[3] &= dataset.stamps[parts[-1].stop - 1] - dataset.stamps[parts[0].start] >= _DRIFT_S
+    free[DRIFT] &= dataset.stamps[parts[-1].stop - 1] - dataset.stamps[parts[0].start] >= _DRIFT_S
     return free
 
 

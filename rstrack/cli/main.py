@@ -118,6 +118,8 @@ def track(
         found = None
         if calibrate:
             found = run_calibration(dataset, None, frames or slice(None), tracker, progress)
+            if not found.solution.finished:
+                raise KeyboardInterrupt
             dataset = found.calibrated()
         result = run.track(dataset, tracker, out, frames or slice(None), noise, progress)
     if found is not None:

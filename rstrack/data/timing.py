@@ -67,6 +67,14 @@ class Timing:
         """Whether stamps are arrival times."""
         return "jittered" in (self.depth.clock.verdict, self.color.clock.verdict)
 
+    @property
+    def mode(self) -> StampsMode:
+        """What makes these stamps of those listed: auto if that does."""
+        streams = self.depth, self.color
+        if all(stream.is_even == (stream.clock.verdict == "jittered") for stream in streams):
+            return "auto"
+        return "regular" if self.depth.is_even else "raw"
+
     def lines(self) -> list[str]:
         """For the screen: one line a stream, one for the offset between them, and what was assumed."""
         color = f"colour: {self.color.text()}"

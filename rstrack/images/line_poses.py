@@ -98,7 +98,7 @@ def to_base_table(spline: Spline, T_world_base: FloatArray, exposure: Exposure) 
     """T_base_cam of each line (lines, 12): rotation row-major, translation."""
     T_world_body, _ = line_motion(spline, exposure)
     T = se3.inverse(T_world_base) @ T_world_body @ se3.inverse(exposure.T_cam_body)
-    return _rows(T)
+    return rows_of(T)
 
 
 def from_base_table(spline: Spline, T_world_base: FloatArray, exposure: Exposure) -> FloatArray:
@@ -107,10 +107,10 @@ def from_base_table(spline: Spline, T_world_base: FloatArray, exposure: Exposure
     T = exposure.T_cam_body @ se3.inverse(T_world_body) @ T_world_base
     delay = exposure.lens.shutter.line_delay(exposure.lens.camera)
     twist_cam = delay * twist @ se3.adjoint(exposure.T_cam_body).T
-    return np.concatenate([_rows(T), twist_cam], axis=1)
+    return np.concatenate([rows_of(T), twist_cam], axis=1)
 
 
-def _rows(T: FloatArray) -> FloatArray:
+def rows_of(T: FloatArray) -> FloatArray:
     """Poses (n, 4, 4) as (n, 12): rotation row-major, translation."""
     return np.concatenate([T[:, :3, :3].reshape(-1, 9), T[:, :3, 3]], axis=1)
 

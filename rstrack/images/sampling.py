@@ -33,6 +33,15 @@ def bilinear(e: Engine, image: Any, width: int, height: int, x: Any, y: Any, act
     return (*near, x - x0, y - y0, active)
 
 
+def value_and_slope(
+    e: Engine, image: Any, width: int, height: int, x: Any, y: Any, active: Any
+) -> tuple[Any, Any, Any, Any]:
+    """The bilinear value at (x, y), its derivatives by x and y, and whether all four neighbours are inside."""
+    a, b, c, d, fx, fy, active = bilinear(e, image, width, height, x, y, active)
+    top, bottom = dr.fma(b - a, fx, a), dr.fma(d - c, fx, c)
+    return dr.fma(bottom - top, fy, top), dr.fma((d - c) - (b - a), fy, b - a), bottom - top, active
+
+
 def nearest(e: Engine, width: int, x: Any, y: Any, active: Any) -> Any:
     """Index of the pixel nearest to (x, y); 0 where not active."""
     column, row = (e.UInt(e.Int(dr.select(active, v + 0.5, 0.0))) for v in (x, y))

@@ -121,6 +121,14 @@ def surface_slopes(rho: Image, fx: float, fy: float) -> tuple[Image, Image]:
     return out[0], out[1]
 
 
+def surface_bends(slope_x: Image, slope_y: Image, fx: float, fy: float) -> tuple[Image, Image]:
+    """Size of the second differences (h, w) of inverse depth from pixel to pixel, along rows and columns."""
+    bend_x, bend_y = np.zeros_like(slope_x), np.zeros_like(slope_y)
+    bend_x[:, 1:-1] = np.abs(slope_x[:, 2:] - slope_x[:, :-2]) / np.float32(2.0 * fx)
+    bend_y[1:-1] = np.abs(slope_y[2:] - slope_y[:-2]) / np.float32(2.0 * fy)
+    return bend_x, bend_y
+
+
 def surface_roughness(rho: Image, slope_x: Image, slope_y: Image, fx: float, fy: float) -> Image:
     """Error (h, w) in m that bilinear interpolation of inverse depth may have: an eighth of its second difference.
 
@@ -128,9 +136,7 @@ def surface_roughness(rho: Image, slope_x: Image, slope_y: Image, fx: float, fy:
     keyframe (0.02 mm each). Taken from the smoothed slopes, so that noise does not pass for corners; a corner's
     second difference is spread over the window there.
     """
-    bend_x, bend_y = np.zeros_like(rho), np.zeros_like(rho)
-    bend_x[:, 1:-1] = np.abs(slope_x[:, 2:] - slope_x[:, :-2]) / np.float32(2.0 * fx)
-    bend_y[1:-1] = np.abs(slope_y[2:] - slope_y[:-2]) / np.float32(2.0 * fy)
+    bend_x, bend_y = surface_bends(slope_x, slope_y, fx, fy)
     z = np.divide(np.float32(1.0), rho, out=np.zeros_like(rho), where=rho > 0)
     return (_NORMAL_WINDOW / 8.0 * z * z * np.maximum(bend_x, bend_y)).astype(np.float32)
 

@@ -12,7 +12,7 @@ pair has. What tells is that the camera turns differently at the two times: stea
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
@@ -20,12 +20,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rsgen.array_types import FloatArray
-from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rsgen.geometry.camera import Camera
 from rsgen.geometry.spline import Spline
 from rstrack.data.dataset import Dataset
-from rstrack.data.rig import Frame, Image
 from rstrack.images.pyramid import intensity
 from rstrack.options import Options
 
@@ -38,8 +35,6 @@ _MOST_S, _COARSE_S, _FINE_S = 0.06, 0.01, 0.0025
 _NEAR = 2
 # Frames that are tracked; of these, every so manieth has its depth looked up in pairs of images so many frames apart.
 _TRACKED, _EVERY, _APART = 60, 4, (4, 8)
-# Depth images as wide as that are thinned out: a short track needs no more, and it takes most of the time.
-_LARGE = 480
 # Windows of the recording of which the one that moves most is taken, and the shift (part of the width, a frame) that is
 # enough: images that move faster are blurred.
 _WINDOWS, _ENOUGH = 8, 0.015
@@ -161,29 +156,16 @@ def _geometric_track(
     dataset: Dataset, frames: range, options: Options, progress: Progress
 ) -> tuple[Spline | None, float, float]:
     """T_world_depth(t) of the frames from depth alone, and the longest time (begin, end) in s that it covers."""
-    from rstrack.tracking.run import make_tracker
+    from rstrack.tracking.rough_track import rough_track
 
-    step = 2 if dataset.rig.depth_camera.width >= _LARGE else 1
-    rig = replace(dataset.rig, depth_camera=thinned(dataset.rig.depth_camera, step))
-    tracker = make_tracker(rig, Options(method="rs-g", backend=options.backend))
-    for count, k in enumerate(frames, 1):
-        try:
-            depth = Image(float(dataset.stamps[k]), np.ascontiguousarray(dataset.images.depth(k)[::step, ::step]))
-            tracker.feed(Frame(depth, ()))
-        except (UserError, np.linalg.LinAlgError):
-            break
-        progress("colour's clock", 0.7 * count / len(frames), "tracking depth")
+    def done(share: float) -> None:
+        progress("colour's clock", 0.7 * share, "tracking depth")
+
+    tracker = rough_track(dataset, frames, Options(method="rs-g", backend=options.backend), done)
     if not tracker.spline_valid or tracker.spline is None:
         return None, 0.0, 0.0
     begin, end = max(tracker.spline_valid, key=lambda span: span[1] - span[0])
     return tracker.spline, begin, end
-
-
-def thinned(camera: Camera, step: int) -> Camera:
-    """The camera whose pixels are every step-th of a camera's, from the first."""
-    fx, fy, cx, cy = (value / step for value in (camera.fx, camera.fy, camera.cx, camera.cy))
-    width, height = -(-camera.width // step), -(-camera.height // step)
-    return replace(camera, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
 
 
 def _pairs(dataset: Dataset, frames: range, begin: float, end: float) -> list[tuple[int, int, int]]:

@@ -20,13 +20,14 @@ from rsgen.geometry.spline import Spline
 from rstrack.calibration import run as calibration_run
 from rstrack.calibration.images import Taken, lines_of
 from rstrack.calibration.load import like, load_stretch, pair_terms
-from rstrack.calibration.parameters import COUNT, NAMES, PRIOR, Parameters, free_of
+from rstrack.calibration.parameters import COUNT, DRIFT, NAMES, PRIOR, USEFUL, Parameters, free_of
 from rstrack.calibration.result import Calibration
 from rstrack.calibration.run import calibrate, parameters_of
 from rstrack.calibration.solve import Solution, solve
 from rstrack.cli.main import main
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.noise import NoisyImages, with_noise
+from rstrack.data.timing import Timing, stream_timing
 from rstrack.options import Options
 
 READOUT_S, RATE_HZ, FRAMES = 0.014, 60.0, 60
@@ -207,6 +208,17 @@ def test_too_little_to_go_by_is_said_in_one_line(shaken: Dataset) -> None:
         calibrate(blind, options=OPTIONS)
 
 
+@pytest.mark.parametrize("drift", [0.0, 3e-3])
+def test_a_drift_is_found_or_else_held(shaken: Dataset, monkeypatch: pytest.MonkeyPatch, drift: float) -> None:
+    monkeypatch.setattr(calibration_run, "_DRIFT_S", 0.5)
+    monkeypatch.setattr(calibration_run, "USEFUL", np.where(np.arange(COUNT) == DRIFT, 1e-3, USEFUL))
+    off = drift * (shaken.color_stamps - shaken.middle)
+    found = calibrate(replace(shaken, color_stamps=shaken.color_stamps - off), ("offset",), options=OPTIONS)
+    assert found.asked[DRIFT] == (drift > 0.0) and not found.undetermined.any()
+    assert found.values.color_drift == pytest.approx(drift, abs=2e-4 if drift else 0.0)
+    assert ("colour drift" in found.text()) == (drift > 0.0)
+
+
 def test_noise_is_that_of_track_and_makes_sigmas_grow(shaken: Dataset) -> None:
     noisy = replace(shaken, images=NoisyImages(shaken.images, 2e-3, 0.02, 7))
     frame = with_noise(shaken.frame(9), 9, 2e-3, 0.02, 7)
@@ -274,10 +286,28 @@ def test_the_camera_file_says_what_was_found(shaken: Dataset, tmp_path: Path) ->
     assert again.rig.depth_shutter.scan == "bottom-top"
     np.testing.assert_allclose(again.rig.T_color_depth, expected.rig.T_color_depth, atol=1e-10)
     np.testing.assert_allclose(again.color_stamps, expected.color_stamps, atol=2e-7)
+    # Stamps are used as they were, whatever 'auto' would make of them.
+    clock = stream_timing("depth", shaken.stamps, "regular", 0.0)
+    regular = replace(made, dataset=replace(shaken, timing=Timing(clock, clock, 0.0)))
+    assert "\nstamps: regular" in regular.camera_file() and "\nstamps" not in made.camera_file()
     text = (tmp_path / "camera.yaml").read_text()
     assert "±" in text and "undetermined, kept" in text
     parameters = made.as_dict()["parameters"]
     assert parameters["T_color_depth.y"]["sigma"] is None and parameters["color.offset_s"]["sigma"] > 0.0
+
+
+def test_ctrl_c_while_calibrating_ends_track_too(
+    shaken: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(dataset: Dataset, *_: object) -> Calibration:
+        start = parameters_of(dataset)
+        nothing = Solution(start, np.zeros(COUNT, bool), np.zeros((3, 0, 0)), np.zeros((3, 0)), 0, 1, 1, finished=False)
+        motion = calibration_run.motion_of(dataset, [range(30)], shaking())
+        return Calibration(dataset, start, nothing, nothing.free, (range(30),), motion, 1.0)
+
+    monkeypatch.setattr(calibration_run, "calibrate", interrupted)
+    assert main(["track", str(shaken.root), "--calibrate", "--out", str(tmp_path / "run"), "--quiet"]) == 130
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_sequence_is_calibrated_and_tracked_by_command(
