@@ -58,6 +58,12 @@ class Projection:
         nx, ny = (v[0] - self.xn * v[2]) * self._inv_z, (v[1] - self.yn * v[2]) * self._inv_z
         return self._du[0] * nx + self._du[1] * ny, self._dv[0] * nx + self._dv[1] * ny
 
+    def shift_of(self, x: Any, y: Any) -> Vector:
+        """The shift of the point, at its depth, that moves its pixel by (x, y)."""
+        (a, b), (c, d) = self._du, self._dv
+        scale = self.q[2] / (a * d - b * c)
+        return scale * (d * x - b * y), scale * (a * y - c * x), type(self.q[2])(0.0)
+
 
 def project(camera: Camera, q: Vector) -> Projection:
     """Pixels of points in the camera's frame."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,19 +20,19 @@ from rstrack.alignment.student_t import cost, curvature, weight
 BLOCKS = 60
 # Those of an unrectified reference are larger: it is bootstrapping only, and pairs of blocks are many.
 PAIR_BLOCKS = 15
-# Integers per block: 21 of H (upper triangle), 6 of g, sum of w s², cost, count, compared, and padding; with brightness
-# 12 of the coupling, 3 of its own H and 2 of its g more.
-_SLOTS, _SLOTS_WITH_BRIGHTNESS = 32, 48
+# Integers per block: 21 of H (upper triangle), 6 of g, sum of w s², cost, count, compared; with n further columns 6 n
+# of the coupling, n (n + 1) / 2 of their own H and n of their g more; and padding.
+_SLOTS, _PAD = 31, 16
 _COMPARED = 30
 _JUDGED = (27, 29, _COMPARED)
 _UPPER = np.triu_indices(6)
 
 
 @dataclass(frozen=True)
-class BrightnessSums:
-    """Sums with c, the derivative of r by a colour image's gain and offset.
+class ColumnSums:
+    """Sums with c, the derivatives of r by n further unknowns: a colour image's gain and offset, what lenses are like.
 
-    coupling (nc, nr, 6, 2) = Σ w j cᵀ, H (2, 2) = Σ w c cᵀ and g (2,) = Σ w c s over all blocks.
+    coupling (nc, nr, 6, n) = Σ w j cᵀ, H (n, n) = Σ w c cᵀ and g (n,) = Σ w c s over all blocks.
     """
 
     coupling: FloatArray
@@ -54,15 +55,15 @@ class BlockSums:
     cost: float
     count: int
     compared: int = 0
-    brightness: BrightnessSums | None = None
+    columns: ColumnSums | None = None
 
     def summed(self) -> BlockSums:
         """The same of all current lines at once."""
-        own = self.brightness
+        own = self.columns
         if own is not None:
             own = replace(own, coupling=own.coupling.sum(axis=0, keepdims=True))
         H, g = self.H.sum(axis=0, keepdims=True), self.g.sum(axis=0, keepdims=True)
-        return replace(self, H=H, g=g, brightness=own)
+        return replace(self, H=H, g=g, columns=own)
 
 
 @dataclass(frozen=True)
@@ -83,8 +84,8 @@ class Scaling:
         units = room / (1.2 * self.bound**2), room / (1.4 * self.bound), room / 16.0
         return np.array([1 / sigma, gate, 1 / self.median_depth, self.bound, *units])
 
-    def unpack(self, raw: FloatArray, current: int, reference: int) -> BlockSums:
-        """Integers as summed on the device to `BlockSums`."""
+    def unpack(self, raw: FloatArray, current: int, reference: int, columns: int = 0) -> BlockSums:
+        """Integers as summed on the device, with so many further columns, to `BlockSums`."""
         raw = raw.reshape(current, reference, -1)
         _, _, _, _, unit_H, unit_g, unit_cost = self.parameters(1.0, 0.0)
         scale = np.array([1.0, 1.0, 1.0, self.median_depth, self.median_depth, self.median_depth])
@@ -93,16 +94,20 @@ class Scaling:
         H[..., a, b] = H[..., b, a] = raw[..., :21] * (scale[a] * scale[b] / unit_H)
         g = raw[..., 21:27] * (scale / unit_g)
         weighted, cost, count, compared = raw[..., 27:31].astype(np.int64).sum(axis=(0, 1)).tolist()
-        brightness = self._brightness(raw, scale) if raw.shape[2] == _SLOTS_WITH_BRIGHTNESS else None
-        return BlockSums(H, g, weighted / unit_cost, cost / unit_cost, count, compared, brightness)
+        more = self._columns(raw, scale, columns) if columns else None
+        return BlockSums(H, g, weighted / unit_cost, cost / unit_cost, count, compared, more)
 
-    def _brightness(self, raw: FloatArray, scale: FloatArray) -> BrightnessSums:
+    def _columns(self, raw: FloatArray, scale: FloatArray, n: int) -> ColumnSums:
         _, _, _, _, unit_H, unit_g, _ = self.parameters(1.0, 0.0)
+        own = _SLOTS + 6 * n
         # c is summed in units of `bound`, so that the same units serve.
-        coupling = np.stack([raw[..., 31:37], raw[..., 37:43]], axis=-1) * (scale[:, None] / (unit_H * self.bound))
-        aa, ab, bb, a, b = raw[..., 43:48].astype(np.int64).sum(axis=(0, 1))
-        H = np.array([[aa, ab], [ab, bb]]) / (unit_H * self.bound**2)
-        return BrightnessSums(coupling, H, np.array([a, b]) / (unit_g * self.bound))
+        coupling = raw[..., _SLOTS:own].reshape(*raw.shape[:2], n, 6).swapaxes(2, 3)
+        summed = raw[..., own : own + n * (n + 1) // 2 + n].astype(np.int64).sum(axis=(0, 1))
+        H = np.empty((n, n))
+        a, b = np.triu_indices(n)
+        H[a, b] = H[b, a] = summed[: len(a)] / (unit_H * self.bound**2)
+        coupling = coupling * (scale[:, None] / (unit_H * self.bound))
+        return ColumnSums(coupling, H, summed[len(a) :] / (unit_g * self.bound))
 
 
 def block_counts(lens: Lens, ref_lens: Lens) -> tuple[int, int, int, int]:
@@ -121,10 +126,10 @@ def _is_global(lens: Lens, ref_lens: Lens) -> bool:
     return lens.lines == 1 and ref_lens.lines == 1
 
 
-def block_slot(
-    line: Any, ref_line: Any, lens: Lens, ref_lens: Lens, y: Any, with_brightness: bool = False
-) -> tuple[Any, int]:
+def block_slot(line: Any, ref_line: Any, lens: Lens, ref_lens: Lens, y: Any, columns: int = 0) -> tuple[Any, int]:
     """First integer of each pixel's block, or pair of blocks, and how many integers there are in all.
+
+    columns: further ones, see `ColumnSums`.
 
     y: the pixel's own, which is its line where all are exposed at once.
     """
@@ -132,17 +137,17 @@ def block_slot(
     if _is_global(lens, ref_lens):
         line = type(line)(dr.clip(y, 0, lens.camera.height - 1))
     block = line // per if reference == 1 else line // per * reference + ref_line // ref_per
-    slots = _SLOTS_WITH_BRIGHTNESS if with_brightness else _SLOTS
+    slots = -(-(_SLOTS + 7 * columns + columns * (columns + 1) // 2) // _PAD) * _PAD
     return block * slots, current * reference * slots
 
 
 def accumulate(
     e: Engine, g: Vector, p: Vector, sign: float, r: Any, active: Any, parameters: list[Any], slot: Any, size: int,
-    c: tuple[Any, Any] | None = None, judged: Any = True,
+    c: Sequence[Any] = (), judged: Any = True,
 ) -> Any:  # fmt: skip
     """Σ w j jᵀ and so on into `size` integers, from `slot` on (`block_slot`); j = sign [g, p × g].
 
-    c: see `BrightnessSums`, each at most 1. judged: pixels that tell σ and are counted; others only add to the system
+    c: see `ColumnSums`, each at most 1. judged: pixels that tell σ and are counted; others only add to the system
     and the cost.
     """
     inv_sigma, gate, inv_lever, bound, unit_H, unit_g, unit_cost = parameters
@@ -163,13 +168,12 @@ def accumulate(
     values += [c * s * (sign * unit_g) for c in wj]
     values += [w * s * s * unit_cost, cost(s) * unit_cost]
     values = [e.Int(dr.round(value)) for value in values] + [e.Int(1), e.Int(1)]
-    if c is not None:
-        c = tuple(dr.select(active, bound * column, 0.0) for column in c)
-        more = [sign * one * column for column in c for one in hj]
-        # Their own curvature is that of reweighted least squares: Newton's would overshoot a large step of brightness.
-        more += [unit_H * w * c[a] * c[b] for a, b in ((0, 0), (0, 1), (1, 1))]
-        more += [w * s * unit_g * column for column in c]
-        values += [e.Int(dr.round(value)) for value in more]
+    c = [dr.select(active, bound * column, 0.0) for column in c]
+    more = [sign * one * column for column in c for one in hj]
+    # Their own curvature is that of reweighted least squares: Newton's would overshoot a large step of brightness.
+    more += [unit_H * w * c[a] * c[b] for a, b in zip(*np.triu_indices(len(c)), strict=True)]
+    more += [w * s * unit_g * column for column in c]
+    values += [e.Int(dr.round(value)) for value in more]
     sums = dr.zeros(e.Int, size)
     for k, value in enumerate(values):
         which = compared if k == _COMPARED else active

@@ -197,7 +197,7 @@ class Terms:
         def finish() -> Linearised:
             with self.timer(f"photometric kernel, level {level}"):
                 current, reference, _, _ = block_counts(lens, ref.lens)
-                sums = scaling.unpack(raw.numpy(), current, reference)
+                sums = scaling.unpack(raw.numpy(), current, reference, len(brightness))
                 return self._finish(
                     sums, slopes, sigma, self.floor_intensity, points.median_depth, brightness, expected
                 )
@@ -245,7 +245,7 @@ class Terms:
         if len(sums.H) > len(slopes.current):
             sums = sums.summed()  # of lines that are exposed at once
         with self.timer("linear algebra: chain"):
-            own = sums.brightness
+            own = sums.columns
             model, coupling = chain(sums, slopes, None if own is None else own.coupling)
         model = Quadratic(model.first, model.H / sigma**2, model.g / sigma)
         cost, eliminated = sums.cost, None

@@ -24,8 +24,9 @@ import drjit as dr
 
 from rsgen.device.arrays import Engine
 from rsgen.device.lens import Lens
-from rsgen.device.projection import TO_BASE, gather, move, project_rolling
+from rsgen.device.projection import TO_BASE, Sighting, Vector, gather, move, project_rolling
 from rsgen.device.recording import recorded_from
+from rsgen.geometry.camera import Camera
 from rstrack.alignment.block_sums import accumulate, block_slot
 from rstrack.alignment.brightness import MID_GREY
 from rstrack.images.blur import blur_length, blur_weight
@@ -76,31 +77,48 @@ def geometric_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int) -> Call
         index, px, py = grid(e, camera.width, camera.height, stride)
         z = dr.gather(e.Float, given.depth, index)
         active = z > 0.0
-        # Errors of depth grow with its square, in triangulating cameras and by interpolation: one σ serves all depths.
-        even = dr.minimum(dr.square(dr.rcp(dr.maximum(z * parameters[2], 1e-3))), NEAREST)
+        even = evened(z, parameters[2])
         q = dr.gather(e.Float, given.rays_x, index) * z, dr.gather(e.Float, given.rays_y, index) * z, z
         line = _line_index(e, lens, px, py)
         p = move(gather(given.to_base, line, TO_BASE, stride=TO_BASE), q)
         seen = project_rolling(ref_lens, given.from_base, p, e.UInt, e.Int)
         value, active = surface(e, ref, given.inverse_depth, seen.x, seen.y, active & seen.valid)
-        at = nearest(e, ref.width, seen.x, seen.y, active)
-        mx, my = dr.gather(e.Float, given.slope_x, at, active), dr.gather(e.Float, given.slope_y, at, active)
-        # Where interpolation errs, its bias counts, not its size: such pixels do not tell how good depth is. In coarse
-        # images, of which they are half, they weigh less the more so they are: without them the flat ones would slide.
-        limit, coarse = (dr.gather(e.Float, given.constants, e.UInt(i)) for i in (7, 8))
-        rough = dr.gather(e.Float, given.roughness, at, active)
-        share = dr.select(rough <= limit, 1.0, coarse * dr.square(limit * dr.rcp(dr.maximum(rough, 1e-9))))
-        # The plane m·q = 1 through the pixel; |m| is one over its distance.
-        mz = value - mx * seen.at.xn - my * seen.at.yn
-        inv_m = share * even * dr.rsqrt(mx * mx + my * my + mz * mz)
-        # (6): the distance to the plane that inverse depth, bilinearly interpolated, has there.
-        r = (1.0 - seen.z * value) * inv_m
-        scale = -seen.z * inv_m
-        g = seen.chain(scale * mx / ref.fx, scale * my / ref.fy, -value * inv_m)
+        r, g, is_smooth = plane_distance(e, given, ref, seen, value, active, even)
         slot, size = block_slot(line, seen.row, lens, ref_lens, py)
-        return accumulate(e, g, p, 1.0, r, active, parameters, slot, size, judged=rough <= limit)
+        return accumulate(e, g, p, 1.0, r, active, parameters, slot, size, judged=is_smooth)
 
     return kernel
+
+
+def plane_distance(
+    e: Engine, given: GeometricInput, ref: Camera, seen: Sighting, value: Any, active: Any, even: Any
+) -> tuple[Any, Vector, Any]:
+    """Equation (6): points' distances to the plane that inverse depth, `value` (1/m) where they are seen, has there.
+
+    even: see `evened`. Returns them (m), their derivatives by a shift of the point in the base frame, and whether the
+    reference is smooth there.
+    """
+    at = nearest(e, ref.width, seen.x, seen.y, active)
+    mx, my = dr.gather(e.Float, given.slope_x, at, active), dr.gather(e.Float, given.slope_y, at, active)
+    # Where interpolation errs, its bias counts, not its size: such pixels do not tell how good depth is. In coarse
+    # images, of which they are half, they weigh less the more so they are: without them the flat ones would slide.
+    limit, coarse = (dr.gather(e.Float, given.constants, e.UInt(i)) for i in (7, 8))
+    rough = dr.gather(e.Float, given.roughness, at, active)
+    share = dr.select(rough <= limit, 1.0, coarse * dr.square(limit * dr.rcp(dr.maximum(rough, 1e-9))))
+    # The plane m·q = 1 through the pixel; |m| is one over its distance.
+    mz = value - mx * seen.at.xn - my * seen.at.yn
+    inv_m = share * even * dr.rsqrt(mx * mx + my * my + mz * mz)
+    r = (1.0 - seen.z * value) * inv_m
+    scale = -seen.z * inv_m
+    return r, seen.chain(scale * mx / ref.fx, scale * my / ref.fy, -value * inv_m), rough <= limit
+
+
+def evened(z: Any, inv_median_depth: Any) -> Any:
+    """By what errors of depth count more the nearer they are.
+
+    They grow with its square, in triangulating cameras and by interpolation: one σ serves all depths then.
+    """
+    return dr.minimum(dr.square(dr.rcp(dr.maximum(z * inv_median_depth, 1e-3))), NEAREST)
 
 
 @dataclass(frozen=True)
@@ -160,7 +178,7 @@ def photometric_kernel(
             r, dx, dy = r * share, dx * share, dy * share
             columns = columns[0] * share, columns[1] * share
         g = seen.chain(dx, dy, 0.0)
-        slot, size = block_slot(seen.row, ref_line, lens, ref_lens, seen.y, with_brightness=True)
+        slot, size = block_slot(seen.row, ref_line, lens, ref_lens, seen.y, columns=len(columns))
         # A twist of the camera moves the point the other way.
         return accumulate(e, g, p, -1.0, r, active, parameters, slot, size, columns)
 

@@ -15,7 +15,7 @@ from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import block_counts
 from rstrack.alignment.normal_equations import Slopes
-from rstrack.calibration.parameters import COUNT, DRIFT, Parameters
+from rstrack.calibration.parameters import DRIFT, EXTRINSICS, POSES, Parameters
 from rstrack.images.line_poses import rows_of
 
 
@@ -56,7 +56,7 @@ class Lines:
 
     T_world_cam (lines, 4, 4); twist (lines, 6): the camera's own per line delay. Derivatives of the twist, in the
     world, of each block's middle: by the control points `first`, `first` + 1, ...: by_points (blocks, 6, 6k); by the
-    parameters: by_parameters (blocks, 6, 10).
+    those parameters that move poses: by_parameters (blocks, 6, 10).
     """
 
     T_world_cam: FloatArray
@@ -96,14 +96,14 @@ def lines_of(taken: Taken, spline: Spline, p: Parameters) -> Lines:
     T, w = spline.pose_and_velocity(t)
     Ad = se3.adjoint(T)
     w_world = (Ad @ w[..., None])[..., 0]
-    by_parameters = np.zeros((blocks, 6, COUNT))
+    by_parameters = np.zeros((blocks, 6, POSES))
     if taken.is_depth:
         by_parameters[..., 0] = w_world * middle[:, None]
     else:
         by_parameters[..., 1] = w_world * middle[:, None]
         by_parameters[..., 2] = w_world
         by_parameters[..., DRIFT] = w_world * (taken.stamp - p.epoch_s)
-        by_parameters[..., 4:] = -Ad @ se3.adjoint(se3.inverse(T_cam_body))
+        by_parameters[..., EXTRINSICS] = -Ad @ se3.adjoint(se3.inverse(T_cam_body))
     return Lines(T_world_cam, twist, slopes.first, slopes.current, by_parameters)
 
 

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 
 import numpy as np
 
-from rsgen.array_types import FloatArray
+from rsgen.array_types import BoolArray, FloatArray
 from rsgen.device.arrays import Engine
 from rsgen.geometry import se3
-from rsgen.geometry.camera import Camera
-from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rstrack.calibration.images import Taken, pair_lens, span
+from rstrack.calibration.optics import Asked
 from rstrack.calibration.pair_terms import PairTerms, averaged, intensity_bound, surface_of
-from rstrack.calibration.parameters import Parameters
+from rstrack.calibration.parameters import COLOR_LENS, COUNT, DEPTH, DEPTH_ERROR, DEPTH_LENS, LENS, Parameters
 from rstrack.calibration.stretch import Stretch, View
 from rstrack.data.dataset import Dataset
+from rstrack.data.depth_error import NONE
 from rstrack.images.line_poses import Exposure
-from rstrack.images.pyramid import camera_rays, color_image, intensity
+from rstrack.images.pyramid import color_image, intensity
 from rstrack.options import Options
 
 # Seconds before the first and after the last line for which a stretch has spline: times move while they are estimated.
@@ -30,13 +29,19 @@ _BASELINE_M = 0.01
 _ROUNDS = 6
 
 
-def pair_terms(e: Engine, dataset: Dataset) -> PairTerms:
-    """The kernels of a dataset's rig."""
+def pair_terms(e: Engine, dataset: Dataset, free: BoolArray | None = None) -> PairTerms:
+    """The kernels of a dataset's rig, with columns for those lens and depth unknowns (29,) that are free."""
     rig = dataset.rig
-    rays = _rays(rig.depth_camera)
-    on_device = e.upload(rays[..., 0]), e.upload(rays[..., 1])
     depth, color = pair_lens(rig.depth_camera, rig.depth_shutter), pair_lens(rig.color_camera, rig.color_shutter)
-    return PairTerms(e, depth, color, on_device)
+    return PairTerms(e, depth, color, _asked(dataset, np.zeros(COUNT, bool) if free is None else free))
+
+
+def _asked(dataset: Dataset, free: BoolArray) -> Asked:
+    one = dataset.rig.is_registered
+    color = tuple(name for name, asked in zip(LENS, free[COLOR_LENS], strict=True) if asked)
+    depth = color if one else tuple(name for name, asked in zip(LENS, free[DEPTH_LENS], strict=True) if asked)
+    depth += tuple(name for name, asked in zip(DEPTH, free[DEPTH_ERROR], strict=True) if asked)
+    return Asked(depth, color, bool(free[DEPTH_ERROR].any()) or dataset.depth_error != NONE, one)
 
 
 def load_stretch(
@@ -83,7 +88,7 @@ def _view(terms: PairTerms, dataset: Dataset, k: int, max_depth: float) -> View:
     z = np.divide(np.float32(1.0), rho, out=np.zeros_like(z), where=rho > 0.0)
     depth = Taken(terms.depth, float(dataset.stamps[k]), rig.depth_shutter.exposure_s, True)
     camera, baseline = rig.depth_camera, _BASELINE_M + float(np.linalg.norm(rig.T_color_depth[:3, 3]))
-    view = View(depth, e.upload(z), surface_of(e, rho, _rays(camera), camera.fx, camera.fy, baseline))
+    view = View(depth, e.upload(z), surface_of(e, rho, camera.fx, camera.fy, baseline))
     if dataset.groups[k]:
         i = dataset.groups[k][0]
         color = dataset.images.color(i)
@@ -91,8 +96,3 @@ def _view(terms: PairTerms, dataset: Dataset, k: int, max_depth: float) -> View:
         view.levels = color_image(e, Exposure(terms.color, 0.0, np.eye(4)), color).levels
         view.bound = intensity_bound(intensity(color), rig.color_camera.fx, view.surface.median_depth)
     return view
-
-
-@lru_cache(maxsize=2)
-def _rays(camera: Camera) -> FloatArray:
-    return camera_rays(Exposure(pair_lens(camera, Shutter()), 0.0, np.eye(4)))

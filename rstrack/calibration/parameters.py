@@ -1,33 +1,57 @@
-"""What is calibrated: readouts of both streams, colour's clock against depth's, and the extrinsics."""
+"""What is calibrated: readouts, colour's clock against depth's, the extrinsics, and on request lenses and depth."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
 import numpy as np
 
 from rsgen.array_types import BoolArray, FloatArray
 from rsgen.geometry import se3
+from rsgen.geometry.camera import Camera
+from rstrack.data.depth_error import DepthError
 
-Group = Literal["readout", "offset", "extrinsics"]
+Group = Literal["readout", "offset", "extrinsics", "depth", "intrinsics"]
 GROUPS: tuple[str, ...] = get_args(Group)
 
-NAMES = (
+LENS = "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"
+DEPTH = "offset_m", "inverse_offset", "radial"
+_POSES = (
     "depth.readout_s", "color.readout_s", "color.offset_s", "color.drift",
     "T_color_depth.x", "T_color_depth.y", "T_color_depth.z",
     "T_color_depth.rx", "T_color_depth.ry", "T_color_depth.rz",
 )  # fmt: skip
-"""The unknowns, in the order of their vectors. Extrinsics: T_color_depth ← exp(ε) T_color_depth, ε in colour's axes."""
-COUNT = len(NAMES)
-DRIFT = NAMES.index("color.drift")
+NAMES = (
+    *_POSES, *(f"{camera}.{name}" for camera in ("depth", "color") for name in LENS),
+    *(f"depth.error.{name}" for name in DEPTH),
+)  # fmt: skip
+"""The unknowns, in the order of their vectors.
 
-_GROUP_OF: tuple[Group, ...] = ("readout", "readout", "offset", "offset", *(("extrinsics",) * 6))
-# What is known of each beforehand (σ): s, s, s, s/s, m, rad.
-PRIOR = np.array([0.03, 0.03, 0.05, 5e-4, *(0.05,) * 3, *np.radians((5.0,) * 3)])
+Extrinsics: T_color_depth ← exp(ε) T_color_depth, ε in colour's axes. Lenses: fx and fy as parts of what the camera file
+has, cx and cy in its focal lengths, and distortion as OpenCV counts it. Depth: see `DepthError`.
+"""
+COUNT, POSES = len(NAMES), len(_POSES)
+DRIFT = NAMES.index("color.drift")
+EXTRINSICS = slice(DRIFT + 1, POSES)
+DEPTH_LENS, COLOR_LENS = slice(POSES, POSES + len(LENS)), slice(POSES + len(LENS), POSES + 2 * len(LENS))
+DEPTH_ERROR = slice(POSES + 2 * len(LENS), COUNT)
+
+_SIZES: tuple[tuple[Group, int], ...] = (
+    ("readout", 2), ("offset", 2), ("extrinsics", 6), ("intrinsics", 2 * len(LENS)), ("depth", len(DEPTH)),
+)  # fmt: skip
+_GROUP_OF = tuple(group for group, size in _SIZES for _ in range(size))
+# What is known of each beforehand (σ): s, s, s, s/s, m, rad; of lenses and depth: see NAMES.
+PRIOR = np.array([
+    0.03, 0.03, 0.05, 5e-4, *(0.05,) * 3, *np.radians((5.0,) * 3),
+    *(0.05, 0.05, 0.05, 0.05, 0.3, 0.5, 0.01, 0.01) * 2, 0.03, 0.02, 0.02,
+])  # fmt: skip
 # σ above which a value is of no use: it is called undetermined and keeps what it was.
-USEFUL = np.array([2e-3, 2e-3, 2e-3, 5e-5, *(5e-3,) * 3, *np.radians((0.3,) * 3)])
+USEFUL = np.array([
+    2e-3, 2e-3, 2e-3, 5e-5, *(5e-3,) * 3, *np.radians((0.3,) * 3),
+    *(0.01, 0.01, 0.01, 0.01, 0.05, 0.2, 5e-3, 5e-3) * 2, 0.01, 5e-3, 5e-3,
+])  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -36,7 +60,7 @@ class Parameters:
 
     *_readout_s: from the first line of an image to after its last, in the camera file's scan; negative: the other way
     round. Colour's stamps t are late or early: taken at t + color_offset_s + color_drift (t − epoch_s). T_color_depth
-    (4, 4): p_color from p_depth.
+    (4, 4): p_color from p_depth. depth_lens, color_lens (8,): changes of the cameras; depth_error (3,): see DEPTH.
     """
 
     depth_readout_s: float
@@ -45,32 +69,58 @@ class Parameters:
     color_drift: float
     T_color_depth: FloatArray
     epoch_s: float = 0.0
+    depth_lens: FloatArray = field(default_factory=lambda: np.zeros(len(LENS)))
+    color_lens: FloatArray = field(default_factory=lambda: np.zeros(len(LENS)))
+    depth_error: FloatArray = field(default_factory=lambda: np.zeros(len(DEPTH)))
 
     def moved(self, step: FloatArray) -> Parameters:
-        """After a step (10,) in the order of NAMES."""
+        """After a step (29,) in the order of NAMES."""
         return replace(
             self,
             depth_readout_s=self.depth_readout_s + float(step[0]),
             color_readout_s=self.color_readout_s + float(step[1]),
             color_offset_s=self.color_offset_s + float(step[2]),
             color_drift=self.color_drift + float(step[3]),
-            T_color_depth=se3.orthonormalise(se3.exp(step[4:]) @ self.T_color_depth),
+            T_color_depth=se3.orthonormalise(se3.exp(step[EXTRINSICS]) @ self.T_color_depth),
+            depth_lens=self.depth_lens + step[DEPTH_LENS],
+            color_lens=self.color_lens + step[COLOR_LENS],
+            depth_error=self.depth_error + step[DEPTH_ERROR],
         )
 
     def since(self, start: Parameters) -> FloatArray:
-        """The step (10,) that leads here from `start`."""
+        """The step (29,) that leads here from `start`."""
         T = se3.log(self.T_color_depth @ se3.inverse(start.T_color_depth))
         clocks = (
             self.depth_readout_s - start.depth_readout_s, self.color_readout_s - start.color_readout_s,
             self.color_offset_s - start.color_offset_s, self.color_drift - start.color_drift,
         )  # fmt: skip
-        return np.concatenate([clocks, T])
+        lenses = self.depth_lens - start.depth_lens, self.color_lens - start.color_lens
+        return np.concatenate([clocks, T, *lenses, self.depth_error - start.depth_error])
 
     def color_time(self, stamp: float) -> float:
         """When a colour image that is stamped so was taken, on depth's clock (s)."""
         return stamp + self.color_offset_s + self.color_drift * (stamp - self.epoch_s)
 
+    @property
+    def error(self) -> DepthError:
+        """The depth camera's error."""
+        return DepthError(*(float(x) for x in self.depth_error))
+
+
+def changed(camera: Camera, lens: FloatArray) -> Camera:
+    """The camera after changes (8,) of its LENS. Raises UserError: focal lengths of nothing."""
+    if not lens.any():
+        return camera
+    fx, fy, cx, cy, *bent = (float(x) for x in lens)
+    distortion = camera.distortion
+    if camera.model == "radtan":
+        distortion = tuple(a + b for a, b in zip(distortion, (*bent, 0.0), strict=False))
+    return replace(
+        camera, fx=camera.fx * (1.0 + fx), fy=camera.fy * (1.0 + fy), cx=camera.cx + cx * camera.fx,
+        cy=camera.cy + cy * camera.fy, distortion=distortion,
+    )  # fmt: skip
+
 
 def free_of(groups: Sequence[str]) -> BoolArray:
-    """Which of the unknowns (10,) belong to the groups."""
+    """Which of the unknowns (29,) belong to the groups."""
     return np.array([group in groups for group in _GROUP_OF])

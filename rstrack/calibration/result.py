@@ -13,7 +13,19 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
-from rstrack.calibration.parameters import COUNT, DRIFT, NAMES, Parameters
+from rstrack.calibration.parameters import (
+    COLOR_LENS,
+    COUNT,
+    DEPTH,
+    DEPTH_ERROR,
+    DEPTH_LENS,
+    DRIFT,
+    EXTRINSICS,
+    LENS,
+    NAMES,
+    Parameters,
+    changed,
+)
 from rstrack.calibration.solve import Solution
 from rstrack.data.dataset import Dataset
 
@@ -25,12 +37,17 @@ _SHOWN = (
     ("depth readout", "ms", 1e3), ("colour readout", "ms", 1e3), ("colour offset", "ms", 1e3),
     ("colour drift", "ppm", 1e6), *((f"colour from depth, {axis}", "mm", 1e3) for axis in "xyz"),
     *((f"colour from depth, about {axis}", "deg", float(np.degrees(1.0))) for axis in "xyz"),
+    *((f"{camera} {name}", "px" if name[0] in "fc" else "", 1.0) for camera in ("depth", "colour") for name in LENS),
+    ("depth offset", "mm", 1e3), ("depth inverse offset", "1/km", 1e3), ("depth radial", "1/km", 1e3),
 )  # fmt: skip
 # What each needs to be told.
 _NEEDS = (
     "turning and shaking in front of surfaces that lie at many angles", "turning and shaking in front of texture",
     "motion that changes", "some ten seconds of motion that changes",
     *(("turning about two axes in front of near and far texture",) * 3), *(("turning about two axes",) * 3),
+    *(("turning about all axes, so that all of the image sees shapes",) * len(LENS)),
+    *(("turning about all axes, so that all of the image sees texture",) * len(LENS)),
+    *(("surfaces near and far, seen from near and far",) * 3),
 )  # fmt: skip
 
 
@@ -60,7 +77,7 @@ def motion_of(dataset: Dataset, parts: Sequence[range], track: Spline) -> Motion
 
 @dataclass(frozen=True)
 class Calibration:
-    """start: the values before; asked (10,): which might change; parts: the stretches of frames that told."""
+    """start: the values before; asked (29,): which might change; parts: the stretches of frames that told."""
 
     dataset: Dataset
     start: Parameters
@@ -72,7 +89,7 @@ class Calibration:
 
     @property
     def undetermined(self) -> BoolArray:
-        """Which (10,) were asked for but are not told by this recording: they have the values that they had."""
+        """Which (29,) were asked for but are not told by this recording: they have the values that they had."""
         return self.asked & ~self.solution.free
 
     @property
@@ -82,24 +99,28 @@ class Calibration:
 
     @property
     def sigmas(self) -> FloatArray:
-        """Their standard errors (10,); NaN where undetermined, 0 where not asked for."""
+        """Their standard errors (29,); NaN where undetermined, 0 where not asked for."""
         return np.where(self.undetermined, np.nan, self.solution.sigmas)
 
     def calibrated(self) -> Dataset:
         """The dataset with these cameras."""
         found, rig = self._upright(), self.dataset.rig
         scans = self._scans()
+        depth, color = self._cameras()
         rig = replace(
             rig,
+            depth_camera=depth,
+            color_camera=color,
             depth_shutter=replace(rig.depth_shutter, readout_s=found.depth_readout_s, scan=scans[0]),
             color_shutter=replace(rig.color_shutter, readout_s=found.color_readout_s, scan=scans[1]),
             T_color_depth=found.T_color_depth,
         )
-        return replace(self.dataset, rig=rig).with_color_offset(found.color_offset_s, drift=found.color_drift)
+        found_dataset = replace(self.dataset, rig=rig, depth_error=found.error)
+        return found_dataset.with_color_offset(found.color_offset_s, drift=found.color_drift)
 
     def text(self) -> str:
         """A table of the values with their σ, what could not be told and why, and what comes with it."""
-        sigmas, absolute, before = self.sigmas, _absolute(self.values), _absolute(self.start)
+        sigmas, absolute, before = self._absolute_sigmas, self._absolute(self.values), self._absolute(self.start)
         lines = [f"{'':<28}{'found':>10}   {'2 sigma':>9}   {'from':>10}"]
         for i, (name, unit, factor) in enumerate(_SHOWN):
             if not self.asked[i]:
@@ -120,8 +141,8 @@ class Calibration:
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON: values in SI units; sigma None where undetermined."""
-        sigmas = self.sigmas
-        absolute, before = _absolute(self.values), _absolute(self.start)
+        sigmas = self._absolute_sigmas
+        absolute, before = self._absolute(self.values), self._absolute(self.start)
         shares = self.solution.shares
         return {
             "parameters": {
@@ -148,21 +169,32 @@ class Calibration:
         names = [f"# rstrack calibrate {self.dataset.name}, {len(self.parts)} stretches; ± is 2 sigma"]
         names += [f"# {note}" for note in self._notes()]
         drift = f"\n  drift_ppm: {1e6 * found.color_drift:.3f}{beside[DRIFT]}"
-        color = _stream("color", rig.color_camera, rig.color_shutter, found.color_readout_s, scans[1])
+        depth_camera, color_camera = self._cameras()
+        color = _stream("color", color_camera, rig.color_shutter, found.color_readout_s, scans[1], beside[COLOR_LENS])
         color += beside[1]
         offset_s = found.color_offset_s - self.dataset.depth_offset_s
         color += f"\n  offset_s: {offset_s:.7f}{beside[2]}"
-        depth = _stream("depth", rig.depth_camera, rig.depth_shutter, found.depth_readout_s, scans[0])
+        depth = _stream("depth", depth_camera, rig.depth_shutter, found.depth_readout_s, scans[0], beside[DEPTH_LENS])
         depth += beside[0]
         rows = ["  - [" + ", ".join(f"{x:.12g}" for x in row) + "]" for row in found.T_color_depth]
-        shown = [f"{_SHOWN[i][0].split(', ')[1]}{beside[i][3:]}" for i in range(DRIFT + 1, COUNT)]
+        shown = [f"{_SHOWN[i][0].split(', ')[1]}{beside[i][3:]}" for i in range(COUNT)[EXTRINSICS]]
         timing = self.dataset.timing
         mode = "auto" if timing is None else timing.mode
         return "\n".join([
             *names, *(() if mode == "auto" else (f"stamps: {mode}",)), color + (drift if found.color_drift else ""),
-            depth + f"\n  depth_scale: {self.dataset.depth_scale:g}",
-            "T_color_depth:" + ("  # " + ", ".join(shown) if self.asked[DRIFT + 1 :].any() else ""), *rows, "",
+            depth + f"\n  depth_scale: {self.dataset.depth_scale:g}" + self._error_entry(),
+            "T_color_depth:" + ("  # " + ", ".join(shown) if self.asked[EXTRINSICS].any() else ""), *rows, "",
         ])  # fmt: skip
+
+    def _error_entry(self) -> str:
+        """The depth camera's error in the camera file, if there is any."""
+        error, at = self.values.depth_error, range(COUNT)[DEPTH_ERROR]
+        if not error.any():
+            return ""
+        beside = self._beside()
+        return "\n  error:" + "".join(
+            f"\n    {name}: {error[k]:.7g}{beside[i]}" for k, (name, i) in enumerate(zip(DEPTH, at, strict=True))
+        )
 
     def _beside(self) -> list[str]:
         """For each of the unknowns the comment beside its value in the camera file."""
@@ -173,8 +205,32 @@ class Calibration:
                 return "  # undetermined, kept"
             return f"  # ± {2.0 * factor * sigmas[i]:.3g} {unit}" if self.asked[i] else ""
 
-        sigmas = self.sigmas
+        sigmas = self._absolute_sigmas
         return [comment(i) for i in range(COUNT)]
+
+    def _cameras(self) -> tuple[Camera, Camera]:
+        """Depth camera and colour camera, as found."""
+        return self._changed(self.values)
+
+    def _changed(self, p: Parameters) -> tuple[Camera, Camera]:
+        rig = self.dataset.rig
+        depth = p.color_lens if rig.is_registered else p.depth_lens
+        return changed(rig.depth_camera, depth), changed(rig.color_camera, p.color_lens)
+
+    def _absolute(self, p: Parameters) -> FloatArray:
+        """The values (29,), SI and px: the extrinsics by position and rotation vector of T_color_depth."""
+        T = p.T_color_depth
+        clocks = p.depth_readout_s, p.color_readout_s, p.color_offset_s, p.color_drift
+        lenses = [_lens(camera) for camera in self._changed(p)]
+        return np.concatenate([clocks, T[:3, 3], se3.log(T)[3:], *lenses, p.depth_error])
+
+    @property
+    def _absolute_sigmas(self) -> FloatArray:
+        """Theirs (29,)."""
+        units, rig = np.ones(COUNT), self.dataset.rig
+        for camera, lens in ((rig.depth_camera, DEPTH_LENS), (rig.color_camera, COLOR_LENS)):
+            units[lens][:4] = camera.fx, camera.fy, camera.fx, camera.fy
+        return self.sigmas * units
 
     def _scans(self) -> tuple[Scan, Scan]:
         """Of depth and colour; the opposite of what was assumed where the readout turned out negative."""
@@ -211,6 +267,8 @@ class Calibration:
             notes.append(f"registered depth has kept its rows' times: one time for all of them is {far} off")
         if self.asked[2]:
             notes.append("a delay of both streams alike cannot be told from images: offsets are against depth's stamps")
+        if self.asked[DEPTH_ERROR].any():
+            notes.append("depth's scale cannot be told from images: path, map and extrinsics grow with it")
         if not self.solution.finished:
             notes.append("interrupted before it had converged")
         elif not self.solution.is_settled:
@@ -218,17 +276,31 @@ class Calibration:
         return notes
 
 
-def _absolute(p: Parameters) -> FloatArray:
-    """The values (10,) as they are shown: the extrinsics by position and rotation vector of T_color_depth."""
-    T = p.T_color_depth
-    clocks = p.depth_readout_s, p.color_readout_s, p.color_offset_s, p.color_drift
-    return np.concatenate([clocks, T[:3, 3], se3.log(T)[3:]])
+def _lens(camera: Camera) -> FloatArray:
+    """LENS (8,) of a camera."""
+    bent = (*camera.distortion, 0.0, 0.0, 0.0, 0.0)[:4] if camera.model == "radtan" else (0.0,) * 4
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *bent])
 
 
-def _stream(name: str, camera: Camera, shutter: Shutter, readout_s: float, scan: Scan) -> str:
+def _stream(name: str, camera: Camera, shutter: Shutter, readout_s: float, scan: Scan, beside: Sequence[str]) -> str:
+    """beside: comments of LENS."""
     K = ", ".join(f"{x:.10g}" for x in (camera.fx, camera.fy, camera.cx, camera.cy))
-    lines = [f"{name}:", f"  width: {camera.width}", f"  height: {camera.height}", f"  intrinsics: [{K}]"]
+    lines = [
+        f"{name}:",
+        f"  width: {camera.width}",
+        f"  height: {camera.height}",
+        f"  intrinsics: [{K}]{_joined(beside[:4])}",
+    ]
     if camera.model != "pinhole":
-        lines += [f"  model: {camera.model}", f"  distortion: [{', '.join(f'{x:.10g}' for x in camera.distortion)}]"]
+        lines += [
+            f"  model: {camera.model}",
+            f"  distortion: [{', '.join(f'{x:.10g}' for x in camera.distortion)}]{_joined(beside[4:])}",
+        ]
     lines += [f"  exposure_s: {shutter.exposure_s:g}", f"  scan: {scan}", f"  readout_s: {readout_s:.7f}"]
     return "\n".join(lines)
+
+
+def _joined(comments: Sequence[str]) -> str:
+    """The comments beside several values of a line as one."""
+    said = [comment.removeprefix("  # ") for comment in comments]
+    return f"  # {'; '.join(said)}" if all(said) and said else ""

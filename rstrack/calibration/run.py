@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
 
@@ -17,12 +17,13 @@ from rsgen.array_types import BoolArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.device.arrays import engine
 from rsgen.errors import UserError
+from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan
 from rsgen.geometry.spline import Spline
 from rstrack.calibration.first_track import Track, first_track
 from rstrack.calibration.load import load_stretch, pair_terms
 from rstrack.calibration.pair_terms import PairTerms
-from rstrack.calibration.parameters import COUNT, DRIFT, GROUPS, USEFUL, Parameters, free_of
+from rstrack.calibration.parameters import COLOR_LENS, COUNT, DEPTH_LENS, DRIFT, GROUPS, USEFUL, Parameters, free_of
 from rstrack.calibration.result import Calibration, motion_of
 from rstrack.calibration.solve import Solution, solve
 from rstrack.calibration.stretch import Stretch
@@ -42,6 +43,8 @@ _LEVELS = (2, 1, 0)
 # Ways in which images may be read, and stretches with which they are tried.
 _AXES: tuple[Scan, ...] = ("top-bottom", "left-right")
 _TRIED = 4
+# Unknowns of a lens that are its distortion, of radial-tangential ones.
+_COEFFICIENTS = 4
 # For the progress bar.
 _ABOUT_STEPS = 20
 
@@ -50,11 +53,11 @@ def calibrate(
     dataset: Dataset, groups: Sequence[str] | None = None, frames: slice = slice(None), options: Options | None = None,
     progress: Progress = no_progress,
 ) -> Calibration:  # fmt: skip
-    """Readouts, colour's clock and extrinsics of a dataset, from the values of its cameras on.
+    """Readouts, colour's clock, extrinsics, lenses and depth of a dataset, from the values of its cameras on.
 
-    groups: of GROUPS, what may change; all by default, but extrinsics where depth is registered to colour. Where Ctrl-C
-    is pressed while it solves, the best so far is returned, marked so. Raises UserError: too few frames, or too few
-    that can be followed; unknown groups; an image that cannot be read.
+    groups: of GROUPS, what may change; by default the first three, but extrinsics where depth is registered to colour.
+    Where Ctrl-C is pressed while it solves, the best so far is returned, marked so. Raises UserError: too few frames,
+    or too few that can be followed; unknown groups; an image that cannot be read.
     """
     begun = time.perf_counter()
     options = options or Options()
@@ -62,6 +65,8 @@ def calibrate(
     _check(dataset, groups, frames)
     chosen = range(len(dataset))[frames]
     engine(options.backend)  # before anything else imports Dr.Jit, which then would choose a libLLVM itself
+    if "intrinsics" in groups:
+        dataset = _bent(dataset)
     start = parameters_of(dataset)
     if dataset.timing is not None and dataset.timing.wants_color_offset and "offset" in groups:
         start = replace(start, color_offset_s=estimate_color_offset(dataset, chosen, options, progress).offset_s)
@@ -70,7 +75,7 @@ def calibrate(
     free = _free(dataset, groups, parts)
     if not dataset.scan_named and "readout" in groups:
         dataset = _oriented(dataset, parts, track.spline, start, options, progress)
-    terms, stretches = _loaded(dataset, parts, track.spline, start, options, progress)
+    terms, stretches = _loaded(dataset, parts, track.spline, start, free, options, progress)
     solution, drifts = _solved(stretches, terms, start, free, progress)
     free[DRIFT] &= drifts
     motion = motion_of(dataset, parts, track.spline)
@@ -78,10 +83,11 @@ def calibrate(
 
 
 def _loaded(
-    dataset: Dataset, parts: Sequence[range], track: Spline, start: Parameters, options: Options, progress: Progress
-) -> tuple[PairTerms, list[Stretch]]:
+    dataset: Dataset, parts: Sequence[range], track: Spline, start: Parameters, free: BoolArray, options: Options,
+    progress: Progress,
+) -> tuple[PairTerms, list[Stretch]]:  # fmt: skip
     base = dataset.with_color_offset(0.0, drift=0.0)
-    terms, stretches = pair_terms(engine(options.backend), base), []
+    terms, stretches = pair_terms(engine(options.backend), base, free), []
     for n, part in enumerate(parts):
         progress("calibrating", 0.15 * n / len(parts), "reading images")
         stretches.append(load_stretch(terms, base, part, track, start, options))
@@ -103,7 +109,7 @@ def _oriented(
         rig = dataset.rig
         shutters = [replace(shutter, scan=scan) for shutter in (rig.depth_shutter, rig.color_shutter)]
         turned = replace(dataset, rig=replace(rig, depth_shutter=shutters[0], color_shutter=shutters[1]))
-        terms, stretches = _loaded(turned, few, track, start, options, no_progress)
+        terms, stretches = _loaded(turned, few, track, start, free, options, no_progress)
         found.append((solve(stretches, terms, start, free, _LEVELS[:-1]).cost, turned))
     progress("scan direction", 1.0, "")
     return min(found, key=lambda each: each[0])[1]
@@ -114,7 +120,19 @@ def parameters_of(dataset: Dataset) -> Parameters:
     rig = dataset.rig
     offset = 0.0 if dataset.timing is None else dataset.timing.color_offset_s or 0.0
     readouts = rig.depth_shutter.readout_s, rig.color_shutter.readout_s
-    return Parameters(*readouts, offset, dataset.color_drift, rig.T_color_depth, dataset.middle)
+    error = np.array(astuple(dataset.depth_error))
+    T = rig.T_color_depth
+    return Parameters(*readouts, offset, dataset.color_drift, T, dataset.middle, depth_error=error)
+
+
+def _bent(dataset: Dataset) -> Dataset:
+    """The dataset with cameras that may be distorted, as OpenCV has it, where they are pinholes."""
+
+    def bent(camera: Camera) -> Camera:
+        return replace(camera, model="radtan", distortion=(0.0,) * 5) if camera.model == "pinhole" else camera
+
+    rig = dataset.rig
+    return replace(dataset, rig=replace(rig, depth_camera=bent(rig.depth_camera), color_camera=bent(rig.color_camera)))
 
 
 def _solved(
@@ -173,15 +191,27 @@ def _motion(dataset: Dataset, part: range, track: Spline) -> float:
 
 
 def _free(dataset: Dataset, groups: Sequence[str], parts: Sequence[range]) -> BoolArray:
-    """What may change (10,): drift only where colour's clock is seen for long enough."""
-    free = free_of(groups)
+    """What may change (29,).
+
+    Drift only where colour's clock is seen for long enough, and of lenses what our distortion has: of registered
+    depth's only the colour camera's.
+    """
+    free, rig = free_of(groups), dataset.rig
+    if rig.is_registered:
+        free[DEPTH_LENS] = False
+    for camera, lens in ((rig.depth_camera, DEPTH_LENS), (rig.color_camera, COLOR_LENS)):
+        if camera.model == "fisheye":
+            free[lens.stop - _COEFFICIENTS : lens.stop] = False
     free[DRIFT] &= dataset.stamps[parts[-1].stop - 1] - dataset.stamps[parts[0].start] >= _DRIFT_S
     return free
 
 
 def _usual(dataset: Dataset) -> tuple[str, ...]:
-    """What can be told of a recording: of registered depth, which the driver has moved, nothing about where it was."""
-    return GROUPS[:2] if dataset.rig.is_registered else GROUPS
+    """What can be told of a recording: of registered depth, which the driver has moved, nothing about where it was.
+
+    Lenses and depth only on request.
+    """
+    return GROUPS[:2] if dataset.rig.is_registered else GROUPS[:3]
 
 
 def _check(dataset: Dataset, groups: Sequence[str], frames: slice) -> None:

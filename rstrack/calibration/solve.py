@@ -11,7 +11,7 @@ from scipy import stats
 from rsgen.array_types import BoolArray, FloatArray
 from rstrack.alignment.acceleration import Acceleration
 from rstrack.calibration.pair_terms import PairTerms
-from rstrack.calibration.parameters import COUNT, PRIOR, Parameters
+from rstrack.calibration.parameters import COUNT, DEPTH, PRIOR, Parameters
 from rstrack.calibration.stretch import Stretch, Sums
 
 # Steps at most on the pyramid's levels, finest first, and part of the formal σ that ends a level.
@@ -34,10 +34,10 @@ Watch = Callable[[int, int, Parameters], None]
 
 @dataclass(frozen=True)
 class Solution:
-    """values; normal equations of the free parameters at them: A (s, n, n), b (s, n) of the s stretches, free (10,).
+    """values; normal equations of the free parameters at them: A (s, n, n), b (s, n) of the s stretches, free (29,).
 
-    cost: negative log-likelihood a pixel. sigma_depth_m, sigma_intensity: of the residuals, medians. last_step (10,):
-    the last one that was taken. blind (10,): σ of what no scatter shows. finished: nobody interrupted it.
+    cost: negative log-likelihood a pixel. sigma_depth_m, sigma_intensity: of the residuals, medians. last_step (29,):
+    the last one that was taken. blind (29,): σ of what no scatter shows. finished: nobody interrupted it.
     """
 
     values: Parameters
@@ -58,7 +58,7 @@ class Solution:
 
     @property
     def sigmas(self) -> FloatArray:
-        """Standard errors (10,) as the scatter of the stretches shows them; 0 of what is not free.
+        """Standard errors (29,) as the scatter of the stretches shows them; 0 of what is not free.
 
         At the solution the stretches' gradients add up to nothing; how far each is from nothing tells how far the next
         recording's solution may lie (the "sandwich" of White, Econometrica 1980, by clusters, of which a stretch is
@@ -94,7 +94,7 @@ def solve(
 ) -> Solution:  # fmt: skip
     """Parameters and all control points jointly, coarse to fine; the stretches' splines are moved.
 
-    free (10,): which parameters may change; the others stay at `start`, to which weak ones are held by PRIOR. Where
+    free (29,): which parameters may change; the others stay at `start`, to which weak ones are held by PRIOR. Where
     `watch` raises KeyboardInterrupt, what has been found so far is returned, `finished` False. Raises
     numpy.linalg.LinAlgError where images say nothing at all.
     """
@@ -126,7 +126,7 @@ def solve(
 
 
 def _blind(stretches: Sequence[Stretch], terms: PairTerms) -> FloatArray:
-    """σ (10,) of what no disagreement shows.
+    """σ (29,) of what no disagreement shows.
 
     Of the extrinsics, so many pixels as an angle and as a shift; of the drift, so many seconds from the middle to an
     end.
@@ -135,13 +135,15 @@ def _blind(stretches: Sequence[Stretch], terms: PairTerms) -> FloatArray:
     depth = float(np.median([view.surface.median_depth for stretch in stretches for view in stretch.views]))
     stamps = [view.depth.stamp for stretch in stretches for view in stretch.views]
     drift = _BLIND_S / max(0.5 * (max(stamps) - min(stamps)), 1e-3)
-    return np.concatenate([np.zeros(3), [drift], np.full(3, turn * depth), np.full(3, turn)])
+    lens = turn * np.array([1.0, 1.0, 1.0, 1.0, 4.0, 8.0, 1.0, 1.0])
+    poses = np.zeros(3), [drift], np.full(3, turn * depth), np.full(3, turn)
+    return np.concatenate([*poses, lens, lens, np.zeros(len(DEPTH))])
 
 
 def _step(
     sums: Sequence[Sums], p: Parameters, start: Parameters, free: BoolArray, acceleration: Acceleration
 ) -> tuple[FloatArray, FloatArray]:
-    """The step (10,) of the parameters, and what is known of the free ones."""
+    """The step (29,) of the parameters, and what is known of the free ones."""
     reduced = [one.reduced() for one in sums]
     prior = _COUNTED / PRIOR[free] ** 2
     at = p.since(start)[free]

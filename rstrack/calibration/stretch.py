@@ -11,13 +11,14 @@ import numpy.typing as npt
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.alignment.block_sums import BlockSums, BrightnessSums
+from rstrack.alignment.block_sums import BlockSums
 from rstrack.alignment.brightness import SAME
 from rstrack.alignment.priors import acceleration_prior, pose_constraint
 from rstrack.alignment.student_t import scale_step
 from rstrack.calibration.images import Lines, Taken, lines_of
+from rstrack.calibration.optics import Optics
 from rstrack.calibration.pair_terms import FLOOR_DEPTH, FLOOR_INTENSITY, PairTerms, Surface
-from rstrack.calibration.parameters import COUNT, Parameters
+from rstrack.calibration.parameters import COUNT, POSES, Parameters
 
 # σ of accelerations (m/s², rad/s²): the tracker's, see `tracking.window`; the ends, which few lines touch, are held
 # more tightly.
@@ -59,7 +60,7 @@ class Sums:
     pixels: int
 
     def reduced(self) -> tuple[FloatArray, FloatArray]:
-        """A (10, 10) and b (10,) of the parameters alone: the control points are what the images then make of them."""
+        """A (29, 29) and b (29,) of the parameters alone: the control points are what the images then make of them."""
         x = len(self.g) - COUNT
         solved = np.linalg.solve(self.H[:x, :x], np.column_stack([self.H[:x, x:], self.g[:x]]))
         A = self.H[x:, x:] - self.H[x:, :x] @ solved[:, :COUNT]
@@ -67,7 +68,7 @@ class Sums:
         return np.asarray(0.5 * (A + A.T)), b
 
     def points_step(self, step: FloatArray) -> FloatArray:
-        """Increments (k, 6) of the control points that go with a step (10,) of the parameters."""
+        """Increments (k, 6) of the control points that go with a step (29,) of the parameters."""
         x = len(self.g) - COUNT
         moved = np.linalg.solve(self.H[:x, :x], self.g[:x] + self.H[:x, x:] @ step)
         return np.asarray(-moved.reshape(-1, 6))
@@ -90,18 +91,15 @@ class Stretch:
         size = 6 * len(self.spline.control_points) + COUNT
         H, g = np.zeros((size, size)), np.zeros(size)
         depths = [lines_of(view.depth, self.spline, p) for view in self.views]
+        optics = terms.optics(p)
         colors = [None if view.color is None else lines_of(view.color, self.spline, p) for view in self.views]
         weighted, counted, cost = np.zeros(2), np.zeros(2, int), 0.0
-        for kind, pair, sums, current, reference, T_base_world in self._pairs(terms, p, level, depths, colors):
+        for kind, pair, sums, current, reference, T_base_world in self._pairs(terms, optics, p, level, depths, colors):
             sigma = self.sigma[kind]
-            J, used = _slopes(sums, current, reference, T_base_world)
-            flat = J.reshape(-1, J.shape[2])
-            own = flat.T @ (sums.H[used] @ J).reshape(-1, J.shape[2]) / sigma**2
-            own_g = flat.T @ sums.g[used].ravel() / sigma
-            if sums.brightness is not None:
-                coupling = flat.T @ sums.brightness.coupling[used].reshape(len(flat), 2) / sigma**2
-                own, own_g = self._without_brightness(pair, sums.brightness, own, own_g, coupling, sigma)
-            _add(H, g, own, own_g, current, reference)
+            own, own_g = _system(sums, current, reference, T_base_world, sigma)
+            if kind:
+                own, own_g = self._without_brightness(pair, own, own_g)
+            _add(H, g, own, own_g, current, reference, terms.asked.at[kind])
             weighted[kind] += sums.weighted
             counted[kind] += sums.count
             cost += sums.cost + sums.count * np.log(sigma)
@@ -117,8 +115,9 @@ class Stretch:
         self.spline = Spline(points, self.spline.t0, self.spline.dt)
 
     def _pairs(
-        self, terms: PairTerms, p: Parameters, level: int, depths: Sequence[Lines], colors: Sequence[Lines | None]
-    ) -> Iterator[tuple[int, tuple[int, int], BlockSums, Lines, Lines, FloatArray]]:
+        self, terms: PairTerms, optics: Optics, p: Parameters, level: int, depths: Sequence[Lines],
+        colors: Sequence[Lines | None],
+    ) -> Iterator[tuple[int, tuple[int, int], BlockSums, Lines, Lines, FloatArray]]:  # fmt: skip
         """Kind (0 depth, 1 colour), pair, sums, lines of the current image and the reference's, T_base_world."""
         waiting = []
         for r, others in enumerate(partners(len(self.views))):
@@ -130,14 +129,14 @@ class Stretch:
             for k in others:
                 view = self.views[k]
                 to_base = depths[k].to_base(T_base_world)
-                started = terms.by_depth(view.z, surface, to_base, ref_from_base, self.sigma[0], level)
+                started = terms.by_depth(view.z, surface, to_base, ref_from_base, optics, self.sigma[0], level)
                 waiting.append((0, (k, r), started, depths[k], depths[r], T_base_world))
                 color = colors[k]
                 if color is None or ref_color is None or color_from_base is None:
                     continue
                 started = terms.by_color(
                     (view.levels[level], ref.levels[level]), surface, ref_to_base, color.from_base(T_base_world),
-                    color_from_base, ref.bound, self.brightness.get((k, r), SAME), self.sigma[1], level,
+                    color_from_base, optics, ref.bound, self.brightness.get((k, r), SAME), self.sigma[1], level,
                 )  # fmt: skip
                 waiting.append((1, (k, r), started, color, ref_color, T_base_world))
             # A few at a time: the device works ahead while their sums are chained.
@@ -145,16 +144,14 @@ class Stretch:
                 yield kind, pair, started(), current, reference, T
             waiting.clear()
 
-    def _without_brightness(
-        self, pair: tuple[int, int], sums: BrightnessSums, H: FloatArray, g: FloatArray, coupling: FloatArray,
-        sigma: float,
-    ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-        """The system without this pair's gain and offset, which take their next values; coupling (m, 2)."""
+    def _without_brightness(self, pair: tuple[int, int], H: FloatArray, g: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The system (m + 2, m + 2) without the last two unknowns, this pair's gain and offset: they take their next
+        values."""
         at, prior = self.brightness.get(pair, SAME), 1.0 / _BRIGHTNESS**2
-        own, own_g = sums.H / sigma**2 + np.diag(prior), sums.g / sigma + prior * at
+        own, own_g, coupling = H[-2:, -2:] + np.diag(prior), g[-2:] + prior * at, H[:-2, -2:]
         solved = np.linalg.solve(own, np.column_stack([own_g, coupling.T]))
         self.brightness[pair] = np.clip(at - solved[:, 0], -0.7, 2.0)
-        return H - coupling @ solved[:, 1:], g - coupling @ solved[:, 0]
+        return H[:-2, :-2] - coupling @ solved[:, 1:], g[:-2] - coupling @ solved[:, 0]
 
     def _add_priors(self, H: FloatArray, g: FloatArray, p: Parameters) -> None:
         count = len(self.spline.control_points)
@@ -185,6 +182,22 @@ def partners(count: int) -> list[list[int]]:
     return found
 
 
+def _system(
+    sums: BlockSums, current: Lines, reference: Lines, T_base_world: FloatArray, sigma: float
+) -> tuple[FloatArray, FloatArray]:
+    """A pair's H and g by control points of the current image, of the reference, the parameters that move poses, those
+    of lenses and depth that are asked for, and gain and offset, if any."""
+    J, used = _slopes(sums, current, reference, T_base_world)
+    flat = J.reshape(-1, J.shape[2])
+    H = flat.T @ (sums.H[used] @ J).reshape(-1, J.shape[2]) / sigma**2
+    g = flat.T @ sums.g[used].ravel() / sigma
+    own = sums.columns
+    if own is None:
+        return H, g
+    coupling = flat.T @ own.coupling[used].reshape(len(flat), -1) / sigma**2
+    return np.block([[H, coupling], [coupling.T, own.H / sigma**2]]), np.concatenate([g, own.g / sigma])
+
+
 def _slopes(
     sums: BlockSums, current: Lines, reference: Lines, T_base_world: FloatArray
 ) -> tuple[FloatArray, tuple[npt.NDArray[np.intp], ...]]:
@@ -199,14 +212,17 @@ def _slopes(
     return np.concatenate([c[used[0]], -r[used[1]], q[0][used[0]] - q[1][used[1]]], axis=2), used
 
 
-def _add(H: FloatArray, g: FloatArray, own: FloatArray, own_g: FloatArray, current: Lines, reference: Lines) -> None:
-    """Add a pair's system, in the columns of `_slopes`, to that of all unknowns."""
-    a, b = current.by_points.shape[2], reference.by_points.shape[2]
-    to = [slice(6 * current.first, 6 * current.first + a), slice(6 * reference.first, 6 * reference.first + b),
-          slice(len(g) - COUNT, len(g))]  # fmt: skip
-    of = [slice(0, a), slice(a, a + b), slice(a + b, a + b + COUNT)]
+def _add(
+    H: FloatArray, g: FloatArray, own: FloatArray, own_g: FloatArray, current: Lines, reference: Lines,
+    asked: Sequence[int],
+) -> None:  # fmt: skip
+    """Add a pair's system, in the columns of `_system`, to that of all unknowns; asked: places of the last ones."""
+    a, b, points = current.by_points.shape[2], reference.by_points.shape[2], len(g) - COUNT
+    to = [np.arange(6 * current.first, 6 * current.first + a), np.arange(6 * reference.first, 6 * reference.first + b),
+          points + np.array([*range(POSES), *asked], int)]  # fmt: skip
+    of = [slice(0, a), slice(a, a + b), slice(a + b, len(own_g))]
     # Images close in time share control points: part by part, since an index that occurs twice is added once only.
     for i, rows in zip(to, of, strict=True):
         g[i] += own_g[rows]
         for j, columns in zip(to, of, strict=True):
-            H[i, j] += own[rows, columns]
+            H[np.ix_(i, j)] += own[rows, columns]

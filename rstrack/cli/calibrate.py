@@ -23,8 +23,8 @@ def calibrate(
     camera: CameraFile = None,
     free: Annotated[
         str | None,
-        "what to estimate, of readout, offset, extrinsics (default: all; depth that is registered to colour has no "
-        "extrinsics)",
+        "what to estimate, of readout, offset, extrinsics, depth, intrinsics (default: the first three; depth that is "
+        "registered to colour has no extrinsics)",
         "NAMES",
     ] = None,
     frames: Frames = None,

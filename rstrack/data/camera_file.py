@@ -28,6 +28,7 @@ from rsgen.files import read_text, read_yaml
 from rsgen.geometry.camera import Camera, Model
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.sequence.format import DEPTH_SCALE
+from rstrack.data.depth_error import NONE, DepthError
 from rstrack.data.opencv_camera_file import check_fy, extrinsic, is_opencv, read_opencv_rig
 from rstrack.data.registered_rows import DepthSensor, registered_shutter
 from rstrack.data.rig import Rig
@@ -50,7 +51,7 @@ class RigFile:
 
     depth_offset_s: to be added to depth's stamps, so that they belong to the first row of the image as it is.
     color_offset_s: to be added to colour's; None: to be found. color_drift: what that grows by, s/s. scan_named:
-    whether it says which way images are read. notes: what was assumed, for the screen.
+    whether it says which way images are read. notes: what was assumed, for the screen. depth_error: of its images.
     """
 
     rig: Rig
@@ -61,6 +62,7 @@ class RigFile:
     color_drift: float = 0.0
     scan_named: bool = True
     notes: tuple[str, ...] = ()
+    depth_error: DepthError = NONE
 
 
 class _Section(BaseModel):
@@ -100,8 +102,15 @@ class _Sensor(_Section):
     T_color_sensor: Matrix4 | None = None
 
 
+class _DepthError(_Section):
+    offset_m: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.0
+    inverse_offset: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.0
+    radial: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.0
+
+
 class _DepthStream(_Stream):
     depth_scale: Annotated[float, Field(ge=1, allow_inf_nan=False)] = DEPTH_SCALE
+    error: _DepthError = _DepthError()
     # Warped into the colour camera; sensor: the camera it was warped from, whose lines readout_s and scan are about.
     registered: bool = False
     sensor: _Sensor | None = None
@@ -155,6 +164,7 @@ def read_rig(path: Path, color_size: Size, depth_size: Size) -> RigFile:
         1e-6 * data.color.drift_ppm,
         any("scan" in stream.model_fields_set for stream in (data.color, depth) if stream is not None),
         notes,
+        NONE if depth is None else DepthError(**depth.error.model_dump()),
     )
 
 

@@ -15,13 +15,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rsgen.array_types import FloatArray
+from rsgen.array_types import Float32Array, FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.format import DEPTH_SCALE, StreamName
 from rsgen.sequence.reader import Sequence, read_sequence
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.camera_file import read_rig
+from rstrack.data.depth_error import NONE, DepthError
 from rstrack.data.generated import as_recorded, is_exact
 from rstrack.data.noise import ImageReader
 from rstrack.data.prefetch import prefetched
@@ -47,7 +48,7 @@ class Dataset:
     assumed when it was read. timing: of recordings, how their stamps came about. color_drift: seconds a second that
     colour's offset grows by, see `with_color_offset`. scan_named: whether the cameras' description says which way
     images are read. depth_scale: units per metre of the depth images. depth_offset_s: what has been added to the stamps
-    of registered depth, see `rstrack.data.camera_file`.
+    of registered depth, see `rstrack.data.camera_file`. images: as they are on disk; depth_error: of the depth in them.
     """
 
     name: str
@@ -66,6 +67,7 @@ class Dataset:
     scan_named: bool = True
     depth_scale: float = DEPTH_SCALE
     depth_offset_s: float = 0.0
+    depth_error: DepthError = NONE
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -77,7 +79,7 @@ class Dataset:
         """
         if not 0 <= k < len(self):
             raise IndexError(f"{self.name} has frames 0 to {len(self) - 1}, not {k}")
-        depth = Image(float(self.stamps[k]), self.images.depth(k))
+        depth = Image(float(self.stamps[k]), self.depth(k))
         colors = tuple(Image(float(self.color_stamps[i]), self.images.color(i)) for i in self.groups[k] if color)
         return Frame(depth, colors)
 
@@ -95,12 +97,16 @@ class Dataset:
                 problems.append(str(error))
                 return []
 
-        depth = image(self.stamps[k], self.images.depth, k)
+        depth = image(self.stamps[k], self.depth, k)
         if not depth:
             return None, tuple(problems)
         group = self.groups[k] if color else ()
         colors = [found for i in group for found in image(self.color_stamps[i], self.images.color, i)]
         return Frame(depth[0], tuple(colors)), tuple(problems)
+
+    def depth(self, k: int) -> Float32Array:
+        """Planar z (h, w) in m of depth image k, 0 = missing, without the camera's own error. Raises UserError."""
+        return self.depth_error.corrected(self.images.depth(k), self.rig.depth_camera)
 
     def frames(self, first: int = 0, last: int | None = None, prefetch: int = 2) -> Iterator[Frame]:
         """Frames [first, last), decoded ahead in a thread that ends with the iteration, early or not.
@@ -177,7 +183,9 @@ def _seen_as(dataset: Dataset, camera_file: Path) -> Dataset:
         depth = stream_timing("depth", dataset.stamps, "raw", 0.0)
         timing = Timing(depth, stream_timing("colour", dataset.color_stamps, "raw", 0.0), 0.0)
     notes = (*dataset.notes, *file.notes)
-    seen = replace(dataset, rig=file.rig, notes=notes, scan_named=file.scan_named, timing=timing)
+    seen = replace(
+        dataset, rig=file.rig, notes=notes, scan_named=file.scan_named, timing=timing, depth_error=file.depth_error
+    )
     if file.color_offset_s is None:
         return replace(seen, color_drift=file.color_drift)
     return seen.with_color_offset(file.color_offset_s, drift=file.color_drift)
@@ -222,7 +230,7 @@ def _of_tum(root: Path, tum: TumFolder) -> Dataset:
     dataset = Dataset(
         root.resolve().name, root, file.rig, depth.used, color.used, (), tum.images, truth_poses=tum.truth_poses,
         notes=tum.notes, timing=timing, scan_named=file.scan_named, depth_scale=file.depth_scale,
-        depth_offset_s=file.depth_offset_s,
+        depth_offset_s=file.depth_offset_s, depth_error=file.depth_error,
     )  # fmt: skip
     found = dataset.with_color_offset(file.color_offset_s or 0.0, drift=file.color_drift)
     return replace(found, timing=timing)

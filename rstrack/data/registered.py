@@ -1,7 +1,7 @@
 """Depth and colour as other trackers want them: pixel on pixel in one pinhole camera, under one stamp.
 
 registrar = Registrar(dataset.rig)
-image = registrar(dataset.images.depth(k), dataset.images.color(i))
+image = registrar(dataset.depth(k), dataset.images.color(i))
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def registered_image(dataset: Dataset, registrar: Registrar, k: int) -> Register
     Raises UserError naming an image that is missing, damaged or of a wrong size.
     """
     nearest = int(np.argmin(np.abs(dataset.color_stamps - dataset.stamps[k])))
-    return registrar(dataset.images.depth(k), dataset.images.color(nearest))
+    return registrar(dataset.depth(k), dataset.images.color(nearest))
 
 
 def _pixel_map(camera: Camera, p_cam: FloatArray) -> tuple[Float32Array, Float32Array]:

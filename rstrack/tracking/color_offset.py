@@ -211,7 +211,7 @@ def _points(dataset: Dataset, spline: Spline, k: int) -> FloatArray:
     camera, shutter = dataset.rig.depth_camera, dataset.rig.depth_shutter
     step = max(camera.width // _ACROSS, 1)
     pixels = camera.pixel_grid()[::step, ::step].reshape(-1, 2)
-    z = dataset.images.depth(k)[::step, ::step].reshape(-1)
+    z = dataset.depth(k)[::step, ::step].reshape(-1)
     rays = camera.unproject(pixels)
     known = (z > 0.0) & np.isfinite(rays).all(axis=1)
     lines = shutter.line_of_pixel(pixels[known], camera)

@@ -13,19 +13,36 @@ import synthetic
 
 from rsgen.device.arrays import engine
 from rsgen.device.lens import Lens
+from rsgen.device.projection import project
 from rsgen.errors import UserError
 from rsgen.geometry import se3
+from rsgen.geometry.camera import Camera, Model
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
 from rstrack.calibration import run as calibration_run
 from rstrack.calibration.images import Taken, lines_of
 from rstrack.calibration.load import like, load_stretch, pair_terms
-from rstrack.calibration.parameters import COUNT, DRIFT, NAMES, PRIOR, USEFUL, Parameters, free_of
+from rstrack.calibration.optics import camera_table, moves, traced
+from rstrack.calibration.parameters import (
+    COUNT,
+    DEPTH_ERROR,
+    DEPTH_LENS,
+    DRIFT,
+    LENS,
+    NAMES,
+    POSES,
+    PRIOR,
+    USEFUL,
+    Parameters,
+    changed,
+    free_of,
+)
 from rstrack.calibration.result import Calibration
 from rstrack.calibration.run import calibrate, parameters_of
 from rstrack.calibration.solve import Solution, solve
 from rstrack.cli.main import main
 from rstrack.data.dataset import Dataset, open_dataset
+from rstrack.data.depth_error import DepthError
 from rstrack.data.noise import NoisyImages, with_noise
 from rstrack.data.timing import Timing, stream_timing
 from rstrack.options import Options
@@ -58,6 +75,13 @@ def shaken(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return recording(tmp_path_factory.mktemp("calibration") / "seq", shaking())
 
 
+def bent(dataset: Dataset) -> Dataset:
+    """With cameras that have a distortion, of nothing."""
+    flat = [replace(c, model="radtan", distortion=(0.0,) * 5) for c in (dataset.rig.depth_camera,
+                                                                       dataset.rig.color_camera)]  # fmt: skip
+    return replace(dataset, rig=replace(dataset.rig, depth_camera=flat[0], color_camera=flat[1]))
+
+
 def told(dataset: Dataset, readout_s: float, late_s: float, moved: np.ndarray, scan: Scan = "top-bottom") -> Dataset:
     """The dataset with cameras of which these are wrong."""
     rig = dataset.rig
@@ -87,7 +111,7 @@ def test_lines_move_with_every_parameter_and_control_point_as_finite_differences
     def moved(by: Parameters, along: Spline) -> np.ndarray:
         return se3.log(lines_of(taken, along, by).T_world_cam @ se3.inverse(lines.T_world_cam))
 
-    for i in range(COUNT):
+    for i in range(POSES):
         step = np.zeros(COUNT)
         step[i] = 1e-6
         numeric = (moved(p.moved(step), spline) - moved(p.moved(-step), spline)) / 2e-6
@@ -105,14 +129,15 @@ def test_lines_move_with_every_parameter_and_control_point_as_finite_differences
 
 
 def test_the_gradient_changes_along_every_parameter_as_the_normal_equations_say(shaken: Dataset) -> None:
-    terms, p = pair_terms(engine("llvm"), shaken), parameters_of(shaken)
+    lensed = bent(shaken)
+    terms, p = pair_terms(engine("llvm"), lensed, np.ones(COUNT, bool)), parameters_of(lensed)
     assert shaken.truth is not None
-    stretch = load_stretch(terms, shaken, range(4, 20), shaken.truth, p, OPTIONS)
+    stretch = load_stretch(terms, lensed, range(4, 20), shaken.truth, p, OPTIONS)
     for _ in range(4):
         stretch.sums(terms, p, 0)
     sigma = stretch.sigma
     at = stretch.sums(terms, p, 0)
-    for i in (0, 1, 2, 4, 5, 6, 7, 8, 9):
+    for i in (*range(DRIFT), *range(DRIFT + 1, COUNT)):
         step = np.zeros(COUNT)
         step[i] = 3.0 / np.sqrt(at.H[-COUNT + i, -COUNT + i])
         ends = []
@@ -137,6 +162,46 @@ def test_scipy_finds_the_same_offset_by_the_cost_alone(shaken: Dataset) -> None:
 
     found = scipy.optimize.minimize_scalar(cost, bounds=(-0.4, 0.4), method="bounded", options={"xatol": 2e-3})
     assert 1e-3 * found.x == pytest.approx(ours.values.color_offset_s, abs=2.5e-5)
+
+
+@pytest.mark.parametrize("model", ["radtan", "fisheye", "pinhole"])
+def test_points_move_as_pixels_do_when_a_lens_or_depth_changes(model: Model) -> None:
+    bends = {"radtan": (0.1, -0.05, 2e-3, -1e-3, 0.02), "fisheye": (0.02, -0.01, 0.0, 0.0), "pinhole": ()}
+    camera = Camera(160, 120, 121.0, 119.0, 78.0, 61.0, model, bends[model])
+    e = engine("llvm")
+    rng = np.random.default_rng(3)
+    q = np.column_stack([rng.uniform(-0.4, 0.4, 50), rng.uniform(-0.3, 0.3, 50), np.ones(50)])
+    q *= rng.uniform(0.7, 3.0, 50)[:, None]
+    table = e.upload(camera_table(camera))
+    lens = traced(e, Lens(camera, Shutter()), table)
+    device = tuple(e.upload(q[:, i]) for i in range(3))
+    names = (*(LENS if model == "radtan" else LENS[:4]), "offset_m", "inverse_offset", "radial")
+    found = moves(names, lens.camera, project(lens.camera, device))
+    uv = camera.project(q)[0]
+    for name, move in zip(names, found, strict=True):
+        shift = np.stack(np.broadcast_arrays(*(np.array(part) for part in move), q[:, 0])[:3], axis=-1)
+        if name in LENS:
+            step = np.zeros(len(LENS))
+            step[LENS.index(name)] = 1e-5
+            wanted = (changed(camera, step).project(q)[0] - changed(camera, -step).project(q)[0]) / 2e-5
+            # By the larger unknown, and by the point's own move.
+            got = (camera.project(q + 1e-5 * shift)[0] - camera.project(q - 1e-5 * shift)[0]) / 2e-5
+            np.testing.assert_allclose(got, wanted, atol=2e-3 * np.abs(wanted).max(), err_msg=name)
+            continue
+        z, ends = q[:, 2], []
+        for sign in (1e-4, -1e-4):
+            error = replace(DepthError(), **{name: sign})
+            x, y = np.rint(uv).astype(int).T
+            image = np.zeros((120, 160), np.float32)
+            r2 = ((q[:, :2] / z[:, None]) ** 2).sum(axis=1)
+            image[y, x] = z
+            near = (camera.unproject(np.stack([x, y], axis=-1))[:, :2] ** 2).sum(axis=1)
+            # The pixel's ray is not quite the point's.
+            own = error.corrected(image, camera)[y, x] - z
+            ends.append(own * (r2 / near if name == "radial" else 1.0))
+        grown = (ends[0] - ends[1]) / 2e-4
+        unique = np.unique(np.rint(uv), axis=0, return_index=True)[1]
+        np.testing.assert_allclose(-shift[unique, 2], grown[unique], rtol=0.02, atol=5e-3, err_msg=name)
 
 
 # --- recordings ------------------------------------------------------------------------------------------------------
@@ -201,7 +266,7 @@ def test_a_camera_at_rest_tells_nothing_and_that_is_said(tmp_path: Path, capsys:
 def test_too_little_to_go_by_is_said_in_one_line(shaken: Dataset) -> None:
     with pytest.raises(UserError, match="20 frames are too few to calibrate from: 42 or more"):
         calibrate(shaken, frames=slice(0, 20), options=OPTIONS)
-    with pytest.raises(UserError, match="--free lens: choose one or more of readout, offset, extrinsics"):
+    with pytest.raises(UserError, match="--free lens: choose one or more of readout, offset, extrinsics, depth"):
         calibrate(shaken, ("readout", "lens"), options=OPTIONS)
     blind = replace(shaken, groups=((),) * len(shaken))
     with pytest.raises(UserError, match="no colour images"):
@@ -268,11 +333,14 @@ def test_a_spline_like_another_passes_through_its_poses() -> None:
 
 def test_the_camera_file_says_what_was_found(shaken: Dataset, tmp_path: Path) -> None:
     start = parameters_of(shaken)
-    found = start.moved(np.array([-0.02, 2e-3, -1.5e-3, 1e-5, 1e-3, 0, 0, 0, 0.01, 0]))
+    step = np.zeros(COUNT)
+    step[:POSES] = -0.02, 2e-3, -1.5e-3, 1e-5, 1e-3, 0, 0, 0, 0.01, 0
+    step[POSES : POSES + 4], step[DEPTH_ERROR] = (0.01, -0.02, 0.03, -0.01), (0.004, 1e-3, -2e-3)
+    found = start.moved(step)
     free = np.ones(COUNT, bool)
     free[5] = False
     A = np.array([np.diag(1.0 / (1e-3 * PRIOR[free]) ** 2)] * 3)
-    solution = Solution(found, free, A, np.zeros((3, 9)), 0.0, 1e-3, 1e-2)
+    solution = Solution(found, free, A, np.zeros((3, COUNT - 1)), 0.0, 1e-3, 1e-2)
     motion = calibration_run.motion_of(shaken, [range(30)], shaking())
     made = Calibration(shaken, start, solution, np.ones(COUNT, bool), (range(30),), motion, 1.0)
     (tmp_path / "camera.yaml").write_text(made.camera_file())
@@ -284,6 +352,8 @@ def test_the_camera_file_says_what_was_found(shaken: Dataset, tmp_path: Path) ->
     ):  # fmt: skip
         assert ours.scan == theirs.scan and ours.readout_s == pytest.approx(theirs.readout_s, abs=1e-7)
     assert again.rig.depth_shutter.scan == "bottom-top"
+    assert again.depth_error == expected.depth_error == DepthError(0.004, 1e-3, -2e-3)
+    assert pytest.approx(changed(shaken.rig.depth_camera, step[DEPTH_LENS]).K, rel=1e-9) == again.rig.depth_camera.K
     np.testing.assert_allclose(again.rig.T_color_depth, expected.rig.T_color_depth, atol=1e-10)
     np.testing.assert_allclose(again.color_stamps, expected.color_stamps, atol=2e-7)
     # Stamps are used as they were, whatever 'auto' would make of them.

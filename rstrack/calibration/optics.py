@@ -1,0 +1,169 @@
+"""Lenses and depth as unknowns: cameras whose values are no part of what is compiled, and what these move."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from rsgen.array_types import FloatArray
+from rsgen.device.arrays import Engine
+from rsgen.device.lens import Lens
+from rsgen.device.projection import Projection, Vector
+from rsgen.geometry.camera import Camera
+from rstrack.alignment.block_sums import BlockSums, ColumnSums
+from rstrack.calibration.parameters import DEPTH, LENS, NAMES
+from rstrack.data.depth_error import DepthError
+
+# Coefficients of distortion at most.
+_BENDS = 5
+# About how far a change of one moves points at the image's edge, m at 1 m, and of depth 1/m² more; a fifth of it is the
+# unit of its column, since two images that nearly agree show little of it.
+_MOVES = {
+    "fx": 0.6, "fy": 0.6, "cx": 1.0, "cy": 1.0, "k1": 0.3, "k2": 0.15, "p1": 0.7, "p2": 0.7,
+    "offset_m": 1.0, "inverse_offset": 1.0, "radial": 0.5,
+}  # fmt: skip
+_SHOWN = 0.2
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Which of LENS are unknown of the depth camera (DEPTH then too) and of the colour camera.
+
+    corrects: whether depth has an error at all. is_one_lens: depth is registered, so that both are the colour camera's.
+    """
+
+    depth: tuple[str, ...] = ()
+    color: tuple[str, ...] = ()
+    corrects: bool = False
+    is_one_lens: bool = False
+
+    @property
+    def at(self) -> tuple[list[int], list[int]]:
+        """Where, among NAMES, the columns of the depth term and those of the colour term belong."""
+        depth = "color" if self.is_one_lens else "depth"
+        names = [f"{depth}.{name}" if name in LENS else f"depth.error.{name}" for name in self.depth]
+        return [NAMES.index(name) for name in names], [NAMES.index(f"color.{name}") for name in self.color]
+
+
+@dataclass(frozen=True)
+class Optics:
+    """On the device: normalised coordinates of depth's pixels, `camera_table` of both, `error_table`."""
+
+    rays_x: Any
+    rays_y: Any
+    depth_camera: Any
+    color_camera: Any
+    error: Any
+
+
+def camera_table(camera: Camera) -> FloatArray:
+    """What `traced` takes (10,)."""
+    bent = (*camera.distortion, *(0.0,) * _BENDS)[:_BENDS]
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *bent, min(camera.max_radius, 1e6)])
+
+
+def traced(e: Engine, lens: Lens, table: Any) -> Lens:
+    """The lens with a camera whose focal lengths, principal point and distortion a kernel reads from `camera_table`."""
+    values = [dr.gather(e.Float, table, e.UInt(i)) for i in range(5 + _BENDS)]
+    camera = lens.camera
+    return Lens(_Traced(camera, values), lens.shutter)
+
+
+class _Traced(Camera):
+    """A camera of device floats, as the functions of `rsgen.device` take it."""
+
+    def __init__(self, camera: Camera, values: Sequence[Any]) -> None:
+        names = "fx", "fy", "cx", "cy"
+        self.__dict__.update(
+            width=camera.width, height=camera.height, model=camera.model, max_radius=values[-1],
+            distortion=tuple(values[4 : 4 + len(camera.distortion)]), **dict(zip(names, values[:4], strict=True)),
+        )  # fmt: skip
+
+
+def without_error(e: Engine, asked: Asked, z: Any, xn: Any, yn: Any, table: Any) -> Any:
+    """Depth on the device, along rays (xn, yn), as `DepthError.corrected` has it."""
+    if not asked.corrects:
+        return z
+    offset, inverse_offset, radial = (dr.gather(e.Float, table, e.UInt(i)) for i in range(len(DEPTH)))
+    return dr.rcp(dr.rcp(z) + dr.fma(radial, xn * xn + yn * yn, inverse_offset)) + offset
+
+
+def moves(names: Sequence[str], camera: Camera, at: Projection) -> list[Vector]:
+    """How a point in the camera's frame would have to move, for each unknown of LENS or DEPTH, to look as if that grew.
+
+    By a larger unknown the pixel of a point moves, and a pixel's point the other way. Per unit of the unknown.
+    """
+    x, y, z = at.xn, at.yn, at.q[2]
+    r2 = x * x + y * y
+
+    def pixel(x: Any, y: Any) -> Vector:
+        return at.shift_of(camera.fx * x, camera.fy * y)
+
+    def along(by: Any) -> Vector:
+        return -by * x, -by * y, -by
+
+    zero = type(z)(0.0)
+    bent = (at.x - camera.cx) / camera.fx, (at.y - camera.cy) / camera.fy
+    found = {
+        "fx": lambda: pixel(bent[0], zero), "fy": lambda: pixel(zero, bent[1]),
+        "cx": lambda: pixel(zero + 1.0, zero), "cy": lambda: pixel(zero, zero + 1.0),
+        "k1": lambda: pixel(x * r2, y * r2), "k2": lambda: pixel(x * r2 * r2, y * r2 * r2),
+        "p1": lambda: pixel(2.0 * x * y, r2 + 2.0 * y * y), "p2": lambda: pixel(r2 + 2.0 * x * x, 2.0 * x * y),
+        "offset_m": lambda: along(zero + 1.0), "inverse_offset": lambda: along(-z * z),
+        "radial": lambda: along(-z * z * r2),
+    }  # fmt: skip
+    return [found[name]() for name in names]
+
+
+def unknown_columns(
+    e: Engine, g: Vector, shifts: Iterable[tuple[Vector, Vector]], cam_base: list[Any], base_cam: list[Any],
+    constants: Any,
+) -> list[Any]:  # fmt: skip
+    """Columns of unknowns, at most 1, from g, the derivative by a shift in the base frame.
+
+    shifts: by `moves`, in the camera that sees the point (cam_base: its R_cam_base, as `gather` has it), and in the
+    other one (base_cam: its R_base_cam). constants: `units` from the ninth on.
+    """
+    bound, found = dr.gather(e.Float, constants, e.UInt(3)), []
+    back = turned_round(cam_base)
+    for k, (there, here) in enumerate(shifts):
+        a, b = turn(back, there), turn(base_cam, here)
+        c = g[0] * (a[0] - b[0]) + g[1] * (a[1] - b[1]) + g[2] * (a[2] - b[2])
+        unit = dr.gather(e.Float, constants, e.UInt(9 + k)) * bound
+        found.append(dr.clip(c / unit, -1.0, 1.0))
+    return found
+
+
+def turned_round(R: list[Any]) -> list[Any]:
+    """Rᵀ, row-major."""
+    return [R[0], R[3], R[6], R[1], R[4], R[7], R[2], R[5], R[8]]
+
+
+def turn(R: list[Any], v: Vector) -> Vector:
+    """R v."""
+    x, y, z = (R[3 * i] * v[0] + R[3 * i + 1] * v[1] + R[3 * i + 2] * v[2] for i in range(3))
+    return x, y, z
+
+
+def in_units(sums: BlockSums, unit: FloatArray) -> BlockSums:
+    """The sums with further columns by the unknowns themselves, not by `unit` (n,) of them."""
+    own = sums.columns
+    if own is None:
+        return sums
+    own = ColumnSums(own.coupling * unit, own.H * np.outer(unit, unit), own.g * unit)
+    return replace(sums, columns=own)
+
+
+def units(names: Sequence[str], median_depth: float) -> FloatArray:
+    """Units (n,) of the columns of such unknowns: what they then come to is like that of a twist."""
+    power = np.array([1.0 if name in LENS else 2.0 * (name != DEPTH[0]) for name in names])
+    return np.array([_SHOWN * _MOVES[name] for name in names]) * median_depth**power
+
+
+def error_table(error: DepthError) -> FloatArray:
+    """What `corrected` takes (3,)."""
+    return np.array([error.offset_m, error.inverse_offset, error.radial])
