@@ -77,7 +77,10 @@ def motion_of(dataset: Dataset, parts: Sequence[range], track: Spline) -> Motion
 
 @dataclass(frozen=True)
 class Calibration:
-    """start: the values before; asked (29,): which might change; parts: the stretches of frames that told."""
+    """start: the values before; asked (29,): which might change; parts: the stretches of frames that told.
+
+    device_notes: what became of what is published of the device, if one was named.
+    """
 
     dataset: Dataset
     start: Parameters
@@ -86,6 +89,7 @@ class Calibration:
     parts: tuple[range, ...]
     motion: Motion
     seconds: float
+    device_notes: tuple[str, ...] = ()
 
     @property
     def undetermined(self) -> BoolArray:
@@ -159,7 +163,7 @@ class Calibration:
             "motion": {"m_s": self.motion.speed, "rad_s": self.motion.rotation, "rad_s2": self.motion.change},
             "sigma_depth_m": self.solution.sigma_depth_m, "sigma_intensity": self.solution.sigma_intensity,
             "finished": self.solution.finished, "converged": self.solution.is_settled, "seconds": self.seconds,
-            "camera_file": self.camera_file(),
+            "device": list(self.device_notes), "camera_file": self.camera_file(),
         }  # fmt: skip
 
     def camera_file(self) -> str:
@@ -252,7 +256,7 @@ class Calibration:
 
     def _notes(self) -> list[str]:
         """What a user should know of the clocks and the directions."""
-        notes = []
+        notes = list(self.device_notes)
         for name, scan, before, readout, sigma in zip(
             ("depth", "colour"), self._scans(), (self.dataset.rig.depth_shutter, self.dataset.rig.color_shutter),
             (self.values.depth_readout_s, self.values.color_readout_s), self.sigmas[:2], strict=True,

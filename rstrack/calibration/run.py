@@ -20,7 +20,9 @@ from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan
 from rsgen.geometry.spline import Spline
+from rstrack.calibration.devices import Device, device_notes
 from rstrack.calibration.first_track import Track, first_track
+from rstrack.calibration.known import Known
 from rstrack.calibration.load import load_stretch, pair_terms
 from rstrack.calibration.pair_terms import PairTerms
 from rstrack.calibration.parameters import COLOR_LENS, COUNT, DEPTH_LENS, DRIFT, GROUPS, USEFUL, Parameters, free_of
@@ -51,11 +53,13 @@ _ABOUT_STEPS = 20
 
 def calibrate(
     dataset: Dataset, groups: Sequence[str] | None = None, frames: slice = slice(None), options: Options | None = None,
-    progress: Progress = no_progress,
+    progress: Progress = no_progress, device: Device | None = None,
 ) -> Calibration:  # fmt: skip
     """Readouts, colour's clock, extrinsics, lenses and depth of a dataset, from the values of its cameras on.
 
     groups: of GROUPS, what may change; by default the first three, but extrinsics where depth is registered to colour.
+    device: what is published of its readouts is where they start and what they are drawn to, unless the recording
+    contradicts it.
     Where Ctrl-C is pressed while it solves, the best so far is returned, marked so. Raises UserError: too few frames,
     or too few that can be followed; unknown groups; an image that cannot be read.
     """
@@ -67,7 +71,8 @@ def calibrate(
     engine(options.backend)  # before anything else imports Dr.Jit, which then would choose a libLLVM itself
     if "intrinsics" in groups:
         dataset = _bent(dataset)
-    start = parameters_of(dataset)
+    before = device.known(parameters_of(dataset)) if device else Known.nothing(parameters_of(dataset))
+    start = before.values
     if dataset.timing is not None and dataset.timing.wants_color_offset and "offset" in groups:
         start = replace(start, color_offset_s=estimate_color_offset(dataset, chosen, options, progress).offset_s)
     track = first_track(dataset, chosen, options, progress)
@@ -76,10 +81,16 @@ def calibrate(
     if not dataset.scan_named and "readout" in groups:
         dataset = _oriented(dataset, parts, track.spline, start, options, progress)
     terms, stretches = _loaded(dataset, parts, track.spline, start, free, options, progress)
-    solution, drifts = _solved(stretches, terms, start, free, progress)
+    known = before = replace(before, values=start)
+    solution, drifts = _solved(stretches, terms, known, free, progress)
+    contradicted = known.contradicted(solution.values, solution.sigmas)
+    if solution.finished and contradicted.any():
+        known = known.without(contradicted)
+        solution, drifts = _solved(stretches, terms, known, free, progress)
     free[DRIFT] &= drifts
     motion = motion_of(dataset, parts, track.spline)
-    return Calibration(dataset, start, solution, free, tuple(parts), motion, time.perf_counter() - begun)
+    notes = device_notes(device, before, known, solution.sigmas) if device else ()
+    return Calibration(dataset, start, solution, free, tuple(parts), motion, time.perf_counter() - begun, notes)
 
 
 def _loaded(
@@ -136,14 +147,15 @@ def _bent(dataset: Dataset) -> Dataset:
 
 
 def _solved(
-    stretches: Sequence[Stretch], terms: PairTerms, file: Parameters, free: BoolArray, progress: Progress
+    stretches: Sequence[Stretch], terms: PairTerms, known: Known, free: BoolArray, progress: Progress
 ) -> tuple[Solution, bool]:
-    """From the file's values on: with all that may change, then without what this recording turns out not to tell.
+    """From the known values on: with all that may change, then without what this recording turns out not to tell.
 
     And whether colour's clock may drift: one that is within its error of the file's is held there, since it would take
     colour away at both ends of the recording.
     """
     levels: Sequence[int] = _LEVELS
+    file = known.values
     start, done, drifts = file, 0, True
 
     def watch(level: int, _: int, p: Parameters) -> None:
@@ -153,7 +165,7 @@ def _solved(
         progress("calibrating", min(0.98, 0.15 + 0.85 * done / _ABOUT_STEPS), note)
 
     while True:
-        solution = solve(stretches, terms, start, free, levels, watch)
+        solution = solve(stretches, terms, start, free, levels, watch, known)
         sigmas = solution.sigmas
         unsure, drift = sigmas / USEFUL, abs(solution.values.color_drift - file.color_drift)
         if solution.finished and unsure.max() > 1.0:

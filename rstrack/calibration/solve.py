@@ -10,6 +10,7 @@ from scipy import stats
 
 from rsgen.array_types import BoolArray, FloatArray
 from rstrack.alignment.acceleration import Acceleration
+from rstrack.calibration.known import Known
 from rstrack.calibration.pair_terms import PairTerms
 from rstrack.calibration.parameters import COUNT, DEPTH, PRIOR, Parameters
 from rstrack.calibration.stretch import Stretch, Sums
@@ -37,7 +38,8 @@ class Solution:
     """values; normal equations of the free parameters at them: A (s, n, n), b (s, n) of the s stretches, free (29,).
 
     cost: negative log-likelihood a pixel. sigma_depth_m, sigma_intensity: of the residuals, medians. last_step (29,):
-    the last one that was taken. blind (29,): σ of what no scatter shows. finished: nobody interrupted it.
+    the last one that was taken. blind (29,): σ of what no scatter shows. finished: nobody interrupted it. known (29,):
+    σ of what was known beforehand, infinite where nothing was.
     """
 
     values: Parameters
@@ -50,6 +52,7 @@ class Solution:
     last_step: FloatArray = field(default_factory=lambda: np.zeros(COUNT))
     blind: FloatArray = field(default_factory=lambda: np.zeros(COUNT))
     finished: bool = True
+    known: FloatArray = field(default_factory=lambda: np.full(COUNT, np.inf))
 
     @property
     def is_settled(self) -> bool:
@@ -63,11 +66,12 @@ class Solution:
         At the solution the stretches' gradients add up to nothing; how far each is from nothing tells how far the next
         recording's solution may lie (the "sandwich" of White, Econometrica 1980, by clusters, of which a stretch is
         one). With few stretches one parameter's scatter says little, so that of all counts too, and Student's factor
-        makes two of these σ hold 95 %.
+        makes two of these σ hold 95 %. What was known beforehand draws the solution to itself, and errs with its own σ.
         """
         count, n = self.b.shape
-        inverse = np.linalg.pinv(self.A.sum(axis=0), hermitian=True)
-        formal = np.maximum(np.diag(inverse), 0.0)
+        told, lent = self.A.sum(axis=0), _COUNTED / self.known[self.free] ** 2
+        inverse = np.linalg.pinv(told + np.diag(lent), hermitian=True)
+        formal = np.maximum(np.diag(inverse @ told @ inverse), 0.0)
         scatter = self.b - self.b.mean(axis=0)
         spread = np.diag(inverse @ (scatter.T @ scatter) @ inverse) * count / max(1, count - 1)
         ratio = np.divide(spread, formal, out=np.ones(n), where=formal > 0.0)
@@ -76,7 +80,8 @@ class Solution:
         inflation = np.maximum((_POOLED * all_of_them + dof * ratio) / (_POOLED + dof), 1.0)
         factor = float(stats.t.ppf(0.975, dof)) / 1.96
         sigmas = np.zeros(COUNT)
-        sigmas[self.free] = np.hypot(factor * np.sqrt(formal * inflation), self.blind[self.free])
+        borrowed = np.sqrt(inverse**2 @ (_COUNTED * lent))
+        sigmas[self.free] = np.hypot(np.hypot(factor * np.sqrt(formal * inflation), borrowed), self.blind[self.free])
         return sigmas
 
     @property
@@ -90,14 +95,15 @@ class Solution:
 
 def solve(
     stretches: Sequence[Stretch], terms: PairTerms, start: Parameters, free: BoolArray, levels: Sequence[int],
-    watch: Watch = lambda *_: None,
+    watch: Watch = lambda *_: None, known: Known | None = None,
 ) -> Solution:  # fmt: skip
     """Parameters and all control points jointly, coarse to fine; the stretches' splines are moved.
 
-    free (29,): which parameters may change; the others stay at `start`, to which weak ones are held by PRIOR. Where
-    `watch` raises KeyboardInterrupt, what has been found so far is returned, `finished` False. Raises
-    numpy.linalg.LinAlgError where images say nothing at all.
+    free (29,): which parameters may change; the others stay at `start`, to which weak ones are held by PRIOR, and to
+    what is `known` as firmly as that is. Where `watch` raises KeyboardInterrupt, what has been found so far is
+    returned, `finished` False. Raises numpy.linalg.LinAlgError where images say nothing at all.
     """
+    known = known or Known.nothing(start)
     p, acceleration, finished, step = start, Acceleration(), True, np.zeros(COUNT)
     try:
         for level in levels:
@@ -108,7 +114,7 @@ def solve(
             for n in range(_MOST_STEPS[level]):
                 watch(level, n, p)
                 sums = [stretch.sums(terms, p, level) for stretch in stretches]
-                step, information = _step(sums, p, start, free, acceleration)
+                step, information = _step(sums, p, start, known, free, acceleration)
                 for stretch, one in zip(stretches, sums, strict=True):
                     stretch.move(one.points_step(step))
                 p = p.moved(step)
@@ -122,7 +128,8 @@ def solve(
     depth, intensity = np.median([stretch.sigma for stretch in stretches], axis=0)
     cost = sum(one.cost for one in sums) / max(1, sum(one.pixels for one in sums))
     b = np.array([one[free] for _, one in reduced])
-    return Solution(p, free, A, b, cost, float(depth), float(intensity), step, _blind(stretches, terms), finished)
+    blind = _blind(stretches, terms)
+    return Solution(p, free, A, b, cost, float(depth), float(intensity), step, blind, finished, known.sigmas)
 
 
 def _blind(stretches: Sequence[Stretch], terms: PairTerms) -> FloatArray:
@@ -141,14 +148,15 @@ def _blind(stretches: Sequence[Stretch], terms: PairTerms) -> FloatArray:
 
 
 def _step(
-    sums: Sequence[Sums], p: Parameters, start: Parameters, free: BoolArray, acceleration: Acceleration
+    sums: Sequence[Sums], p: Parameters, start: Parameters, known: Known, free: BoolArray, acceleration: Acceleration
 ) -> tuple[FloatArray, FloatArray]:
     """The step (29,) of the parameters, and what is known of the free ones."""
     reduced = [one.reduced() for one in sums]
-    prior = _COUNTED / PRIOR[free] ** 2
+    prior, lent = _COUNTED / PRIOR[free] ** 2, _COUNTED / known.sigmas[free] ** 2
     at = p.since(start)[free]
-    information = np.sum([A for A, _ in reduced], axis=0)[np.ix_(free, free)] + np.diag(prior)
+    information = np.sum([A for A, _ in reduced], axis=0)[np.ix_(free, free)] + np.diag(prior + lent)
     gradient = np.sum([b for _, b in reduced], axis=0)[free] + prior * at
+    gradient += lent * p.since(known.values)[free]
     step = np.zeros(COUNT)
     if free.any():
         step[free] = acceleration.extrapolated(at, -np.linalg.solve(information, gradient), information)

@@ -10,7 +10,7 @@ from typing import Annotated
 
 from rsgen.console.command_line import Frames, Json, Quiet
 from rsgen.device.backend import Backend
-from rstrack.cli.options import CameraFile, NoiseDepth, NoiseIntensity, Seed, SequenceFolder
+from rstrack.cli.options import CameraFile, DeviceName, NoiseDepth, NoiseIntensity, Seed, SequenceFolder
 
 STATUS = (
     "exit status: 0 done, 1 some values are not told by the recording, or not converged, 2 wrong input, 130 interrupted"
@@ -27,6 +27,7 @@ def calibrate(
         "registered to colour has no extrinsics)",
         "NAMES",
     ] = None,
+    device: DeviceName = None,
     frames: Frames = None,
     backend: Annotated[Backend, "where kernels run"] = "auto",
     noise_depth: NoiseDepth = 0.0,
@@ -39,17 +40,19 @@ def calibrate(
     """Readouts, clocks and extrinsics of a recording's cameras, from the recording alone, with their errors."""
     from rsgen.console.progress import ProgressDisplay
     from rsgen.files import atomic_write
+    from rstrack.calibration.devices import device_named
     from rstrack.calibration.run import calibrate as run
     from rstrack.data.dataset import open_dataset
     from rstrack.data.noise import NoisyImages
     from rstrack.options import Options
 
+    known = None if device is None else device_named(device)
     dataset = open_dataset(sequence, camera)
     if noise_depth or noise_intensity:
         dataset = replace(dataset, images=NoisyImages(dataset.images, noise_depth, noise_intensity, seed))
     with ProgressDisplay(quiet) as progress:
         groups = None if free is None else tuple(name.strip() for name in free.split(",") if name.strip())
-        found = run(dataset, groups, frames or slice(None), Options(backend=backend), progress)
+        found = run(dataset, groups, frames or slice(None), Options(backend=backend), progress, known)
     if out is not None:
         atomic_write(out, found.camera_file().encode())
     print(dumps(found.as_dict(), indent=2) if json else found.text())

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from rsgen.console.command_line import Commands, Frames, Json, Parser, Quiet, run_program
+from rsgen.errors import UserError
 from rstrack.cli.bench import bench_bootstrap, bench_convergence, bench_speed, stress
 from rstrack.cli.bench_methods import STATUS as BENCH_STATUS
 from rstrack.cli.bench_methods import bench
@@ -18,6 +19,7 @@ from rstrack.cli.calibrate import calibrate
 from rstrack.cli.mapping import keyframes, map_, map_eval
 from rstrack.cli.options import (
     CameraFile,
+    DeviceName,
     NoiseDepth,
     NoiseIntensity,
     Run,
@@ -103,21 +105,26 @@ def track(
     calibrate: Annotated[
         bool, "estimate readouts, colour's clock and extrinsics first, as 'rstrack calibrate' does, and track with them"
     ] = False,
+    device: DeviceName = None,
     quiet: Quiet = False,
 ) -> int:
     """Track a sequence: writes trajectory.txt, spline.npz and run.json; with --calibrate camera.yaml too."""
     from rsgen.console.progress import ProgressDisplay
     from rsgen.files import atomic_write
+    from rstrack.calibration.devices import device_named
     from rstrack.calibration.run import calibrate as run_calibration
     from rstrack.data.dataset import open_dataset
     from rstrack.tracking import run
 
+    if device is not None and not calibrate:
+        raise UserError(f"--device {device}: is for --calibrate, which is not given")
+    known = None if device is None else device_named(device)
     noise = run.Noise(noise_depth, noise_intensity, seed)
     dataset = open_dataset(sequence, camera)
     with ProgressDisplay(quiet) as progress:
         found = None
         if calibrate:
-            found = run_calibration(dataset, None, frames or slice(None), tracker, progress)
+            found = run_calibration(dataset, None, frames or slice(None), tracker, progress, known)
             if not found.solution.finished:
                 raise KeyboardInterrupt
             dataset = found.calibrated()

@@ -7,6 +7,12 @@ from rsgen.console.command_line import number
 
 SequenceFolder = Annotated[Path, "rsgen sequence, TUM RGB-D, ICL-NUIM or 7-Scenes folder"]
 CameraFile = Annotated[Path | None, "camera file to go by instead of what the folder tells of its cameras", "FILE"]
+DeviceName = Annotated[
+    str | None,
+    "camera whose published readouts to start from and be drawn to, for example zed2-720p-30hz; any other word lists "
+    "them",
+    "NAME",
+]
 
 
 def truth_offset(text: str) -> float | Literal["auto"]:

@@ -20,7 +20,9 @@ from rsgen.geometry.camera import Camera, Model
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
 from rstrack.calibration import run as calibration_run
+from rstrack.calibration.devices import Device, Stream
 from rstrack.calibration.images import Taken, lines_of
+from rstrack.calibration.known import Known
 from rstrack.calibration.load import like, load_stretch, pair_terms
 from rstrack.calibration.optics import camera_table, moves, traced
 from rstrack.calibration.parameters import (
@@ -404,3 +406,32 @@ def test_a_sequence_is_calibrated_and_tracked_by_command(
     more = ["--camera", str(wrong), "--calibrate", "--out", str(tmp_path / "again"), "--frames", "0:50", "--quiet"]
     assert main(["track", str(shaken.root), *more]) in (0, 1)
     assert (tmp_path / "again/camera.yaml").read_text().startswith("# rstrack calibrate synthetic")
+
+
+# --- a device that is known ------------------------------------------------------------------------------------------
+
+
+def test_known_values_draw_a_solution_by_as_much_as_they_weigh(shaken: Dataset) -> None:
+    terms, start, free = pair_terms(engine("llvm"), shaken), parameters_of(shaken), free_of(("readout",))
+    off = replace(start, color_readout_s=start.color_readout_s + 5e-4)
+    assert shaken.truth is not None
+    stretches = [load_stretch(terms, shaken, range(4, 20), shaken.truth, start, OPTIONS)]
+    errors = []
+    for sigma_s in (np.inf, 1.0, 1e-7):
+        known = Known(off, np.where(np.arange(COUNT) == 1, sigma_s, np.inf))
+        found = solve(stretches, terms, off, free, (0,), known=known)
+        errors.append(found.values.color_readout_s - off.color_readout_s)
+    assert errors[0] == pytest.approx(-5e-4, abs=1.5e-4) and errors[1] == pytest.approx(errors[0], abs=1e-5)
+    assert abs(errors[2]) < 1e-6 and found.sigmas[1] == pytest.approx(1e-7, rel=0.1)
+
+
+def test_a_device_that_the_recording_contradicts_is_left_out(shaken: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(calibration_run, "_LEVELS", (1,))
+    wrong = told(shaken, 0.01, 0.0, np.zeros(6))
+    stream = Stream("global", "made up", "https://example.org", 0.0, 1e-4)
+    device = Device("made-up", "Made up", stream, stream)
+    found = calibrate(wrong, ("readout",), slice(0, 42), OPTIONS, device=device)
+    assert found.text().count("this recording contradicts the device's") == 2 and found.start.depth_readout_s == 0.0
+    for readout_s in (found.values.depth_readout_s, found.values.color_readout_s):
+        assert readout_s == pytest.approx(READOUT_S, abs=1e-3)
+    assert "# device: Made up: depth global" in found.camera_file()
