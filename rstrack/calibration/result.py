@@ -13,7 +13,9 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
-from rstrack.calibration.parameters import COUNT, DRIFT, NAMES, Parameters
+from rstrack.calibration.pace import Pace, since_begin
+from rstrack.calibration.parameters import COUNT, DRIFT, NAMES, USEFUL, Parameters
+from rstrack.calibration.residuals import Residuals
 from rstrack.calibration.solve import Solution
 from rstrack.data.dataset import Dataset
 
@@ -60,7 +62,11 @@ def motion_of(dataset: Dataset, parts: Sequence[range], track: Spline) -> Motion
 
 @dataclass(frozen=True)
 class Calibration:
-    """start: the values before; asked (10,): which might change; parts: the stretches of frames that told."""
+    """start: the values before; asked (10,): which might change; parts: the stretches of frames that told.
+
+    residuals: of a few stretches, with the values before along the first track, and with those found. pace: by the
+    first track.
+    """
 
     dataset: Dataset
     start: Parameters
@@ -69,6 +75,8 @@ class Calibration:
     parts: tuple[range, ...]
     motion: Motion
     seconds: float
+    residuals: tuple[Residuals, Residuals]
+    pace: Pace
 
     @property
     def undetermined(self) -> BoolArray:
@@ -119,25 +127,40 @@ class Calibration:
         return "\n".join(lines)
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON: values in SI units; sigma None where undetermined."""
-        sigmas = self.sigmas
-        absolute, before = _absolute(self.values), _absolute(self.start)
-        shares = self.solution.shares
+        """For JSON: values in SI units; sigma None where undetermined.
+
+        shown: how a value is called on the screen, its unit there, and the factor from the SI unit to that.
+        useful_sigma: a σ above it makes a value undetermined.
+        """
+        sigmas, solution, (before, after) = self.sigmas, self.solution, self.residuals
+        absolute, start = _absolute(self.values), _absolute(self.start)
+        shares = solution.shares
+        ends = [(part.start, part.stop - 1) for part in self.parts]
         return {
+            "dataset": self.dataset.name,
             "parameters": {
                 name: {
-                    "value": float(absolute[i]), "start": float(before[i]),
+                    "value": float(absolute[i]), "start": float(start[i]),
                     "sigma": None if np.isnan(sigmas[i]) else float(sigmas[i]),
                     "state": "undetermined" if self.undetermined[i] else "found",
                     "told_by_stretch": np.round(shares[:, i], 4).tolist(),
+                    "shown": dict(zip(("label", "unit", "factor"), _SHOWN[i], strict=True)),
+                    "useful_sigma": float(USEFUL[i]), "needs": _NEEDS[i],
                 }
                 for i, name in enumerate(NAMES) if self.asked[i]
             },
             "T_color_depth": self.values.T_color_depth.tolist(),
             "stretches": [[part.start, part.stop] for part in self.parts],
+            "stretch_times_s": np.round([since_begin(self.dataset, each) for each in ends], 4).tolist(),
+            "residuals": {
+                "depth_m": {"before": before.depth_m, "after": after.depth_m},
+                "intensity": {"before": before.intensity, "after": after.intensity},
+            },
+            "pace": self.pace.as_dict(),
             "motion": {"m_s": self.motion.speed, "rad_s": self.motion.rotation, "rad_s2": self.motion.change},
-            "sigma_depth_m": self.solution.sigma_depth_m, "sigma_intensity": self.solution.sigma_intensity,
-            "finished": self.solution.finished, "converged": self.solution.is_settled, "seconds": self.seconds,
+            "sigma_depth_m": solution.sigma_depth_m, "sigma_intensity": solution.sigma_intensity,
+            "finished": solution.finished, "converged": solution.is_settled, "seconds": self.seconds,
+            "notes": self._notes(),
             "camera_file": self.camera_file(),
         }  # fmt: skip
 

@@ -21,8 +21,10 @@ from rsgen.geometry.shutter import Scan
 from rsgen.geometry.spline import Spline
 from rstrack.calibration.first_track import Track, first_track
 from rstrack.calibration.load import load_stretch, pair_terms
+from rstrack.calibration.pace import pace_of
 from rstrack.calibration.pair_terms import PairTerms
 from rstrack.calibration.parameters import COUNT, DRIFT, GROUPS, USEFUL, Parameters, free_of
+from rstrack.calibration.residuals import residuals_at, residuals_now, some_of
 from rstrack.calibration.result import Calibration, motion_of
 from rstrack.calibration.solve import Solution, solve
 from rstrack.calibration.stretch import Stretch
@@ -71,10 +73,14 @@ def calibrate(
     if not dataset.scan_named and "readout" in groups:
         dataset = _oriented(dataset, parts, track.spline, start, options, progress)
     terms, stretches = _loaded(dataset, parts, track.spline, start, options, progress)
+    looked_at = some_of(stretches)
+    before = residuals_at(looked_at, terms, start)
     solution, drifts = _solved(stretches, terms, start, free, progress)
     free[DRIFT] &= drifts
     motion = motion_of(dataset, parts, track.spline)
-    return Calibration(dataset, start, solution, free, tuple(parts), motion, time.perf_counter() - begun)
+    pace = pace_of(dataset, track.frames(dataset, chosen), track.spline)
+    residuals, seconds = (before, residuals_now(looked_at)), time.perf_counter() - begun
+    return Calibration(dataset, start, solution, free, tuple(parts), motion, seconds, residuals, pace)
 
 
 def _loaded(

@@ -33,16 +33,20 @@ def calibrate(
     noise_intensity: NoiseIntensity = 0.0,
     seed: Seed = 0,
     out: Annotated[Path | None, "camera file to write, for rstrack track --camera", "FILE"] = None,
+    report: Annotated[Path | None, "HTML page of the calibration to write", "FILE"] = None,
     json: Json = False,
     quiet: Quiet = False,
 ) -> int:
     """Readouts, clocks and extrinsics of a recording's cameras, from the recording alone, with their errors."""
     from rsgen.console.progress import ProgressDisplay
     from rsgen.files import atomic_write
+    from rstrack.calibration.record import record_of
     from rstrack.calibration.run import calibrate as run
     from rstrack.data.dataset import open_dataset
     from rstrack.data.noise import NoisyImages
     from rstrack.options import Options
+    from rstrack.report.build import write_page
+    from rstrack.report.calibration import calibration_page
 
     dataset = open_dataset(sequence, camera)
     if noise_depth or noise_intensity:
@@ -52,9 +56,13 @@ def calibrate(
         found = run(dataset, groups, frames or slice(None), Options(backend=backend), progress)
     if out is not None:
         atomic_write(out, found.camera_file().encode())
+    if report is not None:
+        write_page(calibration_page(record_of(found)), report)
     print(dumps(found.as_dict(), indent=2) if json else found.text())
     if out is not None and not json:
         print(f"{out}: written (rstrack track {sequence} --camera {out} --out RUN)")
+    if report is not None and not json:
+        print(f"{report}: written, open it in a browser")
     sys.stdout.flush()
     if not found.solution.finished:
         print("rstrack: interrupted; this is the best so far", file=sys.stderr)
