@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rsgen.array_types import FloatArray
-from rstrack.calibration.pair_terms import PairTerms
+from rstrack.calibration.pair_terms import FLOOR_DEPTH, FLOOR_INTENSITY, PairTerms
 from rstrack.calibration.parameters import Parameters
 from rstrack.calibration.stretch import Stretch
 
@@ -44,7 +44,7 @@ def residuals_at(stretches: Sequence[Stretch], terms: PairTerms, p: Parameters) 
     Evaluated on copies: the stretches keep their scales and their brightness.
     """
     scales = np.array([_scales(replace(each, brightness=dict(each.brightness)), terms, p) for each in stretches])
-    return _medians(extrapolated(np.moveaxis(scales, 1, 0)))
+    return _medians(np.maximum(extrapolated(np.moveaxis(scales, 1, 0)), (FLOOR_DEPTH, FLOOR_INTENSITY)))
 
 
 def extrapolated(scales: FloatArray) -> FloatArray:

@@ -22,6 +22,11 @@ class Moved:
     two_sigma: float
     hover: str
 
+    @property
+    def is_found(self) -> bool:
+        """Whether the recording tells it."""
+        return bool(np.isfinite(self.two_sigma))
+
 
 @dataclass(frozen=True)
 class ChangeChart:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from rsgen.array_types import FloatArray
-from rstrack.charts.calibration import ChangeChart, StripChart
+from rstrack.charts.calibration import ChangeChart, Moved, StripChart
 from rstrack.charts.chart import COLORS, TRUE_COLOR
 
 # Heights in pixels: of a row, of an axis with its title below rows, of a curve and what is above it, and the margins.
@@ -31,27 +32,22 @@ def strip_height(chart: StripChart) -> int:
 def change_figure(chart: ChangeChart) -> dict[str, Any]:
     """A dot with whiskers for each value, around the line of no change."""
     inner = change_height(chart) - _TOP - _AXIS
-    data, layout, top = [], _layout(), 0
+    data: list[dict[str, Any]] = []
+    layout, top = _layout(), 0
     for n, (unit, rows) in enumerate(chart.by_unit):
-        names = [_two_lines(row.label) for row in rows]
-        is_found = np.isfinite([row.two_sigma for row in rows])
-        data.append({
-            "type": "scatter", "mode": "markers", "x": [_short(row.change) for row in rows], "y": names,
-            "xaxis": _axis("x", n), "yaxis": _axis("y", n), "showlegend": False,
-            "error_x": {"type": "data", "array": [_short(np.nan_to_num(row.two_sigma)) for row in rows],
-                        "thickness": 1.6, "width": 5, "color": COLORS[0]},
-            "marker": {"size": 9, "color": [COLORS[0] if ok else TRUE_COLOR for ok in is_found],
-                       "symbol": ["circle" if ok else "circle-open" for ok in is_found]},
-            "text": [row.hover for row in rows], "hovertemplate": "%{y}: %{text}<extra></extra>",
-        })  # fmt: skip
+        found = [row for row in rows if row.is_found]
+        on = {"xaxis": _axis("x", n), "yaxis": _axis("y", n)}
+        data += [_dots(which, is_found) | on for is_found, which in _split(rows) if which]
         bottom = top + _ROW * len(rows)
-        reach = 1.15 * max(abs(row.change) + np.nan_to_num(row.two_sigma) for row in rows) or 1.0
+        reach = 1.15 * max((abs(row.change) + row.two_sigma for row in found), default=0.0) or 1.0
         layout[_axis("xaxis", n)] = {
             "title": {"text": f"change, {unit}", "standoff": 4}, "anchor": _axis("y", n), "range": [-reach, reach],
             "zeroline": True, "zerolinewidth": 2, "zerolinecolor": TRUE_COLOR, "nticks": 7, "fixedrange": True,
+            "showticklabels": bool(found),
         }  # fmt: skip
         layout[_axis("yaxis", n)] = _rows(1.0 - bottom / inner, 1.0 - top / inner) | {
-            "anchor": _axis("x", n), "range": [len(rows) - 0.5, -0.5],
+            "anchor": _axis("x", n), "range": [len(rows) - 0.5, -0.5], "categoryorder": "array",
+            "categoryarray": [_two_lines(row.label) for row in rows],
         }  # fmt: skip
         top = bottom + _AXIS
     layout["margin"] |= {"b": _AXIS}
@@ -89,6 +85,24 @@ def strip_figure(chart: StripChart) -> dict[str, Any]:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
+
+
+def _split(rows: Sequence[Moved]) -> tuple[tuple[bool, list[Moved]], ...]:
+    """Those that were found, and the others."""
+    return tuple((is_found, [row for row in rows if row.is_found == is_found]) for is_found in (True, False))
+
+
+def _dots(rows: Sequence[Moved], is_found: bool) -> dict[str, Any]:
+    """Dots with whiskers; hollow and without any where nothing was found."""
+    color = COLORS[0] if is_found else TRUE_COLOR
+    dots = {
+        "type": "scatter", "mode": "markers", "x": [_short(row.change) for row in rows], "showlegend": False,
+        "y": [_two_lines(row.label) for row in rows], "text": [row.hover for row in rows],
+        "marker": {"size": 9, "color": color, "symbol": "circle" if is_found else "circle-open"},
+        "hovertemplate": "%{y}: %{text}<extra></extra>",
+    }  # fmt: skip
+    whiskers = {"type": "data", "array": [_short(row.two_sigma) for row in rows], "thickness": 1.6, "width": 5}
+    return dots | ({"error_x": whiskers | {"color": color}} if is_found else {})
 
 
 def _cells(chart: StripChart) -> dict[str, Any]:

@@ -56,13 +56,13 @@ def calibrate(
         found = run(dataset, groups, frames or slice(None), Options(backend=backend), progress)
     if out is not None:
         atomic_write(out, found.camera_file().encode())
-    if report is not None:
-        write_page(calibration_page(record_of(found)), report)
     print(dumps(found.as_dict(), indent=2) if json else found.text())
     if out is not None and not json:
         print(f"{out}: written (rstrack track {sequence} --camera {out} --out RUN)")
-    if report is not None and not json:
-        print(f"{report}: written, open it in a browser")
+    if report is not None:
+        write_page(calibration_page(record_of(found)), report)
+        if not json:
+            print(f"{report}: written, open it in a browser")
     sys.stdout.flush()
     if not found.solution.finished:
         print("rstrack: interrupted; this is the best so far", file=sys.stderr)

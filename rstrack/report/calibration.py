@@ -15,7 +15,10 @@ _BEFORE = (
     "values that it began with, along the first rough track; so a part of what is gained is the track's, which is "
     "refined together with the values."
 )
-_SIGMA = "σ is measured from how far stretches of the recording disagree. What is wrong with the lenses is not in it."
+_SIGMA = (
+    "σ is measured from how far stretches of the recording disagree: of what is wrong and was not estimated, it knows "
+    "only a part."
+)
 
 
 def calibration_page(record: Record) -> Page:
@@ -37,20 +40,19 @@ def calibration_page(record: Record) -> Page:
 
 
 def calibration_section(record: Record) -> Section:
-    """All of it as one part of a run's page."""
-    warnings = (Note(text, is_warning=True) for text in calibration_warnings(record))
+    """All of it but the warnings as one part of a run's page."""
     blocks = (*_values(record), *_undetermined(record), *_residuals(record), *_where(record), *_camera_file(record))
-    return Section("calibration", "Calibration", (*warnings, *blocks))
+    return Section("calibration", "Calibration", blocks)
 
 
 def calibration_cards(record: Record) -> tuple[Card, ...]:
     """Whether it converged, what was found, and by how much residuals fell."""
     found, asked = len(record.parameters) - len(record.undetermined), len(record.parameters)
     depth, intensity = record.residuals.depth_m, record.residuals.intensity
+    names = _names(record.undetermined.values())
     return (
         _verdict(record),
-        Card(f"{found} of {asked}", "values found", _names(record.undetermined.values()),
-             "bad" if record.undetermined else "good"),
+        Card(f"{found} of {asked}", "values found", f"not {names}" if names else "", "bad" if names else "good"),
         _residual_card("depth", depth, 1e3, "mm"),
         _residual_card("intensity", intensity, 1e2, "%"),
     )  # fmt: skip

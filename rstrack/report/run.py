@@ -16,7 +16,7 @@ from rstrack.metrics.clock import TruthOffset
 from rstrack.metrics.evaluate import Metrics
 from rstrack.metrics.run_evaluate import evaluate_clocks
 from rstrack.metrics.tracked import Tracked, load_run
-from rstrack.report.calibration import calibration_section
+from rstrack.report.calibration import calibration_section, calibration_warnings
 from rstrack.report.page import Card, CardRow, Note, Page, Plot, Section
 from rstrack.report.pictures import frame_panels, shutter_sliders
 
@@ -54,7 +54,9 @@ def run_page(
         except UserError as error:
             warnings.append(f"Images are left out: {error}.")
     if (run / CALIBRATION).is_file():
-        sections.append(calibration_section(read_record(run / CALIBRATION)))
+        record = read_record(run / CALIBRATION)
+        sections.append(calibration_section(record))
+        warnings += [f"Calibration: {text[0].lower()}{text[1:]}" for text in calibration_warnings(record)]
     if info.get("end") not in (None, "done"):
         warnings.insert(0, f"The run ended early: {info['end']}. {info.get('error') or ''}".strip())
     name = tracked.dataset.name if tracked.dataset else _of(info, "dataset").get("name")

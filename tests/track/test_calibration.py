@@ -355,9 +355,18 @@ def test_a_sequence_is_calibrated_and_tracked_by_command(
     )
     right, run = tmp_path / "right.yaml", tmp_path / "run"
     arguments = ["--camera", str(wrong), "--free", "readout,offset", "--out", str(right), "--quiet", "--json"]
+    arguments += ["--report", str(tmp_path / "new/page.html")]
     assert main(["calibrate", str(shaken.root), *arguments, "--backend", "llvm"]) == 0
     figures = json.loads(capsys.readouterr().out)
     assert figures["parameters"]["color.offset_s"]["value"] == pytest.approx(0.0, abs=2e-4)
+    assert figures["parameters"]["color.offset_s"]["shown"] == {"label": "colour offset", "unit": "ms", "factor": 1e3}
+    depth_m, intensity = (figures["residuals"][kind] for kind in ("depth_m", "intensity"))
+    assert depth_m["before"] > 2.0 * depth_m["after"] and intensity["before"] >= intensity["after"]
+    times, pace = np.array(figures["stretch_times_s"]), figures["pace"]
+    assert (times[:, 1] - times[:, 0] == pytest.approx(13 / RATE_HZ, abs=2e-4)) and times.max() <= FRAMES / RATE_HZ
+    turning = np.linalg.norm(shaking().velocity(np.array(pace["time_s"]) + shaken.stamps[0])[:, 3:], axis=1)
+    assert np.median(np.abs(pace["rad_s"] - turning)) < 0.1 * turning.mean()
+    assert "camera.yaml" in (tmp_path / "new/page.html").read_text()
     assert main(["track", str(shaken.root), "--camera", str(right), "--out", str(run), "--quiet"]) == 0
     assert main(["evaluate", str(shaken.root), str(run), "--json"]) == 0
     out = capsys.readouterr().out

@@ -32,8 +32,9 @@ def test_values_stand_beside_their_starts_in_units_that_are_read(tmp_path: Path)
     assert shown.row("depth, mm") == ["depth, mm", "8.00", "2.00", "-75 %"]
     assert shown.row("intensity, % of white")[1:] == ["4.00", "1.00", "-75 %"]
     change, strips = shown.figures
-    assert [trace["x"] for trace in change["data"]] == [[27.957, -0.5, 0.0], [-0.14]]
+    assert [trace["x"] for trace in change["data"]] == [[27.957, -0.5], [0.0], [-0.14]]
     assert change["data"][0]["error_x"]["array"][0] == pytest.approx(0.044)
+    assert change["data"][1]["y"] == ["colour drift"] and "error_x" not in change["data"][1]
     # Two stretches, seen from 1 to 2 s and from 3 to 5 s: what lies between is empty.
     cells = strips["data"][0]
     assert cells["x"] == [1.0, 2.0, 3.0, 5.0]
@@ -102,7 +103,8 @@ def test_a_run_that_was_calibrated_shows_it(tmp_path: Path) -> None:
     assert "Camera file" not in parse(write_report(run)).text
     write_calibration(run, calibration() | {"converged": False})
     shown = parse(write_report(run))
-    assert shown.row("depth readout")[1] == "27.957" and "Not converged" in shown.text
+    assert shown.row("depth readout")[1] == "27.957"
+    assert "Calibration: not converged" in shown.text[: shown.text.index("Errors against")]
     assert ("section", "id", "calibration") in shown.attributes
 
 
