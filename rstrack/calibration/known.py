@@ -17,7 +17,7 @@ _LEAST = 0.1
 
 @dataclass(frozen=True)
 class Known:
-    """values, and how sure they are: σ (10,) in the order of NAMES, in their units, infinite where nothing is known."""
+    """values, and how sure they are: σ (29,) in the order of NAMES, in their units, infinite where nothing is known."""
 
     values: Parameters
     sigmas: FloatArray
@@ -28,7 +28,7 @@ class Known:
         return Known(start, np.full(COUNT, np.inf))
 
     def contradicted(self, found: Parameters, sigmas: FloatArray) -> BoolArray:
-        """Which (10,) of the known values a recording contradicts, by what was found with them and its σ (10,).
+        """Which (29,) of the known values a recording contradicts, by what was found with them and its σ (10,).
 
         A solution that was drawn to a right value moves away from it by as much as it gained: σ² before less σ² after.
         """
@@ -38,5 +38,5 @@ class Known:
         return is_known & (np.abs(found.since(self.values)) > _CONTRADICTS * gained)
 
     def without(self, dropped: BoolArray) -> Known:
-        """The same values, those of `dropped` (10,) for a start only."""
+        """The same values, those of `dropped` (29,) for a start only."""
         return replace(self, sigmas=np.where(dropped, np.inf, self.sigmas))

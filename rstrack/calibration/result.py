@@ -13,6 +13,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
+from rstrack.calibration.pace import Pace, since_begin
 from rstrack.calibration.parameters import (
     COLOR_LENS,
     COUNT,
@@ -23,9 +24,11 @@ from rstrack.calibration.parameters import (
     EXTRINSICS,
     LENS,
     NAMES,
+    USEFUL,
     Parameters,
     changed,
 )
+from rstrack.calibration.residuals import Residuals
 from rstrack.calibration.solve import Solution
 from rstrack.data.dataset import Dataset
 
@@ -79,6 +82,8 @@ def motion_of(dataset: Dataset, parts: Sequence[range], track: Spline) -> Motion
 class Calibration:
     """start: the values before; asked (29,): which might change; parts: the stretches of frames that told.
 
+    residuals: of a few stretches, with the values before along the first track, and with those found. pace: by the
+    first track.
     device_notes: what became of what is published of the device, if one was named.
     """
 
@@ -89,6 +94,8 @@ class Calibration:
     parts: tuple[range, ...]
     motion: Motion
     seconds: float
+    residuals: tuple[Residuals, Residuals]
+    pace: Pace
     device_notes: tuple[str, ...] = ()
 
     @property
@@ -144,26 +151,41 @@ class Calibration:
         return "\n".join(lines)
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON: values in SI units; sigma None where undetermined."""
-        sigmas = self._absolute_sigmas
-        absolute, before = self._absolute(self.values), self._absolute(self.start)
-        shares = self.solution.shares
+        """For JSON: values in SI units; sigma None where undetermined.
+
+        shown: how a value is called on the screen, its unit there, and the factor from the SI unit to that.
+        useful_sigma: a σ above it makes a value undetermined.
+        """
+        sigmas, solution, (before, after) = self._absolute_sigmas, self.solution, self.residuals
+        absolute, start = self._absolute(self.values), self._absolute(self.start)
+        shares, useful = solution.shares, USEFUL * self._units
+        ends = [(part.start, part.stop - 1) for part in self.parts]
         return {
+            "dataset": self.dataset.name,
             "parameters": {
                 name: {
-                    "value": float(absolute[i]), "start": float(before[i]),
+                    "value": float(absolute[i]), "start": float(start[i]),
                     "sigma": None if np.isnan(sigmas[i]) else float(sigmas[i]),
                     "state": "undetermined" if self.undetermined[i] else "found",
                     "told_by_stretch": np.round(shares[:, i], 4).tolist(),
+                    "shown": dict(zip(("label", "unit", "factor"), _SHOWN[i], strict=True)),
+                    "useful_sigma": float(useful[i]), "needs": _NEEDS[i],
                 }
                 for i, name in enumerate(NAMES) if self.asked[i]
             },
             "T_color_depth": self.values.T_color_depth.tolist(),
             "stretches": [[part.start, part.stop] for part in self.parts],
+            "stretch_times_s": np.round([since_begin(self.dataset, each) for each in ends], 4).tolist(),
+            "residuals": {
+                "depth_m": {"before": before.depth_m, "after": after.depth_m},
+                "intensity": {"before": before.intensity, "after": after.intensity},
+            },
+            "pace": self.pace.as_dict(),
             "motion": {"m_s": self.motion.speed, "rad_s": self.motion.rotation, "rad_s2": self.motion.change},
-            "sigma_depth_m": self.solution.sigma_depth_m, "sigma_intensity": self.solution.sigma_intensity,
-            "finished": self.solution.finished, "converged": self.solution.is_settled, "seconds": self.seconds,
-            "device": list(self.device_notes), "camera_file": self.camera_file(),
+            "sigma_depth_m": solution.sigma_depth_m, "sigma_intensity": solution.sigma_intensity,
+            "finished": solution.finished, "converged": solution.is_settled, "seconds": self.seconds,
+            "notes": self._notes(), "device": list(self.device_notes),
+            "camera_file": self.camera_file(),
         }  # fmt: skip
 
     def camera_file(self) -> str:
@@ -230,11 +252,16 @@ class Calibration:
 
     @property
     def _absolute_sigmas(self) -> FloatArray:
-        """Theirs (29,)."""
+        """Their standard errors (29,)."""
+        return self.sigmas * self._units
+
+    @property
+    def _units(self) -> FloatArray:
+        """What a unit of each of NAMES comes to (29,)."""
         units, rig = np.ones(COUNT), self.dataset.rig
         for camera, lens in ((rig.depth_camera, DEPTH_LENS), (rig.color_camera, COLOR_LENS)):
             units[lens][:4] = camera.fx, camera.fy, camera.fx, camera.fy
-        return self.sigmas * units
+        return units
 
     def _scans(self) -> tuple[Scan, Scan]:
         """Of depth and colour; the opposite of what was assumed where the readout turned out negative."""

@@ -24,8 +24,10 @@ from rstrack.calibration.devices import Device, device_notes
 from rstrack.calibration.first_track import Track, first_track
 from rstrack.calibration.known import Known
 from rstrack.calibration.load import load_stretch, pair_terms
+from rstrack.calibration.pace import pace_of
 from rstrack.calibration.pair_terms import PairTerms
 from rstrack.calibration.parameters import COLOR_LENS, COUNT, DEPTH_LENS, DRIFT, GROUPS, USEFUL, Parameters, free_of
+from rstrack.calibration.residuals import residuals_at, residuals_now, some_of
 from rstrack.calibration.result import Calibration, motion_of
 from rstrack.calibration.solve import Solution, solve
 from rstrack.calibration.stretch import Stretch
@@ -81,6 +83,8 @@ def calibrate(
     if not dataset.scan_named and "readout" in groups:
         dataset = _oriented(dataset, parts, track.spline, start, options, progress)
     terms, stretches = _loaded(dataset, parts, track.spline, start, free, options, progress)
+    looked_at = some_of(stretches)
+    residuals = residuals_at(looked_at, terms, start)
     known = before = replace(before, values=start)
     solution, drifts = _solved(stretches, terms, known, free, progress)
     contradicted = known.contradicted(solution.values, solution.sigmas)
@@ -90,7 +94,9 @@ def calibrate(
     free[DRIFT] &= drifts
     motion = motion_of(dataset, parts, track.spline)
     notes = device_notes(device, before, known, solution.sigmas) if device else ()
-    return Calibration(dataset, start, solution, free, tuple(parts), motion, time.perf_counter() - begun, notes)
+    pace = pace_of(dataset, track.frames(dataset, chosen), track.spline)
+    both, seconds = (residuals, residuals_now(looked_at)), time.perf_counter() - begun
+    return Calibration(dataset, start, solution, free, tuple(parts), motion, seconds, both, pace, notes)
 
 
 def _loaded(

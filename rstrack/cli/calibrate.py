@@ -34,6 +34,7 @@ def calibrate(
     noise_intensity: NoiseIntensity = 0.0,
     seed: Seed = 0,
     out: Annotated[Path | None, "camera file to write, for rstrack track --camera", "FILE"] = None,
+    report: Annotated[Path | None, "HTML page of the calibration to write", "FILE"] = None,
     json: Json = False,
     quiet: Quiet = False,
 ) -> int:
@@ -41,10 +42,13 @@ def calibrate(
     from rsgen.console.progress import ProgressDisplay
     from rsgen.files import atomic_write
     from rstrack.calibration.devices import device_named
+    from rstrack.calibration.record import record_of
     from rstrack.calibration.run import calibrate as run
     from rstrack.data.dataset import open_dataset
     from rstrack.data.noise import NoisyImages
     from rstrack.options import Options
+    from rstrack.report.build import write_page
+    from rstrack.report.calibration import calibration_page
 
     known = None if device is None else device_named(device)
     dataset = open_dataset(sequence, camera)
@@ -58,6 +62,10 @@ def calibrate(
     print(dumps(found.as_dict(), indent=2) if json else found.text())
     if out is not None and not json:
         print(f"{out}: written (rstrack track {sequence} --camera {out} --out RUN)")
+    if report is not None:
+        write_page(calibration_page(record_of(found)), report)
+        if not json:
+            print(f"{report}: written, open it in a browser")
     sys.stdout.flush()
     if not found.solution.finished:
         print("rstrack: interrupted; this is the best so far", file=sys.stderr)

@@ -108,10 +108,13 @@ def track(
     device: DeviceName = None,
     quiet: Quiet = False,
 ) -> int:
-    """Track a sequence: writes trajectory.txt, spline.npz and run.json; with --calibrate camera.yaml too."""
+    """Track a sequence: writes trajectory.txt, spline.npz and run.json; with --calibrate camera.yaml and
+    calibration.json too.
+    """
     from rsgen.console.progress import ProgressDisplay
     from rsgen.files import atomic_write
     from rstrack.calibration.devices import device_named
+    from rstrack.calibration.record import CALIBRATION, write_record
     from rstrack.calibration.run import calibrate as run_calibration
     from rstrack.data.dataset import open_dataset
     from rstrack.tracking import run
@@ -129,8 +132,10 @@ def track(
                 raise KeyboardInterrupt
             dataset = found.calibrated()
         result = run.track(dataset, tracker, out, frames or slice(None), noise, progress)
+    (out / CALIBRATION).unlink(missing_ok=True)  # of an earlier run in this folder
     if found is not None:
         atomic_write(out / "camera.yaml", found.camera_file().encode())
+        write_record(found, out / CALIBRATION)
         print(found.text())
     print(result.text())
     print(f"{out}: written (rstrack evaluate {sequence} {out}, rstrack plot ...)")

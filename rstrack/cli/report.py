@@ -1,4 +1,4 @@
-"""The command `rstrack report`: one HTML page of a run, a benchmark or a stress test."""
+"""The command `rstrack report`: one HTML page of a run, a calibration, a benchmark or a stress test."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from rstrack.cli.options import CameraFile, TruthOffset
 
 def report(
     run: Annotated[
-        Path, "folder that 'rstrack track', 'rstrack bench' or 'rstrack stress' wrote, or a TUM file with --sequence"
+        Path,
+        "folder that 'rstrack track', 'rstrack bench' or 'rstrack stress' wrote, a calibration.json, or a TUM file "
+        "with --sequence",
     ],
     *,
     sequence: Annotated[Path | None, "the run's sequence (default: where it was)", "DIR"] = None,
@@ -20,8 +22,8 @@ def report(
     out: Annotated[Path | None, "page to write (default: report.html in the folder)", "FILE"] = None,
     quiet: Quiet = False,
 ) -> int:
-    """One HTML page of a run, a benchmark or a stress test, all in it: tables, plots, the path in 3D, rolling against
-    global shutter.
+    """One HTML page of a run, a calibration, a benchmark or a stress test, all in it: tables, plots, the path in 3D,
+    rolling against global shutter.
     """
     from rsgen.console.progress import ProgressDisplay
     from rstrack.report.build import write_report

@@ -1,4 +1,4 @@
-"""`rstrack report`: which page a folder gets, and where it is written.
+"""`rstrack report`: which page a folder or file gets, and where it is written.
 
 out = write_report(Path("runs/lr_kt2"))
 """
@@ -14,9 +14,11 @@ from rsgen.errors import UserError
 from rsgen.files import atomic_write, write_error
 from rstrack.bench.methods.results import RESULTS
 from rstrack.bench.stress.tables import STRESS
+from rstrack.calibration.record import read_record
 from rstrack.data.estimate import TRAJECTORY
 from rstrack.metrics.clock import TruthOffset
 from rstrack.report.bench import bench_page
+from rstrack.report.calibration import calibration_page
 from rstrack.report.page import Page, render
 from rstrack.report.run import run_page
 from rstrack.report.stress import stress_page
@@ -28,7 +30,8 @@ def write_report(
     folder: Path, sequence: Path | None = None, out: Path | None = None, camera_file: Path | None = None,
     progress: Progress = no_progress, truth_offset: TruthOffset | None = None,
 ) -> Path:  # fmt: skip
-    """Write the page of a run folder, a TUM file with a sequence, or a folder of a benchmark or of a stress test.
+    """Write the page of a run folder, a TUM file with a sequence, a calibration.json, or the folder of a benchmark or
+    of a stress test.
 
     Returns its path. sequence: where the run's sequence is, by default where run.json says. out: the file, by default
     report.html in the folder. camera_file: as in `open_dataset`. progress: called with a stage, the
@@ -38,8 +41,12 @@ def write_report(
     """
     folder = Path(folder)
     page = _page(folder, sequence, camera_file, progress, truth_offset)
+    return write_page(page, out or (folder / REPORT if folder.is_dir() else folder.with_suffix(".html")))
+
+
+def write_page(page: Page, out: Path) -> Path:
+    """Write a page, its folder too if need be; returns its path. Raises UserError."""
     page = dataclasses.replace(page, made_with=f"rstrack {version('rolling-shutter-rgbd')}")
-    out = out or (folder / REPORT if folder.is_dir() else folder.with_suffix(".html"))
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -60,6 +67,10 @@ def _page(
             how = "give it to 'rstrack bench'" if is_bench else "its sequences have one clock"
             raise UserError(f"{folder}: the errors are there already: leave --truth-offset out ({how})")
         return bench_page(folder, progress) if is_bench else stress_page(folder)
+    if folder.suffix == ".json":
+        if sequence is not None or camera_file is not None or truth_offset is not None:
+            raise UserError(f"{folder}: a calibration is all there: leave --sequence, --camera and --truth-offset out")
+        return calibration_page(read_record(folder))
     if folder.is_dir() and not (folder / TRAJECTORY).is_file():
         raise UserError(
             f"{folder}: holds neither {TRAJECTORY}, {RESULTS} nor {STRESS}: give a folder that 'rstrack track', "

@@ -28,6 +28,11 @@
     return changed;
   }
 
+  // Plotly takes a half-transparent cell for one on white: on a dark page its numbers would be dark too.
+  function inked(trace) {
+    return trace.type === "heatmap" ? { ...trace, textfont: { color: color("--ink") } } : trace;
+  }
+
   // The plot's z points up, so its x and y are the view from above.
   function fromAbove({ data, layout: { scene, legend } }) {
     const flat = ({ x, y, name, opacity, line }) => ({
@@ -46,7 +51,7 @@
     const parent = element.parentElement;
     for (const note of parent.querySelectorAll(".no-webgl")) note.hidden = !isFlattened;
     for (const turn of parent.querySelectorAll(".turn")) turn.hidden = isFlattened;
-    return Plotly.react(element, data, themed(layout), config);
+    return Plotly.react(element, data.map(inked), themed(layout), config);
   }
 
   // A browser keeps a dozen WebGL views or so: those that are not shown give theirs back.
@@ -83,6 +88,20 @@
       follow(event);
     });
     stack.addEventListener("pointermove", (event) => { if (event.buttons) follow(event); });
+  }
+
+  // Where a browser keeps the clipboard from a page that was opened as a file, the text is marked for Ctrl-C.
+  for (const file of document.querySelectorAll(".file")) {
+    const text = file.querySelector("pre"), said = file.querySelector(".said");
+    file.querySelector(".copy").addEventListener("click", async () => {
+      try {
+        await navigator.clipboard.writeText(text.textContent);
+        said.textContent = "Copied.";
+      } catch {
+        getSelection().selectAllChildren(text);
+        said.textContent = "Marked: press Ctrl-C.";
+      }
+    });
   }
 
   // The mouse turns the 3D view; so does this slider, for the keyboard. It turns by as much as it was moved.

@@ -5,12 +5,15 @@ html = render(Page("lr_kt2", "tracked with rs-pg", cards, facts, (Section("error
 
 from __future__ import annotations
 
+import base64
 import json
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any, Literal
 
 from rsgen.console.tables import Table
+from rstrack.charts.calibration import ChangeChart, StripChart
+from rstrack.charts.calibration_to_page import change_height, strip_height
 from rstrack.charts.chart import Chart, PathChart
 from rstrack.charts.to_page import Figure, figure_of
 from rstrack.data.estimate import plain
@@ -18,11 +21,15 @@ from rstrack.data.estimate import plain
 
 @dataclass(frozen=True)
 class Card:
-    """One number that a reader wants: its value with a unit, what it is, and what to compare it with."""
+    """One number that a reader wants: its value with a unit, what it is, and what to compare it with.
+
+    verdict: whether it says that all is well, or not.
+    """
 
     value: str
     label: str
     note: str = ""
+    verdict: Literal["", "good", "bad"] = ""
 
 
 @dataclass(frozen=True)
@@ -37,7 +44,7 @@ class CardRow:
 class Plot:
     """A chart of at most so many points a line. Paths are drawn from above where the browser has no WebGL."""
 
-    chart: Chart | PathChart
+    chart: Chart | PathChart | ChangeChart | StripChart
     points: int = 1500
     block: Literal["plot"] = "plot"
 
@@ -45,6 +52,13 @@ class Plot:
     def is_3d(self) -> bool:
         """Whether it can be turned."""
         return isinstance(self.chart, PathChart)
+
+    @property
+    def height(self) -> int | None:
+        """In px where it goes by the number of rows."""
+        if isinstance(self.chart, ChangeChart):
+            return change_height(self.chart)
+        return strip_height(self.chart) if isinstance(self.chart, StripChart) else None
 
 
 @dataclass(frozen=True)
@@ -84,7 +98,21 @@ class Note:
     block: Literal["note"] = "note"
 
 
-Block = Table | Plot | Pictures | Slider | Note
+@dataclass(frozen=True)
+class TextFile:
+    """A text file to copy, or to save under its name."""
+
+    name: str
+    text: str
+    block: Literal["file"] = "file"
+
+    @property
+    def uri(self) -> str:
+        """The file as a data URI."""
+        return "data:text/plain;base64," + base64.b64encode(self.text.encode()).decode("ascii")
+
+
+Block = Table | Plot | Pictures | Slider | Note | TextFile
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 
 from rsgen.errors import UserError
+from rstrack.calibration.record import CALIBRATION, read_record
 from rstrack.charts.chart import Chart, PathChart
 from rstrack.charts.runs import error_charts, inlier_charts, path_chart, time_charts
 from rstrack.metrics.clock import TruthOffset
 from rstrack.metrics.evaluate import Metrics
 from rstrack.metrics.run_evaluate import evaluate_clocks
 from rstrack.metrics.tracked import Tracked, load_run
+from rstrack.report.calibration import calibration_section, calibration_warnings
 from rstrack.report.page import Card, CardRow, Note, Page, Plot, Section
 from rstrack.report.pictures import frame_panels, shutter_sliders
 
@@ -51,6 +53,10 @@ def run_page(
             sections.append(Section("images", "Images", blocks))
         except UserError as error:
             warnings.append(f"Images are left out: {error}.")
+    if (run / CALIBRATION).is_file():
+        record = read_record(run / CALIBRATION)
+        sections.append(calibration_section(record))
+        warnings += [f"Calibration: {text[0].lower()}{text[1:]}" for text in calibration_warnings(record)]
     if info.get("end") not in (None, "done"):
         warnings.insert(0, f"The run ended early: {info['end']}. {info.get('error') or ''}".strip())
     name = tracked.dataset.name if tracked.dataset else _of(info, "dataset").get("name")

@@ -22,6 +22,7 @@ from rstrack.bench.methods.results import Cell, Results
 from rstrack.bench.methods.tables import write_results
 from rstrack.bench.stress.run import ColorScore, DepthScore, Panels, StressResult, TrackScore
 from rstrack.bench.stress.tables import write_stress
+from rstrack.calibration.record import CALIBRATION
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import write_estimate
 from rstrack.metrics.run_evaluate import run_evaluate
@@ -179,3 +180,39 @@ def make_stress(root: Path, seed: int = 5) -> StressResult:
     report = StressResult(NASTY, tuple(color), tuple(depth), tuple(tracking), panels)
     write_stress(report, root)
     return report
+
+
+def calibration() -> dict[str, Any]:
+    """What `rstrack calibrate --json` says: two values found in ms and one in degrees, one undetermined."""
+
+    def value(label: str, unit: str, factor: float, found: float, sigma: float | None, told: list[float]) -> Any:
+        return {
+            "value": found / factor, "start": 0.0, "sigma": None if sigma is None else sigma / factor,
+            "state": "undetermined" if sigma is None else "found", "told_by_stretch": told,
+            "shown": {"label": label, "unit": unit, "factor": factor}, "useful_sigma": 2.0 / factor,
+            "needs": "motion that changes",
+        }  # fmt: skip
+
+    t = np.linspace(0.0, 6.0, 61)
+    return {
+        "dataset": NASTY,
+        "parameters": {
+            "depth.readout_s": value("depth readout", "ms", 1e3, 27.957, 0.022, [0.25, 0.75]),
+            "color.offset_s": value("colour offset", "ms", 1e3, -0.5, 0.3, [0.5, 0.5]),
+            "color.drift": value("colour drift", "ms", 1e3, 0.0, None, [0.0, 0.0]),
+            "T_color_depth.rz": value(
+                "colour from depth, about z", "deg", float(np.degrees(1.0)), -0.14, 0.06, [0.9, 0.1]
+            ),
+        },
+        "stretches": [[10, 20], [30, 50]], "stretch_times_s": [[1.0, 2.0], [3.0, 5.0]],
+        "residuals": {"depth_m": {"before": 8e-3, "after": 2e-3}, "intensity": {"before": 0.04, "after": 0.01}},
+        "pace": {"time_s": t.tolist(), "m_s": np.abs(np.sin(t)).tolist(), "rad_s": (0.5 * np.abs(np.cos(t))).tolist()},
+        "finished": True, "converged": True, "notes": ["offsets are against depth's stamps"], "seconds": 31.2,
+        "camera_file": "color:\n  width: 640\n",
+    }  # fmt: skip
+
+
+def write_calibration(folder: Path, data: dict[str, Any]) -> Path:
+    path = folder / CALIBRATION
+    path.write_text(json.dumps(data))
+    return path

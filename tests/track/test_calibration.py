@@ -25,6 +25,7 @@ from rstrack.calibration.images import Taken, lines_of
 from rstrack.calibration.known import Known
 from rstrack.calibration.load import like, load_stretch, pair_terms
 from rstrack.calibration.optics import camera_table, moves, traced
+from rstrack.calibration.pace import Pace
 from rstrack.calibration.parameters import (
     COUNT,
     DEPTH_ERROR,
@@ -39,6 +40,8 @@ from rstrack.calibration.parameters import (
     changed,
     free_of,
 )
+from rstrack.calibration.record import read_record
+from rstrack.calibration.residuals import Residuals, extrapolated, residuals_at, residuals_now
 from rstrack.calibration.result import Calibration
 from rstrack.calibration.run import calibrate, parameters_of
 from rstrack.calibration.solve import Solution, solve
@@ -52,6 +55,7 @@ from rstrack.options import Options
 READOUT_S, RATE_HZ, FRAMES = 0.014, 60.0, 60
 CORNER = se3.exp(np.array([-0.3, -0.1, 0.2, -0.4, 0.65, 0.1]))
 OPTIONS = Options(backend="llvm")
+RESIDUALS, PACE = (Residuals(2e-3, 0.02), Residuals(1e-3, 0.01)), Pace(*np.ones((3, 2)))
 
 
 def shaking() -> Spline:
@@ -309,6 +313,34 @@ def test_ctrl_c_keeps_what_there_is(shaken: Dataset) -> None:
     assert abs(found.values.color_readout_s - READOUT_S) < abs(0.012 - READOUT_S)
 
 
+def test_looking_at_residuals_leaves_stretches_as_they_are(shaken: Dataset) -> None:
+    noisy = replace(shaken, images=NoisyImages(shaken.images, 2e-3, 0.02, 7))
+    terms, p = pair_terms(engine("llvm"), noisy), parameters_of(noisy)
+    assert noisy.truth is not None
+    seen, other = (load_stretch(terms, noisy, range(4, 20), noisy.truth, p, OPTIONS) for _ in range(2))
+    before = seen.sigma, dict(seen.brightness), seen.spline.control_points.copy()
+    found = residuals_at([seen], terms, p)
+    assert (seen.sigma, seen.brightness) == before[:2]
+    np.testing.assert_array_equal(seen.spline.control_points, before[2])
+    np.testing.assert_array_equal(seen.sums(terms, p, 0).g, other.sums(terms, p, 0).g)
+    for _ in range(9):
+        other.sums(terms, p, 0)
+    settled = residuals_now([other])
+    assert found.depth_m == pytest.approx(settled.depth_m, rel=0.06)
+    assert found.intensity == pytest.approx(settled.intensity, rel=0.06)
+    late = residuals_at([seen], terms, replace(p, color_offset_s=0.02))
+    assert late.intensity > 1.3 * found.intensity and late.depth_m == pytest.approx(found.depth_m, rel=0.02)
+
+
+def test_scales_are_extrapolated_by_the_factor_by_which_steps_shrink() -> None:
+    steps = 3.0 + np.array([2.0, -1.0]) * 0.5 ** np.arange(4)[:, None]
+    np.testing.assert_allclose(extrapolated(steps), [3.0, 3.0])
+    still = np.full((3, 2), 4.0)
+    np.testing.assert_array_equal(extrapolated(still), [4.0, 4.0])
+    growing = np.array([[1.0], [2.0], [9.0]])
+    assert 9.0 < extrapolated(growing)[0] <= 9.0 + 2.0 * 7.0
+
+
 # --- what is said of it ----------------------------------------------------------------------------------------------
 
 
@@ -344,7 +376,7 @@ def test_the_camera_file_says_what_was_found(shaken: Dataset, tmp_path: Path) ->
     A = np.array([np.diag(1.0 / (1e-3 * PRIOR[free]) ** 2)] * 3)
     solution = Solution(found, free, A, np.zeros((3, COUNT - 1)), 0.0, 1e-3, 1e-2)
     motion = calibration_run.motion_of(shaken, [range(30)], shaking())
-    made = Calibration(shaken, start, solution, np.ones(COUNT, bool), (range(30),), motion, 1.0)
+    made = Calibration(shaken, start, solution, np.ones(COUNT, bool), (range(30),), motion, 1.0, RESIDUALS, PACE)
     (tmp_path / "camera.yaml").write_text(made.camera_file())
     again = open_dataset(shaken.root, tmp_path / "camera.yaml")
     expected = made.calibrated()
@@ -375,7 +407,7 @@ def test_ctrl_c_while_calibrating_ends_track_too(
         start = parameters_of(dataset)
         nothing = Solution(start, np.zeros(COUNT, bool), np.zeros((3, 0, 0)), np.zeros((3, 0)), 0, 1, 1, finished=False)
         motion = calibration_run.motion_of(dataset, [range(30)], shaking())
-        return Calibration(dataset, start, nothing, nothing.free, (range(30),), motion, 1.0)
+        return Calibration(dataset, start, nothing, nothing.free, (range(30),), motion, 1.0, RESIDUALS, PACE)
 
     monkeypatch.setattr(calibration_run, "calibrate", interrupted)
     assert main(["track", str(shaken.root), "--calibrate", "--out", str(tmp_path / "run"), "--quiet"]) == 130
@@ -395,9 +427,18 @@ def test_a_sequence_is_calibrated_and_tracked_by_command(
     )
     right, run = tmp_path / "right.yaml", tmp_path / "run"
     arguments = ["--camera", str(wrong), "--free", "readout,offset", "--out", str(right), "--quiet", "--json"]
+    arguments += ["--report", str(tmp_path / "new/page.html")]
     assert main(["calibrate", str(shaken.root), *arguments, "--backend", "llvm"]) == 0
     figures = json.loads(capsys.readouterr().out)
     assert figures["parameters"]["color.offset_s"]["value"] == pytest.approx(0.0, abs=2e-4)
+    assert figures["parameters"]["color.offset_s"]["shown"] == {"label": "colour offset", "unit": "ms", "factor": 1e3}
+    depth_m, intensity = (figures["residuals"][kind] for kind in ("depth_m", "intensity"))
+    assert depth_m["before"] > 2.0 * depth_m["after"] and intensity["before"] >= intensity["after"]
+    times, pace = np.array(figures["stretch_times_s"]), figures["pace"]
+    assert (times[:, 1] - times[:, 0] == pytest.approx(13 / RATE_HZ, abs=2e-4)) and times.max() <= FRAMES / RATE_HZ
+    turning = np.linalg.norm(shaking().velocity(np.array(pace["time_s"]) + shaken.stamps[0])[:, 3:], axis=1)
+    assert np.median(np.abs(pace["rad_s"] - turning)) < 0.1 * turning.mean()
+    assert "camera.yaml" in (tmp_path / "new/page.html").read_text()
     assert main(["track", str(shaken.root), "--camera", str(right), "--out", str(run), "--quiet"]) == 0
     assert main(["evaluate", str(shaken.root), str(run), "--json"]) == 0
     out = capsys.readouterr().out
@@ -406,6 +447,10 @@ def test_a_sequence_is_calibrated_and_tracked_by_command(
     more = ["--camera", str(wrong), "--calibrate", "--out", str(tmp_path / "again"), "--frames", "0:50", "--quiet"]
     assert main(["track", str(shaken.root), *more]) in (0, 1)
     assert (tmp_path / "again/camera.yaml").read_text().startswith("# rstrack calibrate synthetic")
+    kept = read_record(tmp_path / "again/calibration.json")
+    assert kept.camera_file == (tmp_path / "again/camera.yaml").read_text()
+    assert main(["track", str(shaken.root), "--out", str(tmp_path / "again"), "--frames", "0:20", "--quiet"]) in (0, 1)
+    assert not (tmp_path / "again/calibration.json").exists(), "it is of another run"
 
 
 # --- a device that is known ------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from report_util import make_bench, make_run, make_sequence, make_stress
+from report_util import calibration, make_bench, make_run, make_sequence, make_stress, write_calibration
 
 from rstrack.report.build import write_report
 
@@ -201,3 +201,35 @@ def test_the_stress_tests_page_fits_any_width_and_draws_the_chosen_path(
     tab.locator("#keyframe .flip").click()
     inner = np.s_[4:-40, 4:-4]  # without the captions and the line
     assert np.abs(constant - middle_pixels(tab))[inner].mean() > 3.0
+
+
+@pytest.mark.parametrize("width", [1280, 400])
+def test_the_calibrations_page_fits_any_width_and_gives_its_camera_file(
+    tab: Any, browser: Any, tmp_path: Path, width: int
+) -> None:
+    data = calibration()
+    tab.set_viewport_size({"width": width, "height": 800})
+    tab.emulate_media(color_scheme="dark" if width == 400 else "light")
+    tab.goto(write_report(write_calibration(tmp_path, data)).as_uri())
+    tab.wait_for_function(DRAWN)
+    assert tab.evaluate("document.documentElement.scrollWidth") <= width
+    cells = tab.locator("#where .plot")
+    ink = "rgb(231, 234, 240)" if width == 400 else "rgb(29, 33, 41)"
+    numbers = cells.locator(".heatmap-label")
+    assert numbers.all_text_contents() == ["25", "75", "50", "50", "90", "10"]
+    assert numbers.first.locator("text").evaluate("e => getComputedStyle(e).fill") == ink
+    # The cells, the curves below and their names: nothing on top of each other.
+    boxes = cells.evaluate(
+        "e => [...e.querySelectorAll('.ytick, .y2tick, .y3tick')].map(tick => tick.getBoundingClientRect())"
+        ".map(box => [box.left, box.top, box.right, box.bottom])"
+    )
+    for k, (left, top, right, bottom) in enumerate(boxes):
+        assert left >= 0.0 and right <= width
+        assert all(bottom <= b + 1 or d <= top + 1 or right <= a or c <= left for a, b, c, d in boxes[k + 1 :])
+    browser.grant_permissions(["clipboard-read", "clipboard-write"])
+    tab.locator(".copy").click()
+    tab.wait_for_function("() => document.querySelector('.said').textContent")
+    if tab.locator(".said").text_content() == "Copied.":
+        assert tab.evaluate("navigator.clipboard.readText()") == data["camera_file"]
+    else:
+        assert tab.evaluate("getSelection().toString()").strip() == data["camera_file"].strip()

@@ -1,0 +1,118 @@
+"""calibration.json, read back: what `Calibration.as_dict` says and `rstrack report` shows."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from rsgen.errors import UserError, first_problem
+from rsgen.files import atomic_write, read_text
+from rstrack.calibration.result import Calibration
+
+CALIBRATION = "calibration.json"
+
+_Finite = Annotated[float, Field(allow_inf_nan=False)]
+_Positive = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+
+
+class _Stored(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+class Shown(_Stored):
+    """How a value is called on the screen, its unit there, and the factor from the SI unit to that."""
+
+    label: str
+    unit: str
+    factor: _Finite
+
+
+class Parameter(_Stored):
+    """SI units. sigma: None where undetermined. told_by_stretch (s,): parts of what is known of it, 0..1."""
+
+    value: _Finite
+    start: _Finite
+    sigma: _Positive | None
+    state: Literal["found", "undetermined"]
+    told_by_stretch: tuple[_Positive, ...]
+    shown: Shown
+    useful_sigma: _Positive
+    needs: str
+
+    @property
+    def is_found(self) -> bool:
+        """Whether the recording tells it."""
+        return self.sigma is not None
+
+
+class Change(_Stored):
+    """Of a residual's scale."""
+
+    before: _Positive
+    after: _Positive
+
+
+class BothResiduals(_Stored):
+    """Scales with the values and the track before and after: m, and intensity of 0 to 1."""
+
+    depth_m: Change
+    intensity: Change
+
+
+class StoredPace(_Stored):
+    """How fast the camera moved and turned (n,), at times (n,) in s since the first frame."""
+
+    time_s: tuple[_Finite, ...]
+    m_s: tuple[_Positive, ...]
+    rad_s: tuple[_Positive, ...]
+
+
+class Record(_Stored):
+    """A calibration; `parameters` by name, in the order in which they are shown."""
+
+    dataset: str
+    parameters: dict[str, Parameter]
+    stretches: tuple[tuple[int, int], ...]
+    stretch_times_s: tuple[tuple[_Finite, _Finite], ...]
+    residuals: BothResiduals
+    pace: StoredPace
+    finished: bool
+    converged: bool
+    notes: tuple[str, ...]
+    seconds: _Positive
+    camera_file: str
+
+    @model_validator(mode="after")
+    def _fits(self) -> Record:
+        count = len(self.stretches)
+        if len(self.stretch_times_s) != count or any(len(p.told_by_stretch) != count for p in self.parameters.values()):
+            raise ValueError(f"there are {count} stretches, and as many times and parts of every parameter must be")
+        if not len(self.pace.time_s) == len(self.pace.m_s) == len(self.pace.rad_s):
+            raise ValueError("pace: there must be as many speeds as times")
+        return self
+
+    @property
+    def undetermined(self) -> dict[str, Parameter]:
+        """Those that the recording does not tell."""
+        return {name: each for name, each in self.parameters.items() if not each.is_found}
+
+
+def record_of(found: Calibration) -> Record:
+    """The record of a calibration that has just been made."""
+    return Record.model_validate(found.as_dict())
+
+
+def write_record(found: Calibration, path: Path) -> None:
+    """Write calibration.json. Raises UserError."""
+    atomic_write(path, (json.dumps(found.as_dict(), indent=2) + "\n").encode())
+
+
+def read_record(path: Path) -> Record:
+    """What `write_record` or `rstrack calibrate --json` wrote. Raises UserError naming the first wrong field."""
+    try:
+        return Record.model_validate_json(read_text(path))
+    except ValidationError as error:
+        raise UserError(f"{path}: {first_problem(error)}: run 'rstrack calibrate --json' again") from None

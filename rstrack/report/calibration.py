@@ -1,0 +1,158 @@
+"""The report of a calibration: values with their errors, residuals, where it was told, and the camera file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+from rsgen.console.tables import Entry, Table, fixed, significant
+from rstrack.calibration.record import Change, Parameter, Record
+from rstrack.charts.calibration import change_chart, strip_chart
+from rstrack.report.page import Block, Card, CardRow, Note, Page, Plot, Section, TextFile
+
+_BEFORE = (
+    "Scales of the residuals (Student's, medians over a few stretches; those before to some percent). Before: with the "
+    "values that it began with, along the first rough track; so a part of what is gained is the track's, which is "
+    "refined together with the values."
+)
+_SIGMA = (
+    "σ is measured from how far stretches of the recording disagree: of what is wrong and was not estimated, it knows "
+    "only a part."
+)
+
+
+def calibration_page(record: Record) -> Page:
+    """A page of its own."""
+    count, frames = len(record.stretches), sum(end - begin for begin, end in record.stretches)
+    return Page(
+        title=f"{record.dataset}, calibrated",
+        subtitle=f"from {count} stretches of the recording, {frames} frames in all, in {record.seconds:.0f} s",
+        cards=(CardRow(calibration_cards(record)),),
+        sections=(
+            Section("values", "Values", _values(record)),
+            *((Section("undetermined", "Undetermined", _undetermined(record)),) if record.undetermined else ()),
+            Section("residuals", "Residuals", _residuals(record)),
+            Section("where", "Where it was told", _where(record)),
+            Section("camera", "Camera file", _camera_file(record)),
+        ),
+        warnings=calibration_warnings(record),
+    )  # fmt: skip
+
+
+def calibration_section(record: Record) -> Section:
+    """All of it but the warnings as one part of a run's page."""
+    blocks = (*_values(record), *_undetermined(record), *_residuals(record), *_where(record), *_camera_file(record))
+    return Section("calibration", "Calibration", blocks)
+
+
+def calibration_cards(record: Record) -> tuple[Card, ...]:
+    """Whether it converged, what was found, and by how much residuals fell."""
+    found, asked = len(record.parameters) - len(record.undetermined), len(record.parameters)
+    depth, intensity = record.residuals.depth_m, record.residuals.intensity
+    names = _names(record.undetermined.values())
+    return (
+        _verdict(record),
+        Card(f"{found} of {asked}", "values found", f"not {names}" if names else "", "bad" if names else "good"),
+        _residual_card("depth", depth, 1e3, "mm"),
+        _residual_card("intensity", intensity, 1e2, "%"),
+    )  # fmt: skip
+
+
+def calibration_warnings(record: Record) -> tuple[str, ...]:
+    """What must not be overlooked."""
+    warnings = []
+    if not record.finished:
+        warnings.append("Interrupted before it had converged: these are the best values so far, and σ means little.")
+    elif not record.converged:
+        warnings.append("Not converged: the last step still moved values by more than their error. Do not use them.")
+    if record.undetermined:
+        names = _names(record.undetermined.values())
+        warnings.append(f"This recording does not tell {names}: kept as given, see what is needed below.")
+    return tuple(warnings)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _verdict(record: Record) -> Card:
+    if not record.finished:
+        return Card("Interrupted", "before it had converged", "best values so far", "bad")
+    if not record.converged:
+        return Card("Not converged", "do not use these values", "the last step was larger than their errors", "bad")
+    return Card("Converged", "the last step was within the errors", "", "good")
+
+
+def _residual_card(name: str, change: Change, factor: float, unit: str) -> Card:
+    after, before = (f"{significant(x, 3, factor)} {unit}" for x in (change.after, change.before))
+    return Card(after, f"residual of {name}", f"{before} before")
+
+
+def _names(parameters: Iterable[Parameter]) -> str:
+    """Those of one label but for what follows its comma together: colour from depth, x, y and z."""
+    by_head: dict[str, list[str]] = {}
+    for p in parameters:
+        head, _, rest = p.shown.label.partition(", ")
+        by_head.setdefault(head, []).append(rest)
+    return "; ".join(f"{head} ({', '.join(rest)})" if rest != [""] else head for head, rest in by_head.items())
+
+
+def _values(record: Record) -> tuple[Block, ...]:
+    if not record.parameters:
+        return (Note("Nothing was asked for."),)
+    head = ("value", "found", "± 2 σ", "began at", "change", "unit")
+    rows = tuple(_row(p) for p in record.parameters.values())
+    notes = (Note(f"{text[0].upper()}{text[1:]}.") for text in record.notes)
+    return Table(head, rows, "Found, and where it began"), Note(_SIGMA), *notes, Plot(change_chart(record))
+
+
+def _row(p: Parameter) -> tuple[Entry | str, ...]:
+    factor, start = p.shown.factor, p.shown.factor * p.start
+    if p.sigma is None:
+        return p.shown.label, "undetermined", "–", significant(start, 4), "kept", p.shown.unit
+    digits = _digits(2.0 * factor * p.sigma)
+    shown = (fixed(x, digits, factor) for x in (p.value, 2.0 * p.sigma, p.start))
+    return p.shown.label, *shown, fixed(p.value - p.start, digits, factor, sign="+"), p.shown.unit
+
+
+def _digits(error: float) -> int:
+    """After the point, so that two of an error's count."""
+    return min(6, max(0, 1 - math.floor(math.log10(error)))) if error > 0.0 else 3
+
+
+def _undetermined(record: Record) -> tuple[Block, ...]:
+    if not record.undetermined:
+        return ()
+    rows = tuple(
+        (p.shown.label, f"{significant(p.shown.factor * p.value, 4)} {p.shown.unit}",
+         f"{significant(p.shown.factor * p.useful_sigma, 2)} {p.shown.unit}", p.needs)
+        for p in record.undetermined.values()
+    )  # fmt: skip
+    head = ("value", "kept at", "σ was above", "what the recording would need")
+    t = record.pace
+    seen = Note("")
+    if t.m_s:
+        mean, turning = sum(t.m_s) / len(t.m_s), math.degrees(sum(t.rad_s) / len(t.rad_s))
+        seen = Note(f"This recording moves at {mean:.2f} m/s and turns at {turning:.1f} deg/s in the mean.")
+    return Table(head, rows, "Not told by this recording", words=(0, 3)), seen
+
+
+def _residuals(record: Record) -> tuple[Block, ...]:
+    depth, intensity = record.residuals.depth_m, record.residuals.intensity
+    rows = (_fall("depth, mm", depth, 1e3), _fall("intensity, % of white", intensity, 1e2))
+    return Table(("residual", "before", "after", "change"), rows, "Residuals before and after"), Note(_BEFORE)
+
+
+def _fall(name: str, change: Change, factor: float) -> tuple[str, ...]:
+    part = 100.0 * (change.after / change.before - 1.0) if change.before else 0.0
+    return name, significant(change.before, 3, factor), significant(change.after, 3, factor), f"{part:+.0f} %"
+
+
+def _where(record: Record) -> tuple[Block, ...]:
+    return (Plot(strip_chart(record)),) if record.stretches else ()
+
+
+def _camera_file(record: Record) -> tuple[Block, ...]:
+    warning = () if record.finished and record.converged else (
+        Note("Not converged: do not use this file.", is_warning=True),)  # fmt: skip
+    return *warning, TextFile("camera.yaml", record.camera_file), Note(
+        "rstrack track RECORDING --camera camera.yaml --out RUN tracks with it.")  # fmt: skip
