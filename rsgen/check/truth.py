@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from rsgen.errors import UserError
 from rsgen.export.folder import sequence_imu
-from rsgen.files import is_temporary, read_text
+from rsgen.files import is_temporary, read_text, read_yaml
 from rsgen.sensors.imu import imu_csv
-from rsgen.sequence.format import color_truth_path
+from rsgen.sequence.camera_yaml import TRUE_CAMERAS
+from rsgen.sequence.format import STREAMS, color_truth_path
 from rsgen.sequence.reader import Sequence
 
 
@@ -52,10 +54,28 @@ def check_imu(sequence: Sequence) -> tuple[bool, str]:
     return ok, f"{len(rows)} samples, within {worst:.1e} of what the spline gives"
 
 
+def check_true_cameras(sequence: Sequence, config: dict[str, Any]) -> tuple[bool, str]:
+    """truth/cameras.yaml, whose cameras all checks go by, has those of the config. Raises UserError."""
+    stated = read_yaml(sequence.root / TRUE_CAMERAS)
+    for name in STREAMS:
+        camera = stated[name] | stated[name].get("sensor", {})
+        for field in camera.keys() & config[name].keys() - {"registered"}:
+            if camera[field] != config[name][field]:
+                return (
+                    False,
+                    f"{TRUE_CAMERAS}: {name}.{field} is {camera[field]}, but config says {config[name][field]}",
+                )
+    if not np.array_equal(sequence.T_color_depth, config["T_color_depth"]):
+        return False, f"{TRUE_CAMERAS}: T_color_depth is not that of config"
+    return True, f"{TRUE_CAMERAS} has them, sequence.yaml declares others"
+
+
 def extra_checks(sequence: Sequence) -> list[tuple[str, Callable[[], tuple[bool, str]]]]:
     """Those of the checks that concern this sequence, by name."""
     config = sequence.meta.get("config")
     checks: list[tuple[str, Callable[[], tuple[bool, str]]]] = []
+    if isinstance(config, dict) and config.get("declared") is not None:
+        checks.append(("true cameras", partial(check_true_cameras, sequence, config)))
     if sequence.truth_images:
         checks.append(("truth images", partial(check_truth_images, sequence)))
     if isinstance(config, dict) and config.get("imu") is not None:

@@ -49,8 +49,8 @@ class RigFile:
     """The cameras, the depth images' units per metre, and what is to be done with the stamps.
 
     depth_offset_s: to be added to depth's stamps, so that they belong to the first row of the image as it is.
-    color_offset_s: to be added to colour's; None: to be found. color_drift: what that grows by, s/s. scan_named:
-    whether it says which way images are read. notes: what was assumed, for the screen.
+    color_offset_s: to be added to colour's; None: to be found. color_drift: what that grows by, s/s. scan_named,
+    scale_named: whether it says which way images are read, and depth_scale. notes: what was assumed, for the screen.
     """
 
     rig: Rig
@@ -60,6 +60,7 @@ class RigFile:
     color_offset_s: float | None = None
     color_drift: float = 0.0
     scan_named: bool = True
+    scale_named: bool = True
     notes: tuple[str, ...] = ()
 
 
@@ -129,7 +130,7 @@ def read_rig(path: Path, color_size: Size, depth_size: Size) -> RigFile:
     text = read_text(path)
     if is_opencv(text):
         rig, depth_scale = read_opencv_rig(path, text, color_size, depth_size)
-        return RigFile(rig, DEPTH_SCALE if depth_scale is None else depth_scale)
+        return RigFile(rig, depth_scale or DEPTH_SCALE, scale_named=depth_scale is not None)
     try:
         data = _CameraYaml.model_validate(read_yaml(path))
     except ValidationError as error:
@@ -154,6 +155,7 @@ def read_rig(path: Path, color_size: Size, depth_size: Size) -> RigFile:
         None if data.color.offset_s == "auto" else data.color.offset_s,
         1e-6 * data.color.drift_ppm,
         any("scan" in stream.model_fields_set for stream in (data.color, depth) if stream is not None),
+        depth is not None and "depth_scale" in depth.model_fields_set,
         notes,
     )
 

@@ -22,7 +22,7 @@ from rsgen.sequence.format import DEPTH_SCALE, StreamName
 from rsgen.sequence.reader import Sequence, read_sequence
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.camera_file import read_rig
-from rstrack.data.generated import as_recorded, is_exact
+from rstrack.data.generated import as_recorded, is_exact, with_depth_scale
 from rstrack.data.noise import ImageReader
 from rstrack.data.prefetch import prefetched
 from rstrack.data.rig import Frame, Image, Rig
@@ -178,6 +178,9 @@ def _seen_as(dataset: Dataset, camera_file: Path) -> Dataset:
         timing = Timing(depth, stream_timing("colour", dataset.color_stamps, "raw", 0.0), 0.0)
     notes = (*dataset.notes, *file.notes)
     seen = replace(dataset, rig=file.rig, notes=notes, scan_named=file.scan_named, timing=timing)
+    if file.scale_named and isinstance(dataset.images, Sequence):
+        scaled = with_depth_scale(dataset.images, file.depth_scale)
+        seen = replace(seen, images=scaled, depth_scale=file.depth_scale)
     if file.color_offset_s is None:
         return replace(seen, color_drift=file.color_drift)
     return seen.with_color_offset(file.color_offset_s, drift=file.color_drift)
@@ -191,7 +194,10 @@ def _of_generated(root: Path, sequence: Sequence) -> Dataset:
     rig = Rig(depth.camera, depth.shutter, color.camera, color.shutter, sequence.T_color_depth)
     groups = group_colors(depth.stamps, color.stamps)
     stamps = (depth.stamps, color.stamps)
-    return Dataset(sequence.name, root, rig, *stamps, groups, sequence, truth=sequence.spline, sequence=sequence)
+    return Dataset(
+        sequence.name, root, rig, *stamps, groups, sequence, truth=sequence.spline, sequence=sequence,
+        depth_scale=depth.depth_scale,
+    )  # fmt: skip
 
 
 def _of_recorded(root: Path, sequence: Sequence) -> Dataset:
@@ -204,7 +210,7 @@ def _of_recorded(root: Path, sequence: Sequence) -> Dataset:
     groups = group_colors(stamps, color_stamps)
     return Dataset(
         sequence.name, root, found.rig, stamps, color_stamps, groups, sequence, truth_poses=found.truth_poses,
-        timing=found.timing,
+        timing=found.timing, depth_scale=sequence.streams["depth"].depth_scale,
     )  # fmt: skip
 
 
