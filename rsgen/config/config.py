@@ -27,6 +27,7 @@ from rsgen.config.sections import (
     StreamConfig,
     TrajectoryConfig,
 )
+from rsgen.config.target import TargetConfig
 from rsgen.config.truth import TruthConfig
 from rsgen.errors import UserError
 from rsgen.files import parse_yaml
@@ -38,7 +39,7 @@ __all__ = ["Config", "StreamConfig", "describe_fields", "load_config", "validate
 # Fields that change how fast or where a sequence is made, never one byte of it.
 _NOT_CONTENT = {"backend"}
 # Sections that are left out where they are not set: sequences rendered before there were any stay the same.
-_LATER = ("declared",)
+_LATER = ("declared", "target")
 # Fields that hold paths, by section.
 _PATHS = (("trajectory", "file"), ("scene", "file"))
 # PyYAML lets impossible dates, endless digits and endless nesting through as these.
@@ -59,6 +60,7 @@ class Config(Section):
     motion: MotionConfig | None = None
     tremor: TremorConfig | None = None
     scene: SceneConfig
+    target: TargetConfig | None = None
     light: LightConfig = LightConfig()
     color: ColorConfig = ColorConfig()
     depth: DepthConfig = DepthConfig()

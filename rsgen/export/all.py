@@ -21,7 +21,7 @@ def export(to: Export, path: Path, out: Path | None, copy: bool, scene: Path | N
     if to == "kalibr":
         from rsgen.export.kalibr import export_kalibr
 
-        return export_kalibr(sequence, out or path / "kalibr", progress)
+        return export_kalibr(sequence, out or path / "kalibr", copy, progress)
     if to == "euroc":
         from rsgen.export.euroc import export_euroc
 

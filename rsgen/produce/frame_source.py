@@ -18,6 +18,7 @@ from rsgen.console.progress import Progress, no_progress
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.spline import Spline
+from rsgen.produce.identity import fingerprint
 from rsgen.sensors.adaptation import Meter, Reading, Setting, reading
 from rsgen.sensors.color import apply_color_noise, apply_setting
 from rsgen.sensors.depth import apply_depth_noise
@@ -195,22 +196,26 @@ def make_integrator(mi: Any, scene: Any, config: Config, progress: Progress) -> 
         return mi.load_dict({"type": "path", "max_depth": light.max_depth})
     from rsgen.light.cache import baked_field, cache_folder
     from rsgen.render.baked import BakedIntegrator
-    from rsgen.render.scene import content_hash
 
-    file = config.scene.file
+    lit = scene_hash(config)
+    if config.target is not None:
+        lit = fingerprint({"scene": lit, "target": config.target.model_dump(mode="json")})
     return BakedIntegrator(
-        baked_field(scene, content_hash(file), light, cache_folder(file), progress), glossy_spp=light.glossy_spp
+        baked_field(scene, lit, light, cache_folder(config.scene.file), progress), glossy_spp=light.glossy_spp
     )
 
 
 def load_scene(config: Config) -> Any:
-    """The config's Mitsuba scene. Raises UserError."""
+    """The config's Mitsuba scene, with its target if it has one. Raises UserError."""
     from rsgen.device.backend import mitsuba
 
     mitsuba(config.backend)
     from rsgen.render import scene
+    from rsgen.render.board import Board
 
-    return scene.load_scene(config.scene.file)
+    target = config.target
+    board = None if target is None else Board(target.grid, np.array(target.T_world_target, float))
+    return scene.load_scene(config.scene.file, board)
 
 
 def scene_hash(config: Config) -> str:

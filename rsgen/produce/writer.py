@@ -50,6 +50,7 @@ from rsgen.sequence.format import (
     round_stamps,
 )
 from rsgen.sequence.frame_table import FrameTable
+from rsgen.sequence.target_corners import TARGET_CORNERS, target_corners_text
 
 _SPLINE_TOLERANCE = 1e-9
 
@@ -249,6 +250,9 @@ class SequenceWriter:
                 atomic_write(self.out / FRAME_TABLES[s], table.text().encode())
         if self.config.declared is not None:
             atomic_write(self.out / TRUE_CAMERAS, encode_yaml(self._true_cameras()))
+        if (target := self.config.target) is not None:
+            text = target_corners_text(target.grid, np.array(target.T_world_target, float))
+            atomic_write(self.out / TARGET_CORNERS, text.encode())
         if self.config.imu is not None:
             spline = self.spline
             samples = simulate_imu(spline, self.config.imu, spline.t_begin, spline.t_end, self.config.seed)
