@@ -197,12 +197,8 @@ def make_integrator(mi: Any, scene: Any, config: Config, progress: Progress) -> 
     from rsgen.light.cache import baked_field, cache_folder
     from rsgen.render.baked import BakedIntegrator
 
-    lit = scene_hash(config)
-    if config.target is not None:
-        lit = fingerprint({"scene": lit, "target": config.target.model_dump(mode="json")})
-    return BakedIntegrator(
-        baked_field(scene, lit, light, cache_folder(config.scene.file), progress), glossy_spp=light.glossy_spp
-    )
+    field = baked_field(scene, surfaces_hash(config), light, cache_folder(config.scene.file), progress)
+    return BakedIntegrator(field, glossy_spp=light.glossy_spp)
 
 
 def load_scene(config: Config) -> Any:
@@ -226,6 +222,12 @@ def scene_hash(config: Config) -> str:
     from rsgen.render.scene import content_hash
 
     return content_hash(config.scene.file)
+
+
+def surfaces_hash(config: Config) -> str:
+    """Hash of all that is lit: the scene, and its target if it has one. Raises UserError."""
+    scene, target = scene_hash(config), config.target
+    return scene if target is None else fingerprint({"scene": scene, "target": target.model_dump(mode="json")})
 
 
 def setting_of(config: Config, table: FrameTable | None, k: int) -> Setting | None:

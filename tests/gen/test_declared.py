@@ -37,7 +37,7 @@ DECLARED: dict[str, Any] = {
 
 def config_with(declared: Any, **sections: Any) -> Config:
     said = {} if declared is None else {"declared": declared}
-    return Config.model_validate(synthetic.make_config().model_dump() | said | sections)
+    return Config.model_validate(synthetic.make_config(color={"offset_s": 0.004}).model_dump() | said | sections)
 
 
 @pytest.fixture(scope="module")

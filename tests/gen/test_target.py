@@ -19,7 +19,7 @@ from rsgen.config.config import load_config
 from rsgen.errors import UserError
 from rsgen.geometry.aprilgrid import AprilGrid
 from rsgen.geometry.shutter import Shutter, project_rolling
-from rsgen.produce.frame_source import load_scene
+from rsgen.produce.frame_source import load_scene, scene_hash, surfaces_hash
 from rsgen.render.board import Board, drawing, surface
 from rsgen.render.scene import mesh_arrays
 from rsgen.sequence.reader import Sequence, read_sequence
@@ -147,6 +147,14 @@ def test_a_mesh_files_scene_takes_a_board_too(tmp_path: Path) -> None:
         assert len(loaded.shapes()) == shapes
         heights = [mesh_arrays(shape)[0][:, 2] for shape in loaded.shapes()]
         assert sum(len(z) == 4 and np.allclose(z, 0.7, atol=1e-6) for z in heights) == 1
+
+
+def test_a_board_elsewhere_has_a_light_of_its_own(tmp_path: Path) -> None:
+    moved = [*T_WORLD_TARGET[:2], [0, 0, -1, 0.8], T_WORLD_TARGET[3]]
+    sections = ({}, {"target": TARGET}, {"target": TARGET | {"T_world_target": moved}})
+    configs = [load_config(tiny.write_config(tmp_path, 4, **section)) for section in sections]
+    assert len({surfaces_hash(config) for config in configs}) == 3
+    assert surfaces_hash(configs[0]) == scene_hash(configs[0]) == scene_hash(configs[2])
 
 
 @pytest.mark.parametrize(
