@@ -15,7 +15,7 @@ from rsgen.console.progress import Progress
 from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
 from rsgen.geometry.shutter import Shutter
-from rsgen.produce.frame_source import make_integrator
+from rsgen.produce.frame_source import load_scene, make_integrator
 from rsgen.produce.generate import Motion, load_motion
 
 PSNR_FLOOR_DB = 36.0
@@ -72,11 +72,9 @@ def lit_scene(config: Config, progress: Progress) -> tuple[Any, Any, Any]:
     from rsgen.device.backend import mitsuba
 
     mi = mitsuba(config.backend)
-    from rsgen.render.scene import load_scene
-
     if config.light.mode != "baked":
         raise UserError("light.mode is 'path': these measurements are about baked light, leave it at 'baked'")
-    scene = load_scene(config.scene.file)
+    scene = load_scene(config)
     baked = make_integrator(mi, scene, config, progress)
     return scene, baked, mi
 

@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from rsgen.errors import UserError
-from rsgen.export.folder import sequence_imu
-from rsgen.files import is_temporary, read_text
+from rsgen.export.folder import sequence_imu, sequence_target
+from rsgen.files import is_temporary, read_text, read_yaml
 from rsgen.sensors.imu import imu_csv
-from rsgen.sequence.format import color_truth_path
+from rsgen.sequence.camera_yaml import TRUE_CAMERAS
+from rsgen.sequence.format import STREAMS, color_truth_path
 from rsgen.sequence.reader import Sequence
+from rsgen.sequence.target_corners import TARGET_CORNERS, target_corners_text
 
 
 def check_truth_images(sequence: Sequence) -> tuple[bool, str]:
@@ -52,10 +55,41 @@ def check_imu(sequence: Sequence) -> tuple[bool, str]:
     return ok, f"{len(rows)} samples, within {worst:.1e} of what the spline gives"
 
 
+def check_true_cameras(sequence: Sequence, config: dict[str, Any]) -> tuple[bool, str]:
+    """truth/cameras.yaml, whose cameras all checks go by, has those of the config. Raises UserError."""
+    stated = read_yaml(sequence.root / TRUE_CAMERAS)
+    for name in STREAMS:
+        camera = stated[name] | stated[name].get("sensor", {})
+        camera.pop("offset_s", None)  # of colour's clock against depth's, not of its first frame
+        for field in camera.keys() & config[name].keys():
+            if camera[field] != config[name][field]:
+                return (
+                    False,
+                    f"{TRUE_CAMERAS}: {name}.{field} is {camera[field]}, but config says {config[name][field]}",
+                )
+    if not np.array_equal(sequence.T_color_depth, config["T_color_depth"]):
+        return False, f"{TRUE_CAMERAS}: T_color_depth is not that of config"
+    return True, f"{TRUE_CAMERAS} has them, sequence.yaml declares others"
+
+
+def check_target(sequence: Sequence) -> tuple[bool, str]:
+    """truth/target_corners.txt has the corners of the config's target. Raises UserError."""
+    target = sequence_target(sequence)
+    assert target is not None
+    expected = target_corners_text(target.grid, np.array(target.T_world_target, float))
+    if read_text(sequence.root / TARGET_CORNERS) != expected:
+        return False, f"{TARGET_CORNERS} is not that of config.target: render again to write it"
+    return True, f"{target.grid.tag_count} tags, corners as config.target has them"
+
+
 def extra_checks(sequence: Sequence) -> list[tuple[str, Callable[[], tuple[bool, str]]]]:
     """Those of the checks that concern this sequence, by name."""
     config = sequence.meta.get("config")
     checks: list[tuple[str, Callable[[], tuple[bool, str]]]] = []
+    if isinstance(config, dict) and config.get("declared") is not None:
+        checks.append(("true cameras", partial(check_true_cameras, sequence, config)))
+    if isinstance(config, dict) and config.get("target") is not None:
+        checks.append(("target", partial(check_target, sequence)))
     if sequence.truth_images:
         checks.append(("truth images", partial(check_truth_images, sequence)))
     if isinstance(config, dict) and config.get("imu") is not None:

@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -89,11 +90,12 @@ def verify_sequence(path: Path, pairs: int = 20, raycast: int = 0) -> Verificati
     """
     path = Path(path)
     try:
-        sequence = read_sequence(path)
+        stated = read_sequence(path)
+        sequence = stated.as_taken
     except UserError as error:
         return Verification(path, (Check("read", False, str(error)),))
     checks: list[tuple[str, Callable[[], tuple[bool, str]]]] = [
-        ("description", partial(_check_description, sequence)),
+        ("description", partial(_check_description, stated)),
         ("files", partial(_check_files, sequence)),
         ("clocks", partial(_check_clocks, sequence)),
         ("images", partial(_check_images, sequence)),
@@ -120,15 +122,17 @@ def _check_description(sequence: Sequence) -> tuple[bool, str]:
     meta, config = sequence.meta, sequence.meta.get("config")
     if not isinstance(config, dict):
         return False, "sequence.yaml holds no config"
+    declared = _said(config.get("declared"))
     for name in STREAMS:
         stated, asked = meta["streams"][name], config.get(name)
         if not isinstance(asked, dict):
             return False, f"config.{name} is missing in sequence.yaml"
-        asked = asked | {"size": [asked.get("width"), asked.get("height")]}
+        asked = asked | {"size": [asked.get("width"), asked.get("height")]} | _said(declared.get(name))
         for field in stated.keys() & asked.keys():
             if stated[field] != asked[field]:
                 return False, f"streams.{name}.{field} is {stated[field]}, but config says {asked[field]}"
-    if config.get("T_color_depth") != meta["T_color_depth"]:
+    asked = {"T_color_depth": config.get("T_color_depth")} | _said(declared)
+    if asked["T_color_depth"] != meta["T_color_depth"]:
         return False, "T_color_depth is not that of config"
     try:
         found = fingerprint({key: meta.get(key) for key in ("config", "inputs", "versions")})
@@ -137,6 +141,11 @@ def _check_description(sequence: Sequence) -> tuple[bool, str]:
     if found != meta.get("fingerprint"):
         return False, "sequence.yaml was edited: its fingerprint is another one"
     return True, f"fingerprint {found[:16]}"
+
+
+def _said(section: Any) -> dict[str, Any]:
+    """The fields of a section of `declared` that say something."""
+    return {key: value for key, value in section.items() if value is not None} if isinstance(section, dict) else {}
 
 
 def _check_files(sequence: Sequence) -> tuple[bool, str]:

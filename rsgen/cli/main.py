@@ -163,15 +163,15 @@ def verify(
 def export(
     to: Annotated[
         Export,
-        "kalibr: camchain.yaml with line_delay, imu.yaml; euroc: mav0/ (ASL); registered: TUM folder with depth warped "
-        "into the colour camera, its rows' times lost; video: global beside rolling shutter (.mp4); rerun: .rrd "
-        "recording",
+        "kalibr: camchain.yaml with line_delay, imu.yaml, with a target also target.yaml and images; euroc: mav0/ "
+        "(ASL); registered: TUM folder with depth warped into the colour camera, its rows' times lost; video: global "
+        "beside rolling shutter (.mp4); rerun: .rrd recording",
         "|".join(get_args(Export)),
     ],
     sequence: SequenceFolder,
     *,
     out: Annotated[Path | None, "where to (default: within the sequence's folder)", "PATH"] = None,
-    copy: Annotated[bool, "euroc, registered: copy images instead of linking them"] = False,
+    copy: Annotated[bool, "euroc, registered, kalibr: copy images instead of linking them"] = False,
     scene: Annotated[Path | None, "video: scene file, if it has moved since the sequence was rendered"] = None,
     quiet: Quiet = False,
 ) -> int:

@@ -13,6 +13,7 @@ from typing import Any, Literal, Union, get_args, get_origin
 import yaml
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
+from rsgen.config.declared import DeclaredConfig, as_declared
 from rsgen.config.imu import ImuConfig
 from rsgen.config.mocap import MocapConfig
 from rsgen.config.motion import MotionConfig, TremorConfig
@@ -26,15 +27,19 @@ from rsgen.config.sections import (
     StreamConfig,
     TrajectoryConfig,
 )
+from rsgen.config.target import TargetConfig
 from rsgen.config.truth import TruthConfig
 from rsgen.errors import UserError
 from rsgen.files import parse_yaml
-from rsgen.limits import RigidTransform
+from rsgen.limits import Matrix4, RigidTransform
+from rsgen.sequence.format import STREAMS
 
 __all__ = ["Config", "StreamConfig", "describe_fields", "load_config", "validate_config"]
 
 # Fields that change how fast or where a sequence is made, never one byte of it.
 _NOT_CONTENT = {"backend"}
+# Sections that are left out where they are not set: sequences rendered before there were any stay the same.
+_LATER = ("declared", "target")
 # Fields that hold paths, by section.
 _PATHS = (("trajectory", "file"), ("scene", "file"))
 # PyYAML lets impossible dates, endless digits and endless nesting through as these.
@@ -55,6 +60,7 @@ class Config(Section):
     motion: MotionConfig | None = None
     tremor: TremorConfig | None = None
     scene: SceneConfig
+    target: TargetConfig | None = None
     light: LightConfig = LightConfig()
     color: ColorConfig = ColorConfig()
     depth: DepthConfig = DepthConfig()
@@ -65,6 +71,7 @@ class Config(Section):
     truth: TruthConfig = TruthConfig()
     imu: ImuConfig | None = None
     mocap: MocapConfig | None = None
+    declared: DeclaredConfig | None = None
     seed: int = Field(default=0, ge=0, lt=2**31, description="seed of every random number")
     backend: Literal["auto", "llvm", "cuda"] = Field(default="auto", description="where Dr.Jit runs")
 
@@ -75,9 +82,35 @@ class Config(Section):
             raise ValueError(f"trajectory.file: is required: give {given}")
         return self
 
+    @model_validator(mode="after")
+    def _declares_possible_cameras(self) -> Config:
+        for name in STREAMS:
+            try:
+                _ = self.declared_color if name == "color" else self.declared_depth
+            except ValueError as error:
+                raise ValueError(f"declared.{name}.{error}") from None
+        return self
+
+    @property
+    def declared_color(self) -> ColorConfig:
+        """What the sequence says of its colour camera: the truth, unless `declared` says otherwise."""
+        return as_declared(self.color, None if self.declared is None else self.declared.color)
+
+    @property
+    def declared_depth(self) -> DepthConfig:
+        """What the sequence says of its depth camera: the truth, unless `declared` says otherwise."""
+        return as_declared(self.depth, None if self.declared is None else self.declared.depth)
+
+    @property
+    def declared_T_color_depth(self) -> Matrix4:
+        """What the sequence says of the pose between the cameras: the truth, unless `declared` says otherwise."""
+        said = None if self.declared is None else self.declared.T_color_depth
+        return self.T_color_depth if said is None else said
+
     def content(self) -> dict[str, Any]:
         """Everything that decides the sequence's bytes, as plain YAML types (the trajectory and scene by file name)."""
-        content = self.model_dump(mode="json", exclude=_NOT_CONTENT)
+        unset = {name for name in _LATER if getattr(self, name) is None}
+        content = self.model_dump(mode="json", exclude=_NOT_CONTENT | unset)
         for section, name in _PATHS:
             if content[section][name] is not None:
                 content[section][name] = Path(content[section][name]).name

@@ -21,7 +21,7 @@ def export(to: Export, path: Path, out: Path | None, copy: bool, scene: Path | N
     if to == "kalibr":
         from rsgen.export.kalibr import export_kalibr
 
-        return export_kalibr(sequence, out or path / "kalibr", progress)
+        return export_kalibr(sequence, out or path / "kalibr", copy, progress)
     if to == "euroc":
         from rsgen.export.euroc import export_euroc
 
@@ -33,8 +33,8 @@ def export(to: Export, path: Path, out: Path | None, copy: bool, scene: Path | N
     if to == "rerun":
         from rsgen.export.rerun import export_rerun
 
-        return export_rerun(sequence, out or path / f"{sequence.name}.rrd", progress)
-    return _export_video(sequence, out or path / "shutter.mp4", scene, progress)
+        return export_rerun(sequence.as_taken, out or path / f"{sequence.name}.rrd", progress)
+    return _export_video(sequence.as_taken, out or path / "shutter.mp4", scene, progress)
 
 
 def _export_video(sequence: Sequence, out: Path, scene: Path | None, progress: Progress) -> str:

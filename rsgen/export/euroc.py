@@ -23,6 +23,7 @@ from rsgen.config.imu import ImuConfig
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.export.folder import (
+    EPOCH_S,
     four_coefficients,
     image_streams,
     make_folders,
@@ -35,9 +36,6 @@ from rsgen.geometry import se3
 from rsgen.sensors.imu import ImuSamples, nanoseconds, write_imu_csv
 from rsgen.sequence.format import ground_truth, pose_rows
 from rsgen.sequence.reader import Sequence, Stream
-
-EPOCH_S = 1_000_000_000
-"""Added to all stamps by default: every file name then has 19 digits, as EuRoC's have, and sorts by time."""
 
 _MODELS = {"pinhole": "radial-tangential", "radtan": "radial-tangential", "fisheye": "equidistant"}
 _TRUTH = "state_groundtruth_estimate0"

@@ -14,6 +14,7 @@ from pydantic import BaseModel, ValidationError
 from rsgen.array_types import FloatArray
 from rsgen.config.imu import ImuConfig
 from rsgen.config.mocap import MocapConfig
+from rsgen.config.target import TargetConfig
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError, first_problem
 from rsgen.files import atomic_write, read_bytes, write_error
@@ -21,6 +22,9 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.sensors.imu import ImuSamples, simulate_imu
 from rsgen.sequence.reader import Sequence, Stream
+
+EPOCH_S = 1_000_000_000
+"""Added to stamps that are file names: all have 19 digits then, as EuRoC's have, and sort by time."""
 
 SectionT = TypeVar("SectionT", bound=BaseModel)
 
@@ -92,6 +96,15 @@ def sequence_mocap(sequence: Sequence) -> tuple[MocapConfig, int] | None:
     Raises UserError if sequence.yaml's config.mocap is not one.
     """
     return _section(sequence, "mocap", MocapConfig)
+
+
+def sequence_target(sequence: Sequence) -> TargetConfig | None:
+    """The calibration target in a sequence's scene; None where there is none.
+
+    Raises UserError if sequence.yaml's config.target is not one.
+    """
+    found = _section(sequence, "target", TargetConfig)
+    return None if found is None else found[0]
 
 
 def _section(sequence: Sequence, name: str, model: type[SectionT]) -> tuple[SectionT, int] | None:

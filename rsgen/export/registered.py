@@ -13,11 +13,10 @@ from typing import Any
 from rsgen.console.progress import Progress, no_progress
 from rsgen.export.folder import make_folders, new_folder, place_images, sequence_mocap
 from rsgen.files import atomic_write, encode_png, encode_yaml
-from rsgen.geometry.camera import Camera
-from rsgen.geometry.shutter import Shutter
 from rsgen.produce.writer import quantise
 from rsgen.sensors.mocap import reported_poses
 from rsgen.sensors.registration import register_depth
+from rsgen.sequence.camera_yaml import Cameras, ColorClock, camera_yaml
 from rsgen.sequence.format import associate, ground_truth, pose_lines
 from rsgen.sequence.reader import Sequence
 
@@ -30,7 +29,8 @@ def export_registered(sequence: Sequence, out: Path, copy: bool = False, progres
     rgb/ holds hard links where the disk allows, or copies with `copy`. camera.yaml (as rstrack reads it) says that
     depth has the colour camera, and which camera with which shutter it was warped from; groundtruth.txt holds poses of
     the colour camera at true times, or what the sequence's motion capture reports of it. Stamps are the sequence's
-    listed ones; depth that is registered already is linked like colour. Raises UserError if `out` is not empty, or an
+    listed ones; depth that is registered already is linked like colour. Warped, and said in camera.yaml, is what the
+    sequence declares; the poses are the true colour camera's. Raises UserError if `out` is not empty, or an
     image cannot be read.
     """
     color, depth = sequence.streams["color"], sequence.streams["depth"]
@@ -59,10 +59,11 @@ def export_registered(sequence: Sequence, out: Path, copy: bool = False, progres
     pairs = associate(color.listed, depth.listed, 0.5 / min(color.rate_hz, depth.rate_hz))
     _write(out / "associations.txt", [f"{entries['rgb'][i]} {entries['depth'][j]}" for i, j in pairs])
     title = f"ground truth of {sequence.name}: T_world_color"
+    T_color_depth = sequence.as_taken.T_color_depth
     if (mocap := sequence_mocap(sequence)) is None:
-        rows = ground_truth(sequence.spline, color.stamps, depth.stamps, T_cam_body=sequence.T_color_depth)
+        rows = ground_truth(sequence.spline, color.stamps, depth.stamps, T_cam_body=T_color_depth)
     else:
-        rows = reported_poses(sequence.spline, *mocap, sequence.T_color_depth)
+        rows = reported_poses(sequence.spline, *mocap, T_color_depth)
         title += ", as a motion capture reports it"
     _write(out / "groundtruth.txt", pose_lines(title, rows))
     atomic_write(out / "camera.yaml", f"# depth is {_MARK}\n".encode() + encode_yaml(_camera_yaml(sequence)))
@@ -71,29 +72,10 @@ def export_registered(sequence: Sequence, out: Path, copy: bool = False, progres
 
 def _camera_yaml(sequence: Sequence) -> Mapping[str, Any]:
     color, depth = sequence.streams["color"], sequence.streams["depth"]
-    sensor = _camera(depth.camera) | {"T_color_sensor": sequence.T_color_depth.tolist()}
-    warped = {"registered": True, "sensor": sensor, "depth_scale": depth.depth_scale}
-    # Stamps of a driver are for the reader to judge, true ones are to be left alone.
+    sensors = color.camera, color.shutter, depth.camera, depth.shutter
     driver = any((stream.listed != stream.stamps).any() for stream in (color, depth))
-    return {
-        "stamps": "auto" if driver else "raw",
-        "color": _camera(color.camera) | _shutter(color.shutter) | {"offset_s": "auto" if driver else 0.0},
-        "depth": _camera(color.camera) | _shutter(depth.shutter) | warped,
-    }
-
-
-def _camera(camera: Camera) -> dict[str, Any]:
-    return {
-        "width": camera.width,
-        "height": camera.height,
-        "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
-        "model": camera.model,
-        "distortion": list(camera.distortion),
-    }
-
-
-def _shutter(shutter: Shutter) -> dict[str, Any]:
-    return {"readout_s": shutter.readout_s, "exposure_s": shutter.exposure_s, "scan": shutter.scan}
+    clock = ColorClock("auto", is_exact=False) if driver else ColorClock()
+    return camera_yaml(Cameras(*sensors, depth.depth_scale, sequence.T_color_depth), clock, is_registered=True)
 
 
 def _write(path: Path, lines: list[str]) -> None:

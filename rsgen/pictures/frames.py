@@ -50,7 +50,7 @@ def compare_frame(path: Path, frame: int, out: Path | None, scene: Path | None) 
     from rsgen.figures import save
     from rsgen.pictures.figures import comparison
 
-    sequence = read_sequence(path)
+    sequence = read_sequence(path).as_taken
     color, depth = (sequence.streams[name] for name in ("color", "depth"))
     for stream in (color, depth):
         if frame not in stream.indices:

@@ -18,6 +18,7 @@ from rsgen.console.progress import Progress, no_progress
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.spline import Spline
+from rsgen.produce.identity import fingerprint
 from rsgen.sensors.adaptation import Meter, Reading, Setting, reading
 from rsgen.sensors.color import apply_color_noise, apply_setting
 from rsgen.sensors.depth import apply_depth_noise
@@ -195,22 +196,22 @@ def make_integrator(mi: Any, scene: Any, config: Config, progress: Progress) -> 
         return mi.load_dict({"type": "path", "max_depth": light.max_depth})
     from rsgen.light.cache import baked_field, cache_folder
     from rsgen.render.baked import BakedIntegrator
-    from rsgen.render.scene import content_hash
 
-    file = config.scene.file
-    return BakedIntegrator(
-        baked_field(scene, content_hash(file), light, cache_folder(file), progress), glossy_spp=light.glossy_spp
-    )
+    field = baked_field(scene, surfaces_hash(config), light, cache_folder(config.scene.file), progress)
+    return BakedIntegrator(field, glossy_spp=light.glossy_spp)
 
 
 def load_scene(config: Config) -> Any:
-    """The config's Mitsuba scene. Raises UserError."""
+    """The config's Mitsuba scene, with its target if it has one. Raises UserError."""
     from rsgen.device.backend import mitsuba
 
     mitsuba(config.backend)
     from rsgen.render import scene
+    from rsgen.render.board import Board
 
-    return scene.load_scene(config.scene.file)
+    target = config.target
+    board = None if target is None else Board(target.grid, np.array(target.T_world_target, float))
+    return scene.load_scene(config.scene.file, board)
 
 
 def scene_hash(config: Config) -> str:
@@ -221,6 +222,12 @@ def scene_hash(config: Config) -> str:
     from rsgen.render.scene import content_hash
 
     return content_hash(config.scene.file)
+
+
+def surfaces_hash(config: Config) -> str:
+    """Hash of all that is lit: the scene, and its target if it has one. Raises UserError."""
+    scene, target = scene_hash(config), config.target
+    return scene if target is None else fingerprint({"scene": scene, "target": target.model_dump(mode="json")})
 
 
 def setting_of(config: Config, table: FrameTable | None, k: int) -> Setting | None:

@@ -8,11 +8,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from rsgen.array_types import FloatArray
 from rsgen.config.config import Config, StreamConfig
 from rsgen.errors import UserError
 from rsgen.files import is_temporary, read_yaml
 from rsgen.geometry.spline import Spline
+from rsgen.sequence.camera_yaml import Cameras
 from rsgen.sequence.format import CLEAN_COLOR, FORMAT, STREAMS
 
 
@@ -41,17 +44,17 @@ def describe(
 ) -> dict[str, Any]:
     """What sequence.yaml says. stamps: (n,) s of all frames of each stream."""
     registered = {"registered": True} if config.depth.registered else {}
+    color, depth = config.declared_color, config.declared_depth
     identity = {"config": config.content(), "inputs": dict(inputs), "versions": dict(versions)}
     return {
         "format": FORMAT,
         "name": config.name,
         "streams": {
-            "color": _stream_yaml(config.color, stamps["color"]),
-            "depth": _stream_yaml(config.depth, stamps["depth"])
-            | {"depth_scale": config.depth.depth_scale}
-            | registered,
+            "color": _stream_yaml(color, stamps["color"]),
+            "depth": _stream_yaml(depth, stamps["depth"]) | {"depth_scale": depth.depth_scale} | registered,
         },
-        "T_color_depth": [[float(value) for value in row] for row in config.T_color_depth],
+        "T_color_depth": [[float(value) for value in row] for row in config.declared_T_color_depth],
+        **({} if config.declared is None else {"declared": True}),
         "spline": {"knot_spacing_s": spline.dt, "t0_s": spline.t0, "control_points": len(spline.control_points)},
         "noise": noise_yaml(config),
         "truth": {name: list(channels) for name, channels in color_truth(config).items()},
@@ -59,6 +62,13 @@ def describe(
         **identity,
         "fingerprint": fingerprint(identity),
     }
+
+
+def true_cameras(config: Config) -> Cameras:
+    """The cameras that take the images, whatever `declared` says."""
+    color, depth = config.color, config.depth
+    T_color_depth = np.array(config.T_color_depth, float)
+    return Cameras(color.camera, color.shutter, depth.camera, depth.shutter, depth.depth_scale, T_color_depth)
 
 
 def color_truth(config: Config) -> dict[str, tuple[str, ...]]:

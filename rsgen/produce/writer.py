@@ -27,11 +27,12 @@ from rsgen.files import (
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
-from rsgen.produce.identity import color_truth, describe, refuse_foreign_folder
+from rsgen.produce.identity import color_truth, describe, refuse_foreign_folder, true_cameras
 from rsgen.sensors.adaptation import Setting
-from rsgen.sensors.driver import deliver
+from rsgen.sensors.driver import color_clock, deliver
 from rsgen.sensors.imu import sample_clock, simulate_imu, write_imu_csv
 from rsgen.sensors.mocap import reported_poses
+from rsgen.sequence.camera_yaml import TRUE_CAMERAS, camera_yaml
 from rsgen.sequence.format import (
     FOLDERS,
     FRAME_TABLES,
@@ -49,6 +50,7 @@ from rsgen.sequence.format import (
     round_stamps,
 )
 from rsgen.sequence.frame_table import FrameTable
+from rsgen.sequence.target_corners import TARGET_CORNERS, target_corners_text
 
 _SPLINE_TOLERANCE = 1e-9
 
@@ -246,10 +248,22 @@ class SequenceWriter:
             if stream.writes_table:
                 table = stream.table.of(np.flatnonzero(stream.is_delivered))
                 atomic_write(self.out / FRAME_TABLES[s], table.text().encode())
+        if self.config.declared is not None:
+            atomic_write(self.out / TRUE_CAMERAS, encode_yaml(self._true_cameras()))
+        if (target := self.config.target) is not None:
+            text = target_corners_text(target.grid, np.array(target.T_world_target, float))
+            atomic_write(self.out / TARGET_CORNERS, text.encode())
         if self.config.imu is not None:
             spline = self.spline
             samples = simulate_imu(spline, self.config.imu, spline.t_begin, spline.t_end, self.config.seed)
             write_imu_csv(self.out / "imu.csv", samples)
+
+    def _true_cameras(self) -> dict[str, Any]:
+        """Content of truth/cameras.yaml."""
+        config, listed = self.config, self.depth.table.listed_s[self.depth.is_delivered]
+        times = (float(t) for t in (self.color.stamps[0], self.depth.stamps[0], listed[len(listed) // 2]))
+        clock = color_clock(config.color.driver, config.depth.driver, *times)
+        return camera_yaml(true_cameras(config), clock, config.depth.registered)
 
     def _stream(self, stream: StreamName) -> _Stream:
         return self.color if stream == "color" else self.depth

@@ -14,6 +14,7 @@ import sys
 import tempfile
 from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import trimesh
@@ -22,6 +23,9 @@ from numpy.typing import NDArray
 from rsgen.array_types import Float32Array
 from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
+from rsgen.files import encode_png
+from rsgen.render.board import Board, drawing
+from rsgen.render.board import surface as board_surface
 
 log = logging.getLogger("rsgen")
 
@@ -30,19 +34,23 @@ _UNSUPPORTED = ("instance", "shapegroup", "sdfgrid", "bsplinecurve", "linearcurv
 _SEGMENTS = 96
 
 
-def load_scene(path: Path) -> Any:
+def load_scene(path: Path, board: Board | None = None) -> Any:
     """Mitsuba scene of the file at `path` (.xml, or a mesh that trimesh reads: grey, lit by a uniform sky).
 
-    Raises UserError, naming the file, if it is missing, unreadable, empty or of shapes that cannot become triangles.
+    board: to be put into it, as its last shape. Raises UserError, naming the file, if it is missing, unreadable, empty
+    or of shapes that cannot become triangles.
     """
     ensure_built(path)
     mi = mitsuba()
     with tempfile.TemporaryDirectory(prefix="rsgen-scene-") as scratch:
         try:
             if path.suffix.lower() == ".xml":
-                scene = _load_xml(mi, path, Path(scratch))
+                scene = _load_xml(mi, path, Path(scratch), board)
             else:
-                scene = mi.load_dict(_mesh_scene(path, Path(scratch)))
+                shapes = _mesh_scene(path, Path(scratch))
+                if board is not None:
+                    shapes["target"] = mi.load_string(_board_xml(board, Path(scratch)))
+                scene = mi.load_dict(shapes, optimize=board is None)  # else merged, and ordered by memory address
         except UserError:
             raise
         except Exception as error:  # Mitsuba and trimesh raise whatever their parsers do
@@ -115,11 +123,16 @@ def content_hash(path: Path) -> str:
     return digest.hexdigest()
 
 
-def _load_xml(mi: Any, path: Path, scratch: Path) -> Any:
+def _load_xml(mi: Any, path: Path, scratch: Path, board: Board | None) -> Any:
     config = mi.parser.ParserConfig(mi.variant())
     # Merging orders meshes by memory address: emitters and shapes would be numbered anew in each process.
     config.merge_meshes = False
-    state = mi.parser.parse_file(config, str(path.resolve()))
+    file = path.resolve()
+    if board is not None:
+        shape = _board_xml(board, scratch).replace(' version="3.0.0"', "")
+        file = scratch / "with_board.xml"
+        file.write_text(f"<scene version='3.0.0'><include filename={quoteattr(str(path.resolve()))}/>{shape}</scene>")
+    state = mi.parser.parse_file(config, str(file))
     for index, node in enumerate(state.nodes):
         if node.type != mi.ObjectType.Shape:
             continue
@@ -233,6 +246,27 @@ def ply_bytes(vertices: NDArray, faces: NDArray, normals: NDArray | None = None,
     face_rows["n"], face_rows["v"] = 3, faces
     data = np.concatenate(parts, axis=1).astype("<f4")
     return "\n".join(header).encode() + data.tobytes() + face_rows.tobytes()
+
+
+def _board_xml(board: Board, folder: Path) -> str:
+    """A Mitsuba <shape> of the board, matte, its back grey; its files go into `folder`."""
+    (folder / "board.ply").write_bytes(ply_bytes(*board_surface(board)))
+    (folder / "board.png").write_bytes(encode_png(np.repeat(drawing(board.grid)[..., None], 3, axis=2)))
+    return f"""\
+<shape version="3.0.0" type="ply" id="rsgen_target">
+  <string name="filename" value="{folder / "board.ply"}"/>
+  <bsdf type="twosided">
+    <bsdf type="diffuse">
+      <texture type="bitmap" name="reflectance">
+        <string name="filename" value="{folder / "board.png"}"/>
+        <string name="filter_type" value="nearest"/>
+        <boolean name="raw" value="true"/>
+      </texture>
+    </bsdf>
+    <bsdf type="diffuse"><rgb name="reflectance" value="0.5"/></bsdf>
+  </bsdf>
+</shape>
+"""
 
 
 def _mesh_scene(path: Path, scratch: Path) -> dict[str, Any]:

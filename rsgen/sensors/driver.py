@@ -9,6 +9,7 @@ import numpy as np
 from rsgen.array_types import BoolArray, FloatArray, IntArray
 from rsgen.config.driver import DriverConfig
 from rsgen.sensors.seed import driver_generator
+from rsgen.sequence.camera_yaml import ColorClock
 from rsgen.sequence.format import StreamName, round_stamps
 
 # Listings must rise; two images that arrive at once are stamped this far apart where no grid keeps them apart.
@@ -53,3 +54,21 @@ def deliver(stamps: FloatArray, config: DriverConfig | None, seed: int, stream: 
     # A repetition shows the last image that came itself.
     shows = np.maximum.accumulate(np.where(is_delivered & ~is_repeated, frames, 0))
     return Delivery(round_stamps(tick * step), np.where(is_delivered, shows, frames), is_delivered)
+
+
+def color_clock(
+    color: DriverConfig | None, depth: DriverConfig | None, color_first: float, depth_first: float, middle: float
+) -> ColorClock:
+    """What colour's listed stamps need, in the mean, to agree with depth's.
+
+    color_first, depth_first: true stamps in s of both streams' first frames; middle: the listed stamp of depth that it
+    holds at.
+    """
+    if color is None and depth is None:
+        return ColorClock()
+    color, depth = color or DriverConfig(), depth or DriverConfig()
+    color_rate, depth_rate = 1.0 + 1e-6 * color.drift_ppm, 1.0 + 1e-6 * depth.drift_ppm
+    # What colour's driver lists at `middle` was taken at t, when depth's would have listed `as_depth`.
+    t = color_first + (middle - color.offset_s - color_first) / color_rate
+    as_depth = depth_first + depth_rate * (t - depth_first) + depth.offset_s
+    return ColorClock(as_depth - middle, 1e6 * (depth_rate / color_rate - 1.0), is_exact=False)

@@ -93,6 +93,7 @@ class SequenceYaml(_Yaml):
     streams: _Streams
     T_color_depth: tuple[Vector4, Vector4, Vector4, Vector4]
     noise: Any = None
+    declared: bool = False  # cameras are what the sequence claims; truth/cameras.yaml has those that took the images
     truth: dict[Annotated[str, Field(pattern=r"^[a-z_]+$")], tuple[str, ...]] = {}
     fingerprint: str  # the file's last entry: one that was cut off has none
 

@@ -6,7 +6,7 @@ z, rows = sequence.depth(0), sequence.rows("depth")[0]     # metres (h, w); T_wo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rsgen.limits import rigid
+from rsgen.sequence.camera_yaml import TRUE_CAMERAS, read_true_cameras
 from rsgen.sequence.format import (
     FRAME_TABLES,
     LISTINGS,
@@ -76,6 +77,7 @@ class Stream:
 class Sequence:
     """A sequence on disk. T_color_depth (4, 4); `spline` is T_world_depth(t); `meta` is sequence.yaml as it is.
 
+    Cameras are as sequence.yaml declares them; where that is wrong on purpose, `as_taken` has the true ones.
     Frames are counted as listed: k-th line of rgb.txt or depth.txt. Every reading method raises UserError naming the
     file if it is missing, damaged or of another size than sequence.yaml says.
     """
@@ -96,6 +98,20 @@ class Sequence:
     def T_image_depth(self) -> FloatArray:
         """(4, 4) from the depth sensor's coordinates to those of the camera of the images in depth/."""
         return self.T_color_depth if self.streams["depth"].registered else np.eye(4)
+
+    @cached_property
+    def as_taken(self) -> Sequence:
+        """The sequence with the cameras that took it: itself, unless others are declared. Raises UserError."""
+        if not self.meta.get("declared"):
+            return self
+        true = read_true_cameras(self.root)
+        streams: dict[StreamName, Stream] = {
+            "color": replace(self.streams["color"], camera=true.color, shutter=true.color_shutter),
+            "depth": replace(
+                self.streams["depth"], camera=true.depth, shutter=true.depth_shutter, depth_scale=true.depth_scale
+            ),
+        }
+        return replace(self, streams=streams, T_color_depth=true.T_color_depth, meta=self.meta | {"declared": False})
 
     @cached_property
     def _rows(self) -> dict[StreamName, FloatArray]:
@@ -210,6 +226,8 @@ def sequence_info(path: Path) -> str:
     p_world = knots.pose(np.clip(times, knots.t_begin, knots.t_end))[:, :3, 3]
     length = np.linalg.norm(np.diff(p_world, axis=0), axis=1).sum()
     size = sum(file.stat().st_size for file in sequence.root.rglob("*") if file.is_file())
+    if sequence.meta.get("declared"):
+        rows.append(("declared", f"cameras are claims, not the truth, which {TRUE_CAMERAS} has"))
     rows += [
         ("duration", f"{last - first:.3f} s"),
         ("trajectory", f"{length:.3f} m, {len(knots.control_points)} control points every {knots.dt * 1000:g} ms"),

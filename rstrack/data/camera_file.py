@@ -50,8 +50,9 @@ class RigFile:
     """The cameras, the depth images' units per metre, and what is to be done with the stamps.
 
     depth_offset_s: to be added to depth's stamps, so that they belong to the first row of the image as it is.
-    color_offset_s: to be added to colour's; None: to be found. color_drift: what that grows by, s/s. scan_named:
-    whether it says which way images are read. notes: what was assumed, for the screen. depth_error: of its images.
+    color_offset_s: to be added to colour's; None: to be found. color_drift: what that grows by, s/s. scan_named,
+    scale_named: whether it says which way images are read, and depth_scale. notes: what was assumed, for the screen.
+    depth_error: of its images.
     """
 
     rig: Rig
@@ -61,6 +62,7 @@ class RigFile:
     color_offset_s: float | None = None
     color_drift: float = 0.0
     scan_named: bool = True
+    scale_named: bool = True
     notes: tuple[str, ...] = ()
     depth_error: DepthError = NONE
 
@@ -138,7 +140,7 @@ def read_rig(path: Path, color_size: Size, depth_size: Size) -> RigFile:
     text = read_text(path)
     if is_opencv(text):
         rig, depth_scale = read_opencv_rig(path, text, color_size, depth_size)
-        return RigFile(rig, DEPTH_SCALE if depth_scale is None else depth_scale)
+        return RigFile(rig, depth_scale or DEPTH_SCALE, scale_named=depth_scale is not None)
     try:
         data = _CameraYaml.model_validate(read_yaml(path))
     except ValidationError as error:
@@ -163,6 +165,7 @@ def read_rig(path: Path, color_size: Size, depth_size: Size) -> RigFile:
         None if data.color.offset_s == "auto" else data.color.offset_s,
         1e-6 * data.color.drift_ppm,
         any("scan" in stream.model_fields_set for stream in (data.color, depth) if stream is not None),
+        depth is not None and "depth_scale" in depth.model_fields_set,
         notes,
         NONE if depth is None else DepthError(**depth.error.model_dump()),
     )

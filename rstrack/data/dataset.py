@@ -23,7 +23,7 @@ from rsgen.sequence.reader import Sequence, read_sequence
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.camera_file import read_rig
 from rstrack.data.depth_error import NONE, DepthError
-from rstrack.data.generated import as_recorded, is_exact
+from rstrack.data.generated import as_recorded, is_exact, with_depth_scale
 from rstrack.data.noise import ImageReader
 from rstrack.data.prefetch import prefetched
 from rstrack.data.rig import Frame, Image, Rig
@@ -186,6 +186,9 @@ def _seen_as(dataset: Dataset, camera_file: Path) -> Dataset:
     seen = replace(
         dataset, rig=file.rig, notes=notes, scan_named=file.scan_named, timing=timing, depth_error=file.depth_error
     )
+    if file.scale_named and isinstance(dataset.images, Sequence):
+        scaled = with_depth_scale(dataset.images, file.depth_scale)
+        seen = replace(seen, images=scaled, depth_scale=file.depth_scale)
     if file.color_offset_s is None:
         return replace(seen, color_drift=file.color_drift)
     return seen.with_color_offset(file.color_offset_s, drift=file.color_drift)
@@ -199,7 +202,10 @@ def _of_generated(root: Path, sequence: Sequence) -> Dataset:
     rig = Rig(depth.camera, depth.shutter, color.camera, color.shutter, sequence.T_color_depth)
     groups = group_colors(depth.stamps, color.stamps)
     stamps = (depth.stamps, color.stamps)
-    return Dataset(sequence.name, root, rig, *stamps, groups, sequence, truth=sequence.spline, sequence=sequence)
+    return Dataset(
+        sequence.name, root, rig, *stamps, groups, sequence, truth=sequence.spline, sequence=sequence,
+        depth_scale=depth.depth_scale,
+    )  # fmt: skip
 
 
 def _of_recorded(root: Path, sequence: Sequence) -> Dataset:
@@ -212,7 +218,7 @@ def _of_recorded(root: Path, sequence: Sequence) -> Dataset:
     groups = group_colors(stamps, color_stamps)
     return Dataset(
         sequence.name, root, found.rig, stamps, color_stamps, groups, sequence, truth_poses=found.truth_poses,
-        timing=found.timing,
+        timing=found.timing, depth_scale=sequence.streams["depth"].depth_scale,
     )  # fmt: skip
 
 

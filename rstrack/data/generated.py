@@ -2,12 +2,13 @@
 
 Where a sequence's listed stamps are a driver's, or its depth is registered, it is a recording like any other: cameras
 as sequence.yaml tells them, stamps that are arrival times (`rstrack.data.timing`), colour's offset not known. Its truth
-is the pose of each depth frame when it was taken, under the stamp at which it is tracked.
+is the pose of each depth frame when it was taken, under the stamp at which it is tracked. Cameras that are declared
+wrong on purpose are given as they are declared; the truth is that of the cameras that took the images.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -34,6 +35,12 @@ def is_exact(sequence: Sequence) -> bool:
     return not any(s.registered or (s.listed != s.stamps).any() for s in streams)
 
 
+def with_depth_scale(sequence: Sequence, depth_scale: float) -> Sequence:
+    """The sequence with its depth images read at so many units per metre."""
+    depth = replace(sequence.streams["depth"], depth_scale=depth_scale)
+    return replace(sequence, streams=sequence.streams | {"depth": depth})
+
+
 def as_recorded(sequence: Sequence) -> Recorded:
     """The sequence as a recording. Raises UserError where registered depth's rows have no order."""
     color, depth = sequence.streams["color"], sequence.streams["depth"]
@@ -51,5 +58,5 @@ def as_recorded(sequence: Sequence) -> Recorded:
         None if has_driver else 0.0,
     )
     T_world_depth = sequence.spline.pose(np.clip(depth.stamps + late_s, sequence.spline.t_begin, sequence.spline.t_end))
-    poses = T_world_depth @ se3.inverse(sequence.T_image_depth)
+    poses = T_world_depth @ se3.inverse(sequence.as_taken.T_image_depth)
     return Recorded(rig, timing, Trajectory(timing.depth.used, poses))

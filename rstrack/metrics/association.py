@@ -60,7 +60,11 @@ def truth_of(dataset: Dataset) -> Truth | None:
     motion = dataset.truth if dataset.truth is not None else dataset.truth_poses
     if motion is None:
         return None
-    return Truth(motion, dataset.stamps, dataset.rig.depth_camera, dataset.rig.depth_shutter)
+    camera, shutter = dataset.rig.depth_camera, dataset.rig.depth_shutter
+    if dataset.sequence is not None:
+        true = dataset.sequence.as_taken.streams["depth"]
+        camera, shutter = true.camera, true.shutter
+    return Truth(motion, dataset.stamps, camera, shutter)
 
 
 @dataclass(frozen=True)

@@ -144,7 +144,7 @@ def seen_surface(sequence: Sequence) -> FloatArray:
 
     Exact: true depth, back-projected with the true pose of each line. Raises UserError as `rsgen.sequence.reader` does.
     """
-    stream = sequence.streams["depth"]
+    stream = sequence.as_taken.streams["depth"]
     uv = stream.camera.pixel_grid()
     rays = np.nan_to_num(stream.camera.unproject(uv))
     pick = slice(None, None, _STRIDE), slice(None, None, _STRIDE)

@@ -58,6 +58,9 @@ TRUTH = {
     "blur_length": True,
     "color_depth": True,
 }
+_POSE = np.eye(4).tolist()
+_SAID = {"intrinsics": [36.0, 36.0, 23.5, 17.5], "model": "fisheye", "distortion": [0.0, 0.0, 0.0, 0.0]}
+_SAID |= {"readout_s": 0.01, "exposure_s": 0.002, "scan": "bottom-top"}
 _PACE = {"length_m": 0.6, "mean_speed_m_s": 0.3, "mean_rotation_deg_s": 8.0, "ramp_s": 0.4, "clearance_m": 0.05}
 LINE = _PACE | {"kind": "line", "position": [0.1, 0.2, -0.5], "target": [0.0, 0.1, 1.0], "strokes": 2}
 _AT = {"target": [0.0, 0.1, 1.0]}
@@ -93,6 +96,8 @@ def base_config(motion: dict[str, Any] | None = None) -> dict[str, Any]:
         "truth": TRUTH,
         "imu": {},
         "mocap": {},
+        "target": {"T_world_target": _POSE},
+        "declared": {"color": _SAID, "depth": _SAID | {"depth_scale": 5000.0}, "T_color_depth": _POSE},
     }
     data |= {"motion": motion} if motion else {"trajectory": {"file": "motion.txt"}}
     every: dict[str, Any] = Config.model_validate(data).model_dump(mode="json")
