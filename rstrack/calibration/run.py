@@ -26,11 +26,12 @@ from rstrack.calibration.known import Known
 from rstrack.calibration.load import load_stretch, pair_terms
 from rstrack.calibration.pace import pace_of
 from rstrack.calibration.pair_terms import PairTerms
-from rstrack.calibration.parameters import COLOR_LENS, COUNT, DEPTH_LENS, DRIFT, GROUPS, USEFUL, Parameters, free_of
+from rstrack.calibration.parameters import COLOR_LENS, COUNT, DEPTH_LENS, DRIFT, GROUPS, Parameters, free_of
 from rstrack.calibration.residuals import residuals_at, residuals_now, some_of
 from rstrack.calibration.result import Calibration, motion_of
 from rstrack.calibration.solve import Solution, solve
 from rstrack.calibration.stretch import Stretch
+from rstrack.calibration.trust import trust_in
 from rstrack.data.dataset import Dataset
 from rstrack.options import Options
 from rstrack.tracking.color_offset import estimate_color_offset
@@ -44,6 +45,8 @@ _SEVERAL = 6
 # Part of the largest σ, over what is of use, from which on parameters are held together.
 _DRAGS = 0.5
 _LEVELS = (2, 1, 0)
+# See `trust_in`: 0.83 to 0.99 where there is something to see, with a Kinect's noise too, below 0.3 on bare walls.
+_TRUST = 0.5
 # Ways in which images may be read, and stretches with which they are tried.
 _AXES: tuple[Scan, ...] = ("top-bottom", "left-right")
 _TRIED = 4
@@ -87,6 +90,11 @@ def calibrate(
     residuals = residuals_at(looked_at, terms, start)
     known = before = replace(before, values=start)
     solution, drifts = _solved(stretches, terms, known, free, progress)
+    if solution.finished:
+        kept = _trusted(dataset, stretches, terms, solution.values)
+        if len(kept) < len(parts):
+            parts, stretches = [parts[k] for k in kept], [stretches[k] for k in kept]
+            solution, drifts = _solved(stretches, terms, known, free, progress)
     contradicted = known.contradicted(solution.values, solution.sigmas)
     if solution.finished and contradicted.any():
         known = known.without(contradicted)
@@ -173,7 +181,7 @@ def _solved(
     while True:
         solution = solve(stretches, terms, start, free, levels, watch, known)
         sigmas = solution.sigmas
-        unsure, drift = sigmas / USEFUL, abs(solution.values.color_drift - file.color_drift)
+        unsure, drift = solution.unsure, abs(solution.values.color_drift - file.color_drift)
         if solution.finished and unsure.max() > 1.0:
             # What is told least drags others along: they may be told once it is held.
             free = free & (unsure <= max(1.0, _DRAGS * unsure.max()))
@@ -184,6 +192,17 @@ def _solved(
             return solution, drifts
         start = file.moved(np.where(free, solution.values.since(file), 0.0))
         levels = (0,)
+
+
+def _trusted(dataset: Dataset, stretches: Sequence[Stretch], terms: PairTerms, p: Parameters) -> list[int]:
+    """Those stretches (counted from 0) of whose motion more is known than noise makes up. Raises UserError: too few."""
+    kept = [k for k, stretch in enumerate(stretches) if trust_in(stretch, terms, p) > _TRUST]
+    if len(kept) < _FEWEST:
+        raise UserError(
+            f"{dataset.root}: in {len(stretches) - len(kept)} of {len(stretches)} stretches what seems to be known of "
+            "the motion is noise: choose --frames with more shape and print, or a --camera that is less far off"
+        )
+    return kept
 
 
 def _stretches(dataset: Dataset, chosen: range, track: Track) -> list[range]:

@@ -12,7 +12,7 @@ from rsgen.array_types import BoolArray, FloatArray
 from rstrack.alignment.acceleration import Acceleration
 from rstrack.calibration.known import Known
 from rstrack.calibration.pair_terms import PairTerms
-from rstrack.calibration.parameters import COUNT, DEPTH, PRIOR, Parameters
+from rstrack.calibration.parameters import COUNT, DEPTH, DRIFT, PRIOR, USEFUL, Parameters
 from rstrack.calibration.stretch import Stretch, Sums
 
 # Steps at most on the pyramid's levels, finest first, and part of the formal σ that ends a level.
@@ -26,6 +26,11 @@ _POOLED = 4.0
 _BLIND_PX = 0.08
 # And of colour's offset in one part of a recording against another, s.
 _BLIND_S = 3e-5
+# By how much of their noise residuals must move for a useful change of a parameter: see `Solution.unsure`. Made-up
+# clocks had up to 0.0067 (still, sliding and evenly turning cameras), true ones 0.009 and more; no made-up extrinsics
+# were seen above a thousandth.
+_MOVES = np.full(COUNT, 0.0015)
+_MOVES[:DRIFT] = 0.0075
 # Times that the scales of errors are estimated before the first step of a level; once at the finest.
 _ROUNDS = 3
 
@@ -39,7 +44,7 @@ class Solution:
 
     cost: negative log-likelihood a pixel. sigma_depth_m, sigma_intensity: of the residuals, medians. last_step (29,):
     the last one that was taken. blind (29,): σ of what no scatter shows. finished: nobody interrupted it. known (29,):
-    σ of what was known beforehand, infinite where nothing was.
+    σ of what was known beforehand, infinite where nothing was. pixels: that were compared.
     """
 
     values: Parameters
@@ -53,6 +58,7 @@ class Solution:
     blind: FloatArray = field(default_factory=lambda: np.zeros(COUNT))
     finished: bool = True
     known: FloatArray = field(default_factory=lambda: np.full(COUNT, np.inf))
+    pixels: int = 1
 
     @property
     def is_settled(self) -> bool:
@@ -83,6 +89,20 @@ class Solution:
         borrowed = np.sqrt(inverse**2 @ (_COUNTED * lent))
         sigmas[self.free] = np.hypot(np.hypot(factor * np.sqrt(formal * inflation), borrowed), self.blind[self.free])
         return sigmas
+
+    @property
+    def unsure(self) -> FloatArray:
+        """How much less sure the parameters (29,) are than is of use: above 1 they are not told; 0 of what is not free.
+
+        By σ, and by how far a change that is just of use would move residuals, in the mean over pixels and with all
+        else moved to make up for it: what moves them by less than a hundredth of their noise is at the mercy of a
+        hundred small errors of interpolation, which no scatter shows.
+        """
+        unsure, sigmas = np.zeros(COUNT), self.sigmas
+        formal = np.diag(np.linalg.pinv(self.A.sum(axis=0), hermitian=True))
+        moved = USEFUL[self.free] / np.sqrt(np.maximum(formal, 1e-30) * self.pixels)
+        unsure[self.free] = np.where(np.isfinite(self.known[self.free]), 0.0, _MOVES[self.free] / moved)
+        return np.maximum(unsure, sigmas / USEFUL)
 
     @property
     def shares(self) -> FloatArray:
@@ -126,10 +146,11 @@ def solve(
     reduced = [one.reduced() for one in sums]
     A = np.array([one[np.ix_(free, free)] for one, _ in reduced])
     depth, intensity = np.median([stretch.sigma for stretch in stretches], axis=0)
-    cost = sum(one.cost for one in sums) / max(1, sum(one.pixels for one in sums))
+    pixels = max(1, sum(one.pixels for one in sums))
+    cost = sum(one.cost for one in sums) / pixels
     b = np.array([one[free] for _, one in reduced])
     blind = _blind(stretches, terms)
-    return Solution(p, free, A, b, cost, float(depth), float(intensity), step, blind, finished, known.sigmas)
+    return Solution(p, free, A, b, cost, float(depth), float(intensity), step, blind, finished, known.sigmas, pixels)
 
 
 def _blind(stretches: Sequence[Stretch], terms: PairTerms) -> FloatArray:

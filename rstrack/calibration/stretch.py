@@ -194,7 +194,7 @@ def _system(
     own = sums.columns
     if own is None:
         return H, g
-    coupling = flat.T @ own.coupling[used].reshape(len(flat), -1) / sigma**2
+    coupling = flat.T @ own.coupling[used].reshape(len(flat), len(own.g)) / sigma**2
     return np.block([[H, coupling], [coupling.T, own.H / sigma**2]]), np.concatenate([g, own.g / sigma])
 
 
