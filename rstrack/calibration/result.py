@@ -40,7 +40,10 @@ _SHOWN = (
     ("depth readout", "ms", 1e3), ("colour readout", "ms", 1e3), ("colour offset", "ms", 1e3),
     ("colour drift", "ppm", 1e6), *((f"colour from depth, {axis}", "mm", 1e3) for axis in "xyz"),
     *((f"colour from depth, about {axis}", "deg", float(np.degrees(1.0))) for axis in "xyz"),
-    *((f"{camera} {name}", "px" if name[0] in "fc" else "", 1.0) for camera in ("depth", "colour") for name in LENS),
+    *(
+        (f"{camera} {name}", *(("px", 1.0) if name[0] in "fc" else ("1e-3", 1e3)))
+        for camera in ("depth", "colour") for name in LENS
+    ),
     ("depth offset", "mm", 1e3), ("depth inverse offset", "1/km", 1e3), ("depth radial", "1/km", 1e3),
 )  # fmt: skip
 # What each needs to be told.

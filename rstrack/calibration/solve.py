@@ -16,7 +16,7 @@ from rstrack.calibration.parameters import COUNT, DEPTH, DRIFT, PRIOR, USEFUL, P
 from rstrack.calibration.stretch import Stretch, Sums
 
 # Steps at most on the pyramid's levels, finest first, and part of the formal σ that ends a level.
-_MOST_STEPS, _SMALL = (8, 10, 15), (1.0, 5.0, 10.0)
+_MOST_STEPS, _SMALL = (14, 10, 15), (1.0, 5.0, 10.0)
 # About how many times too large the normal equations' information is: a frame counts in several pairs, and pixels are
 # not independent. For the prior's share only; what is said of σ is measured.
 _COUNTED = 25.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ import pytest
 import scipy.optimize
 import synthetic
 
+from rsgen.array_types import ByteArray, Float32Array
 from rsgen.device.arrays import engine
 from rsgen.device.lens import Lens
 from rsgen.device.projection import project
@@ -45,10 +46,11 @@ from rstrack.calibration.residuals import Residuals, extrapolated, residuals_at,
 from rstrack.calibration.result import Calibration
 from rstrack.calibration.run import calibrate, parameters_of
 from rstrack.calibration.solve import Solution, solve
+from rstrack.calibration.trust import trust_in
 from rstrack.cli.main import main
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.depth_error import DepthError
-from rstrack.data.noise import NoisyImages, with_noise
+from rstrack.data.noise import ImageReader, NoisyImages, with_noise
 from rstrack.data.timing import Timing, stream_timing
 from rstrack.options import Options
 
@@ -79,6 +81,21 @@ def recording(root: Path, spline: Spline, readout_s: float = READOUT_S, scan: Sc
 @pytest.fixture(scope="module")
 def shaken(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return recording(tmp_path_factory.mktemp("calibration") / "seq", shaking())
+
+
+@dataclass(frozen=True)
+class FaultyDepth:
+    """Images of which depth is what such an error makes of it."""
+
+    images: ImageReader
+    error: DepthError
+    camera: Camera
+
+    def color(self, k: int) -> ByteArray:
+        return self.images.color(k)
+
+    def depth(self, k: int) -> Float32Array:
+        return self.error.corrected(self.images.depth(k), self.camera)
 
 
 def bent(dataset: Dataset) -> Dataset:
@@ -230,6 +247,24 @@ def test_wrong_cameras_are_put_right(shaken: Dataset, factor: float, late_s: flo
     assert "±" in found.text() and "undetermined" not in found.text()
 
 
+def test_a_lens_and_depth_are_put_right(shaken: Dataset) -> None:
+    rig, color = shaken.rig, shaken.rig.color_camera
+    lens = replace(color, fx=1.02 * color.fx, fy=0.99 * color.fy, cx=color.cx + 1.5, cy=color.cy - 1.0)
+    images = FaultyDepth(shaken.images, DepthError(-0.02), rig.depth_camera)
+    wrong = replace(shaken, images=images, rig=replace(rig, color_camera=lens))
+    found = calibrate(wrong, ("intrinsics", "depth"), options=OPTIONS)
+    made = found.calibrated()
+    for name in ("fx", "fy", "cx", "cy"):
+        assert getattr(made.rig.color_camera, name) == pytest.approx(getattr(color, name), abs=0.15), name
+        depth = getattr(made.rig.depth_camera, name), getattr(rig.depth_camera, name)
+        assert depth[0] == pytest.approx(depth[1], abs=0.1), name
+    assert made.rig.color_camera.distortion == pytest.approx((0.0,) * 5, abs=8e-3)
+    np.testing.assert_allclose(made.depth(30), shaken.depth(30), atol=4e-3)
+    assert found.values.error.offset_m == pytest.approx(0.02, abs=1e-3)
+    text = found.text()
+    assert "colour fx" in text and "depth offset" in text and "depth's scale cannot be told" in text
+
+
 def test_lines_that_are_read_the_other_way_are_seen_to_be(tmp_path: Path) -> None:
     upward = recording(tmp_path / "seq", shaking(), scan="bottom-top")
     found = calibrate(told(upward, 0.004, 0.0, np.zeros(6)), options=OPTIONS)
@@ -261,12 +296,47 @@ def test_a_camera_at_rest_tells_nothing_and_that_is_said(tmp_path: Path, capsys:
     spline = shaking()
     still = Spline(np.broadcast_to(CORNER, spline.control_points.shape).copy(), spline.t0, spline.dt)
     rest = recording(tmp_path / "seq", still)
-    found = calibrate(rest, options=OPTIONS)
+    # Noise is not taken for motion either.
+    noisy = replace(rest, images=NoisyImages(rest.images, 1.2e-3, 0.01, 1))
+    found = calibrate(noisy, frames=slice(0, 42), options=OPTIONS)
     assert found.undetermined[found.asked].all()
     assert found.values.since(found.start) == pytest.approx(np.zeros(COUNT), abs=1e-12)
-    assert "undetermined: needs turning" in found.text() and "turns at 0.0 deg/s" in found.text()
-    assert main(["calibrate", str(tmp_path / "seq"), "--quiet", "--backend", "llvm"]) == 1
+    assert "undetermined: needs turning" in found.text() and "this recording moves at" in found.text()
+    assert main(["calibrate", str(tmp_path / "seq"), "--frames", "0:42", "--quiet", "--backend", "llvm"]) == 1
     assert "undetermined" in capsys.readouterr().out
+
+
+def test_a_bare_wall_is_told_from_a_room(shaken: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def grey(*_: object) -> ByteArray:
+        return np.full((120, 160, 3), 127, np.uint8)
+
+    monkeypatch.setattr(synthetic, "BALL", np.array([0.35, 0.25, -30.0]))
+    monkeypatch.setattr(synthetic, "render_color", grey)
+    base = shaking()
+    wall = se3.exp(np.array([0.0, 0.0, 1.0, 0.05, 0.1, 0.0])) @ se3.inverse(CORNER) @ base.control_points
+    bare = recording(tmp_path / "wall", Spline(wall, base.t0, base.dt))
+    trusts = []
+    for dataset in (shaken, bare):
+        noisy = replace(dataset, images=NoisyImages(dataset.images, 1.2e-3, 0.01, 1))
+        terms, p = pair_terms(engine("llvm"), noisy), parameters_of(noisy)
+        assert dataset.truth is not None
+        stretch = load_stretch(terms, noisy, range(10, 24), dataset.truth, p, OPTIONS)
+        for _ in range(3):
+            stretch.sums(terms, p, 0)
+        trusts.append(trust_in(stretch, terms, p))
+    assert trusts[0] > 0.8 and trusts[1] < 0.3
+    monkeypatch.setattr(calibration_run, "trust_in", lambda *_: 0.1)
+    with pytest.raises(UserError, match="4 of 4 stretches what seems to be known of the motion is noise"):
+        calibrate(shaken, ("readout",), options=OPTIONS)
+
+
+def test_what_residuals_hardly_feel_is_not_told() -> None:
+    free, p = np.arange(COUNT) < 2, Parameters(0.02, 0.02, 0.0, 0.0, np.eye(4))
+    A = np.array([np.diag([4e8, 4e8])] * 3)
+    # Three times 10⁷ pixels: a useful change of 2 ms moves residuals by 0.07 of their noise, or by 0.002.
+    few, many = (Solution(p, free, A, np.zeros((3, 2)), 0.0, 1e-3, 1e-2, pixels=n) for n in (10**6, 10**9))
+    assert (few.unsure[:2] < 1.0).all() and (many.unsure[:2] > 1.0).all() and not many.unsure[2:].any()
+    assert few.sigmas == pytest.approx(many.sigmas)
 
 
 def test_too_little_to_go_by_is_said_in_one_line(shaken: Dataset) -> None:
