@@ -44,7 +44,8 @@ _DRIFT_S = 4.0
 _SEVERAL = 6
 # Part of the largest σ, over what is of use, from which on parameters are held together.
 _DRAGS = 0.5
-_LEVELS = (2, 1, 0)
+# Levels of the pyramid, coarse ones first.
+_COARSE, _FINE = (2, 1), (0,)
 # See `trust_in`: 0.83 to 0.99 where there is something to see, with a Kinect's noise too, below 0.3 on bare walls.
 _TRUST = 0.5
 # Ways in which images may be read, and stretches with which they are tried.
@@ -52,6 +53,8 @@ _AXES: tuple[Scan, ...] = ("top-bottom", "left-right")
 _TRIED = 4
 # Unknowns of a lens that are its distortion, of radial-tangential ones.
 _COEFFICIENTS = 4
+# By how much the solution with other knots, of which half counts, may end earlier.
+_ROUGHLY = 3.0
 # For the progress bar.
 _ABOUT_STEPS = 20
 
@@ -138,7 +141,7 @@ def _oriented(
         shutters = [replace(shutter, scan=scan) for shutter in (rig.depth_shutter, rig.color_shutter)]
         turned = replace(dataset, rig=replace(rig, depth_shutter=shutters[0], color_shutter=shutters[1]))
         terms, stretches = _loaded(turned, few, track, start, free, options, no_progress)
-        found.append((solve(stretches, terms, start, free, _LEVELS[:-1]).cost, turned))
+        found.append((solve(stretches, terms, start, free, _COARSE).cost, turned))
     progress("scan direction", 1.0, "")
     return min(found, key=lambda each: each[0])[1]
 
@@ -169,9 +172,9 @@ def _solved(
     """From the known values on: with all that may change, then without what this recording turns out not to tell.
 
     And whether colour's clock may drift: one that is within its error of the file's is held there, since it would take
-    colour away at both ends of the recording.
+    colour away at both ends of the recording. What else is told only the finest level says.
     """
-    levels: Sequence[int] = _LEVELS
+    levels: tuple[int, ...] = _COARSE
     file = known.values
     start, done, drifts = file, 0, True
 
@@ -185,15 +188,14 @@ def _solved(
         solution = solve(stretches, terms, start, free, levels, watch, known)
         sigmas = solution.sigmas
         unsure, drift = solution.unsure, abs(solution.values.color_drift - file.color_drift)
-        if solution.finished and unsure.max() > 1.0:
+        if solution.finished and free[DRIFT] and drift < 2.0 * sigmas[DRIFT]:
+            drifts, free = False, free & (np.arange(COUNT) != DRIFT)
+        elif solution.finished and levels == _FINE and unsure.max() > 1.0:
             # What is told least drags others along: they may be told once it is held.
             free = free & (unsure <= max(1.0, _DRAGS * unsure.max()))
-        elif solution.finished and free[DRIFT] and drift < 2.0 * sigmas[DRIFT]:
-            drifts, free = False, free & (np.arange(COUNT) != DRIFT)
-        else:
+        elif not solution.finished or levels == _FINE:
             return solution, drifts
-        start = file.moved(np.where(free, solution.values.since(file), 0.0))
-        levels = (0,)
+        start, levels = file.moved(np.where(free, solution.values.since(file), 0.0)), _FINE
 
 
 def _at_other_knots(
@@ -214,7 +216,7 @@ def _at_other_knots(
         progress("calibrating", 0.9, f"with other knots, step {n + 1}")
 
     later = [shifted(each) for each in stretches]
-    other = solve(later, terms, solution.values, solution.free, (0,), watch, known)
+    other = solve(later, terms, solution.values, solution.free, _FINE, watch, known, _ROUGHLY)
     if not other.finished:
         return replace(solution, finished=False)
     half = 0.5 * other.values.since(solution.values)

@@ -115,13 +115,14 @@ class Solution:
 
 def solve(
     stretches: Sequence[Stretch], terms: PairTerms, start: Parameters, free: BoolArray, levels: Sequence[int],
-    watch: Watch = lambda *_: None, known: Known | None = None,
+    watch: Watch = lambda *_: None, known: Known | None = None, ends: float = 1.0,
 ) -> Solution:  # fmt: skip
     """Parameters and all control points jointly, coarse to fine; the stretches' splines are moved.
 
     free (29,): which parameters may change; the others stay at `start`, to which weak ones are held by PRIOR, and to
-    what is `known` as firmly as that is. Where `watch` raises KeyboardInterrupt, what has been found so far is
-    returned, `finished` False. Raises numpy.linalg.LinAlgError where images say nothing at all.
+    what is `known` as firmly as that is. ends: steps so many times larger than usual end a level. Where `watch` raises
+    KeyboardInterrupt, what has been found so far is returned, `finished` False. Raises numpy.linalg.LinAlgError where
+    images say nothing at all.
     """
     known = known or Known.nothing(start)
     p, acceleration, finished, step = start, Acceleration(), True, np.zeros(COUNT)
@@ -138,7 +139,7 @@ def solve(
                 for stretch, one in zip(stretches, sums, strict=True):
                     stretch.move(one.points_step(step))
                 p = p.moved(step)
-                if (step[free] ** 2 * np.diag(information) < _SMALL[level] ** 2).all():
+                if (step[free] ** 2 * np.diag(information) < (ends * _SMALL[level]) ** 2).all():
                     break
     except KeyboardInterrupt:
         finished = False

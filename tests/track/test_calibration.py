@@ -541,7 +541,7 @@ def test_known_values_draw_a_solution_by_as_much_as_they_weigh(shaken: Dataset) 
 
 
 def test_a_device_that_the_recording_contradicts_is_left_out(shaken: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(calibration_run, "_LEVELS", (1,))
+    monkeypatch.setattr(calibration_run, "_COARSE", (1,))
     wrong = told(shaken, 0.01, 0.0, np.zeros(6))
     stream = Stream("global", "made up", "https://example.org", 0.0, 1e-4)
     device = Device("made-up", "Made up", stream, stream)
