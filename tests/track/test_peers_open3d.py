@@ -108,8 +108,8 @@ def test_depth_takes_the_colour_image_that_is_nearest_in_time(tmp_path: Path) ->
     def read(name: str, value: Any) -> Callable[[int], Any]:
         return lambda k: (asked.append((name, k)), value)[1]
 
-    images = SimpleNamespace(depth=read("depth", np.ones((24, 32), np.float32)), color=read("color", None))
-    fake = SimpleNamespace(images=images, stamps=dataset.stamps, color_stamps=dataset.color_stamps)
+    images, depth = SimpleNamespace(color=read("color", None)), read("depth", np.ones((24, 32), np.float32))
+    fake = SimpleNamespace(images=images, depth=depth, stamps=dataset.stamps, color_stamps=dataset.color_stamps)
     for k in range(4):
         registered_image(fake, lambda depth, color: RegisteredImage(depth, color), k)  # type: ignore[arg-type]
     assert [k for name, k in asked if name == "color"] == [0, 0, 1, 2]  # 20 ms late: nearer to the next depth image
