@@ -165,5 +165,5 @@ def units(names: Sequence[str], median_depth: float) -> FloatArray:
 
 
 def error_table(error: DepthError) -> FloatArray:
-    """What `corrected` takes (3,)."""
+    """What `without_error` takes (3,)."""
     return np.array([error.offset_m, error.inverse_offset, error.radial])

@@ -52,7 +52,7 @@ from rstrack.keyframes.keyframe import depth_scaling, strides, surface_bends, su
 # Part of the width over which inverse depth is averaged, to either side.
 _WINDOW = 1.0 / 160.0
 # Gates: residuals beyond are outliers for certain, in σ (depth) and intensity; and smallest credible σ (m, intensity).
-_GATE_SIGMAS, _GATE_INTENSITY = 5.0, 0.3
+GATE_SIGMAS, GATE_INTENSITY = 5.0, 0.3
 FLOOR_DEPTH, FLOOR_INTENSITY = 2e-4, 1.0 / 255.0
 # Part of σ by which the averaging may have bent a pixel's surface.
 _SMOOTH = 0.25
@@ -267,7 +267,7 @@ class PairTerms:
         e, camera, asked = self.e, self.depth.camera, self.asked
         stride = strides(camera.width, camera.height)[level]
         scaling = self._scaling(surface.median_depth, surface.bound, stride, self.depth)
-        gate = max(_GATE_SIGMAS * sigma, 10.0 * FLOOR_DEPTH)
+        gate = max(GATE_SIGMAS * sigma, 10.0 * FLOOR_DEPTH)
         unit = units(asked.depth, surface.median_depth)
         constants = e.upload(np.concatenate([scaling.parameters(sigma, gate), [_SMOOTH * sigma, 0.0], unit]))
         kernel = self._kernel(depth_pair_kernel, self.depth, stride, asked)
@@ -291,7 +291,7 @@ class PairTerms:
         stride = strides(camera.width, camera.height)[level]
         scaling = self._scaling(surface.median_depth, bound, stride, self.color)
         unit = units(asked.color, surface.median_depth)
-        constants = e.upload(np.concatenate([scaling.parameters(sigma, _GATE_INTENSITY), brightness, unit]))
+        constants = e.upload(np.concatenate([scaling.parameters(sigma, GATE_INTENSITY), brightness, unit]))
         kernel = self._kernel(color_pair_kernel, self.color, self.depth, stride, level, asked)
         tables = e.upload(to_base), e.upload(from_base), e.upload(ref_from_base)
         points = surface.shown_z, optics.rays_x, optics.rays_y, tables[0], optics.error

@@ -106,7 +106,7 @@ class Solution:
 
     @property
     def shares(self) -> FloatArray:
-        """Part (s, 10) of what is known of each parameter that each stretch tells, all others known."""
+        """Part (s, 29) of what is known of each parameter that each stretch tells, all others known."""
         own = np.einsum("snn->sn", self.A)
         shares = np.zeros((len(own), COUNT))
         shares[:, self.free] = own / np.maximum(own.sum(axis=0), 1e-300)

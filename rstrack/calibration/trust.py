@@ -20,15 +20,12 @@ from rsgen.device.projection import TO_BASE, gather, move, project_rolling
 from rsgen.geometry import se3
 from rstrack.alignment.residuals import GeometricInput, evened, plane_distance
 from rstrack.calibration.images import lines_of
-from rstrack.calibration.optics import Optics, turn
-from rstrack.calibration.pair_terms import FLOOR_DEPTH, PairTerms
+from rstrack.calibration.optics import Optics, turn, without_error
+from rstrack.calibration.pair_terms import FLOOR_DEPTH, GATE_INTENSITY, GATE_SIGMAS, PairTerms
 from rstrack.calibration.parameters import Parameters
 from rstrack.calibration.stretch import Stretch, View
 from rstrack.images.sampling import grid, surface, value_and_slope
 from rstrack.keyframes.keyframe import strides
-
-# Residuals beyond so many σ do not count.
-_GATE = 5.0
 
 
 def trust_in(stretch: Stretch, terms: PairTerms, p: Parameters) -> float:
@@ -74,12 +71,15 @@ def _by_depth(
                                        current.surface.slope_y)
     )  # fmt: skip
     active = z > 0.0
+    z = without_error(e, terms.asked, z, xn, yn, optics.error)
     T_base_cam = gather(e.upload(to_base), e.UInt(lens.line_of(e.Int(px), e.Int(py))), TO_BASE, stride=TO_BASE)
     p = move(T_base_cam, (xn * z, yn * z, z))
     table = e.upload(from_base)
     seen = project_rolling(lens, table, p, e.UInt, e.Int)
     own = ref.surface
     rho, active = surface(e, camera, own.inverse_depth, seen.x, seen.y, active & seen.valid)
+    if terms.asked.corrects:
+        rho = dr.rcp(without_error(e, terms.asked, dr.rcp(rho), seen.at.xn, seen.at.yn, optics.error))
     constants = e.upload(np.append(np.zeros(7), [np.inf, 0.0]))
     images = own.inverse_depth, own.slope_x, own.slope_y, own.roughness
     given = GeometricInput(current.z, optics.rays_x, optics.rays_y, table, *images, table, constants)
@@ -88,7 +88,7 @@ def _by_depth(
     own_z = 1.0 / z - own_x * xn - own_y * yn
     scale = -even / (own_x * own_x + own_y * own_y + own_z * own_z) ** 0.5
     other = turn(T_base_cam, (scale * own_x, scale * own_y, scale * own_z))
-    return _twists(p, g, other, active & (abs(r) < _GATE * max(sigma, FLOOR_DEPTH)), sigma)
+    return _twists(p, g, other, active & (abs(r) < GATE_SIGMAS * max(sigma, FLOOR_DEPTH)), sigma)
 
 
 def _by_color(
@@ -101,15 +101,16 @@ def _by_color(
     i, px, py = grid(e, camera.width, camera.height, strides(camera.width, camera.height)[0])
     z, xn, yn = (_at(e, image, i) for image in (ref.surface.shown_z, optics.rays_x, optics.rays_y))
     M = gather(e.upload(tables[0]), e.UInt(depth.line_of(e.Int(px), e.Int(py))), TO_BASE, stride=TO_BASE)
-    p, active, found = move(M, (xn * z, yn * z, z)), z > 0.0, []
+    active, found = z > 0.0, []
+    z = without_error(e, terms.asked, z, xn, yn, optics.error)
+    p = move(M, (xn * z, yn * z, z))
     for view, table in ((current, tables[1]), (ref, tables[2])):
         seen = project_rolling(color, e.upload(table), p, e.UInt, e.Int)
         size = color.camera.width, color.camera.height
         value, dx, dy, active = value_and_slope(e, view.levels[0], *size, seen.x, seen.y, active & seen.valid)
         found.append((value, seen.chain(dx, dy, 0.0)))
     (value, g), (ref_value, other) = found
-    # Brightness may differ by anything: what is no outlier in depth is none here.
-    return _twists(p, g, other, active & (abs(value - ref_value) < 0.3), sigma)
+    return _twists(p, g, other, active & (abs(value - ref_value) < GATE_INTENSITY), sigma)
 
 
 def _at(e: Any, image: Any, index: Any) -> Any:
