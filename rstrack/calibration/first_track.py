@@ -10,7 +10,7 @@ from rsgen.console.progress import Progress
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.calibration.load import through
+from rstrack.calibration.pairs.load import through
 from rstrack.data.dataset import Dataset
 from rstrack.options import Method, Options
 from rstrack.tracking.rough_track import rough_track

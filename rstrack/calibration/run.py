@@ -20,18 +20,18 @@ from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan
 from rsgen.geometry.spline import Spline
-from rstrack.calibration.devices import Device, device_notes
+from rstrack.calibration.findings.pace import pace_of
+from rstrack.calibration.findings.residuals import residuals_at, residuals_now, some_of
+from rstrack.calibration.findings.result import Calibration, motion_of
 from rstrack.calibration.first_track import Track, first_track
-from rstrack.calibration.known import Known
-from rstrack.calibration.load import like, load_stretch, pair_terms
-from rstrack.calibration.pace import pace_of
-from rstrack.calibration.pair_terms import PairTerms
-from rstrack.calibration.parameters import COLOR_LENS, COUNT, DEPTH_LENS, DRIFT, GROUPS, Parameters, free_of
-from rstrack.calibration.residuals import residuals_at, residuals_now, some_of
-from rstrack.calibration.result import Calibration, motion_of
+from rstrack.calibration.pairs.load import like, load_stretch, pair_terms
+from rstrack.calibration.pairs.stretch import Stretch
+from rstrack.calibration.pairs.terms import PairTerms
+from rstrack.calibration.pairs.trust import trust_in
 from rstrack.calibration.solve import Solution, solve
-from rstrack.calibration.stretch import Stretch
-from rstrack.calibration.trust import trust_in
+from rstrack.calibration.unknowns.devices import Device, device_notes
+from rstrack.calibration.unknowns.known import Known
+from rstrack.calibration.unknowns.parameters import COLOR_LENS, COUNT, DEPTH_LENS, DRIFT, GROUPS, Parameters, free_of
 from rstrack.data.dataset import Dataset
 from rstrack.options import Options
 from rstrack.tracking.color_offset import estimate_color_offset

@@ -10,10 +10,10 @@ from scipy import stats
 
 from rsgen.array_types import BoolArray, FloatArray
 from rstrack.alignment.acceleration import Acceleration
-from rstrack.calibration.known import Known
-from rstrack.calibration.pair_terms import PairTerms
-from rstrack.calibration.parameters import COUNT, DEPTH, DRIFT, PRIOR, USEFUL, Parameters
-from rstrack.calibration.stretch import Stretch, Sums
+from rstrack.calibration.pairs.stretch import Stretch, Sums
+from rstrack.calibration.pairs.terms import PairTerms
+from rstrack.calibration.unknowns.known import Known
+from rstrack.calibration.unknowns.parameters import COUNT, DEPTH, DRIFT, PRIOR, USEFUL, Parameters
 
 # Steps at most on the pyramid's levels, finest first, and part of the formal σ that ends a level.
 _MOST_STEPS, _SMALL = (14, 10, 15), (1.0, 5.0, 10.0)

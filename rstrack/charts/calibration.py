@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rsgen.array_types import FloatArray
-from rstrack.calibration.record import Parameter, Record
+from rstrack.calibration.findings.record import Parameter, Record
 from rstrack.charts.chart import COLORS, Line, broken
 
 BLUE, ORANGE = COLORS[:2]

@@ -1,4 +1,4 @@
-"""The commands that measure the tracker itself: bench-speed, bench-convergence, bench-bootstrap, stress."""
+"""The commands that measure the tracker itself: bench-speed, -convergence, -bootstrap, -calibration, and stress."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-from rsgen.console.command_line import Json, Quiet, print_figures
+from rsgen.console.command_line import Frames, Json, Quiet, print_figures
 from rsgen.console.configs import ConfigFile
-from rstrack.cli.options import CameraFile, SequenceFolder
+from rsgen.device.backend import Backend
+from rstrack.cli.options import CameraFile, NoiseDepth, NoiseIntensity, SequenceFolder
 from rstrack.options import Method, Options, Peer
 
 Seed = Annotated[int, "of the random choices", int]
@@ -84,6 +85,40 @@ def bench_bootstrap(
     dataset = open_dataset(sequence, camera)
     with ProgressDisplay(quiet=json) as progress:
         found = bootstraps(dataset, tracker, starts, frames, seed, progress)
+    print_figures(found, json)
+    return 0
+
+
+def bench_calibration(
+    sequence: SequenceFolder,
+    *,
+    camera: CameraFile = None,
+    frames: Frames = None,
+    starts: Annotated[int, "wrong cameras at each distance", "N"] = 5,
+    factors: Annotated[
+        list[float] | None, "distances, in units of 50 % of readouts, 15 ms, 5 mm and 0.5 deg (default: 0 1 2 4)"
+    ] = None,
+    noise_depth: NoiseDepth = 0.0,
+    noise_intensity: NoiseIntensity = 0.0,
+    seed: Seed = 0,
+    backend: Annotated[Backend, "where kernels run"] = "auto",
+    json: Json = False,
+) -> int:
+    """Calibrate from cameras that are told ever more wrongly: which are found, and whether the errors' sizes are true.
+
+    The cameras of the sequence are taken for the truth; of one that declares others, those in truth/cameras.yaml.
+    """
+    from rsgen.console.progress import ProgressDisplay
+    from rsgen.sequence.camera_yaml import TRUE_CAMERAS
+    from rstrack.bench.calibration import FACTORS, calibrations
+    from rstrack.data.dataset import open_dataset
+
+    declared = sequence / TRUE_CAMERAS
+    dataset = open_dataset(sequence, declared if camera is None and declared.exists() else camera)
+    noise = noise_depth, noise_intensity
+    options = Options(backend=backend)
+    with ProgressDisplay(quiet=json) as progress:
+        found = calibrations(dataset, frames or slice(None), starts, factors or FACTORS, noise, seed, options, progress)
     print_figures(found, json)
     return 0
 

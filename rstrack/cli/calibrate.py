@@ -41,9 +41,9 @@ def calibrate(
     """Readouts, clocks and extrinsics of a recording's cameras, from the recording alone, with their errors."""
     from rsgen.console.progress import ProgressDisplay
     from rsgen.files import atomic_write
-    from rstrack.calibration.devices import device_named
-    from rstrack.calibration.record import record_of
+    from rstrack.calibration.findings.record import record_of
     from rstrack.calibration.run import calibrate as run
+    from rstrack.calibration.unknowns.devices import device_named
     from rstrack.data.dataset import open_dataset
     from rstrack.data.noise import NoisyImages
     from rstrack.options import Options

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 from rsgen.console.command_line import Commands, Frames, Json, Parser, Quiet, run_program
 from rsgen.errors import UserError
-from rstrack.cli.bench import bench_bootstrap, bench_convergence, bench_speed, stress
+from rstrack.cli.bench import bench_bootstrap, bench_calibration, bench_convergence, bench_speed, stress
 from rstrack.cli.bench_methods import STATUS as BENCH_STATUS
 from rstrack.cli.bench_methods import bench
 from rstrack.cli.calibrate import STATUS as CALIBRATE_STATUS
@@ -87,6 +87,7 @@ def _parser() -> Parser:
     add(bench_speed, "out/lr_kt2 --frames 150 --method rs-pg")
     add(bench_convergence, "out/lr_kt2 --pairs 50 --method rs-pg")
     add(bench_bootstrap, "out/lr_kt2 --starts 50 --frames 20")
+    add(bench_calibration, "out/demo --starts 5 --noise-depth 1.2e-3 --noise-intensity 0.01")
     add(sensitivity, "out/demo --method rs-pg --frames 0:60 --out sensitivity.json")
     add(stress, "stress --out runs/stress --frames 60")
     return commands.parser
@@ -113,9 +114,9 @@ def track(
     """
     from rsgen.console.progress import ProgressDisplay
     from rsgen.files import atomic_write
-    from rstrack.calibration.devices import device_named
-    from rstrack.calibration.record import CALIBRATION, write_record
+    from rstrack.calibration.findings.record import CALIBRATION, write_record
     from rstrack.calibration.run import calibrate as run_calibration
+    from rstrack.calibration.unknowns.devices import device_named
     from rstrack.data.dataset import open_dataset
     from rstrack.tracking import run
 

@@ -136,6 +136,16 @@ class Dataset:
         groups = group_colors(self.stamps, color_stamps)
         return replace(self, color_stamps=color_stamps, groups=groups, timing=timing, color_drift=drift)
 
+    def seen_with(self, rig: Rig) -> Dataset:
+        """The same images taken for those of other cameras, of as many pixels, whose colour may have an offset."""
+        if self.timing is not None:
+            return replace(self, rig=rig)
+        depth, color = (
+            stream_timing("depth", self.stamps, "raw", 0.0),
+            stream_timing("colour", self.color_stamps, "raw", 0.0),
+        )
+        return replace(self, rig=rig, timing=Timing(depth, color, 0.0))
+
     def timed_as(self, info: dict[str, Any]) -> Dataset:
         """The same recording with colour's offset as a run had it, whose run.json holds `info`."""
         clocks = info.get("clocks")
@@ -178,14 +188,10 @@ def _seen_as(dataset: Dataset, camera_file: Path) -> Dataset:
     if found != sizes:
         shown = [" and ".join(f"{w}x{h}" for w, h in pair) for pair in (found, sizes)]
         raise UserError(f"{camera_file}: cameras (colour and depth) of {shown[0]} pixels, but images are {shown[1]}")
-    timing = dataset.timing
-    if timing is None:
-        depth = stream_timing("depth", dataset.stamps, "raw", 0.0)
-        timing = Timing(depth, stream_timing("colour", dataset.color_stamps, "raw", 0.0), 0.0)
-    notes = (*dataset.notes, *file.notes)
     seen = replace(
-        dataset, rig=file.rig, notes=notes, scan_named=file.scan_named, timing=timing, depth_error=file.depth_error
-    )
+        dataset.seen_with(file.rig), notes=(*dataset.notes, *file.notes), scan_named=file.scan_named,
+        depth_error=file.depth_error,
+    )  # fmt: skip
     if file.scale_named and isinstance(dataset.images, Sequence):
         scaled = with_depth_scale(dataset.images, file.depth_scale)
         seen = replace(seen, images=scaled, depth_scale=file.depth_scale)

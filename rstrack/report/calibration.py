@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 
 from rsgen.console.tables import Entry, Table, fixed, significant
-from rstrack.calibration.record import Change, Parameter, Record
+from rstrack.calibration.findings.record import Change, Parameter, Record
 from rstrack.charts.calibration import change_chart, strip_chart
 from rstrack.report.page import Block, Card, CardRow, Note, Page, Plot, Section, TextFile
 

@@ -22,7 +22,7 @@ from rstrack.bench.methods.results import Cell, Results
 from rstrack.bench.methods.tables import write_results
 from rstrack.bench.stress.run import ColorScore, DepthScore, Panels, StressResult, TrackScore
 from rstrack.bench.stress.tables import write_stress
-from rstrack.calibration.record import CALIBRATION
+from rstrack.calibration.findings.record import CALIBRATION
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import write_estimate
 from rstrack.metrics.run_evaluate import run_evaluate

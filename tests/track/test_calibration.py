@@ -22,13 +22,19 @@ from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
 from rstrack.calibration import run as calibration_run
 from rstrack.calibration import solve as calibration_solve
-from rstrack.calibration.devices import Device, Stream
-from rstrack.calibration.images import Taken, lines_of
-from rstrack.calibration.known import Known
-from rstrack.calibration.load import like, load_stretch, pair_terms
-from rstrack.calibration.optics import camera_table, moves, traced
-from rstrack.calibration.pace import Pace
-from rstrack.calibration.parameters import (
+from rstrack.calibration.findings.pace import Pace
+from rstrack.calibration.findings.record import read_record
+from rstrack.calibration.findings.residuals import Residuals, extrapolated, residuals_at, residuals_now
+from rstrack.calibration.findings.result import Calibration
+from rstrack.calibration.pairs.images import Taken, lines_of
+from rstrack.calibration.pairs.load import like, load_stretch, pair_terms
+from rstrack.calibration.pairs.optics import camera_table, moves, traced
+from rstrack.calibration.pairs.trust import trust_in
+from rstrack.calibration.run import calibrate, parameters_of
+from rstrack.calibration.solve import Solution, solve
+from rstrack.calibration.unknowns.devices import Device, Stream
+from rstrack.calibration.unknowns.known import Known
+from rstrack.calibration.unknowns.parameters import (
     COUNT,
     DEPTH_ERROR,
     DEPTH_LENS,
@@ -42,12 +48,6 @@ from rstrack.calibration.parameters import (
     changed,
     free_of,
 )
-from rstrack.calibration.record import read_record
-from rstrack.calibration.residuals import Residuals, extrapolated, residuals_at, residuals_now
-from rstrack.calibration.result import Calibration
-from rstrack.calibration.run import calibrate, parameters_of
-from rstrack.calibration.solve import Solution, solve
-from rstrack.calibration.trust import trust_in
 from rstrack.cli.main import main
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.depth_error import DepthError
@@ -231,10 +231,9 @@ def test_points_move_as_pixels_do_when_a_lens_or_depth_changes(model: Model) -> 
 # --- recordings ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("factor", "late_s"), [(0.0, 0.008), (1.5, -0.008)])
-def test_wrong_cameras_are_put_right(shaken: Dataset, factor: float, late_s: float) -> None:
-    moved = np.array([3e-3, -3e-3, 2e-3, 0.005, -0.004, 0.004])
-    wrong = told(shaken, factor * READOUT_S, late_s, moved)
+def test_wrong_cameras_are_put_right(shaken: Dataset) -> None:
+    moved, late_s = np.array([3e-3, -3e-3, 2e-3, 0.005, -0.004, 0.004]), 0.008
+    wrong = told(shaken, 0.0, late_s, moved)
     found = calibrate(wrong, options=OPTIONS)
     p, true = found.values, shaken.rig
     assert not found.undetermined[[0, 1, 2, 4, 5, 6, 7, 8, 9]].any() and found.solution.finished

@@ -10,11 +10,12 @@ from rsgen.array_types import BoolArray, FloatArray
 from rsgen.device.arrays import Engine
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.calibration.images import Taken, pair_lens, span
-from rstrack.calibration.optics import Asked
-from rstrack.calibration.pair_terms import PairTerms, averaged, intensity_bound, surface_of
-from rstrack.calibration.parameters import COLOR_LENS, COUNT, DEPTH, DEPTH_ERROR, DEPTH_LENS, LENS, Parameters
-from rstrack.calibration.stretch import Stretch, View
+from rstrack.calibration.pairs.images import Taken, pair_lens, span
+from rstrack.calibration.pairs.optics import Asked
+from rstrack.calibration.pairs.stretch import Stretch, View
+from rstrack.calibration.pairs.surfaces import averaged, intensity_bound, surface_of
+from rstrack.calibration.pairs.terms import PairTerms
+from rstrack.calibration.unknowns.parameters import COLOR_LENS, COUNT, DEPTH, DEPTH_ERROR, DEPTH_LENS, LENS, Parameters
 from rstrack.data.dataset import Dataset
 from rstrack.data.depth_error import NONE
 from rstrack.images.line_poses import Exposure

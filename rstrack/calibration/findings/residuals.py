@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rsgen.array_types import FloatArray
-from rstrack.calibration.pair_terms import FLOOR_DEPTH, FLOOR_INTENSITY, PairTerms
-from rstrack.calibration.parameters import Parameters
-from rstrack.calibration.stretch import Stretch
+from rstrack.calibration.pairs.stretch import Stretch
+from rstrack.calibration.pairs.terms import FLOOR_DEPTH, FLOOR_INTENSITY, PairTerms
+from rstrack.calibration.unknowns.parameters import Parameters
 
 # Stretches at most: an evaluation takes as long as a step of the solution.
 _FEW = 3

@@ -13,8 +13,10 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
-from rstrack.calibration.pace import Pace, since_begin
-from rstrack.calibration.parameters import (
+from rstrack.calibration.findings.pace import Pace, since_begin
+from rstrack.calibration.findings.residuals import Residuals
+from rstrack.calibration.solve import Solution
+from rstrack.calibration.unknowns.parameters import (
     COLOR_LENS,
     COUNT,
     DEPTH,
@@ -28,8 +30,6 @@ from rstrack.calibration.parameters import (
     Parameters,
     changed,
 )
-from rstrack.calibration.residuals import Residuals
-from rstrack.calibration.solve import Solution
 from rstrack.data.dataset import Dataset
 
 _OPPOSITE: dict[str, Scan] = {

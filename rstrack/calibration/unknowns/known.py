@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rsgen.array_types import BoolArray, FloatArray
-from rstrack.calibration.parameters import COUNT, Parameters
+from rstrack.calibration.unknowns.parameters import COUNT, Parameters
 
 # How far, in σ, what a recording says may lie from what was known before it is taken to contradict it.
 _CONTRADICTS = 3.0

@@ -15,10 +15,11 @@ from rstrack.alignment.block_sums import BlockSums
 from rstrack.alignment.brightness import SAME
 from rstrack.alignment.priors import acceleration_prior, pose_constraint
 from rstrack.alignment.student_t import scale_step
-from rstrack.calibration.images import Lines, Taken, lines_of
-from rstrack.calibration.optics import Optics
-from rstrack.calibration.pair_terms import FLOOR_DEPTH, FLOOR_INTENSITY, PairTerms, Surface
-from rstrack.calibration.parameters import COUNT, POSES, Parameters
+from rstrack.calibration.pairs.images import Lines, Taken, lines_of
+from rstrack.calibration.pairs.optics import Optics
+from rstrack.calibration.pairs.surfaces import Surface
+from rstrack.calibration.pairs.terms import FLOOR_DEPTH, FLOOR_INTENSITY, PairTerms
+from rstrack.calibration.unknowns.parameters import COUNT, POSES, Parameters
 
 # σ of accelerations (m/s², rad/s²): the tracker's, see `tracking.window`; the ends, which few lines touch, are held
 # more tightly.

@@ -15,7 +15,7 @@ from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import block_counts
 from rstrack.alignment.normal_equations import Slopes
-from rstrack.calibration.parameters import DRIFT, EXTRINSICS, POSES, Parameters
+from rstrack.calibration.unknowns.parameters import DRIFT, EXTRINSICS, POSES, Parameters
 from rstrack.images.line_poses import rows_of
 
 

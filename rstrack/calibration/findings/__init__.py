@@ -1,0 +1,1 @@
+"""What is said of a calibration: values and errors, residuals, pace, records."""

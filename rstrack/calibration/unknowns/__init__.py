@@ -1,0 +1,1 @@
+"""What is unknown, and what is known of it beforehand."""
