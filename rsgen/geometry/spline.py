@@ -40,12 +40,15 @@ class Spline:
 
     Segment l covers [t0 + l dt, t0 + (l + 1) dt) and depends on control points l..l+3 only; the last segment includes
     its end. Neighbouring control points must be less than π apart in rotation. Rotations are taken as they are, not
-    orthonormalised. Raises UserError for wrong shapes, non-finite numbers and matrices that are not rigid motions.
+    orthonormalised. Of a long spline that grows only the end may be held: `first` is the number of the first control
+    point that is; segments are counted from t0 all the same. Raises UserError for wrong shapes, non-finite numbers and
+    matrices that are not rigid motions.
     """
 
     control_points: FloatArray
     t0: float
     dt: float
+    first: int = 0
 
     def __post_init__(self) -> None:
         points = np.array(self.control_points, dtype=np.float64)
@@ -69,35 +72,46 @@ class Spline:
             )
 
     def changed(self, first: int, points: FloatArray) -> Spline:
-        """The spline with control points `points` (n, 4, 4) from index `first` on; they may go beyond the end.
+        """The spline with control points `points` (n, 4, 4) from number `first` on; they may go beyond the end.
 
         Derives anew only what the change touches, however long the spline is; points are trusted to be rigid.
         """
+        first -= self.first
         last = first + len(points)
-        twin = object.__new__(Spline)
         every = np.concatenate([self.control_points[:first], points, self.control_points[last:]])
-        every.setflags(write=False)
-        object.__setattr__(twin, "control_points", every)
-        object.__setattr__(twin, "t0", self.t0)
-        object.__setattr__(twin, "dt", self.dt)
         pairs = slice(max(0, first - 1), min(last, len(every) - 1))
         before, after = every[pairs], every[pairs.start + 1 : pairs.stop + 1]
         fresh = se3.log(se3.inverse(before) @ after)
         gains = se3.left_jacobian_inv(fresh) @ se3.adjoint(se3.inverse(before))
-        for name, new in (("increments", fresh), ("left_gains", gains)):
-            old = getattr(self, name)
-            object.__setattr__(twin, name, np.concatenate([old[: pairs.start], new, old[pairs.stop :]]))
+        derived = [
+            np.concatenate([old[: pairs.start], new, old[pairs.stop :]])
+            for old, new in ((self.increments, fresh), (self.left_gains, gains))
+        ]
+        return self._derived(self.first, every, *derived)
+
+    def tail(self, first: int) -> Spline:
+        """The spline from control point number `first` on, with what has been derived from it."""
+        at = first - self.first
+        return self._derived(first, self.control_points[at:].copy(), self.increments[at:], self.left_gains[at:])
+
+    def _derived(self, first: int, points: FloatArray, increments: FloatArray, left_gains: FloatArray) -> Spline:
+        """One with the same knots, of which all is known and nothing need be checked."""
+        twin = object.__new__(Spline)
+        points.setflags(write=False)
+        known = {"control_points": points, "t0": self.t0, "dt": self.dt, "first": first}
+        for name, value in (known | {"increments": increments, "left_gains": left_gains}).items():
+            object.__setattr__(twin, name, value)
         return twin
 
     @property
     def t_begin(self) -> float:
         """First valid time in seconds."""
-        return self.t0
+        return self.t0 + self.first * self.dt
 
     @property
     def t_end(self) -> float:
         """Last valid time in seconds."""
-        return self.t0 + (len(self.control_points) - 3) * self.dt
+        return self.t0 + (self.first + len(self.control_points) - 3) * self.dt
 
     @cached_property
     def increments(self) -> FloatArray:
@@ -108,17 +122,22 @@ class Spline:
         """Segment (...,) and position on it u (...,) in [0, 1] of times (...,) in seconds; UserError outside."""
         t = np.asarray(t, dtype=np.float64)
         s = (t - self.t0) / self.dt
-        last = len(self.control_points) - 4
+        last = self.first + len(self.control_points) - 4
         # Rounding of the times themselves must not push a first or last stamp out of the spline.
         slack = 1e-9 + 4.0 * np.finfo(np.float64).eps * max(abs(self.t_begin), abs(self.t_end)) / self.dt
-        outside = ~((s >= -slack) & (s <= last + 1 + slack))
+        outside = ~((s >= self.first - slack) & (s <= last + 1 + slack))
         if outside.any():
             raise UserError(
                 f"spline: time {float(t[outside].flat[0])!r} s is outside [{self.t_begin!r}, {self.t_end!r}] s; "
                 "use a longer trajectory or fewer frames"
             )
-        segment = np.clip(np.floor(s), 0, last).astype(np.int64)
+        segment = np.clip(np.floor(s), self.first, last).astype(np.int64)
         return segment, np.asarray(s - segment)
+
+    def _held(self, t: npt.ArrayLike) -> tuple[IntArray, FloatArray]:
+        """`locate` among the control points that are held."""
+        segment, u = self.locate(t)
+        return (segment - self.first if self.first else segment), u
 
     def pose(self, t: npt.ArrayLike) -> FloatArray:
         """T_world_body (..., 4, 4) at times (...,) in seconds: equation (4) with the basis of (5)."""
@@ -128,7 +147,7 @@ class Spline:
             for i in range(0, t.size, _BLOCK):
                 out[i : i + _BLOCK] = self.pose(t.ravel()[i : i + _BLOCK])
             return out.reshape(*t.shape, 4, 4)
-        segment, u = self.locate(t)
+        segment, u = self._held(t)
         T = self.control_points[segment]
         for A in self._factors(segment, powers(u, 4) @ _BASES[0]):
             T = T @ A
@@ -136,7 +155,7 @@ class Spline:
 
     def pose_and_velocity(self, t: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """`pose` (..., 4, 4) and `velocity` (..., 6) at once, for the price of one and a half."""
-        segment, u = self.locate(t)
+        segment, u = self._held(t)
         db = powers(u, 4) @ _BASES[1] / self.dt
         T, w = self.control_points[segment], np.zeros((*u.shape, 6))
         for j, A in enumerate(self._factors(segment, powers(u, 4) @ _BASES[0])):
@@ -168,10 +187,10 @@ class Spline:
         Returns the index of the first of them (...,) and J (..., 4, 6, 6). side "left": T_i ← exp(δ_i) T_i moves
         T(t) ← exp(η) T(t) with η = Σ J_i δ_i (and Σ J_i = I); side "right": the same with increments on the right.
         """
-        segment, u = self.locate(t)
+        segment, u = self._held(t)
         b = powers(u, 4) @ _BASES[0]
         blocks = self._left_blocks(segment, b) if side == "left" else self._right_blocks(segment, b)
-        return segment, np.stack(blocks, axis=-3)
+        return segment + self.first, np.stack(blocks, axis=-3)
 
     def save(self, path: str | Path) -> None:
         """Write control_points, t0 and dt to an .npz file (float64, so that `load` returns the very same spline)."""
@@ -199,7 +218,7 @@ class Spline:
         return se3.exp(self._parts(segment, b))
 
     def _motion(self, t: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        segment, u = self.locate(t)
+        segment, u = self._held(t)
         b = powers(u, 4) @ _BASES[0]
         db = powers(u, 4) @ _BASES[1] / self.dt
         ddb = powers(u, 4) @ _BASES[2] / self.dt**2

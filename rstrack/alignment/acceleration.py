@@ -37,8 +37,9 @@ class Acceleration:
 
         Of all mixtures of the last iterations it begins from the one whose mixed step is least, measured by H.
         """
-        self._at.append(at)
-        self._steps.append(step)
+        # Copies: the optimiser moves its increments in place.
+        self._at.append(at.copy())
+        self._steps.append(step.copy())
         if len(self._steps) < 2:
             return step
         length, before = step @ H @ step, self._steps[-2] @ H @ self._steps[-2]

@@ -71,8 +71,8 @@ class Linearised:
         return weakest_motion(self.seen)
 
     def row_shift(self, increments: FloatArray, focal: float, depth: float) -> float:
-        """Largest movement of a block in pixels under increments (m, 6) of all control points."""
-        twist = self.motion @ increments[self.model.first : self.model.last].ravel()
+        """Largest movement of a block in pixels under increments (k, 6) of the model's control points."""
+        twist = self.motion @ increments.ravel()
         return float((focal * (np.abs(twist[:, :3]).max(axis=1) / depth + np.abs(twist[:, 3:]).max(axis=1))).max())
 
 

@@ -37,8 +37,8 @@ class Quadratic:
         return self if factor == 1.0 else Quadratic(self.first, factor * self.H, factor * self.g)
 
     def moved(self, increments: FloatArray) -> Quadratic:
-        """The same model around a state that has been moved by increments (m, 6) of all control points."""
-        step = increments[self.first : self.last].ravel()
+        """The same model around a state that has been moved by increments (k, 6) of its control points."""
+        step = increments.ravel()
         return replace(self, g=self.g + self.H @ step) if step.any() else self
 
 

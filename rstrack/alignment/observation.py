@@ -31,7 +31,8 @@ START_DEPTH, START_INTENSITY = 5e-3, 0.03
 class _Linearisation:
     """What an observation knows: the model and the next σ.
 
-    at: increments (m, 6) of the control points that it was made at. stands_for: pixels of the finest level for each.
+    at: increments (k, 6) that the model's control points had received when it was made. stands_for: pixels of the
+    finest level for each.
     brightness: gain and offset (2,) of a colour image there.
     """
 
@@ -59,8 +60,7 @@ class Observation:
     independent: float = 1.0
     linearisation: _Linearisation = _Linearisation()
     _visible: Any = None
-    _slopes_at: Spline | None = None
-    _slopes_moved: FloatArray = field(default_factory=lambda: np.zeros((0, 6)))
+    _slopes_at: SplineState | None = None
 
     @property
     def is_depth(self) -> bool:
@@ -111,7 +111,7 @@ class Observation:
         image, sigma, slopes_at = self.image, self.linearisation.sigma, self._slopes(state)
         is_finest = level == 0
         level = THINNED if is_finest and self.independent < THIN_BELOW else level
-        brightness, moved = self.brightness(state), state.moved.copy()
+        brightness, before = self.brightness(state), state.copy()
         if isinstance(image, DepthImage):
             started = terms.geometric(image, self.ref, state.spline, level, sigma or START_DEPTH, slopes_at)
         else:
@@ -128,7 +128,8 @@ class Observation:
 
         def finish() -> None:
             lin = started()
-            self.linearisation = _Linearisation(lin, lin.next_sigma, moved, stands_for, brightness)
+            at = before.received(lin.model.first, lin.model.last)
+            self.linearisation = _Linearisation(lin, lin.next_sigma, at, stands_for, brightness)
 
         return finish
 
@@ -137,7 +138,7 @@ class Observation:
         lin, before = self.linearisation.lin, self.linearisation.brightness
         if lin is None or lin.brightness is None:
             return self.expected if before is None else before
-        return lin.brightness.best(self._since(state)[lin.model.first : lin.model.last].ravel())
+        return lin.brightness.best(self._since(state).ravel())
 
     def shift(self, state: SplineState, focal: float) -> float:
         """Pixels that the lines have moved since the linearisation; infinite where the brightness has changed too."""
@@ -154,25 +155,22 @@ class Observation:
 
     def change(self, state: SplineState) -> float:
         """Change of the cost since the linearisation, by the quadratic model."""
-        model = self.lin.model
-        moved = self._since(state)[model.first : model.last].ravel()
+        model, moved = self.lin.model, self._since(state).ravel()
         return self.stands_for * float(model.g @ moved + 0.5 * moved @ model.H @ moved)
 
     def distance(self, state: SplineState) -> float:
         """How far the state is from that of the linearisation, squared, in σ of what this image tells."""
-        model = self.lin.model
-        moved = self._since(state)[model.first : model.last].ravel()
+        model, moved = self.lin.model, self._since(state).ravel()
         return self.stands_for * float(moved @ model.H @ moved)
 
     def _slopes(self, state: SplineState) -> Spline:
         """Where the poses of its lines are differentiated: an earlier state as long as that is as good."""
-        before = self._slopes_moved
-        if self._slopes_at is None or np.abs(state.moved[: len(before)] - before).max() > _SAME_SLOPES:
-            self._slopes_at, self._slopes_moved = state.spline, state.moved.copy()
-        return self._slopes_at
+        before = self._slopes_at
+        if before is None or state.distance_from(before) > _SAME_SLOPES:
+            self._slopes_at = before = state.copy()
+        return before.spline
 
     def _since(self, state: SplineState) -> FloatArray:
-        since = state.moved.copy()
-        at = self.linearisation.at
-        since[: len(at)] -= at
-        return since
+        """What the model's control points have been moved by since (k, 6)."""
+        model = self.lin.model
+        return state.received(model.first, model.last) - self.linearisation.at

@@ -111,22 +111,27 @@ def _optimise_level(terms: Terms, state: SplineState, problem: Problem, level: i
             H, g = assemble(models, *problem.free)
         with terms.timer("linear algebra: solve"):
             plain = _damped_step(H, g, damping, problem.bandwidth)
-            at = state.moved[first : first + len(plain)].ravel()
+            at = state.received(first, first + len(plain)).ravel()
             step = acceleration.extrapolated(at, plain.ravel(), H).reshape(-1, 6)
             is_plain = bool((step == plain).all())
         state.apply(first, step)
         done.iterations += 1
-        done.last_shift = max(_shift(problem, first, step, state), _shift(problem, first, plain, state))
+        done.last_shift = max(_shift(problem, first, step), _shift(problem, first, plain))
         done.is_within_noise = -float(g @ plain.ravel()) < _LAST[level] and all(_is_noisy(o) for o in problem.fresh)
         if done.is_within_noise or done.last_shift < (_tolerance(problem) if level == 0 else STOP_PX[level]):
             break
 
 
-def _shift(problem: Problem, first: int, step: FloatArray, state: SplineState) -> float:
+def _shift(problem: Problem, first: int, step: FloatArray) -> float:
     """Pixels by which a step (n, 6) of the control points from `first` on moves the lines of the fresh images."""
-    increments = np.zeros_like(state.moved)
-    increments[first : first + len(step)] = step
-    shifts = [o.lin.row_shift(increments, problem.focal, o.ref.median_depth) for o in problem.fresh]
+    shifts = []
+    for o in problem.fresh:
+        model = o.lin.model
+        increments = np.zeros((model.last - model.first, 6))
+        low, high = max(first, model.first), min(first + len(step), model.last)
+        if low < high:
+            increments[low - model.first : high - model.first] = step[low - first : high - first]
+        shifts.append(o.lin.row_shift(increments, problem.focal, o.ref.median_depth))
     return max(shifts, default=0.0)
 
 

@@ -21,8 +21,8 @@ def acceleration_prior(spline: Spline, first: int, last: int, sigma: FloatArray)
     sigma (triples, 6): m and rad per knot squared, so acceleration times dt². Derivative of Ω_j = log(T_{j−1}⁻¹ T_j) by
     left increments: Jl⁻¹(Ω_j) Ad(T_{j−1}⁻¹) (δ_j − δ_{j−1}). Returns the model and the cost.
     """
-    gains = spline.left_gains[first : last - 1]
-    omega = spline.increments[first : last - 1]
+    pairs = slice(first - spline.first, last - 1 - spline.first)
+    gains, omega = spline.left_gains[pairs], spline.increments[pairs]
     r = omega[1:] - omega[:-1]
     J = np.concatenate([gains[:-1], -gains[1:] - gains[:-1], gains[1:]], axis=2)
     return _summed(first, last, J, r, sigma)
@@ -33,8 +33,8 @@ def velocity_prior(spline: Spline, first: int, last: int, sigma: FloatArray) -> 
 
     sigma (6,): m and rad per knot, so velocity times dt. Returns the model and the cost.
     """
-    gains = spline.left_gains[first : last - 1]
-    r = spline.increments[first : last - 1]
+    pairs = slice(first - spline.first, last - 1 - spline.first)
+    gains, r = spline.left_gains[pairs], spline.increments[pairs]
     J = np.concatenate([-gains, gains], axis=2)
     return _summed(first, last, J, r, np.broadcast_to(sigma, r.shape))
 

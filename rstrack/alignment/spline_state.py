@@ -15,10 +15,15 @@ _TOLD = 0.6
 
 
 class SplineState:
-    """The growing spline: control points (m, 4, 4) in the world and the sum of increments that each has received."""
+    """The growing spline, and the sum of increments (m, 6) that each of its control points has received.
 
-    def __init__(self, spline: Spline) -> None:
-        self.spline = spline
+    Only the end is held here, from control point number `first` on, and copied with every step; what is before it moves
+    no more and is in `done`, to which it is only ever added.
+    """
+
+    def __init__(self, spline: Spline, done: PointStore | None = None) -> None:
+        """done: the control points before the spline's first."""
+        self.spline, self.done = spline, done or PointStore()
         self.moved = np.zeros((len(spline.control_points), 6))
         # Until this time (s) the spline is what it was before it was restarted.
         self.untouched = spline.t_end
@@ -30,13 +35,39 @@ class SplineState:
 
     @property
     def points(self) -> FloatArray:
-        """Control points (m, 4, 4)."""
+        """Control points (m, 4, 4) from number `first` on."""
         return self.spline.control_points
+
+    @property
+    def first(self) -> int:
+        """Number of the first control point that is held."""
+        return self.spline.first
+
+    @property
+    def end(self) -> int:
+        """Number of control points, with those before `first`."""
+        return self.first + len(self.points)
 
     @property
     def dt(self) -> float:
         """Seconds between knots."""
         return self.spline.dt
+
+    @property
+    def whole(self) -> Spline:
+        """With all control points."""
+        if not self.first:
+            return self.spline
+        return Spline(np.concatenate([self.done.points[: self.first], self.points]), self.spline.t0, self.dt)
+
+    def received(self, first: int, last: int) -> FloatArray:
+        """Sums of increments (last − first, 6) of control points that are held."""
+        return self.moved[first - self.first : last - self.first].copy()
+
+    def distance_from(self, before: SplineState) -> float:
+        """Largest increment (m, rad) that a control point which both hold has received since."""
+        first, last = max(self.first, before.first), min(self.end, before.end)
+        return float(np.abs(self.received(first, last) - before.received(first, last)).max(initial=0.0))
 
     def copy(self) -> SplineState:
         """A state that can be changed without changing this one."""
@@ -44,26 +75,33 @@ class SplineState:
         twin.moved = self.moved.copy()
         return twin
 
+    def release(self, first: int) -> None:
+        """Hold the control points from number `first` on only: the others move no more."""
+        count = first - self.first
+        self.done.put(self.first, self.points[:count])
+        self.spline, self.moved = self.spline.tail(first), self.moved[count:].copy()
+
     def restarted(self, end: float, first: float, last: float, T_world_body: FloatArray) -> SplineState:
         """The same up to time `end`, as far as `untouched`; from `first` to `last` at rest at T_world_body (4, 4)."""
         points = self.points
         keep = self.segment(end) + 4
         start, stop = self.segment(first), self.segment(last) + 4
-        gap = np.repeat(points[keep - 1][None], max(0, start - keep), axis=0)
+        gap = np.repeat(points[keep - 1 - self.first][None], max(0, start - keep), axis=0)
         still = np.repeat(T_world_body[None], stop - start, axis=0)
-        kept = points[: min(keep, start)]
-        state = SplineState(Spline(np.concatenate([kept, gap, still]), self.spline.t0, self.spline.dt))
-        state.untouched = self.spline.t0 + (len(kept) - 3) * self.dt
+        kept = points[: min(keep, start) - self.first]
+        spline = Spline(np.concatenate([kept, gap, still]), self.spline.t0, self.dt, self.first)
+        state = SplineState(spline, self.done)
+        state.untouched = self.spline.t0 + (min(keep, start) - 3) * self.dt
         return state
 
     def segment(self, t: float) -> int:
-        """Index of the first of the four control points that a time depends on."""
+        """Number of the first of the four control points that a time depends on."""
         return int(np.floor((t - self.spline.t0) / self.spline.dt))
 
     def extend(self, t: float) -> None:
         """Grow with constant velocity until time t is covered."""
         points = self.points
-        missing = self.segment(t) + 4 - len(points)
+        missing = self.segment(t) + 4 - self.end
         if missing <= 0:
             return
         step = se3.inverse(points[-2]) @ points[-1]
@@ -71,7 +109,7 @@ class SplineState:
         for _ in range(missing):
             # Products drift away from rotations, and inverses by transposition amplify that (2.4 times a knot).
             new.append(se3.orthonormalise(new[-1] @ step))
-        self.spline = self.spline.changed(len(points), np.array(new[1:]))
+        self.spline = self.spline.changed(self.end, np.array(new[1:]))
         self.moved = np.concatenate([self.moved, np.zeros((missing, 6))])
 
     def smooth_end(self, t: float) -> None:
@@ -82,15 +120,41 @@ class SplineState:
         """
         points = self.points
         s = (t - self.spline.t0) / self.spline.dt
-        if s - np.floor(s) > _TOLD or self.segment(t) + 4 != len(points):
+        if s - np.floor(s) > _TOLD or self.segment(t) + 4 != self.end:
             return
         step = se3.inverse(points[-3]) @ points[-2]
         T = se3.orthonormalise(points[-2] @ step)
-        self.apply(len(points) - 1, se3.log(T @ se3.inverse(points[-1]))[None])
+        self.apply(self.end - 1, se3.log(T @ se3.inverse(points[-1]))[None])
 
     def apply(self, first: int, increments: FloatArray) -> None:
-        """T_i ← exp(δ_i) T_i for control points first, first + 1, ...; increments (n, 6)."""
-        last = first + len(increments)
-        points = se3.orthonormalise(se3.exp(increments) @ self.points[first:last])
+        """T_i ← exp(δ_i) T_i for control points number first, first + 1, ...; increments (n, 6)."""
+        at = slice(first - self.first, first - self.first + len(increments))
+        points = se3.orthonormalise(se3.exp(increments) @ self.points[at])
         self.spline = self.spline.changed(first, points)
-        self.moved[first:last] += increments
+        self.moved[at] += increments
+
+
+class PointStore:
+    """Poses (n, 4, 4) that grow at their end, at a cost that does not depend on how many there are."""
+
+    def __init__(self) -> None:
+        self._room, self.count = np.empty((64, 4, 4)), 0
+
+    @property
+    def points(self) -> FloatArray:
+        """All of them, not to be written to."""
+        view = self._room[: self.count]
+        view.setflags(write=False)
+        return view
+
+    def put(self, at: int, points: FloatArray) -> None:
+        """Poses from number `at` on, at most the next one: they are the last ones then."""
+        if not 0 <= at <= self.count:
+            raise IndexError(f"poses from number {at} on, where there are {self.count}")
+        end = at + len(points)
+        if end > len(self._room):
+            room = np.empty((max(end, 2 * len(self._room)), 4, 4))
+            room[:at] = self._room[:at]
+            self._room = room
+        self._room[at:end] = points
+        self.count = end

@@ -24,6 +24,7 @@ from rstrack.alignment.linearise import Terms
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Solved
 from rstrack.alignment.pull import pulls
+from rstrack.alignment.spline_state import PointStore
 from rstrack.data.rig import Frame, Rig
 from rstrack.images.device_frame import DeviceFrame, DeviceRig, Timer, untimed
 from rstrack.keyframes.keyframe import Reference
@@ -75,8 +76,8 @@ class Tracker:
         # The newest frame, while it is the reference and cannot be rectified yet.
         self._unconverged: DeviceFrame | None = None
         self._stamps: list[float] = []
-        # Poses of the first of these: those before the current piece of the spline.
-        self._settled: list[FloatArray] = []
+        # Poses of the first of these, which nothing moves any more.
+        self._settled = PointStore()
         self._relocaliser = Relocaliser(rig, self.options, self._keyframes, self._fits, self._observe)
         # Frames of the current piece of the spline, and frames in a row whose colours did not fit the keyframe's.
         self._age, self._colorless = 0, 0
@@ -89,16 +90,14 @@ class Tracker:
     @property
     def spline(self) -> Spline | None:
         """T_world_depth(t) so far; the newest few control points still move. Meaningful within `spline_valid` (s)."""
-        return None if self._window is None else self._window.spline
+        return None if self._window is None else self._window.state.whole
 
     @property
     def trajectory(self) -> tuple[FloatArray, FloatArray]:
         """Stamps (n,) of the frames that were not lost and T_world_depth (n, 4, 4) there."""
-        if self.spline is None:
+        if self._window is None:
             return np.zeros(0), np.zeros((0, 4, 4))
-        stamps = np.array(self._stamps)
-        poses = self.spline.pose(stamps[len(self._settled) :])
-        return stamps, np.concatenate([*(T[None] for T in self._settled), poses])
+        return np.array(self._stamps), np.concatenate([self._settled.points, self._moving_poses(len(self._stamps))])
 
     @property
     def keyframes(self) -> int:
@@ -176,6 +175,7 @@ class Tracker:
         overlap = self._overlap(on_reference)
         frozen = self._fuse_frozen(window)
         renewed = self._renew_keyframe(window, new, frozen, overlap)
+        self._release(window)
         return self._report(new, on_reference, solved, keyframe=renewed, overlap=overlap)
 
     # -- start and restart ------------------------------------------------------------------------------------------
@@ -277,8 +277,7 @@ class Tracker:
         if found is None:
             return self._report(new, lost=True)
         # The new piece may need control points of the last frames before: their poses are kept, not their spline.
-        done = np.array(self._stamps[len(self._settled) :])
-        self._settled += list(window.spline.pose(done)) if len(done) else []
+        self._settled.put(self._settled.count, self._moving_poses(len(self._stamps)))
         begin, end = self.spline_valid.pop()
         if found.window.state.untouched > begin:
             self.spline_valid.append((begin, min(end, found.window.state.untouched)))
@@ -290,6 +289,22 @@ class Tracker:
         self._recent = deque([new])
         self._placed(new, found.fresh, joined=False)
         return self._report(new, found.fresh, found.solved, overlap=self._overlap(found.fresh))
+
+    def _moving_poses(self, end: int) -> FloatArray:
+        """T_world_depth (n, 4, 4) now of the frames found, from the first unsettled one to number `end`."""
+        window, _ = self._known()
+        return window.spline.pose(np.array(self._stamps[self._settled.count : end]))
+
+    def _release(self, window: Window) -> None:
+        """Hold no more of the spline than still moves, or is still to be fused along."""
+        first = window.releasable(min(min(f.first_time, f.stamp) for f in self._recent))
+        if first is None:
+            return
+        end = self._settled.count
+        while window.state.segment(self._stamps[end]) < first:
+            end += 1
+        self._settled.put(self._settled.count, self._moving_poses(end))
+        window.state.release(first)
 
     # -- keyframes --------------------------------------------------------------------------------------------------
 

@@ -25,6 +25,8 @@ _END_TRIPLES, _END_FACTOR = 2, 0.1
 _VELOCITY = np.array([1.5, 1.5, 1.5, 3.0, 3.0, 3.0])
 # Metres and radians within which the reference's pose is held while its own control points are free.
 _GAUGE = np.full(6, 1e-6)
+# Control points that are held beyond those that are needed, and how many are released at once.
+_HELD, _RELEASED = 8, 128
 # Levels to go through from a prediction by constant velocity, and from anything worse.
 TRACKING_LEVELS, LEVELS = (1, 0), (2, 1, 0)
 # Steps at most on the pyramid's levels, finest first.
@@ -79,6 +81,13 @@ class Window:
         state = self.state.restarted(end, new.first_time, new.last_time, T_world_body)
         return Window(self._terms, self._focal, state, state.segment(new.first_time))
 
+    def releasable(self, begin: float) -> int | None:
+        """First control point that times from `begin` (s) on or the active observations depend on, if many are before
+        it."""
+        models = [o.lin.model.first for o in self.active if o.is_linearised]
+        first = min([self.first_free, self.state.segment(begin), *models]) - _HELD
+        return first if first - self.state.first >= _RELEASED else None
+
     def is_frozen(self, t: float) -> bool:
         """Whether nothing that time t (s) depends on moves any more."""
         return self.state.segment(t) + 4 <= self.first_free
@@ -93,7 +102,7 @@ class Window:
         against a reference that moves too. hopeless: whether to end before the finest level, see `optimise`. What was
         solved for becomes active with `keep`.
         """
-        free = self.first_free, len(self.state.points)
+        free = self.first_free, self.state.end
         priors = [self._motion_prior(free)] + ([] if gauge is None else [_pose_prior(gauge)])
         if self.piece > 0 and self.first_free == self.piece:
             priors.append(self._velocity_prior(free))

@@ -36,6 +36,18 @@ def test_one_slow_motion_is_found_in_two_more_steps() -> None:
     assert iterations(slow, accelerated=True) <= 4
 
 
+def test_increments_may_be_moved_in_place_afterwards() -> None:
+    found = []
+    for in_place in (False, True):
+        at, acceleration = np.zeros(12), Acceleration()
+        for n in range(4):
+            given = at if in_place else at.copy()
+            step = acceleration.extrapolated(given, 0.9**n * np.linspace(0.1, 0.5, 12), TRUE)
+            at += step
+        found.append(at)
+    np.testing.assert_array_equal(*found)
+
+
 def test_fast_steps_stay_as_they_are() -> None:
     acceleration, step = Acceleration(), np.full(12, 0.5)
     assert acceleration.extrapolated(np.zeros(12), step, TRUE) is step

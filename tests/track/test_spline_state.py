@@ -8,7 +8,8 @@ from rstrack_util import hand_held
 from util import random_twists
 
 from rsgen.geometry import se3
-from rstrack.alignment.spline_state import SplineState
+from rstrack.alignment.priors import acceleration_prior, velocity_prior
+from rstrack.alignment.spline_state import PointStore, SplineState
 
 
 def test_extension_keeps_the_velocity() -> None:
@@ -133,3 +134,58 @@ def test_a_restart_keeps_what_was_and_stands_still_at_the_pose(gap_knots: float,
         # Between the two it rests where it was.
         between = state.points[state.segment(end) + 4 : state.segment(first_time)]
         assert len(between) > 3 and (between == spline.control_points[state.segment(end) + 3]).all()
+
+
+def test_what_is_released_is_kept_and_all_goes_on_as_before() -> None:
+    rng = np.random.default_rng(8)
+    held, released = SplineState(hand_held(4)), SplineState(hand_held(4))
+    for k in range(60):
+        now = held.spline.t_end + 0.03
+        delta = random_twists(rng, (4,), 0.02, 0.01)
+        for state in (held, released):
+            state.smooth_end(now - 0.03)
+            state.extend(now)
+            state.apply(state.end - 4, delta)
+        if k % 7 == 6:
+            released.release(released.end - 12)
+    assert len(released.points) < 30 < len(held.points) and held.first == 0
+    end = held.spline.t_end
+    for a, b in ((held, released), (held.copy(), released.copy())):
+        assert a.end == b.end == len(b.whole.control_points)
+        np.testing.assert_array_equal(a.spline.control_points, b.whole.control_points)
+        np.testing.assert_array_equal(a.received(a.end - 9, a.end), b.received(a.end - 9, a.end))
+        assert a.segment(end - 0.1) == b.segment(end - 0.1)
+    sigma = np.ones((4, 6))
+    for prior, given in ((acceleration_prior, sigma), (velocity_prior, np.ones(6))):
+        (one, cost), (two, other) = (prior(s.spline, held.end - 6, held.end, given) for s in (held, released))
+        np.testing.assert_array_equal(one.H, two.H)
+        assert cost == other and one.first == two.first
+    T = se3.exp(np.array([1.0, 2.0, 3.0, 0.5, -0.3, 0.2]))
+    one, two = (s.restarted(end - 0.12, end + 0.3, end + 0.4, T) for s in (held, released))
+    np.testing.assert_array_equal(one.points, two.whole.control_points)
+    assert one.untouched == two.untouched and two.first == released.first
+
+
+def test_distances_are_of_the_control_points_that_both_hold() -> None:
+    state = SplineState(hand_held(2))
+    before = state.copy()
+    state.apply(3, np.full((1, 6), 0.5))
+    state.apply(9, np.full((1, 6), 0.1))
+    state.extend(state.spline.t_end + 0.2)
+    assert state.distance_from(before) == pytest.approx(0.5)
+    state.release(6)
+    assert state.distance_from(before) == pytest.approx(0.1)
+
+
+def test_a_store_grows_at_its_end_and_may_be_cut() -> None:
+    poses, store = np.random.default_rng(9).normal(size=(300, 4, 4)), PointStore()
+    for at in range(0, 300, 7):
+        store.put(at, poses[at : at + 7])
+    np.testing.assert_array_equal(store.points, poses)
+    with pytest.raises(ValueError):
+        store.points[0] = 0.0
+    store.put(100, poses[:5])
+    np.testing.assert_array_equal(store.points, np.concatenate([poses[:100], poses[:5]]))
+    for at in (-1, 106):
+        with pytest.raises(IndexError, match="where there are 105"):
+            store.put(at, poses[:1])

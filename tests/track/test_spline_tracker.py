@@ -77,6 +77,22 @@ def test_a_gap_is_bridged_from_the_last_keyframes() -> None:
     assert lost(tracker) == [] and len(tracker.spline_valid) == 2 and worst_step(tracker) < 2e-3
 
 
+@pytest.mark.parametrize("method", ["rs-pg", "gs-g"])
+def test_holding_only_the_end_of_the_spline_changes_no_bit(method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = [blank(frame_at(k)) if k == 13 else frame_at(k) for k in (*range(18), *range(27, 36))]
+    kept = feed(tracker_of(method), frames)
+    monkeypatch.setattr("rstrack.tracking.window._RELEASED", 1)
+    released = feed(tracker_of(method), frames)
+    assert kept._window is not None and released._window is not None
+    assert kept._window.state.first == 0 < 12 < released._window.state.first
+    # Poses are evaluated in other batches, which rounds otherwise.
+    for a, b in zip(kept.trajectory, released.trajectory, strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-15)
+    assert kept.spline is not None and released.spline is not None
+    np.testing.assert_array_equal(kept.spline.control_points, released.spline.control_points)
+    assert kept.spline_valid == released.spline_valid
+
+
 def shown_at(shown: int, k: int) -> Frame:
     """Frame `shown` under the stamp of frame k."""
     frame, late = frame_at(shown), (k - shown) / 30.0
