@@ -67,6 +67,10 @@ class Options:
         "for the baseline",
     ] = "keyframe"
     voxel_m: Annotated[float, "voxels of that volume, m"] = 0.01
+    memory_gb: Annotated[
+        float,
+        "images of old keyframes that take more than this go to temporary files (in TMPDIR) until needed",
+    ] = 2.0
 
     def __post_init__(self) -> None:
         for name, known in (("method", METHODS), ("keyframe_strategy", STRATEGIES), ("reference", SOURCES)):
@@ -80,7 +84,7 @@ class Options:
             raise UserError(
                 f"keyframe_overlap = {self.keyframe_overlap!r} must be positive; 1 makes new ones all the time"
             )
-        for name in ("keyframe_distance", "keyframe_angle_deg", "max_depth"):
+        for name in ("keyframe_distance", "keyframe_angle_deg", "max_depth", "memory_gb"):
             if not getattr(self, name) > 0.0:
                 raise UserError(f"{name} = {getattr(self, name)!r} must be positive")
         if not 0.0 <= self.blur_sigma_px < 1e3:

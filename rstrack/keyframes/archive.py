@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import zipfile
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.errors import UserError
+from rsgen.files import encode_npz
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
@@ -18,38 +23,102 @@ _ALIKE = 0.3
 
 @dataclass(frozen=True)
 class _Archived:
-    """A keyframe on the host: what does not need the device, inverse depth (h, w) and weight (h, w)."""
+    """A keyframe on the host: what does not need the device; images: inverse depth, weight and the host's own (h, w).
+
+    images: None where they are in `file`.
+    """
 
     small: Reference
-    inverse_depth: npt.NDArray[np.float32]
-    weight: npt.NDArray[np.float16]
+    images: dict[str, npt.NDArray[Any]] | None
+    file: Path | None = None
+
+    @property
+    def size(self) -> int:
+        """Bytes of the images that are in memory."""
+        return sum(image.nbytes for image in (self.images or {}).values())
 
 
 @dataclass
 class Archive:
-    """Keyframes by their numbers. One of 640×480 takes 2.5 MB instead of 8 on the device."""
+    """Keyframes by their numbers. One of 640×480 takes 4 MB instead of 8 on the device.
+
+    Beyond `most_bytes` the images of those that have been there longest go to temporary files (in TMPDIR), which are
+    gone when the archive is.
+    """
 
     maker: KeyframeMaker
+    most_bytes: float = float("inf")
     _kept: dict[int, _Archived] = field(default_factory=dict)
+    _size: int = 0
+    _folder: TemporaryDirectory[str] | None = None
 
     def __len__(self) -> int:
         return len(self._kept)
 
+    @property
+    def spilled(self) -> int:
+        """Keyframes whose images are in files."""
+        return sum(kept.images is None for kept in self._kept.values())
+
     def add(self, ref: Reference) -> None:
-        """Keep a keyframe as it is now, in place of what was kept of it before."""
+        """Keep a keyframe as it is now, in place of what was kept of it before. Raises UserError: no room on disk."""
         camera = ref.lens.camera
         rho, weight = (self.maker.e.download(a, (camera.height, camera.width)) for a in (ref.inverse_depth, ref.weight))
-        self._kept[ref.index] = _Archived(ref.emptied(), rho, weight.astype(np.float16))
+        images: dict[str, npt.NDArray[Any]] = {"inverse_depth": rho, "weight": weight.astype(np.float16)}
+        own = {"intensity": ref.intensity, "coarse_intensity": ref.coarse_intensity}
+        images |= {name: image for name, image in own.items() if image is not None}
+        self._forget(ref.index)
+        self._kept[ref.index] = _Archived(ref.emptied().without_images(), images)
+        self._size += self._kept[ref.index].size
+        for index, kept in list(self._kept.items()):
+            if self._size <= self.most_bytes:
+                break
+            if kept.images is not None:
+                self._kept[index] = replace(kept, images=None, file=self._written(index, kept.images))
+                self._size -= kept.size
 
     def get(self, index: int) -> Reference:
-        """The keyframe of frame `index`, on the device again."""
+        """The keyframe of frame `index`, on the device again. Raises UserError: its file is gone."""
         kept = self._kept[index]
-        return self.maker.revived(kept.small, kept.inverse_depth, kept.weight.astype(np.float32))
+        images = kept.images if kept.file is None else _read(kept.file)
+        assert images is not None
+        small = replace(
+            kept.small, intensity=images.get("intensity"), coarse_intensity=images.get("coarse_intensity")
+        )  # fmt: skip
+        return self.maker.revived(small, images["inverse_depth"], images["weight"].astype(np.float32))
+
+    def _forget(self, index: int) -> None:
+        before = self._kept.pop(index, None)
+        if before is not None:
+            self._size -= before.size
+            if before.file is not None:
+                before.file.unlink(missing_ok=True)
+
+    def _written(self, index: int, images: dict[str, npt.NDArray[Any]]) -> Path:
+        try:
+            if self._folder is None:
+                self._folder = TemporaryDirectory(prefix="rstrack-keyframes-")
+            path = Path(self._folder.name) / f"{index:08d}.npz"
+            path.write_bytes(encode_npz(images))
+        except OSError as error:
+            raise UserError(
+                f"keyframes: {len(self._kept)} do not fit --memory-gb, and temporary files cannot be written "
+                f"({error.strerror}): set TMPDIR to a folder with room, or give more --memory-gb"
+            ) from None
+        return path
 
     def alike(self, frame: DeviceFrame, without: set[int]) -> list[int]:
         """Keyframes whose view resembles a frame's, the best first; those in `without` are left out."""
         scores = {k: _resemblance(kept.small, frame) for k, kept in self._kept.items() if k not in without}
         return sorted((k for k, score in scores.items() if score > _ALIKE), key=lambda k: -scores[k])
+
+
+def _read(path: Path) -> dict[str, npt.NDArray[Any]]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise UserError(f"{path}: a keyframe that was put there cannot be read again ({error})") from None
 
 
 def _resemblance(ref: Reference, frame: DeviceFrame) -> float:

@@ -24,6 +24,8 @@ from rstrack.images.sampling import EDGE, NEAREST
 _SPARE_PX, _PLENTY_PX = 320 * 240, 640 * 480
 THINNED = LEVELS
 """Beside the pyramid's levels: the finest with every second of its pixels, for where a good many err alike."""
+# Of a keyframe on the device: five images, and of its points five of a quarter to a 64th of the pixels.
+_PIXEL_BYTES = 28
 # Normals come from a window of this many pixels; the residual itself is not smoothed.
 _NORMAL_WINDOW = 5
 
@@ -88,6 +90,16 @@ class Reference:
         return replace(
             self, inverse_depth=None, slope_x=None, slope_y=None, roughness=None, weight=None, points=()
         )  # fmt: skip
+
+    def without_images(self) -> Reference:
+        """Without what is large on the host."""
+        return replace(self, intensity=None, coarse_intensity=None)
+
+    @property
+    def device_bytes(self) -> int:
+        """About what it takes on the device."""
+        camera = self.lens.camera
+        return _PIXEL_BYTES * camera.width * camera.height
 
 
 def rectified_lens(camera: Camera) -> Lens:

@@ -17,7 +17,7 @@ from rstrack.options import Options
 
 # Keyframes that stay on the device; all others are archived.
 _RECENT = 8
-# Keyframes that a model keeps there: what a camera can come back to.
+# Keyframes that a model keeps there at most, as far as the options' memory goes: what a camera can come back to.
 _MODEL_KEYFRAMES = 256
 # Of the distance and angle at which a keyframe is left behind: an older one that is nearer becomes the reference again.
 _RETURN = 0.7
@@ -35,7 +35,8 @@ class KeyframeStore:
         self._maker, self._options = maker, options
         self._model = SurfaceModel(maker, options.voxel_m) if options.models else None
         self._kept: deque[Reference] = deque(maxlen=_RECENT if self._model is None else _MODEL_KEYFRAMES)
-        self._archive = Archive(maker)
+        self._bytes = 1e9 * options.memory_gb
+        self._archive = Archive(maker, self._bytes)
         self.anchor: Reference | None = None
         self.made = 0
 
@@ -101,6 +102,8 @@ class KeyframeStore:
         if self._kept:
             self._archive.add(self.newest)  # it changes no more
         self._kept.append(ref)
+        while len(self._kept) > max(_RECENT, self._bytes / ref.device_bytes):
+            self._kept.popleft()
         if self._model is not None:
             near = [k for k in self._kept if self._remoteness(ref.T_world_base, k.T_world_base) < _ANCHOR]
             oldest = min(near, key=lambda k: k.index)

@@ -37,6 +37,7 @@ class Stub:
     older: Any
     made_by: str
     brightness: Any = None
+    device_bytes: int = 1
 
 
 class Maker:
@@ -66,7 +67,7 @@ class Model:
 class Shelf:
     """In place of the archive: which keyframes it has."""
 
-    def __init__(self, maker: Maker) -> None:
+    def __init__(self, maker: Maker, most_bytes: float) -> None:
         self.kept: dict[int, Any] = {}
 
     def add(self, ref: Any) -> None:
