@@ -87,7 +87,7 @@ def test_a_tracker_with_hardly_any_memory_finds_the_same() -> None:
     def frames() -> list[Frame]:
         depths = [synthetic.render_depth(TRUTH, CAMERA, SHUTTER, k / 30.0) for k in range(14)]
         depths[9] = np.zeros_like(depths[9])
-        return [Frame(Image(k / 30.0, depth)) for k, depth in enumerate(depths)]
+        return [Frame(Image(k / 30.0, depth), ()) for k, depth in enumerate(depths)]
 
     found = []
     for memory_gb in (2.0, 1e-6):
