@@ -107,6 +107,9 @@ def track(
         bool, "estimate readouts, colour's clock and extrinsics first, as 'rstrack calibrate' does, and track with them"
     ] = False,
     device: DeviceName = None,
+    resume: Annotated[
+        bool, "go on with a run of the same settings in DIR that was stopped or killed, to the same bits"
+    ] = False,
     quiet: Quiet = False,
 ) -> int:
     """Track a sequence: writes trajectory.txt, spline.npz and run.json; with --calibrate camera.yaml and
@@ -122,6 +125,8 @@ def track(
 
     if device is not None and not calibrate:
         raise UserError(f"--device {device}: is for --calibrate, which is not given")
+    if resume and calibrate:
+        raise UserError("--resume --calibrate: 'rstrack calibrate --out camera.yaml' first, and track with --camera")
     known = None if device is None else device_named(device)
     noise = run.Noise(noise_depth, noise_intensity, seed)
     dataset = open_dataset(sequence, camera)
@@ -132,7 +137,7 @@ def track(
             if not found.solution.finished:
                 raise KeyboardInterrupt
             dataset = found.calibrated()
-        result = run.track(dataset, tracker, out, frames or slice(None), noise, progress)
+        result = run.track(dataset, tracker, out, frames or slice(None), noise, progress, resume)
     (out / CALIBRATION).unlink(missing_ok=True)  # of an earlier run in this folder
     if found is not None:
         atomic_write(out / "camera.yaml", found.camera_file().encode())

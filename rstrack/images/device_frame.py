@@ -73,6 +73,7 @@ class DeviceRig:
     """Lenses and rays of a rig as a method sees them; takes its frames to the device.
 
     rays (h, w, 2): normalised coordinates of the depth camera's pixels; device_rays: the same on the device.
+    resolution: step of the depth camera (1/m), 0 until its first images have shown one.
     """
 
     def __init__(self, rig: Rig, options: Options, timer: Timer = untimed) -> None:
@@ -85,8 +86,7 @@ class DeviceRig:
         self._finer = octaves_finer(rig.color_camera, rig.depth_camera)
         self.rays = camera_rays(Exposure(self._depth_lens, 0.0, np.eye(4)))
         self.device_rays = self.e.upload(self.rays[..., 0]), self.e.upload(self.rays[..., 1])
-        # Step of the depth camera (1/m), 0 until its first images have shown one.
-        self._resolution = 0.0
+        self.resolution = 0.0
 
     def upload(self, index: int, frame: Frame) -> DeviceFrame:
         """Frame `index` of a recording. Raises UserError if an image's size or type is not the rig's."""
@@ -96,10 +96,10 @@ class DeviceRig:
     def _upload(self, index: int, frame: Frame) -> DeviceFrame:
         rig, options = self._rig, self._options
         z = _checked(frame.depth, rig.depth_camera, "depth", (), "float metres, 0 = missing", np.floating)
-        if self._resolution == 0.0 and index < _SETTLED:
-            self._resolution = depth_resolution(z)
+        if self.resolution == 0.0 and index < _SETTLED:
+            self.resolution = depth_resolution(z)
         exposure = self._exposure(frame.depth, self._depth_lens, rig.depth_shutter, np.eye(4))
-        depth = depth_image(self.e, exposure, np.where(self._seen, z, 0.0), options.max_depth, self._resolution)
+        depth = depth_image(self.e, exposure, np.where(self._seen, z, 0.0), options.max_depth, self.resolution)
         colors = []
         for image in frame.colors if options.photometric else ():
             pixels = _checked(image, rig.color_camera, "colour", (3,), "uint8 RGB", np.uint8)

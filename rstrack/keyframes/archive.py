@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsgen.errors import UserError
-from rsgen.files import encode_npz
+from rsgen.files import atomic_write, encode_npz
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
@@ -25,7 +25,7 @@ _ALIKE = 0.3
 class _Archived:
     """A keyframe on the host: what does not need the device; images: inverse depth, weight and the host's own (h, w).
 
-    images: None where they are in `file`.
+    images: None where they are in `file` only.
     """
 
     small: Reference
@@ -42,22 +42,38 @@ class _Archived:
 class Archive:
     """Keyframes by their numbers. One of 640×480 takes 4 MB instead of 8 on the device.
 
-    Beyond `most_bytes` the images of those that have been there longest go to temporary files (in TMPDIR), which are
-    gone when the archive is.
+    Beyond `most_bytes` the images of those that have been there longest are in files only: temporary ones (in TMPDIR),
+    which are gone when the archive is, or in `folder`, where all images are written at once and stay, so that a
+    checkpoint need not hold them.
     """
 
     maker: KeyframeMaker
     most_bytes: float = float("inf")
+    folder: Path | None = None
     _kept: dict[int, _Archived] = field(default_factory=dict)
     _size: int = 0
-    _folder: TemporaryDirectory[str] | None = None
+    _added: int = 0
+    _temporary: TemporaryDirectory[str] | None = None
 
     def __len__(self) -> int:
         return len(self._kept)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """For a checkpoint: images that are in files stay there."""
+        kept = {k: each if each.file is None else replace(each, images=None) for k, each in self._kept.items()}
+        return vars(self) | {"_kept": kept, "_size": sum(each.size for each in kept.values()), "_temporary": None}
+
+    def put_in(self, folder: Path) -> None:
+        """Images go to files in a folder from now on; those that are in files are there."""
+        folder.mkdir(parents=True, exist_ok=True)
+        self.folder = folder
+        for k, each in self._kept.items():
+            if each.file is not None:
+                self._kept[k] = replace(each, file=folder / each.file.name)
+
     @property
     def spilled(self) -> int:
-        """Keyframes whose images are in files."""
+        """Keyframes whose images are in files only."""
         return sum(kept.images is None for kept in self._kept.values())
 
     def add(self, ref: Reference) -> None:
@@ -67,50 +83,56 @@ class Archive:
         images: dict[str, npt.NDArray[Any]] = {"inverse_depth": rho, "weight": weight.astype(np.float16)}
         own = {"intensity": ref.intensity, "coarse_intensity": ref.coarse_intensity}
         images |= {name: image for name, image in own.items() if image is not None}
-        self._forget(ref.index)
-        self._kept[ref.index] = _Archived(ref.emptied().without_images(), images)
+        before = self._kept.pop(ref.index, None)
+        if before is not None:
+            self._size -= before.size
+            if before.file is not None and self.folder is None:
+                before.file.unlink(missing_ok=True)
+        self._added += 1
+        file = None if self.folder is None else self._written(self.folder, ref.index, images)
+        self._kept[ref.index] = _Archived(ref.emptied().without_images(), images, file)
         self._size += self._kept[ref.index].size
         for index, kept in list(self._kept.items()):
             if self._size <= self.most_bytes:
                 break
             if kept.images is not None:
-                self._kept[index] = replace(kept, images=None, file=self._written(index, kept.images))
+                file = kept.file or self._written(self._temporary_folder(), index, kept.images)
+                self._kept[index] = replace(kept, images=None, file=file)
                 self._size -= kept.size
 
     def get(self, index: int) -> Reference:
         """The keyframe of frame `index`, on the device again. Raises UserError: its file is gone."""
         kept = self._kept[index]
-        images = kept.images if kept.file is None else _read(kept.file)
-        assert images is not None
+        images = kept.images
+        if images is None:
+            assert kept.file is not None
+            images = _read(kept.file)
         small = replace(
             kept.small, intensity=images.get("intensity"), coarse_intensity=images.get("coarse_intensity")
         )  # fmt: skip
         return self.maker.revived(small, images["inverse_depth"], images["weight"].astype(np.float32))
 
-    def _forget(self, index: int) -> None:
-        before = self._kept.pop(index, None)
-        if before is not None:
-            self._size -= before.size
-            if before.file is not None:
-                before.file.unlink(missing_ok=True)
-
-    def _written(self, index: int, images: dict[str, npt.NDArray[Any]]) -> Path:
-        try:
-            if self._folder is None:
-                self._folder = TemporaryDirectory(prefix="rstrack-keyframes-")
-            path = Path(self._folder.name) / f"{index:08d}.npz"
-            path.write_bytes(encode_npz(images))
-        except OSError as error:
-            raise UserError(
-                f"keyframes: {len(self._kept)} do not fit --memory-gb, and temporary files cannot be written "
-                f"({error.strerror}): set TMPDIR to a folder with room, or give more --memory-gb"
-            ) from None
-        return path
-
     def alike(self, frame: DeviceFrame, without: set[int]) -> list[int]:
         """Keyframes whose view resembles a frame's, the best first; those in `without` are left out."""
         scores = {k: _resemblance(kept.small, frame) for k, kept in self._kept.items() if k not in without}
         return sorted((k for k, score in scores.items() if score > _ALIKE), key=lambda k: -scores[k])
+
+    def _temporary_folder(self) -> Path:
+        if self._temporary is None:
+            try:
+                self._temporary = TemporaryDirectory(prefix="rstrack-keyframes-")
+            except OSError as error:
+                raise UserError(
+                    f"keyframes: {len(self._kept)} do not fit --memory-gb, and there is no folder for temporary files "
+                    f"({error.strerror}): set TMPDIR to one with room, or give more --memory-gb"
+                ) from None
+        return Path(self._temporary.name)
+
+    def _written(self, folder: Path, index: int, images: dict[str, npt.NDArray[Any]]) -> Path:
+        # A name of its own each time: a checkpoint may mean the one before.
+        path = folder / f"keyframe-{index:08d}-{self._added:08d}.npz"
+        atomic_write(path, encode_npz(images))
+        return path
 
 
 def _read(path: Path) -> dict[str, npt.NDArray[Any]]:

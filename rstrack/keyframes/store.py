@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
+from pathlib import Path
 
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
@@ -47,6 +48,10 @@ class KeyframeStore:
     def newest(self) -> Reference:
         """The one that was the reference last."""
         return self._kept[-1]
+
+    def put_in(self, folder: Path) -> None:
+        """Archived images go to files in a folder, see `Archive`."""
+        self._archive.put_in(folder)
 
     def candidates(self, frame: DeviceFrame, skip: int, most: int) -> list[Reference]:
         """Keyframes, ever made, whose view resembles a frame's: `most` of them after the first `skip`, round and round.

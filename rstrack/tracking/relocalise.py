@@ -60,7 +60,7 @@ class Relocaliser:
         self, rig: Rig, options: Options, keyframes: KeyframeStore, fits: FitHistory,
         observe: Callable[[DeviceFrame, Reference, FloatArray], list[Observation]],
     ) -> None:  # fmt: skip
-        self._rig, self._options, self._keyframes, self._fits, self._observe = rig, options, keyframes, fits, observe
+        self._rig, self._options, self._keyframes, self._fits, self.observe = rig, options, keyframes, fits, observe
         self._lost_in_a_row = 0
         self._jump: _Jump | None = None
 
@@ -117,7 +117,7 @@ class Relocaliser:
         def restarted() -> Window:
             return window.restarted(new, end, ref.T_world_base @ T_ref_cam)
 
-        trial, fresh = restarted(), self._observe(new, ref, _matched(new, ref))
+        trial, fresh = restarted(), self.observe(new, ref, _matched(new, ref))
         solved = trial.solve(fresh, LEVELS, hopeless=self._fits.is_hopeless)
         fitting = without_misfits(self._fits, fresh, fresh, ref)
         if len(fitting) < len(fresh) and not self._fits.is_hopeless(fresh):

@@ -43,7 +43,9 @@ if TYPE_CHECKING:
 
 End = Literal["done", "interrupted", "broke down"]
 
-_TRUTH_EVERY = 30
+# Frames after which the error so far is shown anew, at least, and the factor by which they have grown by then: it takes
+# as long as there are frames.
+_TRUTH_EVERY, _TRUTH_GROWTH = 30, 1.05
 # Observability (see FrameReport) below which a motion is held by the prior rather than by depth.
 _WEAK = 5e-4
 # Files that mark a folder as a data set, which a run folder's spline.npz must not overwrite.
@@ -158,12 +160,15 @@ def track(
     frames: slice = slice(None),
     noise: Noise | None = None,
     progress: Progress = no_progress,
+    resume: bool = False,
 ) -> Result:
     """Track frames of a dataset and write the run folder `out`: `write_estimate` says what is in it.
 
     Images that cannot be read are left out, and their frame with them if they are depth images. Where the run stops
-    early, because of an interrupt, what there is gets written. Raises UserError: no such frames, `out` cannot be
-    written or is a dataset, no frame was tracked.
+    early, because of an interrupt, what there is gets written. Long runs write down where they are now and then: with
+    `resume` such a run goes on from there, to the same bits as one that was never stopped (spline trackers without a
+    model). Raises UserError: no such frames, `out` cannot be written or is a dataset, no frame was tracked, a run of
+    other settings is to be resumed.
     """
     chosen = _chosen(dataset, frames)
     dataset = _with_color_timed(dataset, chosen, options, progress)
@@ -171,6 +176,8 @@ def track(
     if truth is not None:
         truth = dataclasses.replace(truth, frame_stamps=dataset.stamps[chosen])
     tracker = make_tracker(dataset.rig, options)
+    from rstrack.tracking.checkpoint import Done, checkpoint_of  # which imports Dr.Jit
+
     _make_folder(out)
     noise = noise or Noise()
 
@@ -180,15 +187,19 @@ def track(
             frame = with_noise(frame, k, noise.sigma_depth, noise.sigma_intensity, noise.seed)
         return frame, problems
 
-    seconds: list[float] = []
-    fed: list[int] = []
-    unreadable: list[tuple[int, str]] = []
+    checkpoint = checkpoint_of(out, dataset, chosen, tracker, dataclasses.asdict(noise))
+    done = Done()
+    if checkpoint is not None:
+        done = checkpoint.resume() if resume else checkpoint.begin()
+    elif resume:
+        raise UserError(f"{out}: --resume is for spline methods without --reference model: track anew")
+    seconds, fed, unreadable = done.seconds, done.fed, done.unreadable
     end: End = "done"
-    error, note = "", ""
-    begin = time.perf_counter()
+    error, note, told_at = "", "", 0
+    begin = time.perf_counter() - done.total_s
     with _stop_flag() as stopped:
-        images = prefetched(load, chosen, 2)
-        for count, k in enumerate(chosen, 1):
+        images = prefetched(load, chosen[done.count :], 2)
+        for count, k in enumerate(chosen[done.count :], done.count + 1):
             frame, problems = next(images)
             unreadable += [(k, problem) for problem in problems]
             if frame is not None:
@@ -200,13 +211,16 @@ def track(
                     break
                 seconds.append(time.perf_counter() - start)
                 fed.append(k)
-            if count % _TRUTH_EVERY == 0 or count == len(chosen):
-                note = _error_note(truth, tracker.trajectory)
+            if count >= max(told_at + _TRUTH_EVERY, _TRUTH_GROWTH * told_at) or count == len(chosen):
+                note, told_at = _error_note(truth, tracker.trajectory), count
             rate = count / (time.perf_counter() - begin)
             progress("tracking", count / len(chosen), f"{rate:.1f} frames/s, {_keyframes(tracker.keyframes)}{note}")
+            done.count, done.total_s = count, time.perf_counter() - begin
             if stopped.is_set() and count < len(chosen):
                 end = "interrupted"
                 break
+            if checkpoint is not None:
+                checkpoint.save_when_due(done)
         del images  # ends its thread
     if not seconds:
         raise UserError(error or f"{unreadable[0][1]}; no other frame of the {len(chosen)} can be read either")
@@ -228,6 +242,10 @@ def track(
     info["metrics"] = None if evaluation is None else evaluation.metrics.as_dict()
     info["truth_offset"] = None if evaluation is None else evaluation.truth_offset
     write_estimate(out, estimate.stamps, estimate.T_world_depth, estimate.spline, info)
+    if checkpoint is not None and end == "interrupted":
+        checkpoint.save(done)
+    elif checkpoint is not None:
+        checkpoint.remove()
     left_out = tuple(problem for _, problem in unreadable)
     return Result(estimate, evaluation, end, error, info["lost"], left_out, dataset.timing)
 

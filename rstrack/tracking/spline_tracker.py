@@ -11,10 +11,13 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from rsgen.array_types import FloatArray
+from rsgen.device.arrays import Engine
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
@@ -37,6 +40,8 @@ from rstrack.tracking.relocalise import Relocaliser, without_misfits
 from rstrack.tracking.uncertainty import Uncertainty
 from rstrack.tracking.window import LEVELS, TRACKING_LEVELS, Window
 
+# What a tracker of the same rig and options would make in the same way.
+_MADE_ANEW = "rig", "options", "_device", "_terms", "_maker"
 # Seconds without a frame after which the motion before says nothing about where the camera is, and beyond which
 # frames hardly belong to one recording.
 _GAP_S, _BREAK_S = 0.3, 3600.0
@@ -103,6 +108,35 @@ class Tracker:
     def keyframes(self) -> int:
         """How many there have been."""
         return self._keyframes.made
+
+    # -- checkpoints ------------------------------------------------------------------------------------------------
+
+    @property
+    def engine(self) -> Engine:
+        """Where it works."""
+        return self._device.e
+
+    @property
+    def shared(self) -> dict[str, object]:
+        """What another tracker of the same rig and options has as well, by name."""
+        shared = {name: getattr(self, name) for name in _MADE_ANEW}
+        return shared | {"engine": self.engine, "timer": self._device.timer, "observe": self._relocaliser.observe}
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """All that feeding frames has changed."""
+        own = {name: value for name, value in vars(self).items() if name not in _MADE_ANEW}
+        return own | {"resolution": self._device.resolution}
+
+    @state.setter
+    def state(self, state: dict[str, Any]) -> None:
+        own = dict(state)
+        self._device.resolution = own.pop("resolution")
+        vars(self).update(own)
+
+    def put_keyframes_in(self, folder: Path) -> None:
+        """Images of keyframes that are put away go to files in a folder at once, where they stay."""
+        self._keyframes.put_in(folder)
 
     # -- the loop ---------------------------------------------------------------------------------------------------
 

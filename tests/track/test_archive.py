@@ -58,7 +58,7 @@ def test_what_does_not_fit_goes_to_files_and_comes_back_the_same(
             archive.add(ref)
     assert (all_of_them.spilled, few.spilled) == (0, 2) and len(few) == 4
     files = sorted(tmp_path.glob("*/*.npz"))
-    assert [file.name for file in files] == ["00000000.npz", "00000001.npz"]
+    assert [file.name for file in files] == ["keyframe-00000000-00000003.npz", "keyframe-00000001-00000004.npz"]
     for ref in refs:
         assert same(few.get(ref.index), all_of_them.get(ref.index))
     # Used again and put back: its file is old, and it is the newest.

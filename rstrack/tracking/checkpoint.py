@@ -1,0 +1,171 @@
+"""A tracker in the middle of a run, on disk: a run that was killed goes on from there, to the same bits.
+
+What a rig's tracker is made of anew (kernels, lenses) is named, not written; what is on the device is written as it is;
+images of keyframes that are put away are files of their own, written once (`rstrack.keyframes.archive`).
+"""
+
+from __future__ import annotations
+
+import io
+import pickle
+import shutil
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from rsgen.device.arrays import Engine
+from rsgen.errors import UserError
+from rsgen.files import atomic_write
+from rstrack.data.dataset import Dataset
+from rstrack.tracking.spline_tracker import Tracker
+
+FOLDER = "checkpoint"
+_STATE = "state.pickle"
+# A run is written down so often at most (s), and takes this part of its time for it at most.
+_EVERY_S, _SHARE = 30.0, 0.03
+# Modules whose classes a checkpoint is made of: nothing else is called when one is read.
+_MODULES = "rsgen", "rstrack", "numpy", "collections", "pathlib", "_codecs", "copyreg"
+_BUILTINS = "slice", "range", "set", "frozenset", "complex", "bytearray"
+_DAMAGED = pickle.UnpicklingError, EOFError, AttributeError, ImportError, IndexError, KeyError, TypeError, ValueError
+
+
+@dataclass
+class Done:
+    """How far a run is: frames that have been looked at, seconds that it took, and what became of the frames."""
+
+    count: int = 0
+    total_s: float = 0.0
+    seconds: list[float] = field(default_factory=list)
+    fed: list[int] = field(default_factory=list)
+    unreadable: list[tuple[int, str]] = field(default_factory=list)
+
+
+def checkpoint_of(
+    out: Path, dataset: Dataset, chosen: range, tracker: object, noise: Mapping[str, Any]
+) -> Checkpoint | None:  # fmt: skip
+    """That of a run into the folder `out`; None for trackers that cannot be written down.
+
+    noise: what is added to the images, by name.
+    """
+    if not isinstance(tracker, Tracker) or tracker.options.models:
+        return None
+    rig, options = dataset.rig, tracker.options
+    depth, color = (rig.depth_camera, rig.depth_shutter), (rig.color_camera, rig.color_shutter)
+    key: dict[str, Any] = {item.name: getattr(options, item.name) for item in fields(options)}
+    key |= {f"noise {name}": value for name, value in noise.items()}
+    key |= {
+        "dataset": dataset.name, "frames": [chosen.start, chosen.stop], "backend": tracker.engine.backend,
+        "cameras": f"{depth} {color} {rig.T_color_depth.tolist()} {dataset.depth_error}",
+        "clocks": [float(dataset.stamps.sum()), float(dataset.color_stamps.sum())],
+        "version": version("rolling-shutter-rgbd"),
+    }  # fmt: skip
+    return Checkpoint(out / FOLDER, tracker, key)
+
+
+@dataclass
+class Checkpoint:
+    """The checkpoint of a run in its folder. key: the run's settings; only such a run goes on from it."""
+
+    root: Path
+    tracker: Tracker
+    key: Mapping[str, Any]
+    _due: float = field(default_factory=lambda: time.monotonic() + _EVERY_S)
+
+    def begin(self) -> Done:
+        """Take away what an earlier run has left; the tracker's keyframes are put away here from now on."""
+        shutil.rmtree(self.root, ignore_errors=True)
+        self.tracker.put_keyframes_in(self.root)
+        return Done()
+
+    def save_when_due(self, done: Done) -> None:
+        """Write down where a run is, if it was long ago. Raises UserError: it cannot be written."""
+        if time.monotonic() < self._due:
+            return
+        begun = time.monotonic()
+        self.save(done)
+        self._due = time.monotonic() + max(_EVERY_S, (time.monotonic() - begun) / _SHARE)
+
+    def save(self, done: Done) -> None:
+        """Write down where a run is, whole or not at all. Raises UserError: it cannot be written."""
+        stream = io.BytesIO()
+        _Writer(stream, self.tracker).dump({"key": dict(self.key), "done": done, "tracker": self.tracker.state})
+        atomic_write(self.root / _STATE, stream.getvalue())
+
+    def resume(self) -> Done:
+        """Bring the tracker, a new one, to where the run was; to its beginning where nothing was written down.
+
+        Raises UserError: damaged, or of a run with other settings.
+        """
+        path = self.root / _STATE
+        try:
+            data = path.read_bytes()
+        except OSError:
+            return self.begin()
+        try:
+            found = _Reader(io.BytesIO(data), self.tracker).load()
+            key, done, state = found["key"], found["done"], found["tracker"]
+        except _DAMAGED as error:
+            raise UserError(f"{path}: cannot be read ({error}): track without --resume") from None
+        for name in sorted({*key, *self.key}):
+            if key.get(name) != self.key.get(name):
+                raise UserError(
+                    f"{path}: is of a run with {name} {key.get(name)}, not {self.key.get(name)}: give the same, or "
+                    "track without --resume"
+                )
+        self.tracker.state = state
+        self.tracker.put_keyframes_in(self.root)
+        return Done(**vars(done))
+
+    def remove(self) -> None:
+        """The run has come to its end."""
+        shutil.rmtree(self.root, ignore_errors=True)
+
+
+class _Writer(pickle.Pickler):
+    def __init__(self, stream: io.BytesIO, tracker: Tracker) -> None:
+        super().__init__(stream, protocol=5)
+        self._names = {id(part): name for name, part in _shared(tracker).items()}
+        self._arrays = _array_types(tracker.engine)
+
+    def persistent_id(self, obj: Any) -> str | None:
+        return self._names.get(id(obj))
+
+    def reducer_override(self, obj: Any) -> Any:
+        if type(obj) in self._arrays:
+            return _Array, (self._arrays[type(obj)], obj.numpy())
+        return NotImplemented
+
+
+class _Reader(pickle.Unpickler):
+    def __init__(self, stream: io.BytesIO, tracker: Tracker) -> None:
+        super().__init__(stream)
+        self._parts, self._engine = _shared(tracker), tracker.engine
+
+    def persistent_load(self, pid: str) -> Any:
+        return self._parts[pid]
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) == (__name__, "_Array"):
+            return self._array
+        known = module.split(".")[0] in _MODULES or (module == "builtins" and name in _BUILTINS)
+        if not known:
+            raise pickle.UnpicklingError(f"it holds a {module}.{name}, which no run has")
+        return super().find_class(module, name)
+
+    def _array(self, kind: str, values: Any) -> Any:
+        return self._engine.upload(values) if kind == "Float" else getattr(self._engine, kind)(values)
+
+
+class _Array:
+    """Stands for a device array of a kind."""
+
+
+def _shared(tracker: Tracker) -> dict[str, Any]:
+    return {"tracker": tracker} | tracker.shared
+
+
+def _array_types(e: Engine) -> dict[Any, str]:
+    return {getattr(e, kind): kind for kind in ("Float", "UInt", "Int", "Bool")}

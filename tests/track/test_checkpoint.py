@@ -1,0 +1,159 @@
+"""Runs that are killed go on to the same bits; what is no checkpoint of theirs is refused in one line."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import synthetic
+
+from rsgen.console.progress import Progress
+from rsgen.errors import UserError
+from rstrack.cli.main import main
+from rstrack.data.dataset import Dataset, open_dataset
+from rstrack.data.estimate import read_estimate
+from rstrack.options import Options
+from rstrack.tracking import checkpoint
+from rstrack.tracking.run import Noise, track
+
+FRAMES = 16
+NOISE = Noise(1e-3, 0.01, 3)
+OPTIONS = Options(method="rs-pg", keyframe_distance=0.03, bootstrap_frames=3, backend="llvm")
+
+
+# The command, with a checkpoint after every frame, of which none takes less than a fifth of a second.
+SLOW = """
+import sys, time
+from rstrack.cli.main import main
+from rstrack.tracking import checkpoint
+from rstrack.tracking.spline_tracker import Tracker
+checkpoint._EVERY_S, checkpoint._SHARE, feed = 0.0, 1e9, Tracker.feed
+Tracker.feed = lambda *given: (time.sleep(0.2), feed(*given))[1]
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """With two frames that are lost in the middle, after which the track begins anew."""
+    root = tmp_path_factory.mktemp("checkpoint") / "seq"
+    stream = {"readout_s": 0.02}
+    config = synthetic.make_config(width=80, height=60, color=stream, depth=stream)
+    synthetic.make_sequence(root, config, FRAMES)
+    for k in (9, 10):
+        for name in ("rgb", "depth"):
+            image = sorted((root / name).iterdir())[k]
+            image.write_bytes(sorted((root / name).iterdir())[0].read_bytes() if name == "rgb" else b"")
+    return open_dataset(root)
+
+
+@pytest.fixture
+def often(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A checkpoint after every frame."""
+    monkeypatch.setattr(checkpoint, "_EVERY_S", 0.0)
+    monkeypatch.setattr(checkpoint, "_SHARE", np.inf)
+
+
+def killed_after(count: int) -> Progress:
+    """A progress that breaks off, as a crash does, after so many frames."""
+    seen: list[str] = []
+
+    def progress(name: str, *_: object) -> None:
+        seen.append(name)
+        if len(seen) > count:
+            raise RuntimeError("crashed")
+
+    return progress
+
+
+def files(run: Path) -> dict[str, bytes]:
+    return {name: (run / name).read_bytes() for name in ("trajectory.txt", "spline.npz")}
+
+
+@pytest.mark.parametrize("memory_gb", [2.0, 1e-6])
+def test_a_run_that_crashes_again_and_again_comes_to_the_same_bits(
+    dataset: Dataset, tmp_path: Path, often: None, memory_gb: float
+) -> None:
+    options = Options(**(vars(OPTIONS) | {"memory_gb": memory_gb}))
+    whole = track(dataset, options, tmp_path / "whole", noise=NOISE)
+    for count in (2, 5, 2, 4):
+        with pytest.raises(RuntimeError, match="crashed"):
+            track(
+                dataset,
+                options,
+                tmp_path / "cut",
+                noise=NOISE,
+                progress=killed_after(count),
+                resume=True,
+            )
+    (tmp_path / "cut").rename(tmp_path / "elsewhere")
+    cut = track(dataset, options, tmp_path / "elsewhere", noise=NOISE, resume=True)
+    assert files(tmp_path / "whole") == files(tmp_path / "elsewhere")
+    assert not (tmp_path / "elsewhere" / checkpoint.FOLDER).exists() and cut.unreadable == whole.unreadable != ()
+    a, b = (read_estimate(tmp_path / name) for name in ("whole", "elsewhere"))
+    assert len(a.info["timings"]["frame_ms"]) == len(b.info["timings"]["frame_ms"]) == FRAMES - 2
+    for name in ("frames", "spline_valid", "lost", "keyframes"):
+        assert a.info[name] == b.info[name], name
+
+
+def test_a_killed_process_goes_on(dataset: Dataset, tmp_path: Path) -> None:
+    command = ["track", str(dataset.root), "--method", "rs-g", "--quiet", "--bootstrap-frames", "3"]
+    child = subprocess.Popen([sys.executable, "-c", SLOW, *command, "--out", str(tmp_path / "cut")])
+    state, deadline = tmp_path / "cut" / checkpoint.FOLDER / "state.pickle", time.monotonic() + 60.0
+    while not state.exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.kill(child.pid, signal.SIGKILL)
+    child.wait()
+    assert state.exists() and not (tmp_path / "cut" / "run.json").exists()
+    assert main([*command, "--out", str(tmp_path / "cut"), "--resume"]) == 1
+    assert main([*command, "--out", str(tmp_path / "whole")]) == 1  # two frames cannot be read
+    assert files(tmp_path / "cut") == files(tmp_path / "whole")
+
+
+def test_only_the_same_run_goes_on(dataset: Dataset, tmp_path: Path, often: None) -> None:
+    out = tmp_path / "run"
+    with pytest.raises(RuntimeError):
+        track(dataset, OPTIONS, out, progress=killed_after(6), resume=True)
+    other = Options(**(vars(OPTIONS) | {"knot_spacing_s": 0.05}))
+    with pytest.raises(UserError, match=r"knot_spacing_s 0\.025, not 0\.05: give the same"):
+        track(dataset, other, out, resume=True)
+    with pytest.raises(UserError, match=r"noise sigma_depth 0\.0, not 0\.001"):
+        track(dataset, OPTIONS, out, noise=Noise(1e-3), resume=True)
+    with pytest.raises(UserError, match=r"frames \[0, 16\], not \[0, 12\]"):
+        track(dataset, OPTIONS, out, slice(0, 12), resume=True)
+    state = out / checkpoint.FOLDER / "state.pickle"
+    for damaged in (b"", state.read_bytes()[:-100], b"hello"):
+        state.write_bytes(damaged)
+        with pytest.raises(UserError, match="cannot be read") as caught:
+            track(dataset, OPTIONS, out, resume=True)
+        assert "\n" not in str(caught.value)
+    # Anew, it does not matter what is there.
+    assert track(dataset, OPTIONS, out, slice(0, 6)).end == "done" and not state.exists()
+
+
+def test_nothing_is_run_by_reading(dataset: Dataset, tmp_path: Path, often: None) -> None:
+    out = tmp_path / "run"
+    (out / checkpoint.FOLDER).mkdir(parents=True)
+
+    class Evil:
+        def __reduce__(self) -> tuple[object, ...]:
+            return os.system, (f"touch {tmp_path / 'touched'}",)
+
+    (out / checkpoint.FOLDER / "state.pickle").write_bytes(pickle.dumps(Evil()))
+    with pytest.raises(UserError, match="which no run has"):
+        track(dataset, OPTIONS, out, resume=True)
+    assert not (tmp_path / "touched").exists()
+
+
+def test_what_cannot_be_resumed_says_so(dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(UserError, match="--resume is for spline methods"):
+        track(dataset, Options(method="baseline", backend="llvm"), tmp_path, resume=True)
+    assert main(["track", str(dataset.root), "--out", str(tmp_path), "--resume", "--calibrate"]) == 2
+    assert "rstrack calibrate --out camera.yaml" in capsys.readouterr().err
