@@ -1,4 +1,4 @@
-"""The commands that measure the tracker itself: bench-speed, -convergence, -bootstrap, -calibration, and stress."""
+"""The commands that measure the tracker: bench-speed, -convergence, -bootstrap, -calibration, -long, and stress."""
 
 from __future__ import annotations
 
@@ -119,6 +119,27 @@ def bench_calibration(
     options = Options(backend=backend)
     with ProgressDisplay(quiet=json) as progress:
         found = calibrations(dataset, frames or slice(None), starts, factors or FACTORS, noise, seed, options, progress)
+    print_figures(found, json)
+    return 0
+
+
+def bench_long(
+    sequence: SequenceFolder,
+    tracker: Options,
+    *,
+    camera: CameraFile = None,
+    frames: Annotated[int, "how many", "N"] = 10_000,
+    loop: Annotated[int, "the sequence's first N, over and over", "N"] = 90,
+    json: Json = False,
+) -> int:
+    """Feed a sequence over and over: whether a frame costs as much after N frames as at the start, and memory."""
+    from rsgen.console.progress import ProgressDisplay
+    from rstrack.bench.long import long_run
+    from rstrack.data.dataset import open_dataset
+
+    dataset = open_dataset(sequence, camera)
+    with ProgressDisplay(quiet=json) as progress:
+        found = long_run(dataset, tracker, frames, loop, progress)
     print_figures(found, json)
     return 0
 
