@@ -20,6 +20,7 @@ from rsgen.device.arrays import Engine
 from rsgen.errors import UserError
 from rsgen.files import atomic_write
 from rstrack.data.dataset import Dataset
+from rstrack.data.estimate import INFO
 from rstrack.tracking.spline_tracker import Tracker
 
 FOLDER = "checkpoint"
@@ -97,12 +98,16 @@ class Checkpoint:
     def resume(self) -> Done:
         """Bring the tracker, a new one, to where the run was; to its beginning where nothing was written down.
 
-        Raises UserError: damaged, or of a run with other settings.
+        Raises UserError: damaged, of a run with other settings, or of one that has ended.
         """
         path = self.root / _STATE
         try:
             data = path.read_bytes()
         except OSError:
+            if not self.root.exists() and (self.root.parent / INFO).exists():
+                raise UserError(
+                    f"{self.root.parent}: this run has come to its end: track without --resume to do it again"
+                ) from None
             return self.begin()
         try:
             found = _Reader(io.BytesIO(data), self.tracker).load()

@@ -136,6 +136,8 @@ def test_only_the_same_run_goes_on(dataset: Dataset, tmp_path: Path, often: None
         assert "\n" not in str(caught.value)
     # Anew, it does not matter what is there.
     assert track(dataset, OPTIONS, out, slice(0, 6)).end == "done" and not state.exists()
+    with pytest.raises(UserError, match="has come to its end"):
+        track(dataset, OPTIONS, out, slice(0, 6), resume=True)
 
 
 def test_nothing_is_run_by_reading(dataset: Dataset, tmp_path: Path, often: None) -> None:
