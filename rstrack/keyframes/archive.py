@@ -25,11 +25,12 @@ _ALIKE = 0.3
 class _Archived:
     """A keyframe on the host: what does not need the device; images: inverse depth, weight and the host's own (h, w).
 
-    images: None where they are in `file` only.
+    images: None where they are in `file` only. number: of this version of it, counted over all that were added.
     """
 
     small: Reference
     images: dict[str, npt.NDArray[Any]] | None
+    number: int
     file: Path | None = None
 
     @property
@@ -43,7 +44,7 @@ class Archive:
     """Keyframes by their numbers. One of 640×480 takes 4 MB instead of 8 on the device.
 
     Beyond `most_bytes` the images of those that have been there longest are in files only: temporary ones (in TMPDIR),
-    which are gone when the archive is, or in `folder`, where all images are written at once and stay, so that a
+    which are gone when the archive is, or in `folder`, where they stay. `write` puts all of them there, so that a
     checkpoint need not hold them.
     """
 
@@ -64,7 +65,7 @@ class Archive:
         return vars(self) | {"_kept": kept, "_size": sum(each.size for each in kept.values()), "_temporary": None}
 
     def put_in(self, folder: Path) -> None:
-        """Images go to files in a folder from now on; those that are in files are there."""
+        """Files are in that folder from now on, and so are those that there are."""
         folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
         for k, each in self._kept.items():
@@ -89,16 +90,18 @@ class Archive:
             if before.file is not None and self.folder is None:
                 before.file.unlink(missing_ok=True)
         self._added += 1
-        file = None if self.folder is None else self._written(self.folder, ref.index, images)
-        self._kept[ref.index] = _Archived(ref.emptied().without_images(), images, file)
+        self._kept[ref.index] = _Archived(ref.emptied().without_images(), images, self._added)
         self._size += self._kept[ref.index].size
         for index, kept in list(self._kept.items()):
             if self._size <= self.most_bytes:
                 break
             if kept.images is not None:
-                file = kept.file or self._written(self._temporary_folder(), index, kept.images)
-                self._kept[index] = replace(kept, images=None, file=file)
+                self._kept[index] = replace(self._written(kept), images=None)
                 self._size -= kept.size
+
+    def write(self) -> None:
+        """All images that are in no file yet. Raises UserError: no room on disk."""
+        self._kept = {index: self._written(kept) for index, kept in self._kept.items()}
 
     def get(self, index: int) -> Reference:
         """The keyframe of frame `index`, on the device again. Raises UserError: its file is gone."""
@@ -128,11 +131,14 @@ class Archive:
                 ) from None
         return Path(self._temporary.name)
 
-    def _written(self, folder: Path, index: int, images: dict[str, npt.NDArray[Any]]) -> Path:
-        # A name of its own each time: a checkpoint may mean the one before.
-        path = folder / f"keyframe-{index:08d}-{self._added:08d}.npz"
-        atomic_write(path, encode_npz(images))
-        return path
+    def _written(self, kept: _Archived) -> _Archived:
+        """With its images in a file too, of a name of its own: a checkpoint may mean an earlier version."""
+        if kept.file is not None or kept.images is None:
+            return kept
+        folder = self.folder or self._temporary_folder()
+        path = folder / f"keyframe-{kept.small.index:08d}-{kept.number:08d}.npz"
+        atomic_write(path, encode_npz(kept.images))
+        return replace(kept, file=path)
 
 
 def _read(path: Path) -> dict[str, npt.NDArray[Any]]:

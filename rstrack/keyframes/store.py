@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
-from pathlib import Path
 
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
@@ -29,7 +28,8 @@ _ANCHOR = 2.0
 class KeyframeStore:
     """Rectified keyframes in the order in which they were last the reference. made: how many there have been.
 
-    anchor: a second, older reference for the frames that are aligned to the newest; only a model has one.
+    archive: where all but the newest are kept too. anchor: a second, older reference for the frames that are aligned to
+    the newest; only a model has one.
     """
 
     def __init__(self, maker: KeyframeMaker, options: Options) -> None:
@@ -37,7 +37,7 @@ class KeyframeStore:
         self._model = SurfaceModel(maker, options.voxel_m) if options.models else None
         self._kept: deque[Reference] = deque(maxlen=_RECENT if self._model is None else _MODEL_KEYFRAMES)
         self._bytes = 1e9 * options.memory_gb
-        self._archive = Archive(maker, self._bytes)
+        self.archive = Archive(maker, self._bytes)
         self.anchor: Reference | None = None
         self.made = 0
 
@@ -49,19 +49,15 @@ class KeyframeStore:
         """The one that was the reference last."""
         return self._kept[-1]
 
-    def put_in(self, folder: Path) -> None:
-        """Archived images go to files in a folder, see `Archive`."""
-        self._archive.put_in(folder)
-
     def candidates(self, frame: DeviceFrame, skip: int, most: int) -> list[Reference]:
         """Keyframes, ever made, whose view resembles a frame's: `most` of them after the first `skip`, round and round.
 
         The newest is not among them.
         """
-        indices = self._archive.alike(frame, {self.newest.index})
+        indices = self.archive.alike(frame, {self.newest.index})
         chosen = [indices[(skip + i) % len(indices)] for i in range(min(most, len(indices)))]
         on_device = {ref.index: ref for ref in self._kept}
-        return [on_device[k] if k in on_device else self._archive.get(k) for k in chosen]
+        return [on_device[k] if k in on_device else self.archive.get(k) for k in chosen]
 
     def use(self, ref: Reference) -> None:
         """A keyframe found again is the newest from now on."""
@@ -105,7 +101,7 @@ class KeyframeStore:
 
     def _use(self, ref: Reference) -> Reference:
         if self._kept:
-            self._archive.add(self.newest)  # it changes no more
+            self.archive.add(self.newest)  # it changes no more
         self._kept.append(ref)
         while len(self._kept) > max(_RECENT, self._bytes / ref.device_bytes):
             self._kept.popleft()

@@ -1,7 +1,7 @@
 """A tracker in the middle of a run, on disk: a run that was killed goes on from there, to the same bits.
 
 What a rig's tracker is made of anew (kernels, lenses) is named, not written; what is on the device is written as it is;
-images of keyframes that are put away are files of their own, written once (`rstrack.keyframes.archive`).
+images of keyframes that are put away go to files of their own, once (`rstrack.keyframes.archive`).
 """
 
 from __future__ import annotations
@@ -76,9 +76,9 @@ class Checkpoint:
     _due: float = field(default_factory=lambda: time.monotonic() + _EVERY_S)
 
     def begin(self) -> Done:
-        """Take away what an earlier run has left; the tracker's keyframes are put away here from now on."""
+        """Take away what an earlier run has left; keyframes' files are here from now on."""
         shutil.rmtree(self.root, ignore_errors=True)
-        self.tracker.put_keyframes_in(self.root)
+        self.tracker.archive.put_in(self.root)
         return Done()
 
     def save_when_due(self, done: Done) -> None:
@@ -91,6 +91,7 @@ class Checkpoint:
 
     def save(self, done: Done) -> None:
         """Write down where a run is, whole or not at all. Raises UserError: it cannot be written."""
+        self.tracker.archive.write()
         stream = io.BytesIO()
         _Writer(stream, self.tracker).dump({"key": dict(self.key), "done": done, "tracker": self.tracker.state})
         atomic_write(self.root / _STATE, stream.getvalue())
@@ -121,7 +122,7 @@ class Checkpoint:
                     "track without --resume"
                 )
         self.tracker.state = state
-        self.tracker.put_keyframes_in(self.root)
+        self.tracker.archive.put_in(self.root)
         return Done(**vars(done))
 
     def remove(self) -> None:

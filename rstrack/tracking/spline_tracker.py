@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,6 +29,7 @@ from rstrack.alignment.pull import pulls
 from rstrack.alignment.spline_state import PointStore
 from rstrack.data.rig import Frame, Rig
 from rstrack.images.device_frame import DeviceFrame, DeviceRig, Timer, untimed
+from rstrack.keyframes.archive import Archive
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.keyframes.store import KeyframeStore
@@ -134,9 +134,10 @@ class Tracker:
         self._device.resolution = own.pop("resolution")
         vars(self).update(own)
 
-    def put_keyframes_in(self, folder: Path) -> None:
-        """Images of keyframes that are put away go to files in a folder at once, where they stay."""
-        self._keyframes.put_in(folder)
+    @property
+    def archive(self) -> Archive:
+        """Where its keyframes are put away."""
+        return self._keyframes.archive
 
     # -- the loop ---------------------------------------------------------------------------------------------------
 
