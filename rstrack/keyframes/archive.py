@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsgen.errors import UserError
-from rsgen.files import atomic_write, encode_npz
+from rsgen.files import atomic_write, encode_npz, write_error
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
@@ -66,7 +66,6 @@ class Archive:
 
     def put_in(self, folder: Path) -> None:
         """Files are in that folder from now on, and so are those that there are."""
-        folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
         for k, each in self._kept.items():
             if each.file is not None:
@@ -136,6 +135,10 @@ class Archive:
         if kept.file is not None or kept.images is None:
             return kept
         folder = self.folder or self._temporary_folder()
+        try:
+            folder.mkdir(exist_ok=True)
+        except OSError as error:
+            raise write_error(folder, error) from None
         path = folder / f"keyframe-{kept.small.index:08d}-{kept.number:08d}.npz"
         atomic_write(path, encode_npz(kept.images))
         return replace(kept, file=path)

@@ -18,7 +18,7 @@ from typing import Any
 
 from rsgen.device.arrays import Engine
 from rsgen.errors import UserError
-from rsgen.files import atomic_write
+from rsgen.files import atomic_write, write_error
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import INFO
 from rstrack.tracking.spline_tracker import Tracker
@@ -91,6 +91,10 @@ class Checkpoint:
 
     def save(self, done: Done) -> None:
         """Write down where a run is, whole or not at all. Raises UserError: it cannot be written."""
+        try:
+            self.root.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise write_error(self.root, error) from None
         self.tracker.archive.write()
         stream = io.BytesIO()
         _Writer(stream, self.tracker).dump({"key": dict(self.key), "done": done, "tracker": self.tracker.state})
@@ -105,7 +109,7 @@ class Checkpoint:
         try:
             data = path.read_bytes()
         except OSError:
-            if not self.root.exists() and (self.root.parent / INFO).exists():
+            if (self.root.parent / INFO).exists():
                 raise UserError(
                     f"{self.root.parent}: this run has come to its end: track without --resume to do it again"
                 ) from None
