@@ -27,9 +27,13 @@ FOLDER = "checkpoint"
 _STATE = "state.pickle"
 # A run is written down so often at most (s), and takes this part of its time for it at most.
 _EVERY_S, _SHARE = 30.0, 0.03
-# Modules whose classes a checkpoint is made of: nothing else is called when one is read.
-_MODULES = "rsgen", "rstrack", "numpy", "collections", "pathlib", "_codecs", "copyreg"
-_BUILTINS = "slice", "range", "set", "frozenset", "complex", "bytearray"
+# What a checkpoint is made of, and nothing else is called when one is read: classes of these packages, and these.
+_PACKAGES = "rsgen", "rstrack", "collections", "pathlib"
+_NAMES = {
+    ("numpy", "ndarray"), ("numpy", "dtype"), ("numpy._core.multiarray", "_reconstruct"),
+    ("numpy._core.multiarray", "scalar"), ("numpy._core.numeric", "_frombuffer"),
+    *(("builtins", name) for name in ("slice", "range", "set", "frozenset", "complex", "bytearray")),
+}  # fmt: skip
 _DAMAGED = pickle.UnpicklingError, EOFError, AttributeError, ImportError, IndexError, KeyError, TypeError, ValueError
 
 
@@ -68,11 +72,15 @@ def checkpoint_of(
 
 @dataclass
 class Checkpoint:
-    """The checkpoint of a run in its folder. key: the run's settings; only such a run goes on from it."""
+    """The checkpoint of a run in its folder. key: the run's settings; only such a run goes on from it.
+
+    problem: why none can be written any more.
+    """
 
     root: Path
     tracker: Tracker
     key: Mapping[str, Any]
+    problem: str = ""
     _due: float = field(default_factory=lambda: time.monotonic() + _EVERY_S)
 
     def begin(self) -> Done:
@@ -82,15 +90,21 @@ class Checkpoint:
         return Done()
 
     def save_when_due(self, done: Done) -> None:
-        """Write down where a run is, if it was long ago. Raises UserError: it cannot be written."""
-        if time.monotonic() < self._due:
+        """Write down where a run is, if it was long ago."""
+        if time.monotonic() < self._due or self.problem:
             return
         begun = time.monotonic()
         self.save(done)
         self._due = time.monotonic() + max(_EVERY_S, (time.monotonic() - begun) / _SHARE)
 
     def save(self, done: Done) -> None:
-        """Write down where a run is, whole or not at all. Raises UserError: it cannot be written."""
+        """Write down where a run is, whole or not at all: a full disk is no reason to give the run up."""
+        try:
+            self._save(done)
+        except UserError as error:
+            self.problem = str(error)
+
+    def _save(self, done: Done) -> None:
         try:
             self.root.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -160,10 +174,10 @@ class _Reader(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) == (__name__, "_Array"):
             return self._array
-        known = module.split(".")[0] in _MODULES or (module == "builtins" and name in _BUILTINS)
-        if not known:
-            raise pickle.UnpicklingError(f"it holds a {module}.{name}, which no run has")
-        return super().find_class(module, name)
+        found = super().find_class(module, name) if module.split(".")[0] in (*_PACKAGES, "numpy", "builtins") else None
+        if (module, name) in _NAMES or (module.split(".")[0] in _PACKAGES and isinstance(found, type)):
+            return found
+        raise pickle.UnpicklingError(f"it holds a {module}.{name}, which no run has")
 
     def _array(self, kind: str, values: Any) -> Any:
         return self._engine.upload(values) if kind == "Float" else getattr(self._engine, kind)(values)

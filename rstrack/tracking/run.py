@@ -127,6 +127,8 @@ class Result:
         if self.unreadable:
             images = "1 image" if len(self.unreadable) == 1 else f"{len(self.unreadable)} images"
             lines.append(f"left out: {images} that cannot be read, first {self.unreadable[0]}")
+        if info.get("checkpoint_error"):
+            lines.append(f"cannot be resumed: {info['checkpoint_error']}")
         lines += [f"assumed: {note}" for note in info["dataset"].get("notes", ())]
         lines += [] if self.timing is None else self.timing.lines()
         return "\n".join(lines + ([] if self.evaluation is None else ["", self.evaluation.text()]))
@@ -222,6 +224,8 @@ def track(
             if checkpoint is not None:
                 checkpoint.save_when_due(done)
         del images  # ends its thread
+    if checkpoint is not None and end == "interrupted":
+        checkpoint.save(done)
     if not seconds:
         raise UserError(error or f"{unreadable[0][1]}; no other frame of the {len(chosen)} can be read either")
     timings = _timings(time.perf_counter() - begin, seconds)
@@ -229,6 +233,7 @@ def track(
         "end": end,
         "error": error or None,
         "keyframes": tracker.keyframes,
+        "checkpoint_error": (checkpoint.problem if checkpoint is not None else "") or None,
         "unreadable": [{"frame": k, "error": problem} for k, problem in unreadable],
         "lost": sum(report.lost for report in tracker.reports),
         "spline_valid": tracker.spline_valid,
@@ -242,9 +247,7 @@ def track(
     info["metrics"] = None if evaluation is None else evaluation.metrics.as_dict()
     info["truth_offset"] = None if evaluation is None else evaluation.truth_offset
     write_estimate(out, estimate.stamps, estimate.T_world_depth, estimate.spline, info)
-    if checkpoint is not None and end == "interrupted":
-        checkpoint.save(done)
-    elif checkpoint is not None:
+    if checkpoint is not None and end != "interrupted":
         checkpoint.remove()
     left_out = tuple(problem for _, problem in unreadable)
     return Result(estimate, evaluation, end, error, info["lost"], left_out, dataset.timing)

@@ -13,9 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import synthetic
+from numpy.testing._private.utils import runstring
 
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
+from rsgen.files import atomic_write
 from rstrack.cli.main import main
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.estimate import read_estimate
@@ -144,14 +146,34 @@ def test_nothing_is_run_by_reading(dataset: Dataset, tmp_path: Path, often: None
     out = tmp_path / "run"
     (out / checkpoint.FOLDER).mkdir(parents=True)
 
-    class Evil:
-        def __reduce__(self) -> tuple[object, ...]:
-            return os.system, (f"touch {tmp_path / 'touched'}",)
+    touched = tmp_path / "touched"
+    code = f"open({str(touched)!r}, 'w')"
 
-    (out / checkpoint.FOLDER / "state.pickle").write_bytes(pickle.dumps(Evil()))
-    with pytest.raises(UserError, match="which no run has"):
-        track(dataset, OPTIONS, out, resume=True)
-    assert not (tmp_path / "touched").exists()
+    class Evil:
+        def __init__(self, function: object, *arguments: object) -> None:
+            self.call = function, arguments
+
+        def __reduce__(self) -> tuple[object, ...]:
+            return self.call
+
+    for evil in (Evil(os.system, f"touch {touched}"), Evil(eval, code), Evil(runstring, code, {}),
+                 Evil(atomic_write, touched, b"")):  # fmt: skip
+        (out / checkpoint.FOLDER / "state.pickle").write_bytes(pickle.dumps(evil))
+        with pytest.raises(UserError, match="which no run has"):
+            track(dataset, OPTIONS, out, resume=True)
+    assert not touched.exists()
+
+
+def test_a_full_disk_ends_checkpoints_and_not_the_run(
+    dataset: Dataset, tmp_path: Path, often: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, _: bytes) -> None:
+        raise UserError(f"{path}: cannot be written (No space left on device): free space")
+
+    monkeypatch.setattr(checkpoint, "atomic_write", full)
+    found = track(dataset, OPTIONS, tmp_path / "run")
+    assert found.end == "done" and "cannot be resumed: " in found.text() and "No space left" in found.text()
+    assert "No space left" in read_estimate(tmp_path / "run").info["checkpoint_error"]
 
 
 def test_what_cannot_be_resumed_says_so(dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
