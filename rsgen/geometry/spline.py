@@ -195,7 +195,7 @@ class Spline:
     def save(self, path: str | Path) -> None:
         """Write control_points, t0 and dt to an .npz file (float64, so that `load` returns the very same spline)."""
         with Path(path).open("wb") as file:
-            np.savez(file, control_points=self.control_points, t0=np.float64(self.t0), dt=np.float64(self.dt))
+            np.savez(file, control_points=self.control_points, t0=np.float64(self.t_begin), dt=np.float64(self.dt))
 
     @classmethod
     def load(cls, path: str | Path) -> Spline:

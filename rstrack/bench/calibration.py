@@ -1,6 +1,6 @@
 """How far off cameras may be and still be found, and whether what is said of the errors is true.
 
-print(calibrations(dataset, range(300), starts=10).text())
+print(calibrations(dataset, slice(0, 300), starts=10).text())
 """
 
 from __future__ import annotations
@@ -126,7 +126,8 @@ def _distance(factor: float) -> str:
     if not factor:
         return "nothing"
     readout = f"readouts {100 * UNIT_READOUT * factor:.0f} %"
-    return f"{readout}, {1e3 * factor * UNIT_OFFSET_S:g} ms, {1e3 * factor * UNIT_M:g} mm, {0.5 * factor:g} deg"
+    turn = f"{np.degrees(factor * UNIT_RAD):g} deg"
+    return f"{readout}, {1e3 * factor * UNIT_OFFSET_S:g} ms, {1e3 * factor * UNIT_M:g} mm, {turn}"
 
 
 def calibrations(
@@ -137,7 +138,7 @@ def calibrations(
     """Calibrate from cameras that are told ever more wrongly, all values at once, each way round at random.
 
     dataset: with its true cameras. noise: of depth and intensity, see `rstrack.data.noise`, other for each start. A
-    readout is never told below 0. Raises UserError: numbers below 0, or a dataset that cannot be calibrated at all.
+    readout is never told below 0. Raises UserError: no starts, or factors below 0.
     """
     if starts < 1 or min(factors, default=-1.0) < 0.0:
         raise UserError(f"{starts} starts from {list(factors)}: give 1 or more starts, and factors of 0 or more")

@@ -27,8 +27,11 @@ FOLDER = "checkpoint"
 _STATE = "state.pickle"
 # A run is written down so often at most (s), and takes this part of its time for it at most.
 _EVERY_S, _SHARE = 30.0, 0.03
-# What a checkpoint is made of, and nothing else is called when one is read: classes of these packages, and these.
-_PACKAGES = "rsgen", "rstrack", "collections", "pathlib"
+# What a checkpoint is made of, and nothing else is called when one is read: classes that these define, and these names.
+_PACKAGES = (
+    "rsgen.device.", "rsgen.geometry.", "rstrack.alignment.", "rstrack.images.", "rstrack.keyframes.",
+    "rstrack.tracking.", "rstrack.data.rig.", "rstrack.options.", "collections.", "pathlib.",
+)  # fmt: skip
 _NAMES = {
     ("numpy", "ndarray"), ("numpy", "dtype"), ("numpy._core.multiarray", "_reconstruct"),
     ("numpy._core.multiarray", "scalar"), ("numpy._core.numeric", "_frombuffer"),
@@ -174,9 +177,13 @@ class _Reader(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) == (__name__, "_Array"):
             return self._array
-        found = super().find_class(module, name) if module.split(".")[0] in (*_PACKAGES, "numpy", "builtins") else None
-        if (module, name) in _NAMES or (module.split(".")[0] in _PACKAGES and isinstance(found, type)):
-            return found
+        if (module, name) in _NAMES:
+            return super().find_class(module, name)
+        # By the names that a module imports everything could be had.
+        if f"{module}.".startswith(_PACKAGES) and "." not in name:
+            found = super().find_class(module, name)
+            if isinstance(found, type) and found.__module__ == module:
+                return found
         raise pickle.UnpicklingError(f"it holds a {module}.{name}, which no run has")
 
     def _array(self, kind: str, values: Any) -> Any:

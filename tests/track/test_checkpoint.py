@@ -161,6 +161,12 @@ def test_nothing_is_run_by_reading(dataset: Dataset, tmp_path: Path, often: None
         (out / checkpoint.FOLDER / "state.pickle").write_bytes(pickle.dumps(evil))
         with pytest.raises(UserError, match="which no run has"):
             track(dataset, OPTIONS, out, resume=True)
+    # What a module of ours imports is not ours: a class, and one by a dotted name.
+    for module, name in (("rstrack.keyframes.archive", "TemporaryDirectory"), ("pathlib", "os._wrap_close")):
+        texts = b"".join(b"\x8c" + bytes([len(text)]) + text.encode() for text in (module, name))
+        (out / checkpoint.FOLDER / "state.pickle").write_bytes(b"\x80\x04" + texts + b"\x93)R.")
+        with pytest.raises(UserError, match="which no run has"):
+            track(dataset, OPTIONS, out, resume=True)
     assert not touched.exists()
 
 
