@@ -14,8 +14,10 @@ from rstrack.alignment.brightness import SAME
 from rstrack.alignment.linearise import Linearised, Terms
 from rstrack.alignment.normal_equations import Quadratic
 from rstrack.alignment.spline_state import SplineState
+from rstrack.images.device_frame import DeviceFrame
 from rstrack.images.pyramid import ColorImage, DepthImage
 from rstrack.keyframes.keyframe import THINNED, Reference
+from rstrack.options import Options
 
 # Increments of control points (m, rad) that change the derivatives of lines by less than a step's own error.
 _SAME_SLOPES = 2e-2
@@ -174,3 +176,12 @@ class Observation:
         """What the model's control points have been moved by since (k, 6)."""
         model = self.lin.model
         return state.received(model.first, model.last) - self.linearisation.at
+
+
+def observe(frame: DeviceFrame, ref: Reference, options: Options, expected: FloatArray = SAME) -> list[Observation]:
+    """What the terms of a method make of a frame against a reference: its depth image, and its colour images.
+
+    expected (2,): gain and offset that the colour images are expected to have against the reference.
+    """
+    depth = [Observation(frame.index, frame.depth, ref)] if options.geometric else []
+    return depth + [Observation(frame.index, c, ref, frame.depth, expected) for c in frame.colors if ref.points]

@@ -52,7 +52,8 @@ class Problem:
     """Observations and priors over the free control points free[0]..free[1].
 
     `fresh` observations go through the pyramid's levels; `settled` ones keep their models of the finest level as long
-    as these are good. `focal` in pixels, to tell how far lines move. `bandwidth`: of the system.
+    as these are good. `focal` in pixels, to tell how far lines move. `bandwidth`: of the system. rigid: the free
+    control points move as one body.
     """
 
     fresh: Sequence[Observation]
@@ -61,6 +62,7 @@ class Problem:
     priors: Sequence[Prior]
     focal: float
     bandwidth: int = 24
+    rigid: bool = False
 
 
 def optimise(
@@ -110,7 +112,7 @@ def _optimise_level(terms: Terms, state: SplineState, problem: Problem, level: i
         with terms.timer("linear algebra: assemble"):
             H, g = assemble(models, *problem.free)
         with terms.timer("linear algebra: solve"):
-            plain = _damped_step(H, g, damping, problem.bandwidth)
+            plain = _damped_step(H, g, damping, problem)
             at = state.received(first, first + len(plain)).ravel()
             step = acceleration.extrapolated(at, plain.ravel(), H).reshape(-1, 6)
             is_plain = bool((step == plain).all())
@@ -135,17 +137,21 @@ def _shift(problem: Problem, first: int, step: FloatArray) -> float:
     return max(shifts, default=0.0)
 
 
-def _damped_step(H: FloatArray, g: FloatArray, damping: float, bandwidth: int) -> FloatArray:
+def _damped_step(H: FloatArray, g: FloatArray, damping: float, problem: Problem) -> FloatArray:
     """Increments (n, 6); rounding can make a system indefinite that hardly tells some motion: then damped more."""
+    count = len(g) // 6
+    if problem.rigid:
+        together = np.tile(np.eye(6), (count, 1))
+        H, g = together.T @ H @ together, together.T @ g
     for _ in range(8):
         damped = H.copy()
         damped[np.diag_indices_from(H)] *= 1.0 + damping
         try:
-            step = solve(damped, g, bandwidth)
+            step = solve(damped, g, problem.bandwidth)
         except np.linalg.LinAlgError:
             step = np.full_like(g, np.nan)
         if np.isfinite(step).all():
-            return step.reshape(-1, 6)
+            return np.tile(step, (count, 1)) if problem.rigid else step.reshape(-1, 6)
         damping = max(1e-9, 100.0 * damping)
     raise np.linalg.LinAlgError("the normal equations have no finite solution")
 

@@ -19,6 +19,7 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.linearise import Terms
+from rstrack.alignment.observation import observe
 from rstrack.alignment.spline_state import SplineState
 from rstrack.bench.bootstrap import generator
 from rstrack.data.dataset import Dataset
@@ -30,7 +31,6 @@ from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.metrics.association import angles_deg
 from rstrack.options import Options
 from rstrack.tracking.lost_track import FitHistory
-from rstrack.tracking.spline_tracker import observe
 from rstrack.tracking.window import Window
 
 # What a frame is moved by, in metres and degrees, and multiples of it; 0 tells how good the truth itself is as a start.

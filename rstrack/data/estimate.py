@@ -23,6 +23,8 @@ from rsgen.sequence.trajectory import read_trajectory
 
 TRAJECTORY = "trajectory.txt"
 SPLINE = "spline.npz"
+ONLINE_TRAJECTORY, ONLINE_SPLINE = "trajectory_online.txt", "spline_online.npz"
+"""The track as it was found frame by frame, where the whole of it has been corrected since."""
 INFO = "run.json"
 
 _ORTHONORMAL_WITHIN = 1e-6
@@ -80,29 +82,38 @@ class Estimate:
 
 
 def write_estimate(
-    folder: Path, stamps: npt.ArrayLike, T_world_depth: npt.ArrayLike, spline: Spline | None, info: dict[str, Any]
-) -> None:
+    folder: Path, stamps: npt.ArrayLike, T_world_depth: npt.ArrayLike, spline: Spline | None, info: dict[str, Any],
+    online: Estimate | None = None,
+) -> None:  # fmt: skip
     """Write a run folder: trajectory.txt (TUM, nanometres and nanoseconds), spline.npz where there is one, run.json.
 
-    Arguments as in `Estimate`. `info` may hold NumPy numbers and arrays; what is not finite becomes null. Each file is
-    written whole or not at all, run.json last; files of an earlier run go first. Raises UserError.
+    Arguments as in `Estimate`. `info` may hold NumPy numbers and arrays; what is not finite becomes null. online: the
+    track before it was corrected, for trajectory_online.txt and spline_online.npz. Each file is written whole or not at
+    all, run.json last; files of an earlier run go first. Raises UserError.
     """
     estimate = Estimate(np.asarray(stamps, np.float64), np.asarray(T_world_depth, np.float64), spline, info)
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name in (INFO, SPLINE):
+        for name in (INFO, SPLINE, ONLINE_TRAJECTORY, ONLINE_SPLINE):
             (folder / name).unlink(missing_ok=True)
     except OSError as error:
         raise write_error(folder, error) from None
+    _write_poses(folder, estimate, TRAJECTORY, SPLINE)
+    if online is not None:
+        _write_poses(folder, online, ONLINE_TRAJECTORY, ONLINE_SPLINE)
+    atomic_write(folder / INFO, (json.dumps(plain(info), indent=1, allow_nan=False) + "\n").encode())
+
+
+def _write_poses(folder: Path, estimate: Estimate, trajectory: str, spline_name: str) -> None:
     lines = ["# T_world_depth", "# stamp tx ty tz qx qy qz qw"]
     for stamp, row in zip(estimate.stamps, pose_rows(estimate.T_world_depth), strict=True):
         lines.append(f"{stamp:.9f} {row[0]:.9f} {row[1]:.9f} {row[2]:.9f} " + " ".join(f"{q:.12f}" for q in row[3:]))
-    atomic_write(folder / TRAJECTORY, ("\n".join(lines) + "\n").encode())
+    atomic_write(folder / trajectory, ("\n".join(lines) + "\n").encode())
+    spline = estimate.spline
     if spline is not None:
         arrays = {"control_points": spline.control_points, "t0": np.array(spline.t0), "dt": np.array(spline.dt)}
-        atomic_write(folder / SPLINE, encode_npz(arrays))
-    atomic_write(folder / INFO, (json.dumps(plain(info), indent=1, allow_nan=False) + "\n").encode())
+        atomic_write(folder / spline_name, encode_npz(arrays))
 
 
 def read_estimate(path: Path) -> Estimate:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_npz, write_error
 from rstrack.images.device_frame import DeviceFrame
@@ -113,6 +114,19 @@ class Archive:
             kept.small, intensity=images.get("intensity"), coarse_intensity=images.get("coarse_intensity")
         )  # fmt: skip
         return self.maker.revived(small, images["inverse_depth"], images["weight"].astype(np.float32))
+
+    @property
+    def indices(self) -> list[int]:
+        """Numbers of the frames that they were made of."""
+        return list(self._kept)
+
+    def small(self, index: int) -> Reference:
+        """The keyframe of frame `index` without its images."""
+        return self._kept[index].small
+
+    def pose(self, index: int) -> FloatArray:
+        """T_world_base (4, 4) of the keyframe of frame `index`."""
+        return self._kept[index].small.T_world_base
 
     def alike(self, frame: DeviceFrame, without: set[int]) -> list[int]:
         """Keyframes whose view resembles a frame's, the best first; those in `without` are left out."""

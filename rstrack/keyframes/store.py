@@ -49,6 +49,11 @@ class KeyframeStore:
         """The one that was the reference last."""
         return self._kept[-1]
 
+    def put_away(self) -> None:
+        """The newest into the archive too, as it is now."""
+        if self._kept:
+            self.archive.add(self.newest)
+
     def candidates(self, frame: DeviceFrame, skip: int, most: int) -> list[Reference]:
         """Keyframes, ever made, whose view resembles a frame's: `most` of them after the first `skip`, round and round.
 

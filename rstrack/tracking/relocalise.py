@@ -16,18 +16,19 @@ from rstrack.alignment.pull import pulls
 from rstrack.data.rig import Rig
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.images.pyramid import DepthImage
+from rstrack.keyframes import coarse_search
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.store import KeyframeStore
 from rstrack.options import Options
-from rstrack.tracking import coarse_search
 from rstrack.tracking.lost_track import FitHistory, implausible
 from rstrack.tracking.uncertainty import Uncertainty
 from rstrack.tracking.window import LEVELS, Window
 
 # Keyframes at which a lost frame is looked for, at once.
 _PLACES = 3
-# Part of the pixels that must fit where a place is recognised by depth though the colours say otherwise.
-_SURE_FIT = 0.9
+# Part of the pixels that must fit where a place is recognised by depth though the colours say otherwise, and how well
+# depth must tell all motions there (see `FrameReport.observability`): one wall fits another.
+_SURE_FIT, _SURE_SEEN = 0.9, 2e-3
 
 
 @dataclass(frozen=True)
@@ -126,10 +127,15 @@ class Relocaliser:
         pulled = pulls(fresh, trial.state)
         uncertainty = before.found_anew(pulled.information)
         # Depth alone is much alike in many places.
-        is_sure = len(fresh) > 1 or not (new.colors and ref.points) or fresh[0].lin.fit >= _SURE_FIT
+        is_sure = len(fresh) > 1 or not (new.colors and ref.points) or _is_sure(fresh[0])
         if self._fits.fault(fresh, solved, ref.pixels, pulled) or not (is_sure and uncertainty.is_known):
             return None
         return Found(trial, fresh, solved, ref, uncertainty)
+
+
+def _is_sure(depth: Observation) -> bool:
+    """Whether a depth image alone tells the place."""
+    return depth.is_linearised and depth.lin.fit >= _SURE_FIT and depth.lin.observability >= _SURE_SEEN
 
 
 def without_misfits(

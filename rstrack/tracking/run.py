@@ -14,7 +14,6 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
@@ -35,10 +34,12 @@ from rstrack.metrics.association import Truth, compare, truth_of
 from rstrack.metrics.evaluate import Metrics
 from rstrack.metrics.run_evaluate import Evaluation, evaluate_clocks
 from rstrack.options import Options
+from rstrack.tracking.record import Noise, diagnostics, settings, timings
 
 if TYPE_CHECKING:
     from rstrack.images.device_frame import Timer
     from rstrack.tracking.frame_report import FrameReport
+    from rstrack.tracking.loop_closing import Closing
 
 
 End = Literal["done", "interrupted", "broke down"]
@@ -79,15 +80,6 @@ class AnyTracker(Protocol):
 
 
 @dataclass(frozen=True)
-class Noise:
-    """Noise added to the frames; see `rstrack.data.noise.with_noise`."""
-
-    sigma_depth: float = 0.0
-    sigma_intensity: float = 0.0
-    seed: int = 0
-
-
-@dataclass(frozen=True)
 class Result:
     """What a run came to.
 
@@ -103,6 +95,7 @@ class Result:
     lost: int
     unreadable: tuple[str, ...] = ()
     timing: Timing | None = None
+    loops: str = ""
 
     @property
     def metrics(self) -> Metrics | None:
@@ -121,6 +114,7 @@ class Result:
             f"{times['total_s']:.1f} s, {rate:.1f} frames/s on {info['backend']}; a frame takes "
             f"{times['median_ms']:.1f} ms (median), {times['mean_ms']:.1f} (mean), {times['p95_ms']:.1f} (95 %)",
         ]
+        lines += [self.loops] if self.loops else []
         weak = sum(not f["lost"] and 0.0 < f["observability"] < _WEAK for f in info["frames"])
         if weak and info["method"] in ("rs-g", "gs-g", "baseline"):
             lines.append(f"in {weak} of {done} frames the geometry hardly fixes all six degrees of freedom (a wall?)")
@@ -178,7 +172,9 @@ def track(
     if truth is not None:
         truth = dataclasses.replace(truth, frame_stamps=dataset.stamps[chosen])
     tracker = make_tracker(dataset.rig, options)
-    from rstrack.tracking.checkpoint import Done, checkpoint_of  # which imports Dr.Jit
+    from rstrack.tracking.checkpoint import Done, checkpoint_of  # these import Dr.Jit
+    from rstrack.tracking.loop_closing import close_loops
+    from rstrack.tracking.spline_tracker import Tracker
 
     _make_folder(out)
     noise = noise or Noise()
@@ -224,36 +220,70 @@ def track(
             if checkpoint is not None:
                 checkpoint.save_when_due(done)
         del images  # ends its thread
-    if checkpoint is not None and end == "interrupted":
-        checkpoint.save(done)
     if not seconds:
         raise UserError(error or f"{unreadable[0][1]}; no other frame of the {len(chosen)} can be read either")
-    timings = _timings(time.perf_counter() - begin, seconds)
-    info = _settings(dataset, chosen, tracker.options, noise) | {
+    closing: Closing | None = None
+    if end == "done" and isinstance(tracker, Tracker) and options.loops == "end":
+        try:
+            closing = close_loops(tracker, lambda index: _readable(load(fed[index])), progress)
+        except KeyboardInterrupt:
+            end = "interrupted"
+    if checkpoint is not None and end == "interrupted":
+        checkpoint.save(done)
+    info = settings(dataset, chosen, tracker.options, noise) | {
         "end": end,
         "error": error or None,
         "keyframes": tracker.keyframes,
         "checkpoint_error": (checkpoint.problem if checkpoint is not None else "") or None,
         "unreadable": [{"frame": k, "error": problem} for k, problem in unreadable],
         "lost": sum(report.lost for report in tracker.reports),
+        "loops": None if closing is None else closing.info(),
         "spline_valid": tracker.spline_valid,
-        "timings": timings,
-        "frames": _diagnostics(dataset, fed, tracker.reports),
+        "timings": timings(time.perf_counter() - begin, seconds),
+        "frames": diagnostics(dataset, fed, tracker.reports),
     }
     if dataset.timing is not None:
         info["clocks"] = dataset.timing.as_dict()
-    estimate = Estimate(*tracker.trajectory, tracker.spline, info)
-    evaluation = _evaluation(truth, estimate)
+    online = Estimate(*tracker.trajectory, tracker.spline, info)
+    estimate = online if closing is None else _corrected(online, closing)
+    evaluation, before = _evaluation(truth, estimate), None
     info["metrics"] = None if evaluation is None else evaluation.metrics.as_dict()
     info["truth_offset"] = None if evaluation is None else evaluation.truth_offset
-    write_estimate(out, estimate.stamps, estimate.T_world_depth, estimate.spline, info)
+    if estimate is not online:
+        before = _evaluation(truth, online)
+        info["metrics_online"] = None if before is None else before.metrics.as_dict()
+    write_estimate(
+        out, estimate.stamps, estimate.T_world_depth, estimate.spline, info, None if estimate is online else online
+    )
     if checkpoint is not None and end != "interrupted":
         checkpoint.remove()
     left_out = tuple(problem for _, problem in unreadable)
-    return Result(estimate, evaluation, end, error, info["lost"], left_out, dataset.timing)
+    loops = "" if closing is None else _loops_text(closing, online, estimate, before)
+    return Result(estimate, evaluation, end, error, info["lost"], left_out, dataset.timing, loops)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
+
+
+def _readable(loaded: tuple[Frame | None, tuple[str, ...]]) -> Frame:
+    """A frame that has been tracked, read once more."""
+    frame, problems = loaded
+    if frame is None:
+        raise UserError(f"{problems[0]}, though it could be read before")
+    return frame
+
+
+def _corrected(online: Estimate, closing: Closing) -> Estimate:
+    if closing.spline is None or online.spline is None:
+        return online
+    poses = closing.poses(online.spline, online.stamps, online.T_world_depth)
+    return Estimate(online.stamps, poses, closing.spline, online.info)
+
+
+def _loops_text(closing: Closing, online: Estimate, estimate: Estimate, before: Evaluation | None) -> str:
+    moved = np.linalg.norm((estimate.T_world_depth - online.T_world_depth)[:, :3, 3], axis=1)
+    was = "" if before is None else f", ATE before {1e3 * before.metrics.ate_rmse_m:.3f} mm"
+    return closing.text(float(moved.max(initial=0.0))) + was
 
 
 def _chosen(dataset: Dataset, frames: slice) -> range:
@@ -326,60 +356,3 @@ def _evaluation(truth: Truth | None, estimate: Estimate) -> Evaluation | None:
         return None if truth is None else evaluate_clocks(truth, estimate)
     except UserError:
         return None
-
-
-def _settings(dataset: Dataset, chosen: range, options: Options, noise: Noise) -> dict[str, Any]:
-    from rsgen.device.arrays import engine
-
-    notes = {"notes": list(dataset.notes)} if dataset.notes else {}
-    versions = {name: version(name) for name in ("numpy", "scipy", "drjit")}
-    return {
-        "method": options.method,
-        "options": dataclasses.asdict(options),
-        "noise": dataclasses.asdict(noise),
-        "versions": {"rstrack": version("rolling-shutter-rgbd"), **versions},
-        "backend": engine(options.backend).backend,
-        "machine": {"cpu_count": os.cpu_count()},
-        "dataset": {
-            "name": dataset.name, "path": str(dataset.root.resolve()),
-            "frames": [chosen.start, chosen.stop], "frames_in_all": len(dataset), **notes,
-        },
-    }  # fmt: skip
-
-
-def _timings(total_s: float, seconds: Sequence[float]) -> dict[str, Any]:
-    """Of the tracker alone, but for the total; the first frames compile kernels."""
-    ms = 1e3 * np.array(seconds)
-    return {
-        "total_s": total_s,
-        "median_ms": float(np.median(ms)),
-        "mean_ms": float(ms.mean()),
-        "p95_ms": float(np.percentile(ms, 95)),
-        "frame_ms": np.round(ms, 3),
-    }
-
-
-def _diagnostics(dataset: Dataset, used: Sequence[int], reports: Sequence[FrameReport]) -> list[dict[str, Any]]:
-    """One dict a frame for the plots: `FrameReport`, with inliers as parts of the run's largest number too.
-
-    listed_stamp: as the recording has it, where it was tracked at another one. Of covariances the upper triangle.
-    """
-    frames = [dataclasses.asdict(report) for report in reports]
-    for k, frame in zip(used, frames, strict=True):
-        frame |= {name: _upper(frame[name]) for name in ("covariance", "drift")}
-        frame["stamp"] = float(dataset.stamps[k])
-        if dataset.timing is not None:
-            frame["listed_stamp"] = float(dataset.timing.depth.listed[k])
-    for stream in ("depth", "color"):
-        counts = [frame[f"inliers_{stream}"] for frame in frames]
-        most = max(counts)
-        for frame, count in zip(frames, counts, strict=True):
-            # Not aligned to anything, as the first frame: no inliers to speak of.
-            frame[f"inliers_{stream}"] = count / most if most and frame["evaluations"] else None
-            frame[f"pixels_{stream}"] = count
-    return frames
-
-
-def _upper(covariance: FloatArray | None) -> FloatArray | None:
-    """The upper triangle (21,) of a covariance (6, 6), row by row."""
-    return None if covariance is None else covariance[np.triu_indices(6)]

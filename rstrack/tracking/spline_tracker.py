@@ -20,10 +20,12 @@ from rsgen.device.arrays import Engine
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
+from rstrack.adjustment.chain import Chain
+from rstrack.adjustment.graph import Seen
 from rstrack.alignment import brightness
 from rstrack.alignment.independence import Independence
 from rstrack.alignment.linearise import Terms
-from rstrack.alignment.observation import Observation
+from rstrack.alignment.observation import Observation, observe
 from rstrack.alignment.optimizer import Solved
 from rstrack.alignment.pull import pulls
 from rstrack.alignment.spline_state import PointStore
@@ -71,6 +73,8 @@ class Tracker:
         self._recent: deque[DeviceFrame] = deque()
         self._fits = FitHistory()
         self._independence = Independence(), Independence()  # of depth pixels, and of colour pixels
+        # What all frames said of the spline.
+        self._chain = Chain()
         # Of the newest frame, and of the recent ones: keyframe and covariance against it.
         self._uncertainty = Uncertainty()
         self._covariances: dict[int, tuple[int, FloatArray]] = {}
@@ -139,6 +143,39 @@ class Tracker:
         """Where its keyframes are put away."""
         return self._keyframes.archive
 
+    # -- for the whole track to be adjusted -------------------------------------------------------------------------
+
+    @property
+    def every_keyframe(self) -> Archive:
+        """All rectified keyframes, the newest with them."""
+        self._keyframes.put_away()
+        return self._keyframes.archive
+
+    @property
+    def seen(self) -> list[Seen]:
+        """What its frames said of the spline's control points."""
+        return self._chain.seen
+
+    @property
+    def drift(self) -> dict[int, FloatArray]:
+        """Covariances of the keyframes' poses, see `Uncertainty`."""
+        return self._uncertainty.drift
+
+    @property
+    def inflations(self) -> tuple[float, float]:
+        """By how much the covariances that depth's pixels give are too small, and colour's."""
+        depth, color = self._independence
+        return depth.inflation, color.inflation
+
+    @property
+    def terms(self) -> Terms:
+        """Its kernels."""
+        return self._terms
+
+    def upload(self, index: int, frame: Frame) -> DeviceFrame:
+        """A frame of the recording as it is aligned."""
+        return self._device.upload(index, frame)
+
     # -- the loop ---------------------------------------------------------------------------------------------------
 
     def feed(self, frame: Frame) -> FrameReport:
@@ -201,6 +238,7 @@ class Tracker:
             return self._relocalise(new)
         self._window, self._uncertainty = window, uncertainty
         window.keep(fresh)
+        self._chain.add(ref, on_reference, window.state, pulled.excess)
         for is_color, term in enumerate(self._independence):
             term.learn(o.inflation for o in on_reference if o.is_depth != is_color)
         self._recent.append(new)
@@ -278,6 +316,7 @@ class Tracker:
         self.spline_valid.clear()
         self._recent.clear()
         self._uncertainty = Uncertainty()
+        self._chain = Chain()
         self._covariances.clear()
         self.reports = [r.as_lost() for r in self.reports]
         return self._start(new)
@@ -295,7 +334,9 @@ class Tracker:
         window.solve(others, levels=(0,))
         window.keep(others)
         for frame in frames:
-            own = pulls([o for o in others if o.frame == frame.index], window.state)
+            seen = [o for o in others if o.frame == frame.index]
+            own = pulls(seen, window.state)
+            self._chain.add(ref, seen, window.state, own.excess)
             self._uncertainty = self._uncertainty.found_anew(own.information)
             if frame is not middle:
                 self._covariances[frame.index] = ref.index, self._covariance(ref)
@@ -318,6 +359,8 @@ class Tracker:
             self.spline_valid.append((begin, min(end, found.window.state.untouched)))
         found.window.keep(found.fresh)
         self._window, self._reference, self._uncertainty = found.window, found.ref, found.uncertainty
+        self._chain.cut(found.window.piece)
+        self._chain.add(found.ref, found.fresh, found.window.state, pulls(found.fresh, found.window.state).excess)
         self._keyframes.use(found.ref)
         self._relocaliser.forget()
         self._pixels, self._unconverged, self._age, self._colorless = 0, None, 1, 0
@@ -465,14 +508,3 @@ class Tracker:
         at, pose = self._covariances.get(frame.index, (ref.index, np.zeros((6, 6))))
         drift = self._uncertainty.drift_of(at, window.spline.pose(frame.depth.exposure.mid_time))
         return replace(report, covariance=pose, drift=drift)
-
-
-def observe(
-    frame: DeviceFrame, ref: Reference, options: Options, expected: FloatArray = brightness.SAME
-) -> list[Observation]:
-    """What the terms of a method make of a frame against a reference: its depth image, and its colour images.
-
-    expected (2,): gain and offset that the colour images are expected to have against the reference.
-    """
-    depth = [Observation(frame.index, frame.depth, ref)] if options.geometric else []
-    return depth + [Observation(frame.index, c, ref, frame.depth, expected) for c in frame.colors if ref.points]

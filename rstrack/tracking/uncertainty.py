@@ -22,7 +22,7 @@ _ACCELERATION = np.array([5.0, 5.0, 5.0, 10.0, 10.0, 10.0])
 _VELOCITY = np.array([1.5, 1.5, 1.5, 3.0, 3.0, 3.0])
 # Systematic error of a pose in pixels of the depth camera, σ: steps not taken to the end, interpolation, knots.
 # Measured on hand-held renderings with noise (docs/measured.md).
-_SYSTEMATIC_PX = 0.01
+SYSTEMATIC_PX = 0.01
 # σ (m, rad) above which a pose is not known.
 _WORST = np.array([0.02, np.radians(2.0)])
 # A pose that nothing tells, m and rad.
@@ -48,7 +48,7 @@ class Uncertainty:
 
     def covariance(self, focal_px: float, depth_m: float) -> FloatArray:
         """The same with what is systematic, for a depth camera of such a focal length and things so far away."""
-        turn = _SYSTEMATIC_PX / focal_px
+        turn = SYSTEMATIC_PX / focal_px
         return np.asarray(self.pose + np.diag(np.repeat([turn * depth_m, turn], 3) ** 2))
 
     @property

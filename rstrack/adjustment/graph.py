@@ -1,0 +1,214 @@
+"""Control points and keyframes, what ties them to each other, and the sparse system that moves all of them at once.
+
+Unknowns are left increments in the world: T_i ← exp(δ_i) T_i of control points, K_j ← exp(ξ_j) K_j of keyframes. What a
+frame says of the control points against a keyframe (`Seen`) is a quadratic model whose Hessian the tracker has made
+anyway. All control points and the keyframe moved as one body change nothing, so that x_i = log(E⁻¹ D_i) takes the place
+of δ_i in it, where D_i and E are by what control point and keyframe have been moved (left, in the world) since the
+model was made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import scipy.sparse
+from scipy.sparse.linalg import splu
+
+from rsgen.array_types import FloatArray, IntArray
+from rsgen.geometry import se3
+from rsgen.geometry.spline import Spline
+from rstrack.adjustment.band import Band
+
+# σ of accelerations, m/s² and rad/s²: of the deviation from the motion before. It decides where nothing else does: in
+# gaps, and in what a wall leaves open.
+_ACCELERATION = np.array([5.0, 5.0, 5.0, 10.0, 10.0, 10.0])
+# Information that holds the first control point, in m⁻² and rad⁻²: the gauge.
+_HELD = 1e14
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What frames say of control points against a keyframe; None: against others of them, by the model itself."""
+
+    keyframe: int | None
+    band: Band
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """The camera at time t (s) was found at T_ref_cam (4, 4) in a keyframe.
+
+    information (6, 6): of increments T_ref_cam exp(ξ), [m; rad].
+    """
+
+    keyframe: int
+    t: float
+    T_ref_cam: FloatArray
+    information: FloatArray
+
+
+@dataclass(frozen=True)
+class State:
+    """A spline T_world_cam(t) and keyframes' T_world_base (4, 4) by their numbers."""
+
+    spline: Spline
+    keyframes: dict[int, FloatArray]
+
+    def error(self, sighting: Sighting) -> FloatArray:
+        """Twist (6,) from where a sighting puts the camera to where it is, in the camera's axes."""
+        T = se3.inverse(self.keyframes[sighting.keyframe]) @ self.spline.pose(sighting.t)
+        return se3.log(se3.inverse(sighting.T_ref_cam) @ T)
+
+    def moved(self, points: FloatArray, keyframes: FloatArray) -> State:
+        """With left increments of the control points (n, 6) and of the keyframes (m, 6), in their order."""
+        T = se3.orthonormalise(se3.exp(points) @ self.spline.control_points)
+        spline = Spline(T, self.spline.t0, self.spline.dt)
+        steps = se3.exp(keyframes)
+        return State(
+            spline, {k: se3.orthonormalise(steps[n] @ K) for n, (k, K) in enumerate(self.keyframes.items())}
+        )  # fmt: skip
+
+    def placed(self, T: FloatArray) -> State:
+        """All of it moved by T (4, 4) in the world."""
+        spline = Spline(se3.orthonormalise(T @ self.spline.control_points), self.spline.t0, self.spline.dt)
+        return State(spline, {k: se3.orthonormalise(T @ K) for k, K in self.keyframes.items()})
+
+
+@dataclass(frozen=True)
+class Graph:
+    """What is known: at: the state around which the models of `seen` were made, and whose motion is the smooth one."""
+
+    at: State
+    seen: Sequence[Seen]
+    sightings: Sequence[Sighting]
+
+    def with_sightings(self, more: Sequence[Sighting]) -> Graph:
+        """With more of them."""
+        return replace(self, sightings=[*self.sightings, *more])
+
+    def step(self, state: State, weights: FloatArray | None = None) -> tuple[State, FloatArray]:
+        """One Gauss-Newton step from a state; weights (n,) of the sightings. Returns the increments too (n, 6)."""
+        system = _System(len(state.spline.control_points), list(state.keyframes))
+        moved_points = _moved(state.spline.control_points, self.at.spline.control_points)
+        for seen in self.seen:
+            system.add_seen(seen, state, self.at, moved_points)
+        for n, sighting in enumerate(self.sightings):
+            system.add_sighting(sighting, state, 1.0 if weights is None else float(weights[n]))
+        system.add_smoothness(state.spline, self.at.spline)
+        x = system.solved()
+        points = len(state.spline.control_points)
+        return state.moved(x[:points], x[points:]), x
+
+
+def _moved(now: FloatArray, before: FloatArray) -> FloatArray:
+    return np.asarray(now @ se3.inverse(before))
+
+
+@dataclass
+class _System:
+    """Blocks of the upper triangle of H and of g, of `points` control points and then the keyframes."""
+
+    points: int
+    keyframes: list[int]
+    _rows: list[IntArray] = field(default_factory=list)
+    _columns: list[IntArray] = field(default_factory=list)
+    _blocks: list[FloatArray] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._number = {k: self.points + n for n, k in enumerate(self.keyframes)}
+        self.g = np.zeros((self.points + len(self.keyframes), 6))
+
+    def add_seen(self, seen: Seen, state: State, at: State, moved_points: FloatArray) -> None:
+        """A keyframe's frames."""
+        band, n = seen.band.unpacked(), len(seen.band.g)
+        n = min(n, self.points - band.first)
+        numbers = band.first + np.arange(n)
+        own = moved_points[numbers]
+        E = own[n // 2]
+        if seen.keyframe is not None:
+            E = state.keyframes[seen.keyframe] @ se3.inverse(at.keyframes[seen.keyframe])
+        x = se3.log(se3.inverse(E) @ own)
+        A = se3.left_jacobian_inv(x) @ se3.adjoint(se3.inverse(E))
+        Hx, whole = band.g[:n].copy(), np.zeros((n, 6, 6))
+        for d in range(band.blocks.shape[1]):
+            rows = np.arange(n - d)
+            if not len(rows):
+                break
+            blocks = band.blocks[: n - d, d]
+            Hx[rows] += (blocks @ x[rows + d][..., None])[..., 0]
+            turned = np.swapaxes(A[rows], 1, 2) @ blocks @ A[rows + d]
+            whole[rows] += turned
+            if d:
+                Hx[rows + d] += (np.swapaxes(blocks, 1, 2) @ x[rows][..., None])[..., 0]
+                whole[rows + d] += np.swapaxes(turned, 1, 2)
+            self._put(numbers[rows], numbers[rows + d], turned)
+        g = (np.swapaxes(A, 1, 2) @ Hx[..., None])[..., 0]
+        self.g[numbers] += g
+        if seen.keyframe is not None:
+            k = self._number[seen.keyframe]
+            self._put(numbers, np.full(n, k), -whole)
+            self._put(np.array([k]), np.array([k]), whole.sum(axis=0)[None])
+            self.g[k] -= g.sum(axis=0)
+
+    def add_sighting(self, sighting: Sighting, state: State, weight: float) -> None:
+        """One of them, with a weight."""
+        e = state.error(sighting)
+        segment, J = state.spline.pose_jacobian(sighting.t)
+        to_cam = se3.right_jacobian_inv(e) @ se3.adjoint(se3.inverse(state.spline.pose(sighting.t)))
+        J = np.concatenate([to_cam @ J, -to_cam[None]])
+        numbers = np.append(int(segment) + np.arange(4), self._number[sighting.keyframe])
+        information = weight * sighting.information
+        self._add(numbers, J, information, e)
+
+    def add_smoothness(self, spline: Spline, before: Spline) -> None:
+        """Small changes of the acceleration between control points."""
+        inverse = 1.0 / (_ACCELERATION * spline.dt**2) ** 2
+        gains, omega = spline.left_gains, spline.increments - before.increments
+        r = omega[1:] - omega[:-1]
+        J = np.stack([gains[:-1], -gains[1:] - gains[:-1], gains[1:]], axis=1)
+        n = len(r)
+        weighted = np.swapaxes(J, 2, 3) * inverse
+        for a in range(3):
+            np.add.at(self.g, np.arange(n) + a, (weighted[:, a] @ r[..., None])[..., 0])
+            for b in range(a, 3):
+                self._put(np.arange(n) + a, np.arange(n) + b, weighted[:, a] @ J[:, b])
+
+    def solved(self) -> FloatArray:
+        """Increments (n, 6) of control points and keyframes. Raises numpy.linalg.LinAlgError."""
+        size = self.g.size
+        self._put(np.zeros(1, int), np.zeros(1, int), _HELD * np.eye(6)[None])
+        rows, columns, blocks = (np.concatenate(a) for a in (self._rows, self._columns, self._blocks))
+        inner = np.arange(6)
+        i = np.broadcast_to(6 * rows[:, None, None] + inner[:, None], blocks.shape).ravel().astype(np.int32)
+        j = np.broadcast_to(6 * columns[:, None, None] + inner, blocks.shape).ravel().astype(np.int32)
+        # Blocks on the diagonal are whole; of the others there is the upper one only.
+        values = np.where((rows == columns)[:, None, None], 0.5, 1.0) * blocks
+        upper = scipy.sparse.coo_matrix((values.ravel(), (i, j)), shape=(size, size)).tocsc()
+        H = scipy.sparse.csc_matrix(upper + upper.T)
+        scale = 1.0 / np.sqrt(np.maximum(H.diagonal(), 1e-300))
+        scaling = scipy.sparse.diags(scale)
+        scaled = scipy.sparse.csc_matrix(scaling @ H @ scaling)
+        symmetric = {"SymmetricMode": True}
+        try:
+            factors = splu(scaled, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
+        except RuntimeError as error:
+            raise np.linalg.LinAlgError(f"the graph's system has no solution ({error})") from None
+        x = -scale * factors.solve(scale * self.g.ravel())
+        if not np.isfinite(x).all():
+            raise np.linalg.LinAlgError("the graph's system has no finite solution")
+        return np.asarray(x.reshape(-1, 6))
+
+    def _add(self, numbers: IntArray, J: FloatArray, information: FloatArray, e: FloatArray) -> None:
+        """A residual e (6,) with derivatives J (k, 6, 6) by increments of some unknowns."""
+        weighted = np.swapaxes(J, 1, 2) @ information
+        for a, row in enumerate(numbers):
+            self.g[row] += weighted[a] @ e
+            for b in range(a, len(numbers)):
+                self._put(np.array([row]), np.array([numbers[b]]), (weighted[a] @ J[b])[None])
+
+    def _put(self, rows: IntArray, columns: IntArray, blocks: FloatArray) -> None:
+        self._rows.append(np.asarray(rows))
+        self._columns.append(np.asarray(columns))
+        self._blocks.append(blocks)

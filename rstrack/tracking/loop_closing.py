@@ -1,0 +1,134 @@
+"""The loops of a track that has come to its end, closed on its spline.
+
+closing = close_loops(tracker, load)
+if closing.state is not None:
+    T_world_depth = closing.poses(tracker)
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rsgen.array_types import FloatArray
+from rsgen.console.progress import Progress, no_progress
+from rsgen.geometry import se3
+from rsgen.geometry.spline import Spline
+from rstrack.adjustment.closing import Closed, closed
+from rstrack.adjustment.graph import Graph, Sighting, State
+from rstrack.adjustment.loops import Loop, LoopSearch
+from rstrack.adjustment.rigid import Usual
+from rstrack.data.rig import Frame
+from rstrack.keyframes.archive import Archive
+from rstrack.tracking.spline_tracker import Tracker
+from rstrack.tracking.uncertainty import SYSTEMATIC_PX
+
+# Loops that `info` lists at most.
+_LISTED = 1000
+
+
+@dataclass(frozen=True)
+class Closing:
+    """What became of it. closed: None where there is nothing to close; seconds: that it took.
+
+    tried: alignments of pairs; faults: why some were none, and how often. problem: why it could not be done.
+    """
+
+    loops: list[Loop]
+    closed: Closed | None
+    seconds: float
+    tried: int = 0
+    faults: Counter[str] | None = None
+    problem: str = ""
+
+    @property
+    def spline(self) -> Spline | None:
+        """The corrected one, if there is any."""
+        return None if self.closed is None else self.closed.state.spline
+
+    def poses(self, online: Spline, stamps: FloatArray, T_world_depth: FloatArray) -> FloatArray:
+        """Poses (n, 4, 4) of a track, moved as its spline is; `online` as it was."""
+        if self.spline is None:
+            return T_world_depth
+        moved = self.spline.pose(stamps) @ se3.inverse(online.pose(stamps))
+        return se3.orthonormalise(moved @ T_world_depth)
+
+    def info(self) -> dict[str, Any]:
+        """For run.json."""
+        refused = () if self.closed is None else self.closed.refused
+        return {
+            "count": len(self.loops) - sum(refused),
+            "refused": sum(refused),
+            "tried": self.tried,
+            "faults": dict(self.faults or {}),
+            "seconds": self.seconds,
+            "problem": self.problem or None,
+            "pairs": [
+                {"frames": [loop.early, loop.late], "disagreement": loop.disagreement, "refused": no}
+                for loop, no in zip(self.loops, refused, strict=False)
+            ][:_LISTED],
+        }
+
+    def text(self, moved_m: float) -> str:
+        """A summary of one line. moved_m: the furthest that a pose was moved."""
+        if self.problem:
+            return f"loops: not closed: {self.problem}"
+        if self.closed is None:
+            return f"loops: none found ({self.seconds:.1f} s)"
+        info = self.info()
+        refused = f", {info['refused']} refused" if info["refused"] else ""
+        moved = f"poses moved by up to {1e3 * moved_m:.2f} mm"
+        return f"loops: {info['count']} closed{refused} in {self.seconds:.1f} s; {moved}"
+
+
+def close_loops(
+    tracker: Tracker, load: Callable[[int], Frame], progress: Progress = no_progress
+) -> Closing:  # fmt: skip
+    """Look for places that a track has come back to, and correct it. load: a frame by its number in the track."""
+    begin = time.perf_counter()
+    spline = tracker.spline
+    keyframes = tracker.every_keyframe
+    if spline is None or len(keyframes) < 2:
+        return Closing([], None, time.perf_counter() - begin)
+    search = LoopSearch(
+        tracker.terms, tracker.rig, tracker.options, keyframes, lambda k: tracker.upload(k, load(k)), spline,
+        tracker.drift, _usual(tracker, keyframes), tracker.inflations,
+    )  # fmt: skip
+    loops = search.find(progress)
+    faults = Counter(search.faults)
+    result: Closed | None = None
+    problem = ""
+    if loops:
+        try:
+            result = closed(graph_of(tracker, keyframes), loops, float(tracker.trajectory[0][0]), progress)
+        except np.linalg.LinAlgError as error:
+            problem = str(error)
+    return Closing(loops, result, time.perf_counter() - begin, search.tried, faults, problem)
+
+
+def graph_of(tracker: Tracker, keyframes: Archive) -> Graph:
+    """What a track's frames said of its spline and its keyframes; each of these was where the spline was then."""
+    spline = tracker.spline
+    assert spline is not None
+    poses = {k: keyframes.pose(k) for k in sorted(keyframes.indices)}
+    turn = SYSTEMATIC_PX / tracker.rig.depth_camera.fx
+    ties = []
+    for k, T_world_base in poses.items():
+        small = keyframes.small(k)
+        information = np.diag(np.repeat([turn * small.median_depth, turn], 3) ** -2.0)
+        ties.append(Sighting(k, small.t, se3.inverse(T_world_base) @ spline.pose(small.t), information))
+    return Graph(State(spline, poses), tracker.seen, ties)
+
+
+def _usual(tracker: Tracker, keyframes: Archive) -> Usual:
+    """The median scales of residuals in a track."""
+    depth = np.median([keyframes.small(k).median_depth for k in keyframes.indices])
+    kept = [report for report in tracker.reports if not report.lost]
+    sigmas = np.array([[report.sigma_depth_m, report.sigma_intensity] for report in kept], dtype=float).reshape(-1, 2)
+    median = [float(np.median(s[np.isfinite(s)])) if np.isfinite(s).any() else float("nan") for s in sigmas.T]
+    return Usual(median[0] / max(0.5, float(depth)) ** 2, median[1])
