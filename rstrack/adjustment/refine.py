@@ -1,0 +1,208 @@
+"""The best spline that a recording holds: every frame against all keyframes that see it, all of it solved at once.
+
+Dense bundle adjustment by turns. With the spline as it is, keyframes are made where the camera has been and the depth
+of all frames that see them is averaged in; then every frame is linearised once against each, and control points and
+keyframes' poses move together (`Graph.step`). Where the camera came back, old and new frames are in one keyframe, so
+that loops are closed too, if they are known to within what alignment forgives (`rstrack track --loops end`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rsgen.array_types import FloatArray, IntArray
+from rsgen.console.progress import Progress, no_progress
+from rsgen.geometry import se3
+from rsgen.geometry.spline import Spline
+from rstrack.adjustment.band import Band
+from rstrack.adjustment.graph import Graph, Seen, State
+from rstrack.adjustment.rigid import Usual
+from rstrack.alignment import brightness
+from rstrack.alignment.linearise import Terms
+from rstrack.alignment.observation import Observation, observe
+from rstrack.alignment.spline_state import SplineState
+from rstrack.images.device_frame import DeviceFrame
+from rstrack.keyframes.keyframe import Reference
+from rstrack.keyframes.maker import KeyframeMaker
+from rstrack.options import Options
+
+# Of the distance and angle at which a tracker leaves a keyframe: no two are nearer, and frames within see it.
+_GRID, _SEEN = 0.7, 1.0
+# Keyframes that a frame is aligned to, at most: the nearest.
+_MOST = 4
+# Weight of a fused pixel in measurements: all of a recording's count alike.
+_FUSED = 1e4
+# Part of the keyframe's pixels that an image has to see, of those compared that must not be outliers, and scale of the
+# residuals over the usual.
+_LEAST_SHARE, _LEAST_FIT, _WORST = 0.15, 0.6, 2.5
+# Gain or offset further from what was expected call for a second look.
+_BRIGHTER = 0.02
+# Furthest that a pose moves (m) in a round after which no other is worth it.
+_STILL = 2e-5
+
+
+@dataclass(frozen=True)
+class Round:
+    """What a round did. moved_m: the furthest that a frame's pose moved; pairs: of a frame and a keyframe."""
+
+    moved_m: float
+    keyframes: int
+    pairs: int
+    usual: Usual
+
+
+@dataclass
+class Refiner:
+    """Refines the spline of a recording.
+
+    frames, times: numbers of the frames whose poses the spline knows, and their mid readouts (n,) s. load: frames by
+    their numbers, on the device. usual: scales of residuals to begin with.
+    """
+
+    terms: Terms
+    maker: KeyframeMaker
+    options: Options
+    frames: Sequence[int]
+    times: FloatArray
+    load: Callable[[Sequence[int]], Iterator[DeviceFrame]]
+    usual: Usual
+    _inflations: tuple[float, float] = field(default=(1.0, 1.0))
+
+    def refined(self, spline: Spline, rounds: int, progress: Progress = no_progress) -> tuple[Spline, list[Round]]:
+        """The spline after so many rounds at most, and what they did; the first frame stays where it was.
+
+        Raises numpy.linalg.LinAlgError where the system has no solution.
+        """
+        done: list[Round] = []
+        while len(done) < rounds and (not done or done[-1].moved_m >= _STILL):
+
+            def told(part: float, note: str) -> None:
+                progress("refining", (len(done) + part) / rounds, f"round {len(done) + 1} of {rounds}, {note}")
+
+            spline, result = self._round(spline, told)
+            done.append(result)
+        progress("refining", 1.0, f"{len(done)} rounds")
+        return spline, done
+
+    def _round(self, spline: Spline, told: Callable[[float, str], None]) -> tuple[Spline, Round]:
+        anchors, near = _grid(spline.pose(self.times), self.options)
+        keyframes = self._fused(spline, anchors, near, told)
+        state = SplineState(spline)
+        bands: dict[int, Band] = {}
+        kept: list[_Figures] = []
+        pairs = 0
+        for n, frame in enumerate(self.load(self.frames)):
+            for k in near[n]:
+                good = self._linearised(frame, keyframes[k], state)
+                pairs += bool(good)
+                for o in good:
+                    bands.setdefault(k, Band()).add(o.model(state))
+                    kept.append(_Figures.of(o))
+            told(0.5 + 0.5 * (n + 1) / len(self.frames), f"{pairs} pairs of a frame and a keyframe")
+        at = State(spline, {k: keyframes[k].T_world_base for k in sorted(bands)})
+        after, _ = Graph(at, [Seen(k, bands[k]) for k in at.keyframes], ()).step(at)
+        first = self.times[0]
+        moved = after.placed(spline.pose(first) @ se3.inverse(after.spline.pose(first))).spline
+        shift = np.linalg.norm((moved.pose(self.times) - spline.pose(self.times))[:, :3, 3], axis=1)
+        self._learn(kept)
+        return moved, Round(float(shift.max()), len(bands), pairs, self.usual)
+
+    def _fused(
+        self, spline: Spline, anchors: IntArray, near: list[IntArray], told: Callable[[float, str], None]
+    ) -> list[Reference]:
+        """A keyframe of each anchor, with the depth of all frames near it, wherever these come in the recording."""
+        numbers = [self.frames[a] for a in anchors]
+        note = f"{len(anchors)} keyframes"
+        made = [
+            self.maker.rectified(frame.index, frame.depth, frame.colors, spline, None) for frame in self.load(numbers)
+        ]
+        fused = list(made)
+        for n, frame in enumerate(self.load(self.frames)):
+            for k in near[n]:
+                if made[k].index != frame.index:
+                    fused[k] = self.maker.fused(fused[k], frame.depth, spline, _FUSED)
+            told(0.4 * (n + 1) / len(self.frames), note)
+        done = []
+        shape = made[0].lens.camera.height, made[0].lens.camera.width
+        for k, frame in enumerate(self.load(numbers)):
+            rho, weight = (self.maker.e.download(a, shape) for a in (fused[k].inverse_depth, fused[k].weight))
+            done.append(self.maker.with_depth(made[k], frame.depth, frame.colors, spline, rho, weight))
+            told(0.4 + 0.1 * (k + 1) / len(numbers), note)
+        return done
+
+    def _linearised(self, frame: DeviceFrame, ref: Reference, state: SplineState) -> list[Observation]:
+        """What a frame's images say against a keyframe, as far as they fit."""
+        expected = brightness.SAME
+        if frame.colors and ref.points:
+            expected = np.asarray(brightness.matched(frame.colors[0].moments, ref.moments))
+        good = []
+        for o in observe(frame, ref, self.options, expected):
+            usual = self._usual(o)
+            o.independent = 1.0 / self._inflations[not o.is_depth]
+            o.begin(usual)
+            o.linearise(self.terms, state, 0)
+            if not o.is_depth and (np.abs(o.brightness(state) - expected) > _BRIGHTER).any():
+                o.linearise(self.terms, state, 0)
+            sees = o.pixels >= _LEAST_SHARE * ref.pixels and o.lin.fit >= _LEAST_FIT
+            if sees and o.lin.next_sigma < _WORST * usual:
+                good.append(o)
+        return good
+
+    def _usual(self, o: Observation) -> float:
+        return self.usual.depth * _spread(o) if o.is_depth else self.usual.intensity
+
+    def _learn(self, kept: list[_Figures]) -> None:
+        depth, color = ([f for f in kept if f.is_depth is is_depth] for is_depth in (True, False))
+        self.usual = Usual(
+            _median([f.sigma for f in depth], self.usual.depth), _median([f.sigma for f in color], self.usual.intensity)
+        )
+        one, other = (max(1.0, _median([f.inflation for f in some], 1.0)) for some in (depth, color))
+        self._inflations = one, other
+
+
+@dataclass(frozen=True)
+class _Figures:
+    """Of an observation: σ, of depth at one metre, and inflation."""
+
+    is_depth: bool
+    sigma: float
+    inflation: float
+
+    @classmethod
+    def of(cls, o: Observation) -> _Figures:
+        return cls(o.is_depth, o.lin.next_sigma / (_spread(o) if o.is_depth else 1.0), o.inflation)
+
+
+def _grid(T: FloatArray, options: Options) -> tuple[IntArray, list[IntArray]]:
+    """Numbers of the poses (n, 4, 4) that become keyframes, and for each pose those of the keyframes it is near."""
+    anchors: list[int] = []
+    remote = np.full((len(T), 0), np.inf)
+    nearest = np.full(len(T), np.inf)
+    for n in range(len(T)):
+        if nearest[n] > _GRID:
+            anchors.append(n)
+            remote = np.column_stack([remote, _remoteness(T[n], T, options)])
+            nearest = np.minimum(nearest, remote[:, -1])
+    order = np.argsort(remote, axis=1, kind="stable")[:, :_MOST]
+    return np.array(anchors), [row[remote[n, row] < _SEEN] for n, row in enumerate(order)]
+
+
+def _remoteness(T_base: FloatArray, T: FloatArray, options: Options) -> FloatArray:
+    """`Options.remoteness` of poses (n, 4, 4) from a keyframe's."""
+    between = se3.inverse(T_base) @ T
+    distance = np.linalg.norm(between[:, :3, 3], axis=1) / options.keyframe_distance
+    angle = np.degrees(np.linalg.norm(se3.log(between)[:, 3:], axis=1)) / options.keyframe_angle_deg
+    return np.asarray(np.maximum(distance, angle))
+
+
+def _spread(o: Observation) -> float:
+    """By how much depth scatters more there than at one metre."""
+    return float(max(0.5, o.ref.median_depth) ** 2)
+
+
+def _median(values: Sequence[float], otherwise: float) -> float:
+    known = [value for value in values if np.isfinite(value)]
+    return float(np.median(known)) if known else otherwise
