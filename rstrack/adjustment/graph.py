@@ -21,9 +21,10 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.adjustment.band import Band
 
-# σ of accelerations, m/s² and rad/s²: of the deviation from the motion before. It decides where nothing else does: in
-# gaps, and in what a wall leaves open.
+# σ of accelerations, m/s² and rad/s², as the tracker has them. They decide where nothing else does: in gaps, and in what
+# a wall leaves open. The first and last control points, which hardly any line tells of, are held tighter.
 _ACCELERATION = np.array([5.0, 5.0, 5.0, 10.0, 10.0, 10.0])
+_END_TRIPLES, _END_FACTOR = 2, 0.1
 # Information that holds the first control point, in m⁻² and rad⁻²: the gauge.
 _HELD = 1e14
 
@@ -78,11 +79,16 @@ class State:
 
 @dataclass(frozen=True)
 class Graph:
-    """What is known: at: the state around which the models of `seen` were made, and whose motion is the smooth one."""
+    """What is known.
+
+    at: the state around which the models of `seen` were made. keeps_motion: accelerations are to stay what they are
+    there; else to be small.
+    """
 
     at: State
     seen: Sequence[Seen]
     sightings: Sequence[Sighting]
+    keeps_motion: bool = True
 
     def with_sightings(self, more: Sequence[Sighting]) -> Graph:
         """With more of them."""
@@ -96,7 +102,8 @@ class Graph:
             system.add_seen(seen, state, self.at, moved_points)
         for n, sighting in enumerate(self.sightings):
             system.add_sighting(sighting, state, 1.0 if weights is None else float(weights[n]))
-        system.add_smoothness(state.spline, self.at.spline)
+        before = self.at.spline.increments if self.keeps_motion else np.zeros_like(state.spline.increments)
+        system.add_smoothness(state.spline, before)
         x = system.solved()
         points = len(state.spline.control_points)
         return state.moved(x[:points], x[points:]), x
@@ -162,11 +169,14 @@ class _System:
         information = weight * sighting.information
         self._add(numbers, J, information, e)
 
-    def add_smoothness(self, spline: Spline, before: Spline) -> None:
-        """Small changes of the acceleration between control points."""
-        inverse = 1.0 / (_ACCELERATION * spline.dt**2) ** 2
-        gains, omega = spline.left_gains, spline.increments - before.increments
+    def add_smoothness(self, spline: Spline, before: FloatArray) -> None:
+        """Small accelerations beside those of increments `before` (n, 6) from control point to control point."""
+        gains, omega = spline.left_gains, spline.increments - before
         r = omega[1:] - omega[:-1]
+        sigma = np.repeat(_ACCELERATION[None] * spline.dt**2, len(r), axis=0)
+        sigma[:_END_TRIPLES] *= _END_FACTOR
+        sigma[-_END_TRIPLES:] *= _END_FACTOR
+        inverse = 1.0 / sigma[:, None, None] ** 2
         J = np.stack([gains[:-1], -gains[1:] - gains[:-1], gains[1:]], axis=1)
         n = len(r)
         weighted = np.swapaxes(J, 2, 3) * inverse

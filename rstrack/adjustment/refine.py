@@ -22,6 +22,7 @@ from rstrack.adjustment.graph import Graph, Seen, State
 from rstrack.adjustment.rigid import Usual
 from rstrack.alignment import brightness
 from rstrack.alignment.linearise import Terms
+from rstrack.alignment.normal_equations import Quadratic
 from rstrack.alignment.observation import Observation, observe
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.device_frame import DeviceFrame
@@ -38,8 +39,10 @@ _FUSED = 1e4
 # Part of the keyframe's pixels that an image has to see, of those compared that must not be outliers, and scale of the
 # residuals over the usual.
 _LEAST_SHARE, _LEAST_FIT, _WORST = 0.15, 0.6, 2.5
-# Gain or offset further from what was expected call for a second look.
-_BRIGHTER = 0.02
+# Gain or offset that have changed by more call for another look, of so many at most.
+_BRIGHTER, _LOOKS = 0.004, 5
+# What all frames that see a keyframe have in common in their errors, in pixels, see `Uncertainty`.
+_SYSTEMATIC_DEPTH_PX, _SYSTEMATIC_COLOR_PX = 1e-5, 0.003
 # Furthest that a pose moves (m) in a round after which no other is worth it.
 _STILL = 2e-5
 
@@ -70,6 +73,9 @@ class Refiner:
     load: Callable[[Sequence[int]], Iterator[DeviceFrame]]
     usual: Usual
     _inflations: tuple[float, float] = field(default=(1.0, 1.0))
+    _sharing: float = 1.0
+    # Gain and offset of the last colour image against each keyframe.
+    _brightness: dict[int, FloatArray] = field(default_factory=dict)
 
     def refined(self, spline: Spline, rounds: int, progress: Progress = no_progress) -> tuple[Spline, list[Round]]:
         """The spline after so many rounds at most, and what they did; the first frame stays where it was.
@@ -89,6 +95,7 @@ class Refiner:
 
     def _round(self, spline: Spline, told: Callable[[float, str], None]) -> tuple[Spline, Round]:
         anchors, near = _grid(spline.pose(self.times), self.options)
+        self._sharing = sum(map(len, near)) / len(anchors)
         keyframes = self._fused(spline, anchors, near, told)
         state = SplineState(spline)
         bands: dict[int, Band] = {}
@@ -99,11 +106,11 @@ class Refiner:
                 good = self._linearised(frame, keyframes[k], state)
                 pairs += bool(good)
                 for o in good:
-                    bands.setdefault(k, Band()).add(o.model(state))
+                    bands.setdefault(k, Band()).add(self._told(o, state, frame))
                     kept.append(_Figures.of(o))
             told(0.5 + 0.5 * (n + 1) / len(self.frames), f"{pairs} pairs of a frame and a keyframe")
         at = State(spline, {k: keyframes[k].T_world_base for k in sorted(bands)})
-        after, _ = Graph(at, [Seen(k, bands[k]) for k in at.keyframes], ()).step(at)
+        after, _ = Graph(at, [Seen(k, bands[k]) for k in at.keyframes], (), keeps_motion=False).step(at)
         first = self.times[0]
         moved = after.placed(spline.pose(first) @ se3.inverse(after.spline.pose(first))).spline
         shift = np.linalg.norm((moved.pose(self.times) - spline.pose(self.times))[:, :3, 3], axis=1)
@@ -135,21 +142,42 @@ class Refiner:
 
     def _linearised(self, frame: DeviceFrame, ref: Reference, state: SplineState) -> list[Observation]:
         """What a frame's images say against a keyframe, as far as they fit."""
-        expected = brightness.SAME
-        if frame.colors and ref.points:
-            expected = np.asarray(brightness.matched(frame.colors[0].moments, ref.moments))
         good = []
-        for o in observe(frame, ref, self.options, expected):
+        expected = self._brightness.get(ref.index)
+        if expected is None:
+            expected = np.asarray(brightness.matched(frame.colors[0].moments, ref.moments)) if frame.colors else None
+        for o in observe(frame, ref, self.options, brightness.SAME if expected is None else expected):
             usual = self._usual(o)
             o.independent = 1.0 / self._inflations[not o.is_depth]
             o.begin(usual)
-            o.linearise(self.terms, state, 0)
-            if not o.is_depth and (np.abs(o.brightness(state) - expected) > _BRIGHTER).any():
+            before = o.brightness(state)
+            for _ in range(_LOOKS):
                 o.linearise(self.terms, state, 0)
+                if o.is_depth or (np.abs(o.brightness(state) - before) < _BRIGHTER).all():
+                    break
+                before = o.brightness(state)
             sees = o.pixels >= _LEAST_SHARE * ref.pixels and o.lin.fit >= _LEAST_FIT
             if sees and o.lin.next_sigma < _WORST * usual:
                 good.append(o)
+                if not o.is_depth:
+                    self._brightness[ref.index] = o.brightness(state)
         return good
+
+    def _told(self, o: Observation, state: SplineState, frame: DeviceFrame) -> Quadratic:
+        """The model of an image against a keyframe which may be off as one body, as are all that share the keyframe.
+
+        What reflections, blur and the keyframe's own noise do to its frames they do to all of them: the mean of n is as
+        far off as each. With a covariance n times as large for each, it is.
+        """
+        model = o.model(state)
+        pixels = (_SYSTEMATIC_DEPTH_PX if o.is_depth else _SYSTEMATIC_COLOR_PX) ** 2 * self._sharing
+        turn = pixels / o.ref.lens.camera.fx**2
+        prior = np.diag(1.0 / np.repeat([turn * o.ref.median_depth**2, turn], 3))
+        T_world_cam = state.spline.pose(frame.depth.exposure.mid_time)
+        together = np.tile(se3.adjoint(T_world_cam), (model.last - model.first, 1))
+        HB = model.H @ together
+        solved = np.linalg.solve(prior + together.T @ HB, np.column_stack([HB.T, together.T @ model.g]))
+        return Quadratic(model.first, model.H - HB @ solved[:, :-1], model.g - HB @ solved[:, -1])
 
     def _usual(self, o: Observation) -> float:
         return self.usual.depth * _spread(o) if o.is_depth else self.usual.intensity

@@ -37,6 +37,8 @@ Kind = TypeVar("Kind", Options, Noise)
 
 # Scales to begin with where a run does not tell any: depth at one metre (m), intensity.
 _USUAL_DEPTH, _USUAL_INTENSITY = 2e-3, 0.015
+# Rounding of times.
+_SLACK_S = 1e-6
 # Distance (m) that things are taken to have had in the run: the first round is told better.
 _TYPICAL_M = 1.5
 
@@ -148,13 +150,16 @@ def _known_frames(dataset: Dataset, estimate: Estimate) -> list[int]:
     """Frames that were tracked, of which all lines are where the spline is known."""
     tracked = {round(float(stamp), 6) for stamp in estimate.stamps}
     rig, known = dataset.rig, []
+    # From the first line to the last.
+    span_depth = (rig.depth_shutter.line_count(rig.depth_camera) - 1) * rig.depth_shutter.line_delay(rig.depth_camera)
+    span_color = (rig.color_shutter.line_count(rig.color_camera) - 1) * rig.color_shutter.line_delay(rig.color_camera)
     for k, stamp in enumerate(dataset.stamps):
         if round(float(stamp), 6) not in tracked:
             continue
         colors = [float(dataset.color_stamps[i]) for i in dataset.groups[k]]
         first = min([float(stamp), *colors])
-        last = max([stamp + rig.depth_shutter.readout_s, *(c + rig.color_shutter.readout_s for c in colors)])
-        if estimate.spline_covers([first, 0.5 * (first + last), last]).all():
+        last = max([stamp + span_depth, *(c + span_color for c in colors)])
+        if estimate.spline_covers([first + _SLACK_S, 0.5 * (first + last), last - _SLACK_S]).all():
             known.append(k)
     return known
 
