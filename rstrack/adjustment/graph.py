@@ -21,8 +21,8 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.adjustment.band import Band
 
-# σ of accelerations, m/s² and rad/s², as the tracker has them. They decide where nothing else does: in gaps, and in what
-# a wall leaves open. The first and last control points, which hardly any line tells of, are held tighter.
+# σ of accelerations, m/s² and rad/s², as the tracker has them. They decide where nothing else does: in gaps, and in
+# what a wall leaves open. The first and last control points, which hardly any line tells of, are held tighter.
 _ACCELERATION = np.array([5.0, 5.0, 5.0, 10.0, 10.0, 10.0])
 _END_TRIPLES, _END_FACTOR = 2, 0.1
 # Information that holds the first control point, in m⁻² and rad⁻²: the gauge.

@@ -14,7 +14,7 @@ from rstrack.alignment import brightness
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.observation import Observation, observe
 from rstrack.alignment.optimizer import Problem, Solved, optimise
-from rstrack.alignment.pull import pulls
+from rstrack.alignment.pull import pulls, steady
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference
@@ -29,6 +29,8 @@ _SETTLED_PX = 0.5
 # Metres, at one metre and growing with the square of the distance, by which depth or colour alone may want to go
 # elsewhere, where that is more than so many σ.
 _TORN, _TORN_SIGMAS = 0.02, 5.0
+# σ of a shift (m) and turn (rad) before anything is known: what an image does not see pulls nowhere.
+_PRIOR = np.repeat([0.05, np.radians(3.0)], 3)
 _MOST_STEPS = (15, 8, 30)
 
 
@@ -80,13 +82,8 @@ def align(
     if not any(o.is_linearised for o in fresh):
         return Alignment(T, np.zeros((6, 6)), "no pixel of it falls on the keyframe", 0.0)
     share = min((o.pixels / max(1, ref.pixels) for o in fresh if o.is_linearised), default=0.0)
-    pulled = pulls(fresh, state)
-    fault = _fault(fresh, solved, ref, usual)
-    distance = max(1.0, ref.median_depth)
-    for metres, sigmas in zip((pulled.depth, pulled.color), pulled.sigmas[1:], strict=True):
-        if not fault and np.isfinite(metres) and metres > _TORN * distance**2 and sigmas > _TORN_SIGMAS:
-            fault = "depth and colour do not agree"
-    return Alignment(T, pulled.information, fault, share)
+    fault = _fault(fresh, solved, ref, usual) or _torn(fresh, state, ref)
+    return Alignment(T, pulls(fresh, state).information, fault, share)
 
 
 def _placed(motion: Spline, frame: DeviceFrame, G: FloatArray) -> SplineState:
@@ -95,6 +92,22 @@ def _placed(motion: Spline, frame: DeviceFrame, G: FloatArray) -> SplineState:
     last = int(motion.locate(frame.last_time)[0]) + 4
     points = se3.orthonormalise(G @ motion.control_points[first - motion.first : last - motion.first])
     return SplineState(Spline(points, motion.t0 + first * motion.dt, motion.dt))
+
+
+def _torn(fresh: Sequence[Observation], state: SplineState, ref: Reference) -> str:
+    """Whether depth alone, or colour alone, would put the frame elsewhere, as one body."""
+    distance = max(1.0, ref.median_depth)
+    for is_depth in (True, False):
+        seen = [steady(o, state) for o in fresh if o.is_depth is is_depth and o.is_linearised]
+        if not seen:
+            continue
+        H = np.diag(1.0 / _PRIOR**2) + sum(H[:6, :6] for H, _ in seen)
+        g = np.sum([g[:6] for _, g in seen], axis=0)
+        twist = np.linalg.solve(H, g)
+        metres = np.linalg.norm(twist[:3]) + ref.median_depth * np.linalg.norm(twist[3:])
+        if metres > _TORN * distance**2 and float(g @ twist) > _TORN_SIGMAS**2:
+            return "depth and colour do not agree"
+    return ""
 
 
 def _fault(fresh: Sequence[Observation], solved: Solved, ref: Reference, usual: Usual) -> str:

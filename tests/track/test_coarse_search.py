@@ -17,9 +17,9 @@ from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.images.device_frame import DeviceFrame, DeviceRig
+from rstrack.keyframes.coarse_search import ranked, search, small_frame, small_keyframe
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.options import Options
-from rstrack.keyframes.coarse_search import ranked, search, small_frame, small_keyframe
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 79.5, 59.5)
 LENS = Camera(160, 120, 120.0, 118.0, 81.0, 58.0, model="radtan", distortion=(0.12, -0.2, 0.002, -0.001))

@@ -1,0 +1,191 @@
+"""Loops of a track are found and closed; what is none is refused; a run is refined. On a ray-cast room."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import synthetic
+
+from rsgen.errors import UserError
+from rsgen.geometry import se3
+from rsgen.geometry.spline import Spline
+from rstrack.adjustment.rigid import Usual, align
+from rstrack.cli.main import main
+from rstrack.data.dataset import Dataset, open_dataset
+from rstrack.data.estimate import read_estimate
+from rstrack.options import Options
+from rstrack.tracking import loop_closing
+from rstrack.tracking.loop_closing import close_loops
+from rstrack.tracking.run import Noise, make_tracker, track
+from rstrack.tracking.spline_tracker import Tracker
+
+FRAMES = 30
+OPTIONS = Options(method="rs-pg", keyframe_distance=0.04, bootstrap_frames=3, backend="llvm")
+# So noisy that it drifts.
+NOISE = Noise(4e-3, 0.02, 1)
+
+
+def to_and_fro() -> Spline:
+    """Twice there and back within a second."""
+    dt, t0 = 0.05, -0.2
+    t = t0 + dt * (np.arange(33) - 1.0)
+    swing = np.sin(2.0 * np.pi * 2.0 * t)
+    xi = np.stack([0.09 * swing, 0.02 * swing, 0.02 * np.cos(9 * t), 0.03 * swing, 0.08 * swing, 0 * t], axis=-1)
+    return Spline(se3.exp(xi), t0, dt)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    root = tmp_path_factory.mktemp("loops") / "seq"
+    stream = {"readout_s": 0.02}
+    config = synthetic.make_config(width=80, height=60, color=stream, depth=stream)
+    writer = synthetic.open_writer(root, config, FRAMES, to_and_fro())
+    synthetic.write_frames(writer)
+    synthetic.write_scene(root)
+    writer.finish()
+    return open_dataset(root)
+
+
+@pytest.fixture(scope="module")
+def run(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("loops-run") / "run"
+    result = track(dataset, OPTIONS, out, noise=NOISE)
+    assert result.lost == 0 and "closed" in result.loops
+    return out
+
+
+def ate(run: Path, name: str = "metrics") -> float:
+    return float(json.loads((run / "run.json").read_text())[name]["ate_rmse_m"])
+
+
+def test_loops_are_closed_and_both_tracks_written(run: Path, dataset: Dataset) -> None:
+    info = json.loads((run / "run.json").read_text())
+    assert info["loops"]["count"] >= 5 and info["loops"]["refused"] == 0 and info["loops"]["problem"] is None
+    assert ate(run) < 0.8 * ate(run, "metrics_online")
+    final, online = read_estimate(run), read_estimate(run / "trajectory_online.txt")
+    np.testing.assert_array_equal(final.stamps, online.stamps)
+    assert np.abs(final.T_world_depth - online.T_world_depth).max() > 1e-4
+    # Poses go with the spline, and the first one stays.
+    assert final.spline is not None
+    np.testing.assert_allclose(final.spline.pose(final.stamps), final.T_world_depth, atol=2e-8)
+    np.testing.assert_allclose(final.T_world_depth[0], online.T_world_depth[0], atol=2e-8)
+    before = Spline.load(run / "spline_online.npz")
+    np.testing.assert_allclose(before.pose(online.stamps), online.T_world_depth, atol=2e-8)
+    early, late = info["loops"]["pairs"][0]["frames"]
+    assert 0 <= early < late < FRAMES
+
+
+def test_without_loops_a_track_stays_as_it_is(dataset: Dataset, run: Path, tmp_path: Path) -> None:
+    result = track(dataset, Options(**(vars(OPTIONS) | {"loops": "off"})), tmp_path / "run", noise=NOISE)
+    assert result.loops == "" and not (tmp_path / "run" / "trajectory_online.txt").exists()
+    assert (tmp_path / "run" / "trajectory.txt").read_bytes() == (run / "trajectory_online.txt").read_bytes()
+    assert (tmp_path / "run" / "spline.npz").read_bytes() == (run / "spline_online.npz").read_bytes()
+
+
+def test_ctrl_c_while_loops_are_closed_leaves_the_track(
+    dataset: Dataset, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(loop_closing, "closed", interrupted)
+    result = track(dataset, OPTIONS, tmp_path / "run", noise=NOISE)
+    assert result.end == "interrupted"
+    assert (tmp_path / "run" / "trajectory.txt").read_bytes() == (run / "trajectory_online.txt").read_bytes()
+    # Where it was interrupted it goes on: nothing is left but the loops.
+    monkeypatch.undo()
+    again = track(dataset, OPTIONS, tmp_path / "run", noise=NOISE, resume=True)
+    assert again.end == "done"
+    assert (tmp_path / "run" / "trajectory.txt").read_bytes() == (run / "trajectory.txt").read_bytes()
+
+
+def tracked(dataset: Dataset) -> Tracker:
+    tracker = make_tracker(dataset.rig, OPTIONS)
+    assert isinstance(tracker, Tracker)
+    for k in range(FRAMES):
+        tracker.feed(dataset.frame(k))
+    return tracker
+
+
+def test_a_frame_is_aligned_to_a_keyframe_of_another_time(dataset: Dataset) -> None:
+    tracker, truth = tracked(dataset), dataset.truth
+    assert truth is not None and tracker.spline is not None
+    keyframes = tracker.every_keyframe
+    early = keyframes.get(min(keyframes.indices))
+    frame = tracker.upload(FRAMES - 3, dataset.frame(FRAMES - 3))
+    mid = frame.depth.exposure.mid_time
+    T_true = se3.inverse(truth.pose(early.t)) @ truth.pose(mid)
+    start = T_true @ se3.exp(np.array([0.015, -0.01, 0.01, 0.01, -0.01, 0.01]))
+    found = align(
+        tracker.terms, tracker.options, frame, early, tracker.spline, start, (2, 1, 0), Usual(2e-3, 0.01)
+    )  # fmt: skip
+    assert found.fault == ""
+    off = np.abs(se3.log(se3.inverse(T_true) @ found.T_ref_cam))
+    assert off[:3].max() < 1.5e-3 and off[3:].max() < 1e-3
+    sigma = np.sqrt(np.diag(np.linalg.inv(found.information)))
+    assert (sigma < 0.01).all()
+    # Another place is none.
+    elsewhere = align(
+        tracker.terms, tracker.options, frame, early, tracker.spline,
+        T_true @ se3.exp(np.array([0.6, 0.0, 0.0, 0.0, 0.5, 0.0])), (1, 0), Usual(2e-3, 0.01),
+    )  # fmt: skip
+    assert elsewhere.fault
+
+
+def test_what_shows_another_place_closes_no_loop(dataset: Dataset) -> None:
+    """Frames of other moments stand in for the keyframes': they fit, but elsewhere, and the two ways contradict."""
+    tracker = tracked(dataset)
+    honest = close_loops(tracker, dataset.frame)
+    assert len(honest.loops) > 3
+    wrong = close_loops(tracked(dataset), lambda k: dataset.frame((k + 7) % FRAMES))
+    assert not wrong.loops and wrong.tried > 10 and sum((wrong.faults or {}).values()) > 0.8 * wrong.tried
+    assert wrong.spline is None and "none found" in wrong.text(0.0)
+
+
+def test_refining_makes_a_run_better(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "refined"
+    assert main(["refine", str(run), "--out", str(out), "--rounds", "3", "--quiet"]) == 0
+    assert "rounds in" in capsys.readouterr().out
+    assert ate(out) < 0.95 * ate(run)
+    info = json.loads((out / "run.json").read_text())
+    rounds = info["refined"]["rounds"]
+    assert len(rounds) <= 3 and rounds[-1]["moved_m"] < rounds[0]["moved_m"]
+    # What it was made of lies beside it.
+    assert (out / "trajectory_online.txt").read_bytes() == (run / "trajectory.txt").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (lambda run: (run / "spline.npz").unlink(), "has no spline"),
+        (lambda run: (run / "run.json").write_text("{}"), "does not say where its sequence is"),
+        (
+            lambda run: (run / "run.json").write_text(
+                json.dumps(json.loads((run / "run.json").read_text()) | {"options": {"method": "magic"}})
+            ),
+            "unknown method 'magic'",
+        ),
+    ],
+)
+def test_what_cannot_be_refined_is_said_in_one_line(run: Path, tmp_path: Path, change: Any, complaint: str) -> None:
+    import shutil
+
+    from rstrack.tracking.refining import refine_run
+
+    copy = tmp_path / "copy"
+    shutil.copytree(run, copy)
+    change(copy)
+    with pytest.raises(UserError) as error:
+        refine_run(copy, tmp_path / "out")
+    assert complaint in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_run_is_not_refined_onto_itself(run: Path) -> None:
+    from rstrack.tracking.refining import refine_run
+
+    with pytest.raises(UserError, match="is the run itself"):
+        refine_run(run, run)
