@@ -70,22 +70,18 @@ class Options:
     ] = "keyframe"
     voxel_m: Annotated[float, "voxels of that volume, m"] = 0.01
     loops: Annotated[
-        Loops,
-        "end: places that the camera has come back to are looked for at the end of a track, and the whole spline is "
-        "corrected; needs a spline, and a recording that ends",
-    ] = "end"
+        Loops | None,
+        "end: places that the camera has come back to are looked for at the end of the recording, and the whole spline "
+        "is corrected (default: end with 'rstrack track', off in benchmarks and live)",
+    ] = None
     memory_gb: Annotated[
         float,
         "images of old keyframes that take more than this go to temporary files (in TMPDIR) until needed",
     ] = 2.0
 
     def __post_init__(self) -> None:
-        for name, known in (
-            ("method", METHODS),
-            ("keyframe_strategy", STRATEGIES),
-            ("reference", SOURCES),
-            ("loops", LOOPS),
-        ):
+        chosen = [("method", METHODS), ("keyframe_strategy", STRATEGIES), ("reference", SOURCES)]
+        for name, known in chosen + ([] if self.loops is None else [("loops", LOOPS)]):
             if getattr(self, name) not in known:
                 raise UserError(f"unknown {name} '{getattr(self, name)}': choose {', '.join(known)}")
         if not 0.001 <= self.knot_spacing_s <= 1.0:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from json import dumps
 from pathlib import Path
 from typing import Annotated, Any
@@ -131,6 +132,7 @@ def track(
         raise UserError(f"--device {device}: is for --calibrate, which is not given")
     if resume and calibrate:
         raise UserError("--resume --calibrate: 'rstrack calibrate --out camera.yaml' first, and track with --camera")
+    tracker = replace(tracker, loops=tracker.loops or "end")
     known = None if device is None else device_named(device)
     noise = run.Noise(noise_depth, noise_intensity, seed)
     dataset = open_dataset(sequence, camera)

@@ -24,7 +24,7 @@ from rstrack.tracking.run import Noise, make_tracker, track
 from rstrack.tracking.spline_tracker import Tracker
 
 FRAMES = 30
-OPTIONS = Options(method="rs-pg", keyframe_distance=0.04, bootstrap_frames=3, backend="llvm")
+OPTIONS = Options(method="rs-pg", keyframe_distance=0.04, bootstrap_frames=3, backend="llvm", loops="end")
 # So noisy that it drifts.
 NOISE = Noise(4e-3, 0.02, 1)
 
