@@ -89,7 +89,8 @@ class LoopSearch:
             frame = self.load(late)
             for m in self._candidates(frame, n, order, T, way):
                 early = order[m]
-                found = self._aligned(frame, early, late, T, self._allowed(early, late, way[n] - way[m]))
+                allowed = self._allowed(early, late, way[n] - way[m])
+                found = self._aligned(frame, early, se3.inverse(T[early]) @ T[late], allowed)
                 if found is not None:
                     halves.setdefault(early, []).append((late, found))
             progress("loops", 0.7 * (n + 1) / len(order), f"{sum(map(len, halves.values()))} places again")
@@ -98,12 +99,18 @@ class LoopSearch:
             frame = self.load(early)
             for late, there in found_there:
                 allowed = self._allowed(early, late, way[order.index(late)] - way[order.index(early)])
-                back = self._aligned(frame, late, early, T, allowed)
+                back = self._aligned(frame, late, se3.inverse(T[late]) @ T[early], allowed)
                 loop = None if back is None else self._loop(early, late, there, back)
                 if loop is not None:
                     loops.append(loop)
             progress("loops", 0.7 + 0.3 * (n + 1) / len(halves), f"{len(loops)} loops")
         return loops
+
+    def pair(self, early: int, late: int, T_early_late: FloatArray, allowed: FloatArray) -> Loop | None:
+        """Whether two keyframes see one place, at T_early_late (4, 4) from each other, up to metres and radians."""
+        there = self._aligned(self.load(late), early, T_early_late, allowed)
+        back = None if there is None else self._aligned(self.load(early), late, se3.inverse(T_early_late), allowed)
+        return None if there is None or back is None else self._loop(early, late, there, back)
 
     def _candidates(
         self, frame: DeviceFrame, n: int, order: list[int], T: dict[int, FloatArray], way: FloatArray
@@ -140,12 +147,11 @@ class LoopSearch:
         return np.asarray(_DRIFT_SIGMAS * sigma + _DRIFT_SHARE * way + _AGREE)
 
     def _aligned(
-        self, frame: DeviceFrame, at: int, number: int, T: dict[int, FloatArray], allowed: FloatArray
-    ) -> Alignment | None:
-        """Frame `number` against the keyframe `at`, if it is found there, no further off than is allowed (m, rad)."""
+        self, frame: DeviceFrame, at: int, T_expected: FloatArray, allowed: FloatArray
+    ) -> Alignment | None:  # fmt: skip
+        """A frame against the keyframe `at`, if it is found there, no further off than is allowed (m, rad)."""
         self.tried += 1
         ref = self._reference(at)
-        T_expected = se3.inverse(T[at]) @ T[number]
         start, levels = T_expected, _NEARBY
         if (allowed > _SURE).any():
             small = coarse_search.small_frame(frame, self.rig, self.options.geometric)

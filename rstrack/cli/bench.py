@@ -144,6 +144,27 @@ def bench_long(
     return 0
 
 
+def bench_loops(
+    sequence: SequenceFolder,
+    tracker: Options,
+    *,
+    camera: CameraFile = None,
+    frames: Frames = None,
+    alike: Annotated[int, "pairs of different places that look alike to try", "N"] = 200,
+    json: Json = False,
+) -> int:
+    """Find the loops of a track: how true they are, and whether places that look alike are taken for one."""
+    from rsgen.console.progress import ProgressDisplay
+    from rstrack.bench.loops import loop_quality
+    from rstrack.data.dataset import open_dataset
+
+    dataset = open_dataset(sequence, camera)
+    with ProgressDisplay(quiet=json) as progress:
+        found = loop_quality(dataset, tracker, frames or slice(None), alike, progress)
+    print_figures(found, json)
+    return 0
+
+
 def stress(
     config: ConfigFile,
     tracker: Options,

@@ -12,7 +12,15 @@ from typing import Annotated, Any
 
 from rsgen.console.command_line import Commands, Frames, Json, Parser, Quiet, run_program
 from rsgen.errors import UserError
-from rstrack.cli.bench import bench_bootstrap, bench_calibration, bench_convergence, bench_long, bench_speed, stress
+from rstrack.cli.bench import (
+    bench_bootstrap,
+    bench_calibration,
+    bench_convergence,
+    bench_long,
+    bench_loops,
+    bench_speed,
+    stress,
+)
 from rstrack.cli.bench_methods import STATUS as BENCH_STATUS
 from rstrack.cli.bench_methods import bench
 from rstrack.cli.calibrate import STATUS as CALIBRATE_STATUS
@@ -93,6 +101,7 @@ def _parser() -> Parser:
     add(bench_bootstrap, "out/lr_kt2 --starts 50 --frames 20")
     add(bench_calibration, "out/demo --starts 5 --noise-depth 1.2e-3 --noise-intensity 0.01")
     add(bench_long, "out/demo --frames 100000 --method rs-g")
+    add(bench_loops, "out/long2 --alike 200")
     add(sensitivity, "out/demo --method rs-pg --frames 0:60 --out sensitivity.json")
     add(stress, "stress --out runs/stress --frames 60")
     return commands.parser

@@ -95,10 +95,7 @@ def close_loops(
     keyframes = tracker.every_keyframe
     if spline is None or len(keyframes) < 2:
         return Closing([], None, time.perf_counter() - begin)
-    search = LoopSearch(
-        tracker.terms, tracker.rig, tracker.options, keyframes, lambda k: tracker.upload(k, load(k)), spline,
-        tracker.drift, _usual(tracker, keyframes), tracker.inflations,
-    )  # fmt: skip
+    search = search_of(tracker, keyframes, spline, load)
     loops = search.find(progress)
     faults = Counter(search.faults)
     result: Closed | None = None
@@ -109,6 +106,14 @@ def close_loops(
         except np.linalg.LinAlgError as error:
             problem = str(error)
     return Closing(loops, result, time.perf_counter() - begin, search.tried, faults, problem)
+
+
+def search_of(tracker: Tracker, keyframes: Archive, spline: Spline, load: Callable[[int], Frame]) -> LoopSearch:
+    """The search for loops of a track; load: a frame by its number in the track."""
+    return LoopSearch(
+        tracker.terms, tracker.rig, tracker.options, keyframes, lambda k: tracker.upload(k, load(k)), spline,
+        tracker.drift, _usual(tracker, keyframes), tracker.inflations,
+    )  # fmt: skip
 
 
 def graph_of(tracker: Tracker, keyframes: Archive) -> Graph:
