@@ -18,6 +18,7 @@ from rstrack.cli.main import main
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.estimate import read_estimate
 from rstrack.options import Options
+from rstrack.report.build import write_report
 from rstrack.tracking import loop_closing
 from rstrack.tracking.loop_closing import close_loops
 from rstrack.tracking.run import Noise, make_tracker, track
@@ -77,6 +78,12 @@ def test_loops_are_closed_and_both_tracks_written(run: Path, dataset: Dataset) -
     np.testing.assert_allclose(before.pose(online.stamps), online.T_world_depth, atol=2e-8)
     early, late = info["loops"]["pairs"][0]["frames"]
     assert 0 <= early < late < FRAMES
+
+
+def test_the_report_says_what_became_of_loops(run: Path) -> None:
+    page = write_report(run).read_text()
+    count = json.loads((run / "run.json").read_text())["loops"]["count"]
+    assert f"{count} closed, 0 refused; ATE before" in page
 
 
 def test_without_loops_a_track_stays_as_it_is(dataset: Dataset, run: Path, tmp_path: Path) -> None:
@@ -144,6 +151,14 @@ def test_what_shows_another_place_closes_no_loop(dataset: Dataset) -> None:
     wrong = close_loops(tracked(dataset), lambda k: dataset.frame((k + 7) % FRAMES))
     assert not wrong.loops and wrong.tried > 10 and sum((wrong.faults or {}).values()) > 0.8 * wrong.tried
     assert wrong.spline is None and "none found" in wrong.text(0.0)
+
+
+def test_the_benchmark_tells_true_loops_from_false_ones(dataset: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--keyframe-distance", "0.04", "--bootstrap-frames", "3", "--backend", "llvm", "--alike", "8"]
+    assert main(["bench-loops", str(dataset.root), *arguments, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["loops"] > 3 and found["false"] == 0 and found["worst_mm"] < 5.0
+    assert found["alike"] == 8 and found["accepted"] == 0
 
 
 def test_refining_makes_a_run_better(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
