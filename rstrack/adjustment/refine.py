@@ -41,8 +41,8 @@ _FUSED = 1e4
 _LEAST_SHARE, _LEAST_FIT, _WORST = 0.15, 0.6, 2.5
 # Gain or offset that have changed by more call for another look, of so many at most.
 _BRIGHTER, _LOOKS = 0.004, 5
-# What all frames that see a keyframe have in common in their errors, in pixels, see `Uncertainty`.
-_SYSTEMATIC_DEPTH_PX, _SYSTEMATIC_COLOR_PX = 1e-5, 0.003
+# What the colours of all frames that see a keyframe have in common in their errors, in pixels, see `Uncertainty`.
+_SYSTEMATIC_PX = 0.003
 # Furthest that a pose moves (m) in a round after which no other is worth it.
 _STILL = 2e-5
 
@@ -106,9 +106,9 @@ class Refiner:
                 good = self._linearised(frame, keyframes[k], state)
                 pairs += bool(good)
                 for o in good:
-                    bands.setdefault(k, Band()).add(self._told(o, state, frame))
+                    bands.setdefault(k, Band()).add(o.model(state) if o.is_depth else self._told(o, state, frame))
                     kept.append(_Figures.of(o))
-            told(0.5 + 0.5 * (n + 1) / len(self.frames), f"{pairs} pairs of a frame and a keyframe")
+            told(0.5 + 0.5 * (n + 1) / len(self.frames), f"{pairs} pairs")
         at = State(spline, {k: keyframes[k].T_world_base for k in sorted(bands)})
         after, _ = Graph(at, [Seen(k, bands[k]) for k in at.keyframes], (), keeps_motion=False).step(at)
         first = self.times[0]
@@ -164,14 +164,13 @@ class Refiner:
         return good
 
     def _told(self, o: Observation, state: SplineState, frame: DeviceFrame) -> Quadratic:
-        """The model of an image against a keyframe which may be off as one body, as are all that share the keyframe.
+        """The model of a colour image against a keyframe which may be off as one body, as are all that share it.
 
-        What reflections, blur and the keyframe's own noise do to its frames they do to all of them: the mean of n is as
-        far off as each. With a covariance n times as large for each, it is.
+        A keyframe's depth is the mean of all its frames', its colours are one image's, whose blur and noise all of them
+        are aligned to: the mean of n is as far off as each. With a covariance n times as large for each, it is.
         """
         model = o.model(state)
-        pixels = (_SYSTEMATIC_DEPTH_PX if o.is_depth else _SYSTEMATIC_COLOR_PX) ** 2 * self._sharing
-        turn = pixels / o.ref.lens.camera.fx**2
+        turn = self._sharing * (_SYSTEMATIC_PX / o.ref.lens.camera.fx) ** 2
         prior = np.diag(1.0 / np.repeat([turn * o.ref.median_depth**2, turn], 3))
         T_world_cam = state.spline.pose(frame.depth.exposure.mid_time)
         together = np.tile(se3.adjoint(T_world_cam), (model.last - model.first, 1))

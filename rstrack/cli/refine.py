@@ -15,7 +15,7 @@ def refine(
     sequence: Annotated[Path | None, "the run's sequence (default: where it was)", "DIR"] = None,
     camera: CameraFile = None,
     out: Annotated[Path, "folder for the refined run, made if need be", "DIR"],
-    rounds: Annotated[int, "rounds at most; fewer where nothing moves any more", "N"] = 4,
+    rounds: Annotated[int, "rounds at most; fewer where nothing moves any more", "N"] = 3,
     quiet: Quiet = False,
 ) -> int:
     """Align every frame of a run to all keyframes that see it, at once: writes a run folder with the refined spline."""

@@ -67,7 +67,7 @@ class Refined:
 
 
 def refine_run(
-    run: Path, out: Path, sequence: Path | None = None, camera_file: Path | None = None, rounds: int = 4,
+    run: Path, out: Path, sequence: Path | None = None, camera_file: Path | None = None, rounds: int = 3,
     progress: Progress = no_progress,
 ) -> Refined:  # fmt: skip
     """Refine the run of a spline tracker and write the result, a run folder: `out`, which may not be `run` itself.
