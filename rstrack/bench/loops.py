@@ -88,7 +88,7 @@ def loop_quality(
         progress("tracking", (n + 1) / len(chosen), "")
     spline = tracker.spline
     assert spline is not None
-    keyframes = tracker.every_keyframe
+    keyframes = tracker.all_keyframes()
     search = search_of(tracker, keyframes, spline, lambda index: dataset.frame(chosen[index]))
     begin = time.perf_counter()
     loops = search.find(progress)

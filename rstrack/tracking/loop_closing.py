@@ -1,8 +1,8 @@
 """The loops of a track that has come to its end, closed on its spline.
 
+stamps, T_world_depth = tracker.trajectory
 closing = close_loops(tracker, load)
-if closing.state is not None:
-    T_world_depth = closing.poses(tracker)
+T_world_depth = closing.poses(tracker.spline, stamps, T_world_depth)
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
+from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.adjustment.closing import Closed, closed
@@ -89,23 +90,26 @@ class Closing:
 def close_loops(
     tracker: Tracker, load: Callable[[int], Frame], progress: Progress = no_progress
 ) -> Closing:  # fmt: skip
-    """Look for places that a track has come back to, and correct it. load: a frame by its number in the track."""
+    """Look for places that a track has come back to, and correct it. load: a frame by its number in the track.
+
+    What goes wrong (an image that can no longer be read, a system without a solution) is no reason to lose the track:
+    it is said in `Closing.problem`.
+    """
     begin = time.perf_counter()
-    spline = tracker.spline
-    keyframes = tracker.every_keyframe
+    spline, keyframes = tracker.spline, tracker.all_keyframes()
     if spline is None or len(keyframes) < 2:
         return Closing([], None, time.perf_counter() - begin)
     search = search_of(tracker, keyframes, spline, load)
-    loops = search.find(progress)
-    faults = Counter(search.faults)
+    loops: list[Loop] = []
     result: Closed | None = None
     problem = ""
-    if loops:
-        try:
+    try:
+        loops = search.find(progress)
+        if loops:
             result = closed(graph_of(tracker, keyframes), loops, float(tracker.trajectory[0][0]), progress)
-        except np.linalg.LinAlgError as error:
-            problem = str(error)
-    return Closing(loops, result, time.perf_counter() - begin, search.tried, faults, problem)
+    except (UserError, np.linalg.LinAlgError) as error:
+        problem = str(error)
+    return Closing(loops, result, time.perf_counter() - begin, search.tried, Counter(search.faults), problem)
 
 
 def search_of(tracker: Tracker, keyframes: Archive, spline: Spline, load: Callable[[int], Frame]) -> LoopSearch:

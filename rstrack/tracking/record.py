@@ -27,6 +27,7 @@ class Noise:
 
 
 def settings(dataset: Dataset, chosen: range, options: Options, noise: Noise) -> dict[str, Any]:
+    """What a run was made with: method, options, noise, versions, machine, and which frames of what."""
     from rsgen.device.arrays import engine
 
     notes = {"notes": list(dataset.notes)} if dataset.notes else {}

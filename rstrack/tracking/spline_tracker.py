@@ -145,9 +145,8 @@ class Tracker:
 
     # -- for the whole track to be adjusted -------------------------------------------------------------------------
 
-    @property
-    def every_keyframe(self) -> Archive:
-        """All rectified keyframes, the newest with them."""
+    def all_keyframes(self) -> Archive:
+        """All rectified keyframes, the newest put away with them."""
         self._keyframes.put_away()
         return self._keyframes.archive
 

@@ -17,6 +17,7 @@ from rstrack.adjustment.rigid import Usual, align
 from rstrack.cli.main import main
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.estimate import read_estimate
+from rstrack.data.rig import Frame
 from rstrack.options import Options
 from rstrack.report.build import write_report
 from rstrack.tracking import loop_closing
@@ -110,6 +111,15 @@ def test_ctrl_c_while_loops_are_closed_leaves_the_track(
     assert (tmp_path / "run" / "trajectory.txt").read_bytes() == (run / "trajectory.txt").read_bytes()
 
 
+def test_an_image_that_is_gone_costs_the_loops_not_the_track(dataset: Dataset) -> None:
+    def gone(k: int) -> Frame:
+        raise UserError(f"frame {k}: is gone")
+
+    closing = close_loops(tracked(dataset), gone)
+    assert closing.spline is None and "not closed: frame" in closing.text(0.0)
+    assert closing.info()["problem"].endswith("is gone") and closing.info()["pairs"] == []
+
+
 def tracked(dataset: Dataset) -> Tracker:
     tracker = make_tracker(dataset.rig, OPTIONS)
     assert isinstance(tracker, Tracker)
@@ -121,7 +131,7 @@ def tracked(dataset: Dataset) -> Tracker:
 def test_a_frame_is_aligned_to_a_keyframe_of_another_time(dataset: Dataset) -> None:
     tracker, truth = tracked(dataset), dataset.truth
     assert truth is not None and tracker.spline is not None
-    keyframes = tracker.every_keyframe
+    keyframes = tracker.all_keyframes()
     early = keyframes.get(min(keyframes.indices))
     frame = tracker.upload(FRAMES - 3, dataset.frame(FRAMES - 3))
     mid = frame.depth.exposure.mid_time
