@@ -79,16 +79,11 @@ class State:
 
 @dataclass(frozen=True)
 class Graph:
-    """What is known.
-
-    at: the state around which the models of `seen` were made. keeps_motion: accelerations are to stay what they are
-    there; else to be small.
-    """
+    """What is known. at: the state around which the models of `seen` were made, and whose accelerations are to stay."""
 
     at: State
     seen: Sequence[Seen]
     sightings: Sequence[Sighting]
-    keeps_motion: bool = True
 
     def with_sightings(self, more: Sequence[Sighting]) -> Graph:
         """With more of them."""
@@ -102,8 +97,7 @@ class Graph:
             system.add_seen(seen, state, self.at, moved_points)
         for n, sighting in enumerate(self.sightings):
             system.add_sighting(sighting, state, 1.0 if weights is None else float(weights[n]))
-        before = self.at.spline.increments if self.keeps_motion else np.zeros_like(state.spline.increments)
-        system.add_smoothness(state.spline, before)
+        system.add_smoothness(state.spline, self.at.spline)
         x = system.solved()
         points = len(state.spline.control_points)
         return state.moved(x[:points], x[points:]), x
@@ -169,9 +163,9 @@ class _System:
         information = weight * sighting.information
         self._add(numbers, J, information, e)
 
-    def add_smoothness(self, spline: Spline, before: FloatArray) -> None:
-        """Small accelerations beside those of increments `before` (n, 6) from control point to control point."""
-        gains, omega = spline.left_gains, spline.increments - before
+    def add_smoothness(self, spline: Spline, before: Spline) -> None:
+        """Small changes of the accelerations that the spline had before."""
+        gains, omega = spline.left_gains, spline.increments - before.increments
         r = omega[1:] - omega[:-1]
         sigma = np.repeat(_ACCELERATION[None] * spline.dt**2, len(r), axis=0)
         sigma[:_END_TRIPLES] *= _END_FACTOR

@@ -1,4 +1,4 @@
-"""Loops of a track are found and closed; what is none is refused; a run is refined. On a ray-cast room."""
+"""Loops of a track are found and closed; what is none is refused. On a ray-cast room."""
 
 from __future__ import annotations
 
@@ -169,48 +169,3 @@ def test_the_benchmark_tells_true_loops_from_false_ones(dataset: Dataset, capsys
     found = json.loads(capsys.readouterr().out)
     assert found["loops"] > 3 and found["false"] == 0 and found["worst_mm"] < 5.0
     assert found["alike"] == 8 and found["accepted"] == 0
-
-
-def test_refining_makes_a_run_better(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "refined"
-    assert main(["refine", str(run), "--out", str(out), "--rounds", "3", "--quiet"]) == 0
-    assert "rounds in" in capsys.readouterr().out
-    assert ate(out) < 0.95 * ate(run)
-    info = json.loads((out / "run.json").read_text())
-    rounds = info["refined"]["rounds"]
-    assert len(rounds) <= 3 and rounds[-1]["moved_m"] < rounds[0]["moved_m"]
-    # What it was made of lies beside it.
-    assert (out / "trajectory_online.txt").read_bytes() == (run / "trajectory.txt").read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("change", "complaint"),
-    [
-        (lambda run: (run / "spline.npz").unlink(), "has no spline"),
-        (lambda run: (run / "run.json").write_text("{}"), "does not say where its sequence is"),
-        (
-            lambda run: (run / "run.json").write_text(
-                json.dumps(json.loads((run / "run.json").read_text()) | {"options": {"method": "magic"}})
-            ),
-            "unknown method 'magic'",
-        ),
-    ],
-)
-def test_what_cannot_be_refined_is_said_in_one_line(run: Path, tmp_path: Path, change: Any, complaint: str) -> None:
-    import shutil
-
-    from rstrack.tracking.refining import refine_run
-
-    copy = tmp_path / "copy"
-    shutil.copytree(run, copy)
-    change(copy)
-    with pytest.raises(UserError) as error:
-        refine_run(copy, tmp_path / "out")
-    assert complaint in str(error.value) and "\n" not in str(error.value)
-
-
-def test_a_run_is_not_refined_onto_itself(run: Path) -> None:
-    from rstrack.tracking.refining import refine_run
-
-    with pytest.raises(UserError, match="is the run itself"):
-        refine_run(run, run)
