@@ -67,7 +67,6 @@ class Closing:
             "refused": sum(refused),
             "tried": self.tried,
             "faults": dict(self.faults or {}),
-            "seconds": self.seconds,
             "problem": self.problem or None,
             "pairs": [
                 {"frames": [loop.early, loop.late], "disagreement": loop.disagreement, "refused": no}

@@ -242,6 +242,8 @@ def track(
         "timings": timings(time.perf_counter() - begin, seconds),
         "frames": diagnostics(dataset, fed, tracker.reports),
     }
+    if closing is not None:
+        info["timings"]["loops_s"] = closing.seconds
     if dataset.timing is not None:
         info["clocks"] = dataset.timing.as_dict()
     online = Estimate(*tracker.trajectory, tracker.spline, info)

@@ -166,7 +166,7 @@ def test_what_is_given_wrongly_is_named_in_one_line(
 def test_a_run_folder_holds_the_trajectory_and_what_made_it(place: Path, original: Path) -> None:
     estimate, info = read_estimate(Path("run")), read_info("run")
     assert len(estimate.stamps) == FRAMES and estimate.spline is not None
-    assert info["options"] == dataclasses.asdict(Options(fuse=True)) and info["method"] == "rs-pg"
+    assert info["options"] == dataclasses.asdict(Options(fuse=True, loops="end")) and info["method"] == "rs-pg"
     where = str((original / "seq").resolve())
     frames = {"frames": [0, FRAMES], "frames_in_all": FRAMES}
     assert info["dataset"] == {"name": "synthetic", "path": where, **frames}
@@ -227,7 +227,7 @@ def test_options_reach_the_tracker(place: Path, capfd: pytest.CaptureFixture[str
     assert run(capfd, words)[0] == 0
     info = read_info("r")
     chosen = {"method": "gs-g", "knot_spacing_s": 0.04, "fuse": False, "bootstrap_frames": 4}
-    assert info["options"] == dataclasses.asdict(Options()) | chosen
+    assert info["options"] == dataclasses.asdict(Options(loops="end")) | chosen
     estimate = read_estimate(Path("r"))
     assert estimate.spline is not None and estimate.spline.dt == 0.04
     np.testing.assert_allclose(estimate.stamps, np.arange(2, 9) / 30, atol=1e-6)
