@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-
-import numpy as np
+from dataclasses import dataclass, field
 
 from rstrack.adjustment.band import Band
 from rstrack.adjustment.graph import Seen
@@ -29,7 +27,7 @@ class Chain:
     @property
     def seen(self) -> list[Seen]:
         """All of it."""
-        return [*self._done, Seen(self._keyframe, self._band.packed())] if len(self._band.g) else list(self._done)
+        return [*self._done, Seen(self._keyframe, self._band.packed())] if len(self._band) else list(self._done)
 
     def add(self, ref: Reference, fresh: Sequence[Observation], state: SplineState, excess: float) -> None:
         """A frame that has been found. excess: by how much σ of its images are too small, see `Pulls.excess`."""
@@ -39,8 +37,7 @@ class Chain:
             self._keyframe = keyframe
         for o in fresh:
             if o.is_linearised:
-                model = o.model(state)
-                self._band.add(replace(model, g=np.zeros_like(model.g)), 1.0 / excess**2)
+                self._band.add(o.model(state), 1.0 / excess**2)
 
     def cut(self, end: int) -> None:
         """Control points from number `end` on are others from now on."""
@@ -48,9 +45,9 @@ class Chain:
         for seen in self._done:
             if seen.band.last > end:
                 seen.band.cut(end)
-        self._done = [seen for seen in self._done if len(seen.band.g)]
+        self._done = [seen for seen in self._done if len(seen.band)]
 
     def _put_away(self) -> None:
-        if len(self._band.g):
+        if len(self._band):
             self._done.append(Seen(self._keyframe, self._band.packed()))
             self._band = Band()

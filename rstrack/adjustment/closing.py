@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.geometry import se3
 from rstrack.adjustment.graph import Graph, State
@@ -25,11 +24,10 @@ _REFUSED = 0.1
 
 @dataclass(frozen=True)
 class Closed:
-    """The state with its loops closed. refused (n,): loops that do not go with the others; steps: it took so many."""
+    """The state with its loops closed. refused (n,): loops that do not go with the others."""
 
     state: State
     refused: tuple[bool, ...]
-    steps: int
 
 
 def closed(graph: Graph, loops: Sequence[Loop], begin: float, progress: Progress = no_progress) -> Closed:
@@ -39,12 +37,14 @@ def closed(graph: Graph, loops: Sequence[Loop], begin: float, progress: Progress
     step). Raises numpy.linalg.LinAlgError where the system has no solution.
     """
     sightings = [s for loop in loops for s in loop.sightings]
-    count, whole = len(graph.sightings), graph.with_sightings(sightings)
-    state, width, steps = graph.at, np.inf, 0
+    count, whole = len(graph.sightings), replace(graph, sightings=[*graph.sightings, *sightings])
+    state, width = graph.at, np.inf
     weights = np.ones(len(whole.sightings))
+    informations = np.array([s.information for s in sightings])
     for steps in range(1, _MOST_STEPS + 1):
         state, x = whole.step(state, weights)
-        squares = np.array([_square(s.information, state.error(s)) for s in sightings])
+        e = state.errors(sightings)
+        squares = np.einsum("ni,nij,nj->n", e, informations, e)
         if width > 1.0:
             width = max(1.0, min(width, 2.0 * float(squares.max(initial=0.0)) / _OUTLIER) / _NARROWER)
         weights[count:] = (width * _OUTLIER / (squares + width * _OUTLIER)) ** 2
@@ -54,8 +54,4 @@ def closed(graph: Graph, loops: Sequence[Loop], begin: float, progress: Progress
     progress("closing loops", 1.0, f"{len(loops)} loops")
     refused = tuple(bool((pair < _REFUSED).all()) for pair in weights[count:].reshape(-1, 2))
     back = graph.at.spline.pose(begin) @ se3.inverse(state.spline.pose(begin))
-    return Closed(state.placed(back), refused, steps)
-
-
-def _square(information: FloatArray, e: FloatArray) -> float:
-    return float(e @ information @ e)
+    return Closed(state.placed(back), refused)

@@ -10,7 +10,7 @@ model was made.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.sparse
@@ -57,10 +57,11 @@ class State:
     spline: Spline
     keyframes: dict[int, FloatArray]
 
-    def error(self, sighting: Sighting) -> FloatArray:
-        """Twist (6,) from where a sighting puts the camera to where it is, in the camera's axes."""
-        T = se3.inverse(self.keyframes[sighting.keyframe]) @ self.spline.pose(sighting.t)
-        return se3.log(se3.inverse(sighting.T_ref_cam) @ T)
+    def errors(self, sightings: Sequence[Sighting]) -> FloatArray:
+        """Twists (n, 6) from where sightings put the camera to where it is, in the camera's axes."""
+        keyframes = np.array([self.keyframes[s.keyframe] for s in sightings])
+        T = se3.inverse(keyframes) @ self.spline.pose(np.array([s.t for s in sightings]))
+        return se3.log(se3.inverse(np.array([s.T_ref_cam for s in sightings])) @ T)
 
     def moved(self, points: FloatArray, keyframes: FloatArray) -> State:
         """With left increments of the control points (n, 6) and of the keyframes (m, 6), in their order."""
@@ -85,26 +86,18 @@ class Graph:
     seen: Sequence[Seen]
     sightings: Sequence[Sighting]
 
-    def with_sightings(self, more: Sequence[Sighting]) -> Graph:
-        """With more of them."""
-        return replace(self, sightings=[*self.sightings, *more])
-
     def step(self, state: State, weights: FloatArray | None = None) -> tuple[State, FloatArray]:
         """One Gauss-Newton step from a state; weights (n,) of the sightings. Returns the increments too (n, 6)."""
         system = _System(len(state.spline.control_points), list(state.keyframes))
-        moved_points = _moved(state.spline.control_points, self.at.spline.control_points)
+        moved_points = state.spline.control_points @ se3.inverse(self.at.spline.control_points)
         for seen in self.seen:
             system.add_seen(seen, state, self.at, moved_points)
-        for n, sighting in enumerate(self.sightings):
-            system.add_sighting(sighting, state, 1.0 if weights is None else float(weights[n]))
+        if self.sightings:
+            system.add_sightings(self.sightings, state, np.ones(len(self.sightings)) if weights is None else weights)
         system.add_smoothness(state.spline, self.at.spline)
         x = system.solved()
         points = len(state.spline.control_points)
         return state.moved(x[:points], x[points:]), x
-
-
-def _moved(now: FloatArray, before: FloatArray) -> FloatArray:
-    return np.asarray(now @ se3.inverse(before))
 
 
 @dataclass
@@ -123,8 +116,8 @@ class _System:
 
     def add_seen(self, seen: Seen, state: State, at: State, moved_points: FloatArray) -> None:
         """A keyframe's frames."""
-        band, n = seen.band.unpacked(), len(seen.band.g)
-        n = min(n, self.points - band.first)
+        band = seen.band
+        n = min(len(band), self.points - band.first)
         numbers = band.first + np.arange(n)
         own = moved_points[numbers]
         E = own[n // 2]
@@ -132,12 +125,12 @@ class _System:
             E = state.keyframes[seen.keyframe] @ se3.inverse(at.keyframes[seen.keyframe])
         x = se3.log(se3.inverse(E) @ own)
         A = se3.left_jacobian_inv(x) @ se3.adjoint(se3.inverse(E))
-        Hx, whole = band.g[:n].copy(), np.zeros((n, 6, 6))
+        Hx, whole = np.zeros((n, 6)), np.zeros((n, 6, 6))
         for d in range(band.blocks.shape[1]):
             rows = np.arange(n - d)
             if not len(rows):
                 break
-            blocks = band.blocks[: n - d, d]
+            blocks = band.blocks[: n - d, d].astype(np.float64)
             Hx[rows] += (blocks @ x[rows + d][..., None])[..., 0]
             turned = np.swapaxes(A[rows], 1, 2) @ blocks @ A[rows + d]
             whole[rows] += turned
@@ -153,15 +146,20 @@ class _System:
             self._put(np.array([k]), np.array([k]), whole.sum(axis=0)[None])
             self.g[k] -= g.sum(axis=0)
 
-    def add_sighting(self, sighting: Sighting, state: State, weight: float) -> None:
-        """One of them, with a weight."""
-        e = state.error(sighting)
-        segment, J = state.spline.pose_jacobian(sighting.t)
-        to_cam = se3.right_jacobian_inv(e) @ se3.adjoint(se3.inverse(state.spline.pose(sighting.t)))
-        J = np.concatenate([to_cam @ J, -to_cam[None]])
-        numbers = np.append(int(segment) + np.arange(4), self._number[sighting.keyframe])
-        information = weight * sighting.information
-        self._add(numbers, J, information, e)
+    def add_sightings(self, sightings: Sequence[Sighting], state: State, weights: FloatArray) -> None:
+        """Some sightings (n), with weights (n,)."""
+        e, times = state.errors(sightings), np.array([s.t for s in sightings])
+        segments, J = state.spline.pose_jacobian(times)
+        to_cam = se3.right_jacobian_inv(e) @ se3.adjoint(se3.inverse(state.spline.pose(times)))
+        J = np.concatenate([to_cam[:, None] @ J, -to_cam[:, None]], axis=1)
+        keyframes = np.array([self._number[s.keyframe] for s in sightings])
+        numbers = np.column_stack([segments[:, None] + np.arange(4), keyframes])
+        information = weights[:, None, None] * np.array([s.information for s in sightings])
+        weighted = np.swapaxes(J, 2, 3) @ information[:, None]
+        np.add.at(self.g, numbers, (weighted @ e[:, None, :, None])[..., 0])
+        for a in range(5):
+            for b in range(a, 5):
+                self._put(numbers[:, a], numbers[:, b], weighted[:, a] @ J[:, b])
 
     def add_smoothness(self, spline: Spline, before: Spline) -> None:
         """Small changes of the accelerations that the spline had before."""
@@ -203,14 +201,6 @@ class _System:
         if not np.isfinite(x).all():
             raise np.linalg.LinAlgError("the graph's system has no finite solution")
         return np.asarray(x.reshape(-1, 6))
-
-    def _add(self, numbers: IntArray, J: FloatArray, information: FloatArray, e: FloatArray) -> None:
-        """A residual e (6,) with derivatives J (k, 6, 6) by increments of some unknowns."""
-        weighted = np.swapaxes(J, 1, 2) @ information
-        for a, row in enumerate(numbers):
-            self.g[row] += weighted[a] @ e
-            for b in range(a, len(numbers)):
-                self._put(np.array([row]), np.array([numbers[b]]), (weighted[a] @ J[b])[None])
 
     def _put(self, rows: IntArray, columns: IntArray, blocks: FloatArray) -> None:
         self._rows.append(np.asarray(rows))

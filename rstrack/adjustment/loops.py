@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -76,7 +77,7 @@ class LoopSearch:
     usual: Usual
     inflations: tuple[float, float] = (1.0, 1.0)
     tried: int = 0
-    faults: dict[str, int] = field(default_factory=dict)
+    faults: Counter[str] = field(default_factory=Counter)
     _references: OrderedDict[int, Reference] = field(default_factory=OrderedDict)
 
     def find(self, progress: Progress = no_progress) -> list[Loop]:
@@ -84,6 +85,7 @@ class LoopSearch:
         order = sorted(self.archive.indices)
         T = {k: self.archive.pose(k) for k in order}
         way = _ways([T[k] for k in order])
+        number = {k: n for n, k in enumerate(order)}
         halves: dict[int, list[tuple[int, Alignment]]] = {}
         for n, late in enumerate(order):
             frame = self.load(late)
@@ -98,7 +100,7 @@ class LoopSearch:
         for n, (early, found_there) in enumerate(halves.items()):
             frame = self.load(early)
             for late, there in found_there:
-                allowed = self._allowed(early, late, way[order.index(late)] - way[order.index(early)])
+                allowed = self._allowed(early, late, way[number[late]] - way[number[early]])
                 back = self._aligned(frame, late, se3.inverse(T[late]) @ T[early], allowed)
                 loop = None if back is None else self._loop(early, late, there, back)
                 if loop is not None:
@@ -200,7 +202,7 @@ class LoopSearch:
         # Directions that the images leave open get a large, finite one.
         return np.asarray(np.linalg.inv(found.information + np.diag(np.repeat([1.0, 1.0], 3))) + systematic)
 
-    @property
+    @cached_property
     def usual_depth(self) -> float:
         """Median distance (m) of what the keyframes see."""
         return float(np.median([self.archive.small(k).median_depth for k in self.archive.indices]))
@@ -217,7 +219,7 @@ class LoopSearch:
         return self._references[index]
 
     def _refuse(self, why: str) -> None:
-        self.faults[why] = self.faults.get(why, 0) + 1
+        self.faults[why] += 1
 
 
 def _sizes(T: FloatArray) -> FloatArray:

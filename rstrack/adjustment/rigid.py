@@ -14,7 +14,7 @@ from rstrack.alignment import brightness
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.observation import Observation, observe
 from rstrack.alignment.optimizer import Problem, Solved, optimise
-from rstrack.alignment.pull import pulls, steady
+from rstrack.alignment.pull import pulls, rigid_pull
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference
@@ -29,8 +29,6 @@ _SETTLED_PX = 0.5
 # Metres, at one metre and growing with the square of the distance, by which depth or colour alone may want to go
 # elsewhere, where that is more than so many σ.
 _TORN, _TORN_SIGMAS = 0.02, 5.0
-# σ of a shift (m) and turn (rad) before anything is known: what an image does not see pulls nowhere.
-_PRIOR = np.repeat([0.05, np.radians(3.0)], 3)
 _MOST_STEPS = (15, 8, 30)
 
 
@@ -47,13 +45,11 @@ class Alignment:
     """T_ref_cam (4, 4) of a frame at mid readout in a keyframe, and what is known of it.
 
     information (6, 6): of increments T_ref_cam exp(ξ) as far as the images agree. fault: why it is none; '' if it is.
-    share: part of the keyframe's pixels that the frame sees.
     """
 
     T_ref_cam: FloatArray
     information: FloatArray
     fault: str
-    share: float
 
 
 def align(
@@ -80,10 +76,9 @@ def align(
         solved = Solved()
     T = se3.inverse(ref.T_world_base) @ state.spline.pose(mid)
     if not any(o.is_linearised for o in fresh):
-        return Alignment(T, np.zeros((6, 6)), "no pixel of it falls on the keyframe", 0.0)
-    share = min((o.pixels / max(1, ref.pixels) for o in fresh if o.is_linearised), default=0.0)
+        return Alignment(T, np.zeros((6, 6)), "no pixel of it falls on the keyframe")
     fault = _fault(fresh, solved, ref, usual) or _torn(fresh, state, ref)
-    return Alignment(T, pulls(fresh, state).information, fault, share)
+    return Alignment(T, pulls(fresh, state).information, fault)
 
 
 def _placed(motion: Spline, frame: DeviceFrame, G: FloatArray) -> SplineState:
@@ -96,16 +91,10 @@ def _placed(motion: Spline, frame: DeviceFrame, G: FloatArray) -> SplineState:
 
 def _torn(fresh: Sequence[Observation], state: SplineState, ref: Reference) -> str:
     """Whether depth alone, or colour alone, would put the frame elsewhere, as one body."""
-    distance = max(1.0, ref.median_depth)
+    limit = _TORN * max(1.0, ref.median_depth) ** 2
     for is_depth in (True, False):
-        seen = [steady(o, state) for o in fresh if o.is_depth is is_depth and o.is_linearised]
-        if not seen:
-            continue
-        H = np.diag(1.0 / _PRIOR**2) + sum(H[:6, :6] for H, _ in seen)
-        g = np.sum([g[:6] for _, g in seen], axis=0)
-        twist = np.linalg.solve(H, g)
-        metres = np.linalg.norm(twist[:3]) + ref.median_depth * np.linalg.norm(twist[3:])
-        if metres > _TORN * distance**2 and float(g @ twist) > _TORN_SIGMAS**2:
+        metres, sigmas = rigid_pull([o for o in fresh if o.is_depth is is_depth], state)
+        if metres > limit and sigmas > _TORN_SIGMAS:
             return "depth and colour do not agree"
     return ""
 

@@ -86,6 +86,17 @@ def _pull(seen: Sequence[tuple[Observation, FloatArray, FloatArray]]) -> tuple[f
     return float(metres), float(np.sqrt(max(0.0, float(g @ twist))))
 
 
+def rigid_pull(fresh: Sequence[Observation], state: SplineState) -> tuple[float, float]:
+    """Metres and σ that observations would move a frame by whose lines can only move as one body; 0 without any."""
+    seen = [steady(o, state) for o in fresh if o.is_linearised]
+    if not seen:
+        return 0.0, 0.0
+    g = np.sum([g[:6] for _, g in seen], axis=0)
+    twist = np.linalg.solve(np.diag(1.0 / _PRIOR[:6] ** 2) + sum(H[:6, :6] for H, _ in seen), g)
+    metres = np.linalg.norm(twist[:3]) + fresh[0].ref.median_depth * np.linalg.norm(twist[3:])
+    return float(metres), float(np.sqrt(max(0.0, float(g @ twist))))
+
+
 def steady(o: Observation, state: SplineState) -> tuple[FloatArray, FloatArray]:
     """H (12, 12) and g (12,) of two twists of an image's lines, in the world's axes about the camera at mid readout.
 

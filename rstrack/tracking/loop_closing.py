@@ -8,9 +8,8 @@ T_world_depth = closing.poses(tracker.spline, stamps, T_world_depth)
 from __future__ import annotations
 
 import time
-from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -44,7 +43,7 @@ class Closing:
     closed: Closed | None
     seconds: float
     tried: int = 0
-    faults: Counter[str] | None = None
+    faults: Mapping[str, int] = field(default_factory=dict)
     problem: str = ""
 
     @property
@@ -66,7 +65,7 @@ class Closing:
             "count": len(self.loops) - sum(refused),
             "refused": sum(refused),
             "tried": self.tried,
-            "faults": dict(self.faults or {}),
+            "faults": dict(self.faults),
             "problem": self.problem or None,
             "pairs": [
                 {"frames": [loop.early, loop.late], "disagreement": loop.disagreement, "refused": no}
@@ -108,7 +107,7 @@ def close_loops(
             result = closed(graph_of(tracker, keyframes), loops, float(tracker.trajectory[0][0]), progress)
     except (UserError, np.linalg.LinAlgError) as error:
         problem = str(error)
-    return Closing(loops, result, time.perf_counter() - begin, search.tried, Counter(search.faults), problem)
+    return Closing(loops, result, time.perf_counter() - begin, search.tried, search.faults, problem)
 
 
 def search_of(tracker: Tracker, keyframes: Archive, spline: Spline, load: Callable[[int], Frame]) -> LoopSearch:

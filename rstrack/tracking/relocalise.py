@@ -133,9 +133,11 @@ class Relocaliser:
         return Found(trial, fresh, solved, ref, uncertainty)
 
 
-def _is_sure(depth: Observation) -> bool:
-    """Whether a depth image alone tells the place."""
-    return depth.is_linearised and depth.lin.fit >= _SURE_FIT and depth.lin.observability >= _SURE_SEEN
+def _is_sure(alone: Observation) -> bool:
+    """Whether an image tells the place without the others."""
+    if not alone.is_linearised or alone.lin.fit < _SURE_FIT:
+        return False
+    return not alone.is_depth or alone.lin.observability >= _SURE_SEEN
 
 
 def without_misfits(

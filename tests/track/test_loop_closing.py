@@ -159,7 +159,7 @@ def test_what_shows_another_place_closes_no_loop(dataset: Dataset) -> None:
     honest = close_loops(tracker, dataset.frame)
     assert len(honest.loops) > 3
     wrong = close_loops(tracked(dataset), lambda k: dataset.frame((k + 7) % FRAMES))
-    assert not wrong.loops and wrong.tried > 10 and sum((wrong.faults or {}).values()) > 0.8 * wrong.tried
+    assert not wrong.loops and wrong.tried > 10 and sum(wrong.faults.values()) > 0.8 * wrong.tried
     assert wrong.spline is None and "none found" in wrong.text(0.0)
 
 
