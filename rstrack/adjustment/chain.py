@@ -14,7 +14,7 @@ from rstrack.keyframes.keyframe import Reference
 
 @dataclass
 class Chain:
-    """Frames' normal equations, summed over those aligned to one keyframe: about 1 kB a frame.
+    """Frames' normal equations, summed over those aligned to one keyframe: 1.5 kB a frame.
 
     Only the Hessians: where the frames were found, nothing pulls at them any more. Frames against references that are
     rolling still are put together under None.
