@@ -76,7 +76,8 @@ class Options:
     ] = None
     memory_gb: Annotated[
         float,
-        "images of old keyframes that take more than this go to temporary files (in TMPDIR) until needed",
+        "images of old keyframes that take more than this go to temporary files (in TMPDIR) until needed, and so do "
+        "far parts of a volume",
     ] = 2.0
 
     def __post_init__(self) -> None:
@@ -151,10 +152,14 @@ class MapOptions:
     every: Annotated[int, "use every N-th frame"] = 1
     color: Annotated[bool, "colour the mesh (default: yes)"] = True
     max_depth: Annotated[float, "depth beyond this is left out, m"] = 6.0
+    memory_gb: Annotated[
+        float, "parts of the volume that take more than this go to a temporary file (in TMPDIR) until needed"
+    ] = 2.0
     backend: Annotated[Backend, "where kernels run"] = "auto"
 
     def __post_init__(self) -> None:
         if self.every < 1:
             raise UserError(f"every = {self.every!r} must be 1 or more")
-        if not self.max_depth > 0.0:
-            raise UserError(f"max_depth = {self.max_depth!r} must be positive")
+        for name in ("max_depth", "memory_gb"):
+            if not getattr(self, name) > 0.0:
+                raise UserError(f"{name} = {getattr(self, name)!r} must be positive")

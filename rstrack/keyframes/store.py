@@ -34,9 +34,9 @@ class KeyframeStore:
 
     def __init__(self, maker: KeyframeMaker, options: Options) -> None:
         self._maker, self._options = maker, options
-        self._model = SurfaceModel(maker, options.voxel_m) if options.models else None
-        self._kept: deque[Reference] = deque(maxlen=_RECENT if self._model is None else _MODEL_KEYFRAMES)
         self._bytes = 1e9 * options.memory_gb
+        self._model = SurfaceModel(maker, options.voxel_m, self._bytes) if options.models else None
+        self._kept: deque[Reference] = deque(maxlen=_RECENT if self._model is None else _MODEL_KEYFRAMES)
         self.archive = Archive(maker, self._bytes)
         self.anchor: Reference | None = None
         self.made = 0

@@ -22,9 +22,9 @@ _MEDIAN_TO_SIGMA = 1.4826
 class SurfaceModel:
     """A signed distance volume of all frames that have converged."""
 
-    def __init__(self, maker: KeyframeMaker, voxel_m: float) -> None:
+    def __init__(self, maker: KeyframeMaker, voxel_m: float, most_bytes: float = float("inf")) -> None:
         self._maker = maker
-        self.volume = Volume(maker.e, voxel_m)
+        self.volume = Volume(maker.e, voxel_m, most_bytes=most_bytes)
 
     def add(self, depth: DepthImage, spline: Spline) -> None:
         """Integrate a frame whose poses no longer change."""

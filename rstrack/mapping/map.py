@@ -157,7 +157,7 @@ def reconstruct(
         raise UserError("map: the estimate has no spline, so lines have no poses of their own: use --shutter gs")
     T_world_estimate, world = _world(dataset, estimate, options.world)
     e = engine(options.backend)
-    volume = Volume(e, options.voxel_m, options.color)
+    volume = Volume(e, options.voxel_m, options.color, most_bytes=1e9 * options.memory_gb)
     mapper = FrameMapper(e, dataset.rig, estimate, shutter, volume, T_world_estimate, options.max_depth)
     chosen = range(0, len(dataset), options.every)
     done = 0

@@ -30,7 +30,8 @@ _EVERY_S, _SHARE = 30.0, 0.03
 # What a checkpoint is made of, and nothing else is called when one is read: classes that these define, and these names.
 _PACKAGES = (
     "rsgen.device.", "rsgen.geometry.", "rstrack.adjustment.", "rstrack.alignment.", "rstrack.images.",
-    "rstrack.keyframes.", "rstrack.tracking.", "rstrack.data.rig.", "rstrack.options.", "collections.", "pathlib.",
+    "rstrack.keyframes.", "rstrack.tracking.", "rstrack.volume.", "rstrack.data.rig.", "rstrack.options.",
+    "collections.", "pathlib.",
 )  # fmt: skip
 _NAMES = {
     ("numpy", "ndarray"), ("numpy", "dtype"), ("numpy._core.multiarray", "_reconstruct"),
@@ -58,7 +59,7 @@ def checkpoint_of(
 
     noise: what is added to the images, by name.
     """
-    if not isinstance(tracker, Tracker) or tracker.options.models:
+    if not isinstance(tracker, Tracker):
         return None
     rig, options = dataset.rig, tracker.options
     depth, color = (rig.depth_camera, rig.depth_shutter), (rig.color_camera, rig.color_shutter)

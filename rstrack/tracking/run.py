@@ -190,7 +190,7 @@ def track(
     if checkpoint is not None:
         done = checkpoint.resume() if resume else checkpoint.begin()
     elif resume:
-        raise UserError(f"{out}: --resume is for spline methods without --reference model: track anew")
+        raise UserError(f"{out}: --resume is for spline methods, not for the baseline: track anew")
     seconds, fed, unreadable = done.seconds, done.fed, done.unreadable
     end: End = "done"
     error, note, told_at = "", "", 0

@@ -1,9 +1,9 @@
 """Device kernels of the signed distance volume: distances' scale, blocks in sight, integration, ray casting.
 
 Lattice point (i, j, k) lies at (i, j, k) times the voxel's size in the world. A block holds 8×8×8 lattice points; the
-directory, a dense table over the blocks' bounding box, says where each block's values begin, -1 for blocks that are
-not there. Kept are sums over frames: of weights, of weights times truncated distances (in units of the truncation), and
-of weights times colours.
+directory, a dense table over a box of blocks about the camera, says where each block's values begin, -1 for blocks that
+are not there. Kept are sums over frames: of weights, of weights times truncated distances (in units of the truncation),
+and of weights times colours.
 """
 
 from __future__ import annotations

@@ -21,6 +21,9 @@ from rstrack.volume.volume import Blocks
 _CHUNK = 8
 # Vertices of neighbouring chunks that are so near (voxels) are one.
 _WELD = 1e-3
+_NOTHING = np.zeros(0, np.int64)
+# Of a cell of vertices' places, by which they are packed into 64 bits wherever they are.
+_CELL_BITS = 14
 
 
 @dataclass(frozen=True)
@@ -82,16 +85,26 @@ def _chunks(blocks: Blocks) -> Iterator[tuple[IntArray, Float32Array, Float32Arr
 
     A chunk ends with the lattice points with which the next begins.
     """
-    padding = [(0, _CHUNK + 1 - n % _CHUNK) for n in blocks.directory.shape]
-    directory = np.pad(blocks.directory, padding, constant_values=-1)
-    for z, y, x in np.unique(np.argwhere(directory >= 0) // _CHUNK, axis=0) * _CHUNK:
-        rows = directory[z : z + _CHUNK + 1, y : y + _CHUNK + 1, x : x + _CHUNK + 1]
+    if not len(blocks.at):
+        return
+    chunk = blocks.at // _CHUNK
+    names, members = np.unique(chunk, axis=0, return_inverse=True)
+    order = np.argsort(members.reshape(-1), kind="stable")
+    of_chunk = np.split(order, np.flatnonzero(np.diff(members.reshape(-1)[order])) + 1)
+    found = {tuple(name.tolist()): rows for name, rows in zip(names, of_chunk, strict=True)}
+    for name in names:
+        first = name * _CHUNK
+        rows = np.full((_CHUNK + 1,) * 3, -1, np.int64)
+        for step in product((0, 1), repeat=3):
+            there = found.get(tuple((name + step).tolist()), _NOTHING)
+            x, y, z = (blocks.at[there] - first).T
+            near = np.maximum(np.maximum(x, y), z) <= _CHUNK
+            rows[z[near], y[near], x[near]] = there[near]
         color = None if blocks.color is None else _dense(blocks.color, rows)
-        first = (np.array([x, y, z]) + blocks.first) * BLOCK
-        yield first, _dense(blocks.tsdf, rows), _dense(blocks.weight, rows), color
+        yield first * BLOCK, _dense(blocks.tsdf, rows), _dense(blocks.weight, rows), color
 
 
-def _dense(values: Float32Array, rows: npt.NDArray[np.int32]) -> Float32Array:
+def _dense(values: Float32Array, rows: IntArray) -> Float32Array:
     """Values (n, 8, 8, 8, ...) of the blocks `rows` (9, 9, 9) at a chunk's lattice points (65, 65, 65, ...)."""
     picked = values[np.maximum(rows, 0)]
     picked[rows < 0] = 0
@@ -133,9 +146,11 @@ def _colors_at(color: Float32Array, zyx: Float32Array) -> npt.NDArray[np.uint8]:
 
 
 def _packed(keys: IntArray) -> IntArray:
-    """One integer for each row (n, 3)."""
-    keys = keys - keys.min(axis=0)
-    size = keys.max(axis=0) + 1
-    if np.prod(size.astype(float)) >= 2.0**62:
+    """One integer for each row (n, 3): cells of 2^14 a side, numbered, and the place in the cell."""
+    cell = keys >> _CELL_BITS
+    cell -= cell.min(axis=0)
+    _, number = np.unique((cell[:, 2] << 42) | (cell[:, 1] << 21) | cell[:, 0], return_inverse=True)
+    if max(cell.max(), number.max()) >= 2**21:
         raise UserError("map: the surface spreads too far for the voxel size: use larger voxels")
-    return np.asarray((keys[:, 2] * size[1] + keys[:, 1]) * size[0] + keys[:, 0])
+    x, y, z = (keys & (2**_CELL_BITS - 1)).T
+    return np.asarray((number.reshape(-1) << 3 * _CELL_BITS) | (z << 2 * _CELL_BITS) | (y << _CELL_BITS) | x)

@@ -79,11 +79,11 @@ def files(run: Path) -> dict[str, bytes]:
     return {name: (run / name).read_bytes() for name in ("trajectory.txt", "spline.npz")}
 
 
-@pytest.mark.parametrize("memory_gb", [2.0, 1e-6])
+@pytest.mark.parametrize("memory_gb, reference", [(2.0, "keyframe"), (1e-6, "keyframe"), (2.0, "model")])
 def test_a_run_that_crashes_again_and_again_comes_to_the_same_bits(
-    dataset: Dataset, tmp_path: Path, often: None, memory_gb: float
+    dataset: Dataset, tmp_path: Path, often: None, memory_gb: float, reference: str
 ) -> None:
-    options = Options(**(vars(OPTIONS) | {"memory_gb": memory_gb}))
+    options = Options(**(vars(OPTIONS) | {"memory_gb": memory_gb, "reference": reference, "voxel_m": 0.03}))
     whole = track(dataset, options, tmp_path / "whole", noise=NOISE)
     for count in (2, 5, 2, 4):
         with pytest.raises(RuntimeError, match="crashed"):

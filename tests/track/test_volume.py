@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rstrack.keyframes.keyframe import rectified_lens
+from rstrack.volume.away import Away
 from rstrack.volume.kernels import BLOCK, scale_kernel
 from rstrack.volume.mesh import extract_surface, write_ply
 from rstrack.volume.volume import Blocks, Volume
@@ -94,8 +96,7 @@ def test_near_measurements_count_more() -> None:
         p = np.array([0.0, 0.0, z])
         index = np.rint(p / 0.02).astype(int)
         found = volume.download()
-        x, y, b = index // BLOCK - found.first
-        block = found.directory[b, y, x]
+        block = int(np.flatnonzero((found.at == index // BLOCK).all(axis=1))[0])
         weights.append(found.weight[block, index[2] % BLOCK, index[1] % BLOCK, index[0] % BLOCK])
     sigma = 0.0012 + 0.0019 * (np.array([1.0, 2.0]) - 0.4) ** 2
     assert weights[0] == pytest.approx(1.0, abs=0.01)
@@ -108,10 +109,8 @@ def test_depth_is_not_interpolated_across_edges() -> None:
     volume = Volume(ENGINE, 0.02)
     volume.integrate(inverse(z), np.eye(4), LENS)
     found = volume.download()
-    rows = np.argwhere(found.directory >= 0)
-    tsdf = found.tsdf[found.directory[tuple(rows.T)]]
-    depth = ((rows[:, 0] + found.first[2])[:, None] * BLOCK + np.arange(BLOCK)) * 0.02
-    crossing = (tsdf <= 0) & (found.weight[found.directory[tuple(rows.T)]] > 0)
+    depth = (found.at[:, 2, None] * BLOCK + np.arange(BLOCK)) * 0.02
+    crossing = (found.tsdf <= 0) & (found.weight > 0)
     where = np.broadcast_to(depth[:, :, None, None], crossing.shape)[crossing]
     # Behind a surface are only points within the truncation (0.08 m, slant included) of one of the two.
     assert (np.minimum(np.abs(where - 1.0), np.abs(where - 2.0)) < 0.1).all() and len(where) > 100
@@ -138,13 +137,108 @@ def test_memory_is_spent_on_the_surface_only() -> None:
 def test_a_volume_grows_beyond_its_first_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     T = POSES[0]
     kept, _ = filled().raycast(T, LENS)
-    monkeypatch.setattr("rstrack.volume.volume._FIRST_BLOCKS", 16)
+    monkeypatch.setattr("rstrack.volume.values._FIRST_BLOCKS", 16)
     volume = filled()
     far = np.eye(4)
     far[:3, 3] = 5.0, -3.0, 0.0  # the directory grows too
     volume.integrate(inverse(np.full(SHAPE, 2.5)), far, LENS)
     assert volume.blocks > 2 * 16
     np.testing.assert_array_equal(ENGINE.download(volume.raycast(T, LENS)[0], SHAPE), ENGINE.download(kept, SHAPE))
+
+
+def far_apart(n: int) -> list[np.ndarray]:
+    """Poses along a long way, and back to the start."""
+    out = []
+    for x in (*np.linspace(0.0, 30.0, n), 0.1):
+        T = se3.exp(np.array([0, 0, 0, 0.02 * x, 0.01 * x, 0.03]))
+        T[:3, 3] = 3.0 * x, 0.1 * x, -0.2 * x
+        out.append(T)
+    return out
+
+
+@pytest.fixture
+def small_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rstrack.volume.directory.MOST_ENTRIES", 60_000)
+    monkeypatch.setattr("rstrack.volume.volume._AT_ONCE", 50)
+    monkeypatch.setattr("rstrack.volume.values._FIRST_BLOCKS", 16)
+
+
+@pytest.mark.parametrize("color", [False, True])
+def test_what_is_far_away_goes_to_a_file_and_comes_back_to_the_bit(
+    monkeypatch: pytest.MonkeyPatch, small_window: None, color: bool
+) -> None:
+    """A small window and hardly any memory against one window for all, and all in memory."""
+    poses, images = far_apart(20), []
+    rng = np.random.default_rng(0)
+    for k, _ in enumerate(poses):
+        z = 1.5 + 0.2 * np.sin(0.3 * k + 5.0 * RAYS[..., 0]) + 0.1 * RAYS[..., 1]
+        images.append((inverse(z), [ENGINE.upload(rng.uniform(0, 1, SHAPE)) for _ in range(4)] if color else None))
+    away = 0
+
+    def made(most_bytes: float) -> tuple[Volume, list[np.ndarray]]:
+        nonlocal away
+        volume, seen = Volume(ENGINE, 0.02, color, most_bytes=most_bytes), []
+        for T, (rho, planes) in zip(poses, images, strict=True):
+            volume.integrate(rho, T, LENS, color=planes)
+            again, colors = volume.raycast(T, LENS, color=color)
+            seen += [ENGINE.download(a, SHAPE) for a in (again, *colors)]
+            away = max(away, volume.blocks_away)
+        return volume, seen
+
+    far, far_seen = made(2e6 if color else 0.7e6)
+    assert far.blocks_away > 0.5 * far.blocks
+    monkeypatch.setattr("rstrack.volume.directory.MOST_ENTRIES", 2**24)
+    away = 0
+    whole, whole_seen = made(np.inf)
+    assert away == 0 and far.bytes < 0.3 * whole.bytes
+    for a, b in zip(far_seen, whole_seen, strict=True):
+        np.testing.assert_array_equal(a, b)
+    a, b = far.download(), whole.download()
+    np.testing.assert_array_equal(a.at, b.at)
+    np.testing.assert_array_equal(a.tsdf, b.tsdf)
+    np.testing.assert_array_equal(a.weight, b.weight)
+    assert (a.color is None) == (not color)
+    if color:
+        np.testing.assert_array_equal(a.color, b.color)
+    assert np.ptp(far.download().at[:, 0]) * 0.02 * BLOCK > 85.0  # m
+    whole_mesh, far_mesh = extract_surface(b, 0.02), extract_surface(a, 0.02)
+    np.testing.assert_array_equal(whole_mesh.vertices, far_mesh.vertices)
+    assert np.ptp(far_mesh.vertices[:, 0]) > 85.0
+
+
+@pytest.mark.parametrize("away_m", [1.0e3, 1.0e5])
+def test_a_volume_is_as_good_far_from_the_origin(away_m: float) -> None:
+    shift = np.eye(4)
+    shift[:3, 3] = np.round(np.array([away_m, -0.3 * away_m, 2.0 * away_m]) / 0.16) * 0.16
+    volume, near = Volume(ENGINE, 0.02), filled()
+    for T in POSES:
+        volume.integrate(inverse(depth_of(WALL, T)), shift @ T, LENS)
+    a, b = (ENGINE.download(v.raycast(s @ POSES[0], LENS)[0], SHAPE) for v, s in ((volume, shift), (near, np.eye(4))))
+    both = (a > 0) & (b > 0)
+    assert both.sum() > 0.99 * max((a > 0).sum(), (b > 0).sum())
+    np.testing.assert_allclose(a[both], b[both], atol=2e-5)
+    mesh = extract_surface(volume.download(), 0.02)
+    off = (mesh.vertices - shift[:3, 3]) @ WALL.normal - WALL.offset
+    assert np.abs(off).max() < 2e-3 and np.median(np.abs(off)) < 2e-4
+
+
+def test_what_is_away_goes_into_a_checkpoint_as_it_is_then() -> None:
+    away, rng = Away(5), np.random.default_rng(1)
+    first, second = rng.normal(size=(2, 3, 5)).astype(np.float32)
+    away.put(np.array([7, 2, 9]), first)
+    away.put(np.array([9]), second[:1])
+    written = pickle.dumps(away)
+    away.put(np.array([7, 2, 9, 4]), np.zeros((4, 5), np.float32))
+    np.testing.assert_array_equal(pickle.loads(written).get(np.array([9, 7, 2])), [second[0], first[0], first[1]])
+    assert len(pickle.loads(pickle.dumps(Away(5)))) == 0
+
+
+def test_a_full_disk_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch, small_window: None) -> None:
+    monkeypatch.setattr("rstrack.volume.away.os.pwrite", lambda *_: 0)
+    volume = Volume(ENGINE, 0.02, most_bytes=1e5)
+    with pytest.raises(UserError, match="No space left"):
+        for T in far_apart(20):
+            volume.integrate(inverse(np.full(SHAPE, 1.5)), T, LENS)
 
 
 def test_colors_come_back() -> None:
@@ -188,10 +282,9 @@ def ball_blocks(radius: float, centre: np.ndarray, color: bool = False) -> Block
 
     planes = [np.clip(0.5 + x / 100, 0, 1), np.full_like(x, 0.25), np.full_like(x, 1.0), np.ones_like(x)]
     colors = np.stack([packed(p) for p in planes], axis=-1).astype(np.float32) if color else None
-    directory = np.arange(n**3, dtype=np.int32).reshape(n, n, n)
     one = np.ones_like(tsdf)
-    first = np.full(3, -n // 2)
-    return Blocks(first, directory, packed(tsdf).astype(np.float32), packed(one).astype(np.float32), colors)
+    at = np.stack(np.unravel_index(np.arange(n**3), (n, n, n))[::-1], axis=-1) - n // 2
+    return Blocks(at, packed(tsdf).astype(np.float32), packed(one).astype(np.float32), colors)
 
 
 def test_a_ball_becomes_a_closed_mesh_without_seams() -> None:
@@ -210,7 +303,7 @@ def test_points_that_were_not_seen_leave_a_hole() -> None:
     z = (np.arange(12) - 6)[:, None, None] * BLOCK
     weight = blocks.weight.reshape(12, 12, 12, BLOCK, BLOCK, BLOCK).copy()
     weight[(z >= 0).ravel()] = 0.0
-    half = extract_surface(Blocks(blocks.first, blocks.directory, blocks.tsdf, weight.reshape(-1, 8, 8, 8), None), 0.01)
+    half = extract_surface(Blocks(blocks.at, blocks.tsdf, weight.reshape(-1, 8, 8, 8), None), 0.01)
     assert half.vertices[:, 2].max() <= -0.01 + 1e-9
     assert 0.4 < len(half.faces) / whole < 0.55
 
