@@ -59,5 +59,6 @@ class ProgressDisplay(AbstractContextManager["ProgressDisplay"]):
         tenth = int(10 * fraction + 1e-9)
         if tenth > self._tenths.get(stage, -1):
             self._tenths[stage] = tenth
-            left = (now - start) * (1 - fraction) / fraction if fraction > 0 else float("nan")
-            self._console.print(f"{title} {100 * fraction:3.0f} %, {now - start:.0f} s, {left:.0f} s left ({note})")
+            left = f", {(now - start) * (1 - fraction) / fraction:.0f} s left" if fraction > 0 else ""
+            said = f" ({note})" if note else ""
+            self._console.print(f"{title} {100 * fraction:3.0f} %, {now - start:.0f} s{left}{said}")
