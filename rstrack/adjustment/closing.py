@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.geometry import se3
 from rstrack.adjustment.graph import Graph, State
@@ -20,25 +21,68 @@ _NARROWER, _MOST_STEPS = 4.0, 40
 _SMALL = 1e-7
 # Weight below which a loop has been refused by the others.
 _REFUSED = 0.1
+# By what the track's own errors may be larger than it thinks, where most loops say so: widened until no more than this
+# part of them is refused. So many must agree: a few may as well be false.
+_SPREADS, _REFUSED_SHARE, _AGREEING = (2.0, 4.0, 8.0, 16.0), 0.25, 4
 
 
 @dataclass(frozen=True)
 class Closed:
-    """The state with its loops closed. refused (n,): loops that do not go with the others."""
+    """The state with its loops closed. refused (n,): loops that do not go with the others, and count for nothing.
+
+    spread: by what the track's own errors were taken to be larger than it thinks.
+    """
 
     state: State
     refused: tuple[bool, ...]
+    spread: float = 1.0
+
+    @property
+    def closed(self) -> int:
+        """Loops that count."""
+        return len(self.refused) - sum(self.refused)
 
 
 def closed(graph: Graph, loops: Sequence[Loop], begin: float, progress: Progress = no_progress) -> Closed:
     """Close loops of the track that a graph describes; the camera stays where it was at time `begin` (s).
 
-    A loop that contradicts the others and the track is left out (Geman and McClure's kernel, made narrower step by
-    step). Raises numpy.linalg.LinAlgError where the system has no solution.
+    A loop that contradicts the others and the track is left out. Where that were most of them, though they go with each
+    other, it is the track that is wrong by more than it thinks: of cameras that are not quite as told, frame after
+    frame errs alike, which no single frame shows. Raises numpy.linalg.LinAlgError where the system has no solution.
     """
+    found = _closed(graph, loops, 1.0, progress)
+    if 2 * found.closed <= len(loops):
+        for spread in _SPREADS if len(loops) >= _AGREEING else ():
+            wider = _closed(graph.weakened(spread), loops, spread, progress)
+            if wider.closed >= max(_AGREEING, (1.0 - _REFUSED_SHARE) * len(loops)):
+                found = wider
+                break
+    back = graph.at.spline.pose(begin) @ se3.inverse(found.state.spline.pose(begin))
+    return replace(found, state=found.state.placed(back))
+
+
+def _closed(graph: Graph, loops: Sequence[Loop], spread: float, progress: Progress) -> Closed:
+    """By graduated non-convexity: Geman and McClure's kernel, made narrower step by step; then without the refused."""
+    refused, state, width = np.zeros(len(loops), bool), graph.at, np.inf
+    while not refused.all():
+        state, weights = _settled(
+            graph, [loop for loop, no in zip(loops, refused, strict=True) if not no], width, progress
+        )
+        width = 1.0
+        weak = (weights.reshape(-1, 2) < _REFUSED).all(axis=1)
+        if not weak.any():
+            return Closed(state, tuple(refused.tolist()), spread)
+        refused[np.flatnonzero(~refused)[weak]] = True
+    return Closed(graph.at, tuple(refused.tolist()), spread)
+
+
+def _settled(
+    graph: Graph, loops: Sequence[Loop], width: float, progress: Progress
+) -> tuple[State, FloatArray]:  # fmt: skip
+    """The state with these loops, and the weights of their sightings; width: of the kernel, inf at first."""
     sightings = [s for loop in loops for s in loop.sightings]
     count, whole = len(graph.sightings), replace(graph, sightings=[*graph.sightings, *sightings])
-    state, width = graph.at, np.inf
+    state = graph.at
     weights = np.ones(len(whole.sightings))
     informations = np.array([s.information for s in sightings])
     for steps in range(1, _MOST_STEPS + 1):
@@ -52,6 +96,4 @@ def closed(graph: Graph, loops: Sequence[Loop], begin: float, progress: Progress
         if width == 1.0 and float(np.abs(x).max()) < _SMALL:
             break
     progress("closing loops", 1.0, f"{len(loops)} loops")
-    refused = tuple(bool((pair < _REFUSED).all()) for pair in weights[count:].reshape(-1, 2))
-    back = graph.at.spline.pose(begin) @ se3.inverse(state.spline.pose(begin))
-    return Closed(state.placed(back), refused)
+    return state, weights[count:]

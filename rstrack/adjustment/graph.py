@@ -10,7 +10,7 @@ model was made.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.sparse
@@ -85,6 +85,12 @@ class Graph:
     at: State
     seen: Sequence[Seen]
     sightings: Sequence[Sighting]
+
+    def weakened(self, spread: float) -> Graph:
+        """With what frames and sightings say taken as so many times as uncertain (σ)."""
+        seen = [replace(each, band=Band(each.band.first, each.band.blocks / spread**2)) for each in self.seen]
+        sightings = [replace(each, information=each.information / spread**2) for each in self.sightings]
+        return Graph(self.at, seen, sightings)
 
     def step(self, state: State, weights: FloatArray | None = None) -> tuple[State, FloatArray]:
         """One Gauss-Newton step from a state; weights (n,) of the sightings. Returns the increments too (n, 6)."""

@@ -64,6 +64,7 @@ class Closing:
         return {
             "count": len(self.loops) - sum(refused),
             "refused": sum(refused),
+            "track_errors_widened": None if self.closed is None else self.closed.spread,
             "tried": self.tried,
             "faults": dict(self.faults),
             "problem": self.problem or None,
@@ -82,7 +83,9 @@ class Closing:
         info = self.info()
         refused = f", {info['refused']} refused" if info["refused"] else ""
         moved = f"poses moved by up to {1e3 * moved_m:.2f} mm"
-        return f"loops: {info['count']} closed{refused} in {self.seconds:.1f} s; {moved}"
+        spread = self.closed.spread
+        wider = f"; they say that the track's errors are about {spread:g} times what it thinks" if spread > 1.0 else ""
+        return f"loops: {info['count']} closed{refused} in {self.seconds:.1f} s; {moved}{wider}"
 
 
 def close_loops(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -232,6 +234,31 @@ def test_loops_take_the_drift_away_and_a_false_one_is_refused() -> None:
     fooled = closed(graph, [*loops, false], 0.0)
     assert fooled.refused == (*([False] * len(loops)), True)
     assert ate(fooled.state.spline, truth.spline) < 1.5 * after
+
+
+def too_sure(graph: Graph, times: float) -> Graph:
+    """Frames that think they know so many times better than they do."""
+    seen = [Seen(each.keyframe, Band(each.band.first, each.band.blocks * times**2)) for each in graph.seen]
+    ties = [replace(each, information=each.information * times**2) for each in graph.sightings]
+    return Graph(graph.at, seen, ties)
+
+
+def test_loops_that_agree_are_believed_against_a_track_that_is_too_sure_of_itself() -> None:
+    graph, truth, loops = drifted_track(np.random.default_rng(5))
+    fair = ate(closed(graph, loops, 0.0).state.spline, truth.spline)
+    found = closed(too_sure(graph, 30.0), loops, 0.0)
+    assert found.spread > 1.0 and sum(found.refused) <= len(loops) / 4
+    assert ate(found.state.spline, truth.spline) < min(2.0 * fair, ate(graph.at.spline, truth.spline) / 2)
+
+
+def test_where_all_loops_are_refused_nothing_moves() -> None:
+    """Three loops are too few to blame the track."""
+    graph, _, loops = drifted_track(np.random.default_rng(5))
+    sure = too_sure(graph, 30.0)
+    found = closed(sure, loops[:3], 0.0)
+    assert found.refused == (True, True, True) and found.spread == 1.0 and found.closed == 0
+    before = sure.at.spline.control_points
+    np.testing.assert_allclose(found.state.spline.control_points, before, rtol=0, atol=1e-12)
 
 
 def test_a_keyframe_goes_with_its_part_of_the_spline() -> None:
