@@ -22,7 +22,6 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.adjustment.chain import Chain
 from rstrack.adjustment.graph import Seen
-from rstrack.alignment import brightness
 from rstrack.alignment.independence import Independence
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.observation import Observation, observe
@@ -37,6 +36,7 @@ from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.keyframes.store import KeyframeStore
 from rstrack.options import Options
 from rstrack.tracking.frame_report import FrameReport, frame_report
+from rstrack.tracking.gains import Gains
 from rstrack.tracking.lost_track import FitHistory, implausible, is_settled
 from rstrack.tracking.relocalise import Relocaliser, without_misfits
 from rstrack.tracking.uncertainty import Uncertainty
@@ -79,9 +79,7 @@ class Tracker:
         self._uncertainty = Uncertainty()
         self._covariances: dict[int, tuple[int, FloatArray]] = {}
         self._pixels = 0
-        # Gain and offset against the first colour image, of the recent frames, and the newest colour image's moments.
-        self._brightness: dict[int, FloatArray] = {}
-        self._moments: FloatArray | None = None
+        self._gains = Gains()
         # The newest frame, while it is the reference and cannot be rectified yet.
         self._unconverged: DeviceFrame | None = None
         self._stamps: list[float] = []
@@ -411,7 +409,7 @@ class Tracker:
         if self.options.keyframe_strategy == "newest" and new.depth.exposure.lens.lines > 1:
             if not self._unfit(new):
                 rolling = self._maker.rolling(new.index, new.depth, new.colors, window.spline)
-                self._reference = replace(rolling, brightness=self._brightness.get(new.index, brightness.SAME))
+                self._reference = replace(rolling, brightness=self._gains.of(new))
                 self._unconverged, self._pixels = new, 0
             return False
         old = self._keyframes.return_to(window.spline.pose(frozen.depth.exposure.mid_time), ref)
@@ -429,8 +427,7 @@ class Tracker:
 
     def _new_keyframe(self, frame: DeviceFrame, older: Reference | None) -> Reference:
         assert self._window is not None
-        bright = self._brightness.get(frame.index, brightness.SAME)
-        self._reference = self._keyframes.make(frame, self._window.spline, older, bright)
+        self._reference = self._keyframes.make(frame, self._window.spline, older, self._gains.of(frame))
         if frame.index in self._covariances:
             before, pose = self._covariances[frame.index]
             T_world_depth = self._reference.T_world_base
@@ -455,11 +452,7 @@ class Tracker:
         expected (2,): gain and offset of its colours; by default about as before.
         """
         if expected is None:
-            before = self._brightness.get(frame.index)
-            if before is None and frame.colors and self._brightness and self._moments is not None:
-                newest = self._brightness[max(self._brightness)]
-                before = brightness.expected(newest, frame.colors[0].moments, self._moments)
-            expected = brightness.SAME if before is None else brightness.relative(before, ref.brightness)
+            expected = self._gains.expected(frame, ref)
         observations = observe(frame, ref, self.options, expected)
         for o in observations:
             o.independent = 1.0 / self._independence[not o.is_depth].inflation
@@ -468,19 +461,12 @@ class Tracker:
     def _placed(self, new: DeviceFrame, fresh: Sequence[Observation] = (), joined: bool = True) -> None:
         """A frame has been found: its stamp, its brightness, and until when the spline is known."""
         self._stamps.append(new.stamp)
-        if new.colors:
-            color = next((o for o in fresh if not o.is_depth), None)
-            found = brightness.SAME
-            if color is not None and self._window is not None:
-                own = color.brightness(self._window.state)
-                found = brightness.absolute(own, color.ref.brightness)
-            oldest = self._recent[0].index if self._recent else new.index
-            self._brightness = {k: b for k, b in self._brightness.items() if k >= oldest} | {new.index: found}
-            self._moments = new.colors[0].moments
-        if self._reference is not None and self._reference.rolling is None:
-            oldest = self._recent[0].index if self._recent else new.index
+        window, ref = self._known()
+        oldest = self._recent[0].index if self._recent else new.index
+        self._gains.learn(new, fresh, window.state, oldest)
+        if ref.rolling is None:
             kept = {k: c for k, c in self._covariances.items() if k >= oldest}
-            self._covariances = kept | {new.index: (self._reference.index, self._covariance(self._reference))}
+            self._covariances = kept | {new.index: (ref.index, self._covariance(ref))}
         begin = min(new.first_time, new.stamp)
         if joined and self.spline_valid:
             begin = self.spline_valid.pop()[0]
