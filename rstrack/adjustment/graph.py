@@ -20,10 +20,10 @@ from rsgen.array_types import FloatArray, IntArray
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.adjustment.band import Band
+from rstrack.alignment.priors import ACCELERATION
 
-# σ of accelerations, m/s² and rad/s², as the tracker has them. They decide where nothing else does: in gaps, and in
-# what a wall leaves open. The first and last control points, which hardly any line tells of, are held tighter.
-_ACCELERATION = np.array([5.0, 5.0, 5.0, 10.0, 10.0, 10.0])
+# The motion prior decides where nothing else does: in gaps, and in what a wall leaves open. The first and last control
+# points, which hardly any line tells of, are held tighter.
 _END_TRIPLES, _END_FACTOR = 2, 0.1
 # Information that holds the first control point, in m⁻² and rad⁻²: the gauge.
 _HELD = 1e14
@@ -171,7 +171,7 @@ class _System:
         """Small changes of the accelerations that the spline had before."""
         gains, omega = spline.left_gains, spline.increments - before.increments
         r = omega[1:] - omega[:-1]
-        sigma = np.repeat(_ACCELERATION[None] * spline.dt**2, len(r), axis=0)
+        sigma = np.repeat(ACCELERATION[None] * spline.dt**2, len(r), axis=0)
         sigma[:_END_TRIPLES] *= _END_FACTOR
         sigma[-_END_TRIPLES:] *= _END_FACTOR
         inverse = 1.0 / sigma[:, None, None] ** 2

@@ -16,10 +16,8 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
+from rstrack.alignment.priors import ACCELERATION, VELOCITY
 
-# σ of accelerations, m/s² and rad/s² (the motion prior's), and of velocities where nothing is known, m/s and rad/s.
-_ACCELERATION = np.array([5.0, 5.0, 5.0, 10.0, 10.0, 10.0])
-_VELOCITY = np.array([1.5, 1.5, 1.5, 3.0, 3.0, 3.0])
 # Systematic error of a pose in pixels of the depth camera, σ: steps not taken to the end, interpolation, knots.
 # Measured on hand-held renderings with noise (docs/measured.md).
 SYSTEMATIC_PX = 0.01
@@ -67,7 +65,7 @@ class Uncertainty:
         F = np.eye(12)
         F[:6, 6:] = seconds * np.eye(6)
         gain = np.concatenate([0.5 * seconds**2 * np.eye(6), seconds * np.eye(6)])
-        predicted = F @ self.state @ F.T + gain @ np.diag(_ACCELERATION**2) @ gain.T
+        predicted = F @ self.state @ F.T + gain @ np.diag(ACCELERATION**2) @ gain.T
         # P − P E (H⁻¹ + Eᵀ P E)⁻¹ Eᵀ P without the inverse of H, which may be singular.
         solved = np.linalg.solve(np.eye(6) + seen @ predicted[:6, :6], seen)
         updated = predicted - predicted[:, :6] @ solved @ predicted[:6]
@@ -76,7 +74,7 @@ class Uncertainty:
     @classmethod
     def of_first(cls) -> Uncertainty:
         """Of the frame that the world is taken from, which may move."""
-        return cls(np.diag(np.concatenate([np.zeros(6), _VELOCITY]) ** 2))
+        return cls(np.diag(np.concatenate([np.zeros(6), VELOCITY]) ** 2))
 
     def found_anew(self, seen: FloatArray) -> Uncertainty:
         """Of a frame of which nothing is known but what its images (6, 6) say."""
@@ -95,4 +93,4 @@ class Uncertainty:
 
 
 def _lost() -> FloatArray:
-    return np.diag(np.concatenate([_NOWHERE, _VELOCITY]) ** 2)
+    return np.diag(np.concatenate([_NOWHERE, VELOCITY]) ** 2)

@@ -11,18 +11,21 @@ from rsgen.geometry.spline import Spline
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Problem, Solved, optimise
-from rstrack.alignment.priors import Prior, acceleration_prior, pose_constraint, velocity_prior
+from rstrack.alignment.priors import (
+    ACCELERATION,
+    VELOCITY,
+    Prior,
+    acceleration_prior,
+    pose_constraint,
+    velocity_prior,
+)
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference
 
-# Motion prior: standard deviation of accelerations, m/s² and rad/s². Hand-held cameras reach 35 m/s² (DESIGN section
-# 5), so it says little where there are data. The newest control points, whose weight in the newest lines is only u³/6,
-# are held a good deal tighter: small systematic errors of the lines would throw them about. So are a piece's first.
-_ACCELERATION = np.array([5.0, 5.0, 5.0, 10.0, 10.0, 10.0])
+# The newest control points, whose weight in the newest lines is only u³/6, are held a good deal tighter by the motion
+# prior: small systematic errors of the lines would throw them about. So are a piece's first.
 _END_TRIPLES, _END_FACTOR = 2, 0.1
-# And of velocities, m/s and rad/s, where a lost track begins anew: one frame's lines hardly tell.
-_VELOCITY = np.array([1.5, 1.5, 1.5, 3.0, 3.0, 3.0])
 # Metres and radians within which the reference's pose is held while its own control points are free.
 _GAUGE = np.full(6, 1e-6)
 # Control points that are held beyond those that are needed, and how many are released at once.
@@ -121,7 +124,7 @@ class Window:
 
     def _motion_prior(self, free: tuple[int, int]) -> Prior:
         first, last = max(self.piece, free[0] - 2), free[1]
-        sigma = np.repeat(_ACCELERATION[None] * self.state.dt**2, last - first - 2, axis=0)
+        sigma = np.repeat(ACCELERATION[None] * self.state.dt**2, last - first - 2, axis=0)
         sigma[-_END_TRIPLES:] *= _END_FACTOR
         if free[0] == self.piece:
             sigma[: max(0, min(_END_TRIPLES, len(sigma) - _END_TRIPLES))] *= _END_FACTOR
@@ -129,7 +132,7 @@ class Window:
 
     def _velocity_prior(self, free: tuple[int, int]) -> Prior:
         """What is known of the motion of a piece that has just begun."""
-        sigma = _VELOCITY * self.state.dt
+        sigma = VELOCITY * self.state.dt
         return lambda spline: velocity_prior(spline, *free, sigma)
 
 

@@ -18,6 +18,7 @@ from rstrack.adjustment.closing import closed
 from rstrack.adjustment.graph import Graph, Seen, Sighting, State
 from rstrack.adjustment.loops import Loop
 from rstrack.alignment.normal_equations import Quadratic, assemble
+from rstrack.alignment.priors import ACCELERATION
 
 
 def quadratic(rng: np.random.Generator, first: int, size: int, strength: float = 1.0) -> Quadratic:
@@ -108,7 +109,7 @@ def test_steps_end_where_least_squares_do() -> None:
             T = se3.inverse(state.keyframes[s.keyframe]) @ state.spline.pose(s.t)
             out.append(np.linalg.cholesky(s.information).T @ se3.log(se3.inverse(s.T_ref_cam) @ T))
         omega = state.spline.increments - spline.increments
-        sigma = np.repeat(graph_module._ACCELERATION[None] * spline.dt**2, len(omega) - 1, axis=0)
+        sigma = np.repeat(ACCELERATION[None] * spline.dt**2, len(omega) - 1, axis=0)
         sigma[:2] *= graph_module._END_FACTOR
         sigma[-2:] *= graph_module._END_FACTOR
         out.append(((omega[1:] - omega[:-1]) / sigma).ravel())

@@ -13,7 +13,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import BlockSums
 from rstrack.alignment.brightness import SAME
-from rstrack.alignment.priors import acceleration_prior, pose_constraint
+from rstrack.alignment.priors import ACCELERATION, acceleration_prior, pose_constraint
 from rstrack.alignment.student_t import scale_step
 from rstrack.calibration.pairs.images import Lines, Taken, lines_of
 from rstrack.calibration.pairs.optics import Optics
@@ -21,9 +21,8 @@ from rstrack.calibration.pairs.surfaces import Surface
 from rstrack.calibration.pairs.terms import FLOOR_DEPTH, FLOOR_INTENSITY, PairTerms
 from rstrack.calibration.unknowns.parameters import COUNT, POSES, Parameters
 
-# σ of accelerations (m/s², rad/s²): the tracker's, see `tracking.window`; the ends, which few lines touch, are held
-# more tightly.
-_ACCELERATION = np.array([15.0, 15.0, 15.0, 30.0, 30.0, 30.0])
+# σ of accelerations (m/s², rad/s²), looser than the tracker's; the ends, which few lines touch, are held more tightly.
+_ACCELERATION = 3.0 * ACCELERATION
 _ENDS, _END_FACTOR = 2, 0.1
 _GAUGE = np.full(6, 1e-6)
 # Frames between those that are compared: near ones tell the clocks, far ones the extrinsics.
