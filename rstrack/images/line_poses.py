@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
@@ -62,16 +64,44 @@ def _line_blocks(lens: Lens) -> tuple[FloatArray, npt.NDArray[np.intp], FloatArr
     return middle, block, (at_zero.times() - middle[block])[:, None]
 
 
-@lru_cache(maxsize=64)
-def _line_motion(spline: Spline, lens: Lens, stamp: float) -> tuple[FloatArray, FloatArray]:
-    """Remembered: both terms ask for the same."""
-    middle, block, dt = _line_blocks(lens)
-    T, twist = spline.pose_and_velocity(stamp + middle)
+# Of splines' images, as long as the spline is there: both terms ask for the same.
+_motions: WeakKeyDictionary[Spline, dict[tuple[Lens, float], tuple[FloatArray, FloatArray]]] = WeakKeyDictionary()
+
+
+def prepare(spline: Spline, exposures: Iterable[Exposure]) -> None:
+    """Work out `line_motion` of several images at once: a call costs more than the numbers do."""
+    known = _motions.setdefault(spline, {})
+    new = list(dict.fromkeys((x.lens, x.stamp) for x in exposures if (x.lens, x.stamp) not in known))
+    if not new:
+        return
+    nodes = [_line_blocks(lens) for lens, _ in new]
+    times = np.concatenate([stamp + middle for (_, stamp), (middle, _, _) in zip(new, nodes, strict=True)])
+    T, twist = spline.pose_and_velocity(times)
+    at, rates, lines = 0, [], []
+    for middle, block, _ in nodes:
+        rates.append(_rate(middle, twist[at : at + len(middle)]))
+        lines.append(at + block)
+        at += len(middle)
+    poses, twists = _moved(
+        T, twist, np.concatenate(rates), np.concatenate(lines), np.concatenate([n[2] for n in nodes])
+    )
+    ends = np.cumsum([len(block) for block in lines])[:-1]
+    known.update(zip(new, zip(np.split(poses, ends), np.split(twists, ends), strict=True), strict=True))
+
+
+def _rate(middle: FloatArray, twist: FloatArray) -> FloatArray:
+    """Change per second (n, 6) of the twists (n, 6) of blocks with their middles at these times (n,)."""
     if len(middle) == 1:
-        return T[block], twist[block]
+        return np.zeros_like(twist)
     # Central differences; a block's twist and the next one's are as far apart as their times.
     slope = (twist[1:] - twist[:-1]) / (middle[1:] - middle[:-1])[:, None]
-    rate = np.concatenate([slope[:1], 0.5 * (slope[1:] + slope[:-1]), slope[-1:]])
+    return np.concatenate([slope[:1], 0.5 * (slope[1:] + slope[:-1]), slope[-1:]])
+
+
+def _moved(
+    T: FloatArray, twist: FloatArray, rate: FloatArray, block: npt.NDArray[np.intp], dt: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Poses and twists of lines that are dt (n, 1) s from the middle of their block."""
     change = rate[block] * dt
     moved = (twist[block] + 0.5 * change) * dt
     w = hat(moved[:, 3:])
@@ -91,7 +121,8 @@ def line_motion(spline: Spline, exposure: Exposure) -> tuple[FloatArray, FloatAr
     With a twist that changes linearly: over the quarter of a millisecond to a block's edge that is exact to nanometres.
     (A constant one is wrong by a micrometre at 35 m/s², and its velocity moves what project_rolling finds by 1e-3 px.)
     """
-    return _line_motion(spline, exposure.lens, exposure.stamp)
+    prepare(spline, [exposure])
+    return _motions[spline][exposure.lens, exposure.stamp]
 
 
 def to_base_table(spline: Spline, T_world_base: FloatArray, exposure: Exposure) -> FloatArray:

@@ -53,7 +53,7 @@ class Maker:
 class Model:
     """In place of the volume: which frames it has."""
 
-    def __init__(self, maker: Maker, voxel_m: float) -> None:
+    def __init__(self, maker: Maker, voxel_m: float, _bytes: float) -> None:
         self.maker, self.added = maker, []
 
     def add(self, depth: str, pose: np.ndarray) -> None:

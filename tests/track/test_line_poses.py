@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from rstrack_util import ENGINE, SCANS, T_COLOR_DEPTH, hand_held
@@ -11,7 +13,14 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
-from rstrack.images.line_poses import IDENTITY_FROM_BASE, Exposure, from_base_table, line_motion, to_base_table
+from rstrack.images.line_poses import (
+    IDENTITY_FROM_BASE,
+    Exposure,
+    from_base_table,
+    line_motion,
+    prepare,
+    to_base_table,
+)
 
 CAMERA = Camera(640, 480, 525.0, 520.0, 319.5, 241.0)
 STAMP = 0.45
@@ -61,6 +70,18 @@ def test_poses_are_those_of_the_spline_at_each_line(scan: Scan, height: int) -> 
         before, after = spline.pose(image.times() - h), spline.pose(image.times() + h)
         difference = se3.log(se3.inverse(before) @ after) / (2.0 * h)
         np.testing.assert_allclose(twist, difference, atol=3e-4)
+
+
+def test_images_worked_out_together_are_as_each_is_alone() -> None:
+    spline, other = hand_held(3), hand_held(3)
+    images = [exposure(scan) for scan in SCANS] + [exposure(readout_s=0.0)]
+    images += [replace(images[0], stamp=STAMP + 0.013)]
+    prepare(spline, images[:2])
+    prepare(spline, [*images, images[0]])
+    for image in images:
+        for together, alone in zip(line_motion(spline, image), line_motion(other, image), strict=True):
+            np.testing.assert_allclose(together, alone, rtol=0, atol=1e-14)
+    assert spline is not other and len({id(line_motion(spline, image)) for image in images}) == len(images)
 
 
 def test_a_hand_that_jerks_costs_nanometres_where_a_constant_twist_costs_a_micrometre() -> None:
