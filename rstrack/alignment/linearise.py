@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -27,7 +27,7 @@ from rstrack.alignment.residuals import (
 )
 from rstrack.alignment.student_t import scale_step
 from rstrack.images.device_frame import DeviceRig, Timer, untimed
-from rstrack.images.line_poses import IDENTITY_FROM_BASE, Exposure, from_base_table, to_base_table
+from rstrack.images.line_poses import IDENTITY_FROM_BASE, Exposure, from_base_table, prepare, to_base_table
 from rstrack.images.pyramid import ColorImage, DepthImage
 from rstrack.keyframes.keyframe import Points, Reference, pyramid_level, strides
 from rstrack.options import Options
@@ -112,6 +112,11 @@ class Terms:
             device.e, device.device_rays, blur_sigma_px=options.blur_sigma_px, counts_rough=not options.photometric,
             timer=device.timer,
         )  # fmt: skip
+
+    def expect(self, spline: Spline, images: Sequence[DepthImage | ColorImage]) -> None:
+        """These images are linearised next, at this spline: their lines' poses are worked out together."""
+        with self.timer("poses of lines"):
+            prepare(spline, [image.exposure for image in images])
 
     def geometric(
         self, image: DepthImage, ref: Reference, spline: Spline, level: int, sigma: float,

@@ -18,7 +18,6 @@ from rstrack.alignment.normal_equations import assemble, solve
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.priors import Prior
 from rstrack.alignment.spline_state import SplineState
-from rstrack.images.line_poses import prepare
 
 # A step that moves no line further is the last one, at the coarse levels and at the finest (pixels).
 STOP_PX = (0.02, 0.1, 0.3)
@@ -162,8 +161,7 @@ def _linearise(terms: Terms, state: SplineState, problem: Problem, level: int) -
     tolerance = RELINEARISE_PX * (1 + 4 * level) if level else _tolerance(problem)
     fresh = [o for o in problem.fresh if not o.is_linearised or _has_moved(o, state, problem.focal, tolerance)]
     settled = [o for o in problem.settled if level == 0 and _has_moved(o, state, problem.focal, tolerance)]
-    with terms.timer("poses of lines"):
-        prepare(state.spline, [o.image.exposure for o in (*fresh, *settled)])
+    terms.expect(state.spline, [o.image for o in (*fresh, *settled)])
     for finish in [o.start(terms, state, level) for o in (*fresh, *settled)]:
         finish()
     return len(fresh) + len(settled)

@@ -26,9 +26,10 @@ from rstrack.tracking.window import LEVELS, Window
 
 # Keyframes at which a lost frame is looked for, at once.
 _PLACES = 3
-# Part of the pixels that must fit where a place is recognised by depth though the colours say otherwise, and how well
-# depth must tell all motions there (see `FrameReport.observability`): one wall fits another.
-_SURE_FIT, _SURE_SEEN = 0.9, 2e-3
+# Part of the pixels that must fit where a place is recognised by one image though the others say otherwise. How well
+# depth alone must tell all motions (see `FrameReport.observability`), since one wall fits another: less where pixels
+# are larger than those of this focal length, by the square of their size, since corners count the less there.
+_SURE_FIT, _SURE_SEEN, _FINE_FOCAL = 0.9, 2e-3, 240.0
 
 
 @dataclass(frozen=True)
@@ -127,17 +128,18 @@ class Relocaliser:
         pulled = pulls(fresh, trial.state)
         uncertainty = before.found_anew(pulled.information)
         # Depth alone is much alike in many places.
-        is_sure = len(fresh) > 1 or not (new.colors and ref.points) or _is_sure(fresh[0])
+        is_sure = len(fresh) > 1 or _is_sure(fresh[0], denied=bool(new.colors and ref.points))
         if self._fits.fault(fresh, solved, ref.pixels, pulled) or not (is_sure and uncertainty.is_known):
             return None
         return Found(trial, fresh, solved, ref, uncertainty)
 
 
-def _is_sure(alone: Observation) -> bool:
-    """Whether an image tells the place without the others."""
-    if not alone.is_linearised or alone.lin.fit < _SURE_FIT:
+def _is_sure(alone: Observation, denied: bool) -> bool:
+    """Whether an image tells the place without others; denied: there are some, and they say otherwise."""
+    if not alone.is_linearised or (denied and alone.lin.fit < _SURE_FIT):
         return False
-    return not alone.is_depth or alone.lin.observability >= _SURE_SEEN
+    finer = min(1.0, alone.ref.lens.camera.fx / _FINE_FOCAL)
+    return not alone.is_depth or alone.lin.observability >= _SURE_SEEN * finer**2
 
 
 def without_misfits(

@@ -50,6 +50,9 @@ class PoseTerms:
         self.visible_asked += 1
         return "some"
 
+    def expect(self, *_: object) -> None:
+        """Nothing to work out beforehand."""
+
     def photometric(
         self, image: Any, ref: Any, spline: Spline, level: int, sigma: float, slopes_at: Spline, visible: Any = None,
         *_: Any,

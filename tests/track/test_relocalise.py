@@ -13,7 +13,7 @@ from rsgen.geometry import se3
 from rstrack.alignment.optimizer import Solved
 from rstrack.images.pyramid import DepthImage
 from rstrack.tracking.lost_track import FitHistory
-from rstrack.tracking.relocalise import Found, Relocaliser, without_misfits
+from rstrack.tracking.relocalise import Found, Relocaliser, _is_sure, without_misfits
 from rstrack.tracking.uncertainty import Uncertainty
 
 REF: Any = SimpleNamespace(pixels=5000, T_world_base=np.eye(4), median_depth=1.0)
@@ -94,3 +94,20 @@ def test_a_jump_that_is_not_confirmed_is_none(second: np.ndarray | None) -> None
 
 def test_given_time_a_camera_may_be_anywhere() -> None:
     assert looked(Sees([away(2.0)]), 1.1)
+
+
+@pytest.mark.parametrize("denied", [False, True])
+@pytest.mark.parametrize("fx", [525.0, 240.0, 120.0])
+def test_depth_alone_tells_a_place_only_where_it_sees_all_motions(denied: bool, fx: float) -> None:
+    """One wall fits another: an iPhone's depth was found 1.5 m and 180 degrees off with an observability of 2.6e-4."""
+
+    def alone(observability: float, fit: float = 0.95, is_depth: bool = True) -> Any:
+        lin = SimpleNamespace(observability=observability, fit=fit)
+        ref = SimpleNamespace(lens=SimpleNamespace(camera=SimpleNamespace(fx=fx)))
+        return SimpleNamespace(lin=lin, ref=ref, is_depth=is_depth, is_linearised=True)
+
+    limit = 2e-3 * min(1.0, fx / 240.0) ** 2
+    assert _is_sure(alone(1.01 * limit), denied) and not _is_sure(alone(0.99 * limit), denied)
+    assert _is_sure(alone(1.01 * limit, fit=0.8), denied) != denied  # what colours deny has to fit well besides
+    assert _is_sure(alone(1e-9, is_depth=False), denied)
+    assert not _is_sure(SimpleNamespace(is_linearised=False), denied)  # type: ignore[arg-type]
