@@ -64,7 +64,9 @@ def _line_blocks(lens: Lens) -> tuple[FloatArray, npt.NDArray[np.intp], FloatArr
     return middle, block, (at_zero.times() - middle[block])[:, None]
 
 
-# Of splines' images, as long as the spline is there: both terms ask for the same.
+# Of a spline's last images, as long as the spline is there: both terms ask for the same. A whole recording is mapped
+# along one spline.
+_REMEMBERED = 64
 _motions: WeakKeyDictionary[Spline, dict[tuple[Lens, float], tuple[FloatArray, FloatArray]]] = WeakKeyDictionary()
 
 
@@ -86,6 +88,8 @@ def prepare(spline: Spline, exposures: Iterable[Exposure]) -> None:
         T, twist, np.concatenate(rates), np.concatenate(lines), np.concatenate([n[2] for n in nodes])
     )
     ends = np.cumsum([len(block) for block in lines])[:-1]
+    for oldest in list(known)[: max(0, len(known) + len(new) - _REMEMBERED)]:
+        del known[oldest]
     known.update(zip(new, zip(np.split(poses, ends), np.split(twists, ends), strict=True), strict=True))
 
 

@@ -62,7 +62,7 @@ class Closing:
         """For run.json."""
         refused = () if self.closed is None else self.closed.refused
         return {
-            "count": len(self.loops) - sum(refused),
+            "count": 0 if self.closed is None else self.closed.closed,
             "refused": sum(refused),
             "track_errors_widened": None if self.closed is None else self.closed.spread,
             "tried": self.tried,

@@ -13,6 +13,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
+from rstrack.images import line_poses
 from rstrack.images.line_poses import (
     IDENTITY_FROM_BASE,
     Exposure,
@@ -82,6 +83,17 @@ def test_images_worked_out_together_are_as_each_is_alone() -> None:
         for together, alone in zip(line_motion(spline, image), line_motion(other, image), strict=True):
             np.testing.assert_allclose(together, alone, rtol=0, atol=1e-14)
     assert spline is not other and len({id(line_motion(spline, image)) for image in images}) == len(images)
+
+
+def test_a_whole_recording_along_one_spline_is_not_remembered() -> None:
+    spline, image = hand_held(2), exposure()
+    first, _ = line_motion(spline, image)
+    for k in range(3 * line_poses._REMEMBERED):
+        line_motion(spline, replace(image, stamp=STAMP + 1e-4 * (k + 1)))
+    assert len(line_poses._motions[spline]) == line_poses._REMEMBERED
+    again, _ = line_motion(spline, image)
+    assert again is not first
+    np.testing.assert_array_equal(again, first)
 
 
 def test_a_hand_that_jerks_costs_nanometres_where_a_constant_twist_costs_a_micrometre() -> None:
