@@ -22,7 +22,7 @@ Strategy = Literal["converged", "newest"]
 STRATEGIES: tuple[str, ...] = get_args(Strategy)
 Source = Literal["keyframe", "model"]
 SOURCES: tuple[str, ...] = get_args(Source)
-Loops = Literal["off", "end"]
+Loops = Literal["off", "online", "end"]
 LOOPS: tuple[str, ...] = get_args(Loops)
 
 
@@ -71,8 +71,9 @@ class Options:
     voxel_m: Annotated[float, "voxels of that volume, m"] = 0.01
     loops: Annotated[
         Loops | None,
-        "end: places that the camera has come back to are looked for at the end of the recording, and the whole spline "
-        "is corrected (default: end with 'rstrack track', off in benchmarks and live)",
+        "places that the camera has come back to are looked for, and the whole spline is corrected: end when the "
+        "recording has ended, online whenever a keyframe is complete (default: end with 'rstrack track', off in "
+        "benchmarks and live)",
     ] = None
     memory_gb: Annotated[
         float,

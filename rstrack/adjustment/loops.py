@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
@@ -63,8 +63,9 @@ class Loop:
 class LoopSearch:
     """Looks for loops of a track. load: a frame on the device by its number.
 
-    motion: T_world_cam(t) of the track. drift: covariances of keyframes' poses, as in `Uncertainty`. inflations: as in
-    `align`. tried, faults: pairs that were aligned, and why some are none.
+    motion: T_world_cam(t) of the track. poses: T_world_base (4, 4) of keyframes, where they are better known than the
+    archive has them. drift: covariances of keyframes' poses, as in `Uncertainty`. inflations: as in `align`. tried,
+    faults: pairs that were aligned, and why some are none.
     """
 
     terms: Terms
@@ -76,6 +77,7 @@ class LoopSearch:
     drift: dict[int, FloatArray]
     usual: Usual
     inflations: tuple[float, float] = (1.0, 1.0)
+    poses: Mapping[int, FloatArray] = field(default_factory=dict)
     tried: int = 0
     faults: Counter[str] = field(default_factory=Counter)
     _references: OrderedDict[int, Reference] = field(default_factory=OrderedDict)
@@ -83,8 +85,7 @@ class LoopSearch:
     def find(self, progress: Progress = no_progress) -> list[Loop]:
         """All loops among the keyframes."""
         order = sorted(self.archive.indices)
-        T = {k: self.archive.pose(k) for k in order}
-        way = _ways([T[k] for k in order])
+        T, way = self._track(order)
         number = {k: n for n, k in enumerate(order)}
         halves: dict[int, list[tuple[int, Alignment]]] = {}
         for n, late in enumerate(order):
@@ -108,9 +109,39 @@ class LoopSearch:
             progress("loops", 0.7 + 0.3 * (n + 1) / len(halves), f"{len(loops)} loops")
         return loops
 
+    def find_of(self, late: int) -> list[Loop]:
+        """Loops from one keyframe to those before it."""
+        order = sorted(k for k in self.archive.indices if k <= late)
+        T, way = self._track(order)
+        n = len(order) - 1
+        frame = self.load(late)
+        loops = []
+        for m in self._candidates(frame, n, order, T, way):
+            early = order[m]
+            allowed = self._allowed(early, late, way[n] - way[m])
+            loop = self._pair(frame, early, late, se3.inverse(T[early]) @ T[late], allowed)
+            if loop is not None:
+                loops.append(loop)
+        return loops
+
+    def _track(self, order: list[int]) -> tuple[dict[int, FloatArray], FloatArray]:
+        """Keyframes' poses, and metres and radians (n, 2) from the first to each along the way."""
+        T = {k: self.pose(k) for k in order}
+        return T, _ways([T[k] for k in order])
+
+    def pose(self, keyframe: int) -> FloatArray:
+        """T_world_base (4, 4)."""
+        known = self.poses.get(keyframe)
+        return self.archive.pose(keyframe) if known is None else known
+
     def pair(self, early: int, late: int, T_early_late: FloatArray, allowed: FloatArray) -> Loop | None:
         """Whether two keyframes see one place, at T_early_late (4, 4) from each other, up to metres and radians."""
-        there = self._aligned(self.load(late), early, T_early_late, allowed)
+        return self._pair(self.load(late), early, late, T_early_late, allowed)
+
+    def _pair(
+        self, frame: DeviceFrame, early: int, late: int, T_early_late: FloatArray, allowed: FloatArray
+    ) -> Loop | None:  # fmt: skip
+        there = self._aligned(frame, early, T_early_late, allowed)
         back = None if there is None else self._aligned(self.load(early), late, se3.inverse(T_early_late), allowed)
         return None if there is None or back is None else self._loop(early, late, there, back)
 
@@ -142,7 +173,7 @@ class LoopSearch:
         """Metres and radians by which a track may be off between two keyframes; way (2,): metres and radians since."""
         nothing = np.zeros((6, 6))
         spread = self.drift.get(late, nothing) - self.drift.get(early, nothing)
-        T_late = self.archive.pose(late)
+        T_late = self.pose(late)
         Ad = se3.adjoint(se3.inverse(T_late))
         own = Ad @ spread @ Ad.T
         sigma = np.sqrt(np.abs([np.trace(own[:3, :3]), np.trace(own[3:, 3:])]))

@@ -6,7 +6,7 @@ print(loop_quality(dataset, Options(), frames=slice(None), alike=200).text())
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -78,7 +78,7 @@ def loop_quality(
     if not isinstance(truth, Spline):
         raise UserError(f"{dataset.root}: has no true spline to compare loops with: give a sequence of rsgen's")
     chosen = range(len(dataset))[frames]
-    tracker = make_tracker(dataset.rig, options)
+    tracker = make_tracker(dataset.rig, replace(options, loops="off"))
     if not isinstance(tracker, Tracker) or not len(chosen):
         raise UserError(
             f"{dataset.root}: has no frame {frames.start}" if not len(chosen) else "baseline: has no spline"

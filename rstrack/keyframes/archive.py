@@ -60,6 +60,9 @@ class Archive:
     def __len__(self) -> int:
         return len(self._kept)
 
+    def __contains__(self, index: int) -> bool:
+        return index in self._kept
+
     def __getstate__(self) -> dict[str, Any]:
         """For a checkpoint: images that are in files stay there."""
         kept = {k: each if each.file is None else replace(each, images=None) for k, each in self._kept.items()}

@@ -21,6 +21,7 @@ from rsgen.errors import UserError
 from rsgen.files import atomic_write, write_error
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import INFO
+from rstrack.tracking.loop_tracker import LoopTracker
 from rstrack.tracking.spline_tracker import Tracker
 
 FOLDER = "checkpoint"
@@ -59,7 +60,7 @@ def checkpoint_of(
 
     noise: what is added to the images, by name.
     """
-    if not isinstance(tracker, Tracker):
+    if not isinstance(tracker, Tracker | LoopTracker):
         return None
     rig, options = dataset.rig, tracker.options
     depth, color = (rig.depth_camera, rig.depth_shutter), (rig.color_camera, rig.color_shutter)
@@ -82,7 +83,7 @@ class Checkpoint:
     """
 
     root: Path
-    tracker: Tracker
+    tracker: Tracker | LoopTracker
     key: Mapping[str, Any]
     problem: str = ""
     _due: float = field(default_factory=lambda: time.monotonic() + _EVERY_S)
@@ -153,7 +154,7 @@ class Checkpoint:
 
 
 class _Writer(pickle.Pickler):
-    def __init__(self, stream: io.BytesIO, tracker: Tracker) -> None:
+    def __init__(self, stream: io.BytesIO, tracker: Tracker | LoopTracker) -> None:
         super().__init__(stream, protocol=5)
         self._names = {id(part): name for name, part in _shared(tracker).items()}
         self._arrays = _array_types(tracker.engine)
@@ -168,7 +169,7 @@ class _Writer(pickle.Pickler):
 
 
 class _Reader(pickle.Unpickler):
-    def __init__(self, stream: io.BytesIO, tracker: Tracker) -> None:
+    def __init__(self, stream: io.BytesIO, tracker: Tracker | LoopTracker) -> None:
         super().__init__(stream)
         self._parts, self._engine = _shared(tracker), tracker.engine
 
@@ -195,7 +196,7 @@ class _Array:
     """Stands for a device array of a kind."""
 
 
-def _shared(tracker: Tracker) -> dict[str, Any]:
+def _shared(tracker: Tracker | LoopTracker) -> dict[str, Any]:
     return {"tracker": tracker} | tracker.shared
 
 

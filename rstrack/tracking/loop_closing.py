@@ -2,7 +2,7 @@
 
 stamps, T_world_depth = tracker.trajectory
 closing = close_loops(tracker, load)
-T_world_depth = closing.poses(tracker.spline, stamps, T_world_depth)
+T_world_depth = closing.moves.poses(tracker.spline, stamps, T_world_depth)
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.adjustment.closing import Closed, closed
 from rstrack.adjustment.graph import Graph, Sighting, State
 from rstrack.adjustment.loops import Loop, LoopSearch
+from rstrack.adjustment.moves import Moves
 from rstrack.adjustment.rigid import Usual
 from rstrack.data.rig import Frame
 from rstrack.keyframes.archive import Archive
@@ -36,7 +37,8 @@ _LISTED = 1000
 class Closing:
     """What became of it. closed: None where there is nothing to close; seconds: that it took.
 
-    tried: alignments of pairs; faults: why some were none, and how often. problem: why it could not be done.
+    tried: alignments of pairs; faults: why some were none, and how often. problem: why it could not be done, or not for
+    all. moves: by what the track is corrected.
     """
 
     loops: list[Loop]
@@ -45,18 +47,7 @@ class Closing:
     tried: int = 0
     faults: Mapping[str, int] = field(default_factory=dict)
     problem: str = ""
-
-    @property
-    def spline(self) -> Spline | None:
-        """The corrected one, if there is any."""
-        return None if self.closed is None else self.closed.state.spline
-
-    def poses(self, online: Spline, stamps: FloatArray, T_world_depth: FloatArray) -> FloatArray:
-        """Poses (n, 4, 4) of a track, moved as its spline is; `online` as it was."""
-        if self.spline is None:
-            return T_world_depth
-        moved = self.spline.pose(stamps) @ se3.inverse(online.pose(stamps))
-        return se3.orthonormalise(moved @ T_world_depth)
+    moves: Moves | None = None
 
     def info(self) -> dict[str, Any]:
         """For run.json."""
@@ -76,16 +67,15 @@ class Closing:
 
     def text(self, moved_m: float) -> str:
         """A summary of one line. moved_m: the furthest that a pose was moved."""
-        if self.problem:
-            return f"loops: not closed: {self.problem}"
         if self.closed is None:
-            return f"loops: none found ({self.seconds:.1f} s)"
+            return f"loops: not closed: {self.problem}" if self.problem else f"loops: none found ({self.seconds:.1f} s)"
         info = self.info()
         refused = f", {info['refused']} refused" if info["refused"] else ""
         moved = f"poses moved by up to {1e3 * moved_m:.2f} mm"
         spread = self.closed.spread
         wider = f"; they say that the track's errors are about {spread:g} times what it thinks" if spread > 1.0 else ""
-        return f"loops: {info['count']} closed{refused} in {self.seconds:.1f} s; {moved}{wider}"
+        problem = f"; not all were looked for: {self.problem}" if self.problem else ""
+        return f"loops: {info['count']} closed{refused} in {self.seconds:.1f} s; {moved}{wider}{problem}"
 
 
 def close_loops(
@@ -103,21 +93,26 @@ def close_loops(
     search = search_of(tracker, keyframes, spline, load)
     loops: list[Loop] = []
     result: Closed | None = None
+    moves: Moves | None = None
     problem = ""
     try:
         loops = search.find(progress)
         if loops:
             result = closed(graph_of(tracker, keyframes), loops, float(tracker.trajectory[0][0]), progress)
+            moves = Moves.between(spline, result.state.spline)
     except (UserError, np.linalg.LinAlgError) as error:
         problem = str(error)
-    return Closing(loops, result, time.perf_counter() - begin, search.tried, search.faults, problem)
+    return Closing(loops, result, time.perf_counter() - begin, search.tried, search.faults, problem, moves)
 
 
-def search_of(tracker: Tracker, keyframes: Archive, spline: Spline, load: Callable[[int], Frame]) -> LoopSearch:
-    """The search for loops of a track; load: a frame by its number in the track."""
+def search_of(
+    tracker: Tracker, keyframes: Archive, spline: Spline, load: Callable[[int], Frame],
+    poses: Mapping[int, FloatArray] | None = None,
+) -> LoopSearch:  # fmt: skip
+    """The search for loops of a track; load: a frame by its number in the track; poses: as in `LoopSearch`."""
     return LoopSearch(
         tracker.terms, tracker.rig, tracker.options, keyframes, lambda k: tracker.upload(k, load(k)), spline,
-        tracker.drift, _usual(tracker, keyframes), tracker.inflations,
+        tracker.drift, _usual(tracker, keyframes), tracker.inflations, poses or {},
     )  # fmt: skip
 
 

@@ -58,14 +58,17 @@ def timings(total_s: float, seconds: Sequence[float]) -> dict[str, Any]:
     }
 
 
-def diagnostics(dataset: Dataset, used: Sequence[int], reports: Sequence[FrameReport]) -> list[dict[str, Any]]:
+def diagnostics(
+    dataset: Dataset, used: Sequence[int], reports: Sequence[FrameReport], spread: float = 1.0
+) -> list[dict[str, Any]]:
     """One dict a frame for the plots: `FrameReport`, with inliers as parts of the run's largest number too.
 
-    listed_stamp: as the recording has it, where it was tracked at another one. Of covariances the upper triangle.
+    listed_stamp: as the recording has it, where it was tracked at another one. Of covariances the upper triangle,
+    for errors `spread` times as large as the frames alone say.
     """
     frames = [dataclasses.asdict(report) for report in reports]
     for k, frame in zip(used, frames, strict=True):
-        frame |= {name: _upper(frame[name]) for name in ("covariance", "drift")}
+        frame |= {name: _upper(frame[name], spread) for name in ("covariance", "drift")}
         frame["stamp"] = float(dataset.stamps[k])
         if dataset.timing is not None:
             frame["listed_stamp"] = float(dataset.timing.depth.listed[k])
@@ -79,6 +82,6 @@ def diagnostics(dataset: Dataset, used: Sequence[int], reports: Sequence[FrameRe
     return frames
 
 
-def _upper(covariance: FloatArray | None) -> FloatArray | None:
+def _upper(covariance: FloatArray | None, spread: float) -> FloatArray | None:
     """The upper triangle (21,) of a covariance (6, 6), row by row."""
-    return None if covariance is None else covariance[np.triu_indices(6)]
+    return None if covariance is None else spread**2 * covariance[np.triu_indices(6)]

@@ -11,11 +11,10 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -29,12 +28,11 @@ from rstrack.data.estimate import Estimate, write_estimate
 from rstrack.data.noise import with_noise
 from rstrack.data.prefetch import prefetched
 from rstrack.data.rig import Frame, Rig
-from rstrack.data.timing import Timing
 from rstrack.metrics.association import Truth, compare, truth_of
-from rstrack.metrics.evaluate import Metrics
 from rstrack.metrics.run_evaluate import Evaluation, evaluate_clocks
 from rstrack.options import Options
 from rstrack.tracking.record import Noise, diagnostics, settings, timings
+from rstrack.tracking.result import End, Result, keyframes_text
 
 if TYPE_CHECKING:
     from rstrack.images.device_frame import Timer
@@ -42,22 +40,23 @@ if TYPE_CHECKING:
     from rstrack.tracking.loop_closing import Closing
 
 
-End = Literal["done", "interrupted", "broke down"]
-
 # Frames after which the error so far is shown anew, at least, and the factor by which they have grown by then: it takes
 # as long as there are frames.
 _TRUTH_EVERY, _TRUTH_GROWTH = 30, 1.05
-# Observability (see FrameReport) below which a motion is held by the prior rather than by depth.
-_WEAK = 5e-4
 # Files that mark a folder as a data set, which a run folder's spline.npz must not overwrite.
 _DATASET_FILES = ("sequence.yaml", "rgb.txt", "depth.txt", "associations.txt", "groundtruth.txt")
 
 
 class AnyTracker(Protocol):
-    """What all trackers have in common. reports: of all frames so far; options: with all that depends on the rig."""
+    """What all trackers have in common."""
 
-    reports: list[FrameReport]
-    options: Options
+    @property
+    def reports(self) -> list[FrameReport]:
+        """Of all frames so far."""
+
+    @property
+    def options(self) -> Options:
+        """With all that depends on the rig."""
 
     @property
     def keyframes(self) -> int:
@@ -79,57 +78,10 @@ class AnyTracker(Protocol):
         """Track one frame."""
 
 
-@dataclass(frozen=True)
-class Result:
-    """What a run came to.
-
-    end: why it stopped; `error` says where the tracker broke down. evaluation: None without a truth, or with too few
-    poses. lost: number of frames. unreadable: what was wrong with each image that was left out; where that was a depth
-    image, its frame was. timing: of recordings, how stamps came about.
-    """
-
-    estimate: Estimate
-    evaluation: Evaluation | None
-    end: End
-    error: str
-    lost: int
-    unreadable: tuple[str, ...] = ()
-    timing: Timing | None = None
-    loops: str = ""
-
-    @property
-    def metrics(self) -> Metrics | None:
-        """Errors with the truth's clock as it is."""
-        return None if self.evaluation is None else self.evaluation.metrics
-
-    def text(self) -> str:
-        """A summary of a few lines, with the metrics if there is a truth."""
-        info, times = self.estimate.info, self.estimate.info["timings"]
-        done, asked = len(info["frames"]), info["dataset"]["frames"][1] - info["dataset"]["frames"][0]
-        part = f"{done} frames" if done == asked else f"{done} of {asked} frames"
-        lost = f"{self.lost} lost" if self.lost else "none lost"
-        rate = done / times["total_s"]
-        lines = [
-            f"{info['method']} on {info['dataset']['name']}: {part}, {_keyframes(info['keyframes'])}, {lost}",
-            f"{times['total_s']:.1f} s, {rate:.1f} frames/s on {info['backend']}; a frame takes "
-            f"{times['median_ms']:.1f} ms (median), {times['mean_ms']:.1f} (mean), {times['p95_ms']:.1f} (95 %)",
-        ]
-        lines += [self.loops] if self.loops else []
-        weak = sum(not f["lost"] and 0.0 < f["observability"] < _WEAK for f in info["frames"])
-        if weak and info["method"] in ("rs-g", "gs-g", "baseline"):
-            lines.append(f"in {weak} of {done} frames the geometry hardly fixes all six degrees of freedom (a wall?)")
-        if self.unreadable:
-            images = "1 image" if len(self.unreadable) == 1 else f"{len(self.unreadable)} images"
-            lines.append(f"left out: {images} that cannot be read, first {self.unreadable[0]}")
-        if info.get("checkpoint_error"):
-            lines.append(f"cannot be resumed: {info['checkpoint_error']}")
-        lines += [f"assumed: {note}" for note in info["dataset"].get("notes", ())]
-        lines += [] if self.timing is None else self.timing.lines()
-        return "\n".join(lines + ([] if self.evaluation is None else ["", self.evaluation.text()]))
-
-
-def make_tracker(rig: Rig, options: Options, timer: Timer | None = None) -> AnyTracker:
-    """The tracker of options.method; `timer` watches the parts of its work.
+def make_tracker(
+    rig: Rig, options: Options, timer: Timer | None = None, load: Callable[[int], Frame] | None = None
+) -> AnyTracker:
+    """The tracker of options.method; `timer` watches the parts of its work. load: as in `LoopTracker`.
 
     Raises UserError if its backend cannot work on this machine.
     """
@@ -144,6 +96,10 @@ def make_tracker(rig: Rig, options: Options, timer: Timer | None = None) -> AnyT
         from rstrack.tracking.pose_tracker import BaselineTracker
 
         return BaselineTracker(rig, options, timer)
+    if options.loops == "online":
+        from rstrack.tracking.loop_tracker import LoopTracker
+
+        return LoopTracker(rig, options, timer, load)
     from rstrack.tracking.spline_tracker import Tracker
 
     return Tracker(rig, options, timer)
@@ -171,12 +127,6 @@ def track(
     truth = truth_of(dataset)
     if truth is not None:
         truth = dataclasses.replace(truth, frame_stamps=dataset.stamps[chosen])
-    tracker = make_tracker(dataset.rig, options)
-    from rstrack.tracking.checkpoint import Done, checkpoint_of  # these import Dr.Jit
-    from rstrack.tracking.loop_closing import close_loops
-    from rstrack.tracking.spline_tracker import Tracker
-
-    _make_folder(out)
     noise = noise or Noise()
 
     def load(k: int) -> tuple[Frame | None, tuple[str, ...]]:
@@ -185,6 +135,14 @@ def track(
             frame = with_noise(frame, k, noise.sigma_depth, noise.sigma_intensity, noise.seed)
         return frame, problems
 
+    def again(index: int) -> Frame:
+        return _readable(load(fed[index]))
+
+    tracker = make_tracker(dataset.rig, options, load=again)
+    from rstrack.tracking.checkpoint import Done, checkpoint_of  # these import Dr.Jit
+    from rstrack.tracking.loop_tracker import LoopTracker
+
+    _make_folder(out)
     checkpoint = checkpoint_of(out, dataset, chosen, tracker, dataclasses.asdict(noise))
     done = Done()
     if checkpoint is not None:
@@ -212,7 +170,7 @@ def track(
             if count >= max(told_at + _TRUTH_EVERY, _TRUTH_GROWTH * told_at) or count == len(chosen):
                 note, told_at = _error_note(truth, tracker.trajectory), count
             rate = count / (time.perf_counter() - begin)
-            progress("tracking", count / len(chosen), f"{rate:.1f} frames/s, {_keyframes(tracker.keyframes)}{note}")
+            progress("tracking", count / len(chosen), f"{rate:.1f} frames/s, {keyframes_text(tracker.keyframes)}{note}")
             done.count, done.total_s = count, time.perf_counter() - begin
             if stopped.is_set() and count < len(chosen):
                 end = "interrupted"
@@ -222,12 +180,7 @@ def track(
         del images  # ends its thread
     if not seconds:
         raise UserError(error or f"{unreadable[0][1]}; no other frame of the {len(chosen)} can be read either")
-    closing: Closing | None = None
-    if end == "done" and isinstance(tracker, Tracker) and options.loops == "end":
-        try:
-            closing = close_loops(tracker, lambda index: _readable(load(fed[index])), progress)
-        except KeyboardInterrupt:
-            end = "interrupted"
+    closing, end = _closed(tracker, again, end, progress)
     if checkpoint is not None and end == "interrupted":
         checkpoint.save(done)
     info = settings(dataset, chosen, tracker.options, noise) | {
@@ -240,13 +193,14 @@ def track(
         "loops": None if closing is None else closing.info(),
         "spline_valid": tracker.spline_valid,
         "timings": timings(time.perf_counter() - begin, seconds),
-        "frames": diagnostics(dataset, fed, tracker.reports),
+        "frames": diagnostics(dataset, fed, tracker.reports, _spread(closing)),
     }
     if closing is not None:
         info["timings"]["loops_s"] = closing.seconds
     if dataset.timing is not None:
         info["clocks"] = dataset.timing.as_dict()
-    online = Estimate(*tracker.trajectory, tracker.spline, info)
+    found = tracker.uncorrected if isinstance(tracker, LoopTracker) else tracker
+    online = Estimate(*found.trajectory, found.spline, info)
     estimate = online if closing is None else _corrected(online, closing)
     evaluation, before = _evaluation(truth, estimate), None
     info["metrics"] = None if evaluation is None else evaluation.metrics.as_dict()
@@ -275,11 +229,34 @@ def _readable(loaded: tuple[Frame | None, tuple[str, ...]]) -> Frame:
     return frame
 
 
+def _closed(
+    tracker: AnyTracker, load: Callable[[int], Frame], end: End, progress: Progress
+) -> tuple[Closing | None, End]:  # fmt: skip
+    """What became of loops, where they were asked for; how the run ends after it."""
+    from rstrack.tracking.loop_closing import close_loops
+    from rstrack.tracking.loop_tracker import LoopTracker
+    from rstrack.tracking.spline_tracker import Tracker
+
+    try:
+        if isinstance(tracker, LoopTracker):
+            return tracker.finished(progress) if end == "done" else tracker.closing, end
+        if end == "done" and isinstance(tracker, Tracker) and tracker.options.loops == "end":
+            return close_loops(tracker, load, progress), end
+    except KeyboardInterrupt:
+        return tracker.closing if isinstance(tracker, LoopTracker) else None, "interrupted"
+    return None, end
+
+
+def _spread(closing: Closing | None) -> float:
+    """By what the track's own errors were found to be larger than it thought."""
+    return 1.0 if closing is None or closing.closed is None else closing.closed.spread
+
+
 def _corrected(online: Estimate, closing: Closing) -> Estimate:
-    if closing.spline is None or online.spline is None:
+    if closing.moves is None or online.spline is None:
         return online
-    poses = closing.poses(online.spline, online.stamps, online.T_world_depth)
-    return Estimate(online.stamps, poses, closing.spline, online.info)
+    poses = closing.moves.poses(online.spline, online.stamps, online.T_world_depth)
+    return Estimate(online.stamps, poses, closing.moves.spline(online.spline), online.info)
 
 
 def _loops_text(closing: Closing, online: Estimate, estimate: Estimate, before: Evaluation | None) -> str:
@@ -336,10 +313,6 @@ def _stop_flag() -> Iterator[threading.Event]:
         yield flag
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-def _keyframes(count: int) -> str:
-    return f"{count} keyframe" + ("" if count == 1 else "s")
 
 
 def _error_note(truth: Truth | None, poses: tuple[FloatArray, FloatArray]) -> str:

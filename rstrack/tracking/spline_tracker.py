@@ -169,6 +169,21 @@ class Tracker:
         """Its kernels."""
         return self._terms
 
+    @property
+    def reference(self) -> int | None:
+        """Number of the frame whose keyframe new ones are aligned to."""
+        return None if self._reference is None else self._reference.index
+
+    @property
+    def piece(self) -> int:
+        """First control point of the current piece of the spline."""
+        return 0 if self._window is None else self._window.piece
+
+    @property
+    def pending(self) -> int:
+        """Number of the oldest frame that may still become a keyframe."""
+        return self._recent[0].index if self._recent else len(self.reports)
+
     def upload(self, index: int, frame: Frame) -> DeviceFrame:
         """A frame of the recording as it is aligned."""
         return self._device.upload(index, frame)

@@ -8,48 +8,27 @@ from typing import Any
 
 import numpy as np
 import pytest
-import synthetic
+from loop_room import FRAMES, NOISE, OPTIONS, make_dataset
 
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.adjustment.rigid import Usual, align
 from rstrack.cli.main import main
-from rstrack.data.dataset import Dataset, open_dataset
+from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import read_estimate
 from rstrack.data.rig import Frame
 from rstrack.options import Options
 from rstrack.report.build import write_report
 from rstrack.tracking import loop_closing
 from rstrack.tracking.loop_closing import close_loops
-from rstrack.tracking.run import Noise, make_tracker, track
+from rstrack.tracking.run import make_tracker, track
 from rstrack.tracking.spline_tracker import Tracker
-
-FRAMES = 30
-OPTIONS = Options(method="rs-pg", keyframe_distance=0.04, bootstrap_frames=3, backend="llvm", loops="end")
-# So noisy that it drifts.
-NOISE = Noise(4e-3, 0.02, 1)
-
-
-def to_and_fro() -> Spline:
-    """Twice there and back within a second."""
-    dt, t0 = 0.05, -0.2
-    t = t0 + dt * (np.arange(33) - 1.0)
-    swing = np.sin(2.0 * np.pi * 2.0 * t)
-    xi = np.stack([0.09 * swing, 0.02 * swing, 0.02 * np.cos(9 * t), 0.03 * swing, 0.08 * swing, 0 * t], axis=-1)
-    return Spline(se3.exp(xi), t0, dt)
 
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    root = tmp_path_factory.mktemp("loops") / "seq"
-    stream = {"readout_s": 0.02}
-    config = synthetic.make_config(width=80, height=60, color=stream, depth=stream)
-    writer = synthetic.open_writer(root, config, FRAMES, to_and_fro())
-    synthetic.write_frames(writer)
-    synthetic.write_scene(root)
-    writer.finish()
-    return open_dataset(root)
+    return make_dataset(tmp_path_factory.mktemp("loops") / "seq")
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +95,7 @@ def test_an_image_that_is_gone_costs_the_loops_not_the_track(dataset: Dataset) -
         raise UserError(f"frame {k}: is gone")
 
     closing = close_loops(tracked(dataset), gone)
-    assert closing.spline is None and "not closed: frame" in closing.text(0.0)
+    assert closing.moves is None and "not closed: frame" in closing.text(0.0)
     assert closing.info()["problem"].endswith("is gone") and closing.info()["pairs"] == []
 
 
@@ -160,7 +139,7 @@ def test_what_shows_another_place_closes_no_loop(dataset: Dataset) -> None:
     assert len(honest.loops) > 3
     wrong = close_loops(tracked(dataset), lambda k: dataset.frame((k + 7) % FRAMES))
     assert not wrong.loops and wrong.tried > 10 and sum(wrong.faults.values()) > 0.8 * wrong.tried
-    assert wrong.spline is None and "none found" in wrong.text(0.0)
+    assert wrong.moves is None and "none found" in wrong.text(0.0)
 
 
 def test_the_benchmark_tells_true_loops_from_false_ones(dataset: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
