@@ -27,7 +27,6 @@ from rstrack.alignment.linearise import Terms
 from rstrack.alignment.observation import Observation, observe
 from rstrack.alignment.optimizer import Solved
 from rstrack.alignment.pull import pulls
-from rstrack.alignment.spline_state import PointStore
 from rstrack.data.rig import Frame, Rig
 from rstrack.images.device_frame import DeviceFrame, DeviceRig, Timer, untimed
 from rstrack.keyframes.archive import Archive
@@ -35,9 +34,11 @@ from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.keyframes.store import KeyframeStore
 from rstrack.options import Options
+from rstrack.tracking.found_poses import FoundPoses
 from rstrack.tracking.frame_report import FrameReport, frame_report
 from rstrack.tracking.gains import Gains
 from rstrack.tracking.lost_track import FitHistory, implausible, is_settled
+from rstrack.tracking.pose_covariances import PoseCovariances
 from rstrack.tracking.relocalise import Relocaliser, without_misfits
 from rstrack.tracking.uncertainty import Uncertainty
 from rstrack.tracking.window import LEVELS, TRACKING_LEVELS, Window
@@ -75,21 +76,16 @@ class Tracker:
         self._independence = Independence(), Independence()  # of depth pixels, and of colour pixels
         # What all frames said of the spline.
         self._chain = Chain()
-        # Of the newest frame, and of the recent ones: keyframe and covariance against it.
-        self._uncertainty = Uncertainty()
-        self._covariances: dict[int, tuple[int, FloatArray]] = {}
+        self._covariances = PoseCovariances(rig.depth_camera.fx)
         self._pixels = 0
         self._gains = Gains()
         # The newest frame, while it is the reference and cannot be rectified yet.
         self._unconverged: DeviceFrame | None = None
-        self._stamps: list[float] = []
-        # Poses of the first of these, which nothing moves any more.
-        self._settled = PointStore()
+        self._found = FoundPoses()
         self._relocaliser = Relocaliser(rig, self.options, self._keyframes, self._fits, self._observe)
         # Frames of the current piece of the spline, and frames in a row whose colours did not fit the keyframe's.
         self._age, self._colorless = 0, 0
         self._last_fed: float | None = None
-        self.spline_valid: list[tuple[float, float]] = []
         self.reports: list[FrameReport] = []
 
     # -- what it has found ------------------------------------------------------------------------------------------
@@ -104,7 +100,12 @@ class Tracker:
         """Stamps (n,) of the frames that were not lost and T_world_depth (n, 4, 4) there."""
         if self._window is None:
             return np.zeros(0), np.zeros((0, 4, 4))
-        return np.array(self._stamps), np.concatenate([self._settled.points, self._moving_poses(len(self._stamps))])
+        return self._found.all(self._window.spline)
+
+    @property
+    def spline_valid(self) -> list[tuple[float, float]]:
+        """Times (begin, end) in s within which the spline is an estimate."""
+        return self._found.valid
 
     @property
     def keyframes(self) -> int:
@@ -156,7 +157,7 @@ class Tracker:
     @property
     def drift(self) -> dict[int, FloatArray]:
         """Covariances of the keyframes' poses, see `Uncertainty`."""
-        return self._uncertainty.drift
+        return self._covariances.uncertainty.drift
 
     @property
     def inflations(self) -> tuple[float, float]:
@@ -201,13 +202,13 @@ class Tracker:
             )
         new = self._device.upload(len(self.reports), frame)
         self._last_fed = stamp
-        if len(self._stamps) == 1 and self._recent:
+        if len(self._found.stamps) == 1 and self._recent:
             self._fit_knots(gap)
         if self._window is None:
             report = self._start(new)
         elif not self._keyframes:
             report = self._bootstrap(new)
-        elif stamp - self._stamps[-1] > _GAP_S:
+        elif stamp - self._found.stamps[-1] > _GAP_S:
             report = self._relocalise(new)
         else:
             report = self._track(new, gap)
@@ -218,7 +219,7 @@ class Tracker:
         window, ref = self._known()
         before = window.copy()
         young = window.piece > 0 and self._age < _YOUNG
-        window.predict(new, self.spline_valid[-1][1], young)
+        window.predict(new, self._found.end, young)
         on_reference = self._observe(new, ref)
         anchor = self._keyframes.anchor
         fresh = on_reference + ([] if anchor is None else self._observe(new, anchor))
@@ -234,21 +235,20 @@ class Tracker:
         fitting = without_misfits(self._fits, fresh, on_reference, ref)
         if len(fitting) < len(fresh) and not self._fits.is_hopeless(on_reference):
             window = before.copy()
-            window.predict(new, self.spline_valid[-1][1], young)
+            window.predict(new, self._found.end, young)
             fresh, on_reference = fitting, [o for o in fitting if o.ref is ref]
             solved = window.solve(fresh, levels, gauge, coupled)
         with self._terms.timer("judgement"):
             pulled = pulls(on_reference, window.state)
             fault = self._fits.fault(on_reference, solved, ref.pixels, pulled)
+            uncertainty = self._covariances.uncertainty
             if ref.rolling is None:
                 # A rolling reference moves with what is aligned to it, which tells nothing of the two together.
-                uncertainty = self._uncertainty.after(new.stamp - self._stamps[-1], pulled.information)
-            else:
-                uncertainty = self._uncertainty
+                uncertainty = uncertainty.after(new.stamp - self._found.stamps[-1], pulled.information)
         if fault or implausible(T_predicted, window.spline.pose(mid), gap) or not uncertainty.is_known:
             self._window = before
             return self._relocalise(new)
-        self._window, self._uncertainty = window, uncertainty
+        self._window, self._covariances.uncertainty = window, uncertainty
         window.keep(fresh)
         self._chain.add(ref, on_reference, window.state, pulled.excess)
         for is_color, term in enumerate(self._independence):
@@ -260,7 +260,7 @@ class Tracker:
         overlap = self._overlap(on_reference)
         frozen = self._fuse_frozen(window)
         renewed = self._renew_keyframe(window, new, frozen, overlap)
-        self._release(window)
+        self._found.release(window, min(min(f.first_time, f.stamp) for f in self._recent))
         return self._report(new, on_reference, solved, keyframe=renewed, overlap=overlap)
 
     # -- start and restart ------------------------------------------------------------------------------------------
@@ -275,7 +275,7 @@ class Tracker:
             self._reference = self._maker.rolling(new.index, new.depth, new.colors, self._window.spline)
         else:
             self._new_keyframe(new, None)
-            self._uncertainty = Uncertainty.of_first()
+            self._covariances.uncertainty = Uncertainty.of_first()
         self._placed(new)
         return self._report(new, keyframe=True)
 
@@ -324,12 +324,9 @@ class Tracker:
     def _begin_anew(self, new: DeviceFrame) -> FrameReport:
         """The first frames did not fit together: they are lost, and the newest is the first one."""
         self._window, self._reference = None, None
-        self._stamps.clear()
-        self.spline_valid.clear()
         self._recent.clear()
-        self._uncertainty = Uncertainty()
+        self._found, self._covariances = FoundPoses(), PoseCovariances(self.rig.depth_camera.fx)
         self._chain = Chain()
-        self._covariances.clear()
         self.reports = [r.as_lost() for r in self.reports]
         return self._start(new)
 
@@ -349,28 +346,24 @@ class Tracker:
             seen = [o for o in others if o.frame == frame.index]
             own = pulls(seen, window.state)
             self._chain.add(ref, seen, window.state, own.excess)
-            self._uncertainty = self._uncertainty.found_anew(own.information)
+            self._covariances.uncertainty = self._covariances.uncertainty.found_anew(own.information)
             if frame is not middle:
-                self._covariances[frame.index] = ref.index, self._covariance(ref)
-        first = self._covariances.get(frames[0].index, (ref.index, np.zeros((6, 6))))
-        T_world_first = window.spline.pose(frames[0].depth.exposure.mid_time)
-        self._uncertainty = self._uncertainty.with_keyframe(ref.index, -1, T_world_first, first[1])
+                self._covariances.add(frame, ref)
+        self._covariances.begin(ref, frames, window.spline)
         for frame in frames[:-1]:
-            self.reports[frame.index] = self._with_covariance(self.reports[frame.index], frame)
+            report = self.reports[frame.index]
+            self.reports[frame.index] = self._covariances.of(report, frame, window.spline, ref.index)
 
     def _relocalise(self, new: DeviceFrame) -> FrameReport:
         """Find a frame again and go on with a new piece of the spline; what was reported before stays as it is."""
         window, ref = self._known()
-        found = self._relocaliser.find(new, window, ref, self.spline_valid[-1][1], self._uncertainty)
+        found = self._relocaliser.find(new, window, ref, self._found.end, self._covariances.uncertainty)
         if found is None:
             return self._report(new, lost=True)
         # The new piece may need control points of the last frames before: their poses are kept, not their spline.
-        self._settled.put(self._settled.count, self._moving_poses(len(self._stamps)))
-        begin, end = self.spline_valid.pop()
-        if found.window.state.untouched > begin:
-            self.spline_valid.append((begin, min(end, found.window.state.untouched)))
+        self._found.begin_piece(window.spline, found.window.state.untouched)
         found.window.keep(found.fresh)
-        self._window, self._reference, self._uncertainty = found.window, found.ref, found.uncertainty
+        self._window, self._reference, self._covariances.uncertainty = found.window, found.ref, found.uncertainty
         self._chain.cut(found.window.piece)
         self._chain.add(found.ref, found.fresh, found.window.state, pulls(found.fresh, found.window.state).excess)
         self._keyframes.use(found.ref)
@@ -379,22 +372,6 @@ class Tracker:
         self._recent = deque([new])
         self._placed(new, found.fresh, joined=False)
         return self._report(new, found.fresh, found.solved, overlap=self._overlap(found.fresh))
-
-    def _moving_poses(self, end: int) -> FloatArray:
-        """T_world_depth (n, 4, 4) now of the frames found, from the first unsettled one to number `end`."""
-        window, _ = self._known()
-        return window.spline.pose(np.array(self._stamps[self._settled.count : end]))
-
-    def _release(self, window: Window) -> None:
-        """Hold no more of the spline than still moves, or is still to be fused along."""
-        first = window.releasable(min(min(f.first_time, f.stamp) for f in self._recent))
-        if first is None:
-            return
-        end = self._settled.count
-        while window.state.segment(self._stamps[end]) < first:
-            end += 1
-        self._settled.put(self._settled.count, self._moving_poses(end))
-        window.state.release(first)
 
     # -- keyframes --------------------------------------------------------------------------------------------------
 
@@ -443,10 +420,7 @@ class Tracker:
     def _new_keyframe(self, frame: DeviceFrame, older: Reference | None) -> Reference:
         assert self._window is not None
         self._reference = self._keyframes.make(frame, self._window.spline, older, self._gains.of(frame))
-        if frame.index in self._covariances:
-            before, pose = self._covariances[frame.index]
-            T_world_depth = self._reference.T_world_base
-            self._uncertainty = self._uncertainty.with_keyframe(frame.index, before, T_world_depth, pose)
+        self._covariances.keyframe(self._reference)
         self._unconverged, self._pixels, self._colorless = None, 0, 0
         return self._reference
 
@@ -475,36 +449,16 @@ class Tracker:
 
     def _placed(self, new: DeviceFrame, fresh: Sequence[Observation] = (), joined: bool = True) -> None:
         """A frame has been found: its stamp, its brightness, and until when the spline is known."""
-        self._stamps.append(new.stamp)
+        self._found.add(new, joined)
         window, ref = self._known()
         oldest = self._recent[0].index if self._recent else new.index
         self._gains.learn(new, fresh, window.state, oldest)
         if ref.rolling is None:
-            kept = {k: c for k, c in self._covariances.items() if k >= oldest}
-            self._covariances = kept | {new.index: (ref.index, self._covariance(ref))}
-        begin = min(new.first_time, new.stamp)
-        if joined and self.spline_valid:
-            begin = self.spline_valid.pop()[0]
-        self.spline_valid.append((begin, new.last_time))
+            self._covariances.add(new, ref, oldest)
 
     def _report(
         self, new: DeviceFrame, fresh: Sequence[Observation] = (), solved: Solved | None = None, *,
         keyframe: bool = False, lost: bool = False, overlap: float = 1.0,
     ) -> FrameReport:  # fmt: skip
         report = frame_report(new.stamp, fresh, solved, keyframe=keyframe, lost=lost, overlap=overlap)
-        if lost or new.index not in self._covariances:
-            return report
-        report = self._with_covariance(report, new)
-        if not fresh or any(o.ref.rolling is not None for o in fresh):
-            return report
-        return replace(report, held_by_motion=self._uncertainty.held_by_motion)
-
-    def _covariance(self, ref: Reference) -> FloatArray:
-        return self._uncertainty.covariance(self.rig.depth_camera.fx, ref.median_depth)
-
-    def _with_covariance(self, report: FrameReport, frame: DeviceFrame) -> FrameReport:
-        """A frame's report with its covariance, where it has one."""
-        window, ref = self._known()
-        at, pose = self._covariances.get(frame.index, (ref.index, np.zeros((6, 6))))
-        drift = self._uncertainty.drift_of(at, window.spline.pose(frame.depth.exposure.mid_time))
-        return replace(report, covariance=pose, drift=drift)
+        return report if lost else self._covariances.report(report, new, fresh, self._known()[0].spline)
