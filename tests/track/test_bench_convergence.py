@@ -48,11 +48,6 @@ def truth_of(dataset: Dataset) -> Spline:
     return dataset.truth
 
 
-@pytest.fixture(scope="module")
-def report(dataset: Dataset) -> conv.ConvergenceResult:
-    return conv.convergence(dataset, OPTIONS, pairs=3, seed=2)
-
-
 def run(capfd: pytest.CaptureFixture[str], words: list[str]) -> tuple[int, str, str]:
     capfd.readouterr()
     status = main(words)
@@ -113,12 +108,14 @@ def test_pairs_are_random_repeatable_and_within_the_truth(dataset: Dataset) -> N
     assert any(a.keyframe != b.keyframe for a, b in zip(pairs, other, strict=True))
 
 
-def test_near_starts_converge_and_far_ones_do_not(report: conv.ConvergenceResult) -> None:
-    rows = {row["moved_m"]: row for row in report.rows()}
-    assert rows[0.02]["converged"] == 1.0 and rows[0.02]["median_error_m"] < 1e-3
-    assert rows[0.02]["median_steps"] > 0 and rows[0.0]["median_steps"] > 0
-    far = [t for t in report.trials if t.factor == 16.0]
-    assert len(far) == 3 and not all(t.converged for t in far)
+def test_near_starts_converge_and_far_ones_do_not(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    # From the last hardly a pixel falls on the keyframe; in between (32 cm, 16 degrees) it is luck, and differs between
+    # machines.
+    monkeypatch.setattr(conv, "FACTORS", (0.0, 0.5, 1.0, 64.0))
+    start, half, near, far = conv.convergence(dataset, OPTIONS, pairs=3, seed=2).rows()
+    for row in (start, half, near):
+        assert row["converged"] == 1.0 and row["median_error_m"] < 1e-3 and row["median_steps"] > 0
+    assert far["moved_m"] == pytest.approx(1.28) and far["converged"] == far["wrong_but_believed"] == 0
 
 
 def test_errors_are_those_of_the_pose_that_was_found(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
