@@ -36,8 +36,8 @@ _NEAR = 2
 # Frames that are tracked; of these, every so manieth has its depth looked up in pairs of images so many frames apart.
 _TRACKED, _EVERY, _APART = 60, 4, (4, 8)
 # Windows of the recording of which the one that moves most is taken, and the shift (part of the width, a frame) that is
-# enough: images that move faster are blurred.
-_WINDOWS, _ENOUGH = 8, 0.015
+# enough: images that move faster are blurred. Where it does not tell, others take its place, so many in all.
+_WINDOWS, _ENOUGH, _TRIES = 8, 0.015, 3
 # Depth pixels looked up in a line; and the fewest a pair may share.
 _ACROSS, _FEWEST = 106, 400
 # 8-bit values that are clipped, and their neighbours.
@@ -79,8 +79,17 @@ def estimate_color_offset(
     frames: those to look at, default all. options: say which backend to use. Raises UserError: an image that
     cannot be read.
     """
-    chosen = _moving_part(dataset, range(len(dataset)) if frames is None else frames)
-    spline, begin, end = _geometric_track(dataset, chosen, options or Options(), progress)
+    parts = _moving_parts(dataset, range(len(dataset)) if frames is None else frames)
+    tried = []
+    for part in parts:
+        tried.append(_estimate(dataset, part, options or Options(), progress))
+        if not tried[-1].reason:
+            return tried[-1]
+    return tried[0]
+
+
+def _estimate(dataset: Dataset, chosen: range, options: Options, progress: Progress) -> ColorOffset:
+    spline, begin, end = _geometric_track(dataset, chosen, options, progress)
     if spline is None:
         return ColorOffset(0.0, np.inf, 0, "the geometry alone gives no track")
     pairs = _pairs(dataset, chosen, begin + _MOST_S, end - _MOST_S)
@@ -128,14 +137,18 @@ def _parabola(x: FloatArray, y: FloatArray) -> tuple[float, float]:
 # --- what to look at -------------------------------------------------------------------------------------------------
 
 
-def _moving_part(dataset: Dataset, frames: range) -> range:
-    """The frames to track: those of the window that moves most, though no more than is enough."""
+def _moving_parts(dataset: Dataset, frames: range) -> list[range]:
+    """Frames to track: windows that do not overlap, the one first that moves most, though no more than is enough."""
     if len(frames) <= _TRACKED:
-        return frames
+        return [frames]
     starts = np.linspace(0, len(frames) - _TRACKED, _WINDOWS).round().astype(int)
     motion = [min(_shift(dataset, frames[int(s) : int(s) + _TRACKED]), _ENOUGH) for s in starts]
-    start = int(starts[int(np.argmax(motion))])
-    return frames[start : start + _TRACKED]
+    chosen: list[int] = []
+    for n in np.argsort(-np.array(motion), kind="stable"):
+        start = int(starts[n])
+        if len(chosen) < _TRIES and all(abs(start - other) >= _TRACKED for other in chosen):
+            chosen.append(start)
+    return [frames[start : start + _TRACKED] for start in chosen]
 
 
 def _shift(dataset: Dataset, frames: range) -> float:

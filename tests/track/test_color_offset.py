@@ -109,6 +109,25 @@ def test_what_the_motion_does_not_tell_is_left_open(shaken: Dataset, monkeypatch
     assert "no track" in estimate_color_offset(shaken).reason
 
 
+def test_where_one_part_does_not_tell_others_are_asked(shaken: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(color_offset, "_TRACKED", 8)
+    asked: list[range] = []
+    silent = color_offset.ColorOffset(0.0, np.inf, 0, "the camera moves too evenly")
+    told = color_offset.ColorOffset(0.01, 1e-3, 20)
+
+    def estimate(_: Dataset, part: range, *__: object) -> color_offset.ColorOffset:
+        asked.append(part)
+        return told if len(asked) == 2 else silent
+
+    monkeypatch.setattr(color_offset, "_estimate", estimate)
+    assert estimate_color_offset(shaken) is told and len(asked) == 2
+    assert not set(asked[0]) & set(asked[1]) and {len(part) for part in asked} == {8}
+    monkeypatch.setattr(color_offset, "_shift", lambda _, part: 0.012 if 20 in part else 1e-4 * part[0])
+    assert estimate_color_offset(shaken) is silent, "none of three told"
+    assert len(asked) == 5 and 20 in asked[2] and asked[3][0] > asked[4][0]
+    assert len(set().union(*asked[2:])) == 24
+
+
 class _Same:
     """One frame for ever, with the noise of 8 bits."""
 
