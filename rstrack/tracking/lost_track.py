@@ -42,6 +42,9 @@ _MEMORY = 30
 # quarter of the last frames stays below, lest bad becomes usual; in the first frames nothing is.
 _PULLS = "whole", "depth", "color"
 _PULL_WHOLE, _PULL_ALONE, _PULL_SIGMAS = (4.0, 1.5e-2), (7.0, 2e-2), (4.0, 5.0)
+# Where a piece of the track has just begun nothing of its own says yet whether it is right: always so many metres only,
+# and fewer times the usual number of σ.
+_NEW_WHOLE, _NEW_ALONE, _NEW_SIGMAS = 6e-3, 8e-3, 3.0
 _USUAL, _FEW = 0.25, 5
 # Frames from which on their median says what is best, and the distance (m) below which limits shrink no further.
 _SETTLED, _CLOSE = 15, 0.5
@@ -81,10 +84,12 @@ class FitHistory:
         """Observations that do not fit, and why. expected: pixels that a whole image puts on the reference."""
         return [(o, why) for o in fresh if (why := self._misfit(o, expected))]
 
-    def fault(self, fresh: Sequence[Observation], solved: Solved, expected: int, pulls: Pulls | None = None) -> str:
+    def fault(
+        self, fresh: Sequence[Observation], solved: Solved, expected: int, pulls: Pulls | None = None, new: bool = False
+    ) -> str:
         """Why a frame has not been found, '' if it has: then it is learnt from.
 
-        expected: as in `misfits`. pulls: of `fresh`, where they are judged.
+        expected: as in `misfits`. pulls: of `fresh`, where they are judged. new: whether its piece has just begun.
         """
         if not fresh or not any(o.is_linearised for o in fresh):
             return "hardly a pixel falls on the keyframe"
@@ -95,7 +100,7 @@ class FitHistory:
             return misfits[0][1]
         if pulls is not None:
             distance = max(_CLOSE, fresh[0].ref.median_depth)
-            torn = self._torn(pulls, distance)
+            torn = self._torn(pulls, distance, new)
             if torn:
                 return torn
             self._pulls.append(pulls.scaled(distance**-2))
@@ -106,14 +111,14 @@ class FitHistory:
                 self._color.learn(o.lin.next_sigma)
         return ""
 
-    def _torn(self, now: Pulls, distance: float) -> str:
+    def _torn(self, now: Pulls, distance: float, new: bool) -> str:
         """distance (m), `_CLOSE` at least: of what is seen; where noise grows with its square, so do pulls."""
-        far = [self._is_far(name, n, now, distance) for n, name in enumerate(_PULLS)]
+        far = [self._is_far(name, n, now, distance, new) for n, name in enumerate(_PULLS)]
         if any(far[1:]):
             return "depth and colour do not agree"
         return "the images do not agree with the motion" if far[0] else ""
 
-    def _is_far(self, name: str, n: int, now: Pulls, distance: float) -> bool:
+    def _is_far(self, name: str, n: int, now: Pulls, distance: float, new: bool) -> bool:
         """Of the pull of that name, the nth: whether it is too far."""
         usual = [(pull, before.sigmas[n]) for before in self._pulls if np.isfinite(pull := getattr(before, name))]
         pull, sigmas = getattr(now, name), now.sigmas[n]
@@ -121,6 +126,8 @@ class FitHistory:
             return False
         metres, known = np.quantile(usual, _USUAL, axis=0)
         (growth, always), (times, least) = _PULL_WHOLE if name == "whole" else _PULL_ALONE, _PULL_SIGMAS
+        if new:
+            always, times = _NEW_WHOLE if name == "whole" else _NEW_ALONE, _NEW_SIGMAS
         is_odd = sigmas > max(least, times * known)
         return bool(is_odd and pull > max(always, growth * distance**2 * metres))
 

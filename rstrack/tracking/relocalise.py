@@ -129,7 +129,7 @@ class Relocaliser:
         uncertainty = before.found_anew(pulled.information)
         # Depth alone is much alike in many places.
         is_sure = len(fresh) > 1 or _is_sure(fresh[0], denied=bool(new.colors and ref.points))
-        if self._fits.fault(fresh, solved, ref.pixels, pulled) or not (is_sure and uncertainty.is_known):
+        if self._fits.fault(fresh, solved, ref.pixels, pulled, True) or not (is_sure and uncertainty.is_known):
             return None
         return Found(trial, fresh, solved, ref, uncertainty)
 

@@ -240,7 +240,7 @@ class Tracker:
             solved = window.solve(fresh, levels, gauge, coupled)
         with self._terms.timer("judgement"):
             pulled = pulls(on_reference, window.state)
-            fault = self._fits.fault(on_reference, solved, ref.pixels, pulled)
+            fault = self._fits.fault(on_reference, solved, ref.pixels, pulled, young)
             uncertainty = self._covariances.uncertainty
             if ref.rolling is None:
                 # A rolling reference moves with what is aligned to it, which tells nothing of the two together.

@@ -42,9 +42,10 @@ def term(
 
 
 def fault(
-    history: FitHistory, terms: Iterable[Any], shift: float = 0.05, expected: int = 5000, pulled: Pulls | None = None
-) -> str:
-    return history.fault(list(terms), Solved(last_shift=shift), expected, pulled)
+    history: FitHistory, terms: Iterable[Any], shift: float = 0.05, expected: int = 5000, pulled: Pulls | None = None,
+    new: bool = False,
+) -> str:  # fmt: skip
+    return history.fault(list(terms), Solved(last_shift=shift), expected, pulled, new)
 
 
 def test_errors_of_depth_may_grow_with_the_square_of_the_distance() -> None:
@@ -160,15 +161,20 @@ def test_all_misfits_are_named() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "usual", "limit", "says"),
+    ("name", "usual", "limit", "new", "says"),
     [
-        ("whole", 4e-3, 16e-3, "the images do not agree with the motion"),
-        ("whole", 1e-5, 15e-3, "the images do not agree with the motion"),
-        ("depth", 3e-3, 21e-3, "depth and colour do not agree"),
-        ("color", 1e-4, 2e-2, "depth and colour do not agree"),
+        ("whole", 4e-3, 16e-3, False, "the images do not agree with the motion"),
+        ("whole", 1e-5, 15e-3, False, "the images do not agree with the motion"),
+        ("depth", 3e-3, 21e-3, False, "depth and colour do not agree"),
+        ("color", 1e-4, 2e-2, False, "depth and colour do not agree"),
+        ("whole", 1e-5, 6e-3, True, "the images do not agree with the motion"),
+        ("depth", 3e-3, 21e-3, True, "depth and colour do not agree"),
+        ("color", 1e-4, 8e-3, True, "depth and colour do not agree"),
     ],
 )
-def test_images_that_pull_much_more_than_usual_are_elsewhere(name: str, usual: float, limit: float, says: str) -> None:
+def test_images_that_pull_much_more_than_usual_are_elsewhere(
+    name: str, usual: float, limit: float, new: bool, says: str
+) -> None:
     def pulled(metres: float, sigmas: float) -> Pulls:
         return Pulls(**({"whole": 0.0, "depth": 0.0, "color": 0.0} | {name: metres}), sigmas=(sigmas,) * 3)
 
@@ -177,8 +183,8 @@ def test_images_that_pull_much_more_than_usual_are_elsewhere(name: str, usual: f
         # Nothing is usual yet: the first few may pull as they like.
         assert fault(history, good, pulled=pulled(1.0 if k == 4 else usual, 2.0)) == ""
     for _ in range(20):
-        assert fault(history, good, pulled=pulled(1.01 * limit, 50.0)) == says
-    assert fault(history, good, pulled=pulled(0.99 * limit, 50.0)) == ""
+        assert fault(history, good, pulled=pulled(1.01 * limit, 50.0), new=new) == says
+    assert fault(history, good, pulled=pulled(0.99 * limit, 50.0), new=new) == ""
     # What is not there does not pull, and where it is not judged nothing is said or learnt.
     assert fault(history, good, pulled=pulled(float("nan"), 50.0)) == fault(history, good) == ""
 
@@ -191,11 +197,11 @@ def pulled_before(frames: int = 10, sigmas: float = 1.0) -> FitHistory:
     return made
 
 
-@pytest.mark.parametrize(("usual", "limit"), [(1.0, 5.0), (3.0, 12.0)])
-def test_pulls_within_noise_or_as_far_from_it_as_usual_are_none(usual: float, limit: float) -> None:
+@pytest.mark.parametrize(("usual", "limit", "new"), [(1.0, 5.0, False), (3.0, 12.0, False), (3.0, 9.0, True)])
+def test_pulls_within_noise_or_as_far_from_it_as_usual_are_none(usual: float, limit: float, new: bool) -> None:
     for sigmas, says in ((0.98 * limit, ""), (1.02 * limit, "the images do not agree with the motion")):
         pulled = Pulls(0.04, 3e-3, 3e-3, (sigmas,) * 3)
-        assert fault(pulled_before(sigmas=usual), [term("depth", 1e-3)], pulled=pulled) == says
+        assert fault(pulled_before(sigmas=usual), [term("depth", 1e-3)], pulled=pulled, new=new) == says
 
 
 def test_pulls_of_what_is_far_away_may_be_larger() -> None:
