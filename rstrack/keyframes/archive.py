@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -133,8 +134,9 @@ class Archive:
 
     def alike(self, frame: DeviceFrame, without: set[int]) -> list[int]:
         """Keyframes whose view resembles a frame's, the best first; those in `without` are left out."""
-        scores = {k: _resemblance(kept.small, frame) for k, kept in self._kept.items() if k not in without}
-        return sorted((k for k, score in scores.items() if score > _ALIKE), key=lambda k: -scores[k])
+        numbers = [k for k in self._kept if k not in without]
+        scores = resemblances([self._kept[k].small for k in numbers], frame)
+        return [numbers[n] for n in np.argsort(-scores, kind="stable") if scores[n] > _ALIKE]
 
     def _temporary_folder(self) -> Path:
         if self._temporary is None:
@@ -169,18 +171,29 @@ def _read(path: Path) -> dict[str, npt.NDArray[Any]]:
         raise UserError(f"{path}: a keyframe that was put there cannot be read again ({error})") from None
 
 
-def _resemblance(ref: Reference, frame: DeviceFrame) -> float:
-    """Mean correlation (−1 to 1) of the thumbnails that both have."""
-    pairs: list[tuple[Any, Any]] = [(ref.depth_thumbnail, frame.depth.thumbnail)]
-    if ref.color_thumbnail is not None and frame.colors:
-        pairs.append((ref.color_thumbnail, frame.colors[0].thumbnail))
-    return float(np.mean([_correlation(a, b) for a, b in pairs]))
+def resemblances(refs: Sequence[Reference], frame: DeviceFrame) -> FloatArray:
+    """Mean correlations (n,), −1 to 1, of a frame's thumbnails and keyframes', those of depth and where there are of
+    colour."""
+    scores = _correlations([ref.depth_thumbnail for ref in refs], frame.depth.thumbnail)
+    colors = [(n, ref.color_thumbnail) for n, ref in enumerate(refs) if ref.color_thumbnail is not None]
+    if colors and frame.colors:
+        at = [n for n, _ in colors]
+        scores[at] = 0.5 * (scores[at] + _correlations([t for _, t in colors], frame.colors[0].thumbnail))
+    return scores
 
 
-def _correlation(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> float:
-    both = (a != 0) & (b != 0)
-    if both.sum() < 0.25 * both.size:
-        return 0.0
-    x, y = a[both] - a[both].mean(), b[both] - b[both].mean()
-    size = float(np.sqrt((x * x).sum() * (y * y).sum()))
-    return float((x * y).sum()) / size if size > 0.0 else 0.0
+def _correlations(many: Sequence[npt.NDArray[Any]], one: npt.NDArray[Any]) -> FloatArray:
+    """Of each of n images with another, over the pixels that both have; 0 where these are less than a quarter."""
+    if not many:
+        return np.zeros(0)
+    a, b = np.stack(many).reshape(len(many), -1).astype(float), one.reshape(-1).astype(float)
+    in_a, in_b = (a != 0).astype(float), (b != 0).astype(float)
+    # Correlations are the same whatever is taken off; this leaves numbers about 0.
+    off = b.sum() / max(1.0, in_b.sum())
+    a, b = in_a * (a - off), in_b * (b - off)
+    count = np.maximum(1.0, in_a @ in_b)
+    sum_a, sum_b = a @ in_b, in_a @ b
+    spread_a, spread_b = (a * a) @ in_b - sum_a**2 / count, in_a @ (b * b) - sum_b**2 / count
+    size = np.sqrt(np.maximum(0.0, spread_a * spread_b))
+    is_known = (in_a @ in_b >= 0.25 * b.size) & (size > 1e-12)
+    return np.where(is_known, (a @ b - sum_a * sum_b / count) / np.where(is_known, size, 1.0), 0.0)

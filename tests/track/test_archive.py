@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.images.device_frame import DeviceRig
-from rstrack.keyframes.archive import Archive
+from rstrack.keyframes.archive import Archive, resemblances
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.options import Options
@@ -104,3 +106,40 @@ def test_a_tracker_with_hardly_any_memory_finds_the_same() -> None:
 def test_memory_is_checked() -> None:
     with pytest.raises(UserError, match="memory_gb"):
         Options(memory_gb=0.0)
+
+
+def plain_correlation(a: np.ndarray, b: np.ndarray) -> float:
+    both = (a != 0) & (b != 0)
+    if both.sum() < 0.25 * both.size or not np.ptp(a[both]) or not np.ptp(b[both]):
+        return 0.0
+    return float(np.corrcoef(a[both], b[both])[0, 1])
+
+
+def test_views_resemble_each_other_as_their_thumbnails_correlate() -> None:
+    rng = np.random.default_rng(3)
+
+    def thumbnail(known: float, base: np.ndarray | None = None) -> np.ndarray:
+        image = 0.3 + 0.1 * rng.standard_normal((15, 20)) + (0.0 if base is None else base)
+        return np.where(rng.random((15, 20)) < known, image, 0.0).astype(np.float32)
+
+    seen = 0.2 * rng.standard_normal((15, 20))
+    depth, color = thumbnail(0.8, seen), thumbnail(1.0, seen)
+    refs = [
+        (thumbnail(0.9, seen), thumbnail(1.0, seen)),
+        (thumbnail(0.9, -seen), thumbnail(1.0)),
+        (thumbnail(0.7, seen), None),
+        (thumbnail(0.2, seen), thumbnail(1.0, seen)),  # hardly anything known
+        (np.full((15, 20), 0.5, np.float32), thumbnail(0.5)),  # a wall
+        (np.zeros((15, 20), np.float32), thumbnail(1.0, seen)),  # no depth
+    ]
+    keyframes: list[Any] = [SimpleNamespace(depth_thumbnail=d, color_thumbnail=c) for d, c in refs]
+    frame: Any = SimpleNamespace(
+        depth=SimpleNamespace(thumbnail=depth), colors=[SimpleNamespace(thumbnail=color)]
+    )  # fmt: skip
+    found = resemblances(keyframes, frame)
+    for n, (d, c) in enumerate(refs):
+        expected = [plain_correlation(d, depth)] + ([] if c is None else [plain_correlation(c, color)])
+        assert found[n] == pytest.approx(np.mean(expected), abs=1e-9)
+    assert found[0] > 0.6 > 0.1 > found[1] and found[5] == pytest.approx(0.5 * plain_correlation(refs[5][1], color))
+    frame.colors = []
+    assert resemblances(keyframes, frame)[5] == 0.0 and resemblances([], frame).shape == (0,)
