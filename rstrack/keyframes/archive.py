@@ -140,13 +140,7 @@ class Archive:
 
     def _temporary_folder(self) -> Path:
         if self._temporary is None:
-            try:
-                self._temporary = TemporaryDirectory(prefix="rstrack-keyframes-")
-            except OSError as error:
-                raise UserError(
-                    f"keyframes: {len(self._kept)} do not fit --memory-gb, and there is no folder for temporary files "
-                    f"({error.strerror}): set TMPDIR to one with room, or give more --memory-gb"
-                ) from None
+            self._temporary = temporary_folder("keyframes", f"keyframes: {len(self._kept)}")
         return Path(self._temporary.name)
 
     def _written(self, kept: _Archived) -> _Archived:
@@ -161,6 +155,17 @@ class Archive:
         path = folder / f"keyframe-{kept.small.index:08d}-{kept.number:08d}.npz"
         atomic_write(path, encode_npz(kept.images))
         return replace(kept, file=path)
+
+
+def temporary_folder(name: str, what: str) -> TemporaryDirectory[str]:
+    """A folder for what does not fit in memory, gone when this is. Raises UserError: there is no room for it."""
+    try:
+        return TemporaryDirectory(prefix=f"rstrack-{name}-")
+    except OSError as error:
+        raise UserError(
+            f"{what} do not fit --memory-gb, and there is no folder for temporary files ({error.strerror}): set TMPDIR "
+            "to one with room, or give more --memory-gb"
+        ) from None
 
 
 def _read(path: Path) -> dict[str, npt.NDArray[Any]]:

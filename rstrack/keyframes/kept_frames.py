@@ -11,6 +11,7 @@ import numpy as np
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_npz
 from rstrack.data.rig import Frame, Image
+from rstrack.keyframes.archive import temporary_folder
 
 
 @dataclass
@@ -42,13 +43,7 @@ class KeptFrames:
 
     def _written(self, number: int, frame: Frame) -> Path:
         if self._temporary is None:
-            try:
-                self._temporary = TemporaryDirectory(prefix="rstrack-frames-")
-            except OSError as error:
-                raise UserError(
-                    f"keyframes' images: they do not fit --memory-gb, and there is no folder for temporary files "
-                    f"({error.strerror}): set TMPDIR to one with room, or give more --memory-gb"
-                ) from None
+            self._temporary = temporary_folder("frames", "keyframes' images: they")
         path = Path(self._temporary.name) / f"frame-{number:08d}.npz"
         images = (frame.depth, *frame.colors)
         arrays = {f"image{n}": image.pixels for n, image in enumerate(images)}
