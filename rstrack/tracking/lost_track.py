@@ -42,6 +42,8 @@ _MEMORY = 30
 # quarter of the last frames stays below, lest bad becomes usual; in the first frames nothing is.
 _PULLS = "whole", "depth", "color"
 _PULL_WHOLE, _PULL_ALONE, _PULL_SIGMAS = (4.0, 1.5e-2), (7.0, 2e-2), (4.0, 5.0)
+# What is said of images that pull too far.
+TORN = "depth and colour do not agree", "the images do not agree with the motion"
 # Where a piece of the track has just begun nothing of its own says yet whether it is right: always so many metres only,
 # and fewer times the usual number of σ.
 _NEW_WHOLE, _NEW_ALONE, _NEW_SIGMAS = 6e-3, 8e-3, 3.0
@@ -115,8 +117,8 @@ class FitHistory:
         """distance (m), `_CLOSE` at least: of what is seen; where noise grows with its square, so do pulls."""
         far = [self._is_far(name, n, now, distance, new) for n, name in enumerate(_PULLS)]
         if any(far[1:]):
-            return "depth and colour do not agree"
-        return "the images do not agree with the motion" if far[0] else ""
+            return TORN[0]
+        return TORN[1] if far[0] else ""
 
     def _is_far(self, name: str, n: int, now: Pulls, distance: float, new: bool) -> bool:
         """Of the pull of that name, the nth: whether it is too far."""

@@ -71,19 +71,21 @@ class Relocaliser:
         self._lost_in_a_row, self._jump = 0, None
 
     def find(
-        self, new: DeviceFrame, window: Window, ref: Reference, end: float, uncertainty: Uncertainty
-    ) -> Found | None:
+        self, new: DeviceFrame, window: Window, ref: Reference, end: float, uncertainty: Uncertainty,
+        torn: bool = False,
+    ) -> Found | None:  # fmt: skip
         """Where a frame was taken, if that can be told; the track ended at time `end` (s).
 
         Small images are aligned to some keyframes, and the whole one from the best of these poses; others take their
         turn with the next frame. A pose that no hand can have brought the camera to is none until the next frame is
-        found beside it.
+        found beside it. torn: whether it was found where the motion led, but pulled away from it: under vibration depth
+        alone fits single frames anywhere nearby, and is not believed then.
         """
         jump, self._jump = self._jump, None
         start = (jump.ref, jump.T_ref_cam) if jump else self._searched(new, window, ref, end)
         self._lost_in_a_row += 1
         found = self._aligned(new, window, end, *start, uncertainty) if start else None
-        if found is None:
+        if found is None or (torn and all(o.is_depth for o in found.fresh)):
             return None
         mid = new.depth.exposure.mid_time
         T_found = found.window.spline.pose(mid)

@@ -37,7 +37,7 @@ from rstrack.options import Options
 from rstrack.tracking.found_poses import FoundPoses
 from rstrack.tracking.frame_report import FrameReport, frame_report
 from rstrack.tracking.gains import Gains
-from rstrack.tracking.lost_track import FitHistory, implausible, is_settled
+from rstrack.tracking.lost_track import TORN, FitHistory, implausible, is_settled
 from rstrack.tracking.pose_covariances import PoseCovariances
 from rstrack.tracking.relocalise import Relocaliser, without_misfits
 from rstrack.tracking.uncertainty import Uncertainty
@@ -247,7 +247,7 @@ class Tracker:
                 uncertainty = uncertainty.after(new.stamp - self._found.stamps[-1], pulled.information)
         if fault or implausible(T_predicted, window.spline.pose(mid), gap) or not uncertainty.is_known:
             self._window = before
-            return self._relocalise(new)
+            return self._relocalise(new, fault in TORN)
         self._window, self._covariances.uncertainty = window, uncertainty
         window.keep(fresh)
         self._chain.add(ref, on_reference, window.state, pulled.excess)
@@ -354,10 +354,10 @@ class Tracker:
             report = self.reports[frame.index]
             self.reports[frame.index] = self._covariances.of(report, frame, window.spline, ref.index)
 
-    def _relocalise(self, new: DeviceFrame) -> FrameReport:
+    def _relocalise(self, new: DeviceFrame, torn: bool = False) -> FrameReport:
         """Find a frame again and go on with a new piece of the spline; what was reported before stays as it is."""
         window, ref = self._known()
-        found = self._relocaliser.find(new, window, ref, self._found.end, self._covariances.uncertainty)
+        found = self._relocaliser.find(new, window, ref, self._found.end, self._covariances.uncertainty, torn)
         if found is None:
             return self._report(new, lost=True)
         # The new piece may need control points of the last frames before: their poses are kept, not their spline.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -43,9 +44,9 @@ def test_what_fits_and_what_stands_alone_stays() -> None:
 class Sees(Relocaliser):
     """Finds each frame where it is told."""
 
-    def __init__(self, T_found: list[np.ndarray | None]) -> None:
+    def __init__(self, T_found: list[np.ndarray | None], fresh: Sequence[Any] = ()) -> None:
         super().__init__(*[None] * 5)  # type: ignore[arg-type]
-        self.T_found, self.started = list(T_found), []
+        self.T_found, self.fresh, self.started = list(T_found), list(fresh or [seen("depth"), seen("color")]), []
 
     def _searched(self, *_: Any) -> Any:
         return REF, np.eye(4)
@@ -56,7 +57,7 @@ class Sees(Relocaliser):
         if T is None:
             return None
         spline = SimpleNamespace(pose=lambda _: T)
-        return Found(SimpleNamespace(spline=spline), [], Solved(), REF, before)  # type: ignore[arg-type]
+        return Found(SimpleNamespace(spline=spline), self.fresh, Solved(), REF, before)  # type: ignore[arg-type]
 
 
 def frame(time: float) -> Any:
@@ -71,12 +72,19 @@ def away(metres: float) -> np.ndarray:
     return np.asarray(TRUTH.pose(0.5) @ se3.exp([metres, 0.0, 0.0, 0.0, 0.0, 0.0]))
 
 
-def looked(relocaliser: Relocaliser, time: float) -> bool:
-    return relocaliser.find(frame(time), AT_END, REF, 0.5, Uncertainty()) is not None  # type: ignore[arg-type]
+def looked(relocaliser: Relocaliser, time: float, torn: bool = False) -> bool:
+    return relocaliser.find(frame(time), AT_END, REF, 0.5, Uncertainty(), torn) is not None  # type: ignore[arg-type]
 
 
 def test_near_the_end_of_the_track_one_look_is_enough() -> None:
     assert looked(Sees([away(0.1)]), 0.533)
+
+
+def test_depth_alone_does_not_find_what_was_pulled_from_where_the_motion_led() -> None:
+    """Shaken: each frame fits by itself, up to 58 mm off."""
+    for fresh, is_found in (([seen("depth")], False), ([seen("color")], True), ([seen("depth"), seen("color")], True)):
+        assert looked(Sees([away(0.1)], fresh), 0.533, torn=True) == is_found
+        assert looked(Sees([away(0.1)], fresh), 0.533)
 
 
 def test_a_jump_needs_a_second_look_at_the_same_place() -> None:
