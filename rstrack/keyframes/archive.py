@@ -196,9 +196,10 @@ def _correlations(many: Sequence[npt.NDArray[Any]], one: npt.NDArray[Any]) -> Fl
     # Correlations are the same whatever is taken off; this leaves numbers about 0.
     off = b.sum() / max(1.0, in_b.sum())
     a, b = in_a * (a - off), in_b * (b - off)
-    count = np.maximum(1.0, in_a @ in_b)
+    shared = in_a @ in_b
+    count = np.maximum(1.0, shared)
     sum_a, sum_b = a @ in_b, in_a @ b
     spread_a, spread_b = (a * a) @ in_b - sum_a**2 / count, in_a @ (b * b) - sum_b**2 / count
     size = np.sqrt(np.maximum(0.0, spread_a * spread_b))
-    is_known = (in_a @ in_b >= 0.25 * b.size) & (size > 1e-12)
+    is_known = (shared >= 0.25 * b.size) & (size > 1e-12)
     return np.where(is_known, (a @ b - sum_a * sum_b / count) / np.where(is_known, size, 1.0), 0.0)
