@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from rsgen.array_types import FloatArray
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Solved
+from rstrack.tracking.fault import Fault
 
 
 @dataclass(frozen=True)
@@ -16,7 +17,7 @@ class FrameReport:
 
     sigma_*: scales of the residuals (m; intensity 0..1), NaN for a term that was not used. inliers_*: pixels that
     counted. iterations, evaluations: steps and linearisations of the optimisation; last_shift_px: how far its last
-    step still moved a line. keyframe: a new one was made; lost: no pose was found, and none is given.
+    step still moved a line. keyframe: a new one was made; lost: no pose was found, and none is given; fault: why.
     observability: smallest eigenvalue of Σ w j jᵀ per pixel, rotations scaled by the scene's depth; near 0 where the
     images leave a motion open. overlap: pixels that fall on the keyframe, against the first frame after it was made.
     covariance: of the pose against its keyframe, (6, 6) [m; rad] in the depth camera's frame at mid readout; drift:
@@ -40,16 +41,18 @@ class FrameReport:
     covariance: FloatArray | None = None
     drift: FloatArray | None = None
     held_by_motion: float = float("nan")
+    fault: Fault = Fault.NONE
 
-    def as_lost(self) -> FrameReport:
+    def as_lost(self, fault: Fault) -> FrameReport:
         """The same frame, given up later on."""
-        return replace(self, lost=True, keyframe=False, covariance=None, drift=None, held_by_motion=float("nan"))
+        lost = replace(self, lost=True, keyframe=False, fault=fault)
+        return replace(lost, covariance=None, drift=None, held_by_motion=float("nan"))
 
 
 def frame_report(
-    stamp: float, fresh: Sequence[Observation], solved: Solved | None, *, keyframe: bool, lost: bool, overlap: float
+    stamp: float, fresh: Sequence[Observation], solved: Solved | None, *, keyframe: bool, fault: Fault, overlap: float
 ) -> FrameReport:
-    """Of a frame with these observations; solved: None where nothing was optimised."""
+    """Of a frame with these observations, lost where there is a fault; solved: None where nothing was optimised."""
     solved = solved or Solved(last_shift=0.0)
     depth = [o for o in fresh if o.is_depth and o.is_linearised]
     color = [o for o in fresh if not o.is_depth and o.is_linearised]
@@ -63,7 +66,8 @@ def frame_report(
         evaluations=solved.evaluations,
         last_shift_px=solved.last_shift,
         keyframe=keyframe,
-        lost=lost,
+        lost=bool(fault),
         observability=max((o.lin.observability for o in (*depth, *color)), default=0.0),
         overlap=overlap,
+        fault=fault,
     )

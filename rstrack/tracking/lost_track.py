@@ -14,6 +14,7 @@ from rsgen.geometry import se3
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Solved
 from rstrack.alignment.pull import Pulls
+from rstrack.tracking.fault import Fault
 
 # A term has to see this share of the reference's pixels, and so many at least, to say anything.
 _LEAST_SHARE = 0.08
@@ -42,8 +43,6 @@ _MEMORY = 30
 # quarter of the last frames stays below, lest bad becomes usual; in the first frames nothing is.
 _PULLS = "whole", "depth", "color"
 _PULL_WHOLE, _PULL_ALONE, _PULL_SIGMAS = (4.0, 1.5e-2), (7.0, 2e-2), (4.0, 5.0)
-# What is said of images that pull too far.
-TORN = "depth and colour do not agree", "the images do not agree with the motion"
 # Where a piece of the track has just begun nothing of its own says yet whether it is right: always so many metres only,
 # and fewer times the usual number of σ.
 _NEW_WHOLE, _NEW_ALONE, _NEW_SIGMAS = 6e-3, 8e-3, 3.0
@@ -82,21 +81,21 @@ class FitHistory:
         self._color = _Usual(_WORST_INTENSITY, _HARMLESS_INTENSITY)
         self._pulls: deque[Pulls] = deque(maxlen=_MEMORY)
 
-    def misfits(self, fresh: Sequence[Observation], expected: int) -> list[tuple[Observation, str]]:
+    def misfits(self, fresh: Sequence[Observation], expected: int) -> list[tuple[Observation, Fault]]:
         """Observations that do not fit, and why. expected: pixels that a whole image puts on the reference."""
         return [(o, why) for o in fresh if (why := self._misfit(o, expected))]
 
     def fault(
         self, fresh: Sequence[Observation], solved: Solved, expected: int, pulls: Pulls | None = None, new: bool = False
-    ) -> str:
-        """Why a frame has not been found, '' if it has: then it is learnt from.
+    ) -> Fault:
+        """Why a frame has not been found, `Fault.NONE` if it has: then it is learnt from.
 
         expected: as in `misfits`. pulls: of `fresh`, where they are judged. new: whether its piece has just begun.
         """
         if not fresh or not any(o.is_linearised for o in fresh):
-            return "hardly a pixel falls on the keyframe"
+            return Fault.NOTHING_SEEN
         if not is_settled(solved):
-            return "the alignment does not settle"
+            return Fault.UNSETTLED
         misfits = self.misfits(fresh, expected)
         if misfits:
             return misfits[0][1]
@@ -111,14 +110,14 @@ class FitHistory:
                 self._depth.learn(o.lin.next_sigma, o.ref.median_depth)
             else:
                 self._color.learn(o.lin.next_sigma)
-        return ""
+        return Fault.NONE
 
-    def _torn(self, now: Pulls, distance: float, new: bool) -> str:
+    def _torn(self, now: Pulls, distance: float, new: bool) -> Fault:
         """distance (m), `_CLOSE` at least: of what is seen; where noise grows with its square, so do pulls."""
         far = [self._is_far(name, n, now, distance, new) for n, name in enumerate(_PULLS)]
         if any(far[1:]):
-            return TORN[0]
-        return TORN[1] if far[0] else ""
+            return Fault.DIVIDED
+        return Fault.PULLED if far[0] else Fault.NONE
 
     def _is_far(self, name: str, n: int, now: Pulls, distance: float, new: bool) -> bool:
         """Of the pull of that name, the nth: whether it is too far."""
@@ -140,13 +139,14 @@ class FitHistory:
             for o in fresh
         )
 
-    def _misfit(self, o: Observation, expected: int) -> str:
-        name = "depth" if o.is_depth else "colour"
+    def _misfit(self, o: Observation, expected: int) -> Fault:
         if not o.is_linearised or o.pixels < max(_LEAST_PIXELS, _LEAST_SHARE * expected):
-            return f"hardly a pixel of the {name} image falls on the keyframe"
+            return Fault.LITTLE_DEPTH if o.is_depth else Fault.LITTLE_COLOR
         if o.lin.fit < _least_fit(o):
-            return f"the {name} image shows something else"
-        return f"the {name} image does not fit" if o.lin.next_sigma > self._limit(o) else ""
+            return Fault.OTHER_DEPTH if o.is_depth else Fault.OTHER_COLOR
+        if o.lin.next_sigma > self._limit(o):
+            return Fault.ODD_DEPTH if o.is_depth else Fault.ODD_COLOR
+        return Fault.NONE
 
     def _limit(self, o: Observation) -> float:
         floor = o.lin.floor

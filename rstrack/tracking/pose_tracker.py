@@ -24,6 +24,7 @@ from rstrack.images.pyramid import LEVELS, DepthImage
 from rstrack.keyframes.keyframe import Reference, strides
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.options import Options
+from rstrack.tracking.fault import Fault
 from rstrack.tracking.frame_report import FrameReport
 
 # Error at the start of an alignment, as σ in m; re-estimated with every step.
@@ -58,9 +59,18 @@ class Alignment:
     observability: float
 
     @property
+    def fault(self) -> Fault:
+        """Where it has not converged, or not on enough pixels."""
+        if self.share < _LEAST_SHARE:
+            return Fault.NOTHING_SEEN
+        if self.shift < _SETTLED_PX:
+            return Fault.NONE
+        return Fault.LEFT_OPEN if self.observability < _LEAST_SEEN else Fault.UNSETTLED
+
+    @property
     def is_good(self) -> bool:
         """Whether it has converged on enough pixels."""
-        return self.share >= _LEAST_SHARE and self.shift < _SETTLED_PX
+        return not self.fault
 
 
 class BaselineTracker:
@@ -117,7 +127,7 @@ class BaselineTracker:
             self._found(new, np.eye(4))
             self._set_keyframe(new, np.eye(4), None)
         nowhere = Alignment(np.eye(4), float("nan"), 0, 0.0, 0, 0.0, 0.0)
-        return _report(new, nowhere, 1.0, keyframe=not is_lost, lost=is_lost)
+        return _report(new, nowhere, 1.0, keyframe=not is_lost, fault=Fault.NO_DEPTH if is_lost else Fault.NONE)
 
     def _track(self, new: DeviceFrame, ref: Reference) -> FrameReport:
         found = self._search(new, ref)
@@ -138,7 +148,7 @@ class BaselineTracker:
                 self._last = [(new.depth.exposure.mid_time, self._last[-1][1])]
                 self._lost_in_a_row = 0
                 self._set_keyframe(new, self._last[-1][1], None)
-        return _report(new, found, overlap, keyframe=renew, lost=not found.is_good)
+        return _report(new, found, overlap, keyframe=renew, fault=found.fault)
 
     def _search(self, new: DeviceFrame, ref: Reference) -> Alignment:
         """Alignment from the predicted pose or, where that fails, the better one of those from the last pose and the
@@ -210,7 +220,7 @@ def _still(T_world_cam: FloatArray, t: float) -> Spline:
     return Spline(np.repeat(T_world_cam[None], 4, axis=0), t - 0.5, 1.0)
 
 
-def _report(new: DeviceFrame, found: Alignment, overlap: float, *, keyframe: bool, lost: bool) -> FrameReport:
+def _report(new: DeviceFrame, found: Alignment, overlap: float, *, keyframe: bool, fault: Fault) -> FrameReport:
     return FrameReport(
         stamp=new.stamp,
         sigma_depth_m=found.sigma,
@@ -221,7 +231,8 @@ def _report(new: DeviceFrame, found: Alignment, overlap: float, *, keyframe: boo
         evaluations=found.evaluations,
         last_shift_px=found.shift,
         keyframe=keyframe,
-        lost=lost,
+        lost=bool(fault),
         observability=found.observability,
         overlap=overlap,
+        fault=fault,
     )

@@ -20,6 +20,7 @@ from rstrack.keyframes import coarse_search
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.store import KeyframeStore
 from rstrack.options import Options
+from rstrack.tracking.fault import Fault
 from rstrack.tracking.lost_track import FitHistory, implausible
 from rstrack.tracking.uncertainty import Uncertainty
 from rstrack.tracking.window import LEVELS, Window
@@ -73,8 +74,8 @@ class Relocaliser:
     def find(
         self, new: DeviceFrame, window: Window, ref: Reference, end: float, uncertainty: Uncertainty,
         torn: bool = False,
-    ) -> Found | None:  # fmt: skip
-        """Where a frame was taken, if that can be told; the track ended at time `end` (s).
+    ) -> Found | Fault:  # fmt: skip
+        """Where a frame was taken, or why that cannot be told; the track ended at time `end` (s).
 
         Small images are aligned to some keyframes, and the whole one from the best of these poses; others take their
         turn with the next frame. A pose that no hand can have brought the camera to is none until the next frame is
@@ -84,9 +85,11 @@ class Relocaliser:
         jump, self._jump = self._jump, None
         start = (jump.ref, jump.T_ref_cam) if jump else self._searched(new, window, ref, end)
         self._lost_in_a_row += 1
-        found = self._aligned(new, window, end, *start, uncertainty) if start else None
-        if found is None or (torn and all(o.is_depth for o in found.fresh)):
-            return None
+        found = self._aligned(new, window, end, *start, uncertainty) if start else Fault.NO_PLACE
+        if isinstance(found, Fault):
+            return found
+        if torn and all(o.is_depth for o in found.fresh):
+            return Fault.UNSURE
         mid = new.depth.exposure.mid_time
         T_found = found.window.spline.pose(mid)
         near = [(window.spline.pose(end), end)]
@@ -94,7 +97,7 @@ class Relocaliser:
             near.append((jump.ref.T_world_base @ jump.T_ref_cam, jump.time))
         if all(implausible(T, T_found, mid - time) for T, time in near):
             self._jump = _Jump(found.ref, se3.inverse(found.ref.T_world_base) @ T_found, mid)
-            return None
+            return Fault.UNCONFIRMED
         return found
 
     def _searched(
@@ -117,7 +120,7 @@ class Relocaliser:
 
     def _aligned(
         self, new: DeviceFrame, window: Window, end: float, ref: Reference, T_ref_cam: FloatArray, before: Uncertainty
-    ) -> Found | None:
+    ) -> Found | Fault:
         def restarted() -> Window:
             return window.restarted(new, end, ref.T_world_base @ T_ref_cam)
 
@@ -131,8 +134,9 @@ class Relocaliser:
         uncertainty = before.found_anew(pulled.information)
         # Depth alone is much alike in many places.
         is_sure = len(fresh) > 1 or _is_sure(fresh[0], denied=bool(new.colors and ref.points))
-        if self._fits.fault(fresh, solved, ref.pixels, pulled, True) or not (is_sure and uncertainty.is_known):
-            return None
+        fault = self._fits.fault(fresh, solved, ref.pixels, pulled, True)
+        if fault or not is_sure or not uncertainty.is_known:
+            return fault or (Fault.LEFT_OPEN if is_sure else Fault.UNSURE)
         return Found(trial, fresh, solved, ref, uncertainty)
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from rstrack.data.estimate import Estimate
 from rstrack.data.timing import Timing
@@ -51,6 +53,7 @@ class Result:
             f"{times['total_s']:.1f} s, {rate:.1f} frames/s on {info['backend']}; a frame takes "
             f"{times['median_ms']:.1f} ms (median), {times['mean_ms']:.1f} (mean), {times['p95_ms']:.1f} (95 %)",
         ]
+        lines += [why] if (why := _faults_text(info["frames"])) else []
         lines += [self.loops] if self.loops else []
         weak = sum(not f["lost"] and 0.0 < f["observability"] < _WEAK for f in info["frames"])
         if weak and info["method"] in ("rs-g", "gs-g", "baseline"):
@@ -63,6 +66,12 @@ class Result:
         lines += [f"assumed: {note}" for note in info["dataset"].get("notes", ())]
         lines += [] if self.timing is None else self.timing.lines()
         return "\n".join(lines + ([] if self.evaluation is None else ["", self.evaluation.text()]))
+
+
+def _faults_text(frames: Sequence[dict[str, Any]]) -> str:
+    """Why frames were lost, most frequent reason first."""
+    faults = Counter(f["fault"] for f in frames if f["lost"])
+    return "lost because: " + "; ".join(f"{why} ({count})" for why, count in faults.most_common()) if faults else ""
 
 
 def keyframes_text(count: int) -> str:

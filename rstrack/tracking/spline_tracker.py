@@ -34,10 +34,11 @@ from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.keyframes.store import KeyframeStore
 from rstrack.options import Options
+from rstrack.tracking.fault import Fault
 from rstrack.tracking.found_poses import FoundPoses
 from rstrack.tracking.frame_report import FrameReport, frame_report
 from rstrack.tracking.gains import Gains
-from rstrack.tracking.lost_track import TORN, FitHistory, implausible, is_settled
+from rstrack.tracking.lost_track import FitHistory, implausible, is_settled
 from rstrack.tracking.pose_covariances import PoseCovariances
 from rstrack.tracking.relocalise import Relocaliser, without_misfits
 from rstrack.tracking.uncertainty import Uncertainty
@@ -245,9 +246,13 @@ class Tracker:
             if ref.rolling is None:
                 # A rolling reference moves with what is aligned to it, which tells nothing of the two together.
                 uncertainty = uncertainty.after(new.stamp - self._found.stamps[-1], pulled.information)
-        if fault or implausible(T_predicted, window.spline.pose(mid), gap) or not uncertainty.is_known:
+        if not fault and implausible(T_predicted, window.spline.pose(mid), gap):
+            fault = Fault.TOO_FAR
+        elif not fault and not uncertainty.is_known:
+            fault = Fault.LEFT_OPEN
+        if fault:
             self._window = before
-            return self._relocalise(new, fault in TORN)
+            return self._relocalise(new, fault)
         self._window, self._covariances.uncertainty = window, uncertainty
         window.keep(fresh)
         self._chain.add(ref, on_reference, window.state, pulled.excess)
@@ -268,7 +273,7 @@ class Tracker:
     def _start(self, new: DeviceFrame) -> FrameReport:
         # Its depth is enough to begin with: the first colour image often comes a little later.
         if new.depth_share < _LEAST_DEPTH or not (self.options.geometric or new.colors):
-            return self._report(new, lost=True)
+            return self._report(new, fault=Fault.NO_DEPTH)
         self._window = self._new_window(new, self.options.knot_spacing_s)
         self._recent.append(new)
         if new.depth.exposure.lens.lines > 1:
@@ -327,7 +332,7 @@ class Tracker:
         self._recent.clear()
         self._found, self._covariances = FoundPoses(), PoseCovariances(self.rig.depth_camera.fx)
         self._chain = Chain()
-        self.reports = [r.as_lost() for r in self.reports]
+        self.reports = [r.as_lost(Fault.NO_START) for r in self.reports]
         return self._start(new)
 
     def _leave_bootstrap(self, window: Window) -> None:
@@ -354,12 +359,15 @@ class Tracker:
             report = self.reports[frame.index]
             self.reports[frame.index] = self._covariances.of(report, frame, window.spline, ref.index)
 
-    def _relocalise(self, new: DeviceFrame, torn: bool = False) -> FrameReport:
-        """Find a frame again and go on with a new piece of the spline; what was reported before stays as it is."""
+    def _relocalise(self, new: DeviceFrame, fault: Fault = Fault.NONE) -> FrameReport:
+        """Find a frame again and go on with a new piece of the spline; what was reported before stays as it is.
+
+        fault: why it is not where the motion led, if it was looked for there.
+        """
         window, ref = self._known()
-        found = self._relocaliser.find(new, window, ref, self._found.end, self._covariances.uncertainty, torn)
-        if found is None:
-            return self._report(new, lost=True)
+        found = self._relocaliser.find(new, window, ref, self._found.end, self._covariances.uncertainty, fault.is_pull)
+        if isinstance(found, Fault):
+            return self._report(new, fault=fault or found)
         # The new piece may need control points of the last frames before: their poses are kept, not their spline.
         self._found.begin_piece(window.spline, found.window.state.untouched)
         found.window.keep(found.fresh)
@@ -458,7 +466,7 @@ class Tracker:
 
     def _report(
         self, new: DeviceFrame, fresh: Sequence[Observation] = (), solved: Solved | None = None, *,
-        keyframe: bool = False, lost: bool = False, overlap: float = 1.0,
+        keyframe: bool = False, fault: Fault = Fault.NONE, overlap: float = 1.0,
     ) -> FrameReport:  # fmt: skip
-        report = frame_report(new.stamp, fresh, solved, keyframe=keyframe, lost=lost, overlap=overlap)
-        return report if lost else self._covariances.report(report, new, fresh, self._known()[0].spline)
+        report = frame_report(new.stamp, fresh, solved, keyframe=keyframe, fault=fault, overlap=overlap)
+        return report if fault else self._covariances.report(report, new, fresh, self._known()[0].spline)

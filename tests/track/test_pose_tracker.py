@@ -164,6 +164,8 @@ def test_lost_frames_are_left_out_and_the_keyframe_is_tried_again() -> None:
         frames[k] = blank(k / RATE_HZ)
     reports = [tracker.feed(frame) for frame in frames]
     assert [report.lost for report in reports] == [k in (3, 4, 5) for k in range(9)]
+    assert [bool(report.fault) for report in reports] == [report.lost for report in reports]
+    assert reports[4].fault == "hardly a pixel falls on the keyframe"
     assert tracker.keyframes == 1
     np.testing.assert_allclose(tracker.trajectory[0], np.delete(np.arange(9) / RATE_HZ, (3, 4, 5)))
     assert errors_mm(tracker, Shutter()).max() < 1.0

@@ -13,6 +13,7 @@ from rstrack_util import hand_held
 from rsgen.geometry import se3
 from rstrack.alignment.optimizer import Solved
 from rstrack.images.pyramid import DepthImage
+from rstrack.tracking.fault import Fault
 from rstrack.tracking.lost_track import FitHistory
 from rstrack.tracking.relocalise import Found, Relocaliser, _is_sure, without_misfits
 from rstrack.tracking.uncertainty import Uncertainty
@@ -55,7 +56,7 @@ class Sees(Relocaliser):
         self.started.append(T_ref_cam)
         T = self.T_found.pop(0)
         if T is None:
-            return None
+            return Fault.NO_PLACE
         spline = SimpleNamespace(pose=lambda _: T)
         return Found(SimpleNamespace(spline=spline), self.fresh, Solved(), REF, before)  # type: ignore[arg-type]
 
@@ -73,7 +74,11 @@ def away(metres: float) -> np.ndarray:
 
 
 def looked(relocaliser: Relocaliser, time: float, torn: bool = False) -> bool:
-    return relocaliser.find(frame(time), AT_END, REF, 0.5, Uncertainty(), torn) is not None  # type: ignore[arg-type]
+    return isinstance(told(relocaliser, time, torn), Found)
+
+
+def told(relocaliser: Relocaliser, time: float, torn: bool = False) -> Found | Fault:
+    return relocaliser.find(frame(time), AT_END, REF, 0.5, Uncertainty(), torn)  # type: ignore[arg-type]
 
 
 def test_near_the_end_of_the_track_one_look_is_enough() -> None:
@@ -83,13 +88,14 @@ def test_near_the_end_of_the_track_one_look_is_enough() -> None:
 def test_depth_alone_does_not_find_what_was_pulled_from_where_the_motion_led() -> None:
     """Shaken: each frame fits by itself, up to 58 mm off."""
     for fresh, is_found in (([seen("depth")], False), ([seen("color")], True), ([seen("depth"), seen("color")], True)):
-        assert looked(Sees([away(0.1)], fresh), 0.533, torn=True) == is_found
+        found = told(Sees([away(0.1)], fresh), 0.533, torn=True)
+        assert isinstance(found, Found) if is_found else found is Fault.UNSURE
         assert looked(Sees([away(0.1)], fresh), 0.533)
 
 
 def test_a_jump_needs_a_second_look_at_the_same_place() -> None:
     relocaliser = Sees([away(2.0), away(2.02)])
-    assert not looked(relocaliser, 0.533) and looked(relocaliser, 0.567)
+    assert told(relocaliser, 0.533) is Fault.UNCONFIRMED and looked(relocaliser, 0.567)
     # The second begins where the first ended.
     np.testing.assert_allclose(relocaliser.started[1], away(2.0), atol=1e-12)
 
