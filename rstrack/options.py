@@ -25,6 +25,9 @@ SOURCES: tuple[str, ...] = get_args(Source)
 Loops = Literal["off", "online", "end"]
 LOOPS: tuple[str, ...] = get_args(Loops)
 
+# Knots (s), and where frames are further apart than so long (s), knots as this part of that.
+_KNOTS_S, _SLOW_S, _KNOTS_PER_FRAME = 0.025, 0.04, 0.75
+
 
 @dataclass(frozen=True)
 class Options:
@@ -36,10 +39,11 @@ class Options:
         "has one pose a frame",
     ] = "rs-pg"
     knot_spacing_s: Annotated[
-        float,
-        "time between control points of the spline, s; with gs that of the frames if it is more, since each gives one "
-        "pose only",
-    ] = 0.025
+        float | None,
+        "time between control points of the spline, s (default: 0.025, or three quarters of the time between frames "
+        "where these come more slowly than 25 a second); with gs that of the frames if it is more, since each gives "
+        "one pose only",
+    ] = None
     knot_phase: Annotated[float, "the first knot lies this part of the spacing before the first line"] = 0.5
     backend: Annotated[Backend, "where kernels run"] = "auto"
     keyframe_overlap: Annotated[
@@ -86,7 +90,7 @@ class Options:
         for name, known in chosen + ([] if self.loops is None else [("loops", LOOPS)]):
             if getattr(self, name) not in known:
                 raise UserError(f"unknown {name} '{getattr(self, name)}': choose {', '.join(known)}")
-        if not 0.001 <= self.knot_spacing_s <= 1.0:
+        if self.knot_spacing_s is not None and not 0.001 <= self.knot_spacing_s <= 1.0:
             raise UserError(f"knot_spacing_s = {self.knot_spacing_s!r} must be between 0.001 and 1 s")
         if not 0.0 <= self.knot_phase <= 1.0:
             raise UserError(f"knot_phase = {self.knot_phase!r} must be between 0 and 1")
@@ -122,9 +126,21 @@ class Options:
         """Whether the photometric term is used."""
         return self.method in ("rs-pg", "rs-p", "gs-pg", "gs-p")
 
-    def decided(self, depth_shutter: Shutter) -> Options:
-        """With `fuse` chosen for such a depth camera where it is None."""
-        return replace(self, fuse=self.rolling or depth_shutter.readout_s == 0.0) if self.fuse is None else self
+    def decided(self, depth_shutter: Shutter, interval_s: float | None = None) -> Options:
+        """With `fuse` chosen for such a depth camera where it is None, and the knots for frames so far apart."""
+        knots = self.knot_spacing_s if interval_s is None else self.knots_s(interval_s)
+        fuse = self.rolling or depth_shutter.readout_s == 0.0 if self.fuse is None else self.fuse
+        return replace(self, fuse=fuse, knot_spacing_s=knots)
+
+    def knots_s(self, interval_s: float = 0.0) -> float:
+        """Time between knots for frames interval_s apart.
+
+        Between slow frames nothing is seen: knots as dense as for fast ones follow the noise of each frame's few lines,
+        and what is predicted from them misses the next frame.
+        """
+        if self.knot_spacing_s is not None:
+            return self.knot_spacing_s
+        return _KNOTS_S if interval_s < _SLOW_S else _KNOTS_PER_FRAME * interval_s
 
     def left_behind(self, T_base_cam: FloatArray, overlap: float) -> bool:
         """Whether a camera at T_base_cam (4, 4), that sees `overlap` of what the keyframe had, needs another one."""

@@ -155,8 +155,8 @@ def convergence(
         raise UserError("convergence: the baseline aligns no spline: choose an rs or gs method")
     chosen = choose_pairs(dataset, truth, options, pairs, seed)
     aligner = _Aligner(dataset.rig, options)
-    t0 = _span(dataset, 0)[0] - options.knot_phase * options.knot_spacing_s
-    spline = resampled(truth, t0, options.knot_spacing_s)
+    t0 = _span(dataset, 0)[0] - options.knot_phase * options.knots_s()
+    spline = resampled(truth, t0, options.knots_s())
     trials: list[Trial] = []
     off_m = 0.0
     for done, pair in enumerate(chosen, 1):
@@ -175,14 +175,14 @@ def convergence(
             trials.append(Trial(pair.keyframe, pair.frame, factor, *error, steps, believed))
         found = sum(trial.converged for trial in trials if trial.factor == 1.0)
         progress("aligning", done / len(chosen), f"{found} of {done} converged")
-    settings = options.method, len(chosen), options.knot_spacing_s
+    settings = options.method, len(chosen), options.knots_s()
     return ConvergenceResult(dataset.name, *settings, off_m, tuple(trials))
 
 
 def choose_pairs(dataset: Dataset, truth: Spline, options: Options, count: int, seed: int) -> list[Pair]:
     """Random pairs of frames one to ten apart; raises UserError if there are none, or for a seed below 0."""
     rng = generator(seed)
-    margin = _END_KNOTS * options.knot_spacing_s
+    margin = _END_KNOTS * options.knots_s()
     usable = []
     for k in range(len(dataset)):
         begin, end = _span(dataset, k)

@@ -77,7 +77,7 @@ def _tracked(dataset: Dataset, chosen: range, options: Options, progress: Progre
         return None
     # A pose a frame: the baseline's.
     period = float(np.median(np.diff(dataset.stamps)))
-    dt = min(options.knot_spacing_s, period)
+    dt = min(options.knots_s(period), period)
     t0 = float(stamps[0]) - dt
     knots = np.asarray(t0 + (np.arange(int((stamps[-1] - t0) / dt) + 5) - 1) * dt, np.float64)
     breaks = np.flatnonzero(np.diff(stamps) > _GAP * period) + 1

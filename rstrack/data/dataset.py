@@ -72,6 +72,10 @@ class Dataset:
     def __len__(self) -> int:
         return len(self.stamps)
 
+    def interval_s(self, frames: range) -> float | None:
+        """The usual time from one of these frames to the next, s; None of a single one."""
+        return float(np.median(np.diff(self.stamps[frames]))) if len(frames) > 1 else None
+
     def frame(self, k: int, *, color: bool = True) -> Frame:
         """Frame k, 0 ≤ k < len, its colour images left out on request.
 

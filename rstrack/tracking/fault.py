@@ -18,6 +18,7 @@ class Fault(StrEnum):
     OTHER_COLOR = "the colour image shows something else"
     ODD_DEPTH = "the depth image does not fit"
     ODD_COLOR = "the colour image does not fit"
+    BOTH_ODD = "depth and colour both fit worse than they should"
     DIVIDED = "depth and colour do not agree"
     PULLED = "the images do not agree with the motion"
     TOO_FAR = "it is further from where the motion led than a hand moves a camera"

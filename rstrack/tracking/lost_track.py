@@ -25,6 +25,9 @@ _LEAST_FIT_DEPTH, _LEAST_FIT_COLOR = 0.65, 0.8
 # growing with the distance; intensity).
 _WORST_DEPTH, _WORST_INTENSITY = 0.03, 0.12
 _GROWTH, _HARMLESS_DEPTH, _HARMLESS_INTENSITY = 6.0, 2e-3, 0.03
+# What each term may reach alone it may not together with the other: geometric mean of the two scales, each over its
+# limit (real recordings that are tracked well: 0.42 at most), and what colours that were left out count for.
+_WORST_TOGETHER, _LEFT_OUT = 0.45, 0.6
 # At coarse levels, before all is aligned, scales are up to 1.3 times these limits, and 2 to 50 where nothing fits.
 _HOPELESS = 2.0
 # What counts as usual grows no further than this over the best that was usual: bad must not become usual.
@@ -86,11 +89,13 @@ class FitHistory:
         return [(o, why) for o in fresh if (why := self._misfit(o, expected))]
 
     def fault(
-        self, fresh: Sequence[Observation], solved: Solved, expected: int, pulls: Pulls | None = None, new: bool = False
-    ) -> Fault:
+        self, fresh: Sequence[Observation], solved: Solved, expected: int, pulls: Pulls | None = None,
+        new: bool = False, colorless: bool = False,
+    ) -> Fault:  # fmt: skip
         """Why a frame has not been found, `Fault.NONE` if it has: then it is learnt from.
 
         expected: as in `misfits`. pulls: of `fresh`, where they are judged. new: whether its piece has just begun.
+        colorless: whether colours that do not fit have been left out.
         """
         if not fresh or not any(o.is_linearised for o in fresh):
             return Fault.NOTHING_SEEN
@@ -99,6 +104,8 @@ class FitHistory:
         misfits = self.misfits(fresh, expected)
         if misfits:
             return misfits[0][1]
+        if self._together(fresh, colorless) > _WORST_TOGETHER:
+            return Fault.BOTH_ODD
         if pulls is not None:
             distance = max(_CLOSE, fresh[0].ref.median_depth)
             torn = self._torn(pulls, distance, new)
@@ -111,6 +118,11 @@ class FitHistory:
             else:
                 self._color.learn(o.lin.next_sigma)
         return Fault.NONE
+
+    def _together(self, fresh: Sequence[Observation], colorless: bool) -> float:
+        depth = max((o.lin.next_sigma / self._limit(o) for o in fresh if o.is_depth), default=0.0)
+        color = max((o.lin.next_sigma / self._limit(o) for o in fresh if not o.is_depth), default=0.0)
+        return float(np.sqrt(depth * max(color, _LEFT_OUT if colorless else 0.0)))
 
     def _torn(self, now: Pulls, distance: float, new: bool) -> Fault:
         """distance (m), `_CLOSE` at least: of what is seen; where noise grows with its square, so do pulls."""

@@ -126,15 +126,16 @@ class Relocaliser:
 
         trial, fresh = restarted(), self.observe(new, ref, _matched(new, ref))
         solved = trial.solve(fresh, LEVELS, hopeless=self._fits.is_hopeless)
-        fitting = without_misfits(self._fits, fresh, fresh, ref)
+        fitting, colorless = without_misfits(self._fits, fresh, fresh, ref), False
         if len(fitting) < len(fresh) and not self._fits.is_hopeless(fresh):
+            colorless = all(o.is_depth for o in fitting)
             trial, fresh = restarted(), fitting
             solved = trial.solve(fresh, LEVELS, hopeless=self._fits.is_hopeless)
         pulled = pulls(fresh, trial.state)
         uncertainty = before.found_anew(pulled.information)
         # Depth alone is much alike in many places.
         is_sure = len(fresh) > 1 or _is_sure(fresh[0], denied=bool(new.colors and ref.points))
-        fault = self._fits.fault(fresh, solved, ref.pixels, pulled, True)
+        fault = self._fits.fault(fresh, solved, ref.pixels, pulled, True, colorless)
         if fault or not is_sure or not uncertainty.is_known:
             return fault or (Fault.LEFT_OPEN if is_sure else Fault.UNSURE)
         return Found(trial, fresh, solved, ref, uncertainty)

@@ -138,6 +138,8 @@ def track(
     def again(index: int) -> Frame:
         return _readable(load(fed[index]))
 
+    options = options.decided(dataset.rig.depth_shutter, dataset.interval_s(chosen))
+
     tracker = make_tracker(dataset.rig, options, load=again)
     from rstrack.tracking.checkpoint import Done, checkpoint_of  # these import Dr.Jit
     from rstrack.tracking.loop_tracker import LoopTracker

@@ -49,6 +49,8 @@ _MADE_ANEW = "rig", "options", "_device", "_terms", "_maker"
 # Seconds without a frame after which the motion before says nothing about where the camera is, and beyond which
 # frames hardly belong to one recording.
 _GAP_S, _BREAK_S = 0.3, 3600.0
+# Seconds ahead that constant velocity predicts to within a few pixels: a hand turns by up to 10 rad/s² more.
+_SURE_S = 0.045
 # Knots are never further apart than this many times the spacing that was asked for.
 _WIDEST = 2.0
 # Part of the pixels that must have depth for a frame to become a keyframe.
@@ -228,20 +230,22 @@ class Tracker:
         gauge = ref if not window.is_frozen(ref.t) and new.depth.exposure.lens.lines == 1 else None
         mid, T_predicted = new.depth.exposure.mid_time, window.spline.pose(new.depth.exposure.mid_time)
         coupled = ref.rolling is not None
-        levels = LEVELS if young else TRACKING_LEVELS
+        levels = LEVELS if young or gap > _SURE_S else TRACKING_LEVELS
         solved = window.solve(fresh, levels, gauge, coupled, self._fits.is_hopeless)
         if not is_settled(solved) and not self._fits.is_hopeless(fresh):
             # Its steps went to and fro; that says nothing against the place.
             solved = window.solve(fresh, (0,), gauge, coupled)
         fitting = without_misfits(self._fits, fresh, on_reference, ref)
+        colorless = False
         if len(fitting) < len(fresh) and not self._fits.is_hopeless(on_reference):
+            colorless = not all(o.is_depth for o in fresh) and all(o.is_depth for o in fitting)
             window = before.copy()
             window.predict(new, self._found.end, young)
             fresh, on_reference = fitting, [o for o in fitting if o.ref is ref]
             solved = window.solve(fresh, levels, gauge, coupled)
         with self._terms.timer("judgement"):
             pulled = pulls(on_reference, window.state)
-            fault = self._fits.fault(on_reference, solved, ref.pixels, pulled, young)
+            fault = self._fits.fault(on_reference, solved, ref.pixels, pulled, young, colorless)
             uncertainty = self._covariances.uncertainty
             if ref.rolling is None:
                 # A rolling reference moves with what is aligned to it, which tells nothing of the two together.
@@ -274,25 +278,28 @@ class Tracker:
         # Its depth is enough to begin with: the first colour image often comes a little later.
         if new.depth_share < _LEAST_DEPTH or not (self.options.geometric or new.colors):
             return self._report(new, fault=Fault.NO_DEPTH)
-        self._window = self._new_window(new, self.options.knot_spacing_s)
+        self._begin(new, self.options.knots_s())
         self._recent.append(new)
-        if new.depth.exposure.lens.lines > 1:
-            self._reference = self._maker.rolling(new.index, new.depth, new.colors, self._window.spline)
-        else:
+        if new.depth.exposure.lens.lines == 1:
             self._new_keyframe(new, None)
             self._covariances.uncertainty = Uncertainty.of_first()
         self._placed(new)
         return self._report(new, keyframe=True)
 
-    def _new_window(self, first: DeviceFrame, dt: float) -> Window:
-        return Window.still(self._terms, self.rig.depth_camera.fx, first, dt, self.options.knot_phase)
+    def _begin(self, first: DeviceFrame, dt: float) -> None:
+        """A spline with knots dt s apart; a rolling first frame is what others are aligned to."""
+        self._window = Window.still(self._terms, self.rig.depth_camera.fx, first, dt, self.options.knot_phase)
+        if first.depth.exposure.lens.lines > 1:
+            self._reference = self._maker.rolling(first.index, first.depth, first.colors, self._window.spline)
 
     def _fit_knots(self, gap: float) -> None:
-        """A global shutter gives one pose a frame, `gap` s apart: no more knots than that can be told."""
+        """Knots for frames `gap` s apart; a global shutter gives one pose each: no more knots than that can be told."""
         window, _ = self._known()
-        dt = window.state.dt
+        dt = self.options.knots_s(gap)
         if self._recent[0].depth.exposure.lens.lines == 1 and gap > dt:
-            self._window = self._new_window(self._recent[0], min(gap, _WIDEST * dt))
+            dt = min(gap, _WIDEST * dt)
+        if dt != window.state.dt:
+            self._begin(self._recent[0], dt)
 
     def _bootstrap(self, new: DeviceFrame) -> FrameReport:
         """Joint alignment of the first frames with the first one, all of them rolling, from zero motion."""

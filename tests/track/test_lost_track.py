@@ -44,9 +44,9 @@ def term(
 
 def fault(
     history: FitHistory, terms: Iterable[Any], shift: float = 0.05, expected: int = 5000, pulled: Pulls | None = None,
-    new: bool = False,
+    new: bool = False, colorless: bool = False,
 ) -> str:  # fmt: skip
-    return history.fault(list(terms), Solved(last_shift=shift), expected, pulled, new)
+    return history.fault(list(terms), Solved(last_shift=shift), expected, pulled, new, colorless)
 
 
 def test_errors_of_depth_may_grow_with_the_square_of_the_distance() -> None:
@@ -154,6 +154,24 @@ def test_depth_and_colour_are_remembered_apart() -> None:
     assert fault(history, [term("depth", 1e-3), term("color", 0.089)]) == ""
     assert fault(history, [term("depth", 1e-3), term("color", 0.091)]) == odd("color")
     assert fault(history, [term("depth", 6.1e-3), term("color", 0.015)]) == odd("depth")
+
+
+def test_both_terms_may_not_fit_badly_at_once() -> None:
+    """Limits of 0.03 m and 0.12 to begin with, of which each alone may reach all, and both 0.45 in geometric mean."""
+    for depth, color, says in (
+        (0.44, 0.45, ""),
+        (0.46, 0.45, Fault.BOTH_ODD),
+        (0.2, 1.0, ""),
+        (0.21, 1.0, Fault.BOTH_ODD),
+    ):
+        assert fault(FitHistory(), [term("depth", 0.03 * depth), term("color", 0.12 * color)]) == says
+    assert fault(FitHistory(), [term("depth", 0.03)]) == fault(FitHistory(), [term("color", 0.12)]) == ""
+
+
+def test_colours_that_were_left_out_speak_against_depth_that_fits_badly() -> None:
+    for depth, says in ((0.33, ""), (0.34, Fault.BOTH_ODD)):  # 0.45² / 0.6
+        assert fault(FitHistory(), [term("depth", 0.03 * depth)], colorless=True) == says
+        assert fault(FitHistory(), [term("depth", 0.03 * depth)]) == ""
 
 
 def test_all_misfits_are_named() -> None:

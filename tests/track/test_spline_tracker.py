@@ -194,3 +194,21 @@ def test_frames_out_of_order_or_of_another_camera() -> None:
 def test_options_are_checked(wrong: dict[str, object]) -> None:
     with pytest.raises(UserError, match=str(next(iter(wrong))).split("_")[0]):
         Options(**wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("interval", "knots"), [(1 / 60, 0.025), (1 / 30, 0.025), (0.0399, 0.025), (1 / 15, 0.05), (0.1, 0.075)]
+)
+def test_slow_frames_get_fewer_knots_unless_they_are_given(interval: float, knots: float) -> None:
+    assert Options().knots_s(interval) == pytest.approx(knots)
+    assert Options(knot_spacing_s=0.03).knots_s(interval) == 0.03
+    decided = Options().decided(ROLLING, interval)
+    assert decided.knot_spacing_s == pytest.approx(knots) and decided.decided(ROLLING) == decided
+
+
+@pytest.mark.parametrize("method", ["rs-pg", "rs-g"])
+@pytest.mark.parametrize(("every", "knots"), [(2, 0.05), (3, 0.075)])
+def test_frames_come_as_slowly_as_they_like(method: Method, every: int, knots: float) -> None:
+    tracker = feed(tracker_of(method), (frame_at(k) for k in range(0, 37, every)))
+    assert lost(tracker) == [] and worst_step(tracker) < 4e-3
+    assert tracker.spline is not None and tracker.spline.dt == pytest.approx(knots)

@@ -54,7 +54,7 @@ def load_stretch(
     """
     views = [_view(terms, dataset, k, options.max_depth) for k in frames]
     begin, end = span([taken for v in views for taken in (v.depth, v.color) if taken is not None], p)
-    knot_s = options.knot_spacing_s
+    knot_s = options.knots_s()
     t0 = begin - _MARGIN_S - options.knot_phase * knot_s
     count = int(np.ceil((end + _MARGIN_S - t0) / knot_s)) + 3
     return Stretch(views, like(track, t0, knot_s, count))
