@@ -85,7 +85,7 @@ def long_run(
     images = list(dataset.frames(0, loop))
     period = float(np.median(np.diff(dataset.stamps)))
     again_s = images[-1].depth.stamp - images[0].depth.stamp + period
-    tracker = make_tracker(dataset.rig, options)
+    tracker = make_tracker(dataset.rig, options, interval_s=period)
     blocks: list[Block] = []
     ms: list[float] = []
     for n in range(frames // BLOCK * BLOCK):

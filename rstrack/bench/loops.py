@@ -78,7 +78,7 @@ def loop_quality(
     if not isinstance(truth, Spline):
         raise UserError(f"{dataset.root}: has no true spline to compare loops with: give a sequence of rsgen's")
     chosen = range(len(dataset))[frames]
-    tracker = make_tracker(dataset.rig, replace(options, loops="off"))
+    tracker = make_tracker(dataset.rig, replace(options, loops="off"), interval_s=dataset.interval_s(chosen))
     if not isinstance(tracker, Tracker) or not len(chosen):
         raise UserError(
             f"{dataset.root}: has no frame {frames.start}" if not len(chosen) else "baseline: has no spline"

@@ -162,7 +162,7 @@ def time_methods(
 
 def _time(dataset: Dataset, options: Options, frames: int, warm_up: int, progress: Progress) -> MethodTimes:
     watch, reading = Stopwatch(), Stopwatch()
-    tracker = make_tracker(dataset.rig, options, watch.timed)
+    tracker = make_tracker(dataset.rig, options, watch.timed, interval_s=dataset.interval_s(range(frames)))
     frame_ms: list[float] = []
     for k in range(frames):
         if k == warm_up:

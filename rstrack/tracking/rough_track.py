@@ -25,8 +25,8 @@ def rough_track(dataset: Dataset, frames: range, options: Options, done: Callabl
     """
     has_color = options.photometric
     step = 2 if dataset.rig.depth_camera.width >= _LARGE and not has_color else 1
-    options = options.decided(dataset.rig.depth_shutter, dataset.interval_s(frames))
-    tracker = make_tracker(replace(dataset.rig, depth_camera=_thinned(dataset.rig.depth_camera, step)), options)
+    rig = replace(dataset.rig, depth_camera=_thinned(dataset.rig.depth_camera, step))
+    tracker = make_tracker(rig, options, interval_s=dataset.interval_s(frames))
     for count, k in enumerate(frames, 1):
         try:
             frame = dataset.frame(k, color=has_color)

@@ -79,9 +79,12 @@ class AnyTracker(Protocol):
 
 
 def make_tracker(
-    rig: Rig, options: Options, timer: Timer | None = None, load: Callable[[int], Frame] | None = None
-) -> AnyTracker:
+    rig: Rig, options: Options, timer: Timer | None = None, load: Callable[[int], Frame] | None = None,
+    interval_s: float | None = None,
+) -> AnyTracker:  # fmt: skip
     """The tracker of options.method; `timer` watches the parts of its work. load: as in `LoopTracker`.
+
+    interval_s: the usual time between frames, where that is known; otherwise the first two tell.
 
     Raises UserError if its backend cannot work on this machine.
     """
@@ -91,7 +94,7 @@ def make_tracker(
     engine(options.backend)
     from rstrack.images.device_frame import untimed
 
-    timer = timer or untimed
+    timer, options = timer or untimed, options.decided(rig.depth_shutter, interval_s)
     if options.method == "baseline":
         from rstrack.tracking.pose_tracker import BaselineTracker
 
@@ -138,9 +141,7 @@ def track(
     def again(index: int) -> Frame:
         return _readable(load(fed[index]))
 
-    options = options.decided(dataset.rig.depth_shutter, dataset.interval_s(chosen))
-
-    tracker = make_tracker(dataset.rig, options, load=again)
+    tracker = make_tracker(dataset.rig, options, load=again, interval_s=dataset.interval_s(chosen))
     from rstrack.tracking.checkpoint import Done, checkpoint_of  # these import Dr.Jit
     from rstrack.tracking.loop_tracker import LoopTracker
 

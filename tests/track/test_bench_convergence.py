@@ -230,7 +230,7 @@ class _Feigned:
 
 
 def test_lost_and_broken_starts_are_listed(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rstrack.bench.bootstrap.make_tracker", lambda *_: _Feigned(dataset))
+    monkeypatch.setattr("rstrack.bench.bootstrap.make_tracker", lambda *_, **__: _Feigned(dataset))
     report = bootstraps(dataset, OPTIONS, starts=99, frames=6)
     runs = {s.frame: s for s in report.starts}
     assert sorted(runs) == list(range(FRAMES - 5))

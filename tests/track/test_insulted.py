@@ -121,7 +121,7 @@ class Told:
 def outcome(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> Any:
     def make(off: dict[int, float | None], first: int = 10, last: int = 13, **told: Any) -> Outcome:
         _, truth = true_poses(SPLINE, dataset.stamps, interpolate=True)
-        monkeypatch.setattr(insulted, "make_tracker", lambda *_: Told(truth, off, **told))
+        monkeypatch.setattr(insulted, "make_tracker", lambda *_, **__: Told(truth, off, **told))
         return judged(Insult("covered", dataset, first, last), Options(), seed=4)
 
     return make

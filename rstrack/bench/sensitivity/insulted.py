@@ -201,7 +201,7 @@ class _Watched:
 
 
 def _watch(dataset: Dataset, options: Options) -> _Watched:
-    tracker = make_tracker(dataset.rig, options)
+    tracker = make_tracker(dataset.rig, options, interval_s=dataset.interval_s(range(len(dataset))))
     seen = _Watched()
     settled: dict[int, FloatArray] = {}
     for k, frame in enumerate(dataset.frames()):
