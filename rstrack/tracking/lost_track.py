@@ -77,9 +77,14 @@ class _Usual:
 
 
 class FitHistory:
-    """Remembers how well the last good frames fitted."""
+    """Remembers how well the last good frames fitted.
 
-    def __init__(self) -> None:
+    is_modelled: whether the lines' times are; taken for a global one, a rolling shutter makes both terms fit worse
+    whenever the camera moves fast.
+    """
+
+    def __init__(self, is_modelled: bool = True) -> None:
+        self._is_modelled = is_modelled
         self._depth = _Usual(_WORST_DEPTH, _HARMLESS_DEPTH)
         self._color = _Usual(_WORST_INTENSITY, _HARMLESS_INTENSITY)
         self._pulls: deque[Pulls] = deque(maxlen=_MEMORY)
@@ -104,7 +109,7 @@ class FitHistory:
         misfits = self.misfits(fresh, expected)
         if misfits:
             return misfits[0][1]
-        if self._together(fresh, colorless) > _WORST_TOGETHER:
+        if self._is_modelled and self._together(fresh, colorless) > _WORST_TOGETHER:
             return Fault.BOTH_ODD
         if pulls is not None:
             distance = max(_CLOSE, fresh[0].ref.median_depth)

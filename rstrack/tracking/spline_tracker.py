@@ -75,7 +75,7 @@ class Tracker:
         self._reference: Reference | None = None
         # Frames whose control points still move, and the newest one whose do not.
         self._recent: deque[DeviceFrame] = deque()
-        self._fits = FitHistory()
+        self._fits = FitHistory(self.options.rolling or rig.depth_shutter.readout_s == 0.0)
         self._independence = Independence(), Independence()  # of depth pixels, and of colour pixels
         # What all frames said of the spline.
         self._chain = Chain()

@@ -168,6 +168,11 @@ def test_both_terms_may_not_fit_badly_at_once() -> None:
     assert fault(FitHistory(), [term("depth", 0.03)]) == fault(FitHistory(), [term("color", 0.12)]) == ""
 
 
+def test_a_rolling_shutter_taken_for_a_global_one_may_make_both_fit_badly() -> None:
+    for modelled, says in ((True, Fault.BOTH_ODD), (False, "")):
+        assert fault(FitHistory(modelled), [term("depth", 0.028), term("color", 0.11)]) == says
+
+
 def test_colours_that_were_left_out_speak_against_depth_that_fits_badly() -> None:
     for depth, says in ((0.33, ""), (0.34, Fault.BOTH_ODD)):  # 0.45² / 0.6
         assert fault(FitHistory(), [term("depth", 0.03 * depth)], colorless=True) == says
