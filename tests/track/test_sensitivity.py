@@ -169,7 +169,7 @@ def test_half_the_depth_is_missing_in_blocks(dataset: Dataset) -> None:
 
 def test_a_global_shutter_is_not_told_readouts(dataset: Dataset) -> None:
     names = [case.name for case in cases(dataset)]
-    assert names[0] == "untouched" and len(set(names)) == len(names) == 21
+    assert names[0] == "untouched" and len(set(names)) == len(names) == 22
     still = [case.name for case in cases(readout_told(dataset, factor=0.0))]
     assert [name for name in names if name not in still] == [n for n in names if "readout" in n or "global" in n]
 
@@ -284,7 +284,7 @@ def test_a_table_of_every_case_that_resumes(
     ]
     assert main(words) == 130 and len(json.loads((tmp_path / "t.json").read_text())["scores"]) == 3
     capfd.readouterr()
-    assert main(words) == 0 and len(tracked) == 4 + 18
+    assert main(words) == 0 and len(tracked) == 4 + 19
     out = capfd.readouterr().out.splitlines()
     scores = json.loads((tmp_path / "t.json").read_text())["scores"]
     assert out[0] == "rs-g on synthetic, frames 1 to 7" and out[2].split()[:2] == ["case", "ATE,"]
@@ -294,7 +294,7 @@ def test_a_table_of_every_case_that_resumes(
     table = (tmp_path / "t.md").read_text().splitlines()
     assert table[2].count("|") == table[3].count("|") == 8 and len(table) == 4 + len(scores)
     # Other settings begin anew, other files stay.
-    assert len(run_sensitivity(open_dataset(sequence), Options(method="baseline"), slice(0, 4)).scores) == 21
+    assert len(run_sensitivity(open_dataset(sequence), Options(method="baseline"), slice(0, 4)).scores) == 22
     (tmp_path / "t.json").write_text("{}")
     assert main(words) == 2 and "t.json: is no table" in capfd.readouterr().err
 

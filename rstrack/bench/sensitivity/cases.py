@@ -56,6 +56,7 @@ def cases(dataset: Dataset, seed: int = 0) -> tuple[Case, ...]:
         Case("stamps jitter 2 ms RMS", lambda d: jittered(d, 0.002, seed)),
         Case("depth only to 2 m", lambda d: with_depth(d, lambda _, z: np.where(z > 2.0, np.float32(0), z))),
         Case("every second frame", lambda d: reordered(d, range(0, len(d), 2), d.stamps[::2])),
+        Case("every third frame", lambda d: reordered(d, range(0, len(d), 3), d.stamps[::3])),
         Case("half the depth missing in blocks", lambda d: depth_in_blocks(d, seed)),
         *(Case(f"colours x {g:g} after a third", partial(darkened, factor=g)) for g in (0.92, 0.5, 2.0)),
         Case("a flash x 2 on every ninth image", flashed),
