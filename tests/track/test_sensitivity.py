@@ -288,7 +288,7 @@ def test_a_table_of_every_case_that_resumes(
     out = capfd.readouterr().out.splitlines()
     scores = json.loads((tmp_path / "t.json").read_text())["scores"]
     assert out[0] == "rs-g on synthetic, frames 1 to 7" and out[2].split()[:2] == ["case", "ATE,"]
-    assert len(out) == 3 + len(scores) == 24 and scores[0]["case"] == "untouched"
+    assert len(out) == 3 + len(scores) == 25 and scores[0]["case"] == "untouched"
     assert out[3].split()[-2:] == [str(scores[0]["lost"]), "7"] and out[3].split()[2] == "1.00"
     assert f"{1e3 * scores[5]['ate_m']:.3f}" in out[8]
     table = (tmp_path / "t.md").read_text().splitlines()
