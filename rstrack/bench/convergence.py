@@ -30,7 +30,7 @@ from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.metrics.association import angles_deg
 from rstrack.options import Options
-from rstrack.tracking.lost_track import FitHistory
+from rstrack.tracking.judgement.lost_track import FitHistory
 from rstrack.tracking.window import Window
 
 # What a frame is moved by, in metres and degrees, and multiples of it; 0 tells how good the truth itself is as a start.

@@ -8,8 +8,8 @@ camera.yaml (depth left out: registered to colour, read out as colour is, 5000 u
 
 Each may have model (pinhole, radtan, fisheye), distortion, exposure_s and scan as in rsgen's configs. T_color_depth
 (4x4) is the identity where it is left out. color.offset_s: seconds added to colour's stamps; auto: see
-`rstrack.data.timing`; color.drift_ppm: millionths by which that grows over the recording, in whose middle it holds;
-both are what `rstrack calibrate` finds, which writes such a file. stamps: auto, raw or regular, see there too.
+`rstrack.data.clocks.timing`; color.drift_ppm: millionths by which that grows over the recording, in whose middle it
+holds; both are what `rstrack calibrate` finds, which writes such a file. stamps: auto, raw or regular, see there too.
 depth.registered: warped into the colour camera, see `rstrack.data.registered_rows`. calibration.yaml: see
 `rstrack.data.opencv_camera_file`.
 """
@@ -28,11 +28,11 @@ from rsgen.files import read_text, read_yaml
 from rsgen.geometry.camera import Camera, Model
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.sequence.format import DEPTH_SCALE
+from rstrack.data.clocks.timing import StampsMode
 from rstrack.data.depth_error import NONE, DepthError
 from rstrack.data.opencv_camera_file import check_fy, extrinsic, is_opencv, read_opencv_rig
 from rstrack.data.registered_rows import DepthSensor, registered_shutter
 from rstrack.data.rig import Rig
-from rstrack.data.timing import StampsMode
 
 EXAMPLE = "color: {width: 640, height: 480, intrinsics: [fx, fy, cx, cy], readout_s: 0.028}"
 _KEYS = "color, depth, T_color_depth and stamps, each camera with width, height, intrinsics, readout_s"

@@ -22,14 +22,14 @@ from rsgen.sequence.format import DEPTH_SCALE, StreamName
 from rsgen.sequence.reader import Sequence, read_sequence
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.camera_file import read_rig
+from rstrack.data.clocks.timing import Timing, stream_timing
 from rstrack.data.depth_error import NONE, DepthError
-from rstrack.data.generated import as_recorded, is_exact, with_depth_scale
+from rstrack.data.layouts.generated import as_recorded, is_exact, with_depth_scale
+from rstrack.data.layouts.seven_scenes import is_seven_scenes, read_seven_scenes
+from rstrack.data.layouts.tum_folder import TumFolder, read_tum_folder
 from rstrack.data.noise import ImageReader
 from rstrack.data.prefetch import prefetched
 from rstrack.data.rig import Frame, Image, Rig
-from rstrack.data.seven_scenes import is_seven_scenes, read_seven_scenes
-from rstrack.data.timing import Timing, stream_timing
-from rstrack.data.tum_folder import TumFolder, read_tum_folder
 
 __all__ = ["Dataset", "Frame", "Image", "Rig", "group_colors", "open_dataset"]
 
@@ -44,8 +44,8 @@ class Dataset:
     stamps: (n,) seconds, one for each depth image, strictly increasing. color_stamps: (m,) seconds, increasing.
     groups: for each frame the indices of its colour images.
     truth: T_world_depth(t), of exact rsgen sequences. truth_poses: T_world_depth, of others that have it.
-    sequence: the rsgen sequence itself, where it is an exact one (`rstrack.data.generated`). notes: what had to be
-    assumed when it was read. timing: of recordings, how their stamps came about. color_drift: seconds a second that
+    sequence: the rsgen sequence itself, where it is an exact one (`rstrack.data.layouts.generated`). notes: what had to
+    be assumed when it was read. timing: of recordings, how their stamps came about. color_drift: seconds a second that
     colour's offset grows by, see `with_color_offset`. scan_named: whether the cameras' description says which way
     images are read. depth_scale: units per metre of the depth images. depth_offset_s: what has been added to the stamps
     of registered depth, see `rstrack.data.camera_file`. images: as they are on disk; depth_error: of the depth in them.
@@ -168,8 +168,8 @@ def open_dataset(path: Path, camera_file: Path | None = None) -> Dataset:
     """Read the description and listings of a folder; images are read when asked for.
 
     path: a sequence that rsgen wrote (it has a sequence.yaml, which holds the cameras), or a TUM RGB-D or ICL-NUIM
-      folder: rgb.txt and depth.txt, or associations.txt; see `rstrack.data.tum_folder`; or one in the layout of
-      7-Scenes: frame-000000.depth.png and so on; see `rstrack.data.seven_scenes`.
+      folder: rgb.txt and depth.txt, or associations.txt; see `rstrack.data.layouts.tum_folder`; or one in the layout of
+      7-Scenes: frame-000000.depth.png and so on; see `rstrack.data.layouts.seven_scenes`.
     camera_file: the cameras, instead of those that a sequence.yaml, or a camera.yaml or calibration.yaml in the folder,
       tells; see `rstrack.data.camera_file`.
     Raises UserError, one line: what is missing or wrong, where, and how to mend it.

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from rsgen.array_types import FloatArray
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Solved
-from rstrack.tracking.fault import Fault
+from rstrack.tracking.judgement.fault import Fault
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,8 @@ from rstrack.adjustment.moves import Moves
 from rstrack.adjustment.rigid import Usual
 from rstrack.data.rig import Frame
 from rstrack.keyframes.archive import Archive
+from rstrack.tracking.judgement.uncertainty import SYSTEMATIC_PX
 from rstrack.tracking.spline_tracker import Tracker
-from rstrack.tracking.uncertainty import SYSTEMATIC_PX
 
 # Loops that `info` lists at most.
 _LISTED = 1000

@@ -24,8 +24,8 @@ from rstrack.images.pyramid import LEVELS, DepthImage
 from rstrack.keyframes.keyframe import Reference, strides
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.options import Options
-from rstrack.tracking.fault import Fault
 from rstrack.tracking.frame_report import FrameReport
+from rstrack.tracking.judgement.fault import Fault
 
 # Error at the start of an alignment, as σ in m; re-estimated with every step.
 _START_DEPTH = 5e-3

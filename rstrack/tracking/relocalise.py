@@ -20,9 +20,9 @@ from rstrack.keyframes import coarse_search
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.store import KeyframeStore
 from rstrack.options import Options
-from rstrack.tracking.fault import Fault
-from rstrack.tracking.lost_track import FitHistory, implausible
-from rstrack.tracking.uncertainty import Uncertainty
+from rstrack.tracking.judgement.fault import Fault
+from rstrack.tracking.judgement.lost_track import FitHistory, implausible
+from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.window import LEVELS, Window
 
 # Keyframes at which a lost frame is looked for, at once.

@@ -34,14 +34,14 @@ from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.keyframes.store import KeyframeStore
 from rstrack.options import Options
-from rstrack.tracking.fault import Fault
 from rstrack.tracking.found_poses import FoundPoses
 from rstrack.tracking.frame_report import FrameReport, frame_report
 from rstrack.tracking.gains import Gains
-from rstrack.tracking.lost_track import FitHistory, implausible, is_settled
-from rstrack.tracking.pose_covariances import PoseCovariances
+from rstrack.tracking.judgement.fault import Fault
+from rstrack.tracking.judgement.lost_track import FitHistory, implausible, is_settled
+from rstrack.tracking.judgement.pose_covariances import PoseCovariances
+from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.relocalise import Relocaliser, without_misfits
-from rstrack.tracking.uncertainty import Uncertainty
 from rstrack.tracking.window import LEVELS, TRACKING_LEVELS, Window
 
 # What a tracker of the same rig and options would make in the same way.

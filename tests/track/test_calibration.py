@@ -49,10 +49,10 @@ from rstrack.calibration.unknowns.parameters import (
     free_of,
 )
 from rstrack.cli.main import main
+from rstrack.data.clocks.timing import Timing, stream_timing
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.depth_error import DepthError
 from rstrack.data.noise import ImageReader, NoisyImages, with_noise
-from rstrack.data.timing import Timing, stream_timing
 from rstrack.options import Options
 
 READOUT_S, RATE_HZ, FRAMES = 0.014, 60.0, 60

@@ -12,8 +12,8 @@ import pytest
 from rsgen.geometry import se3
 from rstrack.alignment.optimizer import Solved
 from rstrack.alignment.pull import Pulls
-from rstrack.tracking.fault import Fault
-from rstrack.tracking.lost_track import FitHistory, implausible, is_settled
+from rstrack.tracking.judgement.fault import Fault
+from rstrack.tracking.judgement.lost_track import FitHistory, implausible, is_settled
 
 NOTHING, UNSETTLED = Fault.NOTHING_SEEN, Fault.UNSETTLED
 NAMES = {"depth": "depth", "color": "colour"}

@@ -13,10 +13,10 @@ from rstrack_util import hand_held
 from rsgen.geometry import se3
 from rstrack.alignment.optimizer import Solved
 from rstrack.images.pyramid import DepthImage
-from rstrack.tracking.fault import Fault
-from rstrack.tracking.lost_track import FitHistory
+from rstrack.tracking.judgement.fault import Fault
+from rstrack.tracking.judgement.lost_track import FitHistory
+from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.relocalise import Found, Relocaliser, _is_sure, without_misfits
-from rstrack.tracking.uncertainty import Uncertainty
 
 REF: Any = SimpleNamespace(pixels=5000, T_world_base=np.eye(4), median_depth=1.0)
 

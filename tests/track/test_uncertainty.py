@@ -10,7 +10,7 @@ import pytest
 from rsgen.geometry import se3
 from rstrack.data.estimate import Estimate
 from rstrack.metrics.consistency import covariances, step_nees
-from rstrack.tracking.uncertainty import Uncertainty
+from rstrack.tracking.judgement.uncertainty import Uncertainty
 
 DT = 1.0 / 30.0
 

@@ -1,9 +1,9 @@
 """Sequences of rsgen as a tracker gets them: exact, or as what a driver and a registration leave of them.
 
 Where a sequence's listed stamps are a driver's, or its depth is registered, it is a recording like any other: cameras
-as sequence.yaml tells them, stamps that are arrival times (`rstrack.data.timing`), colour's offset not known. Its truth
-is the pose of each depth frame when it was taken, under the stamp at which it is tracked. Cameras that are declared
-wrong on purpose are given as they are declared; the truth is that of the cameras that took the images.
+as sequence.yaml tells them, stamps that are arrival times (`rstrack.data.clocks.timing`), colour's offset not known.
+Its truth is the pose of each depth frame when it was taken, under the stamp at which it is tracked. Cameras that are
+declared wrong on purpose are given as they are declared; the truth is that of the cameras that took the images.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import numpy as np
 from rsgen.geometry import se3
 from rsgen.sequence.reader import Sequence
 from rsgen.sequence.trajectory import Trajectory
+from rstrack.data.clocks.timing import StampsMode, Timing, stream_timing
 from rstrack.data.registered_rows import DepthSensor, registered_shutter
 from rstrack.data.rig import Rig
-from rstrack.data.timing import StampsMode, Timing, stream_timing
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.linalg import spsolve
 
 from rsgen.array_types import FloatArray
-from rstrack.data.running_clock import RunningClock
+from rstrack.data.clocks.running_clock import RunningClock
 
 __all__ = ["Clock", "RunningClock", "drift_ppm", "estimate_clock", "regular", "straightened"]
 

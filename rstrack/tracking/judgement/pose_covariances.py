@@ -13,7 +13,7 @@ from rstrack.alignment.observation import Observation
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.frame_report import FrameReport
-from rstrack.tracking.uncertainty import Uncertainty
+from rstrack.tracking.judgement.uncertainty import Uncertainty
 
 
 class PoseCovariances:

@@ -30,8 +30,8 @@ from rsgen.geometry.shutter import Shutter
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.camera_file import RigFile, read_rig
 from rstrack.data.image_files import ImageFiles, decode_color, decode_depth, first_size, repeated
+from rstrack.data.layouts.tum_folder import TumFolder, find_camera_file, repeats_note
 from rstrack.data.rig import Rig
-from rstrack.data.tum_folder import TumFolder, find_camera_file, repeats_note
 
 IntArray = npt.NDArray[np.int64]
 

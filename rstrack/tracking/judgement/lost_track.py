@@ -14,7 +14,7 @@ from rsgen.geometry import se3
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Solved
 from rstrack.alignment.pull import Pulls
-from rstrack.tracking.fault import Fault
+from rstrack.tracking.judgement.fault import Fault
 
 # A term has to see this share of the reference's pixels, and so many at least, to say anything.
 _LEAST_SHARE = 0.08

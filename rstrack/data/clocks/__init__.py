@@ -1,0 +1,1 @@
+"""When images were taken: clocks behind stamps that are times of arrival."""
