@@ -21,16 +21,16 @@ from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.store import KeyframeStore
 from rstrack.options import Options
 from rstrack.tracking.judgement.fault import Fault
-from rstrack.tracking.judgement.lost_track import FitHistory, implausible
+from rstrack.tracking.judgement.lost_track import FitHistory, coarseness, implausible
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.window import LEVELS, Window
 
 # Keyframes at which a lost frame is looked for, at once.
 _PLACES = 3
 # Part of the pixels that must fit where a place is recognised by one image though the others say otherwise. How well
-# depth alone must tell all motions (see `FrameReport.observability`), since one wall fits another: less where pixels
-# are larger than those of this focal length, by the square of their size, since corners count the less there.
-_SURE_FIT, _SURE_SEEN, _FINE_FOCAL = 0.9, 2e-3, 240.0
+# depth alone must tell all motions (see `FrameReport.observability`), since one wall fits another; less where pixels
+# are large.
+_SURE_FIT, _SURE_SEEN = 0.9, 2e-3
 
 
 @dataclass(frozen=True)
@@ -145,8 +145,7 @@ def _is_sure(alone: Observation, denied: bool) -> bool:
     """Whether an image tells the place without others; denied: there are some, and they say otherwise."""
     if not alone.is_linearised or (denied and alone.lin.fit < _SURE_FIT):
         return False
-    finer = min(1.0, alone.ref.lens.camera.fx / _FINE_FOCAL)
-    return not alone.is_depth or alone.lin.observability >= _SURE_SEEN * finer**2
+    return not alone.is_depth or alone.lin.observability >= _SURE_SEEN * coarseness(alone) ** -2
 
 
 def without_misfits(

@@ -32,14 +32,15 @@ def odd(kind: str) -> str:
 
 
 def term(
-    kind: str, sigma: float, count: int = 5000, floor: float = 0.0, fit: float = 1.0, distance: float = 1.0
-) -> Any:
-    """An observation of a linearised image: its scale, pixels, smallest credible scale, part that fits, and how far
-    away (m) what it shows is."""
-    lin = SimpleNamespace(count=count, next_sigma=sigma, floor=floor, fit=fit)
-    return SimpleNamespace(
-        is_depth=kind == "depth", is_linearised=True, lin=lin, pixels=count, ref=SimpleNamespace(median_depth=distance)
-    )
+    kind: str, sigma: float, count: int = 5000, floor: float = 0.0, fit: float = 1.0, distance: float = 1.0,
+    observability: float = 1.0, fx: float = 500.0,
+) -> Any:  # fmt: skip
+    """An observation of a linearised image: its scale, pixels, smallest credible scale, part that fits, how far away
+    (m) what it shows is, how well it tells all motions, and the reference's focal length (px)."""
+    lin = SimpleNamespace(count=count, next_sigma=sigma, floor=floor, fit=fit, observability=observability)
+    lens = SimpleNamespace(camera=SimpleNamespace(fx=fx))
+    ref = SimpleNamespace(median_depth=distance, lens=lens)
+    return SimpleNamespace(is_depth=kind == "depth", is_linearised=True, lin=lin, pixels=count, ref=ref)
 
 
 def fault(
@@ -166,6 +167,18 @@ def test_both_terms_may_not_fit_badly_at_once() -> None:
     ):
         assert fault(FitHistory(), [term("depth", 0.03 * depth), term("color", 0.12 * color)]) == says
     assert fault(FitHistory(), [term("depth", 0.03)]) == fault(FitHistory(), [term("color", 0.12)]) == ""
+
+
+@pytest.mark.parametrize(("fx", "limit"), [(500.0, 5e-3), (240.0, 5e-3), (120.0, 1.25e-3)])
+def test_depth_that_hardly_tells_a_motion_has_to_fit_as_usual(fx: float, limit: float) -> None:
+    for observability, part, says in (
+        (1.01 * limit, 1.0, ""),
+        (0.99 * limit, 0.32, ""),
+        (0.99 * limit, 0.34, Fault.DOUBTFUL),
+    ):
+        seen = term("depth", 0.03 * part, observability=observability, fx=fx)
+        assert fault(FitHistory(), [seen]) == says
+        assert fault(FitHistory(), [seen, term("color", 1e-3)]) == ""  # colour tells the rest
 
 
 def test_a_rolling_shutter_taken_for_a_global_one_may_make_both_fit_badly() -> None:

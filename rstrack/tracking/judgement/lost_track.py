@@ -28,6 +28,10 @@ _GROWTH, _HARMLESS_DEPTH, _HARMLESS_INTENSITY = 6.0, 2e-3, 0.03
 # What each term may reach alone it may not together with the other: geometric mean of the two scales, each over its
 # limit (real recordings that are tracked well: 0.42 at most), and what colours that were left out count for.
 _WORST_TOGETHER, _LEFT_OUT = 0.45, 0.6
+# Depth alone that hardly tells a motion (see `FrameReport.observability`; less where pixels are larger than those of
+# this focal length, by the square of their size, since corners count the less there) has to fit as it usually does:
+# part of the limit. Frames that slid along a wall for 100 mm and more fit two to three times worse than those before.
+_WEAKLY_SEEN, _FINE_FOCAL, _WORST_WEAK = 5e-3, 240.0, 0.33
 # At coarse levels, before all is aligned, scales are up to 1.3 times these limits, and 2 to 50 where nothing fits.
 _HOPELESS = 2.0
 # What counts as usual grows no further than this over the best that was usual: bad must not become usual.
@@ -111,6 +115,8 @@ class FitHistory:
             return misfits[0][1]
         if self._is_modelled and self._together(fresh, colorless) > _WORST_TOGETHER:
             return Fault.BOTH_ODD
+        if all(o.is_depth for o in fresh) and any(self._is_doubtful(o) for o in fresh):
+            return Fault.DOUBTFUL
         if pulls is not None:
             distance = max(_CLOSE, fresh[0].ref.median_depth)
             torn = self._torn(pulls, distance, new)
@@ -128,6 +134,10 @@ class FitHistory:
         depth = max((o.lin.next_sigma / self._limit(o) for o in fresh if o.is_depth), default=0.0)
         color = max((o.lin.next_sigma / self._limit(o) for o in fresh if not o.is_depth), default=0.0)
         return float(np.sqrt(depth * max(color, _LEFT_OUT if colorless else 0.0)))
+
+    def _is_doubtful(self, o: Observation) -> bool:
+        is_weak = o.lin.observability < _WEAKLY_SEEN * coarseness(o) ** -2
+        return is_weak and o.lin.next_sigma > _WORST_WEAK * self._limit(o)
 
     def _torn(self, now: Pulls, distance: float, new: bool) -> Fault:
         """distance (m), `_CLOSE` at least: of what is seen; where noise grows with its square, so do pulls."""
@@ -168,6 +178,11 @@ class FitHistory:
     def _limit(self, o: Observation) -> float:
         floor = o.lin.floor
         return self._depth.limit(floor, o.ref.median_depth) if o.is_depth else self._color.limit(floor)
+
+
+def coarseness(o: Observation) -> float:
+    """How many times larger than usual a reference's pixels are, at least 1: the less do corners count in them."""
+    return max(1.0, _FINE_FOCAL / o.ref.lens.camera.fx)
 
 
 def _least_fit(o: Observation) -> float:
