@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -232,6 +233,12 @@ def pulled_before(frames: int = 10, sigmas: float = 1.0) -> FitHistory:
     for _ in range(frames):
         assert fault(made, [term("depth", 1e-3)], pulled=Pulls(3e-3, 3e-3, 3e-3, (sigmas,) * 3)) == ""
     return made
+
+
+def test_depth_without_colour_disagrees_with_the_motion_only() -> None:
+    alone = Pulls(3e-3, 0.05, float("nan"), (50.0,) * 3)
+    assert fault(pulled_before(), [term("depth", 1e-3)], pulled=alone) is Fault.PULLED
+    assert fault(pulled_before(), [term("depth", 1e-3)], pulled=replace(alone, color=3e-3)) is Fault.DIVIDED
 
 
 @pytest.mark.parametrize(("usual", "limit", "new"), [(1.0, 5.0, False), (3.0, 12.0, False), (3.0, 9.0, True)])

@@ -142,9 +142,9 @@ class FitHistory:
     def _torn(self, now: Pulls, distance: float, new: bool) -> Fault:
         """distance (m), `_CLOSE` at least: of what is seen; where noise grows with its square, so do pulls."""
         far = [self._is_far(name, n, now, distance, new) for n, name in enumerate(_PULLS)]
-        if any(far[1:]):
+        if any(far[1:]) and np.isfinite([now.depth, now.color]).all():
             return Fault.DIVIDED
-        return Fault.PULLED if far[0] else Fault.NONE
+        return Fault.PULLED if any(far) else Fault.NONE
 
     def _is_far(self, name: str, n: int, now: Pulls, distance: float, new: bool) -> bool:
         """Of the pull of that name, the nth: whether it is too far."""
