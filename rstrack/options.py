@@ -25,8 +25,9 @@ SOURCES: tuple[str, ...] = get_args(Source)
 Loops = Literal["off", "online", "end"]
 LOOPS: tuple[str, ...] = get_args(Loops)
 
-# Knots (s), and where frames are further apart than so long (s), knots as this part of that.
-_KNOTS_S, _SLOW_S, _KNOTS_PER_FRAME = 0.025, 0.04, 0.75
+# Knots (s), and where frames are further apart than so long (s), knots as this part of that, up to times (s) over which
+# no motion is carried on.
+_KNOTS_S, _SLOW_S, _KNOTS_PER_FRAME, _SLOWEST_S = 0.025, 0.04, 0.75, 0.3
 
 
 @dataclass(frozen=True)
@@ -140,7 +141,7 @@ class Options:
         """
         if self.knot_spacing_s is not None:
             return self.knot_spacing_s
-        return _KNOTS_S if interval_s < _SLOW_S else _KNOTS_PER_FRAME * interval_s
+        return _KNOTS_S if interval_s < _SLOW_S else _KNOTS_PER_FRAME * min(interval_s, _SLOWEST_S)
 
     def left_behind(self, T_base_cam: FloatArray, overlap: float) -> bool:
         """Whether a camera at T_base_cam (4, 4), that sees `overlap` of what the keyframe had, needs another one."""

@@ -44,8 +44,8 @@ class FrameReport:
     fault: Fault = Fault.NONE
 
     def as_lost(self, fault: Fault) -> FrameReport:
-        """The same frame, given up later on."""
-        lost = replace(self, lost=True, keyframe=False, fault=fault)
+        """The same frame, given up later on; one that is lost already stays so for its own reason."""
+        lost = replace(self, lost=True, keyframe=False, fault=self.fault or fault)
         return replace(lost, covariance=None, drift=None, held_by_motion=float("nan"))
 
 

@@ -16,6 +16,7 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.options import Method, Options
+from rstrack.tracking.judgement.fault import Fault
 from rstrack.tracking.spline_tracker import Tracker
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 79.5, 59.5)
@@ -127,7 +128,9 @@ def test_colour_may_come_late_but_there_is_no_keyframe_without_it() -> None:
         return (frame_at(k) if k >= first_color else replace(frame_at(k), colors=()) for k in range(14))
 
     assert lost(feed(tracker_of("rs-pg"), frames(1))) == []
-    assert lost(feed(tracker_of("rs-pg"), frames(7))) == [0, 1, 2, 3, 4]
+    tracker = feed(tracker_of("rs-pg"), [blank(frame_at(0)), *list(frames(8))[1:]])
+    assert lost(tracker) == [0, 1, 2, 3, 4, 5]
+    assert [report.fault for report in tracker.reports[:6]] == [Fault.NO_DEPTH, *[Fault.NO_START] * 5]
 
 
 def test_a_keyframe_whose_colours_are_another_places_is_left() -> None:
@@ -197,7 +200,8 @@ def test_options_are_checked(wrong: dict[str, object]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("interval", "knots"), [(1 / 60, 0.025), (1 / 30, 0.025), (0.0399, 0.025), (1 / 15, 0.05), (0.1, 0.075)]
+    ("interval", "knots"),
+    [(1 / 60, 0.025), (1 / 30, 0.025), (0.0399, 0.025), (1 / 15, 0.05), (0.1, 0.075), (5.0, 0.225)],
 )
 def test_slow_frames_get_fewer_knots_unless_they_are_given(interval: float, knots: float) -> None:
     assert Options().knots_s(interval) == pytest.approx(knots)
