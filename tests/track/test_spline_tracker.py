@@ -210,8 +210,7 @@ def test_slow_frames_get_fewer_knots_unless_they_are_given(interval: float, knot
     assert decided.knot_spacing_s == pytest.approx(knots) and decided.decided(ROLLING) == decided
 
 
-@pytest.mark.parametrize("method", ["rs-pg", "rs-g"])
-@pytest.mark.parametrize(("every", "knots"), [(2, 0.05), (3, 0.075)])
+@pytest.mark.parametrize(("method", "every", "knots"), [("rs-pg", 3, 0.075), ("rs-g", 2, 0.05)])
 def test_frames_come_as_slowly_as_they_like(method: Method, every: int, knots: float) -> None:
     tracker = feed(tracker_of(method), (frame_at(k) for k in range(0, 37, every)))
     assert lost(tracker) == [] and worst_step(tracker) < 2e-3
