@@ -32,6 +32,10 @@ class Fault(StrEnum):
     NO_DEPTH = "hardly any depth to begin with"
     NO_START = "the first frames do not fit together"
 
+    def __reduce_ex__(self, _: object) -> tuple[type[Fault], tuple[str]]:
+        """By its text, for checkpoints: by its name it would be had through `getattr`, which they do not run."""
+        return Fault, (self.value,)
+
     @property
     def is_pull(self) -> bool:
         """Whether images were found where the motion led, but pull away from it."""
