@@ -166,7 +166,8 @@ def test_what_is_given_wrongly_is_named_in_one_line(
 def test_a_run_folder_holds_the_trajectory_and_what_made_it(place: Path, original: Path) -> None:
     estimate, info = read_estimate(Path("run")), read_info("run")
     assert len(estimate.stamps) == FRAMES and estimate.spline is not None
-    assert info["options"] == dataclasses.asdict(Options(fuse=True, knot_spacing_s=0.025, loops="end")) and info["method"] == "rs-pg"
+    chosen = Options(fuse=True, knot_spacing_s=0.025, loops="end")
+    assert info["options"] == dataclasses.asdict(chosen) and info["method"] == "rs-pg"
     where = str((original / "seq").resolve())
     frames = {"frames": [0, FRAMES], "frames_in_all": FRAMES}
     assert info["dataset"] == {"name": "synthetic", "path": where, **frames}
