@@ -238,7 +238,7 @@ class Tracker:
         fitting = without_misfits(self._fits, fresh, on_reference, ref)
         colorless = False
         if len(fitting) < len(fresh) and not self._fits.is_hopeless(on_reference):
-            colorless = not all(o.is_depth for o in fresh) and all(o.is_depth for o in fitting)
+            colorless = all(o.is_depth for o in fitting)
             window = before.copy()
             window.predict(new, self._found.end, young)
             fresh, on_reference = fitting, [o for o in fitting if o.ref is ref]

@@ -26,7 +26,7 @@ _LEAST_FIT_DEPTH, _LEAST_FIT_COLOR = 0.65, 0.8
 _WORST_DEPTH, _WORST_INTENSITY = 0.03, 0.12
 _GROWTH, _HARMLESS_DEPTH, _HARMLESS_INTENSITY = 6.0, 2e-3, 0.03
 # What each term may reach alone it may not together with the other: geometric mean of the two scales, each over its
-# limit (real recordings that are tracked well: 0.42 at most), and what colours that were left out count for.
+# limit (fr1_rpy in six forms, where it is tracked well: 0.43 at most), and what colours that were left out count for.
 _WORST_TOGETHER, _LEFT_OUT = 0.45, 0.6
 # Depth alone that hardly tells a motion (see `FrameReport.observability`; less where pixels are larger than those of
 # this focal length, by the square of their size, since corners count the less there) has to fit as it usually does:
