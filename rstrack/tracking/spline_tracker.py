@@ -8,7 +8,6 @@ stamps, T_world_depth = tracker.trajectory
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -18,7 +17,6 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.device.arrays import Engine
 from rsgen.errors import UserError
-from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.adjustment.chain import Chain
 from rstrack.adjustment.graph import Seen
@@ -42,6 +40,7 @@ from rstrack.tracking.judgement.lost_track import FitHistory, implausible, is_se
 from rstrack.tracking.judgement.pose_covariances import PoseCovariances
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.relocalise import Relocaliser, without_misfits
+from rstrack.tracking.succession import LEAST_DEPTH, Succession
 from rstrack.tracking.window import LEVELS, TRACKING_LEVELS, Window
 
 # What a tracker of the same rig and options would make in the same way.
@@ -53,12 +52,8 @@ _GAP_S, _BREAK_S = 0.3, 3600.0
 _SURE_S = 0.045
 # Knots are never further apart than this many times the spacing that was asked for.
 _WIDEST = 2.0
-# Part of the pixels that must have depth for a frame to become a keyframe.
-_LEAST_DEPTH = 0.02
 # Frames of a new piece that are aligned jointly: fewer do not tell its velocity.
 _YOUNG = 4
-# Frames in a row whose colours do not fit the keyframe's after which it is the keyframe's that are wrong.
-_COLORLESS = 5
 
 
 class Tracker:
@@ -72,22 +67,17 @@ class Tracker:
         self._maker = KeyframeMaker.of(self._device)
         self._keyframes = KeyframeStore(self._maker, self.options)
         self._window: Window | None = None
-        self._reference: Reference | None = None
-        # Frames whose control points still move, and the newest one whose do not.
-        self._recent: deque[DeviceFrame] = deque()
         self._fits = FitHistory(self.options.rolling or rig.depth_shutter.readout_s == 0.0)
         self._independence = Independence(), Independence()  # of depth pixels, and of colour pixels
         # What all frames said of the spline.
         self._chain = Chain()
         self._covariances = PoseCovariances(rig.depth_camera.fx)
-        self._pixels = 0
         self._gains = Gains()
-        # The newest frame, while it is the reference and cannot be rectified yet.
-        self._unconverged: DeviceFrame | None = None
+        self._succession = self._successors()
         self._found = FoundPoses()
         self._relocaliser = Relocaliser(rig, self.options, self._keyframes, self._fits, self._observe)
-        # Frames of the current piece of the spline, and frames in a row whose colours did not fit the keyframe's.
-        self._age, self._colorless = 0, 0
+        # Frames of the current piece of the spline.
+        self._age = 0
         self._last_fed: float | None = None
         self.reports: list[FrameReport] = []
 
@@ -176,7 +166,8 @@ class Tracker:
     @property
     def reference(self) -> int | None:
         """Number of the frame whose keyframe new ones are aligned to."""
-        return None if self._reference is None else self._reference.index
+        ref = self._succession.reference
+        return None if ref is None else ref.index
 
     @property
     def piece(self) -> int:
@@ -186,7 +177,8 @@ class Tracker:
     @property
     def pending(self) -> int:
         """Number of the oldest frame that may still become a keyframe."""
-        return self._recent[0].index if self._recent else len(self.reports)
+        recent = self._succession.recent
+        return recent[0].index if recent else len(self.reports)
 
     def upload(self, index: int, frame: Frame) -> DeviceFrame:
         """A frame of the recording as it is aligned."""
@@ -205,7 +197,7 @@ class Tracker:
             )
         new = self._device.upload(len(self.reports), frame)
         self._last_fed = stamp
-        if len(self._found.stamps) == 1 and self._recent:
+        if len(self._found.stamps) == 1 and self._succession.recent:
             self._fit_knots(gap)
         if self._window is None:
             report = self._start(new)
@@ -262,44 +254,47 @@ class Tracker:
         self._chain.add(ref, on_reference, window.state, pulled.excess)
         for is_color, term in enumerate(self._independence):
             term.learn(o.inflation for o in on_reference if o.is_depth != is_color)
-        self._recent.append(new)
+        self._succession.recent.append(new)
         self._placed(new, fresh)
         is_colorless = bool(new.colors) and bool(ref.points) and all(o.is_depth for o in on_reference)
-        self._age, self._colorless = self._age + 1, self._colorless + 1 if is_colorless else 0
-        overlap = self._overlap(on_reference)
-        frozen = self._fuse_frozen(window)
-        renewed = self._renew_keyframe(window, new, frozen, overlap)
-        self._found.release(window, min(min(f.first_time, f.stamp) for f in self._recent))
+        self._age += 1
+        self._succession.judged_colors(is_colorless)
+        overlap = self._succession.overlap(on_reference)
+        frozen = self._succession.fuse_frozen(window)
+        renewed = self._succession.renew(window, new, frozen, overlap)
+        self._found.release(window, min(min(f.first_time, f.stamp) for f in self._succession.recent))
         return self._report(new, on_reference, solved, keyframe=renewed, overlap=overlap)
 
     # -- start and restart ------------------------------------------------------------------------------------------
 
     def _start(self, new: DeviceFrame) -> FrameReport:
         # Its depth is enough to begin with: the first colour image often comes a little later.
-        if new.depth_share < _LEAST_DEPTH or not (self.options.geometric or new.colors):
+        if new.depth_share < LEAST_DEPTH or not (self.options.geometric or new.colors):
             return self._report(new, fault=Fault.NO_DEPTH)
-        self._begin(new, self.options.knots_s())
-        self._recent.append(new)
+        window = self._begin(new, self.options.knots_s())
+        self._succession.recent.append(new)
         if new.depth.exposure.lens.lines == 1:
-            self._new_keyframe(new, None)
+            self._succession.make(new, window.spline, None)
             self._covariances.uncertainty = Uncertainty.of_first()
         self._placed(new)
         return self._report(new, keyframe=True)
 
-    def _begin(self, first: DeviceFrame, dt: float) -> None:
+    def _begin(self, first: DeviceFrame, dt: float) -> Window:
         """A spline with knots dt s apart; a rolling first frame is what others are aligned to."""
-        self._window = Window.still(self._terms, self.rig.depth_camera.fx, first, dt, self.options.knot_phase)
+        window = Window.still(self._terms, self.rig.depth_camera.fx, first, dt, self.options.knot_phase)
         if first.depth.exposure.lens.lines > 1:
-            self._reference = self._maker.rolling(first.index, first.depth, first.colors, self._window.spline)
+            self._succession.reference = self._maker.rolling(first.index, first.depth, first.colors, window.spline)
+        self._window = window
+        return window
 
     def _fit_knots(self, gap: float) -> None:
         """Knots for frames `gap` s apart; a global shutter gives one pose each: no more knots than that can be told."""
         window, _ = self._known()
         dt = self.options.knots_s(gap)
-        if self._recent[0].depth.exposure.lens.lines == 1 and gap > dt:
+        if self._succession.recent[0].depth.exposure.lens.lines == 1 and gap > dt:
             dt = min(gap, _WIDEST * dt)
         if dt != window.state.dt:
-            self._begin(self._recent[0], dt)
+            self._begin(self._succession.recent[0], dt)
 
     def _bootstrap(self, new: DeviceFrame) -> FrameReport:
         """Joint alignment of the first frames with the first one, all of them rolling, from zero motion."""
@@ -316,40 +311,40 @@ class Tracker:
         if self._fits.fault(fresh, solved, ref.pixels):
             return self._begin_anew(new)
         window.keep(fresh)
-        self._recent.append(new)
+        self._succession.recent.append(new)
         self._placed(new, fresh)
-        if len(self._recent) < self.options.bootstrap_frames:
+        if len(self._succession.recent) < self.options.bootstrap_frames:
             return self._report(new, fresh, solved)
-        if all(self._unfit(f) for f in self._recent):
+        if all(self._succession.is_unfit(f) for f in self._succession.recent):
             return self._begin_anew(new)  # none of them has a colour image to go on with
         self._leave_bootstrap(window)
         return self._report(new, fresh, solved, keyframe=True)
 
     def _recolored(self, window: Window, ref: Reference, fresh: Sequence[Observation]) -> Reference:
-        first = self._recent[0]
+        first = self._succession.recent[0]
         again = self._maker.rolling(first.index, first.depth, first.colors, window.spline)
-        self._reference = replace(again, T_world_base=ref.T_world_base)
+        self._succession.reference = replace(again, T_world_base=ref.T_world_base)
         for o in (*window.active, *fresh):
-            o.see(self._reference)
-        return self._reference
+            o.see(self._succession.reference)
+        return self._succession.reference
 
     def _begin_anew(self, new: DeviceFrame) -> FrameReport:
         """The first frames did not fit together: they are lost, and the newest is the first one."""
-        self._window, self._reference = None, None
-        self._recent.clear()
-        self._found, self._covariances = FoundPoses(), PoseCovariances(self.rig.depth_camera.fx)
+        self._window, self._found = None, FoundPoses()
+        self._covariances = PoseCovariances(self.rig.depth_camera.fx)
+        self._succession = self._successors()
         self._chain = Chain()
         self.reports = [r.as_lost(Fault.NO_START) for r in self.reports]
         return self._start(new)
 
     def _leave_bootstrap(self, window: Window) -> None:
         """Rectify the middle frame and align all others to it."""
-        frames = list(self._recent)
+        frames = list(self._succession.recent)
         middle = min(
-            (f for f in frames if not self._unfit(f)),
+            (f for f in frames if not self._succession.is_unfit(f)),
             key=lambda f: abs(f.index - frames[len(frames) // 2].index),
         )
-        ref = self._new_keyframe(middle, None)
+        ref = self._succession.make(middle, window.spline, None)
         window.active = []
         others = [o for frame in frames if frame is not middle for o in self._observe(frame, ref)]
         window.solve(others, levels=(0,))
@@ -378,77 +373,24 @@ class Tracker:
         # The new piece may need control points of the last frames before: their poses are kept, not their spline.
         self._found.begin_piece(window.spline, found.window.state.untouched)
         found.window.keep(found.fresh)
-        self._window, self._reference, self._covariances.uncertainty = found.window, found.ref, found.uncertainty
+        self._window, self._covariances.uncertainty = found.window, found.uncertainty
         self._chain.cut(found.window.piece)
         self._chain.add(found.ref, found.fresh, found.window.state, pulls(found.fresh, found.window.state).excess)
-        self._keyframes.use(found.ref)
+        self._succession.use(found.ref, new)
         self._relocaliser.forget()
-        self._pixels, self._unconverged, self._age, self._colorless = 0, None, 1, 0
-        self._recent = deque([new])
+        self._age = 1
         self._placed(new, found.fresh, joined=False)
-        return self._report(new, found.fresh, found.solved, overlap=self._overlap(found.fresh))
-
-    # -- keyframes --------------------------------------------------------------------------------------------------
-
-    def _fuse_frozen(self, window: Window) -> DeviceFrame | None:
-        """Fuse the frames whose control points are frozen but the newest of them, which is returned."""
-        frozen = [f for f in self._recent if window.is_frozen(f.last_time)]
-        for done in frozen[:-1]:
-            self._recent.popleft()
-            before = self._keyframes.newest
-            after = self._keyframes.fuse(done, window.spline)
-            if self._reference is before:
-                self._reference = after
-        return frozen[-1] if frozen else None
-
-    def _renew_keyframe(self, window: Window, new: DeviceFrame, frozen: DeviceFrame | None, overlap: float) -> bool:
-        """Make another frame the reference once it is left behind: a frozen one, or by strategy the newest."""
-        if self._unconverged is not None:
-            if not window.is_frozen(self._unconverged.last_time):
-                return False
-            self._new_keyframe(self._unconverged, self._keyframes.newest if self.options.fuse else None)
-            return True
-        _, ref = self._known()
-        T_base_cam = se3.inverse(ref.T_world_base) @ window.spline.pose(new.depth.exposure.mid_time)
-        is_behind = self.options.left_behind(T_base_cam, overlap) or self._colorless >= _COLORLESS
-        if frozen is None or frozen.index <= ref.index or not is_behind:
-            return False
-        if self.options.keyframe_strategy == "newest" and new.depth.exposure.lens.lines > 1:
-            if not self._unfit(new):
-                rolling = self._maker.rolling(new.index, new.depth, new.colors, window.spline)
-                self._reference = replace(rolling, brightness=self._gains.of(new))
-                self._unconverged, self._pixels = new, 0
-            return False
-        old = self._keyframes.return_to(window.spline.pose(frozen.depth.exposure.mid_time), ref)
-        if old is not None:
-            self._reference, self._pixels, self._colorless = old, 0, 0
-            return True
-        if self._unfit(frozen):
-            return False
-        self._new_keyframe(frozen, ref if self.options.fuse else None)
-        return True
-
-    def _unfit(self, frame: DeviceFrame) -> bool:
-        """Whether a frame shows too little to align others to it."""
-        return frame.depth_share < _LEAST_DEPTH or (self.options.photometric and not frame.colors)
-
-    def _new_keyframe(self, frame: DeviceFrame, older: Reference | None) -> Reference:
-        assert self._window is not None
-        self._reference = self._keyframes.make(frame, self._window.spline, older, self._gains.of(frame))
-        self._covariances.keyframe(self._reference)
-        self._unconverged, self._pixels, self._colorless = None, 0, 0
-        return self._reference
-
-    def _overlap(self, fresh: Sequence[Observation]) -> float:
-        count = next((o.pixels for o in fresh if o.is_linearised and o.lin.count), 0)
-        self._pixels = max(self._pixels, count)
-        return count / self._pixels if count else 0.0
+        return self._report(new, found.fresh, found.solved, overlap=self._succession.overlap(found.fresh))
 
     # -- pieces -----------------------------------------------------------------------------------------------------
 
     def _known(self) -> tuple[Window, Reference]:
-        assert self._window is not None and self._reference is not None
-        return self._window, self._reference
+        ref = self._succession.reference
+        assert self._window is not None and ref is not None
+        return self._window, ref
+
+    def _successors(self) -> Succession:
+        return Succession(self._maker, self._keyframes, self.options, self._gains, self._covariances)
 
     def _observe(self, frame: DeviceFrame, ref: Reference, expected: FloatArray | None = None) -> list[Observation]:
         """What the frame's images say against a reference, as far as their pixels are independent.
@@ -466,7 +408,7 @@ class Tracker:
         """A frame has been found: its stamp, its brightness, and until when the spline is known."""
         self._found.add(new, joined)
         window, ref = self._known()
-        oldest = self._recent[0].index if self._recent else new.index
+        oldest = self._succession.recent[0].index if self._succession.recent else new.index
         self._gains.learn(new, fresh, window.state, oldest)
         if ref.rolling is None:
             self._covariances.add(new, ref, oldest)
