@@ -1,0 +1,116 @@
+"""The keyframe that new frames are aligned to, and how another one succeeds it (paper, sections 3.2 and 3.5)."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+
+from rsgen.geometry import se3
+from rsgen.geometry.spline import Spline
+from rstrack.alignment.observation import Observation
+from rstrack.images.device_frame import DeviceFrame
+from rstrack.keyframes.keyframe import Reference
+from rstrack.keyframes.maker import KeyframeMaker
+from rstrack.keyframes.store import KeyframeStore
+from rstrack.options import Options
+from rstrack.tracking.gains import Gains
+from rstrack.tracking.judgement.pose_covariances import PoseCovariances
+from rstrack.tracking.window import Window
+
+# Part of the pixels that must have depth for a frame to become a keyframe.
+LEAST_DEPTH = 0.02
+# Frames in a row whose colours do not fit the keyframe's after which it is the keyframe's that are wrong.
+_COLORLESS = 5
+
+
+class Succession:
+    """reference: what new frames are aligned to, a keyframe or, where it cannot be rectified yet, a rolling frame.
+
+    recent: frames whose control points still move, and the newest one whose do not.
+    """
+
+    def __init__(
+        self, maker: KeyframeMaker, store: KeyframeStore, options: Options, gains: Gains, covariances: PoseCovariances
+    ) -> None:
+        self._maker, self._store, self._options = maker, store, options
+        self._gains, self._covariances = gains, covariances
+        self.reference: Reference | None = None
+        self.recent: deque[DeviceFrame] = deque()
+        # The newest frame, while it is the reference and cannot be rectified yet.
+        self._unconverged: DeviceFrame | None = None
+        # The most pixels that a frame saw of the reference, and frames in a row whose colours did not fit its own.
+        self._pixels, self._colorless = 0, 0
+
+    def is_unfit(self, frame: DeviceFrame) -> bool:
+        """Whether a frame shows too little to align others to it."""
+        return frame.depth_share < LEAST_DEPTH or (self._options.photometric and not frame.colors)
+
+    def overlap(self, fresh: Sequence[Observation]) -> float:
+        """Part of the reference that a frame sees, of the most that any has seen."""
+        count = next((o.pixels for o in fresh if o.is_linearised and o.lin.count), 0)
+        self._pixels = max(self._pixels, count)
+        return count / self._pixels if count else 0.0
+
+    def judged_colors(self, is_colorless: bool) -> None:
+        """Whether the newest frame's colours were left out."""
+        self._colorless = self._colorless + 1 if is_colorless else 0
+
+    def use(self, found: Reference, frame: DeviceFrame) -> None:
+        """Go on with a keyframe that a lost frame has been found by."""
+        self._store.use(found)
+        self._refer_to(found)
+        self.recent = deque([frame])
+
+    def make(self, frame: DeviceFrame, spline: Spline, older: Reference | None) -> Reference:
+        """A keyframe, rectified with T_world_depth(t) and joined with what an older one saw."""
+        made = self._store.make(frame, spline, older, self._gains.of(frame))
+        self._covariances.keyframe(made)
+        self._refer_to(made)
+        return made
+
+    def fuse_frozen(self, window: Window) -> DeviceFrame | None:
+        """Fuse the frames whose control points are frozen but the newest of them, which is returned."""
+        frozen = [f for f in self.recent if window.is_frozen(f.last_time)]
+        for done in frozen[:-1]:
+            self.recent.popleft()
+            before = self._store.newest
+            after = self._store.fuse(done, window.spline)
+            if self.reference is before:
+                self.reference = after
+        return frozen[-1] if frozen else None
+
+    def renew(self, window: Window, new: DeviceFrame, frozen: DeviceFrame | None, overlap: float) -> bool:
+        """Make another frame the reference once it is left behind: a frozen one, or by strategy the newest.
+
+        Says whether it has become a keyframe.
+        """
+        if self._unconverged is not None:
+            if not window.is_frozen(self._unconverged.last_time):
+                return False
+            self.make(self._unconverged, window.spline, self._store.newest if self._options.fuse else None)
+            return True
+        ref = self.reference
+        assert ref is not None
+        T_base_cam = se3.inverse(ref.T_world_base) @ window.spline.pose(new.depth.exposure.mid_time)
+        is_behind = self._options.left_behind(T_base_cam, overlap) or self._colorless >= _COLORLESS
+        if frozen is None or frozen.index <= ref.index or not is_behind:
+            return False
+        if self._options.keyframe_strategy == "newest" and new.depth.exposure.lens.lines > 1:
+            if not self.is_unfit(new):
+                rolling = self._maker.rolling(new.index, new.depth, new.colors, window.spline)
+                self.reference = replace(rolling, brightness=self._gains.of(new))
+                self._unconverged, self._pixels = new, 0
+            return False
+        old = self._store.return_to(window.spline.pose(frozen.depth.exposure.mid_time), ref)
+        if old is not None:
+            self._refer_to(old)
+            return True
+        if self.is_unfit(frozen):
+            return False
+        self.make(frozen, window.spline, ref if self._options.fuse else None)
+        return True
+
+    def _refer_to(self, ref: Reference) -> None:
+        self.reference = ref
+        self._unconverged, self._pixels, self._colorless = None, 0, 0
