@@ -53,6 +53,9 @@ _PULL_WHOLE, _PULL_ALONE, _PULL_SIGMAS = (4.0, 1.5e-2), (7.0, 2e-2), (4.0, 5.0)
 # Where a piece of the track has just begun nothing of its own says yet whether it is right: always so many metres only,
 # and fewer times the usual number of σ.
 _NEW_WHOLE, _NEW_ALONE, _NEW_SIGMAS = 6e-3, 8e-3, 3.0
+# Depth's errors hang together over an image, as no count of its pixels shows: where colour tells the motion better than
+# depth, to so many metres, and is content to so many σ, it is believed against what depth says.
+_VOUCHES, _CONTENT = 1.5e-2, 10.0
 _USUAL, _FEW = 0.25, 5
 # Frames from which on their median says what is best, and the distance (m) below which limits shrink no further.
 _SETTLED, _CLOSE = 15, 0.5
@@ -141,6 +144,8 @@ class FitHistory:
 
     def _torn(self, now: Pulls, distance: float, new: bool) -> Fault:
         """distance (m), `_CLOSE` at least: of what is seen; where noise grows with its square, so do pulls."""
+        if not new and _is_vouched_for(now):
+            return Fault.NONE
         far = [self._is_far(name, n, now, distance, new) for n, name in enumerate(_PULLS)]
         if any(far[1:]) and np.isfinite([now.depth, now.color]).all():
             return Fault.DIVIDED
@@ -183,6 +188,12 @@ class FitHistory:
 def coarseness(o: Observation) -> float:
     """How many times larger than usual a reference's pixels are, at least 1: the less do corners count in them."""
     return max(1.0, _FINE_FOCAL / o.ref.lens.camera.fx)
+
+
+def _is_vouched_for(now: Pulls) -> bool:
+    """Whether colour alone tells that a frame has been found."""
+    is_told = now.color_spread < min(_VOUCHES, now.depth_spread)
+    return is_told and now.color < _PULL_ALONE[1] and now.sigmas[2] < _CONTENT
 
 
 def _least_fit(o: Observation) -> float:
