@@ -241,6 +241,25 @@ def test_depth_without_colour_disagrees_with_the_motion_only() -> None:
     assert fault(pulled_before(), [term("depth", 1e-3)], pulled=replace(alone, color=3e-3)) is Fault.DIVIDED
 
 
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        ({}, ""),
+        ({"color_spread": 0.016}, Fault.DIVIDED),
+        ({"color_spread": 9e-3, "depth_spread": 8e-3}, Fault.DIVIDED),
+        ({"color": 0.021}, Fault.DIVIDED),
+        ({"sigmas": (15.0, 18.0, 11.0)}, Fault.DIVIDED),
+        ({"color": float("nan"), "color_spread": float("inf")}, Fault.PULLED),
+    ],
+)
+def test_colour_that_tells_the_motion_is_believed_against_depth(changed: dict[str, Any], says: str) -> None:
+    # As depth of 14 mm noise pulls that a robot's camera has three metres before a wall.
+    torn = replace(Pulls(0.034, 0.061, 7e-3, (13.0, 18.0, 7.0), depth_spread=0.02, color_spread=0.01), **changed)
+    images = [term("depth", 1e-3), term("color", 1e-3)]
+    assert fault(pulled_before(), images, pulled=torn) == says
+    assert fault(pulled_before(), images, pulled=torn, new=True) in (Fault.DIVIDED, Fault.PULLED)
+
+
 @pytest.mark.parametrize(("usual", "limit", "new"), [(1.0, 5.0, False), (3.0, 12.0, False), (3.0, 9.0, True)])
 def test_pulls_within_noise_or_as_far_from_it_as_usual_are_none(usual: float, limit: float, new: bool) -> None:
     for sigmas, says in ((0.98 * limit, ""), (1.02 * limit, "the images do not agree with the motion")):
