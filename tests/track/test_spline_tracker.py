@@ -170,8 +170,9 @@ def test_the_newest_frame_serves_as_a_rolling_reference_until_it_is_rectified(me
     rolling = []
     for k in range(24):
         tracker.feed(frame_at(k))
-        assert tracker._reference is not None
-        rolling.append(tracker._reference.rolling is not None)
+        ref = tracker._succession.reference
+        assert ref is not None
+        rolling.append(ref.rolling is not None)
     # After the start: rolling for some frames, then rectified, and so on; a keyframe each time.
     changes = np.flatnonzero(np.diff(np.array(rolling[6:], int)) < 0)
     assert len(changes) >= 2 and tracker.keyframes == 1 + len(changes)
