@@ -37,10 +37,12 @@ def shaking() -> Spline:
     return Spline(CORNER @ se3.exp(np.stack([*moves, *turns], axis=-1)), t0, dt)
 
 
-def recording(root: Path, spline: Spline, readout_s: float = READOUT_S, scan: Scan = "top-bottom") -> Dataset:
+def recording(
+    root: Path, spline: Spline, readout_s: float = READOUT_S, scan: Scan = "top-bottom", frames: int = SHORT.stop
+) -> Dataset:
     stream = {"rate_hz": RATE_HZ, "readout_s": readout_s, "scan": scan}
     config = synthetic.make_config(width=160, height=120, color=stream, depth=stream)
-    writer = synthetic.open_writer(root, config, FRAMES, spline)
+    writer = synthetic.open_writer(root, config, frames, spline)
     synthetic.write_frames(writer)
     writer.finish()
     return open_dataset(root)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 import synthetic
-from shaken_recording import OPTIONS, READOUT_S, bent, recording, shaking, told
+from shaken_recording import OPTIONS, READOUT_S, bent, shaking, told
 
 from rsgen.device.arrays import engine
 from rsgen.device.lens import Lens
@@ -40,11 +40,6 @@ from rstrack.data.depth_error import DepthError
 from rstrack.data.noise import NoisyImages
 
 
-@pytest.fixture(scope="module")
-def shaken(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return recording(tmp_path_factory.mktemp("calibration") / "seq", shaking())
-
-
 @pytest.mark.parametrize("is_depth", [True, False])
 @pytest.mark.parametrize("scan", ["top-bottom", "right-left"])
 def test_lines_move_with_every_parameter_and_control_point_as_finite_differences_say(
@@ -54,12 +49,12 @@ def test_lines_move_with_every_parameter_and_control_point_as_finite_differences
     taken = Taken(Lens(camera, Shutter(1.0, 0.0, scan)), 0.4, 0.006, is_depth)
     p = Parameters(0.017, 0.021, 0.004, 2e-4, synthetic.T_COLOR_DEPTH, epoch_s=0.1)
     spline = shaking()
-    lines = lines_of(taken, spline, p)
+    (lines,) = lines_of([taken], spline, p)
     # One line a block: 12 or 16 lines are fewer than there are blocks.
     assert len(lines.by_parameters) == taken.lens.lines == len(lines.T_world_cam)
 
     def moved(by: Parameters, along: Spline) -> np.ndarray:
-        return se3.log(lines_of(taken, along, by).T_world_cam @ se3.inverse(lines.T_world_cam))
+        return se3.log(lines_of([taken], along, by)[0].T_world_cam @ se3.inverse(lines.T_world_cam))
 
     for i in range(POSES):
         step = np.zeros(COUNT)

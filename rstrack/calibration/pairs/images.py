@@ -7,14 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rsgen.array_types import FloatArray
+from rsgen.array_types import FloatArray, IntArray
 from rsgen.device.lens import Lens
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import block_counts
-from rstrack.alignment.normal_equations import Slopes
 from rstrack.calibration.unknowns.parameters import DRIFT, EXTRINSICS, POSES, Parameters
 from rstrack.images.line_poses import rows_of
 
@@ -74,41 +73,55 @@ class Lines:
         return np.concatenate([rows_of(se3.inverse(T_base_world @ self.T_world_cam)), self.twist], axis=1)
 
 
-def lines_of(taken: Taken, spline: Spline, p: Parameters) -> Lines:
-    """Where the lines of an image were, and what that depends on.
+def lines_of(images: Sequence[Taken], spline: Spline, p: Parameters) -> list[Lines]:
+    """Where the lines of images were, which one camera took, and what that depends on.
 
     A line's time is begin + readout l / lines: a later one moves its pose by its velocity. Extrinsics move the colour
-    camera against the body, which is the depth camera: by −Ad(T_world_color) ε.
+    camera against the body, which is the depth camera: by −Ad(T_world_color) ε. All images at once: calls of the
+    spline cost more than numbers do.
     """
-    first, readout = taken.begin(p)
-    count = taken.lens.lines
-    share = np.arange(count) / count
-    T_world_body, velocity = spline.pose_and_velocity(_within(spline, first + readout * share))
-    T_cam_body = np.eye(4) if taken.is_depth else p.T_color_depth
-    T_world_cam = T_world_body @ se3.inverse(T_cam_body)
-    twist = readout / count * velocity @ se3.adjoint(T_cam_body).T
-
-    blocks, _, per, _ = block_counts(taken.lens, taken.lens)
+    if not images:
+        return []
+    lens, is_depth = images[0].lens, images[0].is_depth
+    first, readout = np.array([taken.begin(p) for taken in images]).T[..., None]
+    count = lens.lines
+    blocks, _, per, _ = block_counts(lens, lens)
     start = np.arange(blocks) * per
     middle = 0.5 * (start + np.minimum(start + per, count) - 1) / count
-    t = _within(spline, first + readout * middle)
-    slopes = Slopes.of(spline, np.eye(4), t, None)
-    T, w = spline.pose_and_velocity(t)
-    Ad = se3.adjoint(T)
-    w_world = (Ad @ w[..., None])[..., 0]
-    by_parameters = np.zeros((blocks, 6, POSES))
-    if taken.is_depth:
+    t = _within(spline, first + readout * np.concatenate([np.arange(count) / count, middle]))
+    T_world_body, velocity = spline.pose_and_velocity(t)
+    T_cam_body = np.eye(4) if is_depth else p.T_color_depth
+    T_world_cam = T_world_body[:, :count] @ se3.inverse(T_cam_body)
+    twist = readout[..., None] / count * velocity[:, :count] @ se3.adjoint(T_cam_body).T
+
+    Ad = se3.adjoint(T_world_body[:, count:])
+    w_world = (Ad @ velocity[:, count:, :, None])[..., 0]
+    by_parameters = np.zeros((len(images), blocks, 6, POSES))
+    if is_depth:
         by_parameters[..., 0] = w_world * middle[:, None]
     else:
         by_parameters[..., 1] = w_world * middle[:, None]
         by_parameters[..., 2] = w_world
-        by_parameters[..., DRIFT] = w_world * (taken.stamp - p.epoch_s)
+        since = np.array([taken.stamp - p.epoch_s for taken in images])
+        by_parameters[..., DRIFT] = w_world * since[:, None, None]
         by_parameters[..., EXTRINSICS] = -Ad @ se3.adjoint(se3.inverse(T_cam_body))
-    return Lines(T_world_cam, twist, slopes.first, slopes.current, by_parameters)
+    points, J = spline.pose_jacobian(t[:, count:])
+    moved = [_by_points(points[k], J[k]) for k in range(len(images))]
+    return [Lines(T_world_cam[k], twist[k], *moved[k], by_parameters[k]) for k in range(len(images))]
+
+
+def _by_points(points: IntArray, J: FloatArray) -> tuple[int, FloatArray]:
+    """Of blocks that four control points move, from `points` (blocks,) on, by J (blocks, 4, 6, 6): the first of all
+    these points, and the derivatives (blocks, 6, 6k) by it and those that follow."""
+    first, rows = int(points.min()), np.arange(len(points))
+    out = np.zeros((len(points), 6, int(points.max()) - first + 4, 6))
+    for i in range(4):
+        out[rows, :, points - first + i] = J[:, i]
+    return first, out.reshape(len(points), 6, -1)
 
 
 def _within(spline: Spline, t: FloatArray) -> FloatArray:
-    """Times (n,) that a step too far has led out of the spline are brought back: the next one leads back."""
+    """Times that a step too far has led out of the spline are brought back: the next one leads back."""
     return np.clip(t, spline.t_begin, spline.t_end)
 
 

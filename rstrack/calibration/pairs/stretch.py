@@ -90,9 +90,10 @@ class Stretch:
         """Around the current spline; re-estimates σ and brightness on the way."""
         size = 6 * len(self.spline.control_points) + COUNT
         H, g = np.zeros((size, size)), np.zeros(size)
-        depths = [lines_of(view.depth, self.spline, p) for view in self.views]
         optics = terms.optics(p)
-        colors = [None if view.color is None else lines_of(view.color, self.spline, p) for view in self.views]
+        depths = lines_of([view.depth for view in self.views], self.spline, p)
+        seen = iter(lines_of([view.color for view in self.views if view.color is not None], self.spline, p))
+        colors = [None if view.color is None else next(seen) for view in self.views]
         weighted, counted, cost = np.zeros(2), np.zeros(2, int), 0.0
         for kind, pair, sums, current, reference, T_base_world in self._pairs(terms, optics, p, level, depths, colors):
             sigma = self.sigma[kind]

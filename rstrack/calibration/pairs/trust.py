@@ -37,10 +37,10 @@ def trust_in(stretch: Stretch, terms: PairTerms, p: Parameters) -> float:
     k = len(stretch.views) // 2
     ref, current = stretch.views[k - 1], stretch.views[k]
     T_base_world = se3.inverse(stretch.spline.pose(ref.depth.mid_time(p)))
-    depths = [lines_of(view.depth, stretch.spline, p) for view in (ref, current)]
+    depths = lines_of([view.depth for view in (ref, current)], stretch.spline, p)
     pairs = [_by_depth(terms, current, ref, (depths[1], depths[0]), T_base_world, p, stretch.sigma[0])]
     if ref.color is not None and current.color is not None:
-        lines = depths[0], *(lines_of(color, stretch.spline, p) for color in (current.color, ref.color))
+        lines = depths[0], *lines_of([current.color, ref.color], stretch.spline, p)
         pairs.append(_by_color(terms, current, ref, lines, T_base_world, p, stretch.sigma[1]))
     lever = ref.surface.median_depth
     common, single = np.zeros((6, 6)), np.zeros((6, 6))

@@ -1,0 +1,14 @@
+"""What several files of tests track."""
+
+from __future__ import annotations
+
+import pytest
+from shaken_recording import FRAMES, recording, shaking
+
+from rstrack.data.dataset import Dataset
+
+
+@pytest.fixture(scope="session")
+def shaken(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """A second of a camera that is shaken before a corner of a room."""
+    return recording(tmp_path_factory.mktemp("shaken") / "seq", shaking(), frames=FRAMES)
