@@ -99,6 +99,10 @@ class Observation:
         """Take another version of the reference, nearly the same."""
         self.ref, self._visible = ref, None
 
+    def count_as(self, independent: float) -> None:
+        """Another part of its pixels counts."""
+        self.independent, self._visible = independent, None
+
     def forget(self, state: SplineState, keep_sigma: bool) -> None:
         """Begin anew, as at a new level of the pyramid."""
         sigma = self.linearisation.sigma if keep_sigma else 0.0

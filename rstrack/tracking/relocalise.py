@@ -21,7 +21,7 @@ from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.store import KeyframeStore
 from rstrack.options import Options
 from rstrack.tracking.judgement.fault import Fault
-from rstrack.tracking.judgement.lost_track import FitHistory, coarseness, implausible
+from rstrack.tracking.judgement.lost_track import FitHistory, coarseness, doubted, implausible
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.window import LEVELS, Window
 
@@ -131,6 +131,8 @@ class Relocaliser:
             colorless = all(o.is_depth for o in fitting)
             trial, fresh = restarted(), fitting
             solved = trial.solve(fresh, LEVELS, hopeless=self._fits.is_hopeless)
+        if doubted(fresh):
+            solved = trial.solve(fresh, (0,))
         pulled = pulls(fresh, trial.state)
         uncertainty = before.found_anew(pulled.information)
         # Depth alone is much alike in many places.

@@ -36,7 +36,7 @@ from rstrack.tracking.found_poses import FoundPoses
 from rstrack.tracking.frame_report import FrameReport, frame_report
 from rstrack.tracking.gains import Gains
 from rstrack.tracking.judgement.fault import Fault
-from rstrack.tracking.judgement.lost_track import FitHistory, implausible, is_settled
+from rstrack.tracking.judgement.lost_track import FitHistory, doubted, implausible, is_settled
 from rstrack.tracking.judgement.pose_covariances import PoseCovariances
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.relocalise import Relocaliser, without_misfits
@@ -235,6 +235,8 @@ class Tracker:
             window.predict(new, self._found.end, young)
             fresh, on_reference = fitting, [o for o in fitting if o.ref is ref]
             solved = window.solve(fresh, levels, gauge, coupled)
+        if doubted(fresh):
+            solved = window.solve(fresh, (0,), gauge, coupled)
         with self._terms.timer("judgement"):
             pulled = pulls(on_reference, window.state)
             fault = self._fits.fault(on_reference, solved, ref.pixels, pulled, young, colorless)

@@ -14,7 +14,7 @@ from rsgen.geometry import se3
 from rstrack.alignment.optimizer import Solved
 from rstrack.alignment.pull import Pulls
 from rstrack.tracking.judgement.fault import Fault
-from rstrack.tracking.judgement.lost_track import FitHistory, implausible, is_settled
+from rstrack.tracking.judgement.lost_track import FitHistory, doubted, implausible, is_settled
 
 NOTHING, UNSETTLED = Fault.NOTHING_SEEN, Fault.UNSETTLED
 NAMES = {"depth": "depth", "color": "colour"}
@@ -34,14 +34,20 @@ def odd(kind: str) -> str:
 
 def term(
     kind: str, sigma: float, count: int = 5000, floor: float = 0.0, fit: float = 1.0, distance: float = 1.0,
-    observability: float = 1.0, fx: float = 500.0,
+    observability: float = 1.0, fx: float = 500.0, inflation: float = 1.0,
 ) -> Any:  # fmt: skip
     """An observation of a linearised image: its scale, pixels, smallest credible scale, part that fits, how far away
-    (m) what it shows is, how well it tells all motions, and the reference's focal length (px)."""
+    (m) what it shows is, how well it tells all motions, the reference's focal length (px), and how many of its pixels
+    tell as much as one (usually two)."""
     lin = SimpleNamespace(count=count, next_sigma=sigma, floor=floor, fit=fit, observability=observability)
     lens = SimpleNamespace(camera=SimpleNamespace(fx=fx))
     ref = SimpleNamespace(median_depth=distance, lens=lens)
-    return SimpleNamespace(is_depth=kind == "depth", is_linearised=True, lin=lin, pixels=count, ref=ref)
+    o = SimpleNamespace(
+        is_depth=kind == "depth", is_linearised=True, lin=lin, pixels=count, ref=ref, inflation=inflation,
+        independent=0.5,
+    )  # fmt: skip
+    o.count_as = lambda independent: setattr(o, "independent", independent)
+    return o
 
 
 def fault(
@@ -315,3 +321,32 @@ def test_a_coarse_level_is_hopeless_where_neither_term_is_near_its_limit() -> No
     near, far = term("depth", 11.9e-3), term("depth", 12.1e-3)
     assert history.is_hopeless([far]) and not history.is_hopeless([near])
     assert not history.is_hopeless([far, term("color", 0.1)]) and history.is_hopeless([far, term("color", 0.3)])
+
+
+@pytest.mark.parametrize(
+    ("depth", "color", "counts"),
+    [
+        (5.9, 2.0, 0.5),
+        (6.1, 2.0, 1.0 / 6.1),
+        (60.0, 5.9, 1.0 / 60.0),
+        (60.0, 6.1, 0.5),  # colour is odd too
+        (60.0, float("nan"), 1.0 / 60.0),
+        (float("nan"), 2.0, 0.5),
+        (60.0, None, 0.5),  # nothing else holds the pose
+    ],
+)
+def test_depth_counts_as_far_as_it_says_itself_where_colour_holds_the_pose(
+    depth: float, color: float | None, counts: float
+) -> None:
+    images = [term("depth", 1e-3, inflation=depth)]
+    images += [] if color is None else [term("color", 1e-3, inflation=color)]
+    assert doubted(images) == (counts != 0.5)
+    assert [o.independent for o in images] == [counts, 0.5][: len(images)]
+    assert not doubted(images), "once is enough"
+
+
+def test_nothing_is_begun_anew_from_lines_that_do_not_hang_together() -> None:
+    for inflation, says in ((19.9, ""), (20.1, Fault.UNSTEADY)):
+        images = [term("depth", 1e-3, inflation=99.0), term("color", 1e-3, inflation=inflation)]
+        assert fault(pulled_before(), images, new=True) == says
+        assert fault(pulled_before(), images) == ""

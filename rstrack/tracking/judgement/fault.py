@@ -20,6 +20,7 @@ class Fault(StrEnum):
     ODD_COLOR = "the colour image does not fit"
     BOTH_ODD = "depth and colour both fit worse than they should"
     DOUBTFUL = "depth hardly tells a motion there, and fits worse than it should"
+    UNSTEADY = "its lines do not show one motion, and no frames before tell it"
     DIVIDED = "depth and colour do not agree"
     PULLED = "the images do not agree with the motion"
     TOO_FAR = "it is further from where the motion led than a hand moves a camera"

@@ -57,6 +57,8 @@ _NEW_WHOLE, _NEW_ALONE, _NEW_SIGMAS = 6e-3, 8e-3, 3.0
 # depth, to so many metres, and is content to so many σ, it is believed against what depth says.
 _VOUCHES, _CONTENT = 1.5e-2, 10.0
 _USUAL, _FEW = 0.25, 5
+# By how much less than usual an image's pixels tell where that is no chance, and where its lines do not hang together.
+_ODD, _UNSTEADY = 3.0, 10.0
 # Frames from which on their median says what is best, and the distance (m) below which limits shrink no further.
 _SETTLED, _CLOSE = 15, 0.5
 
@@ -120,6 +122,8 @@ class FitHistory:
             return Fault.BOTH_ODD
         if all(o.is_depth for o in fresh) and any(self._is_doubtful(o) for o in fresh):
             return Fault.DOUBTFUL
+        if new and any(_oddness(o) > _UNSTEADY for o in fresh if not o.is_depth):
+            return Fault.UNSTEADY
         if pulls is not None:
             distance = max(_CLOSE, fresh[0].ref.median_depth)
             torn = self._torn(pulls, distance, new)
@@ -183,6 +187,26 @@ class FitHistory:
     def _limit(self, o: Observation) -> float:
         floor = o.lin.floor
         return self._depth.limit(floor, o.ref.median_depth) if o.is_depth else self._color.limit(floor)
+
+
+def doubted(fresh: Sequence[Observation]) -> bool:
+    """Let a depth image's pixels count as far as it says itself, where that is far less than usual; whether any does.
+
+    A wall that is seen head-on comes in a few steps of depth, which now and again are off together. Only where colours
+    hold the pose that are not odd themselves: else they may show another place, or the lines may not be where the
+    spline has them.
+    """
+    odd = [o for o in fresh if _oddness(o) > _ODD]
+    if all(o.is_depth for o in fresh) or not all(o.is_depth for o in odd):
+        return False
+    for o in odd:
+        o.count_as(1.0 / o.inflation)
+    return bool(odd)
+
+
+def _oddness(o: Observation) -> float:
+    """How many times less than usual an image's pixels tell; NaN where it cannot be told."""
+    return o.inflation * o.independent if o.is_linearised else float("nan")
 
 
 def coarseness(o: Observation) -> float:
