@@ -95,7 +95,8 @@ def _spread(seen: Sequence[tuple[Observation, FloatArray, FloatArray]]) -> float
     covariance = np.linalg.inv(np.diag(1.0 / _PRIOR**2) + sum(own for _, own, _ in seen))
     distance = seen[0][0].ref.median_depth
     lines = (np.hstack([np.eye(6), side * np.eye(6)]) for side in (-1.0, 1.0))
-    ends = (np.diag(line @ covariance @ line.T).reshape(2, 3).sum(axis=1) for line in lines)
+    # Rounding may leave less than nothing of what is told best.
+    ends = (np.maximum(np.diag(line @ covariance @ line.T), 0.0).reshape(2, 3).sum(axis=1) for line in lines)
     return float(max(np.sqrt(shift) + distance * np.sqrt(turn) for shift, turn in ends))
 
 

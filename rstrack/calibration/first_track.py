@@ -13,7 +13,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.calibration.pairs.load import through
 from rstrack.data.dataset import Dataset
 from rstrack.options import Method, Options
-from rstrack.tracking.rough_track import rough_track
+from rstrack.tracking.first_look.rough_track import rough_track
 
 # How frames are followed. The second is rougher, but takes more: where the readout is far off, what the first makes of
 # depth does not fit together. The third needs colour's clock to be about right, but no shapes. Part of the time that

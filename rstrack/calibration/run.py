@@ -34,7 +34,7 @@ from rstrack.calibration.unknowns.known import Known
 from rstrack.calibration.unknowns.parameters import COLOR_LENS, COUNT, DEPTH_LENS, DRIFT, GROUPS, Parameters, free_of
 from rstrack.data.dataset import Dataset
 from rstrack.options import Options
-from rstrack.tracking.color_offset import estimate_color_offset
+from rstrack.tracking.first_look.color_offset import estimate_color_offset
 
 # Frames of a stretch, the fewest that one may have, and how many stretches there are at least and at most.
 _FRAMES, _FEWEST_FRAMES, _FEWEST, _MOST = 30, 14, 3, 12

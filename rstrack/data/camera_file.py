@@ -92,6 +92,7 @@ class _Stream(_Section):
 
 class _ColorStream(_Stream):
     offset_s: Finite | Literal["auto"] = "auto"
+    falloff: Annotated[float, Field(ge=-0.5, le=2.0, allow_inf_nan=False)] | Literal["auto"] = "auto"
     drift_ppm: Annotated[float, Field(ge=-1e4, le=1e4, allow_inf_nan=False)] = 0.0
 
 
@@ -158,7 +159,14 @@ def read_rig(path: Path, color_size: Size, depth_size: Size) -> RigFile:
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
     return RigFile(
-        Rig(depth_camera, depth_shutter, color_camera, color_shutter, T_color_depth),
+        Rig(
+            depth_camera,
+            depth_shutter,
+            color_camera,
+            color_shutter,
+            T_color_depth,
+            None if data.color.falloff == "auto" else data.color.falloff,
+        ),
         DEPTH_SCALE if depth is None else depth.depth_scale,
         data.stamps,
         depth_offset_s,

@@ -140,6 +140,14 @@ class Dataset:
         groups = group_colors(self.stamps, color_stamps)
         return replace(self, color_stamps=color_stamps, groups=groups, timing=timing, color_drift=drift)
 
+    def with_color_falloff(self, falloff: float, note: str = "") -> Dataset:
+        """The same recording with colours that are known to darken so towards the corners, see `Rig`.
+
+        note: for the screen, where that comes from.
+        """
+        rig = replace(self.rig, color_falloff=falloff)
+        return replace(self, rig=rig, notes=(*self.notes, note) if note else self.notes)
+
     def seen_with(self, rig: Rig) -> Dataset:
         """The same images taken for those of other cameras, of as many pixels, whose colour may have an offset."""
         if self.timing is not None:

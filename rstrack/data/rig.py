@@ -15,13 +15,18 @@ from rsgen.geometry.shutter import Shutter
 
 @dataclass(frozen=True)
 class Rig:
-    """The cameras: everything the tracker must know beside the images. T_color_depth (4, 4): p_color from p_depth."""
+    """The cameras: everything the tracker must know beside the images.
+
+    T_color_depth (4, 4): p_color from p_depth. color_falloff: f, where colour's intensities are those of an even image
+    over 1 + f ρ² at ρ of the way from the centre to a corner; None: not known.
+    """
 
     depth_camera: Camera
     depth_shutter: Shutter
     color_camera: Camera
     color_shutter: Shutter
     T_color_depth: FloatArray
+    color_falloff: float | None = None
 
     @property
     def is_registered(self) -> bool:

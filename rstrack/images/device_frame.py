@@ -23,6 +23,7 @@ from rstrack.images.pyramid import (
     DepthImage,
     camera_rays,
     color_image,
+    corner_distance2,
     depth_image,
     depth_resolution,
     lens_sees,
@@ -84,6 +85,8 @@ class DeviceRig:
         self._color_lens = Lens(rig.color_camera, _seen_as(rig.color_shutter, options.rolling))
         self._seen = lens_sees(rig.depth_camera)
         self._finer = octaves_finer(rig.color_camera, rig.depth_camera)
+        size = rig.color_camera.width, rig.color_camera.height
+        self._evening = 1.0 + np.float32(rig.color_falloff) * corner_distance2(*size) if rig.color_falloff else None
         self.rays = camera_rays(Exposure(self._depth_lens, 0.0, np.eye(4)))
         self.device_rays = self.e.upload(self.rays[..., 0]), self.e.upload(self.rays[..., 1])
         self.resolution = 0.0
@@ -104,7 +107,7 @@ class DeviceRig:
         for image in frame.colors if options.photometric else ():
             pixels = _checked(image, rig.color_camera, "colour", (3,), "uint8 RGB", np.uint8)
             exposure = self._exposure(image, self._color_lens, rig.color_shutter, rig.T_color_depth)
-            colors.append(color_image(self.e, exposure, pixels, self._finer))
+            colors.append(color_image(self.e, exposure, pixels, self._finer, self._evening))
         return DeviceFrame(index, frame.depth.stamp, depth, tuple(colors), depth.count / z.size)
 
     @staticmethod

@@ -110,10 +110,23 @@ def intensity(color: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
     return np.asarray(cv2.GaussianBlur(grey, (0, 0), _BLUR_PX))
 
 
-def color_image(e: Engine, exposure: Exposure, color: npt.NDArray[np.uint8], finer: int = 0) -> ColorImage:
-    """RGB (h, w, 3) uint8 to a pyramid, NaN where a pixel or one beside it is saturated or black; see `ColorImage`."""
+def corner_distance2(width: int, height: int) -> npt.NDArray[np.float32]:
+    """Square (h, w) of the distance from an image's centre, over that of its corners."""
+    u, v = np.arange(width) - (width - 1) / 2, np.arange(height) - (height - 1) / 2
+    return ((u**2 + v[:, None] ** 2) / (u[0] ** 2 + v[0] ** 2)).astype(np.float32)
+
+
+def color_image(
+    e: Engine, exposure: Exposure, color: npt.NDArray[np.uint8], finer: int = 0,
+    evening: npt.NDArray[np.float32] | None = None,
+) -> ColorImage:  # fmt: skip
+    """RGB (h, w, 3) uint8 to a pyramid, NaN where a pixel or one beside it is saturated or black; see `ColorImage`.
+
+    evening (h, w): what intensities are multiplied by, since the camera darkens them.
+    """
     count = LEVELS + max(0, finer)
-    levels = pyramid(intensity(color), count)
+    grey = intensity(color)
+    levels = pyramid(grey if evening is None else grey * evening, count)
     masks = _beyond_range(color, count)
     moments = np.array([levels[-1].mean(), levels[-1].std()], np.float64)
     shown = (np.where(mask, np.float32(np.nan), level) for level, mask in zip(levels, masks, strict=True))

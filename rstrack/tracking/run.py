@@ -126,7 +126,7 @@ def track(
     other settings is to be resumed.
     """
     chosen = _chosen(dataset, frames)
-    dataset = _with_color_timed(dataset, chosen, options, progress)
+    dataset = _with_color_evened(_with_color_timed(dataset, chosen, options, progress), chosen, options, progress)
     truth = truth_of(dataset)
     if truth is not None:
         truth = dataclasses.replace(truth, frame_stamps=dataset.stamps[chosen])
@@ -279,10 +279,20 @@ def _with_color_timed(dataset: Dataset, chosen: range, options: Options, progres
     """The dataset with its colour stamps' offset found, where it is not known, may not be 0 and matters."""
     if dataset.timing is None or not dataset.timing.wants_color_offset or not options.photometric:
         return dataset
-    from rstrack.tracking.color_offset import estimate_color_offset
+    from rstrack.tracking.first_look.color_offset import estimate_color_offset
 
     found = estimate_color_offset(dataset, chosen, options, progress)
     return dataset.with_color_offset(found.offset_s, found.text())
+
+
+def _with_color_evened(dataset: Dataset, chosen: range, options: Options, progress: Progress) -> Dataset:
+    """The dataset with what its colour images lose towards their corners, where that is not known and matters."""
+    if dataset.rig.color_falloff is not None or not options.photometric:
+        return dataset
+    from rstrack.tracking.first_look.color_falloff import estimate_color_falloff
+
+    found = estimate_color_falloff(dataset, chosen, options, progress)
+    return dataset.with_color_falloff(found.falloff, found.text())
 
 
 def _make_folder(out: Path) -> None:

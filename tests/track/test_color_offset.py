@@ -16,8 +16,8 @@ from rsgen.sequence.format import StreamName
 from rstrack.data.dataset import Dataset, group_colors, open_dataset
 from rstrack.data.estimate import read_estimate
 from rstrack.options import Options
-from rstrack.tracking import color_offset
-from rstrack.tracking.color_offset import estimate_color_offset
+from rstrack.tracking.first_look import color_offset, color_pairs
+from rstrack.tracking.first_look.color_offset import estimate_color_offset
 from rstrack.tracking.run import track
 
 WRONG_S = 0.0173
@@ -70,7 +70,7 @@ def test_the_offset_is_found_along_the_true_path(
     truth = shaken.truth
     assert truth is not None
     span = (truth.t_begin, truth.t_end)
-    monkeypatch.setattr(color_offset, "_geometric_track", lambda *_: (truth, *span))
+    monkeypatch.setattr(color_offset, "geometric_track", lambda *_: (truth, *span))
     found = estimate_color_offset(wrongly_stamped(shaken, wrong_s))
     assert not found.reason and found.pairs > 10
     assert found.offset_s == pytest.approx(wrong_s, abs=0.5e-3) and found.sigma_s < 0.5e-3
@@ -81,7 +81,7 @@ def test_a_track_that_colour_contradicts_is_not_believed(shaken: Dataset, monkey
     truth = shaken.truth
     assert truth is not None
     other = replace(truth, control_points=truth.control_points[::-1].copy())
-    monkeypatch.setattr(color_offset, "_geometric_track", lambda *_: (other, truth.t_begin, truth.t_end))
+    monkeypatch.setattr(color_offset, "geometric_track", lambda *_: (other, truth.t_begin, truth.t_end))
     found = estimate_color_offset(wrongly_stamped(shaken, WRONG_S))
     assert "does not fit the track" in found.reason and found.offset_s == 0.0
 
@@ -99,18 +99,18 @@ def test_what_the_motion_does_not_tell_is_left_open(shaken: Dataset, monkeypatch
     truth = shaken.truth
     assert truth is not None
     still = replace(truth, control_points=np.broadcast_to(np.eye(4), truth.control_points.shape).copy())
-    monkeypatch.setattr(color_offset, "_geometric_track", lambda *_: (still, truth.t_begin, truth.t_end))
+    monkeypatch.setattr(color_offset, "geometric_track", lambda *_: (still, truth.t_begin, truth.t_end))
     found = estimate_color_offset(replace(shaken, images=_Same(shaken)))
     assert found.reason and found.offset_s == 0.0 and "used as stamped" in found.text()
-    monkeypatch.setattr(color_offset, "_geometric_track", lambda *_: (truth, truth.t_begin, truth.t_end))
+    monkeypatch.setattr(color_offset, "geometric_track", lambda *_: (truth, truth.t_begin, truth.t_end))
     found = estimate_color_offset(wrongly_stamped(shaken, 0.09))
     assert found.reason and found.offset_s == 0.0
-    monkeypatch.setattr(color_offset, "_geometric_track", lambda *_: (None, 0.0, 0.0))
+    monkeypatch.setattr(color_offset, "geometric_track", lambda *_: (None, 0.0, 0.0))
     assert "no track" in estimate_color_offset(shaken).reason
 
 
 def test_where_one_part_does_not_tell_others_are_asked(shaken: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(color_offset, "_TRACKED", 8)
+    monkeypatch.setattr(color_pairs, "_TRACKED", 8)
     asked: list[range] = []
     silent = color_offset.ColorOffset(0.0, np.inf, 0, "the camera moves too evenly")
     told = color_offset.ColorOffset(0.01, 1e-3, 20)
@@ -122,7 +122,7 @@ def test_where_one_part_does_not_tell_others_are_asked(shaken: Dataset, monkeypa
     monkeypatch.setattr(color_offset, "_estimate", estimate)
     assert estimate_color_offset(shaken) is told and len(asked) == 2
     assert not set(asked[0]) & set(asked[1]) and {len(part) for part in asked} == {8}
-    monkeypatch.setattr(color_offset, "_shift", lambda _, part: 0.012 if 20 in part else 1e-4 * part[0])
+    monkeypatch.setattr(color_pairs, "_shift", lambda _, part: 0.012 if 20 in part else 1e-4 * part[0])
     assert estimate_color_offset(shaken) is silent, "none of three told"
     assert len(asked) == 5 and 20 in asked[2] and asked[3][0] > asked[4][0]
     assert len(set().union(*asked[2:])) == 24

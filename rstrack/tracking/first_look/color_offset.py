@@ -11,42 +11,38 @@ pair has. What tells is that the camera turns differently at the two times: stea
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
-import cv2
 import numpy as np
-import numpy.typing as npt
 
 from rsgen.array_types import FloatArray
-from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.data.dataset import Dataset
-from rstrack.images.pyramid import intensity
 from rstrack.options import Options
+from rstrack.tracking.first_look.color_pairs import (
+    Progress,
+    geometric_track,
+    image_of,
+    looked_up,
+    moving_parts,
+    pairs_in,
+    points_of,
+)
 
-BoolArray = npt.NDArray[np.bool_]
-Progress = Callable[[str, float, str], None]
-
+# For the progress bar.
+_STAGE = "colour's clock"
 # Offsets looked at (s): coarse ones, then fine ones about the best.
 _MOST_S, _COARSE_S, _FINE_S = 0.06, 0.01, 0.0025
 # Fine offsets on each side of the best one through which a parabola is laid.
 _NEAR = 2
-# Frames that are tracked; of these, every so manieth has its depth looked up in pairs of images so many frames apart.
-_TRACKED, _EVERY, _APART = 60, 4, (4, 8)
-# Windows of the recording of which the one that moves most is taken, and the shift (part of the width, a frame) that is
-# enough: images that move faster are blurred. Where it does not tell, others take its place, so many in all.
-_WINDOWS, _ENOUGH, _TRIES = 8, 0.015, 3
-# Depth pixels looked up in a line; and the fewest a pair may share.
-_ACROSS, _FEWEST = 106, 400
-# 8-bit values that are clipped, and their neighbours.
-_BLACK, _WHITE = 4, 250
+# The fewest points that a pair may share.
+_FEWEST = 400
 # The offset is taken for determined if its standard error is below this, and it lies inside of what was looked at.
 _MOST_SIGMA_S = 5e-3
 # Noise of colour images against each other, over their contrast, above which the track is not to be believed.
 _MOST_NOISE = 0.25
-_ROUNDS = 3
 
 
 @dataclass(frozen=True)
@@ -79,7 +75,7 @@ def estimate_color_offset(
     frames: those to look at, default all. options: say which backend to use. Raises UserError: an image that
     cannot be read.
     """
-    parts = _moving_parts(dataset, range(len(dataset)) if frames is None else frames)
+    parts = moving_parts(dataset, range(len(dataset)) if frames is None else frames)
     tried = []
     for part in parts:
         tried.append(_estimate(dataset, part, options or Options(), progress))
@@ -89,10 +85,10 @@ def estimate_color_offset(
 
 
 def _estimate(dataset: Dataset, chosen: range, options: Options, progress: Progress) -> ColorOffset:
-    spline, begin, end = _geometric_track(dataset, chosen, options, progress)
+    spline, begin, end = geometric_track(dataset, chosen, options, progress, _STAGE)
     if spline is None:
         return ColorOffset(0.0, np.inf, 0, "the geometry alone gives no track")
-    pairs = _pairs(dataset, chosen, begin + _MOST_S, end - _MOST_S)
+    pairs = pairs_in(dataset, chosen, begin + _MOST_S, end - _MOST_S)
     if len(pairs) < 6:
         return ColorOffset(0.0, np.inf, len(pairs), "too few images overlap")
     coarse = np.arange(-_MOST_S, _MOST_S + 1e-9, _COARSE_S)
@@ -134,71 +130,6 @@ def _parabola(x: FloatArray, y: FloatArray) -> tuple[float, float]:
     return (float(middle - 0.5 * b / a) if a > 0.0 else float("nan")), float(a)
 
 
-# --- what to look at -------------------------------------------------------------------------------------------------
-
-
-def _moving_parts(dataset: Dataset, frames: range) -> list[range]:
-    """Frames to track: windows that do not overlap, the one first that moves most, though no more than is enough."""
-    if len(frames) <= _TRACKED:
-        return [frames]
-    starts = np.linspace(0, len(frames) - _TRACKED, _WINDOWS).round().astype(int)
-    motion = [min(_shift(dataset, frames[int(s) : int(s) + _TRACKED]), _ENOUGH) for s in starts]
-    chosen: list[int] = []
-    for n in np.argsort(-np.array(motion), kind="stable"):
-        start = int(starts[n])
-        if len(chosen) < _TRIES and all(abs(start - other) >= _TRACKED for other in chosen):
-            chosen.append(start)
-    return [frames[start : start + _TRACKED] for start in chosen]
-
-
-def _shift(dataset: Dataset, frames: range) -> float:
-    """Mean shift from one colour image to the next, as a part of the width, of three pairs in these frames."""
-    shifts = []
-    for k in frames[len(frames) // 6 :: len(frames) // 3]:
-        i = [i for group in dataset.groups[k : k + 3] for i in group][:2]
-        if len(i) == 2:
-            a, b = (cv2.resize(dataset.images.color(n), (96, 72), interpolation=cv2.INTER_AREA) for n in i)
-            window = cv2.createHanningWindow((96, 72), cv2.CV_32F)
-            a, b = (np.asarray(cv2.cvtColor(x, cv2.COLOR_RGB2GRAY), np.float32) for x in (a, b))
-            (du, dv), _ = cv2.phaseCorrelate(a, b, window)
-            shifts.append(float(np.hypot(du, dv)) / 96)
-    return float(np.mean(shifts)) if shifts else 0.0
-
-
-def _geometric_track(
-    dataset: Dataset, frames: range, options: Options, progress: Progress
-) -> tuple[Spline | None, float, float]:
-    """T_world_depth(t) of the frames from depth alone, and the longest time (begin, end) in s that it covers."""
-    from rstrack.tracking.rough_track import rough_track
-
-    def done(share: float) -> None:
-        progress("colour's clock", 0.7 * share, "tracking depth")
-
-    tracker = rough_track(dataset, frames, Options(method="rs-g", backend=options.backend), done)
-    if not tracker.spline_valid or tracker.spline is None:
-        return None, 0.0, 0.0
-    begin, end = max(tracker.spline_valid, key=lambda span: span[1] - span[0])
-    return tracker.spline, begin, end
-
-
-def _pairs(dataset: Dataset, frames: range, begin: float, end: float) -> list[tuple[int, int, int]]:
-    """(frame, colour image, colour image) whose lines lie in [begin, end] seconds."""
-    readout = max(dataset.rig.depth_shutter.readout_s, dataset.rig.color_shutter.readout_s)
-    latest = end - readout
-
-    def color(k: int) -> int | None:
-        group = dataset.groups[k] if k in frames else ()
-        return next((i for i in group if begin <= dataset.color_stamps[i] <= latest), None)
-
-    pairs = []
-    for k in frames[::_EVERY]:
-        for apart in _APART:
-            i, j = color(k), color(k + apart)
-            if i is not None and j is not None and begin <= dataset.stamps[k] <= latest:
-                pairs.append((k, i, j))
-    return pairs
-
-
 # --- how well images agree -------------------------------------------------------------------------------------------
 
 
@@ -206,62 +137,17 @@ def _costs(
     dataset: Dataset, spline: Spline, pairs: Sequence[tuple[int, int, int]], offsets: FloatArray, progress: Progress
 ) -> tuple[FloatArray, FloatArray]:
     """Costs (k, m) of the offsets (m,) of the k pairs that share enough, and their noise (k,) over the contrast."""
-    points = lru_cache(maxsize=2)(lambda k: _points(dataset, spline, k))
-    images = lru_cache(maxsize=16)(lambda i: _image(dataset.images.color(i)))
+    points = lru_cache(maxsize=2)(lambda k: points_of(dataset, spline, k))
+    images = lru_cache(maxsize=16)(lambda i: image_of(dataset.images.color(i)))
     found = [(np.empty((0, len(offsets))), np.empty(0))]
     for n, (k, i, j) in enumerate(pairs):
-        a, b = (_looked_up(dataset, spline, images(m), points(k), dataset.color_stamps[m] + offsets) for m in (i, j))
+        a, b = (looked_up(dataset, spline, images(m), points(k), dataset.color_stamps[m] + offsets) for m in (i, j))
         good = np.isfinite(a).all(axis=0) & np.isfinite(b).all(axis=0)
         if np.count_nonzero(good) >= _FEWEST:
             cost, noise = _disagreement(a[:, good], b[:, good])
             found.append((cost[None], np.array([noise])))
-        progress("colour's clock", 0.7 + 0.3 * (n + 1) / len(pairs), "comparing colour images")
+        progress(_STAGE, 0.7 + 0.3 * (n + 1) / len(pairs), "comparing colour images")
     return np.concatenate([costs for costs, _ in found]), np.concatenate([noise for _, noise in found])
-
-
-def _points(dataset: Dataset, spline: Spline, k: int) -> FloatArray:
-    """Points (n, 3) in the world of frame k's depth, each line with its own pose."""
-    camera, shutter = dataset.rig.depth_camera, dataset.rig.depth_shutter
-    step = max(camera.width // _ACROSS, 1)
-    pixels = camera.pixel_grid()[::step, ::step].reshape(-1, 2)
-    z = dataset.depth(k)[::step, ::step].reshape(-1)
-    rays = camera.unproject(pixels)
-    known = (z > 0.0) & np.isfinite(rays).all(axis=1)
-    lines = shutter.line_of_pixel(pixels[known], camera)
-    T = spline.pose(shutter.line_mid_time(dataset.stamps[k], np.arange(shutter.line_count(camera)), camera))
-    return se3.transform(T[lines.astype(np.int64)], rays[known] * z[known, None])
-
-
-def _image(color: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
-    """Intensities (h/2, w/2), NaN near clipped pixels."""
-    grey = np.asarray(cv2.pyrDown(intensity(color)))
-    clipped = ((color.max(axis=2) >= _WHITE) | (color.max(axis=2) <= _BLACK)).astype(np.uint8)
-    near = cv2.dilate(clipped, np.ones((7, 7), np.uint8))[::2, ::2]
-    return np.where(near > 0, np.float32(np.nan), grey)
-
-
-def _looked_up(
-    dataset: Dataset, spline: Spline, image: npt.NDArray[np.float32], p_world: FloatArray, stamps: FloatArray
-) -> FloatArray:
-    """Intensities (m, n) at points (n, 3) of an image stamped `stamps` (m,); NaN where not seen or clipped.
-
-    Equation (3) by fixed-point iteration, with the pose of the nearest line: a hundredth of a pixel.
-    """
-    camera, shutter, T_color_depth = dataset.rig.color_camera, dataset.rig.color_shutter, dataset.rig.T_color_depth
-    lines = np.arange(shutter.line_count(camera))
-    out = np.full((len(stamps), len(p_world)), np.nan)
-    for m, stamp in enumerate(stamps):
-        T = T_color_depth @ se3.inverse(spline.pose(shutter.line_mid_time(stamp, lines, camera)))
-        line = np.full(len(p_world), len(lines) // 2)
-        for _ in range(_ROUNDS):
-            uv, _ = camera.project(se3.transform(T[line], p_world))
-            at = np.nan_to_num(shutter.line_of_pixel(uv, camera))
-            line = np.clip(np.rint(at), 0, len(lines) - 1).astype(np.int64)
-        uv = np.where(camera.contains(uv)[:, None], 0.5 * uv, -10.0).astype(np.float32)
-        border = cv2.BORDER_CONSTANT
-        u, v = (np.ascontiguousarray(x)[:, None] for x in uv.T)
-        out[m] = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=border, borderValue=float("nan"))[:, 0]
-    return out
 
 
 def _disagreement(a: FloatArray, b: FloatArray) -> tuple[FloatArray, float]:

@@ -1,0 +1,118 @@
+"""Colour that darkens towards the corners, from images that were darkened by so much."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rsgen.array_types import ByteArray
+from rsgen.errors import UserError
+from rsgen.geometry.spline import Spline
+from rstrack.data.camera_file import read_rig
+from rstrack.data.dataset import Dataset, open_dataset
+from rstrack.data.estimate import read_estimate
+from rstrack.images.device_frame import DeviceRig
+from rstrack.images.pyramid import corner_distance2
+from rstrack.options import Options
+from rstrack.tracking.first_look import color_falloff
+from rstrack.tracking.first_look.color_falloff import ColorFalloff, estimate_color_falloff
+from rstrack.tracking.run import track
+
+RPY = Path(__file__).resolve().parents[3] / "shared/data/tum_fr1_rpy"
+needs_rpy = pytest.mark.skipif(not RPY.is_dir(), reason="../shared/data/tum_fr1_rpy is not here")
+
+
+class Darkened:
+    """Images of a lens that takes light from the corners, with a gain of their own."""
+
+    def __init__(self, dataset: Dataset, corner: float, power: float = 1.0) -> None:
+        camera = dataset.rig.color_camera
+        self._images, self.depth = dataset.images, dataset.images.depth
+        self._factor = ((1.0 + corner * corner_distance2(camera.width, camera.height)) ** -power)[..., None]
+
+    def color(self, k: int) -> ByteArray:
+        gain = 1.0 + 0.1 * np.sin(k)
+        return np.rint(np.clip(self._images.color(k) * self._factor * gain, 0, 255)).astype(np.uint8)
+
+
+@pytest.fixture
+def on_its_path(shaken: Dataset, monkeypatch: pytest.MonkeyPatch) -> Dataset:
+    def path(*_: object) -> tuple[Spline, float, float]:
+        assert shaken.truth is not None
+        return shaken.truth, shaken.truth.t_begin, shaken.truth.t_end
+
+    monkeypatch.setattr(color_falloff, "geometric_track", path)
+    return shaken
+
+
+@pytest.mark.parametrize("corner", [0.3, 0.06, -0.1])
+def test_what_the_corners_lose_is_found_whatever_the_gain(on_its_path: Dataset, corner: float) -> None:
+    found = estimate_color_falloff(replace(on_its_path, images=Darkened(on_its_path, corner)))
+    assert found.falloff == pytest.approx(corner, abs=4e-3) and found.sigma < 5e-3 and found.pairs > 10
+    assert f"% {'darker' if corner > 0.0 else 'brighter'}" in found.text()
+
+
+def test_the_law_of_a_lens_is_near_enough(on_its_path: Dataset) -> None:
+    """cos⁴ of a quarter of the light, seen through a gamma of 2.2."""
+    corner = 0.75**-0.5 - 1.0
+    found = estimate_color_falloff(replace(on_its_path, images=Darkened(on_its_path, corner, 2.0 / 2.2)))
+    d2 = corner_distance2(160, 120)
+    np.testing.assert_allclose((1.0 + found.falloff * d2) * (1.0 + corner * d2) ** (-2.0 / 2.2), 1.0, atol=0.01)
+
+
+def test_even_images_stay_as_they_are(on_its_path: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = estimate_color_falloff(on_its_path)
+    assert found.falloff == 0.0 and found.text() == "" and found.sigma < 0.01
+    assert estimate_color_falloff(on_its_path, range(29)) == ColorFalloff(0.0, np.inf, 0), "too few frames"
+    monkeypatch.setattr(color_falloff, "geometric_track", lambda *_: (None, 0.0, 0.0))
+    assert estimate_color_falloff(replace(on_its_path, images=Darkened(on_its_path, 0.3))).falloff == 0.0
+
+
+@needs_rpy
+def test_a_kinect_darkens(tmp_path: Path) -> None:
+    """Nobody has measured it otherwise; two halves of the recording agree."""
+    (tmp_path / "camera.yaml").write_text(
+        "color: {width: 640, height: 480, intrinsics: [525, 525, 319.5, 239.5], readout_s: 0.03, offset_s: 0.018}"
+    )
+    found = estimate_color_falloff(open_dataset(RPY, tmp_path / "camera.yaml"))
+    assert found.falloff == pytest.approx(0.097, abs=0.02) and found.sigma < 0.01
+
+
+def test_the_tracker_sees_even_images(shaken: Dataset) -> None:
+    frame, camera = shaken.frame(3), shaken.rig.color_camera
+    dark = replace(frame, colors=(replace(frame.colors[0], pixels=Darkened(shaken, 0.3).color(3)),))
+    seen = []
+    for rig, given in ((shaken.rig, frame), (replace(shaken.rig, color_falloff=0.3), dark)):
+        image = DeviceRig(rig, Options(backend="llvm")).upload(3, given).colors[0]
+        seen.append(np.array(image.levels[0]).reshape(camera.height, camera.width))
+    good = np.isfinite(seen[0]) & np.isfinite(seen[1])
+    np.testing.assert_allclose(seen[1][good], seen[0][good] * (1.0 + 0.1 * np.sin(3)), atol=0.006)
+
+
+def test_a_run_finds_it_unless_the_camera_file_says_it(
+    shaken: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[range] = []
+
+    def estimate(_: Dataset, frames: range, *__: object) -> ColorFalloff:
+        asked.append(frames)
+        return ColorFalloff(0.25, 0.002, 20)
+
+    monkeypatch.setattr(color_falloff, "estimate_color_falloff", estimate)
+    track(shaken, Options(backend="llvm", loops="off"), tmp_path / "run", slice(0, 8))
+    notes = read_estimate(tmp_path / "run").info["dataset"]["notes"]
+    assert asked == [range(8)] and "20.0 % darker" in notes[0]
+    track(shaken.with_color_falloff(0.1), Options(backend="llvm", loops="off"), tmp_path / "run", slice(0, 8))
+    track(shaken, Options(backend="llvm", method="rs-g", loops="off"), tmp_path / "run", slice(0, 8))
+    assert len(asked) == 1
+    file = tmp_path / "camera.yaml"
+    stream = "width: 160, height: 120, intrinsics: [120, 120, 79.5, 59.5], readout_s: 0.01"
+    for key, falloff in (("", None), (", falloff: auto", None), (", falloff: 0", 0.0), (", falloff: 0.12", 0.12)):
+        file.write_text(f"color: {{{stream}{key}}}")
+        assert read_rig(file, (160, 120), (160, 120)).rig.color_falloff == falloff
+    file.write_text(f"color: {{{stream}, falloff: 3}}")
+    with pytest.raises(UserError, match="falloff"):
+        read_rig(file, (160, 120), (160, 120))
