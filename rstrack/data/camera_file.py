@@ -9,7 +9,8 @@ camera.yaml (depth left out: registered to colour, read out as colour is, 5000 u
 Each may have model (pinhole, radtan, fisheye), distortion, exposure_s and scan as in rsgen's configs. T_color_depth
 (4x4) is the identity where it is left out. color.offset_s: seconds added to colour's stamps; auto: see
 `rstrack.data.clocks.timing`; color.drift_ppm: millionths by which that grows over the recording, in whose middle it
-holds; both are what `rstrack calibrate` finds, which writes such a file. stamps: auto, raw or regular, see there too.
+holds; both are what `rstrack calibrate` finds, which writes such a file. color.falloff: see `Rig`; auto: `track` finds
+it. stamps: auto, raw or regular, see there too.
 depth.registered: warped into the colour camera, see `rstrack.data.registered_rows`. calibration.yaml: see
 `rstrack.data.opencv_camera_file`.
 """

@@ -59,10 +59,11 @@ class ColorFalloff:
         """One line for the screen; empty where colours are taken as they are."""
         if not self.falloff:
             return ""
-        darker = 1.0 - 1.0 / (1.0 + self.falloff)
+        percent = 100.0 * (1.0 - 1.0 / (1.0 + self.falloff))
         return (
-            f"colours of the corners are {100.0 * abs(darker):.1f} % {'darker' if darker > 0.0 else 'brighter'} (by {self.pairs} pairs of images, "
-            f"± {100.0 * self.sigma:.1f} %): evened out; color.falloff: {self.falloff:.3f} in the camera file fixes it"
+            f"colours of the corners are {abs(percent):.1f} % {'darker' if percent > 0.0 else 'brighter'} "
+            f"(± {100.0 * self.sigma:.1f}, by {self.pairs} pairs of images): evened out; "
+            f"color.falloff: {self.falloff:.3f} in the camera file fixes it"
         )
 
 
