@@ -18,7 +18,7 @@ from rstrack.images.line_poses import Exposure
 LEVELS = 3
 # Bilinear interpolation of a sharper picture is drawn to whole and half pixels, by up to 0.05 px.
 _BLUR_PX = 0.8
-# Grey levels (largest of the three channels) from which on, and up to which, a pixel's value may be clipped.
+# Grey levels from which on, and up to which, a channel may be clipped.
 _SATURATED, _BLACK = 250, 5
 # Pixels (a square of this size) about a clipped one that smoothing draws it into, and its share that matters.
 _MARGIN_PX, _LEAST_CLIPPED = 5, 0.2
@@ -134,9 +134,15 @@ def color_image(
 
 
 def _beyond_range(color: npt.NDArray[np.uint8], count: int) -> list[npt.NDArray[np.bool_]]:
-    """For each level the pixels (h, w) whose intensity says nothing: clipped, or smoothed with what was."""
-    most = cv2.max(cv2.max(color[..., 0], color[..., 1]), color[..., 2])  # ten times as fast as color.max(axis=2)
-    clipped = ((most >= _SATURATED) | (most <= _BLACK)).astype(np.uint8)
+    """For each level the pixels (h, w) whose intensity says nothing: clipped, or smoothed with what was.
+
+    Two channels have to be saturated: white paper in warm light saturates red alone, still shows its print, and holds
+    the motion against what shines beside it. All three have to be black.
+    """
+    red, green, blue = cv2.split(color)
+    less, more = cv2.min(red, green), cv2.max(red, green)
+    most, second = cv2.max(more, blue), cv2.max(less, cv2.min(more, blue))
+    clipped = ((second >= _SATURATED) | (most <= _BLACK)).astype(np.uint8)
     weight = cv2.dilate(clipped, np.ones((_MARGIN_PX, _MARGIN_PX), np.uint8)).astype(np.float32)
     out = [weight > _LEAST_CLIPPED]
     for _ in range(count - 1):
