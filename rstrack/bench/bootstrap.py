@@ -19,7 +19,7 @@ from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate, plain
 from rstrack.metrics.association import Truth, compare, truth_of
 from rstrack.options import Options
-from rstrack.tracking.run import make_tracker
+from rstrack.tracking.any_tracker import make_tracker
 
 _LIMITS_M = (1e-3, 5e-3)
 _MIN_POSES = 3

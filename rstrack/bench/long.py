@@ -19,7 +19,7 @@ from rsgen.errors import UserError
 from rstrack.data.dataset import Dataset
 from rstrack.data.rig import Frame
 from rstrack.options import Options
-from rstrack.tracking.run import make_tracker
+from rstrack.tracking.any_tracker import make_tracker
 
 # Frames of a block, and the block (the second) that the last one is compared with: the first compiles kernels.
 BLOCK = 1000

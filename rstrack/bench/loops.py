@@ -70,8 +70,8 @@ def loop_quality(
 
     Raises UserError: no such truth, no frame, or a method without a spline.
     """
+    from rstrack.tracking.any_tracker import make_tracker
     from rstrack.tracking.loop_closing import search_of
-    from rstrack.tracking.run import make_tracker
     from rstrack.tracking.spline_tracker import Tracker
 
     truth = dataset.truth

@@ -24,7 +24,7 @@ from rstrack.data.registered import Registrar, registered_image
 from rstrack.data.rig import Frame
 from rstrack.options import PEERS, Options
 from rstrack.peers.open3d import PeerTracker
-from rstrack.tracking.run import AnyTracker, make_tracker
+from rstrack.tracking.any_tracker import AnyTracker, make_tracker
 
 # Frames at the start that are not counted: the first of them compile kernels.
 _WARM_UP = 20

@@ -132,7 +132,7 @@ def track(
     from rstrack.calibration.run import calibrate as run_calibration
     from rstrack.calibration.unknowns.devices import device_named
     from rstrack.data.dataset import open_dataset
-    from rstrack.tracking import run
+    from rstrack.tracking.runs import run
 
     if device is not None and not calibrate:
         raise UserError(f"--device {device}: is for --calibrate, which is not given")

@@ -191,7 +191,7 @@ def _mid_readout(dataset: Dataset) -> float:
 def _info(
     name: str, dataset: Dataset, chosen: range, tracker: PeerTracker, total_s: float, seconds: list[float]
 ) -> dict[str, Any]:
-    """What run.json holds, by the names of `rstrack.tracking.run.track`."""
+    """What run.json holds, by the names of `rstrack.tracking.runs.run.track`."""
     ms = 1e3 * np.array(seconds)
     frames = [
         {

@@ -11,7 +11,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.options import Options
-from rstrack.tracking.run import Noise
+from rstrack.tracking.runs.record import Noise
 
 FRAMES = 30
 OPTIONS = Options(method="rs-pg", keyframe_distance=0.04, bootstrap_frames=3, backend="llvm", loops="end")

@@ -22,8 +22,9 @@ from rstrack.cli.main import main
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.estimate import read_estimate
 from rstrack.options import Options
-from rstrack.tracking import checkpoint
-from rstrack.tracking.run import Noise, track
+from rstrack.tracking.runs import checkpoint
+from rstrack.tracking.runs.record import Noise
+from rstrack.tracking.runs.run import track
 
 FRAMES = 16
 NOISE = Noise(1e-3, 0.01, 3)
@@ -34,7 +35,7 @@ OPTIONS = Options(method="rs-pg", keyframe_distance=0.03, bootstrap_frames=3, ba
 SLOW = """
 import sys, time
 from rstrack.cli.main import main
-from rstrack.tracking import checkpoint
+from rstrack.tracking.runs import checkpoint
 from rstrack.tracking.spline_tracker import Tracker
 checkpoint._EVERY_S, checkpoint._SHARE, feed = 0.0, 1e9, Tracker.feed
 Tracker.feed = lambda *given: (time.sleep(0.2), feed(*given))[1]

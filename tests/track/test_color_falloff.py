@@ -19,7 +19,7 @@ from rstrack.images.pyramid import corner_distance2
 from rstrack.options import Options
 from rstrack.tracking.first_look import color_falloff
 from rstrack.tracking.first_look.color_falloff import ColorFalloff, estimate_color_falloff
-from rstrack.tracking.run import track
+from rstrack.tracking.runs.run import track
 
 RPY = Path(__file__).resolve().parents[3] / "shared/data/tum_fr1_rpy"
 needs_rpy = pytest.mark.skipif(not RPY.is_dir(), reason="../shared/data/tum_fr1_rpy is not here")

@@ -18,7 +18,7 @@ from rstrack.data.estimate import read_estimate
 from rstrack.options import Options
 from rstrack.tracking.first_look import color_offset, color_pairs
 from rstrack.tracking.first_look.color_offset import estimate_color_offset
-from rstrack.tracking.run import track
+from rstrack.tracking.runs.run import track
 
 WRONG_S = 0.0173
 RPY = Path(__file__).resolve().parents[3] / "shared/data/tum_fr1_rpy"

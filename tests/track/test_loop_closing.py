@@ -21,8 +21,9 @@ from rstrack.data.rig import Frame
 from rstrack.options import Options
 from rstrack.report.build import write_report
 from rstrack.tracking import loop_closing
+from rstrack.tracking.any_tracker import make_tracker
 from rstrack.tracking.loop_closing import close_loops
-from rstrack.tracking.run import make_tracker, track
+from rstrack.tracking.runs.run import track
 from rstrack.tracking.spline_tracker import Tracker
 
 

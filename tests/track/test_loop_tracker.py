@@ -19,9 +19,11 @@ from rstrack.data.estimate import read_estimate
 from rstrack.data.noise import with_noise
 from rstrack.data.rig import Frame, Image
 from rstrack.keyframes.kept_frames import KeptFrames
-from rstrack.tracking import checkpoint, loop_tracker
+from rstrack.tracking import loop_tracker
+from rstrack.tracking.any_tracker import make_tracker
 from rstrack.tracking.loop_tracker import LoopTracker
-from rstrack.tracking.run import make_tracker, track
+from rstrack.tracking.runs import checkpoint
+from rstrack.tracking.runs.run import track
 
 ONLINE = replace(OPTIONS, loops="online")
 

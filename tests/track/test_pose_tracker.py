@@ -16,8 +16,8 @@ from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.options import Options
+from rstrack.tracking.any_tracker import make_tracker as make_any_tracker
 from rstrack.tracking.pose_tracker import BaselineTracker
-from rstrack.tracking.run import make_tracker as make_any_tracker
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 79.5, 59.5)
 # Looking into a corner of the box: walls in all directions, so that every motion is seen.

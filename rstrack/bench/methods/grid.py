@@ -30,7 +30,7 @@ from rstrack.metrics.association import ASSOCIATE_WITHIN_S, truth_of
 from rstrack.metrics.evaluate import Metrics, evaluate
 from rstrack.metrics.run_evaluate import evaluate_clocks
 from rstrack.options import METHODS
-from rstrack.tracking.run import track
+from rstrack.tracking.runs.run import track
 
 CELL = "cell.json"
 

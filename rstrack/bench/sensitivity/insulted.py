@@ -31,7 +31,7 @@ from rstrack.bench.sensitivity.settings import kept_results, settings_of
 from rstrack.data.dataset import Dataset
 from rstrack.metrics.association import angles_deg, true_poses, truth_of
 from rstrack.options import Options
-from rstrack.tracking.run import AnyTracker, make_tracker
+from rstrack.tracking.any_tracker import AnyTracker, make_tracker
 
 _WRONG_M, _WRONG_DEG = 0.020, 2.0
 # Frames within which a camera has to be found again, and after which a pose moves no more.

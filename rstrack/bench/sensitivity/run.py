@@ -22,7 +22,7 @@ from rstrack.bench.sensitivity.changes import reordered
 from rstrack.bench.sensitivity.settings import kept_results, settings_of
 from rstrack.data.dataset import Dataset
 from rstrack.options import Options
-from rstrack.tracking.run import track
+from rstrack.tracking.runs.run import track
 
 _HEAD = ("case", "ATE, mm", "x untouched", "drift, mm/s", "drift, deg/s", "lost", "of frames")
 

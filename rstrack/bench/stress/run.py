@@ -29,7 +29,7 @@ from rstrack.data.estimate import INFO, Estimate, read_estimate
 from rstrack.mapping.fused_keyframes import FusedKeyframe, Sigma, depth_errors, fused_keyframes
 from rstrack.metrics.images import gradient_energy, psnr_db, ssim
 from rstrack.options import Options
-from rstrack.tracking.run import track
+from rstrack.tracking.runs.run import track
 
 # Seconds within which a keyframe and the sharp truth are of the same instant.
 _SAME_INSTANT_S = 1e-4

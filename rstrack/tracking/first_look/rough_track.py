@@ -12,7 +12,7 @@ from rsgen.geometry.camera import Camera
 from rstrack.data.dataset import Dataset
 from rstrack.data.rig import Frame, Image
 from rstrack.options import Options
-from rstrack.tracking.run import AnyTracker, make_tracker
+from rstrack.tracking.any_tracker import AnyTracker, make_tracker
 
 # Depth images as wide as that are thinned out: they take most of the time.
 _LARGE = 480

@@ -11,10 +11,10 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,21 +22,19 @@ from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import write_error
-from rsgen.geometry.spline import Spline
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate, write_estimate
 from rstrack.data.noise import with_noise
 from rstrack.data.prefetch import prefetched
-from rstrack.data.rig import Frame, Rig
+from rstrack.data.rig import Frame
 from rstrack.metrics.association import Truth, compare, truth_of
 from rstrack.metrics.run_evaluate import Evaluation, evaluate_clocks
 from rstrack.options import Options
-from rstrack.tracking.record import Noise, diagnostics, settings, timings
-from rstrack.tracking.result import End, Result, keyframes_text
+from rstrack.tracking.any_tracker import AnyTracker, make_tracker
+from rstrack.tracking.runs.record import Noise, diagnostics, settings, timings
+from rstrack.tracking.runs.result import End, Result, keyframes_text
 
 if TYPE_CHECKING:
-    from rstrack.images.device_frame import Timer
-    from rstrack.tracking.frame_report import FrameReport
     from rstrack.tracking.loop_closing import Closing
 
 
@@ -45,67 +43,6 @@ if TYPE_CHECKING:
 _TRUTH_EVERY, _TRUTH_GROWTH = 30, 1.05
 # Files that mark a folder as a data set, which a run folder's spline.npz must not overwrite.
 _DATASET_FILES = ("sequence.yaml", "rgb.txt", "depth.txt", "associations.txt", "groundtruth.txt")
-
-
-class AnyTracker(Protocol):
-    """What all trackers have in common."""
-
-    @property
-    def reports(self) -> list[FrameReport]:
-        """Of all frames so far."""
-
-    @property
-    def options(self) -> Options:
-        """With all that depends on the rig."""
-
-    @property
-    def keyframes(self) -> int:
-        """How many there have been."""
-
-    @property
-    def spline(self) -> Spline | None:
-        """T_world_depth(t) so far, None where there is none."""
-
-    @property
-    def spline_valid(self) -> Sequence[tuple[float, float]]:
-        """Times (begin, end) in s within which the spline is an estimate."""
-
-    @property
-    def trajectory(self) -> tuple[FloatArray, FloatArray]:
-        """Stamps (n,) in s of the frames that were not lost and T_world_depth (n, 4, 4) there."""
-
-    def feed(self, frame: Frame) -> FrameReport:
-        """Track one frame."""
-
-
-def make_tracker(
-    rig: Rig, options: Options, timer: Timer | None = None, load: Callable[[int], Frame] | None = None,
-    interval_s: float | None = None,
-) -> AnyTracker:  # fmt: skip
-    """The tracker of options.method; `timer` watches the parts of its work. load: as in `LoopTracker`.
-
-    interval_s: the usual time between frames, where that is known; otherwise the first two tell.
-
-    Raises UserError if its backend cannot work on this machine.
-    """
-    from rsgen.device.arrays import engine
-
-    # Before anything else imports Dr.Jit, which then would choose a libLLVM itself.
-    engine(options.backend)
-    from rstrack.images.device_frame import untimed
-
-    timer, options = timer or untimed, options.decided(rig.depth_shutter, interval_s)
-    if options.method == "baseline":
-        from rstrack.tracking.pose_tracker import BaselineTracker
-
-        return BaselineTracker(rig, options, timer)
-    if options.loops == "online":
-        from rstrack.tracking.loop_tracker import LoopTracker
-
-        return LoopTracker(rig, options, timer, load)
-    from rstrack.tracking.spline_tracker import Tracker
-
-    return Tracker(rig, options, timer)
 
 
 def track(
@@ -142,8 +79,8 @@ def track(
         return _readable(load(fed[index]))
 
     tracker = make_tracker(dataset.rig, options, load=again, interval_s=dataset.interval_s(chosen))
-    from rstrack.tracking.checkpoint import Done, checkpoint_of  # these import Dr.Jit
     from rstrack.tracking.loop_tracker import LoopTracker
+    from rstrack.tracking.runs.checkpoint import Done, checkpoint_of  # these import Dr.Jit
 
     _make_folder(out)
     checkpoint = checkpoint_of(out, dataset, chosen, tracker, dataclasses.asdict(noise))

@@ -1,0 +1,76 @@
+"""Which tracker a method has, and what all trackers have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Protocol
+
+from rsgen.array_types import FloatArray
+from rsgen.geometry.spline import Spline
+from rstrack.data.rig import Frame, Rig
+from rstrack.options import Options
+
+if TYPE_CHECKING:
+    from rstrack.images.device_frame import Timer
+    from rstrack.tracking.frame_report import FrameReport
+
+
+class AnyTracker(Protocol):
+    """What all trackers have in common."""
+
+    @property
+    def reports(self) -> list[FrameReport]:
+        """Of all frames so far."""
+
+    @property
+    def options(self) -> Options:
+        """With all that depends on the rig."""
+
+    @property
+    def keyframes(self) -> int:
+        """How many there have been."""
+
+    @property
+    def spline(self) -> Spline | None:
+        """T_world_depth(t) so far, None where there is none."""
+
+    @property
+    def spline_valid(self) -> Sequence[tuple[float, float]]:
+        """Times (begin, end) in s within which the spline is an estimate."""
+
+    @property
+    def trajectory(self) -> tuple[FloatArray, FloatArray]:
+        """Stamps (n,) in s of the frames that were not lost and T_world_depth (n, 4, 4) there."""
+
+    def feed(self, frame: Frame) -> FrameReport:
+        """Track one frame."""
+
+
+def make_tracker(
+    rig: Rig, options: Options, timer: Timer | None = None, load: Callable[[int], Frame] | None = None,
+    interval_s: float | None = None,
+) -> AnyTracker:  # fmt: skip
+    """The tracker of options.method; `timer` watches the parts of its work. load: as in `LoopTracker`.
+
+    interval_s: the usual time between frames, where that is known; otherwise the first two tell.
+
+    Raises UserError if its backend cannot work on this machine.
+    """
+    from rsgen.device.arrays import engine
+
+    # Before anything else imports Dr.Jit, which then would choose a libLLVM itself.
+    engine(options.backend)
+    from rstrack.images.device_frame import untimed
+
+    timer, options = timer or untimed, options.decided(rig.depth_shutter, interval_s)
+    if options.method == "baseline":
+        from rstrack.tracking.pose_tracker import BaselineTracker
+
+        return BaselineTracker(rig, options, timer)
+    if options.loops == "online":
+        from rstrack.tracking.loop_tracker import LoopTracker
+
+        return LoopTracker(rig, options, timer, load)
+    from rstrack.tracking.spline_tracker import Tracker
+
+    return Tracker(rig, options, timer)
