@@ -82,9 +82,10 @@ class KeyframeMaker:
         T_world_base, base, rho = self.rectify(depth, spline)
         shape = base.camera.height, base.camera.width
         host = e.download(rho, shape)
-        made = self._finish(index, depth, colors, spline, t, T_world_base, base, rho, host, None)
         if older is None or older.rolling is not None:
-            return made
+            return self._finish(index, depth, colors, spline, t, T_world_base, base, rho, host, None)
+        # Its colours are looked up once its depth is known.
+        made = self._finish(index, depth, (), spline, t, T_world_base, base, rho, host, None)
         T = se3.inverse(older.T_world_base) @ T_world_base
         from_base = e.upload(np.concatenate([T[:3, :3].ravel(), T[:3, 3], np.zeros(6)]))
         rho, weight = self._fuse(made, older.lens, older.inverse_depth, older.weight, from_base)
