@@ -60,6 +60,16 @@ def eliminate(
     return left, Eliminated(at, step, follow), 0.5 * float(off @ off)
 
 
+def contrast(H: FloatArray, at: FloatArray) -> float:
+    """Standard deviation of the reference's intensities, made as bright as the image by its gain and offset `at` (2,).
+
+    H (2, 2): of gain and offset, over no σ: Σ w c cᵀ with c = −(I_ref − ½), −1.
+    """
+    count = max(float(H[1, 1]), 1e-12)
+    variance = float(H[0, 0]) / count - (float(H[0, 1]) / count) ** 2
+    return float((1.0 + at[0]) * np.sqrt(max(variance, 0.0)))
+
+
 def relative(image: FloatArray, reference: FloatArray) -> FloatArray:
     """Gain and offset (2,) of an image against a reference, from those of both against a third."""
     gain = (1.0 + image[0]) / (1.0 + reference[0])

@@ -14,7 +14,7 @@ from rsgen.device.lens import Lens
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import BlockSums, Scaling, block_counts
-from rstrack.alignment.brightness import SAME, Eliminated, eliminate
+from rstrack.alignment.brightness import SAME, Eliminated, contrast, eliminate
 from rstrack.alignment.independence import inflation
 from rstrack.alignment.normal_equations import Quadratic, Slopes, chain
 from rstrack.alignment.residuals import (
@@ -59,6 +59,8 @@ class Linearised:
     inflation: float
     # Of a colour image: its gain and offset, which the model no longer holds.
     brightness: Eliminated | None = None
+    # What it is expected to differ by from pixel to pixel, see `brightness.contrast`.
+    contrast: float = np.inf
 
     @property
     def fit(self) -> float:
@@ -253,15 +255,18 @@ class Terms:
             own = sums.columns
             model, coupling = chain(sums, slopes, None if own is None else own.coupling)
         model = Quadratic(model.first, model.H / sigma**2, model.g / sigma)
-        cost, eliminated = sums.cost, None
+        cost, eliminated, spread = sums.cost, None, np.inf
         if own is not None:
+            spread = contrast(own.H, brightness)
             scaled = coupling / sigma**2, own.H / sigma**2, own.g / sigma
             model, eliminated, surprise = eliminate(model, *scaled, brightness, expected)
             cost += surprise
         next_sigma = scale_step(sigma, sums.weighted, sums.count, floor)
         seen = seen_motions(sums, median_depth)
         counts = sums.count, sums.compared
-        return Linearised(model, slopes.current, sigma, next_sigma, cost, *counts, floor, seen, scatter, eliminated)
+        return Linearised(
+            model, slopes.current, sigma, next_sigma, cost, *counts, floor, seen, scatter, eliminated, spread
+        )
 
 
 def _stride(lens: Lens, level: int) -> int:

@@ -70,3 +70,14 @@ def test_moments_match_and_small_changes_of_the_view_are_none() -> None:
     known = np.array([0.05, 0.01])
     assert brightness.expected(known, before + 0.02, before) is known
     assert np.abs(brightness.expected(known, after, before) - known).max() > 0.05
+
+
+def test_contrast_is_the_spread_of_the_reference_as_bright_as_the_image() -> None:
+    rng = np.random.default_rng(5)
+    light, w = rng.uniform(0.2, 0.9, 500), rng.uniform(0.1, 1.2, 500)
+    columns = -np.column_stack([light - brightness.MID_GREY, np.ones(500)])
+    H = (columns * w[:, None]).T @ columns
+    seen = light + 0.4 * (light - 0.5) - 0.1
+    expected = np.sqrt(np.cov(seen, aweights=w, ddof=0))
+    assert brightness.contrast(H, np.array([0.4, -0.1])) == pytest.approx(float(expected), rel=1e-9)
+    assert brightness.contrast(np.zeros((2, 2)), np.zeros(2)) == 0.0

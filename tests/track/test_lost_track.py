@@ -34,12 +34,13 @@ def odd(kind: str) -> str:
 
 def term(
     kind: str, sigma: float, count: int = 5000, floor: float = 0.0, fit: float = 1.0, distance: float = 1.0,
-    observability: float = 1.0, fx: float = 500.0, inflation: float = 1.0,
+    observability: float = 1.0, fx: float = 500.0, inflation: float = 1.0, contrast: float = np.inf,
 ) -> Any:  # fmt: skip
     """An observation of a linearised image: its scale, pixels, smallest credible scale, part that fits, how far away
-    (m) what it shows is, how well it tells all motions, the reference's focal length (px), and how many of its pixels
-    tell as much as one (usually two)."""
+    (m) what it shows is, how well it tells all motions, the reference's focal length (px), how many of its pixels
+    tell as much as one (usually two), and what colours are expected to differ by."""
     lin = SimpleNamespace(count=count, next_sigma=sigma, floor=floor, fit=fit, observability=observability)
+    lin.contrast = contrast
     lens = SimpleNamespace(camera=SimpleNamespace(fx=fx))
     ref = SimpleNamespace(median_depth=distance, lens=lens)
     o = SimpleNamespace(
@@ -65,6 +66,14 @@ def test_errors_of_depth_may_grow_with_the_square_of_the_distance() -> None:
     assert fault(history, [term("depth", 0.02)]) == odd("depth")
     assert fault(history, [term("depth", 0.06, distance=3.0)]) == ""
     assert fault(history, [term("depth", 0.10, distance=3.0)]) == odd("depth")  # three times what is worst at a metre
+
+
+def test_colours_that_differ_from_the_keyframe_by_more_than_it_shows_are_another_places() -> None:
+    history = FitHistory()
+    assert fault(history, [term("depth", 3e-3), term("color", 0.10, contrast=0.11)]) == ""
+    assert fault(history, [term("depth", 3e-3), term("color", 0.10, contrast=0.09)]) == other("color")
+    # A plain wall shows less than the camera's noise, and is the same place all the same.
+    assert fault(history, [term("depth", 3e-3), term("color", 0.02, contrast=0.01)]) == ""
 
 
 def after(kind: str, sigmas: Iterable[float]) -> FitHistory:

@@ -180,6 +180,8 @@ class FitHistory:
             return Fault.LITTLE_DEPTH if o.is_depth else Fault.LITTLE_COLOR
         if o.lin.fit < _least_fit(o):
             return Fault.OTHER_DEPTH if o.is_depth else Fault.OTHER_COLOR
+        if max(o.lin.contrast, _HARMLESS_INTENSITY) < o.lin.next_sigma:
+            return Fault.OTHER_COLOR  # what it is expected to show is not in it
         if o.lin.next_sigma > self._limit(o):
             return Fault.ODD_DEPTH if o.is_depth else Fault.ODD_COLOR
         return Fault.NONE
