@@ -36,7 +36,7 @@ from rstrack.tracking.found_poses import FoundPoses
 from rstrack.tracking.frame_report import FrameReport, frame_report
 from rstrack.tracking.gains import Gains
 from rstrack.tracking.judgement.fault import Fault
-from rstrack.tracking.judgement.lost_track import FitHistory, doubted, implausible, is_settled
+from rstrack.tracking.judgement.lost_track import FitHistory, doubted, draws, implausible, is_settled
 from rstrack.tracking.judgement.pose_covariances import PoseCovariances
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.relocalise import Relocaliser, without_misfits
@@ -248,6 +248,8 @@ class Tracker:
             fault = Fault.TOO_FAR
         elif not fault and not uncertainty.is_known:
             fault = Fault.LEFT_OPEN
+        elif not fault and draws(*self._given(before, window), gap):
+            fault = Fault.DRAWS
         if fault:
             self._window = before
             return self._relocalise(new, fault)
@@ -405,6 +407,11 @@ class Tracker:
         for o in observations:
             o.independent = 1.0 / self._independence[not o.is_depth].inflation
         return observations
+
+    def _given(self, before: Window, after: Window) -> tuple[FloatArray, FloatArray]:
+        """Poses (n, 4, 4) of the frames that still move, before and after a new one has been aligned."""
+        stamps = [max(frame.stamp, before.spline.t_begin) for frame in self._succession.recent]
+        return before.spline.pose(stamps), after.spline.pose(stamps)
 
     def _placed(self, new: DeviceFrame, fresh: Sequence[Observation] = (), joined: bool = True) -> None:
         """A frame has been found: its stamp, its brightness, and until when the spline is known."""

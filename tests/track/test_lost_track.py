@@ -14,7 +14,7 @@ from rsgen.geometry import se3
 from rstrack.alignment.optimizer import Solved
 from rstrack.alignment.pull import Pulls
 from rstrack.tracking.judgement.fault import Fault
-from rstrack.tracking.judgement.lost_track import FitHistory, doubted, implausible, is_settled
+from rstrack.tracking.judgement.lost_track import FitHistory, doubted, draws, implausible, is_settled
 
 NOTHING, UNSETTLED = Fault.NOTHING_SEEN, Fault.UNSETTLED
 NAMES = {"depth": "depth", "color": "colour"}
@@ -359,3 +359,19 @@ def test_nothing_is_begun_anew_from_lines_that_do_not_hang_together() -> None:
         images = [term("depth", 1e-3, inflation=99.0), term("color", 1e-3, inflation=inflation)]
         assert fault(pulled_before(), images, new=True) == says
         assert fault(pulled_before(), images) == ""
+
+
+@pytest.mark.parametrize(
+    ("metres", "degrees", "gap", "is_drawn"),
+    [
+        (0.009, 0.0, 1 / 30, False), (0.011, 0.0, 1 / 30, True), (0.0, 0.9, 1 / 30, False), (0.0, 1.1, 1 / 30, True),
+        (0.024, 0.0, 0.1, False), (0.026, 0.0, 0.1, True),
+    ],
+)  # fmt: skip
+def test_earlier_frames_stay_about_where_they_were_found(
+    metres: float, degrees: float, gap: float, is_drawn: bool
+) -> None:
+    given = se3.exp(np.random.default_rng(2).normal(size=(3, 6)))
+    moved = given.copy()
+    moved[1] = given[1] @ se3.exp(np.array([0.0, metres, 0.0, np.radians(degrees), 0.0, 0.0]))
+    assert not draws(given, given, gap) and draws(given, moved, gap) is is_drawn

@@ -22,7 +22,7 @@ REF: Any = SimpleNamespace(pixels=5000, T_world_base=np.eye(4), median_depth=1.0
 
 
 def seen(kind: str, fit: float = 1.0) -> Any:
-    lin = SimpleNamespace(fit=fit, next_sigma=1e-3, floor=0.0, count=5000)
+    lin = SimpleNamespace(fit=fit, next_sigma=1e-3, floor=0.0, count=5000, contrast=np.inf)
     image = object() if kind == "color" else DepthImage.__new__(DepthImage)
     if kind == "depth":
         object.__setattr__(image, "count", 5000)

@@ -25,6 +25,7 @@ class Fault(StrEnum):
     PULLED = "the images do not agree with the motion"
     TOO_FAR = "it is further from where the motion led than a hand moves a camera"
     LEFT_OPEN = "what is seen leaves a motion open"
+    DRAWS = "it draws frames before it from where they were found"
     # Of images against the keyframes that look like them, where the track is lost.
     NO_PLACE = "no keyframe shows what it shows"
     UNSURE = "only depth fits, which many places share"
@@ -40,4 +41,4 @@ class Fault(StrEnum):
     @property
     def is_pull(self) -> bool:
         """Whether images were found where the motion led, but pull away from it."""
-        return self in (Fault.DIVIDED, Fault.PULLED)
+        return self in (Fault.DIVIDED, Fault.PULLED, Fault.DRAWS)

@@ -44,6 +44,9 @@ _WORST_SHIFT_PX = 2.0
 # and rad/s, and what is always allowed.
 _MOST_ACCELERATION, _MOST_VELOCITY = np.array([100.0, 200.0]), np.array([4.0, 8.0])
 _ALWAYS = np.array([0.05, np.radians(4.0)])
+# How far (m, rad) a new frame may draw those before it from where they were given, as many times further as frames come
+# more slowly than 25 a second: 4.4 mm and 0.3° at most on fr1_rpy, 0.2 mm on table1.
+_MOST_DRAWN, _DRAWN_WITHIN_S = np.array([1e-2, np.radians(1.0)]), 0.04
 _MEMORY = 30
 # How far a frame's images, or one term alone, may pull (see `alignment.pull`): so many times the usual, and always so
 # many metres; and so many times the usual number of σ, and always so many. Further in both is too far. Usual is what a
@@ -236,3 +239,10 @@ def implausible(T_predicted: FloatArray, T_found: FloatArray, dt: float) -> bool
     off = se3.log(se3.inverse(T_predicted) @ T_found)
     most = _ALWAYS + np.minimum(_MOST_ACCELERATION * dt**2, _MOST_VELOCITY * dt)
     return bool((np.linalg.norm(off.reshape(2, 3), axis=1) > most).any())
+
+
+def draws(T_given: FloatArray, T_now: FloatArray, gap: float) -> bool:
+    """Whether a frame that came gap s after the one before has drawn poses (n, 4, 4) of earlier ones too far from where
+    they were."""
+    moved = np.linalg.norm(se3.log(se3.inverse(T_given) @ T_now).reshape(-1, 2, 3), axis=-1)
+    return bool((moved > _MOST_DRAWN * max(1.0, gap / _DRAWN_WITHIN_S)).any())
