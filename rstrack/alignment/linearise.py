@@ -59,7 +59,7 @@ class Linearised:
     inflation: float
     # Of a colour image: its gain and offset, which the model no longer holds.
     brightness: Eliminated | None = None
-    # What it is expected to differ by from pixel to pixel, see `brightness.contrast`.
+    # The spread of the intensities that are expected in it, see `brightness.contrast`; infinite for depth.
     contrast: float = np.inf
 
     @property

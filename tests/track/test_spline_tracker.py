@@ -16,6 +16,7 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.options import Method, Options
+from rstrack.tracking import spline_tracker
 from rstrack.tracking.judgement.fault import Fault
 from rstrack.tracking.spline_tracker import Tracker
 
@@ -142,6 +143,16 @@ def test_a_keyframe_whose_colours_are_another_places_is_left() -> None:
     used = [report.inliers_color > 0 for report in tracker.reports]
     assert lost(tracker) == [] and not any(used[1:5]) and all(used[10:])
     assert tracker.keyframes == 2 and worst_step(tracker) < 3e-3
+
+
+def test_a_frame_that_draws_those_before_it_is_lost_and_they_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    tracker = feed(tracker_of("rs-pg"), (frame_at(k) for k in range(10)))
+    stamps, given = tracker.trajectory
+    monkeypatch.setattr(spline_tracker, "draws", lambda *_: True)
+    monkeypatch.setattr(tracker._relocaliser, "find", lambda *_: Fault.NO_PLACE)
+    assert tracker.feed(frame_at(10)).fault == Fault.DRAWS
+    np.testing.assert_array_equal(tracker.trajectory[1], given)
+    assert len(stamps) == 10
 
 
 def test_nothing_but_blank_frames() -> None:
