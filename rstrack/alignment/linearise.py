@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import BlockSums, Scaling, block_counts
 from rstrack.alignment.brightness import SAME, Eliminated, contrast, eliminate
 from rstrack.alignment.independence import inflation
-from rstrack.alignment.normal_equations import Quadratic, Slopes, chain
+from rstrack.alignment.normal_equations import Quadratic, Slopes, chain, prepare_jacobians
 from rstrack.alignment.residuals import (
     GeometricInput,
     PhotometricInput,
@@ -55,12 +56,17 @@ class Linearised:
     floor: float
     # Σ w j jᵀ / count (6, 6) with rotations scaled by the scene's depth.
     seen: FloatArray
-    # See `independence.inflation`.
-    inflation: float
+    # Of the blocks of lines, from which it was made.
+    sums: BlockSums
     # Of a colour image: its gain and offset, which the model no longer holds.
     brightness: Eliminated | None = None
     # The spread of the intensities that are expected in it, see `brightness.contrast`; infinite for depth.
     contrast: float = np.inf
+
+    @cached_property
+    def inflation(self) -> float:
+        """See `independence.inflation`: asked for once a frame, not at every step."""
+        return inflation(self.sums)
 
     @property
     def fit(self) -> float:
@@ -115,10 +121,18 @@ class Terms:
             timer=device.timer,
         )  # fmt: skip
 
-    def expect(self, spline: Spline, images: Sequence[DepthImage | ColorImage]) -> None:
-        """These images are linearised next, at this spline: their lines' poses are worked out together."""
+    def expect(
+        self, spline: Spline, images: Sequence[DepthImage | ColorImage], slopes_at: Sequence[tuple[Spline, Reference]]
+    ) -> None:  # fmt: skip
+        """These images are linearised next, at this spline, with slopes at others and against these references: what is
+        needed of their lines is worked out together."""
         with self.timer("poses of lines"):
             prepare(spline, [image.exposure for image in images])
+            times: dict[Spline, list[FloatArray]] = {}
+            for image, (at, ref) in zip(images, slopes_at, strict=True):
+                times.setdefault(at, []).append(_block_times(image.exposure, ref))
+            for at, wanted in times.items():
+                prepare_jacobians(at, wanted)
 
     def geometric(
         self, image: DepthImage, ref: Reference, spline: Spline, level: int, sigma: float,
@@ -213,9 +227,9 @@ class Terms:
 
     def _slopes(self, spline: Spline, exposure: Exposure, ref: Reference) -> Slopes:
         with self.timer("poses of lines"):
-            _, _, per, ref_per = block_counts(exposure.lens, ref.lens)
+            ref_per = block_counts(exposure.lens, ref.lens)[3]
             ref_times = None if ref.rolling is None else ref.rolling.block_times(ref_per)
-            return Slopes.of(spline, ref.T_world_base, exposure.block_times(per), ref_times)
+            return Slopes.of(spline, ref.T_world_base, _block_times(exposure, ref), ref_times)
 
     def _to_base(self, spline: Spline, T_world_base: FloatArray, exposure: Exposure) -> Any:
         with self.timer("poses of lines"):
@@ -248,12 +262,11 @@ class Terms:
         self, sums: BlockSums, slopes: Slopes, sigma: float, floor: float, median_depth: float,
         brightness: FloatArray = SAME, expected: FloatArray = SAME,
     ) -> Linearised:  # fmt: skip
-        scatter = inflation(sums)
-        if len(sums.H) > len(slopes.current):
-            sums = sums.summed()  # of lines that are exposed at once
+        # Lines that are exposed at once move alike.
+        moved = sums.summed() if len(sums.H) > len(slopes.current) else sums
         with self.timer("linear algebra: chain"):
-            own = sums.columns
-            model, coupling = chain(sums, slopes, None if own is None else own.coupling)
+            own = moved.columns
+            model, coupling = chain(moved, slopes, None if own is None else own.coupling)
         model = Quadratic(model.first, model.H / sigma**2, model.g / sigma)
         cost, eliminated, spread = sums.cost, None, np.inf
         if own is not None:
@@ -265,8 +278,13 @@ class Terms:
         seen = seen_motions(sums, median_depth)
         counts = sums.count, sums.compared
         return Linearised(
-            model, slopes.current, sigma, next_sigma, cost, *counts, floor, seen, scatter, eliminated, spread
+            model, slopes.current, sigma, next_sigma, cost, *counts, floor, seen, sums, eliminated, spread
         )
+
+
+def _block_times(exposure: Exposure, ref: Reference) -> FloatArray:
+    """When the middles of an image's blocks of lines are exposed (n,)."""
+    return exposure.block_times(block_counts(exposure.lens, ref.lens)[2])
 
 
 def _stride(lens: Lens, level: int) -> int:

@@ -9,11 +9,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import scipy.linalg
 
-from rsgen.array_types import FloatArray
+from rsgen.array_types import FloatArray, IntArray
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import BlockSums
@@ -47,10 +48,30 @@ def line_jacobian(spline: Spline, T_world_base: FloatArray, times: FloatArray, f
     return _line_jacobian(spline, T_world_base.tobytes(), times.tobytes(), first, count)
 
 
+# Of a spline's last images: see `line_poses`.
+_REMEMBERED = 64
+_jacobians: WeakKeyDictionary[Spline, dict[bytes, tuple[IntArray, FloatArray]]] = WeakKeyDictionary()
+
+
+def prepare_jacobians(spline: Spline, times: Iterable[FloatArray]) -> None:
+    """Work out what `line_jacobian` of several images' times (n,) needs at once: a call costs more than the numbers."""
+    known = _jacobians.setdefault(spline, {})
+    new = [t for t in {t.tobytes(): t for t in times}.values() if t.tobytes() not in known]
+    if not new:
+        return
+    first, J = spline.pose_jacobian(np.concatenate(new))
+    for oldest in list(known)[: max(0, len(known) + len(new) - _REMEMBERED)]:
+        del known[oldest]
+    ends = np.cumsum([len(t) for t in new])[:-1]
+    for t, *found in zip(new, np.split(first, ends), np.split(J, ends), strict=True):
+        known[t.tobytes()] = found[0], found[1]
+
+
 @lru_cache(maxsize=64)
 def _line_jacobian(spline: Spline, T_world_base: bytes, times: bytes, first: int, count: int) -> FloatArray:
     """Remembered, because both terms and all iterations of a level ask for the same."""
-    at, J = spline.pose_jacobian(np.frombuffer(times))
+    prepare_jacobians(spline, [np.frombuffer(times)])
+    at, J = _jacobians[spline][times]
     J = se3.adjoint(se3.inverse(np.frombuffer(T_world_base).reshape(4, 4))) @ J
     out = np.zeros((len(at), 6, count, 6))
     rows = np.arange(len(at))

@@ -114,7 +114,7 @@ class Observation:
 
     def start(self, terms: Terms, state: SplineState, level: int) -> Callable[[], None]:
         """The same in two steps: the device works until what this returns is called."""
-        image, sigma, slopes_at = self.image, self.linearisation.sigma, self._slopes(state)
+        image, sigma, slopes_at = self.image, self.linearisation.sigma, self.slopes_at(state)
         is_finest = level == 0
         level = THINNED if is_finest and self.independent < THIN_BELOW else level
         brightness, before = self.brightness(state), state.copy()
@@ -169,7 +169,7 @@ class Observation:
         model, moved = self.lin.model, self._since(state).ravel()
         return self.stands_for * float(moved @ model.H @ moved)
 
-    def _slopes(self, state: SplineState) -> Spline:
+    def slopes_at(self, state: SplineState) -> Spline:
         """Where the poses of its lines are differentiated: an earlier state as long as that is as good."""
         before = self._slopes_at
         if before is None or state.distance_from(before) > _SAME_SLOPES:

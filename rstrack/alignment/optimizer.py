@@ -161,10 +161,11 @@ def _linearise(terms: Terms, state: SplineState, problem: Problem, level: int) -
     tolerance = RELINEARISE_PX * (1 + 4 * level) if level else _tolerance(problem)
     fresh = [o for o in problem.fresh if not o.is_linearised or _has_moved(o, state, problem.focal, tolerance)]
     settled = [o for o in problem.settled if level == 0 and _has_moved(o, state, problem.focal, tolerance)]
-    terms.expect(state.spline, [o.image for o in (*fresh, *settled)])
-    for finish in [o.start(terms, state, level) for o in (*fresh, *settled)]:
+    anew = (*fresh, *settled)
+    terms.expect(state.spline, [o.image for o in anew], [(o.slopes_at(state), o.ref) for o in anew])
+    for finish in [o.start(terms, state, level) for o in anew]:
         finish()
-    return len(fresh) + len(settled)
+    return len(anew)
 
 
 def _has_moved(observation: Observation, state: SplineState, focal: float, tolerance: float) -> bool:

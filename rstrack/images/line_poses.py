@@ -8,7 +8,6 @@ from functools import lru_cache
 from weakref import WeakKeyDictionary
 
 import numpy as np
-import numpy.typing as npt
 
 from rsgen.array_types import FloatArray
 from rsgen.device.lens import Lens
@@ -55,42 +54,65 @@ class Exposure:
 
 
 @lru_cache(maxsize=16)
-def _line_blocks(lens: Lens) -> tuple[FloatArray, npt.NDArray[np.intp], FloatArray]:
-    """Times of the blocks' middles after the stamp (s), the block of each line, and each line's time after that."""
+def _line_blocks(lens: Lens) -> tuple[FloatArray, FloatArray]:
+    """Times (n,) of the blocks' middles after the stamp (s), and each line's time after that (n, per block, 1).
+
+    The last block's lines that the image does not have have its middle.
+    """
     at_zero = Exposure(lens, 0.0, np.eye(4))
     per_node = max(1, lens.lines // _NODES)
     middle = at_zero.block_times(per_node)
-    block = np.arange(lens.lines) // per_node
-    return middle, block, (at_zero.times() - middle[block])[:, None]
+    dt = np.zeros(len(middle) * per_node)
+    dt[: lens.lines] = at_zero.times() - middle.repeat(per_node)[: lens.lines]
+    return middle, dt.reshape(len(middle), per_node, 1)
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """Poses T_world_body (n, 4, 4) at the blocks' middles, body twists (n, 6) there and their change per second.
+
+    A line dt from the middle is at T exp(twist dt + ½ rate dt²), to second order in dt.
+    """
+
+    T: FloatArray
+    twist: FloatArray
+    rate: FloatArray
+
+    def powers(self, sign: float) -> FloatArray:
+        """Coefficients (3, n, 4, 4) of 1, dt and dt² in that exponential, or with sign −1 in its inverse."""
+        W, dW = _algebra(self.twist), _algebra(self.rate)
+        return np.stack([np.broadcast_to(np.eye(4), W.shape), sign * W, 0.5 * (W @ W + sign * dW)])
+
+
+def _algebra(twist: FloatArray) -> FloatArray:
+    """Twists (n, 6) as elements of se(3) (n, 4, 4)."""
+    out = np.zeros((len(twist), 4, 4))
+    out[:, :3, :3], out[:, :3, 3] = hat(twist[:, 3:]), twist[:, :3]
+    return out
 
 
 # Of a spline's last images, as long as the spline is there: both terms ask for the same. A whole recording is mapped
 # along one spline.
 _REMEMBERED = 64
-_motions: WeakKeyDictionary[Spline, dict[tuple[Lens, float], tuple[FloatArray, FloatArray]]] = WeakKeyDictionary()
+_motions: WeakKeyDictionary[Spline, dict[tuple[Lens, float], _Motion]] = WeakKeyDictionary()
 
 
 def prepare(spline: Spline, exposures: Iterable[Exposure]) -> None:
-    """Work out `line_motion` of several images at once: a call costs more than the numbers do."""
+    """Work out how the lines of several images move at once: a call costs more than the numbers do."""
     known = _motions.setdefault(spline, {})
     new = list(dict.fromkeys((x.lens, x.stamp) for x in exposures if (x.lens, x.stamp) not in known))
     if not new:
         return
-    nodes = [_line_blocks(lens) for lens, _ in new]
-    times = np.concatenate([stamp + middle for (_, stamp), (middle, _, _) in zip(new, nodes, strict=True)])
+    middles = [_line_blocks(lens)[0] for lens, _ in new]
+    times = np.concatenate([stamp + middle for (_, stamp), middle in zip(new, middles, strict=True)])
     T, twist = spline.pose_and_velocity(times)
-    at, rates, lines = 0, [], []
-    for middle, block, _ in nodes:
-        rates.append(_rate(middle, twist[at : at + len(middle)]))
-        lines.append(at + block)
-        at += len(middle)
-    poses, twists = _moved(
-        T, twist, np.concatenate(rates), np.concatenate(lines), np.concatenate([n[2] for n in nodes])
-    )
-    ends = np.cumsum([len(block) for block in lines])[:-1]
     for oldest in list(known)[: max(0, len(known) + len(new) - _REMEMBERED)]:
         del known[oldest]
-    known.update(zip(new, zip(np.split(poses, ends), np.split(twists, ends), strict=True), strict=True))
+    at = 0
+    for key, middle in zip(new, middles, strict=True):
+        own = slice(at, at + len(middle))
+        known[key] = _Motion(T[own], twist[own], _rate(middle, twist[own]))
+        at += len(middle)
 
 
 def _rate(middle: FloatArray, twist: FloatArray) -> FloatArray:
@@ -102,52 +124,57 @@ def _rate(middle: FloatArray, twist: FloatArray) -> FloatArray:
     return np.concatenate([slope[:1], 0.5 * (slope[1:] + slope[:-1]), slope[-1:]])
 
 
-def _moved(
-    T: FloatArray, twist: FloatArray, rate: FloatArray, block: npt.NDArray[np.intp], dt: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Poses and twists of lines that are dt (n, 1) s from the middle of their block."""
-    change = rate[block] * dt
-    moved = (twist[block] + 0.5 * change) * dt
-    w = hat(moved[:, 3:])
-    # Second order of exp: R(I + w + w²/2), and t likewise.
-    out = T[block]
-    R = out[:, :3, :3].copy()
-    Rw = R @ w
-    out[:, :3, :3] = R + Rw + 0.5 * (Rw @ w)
-    v = moved[:, :3, None]
-    out[:, :3, 3] += ((R + 0.5 * Rw) @ v)[..., 0]
-    return out, twist[block] + change
-
-
-def line_motion(spline: Spline, exposure: Exposure) -> tuple[FloatArray, FloatArray]:
-    """T_world_body (lines, 4, 4) and body twist (lines, 6), from the middle of each line's block.
-
-    With a twist that changes linearly: over the quarter of a millisecond to a block's edge that is exact to nanometres.
-    (A constant one is wrong by a micrometre at 35 m/s², and its velocity moves what project_rolling finds by 1e-3 px.)
-    """
+def _motion(spline: Spline, exposure: Exposure) -> _Motion:
     prepare(spline, [exposure])
     return _motions[spline][exposure.lens, exposure.stamp]
 
 
+def _of_lines(lens: Lens, *powers: FloatArray) -> FloatArray:
+    """What changes with time as Σ powers[k] dtᵏ within each block, powers (n, m) each: at every line (lines, m)."""
+    _, dt = _line_blocks(lens)
+    out = powers[-1][:, None]
+    for power in reversed(powers[:-1]):
+        out = power[:, None] + dt * out
+    return out.reshape(-1, out.shape[-1])[: lens.lines]
+
+
+def line_poses(spline: Spline, exposure: Exposure) -> FloatArray:
+    """T_world_body (lines, 4, 4), from the middle of each line's block.
+
+    With a twist that changes linearly: over the quarter of a millisecond to a block's edge that is exact to nanometres.
+    (A constant one is wrong by a micrometre at 35 m/s², and its velocity moves what project_rolling finds by 1e-3 px.)
+    """
+    motion = _motion(spline, exposure)
+    T = motion.T @ motion.powers(1.0)
+    return _of_lines(exposure.lens, *T.reshape(3, -1, 16)).reshape(-1, 4, 4)
+
+
+def line_twists(spline: Spline, exposure: Exposure) -> FloatArray:
+    """Body twists (lines, 6) likewise, in m/s and rad/s."""
+    motion = _motion(spline, exposure)
+    return _of_lines(exposure.lens, motion.twist, motion.rate)
+
+
 def to_base_table(spline: Spline, T_world_base: FloatArray, exposure: Exposure) -> FloatArray:
     """T_base_cam of each line (lines, 12): rotation row-major, translation."""
-    T_world_body, _ = line_motion(spline, exposure)
-    T = se3.inverse(T_world_base) @ T_world_body @ se3.inverse(exposure.T_cam_body)
-    return rows_of(T)
+    motion = _motion(spline, exposure)
+    T = se3.inverse(T_world_base) @ motion.T @ motion.powers(1.0) @ se3.inverse(exposure.T_cam_body)
+    return _of_lines(exposure.lens, *rows_of(T))
 
 
 def from_base_table(spline: Spline, T_world_base: FloatArray, exposure: Exposure) -> FloatArray:
     """T_cam_base of each line and the camera's body twist per line delay (lines, 18)."""
-    T_world_body, twist = line_motion(spline, exposure)
-    T = exposure.T_cam_body @ se3.inverse(T_world_body) @ T_world_base
+    motion = _motion(spline, exposure)
+    T = exposure.T_cam_body @ motion.powers(-1.0) @ (se3.inverse(motion.T) @ T_world_base)
     delay = exposure.lens.shutter.line_delay(exposure.lens.camera)
-    twist_cam = delay * twist @ se3.adjoint(exposure.T_cam_body).T
-    return np.concatenate([rows_of(T), twist_cam], axis=1)
+    twists = np.stack([motion.twist, motion.rate, np.zeros_like(motion.rate)])
+    twists = delay * twists @ se3.adjoint(exposure.T_cam_body).T
+    return _of_lines(exposure.lens, *np.concatenate([rows_of(T), twists], axis=-1))
 
 
 def rows_of(T: FloatArray) -> FloatArray:
-    """Poses (n, 4, 4) as (n, 12): rotation row-major, translation."""
-    return np.concatenate([T[:, :3, :3].reshape(-1, 9), T[:, :3, 3]], axis=1)
+    """Poses (..., 4, 4) as (..., 12): rotation row-major, translation."""
+    return np.concatenate([T[..., :3, :3].reshape(*T.shape[:-2], 9), T[..., :3, 3]], axis=-1)
 
 
 IDENTITY_FROM_BASE = np.concatenate([np.eye(3).ravel(), np.zeros(9)])[None]

@@ -29,7 +29,7 @@ from rsgen.device.recording import recorded, recorded_from
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.images.blur import blur_weight
-from rstrack.images.line_poses import Exposure, from_base_table, line_motion
+from rstrack.images.line_poses import Exposure, from_base_table, line_twists
 from rstrack.images.pyramid import DepthImage
 from rstrack.images.sampling import EDGE, bilinear, grid
 from rstrack.keyframes.keyframe import Reference
@@ -70,7 +70,7 @@ def linear_image(e: Engine, exposure: Exposure, color: npt.NDArray[np.uint8]) ->
 
 def sweep_table(spline: Spline, exposure: Exposure) -> npt.NDArray[np.float64]:
     """How each line's camera moves while the line is exposed (lines, 6): twist [m; rad] in the camera's frame."""
-    _, twist = line_motion(spline, exposure)
+    twist = line_twists(spline, exposure)
     return np.asarray(exposure.lens.shutter.exposure_s * twist @ se3.adjoint(exposure.T_cam_body).T)
 
 

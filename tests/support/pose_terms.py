@@ -16,6 +16,7 @@ import numpy as np
 
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
+from rstrack.alignment.block_sums import BlockSums
 from rstrack.alignment.linearise import Linearised, Started
 from rstrack.alignment.normal_equations import Quadratic
 from rstrack.alignment.observation import Observation
@@ -73,9 +74,8 @@ class PoseTerms:
         cost = 0.5 * float((e**2).sum())
         self.costs.append(cost)
         model = Quadratic(first, H, np.einsum("nia,ni->a", rows, e))
-        found = Linearised(
-            model, motion, 1.0, self.next_sigma, cost, len(at), len(at), self.floor, np.eye(6), float("nan")
-        )
+        sums = BlockSums(np.zeros((1, 1, 6, 6)), np.zeros((1, 1, 6)), 0.0, cost, len(at))
+        found = Linearised(model, motion, 1.0, self.next_sigma, cost, len(at), len(at), self.floor, np.eye(6), sums)
         return lambda: found
 
 

@@ -13,12 +13,13 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
-from rstrack.images import line_poses
+from rstrack.images import line_poses as lines
 from rstrack.images.line_poses import (
     IDENTITY_FROM_BASE,
     Exposure,
     from_base_table,
-    line_motion,
+    line_poses,
+    line_twists,
     prepare,
     to_base_table,
 )
@@ -62,7 +63,7 @@ def test_poses_are_those_of_the_spline_at_each_line(scan: Scan, height: int) -> 
     camera = Camera(height + 160, height, 525.0, 520.0, 319.5, 241.0)
     for seed in range(4):
         spline, image = hand_held(seed), exposure(scan, camera=camera)
-        T, twist = line_motion(spline, image)
+        T, twist = line_poses(spline, image), line_twists(spline, image)
         exact = spline.pose(image.times())
         # 20 m/s² and 40 rad/s², which change within a knot. 1e-8 rad are 5e-6 px.
         np.testing.assert_allclose(T[:, :3, 3], exact[:, :3, 3], atol=1e-8)
@@ -80,20 +81,20 @@ def test_images_worked_out_together_are_as_each_is_alone() -> None:
     prepare(spline, images[:2])
     prepare(spline, [*images, images[0]])
     for image in images:
-        for together, alone in zip(line_motion(spline, image), line_motion(other, image), strict=True):
-            np.testing.assert_allclose(together, alone, rtol=0, atol=1e-14)
-    assert spline is not other and len({id(line_motion(spline, image)) for image in images}) == len(images)
+        for told in (line_poses, line_twists):
+            np.testing.assert_allclose(told(spline, image), told(other, image), rtol=0, atol=1e-14)
+    assert spline is not other and len(lines._motions[spline]) == len(images)
 
 
 def test_a_whole_recording_along_one_spline_is_not_remembered() -> None:
     spline, image = hand_held(2), exposure()
-    first, _ = line_motion(spline, image)
-    for k in range(3 * line_poses._REMEMBERED):
-        line_motion(spline, replace(image, stamp=STAMP + 1e-4 * (k + 1)))
-    assert len(line_poses._motions[spline]) == line_poses._REMEMBERED
-    again, _ = line_motion(spline, image)
-    assert again is not first
-    np.testing.assert_array_equal(again, first)
+    first = line_poses(spline, image)
+    assert (image.lens, image.stamp) in lines._motions[spline]
+    for k in range(3 * lines._REMEMBERED):
+        line_poses(spline, replace(image, stamp=STAMP + 1e-4 * (k + 1)))
+    assert len(lines._motions[spline]) == lines._REMEMBERED
+    assert (image.lens, image.stamp) not in lines._motions[spline]
+    np.testing.assert_array_equal(line_poses(spline, image), first)
 
 
 def test_a_hand_that_jerks_costs_nanometres_where_a_constant_twist_costs_a_micrometre() -> None:
@@ -104,7 +105,7 @@ def test_a_hand_that_jerks_costs_nanometres_where_a_constant_twist_costs_a_micro
     image = exposure()
     reached = np.abs(np.diff(spline.velocity(image.times())[:, 0]) / np.diff(image.times())).max()
     assert reached == pytest.approx(acceleration, rel=0.02)
-    T, _ = line_motion(spline, image)
+    T = line_poses(spline, image)
     exact = spline.pose(image.times())[:, 0, 3]
     assert np.abs(T[:, 0, 3] - exact).max() < 2e-8
     middle = image.block_times(8).repeat(8)
@@ -116,7 +117,7 @@ def test_a_global_shutter_has_one_line_whose_pose_is_that_of_the_spline() -> Non
     spline, image = hand_held(1), exposure(readout_s=0.0)
     assert image.lens.lines == 1 and image.times() == pytest.approx([STAMP - 0.002])
     assert image.first_time == image.mid_time == image.last_time
-    T, twist = line_motion(spline, image)
+    T, twist = line_poses(spline, image), line_twists(spline, image)
     exact, velocity = spline.pose_and_velocity(np.array([STAMP - 0.002]))
     np.testing.assert_allclose(T, exact, atol=1e-15)
     np.testing.assert_allclose(twist, velocity, atol=1e-15)

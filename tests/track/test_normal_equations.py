@@ -15,6 +15,7 @@ from rstrack.alignment.normal_equations import (
     assemble,
     chain,
     line_jacobian,
+    prepare_jacobians,
     solve,
 )
 
@@ -48,6 +49,16 @@ def test_line_jacobian_is_the_derivative_of_the_twist_in_the_base_frame() -> Non
     # Control points moved alike move every line alike.
     to_base = se3.adjoint(se3.inverse(T_world_base))
     np.testing.assert_allclose(J.reshape(6, 6, 7, 6).sum(axis=2), np.broadcast_to(to_base, (6, 6, 6)), atol=1e-12)
+
+
+def test_jacobians_worked_out_together_are_as_each_is_alone() -> None:
+    spline, other, T = random_spline(3), random_spline(3), se3.exp(np.full(6, 0.2))
+    images = [TIMES, TIMES[:4] + 1e-3, TIMES[1:2]]
+    prepare_jacobians(spline, images[:1])
+    prepare_jacobians(spline, [*images, TIMES[:4] + 1e-3])
+    for times in images:
+        together, alone = line_jacobian(spline, T, times, 0, 7), line_jacobian(other, T, times, 0, 7)
+        np.testing.assert_allclose(together, alone, rtol=0, atol=1e-14)
 
 
 def test_chain_equals_the_sum_over_blocks() -> None:

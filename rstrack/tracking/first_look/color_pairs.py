@@ -24,7 +24,7 @@ _TRACKED, _EVERY, _APART = 60, 4, (4, 8)
 _WINDOWS, _ENOUGH, _TRIES = 8, 0.015, 3
 # Depth pixels looked up in a line.
 _ACROSS = 106
-# 8-bit values that are clipped, and their neighbours.
+# 8-bit values that are clipped, and their neighbours; in any channel, since how bright images are is compared here.
 _BLACK, _WHITE = 4, 250
 _ROUNDS = 3
 
