@@ -63,8 +63,8 @@ def prepare_jacobians(spline: Spline, times: Iterable[FloatArray]) -> None:
     for oldest in list(known)[: max(0, len(known) + len(new) - _REMEMBERED)]:
         del known[oldest]
     ends = np.cumsum([len(t) for t in new])[:-1]
-    for t, *found in zip(new, np.split(first, ends), np.split(J, ends), strict=True):
-        known[t.tobytes()] = found[0], found[1]
+    for t, segments, own in zip(new, np.split(first, ends), np.split(J, ends), strict=True):
+        known[t.tobytes()] = segments, own
 
 
 @lru_cache(maxsize=64)

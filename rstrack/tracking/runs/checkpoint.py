@@ -22,6 +22,7 @@ from rsgen.files import atomic_write, write_error
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import INFO
 from rstrack.tracking.loop_tracker import LoopTracker
+from rstrack.tracking.runs.record import Done
 from rstrack.tracking.spline_tracker import Tracker
 
 FOLDER = "checkpoint"
@@ -40,17 +41,6 @@ _NAMES = {
     *(("builtins", name) for name in ("slice", "range", "set", "frozenset", "complex", "bytearray")),
 }  # fmt: skip
 _DAMAGED = pickle.UnpicklingError, EOFError, AttributeError, ImportError, IndexError, KeyError, TypeError, ValueError
-
-
-@dataclass
-class Done:
-    """How far a run is: frames that have been looked at, seconds that it took, and what became of the frames."""
-
-    count: int = 0
-    total_s: float = 0.0
-    seconds: list[float] = field(default_factory=list)
-    fed: list[int] = field(default_factory=list)
-    unreadable: list[tuple[int, str]] = field(default_factory=list)
 
 
 def checkpoint_of(

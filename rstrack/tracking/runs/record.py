@@ -1,11 +1,11 @@
-"""What run.json says of a run: its settings, its times, and a line for every frame."""
+"""How far a run is, and what run.json says of it: its settings, its times, and a line for every frame."""
 
 from __future__ import annotations
 
 import dataclasses
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from typing import Any
 
@@ -24,6 +24,17 @@ class Noise:
     sigma_depth: float = 0.0
     sigma_intensity: float = 0.0
     seed: int = 0
+
+
+@dataclass
+class Done:
+    """How far a run is: frames that have been looked at, seconds that it took, and what became of the frames."""
+
+    count: int = 0
+    total_s: float = 0.0
+    seconds: list[float] = field(default_factory=list)
+    fed: list[int] = field(default_factory=list)
+    unreadable: list[tuple[int, str]] = field(default_factory=list)
 
 
 def settings(dataset: Dataset, chosen: range, options: Options, noise: Noise) -> dict[str, Any]:

@@ -31,12 +31,14 @@ from rstrack.metrics.association import Truth, compare, truth_of
 from rstrack.metrics.run_evaluate import Evaluation, evaluate_clocks
 from rstrack.options import Options
 from rstrack.tracking.any_tracker import AnyTracker, make_tracker
-from rstrack.tracking.runs.record import Noise, diagnostics, settings, timings
+from rstrack.tracking.runs.record import Done, Noise, diagnostics, settings, timings
 from rstrack.tracking.runs.result import End, Result, keyframes_text
 
 if TYPE_CHECKING:
     from rstrack.tracking.loop_closing import Closing
+    from rstrack.tracking.runs.checkpoint import Checkpoint
 
+Load = Callable[[int], tuple[Frame | None, tuple[str, ...]]]
 
 # Frames after which the error so far is shown anew, at least, and the factor by which they have grown by then: it takes
 # as long as there are frames.
@@ -68,58 +70,26 @@ def track(
     if truth is not None:
         truth = dataclasses.replace(truth, frame_stamps=dataset.stamps[chosen])
     noise = noise or Noise()
-
-    def load(k: int) -> tuple[Frame | None, tuple[str, ...]]:
-        frame, problems = dataset.readable_frame(k, color=options.photometric)
-        if frame is not None:
-            frame = with_noise(frame, k, noise.sigma_depth, noise.sigma_intensity, noise.seed)
-        return frame, problems
+    load = _loader(dataset, options, noise)
+    done = Done()
 
     def again(index: int) -> Frame:
-        return _readable(load(fed[index]))
+        return _readable(load(done.fed[index]))
 
     tracker = make_tracker(dataset.rig, options, load=again, interval_s=dataset.interval_s(chosen))
     from rstrack.tracking.loop_tracker import LoopTracker
-    from rstrack.tracking.runs.checkpoint import Done, checkpoint_of  # these import Dr.Jit
+    from rstrack.tracking.runs.checkpoint import checkpoint_of  # these import Dr.Jit
 
     _make_folder(out)
     checkpoint = checkpoint_of(out, dataset, chosen, tracker, dataclasses.asdict(noise))
-    done = Done()
     if checkpoint is not None:
         done = checkpoint.resume() if resume else checkpoint.begin()
     elif resume:
         raise UserError(f"{out}: --resume is for spline methods, not for the baseline: track anew")
-    seconds, fed, unreadable = done.seconds, done.fed, done.unreadable
-    end: End = "done"
-    error, note, told_at = "", "", 0
     begin = time.perf_counter() - done.total_s
-    with _stop_flag() as stopped:
-        images = prefetched(load, chosen[done.count :], 2)
-        for count, k in enumerate(chosen[done.count :], done.count + 1):
-            frame, problems = next(images)
-            unreadable += [(k, problem) for problem in problems]
-            if frame is not None:
-                start = time.perf_counter()
-                try:
-                    tracker.feed(frame)
-                except (UserError, np.linalg.LinAlgError) as problem:
-                    end, error = "broke down", f"the tracker broke down at frame {k}: {problem}"
-                    break
-                seconds.append(time.perf_counter() - start)
-                fed.append(k)
-            if count >= max(told_at + _TRUTH_EVERY, _TRUTH_GROWTH * told_at) or count == len(chosen):
-                note, told_at = _error_note(truth, tracker.trajectory), count
-            rate = count / (time.perf_counter() - begin)
-            progress("tracking", count / len(chosen), f"{rate:.1f} frames/s, {keyframes_text(tracker.keyframes)}{note}")
-            done.count, done.total_s = count, time.perf_counter() - begin
-            if stopped.is_set() and count < len(chosen):
-                end = "interrupted"
-                break
-            if checkpoint is not None:
-                checkpoint.save_when_due(done)
-        del images  # ends its thread
-    if not seconds:
-        raise UserError(error or f"{unreadable[0][1]}; no other frame of the {len(chosen)} can be read either")
+    end, error = _feed(tracker, load, chosen, done, checkpoint, truth, progress)
+    if not done.fed:
+        raise UserError(error or f"{done.unreadable[0][1]}; no other frame of the {len(chosen)} can be read either")
     closing, end = _closed(tracker, again, end, progress)
     if checkpoint is not None and end == "interrupted":
         checkpoint.save(done)
@@ -128,12 +98,12 @@ def track(
         "error": error or None,
         "keyframes": tracker.keyframes,
         "checkpoint_error": (checkpoint.problem if checkpoint is not None else "") or None,
-        "unreadable": [{"frame": k, "error": problem} for k, problem in unreadable],
+        "unreadable": [{"frame": k, "error": problem} for k, problem in done.unreadable],
         "lost": sum(report.lost for report in tracker.reports),
         "loops": None if closing is None else closing.info(),
         "spline_valid": tracker.spline_valid,
-        "timings": timings(time.perf_counter() - begin, seconds),
-        "frames": diagnostics(dataset, fed, tracker.reports, _spread(closing)),
+        "timings": timings(time.perf_counter() - begin, done.seconds),
+        "frames": diagnostics(dataset, done.fed, tracker.reports, _spread(closing)),
     }
     if closing is not None:
         info["timings"]["loops_s"] = closing.seconds
@@ -153,12 +123,56 @@ def track(
     )
     if checkpoint is not None and end != "interrupted":
         checkpoint.remove()
-    left_out = tuple(problem for _, problem in unreadable)
+    left_out = tuple(problem for _, problem in done.unreadable)
     loops = "" if closing is None else _loops_text(closing, online, estimate, before)
     return Result(estimate, evaluation, end, error, info["lost"], left_out, dataset.timing, loops)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
+
+
+def _loader(dataset: Dataset, options: Options, noise: Noise) -> Load:
+    """Reads a frame by its number, with noise added; None where its depth cannot be read, and what is wrong with it."""
+
+    def load(k: int) -> tuple[Frame | None, tuple[str, ...]]:
+        frame, problems = dataset.readable_frame(k, color=options.photometric)
+        if frame is not None:
+            frame = with_noise(frame, k, noise.sigma_depth, noise.sigma_intensity, noise.seed)
+        return frame, problems
+
+    return load
+
+
+def _feed(
+    tracker: AnyTracker, load: Load, chosen: range, done: Done, checkpoint: Checkpoint | None, truth: Truth | None,
+    progress: Progress,
+) -> tuple[End, str]:  # fmt: skip
+    """The frames that are not done yet through the tracker, told in `done`; how that ended, and what broke down."""
+    note, told_at = "", 0
+    begin = time.perf_counter() - done.total_s
+    with _stop_flag() as stopped:
+        images = prefetched(load, chosen[done.count :], 2)
+        for count, k in enumerate(chosen[done.count :], done.count + 1):
+            frame, problems = next(images)
+            done.unreadable += [(k, problem) for problem in problems]
+            if frame is not None:
+                start = time.perf_counter()
+                try:
+                    tracker.feed(frame)
+                except (UserError, np.linalg.LinAlgError) as problem:
+                    return "broke down", f"the tracker broke down at frame {k}: {problem}"
+                done.seconds.append(time.perf_counter() - start)
+                done.fed.append(k)
+            if count >= max(told_at + _TRUTH_EVERY, _TRUTH_GROWTH * told_at) or count == len(chosen):
+                note, told_at = _error_note(truth, tracker.trajectory), count
+            rate = count / (time.perf_counter() - begin)
+            progress("tracking", count / len(chosen), f"{rate:.1f} frames/s, {keyframes_text(tracker.keyframes)}{note}")
+            done.count, done.total_s = count, time.perf_counter() - begin
+            if stopped.is_set() and count < len(chosen):
+                return "interrupted", ""
+            if checkpoint is not None:
+                checkpoint.save_when_due(done)
+    return "done", ""
 
 
 def _readable(loaded: tuple[Frame | None, tuple[str, ...]]) -> Frame:
