@@ -85,8 +85,8 @@ def test_holding_only_the_end_of_the_spline_changes_no_bit(method: Method, monke
     kept = feed(tracker_of(method), frames)
     monkeypatch.setattr("rstrack.tracking.window._RELEASED", 1)
     released = feed(tracker_of(method), frames)
-    assert kept._window is not None and released._window is not None
-    assert kept._window.state.first == 0 < 12 < released._window.state.first
+    assert kept._track.window is not None and released._track.window is not None
+    assert kept._track.window.state.first == 0 < 12 < released._track.window.state.first
     # Poses are evaluated in other batches, which rounds otherwise.
     for a, b in zip(kept.trajectory, released.trajectory, strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-15)
@@ -181,7 +181,7 @@ def test_the_newest_frame_serves_as_a_rolling_reference_until_it_is_rectified(me
     rolling = []
     for k in range(24):
         tracker.feed(frame_at(k))
-        ref = tracker._succession.reference
+        ref = tracker._track.succession.reference
         assert ref is not None
         rolling.append(ref.rolling is not None)
     # After the start: rolling for some frames, then rectified, and so on; a keyframe each time.

@@ -1,0 +1,125 @@
+"""What a tracker has found so far, and what it has found it with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from rsgen.array_types import FloatArray
+from rstrack.adjustment.chain import Chain
+from rstrack.alignment.independence import Independence
+from rstrack.alignment.linearise import Terms
+from rstrack.alignment.observation import Observation, observe
+from rstrack.alignment.optimizer import Solved
+from rstrack.alignment.pull import Pulls
+from rstrack.data.rig import Rig
+from rstrack.images.device_frame import DeviceFrame, DeviceRig, Timer
+from rstrack.keyframes.keyframe import Reference
+from rstrack.keyframes.maker import KeyframeMaker
+from rstrack.keyframes.store import KeyframeStore
+from rstrack.options import Options
+from rstrack.tracking.found_poses import FoundPoses
+from rstrack.tracking.frame_report import FrameReport, frame_report
+from rstrack.tracking.gains import Gains
+from rstrack.tracking.judgement.fault import Fault
+from rstrack.tracking.judgement.lost_track import FitHistory
+from rstrack.tracking.judgement.pose_covariances import PoseCovariances
+from rstrack.tracking.succession import Succession
+from rstrack.tracking.window import Window
+
+# What a track of the same rig and options would make in the same way.
+_MADE_ANEW = "rig", "options", "device", "terms", "maker"
+
+
+class Track:
+    """The spline as far as it has grown, the frames found on it, and what they said of the cameras.
+
+    window: None until there is a first frame. age: frames of the current piece of the spline. independence: of depth
+    pixels, and of colour pixels. chain: what all frames said of the spline. reports: one of every frame fed.
+    """
+
+    def __init__(self, rig: Rig, options: Options, timer: Timer) -> None:
+        self.rig, self.options = rig, options.decided(rig.depth_shutter)
+        self.device = DeviceRig(rig, self.options, timer)
+        self.terms = Terms.of(self.device, self.options)
+        self.maker = KeyframeMaker.of(self.device)
+        self.keyframes = KeyframeStore(self.maker, self.options)
+        self.fits = FitHistory(self.options.rolling or rig.depth_shutter.readout_s == 0.0)
+        self.independence = Independence(), Independence()
+        self.gains = Gains()
+        self.age = 0
+        self.reports: list[FrameReport] = []
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
+        """Nothing has been found, of what was fed."""
+        self.window: Window | None = None
+        self.found, self.chain = FoundPoses(), Chain()
+        self.covariances = PoseCovariances(self.rig.depth_camera.fx)
+        self.succession = Succession(self.maker, self.keyframes, self.options, self.gains, self.covariances)
+
+    @property
+    def shared(self) -> dict[str, object]:
+        """What another track of the same rig and options has as well, by name."""
+        own = {name: getattr(self, name) for name in _MADE_ANEW}
+        return own | {"engine": self.device.e, "timer": self.device.timer}
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """All that feeding frames has changed."""
+        own = {name: value for name, value in vars(self).items() if name not in _MADE_ANEW}
+        return own | {"resolution": self.device.resolution}
+
+    @state.setter
+    def state(self, state: dict[str, Any]) -> None:
+        own = dict(state)
+        self.device.resolution = own.pop("resolution")
+        vars(self).update(own)
+
+    def known(self) -> tuple[Window, Reference]:
+        """The window and what new frames are aligned to, which there must be."""
+        ref = self.succession.reference
+        assert self.window is not None and ref is not None
+        return self.window, ref
+
+    def observe(self, frame: DeviceFrame, ref: Reference, expected: FloatArray | None = None) -> list[Observation]:
+        """What the frame's images say against a reference, as far as their pixels are independent.
+
+        expected (2,): gain and offset of its colours; by default about as before.
+        """
+        if expected is None:
+            expected = self.gains.expected(frame, ref)
+        observations = observe(frame, ref, self.options, expected)
+        for o in observations:
+            o.independent = 1.0 / self.independence[not o.is_depth].inflation
+        return observations
+
+    def learn(self, ref: Reference, on_reference: Sequence[Observation], window: Window, pulled: Pulls) -> None:
+        """What a frame that was found says of the spline and of its pixels. on_reference: its observations of `ref`."""
+        self.chain.add(ref, on_reference, window.state, pulled.excess)
+        for is_color, term in enumerate(self.independence):
+            term.learn(o.inflation for o in on_reference if o.is_depth != is_color)
+
+    def given(self, before: Window, after: Window) -> tuple[FloatArray, FloatArray]:
+        """Poses (n, 4, 4) of the frames that still move, before and after a new one has been aligned."""
+        stamps = np.array([max(frame.stamp, before.spline.t_begin) for frame in self.succession.recent])
+        return before.spline.pose(stamps), after.spline.pose(stamps)
+
+    def placed(self, new: DeviceFrame, fresh: Sequence[Observation] = (), joined: bool = True) -> None:
+        """A frame has been found: its stamp, its brightness, and until when the spline is known."""
+        self.found.add(new, joined)
+        window, ref = self.known()
+        oldest = self.succession.recent[0].index if self.succession.recent else new.index
+        self.gains.learn(new, fresh, window.state, oldest)
+        if ref.rolling is None:
+            self.covariances.add(new, ref, oldest)
+
+    def report(
+        self, new: DeviceFrame, fresh: Sequence[Observation] = (), solved: Solved | None = None, *,
+        keyframe: bool = False, fault: Fault = Fault.NONE, overlap: float = 1.0,
+    ) -> FrameReport:  # fmt: skip
+        """What became of a frame."""
+        report = frame_report(new.stamp, fresh, solved, keyframe=keyframe, fault=fault, overlap=overlap)
+        return report if fault else self.covariances.report(report, new, fresh, self.known()[0].spline)
