@@ -244,7 +244,7 @@ def garbage_variants(seed: int, edits: int) -> Iterator[ConfigVariant]:
 
 def yaml_bytes(data: dict[str, Any]) -> bytes:
     """YAML, special numbers and characters included."""
-    return yaml.safe_dump(data, sort_keys=False).encode()
+    return yaml.dump(data, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), sort_keys=False).encode()
 
 
 # --- sequences -------------------------------------------------------------------------------------------------------

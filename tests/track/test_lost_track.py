@@ -375,3 +375,13 @@ def test_earlier_frames_stay_about_where_they_were_found(
     moved = given.copy()
     moved[1] = given[1] @ se3.exp(np.array([0.0, metres, 0.0, np.radians(degrees), 0.0, 0.0]))
     assert not draws(given, given, gap) and draws(given, moved, gap) is is_drawn
+
+
+@pytest.mark.parametrize(
+    ("kind", "usual", "limit"), [("depth", 2e-3, 7e-3), ("color", 0.01, 0.035), ("color", 1e-3, 0.03)]
+)
+def test_where_a_piece_begins_images_have_to_fit_nearly_as_usual(kind: str, usual: float, limit: float) -> None:
+    assert fault(after(kind, [usual] * 3), [term(kind, limit)], new=True) == ""
+    assert fault(after(kind, [usual] * 3), [term(kind, 1.01 * limit)], new=True) == odd(kind)
+    if limit > 0.03 or kind == "depth":  # beyond what is harmless anywhere
+        assert fault(after(kind, [usual] * 3), [term(kind, 1.01 * limit)]) == ""
