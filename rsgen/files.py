@@ -39,8 +39,6 @@ _CRC_EMPTY = b"00000000"
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 
 _MOST_YAML_VALUES, _DEEPEST_YAML = 1_000_000, 200
-# libyaml's is seven times as quick; not every build of PyYAML has it.
-_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -193,13 +191,21 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def parse_yaml(text: str) -> Any:
-    """What `yaml.safe_load` returns. Raises its YAMLError or ValueError.
+    """What `yaml.safe_load` returns. Raises its YAMLError, ValueError or RecursionError.
 
-    Refused as well, as a YAMLError, are collections more than two hundred deep, and aliases that stand for more than a
-    million values or for themselves: a few lines of them would keep whatever walks the data busy for ever.
+    Refused as well, as a YAMLError, are aliases that stand for more than a million values or for themselves: a few
+    lines of them would keep whatever walks the data busy for ever.
     """
-    _refuse_deep(text)
-    loader = _Loader(text)
+    try:
+        # libyaml is seven times as quick; not every build of PyYAML has it.
+        fast = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+        return _parsed(text, fast) if _is_flat(text, fast) else _parsed(text, yaml.SafeLoader)
+    except (yaml.YAMLError, ValueError):
+        return _parsed(text, yaml.SafeLoader)  # which says better what is wrong, and where
+
+
+def _parsed(text: str, kind: Any) -> Any:
+    loader = kind(text)
     try:
         node = loader.get_single_node()
         if node is None:
@@ -211,17 +217,17 @@ def parse_yaml(text: str) -> Any:
         loader.dispose()
 
 
-def _refuse_deep(text: str) -> None:
-    """Before anything is composed: libyaml overflows the stack there, and takes the process with it."""
-    loader, depth = _Loader(text), 0
+def _is_flat(text: str, kind: Any) -> bool:
+    """Whether collections are nested so little that libyaml's composer does not overflow the stack."""
+    loader, depth, deepest = kind(text), 0, 0
     try:
-        while loader.check_event():
+        while loader.check_event() and deepest <= _DEEPEST_YAML:
             event = loader.get_event()
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if depth > _DEEPEST_YAML:
-                raise yaml.MarkedYAMLError(problem="nested too deep", problem_mark=event.start_mark)
+            deepest = max(deepest, depth)
     finally:
         loader.dispose()
+    return deepest <= _DEEPEST_YAML
 
 
 def _values(node: yaml.Node, known: dict[int, float]) -> float:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import OpenEXR
 import pytest
+import yaml
 
 from rsgen import files
 from rsgen.errors import UserError
@@ -97,6 +98,25 @@ def test_a_file_of_another_size_or_type_is_refused(tmp_path: Path) -> None:
         with pytest.raises(UserError, match=r"sequence\.yaml asks for") as error:
             read()
         one_line(error, "a.")
+
+
+@pytest.mark.parametrize(
+    "text", ["a: {b: [1, 2.5e-3, .inf, yes, null, 'x']}\nc: &d [1, *d]", "a: &x {b: 1}\nc: {<<: *x, d: 2020-01-01}", ""]
+)
+def test_yaml_is_what_pyyaml_reads(text: str) -> None:
+    known = text.replace("&d [1, *d]", "&d [1]\ne: *d")  # what stands for itself is refused
+    assert files.parse_yaml(known) == yaml.safe_load(known)
+    if known != text:
+        with pytest.raises(yaml.YAMLError):
+            files.parse_yaml(text)
+
+
+def test_yaml_may_be_nested_as_deep_as_it_likes(tmp_path: Path) -> None:
+    """Where libyaml takes the process with it."""
+    assert files.parse_yaml("[" * 150 + "]" * 150) == yaml.safe_load("[" * 150 + "]" * 150)
+    (tmp_path / "a.yaml").write_text("a: " + "[" * 200_000)
+    with pytest.raises(UserError, match="not valid YAML"):
+        files.read_yaml(tmp_path / "a.yaml")
 
 
 def test_other_programs_read_the_images(tmp_path: Path) -> None:

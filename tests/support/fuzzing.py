@@ -244,7 +244,10 @@ def garbage_variants(seed: int, edits: int) -> Iterator[ConfigVariant]:
 
 def yaml_bytes(data: dict[str, Any]) -> bytes:
     """YAML, special numbers and characters included."""
-    return yaml.dump(data, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), sort_keys=False).encode()
+    try:
+        return yaml.dump(data, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), sort_keys=False).encode()
+    except UnicodeEncodeError:  # libyaml writes no surrogates
+        return yaml.safe_dump(data, sort_keys=False).encode()
 
 
 # --- sequences -------------------------------------------------------------------------------------------------------
