@@ -77,8 +77,9 @@ test_all() {
   .venv/bin/mypy
   local contracts
   contracts=$(.venv/bin/lint-imports --no-cache) || { say "$contracts"; return 1; }
-  # One thread per process for the small solves; two processes share the rendering cores.
-  OPENBLAS_NUM_THREADS=1 .venv/bin/python -m pytest -n 2 --dist loadfile "$@"
+  # One thread per process for the small solves; two processes share the rendering cores. Files in their own order: the
+  # slowest have few tests, and would come last and alone.
+  OPENBLAS_NUM_THREADS=1 .venv/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder "$@"
 }
 
 case "${1:-}" in

@@ -230,7 +230,7 @@ class Tracker:
             fault = Fault.TOO_FAR
         elif not fault and not uncertainty.is_known:
             fault = Fault.LEFT_OPEN
-        elif not fault and draws(*track.given(before, window), gap):
+        elif not fault and young and draws(*track.given(before, window), gap):
             fault = Fault.DRAWS
         if fault:
             track.window = before

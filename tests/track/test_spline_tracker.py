@@ -145,14 +145,18 @@ def test_a_keyframe_whose_colours_are_another_places_is_left() -> None:
     assert tracker.keyframes == 2 and worst_step(tracker) < 3e-3
 
 
-def test_a_frame_that_draws_those_before_it_is_lost_and_they_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_a_piece_begins_a_frame_that_draws_those_before_it_is_lost_and_they_stay(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     tracker = feed(tracker_of("rs-pg"), (frame_at(k) for k in range(10)))
-    stamps, given = tracker.trajectory
     monkeypatch.setattr(spline_tracker, "draws", lambda *_: True)
+    # What is known of a piece that goes on outweighs that; after half a second without a frame another one begins.
+    assert lost(feed(tracker, (frame_at(k) for k in (10, 26)))) == []
+    stamps, given = tracker.trajectory
     monkeypatch.setattr(tracker._relocaliser, "find", lambda *_: Fault.NO_PLACE)
-    assert tracker.feed(frame_at(10)).fault == Fault.DRAWS
+    assert tracker.feed(frame_at(27)).fault == Fault.DRAWS
     np.testing.assert_array_equal(tracker.trajectory[1], given)
-    assert len(stamps) == 10
+    assert len(stamps) == 12
 
 
 def test_nothing_but_blank_frames() -> None:
