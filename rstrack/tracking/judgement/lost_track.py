@@ -47,9 +47,9 @@ _WORST_SHIFT_PX = 2.0
 # and rad/s, and what is always allowed.
 _MOST_ACCELERATION, _MOST_VELOCITY = np.array([100.0, 200.0]), np.array([4.0, 8.0])
 _ALWAYS = np.array([0.05, np.radians(4.0)])
-# How far (m, rad) a new frame may draw those before it from where they were given, in a piece of the track that has just
-# begun (an older one knows better: 17 mm are nothing unusual on fr1_rpy), as many times further as frames come more
-# slowly than 25 a second.
+# How far (m, rad) a new frame may draw those before it from where they were given, in a piece of the track that has
+# just begun (an older one knows better: 17 mm are nothing unusual on fr1_rpy), as many times further as frames come
+# more slowly than 25 a second.
 _MOST_DRAWN, _DRAWN_WITHIN_S = np.array([1e-2, np.radians(1.0)]), 0.04
 _MEMORY = 30
 # How far a frame's images, or one term alone, may pull (see `alignment.pull`): so many times the usual, and always so
