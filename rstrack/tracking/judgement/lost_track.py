@@ -25,8 +25,8 @@ _LEAST_FIT_DEPTH, _LEAST_FIT_COLOR = 0.65, 0.8
 # growing with the distance; intensity).
 _WORST_DEPTH, _WORST_INTENSITY = 0.03, 0.12
 _GROWTH, _HARMLESS_DEPTH, _HARMLESS_INTENSITY = 6.0, 2e-3, 0.03
-# In a piece of the track that has just begun nothing of its own says yet what is right: growth there (481 frames found
-# under vibration: 3.0 at most where they were right, 4.5 where one was 26 mm off).
+# In a piece of the track that has just begun nothing of its own says yet what is right: growth there (of 481 frames
+# found under vibration all but one stayed within 3.0; that one, at 4.5, was 26 mm off).
 _NEW_GROWTH = 3.5
 # What each term may reach alone it may not together with the other: geometric mean of the two scales, each over its
 # limit (fr1_rpy in six forms, where it is tracked well: 0.43 at most), and what colours that were left out count for.
