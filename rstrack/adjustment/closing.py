@@ -21,9 +21,11 @@ _NARROWER, _MOST_STEPS = 4.0, 40
 _SMALL = 1e-7
 # Weight below which a loop has been refused by the others.
 _REFUSED = 0.1
-# By what the track's own errors may be larger than it thinks, where most loops say so: widened until no more than this
-# part of them is refused. So many must agree: a few may as well be false.
-_SPREADS, _REFUSED_SHARE, _AGREEING = (2.0, 4.0, 8.0, 16.0), 0.25, 4
+# By what the track's own errors may be larger than it thinks, where loops say so: widened until no more than this part
+# of them is refused. So many must agree: a few may as well be false. The second, for where only some are refused: a track
+# that may bend much more goes with false ones too (tested).
+_MOST_SPREADS, _SOME_SPREADS = (2.0, 4.0, 8.0, 16.0), (2.0, 4.0)
+_REFUSED_SHARE, _AGREEING = 0.25, 4
 
 
 @dataclass(frozen=True)
@@ -46,13 +48,14 @@ class Closed:
 def closed(graph: Graph, loops: Sequence[Loop], begin: float, progress: Progress = no_progress) -> Closed:
     """Close loops of the track that a graph describes; the camera stays where it was at time `begin` (s).
 
-    A loop that contradicts the others and the track is left out. Where that were most of them, though they go with each
-    other, it is the track that is wrong by more than it thinks: of cameras that are not quite as told, frame after
-    frame errs alike, which no single frame shows. Raises numpy.linalg.LinAlgError where the system has no solution.
+    A loop that contradicts the others and the track is left out. Where that were more than a few, though they go with
+    each other, it is the track that is wrong by more than it thinks: of cameras that are not quite as told, frame after
+    frame errs alike, and one blurred stretch may bend all that follows, which no single frame shows. Raises
+    numpy.linalg.LinAlgError where the system has no solution.
     """
     found = _closed(graph, loops, 1.0, progress)
-    if 2 * found.closed <= len(loops):
-        for spread in _SPREADS if len(loops) >= _AGREEING else ():
+    if len(loops) >= _AGREEING and sum(found.refused) > _REFUSED_SHARE * len(loops):
+        for spread in _MOST_SPREADS if 2 * found.closed <= len(loops) else _SOME_SPREADS:
             wider = _closed(graph.weakened(spread), loops, spread, progress)
             if wider.closed >= max(_AGREEING, (1.0 - _REFUSED_SHARE) * len(loops)):
                 found = wider

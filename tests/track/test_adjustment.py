@@ -252,6 +252,41 @@ def test_loops_that_agree_are_believed_against_a_track_that_is_too_sure_of_itsel
     assert ate(found.state.spline, truth.spline) < min(2.0 * fair, ate(graph.at.spline, truth.spline) / 2)
 
 
+def test_a_track_that_is_bent_in_one_place_is_mended_there() -> None:
+    """As by one blurred stretch: loops across it are refused, those before and after are not, and they are the most."""
+    graph, truth, loops = drifted_track(np.random.default_rng(5))
+    at = 120
+    bend = se3.exp(np.array([0.02, -0.02, 0.01, 0.01, 0.02, -0.02]))
+    T = graph.at.spline.control_points
+    points = np.concatenate([T[:at], T[at] @ bend @ se3.inverse(T[at]) @ T[at:]])
+    spline = Spline(se3.orthonormalise(points), 0.0, graph.at.spline.dt)
+    time = {tie.keyframe: tie.t for tie in graph.sightings}
+    bent = replace(graph, at=State(spline, {k: spline.pose(t) for k, t in time.items()}))
+    across = [loop for loop in loops if loop.early < at <= loop.late]
+    beside = [loop for loop in loops if not loop.early < at <= loop.late]
+    few = [*across[:5], *beside[:9]]
+    assert len(across) >= 5 and len(beside) >= 9
+    bent = too_sure(bent, 5.0)
+    found = closed(bent, few, 0.0)
+    assert found.spread > 1.0 and not any(found.refused)
+    assert ate(found.state.spline, truth.spline) < ate(closed(bent, beside[:9], 0.0).state.spline, truth.spline) / 2
+
+
+def test_false_loops_that_agree_with_nothing_stay_refused() -> None:
+    """More than a quarter of all, so that the track is doubted: nothing comes of it."""
+    graph, truth, loops = drifted_track(np.random.default_rng(5))
+    true, fooled = loops[:7], []
+    for n, loop in enumerate(loops[8:11]):
+        wrong = se3.exp(np.array([0.3 - 0.2 * n, 0.1 * n, -0.2, 0.1 * n, 0.05, 0.17]))
+        fooled.append(replace(loop, sightings=(
+            replace(loop.sightings[0], T_ref_cam=loop.sightings[0].T_ref_cam @ wrong),
+            replace(loop.sightings[1], T_ref_cam=se3.inverse(loop.sightings[0].T_ref_cam @ wrong)),
+        )))  # fmt: skip
+    found = closed(graph, [*true, *fooled], 0.0)
+    assert found.refused == (False,) * 7 + (True,) * 3 and found.spread == 1.0
+    assert ate(found.state.spline, truth.spline) < 1.01 * ate(closed(graph, true, 0.0).state.spline, truth.spline)
+
+
 def test_where_all_loops_are_refused_nothing_moves() -> None:
     """Three loops are too few to blame the track."""
     graph, _, loops = drifted_track(np.random.default_rng(5))
