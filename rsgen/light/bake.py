@@ -50,6 +50,7 @@ _LIGHT_TRUST = 64.0
 
 def bake(scene: Any, lattice: Lattice, light: LightConfig, progress: Progress) -> tuple[NDArray, NDArray]:
     """Irradiance (points, 4) float32 of the front and back sides: E_r, E_g, E_b (scene units), alive (0 or 1)."""
+    progress("light", 0.0, "where light is looked at")
     points, index = sample_points(scene, lattice)
     fine, fine_of_point = thin(points, light.texel_m * _FINE_TEXELS)
     log.info("baking light: %d triangles, %d samples of %d stored", len(lattice.first), len(fine), len(fine_of_point))

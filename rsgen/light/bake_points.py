@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from rsgen.array_types import Float32Array, IntArray
-from rsgen.render.irradiance import Lattice, lattice_barycentric
+from rsgen.render.irradiance import Lattice, lattice_barycentric, registry_id
 from rsgen.render.scene import mesh_arrays
 
 _INSET_M = 2e-3  # samples on a triangle's rim move this far inwards: a corner exactly on two surfaces sees neither
@@ -22,6 +23,7 @@ _NEIGHBOURS = 8
 _NORMAL_SCALE = 0.35  # normals this far apart count as much as one spacing
 _APART = 1e4  # spacings between different pieces of surface
 _SMOOTHING = 0.3  # spacings: closer sources than this count alike
+_CHUNK = 1 << 20  # points looked at in one launch
 
 
 @dataclass(frozen=True)
@@ -46,17 +48,17 @@ def sample_points(scene: Any, lattice: Lattice) -> tuple[SurfacePoints, IntArray
     shapes = [s for s in scene.shapes() if s.is_mesh()]
     firsts = np.sort(lattice.shape_first[lattice.shape_first >= 0])
     owner = np.searchsorted(firsts, face, side="right") - 1
-    island = np.empty(count, np.int64)
-    islands = 0
-    for number, shape in enumerate(shapes):
-        label = _islands(*mesh_arrays(shape))
-        here = np.flatnonzero(owner == number)
-        island[here] = islands + label[face[here] - firsts[number]]
-        islands += int(label.max()) + 1
-        for part in np.array_split(here, max(1, len(here) // (1 << 20))):
-            local = (face[part] - firsts[number]).astype(np.uint32)
-            position[part], normal[part], geometric[part] = _surface_at(shape, local, uv[part])
-            middle[part] = _surface_at(shape, local, centre[part])[0]
+    label, islands = [], 0
+    for shape in shapes:
+        label.append(islands + _islands(*mesh_arrays(shape)).astype(np.int64))
+        islands = int(label[-1].max()) + 1
+    island = np.concatenate(label)[face]
+    local = (face - firsts[owner]).astype(np.uint32)
+    numbers = np.array([registry_id(shape) for shape in shapes], np.uint32)[owner]
+    # All shapes at once: a launch for each would be compiled for each.
+    for part in np.array_split(np.arange(count), max(1, math.ceil(count / _CHUNK))):
+        position[part], normal[part], geometric[part] = _surface_at(numbers[part], local[part], uv[part])
+        middle[part] = _surface_at(numbers[part], local[part], centre[part])[0]
     # The side that shading lights, where winding and vertex normals disagree.
     geometric *= np.where(np.einsum("ij,ij->i", geometric, normal) < 0, -1, 1)[:, None].astype(np.float32)
     # Rounded positions and normals make one key: points that triangles share are computed once, so edges cannot show.
@@ -103,12 +105,17 @@ def _mix(columns: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return h
 
 
-def _surface_at(shape: Any, face: NDArray[np.uint32], uv: Float32Array) -> tuple[NDArray, NDArray, NDArray]:
-    """Position, shading normal and geometric normal, as the renderer sees them, at barycentric `uv` of triangles."""
+def _surface_at(
+    shape: NDArray[np.uint32], face: NDArray[np.uint32], uv: Float32Array
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Position, shading normal and geometric normal, as the renderer sees them, at barycentric `uv` of triangles.
+
+    shape: the registry's number of the mesh that each triangle is one of.
+    """
     pi = dr.zeros(mi.PreliminaryIntersection3f, len(face))
     pi.prim_index = mi.UInt32(face)
     pi.prim_uv = mi.Point2f(uv[:, 0], uv[:, 1])
-    pi.shape = mi.ShapePtr(shape)
+    pi.shape = dr.reinterpret_array(mi.ShapePtr, mi.UInt32(shape))
     pi.valid = mi.Bool(True)
     ray = dr.zeros(mi.Ray3f, len(face))
     ray.d = mi.Vector3f(0, 0, 1)
