@@ -73,6 +73,10 @@ class LightConfig(Section):
         default=0.015, description="spacing of the baked irradiance samples, m"
     )
     direct_samples: int = Field(default=64, ge=1, le=4096, description="light samples per irradiance sample")
+    target_db: float = Field(
+        default=40.0, ge=20, le=70,
+        description="PSNR that the sky's light is sampled for where a surface is mid-grey, before it is smoothed",
+    )  # fmt: skip
     gather_rays: int = Field(
         default=512, ge=16, le=16384, description="hemisphere rays per indirect sample, last bounce"
     )

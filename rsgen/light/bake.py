@@ -14,7 +14,8 @@ bytes each time on one backend.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import drjit as dr
@@ -27,25 +28,27 @@ from rsgen.config.config import LightConfig
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
 from rsgen.light.bake_points import Interpolation, SurfacePoints, sample_points, thin
+from rsgen.light.sampling import chunks, r2, rotation
+from rsgen.light.sky import sky_light
+from rsgen.light.specular import first_scatterer, passes_light_on
 from rsgen.render.irradiance import IrradianceField, Lattice, make_field
 
 log = logging.getLogger("rsgen")
 
 
 # Raise when the method changes, so that older caches are not taken for new ones.
-METHOD = 1
-_OFFSET_M = 2e-4  # ray origins above their surface
+METHOD = 2
 _FINE_TEXELS = 0.9  # direct light is computed at points at least about this far apart
 _COARSE_TEXELS = 3.0  # and indirect light at these
 _FIRST_LOOK_RAYS = 12
 _FIRST_LOOK_BOUNCES = 2
 _BOUNCE_RAYS = 32
-_CHUNK = 1 << 18
 _MANY_EMITTERS = 24
 _SMALL_EMITTER_M = 0.3
 # Light sampling is trusted this much more than hemisphere rays; only where an emitter all but touches a surface, and
 # its samples' 1/d² explodes, do the rays take over.
 _LIGHT_TRUST = 64.0
+_GREY_SLOPE = 0.21  # of sRGB at its middle, by the logarithm of light
 
 
 def bake(scene: Any, lattice: Lattice, light: LightConfig, progress: Progress) -> tuple[NDArray, NDArray]:
@@ -56,21 +59,33 @@ def bake(scene: Any, lattice: Lattice, light: LightConfig, progress: Progress) -
     log.info("baking light: %d triangles, %d samples of %d stored", len(lattice.first), len(fine), len(fine_of_point))
     total = np.zeros((len(fine), 3), np.float32)
 
+    lamps, follow = [e for e in scene.emitters() if not e.is_environment()], passes_light_on(scene)
+    by_sky = follow or len(lamps) < len(scene.emitters())
+    sky = np.zeros((len(fine), 3), np.float32)
+    if by_sky:
+        scatter = 10 ** (-light.target_db / 20) / _GREY_SLOPE
+        report = _reporter(progress, 0.0, 0.2, "light of the sky and through panes")
+        sky, reached = sky_light(scene, points, fine, light.texel_m, light.direct_samples, follow, scatter, report)
+        log.info("light of the sky: %.0f dB before smoothing", -20 * math.log10(max(reached * _GREY_SLOPE, 1e-5)))
+
     # A first look with few samples finds what any light reaches; only that gets the full effort.
-    first_look = _direct(scene, points, fine, 2, _reporter(progress, 0.0, 0.05, "finding lit surfaces"))
+    begin = 0.2 if by_sky else 0.0
+    report = _reporter(progress, begin, 0.05, "finding lit surfaces")
+    first_look = sky + _direct(scene, lamps, points, fine, 2, report)
     for bounce in range(_FIRST_LOOK_BOUNCES):
         field = _field(
             lattice, index, total[fine_of_point] + first_look[fine_of_point], np.ones(len(fine_of_point), bool)
         )
-        report = _reporter(progress, 0.05 + 0.03 * bounce, 0.03, "finding lit surfaces")
-        total = _gather(scene, field, points, fine, _FIRST_LOOK_RAYS, report)
+        report = _reporter(progress, begin + 0.05 + 0.03 * bounce, 0.03, "finding lit surfaces")
+        total = _gather(scene, field, points, fine, _FIRST_LOOK_RAYS, follow, by_sky, report)
     alive = (first_look + total).max(axis=1) > 0
     alive_point = alive[fine_of_point]
     fine = fine[alive]
     if not len(fine):
         raise UserError("the scene is dark: no light reaches any surface; add an emitter or move it into the open")
 
-    direct = _direct(scene, points, fine, light.direct_samples, _reporter(progress, 0.11, 0.39, "direct light"))
+    report = _reporter(progress, begin + 0.11, 0.39 - begin, "direct light")
+    direct = sky[alive] + _direct(scene, lamps, points, fine, light.direct_samples, report)
     lit_points = np.flatnonzero(alive_point)
     to_point = Interpolation.between(points, fine, lit_points, light.texel_m)
     coarse = fine[thin(points, light.texel_m * _COARSE_TEXELS, fine)[0]]
@@ -84,7 +99,7 @@ def bake(scene: Any, lattice: Lattice, light: LightConfig, progress: Progress) -
         begin = 0.5 + 0.3 * bounce / light.bounces
         report = _reporter(progress, begin, 1 - begin if last else 0.3 / light.bounces, f"bounce {bounce + 1}")
         rays = light.gather_rays if last else min(_BOUNCE_RAYS, light.gather_rays)
-        indirect = coarse_to_fine(_gather(scene, field, points, coarse, rays, report))
+        indirect = coarse_to_fine(_gather(scene, field, points, coarse, rays, follow, by_sky, report))
     values[lit_points] = to_point(direct + indirect)
     table = _table(values, alive_point)
     progress("light", 1.0, "light baked")
@@ -104,39 +119,24 @@ def _field(lattice: Lattice, index: NDArray, values: NDArray, alive: NDArray) ->
     return make_field(lattice, table[index[0]], table[index[1]])
 
 
-def _rotation(index: Any, dimension: int) -> Any:
-    """Uniform offset in [0, 1) from a hash of a point's number and a dimension."""
-    return mi.sample_tea_float32(index, mi.UInt32(dimension), 4)
-
-
-def _r2(i: Any, offset: Any) -> Any:
-    """Point i of the R2 low-discrepancy sequence (Roberts 2018), rotated by `offset`."""
-    x = offset.x + mi.Float(i) * 0.7548776662466927
-    y = offset.y + mi.Float(i) * 0.5698402909980532
-    return mi.Point2f(x - dr.floor(x), y - dr.floor(y))
-
-
-def _chunks(points: SurfacePoints, which: NDArray, report: Callable[[float], None]):
-    for begin in range(0, len(which), _CHUNK):
-        part = which[begin : begin + _CHUNK]
-        p, n, g = (mi.Vector3f(a[part].T) for a in (points.position, points.normal, points.geometric))
-        yield begin, part, mi.Point3f(p + g * _OFFSET_M), n, mi.UInt32(part.astype(np.uint32))
-        report(min(1.0, (begin + len(part)) / len(which)))
-
-
 def _direct(
-    scene: Any, points: SurfacePoints, which: NDArray, samples: int, report: Callable[[float], None]
+    scene: Any,
+    emitters: Sequence[Any],
+    points: SurfacePoints,
+    which: NDArray,
+    samples: int,
+    report: Callable[[float], None],
 ) -> NDArray:
-    """Direct irradiance (len(which), 3) from all emitters, `samples` for each."""
+    """Direct irradiance (len(which), 3) from emitters, `samples` for each."""
     out = np.zeros((len(which), 3), np.float32)
-    emitters = scene.emitters()
-    for begin, part, p, n, number in _chunks(points, which, report):
+    sky = len(emitters) == len(scene.emitters())
+    for begin, part, p, n, number in chunks(points, which, report):
         total = mi.Color3f(0)
         if len(emitters) > _MANY_EMITTERS:
-            total = _from_emitter(scene, None, p, n, number, samples * _MANY_EMITTERS, 0)
+            total = _from_emitter(scene, None, p, n, number, samples * _MANY_EMITTERS, 0, sky)
         else:
             for k, emitter in enumerate(emitters):
-                total += _from_emitter(scene, emitter, p, n, number, _samples_for(emitter, samples), k)
+                total += _from_emitter(scene, emitter, p, n, number, _samples_for(emitter, samples), k, sky)
                 dr.eval(total)
         out[begin : begin + len(part)] = np.array(total).reshape(3, -1).T
     return out
@@ -150,20 +150,22 @@ def _samples_for(emitter: Any, samples: int) -> int:
 
 
 @dr.syntax
-def _from_emitter(scene, emitter, p, n, number, samples, dimension):
-    """Mean irradiance at p (normal n) from one emitter, or from a random one where `emitter` is None."""
+def _from_emitter(scene, emitter, p, n, number, samples, dimension, sky):
+    """Mean irradiance at p (normal n) from one emitter, or if that is None from a random one (the sky: if `sky`)."""
     it = dr.zeros(mi.Interaction3f, dr.width(p))
     it.p = p
     it.t = mi.Float(1)
     it.n = mi.Normal3f(n)
-    offset = mi.Point2f(_rotation(number, 2 * dimension), _rotation(number, 2 * dimension + 1))
+    offset = mi.Point2f(rotation(number, 2 * dimension), rotation(number, 2 * dimension + 1))
     count = dr.opaque(mi.UInt32, samples)
     total = mi.Color3f(0)
     i = mi.UInt32(0)
     while i < count:
-        u = _r2(i, offset)
+        u = r2(i, offset)
         if dr.hint(emitter is None, mode="scalar"):
             ds, value = scene.sample_emitter_direction(it, u, False)
+            if dr.hint(not sky and scene.environment() is not None, mode="scalar"):
+                value = dr.select(ds.emitter == mi.EmitterPtr(scene.environment()), 0, value)
         else:
             ds, value = emitter.sample_direction(it, u)
         cosine = dr.dot(n, ds.d)
@@ -189,23 +191,28 @@ def _gather(
     points: SurfacePoints,
     which: NDArray,
     rays: int,
+    follow: bool,
+    by_sky: bool,
     report: Callable[[float], None],
 ) -> NDArray:
-    """Irradiance (len(which), 3) that arrives from other surfaces, each lit as `field` says.
+    """Irradiance (len(which), 3) that arrives from other surfaces, each lit as `field` says; follow: through panes too.
 
-    Holds also the small part of emitters' own light that `_direct` leaves out (see `_light_share`).
+    Holds also the small part of emitters' own light that `_direct` leaves out (see `_light_share`); by_sky: without
+    what `sky_light` holds.
     """
     out = np.zeros((len(which), 3), np.float32)
-    for begin, part, p, n, number in _chunks(points, which, report):
-        out[begin : begin + len(part)] = np.array(_gather_at(scene, field, p, n, number, rays)).reshape(3, -1).T
+    for begin, part, p, n, number in chunks(points, which, report):
+        out[begin : begin + len(part)] = (
+            np.array(_gather_at(scene, field, p, n, number, rays, follow, by_sky)).reshape(3, -1).T
+        )
     return out
 
 
 @dr.syntax
-def _gather_at(scene, field, p, n, number, rays):
+def _gather_at(scene, field, p, n, number, rays, follow, by_sky):
     frame = mi.Frame3f(n)
-    offset = mi.Point2f(_rotation(number, 101), _rotation(number, 102))
-    lobe = _rotation(number, 103)
+    offset = mi.Point2f(rotation(number, 101), rotation(number, 102))
+    lobe = rotation(number, 103)
     count = dr.opaque(mi.UInt32, rays)
     context = mi.BSDFContext()
     it = dr.zeros(mi.Interaction3f, dr.width(p))
@@ -215,25 +222,27 @@ def _gather_at(scene, field, p, n, number, rays):
     total = mi.Color3f(0)
     i = mi.UInt32(0)
     while i < count:
-        u = _r2(i, offset)
+        u = r2(i, offset)
         d = frame.to_world(mi.warp.square_to_cosine_hemisphere(u))
-        ray = mi.Ray3f(p, d)
-        pi = scene.ray_intersect_preliminary(ray, coherent=False)
-        si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
+        pick = lobe + mi.Float(i) * 0.6180339887498949
+        pick -= dr.floor(pick)
+        pi, si, ray, through, passed = first_scatterer(scene, mi.Ray3f(p, d), pick, follow, mi.Bool(True))
         hit = si.is_valid()
         emitter = si.emitter(scene)
         lamp = emitter != dr.zeros(mi.EmitterPtr)
+        if dr.hint(by_sky, mode="scalar"):
+            lamp &= hit & (passed == 0)
         towards = mi.DirectionSample3f(scene, si, it)
+        straight = lamp & (passed == 0)
         if dr.hint(many, mode="scalar"):
-            light_pdf = scene.pdf_emitter_direction(it, towards, lamp)
+            light_pdf = scene.pdf_emitter_direction(it, towards, straight)
         else:
-            light_pdf = emitter.pdf_direction(it, towards, lamp)
+            light_pdf = emitter.pdf_direction(it, towards, straight)
         # With pdf cosθ/π, ∫ L cosθ dω is the mean of πL, and of ρE where Lambert's surface sends L = ρE/π.
-        left_out = 1 - _light_share(light_pdf, dr.dot(n, d))
-        total += dr.select(lamp, dr.pi * emitter.eval(si, lamp) * left_out, 0)
+        left_out = dr.select(passed == 0, 1 - _light_share(light_pdf, dr.dot(n, d)), 1)
+        total += dr.select(lamp, dr.pi * through * emitter.eval(si, lamp) * left_out, 0)
         # The sampled weight's mean is the albedo ρ, exactly and without noise for Lambert's law.
-        pick = lobe + mi.Float(i) * 0.6180339887498949
-        _, albedo = si.bsdf(ray).sample(context, si, pick - dr.floor(pick), mi.Point2f(u.y, u.x), hit)
-        total += dr.select(hit, albedo * field.lookup(pi, si, -d, hit), 0)
+        _, albedo = si.bsdf(ray).sample(context, si, pick, mi.Point2f(u.y, u.x), hit)
+        total += dr.select(hit, through * albedo * field.lookup(pi, si, -ray.d, hit), 0)
         i += 1
     return total / mi.Float(count)

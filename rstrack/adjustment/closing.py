@@ -22,8 +22,8 @@ _SMALL = 1e-7
 # Weight below which a loop has been refused by the others.
 _REFUSED = 0.1
 # By what the track's own errors may be larger than it thinks, where loops say so: widened until no more than this part
-# of them is refused. So many must agree: a few may as well be false. The second, for where only some are refused: a track
-# that may bend much more goes with false ones too (tested).
+# of them is refused. So many must agree: a few may as well be false. The second, for where only some are refused: a
+# track that may bend much more goes with false ones too (tested).
 _MOST_SPREADS, _SOME_SPREADS = (2.0, 4.0, 8.0, 16.0), (2.0, 4.0)
 _REFUSED_SHARE, _AGREEING = 0.25, 4
 

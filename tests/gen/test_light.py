@@ -16,6 +16,9 @@ from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.light import cache as lighting
+from rsgen.light.bake_points import SurfacePoints
+from rsgen.light.denoise import denoised, scatter_of
+from rsgen.light.guide import Guide, bin_of
 from rsgen.render.baked import BakedIntegrator
 from rsgen.render.images import ColorRenderer
 from rsgen.render.irradiance import IrradianceField, lattice_barycentric, make_field, make_lattice
@@ -122,6 +125,11 @@ def test_rectangle_emitter(tmp_path: Path) -> None:
     """Form factor of a parallel rectangle from a corner, summed with signs over its four corners."""
     xyz = floor_grid()
     got = floor_light(scene_of(tmp_path, FLOOR, QUAD), xyz, texel_m=0.02, direct_samples=256)
+    agree(got, np.pi * quad_factor(xyz)[:, None] * [1, 2, 3])
+
+
+def quad_factor(xyz: np.ndarray) -> np.ndarray:
+    """Of QUAD, or of a hole in its place, seen from points (n, 3) of the floor."""
     h = 0.7
 
     def corner(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -130,8 +138,91 @@ def test_rectangle_emitter(tmp_path: Path) -> None:
         return (A / ra * np.arctan(B / ra) + B / rb * np.arctan(A / rb)) / (2 * np.pi)
 
     x0, x1, y0, y1 = (0.1 - 0.4 - xyz[:, 0], 0.1 + 0.4 - xyz[:, 0], 0.3 - 0.2 - xyz[:, 1], 0.3 + 0.2 - xyz[:, 1])
-    factor = corner(x1, y1) - corner(x0, y1) - corner(x1, y0) + corner(x0, y0)
-    agree(got, np.pi * factor[:, None] * [1, 2, 3])
+    return corner(x1, y1) - corner(x0, y1) - corner(x1, y0) + corner(x0, y0)
+
+
+BLACK = '<bsdf type="twosided"><bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf></bsdf>'
+SKY = '<emitter type="constant"><rgb name="radiance" value="1,2,3"/></emitter>'
+
+
+def dark_room_with_a_skylight(folder: Path) -> list[str]:
+    """Black walls about the floor and a black ceiling with a hole in QUAD's place."""
+    x, y, h, s = (-0.3, 0.5), (0.1, 0.5), 0.7, 1.0
+    corners = [(-s, -s), (s, -s), (s, s), (-s, s), (x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
+    vertices = [(*c, h) for c in corners] + [(*c, 0.0) for c in corners[:4]]
+    faces = []
+    for k in range(4):
+        n = (k + 1) % 4
+        faces += [(k, n, 4 + n), (k, 4 + n, 4 + k), (k, n, 8 + n), (k, 8 + n, 8 + k)]
+    trimesh.Trimesh(vertices, faces, process=False).export(folder / "room.ply")
+    room = f"""<shape type="ply"><string name="filename" value="room.ply"/><boolean name="face_normals" value="true"/>
+        {BLACK}</shape>"""
+    return [FLOOR, room, SKY]
+
+
+@pytest.mark.parametrize(("pane", "transmits"), [("", 1.0), ("mask", 0.6), ("mirror", 1.0)])
+def test_a_sky_seen_through_a_hole_is_a_lamp_of_that_shape(tmp_path: Path, pane: str, transmits: float) -> None:
+    """With a half-transparent pane in it, it is a dimmer one; with one in a mirror there are two."""
+    elements = dark_room_with_a_skylight(tmp_path)
+    xyz = floor_grid(0.75, 20)
+    factor = transmits * quad_factor(xyz)
+    if pane == "mask":
+        elements.append(
+            f"""<shape type="rectangle"><transform name="to_world"><scale x="0.5" y="0.3"/>
+            <translate x="0.1" y="0.3" z="0.702"/></transform><bsdf type="mask"><float name="opacity" value="0.4"/>
+            {BLACK}</bsdf></shape>"""
+        )
+    if pane == "mirror":
+        elements.append(
+            """<shape type="rectangle"><transform name="to_world"><scale x="0.35" y="0.99"/>
+            <rotate y="1" angle="90"/><translate x="-0.9" z="0.35"/></transform>
+            <bsdf type="conductor"><string name="material" value="none"/></bsdf></shape>"""
+        )
+        factor = factor + quad_factor(xyz * (-1, 1, 1) - (1.8, 0, 0))
+    got = floor_light(scene_of(tmp_path, *elements), xyz, texel_m=0.03, direct_samples=128, target_db=46)
+    error = got / (np.pi * factor[:, None] * [1, 2, 3]) - 1
+    assert np.quantile(np.abs(error), 0.9) < 0.025 and np.abs(error).max() < 0.08
+    assert abs(error.mean()) < 0.006
+
+
+def test_a_guide_draws_what_it_says(tmp_path: Path) -> None:
+    """Two cells: all that is learned of one is where its light comes from, of the other nothing."""
+    rng = np.random.default_rng(3)
+    toward = np.array([0.6, -0.48, 0.64])
+    seen = toward + 0.1 * rng.normal(size=(4000, 3))
+    bins = np.array(bin_of(mi.Vector3f((seen / np.linalg.norm(seen, axis=1, keepdims=True)).T))).astype(np.int64)
+    guide = Guide.learned(np.zeros(4000, np.int64), bins, np.ones(4000), 2)
+    n = 1 << 18
+    even = rng.normal(size=(n, 3)).astype(np.float32)
+    even /= np.linalg.norm(even, axis=1, keepdims=True)
+    for cell, least in ((0, 0.75), (1, None)):
+        numbers = mi.UInt32(np.full(n, cell, np.uint32))
+        d = guide.sample(numbers, mi.Point2f(rng.random((2, n), np.float32)))
+        density = np.array(guide.density(numbers, mi.Vector3f(even.T)))
+        assert 4 * np.pi * density.mean() == pytest.approx(1.0, abs=0.02)
+        share = (np.array(d).reshape(3, -1).T @ toward > 0.9).mean()
+        assert share == pytest.approx(4 * np.pi * (density * (even @ toward > 0.9)).mean(), abs=0.02)
+        if least is None:
+            np.testing.assert_allclose(4 * np.pi * density, 1.0, rtol=1e-4)
+        else:
+            assert share > least
+
+
+def test_noise_is_smoothed_and_edges_of_shadows_are_not() -> None:
+    rng = np.random.default_rng(4)
+    x, y = (k.ravel() for k in np.meshgrid(*2 * [0.01 * np.arange(80)], indexing="ij"))
+    position = np.column_stack([x, y, np.zeros_like(x)]).astype(np.float32)
+    normal = np.tile(np.float32([0, 0, 1]), (len(x), 1))
+    points = SurfacePoints(position, normal, normal, np.zeros(len(x), np.int64))
+    true = np.where(x < 0.405, 1.0, 0.2)
+    halves = true[None, :, None] * (1 + rng.normal(scale=0.05, size=(2, len(x), 1))) * np.ones(3)
+    which = np.arange(len(x))
+    error = denoised(points, which, halves, 0.01)[:, 0] / true - 1
+    away = np.abs(x - 0.405) > 0.08
+    noise = 0.05 / np.sqrt(2)
+    assert scatter_of(points, which, halves, 0.01)[1][away].mean() == pytest.approx(noise, rel=0.1)
+    assert error[away].std() < noise / 3
+    assert np.sqrt(np.mean(error[~away] ** 2)) < noise  # smoothed across, it would be 0.5 and more
 
 
 def test_white_furnace(tmp_path: Path) -> None:

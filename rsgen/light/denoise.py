@@ -1,0 +1,60 @@
+"""Noise of baked light taken out on the surface: averaged over neighbours on one piece that it cannot tell apart."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from rsgen.array_types import Float32Array, FloatArray, IntArray
+from rsgen.light.bake_points import SurfacePoints, thin
+
+_NEIGHBOURS = 32
+_NORMAL_SCALE = 0.35  # normals this far apart count as much as one spacing
+_APART = 1e4  # spacings between different pieces of surface
+_REACH = 2.0  # spacings: of the weight's fall with distance
+_PATCH = 8.0  # spacings that the noise's size is estimated over
+_CHUNK = 1 << 17
+
+
+def scatter_of(
+    points: SurfacePoints, which: IntArray, halves: NDArray, spacing: float
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """Standard error (n,) of the mean of two independent estimates (2, n, 3), and as a part of it; by patches."""
+    patch = thin(points, _PATCH * spacing, which)[1]
+    count = np.bincount(patch)
+    a, b = halves.mean(axis=2)
+    variance = (np.bincount(patch, (a - b) ** 2) / (4 * count))[patch]
+    mean = (np.bincount(patch, ((a + b) / 2) ** 2) / count)[patch]
+    return np.sqrt(variance), np.sqrt(variance / np.maximum(mean, 1e-30))
+
+
+def denoised(points: SurfacePoints, which: IntArray, halves: NDArray, spacing: float) -> Float32Array:
+    """Mean (n, 3) of two independent estimates (2, n, 3) of irradiance, smoothed where noise hides any difference.
+
+    Each half is averaged with weights by the other (Rousselle, Manzi, Zwicker, PG 2013), so that noise does not choose
+    what it is averaged with: edges of shadows stay.
+    """
+    position = points.position[which] / (_REACH * spacing)
+    scaled = np.concatenate(
+        [position, points.normal[which] / _NORMAL_SCALE, _APART * points.piece[which, None]], axis=1
+    ).astype(np.float32)
+    sigma = scatter_of(points, which, halves, spacing)[0]
+    grey = halves.mean(axis=2)
+    # Variance of one half: of a point that scatters more than its neighbours its own.
+    half = np.maximum(2.0 * sigma**2, 0.5 * (grey[0] - grey[1]) ** 2)
+    tree = cKDTree(scaled)
+    out = np.empty((len(which), 3), np.float32)
+    k = min(_NEIGHBOURS, len(which))
+    for begin in range(0, len(which), _CHUNK):
+        part = slice(begin, begin + _CHUNK)
+        distance, near = tree.query(scaled[part], k=k, workers=-1)
+        distance, near = distance.reshape(-1, k), near.reshape(-1, k)
+        spread = half[part, None] + half[near]
+        smoothed = np.zeros((len(near), 3))
+        for one, other in ((0, 1), (1, 0)):
+            apart = (grey[other][part, None] - grey[other][near]) ** 2 - spread
+            weight = np.exp(-0.5 * distance**2 - np.maximum(apart, 0) / np.maximum(spread, 1e-20))
+            smoothed += np.einsum("nk,nkc->nc", weight, halves[one][near]) / (2 * weight.sum(axis=1, keepdims=True))
+        out[part] = smoothed
+    return out

@@ -1,0 +1,38 @@
+"""What all of the baking starts from: points in chunks, and random numbers that are the same each time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+from numpy.typing import NDArray
+
+from rsgen.light.bake_points import SurfacePoints
+
+_OFFSET_M = 2e-4  # ray origins above their surface
+_CHUNK = 1 << 18
+
+
+def rotation(index: Any, dimension: int) -> Any:
+    """Uniform offset in [0, 1) from a hash of a point's number and a dimension."""
+    return mi.sample_tea_float32(index, mi.UInt32(dimension), 4)
+
+
+def r2(i: Any, offset: Any) -> Any:
+    """Point i of the R2 low-discrepancy sequence (Roberts 2018), rotated by `offset`."""
+    x = offset.x + mi.Float(i) * 0.7548776662466927
+    y = offset.y + mi.Float(i) * 0.5698402909980532
+    return mi.Point2f(x - dr.floor(x), y - dr.floor(y))
+
+
+def chunks(
+    points: SurfacePoints, which: NDArray, report: Callable[[float], None], size: int = _CHUNK
+) -> Iterator[tuple[int, NDArray, Any, Any, Any]]:
+    """(first of them, their numbers, ray origins, normals and numbers on the device) of `which`, `size` at a time."""
+    for begin in range(0, len(which), size):
+        part = which[begin : begin + size]
+        p, n, g = (mi.Vector3f(a[part].T) for a in (points.position, points.normal, points.geometric))
+        yield begin, part, mi.Point3f(p + g * _OFFSET_M), n, mi.UInt32(part.astype("uint32"))
+        report(min(1.0, (begin + len(part)) / len(which)))

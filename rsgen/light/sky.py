@@ -1,0 +1,143 @@
+"""Light from the sky, and lamps' light that comes through panes or off mirrors, on points of surfaces.
+
+In a room a sky is seen through a window only: most directions that are drawn from the whole of it end at a wall. So a
+first look tells where light comes from in each part of the scene, and half of the directions are drawn from that. How
+much is drawn depends on how much it still scatters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from rsgen.array_types import Float32Array, IntArray
+from rsgen.light.bake_points import SurfacePoints, thin
+from rsgen.light.denoise import denoised, scatter_of
+from rsgen.light.guide import Guide, bin_of
+from rsgen.light.sampling import chunks, r2, rotation
+from rsgen.light.specular import first_scatterer
+
+_CELL_M = 0.5  # parts of the scene that have one histogram, of like normals on one piece of surface
+_FIRST_LOOK_TEXELS, _FIRST_LOOK_SAMPLES = 3.0, 64
+_GROWTH, _ROUNDS = 2, 6  # after each round so many times as much has been drawn as before it
+
+
+def sky_light(
+    scene: Any, points: SurfacePoints, which: IntArray, texel_m: float, samples: int, follow: bool, scatter: float,
+    report: Callable[[float], None],
+) -> tuple[Float32Array, float]:  # fmt: skip
+    """Irradiance (len(which), 3) from the sky and, with `follow`, from lamps by way of panes and mirrors.
+
+    samples: directions at each point at first; more where the standard error of the irradiance, as a part of it,
+    exceeds `scatter`. Returns too what that is in the end, before it is smoothed: root mean square over all points.
+    """
+    cell = thin(points, _CELL_M, which)[1]
+    guide = _learned(scene, points, which, cell, texel_m, follow)
+    halves = np.zeros((2, len(which), 3))
+    drawn = np.zeros(len(which))
+    means, left = halves, np.zeros(len(which))
+    todo = np.arange(len(which))
+    for round_ in range(_ROUNDS):
+        count = samples if round_ == 0 else (_GROWTH - 1) * int(drawn[todo[0]])
+        begin = int(drawn[todo[0]])
+
+        def share(f: float, n: int = round_) -> None:
+            report((n + f) / _ROUNDS)
+
+        for first, part, p, n, number in chunks(points, which[todo], share):
+            here = todo[first : first + len(part)]
+            sums = _sky_at(scene, guide, mi.UInt32(cell[here].astype(np.uint32)), p, n, number, begin, count, follow)
+            halves[:, here] += np.array(sums, dtype=np.float64).reshape(2, 3, -1).transpose(0, 2, 1)
+        drawn[todo] += count
+        means = halves / np.maximum(drawn[:, None] / 2, 1)
+        left = scatter_of(points, which, means, texel_m)[1]
+        todo = todo[left[todo] > scatter]
+        if not len(todo):
+            break
+    report(1.0)
+    return denoised(points, which, means, texel_m), float(np.sqrt(np.mean(left**2)))
+
+
+def _learned(
+    scene: Any, points: SurfacePoints, which: IntArray, cell: IntArray, texel_m: float, follow: bool
+) -> Guide:  # fmt: skip
+    coarse = thin(points, _FIRST_LOOK_TEXELS * texel_m, which)[0]
+    cells, bins, light = [], [], []
+    for first, part, p, n, number in chunks(points, which[coarse], lambda _: None, (1 << 22) // _FIRST_LOOK_SAMPLES):
+        found = _first_look(scene, p, n, number, follow)
+        here = cell[coarse[first : first + len(part)]]
+        cells.append(np.repeat(here, _FIRST_LOOK_SAMPLES))
+        bins.append(np.array(found[0]))
+        light.append(np.array(found[1], dtype=np.float64))
+    return Guide.learned(
+        np.concatenate(cells), np.concatenate(bins).astype(np.int64), np.concatenate(light), int(cell.max()) + 1
+    )
+
+
+def _first_look(scene: Any, p: Any, n: Any, number: Any, follow: bool) -> tuple[Any, Any]:
+    """Bin and light of each of the first samples of all points, a point's side by side."""
+    count = dr.width(number)
+    index = dr.arange(mi.UInt32, count * _FIRST_LOOK_SAMPLES)
+    point, i = index // _FIRST_LOOK_SAMPLES, index % _FIRST_LOOK_SAMPLES
+    p, n = dr.gather(mi.Point3f, p, point), dr.gather(mi.Vector3f, n, point)
+    number = dr.gather(mi.UInt32, number, point)
+    u = r2(i >> 1, mi.Point2f(rotation(number, 201), rotation(number, 202)))
+    d, density = _drawn(scene, p, n, u, (i & 1) == 1, mi.warp.square_to_cosine_hemisphere(u), None)
+    _, light = _arriving(scene, p, n, d, rotation(number, 203), follow)
+    return bin_of(d), dr.select(density > 0, mi.luminance(light) / dr.maximum(density, 1e-20), 0.0)
+
+
+def _drawn(scene: Any, p: Any, n: Any, u: Any, other: Any, local: Any, guided: Any) -> tuple[Any, Any]:
+    """A direction of the sky's own or, where `other`, another one; and the density of both together.
+
+    guided: (direction, density of any direction) of a guide. Without one, and without a sky, `local` is the other one,
+    about the normal, cosine-distributed.
+    """
+    frame = mi.Frame3f(n)
+    about = frame.to_world(local)
+    own, sky = about, scene.environment()
+    it = dr.zeros(mi.Interaction3f, dr.width(p))
+    it.p, it.t, it.n = p, mi.Float(1), mi.Normal3f(n)
+    if sky is not None:
+        own = sky.sample_direction(it, u)[0].d
+    d = dr.select(other, about if guided is None else guided[0], own)
+    cosine = dr.maximum(dr.dot(n, d), 0) * dr.inv_pi
+    density = cosine if guided is None else guided[1](d)
+    towards = dr.zeros(mi.DirectionSample3f, dr.width(p))
+    towards.d = d
+    density += cosine if sky is None else sky.pdf_direction(it, towards)
+    return d, 0.5 * density
+
+
+def _arriving(scene: Any, p: Any, n: Any, d: Any, pick: Any, follow: bool) -> tuple[Any, Any]:
+    """Whether anything arrives at p (normal n) from direction d, and radiance times cosine."""
+    cosine = dr.dot(n, d)
+    _, si, _, through, passed = first_scatterer(scene, mi.Ray3f(p, d), pick - dr.floor(pick), follow, cosine > 0)
+    emitter = si.emitter(scene)
+    found = (cosine > 0) & (emitter != dr.zeros(mi.EmitterPtr)) & (~si.is_valid() | (passed > 0))
+    return found, dr.select(found, through * emitter.eval(si, found) * cosine, 0)
+
+
+@dr.syntax
+def _sky_at(scene, guide, cell, p, n, number, begin, samples, follow):
+    """Sums over two halves of the samples `begin` to `begin + samples`."""
+    offset = mi.Point2f(rotation(number, 204), rotation(number, 205))
+    lobe = rotation(number, 206)
+    i = dr.opaque(mi.UInt32, begin)
+    end = i + dr.opaque(mi.UInt32, samples)
+    even, odd = mi.Color3f(0), mi.Color3f(0)
+    while i < end:
+        u = r2(i >> 1, offset)
+        guided = (guide.sample(cell, u), lambda d: guide.density(cell, d))
+        d, density = _drawn(scene, p, n, u, (i & 1) == 1, mi.warp.square_to_cosine_hemisphere(u), guided)
+        found, light = _arriving(scene, p, n, d, lobe + mi.Float(i) * 0.6180339887498949, follow)
+        light = dr.select(found & (density > 0), light / dr.maximum(density, 1e-20), 0)
+        first = ((i >> 1) & 1) == 0
+        even += dr.select(first, light, 0)
+        odd += dr.select(first, 0, light)
+        i += 1
+    return mi.Vector3f(even), mi.Vector3f(odd)
