@@ -14,13 +14,12 @@ def flatten(mi: Any, state: Any) -> None:
     each belongs to one shape. Groups may hold instances of other groups. Groups that nobody instances vanish.
     """
     made = 0
-    for key, index in _children(
-        mi, state.nodes[0].props
-    ):  # fetched anew each time: the list of nodes moves as it grows
+    # The root is fetched anew each time: the list of nodes moves as it grows.
+    for key, index in _children(mi, state.nodes[0].props):
         plugin = _shape_plugin(mi, state.nodes[index])
         if plugin not in ("instance", "shapegroup"):
             continue
-        state.nodes[0].props.remove_property(key)
+        del state.nodes[0].props[key]
         if plugin == "instance":
             for copy in _copies(mi, state, index, np.eye(4)):
                 state.nodes[0].props[f"rsgen_instance_{made:06d}"] = mi.Properties.ResolvedReference(copy)

@@ -88,7 +88,12 @@ class Upgrade:
 
     def _children(self, parent: Element) -> None:
         kept = []
+        last = {child.get("name"): child for child in parent if child.tag in _VALUES and child.tag != "ref"}
         for child in list(parent):
+            name = child.get("name")
+            if name is not None and last.get(name, child) is not child:  # the last one counted
+                self._dropped[f"repeated {name}"] += 1
+                continue
             new = self._element(child)
             if new is None:
                 self._leave_out(child)
@@ -158,7 +163,7 @@ class Upgrade:
         return e
 
     def _sky(self, e: Element, plugin: str) -> Element:
-        """Mitsuba 3 has one plugin for all, whose up is z where the old one's was y."""
+        """Mitsuba 3 has one plugin for all: x is south, y west and z up where x was east, y up and z south."""
         scale = old.take(e, "scale", "1")
         parts = {part: old.take(e, part, scale) for part in ("sun_scale", "sky_scale")}
         if plugin != "sunsky":
@@ -170,9 +175,8 @@ class Upgrade:
             SubElement(e, "rgb", name="albedo", value="0.15")
         pose = old.named(e, "to_world")
         pose = SubElement(e, "transform", name="to_world") if pose is None else pose
-        pose.insert(0, Element("rotate", x="1", angle="-90"))
-        by_hour = " with the sun by date and hour" if old.named(e, "sun_direction") is None else ""
-        self._replaced[f"emitter {plugin} by sunsky{by_hour}"] += 1
+        pose.insert(0, Element("matrix", value="0 -1 0 0 0 1 1 0 0"))
+        self._replaced[f"emitter {plugin} by the sunsky of Mitsuba 3"] += 1
         e.set("type", "sunsky")
         return e
 
@@ -182,7 +186,8 @@ class Upgrade:
             return self._scale(e)
         if plugin not in self._known:
             self._replaced[f"texture {plugin} by one colour"] += 1
-            return self._stand_in(e, self._element(old.color_of(e)) or e)
+            shown = old.color_of(e)
+            return self._stand_in(e, self._texture(shown) if shown.tag == "texture" else old.as_rgb(shown))
         if any(old.named(e, axis + word) is not None for axis in "uv" for word in ("offset", "scale")):
             pose = SubElement(e, "transform", name="to_uv")  # Mitsuba's own upgrade scales the offset, too
             SubElement(pose, "scale", x=old.take(e, "uscale", "1"), y=old.take(e, "vscale", "1"))
@@ -235,9 +240,8 @@ class Upgrade:
             return self._mixture(e)
         if plugin not in self._known:
             self._replaced[f"bsdf {plugin} by diffuse"] += 1
-            color = old.renamed(old.color_of(e), "reflectance")
             matte = Element("bsdf", type="diffuse")
-            matte.append(color)
+            matte.append(old.renamed(old.color_of(e), "reflectance"))
             if plugin == "difftrans":  # light passes through it: seen from both sides
                 twosided = Element("bsdf", type="twosided")
                 twosided.append(matte)

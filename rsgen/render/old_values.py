@@ -74,7 +74,7 @@ def as_rgb(e: Element) -> Element:
     value = e.get("value", "").strip()
     if e.tag == "blackbody":
         return _black_body(e)
-    if ":" in value or "filename" in e.attrib:
+    if e.tag == "ref" or ":" in value or "filename" in e.attrib:
         return e
     coded = value.startswith("#")
     rgb = [int(value[k : k + 2], 16) / 255 for k in (1, 3, 5)] if coded else numbers(value)

@@ -24,6 +24,8 @@ log = logging.getLogger("rsgen")
 
 _UNKNOWN = re.compile(r'(\w+) plugin of type "(\w+)":|- \w+ "(\w+)"')
 
+_FAILED = re.compile(r'At (.*?\(line \d+, col \d+\)): failed to instantiate (\w+) plugin of type "(\w+)": (.*)')
+
 
 def parse(mi: Any, config: Any, path: Path, scratch: Path, shape: str | None = None) -> tuple[Any, Changes | None]:
     """Parsed state of a scene file, and what an upgrade changed if it is older than Mitsuba 3 (None: it is not).
@@ -48,28 +50,29 @@ def parse(mi: Any, config: Any, path: Path, scratch: Path, shape: str | None = N
 
 
 def prepare(mi: Any, config: Any, state: Any, path: Path) -> None:
-    """Resolve references and flatten instances, in place.
-
-    Raises UserError if a file is missing or a transform squashes its object flat.
-    """
+    """Resolve references and flatten instances, in place. Raises UserError if a transform squashes a shape flat."""
     mi.parser.transform_upgrade(config, state)
     mi.parser.transform_resolve(config, state)
     flatten(mi, state)
     for node in state.nodes:
         props = node.props
-        if "filename" in props:
-            name = str(props["filename"])
-            if not (path.parent / name).is_file() and not Path(str(mi.file_resolver().resolve(name))).is_file():
-                raise UserError(f"scene {path}: file '{name}' is missing: put it there, or mend its path in the scene")
         if node.type == mi.ObjectType.Shape and "to_world" in props:
-            linear = np.asarray(props["to_world"].matrix, float).reshape(4, 4)[:3, :3]
-            size = float(np.linalg.norm(linear))
-            if not np.isfinite(size) or abs(float(np.linalg.det(linear))) <= 1e-12 * size**3:
+            pose = np.asarray(props["to_world"].matrix, float).reshape(4, 4)
+            linear, size = pose[:3, :3], float(np.linalg.norm(pose[:3, :3]))
+            if not np.isfinite(pose).all() or abs(float(np.linalg.det(linear))) <= 1e-12 * size**3:
                 what = props.id() or props.plugin_name()
                 raise UserError(
                     f"scene {path}: to_world of shape '{what}' squashes it flat or is not finite: "
                     "scale no axis by 0, and mend its numbers"
                 )
+
+
+def check_files(mi: Any, state: Any, path: Path) -> None:
+    """Raise UserError if a mesh or an image that the scene names is not there."""
+    for node in state.nodes:
+        name = str(node.props["filename"]) if "filename" in node.props else None
+        if name is not None and not Path(str(mi.file_resolver().resolve(name))).is_file():
+            raise UserError(f"scene {path}: file '{name}' is missing: put it there, or mend its path in the scene")
 
 
 @contextlib.contextmanager
@@ -95,6 +98,29 @@ def messages_to_log(mi: Any) -> Iterator[list[str]]:
         logger.clear_appenders()
         for appender in before:
             logger.add_appender(appender)
+
+
+def explained(mi: Any, state: Any, error: str) -> str:
+    """Mitsuba's message about an object that it could not make, in one line: which one, why, and how to mend it."""
+    text = " ".join(error.split())
+    found = _FAILED.search(text)
+    if found is None:
+        return text[:300]
+    place, kind, plugin, why = found.groups()
+    node = next((n for n in state.nodes if str(mi.parser.file_location(state, n)) == place), None)
+    props = None if node is None else node.props
+    name = "" if props is None else str(props["filename"]) if "filename" in props else props.id()
+    why = re.sub(r"\[[\w.:]+\] ?", "", why).rstrip("!. ")
+    if "not found" in why and "Plugin" in why:
+        why, mend = "Mitsuba 3 has no such plugin", "name another, or leave it out"
+    elif kind == "shape":
+        mend = "export it anew, whole, as triangles with finite vertices"
+    elif plugin in ("bitmap", "envmap"):
+        mend = "save the image anew"
+    else:
+        mend = "mend it in the scene"
+    which = f" '{name}'" if name else ""
+    return f"{kind} {plugin}{which}: {why[:200]}: {mend}"
 
 
 def unknown_properties(messages: list[str]) -> list[str]:

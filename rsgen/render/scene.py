@@ -25,8 +25,9 @@ from rsgen.errors import UserError
 from rsgen.files import encode_png
 from rsgen.render.board import Board, drawing
 from rsgen.render.board import surface as board_surface
+from rsgen.render.mended import mend_meshes
 from rsgen.render.old_xml import METHOD as OLD_XML
-from rsgen.render.parsed import messages_to_log, parse, prepare, unknown_properties
+from rsgen.render.parsed import check_files, explained, messages_to_log, parse, prepare, unknown_properties
 
 log = logging.getLogger("rsgen")
 
@@ -58,7 +59,7 @@ def load_scene(path: Path, board: Board | None = None) -> Any:
             raise UserError(f"scene {path}: {_first_line(error)}") from None
     if not any(shape.is_mesh() for shape in scene.shapes()):
         raise UserError(f"scene {path}: has no surfaces to render: add a shape")
-    return scene
+    return mend_meshes(mi, scene, path)
 
 
 def ensure_built(path: Path) -> None:
@@ -137,13 +138,13 @@ def _load_xml(mi: Any, path: Path, scratch: Path, board: Board | None, messages:
     resolver = mi.file_resolver()
     resolver.prepend(str(path.resolve().parent))
     try:
-        return _instantiated(mi, config, state, path, scratch)
+        scene = _instantiated(mi, config, state, path, scratch)
     finally:
         del resolver[0]  # else the next scene would find what it lacks, an include say, in this one's folder
-        if changes is not None:
-            changes.dropped.update(unknown_properties(messages))
-            level = logging.WARNING if changes.lossy else logging.DEBUG
-            log.log(level, "scene %s: %s", path, changes.summary())
+    if changes is not None:
+        changes.dropped.update(unknown_properties(messages))
+        log.log(logging.WARNING if changes.lossy else logging.DEBUG, "scene %s: %s", path, changes.summary())
+    return scene
 
 
 def _instantiated(mi: Any, config: Any, state: Any, path: Path, scratch: Path) -> Any:
@@ -156,8 +157,12 @@ def _instantiated(mi: Any, config: Any, state: Any, path: Path, scratch: Path) -
             raise UserError(f"scene {path}: shape '{plugin}' cannot become triangles: export it as a mesh (.ply, .obj)")
         if plugin in _ANALYTIC:
             node.props = _tessellated(mi, node.props, scratch / f"{index}.ply")
+    check_files(mi, state, path)
     mi.parser.transform_all(config, state)
-    scene = mi.parser.instantiate(config, state)
+    try:
+        scene = mi.parser.instantiate(config, state)
+    except Exception as error:  # of whatever kind Mitsuba's plugins raise
+        raise UserError(f"scene {path}: {explained(mi, state, str(error))}") from None
     return scene[0] if isinstance(scene, (list, tuple)) else scene
 
 
