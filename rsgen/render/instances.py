@@ -6,6 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from rsgen.render.mended import rebuilt
+
+_MESHES = ("ply", "obj", "serialized", "cube")
+_MIRRORED = "rsgen_mirrored_"
+
 
 def flatten(mi: Any, state: Any) -> None:
     """Replace the instances of a parsed scene, references resolved, by copies of their groups' shapes, in place.
@@ -24,6 +29,26 @@ def flatten(mi: Any, state: Any) -> None:
             for copy in _copies(mi, state, index, np.eye(4)):
                 state.nodes[0].props[f"rsgen_instance_{made:06d}"] = mi.Properties.ResolvedReference(copy)
                 made += 1
+
+
+def turn_mirrored(mi: Any, scene: Any) -> Any:
+    """The scene with the meshes of mirrored instances right side out again.
+
+    Mitsuba's instances keep their outside out. A mesh of its own with a mirroring pose has it inside where Mitsuba
+    makes the normals from the triangles, not where the file brings them.
+    """
+    turned = [shape for shape in scene.shapes() if shape.id().startswith(_MIRRORED)]
+    for shape in turned:
+        parameters = mi.traverse(shape)
+        vertices, faces = (np.asarray(parameters[key]).reshape(-1, 3) for key in ("vertex_positions", "faces"))
+        if shape.has_vertex_normals():
+            normals = np.asarray(parameters["vertex_normals"]).reshape(-1, 3)
+            a, b, c = (vertices[faces[:, k]] for k in range(3))
+            inside_out = np.einsum("ij,ij->", np.cross(b - a, c - a), normals[faces].sum(axis=1)) > 0
+            parameters["vertex_normals"] = mi.Float((-normals if inside_out else normals).ravel())
+        parameters["faces"] = mi.UInt32(faces[:, ::-1].ravel())
+        parameters.update()
+    return rebuilt(mi, scene) if turned else scene
 
 
 def _children(mi: Any, props: Any) -> list[tuple[str, int]]:
@@ -55,7 +80,11 @@ def _copies(mi: Any, state: Any, instance: int, pose: Any) -> list[int]:
 
 def _copy(mi: Any, state: Any, index: int, pose: Any) -> int:
     node = mi.parser.SceneNode(state.nodes[index])
-    node.props.set_id("")  # the same one twice is an error
+    mirrored = np.linalg.det(pose[:3, :3]) < 0
+    plugin = node.props.plugin_name()
+    node.props.set_id(f"{_MIRRORED}{len(state.nodes)}" if mirrored and plugin in _MESHES else "")  # ids are unique
+    if mirrored and plugin == "sphere":
+        node.props["flip_normals"] = not node.props.get("flip_normals", False)
     node.props["to_world"] = mi.ScalarTransform4f(pose @ _to_world(node.props))
     for key, child in _children(mi, node.props):
         if state.nodes[child].type == mi.ObjectType.Emitter:

@@ -6,6 +6,7 @@ Either would put NaN into the baked light, and from there into images.
 from __future__ import annotations
 
 import logging
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -43,11 +44,19 @@ def mend_meshes(mi: Any, scene: Any, path: Path) -> Any:
         else:
             log.debug("mesh '%s': left out, it has no area", shape.id() or number)
             flat.add(number)
-    if flat:
-        return _without(mi, scene, flat, path)
-    if changed:
-        scene.parameters_changed()
-    return scene
+    if all(number in flat or not shape.is_mesh() for number, shape in enumerate(scene.shapes())):
+        raise UserError(f"scene {path}: no triangle of it has an area: export its meshes anew")
+    return rebuilt(mi, scene, flat) if changed or flat else scene
+
+
+def rebuilt(mi: Any, scene: Any, left_out: Collection[int] = ()) -> Any:
+    """A new scene of all shapes but those numbered in `left_out`, and of all lamps that are no shapes.
+
+    Needed after a mesh's triangles have changed: `scene.parameters_changed` may leave the old ones in Embree's tree.
+    """
+    shapes = {f"shape_{k:06d}": shape for k, shape in enumerate(scene.shapes()) if k not in left_out}
+    lamps = {f"lamp_{k:06d}": lamp for k, lamp in enumerate(scene.emitters()) if lamp.get_shape() is None}
+    return mi.load_dict({"type": "scene", **shapes, **lamps}, optimize=False)
 
 
 def has_area(vertices: Float32Array, faces: NDArray[np.uint32]) -> NDArray[np.bool_]:
@@ -75,6 +84,8 @@ def _mend(mi: Any, shape: Any, vertices: Float32Array, faces: NDArray, keep: NDA
             rows = np.asarray(parameters[name]).reshape(len(faces), -1)
             parameters[name] = mi.Float(rows[keep].ravel())
         parameters["faces"] = mi.UInt32(faces[keep].ravel())
+        if shape.has_vertex_normals():
+            parameters["vertex_normals"] = mi.Float(normals.ravel())  # else made anew, from the triangles
         log.debug("mesh '%s': %d triangles without area dropped", shape.id(), np.count_nonzero(~keep))
     if useless.any():
         mended = np.where(useless[:, None], _vertex_normals(vertices, faces[keep]), normals)
@@ -82,15 +93,6 @@ def _mend(mi: Any, shape: Any, vertices: Float32Array, faces: NDArray, keep: NDA
         log.debug("mesh '%s': %d vertex normals without direction replaced", shape.id(), np.count_nonzero(useless))
     parameters.update()
     return True
-
-
-def _without(mi: Any, scene: Any, flat: set[int], path: Path) -> Any:
-    """The scene's shapes but for those numbered in `flat`, with all emitters that are no shapes, as a new scene."""
-    shapes = {f"shape_{k:06d}": shape for k, shape in enumerate(scene.shapes()) if k not in flat}
-    if not any(shape.is_mesh() for shape in shapes.values()):
-        raise UserError(f"scene {path}: no triangle of it has an area: export its meshes anew")
-    lamps = {f"emitter_{k:06d}": lamp for k, lamp in enumerate(scene.emitters()) if lamp.get_shape() is None}
-    return mi.load_dict({"type": "scene", **shapes, **lamps}, optimize=False)
 
 
 def _vertex_normals(vertices: Float32Array, faces: NDArray) -> NDArray[np.float64]:

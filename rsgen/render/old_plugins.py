@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement
@@ -18,6 +19,8 @@ _ATTRIBUTES = frozenset(
     ("type", "id", "name", "value", "x", "y", "z", "angle", "origin", "target", "up", "filename", "version", "as")
 )
 _RENAMED = {"bump": "bumpmap", "ldrtexture": "bitmap", "exrtexture": "bitmap", "lambertian": "diffuse"}
+Exists = Callable[[str, str], bool]
+"""Whether Mitsuba 3 has a plugin: its kind, as a tag ("shape", "bsdf", "texture", "emitter"), and its name."""
 
 
 @dataclass
@@ -45,8 +48,8 @@ class Changes:
 class Upgrade:
     """One walk over a tree, parents before children, since some plugins take their children apart."""
 
-    def __init__(self, known: frozenset[str], changes: Changes) -> None:
-        self._known = known
+    def __init__(self, exists: Exists, changes: Changes) -> None:
+        self._exists = exists
         self._dropped, self._replaced, self._not_used = changes.dropped, changes.replaced, changes.not_used
         self._version = tuple(map(int, changes.version.split(".")))
         self._alias: dict[str, str] = {}  # id of an object that went -> id of the one in its place
@@ -140,7 +143,7 @@ class Upgrade:
 
     def _shape(self, e: Element) -> Element | None:
         plugin = e.get("type", "")
-        if plugin not in self._known:
+        if not self._exists(e.tag, plugin):
             self._dropped[f"shape {plugin}"] += 1
             return None
         first, *others = [child for child in e if child.tag == "bsdf"] or [Element("bsdf")]
@@ -154,7 +157,7 @@ class Upgrade:
         plugin = e.get("type", "")
         if plugin in ("sky", "sun", "sunsky") and self._version < (2, 0):
             return self._sky(e, plugin)
-        if plugin not in self._known:
+        if not self._exists(e.tag, plugin):
             self._dropped[f"emitter {plugin}"] += 1
             return None
         intensity = {"area": "radiance", "constant": "radiance", "directional": "irradiance"}.get(plugin)
@@ -184,7 +187,7 @@ class Upgrade:
         plugin = e.get("type", "")
         if plugin == "scale":
             return self._scale(e)
-        if plugin not in self._known:
+        if not self._exists(e.tag, plugin):
             self._replaced[f"texture {plugin} by one colour"] += 1
             shown = old.color_of(e)
             return self._stand_in(e, self._texture(shown) if shown.tag == "texture" else old.as_rgb(shown))
@@ -238,7 +241,7 @@ class Upgrade:
             return self._stand_in(e, self._bsdf(inner) if inner.tag == "bsdf" else inner)
         if plugin == "mixturebsdf":
             return self._mixture(e)
-        if plugin not in self._known:
+        if not self._exists(e.tag, plugin):
             self._replaced[f"bsdf {plugin} by diffuse"] += 1
             matte = Element("bsdf", type="diffuse")
             matte.append(old.renamed(old.color_of(e), "reflectance"))

@@ -14,7 +14,7 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 from rsgen.errors import UserError
-from rsgen.render.old_plugins import Changes, Upgrade
+from rsgen.render.old_plugins import Changes, Exists, Upgrade
 
 METHOD = b"old-xml/1"
 """Raise when old files come out differently: their baked light is kept under it."""
@@ -28,16 +28,16 @@ def old_version(path: Path) -> str | None:
     return None if found is None or int(found[1]) >= 3 else f"{int(found[1])}.{int(found[2])}"
 
 
-def upgrade(path: Path, version: str, known: frozenset[str]) -> tuple[bytes, Changes]:
+def upgrade(path: Path, version: str, exists: Exists) -> tuple[bytes, Changes]:
     """The scene file as XML of Mitsuba 3, its includes within it, and what that changed.
 
-    version: from `old_version`; known: the names of all plugins of Mitsuba 3. Raises UserError if it is no XML or an
-    included file is missing.
+    version: from `old_version`; exists: which plugins Mitsuba 3 has. Raises UserError if it is no XML, if an included
+    file is missing, or if a number is none.
     """
     changes = Changes(version)
     root = _read(path, path, {}, changes, 0)
     try:
-        upgraded = Upgrade(known, changes).scene(root)
+        upgraded = Upgrade(exists, changes).scene(root)
     except ValueError as error:
         raise UserError(f"scene {path}: {error}: mend the number in the file") from None
     return ET.tostring(upgraded, "utf-8", xml_declaration=True), changes

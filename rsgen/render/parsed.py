@@ -18,7 +18,7 @@ import numpy as np
 from rsgen.errors import UserError
 from rsgen.render import old_xml
 from rsgen.render.instances import flatten
-from rsgen.render.old_plugins import Changes
+from rsgen.render.old_plugins import Changes, Exists
 
 log = logging.getLogger("rsgen")
 
@@ -36,8 +36,7 @@ def parse(mi: Any, config: Any, path: Path, scratch: Path, shape: str | None = N
     version = old_xml.old_version(path)
     file, changes = path.resolve(), None
     if version is not None:
-        plugins = Path(mi.__file__).parent / "plugins"
-        text, changes = old_xml.upgrade(path, version, frozenset(plugin.stem for plugin in plugins.iterdir()))
+        text, changes = old_xml.upgrade(path, version, plugin_finder(mi))
         file = scratch / "upgraded.xml"
         file.write_bytes(text)
         config.unused_properties = mi.LogLevel.Warn  # listed as dropped, later
@@ -47,6 +46,20 @@ def parse(mi: Any, config: Any, path: Path, scratch: Path, shape: str | None = N
         whole.write_text(f"<scene version='3.0.0'><include filename={quoteattr(str(file))}/>{shape}</scene>")
         file = whole
     return mi.parser.parse_file(config, str(file)), changes
+
+
+def plugin_finder(mi: Any) -> Exists:
+    """Tells whether Mitsuba has a plugin of a kind and a name."""
+    manager, kind = mi.PluginManager.instance(), mi.ObjectType
+    kinds = {"shape": kind.Shape, "bsdf": kind.BSDF, "texture": kind.Texture, "emitter": kind.Emitter}
+
+    def exists(tag: str, plugin: str) -> bool:
+        try:
+            return manager.plugin_type(plugin) == kinds[tag]
+        except RuntimeError:  # there is none of that name
+            return False
+
+    return exists
 
 
 def prepare(mi: Any, config: Any, state: Any, path: Path) -> None:

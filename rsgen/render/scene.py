@@ -25,6 +25,7 @@ from rsgen.errors import UserError
 from rsgen.files import encode_png
 from rsgen.render.board import Board, drawing
 from rsgen.render.board import surface as board_surface
+from rsgen.render.instances import turn_mirrored
 from rsgen.render.mended import mend_meshes
 from rsgen.render.old_xml import METHOD as OLD_XML
 from rsgen.render.parsed import check_files, explained, messages_to_log, parse, prepare, unknown_properties
@@ -163,7 +164,8 @@ def _instantiated(mi: Any, config: Any, state: Any, path: Path, scratch: Path) -
         scene = mi.parser.instantiate(config, state)
     except Exception as error:  # of whatever kind Mitsuba's plugins raise
         raise UserError(f"scene {path}: {explained(mi, state, str(error))}") from None
-    return scene[0] if isinstance(scene, (list, tuple)) else scene
+    scene = scene[0] if isinstance(scene, (list, tuple)) else scene
+    return turn_mirrored(mi, scene)
 
 
 def _tessellated(mi: Any, props: Any, file: Path) -> Any:
