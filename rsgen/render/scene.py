@@ -1,8 +1,8 @@
-"""Load any Mitsuba 3 scene XML, or a mesh file through trimesh, as one Mitsuba scene made of triangles only.
+"""Load any Mitsuba scene XML, or a mesh file through trimesh, as one Mitsuba scene made of triangles only.
 
-Rectangles, disks, spheres and cylinders become meshes on the way in, so that depth, `scene.ply` and the baked light all
-speak of the same triangles. A scene folder that holds a `build.py` but no scene yet is built first; there, a scene
-x.xml with an `x.py` of its own beside it is built by that.
+Rectangles, disks, spheres, cylinders and instances become meshes on the way in, so that depth, `scene.ply` and the
+baked light all speak of the same triangles. A scene folder that holds a `build.py` but no scene yet is built first;
+there, a scene x.xml with an `x.py` of its own beside it is built by that.
 """
 
 from __future__ import annotations

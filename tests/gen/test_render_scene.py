@@ -331,7 +331,7 @@ def test_triangles_without_area_and_normals_without_direction_are_harmless(tmp_p
     assert seen.mean() > 0.3 and np.mean(seen != (np.abs(through) < 1).all(axis=1)) < 1e-3
     np.testing.assert_allclose(np.abs(found["sh_n"][seen]), np.tile([0, 0, 1.0], (seen.sum(), 1)), atol=1e-6)
     for side in baked:
-        assert np.isfinite(side).all() and side[:, :3].max() == pytest.approx(np.pi, rel=0.05)  # under a sky of 1
+        assert np.isfinite(side).all() and side[:, :3].mean() == pytest.approx(np.pi, rel=0.1)  # under a sky of 1
 
 
 def test_light_that_would_not_fit_is_refused_before_memory_is_taken(tmp_path: Path) -> None:
