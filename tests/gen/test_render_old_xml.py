@@ -139,13 +139,14 @@ def test_an_old_file_renders_as_the_same_scene_in_the_words_of_mitsuba_3(tmp_pat
 
 
 @pytest.mark.parametrize("name", SURFACES)
-def test_each_surface_alone(tmp_path: Path, name: str) -> None:
+def test_each_surface_alone_from_both_sides(tmp_path: Path, name: str) -> None:
     mi.Bitmap(np.random.default_rng(1).integers(0, 255, (8, 8, 3)).astype(np.uint8)).write(str(tmp_path / "dots.png"))
-    light = '<emitter type="constant"><rgb name="radiance" value="1"/></emitter>'
-    images = [
-        image(load_scene(write(tmp_path, f'<shape type="rectangle">{bsdf}</shape>{light}', version, f"{version}.xml")))
-        for bsdf, version in zip(SURFACES[name], ("0.5.0", "3.0.0"), strict=True)
-    ]
+    images = []
+    for bsdf, version, pose in zip(SURFACES[name], ("0.5.0", "3.0.0"), ("toWorld", "to_world"), strict=True):
+        turned = f'<transform name="{pose}"><rotate y="1" angle="180"/><translate x="2.2"/></transform>'
+        text = f'<shape type="rectangle">{bsdf}</shape><shape type="rectangle">{turned}{bsdf}</shape>'
+        light = '<emitter type="constant"><rgb name="radiance" value="1"/></emitter>'
+        images.append(image(load_scene(write(tmp_path, text + light, version, f"{version}.xml"))))
     assert images[0].max() > 0.1
     np.testing.assert_allclose(images[0], images[1], rtol=1e-4, atol=1e-5)
 
