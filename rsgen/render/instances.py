@@ -18,17 +18,21 @@ def flatten(mi: Any, state: Any) -> None:
     A copy has its group's BSDF and the pose `to_world(instance) @ to_world(shape)`; an emitter is copied along, since
     each belongs to one shape. Groups may hold instances of other groups. Groups that nobody instances vanish.
     """
-    made = 0
     # The root is fetched anew each time: the list of nodes moves as it grows.
-    for key, index in _children(mi, state.nodes[0].props):
+    before = _children(mi, state.nodes[0].props)
+    after: list[tuple[str, int]] = []
+    for key, index in before:
         plugin = _shape_plugin(mi, state.nodes[index])
-        if plugin not in ("instance", "shapegroup"):
-            continue
-        del state.nodes[0].props[key]
         if plugin == "instance":
-            for copy in _copies(mi, state, index, np.eye(4)):
-                state.nodes[0].props[f"rsgen_instance_{made:06d}"] = mi.Properties.ResolvedReference(copy)
-                made += 1
+            after += [(f"rsgen_instance_{copy:06d}", copy) for copy in _copies(mi, state, index, np.eye(4))]
+        elif plugin != "shapegroup":
+            after.append((key, index))
+    if after == before:
+        return
+    for key, _ in before:
+        del state.nodes[0].props[key]
+    for key, index in after:
+        state.nodes[0].props[key] = mi.Properties.ResolvedReference(index)
 
 
 def turn_mirrored(mi: Any, scene: Any) -> Any:

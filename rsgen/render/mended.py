@@ -62,9 +62,10 @@ def rebuilt(mi: Any, scene: Any, left_out: Collection[int] = ()) -> Any:
 def has_area(vertices: Float32Array, faces: NDArray[np.uint32]) -> NDArray[np.bool_]:
     """(m,) whether each of the faces (m, 3) over vertices (n, 3) has an area, to the precision of float32."""
     a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
-    edges = np.stack([b - a, c - b, a - c])
-    area = np.linalg.norm(np.cross(edges[0], edges[2]), axis=-1)
-    return area > _FLAT * (edges**2).sum(axis=-1).max(axis=0)
+    edges = b - a, c - b, a - c
+    longest = np.maximum.reduce([np.einsum("ij,ij->i", edge, edge) for edge in edges])
+    normal = np.cross(edges[0], edges[2])
+    return np.einsum("ij,ij->i", normal, normal) > (_FLAT * longest) ** 2
 
 
 def _mend(mi: Any, shape: Any, vertices: Float32Array, faces: NDArray, keep: NDArray[np.bool_]) -> bool:
@@ -75,7 +76,8 @@ def _mend(mi: Any, shape: Any, vertices: Float32Array, faces: NDArray, keep: NDA
         normals = np.asarray(shape.vertex_normals_buffer(), np.float32).reshape(-1, 3)
         length = np.linalg.norm(normals, axis=-1)
         useless = ~((length > 1e-6) & (length < 1e6))  # NaN is neither
-        useless[np.setdiff1d(np.arange(len(vertices)), faces[keep])] = False
+        if useless.any():  # of vertices that no triangle has, never mind
+            useless[np.setdiff1d(np.flatnonzero(useless), faces[keep])] = False
     if keep.all() and not useless.any():
         return False
     parameters = mi.traverse(shape)
