@@ -200,9 +200,6 @@ class Upgrade:
         return e
 
     def _bitmap(self, e: Element) -> None:
-        file = old.named(e, "filename")
-        if file is not None:
-            file.set("value", file.get("value", "").replace("\\", "/"))
         modes = {old.take(e, f"wrap_mode{axis}", "repeat") for axis in ("_u", "_v", "")} - {"repeat"}
         if modes:
             mode = min(modes) if modes <= {"clamp", "mirror"} else "clamp"
@@ -266,8 +263,9 @@ class Upgrade:
                 e[list(e).index(texture)] = heights
         if plugin == "normalmap" and texture is not None:
             texture.set("name", "normalmap")
-            old.take(texture, "raw", "")
-            SubElement(texture, "boolean", name="raw", value="true")
+            if texture.get("type") == "bitmap":
+                old.take(texture, "raw", "")
+                SubElement(texture, "boolean", name="raw", value="true")
         return e
 
     def _mixture(self, e: Element) -> Element:

@@ -8,6 +8,7 @@ Properties that Mitsuba 3 does not know pass through here: it lists them itself 
 
 from __future__ import annotations
 
+import os
 import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -35,7 +36,7 @@ def upgrade(path: Path, version: str, exists: Exists) -> tuple[bytes, Changes]:
     file is missing, or if a number is none.
     """
     changes = Changes(version)
-    root = _read(path, path, {}, changes, 0)
+    root = _read(path, path, [], {}, changes, 0)
     try:
         upgraded = Upgrade(exists, changes).scene(root)
     except ValueError as error:
@@ -43,8 +44,13 @@ def upgrade(path: Path, version: str, exists: Exists) -> tuple[bytes, Changes]:
     return ET.tostring(upgraded, "utf-8", xml_declaration=True), changes
 
 
-def _read(scene: Path, file: Path, defaults: dict[str, str], changes: Changes, depth: int) -> Element:
-    """The file's tree with its includes in their places and $parameters replaced by their <default>."""
+def _read(
+    scene: Path, file: Path, folders: list[Path], defaults: dict[str, str], changes: Changes, depth: int
+) -> Element:
+    """The file's tree with its includes in their places and $parameters replaced by their <default>.
+
+    folders: where the files that include this one look for others. Names of files become relative to the scene's own.
+    """
     try:
         root = ET.parse(file).getroot()
     except (ET.ParseError, ValueError, LookupError) as error:
@@ -55,6 +61,7 @@ def _read(scene: Path, file: Path, defaults: dict[str, str], changes: Changes, d
         raise UserError(f"scene {scene}: more than {_DEEPEST} files include one another: end the circle")
     if depth:
         changes.files.append(file)
+    folders = [file.parent, *folders]
 
     def fill(parent: Element) -> None:
         for child in list(parent):
@@ -63,14 +70,30 @@ def _read(scene: Path, file: Path, defaults: dict[str, str], changes: Changes, d
             if child.tag == "default":
                 defaults.setdefault(child.get("name", ""), child.get("value", ""))
                 parent.remove(child)
+            elif child.tag == "path":
+                folders.insert(0, _found(folders, child.get("value", "")))
+                parent.remove(child)
             elif child.tag == "include":
-                included = _read(scene, file.parent / child.get("filename", ""), defaults, changes, depth + 1)
+                name = _found(folders, child.get("filename", ""))
+                included = _read(scene, name, folders, defaults, changes, depth + 1)
                 place = list(parent).index(child)
                 parent.remove(child)
                 for offset, element in enumerate(list(included) if included.tag == "scene" else [included]):
                     parent.insert(place + offset, element)
+            elif child.get("name") == "filename":
+                named = _found(folders, child.get("value", "").replace("\\", "/"))
+                child.set("value", os.path.relpath(named, scene.parent) if named.exists() else child.get("value", ""))
             else:
+                if "filename" in child.attrib:  # a spectrum, which the parser reads itself
+                    named = _found(folders, child.attrib["filename"])
+                    changes.files += [named] if named.is_file() else []
+                    child.set("filename", str(named.resolve()))
                 fill(child)
 
     fill(root)
     return root
+
+
+def _found(folders: list[Path], name: str) -> Path:
+    """The file or folder of that name in the first of the folders that has one; if none has, in the first."""
+    return next((folder / name for folder in folders if (folder / name).exists()), folders[0] / name)

@@ -243,6 +243,8 @@ def test_skies_of_mitsuba_3_that_call_themselves_2_stay_as_they_are(tmp_path: Pa
 
 
 def test_textures_without_counterpart(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "b.png").write_bytes(b"")
     xml, changes = upgraded(
         tmp_path,
         """<texture type="wireframe" id="wire"><rgb name="interiorColor" value="0.1"/></texture>
@@ -269,6 +271,25 @@ def test_names_of_before_0_4(tmp_path: Path) -> None:
     light = '<luminaire type="area"><rgb name="intensity" value="3"/></luminaire>'
     scene = load_scene(write(tmp_path, f'<camera type="perspective"/><shape type="sphere">{light}</shape>', "0.3.0"))
     assert scene.shapes()[0].is_emitter() and image(scene)[29, 39] == pytest.approx([3, 3, 3])
+
+
+def test_files_are_found_as_mitsuba_finds_them(tmp_path: Path) -> None:
+    box = trimesh.creation.box((1, 1, 1))
+    for name in ("here", "parts/beside", "shared/far"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        box.export(tmp_path / f"{name}.ply")
+    (tmp_path / "shared" / "grey.spd").write_text("400 0.5\n700 0.5\n")
+    meshes = "".join(f'<shape type="ply"><string name="filename" value="{name}.ply"/>PAINT</shape>' for name in
+                     ("here", "beside", "far"))  # fmt: skip
+    paint = '<bsdf type="diffuse"><spectrum name="reflectance" filename="grey.spd"/></bsdf>'
+    write(tmp_path / "parts", '<include filename="more.xml"/>', name="all.xml")
+    write(tmp_path / "parts", meshes.replace("PAINT", paint), "2.0.0", name="more.xml")
+    for version in ("0.6.0", "2.1.0"):
+        path = write(tmp_path, '<path value="shared"/><include filename="parts/all.xml"/>', version)
+        assert len(load_scene(path).shapes()) == 3
+        first = content_hash(path)
+        (tmp_path / "shared" / "grey.spd").write_text(f"400 0.5\n700 0.{version[0]}1\n")
+        assert content_hash(path) != first
 
 
 def test_the_content_hash_of_an_old_file(tmp_path: Path) -> None:
