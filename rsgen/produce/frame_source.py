@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from rsgen.array_types import BoolArray, ByteArray, Float32Array, FloatArray
 from rsgen.config.config import Config
 from rsgen.console.progress import Progress, no_progress
+from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.spline import Spline
@@ -197,7 +198,11 @@ def make_integrator(mi: Any, scene: Any, config: Config, progress: Progress) -> 
     from rsgen.light.cache import baked_field, cache_folder
     from rsgen.render.baked import BakedIntegrator
 
-    field = baked_field(scene, surfaces_hash(config), light, cache_folder(config.scene.file), progress)
+    try:
+        field = baked_field(scene, surfaces_hash(config), light, cache_folder(config.scene.file), progress)
+    except UserError as error:
+        told = str(error)
+        raise UserError(told if told.startswith("scene ") else f"scene {config.scene.file}: {told}") from None
     return BakedIntegrator(field, glossy_spp=light.glossy_spp)
 
 

@@ -17,9 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsgen.array_types import Float32Array, IntArray
+from rsgen.errors import UserError
 from rsgen.render.scene import mesh_arrays
 
 _MAX_CELLS = 4095  # cells along one grid axis: 12 bits
+_POINT_BYTES = 300  # of memory that baking takes at its peak for each point, as measured
+_MOST_POINTS = int(4e9 / _POINT_BYTES)
 
 
 @dataclass(frozen=True)
@@ -47,26 +50,63 @@ def registry_id(shape: Any) -> int:
 
 
 def make_lattice(scene: Any, spacing: float) -> Lattice:
-    """Lattice over all meshes of `scene` with about `spacing` metres between samples."""
+    """Lattice over all meshes of `scene` with about `spacing` metres between samples.
+
+    Raises UserError, before it takes the memory, if baking so many samples would need more than 4 GB.
+    """
     shapes = [shape for shape in scene.shapes() if shape.is_mesh()]
     ids = [registry_id(shape) for shape in shapes]
     shape_first = np.full(max(ids) + 1, -1, np.int32)
-    cells, apexes, faces_before = [], [], 0
+    sides, apexes, faces_before = [], [], 0
     for shape, number in zip(shapes, ids, strict=True):
         vertices, faces = mesh_arrays(shape)
         corners = vertices[faces].astype(np.float64)
         # edge k is opposite corner k
         edges = np.linalg.norm(np.roll(corners, -1, axis=1) - np.roll(corners, -2, axis=1), axis=-1)
-        apex = np.argmin(edges, axis=1)
-        lengths = np.stack([edges.max(axis=1), edges.min(axis=1)], axis=1)
-        cells.append(np.clip(np.rint(lengths / spacing), 1, _MAX_CELLS).astype(np.int64))
-        apexes.append(apex)
+        sides.append(np.stack([edges.max(axis=1), edges.min(axis=1)], axis=1))
+        apexes.append(np.argmin(edges, axis=1))
         shape_first[number] = faces_before
         faces_before += len(faces)
-    all_cells = np.concatenate(cells)
-    counts = (all_cells + 1).prod(axis=1)
-    first = np.concatenate([[0], np.cumsum(counts)])
-    return Lattice(first[:-1], all_cells, np.concatenate(apexes).astype(np.int64), shape_first, int(first[-1]))
+    lengths = np.concatenate(sides)
+    _check_size(lengths, spacing)
+    cells = _cells(lengths, spacing)
+    first = np.concatenate([[0], np.cumsum((cells + 1).prod(axis=1))])
+    return Lattice(first[:-1], cells, np.concatenate(apexes).astype(np.int64), shape_first, int(first[-1]))
+
+
+def _cells(lengths: NDArray[np.float64], spacing: float) -> IntArray:
+    """Cells (f, 2) of triangles with edges (f, 2) of these lengths, longest and shortest."""
+    return np.clip(np.rint(lengths / spacing), 1, _MAX_CELLS).astype(np.int64)
+
+
+def _check_size(lengths: NDArray[np.float64], spacing: float) -> None:
+    def count(at: float) -> int:
+        return int((_cells(lengths, at) + 1).prod(axis=1).sum())
+
+    asked = count(spacing)
+    if asked <= _MOST_POINTS:
+        return
+    if 4 * len(lengths) > _MOST_POINTS:
+        raise UserError(
+            f"its {len(lengths)} triangles are too many to bake light on ({_gigabytes(4 * len(lengths))} GB): "
+            "simplify its meshes, or use light.mode path"
+        )
+    low, high = spacing, 2 * spacing
+    while count(high) > _MOST_POINTS:
+        low, high = high, 2 * high
+    while high > 1.02 * low:
+        middle = float(np.sqrt(low * high))
+        low, high = (middle, high) if count(middle) > _MOST_POINTS else (low, middle)
+    digit = 10 ** (np.floor(np.log10(high)) - 1)
+    fits = float(np.ceil(high / digit) * digit)
+    raise UserError(
+        f"light.texel_m {spacing:g} needs {_gigabytes(asked)} GB to bake, with {lengths.max():.3g} m its longest edge: "
+        f"set it to {fits:.2g} or more, or scale the scene to metres"
+    )
+
+
+def _gigabytes(points: int) -> str:
+    return f"{points * _POINT_BYTES / 1e9:.3g}"
 
 
 def lattice_barycentric(lattice: Lattice) -> tuple[IntArray, Float32Array]:

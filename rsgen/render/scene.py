@@ -1,8 +1,8 @@
-"""Load any Mitsuba 3 scene XML, or a mesh file through trimesh, as one Mitsuba scene made of triangles only.
+"""Load any Mitsuba scene XML, or a mesh file through trimesh, as one Mitsuba scene made of triangles only.
 
-Rectangles, disks, spheres and cylinders become meshes on the way in, so that depth, `scene.ply` and the baked light all
-speak of the same triangles. A scene folder that holds a `build.py` but no scene yet is built first; there, a scene
-x.xml with an `x.py` of its own beside it is built by that.
+Rectangles, disks, spheres, cylinders and instances become meshes on the way in, so that depth, `scene.ply` and the
+baked light all speak of the same triangles. A scene folder that holds a `build.py` but no scene yet is built first;
+there, a scene x.xml with an `x.py` of its own beside it is built by that.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import sys
 import tempfile
 from pathlib import Path
 from typing import Any
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import trimesh
@@ -26,11 +25,15 @@ from rsgen.errors import UserError
 from rsgen.files import encode_png
 from rsgen.render.board import Board, drawing
 from rsgen.render.board import surface as board_surface
+from rsgen.render.instances import turn_mirrored
+from rsgen.render.mended import mend_meshes
+from rsgen.render.old_xml import METHOD as OLD_XML
+from rsgen.render.parsed import check_files, explained, messages_to_log, parse, prepare, unknown_properties
 
 log = logging.getLogger("rsgen")
 
 _ANALYTIC = ("rectangle", "disk", "sphere", "cylinder")
-_UNSUPPORTED = ("instance", "shapegroup", "sdfgrid", "bsplinecurve", "linearcurve", "ellipsoids", "ellipsoidsmesh")
+_UNSUPPORTED = ("sdfgrid", "bsplinecurve", "linearcurve", "ellipsoids", "ellipsoidsmesh")
 _SEGMENTS = 96
 
 
@@ -42,10 +45,10 @@ def load_scene(path: Path, board: Board | None = None) -> Any:
     """
     ensure_built(path)
     mi = mitsuba()
-    with tempfile.TemporaryDirectory(prefix="rsgen-scene-") as scratch:
+    with tempfile.TemporaryDirectory(prefix="rsgen-scene-") as scratch, messages_to_log(mi) as messages:
         try:
             if path.suffix.lower() == ".xml":
-                scene = _load_xml(mi, path, Path(scratch), board)
+                scene = _load_xml(mi, path, Path(scratch), board, messages)
             else:
                 shapes = _mesh_scene(path, Path(scratch))
                 if board is not None:
@@ -57,7 +60,7 @@ def load_scene(path: Path, board: Board | None = None) -> Any:
             raise UserError(f"scene {path}: {_first_line(error)}") from None
     if not any(shape.is_mesh() for shape in scene.shapes()):
         raise UserError(f"scene {path}: has no surfaces to render: add a shape")
-    return scene
+    return mend_meshes(mi, scene, path)
 
 
 def ensure_built(path: Path) -> None:
@@ -108,11 +111,16 @@ def content_hash(path: Path) -> str:
     digest = hashlib.sha256(path.read_bytes())
     if path.suffix.lower() == ".xml":
         mi = mitsuba()
-        try:
-            state = mi.parser.parse_file(mi.parser.ParserConfig(mi.variant()), str(path))
-        except Exception as error:
-            raise UserError(f"scene {path}: {_first_line(error)}") from None
-        for included in state.files[1:]:
+        with tempfile.TemporaryDirectory(prefix="rsgen-scene-") as scratch, messages_to_log(mi):
+            try:
+                state, changes = parse(mi, mi.parser.ParserConfig(mi.variant()), path, Path(scratch))
+            except UserError:
+                raise
+            except Exception as error:
+                raise UserError(f"scene {path}: {_first_line(error)}") from None
+        if changes is not None:
+            digest.update(OLD_XML)
+        for included in state.files[1:] if changes is None else changes.files:
             digest.update(hashlib.sha256(Path(str(included)).read_bytes()).digest())
         names = {str(n.props["filename"]) for n in state.nodes if "filename" in n.props.keys()}  # noqa: SIM118
         for name in sorted(names):
@@ -123,16 +131,25 @@ def content_hash(path: Path) -> str:
     return digest.hexdigest()
 
 
-def _load_xml(mi: Any, path: Path, scratch: Path, board: Board | None) -> Any:
+def _load_xml(mi: Any, path: Path, scratch: Path, board: Board | None, messages: list[str]) -> Any:
     config = mi.parser.ParserConfig(mi.variant())
     # Merging orders meshes by memory address: emitters and shapes would be numbered anew in each process.
     config.merge_meshes = False
-    file = path.resolve()
-    if board is not None:
-        shape = _board_xml(board, scratch).replace(' version="3.0.0"', "")
-        file = scratch / "with_board.xml"
-        file.write_text(f"<scene version='3.0.0'><include filename={quoteattr(str(path.resolve()))}/>{shape}</scene>")
-    state = mi.parser.parse_file(config, str(file))
+    state, changes = parse(mi, config, path, scratch, None if board is None else _board_xml(board, scratch))
+    resolver = mi.file_resolver()
+    resolver.prepend(str(path.resolve().parent))
+    try:
+        scene = _instantiated(mi, config, state, path, scratch)
+    finally:
+        del resolver[0]  # else the next scene would find what it lacks, an include say, in this one's folder
+    if changes is not None:
+        changes.dropped.update(unknown_properties(messages))
+        log.log(logging.WARNING if changes.lossy else logging.DEBUG, "scene %s: %s", path, changes.summary())
+    return scene
+
+
+def _instantiated(mi: Any, config: Any, state: Any, path: Path, scratch: Path) -> Any:
+    prepare(mi, config, state, path)
     for index, node in enumerate(state.nodes):
         if node.type != mi.ObjectType.Shape:
             continue
@@ -141,14 +158,14 @@ def _load_xml(mi: Any, path: Path, scratch: Path, board: Board | None) -> Any:
             raise UserError(f"scene {path}: shape '{plugin}' cannot become triangles: export it as a mesh (.ply, .obj)")
         if plugin in _ANALYTIC:
             node.props = _tessellated(mi, node.props, scratch / f"{index}.ply")
-    resolver = mi.file_resolver()
-    resolver.prepend(str(path.resolve().parent))
+    check_files(mi, state, path)
+    mi.parser.transform_all(config, state)
     try:
-        mi.parser.transform_all(config, state)
         scene = mi.parser.instantiate(config, state)
-    finally:
-        del resolver[0]  # else the next scene would find what it lacks, an include say, in this one's folder
-    return scene[0] if isinstance(scene, (list, tuple)) else scene
+    except Exception as error:  # of whatever kind Mitsuba's plugins raise
+        raise UserError(f"scene {path}: {explained(mi, state, str(error))}") from None
+    scene = scene[0] if isinstance(scene, (list, tuple)) else scene
+    return turn_mirrored(mi, scene)
 
 
 def _tessellated(mi: Any, props: Any, file: Path) -> Any:

@@ -1,0 +1,107 @@
+"""Meshes as they come from files, mended on loading: no triangle without area, no vertex normal without direction.
+
+Either would put NaN into the baked light, and from there into images.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsgen.array_types import Float32Array
+from rsgen.errors import UserError
+
+log = logging.getLogger("rsgen")
+
+_FLAT = 1e-7  # twice a triangle's area over its longest edge squared: below lies what float32 makes of a line
+
+
+def mend_meshes(mi: Any, scene: Any, path: Path) -> Any:
+    """The loaded scene without triangles that have no area, and with normals where a mesh's own are useless.
+
+    Meshes are changed in place; one that has no area at all is left out of the scene that this returns. Raises
+    UserError if a mesh names vertices that it has not, has vertices that are not finite, or if none has an area.
+    """
+    changed, flat = False, set()
+    for number, shape in enumerate(scene.shapes()):
+        if not shape.is_mesh():
+            continue
+        vertices = np.asarray(shape.vertex_positions_buffer(), np.float32).reshape(-1, 3)
+        faces = np.asarray(shape.faces_buffer(), np.uint32).reshape(-1, 3)
+        what = f"scene {path}: mesh '{shape.id() or number}'"
+        if faces.size and faces.max() >= len(vertices):
+            raise UserError(f"{what} names vertex {faces.max()} of {len(vertices)}: export it anew")
+        if not np.isfinite(vertices).all():
+            raise UserError(f"{what} has vertices that are not finite: export it anew")
+        keep = has_area(vertices, faces)
+        if keep.any():
+            changed |= _mend(mi, shape, vertices, faces, keep)
+        else:
+            log.debug("mesh '%s': left out, it has no area", shape.id() or number)
+            flat.add(number)
+    if all(number in flat or not shape.is_mesh() for number, shape in enumerate(scene.shapes())):
+        raise UserError(f"scene {path}: no triangle of it has an area: export its meshes anew")
+    return rebuilt(mi, scene, flat) if changed or flat else scene
+
+
+def rebuilt(mi: Any, scene: Any, left_out: Collection[int] = ()) -> Any:
+    """A new scene of all shapes but those numbered in `left_out`, and of all lamps that are no shapes.
+
+    Needed after a mesh's triangles have changed: `scene.parameters_changed` may leave the old ones in Embree's tree.
+    """
+    shapes = {f"shape_{k:06d}": shape for k, shape in enumerate(scene.shapes()) if k not in left_out}
+    lamps = {f"lamp_{k:06d}": lamp for k, lamp in enumerate(scene.emitters()) if lamp.get_shape() is None}
+    return mi.load_dict({"type": "scene", **shapes, **lamps}, optimize=False)
+
+
+def has_area(vertices: Float32Array, faces: NDArray[np.uint32]) -> NDArray[np.bool_]:
+    """(m,) whether each of the faces (m, 3) over vertices (n, 3) has an area, to the precision of float32."""
+    a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
+    edges = b - a, c - b, a - c
+    longest = np.maximum.reduce([np.einsum("ij,ij->i", edge, edge) for edge in edges])
+    normal = np.cross(edges[0], edges[2])
+    return np.einsum("ij,ij->i", normal, normal) > (_FLAT * longest) ** 2
+
+
+def _mend(mi: Any, shape: Any, vertices: Float32Array, faces: NDArray, keep: NDArray[np.bool_]) -> bool:
+    """Whether anything was to be mended."""
+    normals = np.zeros((0, 3), np.float32)
+    useless = np.zeros(len(vertices), bool)
+    if shape.has_vertex_normals():
+        normals = np.asarray(shape.vertex_normals_buffer(), np.float32).reshape(-1, 3)
+        length = np.linalg.norm(normals, axis=-1)
+        useless = ~((length > 1e-6) & (length < 1e6))  # NaN is neither
+        if useless.any():  # of vertices that no triangle has, never mind
+            useless[np.setdiff1d(np.flatnonzero(useless), faces[keep])] = False
+    if keep.all() and not useless.any():
+        return False
+    parameters = mi.traverse(shape)
+    if not keep.all():
+        for name in [name for name in parameters.keys() if name.startswith("face_")]:  # noqa: SIM118
+            rows = np.asarray(parameters[name]).reshape(len(faces), -1)
+            parameters[name] = mi.Float(rows[keep].ravel())
+        parameters["faces"] = mi.UInt32(faces[keep].ravel())
+        if shape.has_vertex_normals():
+            parameters["vertex_normals"] = mi.Float(normals.ravel())  # else made anew, from the triangles
+        log.debug("mesh '%s': %d triangles without area dropped", shape.id(), np.count_nonzero(~keep))
+    if useless.any():
+        mended = np.where(useless[:, None], _vertex_normals(vertices, faces[keep]), normals)
+        parameters["vertex_normals"] = mi.Float(mended.astype(np.float32).ravel())
+        log.debug("mesh '%s': %d vertex normals without direction replaced", shape.id(), np.count_nonzero(useless))
+    parameters.update()
+    return True
+
+
+def _vertex_normals(vertices: Float32Array, faces: NDArray) -> NDArray[np.float64]:
+    """(n, 3) unit normals, weighted by area; those of vertices that no face has, or whose faces cancel, point up."""
+    a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
+    normal = np.repeat(np.cross(b - a, c - a), 3, axis=0)
+    total = np.stack([np.bincount(faces.ravel(), normal[:, k], len(vertices)) for k in range(3)], axis=-1)
+    length = np.linalg.norm(total, axis=-1, keepdims=True)
+    up = np.array([0.0, 0.0, 1.0])
+    return np.where(length > 0, total / np.where(length > 0, length, 1), up)
