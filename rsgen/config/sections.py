@@ -60,7 +60,22 @@ class TrajectoryConfig(Section):
 class SceneConfig(Section):
     """What the camera sees."""
 
-    file: Path = Field(description="Mitsuba 3 scene .xml, or a mesh file that trimesh reads (default light added)")
+    file: Path = Field(description="Mitsuba 3 scene .xml, or a mesh file that trimesh reads (light added)")
+    scale: Annotated[float, limits(1e-9, 1e9, "m")] = Field(default=1.0, description="metres per unit of a mesh file")
+    up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = Field(
+        default="auto", description="axis of a mesh file that is up, the world's z; auto: y of glTF, z of others"
+    )
+    light: Literal["auto", "sky", "ceiling", "none"] = Field(
+        default="auto", description="light of a mesh file; auto: lamps under a room's ceiling, a sky around objects"
+    )
+
+    @model_validator(mode="after")
+    def _is_a_mesh_if_placed(self) -> SceneConfig:
+        if self.file.suffix.lower() == ".xml":
+            for name in ("scale", "up", "light"):
+                if getattr(self, name) != type(self).model_fields[name].default:
+                    raise ValueError(f"{name}: is for mesh files: a Mitsuba scene says that itself")
+        return self
 
 
 class LightConfig(Section):
