@@ -40,7 +40,7 @@ def read_header(path: Path) -> tuple[dict[str, Any], bytes]:
             raise UserError(f"scene {path}: is cut short or damaged: export it again")
         data, chunks = data[20 : 20 + length], data[20 + length :]
     try:
-        header = json.loads(data)
+        header = json.loads(data, parse_constant=_refuse_constant)
     except (ValueError, RecursionError):
         header = None
     if not isinstance(header, dict):
@@ -102,7 +102,11 @@ def sampling(header: dict[str, Any], info: dict[str, Any]) -> tuple[str, bool, F
     # Counter-clockwise as seen in the image, whose v runs down.
     turned = np.array([[c, s], [-s, c]]) @ np.diag(how.get("scale", [1.0, 1.0]))
     transform = np.column_stack([turned, how.get("offset", [0.0, 0.0])])
-    return _WRAP.get(sampler.get("wrapS"), "repeat"), sampler.get("magFilter") == _NEAREST, transform
+    return _WRAP.get(int(sampler.get("wrapS", 0)), "repeat"), sampler.get("magFilter") == _NEAREST, transform
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} is no number in JSON")
 
 
 def _refuse_unknown(path: Path, header: dict[str, Any], primitives: list[dict[str, Any]]) -> None:

@@ -56,18 +56,18 @@ def bsdf(mi: Any, material: Material, attribute: str | None) -> dict[str, Any]:
     """Mitsuba dictionary of a material's BSDF; attribute: of the mesh, to be its colour in the place of its own."""
     metal, roughness = _metal_and_roughness(mi, material)
     paint = {"type": "mesh_attribute", "name": attribute} if attribute else _color(mi, material)
-    share = 0.0 if isinstance(metal, dict) else metal
-    matte = {"type": "diffuse", "reflectance": paint}
+    matte: dict[str, Any] = {"type": "diffuse", "reflectance": paint}
     mean = float(np.mean(_channel(material, 1))) * material.roughness
     if mean < _MATTE:
         # Its roughness takes no texture.
         gloss = max(mean, _SMOOTHEST) ** 2
         matte = {"type": "roughplastic", "distribution": "ggx", "alpha": gloss, "diffuse_reflectance": paint}
     conductor = {"type": "roughconductor", "distribution": "ggx", "alpha": roughness, "specular_reflectance": paint}
+    inner: dict[str, Any]
     if isinstance(metal, dict):
         inner = {"type": "blendbsdf", "weight": metal, "first": matte, "second": conductor}
     else:
-        inner = conductor if share > 0.5 else matte
+        inner = conductor if metal == 1 else matte
     # A tilted diffuse lobe beside a highlight makes sparkles in baked light, which has one irradiance per point.
     if material.normal_texture is not None and inner["type"] in ("diffuse", "roughconductor"):
         inner = {"type": "normalmap", "normalmap": _normals(mi, material), "inner": inner}
@@ -108,7 +108,7 @@ def _channel(material: Material, channel: int) -> Float32Array:
     """Channel (h, w) of the metallic-roughness texture, 0 to 1; 1 where there is none."""
     if material.metal_texture is None:
         return np.ones((1, 1), np.float32)
-    return material.metal_texture.pixels[..., channel].astype(np.float32) / 255
+    return material.metal_texture.pixels[..., channel].astype(np.float32) / np.float32(255)
 
 
 def _color(mi: Any, material: Material) -> dict[str, Any]:
@@ -127,7 +127,7 @@ def _normals(mi: Any, material: Material) -> dict[str, Any]:
 
 
 def _linear(texture: Texture) -> Float32Array:
-    return srgb.decode(np.arange(256, dtype=np.float32) / 255)[texture.pixels[..., :3]]
+    return srgb.decode(np.arange(256) / 255).astype(np.float32)[texture.pixels[..., :3]]
 
 
 def _rgb(values: FloatArray) -> dict[str, Any]:

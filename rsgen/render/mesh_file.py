@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import io
 import logging
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -20,7 +21,10 @@ from rsgen.errors import UserError
 from rsgen.limits import MOST_M
 from rsgen.render import gltf
 from rsgen.render.cutout import Mask, cut_away
+from rsgen.render.default_light import SKY, Probe
+from rsgen.render.material import bsdf, emitter
 from rsgen.render.mesh_visual import Looks, Part, joined
+from rsgen.render.ply import joined_triangles, ply_bytes
 
 log = logging.getLogger("rsgen")
 
@@ -63,6 +67,8 @@ def read_parts(path: Path, options: MeshOptions) -> list[Part]:
     """
     files = {name: file.read_bytes() for name, file in referenced_files(path).items()}
     data, header = path.read_bytes(), None
+    if path.suffix.lower() == ".obj" and (libraries := _named(data, b"mtllib")):
+        files[libraries[0]] = b"\n".join(files[name] for name in libraries)  # trimesh reads the first only
     if path.suffix.lower() in gltf.SUFFIXES:
         header, chunks = gltf.read_header(path)
         data = gltf.for_trimesh(path, header, chunks)
@@ -94,6 +100,40 @@ def read_parts(path: Path, options: MeshOptions) -> list[Part]:
     return parts
 
 
+def mesh_scene(mi: Any, path: Path, scratch: Path, options: MeshOptions) -> dict[str, Any]:
+    """Scene dictionary of a mesh file and of the light that it gets; files go into `scratch`."""
+    parts = read_parts(path, options)
+    shapes: dict[str, Any] = {"type": "scene"}
+    for number, part in enumerate(parts):
+        attribute = "vertex_color" if part.vertex_colors is not None else "face_color"
+        colored = part.vertex_colors is not None or part.face_colors is not None
+        file = scratch / f"{number}.ply"
+        colors = part.vertex_colors, part.face_colors
+        file.write_bytes(ply_bytes(part.vertices, part.faces, part.normals, part.uv, *colors))
+        shape = {"type": "ply", "filename": str(file), "face_normals": part.normals is None}
+        shape["bsdf"] = bsdf(mi, part.material, attribute if colored else None)
+        if (light := emitter(mi, part.material)) is not None:
+            shape["emitter"] = light
+        shapes[f"part{number:05}"] = shape
+    if options.light == "none":
+        return shapes
+    probe = Probe(mi, *joined_triangles([part.vertices for part in parts], [part.faces for part in parts]))
+    if options.light == "sky" or (options.light == "auto" and not probe.encloses()):
+        return shapes | {"sky": {"type": "constant", "radiance": {"type": "rgb", "value": SKY}}}
+    lamps = probe.lamps()
+    if lamps is None:
+        raise UserError(f"scene {path}: has no ceiling to put lamps under: set scene.light to sky")
+    for number, corners in enumerate(lamps.corners):
+        file = scratch / f"lamp{number}.ply"
+        file.write_bytes(ply_bytes(corners, np.array([[0, 1, 2], [0, 2, 3]])))
+        radiance = {"type": "rgb", "value": lamps.radiance}
+        shapes[f"lamp{number:05}"] = {
+            "type": "ply", "filename": str(file), "face_normals": True, "bsdf": {"type": "diffuse"},
+            "emitter": {"type": "area", "radiance": radiance},
+        }  # fmt: skip
+    return shapes
+
+
 def referenced_files(path: Path) -> dict[str, Path]:
     """Files that a mesh file names (buffers, materials, textures), by the name used there.
 
@@ -104,14 +144,13 @@ def referenced_files(path: Path) -> dict[str, Path]:
         names = gltf.external_files(gltf.read_header(path)[0])
         return {name: _beside(path, name) for name in names}
     if suffix == ".obj":
-        found = {name: _beside(path, name) for name in _words_after(path, b"mtllib")[:1]}  # trimesh reads the first
-        textures = {name for file in found.values() for name in _words_after(file, b"map_Kd")}
-        return found | {name: _beside(path, name) for name in sorted(textures)}
+        libraries = {name: _beside(path, name) for name in _named(path.read_bytes(), rb"mtllib")}
+        textures = {name for file in libraries.values() for name in _named(file.read_bytes(), rb"map_Kd")}
+        return libraries | {name: _beside(path, name) for name in sorted(textures)}
     if suffix == ".ply":
         with path.open("rb") as file:
             head = file.read(1 << 16).partition(b"end_header")[0]
-        names = [line[len(b"comment TextureFile") :] for line in head.splitlines() if b"TextureFile" in line]
-        return {name: _beside(path, name) for name in (n.decode(errors="replace").strip() for n in names)}
+        return {name: _beside(path, name) for name in _named(head, rb"comment\s+TextureFile")}
     return {}
 
 
@@ -122,10 +161,10 @@ def hash_into(digest: Any, path: Path, options: MeshOptions) -> None:
         digest.update(name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())
 
 
-def _words_after(path: Path, keyword: bytes) -> list[str]:
-    lines = (line.strip().split(maxsplit=1) for line in path.read_bytes().splitlines())
-    found = (line[1] for line in lines if len(line) == 2 and line[0].lower() == keyword.lower())
-    return [name.decode(errors="replace").strip() for name in found]
+def _named(text: bytes, keyword: bytes) -> list[str]:
+    """What follows a keyword at the beginning of lines, each once."""
+    found = re.findall(rb"^[ \t]*" + keyword + rb"[ \t]+(.+?)\s*$", text, re.MULTILINE | re.IGNORECASE)
+    return list(dict.fromkeys(name.decode(errors="replace") for name in found))
 
 
 def _beside(path: Path, name: str) -> Path:

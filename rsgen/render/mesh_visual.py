@@ -90,20 +90,21 @@ class Looks:
         values = np.array(factors, float)[:, :3] / (np.iinfo(factors.dtype).max if factors.dtype.kind == "u" else 1.0)
         if not np.isfinite(values).all():
             raise UserError(f"scene {self._path}: '{name}' has colours that are not finite: export it again")
-        material = part.material
+        # A primitive without a material is grey only where it has no colours either.
+        material = _WHITE if part.material is _GREY else part.material
         if not np.ptp(values, axis=0).any():
             return replace(part, material=replace(material, color=material.color * values[0]))
         if material.color_texture is not None:
             log.warning("scene %s: vertex colours of '%s' left out: it has a texture", self._path, name)
             return part
-        return replace(part, vertex_colors=np.clip(values * material.color, 0, 1))
+        return replace(part, material=material, vertex_colors=np.clip(values * material.color, 0, 1))
 
     def _material(self, material: Any, with_uv: bool) -> Material:
         key = id(material), with_uv
         if key not in self._made:
             simple = isinstance(material, trimesh.visual.material.SimpleMaterial)
             made = self._simple(material) if simple else self._pbr(material)
-            if not with_uv:
+            if not with_uv and made is not _GREY:
                 none: dict[str, Any] = dict.fromkeys(
                     f"{name}_texture" for name in ("color", "metal", "normal", "emission")
                 )
@@ -116,15 +117,17 @@ class Looks:
         own = material.kwargs
         glow = own.get("ke", ())
         emission = np.array([float(x) for x in glow[:3]]) if len(glow) >= 3 else np.zeros(3)
-        if material.image is not None:
+        # An image without a format is no file's, but trimesh's own dark grey for coordinates without a texture.
+        if material.image is not None and material.image.format is not None:
             return Material(np.ones(3), self._texture(material.image, {}), emission=emission)
-        color = np.array(own["kd"], float) if np.size(own.get("kd")) == 3 else _GREY.color
-        return Material(color, emission=emission)
+        if np.size(own.get("kd")) == 3:
+            return Material(np.array(own["kd"], float), emission=emission)
+        return Material(emission=emission) if emission.any() else _GREY
 
     def _pbr(self, material: Any) -> Material:
         json = {} if self._header is None else gltf.material_of(self._header, material.name)
         if json is None:
-            return _WHITE
+            return _GREY
         extensions = json.get("extensions", {})
         factors = {} if "KHR_materials_pbrSpecularGlossiness" in extensions else json.get("pbrMetallicRoughness", {})
         if "baseColorFactor" in factors:

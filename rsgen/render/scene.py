@@ -12,7 +12,6 @@ import logging
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -27,9 +26,8 @@ from rsgen.errors import UserError
 from rsgen.files import encode_png
 from rsgen.render.board import Board, drawing
 from rsgen.render.board import surface as board_surface
-from rsgen.render.default_light import SKY, Probe
-from rsgen.render.material import bsdf, emitter
-from rsgen.render.mesh_file import AS_IT_IS, MeshOptions, hash_into, read_parts
+from rsgen.render.mesh_file import AS_IT_IS, MeshOptions, hash_into, mesh_scene
+from rsgen.render.ply import joined_triangles, ply_bytes
 
 log = logging.getLogger("rsgen")
 
@@ -51,7 +49,7 @@ def load_scene(path: Path, board: Board | None = None, options: MeshOptions = AS
             if path.suffix.lower() == ".xml":
                 scene = _load_xml(mi, path, Path(scratch), board)
             else:
-                shapes = _mesh_scene(mi, path, Path(scratch), options)
+                shapes = mesh_scene(mi, path, Path(scratch), options)
                 if board is not None:
                     shapes["target"] = mi.load_string(_board_xml(board, Path(scratch)))
                 # Else shapes would be merged, and ordered by memory address.
@@ -87,7 +85,7 @@ def ensure_built(path: Path) -> None:
 def surface(scene: Any) -> tuple[Float32Array, NDArray[np.uint32]]:
     """All triangles of a scene: vertices (n, 3) in the world frame, metres, and faces (m, 3)."""
     vertices, faces = zip(*(mesh_arrays(shape) for shape in scene.shapes() if shape.is_mesh()), strict=True)
-    return _joined(vertices, faces)
+    return joined_triangles(vertices, faces)
 
 
 def mesh_arrays(shape: Any) -> tuple[Float32Array, NDArray[np.uint32]]:
@@ -229,41 +227,6 @@ def _parametric(plugin: str, nu: int, nv: int) -> tuple[NDArray, NDArray, NDArra
     return position, normal, uv, faces
 
 
-def ply_bytes(
-    vertices: NDArray, faces: NDArray, normals: NDArray | None = None, uv: NDArray | None = None,
-    vertex_colors: NDArray | None = None, face_colors: NDArray | None = None,
-) -> bytes:  # fmt: skip
-    """Binary PLY of triangles: vertices (n, 3), faces (m, 3), unit normals (n, 3) and texture coordinates (n, 2).
-
-    Colours (n, 3), (m, 3) become Mitsuba's attributes `vertex_color` and `face_color`, as they are.
-    """
-    names = ["x", "y", "z"]
-    parts = [vertices]
-    if normals is not None:
-        names += ["nx", "ny", "nz"]
-        parts.append(normals / np.linalg.norm(normals, axis=-1, keepdims=True))
-    if uv is not None:
-        names += ["u", "v"]
-        parts.append(uv)
-    if vertex_colors is not None:
-        names += ["r", "g", "b"]
-        parts.append(vertex_colors)
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
-    header += [f"property float {name}" for name in names]
-    header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
-    columns: list[tuple[Any, ...]] = [("n", "u1"), ("v", "<i4", 3)]
-    if face_colors is not None:
-        header += [f"property float {name}" for name in "rgb"]
-        columns.append(("c", "<f4", 3))
-    header += ["end_header", ""]
-    face_rows = np.empty(len(faces), dtype=columns)
-    face_rows["n"], face_rows["v"] = 3, faces
-    if face_colors is not None:
-        face_rows["c"] = face_colors
-    data = np.concatenate(parts, axis=1).astype("<f4")
-    return "\n".join(header).encode() + data.tobytes() + face_rows.tobytes()
-
-
 def _board_xml(board: Board, folder: Path) -> str:
     """A Mitsuba <shape> of the board, matte, its back grey; its files go into `folder`."""
     (folder / "board.ply").write_bytes(ply_bytes(*board_surface(board)))
@@ -283,47 +246,6 @@ def _board_xml(board: Board, folder: Path) -> str:
   </bsdf>
 </shape>
 """
-
-
-def _mesh_scene(mi: Any, path: Path, scratch: Path, options: MeshOptions) -> dict[str, Any]:
-    """Scene dictionary of a mesh file and of the light that it gets; files go into `scratch`."""
-    parts = read_parts(path, options)
-    shapes: dict[str, Any] = {"type": "scene"}
-    for number, part in enumerate(parts):
-        attribute = "vertex_color" if part.vertex_colors is not None else "face_color"
-        colored = part.vertex_colors is not None or part.face_colors is not None
-        file = scratch / f"{number}.ply"
-        colors = part.vertex_colors, part.face_colors
-        file.write_bytes(ply_bytes(part.vertices, part.faces, part.normals, part.uv, *colors))
-        shape = {"type": "ply", "filename": str(file), "face_normals": part.normals is None}
-        shape["bsdf"] = bsdf(mi, part.material, attribute if colored else None)
-        if (light := emitter(mi, part.material)) is not None:
-            shape["emitter"] = light
-        shapes[f"part{number:05}"] = shape
-    if options.light == "none":
-        return shapes
-    probe = Probe(mi, *_joined([part.vertices for part in parts], [part.faces for part in parts]))
-    if options.light == "sky" or (options.light == "auto" and not probe.encloses()):
-        return shapes | {"sky": {"type": "constant", "radiance": {"type": "rgb", "value": SKY}}}
-    lamps = probe.lamps()
-    if lamps is None:
-        raise UserError(f"scene {path}: has no ceiling to put lamps under: set scene.light to sky")
-    for number, corners in enumerate(lamps.corners):
-        file = scratch / f"lamp{number}.ply"
-        file.write_bytes(ply_bytes(corners, np.array([[0, 1, 2], [0, 2, 3]])))
-        radiance = {"type": "rgb", "value": lamps.radiance}
-        shapes[f"lamp{number:05}"] = {
-            "type": "ply", "filename": str(file), "face_normals": True, "bsdf": {"type": "diffuse"},
-            "emitter": {"type": "area", "radiance": radiance},
-        }  # fmt: skip
-    return shapes
-
-
-def _joined(vertices: Sequence[NDArray], faces: Sequence[NDArray]) -> tuple[NDArray, NDArray]:
-    """One mesh of several."""
-    first = np.cumsum([0, *(len(v) for v in vertices)])
-    moved = [f + f.dtype.type(k) for f, k in zip(faces, first[:-1], strict=True)]
-    return np.concatenate(vertices), np.concatenate(moved)
 
 
 def _first_line(error: object) -> str:
