@@ -1,7 +1,8 @@
 """Light for mesh files, which bring none: a sky around objects, lamps under the ceiling of rooms.
 
-A room is what encloses most points between its outer walls: from them, nearly all rays meet surfaces, and from in
-front. An object is open there, or solid: rays that begin inside it meet its surfaces from behind.
+A room is what encloses most points between its outer walls: from them, nearly all rays meet surfaces, more of them from
+in front than from behind (real rooms have some walls turned over). An object is open there, or solid: rays that begin
+inside it meet its surfaces from behind.
 """
 
 from __future__ import annotations
@@ -53,12 +54,12 @@ class Probe:
         k = np.arange(_DIRECTIONS) + 0.5  # a Fibonacci spiral: evenly all around
         z, phi = 1 - 2 * k / _DIRECTIONS, k * np.pi * (1 + 5**0.5)
         around = np.stack([np.cos(phi) * np.sqrt(1 - z * z), np.sin(phi) * np.sqrt(1 - z * z), z], axis=-1)
-        _, front = self._cast(np.repeat(origins, len(around), axis=0), np.tile(around, (len(origins), 1)))
-        share = front.reshape(len(origins), -1).mean(axis=1)
-        return bool((share >= _ENCLOSED).mean() > 0.5)
+        distance, front = self._cast(np.repeat(origins, len(around), axis=0), np.tile(around, (len(origins), 1)))
+        met, from_front = (v.reshape(len(origins), -1).mean(axis=1) for v in (np.isfinite(distance), front))
+        return bool(((met >= _ENCLOSED) & (from_front > met / 2)).mean() > 0.5)
 
     def lamps(self) -> Lamps | None:
-        """Lamps under the ceilings above the middle of the room's height; None if there is no ceiling."""
+        """Lamps under the ceilings above the middle of the room's height; None if there is no ceiling with a floor."""
         size = self.high - self.low
         count = np.clip((size[:2] / _CELL_M).astype(int), 1, _MOST_CELLS)
         cells = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1).reshape(-1, 2)
@@ -68,13 +69,13 @@ class Probe:
         square = half * np.array([[-1, -1, 0], [-1, 1, 0], [1, 1, 0], [1, -1, 0]])  # seen from below, counter-clockwise
         starts = middle[:, None] + np.concatenate([square, np.zeros((1, 3))])
         up = np.tile([0.0, 0.0, 1.0], (starts.size // 3, 1))
-        distance, front = (v.reshape(starts.shape[:2]) for v in self._cast(starts.reshape(-1, 3), up))
-        below = self._cast(middle, -up[: len(middle)])[1]
-        inside = front.all(axis=1) & below
+        above = self._cast(starts.reshape(-1, 3), up)[0].reshape(starts.shape[:2])
+        below = self._cast(middle, -up[: len(middle)])[0]
+        inside = np.isfinite(above).all(axis=1) & np.isfinite(below)
         if not inside.any():
             return None
         corners = starts[inside, :4]
-        corners[..., 2] += (1 - _GAP) * distance[inside].min(axis=1, keepdims=True)
+        corners[..., 2] += (1 - _GAP) * above[inside].min(axis=1, keepdims=True)
         area = len(corners) * (2 * half) ** 2
         floor = size[:2].prod() * inside.mean()
         return Lamps(corners, float(_IRRADIANCE * floor / (np.pi * area)))

@@ -11,12 +11,13 @@ import logging
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import trimesh
 
 from rsgen.array_types import FloatArray
+from rsgen.config.sections import SceneLight, Up
 from rsgen.errors import UserError
 from rsgen.limits import MOST_M
 from rsgen.render import gltf
@@ -27,9 +28,6 @@ from rsgen.render.mesh_visual import Looks, Part, joined
 from rsgen.render.ply import joined_triangles, ply_bytes
 
 log = logging.getLogger("rsgen")
-
-Up = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
-Light = Literal["auto", "sky", "ceiling", "none"]
 
 # Raise when files are read in another way, so that light baked for the older one is not taken for the new one's.
 _READING = 1
@@ -54,7 +52,7 @@ class MeshOptions:
 
     scale: float = 1.0
     up: Up = "auto"
-    light: Light = "auto"
+    light: SceneLight = "auto"
 
 
 AS_IT_IS = MeshOptions()
@@ -73,14 +71,11 @@ def read_parts(path: Path, options: MeshOptions) -> list[Part]:
         header, chunks = gltf.read_header(path)
         data = gltf.for_trimesh(path, header, chunks)
     loaded = trimesh.load_scene(io.BytesIO(data), file_type=path.suffix[1:].lower(), resolver=files, process=False)
-    number = {name: k for k, name in enumerate(loaded.geometry)}
-    placed = [loaded.graph[node] for node in loaded.graph.nodes_geometry]
-    # Names of nodes may be random: by geometry, then by where it is.
-    placed.sort(key=lambda instance: (number[instance[1]], np.ravel(instance[0]).tolist()))
     T_world_file = _world(path, options)
     looks = Looks(path, header)
     parts, dropped = [], 0
-    for T_file_part, name in placed:
+    for node in loaded.graph.nodes_geometry:  # in the file's order; never sort by name, some are random
+        T_file_part, name = loaded.graph[node]
         mesh = loaded.geometry[name]
         if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
             continue
@@ -118,11 +113,12 @@ def mesh_scene(mi: Any, path: Path, scratch: Path, options: MeshOptions) -> dict
     if options.light == "none":
         return shapes
     probe = Probe(mi, *joined_triangles([part.vertices for part in parts], [part.faces for part in parts]))
-    if options.light == "sky" or (options.light == "auto" and not probe.encloses()):
-        return shapes | {"sky": {"type": "constant", "radiance": {"type": "rgb", "value": SKY}}}
-    lamps = probe.lamps()
+    is_room = options.light == "ceiling" or (options.light == "auto" and probe.encloses())
+    lamps = probe.lamps() if is_room else None
+    if lamps is None and options.light == "ceiling":
+        raise UserError(f"scene {path}: has no ceiling over its middle to put lamps under: set scene.light to sky")
     if lamps is None:
-        raise UserError(f"scene {path}: has no ceiling to put lamps under: set scene.light to sky")
+        return shapes | {"sky": {"type": "constant", "radiance": {"type": "rgb", "value": SKY}}}
     for number, corners in enumerate(lamps.corners):
         file = scratch / f"lamp{number}.ply"
         file.write_bytes(ply_bytes(corners, np.array([[0, 1, 2], [0, 2, 3]])))
