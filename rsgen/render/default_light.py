@@ -59,7 +59,7 @@ class Probe:
         return bool(((met >= _ENCLOSED) & (from_front > met / 2)).mean() > 0.5)
 
     def lamps(self) -> Lamps | None:
-        """Lamps under the ceilings above the middle of the room's height; None if there is no ceiling with a floor."""
+        """Lamps under the ceilings above the middle of the room's height; None if there is no ceiling."""
         size = self.high - self.low
         count = np.clip((size[:2] / _CELL_M).astype(int), 1, _MOST_CELLS)
         cells = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1).reshape(-1, 2)
@@ -70,8 +70,7 @@ class Probe:
         starts = middle[:, None] + np.concatenate([square, np.zeros((1, 3))])
         up = np.tile([0.0, 0.0, 1.0], (starts.size // 3, 1))
         above = self._cast(starts.reshape(-1, 3), up)[0].reshape(starts.shape[:2])
-        below = self._cast(middle, -up[: len(middle)])[0]
-        inside = np.isfinite(above).all(axis=1) & np.isfinite(below)
+        inside = np.isfinite(above).all(axis=1)
         if not inside.any():
             return None
         corners = starts[inside, :4]

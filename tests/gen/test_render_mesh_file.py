@@ -26,6 +26,7 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.light.bake import bake
 from rsgen.render.baked import BakedIntegrator
+from rsgen.render.default_light import Probe
 from rsgen.render.images import ColorRenderer, DepthRenderer
 from rsgen.render.irradiance import make_field, make_lattice
 from rsgen.render.mesh_file import MeshOptions
@@ -471,6 +472,8 @@ def test_rooms_get_lamps_and_objects_a_sky(tmp_path: Path) -> None:
     assert lights("turned", "ceiling") == [False] * 2  # walls that face outwards: an object, unless one says so
     with pytest.raises(UserError, match=r"open\.ply: has no ceiling.*scene\.light"):
         load_scene(files["open"], options=MeshOptions(light="ceiling"))
+    bare = room(open_top=True)
+    assert not Probe(mi, np.array(bare.vertices), np.array(bare.faces)).encloses()
     scene = load_scene(files["room"])
     lamps = [shape for shape in scene.shapes() if shape.is_emitter()]
     for shape in lamps:
