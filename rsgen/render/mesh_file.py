@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from PIL import Image
 
 from rsgen.array_types import FloatArray
 from rsgen.config.sections import SceneLight, Up
@@ -63,13 +64,17 @@ def read_parts(path: Path, options: MeshOptions) -> list[Part]:
 
     What trimesh's parsers raise on damaged files comes through.
     """
-    files = {name: file.read_bytes() for name, file in referenced_files(path).items()}
     data, header = path.read_bytes(), None
-    if path.suffix.lower() == ".obj" and (libraries := _named(data, b"mtllib")):
-        files[libraries[0]] = b"\n".join(files[name] for name in libraries)  # trimesh reads the first only
+    files = {name: file.read_bytes() for name, file in referenced_files(path).items()}
     if path.suffix.lower() in gltf.SUFFIXES:
         header, chunks = gltf.read_header(path)
         data = gltf.for_trimesh(path, header, chunks)
+    else:
+        libraries = _named(data, b"mtllib") if path.suffix.lower() == ".obj" else []
+        for name in files.keys() - set(libraries):
+            _refuse_unreadable_texture(path, name, files[name])
+        if libraries:
+            files[libraries[0]] = b"\n".join(files[name] for name in libraries)  # trimesh reads the first only
     loaded = trimesh.load_scene(io.BytesIO(data), file_type=path.suffix[1:].lower(), resolver=files, process=False)
     T_world_file = _world(path, options)
     looks = Looks(path, header)
@@ -168,6 +173,15 @@ def _beside(path: Path, name: str) -> Path:
     if not file.is_file():
         raise UserError(f"scene {path}: file '{name}' that it names is missing: put it there, or take its name out")
     return file
+
+
+def _refuse_unreadable_texture(path: Path, name: str, data: bytes) -> None:
+    """trimesh would leave it out without a word."""
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            image.load()
+    except Exception:  # Pillow raises whatever its decoders do
+        raise UserError(f"scene {path}: texture '{name}' cannot be read: make it a PNG or a JPEG") from None
 
 
 def _world(path: Path, options: MeshOptions) -> FloatArray:

@@ -103,7 +103,10 @@ def content_hash(path: Path, options: MeshOptions = AS_IT_IS) -> str:
     ensure_built(path)
     digest = hashlib.sha256(path.read_bytes())
     if path.suffix.lower() != ".xml":
-        hash_into(digest, path, options)
+        try:
+            hash_into(digest, path, options)
+        except (AttributeError, KeyError, TypeError) as error:  # JSON of another shape than glTF's
+            raise UserError(f"scene {path}: is malformed ({_first_line(error)}): export it again") from None
     else:
         mi = mitsuba()
         try:

@@ -441,6 +441,27 @@ def test_shapes_are_in_one_order_whatever_their_nodes_are_called(tmp_path: Path)
     assert (up > 0).all()  # mirrored ones are not turned over
 
 
+def test_normals_turn_with_their_surfaces(tmp_path: Path) -> None:
+    """Under mirrors and uneven scales; a file without normals is flat."""
+    ball = trimesh.creation.icosphere(3)
+    smooth = trimesh.Trimesh(ball.vertices, ball.faces, vertex_normals=np.array(ball.vertices), process=False)
+    for normals in (True, False):
+        scene = trimesh.Scene()
+        T = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3]) @ np.diag([-1.0, 2.0, 0.5, 1.0])
+        scene.add_geometry(smooth, transform=T)
+        scene.export(tmp_path / "ball.glb", include_normals=normals)
+        loaded = load_scene(tmp_path / "ball.glb", options=MeshOptions(up="z"))
+        si, _ = seen_from_above(loaded, np.random.default_rng(2).uniform(-0.4, 0.4, (500, 2)))
+        # The ellipsoid's own normal is the gradient of |T⁻¹ p|².
+        gradient = np.array(si.p).T @ np.linalg.inv(T[:3, :3] @ T[:3, :3].T)
+        cosine = np.einsum("ij,ij->i", np.array(si.sh_frame.n).T, gradient) / np.linalg.norm(gradient, axis=1)
+        if normals:
+            assert cosine.min() > 0.9995
+        else:
+            assert 0.95 < cosine.min() < 0.9995
+            np.testing.assert_allclose(np.array(si.sh_frame.n), np.array(si.n), atol=1e-6)
+
+
 # --- light
 
 
@@ -529,6 +550,14 @@ def test_broken_files_say_what_is_wrong_in_one_line(tmp_path: Path) -> None:
     }.items():  # fmt: skip
         (tmp_path / name).write_bytes(content)
         fails(tmp_path / name)
+    (tmp_path / "odd.gltf").write_text('{"asset": {"version": "2.0"}, "buffers": 3, "images": [4]}')
+    fails(tmp_path / "odd.gltf")
+    with pytest.raises(UserError, match=r"odd\.gltf: is malformed"):
+        content_hash(tmp_path / "odd.gltf")
+    (tmp_path / "b.obj").write_text("mtllib b.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl m\nf 1/1 2/1 3/1\n")
+    (tmp_path / "b.mtl").write_text("newmtl m\nmap_Kd b.png\n")
+    (tmp_path / "b.png").write_bytes(b"no picture")
+    fails(tmp_path / "b.obj", "b.png' cannot be read", "PNG")
     (tmp_path / "a.obj").write_text("mtllib none.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     fails(tmp_path / "a.obj", "none.mtl", "missing", "put it there")
 
