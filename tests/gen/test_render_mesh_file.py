@@ -532,7 +532,7 @@ def test_broken_files_say_what_is_wrong_in_one_line(tmp_path: Path) -> None:
     fails(gltf("nan", {"POSITION": nan}), "not finite", "mend it")
     fails(gltf("flat", {"POSITION": np.zeros((4, 3), np.float32)}), "no triangles", "export")
     fails(gltf("far", {"POSITION": arrays["POSITION"] * np.float32(1e8)}), "beyond", "scene.scale")
-    fails(gltf("index", {"indices": np.array([0, 1, 9], np.uint32)}), "without vertices|out of bounds")
+    fails(gltf("index", {"indices": np.array([0, 1, 9], np.uint32)}), "faces without vertices", "export it again")
     fails(gltf("zero", nodes=[{"mesh": 0, "scale": [0, 0, 0]}]), "no triangles")
     fails(gltf("endless", nodes=[{"mesh": 0, "translation": [0, float("inf"), 0]}]), "JSON cannot be read")
     fails(gltf("draco", extensionsRequired=["KHR_draco_mesh_compression"]), "KHR_draco_mesh_compression", "without")
