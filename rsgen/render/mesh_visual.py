@@ -92,11 +92,12 @@ class Looks:
             raise UserError(f"scene {self._path}: '{name}' has colours that are not finite: export it again")
         # A primitive without a material is grey only where it has no colours either.
         material = _WHITE if part.material is _GREY else part.material
-        if not np.ptp(values, axis=0).any():
-            return replace(part, material=replace(material, color=material.color * values[0]))
         if material.color_texture is not None:
-            log.warning("scene %s: vertex colours of '%s' left out: it has a texture", self._path, name)
-            return part
+            if np.ptp(values, axis=0).any():
+                log.warning("scene %s: vertex colours of '%s' left out: it has a texture", self._path, name)
+                return part
+            factor = material.color * values[0]
+            return part if (values[0] == 1).all() else replace(part, material=replace(material, color=factor))
         return replace(part, material=material, vertex_colors=np.clip(values * material.color, 0, 1))
 
     def _material(self, material: Any, with_uv: bool) -> Material:

@@ -242,7 +242,7 @@ def test_shiny_surfaces_look_the_same_traced_and_in_baked_light(tmp_path: Path) 
 # --- colours and textures
 
 
-def test_colours_of_a_gltf_are_linear_and_factors(tmp_path: Path) -> None:
+def test_colours_of_a_gltf_are_linear_and_factors(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     colors = np.array([[0.02, 0.5, 0.9], [0.4, 0.1, 0.3], [0.4, 0.1, 0.3], [0.02, 0.5, 0.9]], np.float32)
     arrays = flat_arrays() | {"COLOR_0": colors}
     left, factor = np.array([[-0.999, 0.0]]), [0.5, 1.0, 0.25, 1.0]
@@ -255,6 +255,16 @@ def test_colours_of_a_gltf_are_linear_and_factors(tmp_path: Path) -> None:
     arrays["COLOR_0"] = np.tile(np.array([51, 102, 204, 255], np.uint8), (4, 1))
     scene = load_scene(write_gltf(tmp_path / "bytes.gltf", arrays, tinted))
     np.testing.assert_allclose(albedo(scene, left)[0], [0.1, 0.4, 0.2], rtol=1e-4)
+    # One colour for all vertices is a factor on a texture too; several are not, which is said.
+    papered = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0}}
+    white = with_image(np.full((2, 2, 3), 255, np.uint8))
+    scene = load_scene(write_gltf(tmp_path / "papered.gltf", arrays, papered, **white))
+    np.testing.assert_allclose(albedo(scene, left)[0], [0.2, 0.4, 0.8], rtol=1e-3)
+    arrays["COLOR_0"] = colors
+    with caplog.at_level("WARNING"):
+        scene = load_scene(write_gltf(tmp_path / "both.gltf", arrays, papered, **white))
+    assert "vertex colours of 'GLTF' left out" in caplog.text
+    np.testing.assert_allclose(albedo(scene, left)[0], 1, rtol=1e-3)
     del arrays["COLOR_0"]
     scene = load_scene(write_gltf(tmp_path / "grey.gltf", arrays, None))
     np.testing.assert_allclose(albedo(scene, left)[0], 0.6, rtol=1e-5)
