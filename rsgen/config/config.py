@@ -114,6 +114,7 @@ class Config(Section):
         for section, name in _PATHS:
             if content[section][name] is not None:
                 content[section][name] = Path(content[section][name]).name
+        content["scene"] = {k: v for k, v in content["scene"].items() if v != SceneConfig.model_fields[k].default}
         return content
 
 

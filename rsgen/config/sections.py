@@ -22,6 +22,8 @@ Pixels = Annotated[float, limits(-1e6, 1e6, "px")]
 Seconds = Annotated[float, limits(1e-9, 3600, "s", or_zero=True)]
 Row34 = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 Matrix34 = tuple[Row34, Row34, Row34]
+Up = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
+SceneLight = Literal["auto", "sky", "ceiling", "none"]
 _LEAST_FOCAL_PX = 0.01
 
 
@@ -60,7 +62,22 @@ class TrajectoryConfig(Section):
 class SceneConfig(Section):
     """What the camera sees."""
 
-    file: Path = Field(description="Mitsuba 3 scene .xml, or a mesh file that trimesh reads (default light added)")
+    file: Path = Field(description="Mitsuba 3 scene .xml, or a mesh file that trimesh reads (light added)")
+    scale: Annotated[float, limits(1e-9, 1e9, "m")] = Field(default=1.0, description="metres per unit of a mesh file")
+    up: Up = Field(
+        default="auto", description="axis of a mesh file that is up, the world's z; auto: y of glTF, z of others"
+    )
+    light: SceneLight = Field(
+        default="auto", description="light of a mesh file; auto: lamps under a room's ceiling, a sky around objects"
+    )
+
+    @model_validator(mode="after")
+    def _is_a_mesh_if_placed(self) -> SceneConfig:
+        if self.file.suffix.lower() == ".xml":
+            for name in ("scale", "up", "light"):
+                if getattr(self, name) != type(self).model_fields[name].default:
+                    raise ValueError(f"{name}: is for mesh files: a Mitsuba scene says that itself")
+        return self
 
 
 class LightConfig(Section):

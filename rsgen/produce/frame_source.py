@@ -216,7 +216,7 @@ def load_scene(config: Config) -> Any:
 
     target = config.target
     board = None if target is None else Board(target.grid, np.array(target.T_world_target, float))
-    return scene.load_scene(config.scene.file, board)
+    return scene.load_scene(config.scene.file, board, _mesh_options(config))
 
 
 def scene_hash(config: Config) -> str:
@@ -226,7 +226,13 @@ def scene_hash(config: Config) -> str:
     mitsuba(config.backend)
     from rsgen.render.scene import content_hash
 
-    return content_hash(config.scene.file)
+    return content_hash(config.scene.file, _mesh_options(config))
+
+
+def _mesh_options(config: Config) -> Any:
+    from rsgen.render.mesh_file import MeshOptions
+
+    return MeshOptions(config.scene.scale, config.scene.up, config.scene.light)
 
 
 def surfaces_hash(config: Config) -> str:

@@ -27,8 +27,10 @@ from rsgen.render.board import Board, drawing
 from rsgen.render.board import surface as board_surface
 from rsgen.render.instances import turn_mirrored
 from rsgen.render.mended import mend_meshes
+from rsgen.render.mesh_file import AS_IT_IS, MeshOptions, hash_into, mesh_scene
 from rsgen.render.old_xml import METHOD as OLD_XML
 from rsgen.render.parsed import check_files, explained, messages_to_log, parse, prepare, unknown_properties
+from rsgen.render.ply import joined_triangles, ply_bytes
 
 log = logging.getLogger("rsgen")
 
@@ -37,11 +39,11 @@ _UNSUPPORTED = ("sdfgrid", "bsplinecurve", "linearcurve", "ellipsoids", "ellipso
 _SEGMENTS = 96
 
 
-def load_scene(path: Path, board: Board | None = None) -> Any:
-    """Mitsuba scene of the file at `path` (.xml, or a mesh that trimesh reads: grey, lit by a uniform sky).
+def load_scene(path: Path, board: Board | None = None, options: MeshOptions = AS_IT_IS) -> Any:
+    """Mitsuba scene of the file at `path`: .xml, or a mesh that trimesh reads, with its colours and a light of ours.
 
-    board: to be put into it, as its last shape. Raises UserError, naming the file, if it is missing, unreadable, empty
-    or of shapes that cannot become triangles.
+    board: to be put into it, as its last shape. options: how a mesh file is placed and lit. Raises UserError, naming
+    the file, if it is missing, unreadable, empty or of shapes that cannot become triangles.
     """
     ensure_built(path)
     mi = mitsuba()
@@ -50,10 +52,11 @@ def load_scene(path: Path, board: Board | None = None) -> Any:
             if path.suffix.lower() == ".xml":
                 scene = _load_xml(mi, path, Path(scratch), board, messages)
             else:
-                shapes = _mesh_scene(path, Path(scratch))
+                shapes = mesh_scene(mi, path, Path(scratch), options)
                 if board is not None:
                     shapes["target"] = mi.load_string(_board_xml(board, Path(scratch)))
-                scene = mi.load_dict(shapes, optimize=board is None)  # else merged, and ordered by memory address
+                # Else shapes would be merged, and ordered by memory address.
+                scene = mi.load_dict(shapes, parallel=False, optimize=False)
         except UserError:
             raise
         except Exception as error:  # Mitsuba and trimesh raise whatever their parsers do
@@ -84,15 +87,8 @@ def ensure_built(path: Path) -> None:
 
 def surface(scene: Any) -> tuple[Float32Array, NDArray[np.uint32]]:
     """All triangles of a scene: vertices (n, 3) in the world frame, metres, and faces (m, 3)."""
-    vertices, faces, first = [], [], 0
-    for shape in scene.shapes():
-        if not shape.is_mesh():
-            continue
-        v, f = mesh_arrays(shape)
-        vertices.append(v)
-        faces.append(f + np.uint32(first))
-        first += len(v)
-    return np.concatenate(vertices), np.concatenate(faces)
+    vertices, faces = zip(*(mesh_arrays(shape) for shape in scene.shapes() if shape.is_mesh()), strict=True)
+    return joined_triangles(vertices, faces)
 
 
 def mesh_arrays(shape: Any) -> tuple[Float32Array, NDArray[np.uint32]]:
@@ -102,14 +98,19 @@ def mesh_arrays(shape: Any) -> tuple[Float32Array, NDArray[np.uint32]]:
     return v, f
 
 
-def content_hash(path: Path) -> str:
-    """SHA-256 over the scene file and every file that it includes or names (meshes, textures).
+def content_hash(path: Path, options: MeshOptions = AS_IT_IS) -> str:
+    """SHA-256 over the scene file, every file that it includes or names (meshes, textures), and a mesh file's options.
 
     Raises UserError if one is missing or the scene file is malformed.
     """
     ensure_built(path)
     digest = hashlib.sha256(path.read_bytes())
-    if path.suffix.lower() == ".xml":
+    if path.suffix.lower() != ".xml":
+        try:
+            hash_into(digest, path, options)
+        except (AttributeError, KeyError, TypeError) as error:  # JSON of another shape than glTF's
+            raise UserError(f"scene {path}: is malformed ({_first_line(error)}): export it again") from None
+    else:
         mi = mitsuba()
         with tempfile.TemporaryDirectory(prefix="rsgen-scene-") as scratch, messages_to_log(mi):
             try:
@@ -246,25 +247,6 @@ def _parametric(plugin: str, nu: int, nv: int) -> tuple[NDArray, NDArray, NDArra
     return position, normal, uv, faces
 
 
-def ply_bytes(vertices: NDArray, faces: NDArray, normals: NDArray | None = None, uv: NDArray | None = None) -> bytes:
-    """Binary PLY of triangles: vertices (n, 3), faces (m, 3), unit normals (n, 3) and texture coordinates (n, 2)."""
-    names = ["x", "y", "z"]
-    parts = [vertices]
-    if normals is not None:
-        names += ["nx", "ny", "nz"]
-        parts.append(normals / np.linalg.norm(normals, axis=-1, keepdims=True))
-    if uv is not None:
-        names += ["u", "v"]
-        parts.append(uv)
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
-    header += [f"property float {name}" for name in names]
-    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
-    face_rows = np.empty(len(faces), dtype=[("n", "u1"), ("v", "<i4", 3)])
-    face_rows["n"], face_rows["v"] = 3, faces
-    data = np.concatenate(parts, axis=1).astype("<f4")
-    return "\n".join(header).encode() + data.tobytes() + face_rows.tobytes()
-
-
 def _board_xml(board: Board, folder: Path) -> str:
     """A Mitsuba <shape> of the board, matte, its back grey; its files go into `folder`."""
     (folder / "board.ply").write_bytes(ply_bytes(*board_surface(board)))
@@ -284,24 +266,6 @@ def _board_xml(board: Board, folder: Path) -> str:
   </bsdf>
 </shape>
 """
-
-
-def _mesh_scene(path: Path, scratch: Path) -> dict[str, Any]:
-    """Scene dictionary of a mesh file: grey, seen from both sides, under a uniform sky."""
-    mesh = trimesh.load(path, force="mesh")
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
-        raise UserError(f"scene {path}: holds no triangles with finite vertices")
-    file = scratch / "mesh.ply"
-    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    file.write_bytes(ply_bytes(vertices, faces))
-    return {
-        "type": "scene",
-        "mesh": {
-            "type": "ply", "filename": str(file), "face_normals": True,
-            "bsdf": {"type": "twosided", "inner": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.6}}},
-        },
-        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.8}},
-    }  # fmt: skip
 
 
 def _first_line(error: object) -> str:

@@ -179,10 +179,11 @@ def test_a_sky_seen_through_a_hole_is_a_lamp_of_that_shape(tmp_path: Path, pane:
             <bsdf type="conductor"><string name="material" value="none"/></bsdf></shape>"""
         )
         factor = factor + quad_factor(xyz * (-1, 1, 1) - (1.8, 0, 0))
-    got = floor_light(scene_of(tmp_path, *elements), xyz, texel_m=0.03, direct_samples=128, target_db=46)
+    got = floor_light(scene_of(tmp_path, *elements), xyz, texel_m=0.04, direct_samples=64, target_db=42)
     error = got / (np.pi * factor[:, None] * [1, 2, 3]) - 1
-    assert np.quantile(np.abs(error), 0.9) < 0.025 and np.abs(error).max() < 0.08
-    assert abs(error.mean()) < 0.006
+    # Noise of few samples, no bias; a sky that is drawn from evenly is off by half.
+    assert np.quantile(np.abs(error), 0.9) < 0.04 and np.abs(error).max() < 0.12
+    assert abs(error.mean()) < 0.008
 
 
 def test_a_guide_draws_what_it_says(tmp_path: Path) -> None:

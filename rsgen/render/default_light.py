@@ -1,0 +1,88 @@
+"""Light for mesh files, which bring none: a sky around objects, lamps under the ceiling of rooms.
+
+A room is what encloses most points between its outer walls: from them, nearly all rays meet surfaces, more of them from
+in front than from behind (real rooms have some walls turned over). An object is open there, or solid: rays that begin
+inside it meet its surfaces from behind.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rsgen.array_types import BoolArray, FloatArray, IntArray
+
+SKY = 0.8  # radiance
+_IRRADIANCE = 2.5  # of lamps on a floor, were all their light to reach it: about what the sky gives in the open
+_DIRECTIONS = 64
+_ENCLOSED = 0.9  # share of rays; windows and doors let some out
+_CELL_M = 2.5  # a lamp for each square of this size or larger
+_MOST_CELLS = 4  # along a side
+_LAMP = 0.12  # half a lamp's side, of its cell's shorter one
+_MOST_LAMP_M = 0.3
+_GAP = 0.02  # below the ceiling, of a lamp's height over the middle
+
+
+@dataclass(frozen=True)
+class Lamps:
+    """Square lamps: corners (n, 4, 3), facing down, and their radiance."""
+
+    corners: FloatArray
+    radiance: float
+
+
+class Probe:
+    """Rays into triangles, on the device."""
+
+    def __init__(self, mi: Any, vertices: FloatArray, faces: IntArray) -> None:
+        """vertices (n, 3), world frame, m; faces (m, 3)."""
+        self._mi = mi
+        self.low, self.high = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))
+        mesh = mi.Mesh("probe", len(vertices), len(faces))
+        arrays = mi.traverse(mesh)
+        arrays["vertex_positions"] = mi.Float(vertices.astype(np.float32).ravel())
+        arrays["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
+        arrays.update()
+        self._scene = mi.load_dict({"type": "scene", "mesh": mesh})
+
+    def encloses(self) -> bool:
+        """Whether the triangles are a room."""
+        steps = np.stack(np.meshgrid(*[[0.25, 0.5, 0.75]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        origins = self.low + steps * (self.high - self.low)
+        k = np.arange(_DIRECTIONS) + 0.5  # a Fibonacci spiral: evenly all around
+        z, phi = 1 - 2 * k / _DIRECTIONS, k * np.pi * (1 + 5**0.5)
+        around = np.stack([np.cos(phi) * np.sqrt(1 - z * z), np.sin(phi) * np.sqrt(1 - z * z), z], axis=-1)
+        distance, front = self._cast(np.repeat(origins, len(around), axis=0), np.tile(around, (len(origins), 1)))
+        met, from_front = (v.reshape(len(origins), -1).mean(axis=1) for v in (np.isfinite(distance), front))
+        return bool(((met >= _ENCLOSED) & (from_front > met / 2)).mean() > 0.5)
+
+    def lamps(self) -> Lamps | None:
+        """Lamps under the ceilings above the middle of the room's height; None if there is no ceiling."""
+        size = self.high - self.low
+        count = np.clip((size[:2] / _CELL_M).astype(int), 1, _MOST_CELLS)
+        cells = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1).reshape(-1, 2)
+        middle = np.column_stack([self.low[:2] + (cells + 0.5) / count * size[:2], np.full(len(cells), self.low[2])])
+        middle[:, 2] += size[2] / 2
+        half = min(_LAMP * float((size[:2] / count).min()), _MOST_LAMP_M)
+        square = half * np.array([[-1, -1, 0], [-1, 1, 0], [1, 1, 0], [1, -1, 0]])  # seen from below, counter-clockwise
+        starts = middle[:, None] + np.concatenate([square, np.zeros((1, 3))])
+        up = np.tile([0.0, 0.0, 1.0], (starts.size // 3, 1))
+        above = self._cast(starts.reshape(-1, 3), up)[0].reshape(starts.shape[:2])
+        inside = np.isfinite(above).all(axis=1)
+        if not inside.any():
+            return None
+        corners = starts[inside, :4]
+        corners[..., 2] += (1 - _GAP) * above[inside].min(axis=1, keepdims=True)
+        area = len(corners) * (2 * half) ** 2
+        floor = size[:2].prod() * inside.mean()
+        return Lamps(corners, float(_IRRADIANCE * floor / (np.pi * area)))
+
+    def _cast(self, origins: FloatArray, directions: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Distance (n,) to what rays (n, 3) meet, inf for nothing, and whether they meet it from in front."""
+        mi = self._mi
+        o, d = (v.astype(np.float32).T for v in (origins, directions))
+        si = self._scene.ray_intersect(mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)))
+        distance, normal = np.array(si.t, float), np.array(si.n, float).T
+        return distance, np.isfinite(distance) & (np.einsum("ij,ij->i", normal, directions) < 0)
