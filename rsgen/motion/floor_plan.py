@@ -23,6 +23,7 @@ BOB_M = 0.08
 """So much does the camera rise above its mean height, and sink below it."""
 
 _EYE_M = 1.45  # a camera held before the chest of somebody who stands
+_SLACK_M = 0.06
 _COLUMNS = 48
 _MOST_STOREYS = 24  # surfaces above each other that are looked through for floors
 _LEVEL_M = 0.1  # floors are told apart so finely
@@ -114,7 +115,7 @@ def find_floors(cast: Cast, low: FloatArray, high: FloatArray) -> list[Floor]:
 def floor_plan(triangles: FloatArray, cast: Cast, floor: Floor, clearance_m: float) -> FloorPlan:
     """The plan over a floor of a scene of triangles (m, 3, 3), world, m, at the height at which a camera is held."""
     low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
-    eye_y = floor.y + min(_EYE_M, floor.gap_m - clearance_m - BOB_M)
+    eye_y = floor.y + min(_EYE_M, floor.gap_m - clearance_m - BOB_M - _SLACK_M)
     cell = max(_CELL_M, math.sqrt(float((high[0] - low[0]) * (high[2] - low[2])) / _CELLS))
     shape = tuple(int(math.ceil((high[k] - low[k]) / cell)) + 5 for k in (0, 2))
     corner = np.array([low[0], low[2]]) - 2.0 * cell

@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 
 from rsgen.array_types import FloatArray
 from rsgen.config.config import Config, validate_config
-from rsgen.config.motion import Waypoint
+from rsgen.config.motion import MAX_DURATION_S, Waypoint
 from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
 from rsgen.files import encode_yaml
@@ -49,17 +50,31 @@ _HAND: dict[str, Any] = {
 }
 _SEEN_M = (0.4, 5.0)
 _VIEWS = 40
-_EMPTY = 0.3
+_EMPTY, _DARK = 0.3, 0.02
 
 
 @dataclass(frozen=True)
 class Wish:
-    """What a tour should be like: seconds and m/s, least distance to surfaces in m, and a seed for all that is chance."""
+    """What a tour should be like: seconds and m/s, least distance to surfaces in m, and a seed for all that is chance.
+
+    Raises UserError, naming the option, if one of them is out of bounds.
+    """
 
     seconds: float = 20.0
     speed_m_s: float = 0.35
     clearance_m: float = 0.3
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        bounds = {
+            "seconds": (self.seconds, 2.0, MAX_DURATION_S),
+            "speed": (self.speed_m_s, 0.01, 10.0),
+            "clearance": (self.clearance_m, 0.01, 10.0),
+            "seed": (self.seed, 0, 2**31 - 1),
+        }
+        for option, (value, least, most) in bounds.items():
+            if not least <= value <= most:
+                raise UserError(f"--{option} {value:g}: must lie in {least:g} to {most:.10g}")
 
 
 @dataclass(frozen=True)
@@ -145,11 +160,12 @@ def _room(scene: _Scene, clearance_m: float) -> FloorPlan | None:
             raise scene.wrong("walls but no floor below them: add a floor, or turn the scene so that y is up")
         return None
     best = max(plans, key=lambda plan: (plan.area_m2(plan.largest(clearance_m)), plan.area_m2(plan.inside)))
-    if _HIGHEST_ROOM_M < best.floor.gap_m < math.inf:
-        unit, scale = min(_UNITS.items(), key=lambda u: abs(math.log(u[1] * best.floor.gap_m / _ROOM_M)))
+    height = float(high[1] - low[1])
+    if height > _HIGHEST_ROOM_M:
+        unit, scale = min(_UNITS.items(), key=lambda u: abs(math.log(u[1] * height / _ROOM_M)))
         raise scene.wrong(
-            f"{best.floor.gap_m:.0f} from floor to ceiling, as in a room in {unit}, but scenes are in metres: set "
-            f"scene.scale to {scale:g}, or scale the file"
+            f"a room of {height:.0f} from bottom to top is one in {unit}, but scenes are in metres: set scene.scale to "
+            f"{scale:g}, or scale the file"
         )
     if free_region(best, clearance_m) is not None:
         return best
@@ -223,7 +239,7 @@ def _room_text(scene: _Scene, plan: FloorPlan, clearance_m: float) -> str:
     assert cells is not None
     area, gap = plan.area_m2(cells), plan.floor.gap_m
     high = f"{gap:.2f} m high, {area * gap:.1f} m³ free" if math.isfinite(gap) else "without a ceiling"
-    return f"a room, {high}; at the camera's height, {plan.eye_y:.2f} m, {area:.1f} m² of it are free"
+    return f"a room, {high}; {plan.eye_y - plan.floor.y:.2f} m above the floor a camera has {area:.1f} m²"
 
 
 def _thing_text(thing: _Thing) -> str:
@@ -238,7 +254,8 @@ def _motion_text(scene: _Scene, config: Config, spline: Spline, least: float) ->
     """What the spline is like, and what its camera sees."""
     assert config.motion is not None
     stats = motion_statistics(spline, 0.0, config.motion.duration_s)
-    distance = seen_distances(spline.pose(np.linspace(0.0, config.motion.duration_s, _VIEWS)), scene.cast)
+    times = np.linspace(0.0, config.motion.duration_s, _VIEWS)
+    distance = seen_distances(spline.pose(times), scene.cast)
     near, far = _SEEN_M
     seen, nothing = np.mean((distance >= near) & (distance <= far)), np.mean(~np.isfinite(distance))
     lines = [
@@ -246,4 +263,15 @@ def _motion_text(scene: _Scene, config: Config, spline: Spline, least: float) ->
         f"{stats.mean_rotation_deg_s:.0f} deg/s in the mean; nearest surface {least:.2f} m",
         f"surfaces {near:g} to {far:g} m away in {100 * seen:.0f} % of the views, nothing at all in {100 * nothing:.0f} %",
     ]
-    return lines if nothing < _EMPTY else [*lines, "much of the views is empty: a floor and walls would help a tracker"]
+    if nothing > _EMPTY:
+        lines.append("much of the views is empty: a floor and walls would help a tracker")
+    if scene.file.suffix.lower() != ".xml" and _sky(scene, spline.pose(times)[:, :3, 3]) < _DARK:
+        lines.append("colour will be dark: a mesh has no lamps, and no sky gets in; put it into a Mitsuba scene with one")
+    return lines
+
+
+def _sky(scene: _Scene, p_world: FloatArray) -> float:
+    """Share of all directions in which one sees out of the scene from the places (n, 3)."""
+    around = np.asarray(trimesh.creation.icosphere(subdivisions=2).vertices)
+    distance, _ = scene.cast(np.repeat(p_world, len(around), axis=0), np.tile(around, (len(p_world), 1)))
+    return float(np.mean(np.isinf(distance)))
