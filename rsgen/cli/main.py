@@ -146,7 +146,7 @@ def suggest(
     out: Annotated[Path | None, "config to write (default: print it)", "YAML"] = None,
     seconds: Annotated[float, "length of the sequence, s", float] = 20.0,
     speed: Annotated[float, "mean speed, m/s", float] = 0.35,
-    clearance: Annotated[float, "least distance to the scene's surfaces, m", float] = 0.3,
+    clearance: Annotated[float, "least distance to the scene's surfaces, m", float] = 0.2,
     seed: Annotated[int, "another seed, another tour (default: 0)", "N", int] = 0,
     name: Annotated[str | None, "the sequence's name (default: the scene's)"] = None,
 ) -> int:

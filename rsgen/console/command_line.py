@@ -44,7 +44,7 @@ class Parser(argparse.ArgumentParser):
 class Commands:
     """A program with commands. description: shown as it is by --help."""
 
-    def __init__(self, name: str, description: str, parser: argparse.ArgumentParser | None = None) -> None:
+    def __init__(self, name: str, description: str, parser: Parser | None = None) -> None:
         raw = argparse.RawDescriptionHelpFormatter
         self.name = name
         self.parser = parser or Parser(name, description=description, formatter_class=raw)

@@ -71,10 +71,10 @@ def check_clearance(motion: Spline | Trajectory, triangles: FloatArray, clearanc
     distance, _ = nearest_surface(points, triangles, clearance_m)
     k = int(np.argmin(distance))
     if distance[k] < clearance_m:
+        away = f"away{_free_nearby(points, distance, k, triangles, clearance_m)}"
         raise UserError(
             f"motion: comes within {distance[k]:.3f} m of a surface at {times[k]:.2f} s, at {_listed(points[k])}; "
-            f"clearance_m is {clearance_m:g}: move the path away{_free_nearby(points, distance, k, triangles, clearance_m)} "
-            "or reduce clearance_m"
+            f"clearance_m is {clearance_m:g}: move the path {away} or reduce clearance_m"
         )
 
 
@@ -82,9 +82,7 @@ def _listed(point: FloatArray) -> str:
     return "[" + ", ".join(f"{x:.2f}" for x in point) + "]"
 
 
-def _free_nearby(
-    points: FloatArray, distance: FloatArray, k: int, triangles: FloatArray, clearance_m: float
-) -> str:
+def _free_nearby(points: FloatArray, distance: FloatArray, k: int, triangles: FloatArray, clearance_m: float) -> str:
     """' (free within 0.4 m: [x, y, z])' of the place with clearance_m that is nearest to points[k], or '' without one.
 
     points (n, 3) of a path and their distances (n,), inf beyond clearance_m. A wall must not part the place from the

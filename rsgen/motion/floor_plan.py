@@ -14,7 +14,7 @@ from scipy import ndimage
 from rsgen.array_types import BoolArray, FloatArray
 
 Cast = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
-"""From points (n, 3) along unit directions (n, 3): distances (n,), m, inf for none, and the triangles' normals (n, 3)."""
+"""From points (n, 3) along unit directions (n, 3): distances (n,), m, inf for none, and triangles' normals (n, 3)."""
 
 HEADROOM_M = 1.6
 """Over a floor there is at least so much air."""
@@ -22,18 +22,21 @@ HEADROOM_M = 1.6
 BOB_M = 0.08
 """So much does the camera rise above its mean height, and sink below it."""
 
+HIGHEST_M = 60.0
+"""What has walls and is higher is a room in another unit than metres."""
+
 _EYE_M = 1.45  # a camera held before the chest of somebody who stands
 _SLACK_M = 0.06
 _COLUMNS = 48
 _MOST_STOREYS = 24  # surfaces above each other that are looked through for floors
 _LEVEL_M = 0.1  # floors are told apart so finely
 _CELLS = 1_500_000
-_CELL_M = 0.04
+_CELL_M = 0.03
 _PROBE_M = 0.2
 _PROBES = 20_000
 _AZIMUTHS = 24
 _WALLED = 0.7  # of the horizontal rays, those that hit a wall where the camera is indoors
-_FAR_M = 30.0
+_FAR_M = 30.0  # a wall that is farther off is none
 _LOW_M = 0.55  # one can hold a camera over a sofa or a low table, not over a cupboard
 _SUNK_M = 0.2
 
@@ -115,9 +118,10 @@ def find_floors(cast: Cast, low: FloatArray, high: FloatArray) -> list[Floor]:
 def floor_plan(triangles: FloatArray, cast: Cast, floor: Floor, clearance_m: float) -> FloorPlan:
     """The plan over a floor of a scene of triangles (m, 3, 3), world, m, at the height at which a camera is held."""
     low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+    far = _FAR_M if high[1] - low[1] <= HIGHEST_M else math.inf
     eye_y = floor.y + min(_EYE_M, floor.gap_m - clearance_m - BOB_M - _SLACK_M)
     cell = max(_CELL_M, math.sqrt(float((high[0] - low[0]) * (high[2] - low[2])) / _CELLS))
-    shape = tuple(int(math.ceil((high[k] - low[k]) / cell)) + 5 for k in (0, 2))
+    shape = tuple(math.ceil((high[k] - low[k]) / cell) + 5 for k in (0, 2))
     corner = np.array([low[0], low[2]]) - 2.0 * cell
     reach = clearance_m + BOB_M
     taken = _occupied(triangles, (eye_y - reach, eye_y + reach), corner, cell, shape)
@@ -126,28 +130,28 @@ def floor_plan(triangles: FloatArray, cast: Cast, floor: Floor, clearance_m: flo
     stride = max(1, round(_PROBE_M / cell), math.ceil(math.sqrt(room_m.size / _PROBES)))
     cells = np.stack(np.meshgrid(*(np.arange(0, n, stride) for n in shape), indexing="ij"), axis=-1)
     probes = np.insert(corner + cells.reshape(-1, 2) * cell, 1, eye_y, axis=1)
-    walled, backs, ground = _around(probes, cast)
+    walled, backs, ground = _around(probes, cast, far)
     inside = walled & (ground >= floor.y - _SUNK_M) & (ground <= floor.y + _LOW_M)
     solid = bool(inside.any() and np.median(backs[inside]) > 0.5)
     grid = inside.reshape(cells.shape[:2])
-    nearest = [np.minimum((np.arange(n) + stride // 2) // stride, m - 1) for n, m in zip(shape, grid.shape, strict=True)]
-    return FloorPlan(corner, cell, eye_y, floor, room_m, grid[np.ix_(*nearest)], solid)
+    i, j = (np.minimum((np.arange(shape[k]) + stride // 2) // stride, grid.shape[k] - 1) for k in (0, 1))
+    return FloorPlan(corner, cell, eye_y, floor, room_m, grid[np.ix_(i, j)], solid)
 
 
 def share_without_floor(cast: Cast, low: FloatArray, high: FloatArray) -> float:
-    """Share in [0, 1] of the places at half the height of the box, corners low and high (3,), m, with walls but no floor."""
+    """Share in [0, 1] of the places halfway up the box of corners low and high (3,), m, with walls but no floor."""
     x, z = (low[k] + (np.arange(_COLUMNS) + 0.5) / _COLUMNS * (high[k] - low[k]) for k in (0, 2))
     p = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1).reshape(-1, 2)
-    walled, _, ground = _around(np.insert(p, 1, 0.5 * (low[1] + high[1]), axis=1), cast)
+    walled, _, ground = _around(np.insert(p, 1, 0.5 * (low[1] + high[1]), axis=1), cast, math.inf)
     return float((walled & np.isneginf(ground)).mean())
 
 
-def _around(p_world: FloatArray, cast: Cast) -> tuple[BoolArray, FloatArray, FloatArray]:
-    """Of places (n, 3): whether most horizontal rays hit a wall, the share of walls' backs, the height of what is below."""
+def _around(p_world: FloatArray, cast: Cast, far: float) -> tuple[BoolArray, FloatArray, FloatArray]:
+    """Of places (n, 3): whether most horizontal rays hit a wall within far, the share of backs, the height below."""
     azimuth = (np.arange(_AZIMUTHS) + 0.5) * (math.tau / _AZIMUTHS)
     around = np.tile(np.stack([np.cos(azimuth), np.zeros(_AZIMUTHS), np.sin(azimuth)], axis=1), (len(p_world), 1))
     distance, normal = cast(np.repeat(p_world, _AZIMUTHS, axis=0), around)
-    walled = (distance.reshape(-1, _AZIMUTHS) < _FAR_M).mean(axis=1) >= _WALLED
+    walled = (distance.reshape(-1, _AZIMUTHS) < far).mean(axis=1) >= _WALLED
     backs = (np.einsum("ij,ij->i", normal, around) > 0).reshape(-1, _AZIMUTHS).mean(axis=1)
     below, _ = cast(p_world, np.tile([0.0, -1.0, 0.0], (len(p_world), 1)))
     return walled, backs, p_world[:, 1] - below

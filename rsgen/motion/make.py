@@ -36,7 +36,7 @@ def make_motion(config: MotionConfig, seed: int) -> Trajectory:
 
 
 def least_turning(config: MotionConfig, seed: int) -> float:
-    """Mean rotational speed in deg/s of the motion without its sway: less than it no mean_rotation_deg_s can ask for."""
+    """Mean rotational speed in deg/s of the motion without its sway: mean_rotation_deg_s cannot be less."""
     path, trajectory = _parts(config, seed)
     return motion_statistics(trajectory(path.first_size, 0.0)).mean_rotation_deg_s
 

@@ -1,4 +1,4 @@
-"""A closed walk through the free places of a floor plan, or round an object: where the camera goes, not yet its gaze."""
+"""A closed walk through the free places of a floor plan, or round a thing: where the camera goes, not yet its gaze."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ from rsgen.motion.floor_plan import BOB_M, FloorPlan
 
 _SLACK_M = 0.04  # hand-shake, and the curve between waypoints, need so much more than the clearance
 _DISTANCES_M = (1.2, 1.0, 0.8, 0.65, 0.5)
-_CORNER_M = 0.12  # smoothing may cut so far into corners where the walk keeps the least distance
-_ENOUGH = 0.6  # of the length asked for, or of the longest walk there is
-_SMOOTH_M = (0.4, 0.25, 0.15, 0.08, 0.04)
+_CORNER_M = 0.08  # smoothing may cut so far into corners where the walk keeps the least distance
+_ROUND = 0.04  # area over length squared: a square has 0.0625, a path to and fro nothing
+_ENOUGH = 0.8  # of the length asked for, or of the longest walk there is
+_SMOOTH_M = (0.3, 0.2, 0.12, 0.06)
+_SHRINKING = 1.15  # by so much smoothing shortens an outline, about
 _STEP_M = 0.05
 _WAYPOINT_M = 0.6
 _LEAST_M2 = 0.25  # a camera cannot be carried about in less
 _LEAST_LOOP_M = 1.0
 _BISECTIONS = 12
-_ROUNDED_CELLS = 2.0
 
 _FILLING = 2.4  # radii of a thing's sphere from its middle: within a field of view of 48 degrees
 _NEAREST_M = 0.6
@@ -49,11 +50,15 @@ def walk_inside(plan: FloorPlan, length_m: float, clearance_m: float, rng: np.ra
         return None
     need = clearance_m + _SLACK_M
     enough = _ENOUGH * min(length_m, _length(_outline(widest, plan)))
-    regions = [plan.largest(room) for room in _DISTANCES_M if room > need + _CORNER_M]
-    fitting = [cells for cells in regions if _length(_outline(cells, plan)) >= enough]
+    fitting = []
+    for room in (room for room in _DISTANCES_M if room > need + _CORNER_M):
+        cells = plan.largest(room)
+        length = _length(_outline(cells, plan))
+        if length >= enough and plan.area_m2(cells) >= _ROUND * length**2:
+            fitting.append(cells)
     # The two that keep the farthest from the walls; by chance one of them, so that seeds differ.
     cells = [*fitting, widest, widest][int(rng.integers(2))]
-    loop = _smooth(_outline(_within(cells, plan, length_m, rng), plan), plan, need)
+    loop = _smooth(_outline(_within(cells, plan, _SHRINKING * length_m, rng), plan), plan, need)
     if loop is None:
         return None
     loop = np.roll(loop, int(rng.integers(len(loop))), axis=0)[:: 1 if rng.random() < 0.5 else -1]
@@ -68,13 +73,9 @@ def _outline(cells: BoolArray, plan: FloorPlan) -> FloatArray:
     if not cells.any():
         return np.zeros((0, 2))
     box = ndimage.find_objects(cells.astype(np.uint8))[0]
-    padding = 4
-    soft = ndimage.gaussian_filter(np.pad(cells[box].astype(float), padding), _ROUNDED_CELLS)
-    outlines = find_contours(soft, 0.5)
-    if not outlines:
-        return np.zeros((0, 2))
+    outlines = find_contours(np.pad(cells[box].astype(float), 1), 0.5)
     longest = max(outlines, key=_length)[:-1]
-    return plan.corner + (longest - padding + [box[0].start, box[1].start]) * plan.cell_m
+    return plan.corner + (longest - 1 + [box[0].start, box[1].start]) * plan.cell_m
 
 
 def _length(loop: FloatArray) -> float:
@@ -123,13 +124,11 @@ def _waypoints(p_world: FloatArray) -> FloatArray:
     return p_world[np.round(np.arange(count) * (len(p_world) / count)).astype(np.int64)]
 
 
-def ring(
-    low: FloatArray, high: FloatArray, ground_y: float, rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray]:
+def ring(low: FloatArray, high: FloatArray, ground_y: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """Camera centres and the points they look at, (n, 3), world, m, round a thing in the box of corners low, high (3,).
 
-    So far off that it fills the picture, from a little above, but no higher than somebody who stands on the ground holds
-    a camera, and no nearer than a depth camera sees. rng draws the start, the direction and how uneven the ring is.
+    So far off that it fills the picture, from a little above, but no higher than somebody on the ground holds a camera,
+    and no nearer than a depth camera sees. rng draws the start, the direction and how uneven the ring is.
     """
     centre, half = 0.5 * (low + high), 0.5 * (high - low)
     radius = max(_FILLING * float(np.linalg.norm(half)), float(np.hypot(half[0], half[2])) + _NEAREST_M)
@@ -138,5 +137,5 @@ def ring(
     uneven = 1.0 + _UNEVEN * np.sin(2.0 * around + rng.uniform(0.0, math.tau))
     rise = radius * math.tan(_ABOVE) * (1.0 + 2.0 * _UNEVEN * np.sin(3.0 * around + rng.uniform(0.0, math.tau)))
     y = np.minimum(centre[1] + rise, max(ground_y + _HIGHEST_M, centre[1]))
-    p = np.stack([centre[0] + radius * uneven * np.cos(around), y, centre[2] + radius * uneven * np.sin(around)], axis=1)
-    return p, centre + _UNEVEN * half * rng.uniform(-1.0, 1.0, (count, 3))
+    x, z = (centre[k] + radius * uneven * wave for k, wave in ((0, np.cos(around)), (2, np.sin(around))))
+    return np.stack([x, y, z], axis=1), centre + _UNEVEN * half * rng.uniform(-1.0, 1.0, (count, 3))

@@ -22,7 +22,7 @@ from rsgen.errors import UserError
 from rsgen.files import encode_yaml
 from rsgen.geometry.spline import Spline
 from rsgen.motion.clearance import clearance, plan_tour
-from rsgen.motion.floor_plan import Cast, FloorPlan, find_floors, floor_plan, share_without_floor
+from rsgen.motion.floor_plan import HIGHEST_M, Cast, FloorPlan, find_floors, floor_plan, share_without_floor
 from rsgen.motion.gaze import choose_targets, seen_distances
 from rsgen.motion.make import least_turning
 from rsgen.motion.statistics import motion_statistics
@@ -32,10 +32,10 @@ from rsgen.produce.generate import load_motion, scene_triangles
 _STOREYS = 6  # floors that are looked at, the largest first
 _LARGE = 0.3  # of the scene's ground, what walls enclose where the scene is a room
 _ATTEMPTS = 4
-_CALM = (0.15, 0.5, 2.0)
+_CALM = (0.08, 0.2, 1.0)
 _BRISK_DEG_S = 35.0  # mean rotational speed of hand-held recordings: 15 to 40
 _SWAY_SHARE, _SWAY_DEG_S = 1.1, 3.0  # what the slow turning adds to that of the tour
-_HIGHEST_ROOM_M, _ROOM_M, _LARGEST_THING_M, _SMALLEST_M = 60.0, 2.5, 50.0, 0.001
+_ROOM_M, _LARGEST_THING_M, _SMALLEST_M, _FARTHEST_M = 2.5, 50.0, 0.001, 9000.0
 _UNITS = {"centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254}
 _SKIN = 0.01  # of a scene's size: what lies so flat is its ground
 _SLACK_M = 0.04
@@ -62,7 +62,7 @@ class Wish:
 
     seconds: float = 20.0
     speed_m_s: float = 0.35
-    clearance_m: float = 0.3
+    clearance_m: float = 0.2
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -135,16 +135,17 @@ def suggest_tour(file: Path, name: str | None, wish: Wish) -> Suggestion:
     loaded = load_scene(file)
     scene = _Scene(file, scene_triangles(loaded), partial(cast_rays, loaded))
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", file.stem) if name is None else name
-    plan = _room(scene, wish.clearance_m)
-    thing = _thing(scene) if plan is None else None
+    aim = _room(scene, wish.clearance_m) or _thing(scene)
+    if (farthest := float(np.abs(scene.triangles).max())) > _FARTHEST_M:
+        raise scene.wrong(f"reaches {farthest:.0f} m from the origin: scale it to metres, or move it to the origin")
     rng = np.random.default_rng(wish.seed)
     for _ in range(_ATTEMPTS):
-        tours = _through(scene, plan, wish, rng) if plan is not None else [_round(scene, thing, wish, rng)]
+        tours = _through(scene, aim, wish, rng) if isinstance(aim, FloorPlan) else [_round(scene, aim, wish, rng)]
         config = _config(scene, tours, name, wish)
         spline = load_motion(config).spline
         least = clearance(spline, scene.triangles, _REACH_M)
         if least >= wish.clearance_m:
-            where = _room_text(scene, plan, wish.clearance_m) if plan is not None else _thing_text(thing)
+            where = _room_text(aim, wish.clearance_m) if isinstance(aim, FloorPlan) else _thing_text(aim)
             return Suggestion(config, (f"{file.name}: {where}", *_motion_text(scene, config, spline, least)))
     raise scene.wrong(f"no tour found that keeps {wish.clearance_m:g} m from all surfaces: reduce --clearance")
 
@@ -161,7 +162,7 @@ def _room(scene: _Scene, clearance_m: float) -> FloorPlan | None:
         return None
     best = max(plans, key=lambda plan: (plan.area_m2(plan.largest(clearance_m)), plan.area_m2(plan.inside)))
     height = float(high[1] - low[1])
-    if height > _HIGHEST_ROOM_M:
+    if height > HIGHEST_M:
         unit, scale = min(_UNITS.items(), key=lambda u: abs(math.log(u[1] * height / _ROOM_M)))
         raise scene.wrong(
             f"a room of {height:.0f} from bottom to top is one in {unit}, but scenes are in metres: set scene.scale to "
@@ -234,7 +235,7 @@ def _config(scene: _Scene, tours: Sequence[tuple[Waypoint, ...]], name: str, wis
     return validate_config(data, "motion suggest")
 
 
-def _room_text(scene: _Scene, plan: FloorPlan, clearance_m: float) -> str:
+def _room_text(plan: FloorPlan, clearance_m: float) -> str:
     cells = free_region(plan, clearance_m)
     assert cells is not None
     area, gap = plan.area_m2(cells), plan.floor.gap_m
@@ -261,12 +262,14 @@ def _motion_text(scene: _Scene, config: Config, spline: Spline, least: float) ->
     lines = [
         f"{stats.length_m:.1f} m in {stats.duration_s:.0f} s: {stats.mean_speed_m_s:.2f} m/s, "
         f"{stats.mean_rotation_deg_s:.0f} deg/s in the mean; nearest surface {least:.2f} m",
-        f"surfaces {near:g} to {far:g} m away in {100 * seen:.0f} % of the views, nothing at all in {100 * nothing:.0f} %",
+        f"surfaces {near:g} to {far:g} m away in {100 * seen:.0f} % of the views, nothing in {100 * nothing:.0f} %",
     ]
     if nothing > _EMPTY:
         lines.append("much of the views is empty: a floor and walls would help a tracker")
     if scene.file.suffix.lower() != ".xml" and _sky(scene, spline.pose(times)[:, :3, 3]) < _DARK:
-        lines.append("colour will be dark: a mesh has no lamps, and no sky gets in; put it into a Mitsuba scene with one")
+        lines.append(
+            "colour will be dark: a mesh has no lamps, and no sky gets in; name it in a Mitsuba scene with one"
+        )
     return lines
 
 

@@ -12,9 +12,10 @@ from rsgen.array_types import FloatArray
 
 
 def cast_rays(scene: Any, p_world: FloatArray, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distance (n,) in metres from points (n, 3) along unit directions (n, 3), world frame, and the normals (n, 3) there.
+    """Distance (n,) in metres from points (n, 3) along unit directions (n, 3), world frame, and normals (n, 3) there.
 
-    Normals are those of the triangles, whichever side is hit. Where nothing is the distance is infinite, the normal zero.
+    Normals are the triangles' own, whichever side is hit. Where there is nothing, the distance is infinite and the
+    normal zero.
     """
     ray = mi.Ray3f(_points(p_world), mi.Vector3f(_points(direction)))
     hit = scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from functools import cache
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from rsgen.produce.generate import load_motion
 from rsgen.produce.suggest import Suggestion, Wish, suggest_tour
 from rsgen.sequence.trajectory import Trajectory
 
-CLEARANCE_M = 0.3
+CLEARANCE_M = 0.2
 
 
 def block(low: tuple[float, float, float], high: tuple[float, float, float]) -> trimesh.Trimesh:
@@ -48,11 +49,11 @@ def furnished() -> trimesh.Trimesh:
 
 
 def flat() -> trimesh.Trimesh:
-    """Two rooms of 4 x 4 m, walls 10 cm thick, and a door of 1 x 2 m between them; a garden about the house."""
+    """Two rooms of 4 x 4 m, walls 10 cm thick, and a door of 0.8 x 2 m between them; a garden about the house."""
     walls = [
         ((-0.1, 0, -0.1), (8.2, 2.5, 0)), ((-0.1, 0, 4), (8.2, 2.5, 4.1)), ((-0.1, 0, 0), (0, 2.5, 4)),
-        ((8.1, 0, 0), (8.2, 2.5, 4)), ((4, 0, 0), (4.1, 2.5, 1.5)), ((4, 0, 2.5), (4.1, 2.5, 4)),
-        ((4, 2, 1.5), (4.1, 2.5, 2.5)),
+        ((8.1, 0, 0), (8.2, 2.5, 4)), ((4, 0, 0), (4.1, 2.5, 1.6)), ((4, 0, 2.4), (4.1, 2.5, 4)),
+        ((4, 2, 1.6), (4.1, 2.5, 2.4)),
     ]  # fmt: skip
     garden, roof = block((-6, -0.1, -6), (14, 0, 10)), block((-0.1, 2.5, -0.1), (8.2, 2.6, 4.1))
     return trimesh.util.concatenate([*(block(*wall) for wall in walls), garden, roof])
@@ -77,10 +78,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @cache
-def suggested(folder: Path, name: str, seed: int, seconds: float = 20.0) -> Suggestion:
-    return suggest_tour(folder / f"{name}.ply", None, Wish(seconds, clearance_m=CLEARANCE_M, seed=seed))
+def suggested(folder: Path, name: str, seed: int, seconds: float = 12.0, speed: float = 0.35) -> Suggestion:
+    return suggest_tour(folder / f"{name}.ply", None, Wish(seconds, speed, CLEARANCE_M, seed))
 
 
+@cache
 def spline_of(suggestion: Suggestion) -> Spline:
     return load_motion(suggestion.config).spline
 
@@ -104,16 +106,16 @@ def seen(spline: Spline, mesh: trimesh.Trimesh) -> np.ndarray:
     return depth.reshape(len(T), len(rays))
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("name", SCENES)
 def test_the_way_keeps_clear(folder: Path, name: str, seed: int) -> None:
     p = way(spline_of(suggested(folder, name, seed)))
     distance = trimesh.proximity.closest_point_naive(SCENES[name](), p)[1]
     assert CLEARANCE_M <= distance.min() < 1.5
-    assert np.linalg.norm(np.diff(p, axis=0), axis=1).sum() == pytest.approx(7.0, rel=0.02)
+    assert np.linalg.norm(np.diff(p, axis=0), axis=1).sum() == pytest.approx(12.0 * 0.35, rel=0.02)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_room_is_walked_about_in(folder: Path, seed: int) -> None:
     suggestion = suggested(folder, "furnished", seed)
     spline = spline_of(suggestion)
@@ -127,7 +129,7 @@ def test_a_room_is_walked_about_in(folder: Path, seed: int) -> None:
 
 
 def test_a_camera_turns_like_one_in_a_hand_and_looks_about(folder: Path) -> None:
-    spline = spline_of(suggested(folder, "furnished", 0))
+    spline = spline_of(suggested(folder, "furnished", 0, 20.0))
     stats = motion_statistics(spline, 0.0, 20.0)
     assert stats.mean_speed_m_s == pytest.approx(0.35, rel=0.02)
     assert 5.0 < stats.mean_rotation_deg_s < 45.0 and stats.max_rotation_deg_s < 120.0
@@ -138,18 +140,18 @@ def test_a_camera_turns_like_one_in_a_hand_and_looks_about(folder: Path) -> None
 
 
 def test_a_long_tour_goes_through_the_door_and_not_into_the_garden(folder: Path) -> None:
-    p = way(spline_of(suggested(folder, "flat", 0, 60.0)))
+    p = way(spline_of(suggested(folder, "flat", 0, 21.0, 1.0)))
     assert p[:, 0].min() < 3.0 and p[:, 0].max() > 5.1  # both rooms
     through = p[(p[:, 0] > 3.9) & (p[:, 0] < 4.2)]
-    assert len(through) and (np.abs(through[:, 2] - 2.0) < 0.5).all()
+    assert len(through) and (np.abs(through[:, 2] - 2.0) < 0.4).all()
     assert (p[:, [0, 2]] > 0).all() and (p[:, 0] < 8.1).all() and (p[:, 2] < 4).all()
 
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_thing_is_gone_round_and_looked_at(folder: Path, seed: int) -> None:
-    suggestion = suggested(folder, "still_life", seed, 60.0)
+    suggestion = suggested(folder, "still_life", seed, 15.0, 1.0)
     spline = spline_of(suggestion)
-    p, T = way(spline), spline.pose(np.linspace(0.0, 60.0, 100))
+    p, T = way(spline), spline.pose(np.linspace(0.0, 15.0, 100))
     around = np.unwrap(np.arctan2(p[:, 2], p[:, 0]))
     assert np.ptp(around) > math.tau
     to_table = np.array([0, 0.6, 0]) - T[:, :3, 3]
@@ -161,10 +163,10 @@ def test_a_thing_is_gone_round_and_looked_at(folder: Path, seed: int) -> None:
 
 def test_a_seed_decides_every_byte(folder: Path) -> None:
     first = suggested(folder, "furnished", 1).yaml(folder)
-    again = suggest_tour(folder / "furnished.ply", None, Wish(clearance_m=CLEARANCE_M, seed=1)).yaml(folder)
+    again = suggest_tour(folder / "furnished.ply", None, Wish(12.0, clearance_m=CLEARANCE_M, seed=1)).yaml(folder)
     assert first == again
-    others = {suggested(folder, "furnished", seed).yaml(folder) for seed in range(3)}
-    assert len(others) == 3
+    others = {suggested(folder, "furnished", seed).yaml(folder) for seed in range(2)}
+    assert len(others) == 2
 
 
 # --- the command -----------------------------------------------------------------------------------------------------
@@ -186,7 +188,7 @@ def test_the_command_writes_a_config_that_renders(tmp_path: Path, capsys: pytest
     assert "a room, 2.60 m high" in said and f"rsgen render {out}" in said and "dark" not in said
     config = load_config(out)
     assert config.name == "my_room" and config.scene.file.resolve() == (tmp_path / "my room.xml").resolve()
-    assert config.motion is not None and config.motion.duration_s == 5.0 and config.motion.clearance_m == 0.3
+    assert config.motion is not None and config.motion.duration_s == 5.0 and config.motion.clearance_m == 0.2
     p = way(load_motion(config).spline)
     assert (np.abs(p) < (1.7, 1.0, 2.2)).all()
     assert main(["motion", "suggest", str(tmp_path / "my room.xml"), "--seconds", "5", "--name", "mine"]) == 0
@@ -250,10 +252,13 @@ def test_a_path_into_a_wall_is_told_of_a_free_place_on_its_own_side() -> None:
     with pytest.raises(UserError) as error:
         check_clearance(Trajectory(t, T), room.triangles, CLEARANCE_M)
     said = str(error.value)
-    place = np.array(yaml.safe_load(said.partition("free within 0.4 m: ")[2].partition(")")[0]))
+    found = re.search(r"free within (0\.\d) m: (\[.*?\])\)", said)
+    assert found
+    place = np.array(yaml.safe_load(found[2]))
+    assert np.linalg.norm(place - [1.575, 1, 0]) <= float(found[1]) + 1e-9 and float(found[1]) <= 0.4
     assert trimesh.proximity.closest_point_naive(room, place[None])[1][0] >= CLEARANCE_M
     assert (place > (-1, 0, -1)).all() and (place < (1.58, 2.5, 1)).all()
-    assert "at 3.15 s, at [1.57, 1.00, 0.00]" in said or "at 3.20 s, at [1.60, 1.00, 0.00]" in said
+    assert "0.005 m of a surface at 3.15 s, at [1.58, 1.00, 0.00]" in said
     with pytest.raises(UserError) as narrow:
         check_clearance(Trajectory(t, T), room.triangles, 1.4)
     assert "free within" not in str(narrow.value)  # there is no such place
