@@ -17,7 +17,7 @@ _HALF_WIDTH_DEG = 29.0
 # How welcome a surface is at a distance: too close there is no depth, too far it is coarse.
 _DISTANCE_M = (0.4, 0.9, 1.2, 3.0, 4.5, 10.0)
 _WORTH = (-3.0, 0.0, 1.0, 1.0, 0.3, -0.3)
-_NOTHING = -1.5
+_NOTHING = -5.0
 _SHAPE = 0.8
 _AHEAD = 0.7
 _CHANCE = 0.15

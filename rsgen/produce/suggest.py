@@ -153,14 +153,18 @@ def suggest_tour(file: Path, name: str | None, wish: Wish) -> Suggestion:
 def _room(scene: _Scene, clearance_m: float) -> FloorPlan | None:
     """The plan of the floor with the largest room for a camera; None where the scene is no room. Raises UserError."""
     low, high = scene.box
-    floors = find_floors(scene.cast, low, high)[:_STOREYS]
-    plans = [floor_plan(scene.triangles, scene.cast, floor, clearance_m) for floor in floors]
-    plans = [plan for plan in plans if plan.inside.any()]
-    if not plans:
+    best, most = None, 0.0
+    for floor in find_floors(scene.cast, low, high)[:_STOREYS]:
+        if floor.area_m2 < most:
+            break  # the others are smaller yet
+        plan = floor_plan(scene.triangles, scene.cast, floor, clearance_m)
+        free = plan.area_m2(plan.largest(clearance_m))
+        if plan.inside.any() and (best is None or free > most):
+            best, most = plan, free
+    if best is None:
         if share_without_floor(scene.cast, low, high) >= _LARGE:
             raise scene.wrong("walls but no floor below them: add a floor, or turn the scene so that y is up")
         return None
-    best = max(plans, key=lambda plan: (plan.area_m2(plan.largest(clearance_m)), plan.area_m2(plan.inside)))
     height = float(high[1] - low[1])
     if height > HIGHEST_M:
         unit, scale = min(_UNITS.items(), key=lambda u: abs(math.log(u[1] * height / _ROOM_M)))
