@@ -25,7 +25,7 @@ _LEAST_M2 = 0.25  # a camera cannot be carried about in less
 _LEAST_LOOP_M = 1.0
 _BISECTIONS = 12
 
-_FILLING = 2.4  # radii of a thing's sphere from its middle: within a field of view of 48 degrees
+_FILLING = 1.9  # radii of a thing's sphere from its middle: it takes 60 degrees, and what matters of it less
 _NEAREST_M = 0.6
 _HIGHEST_M = 1.8
 _ABOVE = math.radians(28.0)

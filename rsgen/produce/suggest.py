@@ -39,7 +39,7 @@ _ROOM_M, _LARGEST_THING_M, _SMALLEST_M, _FARTHEST_M = 2.5, 50.0, 0.001, 9000.0
 _UNITS = {"centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254}
 _SKIN = 0.01  # of a scene's size: what lies so flat is its ground
 _SLACK_M = 0.04
-_REACH_M = 5.0
+_REACH_M = 1.0  # so near a surface's distance is told
 _HAND: dict[str, Any] = {
     "sway": [0.7, 1.0, 0.7],
     "sway_hz": 0.25,
@@ -143,7 +143,7 @@ def suggest_tour(file: Path, name: str | None, wish: Wish) -> Suggestion:
         tours = _through(scene, aim, wish, rng) if isinstance(aim, FloorPlan) else [_round(scene, aim, wish, rng)]
         config = _config(scene, tours, name, wish)
         spline = load_motion(config).spline
-        least = clearance(spline, scene.triangles, _REACH_M)
+        least = clearance(spline, scene.triangles, max(_REACH_M, wish.clearance_m))
         if least >= wish.clearance_m:
             where = _room_text(aim, wish.clearance_m) if isinstance(aim, FloorPlan) else _thing_text(aim)
             return Suggestion(config, (f"{file.name}: {where}", *_motion_text(scene, config, spline, least)))
@@ -265,7 +265,8 @@ def _motion_text(scene: _Scene, config: Config, spline: Spline, least: float) ->
     seen, nothing = np.mean((distance >= near) & (distance <= far)), np.mean(~np.isfinite(distance))
     lines = [
         f"{stats.length_m:.1f} m in {stats.duration_s:.0f} s: {stats.mean_speed_m_s:.2f} m/s, "
-        f"{stats.mean_rotation_deg_s:.0f} deg/s in the mean; nearest surface {least:.2f} m",
+        f"{stats.mean_rotation_deg_s:.0f} deg/s in the mean; "
+        + (f"nearest surface {least:.2f} m" if math.isfinite(least) else f"no surface within {_REACH_M:g} m"),
         f"surfaces {near:g} to {far:g} m away in {100 * seen:.0f} % of the views, nothing in {100 * nothing:.0f} %",
     ]
     if nothing > _EMPTY:
