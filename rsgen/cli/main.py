@@ -28,6 +28,7 @@ rsgen makes rolling-shutter RGB-D benchmark sequences with exact continuous-time
   rsgen verify out/demo                 read it back and check it against itself
   rsgen compare out/demo --frame 20     what the rolling shutter did to frame 20
   rsgen fit my_trajectory.txt           how well a spline represents a recorded trajectory
+  rsgen motion suggest room.xml --out room.yaml      a tour through a scene of your own, to render or to edit
   rsgen motion stats table1             how far and how fast a config's camera moves
   rsgen export euroc out/demo           for the tools of others: EuRoC, Kalibr, registered TUM, video, rerun
 
@@ -47,7 +48,9 @@ def _parser() -> Parser:
     add(configs, "")
     with_fields = [add(render, "demo --out out/trial --frames 0:10 --color.spp 64 --depth.readout_s 0")]
     add(fit, "my_trajectory.txt --dt 0.04 --plot fit.png")
-    add(motion, "stats robot_t1 table1")
+    motion = commands.group("motion", "Motions of cameras: propose one for a scene, or tell how those of configs are.")
+    motion.add(suggest, "room.xml --out room.yaml --seed 3, then: rsgen render room.yaml --out out/room")
+    motion.add(stats, "robot_t1 table1")
     add(info, "out/demo")
     add(verify, "out/demo --pairs 50")
     add(compare, "out/demo --frame 20")
@@ -119,11 +122,10 @@ def fit(
     return 0
 
 
-def motion(
-    what: Annotated[Literal["stats"], "stats: print a table, a line a config"],
+def stats(
     configs: Annotated[list[Path], "YAML files, or names that 'rsgen configs' lists", "config", config_file],
 ) -> int:
-    """Stats: length, mean speeds and accelerations of the configs' motions, beside the paper's."""
+    """Print length, mean speeds and accelerations of the configs' motions, a line a config, beside the paper's."""
     from rsgen.config.config import load_config
     from rsgen.motion.statistics import motion_statistics
     from rsgen.motion.table import stats_table
@@ -135,6 +137,32 @@ def motion(
         made = load_motion(config)
         rows.append((config.name, motion_statistics(made.spline, made.first_stamp, made.last_stamp)))
     print(stats_table(rows))
+    return 0
+
+
+def suggest(
+    scene: Annotated[Path, "Mitsuba 3 scene .xml, or a mesh file; metres, y up"],
+    *,
+    out: Annotated[Path | None, "config to write (default: print it)", "YAML"] = None,
+    seconds: Annotated[float, "length of the sequence, s", float] = 20.0,
+    speed: Annotated[float, "mean speed, m/s", float] = 0.35,
+    clearance: Annotated[float, "least distance to the scene's surfaces, m", float] = 0.2,
+    seed: Annotated[int, "another seed, another tour (default: 0)", "N", int] = 0,
+    name: Annotated[str | None, "the sequence's name (default: the scene's)"] = None,
+) -> int:
+    """Propose a tour through a scene that has none: a config whose camera walks through the scene's largest room, or
+    round what it holds, looks at what is 1 to 3 m away, and keeps its distance. Edit it, or render it as it is.
+    """
+    from rsgen.files import atomic_write
+    from rsgen.produce.suggest import Wish, suggest_tour
+
+    suggested = suggest_tour(scene, name, Wish(seconds, speed, clearance, seed))
+    text = suggested.yaml((out or Path("here.yaml")).parent)
+    if out is None:
+        print(text.decode(), end="")
+        return 0
+    atomic_write(out, text)
+    print("\n".join([*suggested.found, f"{out}: written (rsgen render {out})"]))
     return 0
 
 

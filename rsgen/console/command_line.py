@@ -44,10 +44,17 @@ class Parser(argparse.ArgumentParser):
 class Commands:
     """A program with commands. description: shown as it is by --help."""
 
-    def __init__(self, name: str, description: str) -> None:
+    def __init__(self, name: str, description: str, parser: Parser | None = None) -> None:
+        raw = argparse.RawDescriptionHelpFormatter
         self.name = name
-        self.parser = Parser(name, description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-        self._commands = self.parser.add_subparsers(required=True, metavar="COMMAND")
+        self.parser = parser or Parser(name, description=description, formatter_class=raw)
+        self._commands = self.parser.add_subparsers(required=True, metavar="COMMAND", parser_class=Parser)
+
+    def group(self, name: str, description: str) -> Commands:
+        """Commands of their own after the word `name`. description: one sentence, shown by --help of either."""
+        help = description[0].lower() + description[1:].rstrip(".")
+        parser = self._commands.add_parser(name, help=help, description=description)
+        return Commands(f"{self.name} {name}", description, parser)
 
     def add(self, run: Run, example: str, note: str = "") -> argparse.ArgumentParser:
         """The command that `run` declares: its name, its docstring as help, an argument for every parameter.

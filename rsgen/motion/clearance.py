@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -20,6 +21,9 @@ _STEP_M = 0.02
 _MARGIN = 1.2  # a pushed waypoint goes this much farther than it needs, as the curve between waypoints cuts corners
 _ROUNDS = 30
 _SMALLEST_M = 1e-3
+_SHELLS, _NEARBY_M = 20, 1.0  # where a free place is looked for: spheres about the place that is not
+_SIGHT_M = 0.02
+_TRIED = 200
 _CHUNK = 500  # points at once: bounds memory
 
 
@@ -67,11 +71,39 @@ def check_clearance(motion: Spline | Trajectory, triangles: FloatArray, clearanc
     distance, _ = nearest_surface(points, triangles, clearance_m)
     k = int(np.argmin(distance))
     if distance[k] < clearance_m:
-        place = ", ".join(f"{x:.2f}" for x in points[k])
+        away = f"away{_free_nearby(points, distance, k, triangles, clearance_m)}"
         raise UserError(
-            f"motion: comes within {distance[k]:.3f} m of a surface at {times[k]:.2f} s, at [{place}]; clearance_m is "
-            f"{clearance_m:g}: move the path away or reduce clearance_m"
+            f"motion: comes within {distance[k]:.3f} m of a surface at {times[k]:.2f} s, at {_listed(points[k])}; "
+            f"clearance_m is {clearance_m:g}: move the path {away} or reduce clearance_m"
         )
+
+
+def _listed(point: FloatArray) -> str:
+    return "[" + ", ".join(f"{x:.2f}" for x in point) + "]"
+
+
+def _free_nearby(points: FloatArray, distance: FloatArray, k: int, triangles: FloatArray, clearance_m: float) -> str:
+    """' (free within 0.4 m: [x, y, z])' of the place with clearance_m that is nearest to points[k], or '' without one.
+
+    points (n, 3) of a path and their distances (n,), inf beyond clearance_m. A wall must not part the place from the
+    path: from the last point with clearance before k, or else the first after it, one can see it.
+    """
+    steps = np.arange(1, _SHELLS + 1) / _SHELLS * max(_NEARBY_M, 2.0 * clearance_m)
+    around = trimesh.creation.icosphere(subdivisions=2).vertices
+    places = np.round(points[k] + (steps[:, None, None] * around).reshape(-1, 3), 2)
+    places = places[nearest_surface(places, triangles, clearance_m)[0] >= clearance_m]
+    free = np.flatnonzero(distance >= clearance_m)
+    if not len(places) or not len(free):
+        return ""
+    before = free[free < k]
+    seen_from = points[before[-1] if len(before) else free[0]]
+    far = np.linalg.norm(places - points[k], axis=1)
+    for nearest in np.argsort(far, kind="stable")[:_TRIED]:
+        count = max(2, math.ceil(float(np.linalg.norm(places[nearest] - seen_from)) / _SIGHT_M))
+        sight = seen_from + np.linspace(0.0, 1.0, count)[:, None] * (places[nearest] - seen_from)
+        if np.isinf(nearest_surface(sight, triangles, 0.6 * _SIGHT_M)[0]).all():
+            return f" (free within {math.ceil(10.0 * far[nearest]) / 10.0:.1f} m: {_listed(places[nearest])})"
+    return ""
 
 
 def plan_tour(

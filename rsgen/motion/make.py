@@ -31,6 +31,18 @@ def make_motion(config: MotionConfig, seed: int) -> Trajectory:
     seed: of the hand-shake, where config.seed names no other. Length and mean speeds are those of the poses, chord by
     chord, as `motion_statistics` measures them. Raises UserError if no motion of this kind meets them.
     """
+    path, trajectory = _parts(config, seed)
+    return trajectory(*_solve(config, path, lambda size, angle: motion_statistics(trajectory(size, angle))))
+
+
+def least_turning(config: MotionConfig, seed: int) -> float:
+    """Mean rotational speed in deg/s of the motion without its sway: mean_rotation_deg_s cannot be less."""
+    path, trajectory = _parts(config, seed)
+    return motion_statistics(trajectory(path.first_size, 0.0)).mean_rotation_deg_s
+
+
+def _parts(config: MotionConfig, seed: int) -> tuple[Path, Callable[[float, float], Trajectory]]:
+    """The path, and the trajectory of a size and an angle of it, hand-shake included."""
     duration = config.duration_s
     count = math.ceil(duration * RATE_HZ)
     t = np.linspace(0.0, duration, count + 1)
@@ -49,7 +61,7 @@ def make_motion(config: MotionConfig, seed: int) -> Trajectory:
         T[:, 3, 3] = 1.0
         return Trajectory(t, T)
 
-    return trajectory(*_solve(config, path, lambda size, angle: motion_statistics(trajectory(size, angle))))
+    return path, trajectory
 
 
 def _solve(

@@ -1,0 +1,98 @@
+"""What a camera on a closed walk looks at: surfaces at 1 to 3 m, with shape, and no sudden turns."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from rsgen.array_types import FloatArray
+from rsgen.motion.floor_plan import Cast
+
+_AZIMUTHS = 48
+_PITCHES_DEG = (-25.0, -15.0, -5.0)
+_ELEVATIONS_DEG = np.arange(-45.0, 16.0, 10.0)
+_HALF_HEIGHT_DEG = 21.0  # of the field of view, about: a Kinect's
+_HALF_WIDTH_DEG = 29.0
+# How welcome a surface is at a distance: too close there is no depth, too far it is coarse.
+_DISTANCE_M = (0.4, 0.9, 1.2, 3.0, 4.5, 10.0)
+_WORTH = (-3.0, 0.0, 1.0, 1.0, 0.3, -0.3)
+_NOTHING = -5.0
+_SHAPE = 0.8
+_AHEAD = 0.7
+_CHANCE = 0.15
+_EASY_DEG = 30.0
+_MOST_DEG = 60.0  # from a waypoint to the next: the targets' chord stays well before the camera
+_TARGET_M = 2.0
+_GRID = np.linspace(-0.95, 0.95, 12)
+
+
+def choose_targets(p_world: FloatArray, cast: Cast, calm: float, rng: np.random.Generator) -> FloatArray:
+    """Points (n, 3), world, m, to look at from the camera centres (n, 3) of a closed walk, which are 60 cm apart.
+
+    The best sum over all views of their worth, less what turning costs: calm for 30° from one to the next. Views are
+    worth more if surfaces are at 1 to 3 m and face different ways, and if they are ahead rather than behind: so the
+    camera comes to look at all sides. rng adds a little, so that seeds differ.
+    """
+    worth = _views(p_world, cast)
+    way = np.roll(p_world, -1, axis=0) - np.roll(p_world, 1, axis=0)
+    course = np.arctan2(way[:, 2], way[:, 0])[:, None] - np.arange(_AZIMUTHS) * (math.tau / _AZIMUTHS)
+    best = worth.max(axis=2) + _AHEAD * np.cos(course) + _CHANCE * rng.random(worth.shape[:2])
+    azimuth = _closed_way(best, calm)
+    pitch = np.radians(np.take(_PITCHES_DEG, worth[np.arange(len(worth)), azimuth].argmax(axis=1)))
+    return p_world + _TARGET_M * _direction(azimuth * (math.tau / _AZIMUTHS), pitch)
+
+
+def seen_distances(T_world_cam: FloatArray, cast: Cast) -> FloatArray:
+    """Distances (n, rays) in metres, inf for nothing, along a grid of rays through the views of cameras (n, 4, 4)."""
+    x, y = np.meshgrid(np.tan(np.radians(_HALF_WIDTH_DEG)) * _GRID, np.tan(np.radians(_HALF_HEIGHT_DEG)) * _GRID)
+    rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    direction = np.einsum("nij,rj->nri", T_world_cam[:, :3, :3], rays).reshape(-1, 3)
+    distance, _ = cast(np.repeat(T_world_cam[:, :3, 3], len(rays), axis=0), direction)
+    return distance.reshape(len(T_world_cam), len(rays))
+
+
+def _direction(azimuth: FloatArray, elevation: FloatArray) -> FloatArray:
+    """Unit directions (..., 3), world, y up."""
+    level = np.cos(elevation)
+    return np.stack([level * np.cos(azimuth), np.sin(elevation), level * np.sin(azimuth)], axis=-1)
+
+
+def _views(p_world: FloatArray, cast: Cast) -> FloatArray:
+    """Worth (n, azimuths, pitches) of a view from each place in each direction."""
+    azimuth, elevation = np.arange(_AZIMUTHS) * (math.tau / _AZIMUTHS), np.radians(_ELEVATIONS_DEG)
+    rays = _direction(*np.meshgrid(azimuth, elevation, indexing="ij")).reshape(-1, 3)
+    distance, normal = cast(np.repeat(p_world, len(rays), axis=0), np.tile(rays, (len(p_world), 1)))
+    shape = (len(p_world), _AZIMUTHS, len(elevation))
+    worth = np.where(np.isfinite(distance), np.interp(distance, _DISTANCE_M, _WORTH), _NOTHING).reshape(shape)
+    towards = -np.sign(np.einsum("ij,ij->i", normal, np.tile(rays, (len(p_world), 1))))
+    normal = (normal * towards[:, None]).reshape(*shape, 3)
+    half = round(_HALF_WIDTH_DEG / 360.0 * _AZIMUTHS)
+    views = []
+    for pitch in _PITCHES_DEG:
+        rows = np.abs(_ELEVATIONS_DEG - pitch) <= _HALF_HEIGHT_DEG
+        seen, facing = worth[..., rows].mean(axis=2), normal[:, :, rows].mean(axis=2)
+        sides = [(np.roll(seen, k, axis=1), np.roll(facing, k, axis=1)) for k in range(-half, half + 1)]
+        alike = np.linalg.norm(np.mean([side[1] for side in sides], axis=0), axis=-1)
+        views.append(np.mean([side[0] for side in sides], axis=0) + _SHAPE * (1.0 - alike))
+    return np.stack(views, axis=-1)
+
+
+def _closed_way(worth: FloatArray, calm: float) -> FloatArray:
+    """Azimuths (n,) of most worth (n, azimuths) in all, less what it costs to turn from each to the next, in a ring."""
+    turn = np.abs((np.arange(_AZIMUTHS)[:, None] - np.arange(_AZIMUTHS) + _AZIMUTHS // 2) % _AZIMUTHS - _AZIMUTHS // 2)
+    degrees = turn * (360.0 / _AZIMUTHS)
+    cost = np.where(degrees <= _MOST_DEG, calm * (degrees / _EASY_DEG) ** 2, np.inf)
+    # Dynamic programming for all first azimuths at once: sums[first, last].
+    sums = np.where(np.eye(_AZIMUTHS, dtype=bool), worth[0], -np.inf)
+    before = []
+    for here in worth[1:]:
+        through = sums[:, :, None] - cost
+        before.append(through.argmax(axis=1))
+        sums = through.max(axis=1) + here
+    first, last = np.unravel_index(np.argmax(sums - cost.T), sums.shape)
+    way = [last]
+    for step in before[::-1]:
+        way.append(step[first, way[-1]])
+    return np.array(way[::-1])

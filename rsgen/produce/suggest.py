@@ -1,0 +1,285 @@
+"""A tour through a scene that nobody has planned one for: a config to start from, and what was found on the way."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from rsgen.array_types import FloatArray
+from rsgen.config.config import Config, validate_config
+from rsgen.config.motion import MAX_DURATION_S, Waypoint
+from rsgen.device.backend import mitsuba
+from rsgen.errors import UserError
+from rsgen.files import encode_yaml
+from rsgen.geometry.spline import Spline
+from rsgen.motion.clearance import clearance, plan_tour
+from rsgen.motion.floor_plan import HIGHEST_M, Cast, FloorPlan, find_floors, floor_plan, share_without_floor
+from rsgen.motion.gaze import choose_targets, seen_distances
+from rsgen.motion.make import least_turning
+from rsgen.motion.statistics import motion_statistics
+from rsgen.motion.walk import free_region, ring, walk_inside
+from rsgen.produce.generate import load_motion, scene_triangles
+
+_STOREYS = 6  # floors that are looked at, the largest first
+_LARGE = 0.3  # of the scene's ground, what walls enclose where the scene is a room
+_ATTEMPTS = 4
+_CALM = (0.08, 0.2, 1.0)
+_BRISK_DEG_S = 35.0  # mean rotational speed of hand-held recordings: 15 to 40
+_SWAY_SHARE, _SWAY_DEG_S = 1.08, 1.5  # what the slow turning adds to that of the tour
+_ROOM_M, _LARGEST_THING_M, _SMALLEST_M, _FARTHEST_M = 2.5, 50.0, 0.001, 9000.0
+_UNITS = {"centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254}
+_SKIN = 0.01  # of a scene's size: what lies so flat is its ground
+_SLACK_M = 0.04
+_REACH_M = 1.0  # so near a surface's distance is told
+_HAND: dict[str, Any] = {
+    "sway": [0.7, 1.0, 0.7],
+    "sway_hz": 0.25,
+    "shake_position_m": 0.004,
+    "shake_exponent": 2.5,
+    "shake_band_hz": [0.5, 5.5],
+    "shake_rotation_deg": 0.4,
+}
+_SEEN_M = (0.4, 5.0)
+_VIEWS = 40
+_EMPTY, _DARK = 0.3, 0.02
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What a tour should be like: seconds and m/s, least distance to surfaces in m, and a seed for all that is chance.
+
+    Raises UserError, naming the option, if one of them is out of bounds.
+    """
+
+    seconds: float = 20.0
+    speed_m_s: float = 0.35
+    clearance_m: float = 0.2
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        bounds = {
+            "seconds": (self.seconds, 2.0, MAX_DURATION_S),
+            "speed": (self.speed_m_s, 0.01, 10.0),
+            "clearance": (self.clearance_m, 0.01, 10.0),
+            "seed": (self.seed, 0, 2**31 - 1),
+        }
+        for option, (value, least, most) in bounds.items():
+            if not least <= value <= most:
+                raise UserError(f"--{option} {value:g}: must lie in {least:g} to {most:.10g}")
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """A config whose motion keeps its distance, and what was found, a line a fact."""
+
+    config: Config
+    found: tuple[str, ...]
+
+    def yaml(self, folder: Path) -> bytes:
+        """The config as a file in `folder`, with what was found as its comment."""
+        assert self.config.motion is not None
+        data = {
+            "name": self.config.name,
+            "motion": self.config.motion.model_dump(mode="json", exclude_unset=True),
+            "scene": {"file": os.path.relpath(self.config.scene.file, folder)},
+        }
+        return "".join(f"# {line}\n" for line in self.found).encode() + encode_yaml(data)
+
+
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    """A scene file's triangles (m, 3, 3), world, m, and rays into it."""
+
+    file: Path
+    triangles: FloatArray
+    cast: Cast
+
+    @property
+    def box(self) -> tuple[FloatArray, FloatArray]:
+        """Its least and largest corner (3,)."""
+        return self.triangles.min(axis=(0, 1)), self.triangles.max(axis=(0, 1))
+
+    def wrong(self, what: str) -> UserError:
+        """An error of one line that names the file."""
+        return UserError(f"scene {self.file}: {what}")
+
+
+@dataclass(frozen=True, eq=False)
+class _Thing:
+    """Corners (3,) of the box of all but the ground, and the ground's height; world, m."""
+
+    low: FloatArray
+    high: FloatArray
+    ground_y: float
+
+
+def suggest_tour(file: Path, name: str | None, wish: Wish) -> Suggestion:
+    """A tour through the scene `file`: through its largest room, or round the thing that it holds.
+
+    name: of the sequence; None: after the file. Raises UserError naming the file if there is no place for a camera, no
+    floor, or no scene, and if the scene is a room in another unit than metres.
+    """
+    mitsuba()
+    from rsgen.render.rays import cast_rays
+    from rsgen.render.scene import load_scene
+
+    loaded = load_scene(file)
+    scene = _Scene(file, scene_triangles(loaded), partial(cast_rays, loaded))
+    name = re.sub(r"[^A-Za-z0-9_-]+", "_", file.stem) if name is None else name
+    aim = _room(scene, wish.clearance_m) or _thing(scene)
+    if (farthest := float(np.abs(scene.triangles).max())) > _FARTHEST_M:
+        raise scene.wrong(f"reaches {farthest:.0f} m from the origin: scale it to metres, or move it to the origin")
+    rng = np.random.default_rng(wish.seed)
+    for _ in range(_ATTEMPTS):
+        tours = _through(scene, aim, wish, rng) if isinstance(aim, FloorPlan) else [_round(scene, aim, wish, rng)]
+        config = _config(scene, tours, name, wish)
+        spline = load_motion(config).spline
+        least = clearance(spline, scene.triangles, max(_REACH_M, wish.clearance_m))
+        if least >= wish.clearance_m:
+            where = _room_text(aim, wish.clearance_m) if isinstance(aim, FloorPlan) else _thing_text(aim)
+            return Suggestion(config, (f"{file.name}: {where}", *_motion_text(scene, config, spline, least)))
+    raise scene.wrong(f"no tour found that keeps {wish.clearance_m:g} m from all surfaces: reduce --clearance")
+
+
+def _room(scene: _Scene, clearance_m: float) -> FloorPlan | None:
+    """The plan of the floor with the largest room for a camera; None where the scene is no room. Raises UserError."""
+    low, high = scene.box
+    best, most = None, 0.0
+    for floor in find_floors(scene.cast, low, high)[:_STOREYS]:
+        if floor.area_m2 < most:
+            break  # the others are smaller yet
+        plan = floor_plan(scene.triangles, scene.cast, floor, clearance_m)
+        free = plan.area_m2(plan.largest(clearance_m))
+        if plan.inside.any() and (best is None or free > most):
+            best, most = plan, free
+    if best is None:
+        if share_without_floor(scene.cast, low, high) >= _LARGE:
+            raise scene.wrong("walls but no floor below them: add a floor, or turn the scene so that y is up")
+        return None
+    height = float(high[1] - low[1])
+    if height > HIGHEST_M:
+        unit, scale = min(_UNITS.items(), key=lambda u: abs(math.log(u[1] * height / _ROOM_M)))
+        raise scene.wrong(
+            f"a room of {height:.0f} from bottom to top is one in {unit}, but scenes are in metres: set scene.scale to "
+            f"{scale:g}, or scale the file"
+        )
+    if free_region(best, clearance_m) is not None:
+        return best
+    if not best.solid and best.inside.mean() >= _LARGE:
+        raise scene.wrong(
+            f"no room for a camera: no way between its walls at eye height keeps {clearance_m:g} m from all surfaces: "
+            "reduce --clearance, or see that the scene is in metres and y up"
+        )
+    return None
+
+
+def _thing(scene: _Scene) -> _Thing:
+    """All but the ground. Raises UserError if there is nothing else, or next to nothing."""
+    low, high = scene.box
+    size = float((high - low).max())
+    rest = scene.triangles[scene.triangles[..., 1].max(axis=1) > low[1] + _SKIN * size]
+    if not len(rest):
+        raise scene.wrong("holds nothing but a floor: add something to look at")
+    if size < _SMALLEST_M:
+        raise scene.wrong(f"all of it lies within {1000.0 * size:.2g} mm: scale it to metres")
+    return _Thing(rest.min(axis=(0, 1)), rest.max(axis=(0, 1)), float(low[1]))
+
+
+def _through(scene: _Scene, plan: FloorPlan, wish: Wish, rng: np.random.Generator) -> list[tuple[Waypoint, ...]]:
+    """Tours through a room along one walk, whose gaze is ever calmer."""
+    p_world = walk_inside(plan, wish.seconds * wish.speed_m_s, wish.clearance_m, rng)
+    if p_world is None:
+        raise scene.wrong(f"no walk keeps {wish.clearance_m:g} m from all surfaces: reduce --clearance")
+    state = int(rng.integers(2**31))
+    return [
+        _waypoints(p_world, choose_targets(p_world, scene.cast, calm, np.random.default_rng(state))) for calm in _CALM
+    ]
+
+
+def _round(scene: _Scene, thing: _Thing, wish: Wish, rng: np.random.Generator) -> tuple[Waypoint, ...]:
+    """A tour round a thing, pushed off what else is there."""
+    waypoints = _waypoints(*ring(thing.low, thing.high, thing.ground_y, rng))
+    try:
+        return plan_tour(scene.triangles, waypoints, wish.clearance_m + _SLACK_M)
+    except UserError as error:
+        raise scene.wrong(f"no way round what stands there ({error})") from None
+
+
+def _waypoints(p_world: FloatArray, target: FloatArray) -> tuple[Waypoint, ...]:
+    return tuple(
+        Waypoint(position=p, target=t)
+        for p, t in zip(np.round(p_world, 3).tolist(), np.round(target, 3).tolist(), strict=True)
+    )
+
+
+def _config(scene: _Scene, tours: Sequence[tuple[Waypoint, ...]], name: str, wish: Wish) -> Config:
+    """The config of the first tour that turns no faster than people do, or of the last."""
+    for waypoints in tours:
+        motion = {
+            "kind": "tour", "length_m": round(wish.seconds * wish.speed_m_s, 3), "mean_speed_m_s": wish.speed_m_s,
+            "mean_rotation_deg_s": 1e4, "waypoints": [w.model_dump() for w in waypoints],
+            "ramp_s": min(1.0, 0.2 * wish.seconds), **_HAND, "clearance_m": wish.clearance_m, "seed": wish.seed,
+        }  # fmt: skip
+        data = {"name": name, "motion": motion, "scene": {"file": scene.file}}
+        asked = validate_config(data, "motion suggest").motion
+        assert asked is not None
+        least = least_turning(asked, wish.seed)
+        motion["mean_rotation_deg_s"] = round(max(_SWAY_SHARE * least, least + _SWAY_DEG_S), 1)
+        if least <= _BRISK_DEG_S:
+            break
+    return validate_config(data, "motion suggest")
+
+
+def _room_text(plan: FloorPlan, clearance_m: float) -> str:
+    cells = free_region(plan, clearance_m)
+    assert cells is not None
+    area, gap = plan.area_m2(cells), plan.floor.gap_m
+    high = f"{gap:.2f} m high, {area * gap:.1f} m³ free" if math.isfinite(gap) else "without a ceiling"
+    return f"a room, {high}; {plan.eye_y - plan.floor.y:.2f} m above the floor a camera has {area:.1f} m²"
+
+
+def _thing_text(thing: _Thing) -> str:
+    size = thing.high - thing.low
+    text = "a thing of {:.2f} x {:.2f} x {:.2f} m, and a way round it".format(*size)
+    if size.max() <= _LARGEST_THING_M:
+        return text
+    return f"{text}; if that is too large, it may be in centimetres: set scene.scale to 0.01"
+
+
+def _motion_text(scene: _Scene, config: Config, spline: Spline, least: float) -> list[str]:
+    """What the spline is like, and what its camera sees."""
+    assert config.motion is not None
+    stats = motion_statistics(spline, 0.0, config.motion.duration_s)
+    times = np.linspace(0.0, config.motion.duration_s, _VIEWS)
+    distance = seen_distances(spline.pose(times), scene.cast)
+    near, far = _SEEN_M
+    seen, nothing = np.mean((distance >= near) & (distance <= far)), np.mean(~np.isfinite(distance))
+    lines = [
+        f"{stats.length_m:.1f} m in {stats.duration_s:.0f} s: {stats.mean_speed_m_s:.2f} m/s, "
+        f"{stats.mean_rotation_deg_s:.0f} deg/s in the mean; "
+        + (f"nearest surface {least:.2f} m" if math.isfinite(least) else f"no surface within {_REACH_M:g} m"),
+        f"surfaces {near:g} to {far:g} m away in {100 * seen:.0f} % of the views, nothing in {100 * nothing:.0f} %",
+    ]
+    if nothing > _EMPTY:
+        lines.append("much of the views is empty: a floor and walls would help a tracker")
+    if scene.file.suffix.lower() != ".xml" and _sky(scene, spline.pose(times)[:, :3, 3]) < _DARK:
+        lines.append(
+            "colour will be dark: a mesh has no lamps, and no sky gets in; name it in a Mitsuba scene with one"
+        )
+    return lines
+
+
+def _sky(scene: _Scene, p_world: FloatArray) -> float:
+    """Share of all directions in which one sees out of the scene from the places (n, 3)."""
+    around = np.asarray(trimesh.creation.icosphere(subdivisions=2).vertices)
+    distance, _ = scene.cast(np.repeat(p_world, len(around), axis=0), np.tile(around, (len(p_world), 1)))
+    return float(np.mean(np.isinf(distance)))
