@@ -22,7 +22,7 @@ Pixels = Annotated[float, limits(-1e6, 1e6, "px")]
 Seconds = Annotated[float, limits(1e-9, 3600, "s", or_zero=True)]
 Row34 = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 Matrix34 = tuple[Row34, Row34, Row34]
-Up = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
+Up = Literal["x", "y", "z", "-x", "-y", "-z"]
 SceneLight = Literal["auto", "sky", "ceiling", "none"]
 _LEAST_FOCAL_PX = 0.01
 
@@ -65,7 +65,7 @@ class SceneConfig(Section):
     file: Path = Field(description="Mitsuba 3 scene .xml, or a mesh file that trimesh reads (light added)")
     scale: Annotated[float, limits(1e-9, 1e9, "m")] = Field(default=1.0, description="metres per unit of a mesh file")
     up: Up = Field(
-        default="auto", description="axis of a mesh file that is up, the world's z; auto: y of glTF, z of others"
+        default="y", description="axis of a mesh file that is up, the world's y"
     )
     light: SceneLight = Field(
         default="auto", description="light of a mesh file; auto: lamps under a room's ceiling, a sky around objects"

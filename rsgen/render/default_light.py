@@ -60,23 +60,23 @@ class Probe:
 
     def lamps(self) -> Lamps | None:
         """Lamps under the ceilings above the middle of the room's height; None if there is no ceiling."""
-        size = self.high - self.low
-        count = np.clip((size[:2] / _CELL_M).astype(int), 1, _MOST_CELLS)
+        size, ground = self.high - self.low, [0, 2]
+        count = np.clip((size[ground] / _CELL_M).astype(int), 1, _MOST_CELLS)
         cells = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1).reshape(-1, 2)
-        middle = np.column_stack([self.low[:2] + (cells + 0.5) / count * size[:2], np.full(len(cells), self.low[2])])
-        middle[:, 2] += size[2] / 2
-        half = min(_LAMP * float((size[:2] / count).min()), _MOST_LAMP_M)
-        square = half * np.array([[-1, -1, 0], [-1, 1, 0], [1, 1, 0], [1, -1, 0]])  # seen from below, counter-clockwise
+        middle = np.tile(self.low + size / 2, (len(cells), 1))
+        middle[:, ground] = self.low[ground] + (cells + 0.5) / count * size[ground]
+        half = min(_LAMP * float((size[ground] / count).min()), _MOST_LAMP_M)
+        square = half * np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]])  # seen from below, counter-clockwise
         starts = middle[:, None] + np.concatenate([square, np.zeros((1, 3))])
-        up = np.tile([0.0, 0.0, 1.0], (starts.size // 3, 1))
+        up = np.tile([0.0, 1.0, 0.0], (starts.size // 3, 1))
         above = self._cast(starts.reshape(-1, 3), up)[0].reshape(starts.shape[:2])
         inside = np.isfinite(above).all(axis=1)
         if not inside.any():
             return None
         corners = starts[inside, :4]
-        corners[..., 2] += (1 - _GAP) * above[inside].min(axis=1, keepdims=True)
+        corners[..., 1] += (1 - _GAP) * above[inside].min(axis=1, keepdims=True)
         area = len(corners) * (2 * half) ** 2
-        floor = size[:2].prod() * inside.mean()
+        floor = size[ground].prod() * inside.mean()
         return Lamps(corners, float(_IRRADIANCE * floor / (np.pi * area)))
 
     def _cast(self, origins: FloatArray, directions: FloatArray) -> tuple[FloatArray, BoolArray]:

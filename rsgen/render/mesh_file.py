@@ -33,14 +33,14 @@ log = logging.getLogger("rsgen")
 # Raise when files are read in another way, so that light baked for the older one is not taken for the new one's.
 _READING = 1
 _USUAL_M = (0.02, 300.0)  # sizes outside are rather wrong units
-# Rotations that bring an axis of the file up.
+# Rotations that bring an axis of the file up, the world's y.
 _UP = {
-    "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-    "-z": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
-    "y": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
-    "-y": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
-    "x": [[0, 0, -1], [0, 1, 0], [1, 0, 0]],
-    "-x": [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],
+    "y": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    "-y": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
+    "z": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+    "-z": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+    "x": [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
+    "-x": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
 }
 
 
@@ -48,11 +48,11 @@ _UP = {
 class MeshOptions:
     """How a mesh file becomes a scene: metres per unit of the file, which of its axes is up, what lights it.
 
-    up: auto is y for glTF, as its standard says, and z for others. light: see `rsgen.render.default_light`.
+    light: see `rsgen.render.default_light`.
     """
 
     scale: float = 1.0
-    up: Up = "auto"
+    up: Up = "y"
     light: SceneLight = "auto"
 
 
@@ -76,7 +76,7 @@ def read_parts(path: Path, options: MeshOptions) -> list[Part]:
         if libraries:
             files[libraries[0]] = b"\n".join(files[name] for name in libraries)  # trimesh reads the first only
     loaded = trimesh.load_scene(io.BytesIO(data), file_type=path.suffix[1:].lower(), resolver=files, process=False)
-    T_world_file = _world(path, options)
+    T_world_file = _world(options)
     looks = Looks(path, header)
     parts, dropped = [], 0
     for node in loaded.graph.nodes_geometry:  # in the file's order; never sort by name, some are random
@@ -184,12 +184,9 @@ def _refuse_unreadable_texture(path: Path, name: str, data: bytes) -> None:
         raise UserError(f"scene {path}: texture '{name}' cannot be read: make it a PNG or a JPEG") from None
 
 
-def _world(path: Path, options: MeshOptions) -> FloatArray:
-    up = options.up
-    if up == "auto":
-        up = "y" if path.suffix.lower() in gltf.SUFFIXES else "z"
+def _world(options: MeshOptions) -> FloatArray:
     T_world_file = np.eye(4)
-    T_world_file[:3, :3] = options.scale * np.array(_UP[up], float)
+    T_world_file[:3, :3] = options.scale * np.array(_UP[options.up], float)
     return T_world_file
 
 

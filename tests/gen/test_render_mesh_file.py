@@ -38,6 +38,8 @@ CAMERA = Camera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5)
 DIRECT = {"type": "direct", "emitter_samples": 0, "bsdf_samples": 1}
 SKY = {"type": "constant", "radiance": {"type": "rgb", "value": 0.8}}
 AXES = {"x": 0, "y": 1, "z": 2}
+# What is up in these glTF files is along the world's z, from where they are looked at.
+TURNED = MeshOptions(up="-z")
 
 
 def looking(eye: Any, target: Any) -> np.ndarray:
@@ -188,7 +190,7 @@ def test_a_glb_renders_as_the_same_content_written_by_hand(tmp_path: Path) -> No
         matte = {"type": "twosided", "inner": {"type": "diffuse", "reflectance": paint}}
         by_hand[f"shape{k}"] = {"type": "obj", "filename": str(tmp_path / f"{k}.obj"), "face_normals": True, "b": matte}
     T_world_cam = looking((0.8, -4.5, 2.2), (0, 0, 0.4))
-    loaded, reference = load_scene(path), mi.load_dict(by_hand, optimize=False)
+    loaded, reference = load_scene(path, options=TURNED), mi.load_dict(by_hand, optimize=False)
     traced = psnr(ours(loaded, T_world_cam, mi.load_dict(DIRECT), 256), stock(reference, T_world_cam, DIRECT, 256))
     assert traced > 40
     expected = stock(reference, T_world_cam, {"type": "path", "max_depth": 5}, 512)
@@ -232,7 +234,7 @@ def test_shiny_surfaces_look_the_same_traced_and_in_baked_light(tmp_path: Path) 
         smooth = trimesh.Trimesh(ball.vertices, ball.faces, vertex_normals=ball.vertices / 0.4, visual=visual)
         scene.add_geometry(smooth, transform=trimesh.transformations.translation_matrix([k - 1, -0.1, 0]))
     scene.export(tmp_path / "balls.glb", include_normals=True)
-    loaded = load_scene(tmp_path / "balls.glb")
+    loaded = load_scene(tmp_path / "balls.glb", options=TURNED)
     T_world_cam = looking((0.8, -2.4, 0.8), (0, 0, -0.1))
     expected = stock(loaded, T_world_cam, {"type": "path", "max_depth": 6}, 512)
     value = psnr(ours(loaded, T_world_cam, baked(loaded, 0.1), 32), expected)
@@ -246,27 +248,27 @@ def test_colours_of_a_gltf_are_linear_and_factors(tmp_path: Path, caplog: pytest
     colors = np.array([[0.02, 0.5, 0.9], [0.4, 0.1, 0.3], [0.4, 0.1, 0.3], [0.02, 0.5, 0.9]], np.float32)
     arrays = flat_arrays() | {"COLOR_0": colors}
     left, factor = np.array([[-0.999, 0.0]]), [0.5, 1.0, 0.25, 1.0]
-    plain = load_scene(write_gltf(tmp_path / "plain.gltf", arrays, None))
+    plain = load_scene(write_gltf(tmp_path / "plain.gltf", arrays, None), options=TURNED)
     np.testing.assert_allclose(albedo(plain, left)[0], colors[0], atol=1e-3)
     tinted = {"pbrMetallicRoughness": {"baseColorFactor": factor, "metallicFactor": 0}}
-    scene = load_scene(write_gltf(tmp_path / "tinted.gltf", arrays, tinted))
+    scene = load_scene(write_gltf(tmp_path / "tinted.gltf", arrays, tinted), options=TURNED)
     np.testing.assert_allclose(albedo(scene, left)[0], colors[0] * factor[:3], atol=1e-3)
     # Bytes are fractions of 255, also linear.
     arrays["COLOR_0"] = np.tile(np.array([51, 102, 204, 255], np.uint8), (4, 1))
-    scene = load_scene(write_gltf(tmp_path / "bytes.gltf", arrays, tinted))
+    scene = load_scene(write_gltf(tmp_path / "bytes.gltf", arrays, tinted), options=TURNED)
     np.testing.assert_allclose(albedo(scene, left)[0], [0.1, 0.4, 0.2], rtol=1e-4)
     # One colour for all vertices is a factor on a texture too; several are not, which is said.
     papered = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicFactor": 0}}
     white = with_image(np.full((2, 2, 3), 255, np.uint8))
-    scene = load_scene(write_gltf(tmp_path / "papered.gltf", arrays, papered, **white))
+    scene = load_scene(write_gltf(tmp_path / "papered.gltf", arrays, papered, **white), options=TURNED)
     np.testing.assert_allclose(albedo(scene, left)[0], [0.2, 0.4, 0.8], rtol=1e-3)
     arrays["COLOR_0"] = colors
     with caplog.at_level("WARNING"):
-        scene = load_scene(write_gltf(tmp_path / "both.gltf", arrays, papered, **white))
+        scene = load_scene(write_gltf(tmp_path / "both.gltf", arrays, papered, **white), options=TURNED)
     assert "vertex colours of 'GLTF' left out" in caplog.text
     np.testing.assert_allclose(albedo(scene, left)[0], 1, rtol=1e-3)
     del arrays["COLOR_0"]
-    scene = load_scene(write_gltf(tmp_path / "grey.gltf", arrays, None))
+    scene = load_scene(write_gltf(tmp_path / "grey.gltf", arrays, None), options=TURNED)
     np.testing.assert_allclose(albedo(scene, left)[0], 0.6, rtol=1e-5)
 
 
@@ -302,7 +304,7 @@ def test_textures_lie_as_gltf_says(tmp_path: Path) -> None:
         pbr = {"baseColorTexture": {"index": 0} | info, "metallicFactor": 0.0}
         more = with_image(image, samplers=[{"magFilter": 9728} | sampler], textures=[{"source": 0, "sampler": 0}])
         path = write_gltf(tmp_path / "scene.gltf", arrays, {"pbrMetallicRoughness": pbr}, **more)
-        return albedo(load_scene(path), xy).round(3).tolist()
+        return albedo(load_scene(path, options=TURNED), xy).round(3).tolist()
 
     arrays = flat_arrays()
     assert colors({}, arrays) == [red, green, blue, white]
@@ -325,7 +327,7 @@ def test_what_metal_normals_and_emission_become(tmp_path: Path) -> None:
 
     def lobes(**pbr: Any) -> tuple[bool, bool]:
         path = write_gltf(tmp_path / "scene.gltf", flat_arrays(), {"pbrMetallicRoughness": pbr})
-        scene = load_scene(path)
+        scene = load_scene(path, options=TURNED)
         both = int(seen_from_above(scene, middle)[1].flags()[0])
         return bool(both & int(flags.DiffuseReflection)), bool(both & int(flags.GlossyReflection))
 
@@ -342,7 +344,7 @@ def test_what_metal_normals_and_emission_become(tmp_path: Path) -> None:
         "emissiveFactor": [0.1, 0.2, 1.0],
         "extensions": {"KHR_materials_emissive_strength": {"emissiveStrength": 3.0}},
     }  # fmt: skip
-    scene = load_scene(write_gltf(tmp_path / "lean.gltf", flat_arrays(), material, **with_image(image)))
+    scene = load_scene(write_gltf(tmp_path / "lean.gltf", flat_arrays(), material, **with_image(image)), options=TURNED)
     si, bsdf = seen_from_above(scene, np.tile(middle, (2, 1)))
     np.testing.assert_allclose(np.array(si.emitter(scene).eval(si)).T[0], [0.3, 0.6, 3.0], rtol=1e-5)
     wo = si.to_local(mi.Vector3f(np.array([[0.6, -0.6], [0, 0], [0.8, 0.8]], np.float32)))
@@ -363,7 +365,7 @@ def test_what_a_mask_hides_is_not_there(tmp_path: Path, mode: str) -> None:
     pbr = {"baseColorTexture": {"index": 0}, "metallicFactor": 0.0}
     material = {"pbrMetallicRoughness": pbr, "alphaMode": mode}
     path = write_gltf(tmp_path / "disc.gltf", flat_arrays(), material, **with_image(image))
-    scene = load_scene(path)
+    scene = load_scene(path, options=TURNED)
     vertices, faces = surface(scene)
     assert trimesh.Trimesh(vertices, faces).area == pytest.approx(np.pi * radius**2, rel=1.5e-3)
     xy = np.random.default_rng(1).uniform(-1, 1, (4000, 2))
@@ -379,29 +381,29 @@ def test_what_a_mask_hides_is_not_there(tmp_path: Path, mode: str) -> None:
     assert not z[off > 0.04].any()
     # An opaque material takes no notice of alpha.
     del material["alphaMode"]
-    whole = load_scene(write_gltf(path, flat_arrays(), material, **with_image(image)))
+    whole = load_scene(write_gltf(path, flat_arrays(), material, **with_image(image)), options=TURNED)
     assert len(surface(whole)[1]) == 2
     # Where the picture repeats, so do its holes.
     material["alphaMode"] = mode
     arrays = flat_arrays()
     arrays["TEXCOORD_0"] *= 3
-    vertices, faces = surface(load_scene(write_gltf(path, arrays, material, **with_image(image))))
+    vertices, faces = surface(load_scene(write_gltf(path, arrays, material, **with_image(image)), options=TURNED))
     assert trimesh.Trimesh(vertices, faces).area == pytest.approx(np.pi * radius**2, rel=1e-2)
 
 
 # --- where things are
 
 
-@pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z", "auto"])
+@pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z"])
 def test_scale_and_up_place_every_point(tmp_path: Path, up: Any) -> None:
     rng = np.random.default_rng(8)
     mesh = trimesh.creation.icosphere(1)
     mesh.vertices *= rng.uniform(0.5, 2.0, (len(mesh.vertices), 1)) * [1, 2, 3]
     mesh.export(tmp_path / "blob.stl")
     scene = load_scene(tmp_path / "blob.stl", options=MeshOptions(scale=0.25, up=up))
-    axis, sign = ("z", 1) if up == "auto" else (up[-1], -1 if up[0] == "-" else 1)
+    axis, sign = up[-1], -1 if up[0] == "-" else 1
     vertices, faces = surface(scene)
-    heights = np.sort(vertices[faces][..., 2].ravel())
+    heights = np.sort(vertices[faces][..., 1].ravel())
     np.testing.assert_allclose(heights, np.sort(0.25 * sign * mesh.triangles[..., AXES[axis]].ravel()), atol=1e-5)
     # A rotation: nothing is mirrored. Rays from outside then meet what trimesh says they meet.
     assert trimesh.Trimesh(vertices, faces).volume == pytest.approx(mesh.volume * 0.25**3, rel=1e-4)
@@ -417,10 +419,10 @@ def test_scale_and_up_place_every_point(tmp_path: Path, up: Any) -> None:
 
 
 def _rotation(axis: str, sign: int) -> Any:
-    """The rotation by a quarter turn about a horizontal axis, or by a half turn about x, that takes sign·axis to z."""
-    if axis == "z":
+    """The rotation by a quarter turn about a horizontal axis, or by a half turn about x, that takes sign·axis to y."""
+    if axis == "y":
         return np.diag([1, sign, sign])
-    about = np.cross(np.eye(3)[AXES[axis]] * sign, [0, 0, 1.0])
+    about = np.cross(np.eye(3)[AXES[axis]] * sign, [0, 1.0, 0])
     return np.round(trimesh.transformations.rotation_matrix(np.pi / 2, about)[:3, :3])
 
 
@@ -439,7 +441,7 @@ def test_shapes_are_in_one_order_whatever_their_nodes_are_called(tmp_path: Path)
     header["scenes"] = [{"nodes": [3, 1, 0, 2]}]
     header["materials"] = [{}]
     path.write_text(json.dumps(header))
-    scenes = [[mesh_arrays(shape) for shape in load_scene(path).shapes()] for _ in range(6)]
+    scenes = [[mesh_arrays(shape) for shape in load_scene(path, options=TURNED).shapes()] for _ in range(6)]
     assert [len(faces) for _, faces in scenes[0]] == [8, 4]  # one shape a material
     for other in scenes[1:]:
         for (v, f), (v0, f0) in zip(other, scenes[0], strict=True):
@@ -460,7 +462,7 @@ def test_normals_turn_with_their_surfaces(tmp_path: Path) -> None:
         T = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3]) @ np.diag([-1.0, 2.0, 0.5, 1.0])
         scene.add_geometry(smooth, transform=T)
         scene.export(tmp_path / "ball.glb", include_normals=normals)
-        loaded = load_scene(tmp_path / "ball.glb", options=MeshOptions(up="z"))
+        loaded = load_scene(tmp_path / "ball.glb", options=MeshOptions())
         si, _ = seen_from_above(loaded, np.random.default_rng(2).uniform(-0.4, 0.4, (500, 2)))
         # The ellipsoid's own normal is the gradient of |T⁻¹ p|².
         gradient = np.array(si.p).T @ np.linalg.inv(T[:3, :3] @ T[:3, :3].T)
@@ -495,26 +497,29 @@ def test_rooms_get_lamps_and_objects_a_sky(tmp_path: Path) -> None:
         files[name] = tmp_path / f"{name}.ply"
 
     def lights(name: str, light: Any = "auto") -> list[bool]:
-        return [bool(e.is_environment()) for e in load_scene(files[name], options=MeshOptions(light=light)).emitters()]
+        return [
+            bool(e.is_environment())
+            for e in load_scene(files[name], options=MeshOptions(up="z", light=light)).emitters()
+        ]
 
     assert lights("ball") == [True] and lights("open") == [True] and lights("turned") == [True]
     assert lights("room") == lights("crooked") == [False] * 2  # one for each 2.5 m
     assert lights("room", "sky") == [True] and lights("room", "none") == []
     assert lights("turned", "ceiling") == [False] * 2  # walls that face outwards: an object, unless one says so
     with pytest.raises(UserError, match=r"open\.ply: has no ceiling.*scene\.light"):
-        load_scene(files["open"], options=MeshOptions(light="ceiling"))
+        load_scene(files["open"], options=MeshOptions(up="z", light="ceiling"))
     bare = room(open_top=True)
     assert not Probe(mi, np.array(bare.vertices), np.array(bare.faces)).encloses()
-    scene = load_scene(files["room"])
+    scene = load_scene(files["room"], options=MeshOptions(up="z"))
     lamps = [shape for shape in scene.shapes() if shape.is_emitter()]
     for shape in lamps:
         vertices, faces = mesh_arrays(shape)
-        assert 1.0 < vertices[:, 2].min() < 1.25 and np.abs(vertices[:, :2]).max() < 2.5
+        assert 1.0 < vertices[:, 1].min() < 1.25 and np.abs(vertices[:, [0, 2]]).max() < 2.5
         a, b, c = vertices[faces[0]]
-        assert np.cross(b - a, c - a)[2] < 0  # shining down
+        assert np.cross(b - a, c - a)[1] < 0  # shining down
     # The floor is about as bright as a sky would make it in the open.
     field = baked(scene, 0.5)
-    poses = looking((1.5, -2.0, 0.3), (-1.5, 2.0, -0.9))
+    poses = looking((1.5, 0.3, 2.0), (-1.5, -0.9, -2.0))
     seen = ours(scene, poses, field, 4)
     assert 0.3 < np.median(seen) < 0.95
 
@@ -614,6 +619,6 @@ def test_a_config_places_mesh_files_only(tmp_path: Path) -> None:
     for key, value in (("scene.scale", "0"), ("scene.scale", "-1"), ("scene.up", "w"), ("scene.light", "lamp")):
         with pytest.raises(UserError, match=key):
             load_config(tmp_path / "t.yaml", {key: value})
-    for key, value in (("scale", "2"), ("up", "y"), ("light", "sky")):
+    for key, value in (("scale", "2"), ("up", "z"), ("light", "sky")):
         with pytest.raises(UserError, match=f"{key}: is for mesh files"):
             load_config(tmp_path / "t.yaml", {"scene.file": "a.xml", f"scene.{key}": value})
