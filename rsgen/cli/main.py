@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 from rsgen.cli.pictures import SequenceFolder, compare, picture, preview
+from rsgen.config.sections import Up
 from rsgen.console.command_line import Commands, Frames, Json, Parser, Quiet, print_figures, run_program
 from rsgen.console.configs import ConfigFile, config_file, configs_text
 from rsgen.console.scheduler import Scheduler, open_workers
@@ -141,9 +142,11 @@ def stats(
 
 
 def suggest(
-    scene: Annotated[Path, "Mitsuba 3 scene .xml, or a mesh file; metres, y up"],
+    scene: Annotated[Path, "Mitsuba scene .xml, or a mesh file; metres, y up"],
     *,
     out: Annotated[Path | None, "config to write (default: print it)", "YAML"] = None,
+    scale: Annotated[float, "metres per unit of a mesh file (default: 1)", float] = 1.0,
+    up: Annotated[Up, "axis of a mesh file that is up (default: y)"] = "y",
     seconds: Annotated[float, "length of the sequence, s", float] = 20.0,
     speed: Annotated[float, "mean speed, m/s", float] = 0.35,
     clearance: Annotated[float, "least distance to the scene's surfaces, m", float] = 0.2,
@@ -156,7 +159,7 @@ def suggest(
     from rsgen.files import atomic_write
     from rsgen.produce.suggest import Wish, suggest_tour
 
-    suggested = suggest_tour(scene, name, Wish(seconds, speed, clearance, seed))
+    suggested = suggest_tour(scene, name, Wish(seconds, speed, clearance, seed), scale, up)
     text = suggested.yaml((out or Path("here.yaml")).parent)
     if out is None:
         print(text.decode(), end="")

@@ -64,9 +64,7 @@ class SceneConfig(Section):
 
     file: Path = Field(description="Mitsuba 3 scene .xml, or a mesh file that trimesh reads (light added)")
     scale: Annotated[float, limits(1e-9, 1e9, "m")] = Field(default=1.0, description="metres per unit of a mesh file")
-    up: Up = Field(
-        default="y", description="axis of a mesh file that is up, the world's y"
-    )
+    up: Up = Field(default="y", description="axis of a mesh file that is up, the world's y")
     light: SceneLight = Field(
         default="auto", description="light of a mesh file; auto: lamps under a room's ceiling, a sky around objects"
     )

@@ -5,18 +5,18 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 
 from rsgen.array_types import FloatArray
 from rsgen.config.config import Config, validate_config
 from rsgen.config.motion import MAX_DURATION_S, Waypoint
+from rsgen.config.sections import Up
 from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
 from rsgen.files import encode_yaml
@@ -50,7 +50,7 @@ _HAND: dict[str, Any] = {
 }
 _SEEN_M = (0.4, 5.0)
 _VIEWS = 40
-_EMPTY, _DARK = 0.3, 0.02
+_EMPTY = 0.3
 
 
 @dataclass(frozen=True)
@@ -90,18 +90,22 @@ class Suggestion:
         data = {
             "name": self.config.name,
             "motion": self.config.motion.model_dump(mode="json", exclude_unset=True),
-            "scene": {"file": os.path.relpath(self.config.scene.file, folder)},
+            "scene": {
+                **self.config.scene.model_dump(mode="json", exclude_unset=True),
+                "file": os.path.relpath(self.config.scene.file, folder),
+            },
         }
         return "".join(f"# {line}\n" for line in self.found).encode() + encode_yaml(data)
 
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """A scene file's triangles (m, 3, 3), world, m, and rays into it."""
+    """A scene file's triangles (m, 3, 3), world, m, and rays into it. placed: fields of its config but the file."""
 
     file: Path
     triangles: FloatArray
     cast: Cast
+    placed: Mapping[str, Any]
 
     @property
     def box(self) -> tuple[FloatArray, FloatArray]:
@@ -122,18 +126,22 @@ class _Thing:
     ground_y: float
 
 
-def suggest_tour(file: Path, name: str | None, wish: Wish) -> Suggestion:
+def suggest_tour(file: Path, name: str | None, wish: Wish, scale: float = 1.0, up: Up = "y") -> Suggestion:
     """A tour through the scene `file`: through its largest room, or round the thing that it holds.
 
-    name: of the sequence; None: after the file. Raises UserError naming the file if there is no place for a camera, no
-    floor, or no scene, and if the scene is a room in another unit than metres.
+    name: of the sequence; None: after the file. scale, up: of a mesh file, see `MeshOptions`. Raises UserError naming
+    the file if there is no place for a camera, no floor, or no scene, and if it is a room in another unit than metres.
     """
     mitsuba()
+    from rsgen.render.mesh_file import AS_IT_IS, MeshOptions
     from rsgen.render.rays import cast_rays
     from rsgen.render.scene import load_scene
 
-    loaded = load_scene(file)
-    scene = _Scene(file, scene_triangles(loaded), partial(cast_rays, loaded))
+    placed = {key: value for key, value in (("scale", scale), ("up", up)) if value != getattr(AS_IT_IS, key)}
+    if placed and file.suffix.lower() == ".xml":
+        raise UserError(f"--{next(iter(placed))}: is for mesh files: a Mitsuba scene says that itself")
+    loaded = load_scene(file, options=MeshOptions(scale, up))
+    scene = _Scene(file, scene_triangles(loaded), partial(cast_rays, loaded), placed)
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", file.stem) if name is None else name
     aim = _room(scene, wish.clearance_m) or _thing(scene)
     if (farthest := float(np.abs(scene.triangles).max())) > _FARTHEST_M:
@@ -163,14 +171,14 @@ def _room(scene: _Scene, clearance_m: float) -> FloorPlan | None:
             best, most = plan, free
     if best is None:
         if share_without_floor(scene.cast, low, high) >= _LARGE:
-            raise scene.wrong("walls but no floor below them: add a floor, or turn the scene so that y is up")
+            raise scene.wrong("walls but no floor below them: add a floor, or have y up (a mesh file takes --up z)")
         return None
     height = float(high[1] - low[1])
     if height > HIGHEST_M:
         unit, scale = min(_UNITS.items(), key=lambda u: abs(math.log(u[1] * height / _ROOM_M)))
         raise scene.wrong(
-            f"a room of {height:.0f} from bottom to top is one in {unit}, but scenes are in metres: set scene.scale to "
-            f"{scale:g}, or scale the file"
+            f"a room of {height:.0f} from bottom to top is one in {unit}, but scenes are in metres: a mesh file takes "
+            f"--scale {scale:g}, in a Mitsuba scene scale its shapes"
         )
     if free_region(best, clearance_m) is not None:
         return best
@@ -229,7 +237,7 @@ def _config(scene: _Scene, tours: Sequence[tuple[Waypoint, ...]], name: str, wis
             "mean_rotation_deg_s": 1e4, "waypoints": [w.model_dump() for w in waypoints],
             "ramp_s": min(1.0, 0.2 * wish.seconds), **_HAND, "clearance_m": wish.clearance_m, "seed": wish.seed,
         }  # fmt: skip
-        data = {"name": name, "motion": motion, "scene": {"file": scene.file}}
+        data = {"name": name, "motion": motion, "scene": {"file": scene.file, **scene.placed}}
         asked = validate_config(data, "motion suggest").motion
         assert asked is not None
         least = least_turning(asked, wish.seed)
@@ -252,7 +260,7 @@ def _thing_text(thing: _Thing) -> str:
     text = "a thing of {:.2f} x {:.2f} x {:.2f} m, and a way round it".format(*size)
     if size.max() <= _LARGEST_THING_M:
         return text
-    return f"{text}; if that is too large, it may be in centimetres: set scene.scale to 0.01"
+    return f"{text}; if that is too large, it may be in centimetres: a mesh file takes --scale 0.01"
 
 
 def _motion_text(scene: _Scene, config: Config, spline: Spline, least: float) -> list[str]:
@@ -271,15 +279,4 @@ def _motion_text(scene: _Scene, config: Config, spline: Spline, least: float) ->
     ]
     if nothing > _EMPTY:
         lines.append("much of the views is empty: a floor and walls would help a tracker")
-    if scene.file.suffix.lower() != ".xml" and _sky(scene, spline.pose(times)[:, :3, 3]) < _DARK:
-        lines.append(
-            "colour will be dark: a mesh has no lamps, and no sky gets in; name it in a Mitsuba scene with one"
-        )
     return lines
-
-
-def _sky(scene: _Scene, p_world: FloatArray) -> float:
-    """Share of all directions in which one sees out of the scene from the places (n, 3)."""
-    around = np.asarray(trimesh.creation.icosphere(subdivisions=2).vertices)
-    distance, _ = scene.cast(np.repeat(p_world, len(around), axis=0), np.tile(around, (len(p_world), 1)))
-    return float(np.mean(np.isinf(distance)))
