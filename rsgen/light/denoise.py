@@ -48,8 +48,7 @@ def denoised(points: SurfacePoints, which: IntArray, halves: NDArray, spacing: f
     k = min(_NEIGHBOURS, len(which))
     for begin in range(0, len(which), _CHUNK):
         part = slice(begin, begin + _CHUNK)
-        distance, near = tree.query(scaled[part], k=k, workers=-1)
-        distance, near = distance.reshape(-1, k), near.reshape(-1, k)
+        distance, near = (np.reshape(v, (-1, k)) for v in tree.query(scaled[part], k=k, workers=-1))
         spread = half[part, None] + half[near]
         smoothed = np.zeros((len(near), 3))
         for one, other in ((0, 1), (1, 0)):
