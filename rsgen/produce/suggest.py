@@ -133,7 +133,7 @@ def suggest_tour(file: Path, name: str | None, wish: Wish, scale: float = 1.0, u
     the file if there is no place for a camera, no floor, or no scene, and if it is a room in another unit than metres.
     """
     mitsuba()
-    from rsgen.render.mesh_file import AS_IT_IS, MeshOptions
+    from rsgen.render.mesh_files.mesh_file import AS_IT_IS, MeshOptions
     from rsgen.render.rays import cast_rays
     from rsgen.render.scene import load_scene
 

@@ -25,12 +25,12 @@ from rsgen.errors import UserError
 from rsgen.files import encode_png
 from rsgen.render.board import Board, drawing
 from rsgen.render.board import surface as board_surface
-from rsgen.render.instances import turn_mirrored
 from rsgen.render.mended import mend_meshes
-from rsgen.render.mesh_file import AS_IT_IS, MeshOptions, hash_into, mesh_scene
-from rsgen.render.old_xml import METHOD as OLD_XML
-from rsgen.render.parsed import check_files, explained, messages_to_log, parse, prepare, unknown_properties
+from rsgen.render.mesh_files.mesh_file import AS_IT_IS, MeshOptions, hash_into, mesh_scene
 from rsgen.render.ply import joined_triangles, ply_bytes
+from rsgen.render.scene_xml.instances import turn_mirrored
+from rsgen.render.scene_xml.old_xml import METHOD as OLD_XML
+from rsgen.render.scene_xml.parsed import check_files, explained, messages_to_log, parse, prepare, unknown_properties
 
 log = logging.getLogger("rsgen")
 

@@ -26,10 +26,10 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.light.bake import bake
 from rsgen.render.baked import BakedIntegrator
-from rsgen.render.default_light import Probe
 from rsgen.render.images import ColorRenderer, DepthRenderer
 from rsgen.render.irradiance import make_field, make_lattice
-from rsgen.render.mesh_file import MeshOptions
+from rsgen.render.mesh_files.default_light import Probe
+from rsgen.render.mesh_files.mesh_file import MeshOptions
 from rsgen.render.scene import content_hash, load_scene, mesh_arrays, surface
 
 WIDTH, HEIGHT, FOCAL = 80, 60, 70.0

@@ -16,10 +16,10 @@ from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.images import ColorRenderer
-from rsgen.render.old_plugins import Changes
-from rsgen.render.old_xml import old_version, upgrade
-from rsgen.render.parsed import plugin_finder
 from rsgen.render.scene import content_hash, load_scene
+from rsgen.render.scene_xml.old_plugins import Changes
+from rsgen.render.scene_xml.old_xml import old_version, upgrade
+from rsgen.render.scene_xml.parsed import plugin_finder
 
 CAMERA = Camera(80, 60, 60.0, 60.0, 39.5, 29.5)
 

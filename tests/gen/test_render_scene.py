@@ -20,8 +20,8 @@ from rsgen.errors import UserError
 from rsgen.light.bake import bake
 from rsgen.produce.frame_source import make_integrator
 from rsgen.render.irradiance import make_lattice
-from rsgen.render.parsed import messages_to_log
 from rsgen.render.scene import content_hash, ensure_built, load_scene, mesh_arrays, ply_bytes, surface
+from rsgen.render.scene_xml.parsed import messages_to_log
 
 # What 96 segments around leave between chord and circle: radius · (1 − cos(π / 96)).
 SAGITTA = 1 - np.cos(np.pi / 96)

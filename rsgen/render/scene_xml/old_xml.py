@@ -15,7 +15,7 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 from rsgen.errors import UserError
-from rsgen.render.old_plugins import Changes, Exists, Upgrade
+from rsgen.render.scene_xml.old_plugins import Changes, Exists, Upgrade
 
 METHOD = b"old-xml/1"
 """Raise when old files come out differently: their baked light is kept under it."""

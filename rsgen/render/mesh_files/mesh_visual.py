@@ -14,8 +14,8 @@ import trimesh
 from rsgen import srgb
 from rsgen.array_types import FloatArray, IntArray
 from rsgen.errors import UserError
-from rsgen.render import gltf
-from rsgen.render.material import Material, Texture
+from rsgen.render.mesh_files import gltf
+from rsgen.render.mesh_files.material import Material, Texture
 
 log = logging.getLogger("rsgen")
 

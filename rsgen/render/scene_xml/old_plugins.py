@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement
 
-from rsgen.render import old_values as old
+from rsgen.render.scene_xml import old_values as old
 
 _OBJECTS = ("scene", "shape", "bsdf", "texture", "emitter")
 _VALUES = ("float", "integer", "boolean", "string", "point", "vector", "rgb", "spectrum", "transform", "ref", "alias")

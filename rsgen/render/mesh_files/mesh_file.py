@@ -21,11 +21,11 @@ from rsgen.array_types import FloatArray
 from rsgen.config.sections import SceneLight, Up
 from rsgen.errors import UserError
 from rsgen.limits import MOST_M
-from rsgen.render import gltf
-from rsgen.render.cutout import Mask, cut_away
-from rsgen.render.default_light import SKY, Probe
-from rsgen.render.material import bsdf, emitter
-from rsgen.render.mesh_visual import Looks, Part, joined
+from rsgen.render.mesh_files import gltf
+from rsgen.render.mesh_files.cutout import Mask, cut_away
+from rsgen.render.mesh_files.default_light import SKY, Probe
+from rsgen.render.mesh_files.material import bsdf, emitter
+from rsgen.render.mesh_files.mesh_visual import Looks, Part, joined
 from rsgen.render.ply import joined_triangles, ply_bytes
 
 log = logging.getLogger("rsgen")
@@ -48,7 +48,7 @@ _UP = {
 class MeshOptions:
     """How a mesh file becomes a scene: metres per unit of the file, which of its axes is up, what lights it.
 
-    light: see `rsgen.render.default_light`.
+    light: see `rsgen.render.mesh_files.default_light`.
     """
 
     scale: float = 1.0

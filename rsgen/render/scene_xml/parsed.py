@@ -16,9 +16,9 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from rsgen.errors import UserError
-from rsgen.render import old_xml
-from rsgen.render.instances import flatten
-from rsgen.render.old_plugins import Changes, Exists
+from rsgen.render.scene_xml import old_xml
+from rsgen.render.scene_xml.instances import flatten
+from rsgen.render.scene_xml.old_plugins import Changes, Exists
 
 log = logging.getLogger("rsgen")
 

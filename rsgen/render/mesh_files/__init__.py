@@ -1,0 +1,1 @@
+"""Scenes that are mesh files: their parts, materials, cut-outs and light."""

@@ -1,0 +1,1 @@
+"""Scenes in XML: those of older Mitsubas upgraded, instances made into triangles, errors in one line."""
