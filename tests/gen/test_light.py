@@ -522,10 +522,16 @@ def test_the_second_call_loads_what_the_first_baked(tmp_path: Path, monkeypatch:
 
 def test_the_caches_key_depends_on_all_that_decides_the_light() -> None:
     keys = [lighting.cache_key("scene", LIGHT), lighting.cache_key("other scene", LIGHT)]
-    for name, value in {"texel_m": 0.3, "direct_samples": 5, "gather_rays": 17, "bounces": 1}.items():
+    for name, value in {
+        "texel_m": 0.3,
+        "direct_samples": 5,
+        "target_db": 41.0,
+        "gather_rays": 17,
+        "bounces": 1,
+    }.items():
         keys.append(lighting.cache_key("scene", LIGHT.model_copy(update={name: value})))
     assert len(set(keys)) == len(keys)
-    content = {"texel_m", "direct_samples", "gather_rays", "bounces"}
+    content = {"texel_m", "direct_samples", "target_db", "gather_rays", "bounces"}
     assert content | {"mode", "max_depth", "glossy_spp"} == set(LightConfig.model_fields)
     assert lighting.cache_key("scene", LIGHT.model_copy(update={"glossy_spp": 3})) == keys[0]
     # The reference integrator's settings do not touch the bake.

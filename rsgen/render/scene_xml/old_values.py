@@ -19,6 +19,7 @@ def snake(name: str) -> str:
 
 
 def named(e: Element, name: str) -> Element | None:
+    """The child of that name, if there is one."""
     return next((child for child in e if child.get("name") == name), None)
 
 
@@ -32,6 +33,7 @@ def take(e: Element, name: str, default: str) -> str:
 
 
 def renamed(e: Element, name: str | None) -> Element:
+    """The element under another name, or under none."""
     e.attrib.pop("name", None)
     if name is not None:
         e.set("name", name)
@@ -39,14 +41,17 @@ def renamed(e: Element, name: str | None) -> Element:
 
 
 def nested(e: Element, tags: tuple[str, ...]) -> Element | None:
+    """The first child with one of the tags."""
     return next((child for child in e if child.tag in tags), None)
 
 
 def numbers(text: str) -> list[float]:
+    """All numbers of a text, by commas or blanks."""
     return [float(word) for word in re.split(r"[\s,;]+", text.strip()) if word]
 
 
 def joined(values: Iterable[float]) -> str:
+    """Numbers as a text."""
     return ", ".join(f"{value:.7g}" for value in values)
 
 
@@ -64,6 +69,7 @@ def color_of(e: Element) -> Element:
 
 
 def texture_of(rgb: Element) -> Element:
+    """A colour as a texture, for where Mitsuba 3 takes nothing else."""
     texture = Element("texture", type="srgb")
     SubElement(texture, "rgb", name="color", value=rgb.get("value", ""))
     return texture
