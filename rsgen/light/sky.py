@@ -24,6 +24,9 @@ from rsgen.light.specular import first_scatterer
 _CELL_M = 0.5  # parts of the scene that have one histogram, of like normals on one piece of surface
 _FIRST_LOOK_TEXELS, _FIRST_LOOK_SAMPLES = 3.0, 64
 _GROWTH, _ROUNDS = 2, 6  # after each round so many times as much has been drawn as before it
+_EFFORT = (
+    4  # directions drawn in all, of those of the first round: where light is hard to find the worst places get them
+)
 
 
 def sky_light(
@@ -33,7 +36,8 @@ def sky_light(
     """Irradiance (len(which), 3) from the sky and, with `follow`, from lamps by way of panes and mirrors.
 
     samples: directions at each point at first; more where the standard error of the irradiance, as a part of it,
-    exceeds `scatter`. Returns too what that is in the end, before it is smoothed: root mean square over all points.
+    exceeds `scatter`, as far as the effort allows. Returns too what that is in the end, before it is smoothed: root
+    mean square over all points.
     """
     cell = thin(points, _CELL_M, which)[1]
     guide = _learned(scene, points, which, cell, texel_m, follow)
@@ -56,6 +60,9 @@ def sky_light(
         means = halves / np.maximum(drawn[:, None] / 2, 1)
         left = scatter_of(points, which, means, texel_m)[1]
         todo = todo[left[todo] > scatter]
+        spare = max(0.0, _EFFORT * samples * len(which) - drawn.sum())
+        most = int(spare / ((_GROWTH - 1) * drawn.max()))
+        todo = np.sort(todo[np.argsort(-left[todo], kind="stable")[:most]])
         if not len(todo):
             break
     report(1.0)
