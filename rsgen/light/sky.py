@@ -24,9 +24,8 @@ from rsgen.light.specular import first_scatterer
 _CELL_M = 0.5  # parts of the scene that have one histogram, of like normals on one piece of surface
 _FIRST_LOOK_TEXELS, _FIRST_LOOK_SAMPLES = 3.0, 64
 _GROWTH, _ROUNDS = 2, 6  # after each round so many times as much has been drawn as before it
-_EFFORT = (
-    4  # directions drawn in all, of those of the first round: where light is hard to find the worst places get them
-)
+# Directions drawn in all, of those of the first round: where light is hard to find the worst places get them.
+_EFFORT = 4
 
 
 def sky_light(
