@@ -1,7 +1,7 @@
 """Bake a scene's diffuse irradiance: direct light by emitter sampling, indirect by gathering over bounces.
 
 1. Every lattice point of `irradiance.Lattice` (both sides of each triangle; points that coincide are one) gets direct
-   light from each emitter with a stratified set of samples.
+   light from each lamp with a stratified set of samples, and from the sky and through panes as `sky` has it.
    Where a mesh is finer than the texel, a thinned set of points is computed and the others are interpolated.
 2. Indirect light varies slowly, so it is gathered at a still thinner set, a few texels apart, by cosine-distributed
    rays that look the previous bounce up where they hit, and interpolated in position and normal.
@@ -121,22 +121,21 @@ def _field(lattice: Lattice, index: NDArray, values: NDArray, alive: NDArray) ->
 
 def _direct(
     scene: Any,
-    emitters: Sequence[Any],
+    lamps: Sequence[Any],
     points: SurfacePoints,
     which: NDArray,
     samples: int,
     report: Callable[[float], None],
 ) -> NDArray:
-    """Direct irradiance (len(which), 3) from emitters, `samples` for each."""
+    """Direct irradiance (len(which), 3) from all lamps, `samples` for each."""
     out = np.zeros((len(which), 3), np.float32)
-    sky = len(emitters) == len(scene.emitters())
     for begin, part, p, n, number in chunks(points, which, report):
         total = mi.Color3f(0)
-        if len(emitters) > _MANY_EMITTERS:
-            total = _from_emitter(scene, None, p, n, number, samples * _MANY_EMITTERS, 0, sky)
+        if len(lamps) > _MANY_EMITTERS:
+            total = _from_emitter(scene, None, p, n, number, samples * _MANY_EMITTERS, 0)
         else:
-            for k, emitter in enumerate(emitters):
-                total += _from_emitter(scene, emitter, p, n, number, _samples_for(emitter, samples), k, sky)
+            for k, emitter in enumerate(lamps):
+                total += _from_emitter(scene, emitter, p, n, number, _samples_for(emitter, samples), k)
                 dr.eval(total)
         out[begin : begin + len(part)] = np.array(total).reshape(3, -1).T
     return out
@@ -150,8 +149,8 @@ def _samples_for(emitter: Any, samples: int) -> int:
 
 
 @dr.syntax
-def _from_emitter(scene, emitter, p, n, number, samples, dimension, sky):
-    """Mean irradiance at p (normal n) from one emitter, or if that is None from a random one (the sky: if `sky`)."""
+def _from_emitter(scene, emitter, p, n, number, samples, dimension):
+    """Mean irradiance at p (normal n) from one emitter, or if that is None from a random one but the sky."""
     it = dr.zeros(mi.Interaction3f, dr.width(p))
     it.p = p
     it.t = mi.Float(1)
@@ -164,7 +163,7 @@ def _from_emitter(scene, emitter, p, n, number, samples, dimension, sky):
         u = r2(i, offset)
         if dr.hint(emitter is None, mode="scalar"):
             ds, value = scene.sample_emitter_direction(it, u, False)
-            if dr.hint(not sky and scene.environment() is not None, mode="scalar"):
+            if dr.hint(scene.environment() is not None, mode="scalar"):
                 value = dr.select(ds.emitter == mi.EmitterPtr(scene.environment()), 0, value)
         else:
             ds, value = emitter.sample_direction(it, u)

@@ -37,6 +37,12 @@ class SurfacePoints:
     geometric: Float32Array
     piece: IntArray
 
+    def coordinates(self, spacing: float) -> NDArray:
+        """(n, 7): two points are near where positions, in units of `spacing` metres, and normals are, on one piece."""
+        return np.concatenate(
+            [self.position / spacing, self.normal / _NORMAL_SCALE, _APART * self.piece[:, None]], axis=1
+        )
+
 
 def sample_points(scene: Any, lattice: Lattice) -> tuple[SurfacePoints, IntArray]:
     """Unique points of both sides of the lattice, and (2, points) index of each lattice point's front and back one."""
@@ -157,8 +163,7 @@ class Interpolation:
 
         The dark inside of a thin sheet is a millimetre from its lit outside and has the normal of the other outside.
         """
-        parts = [points.position / spacing, points.normal / _NORMAL_SCALE, _APART * points.piece[:, None]]
-        scaled = np.concatenate(parts, axis=1)
+        scaled = points.coordinates(spacing)
         k = min(_NEIGHBOURS, len(sources))
         distance, neighbours = cKDTree(scaled[sources]).query(scaled[targets], k=k, workers=-1, eps=0.2)
         distance, neighbours = np.reshape(distance, (-1, k)), np.reshape(neighbours, (-1, k))

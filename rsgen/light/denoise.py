@@ -10,8 +10,6 @@ from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.light.bake_points import SurfacePoints, thin
 
 _NEIGHBOURS = 32
-_NORMAL_SCALE = 0.35  # normals this far apart count as much as one spacing
-_APART = 1e4  # spacings between different pieces of surface
 _REACH = 2.0  # spacings: of the weight's fall with distance
 _PATCH = 8.0  # spacings that the noise's size is estimated over
 _CHUNK = 1 << 17
@@ -35,10 +33,7 @@ def denoised(points: SurfacePoints, which: IntArray, halves: NDArray, spacing: f
     Each half is averaged with weights by the other (Rousselle, Manzi, Zwicker, PG 2013), so that noise does not choose
     what it is averaged with: edges of shadows stay.
     """
-    position = points.position[which] / (_REACH * spacing)
-    scaled = np.concatenate(
-        [position, points.normal[which] / _NORMAL_SCALE, _APART * points.piece[which, None]], axis=1
-    ).astype(np.float32)
+    scaled = points.coordinates(_REACH * spacing)[which]
     sigma = scatter_of(points, which, halves, spacing)[0]
     grey = halves.mean(axis=2)
     # Variance of one half: of a point that scatters more than its neighbours its own.

@@ -92,19 +92,18 @@ def _first_look(scene: Any, p: Any, n: Any, number: Any, follow: bool) -> tuple[
     p, n = dr.gather(mi.Point3f, p, point), dr.gather(mi.Vector3f, n, point)
     number = dr.gather(mi.UInt32, number, point)
     u = r2(i >> 1, mi.Point2f(rotation(number, 201), rotation(number, 202)))
-    d, density = _drawn(scene, p, n, u, (i & 1) == 1, mi.warp.square_to_cosine_hemisphere(u), None)
+    d, density = _drawn(scene, p, n, u, (i & 1) == 1, None)
     _, light = _arriving(scene, p, n, d, rotation(number, 203), follow)
     return bin_of(d), dr.select(density > 0, mi.luminance(light) / dr.maximum(density, 1e-20), 0.0)
 
 
-def _drawn(scene: Any, p: Any, n: Any, u: Any, other: Any, local: Any, guided: Any) -> tuple[Any, Any]:
+def _drawn(scene: Any, p: Any, n: Any, u: Any, other: Any, guided: Any) -> tuple[Any, Any]:
     """A direction of the sky's own or, where `other`, another one; and the density of both together.
 
-    guided: (direction, density of any direction) of a guide. Without one, and without a sky, `local` is the other one,
-    about the normal, cosine-distributed.
+    guided: (direction, density of any direction) of a guide. In the place of a guide or a sky that is not there: about
+    the normal, cosine-distributed.
     """
-    frame = mi.Frame3f(n)
-    about = frame.to_world(local)
+    about = mi.Frame3f(n).to_world(mi.warp.square_to_cosine_hemisphere(u))
     own, sky = about, scene.environment()
     it = dr.zeros(mi.Interaction3f, dr.width(p))
     it.p, it.t, it.n = p, mi.Float(1), mi.Normal3f(n)
@@ -139,7 +138,7 @@ def _sky_at(scene, guide, cell, p, n, number, begin, samples, follow):
     while i < end:
         u = r2(i >> 1, offset)
         guided = (guide.sample(cell, u), lambda d: guide.density(cell, d))
-        d, density = _drawn(scene, p, n, u, (i & 1) == 1, mi.warp.square_to_cosine_hemisphere(u), guided)
+        d, density = _drawn(scene, p, n, u, (i & 1) == 1, guided)
         found, light = _arriving(scene, p, n, d, lobe + mi.Float(i) * 0.6180339887498949, follow)
         light = dr.select(found & (density > 0), light / dr.maximum(density, 1e-20), 0)
         first = ((i >> 1) & 1) == 0

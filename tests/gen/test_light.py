@@ -186,7 +186,7 @@ def test_a_sky_seen_through_a_hole_is_a_lamp_of_that_shape(tmp_path: Path, pane:
     assert abs(error.mean()) < 0.008
 
 
-def test_a_guide_draws_what_it_says(tmp_path: Path) -> None:
+def test_a_guide_draws_what_it_says() -> None:
     """Two cells: all that is learned of one is where its light comes from, of the other nothing."""
     rng = np.random.default_rng(3)
     toward = np.array([0.6, -0.48, 0.64])
