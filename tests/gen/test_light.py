@@ -181,7 +181,7 @@ def test_a_sky_seen_through_a_hole_is_a_lamp_of_that_shape(tmp_path: Path, pane:
         factor = factor + quad_factor(xyz * (-1, 1, 1) - (1.8, 0, 0))
     got = floor_light(scene_of(tmp_path, *elements), xyz, texel_m=0.04, direct_samples=256, target_db=42)
     error = got / (np.pi * factor[:, None] * [1, 2, 3]) - 1
-    # Noise of few samples, no bias; a sky that is drawn from evenly is off by half.
+    # Noise of few samples, no bias. A sky drawn from evenly: a tenth off in the median, and one place in ten black.
     assert np.quantile(np.abs(error), 0.9) < 0.04 and np.abs(error).max() < 0.12
     assert abs(error.mean()) < 0.008
 
