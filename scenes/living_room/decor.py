@@ -6,9 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from scenes.living_room.pictures import painting_rect
-from scenes.living_room.room import GAP
-from scenes.living_room.shapes import (
+from scenes.kit.shapes import (
     Mesh,
     Parts,
     atlas_uv,
@@ -23,6 +21,8 @@ from scenes.living_room.shapes import (
     superellipsoid,
     tube,
 )
+from scenes.living_room.pictures import painting_rect
+from scenes.living_room.room import GAP
 
 RUG = 0.012  # thickness
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from scenes.living_room.pictures import book_rect
-from scenes.living_room.shapes import (
+from scenes.kit.shapes import (
     Mesh,
     Parts,
     atlas_uv,
@@ -22,6 +21,7 @@ from scenes.living_room.shapes import (
     superellipsoid,
     tube,
 )
+from scenes.living_room.pictures import book_rect
 
 
 def sofa(cloth: str, width: float, depth: float, pillows: list[tuple[str, float, float]], backs: int = 3) -> Parts:

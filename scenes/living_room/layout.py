@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from scenes.kit.shapes import Mesh, Parts, move, move_parts, rotation
 from scenes.living_room import furniture as fu
 from scenes.living_room.decor import RUG, basket, bowl, fruit_bowl, mug, palm, picture, rug, vase, wall_clock
 from scenes.living_room.room import BACK, FLOOR, FRONT, GAP, LEFT, RIGHT
-from scenes.living_room.shapes import Mesh, Parts, move, move_parts, rotation
 
 ON_FLOOR = FLOOR + GAP
 

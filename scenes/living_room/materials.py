@@ -1,44 +1,16 @@
-"""What the room is painted with: every BSDF of the scene, its texture and the size in metres of one texture tile."""
+"""What the living room is painted with: its BSDFs, their textures and the size in metres of one texture tile."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import expit
 
+from scenes.kit import textures as tx
+from scenes.kit.materials import Material, fabric, plain, wood
+from scenes.kit.textures import Image
 from scenes.living_room import pictures
-from scenes.living_room import textures as tx
-from scenes.living_room.textures import Image
-
-DARKEST, LIGHTEST = 0.045, 0.80  # linear albedo of anything in the room
-
-
-@dataclass(frozen=True)
-class Material:
-    """A BSDF: `paint` makes its sRGB image of `pixels` (h, w), laid over `tile` = (u, v) metres; tile (1, 1): an atlas.
-
-    `alpha` > 0 makes it a rough plastic of that roughness, `metal` a rough conductor.
-    """
-
-    paint: Callable[[tuple[int, int]], Image] | None
-    pixels: tuple[int, int] = (512, 512)
-    tile: tuple[float, float] = (1.0, 1.0)
-    alpha: float = 0.0
-    metal: bool = False
-
-
-def _plain(seed: int, base: tx.Colour, contrast: float = 0.6) -> Callable[[tuple[int, int]], Image]:
-    return lambda shape: tx.plaster(shape, seed, base, contrast)
-
-
-def _fabric(seed: int, warp: tx.Colour, weft: tx.Colour, thread: float = 6.0) -> Callable[[tuple[int, int]], Image]:
-    return lambda shape: tx.fabric(shape, seed, warp, weft, thread)
-
-
-def _wood(seed: int, light: tx.Colour, dark: tx.Colour, ring: float = 26.0) -> Callable[[tuple[int, int]], Image]:
-    return lambda shape: tx.wood(shape, seed, light, dark, ring)
 
 
 def _striped(shape: tuple[int, int]) -> Image:
@@ -81,50 +53,39 @@ def _glaze(seed: int, base: tx.Colour, band: tx.Colour) -> Callable[[tuple[int, 
 
 MATERIALS: dict[str, Material] = {
     "floor": Material(lambda s: tx.planks(s, 11, s[1] / 5.0), (2048, 2048), (5.0, 5.0)),
-    "ceiling": Material(_plain(21, (0.86, 0.855, 0.83), 0.75), (2048, 2048), (5.0, 5.0)),
+    "ceiling": Material(plain(21, (0.86, 0.855, 0.83), 0.75), (2048, 2048), (5.0, 5.0)),
     "wall_back": Material(lambda s: tx.wallpaper(s, 31, s[1] / 5.0), (1024, 2048), (5.0, 2.5)),
-    "wall_right": Material(_plain(41, (0.82, 0.79, 0.71), 0.95), (1024, 2048), (5.0, 2.5)),
+    "wall_right": Material(plain(41, (0.82, 0.79, 0.71), 0.95), (1024, 2048), (5.0, 2.5)),
     "wall_left": Material(lambda s: tx.brick(s, 51, s[1] / 5.0), (1024, 2048), (5.0, 2.5)),
-    "wall_front": Material(_plain(61, (0.83, 0.755, 0.66), 0.95), (1024, 2048), (5.0, 2.5)),
-    "paint": Material(_plain(71, (0.86, 0.85, 0.82), 0.55), (1024, 1024), (2.0, 2.0)),
-    "door": Material(_wood(81, (0.60, 0.68, 0.68), (0.42, 0.52, 0.54), 30), (1024, 1024), (2.1, 1.0)),
-    "beam": Material(_wood(91, (0.58, 0.43, 0.30), (0.32, 0.22, 0.15), 24), (1024, 2048), (4.0, 1.4)),
+    "wall_front": Material(plain(61, (0.83, 0.755, 0.66), 0.95), (1024, 2048), (5.0, 2.5)),
+    "paint": Material(plain(71, (0.86, 0.85, 0.82), 0.55), (1024, 1024), (2.0, 2.0)),
+    "door": Material(wood(81, (0.60, 0.68, 0.68), (0.42, 0.52, 0.54), 30), (1024, 1024), (2.1, 1.0)),
+    "beam": Material(wood(91, (0.58, 0.43, 0.30), (0.32, 0.22, 0.15), 24), (1024, 2048), (4.0, 1.4)),
     "rug": Material(lambda s: pictures.rug(s, 101), (1024, 1408)),
-    "sofa_a": Material(_fabric(111, (0.56, 0.60, 0.62), (0.40, 0.46, 0.50)), (1024, 1024), (1.6, 1.6)),
-    "sofa_b": Material(_fabric(121, (0.72, 0.62, 0.48), (0.58, 0.46, 0.33)), (1024, 1024), (1.6, 1.6)),
-    "armchair": Material(_fabric(131, (0.68, 0.42, 0.30), (0.50, 0.28, 0.20)), (1024, 1024), (1.5, 1.5)),
+    "sofa_a": Material(fabric(111, (0.56, 0.60, 0.62), (0.40, 0.46, 0.50)), (1024, 1024), (1.6, 1.6)),
+    "sofa_b": Material(fabric(121, (0.72, 0.62, 0.48), (0.58, 0.46, 0.33)), (1024, 1024), (1.6, 1.6)),
+    "armchair": Material(fabric(131, (0.68, 0.42, 0.30), (0.50, 0.28, 0.20)), (1024, 1024), (1.5, 1.5)),
     "pillow_a": Material(_striped, (512, 512), (0.6, 0.6)),
     "pillow_b": Material(lambda s: tx.wallpaper(s, 141, 800.0), (512, 512), (0.6, 0.6)),
-    "pillow_c": Material(_fabric(151, (0.84, 0.66, 0.36), (0.66, 0.46, 0.22), 8), (512, 512), (0.6, 0.6)),
-    "curtain": Material(_fabric(161, (0.80, 0.74, 0.64), (0.66, 0.58, 0.48), 5), (1024, 1024), (1.6, 1.6)),
-    "oak": Material(_wood(171, (0.76, 0.60, 0.42), (0.50, 0.34, 0.20), 22), (1024, 1024), (1.8, 0.9)),
-    "walnut": Material(_wood(181, (0.50, 0.36, 0.26), (0.28, 0.19, 0.13), 20), (1024, 1024), (1.8, 0.9)),
-    "lacquer": Material(_wood(191, (0.56, 0.40, 0.28), (0.33, 0.21, 0.14), 20), (1024, 1024), (1.8, 0.9), 0.18),
+    "pillow_c": Material(fabric(151, (0.84, 0.66, 0.36), (0.66, 0.46, 0.22), 8), (512, 512), (0.6, 0.6)),
+    "curtain": Material(fabric(161, (0.80, 0.74, 0.64), (0.66, 0.58, 0.48), 5), (1024, 1024), (1.6, 1.6)),
+    "oak": Material(wood(171, (0.76, 0.60, 0.42), (0.50, 0.34, 0.20), 22), (1024, 1024), (1.8, 0.9)),
+    "walnut": Material(wood(181, (0.50, 0.36, 0.26), (0.28, 0.19, 0.13), 20), (1024, 1024), (1.8, 0.9)),
+    "lacquer": Material(wood(191, (0.56, 0.40, 0.28), (0.33, 0.21, 0.14), 20), (1024, 1024), (1.8, 0.9), 0.18),
     "picture": Material(lambda s: pictures.paintings(s, 201), (1024, 1792)),
     "book": Material(lambda s: pictures.books(s, 211), (512, 1536)),
-    "pages": Material(_wood(221, (0.88, 0.84, 0.75), (0.74, 0.68, 0.57), 5), (256, 256), (0.25, 0.25)),
+    "pages": Material(wood(221, (0.88, 0.84, 0.75), (0.74, 0.68, 0.57), 5), (256, 256), (0.25, 0.25)),
     "leaf": Material(lambda s: tx.leaf(s, 231), (256, 512)),
-    "bark": Material(_wood(241, (0.58, 0.46, 0.34), (0.32, 0.24, 0.17), 14), (512, 512), (0.3, 0.3)),
+    "bark": Material(wood(241, (0.58, 0.46, 0.34), (0.32, 0.24, 0.17), 14), (512, 512), (0.3, 0.3)),
     "terracotta": Material(_glaze(251, (0.72, 0.44, 0.32), (0.80, 0.60, 0.48)), (512, 1024), (1.3, 0.6)),
     "soil": Material(_soil, (256, 256), (0.3, 0.3)),
     "glaze_blue": Material(_glaze(261, (0.42, 0.55, 0.62), (0.84, 0.82, 0.76)), (512, 1024), (0.6, 0.3), 0.15),
     "glaze_white": Material(_glaze(271, (0.84, 0.81, 0.75), (0.62, 0.38, 0.30)), (512, 1024), (0.5, 0.25), 0.15),
     "orange": Material(_fruit(281, (0.86, 0.56, 0.24), (0.82, 0.44, 0.18)), (128, 256), (0.3, 0.15)),
     "apple": Material(_fruit(291, (0.66, 0.68, 0.32), (0.70, 0.26, 0.20)), (128, 256), (0.3, 0.15), 0.2),
-    "black": Material(_plain(301, (0.33, 0.32, 0.32), 1.0), (256, 256), (0.5, 0.5), 0.2),
-    "shade": Material(_fabric(311, (0.88, 0.83, 0.73), (0.80, 0.74, 0.62), 6), (512, 1024), (1.2, 0.6)),
-    "wicker": Material(_fabric(321, (0.76, 0.60, 0.40), (0.44, 0.31, 0.19), 22), (512, 1024), (1.0, 0.5)),
+    "black": Material(plain(301, (0.33, 0.32, 0.32), 1.0), (256, 256), (0.5, 0.5), 0.2),
+    "shade": Material(fabric(311, (0.88, 0.83, 0.73), (0.80, 0.74, 0.62), 6), (512, 1024), (1.2, 0.6)),
+    "wicker": Material(fabric(321, (0.76, 0.60, 0.40), (0.44, 0.31, 0.19), 22), (512, 1024), (1.0, 0.5)),
     "clock": Material(lambda s: pictures.clock(s, 341), (384, 384)),
     "brass": Material(None, metal=True, alpha=0.25),
 }
-
-
-def texture(material: Material) -> np.ndarray:
-    """(h, w, 3) uint8 sRGB image of a material, its linear albedo kept within [DARKEST, LIGHTEST]."""
-    assert material.paint is not None
-    image = material.paint(material.pixels)
-
-    def srgb(linear: float) -> float:
-        return 1.055 * linear ** (1 / 2.4) - 0.055
-
-    return np.round(np.clip(image, srgb(DARKEST), srgb(LIGHTEST)) * 255).astype(np.uint8)

@@ -7,7 +7,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from scenes.living_room.textures import Colour, Image, fractal, mix, tint
+from scenes.kit.textures import Colour, Image, fractal, mix, tint
 
 PAINTINGS = (4, 2)  # columns, rows of the atlas of paintings
 BOOKS = 48  # columns of the atlas of spines

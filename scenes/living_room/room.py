@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from scenes.living_room.shapes import (
+from scenes.kit.shapes import (
     Mesh,
     Parts,
     box,

@@ -22,13 +22,13 @@ _ROOT = Path(__file__).resolve().parents[2]
 if str(_ROOT) not in sys.path:  # so that it also runs as a script from anywhere
     sys.path.insert(0, str(_ROOT))
 
+from scenes.kit import materials, scene_files  # noqa: E402
+from scenes.kit.shapes import Parts, merge, move_parts, rotation  # noqa: E402
 from scenes.living_room import build as room  # noqa: E402
-from scenes.living_room import materials, scene_files  # noqa: E402
 from scenes.living_room import table_objects as ob  # noqa: E402
 from scenes.living_room.decor import RUG  # noqa: E402
 from scenes.living_room.layout import ON_FLOOR  # noqa: E402
 from scenes.living_room.room import FLOOR  # noqa: E402
-from scenes.living_room.shapes import Parts, merge, move_parts, rotation  # noqa: E402
 from scenes.living_room.table_textures import OBJECT_MATERIALS  # noqa: E402
 
 REST = 0.0003  # kept between a thing and what it stands on

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.living_room.textures import Colour, Image, fractal
+from scenes.kit.textures import Colour, Image, fractal
 
 Canvas = NDArray[np.uint8]
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from scenes.kit.textures import Colour, Image
 from scenes.living_room.table_drawing import (
     INK,
     PAPER,
@@ -21,7 +22,6 @@ from scenes.living_room.table_drawing import (
     prose,
     write,
 )
-from scenes.living_room.textures import Colour, Image
 
 Rect = tuple[float, float, float, float]  # u0, v0, u1, v1 of a texture
 

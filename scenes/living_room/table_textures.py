@@ -7,11 +7,11 @@ from collections.abc import Callable
 import numpy as np
 from scipy.special import expit
 
+from scenes.kit import textures as tx
+from scenes.kit.materials import Material
+from scenes.kit.textures import Colour, Image
 from scenes.living_room import table_prints as prints
-from scenes.living_room import textures as tx
-from scenes.living_room.materials import Material
 from scenes.living_room.table_drawing import INK
-from scenes.living_room.textures import Colour, Image
 
 MUG_AROUND = 2 * np.pi * 0.042  # circumference of decor.mug, m
 

@@ -17,9 +17,9 @@ from test_scene_living_room import digest, read_ply
 
 from rsgen.errors import UserError
 from rsgen.render.scene import content_hash, ensure_built, load_scene
+from scenes.kit.shapes import merge
 from scenes.living_room import layout, table
 from scenes.living_room.room import FLOOR, RIGHT
-from scenes.living_room.shapes import merge
 
 ROOT = Path(__file__).resolve().parents[2]
 STUB = (

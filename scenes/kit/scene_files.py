@@ -7,8 +7,8 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from scenes.living_room.materials import Material
-from scenes.living_room.shapes import Mesh
+from scenes.kit.materials import Material
+from scenes.kit.shapes import Mesh
 
 _HEADER = """ply
 format binary_little_endian 1.0

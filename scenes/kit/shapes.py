@@ -1,4 +1,4 @@
-"""Closed, outward oriented triangle shapes with normals and texture coordinates: the solids that the room is made of.
+"""Closed, outward oriented triangle shapes with normals and texture coordinates: the solids that rooms are made of.
 
 Lengths are metres in the world frame (right-handed, y up). Texture coordinates are metres too, measured on the surface,
 v downwards in the image, unless `atlas_uv` has put a shape into a part of a picture.
