@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -145,6 +145,16 @@ class LoopSearch:
         back = None if there is None else self._aligned(self.load(early), late, se3.inverse(T_early_late), allowed)
         return None if there is None or back is None else self._loop(early, late, there, back)
 
+    def pair_across(self, other: LoopSearch, early: int, late: int, allowed: FloatArray) -> bool:
+        """Whether a keyframe of this recording and one (`late`) of another by the same cameras are taken for one place.
+
+        Both are tried from where they were taken at one pose, up to metres and radians (2,).
+        """
+        here, there = replace(self, motion=other.motion), replace(other, motion=self.motion)
+        one = here._aligned(other.load(late), early, np.eye(4), allowed)
+        back = None if one is None else there._aligned(self.load(early), late, np.eye(4), allowed)
+        return one is not None and back is not None and not self._differ(early, one, back)
+
     def _candidates(
         self, frame: DeviceFrame, n: int, order: list[int], T: dict[int, FloatArray], way: FloatArray
     ) -> list[int]:
@@ -205,11 +215,10 @@ class LoopSearch:
         return result
 
     def _loop(self, early: int, late: int, there: Alignment, back: Alignment) -> Loop | None:
-        between = _sizes(there.T_ref_cam @ back.T_ref_cam)
-        depth = max(1.0, self._reference(early).median_depth)
-        if (between > _AGREE * np.array([depth, 1.0])).any():
+        if self._differ(early, there, back):
             self._refuse("the two ways of aligning it differ")
             return None
+        between = _sizes(there.T_ref_cam @ back.T_ref_cam)
         # What the two differ by tells more of their errors than either's noise.
         off = se3.log(there.T_ref_cam @ back.T_ref_cam)
         Ad = se3.adjoint(there.T_ref_cam)
@@ -226,6 +235,10 @@ class LoopSearch:
             for at, number, found in ((early, late, there), (late, early, back))
         )
         return Loop(early, late, (one, other), (float(between[0]), float(between[1])))
+
+    def _differ(self, early: int, there: Alignment, back: Alignment) -> bool:
+        depth = max(1.0, self._reference(early).median_depth)
+        return bool((_sizes(there.T_ref_cam @ back.T_ref_cam) > _AGREE * np.array([depth, 1.0])).any())
 
     def _covariance(self, found: Alignment) -> FloatArray:
         turn = _SYSTEMATIC_PX / self.rig.depth_camera.fx

@@ -151,6 +151,7 @@ def bench_loops(
     camera: CameraFile = None,
     frames: Frames = None,
     alike: Annotated[int, "pairs of different places that look alike to try", "N"] = 200,
+    other: Annotated[Path | None, "try those with this recording of another room by the same cameras", "SEQ"] = None,
     json: Json = False,
 ) -> int:
     """Find the loops of a track: how true they are, and whether places that look alike are taken for one."""
@@ -160,7 +161,8 @@ def bench_loops(
 
     dataset = open_dataset(sequence, camera)
     with ProgressDisplay(quiet=json) as progress:
-        found = loop_quality(dataset, tracker, frames or slice(None), alike, progress)
+        elsewhere = None if other is None else open_dataset(other, camera)
+        found = loop_quality(dataset, tracker, frames or slice(None), alike, progress, elsewhere)
     print_figures(found, json)
     return 0
 

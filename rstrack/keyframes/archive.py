@@ -132,11 +132,11 @@ class Archive:
         """T_world_base (4, 4) of the keyframe of frame `index`."""
         return self._kept[index].small.T_world_base
 
-    def alike(self, frame: DeviceFrame, without: set[int]) -> list[int]:
-        """Keyframes whose view resembles a frame's, the best first; those in `without` are left out."""
+    def alike(self, frame: DeviceFrame, without: set[int], least: float = _ALIKE) -> list[int]:
+        """Keyframes whose view resembles a frame's by at least so much, the best first; without those in `without`."""
         numbers = [k for k in self._kept if k not in without]
         scores = resemblances([self._kept[k].small for k in numbers], frame)
-        return [numbers[n] for n in np.argsort(-scores, kind="stable") if scores[n] > _ALIKE]
+        return [numbers[n] for n in np.argsort(-scores, kind="stable") if scores[n] > least]
 
     def _temporary_folder(self) -> Path:
         if self._temporary is None:
