@@ -25,6 +25,15 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from rsgen.errors import UserError
 
 Run = Callable[..., int]
+
+
+@dataclasses.dataclass(frozen=True)
+class Alone:
+    """Among what is declared of an option: the value that it has where no word follows it."""
+
+    value: Any
+
+
 _METAVARS: dict[Any, str] = {int: "N", float: "X"}
 _NO_MATTER = (None, "", (), False)  # defaults of which help says nothing
 
@@ -115,6 +124,8 @@ def _add(to: Any, name: str, hint: Any, default: Any, kind: Any = inspect.Parame
         how |= {"choices": get_args(type_), "metavar": metavar}
     else:
         how |= {"type": convert, "metavar": metavar}
+    for alone in (word for word in more if isinstance(word, Alone)):
+        how |= {"nargs": "?", "const": alone.value}
     if kind is not inspect.Parameter.KEYWORD_ONLY:
         to.add_argument(name, **how, **({"nargs": "+"} if many else {} if required else {"nargs": "?"}))
         return

@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from json import dumps
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from rsgen.console.command_line import Commands, Frames, Json, Parser, Quiet, run_program
+from rsgen.console.command_line import Alone, Commands, Frames, Json, Parser, Quiet, run_program
 from rsgen.errors import UserError
 from rstrack.cli.bench import (
     bench_bootstrap,
@@ -40,6 +41,10 @@ from rstrack.cli.options import (
 from rstrack.cli.report import report
 from rstrack.cli.sensitivity import sensitivity
 from rstrack.options import Options
+
+if TYPE_CHECKING:
+    from rstrack.data.dataset import Dataset
+    from rstrack.view.viewer import Viewer
 
 _DESCRIPTION = """\
 rstrack estimates the continuous-time trajectory of a rolling-shutter RGB-D camera: every line has its own pose.
@@ -121,8 +126,12 @@ def track(
     resume: Annotated[
         bool, "go on with a run of the same settings in DIR that was stopped or killed, to the same bits"
     ] = False,
+    view: Annotated[
+        Path | None, "watch it in rerun's window: images, residuals, path, keyframes, map; or keep that in FILE.rrd",
+        "FILE.rrd", Alone(Path()),
+    ] = None,
     quiet: Quiet = False,
-) -> int:
+) -> int:  # fmt: skip
     """Track a sequence: writes trajectory.txt, spline.npz and run.json; with --calibrate camera.yaml and
     calibration.json too.
     """
@@ -149,7 +158,11 @@ def track(
             if not found.solution.finished:
                 raise KeyboardInterrupt
             dataset = found.calibrated()
-        result = run.track(dataset, tracker, out, frames or slice(None), noise, progress, resume)
+        with _viewed(view, dataset) as viewer:
+            watch = None if viewer is None else viewer.see
+            result = run.track(dataset, tracker, out, frames or slice(None), noise, progress, resume, watch)
+            if viewer is not None:
+                viewer.corrected(result.estimate.T_world_depth)
     (out / CALIBRATION).unlink(missing_ok=True)  # of an earlier run in this folder
     if found is not None:
         atomic_write(out / "camera.yaml", found.camera_file().encode())
@@ -165,6 +178,14 @@ def track(
         print(f"rstrack: {result.error}; the frames before it are in {out}", file=sys.stderr)
         return 1
     return 1 if result.lost or result.unreadable else 0
+
+
+def _viewed(view: Path | None, dataset: Dataset) -> AbstractContextManager[Viewer | None]:
+    if view is None:
+        return nullcontext()
+    from rstrack.view.viewer import open_view
+
+    return open_view(None if view == Path() else view, dataset.rig, dataset.name)
 
 
 def evaluate(

@@ -31,6 +31,10 @@ class AnyTracker(Protocol):
         """How many there have been."""
 
     @property
+    def reference(self) -> int | None:
+        """Number of the frame whose keyframe new ones are aligned to."""
+
+    @property
     def spline(self) -> Spline | None:
         """T_world_depth(t) so far, None where there is none."""
 

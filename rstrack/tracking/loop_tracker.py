@@ -91,6 +91,11 @@ class LoopTracker:
         return self._tracker.keyframes
 
     @property
+    def reference(self) -> int | None:
+        """Number of the frame whose keyframe new ones are aligned to."""
+        return self._tracker.reference
+
+    @property
     def spline(self) -> Spline | None:
         """T_world_depth(t) so far, corrected."""
         found = self._tracker.spline

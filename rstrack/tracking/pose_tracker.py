@@ -101,6 +101,11 @@ class BaselineTracker:
         self.keyframes = 0
 
     @property
+    def reference(self) -> int | None:
+        """Number of the frame whose keyframe new ones are aligned to."""
+        return None if self._reference is None else self._reference.index
+
+    @property
     def trajectory(self) -> tuple[FloatArray, FloatArray]:
         """Stamps (n,) of the frames that were not lost and T_world_depth (n, 4, 4) there."""
         stamps = np.array(self._stamps)

@@ -35,10 +35,13 @@ from rstrack.tracking.runs.record import Done, Noise, diagnostics, settings, tim
 from rstrack.tracking.runs.result import End, Result, keyframes_text
 
 if TYPE_CHECKING:
+    from rstrack.tracking.frame_report import FrameReport
     from rstrack.tracking.loop_closing import Closing
     from rstrack.tracking.runs.checkpoint import Checkpoint
 
 Load = Callable[[int], tuple[Frame | None, tuple[str, ...]]]
+# Told of each frame that was fed: its number among these, the frame, what became of it, and the tracker.
+Watch = Callable[[int, Frame, "FrameReport", AnyTracker], None]
 
 # Frames after which the error so far is shown anew, at least, and the factor by which they have grown by then: it takes
 # as long as there are frames.
@@ -55,14 +58,15 @@ def track(
     noise: Noise | None = None,
     progress: Progress = no_progress,
     resume: bool = False,
+    watch: Watch | None = None,
 ) -> Result:
     """Track frames of a dataset and write the run folder `out`: `write_estimate` says what is in it.
 
     Images that cannot be read are left out, and their frame with them if they are depth images. Where the run stops
     early, because of an interrupt, what there is gets written. Long runs write down where they are now and then: with
     `resume` such a run goes on from there, to the same bits as one that was never stopped (spline trackers without a
-    model). Raises UserError: no such frames, `out` cannot be written or is a dataset, no frame was tracked, a run of
-    other settings is to be resumed.
+    model). watch: looks on. Raises UserError: no such frames, `out` cannot be written or is a dataset, no frame was
+    tracked, a run of other settings is to be resumed.
     """
     chosen = _chosen(dataset, frames)
     dataset = _with_color_evened(_with_color_timed(dataset, chosen, options, progress), chosen, options, progress)
@@ -87,7 +91,7 @@ def track(
     elif resume:
         raise UserError(f"{out}: --resume is for spline methods, not for the baseline: track anew")
     begin = time.perf_counter() - done.total_s
-    end, error = _feed(tracker, load, chosen, done, checkpoint, truth, progress)
+    end, error = _feed(tracker, load, chosen, done, checkpoint, truth, progress, watch)
     if not done.fed:
         raise UserError(error or f"{done.unreadable[0][1]}; no other frame of the {len(chosen)} can be read either")
     closing, end = _closed(tracker, again, end, progress)
@@ -145,7 +149,7 @@ def _loader(dataset: Dataset, options: Options, noise: Noise) -> Load:
 
 def _feed(
     tracker: AnyTracker, load: Load, chosen: range, done: Done, checkpoint: Checkpoint | None, truth: Truth | None,
-    progress: Progress,
+    progress: Progress, watch: Watch | None,
 ) -> tuple[End, str]:  # fmt: skip
     """The frames that are not done yet through the tracker, told in `done`; how that ended, and what broke down."""
     note, told_at = "", 0
@@ -158,11 +162,13 @@ def _feed(
             if frame is not None:
                 start = time.perf_counter()
                 try:
-                    tracker.feed(frame)
+                    report = tracker.feed(frame)
                 except (UserError, np.linalg.LinAlgError) as problem:
                     return "broke down", f"the tracker broke down at frame {k}: {problem}"
                 done.seconds.append(time.perf_counter() - start)
                 done.fed.append(k)
+                if watch is not None:
+                    watch(len(done.fed) - 1, frame, report, tracker)
             if count >= max(told_at + _TRUTH_EVERY, _TRUTH_GROWTH * told_at) or count == len(chosen):
                 note, told_at = _error_note(truth, tracker.trajectory), count
             rate = count / (time.perf_counter() - begin)
