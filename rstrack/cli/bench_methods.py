@@ -17,10 +17,27 @@ STATUS = "exit status: 0 done, 1 a track was lost or failed, 2 wrong input, 130 
 
 
 def _added(text: str) -> tuple[str, Path]:
-    name, equals, folder = text.partition("=")
-    if not (equals and folder and name.replace("-", "").replace("_", "").replace(".", "").isalnum()):
+    name, folder = _named(text)
+    if not (name and folder):
         raise UserError(f"--add {text}: expected NAME=DIR, for example --add orbslam=results/orbslam")
     return name, Path(folder)
+
+
+def _command(text: str) -> tuple[str, str]:
+    from rstrack.peers.command import PLACES, words_of
+
+    name, command = _named(text)
+    if not name:
+        raise UserError(f"--peer-command {text}: expected NAME=COMMAND, for example mine='mine {' '.join(PLACES)}'")
+    words_of(command)
+    return name, command
+
+
+def _named(text: str) -> tuple[str, str]:
+    """NAME and what follows its '='; nothing where that is no name for a folder."""
+    name, equals, rest = text.partition("=")
+    is_name = name.replace("-", "").replace("_", "").replace(".", "").isalnum()
+    return (name, rest) if equals and is_name else ("", "")
 
 
 def bench(
@@ -43,6 +60,13 @@ def bench(
         "a tracker of your own: DIR holds SEQUENCE.txt (TUM), or SEQUENCE/ (a run folder), for each sequence",
         "NAME=DIR",
         _added,
+    ] = None,
+    peer_command: Annotated[
+        list[tuple[str, str]] | None,
+        "a tracker of your own, run on each sequence: mine='mytracker {sequence} {out}' reads the folder {sequence} "
+        "and writes the TUM file {out}",
+        "NAME=COMMAND",
+        _command,
     ] = None,
     truth_offset: TruthOffset = None,
     meshes: Annotated[
@@ -72,7 +96,7 @@ def bench(
     with_meshes = not quick if meshes is None else meshes
     if meshes and not set(SHOWN) & set(choice.methods):
         raise UserError(f"--meshes: is for {', '.join(SHOWN)}: add one of them to --method")
-    plan = make_plan(choice, data, out, tracker, dict(add or ()), truth_offset)
+    plan = make_plan(choice, data, out, tracker, dict(add or ()), truth_offset, dict(peer_command or ()))
     with ProgressDisplay(quiet) as progress:
         with open_workers(scheduler) as workers:
             results = run_plan(plan, workers, progress)

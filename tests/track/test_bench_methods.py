@@ -7,7 +7,9 @@ import dataclasses
 import io
 import json
 import pickle
+import shlex
 import shutil
+import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -39,6 +41,7 @@ from rstrack.cli.bench_methods import bench
 from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.metrics.run_evaluate import run_evaluate
 from rstrack.options import METHODS, PEERS, Options
+from rstrack.peers.command import run_command
 
 ROOT = Path(__file__).parents[2]
 FRAMES = 31
@@ -54,7 +57,7 @@ def parser() -> Parser:
 
 
 def main(words: str) -> int:
-    return run_program("rstrack", parser, words.split(), "nothing was written")
+    return run_program("rstrack", parser, shlex.split(words), "nothing was written")
 
 
 @pytest.fixture(scope="module")
@@ -311,6 +314,41 @@ def test_a_tracker_of_ones_own(place: Path, capfd: pytest.CaptureFixture[str]) -
     assert before.key != after.key and read_cell(before) is not None and read_cell(after) is None
 
 
+def test_a_command_of_ones_own(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """It reads the sequence's folder, here its truth, and writes poses; where it fails its last words are told."""
+    script = place / "my tracker.py"
+    script.write_text(
+        "import pathlib, sys\nfolder, out = map(pathlib.Path, sys.argv[1:])\nprint('looking at', folder)\n"
+        "if folder.name == 'lr_kt2':\n    sys.exit('no such room {sequence}')\n"
+        "out.write_text((folder / 'groundtruth.txt').read_text())\n"
+    )
+    command = f"{shlex.quote(sys.executable)} {shlex.quote(str(script))} {{sequence}} {{out}}"
+    words = "bench bench.yaml --data data --out bench --quiet --method rs-g --fuse"
+    assert main(f"{words} --peer-command {shlex.quote(f'mine={command}')}") == 1
+    out = capfd.readouterr().out
+    assert "failed: mine on lr_kt2: mine: ended with status 1: no such room {sequence} (all of it is in" in out
+    data = json.loads((place / "bench/results.json").read_text())
+    mine = [c for c in data["cells"] if c["method"] == "mine"]
+    assert mine[0]["ate_m"] < 1e-6 and mine[0]["seconds"] > 0.0 and mine[1]["ate_m"] is None
+    assert "looking at" in (place / "bench/cells/robot_t1/mine/command.log").read_text()
+    one, other = (plan(commands={"mine": text}).jobs[-1].key for text in (command, command + " --slow"))
+    assert one != other
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("nowhere/mytracker {sequence} {out}", "cannot run 'nowhere/mytracker'"),
+        ("true {sequence} {out}", "wrote no .*command.txt"),
+        ("cp {sequence}/rgb.txt {out}", "command.txt"),
+        ("false {sequence} {out}", "ended with status 1: it said nothing"),
+    ],
+)
+def test_commands_that_give_nothing(place: Path, command: str, message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        run_command("mine", command, place / "data/robot_t1", place / "peer")
+
+
 def test_poses_outside_the_frames_do_not_count(place: Path) -> None:
     write_tum(place / "mine/robot_t1.txt", "robot_t1")
     job = plan(sequences=["robot_t1"], frames=slice(5, 20), added={"mine": Path("mine")}).jobs[-1]
@@ -390,6 +428,10 @@ def test_peers_are_methods(place: Path, monkeypatch: pytest.MonkeyPatch) -> None
         ("--add mine", ["--add mine", "NAME=DIR"]),
         ("--add ..=x", ["--add ..=x", "NAME=DIR"]),
         ("--add rs-g=x", ["--add rs-g", "another name"]),
+        ("--peer-command mine", ["--peer-command mine", "NAME=COMMAND"]),
+        ("--peer-command mine=track", ["'track'", "{sequence}"]),
+        ("""--peer-command 'mine=track {sequence}'""", ["'track {sequence}'", "does not say {out}"]),
+        ("""--peer-command 'rs-g=track {sequence} {out}'""", ["--peer-command rs-g", "another name"]),
         ("--knot-spacing-s 9", ["knot_spacing_s"]),
         ("--data nowhere", ["rsgen render robot_t1.yaml --out nowhere/robot_t1; rsgen render lr_kt2.yaml --out nowh"]),
         ("--data nowhere --quick", ["nowhere: has no lr_kt2:", "--out nowhere/lr_kt2 --frames 0:12"]),

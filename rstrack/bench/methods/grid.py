@@ -30,6 +30,7 @@ from rstrack.metrics.association import ASSOCIATE_WITHIN_S, truth_of
 from rstrack.metrics.evaluate import Metrics, evaluate
 from rstrack.metrics.run_evaluate import evaluate_clocks
 from rstrack.options import METHODS
+from rstrack.peers.command import run_command
 from rstrack.tracking.runs.run import track
 
 CELL = "cell.json"
@@ -146,10 +147,14 @@ def _estimate(job: Job, dataset: Dataset, progress: Progress) -> tuple[Estimate,
     if job.estimate is not None:
         estimate = _cut(read_estimate(job.estimate), dataset.stamps[frames])
     else:
-        from rstrack.peers.open3d import run_peer
-
         begin = time.perf_counter()
-        estimate = run_peer(job.method, dataset, frames, progress)
+        if job.command:
+            progress(job.method, 0.0, "its command runs")
+            estimate = _cut(run_command(job.method, job.command, dataset.root, job.out), dataset.stamps[frames])
+        else:
+            from rstrack.peers.open3d import run_peer
+
+            estimate = run_peer(job.method, dataset, frames, progress)
         seconds = time.perf_counter() - begin
     info = {"dataset": {"name": dataset.name, "frames": [job.first, job.last]}} | estimate.info | {"method": job.method}
     write_estimate(job.out, estimate.stamps, estimate.T_world_depth, estimate.spline, info)

@@ -30,8 +30,9 @@ class Job:
     """One cell to run; plain enough to be sent to another process that sees the same files.
 
     data: the sequence's folder. frames [first, last). method: a variant (`variants`), `options` those of it; a peer;
-    or, with `estimate` (a run folder or TUM file), another tracker. out: the cell's run folder. key: what the
-    trajectory depends on. truth_offset: of the truth's clock, see `run_evaluate.evaluate_clocks`.
+    or another tracker, with `estimate` (a run folder or TUM file) or `command` (as in `run_command`). out: the cell's
+    run folder. key: what the trajectory depends on. truth_offset: of the truth's clock, see
+    `run_evaluate.evaluate_clocks`.
     """
 
     sequence: str
@@ -44,6 +45,7 @@ class Job:
     out: Path
     key: str
     truth_offset: TruthOffset | None = None
+    command: str = ""
 
 
 @dataclass(frozen=True)
@@ -68,28 +70,28 @@ class Plan:
 
 def make_plan(
     choice: Choice, data: Path, out: Path, options: Options | None = None, added: Mapping[str, Path] | None = None,
-    truth_offset: TruthOffset | None = None,
+    truth_offset: TruthOffset | None = None, commands: Mapping[str, str] | None = None,
 ) -> Plan:  # fmt: skip
     """Look the sequences up and list the cells.
 
     Each of our methods is run with and without fusion, unless `options.fuse` says which.
 
     data: folder with a folder for each sequence. added: other trackers by name, each a folder with SEQUENCE.txt (TUM)
-    or SEQUENCE/ (a run folder) inside. truth_offset: as in `Job`. Raises UserError, one line, if sequences are missing
-    or not whole, saying how to make them.
+    or SEQUENCE/ (a run folder) inside. commands: others by name, run here. truth_offset: as in `Job`. Raises
+    UserError, one line, if sequences are missing or not whole, saying how to make them.
     """
-    options, added = options or Options(), added or {}
-    for name in added:
-        if name in choice.methods or name in METHODS:
-            raise UserError(f"--add {name}=...: there is a method of that name: choose another name")
+    options, added, commands = options or Options(), added or {}, commands or {}
+    for option, name in (*(("--add", name) for name in added), *(("--peer-command", name) for name in commands)):
+        if name in choice.methods or name in METHODS or (option == "--peer-command" and name in added):
+            raise UserError(f"{option} {name}=...: there is a method of that name: choose another name")
     missing = [entry for entry in choice.sequences if not (data / entry.name).is_dir()]
     if missing:
-        commands = "; ".join(_render_command(entry, data, choice) for entry in missing)
+        how = "; ".join(_render_command(entry, data, choice) for entry in missing)
         names = ", ".join(entry.name for entry in missing)
-        raise UserError(f"{data}: has no {names}: leave them out with --sequence, or make them: {commands}")
+        raise UserError(f"{data}: has no {names}: leave them out with --sequence, or make them: {how}")
     sequences: list[SequenceInfo] = []
     jobs: list[Job] = []
-    methods = (*(name for method in choice.methods for name in variants(method, options.fuse)), *added)
+    methods = (*(name for method in choice.methods for name in variants(method, options.fuse)), *added, *commands)
     for entry in choice.sequences:
         dataset = open_dataset(data / entry.name)
         if truth_of(dataset) is None:
@@ -104,10 +106,13 @@ def make_plan(
             estimate = _estimate_path(added[method], entry.name) if method in added else None
             depends = [digest, method, chosen.start, chosen.stop, used and dataclasses.asdict(used), package_version()]
             depends.append(_file_digest(estimate) if estimate is not None else None)
+            command = commands.get(method, "")
+            depends += [command] if command else []
             key = hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()
             cell_out = (out / "cells" / entry.name / folder_of(method)).resolve()
             where = (sequences[-1].path, chosen.start, chosen.stop)
-            jobs.append(Job(entry.name, method, *where, used or options, estimate, cell_out, key, truth_offset))
+            job = Job(entry.name, method, *where, used or options, estimate, cell_out, key, truth_offset, command)
+            jobs.append(job)
     return Plan(tuple(sequences), methods, tuple(jobs), out)
 
 
