@@ -18,6 +18,9 @@ METHODS: tuple[str, ...] = get_args(Method)
 Peer = Literal["open3d-hybrid", "open3d-icp", "open3d-hybrid-keyframe", "open3d-icp-keyframe"]
 PEERS: tuple[str, ...] = get_args(Peer)
 """Open3D's joint photometric and geometric error or its point-to-plane ICP; to the frame before or to a keyframe."""
+CloudPeer = Literal["kiss-icp", "small-gicp"]
+CLOUD_PEERS: tuple[str, ...] = get_args(CloudPeer)
+"""Lidar odometries, on the points of depth images."""
 Strategy = Literal["converged", "newest"]
 STRATEGIES: tuple[str, ...] = get_args(Strategy)
 Source = Literal["keyframe", "model"]

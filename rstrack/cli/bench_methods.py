@@ -54,7 +54,7 @@ def bench(
     frames: Frames = None,
     sequence: Annotated[tuple[str, ...] | None, "only these", "NAME"] = None,
     method: Annotated[tuple[str, ...] | None, "only these", "NAME"] = None,
-    peers: Annotated[bool, "Open3D's odometry too"] = False,
+    peers: Annotated[bool, "Open3D's odometry, KISS-ICP and small_gicp too"] = False,
     add: Annotated[
         list[tuple[str, Path]] | None,
         "a tracker of your own: DIR holds SEQUENCE.txt (TUM), or SEQUENCE/ (a run folder), for each sequence",

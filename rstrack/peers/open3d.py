@@ -5,7 +5,6 @@ estimate = run_peer("open3d-hybrid", open_dataset(Path("out/lr_kt2")), slice(0, 
 
 from __future__ import annotations
 
-import os
 import time
 from dataclasses import dataclass
 from functools import cache
@@ -24,6 +23,7 @@ from rstrack.data.estimate import Estimate
 from rstrack.data.prefetch import prefetched
 from rstrack.data.registered import RegisteredImage, Registrar, registered_image
 from rstrack.options import PEERS, Options
+from rstrack.peers.record import run_info
 
 _KEYFRAME = "-keyframe"
 # Part of the pixels that must have found a partner, and frames in a row without, after which the reference is given up.
@@ -164,7 +164,18 @@ def run_peer(name: str, dataset: Dataset, frames: slice = slice(None), progress:
         raise UserError(f"{dataset.root}: {name} found no pose: the depth images hold next to nothing")
     stamps = np.array(tracker.stamps)
     T_world_depth = se3.interpolated(stamps + _mid_readout(dataset), np.array(tracker.poses), stamps)
-    info = _info(name, dataset, chosen, tracker, time.perf_counter() - begin, seconds)
+    info = run_info(
+        name, {"open3d": version("open3d")}, "Open3D on the CPU", dataset, chosen, time.perf_counter() - begin, seconds
+    )
+    frames_told = [
+        {
+            "stamp": r.stamp, "lost": r.lost, "keyframe": r.keyframe and _KEYFRAME in name,
+            "inliers_depth": r.fitness, "inlier_rmse": r.inlier_rmse,
+        }
+        for r in tracker.reports
+    ]  # fmt: skip
+    lost = sum(report.lost for report in tracker.reports)
+    info |= {"keyframes": tracker.keyframes, "lost": lost, "frames": frames_told}
     return Estimate(stamps, se3.orthonormalise(T_world_depth), info=info)
 
 
@@ -186,36 +197,3 @@ def _mid_readout(dataset: Dataset) -> float:
     """Seconds from a depth frame's stamp to the middle of its readout."""
     camera, shutter = dataset.rig.depth_camera, dataset.rig.depth_shutter
     return float(shutter.line_mid_time(0.0, 0.5 * (shutter.line_count(camera) - 1), camera))
-
-
-def _info(
-    name: str, dataset: Dataset, chosen: range, tracker: PeerTracker, total_s: float, seconds: list[float]
-) -> dict[str, Any]:
-    """What run.json holds, by the names of `rstrack.tracking.runs.run.track`."""
-    ms = 1e3 * np.array(seconds)
-    frames = [
-        {
-            "stamp": r.stamp, "lost": r.lost, "keyframe": r.keyframe and _KEYFRAME in name,
-            "inliers_depth": r.fitness, "inlier_rmse": r.inlier_rmse,
-        }
-        for r in tracker.reports
-    ]  # fmt: skip
-    return {
-        "method": name,
-        "versions": {"rstrack": version("rolling-shutter-rgbd"), "open3d": version("open3d")},
-        "backend": "Open3D on the CPU",
-        "machine": {"cpu_count": os.cpu_count()},
-        "dataset": {"name": dataset.name, "frames": [chosen.start, chosen.stop], "frames_in_all": len(dataset)},
-        "end": "done",
-        "error": None,
-        "keyframes": tracker.keyframes,
-        "lost": sum(report.lost for report in tracker.reports),
-        "timings": {
-            "total_s": total_s,
-            "median_ms": float(np.median(ms)),
-            "mean_ms": float(ms.mean()),
-            "p95_ms": float(np.percentile(ms, 95)),
-            "frame_ms": np.round(ms, 3),
-        },
-        "frames": frames,
-    }

@@ -23,6 +23,8 @@ from matplotlib.figure import Figure
 
 import rsgen.figures
 import rstrack.bench.methods.grid
+import rstrack.peers.clouds
+import rstrack.peers.open3d
 from rsgen.config.config import load_config
 from rsgen.console.command_line import Commands, Parser, run_program
 from rsgen.errors import UserError
@@ -40,7 +42,7 @@ from rstrack.charts.to_page import figure_of
 from rstrack.cli.bench_methods import bench
 from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.metrics.run_evaluate import run_evaluate
-from rstrack.options import METHODS, PEERS, Options
+from rstrack.options import CLOUD_PEERS, METHODS, PEERS, Options
 from rstrack.peers.command import run_command
 
 ROOT = Path(__file__).parents[2]
@@ -404,18 +406,22 @@ def test_an_unreadable_image_is_not_kept_as_a_result(place: Path) -> None:
 
 
 def test_peers_are_methods(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    peers = pytest.importorskip("rstrack.peers.open3d")
+    asked: list[str] = []
 
     def run_peer(name: str, dataset: Any, frames: slice, progress: Any) -> Estimate:
-        assert name == PEERS[0] and dataset.root.name == "robot_t1" and frames == slice(0, FRAMES)
+        asked.append(name)
+        assert dataset.root.name == "robot_t1" and frames == slice(0, FRAMES)
         return Estimate(dataset.stamps, se3.orthonormalise(dataset.truth.pose(dataset.stamps)))
 
-    monkeypatch.setattr(peers, "run_peer", run_peer)
+    monkeypatch.setattr(rstrack.peers.open3d, "run_peer", run_peer)
+    monkeypatch.setattr(rstrack.peers.clouds, "run_cloud_peer", run_peer)
     made = plan(sequences=["robot_t1"], methods=["gs-g"], peers=True)
-    assert made.methods == ("gs-g", "gs-g --fuse", *PEERS)
-    cell = run_cell(made.jobs[2])
-    assert cell.metrics is not None and cell.metrics["ate_rmse_m"] < 1e-9 and cell.seconds is not None
-    assert read_estimate(made.jobs[2].out).info["method"] == PEERS[0]
+    assert made.methods == ("gs-g", "gs-g --fuse", *PEERS, *CLOUD_PEERS)
+    for job in (made.jobs[2], made.jobs[-1]):
+        cell = run_cell(job)
+        assert cell.metrics is not None and cell.metrics["ate_rmse_m"] < 1e-9 and cell.seconds is not None
+        assert read_estimate(job.out).info["method"] == job.method
+    assert asked == [PEERS[0], CLOUD_PEERS[-1]]
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ from rstrack.data.estimate import TRAJECTORY, Estimate, plain, read_estimate, wr
 from rstrack.metrics.association import ASSOCIATE_WITHIN_S, truth_of
 from rstrack.metrics.evaluate import Metrics, evaluate
 from rstrack.metrics.run_evaluate import evaluate_clocks
-from rstrack.options import METHODS
+from rstrack.options import CLOUD_PEERS, METHODS
 from rstrack.peers.command import run_command
 from rstrack.tracking.runs.run import track
 
@@ -151,6 +151,10 @@ def _estimate(job: Job, dataset: Dataset, progress: Progress) -> tuple[Estimate,
         if job.command:
             progress(job.method, 0.0, "its command runs")
             estimate = _cut(run_command(job.method, job.command, dataset.root, job.out), dataset.stamps[frames])
+        elif job.method in CLOUD_PEERS:
+            from rstrack.peers.clouds import run_cloud_peer
+
+            estimate = run_cloud_peer(job.method, dataset, frames, progress)
         else:
             from rstrack.peers.open3d import run_peer
 
