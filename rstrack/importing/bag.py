@@ -11,6 +11,7 @@ import bz2
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -103,7 +104,6 @@ def open_bag(path: Path) -> Iterator[Bag]:
     try:
         from rosbags.rosbag1 import Reader as Reader1
         from rosbags.rosbag2 import Reader as Reader2
-        from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise UserError(f"{path}: reading bags needs rosbags: {INSTALL}") from None
     is_ros1 = path.is_file() and _starts(path, _ROS1_START)
@@ -111,14 +111,13 @@ def open_bag(path: Path) -> Iterator[Bag]:
         ending = ".mcap" if _starts(path, _MCAP_START) else ".db3"
         if path.suffix != ending:
             raise UserError(f"{path}: is a ROS 2 recording: call it {path.with_suffix(ending).name}")
-    store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
     reader: Any = None
     try:
         reader = Reader1(path) if is_ros1 else Reader2(path)
         reader.open()
         if is_ros1:
             _bound_chunks(reader)
-        bag = Bag(path, reader, store, is_ros1)
+        bag = Bag(path, reader, _standard_types(is_ros1), is_ros1)
     except Exception as error:
         _close(reader)
         raise _damaged(path, error) from None
@@ -126,6 +125,17 @@ def open_bag(path: Path) -> Iterator[Bag]:
         yield bag
     finally:
         _close(reader)
+
+
+@cache
+def _standard_types(is_ros1: bool) -> Any:
+    """The messages' definitions, as `rosbags` keeps them; it compiles each when it meets it first."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+    if is_ros1:  # which it lacks
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+    return store
 
 
 def _starts(path: Path, start: bytes) -> bool:

@@ -25,6 +25,7 @@ from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import encode_yaml, write_error
 from rsgen.sequence.format import pose_rows
+from rsgen.sequence.trajectory import MAX_POSITION_M, MIN_POSES
 from rstrack.data.layouts.tum_folder import ESTIMATED
 from rstrack.importing.recording import Inertial, Intrinsics, Picture, Pose, Recording, StreamCamera
 
@@ -213,10 +214,11 @@ def _listings(streams: _Streams, part: Path, file: str, notes: list[str]) -> dic
 
 
 def _truth(poses: Sequence[Pose], part: Path, recording: Recording, notes: list[str]) -> int:
-    once = {pose.stamp_ns: pose.T_world_color for pose in poses if np.isfinite(pose.T_world_color).all()}
+    once = {pose.stamp_ns: pose.T_world_color for pose in poses if _is_pose(pose.T_world_color)}
     if lost := len(poses) - len(once):
         notes.append(f"{lost} of {len(poses)} poses are not finite, or come twice: there is no truth at these images")
-    if not once:
+    if len(once) < MIN_POSES:
+        notes += [f"{len(once)} poses are no truth: groundtruth.txt is not written"] if once else []
         return 0
     rows = pose_rows(np.stack([once[ns] for ns in sorted(once)])).tolist()
     head = f"# {recording.truth}" if recording.is_measured else f"{ESTIMATED}{recording.truth}"
@@ -226,6 +228,10 @@ def _truth(poses: Sequence[Pose], part: Path, recording: Recording, notes: list[
     ]
     (part / "groundtruth.txt").write_text("\n".join([head, "# stamp tx ty tz qx qy qz qw", *lines, ""]))
     return len(once)
+
+
+def _is_pose(T: FloatArray) -> bool:
+    return bool(np.isfinite(T).all() and np.abs(T[:3, 3]).max() <= MAX_POSITION_M)
 
 
 def _imu(streams: _Streams, part: Path, notes: list[str]) -> int:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import math
+import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -101,10 +102,16 @@ class _Video:
     """A video that OpenCV can read, released at the end. Raises UserError."""
 
     def __init__(self, path: Path) -> None:
-        # The frames' order and size as they were encoded: odometry.csv and the intrinsics are about those.
-        self._capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_ORIENTATION_AUTO, 0])
-        if not self._capture.isOpened():
-            raise UserError(f"{path}: cannot be read as a video: it is damaged, or OpenCV has no decoder for it")
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # what is wrong is said here, in one line
+        before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        try:
+            self._capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+            if not self._capture.isOpened():
+                raise UserError(f"{path}: cannot be read as a video: it is damaged, or OpenCV has no decoder for it")
+        finally:
+            cv2.utils.logging.setLogLevel(before)
+        # Pixels as they were encoded: odometry.csv, the intrinsics and depth are about those.
+        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
 
     def __enter__(self) -> Any:
         return self._capture
