@@ -114,6 +114,8 @@ def open_bag(path: Path) -> Iterator[Bag]:
     reader: Any = None
     try:
         reader = Reader1(path) if is_ros1 else Reader2(path)
+        if not is_ros1:
+            _bound_mcap()
         reader.open()
         if is_ros1:
             _bound_chunks(reader)
@@ -180,10 +182,10 @@ def _bound_chunks(reader: Any) -> None:
     from rosbags.rosbag1.reader import decompressors
 
     def unbz2(data: bytes) -> bytes:
-        return _bounded(bz2.BZ2Decompressor(), data)
+        return _bounded(bz2.BZ2Decompressor(), data, _MOST_CHUNK_BYTES)
 
     def unlz4(data: bytes) -> bytes:
-        return _bounded(LZ4FrameDecompressor(), data)
+        return _bounded(LZ4FrameDecompressor(), data, _MOST_CHUNK_BYTES)
 
     ours = {decompressors["bz2"]: unbz2, decompressors["lz4"]: unlz4}
     reader.chunks = {
@@ -192,8 +194,26 @@ def _bound_chunks(reader: Any) -> None:
     }
 
 
-def _bounded(decompressor: Any, data: bytes) -> bytes:
-    out: bytes = decompressor.decompress(data, _MOST_CHUNK_BYTES)
+@cache
+def _bound_mcap() -> None:
+    """Let no chunk of an MCAP unpack to more than it claims, nor that be more than a bound.
+
+    The library looks up in a table of its own how to unpack, and has no other place for that.
+    """
+    from lz4.frame import LZ4FrameDecompressor
+    from rosbags.rosbag2 import storage_mcap
+
+    def unzstd(data: bytes, size: int) -> bytes:
+        return _bounded(storage_mcap.zstd.ZstdDecompressor(), data, min(size, _MOST_CHUNK_BYTES))
+
+    def unlz4(data: bytes, size: int) -> bytes:
+        return _bounded(LZ4FrameDecompressor(), data, min(size, _MOST_CHUNK_BYTES))
+
+    storage_mcap.DECOMPRESSORS |= {"zstd": unzstd, "lz4": unlz4}
+
+
+def _bounded(decompressor: Any, data: bytes, most: int) -> bytes:
+    out: bytes = decompressor.decompress(data, most)
     if not decompressor.eof:
-        raise ValueError("a chunk is cut short, or larger than a gigabyte")
+        raise ValueError(f"a chunk is cut short, or unpacks to more than {most} bytes")
     return out

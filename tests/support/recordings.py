@@ -19,7 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
@@ -153,6 +153,8 @@ def write_spoken(path: Path, talker: Talker, spoken: Spoken, storage: str = "") 
         folder = path.with_suffix(".folder") if path.suffix in (".db3", ".mcap") else path
         plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
         writer = Writer2(folder, version=9, storage_plugin=plugin)
+        if storage == "mcap":
+            writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
     with writer:
         connections: dict[str, Any] = {}
         for topic, kind, ns, data in spoken:
