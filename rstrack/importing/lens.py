@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import get_args
-
 import numpy as np
 import numpy.typing as npt
 
 from rsgen.errors import UserError
-from rsgen.geometry.camera import Camera, Model
+from rsgen.geometry.camera import Camera
 
 # Larger than any camera's: a damaged file, which must not decide how much memory is taken.
 _MOST_PIXELS = 1 << 26
@@ -42,8 +40,8 @@ def camera_of(
             return Camera(width, height, fx, fy, cx, cy, "fisheye", tuple((d + [0.0] * 4)[:4]))
         if key in (*_RADTAN, *_INVERSE, *_RATIONAL) and not any(d[5:]):
             return Camera(width, height, fx, fy, cx, cy, "radtan", tuple((d + [0.0] * 4)[: 5 if any(d[4:]) else 4]))
-        if key in _RATIONAL and len(d) >= 8 and not any(d[8:]) and "rational" in get_args(Model):
-            return Camera(width, height, fx, fy, cx, cy, "rational", tuple(d[:8]))  # type: ignore[arg-type]
+        if key in _RATIONAL and len(d) >= 8 and not any(d[8:]):
+            return Camera(width, height, fx, fy, cx, cy, "rational", tuple(d[:8]))
     except UserError as error:
         raise UserError(f"{name}: {error}") from None
     raise UserError(
