@@ -245,6 +245,11 @@ def test_lens_models_and_undistorted_images(place: Path, capfd: pytest.CaptureFi
     dataset, _ = imported(capfd, "b --force")
     assert dataset.rig.color_camera.model == "radtan" and dataset.rig.color_camera.distortion == tuple(D)
     assert dataset.rig.depth_camera.model == "pinhole"  # image_rect_raw: what is published is undistorted
+    full = [0.5, -2.6, 6e-4, -1e-4, 1.5, 0.38, -2.45, 1.46]
+    spoken = recordings.speak(talker, CONTENT, color_info=("rational_polynomial", full))
+    recordings.write_spoken(place / "d", talker, spoken, "mcap")
+    dataset, _ = imported(capfd, "d --force")
+    assert dataset.rig.color_camera.model == "rational" and dataset.rig.color_camera.distortion == tuple(full)
     spoken = recordings.speak(talker, CONTENT, color_info=("double_sphere", D))
     recordings.write_spoken(place / "c", talker, spoken, "mcap")
     (place / "out").rename(place / "before")
