@@ -128,7 +128,7 @@ def test_a_zip_bomb_and_names_that_leave_the_folder(tmp_path: Path, monkeypatch:
         for info in old.infolist():
             new.writestr(info.filename, bytes(100 << 20) if info.filename == "rgbd/1.jpg" else old.read(info))
     assert bomb.stat().st_size < 1 << 20
-    assert "unpacks to" in attempt(bomb, tmp_path / "out")
+    assert f"unpacks to {100 << 20} bytes" in attempt(bomb, tmp_path / "out")
     # The directory lies about the size: what comes out is counted.
     data = bytearray(bomb.read_bytes())
     at = data.rindex(b"PK\x01\x02", 0, data.rindex(b"rgbd/1.jpg"))
