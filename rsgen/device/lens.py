@@ -61,14 +61,19 @@ class Distorted:
 
 
 def distort(camera: Camera, x: Any, y: Any) -> Distorted:
-    """Pinhole, radial-tangential or fisheye distortion of normalised coordinates; twin of `Camera.project`."""
+    """Pinhole, radtan, rational or fisheye distortion of normalised coordinates; twin of `Camera.project`."""
     if camera.model == "pinhole":
         return Distorted(x, y, 1.0, 0.0, 1.0, 1.0)
     r2 = x * x + y * y
-    if camera.model == "radtan":
-        k1, k2, p1, p2, k3 = _radtan(camera)
+    if camera.model in ("radtan", "rational"):
+        k1, k2, p1, p2, k3 = _brown(camera)
         scale = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
         slope = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * (3.0 * k3)))
+        if camera.model == "rational":
+            k4, k5, k6 = camera.distortion[5:]
+            below = dr.rcp(1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+            scale = scale * below
+            slope = (slope - scale * (2.0 * (k4 + r2 * (2.0 * k5 + r2 * (3.0 * k6))))) * below
         return Distorted(
             x * scale + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
             y * scale + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
@@ -96,7 +101,14 @@ def undistort(camera: Camera, xd: Any, yd: Any) -> tuple[Any, Any]:
         return xd * scale, yd * scale
     if not any(camera.distortion):
         return xd, yd
-    k1, k2, p1, p2, k3 = _radtan(camera)
+    if camera.model == "rational":
+        x, y = xd, yd
+        for _ in range(_UNDISTORT_STEPS):
+            d = distort(camera, x, y)
+            ex, ey, inverse = d.x - xd, d.y - yd, dr.rcp(d.dxx * d.dyy - d.dxy * d.dxy)
+            x, y = x - (d.dyy * ex - d.dxy * ey) * inverse, y - (d.dxx * ey - d.dxy * ex) * inverse
+        return x, y
+    k1, k2, p1, p2, k3 = _brown(camera)
     x, y = xd, yd
     for _ in range(_UNDISTORT_STEPS):
         d, r2 = distort(camera, x, y), x * x + y * y
@@ -112,8 +124,8 @@ def undistort(camera: Camera, xd: Any, yd: Any) -> tuple[Any, Any]:
     return x, y
 
 
-def _radtan(camera: Camera) -> tuple[float, float, float, float, float]:
-    """k1 k2 p1 p2 k3 of a radial-tangential camera."""
+def _brown(camera: Camera) -> tuple[float, float, float, float, float]:
+    """k1 k2 p1 p2 k3 of a radial-tangential or rational camera."""
     k1, k2, p1, p2, k3 = (*camera.distortion, 0.0)[:5]
     return k1, k2, p1, p2, k3
 

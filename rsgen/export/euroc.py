@@ -37,7 +37,9 @@ from rsgen.sensors.imu import ImuSamples, nanoseconds, write_imu_csv
 from rsgen.sequence.format import ground_truth, pose_rows
 from rsgen.sequence.reader import Sequence, Stream
 
-_MODELS = {"pinhole": "radial-tangential", "radtan": "radial-tangential", "fisheye": "equidistant"}
+_MODELS = {"pinhole": "radial-tangential", "fisheye": "equidistant"} | dict.fromkeys(
+    ("radtan", "rational"), "radial-tangential"
+)
 _TRUTH = "state_groundtruth_estimate0"
 _TRUTH_HEADER = (
     "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], "

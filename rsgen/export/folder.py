@@ -162,8 +162,9 @@ def four_coefficients(name: str, camera: Camera) -> list[float]:
     if camera.model == "pinhole":
         return [0.0] * 4
     if any(camera.distortion[4:]):
+        number, k = next((i, k) for i, k in enumerate(camera.distortion[4:], 3) if k)
         raise UserError(
-            f"{name}: k3 = {camera.distortion[4]:g} has no place among Kalibr's and EuRoC's four coefficients: "
-            "render with k3 = 0 or use a fisheye model"
+            f"{name}: k{number} = {k:g} has no place among Kalibr's and EuRoC's four coefficients: "
+            f"render with k{number} = 0 or use a fisheye model"
         )
     return list(camera.distortion[:4])

@@ -29,7 +29,7 @@ from rsgen.sensors.imu import nanoseconds, write_imu_csv
 from rsgen.sequence.reader import Sequence, Stream
 
 COLOR_TOPIC, DEPTH_TOPIC, IMU_TOPIC = "/cam0/image_raw", "/cam1/image_raw", "/imu0"
-_MODELS = {"pinhole": "radtan", "radtan": "radtan", "fisheye": "equidistant"}
+_MODELS = {"pinhole": "radtan", "radtan": "radtan", "rational": "radtan", "fisheye": "equidistant"}
 
 
 def export_kalibr(sequence: Sequence, out: Path, copy: bool = False, progress: Progress = no_progress) -> str:

@@ -1,11 +1,12 @@
-"""Camera models: pinhole, radial-tangential and fisheye; pixels to rays and back, with Jacobians.
+"""Camera models: pinhole, radial-tangential, rational and fisheye; pixels to rays and back, with Jacobians.
 
 Camera frame: x right, y down, z forward. Pixel centres at integer coordinates. Normalised coordinates are (x/z, y/z).
-Distortion as in OpenCV: `radtan` k1 k2 p1 p2 [k3] (Brown-Conrady), `fisheye` k1 k2 k3 k4 (Kannala-Brandt).
+Distortion as in OpenCV: `radtan` k1 k2 p1 p2 [k3] (Brown-Conrady), `rational` k1 k2 p1 p2 k3 k4 k5 k6, in which the
+radial part is divided by 1 + k4 r² + k5 r⁴ + k6 r⁶, `fisheye` k1 k2 k3 k4 (Kannala-Brandt).
 
-Both distortions are polynomials that may fold back at some radius, beyond which one pixel would see two directions. A
-camera here is defined only inside a disc around the optical axis on which the distortion provably is one to one; what
-lies outside is reported as not visible instead of being projected to a wrong place.
+Distortions are polynomials, or quotients of them, that may fold back at some radius, beyond which one pixel would see
+two directions. A camera here is defined only inside a disc around the optical axis on which the distortion provably is
+one to one; what lies outside is reported as not visible instead of being projected to a wrong place.
 """
 
 from __future__ import annotations
@@ -18,13 +19,16 @@ from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
+from numpy.polynomial import Polynomial
 
 from rsgen.array_types import BoolArray, FloatArray
 from rsgen.errors import UserError
 
-Model = Literal["pinhole", "radtan", "fisheye"]
+Model = Literal["pinhole", "radtan", "rational", "fisheye"]
 
-_COEFFICIENTS: dict[str, tuple[int, ...]] = {"pinhole": (0,), "radtan": (4, 5), "fisheye": (4,)}
+_COEFFICIENTS: dict[str, tuple[int, ...]] = {"pinhole": (0,), "radtan": (4, 5), "rational": (8,), "fisheye": (4,)}
+# Radii in a table of the rational distortion, from which its inverse starts.
+_STARTS = 1024
 # Metres. Nearer points have no direction that float64 could tell.
 _MIN_DEPTH = 1e-9
 # A microradian from the image plane; keeps powers of the radius finite.
@@ -36,7 +40,7 @@ class Camera:
     """Width and height in pixels, focal lengths and principal point in pixels, distortion model and coefficients.
 
     Raises UserError for sizes and focal lengths that are not positive, non-finite numbers, and a wrong number of
-    coefficients (pinhole 0, radtan 4 or 5, fisheye 4).
+    coefficients (pinhole 0, radtan 4 or 5, rational 8, fisheye 4).
     """
 
     width: int
@@ -83,11 +87,13 @@ class Camera:
         if self.model == "fisheye":
             theta = math.sqrt(_first_root(_odd_slope(self.distortion)))
             return math.tan(min(theta, math.atan(_MAX_RADIUS)))
-        k1, k2, p1, p2, k3 = self._radtan
+        k1, k2, p1, p2, k3 = self._brown
         # The Jacobian is symmetric; its radial part has the eigenvalues d and (r d)', the tangential part none below
         # -6 |p| r. Where both sums are positive it is positive definite, and on a disc, being convex, that makes the
         # map one to one.
         tangential = 6.0 * math.hypot(p1, p2)
+        if self.model == "rational":
+            return min(_rational_radius((k1, k2, k3), self.distortion[5:], tangential), _MAX_RADIUS)
         across = [1.0, -tangential, k1, 0.0, k2, 0.0, k3]
         along = [1.0, -tangential, 3.0 * k1, 0.0, 5.0 * k2, 0.0, 7.0 * k3]
         return min(_first_root(across), _first_root(along), _MAX_RADIUS)
@@ -131,7 +137,8 @@ class Camera:
         return np.stack([u, v], axis=-1)
 
     @property
-    def _radtan(self) -> tuple[float, float, float, float, float]:
+    def _brown(self) -> tuple[float, float, float, float, float]:
+        """k1 k2 p1 p2 k3 of a radial-tangential or rational camera."""
         k1, k2, p1, p2, k3 = (*self.distortion, 0.0)[:5]
         return k1, k2, p1, p2, k3
 
@@ -151,8 +158,8 @@ class Camera:
         r2 = x * x + y * y
         if self.model == "fisheye":
             return xy * self._fisheye_scale(r2)[0][..., None]
-        k1, k2, p1, p2, k3 = self._radtan
-        d = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        _, _, p1, p2, _ = self._brown
+        d = self._radial_scale(r2)[0]
         return np.stack(
             [x * d + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x), y * d + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y],
             axis=-1,
@@ -167,14 +174,25 @@ class Camera:
         if self.model == "fisheye":
             s, g = self._fisheye_scale(r2)
             return _symmetric(s + g * x * x, g * x * y, s + g * y * y)
-        k1, k2, p1, p2, k3 = self._radtan
-        s = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        g = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * (3.0 * k3)))
+        _, _, p1, p2, _ = self._brown
+        s, g = self._radial_scale(r2)
         return _symmetric(
             s + g * x * x + 2.0 * p1 * y + 6.0 * p2 * x,
             g * x * y + 2.0 * (p1 * x + p2 * y),
             s + g * y * y + 6.0 * p1 * y + 2.0 * p2 * x,
         )
+
+    def _radial_scale(self, r2: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The radial part's s and g = (ds/dr) / r of a radial-tangential or rational camera."""
+        k1, k2, _, _, k3 = self._brown
+        s = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        g = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * (3.0 * k3)))
+        if self.model != "rational":
+            return s, g
+        k4, k5, k6 = self.distortion[5:]
+        below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        slope = 2.0 * (k4 + r2 * (2.0 * k5 + r2 * (3.0 * k6)))
+        return s / below, (g * below - s * slope) / (below * below)
 
     def _fisheye_scale(self, r2: FloatArray) -> tuple[FloatArray, FloatArray]:
         """s = θ_d / r and g = (ds/dr) / r."""
@@ -194,7 +212,12 @@ class Camera:
         if self.model == "fisheye":
             theta = _invert_odd(self.distortion, radius, math.atan(self.max_radius))
             return unit * np.tan(theta)[..., None]
-        k1, k2, p1, p2, k3 = self._radtan
+        if self.model == "rational":
+            reach = math.atan((1.0 - 1e-9) * self.max_radius)
+            radii = np.tan(np.linspace(0.0, reach, _STARTS))
+            start = np.interp(radius, radii * self._radial_scale(radii * radii)[0], radii)
+            return self._newton(unit * start[..., None], distorted)
+        k1, k2, p1, p2, k3 = self._brown
         without_tangential = _invert_odd((k1, k2, k3), radius, self.max_radius)
         if p1 == p2 == 0.0:
             return unit * without_tangential[..., None]
@@ -248,6 +271,18 @@ def _odd(ks: Sequence[float], x: FloatArray) -> FloatArray:
 def _odd_slope(ks: Sequence[float]) -> list[float]:
     """Coefficients, in x² and with the constant term first, of the derivative of `_odd`."""
     return [1.0, *((2 * i + 3) * k for i, k in enumerate(ks))]
+
+
+def _rational_radius(above: Sequence[float], below: Sequence[float], tangential: float) -> float:
+    """As `Camera.max_radius` of N / D, D positive: the conditions of radtan, times D and D².
+
+    above, below (3,): coefficients of r², r⁴, r⁶ of N and of D.
+    """
+    N, D = (Polynomial([1.0, 0.0, k[0], 0.0, k[1], 0.0, k[2]]) for k in (above, below))
+    r = Polynomial([0.0, 1.0])
+    across = N - tangential * r * D
+    along = N * D + r * (N.deriv() * D - N * D.deriv()) - tangential * r * D * D
+    return min(_first_root(p.coef.tolist()) for p in (D, across, along))
 
 
 def _first_root(coefficients: Sequence[float]) -> float:

@@ -26,6 +26,7 @@ from rstrack.cli.bench_methods import STATUS as BENCH_STATUS
 from rstrack.cli.bench_methods import bench
 from rstrack.cli.calibrate import STATUS as CALIBRATE_STATUS
 from rstrack.cli.calibrate import calibrate
+from rstrack.cli.importing import import_
 from rstrack.cli.mapping import keyframes, map_, map_eval
 from rstrack.cli.options import (
     CameraFile,
@@ -49,6 +50,7 @@ if TYPE_CHECKING:
 _DESCRIPTION = """\
 rstrack estimates the continuous-time trajectory of a rolling-shutter RGB-D camera: every line has its own pose.
 
+  rstrack import mine.bag mine                         a folder of a ROS bag, or of what other recorders write
   rstrack info out/demo                                what would be tracked
   rstrack track out/demo --out runs/demo               track it; the trajectory is in runs/demo
   rstrack calibrate out/demo --out camera.yaml         readouts, clocks and extrinsics out of the recording itself
@@ -93,6 +95,7 @@ def _parser() -> Parser:
     add(evaluate, "out/lr_kt2 runs/lr_kt2 --json")
     add(plot, "out/lr_kt2 runs/lr_kt2 --out lr_kt2.png")
     add(info, "out/lr_kt2")
+    add(import_, "mine.bag mine --color /camera/color/image_raw --device realsense-d435")
     add(report, "runs/lr_kt2 --sequence out/lr_kt2")
     add(map_, "out/lr_kt2 runs/lr_kt2 --out lr_kt2.ply --every 5")
     add(map_eval, "lr_kt2.ply out/lr_kt2/scene.ply")

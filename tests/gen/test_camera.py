@@ -23,8 +23,12 @@ FREIBURG1 = replace(PINHOLE, model="radtan", distortion=(0.2624, -0.9531, -0.005
 BARREL = Camera(320, 240, 170.0, 171.0, 158.0, 121.0, "radtan", (-0.25, 0.05, 1e-3, -2e-3))
 TANGENTIAL = replace(PINHOLE, model="radtan", distortion=(0.0, 0.0, 0.03, -0.05))
 FISHEYE = Camera(400, 400, 190.978, 190.973, 198.93, 200.897, "fisheye", (0.00348, 0.00072, -0.00205, 0.0002))
-CAMERAS = [PINHOLE, FREIBURG1, BARREL, TANGENTIAL, FISHEYE]
-NAMES = ["pinhole", "freiburg1", "barrel", "tangential", "fisheye"]
+# As an Azure Kinect's colour camera reports it, and one with all eight coefficients strong.
+AZURE = Camera(1280, 720, 605.7, 605.6, 637.9, 366.2, "rational",
+               (0.4996, -2.6329, 5.7e-4, -1.4e-4, 1.5296, 0.3800, -2.4539, 1.4563))  # fmt: skip
+RATIONAL = replace(PINHOLE, model="rational", distortion=(0.3, 0.1, 0.004, -0.003, 0.02, 0.5, 0.1, 0.01))
+CAMERAS = [PINHOLE, FREIBURG1, BARREL, TANGENTIAL, FISHEYE, AZURE, RATIONAL]
+NAMES = ["pinhole", "freiburg1", "barrel", "tangential", "fisheye", "azure", "rational"]
 each_camera = pytest.mark.parametrize("camera", CAMERAS, ids=NAMES)
 
 

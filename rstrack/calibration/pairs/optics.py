@@ -19,7 +19,7 @@ from rstrack.calibration.unknowns.parameters import DEPTH, LENS, NAMES
 from rstrack.data.depth_error import DepthError
 
 # Coefficients of distortion at most.
-_BENDS = 5
+_BENDS = 8
 # About how far a change of one moves points at the image's edge, m at 1 m, and of depth 1/m² more; a fifth of it is the
 # unit of its column, since two images that nearly agree show little of it.
 _MOVES = {
@@ -61,7 +61,7 @@ class Optics:
 
 
 def camera_table(camera: Camera) -> FloatArray:
-    """What `traced` takes (10,)."""
+    """What `traced` takes (13,)."""
     bent = (*camera.distortion, *(0.0,) * _BENDS)[:_BENDS]
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *bent, min(camera.max_radius, 1e6)])
 

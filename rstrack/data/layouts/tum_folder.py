@@ -29,6 +29,8 @@ from rstrack.data.rig import Rig
 
 _ASSOCIATIONS = ("associations.txt", "associate.txt", "association.txt")
 _CAMERA_FILES = ("camera.yaml", "calibration.yaml")
+ESTIMATED = "# estimated, not measured: "
+"""Begins the first line of a groundtruth.txt whose poses are another estimate from the same images."""
 _MAX_STAMP_S = 1e11  # the year 5138; today in milliseconds, microseconds or nanoseconds is beyond
 
 
@@ -62,7 +64,8 @@ def read_tum_folder(root: Path, camera_file: Path | None) -> TumFolder:
     images = ImageFiles(file.rig, file.depth_scale, color.paths, depth.paths)
     rate = ICL_RATE_HZ if depth.has_frame_numbers and color.has_frame_numbers else 1.0
     stamps = depth.stamps / rate, color.stamps / rate
-    return TumFolder(file, *stamps, images, _truth(root, file.rig), (*depth_note, *color_note))
+    notes = (*depth_note, *color_note, *_truth_note(root))
+    return TumFolder(file, *stamps, images, _truth(root, file.rig), notes)
 
 
 # --- listings --------------------------------------------------------------------------------------------------------
@@ -229,3 +232,17 @@ def _truth(root: Path, rig: Rig) -> Trajectory | None:
         return None
     # Motion capture loses the camera now and then; what an evaluation interpolates over is its own business.
     return read_trajectory(file, max_gap_s=math.inf).moved(T_body_cam=rig.T_color_depth)
+
+
+def _truth_note(root: Path) -> tuple[str, ...]:
+    """What there is to say of a truth that says itself that it is none."""
+    file = root / "groundtruth.txt"
+    if not file.is_file():
+        return ()
+    with file.open("rb") as opened:
+        first = opened.readline(200).decode("utf-8", "replace").strip()
+    if not first.startswith(ESTIMATED):
+        return ()
+    return (
+        f"{file.name} is estimated, not measured: {first.removeprefix(ESTIMATED)}; errors against it are differences",
+    )
