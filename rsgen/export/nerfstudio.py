@@ -3,7 +3,7 @@
 Camera axes are OpenGL's: x right, y up, z backward; pixel centres at halves. Keys beyond nerfstudio's own:
 
     camera_linear_velocity, camera_angular_velocity    of each frame, at its middle line, m/s and rad/s in the
-    rolling_shutter_time, exposure_time                camera's axes; s: 3dgs-deblur (SpectacularAI's forks of nerfstudio
+    rolling_shutter_time, exposure_time                camera's axes; s: 3dgs-deblur (SpectacularAI's nerfstudio
                                                        and gsplat: t = rolling_shutter_time (y / height - 1/2))
     transform_matrix_start, transform_matrix_end       of the first and the last line that are read: gsplat's `viewmats`
     shutter_type                                       and `viewmats_rs` (inverted, in OpenCV's axes), and its

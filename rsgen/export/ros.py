@@ -1,7 +1,7 @@
 """A sequence as a ROS 1 bag, a ROS 2 bag or an MCAP file, with topics and frames as a RealSense's driver names them.
 
     /camera/color/image_raw, camera_info           rgb8
-    /camera/depth/image_rect_raw, camera_info      32FC1, m, NaN = nothing measured; with a depth_scale of 1000 16UC1, mm
+    /camera/depth/image_rect_raw, camera_info    32FC1, m, NaN = nothing measured; 16UC1, mm, of a depth_scale of 1000
     /camera/aligned_depth_to_color/image_raw, ...  instead, where depth is registered
     /camera/imu                                    where the sequence has an IMU
     /tf, /ground_truth/pose                        exact T_world_depth, 200 Hz and at every image's true stamp
