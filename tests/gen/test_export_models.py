@@ -254,7 +254,7 @@ def test_gsplat_s_own_interpolation_comes_as_near_as_is_said(
 def test_the_velocities_move_points_as_3dgs_deblur_moves_them(
     sequence: Sequence, nerf: Path, meta: dict[str, Any]
 ) -> None:
-    """Its arithmetic: axes flipped, t = rolling_shutter_time (y / height − 1/2), y = row + 1/2, straight in the image."""
+    """Axes flipped, t = rolling_shutter_time (y / height − 1/2), y = row + 1/2, straight in the image."""
     seen, camera = sightings(sequence), sequence.streams["color"].camera
     pinhole = replace(camera, model="pinhole", distortion=())
     errors = []
