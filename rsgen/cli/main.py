@@ -17,7 +17,10 @@ from rsgen.console.command_line import Commands, Frames, Json, Parser, Quiet, pr
 from rsgen.console.configs import ConfigFile, config_file, configs_text
 from rsgen.console.scheduler import Scheduler, open_workers
 
-Export = Literal["kalibr", "euroc", "registered", "video", "rerun"]
+Export = Literal[
+    "kalibr", "euroc", "registered", "ros1", "ros2", "mcap", "colmap", "nerfstudio", "video", "rerun"
+]  # fmt: skip
+Storage = Literal["sqlite3", "mcap"]
 BENCH_MODES = ("still", "rs-blur", "path", "rows", "averaged")
 _BLENDER_MODES = ("blender-still", "blender")  # asked for by name: they need bpy and take long
 Mode = Literal["still", "rs-blur", "path", "rows", "averaged", "blender-still", "blender", "all"]
@@ -31,7 +34,7 @@ rsgen makes rolling-shutter RGB-D benchmark sequences with exact continuous-time
   rsgen fit my_trajectory.txt           how well a spline represents a recorded trajectory
   rsgen motion suggest room.xml --out room.yaml      a tour through a scene of your own, to render or to edit
   rsgen motion stats table1             how far and how fast a config's camera moves
-  rsgen export euroc out/demo           for the tools of others: EuRoC, Kalibr, registered TUM, video, rerun
+  rsgen export euroc out/demo           for the tools of others: EuRoC, Kalibr, ROS, COLMAP, nerfstudio ...
 
 A config is a YAML file or a name. Scenes are built, and their light is baked, once: in a checkout beside their scripts,
 otherwise in $XDG_CACHE_HOME/rsgen (~/.cache/rsgen).
@@ -195,15 +198,18 @@ def export(
     to: Annotated[
         Export,
         "kalibr: camchain.yaml with line_delay, imu.yaml, with a target also target.yaml and images; euroc: mav0/ "
-        "(ASL); registered: TUM folder with depth warped into the colour camera, its rows' times lost; video: global "
-        "beside rolling shutter (.mp4); rerun: .rrd recording",
+        "(ASL); registered: TUM folder with depth warped into the colour camera, its rows' times lost; ros1, ros2, "
+        "mcap: a bag with images, IMU, tf and the lines' times; colmap: text model and images; nerfstudio: "
+        "transforms.json with poses and velocities for rolling-shutter splatting; video: global beside rolling shutter "
+        "(.mp4); rerun: .rrd recording",
         "|".join(get_args(Export)),
     ],
     sequence: SequenceFolder,
     *,
     out: Annotated[Path | None, "where to (default: within the sequence's folder)", "PATH"] = None,
-    copy: Annotated[bool, "euroc, registered, kalibr: copy images instead of linking them"] = False,
+    copy: Annotated[bool, "euroc, registered, kalibr, colmap, nerfstudio: copy images instead of linking them"] = False,
     scene: Annotated[Path | None, "video: scene file, if it has moved since the sequence was rendered"] = None,
+    storage: Annotated[Storage, "ros2: what the bag is stored in"] = "sqlite3",
     quiet: Quiet = False,
 ) -> int:
     """Write a sequence in the layout of other tools."""
@@ -211,7 +217,7 @@ def export(
     from rsgen.export.all import export as write
 
     with ProgressDisplay(quiet) as progress:
-        done = write(to, sequence, out, copy, scene, progress)
+        done = write(to, sequence, out, copy, scene, storage, progress)
     print(done)
     return 0
 

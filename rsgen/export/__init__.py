@@ -1,1 +1,1 @@
-"""A sequence in the layouts of other tools: Kalibr, EuRoC/ASL, registered TUM RGB-D, video, rerun."""
+"""A sequence in other tools' layouts: Kalibr, EuRoC/ASL, registered TUM, ROS, COLMAP, nerfstudio, video, rerun."""

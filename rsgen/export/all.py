@@ -6,16 +6,24 @@ from pathlib import Path
 from typing import Literal
 
 from rsgen.console.progress import Progress
+from rsgen.export.ros_bag import Storage
 from rsgen.sequence.reader import Sequence, read_sequence
 
-Export = Literal["kalibr", "euroc", "registered", "video", "rerun"]
+Export = Literal[
+    "kalibr", "euroc", "registered", "ros1", "ros2", "mcap", "colmap", "nerfstudio", "video", "rerun"
+]  # fmt: skip
+
+_BAGS: dict[str, str] = {"ros1": "{}.bag", "ros2": "ros2", "mcap": "{}.mcap"}
 
 
-def export(to: Export, path: Path, out: Path | None, copy: bool, scene: Path | None, progress: Progress) -> str:
+def export(
+    to: Export, path: Path, out: Path | None, copy: bool, scene: Path | None, storage: Storage, progress: Progress
+) -> str:
     """Export the sequence at `path` and say in one line what was written. Raises UserError.
 
-    out: default kalibr/, mav0/, registered/, shutter.mp4 or NAME.rrd within the sequence's folder. copy: images, rather
-    than linking them. scene: for the video, which renders again.
+    out: default kalibr/, mav0/, registered/, NAME.bag, ros2/, NAME.mcap, colmap/, nerfstudio/, shutter.mp4 or NAME.rrd
+    within the sequence's folder. copy: images, rather than linking them. scene: for the video, which renders again.
+    storage: of a ROS 2 bag.
     """
     sequence = read_sequence(path)
     if to == "kalibr":
@@ -30,6 +38,18 @@ def export(to: Export, path: Path, out: Path | None, copy: bool, scene: Path | N
         from rsgen.export.registered import export_registered
 
         return export_registered(sequence, out or path / "registered", copy, progress)
+    if to == "ros1" or to == "ros2" or to == "mcap":
+        from rsgen.export.ros import export_ros
+
+        return export_ros(sequence, out or path / _BAGS[to].format(sequence.name), to, storage, progress)
+    if to == "colmap":
+        from rsgen.export.colmap import export_colmap
+
+        return export_colmap(sequence, out or path / "colmap", copy, progress)
+    if to == "nerfstudio":
+        from rsgen.export.nerfstudio import export_nerfstudio
+
+        return export_nerfstudio(sequence, out or path / "nerfstudio", copy, progress)
     if to == "rerun":
         from rsgen.export.rerun import export_rerun
 
