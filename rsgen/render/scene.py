@@ -12,6 +12,8 @@ import logging
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -140,13 +142,29 @@ def _load_xml(mi: Any, path: Path, scratch: Path, board: Board | None, messages:
     resolver = mi.file_resolver()
     resolver.prepend(str(path.resolve().parent))
     try:
-        scene = _instantiated(mi, config, state, path, scratch)
+        with _threads_to_read_with():
+            scene = _instantiated(mi, config, state, path, scratch)
     finally:
         del resolver[0]  # else the next scene would find what it lacks, an include say, in this one's folder
     if changes is not None:
         changes.dropped.update(unknown_properties(messages))
         log.log(logging.WARNING if changes.lossy else logging.DEBUG, "scene %s: %s", path, changes.summary())
     return scene
+
+
+@contextmanager
+def _threads_to_read_with() -> Iterator[None]:
+    """Two threads at least: with one, as on a machine of one core, Mitsuba 3.9 waits for ever to read an EXR."""
+    import drjit as dr
+
+    before = dr.thread_count()
+    if before < 2:
+        dr.set_thread_count(2)
+    try:
+        yield
+    finally:
+        if before < 2:
+            dr.set_thread_count(before)
 
 
 def _instantiated(mi: Any, config: Any, state: Any, path: Path, scratch: Path) -> Any:

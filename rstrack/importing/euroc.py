@@ -10,7 +10,7 @@ import csv
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
@@ -19,11 +19,11 @@ from rsgen.errors import UserError
 from rsgen.files import listed_file, read_bytes, read_text, read_yaml
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
-from rsgen.geometry.shutter import Scan
 from rsgen.limits import rigid
 from rstrack.importing.arkit import pose_of
 from rstrack.importing.lens import camera_of
 from rstrack.importing.pixels import compressed_color, compressed_depth
+from rstrack.importing.readout import with_shutter
 from rstrack.importing.recording import Inertial, Item, Picture, Pose, Recording, StreamCamera
 
 _MILLIMETRES = 1000.0
@@ -104,11 +104,7 @@ def _camera(path: Path, data: dict[str, Any]) -> StreamCamera:
     shutter = data.get("rolling_shutter")
     if not isinstance(shutter, dict):
         return StreamCamera(camera)
-    times = [shutter.get(name, 0.0) for name in ("readout_s", "exposure_s")]
-    scan: Scan = shutter.get("scan", "top-bottom")
-    if not all(isinstance(t, int | float) and 0 <= t < 10 for t in times) or scan not in get_args(Scan):
-        raise UserError(f"{path}: rolling_shutter needs readout_s and exposure_s in seconds, and a scan")
-    return StreamCamera(camera, float(times[0]), float(times[1]), scan)
+    return with_shutter(str(path), camera, shutter)
 
 
 def _rows(path: Path, least: int) -> list[list[str]]:

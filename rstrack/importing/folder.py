@@ -186,7 +186,8 @@ def _note_sample(streams: _Streams, sample: Inertial) -> None:
 def _listings(streams: _Streams, part: Path, file: str, notes: list[str]) -> dict[str, int]:
     """rgb.txt and depth.txt, by one clock for both."""
     every = [pair for stamps in streams.stamps.values() for pair in stamps]
-    use_arrival = any(stamp == 0 for stamp, _ in every)
+    # A first image may be of time 0; more of them are of none.
+    use_arrival = any(sum(stamp == 0 for stamp, _ in stamps) > 1 for stamps in streams.stamps.values())
     if use_arrival:
         if any(arrival is None for _, arrival in every):
             raise UserError(f"{file}: images without stamps, and nothing else tells their times")

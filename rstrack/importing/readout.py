@@ -1,4 +1,5 @@
-"""Readout times that a recording states: Android's SENSOR_ROLLING_SHUTTER_SKEW among the metadata of images.
+"""Readout times that a recording states: in a topic `rolling_shutter` as `rsgen export` writes it, or Android's
+SENSOR_ROLLING_SHUTTER_SKEW among the metadata of images.
 
 Android: "duration between the start of exposure for the first row of the image sensor, and the start of exposure for
 one past the last row", in nanoseconds, which is `readout_s` (developer.android.com, CaptureResult).
@@ -9,17 +10,48 @@ from __future__ import annotations
 import json
 import re
 from itertools import islice
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
+from rsgen.errors import UserError
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Scan
+from rsgen.sequence.format import StreamName
 from rstrack.importing.bag import Bag
+from rstrack.importing.recording import StreamCamera
 
 _METADATA = ("diagnostic_msgs/KeyValue", "std_msgs/String")
 _SKEW = re.compile(r"(android\.sensor\.|sensor)?rollingshutterskew(ns)?")
 # Metadata messages that are looked at: a frame has some dozens of them.
 _FIRST = 200
 _LONGEST_NS = 1e9
+
+
+def stated_shutter(bag: Bag, image: str, stream: StreamName, camera: Camera) -> StreamCamera:
+    """The camera of an image's topic with what the bag says of its shutter: of `rsgen export` all, of others the skew.
+
+    Raises UserError: what is said of it is no shutter.
+    """
+    for topic in bag.of_kind("std_msgs/String"):
+        if topic.endswith("/rolling_shutter") and (message := bag.first(topic)) is not None:
+            facts = _pairs(str(message.content.data)).get("streams")
+            own = facts.get(stream) if isinstance(facts, dict) else None
+            if isinstance(own, dict):
+                return with_shutter(f"{bag.path}: {topic}", camera, own)
+    return StreamCamera(camera, rolling_shutter_skew(bag, image))
+
+
+def with_shutter(where: str, camera: Camera, facts: dict[str, Any]) -> StreamCamera:
+    """A camera with the shutter of an entry `rolling_shutter` as `rsgen export` writes it.
+
+    Raises UserError naming `where`: times that are none, or an unknown scan.
+    """
+    times = [facts.get(name, 0.0) for name in ("readout_s", "exposure_s")]
+    scan: Scan = facts.get("scan", "top-bottom")
+    if not all(isinstance(t, int | float) and 0 <= t < 10 for t in times) or scan not in get_args(Scan):
+        raise UserError(f"{where}: rolling_shutter needs readout_s and exposure_s in seconds, and a scan")
+    return StreamCamera(camera, float(times[0]), float(times[1]), scan)
 
 
 def rolling_shutter_skew(bag: Bag, image: str) -> float | None:

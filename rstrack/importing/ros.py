@@ -17,8 +17,8 @@ from rstrack.importing.frames import between
 from rstrack.importing.lens import camera_of
 from rstrack.importing.messages import inertial, nanoseconds, picture_of
 from rstrack.importing.pixels import is_float_depth
-from rstrack.importing.readout import rolling_shutter_skew
-from rstrack.importing.recording import FLOAT_DEPTH_SCALE, Item, Picture, Recording, StreamCamera
+from rstrack.importing.readout import stated_shutter
+from rstrack.importing.recording import FLOAT_DEPTH_SCALE, Item, Picture, Recording
 from rstrack.importing.topics import (
     Named,
     base_of,
@@ -62,13 +62,12 @@ def _read_ros(bag: Bag, named: Named) -> Recording:
     is_float = is_float_depth(first.encoding if hasattr(first, "encoding") else first.format)
     imu = find_imu(bag)
     images = {color_topic: ("color", color), depth_topic: ("depth", depth)}
-    exposed = rolling_shutter_skew(bag, base_of(color_topic))
     kind = "ROS 1 bag" if bag.is_ros1 else "ROS 2 recording"
     topics = {"color": color_topic, "depth": depth_topic, "color_info": color_info, "depth_info": depth_info}
     return Recording(
         kind=kind,
-        color=StreamCamera(color, exposed),
-        depth=StreamCamera(depth, rolling_shutter_skew(bag, base_of(depth_topic))),
+        color=stated_shutter(bag, base_of(color_topic), "color", color),
+        depth=stated_shutter(bag, base_of(depth_topic), "depth", depth),
         T_color_depth=np.eye(4) if registered else T,
         is_registered=registered,
         depth_scale=FLOAT_DEPTH_SCALE if is_float else _MILLIMETRES,

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import re
+import subprocess
+import sys
 import tracemalloc
 import warnings
 from pathlib import Path
@@ -17,6 +19,7 @@ from rendering import mi
 
 from rsgen.config.config import LightConfig, load_config
 from rsgen.errors import UserError
+from rsgen.files import encode_exr
 from rsgen.light.bake import bake
 from rsgen.produce.frame_source import make_integrator
 from rsgen.render.irradiance import make_lattice
@@ -450,3 +453,19 @@ def test_a_build_script_that_fails_says_why_in_one_line(tmp_path: Path) -> None:
     fails(tmp_path / "scene.xml", "no such file")
     with pytest.raises(UserError, match="no such file"):
         ensure_built(tmp_path / "scene.xml")
+
+
+def test_one_thread_is_enough_to_read_an_exr(tmp_path: Path) -> None:
+    """As on a machine of one core, where Mitsuba alone waits for ever."""
+    (tmp_path / "sky.exr").write_bytes(encode_exr(np.full((4, 8, 3), 0.5, np.float32), ("R", "G", "B")))
+    (tmp_path / "scene.xml").write_text(
+        '<scene version="3.0.0"><emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>'
+        '<shape type="sphere"/></scene>'
+    )
+    code = (
+        "from rsgen.device.backend import select\nselect()\nimport sys, drjit, pathlib\ndrjit.set_thread_count(1)\n"
+        "from rsgen.render.scene import load_scene\nload_scene(pathlib.Path(sys.argv[1]))\n"
+        "assert drjit.thread_count() == 1"
+    )
+    words = [sys.executable, "-c", code, str(tmp_path / "scene.xml")]
+    subprocess.run(words, cwd=Path(__file__).parents[2], check=True, timeout=60)

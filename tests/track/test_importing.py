@@ -465,6 +465,24 @@ def test_an_exported_euroc_folder_comes_back(place: Path, capfd: pytest.CaptureF
     refused(capfd, "seq", "no depth images", "cam0")
 
 
+def test_an_exported_bag_comes_back_with_its_shutters(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Its first stamp is 0, and counts."""
+    config = synthetic.make_config(32, 24, color={"readout_s": 0.02}, depth={"readout_s": 0.01, "scan": "bottom-top"})
+    writer = synthetic.open_writer(place / "seq", config, 4)
+    synthetic.write_frames(writer)
+    synthetic.write_scene(place / "seq")
+    writer.finish()
+    assert rsgen(["export", "mcap", "seq", "--out", "seq.mcap"]) == 0
+    dataset, said = imported(capfd, "seq.mcap")
+    exact = open_dataset(Path("seq"))
+    assert exact.stamps[0] == 0.0 and dataset.stamps == pytest.approx(exact.stamps, abs=1e-9)
+    assert dataset.rig.color_shutter == exact.rig.color_shutter and dataset.rig.depth_shutter == exact.rig.depth_shutter
+    assert "calibrate" not in said and np.allclose(dataset.rig.T_color_depth, exact.rig.T_color_depth, atol=1e-9)
+    for k in range(len(exact)):
+        assert (dataset.images.depth(k) == exact.images.depth(k)).all()
+        assert (dataset.images.color(k) == exact.images.color(k)).all()
+
+
 # --- the folder ------------------------------------------------------------------------------------------------------
 
 
