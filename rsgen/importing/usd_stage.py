@@ -60,11 +60,14 @@ def read_usd(path: Path, scale: float | None, up: str | None) -> Content:
         for error in stage.GetCompositionErrors():
             missing = str(error).rpartition("Could not open asset @")[2].partition("@")
             text = Path(missing[0]).name if missing[1] else " ".join(str(error).split())[:150]
-            notes.add("part of the scene missing", text)
+            kind = " (usd-core reads no MaterialX)" if text.endswith(".mtlx") else ""
+            notes.add(f"part of the scene missing{kind}", text)
         if not walk.parts:
             raise UserError(f"scene {path}: holds no surface{_also(notes)}: export it with meshes")
     except Tf.ErrorException as error:
-        raise UserError(f"scene {path}: cannot be read ({_reason(error)}): export it again") from None
+        raise UserError(
+            f"scene {path}: cannot be read ({_reason(error).replace(str(path), path.name)}): export it again"
+        ) from None
     finally:
         messages.TakeUncoalescedDiagnostics()
         del messages
@@ -264,5 +267,6 @@ def _also(notes: Notes) -> str:
 
 
 def _reason(error: Exception) -> str:
-    text = " ".join(str(error).split())
-    return text.rpartition(" : ")[2].strip("' ")[:200] or "no reason given"
+    """What the first of USD's errors says, which names the line."""
+    first = " ".join(str(error.args[0] if error.args else error).split())
+    return first.rpartition(" : ")[2].strip("' ")[:200] or "no reason given"
