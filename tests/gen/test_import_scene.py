@@ -39,8 +39,8 @@ MATTE = "float inputs:roughness = 1"
 
 
 # USD wants a line an attribute.
-_ATTRIBUTE = re.compile(r"(?<!uniform) +(?=(?:uniform )?(?:(?:double|float|color3f|point3f|int|int64|quath|bool|asset|string|token|rel)"
-                        r"\d?(?:\[\])? [\w:.]+(?: =| *[}\n]))|\}|def )")  # fmt: skip
+_TYPES = "(?:double|float|color3f|point3f|int|int64|quath|bool|asset|string|token|rel)"
+_ATTRIBUTE = re.compile(rf"(?<!uniform) +(?=(?:uniform )?(?:{_TYPES}\d?(?:\[\])? [\w:.]+(?: =| *[}}\n]))|\}}|def )")
 
 
 def usda(path: Path, content: str, unit: float = 1.0, up: str = "Y") -> Path:
@@ -276,6 +276,9 @@ def test_a_square_shines_as_its_material_and_light_say(tmp_path: Path) -> None:
         point = f"""def SphereLight "L" {{ bool treatAsPoint = 1 float inputs:radius = {0.1 / unit}
             float inputs:intensity = 100 {high} uniform token[] xformOpOrder = ["xformOp:translate"] }}"""
         np.testing.assert_allclose(seen(point, unit), color * 100 * 0.1**2 / 2**2, rtol=1e-4)
+        # By its size in units of the stage, of which its intensity keeps a quarter.
+        by_size = point.replace("intensity = 100", f"intensity = {100 / unit**2} bool inputs:normalize = 1")
+        np.testing.assert_allclose(seen(by_size, unit), color * 100 / 4 / 2**2 / np.pi, rtol=1e-4)
     a, b = 0.25, 0.5  # half sides over height
     form = sum(
         2 * p / np.hypot(1, p) * np.arctan(q / np.hypot(1, p)) for p, q in ((a, b), (b, a))
