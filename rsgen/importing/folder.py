@@ -15,7 +15,7 @@ import numpy as np
 from rsgen import srgb
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
-from rsgen.files import encode_png, write_error
+from rsgen.files import encode_exr, encode_png, write_error
 
 NAME = "scene.xml"
 
@@ -57,7 +57,7 @@ def write_folder(out: Path, force: bool, fill: Callable[[Path], Made]) -> Made:
     return made
 
 
-def write_scene(mi: Any, scene: dict[str, Any], comments: Sequence[str], folder: Path) -> None:
+def write_scene(scene: dict[str, Any], comments: Sequence[str], folder: Path) -> None:
     """scene.xml of a scene dictionary in `folder`, where its meshes are; pictures go into `folder`/textures.
 
     comments: lines at its top.
@@ -65,25 +65,25 @@ def write_scene(mi: Any, scene: dict[str, Any], comments: Sequence[str], folder:
     root = ElementTree.Element("scene", version="3.0.0")
     for name, value in scene.items():
         if name != "type":
-            _element(mi, root, name, value, folder)
+            _element(root, name, value, folder)
     ElementTree.indent(root)
     text = "".join(f"<!-- {line.replace('--', '- -')} -->\n" for line in comments)
     (folder / NAME).write_text(f"{text}{ElementTree.tostring(root, encoding='unicode')}\n", encoding="utf-8")
 
 
-def _element(mi: Any, parent: ElementTree.Element, name: str, value: Any, folder: Path) -> None:
+def _element(parent: ElementTree.Element, name: str, value: Any, folder: Path) -> None:
     if isinstance(value, dict) and value["type"] == "rgb":
         rgb = value["value"]
         rgb = [rgb] if isinstance(rgb, int | float) else rgb
         ElementTree.SubElement(parent, "rgb", name=name, value=" ".join(f"{x:.9g}" for x in rgb))
     elif isinstance(value, dict) and value["type"] == "bitmap":
-        _picture(mi, parent, name, value, folder)
+        _picture(parent, name, value, folder)
     elif isinstance(value, dict):
         tag = _TAG_OF[value["type"]]
         own = ElementTree.SubElement(parent, tag, {"type": value["type"], "id" if tag == "shape" else "name": name})
         for key, inner in value.items():
             if key != "type":
-                _element(mi, own, key, inner, folder)
+                _element(own, key, inner, folder)
     elif isinstance(value, bool):
         ElementTree.SubElement(parent, "boolean", name=name, value=str(value).lower())
     elif isinstance(value, int | float):
@@ -101,7 +101,7 @@ def _matrix(parent: ElementTree.Element, name: str, T: FloatArray) -> None:
     ElementTree.SubElement(own, "matrix", value=" ".join(f"{x:.9g}" for x in T.ravel()))
 
 
-def _picture(mi: Any, parent: ElementTree.Element, name: str, bitmap: dict[str, Any], folder: Path) -> None:
+def _picture(parent: ElementTree.Element, name: str, bitmap: dict[str, Any], folder: Path) -> None:
     """A bitmap's picture as a PNG where that keeps its values, else as an EXR."""
     values = np.atleast_3d(np.array(bitmap["bitmap"], np.float32))
     encoded = srgb.encode(np.clip(values, 0, 1).astype(np.float64))
@@ -114,7 +114,8 @@ def _picture(mi: Any, parent: ElementTree.Element, name: str, bitmap: dict[str, 
         if as_bytes:
             file.write_bytes(encode_png(in_bytes))
         else:
-            mi.Bitmap(values.astype(np.float16)).write(str(file))
+            # By OpenEXR: Mitsuba's own writer was seen to wait for ever beside other libraries' threads.
+            file.write_bytes(encode_exr(values, ("Y",) if values.shape[2] == 1 else ("R", "G", "B")))
     own = ElementTree.SubElement(parent, "texture", type="bitmap", name=name)
     ElementTree.SubElement(own, "string", name="filename", value=file.relative_to(folder).as_posix())
     ElementTree.SubElement(own, "boolean", name="raw", value=str(not as_bytes).lower())

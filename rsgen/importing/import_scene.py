@@ -67,7 +67,7 @@ def _fill(file: Path, folder: Path, scale: float | None, up: Up | None) -> tuple
         f"{len(content.lamps)} lights" + (", and surfaces that glow" if glows else ""),
     )
     scene = {"type": "scene", **part_shapes(mi, parts, folder), **lights}
-    write_scene(mi, scene, [f"made by rsgen import-scene of {file.name}", *found, *notes], folder)
+    write_scene(scene, [f"made by rsgen import-scene of {file.name}", *found, *notes], folder)
     return found, tuple(notes)
 
 

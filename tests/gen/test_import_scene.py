@@ -373,7 +373,7 @@ def test_pictures_that_bytes_cannot_hold_are_written_as_they_are(tmp_path: Path)
     looks = Material(np.array([0.31, 0.52, 0.93]), Texture(pixels, "mirror", True, transform), roughness=0.4)
     scene = {"type": "scene", "shape": {"type": "rectangle", "bsdf": bsdf(mi, looks, None)}}
     direct = mi.load_dict(scene)
-    write_scene(mi, scene, ["a -- comment"], tmp_path)
+    write_scene(scene, ["a -- comment"], tmp_path)
     read = mi.load_file(str(tmp_path / "scene.xml"))
     assert list((tmp_path / "textures").glob("*.exr"))
     uv = np.random.default_rng(3).uniform(-1, 1, (2, 40)).astype(np.float32)
