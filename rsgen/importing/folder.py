@@ -114,7 +114,7 @@ def _picture(parent: ElementTree.Element, name: str, bitmap: dict[str, Any], fol
         if as_bytes:
             file.write_bytes(encode_png(in_bytes))
         else:
-            # By OpenEXR: Mitsuba's own writer was seen to wait for ever beside other libraries' threads.
+            # Not by Mitsuba, whose writer waits for itself for ever where Dr.Jit has one thread.
             file.write_bytes(encode_exr(values, ("Y",) if values.shape[2] == 1 else ("R", "G", "B")))
     own = ElementTree.SubElement(parent, "texture", type="bitmap", name=name)
     ElementTree.SubElement(own, "string", name="filename", value=file.relative_to(folder).as_posix())
