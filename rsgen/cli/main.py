@@ -33,6 +33,7 @@ rsgen makes rolling-shutter RGB-D benchmark sequences with exact continuous-time
   rsgen compare out/demo --frame 20     what the rolling shutter did to frame 20
   rsgen fit my_trajectory.txt           how well a spline represents a recorded trajectory
   rsgen motion suggest room.xml --out room.yaml      a tour through a scene of your own, to render or to edit
+  rsgen import-scene room.blend room    a USD or Blender scene as one of Mitsuba's
   rsgen motion stats table1             how far and how fast a config's camera moves
   rsgen export euroc out/demo           for the tools of others: EuRoC, Kalibr, ROS, COLMAP, nerfstudio ...
 
@@ -55,6 +56,7 @@ def _parser() -> Parser:
     motion = commands.group("motion", "Motions of cameras: propose one for a scene, or tell how those of configs are.")
     motion.add(suggest, "room.xml --out room.yaml --seed 3, then: rsgen render room.yaml --out out/room")
     motion.add(stats, "robot_t1 table1")
+    add(import_scene, "room.blend scenes/room, then: rsgen motion suggest scenes/room/scene.xml --out room.yaml")
     add(info, "out/demo")
     add(verify, "out/demo --pairs 50")
     add(compare, "out/demo --frame 20")
@@ -169,6 +171,25 @@ def suggest(
         return 0
     atomic_write(out, text)
     print("\n".join([*suggested.found, f"{out}: written (rsgen render {out})"]))
+    return 0
+
+
+def import_scene(
+    file: Annotated[Path, "USD (.usd .usda .usdc .usdz), Blender (.blend) or mesh file (.glb .gltf .obj .ply .stl)"],
+    out: Annotated[Path, "folder of the scene"],
+    *,
+    force: Annotated[bool, "replace the folder if it is there"] = False,
+    scale: Annotated[float | None, "metres per unit of the file (default: what it says)", float] = None,
+    up: Annotated[Up | None, "axis of the file that is up (default: what it says; of .blend, y stands for z)"] = None,
+) -> int:
+    """Make a Mitsuba scene of one of another program, in a folder with its meshes and textures: name its scene.xml in
+    scene.file of a config. Says what has been left out. USD needs the package usd-core, .blend files bpy.
+    """
+    from rsgen.importing.import_scene import import_scene as make
+
+    made = make(file, out, force, scale, up)
+    print("\n".join([*made.found, *(f"note: {line}" for line in made.notes)]))
+    print(f"{made.scene}: written (rsgen motion suggest {made.scene} --out mine.yaml)")
     return 0
 
 

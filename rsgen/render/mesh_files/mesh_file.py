@@ -9,6 +9,7 @@ import hashlib
 import io
 import logging
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -76,38 +77,54 @@ def read_parts(path: Path, options: MeshOptions) -> list[Part]:
         if libraries:
             files[libraries[0]] = b"\n".join(files[name] for name in libraries)  # trimesh reads the first only
     loaded = trimesh.load_scene(io.BytesIO(data), file_type=path.suffix[1:].lower(), resolver=files, process=False)
-    T_world_file = _world(options)
+    T_world_file = world_from_file(options)
     looks = Looks(path, header)
-    parts, dropped = [], 0
+    parts = []
     for node in loaded.graph.nodes_geometry:  # in the file's order; never sort by name, some are random
         T_file_part, name = loaded.graph[node]
         mesh = loaded.geometry[name]
-        if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-            continue
-        part = looks.part(mesh, name)
-        if not (np.isfinite(part.vertices).all() and np.isfinite(T_file_part).all()):
-            raise UserError(f"scene {path}: '{name}' has vertices that are not finite: mend it and export it again")
-        part, without_area = _solid(_moved(part, T_world_file @ T_file_part))
+        if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
+            parts.append(placed(path, name, looks.part(mesh, name), T_world_file @ T_file_part))
+    return finished(path, parts)
+
+
+def placed(path: Path, name: str, part: Part, T_world_part: FloatArray) -> Part:
+    """A part of `path`, called `name` there, moved into the world by any affine map. Raises UserError."""
+    if not (np.isfinite(part.vertices).all() and np.isfinite(T_world_part).all()):
+        raise UserError(f"scene {path}: '{name}' has vertices that are not finite: mend it and export it again")
+    return _moved(part, T_world_part)
+
+
+def finished(path: Path, parts: Sequence[Part]) -> list[Part]:
+    """Parts in the world, those alike as one, without triangles of no area and what masks hide. Raises UserError."""
+    left, dropped = [], 0
+    for part in parts:
+        part, without_area = _solid(part)
         dropped += without_area
         if len(part.faces):
-            parts.append(_cut(part))
+            left.append(_cut(part))
     if dropped:
         log.info("scene %s: %d triangles without area left out", path, dropped)
-    parts = _merged([part for part in parts if len(part.faces)])
-    if not parts:
+    left = _merged([part for part in left if len(part.faces)])
+    if not left:
         raise UserError(f"scene {path}: holds no triangles that could be seen: export a mesh, with faces of some area")
-    _check_size(path, parts)
-    return parts
+    _check_size(path, left)
+    return left
 
 
 def mesh_scene(mi: Any, path: Path, scratch: Path, options: MeshOptions) -> dict[str, Any]:
     """Scene dictionary of a mesh file and of the light that it gets; files go into `scratch`."""
     parts = read_parts(path, options)
-    shapes: dict[str, Any] = {"type": "scene"}
+    return {"type": "scene", **part_shapes(mi, parts, scratch), **light_shapes(mi, path, parts, options.light, scratch)}
+
+
+def part_shapes(mi: Any, parts: Sequence[Part], folder: Path) -> dict[str, Any]:
+    """Entries of a scene dictionary for parts, whose meshes go into `folder`."""
+    shapes: dict[str, Any] = {}
     for number, part in enumerate(parts):
         attribute = "vertex_color" if part.vertex_colors is not None else "face_color"
         colored = part.vertex_colors is not None or part.face_colors is not None
-        file = scratch / f"{number}.ply"
+        file = folder / f"{number}.ply"
         colors = part.vertex_colors, part.face_colors
         file.write_bytes(ply_bytes(part.vertices, part.faces, part.normals, part.uv, *colors))
         shape = {"type": "ply", "filename": str(file), "face_normals": part.normals is None}
@@ -115,17 +132,26 @@ def mesh_scene(mi: Any, path: Path, scratch: Path, options: MeshOptions) -> dict
         if (light := emitter(mi, part.material)) is not None:
             shape["emitter"] = light
         shapes[f"part{number:05}"] = shape
-    if options.light == "none":
-        return shapes
+    return shapes
+
+
+def light_shapes(mi: Any, path: Path, parts: Sequence[Part], light: SceneLight, folder: Path) -> dict[str, Any]:
+    """Entries of a scene dictionary for the light that parts get, whose lamps' meshes go into `folder`.
+
+    Raises UserError if lamps are asked for where there is no ceiling.
+    """
+    if light == "none":
+        return {}
     probe = Probe(mi, *joined_triangles([part.vertices for part in parts], [part.faces for part in parts]))
-    is_room = options.light == "ceiling" or (options.light == "auto" and probe.encloses())
+    is_room = light == "ceiling" or (light == "auto" and probe.encloses())
     lamps = probe.lamps() if is_room else None
-    if lamps is None and options.light == "ceiling":
+    if lamps is None and light == "ceiling":
         raise UserError(f"scene {path}: has no ceiling over its middle to put lamps under: set scene.light to sky")
     if lamps is None:
-        return shapes | {"sky": {"type": "constant", "radiance": {"type": "rgb", "value": SKY}}}
+        return {"sky": {"type": "constant", "radiance": {"type": "rgb", "value": SKY}}}
+    shapes: dict[str, Any] = {}
     for number, corners in enumerate(lamps.corners):
-        file = scratch / f"lamp{number}.ply"
+        file = folder / f"lamp{number}.ply"
         file.write_bytes(ply_bytes(corners, np.array([[0, 1, 2], [0, 2, 3]])))
         radiance = {"type": "rgb", "value": lamps.radiance}
         shapes[f"lamp{number:05}"] = {
@@ -184,7 +210,8 @@ def _refuse_unreadable_texture(path: Path, name: str, data: bytes) -> None:
         raise UserError(f"scene {path}: texture '{name}' cannot be read: make it a PNG or a JPEG") from None
 
 
-def _world(options: MeshOptions) -> FloatArray:
+def world_from_file(options: MeshOptions) -> FloatArray:
+    """T_world_file (4, 4): scaled to metres and turned y up."""
     T_world_file = np.eye(4)
     T_world_file[:3, :3] = options.scale * np.array(_UP[options.up], float)
     return T_world_file
