@@ -27,11 +27,12 @@ _TARGET_PIXELS = 3000  # small images are sampled more densely than every fourth
 class Reprojection:
     """Depth of one frame in the next: predicted minus observed z (n,) in metres where both see the same surface.
 
-    `occluded` more pixels are hidden there by a nearer surface.
+    `occluded` more pixels are hidden there by a nearer surface. number (n,): of the object that moves; 0: the scene.
     """
 
     residual: FloatArray
     occluded: int
+    number: IntArray
 
 
 def reproject_depth(sequence: Sequence, k: int, next_k: int) -> Reprojection:
@@ -39,15 +40,15 @@ def reproject_depth(sequence: Sequence, k: int, next_k: int) -> Reprojection:
 
     Pixels of frame k go to the world with their own line's pose and into the other frame with the rolling-shutter
     projection (3); the planar z predicted there is compared with the observed one, interpolated bilinearly in inverse
-    depth. What is on a thing that moves by itself goes with it. Left out: places where that is not good to 0.5 mm (edges),
-    and points hidden by a nearer surface.
+    depth. What is on a thing that moves by itself goes with it. Left out: places where that is not good to 0.5 mm
+    (edges), and points hidden by a nearer surface.
     Raises UserError for unreadable files.
     """
     stream = sequence.streams["depth"]
     stamp = float(stream.stamps[next_k])
     next_z = sequence.truth_depth(next_k).astype(np.float64)
     seen = _seen(sequence, k)
-    residuals, occluded = [], 0
+    residuals, numbers, occluded = [np.zeros(0)], [np.zeros(0, np.int64)], 0
     for which in range(len(sequence.objects) + 1):
         here = seen.number == which
         if not here.any():
@@ -65,8 +66,9 @@ def reproject_depth(sequence: Sequence, k: int, next_k: int) -> Reprojection:
         predicted, observed = predicted[smooth], observed[smooth]
         hidden = predicted - observed > OCCLUDED * predicted
         residuals.append((predicted - observed)[~hidden])
+        numbers.append(np.full(len(residuals[-1]), which))
         occluded += int(hidden.sum())
-    return Reprojection(np.concatenate(residuals) if residuals else np.zeros(0), occluded)
+    return Reprojection(np.concatenate(residuals), occluded, np.concatenate(numbers))
 
 
 def depth_points(sequence: Sequence, k: int) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -102,7 +103,7 @@ class ObjectMotionConfig(Section):
         if self.kind == "waypoints" and len(self.waypoints) < 2:
             raise ValueError("waypoints: give two at least")
         times = [w.time_s for w in self.waypoints]
-        if any(b <= a for a, b in zip(times, times[1:], strict=False)):
+        if any(b <= a for a, b in pairwise(times)):
             raise ValueError("waypoints: their times must rise")
         if self.kind == "drive" and len(self.points) < (3 if self.closed else 2):
             raise ValueError(f"points: give {3 if self.closed else 2} at least")

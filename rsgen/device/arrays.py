@@ -23,7 +23,7 @@ _ALIGNMENT = 64
 
 
 def aligned(array: npt.ArrayLike) -> npt.NDArray[np.float32]:
-    """Flat float32 copy of `array` whose buffer begins where Dr.Jit likes it: else kernels are compiled anew by chance."""
+    """Flat float32 copy of `array` whose buffer begins where Dr.Jit likes it: else kernels are compiled anew."""
     source = np.asarray(array)
     raw = np.empty(source.size + _ALIGNMENT // 4, np.float32)
     start = (-raw.ctypes.data % _ALIGNMENT) // 4

@@ -131,21 +131,26 @@ def check_objects_clear(
 
     camera: T_world_depth.
     """
-    t = np.linspace(*span, max(2, math.ceil((span[1] - span[0]) / _CHECK_S)))
-    T_world_depth = camera.pose(t)
-    eyes = (T_world_depth[:, :3, 3], (T_world_depth @ se3.inverse(T_color_depth))[:, :3, 3])
     for name, spline, corners in zip(names, splines, triangles, strict=True):
-        T_object_world = se3.inverse(spline.pose(t))
         radius = float(np.linalg.norm(corners, axis=-1).max()) + _NEAR_M
-        for eye in eyes:
-            p = se3.transform(T_object_world, eye)
+        for T_eye_depth in (np.eye(4), T_color_depth):
+
+            def way(t: FloatArray, spline: Spline = spline, T_eye: FloatArray = T_eye_depth) -> FloatArray:
+                return np.asarray((se3.inverse(spline.pose(t)) @ camera.pose(t) @ se3.inverse(T_eye))[:, :3, 3])
+
+            t = np.linspace(*span, max(2, math.ceil((span[1] - span[0]) / _CHECK_S)))
+            fastest = float(np.linalg.norm(np.diff(way(t), axis=0), axis=1).max())
+            t = np.linspace(*span, len(t) * max(1, math.ceil(fastest / _NEAR_M)))  # no step leaps over a surface
+            p = way(t)
             close = np.flatnonzero(np.linalg.norm(p, axis=-1) < radius)
             if not len(close):
                 continue
             distance, _ = nearest_surface(p[close], corners, _NEAR_M)
             if np.isfinite(distance).any():
                 when = t[close[int(np.argmax(np.isfinite(distance)))]]
-                raise UserError(f"objects.{name}: comes through the camera at {when:.3f} s: move its path or the camera's")
+                raise UserError(
+                    f"objects.{name}: comes through the camera at {when:.3f} s: move its path or the camera's"
+                )
 
 
 def file_of(thing: ObjectConfig) -> Path | None:

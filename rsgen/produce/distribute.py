@@ -152,13 +152,14 @@ def render_block(block: RenderJob, progress: Progress) -> dict[str, bytes]:
 
 
 def _for_other_processes(config: Config, versions: Mapping[str, str]) -> Config:
-    """The config with the scene's full path and with the backend that runs here, whatever a worker has."""
+    """The config with full paths of scene and meshes, and the backend that runs here, whatever a worker has."""
     scene = config.scene.model_copy(update={"file": config.scene.file.absolute()})
     things = tuple(
         thing if thing.mesh is None else thing.model_copy(update={"mesh": thing.mesh.absolute()})
         for thing in config.objects
     )
-    return config.model_copy(update={"scene": scene, "objects": things, "backend": versions["variant"].partition("_")[0]})
+    backend = versions["variant"].partition("_")[0]
+    return config.model_copy(update={"scene": scene, "objects": things, "backend": backend})
 
 
 # Scene and light that this process rendered last, by what they were made from.

@@ -200,9 +200,7 @@ class FrameSource:
         return int(np.random.SeedSequence([self._config.seed, frame]).generate_state(1)[0])
 
 
-def make_integrator(
-    mi: Any, scene: Any, config: Config, progress: Progress, objects: Sequence[Spline] = ()
-) -> Any:
+def make_integrator(mi: Any, scene: Any, config: Config, progress: Progress, objects: Sequence[Spline] = ()) -> Any:
     """Mitsuba integrator of the config's light: `path`, or `BakedIntegrator` over the scene's baked irradiance.
 
     objects: T_world_object(t) of the config's objects; without any the scene alone is shown.

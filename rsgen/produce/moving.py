@@ -56,7 +56,7 @@ def check_clear_of_camera(
     config: Config, meshes: Sequence[Any], splines: Sequence[Spline], camera: Spline, first: float, last: float
 ) -> None:
     """Raises UserError if an object comes through a camera."""
-    triangles = [np.asarray(mesh.vertices, float)[mesh.faces] for mesh in meshes]
+    triangles = [mesh.vertices[mesh.faces] for mesh in meshes]
     names = [thing.name for thing in config.objects]
     T_color_depth = np.asarray(config.T_color_depth, float)
     check_objects_clear(names, splines, triangles, camera, (first, last), T_color_depth)
@@ -94,5 +94,3 @@ def object_mesh_ply(mesh: Any) -> bytes:
     from rsgen.render.ply import ply_bytes
 
     return ply_bytes(mesh.vertices, mesh.faces)
-
-

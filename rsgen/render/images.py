@@ -133,7 +133,7 @@ class DepthRenderer:
         meeting = objects.meet(ray, dr.select(hit.is_valid(), hit.t, dr.inf))
         z = dr.select(dr.isfinite(meeting.t), meeting.t * self.sensor.planar_depth_scale(u, v), 0)
         dr.eval(z, meeting.number)
-        return tuple(np.array(a, np.float32).reshape(shape) for a in (z, meeting.number))
+        return np.array(z, np.float32).reshape(shape), np.array(meeting.number, np.float32).reshape(shape)
 
 
 def global_shutter(shutter: Shutter) -> Shutter:

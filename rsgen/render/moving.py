@@ -55,7 +55,7 @@ class MovingObject:
 class Meeting:
     """What rays meet first among things: which (UInt32; 0 none, k + 1 the k-th), at what distance, and each one's hit.
 
-    t: of the rays' own length, no more than what was given. normal: Dr.Jit's, see `ObjectsInFrame.shaded`.
+    t: of the rays' own length, no more than what was given. hits: each with the ray in its frame, and its pose.
     """
 
     number: Any
@@ -70,7 +70,7 @@ class ObjectsInFrame:
         self, objects: Sequence[MovingObject], camera: Camera, shutter: Shutter, stamp: float,
         reference: FloatArray | None = None,
     ) -> None:  # fmt: skip
-        """Of the frame at `stamp` (s). reference (3,): what `carried` counts positions from; default: the world's origin.
+        """Of the frame at `stamp` (s). reference (3,): what `carried` counts positions from; default: the origin.
 
         Raises UserError if a thing's spline does not cover the frame.
         """
@@ -123,7 +123,7 @@ class ObjectsInFrame:
         return hidden
 
     def shaded(self, ray: Any, meeting: Meeting) -> Any:
-        """Radiance (Color3f) towards where the rays come from, of what they meet; matte, and 0 where that is nothing."""
+        """Radiance (Color3f) back along rays, of what they meet; matte, and 0 where that is nothing."""
         total = mi.Color3f(0)
         share = dr.clip((ray.time + self._exposure_s) / self._span, 0, 1) if self._span > 0 else mi.Float(0)
         for k, (hit, own, rows) in enumerate(meeting.hits):

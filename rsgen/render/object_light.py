@@ -36,7 +36,7 @@ def irradiance_coefficients(radiance: FloatArray) -> FloatArray:
 
 
 def covered(distance: tuple[Any, Any, Any], normal: tuple[Any, Any, Any]) -> Any:
-    """Share of the cosine-weighted hemisphere about `normal` (unit) that a unit ball covers, `distance` from its middle.
+    """Share of the cosine-weighted hemisphere about `normal` (unit) that a unit ball covers.
 
     distance: from the surface point to the ball's middle, in its radii. Points inside the ball count as just outside.
     """

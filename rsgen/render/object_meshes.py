@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from rsgen.array_types import FloatArray
+from rsgen.array_types import FloatArray, IntArray
 from rsgen.config.objects import ObjectConfig, ShapeConfig
 from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
@@ -35,7 +35,7 @@ class ObjectMesh:
 
     scene: Any
     vertices: FloatArray
-    faces: FloatArray
+    faces: IntArray
     middle: FloatArray
     radius: float
     axes: FloatArray
@@ -53,12 +53,15 @@ def load_object(thing: ObjectConfig) -> ObjectMesh:
         except Exception as error:  # Mitsuba and trimesh raise whatever their parsers do
             text = " ".join(str(error).split())[:300]
             raise UserError(f"objects.{thing.name}: {text}") from None
-    vertices, faces = surface(scene)
-    low, high = vertices.min(axis=0).astype(float), vertices.max(axis=0).astype(float)
+    single, faces = surface(scene)
+    vertices = single.astype(float)
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
     middle = 0.5 * (low + high)
     radius = float(np.linalg.norm(vertices - middle, axis=1).max())
     half = np.maximum(0.5 * (high - low), 0.01 * radius)  # what is flat has some thickness
-    return ObjectMesh(scene, vertices, faces, middle, radius, half * _fullness(vertices, half) ** (1 / 3))
+    return ObjectMesh(
+        scene, vertices, faces.astype(np.int64), middle, radius, half * _fullness(vertices, half) ** (1 / 3)
+    )
 
 
 def _fullness(vertices: FloatArray, half: FloatArray) -> float:

@@ -29,7 +29,7 @@ class Projector:
     ) -> None:  # fmt: skip
         """`sensor`: the depth camera's (`DepthRenderer.sensor`). A positive baseline casts shadows to objects' left.
 
-        width: of the pattern, in widths of the camera's field of view. objects: things that move, exposed as the sensor.
+        width: of the pattern, in widths of the camera's field of view. objects: that move, exposed as the sensor.
         """
         self._scene, self._objects = scene, objects
         self._camera = sensor

@@ -34,7 +34,7 @@ from rsgen.config.sections import ColorConfig
 from rsgen.config.truth import GlobalTime, TruthConfig
 from rsgen.device.lens import Lens, contains
 from rsgen.device.pose_table import PoseFunction, PoseTable
-from rsgen.device.projection import MovingCamera, Vector, rotated_back
+from rsgen.device.projection import MovingCamera, rotated_back
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.images import ColorRenderer
@@ -71,13 +71,13 @@ class TruthRenderer:
         self, T_world_cam: PoseFunction, stamp: float, next_stamp: float | None, seed: int,
         exposure_s: tuple[float, float] | None = None, brightness: float = 1.0,
     ) -> dict[str, NDArray[Any]]:  # fmt: skip
-        """Every image of `TruthConfig.images`, and `object_ids` if things move, of the frame at `stamp` (s): uint8 sRGB (h, w, 3), or float32 (h, w, n).
+        """Every image of `TruthConfig.images` of the frame at `stamp` (s): uint8 sRGB (h, w, 3), or float32 (h, w, n).
 
-        n is the number of the image's EXR channels; with one channel the image is (h, w). `T_world_cam` takes times
-        (n,) s to poses (n, 4, 4) of the colour camera; UserError if it ends before a frame's last line. `next_stamp`
-        is the next frame's stamp, None after the last frame: then flow_next is 0 and nowhere valid. `seed` decides the
-        random numbers of the frame's twins. exposure_s: of this frame and the next, where they are others than the
-        stream's. brightness: factor on the light of the 8-bit images.
+        With `object_ids` if things move. n is the number of the image's EXR channels; with one channel the image is
+        (h, w). `T_world_cam` takes times (n,) s to poses (n, 4, 4) of the colour camera; UserError if it ends before a
+        frame's last line. `next_stamp` is the next frame's stamp, None after the last frame: then flow_next is 0 and
+        nowhere valid. `seed` decides the random numbers of the frame's twins. exposure_s: of this frame and the next,
+        where they are others than the stream's. brightness: factor on the light of the 8-bit images.
         """
         if exposure_s is not None:
             shutters = [replace(self._shutter, exposure_s=each) for each in exposure_s]
