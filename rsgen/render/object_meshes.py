@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from rsgen.array_types import FloatArray, IntArray
+from rsgen.array_types import BoolArray, FloatArray, IntArray
 from rsgen.config.objects import ObjectConfig, ShapeConfig
 from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
 from rsgen.render.mended import mend_meshes
 from rsgen.render.mesh_files.material import Material, bsdf
 from rsgen.render.mesh_files.mesh_file import MeshOptions, hash_into, mesh_scene
-from rsgen.render.ply import ply_bytes
+from rsgen.render.ply import joined_triangles, ply_bytes
 from rsgen.render.scene import surface
 
-_SEGMENTS = 64
-_MOST_FACES = 200_000  # of a built-in shape's checks
+_SEGMENTS = 96  # squares around a ball or cylinder, at least
+_MOST_CHECKS = 20_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,38 +95,59 @@ def _mesh_file(thing: ObjectConfig) -> Path:
 def _shapes(mi: Any, thing: ObjectConfig, scratch: Path) -> dict[str, Any]:
     if thing.shape is None:
         return mesh_scene(mi, _mesh_file(thing), scratch, MeshOptions(thing.scale, thing.up, "none"))
-    mesh, smooth = built_in(thing.shape), thing.shape.kind == "sphere"
-    normals = np.asarray(mesh.vertex_normals, float) if smooth else None
+    vertices, faces, odd = built_in(thing.shape)
+    size, other = np.asarray(thing.shape.size_m), thing.shape.check_color
+    smooth = thing.shape.kind == "sphere"
+    normals = vertices / size**2 if smooth else None
+    colors = None if other is None else np.where(odd[:, None], np.asarray(other), np.asarray(thing.shape.color))
     file = scratch / "shape.ply"
-    colors = _checks(thing.shape, mesh)
-    file.write_bytes(ply_bytes(mesh.vertices, mesh.faces, normals, face_colors=colors))
+    file.write_bytes(ply_bytes(vertices, faces, normals, face_colors=colors))
     look = bsdf(mi, Material(color=np.asarray(thing.shape.color)), None if colors is None else "face_color")
     return {"type": "scene", "shape": {"type": "ply", "filename": str(file), "face_normals": not smooth, "bsdf": look}}
 
 
-def built_in(shape: ShapeConfig) -> trimesh.Trimesh:
-    """Triangles of a box, sphere or cylinder about the origin, fine enough for its checks."""
-    size = np.asarray(shape.size_m, float)
-    if shape.kind == "box":
-        mesh = trimesh.creation.box(extents=size)
-    elif shape.kind == "sphere":
-        mesh = trimesh.creation.icosphere(4, 1.0)
-        mesh.apply_scale(0.5 * size)
-    else:
-        mesh = trimesh.creation.cylinder(radius=0.5, height=1.0, sections=_SEGMENTS)
-        mesh.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))
-        mesh.apply_scale(size)
-    if shape.check_color is None:
-        return mesh
-    if mesh.area / (0.5 * shape.check_m) ** 2 > _MOST_FACES:
+def built_in(shape: ShapeConfig) -> tuple[FloatArray, IntArray, BoolArray]:
+    """Vertices (n, 3) and faces (m, 3) of a box, ball or cylinder about the origin, and which are odd checks (m,)."""
+    size, edge = np.asarray(shape.size_m, float), shape.check_m if shape.check_color is not None else np.inf
+    along = np.maximum(np.rint(size / edge), 1).astype(int)
+    around = 2 * max(1, round(0.25 * np.pi * (size[0] + size[2]) / edge))
+    cut = max(1, -(-_SEGMENTS // around))  # parts of a check, so that it bends
+    if (along * np.roll(along, 1)).sum() + around * along[1] > _MOST_CHECKS:
         raise UserError(f"check_m {shape.check_m:g} is too fine for a thing of {size.max():g} m: raise it")
-    return mesh.subdivide_to_size(0.5 * shape.check_m, max_iter=20)
+    sheets = []
+    if shape.kind == "box":
+        for k in range(3):
+            i, j = (k + 1) % 3, (k + 2) % 3
+            for side in (-0.5, 0.5):
+                a, b, faces, odd = _sheet(along[i], along[j], 1)
+                place = np.full((len(a), 3), side)
+                place[:, i], place[:, j] = a - 0.5, b - 0.5
+                sheets.append((place, faces, odd))
+    elif shape.kind == "sphere":
+        a, b, faces, odd = _sheet(max(2, around // 2), around, cut)
+        sheets.append((_around(0.5 * np.sin(np.pi * a), 0.5 * np.cos(np.pi * a), b), faces, odd))
+    else:
+        a, b, faces, odd = _sheet(along[1], around, cut)
+        sheets.append((_around(0.5, a - 0.5, b), faces, odd))
+        for side in (-0.5, 0.5):
+            a, b, faces, odd = _sheet(max(1, along[0] // 2), around, cut)
+            sheets.append((_around(0.5 * a, side, b), faces, odd))
+    vertices, faces = joined_triangles([sheet[0] for sheet in sheets], [sheet[1] for sheet in sheets])
+    return vertices * size, faces, np.concatenate([sheet[2] for sheet in sheets])
 
 
-def _checks(shape: ShapeConfig, mesh: trimesh.Trimesh) -> FloatArray | None:
-    """Reflectance (m, 3) of each triangle; None where all have one."""
-    if shape.check_color is None:
-        return None
-    cell = np.floor(np.asarray(mesh.triangles_center) / shape.check_m).astype(int)
-    odd = cell.sum(axis=1) % 2 == 1
-    return np.where(odd[:, None], np.asarray(shape.check_color), np.asarray(shape.color))
+def _around(radius: FloatArray | float, y: FloatArray | float, turn: FloatArray) -> FloatArray:
+    """Points (n, 3) about the y axis; turn (n,): of the whole circle."""
+    return np.stack(np.broadcast_arrays(radius * np.sin(2 * np.pi * turn), y, radius * np.cos(2 * np.pi * turn)), -1)
+
+
+def _sheet(rows: int, columns: int, cut: int) -> tuple[FloatArray, FloatArray, IntArray, BoolArray]:
+    """A square of rows x columns checks of cut x cut parts: coordinates a, b (n,) in [0, 1] of its vertices, faces
+    (m, 3), and which faces are of odd checks (m,).
+    """
+    m, n = int(rows) * cut, int(columns) * cut
+    a, b = (grid.ravel() for grid in np.meshgrid(np.arange(m + 1) / m, np.arange(n + 1) / n, indexing="ij"))
+    i, j = (grid.ravel() for grid in np.meshgrid(np.arange(m), np.arange(n), indexing="ij"))
+    p = i * (n + 1) + j
+    faces = np.concatenate([np.stack([p, p + n + 1, p + n + 2], -1), np.stack([p, p + n + 2, p + 1], -1)])
+    return a, b, faces, np.tile((i // cut + j // cut) % 2 == 1, 2)
