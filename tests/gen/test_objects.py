@@ -33,7 +33,7 @@ from rsgen.motion.object_paths import object_spline
 from rsgen.produce.frame_source import FrameSource
 from rsgen.produce.generate import load_motion
 from rsgen.render.images import DepthRenderer
-from rsgen.render.irradiance import IrradianceField
+from rsgen.render.irradiance import IrradianceField, make_field, make_lattice
 from rsgen.render.moving import MovingObject, MovingObjects, ObjectsInFrame
 from rsgen.render.object_light import covered, harmonics, irradiance_coefficients
 from rsgen.render.object_meshes import load_object
@@ -338,6 +338,17 @@ def test_light_from_all_sides_is_even_and_light_from_above_is_above() -> None:
         n = np.array([np.sin(tilt), np.cos(tilt), 0])
         # E of a half-sky on a surface tilted from it is pi (1 + cos) / 2; the second order misses a few hundredths.
         np.testing.assert_allclose((np.array(harmonics(n)) @ c)[0], np.pi * (1 + np.cos(tilt)) / 2, atol=0.05)
+
+
+def test_light_off_walls_is_what_they_are_lit_by_and_reflect() -> None:
+    """In a closed box of one albedo and one irradiance E all that arrives is albedo x E, whichever way it is faced."""
+    paper = {"type": "twosided", "inner": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.4}}}
+    box = mi.load_dict({"type": "scene", "box": {"type": "cube", "bsdf": paper}})
+    lattice = make_lattice(box, 0.5)
+    lit = np.tile(np.array([3.0, 2.0, 1.0, 1.0], np.float32), (lattice.points, 1))
+    c = gathered_light(box, make_field(lattice, lit, lit), np.array([[0.0, 0, 0], [0.3, -0.2, 0.5]]))
+    for n in np.concatenate([np.eye(3), -np.eye(3)]):
+        np.testing.assert_allclose(np.array(harmonics(n)) @ c, np.tile([1.2, 0.8, 0.4], (2, 1)), rtol=0.01)
 
 
 # --- the whole
