@@ -1,13 +1,18 @@
-"""Depth of a sequence against an independent ray caster: trimesh with Embree on scene.ply, float64 rows' poses."""
+"""Depth of a sequence against an independent ray caster: trimesh with Embree on scene.ply, float64 rows' poses.
+
+What moves by itself is cast in its own frame, with each ray moved to where the thing is at its line's time.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
 
-from rsgen.array_types import FloatArray
+from rsgen.array_types import FloatArray, IntArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.sequence.reader import Sequence
@@ -18,7 +23,7 @@ REQUIRED_SHARE = 0.999
 
 @dataclass(frozen=True)
 class RaycastErrors:
-    """Share of pixels within TOLERANCE_M per frame, and the median difference of all, metres."""
+    """Share of pixels within TOLERANCE_M, of the right object, per frame, and the median difference of all, metres."""
 
     frames: tuple[int, ...]
     shares: tuple[float, ...]
@@ -42,34 +47,47 @@ def raycast_sequence(sequence: Sequence, count: int) -> RaycastErrors:
 
     Raises UserError if embreex is not installed, or scene.ply or a frame cannot be read.
     """
+    casters = [_caster(path) for path in (sequence.root / "scene.ply", *(o.mesh for o in sequence.objects))]
+    total = len(sequence.streams["depth"].stamps)
+    if count < 1 or total == 0:
+        raise UserError(f"{sequence.root}: no depth frames to cast: ask for at least one")
+    frames = tuple(int(k) for k in np.unique(np.linspace(0, total - 1, count).round().astype(int)))
+    differences, shares = [], []
+    for k in frames:
+        z, number = _cast(casters, sequence, k)
+        differences.append(np.abs(z - sequence.truth_depth(k)))
+        right = (differences[-1] <= TOLERANCE_M) & (number == sequence.object_ids("depth", k))
+        shares.append(float(np.mean(right)))
+    return RaycastErrors(frames, tuple(shares), float(np.median(differences)))
+
+
+def _caster(path: Path) -> Any:
     try:
         from trimesh.ray.ray_pyembree import RayMeshIntersector
     except ImportError:
         raise UserError("ray casting needs embreex: pip install embreex") from None
     try:
-        mesh = trimesh.load(sequence.root / "scene.ply", process=False, force="mesh")
-        caster = RayMeshIntersector(mesh)
+        return RayMeshIntersector(trimesh.load(path, process=False, force="mesh"))
     except Exception as error:
-        raise UserError(f"{sequence.root / 'scene.ply'}: cannot be read ({type(error).__name__})") from None
-    total = len(sequence.streams["depth"].stamps)
-    if count < 1 or total == 0:
-        raise UserError(f"{sequence.root}: no depth frames to cast: ask for at least one")
-    frames = tuple(int(k) for k in np.unique(np.linspace(0, total - 1, count).round().astype(int)))
-    differences = [np.abs(_cast(caster, sequence, k) - sequence.truth_depth(k)) for k in frames]
-    shares = tuple(float(np.mean(d <= TOLERANCE_M)) for d in differences)
-    return RaycastErrors(frames, shares, float(np.median(differences)))
+        raise UserError(f"{path}: cannot be read ({type(error).__name__})") from None
 
 
-def _cast(caster: object, sequence: Sequence, k: int) -> FloatArray:
-    """Planar z (h, w) of listed depth frame k, 0 where a ray hits nothing."""
-    camera = sequence.streams["depth"].camera
+def _cast(casters: list[Any], sequence: Sequence, k: int) -> tuple[FloatArray, IntArray]:
+    """Planar z (h, w) of listed depth frame k, 0 where a ray hits nothing, and the number of the object hit (h, w)."""
+    stream = sequence.streams["depth"]
+    camera = stream.camera
     uv = camera.pixel_grid().reshape(-1, 2)
     T_world_depth = sequence.pixel_poses("depth", k, uv)
-    origin = T_world_depth[:, :3, 3]
-    direction = np.einsum("nij,nj->ni", T_world_depth[:, :3, :3], camera.unproject(uv))
-    _, ray, p_world = caster.intersects_id(  # type: ignore[attr-defined]
-        origin, direction, multiple_hits=False, return_locations=True
-    )
-    z = np.zeros(len(uv))
-    z[ray] = se3.transform(se3.inverse(T_world_depth[ray]), p_world)[:, 2]
-    return z.reshape(camera.height, camera.width)
+    t = stream.shutter.line_mid_time(float(stream.stamps[k]), stream.shutter.line_of_pixel(uv, camera), camera)
+    z, number = np.full(len(uv), np.inf), np.zeros(len(uv), np.int64)
+    for which, caster in enumerate(casters):
+        T = T_world_depth
+        if which:
+            T = se3.inverse(sequence.objects[which - 1].spline.pose(t)) @ T_world_depth
+        direction = np.einsum("nij,nj->ni", T[:, :3, :3], camera.unproject(uv))
+        _, ray, p = caster.intersects_id(T[:, :3, 3], direction, multiple_hits=False, return_locations=True)
+        there = se3.transform(se3.inverse(T[ray]), p)[:, 2]
+        nearer = there < z[ray]
+        z[ray[nearer]], number[ray[nearer]] = there[nearer], which
+    shape = camera.height, camera.width
+    return np.where(np.isfinite(z), z, 0.0).reshape(shape), number.reshape(shape)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from rsgen.array_types import BoolArray, FloatArray
+from rsgen.array_types import BoolArray, FloatArray, IntArray
+from rsgen.check.objects import RelativeMotion
 from rsgen.geometry import se3
 from rsgen.geometry.shutter import project_rolling
 from rsgen.sequence.reader import Sequence
@@ -25,11 +27,12 @@ _TARGET_PIXELS = 3000  # small images are sampled more densely than every fourth
 class Reprojection:
     """Depth of one frame in the next: predicted minus observed z (n,) in metres where both see the same surface.
 
-    `occluded` more pixels are hidden there by a nearer surface.
+    `occluded` more pixels are hidden there by a nearer surface. number (n,): of the object that moves; 0: the scene.
     """
 
     residual: FloatArray
     occluded: int
+    number: IntArray
 
 
 def reproject_depth(sequence: Sequence, k: int, next_k: int) -> Reprojection:
@@ -37,31 +40,65 @@ def reproject_depth(sequence: Sequence, k: int, next_k: int) -> Reprojection:
 
     Pixels of frame k go to the world with their own line's pose and into the other frame with the rolling-shutter
     projection (3); the planar z predicted there is compared with the observed one, interpolated bilinearly in inverse
-    depth. Left out: places where that is not good to 0.5 mm (edges), and points hidden by a nearer surface.
+    depth. What is on a thing that moves by itself goes with it. Left out: places where that is not good to 0.5 mm
+    (edges), and points hidden by a nearer surface.
     Raises UserError for unreadable files.
     """
     stream = sequence.streams["depth"]
-    p_world = depth_points(sequence, k)
     stamp = float(stream.stamps[next_k])
-    uv_next, t, valid = project_rolling(sequence.spline, np.eye(4), stream.camera, stream.shutter, stamp, p_world)
-    uv_next, t = uv_next[valid], t[valid]
-    predicted = se3.transform(se3.inverse(sequence.spline.pose(t)), p_world[valid])[..., 2]
-    observed, smooth = _interpolate_inverse(sequence.truth_depth(next_k).astype(np.float64), uv_next)
-    predicted, observed = predicted[smooth], observed[smooth]
-    hidden = predicted - observed > OCCLUDED * predicted
-    return Reprojection((predicted - observed)[~hidden], int(hidden.sum()))
+    next_z = sequence.truth_depth(next_k).astype(np.float64)
+    seen = _seen(sequence, k)
+    residuals, numbers, occluded = [np.zeros(0)], [np.zeros(0, np.int64)], 0
+    for which in range(len(sequence.objects) + 1):
+        here = seen.number == which
+        if not here.any():
+            continue
+        points: FloatArray = seen.p_world[here]
+        motion: Any = sequence.spline
+        if which:
+            thing = sequence.objects[which - 1]
+            points = se3.transform(se3.inverse(thing.spline.pose(seen.t[here])), points)
+            motion = RelativeMotion(sequence.spline, thing.spline)
+        uv_next, t, valid = project_rolling(motion, np.eye(4), stream.camera, stream.shutter, stamp, points)
+        uv_next, t = uv_next[valid], t[valid]
+        predicted = se3.transform(se3.inverse(motion.pose(t)), points[valid])[..., 2]
+        observed, smooth = _interpolate_inverse(next_z, uv_next)
+        predicted, observed = predicted[smooth], observed[smooth]
+        hidden = predicted - observed > OCCLUDED * predicted
+        residuals.append((predicted - observed)[~hidden])
+        numbers.append(np.full(len(residuals[-1]), which))
+        occluded += int(hidden.sum())
+    return Reprojection(np.concatenate(residuals), occluded, np.concatenate(numbers))
 
 
 def depth_points(sequence: Sequence, k: int) -> FloatArray:
     """Points (n, 3) in the world that every fourth pixel of exact depth k shows, each from its own line's pose.
 
-    Raises UserError for unreadable files.
+    Without those on things that move by themselves. Raises UserError for unreadable files.
     """
-    camera = sequence.streams["depth"].camera
+    seen = _seen(sequence, k)
+    return seen.p_world[seen.number == 0]
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """n pixels: points (n, 3) in the world, numbers (n,) of the objects they are on, and their lines' times (n,), s."""
+
+    p_world: FloatArray
+    number: IntArray
+    t: FloatArray
+
+
+def _seen(sequence: Sequence, k: int) -> _Seen:
+    """What every fourth row and column of exact depth k shows."""
+    stream = sequence.streams["depth"]
+    camera = stream.camera
     step = max(1, min(_STEP_PX, math.isqrt(camera.width * camera.height // _TARGET_PIXELS)))
     z = sequence.truth_depth(k)[::step, ::step].astype(np.float64)
     uv = camera.pixel_grid()[::step, ::step][z > 0]
-    return se3.transform(sequence.pixel_poses("depth", k, uv), camera.backproject(uv, z[z > 0]))
+    p_world = se3.transform(sequence.pixel_poses("depth", k, uv), camera.backproject(uv, z[z > 0]))
+    t = stream.shutter.line_mid_time(float(stream.stamps[k]), stream.shutter.line_of_pixel(uv, camera), camera)
+    return _Seen(p_world, sequence.object_ids("depth", k)[::step, ::step][z > 0].astype(np.int64), np.asarray(t))
 
 
 def _interpolate_inverse(z: FloatArray, uv: FloatArray) -> tuple[FloatArray, BoolArray]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from rsgen.check.objects import check_objects
 from rsgen.errors import UserError
 from rsgen.export.folder import sequence_imu, sequence_target
 from rsgen.files import is_temporary, read_text, read_yaml
@@ -90,6 +91,8 @@ def extra_checks(sequence: Sequence) -> list[tuple[str, Callable[[], tuple[bool,
         checks.append(("true cameras", partial(check_true_cameras, sequence, config)))
     if isinstance(config, dict) and config.get("target") is not None:
         checks.append(("target", partial(check_target, sequence)))
+    if sequence.objects:
+        checks.append(("objects", partial(check_objects, sequence)))
     if sequence.truth_images:
         checks.append(("truth images", partial(check_truth_images, sequence)))
     if isinstance(config, dict) and config.get("imu") is not None:

@@ -336,6 +336,11 @@ def _check_reprojection(sequence: Sequence, pairs: int) -> tuple[bool, str]:
             return False, f"{frame}: only {len(size)} pixels agree on a surface, {result.occluded} are hidden"
         median, share = float(np.median(size)), float((size <= INLIER_M).mean())
         ok &= median <= MEDIAN_TOLERANCE_M and share >= INLIER_SHARE
+        for which in np.unique(result.number[result.number > 0]):  # nor a thing that moves another way
+            part = size[result.number == which]
+            if len(part) >= MINIMUM_PIXELS and not np.median(part) <= INLIER_M:
+                name = sequence.objects[which - 1].name
+                return False, f"{frame}: object {name} is off by {np.median(part) * 1e3:.1f} mm in the median"
         sizes.append(size)
         worst = max(worst, (median, f"{frame}: median {median * 1e3:.4f} mm, {share:.2%} within"))
     size = np.concatenate(sizes)

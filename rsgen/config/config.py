@@ -17,6 +17,7 @@ from rsgen.config.declared import DeclaredConfig, as_declared
 from rsgen.config.imu import ImuConfig
 from rsgen.config.mocap import MocapConfig
 from rsgen.config.motion import MotionConfig, TremorConfig
+from rsgen.config.objects import MOST_OBJECTS, ObjectConfig, content_of
 from rsgen.config.presets import Preset, with_preset
 from rsgen.config.sections import (
     ColorConfig,
@@ -39,7 +40,7 @@ __all__ = ["Config", "StreamConfig", "describe_fields", "load_config", "validate
 # Fields that change how fast or where a sequence is made, never one byte of it.
 _NOT_CONTENT = {"backend"}
 # Sections that are left out where they are not set: sequences rendered before there were any stay the same.
-_LATER = ("declared", "target")
+_LATER = ("declared", "target", "objects")
 # Fields that hold paths, by section.
 _PATHS = (("trajectory", "file"), ("scene", "file"))
 # PyYAML lets impossible dates, endless digits and endless nesting through as these.
@@ -61,6 +62,9 @@ class Config(Section):
     tremor: TremorConfig | None = None
     scene: SceneConfig
     target: TargetConfig | None = None
+    objects: tuple[ObjectConfig, ...] = Field(
+        default=(), max_length=MOST_OBJECTS, description="things that move by themselves (docs/format.md); []: none"
+    )
     light: LightConfig = LightConfig()
     color: ColorConfig = ColorConfig()
     depth: DepthConfig = DepthConfig()
@@ -80,6 +84,15 @@ class Config(Section):
         if (self.trajectory.file is None) == (self.motion is None):
             given = "one of them, not both" if self.motion else "a recorded file, or a section 'motion'"
             raise ValueError(f"trajectory.file: is required: give {given}")
+        return self
+
+    @model_validator(mode="after")
+    def _names_its_objects(self) -> Config:
+        names = [thing.name for thing in self.objects]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"objects: two are named {twice[0]!r}: give each a name of its own")
+        if self.objects and self.light.mode == "path":
+            raise ValueError("objects: are rendered in baked light only: set light.mode baked")
         return self
 
     @model_validator(mode="after")
@@ -109,11 +122,13 @@ class Config(Section):
 
     def content(self) -> dict[str, Any]:
         """Everything that decides the sequence's bytes, as plain YAML types (the trajectory and scene by file name)."""
-        unset = {name for name in _LATER if getattr(self, name) is None}
+        unset = {name for name in _LATER if not getattr(self, name)}
         content = self.model_dump(mode="json", exclude=_NOT_CONTENT | unset)
         for section, name in _PATHS:
             if content[section][name] is not None:
                 content[section][name] = Path(content[section][name]).name
+        if self.objects:
+            content["objects"] = [content_of(thing) for thing in self.objects]
         content["scene"] = {k: v for k, v in content["scene"].items() if v != SceneConfig.model_fields[k].default}
         return content
 
@@ -136,16 +151,25 @@ def load_config(path: Path, overrides: dict[str, str] | None = None) -> Config:
         raise _error(f"config {path}:{where} is not valid YAML ({problem})") from None
     if not isinstance(data, dict):
         raise _error(f"config {path}: expected a mapping of fields such as 'name:', 'trajectory:', 'scene:'")
-    for section, name in _PATHS:
-        part = data.get(section)
-        if isinstance(part, dict) and isinstance(part.get(name), str):
-            try:
-                part[name] = str(path.parent / Path(part[name]).expanduser())
-            except RuntimeError:
-                raise _error(f"config {path}: {section}.{name}: no such user's home, got {part[name]!r}") from None
+    for where, part, name in _paths_in(data):
+        try:
+            part[name] = str(path.parent / Path(part[name]).expanduser())
+        except RuntimeError:
+            raise _error(f"config {path}: {where}.{name}: no such user's home, got {part[name]!r}") from None
     for key, text in (overrides or {}).items():
         _set(data, key, text)
     return validate_config(data, f"config {path}")
+
+
+def _paths_in(data: dict[str, Any]) -> list[tuple[str, dict[str, Any], str]]:
+    """(section, its fields, field) of every path that a config file gives."""
+    places = [(section, data.get(section), name) for section, name in _PATHS]
+    things = data.get("objects")
+    for k, thing in enumerate(things if isinstance(things, list) else []):
+        places.append((f"objects.{k}", thing, "mesh"))
+        places.append((f"objects.{k}.motion", thing.get("motion") if isinstance(thing, dict) else None, "file"))
+    return [(where, part, name) for where, part, name in places
+            if isinstance(part, dict) and isinstance(part.get(name), str)]  # fmt: skip
 
 
 def validate_config(data: dict[str, Any], where: str) -> Config:

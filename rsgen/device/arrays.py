@@ -22,6 +22,16 @@ from rsgen.device.backend import VARIANTS, Backend, select
 _ALIGNMENT = 64
 
 
+def aligned(array: npt.ArrayLike) -> npt.NDArray[np.float32]:
+    """Flat float32 copy of `array` whose buffer begins where Dr.Jit likes it: else kernels are compiled anew."""
+    source = np.asarray(array)
+    raw = np.empty(source.size + _ALIGNMENT // 4, np.float32)
+    start = (-raw.ctypes.data % _ALIGNMENT) // 4
+    copy = raw[start : start + source.size]
+    copy.reshape(source.shape)[...] = source
+    return copy
+
+
 @dataclass(frozen=True)
 class Engine:
     """Array types of one Dr.Jit backend."""
@@ -34,12 +44,7 @@ class Engine:
 
     def upload(self, array: npt.ArrayLike) -> Any:
         """Flat float32 copy of `array` on the device."""
-        source = np.asarray(array)
-        raw = np.empty(source.size + _ALIGNMENT // 4, np.float32)
-        start = (-raw.ctypes.data % _ALIGNMENT) // 4
-        aligned = raw[start : start + source.size]
-        aligned.reshape(source.shape)[...] = source
-        return self.Float(aligned)
+        return self.Float(aligned(array))
 
     def download(self, array: Any, shape: tuple[int, ...]) -> npt.NDArray[Any]:
         """NumPy copy of a device array."""

@@ -14,6 +14,7 @@ import drjit as dr
 import numpy as np
 
 from rsgen.array_types import FloatArray
+from rsgen.device.arrays import aligned
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 
@@ -49,19 +50,28 @@ class PoseTable:
         T = np.array(np.broadcast_to(T_world_cam(grid if span > 0 else grid[:1]), (steps + 1, 4, 4)))
         if reference is not None:
             T[:, :3, 3] -= reference
-        rows = dr.value_t(vector)(np.ascontiguousarray(T[:, :3, :], np.float32).ravel())
+        rows = dr.value_t(vector)(aligned(T[:, :3, :]))
         dr.make_opaque(rows)
         return PoseTable(rows, steps, step_s, vector)
 
-    def at(self, t: Any, beyond: bool = False) -> list[Any]:
+    def followed_by(self, *others: PoseTable) -> PoseTable:
+        """One table of several of the same frame, for `at` with a number."""
+        rows = dr.concat([self.rows, *(other.rows for other in others)])
+        dr.make_opaque(rows)
+        return PoseTable(rows, self.steps, self.step_s, self.vector)
+
+    def at(self, t: Any, beyond: bool = False, number: Any = None) -> list[Any]:
         """The rows of [R t] at t seconds after the first line's shutter opened.
 
-        Outside the table they stay as at its end, or with `beyond` go on straight.
+        Outside the table they stay as at its end, or with `beyond` go on straight. number: which of the tables that
+        were joined, 0 the first.
         """
         x = t / self.step_s
         if not beyond:
             x = dr.clip(x, 0.0, float(self.steps))
         index = dr.uint32_array_t(x)(dr.clip(x, 0.0, float(self.steps - 1)))
         fraction = x - type(x)(index)
+        if number is not None:
+            index += number * (self.steps + 1)
         low, high = ([dr.gather(self.vector, self.rows, 3 * i + k) for k in range(3)] for i in (index, index + 1))
         return [dr.fma(fraction, b - a, a) for a, b in zip(low, high, strict=True)]

@@ -7,6 +7,7 @@ rsgen.geometry.camera and rsgen.geometry.shutter; the tests compare them.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -194,6 +195,7 @@ class MovingCamera:
 
     lens: Lens
     poses: PoseTable
+    carry: Callable[[Any, Vector], Vector] | None = None  # where points that move by themselves are at times t
 
     def pose(self, t: Any) -> tuple[Vector, tuple[Vector, Vector, Vector]]:
         """The camera's position and the rows of its rotation R_world_cam."""
@@ -204,6 +206,8 @@ class MovingCamera:
         """Pixels of points seen at times t, and where that is defined (see `Camera.project`)."""
         camera = self.lens.camera
         origin, R_world_cam = self.pose(t)
+        if self.carry is not None:
+            p = self.carry(t, p)
         q = rotated_back(R_world_cam, (p[0] - w * origin[0], p[1] - w * origin[1], p[2] - w * origin[2]))
         xn, yn, _, valid = _normalised(camera, q, _TRUTHS_MIN_DEPTH)
         d = distort(camera, xn, yn)

@@ -64,7 +64,7 @@ def _export_video(sequence: Sequence, out: Path, scene: Path | None, progress: P
 
     stream = sequence.streams["color"]
     config = config_of(sequence.root, sequence.meta, scene)
-    source = FrameSource(config, progress, global_shutter=True)
+    source = FrameSource(config, progress, global_shutter=True, objects=[thing.spline for thing in sequence.objects])
     # All lines at the middle line's time.
     middle = 0.5 * (stream.line_count - 1) * stream.shutter.line_delay(stream.camera)
     frames = range(len(stream.paths))

@@ -59,7 +59,8 @@ def compare_frame(path: Path, frame: int, out: Path | None, scene: Path | None) 
     if scene_hash(config) != _mapping(sequence.meta.get("inputs")).get("scene"):
         log.warning("%s: the scene %s has changed since, so more than the shutter differs", path, config.scene.file)
     with ProgressDisplay() as progress:
-        source = FrameSource(config, progress, global_shutter=True)
+        things = [thing.spline for thing in sequence.objects]
+        source = FrameSource(config, progress, global_shutter=True, objects=things)
     at = {stream.name: int(np.flatnonzero(stream.indices == frame)[0]) for stream in (color, depth)}
     middle = {s.name: float(s.stamps[at[s.name]]) + s.shutter.readout_s / 2 for s in (color, depth)}
     setting = setting_of(config, color.table, at["color"])
@@ -75,7 +76,7 @@ def compare_frame(path: Path, frame: int, out: Path | None, scene: Path | None) 
 
 
 def config_of(path: Path, meta: dict[str, Any], scene: Path | None) -> Config:
-    """The config that a sequence records, with its scene found on this machine."""
+    """The config that a sequence records, with its scene and its objects' meshes found on this machine."""
     origin = read_yaml(path / ORIGIN) if (path / ORIGIN).is_file() else {}
     recorded = _mapping(meta.get("config"))
     file = scene or Path(str(origin.get("scene", "")))
@@ -85,6 +86,11 @@ def config_of(path: Path, meta: dict[str, Any], scene: Path | None) -> Config:
     if recorded.get("motion") is None:
         trajectory = {"file": str(origin.get("trajectory", "unused"))}
         recorded["trajectory"] = _mapping(recorded.get("trajectory")) | trajectory
+    things = [_mapping(thing) for thing in recorded.get("objects") or ()]
+    for thing in things:
+        if (mesh := origin.get(f"object {thing.get('name')}")) is not None:
+            thing["mesh"] = str(mesh)
+    recorded["objects"] = things
     return validate_config(recorded, f"{path}/sequence.yaml: config")
 
 

@@ -24,6 +24,7 @@ from rsgen.errors import UserError
 from rsgen.files import atomic_write
 from rsgen.geometry.spline import Spline
 from rsgen.produce.frame_source import ColorShot, DepthShot, FrameSource, scene_hash
+from rsgen.produce.moving import mesh_hashes
 from rsgen.produce.writer import SequenceWriter
 from rsgen.sensors.adaptation import Setting
 from rsgen.sequence.format import StreamName
@@ -73,7 +74,7 @@ def _write_color(writer: SequenceWriter, source: FrameSource, k: int, shot: Colo
 
 
 def _write_depth(writer: SequenceWriter, source: FrameSource, k: int, shot: DepthShot) -> None:
-    writer.write_depth(k, shot.z, source.develop_depth(shot))
+    writer.write_depth(k, shot.z, source.develop_depth(shot), shot.ids)
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ class SequenceRecipe:
     """What a worker has to know of a sequence to render any of its frames.
 
     stamps_color (n,) and stamps_depth (m,): s, of all frames; versions, inputs: as in sequence.yaml. settings: of the
-    automatic camera, of all colour frames; empty without one.
+    automatic camera, of all colour frames; empty without one. objects: T_world_object(t) of the config's.
     """
 
     config: Config
@@ -91,6 +92,7 @@ class SequenceRecipe:
     versions: Mapping[str, str]
     inputs: Mapping[str, str]
     settings: tuple[Setting, ...] = ()
+    objects: tuple[Spline, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -121,6 +123,7 @@ def render_blocks(
         versions,
         inputs,
         writer.settings,
+        writer.objects,
     )
     blocks = [RenderJob(plan, tuple(shots[i : i + _BLOCK])) for i in range(0, len(shots), _BLOCK)]
     done = 0
@@ -140,7 +143,7 @@ def render_block(block: RenderJob, progress: Progress) -> dict[str, bytes]:
     with TemporaryDirectory(prefix="rsgen-") as folder:
         out = Path(folder) / plan.config.name
         stamps = plan.stamps_color, plan.stamps_depth
-        writer = SequenceWriter.open(out, plan.config, plan.spline, *stamps, plan.versions, plan.inputs)
+        writer = SequenceWriter.open(out, plan.config, plan.spline, *stamps, plan.versions, plan.inputs, plan.objects)
         writer = writer.adapted(plan.settings) if plan.settings else writer
         before = set(out.rglob("*"))
         render_shots(writer, source, block.shots, no_progress)
@@ -149,9 +152,14 @@ def render_block(block: RenderJob, progress: Progress) -> dict[str, bytes]:
 
 
 def _for_other_processes(config: Config, versions: Mapping[str, str]) -> Config:
-    """The config with the scene's full path and with the backend that runs here, whatever a worker has."""
+    """The config with full paths of scene and meshes, and the backend that runs here, whatever a worker has."""
     scene = config.scene.model_copy(update={"file": config.scene.file.absolute()})
-    return config.model_copy(update={"scene": scene, "backend": versions["variant"].partition("_")[0]})
+    things = tuple(
+        thing if thing.mesh is None else thing.model_copy(update={"mesh": thing.mesh.absolute()})
+        for thing in config.objects
+    )
+    backend = versions["variant"].partition("_")[0]
+    return config.model_copy(update={"scene": scene, "objects": things, "backend": backend})
 
 
 # Scene and light that this process rendered last, by what they were made from.
@@ -164,7 +172,7 @@ def _source(plan: SequenceRecipe, progress: Progress) -> FrameSource:
         _loaded.clear()
         try:
             _check(plan)
-            _loaded[key] = FrameSource(plan.config, progress)
+            _loaded[key] = FrameSource(plan.config, progress, objects=plan.objects)
         except UserError as error:
             raise UserError(f"worker on {socket.gethostname()}: {error}") from None
     return _loaded[key]
@@ -184,3 +192,6 @@ def _check(plan: SequenceRecipe) -> None:
         )
     if scene_hash(plan.config) != plan.inputs["scene"]:
         raise UserError(f"{plan.config.scene.file}: or a file of it is another one here: copy the scene again")
+    for name, found in mesh_hashes(plan.config).items():
+        if found != plan.inputs[name]:
+            raise UserError(f"{name}: its mesh is another one here: copy it again")

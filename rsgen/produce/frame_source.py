@@ -5,7 +5,7 @@ Exposing a frame uses the renderer and belongs into one thread; developing it is
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,6 +20,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.spline import Spline
 from rsgen.produce.identity import fingerprint
+from rsgen.produce.moving import lit_objects, load_meshes
 from rsgen.sensors.adaptation import Meter, Reading, Setting, reading
 from rsgen.sensors.color import apply_color_noise, apply_setting
 from rsgen.sensors.depth import apply_depth_noise
@@ -51,13 +52,15 @@ class ColorShot:
 class DepthShot:
     """Depth frame `frame`: exact planar z (h, w) in m, and the pixels that the projector does not light, if asked.
 
-    blurred: z as the line's whole exposure gives it; None where its middle stands for it.
+    blurred: z as the line's whole exposure gives it; None where its middle stands for it. ids (h, w): numbers of the
+    objects seen, 0 for none; None where nothing moves.
     """
 
     frame: int
     z: Float32Array
     shadow: BoolArray | None
     blurred: Float32Array | None = None
+    ids: Float32Array | None = None
 
 
 class FrameSource:
@@ -69,8 +72,12 @@ class FrameSource:
         progress: Progress = no_progress,
         global_shutter: bool = False,
         scene: Any = None,
+        objects: Sequence[Spline] = (),
     ) -> None:
-        """Load the scene, unless it is given, and its light (baked now if no cache has it). Raises UserError."""
+        """Load the scene, unless it is given, and its light (baked now if no cache has it). Raises UserError.
+
+        objects: T_world_object(t) of the config's, all of them.
+        """
         from rsgen.device.backend import mitsuba
 
         mi = mitsuba(config.backend)
@@ -82,17 +89,20 @@ class FrameSource:
 
         self._config = config
         self.scene = scene or load_scene(config)
-        self._integrator = integrator = make_integrator(mi, self.scene, config, progress)
+        self._integrator = integrator = make_integrator(mi, self.scene, config, progress, objects)
+        things = integrator.objects if objects else None
         pick = render.global_shutter if global_shutter else lambda shutter: shutter
         color, depth = config.color, config.depth
         self._color = render.ColorRenderer(self.scene, integrator, color.camera, pick(color.shutter), color.spp)
-        self._depth = render.DepthRenderer(self.scene, depth.camera, pick(depth.shutter))
-        self._instant = render.DepthRenderer(self.scene, depth.camera, replace(pick(depth.shutter), exposure_s=0.0))
+        self._depth = render.DepthRenderer(self.scene, depth.camera, pick(depth.shutter), things)
+        instant = replace(pick(depth.shutter), exposure_s=0.0)
+        self._instant = render.DepthRenderer(self.scene, depth.camera, instant, things)
         self._rays = depth.camera.unproject(depth.camera.pixel_grid()) if depth.registered else np.empty(0)
-        self._truth = TruthRenderer(self.scene, integrator, color, config.truth) if config.truth.images else None
+        wanted = bool(config.truth.images) or things is not None
+        self._truth = TruthRenderer(self.scene, integrator, color, config.truth, things) if wanted else None
         lit = depth.noise.model == "kinect" and depth.noise.shadow
         pattern = depth.noise.projector_baseline_m, depth.noise.projector_width
-        self._projector = Projector(self.scene, self._depth.sensor, *pattern) if lit else None
+        self._projector = Projector(self.scene, self._depth.sensor, *pattern, things) if lit else None
         self._T_depth_color = se3.inverse(np.asarray(config.T_color_depth, float))
 
     def expose_color(
@@ -126,16 +136,16 @@ class FrameSource:
 
     def expose_depth(self, spline: Spline, stamp: float, frame: int) -> DepthShot:
         """Cast the depth frame at `stamp` (s)."""
-        z = self.depth(spline, stamp)
+        z, ids = self._depth.cast(spline.pose, stamp)
         # The projector takes the depth sensor as it is now: exposed to this frame.
         shadow = None if self._projector is None else ~self._projector.lights(z, spline.pose, stamp)
         depth = self._config.depth
         if depth.blur_samples == 1:
-            return DepthShot(frame, z, shadow)
+            return DepthShot(frame, z, shadow, ids=ids)
         share = (np.arange(depth.blur_samples) + 0.5) / depth.blur_samples
         instants = stamp - depth.exposure_s * (1 - share)
         samples = [self._instant.render(spline.pose, float(t)) for t in instants]
-        return DepthShot(frame, z, shadow, mixed_depth(samples, depth.noise.model == "tof"))
+        return DepthShot(frame, z, shadow, mixed_depth(samples, depth.noise.model == "tof"), ids)
 
     def develop_depth(self, shot: DepthShot) -> Float32Array:
         """Planar z (h, w) in m that the camera reports, 0 where nothing; of colour's size where registered."""
@@ -190,8 +200,11 @@ class FrameSource:
         return int(np.random.SeedSequence([self._config.seed, frame]).generate_state(1)[0])
 
 
-def make_integrator(mi: Any, scene: Any, config: Config, progress: Progress) -> Any:
-    """Mitsuba integrator of the config's light: `path`, or `BakedIntegrator` over the scene's baked irradiance."""
+def make_integrator(mi: Any, scene: Any, config: Config, progress: Progress, objects: Sequence[Spline] = ()) -> Any:
+    """Mitsuba integrator of the config's light: `path`, or `BakedIntegrator` over the scene's baked irradiance.
+
+    objects: T_world_object(t) of the config's objects; without any the scene alone is shown.
+    """
     light = config.light
     if light.mode == "path":
         return mi.load_dict({"type": "path", "max_depth": light.max_depth})
@@ -203,7 +216,8 @@ def make_integrator(mi: Any, scene: Any, config: Config, progress: Progress) -> 
     except UserError as error:
         told = str(error)
         raise UserError(told if told.startswith("scene ") else f"scene {config.scene.file}: {told}") from None
-    return BakedIntegrator(field, glossy_spp=light.glossy_spp)
+    things = lit_objects(scene, field, load_meshes(config), objects) if objects else None
+    return BakedIntegrator(field, glossy_spp=light.glossy_spp, objects=things)
 
 
 def load_scene(config: Config) -> Any:

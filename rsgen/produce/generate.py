@@ -24,9 +24,17 @@ from rsgen.motion.make import make_motion
 from rsgen.motion.tremor import with_tremor
 from rsgen.produce.distribute import engine_versions, render_blocks, render_shots
 from rsgen.produce.frame_source import FrameSource, load_scene, scene_hash
+from rsgen.produce.moving import (
+    check_clear_of_camera,
+    load_meshes,
+    object_hashes,
+    object_mesh_ply,
+    object_splines,
+)
 from rsgen.produce.writer import SequenceWriter
 from rsgen.sensors.adaptation import Reading, Setting, adapt
 from rsgen.sequence.format import STREAMS, stream_stamps
+from rsgen.sequence.object_files import mesh_file
 from rsgen.sequence.trajectory import Trajectory, read_trajectory
 
 log = logging.getLogger("rsgen")
@@ -43,13 +51,15 @@ ORIGIN = "origin.yaml"
 class Motion:
     """The ground truth of a config: fitted spline of the body (depth camera), recorded stamps, and `fit`.
 
-    fit: of the recorded or made trajectory, before any tremor: what it missed.
+    fit: of the recorded or made trajectory, before any tremor: what it missed. objects: T_world_object(t) of the
+    config's.
     """
 
     spline: Spline
     fit: FitResult
     first_stamp: float
     last_stamp: float
+    objects: tuple[Spline, ...] = ()
 
 
 def load_motion(config: Config) -> Motion:
@@ -74,7 +84,8 @@ def load_motion(config: Config) -> Motion:
         trajectory, dt=spacing, smoothing=settings.smoothing if recorded is None else 0.0, pad_begin_s=before,
         pad_end_s=after,
     )  # fmt: skip
-    return Motion(fit.spline, recorded or fit, float(trajectory.stamps[0]), float(trajectory.stamps[-1]))
+    first, last = float(trajectory.stamps[0]), float(trajectory.stamps[-1])
+    return Motion(fit.spline, recorded or fit, first, last, object_splines(config, first, last))
 
 
 def _recorded(settings: TrajectoryConfig) -> Trajectory:
@@ -107,16 +118,20 @@ def render_sequence(
     identity = engine_versions(config), input_hashes(config)
     # In a new folder: a scene that does not load must not leave one behind that its mended self cannot continue.
     scene = None
+    meshes = load_meshes(config) if motion.objects else ()
     if not (out / "sequence.yaml").exists():
         scene = load_scene(config)
+        check_clear_of_camera(config, meshes, motion.objects, motion.spline, motion.first_stamp, motion.last_stamp)
         least = config.trajectory.clearance_m if config.motion is None else config.motion.clearance_m
         if least is not None:
             check_clearance(motion.spline, scene_triangles(scene), least)
-    writer = SequenceWriter.open(out, config, motion.spline, stamps["color"], stamps["depth"], *identity)
+    writer = SequenceWriter.open(
+        out, config, motion.spline, stamps["color"], stamps["depth"], *identity, motion.objects
+    )
     write_origin(out, config)
     source = None
     if config.color.adapts:
-        source = FrameSource(config, progress, scene=scene)
+        source = FrameSource(config, progress, scene=scene, objects=writer.objects)
         writer = writer.adapted(automatic_settings(config, source, writer, progress))
     todo = sorted(
         [(k, stream) for stream in STREAMS for k in _chosen(writer.missing(stream), frames, len(stamps[stream]))],
@@ -124,11 +139,14 @@ def render_sequence(
     if not (out / "scene.ply").is_file():
         scene = scene or load_scene(config)
         write_scene_ply(scene, out / "scene.ply")
+    for thing, mesh in zip(config.objects, meshes, strict=True):
+        atomic_write(out / mesh_file(thing.name), object_mesh_ply(mesh))
     try:
         if todo and workers is not None:
             render_blocks(writer, todo, *identity, workers, progress)
         elif todo:
-            render_shots(writer, source or FrameSource(config, progress, scene=scene), todo, progress)
+            source = source or FrameSource(config, progress, scene=scene, objects=writer.objects)
+            render_shots(writer, source, todo, progress)
     except (KeyboardInterrupt, SystemExit):
         # A run that the user ends here leaves a readable, shorter sequence.
         writer.finish()
@@ -179,6 +197,7 @@ def write_origin(out: Path, config: Config) -> None:
     where = {"scene": str(config.scene.file.resolve())}
     if config.trajectory.file is not None:
         where["trajectory"] = str(config.trajectory.file.resolve())
+    where |= {f"object {thing.name}": str(thing.mesh.resolve()) for thing in config.objects if thing.mesh is not None}
     atomic_write(out / ORIGIN, encode_yaml(where))
 
 
@@ -186,4 +205,4 @@ def input_hashes(config: Config) -> dict[str, str]:
     """Content hashes of the trajectory file, if there is one, and of the scene with all its files. Raises UserError."""
     file = config.trajectory.file
     trajectory = {} if file is None else {"trajectory": hashlib.sha256(file.read_bytes()).hexdigest()}
-    return trajectory | {"scene": scene_hash(config)}
+    return trajectory | {"scene": scene_hash(config)} | object_hashes(config)

@@ -16,7 +16,7 @@ from rsgen.errors import UserError
 from rsgen.files import is_temporary, read_yaml
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.camera_yaml import Cameras
-from rsgen.sequence.format import CLEAN_COLOR, FORMAT, STREAMS
+from rsgen.sequence.format import CLEAN_COLOR, FORMAT, OBJECT_CHANNELS, OBJECT_IDS, STREAMS
 
 
 def fingerprint(content: Mapping[str, Any]) -> str:
@@ -57,6 +57,7 @@ def describe(
         **({} if config.declared is None else {"declared": True}),
         "spline": {"knot_spacing_s": spline.dt, "t0_s": spline.t0, "control_points": len(spline.control_points)},
         "noise": noise_yaml(config),
+        **({"objects": [thing.name for thing in config.objects]} if config.objects else {}),
         "truth": {name: list(channels) for name, channels in color_truth(config).items()},
         "seed": config.seed,
         **identity,
@@ -74,7 +75,8 @@ def true_cameras(config: Config) -> Cameras:
 def color_truth(config: Config) -> dict[str, tuple[str, ...]]:
     """Images in truth/NAME/ for each colour frame with their EXR channels; no channels: an 8-bit sRGB PNG."""
     clean: dict[str, tuple[str, ...]] = {CLEAN_COLOR: ()} if config.color.noise.model != "none" else {}
-    return clean | config.truth.images
+    masks = {OBJECT_IDS: OBJECT_CHANNELS} if config.objects else {}
+    return clean | config.truth.images | masks
 
 
 def noise_yaml(config: Config) -> dict[str, str] | None:

@@ -34,9 +34,12 @@ from rsgen.sensors.imu import sample_clock, simulate_imu, write_imu_csv
 from rsgen.sensors.mocap import reported_poses
 from rsgen.sequence.camera_yaml import TRUE_CAMERAS, camera_yaml
 from rsgen.sequence.format import (
+    DEPTH_OBJECT_IDS,
     FOLDERS,
     FRAME_TABLES,
     LISTINGS,
+    OBJECT_CHANNELS,
+    OBJECTS,
     ROWS,
     STREAMS,
     TRUTH_DEPTH,
@@ -50,6 +53,7 @@ from rsgen.sequence.format import (
     round_stamps,
 )
 from rsgen.sequence.frame_table import FrameTable
+from rsgen.sequence.object_files import poses_file, spline_file
 from rsgen.sequence.target_corners import TARGET_CORNERS, target_corners_text
 
 _SPLINE_TOLERANCE = 1e-9
@@ -100,6 +104,7 @@ class SequenceWriter:
     color: _Stream
     depth: _Stream
     settings: tuple[Setting, ...] = ()
+    objects: tuple[Spline, ...] = ()
 
     @classmethod
     def open(
@@ -111,12 +116,14 @@ class SequenceWriter:
         stamps_depth: npt.ArrayLike,
         versions: Mapping[str, str],
         inputs: Mapping[str, str],
+        objects: Sequence[Spline] = (),
     ) -> SequenceWriter:
         """Create `out`, or resume what an equal call began there.
 
         stamps_color (n,) and stamps_depth (m,) are the stamps in seconds of all frames of the sequence, as
         `stream_stamps` returns them. `inputs` are content hashes of the trajectory and scene files; `versions` those of
-        every program that decides the bytes. sequence.yaml and spline.npz are written here.
+        every program that decides the bytes. objects: T_world_object(t) of the config's. sequence.yaml and splines are
+        written here.
 
         Raises UserError if the folder holds another sequence or other files, or cannot be written, if a line of a frame
         is read outside the spline's time, or if the IMU's samples are absurdly many; then nothing in it has been
@@ -140,13 +147,17 @@ class SequenceWriter:
             if not (out / "sequence.yaml").exists():
                 atomic_write(out / "sequence.yaml", encode_yaml(text))
             folders = (*FOLDERS.values(), TRUTH_DEPTH, *(f"truth/{name}" for name in color_truth(config)))
+            folders += (DEPTH_OBJECT_IDS, OBJECTS) if objects else ()
             for folder in folders:
                 (out / folder).mkdir(parents=True, exist_ok=True)
             for folder in ("", "truth", *folders):
                 remove_stale_temporaries(out / folder)
         except OSError as error:
             raise write_error(out, error) from None
-        return cls(out, config, _stored_spline(out / "spline.npz", spline), streams["color"], streams["depth"])
+        moving = zip(config.objects, objects, strict=True)
+        things = tuple(_stored_spline(out / spline_file(thing.name), s) for thing, s in moving)
+        spline = _stored_spline(out / "spline.npz", spline)
+        return cls(out, config, spline, streams["color"], streams["depth"], objects=things)
 
     def stamps(self, stream: StreamName) -> FloatArray:
         """True stamps (n,) of all frames of a stream, s."""
@@ -202,13 +213,20 @@ class SequenceWriter:
         _expect(rgb, (*shape, 3), np.uint8)
         atomic_write(self._path("color", k), encode_png(rgb))
 
-    def write_depth(self, k: int, z: Float32Array, reported: Float32Array | None = None) -> None:
+    def write_depth(
+        self, k: int, z: Float32Array, reported: Float32Array | None = None, ids: Float32Array | None = None
+    ) -> None:
         """Write depth frame k, planar z (h, w) float32 in metres; 0, negative, inf and NaN mean nothing measured.
 
         truth/depth/ gets z exactly; depth/ gets what the camera reports (default: z; of the colour camera's size where
-        depth is registered), rounded to 1/depth_scale m, 0 where that leaves 16 bits. Raises UserError if the disk
-        refuses it.
+        depth is registered), rounded to 1/depth_scale m, 0 where that leaves 16 bits. ids (h, w): of the objects seen,
+        where there are any. Raises UserError if the disk refuses it.
         """
+        if (ids is None) != (not self.objects):
+            raise ValueError("ids of a depth frame are of a sequence with objects, and only there")
+        if ids is not None:
+            _expect(ids, (self.depth.camera.height, self.depth.camera.width), np.float32)
+            atomic_write(self._ids_path(k), encode_exr(ids, OBJECT_CHANNELS))
         _expect(z, (self.depth.camera.height, self.depth.camera.width), np.float32)
         camera = self.color.camera if self.config.depth.registered else self.depth.camera
         _expect(z if reported is None else reported, (camera.height, camera.width), np.float32)
@@ -240,6 +258,9 @@ class SequenceWriter:
             rows = reported_poses(self.spline, mocap, self.config.seed, T_image_depth)
             camera += ", as a motion capture reports it"
         _write_lines(self.out / "groundtruth.txt", pose_lines(f"ground truth of {self.config.name}: {camera}", rows))
+        for thing, spline in zip(self.config.objects, self.objects, strict=True):
+            rows = ground_truth(spline, self.color.stamps, self.depth.stamps)
+            _write_lines(self.out / poses_file(thing.name), pose_lines(f"T_world_object of {thing.name}", rows))
         for s in STREAMS:
             stream = self._stream(s)
             T_cam_body = np.array(self.config.T_color_depth, float) if s == "color" else None
@@ -276,13 +297,16 @@ class SequenceWriter:
     def _truth_path(self, k: int) -> Path:
         return self.out / TRUTH_DEPTH / f"{frame_name(k)}.exr"
 
+    def _ids_path(self, k: int) -> Path:
+        return self.out / DEPTH_OBJECT_IDS / f"{frame_name(k)}.exr"
+
     def _color_truth_path(self, name: str, k: int) -> Path:
         return self.out / color_truth_path(name, color_truth(self.config)[name], frame_name(k))
 
     def _is_written(self, stream: StreamName, k: int) -> bool:
         # Atomic writes leave whole files only, so being there is enough; an empty one was made by something else.
         if stream == "depth":
-            truth = [self._truth_path(k)]
+            truth = [self._truth_path(k), *([self._ids_path(k)] if self.objects else [])]
         else:
             truth = [self._color_truth_path(name, k) for name in color_truth(self.config)]
         paths = [self._path(stream, k), *truth]

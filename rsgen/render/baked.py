@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from rsgen.render.irradiance import IrradianceField
+from rsgen.render.moving import MovingObjects, ShadedField
 
 _DIFFUSE = int(mi.BSDFFlags.DiffuseReflection) | int(mi.BSDFFlags.DiffuseTransmission)
 _SPECULAR = int(mi.BSDFFlags.Glossy) | int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.Null)
@@ -24,9 +25,13 @@ class BakedIntegrator(mi.SamplingIntegrator):
     much: of a pixel's samples only `glossy_spp` are traced there, the others are matte or left out.
     """
 
-    def __init__(self, field: IrradianceField, bounces: int = 4, glossy_spp: int = 16) -> None:
+    def __init__(
+        self, field: IrradianceField, bounces: int = 4, glossy_spp: int = 16, objects: MovingObjects | None = None
+    ) -> None:
+        """objects: that stand before the scene in `matte`, and take light from it; `sample` shows the scene alone."""
         super().__init__(mi.Properties())
-        self._field = field
+        self._field = field if objects is None else ShadedField(field, objects)
+        self.objects = objects
         self._bounces = bounces
         self.glossy_spp = glossy_spp
 
@@ -49,7 +54,12 @@ class BakedIntegrator(mi.SamplingIntegrator):
         radiance = si.emitter(scene).eval(si)
         albedo = bsdf.eval_diffuse_reflectance(si, hit & ~rest)
         irradiance = self._field.lookup(pi, si, -ray.d, hit & ~rest)
-        return dr.select(rest, 0, radiance + dr.select(hit, albedo * irradiance * dr.inv_pi, 0)), rest
+        radiance = dr.select(rest, 0, radiance + dr.select(hit, albedo * irradiance * dr.inv_pi, 0))
+        if self.objects is None or self.objects.now is None:
+            return radiance, rest
+        meeting = self.objects.now.meet(ray, dr.select(hit, pi.t, dr.inf))
+        met = meeting.number > 0
+        return dr.select(met, self.objects.now.shaded(ray, meeting), radiance), rest & ~met
 
 
 @dr.syntax

@@ -17,6 +17,7 @@ from rsgen.device.pose_table import PoseFunction
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.baked import BakedIntegrator
+from rsgen.render.moving import MovingObjects
 from rsgen.render.sensor import RollingShutterSensor
 
 # Samples in one launch; more are rendered in several and averaged, which bounds memory.
@@ -29,12 +30,16 @@ class ColorRenderer:
     """Linear colour frames of a scene. Holds the sensor between frames, so that kernels are compiled once."""
 
     def __init__(self, scene: Any, integrator: Any, camera: Camera, shutter: Shutter, spp: int) -> None:
-        """`integrator`: any Mitsuba sampling integrator, e.g. `path` or `rsgen.render.baked.BakedIntegrator`."""
+        """`integrator`: any Mitsuba sampling integrator, e.g. `path` or `rsgen.render.baked.BakedIntegrator`.
+
+        Only the latter shows things that move, its `objects`.
+        """
         self._scene = scene
         self._integrator = integrator
         self._spp = spp
         self._sampler = mi.load_dict({"type": "independent"})
         self.sensor = RollingShutterSensor(camera, shutter)
+        self._objects = integrator.objects if isinstance(integrator, BakedIntegrator) else None
 
     def render(
         self, T_world_cam: PoseFunction, stamp: float, seed: int, exposure_s: float | None = None
@@ -45,6 +50,8 @@ class ColorRenderer:
         """
         self.sensor.expose(T_world_cam, stamp, exposure_s)
         camera = self.sensor.camera
+        if self._objects is not None:
+            self._objects.expose(camera, self.sensor.shutter, stamp)
         pixels = camera.width * camera.height
         per_launch = max(1, min(self._spp, _LAUNCH // pixels))
         total = np.zeros((pixels, 3), np.float64)
@@ -96,13 +103,21 @@ class ColorRenderer:
 class DepthRenderer:
     """Planar depth frames: one ray through each pixel's centre at its line's mid-exposure."""
 
-    def __init__(self, scene: Any, camera: Camera, shutter: Shutter) -> None:
+    def __init__(self, scene: Any, camera: Camera, shutter: Shutter, objects: MovingObjects | None = None) -> None:
         self._scene = scene
         self.sensor = RollingShutterSensor(camera, shutter)
         self._exposure = shutter.exposure_s
+        self._objects = objects
 
     def render(self, T_world_cam: PoseFunction, stamp: float) -> Float32Array:
         """Planar z (h, w) float32, metres, of the frame at `stamp` (s); 0 where the ray hits nothing."""
+        return self.cast(T_world_cam, stamp)[0]
+
+    def cast(self, T_world_cam: PoseFunction, stamp: float) -> tuple[Float32Array, Float32Array | None]:
+        """`render`'s z, and which of the things that move each pixel shows (h, w): 0 none, k + 1 the k-th.
+
+        None where nothing moves.
+        """
         self.sensor.expose(T_world_cam, stamp)
         camera = self.sensor.camera
         pixel = dr.arange(mi.UInt32, camera.width * camera.height)
@@ -110,8 +125,15 @@ class DepthRenderer:
         position = mi.Point2f((u + 0.5) / camera.width, (v + 0.5) / camera.height)
         ray, _ = self.sensor.sample_ray(0.5 * self._exposure, mi.Float(0), position, mi.Point2f(0.5))
         hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
-        z = dr.select(hit.is_valid(), hit.t * self.sensor.planar_depth_scale(u, v), 0)
-        return np.array(z, np.float32).reshape(camera.height, camera.width)
+        shape = camera.height, camera.width
+        if self._objects is None:
+            z = dr.select(hit.is_valid(), hit.t * self.sensor.planar_depth_scale(u, v), 0)
+            return np.array(z, np.float32).reshape(shape), None
+        objects = self._objects.expose(camera, self.sensor.shutter, stamp)
+        meeting = objects.meet(ray, dr.select(hit.is_valid(), hit.t, dr.inf))
+        z = dr.select(dr.isfinite(meeting.t), meeting.t * self.sensor.planar_depth_scale(u, v), 0)
+        dr.eval(z, meeting.number)
+        return np.array(z, np.float32).reshape(shape), np.array(meeting.number, np.float32).reshape(shape)
 
 
 def global_shutter(shutter: Shutter) -> Shutter:

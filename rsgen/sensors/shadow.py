@@ -13,6 +13,7 @@ import numpy as np
 
 from rsgen.array_types import BoolArray, Float32Array
 from rsgen.device.pose_table import PoseFunction
+from rsgen.render.moving import MovingObjects
 from rsgen.render.sensor import RollingShutterSensor
 
 # Shadow rays end this much short of the surface, as a fraction of their length: 0.1 mm at 1 m. Depth is exact to 1e-6.
@@ -22,12 +23,15 @@ _SHORT = 1e-4
 class Projector:
     """A pattern projector beside a depth camera, at (baseline, 0, 0) in its frame, moving with it line by line."""
 
-    def __init__(self, scene: Any, sensor: RollingShutterSensor, baseline_m: float, width: float = 1.0) -> None:
+    def __init__(
+        self, scene: Any, sensor: RollingShutterSensor, baseline_m: float, width: float = 1.0,
+        objects: MovingObjects | None = None,
+    ) -> None:  # fmt: skip
         """`sensor`: the depth camera's (`DepthRenderer.sensor`). A positive baseline casts shadows to objects' left.
 
-        width: of the pattern, in widths of the camera's field of view.
+        width: of the pattern, in widths of the camera's field of view. objects: that move, exposed as the sensor.
         """
-        self._scene = scene
+        self._scene, self._objects = scene, objects
         self._camera = sensor
         self._emitter = RollingShutterSensor(sensor.camera, sensor.shutter)
         self._T_camera_projector = np.eye(4)
@@ -60,6 +64,9 @@ class Projector:
         lit.d = to_surface / distance
         lit.maxt = distance * (1 - _SHORT)
         reached = ~self._scene.ray_test(lit, coherent=True, active=depth > 0)
+        if self._objects is not None and self._objects.now is not None:
+            dr.eval(reached)
+            reached &= ~self._objects.now.hide(lit, depth > 0)
         x = self._x - np.float32(self._T_camera_projector[0, 3]) / np.where(z > 0, z, np.float32(np.inf))
         inside = (x >= self._left) & (x <= self._right) & (z > 0)
         return np.array(reached, bool).reshape(camera.height, camera.width) & inside

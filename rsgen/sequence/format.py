@@ -31,6 +31,10 @@ LISTINGS: dict[StreamName, str] = {"color": "rgb.txt", "depth": "depth.txt"}
 ROWS: dict[StreamName, str] = {"color": "truth/rows_color.npy", "depth": "truth/rows_depth.npy"}
 FRAME_TABLES: dict[StreamName, str] = {"color": "truth/frames_color.txt", "depth": "truth/frames_depth.txt"}
 TRUTH_DEPTH = "truth/depth"
+OBJECTS = "truth/objects"  # splines, poses and meshes of things that move by themselves
+OBJECT_IDS = "object_ids"  # truth/object_ids/: which of them each pixel of a colour frame shows, 0 for none
+DEPTH_OBJECT_IDS = "truth/depth_object_ids"  # the same of depth frames
+OBJECT_CHANNELS = ("id",)
 CLEAN_COLOR = "color"  # truth/color/: what a colour camera without noise would have reported
 GROUND_TRUTH_HZ = 200.0
 DEPTH_SCALE = 5000.0  # units per metre of depth images, unless told otherwise: as TUM's and ICL-NUIM's
@@ -94,6 +98,7 @@ class SequenceYaml(_Yaml):
     T_color_depth: tuple[Vector4, Vector4, Vector4, Vector4]
     noise: Any = None
     declared: bool = False  # cameras are what the sequence claims; truth/cameras.yaml has those that took the images
+    objects: tuple[Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,40}$")], ...] = ()  # names; ids count from 1
     truth: dict[Annotated[str, Field(pattern=r"^[a-z_]+$")], tuple[str, ...]] = {}
     fingerprint: str  # the file's last entry: one that was cut off has none
 

@@ -23,8 +23,11 @@ from rsgen.geometry.spline import Spline
 from rsgen.limits import rigid
 from rsgen.sequence.camera_yaml import TRUE_CAMERAS, read_true_cameras
 from rsgen.sequence.format import (
+    DEPTH_OBJECT_IDS,
     FRAME_TABLES,
     LISTINGS,
+    OBJECT_CHANNELS,
+    OBJECT_IDS,
     ROWS,
     STAMP_TOLERANCE_S,
     STREAMS,
@@ -38,6 +41,7 @@ from rsgen.sequence.format import (
     read_sequence_yaml,
 )
 from rsgen.sequence.frame_table import FrameTable, read_frame_table
+from rsgen.sequence.object_files import SequenceObject, read_objects
 
 _LONGEST_S = 1e6  # as long as stamps may grow
 
@@ -88,6 +92,7 @@ class Sequence:
     T_color_depth: FloatArray
     spline: Spline
     meta: dict[str, Any]
+    objects: tuple[SequenceObject, ...] = ()  # that move by themselves
 
     @property
     def depth_image_camera(self) -> Camera:
@@ -161,6 +166,18 @@ class Sequence:
         path = self.root / color_truth_path(name, images[name], stream.paths[k].stem)
         return read_exr(path, shape, images[name]) if images[name] else read_png(path, (*shape, 3), np.uint8)
 
+    def object_ids(self, stream: StreamName, k: int) -> npt.NDArray[np.uint8]:
+        """Which of `objects` each pixel (h, w) of exact image k shows: 0 none, else its number."""
+        s = self.streams[stream]
+        if not self.objects:
+            return np.zeros((s.camera.height, s.camera.width), np.uint8)
+        folder = DEPTH_OBJECT_IDS if stream == "depth" else f"truth/{OBJECT_IDS}"
+        path = self.root / folder / s.paths[k].with_suffix(".exr").name
+        ids = read_exr(path, (s.camera.height, s.camera.width), OBJECT_CHANNELS)
+        if not np.isin(ids, np.arange(len(self.objects) + 1)).all():
+            raise UserError(f"{path}: names objects that there are not: render it again")
+        return ids.astype(np.uint8)
+
     def rows(self, stream: StreamName) -> FloatArray:
         """Poses (n, lines, 7) tx ty tz qx qy qz qw of each line's camera in the world at mid-exposure.
 
@@ -200,7 +217,9 @@ def read_sequence(path: Path) -> Sequence:
         "depth": _read_stream(root, "depth", description.streams.depth),
     }
     spline = _read_spline(root / "spline.npz", streams)
-    return Sequence(root, description.name, streams, T_color_depth, spline, meta)
+    span = (f(s.stamps[k] for s in streams.values()) for f, k in ((min, 0), (max, -1)))
+    objects = read_objects(root, description.objects, *map(float, span)) if description.objects else ()
+    return Sequence(root, description.name, streams, T_color_depth, spline, meta, objects)
 
 
 def sequence_info(path: Path) -> str:
@@ -228,6 +247,8 @@ def sequence_info(path: Path) -> str:
     size = sum(file.stat().st_size for file in sequence.root.rglob("*") if file.is_file())
     if sequence.meta.get("declared"):
         rows.append(("declared", f"cameras are claims, not the truth, which {TRUE_CAMERAS} has"))
+    if sequence.objects:
+        rows.append(("objects", ", ".join(thing.name for thing in sequence.objects)))
     rows += [
         ("duration", f"{last - first:.3f} s"),
         ("trajectory", f"{length:.3f} m, {len(knots.control_points)} control points every {knots.dt * 1000:g} ms"),

@@ -1,4 +1,4 @@
-"""The exact images of one colour frame. One ray through each pixel's centre serves flow, normals, blur and depth.
+"""The exact images of one colour frame. One ray through each pixel's centre serves flow, normals, blur, depth, masks.
 
 Importing this module needs an active Mitsuba variant (`rsgen.device.backend.mitsuba()`).
 
@@ -15,6 +15,8 @@ exposure, x_{t−t_e} with that at its begin.
 normals: of the triangle at p, in the camera frame of the line's mid-exposure, towards the camera; 0 at infinity.
 
 color_depth: planar z of p, m; 0 at infinity.
+
+object_ids: which of the things that move p is on, 0 for none; p then moves with it, in all of the above.
 """
 
 from __future__ import annotations
@@ -32,12 +34,14 @@ from rsgen.config.sections import ColorConfig
 from rsgen.config.truth import GlobalTime, TruthConfig
 from rsgen.device.lens import Lens, contains
 from rsgen.device.pose_table import PoseFunction, PoseTable
-from rsgen.device.projection import MovingCamera, Vector, rotated_back
+from rsgen.device.projection import MovingCamera, rotated_back
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.images import ColorRenderer
+from rsgen.render.moving import MovingObjects, ObjectsInFrame
 from rsgen.render.sensor import RollingShutterSensor
 from rsgen.sensors.response import to_srgb8
+from rsgen.sequence.format import OBJECT_IDS
 
 # Rays that ask whether a point is seen end this much short of it, as a fraction of their length: 0.1 mm at 1 m.
 _SHORT = 1e-4
@@ -47,8 +51,13 @@ _TIMES: tuple[GlobalTime, ...] = ("first", "middle", "last")
 class TruthRenderer:
     """Renders what a `TruthConfig` asks for. Holds its sensors between frames, so that kernels are compiled once."""
 
-    def __init__(self, scene: Any, integrator: Any, color: ColorConfig, truth: TruthConfig) -> None:
-        """`scene` and `integrator` as for `ColorRenderer`; `color` is the stream that the images belong to."""
+    def __init__(
+        self, scene: Any, integrator: Any, color: ColorConfig, truth: TruthConfig, objects: MovingObjects | None = None
+    ) -> None:
+        """`scene` and `integrator` as for `ColorRenderer`; `color` is the stream that the images belong to.
+
+        objects: things that move, whose masks then are made too.
+        """
         self._scene, self._truth = scene, truth
         self._camera, self._shutter = color.camera, color.shutter
         self._gain = color.exposure_gain
@@ -56,6 +65,7 @@ class TruthRenderer:
         self._sharp = ColorRenderer(scene, integrator, self._camera, sharp, truth.spp)
         self._global = ColorRenderer(scene, integrator, self._camera, Shutter(), truth.spp)
         self._sensor = RollingShutterSensor(self._camera, self._shutter)
+        self._things = () if objects is None else objects.objects
 
     def render(
         self, T_world_cam: PoseFunction, stamp: float, next_stamp: float | None, seed: int,
@@ -63,11 +73,11 @@ class TruthRenderer:
     ) -> dict[str, NDArray[Any]]:  # fmt: skip
         """Every image of `TruthConfig.images` of the frame at `stamp` (s): uint8 sRGB (h, w, 3), or float32 (h, w, n).
 
-        n is the number of the image's EXR channels; with one channel the image is (h, w). `T_world_cam` takes times
-        (n,) s to poses (n, 4, 4) of the colour camera; UserError if it ends before a frame's last line. `next_stamp`
-        is the next frame's stamp, None after the last frame: then flow_next is 0 and nowhere valid. `seed` decides the
-        random numbers of the frame's twins. exposure_s: of this frame and the next, where they are others than the
-        stream's. brightness: factor on the light of the 8-bit images.
+        With `object_ids` if things move. n is the number of the image's EXR channels; with one channel the image is
+        (h, w). `T_world_cam` takes times (n,) s to poses (n, 4, 4) of the colour camera; UserError if it ends before a
+        frame's last line. `next_stamp` is the next frame's stamp, None after the last frame: then flow_next is 0 and
+        nowhere valid. `seed` decides the random numbers of the frame's twins. exposure_s: of this frame and the next,
+        where they are others than the stream's. brightness: factor on the light of the 8-bit images.
         """
         if exposure_s is not None:
             shutters = [replace(self._shutter, exposure_s=each) for each in exposure_s]
@@ -82,9 +92,9 @@ class TruthRenderer:
             instant = global_instant(self._camera, shutter, stamp, time)
             linear = self._global.render(T_world_cam, instant, _seed(seed, 1 + _TIMES.index(time)))
             images[f"global_{time}"] = to_srgb8(linear, gain)
-        if truth.flow or truth.normals or truth.blur_length or truth.color_depth:
+        if truth.flow or truth.normals or truth.blur_length or truth.color_depth or self._things:
             images |= self._geometry(T_world_cam, stamp, next_stamp, *shutters)
-        return {name: images[name] for name in truth.images}
+        return {name: images[name] for name in (*truth.images, *((OBJECT_IDS,) if self._things else ()))}
 
     def _geometry(
         self, T_world_cam: PoseFunction, stamp: float, next_stamp: float | None, shutter: Shutter, next_shutter: Shutter
@@ -93,8 +103,12 @@ class TruthRenderer:
         self._sensor.expose(T_world_cam, stamp, shutter.exposure_s)
         reference = np.asarray(T_world_cam(np.array([stamp])), float).reshape(4, 4)[:3, 3]
         now = _moving(camera, shutter, T_world_cam, stamp, reference)
-        seen = self._cast(now, shutter)
+        things = self._in_frame(shutter, stamp, reference)
+        seen = self._cast(now, shutter, things)
+        now = _carrying(now, things, seen)
         images: dict[str, list[Any]] = {}
+        if things is not None:
+            images[OBJECT_IDS] = [mi.Float(seen.number)]
         if truth.color_depth:
             images["color_depth"] = [seen.z]
         if truth.normals:
@@ -107,14 +121,16 @@ class TruthRenderer:
         if "global" in truth.flow:
             for time in truth.global_shutter:
                 instant = global_instant(camera, shutter, stamp, time)
-                still = _moving(camera, Shutter(), T_world_cam, instant, reference)
+                things = self._in_frame(Shutter(), instant, reference)
+                still = _carrying(_moving(camera, Shutter(), T_world_cam, instant, reference), things, seen)
                 uv, defined = still.project_at(mi.Float(0), seen.p, seen.w)
                 found = defined & contains(camera, *uv)
-                images[f"flow_global_{time}"] = self._flow(seen, uv, found, still.pose(mi.Float(0))[0], reference)
+                images[f"flow_global_{time}"] = self._flow(seen, uv, found, still, mi.Float(0), reference, things)
         if "next" in truth.flow and next_stamp is not None:
-            following = _moving(camera, next_shutter, T_world_cam, next_stamp, reference)
+            things = self._in_frame(next_shutter, next_stamp, reference)
+            following = _carrying(_moving(camera, next_shutter, T_world_cam, next_stamp, reference), things, seen)
             uv, t, found = following.project(following.lens.line_of(*seen.uv), seen.p, seen.w)
-            images["flow_next"] = self._flow(seen, uv, found, following.pose(t)[0], reference)
+            images["flow_next"] = self._flow(seen, uv, found, following, t, reference, things)
         dr.eval(images)
         shape = (camera.height, camera.width)
         out = {name: np.stack([np.array(c, np.float32) for c in images[name]], axis=-1) for name in images}
@@ -122,7 +138,12 @@ class TruthRenderer:
             out["flow_next"] = np.zeros((camera.height * camera.width, 3), np.float32)
         return {name: a.reshape(*shape, *(a.shape[1:] if a.shape[1] > 1 else ())) for name, a in out.items()}
 
-    def _cast(self, now: MovingCamera, shutter: Shutter) -> _Seen:
+    def _in_frame(self, shutter: Shutter, stamp: float, reference: FloatArray) -> ObjectsInFrame | None:
+        if not self._things:
+            return None
+        return ObjectsInFrame(self._things, self._camera, shutter, stamp, reference)
+
+    def _cast(self, now: MovingCamera, shutter: Shutter, things: ObjectsInFrame | None) -> _Seen:
         """What the pixels' centres see at their lines' mid-exposure. The sensor must be exposed to the frame."""
         camera = self._camera
         pixel = dr.arange(mi.UInt32, camera.width * camera.height)
@@ -137,19 +158,36 @@ class TruthRenderer:
         w = dr.select(hit.is_valid(), mi.Float(1), 0)
         p = dr.select(hit.is_valid(), mi.Point3f(origin) + hit.t * ray.d, ray.d)
         z = dr.select(hit.is_valid(), hit.t * self._sensor.planar_depth_scale(uv.x, uv.y), 0)
-        return _Seen(uv, begin, p, w, normal, rotated_back(R_world_cam, normal), z)
+        if things is None:
+            return _Seen(uv, begin, p, w, normal, rotated_back(R_world_cam, normal), z)
+        meeting = things.meet(ray, dr.select(hit.is_valid(), hit.t, dr.inf))
+        met, number = meeting.number > 0, meeting.number
+        p = dr.select(met, things.place(meeting), p)
+        normal = dr.select(met, things.normal(meeting), normal)
+        _, n_world = things.carried(number, begin + 0.5 * shutter.exposure_s, p, normal)
+        z = dr.select(met, meeting.t * self._sensor.planar_depth_scale(uv.x, uv.y), z)
+        dr.eval(p, normal, number, z, w)
+        return _Seen(uv, begin, p, dr.select(met, 1, w), normal, rotated_back(R_world_cam, n_world), z, number)
 
-    def _flow(self, seen: _Seen, uv: tuple[Any, Any], found: Any, origin: Vector, reference: FloatArray) -> list[Any]:
-        """u, v, valid of the flow to pixels `uv`, where `found`, of a camera then at `origin` (from the reference)."""
-        camera = mi.Point3f(origin)
-        towards = seen.p - seen.w * camera
+    def _flow(
+        self, seen: _Seen, uv: tuple[Any, Any], found: Any, other: MovingCamera, t: Any, reference: FloatArray,
+        things: ObjectsInFrame | None,
+    ) -> list[Any]:  # fmt: skip
+        """u, v, valid of the flow to pixels `uv`, where `found`, of another camera at its times t; things: of its."""
+        camera = mi.Point3f(other.pose(t)[0])
+        p, normal = (seen.p, seen.normal) if things is None else things.carried(seen.number, t, seen.p, seen.normal)
+        towards = p - seen.w * camera
         distance = dr.norm(towards)
         at = mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in reference))
         ray = mi.Ray3f(camera + at, towards / distance)
         ray.maxt = dr.select(seen.w > 0, distance * (1 - _SHORT), dr.inf)
-        front = (seen.w == 0) | (dr.dot(seen.normal, towards) < 0)
+        front = (seen.w == 0) | (dr.dot(normal, towards) < 0)
         valid = found & front
         valid &= ~self._scene.ray_test(ray, coherent=True, active=valid)
+        if things is not None:
+            ray.time = t - other.lens.shutter.exposure_s
+            dr.eval(valid)
+            valid &= ~things.hide(ray, valid)
         flow = mi.Point2f(uv) - seen.uv
         keep = dr.isfinite(flow.x) & dr.isfinite(flow.y) & found
         return [dr.select(keep, flow.x, 0), dr.select(keep, flow.y, 0), dr.select(valid, mi.Float(1), 0)]
@@ -164,9 +202,19 @@ def _moving(
     )
 
 
+def _carrying(camera: MovingCamera, things: ObjectsInFrame | None, seen: _Seen) -> MovingCamera:
+    """The camera of a frame over which the points seen move with the things that they are on."""
+    if things is None:
+        return camera
+    return replace(camera, carry=lambda t, p: tuple(things.carried(seen.number, t, mi.Point3f(p), mi.Normal3f(0))[0]))
+
+
 @dataclass(frozen=True)
 class _Seen:
-    """Per pixel, on the device: what its ray meets. Positions relative to the reference, m, world axes."""
+    """Per pixel, on the device: what its ray meets. Positions relative to the reference, m, world axes.
+
+    Those on things that move, and the normals there, are in the things' own frames.
+    """
 
     uv: Any  # the pixel itself
     begin: Any  # s from the first line's shutter opening to its own line's
@@ -175,6 +223,7 @@ class _Seen:
     normal: Any  # world axes, towards the camera, 0 at infinity
     n_cam: Any
     z: Any
+    number: Any = 0  # of the thing, 0 for none
 
 
 def global_instant(camera: Camera, shutter: Shutter, stamp: float, time: GlobalTime) -> float:

@@ -1,0 +1,241 @@
+"""Rigid things with motions of their own, met by rays of a rolling shutter at each ray's own time.
+
+A ray meets a thing at T_world_object(t) where, in the thing's own frame, the ray moved by the inverse meets its mesh:
+so each thing keeps one Mitsuba scene, built once, and a table of poses on the device says where it is at a ray's time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from rsgen.array_types import FloatArray
+from rsgen.device.arrays import aligned
+from rsgen.device.pose_table import PoseTable
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter
+from rsgen.geometry.spline import Spline
+from rsgen.render.object_light import HARMONICS, covered, harmonics
+from rsgen.render.object_meshes import ObjectMesh
+
+Rows = list[Any]  # of [R t]
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectLight:
+    """Irradiance by direction along a path: coefficients (n, 9, 3) at n times, `begin` s on, `step` s apart."""
+
+    coefficients: FloatArray
+    begin: float
+    step: float
+
+    def at(self, t: float) -> FloatArray:
+        """(9, 3) at t s, linear between the times and constant beyond them."""
+        x = float(np.clip((t - self.begin) / self.step, 0, len(self.coefficients) - 1))
+        k = min(int(x), max(len(self.coefficients) - 2, 0))
+        low, high = self.coefficients[k], self.coefficients[min(k + 1, len(self.coefficients) - 1)]
+        return np.asarray(low + (x - k) * (high - low))
+
+
+@dataclass(frozen=True, eq=False)
+class MovingObject:
+    """A thing: its mesh, T_world_object(t), and what lights it; None where it is only met, not seen."""
+
+    mesh: ObjectMesh
+    spline: Spline
+    light: ObjectLight | None = None
+
+
+@dataclass(frozen=True)
+class Meeting:
+    """What rays meet first among things: which (UInt32; 0 none, k + 1 the k-th), at what distance, and each one's hit.
+
+    t: of the rays' own length, no more than what was given. hits: each with the ray in its frame, and its pose.
+    """
+
+    number: Any
+    t: Any
+    hits: tuple[tuple[Any, Any, Rows], ...]
+
+
+class ObjectsInFrame:
+    """All things over one frame of one camera. No dataclass, which Dr.Jit's loops would take apart as their state."""
+
+    def __init__(
+        self, objects: Sequence[MovingObject], camera: Camera, shutter: Shutter, stamp: float,
+        reference: FloatArray | None = None,
+    ) -> None:  # fmt: skip
+        """Of the frame at `stamp` (s). reference (3,): what `carried` counts positions from; default: the origin.
+
+        Raises UserError if a thing's spline does not cover the frame.
+        """
+        self._objects, self._exposure_s = objects, shutter.exposure_s
+        self._span = shutter.exposure_s + shutter.readout_s
+        of, own = PoseTable.of, [o.spline.pose for o in objects]
+        self._poses = [of(mi.Vector4f, camera, shutter, pose, stamp) for pose in own]
+        # One table of all, for points that know their thing: first of what stays, then of each thing.
+        still = np.tile(np.eye(4), (1, 1, 1))
+        still[:, :3, 3] = 0.0 if reference is None else reference
+        self._carried = of(mi.Vector4f, camera, shutter, lambda t: still, stamp, reference).followed_by(
+            *(of(mi.Vector4f, camera, shutter, pose, stamp, reference) for pose in own)
+        )
+        self._light = [self._light_of(o, stamp) for o in objects]
+
+    def _light_of(self, thing: MovingObject, stamp: float) -> Any:
+        if thing.light is None:
+            return None
+        ends = [thing.light.at(stamp - self._exposure_s), thing.light.at(stamp - self._exposure_s + self._span)]
+        table = mi.Float(aligned(np.stack(ends)))
+        dr.make_opaque(table)
+        return table
+
+    def meet(self, ray: Any, t_static: Any) -> Meeting:
+        """What rays meet within `t_static`; their `time` is seconds after the stamp, as the sensor makes it."""
+        t, number = mi.Float(t_static), mi.UInt32(0)
+        hits = []
+        for k, (thing, poses) in enumerate(zip(self._objects, self._poses, strict=True)):
+            rows = poses.at(ray.time + self._exposure_s)
+            own, near = _own_ray(thing, rows, ray, t)
+            _settle(own, near)
+            hit = thing.mesh.scene.ray_intersect_preliminary(own, coherent=True, active=near)
+            _settle(hit)
+            nearer = near & hit.is_valid() & (hit.t < t)
+            t = dr.select(nearer, hit.t, t)
+            number = dr.select(nearer, k + 1, number)
+            hits.append((hit, own, rows))
+        return Meeting(number, t, tuple(hits))
+
+    def hide(self, ray: Any, active: Any) -> Any:
+        """Whether a thing stands in the way of rays, which end at their `maxt`."""
+        hidden = mi.Bool(False)
+        for thing, poses in zip(self._objects, self._poses, strict=True):
+            own, near = _own_ray(thing, poses.at(ray.time + self._exposure_s), ray, ray.maxt)
+            own.maxt = ray.maxt
+            near &= active
+            _settle(own, near, hidden)
+            hidden |= near & thing.mesh.scene.ray_test(own, coherent=True, active=near)
+            _settle(hidden)
+        return hidden
+
+    def shaded(self, ray: Any, meeting: Meeting) -> Any:
+        """Radiance (Color3f) back along rays, of what they meet; matte, and 0 where that is nothing."""
+        total = mi.Color3f(0)
+        share = dr.clip((ray.time + self._exposure_s) / self._span, 0, 1) if self._span > 0 else mi.Float(0)
+        for k, (hit, own, rows) in enumerate(meeting.hits):
+            table = self._light[k]
+            if table is None:
+                continue
+            here = meeting.number == k + 1
+            si = hit.compute_surface_interaction(own, mi.RayFlags.All, here)
+            n = si.sh_frame.n
+            n = dr.select(dr.dot(n, own.d) < 0, n, -n)
+            basis = harmonics(_rotated(rows, n))
+            ends = [
+                [sum(b * dr.gather(mi.Float, table, mi.UInt32(e * HARMONICS * 3 + 3 * j + c))
+                     for j, b in enumerate(basis)) for c in range(3)]
+                for e in range(2)
+            ]  # fmt: skip
+            light = mi.Color3f(*(dr.maximum(dr.lerp(a, b, share), 0) for a, b in zip(*ends, strict=True)))
+            albedo = si.bsdf(own).eval_diffuse_reflectance(si, here)
+            total += dr.select(here, albedo * light * dr.inv_pi, 0)
+        return total
+
+    def normal(self, meeting: Meeting) -> Any:
+        """Unit normals (Normal3f) of the triangles that rays meet, in the things' own frames, towards the rays."""
+        normal = mi.Normal3f(0)
+        for k, (hit, own, _) in enumerate(meeting.hits):
+            here = meeting.number == k + 1
+            n = hit.compute_surface_interaction(own, mi.RayFlags.Minimal, here).n
+            normal = dr.select(here, dr.select(dr.dot(n, own.d) < 0, n, -n), normal)
+        return normal
+
+    def place(self, meeting: Meeting) -> Any:
+        """Points (Point3f) that rays meet, in the things' own frames; 0 where that is nothing."""
+        place = mi.Point3f(0)
+        for k, (_, own, _) in enumerate(meeting.hits):
+            place = dr.select(meeting.number == k + 1, own(meeting.t), place)
+        return place
+
+    def carried(self, number: Any, t: Any, p: Any, normal: Any) -> tuple[Any, Any]:
+        """Points and normals at t seconds after the first line's shutter opened, from the reference, world axes.
+
+        Given in the frame of the thing `number` - 1; where number is 0 they stay what they are.
+        """
+        rows = self._carried.at(t, beyond=True, number=number)
+        moved = mi.Point3f(*(a + row.w for a, row in zip(_rotated(rows, p), rows, strict=True)))
+        return moved, mi.Normal3f(*_rotated(rows, normal))
+
+    def openness(self, p_world: Any, n_world: Any, time: Any) -> Any:
+        """Share of its light that a surface point keeps, `time` seconds after the stamp; n_world: the lit side's."""
+        open_ = mi.Float(1)
+        for thing, poses in zip(self._objects, self._poses, strict=True):
+            rows = poses.at(time + self._exposure_s)
+            p, n = _rotated_back(rows, p_world - _origin(rows)), _rotated_back(rows, n_world)
+            middle, axes = thing.mesh.middle.tolist(), thing.mesh.axes.tolist()
+            away = [(m - x) / a for m, x, a in zip(middle, p, axes, strict=True)]
+            scaled = dr.normalize(mi.Vector3f(*(x * a for x, a in zip(n, axes, strict=True))))
+            open_ *= 1 - covered(tuple(away), tuple(scaled))
+        return open_
+
+
+class MovingObjects:
+    """The things of a sequence; what renders them points them at each frame, as `RollingShutterSensor` is."""
+
+    def __init__(self, objects: Sequence[MovingObject]) -> None:
+        self.objects = tuple(objects)
+        self.now: ObjectsInFrame | None = None
+
+    def expose(self, camera: Camera, shutter: Shutter, stamp: float) -> ObjectsInFrame:
+        """Make the frame at `stamp` (s) the present one. Raises UserError if a spline does not cover it."""
+        self.now = ObjectsInFrame(self.objects, camera, shutter, stamp)
+        return self.now
+
+
+class ShadedField:
+    """A scene's irradiance without what the things around take of it; stands in for `IrradianceField`."""
+
+    def __init__(self, field: Any, objects: MovingObjects) -> None:
+        self._field, self._objects = field, objects
+
+    def lookup(self, pi: Any, si: Any, wi_world: Any, active: Any = True) -> Any:
+        """As `IrradianceField.lookup`; hits carry their rays' times."""
+        assert self._objects.now is not None
+        n = dr.select(dr.dot(si.n, wi_world) < 0, -si.n, si.n)
+        return self._field.lookup(pi, si, wi_world, active) * self._objects.now.openness(si.p, n, si.time)
+
+
+def _own_ray(thing: MovingObject, rows: Rows, ray: Any, most: Any) -> tuple[Any, Any]:
+    """Rays in the thing's own frame, and whether they come near it within `most`."""
+    o = mi.Point3f(*_rotated_back(rows, ray.o - _origin(rows)))
+    d = mi.Vector3f(*_rotated_back(rows, ray.d))
+    to_middle = mi.Point3f(*thing.mesh.middle.tolist()) - o
+    along = dr.dot(to_middle, d)
+    radius = thing.mesh.radius * (1 + 1e-4)
+    near = dr.squared_norm(to_middle - along * d) < radius * radius
+    near &= (along > -radius) & (along - radius < most)
+    return mi.Ray3f(o, d), near
+
+
+def _origin(rows: Rows) -> Any:
+    return mi.Point3f(*(row.w for row in rows))
+
+
+def _rotated(rows: Rows, v: Any) -> tuple[Any, Any, Any]:
+    x, y, z = (row.x * v.x + row.y * v.y + row.z * v.z for row in rows)
+    return x, y, z
+
+
+def _rotated_back(rows: Rows, v: Any) -> tuple[Any, Any, Any]:
+    a, b, c = rows
+    return (a.x * v.x + b.x * v.y + c.x * v.z, a.y * v.x + b.y * v.y + c.y * v.z, a.z * v.x + b.z * v.y + c.z * v.z)
+
+
+def _settle(*values: Any) -> None:
+    """On CUDA, a kernel traces rays in one scene only: what comes before the next scene is computed first."""
+    if dr.backend_v(mi.Float) == dr.JitBackend.CUDA:
+        dr.eval(*values)
