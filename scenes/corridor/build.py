@@ -1,10 +1,11 @@
 """Builds the corridor: `python scenes/corridor/build.py [--seed N] [--out DIR]` writes scene.xml, meshes/, textures/.
 
-A corridor of a school or an institute, 18.2 x 3 x 2.4 m, with seven doors alike, and a staircase at its end: ten steps up to
-a landing under a window. Frame: right-handed, y up, metres; x along the corridor from 0 to 18.2, the stairwell from 14 on
-(4.7 m high), z from -1.2 to 1.2, floor at y = 0, landing at y = 1.7. Everything is procedural and seeded: two builds of one
-seed are equal byte for byte. A seed draws colours, boards and notices, lockers or benches, lamps (which are on, their
-temperature), sky. The result is a plain Mitsuba 3 scene of triangle meshes: diffuse surfaces, handles of metal, area lights.
+A corridor of a school or an institute, 18.2 x 3 x 2.4 m, with seven doors alike, and a staircase at its end: ten steps
+up to a landing under a window. Frame: right-handed, y up, metres; x along the corridor from 0 to 18.2, the stairwell
+from 14 on (4.7 m high), z from -1.2 to 1.2, floor at y = 0, landing at y = 1.7. Everything is procedural and seeded:
+two builds of one seed are equal byte for byte. A seed draws colours, boards and notices, lockers or benches, lamps
+(which are on, their temperature), sky. The result is a plain Mitsuba 3 scene of triangle meshes: diffuse surfaces,
+handles of metal, area lights.
 
     build.py      puts it all together          room.py       walls, doors, lamps, pipes
     materials.py  BSDFs and their textures      stairs.py     flight, balustrade, handrails
@@ -28,7 +29,7 @@ from scenes.kit.prints import town  # noqa: E402
 from scenes.kit.room_files import Lamp, look_at, write_room  # noqa: E402
 from scenes.kit.variants import command, draw, kelvin  # noqa: E402
 
-LAMP_RADIANCE = 26.0
+LAMP_RADIANCE = 58.0
 SKY, GROUND = 2.0, 0.6
 
 
@@ -37,7 +38,7 @@ def contents(seed: int) -> tuple[list[Piece], list[Lamp]]:
     rng = draw(seed, "light")
     pieces = [Piece("shell", room.shell()), *room.fixtures(), *layout.arrange(seed)]
     lamps = []
-    colour = kelvin(float(rng.uniform(3400, 6000))) / kelvin(4600)  # as a camera balanced for 4600 K sees it
+    colour = kelvin(float(rng.uniform(3800, 6000))) / kelvin(4600)  # as a camera balanced for 4600 K sees it
     dark = int(rng.integers(len(room.LAMPS))) if rng.uniform() < 0.6 else -1
     for i, place in enumerate(room.LAMPS):
         housing, face = room.lamp(*place)

@@ -10,7 +10,7 @@ from scenes.corridor.stairs import LANDING
 from scenes.kit.fittings import bin_, board, cabinet, extinguisher, radiator, sign, switch
 from scenes.kit.pieces import Piece, stand
 from scenes.kit.prints import atlas_rect
-from scenes.kit.shapes import Parts, atlas_uv, box, merge, move_parts, quad, rotation, superellipsoid
+from scenes.kit.shapes import Mesh, Parts, atlas_uv, box, merge, move_parts, quad, rotation, superellipsoid
 from scenes.kit.variants import draw
 from scenes.kit.walls import GAP
 
@@ -41,7 +41,7 @@ def arrange(seed: int) -> list[Piece]:
         pieces.append(
             Piece("lockers", south.hang(cabinet(1.20, 0.42, 1.80, 2, 4), (x0 - 12.6, room.FLOOR + GAP), 0.016))
         )
-        pieces.append(Piece("bench", _bench(room.HALF - 0.03, 0.95 - 0.55)))
+        pieces.append(Piece("bench", _bench(room.HALF - 0.03, 0.72)))
     else:
         pieces.append(Piece("bench", _bench(room.HALF - 0.03, 12.6)))
         pieces.append(Piece("board south 3", south.hang(_notice_board(1.5, 0.9, rng), (x0 - 12.6, 1.62))))
@@ -66,10 +66,10 @@ def _bench(back: float, x: float) -> Parts:
     """Bench of slats on two trestles, its back edge at z = `back`, about x."""
     y = room.FLOOR + GAP
     slats = [
-        box([x - 0.7, y + 0.42, back - 0.09 * (k + 1)], [x + 0.7, y + 0.445, back - 0.09 * k - 0.012]) for k in range(4)
+        box([x - 0.6, y + 0.42, back - 0.09 * (k + 1)], [x + 0.6, y + 0.445, back - 0.09 * k - 0.012]) for k in range(4)
     ]
     legs = []
-    for q in (x - 0.55, x + 0.55):
+    for q in (x - 0.45, x + 0.45):
         legs += [
             box([q - 0.02, y + 0.385, back - 0.35], [q + 0.02, y + 0.419, back - 0.012]),
             box([q - 0.02, y, back - 0.34], [q + 0.02, y + 0.384, back - 0.30]),
@@ -81,7 +81,8 @@ def _bench(back: float, x: float) -> Parts:
 def _notice_board(width: float, height: float, rng: np.random.Generator) -> Parts:
     """Cork board with notices pinned in rows, a little askew, some places bare."""
     parts = board(width, height, "cork", "bench")
-    sheets, pins = [], {name: [] for name in _PINS}
+    sheets = []
+    pins: dict[str, list[Mesh]] = {name: [] for name in _PINS}
     columns, rows = int((width - 0.1) / 0.27), 2
     for i in range(columns):
         for j in range(rows):

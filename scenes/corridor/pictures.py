@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -35,10 +36,11 @@ def notices(shape: tuple[int, int], seed: int) -> Image:
     cells: list[Callable[[tuple[int, int]], Image]] = []
     for i in range(NOTICES[0] * NOTICES[1]):
         if i % 3 == 2:
-            cells.append(lambda s, k=i, p=palettes[int(rng.integers(3))]: poster(s, seed + 13 * k, p, titles[k % 6]))
+            palette = palettes[int(rng.integers(3))]
+            cells.append(partial(poster, seed=seed + 13 * i, palette=palette, title=titles[i % 6]))
         else:
             paper, ink = papers[int(rng.integers(5))], _INKS[int(rng.integers(4))]
-            cells.append(lambda s, k=i, p=paper, c=ink: page(s, seed + 13 * k, p, c))
+            cells.append(partial(page, seed=seed + 13 * i, paper=paper, accent=ink))
     return atlas(cells, NOTICES[0])(shape)
 
 
@@ -56,6 +58,7 @@ def plates(shape: tuple[int, int], seed: int) -> Image:
         (f"LEVEL {floor + 1}", (0.30, 0.42, 0.58), white, 0.26),
     ]
     cells: list[Callable[[tuple[int, int]], Image]] = [
-        lambda s, t=text, k=i: plate(s, t[0], t[1], t[2], seed + k, t[3]) for i, text in enumerate(texts)
+        partial(plate, text=text, ground=ground, ink=ink, seed=seed + i, size=size)
+        for i, (text, ground, ink, size) in enumerate(texts)
     ]
     return atlas(cells, PLATES[0])(shape)

@@ -122,7 +122,7 @@ def _pipes() -> Piece:
 
 
 def lamp(x: float, y: float) -> tuple[Parts, Mesh]:
-    """A long ceiling lamp below the ceiling at height `y`: its housing, and its shining face, which nothing reaches below."""
+    """A long lamp below the ceiling at height `y`: housing, and shining face, which nothing reaches below."""
     low = y - 0.062
     z = 0.0 if y == CEILING else (SIDE - HALF) / 2
     housing = box([x - 0.62, low, z - 0.11], [x + 0.62, y - GAP, z + 0.11])

@@ -18,7 +18,7 @@ _RAIL = 0.92  # above the nosings
 
 
 def flight(end: float, z0: float) -> list[tuple[str, Mesh]]:
-    """Masonry from the wall at z0 to SIDE: risers, treads, landing up to x = `end`, and the wall below the open side."""
+    """Masonry from the wall at z0 to SIDE: risers, treads, landing up to x = `end`, the wall below the open side."""
     stone, side = [], []
     deep = SIDE - z0
     for i in range(STEPS):

@@ -57,7 +57,7 @@ def door(o: Opening, leaf: str, casing: str, metal: str, hinge: str = "left", gl
     z = z1 + GAP
     lever = tube(
         [
-            [handle_x, h, z],
+            [handle_x, h, z + 0.0065],
             [handle_x, h, z + 0.045],
             [handle_x + side * 0.008, h, z + 0.053],
             [handle_x + side * 0.03, h, z + 0.055],
@@ -139,14 +139,13 @@ def extinguisher(red: str, black: str, metal: str) -> Parts:
 def bin_(material: str, height: float = 0.32, radius: float = 0.14) -> Parts:
     """Waste bin about the origin, standing on y = 0."""
     r = radius
-    outer = [[0.8 * r, 0.0], [r, height]]
-    inner = [[r - 0.006, height], [0.8 * r - 0.006, 0.006]]
-    return [(material, lathe([[0, 0], *outer, *inner, [0, 0.006]], 40))]
+    profile = [[0, 0], [0.8 * r, 0], [r, height], [r - 0.006, height], [0.8 * r - 0.006, 0.006], [0, 0.006]]
+    return [(material, lathe(profile, 40))]
 
 
 def rail(path: list[list[float]], radius: float, wood: str, metal: str, out: float, posts: list[int]) -> Parts:
     """Handrail along the points `path` of a wall's frame, `out` of the wall, held at the points `posts`."""
-    p = np.asarray(path, float) + (0.0, 0.0, out)
+    p = np.asarray(path, float) + np.array([0.0, 0.0, out])
     brackets = []
     for i in posts:
         x, y, _ = p[i]

@@ -113,7 +113,7 @@ def plate(shape: tuple[int, int], text: str, ground: Colour, ink: Colour, seed: 
 
 
 def worn(image: Image, seed: int, metre: float, scuffs: int, colour: Colour, where: tuple[float, float]) -> Image:
-    """Painted surface with dents and scuffs of `colour` between two heights of the image (of its height, from above)."""
+    """Painted surface with dents and scuffs of `colour` between two heights (parts of the image, from above)."""
     h, w = image.shape[:2]
     rng = np.random.default_rng(seed)
     mask = np.zeros((h, w), np.uint8)

@@ -46,7 +46,7 @@ def command(build: Callable[[Path, int], Path], what: str, folder: Path) -> None
     """Command line of a build script: `--seed` and `--out`, by default `folder`; prints the scene's path."""
     parser = argparse.ArgumentParser(
         description=f"Build {what} as a Mitsuba 3 scene.",
-        epilog="A config names a variant by its folder: scene.file .../seed3/scene.xml is built with --seed 3 if absent.",
+        epilog="A config names a variant by its folder: ROOM/seed3/scene.xml is built with --seed 3 if absent.",
     )
     parser.add_argument("--seed", type=int, default=0, help="variant: arrangement, colours, lamps (default: 0)")
     parser.add_argument("--out", type=Path, help="folder to write to (default: this script's, or its seedN)")

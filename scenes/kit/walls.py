@@ -1,12 +1,13 @@
 """Walls with openings, and what is fixed to them: a wall's own frame, its surface, reveals and skirting boards.
 
-Everything of a wall is modelled in its frame: x to the right as seen from inside, y up (the world's height), z out of the
-wall into the room. Going round a room to the right, each wall's right end is the next one's left end.
+Everything of a wall is modelled in its frame: x to the right as seen from inside, y up (the world's height), z out of
+the wall into the room. Going round a room to the right, each wall's right end is the next one's left end.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -68,8 +69,8 @@ class Wall:
         xs = sorted({0.0, self.length, *(x for o in self.openings for x in (o.x0, o.x1))})
         ys = sorted({y0, y1, *(y for o in self.openings for y in (o.y0, o.y1) if y0 < y < y1)})
         cells = []
-        for a, b in zip(xs, xs[1:], strict=False):
-            for c, d in zip(ys, ys[1:], strict=False):
+        for a, b in pairwise(xs):
+            for c, d in pairwise(ys):
                 x, y = (a + b) / 2, (c + d) / 2
                 if not any(o.x0 < x < o.x1 and o.y0 < y < o.y1 for o in self.openings):
                     cells.append(quad([a, d, 0], [b - a, 0, 0], [0, c - d, 0], (a, self.top - d)))

@@ -1,10 +1,10 @@
 """Builds the office: `python scenes/office/build.py [--seed N] [--out DIR]` writes scene.xml, meshes/, textures/ there.
 
-An office for four, 8 x 2.8 x 6 m, beside a meeting room behind glass. Frame: right-handed, y up, metres; x from -4 to 4,
-z from -3 (whiteboard, door) to 3 (windows), floor at y = 0, the glass at x = 1.4. Everything is procedural and seeded: two
-builds of one seed are equal byte for byte. A seed draws the plan of the desks and what is on them, colours, lamps (which
-are on, their temperature), screens, blinds, sky. The result is a plain Mitsuba 3 scene of triangle meshes: diffuse
-surfaces, a few rough plastics and metals, thin glass, area lights (ceiling panels, screens, window panes).
+An office for four, 8 x 2.8 x 6 m, beside a meeting room behind glass. Frame: right-handed, y up, metres; x from -4 to
+4, z from -3 (whiteboard, door) to 3 (windows), floor at y = 0, the glass at x = 1.4. Everything is procedural and
+seeded: two builds of one seed are equal byte for byte. A seed draws the plan of the desks and what is on them, colours,
+lamps (which are on, their temperature), screens, blinds, sky. The result is a plain Mitsuba 3 scene of triangle meshes:
+diffuse surfaces, a few rough plastics and metals, thin glass, area lights (ceiling panels, screens, window panes).
 
     build.py      puts it all together          room.py       building, partition, windows, lamps
     materials.py  BSDFs and their textures      furniture.py  desks, chairs, shelves, tables
@@ -29,7 +29,7 @@ from scenes.kit.variants import command, draw, kelvin  # noqa: E402
 from scenes.office import layout, pictures, room  # noqa: E402
 from scenes.office.materials import materials  # noqa: E402
 
-PANEL_RADIANCE = 28.0  # of each of eight panels; fewer shine brighter
+PANEL_RADIANCE = 35.0  # of each of eight panels; fewer shine brighter
 SCREEN_RADIANCE = 0.75  # of a white pixel
 SKY, GROUND = 1.7, 0.6
 
@@ -39,7 +39,7 @@ def contents(seed: int) -> tuple[list[Piece], list[Lamp]]:
     arrangement = layout.arrange(seed)
     rng = draw(seed, "light")
     pieces = [Piece("shell", room.shell()), *room.fixtures(rng), *arrangement.pieces]
-    colour = kelvin(float(rng.uniform(3400, 6000))) / kelvin(4600)  # as a camera balanced for 4600 K sees it
+    colour = kelvin(float(rng.uniform(3800, 6000))) / kelvin(4600)  # as a camera balanced for 4600 K sees it
     on = rng.uniform(size=len(room.PANELS)) > 0.15
     on[[0, 4, 6]] = True
     power = PANEL_RADIANCE * len(on) / on.sum()

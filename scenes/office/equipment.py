@@ -1,4 +1,4 @@
-"""What lies and stands on the desks: screens, keyboards, papers, mugs, telephones; each about its own origin on y = 0."""
+"""What is on the desks: screens, keyboards, papers, mugs, telephones; each about its own origin on y = 0."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ def keyboard() -> Parts:
         for k in range(16):
             wide = 0.095 if row == 4 and k == 4 else 0.0195
             if x + wide <= 0.2125:
-                keys.append(box([x, 0.0142, z], [x + wide, 0.0195, z + 0.0185]))
-            x += wide + 0.0035 if row != 4 or k != 4 else wide + 0.0035
+                keys.append(box([x, 0.0150, z], [x + wide, 0.0195, z + 0.0185]))
+            x += wide + 0.0035
     return [("plastic", body), ("key", merge(keys))]
 
 
@@ -115,9 +115,9 @@ def pencils(rng: np.random.Generator) -> Parts:
     pot = lathe([[0, 0], [0.036, 0], [0.038, 0.10], [0.0355, 0.10], [0.0335, 0.003], [0, 0.003]], 32)
     pens = []
     for k in range(5):
-        a = 2 * np.pi * k / 5 + rng.uniform(0, 0.6)
+        a = 2 * np.pi * k / 5 + rng.uniform(0, 0.3)
         foot, top = (
-            np.array([0.012 * np.cos(a), 0.0085, 0.012 * np.sin(a)]),
+            np.array([0.017 * np.cos(a), 0.0085, 0.017 * np.sin(a)]),
             np.array([0.030 * np.cos(a), 0.15, 0.030 * np.sin(a)]),
         )
         pens.append(tube([foot, (foot + top) / 2, top], 0.004, 8))
@@ -128,7 +128,7 @@ def laptop(picture: int) -> tuple[Parts, Mesh]:
     """Open laptop, the user at +z; and its screen."""
     base = rounded_box([-0.16, 0.0, -0.11], [0.16, 0.016, 0.11], 0.004, 4, edge=1)
     keys = [
-        box([-0.14 + 0.0235 * i, 0.0163, -0.075 + 0.021 * j], [-0.119 + 0.0235 * i, 0.0185, -0.0565 + 0.021 * j])
+        box([-0.14 + 0.0235 * i, 0.0170, -0.075 + 0.021 * j], [-0.119 + 0.0235 * i, 0.0190, -0.0565 + 0.021 * j])
         for i in range(12)
         for j in range(4)
     ]

@@ -150,7 +150,7 @@ def shelf() -> Parts:
 
 
 def binders(x0: float, x1: float, rng: np.random.Generator) -> Parts:
-    """Binders, box files and books upright on y = 0 from x0 to x1, spines at z close to 0.3; the last third may be bare."""
+    """Binders and books upright on y = 0 from x0 to x1, spines at z close to 0.3; the last third may be bare."""
     spines, bodies = [], []
     x, end = x0, x1 - rng.uniform(0.0, 0.35) * (x1 - x0)
     while True:
@@ -161,8 +161,8 @@ def binders(x0: float, x1: float, rng: np.random.Generator) -> Parts:
         )  # fmt: skip
         if x + w > end:
             break
-        z1 = 0.305 - (rng.uniform(0, 0.02) if kind < 0.65 else rng.uniform(0.03, 0.06))
-        cover = rounded_box([x, GAP, z1 - d], [x + w - 0.0015, h, z1], 0.002, 1, edge=1)
+        z1 = 0.328 - (rng.uniform(0, 0.02) if kind < 0.65 else rng.uniform(0.03, 0.06))
+        cover = box([x, GAP, z1 - d], [x + w - 0.0015, h, z1])
         face = quad([x + 0.002, h - 0.003, z1 + 0.0006], [w - 0.0055, 0, 0], [0, 0.008 - h, 0])
         cell = int(rng.integers(BINDERS // 2)) if kind < 0.65 else BINDERS // 2 + int(rng.integers(BINDERS // 2))
         rect = atlas_rect(cell, BINDERS, 1, 0.02)
@@ -175,7 +175,7 @@ def binders(x0: float, x1: float, rng: np.random.Generator) -> Parts:
 
 def divider(width: float) -> Parts:
     """Fabric screen between two desks, about the middle of its foot on the desks' tops, which it straddles."""
-    panel = rounded_box([-width / 2, -0.09, -0.013], [width / 2, 0.40, 0.013], 0.008, 8, edge=2)
+    panel = rounded_box([-width / 2, 0.006, -0.013], [width / 2, 0.40, 0.013], 0.008, 8, edge=2)
     feet = [
         box([x - 0.03, GAP, s * 0.014 - (0.04 if s < 0 else 0)], [x + 0.03, 0.005, s * 0.014 + (0.04 if s > 0 else 0)])
         for x in (-width / 2 + 0.2, width / 2 - 0.2)

@@ -50,11 +50,10 @@ def _islands(rng: np.random.Generator) -> tuple[list[Place], list[Place]]:
         x, z = -1.35 + rng.uniform(-0.15, 0.15), 0.35 + rng.uniform(-0.1, 0.15)
         desks = [Place(x + s, z + q, t) for s in (-0.805, 0.805) for q, t in ((d, 0), (-d, 180))]
         return desks, [Place(x + s, z, 0) for s in (-0.805, 0.805)]
-    if plan == 1:  # two islands of two across the room
-        z = 0.45 + rng.uniform(-0.1, 0.1)
-        xs = (-2.25, 0.05)
-        desks = [Place(x + q, z, t) for x in xs for q, t in ((d, 90), (-d, -90))]
-        return desks, [Place(x, z, 90) for x in xs]
+    if plan == 1:  # the same turned by a quarter
+        x, z = -1.1 + rng.uniform(-0.1, 0.1), 0.1 + rng.uniform(-0.1, 0.1)
+        desks = [Place(x + q, z + s, t) for s in (-0.805, 0.805) for q, t in ((d, 90), (-d, -90))]
+        return desks, [Place(x, z + s, 90) for s in (-0.805, 0.805)]
     x, z = -0.9 + rng.uniform(-0.1, 0.1), -0.05 + rng.uniform(-0.05, 0.05)  # an island of two, two along the window
     desks = [Place(x, z + d, 0), Place(x, z - d, 180)]
     desks += [Place(q, FRONT - 0.17 - fu.DESK[1] / 2, 180) for q in (-2.75, -0.1)]
@@ -102,7 +101,7 @@ def _workplace(place: Place, rng: np.random.Generator, pieces: list[Piece], scre
 
     side = float(rng.choice([-1.0, 1.0]))
     put("desk", fu.desk(0.37 * k), 0, ON_FLOOR, 0)
-    put("pedestal", fu.pedestal(), -side * 0.46, ON_FLOOR, 0.10)
+    put("pedestal", fu.pedestal(), -side * 0.44, ON_FLOOR, 0.10)
     put(
         "chair",
         fu.office_chair(float(rng.uniform(-35, 35))),
@@ -126,7 +125,7 @@ def _workplace(place: Place, rng: np.random.Generator, pieces: list[Piece], scre
         put("telephone", eq.telephone(), side * 0.56, _TOP, -0.10, side * -15)
         put("files", eq.papers(rng, 4), -side * 0.56, _TOP, -0.16, float(rng.uniform(-6, 6)))
     put("mug", eq.coffee(float(rng.uniform(0, 360))), side * 0.62, _TOP, 0.12 + float(rng.uniform(0, 0.08)))
-    put("pens", eq.pencils(rng), -side * 0.70, _TOP, 0.0)
+    put("pens", eq.pencils(rng), -side * 0.27, _TOP, 0.02)
 
 
 def _shelves(rng: np.random.Generator, pieces: list[Piece]) -> None:

@@ -15,6 +15,7 @@ from scenes.kit.variants import draw
 from scenes.office import pictures
 
 Painter = Callable[[tuple[int, int]], Image]
+Pair = tuple[Colour, Colour]
 
 
 def carpet(seed: int, base: Colour, other: Colour) -> Painter:
@@ -76,20 +77,20 @@ def _wall(seed: int, base: Colour, contrast: float) -> Painter:
     )
 
 
-CARPETS: list[tuple[Colour, Colour]] = [
+CARPETS: list[Pair] = [
     ((0.40, 0.43, 0.47), (0.58, 0.60, 0.62)),
     ((0.36, 0.42, 0.44), (0.62, 0.58, 0.42)),
     ((0.47, 0.44, 0.41), (0.34, 0.38, 0.44)),
     ((0.34, 0.39, 0.48), (0.52, 0.58, 0.66)),
 ]
 ACCENTS: list[Colour] = [(0.52, 0.66, 0.66), (0.70, 0.62, 0.46), (0.50, 0.58, 0.70), (0.62, 0.66, 0.52)]
-CLOTHS: list[tuple[Colour, Colour]] = [
+CLOTHS: list[Pair] = [
     ((0.33, 0.36, 0.41), (0.28, 0.30, 0.34)),
     ((0.30, 0.44, 0.56), (0.26, 0.36, 0.46)),
     ((0.62, 0.40, 0.30), (0.48, 0.30, 0.24)),
     ((0.40, 0.50, 0.40), (0.32, 0.40, 0.33)),
 ]
-WOODS: list[tuple[Colour, Colour]] = [
+WOODS: list[Pair] = [
     ((0.78, 0.66, 0.50), (0.60, 0.46, 0.32)),
     ((0.82, 0.76, 0.66), (0.68, 0.60, 0.50)),
     ((0.62, 0.46, 0.33), (0.42, 0.29, 0.20)),
@@ -100,11 +101,12 @@ def materials(seed: int) -> dict[str, Material]:
     """All materials of the office of this seed."""
     rng = draw(seed, "colours")
 
-    def one(options: list) -> tuple:
+    def one(options: list[Pair]) -> Pair:
         return options[int(rng.integers(len(options)))]
 
     base, other = one(CARPETS)
-    accent, chair, screen = one(ACCENTS), one(CLOTHS), one(CLOTHS)
+    accent = ACCENTS[int(rng.integers(len(ACCENTS)))]
+    chair, screen = one(CLOTHS), one(CLOTHS)
     desk, table, shelf = one(WOODS), one(WOODS), one(WOODS)
     n = 10_000 * (seed + 1)
     white = (0.83, 0.82, 0.79)
@@ -118,7 +120,7 @@ def materials(seed: int) -> dict[str, Material]:
         "frame": Material(_speckled(n + 61, (0.36, 0.37, 0.39)), (512, 512), (0.8, 0.8)),
         "steel": Material(_speckled(n + 62, (0.62, 0.63, 0.64)), (512, 512), (0.8, 0.8)),
         "paint": Material(_speckled(n + 63, (0.82, 0.82, 0.80), 0.7), (512, 512), (0.8, 0.8)),
-        "door": Material(wood(n + 71, *WOODS[int(rng.integers(3))], 30), (1024, 512), (2.1, 1.05)),
+        "door": Material(wood(n + 71, *one(WOODS), 30), (1024, 512), (2.1, 1.05)),
         "laminate": Material(wood(n + 81, *desk, 26), (1024, 1024), (1.7, 1.7)),
         "table_wood": Material(wood(n + 85, *table, 24), (1024, 1024), (2.4, 1.6)),
         "shelf": Material(wood(n + 91, *shelf, 24), (1024, 1024), (1.9, 1.2)),
@@ -135,7 +137,7 @@ def materials(seed: int) -> dict[str, Material]:
         "whiteboard": Material(lambda s: pictures.whiteboard(s, n + 161), (768, 1280)),
         "board": Material(plain(n + 165, (0.80, 0.80, 0.80), 0.4), (256, 256), (0.8, 0.8)),
         "poster": Material(lambda s: pictures.posters(s, n + 171), (640, 1344)),
-        "glaze": Material(plain(n + 181, one(ACCENTS), 0.9), (256, 256), (0.4, 0.4), 0.15),
+        "glaze": Material(plain(n + 181, ACCENTS[int(rng.integers(len(ACCENTS)))], 0.9), (256, 256), (0.4, 0.4), 0.15),
         "pen": Material(fabric(n + 185, (0.30, 0.40, 0.62), (0.66, 0.30, 0.26), 40), (128, 128), (0.05, 0.05)),
         "carton": Material(_speckled(n + 187, (0.62, 0.52, 0.40), 1.5), (256, 256), (0.5, 0.5)),
         "leaf": Material(lambda s: tx.leaf(s, n + 191), (256, 512)),

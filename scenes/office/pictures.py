@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 
 import cv2
@@ -103,7 +104,7 @@ def screens(shape: tuple[int, int], seed: int) -> Image:
     """Linear radiance of eight screens, SCREENS = (columns, rows) of equal cells: white is 1."""
     painters = (_code, _table, _document, _charts, _code, _photograph, _document, _table)
     cells: list[Callable[[tuple[int, int]], Image]] = [
-        lambda s, p=painter, k=seed + 50 * i: p(s, k) for i, painter in enumerate(painters)
+        partial(painter, seed=seed + 50 * i) for i, painter in enumerate(painters)
     ]
     return np.clip(atlas(cells, SCREENS[0])(shape), 0.02, 1) ** np.float32(2.2)
 
@@ -112,11 +113,14 @@ def binders(shape: tuple[int, int], seed: int) -> Image:
     """Atlas of BINDERS spines side by side: marbled or plain binders with a label, then books."""
     h, w = shape
     rng = np.random.default_rng(seed)
-    palette = [(0.30, 0.31, 0.34), (0.66, 0.28, 0.25), (0.26, 0.40, 0.58), (0.36, 0.50, 0.38), (0.80, 0.70, 0.36), (0.74, 0.74, 0.73), (0.50, 0.38, 0.56)]  # fmt: skip
+    palette = [
+        *[(0.30, 0.31, 0.34), (0.66, 0.28, 0.25), (0.26, 0.40, 0.58), (0.36, 0.50, 0.38)],
+        *[(0.80, 0.70, 0.36), (0.74, 0.74, 0.73), (0.50, 0.38, 0.56)],
+    ]
     out: Image = np.empty((h, w, 3), np.float32)
     for i, (a, b) in enumerate(pairwise(np.round(np.linspace(0, w, BINDERS + 1)).astype(int))):
         colour = np.clip(np.array(palette[int(rng.integers(len(palette)))]) + rng.normal(0, 0.03, 3), 0.22, 0.86)
-        spine = np.broadcast_to(colour.astype(np.float32), (h, b - a, 3)).copy()
+        spine: Image = np.broadcast_to(colour.astype(np.float32), (h, b - a, 3)).copy()
         n = b - a
         if i < BINDERS // 2:
             spine = spine * (1 + 0.10 * np.clip(fractal((h, n), seed + i, 30, 3, 0.8), -2, 2))[..., None]
@@ -146,7 +150,7 @@ def pages(shape: tuple[int, int], seed: int) -> Image:
     rng = np.random.default_rng(seed)
     papers = [(0.88, 0.87, 0.84), (0.89, 0.89, 0.88), (0.88, 0.84, 0.70), (0.78, 0.84, 0.88)]
     cells: list[Callable[[tuple[int, int]], Image]] = [
-        lambda s, k=i, p=papers[int(rng.integers(4))], c=_BARS[i % 4]: page(s, seed + 7 * k, p, c)
+        partial(page, seed=seed + 7 * i, paper=papers[int(rng.integers(4))], accent=_BARS[i % 4])
         for i in range(PAGES[0] * PAGES[1])
     ]
     return atlas(cells, PAGES[0])(shape)
@@ -205,6 +209,6 @@ def posters(shape: tuple[int, int], seed: int) -> Image:
     ]
     titles = ("OPEN DAY", "FORUM 26", "SUMMER")
     cells: list[Callable[[tuple[int, int]], Image]] = [
-        lambda s, k=i: poster(s, seed + 31 * k, palettes[(k + seed) % 3], titles[k]) for i in range(3)
+        partial(poster, seed=seed + 31 * i, palette=palettes[(i + seed) % 3], title=titles[i]) for i in range(3)
     ]
     return atlas(cells, POSTERS[0])(shape)

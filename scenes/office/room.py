@@ -58,7 +58,7 @@ def fixtures(rng: np.random.Generator) -> list[Piece]:
     for x in (3.95, 5.40, 6.85):
         pieces.append(Piece("radiator", front.hang(_named(radiator()), (x, FLOOR + GAP), 0.015)))
     pieces.append(Piece("radiator", front.hang(_named(radiator()), (1.30, FLOOR + GAP), 0.015)))
-    pieces.append(Piece("switch", back.hang(switch("paint"), (5.42, 1.10))))
+    pieces.append(Piece("switch", back.hang(switch("paint"), (4.08, 1.10))))
     pieces.append(Piece("whiteboard", back.hang(_whiteboard(), (float(rng.uniform(1.95, 2.6)), 1.50))))
     order = rng.permutation(3)
     for i, (wall, x, y) in enumerate(
