@@ -5,6 +5,8 @@ In a wall's frame (scenes.kit.walls): x to the right, y up, z out of the wall, u
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from scenes.kit.shapes import (
@@ -25,6 +27,7 @@ from scenes.kit.walls import GAP, Opening, frame
 Rect = tuple[float, float, float, float]  # u0, v0, u1, v1 of a picture
 
 
+@cache
 def radiator(length: float = 0.95, height: float = 0.52, columns: int = 17) -> Parts:
     """Column radiator about x = 0, back at z = 0, feet on y = 0."""
     xs = np.linspace(-length / 2 + 0.03, length / 2 - 0.03, columns)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from scenes.kit.prints import atlas_rect
@@ -53,6 +55,7 @@ def television(picture: int) -> tuple[Parts, Mesh]:
     return [("plastic", case), ("steel", mount)], _screen(1.20, 0.68, 0.0, 0.0658, picture)
 
 
+@cache
 def keyboard() -> Parts:
     """Keyboard with its keys, the user at +z."""
     body = rounded_box([-0.22, 0.0, -0.065], [0.22, 0.014, 0.065], 0.004, 3, edge=1)
@@ -68,6 +71,7 @@ def keyboard() -> Parts:
     return [("plastic", body), ("key", merge(keys))]
 
 
+@cache
 def mouse() -> Parts:
     """Mouse on a mat."""
     mat = rounded_box([-0.11, 0.0, -0.09], [0.11, 0.003, 0.09], 0.0012, 2, edge=1)
@@ -93,6 +97,7 @@ def papers(rng: np.random.Generator, sheets: int) -> Parts:
     return parts
 
 
+@cache
 def telephone() -> Parts:
     """Desk telephone, the user at +z."""
     base = rounded_box([-0.09, 0.0, -0.10], [0.09, 0.035, 0.10], 0.01, 4, edge=2)

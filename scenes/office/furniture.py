@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from scenes.kit.prints import atlas_rect
@@ -49,6 +51,7 @@ def desk(shift: float) -> Parts:
     return [("laminate", shift_uv(top, shift, 0.7 * shift)), ("steel", merge([*steel, tray, *hooks]))]
 
 
+@cache
 def pedestal() -> Parts:
     """Drawer unit on a plinth, its front at +z, about the middle of its foot: 0.42 wide, 0.56 deep, 0.58 high."""
     w, d, h = 0.21, 0.28, 0.58
@@ -104,6 +107,7 @@ def office_chair(turn: float) -> Parts:
     return [("black", merge([*base, *castors])), ("chrome", hub), *[(n, move(m, r=r)) for n, m in upper]]
 
 
+@cache
 def visitor_chair() -> Parts:
     """Four-legged meeting chair about the middle of its seat, sitter faces -z."""
     seat = rounded_box([-0.225, 0.43, -0.22], [0.225, 0.475, 0.21], 0.02, 8, 0.004)
@@ -133,6 +137,7 @@ def meeting_table() -> Parts:
     return [("table_wood", top), ("steel", merge(legs))]
 
 
+@cache
 def shelf() -> Parts:
     """Open bookcase about x = 0, back at z = 0: plinth, five boards (see SHELF_BOARDS), top, sides, back panel."""
     w, d, h = SHELF

@@ -30,7 +30,7 @@ PLACES = {
     "corridor": np.array([[1, 1.6, 0.1], [10, 1.6, -0.2], [16, 3.0, -0.4], [16.5, 1.5, 0.7]]),
 }
 ROOMS: dict[str, ModuleType] = {"office": office, "corridor": corridor}
-VARIANTS = [("office", 0), ("office", 1), ("office", 4), ("corridor", 1)]  # three plans of desks
+VARIANTS = [("office", 0), ("office", 1), ("corridor", 1)]
 TOUCH = 0.004  # metres within which things that bear each other stand apart
 
 
@@ -100,14 +100,13 @@ def test_rooms_are_closed_and_show_their_fronts(name: str, seed: int) -> None:
     room, bounds, places = made(name, seed), BOUNDS[name], PLACES[name]
     d = directions(4000, 2)
     edges = np.array(np.meshgrid(*bounds.T)).reshape(3, -1).T
-    for place in places:
-        corner = (edges - place) / np.linalg.norm(edges - place, axis=1, keepdims=True)
-        rays = np.concatenate([d, corner])
-        index, _ = first_hits(room.triangles, np.broadcast_to(place, rays.shape), rays)
-        assert (index >= 0).all(), f"{(index < 0).sum()} rays leave the room"
-        back = (np.einsum("ij,ij->i", room.normals[index], rays) > 1e-3) & ~room.glass[index]
-        shown = {room.pieces[i].name if i < len(room.pieces) else "lamp" for i in room.owner[index[back]]}
-        assert back.mean() < 1e-3, f"backs are seen of {shown}"
+    corners = [(edges - p) / np.linalg.norm(edges - p, axis=1, keepdims=True) for p in places]
+    rays = np.concatenate([np.concatenate([d, corner]) for corner in corners])
+    index, _ = first_hits(room.triangles, np.repeat(places, len(d) + len(edges), axis=0), rays)
+    assert (index >= 0).all(), f"{(index < 0).sum()} rays leave the room"
+    back = (np.einsum("ij,ij->i", room.normals[index], rays) > 1e-3) & ~room.glass[index]
+    shown = {room.pieces[i].name if i < len(room.pieces) else "lamp" for i in room.owner[index[back]]}
+    assert back.mean() < 1e-3, f"backs are seen of {shown}"
 
 
 def crossings(pieces: list[Piece]) -> list[tuple[str, str]]:
