@@ -123,7 +123,16 @@ def board(width: float, height: float, surface: str, rim: str, tray: str = "") -
 def extinguisher(red: str, black: str, metal: str) -> Parts:
     """Powder extinguisher hanging about x = 0 on a bracket; its foot at y = 0."""
     z = 0.10
-    profile = [[0, 0], [0.07, 0], [0.078, 0.012], [0.078, 0.40], [0.07, 0.44], [0.045, 0.468], [0.02, 0.48], [0, 0.48]]
+    profile: list[list[float]] = [
+        [0, 0],
+        [0.07, 0],
+        [0.078, 0.012],
+        [0.078, 0.40],
+        [0.07, 0.44],
+        [0.045, 0.468],
+        [0.02, 0.48],
+        [0, 0.48],
+    ]
     body = move(lathe(profile, 36), (0, 0, z))
     valve = move(lathe([[0, 0], [0.021, 0], [0.021, 0.05], [0, 0.05]], 20), (0, 0.481, z))
     levers = [
@@ -142,7 +151,14 @@ def extinguisher(red: str, black: str, metal: str) -> Parts:
 def bin_(material: str, height: float = 0.32, radius: float = 0.14) -> Parts:
     """Waste bin about the origin, standing on y = 0."""
     r = radius
-    profile = [[0, 0], [0.8 * r, 0], [r, height], [r - 0.006, height], [0.8 * r - 0.006, 0.006], [0, 0.006]]
+    profile: list[list[float]] = [
+        [0, 0],
+        [0.8 * r, 0],
+        [r, height],
+        [r - 0.006, height],
+        [0.8 * r - 0.006, 0.006],
+        [0, 0.006],
+    ]
     return [(material, lathe(profile, 40))]
 
 
