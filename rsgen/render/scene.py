@@ -2,13 +2,14 @@
 
 Rectangles, disks, spheres, cylinders and instances become meshes on the way in, so that depth, `scene.ply` and the
 baked light all speak of the same triangles. A scene folder that holds a `build.py` but no scene yet is built first;
-there, a scene x.xml with an `x.py` of its own beside it is built by that.
+there, a scene x.xml with an `x.py` of its own beside it is built by that, and seedN/scene.xml by `build.py --seed N`.
 """
 
 from __future__ import annotations
 
 import hashlib
 import logging
+import re
 import subprocess
 import sys
 import tempfile
@@ -71,17 +72,20 @@ def load_scene(path: Path, board: Board | None = None, options: MeshOptions = AS
 def ensure_built(path: Path) -> None:
     """If the scene file is absent but a `build.py` stands beside it, run that, or for x.xml the `x.py` there if any.
 
-    Raises UserError if there is no scene then.
+    ROOM/seedN/scene.xml is the variant that `ROOM/build.py --seed N` makes. Raises UserError if there is no scene then.
     """
-    script = path.parent / "build.py"
+    own, script = path.with_suffix(".py"), path.parent / "build.py"
+    words = [str(own if own.is_file() else script)]
+    variant = re.fullmatch(r"seed([0-9]{1,9})", path.absolute().parent.name)
+    if variant and not script.is_file():
+        script = path.parent.parent / "build.py"
+        words = [str(script), "--seed", variant[1], "--out", str(path.parent)]
     if not path.is_file() and script.is_file():
-        own = path.with_suffix(".py")
-        script = own if own.is_file() else script
         log.info("building %s (once)", path)
-        child = subprocess.run([sys.executable, str(script)], capture_output=True, text=True)
+        child = subprocess.run([sys.executable, *words], capture_output=True, text=True)
         if child.returncode:
             raise UserError(
-                f"scene {path}: {script} failed ({_first_line(child.stderr.strip().rpartition(chr(10))[2])})"
+                f"scene {path}: {words[0]} failed ({_first_line(child.stderr.strip().rpartition(chr(10))[2])})"
             )
     if not path.is_file():
         raise UserError(f"scene {path}: no such file: name a Mitsuba 3 .xml or a mesh file in scene.file")

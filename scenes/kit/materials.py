@@ -17,14 +17,16 @@ DARKEST, LIGHTEST = 0.045, 0.80  # linear albedo of anything in a room
 class Material:
     """A BSDF: `paint` makes its sRGB image of `pixels` (h, w), laid over `tile` = (u, v) metres; tile (1, 1): an atlas.
 
-    `alpha` > 0 makes it a rough plastic of that roughness, `metal` a rough conductor.
+    `alpha` > 0 makes it a rough plastic of that roughness; `metal` names a rough conductor of Mitsuba's (Cu, Al, Cr);
+    `glass` is a thin pane.
     """
 
     paint: Callable[[tuple[int, int]], Image] | None
     pixels: tuple[int, int] = (512, 512)
     tile: tuple[float, float] = (1.0, 1.0)
     alpha: float = 0.0
-    metal: bool = False
+    metal: str = ""
+    glass: bool = False
 
 
 def plain(seed: int, base: tx.Colour, contrast: float = 0.6) -> Callable[[tuple[int, int]], Image]:

@@ -43,10 +43,12 @@ def write_pfm(path: Path, image: np.ndarray) -> None:
 
 
 def bsdf(name: str, material: Material) -> str:
-    """XML of one two-sided BSDF with the id `name`."""
+    """XML of one BSDF with the id `name`, two-sided but for glass."""
+    if material.glass:
+        return f'  <bsdf type="thindielectric" id={quoteattr(name)}/>'
     if material.metal:
         inner = (
-            '<bsdf type="roughconductor"><string name="material" value="Cu"/>'
+            f'<bsdf type="roughconductor"><string name="material" value="{material.metal}"/>'
             f'<string name="distribution" value="ggx"/><float name="alpha" value="{material.alpha}"/></bsdf>'
         )
     else:

@@ -87,5 +87,5 @@ MATERIALS: dict[str, Material] = {
     "shade": Material(fabric(311, (0.88, 0.83, 0.73), (0.80, 0.74, 0.62), 6), (512, 1024), (1.2, 0.6)),
     "wicker": Material(fabric(321, (0.76, 0.60, 0.40), (0.44, 0.31, 0.19), 22), (512, 1024), (1.0, 0.5)),
     "clock": Material(lambda s: pictures.clock(s, 341), (384, 384)),
-    "brass": Material(None, metal=True, alpha=0.25),
+    "brass": Material(None, metal="Cu", alpha=0.25),
 }

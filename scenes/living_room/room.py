@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from scenes.kit.fittings import radiator
 from scenes.kit.shapes import (
     Mesh,
     Parts,
@@ -192,16 +193,6 @@ def door() -> Parts:
     )
     plate = rounded_box([x, h - 0.11, z - 0.022], [x + 0.004, h + 0.06, z + 0.022], 0.0019, 2)
     return [("paint", merge(casing)), ("door", merge(leaf)), ("brass", merge([lever, plate]))]
-
-
-def radiator(length: float = 0.95, height: float = 0.52, columns: int = 17) -> Parts:
-    """Column radiator about x = 0, back at z = 0, feet on y = 0."""
-    xs = np.linspace(-length / 2 + 0.03, length / 2 - 0.03, columns)
-    fins = [rounded_box([x - 0.0225, 0.09, 0.035], [x + 0.0225, height, 0.105], 0.02, 4) for x in xs]
-    feet = [box([x - 0.015, 0.0, 0.05], [x + 0.015, 0.089, 0.09]) for x in (xs[1], xs[-2])]
-    pipe = tube([[xs[-1] + 0.024, 0.14, 0.07], [length / 2 + 0.05, 0.14, 0.07], [length / 2 + 0.05, 0.0, 0.07]], 0.011)
-    knob = move(lathe([[0, 0], [0.022, 0], [0.024, 0.04], [0.018, 0.055], [0, 0.055]]), (length / 2 + 0.05, 0.15, 0.07))
-    return [("paint", merge([*fins, *feet, pipe])), ("black", knob)]
 
 
 def spots() -> tuple[Parts, list[tuple[Mesh, float]]]:

@@ -25,7 +25,7 @@ from scenes.kit.shapes import (
     superellipsoid,
     tube,
 )
-from scenes.living_room.decor import mug
+from scenes.kit.vessels import mug
 from scenes.living_room.table_prints import CARDS, CARTONS, COVERS, LETTERS, SPINE, Rect, cell
 
 _WRAP = (1.0, 0.0, 0.0, 1.0)  # a lathe's azimuth runs to the left of who looks at it

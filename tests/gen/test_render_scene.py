@@ -445,6 +445,19 @@ def test_a_missing_scene_is_built_by_the_script_beside_it(tmp_path: Path) -> Non
     assert (tmp_path / "runs").read_text() == "x"  # once
 
 
+def test_a_missing_variant_is_built_by_the_script_of_its_room(tmp_path: Path) -> None:
+    (tmp_path / "build.py").write_text(
+        "import sys\nfrom pathlib import Path\n"
+        "assert sys.argv[1] == '--seed' and sys.argv[3] == '--out' and len(sys.argv) == 5, sys.argv\n"
+        "out = Path(sys.argv[4])\nout.mkdir()\n"
+        "cubes = '<shape type=\"cube\"/>' * int(sys.argv[2])\n"
+        "(out / 'scene.xml').write_text(f'<scene version=\"3.0.0\">{cubes}</scene>')\n"
+    )
+    assert len(surface(load_scene(tmp_path / "seed3" / "scene.xml"))[1]) == 36
+    fails(tmp_path / "seed" / "scene.xml", "no such file")
+    fails(tmp_path / "other3" / "scene.xml", "no such file")
+
+
 def test_a_build_script_that_fails_says_why_in_one_line(tmp_path: Path) -> None:
     script = tmp_path / "build.py"
     script.write_text("raise SystemExit('first line\\nno disk space left')")
