@@ -17,7 +17,8 @@ DARKEST, LIGHTEST = 0.045, 0.80  # linear albedo of anything in a room
 class Material:
     """A BSDF: `paint` makes its sRGB image of `pixels` (h, w), laid over `tile` = (u, v) metres; tile (1, 1): an atlas.
 
-    `alpha` > 0 makes it a rough plastic of that roughness, `metal` a rough conductor.
+    `alpha` > 0 makes it a rough plastic of that roughness, `metal` a rough conductor
+    of the stuff that Mitsuba calls `conductor`.
     """
 
     paint: Callable[[tuple[int, int]], Image] | None
@@ -25,6 +26,7 @@ class Material:
     tile: tuple[float, float] = (1.0, 1.0)
     alpha: float = 0.0
     metal: bool = False
+    conductor: str = "Cu"
 
 
 def plain(seed: int, base: tx.Colour, contrast: float = 0.6) -> Callable[[tuple[int, int]], Image]:

@@ -46,7 +46,7 @@ def bsdf(name: str, material: Material) -> str:
     """XML of one two-sided BSDF with the id `name`."""
     if material.metal:
         inner = (
-            '<bsdf type="roughconductor"><string name="material" value="Cu"/>'
+            f'<bsdf type="roughconductor"><string name="material" value="{material.conductor}"/>'
             f'<string name="distribution" value="ggx"/><float name="alpha" value="{material.alpha}"/></bsdf>'
         )
     else:
