@@ -16,6 +16,7 @@ from rsgen.config.sections import Up
 from rsgen.console.command_line import Commands, Frames, Json, Parser, Quiet, print_figures, run_program
 from rsgen.console.configs import ConfigFile, config_file, configs_text
 from rsgen.console.scheduler import Scheduler, open_workers
+from rsgen.errors import UserError
 
 Export = Literal["kalibr", "euroc", "registered", "video", "rerun"]
 BENCH_MODES = ("still", "rs-blur", "path", "rows", "averaged")
@@ -25,6 +26,7 @@ _DESCRIPTION = """\
 rsgen makes rolling-shutter RGB-D benchmark sequences with exact continuous-time ground truth.
 
   rsgen configs                         what can be rendered at once
+  rsgen scenes                          the rooms that ship; rsgen scenes NAME --seed N --out DIR makes others like them
   rsgen render demo                     a short sequence in out/demo
   rsgen verify out/demo                 read it back and check it against itself
   rsgen compare out/demo --frame 20     what the rolling shutter did to frame 20
@@ -47,6 +49,7 @@ def _parser() -> Parser:
     commands = Commands("rsgen", _DESCRIPTION)
     add = commands.add
     add(configs, "")
+    add(scenes, "workshop, or: rsgen scenes workshop --seed 3 --out rooms/workshop3")
     with_fields = [add(render, "demo --out out/trial --frames 0:10 --color.spp 64 --depth.readout_s 0")]
     add(fit, "my_trajectory.txt --dt 0.04 --plot fit.png")
     motion = commands.group("motion", "Motions of cameras: propose one for a scene, or tell how those of configs are.")
@@ -79,6 +82,30 @@ def _add_fields(command: argparse.ArgumentParser) -> None:
 def configs() -> int:
     """List the configs that can be named."""
     print(configs_text())
+    return 0
+
+
+def scenes(
+    name: Annotated[str | None, "tell more of this scene"] = None,
+    *,
+    seed: Annotated[int | None, "another seed, another arrangement of it, to be built into --out", "N", int] = None,
+    out: Annotated[Path | None, "build the scene NAME into this folder, not beside its script", "DIR"] = None,
+    json: Json = False,
+) -> int:
+    """List the scenes that ship: what each is, its size, configs, whether it is built and lit. With a name: more of
+    that one; with --out: build it there, with --seed in another arrangement, and print what a config says to render it.
+    """
+    from rsgen.produce.library import build_variant, describe_scene, list_scenes
+
+    if seed is not None and out is None:
+        raise UserError("--seed: needs --out DIR, the folder to build into, and the scene's name")
+    if out is None:
+        print_figures(list_scenes() if name is None else describe_scene(name), json)
+        return 0
+    if name is None:
+        raise UserError(f"--out {out}: needs the name of a scene before it (rsgen scenes lists them)")
+    built = build_variant(name, seed, out)
+    print(f"scene: {{file: {built.resolve()}}}")
     return 0
 
 

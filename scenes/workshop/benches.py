@@ -78,14 +78,14 @@ def spanner(size: float = 1.0) -> Parts:
     for s in (-1, 1):
         ends.append(rod("y", (s * 0.093, 0.0, 0), 0.009, 0.017, 20))
         for side in (-1, 1):
-            ends.append(beam((s * 0.107, 0.0045, side * 0.012), (s * 0.124, 0.0045, side * 0.010), 0.009, 0.0088))
+            ends.append(beam((s * 0.107, 0.0045, side * 0.012), (s * 0.124, 0.0045, side * 0.010), 0.009, 0.006))
     return _sized([("bright", merge([shaft, *ends]))], size)
 
 
 def screwdriver(size: float = 1.0) -> Parts:
     """Screwdriver lying on y = 0 along x."""
-    profile = [[0, 0], [0.011, 0.004], [0.0145, 0.02], [0.0145, 0.075], [0.009, 0.09], [0.009, 0.10], [0, 0.10]]
-    grip = turned("x", (-0.11, 0.0148, 0), profile, 14)
+    shape = [[0.0, 0.0], [0.011, 0.004], [0.0145, 0.02], [0.0145, 0.075], [0.009, 0.09], [0.009, 0.10], [0.0, 0.10]]
+    grip = turned("x", (-0.11, 0.0148, 0), shape, 14)
     return _sized([("handle_red", grip), ("bright", rod("x", (-0.0095, 0.0148, 0), 0.12, 0.0035, 10))], size)
 
 
@@ -108,7 +108,7 @@ def pliers(size: float = 1.0) -> Parts:
         tube([[0.0, 0.009, s * 0.006], [-0.05, 0.009, s * 0.022], [-0.12, 0.009, s * 0.026]], 0.008, 10)
         for s in (-1, 1)
     ]
-    jaws = [beam((0.006, 0.009, s * 0.006), (0.06, 0.009, s * 0.004), 0.009, 0.012) for s in (-1, 1)]
+    jaws = [beam((0.006, 0.009, s * 0.006), (0.06, 0.009, s * 0.0055), 0.008, 0.012) for s in (-1, 1)]
     return _sized(
         [("handle_red", merge(grips)), ("cast", merge([*jaws, rod("y", (0.004, 0.0, 0), 0.0178, 0.011, 16)]))], size
     )
@@ -125,8 +125,8 @@ def tin(radius: float, height: float, paint: str) -> Parts:
     """Paint tin or jar with a rim and a lid, on y = 0."""
     r, h = radius, height
     profile = [
-        [0, 0],
-        [r, 0],
+        [0.0, 0.0],
+        [r, 0.0],
         [r, 0.006],
         [0.96 * r, 0.01],
         [0.96 * r, h - 0.012],
@@ -134,7 +134,7 @@ def tin(radius: float, height: float, paint: str) -> Parts:
         [r, h],
         [0.86 * r, h],
     ]
-    return [(paint, turned("y", (0, 0, 0), [*profile, [0.84 * r, h - 0.006], [0, h - 0.006]], 32))]
+    return [(paint, turned("y", (0, 0, 0), [*profile, [0.84 * r, h - 0.006], [0.0, h - 0.006]], 32))]
 
 
 def tool_box(paint: str) -> Parts:

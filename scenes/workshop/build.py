@@ -34,6 +34,7 @@ from scenes.kit.shapes import Mesh, Parts  # noqa: E402
 from scenes.workshop import drawings, hall, layout  # noqa: E402
 from scenes.workshop.materials import materials  # noqa: E402
 
+ABOUT = "A machine shop: lathes, mills, benches, racks, a crane under steel trusses, windows below the eaves"
 SKY, HORIZON = 7.0, 3.5  # radiance behind the panes
 LAMP_RADIANCE = 190.0
 

@@ -161,5 +161,5 @@ def sky(shape: tuple[int, int], seed: int, zenith: float, horizon: float) -> Ima
     out = level[..., None] * np.array((0.94, 1.0, 1.08), np.float32)
     roofs = 0.80 + 0.10 * tx.fractal((1, w), seed + 1, w / 4, 20, 1.4)
     ground = np.clip((v - roofs) / 0.05, 0, 1)
-    out = tx.mix(out, tuple(horizon * c for c in (0.40, 0.43, 0.36)), ground)
+    out = tx.mix(out, (0.40 * horizon, 0.43 * horizon, 0.36 * horizon), ground)
     return np.maximum(out, 0.05 * horizon)

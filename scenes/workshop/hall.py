@@ -60,7 +60,7 @@ def floor(bays: Sequence[Rect]) -> Parts:
     patches.append(("floor_hazard", (9.0, 9.6, DOOR[0] + 0.3, DOOR[1] - 0.3)))
     out = []
     for name, (x0, x1, z0, z1) in patchwork((-LONG, LONG, -WIDE, WIDE), patches, "floor"):
-        out.append((name, quad([x0, 0, z1], [x1 - x0, 0, 0], [0, 0, z0 - z1], (x0 + LONG, WIDE - z1))))
+        out.append((name, quad([x0, 0, z0], [x1 - x0, 0, 0], [0, 0, z1 - z0], (x0 + LONG, z0 + WIDE))))
     return out
 
 

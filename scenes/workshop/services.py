@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 
 from scenes.kit.shapes import Parts, atlas_uv, box, merge, move_parts, rotation, rounded_box, tube
@@ -15,42 +13,25 @@ PIPES = (("pipe_a", 2.50, 0.024), ("pipe_b", 2.61, 0.030), ("conduit", 2.71, 0.0
 
 
 def pipes(side: int) -> Parts:
-    """Pipes along a long wall on clips, their ends turned into the wall, and a cable duct above them."""
-    z = side * (WIDE - 0.055)
-    end = LONG - 0.4
-    parts: Parts = []
-    for name, y, r in PIPES:
-        path = [
-            [-end, y, side * (WIDE - 0.004)],
-            [-end, y, z - side * 0.01],
-            [-end + 0.05, y, z],
-            [0.0, y, z],
-            [end - 0.05, y, z],
-        ]
-        path += [[end, y, z - side * 0.01], [end, y, side * (WIDE - 0.004)]]
-        parts.append((name, tube(_filleted(np.array(path, float)), r, 14)))
+    """Pipes along a long wall on brackets, their sleeves, and a cable duct above them."""
+    z, end = side * (WIDE - 0.07), LONG - 0.35
+    parts: Parts = [(name, rod("x", (-end, y, z), 2 * end, r, 16)) for name, y, r in PIPES]
     near, far = sorted((side * (WIDE - 0.09), side * (WIDE - GAP)))
     duct = box([-LONG + 0.3, 2.78, near], [LONG - 0.3, 2.88, far])
-    clips = []
-    for x in np.arange(-9.25, 9.3, 1.25).tolist():
-        a, b = sorted((side * (WIDE - 0.018), side * (WIDE - GAP)))
-        clips.append(box([x - 0.02, 2.455, a], [x + 0.02, 2.755, b]))
-    joints = [
-        rod("x", (x, y, z), 0.07, 1.25 * r, 16) for x in np.arange(-7.4, 8.0, 3.1).tolist() for _, y, r in PIPES[:2]
+    brackets = []
+    for x in np.arange(-8.9, 9.3, 1.25).tolist():
+        a, b = sorted((side * (WIDE - 0.068), side * (WIDE - GAP)))
+        brackets.append(box([x - 0.02, 2.465, a], [x + 0.02, 2.735, b]))
+    sleeves = [
+        rod("x", (x, y, z), 0.07, 1.2 * r, 16) for x in np.arange(-7.4, 8.0, 3.1).tolist() for _, y, r in PIPES[:2]
     ]
-    return [*parts, ("conduit", duct), ("frame", merge(clips)), ("cast", merge(joints))]
-
-
-def _filleted(path: np.ndarray) -> np.ndarray:
-    """The path with points added along its legs, so that a tube keeps its girth round its corners."""
-    legs = [a + (b - a) * t for a, b in pairwise(path) for t in np.array([[0.0], [0.25], [0.75]])]
-    return np.array([*legs, path[-1]])
+    return [*parts, ("conduit", duct), ("frame", merge(brackets)), ("cast", merge(sleeves))]
 
 
 def switch_box(rng: np.random.Generator) -> Parts:
     """Sockets and a switch on a back plate, fed by a conduit from the duct above; z = 0 is the wall, facing +z."""
     plate = rounded_box([-0.14, 1.10, GAP], [0.14, 1.42, 0.05], 0.008, 3, edge=2)
-    parts: Parts = [("conduit", plate), ("conduit", rod("y", (0.0, 1.421, 0.022), 1.355, 0.012, 12))]
+    parts: Parts = [("conduit", plate), ("conduit", rod("y", (0.0, 1.421, 0.015), 1.355, 0.010, 12))]
     for k, x in enumerate((-0.065, 0.065)):
         name = ("extinguisher", "pipe_b")[int(rng.integers(2))]
         socket = turned("z", (x, 1.19, 0.0505), [[0, 0], [0.048, 0], [0.042, 0.05], [0.030, 0.055], [0, 0.055]], 24)

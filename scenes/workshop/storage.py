@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from scenes.kit.shapes import Parts, atlas_uv, box, merge, move_parts, rounded_box, shift_uv, tube
+from scenes.kit.shapes import Mesh, Parts, atlas_uv, box, merge, move_parts, rounded_box, shift_uv, tube
 from scenes.workshop.drawings import label_rect
 from scenes.workshop.solids import GAP, beam, ring, rod, turned
 
@@ -213,7 +213,8 @@ def bar_rack(rng: np.random.Generator) -> Parts:
         frame.append(box([x - 0.05, 0.061, -0.30], [x + 0.05, 1.90, -0.20]))
         frame += [box([x - 0.03, 0.35 + 0.36 * k, -0.199], [x + 0.03, 0.39 + 0.36 * k, 0.22]) for k in range(5)]
     frame.append(box([-0.649, 1.2, -0.27], [0.649, 1.28, -0.25]))
-    stock, red = [], []
+    stock: list[Mesh] = []
+    red: list[Mesh] = []
     for k in range(5):
         z = -0.17
         while z < 0.17:
@@ -232,5 +233,5 @@ def bar_rack(rng: np.random.Generator) -> Parts:
 
 def waste_bin(paint: str) -> Parts:
     """Round waste bin of 0.65 m, open."""
-    outer = [[0, 0], [0.20, 0], [0.23, 0.62], [0.24, 0.63], [0.24, 0.65], [0.225, 0.65]]
-    return [(paint, turned("y", (0, 0, 0), [*outer, [0.19, 0.02], [0, 0.02]], 40))]
+    outer = [[0.0, 0.0], [0.20, 0.0], [0.23, 0.62], [0.24, 0.63], [0.24, 0.65], [0.225, 0.65]]
+    return [(paint, turned("y", (0, 0, 0), [*outer, [0.19, 0.02], [0.0, 0.02]], 40))]

@@ -110,7 +110,7 @@ def enamel(seed: int, base: Colour, wear: float = 1.0, under: Colour = (0.34, 0.
         grime = np.clip(tx.fractal(shape, seed + 5, 260, 6, 1.1, (5.0, 1.0)) - 0.6, 0, 2)
         out = out * (1 - 0.07 * wear * grime)[..., None]
         scratch = np.clip(tx.fractal(shape, seed + 6, 60, 2.8, 0.4, (1.0, 16.0)) - 2.0, 0, 1)
-        out = tx.mix(out, tuple(min(0.9, 1.25 * c) for c in base), 0.6 * wear * scratch)
+        out = tx.mix(out, 1.2 * np.array(base, np.float32), 0.6 * wear * scratch)
         chips = expit(14 * (tx.fractal(shape, seed + 7, 70, 4, 1.1) - (2.9 - 0.6 * wear)))
         return tx.mix(out, under, 0.85 * chips)
 
