@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
@@ -174,19 +175,29 @@ def suggest(
     out: Annotated[Path | None, "config to write (default: print it)", "YAML"] = None,
     scale: Annotated[float, "metres per unit of a mesh file (default: 1)", float] = 1.0,
     up: Annotated[Up, "axis of a mesh file that is up (default: y)"] = "y",
-    seconds: Annotated[float, "length of the sequence, s", float] = 20.0,
-    speed: Annotated[float, "mean speed, m/s", float] = 0.35,
+    seconds: Annotated[float | None, "length of the sequence, s (default: 20, or as --like)", float] = None,
+    speed: Annotated[float | None, "mean speed, m/s (default: 0.35, or as --like)", float] = None,
+    like: Annotated[
+        Path | None, "a config, or its name: take over its length, speed, cameras, noise, truth", "CONFIG", config_file
+    ] = None,
     clearance: Annotated[float, "least distance to the scene's surfaces, m", float] = 0.2,
     seed: Annotated[int, "another seed, another tour (default: 0)", "N", int] = 0,
     name: Annotated[str | None, "the sequence's name (default: the scene's)"] = None,
 ) -> int:
     """Propose a tour through a scene that has none: a config whose camera walks through the scene's largest room, or
-    round what it holds, looks at what is 1 to 3 m away, and keeps its distance. Edit it, or render it as it is.
+    round what it holds, looks at what is 1 to 3 m away, and keeps its distance. Edit it, or render it as it is. With
+    --like table1 it is the counterpart of table1 in this scene; --seed gives as many ways through it as are wanted.
     """
+    from rsgen.config.config import load_config
     from rsgen.files import atomic_write
-    from rsgen.produce.suggest import Wish, suggest_tour
+    from rsgen.produce.suggest import Wish, suggest_tour, wish_like
 
-    suggested = suggest_tour(scene, name, Wish(seconds, speed, clearance, seed), scale, up)
+    model = None if like is None else load_config(like)
+    wish = Wish(clearance_m=clearance, seed=seed)
+    wish = wish if model is None else wish_like(model, wish)
+    wish = wish if seconds is None else replace(wish, seconds=seconds)
+    wish = wish if speed is None else replace(wish, speed_m_s=speed)
+    suggested = suggest_tour(scene, name, wish, scale, up, model)
     text = suggested.yaml((out or Path("here.yaml")).parent)
     if out is None:
         print(text.decode(), end="")

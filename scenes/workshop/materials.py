@@ -48,8 +48,8 @@ def materials(seed: int) -> dict[str, Material]:
 
     out = {
         "floor": floor(), "floor_line": floor(line), "floor_hazard": floor((0.84, 0.68, 0.22), True),
-        "wall_upper": Material(sf.blockwork(k + 31, wall, 2048 / 4), (2048, 2048), (4.0, 4.0)),
-        "wall_lower": Material(sf.blockwork(k + 51, dado, 2048 / 4, 1.6), (2048, 2048), (4.0, 4.0)),
+        "wall_upper": Material(sf.blockwork(k + 31, wall, 4.0), (2048, 2048), (4.0, 4.0)),
+        "wall_lower": Material(sf.blockwork(k + 51, dado, 4.0, 1.6), (2048, 2048), (4.0, 4.0)),
         "roof": Material(sf.sheet(k + 71, (0.72, 0.73, 0.72), 64), (1024, 1024), (3.2, 3.2)),
         "steel": painted(91, steel, 0.7), "purlin": painted(101, (0.64, 0.62, 0.58), 0.5),
         "window_paint": painted(111, (0.60, 0.64, 0.62), 0.6), "crane": painted(121, (0.86, 0.69, 0.22), 0.8),

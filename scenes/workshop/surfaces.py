@@ -62,11 +62,12 @@ def floor(seed: int, metre: float, stripe: Colour | None = None, hazard: bool = 
     return paint
 
 
-def blockwork(seed: int, base: Colour, metre: float, dirt: float = 1.0) -> Painter:
-    """Painted blocks of 0.4 by 0.2 m in running bond: joints, roller marks, scuffs and runs of dirt."""
+def blockwork(seed: int, base: Colour, tile: float, dirt: float = 1.0) -> Painter:
+    """Painted blocks of 0.4 by 0.2 m in running bond on a square of `tile` m: joints, roller marks, runs of dirt."""
 
     def paint(shape: tuple[int, int]) -> Image:
         h, w = shape
+        metre = w / tile
         rng = np.random.default_rng(seed)
         rows, cols = round(h / (0.2 * metre)), round(w / (0.4 * metre))
         wob = tx.fractal(shape, seed + 1, 0.2 * metre, 6, 1.2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -18,14 +19,19 @@ from scenes.workshop import build as scene
 from scenes.workshop import hall, layout
 from scenes.workshop.materials import materials
 
-SEEDS = (0, 1, 2, 3)
+SEEDS = (0, 1)
 EMBEDDED = 5e-4  # m; rays start so far before a surface
+
+
+@cache
+def placed(seed: int) -> list[layout.Thing]:
+    return layout.things(seed)
 
 
 @cache
 def things(seed: int) -> list[tuple[str, Mesh, bool]]:
     """Name, mesh and whether it hangs: all things, and the building's columns, crane, doors."""
-    out = [(t.name, merge([m for _, m in t.parts]), t.hangs) for t in layout.things(seed)]
+    out = [(t.name, merge([m for _, m in t.parts]), t.hangs) for t in placed(seed)]
     for name, parts in (("steelwork", hall.steelwork()), ("crane", layout.crane(seed)), ("doors", hall.doors())):
         out.append((name, merge([m for _, m in parts]), True))
     return [*out, ("bars", merge([m for _, m in hall.window_bars()]), True)]
@@ -47,7 +53,9 @@ def shell_meshes() -> list[Mesh]:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_meshes_are_sound_and_within_the_hall(seed: int) -> None:
-    surfaces, discs = scene.parts(seed)
+    lamps, discs = layout.lamps(seed)
+    surfaces = [*hall.floor(layout.bays()), *hall.shell(), *hall.doors(), *layout.crane(seed), *lamps]
+    surfaces += [part for thing in placed(seed) for part in thing.parts]
     assert {name for name, _ in surfaces} <= set(materials(seed))
     whole = merge([m for _, m in surfaces])
     assert np.isfinite(whole.v).all() and 150_000 < len(whole.f) < 500_000
@@ -64,10 +72,10 @@ def test_the_shell_is_closed() -> None:
     mesh = merge(shell_meshes())
     rng = np.random.default_rng(2)
     d = rng.normal(size=(20_000, 3))
-    seams = [m.v.mean(0) * 0 + v for m in shell_meshes() for v in m.v]  # straight at corners and along edges
+    corners = np.concatenate([m.v for m in shell_meshes()])
+    seams = np.concatenate([corners, (corners[1:] + corners[:-1]) / 2])  # and closely beside corners and seams
     centre = np.array([0.3, 2.1, 0.2])
-    d = np.concatenate([d, np.array(seams) - centre, (np.array(seams)[1:] + np.array(seams)[:-1]) / 2 - centre])
-    d = d[np.linalg.norm(d, axis=1) > 0.5]
+    d = np.concatenate([d, seams + rng.normal(0, 5e-4, seams.shape) - centre])
     solid = trimesh.Trimesh(mesh.v, mesh.f, process=False)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     first = solid.ray.intersects_first(np.broadcast_to(centre, d.shape), d)
@@ -81,14 +89,14 @@ def test_no_thing_is_inside_another(seed: int) -> None:
     """Points on each thing, and straight up from there: what is entered has been left before, thing by thing."""
     solid, owner = everything(seed)
     rng = np.random.default_rng(seed)
-    count = 12_000
+    count = 4_000
     face = rng.choice(len(solid.faces), count, p=solid.area_faces / solid.area_faces.sum())
     few = rng.integers(0, len(solid.faces), count)
     face = np.concatenate([face, few])
     w = rng.dirichlet(np.ones(3), len(face))
     start = np.einsum("nk,nkd->nd", w, solid.triangles[face]) + EMBEDDED * solid.face_normals[face]
     way = np.array([0.013, 1.0, 0.021]) / np.linalg.norm([0.013, 1.0, 0.021])
-    hits, ray, hit = RayMeshIntersector(solid).intersects_location(start, np.broadcast_to(way, start.shape))
+    _, ray, hit = RayMeshIntersector(solid).intersects_location(start, np.broadcast_to(way, start.shape))
     other = owner[hit] != owner[face[ray]]
     leaving = np.sign(solid.face_normals[hit] @ way)
     depth = np.zeros((len(start), len(things(seed))))
@@ -111,7 +119,7 @@ def test_what_does_not_hang_stands(seed: int) -> None:
             assert low > 0, name
             gap = np.array([low])
         else:
-            start = feet + (0, 1e-4, 0)
+            start = feet + np.array([0, 1e-4, 0])
             hits, ray, hit = caster.intersects_location(start, np.broadcast_to([0.0, -1.0, 0.0], start.shape))
             alien = owner[hit] != k
             gap = start[ray[alien], 1] - 1e-4 - hits[alien, 1]
@@ -130,7 +138,7 @@ def same_planes(meshes: list[Mesh]) -> NDArray[np.int64]:
     corners, n = corners[keep], cross[keep] / area[keep, None]
     offset = np.einsum("fk,fk->f", corners[:, 0], n)
     key = np.round(np.concatenate([n * 500, offset[:, None] / 2e-4], axis=1)).astype(np.int64)
-    _, group = np.unique(key, axis=0, return_inverse=True)
+    _, group = np.unique(key @ [1_000_003, 10_000_000_019, 100_000_000_000_031, 1], return_inverse=True)
     axis = np.abs(n).argmax(axis=1)
     flat = np.take_along_axis(corners, np.array([[1, 2], [0, 2], [0, 1]])[axis][:, None, :], axis=2)
     low, high = flat.min(axis=1), flat.max(axis=1)
@@ -163,7 +171,7 @@ def shared(one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.f
 
 def test_overlapping_of_known_triangles() -> None:
     one = np.array([[0.0, 0], [1, 0], [0, 1]])
-    others = np.array([one + 0.2, 1 - one, one + (2, 0)])  # over it, the other half of a square, beside it
+    others = np.array([one + 0.2, 1 - one, one + np.array([2, 0])])  # over it, the other half of a square, beside it
     depth = shared(np.array([one, one, one]), others)
     assert depth[0] > 0.1 and abs(depth[1]) < 1e-9 and depth[2] == pytest.approx(-1)
     low, high = box([0, 0, 0], [1, 1, 1]), box([0.5, 0.2, 0.2], [1, 0.8, 0.8])
@@ -171,7 +179,7 @@ def test_overlapping_of_known_triangles() -> None:
     assert len(same_planes([low, high])) > 0
 
 
-@pytest.mark.parametrize("seed", SEEDS[:2])
+@pytest.mark.parametrize("seed", SEEDS)
 def test_no_two_faces_coincide(seed: int) -> None:
     found = things(seed)
     meshes = [*(m for _, m, _ in found), merge([m for _, m in [*hall.floor(layout.bays()), *hall.shell()]])]
@@ -180,35 +188,32 @@ def test_no_two_faces_coincide(seed: int) -> None:
     assert {(names[a], names[b]) for a, b in owner[same_planes(meshes)]} == set()
 
 
-def test_seeds_differ_and_one_seed_does_not() -> None:
-    names = [tuple(name for name, _, _ in things(seed)) for seed in SEEDS]
-    assert len(set(names)) == len(SEEDS)
+def test_a_seed_decides_everything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     again = layout.things(0)
-    first = [m for t in again for _, m in t.parts]
-    assert all(
-        np.array_equal(a.v, b.v) for a, b in zip(first, [m for t in layout.things(0) for _, m in t.parts], strict=True)
-    )
-
-
-def test_two_builds_are_equal_byte_for_byte(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    small = {name: shrunk(m) for name, m in materials(5).items()}
-    monkeypatch.setattr(scene, "materials", lambda seed: small)
-    one, two, other = (scene.build(tmp_path / name, seed) for name, seed in (("a", 5), ("b", 5), ("c", 6)))
-    assert digest(one.parent) == digest(two.parent) != digest(other.parent)
-    assert all(f"{p.relative_to(one.parent)}" in one.read_text() for p in one.parent.rglob("*.*") if p != one)
+    same = zip([m for t in again for _, m in t.parts], [m for t in placed(0) for _, m in t.parts], strict=True)
+    assert all(np.array_equal(a.v, b.v) and np.array_equal(a.uv, b.uv) for a, b in same)
+    assert {t.name for t in placed(0)} != {t.name for t in placed(1)}
+    small = {seed: {name: shrunk(m) for name, m in materials(seed).items()} for seed in SEEDS}
+    monkeypatch.setattr(scene, "materials", small.__getitem__)
+    monkeypatch.setattr(layout, "things", placed)
+    one, two, other = (scene.build(tmp_path / name, seed) for name, seed in (("a", 0), ("b", 0), ("c", 1)))
+    assert digest(one.parent) == digest(two.parent)
+    changed = {name for name, state in digest(one.parent).items() if digest(other.parent).get(name) != state}
+    assert {"meshes/machine_a.ply", "textures/machine_a.png", "textures/sky_north.pfm", "scene.xml"} <= changed
+    files = [p for p in one.parent.rglob("*.*") if p != one]
+    assert len(files) > 100 and all(p.relative_to(one.parent).as_posix() in one.read_text() for p in files)
 
 
 def shrunk(material: Material) -> Material:
-    image = None if material.paint is None else lambda _: np.full((2, 2, 3), 0.5)
-    return Material(image, (2, 2), material.tile, material.alpha, material.metal, material.conductor)
+    """The same in 64 x 64 texels."""
+    return replace(material, pixels=(64, 64))
 
 
-@pytest.mark.parametrize("seed", SEEDS[:2])
-def test_albedos_are_those_of_a_room(seed: int) -> None:
-    for name, material in materials(seed).items():
-        if material.paint is None or material.pixels[1] > 600:
-            continue  # the large ones take seconds; a texture's bounds are the kit's
-        image = texture(material).astype(float) / 255
+def test_albedos_are_those_of_a_room() -> None:
+    for name, material in materials(0).items():
+        if material.paint is None:
+            continue
+        image = texture(shrunk(material)).astype(float) / 255
         linear = np.where(image <= 0.04045, image / 12.92, ((image + 0.055) / 1.055) ** 2.4)
         assert linear.max() <= 0.81 and 0.04 < linear.mean() < 0.8, name
         assert linear.std() > 0.003, f"{name} has no texture"
