@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
@@ -16,6 +17,7 @@ from rsgen.config.sections import Up
 from rsgen.console.command_line import Commands, Frames, Json, Parser, Quiet, print_figures, run_program
 from rsgen.console.configs import ConfigFile, config_file, configs_text
 from rsgen.console.scheduler import Scheduler, open_workers
+from rsgen.errors import UserError
 
 Export = Literal[
     "kalibr", "euroc", "registered", "ros1", "ros2", "mcap", "colmap", "nerfstudio", "video", "rerun"
@@ -28,6 +30,7 @@ _DESCRIPTION = """\
 rsgen makes rolling-shutter RGB-D benchmark sequences with exact continuous-time ground truth.
 
   rsgen configs                         what can be rendered at once
+  rsgen scenes                          the rooms that ship; rsgen scenes NAME --seed N --out DIR makes others like them
   rsgen render demo                     a short sequence in out/demo
   rsgen verify out/demo                 read it back and check it against itself
   rsgen compare out/demo --frame 20     what the rolling shutter did to frame 20
@@ -51,6 +54,7 @@ def _parser() -> Parser:
     commands = Commands("rsgen", _DESCRIPTION)
     add = commands.add
     add(configs, "")
+    add(scenes, "workshop, or: rsgen scenes workshop --seed 3 --out rooms/workshop3")
     with_fields = [add(render, "demo --out out/trial --frames 0:10 --color.spp 64 --depth.readout_s 0")]
     add(fit, "my_trajectory.txt --dt 0.04 --plot fit.png")
     motion = commands.group("motion", "Motions of cameras: propose one for a scene, or tell how those of configs are.")
@@ -84,6 +88,30 @@ def _add_fields(command: argparse.ArgumentParser) -> None:
 def configs() -> int:
     """List the configs that can be named."""
     print(configs_text())
+    return 0
+
+
+def scenes(
+    name: Annotated[str | None, "tell more of this scene"] = None,
+    *,
+    seed: Annotated[int | None, "another seed, another arrangement of it, to be built into --out", "N", int] = None,
+    out: Annotated[Path | None, "build the scene NAME into this folder, not beside its script", "DIR"] = None,
+    json: Json = False,
+) -> int:
+    """List the scenes that ship: what each is, its size, configs, whether it is built and lit. With a name: more of
+    that one; with --out: build it there, with --seed in another arrangement, and print what a config says to render it.
+    """
+    from rsgen.produce.library import build_variant, describe_scene, list_scenes
+
+    if seed is not None and out is None:
+        raise UserError("--seed: needs --out DIR, the folder to build into, and the scene's name")
+    if out is None:
+        print_figures(list_scenes() if name is None else describe_scene(name), json)
+        return 0
+    if name is None:
+        raise UserError(f"--out {out}: needs the name of a scene before it (rsgen scenes lists them)")
+    built = build_variant(name, seed, out)
+    print(f"scene: {{file: {built.resolve()}}}")
     return 0
 
 
@@ -152,19 +180,29 @@ def suggest(
     out: Annotated[Path | None, "config to write (default: print it)", "YAML"] = None,
     scale: Annotated[float, "metres per unit of a mesh file (default: 1)", float] = 1.0,
     up: Annotated[Up, "axis of a mesh file that is up (default: y)"] = "y",
-    seconds: Annotated[float, "length of the sequence, s", float] = 20.0,
-    speed: Annotated[float, "mean speed, m/s", float] = 0.35,
+    seconds: Annotated[float | None, "length of the sequence, s (default: 20, or as --like)", float] = None,
+    speed: Annotated[float | None, "mean speed, m/s (default: 0.35, or as --like)", float] = None,
+    like: Annotated[
+        Path | None, "a config, or its name: take over its length, speed, cameras, noise, truth", "CONFIG", config_file
+    ] = None,
     clearance: Annotated[float, "least distance to the scene's surfaces, m", float] = 0.2,
     seed: Annotated[int, "another seed, another tour (default: 0)", "N", int] = 0,
     name: Annotated[str | None, "the sequence's name (default: the scene's)"] = None,
 ) -> int:
     """Propose a tour through a scene that has none: a config whose camera walks through the scene's largest room, or
-    round what it holds, looks at what is 1 to 3 m away, and keeps its distance. Edit it, or render it as it is.
+    round what it holds, looks at what is 1 to 3 m away, and keeps its distance. Edit it, or render it as it is. With
+    --like table1 it is the counterpart of table1 in this scene; --seed gives as many ways through it as are wanted.
     """
+    from rsgen.config.config import load_config
     from rsgen.files import atomic_write
-    from rsgen.produce.suggest import Wish, suggest_tour
+    from rsgen.produce.suggest import Wish, suggest_tour, wish_like
 
-    suggested = suggest_tour(scene, name, Wish(seconds, speed, clearance, seed), scale, up)
+    model = None if like is None else load_config(like)
+    wish = Wish(clearance_m=clearance, seed=seed)
+    wish = wish if model is None else wish_like(model, wish)
+    wish = wish if seconds is None else replace(wish, seconds=seconds)
+    wish = wish if speed is None else replace(wish, speed_m_s=speed)
+    suggested = suggest_tour(scene, name, wish, scale, up, model)
     text = suggested.yaml((out or Path("here.yaml")).parent)
     if out is None:
         print(text.decode(), end="")

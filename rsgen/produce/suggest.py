@@ -6,7 +6,7 @@ import math
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -48,6 +48,8 @@ _HAND: dict[str, Any] = {
     "shake_band_hz": [0.5, 5.5],
     "shake_rotation_deg": 0.4,
 }
+_LARGE_M2, _TEXELS = 300.0, 1.15e6  # a larger surface gets coarser light than the default: about so many texels
+_CAMERAS = ("color", "depth", "T_color_depth", "truth", "imu", "mocap", "tremor")
 _SEEN_M = (0.4, 5.0)
 _VIEWS = 40
 _EMPTY = 0.3
@@ -95,6 +97,9 @@ class Suggestion:
                 "file": os.path.relpath(self.config.scene.file, folder),
             },
         }
+        for section in ("light", *_CAMERAS):
+            if section in self.config.model_fields_set:
+                data[section] = self.config.model_dump(mode="json", include={section}, exclude_unset=True)[section]
         return "".join(f"# {line}\n" for line in self.found).encode() + encode_yaml(data)
 
 
@@ -126,11 +131,14 @@ class _Thing:
     ground_y: float
 
 
-def suggest_tour(file: Path, name: str | None, wish: Wish, scale: float = 1.0, up: Up = "y") -> Suggestion:
+def suggest_tour(
+    file: Path, name: str | None, wish: Wish, scale: float = 1.0, up: Up = "y", like: Config | None = None
+) -> Suggestion:
     """A tour through the scene `file`: through its largest room, or round the thing that it holds.
 
-    name: of the sequence; None: after the file. scale, up: of a mesh file, see `MeshOptions`. Raises UserError naming
-    the file if there is no place for a camera, no floor, or no scene, and if it is a room in another unit than metres.
+    name: of the sequence; None: after the file. scale, up: of a mesh file, see `MeshOptions`. like: whose cameras,
+    noise and truth it is to have; None: the defaults. Raises UserError naming the file if there is no place for a
+    camera, no floor, or no scene, and if it is a room in another unit than metres.
     """
     mitsuba()
     from rsgen.render.mesh_files.mesh_file import AS_IT_IS, MeshOptions
@@ -149,7 +157,7 @@ def suggest_tour(file: Path, name: str | None, wish: Wish, scale: float = 1.0, u
     rng = np.random.default_rng(wish.seed)
     for _ in range(_ATTEMPTS):
         tours = _through(scene, aim, wish, rng) if isinstance(aim, FloorPlan) else [_round(scene, aim, wish, rng)]
-        config = _config(scene, tours, name, wish)
+        config = _config(scene, tours, name, wish, like)
         spline = load_motion(config).spline
         least = clearance(spline, scene.triangles, max(_REACH_M, wish.clearance_m))
         if least >= wish.clearance_m:
@@ -229,15 +237,34 @@ def _waypoints(p_world: FloatArray, target: FloatArray) -> tuple[Waypoint, ...]:
     )
 
 
-def _config(scene: _Scene, tours: Sequence[tuple[Waypoint, ...]], name: str, wish: Wish) -> Config:
+def wish_like(config: Config, wish: Wish) -> Wish:
+    """The wish with the length and mean speed of a config's made motion, if it has one that lasts long enough."""
+    motion = config.motion
+    if motion is None:
+        return wish
+    return replace(wish, seconds=round(max(2.0, motion.duration_s), 2), speed_m_s=motion.mean_speed_m_s)
+
+
+def _sections(scene: _Scene, like: Config | None) -> dict[str, Any]:
+    """What a config says beside its motion and scene: coarser light in a large one, and the cameras of another."""
+    given = {} if like is None else like.model_dump(mode="json", include=set(_CAMERAS), exclude_unset=True)
+    corners = scene.triangles
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
+    if area > _LARGE_M2:
+        given["light"] = {"texel_m": math.ceil(200.0 * math.sqrt(area / _TEXELS)) / 200.0}
+    return given
+
+
+def _config(scene: _Scene, tours: Sequence[tuple[Waypoint, ...]], name: str, wish: Wish, like: Config | None) -> Config:
     """The config of the first tour that turns no faster than people do, or of the last."""
+    sections = _sections(scene, like)
     for waypoints in tours:
         motion = {
             "kind": "tour", "length_m": round(wish.seconds * wish.speed_m_s, 3), "mean_speed_m_s": wish.speed_m_s,
             "mean_rotation_deg_s": 1e4, "waypoints": [w.model_dump() for w in waypoints],
             "ramp_s": min(1.0, 0.2 * wish.seconds), **_HAND, "clearance_m": wish.clearance_m, "seed": wish.seed,
         }  # fmt: skip
-        data = {"name": name, "motion": motion, "scene": {"file": scene.file, **scene.placed}}
+        data = {"name": name, "motion": motion, "scene": {"file": scene.file, **scene.placed}, **sections}
         asked = validate_config(data, "motion suggest").motion
         assert asked is not None
         least = least_turning(asked, wish.seed)

@@ -30,6 +30,7 @@ from scenes.kit.shapes import Mesh, Parts  # noqa: E402
 from scenes.living_room import layout, pictures, room  # noqa: E402
 from scenes.living_room.materials import MATERIALS  # noqa: E402
 
+ABOUT = "A furnished living room of ICL-NUIM's dimensions, through which its trajectories pass"
 SHADE_RADIANCE = (0.62, 0.46, 0.28)
 SKY, GROUND = 2.2, 0.62  # radiance behind the window
 SPOT_COLOUR = np.array([1.05, 0.98, 0.86])

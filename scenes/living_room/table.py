@@ -31,6 +31,7 @@ from scenes.living_room.layout import ON_FLOOR  # noqa: E402
 from scenes.living_room.room import FLOOR  # noqa: E402
 from scenes.living_room.table_textures import OBJECT_MATERIALS  # noqa: E402
 
+ABOUT = "The living room with its table set: everyday things with fine print"
 REST = 0.0003  # kept between a thing and what it stands on
 TABLE = (0.50, 0.72)  # x, z of the table's middle; its top is 0.70 m by 1.15 m
 LEVELS = {"table": 0.54, "rug": ON_FLOOR + RUG - 0.0009, "floor": FLOOR}  # heights; the rug's is its crests'

@@ -14,7 +14,8 @@ import yaml
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from rsgen.cli.main import main
-from rsgen.config.config import load_config
+from rsgen.config.config import LightConfig, load_config
+from rsgen.console.configs import config_file
 from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
 from rsgen.motion.clearance import check_clearance
@@ -194,6 +195,34 @@ def test_the_command_writes_a_config_that_renders(tmp_path: Path, capsys: pytest
     assert main(["motion", "suggest", str(tmp_path / "my room.xml"), "--seconds", "5", "--name", "mine"]) == 0
     printed = yaml.safe_load(capsys.readouterr().out)
     assert printed["name"] == "mine" and printed["motion"] == yaml.safe_load(out.read_text())["motion"]
+
+
+def test_a_counterpart_has_the_cameras_of_another_config_and_is_as_long_and_fast(tmp_path: Path) -> None:
+    furnished().export(tmp_path / "room.ply")
+    out, model = tmp_path / "t.yaml", load_config(config_file("robot_t2"))
+    words = ["motion", "suggest", str(tmp_path / "room.ply"), "--name", "t", "--out", str(out), "--seed", "4"]
+    assert main([*words, "--like", "robot_t2"]) == 0
+    tour = load_config(out)
+    assert (tour.color, tour.depth, tour.T_color_depth) == (model.color, model.depth, model.T_color_depth)
+    assert (tour.truth, tour.imu) == (model.truth, model.imu) and tour.depth.noise.model == "kinect"
+    assert tour.motion is not None and model.motion is not None
+    assert tour.motion.mean_speed_m_s == model.motion.mean_speed_m_s and tour.motion.kind == "tour"
+    assert tour.motion.duration_s == pytest.approx(model.motion.duration_s, rel=1e-3)
+    assert main([*words, "--like", "robot_t2", "--seconds", "5", "--speed", "0.2"]) == 0
+    slow = load_config(out).motion
+    assert slow is not None and slow.mean_speed_m_s == 0.2 and slow.duration_s == pytest.approx(5.0, rel=1e-3)
+
+
+def test_a_large_scene_gets_light_that_fits_into_memory(tmp_path: Path) -> None:
+    hall((0, 0, 0), (20, 6, 12)).export(tmp_path / "hall.ply")
+    mesh = trimesh.load(tmp_path / "hall.ply")
+    suggestion = suggest_tour(tmp_path / "hall.ply", None, Wish(seconds=4.0))
+    texel = suggestion.config.light.texel_m
+    assert 0.02 <= texel <= 0.04 and mesh.area / texel**2 < 1.2e6
+    (tmp_path / "hall.yaml").write_bytes(suggestion.yaml(tmp_path))
+    assert load_config(tmp_path / "hall.yaml").light.texel_m == texel
+    furnished().export(tmp_path / "room.ply")
+    assert suggest_tour(tmp_path / "room.ply", None, Wish(seconds=4.0)).config.light == LightConfig()
 
 
 def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,315 @@
+"""The scenes that ship: found by looking into the folder scenes, each with the script that builds it.
+
+A script is one that defines a function `build`: scenes/X/build.py builds scenes/X/scene.xml and is called X, another
+scenes/X/y.py builds scenes/X/y.xml and is called y (`render.scene.ensure_built` builds by the same rule). It is read,
+not run: what it is comes from its constant ABOUT, or else from its docstring, and it takes seeds where `build` has a
+parameter of that name.
+"""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsgen.array_types import FloatArray
+from rsgen.config.config import load_config
+from rsgen.console.configs import configs_folder
+from rsgen.console.tables import Table
+from rsgen.errors import UserError
+from rsgen.files import parse_yaml
+
+_SHORT = 110  # characters of what a scene is
+_PLY_TYPES = {
+    b"char": "i1", b"uchar": "u1", b"short": "<i2", b"ushort": "<u2", b"int": "<i4", b"uint": "<u4", b"float": "<f4",
+    b"double": "<f8",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ShippedScene:
+    """A scene of the library. file: the Mitsuba scene that `script` builds; configs: those that render it."""
+
+    name: str
+    about: str
+    script: Path
+    file: Path
+    takes_seed: bool
+    configs: tuple[Path, ...]
+
+    @property
+    def is_built(self) -> bool:
+        """Whether its file is there."""
+        return self.file.is_file()
+
+    @property
+    def how_to_vary(self) -> str:
+        """The command that builds another such scene, or that there is none."""
+        return f"rsgen scenes {self.name} --seed N --out DIR" if self.takes_seed else "takes no seed"
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What a built scene is made of. size: (3,) m, of its box; lit: how many of the settings of light are baked."""
+
+    triangles: int
+    size: tuple[float, float, float]
+    materials: tuple[str, ...]
+    lit: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Room:
+    """The largest floor of a scene: its height y and the free height above it, m; None: without a ceiling."""
+
+    floor_y: float
+    free_height: float | None
+
+
+@dataclass(frozen=True)
+class Listing:
+    """Scenes with their contents, None where they are not built."""
+
+    entries: tuple[tuple[ShippedScene, Contents | None], ...]
+    folder: Path
+
+    def text(self) -> str:
+        """A block of lines a scene."""
+        blocks = []
+        for scene, contents in self.entries:
+            lines = [f"{scene.name}: {scene.about}", f"  {_built_text(contents)}"]
+            lines.append(f"  configs: {' '.join(file.stem for file in scene.configs) or 'none yet'}")
+            lines.append(f"  another by seed: {scene.how_to_vary}")
+            blocks.append("\n".join(lines))
+        return "\n".join([*blocks, f"in {self.folder} (rsgen scenes NAME tells more of one)"])
+
+    def as_dict(self) -> dict[str, Any]:
+        """The same by name, sizes in m."""
+        return {scene.name: _facts(scene, contents) for scene, contents in self.entries}
+
+
+@dataclass(frozen=True)
+class Description:
+    """One scene in full; contents and room are None where it is not built."""
+
+    scene: ShippedScene
+    contents: Contents | None
+    room: Room | None
+
+    def text(self) -> str:
+        """A line a fact."""
+        scene, contents, room = self.scene, self.contents, self.room
+        rows = [("what", scene.about), ("file", str(scene.file)), ("script", str(scene.script))]
+        rows.append(("built", _built_text(contents)))
+        if room is not None:
+            high = "no ceiling" if room.free_height is None else f"{room.free_height:.2f} m free above it"
+            rows.append(("floor", f"at y = {room.floor_y:.3f} m, {high}"))
+        if contents is not None:
+            rows.append(("materials", f"{len(contents.materials)}: {' '.join(contents.materials)}"))
+        rows.append(("configs", " ".join(file.stem for file in scene.configs) or "none yet"))
+        rows.append(("another", scene.how_to_vary))
+        rows.append(("a tour", f"rsgen motion suggest {scene.file} --seed N --out my.yaml"))
+        return Table((scene.name, ""), tuple(rows), words=(0, 1)).text()
+
+    def as_dict(self) -> dict[str, Any]:
+        """The same as plain values, m."""
+        room = self.room
+        return {
+            "name": self.scene.name, **_facts(self.scene, self.contents),
+            "materials": None if self.contents is None else list(self.contents.materials),
+            "floor_y_m": None if room is None else room.floor_y,
+            "free_height_m": None if room is None else room.free_height,
+        }  # fmt: skip
+
+
+def scenes_folder() -> Path:
+    """The folder of the scenes, beside that of the configs."""
+    return configs_folder().parent / "scenes"
+
+
+def shipped_scenes(folder: Path, configs: Path) -> list[ShippedScene]:
+    """The scenes below `folder`, by name, with those of the `configs` (a folder) that render each."""
+    users: dict[Path, list[Path]] = {}
+    for file in sorted(configs.glob("*.yaml")):
+        data = parse_yaml(file.read_text(encoding="utf-8"))
+        of = data.get("scene") if isinstance(data, dict) else None
+        if isinstance(of, dict) and isinstance(of.get("file"), str):
+            users.setdefault((file.parent / of["file"]).resolve(), []).append(file)
+    found = []
+    for script in sorted(folder.glob("*/*.py")):
+        tree = ast.parse(script.read_text(encoding="utf-8"))
+        build = next((n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == "build"), None)
+        if build is None:
+            continue
+        is_main = script.name == "build.py"
+        file = script.with_name("scene.xml") if is_main else script.with_suffix(".xml")
+        arguments = [a.arg for a in (*build.args.args, *build.args.kwonlyargs)]
+        found.append(
+            ShippedScene(
+                script.parent.name if is_main else script.stem, _about(tree), script, file, "seed" in arguments,
+                tuple(users.get(file.resolve(), ())),
+            )
+        )  # fmt: skip
+    return sorted(found, key=lambda scene: scene.name)
+
+
+def list_scenes() -> Listing:
+    """What ships, and what is built and lit of it. Raises UserError if a built scene is damaged."""
+    folder = scenes_folder()
+    scenes = shipped_scenes(folder, configs_folder())
+    return Listing(tuple((scene, _contents(scene)) for scene in scenes), folder)
+
+
+def find_scene(name: str) -> ShippedScene:
+    """The scene that is called so. Raises UserError naming those that there are."""
+    scenes = shipped_scenes(scenes_folder(), configs_folder())
+    for scene in scenes:
+        if scene.name == name:
+            return scene
+    raise UserError(f"scene '{name}': no such scene ships: choose {', '.join(scene.name for scene in scenes)}")
+
+
+def describe_scene(name: str) -> Description:
+    """One scene in full. Raises UserError for an unknown name."""
+    scene = find_scene(name)
+    contents = _contents(scene)
+    return Description(scene, contents, None if contents is None else _room(scene.file))
+
+
+def build_variant(name: str, seed: int | None, out: Path) -> Path:
+    """Build the scene into the folder `out` with a seed, None: the script's own, and return the path of its file.
+
+    Raises UserError for an unknown name, a seed where the script takes none or below 0, and if the script fails.
+    """
+    scene = find_scene(name)
+    if seed is not None and not scene.takes_seed:
+        raise UserError(f"--seed {seed}: scene '{name}' takes no seed: leave it out, or choose another scene")
+    if seed is not None and seed < 0:
+        raise UserError(f"--seed {seed}: must be at least 0")
+    if out.exists() and not out.is_dir():
+        raise UserError(f"--out {out}: is a file: name a folder")
+    seeded = [] if seed is None else ["--seed", str(seed)]
+    done = subprocess.run(
+        [sys.executable, str(scene.script), "--out", str(out), *seeded], capture_output=True, text=True
+    )
+    if done.returncode:
+        raise UserError(f"scene '{name}': {scene.script} failed ({done.stderr.strip().rpartition(chr(10))[2]})")
+    return out / scene.file.name
+
+
+def _about(tree: ast.Module) -> str:
+    """What a script says that it builds: its constant ABOUT, or the first sentence after its docstring's first line."""
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and [getattr(t, "id", "") for t in node.targets] == ["ABOUT"]:
+            return str(ast.literal_eval(node.value))
+    head, _, rest = (ast.get_docstring(tree) or "").partition("\n\n")
+    text = " ".join((rest.partition("\n\n")[0] or head).split())
+    sentence = text.partition(". ")[0].rstrip(".")
+    return sentence if len(sentence) <= _SHORT else sentence[:_SHORT].rpartition(" ")[0] + " ..."
+
+
+def _built_text(contents: Contents | None) -> str:
+    if contents is None:
+        return "not built yet: it is when it is first rendered"
+    lit, settings = contents.lit
+    x, y, z = contents.size
+    light = (
+        "light baked"
+        if lit == settings
+        else "light not baked yet"
+        if not lit
+        else f"light baked for {lit} of {settings} settings"
+    )
+    return f"{x:.1f} x {y:.1f} x {z:.1f} m, {contents.triangles:,} triangles, {light}"
+
+
+def _facts(scene: ShippedScene, contents: Contents | None) -> dict[str, Any]:
+    return {
+        "about": scene.about, "file": str(scene.file), "script": str(scene.script), "built": contents is not None,
+        "triangles": None if contents is None else contents.triangles,
+        "size_m": None if contents is None else list(contents.size),
+        "light_baked": None if contents is None else contents.lit[0] == contents.lit[1],
+        "configs": [file.stem for file in scene.configs], "takes_seed": scene.takes_seed,
+    }  # fmt: skip
+
+
+def _contents(scene: ShippedScene) -> Contents | None:
+    """What its file and the meshes that it names hold; None: it is not built. Raises UserError if it is damaged."""
+    if not scene.is_built:
+        return None
+    try:
+        meshes, materials = _named(scene.file)
+        counted = [_ply_box(mesh) for mesh in meshes]
+    except (OSError, ET.ParseError, KeyError, ValueError, IndexError) as error:
+        raise UserError(f"scene {scene.file}: is damaged ({error}): delete it, then it is built again") from None
+    low = np.min([box[1] for box in counted], axis=0)
+    high = np.max([box[2] for box in counted], axis=0)
+    x, y, z = (float(v) for v in high - low)
+    return Contents(sum(box[0] for box in counted), (x, y, z), tuple(sorted(materials)), _lit(scene))
+
+
+def _named(file: Path) -> tuple[list[Path], set[str]]:
+    """The mesh files and the ids of the materials of a scene file and of those that it includes."""
+    root = ET.fromstring(file.read_bytes())
+    meshes = [
+        file.parent / value.get("value", "")
+        for shape in root.iter("shape")
+        for value in shape.iter("string")
+        if value.get("name") == "filename" and value.get("value", "").endswith(".ply")
+    ]
+    materials = {str(bsdf.get("id")) for bsdf in root.iter("bsdf") if bsdf.get("id")}
+    for include in root.iter("include"):
+        more, others = _named(file.parent / include.get("filename", ""))
+        meshes, materials = meshes + more, materials | others
+    return meshes, materials
+
+
+def _ply_box(path: Path) -> tuple[int, FloatArray, FloatArray]:
+    """Triangles of a binary PLY, and its vertices' least and largest corner (3,). Raises OSError or ValueError."""
+    head, end, body = path.read_bytes().partition(b"end_header\n")
+    if not end:
+        raise ValueError(f"{path.name} is no PLY file")
+    words = [line.split() for line in head.splitlines()]
+    counts = {w[1]: int(w[2]) for w in words if w[0] == b"element"}
+    after = words.index(next(w for w in words if w[:2] == [b"element", b"face"]))
+    fields = [(w[2].decode(), _PLY_TYPES[w[1]]) for w in words[:after] if w[0] == b"property"]
+    vertices = np.frombuffer(body, np.dtype(fields), counts[b"vertex"])
+    position = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    return counts[b"face"], position.min(axis=0), position.max(axis=0)
+
+
+def _lit(scene: ShippedScene) -> tuple[int, int]:
+    """How many of the settings of light with which its configs render it are baked, and of how many."""
+    from rsgen.config.config import LightConfig
+    from rsgen.device.backend import mitsuba
+
+    mitsuba()
+    from rsgen.light.cache import cache_folder, cache_key
+    from rsgen.render.scene import content_hash
+
+    lights = [load_config(file).light for file in scene.configs] or [LightConfig()]
+    state = content_hash(scene.file)
+    keys = {cache_key(state, light) for light in lights if light.mode == "baked"}
+    folder = cache_folder(scene.file)
+    return sum((folder / f"irradiance-{key}.npz").is_file() for key in keys), len(keys)
+
+
+def _room(file: Path) -> Room | None:
+    """The largest floor of a built scene, as `motion suggest` finds it."""
+    from rsgen.motion.floor_plan import find_floors
+    from rsgen.render.rays import cast_rays
+    from rsgen.render.scene import load_scene, surface
+
+    loaded = load_scene(file)
+    corners = surface(loaded)[0].astype(np.float64)
+    floors = find_floors(partial(cast_rays, loaded), corners.min(axis=0), corners.max(axis=0))
+    if not floors:
+        return None
+    return Room(floors[0].y, floors[0].gap_m if np.isfinite(floors[0].gap_m) else None)

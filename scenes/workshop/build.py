@@ -1,0 +1,89 @@
+"""Builds the workshop: `python scenes/workshop/build.py [--seed N] [--out DIR]` writes scene.xml, meshes/, textures/.
+
+A machine shop of 20 x 12 x 6 m: lathes, mills, drills and saws in two rows, benches under tool boards, racks, a crane
+under steel trusses, a roller door, bands of windows below the eaves and lamps on cords. Right-handed, y up, metres; the
+floor is y = 0, x runs along the hall. Everything is procedural: two builds of one seed are equal byte for byte, another
+seed arranges, paints and lights it differently. The result is a plain Mitsuba 3 scene of triangle meshes (one per BSDF,
+binary PLY with normals and texture coordinates), diffuse, a few rough plastic and one rough metal, and area lights
+(panes, lamps).
+
+    build.py      puts it all together          benches.py    workbench, vice, tools, tool board
+    hall.py       shell, steelwork, crane       storage.py    racks, crates, pallets, drums, bottles
+    services.py   pipes, switch boxes, signs    machines.py   machine tools
+    layout.py     what stands where             solids.py     bars, rods, wheels, profiles
+    materials.py  BSDFs and their textures      surfaces.py   concrete, blockwork, enamel, rust
+                                                drawings.py   signs, labels, sky
+Solids, noise, wood, cloth and the writing of files are in scenes/kit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+
+_ROOT = Path(__file__).resolve().parents[2]
+if str(_ROOT) not in sys.path:  # so that it also runs as a script from anywhere
+    sys.path.insert(0, str(_ROOT))
+
+from scenes.kit import scene_files  # noqa: E402
+from scenes.kit.room_files import Lamp, look_at, write_room  # noqa: E402
+from scenes.kit.shapes import Mesh, Parts  # noqa: E402
+from scenes.workshop import drawings, hall, layout  # noqa: E402
+from scenes.workshop.materials import materials  # noqa: E402
+
+ABOUT = "A machine shop: lathes, mills, benches, racks, a crane under steel trusses, windows below the eaves"
+SKY, HORIZON = 7.0, 3.5  # radiance behind the panes
+LAMP_RADIANCE = 190.0
+
+
+def parts(seed: int) -> tuple[Parts, list[tuple[Mesh, float]]]:
+    """Everything in the hall: surfaces by material, and the lamps' luminous discs with their share of the light."""
+    lamps, discs = layout.lamps(seed)
+    building = [*hall.floor(layout.bays()), *hall.shell(), *hall.window_bars(), *hall.doors(), *hall.steelwork()]
+    stood = [part for thing in layout.things(seed) for part in thing.parts]
+    return [*building, *layout.crane(seed), *lamps, *stood], discs
+
+
+def build(out: Path, seed: int = 0) -> Path:
+    """Write the scene into the folder `out` (made if need be) and return the path of its scene.xml, written last.
+
+    Raises OSError if the folder cannot be written.
+    """
+    surfaces, discs = parts(seed)
+    rng = np.random.default_rng([seed, 5])
+    tone = np.array([1.0, 0.94, 0.82]) if rng.uniform() < 0.5 else np.array([0.94, 1.0, 0.98])
+    day = float(rng.uniform(0.8, 1.2))
+    lamps = [
+        Lamp(f"lamp_{i}", "black", mesh, scene_files.radiance(tuple(LAMP_RADIANCE * share * tone)))
+        for i, (mesh, share) in enumerate(discs)
+    ]
+    pictures = {}
+    for name, side, light in (("south", -1, 1.1), ("north", 1, 0.8)):
+        sky = scene_files.radiance_map(f"textures/sky_{name}.pfm")
+        lamps.append(Lamp(f"panes_{name}", "black", hall.panes(side), sky, atlas=True))
+        level = day * light
+        pictures[f"sky_{name}"] = drawings.sky((64, 1024), 900 + 10 * seed + side, SKY * level, HORIZON * level)
+    return write_room(
+        out,
+        surfaces,
+        materials(seed),
+        lamps,
+        camera=look_at((-8.9, 1.65, 0.6), (0.0, 1.2, -0.8)),
+        pictures=pictures,
+    )
+
+
+def main() -> None:
+    """Command line: build into --out, by default this script's own folder."""
+    parser = argparse.ArgumentParser(description="Build the workshop as a Mitsuba 3 scene.")
+    parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parent, help="folder to write to")
+    parser.add_argument("--seed", type=int, default=0, help="another seed, another workshop (default: 0)")
+    given = parser.parse_args()
+    print(build(given.out, given.seed))
+
+
+if __name__ == "__main__":
+    main()
