@@ -302,7 +302,7 @@ def _lit(scene: ShippedScene) -> tuple[int, int]:
 
 
 def _room(file: Path) -> Room | None:
-    """The largest floor of a built scene, as `motion suggest` finds it."""
+    """The largest floor of a built scene with a ceiling over it, as `motion suggest` finds it; without one, of all."""
     from rsgen.motion.floor_plan import find_floors
     from rsgen.render.rays import cast_rays
     from rsgen.render.scene import load_scene, surface
@@ -312,4 +312,5 @@ def _room(file: Path) -> Room | None:
     floors = find_floors(partial(cast_rays, loaded), corners.min(axis=0), corners.max(axis=0))
     if not floors:
         return None
-    return Room(floors[0].y, floors[0].gap_m if np.isfinite(floors[0].gap_m) else None)
+    floor = next((floor for floor in floors if np.isfinite(floor.gap_m)), floors[0])  # a roof is larger than a room
+    return Room(floor.y, floor.gap_m if np.isfinite(floor.gap_m) else None)

@@ -74,7 +74,7 @@ def ensure_built(path: Path) -> None:
 
     ROOM/seedN/scene.xml is the variant that `ROOM/build.py --seed N` makes. Raises UserError if there is no scene then.
     """
-    own, script = path.with_suffix(".py"), path.parent / "build.py"
+    own, script = path.parent / f"{path.stem}.py", path.parent / "build.py"
     words = [str(own if own.is_file() else script)]
     variant = re.fullmatch(r"seed([0-9]{1,9})", path.absolute().parent.name)
     if variant and not script.is_file():

@@ -23,7 +23,7 @@ _BARS: list[Colour] = [(0.33, 0.52, 0.70), (0.80, 0.52, 0.30), (0.42, 0.60, 0.42
 def _code(shape: tuple[int, int], seed: int) -> Image:
     h, w = shape
     rng = np.random.default_rng(seed)
-    out: Image = np.empty((h, w, 3), np.float32)
+    out: Image = np.zeros((h, w, 3), np.float32)
     out[:] = (0.23, 0.25, 0.29)
     out[:, : w // 6] = (0.28, 0.30, 0.34)
     out[: h // 20] = (0.36, 0.38, 0.42)
@@ -47,7 +47,7 @@ def _code(shape: tuple[int, int], seed: int) -> Image:
 def _table(shape: tuple[int, int], seed: int) -> Image:
     h, w = shape
     rng = np.random.default_rng(seed)
-    out: Image = np.empty((h, w, 3), np.float32)
+    out: Image = np.zeros((h, w, 3), np.float32)
     out[:] = (0.84, 0.85, 0.86)
     out[: h // 9] = (0.33, 0.50, 0.40)
     for y in np.linspace(0.14, 0.97, 26):
@@ -64,7 +64,7 @@ def _table(shape: tuple[int, int], seed: int) -> Image:
 def _charts(shape: tuple[int, int], seed: int) -> Image:
     h, w = shape
     rng = np.random.default_rng(seed)
-    out: Image = np.empty((h, w, 3), np.float32)
+    out: Image = np.zeros((h, w, 3), np.float32)
     out[:] = (0.80, 0.82, 0.84)
     out[:, : w // 8] = (0.30, 0.36, 0.44)
     for k in range(4):
@@ -79,7 +79,7 @@ def _charts(shape: tuple[int, int], seed: int) -> Image:
 
 def _document(shape: tuple[int, int], seed: int) -> Image:
     h, w = shape
-    out: Image = np.empty((h, w, 3), np.float32)
+    out: Image = np.zeros((h, w, 3), np.float32)
     out[:] = (0.55, 0.58, 0.62)
     out[: h // 10] = (0.36, 0.46, 0.60)
     for k in range(2):
@@ -117,7 +117,7 @@ def binders(shape: tuple[int, int], seed: int) -> Image:
         *[(0.30, 0.31, 0.34), (0.66, 0.28, 0.25), (0.26, 0.40, 0.58), (0.36, 0.50, 0.38)],
         *[(0.80, 0.70, 0.36), (0.74, 0.74, 0.73), (0.50, 0.38, 0.56)],
     ]
-    out: Image = np.empty((h, w, 3), np.float32)
+    out: Image = np.zeros((h, w, 3), np.float32)
     for i, (a, b) in enumerate(pairwise(np.round(np.linspace(0, w, BINDERS + 1)).astype(int))):
         colour = np.clip(np.array(palette[int(rng.integers(len(palette)))]) + rng.normal(0, 0.03, 3), 0.22, 0.86)
         spine: Image = np.broadcast_to(colour.astype(np.float32), (h, b - a, 3)).copy()

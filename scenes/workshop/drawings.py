@@ -106,7 +106,7 @@ def signs(shape: tuple[int, int], seed: int) -> Image:
     """Atlas of safety signs and notices, slightly faded and stained."""
     cols, rows = SIGNS
     h, w = shape[0] // rows, shape[1] // cols
-    out = np.empty((*shape, 3), np.float32)
+    out = np.zeros((*shape, 3), np.float32)
     for index in range(cols * rows):
         cell = np.empty((h, w, 3), np.float32)
         if index < 3:
@@ -131,7 +131,7 @@ def labels(shape: tuple[int, int], seed: int) -> Image:
     cols, rows = LABELS
     h, w = shape[0] // rows, shape[1] // cols
     rng = np.random.default_rng(seed)
-    out = np.empty((*shape, 3), np.float32)
+    out = np.zeros((*shape, 3), np.float32)
     for index in range(cols * rows):
         cell = np.empty((h, w, 3), np.float32)
         cell[:] = np.array(_WHITE) * rng.uniform(0.9, 1.0)
