@@ -14,6 +14,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
+from scenes.kit.materials import Material
 from scenes.living_room import build as scene
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -51,9 +52,16 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="session")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Built:
-    """The room, built once for all tests."""
-    xml = scene.build(tmp_path_factory.mktemp("living_room"))
+    """The room, built once for all tests, its textures painted at half their size, in a quarter of the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene, "MATERIALS", painted_small(2))
+        xml = scene.build(tmp_path_factory.mktemp("living_room"))
     return Built(xml, {p.stem: read_ply(p) for p in sorted((xml.parent / "meshes").glob("*.ply"))})
+
+
+def painted_small(part: int) -> dict[str, Material]:
+    """The room's materials with textures of so many times fewer pixels each way."""
+    return {n: replace(m, pixels=(m.pixels[0] // part, m.pixels[1] // part)) for n, m in scene.MATERIALS.items()}
 
 
 def digest(folder: Path) -> dict[str, str]:
@@ -89,9 +97,8 @@ def test_distances_against_brute_force() -> None:
 def test_two_builds_are_equal_byte_for_byte(
     built: Built, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:  # fmt: skip
-    """Meshes as they are, textures painted small: by the same painters, in a twentieth of the time."""
-    small = {name: replace(m, pixels=(m.pixels[0] // 4, m.pixels[1] // 4)) for name, m in scene.MATERIALS.items()}
-    monkeypatch.setattr(scene, "MATERIALS", small)
+    """Textures painted small: by the same painters, in a twentieth of the time."""
+    monkeypatch.setattr(scene, "MATERIALS", painted_small(4))
     first, second = (digest(scene.build(tmp_path / name).parent) for name in ("first", "second"))
     assert first == second and len(first) > 60
     whole = digest(built.xml.parent)

@@ -184,6 +184,7 @@ def test_a_sequence_is_calibrated_and_tracked_by_command(
     assert not (tmp_path / "again/calibration.json").exists(), "it is of another run"
 
 
+@pytest.mark.usefixtures("in_one_phase")
 def test_a_device_that_the_recording_contradicts_is_left_out(shaken: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(calibration_run, "_COARSE", (1,))
     wrong = told(shaken, 0.01, 0.0, np.zeros(6))
