@@ -38,6 +38,7 @@ def few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stretch, "_APART", (4, 9))
 
 
+@pytest.mark.usefixtures("in_one_phase")
 def test_a_lens_and_depth_are_put_right(shaken: Dataset) -> None:
     rig, color = shaken.rig, shaken.rig.color_camera
     lens = replace(color, fx=1.02 * color.fx, fy=0.99 * color.fy, cx=color.cx + 1.5, cy=color.cy - 1.0)
@@ -109,6 +110,7 @@ def test_a_drift_is_found_or_else_held(shaken: Dataset, monkeypatch: pytest.Monk
     assert ("colour drift" in found.text()) == (drift > 0.0)
 
 
+@pytest.mark.usefixtures("in_one_phase")
 def test_noise_is_that_of_track_and_makes_sigmas_grow(shaken: Dataset) -> None:
     noisy = replace(shaken, images=NoisyImages(shaken.images, 2e-3, 0.02, 7))
     frame = with_noise(shaken.frame(9), 9, 2e-3, 0.02, 7)

@@ -38,12 +38,6 @@ def few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stretch, "_APART", (4, 9))
 
 
-@pytest.fixture
-def in_one_phase(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With these knots only, in three quarters of the time: for what is found either way."""
-    monkeypatch.setattr(calibration_run, "_at_other_knots", lambda *given: given[3])
-
-
 @pytest.mark.usefixtures("in_one_phase")
 def test_lines_that_are_read_the_other_way_are_seen_to_be(tmp_path: Path) -> None:
     upward = recording(tmp_path / "seq", shaking(), scan="bottom-top")
