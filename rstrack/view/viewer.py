@@ -40,7 +40,7 @@ _EVERY_S = 0.1
 # The path is drawn anew after so many frames, and once it is so many times as long.
 _PATH_EVERY, _PATH_GROWTH = 10, 1.05
 # Frames that are remembered until one of them turns out to be a keyframe.
-_RECENT = 64
+_RECENT = 16
 # Depth residuals from minus to plus so many of the track's σ, blue to red.
 _SIGMAS = 3.0
 _PATH_COLOR, _TRUE_COLOR = [230, 120, 30], [90, 160, 90]

@@ -17,7 +17,7 @@ from rstrack.cli.main import main
 from rstrack.data.dataset import open_dataset
 from rstrack.data.rig import Image
 from rstrack.view.residuals import depth_residuals, world_points
-from rstrack.view.viewer import open_view
+from rstrack.view.viewer import Viewer, open_view
 
 
 @pytest.mark.parametrize("scan", ["top-bottom", "bottom-top", "right-left"])
@@ -93,6 +93,21 @@ def test_a_run_is_watched_and_stays_the_same_to_the_bit(tmp_path: Path, rerun: R
     assert told["world/camera/color/image"] == told["world/camera/depth/image"] == 5
     assert sum(name.startswith("world/map/") for name in told) >= 2 and told["residuals/depth"] >= 2
     assert max(told[name] for name in told if name.startswith("world/map/")) == 1
+
+
+def test_a_view_that_breaks_down_leaves_what_was_tracked(
+    tmp_path: Path, rerun: Rerun, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(_: Viewer, index: int, *__: object) -> None:
+        if index == 4:
+            raise UserError("no room")
+
+    root = synthetic.make_sequence(tmp_path / "seq", synthetic.make_config(width=80, height=60), frames=5)
+    monkeypatch.setattr(Viewer, "see", broken)
+    arguments = ["track", str(root), "--backend", "llvm", "--bootstrap-frames", "3", "--quiet"]
+    assert main([*arguments, "--out", str(tmp_path / "run"), "--view", str(tmp_path / "run.rrd")]) == 1
+    assert "--view broke down at frame 4: no room" in capsys.readouterr().err
+    assert len((tmp_path / "run/trajectory.txt").read_text().splitlines()) >= 5
 
 
 def test_a_window_is_opened_where_no_file_is_named(tmp_path: Path, rerun: Rerun) -> None:

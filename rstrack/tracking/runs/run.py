@@ -168,7 +168,10 @@ def _feed(
                 done.seconds.append(time.perf_counter() - start)
                 done.fed.append(k)
                 if watch is not None:
-                    watch(len(done.fed) - 1, frame, report, tracker)
+                    try:
+                        watch(len(done.fed) - 1, frame, report, tracker)
+                    except UserError as problem:  # what was tracked gets written all the same
+                        return "broke down", f"--view broke down at frame {k}: {problem}"
             if count >= max(told_at + _TRUTH_EVERY, _TRUTH_GROWTH * told_at) or count == len(chosen):
                 note, told_at = _error_note(truth, tracker.trajectory), count
             rate = count / (time.perf_counter() - begin)
