@@ -1,0 +1,1 @@
+"""What an inertial measurement unit recorded, and what is known of it."""
