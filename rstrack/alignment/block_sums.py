@@ -23,8 +23,6 @@ PAIR_BLOCKS = 15
 # Integers per block: 21 of H (upper triangle), 6 of g, sum of w s², cost, count, compared; with n further columns 6 n
 # of the coupling, n (n + 1) / 2 of their own H and n of their g more; and padding.
 _SLOTS, _PAD = 31, 16
-_COMPARED = 30
-_JUDGED = (27, 29, _COMPARED)
 _UPPER = np.triu_indices(6)
 
 
@@ -126,26 +124,55 @@ def _is_global(lens: Lens, ref_lens: Lens) -> bool:
     return lens.lines == 1 and ref_lens.lines == 1
 
 
-def block_slot(line: Any, ref_line: Any, lens: Lens, ref_lens: Lens, y: Any, columns: int = 0) -> tuple[Any, int]:
-    """First integer of each pixel's block, or pair of blocks, and how many integers there are in all.
+def block_slot(line: Any, ref_line: Any, lens: Lens, ref_lens: Lens, y: Any, columns: int = 0) -> Any:
+    """First integer of each pixel's block, or pair of blocks.
 
-    columns: further ones, see `ColumnSums`.
-
-    y: the pixel's own, which is its line where all are exposed at once.
+    columns: further ones, see `ColumnSums`. y: the pixel's own, which is its line where all are exposed at once.
     """
-    current, reference, per, ref_per = block_counts(lens, ref_lens)
+    _, reference, per, ref_per = block_counts(lens, ref_lens)
     if _is_global(lens, ref_lens):
         line = type(line)(dr.clip(y, 0, lens.camera.height - 1))
     block = line // per if reference == 1 else line // per * reference + ref_line // ref_per
-    slots = -(-(_SLOTS + 7 * columns + columns * (columns + 1) // 2) // _PAD) * _PAD
-    return block * slots, current * reference * slots
+    return block * _slots(columns)
 
 
-def accumulate(
-    e: Engine, g: Vector, p: Vector, sign: float, r: Any, active: Any, parameters: list[Any], slot: Any, size: int,
+@dataclass(frozen=True)
+class Layout:
+    """How many integers there are in all, and how many of them each pixel adds to."""
+
+    size: int
+    values: int
+
+
+def layout(lens: Lens, ref_lens: Lens, columns: int = 0) -> Layout:
+    """Of the sums of an image against a reference, with so many further columns."""
+    current, reference, _, _ = block_counts(lens, ref_lens)
+    return Layout(current * reference * _slots(columns), _values(columns))
+
+
+def _values(columns: int) -> int:
+    return _SLOTS + 7 * columns + columns * (columns + 1) // 2
+
+
+def _slots(columns: int) -> int:
+    return -(-_values(columns) // _PAD) * _PAD
+
+
+@dataclass(frozen=True)
+class Contribution:
+    """What each pixel adds to its block: integers (0 where it adds nothing) from number `slot` on, of those that are
+    `compared`."""
+
+    slot: Any
+    values: tuple[Any, ...]
+    compared: Any
+
+
+def contribution(
+    e: Engine, g: Vector, p: Vector, sign: float, r: Any, active: Any, parameters: list[Any], slot: Any,
     c: Sequence[Any] = (), judged: Any = True,
-) -> Any:  # fmt: skip
-    """Σ w j jᵀ and so on into `size` integers, from `slot` on (`block_slot`); j = sign [g, p × g].
+) -> Contribution:  # fmt: skip
+    """w j jᵀ and so on of pixels, from `slot` on (`block_slot`); j = sign [g, p × g].
 
     c: see `ColumnSums`, each at most 1. judged: pixels that tell σ and are counted; others only add to the system
     and the cost.
@@ -164,19 +191,14 @@ def accumulate(
     wj = [w * c for c in j]
     h = unit_H * curvature(s)
     hj = [h * c for c in wj]
-    values = [hj[a] * j[b] for a, b in zip(*_UPPER, strict=True)]
-    values += [c * s * (sign * unit_g) for c in wj]
-    values += [w * s * s * unit_cost, cost(s) * unit_cost]
-    values = [e.Int(dr.round(value)) for value in values] + [e.Int(1), e.Int(1)]
+    sums = [hj[a] * j[b] for a, b in zip(*_UPPER, strict=True)]
+    sums += [c * s * (sign * unit_g) for c in wj]
+    told = dr.select(active & judged, w * s * s * unit_cost, 0.0), cost(s) * unit_cost
+    counted = [dr.select(which & judged, e.Int(1), e.Int(0)) for which in (active, compared)]
     c = [dr.select(active, bound * column, 0.0) for column in c]
     more = [sign * one * column for column in c for one in hj]
     # Their own curvature is that of reweighted least squares: Newton's would overshoot a large step of brightness.
     more += [unit_H * w * c[a] * c[b] for a, b in zip(*np.triu_indices(len(c)), strict=True)]
     more += [w * s * unit_g * column for column in c]
-    values += [e.Int(dr.round(value)) for value in more]
-    sums = dr.zeros(e.Int, size)
-    for k, value in enumerate(values):
-        which = compared if k == _COMPARED else active
-        which = which & judged if judged is not True and k in _JUDGED else which
-        dr.scatter_reduce(dr.ReduceOp.Add, sums, value, slot + k, which, mode=dr.ReduceMode.Expand)
-    return sums
+    whole = [[e.Int(dr.round(value)) for value in part] for part in ((*sums, *told), more)]
+    return Contribution(slot, (*whole[0], *counted, *whole[1]), compared)

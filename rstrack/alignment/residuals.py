@@ -27,8 +27,9 @@ from rsgen.device.lens import Lens
 from rsgen.device.projection import TO_BASE, Sighting, Vector, gather, move, project_rolling
 from rsgen.device.recording import recorded_from
 from rsgen.geometry.camera import Camera
-from rstrack.alignment.block_sums import accumulate, block_slot
+from rstrack.alignment.block_sums import Contribution, block_slot, contribution, layout
 from rstrack.alignment.brightness import MID_GREY
+from rstrack.alignment.pixel_runs import Pixels, summed
 from rstrack.images.blur import blur_length, blur_weight
 from rstrack.images.sampling import EDGE, NEAREST, grid, level_size, nearest, surface, value_and_slope
 
@@ -74,18 +75,23 @@ def geometric_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int) -> Call
     @recorded_from(GeometricInput)
     def kernel(given: GeometricInput) -> Any:
         parameters = [dr.gather(e.Float, given.constants, e.UInt(i)) for i in range(7)]
-        index, px, py = grid(e, camera.width, camera.height, stride)
-        z = dr.gather(e.Float, given.depth, index)
-        active = z > 0.0
-        even = evened(z, parameters[2])
-        q = dr.gather(e.Float, given.rays_x, index) * z, dr.gather(e.Float, given.rays_y, index) * z, z
-        line = _line_index(e, lens, px, py)
-        p = move(gather(given.to_base, line, TO_BASE, stride=TO_BASE), q)
-        seen = project_rolling(ref_lens, given.from_base, p, e.UInt, e.Int)
-        value, active = surface(e, ref, given.inverse_depth, seen.x, seen.y, active & seen.valid)
-        r, g, is_smooth = plane_distance(e, given, ref, seen, value, active, even)
-        slot, size = block_slot(line, seen.row, lens, ref_lens, py)
-        return accumulate(e, g, p, 1.0, r, active, parameters, slot, size, judged=is_smooth)
+
+        def at(pixels: Pixels) -> Contribution:
+            z = dr.gather(e.Float, given.depth, pixels.index)
+            active = pixels.meant & (z > 0.0)
+            even = evened(z, parameters[2])
+            q = *(dr.gather(e.Float, ray, pixels.index) * z for ray in (given.rays_x, given.rays_y)), z
+            line = _line_index(e, lens, pixels.x, pixels.y)
+            p = move(gather(given.to_base, line, TO_BASE, stride=TO_BASE), q)
+            seen = project_rolling(ref_lens, given.from_base, p, e.UInt, e.Int)
+            value, active = surface(e, ref, given.inverse_depth, seen.x, seen.y, active & seen.valid)
+            r, g, is_smooth = plane_distance(e, given, ref, seen, value, active, even)
+            slot = block_slot(line, seen.row, lens, ref_lens, pixels.y)
+            return contribution(e, g, p, 1.0, r, active, parameters, slot, judged=is_smooth)
+
+        down = lens.lines > 1 and not lens.shutter.by_rows
+        shape, is_steady = (camera.width, camera.height, stride), ref_lens.lines == 1
+        return summed(e, shape, layout(lens, ref_lens), at, down, is_steady)
 
     return kernel
 
@@ -158,29 +164,35 @@ def photometric_kernel(
     @recorded_from(PhotometricInput)
     def kernel(given: PhotometricInput) -> Any:
         parameters = [dr.gather(e.Float, given.constants, e.UInt(i)) for i in range(7)]
-        p = given.x, given.y, given.z
-        active = (given.z > 0.0) & (given.visible > 0.5)
-        _, x, y = grid(e, ref.width, ref.height, stride)
-        ref_line = _line_index(e, ref_lens, x, y)
-        if ref_lens.lines > 1:
-            p = move(gather(given.to_base, ref_line, TO_BASE, stride=TO_BASE), p)
-        seen = project_rolling(lens, given.from_base, p, e.UInt, e.Int)
-        u, v = seen.x * shrink, seen.y * shrink
-        value, dx, dy, active = value_and_slope(e, given.image, width, height, u, v, active & seen.valid)
-        dx, dy = dx * shrink, dy * shrink
         gain, offset = (dr.gather(e.Float, given.constants, e.UInt(i)) for i in (7, 8))
-        contrast = given.intensity - MID_GREY
-        r = value - (given.intensity + dr.fma(gain, contrast, offset))  # (8), and brightness
-        columns = -contrast, e.Float(-1.0)
-        if weighs_blur:
-            # Of the squared error, so that σ stays that of sharp points.
-            share = dr.sqrt(blur_weight(blur_length(lens, seen.pixel_speed), 1.0 / blur_sigma_px**2))  # (13)
-            r, dx, dy = r * share, dx * share, dy * share
-            columns = columns[0] * share, columns[1] * share
-        g = seen.chain(dx, dy, 0.0)
-        slot, size = block_slot(seen.row, ref_line, lens, ref_lens, seen.y, columns=len(columns))
-        # A twist of the camera moves the point the other way.
-        return accumulate(e, g, p, -1.0, r, active, parameters, slot, size, columns)
+
+        def at(pixels: Pixels) -> Contribution:
+            stored = given.x, given.y, given.z, given.intensity, given.visible
+            x, y, z, intensity, visible = (dr.gather(e.Float, values, pixels.number) for values in stored)
+            p: Vector = x, y, z
+            active = pixels.meant & (z > 0.0) & (visible > 0.5)
+            ref_line = _line_index(e, ref_lens, pixels.x, pixels.y)
+            if ref_lens.lines > 1:
+                p = move(gather(given.to_base, ref_line, TO_BASE, stride=TO_BASE), p)
+            seen = project_rolling(lens, given.from_base, p, e.UInt, e.Int)
+            u, v = seen.x * shrink, seen.y * shrink
+            value, dx, dy, active = value_and_slope(e, given.image, width, height, u, v, active & seen.valid)
+            dx, dy = dx * shrink, dy * shrink
+            contrast = intensity - MID_GREY
+            r = value - (intensity + dr.fma(gain, contrast, offset))  # (8), and brightness
+            columns = -contrast, e.Float(-1.0)
+            if weighs_blur:
+                # Of the squared error, so that σ stays that of sharp points.
+                share = dr.sqrt(blur_weight(blur_length(lens, seen.pixel_speed), 1.0 / blur_sigma_px**2))  # (13)
+                r, dx, dy = r * share, dx * share, dy * share
+                columns = columns[0] * share, columns[1] * share
+            g = seen.chain(dx, dy, 0.0)
+            slot = block_slot(seen.row, ref_line, lens, ref_lens, seen.y, columns=len(columns))
+            # A twist of the camera moves the point the other way.
+            return contribution(e, g, p, -1.0, r, active, parameters, slot, columns)
+
+        down = lens.lines > 1 and not lens.shutter.by_rows
+        return summed(e, (ref.width, ref.height, stride), layout(lens, ref_lens, 2), at, down, False)
 
     return kernel
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
+import drjit as dr
 import numpy as np
 import pytest
 import synthetic
@@ -22,9 +24,10 @@ from rsgen.geometry import se3
 from rsgen.geometry.so3 import hat
 from rsgen.geometry.spline import Spline
 from rstrack.alignment import block_sums as block_sums_module
-from rstrack.alignment import residuals
-from rstrack.alignment.block_sums import BlockSums, Scaling, block_counts
+from rstrack.alignment import pixel_runs, residuals
+from rstrack.alignment.block_sums import BlockSums, Contribution, Layout, Scaling, block_counts
 from rstrack.alignment.normal_equations import Slopes, chain
+from rstrack.alignment.pixel_runs import Pixels
 from rstrack.alignment.student_t import LEAST_CURVATURE, NU, weight
 from rstrack.images import line_poses as lines
 from rstrack.images.line_poses import IDENTITY_FROM_BASE, to_base_table
@@ -218,15 +221,25 @@ def test_blocks_chained_to_control_points_equal_dense_pixel_jacobians(room: tupl
 # -- fixed point ---------------------------------------------------------------------------------------------------
 
 
+def scattered(found: Contribution, size: int) -> Any:
+    """Pixel by pixel."""
+    sums = dr.zeros(ENGINE.Int, size)
+    for k, value in enumerate(found.values):
+        dr.scatter_reduce(dr.ReduceOp.Add, sums, value, found.slot + k, found.compared)
+    return sums
+
+
 def accumulate(
     g: np.ndarray, p: np.ndarray, r: np.ndarray, scaling: Scaling, sigma: float, gate: float
 ) -> tuple[np.ndarray, BlockSums]:
     """All pixels into one block."""
     constants = [ENGINE.Float(float(c)) for c in scaling.parameters(sigma, gate)]
     columns = [ENGINE.upload(c) for c in (*g.T, *p.T, r)]
-    raw = block_sums_module.accumulate(
-        ENGINE, tuple(columns[:3]), tuple(columns[3:6]), -1.0, columns[6], ENGINE.Bool(True), constants,
-        ENGINE.UInt(0), 32,
+    raw = scattered(
+        block_sums_module.contribution(
+            ENGINE, tuple(columns[:3]), tuple(columns[3:6]), -1.0, columns[6], ENGINE.Bool(True), constants,
+            ENGINE.UInt(0),
+        ), 32,
     ).numpy()  # fmt: skip
     return raw, scaling.unpack(raw, 1, 1)
 
@@ -258,6 +271,35 @@ def test_full_blocks_of_the_worst_pixels_do_not_overflow(s: float, length: float
     assert np.abs(raw.astype(np.int64)).max() < 2**31 - 2**24
     # All pixels are rounded alike, by half a unit at most.
     assert_sums(got, want, scaling.median_depth, tuple(count / scaling.parameters(sigma, 1.0)[4:]))
+
+
+@pytest.mark.parametrize(("width", "height", "stride"), [(7, 5, 1), (101, 67, 1), (90, 61, 2), (3, 200, 1)])
+@pytest.mark.parametrize("down", [False, True])
+@pytest.mark.parametrize("run", [1, 3, 40])
+def test_runs_of_pixels_add_up_to_what_pixels_do(
+    monkeypatch: pytest.MonkeyPatch, width: int, height: int, stride: int, down: bool, run: int
+) -> None:
+    monkeypatch.setattr(pixel_runs, "_run", lambda *_: run)
+    rng = np.random.default_rng(width + run)
+    y, x = np.mgrid[:height:stride, :width:stride]
+    # Runs leave blocks at every other step here, stay long there, and some pixels belong to none.
+    block = np.where(x > width // 2, rng.integers(0, 6, x.shape), y // 9 % 6)
+    values, active = rng.integers(-1000, 1000, (2, *x.shape)), rng.random(x.shape) < 0.8
+    want = np.zeros((6, 2), int)
+    np.add.at(want, block[active], np.moveaxis(values * active, 0, -1)[active])
+    arrays = [ENGINE.UInt(2 * block.ravel()), *(ENGINE.Int(v.ravel()) for v in values), ENGINE.Bool(active.ravel())]
+    seen = dr.zeros(ENGINE.Int, width * height)
+
+    def at(pixels: Pixels) -> Contribution:
+        slot, a, b, is_active = (dr.gather(type(array), array, pixels.number) for array in arrays)
+        compared = is_active & pixels.meant
+        dr.scatter_add(seen, ENGINE.Int(1), pixels.y * width + pixels.x, pixels.meant & (pixels.index < len(seen)))
+        return Contribution(slot, tuple(dr.select(compared, v, 0) for v in (a, b)), compared)
+
+    got = pixel_runs.summed(ENGINE, (width, height, stride), Layout(12, 2), at, down, False)
+    assert np.array_equal(got.numpy().reshape(6, 2), want)
+    assert np.array_equal(seen.numpy().reshape(height, width)[::stride, ::stride], np.ones_like(x))
+    assert seen.numpy().sum() == x.size
 
 
 def test_sums_unpack_to_float64_ones() -> None:

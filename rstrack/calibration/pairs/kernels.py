@@ -20,11 +20,12 @@ from rsgen.device.arrays import Engine
 from rsgen.device.lens import Lens
 from rsgen.device.projection import TO_BASE, Sighting, Vector, gather, move, project, project_rolling
 from rsgen.device.recording import recorded_from
-from rstrack.alignment.block_sums import accumulate, block_slot
+from rstrack.alignment.block_sums import Contribution, block_slot, contribution, layout
 from rstrack.alignment.brightness import MID_GREY
+from rstrack.alignment.pixel_runs import Pixels, summed
 from rstrack.alignment.residuals import GeometricInput, evened, plane_distance
 from rstrack.calibration.pairs.optics import Asked, moves, traced, turned_round, unknown_columns, without_error
-from rstrack.images.sampling import cubic_value_and_slope, grid, level_size, surface
+from rstrack.images.sampling import cubic_value_and_slope, level_size, surface
 
 
 @dataclass(frozen=True)
@@ -75,16 +76,16 @@ class Point:
     active: Any
 
 
-def _points(e: Engine, depth: Lens, stride: int, asked: Asked, given: DepthPairInput | ColorPairInput) -> Point:
-    """Of every stride-th pixel of a depth image."""
-    pixel, px, py = grid(e, depth.camera.width, depth.camera.height, stride)
-    z, xn, yn = (dr.gather(e.Float, image, pixel) for image in (given.depth, given.rays_x, given.rays_y))
-    active = z > 0.0
+def _points(e: Engine, depth: Lens, pixels: Pixels, asked: Asked, given: DepthPairInput | ColorPairInput) -> Point:
+    """Of pixels of a depth image."""
+    images = given.depth, given.rays_x, given.rays_y
+    z, xn, yn = (dr.gather(e.Float, image, pixels.index) for image in images)
+    active = pixels.meant & (z > 0.0)
     z = without_error(e, asked, z, xn, yn, given.error)
     q = xn * z, yn * z, z
-    line = e.UInt(depth.line_of(e.Int(px), e.Int(py)))
+    line = e.UInt(depth.line_of(e.Int(pixels.x), e.Int(pixels.y)))
     T_base_cam = gather(given.to_base, line, TO_BASE, stride=TO_BASE)
-    return Point(pixel, line, py, xn, yn, z, q, move(T_base_cam, q), T_base_cam, active)
+    return Point(pixels.index, line, pixels.y, xn, yn, z, q, move(T_base_cam, q), T_base_cam, active)
 
 
 @dataclass(frozen=True)
@@ -104,10 +105,10 @@ class DepthResidual:
     is_smooth: Any
 
 
-def depth_residual(e: Engine, depth: Lens, stride: int, asked: Asked, given: DepthPairInput) -> DepthResidual:
+def depth_residual(e: Engine, depth: Lens, pixels: Pixels, asked: Asked, given: DepthPairInput) -> DepthResidual:
     """Equation (6) with rows' times on both sides."""
     lens = traced(e, depth, given.camera)
-    at = _points(e, depth, stride, asked, given)
+    at = _points(e, depth, pixels, asked, given)
     seen = project_rolling(lens, given.from_base, at.p, e.UInt, e.Int)
     rho, active = surface(e, lens.camera, given.inverse_depth, seen.x, seen.y, at.active & seen.valid)
     if asked.corrects:
@@ -139,7 +140,7 @@ class ColorResidual:
 
 
 def color_residual(
-    e: Engine, color: Lens, depth: Lens, stride: int, level: int, asked: Asked, given: ColorPairInput
+    e: Engine, color: Lens, depth: Lens, pixels: Pixels, level: int, asked: Asked, given: ColorPairInput
 ) -> ColorResidual:
     """Intensities of the level, the reference's with the gain and offset that the current image has."""
     width, height = level_size(color.camera.width, level), level_size(color.camera.height, level)
@@ -151,7 +152,7 @@ def color_residual(
         return value, seen.chain(dx * shrink, dy * shrink, 0.0), active
 
     lens = traced(e, color, given.camera)
-    at = _points(e, depth, stride, asked, given)
+    at = _points(e, depth, pixels, asked, given)
     here = project_rolling(lens, given.from_base, at.p, e.UInt, e.Int)
     there = project_rolling(lens, given.ref_from_base, at.p, e.UInt, e.Int)
     value, own, active = looked_up(given.image, here, at.active)
@@ -169,13 +170,19 @@ def depth_pair_kernel(e: Engine, depth: Lens, stride: int, asked: Asked) -> Call
     @recorded_from(DepthPairInput)
     def kernel(given: DepthPairInput) -> Any:
         parameters = [dr.gather(e.Float, given.constants, e.UInt(i)) for i in range(7)]
-        of = depth_residual(e, depth, stride, asked, given)
-        at, seen, columns = of.at, of.seen, []
-        if names:
-            here, there = (moves(names, of.lens.camera, one) for one in (project(of.lens.camera, at.q), seen.at))
-            columns = unknown_columns(e, of.g, zip(there, here, strict=True), seen.M, at.T_base_cam, given.constants)
-        slot, size = block_slot(at.line, seen.row, depth, depth, at.row, len(names))
-        return accumulate(e, of.g, at.p, 1.0, of.r, of.active, parameters, slot, size, columns, of.is_smooth)
+
+        def at(pixels: Pixels) -> Contribution:
+            of = depth_residual(e, depth, pixels, asked, given)
+            point, seen, columns = of.at, of.seen, []
+            if names:
+                own = project(of.lens.camera, point.q), seen.at
+                here, there = (moves(names, of.lens.camera, one) for one in own)
+                shifts = zip(there, here, strict=True)
+                columns = unknown_columns(e, of.g, shifts, seen.M, point.T_base_cam, given.constants)
+            slot = block_slot(point.line, seen.row, depth, depth, point.row, len(names))
+            return contribution(e, of.g, point.p, 1.0, of.r, of.active, parameters, slot, columns, of.is_smooth)
+
+        return _summed(e, depth, depth, stride, len(names), at)
 
     return kernel
 
@@ -192,15 +199,25 @@ def color_pair_kernel(
     @recorded_from(ColorPairInput)
     def kernel(given: ColorPairInput) -> Any:
         parameters = [dr.gather(e.Float, given.constants, e.UInt(i)) for i in range(7)]
-        of = color_residual(e, color, depth, stride, level, asked, given)
-        here, there, columns = of.here, of.there, []
-        a, b, c = (0.5 * dr.fma(1.0 + of.gain, two, one) for one, two in zip(of.own, of.other, strict=True))
-        if names:
-            pairs = zip(*(moves(names, of.lens.camera, seen.at) for seen in (here, there)), strict=True)
-            columns = unknown_columns(e, (a, b, c), pairs, here.M, turned_round(there.M), given.constants)
-        columns += [-of.contrast, e.Float(-1.0)]
-        slot, size = block_slot(here.row, there.row, color, color, here.y, len(columns))
-        # A twist of the camera moves the point the other way.
-        return accumulate(e, (a, b, c), of.p, -1.0, of.r, of.active, parameters, slot, size, columns)
+
+        def at(pixels: Pixels) -> Contribution:
+            of = color_residual(e, color, depth, pixels, level, asked, given)
+            here, there, columns = of.here, of.there, []
+            a, b, c = (0.5 * dr.fma(1.0 + of.gain, two, one) for one, two in zip(of.own, of.other, strict=True))
+            if names:
+                pairs = zip(*(moves(names, of.lens.camera, seen.at) for seen in (here, there)), strict=True)
+                columns = unknown_columns(e, (a, b, c), pairs, here.M, turned_round(there.M), given.constants)
+            columns += [-of.contrast, e.Float(-1.0)]
+            slot = block_slot(here.row, there.row, color, color, here.y, len(columns))
+            # A twist of the camera moves the point the other way.
+            return contribution(e, (a, b, c), of.p, -1.0, of.r, of.active, parameters, slot, columns)
+
+        return _summed(e, depth, color, stride, len(names) + 2, at)
 
     return kernel
+
+
+def _summed(e: Engine, depth: Lens, lens: Lens, stride: int, columns: int, at: Callable[[Pixels], Contribution]) -> Any:
+    """Sums over a depth image's pixels, in blocks of a lens's lines."""
+    shape = depth.camera.width, depth.camera.height, stride
+    return summed(e, shape, layout(lens, lens, columns), at, not lens.shutter.by_rows, False)

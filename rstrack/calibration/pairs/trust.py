@@ -19,6 +19,7 @@ from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rstrack.alignment.block_sums import Scaling
 from rstrack.alignment.brightness import SAME
+from rstrack.alignment.pixel_runs import Pixels, every
 from rstrack.calibration.pairs.images import Lines, lines_of
 from rstrack.calibration.pairs.kernels import color_residual, depth_residual
 from rstrack.calibration.pairs.optics import turn
@@ -64,7 +65,7 @@ def _by_depth(
     e, surface = terms.e, ref.surface
     tables = lines[0].to_base(T_base_world), lines[1].from_base(T_base_world)
     given = terms.depth_input(current.z, surface, *tables, terms.optics(p), np.inf, _scaling(surface))
-    of = depth_residual(e, terms.depth, terms.stride(0), terms.asked, given)
+    of = depth_residual(e, terms.depth, _pixels(terms), terms.asked, given)
     at, own = of.at, (current.surface.slope_x, current.surface.slope_y)
     own_x, own_y = (dr.gather(e.Float, slope, at.pixel) for slope in own)
     own_z = 1.0 / at.z - own_x * at.xn - own_y * at.yn
@@ -82,8 +83,13 @@ def _by_color(
     tables = lines[0].to_base(T_base_world), lines[1].from_base(T_base_world), lines[2].from_base(T_base_world)
     images, scaling = (current.levels[0], ref.levels[0]), _scaling(ref.surface)
     given = terms.color_input(images, ref.surface, tables, terms.optics(p), SAME, sigma, scaling)
-    of = color_residual(terms.e, terms.color, terms.depth, terms.stride(0), 0, terms.asked, given)
+    of = color_residual(terms.e, terms.color, terms.depth, _pixels(terms), 0, terms.asked, given)
     return _twists(of.p, of.own, of.other, of.active & (abs(of.r) < GATE_INTENSITY), sigma)
+
+
+def _pixels(terms: PairTerms) -> Pixels:
+    camera = terms.depth.camera
+    return every(terms.e, camera.width, camera.height, terms.stride(0))
 
 
 def _scaling(surface: Surface) -> Scaling:
