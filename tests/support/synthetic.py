@@ -82,7 +82,8 @@ def pixel_rays(
     """Origins and directions (h, w, 3) in the world of all pixels' rays, planar z = ray parameter."""
     uv = camera.pixel_grid()
     t = shutter.line_mid_time(stamp, shutter.line_of_pixel(uv, camera), camera)
-    T_world_cam = spline.pose(t) @ se3.inverse(T_cam_body)
+    times, line = np.unique(t, return_inverse=True)
+    T_world_cam = (spline.pose(times) @ se3.inverse(T_cam_body))[line.reshape(t.shape)]
     return T_world_cam[..., :3, 3], np.einsum("...ij,...j->...i", T_world_cam[..., :3, :3], camera.unproject(uv))
 
 
