@@ -14,7 +14,8 @@ import os
 import struct
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,22 @@ def atomic_write(path: Path, data: bytes) -> None:
             raise
     except OSError as error:
         raise write_error(path, error) from None
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A name beside `path`, of the same suffix, for libraries that write files themselves.
+
+    Once the block ends well, what was written there is at `path`; else it is deleted. Raises UserError for an OSError.
+    """
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    try:
+        yield temporary
+        temporary.replace(path)
+    except OSError as error:
+        raise write_error(path, error) from None
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def write_error(path: Path, error: OSError) -> UserError:

@@ -53,8 +53,9 @@ def test_there_is_something_to_check() -> None:
         "rsgen.motion.fit_summary", "rsgen.device.backend", "rsgen.console.scheduler", "rsgen.produce.distribute",
         "rsgen.produce.generate", "rsgen.produce.frame_source", "rsgen.pictures.frames", "rsgen.cli.main",
         "rsgen.motion.make", "rsgen.sensors.color", "rsgen.sensors.depth", "rsgen.sensors.imu", "rsgen.config.truth",
-        "rsgen.export.kalibr", "rsgen.export.euroc", "rsgen.export.registered", "rsgen.export.video",
-        "rsgen.export.ros", "rsgen.export.colmap", "rsgen.export.nerfstudio",
+        "rsgen.export.folders.kalibr", "rsgen.export.folders.euroc", "rsgen.export.folders.registered",
+        "rsgen.export.viewing.video", "rsgen.export.bags.ros", "rsgen.export.reconstruction.colmap",
+        "rsgen.export.reconstruction.nerfstudio",
     ],
 )  # fmt: skip
 def test_no_engine_is_loaded_where_nothing_is_rendered(module: str) -> None:

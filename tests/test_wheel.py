@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
+import ast
 import os
+import re
 import subprocess
 import sys
+import tomllib
 import zipfile
+from importlib.metadata import PathDistribution
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import yaml
 
 from rsgen.config.config import load_config
 from rsgen.console.configs import config_file, configs_folder
 
 ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+# Packages whose modules have another name, and what comes with a package that is named.
+PACKAGES = {
+    "PIL": "pillow", "cv2": "opencv-python-headless", "skimage": "scikit-image", "yaml": "PyYAML", "rerun": "rerun-sdk",
+    "bpy": "bpy", "mathutils": "bpy", "pxr": "usd-core", "liblzfse": "pyliblzfse", "dask": "distributed",
+    "apsw": "rosbags", "lz4": "rosbags", "markupsafe": "jinja2",
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -79,3 +91,53 @@ def test_a_file_goes_before_a_name_and_another_name_is_taken_for_a_file(
     (tmp_path / "demo").write_text("name: mine")
     assert config_file("demo") == Path("demo") and config_file("none") == Path("none")
     assert config_file("table1") == ROOT / "configs/table1.yaml"  # a folder is no config
+
+
+def requirement(text: str) -> str:
+    return re.split(r"[^\w.-]", text)[0].lower()
+
+
+def modules(path: Path) -> set[str]:
+    """Packages that a file imports, by statement or by `import_module` of a constant."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found.add(node.module or "")
+        elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
+            name = getattr(node.func, "attr", getattr(node.func, "id", ""))
+            found |= {str(node.args[0].value)} if name == "import_module" else set()
+    return {name.partition(".")[0] for name in found} - sys.stdlib_module_names - {"rsgen", "rstrack", ""}
+
+
+def test_all_that_is_imported_is_required_or_an_extra() -> None:
+    extras = {name: parts for name, parts in PROJECT["optional-dependencies"].items() if name not in ("test", "docs")}
+    known = {requirement(text) for text in (*PROJECT["dependencies"], *(part for e in extras.values() for part in e))}
+    files = [path for folder in ("rsgen", "rstrack", "docs/examples") for path in (ROOT / folder).rglob("*.py")]
+    used = {name for path in files for name in modules(path)}
+    assert {"rosbags", "pyrealsense2", "pxr"} < used
+    assert not {name for name in used if PACKAGES.get(name, name).lower() not in known}
+
+
+def test_the_wheel_offers_the_extras_that_are_named(site: Path) -> None:
+    found = PathDistribution(next(site.glob("*.dist-info"))).metadata
+    extras = set(found.get_all("Provides-Extra") or ())
+    assert extras == set(PROJECT["optional-dependencies"])
+    texts = [
+        *(ROOT / "docs").rglob("*.md"),
+        *(p for f in ("rsgen", "rstrack", "docs") for p in (ROOT / f).rglob("*.py")),
+    ]
+    named = {x for p in texts for group in re.findall(r"rgbd\[([\w,]+)\]", p.read_text()) for x in group.split(",")}
+    assert len(named) > 5 and named <= extras
+    assert found["Version"] == PROJECT["version"]
+
+
+def test_what_is_to_be_cited_is_this_version() -> None:
+    cited = yaml.safe_load((ROOT / "docs/CITATION.cff").read_text())
+    assert cited["cff-version"] == "1.2.0" and {"message", "title", "authors"} <= set(cited)
+    assert cited["version"] == PROJECT["version"] and cited["license"] == PROJECT["license"]
+    told = re.findall(r"^## \[(\d+\.\d+\.\d+)\] - (\d{4}-\d\d-\d\d)$", (ROOT / "docs/CHANGELOG.md").read_text(), re.M)
+    assert told[0] == (PROJECT["version"], str(cited["date-released"]))
+    numbers = [tuple(map(int, version.split("."))) for version, _ in told]
+    assert numbers == sorted(set(numbers), reverse=True) and numbers[-1] == (0, 1, 0)

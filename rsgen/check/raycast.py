@@ -65,7 +65,7 @@ def _caster(path: Path) -> Any:
     try:
         from trimesh.ray.ray_pyembree import RayMeshIntersector
     except ImportError:
-        raise UserError("ray casting needs embreex: pip install embreex") from None
+        raise UserError("ray casting needs embreex: pip install 'rolling-shutter-rgbd[raycast]'") from None
     try:
         return RayMeshIntersector(trimesh.load(path, process=False, force="mesh"))
     except Exception as error:

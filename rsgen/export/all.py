@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from rsgen.console.progress import Progress
-from rsgen.export.ros_bag import Storage
+from rsgen.export.bags.bag import Storage
 from rsgen.sequence.reader import Sequence, read_sequence
 
 Export = Literal[
@@ -27,38 +27,38 @@ def export(
     """
     sequence = read_sequence(path)
     if to == "kalibr":
-        from rsgen.export.kalibr import export_kalibr
+        from rsgen.export.folders.kalibr import export_kalibr
 
         return export_kalibr(sequence, out or path / "kalibr", copy, progress)
     if to == "euroc":
-        from rsgen.export.euroc import export_euroc
+        from rsgen.export.folders.euroc import export_euroc
 
         return export_euroc(sequence, out or path, copy, progress=progress)
     if to == "registered":
-        from rsgen.export.registered import export_registered
+        from rsgen.export.folders.registered import export_registered
 
         return export_registered(sequence, out or path / "registered", copy, progress)
     if to == "ros1" or to == "ros2" or to == "mcap":
-        from rsgen.export.ros import export_ros
+        from rsgen.export.bags.ros import export_ros
 
         return export_ros(sequence, out or path / _BAGS[to].format(sequence.name), to, storage, progress)
     if to == "colmap":
-        from rsgen.export.colmap import export_colmap
+        from rsgen.export.reconstruction.colmap import export_colmap
 
         return export_colmap(sequence, out or path / "colmap", copy, progress)
     if to == "nerfstudio":
-        from rsgen.export.nerfstudio import export_nerfstudio
+        from rsgen.export.reconstruction.nerfstudio import export_nerfstudio
 
         return export_nerfstudio(sequence, out or path / "nerfstudio", copy, progress)
     if to == "rerun":
-        from rsgen.export.rerun import export_rerun
+        from rsgen.export.viewing.rerun import export_rerun
 
         return export_rerun(sequence.as_taken, out or path / f"{sequence.name}.rrd", progress)
     return _export_video(sequence.as_taken, out or path / "shutter.mp4", scene, progress)
 
 
 def _export_video(sequence: Sequence, out: Path, scene: Path | None, progress: Progress) -> str:
-    from rsgen.export.video import write_video
+    from rsgen.export.viewing.video import write_video
     from rsgen.pictures.frames import config_of
     from rsgen.produce.frame_source import FrameSource, setting_of
 

@@ -24,6 +24,7 @@ from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
 
 FORMAT = "rsgen-sequence/1"
+_FORMAT_NAME = FORMAT.partition("/")[0] + "/"
 StreamName = Literal["color", "depth"]
 STREAMS: tuple[StreamName, StreamName] = ("color", "depth")
 FOLDERS: dict[StreamName, str] = {"color": "rgb", "depth": "depth"}
@@ -157,7 +158,10 @@ def read_sequence_yaml(path: Path) -> tuple[SequenceYaml, dict[str, Any]]:
     """sequence.yaml, validated and as it is. Raises UserError naming the wrong field."""
     data = read_yaml(path)
     if data.get("format") != FORMAT:
-        raise UserError(f"{path}: format is {data.get('format')!r}, this version of rsgen reads {FORMAT!r}")
+        found = data.get("format")
+        newer = isinstance(found, str) and found.startswith(_FORMAT_NAME)
+        cure = "install a newer rsgen" if newer else f"is this a sequence of rsgen? It begins with 'format: {FORMAT}'"
+        raise UserError(f"{path}: format is {found!r}, this version of rsgen reads {FORMAT!r}: {cure}")
     try:
         return SequenceYaml.model_validate(data), data
     except ValidationError as error:

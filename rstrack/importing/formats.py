@@ -5,14 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 from rsgen.errors import UserError
-from rstrack.importing.bag import is_bag
-from rstrack.importing.euroc import is_euroc, read_euroc
-from rstrack.importing.record3d import is_r3d, read_r3d
+from rstrack.importing.bags.bag import is_bag
+from rstrack.importing.bags.ros import read_bag
+from rstrack.importing.bags.topics import Named
+from rstrack.importing.datasets.euroc import is_euroc, read_euroc
+from rstrack.importing.datasets.scannet import is_sens, read_sens
+from rstrack.importing.phones.record3d import is_r3d, read_r3d
+from rstrack.importing.phones.stray_scanner import is_stray_scanner, read_stray_scanner
 from rstrack.importing.recording import Recording
-from rstrack.importing.ros import read_bag
-from rstrack.importing.scannet import is_sens, read_sens
-from rstrack.importing.stray_scanner import is_stray_scanner, read_stray_scanner
-from rstrack.importing.topics import Named
 
 _KNOWN = (
     "a ROS 1 or ROS 2 bag, an MCAP file, what librealsense recorded, a .sens or .r3d file, or a folder of Stray "

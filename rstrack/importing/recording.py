@@ -8,6 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
 from rsgen.array_types import FloatArray
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan
@@ -49,6 +53,16 @@ class Pose:
 
     stamp_ns: int
     T_world_color: FloatArray
+
+
+def pose_of(q: npt.ArrayLike, t: npt.ArrayLike) -> FloatArray:
+    """(4, 4) of a quaternion x y z w and a translation in metres; NaN where the quaternion is none."""
+    q = np.asarray(q, float)
+    if not (np.isfinite(q).all() and np.isfinite(t).all()) or abs(np.linalg.norm(q) - 1.0) > 1e-2:
+        return np.full((4, 4), np.nan)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_quat(q).as_matrix(), t
+    return T
 
 
 @dataclass(frozen=True)

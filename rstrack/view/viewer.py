@@ -10,7 +10,6 @@ times a second, so that the tracker hardly waits.
 from __future__ import annotations
 
 import importlib
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -22,7 +21,7 @@ import numpy as np
 
 from rsgen.array_types import ByteArray, FloatArray
 from rsgen.errors import UserError
-from rsgen.files import write_error
+from rsgen.files import whole_file, write_error
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.data.rig import Frame, Image, Rig
@@ -66,23 +65,18 @@ def open_view(file: Path | None, rig: Rig, name: str) -> Iterator[Viewer]:
         raise UserError(f"--view {file}: a rerun recording is named .rrd")
     if file.exists():
         raise UserError(f"--view {file}: is there already: choose another name or delete it")
-    temporary = file.with_name(f".{file.stem}.{os.getpid()}.tmp.rrd")
     recording = rr.RecordingStream("rstrack", recording_id=name)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise write_error(file, error) from None
-    try:
-        recording.save(temporary)
-        yield Viewer(rr, recording, rig)
-        recording.flush()
-        recording.disconnect()
-        temporary.replace(file)
-    except OSError as error:
-        raise write_error(file, error) from None
-    finally:
-        recording.disconnect()
-        temporary.unlink(missing_ok=True)
+    with whole_file(file) as temporary:
+        try:
+            recording.save(temporary)
+            yield Viewer(rr, recording, rig)
+            recording.flush()
+        finally:
+            recording.disconnect()
 
 
 def _rerun() -> Any:

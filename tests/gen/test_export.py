@@ -23,12 +23,12 @@ from rsgen.config.config import Config
 from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
 from rsgen.export import folder
-from rsgen.export.euroc import export_euroc
 from rsgen.export.folder import place_images, row_clock, sequence_imu
-from rsgen.export.kalibr import export_kalibr
-from rsgen.export.registered import export_registered
-from rsgen.export.rerun import export_rerun
-from rsgen.export.video import write_video
+from rsgen.export.folders.euroc import export_euroc
+from rsgen.export.folders.kalibr import export_kalibr
+from rsgen.export.folders.registered import export_registered
+from rsgen.export.viewing.rerun import export_rerun
+from rsgen.export.viewing.video import write_video
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter
@@ -488,7 +488,10 @@ def test_the_exported_imu_is_that_of_the_sequences_own_file(tmp_path: Path) -> N
 
 
 def test_the_exports_load_no_engine() -> None:
-    names = [f"rsgen.export.{name}" for name in ("kalibr", "euroc", "registered", "video", "rerun")]
+    names = [
+        f"rsgen.export.{name}"
+        for name in ("folders.kalibr", "folders.euroc", "folders.registered", "viewing.video", "viewing.rerun")
+    ]
     modules = ", ".join(["sys", "rsgen.sensors.imu", *names])
     code = f"import {modules}; print(*({{'mitsuba', 'drjit', 'rerun'}} & set(sys.modules)))"
     root = Path(__file__).parents[2]

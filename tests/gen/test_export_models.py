@@ -15,10 +15,10 @@ import trimesh
 from scipy.spatial.transform import Rotation, Slerp
 
 from rsgen.errors import UserError
-from rsgen.export.aligned import NOTHING
-from rsgen.export.approximation import Loss, sightings
-from rsgen.export.colmap import camera_line, export_colmap
-from rsgen.export.nerfstudio import export_nerfstudio, ngp_rolling_shutter
+from rsgen.export.poses.approximation import Loss, sightings
+from rsgen.export.reconstruction.aligned import NOTHING
+from rsgen.export.reconstruction.colmap import camera_line, export_colmap
+from rsgen.export.reconstruction.nerfstudio import export_nerfstudio, ngp_rolling_shutter
 from rsgen.files import read_png
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera

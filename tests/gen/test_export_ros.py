@@ -16,10 +16,10 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation, Slerp
 
 from rsgen.errors import UserError
-from rsgen.export import ros_bag
+from rsgen.export.bags import bag
+from rsgen.export.bags.bag import Kind, Storage
+from rsgen.export.bags.ros import export_ros, loss_of_tf
 from rsgen.export.folder import sequence_imu
-from rsgen.export.ros import export_ros, loss_of_tf
-from rsgen.export.ros_bag import Kind, Storage
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.spline import Spline
@@ -271,7 +271,7 @@ def test_without_rosbags_and_before_time_0(sequence: Sequence, tmp_path: Path, m
     def absent(name: str) -> None:
         raise ImportError(name)
 
-    monkeypatch.setattr(ros_bag.importlib, "import_module", absent)
+    monkeypatch.setattr(bag.importlib, "import_module", absent)
     with pytest.raises(UserError, match="pip install rosbags"):
         export_ros(sequence, tmp_path / "a.bag", "ros1")
     assert not list(tmp_path.iterdir())

@@ -225,3 +225,18 @@ def test_wrong_arrays_are_not_encoded() -> None:
     for encode, image in ((files.encode_png, Z), (files.encode_png, RGB[..., :2]), (files.encode_exr, Z.astype(float))):
         with pytest.raises(ValueError, match="written from"):
             encode(image)
+
+
+def test_what_a_library_writes_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
+    out = tmp_path / "a.rrd"
+    with pytest.raises(ValueError, match="midway"), files.whole_file(out) as temporary:
+        temporary.write_bytes(b"half")
+        assert temporary.suffix == ".rrd" and temporary.parent == tmp_path
+        raise ValueError("midway")
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(UserError, match=r"a\.rrd: cannot be written"), files.whole_file(out):
+        raise OSError(28, "No space left on device")
+    with files.whole_file(out) as temporary:
+        temporary.write_bytes(b"whole")
+        assert not out.exists()
+    assert out.read_bytes() == b"whole" and list(tmp_path.iterdir()) == [out]

@@ -7,7 +7,6 @@ the pose in the middle of their readout.
 from __future__ import annotations
 
 import importlib
-import os
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.export.folder import image_streams, sequence_imu
-from rsgen.files import read_bytes, write_error
+from rsgen.files import read_bytes, whole_file
 from rsgen.geometry import se3
 from rsgen.sequence.format import ground_truth
 from rsgen.sequence.reader import Sequence, Stream
@@ -41,19 +40,14 @@ def export_rerun(sequence: Sequence, out: Path, progress: Progress = no_progress
         raise UserError(f"{out}: is there already: choose another --out or delete it")
     if not out.parent.is_dir():
         raise UserError(f"{out.parent}: no such folder: make it or choose another --out")
-    temporary = out.with_name(f".{out.stem}.{os.getpid()}.tmp.rrd")
     recording = rr.RecordingStream("rsgen", recording_id=sequence.name)
-    try:
-        recording.save(temporary)
-        _log(rr, recording, sequence, progress)
-        recording.flush()
-        recording.disconnect()
-        temporary.replace(out)
-    except OSError as error:
-        raise write_error(out, error) from None
-    finally:
-        recording.disconnect()
-        temporary.unlink(missing_ok=True)
+    with whole_file(out) as temporary:
+        try:
+            recording.save(temporary)
+            _log(rr, recording, sequence, progress)
+            recording.flush()
+        finally:
+            recording.disconnect()
     return f"{out}: {out.stat().st_size / 1e6:.1f} MB, open it with 'rerun {out.name}'"
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from rsgen.export.approximation import Loss, exposures
+from rsgen.export.poses.approximation import Loss, exposures
 from rsgen.sensors.imu import nanoseconds
 from rsgen.sequence.reader import Sequence, Stream
 

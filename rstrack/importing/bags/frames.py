@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
-from rstrack.importing.bag import Bag
+from rstrack.importing.bags.bag import Bag
 
 _TF = "tf2_msgs/TFMessage"
 _OLD_TF = "tf/tfMessage"

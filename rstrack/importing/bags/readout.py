@@ -10,16 +10,15 @@ from __future__ import annotations
 import json
 import re
 from itertools import islice
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
-from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
-from rsgen.geometry.shutter import Scan
 from rsgen.sequence.format import StreamName
-from rstrack.importing.bag import Bag
+from rstrack.importing.bags.bag import Bag
 from rstrack.importing.recording import StreamCamera
+from rstrack.importing.shutter import with_shutter
 
 _METADATA = ("diagnostic_msgs/KeyValue", "std_msgs/String")
 _SKEW = re.compile(r"(android\.sensor\.|sensor)?rollingshutterskew(ns)?")
@@ -40,18 +39,6 @@ def stated_shutter(bag: Bag, image: str, stream: StreamName, camera: Camera) -> 
             if isinstance(own, dict):
                 return with_shutter(f"{bag.path}: {topic}", camera, own)
     return StreamCamera(camera, rolling_shutter_skew(bag, image))
-
-
-def with_shutter(where: str, camera: Camera, facts: dict[str, Any]) -> StreamCamera:
-    """A camera with the shutter of an entry `rolling_shutter` as `rsgen export` writes it.
-
-    Raises UserError naming `where`: times that are none, or an unknown scan.
-    """
-    times = [facts.get(name, 0.0) for name in ("readout_s", "exposure_s")]
-    scan: Scan = facts.get("scan", "top-bottom")
-    if not all(isinstance(t, int | float) and 0 <= t < 10 for t in times) or scan not in get_args(Scan):
-        raise UserError(f"{where}: rolling_shutter needs readout_s and exposure_s in seconds, and a scan")
-    return StreamCamera(camera, float(times[0]), float(times[1]), scan)
 
 
 def rolling_shutter_skew(bag: Bag, image: str) -> float | None:

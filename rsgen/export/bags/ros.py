@@ -23,10 +23,10 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
-from rsgen.export.approximation import Loss, between, loss_of_poses, sightings
+from rsgen.export.bags.bag import TF, Bag, Kind, Storage, new_bag
 from rsgen.export.folder import image_streams, sequence_imu
-from rsgen.export.ros_bag import TF, Bag, Kind, Storage, new_bag
-from rsgen.export.shutter_facts import loss_words, shutter_facts
+from rsgen.export.poses.approximation import Loss, between, loss_of_poses, sightings
+from rsgen.export.poses.shutter_facts import loss_words, shutter_facts
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import nanoseconds

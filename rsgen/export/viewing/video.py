@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import numpy as np
 from rsgen.array_types import ByteArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
-from rsgen.files import write_error
+from rsgen.files import whole_file
 
 # Encoders that OpenCV's own wheels bring along.
 _CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
@@ -42,14 +41,8 @@ def write_video(
         raise UserError(f"{path}: is there already: choose another --out or delete it")
     if not path.parent.is_dir():
         raise UserError(f"{path.parent}: no such folder: make it or choose another --out")
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
-    try:
+    with whole_file(path) as temporary:
         written = _write(temporary, path, zip(frames_left, frames_right, strict=True), fps, labels, count, progress)
-        temporary.replace(path)
-    except OSError as error:
-        raise write_error(path, error) from None
-    finally:
-        temporary.unlink(missing_ok=True)
     return f"{path}: {written} frames at {fps:g} Hz, {labels[0]} left and {labels[1]} right"
 
 

@@ -14,10 +14,10 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
-from rsgen.export.approximation import Loss, loss_of_poses, poses_of_line, sightings
 from rsgen.export.folder import make_folders, new_folder, place_images
-from rsgen.export.shutter_facts import loss_words, shutter_facts
-from rsgen.export.surface_points import SurfacePoints, surface_points
+from rsgen.export.poses.approximation import Loss, loss_of_poses, poses_of_line, sightings
+from rsgen.export.poses.shutter_facts import loss_words, shutter_facts
+from rsgen.export.poses.surface_points import SurfacePoints, surface_points
 from rsgen.files import atomic_write, read_bytes
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera

@@ -8,25 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
-from rsgen.array_types import FloatArray
 from rsgen.geometry.camera import Camera
 from rstrack.importing.lens import camera_of
 
 TRUTH = "ARKit's poses, from the same images and the phone's IMU"
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """T_arkit_camera: coordinates of our camera in ARKit's."""
-
-
-def pose_of(q: npt.ArrayLike, t: npt.ArrayLike) -> FloatArray:
-    """(4, 4) of a quaternion x y z w and a translation in metres; NaN where the quaternion is none."""
-    q = np.asarray(q, float)
-    if not (np.isfinite(q).all() and np.isfinite(t).all()) or abs(np.linalg.norm(q) - 1.0) > 1e-2:
-        return np.full((4, 4), np.nan)
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.from_quat(q).as_matrix(), t
-    return T
 
 
 def median_camera(name: str, size: tuple[int, int], intrinsics: npt.ArrayLike) -> Camera:

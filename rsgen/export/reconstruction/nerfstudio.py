@@ -21,8 +21,8 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
-from rsgen.export.aligned import aligned_depth
-from rsgen.export.approximation import (
+from rsgen.export.folder import make_folders, new_folder, place_images
+from rsgen.export.poses.approximation import (
     Loss,
     between,
     blur_centres,
@@ -32,10 +32,10 @@ from rsgen.export.approximation import (
     poses_of_line,
     sightings,
 )
-from rsgen.export.colmap import ONE_POSE, PIXEL_SHIFT, middle_line, write_shutter_files
-from rsgen.export.folder import make_folders, new_folder, place_images
-from rsgen.export.shutter_facts import loss_words
-from rsgen.export.surface_points import SurfacePoints, surface_points
+from rsgen.export.poses.shutter_facts import loss_words
+from rsgen.export.poses.surface_points import SurfacePoints, surface_points
+from rsgen.export.reconstruction.aligned import aligned_depth
+from rsgen.export.reconstruction.colmap import ONE_POSE, PIXEL_SHIFT, middle_line, write_shutter_files
 from rsgen.files import atomic_write
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera

@@ -16,9 +16,18 @@ from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.files import encode_png
 from rsgen.geometry.camera import Camera
-from rstrack.importing.arkit import FLIP, TRUTH, median_camera, pose_of, resized
+from rstrack.importing.phones.arkit import FLIP, TRUTH, median_camera, resized
 from rstrack.importing.pixels import compressed_color, header_size, units_of_metres
-from rstrack.importing.recording import FLOAT_DEPTH_SCALE, Intrinsics, Item, Picture, Pose, Recording, StreamCamera
+from rstrack.importing.recording import (
+    FLOAT_DEPTH_SCALE,
+    Intrinsics,
+    Item,
+    Picture,
+    Pose,
+    Recording,
+    StreamCamera,
+    pose_of,
+)
 
 _NAME = re.compile(r"rgbd/(\d{1,9})\.(jpg|depth|conf)")
 # A file in the zip that unpacks to more is refused: they hold a photograph or 200 kB of depth.

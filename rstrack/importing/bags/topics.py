@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from rsgen.errors import UserError
-from rstrack.importing.bag import Bag
+from rstrack.importing.bags.bag import Bag
 
 IMAGE, COMPRESSED, INFO, IMU = (
     "sensor_msgs/Image", "sensor_msgs/CompressedImage", "sensor_msgs/CameraInfo", "sensor_msgs/Imu",

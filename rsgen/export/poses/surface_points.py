@@ -8,7 +8,7 @@ import numpy as np
 
 from rsgen.array_types import ByteArray, FloatArray, IntArray
 from rsgen.console.progress import Progress
-from rsgen.export.approximation import blur_centres, exact_points
+from rsgen.export.poses.approximation import blur_centres, exact_points
 from rsgen.geometry import se3
 from rsgen.geometry.shutter import project_rolling
 from rsgen.sequence.reader import Sequence

@@ -20,11 +20,10 @@ from rsgen.files import listed_file, read_bytes, read_text, read_yaml
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.limits import rigid
-from rstrack.importing.arkit import pose_of
 from rstrack.importing.lens import camera_of
 from rstrack.importing.pixels import compressed_color, compressed_depth
-from rstrack.importing.readout import with_shutter
-from rstrack.importing.recording import Inertial, Item, Picture, Pose, Recording, StreamCamera
+from rstrack.importing.recording import Inertial, Item, Picture, Pose, Recording, StreamCamera, pose_of
+from rstrack.importing.shutter import with_shutter
 
 _MILLIMETRES = 1000.0
 _TRUTH = "state_groundtruth_estimate0"

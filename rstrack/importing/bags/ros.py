@@ -11,15 +11,12 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
-from rstrack.importing import realsense
-from rstrack.importing.bag import Bag, Message, open_bag
-from rstrack.importing.frames import between
-from rstrack.importing.lens import camera_of
-from rstrack.importing.messages import inertial, nanoseconds, picture_of
-from rstrack.importing.pixels import is_float_depth
-from rstrack.importing.readout import stated_shutter
-from rstrack.importing.recording import FLOAT_DEPTH_SCALE, Item, Picture, Recording
-from rstrack.importing.topics import (
+from rstrack.importing.bags import realsense
+from rstrack.importing.bags.bag import Bag, Message, open_bag
+from rstrack.importing.bags.frames import between
+from rstrack.importing.bags.messages import inertial, nanoseconds, picture_of
+from rstrack.importing.bags.readout import stated_shutter
+from rstrack.importing.bags.topics import (
     Named,
     base_of,
     find_color,
@@ -29,6 +26,9 @@ from rstrack.importing.topics import (
     is_rectified,
     is_registered,
 )
+from rstrack.importing.lens import camera_of
+from rstrack.importing.pixels import is_float_depth
+from rstrack.importing.recording import FLOAT_DEPTH_SCALE, Item, Picture, Recording
 
 _MILLIMETRES = 1000.0
 

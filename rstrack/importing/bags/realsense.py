@@ -25,12 +25,12 @@ from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
-from rstrack.importing.bag import Bag, Message, open_bag
-from rstrack.importing.frames import transform_of
+from rstrack.importing.bags.bag import Bag, Message, open_bag
+from rstrack.importing.bags.frames import transform_of
+from rstrack.importing.bags.messages import inertial, nanoseconds, picture_of
+from rstrack.importing.bags.topics import COMPRESSED, IMAGE, IMU, Named, listed
 from rstrack.importing.lens import camera_of
-from rstrack.importing.messages import inertial, nanoseconds, picture_of
 from rstrack.importing.recording import Item, Picture, Recording, StreamCamera
-from rstrack.importing.topics import COMPRESSED, IMAGE, IMU, Named, listed
 
 _DATA = re.compile(
     r"(/device_\d+/sensor_\d+/(Depth|Color|Gyro|Accel)_\d+)/(?:image|imu)/data(?:/compressed|/compressedDepth)?"

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from rsgen.geometry.camera import Camera
-from rstrack.importing.bag import Message
+from rstrack.importing.bags.bag import Message
 from rstrack.importing.pixels import color_png, compressed_color, compressed_depth, depth_png
 from rstrack.importing.recording import Inertial
 

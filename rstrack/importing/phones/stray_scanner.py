@@ -20,9 +20,9 @@ from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.files import encode_png, png_fault, read_bytes, read_text
 from rsgen.geometry.camera import Camera
-from rstrack.importing.arkit import TRUTH, median_camera, pose_of, resized
+from rstrack.importing.phones.arkit import TRUTH, median_camera, resized
 from rstrack.importing.pixels import check_size, decode, header_size
-from rstrack.importing.recording import Inertial, Intrinsics, Item, Picture, Pose, Recording, StreamCamera
+from rstrack.importing.recording import Inertial, Intrinsics, Item, Picture, Pose, Recording, StreamCamera, pose_of
 
 _MILLIMETRES = 1000.0
 _POSE, _INTRINSICS = ("x", "y", "z", "qx", "qy", "qz", "qw"), ("fx", "fy", "cx", "cy")

@@ -1,0 +1,1 @@
+"""Layouts of calibration and odometry: Kalibr, EuRoC/ASL, and registered TUM folders."""

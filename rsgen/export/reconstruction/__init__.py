@@ -1,0 +1,1 @@
+"""Layouts of reconstruction: COLMAP, nerfstudio, and depth in the colour camera's pixels."""

@@ -1,0 +1,1 @@
+"""To look at: a video of both shutters, and a rerun recording."""

@@ -1,0 +1,1 @@
+"""Layouts of datasets: EuRoC/ASL and ScanNet."""

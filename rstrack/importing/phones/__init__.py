@@ -1,0 +1,1 @@
+"""Recordings of phones' apps: Record3D and Stray Scanner, on ARKit."""
