@@ -27,8 +27,8 @@ from rsgen.limits import rigid
 from rstrack.data.imu.recording import ImuNoise
 
 EXAMPLE = "T_imu_depth: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
-PHONE = ImuNoise(gyro_density=1.2e-4, gyro_walk=1.0e-5, accel_density=1.2e-3, accel_walk=3.0e-4)
-"""What an IMU is taken for of which nothing is known: a phone's of the LSM6DS kind (as rsgen's preset)."""
+PHONE = ImuNoise(gyro_density=1.3e-4, gyro_walk=2.0e-5, accel_density=1.4e-3, accel_walk=2.0e-4)
+"""What an IMU is taken for of which nothing is known: a phone's, twice as noisy as an LSM6DSO (preset phone)."""
 STANDARD_GRAVITY = 9.80665
 # How far rows of a rotation in a foreign file may be from orthonormal: Kalibr writes 8 digits and more, hands 4.
 _RIGID = 1e-3
