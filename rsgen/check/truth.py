@@ -14,6 +14,7 @@ from rsgen.errors import UserError
 from rsgen.export.folder import sequence_imu, sequence_target
 from rsgen.files import is_temporary, read_text, read_yaml
 from rsgen.sensors.imu import imu_csv
+from rsgen.sensors.imu_truth import IMU_TRUTH_CSV, IMU_TRUTH_YAML, imu_truth_csv
 from rsgen.sequence.camera_yaml import TRUE_CAMERAS
 from rsgen.sequence.format import STREAMS, color_truth_path
 from rsgen.sequence.reader import Sequence
@@ -53,6 +54,12 @@ def check_imu(sequence: Sequence) -> tuple[bool, str]:
         return False, f"{path}: {len(rows)} samples, {len(expected)} expected"
     worst = float(np.abs(rows - expected)[:, 1:].max())
     ok = np.array_equal(rows[:, 0], expected[:, 0]) and worst < 1e-9
+    if found[0].has_truth:
+        truth = sequence.root / IMU_TRUTH_CSV
+        if read_text(truth) != imu_truth_csv(found[1]):
+            return False, f"{truth}: is not what the spline and the settings give: render again to write it"
+        if not (sequence.root / IMU_TRUTH_YAML).is_file():
+            return False, f"{sequence.root / IMU_TRUTH_YAML}: is missing: render again to write it"
     return ok, f"{len(rows)} samples, within {worst:.1e} of what the spline gives"
 
 

@@ -127,6 +127,11 @@ class Config(Section):
         for section, name in _PATHS:
             if content[section][name] is not None:
                 content[section][name] = Path(content[section][name]).name
+        if self.imu is not None:
+            content["imu"] = self.imu.content()
+        for name in STREAMS:  # a driver without blackouts is what it was before there were any
+            if (driver := content[name]["driver"]) is not None and not driver["blackouts"]:
+                del driver["blackouts"]
         if self.objects:
             content["objects"] = [content_of(thing) for thing in self.objects]
         content["scene"] = {k: v for k, v in content["scene"].items() if v != SceneConfig.model_fields[k].default}

@@ -8,6 +8,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from rsgen.limits import limits
 
+Seconds = Annotated[float, limits(-1e9, 1e9, "s")]
+Length = Annotated[float, limits(1e-3, 1e4, "s")]
 Share = Annotated[float, Field(ge=0, le=0.9)]
 
 
@@ -28,6 +30,10 @@ class DriverConfig(BaseModel):
     )
     dropped: Share = Field(default=0.0, description="probability that an image is lost")
     repeated: Share = Field(default=0.0, description="probability that the image before is delivered in its place")
+
+    blackouts: tuple[tuple[Seconds, Length], ...] = Field(
+        default=(), max_length=1000, description="[from, for] in true seconds: no image of these times is delivered"
+    )
 
     @model_validator(mode="after")
     def _some_are_delivered(self) -> DriverConfig:

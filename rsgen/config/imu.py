@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from rsgen.array_types import FloatArray
+from rsgen.config.imu_presets import ImuPreset, with_imu_preset
 from rsgen.geometry import se3
-from rsgen.limits import Matrix4, RigidTransform
+from rsgen.limits import Matrix4, RigidTransform, limits
 
 # Bounded so that products of two stay far from overflow.
 Number = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -22,11 +23,22 @@ _IDENTITY3: Matrix3 = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 _IDENTITY4: Matrix4 = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
+# Fields that are left out of sequence.yaml where they are not set: what was rendered before there were any stays same.
+_LATER = (
+    "preset", "warmup_s", "gyroscope_warmup", "accelerometer_warmup", "jitter_s", "dropped", "dropped_run",
+    "clock_offset_s", "clock_drift_ppm", "stamp_error_s",
+)  # fmt: skip
+
+
 class ImuConfig(BaseModel):
     """An inertial measurement unit fixed to the depth camera; the noise defaults are those of EuRoC's (ADIS16448)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    preset: ImuPreset | None = Field(
+        default=None,
+        description="phone (LSM6DSO), d435i (BMI055) or euroc (ADIS16448): noise, biases, place; other fields override",
+    )
     rate_hz: float = Field(default=200.0, gt=0, le=100_000, description="samples per second")
     T_imu_depth: RigidTransform = Field(default=_IDENTITY4, description="depth-camera to IMU coordinates, m")
     gravity: Vector3 = Field(default=(0.0, -9.80665, 0.0), description="gravity in the world, m/s^2 (default: y is up)")
@@ -46,6 +58,44 @@ class ImuConfig(BaseModel):
     accelerometer_range: Range | None = Field(
         default=None, description="largest reading of an axis, m/s^2; null: no limit"
     )
+
+    warmup_s: Annotated[float, limits(0.1, 1e5, "s")] = Field(
+        default=90.0, description="time constant of the biases' drift while the unit warms up, s"
+    )
+    gyroscope_warmup: Density = Field(default=0.0, description="size of that drift, an axis, by the seed, RMS, rad/s")
+    accelerometer_warmup: Density = Field(default=0.0, description="size of that drift, an axis, RMS, m/s^2")
+    jitter_s: Annotated[float, limits(0, 1, "s")] = Field(
+        default=0.0, description="samples are taken early or late by this, RMS, at most a fifth of a period, s"
+    )
+    dropped: Annotated[float, Field(ge=0, le=0.9)] = Field(default=0.0, description="part of the samples that is lost")
+    dropped_run: Annotated[float, Field(ge=1, le=1e4)] = Field(
+        default=1.0, description="how many are lost in a row, in the mean"
+    )
+    clock_offset_s: Annotated[float, limits(-10, 10, "s")] = Field(
+        default=0.0, description="the IMU's stamps minus true time at the first sample, s"
+    )
+    clock_drift_ppm: Annotated[float, limits(-1e4, 1e4, "ppm")] = Field(
+        default=0.0, description="how fast the IMU's clock runs against the images', parts per million"
+    )
+    stamp_error_s: Annotated[float, limits(0, 1, "s")] = Field(
+        default=0.0, description="white error of the stamps, RMS, at most a fifth of a period, s"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fills_in_the_preset(cls, data: Any) -> Any:
+        return with_imu_preset(data)
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether truth/ tells of its samples' true times and biases, and of what it is: if any later field is set."""
+        return bool(set(self.content()) & set(_LATER))
+
+    def content(self) -> dict[str, Any]:
+        """What decides its bytes, as plain YAML types."""
+        fields = type(self).model_fields
+        unset = {name for name in _LATER if getattr(self, name) == fields[name].default}
+        return self.model_dump(mode="json", exclude=unset)
 
     def T_depth_imu(self) -> FloatArray:
         """IMU to depth-camera coordinates (4, 4)."""

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from rsgen.array_types import BoolArray, ByteArray, Float32Array, FloatArray
 from rsgen.config.config import Config, StreamConfig
+from rsgen.config.imu import ImuConfig
 from rsgen.errors import UserError
 from rsgen.files import (
     atomic_write,
@@ -31,6 +32,7 @@ from rsgen.produce.identity import color_truth, describe, refuse_foreign_folder,
 from rsgen.sensors.adaptation import Setting
 from rsgen.sensors.driver import color_clock, deliver
 from rsgen.sensors.imu import sample_clock, simulate_imu, write_imu_csv
+from rsgen.sensors.imu_truth import IMU_TRUTH_CSV, IMU_TRUTH_YAML, imu_truth_csv, imu_truth_yaml
 from rsgen.sensors.mocap import reported_poses
 from rsgen.sequence.camera_yaml import TRUE_CAMERAS, camera_yaml
 from rsgen.sequence.format import (
@@ -278,6 +280,9 @@ class SequenceWriter:
             spline = self.spline
             samples = simulate_imu(spline, self.config.imu, spline.t_begin, spline.t_end, self.config.seed)
             write_imu_csv(self.out / "imu.csv", samples)
+            if self.config.imu.has_truth:
+                atomic_write(self.out / IMU_TRUTH_CSV, imu_truth_csv(samples).encode())
+                atomic_write(self.out / IMU_TRUTH_YAML, encode_yaml(self._true_imu(self.config.imu)))
 
     def _true_cameras(self) -> dict[str, Any]:
         """Content of truth/cameras.yaml."""
@@ -285,6 +290,13 @@ class SequenceWriter:
         times = (float(t) for t in (self.color.stamps[0], self.depth.stamps[0], listed[len(listed) // 2]))
         clock = color_clock(config.color.driver, config.depth.driver, *times)
         return camera_yaml(true_cameras(config), clock, config.depth.registered)
+
+    def _true_imu(self, imu: ImuConfig) -> dict[str, Any]:
+        """Content of truth/imu.yaml."""
+        start, _ = sample_clock(imu, self.spline.t_begin, self.spline.t_end)
+        listed = self.depth.table.listed_s[self.depth.is_delivered]
+        T_image_depth = np.array(self.config.T_color_depth, float) if self.config.depth.registered else np.eye(4)
+        return imu_truth_yaml(imu, start, float(listed[len(listed) // 2]), T_image_depth)
 
     def _stream(self, stream: StreamName) -> _Stream:
         return self.color if stream == "color" else self.depth

@@ -34,7 +34,8 @@ def deliver(stamps: FloatArray, config: DriverConfig | None, seed: int, stream: 
 
     listed = ⌈t + (t − t_0) drift + offset + N(0, jitter²)⌉ to the grid, less half a grid's step so that the mean delay
     stays `offset_s`; where that does not rise, the later image waits for the next step of the grid. Each frame's random
-    numbers depend on the seed, the stream and the frame's number alone. The first frame is always delivered.
+    numbers depend on the seed, the stream and the frame's number alone. The first frame is always delivered, but in a
+    blackout.
     """
     count = len(stamps)
     frames = np.arange(count)
@@ -50,6 +51,8 @@ def deliver(stamps: FloatArray, config: DriverConfig | None, seed: int, stream: 
     tick = np.maximum.accumulate(tick - frames) + frames
     drawn = fate.random(count)
     is_delivered = (drawn >= config.dropped) | (frames == 0)
+    for begin, length in config.blackouts:
+        is_delivered &= (stamps < begin) | (stamps >= begin + length)
     is_repeated = is_delivered & (drawn < config.dropped + config.repeated) & (frames > 0)
     # A repetition shows the last image that came itself.
     shows = np.maximum.accumulate(np.where(is_delivered & ~is_repeated, frames, 0))

@@ -4,7 +4,8 @@ Specific force and angular rate in the IMU's frame, at the IMU's place (lever ar
     gyro = M_g ω + b_g + n_g,      accel = M_a (a − g) + b_a + n_a,      both clipped to the sensor's range.
 Noise as Kalibr and the EuRoC sets state it, by continuous-time densities (Kalibr's wiki, "IMU Noise Model"): white
 noise of density σ sampled at rate f has the standard deviation σ √f, a bias that diffuses with density σ_b takes steps
-of standard deviation σ_b / √f.
+of standard deviation σ_b / √f. While the unit warms up a bias drifts by A (1 − exp(−t/τ)) beside that.
+Samples may come late or early, be lost, and bear the stamps of a clock of their own; values are those of true times.
 """
 
 from __future__ import annotations
@@ -31,7 +32,9 @@ _BLOCK = 4096
 # Marks the IMU's random numbers among all that derive from a sequence's seed. Never zero: NumPy's SeedSequence takes
 # [a, b] and [a, b, 0] for the same.
 _STREAM = 0x494D55
-_GYRO_NOISE, _GYRO_BIAS, _ACCEL_NOISE, _ACCEL_BIAS = 1, 2, 3, 4
+_GYRO_NOISE, _GYRO_BIAS, _ACCEL_NOISE, _ACCEL_BIAS, _WARMUP, _JITTER, _LOST, _RUNS, _STAMPS = range(1, 10)
+# Part of a period that jitter, and the stamps' errors, may reach: stamps then rise still.
+_MOST_LATE = 0.2
 
 IMU_CSV_HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
@@ -44,7 +47,7 @@ IMU_CSV_HEADER = (
 class ImuSamples:
     """n samples: t (n,) s; gyro (n, 3) rad/s and accel (n, 3) m/s² in the IMU's frame; the biases (n, 3) within them.
 
-    A resting accelerometer reads −g: the specific force.
+    A resting accelerometer reads −g: the specific force. t: when they were taken; stamps (n,): what the unit says, s.
     """
 
     t: FloatArray
@@ -52,6 +55,7 @@ class ImuSamples:
     accel: FloatArray
     gyro_bias: FloatArray
     accel_bias: FloatArray
+    stamps: FloatArray
 
 
 def exact_imu(
@@ -94,11 +98,15 @@ def sample_clock(config: ImuConfig, t_begin: float, t_end: float) -> tuple[float
 def simulate_imu(spline: Spline, config: ImuConfig, t_begin: float, t_end: float, seed: int) -> ImuSamples:
     """What the IMU reads from `t_begin` to `t_end` seconds, both within the spline T_world_depth(t).
 
-    Sample k is at t_begin + k / rate, to the nanosecond. Random numbers depend on `seed` and k alone, so that a longer
-    recording begins with the samples of a shorter one. Raises UserError for times outside the spline and absurd counts.
+    Sample k is at t_begin + k / rate, to the nanosecond, but for jitter. Random numbers depend on `seed` and k alone,
+    so that a longer recording begins with the samples of a shorter one. Raises UserError for times outside the spline
+    and absurd counts.
     """
     start, count = sample_clock(config, t_begin, t_end)
-    t = round_stamps(start + np.arange(count) / config.rate_hz)
+    t = start + np.arange(count) / config.rate_hz
+    if config.jitter_s:
+        t = np.maximum(t + _bounded(count, config.jitter_s, config.rate_hz, _generator(seed, _JITTER)), start)
+    t = round_stamps(t)
     t = np.minimum(t, t_end)  # the last one may have been rounded up
     gyro, force = exact_imu(spline, se3.inverse(config.T_depth_imu()), config.gravity, t)
     gyro_bias = _random_walk(
@@ -108,13 +116,20 @@ def simulate_imu(spline: Spline, config: ImuConfig, t_begin: float, t_end: float
         len(t), config.accelerometer_bias, config.accelerometer_random_walk, config.rate_hz,
         _generator(seed, _ACCEL_BIAS),
     )  # fmt: skip
+    if config.gyroscope_warmup or config.accelerometer_warmup:
+        warmed = -np.expm1((start - t) / config.warmup_s)[:, None]
+        sizes = _generator(seed, _WARMUP).standard_normal((2, 3))
+        gyro_bias = gyro_bias + config.gyroscope_warmup * sizes[0] * warmed
+        accel_bias = accel_bias + config.accelerometer_warmup * sizes[1] * warmed
     gyro_noise = _white(len(t), config.gyroscope_noise_density, config.rate_hz, _generator(seed, _GYRO_NOISE))
     accel_noise = _white(len(t), config.accelerometer_noise_density, config.rate_hz, _generator(seed, _ACCEL_NOISE))
-    gyro = gyro @ np.array(config.gyroscope_matrix).T + gyro_bias + gyro_noise
-    accel = force @ np.array(config.accelerometer_matrix).T + accel_bias + accel_noise
-    return ImuSamples(
-        t, _clip(gyro, config.gyroscope_range), _clip(accel, config.accelerometer_range), gyro_bias, accel_bias
+    gyro = _clip(gyro @ np.array(config.gyroscope_matrix).T + gyro_bias + gyro_noise, config.gyroscope_range)
+    accel = _clip(
+        force @ np.array(config.accelerometer_matrix).T + accel_bias + accel_noise, config.accelerometer_range
     )
+    stamps = _stamped(t, start, config, seed)
+    kept = _kept(count, config, seed)
+    return ImuSamples(t[kept], gyro[kept], accel[kept], gyro_bias[kept], accel_bias[kept], stamps[kept])
 
 
 def write_imu_csv(path: Path, samples: ImuSamples, epoch_s: int = 0) -> None:
@@ -124,7 +139,7 @@ def write_imu_csv(path: Path, samples: ImuSamples, epoch_s: int = 0) -> None:
 
 def imu_csv(samples: ImuSamples, epoch_s: int = 0) -> str:
     """Samples as the text of EuRoC's imu0/data.csv: whole nanoseconds, rad/s, m/s². `epoch_s` is added to all times."""
-    stamps = nanoseconds(samples.t, epoch_s)
+    stamps = nanoseconds(samples.stamps, epoch_s)
     lines = [
         ",".join([str(stamp), *(f"{value:.12g}" for value in row)])
         for stamp, row in zip(stamps, np.column_stack([samples.gyro, samples.accel]).tolist(), strict=True)
@@ -148,6 +163,35 @@ def _white(count: int, density: float, rate_hz: float, rng: np.random.Generator)
 def _random_walk(count: int, start: Vector3, density: float, rate_hz: float, rng: np.random.Generator) -> FloatArray:
     steps = density / math.sqrt(rate_hz) * rng.standard_normal((count - 1, 3))
     return np.asarray(np.array(start) + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)]))
+
+
+def _bounded(count: int, sigma: float, rate_hz: float, rng: np.random.Generator) -> FloatArray:
+    """Normal errors of times (count,) in s, cut off where samples could change places."""
+    most = _MOST_LATE / rate_hz
+    return np.asarray(np.clip(sigma * rng.standard_normal(count), -most, most))
+
+
+def _stamped(t: FloatArray, start: float, config: ImuConfig, seed: int) -> FloatArray:
+    """What the unit's own clock says at times t (n,), s; t itself where that is the images' clock."""
+    if not (config.clock_offset_s or config.clock_drift_ppm or config.stamp_error_s):
+        return t
+    error = _bounded(len(t), config.stamp_error_s, config.rate_hz, _generator(seed, _STAMPS))
+    return round_stamps(t + config.clock_offset_s + 1e-6 * config.clock_drift_ppm * (t - start) + error)
+
+
+def _kept(count: int, config: ImuConfig, seed: int) -> npt.NDArray[np.bool_]:
+    """Which samples (count,) arrive: losses begin anywhere and last for geometrically many."""
+    kept = np.ones(count, bool)
+    if config.dropped:
+        begins = _generator(seed, _LOST).random(count) < -math.log1p(-config.dropped) / config.dropped_run
+        runs = _generator(seed, _RUNS).geometric(1.0 / config.dropped_run, count)
+        first = np.flatnonzero(begins)
+        changes = np.zeros(count + 1, np.int64)
+        np.add.at(changes, first, 1)
+        np.add.at(changes, np.minimum(first + runs[first], count), -1)
+        kept = np.cumsum(changes)[:count] == 0
+        kept[0] = True
+    return kept
 
 
 def _clip(values: FloatArray, limit: float | None) -> FloatArray:

@@ -7,6 +7,7 @@ from collections import Counter
 import numpy as np
 
 from rsgen.array_types import FloatArray
+from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
@@ -29,6 +30,7 @@ def describe(dataset: Dataset) -> str:
         ("colour", f"{_relative_pose(rig.T_color_depth)} from the depth camera"),
         ("frames", f"{len(dataset)}, {_groups(dataset)}"),
         ("truth", _truth(dataset)),
+        *_imu(dataset),
         *(("note", note) for note in dataset.notes),
     ]
     if dataset.timing is not None:
@@ -58,6 +60,30 @@ def _shutter(shutter: Shutter, camera: Camera) -> str:
 def _relative_pose(T: FloatArray) -> str:
     angle = np.degrees(np.linalg.norm(se3.log(T)[3:]))
     return f"{1e3 * np.linalg.norm(T[:3, 3]):.1f} mm and {angle:.2f} degrees"
+
+
+def _imu(dataset: Dataset) -> list[tuple[str, str]]:
+    """Samples, noise and place of an IMU, or why it cannot be used; nothing where there is none."""
+    if dataset.imu_files is None:
+        return []
+    try:
+        found = dataset.read_imu
+    except UserError as error:
+        return [("imu", f"not to be used: {error}")]
+    if found is None:
+        return []
+    imu = found.recording
+    kind = "accelerometer alone" if imu.gyro is None else "gyroscope and accelerometer"
+    noise = imu.noise
+    gyro = "" if imu.gyro is None else f"{noise.gyro_density:.3g} rad/s/√Hz, "
+    return [
+        ("imu", f"{kind}, {len(imu.t)} samples at {imu.rate_hz:.4g} Hz, {imu.t[0]:.3f} to {imu.t[-1]:.3f} s"),
+        (
+            "",
+            f"{_relative_pose(imu.T_imu_depth)} from the depth camera, noise {gyro}{noise.accel_density:.3g} m/s²/√Hz",
+        ),
+        *(("", note) for note in found.notes),
+    ]
 
 
 def _groups(dataset: Dataset) -> str:

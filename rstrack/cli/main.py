@@ -31,6 +31,7 @@ from rstrack.cli.mapping import keyframes, map_, map_eval
 from rstrack.cli.options import (
     CameraFile,
     DeviceName,
+    ImuFile,
     NoiseDepth,
     NoiseIntensity,
     Run,
@@ -117,6 +118,7 @@ def track(
     tracker: Options,
     *,
     camera: CameraFile = None,
+    imu: ImuFile = None,
     out: Annotated[Path, "folder for the run, made if need be", "DIR"],
     frames: Frames = None,
     noise_depth: NoiseDepth = 0.0,
@@ -153,7 +155,7 @@ def track(
     tracker = replace(tracker, loops=tracker.loops or "end")
     known = None if device is None else device_named(device)
     noise = run.Noise(noise_depth, noise_intensity, seed)
-    dataset = open_dataset(sequence, camera)
+    dataset = open_dataset(sequence, camera, imu)
     with ProgressDisplay(quiet) as progress:
         found = None
         if calibrate:
@@ -237,10 +239,10 @@ def plot(
     return 0
 
 
-def info(sequence: SequenceFolder, *, camera: CameraFile = None) -> int:
-    """Say what would be tracked: cameras, shutters, frames, truth."""
+def info(sequence: SequenceFolder, *, camera: CameraFile = None, imu: ImuFile = None) -> int:
+    """Say what would be tracked: cameras, shutters, frames, an IMU, truth."""
     from rstrack.cli.info import describe
     from rstrack.data.dataset import open_dataset
 
-    print(describe(open_dataset(sequence, camera)))
+    print(describe(open_dataset(sequence, camera, imu)))
     return 0

@@ -7,6 +7,11 @@ from rsgen.console.command_line import number
 
 SequenceFolder = Annotated[Path, "rsgen sequence, TUM RGB-D, ICL-NUIM or 7-Scenes folder"]
 CameraFile = Annotated[Path | None, "camera file to go by instead of what the folder tells of its cameras", "FILE"]
+ImuFile = Annotated[
+    Path | None,
+    "imu.yaml as Kalibr has it, of the IMU whose samples the folder has: densities, T_imu_depth or T_cam_imu, offset_s",
+    "FILE",
+]
 DeviceName = Annotated[
     str | None,
     "camera whose published readouts to start from and be drawn to, for example zed2-720p-30hz; any other word lists "

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,8 @@ from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.camera_file import read_rig
 from rstrack.data.clocks.timing import Timing, stream_timing
 from rstrack.data.depth_error import NONE, DepthError
+from rstrack.data.imu.files import ImuFiles, ReadImu, find_imu
+from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.layouts.generated import as_recorded, is_exact, with_depth_scale
 from rstrack.data.layouts.seven_scenes import is_seven_scenes, read_seven_scenes
 from rstrack.data.layouts.tum_folder import TumFolder, read_tum_folder
@@ -49,6 +52,7 @@ class Dataset:
     colour's offset grows by, see `with_color_offset`. scan_named: whether the cameras' description says which way
     images are read. depth_scale: units per metre of the depth images. depth_offset_s: what has been added to the stamps
     of registered depth, see `rstrack.data.camera_file`. images: as they are on disk; depth_error: of the depth in them.
+    imu_files: where an IMU's samples are.
     """
 
     name: str
@@ -68,6 +72,7 @@ class Dataset:
     depth_scale: float = DEPTH_SCALE
     depth_offset_s: float = 0.0
     depth_error: DepthError = NONE
+    imu_files: ImuFiles | None = None
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -118,6 +123,21 @@ class Dataset:
         Raises UserError as `frame` does, when it is that frame's turn.
         """
         return prefetched(self.frame, range(len(self))[first:last], prefetch)
+
+    @property
+    def imu(self) -> ImuRecording | None:
+        """What an IMU recorded meanwhile, None without one; it is read when first asked for.
+
+        Raises UserError, one line: the file that is wrong, or that nothing tells where the IMU sits.
+        """
+        return None if self.read_imu is None else self.read_imu.recording
+
+    @cached_property
+    def read_imu(self) -> ReadImu | None:
+        """The same with what was assumed or is odd about it. Raises UserError."""
+        if self.imu_files is None:
+            return None
+        return self.imu_files.read(self.stamps, self.middle, self.rig.T_color_depth)
 
     @property
     def middle(self) -> float:
@@ -172,7 +192,7 @@ class Dataset:
         return None if self.sequence is None else self.sequence.rows(stream)
 
 
-def open_dataset(path: Path, camera_file: Path | None = None) -> Dataset:
+def open_dataset(path: Path, camera_file: Path | None = None, imu_file: Path | None = None) -> Dataset:
     """Read the description and listings of a folder; images are read when asked for.
 
     path: a sequence that rsgen wrote (it has a sequence.yaml, which holds the cameras), or a TUM RGB-D or ICL-NUIM
@@ -180,6 +200,7 @@ def open_dataset(path: Path, camera_file: Path | None = None) -> Dataset:
       7-Scenes: frame-000000.depth.png and so on; see `rstrack.data.layouts.seven_scenes`.
     camera_file: the cameras, instead of those that a sequence.yaml, or a camera.yaml or calibration.yaml in the folder,
       tells; see `rstrack.data.camera_file`.
+    imu_file: what describes the IMU, see `rstrack.data.imu.description`; without it the IMU is read when asked for.
     Raises UserError, one line: what is missing or wrong, where, and how to mend it.
     """
     root = Path(path)
@@ -187,9 +208,14 @@ def open_dataset(path: Path, camera_file: Path | None = None) -> Dataset:
         raise UserError(f"{root}: no such folder: give an rsgen sequence or a TUM RGB-D, ICL-NUIM or 7-Scenes folder")
     if not (root / "sequence.yaml").exists():
         read = read_seven_scenes if is_seven_scenes(root) else read_tum_folder
-        return _of_tum(root, read(root, camera_file))
-    dataset = _of_generated(root, read_sequence(root))
-    return dataset if camera_file is None else _seen_as(dataset, camera_file)
+        found = replace(_of_tum(root, read(root, camera_file)), imu_files=find_imu(root, imu_file))
+    else:
+        sequence = read_sequence(root)
+        found = replace(_of_generated(root, sequence), imu_files=find_imu(root, imu_file, sequence.meta))
+        found = found if camera_file is None else _seen_as(found, camera_file)
+    if imu_file is not None:
+        _ = found.read_imu  # what was named has to be right
+    return found
 
 
 def _seen_as(dataset: Dataset, camera_file: Path) -> Dataset:

@@ -2,7 +2,7 @@
 
 rgb/000000.png depth/000000.png rgb.txt depth.txt camera.yaml     see docs/format.md
 groundtruth.txt   poses of the colour camera, where the recording has any; its first line says whose
-imu.csv           EuRoC's columns
+imu.csv           EuRoC's columns; imu.yaml where the recording says where the IMU sits, or how noisy it is
 intrinsics.csv    stamp [ns], fx, fy, cx, cy of each colour image, where they change
 import.json       what was read of which file, and what was assumed
 """
@@ -26,6 +26,8 @@ from rsgen.errors import UserError
 from rsgen.files import encode_yaml, write_error
 from rsgen.sequence.format import pose_rows
 from rsgen.sequence.trajectory import MAX_POSITION_M, MIN_POSES
+from rstrack.data.imu.description import imu_yaml
+from rstrack.data.imu.files import IMU_YAML
 from rstrack.data.layouts.tum_folder import ESTIMATED
 from rstrack.importing.recording import Inertial, Intrinsics, Picture, Pose, Recording, StreamCamera
 
@@ -152,6 +154,8 @@ def _write(
     counts = _listings(streams, part, file, notes)
     poses = _truth(streams.poses, part, recording, notes)
     imu = _imu(streams, part, notes)
+    if imu:
+        _imu_file(recording, part, notes)
     _intrinsics(streams.intrinsics, part, notes)
     known = [
         s.readout_s if s.readout_s is not None else e
@@ -254,6 +258,16 @@ def _imu(streams: _Streams, part: Path, notes: list[str]) -> int:
     lines = [",".join([str(ns), *map(repr, row)]) for ns, row in zip(gyro_ns.tolist(), table, strict=True)]
     (part / "imu.csv").write_text("\n".join([_IMU_HEADER, *lines, ""]))
     return len(lines)
+
+
+def _imu_file(recording: Recording, part: Path, notes: list[str]) -> None:
+    """imu.yaml, as far as anything is known."""
+    T, noise = recording.T_imu_depth, recording.imu_noise
+    if T is None:
+        notes.append("where the IMU sits is not told: write T_imu_depth into imu.yaml, or rstrack calibrate --free imu")
+    if T is not None or noise is not None:
+        head = f"# Written by rstrack import, from a {recording.kind}."
+        (part / IMU_YAML).write_text("\n".join([head, imu_yaml(T, noise)]))
 
 
 def _in_order(stamps: Any, values: FloatArray) -> tuple[Any, FloatArray]:

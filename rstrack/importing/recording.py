@@ -16,6 +16,7 @@ from rsgen.array_types import FloatArray
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan
 from rsgen.sequence.format import StreamName
+from rstrack.data.imu.recording import ImuNoise
 
 FLOAT_DEPTH_SCALE = 5000.0
 """Units per metre of depth that was stored as floats."""
@@ -94,7 +95,7 @@ class Recording:
     depth images have been warped into the colour camera. depth_scale: units per metre. pictures: how many `items` will
     give, for the progress. truth: whose poses those among the items are, if any; is_measured: by another instrument,
     not estimated from the same images. notes: what was assumed, a line each. source: what was read of what, for
-    import.json.
+    import.json. T_imu_depth (4, 4): p_imu from p of the depth images' camera, and the IMU's noise; None: not told.
     """
 
     kind: str
@@ -109,3 +110,5 @@ class Recording:
     is_measured: bool = False
     notes: tuple[str, ...] = ()
     source: Mapping[str, str | float] = field(default_factory=dict)
+    T_imu_depth: FloatArray | None = None
+    imu_noise: ImuNoise | None = None

@@ -33,6 +33,7 @@ COUNT = 5
 COLOR, DEPTH = "/camera/color/image_raw", "/camera/depth/image_rect_raw"
 FRAME = {"color": "camera_color_optical_frame", "depth": "camera_depth_optical_frame"}
 T_COLOR_DEPTH = se3.exp(np.array([0.0148, 0.0002, -0.0004, 0.004, -0.007, 0.002]))
+T_IMU_DEPTH = se3.exp(np.array([0.006, -0.005, -0.012, 0.02, 0.01, -0.03]))
 
 
 @dataclass(frozen=True)
@@ -228,6 +229,8 @@ def write_realsense(path: Path, content: Content, unit: float = 0.001) -> Path:
         info = talker.info("", size, K, "Inverse Brown Conrady", [0.0] * 5)
         say(f"{prefixes[name]}/info/camera_info", "sensor_msgs/CameraInfo", 1, info)
         say(f"{prefixes[name]}/tf/1", "geometry_msgs/Transform", 1, talker.transform(T))
+    motion = talker.transform(T_IMU_DEPTH @ T_depth_reference)
+    say("/device_0/sensor_2/Gyro_0/tf/1", "geometry_msgs/Transform", 1, motion)
     for k in range(COUNT):
         for name, ns, pixels, encoding, units in (
             ("depth", content.depth_ns[k], content.units[k], "mono16", unit),

@@ -18,6 +18,7 @@ import yaml
 from recordings import COLOR, COLOR_K, COLOR_SIZE, COUNT, DEPTH, DEPTH_K, FRAME, T_COLOR_DEPTH, Content, Talker
 
 from rsgen.cli.main import main as rsgen
+from rsgen.config.imu import ImuConfig
 from rsgen.files import encode_png
 from rsgen.geometry import se3
 from rstrack.cli.info import describe
@@ -113,10 +114,24 @@ def test_what_librealsense_records_comes_back(place: Path, capfd: pytest.Capture
     assert dataset.depth_scale == 1000 and "RealSense" in said
     # The table has a global shutter for depth and no time for colour.
     assert "readout of colour:" in said and "--device realsense-d435" in said
+    assert dataset.imu_files is not None and (T_imu := dataset.imu_files.description().T_imu_depth) is not None
+    assert np.allclose(T_imu, recordings.T_IMU_DEPTH, atol=1e-6)
     imu = np.loadtxt("out/imu.csv", delimiter=",")  # accel is 3 ms later: interpolated, the first sample has none
     assert imu.shape == (COUNT - 1, 7) and np.allclose(imu[:, 3], [1, 2, 3, 4]) and "interpolated" in said
     assert np.allclose(imu[:, 5], np.array([1, 2, 3, 4]) - 3e6 / 33_366_700, atol=1e-6)
     assert np.allclose(imu[:, 1], 0.5) and np.allclose(imu[:, 6], 9.0)
+
+
+def test_where_the_imu_sits_comes_along_by_tf(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    talker, edge = Talker(True), ("imu", FRAME["depth"], recordings.T_IMU_DEPTH)
+    color = (FRAME["depth"], FRAME["color"], se3.inverse(T_COLOR_DEPTH))
+    recordings.write_spoken(place / "one.bag", talker, recordings.speak(talker, CONTENT, tf=[edge, color]))
+    dataset, said = imported(capfd, "one.bag")
+    assert dataset.imu_files is not None and (T_imu := dataset.imu_files.description().T_imu_depth) is not None
+    assert np.allclose(T_imu, recordings.T_IMU_DEPTH, atol=1e-6) and "--free imu" not in said
+    recordings.write_spoken(place / "none.bag", talker, recordings.speak(talker, CONTENT))
+    dataset, said = imported(capfd, "none.bag --force")
+    assert not Path("out/imu.yaml").exists() and "where the IMU sits is not told" in said
 
 
 def test_the_unit_of_depth_is_the_cameras(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -438,7 +453,8 @@ def test_stray_scanners_folders_come_back(place: Path, capfd: pytest.CaptureFixt
 
 def test_an_exported_euroc_folder_comes_back(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
     config = synthetic.make_config(32, 24, color={"readout_s": 0.02}, depth={"readout_s": 0.01, "scan": "bottom-top"})
-    writer = synthetic.open_writer(place / "seq", config, 4)
+    imu = ImuConfig(T_imu_depth=recordings.T_IMU_DEPTH.tolist(), accelerometer_range=50.0)
+    writer = synthetic.open_writer(place / "seq", config.model_copy(update={"imu": imu}), 4)
     synthetic.write_frames(writer)
     synthetic.write_scene(place / "seq")
     writer.finish()
@@ -449,6 +465,10 @@ def test_an_exported_euroc_folder_comes_back(place: Path, capfd: pytest.CaptureF
     assert dataset.rig.color_camera == exact.rig.color_camera and dataset.rig.depth_camera == exact.rig.depth_camera
     assert np.allclose(dataset.rig.T_color_depth, exact.rig.T_color_depth, atol=1e-12)
     assert "calibrate" not in said and dataset.depth_scale == exact.depth_scale
+    assert dataset.imu is not None and exact.imu is not None
+    assert np.allclose(dataset.imu.T_imu_depth, exact.imu.T_imu_depth, atol=1e-8)
+    assert np.allclose(dataset.imu.accel, exact.imu.accel[-len(dataset.imu.accel) :], atol=1e-9)
+    assert dataset.imu.noise.gyro_density == exact.imu.noise.gyro_density
     for k in range(len(exact)):
         assert (dataset.images.depth(k) == exact.images.depth(k)).all()
         assert (dataset.images.color(k) == exact.images.color(k)).all()

@@ -190,6 +190,6 @@ def _imu(bag: Bag, imu: Any) -> Iterator[Message]:
             "linear_acceleration_covariance": accel,
         }
 
-    for k, ns in enumerate(nanoseconds(samples.t)):
+    for k, ns in enumerate(nanoseconds(samples.stamps)):
         if ns >= 0:
             yield ns, lambda ns=ns, k=k: write(ns, **fields(ns, k))  # type: ignore[misc]

@@ -89,7 +89,7 @@ def camchain(sequence: Sequence, imu: ImuConfig | None) -> dict[str, Any]:
         T_depth_imu = imu.T_depth_imu()
         for name, stream, T_cam_depth in (("cam0", color, sequence.T_color_depth), ("cam1", depth, None)):
             T_cam_imu = T_depth_imu if T_cam_depth is None else T_cam_depth @ T_depth_imu
-            shift = row_clock(stream.name, stream.camera, stream.shutter).first_s
+            shift = row_clock(stream.name, stream.camera, stream.shutter).first_s + imu.clock_offset_s
             cameras[name] |= {"T_cam_imu": _matrix(T_cam_imu), "timeshift_cam_imu": shift}
     return cameras
 

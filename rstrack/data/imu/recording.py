@@ -27,10 +27,10 @@ class ImuNoise:
 class ImuRecording:
     """n samples of one unit fixed to the depth camera, in the order of time.
 
-    t (n,): s, on the clock of the images' stamps as far as it is known. gyro (n, 3): angular rate, rad/s; or None,
-    without a gyroscope. accel (n, 3): specific force a − g, m/s²: at rest it reads −g. Both in the IMU's frame, at
-    its own place. T_imu_depth (4, 4): p_imu from p_depth. gravity: its strength, m/s²; its direction in the
-    tracker's world is not known beforehand.
+    t (n,): s, on the clock of the images' stamps as far as it is known. gyro (n, 3): angular rate, rad/s; None where
+    there is no gyroscope. accel (n, 3): specific force a − g, m/s²: at rest it reads −g. Both in the IMU's frame, at
+    its own place. T_imu_depth (4, 4): p_imu from p_depth. gravity: its strength, m/s²; its direction in the tracker's
+    world is not known beforehand.
     """
 
     t: FloatArray

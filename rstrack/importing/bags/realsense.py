@@ -51,9 +51,11 @@ def read_realsense(bag: Bag, named: Named) -> Recording:
     color = _camera(bag, prefixes["color"], named.color_info)
     depth = _camera(bag, prefixes["depth"], named.depth_info)
     from_reference = {name: _from_reference(bag, prefix) for name, prefix in prefixes.items()}
-    T, notes = _extrinsics(from_reference)
+    T = _between(from_reference["color"], from_reference["depth"])
+    alone = "the streams' transforms have no common reference: T_color_depth is taken for the identity"
     images = {topics["color"]: ("color", color), topics["depth"]: ("depth", depth)}
     imu = tuple(topic for topic in bag.of_kind(IMU) if _DATA.fullmatch(topic))
+    placed = [_between(_from_reference(bag, _prefix(topic)), from_reference["depth"]) for topic in imu]
     device = _text(bag, prefixes["depth"].split("/sensor_")[0] + "/info")
     return Recording(
         kind="RealSense recording",
@@ -64,8 +66,9 @@ def read_realsense(bag: Bag, named: Named) -> Recording:
         depth_scale=float(f"{1.0 / _unit(bag, topics['depth'], prefixes['depth']):.6g}"),
         items=_items(bag.path, images, imu),
         pictures=sum(bag.topics[topic].count for topic in images),
-        notes=notes,
+        notes=(alone,) if T is None else (),
         source=topics | ({"imu": ", ".join(imu)} if imu else {}) | ({"device": device} if device else {}),
+        T_imu_depth=next((T for T in placed if T is not None), None),
     )
 
 
@@ -128,11 +131,10 @@ def _of_text(text: str) -> FloatArray | None:
     return se3.orthonormalise(T)
 
 
-def _extrinsics(streams: dict[str, dict[int, FloatArray]]) -> tuple[FloatArray | None, tuple[str, ...]]:
-    common = sorted(set(streams["color"]) & set(streams["depth"]))
-    if not common:
-        return None, ("the streams' transforms have no common reference: T_color_depth is taken for the identity",)
-    return streams["color"][common[0]] @ se3.inverse(streams["depth"][common[0]]), ()
+def _between(to: dict[int, FloatArray], from_: dict[int, FloatArray]) -> FloatArray | None:
+    """T_to_from (4, 4) of two streams' poses against their references; None if they have none in common."""
+    common = sorted(set(to) & set(from_))
+    return to[common[0]] @ se3.inverse(from_[common[0]]) if common else None
 
 
 def _unit(bag: Bag, topic: str, prefix: str) -> float:

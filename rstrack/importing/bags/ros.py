@@ -61,6 +61,9 @@ def _read_ros(bag: Bag, named: Named) -> Recording:
     first = _first(bag, depth_topic).content
     is_float = is_float_depth(first.encoding if hasattr(first, "encoding") else first.format)
     imu = find_imu(bag)
+    frame = (first_color if registered else _first(bag, depth_topic)).content.header.frame_id
+    first_imu = bag.first(imu[0]) if imu else None
+    T_imu = None if first_imu is None else between(bag, str(first_imu.content.header.frame_id), str(frame))
     images = {color_topic: ("color", color), depth_topic: ("depth", depth)}
     kind = "ROS 1 bag" if bag.is_ros1 else "ROS 2 recording"
     topics = {"color": color_topic, "depth": depth_topic, "color_info": color_info, "depth_info": depth_info}
@@ -75,6 +78,7 @@ def _read_ros(bag: Bag, named: Named) -> Recording:
         pictures=sum(bag.topics[topic].count for topic in images),
         notes=tuple(notes),
         source=topics | ({"imu": ", ".join(imu)} if imu else {}),
+        T_imu_depth=T_imu,
     )
 
 

@@ -12,14 +12,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
-from rsgen.files import listed_file, read_bytes, read_text, read_yaml
+from rsgen.files import listed_file, read_bytes, read_text
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
-from rsgen.limits import rigid
+from rstrack.data.imu.description import body_pose, read_asl_yaml, read_sensor_yaml
 from rstrack.importing.lens import camera_of
 from rstrack.importing.pixels import compressed_color, compressed_depth
 from rstrack.importing.recording import Inertial, Item, Picture, Pose, Recording, StreamCamera, pose_of
@@ -42,10 +40,13 @@ def read_euroc(path: Path) -> Recording:
         raise UserError(
             f"{root}: has no depth images (depth0; there are {there}): rstrack tracks colour with depth only"
         )
-    sensors = {name: _sensor(root / name / "sensor.yaml") for name in ("cam0", "depth0")}
-    T_body = {name: _T_body(root / name / "sensor.yaml", data) for name, data in sensors.items()}
+    sensors = {name: read_asl_yaml(root / name / "sensor.yaml") for name in ("cam0", "depth0")}
+    T_body = {name: _on_body(root / name / "sensor.yaml") for name in sensors}
     color, depth = (_camera(root / name / "sensor.yaml", data) for name, data in sensors.items())
     listed = {name: _listed(root, name) for name in sensors}
+    T_color_depth = se3.inverse(T_body["cam0"]) @ T_body["depth0"]
+    sensor = root / "imu0" / "sensor.yaml"
+    imu = read_sensor_yaml(sensor) if sensor.is_file() else None
     scale = sensors["depth0"].get("depth_scale", _MILLIMETRES)
     if not isinstance(scale, int | float) or not 1 <= scale < 1e6:
         raise UserError(f"{root / 'depth0' / 'sensor.yaml'}: depth_scale must lie in 1 to 1e6 units per metre")
@@ -53,7 +54,7 @@ def read_euroc(path: Path) -> Recording:
         kind="EuRoC folder",
         color=color,
         depth=depth,
-        T_color_depth=se3.inverse(T_body["cam0"]) @ T_body["depth0"],
+        T_color_depth=T_color_depth,
         is_registered=False,
         depth_scale=float(scale),
         items=_items(root, listed, color.camera, depth.camera, T_body["cam0"]),
@@ -61,6 +62,8 @@ def read_euroc(path: Path) -> Recording:
         truth=f"{_TRUTH} of {root}".replace(str(root), root.name),
         is_measured=True,
         source={"color": "cam0", "depth": "depth0"},
+        T_imu_depth=None if imu is None else imu.extrinsics(T_color_depth),
+        imu_noise=None if imu is None else imu.noise,
     )
 
 
@@ -68,24 +71,10 @@ def _root(path: Path) -> Path:
     return path / "mav0" if (path / "mav0").is_dir() else path
 
 
-def _sensor(path: Path) -> dict[str, Any]:
-    text = read_text(path)
-    if not text.startswith("%YAML"):  # EuRoC's own begin as OpenCV writes, which is YAML 1.0 by name
-        return read_yaml(path)
-    from rsgen.files import parse_yaml
-
-    data = parse_yaml(text.partition("\n")[2].lstrip("-\n"))
-    return data if isinstance(data, dict) else {}
-
-
-def _T_body(path: Path, data: dict[str, Any]) -> FloatArray:
-    """T_body_sensor (4, 4)."""
-    try:
-        return rigid(np.array(data["T_BS"]["data"], float).reshape(4, 4), 1e-3)
-    except (KeyError, TypeError, ValueError):
-        raise UserError(
-            f"{path}: T_BS is missing, or no rigid transform: expected 'T_BS: {{data: [16 numbers]}}'"
-        ) from None
+def _on_body(path: Path) -> FloatArray:
+    T_body_sensor = body_pose(path)
+    assert T_body_sensor is not None  # the file was read before
+    return T_body_sensor
 
 
 def _camera(path: Path, data: dict[str, Any]) -> StreamCamera:
