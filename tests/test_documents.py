@@ -20,7 +20,7 @@ from rstrack.cli.main import main as rstrack
 
 ROOT = Path(__file__).parents[1]
 README, MEASURED = ROOT / "README.md", ROOT / "docs/measured.md"
-DOCUMENTS = [README, *sorted((ROOT / "docs").glob("*.md"))]
+DOCUMENTS = [README, *sorted((ROOT / "docs").rglob("*.md"))]
 PROGRAMS: dict[str, Callable[[list[str]], object]] = {"rsgen": rsgen, "rstrack": rstrack}
 
 document = pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)

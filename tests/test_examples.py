@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import json
+import re
 import shlex
 import sys
 from pathlib import Path
@@ -111,3 +113,25 @@ def test_a_tracker_of_ones_own_in_the_bench(tmp_path: Path, monkeypatch: pytest.
     T, T_true = estimate.T_world_depth, synthetic.make_spline().pose(estimate.stamps)
     off, moved = errors(T, T_true), np.linalg.norm(T_true[:, :3, 3] - T_true[0, :3, 3], axis=1)
     assert len(T) == 8 and moved[-1] > 0.15 and off.max() < 0.2 * moved[-1]  # 12 % at 160 columns
+
+
+NOTEBOOK = EXAMPLES / "scene_to_table.ipynb"
+
+
+def test_the_notebook_is_kept_without_what_it_prints() -> None:
+    cells = json.loads(NOTEBOOK.read_text())["cells"]
+    code = [cell for cell in cells if cell["cell_type"] == "code"]
+    assert len(code) > 5 and all(cell["outputs"] == [] and cell["execution_count"] is None for cell in code)
+
+
+def test_the_notebook_runs_from_a_scene_to_a_table() -> None:
+    nbformat = pytest.importorskip("nbformat", reason="pip install '.[docs]' to run the notebook")
+    nbclient = pytest.importorskip("nbclient", reason="pip install '.[docs]' to run the notebook")
+    pytest.importorskip("ipykernel", reason="pip install '.[docs]' to run the notebook")
+    notebook = nbformat.read(NOTEBOOK, as_version=4)
+    nbclient.NotebookClient(notebook, timeout=300, kernel_name="python3").execute()
+    shown = [out["data"] for cell in notebook.cells for out in cell.get("outputs", ()) if "data" in out]
+    table = next(data["text/markdown"] for data in shown if "text/markdown" in data)
+    ate = {name: float(value) for name, value in re.findall(r"`([\w-]+)` \| [^|]+ \| ([\d.]+) \|", table)}
+    assert ate["rs-pg"] < 1.0 and ate["gs-pg"] > 3.0 * ate["rs-pg"]
+    assert sum("image/png" in data for data in shown) == 2

@@ -11,11 +11,9 @@ import re
 from pathlib import Path
 from typing import Any
 
-from mkdocs.structure.files import File
-
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("rsgen", "rstrack")
-# Anything that follows `(`, up to the anchor.
+# Mark of a picture, text, target, anchor.
 _LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s#]*)(#[^)\s]*)?\)")
 
 
@@ -79,6 +77,8 @@ def on_config(config: Any) -> Any:
 
 def on_files(files: Any, config: Any) -> Any:
     """The front page and the reference, which lie in no folder."""
+    from mkdocs.structure.files import File  # here, so that the rest is tested without MkDocs
+
     pages = {"index.md": (ROOT / "README.md").read_text()}
     for package in PACKAGES:
         pages[f"reference/{package}/index.md"] = face(package)

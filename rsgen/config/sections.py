@@ -123,7 +123,9 @@ class StreamConfig(Section):
     )
     model: Model = Field(default="pinhole", description="distortion model")
     distortion: tuple[Annotated[float, limits(-1e6, 1e6, "(coefficient)")], ...] = Field(
-        default=(), description="radtan k1 k2 p1 p2 [k3]; rational k1 k2 p1 p2 k3 k4 k5 k6; fisheye k1 k2 k3 k4"
+        default=(),
+        description="radtan k1 k2 p1 p2 [k3]; rational k1 k2 p1 p2 k3 k4 k5 k6; "
+        "fisheye k1 k2 k3 k4; double_sphere xi alpha",
     )
     rate_hz: Annotated[float, limits(1e-4, 1e5, "Hz")] = Field(default=30.0, description="frames per second")
     offset_s: Annotated[float, limits(-1e9, 1e9, "s")] = Field(

@@ -61,7 +61,7 @@ class Distorted:
 
 
 def distort(camera: Camera, x: Any, y: Any) -> Distorted:
-    """Pinhole, radtan, rational or fisheye distortion of normalised coordinates; twin of `Camera.project`."""
+    """Distortion of normalised coordinates by any of the models; twin of `Camera.project`."""
     if camera.model == "pinhole":
         return Distorted(x, y, 1.0, 0.0, 1.0, 1.0)
     r2 = x * x + y * y
@@ -82,6 +82,14 @@ def distort(camera: Camera, x: Any, y: Any) -> Distorted:
             scale + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x,
             scale,
         )
+    if camera.model == "double_sphere":
+        xi, alpha = camera.distortion
+        inverse_d1 = dr.rsqrt(1.0 + r2)
+        k = xi * ((1.0 + r2) * inverse_d1) + 1.0
+        d2 = dr.sqrt(r2 + k * k)
+        scale = dr.rcp(alpha * d2 + (1.0 - alpha) * k)
+        slope = -scale * scale * (alpha * (1.0 + k * xi * inverse_d1) / d2 + (1.0 - alpha) * xi * inverse_d1)
+        return Distorted(x * scale, y * scale, scale + slope * x * x, slope * x * y, scale + slope * y * y, scale)
     r = dr.sqrt(dr.maximum(r2, 1e-12))
     bent, rate = _bend(camera, dr.atan(r))
     scale = bent / r
@@ -90,7 +98,14 @@ def distort(camera: Camera, x: Any, y: Any) -> Distorted:
 
 
 def undistort(camera: Camera, xd: Any, yd: Any) -> tuple[Any, Any]:
-    """The inverse of `distort` by Newton steps; twin of `Camera.unproject`."""
+    """The inverse of `distort` by Newton steps, of a double sphere in closed form; twin of `Camera.unproject`."""
+    if camera.model == "double_sphere":
+        xi, alpha = camera.distortion
+        r2 = xd * xd + yd * yd
+        mz = (1.0 - alpha * alpha * r2) / (alpha * dr.sqrt(1.0 - (2.0 * alpha - 1.0) * r2) + 1.0 - alpha)
+        factor = (mz * xi + dr.sqrt(mz * mz + (1.0 - xi * xi) * r2)) / (mz * mz + r2)
+        scale = factor / (factor * mz - xi)
+        return xd * scale, yd * scale
     if camera.model == "fisheye":
         theta_d = dr.sqrt(xd * xd + yd * yd)
         theta = theta_d

@@ -161,6 +161,8 @@ def four_coefficients(name: str, camera: Camera) -> list[float]:
     """Distortion as the four numbers that Kalibr and EuRoC have; zeros (of radtan) for a pinhole. Raises UserError."""
     if camera.model == "pinhole":
         return [0.0] * 4
+    if camera.model == "double_sphere":
+        raise UserError(f"{name}: EuRoC has no double_sphere lens: render with radtan or fisheye, or export kalibr")
     if any(camera.distortion[4:]):
         number, k = next((i, k) for i, k in enumerate(camera.distortion[4:], 3) if k)
         raise UserError(

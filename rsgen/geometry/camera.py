@@ -1,8 +1,9 @@
-"""Camera models: pinhole, radial-tangential, rational and fisheye; pixels to rays and back, with Jacobians.
+"""Camera models: pinhole, radial-tangential, rational, fisheye, double sphere; pixels to rays and back, with Jacobians.
 
 Camera frame: x right, y down, z forward. Pixel centres at integer coordinates. Normalised coordinates are (x/z, y/z).
 Distortion as in OpenCV: `radtan` k1 k2 p1 p2 [k3] (Brown-Conrady), `rational` k1 k2 p1 p2 k3 k4 k5 k6, in which the
-radial part is divided by 1 + k4 r² + k5 r⁴ + k6 r⁶, `fisheye` k1 k2 k3 k4 (Kannala-Brandt).
+radial part is divided by 1 + k4 r² + k5 r⁴ + k6 r⁶, `fisheye` k1 k2 k3 k4 (Kannala-Brandt);
+`double_sphere` xi alpha as in Kalibr and Basalt (`rsgen.geometry.double_sphere`).
 
 Distortions are polynomials, or quotients of them, that may fold back at some radius, beyond which one pixel would see
 two directions. A camera here is defined only inside a disc around the optical axis on which the distortion provably is
@@ -23,10 +24,17 @@ from numpy.polynomial import Polynomial
 
 from rsgen.array_types import BoolArray, FloatArray
 from rsgen.errors import UserError
+from rsgen.geometry import double_sphere
 
-Model = Literal["pinhole", "radtan", "rational", "fisheye"]
+Model = Literal["pinhole", "radtan", "rational", "fisheye", "double_sphere"]
 
-_COEFFICIENTS: dict[str, tuple[int, ...]] = {"pinhole": (0,), "radtan": (4, 5), "rational": (8,), "fisheye": (4,)}
+_COEFFICIENTS: dict[str, tuple[int, ...]] = {
+    "pinhole": (0,),
+    "radtan": (4, 5),
+    "rational": (8,),
+    "fisheye": (4,),
+    "double_sphere": (2,),
+}
 # Radii in a table of the rational distortion, from which its inverse starts.
 _STARTS = 1024
 # Metres. Nearer points have no direction that float64 could tell.
@@ -40,7 +48,8 @@ class Camera:
     """Width and height in pixels, focal lengths and principal point in pixels, distortion model and coefficients.
 
     Raises UserError for sizes and focal lengths that are not positive, non-finite numbers, and a wrong number of
-    coefficients (pinhole 0, radtan 4 or 5, rational 8, fisheye 4).
+    coefficients (pinhole 0, radtan 4 or 5, rational 8, fisheye 4, double_sphere 2, of which xi is in (-1, 1] and alpha
+    in [0, 1]).
     """
 
     width: int
@@ -73,6 +82,8 @@ class Camera:
             raise UserError(
                 f"camera: {self.model} takes {counts} finite distortion coefficients, not {self.distortion}"
             )
+        if self.model == "double_sphere" and not double_sphere.is_lens(*self.distortion):
+            raise UserError(f"camera: double_sphere takes xi in (-1, 1] and alpha in [0, 1], not {self.distortion}")
 
     @property
     def K(self) -> FloatArray:
@@ -87,6 +98,8 @@ class Camera:
         if self.model == "fisheye":
             theta = math.sqrt(_first_root(_odd_slope(self.distortion)))
             return math.tan(min(theta, math.atan(_MAX_RADIUS)))
+        if self.model == "double_sphere":
+            return min(double_sphere.max_radius(*self._sphere), _MAX_RADIUS)
         k1, k2, p1, p2, k3 = self._brown
         # The Jacobian is symmetric; its radial part has the eigenvalues d and (r d)', the tangential part none below
         # -6 |p| r. Where both sums are positive it is positive definite, and on a disc, being convex, that makes the
@@ -142,6 +155,12 @@ class Camera:
         k1, k2, p1, p2, k3 = (*self.distortion, 0.0)[:5]
         return k1, k2, p1, p2, k3
 
+    @property
+    def _sphere(self) -> tuple[float, float]:
+        """xi and alpha of a double sphere."""
+        xi, alpha = self.distortion
+        return xi, alpha
+
     def _normalise(self, p_cam: npt.ArrayLike) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Normalised coordinates (..., 2), 1/z (...,) and whether the camera is defined there; 0 where it is not."""
         p = np.asarray(p_cam, dtype=np.float64)
@@ -158,6 +177,8 @@ class Camera:
         r2 = x * x + y * y
         if self.model == "fisheye":
             return xy * self._fisheye_scale(r2)[0][..., None]
+        if self.model == "double_sphere":
+            return xy * double_sphere.scale(*self._sphere, r2)[0][..., None]
         _, _, p1, p2, _ = self._brown
         d = self._radial_scale(r2)[0]
         return np.stack(
@@ -171,8 +192,8 @@ class Camera:
             return np.broadcast_to(np.eye(2), (*xy.shape, 2))
         x, y = xy[..., 0], xy[..., 1]
         r2 = x * x + y * y
-        if self.model == "fisheye":
-            s, g = self._fisheye_scale(r2)
+        if self.model in ("fisheye", "double_sphere"):
+            s, g = self._fisheye_scale(r2) if self.model == "fisheye" else double_sphere.scale(*self._sphere, r2)
             return _symmetric(s + g * x * x, g * x * y, s + g * y * y)
         _, _, p1, p2, _ = self._brown
         s, g = self._radial_scale(r2)
@@ -207,6 +228,9 @@ class Camera:
     def _undistort(self, distorted: FloatArray) -> FloatArray:
         if self.model == "pinhole":
             return distorted
+        if self.model == "double_sphere":
+            xy = double_sphere.undistort(*self._sphere, distorted)
+            return np.where((np.hypot(xy[..., 0], xy[..., 1]) < self.max_radius)[..., None], xy, np.nan)
         radius = np.hypot(distorted[..., 0], distorted[..., 1])
         unit = distorted / np.where(radius > 0.0, radius, 1.0)[..., None]
         if self.model == "fisheye":

@@ -267,7 +267,7 @@ def _free(dataset: Dataset, groups: Sequence[str], parts: Sequence[range]) -> Bo
     if rig.is_registered:
         free[DEPTH_LENS] = False
     for camera, lens in ((rig.depth_camera, DEPTH_LENS), (rig.color_camera, COLOR_LENS)):
-        if camera.model in ("fisheye", "rational"):
+        if camera.model in ("fisheye", "rational", "double_sphere"):
             free[lens.stop - _COEFFICIENTS : lens.stop] = False
     free[DRIFT] &= dataset.stamps[parts[-1].stop - 1] - dataset.stamps[parts[0].start] >= _DRIFT_S
     return free

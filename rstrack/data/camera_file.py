@@ -6,7 +6,8 @@ camera.yaml (depth left out: registered to colour, read out as colour is, 5000 u
     depth: {width: 640, height: 480, intrinsics: [481.2, 480.0, 319.5, 239.5], readout_s: 0.028, depth_scale: 5000}
     stamps: auto
 
-Each may have model (pinhole, radtan, rational, fisheye), distortion, exposure_s and scan as in rsgen's configs.
+Each may have model (pinhole, radtan, rational, fisheye, double_sphere), distortion, exposure_s and scan as in rsgen's
+configs.
 T_color_depth (4x4) is the identity where it is left out. color.offset_s: seconds added to colour's stamps; auto: see
 `rstrack.data.clocks.timing`; color.drift_ppm: millionths by which that grows over the recording, in whose middle it
 holds; both are what `rstrack calibrate` finds, which writes such a file. color.falloff: see `Rig`; auto: `track` finds

@@ -14,6 +14,7 @@ _PINHOLE = ("", "none", "pinhole")
 _RADTAN = ("plumb_bob", "radtan", "radial-tangential", "brown_conrady", "modified_brown_conrady")
 _INVERSE = ("inverse_brown_conrady",)
 _RATIONAL = ("rational_polynomial", "rational")
+_DOUBLE_SPHERE = ("double_sphere", "ds")
 _FISHEYE = ("equidistant", "fisheye", "kannala_brandt", "kannala_brandt4")
 
 
@@ -23,8 +24,9 @@ def camera_of(
     """The camera of a ROS camera_info, of librealsense or of an ASL sensor.yaml.
 
     name: for messages. intrinsics: fx, fy, cx, cy in pixels, pixel centres at integers. coefficients: in OpenCV's
-    order, k1 k2 p1 p2 k3 k4 k5 k6 of the rational model; zeros at the end are no matter. librealsense's inverse
-    Brown-Conrady is what its own projection makes of it, radtan. Raises UserError: a model that there is none of.
+    order, k1 k2 p1 p2 k3 k4 k5 k6 of the rational model, xi alpha of the double sphere; zeros at the end are no matter.
+    librealsense's inverse Brown-Conrady is what its own projection makes of it, radtan. Raises UserError: a model that
+    there is none of.
     """
     d = np.ravel(np.asarray(coefficients, float)).tolist()
     key = model.strip().lower().replace(" ", "_")
@@ -32,12 +34,14 @@ def camera_of(
     if width * height > _MOST_PIXELS:
         raise UserError(f"{name}: {width}x{height} pixels are absurd: the file is damaged")
     try:
-        if not any(d) and key not in _FISHEYE:
+        if not any(d) and key not in (*_FISHEYE, *_DOUBLE_SPHERE):
             return Camera(width, height, fx, fy, cx, cy)
         if key in _PINHOLE:
             raise UserError(f"distortion {d} without a model")
         if key in _FISHEYE:
             return Camera(width, height, fx, fy, cx, cy, "fisheye", tuple((d + [0.0] * 4)[:4]))
+        if key in _DOUBLE_SPHERE and len(d) == 2:
+            return Camera(width, height, fx, fy, cx, cy, "double_sphere", (d[0], d[1]))
         if key in (*_RADTAN, *_INVERSE, *_RATIONAL) and not any(d[5:]):
             return Camera(width, height, fx, fy, cx, cy, "radtan", tuple((d + [0.0] * 4)[: 5 if any(d[4:]) else 4]))
         if key in _RATIONAL and len(d) >= 8 and not any(d[8:]):

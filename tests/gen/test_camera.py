@@ -27,9 +27,17 @@ FISHEYE = Camera(400, 400, 190.978, 190.973, 198.93, 200.897, "fisheye", (0.0034
 AZURE = Camera(1280, 720, 605.7, 605.6, 637.9, 366.2, "rational",
                (0.4996, -2.6329, 5.7e-4, -1.4e-4, 1.5296, 0.3800, -2.4539, 1.4563))  # fmt: skip
 RATIONAL = replace(PINHOLE, model="rational", distortion=(0.3, 0.1, 0.004, -0.003, 0.02, 0.5, 0.1, 0.01))
-CAMERAS = [PINHOLE, FREIBURG1, BARREL, TANGENTIAL, FISHEYE, AZURE, RATIONAL]
-NAMES = ["pinhole", "freiburg1", "barrel", "tangential", "fisheye", "azure", "rational"]
+# The double sphere paper's BF2M2020S23 lens, one whose alpha is below a half, and one that ends before 90 degrees.
+SPHERES = [
+    Camera(640, 480, 313.2, 313.2, 319.5, 239.5, "double_sphere", (-0.18, 0.59)),
+    Camera(640, 480, 400.0, 410.0, 310.0, 241.0, "double_sphere", (0.3, 0.4)),
+    Camera(320, 240, 260.0, 260.0, 160.0, 119.0, "double_sphere", (-0.7, 0.3)),
+]
+CAMERAS = [PINHOLE, FREIBURG1, BARREL, TANGENTIAL, FISHEYE, AZURE, RATIONAL, *SPHERES]
+NAMES = ["pinhole", "freiburg1", "barrel", "tangential", "fisheye", "azure", "rational", "ds", "ds 0.4", "ds ends"]
 each_camera = pytest.mark.parametrize("camera", CAMERAS, ids=NAMES)
+each_of_opencv = pytest.mark.parametrize("camera", CAMERAS[:-3], ids=NAMES[:-3])
+each_sphere = pytest.mark.parametrize("camera", SPHERES, ids=NAMES[-3:])
 
 
 def opencv_project(camera: Camera, p_cam: np.ndarray) -> np.ndarray:
@@ -48,7 +56,7 @@ def visible_points(camera: Camera, count: int = 300) -> np.ndarray:
     return np.concatenate([camera.backproject(uv, rng.uniform(0.3, 8.0, count)), [[0.0, 0.0, 2.0], [1e-12, 0.0, 1.0]]])
 
 
-@each_camera
+@each_of_opencv
 def test_projection_agrees_with_opencv(camera: Camera) -> None:
     p = visible_points(camera)
     uv, valid = camera.project(p)
@@ -56,7 +64,7 @@ def test_projection_agrees_with_opencv(camera: Camera) -> None:
     np.testing.assert_allclose(uv, opencv_project(camera, p), rtol=0, atol=1e-9)
 
 
-@each_camera
+@each_of_opencv
 def test_unprojection_agrees_with_opencv(camera: Camera) -> None:
     uv = np.random.default_rng(2).uniform(0.2, 0.8, size=(100, 2)) * (camera.width, camera.height)
     stop = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 1000, 1e-15)
@@ -69,6 +77,46 @@ def test_unprojection_agrees_with_opencv(camera: Camera) -> None:
         else:
             xy = cv2.undistortPoints(uv[:, None], camera.K, D, criteria=stop)
     np.testing.assert_allclose(camera.unproject(uv)[:, :2], xy[:, 0], rtol=0, atol=1e-8)
+
+
+def two_spheres(camera: Camera, p: np.ndarray) -> np.ndarray:
+    """The paper's projection (40) in three dimensions, as Basalt has it."""
+    (xi, alpha), (x, y, z) = camera.distortion, p.T
+    d1 = np.sqrt(x**2 + y**2 + z**2)
+    d2 = np.sqrt(x**2 + y**2 + (xi * d1 + z) ** 2)
+    depth = alpha * d2 + (1 - alpha) * (xi * d1 + z)
+    return np.stack([camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy], axis=-1)
+
+
+@each_sphere
+def test_a_double_sphere_is_the_papers(camera: Camera) -> None:
+    p = visible_points(camera)
+    uv, valid = camera.project(p)
+    assert valid.all()
+    np.testing.assert_allclose(uv, two_spheres(camera, p), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("xi", "alpha"), [(-0.7, 0.3), (-0.9, 0.7), (-0.5, 0.0), (-0.99, 0.5), (-0.6, 1.0), (0.4, 0.9)]
+)
+def test_a_double_sphere_is_seen_up_to_where_it_folds(xi: float, alpha: float) -> None:
+    camera = Camera(640, 480, 300.0, 300.0, 319.5, 239.5, "double_sphere", (xi, alpha))
+    end = camera.max_radius
+    r = np.linspace(0.0, min(end, 50.0), 20001)[1:-1]
+    p = np.stack([r, np.zeros_like(r), np.ones_like(r)], axis=-1)
+    assert (np.diff(two_spheres(camera, p)[:, 0]) > 0.0).all()
+    assert (two_spheres(camera, p)[:, 0] > camera.cx).all()
+    # Just behind the end, where there is one: it turns back, or comes out on the other side.
+    if end < 50.0:
+        after = two_spheres(camera, np.array([[end * (1.0 + 1e-4), 0.0, 1.0], [end * (1.0 + 2e-4), 0.0, 1.0]]))[:, 0]
+        assert after[1] < after[0] or after[0] < camera.cx
+        assert camera.project([[end * 1.001, 0.0, 1.0], [end * 0.999, 0.0, 1.0]])[1].tolist() == [False, True]
+
+
+@pytest.mark.parametrize("distortion", [(-1.0, 0.5), (0.2, 1.1), (0.2, -0.1), (1.2, 0.5), (0.1,)])
+def test_what_is_no_double_sphere(distortion: tuple[float, ...]) -> None:
+    with pytest.raises(UserError, match="double_sphere takes"):
+        replace(PINHOLE, model="double_sphere", distortion=distortion)
 
 
 @each_camera

@@ -36,6 +36,8 @@ CAMERAS = {
     ),
     "folding rational": Camera(640, 480, 525.0, 520.0, 310.0, 241.0, "rational", (-0.2, 0, 1e-3, 0, 0, 0.3, 0, 0)),
     "fisheye": Camera(640, 480, 320.0, 322.0, 310.0, 241.0, "fisheye", (0.03, -0.01, 0.004, -0.001)),
+    "double sphere": Camera(640, 480, 313.2, 313.2, 319.5, 239.5, "double_sphere", (-0.18, 0.59)),
+    "double sphere that ends": Camera(640, 480, 320.0, 322.0, 310.0, 241.0, "double_sphere", (-0.6, 0.7)),
     "folding fisheye": Camera(640, 480, 320.0, 322.0, 310.0, 241.0, "fisheye", (-0.15, -0.05, 0.0, 0.0)),
 }
 STAMP = 0.45

@@ -135,6 +135,16 @@ def test_a_fisheye_is_called_equidistant_and_zero_noise_is_pointed_out(sequence:
     assert cam0["distortion_model"] == "equidistant" and cam0["distortion_coeffs"] == [0.1, 0.02, 0.0, 0.001]
 
 
+def test_a_double_sphere_is_kalibrs_ds_and_not_eurocs(plain: Sequence, tmp_path: Path) -> None:
+    camera = Camera(64, 48, 40, 41, 31.5, 23.5, "double_sphere", (-0.2, 0.6))
+    export_kalibr(with_color(plain, camera=camera), tmp_path / "kalibr")
+    cam0 = load(tmp_path / "kalibr/camchain.yaml")["cam0"]
+    assert (cam0["camera_model"], cam0["distortion_model"], cam0["distortion_coeffs"]) == ("ds", "none", [])
+    assert cam0["intrinsics"] == [-0.2, 0.6, 40, 41, 31.5, 23.5]  # as Kalibr has them: xi alpha fu fv pu pv
+    with pytest.raises(UserError, match="EuRoC has no double_sphere lens"):
+        export_euroc(with_color(plain, camera=camera), tmp_path / "euroc")
+
+
 # --- EuRoC -----------------------------------------------------------------------------------------------------------
 
 

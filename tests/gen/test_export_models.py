@@ -163,6 +163,8 @@ CAMERAS = [
     Camera(64, 48, 50, 51, 31.5, 23.0),
     Camera(64, 48, 50, 51, 31.5, 23.0, "radtan", RADTAN),
     Camera(64, 48, 50, 51, 31.5, 23.0, "radtan", (*RADTAN, 0.01)),
+    Camera(64, 48, 50, 51, 31.5, 23.0, "rational", (0.3, 0.1, 0.004, -0.003, 0.02, 0.5, 0.1, 0.01)),
+    Camera(64, 48, 50, 51, 31.5, 23.0, "rational", (*RADTAN, 0.0, 0.0, 0.0, 0.0)),
     Camera(64, 48, 50, 51, 31.5, 23.0, "fisheye", (0.1, 0.02, 0.0, 0.001)),
 ]
 P_CAM = np.array([[0.1, 0.2, 1.0], [-0.5, 0.3, 1.2], [0.4, -0.4, 0.9], [0.0, 0.0, 2.0]])
@@ -180,6 +182,24 @@ def test_cameras_of_colmap_are_half_a_pixel_off_and_otherwise_opencv_s(camera: C
         assert len(D) == {"PINHOLE": 0, "OPENCV": 4, "FULL_OPENCV": 8}[model]
         uv, _ = cv2.projectPoints(P_CAM, zero, zero, K, np.array(D) if D else None)
     np.testing.assert_allclose(uv.reshape(-1, 2), camera.project(P_CAM)[0] + 0.5, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("export", "model", "distortion"),
+    [
+        (export_colmap, "double_sphere", (-0.2, 0.6)),
+        (export_nerfstudio, "double_sphere", (-0.2, 0.6)),
+        (export_nerfstudio, "rational", (0.3, 0.1, 0.004, -0.003, 0.02, 0.5, 0.1, 0.01)),
+    ],
+)
+def test_lenses_that_a_format_has_not(
+    sequence: Sequence, tmp_path: Path, export: Any, model: Any, distortion: tuple[float, ...]
+) -> None:
+    camera = replace(sequence.streams["color"].camera, model=model, distortion=distortion)
+    color = replace(sequence.streams["color"], camera=camera)
+    with pytest.raises(UserError, match=rf"has no {model} lens: render with"):
+        export(replace(sequence, streams={**sequence.streams, "color": color}), tmp_path / "out")
+    assert not list(tmp_path.iterdir())
 
 
 def test_pycolmap_reads_the_model(sequence: Sequence, colmap: Path) -> None:

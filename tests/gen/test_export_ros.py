@@ -211,6 +211,23 @@ def test_registered_depth_and_millimetres(sequence: Sequence, tmp_path: Path) ->
     assert "registered" in facts(found)["streams"]["depth"]
 
 
+def test_a_rational_lens_keeps_its_coefficients_and_a_double_sphere_is_refused(
+    sequence: Sequence, tmp_path: Path
+) -> None:
+    def lens(model: Any, distortion: tuple[float, ...]) -> Sequence:
+        camera = Camera(64, 48, 40, 41, 31.5, 23.5, model, distortion)
+        color = replace(sequence.streams["color"], camera=camera)
+        return replace(sequence, streams={**sequence.streams, "color": color})
+
+    eight = (0.3, 0.1, 0.004, -0.003, 0.02, 0.5, 0.1, 0.01)
+    export_ros(lens("rational", eight), tmp_path / "a.bag", "ros1")
+    info = read(tmp_path / "a.bag")["/camera/color/camera_info"][0][1]
+    assert info.distortion_model == "rational_polynomial" and tuple(info.D) == eight
+    with pytest.raises(UserError, match="has no double_sphere lens"):
+        export_ros(lens("double_sphere", (-0.2, 0.6)), tmp_path / "b.bag", "ros1")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.bag"]
+
+
 def test_a_fisheye_is_equidistant(sequence: Sequence, tmp_path: Path) -> None:
     camera = Camera(64, 48, 40, 41, 31.5, 23.5, "fisheye", (0.1, 0.02, 0.0, 0.001))
     color = replace(sequence.streams["color"], camera=camera)

@@ -265,6 +265,11 @@ def test_lens_models_and_undistorted_images(place: Path, capfd: pytest.CaptureFi
     recordings.write_spoken(place / "d", talker, spoken, "mcap")
     dataset, _ = imported(capfd, "d --force")
     assert dataset.rig.color_camera.model == "rational" and dataset.rig.color_camera.distortion == tuple(full)
+    spoken = recordings.speak(talker, CONTENT, color_info=("double_sphere", [-0.2, 0.6]))
+    recordings.write_spoken(place / "e", talker, spoken, "mcap")
+    dataset, _ = imported(capfd, "e --force")
+    assert dataset.rig.color_camera.model == "double_sphere"
+    assert dataset.rig.color_camera.distortion == (-0.2, 0.6)
     spoken = recordings.speak(talker, CONTENT, color_info=("double_sphere", D))
     recordings.write_spoken(place / "c", talker, spoken, "mcap")
     (place / "out").rename(place / "before")

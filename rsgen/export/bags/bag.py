@@ -24,6 +24,11 @@ _SUFFIX = {"ros1": ".bag", "ros2": "", "mcap": ".mcap"}
 TF = "tf2_msgs/msg/TFMessage"  # which rosbags does not know of ROS 1
 _BAG_VERSION: Literal[8] = 8  # of ROS 2 Iron; the next writes QoS in a way that older ones cannot read
 # Axes of ROS's vectors, in the order of ours.
+# ROS's names of lens models, and how many coefficients each has.
+_MODELS = {
+    "pinhole": ("plumb_bob", 5), "radtan": ("plumb_bob", 5), "rational": ("rational_polynomial", 8),
+    "fisheye": ("equidistant", 4),
+}  # fmt: skip
 _AXES = {"Vector3": "xyz", "Point": "xyz", "Quaternion": "xyzw"}
 
 
@@ -71,9 +76,12 @@ class Bag:
         return self.message(f"geometry_msgs/msg/{name}", **{axis: float(value) for axis, value in fields})
 
     def camera_info(self, header: Any, camera: Camera) -> dict[str, Any]:
-        """Fields of sensor_msgs/CameraInfo: plumb_bob, or equidistant for a fisheye; pixel centres as ours."""
+        """Fields of sensor_msgs/CameraInfo, by the model's name in ROS; pixel centres as ours. Raises UserError."""
+        if camera.model not in _MODELS:
+            raise UserError(f"camera_info has no {camera.model} lens: render with radtan, rational or fisheye")
+        name, count = _MODELS[camera.model]
         matrices = {
-            "D": np.array(camera.distortion if camera.model == "fisheye" else (*camera.distortion, *[0.0] * 5)[:5]),
+            "D": np.array((*camera.distortion, *[0.0] * count)[:count]),
             "K": camera.K.ravel(),
             "R": np.eye(3).ravel(),
             "P": np.column_stack([camera.K, np.zeros(3)]).ravel(),
@@ -83,7 +91,7 @@ class Bag:
             "header": header,
             "height": camera.height,
             "width": camera.width,
-            "distortion_model": "equidistant" if camera.model == "fisheye" else "plumb_bob",
+            "distortion_model": name,
             **(matrices if self.kind == "ros1" else {name.lower(): value for name, value in matrices.items()}),
             "binning_x": 0,
             "binning_y": 0,

@@ -112,6 +112,7 @@ def truth_csv(
 
 def _camera_yaml(stream: Stream, T_BS: FloatArray) -> dict[str, Any]:
     camera, shutter = stream.camera, stream.shutter
+    coefficients = four_coefficients(stream.name, camera)
     data: dict[str, Any] = {
         "sensor_type": "camera",
         "comment": f"rsgen {stream.name}; stamps are the end of line 0's exposure, see rolling_shutter",
@@ -121,7 +122,7 @@ def _camera_yaml(stream: Stream, T_BS: FloatArray) -> dict[str, Any]:
         "camera_model": "pinhole",
         "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
         "distortion_model": _MODELS[camera.model],
-        "distortion_coefficients": four_coefficients(stream.name, camera),
+        "distortion_coefficients": coefficients,
         "rolling_shutter": {
             "readout_s": shutter.readout_s,
             "exposure_s": shutter.exposure_s,

@@ -112,11 +112,16 @@ _DENSITIES = (
 
 def _camera(stream: Stream, topic: str) -> dict[str, Any]:
     camera = stream.camera
+    pinhole = [camera.fx, camera.fy, camera.cx, camera.cy]
+    if camera.model == "double_sphere":
+        lens = {"camera_model": "ds", "intrinsics": [*camera.distortion, *pinhole], "distortion_model": "none"}
+        bent: list[float] = []
+    else:
+        lens = {"camera_model": "pinhole", "intrinsics": pinhole, "distortion_model": _MODELS[camera.model]}
+        bent = four_coefficients(stream.name, camera)
     return {
-        "camera_model": "pinhole",
-        "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
-        "distortion_model": _MODELS[camera.model],
-        "distortion_coeffs": four_coefficients(stream.name, camera),
+        **lens,
+        "distortion_coeffs": bent,
         "resolution": [camera.width, camera.height],
         "rostopic": topic,
         "line_delay": row_clock(stream.name, camera, stream.shutter).delay_s,

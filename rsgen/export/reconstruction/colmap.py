@@ -14,6 +14,7 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
+from rsgen.errors import UserError
 from rsgen.export.folder import make_folders, new_folder, place_images
 from rsgen.export.poses.approximation import Loss, loss_of_poses, poses_of_line, sightings
 from rsgen.export.poses.shutter_facts import loss_words, shutter_facts
@@ -38,6 +39,7 @@ def export_colmap(sequence: Sequence, out: Path, copy: bool = False, progress: P
     """
     sequence = sequence.as_taken
     color = sequence.streams["color"]
+    cameras = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", f"1 {camera_line(color.camera)}"]
     T_world_color = poses_of_line(sequence, middle_line(sequence))
     losses = {ONE_POSE: loss_of_one_pose(sequence, T_world_color)}
     points = surface_points(sequence, progress, (0.0, 0.8))
@@ -49,7 +51,7 @@ def export_colmap(sequence: Sequence, out: Path, copy: bool = False, progress: P
     place_images(color.paths, [out / "images" / name for name in names], copy, progress, (0.8, 1.0))
     write_shutter_files(sequence, out, losses)
     files = {
-        "cameras.txt": ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", f"1 {camera_line(color.camera)}"],
+        "cameras.txt": cameras,
         "images.txt": _images(T_world_color, names, points),
         "points3D.txt": _points(T_world_color, color.camera, points),
     }
@@ -76,13 +78,15 @@ def write_shutter_files(sequence: Sequence, out: Path, losses: dict[str, Loss]) 
 
 
 def camera_line(camera: Camera) -> str:
-    """MODEL WIDTH HEIGHT PARAMS[] of a camera: PINHOLE, OPENCV, FULL_OPENCV (with k3) or OPENCV_FISHEYE."""
+    """MODEL WIDTH HEIGHT PARAMS[]: PINHOLE, OPENCV, FULL_OPENCV (k3 and more), OPENCV_FISHEYE. Raises UserError."""
     model, distortion = "PINHOLE", camera.distortion
     if camera.model == "fisheye":
         model = "OPENCV_FISHEYE"
+    elif camera.model == "double_sphere":
+        raise UserError("COLMAP has no double_sphere lens: render with radtan, rational or fisheye")
     elif any(distortion[4:]):
-        model, distortion = "FULL_OPENCV", (*distortion, 0.0, 0.0, 0.0)
-    elif camera.model == "radtan":
+        model, distortion = "FULL_OPENCV", (*distortion, 0.0, 0.0, 0.0)[:8]
+    elif camera.model in ("radtan", "rational"):
         model, distortion = "OPENCV", distortion[:4]
     params = (camera.fx, camera.fy, camera.cx + PIXEL_SHIFT, camera.cy + PIXEL_SHIFT, *distortion)
     return " ".join([model, f"{camera.width} {camera.height}", *(repr(float(value)) for value in params)])

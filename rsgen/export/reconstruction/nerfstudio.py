@@ -21,6 +21,7 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
+from rsgen.errors import UserError
 from rsgen.export.folder import make_folders, new_folder, place_images
 from rsgen.export.poses.approximation import (
     Loss,
@@ -64,6 +65,8 @@ def export_nerfstudio(sequence: Sequence, out: Path, copy: bool = False, progres
     """
     sequence = sequence.as_taken
     color = sequence.streams["color"]
+    if color.camera.model not in _MODELS:
+        raise UserError(f"nerfstudio has no {color.camera.model} lens: render with radtan or fisheye")
     points = surface_points(sequence, progress, (0.0, 0.5))
     losses = _losses(sequence)
 
