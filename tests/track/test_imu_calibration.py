@@ -229,3 +229,16 @@ def test_the_command(dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFix
     assert "--free imu" in capsys.readouterr().err
     assert main(["calibrate", where, "--free", "imu", "--run", str(tmp_path / "nowhere")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_errors_that_are_alike_count_for_more() -> None:
+    """An autoregression of φ has in sums (1 + φ) / (1 − φ) times the variance of white noise."""
+    from rstrack.calibration.imu.solve import _alike
+
+    rng = np.random.default_rng(0)
+    white = rng.normal(size=(20000, 6))
+    assert _alike(white) == pytest.approx(1.0, abs=0.05)
+    regressed = np.zeros_like(white)
+    for k in range(1, len(white)):
+        regressed[k] = 0.5 * regressed[k - 1] + white[k]
+    assert _alike(regressed) == pytest.approx(np.sqrt(3.0), rel=0.05)
