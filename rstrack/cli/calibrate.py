@@ -6,11 +6,16 @@ import sys
 from dataclasses import replace
 from json import dumps
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from rsgen.console.command_line import Frames, Json, Quiet
 from rsgen.device.backend import Backend
-from rstrack.cli.options import CameraFile, DeviceName, NoiseDepth, NoiseIntensity, Seed, SequenceFolder
+from rsgen.errors import UserError
+from rstrack.cli.options import CameraFile, DeviceName, ImuFile, NoiseDepth, NoiseIntensity, Seed, SequenceFolder
+
+if TYPE_CHECKING:
+    from rstrack.data.dataset import Dataset
+    from rstrack.options import Options
 
 STATUS = (
     "exit status: 0 done, 1 some values are not told by the recording, or not converged, 2 wrong input, 130 interrupted"
@@ -24,10 +29,14 @@ def calibrate(
     free: Annotated[
         str | None,
         "what to estimate, of readout, offset, extrinsics, depth, intrinsics (default: the first three; depth that is "
-        "registered to colour has no extrinsics)",
+        "registered to colour has no extrinsics); or imu alone: place, clock, biases and scale of an IMU",
         "NAMES",
     ] = None,
     device: DeviceName = None,
+    imu: ImuFile = None,
+    run: Annotated[
+        Path | None, "with --free imu: a run of this recording, whose spline is taken; otherwise it is tracked", "RUN"
+    ] = None,
     frames: Frames = None,
     backend: Annotated[Backend, "where kernels run"] = "auto",
     noise_depth: NoiseDepth = 0.0,
@@ -42,7 +51,7 @@ def calibrate(
     from rsgen.console.progress import ProgressDisplay
     from rsgen.files import atomic_write
     from rstrack.calibration.findings.record import record_of
-    from rstrack.calibration.run import calibrate as run
+    from rstrack.calibration.run import calibrate as calibrate_cameras
     from rstrack.calibration.unknowns.devices import device_named
     from rstrack.data.dataset import open_dataset
     from rstrack.data.noise import NoisyImages
@@ -51,12 +60,23 @@ def calibrate(
     from rstrack.report.calibration import calibration_page
 
     known = None if device is None else device_named(device)
+    groups = None if free is None else tuple(name.strip() for name in free.split(",") if name.strip())
     dataset = open_dataset(sequence, camera)
     if noise_depth or noise_intensity:
         dataset = replace(dataset, images=NoisyImages(dataset.images, noise_depth, noise_intensity, seed))
+    if groups is not None and "imu" in groups:
+        if groups != ("imu",) or device is not None or report is not None:
+            raise UserError(
+                "--free imu: stands alone, without other names, --device and --report: calibrate the cameras first, "
+                "and give what was found as --camera"
+            )
+        if imu is not None and dataset.imu_files is not None:
+            dataset = replace(dataset, imu_files=replace(dataset.imu_files, given=imu))
+        return _imu(sequence, dataset, run, frames or slice(None), Options(backend=backend), out, json, quiet)
+    if run is not None or imu is not None:
+        raise UserError("--run and --imu: are for --free imu")
     with ProgressDisplay(quiet) as progress:
-        groups = None if free is None else tuple(name.strip() for name in free.split(",") if name.strip())
-        found = run(dataset, groups, frames or slice(None), Options(backend=backend), progress, known)
+        found = calibrate_cameras(dataset, groups, frames or slice(None), Options(backend=backend), progress, known)
     if out is not None:
         atomic_write(out, found.camera_file().encode())
     print(dumps(found.as_dict(), indent=2) if json else found.text())
@@ -71,3 +91,24 @@ def calibrate(
         print("rstrack: interrupted; this is the best so far", file=sys.stderr)
         return 130
     return 1 if found.undetermined.any() or not found.solution.is_settled else 0
+
+
+def _imu(
+    sequence: Path, dataset: Dataset, run: Path | None, frames: slice, options: Options, out: Path | None, json: bool,
+    quiet: bool,
+) -> int:  # fmt: skip
+    from rsgen.console.progress import ProgressDisplay
+    from rsgen.files import atomic_write
+    from rstrack.calibration.imu.run import calibrate_imu, track_of, track_of_run
+
+    if dataset.imu_files is not None:
+        dataset.imu_files.description()  # complain before minutes of tracking
+    with ProgressDisplay(quiet) as progress:
+        followed = track_of(dataset, frames, options, progress) if run is None else track_of_run(run)
+        found = calibrate_imu(dataset, followed, progress)
+    if out is not None:
+        atomic_write(out, found.imu_file().encode())
+    print(dumps(found.as_dict(), indent=2) if json else found.text())
+    if out is not None and not json:
+        print(f"{out}: written (rstrack track {sequence} --imu {out} --out RUN)")
+    return 1 if found.undetermined.any() else 0

@@ -1,8 +1,9 @@
 """What is wrong with an IMU's samples, told by their magnitudes: units, rate, gaps, and times that are not the images'.
 
-Units, by what a hand or a robot does to a camera: the median of the specific force's norm is near g, and the direction
-of gravity in the IMU's frame turns as the gyroscope says: d/dt f = -ω x f + what the motion adds. That tells a
-gyroscope in degrees, whose ω is 57 times too large; where gravity keeps its direction, the mere size of the rate does.
+Units, by what a hand or a robot does to a camera: the median of the specific force's norm is near g or a few times it,
+and the direction of gravity in the IMU's frame turns as the gyroscope says: d/dt f = -ω x f + what the motion adds.
+That tells a gyroscope in degrees, whose ω is 57 times too large; where gravity keeps its direction, the mere size of
+the rate does.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ LOWEST_HZ, LOW_HZ = 25.0, 90.0
 """Rates below which an IMU says nothing that a camera of 30 Hz does not, and below which that is said."""
 # Steps longer than so many usual ones are gaps.
 _GAP = 1.75
-# Part of g within which the median specific force lies, and of the factor between two units.
-_NEAR_G, _NEAR_UNIT = (0.6, 1.6), (0.75, 1.3)
+# Part of g within which the median specific force lies (2.4 where fast, and shaken); of the factor between units.
+_NEAR_G, _NEAR_UNIT = (0.6, 10.0), (0.75, 1.3)
 _ACCEL_UNITS = (("g", 9.80665), ("mg", 9.80665e-3), ("cm/s²", 1e-2), ("mm/s²", 1e-3))
 _GYRO_UNITS = (("deg/s", np.pi / 180.0), ("mdeg/s", np.pi / 180e3), ("mrad/s", 1e-3))
 _STAMP_UNITS = (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6), ("ns", 1e-9))

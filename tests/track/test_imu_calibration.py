@@ -1,0 +1,244 @@
+"""An IMU against a tracked camera: derivatives by differences, what a made recording gives, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_dataset import make_tum
+from test_imu_input import swung
+from util import random_spline
+
+from rsgen.config.imu import ImuConfig
+from rsgen.errors import UserError
+from rsgen.geometry import se3, so3
+from rsgen.geometry.spline import Spline
+from rsgen.sensors.imu import exact_imu, imu_csv, simulate_imu
+from rstrack.calibration.imu.result import ImuCalibration
+from rstrack.calibration.imu.run import Followed, calibrate_imu
+from rstrack.calibration.imu.tracked import Track, corrected, corrections, motion_at, spread
+from rstrack.calibration.imu.unit import (
+    COUNT,
+    DRIFT,
+    LEVER,
+    OFFSET,
+    ROTATION,
+    SCALE,
+    Unit,
+    at_stamps,
+    by_corrections,
+    by_time,
+    by_unit,
+    hats,
+    readings,
+)
+from rstrack.cli.main import main
+from rstrack.data.dataset import Dataset, open_dataset
+
+SCALES = np.array([1.01, 0.995, 1.004])
+CONFIG = ImuConfig.model_validate({
+    "preset": "phone", "clock_offset_s": 0.0125, "clock_drift_ppm": 80.0, "gyroscope_matrix": np.diag(SCALES).tolist(),
+    "dropped": 0.01,
+})  # fmt: skip
+SECONDS = 12.0
+TRUE = swung(SECONDS)
+SAMPLES = simulate_imu(TRUE, CONFIG, 0.0, SECONDS, seed=1)
+
+
+def unit_of(spline: Spline, rng: np.random.Generator) -> Unit:
+    T = se3.exp(0.5 * rng.normal(size=6))
+    return Unit(
+        T[:3, :3], 0.1 * rng.normal(size=3), 0.003, 1e-3, 0.02 * rng.normal(size=3), np.array([0.3, -9.7, 1.0]),
+        np.linspace(spline.t_begin, spline.t_end, 3), 0.1 * rng.normal(size=(3, 6)), spline.t_begin + 0.2,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("parts", [1, 3])
+def test_derivatives_are_those_of_differences(parts: int) -> None:
+    rng, spline = np.random.default_rng(parts), random_spline(3, points=10, angle=0.3)
+    track = Track(spline, parts)
+    unit, x = unit_of(spline, rng), np.zeros((track.count, 6))
+    stamps = np.linspace(spline.t_begin + 0.02, spline.t_end - 0.02, 23)
+
+    def read(unit: Unit, x: np.ndarray) -> np.ndarray:
+        return np.stack(readings(unit, *at_stamps(track, unit, x, stamps)))
+
+    motion, t = at_stamps(track, unit, x, stamps)
+    change = by_time(track, unit, x, stamps)
+    J = by_unit(unit, motion, t, change, stamps)
+    for i in range(COUNT + unit.biases.size):
+        step = np.zeros(COUNT + unit.biases.size)
+        step[i] = 1e-4 if i == OFFSET else 1e-5  # of times as by_time does: jerks jump at knots
+        found = (read(unit.moved(step), x) - read(unit.moved(-step), x)) / (2 * step[i])
+        if i != DRIFT:
+            np.testing.assert_allclose(J[..., i], found, atol=1e-5 * np.abs(found).max() + 1e-9)
+    np.testing.assert_allclose(J[..., DRIFT], J[..., OFFSET] * (stamps - unit.middle)[:, None])
+    by_x = [spread(motion, blocks, track.count).toarray() for blocks in by_corrections(unit, motion)]
+    for k in range(0, track.count, 3):
+        for c in range(6):
+            step = np.zeros_like(x)
+            step[k, c] = 1e-6
+            found = (read(unit, step) - read(unit, -step)) / 2e-6
+            for sensor in range(2):
+                close = 1e-5 * np.abs(found[sensor]).max() + 1e-9
+                np.testing.assert_allclose(by_x[sensor][:, 6 * k + c], found[sensor].ravel(), atol=close)
+
+
+def test_readings_are_those_of_the_generator() -> None:
+    spline = random_spline(5, points=12, angle=0.3)
+    unit = unit_of(spline, np.random.default_rng(1))
+    t = np.linspace(spline.t_begin, spline.t_end, 50)
+    gyro, accel = exact_imu(spline, unit.T_imu_depth, unit.gravity, t)
+    bias = hats(unit.bias_times, t) @ unit.biases
+    found = readings(unit, motion_at(Track(spline), t), t)
+    np.testing.assert_allclose(found[0], (1.0 + unit.scale) * gyro + bias[:, :3], atol=1e-10)
+    np.testing.assert_allclose(found[1], accel + bias[:, 3:], atol=1e-9)
+
+
+def test_a_corrected_motion_is_that_of_the_corrected_poses() -> None:
+    """Finite differences of R exp(φ), p + δ."""
+    spline, rng = random_spline(7, points=9, angle=0.3), np.random.default_rng(0)
+    track = Track(spline, 2)
+    x, h = 1e-4 * rng.normal(size=(track.count, 6)), 1e-4
+    t = spline.t_begin + 0.0125 + 0.025 * np.arange(11)  # amid the pieces, where all is smooth
+
+    def poses(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        T, value = spline.pose(t), corrections(motion_at(track, t), x)[0]
+        return T[:, :3, :3] @ so3.exp(value[:, :3]), T[:, :3, 3] + value[:, 3:]
+
+    (early, p0), (now, p1), (late, p2) = (poses(t + k * h) for k in (-1, 0, 1))
+    motion = corrected(motion_at(track, t), x)
+    np.testing.assert_allclose(motion.R, now, atol=1e-12)
+    np.testing.assert_allclose(motion.rate, so3.log(np.swapaxes(early, 1, 2) @ late) / (2 * h), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(motion.acceleration, (p2 - 2 * p1 + p0) / h**2, rtol=1e-4, atol=1e-3)
+    after, before = (corrected(motion_at(track, t + k * h), x).rate for k in (1, -1))
+    np.testing.assert_allclose(motion.rate_change, (after - before) / (2 * h), rtol=1e-3, atol=2e-3)
+
+
+def tracked(noise: float, seed: int = 0, dt: float = 0.025) -> Followed:
+    """The true motion with knots of its own, which do not meet the true ones, and errors as a tracker's."""
+    knots = np.arange(0.3 * dt, SECONDS, dt)
+    points = TRUE.pose(np.clip(knots, TRUE.t_begin, TRUE.t_end))
+    fitted = points.copy()
+    for _ in range(4):  # control points whose spline passes through the poses
+        spline = Spline(fitted, knots[1], dt)
+        inside = slice(1, len(knots) - 2)
+        error = se3.log(se3.inverse(spline.pose(knots[inside])) @ points[inside])
+        fitted[inside] = fitted[inside] @ se3.exp(error)
+        fitted = se3.orthonormalise(fitted)
+    shaken = fitted @ se3.exp(noise * np.random.default_rng(seed).normal(size=(len(fitted), 6)))
+    spline = Spline(shaken, knots[1], dt)
+    return Followed(spline, ((spline.t_begin, spline.t_end),))
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """Frames for 10 s, of which the stamps alone count here, with the samples beside."""
+    root = make_tum(tmp_path_factory.mktemp("imu") / "mine")
+    (root / "imu.csv").write_text(imu_csv(SAMPLES))
+    noise = {name: getattr(CONFIG, name) for name in ImuConfig.model_fields if name.endswith(("density", "walk"))}
+    (root / "imu.yaml").write_text("\n".join(f"{name}: {value}" for name, value in noise.items()))
+    return replace(open_dataset(root), stamps=np.arange(1.0, 11.0, 1 / 30))
+
+
+@pytest.fixture(scope="module")
+def found(dataset: Dataset) -> ImuCalibration:
+    return calibrate_imu(dataset, tracked(1e-4))
+
+
+def test_place_clock_and_scale_are_found_within_their_errors(found: ImuCalibration, dataset: Dataset) -> None:
+    T_true, sigmas = np.array(CONFIG.T_imu_depth), found.sigmas
+    turn = so3.log(found.T_imu_depth[:3, :3] @ T_true[:3, :3].T)
+    assert np.linalg.norm(turn) < np.radians(0.05) and (np.abs(turn) < 5.0 * sigmas[ROTATION]).all()
+    shift = found.T_imu_depth[:3, 3] - T_true[:3, 3]
+    assert np.linalg.norm(shift) < 1e-3 and (np.abs(shift) < 5.0 * found.translation_sigma).all()
+    middle = dataset.middle
+    offset = (middle - 0.0125) / (1 + 80e-6) - middle  # the stamp `middle` was taken then; its clock begins at 0
+    assert abs(found.offset_s - offset) < min(1e-4, 5.0 * sigmas[OFFSET])
+    assert abs(found.drift + 80e-6) < 5.0 * sigmas[DRIFT] < 1e-4
+    assert (np.abs(np.diag(found.gyro_matrix) - SCALES) < 5.0 * sigmas[SCALE]).all() and sigmas[SCALE].max() < 1e-3
+    assert not found.undetermined.any() and (sigmas[LEVER] > 1e-5).all()
+    unit = found.solution.unit
+    at = np.searchsorted(SAMPLES.t, unit.bias_times[1:-1])
+    assert np.abs(unit.biases[1:-1, :3] - SAMPLES.gyro_bias[at]).max() < 5e-4
+    assert np.abs(unit.biases[1:-1, 3:] - SAMPLES.accel_bias[at]).max() < 1e-2
+
+
+def test_what_was_written_brings_the_samples_to_the_images_clock(found: ImuCalibration, dataset: Dataset) -> None:
+    assert dataset.imu_files is not None
+    file = dataset.root / "found.yaml"
+    file.write_text(found.imu_file())
+    right = replace(dataset, imu_files=replace(dataset.imu_files, given=file))
+    imu = right.imu
+    assert imu is not None and imu.gyro is not None
+    np.testing.assert_allclose(imu.t, SAMPLES.t, atol=1.5e-4)
+    np.testing.assert_allclose(imu.T_imu_depth, found.T_imu_depth, atol=1e-8)
+    np.testing.assert_allclose(imu.gyro * (1.0 + found.solution.unit.scale), SAMPLES.gyro, atol=1e-6)
+    # What is found from there on is told on top of that: the file of the whole is the same.
+    assert right.imu_files is not None and right.imu_files.description().offset_s == pytest.approx(found.offset_s)
+    rest = replace(found, said=right.imu_files.description())
+    assert rest.offset_s == pytest.approx(2 * found.offset_s, abs=1e-5)
+    np.testing.assert_allclose(rest.gyro_matrix, found.gyro_matrix @ found.gyro_matrix, atol=1e-6)
+    assert "±" in found.text() and found.as_dict()["undetermined"] == []
+
+
+def test_a_track_that_errs_more_tells_less(found: ImuCalibration, dataset: Dataset) -> None:
+    worse = calibrate_imu(dataset, tracked(4e-4))
+    assert (worse.sigmas[:OFFSET] > 1.3 * found.sigmas[:OFFSET]).all()
+    assert worse.solution.sizes.poses[0] > 2.0 * found.solution.sizes.poses[0]
+
+
+def test_what_tells_nothing_is_one_line(dataset: Dataset, tmp_path: Path) -> None:
+    track = tracked(0.0)
+    with pytest.raises(UserError, match="followed in a row"):
+        calibrate_imu(dataset, Followed(track.spline, ((1.0, 4.0),)))
+    with pytest.raises(UserError, match="has no IMU"):
+        calibrate_imu(replace(dataset, imu_files=None), track)
+    other = simulate_imu(swung(40.0), CONFIG, 27.0, 27.0 + SECONDS, 0)
+    root = make_tum(tmp_path / "other")
+    (root / "imu.csv").write_text(imu_csv(replace(other, stamps=SAMPLES.t[0] + other.t - other.t[0])))
+    with pytest.raises(UserError, match="does not turn as the track does"):
+        calibrate_imu(replace(open_dataset(root), stamps=dataset.stamps), track)
+    (root / "imu.csv").unlink()
+    lines = [f"{t:.6f} " + " ".join(f"{x:.6f}" for x in row) for t, row in zip(SAMPLES.t, SAMPLES.accel, strict=True)]
+    (root / "accelerometer.txt").write_text("\n".join(lines))
+    with pytest.raises(UserError, match="accelerometer alone"):
+        calibrate_imu(replace(open_dataset(root), stamps=dataset.stamps), track)
+
+
+def test_turning_about_one_axis_tells_no_axes() -> None:
+    from rstrack.calibration.imu.start import begin
+
+    t = np.arange(200) * 0.05
+    twist = np.zeros((len(t), 6))
+    twist[:, 4] = np.sin(2.0 * t)
+    spline = Spline(se3.exp(twist), 0.0, 0.05)
+    samples = simulate_imu(spline, CONFIG, 0.0, spline.t_end, 0)
+    given = samples.stamps, samples.gyro, samples.accel, 9.80665, np.array([0.0, 9.0]), 4.0
+    with pytest.raises(UserError, match="one axis only"):
+        begin(Track(spline), (0.0, 9.0), *given)
+
+
+def test_the_command(dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    where = str(dataset.root)
+    assert main(["calibrate", where, "--free", "imu,readout"]) == 2
+    assert "stands alone" in capsys.readouterr().err
+    assert main(["calibrate", where, "--run", "nowhere"]) == 2
+    assert "--free imu" in capsys.readouterr().err
+    assert main(["calibrate", where, "--free", "imu", "--run", str(tmp_path / "nowhere")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_errors_that_are_alike_count_for_more() -> None:
+    """An autoregression of φ has in sums (1 + φ) / (1 − φ) times the variance of white noise."""
+    from rstrack.calibration.imu.solve import _alike
+
+    rng = np.random.default_rng(0)
+    white = rng.normal(size=(20000, 6))
+    assert _alike(white) == pytest.approx(1.0, abs=0.05)
+    regressed = np.zeros_like(white)
+    for k in range(1, len(white)):
+        regressed[k] = 0.5 * regressed[k - 1] + white[k]
+    assert _alike(regressed) == pytest.approx(np.sqrt(3.0), rel=0.05)
