@@ -69,7 +69,7 @@ def _parser() -> Parser:
     add(preview, "out/demo --count 6")
     add(picture, "ours.ply theirs.ply --out meshes.png --label ours --label theirs")
     add(export, "euroc out/table1")
-    with_fields += [add(pack, "demo office1 --count 1000 --layout carla-rs --out packs/rooms --color.spp 8 --truth.spp 8")]
+    with_fields += [add(pack, "demo office1 --count 1000 --out packs/rooms --color.spp 8 --truth.spp 8")]
     with_fields += [add(check_light, "demo --spp 1024 --out light.png")]
     with_fields += [add(bench, "demo --spp 16 --mode still --mode rs-blur")]
     for command in with_fields:

@@ -21,8 +21,8 @@ def pack(
     **fields: str,
 ) -> int:
     """Render pairs of rolling and global images to train on: short sequences along random stretches of the configs'
-    motions, at random speed, view, readout and exposure, with flow, masks and gyroscope. Another --seed makes another pack;
-    rooms by other seeds ('rsgen scenes') make more scenes; --color.spp 8 --truth.spp 8 do where light is baked.
+    motions, at random speed, view, readout and exposure, with flow, masks and gyroscope. Another --seed, another
+    pack; rooms by other seeds ('rsgen scenes') make more scenes; --color.spp 8 --truth.spp 8 do where light is baked.
     """
     from rsgen.config.config import load_config
     from rsgen.console.progress import ProgressDisplay

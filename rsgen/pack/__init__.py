@@ -1,1 +1,1 @@
-"""Training packs for rolling-shutter correction: pairs of rolling and global images in the layouts of known datasets."""
+"""Training packs for rolling-shutter correction: pairs of rolling and global images in known layouts."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from rsgen.geometry.spline import Spline
 
 Layout = Literal["carla-rs", "fastec-rs"]
 LAYOUTS: tuple[str, ...] = get_args(Layout)
+_DEFAULTS = {"readout": (0.010, 0.030), "exposure": (0.0, 0.0), "speed": (0.7, 3.0)}
 # Pitch and roll are drawn from this part of the angle that yaw is.
 _TILT = 1 / 3
 # A stretch may take up this part of the motion at most: the rest is where it may begin.
@@ -34,9 +35,13 @@ class PackOptions:
         Layout, "names of files: those of Carla-RS (0000_rs.png ...) or Fastec-RS (000_rolling.png ...)"
     ] = "carla-rs"
     length: Annotated[int, "frames of a sequence; loaders of Carla-RS read 10, of Fastec-RS 34 at most", "N"] = 10
-    readout: Annotated[tuple[float, ...], "shortest and longest, s", "S"] = (0.010, 0.030)
-    exposure: Annotated[tuple[float, ...], "shortest and longest, s: global images are sharp", "S"] = (0.0, 0.0)
-    speed: Annotated[tuple[float, ...], "slowest and fastest, times the config's own (drawn by ratio)", "X"] = (0.7, 3.0)
+    readout: Annotated[tuple[float, ...] | None, "shortest and longest, s (default: 0.01 0.03)", "S"] = None
+    exposure: Annotated[
+        tuple[float, ...] | None, "shortest and longest, s; global images are sharp (default: 0 0)", "S"
+    ] = None
+    speed: Annotated[
+        tuple[float, ...] | None, "slowest and fastest, times the config's own, drawn by ratio (default: 0.7 3)", "X"
+    ] = None
     turn_deg: Annotated[float, "the camera looks up to so many degrees aside, and a third of it up or down"] = 20.0
 
     def __post_init__(self) -> None:
@@ -45,12 +50,23 @@ class PackOptions:
         if not 2 <= self.length <= 34:
             raise UserError(f"--length {self.length}: must be 2 to 34: loaders take neighbouring frames of a sequence")
         for name, least, most in (("readout", 0.0, 1.0), ("exposure", 0.0, 1.0), ("speed", 1e-3, 100.0)):
-            given = getattr(self, name)
+            given = getattr(self, name) or _DEFAULTS[name]
             if len(given) != 2 or not least <= given[0] <= given[1] <= most:
                 shown = " ".join(f"{value:g}" for value in given)
                 raise UserError(f"--{name} {shown}: give two rising numbers between {least:g} and {most:g}")
         if not 0.0 <= self.turn_deg <= 180.0:
             raise UserError(f"--turn-deg {self.turn_deg:g}: must be between 0 and 180")
+
+    def span(self, name: str) -> tuple[float, float]:
+        """Ends of what 'readout' or 'exposure' (s), or 'speed', is drawn from."""
+        low, high = getattr(self, name) or _DEFAULTS[name]
+        return float(low), float(high)
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """What decides a pack's bytes, but for its count, as plain data."""
+        spans = {name: list(self.span(name)) for name in _DEFAULTS}
+        return {"layout": self.layout, "length": self.length, **spans, "turn_deg": self.turn_deg}
 
     @property
     def sequences(self) -> int:
@@ -84,16 +100,17 @@ def draw_sequence(
     rng = np.random.default_rng([seed, index])
     config = int(rng.integers(len(spans)))
     begin, end = spans[config]
-    if options.readout[1] > 1.0 / rates_hz[config] + 1e-12:
+    slowest = options.span("readout")[1]
+    if slowest > 1.0 / rates_hz[config] + 1e-12:
         raise UserError(
-            f"--readout {options.readout[1]:g}: is longer than the {1.0 / rates_hz[config]:.4g} s between frames: lower "
-            "it, or color.rate_hz"
+            f"--readout {slowest:g}: is longer than the {1.0 / rates_hz[config]:.4g} s between frames: "
+            "lower it, or color.rate_hz"
         )
-    readout, exposure = (float(rng.uniform(*span)) for span in (options.readout, options.exposure))
-    speed = math.exp(rng.uniform(*np.log(options.speed)))
+    readout, exposure = (float(rng.uniform(*span)) for span in (options.span("readout"), options.span("exposure")))
+    speed = math.exp(rng.uniform(*np.log(options.span("speed"))))
     takes = (options.length - 1) / rates_hz[config] + readout + exposure
     speed = min(speed, _MOST_OF_MOTION * (end - begin) / takes)
-    if speed < 0.1 * options.speed[0]:
+    if speed < 0.1 * options.span("speed")[0]:
         raise UserError(f"the motion lasts {end - begin:.3g} s, a sequence {takes:.3g} s: use a longer one")
     start = float(rng.uniform(begin + speed * exposure, end - speed * (takes - exposure)))
     most = math.radians(options.turn_deg)

@@ -131,14 +131,15 @@ def _identity(config: Config) -> dict[str, Any]:
 
 def _open(out: Path, identities: Sequence[dict[str, Any]], options: PackOptions, seed: int) -> None:
     """Begin or continue the pack in `out`. Raises UserError if it holds anything else."""
-    settings = {name: value for name, value in dataclasses.asdict(options).items() if name != "count"}
-    content = {"format": FORMAT, "seed": seed, "options": json.loads(json.dumps(settings)), "configs": list(identities)}
+    content = {"format": FORMAT, "seed": seed, "options": options.content, "configs": list(identities)}
     content["fingerprint"] = fingerprint(content)
     cure = "choose another --out or delete the folder"
     if (out / PACK).is_file():
         old = read_yaml(out / PACK)
         if old.get("fingerprint") != content["fingerprint"]:
-            names = [name for name in ("seed", "options", "configs") if old.get(name) != content[name]] or ["fingerprint"]
+            names = [name for name in ("seed", "options", "configs") if old.get(name) != content[name]] or [
+                "fingerprint"
+            ]
             raise UserError(f"{out}: holds another pack, of other {' and '.join(names)}: {cure}")
         return
     try:
@@ -174,4 +175,3 @@ def _about(job: PackJob, stage: Stage) -> dict[str, Any]:
         "rate_hz": color.rate_hz, "size": [color.width, color.height], "intrinsics": list(color.intrinsics),
         "model": color.model, "distortion": list(color.distortion), "scan": color.scan,
     }  # fmt: skip
-

@@ -67,7 +67,9 @@ def render_pairs(stage: Stage, drawn: Drawn, length: int) -> Iterator[Pair]:
         linear = rolling.render(pose, stamp, seed) * np.float32(color.exposure_gain)
         images = twins.render(pose, stamp, None, seed)
         flow = {time: images[f"flow_global_{time}"] for time in TIMES}
-        into = {time: back.flow_into(pose, global_instant(camera, shutter, stamp, time), shutter, stamp) for time in TIMES}
+        into = {
+            time: back.flow_into(pose, global_instant(camera, shutter, stamp, time), shutter, stamp) for time in TIMES
+        }
         yield Pair(
             apply_color_noise(linear, color.noise, noise_generator(drawn.seed, "color", k)),
             {time: images[f"global_{time}"] for time in TIMES},
@@ -78,7 +80,7 @@ def render_pairs(stage: Stage, drawn: Drawn, length: int) -> Iterator[Pair]:
 
 
 def gyro_samples(stage: Stage, drawn: Drawn, length: int) -> ImuSamples:
-    """Exact angular rate and specific force in the colour camera's frame, from the first frame's stamp to the last line.
+    """Exact angular rate and specific force in the colour camera's frame, from the first stamp to the last line.
 
     Before that, EuRoC's format has no sign for times.
     """

@@ -92,7 +92,15 @@ def bench(
         refuse_for_sweep([name for name, given in refused.items() if given], frames)
         last = None if frames is None else frames.stop
         return bench_sweep(
-            config, sweep, tracker, out or Path("out/readout_sweep"), last, sequence or (), method or (), scheduler, quiet
+            config,
+            sweep,
+            tracker,
+            out or Path("out/readout_sweep"),
+            last,
+            sequence or (),
+            method or (),
+            scheduler,
+            quiet,
         )
     if sweep != SweepChoice():
         raise UserError(f"{config}: is no sweep: --width, --readout, --exposure and --seeds are for readout_sweep")

@@ -28,7 +28,9 @@ def refuse_for_sweep(given: Sequence[str], frames: slice | None) -> None:
     if given:
         raise UserError(f"{given[0]}: is not for a readout sweep (its config names the methods, --method chooses)")
     if frames is not None and frames.start:
-        raise UserError(f"--frames {frames.start}:...: a readout sweep begins with frame 0: --frames 0:{frames.stop or 60}")
+        raise UserError(
+            f"--frames {frames.start}:...: a readout sweep begins with frame 0: --frames 0:{frames.stop or 60}"
+        )
 
 
 def bench_sweep(

@@ -103,9 +103,7 @@ def settings_text(camera: Camera, rate_hz: float) -> str:
     return "\n".join(["%YAML:1.0", *(f"{name}: {value}" for name, value in values.items())]) + "\n"
 
 
-def _write_frames(
-    folder: Path, dataset: Dataset, chosen: range, images: Iterable[RegisteredImage], seed: int
-) -> None:
+def _write_frames(folder: Path, dataset: Dataset, chosen: range, images: Iterable[RegisteredImage], seed: int) -> None:
     """What the worker reads: frames and vocabulary. Raises UserError."""
     step = max(1, -(-len(chosen) // _MOST_IMAGES))
     learnt_from, given = [], os.environ.get(VOCABULARY)

@@ -48,9 +48,7 @@ def orb_descriptors(images: Iterable[ByteArray], features: int = _FEATURES) -> l
     return [np.zeros((0, BYTES), np.uint8) if d is None else np.asarray(d, np.uint8) for d in found]
 
 
-def train_vocabulary(
-    images: list[NDArray[np.uint8]], branches: int = 10, levels: int = 3, seed: int = 0
-) -> Vocabulary:
+def train_vocabulary(images: list[NDArray[np.uint8]], branches: int = 10, levels: int = 3, seed: int = 0) -> Vocabulary:
     """k-medians of bits, again within each cluster, `levels` deep; images: descriptors (n_i, 32) of each image.
 
     As DBoW2 learns it (Gálvez-López, Tardós, T-RO 2012): a word weighs log(images / images that show it).

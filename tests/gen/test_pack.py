@@ -1,4 +1,4 @@
-"""Training packs: what is drawn, flow and masks against the images themselves, resuming, and files as loaders want them."""
+"""Training packs: what is drawn, flow and masks against the images themselves, resuming, files as loaders want them."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from tiny import write_config
 
 from rsgen.cli.main import main
 from rsgen.config.config import load_config
@@ -57,7 +58,8 @@ def test_the_cameras_curve_is_the_bodys_faster_turned_and_from_the_lens() -> Non
     ("change", "told"),
     [
         ({"readout": (0.03, 0.01)}, "--readout 0.03 0.01"), ({"length": 1}, "--length 1"), ({"count": 0}, "--count 0"),
-        ({"speed": (0.0, 1.0)}, "--speed 0 1"), ({"turn_deg": 181.0}, "--turn-deg"), ({"exposure": (0.1,)}, "--exposure"),
+        ({"speed": (0.0, 1.0)}, "--speed 0 1"), ({"turn_deg": 181.0}, "--turn-deg"),
+        ({"exposure": (0.1,)}, "--exposure"),
     ],
 )  # fmt: skip
 def test_ranges_that_are_none_are_refused(change: dict[str, object], told: str) -> None:
@@ -66,9 +68,9 @@ def test_ranges_that_are_none_are_refused(change: dict[str, object], told: str) 
 
 
 def test_motions_too_short_and_readouts_too_long_are_refused() -> None:
-    with pytest.raises(UserError, match="motion lasts 0.01 s"):
+    with pytest.raises(UserError, match=r"motion lasts 0\.01 s"):
         draw_sequence(PackOptions(), 0, 0, [(0.0, 0.01)], [30.0])
-    with pytest.raises(UserError, match="longer than the 0.01667 s between frames"):
+    with pytest.raises(UserError, match=r"longer than the 0\.01667 s between frames"):
         draw_sequence(PackOptions(), 0, 0, [(0.0, 10.0)], [60.0])
 
 
@@ -89,7 +91,16 @@ def test_the_velocity_log_is_one_line_of_six_numbers() -> None:
 
 # -- rendered ---------------------------------------------------------------------------------------------------------
 
-OPTIONS = ("--length", "2", "--readout", "0.03", "0.03", "--speed", "2", "2", "--color.spp", "16", "--truth.spp", "16")
+OPTIONS = ("--length", "2", "--readout", "0.03", "0.03", "--speed", "8", "8", "--color.spp", "16", "--truth.spp", "16")
+
+
+@pytest.fixture(scope="module")
+def small_config(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_config(
+        tmp_path_factory.mktemp("config"),
+        frames=31,
+        color={"width": 96, "height": 72, "intrinsics": [72.0, 72.0, 47.5, 35.5]},
+    )
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +123,9 @@ def psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray) -> float:
 def test_a_pack_holds_whole_sequences_with_all_their_files(packed: Path) -> None:
     assert sorted(path.name for path in packed.iterdir()) == ["000000", "000001", "pack.yaml"]
     kinds = ("rs.png", "gs_f.png", "gs_m.png", "mask.png", "mask_m.png", "flow_mask.png", "flow_mask_m.png")
-    names = {f"{k:04d}_{kind}" for k in (0, 1) for kind in kinds} | {f"{k:04d}{m}.flow" for k in (0, 1) for m in ("", "_m")}
+    names = {f"{k:04d}_{kind}" for k in (0, 1) for kind in kinds} | {
+        f"{k:04d}{m}.flow" for k in (0, 1) for m in ("", "_m")
+    }
     found = {path.name for path in (packed / "000001").iterdir()}
     assert found == names | {"gt_vel.log", "imu.csv", "sequence.json"}
 

@@ -130,5 +130,7 @@ def narrow(
 
 def installed(methods: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """The methods that can run here, and those whose packages are not installed."""
-    lacking = tuple(name for name in methods if name not in METHODS and find_spec(_PACKAGES.get(name, "open3d")) is None)
+    lacking = tuple(
+        name for name in methods if name not in METHODS and find_spec(_PACKAGES.get(name, "open3d")) is None
+    )
     return tuple(name for name in methods if name not in lacking), lacking
