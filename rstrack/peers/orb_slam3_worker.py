@@ -20,7 +20,8 @@ import numpy as np
 def work(folder: Path, module: Any) -> None:
     """Track the frames of a folder with the module pyorbslam3, no faster than they were taken: mapping needs time."""
     slam = module.Slam(str(folder / "vocabulary.txt"), str(folder / "settings.yaml"), module.Sensor.RGBD)
-    ms, tracked = [], []
+    ms: list[float] = []
+    tracked: list[bool] = []
     start = first = 0.0
     for path in sorted(folder.glob("[0-9]*.npz")):
         with np.load(path) as frame:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +45,7 @@ def test_rsgen_reads_what_it_is_told_of_a_case(motion: str) -> None:
     case = Case(motion, 0.014, 0.010, 160)
     words = render_words(config, case, Path("x"))
     assert words[words.index("--frames") + 1] == "0:20"
-    fields = {name[2:]: value for name, value in zip(words, words[1:], strict=False) if name.startswith("--")}
+    fields = {name[2:]: value for name, value in pairwise(words) if name.startswith("--")}
     given = {name: value for name, value in fields.items() if "." in name}
     small, whole = load_config(config.motions[0].config, given), load_config(config.motions[0].config)
     for stream in ("color", "depth"):
@@ -52,8 +53,6 @@ def test_rsgen_reads_what_it_is_told_of_a_case(motion: str) -> None:
         assert (a.width, a.height, a.readout_s, a.exposure_s) == (160, 120, 0.014, 0.010)
         assert a.noise.model == "none" and a.offset_s - 0.005 == pytest.approx(b.offset_s, abs=1e-12)
         # The same view: the images' corners are seen in the same directions.
-        corners = np.array([[-0.5, -0.5], [1.0, 1.0]])
-        ends = [corners * [c.width - 0.5, c.height - 0.5] - [[0, 0], [0, 0]] for c in (a.camera, b.camera)]
         ends = [np.array([[-0.5, -0.5], [c.width - 0.5, c.height - 0.5]]) for c in (a.camera, b.camera)]
         rays = [c.unproject(end) for c, end in zip((a.camera, b.camera), ends, strict=True)]
         np.testing.assert_allclose(*rays, atol=1e-6)
@@ -179,10 +178,8 @@ def test_tables_say_means_growth_and_what_was_lost(tmp_path: Path) -> None:
     assert theirs[1].endswith("†") and theirs[3] == "8.00"
     assert [str(entry) for entry in table1.rows[0]][2:] == ["lost", "-"]
     text = write_sweep(found, tmp_path)
-    assert (
-        "left out, not installed: orb-slam3" in text
-        and "gs-pg on table1_320px_readout_28ms_exposure_0ms 3 of 3" in text
-    )
+    assert "left out, not installed: orb-slam3" in text
+    assert "gs-pg on table1_320px_readout_28ms_exposure_0ms 3 of 3" in text
     data = json.loads((tmp_path / "results.json").read_text())
     assert len(data["points"]) == 8 and len(data["cells"]) == 24
     assert {p["ate_m"] for p in data["points"] if p["lost"] == 3} == {None}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 from importlib.util import find_spec
 from pathlib import Path
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -102,7 +103,7 @@ class FakeSlam:
 
         RGBD = "rgbd"
 
-    given: list[tuple[tuple[int, ...], np.dtype, float]] = []
+    given: ClassVar[list[tuple[tuple[int, ...], np.dtype, float]]] = []
 
     def __init__(self, vocabulary: str, settings: str, sensor: str) -> None:
         assert Path(vocabulary).name == "vocabulary.txt" and Path(settings).name == "settings.yaml" and sensor == "rgbd"
