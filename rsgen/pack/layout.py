@@ -11,10 +11,11 @@ import cv2
 import numpy as np
 
 from rsgen.array_types import BoolArray, ByteArray, Float32Array, FloatArray
+from rsgen.config.truth import GlobalTime
 from rsgen.files import encode_png
 from rsgen.pack.draw import Drawn, Layout
 
-TIMES = ("first", "middle")
+TIMES: tuple[GlobalTime, ...] = ("first", "middle")
 _FLO_MAGIC = 202021.25
 _MARK = {"carla-rs": "gt_vel.log", "fastec-rs": "meta.log"}
 _ROLLING = {"carla-rs": "_rs.png", "fastec-rs": "_rolling.png"}

@@ -50,7 +50,8 @@ def write_charts(
             axis.tick_params(labelbottom=is_last)
             axis.set_xlabel(chart.x_label if is_last else "")
     if one_legend and others:
-        figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
+        named = figure.axes[0].get_legend_handles_labels()
+        figure.legend(*named, loc="outside lower center", ncols=max(1, int(width / 2)), frameon=False, fontsize=9)
     if title:
         figure.suptitle(title, fontsize=13)
     save(figure, Path(path))

@@ -21,7 +21,7 @@ from rstrack.bench.readout import cases as cases_module
 from rstrack.bench.readout.cases import Case, case_overrides, cases_of, render_cases, render_words
 from rstrack.bench.readout.config import SweepConfig, is_sweep, load_sweep_config, narrow
 from rstrack.bench.readout.plot import draw_sweep, sweep_charts
-from rstrack.bench.readout.results import growth, log_interval, points_of, sweep_tables, write_sweep
+from rstrack.bench.readout.results import Point, growth, log_interval, points_of, sweep_tables, write_sweep
 from rstrack.bench.readout.run import SweepResult
 from rstrack.cli.main import main
 from rstrack.options import Options
@@ -189,6 +189,11 @@ def test_tables_say_means_growth_and_what_was_lost(tmp_path: Path) -> None:
 def test_growth_is_unknown_where_a_track_is_lost() -> None:
     points = [p for p in points_of(result()) if p.method == "gs-pg" and p.case.motion == "table1"]
     assert growth(points) is None and growth(points[:1]) is None
+
+
+def test_growth_is_the_largest_over_the_smallest_wherever_they_are() -> None:
+    case = Case("a", 0.0, 0.0)
+    assert growth([Point(case, "m", (value,), 0) for value in (2.0, 6.0, 1.5, 3.0)]) == pytest.approx(4.0)
 
 
 def test_the_picture_has_a_line_with_its_interval_for_each_method(tmp_path: Path) -> None:
