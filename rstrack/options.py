@@ -21,6 +21,9 @@ PEERS: tuple[str, ...] = get_args(Peer)
 CloudPeer = Literal["kiss-icp", "small-gicp"]
 CLOUD_PEERS: tuple[str, ...] = get_args(CloudPeer)
 """Lidar odometries, on the points of depth images."""
+SlamPeer = Literal["orb-slam3"]
+SLAM_PEERS: tuple[str, ...] = get_args(SlamPeer)
+"""Whole SLAM systems, with map and loops."""
 Strategy = Literal["converged", "newest"]
 STRATEGIES: tuple[str, ...] = get_args(Strategy)
 Source = Literal["keyframe", "model"]

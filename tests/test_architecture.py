@@ -21,7 +21,7 @@ SHARED = (
     "array_types", "console", "device", "errors", "figures", "files", "geometry", "limits", "sequence", "srgb",
 )  # fmt: skip
 ENGINES = ("mitsuba", "drjit")
-CONFIGS = sorted(path for path in (ROOT / "configs").glob("*.yaml") if path.stem != "evaluation")
+CONFIGS = sorted(path for path in (ROOT / "configs").glob("*.yaml") if path.stem not in ("evaluation", "readout_sweep"))
 
 
 def name(path: Path) -> str:

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
+from rsgen.cli.pack import pack
 from rsgen.cli.pictures import SequenceFolder, compare, picture, preview
 from rsgen.config.sections import Up
 from rsgen.console.command_line import Commands, Frames, Json, Parser, Quiet, print_figures, run_program
@@ -38,6 +39,7 @@ rsgen makes rolling-shutter RGB-D benchmark sequences with exact continuous-time
   rsgen motion suggest room.xml --out room.yaml      a tour through a scene of your own, to render or to edit
   rsgen import-scene room.blend room    a USD or Blender scene as one of Mitsuba's
   rsgen motion stats table1             how far and how fast a config's camera moves
+  rsgen pack demo --out packs/demo      pairs of rolling and global images, for training
   rsgen export euroc out/demo           for the tools of others: EuRoC, Kalibr, ROS, COLMAP, nerfstudio ...
 
 A config is a YAML file or a name. Scenes are built, and their light is baked, once: in a checkout beside their scripts,
@@ -67,6 +69,7 @@ def _parser() -> Parser:
     add(preview, "out/demo --count 6")
     add(picture, "ours.ply theirs.ply --out meshes.png --label ours --label theirs")
     add(export, "euroc out/table1")
+    with_fields += [add(pack, "demo office1 --count 1000 --out packs/rooms --color.spp 8 --truth.spp 8")]
     with_fields += [add(check_light, "demo --spp 1024 --out light.png")]
     with_fields += [add(bench, "demo --spp 16 --mode still --mode rs-blur")]
     for command in with_fields:

@@ -127,16 +127,37 @@ class TruthRenderer:
                 found = defined & contains(camera, *uv)
                 images[f"flow_global_{time}"] = self._flow(seen, uv, found, still, mi.Float(0), reference, things)
         if "next" in truth.flow and next_stamp is not None:
-            things = self._in_frame(next_shutter, next_stamp, reference)
-            following = _carrying(_moving(camera, next_shutter, T_world_cam, next_stamp, reference), things, seen)
-            uv, t, found = following.project(following.lens.line_of(*seen.uv), seen.p, seen.w)
-            images["flow_next"] = self._flow(seen, uv, found, following, t, reference, things)
+            images["flow_next"] = self._flow_into(T_world_cam, seen, next_stamp, next_shutter, reference)
         dr.eval(images)
         shape = (camera.height, camera.width)
         out = {name: np.stack([np.array(c, np.float32) for c in images[name]], axis=-1) for name in images}
         if "next" in truth.flow and next_stamp is None:
             out["flow_next"] = np.zeros((camera.height * camera.width, 3), np.float32)
         return {name: a.reshape(*shape, *(a.shape[1:] if a.shape[1] > 1 else ())) for name, a in out.items()}
+
+    def flow_into(
+        self, T_world_cam: PoseFunction, stamp: float, other: Shutter, other_stamp: float
+    ) -> Float32Array:
+        """Flow (h, w, 3), u v valid, from the frame at `stamp` (s) into one that the same camera takes with the shutter
+        `other` at other_stamp (s). T_world_cam: as in `render`.
+        """
+        camera, shutter = self._camera, self._shutter
+        self._sensor.expose(T_world_cam, stamp, shutter.exposure_s)
+        reference = np.asarray(T_world_cam(np.array([stamp])), float).reshape(4, 4)[:3, 3]
+        now = _moving(camera, shutter, T_world_cam, stamp, reference)
+        seen = self._cast(now, shutter, self._in_frame(shutter, stamp, reference))
+        flow = self._flow_into(T_world_cam, seen, other_stamp, other, reference)
+        dr.eval(flow)
+        return np.stack([np.array(c, np.float32) for c in flow], axis=-1).reshape(camera.height, camera.width, 3)
+
+    def _flow_into(
+        self, T_world_cam: PoseFunction, seen: _Seen, stamp: float, shutter: Shutter, reference: FloatArray
+    ) -> list[Any]:
+        """u, v, valid of the flow of what is seen into the frame at `stamp`, each of whose lines has its own time."""
+        things = self._in_frame(shutter, stamp, reference)
+        following = _carrying(_moving(self._camera, shutter, T_world_cam, stamp, reference), things, seen)
+        uv, t, found = following.project(following.lens.line_of(*seen.uv), seen.p, seen.w)
+        return self._flow(seen, uv, found, following, t, reference, things)
 
     def _in_frame(self, shutter: Shutter, stamp: float, reference: FloatArray) -> ObjectsInFrame | None:
         if not self._things:

@@ -26,7 +26,10 @@ _ROOM = 0.35
 
 @dataclass(frozen=True)
 class Line:
-    """Values y (n,) over x (n,), NaN where there is none. has_points: few values were measured, and each is marked."""
+    """Values y (n,) over x (n,), NaN where there is none. has_points: few values were measured, and each is marked.
+
+    low, high (n,): ends of the values' intervals, where these are known.
+    """
 
     name: str
     color: str
@@ -34,6 +37,8 @@ class Line:
     y: FloatArray
     is_dashed: bool = False
     has_points: bool = False
+    low: FloatArray | None = None
+    high: FloatArray | None = None
 
 
 @dataclass(frozen=True)

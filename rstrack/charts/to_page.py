@@ -71,6 +71,9 @@ def _line(line: Line, points: int) -> dict[str, Any]:
     style: dict[str, Any] = {"line": {"color": line.color, "width": 1.4, "dash": dash}, "hovertemplate": hover}
     if line.has_points:
         marker = {"color": line.color, "size": 7}
+        if line.low is not None and line.high is not None:
+            ends = {"array": _short(line.high - line.y, 4), "arrayminus": _short(line.y - line.low, 4)}
+            style["error_y"] = {"type": "data", "symmetric": False, "thickness": 1.2, **ends}
         return _scatter(line.name, _short(line.x, 6), _short(line.y, 4), mode="lines+markers", marker=marker, **style)
     index = _thinned(len(line.x), points)
     x, y = broken(line.x[index], line.y[index])

@@ -1,4 +1,4 @@
-"""The command `rstrack bench`: the whole evaluation."""
+"""The command `rstrack bench`: the whole evaluation, or the readout sweep."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from rsgen.console.command_line import Frames, Quiet
 from rsgen.console.configs import ConfigFile
 from rsgen.console.scheduler import Scheduler, open_workers
 from rsgen.errors import UserError
+from rstrack.bench.readout.config import is_sweep
+from rstrack.cli.bench_sweep import SweepChoice, bench_sweep, refuse_for_sweep
 from rstrack.cli.options import TruthOffset
 from rstrack.options import Options
 
@@ -42,6 +44,7 @@ def _named(text: str) -> tuple[str, str]:
 
 def bench(
     tracker: Options,
+    sweep: SweepChoice,
     config: ConfigFile = Path("evaluation"),
     *,
     data: Annotated[Path, "folder of the sequences' folders", "DIR"] = Path("out"),
@@ -54,7 +57,7 @@ def bench(
     frames: Frames = None,
     sequence: Annotated[tuple[str, ...] | None, "only these", "NAME"] = None,
     method: Annotated[tuple[str, ...] | None, "only these", "NAME"] = None,
-    peers: Annotated[bool, "Open3D's odometry, KISS-ICP and small_gicp too"] = False,
+    peers: Annotated[bool, "Open3D's odometry, KISS-ICP, small_gicp and ORB-SLAM3 too"] = False,
     add: Annotated[
         list[tuple[str, Path]] | None,
         "a tracker of your own: DIR holds SEQUENCE.txt (TUM), or SEQUENCE/ (a run folder), for each sequence",
@@ -78,8 +81,29 @@ def bench(
     """Every method on every sequence against the truth, the paper's figures beside: tables, plots.
 
     Each of our methods runs with fused keyframes and without, unless --fuse or --no-fuse says which. Tables show the
-    better of the two for baseline and gs-*, and both for rs-*.
+    better of the two for baseline and gs-*, and both for rs-*. With the config readout_sweep: one motion after the
+    other at every readout, rendered first where need be; --sequence then names motions.
     """
+    if is_sweep(config):
+        refused = {
+            "--quick": quick, "--peers": peers, "--add": add, "--peer-command": peer_command, "--meshes": meshes,
+            "--truth-offset": truth_offset is not None,
+        }  # fmt: skip
+        refuse_for_sweep([name for name, given in refused.items() if given], frames)
+        last = None if frames is None else frames.stop
+        return bench_sweep(
+            config,
+            sweep,
+            tracker,
+            out or Path("out/readout_sweep"),
+            last,
+            sequence or (),
+            method or (),
+            scheduler,
+            quiet,
+        )
+    if sweep != SweepChoice():
+        raise UserError(f"{config}: is no sweep: --width, --readout, --exposure and --seeds are for readout_sweep")
     from rsgen.console.progress import ProgressDisplay
     from rstrack.bench.methods.config import choose, load_bench_config
     from rstrack.bench.methods.grid import run_plan

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from rsgen.errors import UserError, first_problem
 from rsgen.files import read_yaml
-from rstrack.options import CLOUD_PEERS, METHODS, PEERS
+from rstrack.options import CLOUD_PEERS, METHODS, PEERS, SLAM_PEERS
 
 # Names of sequences and methods are folders too.
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]*$")]
@@ -97,8 +97,8 @@ def choose(
 ) -> Choice:
     """Narrow the evaluation down; what is given beats what `quick` says.
 
-    sequences, methods: names, none: all of the config; methods may name any of `rstrack.options.METHODS`, PEERS and
-    CLOUD_PEERS. peers: add all of the latter two. Raises UserError for names that there are not.
+    sequences, methods: names, none: all of the config; methods may name any of `rstrack.options.METHODS`, PEERS,
+    CLOUD_PEERS and SLAM_PEERS. peers: add all of the latter three. Raises UserError for names that there are not.
     """
     subset = config.quick if quick else None
     if quick and subset is None:
@@ -109,7 +109,7 @@ def choose(
         if name not in known:
             raise UserError(f"--sequence {name}: the config has no such sequence: it has {', '.join(known)}")
     chosen = list(dict.fromkeys(methods or (subset.methods if subset else config.methods)))
-    others = (*PEERS, *CLOUD_PEERS)
+    others = (*PEERS, *CLOUD_PEERS, *SLAM_PEERS)
     for method in chosen:
         if method not in (*METHODS, *others):
             raise UserError(f"no method '{method}': choose from {', '.join((*METHODS, *others))}")

@@ -26,11 +26,13 @@ from rstrack.bench.methods.results import Cell, Results
 from rstrack.bench.methods.variants import method_of
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.estimate import TRAJECTORY, Estimate, plain, read_estimate, write_estimate
+from rstrack.data.noise import NoisyImages
 from rstrack.metrics.association import ASSOCIATE_WITHIN_S, truth_of
 from rstrack.metrics.evaluate import Metrics, evaluate
 from rstrack.metrics.run_evaluate import evaluate_clocks
-from rstrack.options import CLOUD_PEERS, METHODS
+from rstrack.options import CLOUD_PEERS, METHODS, SLAM_PEERS
 from rstrack.peers.command import run_command
+from rstrack.tracking.runs.record import Noise
 from rstrack.tracking.runs.run import track
 
 CELL = "cell.json"
@@ -79,7 +81,7 @@ def run_cell(job: Job, progress: Progress = no_progress) -> Cell:
     make = partial(Cell, job.key, job.sequence, job.method, frames=frames, truth_offset=job.truth_offset)
     there = _read(job)
     try:
-        dataset = open_dataset(job.data)
+        dataset = _seen(open_dataset(job.data), job.noise)
         if there is not None:
             estimate, seconds = read_estimate(job.out), there.seconds
         else:
@@ -133,11 +135,19 @@ def _name(job: Job) -> str:
     return f"{job.sequence} {job.method}"
 
 
+def _seen(dataset: Dataset, noise: Noise | None) -> Dataset:
+    """The dataset with noise in its images, the same that our trackers add themselves (and note in run.json)."""
+    if noise is None:
+        return dataset
+    noisy = NoisyImages(dataset.images, noise.sigma_depth, noise.sigma_intensity, noise.seed)
+    return dataclasses.replace(dataset, images=noisy)
+
+
 def _estimate(job: Job, dataset: Dataset, progress: Progress) -> tuple[Estimate, float | None]:
     """The trajectory, written to the cell's folder, and the seconds that it took. Raises UserError."""
     frames = slice(job.first, job.last)
     if method_of(job.method) in METHODS:
-        result = track(dataset, job.options, job.out, frames, progress=progress)
+        result = track(open_dataset(job.data), job.options, job.out, frames, job.noise, progress)
         if result.end == "interrupted":
             raise KeyboardInterrupt
         if result.unreadable:
@@ -155,6 +165,10 @@ def _estimate(job: Job, dataset: Dataset, progress: Progress) -> tuple[Estimate,
             from rstrack.peers.clouds import run_cloud_peer
 
             estimate = run_cloud_peer(job.method, dataset, frames, progress)
+        elif job.method in SLAM_PEERS:
+            from rstrack.peers.orb_slam3 import run_orb_slam3
+
+            estimate = run_orb_slam3(dataset, frames, progress, seed=0 if job.noise is None else job.noise.seed)
         else:
             from rstrack.peers.open3d import run_peer
 

@@ -18,6 +18,7 @@ from rstrack.data.estimate import TRAJECTORY
 from rstrack.metrics.association import truth_of
 from rstrack.metrics.clock import TruthOffset
 from rstrack.options import METHODS, Options
+from rstrack.tracking.runs.record import Noise
 
 # What describes a sequence, rsgen's or TUM's; the images themselves are not read for the key.
 _DESCRIPTIONS = (
@@ -32,7 +33,7 @@ class Job:
     data: the sequence's folder. frames [first, last). method: a variant (`variants`), `options` those of it; a peer;
     or another tracker, with `estimate` (a run folder or TUM file) or `command` (as in `run_command`). out: the cell's
     run folder. key: what the trajectory depends on. truth_offset: of the truth's clock, see
-    `run_evaluate.evaluate_clocks`.
+    `run_evaluate.evaluate_clocks`. noise: added to the images that are read; a command does not see it.
     """
 
     sequence: str
@@ -46,6 +47,7 @@ class Job:
     key: str
     truth_offset: TruthOffset | None = None
     command: str = ""
+    noise: Noise | None = None
 
 
 @dataclass(frozen=True)
@@ -98,22 +100,35 @@ def make_plan(
             raise UserError(f"{dataset.root}: has no ground truth to compare with: leave it out with --sequence")
         chosen = _chosen(dataset, entry, data, choice)
         sequences.append(SequenceInfo(entry.name, entry.group, (data / entry.name).resolve(), len(chosen)))
-        digest = _digest(data / entry.name)
+        digest = sequence_digest(data / entry.name)
         for method in methods:
-            used = None
-            if method_of(method) in METHODS:
-                used = Options(**dataclasses.asdict(options) | {"method": method_of(method), "fuse": fuses(method)})
-            estimate = _estimate_path(added[method], entry.name) if method in added else None
-            depends = [digest, method, chosen.start, chosen.stop, used and dataclasses.asdict(used), package_version()]
-            depends.append(_file_digest(estimate) if estimate is not None else None)
-            command = commands.get(method, "")
-            depends += [command] if command else []
-            key = hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()
             cell_out = (out / "cells" / entry.name / folder_of(method)).resolve()
-            where = (sequences[-1].path, chosen.start, chosen.stop)
-            job = Job(entry.name, method, *where, used or options, estimate, cell_out, key, truth_offset, command)
-            jobs.append(job)
+            job = Job(
+                entry.name, method, sequences[-1].path, chosen.start, chosen.stop, options,
+                _estimate_path(added[method], entry.name) if method in added else None, cell_out, "", truth_offset,
+                commands.get(method, ""),
+            )  # fmt: skip
+            jobs.append(keyed(job, digest))
     return Plan(tuple(sequences), methods, tuple(jobs), out)
+
+
+def keyed(job: Job, digest: str) -> Job:
+    """A job with its variant's options and its key; digest: of its sequence, see `sequence_digest`."""
+    used = None
+    if method_of(job.method) in METHODS:
+        asked = {"method": method_of(job.method), "fuse": fuses(job.method)}
+        used = Options(**dataclasses.asdict(job.options) | asked)
+    depends = [digest, job.method, job.first, job.last, used and dataclasses.asdict(used), package_version()]
+    depends.append(_file_digest(job.estimate) if job.estimate is not None else None)
+    depends += [job.command] if job.command else []
+    depends += [dataclasses.asdict(job.noise)] if job.noise is not None else []
+    key = hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()
+    return dataclasses.replace(job, options=used or job.options, key=key)
+
+
+def sequence_digest(root: Path) -> str:
+    """Of what describes a sequence: its lists, cameras and truth, not its images."""
+    return ",".join(f"{name} {_file_digest(root / name)}" for name in _DESCRIPTIONS if (root / name).is_file())
 
 
 def package_version() -> str:
@@ -147,10 +162,6 @@ def _chosen(dataset: Dataset, entry: SequenceEntry, data: Path, choice: Choice) 
 def _estimate_path(folder: Path, sequence: str) -> Path:
     file, run = folder / f"{sequence}.txt", folder / sequence
     return (run if run.is_dir() and not file.is_file() else file).resolve()
-
-
-def _digest(root: Path) -> str:
-    return ",".join(f"{name} {_file_digest(root / name)}" for name in _DESCRIPTIONS if (root / name).is_file())
 
 
 def _file_digest(path: Path) -> str | None:

@@ -1,0 +1,139 @@
+"""ORB-SLAM3 (Campos et al., T-RO 2021) with depth and colour, from the package pyorbslam3 (GPL, not one of ours).
+
+estimate = run_orb_slam3(open_dataset(Path("out/table1")), slice(0, 300))
+
+It runs in a process of its own (`orb_slam3_worker`), at the pace of the recording as with a camera; its threads make
+no two runs alike. Settings are those of its own example for a RealSense D435i; 500 to 2000 features, points kept to
+200 baselines and a quarter of the pace were tried once and changed nothing beyond that. Its vocabulary is learnt from
+the frames' own features, unless RSTRACK_ORB_VOCABULARY names a file, such as the ORBvoc.txt of its sources.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterable
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
+import numpy as np
+
+from rsgen.console.progress import Progress, no_progress
+from rsgen.errors import UserError
+from rsgen.geometry import se3
+from rsgen.geometry.camera import Camera
+from rstrack.data.dataset import Dataset
+from rstrack.data.estimate import Estimate, read_estimate
+from rstrack.data.prefetch import prefetched
+from rstrack.data.registered import RegisteredImage, Registrar, registered_image
+from rstrack.options import Options
+from rstrack.peers.orb_vocabulary import orb_descriptors, train_vocabulary, write_vocabulary
+from rstrack.peers.record import run_info
+
+NAME = "orb-slam3"
+VOCABULARY = "RSTRACK_ORB_VOCABULARY"
+SETTINGS = {"features": 1250, "scale_factor": 1.2, "levels": 8, "ini_fast": 20, "min_fast": 7, "far_baselines": 40.0}
+_BASELINE_M = 0.0745
+# Of the images that the vocabulary is learnt from.
+_MOST_IMAGES = 120
+_WORKER = "rstrack.peers.orb_slam3_worker"
+
+
+def run_orb_slam3(
+    dataset: Dataset, frames: slice = slice(None), progress: Progress = no_progress, seed: int = 0
+) -> Estimate:
+    """Track frames of a dataset; poses at the depth frames' stamps, of its final trajectory.
+
+    Its input is registered by `rstrack.data.registered`; as of our baseline, a pose is taken for that of the middle of
+    the readout, and interpolated to the stamp. seed: of the vocabulary. Raises UserError: it is not installed, no such
+    frames, an image cannot be read, its process fails, nothing was tracked.
+    """
+    chosen = range(len(dataset))[frames]
+    if not len(chosen):
+        raise UserError(f"{dataset.root}: has no frame {frames.start}: its frames are 0 to {len(dataset) - 1}")
+    if find_spec("pyorbslam3") is None:
+        raise UserError("the peer needs pyorbslam3 (GPL): pip install 'pyorbslam3>=0.1.1,<0.2'")
+    registrar = Registrar(dataset.rig)
+    begin = time.perf_counter()
+    with TemporaryDirectory(prefix="rstrack-orb-") as name:
+        folder = Path(name)
+        images = prefetched(lambda k: registered_image(dataset, registrar, k), chosen, 2)
+        _write_frames(folder, dataset, chosen, images, seed)
+        (folder / "settings.yaml").write_text(settings_text(registrar.camera, _rate(dataset, chosen)))
+        progress("tracking", 0.0, f"{NAME} runs")
+        _run_worker(folder, dataset)
+        with np.load(folder / "frames.npz") as told:
+            ms, tracked = told["ms"], told["tracked"]
+        if not (folder / "final.txt").is_file():
+            raise UserError(f"{dataset.root}: {NAME} tracked no frame: too few features in the images")
+        found = read_estimate(folder / "final.txt")
+    camera, shutter = dataset.rig.depth_camera, dataset.rig.depth_shutter
+    middle = float(shutter.line_mid_time(0.0, 0.5 * (shutter.line_count(camera) - 1), camera))
+    nearest = np.abs(dataset.stamps[chosen][None] - found.stamps[:, None]).argmin(axis=1)
+    # Its file has microseconds only.
+    stamps, first = np.unique(dataset.stamps[chosen][nearest], return_index=True)
+    T_world_depth = se3.interpolated(stamps + middle, found.T_world_depth[first], stamps)
+    total_s = time.perf_counter() - begin
+    info = run_info(NAME, {"pyorbslam3": version("pyorbslam3")}, "on the CPU", dataset, chosen, total_s, 1e-3 * ms)
+    info |= {"settings": SETTINGS, "keyframes": 0, "lost": int((~tracked).sum())}
+    return Estimate(stamps, se3.orthonormalise(T_world_depth), info=info)
+
+
+def settings_text(camera: Camera, rate_hz: float) -> str:
+    """ORB-SLAM3's settings for a pinhole and depth in metres; of the viewer too, which it insists on."""
+    s = SETTINGS
+    values = {
+        "File.version": '"1.0"', "Camera.type": '"PinHole"',
+        "Camera1.fx": camera.fx, "Camera1.fy": camera.fy, "Camera1.cx": camera.cx, "Camera1.cy": camera.cy,
+        "Camera1.k1": 0.0, "Camera1.k2": 0.0, "Camera1.p1": 0.0, "Camera1.p2": 0.0,
+        "Camera.width": camera.width, "Camera.height": camera.height, "Camera.fps": max(1, round(rate_hz)),
+        "Camera.RGB": 1, "Stereo.ThDepth": s["far_baselines"], "Stereo.b": _BASELINE_M, "RGBD.DepthMapFactor": 1.0,
+        "ORBextractor.nFeatures": s["features"], "ORBextractor.scaleFactor": s["scale_factor"],
+        "ORBextractor.nLevels": s["levels"], "ORBextractor.iniThFAST": s["ini_fast"],
+        "ORBextractor.minThFAST": s["min_fast"],
+        "Viewer.KeyFrameSize": 0.05, "Viewer.KeyFrameLineWidth": 1.0, "Viewer.GraphLineWidth": 0.9,
+        "Viewer.PointSize": 2.0, "Viewer.CameraSize": 0.08, "Viewer.CameraLineWidth": 3.0, "Viewer.ViewpointX": 0.0,
+        "Viewer.ViewpointY": -0.7, "Viewer.ViewpointZ": -1.8, "Viewer.ViewpointF": 500.0,
+    }  # fmt: skip
+    return "\n".join(["%YAML:1.0", *(f"{name}: {value}" for name, value in values.items())]) + "\n"
+
+
+def _write_frames(folder: Path, dataset: Dataset, chosen: range, images: Iterable[RegisteredImage], seed: int) -> None:
+    """What the worker reads: frames and vocabulary. Raises UserError."""
+    step = max(1, -(-len(chosen) // _MOST_IMAGES))
+    learnt_from, given = [], os.environ.get(VOCABULARY)
+    for n, (k, image) in enumerate(zip(chosen, images, strict=True)):
+        gray = cv2.cvtColor(image.color, cv2.COLOR_RGB2GRAY)
+        depth = np.where(image.depth < Options().max_depth, image.depth, np.float32(0))
+        np.savez(folder / f"{n:06d}.npz", stamp=dataset.stamps[k], gray=gray, depth=depth)
+        if n % step == 0 and not given:
+            learnt_from += orb_descriptors([image.color])
+    if given:
+        if not Path(given).is_file():
+            raise UserError(f"{VOCABULARY}={given}: is no file: name ORB-SLAM3's ORBvoc.txt, or leave it out")
+        (folder / "vocabulary.txt").symlink_to(Path(given).resolve())
+    elif not sum(map(len, learnt_from)):
+        raise UserError(f"{dataset.root}: {NAME} finds no feature in the images")
+    else:
+        write_vocabulary(folder / "vocabulary.txt", train_vocabulary(learnt_from, seed=seed))
+
+
+def _rate(dataset: Dataset, chosen: range) -> float:
+    return 1.0 / (dataset.interval_s(chosen) or 1.0 / 30.0)
+
+
+def _run_worker(folder: Path, dataset: Dataset) -> None:
+    """Raises UserError with the last line it said, if it fails."""
+    log = folder / "log.txt"
+    with log.open("wb") as file:
+        words = [sys.executable, "-m", _WORKER, str(folder)]
+        status = subprocess.run(words, stdout=file, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL)
+    if status.returncode or not (folder / "frames.npz").is_file():
+        lines = log.read_text(errors="replace").split("\n")
+        last = next((line.strip() for line in reversed(lines) if line.strip()), "it said nothing")
+        raise UserError(f"{dataset.root}: {NAME} ended with status {status.returncode}: {last[:200]}")
