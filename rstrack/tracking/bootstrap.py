@@ -12,6 +12,7 @@ from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.frame_report import FrameReport
 from rstrack.tracking.judgement.fault import Fault
 from rstrack.tracking.judgement.uncertainty import Uncertainty
+from rstrack.tracking.moving.leave_out import LeftOut
 from rstrack.tracking.succession import LEAST_DEPTH
 from rstrack.tracking.track import Track
 from rstrack.tracking.window import Window
@@ -48,16 +49,23 @@ def bootstrap(track: Track, new: DeviceFrame) -> FrameReport:
     window, ref = track.known()
     window.state.extend(new.last_time)
     fresh = track.observe(new, ref)
-    solved = window.solve(fresh, gauge=ref, coupled=True)
+    left = LeftOut(new.depth)
+
+    def leave_out() -> None:
+        nonlocal left
+        left = track.leave_out(new.depth, ref, fresh, window.state)
+
+    solved = window.solve(fresh, gauge=ref, coupled=True, before_finest=leave_out)
     if ref.points:
         # Its colours were looked up as if the first frame stood still: again, with the motion found.
         ref, earlier = _recolored(track, window, ref, fresh), window.active
         window.active = []
-        solved = window.solve([*earlier, *fresh], (1, 0), gauge=ref, coupled=True)
+        solved = window.solve([*earlier, *fresh], (1, 0), gauge=ref, coupled=True, before_finest=leave_out)
         window.active = earlier
     if track.fits.fault(fresh, solved, ref.pixels):
         return _begin_anew(track, new)
     window.keep(fresh)
+    new = replace(new, depth=left.depth)
     track.succession.recent.append(new)
     track.placed(new, fresh)
     if len(track.succession.recent) < track.options.bootstrap_frames:

@@ -1,0 +1,95 @@
+"""Leave out of a frame, and of its keyframe, what moves by itself: before the last level of an alignment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import numpy as np
+
+from rsgen.device.arrays import Engine
+from rstrack.alignment.brightness import SAME
+from rstrack.alignment.free_space import FreeSpace, grid_of
+from rstrack.alignment.observation import START_DEPTH, Observation
+from rstrack.alignment.spline_state import SplineState
+from rstrack.images.pyramid import DepthImage
+from rstrack.keyframes.keyframe import Reference, strides
+from rstrack.tracking.moving.regions import Mask, moving
+
+# Part of what is seen that may move: where more seems to, it is the pose that is wrong.
+_MOST = 0.5
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """depth: of the frame, without what moves; gone: pixels (gh, gw) of the keyframe's grid that the frame sees through
+    or that have moved on, None where none have."""
+
+    depth: DepthImage
+    gone: Mask | None = None
+
+
+def leave_out(
+    space: FreeSpace, depth: DepthImage, ref: Reference, fresh: Sequence[Observation], state: SplineState
+) -> LeftOut:
+    """Let a frame's observations count without what moves, as seen from where they have been aligned to so far.
+
+    depth: the frame's whole image. fresh: its observations; those of `ref` do without what is gone from it, too.
+    """
+    own = [o for o in fresh if o.ref.index == ref.index]
+    left = _found(space, depth, ref, own, state)
+    e, cleaned = space.device.e, ref if left.gone is None else without(space.device.e, ref, left.gone)
+    for o in fresh:
+        if isinstance(o.image, DepthImage):
+            o.image = left.depth
+        if o.ref.index == ref.index and o.ref is not cleaned:
+            o.see(cleaned)
+    return left
+
+
+def _found(
+    space: FreeSpace, depth: DepthImage, ref: Reference, own: Sequence[Observation], state: SplineState
+) -> LeftOut:
+    nothing = LeftOut(depth)
+    if not own or not all(o.is_linearised for o in own):
+        return nothing
+    color = next((o for o in own if not o.is_depth), None)
+    sigma_depth = next((o.lin.next_sigma for o in own if o.is_depth), START_DEPTH)
+    image, brightness = (color.image, color.brightness(state)) if color else (None, SAME)
+    assert not isinstance(image, DepthImage)
+    in_frame, in_ref = space.compare(depth, image, brightness, ref, state.spline)
+    with space.device.timer("what moves: regions"):
+        scales = sigma_depth, ref.median_depth, color.lin.next_sigma if color else np.inf
+        came, gone = moving(in_frame, *scales), moving(in_ref, *scales)
+        shares = [(m & np.isfinite(s.z)).sum() / max(1, np.isfinite(s.z).sum()) for m, s in ((came, in_frame), (gone, in_ref))]
+        if max(shares) > _MOST:
+            return nothing
+        rest = _without(space.device.e, depth, came) if came.any() else depth
+        return LeftOut(rest, gone if gone.any() else None)
+
+
+def _without(e: Engine, depth: DepthImage, came: Mask) -> DepthImage:
+    camera = depth.exposure.lens.camera
+    keep = e.upload(~_full(came, grid_of(depth.exposure.lens)[1], camera.height, camera.width))
+    z, inverse_z = depth.z * keep, depth.inverse_z * keep
+    dr.eval(z, inverse_z)
+    count = int(np.count_nonzero(e.download(z, (camera.height, camera.width))))
+    return replace(depth, z=z, inverse_z=inverse_z, count=count, whole=depth)
+
+
+def without(e: Engine, ref: Reference, gone: Mask) -> Reference:
+    """A keyframe without pixels (gh, gw) of its grid."""
+    camera = ref.lens.camera
+    keep = ~_full(gone, grid_of(ref.lens)[1], camera.height, camera.width)
+    inverse_depth = ref.inverse_depth * e.upload(keep)
+    points = []
+    for known, stride in zip(ref.points, strides(camera.width, camera.height), strict=bool(ref.points)):
+        points.append(replace(known, z=known.z * e.upload(keep[::stride, ::stride])))
+    dr.eval(inverse_depth, [p.z for p in points])
+    return replace(ref, inverse_depth=inverse_depth, points=tuple(points))
+
+
+def _full(mask: Mask, stride: int, height: int, width: int) -> Mask:
+    """A mask of every stride-th pixel for all of them (height, width)."""
+    return mask.repeat(stride, axis=0).repeat(stride, axis=1)[:height, :width]

@@ -1,0 +1,87 @@
+"""From pixels that stand in free space to the things that they belong to: NumPy and OpenCV on small grids."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from rstrack.alignment.free_space import Grid, Seen
+from rstrack.images.sampling import EDGE
+
+Mask = npt.NDArray[np.bool_]
+
+# How far before what was seen (m, part of the depth, σ of depth there) a pixel has to stand to be in free space.
+_BEFORE_M, _BEFORE_SIGMAS = 0.02, 5.0
+# Part of the grid that has to be in free space, once thin lines are taken off, for anything to move.
+_LEAST = 2e-3
+# Window over which residuals are averaged, and averages that a resting surface hardly has: of depth in σ, and of the
+# size of intensity's, in σ.
+_WINDOW, _WORST_DEPTH, _WORST_INTENSITY = 5, 1.0, 1.8
+# Steps through what cannot be told that a thing is followed, and the part of it that has to stand in free space.
+_UNKNOWN_STEPS, _LEAST_SHARE = 6, 0.1
+# Pixels of the grid that edges are given besides.
+_MARGIN = 1
+
+
+def moving(seen: Seen, sigma_depth: float, median_depth: float, sigma_intensity: float) -> Mask:
+    """Pixels (gh, gw) of things that have moved: in free space, or on one surface with such that are.
+
+    sigma_depth (m): scale of depth's residuals at median_depth (m), growing with the square of depth; sigma_intensity:
+    that of intensity's. Nothing where too little stands in free space to tell.
+    """
+    scale = sigma_depth * np.square(seen.z / np.float32(median_depth))
+    known = np.isfinite(seen.free) & np.isfinite(scale)
+    far = np.where(known, seen.free, 0.0) > np.maximum(
+        _BEFORE_M + EDGE * np.nan_to_num(seen.z), _BEFORE_SIGMAS * np.nan_to_num(scale, nan=np.inf)
+    )
+    cross = np.ones((3, 3), np.uint8)
+    seeds = cv2.morphologyEx(far.astype(np.uint8), cv2.MORPH_OPEN, cross) > 0
+    if np.count_nonzero(seeds) < _LEAST * seeds.size:
+        return np.zeros_like(seeds)
+    grown = _grown(seeds, far | _at_odds(seen, scale, sigma_intensity), ~(np.isfinite(seen.apart) | far), seen.z)
+    grown = cv2.morphologyEx(grown.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    return np.asarray(cv2.dilate(grown, np.ones((2 * _MARGIN + 1, 2 * _MARGIN + 1), np.uint8)) > 0)
+
+
+def _at_odds(seen: Seen, scale: Grid, sigma_intensity: float) -> Mask:
+    """Where depth or intensity differs, on average over a window, by more than it does on what rests."""
+    depth = _mean(seen.apart / np.maximum(scale, 1e-6))
+    color = _mean(np.abs(seen.intensity) / np.float32(sigma_intensity)) if np.isfinite(sigma_intensity) else 0.0
+    return np.asarray((np.abs(depth) > _WORST_DEPTH) | (color > _WORST_INTENSITY))
+
+
+def _mean(values: Grid) -> Grid:
+    """Over a window, of what is known in it; 0 where nothing is."""
+    known = np.isfinite(values)
+    size = (_WINDOW, _WINDOW)
+    # Outliers have their say, but one alone is no thing.
+    total = cv2.blur(np.where(known, np.clip(values, -4.0, 4.0), 0.0).astype(np.float32), size)
+    share = cv2.blur(known.astype(np.float32), size)
+    return np.asarray(total / np.maximum(share, 1e-3), np.float32)
+
+
+def _grown(seeds: Mask, odd: Mask, unknown: Mask, z: Grid) -> Mask:
+    """Seeds with what is connected to them on one surface and is odd, or unknown but near."""
+    near = cv2.dilate(seeds.astype(np.uint8), np.ones((2 * _UNKNOWN_STEPS + 1,) * 2, np.uint8)) > 0
+    open_ = (seeds | ((odd | (unknown & near)) & ~_edges(z))).astype(np.uint8)
+    count, labels = cv2.connectedComponents(open_, connectivity=4)
+    area = np.bincount(labels.ravel(), minlength=count)
+    own = np.bincount(labels[seeds], minlength=count)
+    kept = own >= np.maximum(1.0, _LEAST_SHARE * area)
+    kept[0] = False
+    return np.asarray(kept[labels] | seeds)
+
+
+def _edges(z: Grid) -> Mask:
+    """Pixels without depth, or whose neighbour right or below lies on another surface."""
+    out = ~np.isfinite(z)
+    z = np.nan_to_num(z)
+    for axis in (0, 1):
+        a, b = (z[1:], z[:-1]) if axis == 0 else (z[:, 1:], z[:, :-1])
+        jump = np.abs(a - b) > EDGE * np.minimum(a, b)
+        if axis == 0:
+            out[:-1] |= jump
+        else:
+            out[:, :-1] |= jump
+    return out
