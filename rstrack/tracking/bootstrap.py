@@ -12,10 +12,11 @@ from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.frame_report import FrameReport
 from rstrack.tracking.judgement.fault import Fault
 from rstrack.tracking.judgement.uncertainty import Uncertainty
-from rstrack.tracking.moving.leave_out import LeftOut
+from rstrack.tracking.moving.leave_out import LeftOut, without
+from rstrack.tracking.moving.majority import not_with_most
 from rstrack.tracking.succession import LEAST_DEPTH
 from rstrack.tracking.track import Track
-from rstrack.tracking.window import Window
+from rstrack.tracking.window import LEVELS, Window
 
 # Knots are never further apart than this many times the spacing that was asked for.
 _WIDEST = 2.0
@@ -49,28 +50,41 @@ def bootstrap(track: Track, new: DeviceFrame) -> FrameReport:
     window, ref = track.known()
     window.state.extend(new.last_time)
     fresh = track.observe(new, ref)
-    left = LeftOut(new.depth)
+    left = [LeftOut(new.depth)]
 
     def leave_out() -> None:
-        nonlocal left
-        left = track.leave_out(new.depth, ref, fresh, window.state)
+        left[:] = track.leave_out([new], ref, fresh, window.state)
 
     solved = window.solve(fresh, gauge=ref, coupled=True, before_finest=leave_out)
-    if ref.points:
-        # Its colours were looked up as if the first frame stood still: again, with the motion found.
-        ref, earlier = _recolored(track, window, ref, fresh), window.active
+    moves = bool(left[0].depth.moving) or left[0].gone is not None
+    if ref.points or moves:
+        if ref.points:
+            # Its colours were looked up as if the first frame stood still: again, with the motion found.
+            ref = _recolored(track, window, ref, fresh)
+        earlier, frames = window.active, [*list(track.succession.recent)[1:], new]
+
+        def leave_out_all() -> None:
+            # What moves has moved further by now: it shows in the earlier frames too.
+            left[:] = track.leave_out(frames, ref, [*earlier, *fresh], window.state)
+
+        if moves:
+            _begin_with_most(track, ref, frames, [*earlier, *fresh])
         window.active = []
-        solved = window.solve([*earlier, *fresh], (1, 0), gauge=ref, coupled=True, before_finest=leave_out)
+        levels = LEVELS if moves else (1, 0)
+        solved = window.solve([*earlier, *fresh], levels, gauge=ref, coupled=True, before_finest=leave_out_all)
         window.active = earlier
     if track.fits.fault(fresh, solved, ref.pixels):
         return _begin_anew(track, new)
     window.keep(fresh)
-    new = replace(new, depth=left.depth)
-    track.succession.recent.append(new)
+    recent = track.succession.recent
+    recent.append(new)
+    for n, one in enumerate(reversed(left), 1):
+        recent[-n] = replace(recent[-n], depth=one.depth)
+    new = recent[-1]
     track.placed(new, fresh)
-    if len(track.succession.recent) < track.options.bootstrap_frames:
+    if len(recent) < track.options.bootstrap_frames:
         return track.report(new, fresh, solved)
-    if all(track.succession.is_unfit(f) for f in track.succession.recent):
+    if all(track.succession.is_unfit(f) for f in recent):
         return _begin_anew(track, new)  # none of them has a colour image to go on with
     _leave(track, window)
     return track.report(new, fresh, solved, keyframe=True)
@@ -94,6 +108,17 @@ def _recolored(track: Track, window: Window, ref: Reference, fresh: Sequence[Obs
     return track.succession.reference
 
 
+def _begin_with_most(
+    track: Track, ref: Reference, frames: Sequence[DeviceFrame], observations: Sequence[Observation]
+) -> None:
+    """Leave out of the first frame what does not move as most of it does, until the alignment tells it better."""
+    odd = not_with_most(track.device.e, [track.succession.recent[0], *frames], track.device.rays)
+    if odd is not None and odd.any():
+        rest = without(track.device.e, ref, odd)
+        for o in observations:
+            o.see(rest)
+
+
 def _begin_anew(track: Track, new: DeviceFrame) -> FrameReport:
     """The first frames did not fit together: they are lost, and the newest is the first one."""
     track.begin_anew()
@@ -112,6 +137,12 @@ def _leave(track: Track, window: Window) -> None:
     window.active = []
     others = [o for frame in frames if frame is not middle for o in track.observe(frame, ref)]
     window.solve(others, levels=(0,))
+    rest = [frame for frame in frames if frame is not middle]
+    left = track.leave_out(rest, ref, others, window.state)
+    if any(one.depth.moving or one.gone is not None for one in left):
+        window.solve(others, levels=(0,))
+        for one in left:
+            track.succession.saw_through(one.gone)
     window.keep(others)
     for frame in frames:
         seen = [o for o in others if o.frame == frame.index]

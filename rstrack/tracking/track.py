@@ -19,7 +19,6 @@ from rstrack.alignment.pull import Pulls
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.rig import Rig
 from rstrack.images.device_frame import DeviceFrame, DeviceRig, Timer
-from rstrack.images.pyramid import DepthImage
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.keyframes.store import KeyframeStore
@@ -110,10 +109,14 @@ class Track:
             term.learn(o.inflation for o in on_reference if o.is_depth != is_color)
 
     def leave_out(
-        self, depth: DepthImage, ref: Reference, fresh: Sequence[Observation], state: SplineState
-    ) -> LeftOut:
-        """See `moving.leave_out`; nothing where that is not wanted."""
-        return leave_out(self.space, depth, ref, fresh, state) if self._finds_moving else LeftOut(depth)
+        self, frames: Sequence[DeviceFrame], ref: Reference, fresh: Sequence[Observation], state: SplineState
+    ) -> list[LeftOut]:
+        """What moves in frames; their observations `fresh` do without it, see `moving.leave_out`."""
+        depths = [frame.depth.occluder for frame in frames]
+        if not self._finds_moving:
+            return [LeftOut(depth) for depth in depths]
+        own = [[o for o in fresh if o.frame == frame.index] for frame in frames]
+        return leave_out(self.space, depths, ref, own, state)
 
     def given(self, before: Window, after: Window) -> tuple[FloatArray, FloatArray]:
         """Poses (n, 4, 4) of the frames that still move, before and after a new one has been aligned."""

@@ -31,20 +31,24 @@ class LeftOut:
 
 
 def leave_out(
-    space: FreeSpace, depth: DepthImage, ref: Reference, fresh: Sequence[Observation], state: SplineState
-) -> LeftOut:
-    """Let a frame's observations count without what moves, as seen from where they have been aligned to so far.
+    space: FreeSpace, depths: Sequence[DepthImage], ref: Reference, fresh: Sequence[Sequence[Observation]],
+    state: SplineState,
+) -> list[LeftOut]:  # fmt: skip
+    """Let frames' observations count without what moves, as seen from where they have been aligned to so far.
 
-    depth: the frame's whole image. fresh: its observations; those of `ref` do without what is gone from it, too.
+    depths: the frames' whole images. fresh: of each frame its observations; those of `ref` do without what any of the
+    frames finds gone from it, too.
     """
-    own = [o for o in fresh if o.ref.index == ref.index]
-    left = _found(space, depth, ref, own, state)
-    e, cleaned = space.device.e, ref if left.gone is None else without(space.device.e, ref, left.gone)
-    for o in fresh:
-        if isinstance(o.image, DepthImage):
-            o.image = left.depth
-        if o.ref.index == ref.index and o.ref is not cleaned:
-            o.see(cleaned)
+    of_ref = [[o for o in own if o.ref.index == ref.index] for own in fresh]
+    left = [_found(space, depth, ref, own, state) for depth, own in zip(depths, of_ref, strict=True)]
+    gone = [one.gone for one in left if one.gone is not None]
+    cleaned = without(space.device.e, ref, np.any(gone, axis=0)) if gone else ref
+    for one, own in zip(left, fresh, strict=True):
+        for o in own:
+            if isinstance(o.image, DepthImage):
+                o.image = one.depth
+            if o.ref.index == ref.index and o.ref is not cleaned:
+                o.see(cleaned)
     return left
 
 
