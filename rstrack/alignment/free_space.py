@@ -55,7 +55,8 @@ class SpaceInput:
 def free_space_kernel(
     e: Engine, lens: Lens, other: Lens, stride: int, has_rays: bool
 ) -> Callable[[SpaceInput], Any]:
-    """Kernel → (free, apart, value) at every stride-th pixel of `lens`, see `Seen`; `_UNKNOWN` where not to be told.
+    """Kernel → (free, apart, value) at every stride-th pixel of `lens`, see `Seen`; `_UNKNOWN` where not to be told, a
+    value of twice that outside the other image.
 
     has_rays: whether the image's rays are given; a rectified one's are those of its pinhole.
     """
@@ -91,7 +92,7 @@ def free_space_kernel(
         apart = dr.select(met, dr.rcp(dr.select(met, value, 1.0)) - seen.z, _UNKNOWN)
         column = e.UInt(e.Int(dr.select(inside, (seen.x + 0.5) / stride, 0.0)))
         row = e.UInt(e.Int(dr.select(inside, (seen.y + 0.5) / stride, 0.0)))
-        handed = dr.select(inside, dr.gather(e.Float, given.values, row * columns + column, inside), _UNKNOWN)
+        handed = dr.select(inside, dr.gather(e.Float, given.values, row * columns + column, inside), 2.0 * _UNKNOWN)
         return free, apart, handed
 
     return kernel
@@ -140,13 +141,15 @@ class Seen:
     """What the pixels of an image's grid (gh, gw) are, seen from the other image; NaN where that cannot be told.
 
     z (m): the image's own depth; free (m): how far it stands in front of all that the other shows about there; apart
-    (m): how far in front of the surface there; intensity: the colour image's, less that expected.
+    (m): how far in front of the surface there; intensity: the colour image's, less that expected; outside: whether it
+    is not within the other image.
     """
 
     z: Grid
     free: Grid
     apart: Grid
     intensity: Grid
+    outside: npt.NDArray[np.bool_]
 
 
 @dataclass
@@ -201,15 +204,13 @@ class FreeSpace:
         pick = slice(None, None, stride)
         full = lens.camera.height, lens.camera.width
 
-        def seen(inverse_depth: Any, free: Any, apart: Any, value: Any) -> Seen:
+        def seen(inverse_depth: Any, *given: Any) -> Seen:
             rho = e.download(inverse_depth, full)[pick, pick]
             z = np.divide(np.float32(1.0), rho, out=np.full_like(rho, np.nan), where=rho > 0)
-            return Seen(z, *(_known(e.download(a, shape)) for a in (free, apart, value)))
+            free, apart, handed, own = (e.download(a, shape) for a in (*given, given[-1])[:4])
+            return Seen(z, _known(free), _known(apart), _known(own), handed > 1.5 * _UNKNOWN)
 
-        return (
-            seen(depth.inverse_z, *into_ref),
-            seen(ref.inverse_depth, *into_frame[:2], intensity),
-        )
+        return seen(depth.inverse_z, *into_ref), seen(ref.inverse_depth, *into_frame, intensity)
 
 
 def grid_of(lens: Lens) -> tuple[int, int]:

@@ -65,7 +65,8 @@ def bootstrap(track: Track, new: DeviceFrame) -> FrameReport:
 
         def leave_out_all() -> None:
             # What moves has moved further by now: it shows in the earlier frames too.
-            left[:] = track.leave_out(frames, ref, [*earlier, *fresh], window.state)
+            whole = [replace(frame, depth=frame.depth.occluder) for frame in frames]
+            left[:] = track.leave_out(whole, ref, [*earlier, *fresh], window.state)
 
         if moves:
             _begin_with_most(track, ref, frames, [*earlier, *fresh])

@@ -112,7 +112,7 @@ class Track:
         self, frames: Sequence[DeviceFrame], ref: Reference, fresh: Sequence[Observation], state: SplineState
     ) -> list[LeftOut]:
         """What moves in frames; their observations `fresh` do without it, see `moving.leave_out`."""
-        depths = [frame.depth.occluder for frame in frames]
+        depths = [frame.depth for frame in frames]
         if not self._finds_moving:
             return [LeftOut(depth) for depth in depths]
         own = [[o for o in fresh if o.frame == frame.index] for frame in frames]

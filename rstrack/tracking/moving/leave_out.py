@@ -36,7 +36,7 @@ def leave_out(
 ) -> list[LeftOut]:  # fmt: skip
     """Let frames' observations count without what moves, as seen from where they have been aligned to so far.
 
-    depths: the frames' whole images. fresh: of each frame its observations; those of `ref` do without what any of the
+    depths: the frames' images; what has been left out of them already stays so. fresh: of each frame its observations; those of `ref` do without what any of the
     frames finds gone from it, too.
     """
     of_ref = [[o for o in own if o.ref.index == ref.index] for own in fresh]
@@ -62,7 +62,7 @@ def _found(
     sigma_depth = next((o.lin.next_sigma for o in own if o.is_depth), START_DEPTH)
     image, brightness = (color.image, color.brightness(state)) if color else (None, SAME)
     assert not isinstance(image, DepthImage)
-    in_frame, in_ref = space.compare(depth, image, brightness, ref, state.spline)
+    in_frame, in_ref = space.compare(depth.occluder, image, brightness, ref, state.spline)
     with space.device.timer("what moves: regions"):
         scales = sigma_depth, ref.median_depth, color.lin.next_sigma if color else np.inf
         came, gone = moving(in_frame, *scales), moving(in_ref, *scales)
@@ -79,7 +79,7 @@ def _without(e: Engine, depth: DepthImage, came: Mask) -> DepthImage:
     z, inverse_z = depth.z * keep, depth.inverse_z * keep
     dr.eval(z, inverse_z)
     count = int(np.count_nonzero(e.download(z, (camera.height, camera.width))))
-    return replace(depth, z=z, inverse_z=inverse_z, count=count, whole=depth)
+    return replace(depth, z=z, inverse_z=inverse_z, count=count, whole=depth.occluder)
 
 
 def without(e: Engine, ref: Reference, gone: Mask) -> Reference:

@@ -18,8 +18,8 @@ _LEAST = 2e-3
 # Window over which residuals are averaged, and averages that a resting surface hardly has: of depth in σ, and of the
 # size of intensity's, in σ.
 _WINDOW, _WORST_DEPTH, _WORST_INTENSITY = 5, 1.0, 1.8
-# Steps through what cannot be told that a thing is followed, and the part of it that has to stand in free space.
-_UNKNOWN_STEPS, _LEAST_SHARE = 6, 0.1
+# Steps outside the other image that a thing is followed, and the part of it that has to stand in free space.
+_OUTSIDE_STEPS, _LEAST_SHARE = 6, 0.1
 # Pixels of the grid that edges are given besides.
 _MARGIN = 1
 
@@ -39,7 +39,7 @@ def moving(seen: Seen, sigma_depth: float, median_depth: float, sigma_intensity:
     seeds = cv2.morphologyEx(far.astype(np.uint8), cv2.MORPH_OPEN, cross) > 0
     if np.count_nonzero(seeds) < _LEAST * seeds.size:
         return np.zeros_like(seeds)
-    grown = _grown(seeds, far | _at_odds(seen, scale, sigma_intensity), ~(np.isfinite(seen.apart) | far), seen.z)
+    grown = _grown(seeds, far | _at_odds(seen, scale, sigma_intensity), seen)
     grown = cv2.morphologyEx(grown.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
     return np.asarray(cv2.dilate(grown, np.ones((2 * _MARGIN + 1, 2 * _MARGIN + 1), np.uint8)) > 0)
 
@@ -61,10 +61,12 @@ def _mean(values: Grid) -> Grid:
     return np.asarray(total / np.maximum(share, 1e-3), np.float32)
 
 
-def _grown(seeds: Mask, odd: Mask, unknown: Mask, z: Grid) -> Mask:
-    """Seeds with what is connected to them on one surface and is odd, or unknown but near."""
-    near = cv2.dilate(seeds.astype(np.uint8), np.ones((2 * _UNKNOWN_STEPS + 1,) * 2, np.uint8)) > 0
-    open_ = (seeds | ((odd | (unknown & near)) & ~_edges(z))).astype(np.uint8)
+def _grown(seeds: Mask, odd: Mask, seen: Seen) -> Mask:
+    """Seeds with what is connected to them on one surface and is odd, or cannot be told: in a hole, where something may
+    have been left out, or outside, but near."""
+    unknown, z = ~np.isfinite(seen.apart), seen.z
+    near = cv2.dilate(seeds.astype(np.uint8), np.ones((2 * _OUTSIDE_STEPS + 1,) * 2, np.uint8)) > 0
+    open_ = (seeds | ((odd | (unknown & (near | ~seen.outside))) & ~_edges(z))).astype(np.uint8)
     count, labels = cv2.connectedComponents(open_, connectivity=4)
     area = np.bincount(labels.ravel(), minlength=count)
     own = np.bincount(labels[seeds], minlength=count)
