@@ -162,55 +162,58 @@ class FreeSpace:
     def __post_init__(self) -> None:
         self._kernel = Kernels(self.device.e)
 
-    def compare(
-        self, depth: DepthImage, color: ColorImage | None, brightness: FloatArray, ref: Reference, spline: Spline
-    ) -> tuple[Seen, Seen]:
-        """A frame's depth image seen from its keyframe, and the keyframe seen from the frame, at T_world_depth(t).
+    def keyframe_in_frame(
+        self, ref: Reference, depth: DepthImage, color: ColorImage | None, brightness: FloatArray, spline: Spline
+    ) -> tuple[Seen, Any]:
+        """The keyframe seen from a frame's depth image, at T_world_depth(t); and its differences of intensity on the device.
 
         color: that image of the frame, brightness (2,): its gain and offset against the keyframe's; None: no intensities.
         """
+        e, (level, stride) = self.device.e, grid_of(ref.lens)
         with self.device.timer("what moves: compare"):
-            return self._compare(depth, color, brightness, ref, spline)
+            to_base, _ = self._lines(ref, spline)
+            if color is None or not ref.points:
+                intensity = e.upload(np.full(grid_shape(ref.lens), _UNKNOWN))
+            else:
+                points, own_level = ref.points[level], color.level(pyramid_level(level))
+                kernel = self._kernel(intensity_kernel, color.exposure.lens, ref.lens, stride, own_level)
+                color_at = e.upload(from_base_table(spline, ref.T_world_base, color.exposure))
+                given = points.x, points.y, points.z, points.intensity, to_base, color.levels[own_level], color_at
+                intensity = kernel(IntensityInput(*given, e.upload(brightness)))
+            from_base = e.upload(from_base_table(spline, ref.T_world_base, depth.exposure))
+            free, apart, handed = self._kernel(
+                free_space_kernel, ref.lens, depth.exposure.lens, stride, ref.rolling is not None
+            )(SpaceInput(ref.inverse_depth, *self.device.device_rays, to_base, depth.inverse_z, from_base, intensity))
+            return self._seen(ref.lens, ref.inverse_depth, free, apart, intensity, handed), intensity
 
-    def _compare(
-        self, depth: DepthImage, color: ColorImage | None, brightness: FloatArray, ref: Reference, spline: Spline
-    ) -> tuple[Seen, Seen]:
+    def frame_in_keyframe(self, depth: DepthImage, ref: Reference, intensity: Any, spline: Spline) -> Seen:
+        """A frame's depth image seen from its keyframe. intensity: differences as `keyframe_in_frame` gives them."""
         e, lens = self.device.e, depth.exposure.lens
-        level, stride = grid_of(lens)
-        rolling = ref.rolling is not None
-        rays = self.device.device_rays
-        frame_lines = e.upload(to_base_table(spline, ref.T_world_base, depth.exposure))
-        frame_at = e.upload(from_base_table(spline, ref.T_world_base, depth.exposure))
+        with self.device.timer("what moves: compare"):
+            to_base = e.upload(to_base_table(spline, ref.T_world_base, depth.exposure))
+            _, from_base = self._lines(ref, spline)
+            free, apart, handed = self._kernel(free_space_kernel, lens, ref.lens, grid_of(lens)[1], True)(
+                SpaceInput(
+                    depth.inverse_z, *self.device.device_rays, to_base, ref.inverse_depth, from_base, intensity
+                )
+            )
+            return self._seen(lens, depth.inverse_z, free, apart, handed, handed)
+
+    def _lines(self, ref: Reference, spline: Spline) -> tuple[Any, Any]:
+        e = self.device.e
         if ref.rolling is None:
-            ref_lines, ref_at = e.upload(_IDENTITY_TO_BASE), e.upload(IDENTITY_FROM_BASE)
-        else:
-            ref_lines = e.upload(to_base_table(spline, ref.T_world_base, ref.rolling))
-            ref_at = e.upload(from_base_table(spline, ref.T_world_base, ref.rolling))
-        shape = grid_shape(lens)
-        if color is None or not ref.points:
-            intensity = e.upload(np.full(shape, _UNKNOWN))
-        else:
-            points, own_level = ref.points[level], color.level(pyramid_level(level))
-            kernel = self._kernel(intensity_kernel, color.exposure.lens, ref.lens, stride, own_level)
-            color_at = e.upload(from_base_table(spline, ref.T_world_base, color.exposure))
-            given = points.x, points.y, points.z, points.intensity, ref_lines, color.levels[own_level], color_at
-            intensity = kernel(IntensityInput(*given, e.upload(brightness)))
-        into_ref = self._kernel(free_space_kernel, lens, ref.lens, stride, True)(
-            SpaceInput(depth.inverse_z, *rays, frame_lines, ref.inverse_depth, ref_at, intensity)
+            return e.upload(_IDENTITY_TO_BASE), e.upload(IDENTITY_FROM_BASE)
+        return (
+            e.upload(to_base_table(spline, ref.T_world_base, ref.rolling)),
+            e.upload(from_base_table(spline, ref.T_world_base, ref.rolling)),
         )
-        into_frame = self._kernel(free_space_kernel, ref.lens, lens, stride, rolling)(
-            SpaceInput(ref.inverse_depth, *rays, ref_lines, depth.inverse_z, frame_at, intensity)
-        )
-        pick = slice(None, None, stride)
-        full = lens.camera.height, lens.camera.width
 
-        def seen(inverse_depth: Any, *given: Any) -> Seen:
-            rho = e.download(inverse_depth, full)[pick, pick]
-            z = np.divide(np.float32(1.0), rho, out=np.full_like(rho, np.nan), where=rho > 0)
-            free, apart, handed, own = (e.download(a, shape) for a in (*given, given[-1])[:4])
-            return Seen(z, _known(free), _known(apart), _known(own), handed > 1.5 * _UNKNOWN)
-
-        return seen(depth.inverse_z, *into_ref), seen(ref.inverse_depth, *into_frame, intensity)
+    def _seen(self, lens: Lens, inverse_depth: Any, free: Any, apart: Any, intensity: Any, handed: Any) -> Seen:
+        e, shape, stride = self.device.e, grid_shape(lens), grid_of(lens)[1]
+        rho = e.download(inverse_depth, (lens.camera.height, lens.camera.width))[::stride, ::stride]
+        z = np.divide(np.float32(1.0), rho, out=np.full_like(rho, np.nan), where=rho > 0)
+        known = (_known(e.download(values, shape)) for values in (free, apart, intensity))
+        return Seen(z, *known, e.download(handed, shape) > 1.5 * _UNKNOWN)
 
 
 def grid_of(lens: Lens) -> tuple[int, int]:

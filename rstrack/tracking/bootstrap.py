@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -12,7 +13,7 @@ from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.frame_report import FrameReport
 from rstrack.tracking.judgement.fault import Fault
 from rstrack.tracking.judgement.uncertainty import Uncertainty
-from rstrack.tracking.moving.leave_out import LeftOut, without
+from rstrack.tracking.moving.leave_out import LeftOut, left_out_with, without
 from rstrack.tracking.moving.majority import not_with_most
 from rstrack.tracking.succession import LEAST_DEPTH
 from rstrack.tracking.track import Track
@@ -127,8 +128,21 @@ def _begin_anew(track: Track, new: DeviceFrame) -> FrameReport:
     return start(track, new)
 
 
+def _leave_out_by_last(track: Track, window: Window) -> None:
+    """What has hardly moved since the first frame has done so until the last one: left out of those between."""
+    *frames, last = track.succession.recent
+    ref = track.maker.rolling(last.index, last.depth.occluder, last.colors, window.spline)
+    rest = [
+        replace(frame, depth=left_out_with(track.space, frame.depth, last.depth, ref, window.spline))
+        for frame in frames
+    ]
+    track.succession.recent = deque([*rest, last])
+
+
 def _leave(track: Track, window: Window) -> None:
     """Rectify the middle frame and align all others to it."""
+    if any(frame.depth.moving for frame in track.succession.recent):
+        _leave_out_by_last(track, window)
     frames, covariances = list(track.succession.recent), track.covariances
     middle = min(
         (f for f in frames if not track.succession.is_unfit(f)),

@@ -9,13 +9,14 @@ import drjit as dr
 import numpy as np
 
 from rsgen.device.arrays import Engine
+from rsgen.geometry.spline import Spline
 from rstrack.alignment.brightness import SAME
-from rstrack.alignment.free_space import FreeSpace, grid_of
+from rstrack.alignment.free_space import FreeSpace, Seen, grid_of
 from rstrack.alignment.observation import START_DEPTH, Observation
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.pyramid import DepthImage
 from rstrack.keyframes.keyframe import Reference, strides
-from rstrack.tracking.moving.regions import Mask, moving
+from rstrack.tracking.moving.regions import Mask, moving, moving_with
 
 # Part of what is seen that may move: where more seems to, it is the pose that is wrong.
 _MOST = 0.5
@@ -62,15 +63,41 @@ def _found(
     sigma_depth = next((o.lin.next_sigma for o in own if o.is_depth), START_DEPTH)
     image, brightness = (color.image, color.brightness(state)) if color else (None, SAME)
     assert not isinstance(image, DepthImage)
-    in_frame, in_ref = space.compare(depth.occluder, image, brightness, ref, state.spline)
+    e, scales = space.device.e, (sigma_depth, ref.median_depth, color.lin.next_sigma if color else np.inf)
+    seen, intensity = space.keyframe_in_frame(ref, depth.occluder, image, brightness, state.spline)
     with space.device.timer("what moves: regions"):
-        scales = sigma_depth, ref.median_depth, color.lin.next_sigma if color else np.inf
-        came, gone = moving(in_frame, *scales), moving(in_ref, *scales)
-        shares = [(m & np.isfinite(s.z)).sum() / max(1, np.isfinite(s.z).sum()) for m, s in ((came, in_frame), (gone, in_ref))]
-        if max(shares) > _MOST:
-            return nothing
-        rest = _without(space.device.e, depth, came) if came.any() else depth
-        return LeftOut(rest, gone if gone.any() else None)
+        gone = moving(seen, *scales)
+    if _share(gone, seen) > _MOST:
+        return nothing
+    # What falls where something is gone may be that in another place.
+    rest = without(e, ref, gone) if gone.any() else ref
+    seen = space.frame_in_keyframe(depth.occluder, rest, intensity, state.spline)
+    with space.device.timer("what moves: regions"):
+        came = moving(seen, *scales)
+    if _share(came, seen) > _MOST:
+        return nothing
+    return LeftOut(_without(e, depth, came) if came.any() else depth, gone if gone.any() else None)
+
+
+def left_out_with(space: FreeSpace, depth: DepthImage, last: DepthImage, ref: Reference, spline: Spline) -> DepthImage:
+    """A frame's depth image without what another frame does without and shows at about the same place.
+
+    ref: of the other frame's whole depth image, of which `last` is what has been left.
+    """
+    if last.whole is None:
+        return depth
+    e, camera = space.device.e, last.exposure.lens.camera
+    full, stride = (camera.height, camera.width), grid_of(last.exposure.lens)[1]
+    rest = e.download(last.z, full) > 0
+    odd = (e.download(last.whole.z, full) > 0) & ~rest
+    seen = space.frame_in_keyframe(depth.occluder, ref, e.upload(odd[::stride, ::stride]), spline)
+    came = moving_with(seen, np.nan_to_num(seen.intensity) > 0.5, START_DEPTH, ref.median_depth)
+    return _without(e, depth, came) if came.any() and _share(came, seen) <= _MOST else depth
+
+
+def _share(mask: Mask, seen: Seen) -> float:
+    known = np.isfinite(seen.z)
+    return float(np.count_nonzero(mask & known) / max(1, np.count_nonzero(known)))
 
 
 def _without(e: Engine, depth: DepthImage, came: Mask) -> DepthImage:

@@ -18,8 +18,9 @@ _LEAST = 2e-3
 # Window over which residuals are averaged, and averages that a resting surface hardly has: of depth in σ, and of the
 # size of intensity's, in σ.
 _WINDOW, _WORST_DEPTH, _WORST_INTENSITY = 5, 1.0, 1.8
-# Steps outside the other image that a thing is followed, and the part of it that has to stand in free space.
-_OUTSIDE_STEPS, _LEAST_SHARE = 6, 0.1
+# Steps beyond what was seen that a thing is followed, and the part of what can be told of it that has to stand in free
+# space.
+_BEYOND_STEPS, _LEAST_SHARE = 6, 0.1
 # Pixels of the grid that edges are given besides.
 _MARGIN = 1
 
@@ -30,25 +31,50 @@ def moving(seen: Seen, sigma_depth: float, median_depth: float, sigma_intensity:
     sigma_depth (m): scale of depth's residuals at median_depth (m), growing with the square of depth; sigma_intensity:
     that of intensity's. Nothing where too little stands in free space to tell.
     """
-    scale = sigma_depth * np.square(seen.z / np.float32(median_depth))
-    known = np.isfinite(seen.free) & np.isfinite(scale)
-    far = np.where(known, seen.free, 0.0) > np.maximum(
-        _BEFORE_M + EDGE * np.nan_to_num(seen.z), _BEFORE_SIGMAS * np.nan_to_num(scale, nan=np.inf)
-    )
-    cross = np.ones((3, 3), np.uint8)
-    seeds = cv2.morphologyEx(far.astype(np.uint8), cv2.MORPH_OPEN, cross) > 0
+    scale, least = _scales(seen.z, sigma_depth, median_depth)
+    far = np.nan_to_num(seen.free) > least
+    seeds = _opened(far)
     if np.count_nonzero(seeds) < _LEAST * seeds.size:
         return np.zeros_like(seeds)
-    grown = _grown(seeds, far | _at_odds(seen, scale, sigma_intensity), seen)
-    grown = cv2.morphologyEx(grown.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
-    return np.asarray(cv2.dilate(grown, np.ones((2 * _MARGIN + 1, 2 * _MARGIN + 1), np.uint8)) > 0)
+    # Behind what is seen there nothing is known.
+    hidden = np.nan_to_num(seen.apart) < -least
+    odd = far | _at_odds(np.where(hidden, np.nan, seen.apart) / scale, seen.intensity, sigma_intensity)
+    grown = _grown(seeds, odd, hidden | ~np.isfinite(seen.apart), hidden | seen.outside, seen.z)
+    return _widened(grown)
 
 
-def _at_odds(seen: Seen, scale: Grid, sigma_intensity: float) -> Mask:
-    """Where depth or intensity differs, on average over a window, by more than it does on what rests."""
-    depth = _mean(seen.apart / np.maximum(scale, 1e-6))
-    color = _mean(np.abs(seen.intensity) / np.float32(sigma_intensity)) if np.isfinite(sigma_intensity) else 0.0
-    return np.asarray((np.abs(depth) > _WORST_DEPTH) | (color > _WORST_INTENSITY))
+def moving_with(seen: Seen, left_out: Mask, sigma_depth: float, median_depth: float) -> Mask:
+    """Pixels (gh, gw) of things that the other image shows about there and does without.
+
+    left_out (gh, gw): pixels that fall where something has been left out of it.
+    """
+    _, least = _scales(seen.z, sigma_depth, median_depth)
+    seeds = _opened(left_out & (np.abs(np.nan_to_num(seen.apart, nan=np.inf)) < least))
+    nowhere = np.zeros_like(seeds)
+    grown = _grown(seeds, left_out | (np.nan_to_num(seen.free) > least), nowhere, nowhere, seen.z)
+    return _widened(grown) if seeds.any() else nowhere
+
+
+def _scales(z: Grid, sigma_depth: float, median_depth: float) -> tuple[Grid, Grid]:
+    """σ (m) at depths z, and how far before what was seen something has to stand to be in free space."""
+    z = np.nan_to_num(z)
+    scale = np.maximum(sigma_depth * np.square(z / np.float32(median_depth)), 1e-6)
+    return scale, np.maximum(_BEFORE_M + EDGE * z, _BEFORE_SIGMAS * scale)
+
+
+def _opened(mask: Mask) -> Mask:
+    return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0)
+
+
+def _widened(grown: Mask) -> Mask:
+    closed = cv2.morphologyEx(grown.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    return np.asarray(cv2.dilate(closed, np.ones((2 * _MARGIN + 1, 2 * _MARGIN + 1), np.uint8)) > 0)
+
+
+def _at_odds(depth: Grid, intensity: Grid, sigma_intensity: float) -> Mask:
+    """Where depth (in σ) or intensity differs, on average over a window, by more than it does on what rests."""
+    color = _mean(np.abs(intensity) / np.float32(sigma_intensity)) if np.isfinite(sigma_intensity) else 0.0
+    return np.asarray((np.abs(_mean(depth)) > _WORST_DEPTH) | (color > _WORST_INTENSITY))
 
 
 def _mean(values: Grid) -> Grid:
@@ -61,16 +87,18 @@ def _mean(values: Grid) -> Grid:
     return np.asarray(total / np.maximum(share, 1e-3), np.float32)
 
 
-def _grown(seeds: Mask, odd: Mask, seen: Seen) -> Mask:
-    """Seeds with what is connected to them on one surface and is odd, or cannot be told: in a hole, where something may
-    have been left out, or outside, but near."""
-    unknown, z = ~np.isfinite(seen.apart), seen.z
-    near = cv2.dilate(seeds.astype(np.uint8), np.ones((2 * _OUTSIDE_STEPS + 1,) * 2, np.uint8)) > 0
-    open_ = (seeds | ((odd | (unknown & (near | ~seen.outside))) & ~_edges(z))).astype(np.uint8)
-    count, labels = cv2.connectedComponents(open_, connectivity=4)
-    area = np.bincount(labels.ravel(), minlength=count)
+def _grown(seeds: Mask, odd: Mask, unknown: Mask, beyond: Mask, z: Grid) -> Mask:
+    """Seeds with what is connected to them on one surface and is odd, or cannot be told.
+
+    That is so in holes, where something may have been left out, and beyond what was seen: there they are followed for a
+    few steps only.
+    """
+    near = cv2.dilate(seeds.astype(np.uint8), np.ones((2 * _BEYOND_STEPS + 1,) * 2, np.uint8)) > 0
+    open_ = seeds | ((np.where(unknown, near | ~beyond, odd)) & ~_edges(z))
+    count, labels = cv2.connectedComponents(open_.astype(np.uint8), connectivity=4)
+    told = np.bincount(labels[seeds | ~unknown], minlength=count)
     own = np.bincount(labels[seeds], minlength=count)
-    kept = own >= np.maximum(1.0, _LEAST_SHARE * area)
+    kept = own >= np.maximum(1.0, _LEAST_SHARE * told)
     kept[0] = False
     return np.asarray(kept[labels] | seeds)
 
