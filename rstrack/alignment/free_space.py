@@ -52,9 +52,7 @@ class SpaceInput:
     values: Any
 
 
-def free_space_kernel(
-    e: Engine, lens: Lens, other: Lens, stride: int, has_rays: bool
-) -> Callable[[SpaceInput], Any]:
+def free_space_kernel(e: Engine, lens: Lens, other: Lens, stride: int, has_rays: bool) -> Callable[[SpaceInput], Any]:
     """Kernel → (free, apart, value) at every stride-th pixel of `lens`, see `Seen`; `_UNKNOWN` where not to be told, a
     value of twice that outside the other image.
 
@@ -165,9 +163,11 @@ class FreeSpace:
     def keyframe_in_frame(
         self, ref: Reference, depth: DepthImage, color: ColorImage | None, brightness: FloatArray, spline: Spline
     ) -> tuple[Seen, Any]:
-        """The keyframe seen from a frame's depth image, at T_world_depth(t); and its differences of intensity on the device.
+        """The keyframe seen from a frame's depth image, at T_world_depth(t), and its differences of intensity on the
+        device.
 
-        color: that image of the frame, brightness (2,): its gain and offset against the keyframe's; None: no intensities.
+        color: that image of the frame; None: no intensities. brightness (2,): its gain and offset against the
+        keyframe's.
         """
         e, (level, stride) = self.device.e, grid_of(ref.lens)
         with self.device.timer("what moves: compare"):
@@ -193,9 +193,7 @@ class FreeSpace:
             to_base = e.upload(to_base_table(spline, ref.T_world_base, depth.exposure))
             _, from_base = self._lines(ref, spline)
             free, apart, handed = self._kernel(free_space_kernel, lens, ref.lens, grid_of(lens)[1], True)(
-                SpaceInput(
-                    depth.inverse_z, *self.device.device_rays, to_base, ref.inverse_depth, from_base, intensity
-                )
+                SpaceInput(depth.inverse_z, *self.device.device_rays, to_base, ref.inverse_depth, from_base, intensity)
             )
             return self._seen(lens, depth.inverse_z, free, apart, handed, handed)
 
@@ -212,8 +210,8 @@ class FreeSpace:
         e, shape, stride = self.device.e, grid_shape(lens), grid_of(lens)[1]
         rho = e.download(inverse_depth, (lens.camera.height, lens.camera.width))[::stride, ::stride]
         z = np.divide(np.float32(1.0), rho, out=np.full_like(rho, np.nan), where=rho > 0)
-        known = (_known(e.download(values, shape)) for values in (free, apart, intensity))
-        return Seen(z, *known, e.download(handed, shape) > 1.5 * _UNKNOWN)
+        before, off, differs = (_known(e.download(values, shape)) for values in (free, apart, intensity))
+        return Seen(z, before, off, differs, e.download(handed, shape) > 1.5 * _UNKNOWN)
 
 
 def grid_of(lens: Lens) -> tuple[int, int]:

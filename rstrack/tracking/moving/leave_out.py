@@ -37,8 +37,8 @@ def leave_out(
 ) -> list[LeftOut]:  # fmt: skip
     """Let frames' observations count without what moves, as seen from where they have been aligned to so far.
 
-    depths: the frames' images; what has been left out of them already stays so. fresh: of each frame its observations; those of `ref` do without what any of the
-    frames finds gone from it, too.
+    depths: the frames' images; what has been left out of them already stays so. fresh: of each frame its observations;
+    those of `ref` do without what any of the frames finds gone from it, too.
     """
     of_ref = [[o for o in own if o.ref.index == ref.index] for own in fresh]
     left = [_found(space, depth, ref, own, state) for depth, own in zip(depths, of_ref, strict=True)]
@@ -97,7 +97,7 @@ def left_out_with(space: FreeSpace, depth: DepthImage, last: DepthImage, ref: Re
 
 def _share(mask: Mask, seen: Seen) -> float:
     known = np.isfinite(seen.z)
-    return float(np.count_nonzero(mask & known) / max(1, np.count_nonzero(known)))
+    return np.count_nonzero(mask & known) / max(1, int(np.count_nonzero(known)))
 
 
 def _without(e: Engine, depth: DepthImage, came: Mask) -> DepthImage:

@@ -9,9 +9,11 @@ image for as long as it takes to align the others to the rest.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from rsgen.array_types import FloatArray
 from rsgen.device.arrays import Engine
@@ -33,7 +35,8 @@ _FEWEST, _MAJORITY = 40, 0.5
 def not_with_most(e: Engine, frames: Sequence[DeviceFrame], rays: FloatArray) -> Mask | None:
     """Pixels (gh, gw) of the first frame's grid that do not move as most of it does; None where that cannot be told.
 
-    frames: in order; rays (h, w, 2): of the depth camera. Poses of lines do not count: pixels are asked for, not tenths.
+    frames: in order; rays (h, w, 2): of the depth camera. Lines are taken to be exposed at once: pixels are asked for,
+    not tenths.
     """
     if len(frames) < 2 or not all(frame.colors for frame in frames):
         return None
@@ -71,20 +74,26 @@ def not_with_most(e: Engine, frames: Sequence[DeviceFrame], rays: FloatArray) ->
     return np.asarray(cv2.resize(odd.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0)
 
 
-def _grey(e: Engine, image: ColorImage) -> FloatArray:
+def _grey(e: Engine, image: ColorImage) -> npt.NDArray[np.uint8]:
     camera = image.exposure.lens.camera
     values = e.download(image.levels[0], (camera.height, camera.width))
     return np.asarray(np.nan_to_num(255.0 * values, nan=255.0).clip(0, 255).astype(np.uint8))
 
 
-def _follow(images: Sequence[FloatArray], uv: FloatArray) -> tuple[FloatArray, Mask]:
-    """Where points (n, 2) of the first image are in the last one, followed from image to image, and whether they were."""
+def _follow(images: Sequence[npt.NDArray[np.uint8]], uv: FloatArray) -> tuple[FloatArray, Mask]:
+    """Where points (n, 2) of the first image are in the last one, and whether they could be followed from image to
+    image."""
     at, good = uv.astype(np.float32)[:, None], np.ones(len(uv), bool)
-    window = {"winSize": (_WINDOW, _WINDOW), "maxLevel": 3, "minEigThreshold": 1e-3}
-    for before, after in zip(images, images[1:], strict=False):
-        to, seen, _ = cv2.calcOpticalFlowPyrLK(before, after, at, None, **window)
-        back, seen_back, _ = cv2.calcOpticalFlowPyrLK(after, before, to, None, **window)
-        missed = np.linalg.norm((back - at)[:, 0], axis=1)
-        good &= (seen[:, 0] > 0) & (seen_back[:, 0] > 0) & (missed < _BACK_PX)
+    for before, after in pairwise(images):
+        to, seen = _flow(before, after, at)
+        back, seen_back = _flow(after, before, to)
+        good &= seen & seen_back & (np.linalg.norm((back - at)[:, 0], axis=1) < _BACK_PX)
         at = to
     return at[:, 0].astype(np.float64), good
+
+
+def _flow(
+    before: npt.NDArray[np.uint8], after: npt.NDArray[np.uint8], at: npt.NDArray[np.float32]
+) -> tuple[npt.NDArray[np.float32], Mask]:
+    to, seen, _ = cv2.calcOpticalFlowPyrLK(before, after, at, at.copy(), winSize=(_WINDOW, _WINDOW))
+    return np.asarray(to, np.float32), np.asarray(seen)[:, 0] > 0

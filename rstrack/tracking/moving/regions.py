@@ -38,7 +38,8 @@ def moving(seen: Seen, sigma_depth: float, median_depth: float, sigma_intensity:
         return np.zeros_like(seeds)
     # Behind what is seen there nothing is known.
     hidden = np.nan_to_num(seen.apart) < -least
-    odd = far | _at_odds(np.where(hidden, np.nan, seen.apart) / scale, seen.intensity, sigma_intensity)
+    depth = (np.where(hidden, np.nan, seen.apart) / scale).astype(np.float32)
+    odd = far | _at_odds(depth, seen.intensity, sigma_intensity)
     grown = _grown(seeds, odd, hidden | ~np.isfinite(seen.apart), hidden | seen.outside, seen.z)
     return _widened(grown)
 
@@ -49,9 +50,10 @@ def moving_with(seen: Seen, left_out: Mask, sigma_depth: float, median_depth: fl
     left_out (gh, gw): pixels that fall where something has been left out of it.
     """
     _, least = _scales(seen.z, sigma_depth, median_depth)
-    seeds = _opened(left_out & (np.abs(np.nan_to_num(seen.apart, nan=np.inf)) < least))
+    apart = np.nan_to_num(seen.apart)
+    seeds = _opened(left_out & np.isfinite(seen.apart) & (np.abs(apart) < least))
     nowhere = np.zeros_like(seeds)
-    grown = _grown(seeds, left_out | (np.nan_to_num(seen.free) > least), nowhere, nowhere, seen.z)
+    grown = _grown(seeds, (left_out & (apart > -least)) | (np.nan_to_num(seen.free) > least), nowhere, nowhere, seen.z)
     return _widened(grown) if seeds.any() else nowhere
 
 
@@ -59,7 +61,7 @@ def _scales(z: Grid, sigma_depth: float, median_depth: float) -> tuple[Grid, Gri
     """σ (m) at depths z, and how far before what was seen something has to stand to be in free space."""
     z = np.nan_to_num(z)
     scale = np.maximum(sigma_depth * np.square(z / np.float32(median_depth)), 1e-6)
-    return scale, np.maximum(_BEFORE_M + EDGE * z, _BEFORE_SIGMAS * scale)
+    return scale.astype(np.float32), np.maximum(_BEFORE_M + EDGE * z, _BEFORE_SIGMAS * scale)
 
 
 def _opened(mask: Mask) -> Mask:
@@ -73,7 +75,7 @@ def _widened(grown: Mask) -> Mask:
 
 def _at_odds(depth: Grid, intensity: Grid, sigma_intensity: float) -> Mask:
     """Where depth (in σ) or intensity differs, on average over a window, by more than it does on what rests."""
-    color = _mean(np.abs(intensity) / np.float32(sigma_intensity)) if np.isfinite(sigma_intensity) else 0.0
+    color = _mean((np.abs(intensity) / sigma_intensity).astype(np.float32))  # infinite where there is none: never odd
     return np.asarray((np.abs(_mean(depth)) > _WORST_DEPTH) | (color > _WORST_INTENSITY))
 
 
