@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import cv2
@@ -132,6 +132,11 @@ def test_a_thing_ends_where_another_surface_or_what_rests_begins() -> None:
     seen.free[30:50, 60:72] = seen.apart[30:50, 60:72] = 0.5
     found = regions(seen)
     assert found[30:50, 60:72].all() and found.sum() < 900
+    seen = still()
+    seen.free[30:50, 60:72] = seen.apart[30:50, 60:72] = 0.5
+    seen.free[:, 10:60] = seen.apart[:, 10:60] = -0.4  # what something hid before
+    found = regions(seen)
+    assert found[30:50, 60:72].all() and found.sum() < 900
 
 
 def test_what_another_frame_does_without_is_found_by_its_place() -> None:
@@ -230,6 +235,7 @@ def test_a_ball_that_passes_is_left_out_of_frame_and_keyframe(recording: Recordi
         first = recording.balls[0]
         assert kept[_inner(first)].mean() < (0.3 if k == 2 else 0.1) and kept[~first].mean() > 0.85
         assert color.ref is depth.ref and (e.download(ref.inverse_depth, SIZE) > 0.0)[first].mean() > 0.8
+        assert [o.occluder for o in track.observe(replace(frames[k], depth=left.depth), ref)] == [None, frames[k].depth]
         for o in fresh:
             o.linearise(track.terms, state, 0)
             assert o.lin.fit > 0.95
