@@ -68,6 +68,11 @@ class Options:
         "average the depth of later frames into the keyframe (default: yes, but not if a rolling shutter is taken for "
         "a global one, since what is averaged then does not fit together)",
     ] = None
+    moving: Annotated[
+        bool,
+        "leave out what moves by itself, as far as it stands where a keyframe saw through, or the other way round (not "
+        "for the baseline, nor where a rolling shutter is taken for a global one)",
+    ] = True
     bootstrap_frames: Annotated[int, "frames that are aligned jointly at the start"] = 6
     max_depth: Annotated[float, "depth beyond this counts as missing, m"] = 12.0
     blur_sigma_px: Annotated[

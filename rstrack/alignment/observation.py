@@ -188,4 +188,6 @@ def observe(frame: DeviceFrame, ref: Reference, options: Options, expected: Floa
     expected (2,): gain and offset that the colour images are expected to have against the reference.
     """
     depth = [Observation(frame.index, frame.depth, ref)] if options.geometric else []
-    return depth + [Observation(frame.index, c, ref, frame.depth, expected) for c in frame.colors if ref.points]
+    return depth + [
+        Observation(frame.index, c, ref, frame.depth.occluder, expected) for c in frame.colors if ref.points
+    ]

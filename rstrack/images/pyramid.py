@@ -31,6 +31,7 @@ class DepthImage:
 
     count: pixels that have depth. thumbnail (15, 20): of 1/z, 0 missing.
     resolution: the camera's step (1/m, see `depth_resolution`), 0 where it shows none.
+    whole: the image before what moves by itself was left out of it; None where nothing was.
     """
 
     exposure: Exposure
@@ -39,6 +40,17 @@ class DepthImage:
     count: int
     thumbnail: npt.NDArray[np.float32] = field(default_factory=lambda: np.zeros(_THUMBNAIL[::-1], np.float32))
     resolution: float = 0.0
+    whole: DepthImage | None = None
+
+    @property
+    def occluder(self) -> DepthImage:
+        """All that it shows: what moves hides what rests."""
+        return self.whole or self
+
+    @property
+    def moving(self) -> float:
+        """Part of its pixels that were left out since they move by themselves."""
+        return 1.0 - self.count / self.occluder.count if self.whole else 0.0
 
 
 @dataclass(frozen=True)

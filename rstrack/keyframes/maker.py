@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -33,6 +34,8 @@ from rstrack.keyframes.rectification import ColorInput, FusionInput, color_kerne
 _AGREE = 0.03
 # Weight of a fused pixel in measurements; more would let a keyframe's first errors live for ever.
 _MOST = 30.0
+# Part of the width about what moves within which colours may be its own.
+_MARGIN = 0.0125
 
 
 @dataclass
@@ -108,6 +111,17 @@ class KeyframeMaker:
         rho, _, _ = self._kernel(rectify_kernel, lens, base)(depth.inverse_z, *self.device_rays, to_base)
         return T_world_base, base, rho
 
+    def _hidden(self, depth: DepthImage, whole: DepthImage, spline: Spline) -> npt.NDArray[np.bool_]:
+        """Pixels (h, w) of a rectified image before which something moves, and those about them.
+
+        Colours are taken a little later and from beside: there they are no older depth's.
+        """
+        camera = depth.exposure.lens.camera
+        shape = camera.height, camera.width
+        rest, all_ = (self.e.download(self.rectify(image, spline)[2], shape) > 0 for image in (depth, whole))
+        margin = 2 * round(_MARGIN * camera.width) + 1
+        return np.asarray(cv2.dilate((all_ & ~rest).astype(np.uint8), np.ones((margin, margin), np.uint8)) > 0)
+
     def with_depth(
         self, made: Reference, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, rho: Image,
         weight: npt.NDArray[Any],
@@ -175,6 +189,11 @@ class KeyframeMaker:
             intensity = look_up(0)
             if color.finer > 0:
                 coarse = look_up(color.finer)
+            if depth.whole is not None:
+                hidden = self._hidden(depth, depth.whole, spline)
+                intensity[hidden] = np.nan
+                if coarse is not None:
+                    coarse[hidden] = np.nan
         small = Reference(
             index, depth.exposure.stamp, t, T_world_base, lens, rolling, None, None, None, None, None, (), 1.0, 1.0, 0,
             moments, intensity, thumbnail(rho, rho > 0), color_thumbnail, coarse_intensity=coarse,

@@ -91,6 +91,10 @@ class KeyframeStore:
                 self._kept[-1] = self._maker.fused(self.newest, frame.depth, spline)
         return self.newest
 
+    def improve(self, ref: Reference) -> None:
+        """Another version of the newest keyframe."""
+        self._kept[-1] = ref
+
     def return_to(self, T_world_cam: FloatArray, left: Reference) -> Reference | None:
         """The oldest of a model's keyframes but `left` that is near a camera: it has drifted least. Now the newest."""
         if self._model is None:

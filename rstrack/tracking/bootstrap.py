@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -12,9 +13,11 @@ from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.frame_report import FrameReport
 from rstrack.tracking.judgement.fault import Fault
 from rstrack.tracking.judgement.uncertainty import Uncertainty
+from rstrack.tracking.moving.leave_out import LeftOut, left_out_with, without
+from rstrack.tracking.moving.majority import not_with_most
 from rstrack.tracking.succession import LEAST_DEPTH
 from rstrack.tracking.track import Track
-from rstrack.tracking.window import Window
+from rstrack.tracking.window import LEVELS, Window
 
 # Knots are never further apart than this many times the spacing that was asked for.
 _WIDEST = 2.0
@@ -48,21 +51,42 @@ def bootstrap(track: Track, new: DeviceFrame) -> FrameReport:
     window, ref = track.known()
     window.state.extend(new.last_time)
     fresh = track.observe(new, ref)
-    solved = window.solve(fresh, gauge=ref, coupled=True)
-    if ref.points:
-        # Its colours were looked up as if the first frame stood still: again, with the motion found.
-        ref, earlier = _recolored(track, window, ref, fresh), window.active
+    left = [LeftOut(new.depth)]
+
+    def leave_out() -> None:
+        left[:] = track.leave_out([new], ref, fresh, window.state)
+
+    solved = window.solve(fresh, gauge=ref, coupled=True, before_finest=leave_out)
+    moves = bool(left[0].depth.moving) or left[0].gone is not None
+    if ref.points or moves:
+        if ref.points:
+            # Its colours were looked up as if the first frame stood still: again, with the motion found.
+            ref = _recolored(track, window, ref, fresh)
+        earlier, frames = window.active, [*list(track.succession.recent)[1:], new]
+
+        def leave_out_all() -> None:
+            # What moves has moved further by now: it shows in the earlier frames too.
+            whole = [replace(frame, depth=frame.depth.occluder) for frame in frames]
+            left[:] = track.leave_out(whole, ref, [*earlier, *fresh], window.state)
+
+        if moves:
+            _begin_with_most(track, ref, frames, [*earlier, *fresh])
         window.active = []
-        solved = window.solve([*earlier, *fresh], (1, 0), gauge=ref, coupled=True)
+        levels = LEVELS if moves else (1, 0)
+        solved = window.solve([*earlier, *fresh], levels, gauge=ref, coupled=True, before_finest=leave_out_all)
         window.active = earlier
     if track.fits.fault(fresh, solved, ref.pixels):
         return _begin_anew(track, new)
     window.keep(fresh)
-    track.succession.recent.append(new)
+    recent = track.succession.recent
+    recent.append(new)
+    for n, one in enumerate(reversed(left), 1):
+        recent[-n] = replace(recent[-n], depth=one.depth)
+    new = recent[-1]
     track.placed(new, fresh)
-    if len(track.succession.recent) < track.options.bootstrap_frames:
+    if len(recent) < track.options.bootstrap_frames:
         return track.report(new, fresh, solved)
-    if all(track.succession.is_unfit(f) for f in track.succession.recent):
+    if all(track.succession.is_unfit(f) for f in recent):
         return _begin_anew(track, new)  # none of them has a colour image to go on with
     _leave(track, window)
     return track.report(new, fresh, solved, keyframe=True)
@@ -86,6 +110,17 @@ def _recolored(track: Track, window: Window, ref: Reference, fresh: Sequence[Obs
     return track.succession.reference
 
 
+def _begin_with_most(
+    track: Track, ref: Reference, frames: Sequence[DeviceFrame], observations: Sequence[Observation]
+) -> None:
+    """Leave out of the first frame what does not move as most of it does, until the alignment tells it better."""
+    odd = not_with_most(track.device.e, [track.succession.recent[0], *frames], track.device.rays)
+    if odd is not None and odd.any():
+        rest = without(track.device.e, ref, odd)
+        for o in observations:
+            o.see(rest)
+
+
 def _begin_anew(track: Track, new: DeviceFrame) -> FrameReport:
     """The first frames did not fit together: they are lost, and the newest is the first one."""
     track.begin_anew()
@@ -93,8 +128,21 @@ def _begin_anew(track: Track, new: DeviceFrame) -> FrameReport:
     return start(track, new)
 
 
+def _leave_out_by_last(track: Track, window: Window) -> None:
+    """What has hardly moved since the first frame has done so until the last one: left out of those between."""
+    *frames, last = track.succession.recent
+    ref = track.maker.rolling(last.index, last.depth.occluder, last.colors, window.spline)
+    rest = [
+        replace(frame, depth=left_out_with(track.space, frame.depth, last.depth, ref, window.spline))
+        for frame in frames
+    ]
+    track.succession.recent = deque([*rest, last])
+
+
 def _leave(track: Track, window: Window) -> None:
     """Rectify the middle frame and align all others to it."""
+    if any(frame.depth.moving for frame in track.succession.recent):
+        _leave_out_by_last(track, window)
     frames, covariances = list(track.succession.recent), track.covariances
     middle = min(
         (f for f in frames if not track.succession.is_unfit(f)),
@@ -104,6 +152,12 @@ def _leave(track: Track, window: Window) -> None:
     window.active = []
     others = [o for frame in frames if frame is not middle for o in track.observe(frame, ref)]
     window.solve(others, levels=(0,))
+    rest = [frame for frame in frames if frame is not middle]
+    left = track.leave_out(rest, ref, others, window.state)
+    if any(one.depth.moving or one.gone is not None for one in left):
+        window.solve(others, levels=(0,))
+        for one in left:
+            track.succession.saw_through(one.gone)
     window.keep(others)
     for frame in frames:
         seen = [o for o in others if o.frame == frame.index]

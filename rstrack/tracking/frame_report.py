@@ -23,7 +23,7 @@ class FrameReport:
     covariance: of the pose against its keyframe, (6, 6) [m; rad] in the depth camera's frame at mid readout; drift:
     what the errors of the keyframes before add to that against the first frame; None where there are none: of lost
     frames, and with the baseline. held_by_motion: largest part (0..1) that the motion before, not the images, has in
-    what is known of any direction.
+    what is known of any direction. moving: part of the depth image that was left out since it moves by itself.
     """
 
     stamp: float
@@ -41,6 +41,7 @@ class FrameReport:
     covariance: FloatArray | None = None
     drift: FloatArray | None = None
     held_by_motion: float = float("nan")
+    moving: float = 0.0
     fault: Fault = Fault.NONE
 
     def as_lost(self, fault: Fault) -> FrameReport:

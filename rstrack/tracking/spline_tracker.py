@@ -8,6 +8,7 @@ stamps, T_world_depth = tracker.trajectory
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from rstrack.tracking.bootstrap import bootstrap, fit_knots, start
 from rstrack.tracking.frame_report import FrameReport
 from rstrack.tracking.judgement.fault import Fault
 from rstrack.tracking.judgement.lost_track import doubted, draws, implausible, is_settled
+from rstrack.tracking.moving.leave_out import LeftOut
 from rstrack.tracking.relocalise import Relocaliser, without_misfits
 from rstrack.tracking.track import Track
 from rstrack.tracking.window import LEVELS, TRACKING_LEVELS
@@ -205,7 +207,15 @@ class Tracker:
         mid, T_predicted = new.depth.exposure.mid_time, window.spline.pose(new.depth.exposure.mid_time)
         coupled = ref.rolling is not None
         levels = LEVELS if young or gap > _SURE_S else TRACKING_LEVELS
-        solved = window.solve(fresh, levels, gauge, coupled, fits.is_hopeless)
+        left = LeftOut(new.depth)
+
+        def leave_out() -> None:
+            nonlocal left
+            if not fits.is_hopeless(fresh):
+                (left,) = track.leave_out([new], ref, fresh, window.state)
+
+        solved = window.solve(fresh, levels, gauge, coupled, fits.is_hopeless, leave_out)
+        on_reference = [o for o in fresh if o.ref.index == ref.index]
         if not is_settled(solved) and not fits.is_hopeless(fresh):
             # Its steps went to and fro; that says nothing against the place.
             solved = window.solve(fresh, (0,), gauge, coupled)
@@ -215,8 +225,8 @@ class Tracker:
             colorless = all(o.is_depth for o in fitting)
             window = before.copy()
             window.predict(new, track.found.end, young)
-            fresh, on_reference = fitting, [o for o in fitting if o.ref is ref]
-            solved = window.solve(fresh, levels, gauge, coupled)
+            fresh, on_reference = fitting, [o for o in fitting if o.ref.index == ref.index]
+            solved = window.solve(fresh, levels, gauge, coupled, before_finest=leave_out)
         if doubted(fresh):
             solved = window.solve(fresh, (0,), gauge, coupled)
         with track.terms.timer("judgement"):
@@ -236,6 +246,7 @@ class Tracker:
             track.window = before
             return self._relocalise(new, fault)
         track.window, track.covariances.uncertainty = window, uncertainty
+        new = replace(new, depth=left.depth)
         window.keep(fresh)
         track.learn(ref, on_reference, window, pulled)
         track.succession.recent.append(new)
@@ -243,6 +254,7 @@ class Tracker:
         track.age += 1
         track.succession.judged_colors(bool(new.colors and ref.points) and all(o.is_depth for o in on_reference))
         overlap = track.succession.overlap(on_reference)
+        track.succession.saw_through(left.gone)
         frozen = track.succession.fuse_frozen(window)
         renewed = track.succession.renew(window, new, frozen, overlap)
         track.found.release(window, min(min(f.first_time, f.stamp) for f in track.succession.recent))

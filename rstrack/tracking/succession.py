@@ -6,6 +6,9 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+import numpy.typing as npt
+
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.observation import Observation
@@ -16,12 +19,16 @@ from rstrack.keyframes.store import KeyframeStore
 from rstrack.options import Options
 from rstrack.tracking.gains import Gains
 from rstrack.tracking.judgement.pose_covariances import PoseCovariances
+from rstrack.tracking.moving.leave_out import without
+from rstrack.tracking.moving.regions import Mask
 from rstrack.tracking.window import Window
 
 # Part of the pixels that must have depth for a frame to become a keyframe.
 LEAST_DEPTH = 0.02
 # Frames in a row whose colours do not fit the keyframe's after which it is the keyframe's that are wrong.
 _COLORLESS = 5
+# Frames that have to see through a keyframe's pixel, or find it elsewhere, for it to be gone.
+_SEEN_THROUGH = 3
 
 
 class Succession:
@@ -41,6 +48,8 @@ class Succession:
         self._unconverged: DeviceFrame | None = None
         # The most pixels that a frame saw of the reference, and frames in a row whose colours did not fit its own.
         self._pixels, self._colorless = 0, 0
+        # How often pixels of the reference's grid have been seen through.
+        self._gone: npt.NDArray[np.uint8] | None = None
 
     def is_unfit(self, frame: DeviceFrame) -> bool:
         """Whether a frame shows too little to align others to it."""
@@ -55,6 +64,23 @@ class Succession:
     def judged_colors(self, is_colorless: bool) -> None:
         """Whether the newest frame's colours were left out."""
         self._colorless = self._colorless + 1 if is_colorless else 0
+
+    def saw_through(self, gone: Mask | None) -> None:
+        """Pixels (gh, gw) of the reference's grid that the newest frame has found to be gone, if there are any.
+
+        Those that several have are no longer part of it.
+        """
+        ref = self.reference
+        if gone is None or ref is None:
+            return
+        before = np.zeros(gone.shape, np.uint8) if self._gone is None else self._gone
+        self._gone = np.where(gone & (before < 255), before + 1, before).astype(np.uint8)
+        surely = self._gone == _SEEN_THROUGH
+        if not (surely & gone).any():
+            return
+        self.reference = without(self._maker.e, ref, self._gone >= _SEEN_THROUGH)
+        if self._store and self._store.newest is ref:
+            self._store.improve(self.reference)
 
     def use(self, found: Reference, frame: DeviceFrame) -> None:
         """Go on with a keyframe that a lost frame has been found by."""
@@ -100,7 +126,7 @@ class Succession:
             if not self.is_unfit(new):
                 rolling = self._maker.rolling(new.index, new.depth, new.colors, window.spline)
                 self.reference = replace(rolling, brightness=self._gains.of(new))
-                self._unconverged, self._pixels = new, 0
+                self._unconverged, self._pixels, self._gone = new, 0, None
             return False
         old = self._store.return_to(window.spline.pose(frozen.depth.exposure.mid_time), ref)
         if old is not None:
@@ -114,3 +140,4 @@ class Succession:
     def _refer_to(self, ref: Reference) -> None:
         self.reference = ref
         self._unconverged, self._pixels, self._colorless = None, 0, 0
+        self._gone = None

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from rsgen.array_types import FloatArray
 from rstrack.adjustment.chain import Chain
+from rstrack.alignment.free_space import FreeSpace
 from rstrack.alignment.independence import Independence
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.observation import Observation, observe
 from rstrack.alignment.optimizer import Solved
 from rstrack.alignment.pull import Pulls
+from rstrack.alignment.spline_state import SplineState
 from rstrack.data.rig import Rig
 from rstrack.images.device_frame import DeviceFrame, DeviceRig, Timer
 from rstrack.keyframes.keyframe import Reference
@@ -26,11 +29,12 @@ from rstrack.tracking.gains import Gains
 from rstrack.tracking.judgement.fault import Fault
 from rstrack.tracking.judgement.lost_track import FitHistory
 from rstrack.tracking.judgement.pose_covariances import PoseCovariances
+from rstrack.tracking.moving.leave_out import LeftOut, leave_out
 from rstrack.tracking.succession import Succession
 from rstrack.tracking.window import Window
 
 # What a track of the same rig and options would make in the same way.
-_MADE_ANEW = "rig", "options", "device", "terms", "maker"
+_MADE_ANEW = "rig", "options", "device", "terms", "maker", "space"
 
 
 class Track:
@@ -45,10 +49,12 @@ class Track:
         self.device = DeviceRig(rig, self.options, timer)
         self.terms = Terms.of(self.device, self.options)
         self.maker = KeyframeMaker.of(self.device)
+        self.space = FreeSpace(self.device)
         self.keyframes = KeyframeStore(self.maker, self.options)
         self.fits = FitHistory(self.options.rolling or rig.depth_shutter.readout_s == 0.0)
         self.independence = Independence(), Independence()
         self.gains = Gains()
+        self._finds_moving = self.options.moving and self.fits.is_modelled
         self.age = 0
         self.reports: list[FrameReport] = []
         self.begin_anew()
@@ -102,6 +108,16 @@ class Track:
         for is_color, term in enumerate(self.independence):
             term.learn(o.inflation for o in on_reference if o.is_depth != is_color)
 
+    def leave_out(
+        self, frames: Sequence[DeviceFrame], ref: Reference, fresh: Sequence[Observation], state: SplineState
+    ) -> list[LeftOut]:
+        """What moves in frames; their observations `fresh` do without it, see `moving.leave_out`."""
+        depths = [frame.depth for frame in frames]
+        if not self._finds_moving:
+            return [LeftOut(depth) for depth in depths]
+        own = [[o for o in fresh if o.frame == frame.index] for frame in frames]
+        return leave_out(self.space, depths, ref, own, state)
+
     def given(self, before: Window, after: Window) -> tuple[FloatArray, FloatArray]:
         """Poses (n, 4, 4) of the frames that still move, before and after a new one has been aligned."""
         stamps = np.array([max(frame.stamp, before.spline.t_begin) for frame in self.succession.recent])
@@ -122,4 +138,5 @@ class Track:
     ) -> FrameReport:  # fmt: skip
         """What became of a frame."""
         report = frame_report(new.stamp, fresh, solved, keyframe=keyframe, fault=fault, overlap=overlap)
+        report = replace(report, moving=new.depth.moving)
         return report if fault else self.covariances.report(report, new, fresh, self.known()[0].spline)

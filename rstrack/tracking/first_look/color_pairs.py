@@ -60,13 +60,18 @@ def _shift(dataset: Dataset, frames: range) -> float:
 def geometric_track(
     dataset: Dataset, frames: range, options: Options, progress: Progress, stage: str
 ) -> tuple[Spline | None, float, float]:
-    """T_world_depth(t) of the frames from depth alone, and the longest time (begin, end) in s that it covers."""
+    """T_world_depth(t) of the frames from depth alone, and the longest time (begin, end) in s that it covers.
+
+    With colour where something moves by itself: depth alone hardly tells what rests.
+    """
     from rstrack.tracking.first_look.rough_track import rough_track
 
     def done(share: float) -> None:
         progress(stage, 0.7 * share, "tracking depth")
 
     tracker = rough_track(dataset, frames, Options(method="rs-g", backend=options.backend), done)
+    if any(report.moving for report in tracker.reports):
+        tracker = rough_track(dataset, frames, Options(backend=options.backend), done)
     if not tracker.spline_valid or tracker.spline is None:
         return None, 0.0, 0.0
     begin, end = max(tracker.spline_valid, key=lambda span: span[1] - span[0])

@@ -100,7 +100,7 @@ class FitHistory:
     """
 
     def __init__(self, is_modelled: bool = True) -> None:
-        self._is_modelled = is_modelled
+        self.is_modelled = is_modelled
         self._depth = _Usual(_WORST_DEPTH, _HARMLESS_DEPTH)
         self._color = _Usual(_WORST_INTENSITY, _HARMLESS_INTENSITY)
         self._pulls: deque[Pulls] = deque(maxlen=_MEMORY)
@@ -125,7 +125,7 @@ class FitHistory:
         misfits = self.misfits(fresh, expected)
         if misfits:
             return misfits[0][1]
-        if self._is_modelled and self._together(fresh, colorless) > _WORST_TOGETHER:
+        if self.is_modelled and self._together(fresh, colorless) > _WORST_TOGETHER:
             return Fault.BOTH_ODD
         if all(o.is_depth for o in fresh) and any(self._is_doubtful(o) for o in fresh):
             return Fault.DOUBTFUL

@@ -1,0 +1,234 @@
+"""What one of two depth images sees where the other one saw through: free space that something has come into.
+
+Each pixel of one image is moved to the other by the poses of its own line. Where it lies in front of all that is seen
+about there, it stands in what was free: seen from a frame into its keyframe something has come, the other way round
+something has gone. A static scene does not do that, whatever hides what; noise, edges and wrong poses do, by little.
+Beside that: how far the point is from the surface there, and how far the keyframe's intensity from the colour image's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import numpy.typing as npt
+
+from rsgen.array_types import FloatArray
+from rsgen.device.arrays import Engine, Kernels
+from rsgen.device.lens import Lens
+from rsgen.device.projection import TO_BASE, gather, move, project_rolling
+from rsgen.device.recording import recorded_from
+from rsgen.geometry.spline import Spline
+from rstrack.alignment.brightness import MID_GREY
+from rstrack.images.device_frame import DeviceRig
+from rstrack.images.line_poses import IDENTITY_FROM_BASE, from_base_table, to_base_table
+from rstrack.images.pyramid import ColorImage, DepthImage
+from rstrack.images.sampling import bilinear, grid, level_size, nearest, surface
+from rstrack.keyframes.keyframe import Reference, pyramid_level, strides
+
+# What a kernel writes where it cannot tell: no metres, and no intensity, are as large.
+_UNKNOWN = 1e6
+# Pixels of the largest grid that is compared: what moves need not be known to the pixel.
+_GRID_PX = 160 * 120
+_IDENTITY_TO_BASE = np.append(np.eye(3).ravel(), np.zeros(3))
+
+Grid = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class SpaceInput:
+    """Device arrays of the kernel: 1/z of the image whose pixels are moved, its rays and the poses of its lines; 1/z of
+    the other image and the poses of its lines; a value of each pixel of the other's grid, to be handed over."""
+
+    inverse_depth: Any
+    rays_x: Any
+    rays_y: Any
+    to_base: Any
+    other: Any
+    from_base: Any
+    values: Any
+
+
+def free_space_kernel(e: Engine, lens: Lens, other: Lens, stride: int, has_rays: bool) -> Callable[[SpaceInput], Any]:
+    """Kernel → (free, apart, value) at every stride-th pixel of `lens`, see `Seen`; `_UNKNOWN` where not to be told, a
+    value of twice that outside the other image.
+
+    has_rays: whether the image's rays are given; a rectified one's are those of its pinhole.
+    """
+    camera, there = lens.camera, other.camera
+    columns = -(-there.width // stride)
+
+    @recorded_from(SpaceInput)
+    def kernel(given: SpaceInput) -> Any:
+        index, px, py = grid(e, camera.width, camera.height, stride)
+        rho = dr.gather(e.Float, given.inverse_depth, index)
+        known = rho > 0.0
+        z = dr.rcp(dr.select(known, rho, 1.0))
+        if has_rays:
+            ray = dr.gather(e.Float, given.rays_x, index), dr.gather(e.Float, given.rays_y, index)
+        else:
+            ray = (e.Float(px) - camera.cx) / camera.fx, (e.Float(py) - camera.cy) / camera.fy
+        line = e.UInt(0) if lens.lines == 1 else e.UInt(lens.line_of(e.Int(px), e.Int(py)))
+        p = move(gather(given.to_base, line, TO_BASE, stride=TO_BASE), (ray[0] * z, ray[1] * z, z))
+        seen = project_rolling(other, given.from_base, p, e.UInt, e.Int)
+        inside = known & seen.valid
+        inside &= (seen.x >= 0.0) & (seen.y >= 0.0) & (seen.x < there.width - 1.0) & (seen.y < there.height - 1.0)
+        # The nearest of what is seen about there: an edge may lie a pixel or two elsewhere.
+        nearest_rho = e.Float(0.0)
+        for dy in (-stride, 0, stride):
+            for dx in (-stride, 0, stride):
+                x = dr.clip(seen.x + dx, 0.0, there.width - 1.0)
+                y = dr.clip(seen.y + dy, 0.0, there.height - 1.0)
+                at = nearest(e, there.width, x, y, inside)
+                nearest_rho = dr.maximum(nearest_rho, dr.gather(e.Float, given.other, at, inside))
+        shown = inside & (nearest_rho > 0.0)
+        free = dr.select(shown, dr.rcp(dr.select(shown, nearest_rho, 1.0)) - seen.z, _UNKNOWN)
+        value, met = surface(e, there, given.other, seen.x, seen.y, inside)
+        apart = dr.select(met, dr.rcp(dr.select(met, value, 1.0)) - seen.z, _UNKNOWN)
+        column = e.UInt(e.Int(dr.select(inside, (seen.x + 0.5) / stride, 0.0)))
+        row = e.UInt(e.Int(dr.select(inside, (seen.y + 0.5) / stride, 0.0)))
+        handed = dr.select(inside, dr.gather(e.Float, given.values, row * columns + column, inside), 2.0 * _UNKNOWN)
+        return free, apart, handed
+
+    return kernel
+
+
+@dataclass(frozen=True)
+class IntensityInput:
+    """Device arrays: points of the keyframe and their intensities as in `PhotometricInput`, the poses of its lines, the
+    colour image at the level, the poses of its lines; brightness: gain and offset."""
+
+    x: Any
+    y: Any
+    z: Any
+    intensity: Any
+    to_base: Any
+    image: Any
+    from_base: Any
+    brightness: Any
+
+
+def intensity_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int, level: int) -> Callable[[IntensityInput], Any]:
+    """Kernel → the colour image's intensity less the one expected, of each of the keyframe's points."""
+    width, height = level_size(lens.camera.width, level), level_size(lens.camera.height, level)
+    shrink, ref = 0.5**level, ref_lens.camera
+
+    @recorded_from(IntensityInput)
+    def kernel(given: IntensityInput) -> Any:
+        p = given.x, given.y, given.z
+        if ref_lens.lines > 1:
+            _, x, y = grid(e, ref.width, ref.height, stride)
+            line = e.UInt(ref_lens.line_of(e.Int(x), e.Int(y)))
+            p = move(gather(given.to_base, line, TO_BASE, stride=TO_BASE), p)
+        seen = project_rolling(lens, given.from_base, p, e.UInt, e.Int)
+        active = (given.z > 0.0) & seen.valid
+        a, b, c, d, fx, fy, active = bilinear(e, given.image, width, height, seen.x * shrink, seen.y * shrink, active)
+        value = dr.lerp(dr.lerp(a, b, fx), dr.lerp(c, d, fx), fy)
+        gain, offset = (dr.gather(e.Float, given.brightness, e.UInt(i)) for i in (0, 1))
+        expected = given.intensity + dr.fma(gain, given.intensity - MID_GREY, offset)
+        return dr.select(active & dr.isfinite(value), value - expected, _UNKNOWN)
+
+    return kernel
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What the pixels of an image's grid (gh, gw) are, seen from the other image; NaN where that cannot be told.
+
+    z (m): the image's own depth; free (m): how far it stands in front of all that the other shows about there; apart
+    (m): how far in front of the surface there; intensity: the colour image's, less that expected; outside: whether it
+    is not within the other image.
+    """
+
+    z: Grid
+    free: Grid
+    apart: Grid
+    intensity: Grid
+    outside: npt.NDArray[np.bool_]
+
+
+@dataclass
+class FreeSpace:
+    """Kernels of one rig."""
+
+    device: DeviceRig
+    _kernel: Kernels = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._kernel = Kernels(self.device.e)
+
+    def keyframe_in_frame(
+        self, ref: Reference, depth: DepthImage, color: ColorImage | None, brightness: FloatArray, spline: Spline
+    ) -> tuple[Seen, Any]:
+        """The keyframe seen from a frame's depth image, at T_world_depth(t), and its differences of intensity on the
+        device.
+
+        color: that image of the frame; None: no intensities. brightness (2,): its gain and offset against the
+        keyframe's.
+        """
+        e, (level, stride) = self.device.e, grid_of(ref.lens)
+        with self.device.timer("what moves: compare"):
+            to_base, _ = self._lines(ref, spline)
+            if color is None or not ref.points:
+                intensity = e.upload(np.full(grid_shape(ref.lens), _UNKNOWN))
+            else:
+                points, own_level = ref.points[level], color.level(pyramid_level(level))
+                kernel = self._kernel(intensity_kernel, color.exposure.lens, ref.lens, stride, own_level)
+                color_at = e.upload(from_base_table(spline, ref.T_world_base, color.exposure))
+                given = points.x, points.y, points.z, points.intensity, to_base, color.levels[own_level], color_at
+                intensity = kernel(IntensityInput(*given, e.upload(brightness)))
+            from_base = e.upload(from_base_table(spline, ref.T_world_base, depth.exposure))
+            free, apart, handed = self._kernel(
+                free_space_kernel, ref.lens, depth.exposure.lens, stride, ref.rolling is not None
+            )(SpaceInput(ref.inverse_depth, *self.device.device_rays, to_base, depth.inverse_z, from_base, intensity))
+            return self._seen(ref.lens, ref.inverse_depth, free, apart, intensity, handed), intensity
+
+    def frame_in_keyframe(self, depth: DepthImage, ref: Reference, intensity: Any, spline: Spline) -> Seen:
+        """A frame's depth image seen from its keyframe. intensity: differences as `keyframe_in_frame` gives them."""
+        e, lens = self.device.e, depth.exposure.lens
+        with self.device.timer("what moves: compare"):
+            to_base = e.upload(to_base_table(spline, ref.T_world_base, depth.exposure))
+            _, from_base = self._lines(ref, spline)
+            free, apart, handed = self._kernel(free_space_kernel, lens, ref.lens, grid_of(lens)[1], True)(
+                SpaceInput(depth.inverse_z, *self.device.device_rays, to_base, ref.inverse_depth, from_base, intensity)
+            )
+            return self._seen(lens, depth.inverse_z, free, apart, handed, handed)
+
+    def _lines(self, ref: Reference, spline: Spline) -> tuple[Any, Any]:
+        e = self.device.e
+        if ref.rolling is None:
+            return e.upload(_IDENTITY_TO_BASE), e.upload(IDENTITY_FROM_BASE)
+        return (
+            e.upload(to_base_table(spline, ref.T_world_base, ref.rolling)),
+            e.upload(from_base_table(spline, ref.T_world_base, ref.rolling)),
+        )
+
+    def _seen(self, lens: Lens, inverse_depth: Any, free: Any, apart: Any, intensity: Any, handed: Any) -> Seen:
+        e, shape, stride = self.device.e, grid_shape(lens), grid_of(lens)[1]
+        rho = e.download(inverse_depth, (lens.camera.height, lens.camera.width))[::stride, ::stride]
+        z = np.divide(np.float32(1.0), rho, out=np.full_like(rho, np.nan), where=rho > 0)
+        before, off, differs = (_known(e.download(values, shape)) for values in (free, apart, intensity))
+        return Seen(z, before, off, differs, e.download(handed, shape) > 1.5 * _UNKNOWN)
+
+
+def grid_of(lens: Lens) -> tuple[int, int]:
+    """Level of the keyframe's points whose grid is fine enough to tell what moves, and its stride in pixels."""
+    camera = lens.camera
+    every = strides(camera.width, camera.height)[:-1]
+    for level, stride in enumerate(every):
+        if -(-camera.width // stride) * -(-camera.height // stride) <= _GRID_PX:
+            return level, stride
+    return len(every) - 1, every[-1]
+
+
+def grid_shape(lens: Lens) -> tuple[int, int]:
+    """Rows and columns of that grid."""
+    _, stride = grid_of(lens)
+    return -(-lens.camera.height // stride), -(-lens.camera.width // stride)
+
+
+def _known(values: Grid) -> Grid:
+    return np.where(values < 0.5 * _UNKNOWN, values, np.float32(np.nan))

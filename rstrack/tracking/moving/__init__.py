@@ -1,0 +1,1 @@
+"""What moves by itself: found, grown to whole things, and left out."""

@@ -1,0 +1,293 @@
+"""What moves by itself: free space against ray casting, regions against made ones, and a track that does without."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import cv2
+import numpy as np
+import pytest
+import synthetic
+from rstrack_util import (
+    FloatArray,
+    Plane,
+    depth_input,
+    exact_reference,
+    exposure,
+    hand_held,
+    plane_before,
+    small_camera,
+)
+
+from rsgen.geometry import se3
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter, project_rolling
+from rsgen.geometry.spline import Spline
+from rstrack.alignment.free_space import FreeSpace, Seen
+from rstrack.alignment.spline_state import SplineState
+from rstrack.data.rig import Frame, Image, Rig
+from rstrack.images import line_poses as lines
+from rstrack.images.device_frame import DeviceRig, untimed
+from rstrack.options import Options
+from rstrack.tracking.moving.majority import not_with_most
+from rstrack.tracking.moving.regions import Mask, moving, moving_with
+from rstrack.tracking.track import Track
+
+REF_STAMP, STAMP = 0.43, 0.465
+SHAPE = 72, 96
+
+
+# -- free space -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def exact_poses(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every line's pose from the spline, not from its block's middle."""
+    monkeypatch.setattr(lines, "_NODES", 10**6)
+
+
+@pytest.mark.parametrize("ref_scan", [None, "top-bottom"])
+@pytest.mark.usefixtures("exact_poses")
+def test_free_space_is_what_rays_say(ref_scan: Literal["top-bottom"] | None) -> None:
+    """A plane that has come 0.1 m nearer: how far its points stand before the old one, and the other way round."""
+    truth, camera = hand_held(1), small_camera()
+    old = plane_before(truth.pose(REF_STAMP), (0.3, -0.2, 1.0))
+    new = Plane(old.normal, old.offset - 0.1)
+    at, ref_at = exposure(STAMP, "top-bottom", camera), exposure(REF_STAMP, ref_scan, camera)
+    ref, depth = exact_reference(old.cast, truth, ref_at), depth_input(new.cast, truth, at)
+    shutter = at.lens.shutter
+    space = FreeSpace(DeviceRig(Rig(camera, shutter, camera, shutter, np.eye(4)), Options(backend="llvm")))
+    in_frame, intensity = space.keyframe_in_frame(ref, depth, None, np.zeros(2), truth)
+    in_ref = space.frame_in_keyframe(depth, ref, intensity, truth)
+    for seen, own, other, plane, sign in ((in_ref, at, ref_at, old, 1), (in_frame, ref_at, at, new, -1)):
+        uv = camera.pixel_grid()
+        T = truth.pose(own.lens.shutter.line_mid_time(own.stamp, own.lens.shutter.line_of_pixel(uv, camera), camera))
+        p = se3.transform(T, camera.unproject(uv) * seen.z[..., None].astype(np.float64))
+        _, t, valid = project_rolling(truth, np.eye(4), camera, other.lens.shutter, other.stamp, p)
+        T = truth.pose(np.where(valid, t, STAMP))
+        origin, z = T[..., :3, 3], se3.transform(se3.inverse(T), p)[..., 2]
+        apart = plane.cast(origin, (p - origin) / z[..., None]) - z
+        good = valid & np.isfinite(seen.apart)
+        assert good.sum() > 1500
+        assert np.abs(seen.apart - apart)[good].max() < 3e-4
+        assert (sign * seen.apart[good] > 0.05).all()
+        # The nearest about there is nearer, by what the plane's slant makes of a pixel and a half.
+        assert (seen.free[good] < seen.apart[good]).all() and (seen.free[good] > seen.apart[good] - 0.15).all()
+        assert not (np.isfinite(seen.free) & seen.outside).any() and (valid[~seen.outside]).mean() > 0.95
+        assert np.isnan(seen.intensity).all()
+
+
+# -- regions ----------------------------------------------------------------------------------------------------------
+
+
+def still(seed: int = 0) -> Seen:
+    """A wall 2 m away with 4 mm of noise, seen twice; its right quarter has not been seen before."""
+    rng = np.random.default_rng(seed)
+    apart = rng.normal(0.0, 4e-3, SHAPE).astype(np.float32)
+    outside = np.zeros(SHAPE, bool)
+    outside[:, 72:] = True
+    apart[outside] = np.nan
+    intensity = rng.normal(0.0, 0.01, SHAPE).astype(np.float32)
+    return Seen(np.full(SHAPE, 2.0, np.float32), apart.copy(), apart, intensity, outside)
+
+
+def regions(seen: Seen) -> Mask:
+    return moving(seen, 4e-3, 2.0, 0.01)
+
+
+def test_what_rests_does_not_move() -> None:
+    """Noise, edges that lie a line or two elsewhere, flying pixels, what was hidden or not seen, another light."""
+    seen = still()
+    seen.free[20:22] = seen.free[:, 30:32] = seen.apart[20:22] = 0.5
+    flying = np.random.default_rng(1).random(SHAPE) < 0.02
+    seen.free[flying] = 1.0
+    seen.apart[40:60, 10:30] = seen.free[40:60, 10:30] = -0.4
+    seen.intensity[40:, 40:60] = 0.2
+    assert not regions(seen).any()
+
+
+@pytest.mark.parametrize("way", ["depth", "intensity", "hole"])
+def test_a_thing_is_found_whole(way: str) -> None:
+    """A box 0.5 m before the wall: a third of it has come into free space, the rest is where it was before."""
+    seen, box = still(), np.zeros(SHAPE, bool)
+    box[20:50, 20:50] = True
+    came = box & (np.arange(SHAPE[1]) < 30)
+    seen.z[box] = 1.5
+    seen.free[came] = seen.apart[came] = 0.5
+    rest = box & ~came
+    if way == "depth":
+        seen.apart[rest] += 0.012
+    elif way == "intensity":
+        seen.intensity[rest] += np.where(np.indices(SHAPE).sum(axis=0) // 4 % 2, 0.1, -0.1)[rest]
+    else:
+        seen.free[rest] = seen.apart[rest] = np.nan
+    found = regions(seen)
+    assert found[box].mean() > 0.95 and (found & ~box).sum() < 0.2 * box.sum()
+
+
+def test_a_thing_ends_where_another_surface_or_what_rests_begins() -> None:
+    """Against the wall, beside where nobody has looked: growth ends after a few pixels, and does not take the wall."""
+    seen = still()
+    seen.free[30:50, 60:72] = seen.apart[30:50, 60:72] = 0.5
+    found = regions(seen)
+    assert found[30:50, 60:72].all() and found.sum() < 900
+    seen = still()
+    seen.free[30:50, 60:72] = seen.apart[30:50, 60:72] = 0.5
+    seen.free[:, 10:60] = seen.apart[:, 10:60] = -0.4  # what something hid before
+    found = regions(seen)
+    assert found[30:50, 60:72].all() and found.sum() < 900
+
+
+def test_what_another_frame_does_without_is_found_by_its_place() -> None:
+    """Hardly moved since: it would not show in free space."""
+    seen, box = still(), np.zeros(SHAPE, bool)
+    box[20:50, 20:50] = True
+    seen.z[box], seen.free[box] = 1.5, 0.0
+    before = np.roll(box, 2, axis=1)
+    seen.apart[box & ~before] = 0.5
+    seen.free[box & ~before] = 0.5
+    seen.apart[before & ~box] = -0.5  # the wall behind, where it was before: that rests
+    assert not regions(seen)[30:40, 30:40].any()
+    found = moving_with(seen, before, 4e-3, 2.0)
+    assert found[box].mean() > 0.95 and (found & ~box).sum() < 0.2 * box.sum()
+
+
+# -- the track --------------------------------------------------------------------------------------------------------
+
+SIZE = 96, 128
+CAMERA = Camera(128, 96, 100.0, 100.0, 63.5, 47.5)
+SHUTTER = Shutter(readout_s=0.028)
+T_COLOR_DEPTH = se3.exp(np.array([-0.03, 0.0, 0.0, 0.0, 0.0, 0.0]))
+RADIUS = 0.33
+# Of a texture that does not repeat itself, rad/m.
+WAVES = np.random.default_rng(5).normal(0.0, 10.0, (3, 10))
+
+
+def center(t: FloatArray) -> FloatArray:
+    """Of a ball (..., 3) in the world: to and fro before the camera, at up to 0.6 m/s."""
+    t = np.asarray(t)
+    return np.stack([0.25 * np.sin(2.4 * t), -0.05 + 0.1 * np.cos(2.0 * t), 0.95 + 0.0 * t], axis=-1)
+
+
+def picture(spline: Spline, stamp: float, T_cam_body: FloatArray) -> tuple[FloatArray, FloatArray, Mask]:
+    """z (h, w), colours (h, w, 3) in 0..255 and where the ball is: a room with furniture, and a ball that passes."""
+    uv = CAMERA.pixel_grid()
+    t = SHUTTER.line_mid_time(stamp, SHUTTER.line_of_pixel(uv, CAMERA), CAMERA)
+    T = spline.pose(t) @ se3.inverse(T_cam_body)
+    p, d = T[..., :3, 3], np.einsum("...ij,...j->...i", T[..., :3, :3], CAMERA.unproject(uv))
+    room = synthetic.cast(p, d)
+    to_ball = center(t) - p
+    a, b = (d**2).sum(-1), (d * to_ball).sum(-1)
+    under = b**2 - a * ((to_ball**2).sum(-1) - RADIUS**2)
+    ball = (b - np.sqrt(np.maximum(under, 0.0))) / a
+    is_ball = (under > 0.0) & (ball > 0.0) & (ball < room)
+    z = np.where(is_ball, ball, room)
+    hit = p + d * z[..., None] - np.where(is_ball[..., None], center(t), 0.0)
+    waves = np.sin(np.where(is_ball[..., None], 1.5, 1.0) * (hit @ WAVES) + np.arange(WAVES.shape[1])).sum(axis=-1)
+    return z, np.repeat(127.5 + 30.0 * waves[..., None], 3, axis=-1), is_ball
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A rig's frames, where the ball is in their depth images, and the motion of the camera."""
+
+    rig: Rig
+    frames: list[Frame]
+    balls: list[Mask]
+    truth: Spline
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    """A third of a second with 2 mm of noise on depth; a fifth of the picture moves."""
+    truth, rng = synthetic.make_spline(0.5), np.random.default_rng(3)
+    frames, balls = [], []
+    for k in range(0, 11, 2):
+        z, _, ball = picture(truth, k / 30, np.eye(4))
+        _, color, _ = picture(truth, k / 30 + 0.004, T_COLOR_DEPTH)
+        z = (z + rng.normal(0.0, 2e-3, z.shape)).astype(np.float32)
+        color = np.clip(np.rint(color + rng.normal(0.0, 1.5, color.shape)), 0, 255).astype(np.uint8)
+        frames.append(Frame(Image(k / 30, z), (Image(k / 30 + 0.004, color),)))
+        balls.append(ball)
+    assert 0.1 < np.mean(balls) < 0.3
+    return Recording(Rig(CAMERA, SHUTTER, CAMERA, SHUTTER, T_COLOR_DEPTH), frames, balls, truth)
+
+
+def test_a_ball_that_passes_is_left_out_of_frame_and_keyframe(recording: Recording) -> None:
+    track = Track(recording.rig, Options(backend="llvm"), untimed)
+    e, state = track.device.e, SplineState(recording.truth)
+    frames = [track.device.upload(k, frame) for k, frame in enumerate(recording.frames)]
+    ref = track.maker.rectified(0, frames[0].depth, frames[0].colors, recording.truth, None)
+    for k in (2, 5):
+        fresh = track.observe(frames[k], ref)
+        for o in fresh:
+            o.linearise(track.terms, state, 1)
+        (left,) = track.leave_out([frames[k]], ref, fresh, state)
+        mask = e.download(left.depth.z, SIZE) == 0.0
+        ball = recording.balls[k]
+        assert mask[ball].mean() > 0.9 and ball[mask].mean() > 0.8
+        assert left.depth.moving == pytest.approx(mask.mean(), abs=1e-6)
+        assert left.depth.occluder is frames[k].depth
+        depth, color = fresh
+        assert depth.image is left.depth and color.occluder is frames[k].depth
+        kept = e.download(color.ref.inverse_depth, SIZE) > 0.0
+        first = recording.balls[0]
+        assert kept[_inner(first)].mean() < (0.3 if k == 2 else 0.1) and kept[~first].mean() > 0.85
+        assert color.ref is depth.ref and (e.download(ref.inverse_depth, SIZE) > 0.0)[first].mean() > 0.8
+        assert [o.occluder for o in track.observe(replace(frames[k], depth=left.depth), ref)] == [None, frames[k].depth]
+        for o in fresh:
+            o.linearise(track.terms, state, 0)
+            assert o.lin.fit > 0.95
+        again = track.observe(frames[k], ref)
+        for o in again:
+            o.linearise(track.terms, state, 0)
+        assert min(o.lin.fit for o in again) < 0.85
+    made = track.maker.rectified(5, left.depth, frames[5].colors, recording.truth, ref)
+    assert made.intensity is not None and np.isnan(made.intensity[_inner(recording.balls[5])]).all()
+
+
+def test_what_is_told_not_to_look_does_not(recording: Recording) -> None:
+    track = Track(recording.rig, Options(backend="llvm", moving=False), untimed)
+    frames = [track.device.upload(k, recording.frames[k]) for k in (0, 5)]
+    ref = track.maker.rectified(0, frames[0].depth, frames[0].colors, recording.truth, None)
+    fresh = track.observe(frames[1], ref)
+    for o in fresh:
+        o.linearise(track.terms, SplineState(recording.truth), 1)
+    (left,) = track.leave_out([frames[1]], ref, fresh, SplineState(recording.truth))
+    assert left.depth is frames[1].depth and left.gone is None and left.depth.moving == 0.0
+    assert all(o.ref is ref for o in fresh)
+
+
+def test_a_keyframe_does_without_what_several_frames_see_through(recording: Recording) -> None:
+    track = Track(recording.rig, Options(backend="llvm"), untimed)
+    first = track.device.upload(0, recording.frames[0])
+    ref = track.succession.make(first, recording.truth, None)
+    gone = np.zeros(SIZE, bool)
+    gone[10:30, 20:60] = True
+    for _ in range(2):
+        track.succession.saw_through(gone)
+        assert track.succession.reference is ref
+    track.succession.saw_through(None)
+    track.succession.saw_through(gone)
+    cleaned = track.succession.reference
+    assert cleaned is not None and track.keyframes.newest is cleaned
+    rho = track.device.e.download(cleaned.inverse_depth, SIZE)
+    assert not rho[gone].any() and (rho[~gone] > 0.0).mean() > 0.9
+    assert not track.device.e.download(cleaned.points[0].z, SIZE)[gone].any()
+
+
+def _inner(mask: Mask) -> Mask:
+    """Without two pixels at the border."""
+    return np.asarray(cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0)
+
+
+def test_the_majority_is_what_rests(recording: Recording) -> None:
+    """Told by the first frames alone, before anything has been aligned."""
+    device = DeviceRig(recording.rig, Options(backend="llvm"))
+    frames = [device.upload(k, frame) for k, frame in enumerate(recording.frames[:4])]
+    odd = not_with_most(device.e, frames, device.rays)
+    assert odd is not None
+    ball = recording.balls[0]
+    assert odd[ball].mean() > 0.3 and odd[~ball].mean() < 0.15
+    assert not_with_most(device.e, frames[:1], device.rays) is None
