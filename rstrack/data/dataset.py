@@ -24,6 +24,7 @@ from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.camera_file import read_rig
 from rstrack.data.clocks.timing import Timing, stream_timing
 from rstrack.data.depth_error import NONE, DepthError
+from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.layouts.generated import as_recorded, is_exact, with_depth_scale
 from rstrack.data.layouts.seven_scenes import is_seven_scenes, read_seven_scenes
 from rstrack.data.layouts.tum_folder import TumFolder, read_tum_folder
@@ -49,6 +50,7 @@ class Dataset:
     colour's offset grows by, see `with_color_offset`. scan_named: whether the cameras' description says which way
     images are read. depth_scale: units per metre of the depth images. depth_offset_s: what has been added to the stamps
     of registered depth, see `rstrack.data.camera_file`. images: as they are on disk; depth_error: of the depth in them.
+    imu: of a unit on the cameras.
     """
 
     name: str
@@ -68,6 +70,7 @@ class Dataset:
     depth_scale: float = DEPTH_SCALE
     depth_offset_s: float = 0.0
     depth_error: DepthError = NONE
+    imu: ImuRecording | None = None
 
     def __len__(self) -> int:
         return len(self.stamps)

@@ -15,8 +15,9 @@ GYRO, ACCEL, GRAVITY = slice(0, 3), slice(3, 6), slice(6, 9)
 _GYRO_BIAS, _ACCEL_BIAS = 0.1, 0.6
 # How well gravity's strength is known, m/s²: over the earth, and of a unit's scale.
 _STRENGTH = 0.03
-# σ of a direction of gravity, degrees, and of the gyroscope's bias, rad/s, below which the unit is of use.
-_KNOWN_DEG, _KNOWN_GYRO = 1.0, 5e-3
+# σ of the gyroscope's bias (rad/s), and of the force (m/s²) that gravity and the accelerometer's bias make together in
+# an attitude, below which the unit is of use; and of gravity's direction, degrees, below which that is determined.
+_KNOWN_GYRO, _KNOWN_FORCE, _KNOWN_DEG = 5e-3, 0.15, 0.3
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,8 @@ class Belief:
     def initial(cls, gravity: FloatArray) -> Belief:
         """Before anything is known; gravity (3,) a guess in the world, whose strength alone counts."""
         sigma = np.repeat([_GYRO_BIAS, _ACCEL_BIAS, 3.0 * float(np.linalg.norm(gravity))], 3)
-        return cls(np.concatenate([np.zeros(6), gravity]), np.diag(sigma**-2.0))
+        mean = np.concatenate([np.zeros(6), np.asarray(gravity, dtype=np.float64)])
+        return cls(mean, np.asarray(np.diag(sigma**-2.0)))
 
     @property
     def covariance(self) -> FloatArray:
@@ -57,8 +59,15 @@ class Belief:
 
     @property
     def is_determined(self) -> bool:
-        """Whether gravity is known to a degree, and the gyroscope's bias to 0.3 °/s."""
-        return self.direction_deg < _KNOWN_DEG and bool((self.sigmas[GYRO] < _KNOWN_GYRO).all())
+        """Whether gravity's direction is known to 0.3° (one σ): until then it may be the accelerometer's bias."""
+        return self.direction_deg < _KNOWN_DEG
+
+    def is_usable(self, R_imu_world: FloatArray) -> bool:
+        """Whether readings in an attitude (3, 3) tell accelerations to 0.15 m/s², and rates to 0.3 °/s."""
+        J = np.concatenate([np.zeros((3, 3)), np.eye(3), -R_imu_world], axis=1)
+        covariance = self.covariance
+        force = float(np.linalg.eigvalsh(J @ covariance @ J.T)[-1])
+        return force < _KNOWN_FORCE**2 and bool((np.diag(covariance)[GYRO] < _KNOWN_GYRO**2).all())
 
     def of_strength(self, strength: float) -> Belief:
         """With gravity on the sphere of a known strength, m/s²: |g| is a measurement, taken where it is in the end."""
@@ -68,5 +77,5 @@ class Belief:
             u[GRAVITY] = mean[GRAVITY] / max(1e-9, float(np.linalg.norm(mean[GRAVITY])))
             information = self.information + np.outer(u, u) / _STRENGTH**2
             # |g| + u (g' − g) = strength, and u g = |g|.
-            mean = np.linalg.solve(information, start + u * strength / _STRENGTH**2)
+            mean = np.asarray(np.linalg.solve(information, start + u * strength / _STRENGTH**2))
         return Belief(mean, 0.5 * (information + information.T))

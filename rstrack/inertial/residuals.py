@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rsgen.array_types import FloatArray
+from rsgen.array_types import FloatArray, IntArray
 from rsgen.geometry import se3
 from rsgen.geometry.so3 import cross, hat
 from rsgen.geometry.spline import Spline
@@ -77,7 +77,7 @@ class Joint:
 
 def residuals(
     spline: Spline, samples: Samples, T_imu_depth: FloatArray, belief: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, IntArray]:
     """r (n, 6), its derivatives (n, 6, 33) by the four control points and by the belief's nine numbers, and the first
     of these control points (n,).
 

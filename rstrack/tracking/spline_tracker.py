@@ -19,6 +19,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.adjustment.graph import Seen
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.pull import pulls
+from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.rig import Frame, Rig
 from rstrack.images.device_frame import DeviceFrame, Timer, untimed
 from rstrack.keyframes.archive import Archive
@@ -43,9 +44,15 @@ _YOUNG = 4
 class Tracker:
     """Estimates T_world_depth(t); the world is the depth camera's frame at the middle of the first image."""
 
-    def __init__(self, rig: Rig, options: Options | None = None, timer: Timer = untimed) -> None:
-        """timer: watches the parts of the work, see `Timer`."""
-        self._track = track = Track(rig, options or Options(), timer)
+    def __init__(
+        self, rig: Rig, options: Options | None = None, timer: Timer = untimed, imu: ImuRecording | None = None
+    ) -> None:  # fmt: skip
+        """timer: watches the parts of the work, see `Timer`. imu: of a unit on the cameras, for methods that use one;
+        UserError if they have none."""
+        options = options or Options()
+        if options.inertial and imu is None:
+            raise UserError(f"method {options.method}: needs an IMU's recording, and there is none")
+        self._track = track = Track(rig, options, timer, imu if options.inertial else None)
         self._relocaliser = Relocaliser(rig, track.options, track.keyframes, track.fits, track.observe)
         self._last_fed: float | None = None
 
@@ -237,7 +244,7 @@ class Tracker:
             return self._relocalise(new, fault)
         track.window, track.covariances.uncertainty = window, uncertainty
         window.keep(fresh)
-        track.learn(ref, on_reference, window, pulled)
+        track.learn(ref, on_reference, window, pulled, new.last_time)
         track.succession.recent.append(new)
         track.placed(new, fresh)
         track.age += 1

@@ -80,7 +80,9 @@ def track(
     def again(index: int) -> Frame:
         return _readable(load(done.fed[index]))
 
-    tracker = make_tracker(dataset.rig, options, load=again, interval_s=dataset.interval_s(chosen))
+    if options.inertial and dataset.imu is None:
+        raise UserError(f"{dataset.root}: --method {options.method} needs an IMU, and this has none: use {options.method[:-1]}")
+    tracker = make_tracker(dataset.rig, options, load=again, interval_s=dataset.interval_s(chosen), imu=dataset.imu)
     from rstrack.tracking.loop_tracker import LoopTracker
     from rstrack.tracking.runs.checkpoint import checkpoint_of  # these import Dr.Jit
 
