@@ -37,7 +37,7 @@ class Belief:
     @property
     def covariance(self) -> FloatArray:
         """(9, 9)."""
-        return np.linalg.inv(self.information)
+        return np.asarray(np.linalg.inv(self.information))
 
     @property
     def sigmas(self) -> FloatArray:

@@ -18,8 +18,8 @@ from rstrack.inertial.smoother import Smoother
 
 # σ of readings (rad/s, m/s²) before it is known what of them the spline can follow, and samples that tell.
 _START, _MEMORY = np.array([0.03, 0.3]), 100.0
-# Gravity in the world turns as the track drifts: m/s² per √s.
-_DRIFT = 2e-3
+# Gravity in the world turns as the track drifts, beside what keyframes' covariances say: m/s² per √s.
+_DRIFT = 5e-4
 # Increments of control points (m, rad) that leave the samples' derivatives as they were.
 _SAME = 1e-2
 # Part of the degrees of freedom of its samples that a spline leaves, at least, lest few samples seem to fit too well.
@@ -76,6 +76,12 @@ class Inertia:
         if self._smoother is not None:
             self._smoother.forget(self._smoother.last)
         self._until = self._next = -np.inf
+
+    def shift(self, covariance: FloatArray) -> None:
+        """Images tell the pose against another keyframe from now on, which lies in the world up to a left increment
+        with covariance (6, 6): that is no motion."""
+        if self._smoother is not None:
+            self._smoother.shift(covariance)
 
     def covers(self, begin: float, end: float) -> bool:
         """Whether there are samples from begin to end (s), without a gap worth mentioning."""

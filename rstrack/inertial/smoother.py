@@ -13,7 +13,7 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rstrack.alignment.normal_equations import Quadratic
 from rstrack.alignment.spline_state import SplineState
-from rstrack.inertial.belief import SIZE, Belief
+from rstrack.inertial.belief import GRAVITY, SIZE, Belief
 from rstrack.inertial.residuals import Joint
 
 # Information of a control point that nothing tells (σ 100 m, rad): systems are never singular.
@@ -77,11 +77,24 @@ class Smoother:
     def diffuse(self, variance: FloatArray) -> None:
         """The nine numbers walk on: variances (9,) of their steps."""
         walks = np.flatnonzero(variance > 0.0)
-        at = len(self.g) - SIZE + walks
-        rows = self.H[at]
-        # (H⁻¹ + M Q Mᵀ)⁻¹ = H − H M (Q⁻¹ + Mᵀ H M)⁻¹ Mᵀ H, the mean staying where it is.
-        gains = np.linalg.solve(np.diag(1.0 / variance[walks]) + rows[:, at], rows)
-        self.g = self.g - gains.T @ self.g[at]
+        ways = np.zeros((len(self.g), len(walks)))
+        ways[len(self.g) - SIZE + walks, np.arange(len(walks))] = 1.0
+        self._loosen(ways, np.diag(variance[walks]))
+
+    def shift(self, covariance: FloatArray) -> None:
+        """What is held comes to lie elsewhere in the world, as one body, with gravity: by a left increment with
+        covariance (6, 6), as where images are aligned to another keyframe from now on."""
+        x, y, z = self.belief[GRAVITY]
+        ways = np.concatenate([np.tile(np.eye(6), (len(self.at), 1)), np.zeros((SIZE, 6))])
+        ways[-3:, 3:] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]  # φ × g
+        self._loosen(ways, covariance)
+
+    def _loosen(self, ways: FloatArray, covariance: FloatArray) -> None:
+        """Noise of a covariance (m, m) along ways (n, m): (H⁻¹ + M Q Mᵀ)⁻¹ = H − H M (I + Q Mᵀ H M)⁻¹ Q Mᵀ H, the mean
+        staying where it is."""
+        rows = ways.T @ self.H
+        gains = np.linalg.solve(np.eye(len(covariance)) + covariance @ rows @ ways, covariance @ rows)
+        self.g = self.g - gains.T @ (ways.T @ self.g)
         H = self.H - rows.T @ gains
         self.H = 0.5 * (H + H.T)
 

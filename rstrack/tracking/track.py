@@ -60,6 +60,7 @@ class Track:
     def begin_anew(self) -> None:
         """Nothing has been found, of what was fed."""
         self.window: Window | None = None
+        self._told_by = -1
         if self.inertia is not None:
             self.inertia.begin_world()
         self.found, self.chain = FoundPoses(), Chain()
@@ -117,8 +118,18 @@ class Track:
     def learn_inertia(self, fresh: Sequence[Observation], window: Window, excess: float, end: float) -> None:
         """What a frame that ends at time `end` (s) says of an IMU's biases and of gravity. excess: see `Pulls`."""
         if self.inertia is not None:
+            self._shift_inertia(fresh)
             models = [o.model(window.state).scaled(1.0 / excess**2) for o in fresh if o.is_linearised]
             self.inertia.learn(window.state, window.piece, models, end)
+
+    def _shift_inertia(self, fresh: Sequence[Observation]) -> None:
+        """An IMU knows nothing of keyframes: that another one lies a little off is no motion."""
+        index = next((o.ref.index for o in fresh if o.ref.rolling is None), self._told_by)
+        drift = self.covariances.uncertainty.drift
+        if self.inertia is not None and self._told_by in drift and index in drift and index != self._told_by:
+            between = drift[index] - drift[self._told_by] if index > self._told_by else drift[self._told_by] - drift[index]
+            self.inertia.shift(between)
+        self._told_by = index
 
     def given(self, before: Window, after: Window) -> tuple[FloatArray, FloatArray]:
         """Poses (n, 4, 4) of the frames that still move, before and after a new one has been aligned."""
