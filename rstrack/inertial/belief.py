@@ -64,10 +64,13 @@ class Belief:
 
     def is_usable(self, R_imu_world: FloatArray) -> bool:
         """Whether readings in an attitude (3, 3) tell accelerations to 0.15 m/s², and rates to 0.3 °/s."""
+        rates = np.diag(self.covariance)[GYRO]
+        return self.force_variance(R_imu_world) < _KNOWN_FORCE**2 and bool((rates < _KNOWN_GYRO**2).all())
+
+    def force_variance(self, R_imu_world: FloatArray) -> float:
+        """Of what gravity and the accelerometer's bias make together in an attitude (3, 3), in the worst direction."""
         J = np.concatenate([np.zeros((3, 3)), np.eye(3), -R_imu_world], axis=1)
-        covariance = self.covariance
-        force = float(np.linalg.eigvalsh(J @ covariance @ J.T)[-1])
-        return force < _KNOWN_FORCE**2 and bool((np.diag(covariance)[GYRO] < _KNOWN_GYRO**2).all())
+        return float(np.linalg.eigvalsh(J @ self.covariance @ J.T)[-1])
 
     def of_strength(self, strength: float) -> Belief:
         """With gravity on the sphere of a known strength, m/s²: |g| is a measurement, taken where it is in the end."""

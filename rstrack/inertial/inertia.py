@@ -12,7 +12,7 @@ from rstrack.alignment.normal_equations import Quadratic
 from rstrack.alignment.priors import ACCELERATION, Prior, acceleration_prior
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.imu.recording import ImuRecording
-from rstrack.inertial.belief import GRAVITY, Belief
+from rstrack.inertial.belief import GRAVITY, GYRO, Belief
 from rstrack.inertial.residuals import Samples, summed
 from rstrack.inertial.smoother import Smoother
 
@@ -88,6 +88,13 @@ class Inertia:
         t = self.samples.between(begin, end).t
         longest = max(3.0 / self.recording.rate_hz, 0.02)
         return bool(np.diff(np.concatenate([[begin], t, [end]])).max() <= longest)
+
+    def accelerations(self, seconds: float, R_imu_world: FloatArray) -> FloatArray:
+        """σ (6,) of accelerations over so many seconds in an attitude (3, 3), m/s² and rad/s², with what it says."""
+        gyro, accel = self.sigma**2 / max(1.0, seconds * self.recording.rate_hz)
+        gyro += float(np.diag(self.belief.covariance)[GYRO].max())
+        accel += self.belief.force_variance(R_imu_world)
+        return np.repeat(np.sqrt([accel, (2.0 / seconds) ** 2 * gyro]), 3)
 
     # -- what it says of the spline ---------------------------------------------------------------------------------
 
@@ -176,7 +183,7 @@ class Inertia:
 
 
 class _Prior:
-    """The samples' normal equations around a state, kept while it hardly moves; see `rstrack.alignment.priors.Prior`."""
+    """The samples' normal equations around a state, kept while it hardly moves: a `rstrack.alignment.priors.Prior`."""
 
     def __init__(self, inertia: Inertia, samples: Samples, state: SplineState) -> None:
         self._inertia, self._samples, self._state = inertia, samples, state

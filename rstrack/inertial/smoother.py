@@ -69,8 +69,9 @@ class Smoother:
         if low >= high:
             return
         size = len(self.g)
-        own = np.concatenate([np.arange(6 * (low - model.first), 6 * (high - model.first)), 6 * count + np.arange(tail)])
-        to = np.concatenate([np.arange(6 * (low - self.first), 6 * (high - self.first)), size - tail + np.arange(tail)])
+        both = 6 * low + np.arange(6 * (high - low))
+        own = np.concatenate([both - 6 * model.first, 6 * count + np.arange(tail)])
+        to = np.concatenate([both - 6 * self.first, size - tail + np.arange(tail)])
         self.H[np.ix_(to, to)] += model.H[np.ix_(own, own)]
         self.g[to] += model.g[own]
 

@@ -23,7 +23,8 @@ class FrameReport:
     covariance: of the pose against its keyframe, (6, 6) [m; rad] in the depth camera's frame at mid readout; drift:
     what the errors of the keyframes before add to that against the first frame; None where there are none: of lost
     frames, and with the baseline. held_by_motion: largest part (0..1) that the motion before, not the images, has in
-    what is known of any direction.
+    what is known of any direction. bridged: its images were of no use, as fault says, and it has its pose from an IMU
+    and from frames after it: until these came, it was lost.
     """
 
     stamp: float
@@ -42,6 +43,7 @@ class FrameReport:
     drift: FloatArray | None = None
     held_by_motion: float = float("nan")
     fault: Fault = Fault.NONE
+    bridged: bool = False
 
     def as_lost(self, fault: Fault) -> FrameReport:
         """The same frame, given up later on; one that is lost already stays so for its own reason."""

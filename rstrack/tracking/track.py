@@ -13,6 +13,7 @@ from rstrack.alignment.independence import Independence
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.observation import Observation, observe
 from rstrack.alignment.optimizer import Solved
+from rstrack.alignment.priors import ACCELERATION
 from rstrack.alignment.pull import Pulls
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.rig import Rig
@@ -39,8 +40,8 @@ class Track:
     """The spline as far as it has grown, the frames found on it, and what they said of the cameras.
 
     window: None until there is a first frame. age: frames of the current piece of the spline. independence: of depth
-    pixels, and of colour pixels. chain: what all frames said of the spline. reports: one of every frame fed. inertia: what
-    an IMU says beside them, or None.
+    pixels, and of colour pixels. chain: what all frames said of the spline. reports: one of every frame fed.
+    inertia: what an IMU says beside them, or None.
     """
 
     def __init__(self, rig: Rig, options: Options, timer: Timer, imu: ImuRecording | None = None) -> None:
@@ -105,7 +106,9 @@ class Track:
             o.independent = 1.0 / self.independence[not o.is_depth].inflation
         return observations
 
-    def learn(self, ref: Reference, on_reference: Sequence[Observation], window: Window, pulled: Pulls, end: float) -> None:
+    def learn(
+        self, ref: Reference, on_reference: Sequence[Observation], window: Window, pulled: Pulls, end: float
+    ) -> None:  # fmt: skip
         """What a frame that was found, and ends at time `end` (s), says of the spline and of its pixels.
 
         on_reference: its observations of `ref`.
@@ -122,13 +125,21 @@ class Track:
             models = [o.model(window.state).scaled(1.0 / excess**2) for o in fresh if o.is_linearised]
             self.inertia.learn(window.state, window.piece, models, end)
 
+    def accelerations(self, window: Window, seconds: float) -> FloatArray:
+        """σ (6,) of accelerations over so many seconds, beyond what is known, m/s² and rad/s²: an IMU tells most."""
+        if self.inertia is None or seconds <= 0.0 or not window.is_led(self.found.end, self.found.end + seconds):
+            return ACCELERATION
+        R_depth_world = window.spline.pose(self.found.end)[:3, :3].T
+        told = self.inertia.accelerations(seconds, self.inertia.recording.T_imu_depth[:3, :3] @ R_depth_world)
+        return np.minimum(ACCELERATION, told)
+
     def _shift_inertia(self, fresh: Sequence[Observation]) -> None:
         """An IMU knows nothing of keyframes: that another one lies a little off is no motion."""
         index = next((o.ref.index for o in fresh if o.ref.rolling is None), self._told_by)
         drift = self.covariances.uncertainty.drift
         if self.inertia is not None and self._told_by in drift and index in drift and index != self._told_by:
-            between = drift[index] - drift[self._told_by] if index > self._told_by else drift[self._told_by] - drift[index]
-            self.inertia.shift(between)
+            older, newer = sorted((index, self._told_by))
+            self.inertia.shift(drift[newer] - drift[older])
         self._told_by = index
 
     def given(self, before: Window, after: Window) -> tuple[FloatArray, FloatArray]:

@@ -81,7 +81,8 @@ def track(
         return _readable(load(done.fed[index]))
 
     if options.inertial and dataset.imu is None:
-        raise UserError(f"{dataset.root}: --method {options.method} needs an IMU, and this has none: use {options.method[:-1]}")
+        without = options.method.removesuffix("i")
+        raise UserError(f"{dataset.root}: has no IMU's recording, which --method {options.method} needs: take {without}")
     tracker = make_tracker(dataset.rig, options, load=again, interval_s=dataset.interval_s(chosen), imu=dataset.imu)
     from rstrack.tracking.loop_tracker import LoopTracker
     from rstrack.tracking.runs.checkpoint import checkpoint_of  # these import Dr.Jit
