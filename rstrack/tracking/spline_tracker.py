@@ -22,6 +22,7 @@ from rstrack.alignment.pull import pulls
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.rig import Frame, Rig
 from rstrack.images.device_frame import DeviceFrame, Timer, untimed
+from rstrack.inertial.inertia import Inertia
 from rstrack.keyframes.archive import Archive
 from rstrack.options import Options
 from rstrack.tracking.bootstrap import bootstrap, fit_knots, start
@@ -142,6 +143,11 @@ class Tracker:
     def seen(self) -> list[Seen]:
         """What its frames said of the spline's control points."""
         return self._track.chain.seen
+
+    @property
+    def inertia(self) -> Inertia | None:
+        """What has been found of an IMU, where the method uses one."""
+        return self._track.inertia
 
     @property
     def drift(self) -> dict[int, FloatArray]:
