@@ -32,6 +32,10 @@ _END_TRIPLES, _END_FACTOR = 2, 0.1
 _GAUGE = np.full(6, 1e-6)
 # Control points that are held beyond those that are needed, and how many are released at once.
 _HELD, _RELEASED = 8, 128
+# Seconds for which control points that no new image touches stay free beside an IMU: about as long as what images say
+# of the motion gets better by averaging along it. And degrees that the camera turns in them, at most: a keyframe is made
+# of a frame that is frozen, and must not be left behind by then.
+_LAG_S, _LAG_DEG = 0.1, 3.0
 # Levels to go through from a prediction by constant velocity, and from anything worse.
 TRACKING_LEVELS, LEVELS = (1, 0), (2, 1, 0)
 # Steps from constant velocity to what an IMU says of the motion since the last frame, and a step (m, rad) that is the
@@ -80,7 +84,7 @@ class Window:
 
     def predict(self, new: DeviceFrame, end: float, young: bool = False) -> None:
         """Go on with constant velocity, or as an IMU leads, from time `end` (s) until the frame is covered; what it
-        touches is free.
+        touches is free, and with an IMU what came shortly before.
 
         young: the piece's first frame alone does not tell its velocity; all of the piece stays free. Where frames are
         missing, and an IMU leads over the gap, all control points in it are free.
@@ -89,7 +93,7 @@ class Window:
         if self.is_led(end, new.last_time):
             self.state.extend(new.last_time)
             self._follow_lead(end)
-            begin = min(begin, self.state.segment(end))
+            begin = max(self.first_free, min(begin, self.state.segment(end)) - self._lag(end))
         else:
             self.state.smooth_end(end)
             self.state.extend(new.last_time)
@@ -99,6 +103,11 @@ class Window:
     def is_led(self, begin: float, end: float) -> bool:
         """Whether an IMU tells the motion from time begin to end (s)."""
         return self._inertia is not None and self._inertia.is_usable and self._inertia.covers(begin, end)
+
+    def _lag(self, end: float) -> int:
+        """Knots for which control points stay free before time `end` (s)."""
+        turning = float(np.degrees(np.linalg.norm(self.spline.velocity(end)[3:])))
+        return int(min(_LAG_S, _LAG_DEG / max(turning, 1e-9)) / self.state.dt + 0.5)
 
     def _follow_lead(self, end: float) -> None:
         """Move the control points that lines until time `end` (s) left open to where the IMU has them; the images seen
