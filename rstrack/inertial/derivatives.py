@@ -43,38 +43,49 @@ def motion(spline: Spline, t: FloatArray) -> Motion:
     With y = Ad(A_j⁻¹) w_{j−1} and x = Ad(A_j⁻¹) ẇ_{j−1}, both of which Ω_j turns by ad(·) b_j Jr(b_j Ω_j):
     dw_j = Ad(A_j⁻¹) dw_{j−1} + (b_j ad(y) Jr + ḃ_j) dΩ_j,
     dẇ_j = Ad(A_j⁻¹) dẇ_{j−1} + (b_j ad(x) Jr + ḃ_j ad(w_j) + b̈_j) dΩ_j − ḃ_j ad(Ω_j) dw_j.
+    The pose's right increment likewise: e_j = Ad(A_j⁻¹) e_{j−1} + b_j Jr dΩ_j, from e_0 = Ad(T_0⁻¹) δ_0.
     """
     segment, u = spline.locate(t)
     held, n = segment - spline.first, len(u)
     b, db, ddb = (powers(u, 4) @ basis / spline.dt**k for k, basis in enumerate(_BASES))
-    omega = spline.increments[held[:, None] + np.arange(3)]
+    three = held[:, None] + np.arange(3)
+    omega = spline.increments[three]
     parts = b[..., None] * omega
-    A, Jr, ad = se3.exp(parts), se3.right_jacobian(parts), se3.ad(omega)
+    A, ad = se3.exp(parts), se3.ad(omega)
+    turned = b[..., None, None] * se3.right_jacobian(parts)
     back = se3.adjoint(se3.inverse(A))
-    w, dw = np.zeros((n, 6)), np.zeros((n, 6))
-    by_w, by_dw = np.zeros((n, 6, 18)), np.zeros((n, 6, 18))
+    T = spline.control_points[held]
+    state = np.zeros((n, 6, 2))  # w and ẇ
+    by = np.zeros((n, 6, 60))  # of w and ẇ by Ω_1..Ω_3, of e by those and by δ_0
+    by[:, :, 54:] = se3.adjoint(se3.inverse(T))
     one = np.eye(6)
     for j in range(3):
-        own, bj, dbj, ddbj = slice(6 * j, 6 * j + 6), b[:, j, None], db[:, j, None], ddb[:, j, None]
-        y, x = np.moveaxis(back[:, j] @ np.stack([w, dw], axis=-1), -1, 0)
-        w = y + dbj * omega[:, j]
-        ad_w = se3.ad(w)
-        dw = x + dbj * (ad_w @ omega[:, j, :, None])[..., 0] + ddbj * omega[:, j]
-        turned = bj[..., None] * Jr[:, j]
-        by_w = back[:, j] @ by_w
-        by_w[:, :, own] += se3.ad(y) @ turned + dbj[..., None] * one
-        by_dw = back[:, j] @ by_dw - dbj[..., None] * (ad[:, j] @ by_w)
-        by_dw[:, :, own] += se3.ad(x) @ turned + dbj[..., None] * ad_w + ddbj[..., None] * one
-    gains = spline.left_gains[held[:, None] + np.arange(3)]
-    T, J = spline.pose(t), spline.pose_jacobian(t)[1]
-    by_turn = np.moveaxis(J[:, :, 3:], 1, 2).reshape(n, 3, 24)
-    return Motion(segment, T[:, :3, :3], w, dw, _by_points(by_w, gains), _by_points(by_dw, gains), by_turn)
+        bj, bbj = db[:, j, None, None], ddb[:, j, None, None]
+        state, by = back[:, j] @ state, back[:, j] @ by
+        ad_y, ad_x = np.moveaxis(se3.ad(np.swapaxes(state, 1, 2)), 1, 0)
+        state[..., 0] += bj[..., 0] * omega[:, j]
+        ad_w = se3.ad(state[..., 0])
+        state[..., 1] += ((bj * ad_w + bbj * one) @ omega[:, j, :, None])[..., 0]
+        own = 6 * j
+        by[:, :, own : own + 6] += ad_y @ turned[:, j] + bj * one
+        by[:, :, 18:36] -= bj * (ad[:, j] @ by[:, :, :18])
+        by[:, :, 18 + own : 24 + own] += ad_x @ turned[:, j] + bj * ad_w + bbj * one
+        by[:, :, 36 + own : 42 + own] += turned[:, j]
+        T = T @ A[:, j]
+    R = T[:, :3, :3]
+    by[:, 3:, 36:] = R @ by[:, 3:, 36:]
+    gains = spline.left_gains[three]
+    by_turn = _by_points(by[:, 3:, 36:54], gains)
+    by_turn[:, :, :6] += by[:, 3:, 54:]
+    twist, rate = state[..., 0], state[..., 1]
+    return Motion(
+        segment, R, twist, rate, _by_points(by[:, :, :18], gains), _by_points(by[:, :, 18:36], gains), by_turn
+    )
 
 
 def _by_points(by_increments: FloatArray, gains: FloatArray) -> FloatArray:
-    """From Ω_1..Ω_3 (n, 6, 18) to the four control points (n, 6, 24): dΩ_j = G_j (δ_j − δ_{j−1})."""
-    n = len(gains)
-    out = np.zeros((n, 6, 24))
+    """From Ω_1..Ω_3 (n, k, 18) to the four control points (n, k, 24): dΩ_j = G_j (δ_j − δ_{j−1})."""
+    out = np.zeros((*by_increments.shape[:2], 24))
     for j in range(3):
         part = by_increments[:, :, 6 * j : 6 * j + 6] @ gains[:, j]
         out[:, :, 6 * j : 6 * j + 6] -= part

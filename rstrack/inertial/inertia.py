@@ -9,7 +9,7 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.normal_equations import Quadratic
-from rstrack.alignment.priors import ACCELERATION, Prior, acceleration_prior
+from rstrack.alignment.priors import ACCELERATION, acceleration_prior
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.inertial.belief import GRAVITY, GYRO, Belief
@@ -98,12 +98,12 @@ class Inertia:
 
     # -- what it says of the spline ---------------------------------------------------------------------------------
 
-    def prior(self, state: SplineState, piece: int, first: int) -> Prior:
+    def prior(self, state: SplineState, piece: int, first: int) -> InertialPrior:
         """All samples that depend on control points from `first` on, of the piece of the spline that begins at control
         point `piece`, while it moves with `state`; biases and gravity as far as they are known."""
         spline = state.spline
         begin = max(spline.t0 + max(piece, first - 3) * spline.dt, spline.t_begin)
-        return _Prior(self, self.samples.between(begin, spline.t_end), state)
+        return InertialPrior(self, self.samples.between(begin, spline.t_end), state, first)
 
     # -- what the track says of it ----------------------------------------------------------------------------------
 
@@ -182,25 +182,29 @@ class Inertia:
         self.sigma = np.maximum(self._noise, np.sqrt(mean))
 
 
-class _Prior:
-    """The samples' normal equations around a state, kept while it hardly moves: a `rstrack.alignment.priors.Prior`."""
+class InertialPrior:
+    """The samples' normal equations around a state, kept while it hardly moves: a `rstrack.alignment.priors.Prior`.
 
-    def __init__(self, inertia: Inertia, samples: Samples, state: SplineState) -> None:
-        self._inertia, self._samples, self._state = inertia, samples, state
+    first, end: the control points that its samples depend on, and how many there were of all.
+    """
+
+    def __init__(self, inertia: Inertia, samples: Samples, state: SplineState, first: int) -> None:
+        self._inertia, self._samples, self.state = inertia, samples, state
+        self.first, self.end = first, state.end
         self._known: tuple[Quadratic, float] | None = None
         self._at = np.zeros((0, 6))
 
     def __call__(self, spline: Spline) -> tuple[Quadratic, float]:
         if self._known is not None:
             model, cost = self._known
-            moved = self._state.received(model.first, model.last) - self._at
+            moved = self.state.received(model.first, model.last) - self._at
             if np.abs(moved).max() < _SAME:
                 step = moved.ravel()
                 return model.moved(moved), cost + float(model.g @ step + 0.5 * step @ model.H @ step)
         inertia = self._inertia
         joint, _ = summed(spline, self._samples, inertia.recording.T_imu_depth, inertia.belief, inertia.sigma)
         if joint is None:
-            return Quadratic(self._state.end - 1, np.zeros((6, 6)), np.zeros(6)), 0.0
+            return Quadratic(self.state.end - 1, np.zeros((6, 6)), np.zeros(6)), 0.0
         self._known = joint.without_belief(inertia.belief.information)
-        self._at = self._state.received(joint.first, joint.first + joint.count)
+        self._at = self.state.received(joint.first, joint.first + joint.count)
         return self._known

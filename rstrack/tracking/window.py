@@ -22,7 +22,7 @@ from rstrack.alignment.priors import (
 )
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.device_frame import DeviceFrame
-from rstrack.inertial.inertia import Inertia
+from rstrack.inertial.inertia import Inertia, InertialPrior
 from rstrack.keyframes.keyframe import Reference
 
 # The newest control points, whose weight in the newest lines is only u³/6, are held a good deal tighter by the motion
@@ -33,14 +33,14 @@ _GAUGE = np.full(6, 1e-6)
 # Control points that are held beyond those that are needed, and how many are released at once.
 _HELD, _RELEASED = 8, 128
 # Seconds for which control points that no new image touches stay free beside an IMU: about as long as what images say
-# of the motion gets better by averaging along it. And degrees that the camera turns in them, at most: a keyframe is made
-# of a frame that is frozen, and must not be left behind by then.
+# of the motion gets better by averaging along it. And degrees that the camera turns in them, at most: keyframes are made
+# of frozen frames, and must not be left behind by then.
 _LAG_S, _LAG_DEG = 0.1, 3.0
 # Levels to go through from a prediction by constant velocity, and from anything worse.
 TRACKING_LEVELS, LEVELS = (1, 0), (2, 1, 0)
 # Steps from constant velocity to what an IMU says of the motion since the last frame, and a step (m, rad) that is the
 # last one.
-_LED_STEPS, _LED = 4, 1e-4
+_LED_STEPS, _LED = 4, 1e-3
 # Steps at most on the pyramid's levels, finest first.
 _MOST_STEPS = (15, 8, 30)
 
@@ -60,6 +60,7 @@ class Window:
         self.state, self.piece = state, piece
         self.first_free = piece
         self.active: list[Observation] = []
+        self._led: InertialPrior | None = None
 
     @classmethod
     def still(
@@ -167,6 +168,7 @@ class Window:
     def keep(self, fresh: Sequence[Observation]) -> None:
         """Fresh observations take part from now on."""
         self.active += fresh
+        self._led = None
 
     def _motion_prior(self, free: tuple[int, int]) -> Prior:
         first, last = max(self.piece, free[0] - 2), free[1]
@@ -182,7 +184,10 @@ class Window:
         last = self.state.spline.t_end
         if self._inertia is None or not self.is_led(last - 2.0 * self.state.dt, last):
             return []
-        return [self._inertia.prior(self.state, self.piece, free[0])]
+        known = self._led
+        if known is None or known.state is not self.state or known.first > free[0] or known.end != self.state.end:
+            known = self._led = self._inertia.prior(self.state, self.piece, free[0])
+        return [known]
 
     def _velocity_prior(self, free: tuple[int, int]) -> Prior:
         """What is known of the motion of a piece that has just begun."""

@@ -47,7 +47,9 @@ def test_motion_is_the_splines() -> None:
     at = motion(spline, t)
     np.testing.assert_allclose(at.twist, spline.velocity(t), atol=1e-12)
     np.testing.assert_allclose(at.rate, spline.acceleration(t), atol=1e-10)
-    np.testing.assert_array_equal(at.rotation, spline.pose(t)[:, :3, :3])
+    np.testing.assert_allclose(at.rotation, spline.pose(t)[:, :3, :3], atol=1e-14)
+    J = np.moveaxis(spline.pose_jacobian(t)[1][:, :, 3:], 1, 2).reshape(len(t), 3, 24)
+    np.testing.assert_allclose(at.by_turn, J, atol=1e-11)
 
 
 def test_residuals_vanish_at_the_truth() -> None:
