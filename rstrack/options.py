@@ -13,7 +13,7 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.shutter import Shutter
 
-Method = Literal["rs-pg", "rs-g", "rs-p", "gs-pg", "gs-g", "gs-p", "baseline"]
+Method = Literal["rs-pg", "rs-g", "rs-p", "rs-pgi", "rs-gi", "gs-pg", "gs-g", "gs-p", "baseline"]
 METHODS: tuple[str, ...] = get_args(Method)
 Peer = Literal["open3d-hybrid", "open3d-icp", "open3d-hybrid-keyframe", "open3d-icp-keyframe"]
 PEERS: tuple[str, ...] = get_args(Peer)
@@ -42,8 +42,8 @@ class Options:
 
     method: Annotated[
         Method,
-        "rs models the rolling shutter, gs takes all lines at mid readout; p photometric, g geometric error; baseline "
-        "has one pose a frame",
+        "rs models the rolling shutter, gs takes all lines at mid readout; p photometric, g geometric error, i "
+        "an IMU's residuals besides; baseline has one pose a frame",
     ] = "rs-pg"
     knot_spacing_s: Annotated[
         float | None,
@@ -131,12 +131,17 @@ class Options:
     @property
     def geometric(self) -> bool:
         """Whether the geometric term is used."""
-        return self.method in ("rs-pg", "rs-g", "gs-pg", "gs-g", "baseline")
+        return self.method in ("rs-pg", "rs-g", "rs-pgi", "rs-gi", "gs-pg", "gs-g", "baseline")
 
     @property
     def photometric(self) -> bool:
         """Whether the photometric term is used."""
-        return self.method in ("rs-pg", "rs-p", "gs-pg", "gs-p")
+        return self.method in ("rs-pg", "rs-p", "rs-pgi", "gs-pg", "gs-p")
+
+    @property
+    def inertial(self) -> bool:
+        """Whether an IMU is used."""
+        return self.method in ("rs-pgi", "rs-gi")
 
     def decided(self, depth_shutter: Shutter, interval_s: float | None = None) -> Options:
         """With `fuse` chosen for such a depth camera where it is None, and the knots for frames so far apart."""

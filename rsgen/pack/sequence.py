@@ -90,7 +90,7 @@ def gyro_samples(stage: Stage, drawn: Drawn, length: int) -> ImuSamples:
     gravity = _GRAVITY if stage.config.imu is None else stage.config.imu.gravity
     spline = camera_spline(stage.spline, drawn, T_depth_color(stage.config))
     gyro, accel = exact_imu(spline, np.eye(4), gravity, t)
-    return ImuSamples(t, gyro, accel, np.zeros_like(gyro), np.zeros_like(accel))
+    return ImuSamples(t, gyro, accel, np.zeros_like(gyro), np.zeros_like(accel), stamps=t)
 
 
 def mean_twist(stage: Stage, drawn: Drawn, length: int) -> FloatArray:

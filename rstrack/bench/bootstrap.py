@@ -125,7 +125,9 @@ def generator(seed: int) -> np.random.Generator:
 
 
 def _run(dataset: Dataset, truth: Truth, options: Options, frames: range) -> Start:
-    tracker = make_tracker(dataset.rig, options, interval_s=dataset.interval_s(frames))
+    tracker = make_tracker(
+        dataset.rig, options, interval_s=dataset.interval_s(frames), imu=dataset.imu if options.inertial else None
+    )
     error = ""
     for k, frame in zip(frames, dataset.frames(frames.start, frames.stop), strict=True):
         try:

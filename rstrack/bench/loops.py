@@ -117,7 +117,8 @@ def _tracked(dataset: Dataset, options: Options, frames: slice, progress: Progre
     from rstrack.tracking.spline_tracker import Tracker
 
     chosen = range(len(dataset))[frames]
-    tracker = make_tracker(dataset.rig, replace(options, loops="off"), interval_s=dataset.interval_s(chosen))
+    interval_s, without = dataset.interval_s(chosen), replace(options, loops="off")
+    tracker = make_tracker(dataset.rig, without, interval_s=interval_s, imu=dataset.imu if options.inertial else None)
     if not isinstance(tracker, Tracker) or not len(chosen):
         raise UserError(
             f"{dataset.root}: has no frame {frames.start}" if not len(chosen) else "baseline: has no spline"

@@ -162,7 +162,10 @@ def time_methods(
 
 def _time(dataset: Dataset, options: Options, frames: int, warm_up: int, progress: Progress) -> MethodTimes:
     watch, reading = Stopwatch(), Stopwatch()
-    tracker = make_tracker(dataset.rig, options, watch.timed, interval_s=dataset.interval_s(range(frames)))
+    interval_s = dataset.interval_s(range(frames))
+    tracker = make_tracker(
+        dataset.rig, options, watch.timed, interval_s=interval_s, imu=dataset.imu if options.inertial else None
+    )
     frame_ms: list[float] = []
     for k in range(frames):
         if k == warm_up:

@@ -128,6 +128,9 @@ def track(
         bool, "estimate readouts, colour's clock and extrinsics first, as 'rstrack calibrate' does, and track with them"
     ] = False,
     device: DeviceName = None,
+    gravity: Annotated[
+        bool, "write the trajectory in a world whose z axis points up, as an IMU tells (rs-pgi, rs-gi)"
+    ] = False,
     resume: Annotated[
         bool, "go on with a run of the same settings in DIR that was stopped or killed, to the same bits"
     ] = False,
@@ -165,7 +168,7 @@ def track(
             dataset = found.calibrated()
         with _viewed(view, dataset) as viewer:
             watch = None if viewer is None else viewer.see
-            result = run.track(dataset, tracker, out, frames or slice(None), noise, progress, resume, watch)
+            result = run.track(dataset, tracker, out, frames or slice(None), noise, progress, resume, watch, gravity)
             if viewer is not None:
                 viewer.corrected(result.estimate.T_world_depth)
     (out / CALIBRATION).unlink(missing_ok=True)  # of an earlier run in this folder

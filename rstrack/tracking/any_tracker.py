@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from rsgen.array_types import FloatArray
 from rsgen.geometry.spline import Spline
+from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.rig import Frame, Rig
 from rstrack.options import Options
 
@@ -52,13 +53,14 @@ class AnyTracker(Protocol):
 
 def make_tracker(
     rig: Rig, options: Options, timer: Timer | None = None, load: Callable[[int], Frame] | None = None,
-    interval_s: float | None = None,
+    interval_s: float | None = None, imu: ImuRecording | None = None,
 ) -> AnyTracker:  # fmt: skip
     """The tracker of options.method; `timer` watches the parts of its work. load: as in `LoopTracker`.
 
-    interval_s: the usual time between frames, where that is known; otherwise the first two tell.
+    interval_s: the usual time between frames, where that is known; otherwise the first two tell. imu: of a unit
+    on the cameras; methods that use none take no notice.
 
-    Raises UserError if its backend cannot work on this machine.
+    Raises UserError if its backend cannot work on this machine, or the method needs an IMU and there is none.
     """
     from rsgen.device.arrays import engine
 
@@ -74,7 +76,7 @@ def make_tracker(
     if options.loops == "online":
         from rstrack.tracking.loop_tracker import LoopTracker
 
-        return LoopTracker(rig, options, timer, load)
+        return LoopTracker(rig, options, timer, load, imu)
     from rstrack.tracking.spline_tracker import Tracker
 
-    return Tracker(rig, options, timer)
+    return Tracker(rig, options, timer, imu)

@@ -94,7 +94,7 @@ def bootstrap(track: Track, new: DeviceFrame) -> FrameReport:
 
 def _begin(track: Track, first: DeviceFrame, dt: float) -> Window:
     """A spline with knots dt s apart; a rolling first frame is what others are aligned to."""
-    window = Window.still(track.terms, track.rig.depth_camera.fx, first, dt, track.options.knot_phase)
+    window = Window.still(track.terms, track.rig.depth_camera.fx, first, dt, track.options.knot_phase, track.inertia)
     if first.depth.exposure.lens.lines > 1:
         track.succession.reference = track.maker.rolling(first.index, first.depth, first.colors, window.spline)
     track.window = window
@@ -163,6 +163,7 @@ def _leave(track: Track, window: Window) -> None:
         seen = [o for o in others if o.frame == frame.index]
         own = pulls(seen, window.state)
         track.chain.add(ref, seen, window.state, own.excess)
+        track.learn_inertia(seen, window, own.excess, frame.last_time)
         covariances.uncertainty = covariances.uncertainty.found_anew(own.information)
         if frame is not middle:
             covariances.add(frame, ref)

@@ -24,6 +24,8 @@ class FrameReport:
     what the errors of the keyframes before add to that against the first frame; None where there are none: of lost
     frames, and with the baseline. held_by_motion: largest part (0..1) that the motion before, not the images, has in
     what is known of any direction. moving: part of the depth image that was left out since it moves by itself.
+    bridged: its images were of no use, as fault says, and it has its pose from an IMU and from frames after it: until
+    these came, it was lost.
     """
 
     stamp: float
@@ -43,6 +45,7 @@ class FrameReport:
     held_by_motion: float = float("nan")
     moving: float = 0.0
     fault: Fault = Fault.NONE
+    bridged: bool = False
 
     def as_lost(self, fault: Fault) -> FrameReport:
         """The same frame, given up later on; one that is lost already stays so for its own reason."""

@@ -27,6 +27,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.adjustment.closing import Closed, closed
 from rstrack.adjustment.loops import Loop, LoopSearch
 from rstrack.adjustment.moves import Moves
+from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.rig import Frame, Rig
 from rstrack.images.device_frame import Timer, untimed
 from rstrack.keyframes.archive import Archive
@@ -55,11 +56,14 @@ class LoopTracker:
 
     def __init__(
         self, rig: Rig, options: Options | None = None, timer: Timer = untimed,
-        load: Callable[[int], Frame] | None = None,
+        load: Callable[[int], Frame] | None = None, imu: ImuRecording | None = None,
     ) -> None:  # fmt: skip
-        """load: a frame by its number, counted from 0 as they were fed; without it keyframes' images are kept."""
+        """load: a frame by its number, counted from 0 as they were fed; without it keyframes' images are kept.
+
+        imu: as `Tracker` has it.
+        """
         self.rig, self._load = rig, load
-        self._tracker = Tracker(rig, options, timer)
+        self._tracker = Tracker(rig, options, timer, imu)
         self._frames = KeptFrames(1e9 * self.options.memory_gb)
         self._held: deque[tuple[int, Frame]] = deque()
         self._moves = Moves()

@@ -20,11 +20,14 @@ from rsgen.geometry.spline import Spline
 from rstrack.adjustment.graph import Seen
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.pull import pulls
+from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.rig import Frame, Rig
 from rstrack.images.device_frame import DeviceFrame, Timer, untimed
+from rstrack.inertial.inertia import Inertia
 from rstrack.keyframes.archive import Archive
 from rstrack.options import Options
 from rstrack.tracking.bootstrap import bootstrap, fit_knots, start
+from rstrack.tracking.bridging import Bridge
 from rstrack.tracking.frame_report import FrameReport
 from rstrack.tracking.judgement.fault import Fault
 from rstrack.tracking.judgement.lost_track import doubted, draws, implausible, is_settled
@@ -38,17 +41,29 @@ from rstrack.tracking.window import LEVELS, TRACKING_LEVELS
 _GAP_S, _BREAK_S = 0.3, 3600.0
 # Seconds ahead that constant velocity predicts to within a few pixels: a hand turns by up to 10 rad/s² more.
 _SURE_S = 0.045
+# The same where an IMU leads: it is off by a millimetre or two then.
+_LED_S = 0.5
 # Frames of a new piece that are aligned jointly: fewer do not tell its velocity.
 _YOUNG = 4
+
+# What of a tracker frames change, beside its track.
+_STATE = "relocaliser", "bridge", "last_fed"
 
 
 class Tracker:
     """Estimates T_world_depth(t); the world is the depth camera's frame at the middle of the first image."""
 
-    def __init__(self, rig: Rig, options: Options | None = None, timer: Timer = untimed) -> None:
-        """timer: watches the parts of the work, see `Timer`."""
-        self._track = track = Track(rig, options or Options(), timer)
+    def __init__(
+        self, rig: Rig, options: Options | None = None, timer: Timer = untimed, imu: ImuRecording | None = None
+    ) -> None:  # fmt: skip
+        """timer: watches the parts of the work, see `Timer`. imu: of a unit on the cameras, for methods that use one;
+        UserError if they have none."""
+        options = options or Options()
+        if options.inertial and imu is None:
+            raise UserError(f"method {options.method}: needs an IMU's recording, and there is none")
+        self._track = track = Track(rig, options, timer, imu if options.inertial else None)
         self._relocaliser = Relocaliser(rig, track.options, track.keyframes, track.fits, track.observe)
+        self._bridge = Bridge()
         self._last_fed: float | None = None
 
     # -- what it has found ------------------------------------------------------------------------------------------
@@ -105,11 +120,14 @@ class Tracker:
     @property
     def state(self) -> dict[str, Any]:
         """All that feeding frames has changed."""
-        return {"track": self._track.state, "relocaliser": self._relocaliser, "last_fed": self._last_fed}
+        own = {name: getattr(self, f"_{name}") for name in _STATE}
+        return own | {"track": self._track.state}
 
     @state.setter
     def state(self, state: dict[str, Any]) -> None:
-        self._track.state, self._relocaliser, self._last_fed = state["track"], state["relocaliser"], state["last_fed"]
+        self._track.state = state["track"]
+        for name in _STATE:
+            setattr(self, f"_{name}", state[name])
 
     @property
     def archive(self) -> Archive:
@@ -127,6 +145,11 @@ class Tracker:
     def seen(self) -> list[Seen]:
         """What its frames said of the spline's control points."""
         return self._track.chain.seen
+
+    @property
+    def inertia(self) -> Inertia | None:
+        """What has been found of an IMU, where the method uses one."""
+        return self._track.inertia
 
     @property
     def drift(self) -> dict[int, FloatArray]:
@@ -185,6 +208,8 @@ class Tracker:
             report = start(track, new)
         elif not track.keyframes:
             report = bootstrap(track, new)
+        elif self._bridge.leads(track, new):
+            report = self._follow(new, stamp - track.found.stamps[-1], led=True)
         elif stamp - track.found.stamps[-1] > _GAP_S:
             report = self._relocalise(new)
         else:
@@ -192,8 +217,8 @@ class Tracker:
         track.reports.append(report)
         return report
 
-    def _follow(self, new: DeviceFrame, gap: float) -> FrameReport:
-        """Go on with a frame where the motion leads, `gap` s after the one before."""
+    def _follow(self, new: DeviceFrame, gap: float, led: bool = False) -> FrameReport:
+        """Go on with a frame where the motion leads, `gap` s after the one before; led: by an IMU."""
         track, fits = self._track, self._track.fits
         window, ref = track.known()
         before = window.copy()
@@ -206,7 +231,7 @@ class Tracker:
         gauge = ref if not window.is_frozen(ref.t) and new.depth.exposure.lens.lines == 1 else None
         mid, T_predicted = new.depth.exposure.mid_time, window.spline.pose(new.depth.exposure.mid_time)
         coupled = ref.rolling is not None
-        levels = LEVELS if young or gap > _SURE_S else TRACKING_LEVELS
+        levels = LEVELS if young or gap > (_LED_S if led else _SURE_S) else TRACKING_LEVELS
         left = LeftOut(new.depth)
 
         def leave_out() -> None:
@@ -235,7 +260,9 @@ class Tracker:
             uncertainty = track.covariances.uncertainty
             if ref.rolling is None:
                 # A rolling reference moves with what is aligned to it, which tells nothing of the two together.
-                uncertainty = uncertainty.after(new.stamp - track.found.stamps[-1], pulled.information)
+                seconds = new.stamp - track.found.stamps[-1]
+                accelerations = track.accelerations(window, seconds)
+                uncertainty = uncertainty.after(seconds, pulled.information, accelerations)
         if not fault and implausible(T_predicted, window.spline.pose(mid), gap):
             fault = Fault.TOO_FAR
         elif not fault and not uncertainty.is_known:
@@ -244,11 +271,15 @@ class Tracker:
             fault = Fault.DRAWS
         if fault:
             track.window = before
+            if led:
+                self._bridge.put(track, new)
+                return track.report(new, fault=fault)
             return self._relocalise(new, fault)
+        self._bridge.close(track)
         track.window, track.covariances.uncertainty = window, uncertainty
         new = replace(new, depth=left.depth)
         window.keep(fresh)
-        track.learn(ref, on_reference, window, pulled)
+        track.learn(ref, on_reference, window, pulled, new.last_time)
         track.succession.recent.append(new)
         track.placed(new, fresh)
         track.age += 1
@@ -279,6 +310,9 @@ class Tracker:
         track.chain.add(found.ref, found.fresh, found.window.state, pulls(found.fresh, found.window.state).excess)
         track.succession.use(found.ref, new)
         self._relocaliser.forget()
+        self._bridge.forget()
+        if track.inertia is not None:
+            track.inertia.begin_piece()
         track.age = 1
         track.placed(new, found.fresh, joined=False)
         return track.report(new, found.fresh, found.solved, overlap=track.succession.overlap(found.fresh))

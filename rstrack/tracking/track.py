@@ -15,10 +15,13 @@ from rstrack.alignment.independence import Independence
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.observation import Observation, observe
 from rstrack.alignment.optimizer import Solved
+from rstrack.alignment.priors import ACCELERATION
 from rstrack.alignment.pull import Pulls
 from rstrack.alignment.spline_state import SplineState
+from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.rig import Rig
 from rstrack.images.device_frame import DeviceFrame, DeviceRig, Timer
+from rstrack.inertial.inertia import Inertia
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.keyframes.store import KeyframeStore
@@ -42,9 +45,10 @@ class Track:
 
     window: None until there is a first frame. age: frames of the current piece of the spline. independence: of depth
     pixels, and of colour pixels. chain: what all frames said of the spline. reports: one of every frame fed.
+    inertia: what an IMU says beside them, or None.
     """
 
-    def __init__(self, rig: Rig, options: Options, timer: Timer) -> None:
+    def __init__(self, rig: Rig, options: Options, timer: Timer, imu: ImuRecording | None = None) -> None:
         self.rig, self.options = rig, options.decided(rig.depth_shutter)
         self.device = DeviceRig(rig, self.options, timer)
         self.terms = Terms.of(self.device, self.options)
@@ -57,11 +61,15 @@ class Track:
         self._finds_moving = self.options.moving and self.fits.is_modelled
         self.age = 0
         self.reports: list[FrameReport] = []
+        self.inertia = None if imu is None else Inertia(imu)
         self.begin_anew()
 
     def begin_anew(self) -> None:
         """Nothing has been found, of what was fed."""
         self.window: Window | None = None
+        self._told_by = -1
+        if self.inertia is not None:
+            self.inertia.begin_world()
         self.found, self.chain = FoundPoses(), Chain()
         self.covariances = PoseCovariances(self.rig.depth_camera.fx)
         self.succession = Succession(self.maker, self.keyframes, self.options, self.gains, self.covariances)
@@ -70,6 +78,8 @@ class Track:
     def shared(self) -> dict[str, object]:
         """What another track of the same rig and options has as well, by name."""
         own = {name: getattr(self, name) for name in _MADE_ANEW}
+        if self.inertia is not None:
+            own |= {"imu": self.inertia.recording, "imu_samples": self.inertia.samples}
         return own | {"engine": self.device.e, "timer": self.device.timer}
 
     @property
@@ -102,9 +112,15 @@ class Track:
             o.independent = 1.0 / self.independence[not o.is_depth].inflation
         return observations
 
-    def learn(self, ref: Reference, on_reference: Sequence[Observation], window: Window, pulled: Pulls) -> None:
-        """What a frame that was found says of the spline and of its pixels. on_reference: its observations of `ref`."""
+    def learn(
+        self, ref: Reference, on_reference: Sequence[Observation], window: Window, pulled: Pulls, end: float
+    ) -> None:  # fmt: skip
+        """What a frame that was found, and ends at time `end` (s), says of the spline and of its pixels.
+
+        on_reference: its observations of `ref`.
+        """
         self.chain.add(ref, on_reference, window.state, pulled.excess)
+        self.learn_inertia(on_reference, window, pulled.excess, end)
         for is_color, term in enumerate(self.independence):
             term.learn(o.inflation for o in on_reference if o.is_depth != is_color)
 
@@ -117,6 +133,30 @@ class Track:
             return [LeftOut(depth) for depth in depths]
         own = [[o for o in fresh if o.frame == frame.index] for frame in frames]
         return leave_out(self.space, depths, ref, own, state)
+
+    def learn_inertia(self, fresh: Sequence[Observation], window: Window, excess: float, end: float) -> None:
+        """What a frame that ends at time `end` (s) says of an IMU's biases and of gravity. excess: see `Pulls`."""
+        if self.inertia is not None:
+            self._shift_inertia(fresh)
+            models = [o.model(window.state).scaled(1.0 / excess**2) for o in fresh if o.is_linearised]
+            self.inertia.learn(window.state, window.piece, models, end)
+
+    def accelerations(self, window: Window, seconds: float) -> FloatArray:
+        """σ (6,) of accelerations over so many seconds, beyond what is known, m/s² and rad/s²: an IMU tells most."""
+        if self.inertia is None or seconds <= 0.0 or not window.is_led(self.found.end, self.found.end + seconds):
+            return ACCELERATION
+        R_depth_world = window.spline.pose(self.found.end)[:3, :3].T
+        told = self.inertia.accelerations(seconds, self.inertia.recording.T_imu_depth[:3, :3] @ R_depth_world)
+        return np.minimum(ACCELERATION, told)
+
+    def _shift_inertia(self, fresh: Sequence[Observation]) -> None:
+        """An IMU knows nothing of keyframes: that another one lies a little off is no motion."""
+        index = next((o.ref.index for o in fresh if o.ref.rolling is None), self._told_by)
+        drift = self.covariances.uncertainty.drift
+        if self.inertia is not None and self._told_by in drift and index in drift and index != self._told_by:
+            older, newer = sorted((index, self._told_by))
+            self.inertia.shift(drift[newer] - drift[older])
+        self._told_by = index
 
     def given(self, before: Window, after: Window) -> tuple[FloatArray, FloatArray]:
         """Poses (n, 4, 4) of the frames that still move, before and after a new one has been aligned."""

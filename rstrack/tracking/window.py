@@ -9,6 +9,7 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.linearise import Terms
+from rstrack.alignment.normal_equations import assemble, solve
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Problem, Solved, optimise
 from rstrack.alignment.priors import (
@@ -21,6 +22,7 @@ from rstrack.alignment.priors import (
 )
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.device_frame import DeviceFrame
+from rstrack.inertial.inertia import Inertia, InertialPrior
 from rstrack.keyframes.keyframe import Reference
 
 # The newest control points, whose weight in the newest lines is only u³/6, are held a good deal tighter by the motion
@@ -30,8 +32,15 @@ _END_TRIPLES, _END_FACTOR = 2, 0.1
 _GAUGE = np.full(6, 1e-6)
 # Control points that are held beyond those that are needed, and how many are released at once.
 _HELD, _RELEASED = 8, 128
+# Seconds for which control points that no new image touches stay free beside an IMU: about as long as what images say
+# of the motion gets better by averaging along it. And degrees that the camera turns in them, at most: keyframes are
+# made of frozen frames, and must not be left behind by then.
+_LAG_S, _LAG_DEG = 0.1, 3.0
 # Levels to go through from a prediction by constant velocity, and from anything worse.
 TRACKING_LEVELS, LEVELS = (1, 0), (2, 1, 0)
+# Steps from constant velocity to what an IMU says of the motion since the last frame, and a step (m, rad) that is the
+# last one.
+_LED_STEPS, _LED = 4, 1e-3
 # Steps at most on the pyramid's levels, finest first.
 _MOST_STEPS = (15, 8, 30)
 
@@ -41,22 +50,27 @@ class Window:
 
     piece: first control point of the current piece of the spline; those before it belong to another, or to a gap.
     first_free: first control point that moves when `solve` is called; all after it do. `active`: observations of
-    earlier frames that touch those. `focal`: the depth camera's, in pixels.
+    earlier frames that touch those. `focal`: the depth camera's, in pixels. inertia: an IMU beside the images, or None.
     """
 
-    def __init__(self, terms: Terms, focal: float, state: SplineState, piece: int = 0) -> None:
-        self._terms, self._focal = terms, focal
+    def __init__(
+        self, terms: Terms, focal: float, state: SplineState, piece: int = 0, inertia: Inertia | None = None
+    ) -> None:  # fmt: skip
+        self._terms, self._focal, self._inertia = terms, focal, inertia
         self.state, self.piece = state, piece
         self.first_free = piece
         self.active: list[Observation] = []
+        self._led: InertialPrior | None = None
 
     @classmethod
-    def still(cls, terms: Terms, focal: float, first: DeviceFrame, dt: float, phase: float) -> Window:
+    def still(
+        cls, terms: Terms, focal: float, first: DeviceFrame, dt: float, phase: float, inertia: Inertia | None = None
+    ) -> Window:  # fmt: skip
         """A camera at rest at the world's origin while its first frame is taken; knots dt s apart, one of them `phase`
         knots before it."""
         state = SplineState.still(min(first.first_time, first.stamp) - phase * dt, dt, np.eye(4))
         state.extend(first.last_time)
-        return cls(terms, focal, state)
+        return cls(terms, focal, state, inertia=inertia)
 
     @property
     def spline(self) -> Spline:
@@ -65,24 +79,56 @@ class Window:
 
     def copy(self) -> Window:
         """A window that can be changed without changing this one."""
-        twin = Window(self._terms, self._focal, self.state.copy(), self.piece)
+        twin = Window(self._terms, self._focal, self.state.copy(), self.piece, self._inertia)
         twin.first_free, twin.active = self.first_free, list(self.active)
         return twin
 
     def predict(self, new: DeviceFrame, end: float, young: bool = False) -> None:
-        """Go on with constant velocity from time `end` (s) until the frame is covered; what it touches is free.
+        """Go on with constant velocity, or as an IMU leads, from time `end` (s) until the frame is covered; what it
+        touches is free, and with an IMU what came shortly before.
 
-        young: the piece's first frame alone does not tell its velocity; all of the piece stays free.
+        young: the piece's first frame alone does not tell its velocity; all of the piece stays free. Where frames are
+        missing, and an IMU leads over the gap, all control points in it are free.
         """
-        self.state.smooth_end(end)
-        self.state.extend(new.last_time)
-        self.first_free = self.piece if young else max(self.piece, self.state.segment(new.first_time))
+        begin = self.state.segment(new.first_time)
+        if self.is_led(end, new.last_time):
+            self.state.extend(new.last_time)
+            self._follow_lead(end)
+            begin = max(self.first_free, min(begin, self.state.segment(end)) - self._lag(end))
+        else:
+            self.state.smooth_end(end)
+            self.state.extend(new.last_time)
+        self.first_free = self.piece if young else max(self.piece, begin)
         self.active = [o for o in self.active if o.is_linearised and o.lin.model.last > self.first_free]
+
+    def is_led(self, begin: float, end: float) -> bool:
+        """Whether an IMU tells the motion from time begin to end (s)."""
+        return self._inertia is not None and self._inertia.is_usable and self._inertia.covers(begin, end)
+
+    def _lag(self, end: float) -> int:
+        """Knots for which control points stay free before time `end` (s)."""
+        turning = float(np.degrees(np.linalg.norm(self.spline.velocity(end)[3:])))
+        return int(min(_LAG_S, _LAG_DEG / max(turning, 1e-9)) / self.state.dt + 0.5)
+
+    def _follow_lead(self, end: float) -> None:
+        """Move the control points that lines until time `end` (s) left open to where the IMU has them; the images seen
+        before hold the others."""
+        first = max(self.piece, min(self.first_free, self.state.segment(end)))
+        free = first, self.state.end
+        priors = [self._motion_prior(free), *self._inertial(free)]
+        active = [o for o in self.active if o.is_linearised]
+        for _ in range(_LED_STEPS):
+            models = [o.model(self.state) for o in active] + [prior(self.spline)[0] for prior in priors]
+            H, g = assemble(models, *free)
+            step = solve(H, g, len(g)).reshape(-1, 6)
+            self.state.apply(first, step)
+            if np.abs(step).max() < _LED:
+                break
 
     def restarted(self, new: DeviceFrame, end: float, T_world_body: FloatArray) -> Window:
         """The same spline up to time `end` (s), and a new piece at rest at T_world_body (4, 4) for a new frame."""
         state = self.state.restarted(end, new.first_time, new.last_time, T_world_body)
-        return Window(self._terms, self._focal, state, state.segment(new.first_time))
+        return Window(self._terms, self._focal, state, state.segment(new.first_time), self._inertia)
 
     def releasable(self, begin: float) -> int | None:
         """First control point that times from `begin` (s) on or the active observations depend on, if many are before
@@ -107,10 +153,11 @@ class Window:
         solved for becomes active with `keep`.
         """
         free = self.first_free, self.state.end
-        priors = [self._motion_prior(free)] + ([] if gauge is None else [_pose_prior(gauge)])
+        inertial = self._inertial(free)
+        priors = [self._motion_prior(free), *inertial] + ([] if gauge is None else [_pose_prior(gauge)])
         if self.piece > 0 and self.first_free == self.piece:
             priors.append(self._velocity_prior(free))
-        bandwidth = 6 * (free[1] - free[0]) if coupled else 24
+        bandwidth = 6 * (free[1] - free[0]) if coupled or inertial else 24
         problem = Problem(fresh, self.active, free, priors, self._focal, bandwidth)
         try:
             with self._terms.timer("optimiser"):
@@ -122,14 +169,26 @@ class Window:
     def keep(self, fresh: Sequence[Observation]) -> None:
         """Fresh observations take part from now on."""
         self.active += fresh
+        self._led = None
 
     def _motion_prior(self, free: tuple[int, int]) -> Prior:
         first, last = max(self.piece, free[0] - 2), free[1]
         sigma = np.repeat(ACCELERATION[None] * self.state.dt**2, last - first - 2, axis=0)
-        sigma[-_END_TRIPLES:] *= _END_FACTOR
+        if not self._inertial(free):
+            sigma[-_END_TRIPLES:] *= _END_FACTOR
         if free[0] == self.piece:
             sigma[: max(0, min(_END_TRIPLES, len(sigma) - _END_TRIPLES))] *= _END_FACTOR
         return lambda spline: acceleration_prior(spline, first, last, sigma)
+
+    def _inertial(self, free: tuple[int, int]) -> list[Prior]:
+        """What an IMU says, where it tells the newest control points."""
+        last = self.state.spline.t_end
+        if self._inertia is None or not self.is_led(last - 2.0 * self.state.dt, last):
+            return []
+        known = self._led
+        if known is None or known.state is not self.state or known.first > free[0] or known.end != self.state.end:
+            known = self._led = self._inertia.prior(self.state, self.piece, free[0])
+        return [known]
 
     def _velocity_prior(self, free: tuple[int, int]) -> Prior:
         """What is known of the motion of a piece that has just begun."""

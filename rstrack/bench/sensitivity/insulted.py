@@ -201,7 +201,8 @@ class _Watched:
 
 
 def _watch(dataset: Dataset, options: Options) -> _Watched:
-    tracker = make_tracker(dataset.rig, options, interval_s=dataset.interval_s(range(len(dataset))))
+    interval_s = dataset.interval_s(range(len(dataset)))
+    tracker = make_tracker(dataset.rig, options, interval_s=interval_s, imu=dataset.imu if options.inertial else None)
     seen = _Watched()
     settled: dict[int, FloatArray] = {}
     for k, frame in enumerate(dataset.frames()):

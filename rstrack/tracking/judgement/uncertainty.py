@@ -60,12 +60,15 @@ class Uncertainty:
         """Largest part, 0 to 1, that the motion before, not the images, has in what is known of any direction."""
         return float(np.clip(1.0 - np.linalg.eigvals(self.pose @ self.seen).real.min(), 0.0, 1.0))
 
-    def after(self, seconds: float, seen: FloatArray) -> Uncertainty:
-        """So many seconds later, with what the images then say (6, 6)."""
+    def after(self, seconds: float, seen: FloatArray, accelerations: FloatArray = ACCELERATION) -> Uncertainty:
+        """So many seconds later, with what the images then say (6, 6).
+
+        accelerations (6,): σ of what the velocity changes by beyond what is known, m/s² and rad/s².
+        """
         F = np.eye(12)
         F[:6, 6:] = seconds * np.eye(6)
         gain = np.concatenate([0.5 * seconds**2 * np.eye(6), seconds * np.eye(6)])
-        predicted = F @ self.state @ F.T + gain @ np.diag(ACCELERATION**2) @ gain.T
+        predicted = F @ self.state @ F.T + gain @ np.diag(accelerations**2) @ gain.T
         # P − P E (H⁻¹ + Eᵀ P E)⁻¹ Eᵀ P without the inverse of H, which may be singular.
         solved = np.linalg.solve(np.eye(6) + seen @ predicted[:6, :6], seen)
         updated = predicted - predicted[:, :6] @ solved @ predicted[:6]

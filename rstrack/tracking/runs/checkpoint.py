@@ -32,8 +32,8 @@ _EVERY_S, _SHARE = 30.0, 0.03
 # What a checkpoint is made of, and nothing else is called when one is read: classes that these define, and these names.
 _PACKAGES = (
     "rsgen.device.", "rsgen.geometry.", "rstrack.adjustment.", "rstrack.alignment.", "rstrack.images.",
-    "rstrack.keyframes.", "rstrack.tracking.", "rstrack.volume.", "rstrack.data.rig.", "rstrack.options.",
-    "collections.", "pathlib.",
+    "rstrack.inertial.", "rstrack.keyframes.", "rstrack.tracking.", "rstrack.volume.", "rstrack.data.rig.",
+    "rstrack.options.", "collections.", "pathlib.",
 )  # fmt: skip
 _NAMES = {
     ("numpy", "ndarray"), ("numpy", "dtype"), ("numpy._core.multiarray", "_reconstruct"),

@@ -41,7 +41,9 @@ def settings(dataset: Dataset, chosen: range, options: Options, noise: Noise) ->
     """What a run was made with: method, options, noise, versions, machine, and which frames of what."""
     from rsgen.device.arrays import engine
 
-    notes = {"notes": list(dataset.notes)} if dataset.notes else {}
+    read = dataset.read_imu if options.inertial else None
+    assumed = [*dataset.notes, *(() if read is None else read.notes)]
+    notes = {"notes": assumed} if assumed else {}
     versions = {name: version(name) for name in ("numpy", "scipy", "drjit")}
     return {
         "method": options.method,

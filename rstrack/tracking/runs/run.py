@@ -27,6 +27,7 @@ from rstrack.data.estimate import Estimate, write_estimate
 from rstrack.data.noise import with_noise
 from rstrack.data.prefetch import prefetched
 from rstrack.data.rig import Frame
+from rstrack.inertial import record as imu_record
 from rstrack.metrics.association import Truth, compare, truth_of
 from rstrack.metrics.run_evaluate import Evaluation, evaluate_clocks
 from rstrack.options import Options
@@ -59,14 +60,15 @@ def track(
     progress: Progress = no_progress,
     resume: bool = False,
     watch: Watch | None = None,
+    gravity: bool = False,
 ) -> Result:
     """Track frames of a dataset and write the run folder `out`: `write_estimate` says what is in it.
 
     Images that cannot be read are left out, and their frame with them if they are depth images. Where the run stops
     early, because of an interrupt, what there is gets written. Long runs write down where they are now and then: with
     `resume` such a run goes on from there, to the same bits as one that was never stopped (spline trackers without a
-    model). watch: looks on. Raises UserError: no such frames, `out` cannot be written or is a dataset, no frame was
-    tracked, a run of other settings is to be resumed.
+    model). watch: looks on. gravity: write what an IMU has up as +z. Raises UserError: no such frames, `out` cannot be
+    written or is a dataset, no frame was tracked, a run of other settings is to be resumed, no IMU where one is needed.
     """
     chosen = _chosen(dataset, frames)
     dataset = _with_color_evened(_with_color_timed(dataset, chosen, options, progress), chosen, options, progress)
@@ -80,9 +82,17 @@ def track(
     def again(index: int) -> Frame:
         return _readable(load(done.fed[index]))
 
-    tracker = make_tracker(dataset.rig, options, load=again, interval_s=dataset.interval_s(chosen))
+    # Methods without one do not care whether it can be read.
+    imu = dataset.imu if options.inertial else None
+    if options.inertial and imu is None:
+        without = options.method.removesuffix("i")
+        raise UserError(f"{dataset.root}: has no IMU, which --method {options.method} needs: take {without}")
+    if gravity and not options.inertial:
+        raise UserError(f"--gravity: method {options.method} does not tell where down is: take rs-pgi or rs-gi")
+    tracker = make_tracker(dataset.rig, options, load=again, interval_s=dataset.interval_s(chosen), imu=imu)
     from rstrack.tracking.loop_tracker import LoopTracker
-    from rstrack.tracking.runs.checkpoint import checkpoint_of  # these import Dr.Jit
+    from rstrack.tracking.runs.checkpoint import checkpoint_of
+    from rstrack.tracking.spline_tracker import Tracker  # these import Dr.Jit
 
     _make_folder(out)
     checkpoint = checkpoint_of(out, dataset, chosen, tracker, dataclasses.asdict(noise))
@@ -116,6 +126,15 @@ def track(
     found = tracker.uncorrected if isinstance(tracker, LoopTracker) else tracker
     online = Estimate(*found.trajectory, found.spline, info)
     estimate = online if closing is None else _corrected(online, closing)
+    unit = ""
+    if isinstance(found, Tracker) and found.inertia is not None:
+        info["imu"] = imu_record.record(found.inertia)
+        unit = imu_record.text(info["imu"], dataset.stamps[chosen[0]], sum(r.bridged for r in tracker.reports))
+        if gravity:
+            is_same = estimate is online
+            online = _upright(online)
+            estimate = online if is_same else _upright(estimate)
+            info["imu"]["gravity"] = [0.0, 0.0, -float(np.linalg.norm(info["imu"]["gravity"]))]
     evaluation, before = _evaluation(truth, estimate), None
     info["metrics"] = None if evaluation is None else evaluation.metrics.as_dict()
     info["truth_offset"] = None if evaluation is None else evaluation.truth_offset
@@ -129,7 +148,7 @@ def track(
         checkpoint.remove()
     left_out = tuple(problem for _, problem in done.unreadable)
     loops = "" if closing is None else _loops_text(closing, online, estimate, before)
-    return Result(estimate, evaluation, end, error, info["lost"], left_out, dataset.timing, loops)
+    return Result(estimate, evaluation, end, error, info["lost"], left_out, dataset.timing, loops, unit)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -220,6 +239,13 @@ def _corrected(online: Estimate, closing: Closing) -> Estimate:
         return online
     poses = closing.moves.poses(online.spline, online.stamps, online.T_world_depth)
     return Estimate(online.stamps, poses, closing.moves.spline(online.spline), online.info)
+
+
+def _upright(estimate: Estimate) -> Estimate:
+    """With z up, as its IMU has it."""
+    T_upright_world = imu_record.upright(np.array(estimate.info["imu"]["gravity"]))
+    spline = None if estimate.spline is None else imu_record.turned(T_upright_world, estimate.spline)
+    return Estimate(estimate.stamps, T_upright_world @ estimate.T_world_depth, spline, estimate.info)
 
 
 def _loops_text(closing: Closing, online: Estimate, estimate: Estimate, before: Evaluation | None) -> str:

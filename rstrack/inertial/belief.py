@@ -1,0 +1,84 @@
+"""What is believed of a unit's biases and of gravity: nine numbers, normally distributed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rsgen.array_types import FloatArray
+
+SIZE = 9
+"""Gyroscope's bias (rad/s), accelerometer's bias, gravity in the world (both m/s²)."""
+GYRO, ACCEL, GRAVITY = slice(0, 3), slice(3, 6), slice(6, 9)
+# σ of biases before anything is known: rad/s and m/s², as sheets of cheap units have them.
+_GYRO_BIAS, _ACCEL_BIAS = 0.1, 0.6
+# How well gravity's strength is known, m/s²: over the earth, and of a unit's scale.
+_STRENGTH = 0.03
+# σ of the gyroscope's bias (rad/s), and of the force (m/s²) that gravity and the accelerometer's bias make together in
+# an attitude, below which the unit is of use; and of gravity's direction, degrees, below which that is determined.
+_KNOWN_GYRO, _KNOWN_FORCE, _KNOWN_DEG = 5e-3, 0.15, 0.3
+
+
+@dataclass(frozen=True)
+class Belief:
+    """mean (9,): gyroscope's bias, accelerometer's bias, gravity in the world. information (9, 9): around that."""
+
+    mean: FloatArray
+    information: FloatArray
+
+    @classmethod
+    def initial(cls, gravity: FloatArray) -> Belief:
+        """Before anything is known; gravity (3,) a guess in the world, whose strength alone counts."""
+        sigma = np.repeat([_GYRO_BIAS, _ACCEL_BIAS, 3.0 * float(np.linalg.norm(gravity))], 3)
+        mean = np.concatenate([np.zeros(6), np.asarray(gravity, dtype=np.float64)])
+        return cls(mean, np.asarray(np.diag(sigma**-2.0)))
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(9, 9)."""
+        return np.asarray(np.linalg.inv(self.information))
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(9,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def direction(self) -> FloatArray:
+        """Unit vector (3,) along gravity, in the world: down."""
+        g = self.mean[GRAVITY]
+        return np.asarray(g / np.linalg.norm(g))
+
+    @property
+    def direction_deg(self) -> float:
+        """σ of gravity's direction in the worse of its two ways, degrees."""
+        across = np.eye(3) - np.outer(self.direction, self.direction)
+        worst = np.linalg.eigvalsh(across @ self.covariance[GRAVITY, GRAVITY] @ across)[-1]
+        return float(np.degrees(np.sqrt(max(0.0, worst)) / np.linalg.norm(self.mean[GRAVITY])))
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether gravity's direction is known to 0.3° (one σ): until then it may be the accelerometer's bias."""
+        return self.direction_deg < _KNOWN_DEG
+
+    def is_usable(self, R_imu_world: FloatArray) -> bool:
+        """Whether readings in an attitude (3, 3) tell accelerations to 0.15 m/s², and rates to 0.3 °/s."""
+        rates = np.diag(self.covariance)[GYRO]
+        return self.force_variance(R_imu_world) < _KNOWN_FORCE**2 and bool((rates < _KNOWN_GYRO**2).all())
+
+    def force_variance(self, R_imu_world: FloatArray) -> float:
+        """Of what gravity and the accelerometer's bias make together in an attitude (3, 3), in the worst direction."""
+        J = np.concatenate([np.zeros((3, 3)), np.eye(3), -R_imu_world], axis=1)
+        return float(np.linalg.eigvalsh(J @ self.covariance @ J.T)[-1])
+
+    def of_strength(self, strength: float) -> Belief:
+        """With gravity on the sphere of a known strength, m/s²: |g| is a measurement, taken where it is in the end."""
+        mean, start = self.mean, self.information @ self.mean
+        for _ in range(3):
+            u = np.zeros(SIZE)
+            u[GRAVITY] = mean[GRAVITY] / max(1e-9, float(np.linalg.norm(mean[GRAVITY])))
+            information = self.information + np.outer(u, u) / _STRENGTH**2
+            # |g| + u (g' − g) = strength, and u g = |g|.
+            mean = np.asarray(np.linalg.solve(information, start + u * strength / _STRENGTH**2))
+        return Belief(mean, 0.5 * (information + information.T))

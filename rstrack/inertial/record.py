@@ -1,0 +1,66 @@
+"""What a run says of an IMU at its end, in run.json and in a line on the screen; and a world that stands upright."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rsgen.array_types import FloatArray
+from rsgen.geometry import so3
+from rsgen.geometry.spline import Spline
+from rstrack.inertial.belief import ACCEL, GRAVITY, GYRO
+from rstrack.inertial.inertia import Inertia
+
+
+def record(inertia: Inertia) -> dict[str, Any]:
+    """Gravity in the run's world (m/s²) and the biases (rad/s, m/s²), each with σ, and when they were known (s)."""
+    belief, sigmas = inertia.belief, inertia.belief.sigmas
+    return {
+        "usable_s": _known(inertia.usable_s),
+        "gravity_determined_s": _known(inertia.determined_s),
+        "gravity": belief.mean[GRAVITY].tolist(),
+        "gravity_sigma_deg": belief.direction_deg,
+        "gyro_bias": belief.mean[GYRO].tolist(),
+        "gyro_bias_sigma": sigmas[GYRO].tolist(),
+        "accel_bias": belief.mean[ACCEL].tolist(),
+        "accel_bias_sigma": sigmas[ACCEL].tolist(),
+        "gyro_residual": float(inertia.sigma[0]),
+        "accel_residual": float(inertia.sigma[1]),
+    }
+
+
+def text(found: dict[str, Any], begin: float, bridged: int) -> str:
+    """One line of `record`; begin: stamp (s) of the run's first frame. bridged: frames whose pose is the IMU's."""
+    if found["usable_s"] is None:
+        return "IMU: it was of no use: too short a track to tell its biases"
+    known = found["gravity_determined_s"]
+    when = "" if known is None else f" (to 0.3° after {known - begin:.1f} s)"
+    biases = f"{_vector(found['gyro_bias'])} rad/s and {_vector(found['accel_bias'])} m/s²"
+    over = f", {bridged} frames bridged" if bridged else ""
+    return f"IMU: gravity known to {found['gravity_sigma_deg']:.2f}°{when}, biases {biases}{over}"
+
+
+def upright(gravity: FloatArray) -> FloatArray:
+    """T_upright_world (4, 4) by the shortest turn: gravity (3,), in the world, points along −z of what is upright."""
+    up = -gravity / np.linalg.norm(gravity)
+    axis, cosine = np.cross(up, [0.0, 0.0, 1.0]), float(up[2])
+    sine = float(np.linalg.norm(axis))
+    # Upside down every axis across is as short a way.
+    axis = axis / sine if sine > 1e-9 else np.array([1.0, 0.0, 0.0])
+    T = np.eye(4)
+    T[:3, :3] = so3.exp(np.arctan2(sine, cosine) * axis)
+    return T
+
+
+def turned(T_upright_world: FloatArray, spline: Spline) -> Spline:
+    """T_upright_body(t) of T_world_body(t)."""
+    return Spline(T_upright_world @ spline.control_points, spline.t0, spline.dt, spline.first)
+
+
+def _known(seconds: float) -> float | None:
+    return seconds if np.isfinite(seconds) else None
+
+
+def _vector(values: list[float]) -> str:
+    return "(" + ", ".join(f"{value:.4f}" for value in values) + ")"

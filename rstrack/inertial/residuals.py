@@ -1,0 +1,125 @@
+"""Residuals of gyroscope and accelerometer at their own stamps, by the spline's control points, biases and gravity.
+
+r = [ω_imu + b_g − gyro; a_imu − R_imu_world g + b_a − accel], with twist and rate taken to the unit by the adjoint of
+T_imu_depth, lever arm included: a_imu = v̇ + ω × v there (DESIGN section 4).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rsgen.array_types import FloatArray, IntArray
+from rsgen.geometry import se3
+from rsgen.geometry.so3 import cross, hat
+from rsgen.geometry.spline import Spline
+from rstrack.alignment.normal_equations import Quadratic
+from rstrack.data.imu.recording import ImuRecording
+from rstrack.inertial.belief import ACCEL, GRAVITY, GYRO, SIZE, Belief
+from rstrack.inertial.derivatives import motion
+
+# Readings within this part of the range's end are saturated, or may be.
+_SATURATED = 0.995
+
+
+@dataclass(frozen=True)
+class Samples:
+    """n of a unit's samples: t (n,) s, values (n, 6) = [gyro; accel], counts (n, 6): whether a reading does."""
+
+    t: FloatArray
+    values: FloatArray
+    counts: FloatArray
+
+    @classmethod
+    def of(cls, imu: ImuRecording) -> Samples:
+        """All of a recording; saturated readings and those that are not numbers do not count."""
+        gyro = np.full_like(imu.accel, np.nan) if imu.gyro is None else imu.gyro
+        values = np.concatenate([gyro, imu.accel], axis=1)
+        limits = [np.inf if r is None else _SATURATED * r for r in (imu.noise.gyro_range, imu.noise.accel_range)]
+        with np.errstate(invalid="ignore"):
+            counts = np.isfinite(values) & (np.abs(values) < np.repeat(limits, 3))
+        return cls(np.asarray(imu.t, dtype=np.float64), np.where(counts, values, 0.0), counts.astype(np.float64))
+
+    def between(self, begin: float, end: float) -> Samples:
+        """Those of begin ≤ t < end."""
+        part = slice(*np.searchsorted(self.t, [begin, end]))
+        return Samples(self.t[part], self.values[part], self.counts[part])
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+
+@dataclass(frozen=True)
+class Joint:
+    """½ xᵀ H x + gᵀ x over control points from `first` on and, last, the nine numbers of a `Belief`; cost: at x = 0."""
+
+    first: int
+    H: FloatArray
+    g: FloatArray
+    cost: float
+
+    @property
+    def count(self) -> int:
+        """Control points."""
+        return (len(self.g) - SIZE) // 6
+
+    def without_belief(self, information: FloatArray) -> tuple[Quadratic, float]:
+        """Over the control points alone, the nine numbers being best at every step and known beforehand as
+        `information` (9, 9) says."""
+        z = slice(6 * self.count, None)
+        c = slice(0, 6 * self.count)
+        solved = np.linalg.solve(self.H[z, z] + information, np.column_stack([self.H[z, c], self.g[z]]))
+        H = self.H[c, c] - self.H[c, z] @ solved[:, :-1]
+        g = self.g[c] - self.H[c, z] @ solved[:, -1]
+        return Quadratic(self.first, 0.5 * (H + H.T), g), self.cost - 0.5 * float(self.g[z] @ solved[:, -1])
+
+
+def residuals(
+    spline: Spline, samples: Samples, T_imu_depth: FloatArray, belief: FloatArray
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """r (n, 6), its derivatives (n, 6, 33) by the four control points and by the belief's nine numbers, and the first
+    of these control points (n,).
+
+    belief (9,): see `Belief`. All samples' times must be within the spline.
+    """
+    at = motion(spline, samples.t)
+    Ad, n = se3.adjoint(T_imu_depth), len(samples)
+    twist, rate = at.twist @ Ad.T, at.rate @ Ad.T
+    by_twist, by_rate = Ad @ at.by_twist, Ad @ at.by_rate
+    v, omega = twist[:, :3], twist[:, 3:]
+    R_imu_world = T_imu_depth[:3, :3] @ np.swapaxes(at.rotation, 1, 2)
+    g = belief[GRAVITY]
+    r = np.concatenate([omega + belief[GYRO], rate[:, :3] + cross(omega, v) - R_imu_world @ g + belief[ACCEL]], axis=1)
+    J = np.zeros((n, 6, 24 + SIZE))
+    J[:, :3, :24] = by_twist[:, 3:]
+    J[:, 3:, :24] = by_rate[:, :3] + hat(omega) @ by_twist[:, :3] - hat(v) @ by_twist[:, 3:]
+    # R ← exp(φ) R turns Rᵀ g by Rᵀ g^ φ.
+    J[:, 3:, :24] -= (R_imu_world @ hat(g)) @ at.by_turn
+    J[:, :3, 24:27] = J[:, 3:, 27:30] = np.eye(3)
+    J[:, 3:, 30:] = -R_imu_world
+    return r - samples.values, J, at.first
+
+
+def summed(
+    spline: Spline, samples: Samples, T_imu_depth: FloatArray, belief: Belief, sigma: FloatArray
+) -> tuple[Joint | None, FloatArray]:
+    """The samples' normal equations around the spline and the belief's mean, and their residuals (n, 6).
+
+    sigma (2,): of a gyroscope's reading (rad/s), of an accelerometer's (m/s²). None without samples.
+    """
+    if not len(samples):
+        return None, np.zeros((0, 6))
+    r, J, segments = residuals(spline, samples, T_imu_depth, belief.mean)
+    root = samples.counts / np.repeat(sigma, 3)
+    whitened = np.concatenate([J, r[..., None]], axis=2) * root[..., None]
+    starts = np.flatnonzero(np.diff(segments, prepend=segments[0] - 1))
+    first, count = int(segments[0]), int(segments[-1] - segments[0]) + 4
+    size = 6 * count + SIZE
+    total = np.zeros((size + 1, size + 1))
+    tail = np.arange(6 * count, size + 1)
+    for begin, end in zip(starts, [*starts[1:], len(segments)], strict=True):
+        rows = whitened[begin:end].reshape(-1, 24 + SIZE + 1)
+        at = np.concatenate([6 * (segments[begin] - first) + np.arange(24), tail])
+        total[np.ix_(at, at)] += rows.T @ rows
+    return Joint(first, total[:-1, :-1], total[:-1, -1], 0.5 * float(total[-1, -1])), r

@@ -1,0 +1,117 @@
+"""A fixed-lag smoother over the newest control points, biases and gravity: what all images and samples so far say.
+
+Each image's normal equations and each sample are added once. Control points that nothing new depends on are
+marginalised, not fixed: a spline held where it was estimated would make biases look far better known than they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rsgen.array_types import FloatArray
+from rstrack.alignment.normal_equations import Quadratic
+from rstrack.alignment.spline_state import SplineState
+from rstrack.inertial.belief import GRAVITY, SIZE, Belief
+from rstrack.inertial.residuals import Joint
+
+# Information of a control point that nothing tells (σ 100 m, rad): systems are never singular.
+_NOTHING = 1e-4
+
+
+@dataclass
+class Smoother:
+    """½ xᵀ H x + gᵀ x over control points `first`... and the nine numbers of a belief, as increments since the control
+    points had received `at` (k, 6) and around `belief` (9,)."""
+
+    first: int
+    H: FloatArray
+    g: FloatArray
+    at: FloatArray
+    belief: FloatArray
+
+    @classmethod
+    def start(cls, belief: Belief) -> Smoother:
+        """Without any control points."""
+        return cls(0, belief.information.copy(), np.zeros(SIZE), np.zeros((0, 6)), belief.mean)
+
+    @property
+    def last(self) -> int:
+        """One past the last control point."""
+        return self.first + len(self.at)
+
+    def reach(self, state: SplineState, first: int, last: int) -> None:
+        """Be around a state, and hold its control points up to `last`; from `first` on, if there are none yet."""
+        if not len(self.at):
+            self.first = first
+        if len(self.at):
+            self.g = self.g + self.H[:, :-SIZE] @ (state.received(self.first, self.last) - self.at).ravel()
+        missing = 6 * max(0, last - self.last)
+        if missing:
+            c, size = len(self.g) - SIZE, len(self.g) + missing
+            order = np.concatenate([np.arange(c), np.arange(c + missing, size)])
+            H, g = np.diag(np.full(size, _NOTHING)), np.zeros(size)
+            H[np.ix_(order, order)], g[order] = self.H, self.g
+            self.H, self.g = H, g
+        self.at = state.received(self.first, max(last, self.last))
+
+    def around(self, belief: FloatArray) -> None:
+        """Be around another belief (9,)."""
+        self.g = self.g + self.H[:, -SIZE:] @ (belief - self.belief)
+        self.belief = belief.copy()
+
+    def add(self, model: Quadratic | Joint) -> None:
+        """What is around the same state (and belief). Control points before the first are taken to be fixed."""
+        tail = SIZE if isinstance(model, Joint) else 0
+        count = (len(model.g) - tail) // 6
+        low, high = max(model.first, self.first), min(model.first + count, self.last)
+        if low >= high:
+            return
+        size = len(self.g)
+        both = 6 * low + np.arange(6 * (high - low))
+        own = np.concatenate([both - 6 * model.first, 6 * count + np.arange(tail)])
+        to = np.concatenate([both - 6 * self.first, size - tail + np.arange(tail)])
+        self.H[np.ix_(to, to)] += model.H[np.ix_(own, own)]
+        self.g[to] += model.g[own]
+
+    def diffuse(self, variance: FloatArray) -> None:
+        """The nine numbers walk on: variances (9,) of their steps."""
+        walks = np.flatnonzero(variance > 0.0)
+        ways = np.zeros((len(self.g), len(walks)))
+        ways[len(self.g) - SIZE + walks, np.arange(len(walks))] = 1.0
+        self._loosen(ways, np.diag(variance[walks]))
+
+    def shift(self, covariance: FloatArray) -> None:
+        """What is held comes to lie elsewhere in the world, as one body, with gravity: by a left increment with
+        covariance (6, 6), as where images are aligned to another keyframe from now on."""
+        x, y, z = self.belief[GRAVITY]
+        ways = np.concatenate([np.tile(np.eye(6), (len(self.at), 1)), np.zeros((SIZE, 6))])
+        ways[-3:, 3:] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]  # φ × g
+        self._loosen(ways, covariance)
+
+    def _loosen(self, ways: FloatArray, covariance: FloatArray) -> None:
+        """Noise of a covariance (m, m) along ways (n, m): (H⁻¹ + M Q Mᵀ)⁻¹ = H − H M (I + Q Mᵀ H M)⁻¹ Q Mᵀ H, the mean
+        staying where it is."""
+        rows = ways.T @ self.H
+        gains = np.linalg.solve(np.eye(len(covariance)) + covariance @ rows @ ways, covariance @ rows)
+        self.g = self.g - gains.T @ (ways.T @ self.g)
+        H = self.H - rows.T @ gains
+        self.H = 0.5 * (H + H.T)
+
+    def forget(self, first: int) -> None:
+        """Marginalise the control points before number `first`."""
+        count = 6 * min(max(0, first - self.first), len(self.at))
+        if not count:
+            return
+        solved = np.linalg.solve(self.H[:count, :count], np.column_stack([self.H[:count, count:], self.g[:count]]))
+        H = self.H[count:, count:] - self.H[count:, :count] @ solved[:, :-1]
+        self.g = self.g[count:] - self.H[count:, :count] @ solved[:, -1]
+        self.H, self.at = 0.5 * (H + H.T), self.at[count // 6 :]
+        self.first += count // 6
+
+    def marginal(self) -> Belief:
+        """What is believed of the nine numbers."""
+        only = Smoother(self.first, self.H, self.g, self.at, self.belief)
+        only.forget(self.last)
+        return Belief(self.belief - np.linalg.solve(only.H, only.g), only.H)

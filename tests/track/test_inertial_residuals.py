@@ -1,0 +1,142 @@
+"""IMU residuals on the spline: values against the generator's, derivatives against finite differences, sums."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rsgen.array_types import FloatArray
+from rsgen.geometry import se3
+from rsgen.geometry.spline import Spline
+from rsgen.sensors.imu import exact_imu
+from rstrack.data.imu.recording import ImuNoise, ImuRecording
+from rstrack.inertial.belief import SIZE, Belief
+from rstrack.inertial.derivatives import motion
+from rstrack.inertial.residuals import Samples, residuals, summed
+
+T_IMU_DEPTH = se3.exp([0.03, -0.02, 0.05, 0.3, -1.2, 0.7])
+GRAVITY = np.array([1.0, -9.0, 3.5])
+BIAS = np.array([0.01, -0.02, 0.03, 0.1, 0.2, -0.3])
+
+
+def wild_spline(seed: int = 0, count: int = 9, first: int = 0) -> Spline:
+    rng = np.random.default_rng(seed)
+    points = [np.eye(4)]
+    for _ in range(count - 1):
+        points.append(points[-1] @ se3.exp(rng.normal(0.0, [0.1] * 3 + [0.3] * 3)))
+    return Spline(np.array(points), -0.1, 0.05, first)
+
+
+def recording(spline: Spline, t: FloatArray, noise: ImuNoise | None = None) -> ImuRecording:
+    gyro, accel = exact_imu(spline, T_IMU_DEPTH, GRAVITY, t)
+    noise = noise or ImuNoise(1e-4, 1e-5, 1e-3, 1e-4)
+    return ImuRecording(t, gyro + BIAS[:3], accel + BIAS[3:], noise, T_IMU_DEPTH, 200.0)
+
+
+def moved(spline: Spline, number: int, axis: int, step: float) -> Spline:
+    points = spline.control_points.copy()
+    increment = np.zeros(6)
+    increment[axis] = step
+    points[number] = se3.exp(increment) @ points[number]
+    return Spline(points, spline.t0, spline.dt, spline.first)
+
+
+def test_motion_is_the_splines() -> None:
+    spline = wild_spline(first=5)
+    t = np.linspace(spline.t_begin, spline.t_end, 23)
+    at = motion(spline, t)
+    np.testing.assert_allclose(at.twist, spline.velocity(t), atol=1e-12)
+    np.testing.assert_allclose(at.rate, spline.acceleration(t), atol=1e-10)
+    np.testing.assert_allclose(at.rotation, spline.pose(t)[:, :3, :3], atol=1e-14)
+    J = np.moveaxis(spline.pose_jacobian(t)[1][:, :, 3:], 1, 2).reshape(len(t), 3, 24)
+    np.testing.assert_allclose(at.by_turn, J, atol=1e-11)
+
+
+def test_residuals_vanish_at_the_truth() -> None:
+    spline = wild_spline()
+    imu = recording(spline, np.linspace(spline.t_begin, spline.t_end, 40))
+    r, _, _ = residuals(spline, Samples.of(imu), T_IMU_DEPTH, np.concatenate([BIAS, GRAVITY]))
+    assert np.abs(r).max() < 1e-11
+
+
+def test_derivatives_by_control_points_are_finite_differences() -> None:
+    spline = wild_spline(3)
+    t = np.linspace(spline.t_begin, spline.t_end, 13)
+    samples, belief = Samples.of(recording(wild_spline(4), t)), np.concatenate([BIAS, GRAVITY])
+    _, J, first = residuals(spline, samples, T_IMU_DEPTH, belief)
+    step, worst = 1e-5, np.zeros(2)
+    for number in range(len(spline.control_points)):
+        for axis in range(6):
+            ends = [residuals(moved(spline, number, axis, s * step), samples, T_IMU_DEPTH, belief)[0] for s in (-1, 1)]
+            told = np.zeros((len(t), 6))
+            for k in np.flatnonzero((first <= number) & (number < first + 4)):
+                told[k] = J[k, :, 6 * (number - first[k]) + axis]
+            off = np.abs((ends[1] - ends[0]) / (2 * step) - told)
+            worst = np.maximum(worst, [off[:, :3].max(), off[:, 3:].max()])
+    # Rates go with 1/dt, accelerations with 1/dt²: 20 and 400.
+    assert (worst < [1e-6, 2e-5]).all() and np.abs(J[:, 3:, :24]).max() > 100.0
+
+
+def test_derivatives_by_biases_and_gravity_are_finite_differences() -> None:
+    spline = wild_spline(3)
+    samples = Samples.of(recording(spline, np.linspace(spline.t_begin, spline.t_end, 13)))
+    belief = np.concatenate([BIAS, GRAVITY])
+    _, J, _ = residuals(spline, samples, T_IMU_DEPTH, belief)
+    for i, e in enumerate(np.eye(SIZE)):
+        ends = [residuals(spline, samples, T_IMU_DEPTH, belief + s * e)[0] for s in (-0.5, 0.5)]
+        np.testing.assert_allclose(ends[1] - ends[0], J[:, :, 24 + i], atol=1e-9)
+
+
+def test_sums_are_the_dense_least_squares() -> None:
+    spline = wild_spline(3)
+    samples = Samples.of(recording(wild_spline(4), np.linspace(spline.t_begin + 0.06, spline.t_end, 50)))
+    belief, sigma = Belief.initial(GRAVITY), np.array([0.01, 0.2])
+    joint, r = summed(spline, samples, T_IMU_DEPTH, belief, sigma)
+    assert joint is not None and joint.first == 1 and joint.count == len(spline.control_points) - 1
+    _, J, first = residuals(spline, samples, T_IMU_DEPTH, belief.mean)
+    dense = np.zeros((len(r), 6, 6 * joint.count + SIZE))
+    for k, at in enumerate(first - 1):
+        dense[k, :, 6 * at : 6 * at + 24], dense[k, :, -SIZE:] = J[k, :, :24], J[k, :, 24:]
+    scaled = (dense / np.repeat(sigma, 3)[:, None]).reshape(-1, dense.shape[2])
+    target = (r / np.repeat(sigma, 3)).ravel()
+    np.testing.assert_allclose(joint.H, scaled.T @ scaled, rtol=1e-9, atol=1e-6 * np.abs(joint.H).max())
+    np.testing.assert_allclose(joint.g, scaled.T @ target, rtol=1e-9, atol=1e-9 * np.abs(joint.g).max())
+    assert joint.cost == pytest.approx(0.5 * float(target @ target))
+
+
+def test_belief_is_eliminated_as_if_it_were_solved_for() -> None:
+    spline = wild_spline(3)
+    samples = Samples.of(recording(wild_spline(4), np.linspace(spline.t_begin, spline.t_end, 50)))
+    belief = Belief.initial(GRAVITY)
+    joint, _ = summed(spline, samples, T_IMU_DEPTH, belief, np.array([0.01, 0.2]))
+    assert joint is not None
+    model, cost = joint.without_belief(belief.information)
+    step = np.random.default_rng(0).normal(0.0, 1e-3, len(model.g))
+    H, g = joint.H.copy(), joint.g
+    H[-SIZE:, -SIZE:] += belief.information
+    c, z = slice(0, -SIZE), slice(-SIZE, None)
+    best = -np.linalg.solve(H[z, z], g[z] + H[z, c] @ step)
+    whole = np.concatenate([step, best])
+    expected = joint.cost + g @ whole + 0.5 * whole @ H @ whole
+    assert cost + model.g @ step + 0.5 * step @ model.H @ step == pytest.approx(expected, rel=1e-9)
+
+
+def test_saturated_and_missing_readings_do_not_count() -> None:
+    t = np.array([0.0, 0.1])
+    noise = ImuNoise(1e-4, 1e-5, 1e-3, 1e-4, gyro_range=4.0, accel_range=20.0)
+    gyro = np.array([[4.0, 3.9, -4.0], [np.nan, 0.0, 0.0]])
+    accel = np.array([[0.0, -20.0, 19.0], [np.inf, 0.0, 0.0]])
+    samples = Samples.of(ImuRecording(t, gyro, accel, noise, np.eye(4), 10.0))
+    np.testing.assert_array_equal(samples.counts, [[0, 1, 0, 1, 0, 1], [0, 1, 1, 0, 1, 1]])
+    assert np.isfinite(samples.values).all()
+    without = Samples.of(ImuRecording(t, None, accel[:1].repeat(2, 0), noise, np.eye(4), 10.0))
+    assert not without.counts[:, :3].any() and without.counts[:, 3:].any()
+
+
+def test_gravity_of_a_known_strength_is_on_its_sphere() -> None:
+    start = Belief.initial(np.array([0.0, -9.0, 0.0]))
+    told = Belief(np.concatenate([BIAS, [3.0, -9.0, 4.0]]), start.information + np.diag([0.0] * 6 + [4.0] * 3))
+    found = told.of_strength(9.80665)
+    assert np.linalg.norm(found.mean[6:]) == pytest.approx(9.80665, abs=2e-3)
+    # All directions were known alike: the nearest point of the sphere is the best.
+    np.testing.assert_allclose(found.direction, told.direction, atol=1e-6)

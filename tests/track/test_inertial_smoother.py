@@ -1,0 +1,180 @@
+"""Biases and gravity beside a spline: against SciPy's least squares, against dense algebra, and over many seeds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from rsgen.array_types import FloatArray
+from rsgen.config.imu import ImuConfig
+from rsgen.geometry import se3
+from rsgen.geometry.spline import Spline
+from rsgen.sensors.imu import exact_imu, simulate_imu
+from rstrack.alignment.normal_equations import Quadratic
+from rstrack.alignment.priors import pose_constraint
+from rstrack.alignment.spline_state import SplineState
+from rstrack.data.imu.recording import ImuNoise, ImuRecording
+from rstrack.inertial.belief import SIZE, Belief
+from rstrack.inertial.inertia import Inertia
+from rstrack.inertial.residuals import Samples, summed
+from rstrack.inertial.smoother import Smoother
+
+GRAVITY = np.array([2.0, -8.6, 4.262])
+STRENGTH = float(np.linalg.norm(GRAVITY))
+BIAS = np.array([0.01, -0.008, 0.006, 0.1, -0.07, 0.05])
+DT, POSE_SIGMA = 0.025, np.repeat([3e-4, 3e-4], 3)
+
+
+def hand_held(seconds: float, seed: int) -> Spline:
+    """Sways of some centimetres and degrees, up to 2 Hz."""
+    rng = np.random.default_rng(seed)
+    t = DT * (np.arange(int(seconds / DT) + 4) - 1)
+    frequency, phase = rng.uniform(0.2, 2.0, (6, 4)), rng.uniform(0.0, 6.3, (6, 4))
+    size = np.repeat([0.03, 0.1], 3)[:, None] / (1.0 + frequency)
+    twists = (size[..., None] * np.sin(2 * np.pi * frequency[..., None] * t + phase[..., None])).sum(axis=1).T
+    return Spline(se3.exp(twists), -DT, DT)
+
+
+def recording(spline: Spline, seed: int, walk: float = 1.0) -> ImuRecording:
+    config = ImuConfig(
+        gravity=tuple(GRAVITY), T_imu_depth=tuple(map(tuple, se3.exp([0.01, 0.02, -0.01, 0.1, 0.2, 1.5]).tolist())),
+        gyroscope_noise_density=7e-5, gyroscope_random_walk=walk * 1e-5, accelerometer_noise_density=1e-3,
+        accelerometer_random_walk=walk * 1e-4, gyroscope_bias=tuple(BIAS[:3]), accelerometer_bias=tuple(BIAS[3:]),
+    )  # fmt: skip
+    read = simulate_imu(spline, config, spline.t_begin, spline.t_end, seed)
+    noise = ImuNoise(7e-5, max(walk, 1e-3) * 1e-5, 1e-3, max(walk, 1e-3) * 1e-4)
+    T_imu_depth = se3.inverse(config.T_depth_imu())
+    return ImuRecording(read.t, read.gyro, read.accel, noise, T_imu_depth, 200.0, STRENGTH)
+
+
+def seen_poses(spline: Spline, rng: np.random.Generator, every: float = 1 / 30) -> list[tuple[float, FloatArray]]:
+    times = np.arange(spline.t_begin + 0.01, spline.t_end, every)
+    errors = POSE_SIGMA * rng.standard_normal((len(times), 6))
+    return list(zip(times.tolist(), se3.exp(errors) @ spline.pose(times), strict=True))
+
+
+def test_a_small_problem_is_solved_as_by_scipy() -> None:
+    truth = hand_held(0.05, 1)
+    imu, poses = recording(truth, 2), seen_poses(truth, np.random.default_rng(3), 0.01)
+    times, T_seen = np.array([t for t, _ in poses]), np.array([T for _, T in poses])
+    samples, sigma = Samples.of(imu), np.array([2e-3, 0.03])
+    start = Belief.initial(GRAVITY + np.array([0.5, -0.3, 0.4]))
+    first = Spline(se3.exp(np.random.default_rng(4).normal(0.0, 2e-3, (len(truth.control_points), 6)))
+                   @ truth.control_points, truth.t0, truth.dt)  # fmt: skip
+    count = len(first.control_points)
+
+    def cost(x: FloatArray) -> FloatArray:
+        moved = Spline(se3.exp(x[:-SIZE].reshape(-1, 6)) @ first.control_points, first.t0, first.dt)
+        belief = start.mean + x[-SIZE:]
+        gyro, force = exact_imu(moved, imu.T_imu_depth, belief[6:], samples.t)
+        r = np.concatenate([gyro, force], axis=1) + belief[:6] - samples.values
+        seen = se3.log(moved.pose(times) @ se3.inverse(T_seen)) / POSE_SIGMA
+        known = (belief - start.mean) * np.sqrt(np.diag(start.information))
+        return np.concatenate([(r / np.repeat(sigma, 3)).ravel(), seen.ravel(), known])
+
+    expected = least_squares(cost, np.zeros(6 * count + SIZE), x_scale="jac", method="trf", xtol=1e-14, ftol=1e-14)
+    state, belief = SplineState(first), start.mean.copy()
+    for _ in range(5):
+        smoother = Smoother.start(start)
+        smoother.around(belief)
+        smoother.reach(state, 0, count)
+        for t, T in poses:
+            smoother.add(pose_constraint(state.spline, t, T, POSE_SIGMA)[0])
+        joint, _ = summed(state.spline, samples, imu.T_imu_depth, Belief(belief, start.information), sigma)
+        assert joint is not None
+        smoother.add(joint)
+        step = -np.linalg.solve(smoother.H, smoother.g)
+        np.testing.assert_allclose(smoother.marginal().mean, belief + step[-SIZE:], atol=1e-8)
+        state.apply(0, step[:-SIZE].reshape(-1, 6))
+        belief = belief + step[-SIZE:]
+    best = Spline(se3.exp(expected.x[:-SIZE].reshape(-1, 6)) @ first.control_points, first.t0, first.dt)
+    np.testing.assert_allclose(belief, start.mean + expected.x[-SIZE:], atol=1e-5)
+    t = np.linspace(best.t_begin, best.t_end, 20)
+    np.testing.assert_allclose(state.spline.pose(t), best.pose(t), atol=1e-7)
+
+
+def filled(seed: int = 0) -> Smoother:
+    rng = np.random.default_rng(seed)
+    smoother = Smoother.start(Belief.initial(GRAVITY))
+    smoother.reach(SplineState.still(0.0, DT, np.eye(4), 6), 0, 6)
+    root = rng.normal(0.0, 1.0, (90, 45))
+    smoother.H, smoother.g = smoother.H + root.T @ root, rng.normal(0.0, 1.0, 45)
+    return smoother
+
+
+def test_marginalising_leaves_the_rest_as_it_was() -> None:
+    smoother = filled()
+    covariance, mean = np.linalg.inv(smoother.H), -np.linalg.solve(smoother.H, smoother.g)
+    for first in (2, 3, 5):
+        smoother.forget(first)
+        rest = slice(6 * first, None)
+        np.testing.assert_allclose(np.linalg.inv(smoother.H), covariance[rest, rest], atol=1e-9)
+        np.testing.assert_allclose(-np.linalg.solve(smoother.H, smoother.g), mean[rest], atol=1e-9)
+    assert smoother.first == 5 and smoother.last == 6
+
+
+def test_walks_and_shifts_add_to_covariances_and_leave_means() -> None:
+    smoother = filled(1)
+    before, mean = np.linalg.inv(smoother.H), -np.linalg.solve(smoother.H, smoother.g)
+    variance = np.array([0.1, 0.2, 0.3, 0.0, 0.0, 0.4, 0.0, 0.0, 0.0])
+    smoother.diffuse(variance)
+    root = np.random.default_rng(2).normal(0.0, 0.1, (6, 6))
+    smoother.shift(root @ root.T)
+    ways = np.concatenate([np.tile(np.eye(6), (6, 1)), np.zeros((9, 6))])
+    for i, axis in enumerate(np.eye(3)):
+        ways[-3:, 3 + i] = np.cross(axis, smoother.belief[6:])
+    expected = before + np.diag(np.concatenate([np.zeros(36), variance])) + ways @ root @ root.T @ ways.T
+    np.testing.assert_allclose(np.linalg.inv(smoother.H), expected, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(-np.linalg.solve(smoother.H, smoother.g), mean, atol=1e-8)
+
+
+def learnt(seed: int, seconds: float, every: float = 1 / 30, known: bool = False) -> tuple[Inertia, Spline]:
+    """A unit beside poses with noise, as the tracker would tell it of them. known: how readings scatter is."""
+    truth = hand_held(seconds, seed)
+    inertia, state = Inertia(recording(truth, seed)), SplineState(truth)
+    if known:
+        inertia.sigma = np.array([7e-5, 1e-3]) * 200**0.5
+    for t, T in seen_poses(truth, np.random.default_rng(seed), every):
+        model, _ = pose_constraint(state.spline, t, T, POSE_SIGMA)
+        inertia.learn(state, 0, [model], t + 0.015 if t + 0.015 < truth.t_end else t)
+    return inertia, truth
+
+
+def test_biases_and_gravity_are_found_to_what_their_sigmas_say() -> None:
+    """Of 50 seeds: within 3 σ in 95 % and more, and the σ as large as the errors are."""
+    scores = []
+    for seed in range(50):
+        inertia, _ = learnt(seed, 0.8, 0.1, known=True)
+        off = inertia.belief.mean - np.concatenate([BIAS, GRAVITY])
+        scores.append(off / inertia.belief.sigmas)
+    assert (np.abs(scores) < 3.0).mean() > 0.98
+    np.testing.assert_allclose(np.sqrt(np.mean(np.square(scores)[:, :3])), 1.0, atol=0.2)
+    assert 0.3 < np.sqrt(np.mean(np.square(scores)[:, 3:])) < 1.2  # the prior of biases is wider than these are
+
+
+def test_a_second_look_knows_gravity_and_says_when() -> None:
+    inertia, truth = learnt(3, 5.0, 0.1)
+    angle = np.degrees(np.arccos(min(1.0, inertia.belief.direction @ GRAVITY / STRENGTH)))
+    assert angle < 0.2 and inertia.belief.direction_deg < 0.3
+    assert 0.1 < inertia.usable_s < 1.0 < inertia.determined_s < 4.5 < truth.t_end
+    # The spline can follow all that there is: readings scatter by their noise.
+    np.testing.assert_allclose(inertia.sigma, [7e-5 * 200**0.5, 1e-3 * 200**0.5], rtol=0.5)
+
+
+def test_another_world_has_its_own_gravity_and_the_same_biases() -> None:
+    inertia, _ = learnt(3, 1.2)
+    sigmas = inertia.belief.sigmas[:6]
+    inertia.begin_world()
+    np.testing.assert_allclose(inertia.belief.sigmas[:6], sigmas, rtol=1e-9)
+    assert not inertia.is_usable and inertia.belief.direction_deg > 45.0
+
+
+def test_what_comes_before_the_first_control_point_is_taken_for_fixed() -> None:
+    smoother = Smoother.start(Belief.initial(GRAVITY))
+    smoother.reach(SplineState.still(0.0, DT, np.eye(4), 8), 3, 6)
+    model = Quadratic(1, np.arange(1.0, 24 * 24 + 1).reshape(24, 24), np.arange(24.0))
+    smoother.add(model)
+    np.testing.assert_array_equal(smoother.g[:12], model.g[12:])
+    np.testing.assert_allclose(smoother.H[:12, :12] - 1e-4 * np.eye(12), model.H[12:, 12:])
+    assert smoother.g[12:] == pytest.approx(0.0)
