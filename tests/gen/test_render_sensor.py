@@ -36,7 +36,8 @@ from rsgen.render.sensor import RollingShutterSensor
 STAMP = 0.31
 # About 1 m/s and 1.5 rad/s from a pose that is not the identity.
 MOTION = constant_twist((0.7, -0.5, 0.6, 0.6, -1.1, 0.9), se3.exp(np.array([0.1, 0.2, -0.3, 0.2, -0.4, 0.3])))
-MODELS = {"pinhole": CAMERA, "radtan": RADTAN, "fisheye": FISHEYE}
+DOUBLE_SPHERE = replace(CAMERA, model="double_sphere", distortion=(-0.18, 0.59))
+MODELS = {"pinhole": CAMERA, "radtan": RADTAN, "fisheye": FISHEYE, "double_sphere": DOUBLE_SPHERE}
 
 
 @pytest.fixture(scope="module")
