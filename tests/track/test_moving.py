@@ -134,7 +134,7 @@ def test_a_thing_ends_where_another_surface_or_what_rests_begins() -> None:
     assert found[30:50, 60:72].all() and found.sum() < 900
     seen = still()
     seen.free[30:50, 60:72] = seen.apart[30:50, 60:72] = 0.5
-    seen.free[:, 10:60] = seen.apart[:, 10:60] = -0.4  # what something hid before
+    seen.free[:, 40:60] = seen.apart[:, 40:60] = -0.4  # what something hid before
     found = regions(seen)
     assert found[30:50, 60:72].all() and found.sum() < 900
 
