@@ -273,9 +273,10 @@ def test_full_blocks_of_the_worst_pixels_do_not_overflow(s: float, length: float
     assert_sums(got, want, scaling.median_depth, tuple(count / scaling.parameters(sigma, 1.0)[4:]))
 
 
-@pytest.mark.parametrize(("width", "height", "stride"), [(7, 5, 1), (101, 67, 1), (90, 61, 2), (3, 200, 1)])
-@pytest.mark.parametrize("down", [False, True])
-@pytest.mark.parametrize("run", [1, 3, 40])
+@pytest.mark.parametrize(
+    ("width", "height", "stride", "down", "run"),
+    [(101, 67, 1, False, 1), (101, 67, 1, False, 40), (90, 61, 2, True, 3), (3, 200, 1, False, 40)],
+)
 def test_runs_of_pixels_add_up_to_what_pixels_do(
     monkeypatch: pytest.MonkeyPatch, width: int, height: int, stride: int, down: bool, run: int
 ) -> None:
