@@ -33,8 +33,8 @@ _GAUGE = np.full(6, 1e-6)
 # Control points that are held beyond those that are needed, and how many are released at once.
 _HELD, _RELEASED = 8, 128
 # Seconds for which control points that no new image touches stay free beside an IMU: about as long as what images say
-# of the motion gets better by averaging along it. And degrees that the camera turns in them, at most: keyframes are made
-# of frozen frames, and must not be left behind by then.
+# of the motion gets better by averaging along it. And degrees that the camera turns in them, at most: keyframes are
+# made of frozen frames, and must not be left behind by then.
 _LAG_S, _LAG_DEG = 0.1, 3.0
 # Levels to go through from a prediction by constant velocity, and from anything worse.
 TRACKING_LEVELS, LEVELS = (1, 0), (2, 1, 0)
