@@ -135,9 +135,7 @@ class TruthRenderer:
             out["flow_next"] = np.zeros((camera.height * camera.width, 3), np.float32)
         return {name: a.reshape(*shape, *(a.shape[1:] if a.shape[1] > 1 else ())) for name, a in out.items()}
 
-    def flow_into(
-        self, T_world_cam: PoseFunction, stamp: float, other: Shutter, other_stamp: float
-    ) -> Float32Array:
+    def flow_into(self, T_world_cam: PoseFunction, stamp: float, other: Shutter, other_stamp: float) -> Float32Array:
         """Flow (h, w, 3), u v valid, from the frame at `stamp` (s) into one that the same camera takes with the shutter
         `other` at other_stamp (s). T_world_cam: as in `render`.
         """

@@ -25,6 +25,7 @@ import rsgen.figures
 import rstrack.bench.methods.grid
 import rstrack.peers.clouds
 import rstrack.peers.open3d
+import rstrack.peers.orb_slam3
 from rsgen.config.config import load_config
 from rsgen.console.command_line import Commands, Parser, run_program
 from rsgen.errors import UserError
@@ -42,7 +43,7 @@ from rstrack.charts.to_page import figure_of
 from rstrack.cli.bench_methods import bench
 from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.metrics.run_evaluate import run_evaluate
-from rstrack.options import CLOUD_PEERS, METHODS, PEERS, Options
+from rstrack.options import CLOUD_PEERS, METHODS, PEERS, SLAM_PEERS, Options
 from rstrack.peers.command import run_command
 
 ROOT = Path(__file__).parents[2]
@@ -415,13 +416,18 @@ def test_peers_are_methods(place: Path, monkeypatch: pytest.MonkeyPatch) -> None
 
     monkeypatch.setattr(rstrack.peers.open3d, "run_peer", run_peer)
     monkeypatch.setattr(rstrack.peers.clouds, "run_cloud_peer", run_peer)
+
+    def run_slam(dataset: Any, frames: slice, progress: Any, seed: int) -> Estimate:
+        return run_peer("orb-slam3", dataset, frames, progress)
+
+    monkeypatch.setattr(rstrack.peers.orb_slam3, "run_orb_slam3", run_slam)
     made = plan(sequences=["robot_t1"], methods=["gs-g"], peers=True)
-    assert made.methods == ("gs-g", "gs-g --fuse", *PEERS, *CLOUD_PEERS)
-    for job in (made.jobs[2], made.jobs[-1]):
+    assert made.methods == ("gs-g", "gs-g --fuse", *PEERS, *CLOUD_PEERS, *SLAM_PEERS)
+    for job in (made.jobs[2], made.jobs[-2], made.jobs[-1]):
         cell = run_cell(job)
         assert cell.metrics is not None and cell.metrics["ate_rmse_m"] < 1e-9 and cell.seconds is not None
         assert read_estimate(job.out).info["method"] == job.method
-    assert asked == [PEERS[0], CLOUD_PEERS[-1]]
+    assert asked == [PEERS[0], CLOUD_PEERS[-1], SLAM_PEERS[-1]]
 
 
 @pytest.mark.parametrize(

@@ -57,6 +57,14 @@ def test_the_tree_tells_clusters_apart_and_weighs_them_by_how_rare_they_are() ->
     np.testing.assert_array_equal(tree.descriptor, again.descriptor)
 
 
+def test_a_words_bits_are_those_of_most_of_its_features() -> None:
+    images = clustered(np.random.default_rng(1))
+    centres = np.random.default_rng(1).integers(0, 256, (12, BYTES), dtype=np.uint8)
+    tree = train_vocabulary(images, branches=12, levels=1, seed=0)
+    far = np.unpackbits(centres[:, None] ^ tree.descriptor[None], axis=-1).sum(axis=-1).min(axis=1)
+    assert (far == 0).sum() >= 10  # two may have been taken for one
+
+
 def test_a_few_descriptors_are_words_each() -> None:
     rng = np.random.default_rng(0)
     few = rng.integers(0, 256, (3, BYTES), dtype=np.uint8)

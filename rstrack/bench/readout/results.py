@@ -129,11 +129,15 @@ def sweep_tables(result: SweepResult, quantity: Quantity = QUANTITIES[0]) -> lis
 def sweep_notes(result: SweepResult) -> list[str]:
     """What has to be said about the figures, one line each."""
     noise = result.config.noise
-    lines = [
-        f"RMSE over {min(result.frames.values())} to {max(result.frames.values())} frames; geometric mean over "
-        f"{noise.seeds} seeds of noise (depth {noise.depth:g} z² m, grey values {noise.intensity:g}), in brackets its "
-        f"{100 * CONFIDENCE:.0f} % interval: what other noise would change, not what another motion would"
-    ]
+    frames = sorted({*result.frames.values()})
+    over = f"{frames[0]} frames" if len(frames) == 1 else f"{frames[0]} to {frames[-1]} frames"
+    noisy = f"noise (depth {noise.depth:g} z² m, grey values {noise.intensity:g})"
+    lines = [f"RMSE over {over}, one seed of {noisy}: no intervals"]
+    if noise.seeds > 1:
+        lines = [
+            f"RMSE over {over}; geometric mean over {noise.seeds} seeds of {noisy}, in brackets its "
+            f"{100 * CONFIDENCE:.0f} % interval: what other noise would change, not what another motion would"
+        ]
     some = [p for p in points_of(result) if p.lost]
     if some:
         lost = ", ".join(f"{p.method} on {p.case.name} {p.lost} of {p.lost + len(p.values)}" for p in some)
