@@ -16,9 +16,11 @@ from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.light import cache as lighting
-from rsgen.light.bake_points import SurfacePoints
-from rsgen.light.denoise import denoised, scatter_of
+from rsgen.light.bake_points import thin
+from rsgen.light.denoise import denoised
 from rsgen.light.guide import Guide, bin_of
+from rsgen.light.rounds import PATCH, scatter_of
+from rsgen.light.surface_points import SurfacePoints
 from rsgen.render.baked import BakedIntegrator
 from rsgen.render.images import ColorRenderer
 from rsgen.render.irradiance import IrradianceField, lattice_barycentric, make_field, make_lattice
@@ -114,7 +116,7 @@ def test_point_light(tmp_path: Path) -> None:
 def test_disk_emitter(tmp_path: Path) -> None:
     """Form factor of a parallel disk: ½ [1 − (x² + h² − a²) / √((x² + h² + a²)² − 4 a² x²)]."""
     xyz = floor_grid()
-    got = floor_light(scene_of(tmp_path, FLOOR, DISK), xyz, texel_m=0.02, direct_samples=256)
+    got = floor_light(scene_of(tmp_path, FLOOR, DISK), xyz, texel_m=0.02, direct_samples=256, target_db=55)
     a, h = 0.25, 0.6
     x2 = ((xyz[:, :2] - (-0.2, 0.1)) ** 2).sum(-1)
     factor = 0.5 * (1 - (x2 + h**2 - a**2) / np.sqrt((x2 + h**2 + a**2) ** 2 - 4 * a**2 * x2))
@@ -124,7 +126,7 @@ def test_disk_emitter(tmp_path: Path) -> None:
 def test_rectangle_emitter(tmp_path: Path) -> None:
     """Form factor of a parallel rectangle from a corner, summed with signs over its four corners."""
     xyz = floor_grid()
-    got = floor_light(scene_of(tmp_path, FLOOR, QUAD), xyz, texel_m=0.02, direct_samples=256)
+    got = floor_light(scene_of(tmp_path, FLOOR, QUAD), xyz, texel_m=0.02, direct_samples=256, target_db=55)
     agree(got, np.pi * quad_factor(xyz)[:, None] * [1, 2, 3])
 
 
@@ -218,10 +220,11 @@ def test_noise_is_smoothed_and_edges_of_shadows_are_not() -> None:
     true = np.where(x < 0.405, 1.0, 0.2)
     halves = true[None, :, None] * (1 + rng.normal(scale=0.05, size=(2, len(x), 1))) * np.ones(3)
     which = np.arange(len(x))
-    error = denoised(points, which, halves, 0.01)[:, 0] / true - 1
+    sigma = scatter_of(thin(points, PATCH * 0.01)[1], halves)
+    error = denoised(points, which, halves, sigma, 0.01, which)[:, 0] / true - 1
     away = np.abs(x - 0.405) > 0.08
     noise = 0.05 / np.sqrt(2)
-    assert scatter_of(points, which, halves, 0.01)[1][away].mean() == pytest.approx(noise, rel=0.1)
+    assert (sigma / true)[away].mean() == pytest.approx(noise, rel=0.1)
     assert error[away].std() < noise / 3
     assert np.sqrt(np.mean(error[~away] ** 2)) < noise  # smoothed across, it would be 0.5 and more
 
