@@ -65,7 +65,9 @@ def transmitted(scene, p, d, distance, active, follow):
     Panes that bend light, of a thickness, throw a shadow; what they let through is found by `first_scatterer`.
     """
     # Short of the emitter itself, whose surface would shadow its own sample.
-    ray = mi.Ray3f(p, d, distance * (1 - 1e-4) - 1e-5, 0.0, mi.Color0f())
+    length = distance * (1 - 1e-4) - 1e-5
+    end = p + d * length
+    ray = mi.Ray3f(p, d, length, 0.0, mi.Color0f())
     if dr.hint(not follow, mode="scalar"):
         return mi.Color3f(dr.select(active & ~scene.ray_test(ray, active=active), 1, 0))
     through = mi.Color3f(dr.select(active, 1, 0))
@@ -79,8 +81,12 @@ def transmitted(scene, p, d, distance, active, follow):
         share = si.bsdf(ray).eval_null_transmission(si, clear)
         through = dr.select(clear, through * share, dr.select(going, 0, through))
         onward = si.spawn_ray(ray.d)
-        ray.maxt = dr.select(clear, ray.maxt - pi.t, ray.maxt)
+        # It goes on a little beside its line, and is aimed anew: else it would reach into the emitter.
+        rest = end - onward.o
+        length = dr.norm(rest)
         ray.o = dr.select(clear, onward.o, ray.o)
+        ray.d = dr.select(clear, rest / length, ray.d)
+        ray.maxt = dr.select(clear, length, ray.maxt)
         going = clear & (dr.max(through) > 0)
         passed += 1
     return through
