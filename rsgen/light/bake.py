@@ -33,7 +33,7 @@ from rsgen.light.denoise import denoised
 from rsgen.light.estimate import estimated_db
 from rsgen.light.gather import gathering
 from rsgen.light.lamps import first_look, lamp_light
-from rsgen.light.rounds import GREY_SLOPE, PATCH, scatter_of
+from rsgen.light.rounds import GREY_SLOPE, PATCH, scatter_of, typical
 from rsgen.light.sky import has_sky_light, sky_light
 from rsgen.light.specular import passes_light_on
 from rsgen.render.irradiance import Lattice
@@ -95,7 +95,7 @@ def _direct(
     # A first look with few samples finds what any light reaches; only that gets the full effort.
     rough = first_look(scene, points, fine, follow, _reporter(progress, 0.03, 0.04, "finding lit surfaces"))
     grey = rough.mean(axis=1)
-    beside = grey + _AMBIENT * (np.median(grey[grey > 0]) if grey.any() else 0.0)
+    beside = grey + _AMBIENT * typical(grey)
     patch = thin(points, PATCH * light.texel_m, fine)[1]
     means, left = np.zeros((2, len(fine), 3)), np.zeros(len(fine))
     if has_sky_light(scene):

@@ -18,6 +18,7 @@ from rsgen.array_types import Float32Array
 from rsgen.light.bake_points import surface_at
 from rsgen.light.gather import gathering
 from rsgen.light.lamps import lamp_light
+from rsgen.light.rounds import typical
 from rsgen.light.sky import has_sky_light, sky_light
 from rsgen.light.specular import passes_light_on
 from rsgen.light.surface_points import SurfacePoints
@@ -35,7 +36,7 @@ _SEED = 20
 def estimated_db(scene: Any, field: IrradianceField, texel_m: float) -> float:
     """PSNR, dB, in sRGB, of mid-grey surfaces all over the scene, by area, as far as any light reaches them.
 
-    The light that half of these have is exposed to mid-grey. Infinite where there is none.
+    Exposed so that `rounds.typical` light makes mid-grey. Infinite where there is no light.
     """
     numbers, faces, uv, back = _places(scene)
     position, normal, geometric = surface_at(numbers, faces, uv)
@@ -51,7 +52,7 @@ def estimated_db(scene: Any, field: IrradianceField, texel_m: float) -> float:
     lit = halves.max(axis=(0, 2)) > 0
     if not lit.any():
         return math.inf
-    exposure = _GREY / np.median(halves[:, lit].mean(axis=(0, 2)))
+    exposure = _GREY / typical(halves[:, lit].mean(axis=(0, 2)))
     one, other, ours = (srgb.encode(np.clip(exposure * e[lit], 0, 1)) for e in (*halves, baked))
     error = float(np.mean((ours - one) * (ours - other)))
     return -10 * math.log10(max(error, _LEAST_ERROR))

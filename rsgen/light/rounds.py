@@ -24,6 +24,19 @@ def scatter_of(patch: IntArray, halves: NDArray) -> FloatArray:
     return np.sqrt((np.bincount(patch, (a - b) ** 2) / (4 * np.bincount(patch)))[patch])
 
 
+def typical(light: FloatArray) -> float:
+    """The light (n,) that a camera is exposed for: half of the places have more, those left out that hardly have any.
+
+    Hardly any is a hundredth of what the place has that half of all light falls short of; 0 where there is none at all.
+    """
+    rising = np.sort(light)
+    total = np.cumsum(rising)
+    if not len(light) or total[-1] <= 0:
+        return 0.0
+    common = rising[np.searchsorted(total, 0.5 * total[-1])]
+    return float(np.median(rising[rising >= 0.01 * common]))
+
+
 def shown(patch: IntArray, sigma: FloatArray, grey: FloatArray) -> FloatArray:
     """What an error sigma (n,) beside light `grey` (n,) amounts to, as a part of a mid-grey surface's light.
 
@@ -31,10 +44,10 @@ def shown(patch: IntArray, sigma: FloatArray, grey: FloatArray) -> FloatArray:
     that, as in what is overexposed, it is taken for no more.
     """
     light = (np.bincount(patch, grey) / np.bincount(patch))[patch]
-    lit = light[light > 0]
-    if not len(lit):
+    exposed = typical(light)
+    if exposed <= 0:
         return np.zeros(len(grey))
-    part = np.maximum(light / np.median(lit), 1e-12)
+    part = np.maximum(light / exposed, 1e-12)
     return sigma / np.maximum(light, 1e-30) * np.minimum(part, 1.0) ** _TONE
 
 

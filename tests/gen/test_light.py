@@ -511,7 +511,7 @@ def test_what_is_buried_does_not_darken_its_neighbours(tmp_path: Path) -> None:
 def test_light_does_not_leak_under_a_wall(tmp_path: Path) -> None:
     """A wall that stands a little in the floor, between a bright and a dim room: neither light is seen in the other."""
     wall = """<shape type="cube"><transform name="to_world"><scale x="0.01" y="3" z="1.2"/>
-        <translate x="0.013" z="1.1"/></transform><bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf></shape>"""
+        <translate x="0.013" z="1.1"/></transform>{BLACK}</shape>""".replace("{BLACK}", BLACK)
     lamps = [
         f"""<emitter type="point"><point name="position" x="{x}" y="0.1" z="0.5"/>
         <rgb name="intensity" value="{power},{power},{power}"/></emitter>"""
