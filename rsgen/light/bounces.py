@@ -58,7 +58,8 @@ def light_off_surfaces(
 ) -> Float32Array:  # fmt: skip
     """Irradiance (n, 3) that surfaces throw on the points `fine` (n,), which have `direct` (n, 3) from elsewhere.
 
-    lit_by: the field of a light (n, 3) at `fine`. scatter: see `rounds`.
+    lit_by: the field of a light (n, 3) at `fine`. Drawn until twice `scatter` is left (see `rounds`), which smoothing
+    and the interpolation bring down to about that: they reach over a dozen points.
     """
     if not light.bounces:
         return np.zeros_like(direct)
@@ -74,7 +75,7 @@ def light_off_surfaces(
     patch, beside = thin(points, PATCH * spacing, coarse)[1], direct[of_fine].mean(axis=1)
     first = max(2, light.gather_rays >> (_LAST_ROUNDS - 1))
     means, left = in_rounds(
-        gather_from(before), patch, lambda own: own + beside, scatter, first, _LAST_ROUNDS, math.inf,
+        gather_from(before), patch, lambda own: own + beside, 2 * scatter, first, _LAST_ROUNDS, math.inf,
         lambda f: report(0.5 + 0.5 * f),
     )  # fmt: skip
     noisy = np.flatnonzero(left > scatter)

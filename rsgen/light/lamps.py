@@ -78,6 +78,9 @@ def lamp_light(
         means += own
         square += left**2
 
+    if all(lamp.get_shape() is None for lamp in lamps_of(scene)):
+        return means, np.sqrt(square)
+
     def sample(at: Sequence[Any], _: IntArray, begin: int, count: int) -> Any:
         return _near_at(scene, *at, begin, count, follow)
 
