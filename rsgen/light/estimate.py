@@ -28,13 +28,14 @@ from rsgen.render.scene import mesh_arrays
 
 _PLACES = 4096
 _GREY = 0.18  # reflectance of the surface that is looked at, where light is typical
+_LIT = 0.01  # of the typical light: with less, a place is inside of something, where nobody looks
 _SAMPLES, _SKY_SAMPLES, _RAYS = 64, 1024, 512  # of each lamp, the sky and surfaces
 _LEAST_ERROR = 1e-6
 _SEED = 20
 
 
 def estimated_db(scene: Any, field: IrradianceField, texel_m: float) -> float:
-    """PSNR, dB, in sRGB, of mid-grey surfaces all over the scene, by area, as far as any light reaches them.
+    """PSNR, dB, in sRGB, of mid-grey surfaces all over the scene, by area, as far as they are lit.
 
     Exposed so that `rounds.typical` light makes mid-grey. Infinite where there is no light.
     """
@@ -49,10 +50,11 @@ def estimated_db(scene: Any, field: IrradianceField, texel_m: float) -> float:
     pi, si = at_triangles(numbers[open_], faces[open_], uv[open_])
     baked = np.array(field.lookup(pi, si, mi.Vector3f(points.normal.T)), np.float64).reshape(3, -1).T
     halves = _computed(scene, field, points, texel_m)
-    lit = halves.max(axis=(0, 2)) > 0
-    if not lit.any():
+    grey = halves.mean(axis=(0, 2))
+    exposed = typical(grey)
+    if exposed <= 0:
         return math.inf
-    exposure = _GREY / typical(halves[:, lit].mean(axis=(0, 2)))
+    lit, exposure = grey >= _LIT * exposed, _GREY / exposed
     one, other, ours = (srgb.encode(np.clip(exposure * e[lit], 0, 1)) for e in (*halves, baked))
     error = float(np.mean((ours - one) * (ours - other)))
     return -10 * math.log10(max(error, _LEAST_ERROR))
