@@ -87,15 +87,25 @@ class LightConfig(Section):
     texel_m: Annotated[float, limits(1e-3, 100, "m: memory grows with 1 / texel_m^2")] = Field(
         default=0.015, description="spacing of the baked irradiance samples, m"
     )
-    direct_samples: int = Field(default=64, ge=1, le=4096, description="light samples per irradiance sample")
+    direct_samples: int = Field(
+        default=64,
+        ge=1,
+        le=4096,
+        description="samples of each lamp per irradiance sample: an eighth where that will do, at most twice as many",
+    )
     target_db: float = Field(
         default=40.0, ge=20, le=70,
-        description="PSNR that the sky's light is sampled for where a surface is mid-grey, before it is smoothed",
+        description="PSNR that light is sampled for where a surface is mid-grey, before it is smoothed",
     )  # fmt: skip
     gather_rays: int = Field(
-        default=512, ge=16, le=16384, description="hemisphere rays per indirect sample, last bounce"
+        default=512, ge=16, le=16384, description="hemisphere rays per indirect sample, last bounce, at most"
     )
-    bounces: int = Field(default=8, ge=0, le=32, description="indirect diffuse bounces")
+    bounces: int = Field(
+        default=8,
+        ge=0,
+        le=32,
+        description="indirect diffuse bounces, at most; from 3 on those that follow are extrapolated",
+    )
     glossy_spp: int = Field(
         default=16, ge=1, le=65536, description="samples per pixel at most where a surface is not purely diffuse"
     )

@@ -1,247 +1,152 @@
 """Bake a scene's diffuse irradiance: direct light by emitter sampling, indirect by gathering over bounces.
 
 1. Every lattice point of `irradiance.Lattice` (both sides of each triangle; points that coincide are one) gets direct
-   light from each lamp with a stratified set of samples, and from the sky and through panes as `sky` has it.
+   light from each lamp with a stratified set of samples, and from the sky and off mirrors as `sky` has it.
    Where a mesh is finer than the texel, a thinned set of points is computed and the others are interpolated.
 2. Indirect light varies slowly, so it is gathered at a still thinner set, a few texels apart, by cosine-distributed
    rays that look the previous bounce up where they hit, and interpolated in position and normal.
-3. Points that never get any light (buried in another object) are marked as not alive.
+3. Points that never get any light (buried in another object) are marked as not alive, and how far others count where
+   something stands on their surface (`walls`).
 
-All randomness is a fixed low-discrepancy sequence rotated by a hash of the point's number: a scene bakes to the same
-bytes each time on one backend.
+How many samples a point gets depends on what their scatter would show as (`rounds`); what is left is smoothed where it
+hides any difference (`denoise`). All randomness is a fixed low-discrepancy sequence rotated by a hash of the point's
+number: a scene bakes to the same bytes each time on one backend.
 """
 
 from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from rsgen.array_types import Float32Array
+from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.config.config import LightConfig
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
-from rsgen.light.bake_points import Interpolation, SurfacePoints, sample_points, thin
-from rsgen.light.sampling import chunks, r2, rotation
-from rsgen.light.sky import sky_light
-from rsgen.light.specular import first_scatterer, passes_light_on
-from rsgen.render.irradiance import IrradianceField, Lattice, make_field
+from rsgen.light.bake_points import Interpolation, sample_points, thin
+from rsgen.light.bounces import Surfaces, light_off_surfaces
+from rsgen.light.denoise import denoised
+from rsgen.light.estimate import estimated_db
+from rsgen.light.gather import gathering
+from rsgen.light.lamps import first_look, lamp_light
+from rsgen.light.rounds import GREY_SLOPE, PATCH, scatter_of, typical
+from rsgen.light.sky import has_sky_light, sky_light
+from rsgen.light.specular import passes_light_on
+from rsgen.render.irradiance import Lattice
 
 log = logging.getLogger("rsgen")
 
 
 # Raise when the method changes, so that older caches are not taken for new ones.
-METHOD = 2
+METHOD = 3
 _FINE_TEXELS = 0.9  # direct light is computed at points at least about this far apart
-_COARSE_TEXELS = 3.0  # and indirect light at these
 _FIRST_LOOK_RAYS = 12
 _FIRST_LOOK_BOUNCES = 2
-_BOUNCE_RAYS = 32
-_MANY_EMITTERS = 24
-_SMALL_EMITTER_M = 0.3
-# Light sampling is trusted this much more than hemisphere rays; only where an emitter all but touches a surface, and
-# its samples' 1/d² explodes, do the rays take over.
-_LIGHT_TRUST = 64.0
-_GREY_SLOPE = 0.21  # of sRGB at its middle, by the logarithm of light
+_AMBIENT = 0.1  # light off surfaces, as a part of the typical light off lamps, until it is known
+_OF_THE_WHOLE = 0.25  # the scatter of each kind of light, of what is asked: they add up, and neighbours compare
 
 
 def bake(scene: Any, lattice: Lattice, light: LightConfig, progress: Progress) -> tuple[NDArray, NDArray]:
-    """Irradiance (points, 4) float32 of the front and back sides: E_r, E_g, E_b (scene units), alive (0 or 1)."""
+    """Irradiance (points, 4) float32 of the front and back sides: E_r, E_g, E_b (scene units), w.
+
+    w: 0 where no light reaches, else 1 + how far the sample counts (see `render.irradiance.packed_reach`).
+    """
     progress("light", 0.0, "where light is looked at")
-    points, index = sample_points(scene, lattice)
+    points, index, reach = sample_points(scene, lattice, light.texel_m)
+    surfaces = Surfaces(scene, lattice, points, index, reach, passes_light_on(scene))
     fine, fine_of_point = thin(points, light.texel_m * _FINE_TEXELS)
     log.info("baking light: %d triangles, %d samples of %d stored", len(lattice.first), len(fine), len(fine_of_point))
-    total = np.zeros((len(fine), 3), np.float32)
+    scatter = 10 ** (-light.target_db / 20) / GREY_SLOPE
+    direct, alive = _direct(surfaces, fine, fine_of_point, light, scatter, progress)
+    fine, alive_point = fine[alive], alive[fine_of_point]
 
-    lamps, follow = [e for e in scene.emitters() if not e.is_environment()], passes_light_on(scene)
-    by_sky = follow or len(lamps) < len(scene.emitters())
-    sky = np.zeros((len(fine), 3), np.float32)
-    if by_sky:
-        scatter = 10 ** (-light.target_db / 20) / _GREY_SLOPE
-        report = _reporter(progress, 0.0, 0.2, "light of the sky and through panes")
-        sky, reached = sky_light(scene, points, fine, light.texel_m, light.direct_samples, follow, scatter, report)
-        log.info("light of the sky: %.0f dB before smoothing", -20 * math.log10(max(reached * _GREY_SLOPE, 1e-5)))
-
-    # A first look with few samples finds what any light reaches; only that gets the full effort.
-    begin = 0.2 if by_sky else 0.0
-    report = _reporter(progress, begin, 0.05, "finding lit surfaces")
-    first_look = sky + _direct(scene, lamps, points, fine, 2, report)
-    for bounce in range(_FIRST_LOOK_BOUNCES):
-        field = _field(
-            lattice, index, total[fine_of_point] + first_look[fine_of_point], np.ones(len(fine_of_point), bool)
-        )
-        report = _reporter(progress, begin + 0.05 + 0.03 * bounce, 0.03, "finding lit surfaces")
-        total = _gather(scene, field, points, fine, _FIRST_LOOK_RAYS, follow, by_sky, report)
-    alive = (first_look + total).max(axis=1) > 0
-    alive_point = alive[fine_of_point]
-    fine = fine[alive]
-    if not len(fine):
-        raise UserError("the scene is dark: no light reaches any surface; add an emitter or move it into the open")
-
-    report = _reporter(progress, begin + 0.11, 0.39 - begin, "direct light")
-    direct = sky[alive] + _direct(scene, lamps, points, fine, light.direct_samples, report)
     lit_points = np.flatnonzero(alive_point)
     to_point = Interpolation.between(points, fine, lit_points, light.texel_m)
-    coarse = fine[thin(points, light.texel_m * _COARSE_TEXELS, fine)[0]]
-    coarse_to_fine = Interpolation.between(points, coarse, fine, light.texel_m * _COARSE_TEXELS)
-    indirect = np.zeros_like(direct)
     values = np.zeros((len(points.position), 3), np.float32)
-    for bounce in range(light.bounces):
-        last = bounce == light.bounces - 1
-        values[lit_points] = to_point(direct + indirect)
-        field = _field(lattice, index, values, alive_point)
-        begin = 0.5 + 0.3 * bounce / light.bounces
-        report = _reporter(progress, begin, 1 - begin if last else 0.3 / light.bounces, f"bounce {bounce + 1}")
-        rays = light.gather_rays if last else min(_BOUNCE_RAYS, light.gather_rays)
-        indirect = coarse_to_fine(_gather(scene, field, points, coarse, rays, follow, by_sky, report))
-    values[lit_points] = to_point(direct + indirect)
-    table = _table(values, alive_point)
+
+    def at_points(light_of_fine: Float32Array) -> Float32Array:
+        values[lit_points] = to_point(light_of_fine)
+        return values
+
+    def lit_by(light_of_fine: Float32Array) -> Any:
+        return surfaces.field(at_points(light_of_fine), alive_point)
+
+    report = _reporter(progress, 0.6, 0.37, "light off surfaces")
+    total = direct + light_off_surfaces(surfaces, fine, direct, lit_by, light, _OF_THE_WHOLE * scatter, report)
+    progress("light", 0.97, "how right it is")
+    reached = estimated_db(scene, lit_by(total), light.texel_m)
+    log.info("light baked, by estimate to %.0f dB on mid-grey surfaces (light.target_db: %g)", reached, light.target_db)
     progress("light", 1.0, "light baked")
-    return table[index[0]], table[index[1]]
+    return surfaces.sides(at_points(total), alive_point)
+
+
+def _direct(
+    surfaces: Surfaces, fine: IntArray, fine_of_point: IntArray, light: LightConfig, scatter: float, progress: Progress
+) -> tuple[Float32Array, NDArray[np.bool_]]:
+    """Direct irradiance (m, 3) of those of the points `fine` that any light reaches, and which these are (n,).
+
+    Raises UserError if there are none.
+    """
+    scene, points, follow = surfaces.scene, surfaces.points, surfaces.follow
+    # A first look with few samples finds what any light reaches; only that gets the full effort.
+    rough = first_look(scene, points, fine, follow, _reporter(progress, 0.03, 0.04, "finding lit surfaces"))
+    grey = rough.mean(axis=1)
+    beside = grey + _AMBIENT * typical(grey)
+    patch = thin(points, PATCH * light.texel_m, fine)[1]
+    means, left = np.zeros((2, len(fine), 3)), np.zeros(len(fine))
+    if has_sky_light(scene):
+        report = _reporter(progress, 0.07, 0.18, "light of the sky and off mirrors")
+        means, left = sky_light(
+            scene, points, fine, patch, light.texel_m, light.direct_samples, follow, beside, scatter, report
+        )
+        log.info("light of the sky: %.0f dB before smoothing", _as_db(left))
+    seen = (rough + means.mean(axis=0)).astype(np.float32)
+    alive = _reached(surfaces, fine, fine_of_point, seen, _reporter(progress, 0.25, 0.05, "finding lit surfaces"))
+    if not alive.any():
+        raise UserError("the scene is dark: no light reaches any surface; add an emitter or move it into the open")
+    fine, patch, means, left = fine[alive], _renumbered(patch[alive]), means[:, alive], left[alive]
+
+    report, part = _reporter(progress, 0.3, 0.3, "direct light"), _OF_THE_WHOLE * scatter
+    all_light = beside[alive] + means.mean(axis=(0, 2))
+    of_lamps, left_of_lamps = lamp_light(
+        scene, points, fine, patch, light.direct_samples, follow, all_light, part, report
+    )
+    means += of_lamps
+    noisy = np.flatnonzero(np.hypot(left, left_of_lamps) > part)
+    return denoised(points, fine, means, scatter_of(patch, means), light.texel_m, noisy), alive
+
+
+def _reached(
+    surfaces: Surfaces, fine: IntArray, fine_of_point: IntArray, seen: Float32Array, report: Callable[[float], None]
+) -> NDArray[np.bool_]:
+    """Which of `fine` (n,) any light reaches, given the direct light (n, 3) that a first look has seen there."""
+    total = seen.copy()
+    everywhere = np.ones(len(fine_of_point), bool)
+    for bounce in range(_FIRST_LOOK_BOUNCES):
+        dark = np.flatnonzero(total.max(axis=1) <= 0)
+        if not len(dark):
+            break
+        field = surfaces.field(total[fine_of_point], everywhere)
+        draw = gathering(surfaces.scene, field, surfaces.points, fine[dark], surfaces.follow)
+
+        def share(f: float, k: int = bounce) -> None:
+            report((k + f) / _FIRST_LOOK_BOUNCES)
+
+        total[dark] = draw(np.arange(len(dark)), 0, _FIRST_LOOK_RAYS, share).sum(axis=0)
+    return total.max(axis=1) > 0
+
+
+def _renumbered(label: IntArray) -> IntArray:
+    return np.unique(label, return_inverse=True)[1].ravel()
+
+
+def _as_db(left: FloatArray) -> float:
+    return -20 * math.log10(max(float(np.sqrt(np.mean(left**2))) * GREY_SLOPE, 1e-5))
 
 
 def _reporter(progress: Progress, begin: float, span: float, what: str) -> Callable[[float], None]:
     return lambda fraction: progress("light", begin + span * fraction, what)
-
-
-def _table(values: NDArray, alive: NDArray) -> Float32Array:
-    return np.where(alive[:, None], np.concatenate([values, alive[:, None]], axis=1), 0).astype(np.float32)
-
-
-def _field(lattice: Lattice, index: NDArray, values: NDArray, alive: NDArray) -> IrradianceField:
-    table = _table(values, alive)
-    return make_field(lattice, table[index[0]], table[index[1]])
-
-
-def _direct(
-    scene: Any,
-    lamps: Sequence[Any],
-    points: SurfacePoints,
-    which: NDArray,
-    samples: int,
-    report: Callable[[float], None],
-) -> NDArray:
-    """Direct irradiance (len(which), 3) from all lamps, `samples` for each."""
-    out = np.zeros((len(which), 3), np.float32)
-    for begin, part, p, n, number in chunks(points, which, report):
-        total = mi.Color3f(0)
-        if len(lamps) > _MANY_EMITTERS:
-            total = _from_emitter(scene, None, p, n, number, samples * _MANY_EMITTERS, 0)
-        else:
-            for k, emitter in enumerate(lamps):
-                total += _from_emitter(scene, emitter, p, n, number, _samples_for(emitter, samples), k)
-                dr.eval(total)
-        out[begin : begin + len(part)] = np.array(total).reshape(3, -1).T
-    return out
-
-
-def _samples_for(emitter: Any, samples: int) -> int:
-    """A small emitter's penumbra is narrow: a quarter of the samples serves as well."""
-    shape = emitter.get_shape()
-    small = shape is not None and dr.norm(shape.bbox().extents()) < _SMALL_EMITTER_M
-    return max(1, samples // 4) if small else samples
-
-
-@dr.syntax
-def _from_emitter(scene, emitter, p, n, number, samples, dimension):
-    """Mean irradiance at p (normal n) from one emitter, or if that is None from a random one but the sky."""
-    it = dr.zeros(mi.Interaction3f, dr.width(p))
-    it.p = p
-    it.t = mi.Float(1)
-    it.n = mi.Normal3f(n)
-    offset = mi.Point2f(rotation(number, 2 * dimension), rotation(number, 2 * dimension + 1))
-    count = dr.opaque(mi.UInt32, samples)
-    total = mi.Color3f(0)
-    i = mi.UInt32(0)
-    while i < count:
-        u = r2(i, offset)
-        if dr.hint(emitter is None, mode="scalar"):
-            ds, value = scene.sample_emitter_direction(it, u, False)
-            if dr.hint(scene.environment() is not None, mode="scalar"):
-                value = dr.select(ds.emitter == mi.EmitterPtr(scene.environment()), 0, value)
-        else:
-            ds, value = emitter.sample_direction(it, u)
-        cosine = dr.dot(n, ds.d)
-        lit = (cosine > 0) & (ds.pdf > 0) & (dr.max(value) > 0)
-        # Short of the emitter itself, whose surface would shadow its own sample.
-        shadow = mi.Ray3f(p, ds.d, ds.dist * (1 - 1e-4) - 1e-5, 0.0, mi.Color0f())
-        lit &= ~scene.ray_test(shadow, active=lit)
-        total += dr.select(lit, value * cosine * dr.select(ds.delta, 1, _light_share(ds.pdf, cosine)), 0)
-        i += 1
-    return total / mi.Float(count)
-
-
-def _light_share(light_pdf: Any, cosine: Any) -> Any:
-    """The light samples' part in the balance heuristic (Veach and Guibas 1995) with cosine-distributed rays."""
-    # Written so that a grazing emitter's infinite density gives 1, and 0 / 0 does not occur.
-    trusted = dr.maximum(_LIGHT_TRUST * light_pdf, 1e-20)
-    return dr.rcp(1 + dr.maximum(cosine, 0) * dr.inv_pi / trusted)
-
-
-def _gather(
-    scene: Any,
-    field: IrradianceField,
-    points: SurfacePoints,
-    which: NDArray,
-    rays: int,
-    follow: bool,
-    by_sky: bool,
-    report: Callable[[float], None],
-) -> NDArray:
-    """Irradiance (len(which), 3) that arrives from other surfaces, each lit as `field` says; follow: through panes too.
-
-    Holds also the small part of emitters' own light that `_direct` leaves out (see `_light_share`); by_sky: without
-    what `sky_light` holds.
-    """
-    out = np.zeros((len(which), 3), np.float32)
-    for begin, part, p, n, number in chunks(points, which, report):
-        out[begin : begin + len(part)] = (
-            np.array(_gather_at(scene, field, p, n, number, rays, follow, by_sky)).reshape(3, -1).T
-        )
-    return out
-
-
-@dr.syntax
-def _gather_at(scene, field, p, n, number, rays, follow, by_sky):
-    frame = mi.Frame3f(n)
-    offset = mi.Point2f(rotation(number, 101), rotation(number, 102))
-    lobe = rotation(number, 103)
-    count = dr.opaque(mi.UInt32, rays)
-    context = mi.BSDFContext()
-    it = dr.zeros(mi.Interaction3f, dr.width(p))
-    it.p = p
-    it.n = mi.Normal3f(n)
-    many = len(scene.emitters()) > _MANY_EMITTERS
-    total = mi.Color3f(0)
-    i = mi.UInt32(0)
-    while i < count:
-        u = r2(i, offset)
-        d = frame.to_world(mi.warp.square_to_cosine_hemisphere(u))
-        pick = lobe + mi.Float(i) * 0.6180339887498949
-        pick -= dr.floor(pick)
-        pi, si, ray, through, passed = first_scatterer(scene, mi.Ray3f(p, d), pick, follow, mi.Bool(True))
-        hit = si.is_valid()
-        emitter = si.emitter(scene)
-        lamp = emitter != dr.zeros(mi.EmitterPtr)
-        if dr.hint(by_sky, mode="scalar"):
-            lamp &= hit & (passed == 0)
-        towards = mi.DirectionSample3f(scene, si, it)
-        straight = lamp & (passed == 0)
-        if dr.hint(many, mode="scalar"):
-            light_pdf = scene.pdf_emitter_direction(it, towards, straight)
-        else:
-            light_pdf = emitter.pdf_direction(it, towards, straight)
-        # With pdf cosθ/π, ∫ L cosθ dω is the mean of πL, and of ρE where Lambert's surface sends L = ρE/π.
-        left_out = dr.select(passed == 0, 1 - _light_share(light_pdf, dr.dot(n, d)), 1)
-        total += dr.select(lamp, dr.pi * through * emitter.eval(si, lamp) * left_out, 0)
-        # The sampled weight's mean is the albedo ρ, exactly and without noise for Lambert's law.
-        _, albedo = si.bsdf(ray).sample(context, si, pick, mi.Point2f(u.y, u.x), hit)
-        total += dr.select(hit, through * albedo * field.lookup(pi, si, -ray.d, hit), 0)
-        i += 1
-    return total / mi.Float(count)

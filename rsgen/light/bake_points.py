@@ -6,8 +6,6 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
@@ -15,37 +13,24 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from rsgen.array_types import Float32Array, IntArray
-from rsgen.render.irradiance import Lattice, lattice_barycentric, registry_id
+from rsgen.light.surface_points import SurfacePoints
+from rsgen.light.walls import find_barriers, find_covered
+from rsgen.render.irradiance import Lattice, at_triangles, lattice_barycentric, registry_id
 from rsgen.render.scene import mesh_arrays
 
 _INSET_M = 2e-3  # samples on a triangle's rim move this far inwards: a corner exactly on two surfaces sees neither
+_COVERED_TEXELS, _COVERED_M = 0.3, 0.01  # what is nearer above a surface than either covers it
 _NEIGHBOURS = 8
-_NORMAL_SCALE = 0.35  # normals this far apart count as much as one spacing
-_APART = 1e4  # spacings between different pieces of surface
 _SMOOTHING = 0.3  # spacings: closer sources than this count alike
 _CHUNK = 1 << 20  # points looked at in one launch
 
 
-@dataclass(frozen=True)
-class SurfacePoints:
-    """Unique sample points: position on the surface, shading normal, geometric normal, (n, 3) float32 each, and (n,)
-    the number of the piece of surface that each lies on: one side of a connected part of a mesh.
+def sample_points(
+    scene: Any, lattice: Lattice, texel_m: float
+) -> tuple[SurfacePoints, IntArray, tuple[NDArray, NDArray]]:  # fmt: skip
+    """Unique points of both sides of the lattice, the (2, points) index of each lattice point's front and back one, and
+    how far these count on either side (see `walls.Barriers`).
     """
-
-    position: Float32Array
-    normal: Float32Array
-    geometric: Float32Array
-    piece: IntArray
-
-    def coordinates(self, spacing: float) -> NDArray:
-        """(n, 7): two points are near where positions, in units of `spacing` metres, and normals are, on one piece."""
-        return np.concatenate(
-            [self.position / spacing, self.normal / _NORMAL_SCALE, _APART * self.piece[:, None]], axis=1
-        )
-
-
-def sample_points(scene: Any, lattice: Lattice) -> tuple[SurfacePoints, IntArray]:
-    """Unique points of both sides of the lattice, and (2, points) index of each lattice point's front and back one."""
     face, uv = lattice_barycentric(lattice)
     count = len(face)
     centre = np.full((count, 2), 1 / 3, np.float32)
@@ -63,8 +48,8 @@ def sample_points(scene: Any, lattice: Lattice) -> tuple[SurfacePoints, IntArray
     numbers = np.array([registry_id(shape) for shape in shapes], np.uint32)[owner]
     # All shapes at once: a launch for each would be compiled for each.
     for part in np.array_split(np.arange(count), max(1, math.ceil(count / _CHUNK))):
-        position[part], normal[part], geometric[part] = _surface_at(numbers[part], local[part], uv[part])
-        middle[part] = _surface_at(numbers[part], local[part], centre[part])[0]
+        position[part], normal[part], geometric[part] = surface_at(numbers[part], local[part], uv[part])
+        middle[part] = surface_at(numbers[part], local[part], centre[part])[0]
     # The side that shading lights, where winding and vertex normals disagree.
     geometric *= np.where(np.einsum("ij,ij->i", geometric, normal) < 0, -1, 1)[:, None].astype(np.float32)
     # Rounded positions and normals make one key: points that triangles share are computed once, so edges cannot show.
@@ -82,12 +67,14 @@ def sample_points(scene: Any, lattice: Lattice) -> tuple[SurfacePoints, IntArray
         index[side] = inverse + offset
         offset += len(first)
     front, back = unique_first
-    return SurfacePoints(
-        np.concatenate([position[front], position[back]]),
-        np.concatenate([normal[front], -normal[back]]),
-        np.concatenate([geometric[front], -geometric[back]]),
-        np.concatenate([2 * island[front], 2 * island[back] + 1]),
-    ), index
+    place = np.unique(_mix(np.column_stack([key_parts[:, :3], island]).astype(np.uint64)), return_inverse=True)[1]
+    all_positions = np.concatenate([position[front], position[back]])
+    all_geometric = np.concatenate([geometric[front], -geometric[back]])
+    covered = find_covered(scene, all_positions, all_geometric, min(_COVERED_TEXELS * texel_m, _COVERED_M))[index]
+    join = np.stack([place, place + place.max() + 1])
+    barriers = find_barriers(scene, lattice, position, geometric, index, join, (covered[0], covered[1]))
+    all_normals = np.concatenate([normal[front], -normal[back]])
+    return SurfacePoints(all_positions, all_normals, all_geometric, barriers.piece), index, barriers.reach
 
 
 def _islands(vertices: NDArray, faces: NDArray) -> IntArray:
@@ -111,21 +98,14 @@ def _mix(columns: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return h
 
 
-def _surface_at(
+def surface_at(
     shape: NDArray[np.uint32], face: NDArray[np.uint32], uv: Float32Array
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Position, shading normal and geometric normal, as the renderer sees them, at barycentric `uv` of triangles.
 
     shape: the registry's number of the mesh that each triangle is one of.
     """
-    pi = dr.zeros(mi.PreliminaryIntersection3f, len(face))
-    pi.prim_index = mi.UInt32(face)
-    pi.prim_uv = mi.Point2f(uv[:, 0], uv[:, 1])
-    pi.shape = dr.reinterpret_array(mi.ShapePtr, mi.UInt32(shape))
-    pi.valid = mi.Bool(True)
-    ray = dr.zeros(mi.Ray3f, len(face))
-    ray.d = mi.Vector3f(0, 0, 1)
-    si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
+    si = at_triangles(shape, face, uv)[1]
     return tuple(np.array(v, np.float32).reshape(3, -1).T for v in (si.p, si.sh_frame.n, si.n))  # type: ignore[return-value]
 
 

@@ -70,6 +70,7 @@ def _load(path: Path, lattice: Lattice) -> tuple[NDArray, NDArray] | None:
                 values = np.zeros((lattice.points, 4), np.float32)
                 values[alive, :3] = data[side]
                 values[alive, 3] = 1
+                values[data[f"{side}_parted"], 3] += data[f"{side}_reach"]
                 sides.append(values)
     except (OSError, ValueError, KeyError, EOFError, IndexError, zipfile.BadZipFile, zlib.error):
         return None
@@ -81,7 +82,9 @@ def _store(path: Path, front: NDArray, back: NDArray) -> None:
     arrays: dict[str, NDArray] = {}
     for side, values in zip(_SIDES, (front, back), strict=True):
         alive = values[:, 3] > 0
+        parted = np.flatnonzero(values[:, 3] > 1).astype(np.uint32)
         arrays |= {side: values[alive, :3], f"{side}_alive": np.packbits(alive)}
+        arrays |= {f"{side}_parted": parted, f"{side}_reach": (values[parted, 3] - 1).astype(np.uint32)}
     temporary = path.with_suffix(f".{os.getpid()}.tmp.npz")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

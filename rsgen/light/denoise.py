@@ -7,42 +7,33 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from rsgen.array_types import Float32Array, FloatArray, IntArray
-from rsgen.light.bake_points import SurfacePoints, thin
+from rsgen.light.surface_points import SurfacePoints
 
 _NEIGHBOURS = 32
 _REACH = 2.0  # spacings: of the weight's fall with distance
-_PATCH = 8.0  # spacings that the noise's size is estimated over
 _CHUNK = 1 << 17
 
 
-def scatter_of(
-    points: SurfacePoints, which: IntArray, halves: NDArray, spacing: float
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """Standard error (n,) of the mean of two independent estimates (2, n, 3), and as a part of it; by patches."""
-    patch = thin(points, _PATCH * spacing, which)[1]
-    count = np.bincount(patch)
-    a, b = halves.mean(axis=2)
-    variance = (np.bincount(patch, (a - b) ** 2) / (4 * count))[patch]
-    mean = (np.bincount(patch, ((a + b) / 2) ** 2) / count)[patch]
-    return np.sqrt(variance), np.sqrt(variance / np.maximum(mean, 1e-30))
-
-
-def denoised(points: SurfacePoints, which: IntArray, halves: NDArray, spacing: float) -> Float32Array:
+def denoised(
+    points: SurfacePoints, which: IntArray, halves: NDArray, sigma: FloatArray, spacing: float, noisy: IntArray
+) -> Float32Array:
     """Mean (n, 3) of two independent estimates (2, n, 3) of irradiance, smoothed where noise hides any difference.
 
+    sigma: standard error (n,) of the mean, in grey. noisy: which of the points are looked at, the others stay.
     Each half is averaged with weights by the other (Rousselle, Manzi, Zwicker, PG 2013), so that noise does not choose
     what it is averaged with: edges of shadows stay.
     """
+    out = halves.mean(axis=0).astype(np.float32)
+    if not len(noisy):
+        return out
     scaled = points.coordinates(_REACH * spacing)[which]
-    sigma = scatter_of(points, which, halves, spacing)[0]
     grey = halves.mean(axis=2)
     # Variance of one half: of a point that scatters more than its neighbours its own.
     half = np.maximum(2.0 * sigma**2, 0.5 * (grey[0] - grey[1]) ** 2)
     tree = cKDTree(scaled)
-    out = np.empty((len(which), 3), np.float32)
     k = min(_NEIGHBOURS, len(which))
-    for begin in range(0, len(which), _CHUNK):
-        part = slice(begin, begin + _CHUNK)
+    for begin in range(0, len(noisy), _CHUNK):
+        part = noisy[begin : begin + _CHUNK]
         distance, near = (np.reshape(v, (-1, k)) for v in tree.query(scaled[part], k=k, workers=-1))
         spread = half[part, None] + half[near]
         smoothed = np.zeros((len(near), 3))

@@ -16,7 +16,7 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.device.arrays import aligned
 from rsgen.light.sampling import r2
-from rsgen.light.specular import first_scatterer, passes_light_on
+from rsgen.light.specular import first_scatterer, passes_light_on, transmitted
 from rsgen.render.irradiance import IrradianceField
 from rsgen.render.object_light import HARMONICS, harmonics, irradiance_coefficients
 
@@ -36,7 +36,7 @@ def _gathered(scene: Any, field: IrradianceField, p_world: FloatArray, follow: b
     """Coefficients (n, 9, 3) of the radiance that arrives."""
     total = _from_surfaces(scene, field, p_world, follow)
     if len(scene.emitters()):
-        total = total + _from_lamps(scene, p_world)
+        total = total + _from_lamps(scene, p_world, follow)
     return total
 
 
@@ -48,26 +48,25 @@ def _from_surfaces(scene: Any, field: IrradianceField, p_world: FloatArray, foll
     pick = mi.Float(i) * 0.6180339887498949
     pick -= dr.floor(pick)
     ray = mi.Ray3f(_places(p_world, index // _RAYS), d)
-    pi, si, ray, through, passed = first_scatterer(scene, ray, pick, follow, mi.Bool(True))
+    pi, si, ray, through, turned = first_scatterer(scene, ray, pick, follow, mi.Bool(True))
     hit = si.is_valid()
     emitter = si.emitter(scene)
-    lamp = (emitter != dr.zeros(mi.EmitterPtr)) & (passed > 0)  # the others are sampled
+    lamp = (emitter != dr.zeros(mi.EmitterPtr)) & turned  # the others are sampled
     radiance = dr.select(lamp, through * emitter.eval(si, lamp), 0)
     albedo = si.bsdf(ray).eval_diffuse_reflectance(si, hit)
     radiance += dr.select(hit, through * albedo * field.lookup(pi, si, -ray.d, hit) * dr.inv_pi, 0)
     return _projected(radiance, d, _RAYS) * (4 * np.pi)
 
 
-def _from_lamps(scene: Any, p_world: FloatArray) -> FloatArray:
+def _from_lamps(scene: Any, p_world: FloatArray, follow: bool) -> FloatArray:
     index = dr.arange(mi.UInt32, len(p_world) * _LAMP_SAMPLES)
     it = dr.zeros(mi.Interaction3f, dr.width(index))
     it.p = _places(p_world, index // _LAMP_SAMPLES)
     it.t = mi.Float(1)
     ds, value = scene.sample_emitter_direction(it, r2(index % _LAMP_SAMPLES, mi.Point2f(0.5)), False)
     lit = (ds.pdf > 0) & (dr.max(value) > 0)
-    shadow = mi.Ray3f(it.p, ds.d, ds.dist * (1 - 1e-4) - 1e-5, 0.0, mi.Color0f())
-    lit &= ~scene.ray_test(shadow, active=lit)
-    return _projected(dr.select(lit, value, 0), ds.d, _LAMP_SAMPLES)
+    arrives = transmitted(scene, it.p, ds.d, ds.dist, lit, follow)
+    return _projected(dr.select(lit, value * arrives, 0), ds.d, _LAMP_SAMPLES)
 
 
 def _places(p_world: FloatArray, which: Any) -> Any:

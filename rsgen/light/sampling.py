@@ -9,13 +9,13 @@ import drjit as dr
 import mitsuba as mi
 from numpy.typing import NDArray
 
-from rsgen.light.bake_points import SurfacePoints
+from rsgen.light.surface_points import SurfacePoints
 
-_OFFSET_M = 2e-4  # ray origins above their surface
+OFFSET_M = 2e-4  # ray origins above their surface
 _CHUNK = 1 << 18
 
 
-def rotation(index: Any, dimension: int) -> Any:
+def rotation(index: Any, dimension: Any) -> Any:
     """Uniform offset in [0, 1) from a hash of a point's number and a dimension."""
     return mi.sample_tea_float32(index, mi.UInt32(dimension), 4)
 
@@ -34,5 +34,5 @@ def chunks(
     for begin in range(0, len(which), size):
         part = which[begin : begin + size]
         p, n, g = (mi.Vector3f(a[part].T) for a in (points.position, points.normal, points.geometric))
-        yield begin, part, mi.Point3f(p + g * _OFFSET_M), n, mi.UInt32(part.astype("uint32"))
+        yield begin, part, mi.Point3f(p + g * OFFSET_M), n, mi.UInt32(part.astype("uint32"))
         report(min(1.0, (begin + len(part)) / len(which)))

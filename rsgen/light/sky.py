@@ -1,4 +1,4 @@
-"""Light from the sky, and lamps' light that comes through panes or off mirrors, on points of surfaces.
+"""Light from the sky, and lamps' light that comes off mirrors or through thick glass, on points of surfaces.
 
 In a room a sky is seen through a window only: most directions that are drawn from the whole of it end at a wall. So a
 first look tells where light comes from in each part of the scene, and half of the directions are drawn from that. How
@@ -7,65 +7,55 @@ much is drawn depends on how much it still scatters.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
-from rsgen.array_types import Float32Array, IntArray
-from rsgen.light.bake_points import SurfacePoints, thin
-from rsgen.light.denoise import denoised, scatter_of
+from rsgen.array_types import FloatArray, IntArray
+from rsgen.light.bake_points import thin
 from rsgen.light.guide import Guide, bin_of
+from rsgen.light.rounds import drawn_at, in_rounds
 from rsgen.light.sampling import chunks, r2, rotation
-from rsgen.light.specular import first_scatterer
+from rsgen.light.specular import first_scatterer, passes_light_on
+from rsgen.light.surface_points import SurfacePoints
 
 _CELL_M = 0.5  # parts of the scene that have one histogram, of like normals on one piece of surface
 _FIRST_LOOK_TEXELS, _FIRST_LOOK_SAMPLES = 3.0, 64
-_GROWTH, _ROUNDS = 2, 6  # after each round so many times as much has been drawn as before it
+_ROUNDS = 6
 # Directions drawn in all, of those of the first round: where light is hard to find the worst places get them.
-_EFFORT = 4
+_EFFORT = 4.0
+_LESS = 4  # without a sky, what comes is lamps' light off mirrors and through thick glass: mostly nothing
+
+
+def has_sky_light(scene: Any) -> bool:
+    """Whether a scene has any of this light."""
+    return scene.environment() is not None or passes_light_on(scene)
 
 
 def sky_light(
-    scene: Any, points: SurfacePoints, which: IntArray, texel_m: float, samples: int, follow: bool, scatter: float,
-    report: Callable[[float], None],
-) -> tuple[Float32Array, float]:  # fmt: skip
-    """Irradiance (len(which), 3) from the sky and, with `follow`, from lamps by way of panes and mirrors.
+    scene: Any, points: SurfacePoints, which: IntArray, patch: IntArray, texel_m: float, samples: int, follow: bool,
+    beside: FloatArray, scatter: float, report: Callable[[float], None],
+) -> tuple[NDArray[np.float64], FloatArray]:  # fmt: skip
+    """Irradiance from the sky and, with `follow`, from lamps by ways with turns: off mirrors and through thick glass.
 
-    samples: directions at each point at first; more where the standard error of the irradiance, as a part of it,
-    exceeds `scatter`, as far as the effort allows. Returns too what that is in the end, before it is smoothed: root
-    mean square over all points.
+    samples: directions at each point at first; more where the standard error exceeds `scatter`, as far as the effort
+    allows; beside (n,): light that points have from elsewhere, in grey. Returns means (2, len(which), 3) of two halves
+    of what was drawn, and the error (n,) left (see `rounds`).
     """
     cell = thin(points, _CELL_M, which)[1]
     guide = _learned(scene, points, which, cell, texel_m, follow)
-    halves = np.zeros((2, len(which), 3))
-    drawn = np.zeros(len(which))
-    means, left = halves, np.zeros(len(which))
-    todo = np.arange(len(which))
-    for round_ in range(_ROUNDS):
-        count = samples if round_ == 0 else (_GROWTH - 1) * int(drawn[todo[0]])
-        begin = int(drawn[todo[0]])
 
-        def share(f: float, n: int = round_) -> None:
-            report((n + f) / _ROUNDS)
+    def sample(at: Sequence[Any], here: IntArray, begin: int, count: int) -> Any:
+        return _sky_at(scene, guide, mi.UInt32(cell[here].astype(np.uint32)), *at, begin, count, follow)
 
-        for first, part, p, n, number in chunks(points, which[todo], share):
-            here = todo[first : first + len(part)]
-            sums = _sky_at(scene, guide, mi.UInt32(cell[here].astype(np.uint32)), p, n, number, begin, count, follow)
-            halves[:, here] += np.array(sums, dtype=np.float64).reshape(2, 3, -1).transpose(0, 2, 1)
-        drawn[todo] += count
-        means = halves / np.maximum(drawn[:, None] / 2, 1)
-        left = scatter_of(points, which, means, texel_m)[1]
-        todo = todo[left[todo] > scatter]
-        spare = max(0.0, _EFFORT * samples * len(which) - drawn.sum())
-        most = int(spare / ((_GROWTH - 1) * drawn.max()))
-        todo = np.sort(todo[np.argsort(-left[todo], kind="stable")[:most]])
-        if not len(todo):
-            break
-    report(1.0)
-    return denoised(points, which, means, texel_m), float(np.sqrt(np.mean(left**2)))
+    draw = drawn_at(which, partial(chunks, points), sample)
+    first = samples if scene.environment() is not None else max(4, samples // _LESS)
+    return in_rounds(draw, patch, lambda own: own + beside, scatter, first, _ROUNDS, _EFFORT * samples, report)
 
 
 def _learned(
@@ -121,9 +111,9 @@ def _drawn(scene: Any, p: Any, n: Any, u: Any, other: Any, guided: Any) -> tuple
 def _arriving(scene: Any, p: Any, n: Any, d: Any, pick: Any, follow: bool) -> tuple[Any, Any]:
     """Whether anything arrives at p (normal n) from direction d, and radiance times cosine."""
     cosine = dr.dot(n, d)
-    _, si, _, through, passed = first_scatterer(scene, mi.Ray3f(p, d), pick - dr.floor(pick), follow, cosine > 0)
+    _, si, _, through, turned = first_scatterer(scene, mi.Ray3f(p, d), pick - dr.floor(pick), follow, cosine > 0)
     emitter = si.emitter(scene)
-    found = (cosine > 0) & (emitter != dr.zeros(mi.EmitterPtr)) & (~si.is_valid() | (passed > 0))
+    found = (cosine > 0) & (emitter != dr.zeros(mi.EmitterPtr)) & (~si.is_valid() | turned)
     return found, dr.select(found, through * emitter.eval(si, found) * cosine, 0)
 
 

@@ -20,6 +20,9 @@ from rsgen.array_types import Float32Array, IntArray
 from rsgen.errors import UserError
 from rsgen.render.scene import mesh_arrays
 
+REACH_LEVELS = 31  # how far a sample counts towards a neighbour: level / 30 of the way
+FREE = REACH_LEVELS  # and this, beyond the neighbour: nothing stands between
+_BLOCKED = 1e-4  # weight of a sample that something stands before: it counts where no other does
 _MAX_CELLS = 4095  # cells along one grid axis: 12 bits
 _POINT_BYTES = 300  # of memory that baking takes at its peak for each point, as measured
 _MOST_POINTS = int(4e9 / _POINT_BYTES)
@@ -126,15 +129,39 @@ def lattice_barycentric(lattice: Lattice) -> tuple[IntArray, Float32Array]:
     return face, weights[:, 1:]
 
 
+def at_triangles(shape: NDArray[np.uint32], face: NDArray[np.uint32], uv: Float32Array) -> tuple[Any, Any]:
+    """(pi, si), as if met by rays, at barycentric uv (n, 2) of triangles of the meshes with these `registry_id`."""
+    pi = dr.zeros(mi.PreliminaryIntersection3f, len(face))
+    pi.t = mi.Float(1)  # else it counts as no hit
+    pi.prim_index = mi.UInt32(face)
+    pi.prim_uv = mi.Point2f(uv[:, 0], uv[:, 1])
+    pi.shape = dr.reinterpret_array(mi.ShapePtr, mi.UInt32(shape))
+    pi.valid = mi.Bool(True)
+    ray = dr.zeros(mi.Ray3f, len(face))
+    ray.d = mi.Vector3f(0, 0, 1)
+    return pi, pi.compute_surface_interaction(ray, mi.RayFlags.All)
+
+
+def packed_reach(levels: NDArray[np.uint8]) -> NDArray[np.uint32]:
+    """(n,) code of how far samples count, `levels` (n, 4) towards +u, -u, +v and -v; 0 where nothing is in the way.
+
+    Codes are below 2^20, so that with the 1 of a living sample they are exact in float32.
+    """
+    taken = (FREE - levels.astype(np.uint32)) << np.array([0, 5, 10, 15], np.uint32)
+    return taken.sum(axis=1).astype(np.uint32)
+
+
 class IrradianceField:
     """Device tables for `lookup`; no dataclass, which Dr.Jit's loops would take apart as their state.
 
-    A point that no light can reach (buried in another object) is not alive and does not darken its neighbours.
+    A point that no light can reach (buried in another object) is not alive and does not darken its neighbours; one
+    beyond a wall, or under what lies on the surface, does not count on this side of it (see `packed_reach`).
     """
 
     def __init__(self, shape_first: Any, faces: Any, values: Any, face_count: int) -> None:
         """`shape_first` Int32 by registry id; `faces` UInt32 pairs (first point, packed cells and apex), front sides
-        then back sides; `values` Float, (E_r, E_g, E_b, alive) per lattice point of each stored side.
+        then back sides; `values` Float, (E_r, E_g, E_b, w) per lattice point of each stored side: w is 0 for a point
+        that is not alive, else 1 + its reach.
         """
         self.shape_first = shape_first
         self.faces = faces
@@ -162,19 +189,27 @@ class IrradianceField:
         fx, fy = x - mi.Float(i), y - mi.Float(j)
         corner = entry.x + i * (nv + 1) + j
         total = mi.Vector4f(0)
-        for offset, weight in (
-            (corner, (1 - fx) * (1 - fy)),
-            (corner + 1, (1 - fx) * fy),
-            (corner + nv + 1, fx * (1 - fy)),
-            (corner + nv + 2, fx * fy),
+        for offset, du, dv, u_bits, v_bits in (
+            (corner, fx, fy, 0, 10),
+            (corner + 1, fx, 1 - fy, 0, 15),
+            (corner + nv + 1, 1 - fx, fy, 5, 10),
+            (corner + nv + 2, 1 - fx, 1 - fy, 5, 15),
         ):
             value = dr.gather(mi.Vector4f, self.values, offset, active)
-            total += value * (weight * value.w)
+            taken = mi.UInt32(dr.maximum(value.w - 1, 0))
+            reaches = (du <= _reach(taken >> u_bits)) & (dv <= _reach(taken >> v_bits))
+            weight = (1 - du) * (1 - dv) * dr.select(value.w > 0, dr.select(reaches, 1, _BLOCKED), 0)
+            total += mi.Vector4f(value.x, value.y, value.z, 1) * weight
         return mi.Color3f(total.xyz) * dr.select(total.w > 0, dr.rcp(dr.maximum(total.w, 1e-12)), 0)
 
 
+def _reach(code: Any) -> Any:
+    """Part of the way to the neighbour, above 1 where it is free."""
+    return mi.Float(FREE - (code & 31)) / (REACH_LEVELS - 1)
+
+
 def make_field(lattice: Lattice, front: Float32Array, back: Float32Array) -> IrradianceField:
-    """Upload values (points, 4) of both sides; back sides that no light reaches share one dark cell."""
+    """Upload values (points, 4) of both sides, as `IrradianceField` has them; unlit back sides share one dark cell."""
     packed = lattice.packed()
     lit = np.maximum.reduceat(back[:, 3], lattice.first) > 0
     keep = np.repeat(lit, (lattice.cells + 1).prod(axis=1))

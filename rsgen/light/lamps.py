@@ -1,0 +1,189 @@
+"""Direct light of lamps on points of surfaces, drawn from each lamp in rounds.
+
+Where a lamp all but touches a surface, samples on it scatter without bound (1 / d²): there rays about the normal take
+over, by the balance heuristic (Veach and Guibas 1995).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from rsgen.array_types import FloatArray, IntArray
+from rsgen.light.rounds import drawn_at, in_rounds
+from rsgen.light.sampling import chunks, r2, rotation
+from rsgen.light.specular import first_scatterer, transmitted
+from rsgen.light.surface_points import SurfacePoints
+
+MANY_EMITTERS = 24  # more are sampled together, as one
+_ROUNDS = 5
+_FIRST_LOOK = 2
+_NEAR_RAYS, _NEAR_ROUNDS = 8, 7
+# Samples on lamps are trusted this much more than rays about the normal.
+_LIGHT_TRUST = 64.0
+
+
+def lamps_of(scene: Any) -> list[Any]:
+    """All emitters but the sky."""
+    return [emitter for emitter in scene.emitters() if not emitter.is_environment()]
+
+
+def first_look(
+    scene: Any, points: SurfacePoints, which: IntArray, follow: bool, report: Callable[[float], None]
+) -> NDArray[np.float64]:
+    """Direct irradiance (n, 3) from all lamps by a few samples of each."""
+    kinds = _kinds(scene)
+    total = np.zeros((len(which), 3))
+    for k, (emitter, dimension, _) in enumerate(kinds):
+        draw = _draw(scene, emitter, dimension, points, which, follow)
+        count = _FIRST_LOOK if emitter is not None else _FIRST_LOOK * MANY_EMITTERS
+
+        def share(f: float, k: int = k) -> None:
+            report((k + f) / len(kinds))
+
+        total += draw(np.arange(len(which)), 0, count, share).sum(axis=0) / count
+    return total
+
+
+def lamp_light(
+    scene: Any, points: SurfacePoints, which: IntArray, patch: IntArray, samples: int, follow: bool,
+    light: FloatArray, scatter: float, report: Callable[[float], None],
+) -> tuple[NDArray[np.float64], FloatArray]:  # fmt: skip
+    """Direct irradiance from all lamps but the sky, with `follow` through thin panes too.
+
+    samples: of each lamp, at most twice as many where they scatter and an eighth where they do not; light (n,): all
+    light of the points, about, in grey. Returns means (2, n, 3) of two halves of what was drawn, and the error (n,)
+    left (see `rounds`).
+    """
+    kinds = _kinds(scene)
+    means, square = np.zeros((2, len(which), 3)), np.zeros(len(which))
+    for k, (emitter, dimension, delta) in enumerate(kinds):
+        draw = _draw(scene, emitter, dimension, points, which, follow)
+        count = samples * (1 if emitter is not None else MANY_EMITTERS)
+        first, rounds = (2, 1) if delta else (max(2, count // 8), _ROUNDS)
+
+        def share(f: float, k: int = k) -> None:
+            report(0.9 * (k + f) / len(kinds))
+
+        own, left = in_rounds(
+            draw, patch, lambda _: light, scatter / math.sqrt(len(kinds)), first, rounds, math.inf, share
+        )
+        means += own
+        square += left**2
+
+    if all(lamp.get_shape() is None for lamp in lamps_of(scene)):
+        return means, np.sqrt(square)
+
+    def sample(at: Sequence[Any], _: IntArray, begin: int, count: int) -> Any:
+        return _near_at(scene, *at, begin, count, follow)
+
+    draw = drawn_at(which, partial(chunks, points), sample)
+    own, left = in_rounds(
+        draw, patch, lambda _: light, scatter, _NEAR_RAYS, _NEAR_ROUNDS, 2.0 * samples, lambda f: report(0.9 + 0.1 * f)
+    )
+    return means + own, np.sqrt(square + left**2)
+
+
+def _kinds(scene: Any) -> list[tuple[Any, int, bool]]:
+    """What is sampled by itself: (emitter or None for any, number of its random numbers, one sample tells all)."""
+    lamps = lamps_of(scene)
+    if len(lamps) > MANY_EMITTERS:
+        return [(None, 0, False)]
+    return [(lamp, k, int(lamp.flags()) & int(mi.EmitterFlags.Delta) != 0) for k, lamp in enumerate(lamps)]
+
+
+def _registry_id(emitter: Any) -> int:
+    return int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0])
+
+
+def _draw(scene: Any, emitter: Any, dimension: int, points: SurfacePoints, which: IntArray, follow: bool) -> Any:
+    def sample(at: Sequence[Any], _: IntArray, begin: int, count: int) -> Any:
+        return _from_emitter(scene, emitter, *at, begin, count, dimension, follow)
+
+    return drawn_at(which, partial(chunks, points), sample)
+
+
+@dr.syntax
+def _from_emitter(scene, emitter, p, n, number, begin, samples, dimension, follow):
+    """Sums over two halves of the samples `begin` to `begin + samples` of irradiance at p (normal n) from one emitter.
+
+    If that is None, from random ones but the sky.
+    """
+    it = dr.zeros(mi.Interaction3f, dr.width(p))
+    it.p = p
+    it.t = mi.Float(1)
+    it.n = mi.Normal3f(n)
+    # Neither is part of the program: what is compiled for one lamp serves for all.
+    first_dimension = dr.opaque(mi.UInt32, 2 * dimension)
+    offset = mi.Point2f(rotation(number, first_dimension), rotation(number, first_dimension + 1))
+    lamp = dr.reinterpret_array(mi.EmitterPtr, dr.opaque(mi.UInt32, 0 if emitter is None else _registry_id(emitter)))
+    i = dr.opaque(mi.UInt32, begin)
+    end = i + dr.opaque(mi.UInt32, samples)
+    even, odd = mi.Color3f(0), mi.Color3f(0)
+    while i < end:
+        u = r2(i, offset)
+        if dr.hint(emitter is None, mode="scalar"):
+            ds, value = scene.sample_emitter_direction(it, u, False)
+            if dr.hint(scene.environment() is not None, mode="scalar"):
+                value = dr.select(ds.emitter == mi.EmitterPtr(scene.environment()), 0, value)
+        else:
+            ds, value = lamp.sample_direction(it, u)
+        cosine = dr.dot(n, ds.d)
+        lit = (cosine > 0) & (ds.pdf > 0) & (dr.max(value) > 0)
+        arrives = transmitted(scene, p, ds.d, ds.dist, lit, follow)
+        light = value * cosine * dr.select(ds.delta, 1, _light_share(ds.pdf, cosine))
+        light = dr.select(lit, light * arrives, 0)
+        first = (i & 1) == 0
+        even += dr.select(first, light, 0)
+        odd += dr.select(first, 0, light)
+        i += 1
+    return mi.Vector3f(even), mi.Vector3f(odd)
+
+
+def _light_share(light_pdf: Any, cosine: Any) -> Any:
+    """The light samples' part in the balance heuristic with cosine-distributed rays."""
+    # Written so that a grazing emitter's infinite density gives 1, and 0 / 0 does not occur.
+    trusted = dr.maximum(_LIGHT_TRUST * light_pdf, 1e-20)
+    return dr.rcp(1 + dr.maximum(cosine, 0) * dr.inv_pi / trusted)
+
+
+@dr.syntax
+def _near_at(scene, p, n, number, begin, rays, follow):
+    """Sums over two halves of the rays `begin` to `begin + rays` of what `_from_emitter` leaves to rays."""
+    frame = mi.Frame3f(n)
+    offset = mi.Point2f(rotation(number, 111), rotation(number, 112))
+    lobe = rotation(number, 113)
+    it = dr.zeros(mi.Interaction3f, dr.width(p))
+    it.p = p
+    it.n = mi.Normal3f(n)
+    many = len(scene.emitters()) > MANY_EMITTERS
+    i = dr.opaque(mi.UInt32, begin)
+    end = i + dr.opaque(mi.UInt32, rays)
+    even, odd = mi.Color3f(0), mi.Color3f(0)
+    while i < end:
+        d = frame.to_world(mi.warp.square_to_cosine_hemisphere(r2(i, offset)))
+        pick = lobe + mi.Float(i) * 0.6180339887498949
+        pick -= dr.floor(pick)
+        _, si, _, through, turned = first_scatterer(scene, mi.Ray3f(p, d), pick, follow, mi.Bool(True))
+        emitter = si.emitter(scene)
+        lamp = (emitter != dr.zeros(mi.EmitterPtr)) & si.is_valid() & ~turned  # the others are `sky_light`'s
+        towards = mi.DirectionSample3f(scene, si, it)
+        if dr.hint(many, mode="scalar"):
+            light_pdf = scene.pdf_emitter_direction(it, towards, lamp)
+        else:
+            light_pdf = emitter.pdf_direction(it, towards, lamp)
+        # With pdf cosθ/π, ∫ L cosθ dω is the mean of πL.
+        left_out = 1 - _light_share(light_pdf, dr.dot(n, d))
+        light = dr.select(lamp, dr.pi * through * emitter.eval(si, lamp) * left_out, 0)
+        first = (i & 1) == 0
+        even += dr.select(first, light, 0)
+        odd += dr.select(first, 0, light)
+        i += 1
+    return mi.Vector3f(even), mi.Vector3f(odd)

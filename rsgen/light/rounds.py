@@ -1,0 +1,99 @@
+"""Light drawn in rounds: at each point of a surface as many samples as what it shows needs, and no more."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsgen.array_types import FloatArray, IntArray
+
+# Sums (2, n, 3) over two halves of the samples `begin` to `begin + count` at some of the points, which it is told.
+Draw = Callable[[IntArray, int, int, Callable[[float], None]], NDArray[np.float64]]
+
+GREY_SLOPE = 0.21  # of sRGB at its middle, by the logarithm of light
+_TONE = 1 / 2.4  # sRGB goes by this power of light
+PATCH = 8.0  # spacings that noise's size is estimated over
+
+
+def scatter_of(patch: IntArray, halves: NDArray) -> FloatArray:
+    """Standard error (n,) of the mean of two independent estimates (2, n, 3) in grey, of each point's patch (n,)."""
+    a, b = halves.mean(axis=2)
+    return np.sqrt((np.bincount(patch, (a - b) ** 2) / (4 * np.bincount(patch)))[patch])
+
+
+def typical(light: FloatArray) -> float:
+    """The light (n,) that a camera is exposed for: half of the places have more, those left out that hardly have any.
+
+    Hardly any is a hundredth of what the place has that half of all light falls short of; 0 where there is none at all.
+    """
+    rising = np.sort(light)
+    total = np.cumsum(rising)
+    if not len(light) or total[-1] <= 0:
+        return 0.0
+    common = rising[np.searchsorted(total, 0.5 * total[-1])]
+    return float(np.median(rising[rising >= 0.01 * common]))
+
+
+def shown(patch: IntArray, sigma: FloatArray, grey: FloatArray) -> FloatArray:
+    """What an error sigma (n,) beside light `grey` (n,) amounts to, as a part of a mid-grey surface's light.
+
+    A camera is exposed for what is typical: in the shade of that, sRGB shows less of an error. In what is brighter than
+    that, as in what is overexposed, it is taken for no more.
+    """
+    light = (np.bincount(patch, grey) / np.bincount(patch))[patch]
+    exposed = typical(light)
+    if exposed <= 0:
+        return np.zeros(len(grey))
+    part = np.maximum(light / exposed, 1e-12)
+    return sigma / np.maximum(light, 1e-30) * np.minimum(part, 1.0) ** _TONE
+
+
+def in_rounds(
+    draw: Draw, patch: IntArray, light: Callable[[NDArray], NDArray], scatter: float, first: int, rounds: int,
+    effort: float, report: Callable[[float], None],
+) -> tuple[NDArray[np.float64], FloatArray]:  # fmt: skip
+    """Means (2, n, 3) of the halves of what `draw` drew at n points, and the errors (n,) left, as `shown` has them.
+
+    patch: what each point's noise is estimated over. light: all the light (n,) of points, in grey, given what this kind
+    brings. After the first round, each draws as much again as all before it, where more than `scatter` is left, the
+    worst first while no more than `effort` samples a point are drawn on the average.
+    """
+    n = len(patch)
+    sums, drawn = np.zeros((2, n, 3)), np.zeros(n, np.int64)
+    todo: IntArray = np.arange(n)
+    means, left = sums, np.zeros(n)
+    for k in range(rounds):
+        begin = int(drawn[todo[0]])
+        count = first if k == 0 else begin
+
+        def share(f: float, k: int = k) -> None:
+            report((k + f) / rounds)
+
+        sums[:, todo] += draw(todo, begin, count, share)
+        drawn[todo] += count
+        means = sums / (drawn[:, None] / 2)
+        left = shown(patch, scatter_of(patch, means), light(means.mean(axis=(0, 2))))
+        todo = todo[left[todo] > scatter]
+        most = int(min(max(0.0, effort * n - drawn.sum()) / drawn.max(), n))
+        todo = np.sort(todo[np.argsort(-left[todo], kind="stable")[:most]])
+        if not len(todo):
+            break
+    report(1.0)
+    return means, left
+
+
+def drawn_at(which: IntArray, chunks: Callable[..., Any], sample: Callable[..., Any]) -> Draw:
+    """A `Draw` at the points `which`, from `sample(points on the device, their places in `which`, begin, count)`."""
+
+    def draw(todo: IntArray, begin: int, count: int, report: Callable[[float], None]) -> NDArray[np.float64]:
+        out = np.zeros((2, len(todo), 3))
+        for first, part, *at in chunks(which[todo], report):
+            here = slice(first, first + len(part))
+            sums = sample(at, todo[here], begin, count)
+            out[:, here] = np.array(sums, dtype=np.float64).reshape(2, 3, -1).transpose(0, 2, 1)
+        return out
+
+    return draw

@@ -1,0 +1,32 @@
+"""The points of a scene's surfaces that light is baked at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsgen.array_types import Float32Array, IntArray
+
+_NORMAL_SCALE = 0.35  # normals this far apart count as much as one spacing
+_APART = 1e4  # spacings between different pieces of surface
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Unique sample points: position on the surface, shading normal, geometric normal, (n, 3) float32 each, and (n,)
+    the number of the piece of surface that each lies on: one side of a connected part of a mesh that
+    nothing parts (see `walls`).
+    """
+
+    position: Float32Array
+    normal: Float32Array
+    geometric: Float32Array
+    piece: IntArray
+
+    def coordinates(self, spacing: float) -> NDArray:
+        """(n, 7): two points are near where positions, in units of `spacing` metres, and normals are, on one piece."""
+        return np.concatenate(
+            [self.position / spacing, self.normal / _NORMAL_SCALE, _APART * self.piece[:, None]], axis=1
+        )

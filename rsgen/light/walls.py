@@ -1,0 +1,119 @@
+"""What stands on a surface and parts it: a floor under a wall, a board or a box is two pieces, each with its own light.
+
+Light must not be mixed across: outside of a wall the sky shines on the floor, a texel from the room. Between every two
+neighbours of a triangle's grid a ray runs just above the surface. Where something is in its way, each of the two counts
+as far as that alone (`Barriers.reach`, for the lookup), and pieces of surface that are joined nowhere else are kept
+apart while light is smoothed and interpolated (`Barriers.piece`). What has something right above it, as a desk has
+under a sheet of paper, is seen by nobody and counts for nothing beside it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from rsgen.array_types import Float32Array, IntArray
+from rsgen.light.sampling import OFFSET_M
+from rsgen.render.irradiance import FREE, REACH_LEVELS, Lattice, packed_reach
+
+_HEIGHT_M = 1e-3  # of the rays above the surface
+_SHORTEST_M = 2e-3  # neighbours nearer than this are taken for joined
+_CHUNK = 1 << 20
+
+
+@dataclass(frozen=True)
+class Barriers:
+    """reach: for the front and the back, (points,) uint32 of each lattice point, 0 where it reaches all its neighbours
+    (see `packed_reach`); piece (n,): number of the piece of surface that each unique point lies on.
+    """
+
+    reach: tuple[NDArray[np.uint32], NDArray[np.uint32]]
+    piece: IntArray
+
+
+def find_barriers(
+    scene: Any, lattice: Lattice, position: Float32Array, normal: Float32Array, index: IntArray, join: IntArray,
+    covered: tuple[NDArray[np.bool_], NDArray[np.bool_]],
+) -> Barriers:  # fmt: skip
+    """Barriers of a scene between its lattice's points.
+
+    position, normal: (points, 3), world, m: where light is looked at, and the geometric normal of the front. index:
+    (2, points), the unique point of each one's front and back. join: (2, points), alike where points of the front, or
+    of the back, are at one place of one surface. covered: (points,) of front and back, see `find_covered`.
+    """
+    here, there, along = _neighbours(lattice)
+    levels = [np.full((lattice.points, 4), FREE, np.uint8) for _ in range(2)]
+    ends: list[NDArray] = [index[0], index[1]], [join[0] + index.max() + 1, join[1] + index.max() + 1]  # type: ignore[assignment]
+    a, b = [np.concatenate(e) for e in ends]
+    for side, sign in enumerate((1.0, -1.0)):
+        hidden = covered[side]
+        apart = hidden[here] != hidden[there]
+        for begin in range(0, len(here), _CHUNK):
+            part = slice(begin, begin + _CHUNK)
+            blocked, forth, back = _between(scene, position, sign * normal, here[part], there[part])
+            at = begin + blocked
+            apart[at] = True
+            levels[side][here[at], along[at]] = forth
+            levels[side][there[at], along[at] + 1] = back
+        levels[side][hidden] = 0
+        a = np.concatenate([a, index[side][here[~apart]]])
+        b = np.concatenate([b, index[side][there[~apart]]])
+    size = int(max(a.max(), b.max())) + 1
+    label = connected_components(coo_array((np.ones(len(a), bool), (a, b)), shape=(size, size)), directed=False)[1]
+    return Barriers((packed_reach(levels[0]), packed_reach(levels[1])), label[: int(index.max()) + 1].astype(np.int64))
+
+
+def find_covered(scene: Any, position: Float32Array, normal: Float32Array, within_m: float) -> NDArray[np.bool_]:
+    """Which points (n, 3) have something less than `within_m` in front of them, along the normal."""
+    out = np.zeros(len(position), bool)
+    for begin in range(0, len(position), _CHUNK):
+        part = slice(begin, begin + _CHUNK)
+        rays = mi.Ray3f(mi.Point3f((position[part] + OFFSET_M * normal[part]).T), mi.Vector3f(normal[part].T))
+        rays.maxt = mi.Float(within_m)
+        out[part] = np.array(scene.ray_test(rays)).astype(bool)
+    return out
+
+
+def _neighbours(lattice: Lattice) -> tuple[IntArray, IntArray, IntArray]:
+    """Pairs of neighbours in the grids of all triangles, and the way from the first to the second: 0 is u, 2 is v."""
+    counts = (lattice.cells + 1).prod(axis=1)
+    face = np.repeat(np.arange(len(counts)), counts)
+    point = np.arange(lattice.points)
+    nu, nv = lattice.cells[face].T
+    row, column = np.divmod(point - lattice.first[face], nv + 1)
+    down, right = point[row < nu], point[(column < nv) & (row > 0)]  # a triangle's apex is all of its first row
+    here = np.concatenate([down, right])
+    there = np.concatenate([down + nv[down] + 1, right + 1])
+    return here, there, np.repeat([0, 2], [len(down), len(right)])
+
+
+def _between(
+    scene: Any, position: Float32Array, normal: NDArray, here: IntArray, there: IntArray
+) -> tuple[IntArray, NDArray, NDArray]:
+    """Which pairs something stands between, and how far it is from the first and from the second, in levels."""
+    p = position[here] + np.float32(_HEIGHT_M) * normal[here]
+    way = (position[there] - position[here]).astype(np.float32)
+    length = np.linalg.norm(way, axis=1)
+    long = np.flatnonzero(length > _SHORTEST_M)
+    rays = mi.Ray3f(mi.Point3f(p[long].T), mi.Vector3f((way[long] / length[long, None]).T))
+    rays.maxt = mi.Float(length[long])
+    blocked = long[np.array(scene.ray_test(rays)).astype(bool)]
+    if not len(blocked):
+        return blocked, np.zeros(0, np.uint8), np.zeros(0, np.uint8)
+    away = []
+    for start, sign in ((p, 1.0), (p + way, -1.0)):
+        d = sign * way[blocked] / length[blocked, None]
+        rays = mi.Ray3f(mi.Point3f(start[blocked].T), mi.Vector3f(d.astype(np.float32).T))
+        rays.maxt = mi.Float(length[blocked])
+        pi = scene.ray_intersect_preliminary(rays, coherent=False)
+        # What a ray meets one way and misses the other, at the very end of it, is far.
+        t = np.array(dr.select(pi.is_valid(), pi.t, rays.maxt))
+        away.append(np.clip(np.rint(t / length[blocked] * (REACH_LEVELS - 1)), 0, REACH_LEVELS - 1).astype(np.uint8))
+    return blocked, away[0], away[1]
