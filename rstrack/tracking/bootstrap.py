@@ -21,16 +21,22 @@ from rstrack.tracking.window import LEVELS, Window
 
 # Knots are never further apart than this many times the spacing that was asked for.
 _WIDEST = 2.0
+# Where depth gives one pose a knot, how far after a knot, in knots: half-way between two it would not see control
+# points that alternate, of which rolling colours then tell little and wrongly.
+_AFTER_KNOT = 0.1
 
 
 def start(track: Track, new: DeviceFrame) -> FrameReport:
     """The first frame. Its depth is enough to begin with: the first colour image often comes a little later."""
     if new.depth_share < LEAST_DEPTH or not (track.options.geometric or new.colors):
         return track.report(new, fault=Fault.NO_DEPTH)
-    window = _begin(track, new, track.options.knots_s())
+    window = _begin(track, new, track.options.knots_s(), track.options.knot_phase)
     track.succession.recent.append(new)
     if new.depth.exposure.lens.lines == 1:
-        track.succession.make(new, window.spline, None)
+        # Rolling colours, looked up as if the camera stood still, would contradict all that comes: the next keyframe,
+        # whose motion is known, has colours.
+        colors = () if _colors_roll(track) else new.colors
+        track.succession.make(replace(new, colors=colors), window.spline, None)
         track.covariances.uncertainty = Uncertainty.of_first()
     track.placed(new)
     return track.report(new, keyframe=True)
@@ -39,11 +45,12 @@ def start(track: Track, new: DeviceFrame) -> FrameReport:
 def fit_knots(track: Track, gap: float) -> None:
     """Knots for frames `gap` s apart; a global shutter gives one pose each: no more knots than that can be told."""
     window, _ = track.known()
-    dt, first = track.options.knots_s(gap), track.succession.recent[0]
+    dt, first, phase = track.options.knots_s(gap), track.succession.recent[0], track.options.knot_phase
     if first.depth.exposure.lens.lines == 1 and gap > dt:
         dt = min(gap, _WIDEST * dt)
+        phase = _AFTER_KNOT if _colors_roll(track) else phase
     if dt != window.state.dt:
-        _begin(track, first, dt)
+        _begin(track, first, dt, phase)
 
 
 def bootstrap(track: Track, new: DeviceFrame) -> FrameReport:
@@ -92,9 +99,14 @@ def bootstrap(track: Track, new: DeviceFrame) -> FrameReport:
     return track.report(new, fresh, solved, keyframe=True)
 
 
-def _begin(track: Track, first: DeviceFrame, dt: float) -> Window:
-    """A spline with knots dt s apart; a rolling first frame is what others are aligned to."""
-    window = Window.still(track.terms, track.rig.depth_camera.fx, first, dt, track.options.knot_phase, track.inertia)
+def _colors_roll(track: Track) -> bool:
+    return track.options.rolling and track.rig.color_shutter.readout_s > 0.0
+
+
+def _begin(track: Track, first: DeviceFrame, dt: float, phase: float) -> Window:
+    """A spline with knots dt s apart, one of them `phase` knots before the first frame; a rolling first frame is what
+    others are aligned to."""
+    window = Window.still(track.terms, track.rig.depth_camera.fx, first, dt, phase, track.inertia)
     if first.depth.exposure.lens.lines > 1:
         track.succession.reference = track.maker.rolling(first.index, first.depth, first.colors, window.spline)
     track.window = window

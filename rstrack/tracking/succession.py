@@ -120,7 +120,10 @@ class Succession:
         assert ref is not None
         T_base_cam = se3.inverse(ref.T_world_base) @ window.spline.pose(new.depth.exposure.mid_time)
         is_behind = self._options.left_behind(T_base_cam, overlap) or self._colorless >= _COLORLESS
-        if frozen is None or frozen.index <= ref.index or not is_behind:
+        if frozen is None or frozen.index <= ref.index:
+            return False
+        is_behind |= self._options.photometric and not ref.points and bool(frozen.colors)
+        if not is_behind:
             return False
         if self._options.keyframe_strategy == "newest" and new.depth.exposure.lens.lines > 1:
             if not self.is_unfit(new):
