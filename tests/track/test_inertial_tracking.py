@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.sensors.imu import simulate_imu
+from rsgen.sensors.imu import simulate_imu, write_imu_csv
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import read_estimate
 from rstrack.data.imu.recording import ImuNoise, ImuRecording
@@ -31,6 +30,12 @@ CAMERA, SHUTTER = Camera(80, 60, 60.0, 60.0, 39.5, 29.5), Shutter(readout_s=0.02
 TRUTH = synthetic.make_spline(0.3)
 OPTIONS: dict[str, Any] = {"method": "rs-gi", "bootstrap_frames": 3, "backend": "llvm"}
 BIAS = (0.01, -0.008, 0.006)
+_NOISE = """
+gyroscope_noise_density: 1.7e-4
+gyroscope_random_walk: 2.0e-5
+accelerometer_noise_density: 2.0e-3
+accelerometer_random_walk: 3.0e-3
+"""
 
 
 def imu_of(gravity: tuple[float, float, float] = (0.0, -9.80665, 0.0)) -> ImuRecording:
@@ -84,11 +89,12 @@ def test_a_run_says_what_it_found_and_resumes_to_the_same_bits(tmp_path: Path, m
     dataset = open_dataset(tmp_path / "seq")
     assert dataset.truth is not None
     read = simulate_imu(dataset.truth, ImuConfig(gyroscope_bias=BIAS), dataset.truth.t_begin, dataset.truth.t_end, 2)
-    noise = ImuNoise(1.7e-4, 2e-5, 2e-3, 3e-3)
-    with_imu = replace(dataset, imu=ImuRecording(read.t, read.gyro, read.accel, noise, np.eye(4), 200.0))
+    write_imu_csv(dataset.root / "imu.csv", read)
+    (dataset.root / "imu.yaml").write_text(f"{_NOISE}T_imu_depth: {np.eye(4).tolist()}\n")
+    with_imu = open_dataset(dataset.root)
     options = Options(**OPTIONS)
     with pytest.raises(UserError, match="has no IMU, which --method rs-gi needs: take rs-g"):
-        track(replace(dataset, imu=None), options, tmp_path / "none")
+        track(dataset, options, tmp_path / "none")
     with pytest.raises(UserError, match="--gravity: method rs-g does not tell"):
         track(dataset, Options(method="rs-g"), tmp_path / "none", gravity=True)
     whole = track(with_imu, options, tmp_path / "whole")
