@@ -22,10 +22,11 @@ from rsgen.device.backend import VARIANTS, Backend, select
 _ALIGNMENT = 64
 
 
-def aligned(array: npt.ArrayLike) -> npt.NDArray[np.float32]:
-    """Flat float32 copy of `array` whose buffer begins where Dr.Jit likes it: else kernels are compiled anew."""
+def aligned(array: npt.ArrayLike, dtype: npt.DTypeLike = np.float32) -> npt.NDArray[Any]:
+    """Flat copy of `array`, of a type of four bytes, whose buffer begins where Dr.Jit likes it: else kernels are compiled
+    anew, for every combination of arguments that do and that do not."""
     source = np.asarray(array)
-    raw = np.empty(source.size + _ALIGNMENT // 4, np.float32)
+    raw: npt.NDArray[Any] = np.empty(source.size + _ALIGNMENT // 4, dtype)
     start = (-raw.ctypes.data % _ALIGNMENT) // 4
     copy = raw[start : start + source.size]
     copy.reshape(source.shape)[...] = source

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsgen.array_types import FloatArray, IntArray
+from rsgen.device.arrays import aligned
 from rsgen.light.bake_points import thin
 from rsgen.light.guide import Guide, bin_of
 from rsgen.light.rounds import drawn_at, in_rounds
@@ -51,7 +52,7 @@ def sky_light(
     guide = _learned(scene, points, which, cell, texel_m, follow)
 
     def sample(at: Sequence[Any], here: IntArray, begin: int, count: int) -> Any:
-        return _sky_at(scene, guide, mi.UInt32(cell[here].astype(np.uint32)), *at, begin, count, follow)
+        return _sky_at(scene, guide, mi.UInt32(aligned(cell[here], np.uint32)), *at, begin, count, follow)
 
     draw = drawn_at(which, partial(chunks, points), sample)
     first = samples if scene.environment() is not None else max(4, samples // _LESS)

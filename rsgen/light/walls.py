@@ -20,7 +20,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from rsgen.array_types import Float32Array, IntArray
-from rsgen.light.sampling import OFFSET_M
+from rsgen.device.arrays import aligned
+from rsgen.light.sampling import OFFSET_M, vectors
 from rsgen.render.irradiance import FREE, REACH_LEVELS, Lattice, packed_reach
 
 _HEIGHT_M = 1e-3  # of the rays above the surface
@@ -75,7 +76,7 @@ def find_covered(scene: Any, position: Float32Array, normal: Float32Array, withi
     out = np.zeros(len(position), bool)
     for begin in range(0, len(position), _CHUNK):
         part = slice(begin, begin + _CHUNK)
-        rays = mi.Ray3f(mi.Point3f((position[part] + OFFSET_M * normal[part]).T), mi.Vector3f(normal[part].T))
+        rays = mi.Ray3f(mi.Point3f(vectors(position[part] + OFFSET_M * normal[part])), vectors(normal[part]))
         rays.maxt = mi.Float(within_m)
         out[part] = np.array(scene.ray_test(rays)).astype(bool)
     return out
@@ -102,16 +103,16 @@ def _between(
     way = (position[there] - position[here]).astype(np.float32)
     length = np.linalg.norm(way, axis=1)
     long = np.flatnonzero(length > _SHORTEST_M)
-    rays = mi.Ray3f(mi.Point3f(p[long].T), mi.Vector3f((way[long] / length[long, None]).T))
-    rays.maxt = mi.Float(length[long])
+    rays = mi.Ray3f(mi.Point3f(vectors(p[long])), vectors(way[long] / length[long, None]))
+    rays.maxt = mi.Float(aligned(length[long]))
     blocked = long[np.array(scene.ray_test(rays)).astype(bool)]
     if not len(blocked):
         return blocked, np.zeros(0, np.uint8), np.zeros(0, np.uint8)
     away = []
     for start, sign in ((p, 1.0), (p + way, -1.0)):
         d = sign * way[blocked] / length[blocked, None]
-        rays = mi.Ray3f(mi.Point3f(start[blocked].T), mi.Vector3f(d.astype(np.float32).T))
-        rays.maxt = mi.Float(length[blocked])
+        rays = mi.Ray3f(mi.Point3f(vectors(start[blocked])), vectors(d))
+        rays.maxt = mi.Float(aligned(length[blocked]))
         pi = scene.ray_intersect_preliminary(rays, coherent=False)
         # What a ray meets one way and misses the other, at the very end of it, is far.
         t = np.array(dr.select(pi.is_valid(), pi.t, rays.maxt))
