@@ -23,8 +23,8 @@ _ALIGNMENT = 64
 
 
 def aligned(array: npt.ArrayLike, dtype: npt.DTypeLike = np.float32) -> npt.NDArray[Any]:
-    """Flat copy of `array`, of a type of four bytes, whose buffer begins where Dr.Jit likes it: else kernels are compiled
-    anew, for every combination of arguments that do and that do not."""
+    """Flat copy of `array`, of a type of four bytes, whose buffer begins where Dr.Jit likes it: else kernels are
+    compiled anew, for every combination of arguments that do and that do not."""
     source = np.asarray(array)
     raw: npt.NDArray[Any] = np.empty(source.size + _ALIGNMENT // 4, dtype)
     start = (-raw.ctypes.data % _ALIGNMENT) // 4
