@@ -34,8 +34,8 @@ from rstrack.data.depth_error import DepthError
 
 @pytest.fixture(autouse=True)
 def few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Half of the pairs of frames, in half of the time: what they all find stands beside the derivatives."""
-    monkeypatch.setattr(stretch, "_APART", (4, 9))
+    """A quarter of the pairs of frames, in a third of the time: what all find stands beside the derivatives."""
+    monkeypatch.setattr(stretch, "_APART", (5,))
 
 
 @pytest.mark.usefixtures("in_one_phase")
