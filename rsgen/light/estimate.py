@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import mitsuba as mi
+import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +19,7 @@ from rsgen.light.bake_points import surface_at
 from rsgen.light.gather import gathering
 from rsgen.light.lamps import lamp_light
 from rsgen.light.rounds import typical
+from rsgen.light.sampling import vectors
 from rsgen.light.sky import has_sky_light, sky_light
 from rsgen.light.specular import passes_light_on
 from rsgen.light.surface_points import SurfacePoints
@@ -48,7 +49,9 @@ def estimated_db(scene: Any, field: IrradianceField, texel_m: float) -> float:
     piece = np.zeros(int(open_.sum()), np.int64)
     points = SurfacePoints(position[open_], normal[open_], geometric[open_], piece)
     pi, si = at_triangles(numbers[open_], faces[open_], uv[open_])
-    baked = np.array(field.lookup(pi, si, mi.Vector3f(points.normal.T)), np.float64).reshape(3, -1).T
+    looked_up = field.lookup(pi, si, vectors(points.normal))
+    dr.eval(looked_up)  # by itself, see `rounds.drawn_at`
+    baked = np.array(looked_up, np.float64).reshape(3, -1).T
     halves = _computed(scene, field, points, texel_m)
     grey = halves.mean(axis=(0, 2))
     exposed = typical(grey)

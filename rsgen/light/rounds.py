@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
@@ -93,6 +94,8 @@ def drawn_at(which: IntArray, chunks: Callable[..., Any], sample: Callable[..., 
         for first, part, *at in chunks(which[todo], report):
             here = slice(first, first + len(part))
             sums = sample(at, todo[here], begin, count)
+            # By itself: laid out for NumPy in the same kernel, it would be compiled anew for every number of points.
+            dr.eval(sums)
             out[:, here] = np.array(sums, dtype=np.float64).reshape(2, 3, -1).transpose(0, 2, 1)
         return out
 
