@@ -38,13 +38,14 @@ class CloudTracker(Protocol):
     settings: dict[str, float]
 
     def register(self, p_cam: FloatArray, line: FloatArray) -> FloatArray:
-        """T_world_cam (4, 4) at the last line, from points (n, 3) in m that were seen at times `line` (n,), 0..1."""
+        """T_world_cam (4, 4) at the last line, from points (n, 3) in m that were seen at times `line` (n,), see
+        `cloud_of`."""
 
 
 class KissIcp:
     """KISS-ICP (Vizzo et al., RA-L 2023): point to point against a voxel map, deskewed to the end of each scan.
 
-    It takes a scan to last as long as the time between two; a readout that is shorter is deskewed too much by so much.
+    It takes a scan to last as long as the time between two, whatever it is told, and deskews shorter readouts too much.
     """
 
     def __init__(self, max_depth: float) -> None:
@@ -138,12 +139,14 @@ def run_cloud_peer(
 
 
 def cloud_of(dataset: Dataset) -> Callable[[int], tuple[FloatArray, FloatArray]]:
-    """Of frame k: points (n, 3) in the depth camera, m, and where in its readout each was seen, from 0 to 1."""
+    """Of frame k: points (n, 3) in the depth camera, m, and when each was seen (n,), in times between two frames: the
+    last line at 1."""
     camera, shutter = dataset.rig.depth_camera, dataset.rig.depth_shutter
     stride = max(1, round(np.sqrt(camera.width * camera.height / _POINTS)))
     uv = camera.pixel_grid()[::stride, ::stride].reshape(-1, 2)
     rays = camera.unproject(uv)
-    line = shutter.line_of_pixel(uv, camera) / (shutter.line_count(camera) - 1)
+    before_s = _last_line(dataset) - shutter.line_mid_time(0.0, shutter.line_of_pixel(uv, camera), camera)
+    line = np.maximum(0.0, 1.0 - before_s / float(np.median(np.diff(dataset.stamps))))
     longest = Options().max_depth
 
     def cloud(k: int) -> tuple[FloatArray, FloatArray]:
