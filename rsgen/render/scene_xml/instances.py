@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from rsgen.device.arrays import aligned
 from rsgen.render.mended import rebuilt
 
 _MESHES = ("ply", "obj", "serialized", "cube")
@@ -49,8 +50,9 @@ def turn_mirrored(mi: Any, scene: Any) -> Any:
             normals = np.asarray(parameters["vertex_normals"]).reshape(-1, 3)
             a, b, c = (vertices[faces[:, k]] for k in range(3))
             inside_out = np.einsum("ij,ij->", np.cross(b - a, c - a), normals[faces].sum(axis=1)) > 0
-            parameters["vertex_normals"] = mi.Float((-normals if inside_out else normals).ravel())
-        parameters["faces"] = mi.UInt32(faces[:, ::-1].ravel())
+            # A copy: what is looked at here is the array that this takes the place of, and is freed.
+            parameters["vertex_normals"] = mi.Float(aligned(-normals if inside_out else normals))
+        parameters["faces"] = mi.UInt32(aligned(faces[:, ::-1], np.uint32))
         parameters.update()
     return rebuilt(mi, scene) if turned else scene
 
