@@ -60,7 +60,8 @@ class KissIcp:
 
     def register(self, p_cam: FloatArray, line: FloatArray) -> FloatArray:
         """See `CloudTracker`."""
-        self._odometry.register_frame(p_cam, line)
+        # It stretches the times to 0..1: where all are alike, which it would divide by, nothing is to be deskewed.
+        self._odometry.register_frame(p_cam, line if np.ptp(line) > 0.0 else np.empty(0))
         return np.array(self._odometry.last_pose)
 
 

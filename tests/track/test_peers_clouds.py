@@ -19,7 +19,7 @@ from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.metrics.association import truth_of
 from rstrack.metrics.evaluate import evaluate
 from rstrack.options import CLOUD_PEERS
-from rstrack.peers.clouds import cloud_of, deskewed, run_cloud_peer
+from rstrack.peers.clouds import KissIcp, cloud_of, deskewed, run_cloud_peer
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +74,20 @@ def test_poses_are_those_of_the_last_line(dataset: Dataset, monkeypatch: pytest.
     info = estimate.info
     assert info["method"] == "kiss-icp" and info["versions"]["kiss-icp"] == "0"
     assert len(info["timings"]["frame_ms"]) == 10
+
+
+def test_kiss_icp_is_told_no_times_where_all_points_have_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    # It would divide by what lies between the first and the last, and end the process.
+    given: list[np.ndarray] = []
+    odometry = SimpleNamespace(register_frame=lambda _, times: given.append(times), last_pose=np.eye(4))
+    config = SimpleNamespace(data=SimpleNamespace(), mapping=SimpleNamespace(), adaptive_threshold=SimpleNamespace())
+    monkeypatch.setitem(sys.modules, "kiss_icp.kiss_icp", SimpleNamespace(KissICP=lambda _: odometry))
+    monkeypatch.setitem(sys.modules, "kiss_icp.config", SimpleNamespace(load_config=lambda _: config))
+    tracker = KissIcp(5.0)
+    for line in (np.ones(4), np.linspace(0.5, 1.0, 4)):
+        tracker.register(np.ones((4, 3)), line)
+    assert given[0].size == 0
+    np.testing.assert_array_equal(given[1], np.linspace(0.5, 1.0, 4))
 
 
 def test_small_gicp_gets_a_guess_and_a_new_keyframe(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
