@@ -27,15 +27,15 @@ from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.config.config import LightConfig
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
-from rsgen.light.bake_points import Interpolation, sample_points, thin
 from rsgen.light.bounces import Surfaces, light_off_surfaces
-from rsgen.light.denoise import denoised
+from rsgen.light.drawing.gather import gathering
+from rsgen.light.drawing.lamps import first_look, lamp_light
+from rsgen.light.drawing.rounds import GREY_SLOPE, PATCH, scatter_of, typical
+from rsgen.light.drawing.sky import has_sky_light, sky_light
+from rsgen.light.drawing.specular import passes_light_on
 from rsgen.light.estimate import estimated_db
-from rsgen.light.gather import gathering
-from rsgen.light.lamps import first_look, lamp_light
-from rsgen.light.rounds import GREY_SLOPE, PATCH, scatter_of, typical
-from rsgen.light.sky import has_sky_light, sky_light
-from rsgen.light.specular import passes_light_on
+from rsgen.light.places.bake_points import Interpolation, sample_points, thin
+from rsgen.light.places.denoise import denoised
 from rsgen.render.irradiance import Lattice
 
 log = logging.getLogger("rsgen")

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from rsgen.array_types import Float32Array, IntArray
 from rsgen.config.config import LightConfig
-from rsgen.light.bake_points import Interpolation, thin
-from rsgen.light.denoise import denoised
-from rsgen.light.gather import gathering
-from rsgen.light.rounds import PATCH, in_rounds, scatter_of
-from rsgen.light.surface_points import SurfacePoints
+from rsgen.light.drawing.gather import gathering
+from rsgen.light.drawing.rounds import PATCH, in_rounds, scatter_of
+from rsgen.light.places.bake_points import Interpolation, thin
+from rsgen.light.places.denoise import denoised
+from rsgen.light.places.surface_points import SurfacePoints
 from rsgen.render.irradiance import IrradianceField, Lattice, make_field
 
 _COARSE_TEXELS = 3.0  # light off surfaces is gathered at points about this far apart

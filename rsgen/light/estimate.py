@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 
 from rsgen import srgb
 from rsgen.array_types import Float32Array
-from rsgen.light.bake_points import surface_at
-from rsgen.light.gather import gathering
-from rsgen.light.lamps import lamp_light
-from rsgen.light.rounds import typical
-from rsgen.light.sampling import vectors
-from rsgen.light.sky import has_sky_light, sky_light
-from rsgen.light.specular import passes_light_on
-from rsgen.light.surface_points import SurfacePoints
-from rsgen.light.walls import find_covered
+from rsgen.light.drawing.gather import gathering
+from rsgen.light.drawing.lamps import lamp_light
+from rsgen.light.drawing.rounds import typical
+from rsgen.light.drawing.sky import has_sky_light, sky_light
+from rsgen.light.drawing.specular import passes_light_on
+from rsgen.light.places.bake_points import surface_at
+from rsgen.light.places.sampling import vectors
+from rsgen.light.places.surface_points import SurfacePoints
+from rsgen.light.places.walls import find_covered
 from rsgen.render.irradiance import IrradianceField, at_triangles, registry_id
 from rsgen.render.scene import mesh_arrays
 

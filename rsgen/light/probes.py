@@ -15,8 +15,8 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.device.arrays import aligned
-from rsgen.light.sampling import r2
-from rsgen.light.specular import first_scatterer, passes_light_on, transmitted
+from rsgen.light.drawing.specular import first_scatterer, passes_light_on, transmitted
+from rsgen.light.places.sampling import r2
 from rsgen.render.irradiance import IrradianceField
 from rsgen.render.object_light import HARMONICS, harmonics, irradiance_coefficients
 

@@ -17,13 +17,13 @@ from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.light import cache as lighting
-from rsgen.light.bake_points import thin
-from rsgen.light.denoise import denoised
+from rsgen.light.drawing.guide import Guide, bin_of
+from rsgen.light.drawing.rounds import PATCH, in_rounds, scatter_of
 from rsgen.light.estimate import estimated_db
-from rsgen.light.guide import Guide, bin_of
-from rsgen.light.rounds import PATCH, in_rounds, scatter_of
-from rsgen.light.surface_points import SurfacePoints
-from rsgen.light.walls import find_covered
+from rsgen.light.places.bake_points import thin
+from rsgen.light.places.denoise import denoised
+from rsgen.light.places.surface_points import SurfacePoints
+from rsgen.light.places.walls import find_covered
 from rsgen.render.baked import BakedIntegrator
 from rsgen.render.images import ColorRenderer
 from rsgen.render.irradiance import IrradianceField, lattice_barycentric, make_field, make_lattice

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsgen.device.arrays import aligned
-from rsgen.light.surface_points import SurfacePoints
+from rsgen.light.places.surface_points import SurfacePoints
 
 OFFSET_M = 2e-4  # ray origins above their surface
 _CHUNK = 1 << 18

@@ -13,8 +13,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from rsgen.array_types import Float32Array, IntArray
-from rsgen.light.surface_points import SurfacePoints
-from rsgen.light.walls import find_barriers, find_covered
+from rsgen.light.places.surface_points import SurfacePoints
+from rsgen.light.places.walls import find_barriers, find_covered
 from rsgen.render.irradiance import Lattice, at_triangles, lattice_barycentric, registry_id
 from rsgen.render.scene import mesh_arrays
 

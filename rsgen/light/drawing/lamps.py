@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsgen.array_types import FloatArray, IntArray
-from rsgen.light.rounds import drawn_at, in_rounds
-from rsgen.light.sampling import chunks, r2, rotation
-from rsgen.light.specular import first_scatterer, transmitted
-from rsgen.light.surface_points import SurfacePoints
+from rsgen.light.drawing.rounds import drawn_at, in_rounds
+from rsgen.light.drawing.specular import first_scatterer, transmitted
+from rsgen.light.places.sampling import chunks, r2, rotation
+from rsgen.light.places.surface_points import SurfacePoints
 
 MANY_EMITTERS = 24  # more are sampled together, as one
 _ROUNDS = 5

@@ -10,10 +10,10 @@ import drjit as dr
 import mitsuba as mi
 
 from rsgen.array_types import IntArray
-from rsgen.light.rounds import Draw, drawn_at
-from rsgen.light.sampling import chunks, r2, rotation
-from rsgen.light.specular import first_scatterer
-from rsgen.light.surface_points import SurfacePoints
+from rsgen.light.drawing.rounds import Draw, drawn_at
+from rsgen.light.drawing.specular import first_scatterer
+from rsgen.light.places.sampling import chunks, r2, rotation
+from rsgen.light.places.surface_points import SurfacePoints
 from rsgen.render.irradiance import IrradianceField
 
 

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 
 from rsgen.array_types import FloatArray, IntArray
 from rsgen.device.arrays import aligned
-from rsgen.light.bake_points import thin
-from rsgen.light.guide import Guide, bin_of
-from rsgen.light.rounds import drawn_at, in_rounds
-from rsgen.light.sampling import chunks, r2, rotation
-from rsgen.light.specular import first_scatterer, passes_light_on
-from rsgen.light.surface_points import SurfacePoints
+from rsgen.light.drawing.guide import Guide, bin_of
+from rsgen.light.drawing.rounds import drawn_at, in_rounds
+from rsgen.light.drawing.specular import first_scatterer, passes_light_on
+from rsgen.light.places.bake_points import thin
+from rsgen.light.places.sampling import chunks, r2, rotation
+from rsgen.light.places.surface_points import SurfacePoints
 
 _CELL_M = 0.5  # parts of the scene that have one histogram, of like normals on one piece of surface
 _FIRST_LOOK_TEXELS, _FIRST_LOOK_SAMPLES = 3.0, 64

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from rsgen.array_types import Float32Array, FloatArray, IntArray
-from rsgen.light.surface_points import SurfacePoints
+from rsgen.light.places.surface_points import SurfacePoints
 
 _NEIGHBOURS = 32
 _REACH = 2.0  # spacings: of the weight's fall with distance

@@ -21,7 +21,7 @@ from scipy.sparse.csgraph import connected_components
 
 from rsgen.array_types import Float32Array, IntArray
 from rsgen.device.arrays import aligned
-from rsgen.light.sampling import OFFSET_M, vectors
+from rsgen.light.places.sampling import OFFSET_M, vectors
 from rsgen.render.irradiance import FREE, REACH_LEVELS, Lattice, packed_reach
 
 _HEIGHT_M = 1e-3  # of the rays above the surface
