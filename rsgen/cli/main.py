@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
@@ -52,6 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return run_program("rsgen", _parser, arguments, "the same command resumes")
 
 
+@cache  # of some hundred options: whoever calls `main` often would wait for it each time
 def _parser() -> Parser:
     commands = Commands("rsgen", _DESCRIPTION)
     add = commands.add

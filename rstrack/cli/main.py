@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
+from functools import cache
 from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -85,6 +86,7 @@ class _Version(argparse.Action):
         parser.exit()
 
 
+@cache  # of some hundred options: whoever calls `main` often would wait for it each time
 def _parser() -> Parser:
     commands = Commands("rstrack", _DESCRIPTION)
     commands.parser.add_argument(
