@@ -33,6 +33,24 @@ def aligned(array: npt.ArrayLike, dtype: npt.DTypeLike = np.float32) -> npt.NDAr
     return copy
 
 
+def vectors(kind: Any, rows: npt.ArrayLike) -> Any:
+    """Rows (n, k) on the device, as Dr.Jit's `kind` of k floats each."""
+    import drjit as dr
+
+    return kind(*(dr.value_t(kind)(aligned(column)) for column in np.asarray(rows).T))
+
+
+def rows_of(vector: Any) -> npt.NDArray[Any]:
+    """Rows (n, k) of a device vector of k components, computed first and fetched one by one.
+
+    Dr.Jit itself would lay them out in one array by a kernel that is compiled anew for every n.
+    """
+    import drjit as dr
+
+    dr.eval(vector)
+    return np.stack(np.broadcast_arrays(*(np.array(component) for component in vector)), axis=-1)
+
+
 @dataclass(frozen=True)
 class Engine:
     """Array types of one Dr.Jit backend."""

@@ -9,19 +9,19 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import drjit as dr
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
 from rsgen import srgb
 from rsgen.array_types import Float32Array
+from rsgen.device.arrays import rows_of, vectors
 from rsgen.light.drawing.gather import gathering
 from rsgen.light.drawing.lamps import lamp_light
 from rsgen.light.drawing.rounds import typical
 from rsgen.light.drawing.sky import has_sky_light, sky_light
 from rsgen.light.drawing.specular import passes_light_on
 from rsgen.light.places.bake_points import surface_at
-from rsgen.light.places.sampling import vectors
 from rsgen.light.places.surface_points import SurfacePoints
 from rsgen.light.places.walls import find_covered
 from rsgen.render.irradiance import IrradianceField, at_triangles, registry_id
@@ -49,9 +49,7 @@ def estimated_db(scene: Any, field: IrradianceField, texel_m: float) -> float:
     piece = np.zeros(int(open_.sum()), np.int64)
     points = SurfacePoints(position[open_], normal[open_], geometric[open_], piece)
     pi, si = at_triangles(numbers[open_], faces[open_], uv[open_])
-    looked_up = field.lookup(pi, si, vectors(points.normal))
-    dr.eval(looked_up)  # by itself, see `rounds.drawn_at`
-    baked = np.array(looked_up, np.float64).reshape(3, -1).T
+    baked = rows_of(field.lookup(pi, si, vectors(mi.Vector3f, points.normal))).astype(np.float64)
     halves = _computed(scene, field, points, texel_m)
     grey = halves.mean(axis=(0, 2))
     exposed = typical(grey)

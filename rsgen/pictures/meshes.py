@@ -21,6 +21,7 @@ import numpy as np
 from rsgen import srgb
 from rsgen.array_types import ByteArray, Float32Array, FloatArray, IntArray
 from rsgen.console.progress import Progress, no_progress
+from rsgen.device.arrays import aligned
 from rsgen.errors import UserError
 from rsgen.files import read_bytes
 from rsgen.geometry.camera import Camera
@@ -194,7 +195,7 @@ def render_mesh(mesh: ColoredMesh, view: View, reach: float) -> ByteArray:
         file = Path(folder) / "mesh.ply"
         file.write_bytes(ply_bytes(mesh.vertices, mesh.faces, mesh.normals))
         scene = mi.load_dict({"type": "scene", "mesh": {"type": "ply", "filename": str(file)}})
-    colors = mi.Float(np.ascontiguousarray(mesh.colors).ravel())
+    colors = mi.Float(aligned(mesh.colors))
     pixels = view.camera.width * view.camera.height
     per_launch = max(1, min(_SAMPLES, _LAUNCH // pixels))
     total = np.zeros((pixels, 3))

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsgen.array_types import Float32Array, IntArray
+from rsgen.device.arrays import aligned, vectors
 from rsgen.errors import UserError
 from rsgen.render.scene import mesh_arrays
 
@@ -133,9 +134,9 @@ def at_triangles(shape: NDArray[np.uint32], face: NDArray[np.uint32], uv: Float3
     """(pi, si), as if met by rays, at barycentric uv (n, 2) of triangles of the meshes with these `registry_id`."""
     pi = dr.zeros(mi.PreliminaryIntersection3f, len(face))
     pi.t = mi.Float(1)  # else it counts as no hit
-    pi.prim_index = mi.UInt32(face)
-    pi.prim_uv = mi.Point2f(uv[:, 0], uv[:, 1])
-    pi.shape = dr.reinterpret_array(mi.ShapePtr, mi.UInt32(shape))
+    pi.prim_index = mi.UInt32(aligned(face, np.uint32))
+    pi.prim_uv = vectors(mi.Point2f, uv)
+    pi.shape = dr.reinterpret_array(mi.ShapePtr, mi.UInt32(aligned(shape, np.uint32)))
     pi.valid = mi.Bool(True)
     ray = dr.zeros(mi.Ray3f, len(face))
     ray.d = mi.Vector3f(0, 0, 1)
@@ -166,7 +167,7 @@ class IrradianceField:
         self.shape_first = shape_first
         self.faces = faces
         self.values = values
-        self.face_count = face_count
+        self.back_first = dr.opaque(mi.UInt32, face_count)  # else kernels are compiled for each number of triangles
 
     def lookup(self, pi: Any, si: Any, wi_world: Any, active: Any = True) -> Any:
         """Irradiance (Color3f, scene units) at hits `pi`/`si`, on the side where `wi_world`, towards the viewer, is."""
@@ -175,7 +176,7 @@ class IrradianceField:
         active = active & si.is_valid() & (first_face >= 0)
         # Shading decides which side is lit: meshes exist whose winding and vertex normals disagree.
         back = dr.dot(si.n, wi_world) * dr.dot(si.n, si.sh_frame.n) < 0
-        face = mi.UInt32(first_face) + pi.prim_index + dr.select(back, mi.UInt32(self.face_count), 0)
+        face = mi.UInt32(first_face) + pi.prim_index + dr.select(back, self.back_first, 0)
         entry = dr.gather(mi.Vector2u, self.faces, face, active)
         nu, nv, apex = entry.y & 0xFFF, (entry.y >> 12) & 0xFFF, entry.y >> 24
         b1, b2 = pi.prim_uv.x, pi.prim_uv.y
@@ -222,5 +223,8 @@ def make_field(lattice: Lattice, front: Float32Array, back: Float32Array) -> Irr
     ).astype(np.uint32)
     values = np.concatenate([front, np.zeros((4, 4), np.float32), back[keep]]).astype(np.float32)
     return IrradianceField(
-        mi.Int32(lattice.shape_first), mi.UInt32(faces.ravel()), mi.Float(values.ravel()), len(lattice.first)
+        mi.Int32(aligned(lattice.shape_first, np.int32)),
+        mi.UInt32(aligned(faces, np.uint32)),
+        mi.Float(aligned(values)),
+        len(lattice.first),
     )

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsgen.array_types import Float32Array
+from rsgen.device.arrays import aligned
 from rsgen.errors import UserError
 
 log = logging.getLogger("rsgen")
@@ -84,14 +85,14 @@ def _mend(mi: Any, shape: Any, vertices: Float32Array, faces: NDArray, keep: NDA
     if not keep.all():
         for name in [name for name in parameters.keys() if name.startswith("face_")]:  # noqa: SIM118
             rows = np.asarray(parameters[name]).reshape(len(faces), -1)
-            parameters[name] = mi.Float(rows[keep].ravel())
-        parameters["faces"] = mi.UInt32(faces[keep].ravel())
+            parameters[name] = mi.Float(aligned(rows[keep]))
+        parameters["faces"] = mi.UInt32(aligned(faces[keep], np.uint32))
         if shape.has_vertex_normals():
-            parameters["vertex_normals"] = mi.Float(normals.ravel())  # else made anew, from the triangles
+            parameters["vertex_normals"] = mi.Float(aligned(normals))  # else made anew, from the triangles
         log.debug("mesh '%s': %d triangles without area dropped", shape.id(), np.count_nonzero(~keep))
     if useless.any():
         mended = np.where(useless[:, None], _vertex_normals(vertices, faces[keep]), normals)
-        parameters["vertex_normals"] = mi.Float(mended.astype(np.float32).ravel())
+        parameters["vertex_normals"] = mi.Float(aligned(mended))
         log.debug("mesh '%s': %d vertex normals without direction replaced", shape.id(), np.count_nonzero(useless))
     parameters.update()
     return True

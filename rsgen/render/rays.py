@@ -7,8 +7,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import numpy.typing as npt
 
 from rsgen.array_types import FloatArray
+from rsgen.device.arrays import rows_of, vectors
 
 
 def cast_rays(scene: Any, p_world: FloatArray, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -17,13 +19,14 @@ def cast_rays(scene: Any, p_world: FloatArray, direction: FloatArray) -> tuple[F
     Normals are the triangles' own, whichever side is hit. Where there is nothing, the distance is infinite and the
     normal zero.
     """
-    ray = mi.Ray3f(_points(p_world), mi.Vector3f(_points(direction)))
+    ray = rays_from(p_world, direction)
     hit = scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False)
     valid = hit.is_valid()
-    distance = np.asarray(dr.select(valid, hit.t, dr.inf), float)
-    normal = np.asarray(dr.select(valid, hit.n, 0), float)
-    return distance.reshape(-1), normal.T.reshape(-1, 3)
+    distance, normal = dr.select(valid, hit.t, dr.inf), dr.select(valid, hit.n, 0)
+    dr.eval(distance, normal)
+    return np.asarray(distance, float).reshape(-1), rows_of(normal).astype(float)
 
 
-def _points(rows: FloatArray) -> Any:
-    return mi.Point3f(np.ascontiguousarray(rows.T, np.float32))
+def rays_from(p_world: npt.ArrayLike, direction: npt.ArrayLike) -> Any:
+    """Rays on the device from points (n, 3) along unit directions (n, 3)."""
+    return mi.Ray3f(vectors(mi.Point3f, p_world), vectors(mi.Vector3f, direction))

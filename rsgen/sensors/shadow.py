@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from rsgen.array_types import BoolArray, Float32Array
+from rsgen.device.arrays import aligned
 from rsgen.device.pose_table import PoseFunction
 from rsgen.render.moving import MovingObjects
 from rsgen.render.sensor import RollingShutterSensor
@@ -58,7 +59,7 @@ class Projector:
             sensor.sample_ray(middle, mi.Float(0), position, mi.Point2f(0.5))[0]
             for sensor in (self._camera, self._emitter)
         )
-        depth = mi.Float(np.ascontiguousarray(z, np.float32).ravel())
+        depth = mi.Float(aligned(z))
         to_surface = seen.o + seen.d * (depth / self._camera.planar_depth_scale(u, v)) - lit.o
         distance = dr.norm(to_surface)
         lit.d = to_surface / distance

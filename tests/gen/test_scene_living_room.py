@@ -97,13 +97,9 @@ def test_distances_against_brute_force() -> None:
 def test_two_builds_are_equal_byte_for_byte(
     built: Built, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:  # fmt: skip
-    """Textures painted small: by the same painters, in a twentieth of the time."""
-    monkeypatch.setattr(scene, "MATERIALS", painted_small(4))
-    first, second = (digest(scene.build(tmp_path / name).parent) for name in ("first", "second"))
-    assert first == second and len(first) > 60
-    whole = digest(built.xml.parent)
-    same = {name for name in first if not name.startswith("textures")}
-    assert {name: first[name] for name in same} == {name: whole[name] for name in same}
+    monkeypatch.setattr(scene, "MATERIALS", painted_small(2))
+    again = digest(scene.build(tmp_path / "again").parent)
+    assert again == digest(built.xml.parent) and len(again) > 60
 
 
 def test_meshes_are_well_formed(built: Built) -> None:

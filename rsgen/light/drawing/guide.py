@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsgen.array_types import IntArray
+from rsgen.device.arrays import aligned
 
 # Bins around the vertical and along it: of equal solid angle.
 _AROUND, _ALONG = 32, 16
@@ -42,7 +43,7 @@ class Guide:
         share = np.where(total > 0, flat / np.where(total > 0, total, 1.0), 1.0 / _BINS)
         cumulative = np.cumsum((1.0 - _EVENLY) * share + _EVENLY / _BINS, axis=1)
         cumulative[:, -1] = 1.0
-        return cls(mi.Float(cumulative.astype(np.float32).ravel()))
+        return cls(mi.Float(aligned(cumulative)))
 
     def sample(self, cell: Any, u: Any) -> Any:
         """A direction (Vector3f, world frame) in each cell, by two uniform numbers."""

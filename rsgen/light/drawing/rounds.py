@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsgen.array_types import FloatArray, IntArray
+from rsgen.device.arrays import rows_of
 
 # Sums (2, n, 3) over two halves of the samples `begin` to `begin + count` at some of the points, which it is told.
 Draw = Callable[[IntArray, int, int, Callable[[float], None]], NDArray[np.float64]]
@@ -94,9 +95,8 @@ def drawn_at(which: IntArray, chunks: Callable[..., Any], sample: Callable[..., 
         for first, part, *at in chunks(which[todo], report):
             here = slice(first, first + len(part))
             sums = sample(at, todo[here], begin, count)
-            # By itself: laid out for NumPy in the same kernel, it would be compiled anew for every number of points.
             dr.eval(sums)
-            out[:, here] = np.array(sums, dtype=np.float64).reshape(2, 3, -1).transpose(0, 2, 1)
+            out[:, here] = [rows_of(half) for half in sums]
         return out
 
     return draw

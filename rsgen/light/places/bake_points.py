@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
@@ -13,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from rsgen.array_types import Float32Array, IntArray
+from rsgen.device.arrays import rows_of
 from rsgen.light.places.surface_points import SurfacePoints
 from rsgen.light.places.walls import find_barriers, find_covered
 from rsgen.render.irradiance import Lattice, at_triangles, lattice_barycentric, registry_id
@@ -106,7 +108,8 @@ def surface_at(
     shape: the registry's number of the mesh that each triangle is one of.
     """
     si = at_triangles(shape, face, uv)[1]
-    return tuple(np.array(v, np.float32).reshape(3, -1).T for v in (si.p, si.sh_frame.n, si.n))  # type: ignore[return-value]
+    dr.eval(si.p, si.sh_frame.n, si.n)
+    return rows_of(si.p), rows_of(si.sh_frame.n), rows_of(si.n)
 
 
 def thin(points: SurfacePoints, spacing: float, among: IntArray | None = None) -> tuple[IntArray, IntArray]:

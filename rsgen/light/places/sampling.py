@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from rsgen.device.arrays import aligned
+from rsgen.device.arrays import aligned, vectors
 from rsgen.light.places.surface_points import SurfacePoints
 
 OFFSET_M = 2e-4  # ray origins above their surface
@@ -29,17 +29,12 @@ def r2(i: Any, offset: Any) -> Any:
     return mi.Point2f(x - dr.floor(x), y - dr.floor(y))
 
 
-def vectors(rows: NDArray) -> Any:
-    """Rows (n, 3) on the device."""
-    return mi.Vector3f(*(mi.Float(aligned(column)) for column in rows.T))
-
-
 def chunks(
     points: SurfacePoints, which: NDArray, report: Callable[[float], None], size: int = _CHUNK
 ) -> Iterator[tuple[int, NDArray, Any, Any, Any]]:
     """(first of them, their numbers, ray origins, normals and numbers on the device) of `which`, `size` at a time."""
     for begin in range(0, len(which), size):
         part = which[begin : begin + size]
-        p, n, g = (vectors(a[part]) for a in (points.position, points.normal, points.geometric))
+        p, n, g = (vectors(mi.Vector3f, a[part]) for a in (points.position, points.normal, points.geometric))
         yield begin, part, mi.Point3f(p + g * OFFSET_M), n, mi.UInt32(aligned(part, np.uint32))
         report(min(1.0, (begin + len(part)) / len(which)))

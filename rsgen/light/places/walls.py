@@ -21,8 +21,9 @@ from scipy.sparse.csgraph import connected_components
 
 from rsgen.array_types import Float32Array, IntArray
 from rsgen.device.arrays import aligned
-from rsgen.light.places.sampling import OFFSET_M, vectors
+from rsgen.light.places.sampling import OFFSET_M
 from rsgen.render.irradiance import FREE, REACH_LEVELS, Lattice, packed_reach
+from rsgen.render.rays import rays_from
 
 _HEIGHT_M = 1e-3  # of the rays above the surface
 _SHORTEST_M = 2e-3  # neighbours nearer than this are taken for joined
@@ -76,8 +77,8 @@ def find_covered(scene: Any, position: Float32Array, normal: Float32Array, withi
     out = np.zeros(len(position), bool)
     for begin in range(0, len(position), _CHUNK):
         part = slice(begin, begin + _CHUNK)
-        rays = mi.Ray3f(mi.Point3f(vectors(position[part] + OFFSET_M * normal[part])), vectors(normal[part]))
-        rays.maxt = mi.Float(within_m)
+        rays = rays_from(position[part] + OFFSET_M * normal[part], normal[part])
+        rays.maxt = dr.opaque(mi.Float, within_m)
         out[part] = np.array(scene.ray_test(rays)).astype(bool)
     return out
 
@@ -103,7 +104,7 @@ def _between(
     way = (position[there] - position[here]).astype(np.float32)
     length = np.linalg.norm(way, axis=1)
     long = np.flatnonzero(length > _SHORTEST_M)
-    rays = mi.Ray3f(mi.Point3f(vectors(p[long])), vectors(way[long] / length[long, None]))
+    rays = rays_from(p[long], way[long] / length[long, None])
     rays.maxt = mi.Float(aligned(length[long]))
     blocked = long[np.array(scene.ray_test(rays)).astype(bool)]
     if not len(blocked):
@@ -111,7 +112,7 @@ def _between(
     away = []
     for start, sign in ((p, 1.0), (p + way, -1.0)):
         d = sign * way[blocked] / length[blocked, None]
-        rays = mi.Ray3f(mi.Point3f(vectors(start[blocked])), vectors(d))
+        rays = rays_from(start[blocked], d)
         rays.maxt = mi.Float(aligned(length[blocked]))
         pi = scene.ray_intersect_preliminary(rays, coherent=False)
         # What a ray meets one way and misses the other, at the very end of it, is far.

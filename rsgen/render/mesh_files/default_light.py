@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from rsgen.array_types import BoolArray, FloatArray, IntArray
+from rsgen.device.arrays import aligned
 
 SKY = 0.8  # radiance
 _IRRADIANCE = 2.5  # of lamps on a floor, were all their light to reach it: about what the sky gives in the open
@@ -42,8 +43,8 @@ class Probe:
         self.low, self.high = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))
         mesh = mi.Mesh("probe", len(vertices), len(faces))
         arrays = mi.traverse(mesh)
-        arrays["vertex_positions"] = mi.Float(vertices.astype(np.float32).ravel())
-        arrays["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
+        arrays["vertex_positions"] = mi.Float(aligned(vertices))
+        arrays["faces"] = mi.UInt32(aligned(faces, np.uint32))
         arrays.update()
         self._scene = mi.load_dict({"type": "scene", "mesh": mesh})
 
@@ -81,8 +82,7 @@ class Probe:
 
     def _cast(self, origins: FloatArray, directions: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Distance (n,) to what rays (n, 3) meet, inf for nothing, and whether they meet it from in front."""
-        mi = self._mi
-        o, d = (v.astype(np.float32).T for v in (origins, directions))
-        si = self._scene.ray_intersect(mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)))
-        distance, normal = np.array(si.t, float), np.array(si.n, float).T
+        from rsgen.render.rays import cast_rays
+
+        distance, normal = cast_rays(self._scene, origins, directions)
         return distance, np.isfinite(distance) & (np.einsum("ij,ij->i", normal, directions) < 0)
