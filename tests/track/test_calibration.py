@@ -94,8 +94,8 @@ def test_a_bare_wall_is_told_from_a_room(shaken: Dataset, tmp_path: Path, monkey
         trusts.append(trust_in(part, terms, p))
     assert trusts[0] > 0.8 and trusts[1] < 0.3
     monkeypatch.setattr(calibration_run, "trust_in", lambda *_: 0.1)
-    with pytest.raises(UserError, match="4 of 4 stretches what seems to be known of the motion is noise"):
-        calibrate(shaken, ("readout",), options=OPTIONS)
+    with pytest.raises(UserError, match="3 of 3 stretches what seems to be known of the motion is noise"):
+        calibrate(shaken, ("readout",), SHORT, OPTIONS)
 
 
 @pytest.mark.parametrize("drift", [0.0, 3e-3])
@@ -104,7 +104,7 @@ def test_a_drift_is_found_or_else_held(shaken: Dataset, monkeypatch: pytest.Monk
     # A second shows a drift a hundred times less well than ten do.
     monkeypatch.setattr(calibration_solve, "USEFUL", np.where(np.arange(COUNT) == DRIFT, 1e-3, USEFUL))
     off = drift * (shaken.color_stamps - shaken.middle)
-    found = calibrate(replace(shaken, color_stamps=shaken.color_stamps - off), ("offset",), options=OPTIONS)
+    found = calibrate(replace(shaken, color_stamps=shaken.color_stamps - off), ("offset",), SHORT, OPTIONS)
     assert found.asked[DRIFT] == (drift > 0.0) and not found.undetermined.any()
     assert found.values.color_drift == pytest.approx(drift, abs=2e-4 if drift else 0.0)
     assert ("colour drift" in found.text()) == (drift > 0.0)
