@@ -168,7 +168,7 @@ EVERY = 10  # control points from keyframe to keyframe
 
 def drifted_track(rng: np.random.Generator) -> tuple[Graph, State, list[Loop]]:
     """Three rounds on a circle, tracked with errors from keyframe to keyframe; the truth; and true loops."""
-    dt, count = 0.05, 363
+    dt, count = 0.05, 243
     angle = 3 * 2.0 * np.pi * np.arange(count) / count
     xi = np.stack([np.cos(angle), np.sin(angle), 0.1 * np.sin(2 * angle)], axis=1)
     T = np.stack([np.eye(4)] * count)
@@ -255,7 +255,7 @@ def test_loops_that_agree_are_believed_against_a_track_that_is_too_sure_of_itsel
 def test_a_track_that_is_bent_in_one_place_is_mended_there() -> None:
     """As by one blurred stretch: loops across it are refused, those before and after are not, and they are the most."""
     graph, truth, loops = drifted_track(np.random.default_rng(5))
-    at = 120
+    at = 80
     bend = se3.exp(np.array([0.02, -0.02, 0.01, 0.01, 0.02, -0.02]))
     T = graph.at.spline.control_points
     points = np.concatenate([T[:at], T[at] @ bend @ se3.inverse(T[at]) @ T[at:]])
@@ -264,12 +264,12 @@ def test_a_track_that_is_bent_in_one_place_is_mended_there() -> None:
     bent = replace(graph, at=State(spline, {k: spline.pose(t) for k, t in time.items()}))
     across = [loop for loop in loops if loop.early < at <= loop.late]
     beside = [loop for loop in loops if not loop.early < at <= loop.late]
-    few = [*across[:5], *beside[:9]]
-    assert len(across) >= 5 and len(beside) >= 9
+    few = [*across[:5], *beside[:8]]
+    assert len(across) >= 5 and len(beside) >= 8
     bent = too_sure(bent, 5.0)
     found = closed(bent, few, 0.0)
     assert found.spread > 1.0 and not any(found.refused)
-    assert ate(found.state.spline, truth.spline) < ate(closed(bent, beside[:9], 0.0).state.spline, truth.spline) / 2
+    assert ate(found.state.spline, truth.spline) < ate(closed(bent, beside[:8], 0.0).state.spline, truth.spline) / 2
 
 
 def test_false_loops_that_agree_with_nothing_stay_refused() -> None:

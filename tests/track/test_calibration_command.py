@@ -164,7 +164,8 @@ def test_a_sequence_is_calibrated_and_tracked_by_command(
     turning = np.linalg.norm(shaking().velocity(np.array(pace["time_s"]) + shaken.stamps[0])[:, 3:], axis=1)
     assert np.median(np.abs(pace["rad_s"] - turning)) < 0.1 * turning.mean()
     assert "camera.yaml" in (tmp_path / "new/page.html").read_text()
-    assert main(["track", str(shaken.root), "--camera", str(right), "--out", str(run), "--frames", "0:24", "--quiet"]) == 0
+    tracked = ["track", str(shaken.root), "--camera", str(right), "--out", str(run), "--frames", "0:24", "--quiet"]
+    assert main(tracked) == 0
     assert main(["evaluate", str(shaken.root), str(run), "--json"]) == 0
     out = capsys.readouterr().out
     errors = json.loads(out[out.index("{\n") :])

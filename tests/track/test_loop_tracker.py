@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from loop_room import FRAMES, NOISE, OPTIONS, make_dataset, to_and_fro
+from loop_room import FRAMES, NOISE, OPTIONS
+from loop_room import to_and_fro as true_path
 
 from rsgen.errors import UserError
 from rsgen.geometry import se3
@@ -28,15 +29,15 @@ from rstrack.tracking.runs.run import track
 ONLINE = replace(OPTIONS, loops="online")
 
 
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return make_dataset(tmp_path_factory.mktemp("online") / "seq")
+@pytest.fixture
+def dataset(to_and_fro: Dataset) -> Dataset:
+    return to_and_fro
 
 
 @pytest.fixture(scope="module")
-def run(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(to_and_fro: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("online-run") / "run"
-    result = track(dataset, ONLINE, out, noise=NOISE)
+    result = track(to_and_fro, ONLINE, out, noise=NOISE)
     assert result.lost == 0 and "closed" in result.loops
     return out
 
@@ -46,15 +47,14 @@ def frames(dataset: Dataset) -> list[Frame]:
     return [with_noise(dataset.frame(k), k, *noisy) for k in range(FRAMES)]
 
 
-def test_it_ends_as_well_as_loops_closed_at_the_end(dataset: Dataset, run: Path, tmp_path: Path) -> None:
-    track(dataset, OPTIONS, tmp_path / "end", noise=NOISE)
-    online, end = (json.loads((folder / "run.json").read_text()) for folder in (run, tmp_path / "end"))
+def test_it_ends_as_well_as_loops_closed_at_the_end(run: Path, closed_at_end: Path) -> None:
+    online, end = (json.loads((folder / "run.json").read_text()) for folder in (run, closed_at_end))
     assert online["metrics"]["ate_rmse_m"] < 1.05 * end["metrics"]["ate_rmse_m"]
     assert online["metrics"]["ate_rmse_m"] < 0.8 * online["metrics_online"]["ate_rmse_m"]
     assert online["loops"]["count"] >= 0.8 * end["loops"]["count"] and online["loops"]["problem"] is None
     # The tracker within goes its own way, to the same bits.
     for name in ("trajectory_online.txt", "spline_online.npz"):
-        assert (run / name).read_bytes() == (tmp_path / "end" / name).read_bytes()
+        assert (run / name).read_bytes() == (closed_at_end / name).read_bytes()
     final = read_estimate(run)
     assert final.spline is not None
     np.testing.assert_allclose(final.spline.pose(final.stamps), final.T_world_depth, atol=2e-8)
@@ -65,7 +65,7 @@ def test_live_it_knows_where_it_is(dataset: Dataset, memory_gb: float) -> None:
     """Without files to read again; with images of keyframes in memory, or not even room for one."""
     tracker = make_tracker(dataset.rig, replace(ONLINE, memory_gb=memory_gb))
     assert isinstance(tracker, LoopTracker)
-    truth, off = to_and_fro(), []
+    truth, off = true_path(), []
     for frame in frames(dataset):
         tracker.feed(frame)
         stamps, T = tracker.trajectory
