@@ -25,6 +25,13 @@ RPY = Path(__file__).resolve().parents[3] / "shared/data/tum_fr1_rpy"
 needs_rpy = pytest.mark.skipif(not RPY.is_dir(), reason="../shared/data/tum_fr1_rpy is not here")
 
 
+@pytest.fixture(autouse=True)
+def few_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A quarter of the points of images as small as these, in a third of the time."""
+    monkeypatch.setattr(color_pairs, "_ACROSS", 80)
+    monkeypatch.setattr(color_offset, "_FEWEST", 100)
+
+
 def shaking() -> Spline:
     """T_world_depth over [-0.2, 1.3] s: turned to and fro by about 0.15 rad twice a second, in one place."""
     dt, t0 = 0.05, -0.2
