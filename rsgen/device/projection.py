@@ -222,16 +222,25 @@ class MovingCamera:
         lens = self.lens
         delay, last = lens.shutter.line_delay(lens.camera), lens.lines - 1.0
         half = 0.5 * lens.shutter.exposure_s
-        line = dr.clip(start, -0.5, last + 0.5)
-        error = lens.line_of(*self.project_at(half + line * delay, p, w)[0]) - line
-        slope = type(line)(-1.0)
-        for _ in range(_SECANT_STEPS):
+
+        def step(
+            count: Any, line: Any, error: Any, slope: Any, _x: Any, _y: Any, _defined: Any
+        ) -> tuple[Any, Any, Any, Any, Any, Any, Any]:
             new = dr.clip(line - error / slope, -0.5, last + 0.5)
             (x, y), defined = self.project_at(half + new * delay, p, w)
-            new_error, step = lens.line_of(x, y) - new, new - line
-            secant = (new_error - error) / step
-            slope = dr.select((dr.abs(step) > _SECANT_FROM) & (secant < 0), secant, slope)
-            line, error = new, new_error
+            new_error, way = lens.line_of(x, y) - new, new - line
+            secant = (new_error - error) / way
+            slope = dr.select((dr.abs(way) > _SECANT_FROM) & (secant < 0), secant, slope)
+            return count + 1, new, new_error, slope, x, y, defined
+
+        line = dr.clip(start, -0.5, last + 0.5)
+        (x, y), defined = self.project_at(half + line * delay, p, w)
+        # A loop on the device: written out, all steps take a second to be compiled, and eight where things move.
+        _, line, error, _, x, y, defined = dr.while_loop(
+            (dr.uint32_array_t(line)(0), line, lens.line_of(x, y) - line, type(line)(-1.0), x, y, defined),
+            lambda count, *_: count < _SECANT_STEPS,
+            step,
+        )
         found = defined & contains(lens.camera, x, y) & (dr.abs(error) < _FOUND_WITHIN)
         return (x, y), half + line * delay, found
 
