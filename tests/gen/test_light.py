@@ -1,102 +1,41 @@
-"""Baked light: white furnace, closed forms, the path tracer, the lattice's interpolation, the cache."""
+"""Baked light: closed forms, samples and their noise, white furnace, the path tracer."""
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
+from lit import (
+    BLACK,
+    CORNELL,
+    DISK,
+    FLOOR,
+    POINT,
+    QUAD,
+    floor_grid,
+    floor_light,
+    quad_factor,
+    scene_of,
+    silent,
+)
 from rendering import constant_twist, mi
 
-from rsgen import srgb
 from rsgen.config.config import LightConfig
-from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.light import cache as lighting
 from rsgen.light.drawing.guide import Guide, bin_of
 from rsgen.light.drawing.rounds import PATCH, in_rounds, scatter_of
-from rsgen.light.estimate import estimated_db
 from rsgen.light.places.bake_points import thin
 from rsgen.light.places.denoise import denoised
 from rsgen.light.places.surface_points import SurfacePoints
-from rsgen.light.places.walls import find_covered
 from rsgen.render.baked import BakedIntegrator
 from rsgen.render.images import ColorRenderer
-from rsgen.render.irradiance import IrradianceField, lattice_barycentric, make_field, make_lattice
-from rsgen.render.scene import load_scene, surface
+from rsgen.render.irradiance import make_field, make_lattice
 from rsgen.sensors.response import to_srgb8
-
-UP = np.array([0.0, 0.0, 1.0])
-FLOOR = """<shape type="rectangle" id="floor">
-    <bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf>
-</shape>"""  # z = 0, [-1, 1]², black: what it gets is direct light alone
-POINT = """<emitter type="point"><point name="position" x="0.3" y="-0.2" z="0.8"/>
-    <rgb name="intensity" value="1,2,4"/></emitter>"""
-DISK = """<shape type="disk"><transform name="to_world"><rotate x="1" angle="180"/><scale value="0.25"/>
-    <translate x="-0.2" y="0.1" z="0.6"/></transform><bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf>
-    <emitter type="area"><rgb name="radiance" value="3,2,1"/></emitter></shape>"""
-QUAD = """<shape type="rectangle"><transform name="to_world"><rotate x="1" angle="180"/><scale x="0.4" y="0.2"/>
-    <translate x="0.1" y="0.3" z="0.7"/></transform><bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf>
-    <emitter type="area"><rgb name="radiance" value="1,2,3"/></emitter></shape>"""
-
-
-def silent(*_: Any) -> None:
-    pass
-
-
-def scene_of(folder: Path, *elements: str) -> Any:
-    return load_scene(write_scene(folder, *elements))
-
-
-def write_scene(folder: Path, *elements: str) -> Path:
-    path = folder / "scene.xml"
-    path.write_text('<scene version="3.0.0">' + "\n".join(elements) + "</scene>")
-    return path
-
-
-def bake(scene: Any, **settings: Any) -> tuple[Any, np.ndarray, np.ndarray]:
-    """Lattice and both sides (points, 4)."""
-    light = LightConfig(**{"texel_m": 0.05, "bounces": 0, "gather_rays": 64, **settings})
-    lattice = make_lattice(scene, light.texel_m)
-    return lattice, *lighting.bake(scene, lattice, light, silent)
-
-
-def lookup(
-    scene: Any, field: IrradianceField, origin: np.ndarray, direction: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Points hit (n, 3) and the irradiance (n, 3) found there by rays."""
-    return lookup_side(scene, field, origin, direction)[:2]
-
-
-def lookup_side(
-    scene: Any, field: IrradianceField, origin: Any, direction: Any
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """As `lookup`, and whether each ray met the front of its triangle (n,)."""
-    origin, direction = np.broadcast_arrays(np.asarray(origin, np.float32), np.asarray(direction, np.float32))
-    ray = mi.Ray3f(mi.Point3f(origin.T), mi.Vector3f(direction.T))
-    pi = scene.ray_intersect_preliminary(ray, coherent=True)
-    si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
-    assert np.all(np.array(si.is_valid()))
-    front = np.einsum("ij,ij->i", np.array(si.n).reshape(3, -1).T, direction) < 0
-    return np.array(si.p).T, np.array(field.lookup(pi, si, -ray.d)).reshape(3, -1).T, front
-
-
-def floor_grid(extent: float = 0.9, count: int = 25) -> np.ndarray:
-    x, y = np.meshgrid(*2 * [np.linspace(-extent, extent, count)])
-    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1)
-
-
-def floor_light(scene: Any, xyz: np.ndarray, **settings: Any) -> np.ndarray:
-    """Baked irradiance (n, 3) of the floor at points, looked up from just above."""
-    lattice, front, back = bake(scene, **settings)
-    return lookup(scene, make_field(lattice, front, back), xyz + 0.005 * UP, -UP)[1]
-
-
-# --- closed forms
 
 
 def agree(got: np.ndarray, expected: np.ndarray) -> None:
@@ -133,20 +72,6 @@ def test_rectangle_emitter(tmp_path: Path) -> None:
     agree(got, np.pi * quad_factor(xyz)[:, None] * [1, 2, 3])
 
 
-def quad_factor(xyz: np.ndarray) -> np.ndarray:
-    """Of QUAD, or of a hole in its place, seen from points (n, 3) of the floor."""
-    h = 0.7
-
-    def corner(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        A, B = a / h, b / h
-        ra, rb = np.sqrt(1 + A**2), np.sqrt(1 + B**2)
-        return (A / ra * np.arctan(B / ra) + B / rb * np.arctan(A / rb)) / (2 * np.pi)
-
-    x0, x1, y0, y1 = (0.1 - 0.4 - xyz[:, 0], 0.1 + 0.4 - xyz[:, 0], 0.3 - 0.2 - xyz[:, 1], 0.3 + 0.2 - xyz[:, 1])
-    return corner(x1, y1) - corner(x0, y1) - corner(x1, y0) + corner(x0, y0)
-
-
-BLACK = '<bsdf type="twosided"><bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf></bsdf>'
 SKY = '<emitter type="constant"><rgb name="radiance" value="1,2,3"/></emitter>'
 
 
@@ -285,29 +210,6 @@ def test_white_furnace(tmp_path: Path) -> None:
     assert np.quantile(np.abs(ratio - 1), 0.95) < 0.01
 
 
-CORNELL = [
-    f"""<shape type="rectangle"><transform name="to_world">{turn}<translate {move}/></transform>
-    <bsdf type="diffuse"><rgb name="reflectance" value="{color}"/></bsdf></shape>"""
-    for turn, move, color in (
-        ('<rotate x="1" angle="-90"/>', 'y="-1"', "0.7"),
-        ('<rotate x="1" angle="90"/>', 'y="1"', "0.7"),
-        ('<rotate y="1" angle="180"/>', 'z="1"', "0.7"),
-        ('<rotate y="1" angle="90"/>', 'x="-1"', "0.6,0.1,0.1"),
-        ('<rotate y="1" angle="-90"/>', 'x="1"', "0.1,0.5,0.1"),
-    )
-] + [
-    """<shape type="sphere"><float name="radius" value="0.35"/><point name="center" x="0.35" y="-0.65" z="0.2"/>
-    <bsdf type="roughplastic"><rgb name="diffuse_reflectance" value="0.2,0.4,0.7"/>
-    <float name="alpha" value="0.15"/></bsdf></shape>""",
-    """<shape type="cube"><transform name="to_world"><scale x="0.3" y="0.5" z="0.3"/><rotate y="1" angle="20"/>
-    <translate x="-0.4" y="-0.5" z="0.4"/></transform>
-    <bsdf type="diffuse"><rgb name="reflectance" value="0.7"/></bsdf></shape>""",
-    """<shape type="rectangle"><transform name="to_world"><scale value="0.3"/><rotate x="1" angle="90"/>
-    <translate y="0.99"/></transform><bsdf type="diffuse"/>
-    <emitter type="area"><rgb name="radiance" value="8,7,5"/></emitter></shape>""",
-]
-
-
 def test_baked_light_agrees_with_the_path_tracer(tmp_path: Path) -> None:
     """A Cornell-like box with a block and a rough plastic ball; sRGB PSNR as the issue asks of the living room."""
     scene = scene_of(tmp_path, *CORNELL)
@@ -365,313 +267,3 @@ def test_a_glossy_floor_in_a_dim_mirror_is_what_stands_behind_it_dimmed(tmp_path
     seen, behind = images[0][5:11], images[1][5:11, ::-1]  # rows of the floor in the mirror
     assert behind.max() > 3 * behind.min()  # the lamp's reflection among them
     np.testing.assert_allclose(seen.mean(axis=(0, 1)), [0.03, 0.02, 0.01] * behind.mean(axis=(0, 1)), rtol=0.02)
-
-
-# --- lattice and lookup
-
-
-@pytest.fixture(scope="module")
-def shapes(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """Two meshes with triangles of many shapes: a warped grid (thin, long, right-angled ones) and a ball."""
-    folder = tmp_path_factory.mktemp("shapes")
-    rng = np.random.default_rng(2)
-    steps = np.array([0, 0.004, 0.03, 0.2, 0.23, 0.9, 1.0])
-    x, y = np.meshgrid(2 * steps - 1, 3 * steps[:5] ** 2)
-    vertices = np.column_stack([x.ravel(), y.ravel(), 0.1 * rng.random(x.size)])
-    i, j = (k.ravel() for k in np.meshgrid(np.arange(4), np.arange(6), indexing="ij"))
-    p = i * 7 + j
-    faces = np.concatenate([np.column_stack([p, p + 1, p + 8]), np.column_stack([p + 8, p + 7, p])])
-    faces = np.array([np.roll(face, rng.integers(3)) for face in faces])
-    trimesh.Trimesh(vertices, faces, process=False).export(folder / "grid.ply")
-    ball = trimesh.creation.icosphere(2, 0.4)
-    ball.apply_translation((0, 0, 1))
-    ball.export(folder / "ball.ply")
-    flat = '<boolean name="face_normals" value="true"/>'
-    return scene_of(
-        folder,
-        *(f'<shape type="ply"><string name="filename" value="{n}.ply"/>{flat}</shape>' for n in ("grid", "ball")),
-    )
-
-
-def lattice_positions(scene: Any, lattice: Any) -> np.ndarray:
-    """World positions (points, 3), from the triangles and the barycentrics (b1, b2)."""
-    vertices, faces = surface(scene)
-    face, uv = lattice_barycentric(lattice)
-    a, b, c = (vertices[faces[face, k]].astype(float) for k in range(3))
-    return a + uv[:, :1] * (b - a) + uv[:, 1:] * (c - a)
-
-
-@pytest.mark.parametrize("spacing", [0.02, 0.11, 10.0])
-def test_lattice_covers_every_triangle_at_its_spacing(shapes: Any, spacing: float) -> None:
-    lattice = make_lattice(shapes, spacing)
-    vertices, faces = surface(shapes)
-    face, uv = lattice_barycentric(lattice)
-    counts = (lattice.cells + 1).prod(axis=1)
-    assert lattice.points == counts.sum() == len(face)
-    np.testing.assert_array_equal(np.bincount(face, minlength=len(faces)), counts)
-    np.testing.assert_array_equal(lattice.first, np.concatenate([[0], np.cumsum(counts)[:-1]]))
-    assert uv.min() >= 0 and uv.sum(axis=1).max() <= 1 + 1e-6
-    # Every triangle's corners are lattice points, and neighbours along a grid line lie about `spacing` apart.
-    positions = lattice_positions(shapes, lattice)
-    for k, corners in enumerate(vertices[faces]):
-        own = positions[lattice.first[k] :][: counts[k]]
-        assert np.linalg.norm(own[:, None] - corners, axis=-1).min(axis=0).max() < 1e-6
-        rows = own.reshape(*(lattice.cells[k] + 1), 3)
-        for axis in (0, 1):
-            step = np.linalg.norm(np.diff(rows, axis=axis), axis=-1).max()
-            assert step <= 1.5 * spacing + 1e-9 or lattice.cells[k, axis] == 1
-            assert lattice.cells[k, axis] == 1 or step >= 0.6 * spacing
-
-
-def smooth(p: np.ndarray) -> np.ndarray:
-    return np.stack([2 + p @ (0.3, -0.2, 0.4), 1 + p @ (-0.1, 0.2, 0.3), 3 + p @ (0.5, 0.1, -0.6)], axis=-1)
-
-
-def random_hits(scene: Any, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Ray origins and directions from near random surface points, front side for even and back for odd rays."""
-    vertices, faces = surface(scene)
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    points, face = trimesh.sample.sample_surface_even(mesh, count, seed=seed)
-    side = np.where(np.arange(len(points)) % 2, -1, 1)[:, None] * mesh.face_normals[face]
-    return points + 2e-5 * side, -side
-
-
-@pytest.mark.parametrize("spacing", [0.02, 0.11, 10.0])
-def test_lookup_reproduces_a_linear_function_on_both_sides(shapes: Any, spacing: float) -> None:
-    lattice = make_lattice(shapes, spacing)
-    alive = np.ones((lattice.points, 1))
-    values = smooth(lattice_positions(shapes, lattice))
-    field = make_field(lattice, np.hstack([values, alive]), np.hstack([-values, alive]))
-    origin, direction = random_hits(shapes, 4000, seed=1)
-    hit, got, front = lookup_side(shapes, field, origin, direction)
-    assert np.abs(hit - origin).max() < 1e-4
-    assert np.mean(front == (np.arange(len(hit)) % 2 == 0)) > 0.99  # rays near an edge may meet its other triangle
-    np.testing.assert_allclose(got, np.where(front, 1, -1)[:, None] * smooth(hit), atol=1e-4)
-
-
-def test_points_that_are_not_alive_do_not_count(shapes: Any) -> None:
-    lattice = make_lattice(shapes, 0.02)
-    values = smooth(lattice_positions(shapes, lattice))
-    dead = np.random.default_rng(3).random(lattice.points) < 0.3
-    front = np.where(dead[:, None], 0, np.column_stack([values, np.ones(len(values))]))
-    field = make_field(lattice, front, np.zeros_like(front))
-    origin, direction = random_hits(shapes, 4000, seed=2)
-    hit, got, on_front = lookup_side(shapes, field, origin, direction)
-    assert not got[~on_front].any()  # a back side without light is black
-    lit = on_front & (got[:, 0] != 0)
-    assert lit.sum() > 0.95 * on_front.sum()
-    # Only the living neighbours count, at most about a cell away.
-    np.testing.assert_allclose(got[lit], smooth(hit[lit]), atol=0.04)
-
-
-def test_light_is_continuous_over_edges_that_triangles_share(tmp_path: Path) -> None:
-    scene = scene_of(tmp_path, *CORNELL)
-    lattice, front, back = bake(scene, bounces=2, direct_samples=64)
-    field = make_field(lattice, front, back)
-    # The floor's diagonals, whichever the rectangle has, and lines parallel to them within one triangle.
-    s = np.linspace(-0.9, 0.9, 200)
-    for sign in (1, -1):
-        across = np.array([1, 0, -sign]) / np.sqrt(2)
-        edge = np.stack([s, np.full_like(s, -0.9), sign * s], axis=-1)
-        clear = (np.abs(edge[:, 0] + 0.4) > 0.5) & (np.abs(edge[:, 0] - 0.35) > 0.1)
-        left, right = (
-            lookup(scene, field, edge[clear] + (0, -0.09, 0) + k * 2e-4 * across, (0, -1, 0))[1] for k in (-1, 1)
-        )
-        np.testing.assert_allclose(left, right, rtol=0.01)
-
-
-def test_a_sheet_is_lit_on_the_side_that_faces_the_light(tmp_path: Path) -> None:
-    scene = scene_of(tmp_path, FLOOR, POINT)
-    lattice, front, back = bake(scene)
-    field = make_field(lattice, front, back)
-    xyz = floor_grid()
-    above = lookup(scene, field, xyz + 0.01 * UP, -UP)[1]
-    below = lookup(scene, field, xyz - 0.01 * UP, UP)[1]
-    assert above.min() > 0.1 and not below.any()
-
-
-def test_what_is_buried_does_not_darken_its_neighbours(tmp_path: Path) -> None:
-    """A slab sunk into the floor, too flat to throw a shadow: the floor right beside it is lit as if it were alone."""
-    slab = """<shape type="cube"><transform name="to_world"><scale x="0.3" y="0.3" z="0.02"/><rotate z="1" angle="30"/>
-        <translate z="-0.019"/></transform><bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf></shape>"""
-    angle = np.radians(30)
-    R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    s = np.linspace(-0.29, 0.29, 50)
-    beside = [np.stack([s, np.full_like(s, 0.3 + gap)], -1) @ R.T for gap in (0.01, 0.02, 0.04)]
-    xyz = np.column_stack([np.concatenate(beside), np.zeros(150)])
-    scene = scene_of(tmp_path, FLOOR, slab, POINT)
-    # Beside the slab the lookup extrapolates by up to a texel: 3 cm keeps the light's own fall-off below the tolerance.
-    lattice, front, back = bake(scene, texel_m=0.03)
-    assert (front[:, 3] == 0).sum() > 50  # the floor below the slab
-    got = lookup(scene, make_field(lattice, front, back), xyz + 0.005 * UP, -UP)[1]
-    d = np.array([0.3, -0.2, 0.8]) - xyz
-    np.testing.assert_allclose(got[:, 0], 0.8 / np.linalg.norm(d, axis=-1) ** 3, rtol=0.06)
-
-
-def test_light_does_not_leak_under_a_wall(tmp_path: Path) -> None:
-    """A wall that stands a little in the floor, between a bright and a dim room: neither light is seen in the other."""
-    wall = """<shape type="cube"><transform name="to_world"><scale x="0.01" y="3" z="1.2"/>
-        <translate x="0.013" z="1.1"/></transform>{BLACK}</shape>""".replace("{BLACK}", BLACK)
-    lamps = [
-        f"""<emitter type="point"><point name="position" x="{x}" y="0.1" z="0.5"/>
-        <rgb name="intensity" value="{power},{power},{power}"/></emitter>"""
-        for x, power in ((0.5, 100), (-0.5, 1))
-    ]
-    scene = scene_of(tmp_path, FLOOR, wall, *lamps)
-    lattice, front, back = bake(scene, texel_m=0.03)
-    assert (front[:, 3] > 1).sum() > 60
-    field = make_field(lattice, front, back)
-    y = np.linspace(-0.8, 0.8, 40)
-    for x0, side, power in ((-0.5, -1, 1), (0.5, 1, 100)):
-        for gap in (0.003, 0.01, 0.02):
-            xyz = np.stack([np.full_like(y, 0.013 + side * (0.01 + gap)), y, np.zeros_like(y)], axis=-1)
-            got = lookup(scene, field, xyz + 0.002 * UP, -UP)[1][:, 0]
-            d = np.array([x0, 0.1, 0.5]) - xyz
-            np.testing.assert_allclose(got, power * 0.5 / np.linalg.norm(d, axis=-1) ** 3, rtol=0.12)
-
-
-def test_what_lies_right_under_a_sheet_is_covered(tmp_path: Path) -> None:
-    sheet = """<shape type="rectangle"><transform name="to_world"><scale value="0.3"/><translate z="0.004"/></transform>
-        <bsdf type="diffuse"/></shape>"""
-    scene = scene_of(tmp_path, FLOOR, sheet)
-    p = floor_grid(0.9, 24).astype(np.float32)
-    up = np.tile(UP.astype(np.float32), (len(p), 1))
-    under = np.abs(p[:, :2]).max(axis=1) < 0.3
-    np.testing.assert_array_equal(find_covered(scene, p, up, 0.005), under)
-    assert not find_covered(scene, p, up, 0.003).any() and not find_covered(scene, p, -up, 0.005).any()
-
-
-def test_the_estimate_is_the_error_that_is_there(tmp_path: Path) -> None:
-    """A tenth too bright everywhere on the floor, exposed so that half of it is brighter than a reflectance of 0.18."""
-    scene = scene_of(tmp_path, FLOOR, QUAD)
-    lattice, front, back = bake(scene, texel_m=0.04, direct_samples=256, target_db=50)
-    assert estimated_db(scene, make_field(lattice, front, back), 0.04) > 44
-    off = np.array([1.1, 1.1, 1.1, 1.0], np.float32)
-    xy = np.random.default_rng(5).uniform(-1, 1, (4000, 2))
-    light = quad_factor(np.column_stack([xy, np.zeros(len(xy))]))[:, None] * [1.0, 2.0, 3.0]
-    shown = 0.18 * light / np.median(light.mean(axis=1))
-    error = srgb.encode(np.clip(1.1 * shown, 0, 1)) - srgb.encode(np.clip(shown, 0, 1))
-    expected = -10 * np.log10(np.mean(error**2))
-    assert estimated_db(scene, make_field(lattice, front * off, back * off), 0.04) == pytest.approx(expected, abs=1.0)
-
-
-# --- the same bytes again, and the cache
-
-
-def test_a_bake_is_deterministic(tmp_path: Path) -> None:
-    scene = scene_of(tmp_path, *CORNELL)
-    reloaded = load_scene(tmp_path / "scene.xml")
-    first, again = (bake(s, texel_m=0.1, bounces=2) for s in (scene, reloaded))
-    assert first[1].tobytes() == again[1].tobytes() and first[2].tobytes() == again[2].tobytes()
-
-
-LIGHT = LightConfig(texel_m=0.2, direct_samples=4, gather_rays=16, bounces=0)
-
-
-def values_of(field: IrradianceField) -> np.ndarray:
-    return np.array(field.values)
-
-
-def test_the_second_call_loads_what_the_first_baked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = scene_of(tmp_path, FLOOR, POINT)
-    cache = tmp_path / "deep" / "cache"
-    baked = lighting.baked_field(scene, "hash", LIGHT, cache, silent)
-    assert len(list(cache.iterdir())) == 1  # no temporary file is left
-
-    def fail(*_: Any) -> Any:
-        raise AssertionError("baked again")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(lighting, "bake", fail)
-        loaded = lighting.baked_field(scene, "hash", LIGHT, cache, silent)
-        np.testing.assert_array_equal(values_of(loaded), values_of(baked))
-        with pytest.raises(AssertionError, match="baked again"):
-            lighting.baked_field(scene, "another hash", LIGHT, cache, silent)
-
-    # A damaged file is baked again and mended: truncated, garbage, empty, of another scene's size.
-    (file,) = cache.iterdir()
-    whole = file.read_bytes()
-    wrong = tmp_path / "wrong.npz"
-    np.savez(wrong, front=np.zeros((3, 4)), back=np.zeros((3, 4)))
-    flipped = bytearray(whole)
-    flipped[len(whole) // 3] ^= 0xFF
-    for damage in (whole[: len(whole) // 2], b"garbage", b"", wrong.read_bytes(), bytes(flipped)):
-        file.write_bytes(damage)
-        mended = lighting.baked_field(scene, "hash", LIGHT, cache, silent)
-        np.testing.assert_array_equal(values_of(mended), values_of(baked))
-        assert file.read_bytes() != damage
-
-
-def test_the_caches_key_depends_on_all_that_decides_the_light() -> None:
-    keys = [lighting.cache_key("scene", LIGHT), lighting.cache_key("other scene", LIGHT)]
-    for name, value in {
-        "texel_m": 0.3,
-        "direct_samples": 5,
-        "target_db": 41.0,
-        "gather_rays": 17,
-        "bounces": 1,
-    }.items():
-        keys.append(lighting.cache_key("scene", LIGHT.model_copy(update={name: value})))
-    assert len(set(keys)) == len(keys)
-    content = {"texel_m", "direct_samples", "target_db", "gather_rays", "bounces"}
-    assert content | {"mode", "max_depth", "glossy_spp"} == set(LightConfig.model_fields)
-    assert lighting.cache_key("scene", LIGHT.model_copy(update={"glossy_spp": 3})) == keys[0]
-    # The reference integrator's settings do not touch the bake.
-    assert lighting.cache_key("scene", LIGHT.model_copy(update={"max_depth": 3})) == keys[0]
-    assert lighting.cache_key("scene", LIGHT) == keys[0]
-
-
-def test_a_cache_that_cannot_be_written_only_warns(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    scene = scene_of(tmp_path, FLOOR, POINT)
-    blocked = tmp_path / "file"
-    blocked.write_text("in the way")
-    with caplog.at_level(logging.WARNING, "rsgen"):
-        field = lighting.baked_field(scene, "hash", LIGHT, blocked / "cache", silent)
-    assert values_of(field).max() > 0
-    assert len(caplog.records) == 1 and "cannot be written" in caplog.text
-
-
-def test_the_cache_lies_beside_the_scene_or_in_the_users_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert lighting.cache_folder(tmp_path / "scene.xml") == tmp_path / ".rsgen-cache"
-    monkeypatch.setattr(lighting.os, "access", lambda *_: False)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
-    assert lighting.cache_folder(tmp_path / "scene.xml") == tmp_path / "home" / "rsgen"
-
-
-def test_a_dark_scene_is_an_error(tmp_path: Path) -> None:
-    behind = POINT.replace('z="0.8"', 'z="5"').replace("1,2,4", "0")
-    with pytest.raises(UserError, match="dark") as caught:
-        bake(scene_of(tmp_path, FLOOR, behind))
-    assert "\n" not in str(caught.value)
-    with pytest.raises(UserError, match="dark"):
-        bake(scene_of(tmp_path, FLOOR))
-
-
-def test_progress_grows_to_one(tmp_path: Path) -> None:
-    scene = scene_of(tmp_path, FLOOR, POINT)
-    seen: list[float] = []
-    light = LIGHT.model_copy(update={"bounces": 3})
-    lighting.bake(scene, make_lattice(scene, 0.1), light, lambda stage, fraction, note: seen.append(fraction))
-    assert seen == sorted(seen) and seen[0] >= 0 and seen[-1] == 1.0
-
-
-def test_the_dark_inside_of_a_thin_sheet_does_not_darken_its_outside(tmp_path: Path) -> None:
-    """Regression: a folded curtain lost a third of its light to samples 2 mm behind it that have the same normal."""
-    slab = trimesh.creation.box((0.3, 0.3, 0.002))
-    slab.update_faces(slab.face_normals[:, 0] < 0.5)  # one end is open, so that a little light gets in
-    vertices, faces = trimesh.remesh.subdivide_to_size(slab.vertices, slab.faces, 0.006)
-    trimesh.Trimesh(vertices, faces).export(tmp_path / "slab.ply")
-    scene = scene_of(
-        tmp_path,
-        """<shape type="ply"><string name="filename" value="slab.ply"/><boolean name="face_normals" value="true"/>
-        <bsdf type="twosided"><bsdf type="diffuse"/></bsdf></shape>
-        <emitter type="constant"><rgb name="radiance" value="1,2,3"/></emitter>""",
-    )
-    light = LightConfig(texel_m=0.02, bounces=2, gather_rays=64, direct_samples=256)
-    front, back = lighting.bake(scene, make_lattice(scene, light.texel_m), light, silent)
-    # A convex body's outside sees the whole hemisphere of a uniform sky: E = π L.
-    assert (front[:, 3] == 1).all()
-    np.testing.assert_allclose(front[:, :3].mean(axis=0), np.pi * np.array([1, 2, 3]), rtol=0.005)
-    assert np.quantile(np.abs(front[:, 0] / np.pi - 1), 0.95) < 0.05
-    assert back[:, 0].mean() < 0.5  # and the inside is dark, but not all of it
-    assert back[:, 3].any()
