@@ -6,11 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rendering import mi
+from rendering import dr, mi
 
 from rsgen.config.config import LightConfig
+from rsgen.device.arrays import rows_of
 from rsgen.light import cache as lighting
 from rsgen.render.irradiance import IrradianceField, make_field, make_lattice
+from rsgen.render.rays import rays_from
 from rsgen.render.scene import load_scene
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -61,12 +63,14 @@ def lookup_side(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """As `lookup`, and whether each ray met the front of its triangle (n,)."""
     origin, direction = np.broadcast_arrays(np.asarray(origin, np.float32), np.asarray(direction, np.float32))
-    ray = mi.Ray3f(mi.Point3f(origin.T), mi.Vector3f(direction.T))
+    ray = rays_from(origin, direction)
     pi = scene.ray_intersect_preliminary(ray, coherent=True)
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
+    light = field.lookup(pi, si, -ray.d)
+    dr.eval(si.is_valid(), si.n, si.p, light)
     assert np.all(np.array(si.is_valid()))
-    front = np.einsum("ij,ij->i", np.array(si.n).reshape(3, -1).T, direction) < 0
-    return np.array(si.p).T, np.array(field.lookup(pi, si, -ray.d)).reshape(3, -1).T, front
+    front = np.einsum("ij,ij->i", rows_of(si.n), direction) < 0
+    return rows_of(si.p), rows_of(light), front
 
 
 def floor_grid(extent: float = 0.9, count: int = 25) -> np.ndarray:

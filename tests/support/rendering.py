@@ -14,6 +14,7 @@ import synthetic
 import trimesh
 
 from rsgen.array_types import FloatArray
+from rsgen.device.arrays import rows_of
 from rsgen.device.backend import mitsuba
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
@@ -119,6 +120,6 @@ class RayProbe(mi.SamplingIntegrator):
         self.origin = self.direction = self.time = np.zeros(0)
 
     def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True):
-        self.origin, self.direction = (np.array(v).reshape(3, -1).T for v in (ray.o, ray.d))
+        self.origin, self.direction = (rows_of(v) for v in (ray.o, ray.d))
         self.time = np.array(ray.time)
         return mi.Color3f(ray.time), mi.Bool(True), []

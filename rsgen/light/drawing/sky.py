@@ -66,6 +66,7 @@ def _learned(
     cells, bins, light = [], [], []
     for first, part, p, n, number in chunks(points, which[coarse], lambda _: None, (1 << 22) // _FIRST_LOOK_SAMPLES):
         found = _first_look(scene, p, n, number, follow)
+        dr.eval(found)
         here = cell[coarse[first : first + len(part)]]
         cells.append(np.repeat(here, _FIRST_LOOK_SAMPLES))
         bins.append(np.array(found[0]))
