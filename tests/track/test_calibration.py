@@ -57,6 +57,7 @@ def test_a_lens_and_depth_are_put_right(shaken: Dataset) -> None:
     assert "colour fx" in text and "depth offset" in text and "depth's scale cannot be told" in text
 
 
+@pytest.mark.usefixtures("in_one_phase")
 def test_a_camera_at_rest_tells_nothing_and_that_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
