@@ -1,1 +1,1 @@
-"""The whole spline adjusted at once: loops closed."""
+"""The whole spline adjusted at once: loops closed, a recording refined."""

@@ -31,10 +31,20 @@ _HELD = 1e14
 
 @dataclass(frozen=True)
 class Seen:
-    """What frames say of control points against a keyframe; None: against others of them, by the model itself."""
+    """What frames say of control points against a keyframe; None: against others of them, by the model itself.
+
+    pull (n, 6): gradient of what they say, of the band's control points, where the models were made; None: zero, as
+    after the tracker's own steps.
+    """
 
     keyframe: int | None
     band: Band
+    pull: FloatArray | None = None
+
+    def weakened(self, spread: float) -> Seen:
+        """Taken as so many times as uncertain (σ)."""
+        pull = None if self.pull is None else self.pull / spread**2
+        return Seen(self.keyframe, Band(self.band.first, self.band.blocks / spread**2), pull)
 
 
 @dataclass(frozen=True)
@@ -80,17 +90,22 @@ class State:
 
 @dataclass(frozen=True)
 class Graph:
-    """What is known. at: the state around which the models of `seen` were made, and whose accelerations are to stay."""
+    """What is known.
+
+    at: the state around which the models of `seen` were made. keeps_motion: accelerations are to stay what they are
+    there; else to be small.
+    """
 
     at: State
     seen: Sequence[Seen]
     sightings: Sequence[Sighting]
+    keeps_motion: bool = True
 
     def weakened(self, spread: float) -> Graph:
         """With what frames and sightings say taken as so many times as uncertain (σ)."""
-        seen = [replace(each, band=Band(each.band.first, each.band.blocks / spread**2)) for each in self.seen]
+        seen = [each.weakened(spread) for each in self.seen]
         sightings = [replace(each, information=each.information / spread**2) for each in self.sightings]
-        return Graph(self.at, seen, sightings)
+        return replace(self, seen=seen, sightings=sightings)
 
     def step(self, state: State, weights: FloatArray | None = None) -> tuple[State, FloatArray]:
         """One Gauss-Newton step from a state; weights (n,) of the sightings. Returns the increments too (n, 6)."""
@@ -100,7 +115,8 @@ class Graph:
             system.add_seen(seen, state, self.at, moved_points)
         if self.sightings:
             system.add_sightings(self.sightings, state, np.ones(len(self.sightings)) if weights is None else weights)
-        system.add_smoothness(state.spline, self.at.spline)
+        before = self.at.spline.increments if self.keeps_motion else np.zeros_like(state.spline.increments)
+        system.add_smoothness(state.spline, before)
         x = system.solved()
         points = len(state.spline.control_points)
         return state.moved(x[:points], x[points:]), x
@@ -132,6 +148,8 @@ class _System:
         x = se3.log(se3.inverse(E) @ own)
         A = se3.left_jacobian_inv(x) @ se3.adjoint(se3.inverse(E))
         Hx, whole = np.zeros((n, 6)), np.zeros((n, 6, 6))
+        if seen.pull is not None:
+            Hx += seen.pull[:n]
         for d in range(band.blocks.shape[1]):
             rows = np.arange(n - d)
             if not len(rows):
@@ -167,9 +185,9 @@ class _System:
             for b in range(a, 5):
                 self._put(numbers[:, a], numbers[:, b], weighted[:, a] @ J[:, b])
 
-    def add_smoothness(self, spline: Spline, before: Spline) -> None:
-        """Small changes of the accelerations that the spline had before."""
-        gains, omega = spline.left_gains, spline.increments - before.increments
+    def add_smoothness(self, spline: Spline, before: FloatArray) -> None:
+        """Small accelerations beside those of increments `before` (n, 6) from control point to control point."""
+        gains, omega = spline.left_gains, spline.increments - before
         r = omega[1:] - omega[:-1]
         sigma = np.repeat(ACCELERATION[None] * spline.dt**2, len(r), axis=0)
         sigma[:_END_TRIPLES] *= _END_FACTOR

@@ -103,6 +103,10 @@ class Observation:
         """Another part of its pixels counts."""
         self.independent, self._visible = independent, None
 
+    def begin(self, sigma: float) -> None:
+        """The first linearisation takes this σ."""
+        self.linearisation = _Linearisation(sigma=sigma)
+
     def forget(self, state: SplineState, keep_sigma: bool) -> None:
         """Begin anew, as at a new level of the pyramid."""
         sigma = self.linearisation.sigma if keep_sigma else 0.0

@@ -41,6 +41,7 @@ from rstrack.cli.options import (
     TruthExtrinsics,
     TruthOffset,
 )
+from rstrack.cli.refine import refine
 from rstrack.cli.report import report
 from rstrack.cli.sensitivity import sensitivity
 from rstrack.options import Options
@@ -56,6 +57,7 @@ rstrack estimates the continuous-time trajectory of a rolling-shutter RGB-D came
   rstrack info out/demo                                what would be tracked
   rstrack track out/demo --out runs/demo               track it; the trajectory is in runs/demo
   rstrack calibrate out/demo --out camera.yaml         readouts, clocks and extrinsics out of the recording itself
+  rstrack refine runs/demo --out runs/refined          every frame against all that saw the same: slow, and the best
   rstrack evaluate out/demo runs/demo                  errors against the ground truth
   rstrack plot out/demo runs/demo --out demo.png       path and errors as a picture
   rstrack report runs/demo                             all of it as one HTML page
@@ -95,6 +97,7 @@ def _parser() -> Parser:
     add = commands.add
     add(track, "out/lr_kt2 --method rs-pg --out runs/lr_kt2 --frames 0:300 --noise-depth 1.2e-3", _STATUS)
     add(calibrate, "recording --out camera.yaml", CALIBRATE_STATUS)
+    add(refine, "runs/table1 --out runs/table1-refined")
     add(evaluate, "out/lr_kt2 runs/lr_kt2 --json")
     add(plot, "out/lr_kt2 runs/lr_kt2 --out lr_kt2.png")
     add(info, "out/lr_kt2")

@@ -63,7 +63,7 @@ def keyframes(
     from rstrack.mapping.keyframes import write_keyframes
 
     estimate = read_estimate(run)
-    dataset = open_dataset(sequence, camera).timed_as(estimate.info)
+    dataset = open_dataset(sequence, camera).as_seen_by(estimate.info)
     with ProgressDisplay(quiet) as progress:
         count = write_keyframes(dataset, estimate, out, sigma_px or None, progress=progress)
     print(f"{out}: {count} keyframes written")

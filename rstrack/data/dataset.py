@@ -178,11 +178,15 @@ class Dataset:
         )
         return replace(self, rig=rig, timing=Timing(depth, color, 0.0))
 
-    def timed_as(self, info: dict[str, Any]) -> Dataset:
-        """The same recording with colour's offset as a run had it, whose run.json holds `info`."""
-        clocks = info.get("clocks")
+    def as_seen_by(self, info: dict[str, Any]) -> Dataset:
+        """The same recording with colour's offset and darker corners as a run had them, whose run.json holds `info`."""
+        clocks, recorded = info.get("clocks"), info.get("dataset")
         offset_s = clocks.get("color_offset_s") if self.timing is not None and isinstance(clocks, dict) else None
-        return self.with_color_offset(float(offset_s)) if isinstance(offset_s, float | int) else self
+        timed = self.with_color_offset(float(offset_s)) if isinstance(offset_s, float | int) else self
+        falloff = recorded.get("color_falloff") if isinstance(recorded, dict) else None
+        if self.rig.color_falloff is not None or not isinstance(falloff, float | int):
+            return timed
+        return timed.with_color_falloff(float(falloff))
 
     def rows(self, stream: StreamName) -> FloatArray | None:
         """True poses (images, lines, 7) tx ty tz qx qy qz qw of each line's camera in the world; None if not known.

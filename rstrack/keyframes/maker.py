@@ -132,15 +132,20 @@ class KeyframeMaker:
             made.index, depth, colors, spline, made.t, made.T_world_base, made.lens, on_device, rho, weight
         )
 
-    def fused(self, ref: Reference, depth: DepthImage, spline: Spline) -> Reference:
-        """The keyframe with the depth of one more frame, whose poses are known, averaged in."""
+    def fused(self, ref: Reference, depth: DepthImage, spline: Spline, most: float = _MOST) -> Reference:
+        """The keyframe with the depth of one more frame, whose poses are known, averaged in.
+
+        most: weight of a pixel in measurements beyond which the oldest count ever less.
+        """
         with self.timer("keyframes: fuse"):
             from_base = self.e.upload(from_base_table(spline, ref.T_world_base, depth.exposure))
-            rho, weight = self._fuse(ref, depth.exposure.lens, depth.inverse_z, self._ones(depth), from_base)
+            rho, weight = self._fuse(ref, depth.exposure.lens, depth.inverse_z, self._ones(depth), from_base, most)
         return replace(ref, inverse_depth=rho, weight=weight)
 
-    def _fuse(self, ref: Reference, lens: Lens, source: Any, source_weight: Any, from_base: Any) -> tuple[Any, Any]:
-        constants = self.e.upload(np.array([_AGREE, _MOST]))
+    def _fuse(
+        self, ref: Reference, lens: Lens, source: Any, source_weight: Any, from_base: Any, most: float = _MOST
+    ) -> tuple[Any, Any]:
+        constants = self.e.upload(np.array([_AGREE, most]))
         kernel = self._kernel(fuse_kernel, lens, ref.lens)
         fused: tuple[Any, Any] = kernel(
             FusionInput(

@@ -191,7 +191,7 @@ def run_map(
         if path is not None and not path.parent.is_dir():
             raise UserError(f"{path}: there is no folder {path.parent}: make it or choose another name")
     estimate = read_estimate(estimate_path)
-    dataset = open_dataset(seq_path, camera_file).timed_as(estimate.info)
+    dataset = open_dataset(seq_path, camera_file).as_seen_by(estimate.info)
     result = reconstruct(dataset, estimate, options, progress)
     comment = f"rstrack map, world {result.world}, shutter {result.shutter}, voxels {options.voxel_m:g} m"
     write_ply(out, result.surface, comment)

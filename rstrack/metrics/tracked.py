@@ -92,7 +92,7 @@ def true_path(truth: Truth, begin: float, end: float) -> tuple[FloatArray, Float
 
 def _dataset(estimate: Estimate, sequence: Path | None, camera_file: Path | None, notes: list[str]) -> Dataset | None:
     if sequence is not None:
-        return open_dataset(sequence, camera_file).timed_as(estimate.info)
+        return open_dataset(sequence, camera_file).as_seen_by(estimate.info)
     recorded = estimate.info.get("dataset")
     path = recorded.get("path") if isinstance(recorded, dict) else None
     if not isinstance(path, str):
@@ -100,7 +100,7 @@ def _dataset(estimate: Estimate, sequence: Path | None, camera_file: Path | None
                      "--sequence.")  # fmt: skip
         return None
     try:
-        return open_dataset(Path(path), camera_file).timed_as(estimate.info)
+        return open_dataset(Path(path), camera_file).as_seen_by(estimate.info)
     except UserError as error:
         notes.append(f"No errors and no images: {error}. If the sequence has moved, name it with --sequence.")
         return None

@@ -137,6 +137,7 @@ def _facts(info: dict[str, Any]) -> tuple[tuple[str, str], ...]:
         ("frames", ":".join(str(n) for n in dataset.get("frames") or ())),
         ("keyframes", info.get("keyframes")),
         ("loops", _loops(info)),
+        ("refined", _refined(info)),
         ("added noise", _listed({k: v for k, v in noise.items() if v and k != "seed"})),
         ("settings", _listed({k: v for k, v in _of(info, "options").items() if k != "method"})),
         ("backend", info.get("backend")),
@@ -154,6 +155,14 @@ def _loops(info: dict[str, Any]) -> str:
     before = _of(info, "metrics_online").get("ate_rmse_m")
     was = f"; ATE before {number(before, 1e3)} mm" if isinstance(before, int | float) else ""
     return f"{loops.get('count', 0)} closed, {loops.get('refused', 0)} refused{was}"
+
+
+def _refined(info: dict[str, Any]) -> str:
+    rounds = _of(info, "refined").get("rounds")
+    if not isinstance(rounds, list):
+        return ""
+    moved = ", ".join(number(r["moved_m"], 1e3) for r in rounds if isinstance(r, dict) and "moved_m" in r)
+    return f"{len(rounds)} rounds, which moved poses by up to {moved} mm"
 
 
 def _listed(values: dict[str, Any]) -> str:

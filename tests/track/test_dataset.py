@@ -290,8 +290,8 @@ def test_arrival_times_are_straightened_and_colour_is_shifted_and_grouped(tmp_pa
     shifted = dataset.with_color_offset(0.01 + 1 / 30)
     assert shifted.groups[:2] == ((), (0,)) and shifted.timing is not None
     np.testing.assert_allclose(shifted.color_stamps - dataset.color_stamps, 1 / 30, atol=1e-6)
-    assert dataset.timed_as({"clocks": {"color_offset_s": 0.02}}).color_stamps[0] > dataset.color_stamps[0]
-    assert dataset.timed_as({"clocks": None}) is dataset
+    assert dataset.as_seen_by({"clocks": {"color_offset_s": 0.02}}).color_stamps[0] > dataset.color_stamps[0]
+    assert dataset.as_seen_by({"clocks": None}) is dataset
     text = "\n".join(timing.lines())
     assert "depth: 33.3" in text and "RMS straightened" in text and "+10.0 ms added" in text
 

@@ -54,7 +54,8 @@ def settings(dataset: Dataset, chosen: range, options: Options, noise: Noise) ->
         "machine": {"cpu_count": os.cpu_count()},
         "dataset": {
             "name": dataset.name, "path": str(dataset.root.resolve()),
-            "frames": [chosen.start, chosen.stop], "frames_in_all": len(dataset), **notes,
+            "frames": [chosen.start, chosen.stop], "frames_in_all": len(dataset),
+            "color_falloff": dataset.rig.color_falloff, **notes,
         },
     }  # fmt: skip
 

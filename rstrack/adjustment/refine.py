@@ -1,0 +1,285 @@
+"""The best spline that a recording holds: every frame against all keyframes that see it, all of it solved at once.
+
+Dense bundle adjustment by turns. With the spline as it is, keyframes are made where the camera has been and the depth
+of all frames that see them is averaged in; then every frame is linearised once against each, and control points and
+keyframes' poses move together (`Graph.step`). Where the camera came back, old and new frames are in one keyframe, so
+that loops are closed too, if they are known to within what alignment forgives (`rstrack track --loops end`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rsgen.array_types import FloatArray, IntArray
+from rsgen.console.progress import Progress, no_progress
+from rsgen.geometry import se3
+from rsgen.geometry.spline import Spline
+from rstrack.adjustment.band import Band
+from rstrack.adjustment.graph import Graph, Seen, State
+from rstrack.adjustment.rigid import Usual
+from rstrack.alignment import brightness
+from rstrack.alignment.linearise import Terms
+from rstrack.alignment.normal_equations import Quadratic
+from rstrack.alignment.observation import Observation, observe
+from rstrack.alignment.spline_state import SplineState
+from rstrack.images.device_frame import DeviceFrame
+from rstrack.keyframes.keyframe import Reference
+from rstrack.keyframes.maker import KeyframeMaker
+from rstrack.options import Options
+
+# Of the distance and angle at which a tracker leaves a keyframe: no two are nearer, and frames within see it.
+_GRID, _SEEN = 0.5, 1.0
+# Keyframes that a frame is aligned to, at most: the nearest.
+_MOST = 4
+# Weight of a fused pixel in measurements: all of a recording's count alike.
+_FUSED = 1e4
+# Part of the keyframe's pixels that an image has to see, of those compared that must not be outliers, and scale of the
+# residuals over the usual.
+_LEAST_SHARE, _LEAST_FIT, _WORST = 0.15, 0.6, 2.5
+# Gain or offset that have changed by more call for another look, of so many at most.
+_BRIGHTER, _LOOKS = 0.004, 5
+# By how much colours may be drawn along, of what the way to the keyframe moves the picture: what shines shows things
+# that lie behind it, which move less (measured on a lacquered table, docs/measured.md).
+_SHINE = 3e-4
+# Information (m⁻², rad⁻²) of a frame that has not moved from its keyframe that its colours are not drawn along.
+_UNMOVED = 1e14
+# Furthest that a pose moves (m) in a round after which no other is worth it.
+_STILL = 2e-5
+
+
+# A keyframe that a frame is near, by its number, and the weight of what the frame says against it.
+Near = list[tuple[int, float]]
+
+
+@dataclass(frozen=True)
+class Round:
+    """What a round did. moved_m: the furthest that a frame's pose moved; pairs: of a frame and a keyframe."""
+
+    moved_m: float
+    keyframes: int
+    pairs: int
+    usual: Usual
+
+
+@dataclass
+class Refiner:
+    """Refines the spline of a recording.
+
+    frames, times: numbers of the frames whose poses the spline knows, and their mid readouts (n,) s. load: frames by
+    their numbers, on the device. usual: scales of residuals to begin with.
+    """
+
+    terms: Terms
+    maker: KeyframeMaker
+    options: Options
+    frames: Sequence[int]
+    times: FloatArray
+    load: Callable[[Sequence[int]], Iterator[DeviceFrame]]
+    usual: Usual
+    _inflations: tuple[float, float] = field(default=(1.0, 1.0))
+    _sharing: float = 1.0
+    # Gain and offset of the last colour image against each keyframe.
+    _brightness: dict[int, FloatArray] = field(default_factory=dict)
+
+    def refined(self, spline: Spline, rounds: int, progress: Progress = no_progress) -> tuple[Spline, list[Round]]:
+        """The spline after so many rounds at most, and what they did; the first frame stays where it was.
+
+        Raises numpy.linalg.LinAlgError where the system has no solution.
+        """
+        done: list[Round] = []
+        while len(done) < rounds and (not done or done[-1].moved_m >= _STILL):
+
+            def told(part: float, note: str) -> None:
+                progress("refining", (len(done) + part) / rounds, f"round {len(done) + 1} of {rounds}, {note}")
+
+            spline, result = self._round(spline, told)
+            done.append(result)
+        progress("refining", 1.0, f"{len(done)} rounds")
+        return spline, done
+
+    def _round(self, spline: Spline, told: Callable[[float, str], None]) -> tuple[Spline, Round]:
+        anchors, near = _grid(spline.pose(self.times), self.options)
+        self._sharing = sum(map(len, near)) / len(anchors)
+        keyframes = self._fused(spline, anchors, near, told)
+        state = SplineState(spline)
+        told_of: dict[int, _Told] = {}
+        kept: list[_Figures] = []
+        pairs = 0
+        for n, frame in enumerate(self.load(self.frames)):
+            for k, weight in near[n]:
+                good = self._linearised(frame, keyframes[k], state)
+                pairs += bool(good)
+                for o in good:
+                    told_of.setdefault(k, _Told()).add(self._told(o, state, frame).scaled(weight))
+                    kept.append(_Figures.of(o))
+            told(0.5 + 0.5 * (n + 1) / len(self.frames), f"{pairs} pairs")
+        at = State(spline, {k: keyframes[k].T_world_base for k in sorted(told_of)})
+        seen = [told_of[k].seen(k) for k in at.keyframes]
+        after, _ = Graph(at, seen, (), keeps_motion=False).step(at)
+        first = self.times[0]
+        moved = after.placed(spline.pose(first) @ se3.inverse(after.spline.pose(first))).spline
+        shift = np.linalg.norm((moved.pose(self.times) - spline.pose(self.times))[:, :3, 3], axis=1)
+        self._learn(kept)
+        return moved, Round(float(shift.max()), len(seen), pairs, self.usual)
+
+    def _fused(
+        self, spline: Spline, anchors: IntArray, near: list[Near], told: Callable[[float, str], None]
+    ) -> list[Reference]:
+        """A keyframe of each anchor, with the depth of all frames near it, wherever these come in the recording."""
+        numbers = [self.frames[a] for a in anchors]
+        note = f"{len(anchors)} keyframes"
+        made = [
+            self.maker.rectified(frame.index, frame.depth, frame.colors, spline, None) for frame in self.load(numbers)
+        ]
+        fused = list(made)
+        for n, frame in enumerate(self.load(self.frames)):
+            for k, _ in near[n]:
+                if made[k].index != frame.index:
+                    fused[k] = self.maker.fused(fused[k], frame.depth, spline, _FUSED)
+            told(0.4 * (n + 1) / len(self.frames), note)
+        done = []
+        shape = made[0].lens.camera.height, made[0].lens.camera.width
+        for k, frame in enumerate(self.load(numbers)):
+            rho, weight = (self.maker.e.download(a, shape) for a in (fused[k].inverse_depth, fused[k].weight))
+            done.append(self.maker.with_depth(made[k], frame.depth, frame.colors, spline, rho, weight))
+            told(0.4 + 0.1 * (k + 1) / len(numbers), note)
+        return done
+
+    def _linearised(self, frame: DeviceFrame, ref: Reference, state: SplineState) -> list[Observation]:
+        """What a frame's images say against a keyframe, as far as they fit."""
+        good = []
+        expected = self._brightness.get(ref.index)
+        if expected is None:
+            expected = np.asarray(brightness.matched(frame.colors[0].moments, ref.moments)) if frame.colors else None
+        for o in observe(frame, ref, self.options, brightness.SAME if expected is None else expected):
+            usual = self._usual(o)
+            o.independent = 1.0 / self._inflations[not o.is_depth]
+            o.begin(usual)
+            before = o.brightness(state)
+            for _ in range(_LOOKS):
+                o.linearise(self.terms, state, 0)
+                if o.is_depth or (np.abs(o.brightness(state) - before) < _BRIGHTER).all():
+                    break
+                before = o.brightness(state)
+            sees = o.pixels >= _LEAST_SHARE * ref.pixels and o.lin.fit >= _LEAST_FIT
+            if sees and o.lin.next_sigma < _WORST * usual:
+                good.append(o)
+                if not o.is_depth:
+                    self._brightness[ref.index] = o.brightness(state)
+        return good
+
+    def _told(self, o: Observation, state: SplineState, frame: DeviceFrame) -> Quadratic:
+        """The model of an image against a keyframe; colours may be drawn along by it, as are all that see it.
+
+        What all n images of a keyframe have in common in their errors does not average out: with a covariance n times
+        as large for each it does not.
+        """
+        model = o.model(state)
+        if o.is_depth:
+            return model
+        T_world_cam = state.spline.pose(frame.depth.exposure.mid_time)
+        depth = o.ref.median_depth
+        way = float(np.linalg.norm(T_world_cam[:3, 3] - o.ref.T_world_base[:3, 3])) / depth
+        turn = self._sharing * (_SHINE * way) ** 2
+        information = np.diag(np.minimum(1.0 / np.maximum(np.repeat([turn * depth**2, turn], 3), 1e-300), _UNMOVED))
+        return doubted(model, se3.adjoint(T_world_cam), information)
+
+    def _usual(self, o: Observation) -> float:
+        return self.usual.depth * _spread(o) if o.is_depth else self.usual.intensity
+
+    def _learn(self, kept: list[_Figures]) -> None:
+        depth, color = ([f for f in kept if f.is_depth is is_depth] for is_depth in (True, False))
+        self.usual = Usual(
+            _median([f.sigma for f in depth], self.usual.depth), _median([f.sigma for f in color], self.usual.intensity)
+        )
+        one, other = (max(1.0, _median([f.inflation for f in some], 1.0)) for some in (depth, color))
+        self._inflations = one, other
+
+
+@dataclass
+class _Told:
+    """What frames say against one keyframe."""
+
+    band: Band = field(default_factory=Band)
+    models: list[tuple[int, FloatArray]] = field(default_factory=list)
+
+    def add(self, model: Quadratic) -> None:
+        """One more."""
+        self.band.add(model)
+        self.models.append((model.first, model.g.reshape(-1, 6)))
+
+    def seen(self, keyframe: int) -> Seen:
+        """All of it."""
+        pull = np.zeros((len(self.band), 6))
+        for first, g in self.models:
+            pull[first - self.band.first :][: len(g)] += g
+        return Seen(keyframe, self.band, pull)
+
+
+def doubted(model: Quadratic, to_world: FloatArray, information: FloatArray) -> Quadratic:
+    """A model of control points whose image may be off as one body, eliminated.
+
+    to_world (6, 6): adjoint that takes twists of that body to the world's. information (6, 6): of how far off it is.
+    """
+    together = np.tile(to_world, (model.last - model.first, 1))
+    HB = model.H @ together
+    solved = np.linalg.solve(information + together.T @ HB, np.column_stack([HB.T, together.T @ model.g]))
+    H = model.H - HB @ solved[:, :-1]
+    return Quadratic(model.first, 0.5 * (H + H.T), model.g - HB @ solved[:, -1])
+
+
+@dataclass(frozen=True)
+class _Figures:
+    """Of an observation: σ, of depth at one metre, and inflation."""
+
+    is_depth: bool
+    sigma: float
+    inflation: float
+
+    @classmethod
+    def of(cls, o: Observation) -> _Figures:
+        return cls(o.is_depth, o.lin.next_sigma / (_spread(o) if o.is_depth else 1.0), o.inflation)
+
+
+def _grid(T: FloatArray, options: Options) -> tuple[IntArray, list[Near]]:
+    """Numbers of the poses (n, 4, 4) that become keyframes, and for each pose the keyframes it is near.
+
+    A frame's noise is in all its pairs, so that their weights sum to one; and the nearer a keyframe, the less of it is
+    hidden, bent by interpolation or shines otherwise.
+    """
+    anchors: list[int] = []
+    remote = np.full((len(T), 0), np.inf)
+    nearest = np.full(len(T), np.inf)
+    for n in range(len(T)):
+        if nearest[n] > _GRID:
+            anchors.append(n)
+            remote = np.column_stack([remote, _remoteness(T[n], T, options)])
+            nearest = np.minimum(nearest, remote[:, -1])
+    order = np.argsort(remote, axis=1, kind="stable")[:, :_MOST]
+    near = []
+    for n, row in enumerate(order):
+        r = remote[n, row]
+        weight = (1.0 - np.minimum(r / _SEEN, 1.0) ** 2) ** 2
+        near.append([(int(k), float(w)) for k, w in zip(row, weight / max(weight.sum(), 1e-9), strict=True) if w > 0])
+    return np.array(anchors), near
+
+
+def _remoteness(T_base: FloatArray, T: FloatArray, options: Options) -> FloatArray:
+    """`Options.remoteness` of poses (n, 4, 4) from a keyframe's."""
+    between = se3.inverse(T_base) @ T
+    distance = np.linalg.norm(between[:, :3, 3], axis=1) / options.keyframe_distance
+    angle = np.degrees(np.linalg.norm(se3.log(between)[:, 3:], axis=1)) / options.keyframe_angle_deg
+    return np.asarray(np.maximum(distance, angle))
+
+
+def _spread(o: Observation) -> float:
+    """By how much depth scatters more there than at one metre."""
+    return float(max(0.5, o.ref.median_depth) ** 2)
+
+
+def _median(values: Sequence[float], otherwise: float) -> float:
+    known = [value for value in values if np.isfinite(value)]
+    return float(np.median(known)) if known else otherwise

@@ -1,0 +1,185 @@
+"""`rstrack refine`: a run's spline refined over the whole recording, into a run folder of its own.
+
+result = refine_run(Path("runs/table1"), Path("runs/table1-refined"))
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from rsgen.console.progress import Progress, no_progress
+from rsgen.device.arrays import engine
+from rsgen.errors import UserError
+from rsgen.geometry import se3
+from rstrack.adjustment.rigid import Usual
+from rstrack.data.dataset import Dataset
+from rstrack.data.estimate import INFO, Estimate, write_estimate
+from rstrack.data.noise import with_noise
+from rstrack.data.prefetch import prefetched
+from rstrack.data.rig import Frame
+from rstrack.metrics.association import Truth, truth_of
+from rstrack.metrics.run_evaluate import Evaluation, evaluate_clocks
+from rstrack.metrics.tracked import load_run
+from rstrack.options import Options
+from rstrack.tracking.runs.record import Noise
+
+if TYPE_CHECKING:
+    from rstrack.adjustment.refine import Refiner
+    from rstrack.images.device_frame import DeviceFrame
+
+Kind = TypeVar("Kind", Options, Noise)
+
+# Scales to begin with where a run does not tell any: depth at one metre (m), intensity.
+_USUAL_DEPTH, _USUAL_INTENSITY = 2e-3, 0.015
+# Rounding of times.
+_SLACK_S = 1e-6
+# Distance (m) that things are taken to have had in the run: the first round is told better.
+_TYPICAL_M = 1.5
+
+
+@dataclass(frozen=True)
+class Refined:
+    """estimate: refined. rounds: what each did. before, after: errors, None without a truth."""
+
+    estimate: Estimate
+    rounds: list[dict[str, Any]]
+    before: Evaluation | None
+    after: Evaluation | None
+    seconds: float
+
+    def text(self) -> str:
+        """A summary of a few lines."""
+        moved = ", ".join(f"{1e3 * r['moved_m']:.3f}" for r in self.rounds)
+        last = self.rounds[-1]
+        lines = [
+            f"{len(self.rounds)} rounds in {self.seconds:.0f} s: {last['keyframes']} keyframes, {last['pairs']} pairs "
+            f"of a frame and a keyframe; poses moved by up to {moved} mm"
+        ]
+        if self.before is not None and self.after is not None:
+            lines += [f"ATE before {1e3 * self.before.metrics.ate_rmse_m:.3f} mm", "", self.after.text()]
+        return "\n".join(lines)
+
+
+def refine_run(
+    run: Path, out: Path, sequence: Path | None = None, camera_file: Path | None = None, rounds: int = 3,
+    progress: Progress = no_progress,
+) -> Refined:  # fmt: skip
+    """Refine the run of a spline tracker and write the result, a run folder: `out`, which may not be `run` itself.
+
+    sequence, camera_file: as in `load_run`. rounds: at most. Raises UserError.
+    """
+    if out.resolve() == run.resolve():
+        raise UserError(f"{out}: is the run itself: choose another --out, so that both remain")
+    begin = time.perf_counter()
+    tracked = load_run(run, sequence, camera_file)
+    dataset, estimate = tracked.dataset, tracked.estimate
+    if dataset is None:
+        raise UserError(f"{run}: {tracked.notes[0][0].lower()}{tracked.notes[0][1:]}")
+    if estimate.spline is None:
+        raise UserError(f"{run}: has no spline, so there is nothing to refine: track with one of the rs or gs methods")
+    options = _settings(estimate.info, run, "options", Options).decided(dataset.rig.depth_shutter)
+    noise = _settings(estimate.info, run, "noise", Noise)
+    refiner = _refiner(dataset, estimate, options, noise, run)
+    try:
+        spline, done = refiner.refined(estimate.spline, rounds, progress)
+    except np.linalg.LinAlgError as error:
+        raise UserError(f"{run}: cannot be refined: {error}") from None
+    moved = spline.pose(estimate.stamps) @ se3.inverse(estimate.spline.pose(estimate.stamps))
+    told = [asdict(r) for r in done]
+    seconds = time.perf_counter() - begin
+    info = estimate.info | {"refined": {"of": str(run.resolve()), "rounds": told, "seconds": seconds}}
+    result = Estimate(estimate.stamps, se3.orthonormalise(moved @ estimate.T_world_depth), spline, info)
+    truth = truth_of(dataset)
+    before, after = (None if truth is None else _evaluated(truth, each) for each in (estimate, result))
+    info["metrics"] = None if after is None else after.metrics.as_dict()
+    info["truth_offset"] = None if after is None else after.truth_offset
+    write_estimate(out, result.stamps, result.T_world_depth, spline, info, estimate)
+    return Refined(result, told, before, after, seconds)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _settings(info: dict[str, Any], run: Path, name: str, kind: type[Kind]) -> Kind:
+    """Options or noise as the run had them."""
+    had = info.get(name)
+    if not isinstance(had, dict):
+        raise UserError(f"{run / INFO}: does not say with what {name} it was tracked: track again")
+    known = {item.name for item in fields(kind)}
+    try:
+        return kind(**{key: value for key, value in had.items() if key in known})
+    except (TypeError, UserError) as error:
+        raise UserError(f"{run / INFO}: {name}: {error}") from None
+
+
+def _refiner(dataset: Dataset, estimate: Estimate, options: Options, noise: Noise, run: Path) -> Refiner:
+    engine(options.backend)
+    # After the engine: it chooses the libLLVM that Dr.Jit loads.
+    from rstrack.adjustment.refine import Refiner
+    from rstrack.alignment.linearise import Terms
+    from rstrack.images.device_frame import DeviceRig
+    from rstrack.keyframes.maker import KeyframeMaker
+
+    device = DeviceRig(dataset.rig, options)
+
+    def load(numbers: Sequence[int]) -> Iterator[DeviceFrame]:
+        def read(k: int) -> Frame:
+            frame, problems = dataset.readable_frame(k, color=options.photometric)
+            if frame is None:
+                raise UserError(f"{problems[0]}, though it could be read before")
+            return with_noise(frame, k, noise.sigma_depth, noise.sigma_intensity, noise.seed)
+
+        for k, frame in zip(numbers, prefetched(read, numbers, 2), strict=True):
+            yield device.upload(k, frame)
+
+    numbers = _known_frames(dataset, estimate)
+    if len(numbers) < 2:
+        raise UserError(f"{run}: its spline knows no two frames of {dataset.root}: is it that recording's?")
+    times = np.asarray(dataset.stamps)[numbers] + 0.5 * dataset.rig.depth_shutter.readout_s
+    terms, maker = Terms.of(device, options), KeyframeMaker.of(device)
+    return Refiner(terms, maker, options, numbers, times, load, _usual(estimate.info))
+
+
+def _known_frames(dataset: Dataset, estimate: Estimate) -> list[int]:
+    """Frames that were tracked, of which all lines are where the spline is known."""
+    tracked = {round(float(stamp), 6) for stamp in estimate.stamps}
+    rig, known = dataset.rig, []
+    # From the first line to the last.
+    span_depth = (rig.depth_shutter.line_count(rig.depth_camera) - 1) * rig.depth_shutter.line_delay(rig.depth_camera)
+    span_color = (rig.color_shutter.line_count(rig.color_camera) - 1) * rig.color_shutter.line_delay(rig.color_camera)
+    for k, stamp in enumerate(dataset.stamps):
+        if round(float(stamp), 6) not in tracked:
+            continue
+        colors = [float(dataset.color_stamps[i]) for i in dataset.groups[k]]
+        first = min([float(stamp), *colors])
+        last = max([stamp + span_depth, *(c + span_color for c in colors)])
+        if estimate.spline_covers([first + _SLACK_S, 0.5 * (first + last), last - _SLACK_S]).all():
+            known.append(k)
+    return known
+
+
+def _usual(info: dict[str, Any]) -> Usual:
+    """Scales of residuals as the run had them, of depth as if it were at one metre."""
+    frames = [f for f in info.get("frames", ()) if isinstance(f, dict)]
+    of = {
+        name: [f[name] for f in frames if isinstance(f.get(name), float)]
+        for name in ("sigma_depth_m", "sigma_intensity")
+    }
+    return Usual(
+        float(np.median(of["sigma_depth_m"])) / _TYPICAL_M**2 if of["sigma_depth_m"] else _USUAL_DEPTH,
+        float(np.median(of["sigma_intensity"])) if of["sigma_intensity"] else _USUAL_INTENSITY,
+    )
+
+
+def _evaluated(truth: Truth, estimate: Estimate) -> Evaluation | None:
+    """None where fewer than three poses have a true counterpart."""
+    try:
+        return evaluate_clocks(truth, estimate)
+    except UserError:
+        return None

@@ -1,0 +1,108 @@
+"""A run is refined: every frame against all keyframes that see it. On a ray-cast room."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from loop_room import OPTIONS, make_dataset
+
+from rsgen.errors import UserError
+from rsgen.geometry import se3
+from rstrack.adjustment.refine import doubted
+from rstrack.alignment.normal_equations import Quadratic
+from rstrack.cli.main import main
+from rstrack.data.estimate import read_estimate
+from rstrack.report.build import write_report
+from rstrack.tracking.runs.record import Noise
+from rstrack.tracking.runs.refining import refine_run
+from rstrack.tracking.runs.run import track
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("refine")
+    dataset = make_dataset(folder / "seq").with_color_falloff(1e-5)
+    result = track(dataset, OPTIONS, folder / "run", noise=Noise(1.2e-3, 0.01, 1))
+    assert result.lost == 0
+    return folder / "run"
+
+
+def ate(run: Path) -> float:
+    return float(json.loads((run / "run.json").read_text())["metrics"]["ate_rmse_m"])
+
+
+def test_refining_makes_a_run_better(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "refined"
+    assert main(["refine", str(run), "--out", str(out), "--rounds", "3", "--quiet"]) == 0
+    assert "rounds in" in capsys.readouterr().out
+    assert ate(out) < 0.85 * ate(run)
+    info = json.loads((out / "run.json").read_text())
+    rounds = info["refined"]["rounds"]
+    assert len(rounds) <= 3 and rounds[-1]["moved_m"] < rounds[0]["moved_m"]
+    # What it was made of lies beside it, the first pose stays, and poses go with the spline.
+    assert (out / "trajectory_online.txt").read_bytes() == (run / "trajectory.txt").read_bytes()
+    before, after = read_estimate(run), read_estimate(out)
+    np.testing.assert_allclose(after.T_world_depth[0], before.T_world_depth[0], atol=1e-4)
+    assert after.spline is not None
+    np.testing.assert_allclose(after.spline.pose(after.stamps), after.T_world_depth, atol=2e-8)
+    # As the run saw it.
+    assert info["dataset"]["color_falloff"] == 1e-5
+    assert "refined" in write_report(out).read_text()
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (lambda run: (run / "spline.npz").unlink(), "has no spline"),
+        (lambda run: (run / "run.json").write_text("{}"), "does not say where its sequence is"),
+        (
+            lambda run: (run / "run.json").write_text(
+                json.dumps(json.loads((run / "run.json").read_text()) | {"options": {"method": "magic"}})
+            ),
+            "unknown method 'magic'",
+        ),
+    ],
+)
+def test_what_cannot_be_refined_is_said_in_one_line(
+    run: Path, tmp_path: Path, change: Callable[[Path], object], complaint: str
+) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(run, copy)
+    change(copy)
+    with pytest.raises(UserError) as error:
+        refine_run(copy, tmp_path / "out")
+    assert complaint in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_run_is_not_refined_onto_itself(run: Path) -> None:
+    with pytest.raises(UserError, match="is the run itself"):
+        refine_run(run, run)
+
+
+def test_a_doubted_image_is_one_whose_offset_is_an_unknown_too() -> None:
+    """Against the minimum over the offset, found by least squares of the whole cost."""
+    rng = np.random.default_rng(5)
+    A, b = rng.normal(size=(30, 18)), rng.normal(size=30)  # residuals A x − b of three control points
+    to_world = se3.adjoint(se3.exp(rng.normal(size=6)))
+    root = np.diag(rng.uniform(0.5, 3.0, size=6))
+    found = doubted(Quadratic(4, A.T @ A, -A.T @ b), to_world, root @ root)
+    assert found.first == 4
+
+    together = A @ np.tile(to_world, (3, 1))
+
+    def cost(x: np.ndarray) -> float:
+        rows, right = np.vstack([together, root]), np.concatenate([b - A @ x, np.zeros(6)])
+        offset = np.linalg.lstsq(rows, right, rcond=None)[0]
+        return 0.5 * float(np.sum((rows @ offset - right) ** 2))
+
+    for x in rng.normal(size=(5, 18)):
+        told = 0.5 * x @ found.H @ x + found.g @ x
+        assert told == pytest.approx(cost(x) - cost(np.zeros(18)), rel=1e-9, abs=1e-9)
+    # Surely where it is, nothing changes.
+    same = doubted(Quadratic(4, A.T @ A, -A.T @ b), to_world, 1e14 * np.eye(6))
+    np.testing.assert_allclose(same.H, A.T @ A, atol=1e-8)
