@@ -68,8 +68,9 @@ class Round:
 class Refiner:
     """Refines the spline of a recording.
 
-    frames, times: numbers of the frames whose poses the spline knows, and their mid readouts (n,) s. load: frames by
-    their numbers, on the device. usual: scales of residuals to begin with.
+    frames, times: numbers of the frames whose poses the spline knows, and their mid readouts (n,) s. begin: when (s)
+    the camera stays where it was. load: frames by their numbers, on the device. usual: scales of residuals to begin
+    with.
     """
 
     terms: Terms
@@ -77,6 +78,7 @@ class Refiner:
     options: Options
     frames: Sequence[int]
     times: FloatArray
+    begin: float
     load: Callable[[Sequence[int]], Iterator[DeviceFrame]]
     usual: Usual
     _inflations: tuple[float, float] = field(default=(1.0, 1.0))
@@ -85,7 +87,7 @@ class Refiner:
     _brightness: dict[int, FloatArray] = field(default_factory=dict)
 
     def refined(self, spline: Spline, rounds: int, progress: Progress = no_progress) -> tuple[Spline, list[Round]]:
-        """The spline after so many rounds at most, and what they did; the first frame stays where it was.
+        """The spline after so many rounds at most, and what they did.
 
         Raises numpy.linalg.LinAlgError where the system has no solution.
         """
@@ -119,8 +121,7 @@ class Refiner:
         at = State(spline, {k: keyframes[k].T_world_base for k in sorted(told_of)})
         seen = [told_of[k].seen(k) for k in at.keyframes]
         after, _ = Graph(at, seen, (), keeps_motion=False).step(at)
-        first = self.times[0]
-        moved = after.placed(spline.pose(first) @ se3.inverse(after.spline.pose(first))).spline
+        moved = after.placed(spline.pose(self.begin) @ se3.inverse(after.spline.pose(self.begin))).spline
         shift = np.linalg.norm((moved.pose(self.times) - spline.pose(self.times))[:, :3, 3], axis=1)
         self._learn(kept)
         return moved, Round(float(shift.max()), len(seen), pairs, self.usual)

@@ -47,7 +47,7 @@ def test_refining_makes_a_run_better(run: Path, tmp_path: Path, capsys: pytest.C
     # What it was made of lies beside it, the first pose stays, and poses go with the spline.
     assert (out / "trajectory_online.txt").read_bytes() == (run / "trajectory.txt").read_bytes()
     before, after = read_estimate(run), read_estimate(out)
-    np.testing.assert_allclose(after.T_world_depth[0], before.T_world_depth[0], atol=1e-4)
+    np.testing.assert_allclose(after.T_world_depth[0], before.T_world_depth[0], atol=2e-8)
     assert after.spline is not None
     np.testing.assert_allclose(after.spline.pose(after.stamps), after.T_world_depth, atol=2e-8)
     # As the run saw it.
@@ -82,6 +82,11 @@ def test_what_cannot_be_refined_is_said_in_one_line(
 def test_a_run_is_not_refined_onto_itself(run: Path) -> None:
     with pytest.raises(UserError, match="is the run itself"):
         refine_run(run, run)
+
+
+def test_no_round_is_no_refinement(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="--rounds 0: at least one round"):
+        refine_run(run, tmp_path / "out", rounds=0)
 
 
 def test_a_doubted_image_is_one_whose_offset_is_an_unknown_too() -> None:

@@ -76,6 +76,8 @@ def refine_run(
     """
     if out.resolve() == run.resolve():
         raise UserError(f"{out}: is the run itself: choose another --out, so that both remain")
+    if rounds < 1:
+        raise UserError(f"--rounds {rounds}: at least one round is needed")
     begin = time.perf_counter()
     tracked = load_run(run, sequence, camera_file)
     dataset, estimate = tracked.dataset, tracked.estimate
@@ -143,7 +145,8 @@ def _refiner(dataset: Dataset, estimate: Estimate, options: Options, noise: Nois
         raise UserError(f"{run}: its spline knows no two frames of {dataset.root}: is it that recording's?")
     times = np.asarray(dataset.stamps)[numbers] + 0.5 * dataset.rig.depth_shutter.readout_s
     terms, maker = Terms.of(device, options), KeyframeMaker.of(device)
-    return Refiner(terms, maker, options, numbers, times, load, _usual(estimate.info))
+    begin = float(estimate.stamps[0])
+    return Refiner(terms, maker, options, numbers, times, begin, load, _usual(estimate.info))
 
 
 def _known_frames(dataset: Dataset, estimate: Estimate) -> list[int]:
