@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_dataset import make_tum
+from tum_recording import make_tum
 from test_imu_input import swung
 from util import random_spline
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from synthetic import make_config, make_sequence
-from test_dataset import STAMPS, make_tum
+from tum_recording import STAMPS, make_tum
 
 from rsgen.config.imu import ImuConfig
 from rsgen.errors import UserError
