@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tum_recording import make_tum
 from test_imu_input import swung
+from tum_recording import make_tum
 from util import random_spline
 
 from rsgen.config.imu import ImuConfig
