@@ -271,10 +271,14 @@ class Tracker:
             fault = Fault.DRAWS
         if fault:
             track.window = before
-            if led:
+            if not led:
+                return self._relocalise(new, fault)
+            # Where the camera has turned away from the keyframe meanwhile another one may show what it sees.
+            others = (fault.is_elsewhere or gap > _GAP_S) and not track.succession.is_unfit(new)
+            report = self._relocalise(new, fault) if others else track.report(new, fault=fault)
+            if report.lost:
                 self._bridge.put(track, new)
-                return track.report(new, fault=fault)
-            return self._relocalise(new, fault)
+            return report
         self._bridge.close(track)
         track.window, track.covariances.uncertainty = window, uncertainty
         new = replace(new, depth=left.depth)

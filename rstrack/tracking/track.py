@@ -21,6 +21,7 @@ from rstrack.alignment.spline_state import SplineState
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.rig import Rig
 from rstrack.images.device_frame import DeviceFrame, DeviceRig, Timer
+from rstrack.inertial.band import with_knots
 from rstrack.inertial.inertia import Inertia
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
@@ -49,7 +50,8 @@ class Track:
     """
 
     def __init__(self, rig: Rig, options: Options, timer: Timer, imu: ImuRecording | None = None) -> None:
-        self.rig, self.options = rig, options.decided(rig.depth_shutter)
+        self.rig = rig
+        self.options = with_knots(options, imu, rig.depth_camera.fx).decided(rig.depth_shutter)
         self.device = DeviceRig(rig, self.options, timer)
         self.terms = Terms.of(self.device, self.options)
         self.maker = KeyframeMaker.of(self.device)
