@@ -9,7 +9,7 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.linearise import Terms
-from rstrack.alignment.normal_equations import assemble, solve
+from rstrack.alignment.normal_equations import assemble, solve_damped
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Problem, Solved, optimise
 from rstrack.alignment.priors import (
@@ -122,7 +122,7 @@ class Window:
         for _ in range(_LED_STEPS):
             models = [o.model(self.state) for o in active] + [prior(self.spline)[0] for prior in priors]
             H, g = assemble(models, *free)
-            step = solve(H, g, len(g)).reshape(-1, 6)
+            step = solve_damped(H, g, len(g)).reshape(-1, 6)
             self.state.apply(first, step)
             if np.abs(step).max() < _LED:
                 break

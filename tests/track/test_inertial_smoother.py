@@ -130,7 +130,7 @@ def test_walks_and_shifts_add_to_covariances_and_leave_means() -> None:
 
 
 def test_a_shift_less_than_nothing_takes_nothing_away() -> None:
-    """On imu_fast differences of keyframes' covariances had negative eigenvalues, and the biases' variances got them."""
+    """On imu_fast differences of keyframes' covariances had negative eigenvalues, then the biases' variances."""
     smoother, twin = filled(4), filled(4)
     axes = np.linalg.qr(np.random.default_rng(5).normal(size=(6, 6)))[0]
     smoother.shift((axes * [1e-3, 2e-3, 0.0, -1e-3, -0.5, 4e-3]) @ axes.T)
