@@ -15,6 +15,7 @@ from scipy.signal import welch
 
 from rsgen.array_types import FloatArray
 from rstrack.data.imu.recording import ImuRecording
+from rstrack.inertial.wild import wild
 from rstrack.options import Options
 
 # Spacings to choose from, s.
@@ -49,10 +50,10 @@ class Band:
         """Of a whole recording, in the mean over it; None of a gyroscope that is not there."""
         t = np.arange(recording.t[0], recording.t[-1], 1.0 / recording.rate_hz)
         noise = recording.noise
-        hertz, force = _spectrum(t, recording.t, recording.accel, recording.rate_hz)
+        hertz, force = _spectrum(t, recording.t, recording.accel, noise.accel_density, recording.rate_hz)
         rate = np.zeros_like(force)
         if recording.gyro is not None:
-            _, rate = _spectrum(t, recording.t, recording.gyro, recording.rate_hz)
+            _, rate = _spectrum(t, recording.t, recording.gyro, noise.gyro_density, recording.rate_hz)
         return cls(
             hertz,
             np.maximum(0.0, rate - 6.0 * noise.gyro_density**2),
@@ -94,9 +95,14 @@ def with_knots(options: Options, recording: ImuRecording | None, focal: float) -
     return replace(options, knot_spacing_s=Band.of(recording).knots_s(focal, recording.rate_hz))
 
 
-def _spectrum(t: FloatArray, at: FloatArray, values: FloatArray, rate_hz: float) -> tuple[FloatArray, FloatArray]:
-    """Frequencies (n,) above 0 and the power (n,) a Hz of values (k, 3), read at times (k,), of all axes."""
-    told = np.isfinite(values).all(axis=1)
+def _spectrum(
+    t: FloatArray, at: FloatArray, values: FloatArray, density: float, rate_hz: float
+) -> tuple[FloatArray, FloatArray]:
+    """Frequencies (n,) above 0 and the power (n,) a Hz of values (k, 3), read at times (k,), all axes together.
+
+    t: even times to take it at. density: of the noise.
+    """
+    told = (np.isfinite(values) & ~wild(values, density * np.sqrt(rate_hz))).all(axis=1)
     even: FloatArray = np.stack([np.interp(t, at[told], axis[told]) for axis in values.T])
     length = min(len(t), max(8, round(_STRETCH_S * rate_hz)))
     # The stubs have 'literal' where SciPy has 'linear'.

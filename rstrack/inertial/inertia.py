@@ -107,12 +107,13 @@ class Inertia:
         longest = max(3.0 / self.recording.rate_hz, 0.02)
         return bool(np.diff(np.concatenate([[begin], t, [end]])).max() <= longest)
 
-    def accelerations(self, seconds: float, R_imu_world: FloatArray) -> FloatArray:
-        """σ (6,) of accelerations over so many seconds in an attitude (3, 3), m/s² and rad/s², with what it says."""
+    def told(self, seconds: float, R_imu_world: FloatArray) -> tuple[FloatArray, float]:
+        """σ (6,) of accelerations over so many seconds in an attitude (3, 3), m/s² and rad/s², with what it says, and
+        of the mean angular rate, rad/s."""
         gyro, accel = self.sigma**2 / max(1.0, seconds * self.recording.rate_hz)
         gyro += float(np.diag(self.belief.covariance)[GYRO].max())
         accel += self.belief.force_variance(R_imu_world)
-        return np.repeat(np.sqrt([accel, (2.0 / seconds) ** 2 * gyro]), 3)
+        return np.repeat(np.sqrt([accel, (2.0 / seconds) ** 2 * gyro]), 3), float(np.sqrt(gyro))
 
     # -- what it says of the spline ---------------------------------------------------------------------------------
 

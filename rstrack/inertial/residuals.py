@@ -18,6 +18,7 @@ from rstrack.alignment.normal_equations import Quadratic
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.inertial.belief import ACCEL, GRAVITY, GYRO, SIZE, Belief
 from rstrack.inertial.derivatives import motion
+from rstrack.inertial.wild import wild
 
 # Readings within this part of the range's end are saturated, or may be.
 _SATURATED = 0.995
@@ -33,12 +34,15 @@ class Samples:
 
     @classmethod
     def of(cls, imu: ImuRecording) -> Samples:
-        """All of a recording; saturated readings and those that are not numbers do not count."""
+        """All of a recording; saturated readings, single wild ones, and those that are not numbers do not count."""
         gyro = np.full_like(imu.accel, np.nan) if imu.gyro is None else imu.gyro
         values = np.concatenate([gyro, imu.accel], axis=1)
         limits = [np.inf if r is None else _SATURATED * r for r in (imu.noise.gyro_range, imu.noise.accel_range)]
+        root = np.sqrt(imu.rate_hz)
+        parts = (gyro, imu.noise.gyro_density * root), (imu.accel, imu.noise.accel_density * root)
         with np.errstate(invalid="ignore"):
             counts = np.isfinite(values) & (np.abs(values) < np.repeat(limits, 3))
+            counts &= ~np.concatenate([wild(part, sigma) for part, sigma in parts], axis=1)
         return cls(np.asarray(imu.t, dtype=np.float64), np.where(counts, values, 0.0), counts.astype(np.float64))
 
     def between(self, begin: float, end: float) -> Samples:

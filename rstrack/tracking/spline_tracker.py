@@ -261,8 +261,7 @@ class Tracker:
             if ref.rolling is None:
                 # A rolling reference moves with what is aligned to it, which tells nothing of the two together.
                 seconds = new.stamp - track.found.stamps[-1]
-                accelerations = track.accelerations(window, seconds)
-                uncertainty = uncertainty.after(seconds, pulled.information, accelerations)
+                uncertainty = uncertainty.after(seconds, pulled.information, *track.accelerations(window, seconds))
         if not fault and implausible(T_predicted, window.spline.pose(mid), gap):
             fault = Fault.TOO_FAR
         elif not fault and not uncertainty.is_known:

@@ -17,6 +17,7 @@ from rstrack.data.imu.recording import ImuNoise, ImuRecording
 from rstrack.data.rig import Rig
 from rstrack.inertial.band import Band, missed, with_knots
 from rstrack.inertial.inertia import Inertia
+from rstrack.inertial.residuals import Samples
 from rstrack.options import Options
 from rstrack.tracking.spline_tracker import Tracker
 
@@ -102,3 +103,18 @@ def test_the_prior_lets_through_what_the_readings_say_of_accelerations() -> None
     inertia = Inertia(recording(swinging(size, 20.0)))
     rms = size * (2 * np.pi * 20.0) ** 2 / np.sqrt(2)
     np.testing.assert_allclose(inertia.common, np.maximum([5.0] * 3 + [10.0] * 3, 3.0 * rms), rtol=0.1)
+
+
+def test_single_wild_readings_do_not_count_and_do_not_make_knots_denser() -> None:
+    truth = swinging(np.repeat([1e-3, 5e-3], 3), 20.0)
+    read = recording(truth)
+    assert read.gyro is not None and Samples.of(read).counts.all()
+    rng = np.random.default_rng(3)
+    at = 5 + 25 * np.arange(60), rng.integers(0, 6, 60)
+    values = np.concatenate([read.gyro, read.accel], axis=1)
+    values[at] += rng.choice([-1.0, 1.0], 60) * np.where(at[1] < 3, 8.0, 160.0)
+    broken = ImuRecording(read.t, values[:, :3], values[:, 3:], NOISE, np.eye(4), 200.0)
+    np.testing.assert_array_equal(
+        np.argwhere(Samples.of(broken).counts == 0.0), np.argwhere(values != np.hstack([read.gyro, read.accel]))
+    )
+    np.testing.assert_allclose(Band.of(broken).scatter(0.025), Band.of(read).scatter(0.025), rtol=0.05)
