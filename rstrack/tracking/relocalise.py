@@ -73,17 +73,17 @@ class Relocaliser:
 
     def find(
         self, new: DeviceFrame, window: Window, ref: Reference, end: float, uncertainty: Uncertainty,
-        torn: bool = False,
+        torn: bool = False, T_led: FloatArray | None = None,
     ) -> Found | Fault:  # fmt: skip
         """Where a frame was taken, or why that cannot be told; the track ended at time `end` (s).
 
         Small images are aligned to some keyframes, and the whole one from the best of these poses; others take their
         turn with the next frame. A pose that no hand can have brought the camera to is none until the next frame is
         found beside it. torn: whether it was found where the motion led, but pulled away from it: under vibration depth
-        alone fits single frames anywhere nearby, and is not believed then.
+        alone fits single frames anywhere nearby, and is not believed then. T_led (4, 4): where an IMU has it.
         """
         jump, self._jump = self._jump, None
-        start = (jump.ref, jump.T_ref_cam) if jump else self._searched(new, window, ref, end)
+        start = (jump.ref, jump.T_ref_cam) if jump else self._searched(new, window, ref, end, T_led)
         self._lost_in_a_row += 1
         found = self._aligned(new, window, end, *start, uncertainty) if start else Fault.NO_PLACE
         if isinstance(found, Fault):
@@ -101,13 +101,15 @@ class Relocaliser:
         return found
 
     def _searched(
-        self, new: DeviceFrame, window: Window, ref: Reference, end: float
+        self, new: DeviceFrame, window: Window, ref: Reference, end: float, T_led: FloatArray | None
     ) -> tuple[Reference, FloatArray] | None:
         """The keyframe and T_ref_cam (4, 4) whose turn it is."""
         newest = self._keyframes.newest if ref.rolling is not None else ref
         skip = (self._lost_in_a_row // 2) * (_PLACES - 1)
         places = [newest, *self._keyframes.candidates(new, skip, _PLACES - 1)]
         T_ends = [window.spline.pose(end), *(place.T_world_base for place in places[1:])]
+        if T_led is not None:
+            places, T_ends = [*places, *places], [*T_ends, *[T_led] * len(places)]
         ranked = coarse_search.ranked(
             coarse_search.small_frame(new, self._rig, self._options.geometric),
             [(coarse_search.small_keyframe(place), se3.inverse(place.T_world_base) @ T)

@@ -274,7 +274,7 @@ class Tracker:
                 return self._relocalise(new, fault)
             # Where the camera has turned away from the keyframe meanwhile another one may show what it sees.
             others = (fault.is_elsewhere or gap > _GAP_S) and not track.succession.is_unfit(new)
-            report = self._relocalise(new, fault) if others else track.report(new, fault=fault)
+            report = self._relocalise(new, fault, T_predicted) if others else track.report(new, fault=fault)
             if report.lost:
                 self._bridge.put(track, new)
             return report
@@ -294,15 +294,17 @@ class Tracker:
         track.found.release(window, min(min(f.first_time, f.stamp) for f in track.succession.recent))
         return track.report(new, on_reference, solved, keyframe=renewed, overlap=overlap)
 
-    def _relocalise(self, new: DeviceFrame, fault: Fault = Fault.NONE) -> FrameReport:
+    def _relocalise(
+        self, new: DeviceFrame, fault: Fault = Fault.NONE, T_led: FloatArray | None = None
+    ) -> FrameReport:  # fmt: skip
         """Find a frame again and go on with a new piece of the spline; what was reported before stays as it is.
 
-        fault: why it is not where the motion led, if it was looked for there.
+        fault: why it is not where the motion led, if it was looked for there. T_led (4, 4): where an IMU led it.
         """
         track = self._track
         window, ref = track.known()
         uncertainty = track.covariances.uncertainty
-        found = self._relocaliser.find(new, window, ref, track.found.end, uncertainty, fault.is_pull)
+        found = self._relocaliser.find(new, window, ref, track.found.end, uncertainty, fault.is_pull, T_led)
         if isinstance(found, Fault):
             return track.report(new, fault=fault or found)
         # The new piece may need control points of the last frames before: their poses are kept, not their spline.
