@@ -46,14 +46,14 @@ class Inertia:
 
     def __init__(self, recording: ImuRecording) -> None:
         self.recording, self.samples = recording, Samples.of(recording)
+        self.usable_s = self.determined_s = float("nan")
         noise, root = recording.noise, np.sqrt(recording.rate_hz)
         self._noise = np.array([noise.gyro_density, noise.accel_density]) * root
         walks = np.repeat([noise.gyro_walk, noise.accel_walk, _DRIFT], 3)
         self._walk = walks**2
         self._band, self._dt = Band.of(recording), 0.0
-        self.common = np.maximum(ACCELERATION, _RARE * self._band.accelerations)
+        self.common = np.maximum(ACCELERATION, _RARE * self._band.accelerations) if self.tells else ACCELERATION
         self.sigma, self._told = self._noise, np.zeros(2)
-        self.usable_s = self.determined_s = float("nan")
         self._smoother: Smoother | None = None
         self._until, self._next, self._tripled = -np.inf, -np.inf, 0
         self.belief = Belief.initial(np.array([0.0, recording.gravity, 0.0]))

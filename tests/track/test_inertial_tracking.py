@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +114,16 @@ def test_a_method_without_imu_takes_no_notice_of_one_and_one_with_needs_it() -> 
             tracker.feed(frame_at(k))
     np.testing.assert_array_equal(trackers[0].trajectory[1], trackers[1].trajectory[1])
     assert trackers[1].inertia is None
+
+
+def test_an_accelerometer_alone_changes_nothing() -> None:
+    """Without a gyroscope it is never sure enough of biases and gravity, and must not harm."""
+    rig, alone = Rig(CAMERA, SHUTTER, CAMERA, SHUTTER, np.eye(4)), replace(imu_of(vibrating()), gyro=None)
+    trackers = [Tracker(rig, Options(**OPTIONS | {"method": "rs-g"})), Tracker(rig, Options(**OPTIONS), imu=alone)]
+    for k in range(8):
+        for tracker in trackers:
+            tracker.feed(frame_at(k))
+    np.testing.assert_array_equal(trackers[0].trajectory[1], trackers[1].trajectory[1])
 
 
 def test_a_run_says_what_it_found_and_resumes_to_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
