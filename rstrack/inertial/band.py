@@ -23,7 +23,7 @@ _SPACINGS_S = 0.1, 0.05, 1 / 30, 0.025, 1 / 60, 0.0125, 1 / 120, 0.00625, 0.005
 # Samples a knot, at least: with fewer the readings do not tell where control points are.
 _SAMPLES = 1.2
 # Root mean square by which lines of the depth image may be off their best spline, of what is 1 m away, px.
-MOST_PX = 0.005
+_MOST_PX = 0.005
 # Seconds whose spectrum is taken at once.
 _STRETCH_S = 1.0
 # Of the sum over k: what is left out is less than 1e-6 for lines (degree 1), and far less for the others.
@@ -81,7 +81,7 @@ class Band:
         """The widest spacing (s) that misses less of the motion than lines of a camera with a focal length (px) tell,
         and the densest that readings at rate_hz determine where none does."""
         usable = [dt for dt in _SPACINGS_S if dt * rate_hz >= _SAMPLES] or [_SPACINGS_S[0]]
-        return next((dt for dt in usable if focal * np.hypot(*self.missed_motion(dt)) < MOST_PX), usable[-1])
+        return next((dt for dt in usable if focal * np.hypot(*self.missed_motion(dt)) < _MOST_PX), usable[-1])
 
     def _root(self, density: FloatArray) -> float:
         return float(np.sqrt(density.sum() * (self.hertz[1] - self.hertz[0])))

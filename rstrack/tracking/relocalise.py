@@ -27,6 +27,8 @@ from rstrack.tracking.window import LEVELS, Window
 
 # Keyframes at which a lost frame is looked for, at once.
 _PLACES = 3
+# An IMU is off by no more than a hand in so many seconds, s: 0.25 m and 27 degrees.
+_LED_OFF_S = 0.05
 # Part of the pixels that must fit where a place is recognised by one image though the others say otherwise. How well
 # depth alone must tell all motions (see `FrameReport.observability`), since one wall fits another; less where pixels
 # are large.
@@ -117,6 +119,8 @@ class Relocaliser:
         )  # fmt: skip
         if not ranked:
             return None
+        if T_led is not None:
+            ranked = where_led(T_led, places, ranked) or ranked
         chosen, T_ref_cam = ranked[self._lost_in_a_row % len(ranked)]
         return places[chosen], T_ref_cam
 
@@ -143,6 +147,13 @@ class Relocaliser:
         if fault or not is_sure or not uncertainty.is_known:
             return fault or (Fault.LEFT_OPEN if is_sure else Fault.UNSURE)
         return Found(trial, fresh, solved, ref, uncertainty)
+
+
+def where_led(
+    T_led: FloatArray, places: Sequence[Reference], ranked: Sequence[tuple[int, FloatArray]]
+) -> list[tuple[int, FloatArray]]:
+    """Those of ranked poses, T_place_cam (4, 4) at a place by its number, where an IMU may have led: T_led (4, 4)."""
+    return [(k, T) for k, T in ranked if not implausible(T_led, places[k].T_world_base @ T, _LED_OFF_S)]
 
 
 def _is_sure(alone: Observation, denied: bool) -> bool:
