@@ -48,8 +48,8 @@ class Options:
     knot_spacing_s: Annotated[
         float | None,
         "time between control points of the spline, s (default: 0.025, or three quarters of the time between frames "
-        "where these come more slowly than 25 a second); with gs that of the frames if it is more, since each gives "
-        "one pose only",
+        "where these come more slowly than 25 a second; beside an IMU as dense as what it reads needs); with gs that "
+        "of the frames if it is more, since each gives one pose only",
     ] = None
     knot_phase: Annotated[float, "the first knot lies this part of the spacing before the first line"] = 0.5
     backend: Annotated[Backend, "where kernels run"] = "auto"

@@ -152,3 +152,19 @@ def solve(H: FloatArray, g: FloatArray, bandwidth: int = 24) -> FloatArray:
     for k in range(bandwidth):
         band[k, : size - k] = np.diagonal(scaled, -k)
     return -scale * np.asarray(scipy.linalg.solveh_banded(band, right, lower=True))
+
+
+def solve_damped(H: FloatArray, g: FloatArray, bandwidth: int, damping: float = 0.0) -> FloatArray:
+    """The step (n,) of Levenberg-Marquardt; rounding can make a system indefinite that hardly tells some motion: then
+    damped more. Raises numpy.linalg.LinAlgError where no damping helps."""
+    for _ in range(8):
+        damped = H.copy()
+        damped[np.diag_indices_from(H)] *= 1.0 + damping
+        try:
+            step = solve(damped, g, bandwidth)
+        except np.linalg.LinAlgError:
+            step = np.full_like(g, np.nan)
+        if np.isfinite(step).all():
+            return step
+        damping = max(1e-9, 100.0 * damping)
+    raise np.linalg.LinAlgError("the normal equations have no finite solution")

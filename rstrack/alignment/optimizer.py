@@ -14,7 +14,7 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rstrack.alignment.acceleration import Acceleration
 from rstrack.alignment.linearise import Terms
-from rstrack.alignment.normal_equations import assemble, solve
+from rstrack.alignment.normal_equations import assemble, solve_damped
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.priors import Prior
 from rstrack.alignment.spline_state import SplineState
@@ -142,22 +142,12 @@ def _shift(problem: Problem, first: int, step: FloatArray) -> float:
 
 
 def _damped_step(H: FloatArray, g: FloatArray, damping: float, problem: Problem) -> FloatArray:
-    """Increments (n, 6); rounding can make a system indefinite that hardly tells some motion: then damped more."""
+    """Increments (n, 6)."""
     count = len(g) // 6
-    if problem.rigid:
-        together = np.tile(np.eye(6), (count, 1))
-        H, g = together.T @ H @ together, together.T @ g
-    for _ in range(8):
-        damped = H.copy()
-        damped[np.diag_indices_from(H)] *= 1.0 + damping
-        try:
-            step = solve(damped, g, problem.bandwidth)
-        except np.linalg.LinAlgError:
-            step = np.full_like(g, np.nan)
-        if np.isfinite(step).all():
-            return np.tile(step, (count, 1)) if problem.rigid else step.reshape(-1, 6)
-        damping = max(1e-9, 100.0 * damping)
-    raise np.linalg.LinAlgError("the normal equations have no finite solution")
+    if not problem.rigid:
+        return solve_damped(H, g, problem.bandwidth, damping).reshape(-1, 6)
+    together = np.tile(np.eye(6), (count, 1))
+    return np.tile(solve_damped(together.T @ H @ together, together.T @ g, problem.bandwidth, damping), (count, 1))
 
 
 def _linearise(terms: Terms, state: SplineState, problem: Problem, level: int) -> int:

@@ -12,23 +12,33 @@ from rstrack.alignment.normal_equations import Quadratic
 from rstrack.alignment.priors import ACCELERATION, acceleration_prior
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.imu.recording import ImuRecording
+from rstrack.inertial.band import Band
 from rstrack.inertial.belief import GRAVITY, GYRO, Belief
 from rstrack.inertial.residuals import Samples, summed
 from rstrack.inertial.smoother import Smoother
 
-# σ of readings (rad/s, m/s²) before it is known what of them the spline can follow, and samples that tell.
-_START, _MEMORY = np.array([0.03, 0.3]), 100.0
+# σ of the mean acceleration of a track's first moments, m/s².
+_MEAN_ACCELERATION = 1.0
+# Samples that tell how readings scatter about the spline, and that the scatter which is expected counts as.
+_MEMORY, _EXPECTED = 100.0, 10.0
+# Accelerations that the motion prior allows for, over what the readings are in the mean: the prior must not hold what
+# they tell, nor what they tell be taken for scatter because the prior held it.
+_RARE = 3.0
 # Gravity in the world turns as the track drifts, beside what keyframes' covariances say: m/s² per √s.
 _DRIFT = 5e-4
 # Increments of control points (m, rad) that leave the samples' derivatives as they were.
 _SAME = 1e-2
-# Part of the degrees of freedom of its samples that a spline leaves, at least, lest few samples seem to fit too well.
-_LEAST_LEFT = 0.3
+# The same for gravity (m/s²): turns of the spline and changes of gravity are told by their product, which at the start,
+# when gravity is a guess, no derivative knows.
+_SAME_GRAVITY = 0.1
+# What follows from the recording alone.
+_GIVEN = "recording", "samples", "common", "_band"
 
 
 class Inertia:
     """recording: of the unit. belief: of its biases and gravity as far as is known.
 
+    common (6,): standard deviation of accelerations for the motion prior, m/s² and rad/s².
     sigma (2,): of a gyroscope's reading against the spline (rad/s), and of an accelerometer's (m/s²): never less than
     their noise, and as much as the spline cannot follow. usable_s: time (s) from which on the unit is of use;
     determined_s: at which gravity's direction was first known; NaN before.
@@ -36,12 +46,14 @@ class Inertia:
 
     def __init__(self, recording: ImuRecording) -> None:
         self.recording, self.samples = recording, Samples.of(recording)
+        self.usable_s = self.determined_s = float("nan")
         noise, root = recording.noise, np.sqrt(recording.rate_hz)
         self._noise = np.array([noise.gyro_density, noise.accel_density]) * root
         walks = np.repeat([noise.gyro_walk, noise.accel_walk, _DRIFT], 3)
         self._walk = walks**2
-        self.sigma = np.maximum(_START, self._noise)
-        self.usable_s = self.determined_s = float("nan")
+        self._band, self._dt = Band.of(recording), 0.0
+        self.common = np.maximum(ACCELERATION, _RARE * self._band.accelerations) if self.tells else ACCELERATION
+        self.sigma, self._told = self._noise, np.zeros(2)
         self._smoother: Smoother | None = None
         self._until, self._next, self._tripled = -np.inf, -np.inf, 0
         self.belief = Belief.initial(np.array([0.0, recording.gravity, 0.0]))
@@ -49,7 +61,7 @@ class Inertia:
     @property
     def state(self) -> dict[str, object]:
         """All that a track has changed."""
-        return {name: value for name, value in vars(self).items() if name not in ("recording", "samples")}
+        return {name: value for name, value in vars(self).items() if name not in _GIVEN}
 
     @state.setter
     def state(self, state: dict[str, object]) -> None:
@@ -59,6 +71,12 @@ class Inertia:
     def is_usable(self) -> bool:
         """Whether it is of use."""
         return bool(np.isfinite(self.usable_s))
+
+    @property
+    def tells(self) -> bool:
+        """Whether it says something of a motion: of how it changes at once, while biases and gravity are still unknown;
+        without a gyroscope once it is of use."""
+        return self.is_usable or self.recording.gyro is not None
 
     def begin_world(self) -> None:
         """The world is another one from now on; biases stay what they are."""
@@ -89,12 +107,13 @@ class Inertia:
         longest = max(3.0 / self.recording.rate_hz, 0.02)
         return bool(np.diff(np.concatenate([[begin], t, [end]])).max() <= longest)
 
-    def accelerations(self, seconds: float, R_imu_world: FloatArray) -> FloatArray:
-        """σ (6,) of accelerations over so many seconds in an attitude (3, 3), m/s² and rad/s², with what it says."""
+    def told(self, seconds: float, R_imu_world: FloatArray) -> tuple[FloatArray, float]:
+        """σ (6,) of accelerations over so many seconds in an attitude (3, 3), m/s² and rad/s², with what it says, and
+        of the mean angular rate, rad/s."""
         gyro, accel = self.sigma**2 / max(1.0, seconds * self.recording.rate_hz)
         gyro += float(np.diag(self.belief.covariance)[GYRO].max())
         accel += self.belief.force_variance(R_imu_world)
-        return np.repeat(np.sqrt([accel, (2.0 / seconds) ** 2 * gyro]), 3)
+        return np.repeat(np.sqrt([accel, (2.0 / seconds) ** 2 * gyro]), 3), float(np.sqrt(gyro))
 
     # -- what it says of the spline ---------------------------------------------------------------------------------
 
@@ -102,8 +121,17 @@ class Inertia:
         """All samples that depend on control points from `first` on, of the piece of the spline that begins at control
         point `piece`, while it moves with `state`; biases and gravity as far as they are known."""
         spline = state.spline
+        self._expect(spline.dt)
         begin = max(spline.t0 + max(piece, first - 3) * spline.dt, spline.t_begin)
-        return InertialPrior(self, self.samples.between(begin, spline.t_end), state, first)
+        samples = self.samples.between(begin, spline.t_end)
+        if self.is_usable:
+            return InertialPrior(self, samples, state, first, self.belief)
+        # A belief that is still wrong would draw the spline, and find itself confirmed: as good as none, so that it
+        # says how the motion changes. Only that a hand accelerates little in the mean holds where images tell little.
+        mean = np.concatenate([np.zeros(6), self._guessed(spline, samples)])
+        loose = Belief.initial(mean[GRAVITY]).information.copy()
+        loose[GRAVITY, GRAVITY] = np.eye(3) / _MEAN_ACCELERATION**2
+        return InertialPrior(self, samples, state, first, Belief(mean, loose))
 
     # -- what the track says of it ----------------------------------------------------------------------------------
 
@@ -114,6 +142,7 @@ class Inertia:
         """
         if not models:
             return
+        self._expect(state.dt)
         low, high = min(m.first for m in models), max(m.last for m in models)
         begin = max(self._until, state.spline.t0 + piece * state.dt, state.spline.t_begin)
         self._until, self._next = max(begin, self._next), end
@@ -128,15 +157,16 @@ class Inertia:
         self._regular(smoother, state.spline)
         for model in models:
             smoother.add(model)
-        joint, r = summed(state.spline, fresh, self.recording.T_imu_depth, self.belief, self.sigma)
+        joint, scatter = summed(state.spline, fresh, self.recording.T_imu_depth, self.belief.mean, self.sigma)
         if joint is not None:
             smoother.add(joint)
             smoother.diffuse(self._walk * max(1e-6, float(self._until - begin)))
         keep = state.segment(self._until) if joint is not None else smoother.first
         smoother.forget(max(keep, state.first))
+        before = self.belief.mean
         self._believe(smoother)
-        if joint is not None and self.is_usable:
-            self._learn_sigma(r, fresh.counts, state.dt)
+        if joint is not None and self.tells:
+            self._learn_sigma(scatter.after(self.belief.mean - before), fresh.counts, state.dt)
         R_imu_world = self.recording.T_imu_depth[:3, :3] @ state.spline.pose(self._until)[:3, :3].T
         if not self.is_usable and self.belief.is_usable(R_imu_world):
             self.usable_s = end
@@ -150,18 +180,20 @@ class Inertia:
         fresh = self.samples.between(begin, spline.t_end)
         if not len(fresh):
             return None
-        R = spline.pose(fresh.t)[:, :3, :3] @ self.recording.T_imu_depth[:3, :3].T
-        up = (R @ fresh.values[:, 3:, None])[..., 0].mean(axis=0)
-        if not np.linalg.norm(up) > 0.0:
-            return None
-        self.belief.mean[GRAVITY] = -self.recording.gravity * up / np.linalg.norm(up)
+        self.belief.mean[GRAVITY] = self._guessed(spline, fresh)
         return Smoother.start(self.belief)
+
+    def _guessed(self, spline: Spline, samples: Samples) -> FloatArray:
+        """Gravity in the world (3,), m/s², if the samples' mean force were nothing else."""
+        R = spline.pose(samples.t)[:, :3, :3] @ self.recording.T_imu_depth[:3, :3].T
+        up = (R @ samples.values[:, 3:, None])[..., 0].sum(axis=0)
+        return np.asarray(-self.recording.gravity * up / max(1e-9, float(np.linalg.norm(up))))
 
     def _regular(self, smoother: Smoother, spline: Spline) -> None:
         """The weak prior of accelerations for control points that have come anew."""
         first, last = max(self._tripled - 2, smoother.first), smoother.last
         if last - first >= 3:
-            sigma = np.repeat(ACCELERATION[None] * spline.dt**2, last - first - 2, axis=0)
+            sigma = np.repeat(self.common[None] * spline.dt**2, last - first - 2, axis=0)
             smoother.add(acceleration_prior(spline, first, last, sigma)[0])
             self._tripled = last
 
@@ -170,12 +202,23 @@ class Inertia:
         self.belief = free.of_strength(self.recording.gravity)
         smoother.around(self.belief.mean)
 
+    def _expect(self, dt: float) -> None:
+        """Readings to scatter about a spline with knots dt s apart as their noise and what it cannot follow make them.
+
+        Learnt alone, from a start that says little, σ would stay as large as that start makes the scatter.
+        """
+        if dt != self._dt:
+            self._dt, self.sigma = dt, np.hypot(self._noise, self._band.scatter(dt))
+            self._told = np.full(2, _EXPECTED)
+
     def _learn_sigma(self, r: FloatArray, counts: FloatArray, dt: float) -> None:
-        left = max(_LEAST_LEFT, 1.0 - 1.0 / (self.recording.rate_hz * dt))
+        # Of noise a spline follows a part; what it cannot follow is all in the residuals.
+        followed = min(1.0, 1.0 / (self.recording.rate_hz * dt)) * self._noise**2
         squares, number = (r**2 * counts).reshape(-1, 2, 3).sum(axis=(0, 2)), counts.reshape(-1, 2, 3).sum(axis=(0, 2))
         known = number > 0.0
-        weight = np.minimum(1.0, number / (3.0 * _MEMORY))
-        seen = squares / np.maximum(1.0, number) / left
+        self._told = np.minimum(self._told + number / 3.0, _MEMORY)
+        weight = np.minimum(1.0, number / (3.0 * self._told))
+        seen = squares / np.maximum(1.0, number) + followed
         # One blow must not blind it for long.
         seen = np.minimum(seen, 25.0 * self.sigma**2)
         mean = np.where(known, (1.0 - weight) * self.sigma**2 + weight * seen, self.sigma**2)
@@ -188,11 +231,12 @@ class InertialPrior:
     first, end: the control points that its samples depend on, and how many there were of all.
     """
 
-    def __init__(self, inertia: Inertia, samples: Samples, state: SplineState, first: int) -> None:
+    def __init__(self, inertia: Inertia, samples: Samples, state: SplineState, first: int, belief: Belief) -> None:
+        self._belief = belief
         self._inertia, self._samples, self.state = inertia, samples, state
         self.first, self.end = first, state.end
         self._known: tuple[Quadratic, float] | None = None
-        self._at = np.zeros((0, 6))
+        self._at, self._nine = np.zeros((0, 6)), belief.mean
 
     def __call__(self, spline: Spline) -> tuple[Quadratic, float]:
         if self._known is not None:
@@ -202,9 +246,13 @@ class InertialPrior:
                 step = moved.ravel()
                 return model.moved(moved), cost + float(model.g @ step + 0.5 * step @ model.H @ step)
         inertia = self._inertia
-        joint, _ = summed(spline, self._samples, inertia.recording.T_imu_depth, inertia.belief, inertia.sigma)
-        if joint is None:
-            return Quadratic(self.state.end - 1, np.zeros((6, 6)), np.zeros(6)), 0.0
-        self._known = joint.without_belief(inertia.belief.information)
-        self._at = self.state.received(joint.first, joint.first + joint.count)
+        for _ in range(2):
+            joint, _ = summed(spline, self._samples, inertia.recording.T_imu_depth, self._nine, inertia.sigma)
+            if joint is None:
+                return Quadratic(self.state.end - 1, np.zeros((6, 6)), np.zeros(6)), 0.0
+            model, cost, best = joint.without_belief(self._belief, self._nine)
+            if np.abs(best - self._nine)[GRAVITY].max() < _SAME_GRAVITY:
+                break
+            self._nine = best
+        self._known, self._at = (model, cost), self.state.received(model.first, model.last)
         return self._known

@@ -18,6 +18,7 @@ from rstrack.alignment.normal_equations import Quadratic
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.inertial.belief import ACCEL, GRAVITY, GYRO, SIZE, Belief
 from rstrack.inertial.derivatives import motion
+from rstrack.inertial.wild import wild
 
 # Readings within this part of the range's end are saturated, or may be.
 _SATURATED = 0.995
@@ -33,12 +34,15 @@ class Samples:
 
     @classmethod
     def of(cls, imu: ImuRecording) -> Samples:
-        """All of a recording; saturated readings and those that are not numbers do not count."""
+        """All of a recording; saturated readings, single wild ones, and those that are not numbers do not count."""
         gyro = np.full_like(imu.accel, np.nan) if imu.gyro is None else imu.gyro
         values = np.concatenate([gyro, imu.accel], axis=1)
         limits = [np.inf if r is None else _SATURATED * r for r in (imu.noise.gyro_range, imu.noise.accel_range)]
+        root = np.sqrt(imu.rate_hz)
+        parts = (gyro, imu.noise.gyro_density * root), (imu.accel, imu.noise.accel_density * root)
         with np.errstate(invalid="ignore"):
             counts = np.isfinite(values) & (np.abs(values) < np.repeat(limits, 3))
+            counts &= ~np.concatenate([wild(part, sigma) for part, sigma in parts], axis=1)
         return cls(np.asarray(imu.t, dtype=np.float64), np.where(counts, values, 0.0), counts.astype(np.float64))
 
     def between(self, begin: float, end: float) -> Samples:
@@ -64,15 +68,30 @@ class Joint:
         """Control points."""
         return (len(self.g) - SIZE) // 6
 
-    def without_belief(self, information: FloatArray) -> tuple[Quadratic, float]:
-        """Over the control points alone, the nine numbers being best at every step and known beforehand as
-        `information` (9, 9) says."""
+    def without_belief(self, belief: Belief, at: FloatArray) -> tuple[Quadratic, float, FloatArray]:
+        """Over the control points alone, the nine numbers, here around `at` (9,), being best at every step and known
+        beforehand as `belief` says; the cost, and the best nine (9,) where no control point moves."""
         z = slice(6 * self.count, None)
         c = slice(0, 6 * self.count)
-        solved = np.linalg.solve(self.H[z, z] + information, np.column_stack([self.H[z, c], self.g[z]]))
+        off = at - belief.mean
+        pull = self.g[z] + belief.information @ off
+        solved = np.linalg.solve(self.H[z, z] + belief.information, np.column_stack([self.H[z, c], pull]))
         H = self.H[c, c] - self.H[c, z] @ solved[:, :-1]
         g = self.g[c] - self.H[c, z] @ solved[:, -1]
-        return Quadratic(self.first, 0.5 * (H + H.T), g), self.cost - 0.5 * float(self.g[z] @ solved[:, -1])
+        cost = self.cost + 0.5 * float(off @ belief.information @ off) - 0.5 * float(pull @ solved[:, -1])
+        return Quadratic(self.first, 0.5 * (H + H.T), g), cost, at - solved[:, -1]
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """Residuals r (n, 6), and by_belief (n, 6, 9) what a belief's nine numbers do to them."""
+
+    r: FloatArray
+    by_belief: FloatArray
+
+    def after(self, change: FloatArray) -> FloatArray:
+        """(n, 6), where the nine numbers have changed by (9,)."""
+        return self.r + self.by_belief @ change
 
 
 def residuals(
@@ -102,15 +121,15 @@ def residuals(
 
 
 def summed(
-    spline: Spline, samples: Samples, T_imu_depth: FloatArray, belief: Belief, sigma: FloatArray
-) -> tuple[Joint | None, FloatArray]:
-    """The samples' normal equations around the spline and the belief's mean, and their residuals (n, 6).
+    spline: Spline, samples: Samples, T_imu_depth: FloatArray, belief: FloatArray, sigma: FloatArray
+) -> tuple[Joint | None, Scatter]:
+    """The samples' normal equations around the spline and a belief's nine numbers, and how they scatter about these.
 
     sigma (2,): of a gyroscope's reading (rad/s), of an accelerometer's (m/s²). None without samples.
     """
     if not len(samples):
-        return None, np.zeros((0, 6))
-    r, J, segments = residuals(spline, samples, T_imu_depth, belief.mean)
+        return None, Scatter(np.zeros((0, 6)), np.zeros((0, 6, SIZE)))
+    r, J, segments = residuals(spline, samples, T_imu_depth, belief)
     root = samples.counts / np.repeat(sigma, 3)
     whitened = np.concatenate([J, r[..., None]], axis=2) * root[..., None]
     starts = np.flatnonzero(np.diff(segments, prepend=segments[0] - 1))
@@ -122,4 +141,4 @@ def summed(
         rows = whitened[begin:end].reshape(-1, 24 + SIZE + 1)
         at = np.concatenate([6 * (segments[begin] - first) + np.arange(24), tail])
         total[np.ix_(at, at)] += rows.T @ rows
-    return Joint(first, total[:-1, :-1], total[:-1, -1], 0.5 * float(total[-1, -1])), r
+    return Joint(first, total[:-1, :-1], total[:-1, -1], 0.5 * float(total[-1, -1])), Scatter(r, J[:, :, 24:])

@@ -84,7 +84,12 @@ class Smoother:
 
     def shift(self, covariance: FloatArray) -> None:
         """What is held comes to lie elsewhere in the world, as one body, with gravity: by a left increment with
-        covariance (6, 6), as where images are aligned to another keyframe from now on."""
+        covariance (6, 6), as where images are aligned to another keyframe from now on.
+
+        Where a difference of two keyframes' is less than nothing in some motion, nothing is loosened there.
+        """
+        sizes, axes = np.linalg.eigh(covariance)
+        covariance = (axes * np.maximum(0.0, sizes)) @ axes.T
         x, y, z = self.belief[GRAVITY]
         ways = np.concatenate([np.tile(np.eye(6), (len(self.at), 1)), np.zeros((SIZE, 6))])
         ways[-3:, 3:] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]  # φ × g

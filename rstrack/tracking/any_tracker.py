@@ -9,6 +9,7 @@ from rsgen.array_types import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.rig import Frame, Rig
+from rstrack.inertial.band import with_knots
 from rstrack.options import Options
 
 if TYPE_CHECKING:
@@ -68,7 +69,8 @@ def make_tracker(
     engine(options.backend)
     from rstrack.images.device_frame import untimed
 
-    timer, options = timer or untimed, options.decided(rig.depth_shutter, interval_s)
+    options = with_knots(options, imu, rig.depth_camera.fx).decided(rig.depth_shutter, interval_s)
+    timer = timer or untimed
     if options.method == "baseline":
         from rstrack.tracking.pose_tracker import BaselineTracker
 

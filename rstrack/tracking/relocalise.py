@@ -27,6 +27,8 @@ from rstrack.tracking.window import LEVELS, Window
 
 # Keyframes at which a lost frame is looked for, at once.
 _PLACES = 3
+# An IMU is off by no more than a hand in so many seconds, s: 0.25 m and 27 degrees.
+_LED_OFF_S = 0.05
 # Part of the pixels that must fit where a place is recognised by one image though the others say otherwise. How well
 # depth alone must tell all motions (see `FrameReport.observability`), since one wall fits another; less where pixels
 # are large.
@@ -73,17 +75,17 @@ class Relocaliser:
 
     def find(
         self, new: DeviceFrame, window: Window, ref: Reference, end: float, uncertainty: Uncertainty,
-        torn: bool = False,
+        torn: bool = False, T_led: FloatArray | None = None,
     ) -> Found | Fault:  # fmt: skip
         """Where a frame was taken, or why that cannot be told; the track ended at time `end` (s).
 
         Small images are aligned to some keyframes, and the whole one from the best of these poses; others take their
         turn with the next frame. A pose that no hand can have brought the camera to is none until the next frame is
         found beside it. torn: whether it was found where the motion led, but pulled away from it: under vibration depth
-        alone fits single frames anywhere nearby, and is not believed then.
+        alone fits single frames anywhere nearby, and is not believed then. T_led (4, 4): where an IMU has it.
         """
         jump, self._jump = self._jump, None
-        start = (jump.ref, jump.T_ref_cam) if jump else self._searched(new, window, ref, end)
+        start = (jump.ref, jump.T_ref_cam) if jump else self._searched(new, window, ref, end, T_led)
         self._lost_in_a_row += 1
         found = self._aligned(new, window, end, *start, uncertainty) if start else Fault.NO_PLACE
         if isinstance(found, Fault):
@@ -101,13 +103,15 @@ class Relocaliser:
         return found
 
     def _searched(
-        self, new: DeviceFrame, window: Window, ref: Reference, end: float
+        self, new: DeviceFrame, window: Window, ref: Reference, end: float, T_led: FloatArray | None
     ) -> tuple[Reference, FloatArray] | None:
         """The keyframe and T_ref_cam (4, 4) whose turn it is."""
         newest = self._keyframes.newest if ref.rolling is not None else ref
         skip = (self._lost_in_a_row // 2) * (_PLACES - 1)
         places = [newest, *self._keyframes.candidates(new, skip, _PLACES - 1)]
         T_ends = [window.spline.pose(end), *(place.T_world_base for place in places[1:])]
+        if T_led is not None:
+            places, T_ends = [*places, *places], [*T_ends, *[T_led] * len(places)]
         ranked = coarse_search.ranked(
             coarse_search.small_frame(new, self._rig, self._options.geometric),
             [(coarse_search.small_keyframe(place), se3.inverse(place.T_world_base) @ T)
@@ -115,6 +119,8 @@ class Relocaliser:
         )  # fmt: skip
         if not ranked:
             return None
+        if T_led is not None:
+            ranked = where_led(T_led, places, ranked) or ranked
         chosen, T_ref_cam = ranked[self._lost_in_a_row % len(ranked)]
         return places[chosen], T_ref_cam
 
@@ -141,6 +147,13 @@ class Relocaliser:
         if fault or not is_sure or not uncertainty.is_known:
             return fault or (Fault.LEFT_OPEN if is_sure else Fault.UNSURE)
         return Found(trial, fresh, solved, ref, uncertainty)
+
+
+def where_led(
+    T_led: FloatArray, places: Sequence[Reference], ranked: Sequence[tuple[int, FloatArray]]
+) -> list[tuple[int, FloatArray]]:
+    """Those of ranked poses, T_place_cam (4, 4) at a place by its number, where an IMU may have led: T_led (4, 4)."""
+    return [(k, T) for k, T in ranked if not implausible(T_led, places[k].T_world_base @ T, _LED_OFF_S)]
 
 
 def _is_sure(alone: Observation, denied: bool) -> bool:

@@ -261,8 +261,7 @@ class Tracker:
             if ref.rolling is None:
                 # A rolling reference moves with what is aligned to it, which tells nothing of the two together.
                 seconds = new.stamp - track.found.stamps[-1]
-                accelerations = track.accelerations(window, seconds)
-                uncertainty = uncertainty.after(seconds, pulled.information, accelerations)
+                uncertainty = uncertainty.after(seconds, pulled.information, *track.accelerations(window, seconds))
         if not fault and implausible(T_predicted, window.spline.pose(mid), gap):
             fault = Fault.TOO_FAR
         elif not fault and not uncertainty.is_known:
@@ -271,10 +270,14 @@ class Tracker:
             fault = Fault.DRAWS
         if fault:
             track.window = before
-            if led:
+            if not led:
+                return self._relocalise(new, fault)
+            # Where the camera has turned away from the keyframe meanwhile another one may show what it sees.
+            others = (fault.is_elsewhere or gap > _GAP_S) and not track.succession.is_unfit(new)
+            report = self._relocalise(new, fault, T_predicted) if others else track.report(new, fault=fault)
+            if report.lost:
                 self._bridge.put(track, new)
-                return track.report(new, fault=fault)
-            return self._relocalise(new, fault)
+            return report
         self._bridge.close(track)
         track.window, track.covariances.uncertainty = window, uncertainty
         new = replace(new, depth=left.depth)
@@ -291,15 +294,17 @@ class Tracker:
         track.found.release(window, min(min(f.first_time, f.stamp) for f in track.succession.recent))
         return track.report(new, on_reference, solved, keyframe=renewed, overlap=overlap)
 
-    def _relocalise(self, new: DeviceFrame, fault: Fault = Fault.NONE) -> FrameReport:
+    def _relocalise(
+        self, new: DeviceFrame, fault: Fault = Fault.NONE, T_led: FloatArray | None = None
+    ) -> FrameReport:  # fmt: skip
         """Find a frame again and go on with a new piece of the spline; what was reported before stays as it is.
 
-        fault: why it is not where the motion led, if it was looked for there.
+        fault: why it is not where the motion led, if it was looked for there. T_led (4, 4): where an IMU led it.
         """
         track = self._track
         window, ref = track.known()
         uncertainty = track.covariances.uncertainty
-        found = self._relocaliser.find(new, window, ref, track.found.end, uncertainty, fault.is_pull)
+        found = self._relocaliser.find(new, window, ref, track.found.end, uncertainty, fault.is_pull, T_led)
         if isinstance(found, Fault):
             return track.report(new, fault=fault or found)
         # The new piece may need control points of the last frames before: their poses are kept, not their spline.

@@ -21,6 +21,7 @@ from rstrack.alignment.spline_state import SplineState
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.rig import Rig
 from rstrack.images.device_frame import DeviceFrame, DeviceRig, Timer
+from rstrack.inertial.band import with_knots
 from rstrack.inertial.inertia import Inertia
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
@@ -49,7 +50,8 @@ class Track:
     """
 
     def __init__(self, rig: Rig, options: Options, timer: Timer, imu: ImuRecording | None = None) -> None:
-        self.rig, self.options = rig, options.decided(rig.depth_shutter)
+        self.rig = rig
+        self.options = with_knots(options, imu, rig.depth_camera.fx).decided(rig.depth_shutter)
         self.device = DeviceRig(rig, self.options, timer)
         self.terms = Terms.of(self.device, self.options)
         self.maker = KeyframeMaker.of(self.device)
@@ -141,13 +143,14 @@ class Track:
             models = [o.model(window.state).scaled(1.0 / excess**2) for o in fresh if o.is_linearised]
             self.inertia.learn(window.state, window.piece, models, end)
 
-    def accelerations(self, window: Window, seconds: float) -> FloatArray:
-        """σ (6,) of accelerations over so many seconds, beyond what is known, m/s² and rad/s²: an IMU tells most."""
+    def accelerations(self, window: Window, seconds: float) -> tuple[FloatArray, float]:
+        """σ (6,) of accelerations over so many seconds, beyond what is known, m/s² and rad/s², and of the angular rate,
+        rad/s: an IMU tells most."""
         if self.inertia is None or seconds <= 0.0 or not window.is_led(self.found.end, self.found.end + seconds):
-            return ACCELERATION
+            return ACCELERATION, np.inf
         R_depth_world = window.spline.pose(self.found.end)[:3, :3].T
-        told = self.inertia.accelerations(seconds, self.inertia.recording.T_imu_depth[:3, :3] @ R_depth_world)
-        return np.minimum(ACCELERATION, told)
+        told, rate = self.inertia.told(seconds, self.inertia.recording.T_imu_depth[:3, :3] @ R_depth_world)
+        return np.minimum(ACCELERATION, told), rate
 
     def _shift_inertia(self, fresh: Sequence[Observation]) -> None:
         """An IMU knows nothing of keyframes: that another one lies a little off is no motion."""

@@ -9,7 +9,7 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.linearise import Terms
-from rstrack.alignment.normal_equations import assemble, solve
+from rstrack.alignment.normal_equations import assemble, solve_damped
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Problem, Solved, optimise
 from rstrack.alignment.priors import (
@@ -36,6 +36,8 @@ _HELD, _RELEASED = 8, 128
 # of the motion gets better by averaging along it. And degrees that the camera turns in them, at most: keyframes are
 # made of frozen frames, and must not be left behind by then.
 _LAG_S, _LAG_DEG = 0.1, 3.0
+# Seconds before the spline's end that an IMU has to tell, or the newest control points are held as if there were none.
+_NEWEST_S = 0.05
 # Levels to go through from a prediction by constant velocity, and from anything worse.
 TRACKING_LEVELS, LEVELS = (1, 0), (2, 1, 0)
 # Steps from constant velocity to what an IMU says of the motion since the last frame, and a step (m, rad) that is the
@@ -120,7 +122,7 @@ class Window:
         for _ in range(_LED_STEPS):
             models = [o.model(self.state) for o in active] + [prior(self.spline)[0] for prior in priors]
             H, g = assemble(models, *free)
-            step = solve(H, g, len(g)).reshape(-1, 6)
+            step = solve_damped(H, g, len(g)).reshape(-1, 6)
             self.state.apply(first, step)
             if np.abs(step).max() < _LED:
                 break
@@ -173,22 +175,27 @@ class Window:
 
     def _motion_prior(self, free: tuple[int, int]) -> Prior:
         first, last = max(self.piece, free[0] - 2), free[1]
-        sigma = np.repeat(ACCELERATION[None] * self.state.dt**2, last - first - 2, axis=0)
+        common = ACCELERATION if self._inertia is None else self._inertia.common
+        sigma = np.repeat(common[None] * self.state.dt**2, last - first - 2, axis=0)
         if not self._inertial(free):
             sigma[-_END_TRIPLES:] *= _END_FACTOR
-        if free[0] == self.piece:
+        if free[0] == self.piece and not self._tells_from(self.spline.t0 + self.piece * self.state.dt):
             sigma[: max(0, min(_END_TRIPLES, len(sigma) - _END_TRIPLES))] *= _END_FACTOR
         return lambda spline: acceleration_prior(spline, first, last, sigma)
 
     def _inertial(self, free: tuple[int, int]) -> list[Prior]:
         """What an IMU says, where it tells the newest control points."""
-        last = self.state.spline.t_end
-        if self._inertia is None or not self.is_led(last - 2.0 * self.state.dt, last):
+        last, inertia = self.state.spline.t_end, self._inertia
+        if inertia is None or not inertia.tells or not inertia.covers(last - _NEWEST_S, last):
             return []
         known = self._led
         if known is None or known.state is not self.state or known.first > free[0] or known.end != self.state.end:
-            known = self._led = self._inertia.prior(self.state, self.piece, free[0])
+            known = self._led = inertia.prior(self.state, self.piece, free[0])
         return [known]
+
+    def _tells_from(self, begin: float) -> bool:
+        """Whether an IMU says how the motion changes in a piece's first control points, that begins at a time (s)."""
+        return self._inertia is not None and self._inertia.tells and self._inertia.covers(begin, begin + _NEWEST_S)
 
     def _velocity_prior(self, free: tuple[int, int]) -> Prior:
         """What is known of the motion of a piece that has just begun."""

@@ -91,9 +91,12 @@ def test_sums_are_the_dense_least_squares() -> None:
     spline = wild_spline(3)
     samples = Samples.of(recording(wild_spline(4), np.linspace(spline.t_begin + 0.06, spline.t_end, 50)))
     belief, sigma = Belief.initial(GRAVITY), np.array([0.01, 0.2])
-    joint, r = summed(spline, samples, T_IMU_DEPTH, belief, sigma)
+    joint, scatter = summed(spline, samples, T_IMU_DEPTH, belief.mean, sigma)
     assert joint is not None and joint.first == 1 and joint.count == len(spline.control_points) - 1
-    _, J, first = residuals(spline, samples, T_IMU_DEPTH, belief.mean)
+    r, J, first = residuals(spline, samples, T_IMU_DEPTH, belief.mean)
+    change = np.random.default_rng(5).normal(0.0, 0.1, SIZE)
+    expected, _, _ = residuals(spline, samples, T_IMU_DEPTH, belief.mean + change)
+    np.testing.assert_allclose(scatter.after(change), expected, atol=1e-9)
     dense = np.zeros((len(r), 6, 6 * joint.count + SIZE))
     for k, at in enumerate(first - 1):
         dense[k, :, 6 * at : 6 * at + 24], dense[k, :, -SIZE:] = J[k, :, :24], J[k, :, 24:]
@@ -107,18 +110,19 @@ def test_sums_are_the_dense_least_squares() -> None:
 def test_belief_is_eliminated_as_if_it_were_solved_for() -> None:
     spline = wild_spline(3)
     samples = Samples.of(recording(wild_spline(4), np.linspace(spline.t_begin, spline.t_end, 50)))
-    belief = Belief.initial(GRAVITY)
-    joint, _ = summed(spline, samples, T_IMU_DEPTH, belief, np.array([0.01, 0.2]))
+    rng, belief = np.random.default_rng(0), Belief.initial(GRAVITY)
+    at = belief.mean + rng.normal(0.0, 0.1, SIZE)
+    joint, _ = summed(spline, samples, T_IMU_DEPTH, at, np.array([0.01, 0.2]))
     assert joint is not None
-    model, cost = joint.without_belief(belief.information)
-    step = np.random.default_rng(0).normal(0.0, 1e-3, len(model.g))
-    H, g = joint.H.copy(), joint.g
-    H[-SIZE:, -SIZE:] += belief.information
-    c, z = slice(0, -SIZE), slice(-SIZE, None)
-    best = -np.linalg.solve(H[z, z], g[z] + H[z, c] @ step)
-    whole = np.concatenate([step, best])
-    expected = joint.cost + g @ whole + 0.5 * whole @ H @ whole
-    assert cost + model.g @ step + 0.5 * step @ model.H @ step == pytest.approx(expected, rel=1e-9)
+    model, cost, nine = joint.without_belief(belief, at)
+    H, g, known = joint.H, joint.g, belief.information
+    c, z, off = slice(0, -SIZE), slice(-SIZE, None), at - belief.mean
+    for step in (rng.normal(0.0, 1e-3, len(model.g)), np.zeros(len(model.g))):
+        best = -np.linalg.solve(H[z, z] + known, g[z] + known @ off + H[z, c] @ step)
+        whole = np.concatenate([step, best])
+        expected = joint.cost + g @ whole + 0.5 * whole @ H @ whole + 0.5 * (best + off) @ known @ (best + off)
+        assert cost + model.g @ step + 0.5 * step @ model.H @ step == pytest.approx(expected, rel=1e-9)
+    np.testing.assert_allclose(nine, at + best, rtol=1e-9)
 
 
 def test_saturated_and_missing_readings_do_not_count() -> None:

@@ -17,6 +17,7 @@ from rstrack.alignment.normal_equations import (
     line_jacobian,
     prepare_jacobians,
     solve,
+    solve_damped,
 )
 
 TIMES = np.array([0.34, 0.352, 0.41, 0.43, 0.449, 0.452])  # segments 0 (twice), 2 (three times) and 3
@@ -189,3 +190,21 @@ def test_equations_that_are_not_finite_have_no_solution(broken: str) -> None:
         (H if broken == "H is NaN" else g)[3] = np.nan
     with pytest.raises(np.linalg.LinAlgError):
         solve(H, g)
+
+
+def test_a_system_that_rounding_made_indefinite_is_damped() -> None:
+    """An IMU beside a bare wall, imu_walls: seconds of motions that no image tells ended the run."""
+    rng = np.random.default_rng(6)
+    axes = np.linalg.qr(rng.normal(size=(60, 60)))[0]
+    sizes = np.geomspace(1.0, 1e6, 60)
+    g = axes @ (sizes * rng.normal(size=60))
+    H = (axes * sizes) @ axes.T
+    np.testing.assert_array_equal(solve_damped(H, g, 60), solve(H, g, 60))
+    sizes[0] = -1e-4
+    H = (axes * sizes) @ axes.T
+    with pytest.raises(np.linalg.LinAlgError):
+        solve(H, g, 60)
+    told = axes[:, 1:].T @ solve_damped(H, g, 60)
+    np.testing.assert_allclose(told, -axes[:, 1:].T @ g / sizes[1:], rtol=0.05, atol=0.05)
+    with pytest.raises(np.linalg.LinAlgError):
+        solve_damped(H, np.full(60, np.nan), 60)

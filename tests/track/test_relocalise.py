@@ -16,7 +16,7 @@ from rstrack.images.pyramid import DepthImage
 from rstrack.tracking.judgement.fault import Fault
 from rstrack.tracking.judgement.lost_track import FitHistory
 from rstrack.tracking.judgement.uncertainty import Uncertainty
-from rstrack.tracking.relocalise import Found, Relocaliser, _is_sure, without_misfits
+from rstrack.tracking.relocalise import Found, Relocaliser, _is_sure, where_led, without_misfits
 
 REF: Any = SimpleNamespace(pixels=5000, T_world_base=np.eye(4), median_depth=1.0)
 
@@ -125,3 +125,16 @@ def test_depth_alone_tells_a_place_only_where_it_sees_all_motions(denied: bool, 
     assert _is_sure(alone(1.01 * limit, fit=0.8), denied) != denied  # what colours deny has to fit well besides
     assert _is_sure(alone(1e-9, is_depth=False), denied)
     assert not _is_sure(SimpleNamespace(is_linearised=False), denied)  # type: ignore[arg-type]
+
+
+def test_of_places_that_look_alike_those_count_where_an_imu_led() -> None:
+    """On imu_fast the other side of the table looked most like what was seen after a second without images."""
+
+    def along(x: float) -> np.ndarray:
+        return se3.exp(np.array([x, 0.0, 0.0, 0.0, 0.0, 0.0]))
+
+    places: Any = [SimpleNamespace(T_world_base=along(x)) for x in (3.0, 0.0, 0.5)]
+    turned = along(0.7) @ se3.exp(np.array([0.0, 0.0, 0.0, 0.0, np.pi, 0.0]))
+    ranked = [(0, along(0.1)), (1, turned), (2, along(0.1)), (1, along(0.9))]
+    assert where_led(along(0.7), places, ranked) == ranked[2:]
+    assert where_led(along(-5.0), places, ranked) == []

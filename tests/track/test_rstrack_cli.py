@@ -17,7 +17,7 @@ import pytest
 import synthetic
 
 import rsgen.console.progress
-import rstrack.alignment.optimizer
+import rstrack.alignment.normal_equations
 from rstrack.bench.speed import Stopwatch
 from rstrack.cli.main import main
 from rstrack.data.estimate import read_estimate
@@ -428,7 +428,7 @@ def test_a_tracker_that_breaks_down_keeps_what_it_had(
 
 
 def test_the_speed_benchmark_accounts_for_all_time(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    solve = rstrack.alignment.optimizer.solve
+    solve = rstrack.alignment.normal_equations.solve
     status, out, _ = run(capfd, "bench-speed seq --frames 12 --method rs-pg --method rs-g --json")
     report = json.loads(out)
     assert status == 0 and report["frames"] == [6, 12] and report["depth_size"] == [160, 120]
@@ -441,7 +441,7 @@ def test_the_speed_benchmark_accounts_for_all_time(place: Path, capfd: pytest.Ca
         assert needed <= set(parts) and all(parts[name] > 0 for name in needed)
         assert ("photometric kernel, level 0" in parts) == (method == "rs-pg")
         assert parts["other"] < 0.5 * times["mean_ms"] and times["read_ms"] > 0
-    assert rstrack.alignment.optimizer.solve is solve
+    assert rstrack.alignment.normal_equations.solve is solve
 
 
 def test_the_speed_table(place: Path, capfd: pytest.CaptureFixture[str]) -> None:

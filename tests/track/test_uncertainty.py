@@ -63,6 +63,20 @@ def test_a_motion_that_no_image_shows_is_known_ever_less_until_it_is_unknown() -
     assert len(sigmas) > 3 and (np.diff(sigmas) > 0).all() and np.sqrt(uncertainty.pose[1, 1]) < 2e-4
 
 
+def test_a_gyroscope_knows_turns_as_its_noise_adds_up_and_nothing_of_places() -> None:
+    """On imu_walls turns about the wall's normal were held to be unknown by degrees, and gravity's direction too."""
+    rate, told, steps = 4e-4, np.repeat([0.1, 2 * 4e-4 / DT], 3), 180
+    seen = np.diag([1e8, 1e8, 1e8, 1e10, 1e10, 1e10])
+    start = Uncertainty.of_first().after(DT, seen).after(DT, seen)
+    known = wandering = start
+    for _ in range(steps):
+        known = known.after(DT, np.zeros((6, 6)), told, rate)
+        wandering = wandering.after(DT, np.zeros((6, 6)), told)
+    turn, lost = (np.sqrt(u.pose[3, 3]) for u in (known, wandering))
+    assert turn == pytest.approx(rate * DT * steps**0.5, rel=0.4) and lost > 30.0 * turn
+    np.testing.assert_allclose(known.pose[:3, :3], wandering.pose[:3, :3], rtol=1e-9)
+
+
 def test_what_is_systematic_is_a_part_of_a_pixel() -> None:
     H = 1e20 * np.eye(6)
     sigma = np.sqrt(np.diag(Uncertainty().found_anew(H).covariance(500.0, 2.0)))

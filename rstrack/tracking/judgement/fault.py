@@ -39,6 +39,11 @@ class Fault(StrEnum):
         return Fault, (self.value,)
 
     @property
+    def is_elsewhere(self) -> bool:
+        """Whether the keyframe is not in view where the motion led."""
+        return self in (Fault.NOTHING_SEEN, Fault.LITTLE_DEPTH, Fault.LITTLE_COLOR)
+
+    @property
     def is_pull(self) -> bool:
         """Whether images were found where the motion led, but pull away from it."""
         return self in (Fault.DIVIDED, Fault.PULLED, Fault.DRAWS)

@@ -60,18 +60,19 @@ class Uncertainty:
         """Largest part, 0 to 1, that the motion before, not the images, has in what is known of any direction."""
         return float(np.clip(1.0 - np.linalg.eigvals(self.pose @ self.seen).real.min(), 0.0, 1.0))
 
-    def after(self, seconds: float, seen: FloatArray, accelerations: FloatArray = ACCELERATION) -> Uncertainty:
+    def after(
+        self, seconds: float, seen: FloatArray, accelerations: FloatArray = ACCELERATION, rate: float = np.inf
+    ) -> Uncertainty:
         """So many seconds later, with what the images then say (6, 6).
 
-        accelerations (6,): σ of what the velocity changes by beyond what is known, m/s² and rad/s².
+        accelerations (6,): σ of what the velocity changes by beyond what is known, m/s² and rad/s². rate: σ of the
+        angular rate itself, rad/s, where a gyroscope tells it: it does not wander, as what is told by its changes does.
         """
         F = np.eye(12)
         F[:6, 6:] = seconds * np.eye(6)
         gain = np.concatenate([0.5 * seconds**2 * np.eye(6), seconds * np.eye(6)])
         predicted = F @ self.state @ F.T + gain @ np.diag(accelerations**2) @ gain.T
-        # P − P E (H⁻¹ + Eᵀ P E)⁻¹ Eᵀ P without the inverse of H, which may be singular.
-        solved = np.linalg.solve(np.eye(6) + seen @ predicted[:6, :6], seen)
-        updated = predicted - predicted[:, :6] @ solved @ predicted[:6]
+        updated = _told(_told(predicted, slice(9, 12), np.eye(3) / rate**2), slice(0, 6), seen)
         return replace(self, state=0.5 * (updated + updated.T), seen=seen)
 
     @classmethod
@@ -93,6 +94,13 @@ class Uncertainty:
         """Covariance (6, 6) that a keyframe's own error gives the pose T_world_depth (4, 4)."""
         Ad = se3.adjoint(se3.inverse(T_world_depth))
         return np.asarray(Ad @ self.drift.get(index, np.zeros((6, 6))) @ Ad.T)
+
+
+def _told(P: FloatArray, part: slice, information: FloatArray) -> FloatArray:
+    """Covariance P (12, 12) with information (k, k) of a part of the state."""
+    # P − P E (H⁻¹ + Eᵀ P E)⁻¹ Eᵀ P without the inverse of H, which may be singular.
+    solved = np.linalg.solve(np.eye(len(information)) + information @ P[part, part], information)
+    return np.asarray(P - P[:, part] @ solved @ P[part])
 
 
 def _lost() -> FloatArray:

@@ -1,0 +1,110 @@
+"""How dense knots have to be for a motion, told by the band of an IMU's readings before anything is tracked.
+
+A uniform spline of degree n with knots Δt apart misses of a wave of f Hz, at best and in the mean over its phases, the
+part 1 − sinc²ⁿ⁺²(f Δt) / Σ_k sinc²ⁿ⁺²(f Δt + k) of its power (Blu and Unser, Quantitative Fourier Analysis of
+Approximation Techniques, IEEE Trans. Signal Processing 47(10), 1999). Poses are cubic, so rates are of degree 2 and
+accelerations of degree 1; what is missed of poses follows from the readings' spectrum, divided by (2πf)² and (2πf)⁴.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.signal import welch
+
+from rsgen.array_types import FloatArray
+from rstrack.data.imu.recording import ImuRecording
+from rstrack.inertial.wild import wild
+from rstrack.options import Options
+
+# Spacings to choose from, s.
+_SPACINGS_S = 0.1, 0.05, 1 / 30, 0.025, 1 / 60, 0.0125, 1 / 120, 0.00625, 0.005
+# Samples a knot, at least: with fewer the readings do not tell where control points are.
+_SAMPLES = 1.2
+# Root mean square by which lines of the depth image may be off their best spline, of what is 1 m away, px.
+_MOST_PX = 0.005
+# Seconds whose spectrum is taken at once.
+_STRETCH_S = 1.0
+# Of the sum over k: what is left out is less than 1e-6 for lines (degree 1), and far less for the others.
+_ALIASES = np.arange(-50, 51)
+
+
+def missed(x: FloatArray, degree: int) -> FloatArray:
+    """Part (n,) of the power of waves that a spline of a degree misses; x (n,): waves per knot."""
+    power = 2 * degree + 2
+    return np.asarray(1.0 - np.sinc(x) ** power / (np.sinc(x[:, None] + _ALIASES) ** power).sum(axis=1))
+
+
+@dataclass(frozen=True)
+class Band:
+    """hertz (n,) and, of all three axes together, what motion adds to the noise: rate (n,) (rad/s)²/Hz and force (n,)
+    (m/s²)²/Hz. Gravity that turns with the camera is in it, little where knots matter."""
+
+    hertz: FloatArray
+    rate: FloatArray
+    force: FloatArray
+
+    @classmethod
+    def of(cls, recording: ImuRecording) -> Band:
+        """Of a whole recording, in the mean over it; None of a gyroscope that is not there."""
+        t = np.arange(recording.t[0], recording.t[-1], 1.0 / recording.rate_hz)
+        noise = recording.noise
+        hertz, force = _spectrum(t, recording.t, recording.accel, noise.accel_density, recording.rate_hz)
+        rate = np.zeros_like(force)
+        if recording.gyro is not None:
+            _, rate = _spectrum(t, recording.t, recording.gyro, noise.gyro_density, recording.rate_hz)
+        return cls(
+            hertz,
+            np.maximum(0.0, rate - 6.0 * noise.gyro_density**2),
+            np.maximum(0.0, force - 6.0 * noise.accel_density**2),
+        )
+
+    def missed_motion(self, dt: float) -> tuple[float, float]:
+        """Root mean square of what the best spline with knots dt s apart is off: turn (rad) and place (m)."""
+        part, omega = missed(self.hertz * dt, 3), 2.0 * np.pi * self.hertz
+        return self._root(part * self.rate / omega**2), self._root(part * self.force / omega**4)
+
+    def scatter(self, dt: float) -> FloatArray:
+        """(2,): root mean square of an axis of the gyroscope (rad/s) and of the accelerometer (m/s²), without their
+        noise, about the best spline with knots dt s apart."""
+        axis = ((2, self.rate / 3.0), (1, self.force / 3.0))
+        return np.array([self._root(missed(self.hertz * dt, degree) * density) for degree, density in axis])
+
+    @property
+    def accelerations(self) -> FloatArray:
+        """(6,): root mean square of an axis, m/s² and rad/s², of all that is faster than 1 Hz."""
+        turning = self._root(self.rate * (2.0 * np.pi * self.hertz) ** 2 / 3.0)
+        return np.repeat([self._root(self.force / 3.0), turning], 3)
+
+    def knots_s(self, focal: float, rate_hz: float) -> float:
+        """The widest spacing (s) that misses less of the motion than lines of a camera with a focal length (px) tell,
+        and the densest that readings at rate_hz determine where none does."""
+        usable = [dt for dt in _SPACINGS_S if dt * rate_hz >= _SAMPLES] or [_SPACINGS_S[0]]
+        return next((dt for dt in usable if focal * np.hypot(*self.missed_motion(dt)) < _MOST_PX), usable[-1])
+
+    def _root(self, density: FloatArray) -> float:
+        return float(np.sqrt(density.sum() * (self.hertz[1] - self.hertz[0])))
+
+
+def with_knots(options: Options, recording: ImuRecording | None, focal: float) -> Options:
+    """Options with knots as dense as a unit's motion needs them for a camera with a focal length (px), where nothing
+    else is asked for; an accelerometer alone does not tell enough between images to have them otherwise."""
+    if options.knot_spacing_s is not None or not options.inertial or recording is None or recording.gyro is None:
+        return options
+    return replace(options, knot_spacing_s=Band.of(recording).knots_s(focal, recording.rate_hz))
+
+
+def _spectrum(
+    t: FloatArray, at: FloatArray, values: FloatArray, density: float, rate_hz: float
+) -> tuple[FloatArray, FloatArray]:
+    """Frequencies (n,) above 0 and the power (n,) a Hz of values (k, 3), read at times (k,), all axes together.
+
+    t: even times to take it at. density: of the noise.
+    """
+    told = (np.isfinite(values) & ~wild(values, density * np.sqrt(rate_hz))).all(axis=1)
+    even: FloatArray = np.stack([np.interp(t, at[told], axis[told]) for axis in values.T])
+    length = min(len(t), max(8, round(_STRETCH_S * rate_hz)))
+    # The stubs have 'literal' where SciPy has 'linear'.
+    hertz, power = welch(even, rate_hz, nperseg=length, detrend="linear")  # type: ignore[call-overload]
+    return np.asarray(hertz[1:]), np.asarray(power[:, 1:].sum(axis=0))
