@@ -62,7 +62,8 @@ def geometric_track(
 ) -> tuple[Spline | None, float, float]:
     """T_world_depth(t) of the frames from depth alone, and the longest time (begin, end) in s that it covers.
 
-    With colour where something moves by itself: depth alone hardly tells what rests.
+    From depth alone whatever it sees: a track that followed colours would agree with them at whatever time they are
+    taken to be.
     """
     from rstrack.tracking.first_look.rough_track import rough_track
 
@@ -70,8 +71,6 @@ def geometric_track(
         progress(stage, 0.7 * share, "tracking depth")
 
     tracker = rough_track(dataset, frames, Options(method="rs-g", backend=options.backend), done)
-    if any(report.moving for report in tracker.reports):
-        tracker = rough_track(dataset, frames, Options(backend=options.backend), done)
     if not tracker.spline_valid or tracker.spline is None:
         return None, 0.0, 0.0
     begin, end = max(tracker.spline_valid, key=lambda span: span[1] - span[0])
