@@ -98,7 +98,7 @@ def estimate_color_falloff(
 
 
 def _compared(dataset: Dataset, part: range, options: Options, progress: Progress) -> list[_Pair]:
-    spline, begin, end = geometric_track(dataset, part, options, progress, _STAGE)
+    spline, begin, end = geometric_track(dataset, part, options, progress, _STAGE, True)
     if spline is None:
         return []
     camera = dataset.rig.color_camera

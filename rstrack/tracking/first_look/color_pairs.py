@@ -58,12 +58,12 @@ def _shift(dataset: Dataset, frames: range) -> float:
 
 
 def geometric_track(
-    dataset: Dataset, frames: range, options: Options, progress: Progress, stage: str
+    dataset: Dataset, frames: range, options: Options, progress: Progress, stage: str, color_is_timed: bool = False
 ) -> tuple[Spline | None, float, float]:
     """T_world_depth(t) of the frames from depth alone, and the longest time (begin, end) in s that it covers.
 
-    From depth alone whatever it sees: a track that followed colours would agree with them at whatever time they are
-    taken to be.
+    color_is_timed: take colours too where something moves by itself, since depth alone hardly tells what rests. Not
+    where colour's clock is what is looked for: a track that follows colours agrees with them whatever it is.
     """
     from rstrack.tracking.first_look.rough_track import rough_track
 
@@ -71,6 +71,8 @@ def geometric_track(
         progress(stage, 0.7 * share, "tracking depth")
 
     tracker = rough_track(dataset, frames, Options(method="rs-g", backend=options.backend), done)
+    if color_is_timed and any(report.moving for report in tracker.reports):
+        tracker = rough_track(dataset, frames, Options(backend=options.backend), done)
     if not tracker.spline_valid or tracker.spline is None:
         return None, 0.0, 0.0
     begin, end = max(tracker.spline_valid, key=lambda span: span[1] - span[0])
