@@ -24,7 +24,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter, project_rolling
 from rsgen.geometry.spline import Spline
-from rstrack.alignment.free_space import FreeSpace, Seen
+from rstrack.alignment.free_space import FreeSpace, Seen, grid_of
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.images import line_poses as lines
@@ -58,7 +58,8 @@ def test_free_space_is_what_rays_say(ref_scan: Literal["top-bottom"] | None) -> 
     ref, depth = exact_reference(old.cast, truth, ref_at), depth_input(new.cast, truth, at)
     shutter = at.lens.shutter
     space = FreeSpace(DeviceRig(Rig(camera, shutter, camera, shutter, np.eye(4)), Options(backend="llvm")))
-    in_frame, intensity = space.keyframe_in_frame(ref, depth, None, np.zeros(2), truth)
+    intensity = space.intensity(ref, None, np.zeros(2), truth)
+    in_frame = space.keyframe_in_frame(ref, depth, intensity, truth)
     in_ref = space.frame_in_keyframe(depth, ref, intensity, truth)
     for seen, own, other, plane, sign in ((in_ref, at, ref_at, old, 1), (in_frame, ref_at, at, new, -1)):
         uv = camera.pixel_grid()
@@ -76,6 +77,34 @@ def test_free_space_is_what_rays_say(ref_scan: Literal["top-bottom"] | None) -> 
         assert (seen.free[good] < seen.apart[good]).all() and (seen.free[good] > seen.apart[good] - 0.15).all()
         assert not (np.isfinite(seen.free) & seen.outside).any() and (valid[~seen.outside]).mean() > 0.95
         assert np.isnan(seen.intensity).all()
+
+
+def test_only_every_stride_th_pixel_is_looked_at() -> None:
+    """And the closer look begins with what the first one gave."""
+    camera = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
+    truth, at = hand_held(1), exposure(STAMP, "top-bottom", camera)
+    plane = plane_before(truth.pose(REF_STAMP), (0.3, -0.2, 1.0))
+    ref = exact_reference(plane.cast, truth, exposure(REF_STAMP, None, camera))
+    depth = depth_input(Plane(plane.normal, plane.offset - 0.1).cast, truth, at)
+    space = FreeSpace(DeviceRig(Rig(camera, at.lens.shutter, camera, at.lens.shutter, np.eye(4)), Options("rs-g")))
+    assert grid_of(at.lens)[1] == 2
+    intensity = space.intensity(ref, None, np.zeros(2), truth)
+    for near, seen, rho in (
+        (
+            space.before_keyframe(depth, ref, truth),
+            space.frame_in_keyframe(depth, ref, intensity, truth),
+            depth.inverse_z,
+        ),
+        (
+            space.before_frame(ref, depth, truth),
+            space.keyframe_in_frame(ref, depth, intensity, truth),
+            ref.inverse_depth,
+        ),
+    ):
+        picked = space.device.e.download(rho, (240, 320))[::2, ::2]
+        np.testing.assert_array_equal(near.z, np.float32(1.0) / picked)
+        np.testing.assert_array_equal(seen.z, near.z)
+        np.testing.assert_array_equal(seen.free, near.free)
 
 
 # -- regions ----------------------------------------------------------------------------------------------------------

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -11,12 +13,12 @@ import numpy as np
 from rsgen.device.arrays import Engine
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.brightness import SAME
-from rstrack.alignment.free_space import FreeSpace, Seen, grid_of
+from rstrack.alignment.free_space import Free, FreeSpace, Seen, grid_of
 from rstrack.alignment.observation import START_DEPTH, Observation
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.pyramid import DepthImage
 from rstrack.keyframes.keyframe import Reference, strides
-from rstrack.tracking.moving.regions import Mask, moving, moving_with
+from rstrack.tracking.moving.regions import Mask, anything, moving, moving_with
 
 # Part of what is seen that may move: where more seems to, it is the pose that is wrong.
 _MOST = 0.5
@@ -63,20 +65,40 @@ def _found(
     sigma_depth = next((o.lin.next_sigma for o in own if o.is_depth), START_DEPTH)
     image, brightness = (color.image, color.brightness(state)) if color else (None, SAME)
     assert not isinstance(image, DepthImage)
-    e, scales = space.device.e, (sigma_depth, ref.median_depth, color.lin.next_sigma if color else np.inf)
-    seen, intensity = space.keyframe_in_frame(ref, depth.occluder, image, brightness, state.spline)
-    with space.device.timer("what moves: regions"):
-        gone = moving(seen, *scales)
-    if _share(gone, seen) > _MOST:
+    e, scales = space.device.e, (sigma_depth, ref.median_depth)
+    sigma_intensity = color.lin.next_sigma if color else np.inf
+
+    @cache
+    def differences() -> Any:
+        return space.intensity(ref, image, brightness, state.spline)
+
+    gone = _moving(space, space.before_frame(ref, depth.occluder, state.spline), scales, sigma_intensity,
+                   lambda: space.keyframe_in_frame(ref, depth.occluder, differences(), state.spline))  # fmt: skip
+    if gone is None:
         return nothing
     # What falls where something is gone may be that in another place.
     rest = without(e, ref, gone) if gone.any() else ref
-    seen = space.frame_in_keyframe(depth.occluder, rest, intensity, state.spline)
-    with space.device.timer("what moves: regions"):
-        came = moving(seen, *scales)
-    if _share(came, seen) > _MOST:
+    came = _moving(space, space.before_keyframe(depth.occluder, rest, state.spline), scales, sigma_intensity,
+                   lambda: space.frame_in_keyframe(depth.occluder, rest, differences(), state.spline))  # fmt: skip
+    if came is None:
         return nothing
     return LeftOut(_without(e, depth, came) if came.any() else depth, gone if gone.any() else None)
+
+
+def _moving(
+    space: FreeSpace, near: Free, scales: tuple[float, float], sigma_intensity: float, look: Callable[[], Seen]
+) -> Mask | None:
+    """Pixels of what moves, None where so much seems to that the pose is wrong. look: closer, where something may move.
+
+    scales (m): as `moving` takes them.
+    """
+    with space.device.timer("what moves: regions"):
+        if not anything(near, *scales):
+            return np.zeros(near.z.shape, bool)
+    seen = look()
+    with space.device.timer("what moves: regions"):
+        found = moving(seen, *scales, sigma_intensity)
+    return None if _share(found, seen) > _MOST else found
 
 
 def left_out_with(space: FreeSpace, depth: DepthImage, last: DepthImage, ref: Reference, spline: Spline) -> DepthImage:
@@ -95,7 +117,7 @@ def left_out_with(space: FreeSpace, depth: DepthImage, last: DepthImage, ref: Re
     return _without(e, depth, came) if came.any() and _share(came, seen) <= _MOST else depth
 
 
-def _share(mask: Mask, seen: Seen) -> float:
+def _share(mask: Mask, seen: Free) -> float:
     known = np.isfinite(seen.z)
     return np.count_nonzero(mask & known) / max(1, int(np.count_nonzero(known)))
 

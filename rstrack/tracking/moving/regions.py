@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rstrack.alignment.free_space import Grid, Seen
+from rstrack.alignment.free_space import Free, Grid, Seen
 from rstrack.images.sampling import EDGE
 
 Mask = npt.NDArray[np.bool_]
@@ -34,7 +34,7 @@ def moving(seen: Seen, sigma_depth: float, median_depth: float, sigma_intensity:
     scale, least = _scales(seen.z, sigma_depth, median_depth)
     far = np.nan_to_num(seen.free) > least
     seeds = _opened(far)
-    if np.count_nonzero(seeds) < _LEAST * seeds.size:
+    if not _is_enough(seeds):
         return np.zeros_like(seeds)
     # Behind what is seen there nothing is known.
     hidden = np.nan_to_num(seen.apart) < -least
@@ -42,6 +42,16 @@ def moving(seen: Seen, sigma_depth: float, median_depth: float, sigma_intensity:
     odd = far | _at_odds(depth, seen.intensity, sigma_intensity)
     grown = _grown(seeds, odd, hidden | ~np.isfinite(seen.apart), hidden | seen.outside, seen.z)
     return _widened(grown)
+
+
+def anything(near: Free, sigma_depth: float, median_depth: float) -> bool:
+    """Whether enough stands in free space for `moving` to find something."""
+    _, least = _scales(near.z, sigma_depth, median_depth)
+    return _is_enough(_opened(np.nan_to_num(near.free) > least))
+
+
+def _is_enough(seeds: Mask) -> bool:
+    return np.count_nonzero(seeds) >= _LEAST * seeds.size
 
 
 def moving_with(seen: Seen, left_out: Mask, sigma_depth: float, median_depth: float) -> Mask:
