@@ -213,6 +213,15 @@ class FreeSpace:
             given = self._of_frame(depth, ref, spline)
             return self._seen(depth.exposure.lens, ref.lens, True, given, intensity, True)
 
+    def frame_in_frame(self, depth: DepthImage, other: DepthImage, values: Grid, spline: Spline) -> Seen:
+        """A depth image seen from another one, whose values (gh, gw) it is handed as intensities."""
+        e, T_world_base = self.device.e, spline.pose(other.exposure.mid_time)
+        with self.device.timer("what moves: compare"):
+            to_base = e.upload(to_base_table(spline, T_world_base, depth.exposure))
+            from_base = e.upload(from_base_table(spline, T_world_base, other.exposure))
+            given = SpaceInput(depth.inverse_z, *self.device.device_rays, to_base, other.inverse_z, from_base)
+            return self._seen(depth.exposure.lens, other.exposure.lens, True, given, e.upload(values), True)
+
     def intensity(self, ref: Reference, color: ColorImage | None, brightness: FloatArray, spline: Spline) -> Any:
         """A colour image's intensities less those expected at the keyframe's grid, on the device; without one unknown.
 

@@ -34,8 +34,8 @@ from rstrack.keyframes.rectification import ColorInput, FusionInput, color_kerne
 _AGREE = 0.03
 # Weight of a fused pixel in measurements; more would let a keyframe's first errors live for ever.
 _MOST = 30.0
-# Part of the width about what moves within which colours may be its own.
-_MARGIN = 0.0125
+MARGIN = 0.0125
+"""Part of the width about what moves within which colours may be its own."""
 
 
 @dataclass
@@ -119,7 +119,7 @@ class KeyframeMaker:
         camera = depth.exposure.lens.camera
         shape = camera.height, camera.width
         rest, all_ = (self.e.download(self.rectify(image, spline)[2], shape) > 0 for image in (depth, whole))
-        margin = 2 * round(_MARGIN * camera.width) + 1
+        margin = 2 * round(MARGIN * camera.width) + 1
         return np.asarray(cv2.dilate((all_ & ~rest).astype(np.uint8), np.ones((margin, margin), np.uint8)) > 0)
 
     def with_depth(

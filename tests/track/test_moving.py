@@ -28,8 +28,10 @@ from rstrack.alignment.free_space import FreeSpace, Seen, grid_of
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.images import line_poses as lines
-from rstrack.images.device_frame import DeviceRig, untimed
+from rstrack.images.device_frame import DeviceFrame, DeviceRig, untimed
+from rstrack.images.pyramid import DepthImage
 from rstrack.options import Options
+from rstrack.tracking.moving.leave_out import without, without_pixels
 from rstrack.tracking.moving.majority import not_with_most
 from rstrack.tracking.moving.regions import Mask, moving, moving_with
 from rstrack.tracking.track import Track
@@ -199,7 +201,9 @@ def center(t: FloatArray) -> FloatArray:
     return np.stack([0.25 * np.sin(2.4 * t), -0.05 + 0.1 * np.cos(2.0 * t), 0.95 + 0.0 * t], axis=-1)
 
 
-def picture(spline: Spline, stamp: float, T_cam_body: FloatArray) -> tuple[FloatArray, FloatArray, Mask]:
+def picture(
+    spline: Spline, stamp: float, T_cam_body: FloatArray, radius: float = RADIUS
+) -> tuple[FloatArray, FloatArray, Mask]:
     """z (h, w), colours (h, w, 3) in 0..255 and where the ball is: a room with furniture, and a ball that passes."""
     uv = CAMERA.pixel_grid()
     t = SHUTTER.line_mid_time(stamp, SHUTTER.line_of_pixel(uv, CAMERA), CAMERA)
@@ -208,7 +212,7 @@ def picture(spline: Spline, stamp: float, T_cam_body: FloatArray) -> tuple[Float
     room = synthetic.cast(p, d)
     to_ball = center(t) - p
     a, b = (d**2).sum(-1), (d * to_ball).sum(-1)
-    under = b**2 - a * ((to_ball**2).sum(-1) - RADIUS**2)
+    under = b**2 - a * ((to_ball**2).sum(-1) - radius**2)
     ball = (b - np.sqrt(np.maximum(under, 0.0))) / a
     is_ball = (under > 0.0) & (ball > 0.0) & (ball < room)
     z = np.where(is_ball, ball, room)
@@ -259,12 +263,13 @@ def test_a_ball_that_passes_is_left_out_of_frame_and_keyframe(recording: Recordi
         assert left.depth.moving == pytest.approx(mask.mean(), abs=1e-6)
         assert left.depth.occluder is frames[k].depth
         depth, color = fresh
-        assert depth.image is left.depth and color.occluder is frames[k].depth
+        assert depth.image is left.depth and color.occluder is left.depth.hider
         kept = e.download(color.ref.inverse_depth, SIZE) > 0.0
         first = recording.balls[0]
         assert kept[_inner(first)].mean() < (0.3 if k == 2 else 0.1) and kept[~first].mean() > 0.85
         assert color.ref is depth.ref and (e.download(ref.inverse_depth, SIZE) > 0.0)[first].mean() > 0.8
-        assert [o.occluder for o in track.observe(replace(frames[k], depth=left.depth), ref)] == [None, frames[k].depth]
+        again = track.observe(replace(frames[k], depth=left.depth), ref)
+        assert [o.occluder for o in again] == [None, left.depth.hider]
         for o in fresh:
             o.linearise(track.terms, state, 0)
             assert o.lin.fit > 0.95
@@ -274,6 +279,49 @@ def test_a_ball_that_passes_is_left_out_of_frame_and_keyframe(recording: Recordi
         assert min(o.lin.fit for o in again) < 0.85
     made = track.maker.rectified(5, left.depth, frames[5].colors, recording.truth, ref)
     assert made.intensity is not None and np.isnan(made.intensity[_inner(recording.balls[5])]).all()
+
+
+def test_what_moves_hides_a_little_more_of_colours_than_of_depth(recording: Recording) -> None:
+    """By the time of the colour image it has moved: no point is compared with its own edge."""
+    track = Track(recording.rig, Options(backend="llvm"), untimed)
+    e, state = track.device.e, SplineState(recording.truth)
+    frames = [track.device.upload(k, frame) for k, frame in enumerate(recording.frames)]
+    ref = track.maker.rectified(0, frames[0].depth, frames[0].colors, recording.truth, None)
+    fresh = track.observe(frames[2], ref)
+    for o in fresh:
+        o.linearise(track.terms, state, 1)
+    (left,) = track.leave_out([frames[2]], ref, fresh, state)
+    exact, wide = (e.download(image.z, SIZE) for image in (left.depth.occluder, left.depth.hider))
+    assert (wide <= exact + 1e-6).all()
+    nearer = wide < exact - 0.05
+    about = cv2.dilate(recording.balls[2].astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    ring = about & (cv2.dilate(recording.balls[2].astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
+    assert nearer[~about].mean() < 0.01 and nearer[ring].mean() > 0.3
+    assert frames[2].depth.hider is frames[2].depth  # nothing left out: nothing made wider
+
+
+def test_what_stands_where_it_was_left_out_is_left_out_again(recording: Recording) -> None:
+    """In a hole of the keyframe nothing tells it from what rests, but by where it was in the frame before."""
+    track = Track(recording.rig, Options(backend="llvm"), untimed)
+    e, state = track.device.e, SplineState(recording.truth)
+    frames = [track.device.upload(k, frame) for k, frame in enumerate(recording.frames)]
+    ref = track.maker.rectified(0, frames[0].depth, frames[0].colors, recording.truth, None)
+    hole = np.zeros(SIZE, bool)
+    hole[:, 20:] = True
+    ref = without(e, ref, hole)
+    ball = recording.balls[2]
+
+    def mask(frame: DeviceFrame, before: DepthImage | None) -> Mask:
+        fresh = track.observe(frame, ref)
+        for o in fresh:
+            o.linearise(track.terms, state, 1)
+        (left,) = track.leave_out([frame], ref, fresh, state, before)
+        return np.asarray(e.download(left.depth.z, SIZE) == 0.0)
+
+    assert mask(frames[2], None)[ball].mean() < 0.05
+    before = without_pixels(e, frames[1].depth, recording.balls[1])
+    found = mask(frames[2], before)
+    assert found[ball].mean() > 0.6 and ball[found].mean() > 0.8
 
 
 def test_what_is_told_not_to_look_does_not(recording: Recording) -> None:
@@ -320,3 +368,20 @@ def test_the_majority_is_what_rests(recording: Recording) -> None:
     ball = recording.balls[0]
     assert odd[ball].mean() > 0.3 and odd[~ball].mean() < 0.15
     assert not_with_most(device.e, frames[:1], device.rays) is None
+
+
+def test_the_majority_is_told_by_depth_where_there_are_no_colours(recording: Recording) -> None:
+    """A smaller ball: the large one and one wall are more than the rest, for who sees no colours."""
+    rng, frames = np.random.default_rng(3), []
+    for k in range(4):
+        z, _, ball = picture(recording.truth, k / 30, np.eye(4), radius=0.2)
+        frames.append(Frame(Image(k / 30, (z + rng.normal(0.0, 2e-3, z.shape)).astype(np.float32)), ()))
+        if k == 0:
+            first = ball
+    device = DeviceRig(recording.rig, Options(method="rs-g", backend="llvm"))
+    uploaded = [device.upload(k, frame) for k, frame in enumerate(frames)]
+    odd = not_with_most(device.e, uploaded, device.rays)
+    assert odd is not None
+    assert odd[first].mean() > 0.5 and odd[~first].mean() < 0.1
+    resting = [replace(frame, depth=uploaded[0].depth) for frame in uploaded]
+    assert not np.asarray(not_with_most(device.e, resting, device.rays)).any()

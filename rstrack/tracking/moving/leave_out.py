@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
+import cv2
 import drjit as dr
 import numpy as np
 
@@ -18,7 +19,8 @@ from rstrack.alignment.observation import START_DEPTH, Observation
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.pyramid import DepthImage
 from rstrack.keyframes.keyframe import Reference, strides
-from rstrack.tracking.moving.regions import Mask, anything, moving, moving_with
+from rstrack.keyframes.maker import MARGIN
+from rstrack.tracking.moving.regions import Mask, anything, full_size, moving, moving_with, untold
 
 # Part of what is seen that may move: where more seems to, it is the pose that is wrong.
 _MOST = 0.5
@@ -32,32 +34,41 @@ class LeftOut:
     depth: DepthImage
     gone: Mask | None = None
 
+    @property
+    def moves(self) -> bool:
+        """Whether anything does."""
+        return self.depth.whole is not None or self.gone is not None
+
 
 def leave_out(
     space: FreeSpace, depths: Sequence[DepthImage], ref: Reference, fresh: Sequence[Sequence[Observation]],
-    state: SplineState,
+    state: SplineState, before: DepthImage | None = None,
 ) -> list[LeftOut]:  # fmt: skip
     """Let frames' observations count without what moves, as seen from where they have been aligned to so far.
 
     depths: the frames' images; what has been left out of them already stays so. fresh: of each frame its observations;
-    those of `ref` do without what any of the frames finds gone from it, too.
+    those of `ref` do without what any of the frames finds gone from it, too. before: of the frame before them, if it is
+    known what moves there.
     """
     of_ref = [[o for o in own if o.ref.index == ref.index] for own in fresh]
-    left = [_found(space, depth, ref, own, state) for depth, own in zip(depths, of_ref, strict=True)]
+    left = [_found(space, depth, ref, own, state, before) for depth, own in zip(depths, of_ref, strict=True)]
     gone = [one.gone for one in left if one.gone is not None]
     cleaned = without(space.device.e, ref, np.any(gone, axis=0)) if gone else ref
     for one, own in zip(left, fresh, strict=True):
         for o in own:
             if isinstance(o.image, DepthImage):
                 o.image = one.depth
+            elif one.depth.whole is not None:
+                o.hidden_by(one.depth.hider)
             if o.ref.index == ref.index and o.ref is not cleaned:
                 o.see(cleaned)
     return left
 
 
 def _found(
-    space: FreeSpace, depth: DepthImage, ref: Reference, own: Sequence[Observation], state: SplineState
-) -> LeftOut:
+    space: FreeSpace, depth: DepthImage, ref: Reference, own: Sequence[Observation], state: SplineState,
+    before: DepthImage | None,
+) -> LeftOut:  # fmt: skip
     nothing = LeftOut(depth)
     if not own or not all(o.is_linearised for o in own):
         return nothing
@@ -78,11 +89,16 @@ def _found(
         return nothing
     # What falls where something is gone may be that in another place.
     rest = without(e, ref, gone) if gone.any() else ref
-    came = _moving(space, space.before_keyframe(depth.occluder, rest, state.spline), scales, sigma_intensity,
-                   lambda: space.frame_in_keyframe(depth.occluder, rest, differences(), state.spline))  # fmt: skip
+
+    def look() -> Seen:
+        return space.frame_in_keyframe(depth.occluder, rest, differences(), state.spline)
+
+    came = _moving(space, space.before_keyframe(depth.occluder, rest, state.spline), scales, sigma_intensity, look)
+    if came is not None and before is not None and before.whole is not None:
+        came = came | (untold(look(), *scales) & _as_before(space, depth, before, state.spline, scales))
     if came is None:
         return nothing
-    return LeftOut(_without(e, depth, came) if came.any() else depth, gone if gone.any() else None)
+    return LeftOut(without_pixels(e, depth, came) if came.any() else depth, gone if gone.any() else None)
 
 
 def _moving(
@@ -101,20 +117,29 @@ def _moving(
     return None if _share(found, seen) > _MOST else found
 
 
-def left_out_with(space: FreeSpace, depth: DepthImage, last: DepthImage, ref: Reference, spline: Spline) -> DepthImage:
+def _as_before(
+    space: FreeSpace, depth: DepthImage, other: DepthImage, spline: Spline, scales: tuple[float, float]
+) -> Mask:
+    """Pixels (gh, gw) of a frame that show, at about the same place, what has been left out of another one."""
+    e, camera, stride = space.device.e, other.exposure.lens.camera, grid_of(other.exposure.lens)[1]
+    full = camera.height, camera.width
+    odd = (e.download(other.occluder.z, full) > 0) & ~(e.download(other.z, full) > 0)
+    seen = space.frame_in_frame(depth.occluder, other.occluder, odd[::stride, ::stride].astype(np.float32), spline)
+    with space.device.timer("what moves: regions"):
+        return moving_with(seen, np.nan_to_num(seen.intensity) > 0.5, *scales)
+
+
+def left_out_with(
+    space: FreeSpace, depth: DepthImage, other: DepthImage, median_depth: float, spline: Spline
+) -> DepthImage:
     """A frame's depth image without what another frame does without and shows at about the same place.
 
-    ref: of the other frame's whole depth image, of which `last` is what has been left.
+    median_depth (m): of what they show.
     """
-    if last.whole is None:
+    if other.whole is None:
         return depth
-    e, camera = space.device.e, last.exposure.lens.camera
-    full, stride = (camera.height, camera.width), grid_of(last.exposure.lens)[1]
-    rest = e.download(last.z, full) > 0
-    odd = (e.download(last.whole.z, full) > 0) & ~rest
-    seen = space.frame_in_keyframe(depth.occluder, ref, e.upload(odd[::stride, ::stride]), spline)
-    came = moving_with(seen, np.nan_to_num(seen.intensity) > 0.5, START_DEPTH, ref.median_depth)
-    return _without(e, depth, came) if came.any() and _share(came, seen) <= _MOST else depth
+    came = _as_before(space, depth, other, spline, (START_DEPTH, median_depth))
+    return without_pixels(space.device.e, depth, came) if came.any() and came.mean() <= _MOST else depth
 
 
 def _share(mask: Mask, seen: Free) -> float:
@@ -122,27 +147,32 @@ def _share(mask: Mask, seen: Free) -> float:
     return np.count_nonzero(mask & known) / max(1, int(np.count_nonzero(known)))
 
 
-def _without(e: Engine, depth: DepthImage, came: Mask) -> DepthImage:
-    camera = depth.exposure.lens.camera
-    keep = e.upload(~_full(came, grid_of(depth.exposure.lens)[1], camera.height, camera.width))
+def without_pixels(e: Engine, depth: DepthImage, came: Mask) -> DepthImage:
+    """A depth image without pixels (gh, gw) of its grid; as it was before it hides what it did, and some more."""
+    camera, whole = depth.exposure.lens.camera, depth.occluder
+    shape = camera.height, camera.width
+    keep = e.upload(~full_size(came, grid_of(depth.exposure.lens)[1], *shape))
     z, inverse_z = depth.z * keep, depth.inverse_z * keep
     dr.eval(z, inverse_z)
-    count = int(np.count_nonzero(e.download(z, (camera.height, camera.width))))
-    return replace(depth, z=z, inverse_z=inverse_z, count=count, whole=depth.occluder)
+    rest, all_ = e.download(inverse_z, shape), e.download(whole.inverse_z, shape)
+    screen = replace(whole, z=e.upload(_widened_z(np.where(rest > 0, 0.0, all_), all_)))
+    return replace(depth, z=z, inverse_z=inverse_z, count=int(np.count_nonzero(rest)), whole=whole, screen=screen)
+
+
+def _widened_z(moving: Mask, whole: Mask) -> Mask:
+    """z (h, w), m, of what hides points: 1/z of what moves (h, w), and as far beside it as colours may show it."""
+    margin = 2 * round(MARGIN * whole.shape[1]) + 1
+    rho = np.maximum(whole, cv2.dilate(np.asarray(moving, np.float32), np.ones((margin, margin), np.uint8)))
+    return np.divide(np.float32(1.0), rho, out=np.zeros_like(rho), where=rho > 0)
 
 
 def without(e: Engine, ref: Reference, gone: Mask) -> Reference:
     """A keyframe without pixels (gh, gw) of its grid."""
     camera = ref.lens.camera
-    keep = ~_full(gone, grid_of(ref.lens)[1], camera.height, camera.width)
+    keep = ~full_size(gone, grid_of(ref.lens)[1], camera.height, camera.width)
     inverse_depth = ref.inverse_depth * e.upload(keep)
     points = []
     for known, stride in zip(ref.points, strides(camera.width, camera.height), strict=bool(ref.points)):
         points.append(replace(known, z=known.z * e.upload(keep[::stride, ::stride])))
     dr.eval(inverse_depth, [p.z for p in points])
     return replace(ref, inverse_depth=inverse_depth, points=tuple(points))
-
-
-def _full(mask: Mask, stride: int, height: int, width: int) -> Mask:
-    """A mask of every stride-th pixel for all of them (height, width)."""
-    return mask.repeat(stride, axis=0).repeat(stride, axis=1)[:height, :width]

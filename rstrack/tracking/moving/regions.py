@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -51,7 +53,14 @@ def anything(near: Free, sigma_depth: float, median_depth: float) -> bool:
 
 
 def _is_enough(seeds: Mask) -> bool:
-    return np.count_nonzero(seeds) >= _LEAST * seeds.size
+    return bool(np.count_nonzero(seeds) >= _LEAST * seeds.size)
+
+
+def untold(seen: Seen, sigma_depth: float, median_depth: float) -> Mask:
+    """Pixels (gh, gw) of which the other image says nothing: they fall into its holes, beyond it, or behind what it
+    shows."""
+    _, least = _scales(seen.z, sigma_depth, median_depth)
+    return np.asarray(np.isfinite(seen.z) & ~(seen.apart >= -least))
 
 
 def moving_with(seen: Seen, left_out: Mask, sigma_depth: float, median_depth: float) -> Mask:
@@ -65,6 +74,11 @@ def moving_with(seen: Seen, left_out: Mask, sigma_depth: float, median_depth: fl
     nowhere = np.zeros_like(seeds)
     grown = _grown(seeds, (left_out & (apart > -least)) | (np.nan_to_num(seen.free) > least), nowhere, nowhere, seen.z)
     return _widened(grown) if seeds.any() else nowhere
+
+
+def full_size(values: npt.NDArray[Any], stride: int, height: int, width: int) -> npt.NDArray[Any]:
+    """Values of every stride-th pixel for all of them (height, width)."""
+    return values.repeat(stride, axis=0).repeat(stride, axis=1)[:height, :width]
 
 
 def _scales(z: Grid, sigma_depth: float, median_depth: float) -> tuple[Grid, Grid]:
