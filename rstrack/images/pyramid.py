@@ -32,7 +32,7 @@ class DepthImage:
     count: pixels that have depth. thumbnail (15, 20): of 1/z, 0 missing.
     resolution: the camera's step (1/m, see `depth_resolution`), 0 where it shows none.
     whole: the image before what moves by itself was left out of it; None where nothing was. screen: that one with what
-    moves made wider.
+    moves made wider. left_out (gh, gw): every so-manyth pixel and row (left_out_stride) that was, None likewise.
     """
 
     exposure: Exposure
@@ -43,6 +43,8 @@ class DepthImage:
     resolution: float = 0.0
     whole: DepthImage | None = None
     screen: DepthImage | None = None
+    left_out: npt.NDArray[np.bool_] | None = None
+    left_out_stride: int = 1
 
     @property
     def occluder(self) -> DepthImage:

@@ -173,6 +173,8 @@ def _leave(track: Track, window: Window) -> None:
         cleaned = {frame.index: replace(frame, depth=one.depth) for frame, one in zip(rest, left, strict=True)}
         track.succession.recent = deque(cleaned.get(frame.index, frame) for frame in frames)
     window.keep(others)
+    for frame in track.succession.recent:
+        track.remember(frame)
     for frame in frames:
         seen = [o for o in others if o.frame == frame.index]
         own = pulls(seen, window.state)

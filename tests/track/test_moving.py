@@ -29,11 +29,12 @@ from rstrack.alignment.spline_state import SplineState
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.images import line_poses as lines
 from rstrack.images.device_frame import DeviceFrame, DeviceRig, untimed
+from rstrack.images.left_out import Mask, without_pixels
 from rstrack.images.pyramid import DepthImage
 from rstrack.options import Options
-from rstrack.tracking.moving.leave_out import without, without_pixels
+from rstrack.tracking.moving.leave_out import without
 from rstrack.tracking.moving.majority import not_with_most
-from rstrack.tracking.moving.regions import Mask, moving, moving_with
+from rstrack.tracking.moving.regions import moving, moving_with
 from rstrack.tracking.track import Track
 
 REF_STAMP, STAMP = 0.43, 0.465
@@ -319,7 +320,7 @@ def test_what_stands_where_it_was_left_out_is_left_out_again(recording: Recordin
         return np.asarray(e.download(left.depth.z, SIZE) == 0.0)
 
     assert mask(frames[2], None)[ball].mean() < 0.05
-    before = without_pixels(e, frames[1].depth, recording.balls[1])
+    before = without_pixels(e, frames[1].depth, recording.balls[1], 1)
     found = mask(frames[2], before)
     assert found[ball].mean() > 0.6 and ball[found].mean() > 0.8
 

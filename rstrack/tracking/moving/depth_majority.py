@@ -10,9 +10,9 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
+from rstrack.images.left_out import Mask
 from rstrack.images.sampling import EDGE
 from rstrack.keyframes.keyframe import Image, surface_slopes
-from rstrack.tracking.moving.regions import Mask
 
 # Pixels over which inverse depth is averaged.
 _AVERAGED = 5

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
-import cv2
 import drjit as dr
 import numpy as np
 
@@ -17,10 +16,10 @@ from rstrack.alignment.brightness import SAME
 from rstrack.alignment.free_space import Free, FreeSpace, Seen, grid_of
 from rstrack.alignment.observation import START_DEPTH, Observation
 from rstrack.alignment.spline_state import SplineState
+from rstrack.images.left_out import full_size, without_pixels
 from rstrack.images.pyramid import DepthImage
 from rstrack.keyframes.keyframe import Reference, strides
-from rstrack.keyframes.maker import MARGIN
-from rstrack.tracking.moving.regions import Mask, anything, full_size, moving, moving_with, untold
+from rstrack.tracking.moving.regions import Mask, anything, moving, moving_with, untold
 
 # Part of what is seen that may move: where more seems to, it is the pose that is wrong.
 _MOST = 0.5
@@ -98,7 +97,10 @@ def _found(
         came = came | (untold(look(), *scales) & _as_before(space, depth, before, state.spline, scales))
     if came is None:
         return nothing
-    return LeftOut(without_pixels(e, depth, came) if came.any() else depth, gone if gone.any() else None)
+    return LeftOut(
+        without_pixels(e, depth, came, grid_of(depth.exposure.lens)[1]) if came.any() else depth,
+        gone if gone.any() else None,
+    )
 
 
 def _moving(
@@ -121,10 +123,8 @@ def _as_before(
     space: FreeSpace, depth: DepthImage, other: DepthImage, spline: Spline, scales: tuple[float, float]
 ) -> Mask:
     """Pixels (gh, gw) of a frame that show, at about the same place, what has been left out of another one."""
-    e, camera, stride = space.device.e, other.exposure.lens.camera, grid_of(other.exposure.lens)[1]
-    full = camera.height, camera.width
-    odd = (e.download(other.occluder.z, full) > 0) & ~(e.download(other.z, full) > 0)
-    seen = space.frame_in_frame(depth.occluder, other.occluder, odd[::stride, ::stride].astype(np.float32), spline)
+    assert other.left_out is not None
+    seen = space.frame_in_frame(depth.occluder, other.occluder, other.left_out.astype(np.float32), spline)
     with space.device.timer("what moves: regions"):
         return moving_with(seen, np.nan_to_num(seen.intensity) > 0.5, *scales)
 
@@ -139,31 +139,16 @@ def left_out_with(
     if other.whole is None:
         return depth
     came = _as_before(space, depth, other, spline, (START_DEPTH, median_depth))
-    return without_pixels(space.device.e, depth, came) if came.any() and came.mean() <= _MOST else depth
+    return (
+        without_pixels(space.device.e, depth, came, other.left_out_stride)
+        if came.any() and came.mean() <= _MOST
+        else depth
+    )
 
 
 def _share(mask: Mask, seen: Free) -> float:
     known = np.isfinite(seen.z)
     return np.count_nonzero(mask & known) / max(1, int(np.count_nonzero(known)))
-
-
-def without_pixels(e: Engine, depth: DepthImage, came: Mask) -> DepthImage:
-    """A depth image without pixels (gh, gw) of its grid; as it was before it hides what it did, and some more."""
-    camera, whole = depth.exposure.lens.camera, depth.occluder
-    shape = camera.height, camera.width
-    keep = e.upload(~full_size(came, grid_of(depth.exposure.lens)[1], *shape))
-    z, inverse_z = depth.z * keep, depth.inverse_z * keep
-    dr.eval(z, inverse_z)
-    rest, all_ = e.download(inverse_z, shape), e.download(whole.inverse_z, shape)
-    screen = replace(whole, z=e.upload(_widened_z(np.where(rest > 0, 0.0, all_), all_)))
-    return replace(depth, z=z, inverse_z=inverse_z, count=int(np.count_nonzero(rest)), whole=whole, screen=screen)
-
-
-def _widened_z(moving: Mask, whole: Mask) -> Mask:
-    """z (h, w), m, of what hides points: 1/z of what moves (h, w), and as far beside it as colours may show it."""
-    margin = 2 * round(MARGIN * whole.shape[1]) + 1
-    rho = np.maximum(whole, cv2.dilate(np.asarray(moving, np.float32), np.ones((margin, margin), np.uint8)))
-    return np.divide(np.float32(1.0), rho, out=np.zeros_like(rho), where=rho > 0)
 
 
 def without(e: Engine, ref: Reference, gone: Mask) -> Reference:

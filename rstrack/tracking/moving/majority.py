@@ -20,10 +20,10 @@ from rsgen.device.arrays import Engine
 from rsgen.geometry import se3
 from rstrack.alignment.free_space import grid_shape
 from rstrack.images.device_frame import DeviceFrame
+from rstrack.images.left_out import Mask
 from rstrack.images.pyramid import ColorImage
 from rstrack.keyframes.keyframe import Image, on_one_surface
 from rstrack.tracking.moving.depth_majority import apart, averaged, goes_elsewhere
-from rstrack.tracking.moving.regions import Mask
 
 # Points across the image, the window in which each is followed (px), and how far (px) following it back may miss it.
 _ACROSS, _WINDOW, _BACK_PX = 40, 15, 1.0

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from rstrack.alignment.free_space import Free, Grid, Seen
+from rstrack.images.left_out import Mask
 from rstrack.images.sampling import EDGE
-
-Mask = npt.NDArray[np.bool_]
 
 # How far before what was seen (m, part of the depth, σ of depth there) a pixel has to stand to be in free space.
 _BEFORE_M, _BEFORE_SIGMAS = 0.02, 5.0
@@ -74,11 +70,6 @@ def moving_with(seen: Seen, left_out: Mask, sigma_depth: float, median_depth: fl
     nowhere = np.zeros_like(seeds)
     grown = _grown(seeds, (left_out & (apart > -least)) | (np.nan_to_num(seen.free) > least), nowhere, nowhere, seen.z)
     return _widened(grown) if seeds.any() else nowhere
-
-
-def full_size(values: npt.NDArray[Any], stride: int, height: int, width: int) -> npt.NDArray[Any]:
-    """Values of every stride-th pixel for all of them (height, width)."""
-    return values.repeat(stride, axis=0).repeat(stride, axis=1)[:height, :width]
 
 
 def _scales(z: Grid, sigma_depth: float, median_depth: float) -> tuple[Grid, Grid]:
