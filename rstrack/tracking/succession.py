@@ -14,7 +14,6 @@ from rsgen.geometry.spline import Spline
 from rstrack.alignment.observation import Observation
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.images.left_out import Mask
-from rstrack.images.pyramid import DepthImage
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.keyframes.store import KeyframeStore
@@ -51,11 +50,6 @@ class Succession:
         self._pixels, self._colorless = 0, 0
         # How often pixels of the reference's grid have been seen through.
         self._gone: npt.NDArray[np.uint8] | None = None
-
-    @property
-    def last(self) -> DepthImage | None:
-        """Depth of the frame before the next one, if there is one."""
-        return self.recent[-1].depth if self.recent else None
 
     def is_unfit(self, frame: DeviceFrame) -> bool:
         """Whether a frame shows too little to align others to it."""

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 import synthetic
+from moving_ball import RIG, SIZE, T_COLOR_DEPTH, picture
 from rstrack_util import (
-    FloatArray,
     Plane,
     depth_input,
     exact_reference,
@@ -22,17 +22,15 @@ from rstrack_util import (
 
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
-from rsgen.geometry.shutter import Shutter, project_rolling
+from rsgen.geometry.shutter import project_rolling
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.free_space import FreeSpace, Seen, grid_of
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.images import line_poses as lines
-from rstrack.images.device_frame import DeviceFrame, DeviceRig, untimed
-from rstrack.images.left_out import Mask, without_pixels
-from rstrack.images.pyramid import DepthImage
+from rstrack.images.device_frame import DeviceRig, untimed
+from rstrack.images.left_out import Mask
 from rstrack.options import Options
-from rstrack.tracking.moving.leave_out import without
 from rstrack.tracking.moving.majority import not_with_most
 from rstrack.tracking.moving.regions import moving, moving_with
 from rstrack.tracking.track import Track
@@ -187,40 +185,6 @@ def test_what_another_frame_does_without_is_found_by_its_place() -> None:
 
 # -- the track --------------------------------------------------------------------------------------------------------
 
-SIZE = 96, 128
-CAMERA = Camera(128, 96, 100.0, 100.0, 63.5, 47.5)
-SHUTTER = Shutter(readout_s=0.028)
-T_COLOR_DEPTH = se3.exp(np.array([-0.03, 0.0, 0.0, 0.0, 0.0, 0.0]))
-RADIUS = 0.33
-# Of a texture that does not repeat itself, rad/m.
-WAVES = np.random.default_rng(5).normal(0.0, 10.0, (3, 10))
-
-
-def center(t: FloatArray) -> FloatArray:
-    """Of a ball (..., 3) in the world: to and fro before the camera, at up to 0.6 m/s."""
-    t = np.asarray(t)
-    return np.stack([0.25 * np.sin(2.4 * t), -0.05 + 0.1 * np.cos(2.0 * t), 0.95 + 0.0 * t], axis=-1)
-
-
-def picture(
-    spline: Spline, stamp: float, T_cam_body: FloatArray, radius: float = RADIUS
-) -> tuple[FloatArray, FloatArray, Mask]:
-    """z (h, w), colours (h, w, 3) in 0..255 and where the ball is: a room with furniture, and a ball that passes."""
-    uv = CAMERA.pixel_grid()
-    t = SHUTTER.line_mid_time(stamp, SHUTTER.line_of_pixel(uv, CAMERA), CAMERA)
-    T = spline.pose(t) @ se3.inverse(T_cam_body)
-    p, d = T[..., :3, 3], np.einsum("...ij,...j->...i", T[..., :3, :3], CAMERA.unproject(uv))
-    room = synthetic.cast(p, d)
-    to_ball = center(t) - p
-    a, b = (d**2).sum(-1), (d * to_ball).sum(-1)
-    under = b**2 - a * ((to_ball**2).sum(-1) - radius**2)
-    ball = (b - np.sqrt(np.maximum(under, 0.0))) / a
-    is_ball = (under > 0.0) & (ball > 0.0) & (ball < room)
-    z = np.where(is_ball, ball, room)
-    hit = p + d * z[..., None] - np.where(is_ball[..., None], center(t), 0.0)
-    waves = np.sin(np.where(is_ball[..., None], 1.5, 1.0) * (hit @ WAVES) + np.arange(WAVES.shape[1])).sum(axis=-1)
-    return z, np.repeat(127.5 + 30.0 * waves[..., None], 3, axis=-1), is_ball
-
 
 @dataclass(frozen=True)
 class Recording:
@@ -245,7 +209,7 @@ def recording() -> Recording:
         frames.append(Frame(Image(k / 30, z), (Image(k / 30 + 0.004, color),)))
         balls.append(ball)
     assert 0.1 < np.mean(balls) < 0.3
-    return Recording(Rig(CAMERA, SHUTTER, CAMERA, SHUTTER, T_COLOR_DEPTH), frames, balls, truth)
+    return Recording(RIG, frames, balls, truth)
 
 
 def test_a_ball_that_passes_is_left_out_of_frame_and_keyframe(recording: Recording) -> None:
@@ -299,30 +263,6 @@ def test_what_moves_hides_a_little_more_of_colours_than_of_depth(recording: Reco
     ring = about & (cv2.dilate(recording.balls[2].astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
     assert nearer[~about].mean() < 0.01 and nearer[ring].mean() > 0.3
     assert frames[2].depth.hider is frames[2].depth  # nothing left out: nothing made wider
-
-
-def test_what_stands_where_it_was_left_out_is_left_out_again(recording: Recording) -> None:
-    """In a hole of the keyframe nothing tells it from what rests, but by where it was in the frame before."""
-    track = Track(recording.rig, Options(backend="llvm"), untimed)
-    e, state = track.device.e, SplineState(recording.truth)
-    frames = [track.device.upload(k, frame) for k, frame in enumerate(recording.frames)]
-    ref = track.maker.rectified(0, frames[0].depth, frames[0].colors, recording.truth, None)
-    hole = np.zeros(SIZE, bool)
-    hole[:, 20:] = True
-    ref = without(e, ref, hole)
-    ball = recording.balls[2]
-
-    def mask(frame: DeviceFrame, before: DepthImage | None) -> Mask:
-        fresh = track.observe(frame, ref)
-        for o in fresh:
-            o.linearise(track.terms, state, 1)
-        (left,) = track.leave_out([frame], ref, fresh, state, before)
-        return np.asarray(e.download(left.depth.z, SIZE) == 0.0)
-
-    assert mask(frames[2], None)[ball].mean() < 0.05
-    before = without_pixels(e, frames[1].depth, recording.balls[1], 1)
-    found = mask(frames[2], before)
-    assert found[ball].mean() > 0.6 and ball[found].mean() > 0.8
 
 
 def test_what_is_told_not_to_look_does_not(recording: Recording) -> None:

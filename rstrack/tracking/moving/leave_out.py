@@ -19,7 +19,7 @@ from rstrack.alignment.spline_state import SplineState
 from rstrack.images.left_out import full_size, without_pixels
 from rstrack.images.pyramid import DepthImage
 from rstrack.keyframes.keyframe import Reference, strides
-from rstrack.tracking.moving.regions import Mask, anything, moving, moving_with, untold
+from rstrack.tracking.moving.regions import Mask, anything, moving, moving_with
 
 # Part of what is seen that may move: where more seems to, it is the pose that is wrong.
 _MOST = 0.5
@@ -41,16 +41,15 @@ class LeftOut:
 
 def leave_out(
     space: FreeSpace, depths: Sequence[DepthImage], ref: Reference, fresh: Sequence[Sequence[Observation]],
-    state: SplineState, before: DepthImage | None = None,
+    state: SplineState,
 ) -> list[LeftOut]:  # fmt: skip
     """Let frames' observations count without what moves, as seen from where they have been aligned to so far.
 
     depths: the frames' images; what has been left out of them already stays so. fresh: of each frame its observations;
-    those of `ref` do without what any of the frames finds gone from it, too. before: of the frame before them, if it is
-    known what moves there.
+    those of `ref` do without what any of the frames finds gone from it, too.
     """
     of_ref = [[o for o in own if o.ref.index == ref.index] for own in fresh]
-    left = [_found(space, depth, ref, own, state, before) for depth, own in zip(depths, of_ref, strict=True)]
+    left = [_found(space, depth, ref, own, state) for depth, own in zip(depths, of_ref, strict=True)]
     gone = [one.gone for one in left if one.gone is not None]
     cleaned = without(space.device.e, ref, np.any(gone, axis=0)) if gone else ref
     for one, own in zip(left, fresh, strict=True):
@@ -65,9 +64,8 @@ def leave_out(
 
 
 def _found(
-    space: FreeSpace, depth: DepthImage, ref: Reference, own: Sequence[Observation], state: SplineState,
-    before: DepthImage | None,
-) -> LeftOut:  # fmt: skip
+    space: FreeSpace, depth: DepthImage, ref: Reference, own: Sequence[Observation], state: SplineState
+) -> LeftOut:
     nothing = LeftOut(depth)
     if not own or not all(o.is_linearised for o in own):
         return nothing
@@ -93,8 +91,6 @@ def _found(
         return space.frame_in_keyframe(depth.occluder, rest, differences(), state.spline)
 
     came = _moving(space, space.before_keyframe(depth.occluder, rest, state.spline), scales, sigma_intensity, look)
-    if came is not None and before is not None and before.whole is not None:
-        came = came | (untold(look(), *scales) & _as_before(space, depth, before, state.spline, scales))
     if came is None:
         return nothing
     return LeftOut(
@@ -119,16 +115,6 @@ def _moving(
     return None if _share(found, seen) > _MOST else found
 
 
-def _as_before(
-    space: FreeSpace, depth: DepthImage, other: DepthImage, spline: Spline, scales: tuple[float, float]
-) -> Mask:
-    """Pixels (gh, gw) of a frame that show, at about the same place, what has been left out of another one."""
-    assert other.left_out is not None
-    seen = space.frame_in_frame(depth.occluder, other.occluder, other.left_out.astype(np.float32), spline)
-    with space.device.timer("what moves: regions"):
-        return moving_with(seen, np.nan_to_num(seen.intensity) > 0.5, *scales)
-
-
 def left_out_with(
     space: FreeSpace, depth: DepthImage, other: DepthImage, median_depth: float, spline: Spline
 ) -> DepthImage:
@@ -136,14 +122,13 @@ def left_out_with(
 
     median_depth (m): of what they show.
     """
-    if other.whole is None:
+    if other.left_out is None:
         return depth
-    came = _as_before(space, depth, other, spline, (START_DEPTH, median_depth))
-    return (
-        without_pixels(space.device.e, depth, came, other.left_out_stride)
-        if came.any() and came.mean() <= _MOST
-        else depth
-    )
+    seen = space.frame_in_frame(depth.occluder, other.occluder, other.left_out.astype(np.float32), spline)
+    came = moving_with(seen, np.nan_to_num(seen.intensity) > 0.5, START_DEPTH, median_depth)
+    if not came.any() or _share(came, seen) > _MOST:
+        return depth
+    return without_pixels(space.device.e, depth, came, other.left_out_stride)
 
 
 def _share(mask: Mask, seen: Free) -> float:
