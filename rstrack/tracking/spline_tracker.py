@@ -249,7 +249,7 @@ class Tracker:
         def leave_out() -> None:
             nonlocal left
             if not fits.is_hopeless(fresh):
-                (left,) = track.leave_out([new], ref, fresh, window.state)
+                (left,) = track.leave_out([new], ref, fresh, window.state, track.succession.recent[-1].depth)
 
         solved = window.solve(fresh, levels, gauge, coupled, fits.is_hopeless, leave_out)
         on_reference = [o for o in fresh if o.ref.index == ref.index]

@@ -22,6 +22,7 @@ from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.moving_masks import MovingMasks
 from rstrack.data.rig import Rig
 from rstrack.images.device_frame import DeviceFrame, DeviceRig, Timer
+from rstrack.images.pyramid import DepthImage
 from rstrack.inertial.inertia import Inertia
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
@@ -126,14 +127,18 @@ class Track:
             term.learn(o.inflation for o in on_reference if o.is_depth != is_color)
 
     def leave_out(
-        self, frames: Sequence[DeviceFrame], ref: Reference, fresh: Sequence[Observation], state: SplineState
-    ) -> list[LeftOut]:
-        """What moves in frames; their observations `fresh` do without it, see `moving.leave_out`."""
+        self, frames: Sequence[DeviceFrame], ref: Reference, fresh: Sequence[Observation], state: SplineState,
+        before: DepthImage | None = None,
+    ) -> list[LeftOut]:  # fmt: skip
+        """What moves in frames; their observations `fresh` do without it, see `moving.leave_out`.
+
+        before: of the frame before them.
+        """
         depths = [frame.depth for frame in frames]
         if not self._finds_moving:
             return [LeftOut(depth) for depth in depths]
         own = [[o for o in fresh if o.frame == frame.index] for frame in frames]
-        return leave_out(self.space, depths, ref, own, state)
+        return leave_out(self.space, depths, ref, own, state, before)
 
     def remember(self, frame: DeviceFrame) -> None:
         """What was left out of a frame since it moves by itself."""

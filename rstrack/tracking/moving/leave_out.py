@@ -19,7 +19,7 @@ from rstrack.alignment.spline_state import SplineState
 from rstrack.images.left_out import full_size, without_pixels
 from rstrack.images.pyramid import DepthImage
 from rstrack.keyframes.keyframe import Reference, strides
-from rstrack.tracking.moving.regions import Mask, anything, moving, moving_with
+from rstrack.tracking.moving.regions import Mask, anything, moving, moving_with, untold
 
 # Part of what is seen that may move: where more seems to, it is the pose that is wrong.
 _MOST = 0.5
@@ -41,15 +41,15 @@ class LeftOut:
 
 def leave_out(
     space: FreeSpace, depths: Sequence[DepthImage], ref: Reference, fresh: Sequence[Sequence[Observation]],
-    state: SplineState,
+    state: SplineState, before: DepthImage | None = None,
 ) -> list[LeftOut]:  # fmt: skip
     """Let frames' observations count without what moves, as seen from where they have been aligned to so far.
 
     depths: the frames' images; what has been left out of them already stays so. fresh: of each frame its observations;
-    those of `ref` do without what any of the frames finds gone from it, too.
+    those of `ref` do without what any of the frames finds gone from it, too. before: of the frame before them.
     """
     of_ref = [[o for o in own if o.ref.index == ref.index] for own in fresh]
-    left = [_found(space, depth, ref, own, state) for depth, own in zip(depths, of_ref, strict=True)]
+    left = [_found(space, depth, ref, own, state, before) for depth, own in zip(depths, of_ref, strict=True)]
     gone = [one.gone for one in left if one.gone is not None]
     cleaned = without(space.device.e, ref, np.any(gone, axis=0)) if gone else ref
     for one, own in zip(left, fresh, strict=True):
@@ -64,8 +64,9 @@ def leave_out(
 
 
 def _found(
-    space: FreeSpace, depth: DepthImage, ref: Reference, own: Sequence[Observation], state: SplineState
-) -> LeftOut:
+    space: FreeSpace, depth: DepthImage, ref: Reference, own: Sequence[Observation], state: SplineState,
+    before: DepthImage | None,
+) -> LeftOut:  # fmt: skip
     nothing = LeftOut(depth)
     if not own or not all(o.is_linearised for o in own):
         return nothing
@@ -93,6 +94,10 @@ def _found(
     came = _moving(space, space.before_keyframe(depth.occluder, rest, state.spline), scales, sigma_intensity, look)
     if came is None:
         return nothing
+    if color is None and before is not None and before.left_out is not None:
+        # Without colours only its place tells, in the keyframe's holes, what was left out of the frame before. It creeps
+        # over what rests beside it; with colours that costs more than it gains.
+        came = came | (untold(look(), *scales) & _as_before(space, depth, before, state.spline, scales))
     return LeftOut(
         without_pixels(e, depth, came, grid_of(depth.exposure.lens)[1]) if came.any() else depth,
         gone if gone.any() else None,
@@ -115,6 +120,16 @@ def _moving(
     return None if _share(found, seen) > _MOST else found
 
 
+def _as_before(
+    space: FreeSpace, depth: DepthImage, other: DepthImage, spline: Spline, scales: tuple[float, float]
+) -> Mask:
+    """Pixels (gh, gw) of a frame that show, at about the same place, what has been left out of another one."""
+    assert other.left_out is not None
+    seen = space.frame_in_frame(depth.occluder, other.occluder, other.left_out.astype(np.float32), spline)
+    with space.device.timer("what moves: regions"):
+        return moving_with(seen, np.nan_to_num(seen.intensity) > 0.5, *scales)
+
+
 def left_out_with(
     space: FreeSpace, depth: DepthImage, other: DepthImage, median_depth: float, spline: Spline
 ) -> DepthImage:
@@ -124,9 +139,8 @@ def left_out_with(
     """
     if other.left_out is None:
         return depth
-    seen = space.frame_in_frame(depth.occluder, other.occluder, other.left_out.astype(np.float32), spline)
-    came = moving_with(seen, np.nan_to_num(seen.intensity) > 0.5, START_DEPTH, median_depth)
-    if not came.any() or _share(came, seen) > _MOST:
+    came = _as_before(space, depth, other, spline, (START_DEPTH, median_depth))
+    if not came.any() or came.mean() > _MOST:
         return depth
     return without_pixels(space.device.e, depth, came, other.left_out_stride)
 

@@ -52,6 +52,13 @@ def _is_enough(seeds: Mask) -> bool:
     return bool(np.count_nonzero(seeds) >= _LEAST * seeds.size)
 
 
+def untold(seen: Seen, sigma_depth: float, median_depth: float) -> Mask:
+    """Pixels (gh, gw) of which the other image says nothing: they fall into its holes, beyond it, or behind what it
+    shows."""
+    _, least = _scales(seen.z, sigma_depth, median_depth)
+    return np.asarray(np.isfinite(seen.z) & ~(seen.apart >= -least))
+
+
 def moving_with(seen: Seen, left_out: Mask, sigma_depth: float, median_depth: float) -> Mask:
     """Pixels (gh, gw) of things that the other image shows about there and does without.
 
