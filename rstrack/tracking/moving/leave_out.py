@@ -95,8 +95,8 @@ def _found(
     if came is None:
         return nothing
     if color is None and before is not None and before.left_out is not None:
-        # Without colours only its place tells, in the keyframe's holes, what was left out of the frame before. It creeps
-        # over what rests beside it; with colours that costs more than it gains.
+        # Without colours only its place tells, in the keyframe's holes, what was left out of the frame before. That
+        # creeps over what rests beside it; with colours it costs more than it gains.
         came = came | (untold(look(), *scales) & _as_before(space, depth, before, state.spline, scales))
     return LeftOut(
         without_pixels(e, depth, came, grid_of(depth.exposure.lens)[1]) if came.any() else depth,
