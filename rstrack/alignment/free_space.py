@@ -40,8 +40,8 @@ Grid = npt.NDArray[np.float32]
 
 @dataclass(frozen=True)
 class SpaceInput:
-    """Device arrays of the kernel: 1/z of the image whose pixels are moved, its rays and the poses of its lines; 1/z of
-    the other image and the poses of its lines; a value of each pixel of the other's grid, to be handed over."""
+    """Device arrays of the kernels: 1/z of the image whose pixels are moved, its rays and the poses of its lines; 1/z
+    of the other image and the poses of its lines."""
 
     inverse_depth: Any
     rays_x: Any
@@ -49,33 +49,44 @@ class SpaceInput:
     to_base: Any
     other: Any
     from_base: Any
+
+
+@dataclass(frozen=True)
+class MeetingInput(SpaceInput):
+    """The same, and a value of each pixel of the other's grid, to be handed over."""
+
     values: Any
 
 
+def _moved(e: Engine, lens: Lens, other: Lens, stride: int, has_rays: bool, given: SpaceInput) -> tuple[Any, Any, Any]:
+    """1/z of every stride-th pixel of `lens`, where it is seen in `other`, and whether it is within that image."""
+    camera, there = lens.camera, other.camera
+    index, px, py = grid(e, camera.width, camera.height, stride)
+    rho = dr.gather(e.Float, given.inverse_depth, index)
+    known = rho > 0.0
+    z = dr.rcp(dr.select(known, rho, 1.0))
+    if has_rays:
+        ray = dr.gather(e.Float, given.rays_x, index), dr.gather(e.Float, given.rays_y, index)
+    else:
+        ray = (e.Float(px) - camera.cx) / camera.fx, (e.Float(py) - camera.cy) / camera.fy
+    line = e.UInt(0) if lens.lines == 1 else e.UInt(lens.line_of(e.Int(px), e.Int(py)))
+    p = move(gather(given.to_base, line, TO_BASE, stride=TO_BASE), (ray[0] * z, ray[1] * z, z))
+    seen = project_rolling(other, given.from_base, p, e.UInt, e.Int)
+    inside = known & seen.valid
+    inside &= (seen.x >= 0.0) & (seen.y >= 0.0) & (seen.x < there.width - 1.0) & (seen.y < there.height - 1.0)
+    return rho, seen, inside
+
+
 def free_space_kernel(e: Engine, lens: Lens, other: Lens, stride: int, has_rays: bool) -> Callable[[SpaceInput], Any]:
-    """Kernel → (free, apart, value) at every stride-th pixel of `lens`, see `Seen`; `_UNKNOWN` where not to be told, a
-    value of twice that outside the other image.
+    """Kernel → (1/z, free) at every stride-th pixel of `lens`, see `Free`: 0 and `_UNKNOWN` where not to be told.
 
     has_rays: whether the image's rays are given; a rectified one's are those of its pinhole.
     """
-    camera, there = lens.camera, other.camera
-    columns = -(-there.width // stride)
+    there = other.camera
 
     @recorded_from(SpaceInput)
     def kernel(given: SpaceInput) -> Any:
-        index, px, py = grid(e, camera.width, camera.height, stride)
-        rho = dr.gather(e.Float, given.inverse_depth, index)
-        known = rho > 0.0
-        z = dr.rcp(dr.select(known, rho, 1.0))
-        if has_rays:
-            ray = dr.gather(e.Float, given.rays_x, index), dr.gather(e.Float, given.rays_y, index)
-        else:
-            ray = (e.Float(px) - camera.cx) / camera.fx, (e.Float(py) - camera.cy) / camera.fy
-        line = e.UInt(0) if lens.lines == 1 else e.UInt(lens.line_of(e.Int(px), e.Int(py)))
-        p = move(gather(given.to_base, line, TO_BASE, stride=TO_BASE), (ray[0] * z, ray[1] * z, z))
-        seen = project_rolling(other, given.from_base, p, e.UInt, e.Int)
-        inside = known & seen.valid
-        inside &= (seen.x >= 0.0) & (seen.y >= 0.0) & (seen.x < there.width - 1.0) & (seen.y < there.height - 1.0)
+        rho, seen, inside = _moved(e, lens, other, stride, has_rays, given)
         # The nearest of what is seen about there: an edge may lie a pixel or two elsewhere.
         nearest_rho = e.Float(0.0)
         for dy in (-stride, 0, stride):
@@ -85,13 +96,25 @@ def free_space_kernel(e: Engine, lens: Lens, other: Lens, stride: int, has_rays:
                 at = nearest(e, there.width, x, y, inside)
                 nearest_rho = dr.maximum(nearest_rho, dr.gather(e.Float, given.other, at, inside))
         shown = inside & (nearest_rho > 0.0)
-        free = dr.select(shown, dr.rcp(dr.select(shown, nearest_rho, 1.0)) - seen.z, _UNKNOWN)
-        value, met = surface(e, there, given.other, seen.x, seen.y, inside)
+        return rho, dr.select(shown, dr.rcp(dr.select(shown, nearest_rho, 1.0)) - seen.z, _UNKNOWN)
+
+    return kernel
+
+
+def meeting_kernel(e: Engine, lens: Lens, other: Lens, stride: int, has_rays: bool) -> Callable[[MeetingInput], Any]:
+    """Kernel → (apart, value) at the same pixels, see `Seen`; `_UNKNOWN` where not to be told, a value of twice that
+    outside the other image."""
+    columns = -(-other.camera.width // stride)
+
+    @recorded_from(MeetingInput)
+    def kernel(given: MeetingInput) -> Any:
+        _, seen, inside = _moved(e, lens, other, stride, has_rays, given)
+        value, met = surface(e, other.camera, given.other, seen.x, seen.y, inside)
         apart = dr.select(met, dr.rcp(dr.select(met, value, 1.0)) - seen.z, _UNKNOWN)
         column = e.UInt(e.Int(dr.select(inside, (seen.x + 0.5) / stride, 0.0)))
         row = e.UInt(e.Int(dr.select(inside, (seen.y + 0.5) / stride, 0.0)))
         handed = dr.select(inside, dr.gather(e.Float, given.values, row * columns + column, inside), 2.0 * _UNKNOWN)
-        return free, apart, handed
+        return apart, handed
 
     return kernel
 
@@ -135,16 +158,24 @@ def intensity_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int, level: 
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What the pixels of an image's grid (gh, gw) are, seen from the other image; NaN where that cannot be told.
+class Free:
+    """Whether pixels of an image's grid (gh, gw) stand in what the other image saw through; NaN where not to be told.
 
-    z (m): the image's own depth; free (m): how far it stands in front of all that the other shows about there; apart
-    (m): how far in front of the surface there; intensity: the colour image's, less that expected; outside: whether it
-    is not within the other image.
+    z (m): the image's own depth; free (m): how far it stands in front of all that the other shows about there.
     """
 
     z: Grid
     free: Grid
+
+
+@dataclass(frozen=True)
+class Seen(Free):
+    """The same, and what else those pixels are, seen from the other image.
+
+    apart (m): how far in front of the surface there; intensity: the colour image's, less that expected; outside:
+    whether it is not within the other image.
+    """
+
     apart: Grid
     intensity: Grid
     outside: npt.NDArray[np.bool_]
@@ -152,7 +183,7 @@ class Seen:
 
 @dataclass
 class FreeSpace:
-    """Kernels of one rig."""
+    """Kernels of one rig. Poses of lines are those of T_world_depth(t)."""
 
     device: DeviceRig
     _kernel: Kernels = field(init=False)
@@ -160,42 +191,62 @@ class FreeSpace:
     def __post_init__(self) -> None:
         self._kernel = Kernels(self.device.e)
 
-    def keyframe_in_frame(
-        self, ref: Reference, depth: DepthImage, color: ColorImage | None, brightness: FloatArray, spline: Spline
-    ) -> tuple[Seen, Any]:
-        """The keyframe seen from a frame's depth image, at T_world_depth(t), and its differences of intensity on the
-        device.
+    def before_frame(self, ref: Reference, depth: DepthImage, spline: Spline) -> Free:
+        """The keyframe's pixels before a frame's depth image."""
+        with self.device.timer("what moves: compare"):
+            return self._free(ref.lens, depth.exposure.lens, ref.rolling is not None, self._of_ref(ref, depth, spline))
 
-        color: that image of the frame; None: no intensities. brightness (2,): its gain and offset against the
-        keyframe's.
+    def before_keyframe(self, depth: DepthImage, ref: Reference, spline: Spline) -> Free:
+        """A frame's pixels before the keyframe."""
+        with self.device.timer("what moves: compare"):
+            return self._free(depth.exposure.lens, ref.lens, True, self._of_frame(depth, ref, spline))
+
+    def keyframe_in_frame(self, ref: Reference, depth: DepthImage, intensity: Any, spline: Spline) -> Seen:
+        """The keyframe seen from a frame's depth image. intensity: differences as `intensity` gives them."""
+        with self.device.timer("what moves: compare"):
+            given = self._of_ref(ref, depth, spline)
+            return self._seen(ref.lens, depth.exposure.lens, ref.rolling is not None, given, intensity, False)
+
+    def frame_in_keyframe(self, depth: DepthImage, ref: Reference, intensity: Any, spline: Spline) -> Seen:
+        """A frame's depth image seen from its keyframe. intensity: differences as `intensity` gives them."""
+        with self.device.timer("what moves: compare"):
+            given = self._of_frame(depth, ref, spline)
+            return self._seen(depth.exposure.lens, ref.lens, True, given, intensity, True)
+
+    def frame_in_frame(self, depth: DepthImage, other: DepthImage, values: Grid, spline: Spline) -> Seen:
+        """A depth image seen from another one, whose values (gh, gw) it is handed as intensities."""
+        e, T_world_base = self.device.e, spline.pose(other.exposure.mid_time)
+        with self.device.timer("what moves: compare"):
+            to_base = e.upload(to_base_table(spline, T_world_base, depth.exposure))
+            from_base = e.upload(from_base_table(spline, T_world_base, other.exposure))
+            given = SpaceInput(depth.inverse_z, *self.device.device_rays, to_base, other.inverse_z, from_base)
+            return self._seen(depth.exposure.lens, other.exposure.lens, True, given, e.upload(values), True)
+
+    def intensity(self, ref: Reference, color: ColorImage | None, brightness: FloatArray, spline: Spline) -> Any:
+        """A colour image's intensities less those expected at the keyframe's grid, on the device; without one unknown.
+
+        brightness (2,): its gain and offset against the keyframe's.
         """
         e, (level, stride) = self.device.e, grid_of(ref.lens)
         with self.device.timer("what moves: compare"):
-            to_base, _ = self._lines(ref, spline)
             if color is None or not ref.points:
-                intensity = e.upload(np.full(grid_shape(ref.lens), _UNKNOWN))
-            else:
-                points, own_level = ref.points[level], color.level(pyramid_level(level))
-                kernel = self._kernel(intensity_kernel, color.exposure.lens, ref.lens, stride, own_level)
-                color_at = e.upload(from_base_table(spline, ref.T_world_base, color.exposure))
-                given = points.x, points.y, points.z, points.intensity, to_base, color.levels[own_level], color_at
-                intensity = kernel(IntensityInput(*given, e.upload(brightness)))
-            from_base = e.upload(from_base_table(spline, ref.T_world_base, depth.exposure))
-            free, apart, handed = self._kernel(
-                free_space_kernel, ref.lens, depth.exposure.lens, stride, ref.rolling is not None
-            )(SpaceInput(ref.inverse_depth, *self.device.device_rays, to_base, depth.inverse_z, from_base, intensity))
-            return self._seen(ref.lens, ref.inverse_depth, free, apart, intensity, handed), intensity
+                return e.upload(np.full(grid_shape(ref.lens), _UNKNOWN))
+            points, own_level = ref.points[level], color.level(pyramid_level(level))
+            kernel = self._kernel(intensity_kernel, color.exposure.lens, ref.lens, stride, own_level)
+            to_base, _ = self._lines(ref, spline)
+            from_base = e.upload(from_base_table(spline, ref.T_world_base, color.exposure))
+            given = points.x, points.y, points.z, points.intensity, to_base, color.levels[own_level], from_base
+            return kernel(IntensityInput(*given, e.upload(brightness)))
 
-    def frame_in_keyframe(self, depth: DepthImage, ref: Reference, intensity: Any, spline: Spline) -> Seen:
-        """A frame's depth image seen from its keyframe. intensity: differences as `keyframe_in_frame` gives them."""
-        e, lens = self.device.e, depth.exposure.lens
-        with self.device.timer("what moves: compare"):
-            to_base = e.upload(to_base_table(spline, ref.T_world_base, depth.exposure))
-            _, from_base = self._lines(ref, spline)
-            free, apart, handed = self._kernel(free_space_kernel, lens, ref.lens, grid_of(lens)[1], True)(
-                SpaceInput(depth.inverse_z, *self.device.device_rays, to_base, ref.inverse_depth, from_base, intensity)
-            )
-            return self._seen(lens, depth.inverse_z, free, apart, handed, handed)
+    def _of_ref(self, ref: Reference, depth: DepthImage, spline: Spline) -> SpaceInput:
+        from_base = self.device.e.upload(from_base_table(spline, ref.T_world_base, depth.exposure))
+        to_base, _ = self._lines(ref, spline)
+        return SpaceInput(ref.inverse_depth, *self.device.device_rays, to_base, depth.inverse_z, from_base)
+
+    def _of_frame(self, depth: DepthImage, ref: Reference, spline: Spline) -> SpaceInput:
+        to_base = self.device.e.upload(to_base_table(spline, ref.T_world_base, depth.exposure))
+        _, from_base = self._lines(ref, spline)
+        return SpaceInput(depth.inverse_z, *self.device.device_rays, to_base, ref.inverse_depth, from_base)
 
     def _lines(self, ref: Reference, spline: Spline) -> tuple[Any, Any]:
         e = self.device.e
@@ -206,12 +257,23 @@ class FreeSpace:
             e.upload(from_base_table(spline, ref.T_world_base, ref.rolling)),
         )
 
-    def _seen(self, lens: Lens, inverse_depth: Any, free: Any, apart: Any, intensity: Any, handed: Any) -> Seen:
-        e, shape, stride = self.device.e, grid_shape(lens), grid_of(lens)[1]
-        rho = e.download(inverse_depth, (lens.camera.height, lens.camera.width))[::stride, ::stride]
+    def _free(self, lens: Lens, other: Lens, has_rays: bool, given: SpaceInput) -> Free:
+        kernel = self._kernel(free_space_kernel, lens, other, grid_of(lens)[1], has_rays)
+        rho, free = (self.device.e.download(values, grid_shape(lens)) for values in kernel(given))
         z = np.divide(np.float32(1.0), rho, out=np.full_like(rho, np.nan), where=rho > 0)
-        before, off, differs = (_known(e.download(values, shape)) for values in (free, apart, intensity))
-        return Seen(z, before, off, differs, e.download(handed, shape) > 1.5 * _UNKNOWN)
+        return Free(z, _known(free))
+
+    def _seen(
+        self, lens: Lens, other: Lens, has_rays: bool, given: SpaceInput, intensity: Any, is_handed: bool
+    ) -> Seen:
+        """is_handed: whether the intensities are the other image's."""
+        e, shape = self.device.e, grid_shape(lens)
+        near = self._free(lens, other, has_rays, given)
+        kernel = self._kernel(meeting_kernel, lens, other, grid_of(lens)[1], has_rays)
+        apart, handed = kernel(MeetingInput(**vars(given), values=intensity))
+        off, value = (e.download(values, shape) for values in (apart, handed))
+        own = value if is_handed else e.download(intensity, shape)
+        return Seen(near.z, near.free, _known(off), _known(own), value > 1.5 * _UNKNOWN)
 
 
 def grid_of(lens: Lens) -> tuple[int, int]:

@@ -99,6 +99,10 @@ class Observation:
         """Take another version of the reference, nearly the same."""
         self.ref, self._visible = ref, None
 
+    def hidden_by(self, occluder: DepthImage) -> None:
+        """Take another depth image to tell which points a colour image cannot see."""
+        self.occluder, self._visible = occluder, None
+
     def count_as(self, independent: float) -> None:
         """Another part of its pixels counts."""
         self.independent, self._visible = independent, None
@@ -192,6 +196,4 @@ def observe(frame: DeviceFrame, ref: Reference, options: Options, expected: Floa
     expected (2,): gain and offset that the colour images are expected to have against the reference.
     """
     depth = [Observation(frame.index, frame.depth, ref)] if options.geometric else []
-    return depth + [
-        Observation(frame.index, c, ref, frame.depth.occluder, expected) for c in frame.colors if ref.points
-    ]
+    return depth + [Observation(frame.index, c, ref, frame.depth.hider, expected) for c in frame.colors if ref.points]

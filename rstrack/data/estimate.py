@@ -20,6 +20,7 @@ from rsgen.files import atomic_write, encode_npz, read_text, write_error
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.format import pose_rows
 from rsgen.sequence.trajectory import read_trajectory
+from rstrack.data.moving_masks import MOVING, MovingMasks
 
 TRAJECTORY = "trajectory.txt"
 SPLINE = "spline.npz"
@@ -36,13 +37,15 @@ class Estimate:
 
     stamps: (n,) seconds, strictly increasing. T_world_depth: (n, 4, 4). spline: T_world_depth(t), where the tracker has
     one. info: what run.json holds; `info["spline_valid"]`, a list of [t_begin, t_end] in seconds, restricts where the
-    spline is an estimate (without it: everywhere). Raises UserError for anything that is not that.
+    spline is an estimate (without it: everywhere). moving: pixels left out since they move by themselves, by the data
+    set's frames. Raises UserError for anything that is not that.
     """
 
     stamps: FloatArray
     T_world_depth: FloatArray
     spline: Spline | None = None
     info: dict[str, Any] = field(default_factory=dict)
+    moving: MovingMasks = field(default_factory=MovingMasks)
 
     def __post_init__(self) -> None:
         stamps, T = np.asarray(self.stamps, np.float64), np.asarray(self.T_world_depth, np.float64)
@@ -95,7 +98,7 @@ def write_estimate(
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name in (INFO, SPLINE, ONLINE_TRAJECTORY, ONLINE_SPLINE):
+        for name in (INFO, SPLINE, ONLINE_TRAJECTORY, ONLINE_SPLINE, MOVING):
             (folder / name).unlink(missing_ok=True)
     except OSError as error:
         raise write_error(folder, error) from None
@@ -130,8 +133,9 @@ def read_estimate(path: Path) -> Estimate:
     poses = read_trajectory(file, format="tum", max_gap_s=math.inf)
     spline = Spline.load(path / SPLINE) if is_folder and (path / SPLINE).exists() else None
     info = _read_info(path / INFO) if is_folder and (path / INFO).exists() else {}
+    moving = MovingMasks.read(path) if is_folder else MovingMasks()
     try:
-        return Estimate(poses.stamps, poses.T_world_cam, spline, info)
+        return Estimate(poses.stamps, poses.T_world_cam, spline, info, moving)
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
 

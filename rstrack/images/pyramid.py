@@ -31,7 +31,8 @@ class DepthImage:
 
     count: pixels that have depth. thumbnail (15, 20): of 1/z, 0 missing.
     resolution: the camera's step (1/m, see `depth_resolution`), 0 where it shows none.
-    whole: the image before what moves by itself was left out of it; None where nothing was.
+    whole: the image before what moves by itself was left out of it; None where nothing was. screen: that one with what
+    moves made wider. left_out (gh, gw): every so-manyth pixel and row (left_out_stride) that was, None likewise.
     """
 
     exposure: Exposure
@@ -41,11 +42,19 @@ class DepthImage:
     thumbnail: npt.NDArray[np.float32] = field(default_factory=lambda: np.zeros(_THUMBNAIL[::-1], np.float32))
     resolution: float = 0.0
     whole: DepthImage | None = None
+    screen: DepthImage | None = None
+    left_out: npt.NDArray[np.bool_] | None = None
+    left_out_stride: int = 1
 
     @property
     def occluder(self) -> DepthImage:
         """All that it shows: what moves hides what rests."""
         return self.whole or self
+
+    @property
+    def hider(self) -> DepthImage:
+        """What tells which points colour images taken with it may not see: things have moved a little by then."""
+        return self.screen or self.occluder
 
     @property
     def moving(self) -> float:

@@ -67,7 +67,10 @@ def small_frame(frame: DeviceFrame, rig: Rig, geometric: bool) -> SmallFrame:
     """A frame as the search takes it. geometric: whether its depth is looked at."""
     depth = frame.depth.thumbnail
     inverse_depth = _pinhole(np.where(depth > 0, depth, np.nan), rig.depth_camera) if geometric else None
-    intensity = _pinhole(np.asarray(frame.colors[0].thumbnail, float), rig.color_camera) if frame.colors else None
+    intensity = None
+    if frame.colors:
+        grey = frame.colors[0].thumbnail
+        intensity = _pinhole(np.where(grey > 0, grey, np.nan), rig.color_camera)
     return SmallFrame(inverse_depth, intensity, rig.T_color_depth)
 
 

@@ -15,6 +15,7 @@ from rsgen.device.lens import Lens
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.images.device_frame import DeviceRig, Timer, untimed
+from rstrack.images.left_out import MARGIN, thumbnail_without
 from rstrack.images.line_poses import from_base_table, to_base_table
 from rstrack.images.pyramid import ColorImage, DepthImage, thumbnail
 from rstrack.keyframes.keyframe import (
@@ -34,8 +35,6 @@ from rstrack.keyframes.rectification import ColorInput, FusionInput, color_kerne
 _AGREE = 0.03
 # Weight of a fused pixel in measurements; more would let a keyframe's first errors live for ever.
 _MOST = 30.0
-# Part of the width about what moves within which colours may be its own.
-_MARGIN = 0.0125
 
 
 @dataclass
@@ -119,7 +118,7 @@ class KeyframeMaker:
         camera = depth.exposure.lens.camera
         shape = camera.height, camera.width
         rest, all_ = (self.e.download(self.rectify(image, spline)[2], shape) > 0 for image in (depth, whole))
-        margin = 2 * round(_MARGIN * camera.width) + 1
+        margin = 2 * round(MARGIN * camera.width) + 1
         return np.asarray(cv2.dilate((all_ & ~rest).astype(np.uint8), np.ones((margin, margin), np.uint8)) > 0)
 
     def with_depth(
@@ -180,7 +179,7 @@ class KeyframeMaker:
         intensity, coarse, color_thumbnail, moments = None, None, None, np.zeros(2)
         if colors:
             color = min(colors, key=lambda c: abs(c.exposure.mid_time - t))
-            moments, color_thumbnail = color.moments, color.thumbnail
+            moments, color_thumbnail = color.moments, thumbnail_without(color, depth)
             _, grid = (self.rays, self.device_rays) if rolling else self._pinhole_rays(lens)
             to_base = e.upload(to_base_table(spline, T_world_base, rolling) if rolling else np.zeros(12))
             from_base = e.upload(from_base_table(spline, T_world_base, color.exposure))

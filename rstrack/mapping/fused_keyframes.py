@@ -16,6 +16,7 @@ from rsgen.device.arrays import engine
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.data.dataset import Dataset
+from rstrack.data.moving_masks import MovingMasks
 from rstrack.images.pyramid import depth_image
 from rstrack.keyframes.keyframe import Reference
 from rstrack.options import Options
@@ -51,11 +52,13 @@ def fused_keyframes(
     options: Options | None = None,
     frames: Sequence[int] | None = None,
     covers: Callable[[float], bool] = lambda t: True,
+    moving: MovingMasks | None = None,
 ) -> Iterator[FusedKeyframe]:
     """Fuse every frame, in order, into the newest keyframe; its successor inherits depth, colour and weights.
 
     spline: T_world_depth(t). frames: indices into the dataset, increasing (default: all). covers: whether the spline is
-    known at a time in s; frames of which it is not are left out. A new keyframe is made at the distance or angle that
+    known at a time in s; frames of which it is not are left out. moving: what is left
+    out of them. A new keyframe is made at the distance or angle that
     `options` say.
     """
     options = options or Options()
@@ -64,6 +67,7 @@ def fused_keyframes(
     e = engine(options.backend)
     # After the engine: it chooses the libLLVM that Dr.Jit loads.
     from rstrack.images.device_frame import DeviceRig
+    from rstrack.images.left_out import frame_without
     from rstrack.keyframes.maker import KeyframeMaker
     from rstrack.mapping.color_fusion import SIGMA_PX, ColorFusion, FusedColor, linear_image
 
@@ -84,6 +88,9 @@ def fused_keyframes(
     for k in range(len(dataset)) if frames is None else frames:
         frame = dataset.frame(k)
         new = device.upload(k, frame)
+        mask = None if moving is None else moving.grid(k)
+        if moving is not None and mask is not None:
+            new = frame_without(e, new, mask, moving.stride)
         if not new.colors or not all(covers(t) for t in (new.first_time, new.last_time)):
             continue
         t = new.depth.exposure.mid_time
@@ -104,9 +111,10 @@ def fused_keyframes(
         for image, color in zip(frame.colors, new.colors, strict=True):
             light = linear_image(e, color.exposure, image.pixels)
             colors = {
-                sigma: fusion.add(colors[sigma], ref, light, new.depth, spline) for sigma, fusion in fusions.items()
+                sigma: fusion.add(colors[sigma], ref, light, new.depth.hider, spline)
+                for sigma, fusion in fusions.items()
             }
-            alone_color = viewer.add(viewer.start(ref), ref, light, new.depth, spline)
+            alone_color = viewer.add(viewer.start(ref), ref, light, new.depth.hider, spline)
             weight = e.download(alone_color.weight, single.shape)
             mean = float(weight[weight > 0].mean()) if (weight > 0).any() else np.inf
             if most_blurred is None or mean < least:

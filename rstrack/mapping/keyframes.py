@@ -44,7 +44,7 @@ def write_keyframes(
     listings: dict[str, list[str]] = {"rgb.txt": [], "depth.txt": [], TRAJECTORY: []}
     camera = None
     covers = lambda t: bool(estimate.spline_covers(t))  # noqa: E731
-    for count, done in enumerate(fused_keyframes(dataset, spline, (sigma_px,), options, None, covers)):
+    for count, done in enumerate(fused_keyframes(dataset, spline, (sigma_px,), options, None, covers, estimate.moving)):
         ref, (image, weight), name = done.reference, done.colors[sigma_px], f"{frame_name(count)}.png"
         z = np.divide(1.0, done.inverse_depth, out=np.zeros_like(done.inverse_depth), where=done.inverse_depth > 0)
         units = np.rint(DEPTH_SCALE * z.astype(np.float64))

@@ -23,6 +23,7 @@ from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.data.prefetch import prefetched
 from rstrack.data.rig import Frame, Rig
+from rstrack.images.left_out import MARGIN
 from rstrack.images.line_poses import Exposure, from_base_table, to_base_table
 from rstrack.images.pyramid import camera_rays, depth_image, lens_sees
 from rstrack.keyframes.keyframe import rectified_lens
@@ -73,8 +74,11 @@ class FrameMapper:
         self._rays, self._seen = tuple(e.upload(rays[..., i]) for i in (0, 1)), lens_sees(rig.depth_camera)
         self._kernel = Kernels(e)
 
-    def __call__(self, frame: Frame) -> bool:
-        """Integrate one frame; False if the estimate does not cover it."""
+    def __call__(self, frame: Frame, number: int) -> bool:
+        """Integrate one frame of the data set without what moves by itself; False if the estimate does not cover it.
+
+        Raises UserError if the estimate has masks of images of another size.
+        """
         e = self._e
         exposure = Exposure(self._depth_lens, frame.depth.stamp + self._middle("depth"), np.eye(4))
         t = exposure.mid_time
@@ -82,7 +86,10 @@ class FrameMapper:
             return False
         T_estimate_base = self._pose(t)
         z = np.where(self._seen, frame.depth.pixels, 0.0)
-        depth = depth_image(e, exposure, z, self._max_depth)
+        camera = self._rig.depth_camera
+        # Its colours are taken a little later, and from beside: what is next to it is seen better by other frames.
+        moving = self._estimate.moving.of(number, camera.height, camera.width, round(MARGIN * camera.width))
+        depth = depth_image(e, exposure, z if moving is None else np.where(moving, 0.0, z), self._max_depth)
         if self._rolling:
             assert self._estimate.spline is not None
             to_base = to_base_table(self._estimate.spline, T_estimate_base, exposure)
@@ -161,8 +168,9 @@ def reconstruct(
     mapper = FrameMapper(e, dataset.rig, estimate, shutter, volume, T_world_estimate, options.max_depth)
     chosen = range(0, len(dataset), options.every)
     done = 0
-    for count, frame in enumerate(prefetched(lambda k: dataset.frame(k, color=options.color), chosen, 2), 1):
-        done += mapper(frame)
+    images = prefetched(lambda k: dataset.frame(k, color=options.color), chosen, 2)
+    for count, (number, frame) in enumerate(zip(chosen, images, strict=True), 1):
+        done += mapper(frame, number)
         progress("integrating", count / len(chosen), f"{volume.blocks} blocks, {volume.bytes / 2**20:.0f} MB")
     if not done:
         raise UserError(

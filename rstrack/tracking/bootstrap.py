@@ -64,7 +64,7 @@ def bootstrap(track: Track, new: DeviceFrame) -> FrameReport:
         left[:] = track.leave_out([new], ref, fresh, window.state)
 
     solved = window.solve(fresh, gauge=ref, coupled=True, before_finest=leave_out)
-    moves = bool(left[0].depth.moving) or left[0].gone is not None
+    moves = left[0].moves
     if ref.points or moves:
         if ref.points:
             # Its colours were looked up as if the first frame stood still: again, with the motion found.
@@ -143,9 +143,9 @@ def _begin_anew(track: Track, new: DeviceFrame) -> FrameReport:
 def _leave_out_by_last(track: Track, window: Window) -> None:
     """What has hardly moved since the first frame has done so until the last one: left out of those between."""
     *frames, last = track.succession.recent
-    ref = track.maker.rolling(last.index, last.depth.occluder, last.colors, window.spline)
+    _, ref = track.known()
     rest = [
-        replace(frame, depth=left_out_with(track.space, frame.depth, last.depth, ref, window.spline))
+        replace(frame, depth=left_out_with(track.space, frame.depth, last.depth, ref.median_depth, window.spline))
         for frame in frames
     ]
     track.succession.recent = deque([*rest, last])
@@ -166,11 +166,15 @@ def _leave(track: Track, window: Window) -> None:
     window.solve(others, levels=(0,))
     rest = [frame for frame in frames if frame is not middle]
     left = track.leave_out(rest, ref, others, window.state)
-    if any(one.depth.moving or one.gone is not None for one in left):
+    if any(one.moves for one in left):
         window.solve(others, levels=(0,))
         for one in left:
             track.succession.saw_through(one.gone)
+        cleaned = {frame.index: replace(frame, depth=one.depth) for frame, one in zip(rest, left, strict=True)}
+        track.succession.recent = deque(cleaned.get(frame.index, frame) for frame in frames)
     window.keep(others)
+    for frame in track.succession.recent:
+        track.remember(frame)
     for frame in frames:
         seen = [o for o in others if o.frame == frame.index]
         own = pulls(seen, window.state)

@@ -13,6 +13,7 @@ from rstrack.alignment import brightness
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Solved
 from rstrack.alignment.pull import pulls
+from rstrack.alignment.spline_state import SplineState
 from rstrack.data.rig import Rig
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.images.pyramid import DepthImage
@@ -23,6 +24,7 @@ from rstrack.options import Options
 from rstrack.tracking.judgement.fault import Fault
 from rstrack.tracking.judgement.lost_track import FitHistory, coarseness, doubted, implausible
 from rstrack.tracking.judgement.uncertainty import Uncertainty
+from rstrack.tracking.moving.leave_out import LeftOut
 from rstrack.tracking.window import LEVELS, Window
 
 # Keyframes at which a lost frame is looked for, at once.
@@ -37,13 +39,17 @@ _SURE_FIT, _SURE_SEEN = 0.9, 2e-3
 
 @dataclass(frozen=True)
 class Found:
-    """A frame that was found again: a window with a new piece of the spline, and what says so."""
+    """A frame that was found again: a window with a new piece of the spline, and what says so.
+
+    depth: its image, without what moves by itself.
+    """
 
     window: Window
     fresh: list[Observation]
     solved: Solved
     ref: Reference
     uncertainty: Uncertainty
+    depth: DepthImage
 
 
 @dataclass(frozen=True)
@@ -58,14 +64,17 @@ class _Jump:
 class Relocaliser:
     """Remembers what was tried for the frames that are lost in a row.
 
-    observe: what a frame's images say against a reference, given gain and offset (2,) that are expected.
+    observe: what a frame's images say against a reference, given gain and offset (2,) that are expected. leave_out: see
+    `moving.leave_out`.
     """
 
     def __init__(
         self, rig: Rig, options: Options, keyframes: KeyframeStore, fits: FitHistory,
         observe: Callable[[DeviceFrame, Reference, FloatArray], list[Observation]],
+        leave_out: Callable[[list[DeviceFrame], Reference, list[Observation], SplineState], list[LeftOut]],
     ) -> None:  # fmt: skip
-        self._rig, self._options, self._keyframes, self._fits, self.observe = rig, options, keyframes, fits, observe
+        self._rig, self._options, self._keyframes, self._fits = rig, options, keyframes, fits
+        self.observe, self.leave_out = observe, leave_out
         self._lost_in_a_row = 0
         self._jump: _Jump | None = None
 
@@ -139,6 +148,14 @@ class Relocaliser:
             solved = trial.solve(fresh, LEVELS, hopeless=self._fits.is_hopeless)
         if doubted(fresh):
             solved = trial.solve(fresh, (0,))
+        depth = new.depth
+        if not self._fits.is_hopeless(fresh):
+            # Only now: at a wrong place a good deal would seem to move, and what is left might fit.
+            (left,) = self.leave_out([new], ref, fresh, trial.state)
+            if left.moves and not self._fits.fault(
+                fresh, solved, ref.pixels, pulls(fresh, trial.state), True, colorless
+            ):
+                depth, solved = left.depth, trial.solve(fresh, (0,))
         pulled = pulls(fresh, trial.state)
         uncertainty = before.found_anew(pulled.information)
         # Depth alone is much alike in many places.
@@ -146,7 +163,7 @@ class Relocaliser:
         fault = self._fits.fault(fresh, solved, ref.pixels, pulled, True, colorless)
         if fault or not is_sure or not uncertainty.is_known:
             return fault or (Fault.LEFT_OPEN if is_sure else Fault.UNSURE)
-        return Found(trial, fresh, solved, ref, uncertainty)
+        return Found(trial, fresh, solved, ref, uncertainty, depth)
 
 
 def where_led(

@@ -21,8 +21,10 @@ from rstrack.adjustment.graph import Seen
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.pull import pulls
 from rstrack.data.imu.recording import ImuRecording
+from rstrack.data.moving_masks import MovingMasks
 from rstrack.data.rig import Frame, Rig
 from rstrack.images.device_frame import DeviceFrame, Timer, untimed
+from rstrack.images.left_out import frame_without
 from rstrack.inertial.inertia import Inertia
 from rstrack.keyframes.archive import Archive
 from rstrack.options import Options
@@ -62,7 +64,7 @@ class Tracker:
         if options.inertial and imu is None:
             raise UserError(f"method {options.method}: needs an IMU's recording, and there is none")
         self._track = track = Track(rig, options, timer, imu if options.inertial else None)
-        self._relocaliser = Relocaliser(rig, track.options, track.keyframes, track.fits, track.observe)
+        self._relocaliser = Relocaliser(rig, track.options, track.keyframes, track.fits, track.observe, track.leave_out)
         self._bridge = Bridge()
         self._last_fed: float | None = None
 
@@ -115,7 +117,10 @@ class Tracker:
     @property
     def shared(self) -> dict[str, object]:
         """What another tracker of the same rig and options has as well, by name."""
-        return self._track.shared | {"observe": self._relocaliser.observe}
+        return self._track.shared | {
+            "observe": self._relocaliser.observe,
+            "leave out": self._relocaliser.leave_out,
+        }
 
     @property
     def state(self) -> dict[str, Any]:
@@ -168,6 +173,11 @@ class Tracker:
         return self._track.terms
 
     @property
+    def left_out(self) -> MovingMasks:
+        """What frames have been found to show that moves by itself, by their numbers."""
+        return self._track.left_out
+
+    @property
     def reference(self) -> int | None:
         """Number of the frame whose keyframe new ones are aligned to."""
         ref = self._track.succession.reference
@@ -185,8 +195,10 @@ class Tracker:
         return recent[0].index if recent else len(self.reports)
 
     def upload(self, index: int, frame: Frame) -> DeviceFrame:
-        """A frame of the recording as it is aligned."""
-        return self._track.device.upload(index, frame)
+        """A frame of the recording as it is aligned: without what has been found to move in it."""
+        new, masks = self._track.device.upload(index, frame), self._track.left_out
+        mask = masks.grid(index)
+        return new if mask is None else frame_without(self._track.device.e, new, mask, masks.stride)
 
     # -- the loop ---------------------------------------------------------------------------------------------------
 
@@ -237,7 +249,7 @@ class Tracker:
         def leave_out() -> None:
             nonlocal left
             if not fits.is_hopeless(fresh):
-                (left,) = track.leave_out([new], ref, fresh, window.state)
+                (left,) = track.leave_out([new], ref, fresh, window.state, track.succession.recent[-1].depth)
 
         solved = window.solve(fresh, levels, gauge, coupled, fits.is_hopeless, leave_out)
         on_reference = [o for o in fresh if o.ref.index == ref.index]
@@ -281,6 +293,7 @@ class Tracker:
         self._bridge.close(track)
         track.window, track.covariances.uncertainty = window, uncertainty
         new = replace(new, depth=left.depth)
+        track.remember(new)
         window.keep(fresh)
         track.learn(ref, on_reference, window, pulled, new.last_time)
         track.succession.recent.append(new)
@@ -313,6 +326,8 @@ class Tracker:
         track.window, track.covariances.uncertainty = found.window, found.uncertainty
         track.chain.cut(found.window.piece)
         track.chain.add(found.ref, found.fresh, found.window.state, pulls(found.fresh, found.window.state).excess)
+        new = replace(new, depth=found.depth)
+        track.remember(new)
         track.succession.use(found.ref, new)
         self._relocaliser.forget()
         self._bridge.forget()

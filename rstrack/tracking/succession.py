@@ -13,6 +13,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.observation import Observation
 from rstrack.images.device_frame import DeviceFrame
+from rstrack.images.left_out import Mask
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.keyframes.store import KeyframeStore
@@ -20,7 +21,6 @@ from rstrack.options import Options
 from rstrack.tracking.gains import Gains
 from rstrack.tracking.judgement.pose_covariances import PoseCovariances
 from rstrack.tracking.moving.leave_out import without
-from rstrack.tracking.moving.regions import Mask
 from rstrack.tracking.window import Window
 
 # Part of the pixels that must have depth for a frame to become a keyframe.

@@ -19,8 +19,10 @@ from rstrack.alignment.priors import ACCELERATION
 from rstrack.alignment.pull import Pulls
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.imu.recording import ImuRecording
+from rstrack.data.moving_masks import MovingMasks
 from rstrack.data.rig import Rig
 from rstrack.images.device_frame import DeviceFrame, DeviceRig, Timer
+from rstrack.images.pyramid import DepthImage
 from rstrack.inertial.band import with_knots
 from rstrack.inertial.inertia import Inertia
 from rstrack.keyframes.keyframe import Reference
@@ -46,7 +48,7 @@ class Track:
 
     window: None until there is a first frame. age: frames of the current piece of the spline. independence: of depth
     pixels, and of colour pixels. chain: what all frames said of the spline. reports: one of every frame fed.
-    inertia: what an IMU says beside them, or None.
+    inertia: what an IMU says beside them, or None. left_out: of frames, since it moves by itself.
     """
 
     def __init__(self, rig: Rig, options: Options, timer: Timer, imu: ImuRecording | None = None) -> None:
@@ -72,7 +74,7 @@ class Track:
         self._told_by = -1
         if self.inertia is not None:
             self.inertia.begin_world()
-        self.found, self.chain = FoundPoses(), Chain()
+        self.found, self.chain, self.left_out = FoundPoses(), Chain(), MovingMasks()
         self.covariances = PoseCovariances(self.rig.depth_camera.fx)
         self.succession = Succession(self.maker, self.keyframes, self.options, self.gains, self.covariances)
 
@@ -127,14 +129,23 @@ class Track:
             term.learn(o.inflation for o in on_reference if o.is_depth != is_color)
 
     def leave_out(
-        self, frames: Sequence[DeviceFrame], ref: Reference, fresh: Sequence[Observation], state: SplineState
-    ) -> list[LeftOut]:
-        """What moves in frames; their observations `fresh` do without it, see `moving.leave_out`."""
+        self, frames: Sequence[DeviceFrame], ref: Reference, fresh: Sequence[Observation], state: SplineState,
+        before: DepthImage | None = None,
+    ) -> list[LeftOut]:  # fmt: skip
+        """What moves in frames; their observations `fresh` do without it, see `moving.leave_out`.
+
+        before: of the frame before them.
+        """
         depths = [frame.depth for frame in frames]
         if not self._finds_moving:
             return [LeftOut(depth) for depth in depths]
         own = [[o for o in fresh if o.frame == frame.index] for frame in frames]
-        return leave_out(self.space, depths, ref, own, state)
+        return leave_out(self.space, depths, ref, own, state, before)
+
+    def remember(self, frame: DeviceFrame) -> None:
+        """What was left out of a frame since it moves by itself."""
+        if frame.depth.left_out is not None:
+            self.left_out.put(frame.index, frame.depth.left_out, frame.depth.left_out_stride)
 
     def learn_inertia(self, fresh: Sequence[Observation], window: Window, excess: float, end: float) -> None:
         """What a frame that ends at time `end` (s) says of an IMU's biases and of gravity. excess: see `Pulls`."""

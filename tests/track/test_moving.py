@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 import synthetic
+from moving_ball import RIG, SIZE, T_COLOR_DEPTH, picture
 from rstrack_util import (
-    FloatArray,
     Plane,
     depth_input,
     exact_reference,
@@ -22,16 +22,17 @@ from rstrack_util import (
 
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
-from rsgen.geometry.shutter import Shutter, project_rolling
+from rsgen.geometry.shutter import project_rolling
 from rsgen.geometry.spline import Spline
-from rstrack.alignment.free_space import FreeSpace, Seen
+from rstrack.alignment.free_space import FreeSpace, Seen, grid_of
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.images import line_poses as lines
 from rstrack.images.device_frame import DeviceRig, untimed
+from rstrack.images.left_out import Mask
 from rstrack.options import Options
 from rstrack.tracking.moving.majority import not_with_most
-from rstrack.tracking.moving.regions import Mask, moving, moving_with
+from rstrack.tracking.moving.regions import moving, moving_with
 from rstrack.tracking.track import Track
 
 REF_STAMP, STAMP = 0.43, 0.465
@@ -58,7 +59,8 @@ def test_free_space_is_what_rays_say(ref_scan: Literal["top-bottom"] | None) -> 
     ref, depth = exact_reference(old.cast, truth, ref_at), depth_input(new.cast, truth, at)
     shutter = at.lens.shutter
     space = FreeSpace(DeviceRig(Rig(camera, shutter, camera, shutter, np.eye(4)), Options(backend="llvm")))
-    in_frame, intensity = space.keyframe_in_frame(ref, depth, None, np.zeros(2), truth)
+    intensity = space.intensity(ref, None, np.zeros(2), truth)
+    in_frame = space.keyframe_in_frame(ref, depth, intensity, truth)
     in_ref = space.frame_in_keyframe(depth, ref, intensity, truth)
     for seen, own, other, plane, sign in ((in_ref, at, ref_at, old, 1), (in_frame, ref_at, at, new, -1)):
         uv = camera.pixel_grid()
@@ -76,6 +78,34 @@ def test_free_space_is_what_rays_say(ref_scan: Literal["top-bottom"] | None) -> 
         assert (seen.free[good] < seen.apart[good]).all() and (seen.free[good] > seen.apart[good] - 0.15).all()
         assert not (np.isfinite(seen.free) & seen.outside).any() and (valid[~seen.outside]).mean() > 0.95
         assert np.isnan(seen.intensity).all()
+
+
+def test_only_every_stride_th_pixel_is_looked_at() -> None:
+    """And the closer look begins with what the first one gave."""
+    camera = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
+    truth, at = hand_held(1), exposure(STAMP, "top-bottom", camera)
+    plane = plane_before(truth.pose(REF_STAMP), (0.3, -0.2, 1.0))
+    ref = exact_reference(plane.cast, truth, exposure(REF_STAMP, None, camera))
+    depth = depth_input(Plane(plane.normal, plane.offset - 0.1).cast, truth, at)
+    space = FreeSpace(DeviceRig(Rig(camera, at.lens.shutter, camera, at.lens.shutter, np.eye(4)), Options("rs-g")))
+    assert grid_of(at.lens)[1] == 2
+    intensity = space.intensity(ref, None, np.zeros(2), truth)
+    for near, seen, rho in (
+        (
+            space.before_keyframe(depth, ref, truth),
+            space.frame_in_keyframe(depth, ref, intensity, truth),
+            depth.inverse_z,
+        ),
+        (
+            space.before_frame(ref, depth, truth),
+            space.keyframe_in_frame(ref, depth, intensity, truth),
+            ref.inverse_depth,
+        ),
+    ):
+        picked = space.device.e.download(rho, (240, 320))[::2, ::2]
+        np.testing.assert_array_equal(near.z, np.float32(1.0) / picked)
+        np.testing.assert_array_equal(seen.z, near.z)
+        np.testing.assert_array_equal(seen.free, near.free)
 
 
 # -- regions ----------------------------------------------------------------------------------------------------------
@@ -155,38 +185,6 @@ def test_what_another_frame_does_without_is_found_by_its_place() -> None:
 
 # -- the track --------------------------------------------------------------------------------------------------------
 
-SIZE = 96, 128
-CAMERA = Camera(128, 96, 100.0, 100.0, 63.5, 47.5)
-SHUTTER = Shutter(readout_s=0.028)
-T_COLOR_DEPTH = se3.exp(np.array([-0.03, 0.0, 0.0, 0.0, 0.0, 0.0]))
-RADIUS = 0.33
-# Of a texture that does not repeat itself, rad/m.
-WAVES = np.random.default_rng(5).normal(0.0, 10.0, (3, 10))
-
-
-def center(t: FloatArray) -> FloatArray:
-    """Of a ball (..., 3) in the world: to and fro before the camera, at up to 0.6 m/s."""
-    t = np.asarray(t)
-    return np.stack([0.25 * np.sin(2.4 * t), -0.05 + 0.1 * np.cos(2.0 * t), 0.95 + 0.0 * t], axis=-1)
-
-
-def picture(spline: Spline, stamp: float, T_cam_body: FloatArray) -> tuple[FloatArray, FloatArray, Mask]:
-    """z (h, w), colours (h, w, 3) in 0..255 and where the ball is: a room with furniture, and a ball that passes."""
-    uv = CAMERA.pixel_grid()
-    t = SHUTTER.line_mid_time(stamp, SHUTTER.line_of_pixel(uv, CAMERA), CAMERA)
-    T = spline.pose(t) @ se3.inverse(T_cam_body)
-    p, d = T[..., :3, 3], np.einsum("...ij,...j->...i", T[..., :3, :3], CAMERA.unproject(uv))
-    room = synthetic.cast(p, d)
-    to_ball = center(t) - p
-    a, b = (d**2).sum(-1), (d * to_ball).sum(-1)
-    under = b**2 - a * ((to_ball**2).sum(-1) - RADIUS**2)
-    ball = (b - np.sqrt(np.maximum(under, 0.0))) / a
-    is_ball = (under > 0.0) & (ball > 0.0) & (ball < room)
-    z = np.where(is_ball, ball, room)
-    hit = p + d * z[..., None] - np.where(is_ball[..., None], center(t), 0.0)
-    waves = np.sin(np.where(is_ball[..., None], 1.5, 1.0) * (hit @ WAVES) + np.arange(WAVES.shape[1])).sum(axis=-1)
-    return z, np.repeat(127.5 + 30.0 * waves[..., None], 3, axis=-1), is_ball
-
 
 @dataclass(frozen=True)
 class Recording:
@@ -211,7 +209,7 @@ def recording() -> Recording:
         frames.append(Frame(Image(k / 30, z), (Image(k / 30 + 0.004, color),)))
         balls.append(ball)
     assert 0.1 < np.mean(balls) < 0.3
-    return Recording(Rig(CAMERA, SHUTTER, CAMERA, SHUTTER, T_COLOR_DEPTH), frames, balls, truth)
+    return Recording(RIG, frames, balls, truth)
 
 
 def test_a_ball_that_passes_is_left_out_of_frame_and_keyframe(recording: Recording) -> None:
@@ -230,12 +228,13 @@ def test_a_ball_that_passes_is_left_out_of_frame_and_keyframe(recording: Recordi
         assert left.depth.moving == pytest.approx(mask.mean(), abs=1e-6)
         assert left.depth.occluder is frames[k].depth
         depth, color = fresh
-        assert depth.image is left.depth and color.occluder is frames[k].depth
+        assert depth.image is left.depth and color.occluder is left.depth.hider
         kept = e.download(color.ref.inverse_depth, SIZE) > 0.0
         first = recording.balls[0]
         assert kept[_inner(first)].mean() < (0.3 if k == 2 else 0.1) and kept[~first].mean() > 0.85
         assert color.ref is depth.ref and (e.download(ref.inverse_depth, SIZE) > 0.0)[first].mean() > 0.8
-        assert [o.occluder for o in track.observe(replace(frames[k], depth=left.depth), ref)] == [None, frames[k].depth]
+        again = track.observe(replace(frames[k], depth=left.depth), ref)
+        assert [o.occluder for o in again] == [None, left.depth.hider]
         for o in fresh:
             o.linearise(track.terms, state, 0)
             assert o.lin.fit > 0.95
@@ -245,6 +244,25 @@ def test_a_ball_that_passes_is_left_out_of_frame_and_keyframe(recording: Recordi
         assert min(o.lin.fit for o in again) < 0.85
     made = track.maker.rectified(5, left.depth, frames[5].colors, recording.truth, ref)
     assert made.intensity is not None and np.isnan(made.intensity[_inner(recording.balls[5])]).all()
+
+
+def test_what_moves_hides_a_little_more_of_colours_than_of_depth(recording: Recording) -> None:
+    """By the time of the colour image it has moved: no point is compared with its own edge."""
+    track = Track(recording.rig, Options(backend="llvm"), untimed)
+    e, state = track.device.e, SplineState(recording.truth)
+    frames = [track.device.upload(k, frame) for k, frame in enumerate(recording.frames)]
+    ref = track.maker.rectified(0, frames[0].depth, frames[0].colors, recording.truth, None)
+    fresh = track.observe(frames[2], ref)
+    for o in fresh:
+        o.linearise(track.terms, state, 1)
+    (left,) = track.leave_out([frames[2]], ref, fresh, state)
+    exact, wide = (e.download(image.z, SIZE) for image in (left.depth.occluder, left.depth.hider))
+    assert (wide <= exact + 1e-6).all()
+    nearer = wide < exact - 0.05
+    about = cv2.dilate(recording.balls[2].astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    ring = about & (cv2.dilate(recording.balls[2].astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
+    assert nearer[~about].mean() < 0.01 and nearer[ring].mean() > 0.3
+    assert frames[2].depth.hider is frames[2].depth  # nothing left out: nothing made wider
 
 
 def test_what_is_told_not_to_look_does_not(recording: Recording) -> None:
@@ -291,3 +309,20 @@ def test_the_majority_is_what_rests(recording: Recording) -> None:
     ball = recording.balls[0]
     assert odd[ball].mean() > 0.3 and odd[~ball].mean() < 0.15
     assert not_with_most(device.e, frames[:1], device.rays) is None
+
+
+def test_the_majority_is_told_by_depth_where_there_are_no_colours(recording: Recording) -> None:
+    """A smaller ball: the large one and one wall are more than the rest, for who sees no colours."""
+    rng, frames = np.random.default_rng(3), []
+    for k in range(4):
+        z, _, ball = picture(recording.truth, k / 30, np.eye(4), radius=0.2)
+        frames.append(Frame(Image(k / 30, (z + rng.normal(0.0, 2e-3, z.shape)).astype(np.float32)), ()))
+        if k == 0:
+            first = ball
+    device = DeviceRig(recording.rig, Options(method="rs-g", backend="llvm"))
+    uploaded = [device.upload(k, frame) for k, frame in enumerate(frames)]
+    odd = not_with_most(device.e, uploaded, device.rays)
+    assert odd is not None
+    assert odd[first].mean() > 0.5 and odd[~first].mean() < 0.1
+    resting = [replace(frame, depth=uploaded[0].depth) for frame in uploaded]
+    assert not np.asarray(not_with_most(device.e, resting, device.rays)).any()

@@ -46,7 +46,7 @@ class Sees(Relocaliser):
     """Finds each frame where it is told."""
 
     def __init__(self, T_found: list[np.ndarray | None], fresh: Sequence[Any] = ()) -> None:
-        super().__init__(*[None] * 5)  # type: ignore[arg-type]
+        super().__init__(*[None] * 6)  # type: ignore[arg-type]
         self.T_found, self.fresh, self.started = list(T_found), list(fresh or [seen("depth"), seen("color")]), []
 
     def _searched(self, *_: Any) -> Any:
@@ -58,7 +58,7 @@ class Sees(Relocaliser):
         if T is None:
             return Fault.NO_PLACE
         spline = SimpleNamespace(pose=lambda _: T)
-        return Found(SimpleNamespace(spline=spline), self.fresh, Solved(), REF, before)  # type: ignore[arg-type]
+        return Found(SimpleNamespace(spline=spline), self.fresh, Solved(), REF, before, new.depth)  # type: ignore[arg-type]
 
 
 def frame(time: float) -> Any:

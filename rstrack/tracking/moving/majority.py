@@ -20,9 +20,10 @@ from rsgen.device.arrays import Engine
 from rsgen.geometry import se3
 from rstrack.alignment.free_space import grid_shape
 from rstrack.images.device_frame import DeviceFrame
+from rstrack.images.left_out import Mask
 from rstrack.images.pyramid import ColorImage
-from rstrack.keyframes.keyframe import on_one_surface
-from rstrack.tracking.moving.regions import Mask
+from rstrack.keyframes.keyframe import Image, on_one_surface
+from rstrack.tracking.moving.depth_majority import apart, averaged, goes_elsewhere
 
 # Points across the image, the window in which each is followed (px), and how far (px) following it back may miss it.
 _ACROSS, _WINDOW, _BACK_PX = 40, 15, 1.0
@@ -38,7 +39,7 @@ def not_with_most(e: Engine, frames: Sequence[DeviceFrame], rays: FloatArray) ->
     frames: in order; rays (h, w, 2): of the depth camera. Lines are taken to be exposed at once: pixels are asked for,
     not tenths.
     """
-    if len(frames) < 2 or not all(frame.colors for frame in frames):
+    if len(frames) < 2:
         return None
     first = frames[0].depth
     lens = first.exposure.lens
@@ -47,11 +48,35 @@ def not_with_most(e: Engine, frames: Sequence[DeviceFrame], rays: FloatArray) ->
     pick = (slice(step // 2, None, step), slice(step // 2, None, step))
     rho = e.download(first.inverse_z, shape)
     known = on_one_surface(rho)[pick]
-    z = 1.0 / np.where(known, rho[pick], 1.0)
-    p_depth = np.stack([rays[..., 0][pick] * z, rays[..., 1][pick] * z, z], axis=-1)
+
+    def points(rho: Image) -> FloatArray:
+        z = 1.0 / rho[pick][known]
+        return np.stack([rays[..., 0][pick][known] * z, rays[..., 1][pick][known] * z, z], axis=-1)
+
+    if all(frame.colors for frame in frames):
+        told = _by_colors(e, frames, points(rho))
+    else:
+        later = [e.download(frame.depth.inverse_z, shape) for frame in frames[1:]]
+        off = apart(points(averaged(rho)), later, rays, lens.camera)
+        told = np.isfinite(off), goes_elsewhere(off)
+    if told is None:
+        return None
+    good, elsewhere = told
+    if np.count_nonzero(good) < _FEWEST or np.count_nonzero(good & ~elsewhere) < _MAJORITY * np.count_nonzero(good):
+        return None
+    # +1: goes another way, -1: with most, 0: not known, to be told by those about it.
+    cells = np.zeros(known.shape, np.float32)
+    cells[known] = np.where(good, np.where(elsewhere, 1.0, -1.0), 0.0)
+    odd = np.where(cells == 0.0, cv2.blur(cells, (3, 3)), cells + 0.25 * cv2.blur(cells, (3, 3))) > 0.0
+    size = grid_shape(lens)[::-1]
+    return np.asarray(cv2.resize(odd.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0)
+
+
+def _by_colors(e: Engine, frames: Sequence[DeviceFrame], p_depth: FloatArray) -> tuple[Mask, Mask] | None:
+    """Which points (n, 3) of the first frame, in its depth camera, could be followed, and which go elsewhere."""
     exposure = frames[0].colors[0].exposure
     camera = exposure.lens.camera
-    p_color = se3.transform(exposure.T_cam_body, p_depth[known])
+    p_color = se3.transform(exposure.T_cam_body, p_depth)
     uv, _ = camera.project(p_color)
     followed, good = _follow([_grey(e, frame.colors[0]) for frame in frames], uv)
     good &= camera.contains(uv) & camera.contains(followed)
@@ -62,16 +87,11 @@ def not_with_most(e: Engine, frames: Sequence[DeviceFrame], rays: FloatArray) ->
         p_color[good], to, np.eye(3), None, iterationsCount=_TRIALS, reprojectionError=_MISS_PX / camera.fx,
         confidence=_CONFIDENCE, flags=cv2.SOLVEPNP_EPNP,
     )  # fmt: skip
-    if not found or inliers is None or len(inliers) < _MAJORITY * np.count_nonzero(good):
+    if not found or inliers is None:
         return None
-    # +1: goes another way, -1: with most, 0: not known, to be told by those about it.
-    votes = np.where(good, np.float32(1.0), np.float32(0.0))
-    votes[np.flatnonzero(good)[inliers[:, 0]]] = -1.0
-    cells = np.zeros(known.shape, np.float32)
-    cells[known] = votes
-    odd = np.where(cells == 0.0, cv2.blur(cells, (3, 3)), cells + 0.25 * cv2.blur(cells, (3, 3))) > 0.0
-    size = grid_shape(lens)[::-1]
-    return np.asarray(cv2.resize(odd.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0)
+    elsewhere = good.copy()
+    elsewhere[np.flatnonzero(good)[inliers[:, 0]]] = False
+    return good, elsewhere
 
 
 def _grey(e: Engine, image: ColorImage) -> npt.NDArray[np.uint8]:

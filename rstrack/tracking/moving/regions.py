@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from rstrack.alignment.free_space import Grid, Seen
+from rstrack.alignment.free_space import Free, Grid, Seen
+from rstrack.images.left_out import Mask
 from rstrack.images.sampling import EDGE
-
-Mask = npt.NDArray[np.bool_]
 
 # How far before what was seen (m, part of the depth, σ of depth there) a pixel has to stand to be in free space.
 _BEFORE_M, _BEFORE_SIGMAS = 0.02, 5.0
@@ -34,7 +32,7 @@ def moving(seen: Seen, sigma_depth: float, median_depth: float, sigma_intensity:
     scale, least = _scales(seen.z, sigma_depth, median_depth)
     far = np.nan_to_num(seen.free) > least
     seeds = _opened(far)
-    if np.count_nonzero(seeds) < _LEAST * seeds.size:
+    if not _is_enough(seeds):
         return np.zeros_like(seeds)
     # Behind what is seen there nothing is known.
     hidden = np.nan_to_num(seen.apart) < -least
@@ -42,6 +40,23 @@ def moving(seen: Seen, sigma_depth: float, median_depth: float, sigma_intensity:
     odd = far | _at_odds(depth, seen.intensity, sigma_intensity)
     grown = _grown(seeds, odd, hidden | ~np.isfinite(seen.apart), hidden | seen.outside, seen.z)
     return _widened(grown)
+
+
+def anything(near: Free, sigma_depth: float, median_depth: float) -> bool:
+    """Whether enough stands in free space for `moving` to find something."""
+    _, least = _scales(near.z, sigma_depth, median_depth)
+    return _is_enough(_opened(np.nan_to_num(near.free) > least))
+
+
+def _is_enough(seeds: Mask) -> bool:
+    return bool(np.count_nonzero(seeds) >= _LEAST * seeds.size)
+
+
+def untold(seen: Seen, sigma_depth: float, median_depth: float) -> Mask:
+    """Pixels (gh, gw) of which the other image says nothing: they fall into its holes, beyond it, or behind what it
+    shows."""
+    _, least = _scales(seen.z, sigma_depth, median_depth)
+    return np.asarray(np.isfinite(seen.z) & ~(seen.apart >= -least))
 
 
 def moving_with(seen: Seen, left_out: Mask, sigma_depth: float, median_depth: float) -> Mask:

@@ -33,6 +33,7 @@ _EVERY_S, _SHARE = 30.0, 0.03
 _PACKAGES = (
     "rsgen.device.", "rsgen.geometry.", "rstrack.adjustment.", "rstrack.alignment.", "rstrack.images.",
     "rstrack.inertial.", "rstrack.keyframes.", "rstrack.tracking.", "rstrack.volume.", "rstrack.data.rig.",
+    "rstrack.data.moving_masks.",
     "rstrack.options.", "collections.", "pathlib.",
 )  # fmt: skip
 _NAMES = {

@@ -144,6 +144,8 @@ def track(
     write_estimate(
         out, estimate.stamps, estimate.T_world_depth, estimate.spline, info, None if estimate is online else online
     )
+    if isinstance(found, Tracker):
+        found.left_out.write(out, done.fed)
     if checkpoint is not None and end != "interrupted":
         checkpoint.remove()
     left_out = tuple(problem for _, problem in done.unreadable)
