@@ -96,12 +96,13 @@ def refine_run(
     told = [asdict(r) for r in done]
     seconds = time.perf_counter() - begin
     info = estimate.info | {"refined": {"of": str(run.resolve()), "rounds": told, "seconds": seconds}}
-    result = Estimate(estimate.stamps, se3.orthonormalise(moved @ estimate.T_world_depth), spline, info)
+    result = Estimate(estimate.stamps, se3.orthonormalise(moved @ estimate.T_world_depth), spline, info, estimate.moving)
     truth = truth_of(dataset)
     before, after = (None if truth is None else _evaluated(truth, each) for each in (estimate, result))
     info["metrics"] = None if after is None else after.metrics.as_dict()
     info["truth_offset"] = None if after is None else after.truth_offset
     write_estimate(out, result.stamps, result.T_world_depth, spline, info, estimate)
+    result.moving.write(out, range(len(dataset)))
     return Refined(result, told, before, after, seconds)
 
 
@@ -126,6 +127,7 @@ def _refiner(dataset: Dataset, estimate: Estimate, options: Options, noise: Nois
     from rstrack.adjustment.refine import Refiner
     from rstrack.alignment.linearise import Terms
     from rstrack.images.device_frame import DeviceRig
+    from rstrack.images.left_out import frame_without
     from rstrack.keyframes.maker import KeyframeMaker
 
     device = DeviceRig(dataset.rig, options)
@@ -138,7 +140,8 @@ def _refiner(dataset: Dataset, estimate: Estimate, options: Options, noise: Nois
             return with_noise(frame, k, noise.sigma_depth, noise.sigma_intensity, noise.seed)
 
         for k, frame in zip(numbers, prefetched(read, numbers, 2), strict=True):
-            yield device.upload(k, frame)
+            uploaded, mask = device.upload(k, frame), estimate.moving.grid(k)
+            yield uploaded if mask is None else frame_without(device.e, uploaded, mask, estimate.moving.stride)
 
     numbers = _known_frames(dataset, estimate)
     if len(numbers) < 2:
