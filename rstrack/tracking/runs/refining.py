@@ -96,7 +96,8 @@ def refine_run(
     told = [asdict(r) for r in done]
     seconds = time.perf_counter() - begin
     info = estimate.info | {"refined": {"of": str(run.resolve()), "rounds": told, "seconds": seconds}}
-    result = Estimate(estimate.stamps, se3.orthonormalise(moved @ estimate.T_world_depth), spline, info, estimate.moving)
+    poses = se3.orthonormalise(moved @ estimate.T_world_depth)
+    result = Estimate(estimate.stamps, poses, spline, info, estimate.moving)
     truth = truth_of(dataset)
     before, after = (None if truth is None else _evaluated(truth, each) for each in (estimate, result))
     info["metrics"] = None if after is None else after.metrics.as_dict()
