@@ -113,13 +113,15 @@ def test_a_clock_is_not_looked_for_with_colours_whatever_seems_to_move(
 
 
 @needs_rpy
-@pytest.mark.parametrize("frames", [range(60, 120), range(195)], ids=["a second", "all"])
-def test_the_offset_of_a_kinect(tmp_path: Path, frames: range) -> None:
+@pytest.mark.parametrize(
+    ("frames", "sigma_s"), [(range(60, 120), 3e-3), (range(195), 5e-3)], ids=["two seconds", "all of it"]
+)
+def test_the_offset_of_a_kinect(tmp_path: Path, frames: range, sigma_s: float) -> None:
     """SOURCE.md: about 22 ms, found by trial with stamps straightened over all of the recording."""
     camera = "color: {width: 640, height: 480, intrinsics: [525, 525, 319.5, 239.5], readout_s: 0.03}"
     (tmp_path / "camera.yaml").write_text(camera)
     found = estimate_color_offset(open_dataset(RPY, tmp_path / "camera.yaml"), frames)
-    assert not found.reason and 0.015 < found.offset_s < 0.026 and found.sigma_s < 5e-3
+    assert not found.reason and 0.015 < found.offset_s < 0.026 and found.sigma_s < sigma_s
 
 
 def test_what_the_motion_does_not_tell_is_left_open(shaken: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
