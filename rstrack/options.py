@@ -165,8 +165,13 @@ class Options:
 
     def remoteness(self, T_base_cam: FloatArray) -> float:
         """The larger of distance and angle of a camera at T_base_cam (4, 4), each over where a keyframe is left."""
-        distance, angle = np.linalg.norm(T_base_cam[:3, 3]), np.linalg.norm(se3.log(T_base_cam)[3:])
-        return float(max(distance / self.keyframe_distance, np.degrees(angle) / self.keyframe_angle_deg))
+        return float(self.remoteness_of_each(T_base_cam))
+
+    def remoteness_of_each(self, T_base_cam: FloatArray) -> FloatArray:
+        """The same (...) of cameras at T_base_cam (..., 4, 4)."""
+        distance = np.linalg.norm(T_base_cam[..., :3, 3], axis=-1)
+        angle = np.degrees(np.linalg.norm(se3.log(T_base_cam)[..., 3:], axis=-1))
+        return np.asarray(np.maximum(distance / self.keyframe_distance, angle / self.keyframe_angle_deg))
 
 
 @dataclass(frozen=True)

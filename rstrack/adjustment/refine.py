@@ -49,7 +49,6 @@ _UNMOVED = 1e14
 # Furthest that a pose moves (m) in a round after which no other is worth it.
 _STILL = 2e-5
 
-
 # A keyframe that a frame is near, by its number, and the weight of what the frame says against it.
 Near = list[tuple[int, float]]
 
@@ -107,7 +106,7 @@ class Refiner:
         self._sharing = sum(map(len, near)) / len(anchors)
         keyframes = self._fused(spline, anchors, near, told)
         state = SplineState(spline)
-        told_of: dict[int, _Told] = {}
+        against: dict[int, _Against] = {}
         kept: list[_Figures] = []
         pairs = 0
         for n, frame in enumerate(self.load(self.frames)):
@@ -115,11 +114,11 @@ class Refiner:
                 good = self._linearised(frame, keyframes[k], state)
                 pairs += bool(good)
                 for o in good:
-                    told_of.setdefault(k, _Told()).add(self._told(o, state, frame).scaled(weight))
+                    against.setdefault(k, _Against()).add(self._model(o, state, frame).scaled(weight))
                     kept.append(_Figures.of(o))
             told(0.5 + 0.5 * (n + 1) / len(self.frames), f"{pairs} pairs")
-        at = State(spline, {k: keyframes[k].T_world_base for k in sorted(told_of)})
-        seen = [told_of[k].seen(k) for k in at.keyframes]
+        at = State(spline, {k: keyframes[k].T_world_base for k in sorted(against)})
+        seen = [against[k].seen(k) for k in at.keyframes]
         after, _ = Graph(at, seen, (), keeps_motion=False).step(at)
         moved = after.placed(spline.pose(self.begin) @ se3.inverse(after.spline.pose(self.begin))).spline
         shift = np.linalg.norm((moved.pose(self.times) - spline.pose(self.times))[:, :3, 3], axis=1)
@@ -132,9 +131,8 @@ class Refiner:
         """A keyframe of each anchor, with the depth of all frames near it, wherever these come in the recording."""
         numbers = [self.frames[a] for a in anchors]
         note = f"{len(anchors)} keyframes"
-        made = [
-            self.maker.rectified(frame.index, frame.depth, frame.colors, spline, None) for frame in self.load(numbers)
-        ]
+        # Colours are looked up once depth is known.
+        made = [self.maker.rectified(frame.index, frame.depth, (), spline, None) for frame in self.load(numbers)]
         fused = list(made)
         for n, frame in enumerate(self.load(self.frames)):
             for k, _ in near[n]:
@@ -172,7 +170,7 @@ class Refiner:
                     self._brightness[ref.index] = o.brightness(state)
         return good
 
-    def _told(self, o: Observation, state: SplineState, frame: DeviceFrame) -> Quadratic:
+    def _model(self, o: Observation, state: SplineState, frame: DeviceFrame) -> Quadratic:
         """The model of an image against a keyframe; colours may be drawn along by it, as are all that see it.
 
         What all n images of a keyframe have in common in their errors does not average out: with a covariance n times
@@ -201,7 +199,7 @@ class Refiner:
 
 
 @dataclass
-class _Told:
+class _Against:
     """What frames say against one keyframe."""
 
     band: Band = field(default_factory=Band)
@@ -257,7 +255,7 @@ def _grid(T: FloatArray, options: Options) -> tuple[IntArray, list[Near]]:
     for n in range(len(T)):
         if nearest[n] > _GRID:
             anchors.append(n)
-            remote = np.column_stack([remote, _remoteness(T[n], T, options)])
+            remote = np.column_stack([remote, options.remoteness_of_each(se3.inverse(T[n]) @ T)])
             nearest = np.minimum(nearest, remote[:, -1])
     order = np.argsort(remote, axis=1, kind="stable")[:, :_MOST]
     near = []
@@ -266,14 +264,6 @@ def _grid(T: FloatArray, options: Options) -> tuple[IntArray, list[Near]]:
         weight = (1.0 - np.minimum(r / _SEEN, 1.0) ** 2) ** 2
         near.append([(int(k), float(w)) for k, w in zip(row, weight / max(weight.sum(), 1e-9), strict=True) if w > 0])
     return np.array(anchors), near
-
-
-def _remoteness(T_base: FloatArray, T: FloatArray, options: Options) -> FloatArray:
-    """`Options.remoteness` of poses (n, 4, 4) from a keyframe's."""
-    between = se3.inverse(T_base) @ T
-    distance = np.linalg.norm(between[:, :3, 3], axis=1) / options.keyframe_distance
-    angle = np.degrees(np.linalg.norm(se3.log(between)[:, 3:], axis=1)) / options.keyframe_angle_deg
-    return np.asarray(np.maximum(distance, angle))
 
 
 def _spread(o: Observation) -> float:

@@ -105,6 +105,14 @@ class Evaluation:
         return f"the truth {size}{spread} ms {side} the stamps"
 
 
+def evaluated(truth: Truth | None, estimate: Estimate) -> Evaluation | None:
+    """`evaluate_clocks`; None without a truth, and where fewer than three poses have a true counterpart."""
+    try:
+        return None if truth is None else evaluate_clocks(truth, estimate)
+    except UserError:
+        return None
+
+
 def evaluate_clocks(truth: Truth, estimate: Estimate, offset: TruthOffset | None = None) -> Evaluation:
     """Evaluate with the clocks as they are, and with an offset: given, found, or None.
 

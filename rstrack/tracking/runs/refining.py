@@ -23,8 +23,8 @@ from rstrack.data.estimate import INFO, Estimate, write_estimate
 from rstrack.data.noise import with_noise
 from rstrack.data.prefetch import prefetched
 from rstrack.data.rig import Frame
-from rstrack.metrics.association import Truth, truth_of
-from rstrack.metrics.run_evaluate import Evaluation, evaluate_clocks
+from rstrack.metrics.association import truth_of
+from rstrack.metrics.run_evaluate import Evaluation, evaluated
 from rstrack.metrics.tracked import load_run
 from rstrack.options import Options
 from rstrack.tracking.runs.record import Noise
@@ -99,7 +99,7 @@ def refine_run(
     poses = se3.orthonormalise(moved @ estimate.T_world_depth)
     result = Estimate(estimate.stamps, poses, spline, info, estimate.moving)
     truth = truth_of(dataset)
-    before, after = (None if truth is None else _evaluated(truth, each) for each in (estimate, result))
+    before, after = (evaluated(truth, each) for each in (estimate, result))
     info["metrics"] = None if after is None else after.metrics.as_dict()
     info["truth_offset"] = None if after is None else after.truth_offset
     write_estimate(out, result.stamps, result.T_world_depth, spline, info, estimate)
@@ -182,11 +182,3 @@ def _usual(info: dict[str, Any]) -> Usual:
         float(np.median(of["sigma_depth_m"])) / _TYPICAL_M**2 if of["sigma_depth_m"] else _USUAL_DEPTH,
         float(np.median(of["sigma_intensity"])) if of["sigma_intensity"] else _USUAL_INTENSITY,
     )
-
-
-def _evaluated(truth: Truth, estimate: Estimate) -> Evaluation | None:
-    """None where fewer than three poses have a true counterpart."""
-    try:
-        return evaluate_clocks(truth, estimate)
-    except UserError:
-        return None

@@ -29,7 +29,7 @@ from rstrack.data.prefetch import prefetched
 from rstrack.data.rig import Frame
 from rstrack.inertial import record as imu_record
 from rstrack.metrics.association import Truth, compare, truth_of
-from rstrack.metrics.run_evaluate import Evaluation, evaluate_clocks
+from rstrack.metrics.run_evaluate import Evaluation, evaluated
 from rstrack.options import Options
 from rstrack.tracking.any_tracker import AnyTracker, make_tracker
 from rstrack.tracking.runs.record import Done, Noise, diagnostics, settings, timings
@@ -135,11 +135,11 @@ def track(
             online = _upright(online)
             estimate = online if is_same else _upright(estimate)
             info["imu"]["gravity"] = [0.0, 0.0, -float(np.linalg.norm(info["imu"]["gravity"]))]
-    evaluation, before = _evaluation(truth, estimate), None
+    evaluation, before = evaluated(truth, estimate), None
     info["metrics"] = None if evaluation is None else evaluation.metrics.as_dict()
     info["truth_offset"] = None if evaluation is None else evaluation.truth_offset
     if estimate is not online:
-        before = _evaluation(truth, online)
+        before = evaluated(truth, online)
         info["metrics_online"] = None if before is None else before.metrics.as_dict()
     write_estimate(
         out, estimate.stamps, estimate.T_world_depth, estimate.spline, info, None if estimate is online else online
@@ -324,11 +324,3 @@ def _error_note(truth: Truth | None, poses: tuple[FloatArray, FloatArray]) -> st
     except UserError:
         return ""  # fewer than three poses
     return f", ATE {1e3 * np.sqrt(np.mean(errors**2)):.2f} mm"
-
-
-def _evaluation(truth: Truth | None, estimate: Estimate) -> Evaluation | None:
-    """None also where fewer than three poses have a true counterpart."""
-    try:
-        return None if truth is None else evaluate_clocks(truth, estimate)
-    except UserError:
-        return None
