@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from loop_room import OPTIONS, make_dataset
+from loop_room import FRAMES, OPTIONS, make_dataset
 
 from rsgen.errors import UserError
 from rsgen.geometry import se3
@@ -17,7 +18,9 @@ from rstrack.adjustment.refine import doubted
 from rstrack.alignment.normal_equations import Quadratic
 from rstrack.cli.main import main
 from rstrack.data.estimate import read_estimate
+from rstrack.metrics.tracked import load_run
 from rstrack.report.build import write_report
+from rstrack.tracking.runs import refining
 from rstrack.tracking.runs.record import Noise
 from rstrack.tracking.runs.refining import refine_run
 from rstrack.tracking.runs.run import track
@@ -111,3 +114,16 @@ def test_a_doubted_image_is_one_whose_offset_is_an_unknown_too() -> None:
     # Surely where it is, nothing changes.
     same = doubted(Quadratic(4, A.T @ A, -A.T @ b), to_world, 1e14 * np.eye(6))
     np.testing.assert_allclose(same.H, A.T @ A, atol=1e-8)
+
+
+def test_a_frame_whose_colours_come_too_late_for_the_spline_is_refined_by_its_depth(run: Path) -> None:
+    tracked = load_run(run)
+    assert tracked.dataset is not None and tracked.estimate.spline is not None
+    known = refining._known_frames(tracked.dataset, tracked.estimate)
+    assert len(known) >= FRAMES - 1
+    late = replace(tracked.dataset, color_stamps=tracked.dataset.color_stamps + 0.007)
+    assert refining._known_frames(late, tracked.estimate) == known
+    # Of those colours no line is asked for.
+    end = tracked.estimate.info["spline_valid"][-1][1]
+    assert refining._is_covered(tracked.estimate, end - 0.02, 0.019)
+    assert not refining._is_covered(tracked.estimate, end - 0.02, 0.03)

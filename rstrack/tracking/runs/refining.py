@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -17,6 +17,8 @@ from rsgen.console.progress import Progress, no_progress
 from rsgen.device.arrays import engine
 from rsgen.errors import UserError
 from rsgen.geometry import se3
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter
 from rstrack.adjustment.rigid import Usual
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import INFO, Estimate, write_estimate
@@ -132,13 +134,15 @@ def _refiner(dataset: Dataset, estimate: Estimate, options: Options, noise: Nois
     from rstrack.keyframes.maker import KeyframeMaker
 
     device = DeviceRig(dataset.rig, options)
+    color_s = _span_s(dataset.rig.color_camera, dataset.rig.color_shutter)
 
     def load(numbers: Sequence[int]) -> Iterator[DeviceFrame]:
         def read(k: int) -> Frame:
             frame, problems = dataset.readable_frame(k, color=options.photometric)
             if frame is None:
                 raise UserError(f"{problems[0]}, though it could be read before")
-            return with_noise(frame, k, noise.sigma_depth, noise.sigma_intensity, noise.seed)
+            colors = tuple(c for c in frame.colors if _is_covered(estimate, c.stamp, color_s))
+            return with_noise(replace(frame, colors=colors), k, noise.sigma_depth, noise.sigma_intensity, noise.seed)
 
         for k, frame in zip(numbers, prefetched(read, numbers, 2), strict=True):
             uploaded, mask = device.upload(k, frame), estimate.moving.grid(k)
@@ -154,21 +158,24 @@ def _refiner(dataset: Dataset, estimate: Estimate, options: Options, noise: Nois
 
 
 def _known_frames(dataset: Dataset, estimate: Estimate) -> list[int]:
-    """Frames that were tracked, of which all lines are where the spline is known."""
+    """Frames that were tracked, of whose depth all lines are where the spline is known."""
     tracked = {round(float(stamp), 6) for stamp in estimate.stamps}
-    rig, known = dataset.rig, []
-    # From the first line to the last.
-    span_depth = (rig.depth_shutter.line_count(rig.depth_camera) - 1) * rig.depth_shutter.line_delay(rig.depth_camera)
-    span_color = (rig.color_shutter.line_count(rig.color_camera) - 1) * rig.color_shutter.line_delay(rig.color_camera)
-    for k, stamp in enumerate(dataset.stamps):
-        if round(float(stamp), 6) not in tracked:
-            continue
-        colors = [float(dataset.color_stamps[i]) for i in dataset.groups[k]]
-        first = min([float(stamp), *colors])
-        last = max([stamp + span_depth, *(c + span_color for c in colors)])
-        if estimate.spline_covers([first + _SLACK_S, 0.5 * (first + last), last - _SLACK_S]).all():
-            known.append(k)
-    return known
+    depth_s = _span_s(dataset.rig.depth_camera, dataset.rig.depth_shutter)
+    return [
+        k for k, stamp in enumerate(dataset.stamps)
+        if round(float(stamp), 6) in tracked and _is_covered(estimate, float(stamp), depth_s)
+    ]  # fmt: skip
+
+
+def _span_s(camera: Camera, shutter: Shutter) -> float:
+    """Seconds from the first line to the last."""
+    return (shutter.line_count(camera) - 1) * shutter.line_delay(camera)
+
+
+def _is_covered(estimate: Estimate, stamp: float, span_s: float) -> bool:
+    """Whether the spline is known for all lines of an image; of the last frame's colours it often is not."""
+    first, last = stamp + _SLACK_S, stamp + span_s - _SLACK_S
+    return bool(estimate.spline_covers([first, 0.5 * (first + last), last]).all())
 
 
 def _usual(info: dict[str, Any]) -> Usual:
