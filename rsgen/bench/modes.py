@@ -25,7 +25,8 @@ from rsgen.config.config import Config
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
 from rsgen.geometry.shutter import Shutter
-from rsgen.produce.generate import engine_versions, load_motion
+from rsgen.produce.generate import engine_versions
+from rsgen.produce.ground_truth import load_motion
 
 MODES = ("still", "rs-blur", "path", "rows", "averaged")
 BLENDER_MODES = ("blender-still", "blender")

@@ -16,7 +16,7 @@ from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
 from rsgen.geometry.shutter import Shutter
 from rsgen.produce.frame_source import load_scene, make_integrator
-from rsgen.produce.generate import Motion, load_motion
+from rsgen.produce.ground_truth import Motion, load_motion
 
 PSNR_FLOOR_DB = 36.0
 _REFERENCE_DEPTH = 64  # path length of the reference; Russian roulette ends most paths long before

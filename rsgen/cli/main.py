@@ -168,7 +168,7 @@ def stats(
     from rsgen.config.config import load_config
     from rsgen.motion.statistics import motion_statistics
     from rsgen.motion.table import stats_table
-    from rsgen.produce.generate import load_motion
+    from rsgen.produce.ground_truth import load_motion
 
     rows = []
     for file in configs:

@@ -91,7 +91,7 @@ class LightConfig(Section):
         default=64,
         ge=1,
         le=4096,
-        description="samples of each lamp per irradiance sample: an eighth where that will do, at most twice as many",
+        description="samples of each lamp per irradiance sample: a sixteenth where that will do, at most twice as many",
     )
     target_db: float = Field(
         default=40.0, ge=20, le=70,

@@ -33,7 +33,6 @@ from rsgen.light.drawing.lamps import first_look, lamp_light
 from rsgen.light.drawing.rounds import GREY_SLOPE, PATCH, scatter_of, typical
 from rsgen.light.drawing.sky import has_sky_light, sky_light
 from rsgen.light.drawing.specular import passes_light_on
-from rsgen.light.estimate import estimated_db
 from rsgen.light.places.bake_points import Interpolation, sample_points, thin
 from rsgen.light.places.denoise import denoised
 from rsgen.render.irradiance import Lattice
@@ -42,7 +41,7 @@ log = logging.getLogger("rsgen")
 
 
 # Raise when the method changes, so that older caches are not taken for new ones.
-METHOD = 3
+METHOD = 4
 _FINE_TEXELS = 0.9  # direct light is computed at points at least about this far apart
 _FIRST_LOOK_RAYS = 12
 _FIRST_LOOK_BOUNCES = 2
@@ -75,11 +74,8 @@ def bake(scene: Any, lattice: Lattice, light: LightConfig, progress: Progress) -
     def lit_by(light_of_fine: Float32Array) -> Any:
         return surfaces.field(at_points(light_of_fine), alive_point)
 
-    report = _reporter(progress, 0.6, 0.37, "light off surfaces")
+    report = _reporter(progress, 0.6, 0.4, "light off surfaces")
     total = direct + light_off_surfaces(surfaces, fine, direct, lit_by, light, _OF_THE_WHOLE * scatter, report)
-    progress("light", 0.97, "how right it is")
-    reached = estimated_db(scene, lit_by(total), light.texel_m)
-    log.info("light baked, by estimate to %.0f dB on mid-grey surfaces (light.target_db: %g)", reached, light.target_db)
     progress("light", 1.0, "light baked")
     return surfaces.sides(at_points(total), alive_point)
 
@@ -97,14 +93,14 @@ def _direct(
     grey = rough.mean(axis=1)
     beside = grey + _AMBIENT * typical(grey)
     patch = thin(points, PATCH * light.texel_m, fine)[1]
-    means, left = np.zeros((2, len(fine), 3)), np.zeros(len(fine))
+    means, left = np.zeros((2, len(fine), 3), np.float32), np.zeros(len(fine))
     if has_sky_light(scene):
         report = _reporter(progress, 0.07, 0.18, "light of the sky and off mirrors")
         means, left = sky_light(
             scene, points, fine, patch, light.texel_m, light.direct_samples, follow, beside, scatter, report
         )
         log.info("light of the sky: %.0f dB before smoothing", _as_db(left))
-    seen = (rough + means.mean(axis=0)).astype(np.float32)
+    seen = rough + means.mean(axis=0)
     alive = _reached(surfaces, fine, fine_of_point, seen, _reporter(progress, 0.25, 0.05, "finding lit surfaces"))
     if not alive.any():
         raise UserError("the scene is dark: no light reaches any surface; add an emitter or move it into the open")

@@ -9,6 +9,7 @@ import logging
 import os
 import zipfile
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,8 @@ from rsgen.config.config import LightConfig
 from rsgen.console.configs import user_cache
 from rsgen.console.progress import Progress
 from rsgen.light.bake import METHOD, bake
+from rsgen.light.estimate import estimated_quality
+from rsgen.light.sight import Sight
 from rsgen.render.irradiance import IrradianceField, Lattice, make_field, make_lattice
 
 log = logging.getLogger("rsgen")
@@ -27,8 +30,14 @@ log = logging.getLogger("rsgen")
 _SIDES = ("front", "back")
 
 
-def baked_field(scene: Any, scene_hash: str, light: LightConfig, cache: Path, progress: Progress) -> IrradianceField:
-    """The scene's irradiance: from `cache` (a folder) if it was baked with the same inputs before, else baked now."""
+def baked_field(
+    scene: Any, scene_hash: str, light: LightConfig, cache: Path, progress: Progress,
+    sight: Callable[[], Sight] | None = None,
+) -> IrradianceField:  # fmt: skip
+    """The scene's irradiance: from `cache` (a folder) if it was baked with the same inputs before, else baked now.
+
+    sight: lines along which it will be seen; with them, how right a new bake is there is told.
+    """
     lattice = make_lattice(scene, light.texel_m)
     key = cache_key(scene_hash, light)
     path = cache / f"irradiance-{key}.npz"
@@ -38,7 +47,12 @@ def baked_field(scene: Any, scene_hash: str, light: LightConfig, cache: Path, pr
         _store(path, front, back)
     else:
         front, back = stored
-    return make_field(lattice, front, back)
+    field = make_field(lattice, front, back)
+    if stored is None and sight is not None:
+        progress("light", 1.0, "how right it is")
+        quality = estimated_quality(scene, field, light.texel_m, sight())
+        log.info("light baked: %s (light.target_db: %g)", quality, light.target_db)
+    return field
 
 
 def cache_key(scene_hash: str, light: LightConfig) -> str:

@@ -24,7 +24,8 @@ from rsgen.pack.draw import Drawn, PackOptions, draw_sequence
 from rsgen.pack.layout import mark_file, pair_files
 from rsgen.pack.sequence import Stage, gyro_samples, load_stage, mean_twist, render_pairs
 from rsgen.produce.distribute import engine_versions
-from rsgen.produce.generate import input_hashes, load_motion
+from rsgen.produce.generate import input_hashes
+from rsgen.produce.ground_truth import load_motion
 from rsgen.produce.identity import fingerprint
 from rsgen.sensors.imu import imu_csv
 

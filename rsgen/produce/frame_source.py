@@ -19,6 +19,7 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.spline import Spline
+from rsgen.produce.ground_truth import lines_of_sight
 from rsgen.produce.identity import fingerprint
 from rsgen.produce.moving import lit_objects, load_meshes
 from rsgen.sensors.adaptation import Meter, Reading, Setting, reading
@@ -212,7 +213,8 @@ def make_integrator(mi: Any, scene: Any, config: Config, progress: Progress, obj
     from rsgen.render.baked import BakedIntegrator
 
     try:
-        field = baked_field(scene, surfaces_hash(config), light, cache_folder(config.scene.file), progress)
+        cache = cache_folder(config.scene.file)
+        field = baked_field(scene, surfaces_hash(config), light, cache, progress, lambda: lines_of_sight(config))
     except UserError as error:
         told = str(error)
         raise UserError(told if told.startswith("scene ") else f"scene {config.scene.file}: {told}") from None

@@ -5,96 +5,37 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rsgen.array_types import FloatArray
-from rsgen.config.config import Config, TrajectoryConfig
+from rsgen.config.config import Config
 from rsgen.console.progress import Progress
 from rsgen.console.scheduler import Workers
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_yaml
-from rsgen.geometry.spline import Spline
 from rsgen.motion.clearance import check_clearance
-from rsgen.motion.fit import FitResult, fit_spline
-from rsgen.motion.make import make_motion
-from rsgen.motion.tremor import with_tremor
 from rsgen.produce.distribute import engine_versions, render_blocks, render_shots
 from rsgen.produce.frame_source import FrameSource, load_scene, scene_hash
+from rsgen.produce.ground_truth import Motion, load_motion
 from rsgen.produce.moving import (
     check_clear_of_camera,
     load_meshes,
     object_hashes,
     object_mesh_ply,
-    object_splines,
 )
 from rsgen.produce.writer import SequenceWriter
 from rsgen.sensors.adaptation import Reading, Setting, adapt
 from rsgen.sequence.format import STREAMS, stream_stamps
 from rsgen.sequence.object_files import mesh_file
-from rsgen.sequence.trajectory import Trajectory, read_trajectory
 
 log = logging.getLogger("rsgen")
-
-# About 12 days. Up to here a float64 tells 0.1 ns apart; in Unix time 0.24 us, half a percent of a line delay.
-_LARGEST_STAMP_S = 1e6
 
 # What a sequence folder remembers of the machine that rendered it, for commands that render again. Not part of the
 # format: a sequence is whole without it.
 ORIGIN = "origin.yaml"
-
-
-@dataclass(frozen=True)
-class Motion:
-    """The ground truth of a config: fitted spline of the body (depth camera), recorded stamps, and `fit`.
-
-    fit: of the recorded or made trajectory, before any tremor: what it missed. objects: T_world_object(t) of the
-    config's.
-    """
-
-    spline: Spline
-    fit: FitResult
-    first_stamp: float
-    last_stamp: float
-    objects: tuple[Spline, ...] = ()
-
-
-def load_motion(config: Config) -> Motion:
-    """Read or make, place and fit the config's trajectory; the spline covers every line of every frame.
-
-    Stamps stay those of the file unless they are too large to time a line by (Unix time): then the first becomes 0.
-    Raises UserError naming the trajectory's file and line, or what a motion cannot meet.
-    """
-    settings = config.trajectory
-    trajectory = make_motion(config.motion, config.seed) if config.motion is not None else _recorded(settings)
-    if settings.T_world_file is not None:
-        trajectory = trajectory.moved(np.asarray(settings.T_world_file, float))
-    spacing = settings.knot_spacing_s
-    recorded = None
-    if config.tremor is not None:
-        recorded = fit_spline(trajectory, dt=spacing, smoothing=settings.smoothing)
-        trajectory, spacing = with_tremor(recorded.spline, config.tremor, config.seed, trajectory.stamps[[0, -1]])
-    streams = (config.color, config.depth)
-    before = max(s.longest_exposure_s - min(s.offset_s, 0.0) for s in streams)
-    after = max(s.readout_s for s in streams)
-    fit = fit_spline(
-        trajectory, dt=spacing, smoothing=settings.smoothing if recorded is None else 0.0, pad_begin_s=before,
-        pad_end_s=after,
-    )  # fmt: skip
-    first, last = float(trajectory.stamps[0]), float(trajectory.stamps[-1])
-    return Motion(fit.spline, recorded or fit, first, last, object_splines(config, first, last))
-
-
-def _recorded(settings: TrajectoryConfig) -> Trajectory:
-    assert settings.file is not None  # or there were a motion
-    trajectory = read_trajectory(settings.file, format=settings.format, icl_start=settings.icl_start)
-    if np.abs(trajectory.stamps).max() >= _LARGEST_STAMP_S:
-        log.info("%s: large stamps, so time counts from the first, %.9f s", settings.file, trajectory.stamps[0])
-        trajectory = trajectory.rebased()
-    return trajectory
 
 
 def sequence_stamps(config: Config, motion: Motion) -> dict[str, FloatArray]:

@@ -27,7 +27,8 @@ from rsgen.motion.gaze import choose_targets, seen_distances
 from rsgen.motion.make import least_turning
 from rsgen.motion.statistics import motion_statistics
 from rsgen.motion.walk import free_region, ring, walk_inside
-from rsgen.produce.generate import load_motion, scene_triangles
+from rsgen.produce.generate import scene_triangles
+from rsgen.produce.ground_truth import load_motion
 
 _STOREYS = 6  # floors that are looked at, the largest first
 _LARGE = 0.3  # of the scene's ground, what walls enclose where the scene is a room

@@ -25,7 +25,7 @@ REACH_LEVELS = 31  # how far a sample counts towards a neighbour: level / 30 of 
 FREE = REACH_LEVELS  # and this, beyond the neighbour: nothing stands between
 _BLOCKED = 1e-4  # weight of a sample that something stands before: it counts where no other does
 _MAX_CELLS = 4095  # cells along one grid axis: 12 bits
-_POINT_BYTES = 300  # of memory that baking takes at its peak for each point, as measured
+_POINT_BYTES = 400  # of memory that baking takes at its peak for each point, as measured
 _MOST_POINTS = int(4e9 / _POINT_BYTES)
 
 

@@ -23,7 +23,8 @@ from rsgen.console import scheduler
 from rsgen.console.scheduler import DaskWorkers, InProcess, open_workers
 from rsgen.errors import UserError
 from rsgen.produce.distribute import RenderJob, SequenceRecipe, engine_versions, render_block
-from rsgen.produce.generate import input_hashes, load_motion, render_sequence, sequence_stamps
+from rsgen.produce.generate import input_hashes, render_sequence, sequence_stamps
+from rsgen.produce.ground_truth import load_motion
 from rsgen.sequence.reader import read_sequence
 
 FRAMES = 15  # 30 images, 4 blocks

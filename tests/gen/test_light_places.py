@@ -27,8 +27,9 @@ from lit import (
 from rsgen import srgb
 from rsgen.config.config import LightConfig
 from rsgen.light import cache as lighting
-from rsgen.light.estimate import estimated_db
+from rsgen.light.estimate import estimated_quality
 from rsgen.light.places.walls import find_covered
+from rsgen.light.sight import Sight
 from rsgen.render.irradiance import lattice_barycentric, make_field, make_lattice
 from rsgen.render.scene import surface
 
@@ -204,18 +205,41 @@ def test_what_lies_right_under_a_sheet_is_covered(tmp_path: Path) -> None:
     assert not find_covered(scene, p, up, 0.003).any() and not find_covered(scene, p, -up, 0.005).any()
 
 
+def from_above(xy: np.ndarray) -> Sight:
+    """Down on the floor at xy (n, 2)."""
+    return Sight(np.column_stack([xy, np.full(len(xy), 0.3)]), np.tile(-UP, (len(xy), 1)))
+
+
 def test_the_estimate_is_the_error_that_is_there(tmp_path: Path) -> None:
     """A tenth too bright everywhere on the floor, exposed so that half of it is brighter than a reflectance of 0.18."""
     scene = scene_of(tmp_path, FLOOR, QUAD)
     lattice, front, back = bake(scene, texel_m=0.04, direct_samples=256, target_db=50)
-    assert estimated_db(scene, make_field(lattice, front, back), 0.04) > 44
-    off = np.array([1.1, 1.1, 1.1, 1.0], np.float32)
     xy = np.random.default_rng(5).uniform(-1, 1, (4000, 2))
+    good = estimated_quality(scene, make_field(lattice, front, back), 0.04, from_above(xy))
+    assert good.psnr_db > good.at_least_db > 44
+    off = np.array([1.1, 1.1, 1.1, 1.0], np.float32)
     light = quad_factor(np.column_stack([xy, np.zeros(len(xy))]))[:, None] * [1.0, 2.0, 3.0]
     shown = 0.18 * light / np.median(light.mean(axis=1))
-    error = srgb.encode(np.clip(1.1 * shown, 0, 1)) - srgb.encode(np.clip(shown, 0, 1))
-    expected = -10 * np.log10(np.mean(error**2))
-    assert estimated_db(scene, make_field(lattice, front * off, back * off), 0.04) == pytest.approx(expected, abs=1.0)
+    square = (srgb.encode(np.clip(1.1 * shown, 0, 1)) - srgb.encode(np.clip(shown, 0, 1))) ** 2
+    poor = estimated_quality(scene, make_field(lattice, front * off, back * off), 0.04, from_above(xy))
+    assert poor.psnr_db == pytest.approx(-10 * np.log10(square.mean()), abs=0.3)
+    sure = square.mean() + 2 * square.mean(axis=1).std() / np.sqrt(len(xy))
+    assert poor.at_least_db == pytest.approx(-10 * np.log10(sure), abs=0.3)
+
+
+def test_the_estimate_counts_what_is_seen(tmp_path: Path) -> None:
+    """Light that is wrong on one half of the floor is told of where that half is looked at, and only there."""
+    scene = scene_of(tmp_path, FLOOR, QUAD)
+    lattice, front, back = bake(scene, texel_m=0.04, direct_samples=256, target_db=50)
+    left = lattice_positions(scene, lattice)[:, 0] < 0
+    front[left, :3] *= 1.3
+    field = make_field(lattice, front, back)
+    xy = np.random.default_rng(6).uniform(-1, 1, (1000, 2))
+    for x, right in ((-0.05 - abs(xy[:, 0] * 0.9), False), (0.05 + abs(xy[:, 0] * 0.9), True)):
+        quality = estimated_quality(scene, field, 0.04, from_above(np.column_stack([x, xy[:, 1]])))
+        assert (quality.at_least_db > 44) == right and (quality.psnr_db < 30) != right
+    none = Sight(np.array([[0.0, 0.0, 2.0]]), UP[None])
+    assert estimated_quality(scene, field, 0.04, none).psnr_db == np.inf  # nothing is seen
 
 
 def test_the_dark_inside_of_a_thin_sheet_does_not_darken_its_outside(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
 from rsgen.motion.clearance import check_clearance
 from rsgen.motion.statistics import motion_statistics
-from rsgen.produce.generate import load_motion
+from rsgen.produce.ground_truth import load_motion
 from rsgen.produce.suggest import Suggestion, Wish, suggest_tour
 from rsgen.sequence.trajectory import Trajectory
 

@@ -17,7 +17,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.motion.fit import fit_spline
 from rsgen.motion.tremor import with_tremor
-from rsgen.produce.generate import load_motion
+from rsgen.produce.ground_truth import load_motion
 
 ROOT = Path(__file__).parents[2]
 SECONDS = 8.0

@@ -31,7 +31,7 @@ from rsgen.geometry.shutter import Shutter
 from rsgen.light.probes import gathered_light
 from rsgen.motion.object_paths import object_spline
 from rsgen.produce.frame_source import FrameSource
-from rsgen.produce.generate import load_motion
+from rsgen.produce.ground_truth import load_motion
 from rsgen.render.images import DepthRenderer
 from rsgen.render.irradiance import IrradianceField, make_field, make_lattice
 from rsgen.render.moving import MovingObject, MovingObjects, ObjectsInFrame

@@ -160,7 +160,7 @@ def test_masks_say_which_global_pixels_the_rolling_image_holds(packed: Path) -> 
 def test_the_gyroscope_reads_what_the_camera_turned(packed: Path, small_config: Path) -> None:
     about = json.loads((packed / "000000/sequence.json").read_text())
     table = np.loadtxt(packed / "000000/imu.csv", delimiter=",", comments="#")
-    from rsgen.produce.generate import load_motion
+    from rsgen.produce.ground_truth import load_motion
 
     config = load_config(small_config)
     fields = {name: about[name] for name in ("config", "readout_s", "exposure_s", "start_s", "speed", "seed")}

@@ -26,7 +26,8 @@ from rsgen.console.command_line import parse_frames
 from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
 from rsgen.produce.frame_source import FrameSource
-from rsgen.produce.generate import load_motion, render_sequence
+from rsgen.produce.generate import render_sequence
+from rsgen.produce.ground_truth import load_motion
 from rsgen.sequence.reader import read_sequence
 
 ROOT = Path(__file__).parents[2]

@@ -14,7 +14,7 @@ from rsgen.cli.main import main
 from rsgen.config.config import load_config
 from rsgen.motion.statistics import motion_statistics
 from rsgen.produce.frame_source import FrameSource
-from rsgen.produce.generate import load_motion
+from rsgen.produce.ground_truth import load_motion
 from rsgen.sequence.reader import read_sequence
 
 MOTION = {

@@ -18,7 +18,8 @@ from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
 from rsgen.produce.distribute import RenderJob, SequenceRecipe, engine_versions, render_block
 from rsgen.produce.frame_source import setting_of
-from rsgen.produce.generate import input_hashes, load_motion, sequence_stamps
+from rsgen.produce.generate import input_hashes, sequence_stamps
+from rsgen.produce.ground_truth import load_motion
 from rsgen.sensors.adaptation import Reading, Setting, adapt, reading
 from rsgen.sensors.color import apply_color_noise, apply_setting
 from rsgen.sequence.reader import read_sequence

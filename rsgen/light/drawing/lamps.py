@@ -14,16 +14,15 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
-from rsgen.array_types import FloatArray, IntArray
+from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.light.drawing.rounds import drawn_at, in_rounds
 from rsgen.light.drawing.specular import first_scatterer, transmitted
 from rsgen.light.places.sampling import chunks, r2, rotation
 from rsgen.light.places.surface_points import SurfacePoints
 
 MANY_EMITTERS = 24  # more are sampled together, as one
-_ROUNDS = 5
+_ROUNDS = 6  # the last one ends at twice as many samples as are asked for
 _FIRST_LOOK = 2
 _NEAR_RAYS, _NEAR_ROUNDS = 8, 7
 # Samples on lamps are trusted this much more than rays about the normal.
@@ -37,37 +36,41 @@ def lamps_of(scene: Any) -> list[Any]:
 
 def first_look(
     scene: Any, points: SurfacePoints, which: IntArray, follow: bool, report: Callable[[float], None]
-) -> NDArray[np.float64]:
-    """Direct irradiance (n, 3) from all lamps by a few samples of each."""
+) -> Float32Array:
+    """Direct irradiance (n, 3) from all lamps by a sample of each, or by the second where the first found none."""
     kinds = _kinds(scene)
-    total = np.zeros((len(which), 3))
-    for k, (emitter, dimension, _) in enumerate(kinds):
-        draw = _draw(scene, emitter, dimension, points, which, follow)
-        count = _FIRST_LOOK if emitter is not None else _FIRST_LOOK * MANY_EMITTERS
+    total = np.zeros((len(which), 3), np.float32)
+    for look in range(_FIRST_LOOK):
+        dark = np.flatnonzero(total.max(axis=1) <= 0)
+        found = np.zeros((len(dark), 3), np.float32)
+        for k, (emitter, dimension, _) in enumerate(kinds):
+            draw = _draw(scene, emitter, dimension, points, which[dark], follow)
+            count = 1 if emitter is not None else MANY_EMITTERS
 
-        def share(f: float, k: int = k) -> None:
-            report((k + f) / len(kinds))
+            def share(f: float, done: float = look + k / len(kinds)) -> None:
+                report((done + f / len(kinds)) / _FIRST_LOOK)
 
-        total += draw(np.arange(len(which)), 0, count, share).sum(axis=0) / count
+            found += draw(np.arange(len(dark)), look * count, count, share).sum(axis=0) / count
+        total[dark] = found
     return total
 
 
 def lamp_light(
     scene: Any, points: SurfacePoints, which: IntArray, patch: IntArray, samples: int, follow: bool,
     light: FloatArray, scatter: float, report: Callable[[float], None],
-) -> tuple[NDArray[np.float64], FloatArray]:  # fmt: skip
+) -> tuple[Float32Array, FloatArray]:  # fmt: skip
     """Direct irradiance from all lamps but the sky, with `follow` through thin panes too.
 
-    samples: of each lamp, at most twice as many where they scatter and an eighth where they do not; light (n,): all
+    samples: of each lamp, at most twice as many where they scatter and a sixteenth where they do not; light (n,): all
     light of the points, about, in grey. Returns means (2, n, 3) of two halves of what was drawn, and the error (n,)
     left (see `rounds`).
     """
     kinds = _kinds(scene)
-    means, square = np.zeros((2, len(which), 3)), np.zeros(len(which))
+    means, square = np.zeros((2, len(which), 3), np.float32), np.zeros(len(which))
     for k, (emitter, dimension, delta) in enumerate(kinds):
         draw = _draw(scene, emitter, dimension, points, which, follow)
         count = samples * (1 if emitter is not None else MANY_EMITTERS)
-        first, rounds = (2, 1) if delta else (max(2, count // 8), _ROUNDS)
+        first, rounds = (2, 1) if delta else (max(2, count >> (_ROUNDS - 2)), _ROUNDS)
 
         def share(f: float, k: int = k) -> None:
             report(0.9 * (k + f) / len(kinds))

@@ -9,11 +9,11 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from rsgen.array_types import FloatArray, IntArray
+from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.device.arrays import rows_of
 
 # Sums (2, n, 3) over two halves of the samples `begin` to `begin + count` at some of the points, which it is told.
-Draw = Callable[[IntArray, int, int, Callable[[float], None]], NDArray[np.float64]]
+Draw = Callable[[IntArray, int, int, Callable[[float], None]], Float32Array]
 
 GREY_SLOPE = 0.21  # of sRGB at its middle, by the logarithm of light
 _TONE = 1 / 2.4  # sRGB goes by this power of light
@@ -56,7 +56,7 @@ def shown(patch: IntArray, sigma: FloatArray, grey: FloatArray) -> FloatArray:
 def in_rounds(
     draw: Draw, patch: IntArray, light: Callable[[NDArray], NDArray], scatter: float, first: int, rounds: int,
     effort: float, report: Callable[[float], None],
-) -> tuple[NDArray[np.float64], FloatArray]:  # fmt: skip
+) -> tuple[Float32Array, FloatArray]:  # fmt: skip
     """Means (2, n, 3) of the halves of what `draw` drew at n points, and the errors (n,) left, as `shown` has them.
 
     patch: what each point's noise is estimated over. light: all the light (n,) of points, in grey, given what this kind
@@ -64,9 +64,10 @@ def in_rounds(
     worst first while no more than `effort` samples a point are drawn on the average.
     """
     n = len(patch)
-    sums, drawn = np.zeros((2, n, 3)), np.zeros(n, np.int64)
+    sums, drawn = np.zeros((2, n, 3), np.float32), np.zeros(n, np.int64)
     todo: IntArray = np.arange(n)
-    means, left = sums, np.zeros(n)
+    means: Float32Array = sums
+    left = np.zeros(n)
     for k in range(rounds):
         begin = int(drawn[todo[0]])
         count = first if k == 0 else begin
@@ -76,7 +77,7 @@ def in_rounds(
 
         sums[:, todo] += draw(todo, begin, count, share)
         drawn[todo] += count
-        means = sums / (drawn[:, None] / 2)
+        means = np.divide(sums, drawn[:, None] / 2, dtype=np.float32)
         left = shown(patch, scatter_of(patch, means), light(means.mean(axis=(0, 2))))
         todo = todo[left[todo] > scatter]
         most = int(min(max(0.0, effort * n - drawn.sum()) / drawn.max(), n))
@@ -90,8 +91,8 @@ def in_rounds(
 def drawn_at(which: IntArray, chunks: Callable[..., Any], sample: Callable[..., Any]) -> Draw:
     """A `Draw` at the points `which`, from `sample(points on the device, their places in `which`, begin, count)`."""
 
-    def draw(todo: IntArray, begin: int, count: int, report: Callable[[float], None]) -> NDArray[np.float64]:
-        out = np.zeros((2, len(todo), 3))
+    def draw(todo: IntArray, begin: int, count: int, report: Callable[[float], None]) -> Float32Array:
+        out = np.zeros((2, len(todo), 3), np.float32)
         for first, part, *at in chunks(which[todo], report):
             here = slice(first, first + len(part))
             sums = sample(at, todo[here], begin, count)

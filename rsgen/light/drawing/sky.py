@@ -14,9 +14,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
-from rsgen.array_types import FloatArray, IntArray
+from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.device.arrays import aligned
 from rsgen.light.drawing.guide import Guide, bin_of
 from rsgen.light.drawing.rounds import drawn_at, in_rounds
@@ -41,7 +40,7 @@ def has_sky_light(scene: Any) -> bool:
 def sky_light(
     scene: Any, points: SurfacePoints, which: IntArray, patch: IntArray, texel_m: float, samples: int, follow: bool,
     beside: FloatArray, scatter: float, report: Callable[[float], None],
-) -> tuple[NDArray[np.float64], FloatArray]:  # fmt: skip
+) -> tuple[Float32Array, FloatArray]:  # fmt: skip
     """Irradiance from the sky and, with `follow`, from lamps by ways with turns: off mirrors and through thick glass.
 
     samples: directions at each point at first; more where the standard error exceeds `scatter`, as far as the effort

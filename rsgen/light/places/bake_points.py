@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,9 +32,25 @@ def sample_points(
     """Unique points of both sides of the lattice, the (2, points) index of each lattice point's front and back one, and
     how far these count on either side (see `walls.Barriers`).
     """
+    position, normal, geometric, key = _on_lattice(scene, lattice)
+    chosen, index, place = _unique(*key)
+    first = np.concatenate(chosen)
+    sign = np.repeat(np.array([1, -1], np.float32), [len(side) for side in chosen])[:, None]
+    unique_geometric = sign * geometric[first]
+    within = min(_COVERED_TEXELS * texel_m, _COVERED_M)
+    covered = find_covered(scene, position[first], unique_geometric, within)[index]
+    barriers = find_barriers(scene, lattice, position, geometric, index, place, (covered[0], covered[1]))
+    points = SurfacePoints(position[first], sign * normal[first], unique_geometric, barriers.piece)
+    return points, index, barriers.reach
+
+
+def _on_lattice(scene: Any, lattice: Lattice) -> tuple[Float32Array, Float32Array, Float32Array, tuple[NDArray, ...]]:
+    """At a lattice's points: where to look at light from, shading and geometric normal of the front, (points, 3) each.
+
+    And what makes two of them alike: position and normal, rounded, and the connected piece of mesh.
+    """
     face, uv = lattice_barycentric(lattice)
     count = len(face)
-    centre = np.full((count, 2), 1 / 3, np.float32)
     position = np.empty((count, 3), np.float32)
     normal, geometric, middle = (np.empty_like(position) for _ in range(3))
     shapes = [s for s in scene.shapes() if s.is_mesh()]
@@ -45,38 +60,35 @@ def sample_points(
     for shape in shapes:
         label.append(islands + _islands(*mesh_arrays(shape)).astype(np.int64))
         islands = int(label[-1].max()) + 1
-    island = np.concatenate(label)[face]
-    local = (face - firsts[owner]).astype(np.uint32)
-    numbers = np.array([registry_id(shape) for shape in shapes], np.uint32)[owner]
+    numbers = np.array([registry_id(shape) for shape in shapes], np.uint32)
     # All shapes at once: a launch for each would be compiled for each.
-    for part in np.array_split(np.arange(count), max(1, math.ceil(count / _CHUNK))):
-        position[part], normal[part], geometric[part] = surface_at(numbers[part], local[part], uv[part])
-        middle[part] = surface_at(numbers[part], local[part], centre[part])[0]
+    for begin in range(0, count, _CHUNK):
+        part = slice(begin, begin + _CHUNK)
+        of, local = numbers[owner[part]], (face[part] - firsts[owner[part]]).astype(np.uint32)
+        position[part], normal[part], geometric[part] = surface_at(of, local, uv[part])
+        middle[part] = surface_at(of, local, np.full_like(uv[part], 1 / 3))[0]
     # The side that shading lights, where winding and vertex normals disagree.
     geometric *= np.where(np.einsum("ij,ij->i", geometric, normal) < 0, -1, 1)[:, None].astype(np.float32)
-    # Rounded positions and normals make one key: points that triangles share are computed once, so edges cannot show.
-    key_parts = np.concatenate([np.round(position * 1e4), np.round(normal * 32)], axis=1).astype(np.int64)
+    key = np.round(position * 1e4).astype(np.int32), np.round(normal * 32).astype(np.int32), np.concatenate(label)[face]
     inward = middle - position
     distance = np.linalg.norm(inward, axis=1, keepdims=True)
-    position = position + inward * np.minimum(_INSET_M / np.maximum(distance, 1e-9), 0.1)
+    position += inward * np.minimum(_INSET_M / np.maximum(distance, 1e-9), 0.1)
+    return position, normal, geometric, key
 
-    unique_first, index = [], np.empty((2, count), np.int64)
-    offset = 0
+
+def _unique(position: NDArray, normal: NDArray, island: IntArray) -> tuple[list[IntArray], NDArray, NDArray]:
+    """Which lattice points stand for all of the front and of the back; (2, points) which of these, fronts before backs,
+    each is; and (points,) a number of the place on its piece of mesh.
+
+    Points that triangles share are computed once, so that edges cannot show.
+    """
+    chosen: list[IntArray] = []
+    index = np.empty((2, len(island)), np.int32)
     for side, sign in enumerate((1, -1)):
-        key = _mix((key_parts * np.array([1, 1, 1, sign, sign, sign])).astype(np.uint64))
-        _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
-        unique_first.append(first)
-        index[side] = inverse + offset
-        offset += len(first)
-    front, back = unique_first
-    place = np.unique(_mix(np.column_stack([key_parts[:, :3], island]).astype(np.uint64)), return_inverse=True)[1]
-    all_positions = np.concatenate([position[front], position[back]])
-    all_geometric = np.concatenate([geometric[front], -geometric[back]])
-    covered = find_covered(scene, all_positions, all_geometric, min(_COVERED_TEXELS * texel_m, _COVERED_M))[index]
-    join = np.stack([place, place + place.max() + 1])
-    barriers = find_barriers(scene, lattice, position, geometric, index, join, (covered[0], covered[1]))
-    all_normals = np.concatenate([normal[front], -normal[back]])
-    return SurfacePoints(all_positions, all_normals, all_geometric, barriers.piece), index, barriers.reach
+        _, first, inverse = np.unique(_mix(*position.T, *(sign * normal).T), return_index=True, return_inverse=True)
+        index[side] = inverse + sum(map(len, chosen))
+        chosen.append(first)
+    return chosen, index, np.unique(_mix(*position.T, island), return_inverse=True)[1]
 
 
 def _islands(vertices: NDArray, faces: NDArray) -> IntArray:
@@ -89,14 +101,15 @@ def _islands(vertices: NDArray, faces: NDArray) -> IntArray:
     return connected_components(edges, directed=False)[1][a]
 
 
-def _mix(columns: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """One well-mixed 64-bit hash of each row (splitmix64's finaliser, chained over columns)."""
-    h = np.zeros(len(columns), np.uint64)
-    for column in columns.T:
-        h = h ^ column
-        h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-        h = h ^ (h >> np.uint64(31))
+def _mix(*columns: IntArray) -> NDArray[np.uint64]:
+    """One well-mixed 64-bit hash of each row of integers (splitmix64's finaliser, chained over columns)."""
+    h = np.zeros(len(columns[0]), np.uint64)
+    for column in columns:
+        h ^= column.astype(np.int64).view(np.uint64)
+        for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+            h ^= h >> np.uint64(shift)
+            h *= np.uint64(factor)
+        h ^= h >> np.uint64(31)
     return h
 
 
@@ -120,11 +133,11 @@ def thin(points: SurfacePoints, spacing: float, among: IntArray | None = None) -
     position, normal, piece = points.position, points.normal, points.piece
     if among is not None:
         position, normal, piece = position[among], normal[among], piece[among]
-    scaled = position / spacing
-    cell = np.floor(scaled)
-    off_centre = ((scaled - cell - 0.5) ** 2).sum(axis=1)
+    cell = np.floor(position / spacing)
+    off_centre = ((position / spacing - cell - 0.5) ** 2).sum(axis=1)
     # A buried face must not stand for a lit one just in front of it, so pieces of surface are kept apart.
-    key = _mix(np.concatenate([cell, np.round(normal), piece[:, None]], axis=1).astype(np.int64).astype(np.uint64))
+    key = _mix(*cell.T, *np.round(normal).T, piece)
+    del cell
     order = np.lexsort((off_centre, key))
     sorted_key = key[order]
     starts = np.concatenate([[True], sorted_key[1:] != sorted_key[:-1]])
@@ -146,16 +159,19 @@ class Interpolation:
 
         The dark inside of a thin sheet is a millimetre from its lit outside and has the normal of the other outside.
         """
-        scaled = points.coordinates(spacing)
         k = min(_NEIGHBOURS, len(sources))
-        distance, neighbours = cKDTree(scaled[sources]).query(scaled[targets], k=k, workers=-1, eps=0.2)
-        distance, neighbours = np.reshape(distance, (-1, k)), np.reshape(neighbours, (-1, k))
-        # Falls to zero at the furthest neighbour, so that the interpolant is continuous as neighbours change, and
-        # grows without bound towards a source, so that it passes through the sources.
-        near = np.clip(1 - (distance / (distance[:, -1:] * 1.0001 + 1e-9)) ** 2, 0, 1) ** 2
-        weights = (near + 1e-6) / (distance**2 + _SMOOTHING**2)
-        weights /= weights.sum(axis=1, keepdims=True)
-        return cls(neighbours.astype(np.int32), weights.astype(np.float32))
+        tree = cKDTree(points.coordinates(spacing, sources))
+        near, weights = np.empty((len(targets), k), np.int32), np.empty((len(targets), k), np.float32)
+        for begin in range(0, len(targets), _CHUNK):
+            part = slice(begin, begin + _CHUNK)
+            found = tree.query(points.coordinates(spacing, targets[part]), k=k, workers=-1, eps=0.2)
+            distance, near[part] = (np.reshape(v, (-1, k)) for v in found)
+            # Falls to zero at the furthest neighbour, so that the interpolant is continuous as neighbours change, and
+            # grows without bound towards a source, so that it passes through the sources.
+            falling = np.clip(1 - (distance / (distance[:, -1:] * 1.0001 + 1e-9)) ** 2, 0, 1) ** 2
+            weight = (falling + 1e-6) / (distance**2 + _SMOOTHING**2)
+            weights[part] = weight / weight.sum(axis=1, keepdims=True)
+        return cls(near, weights)
 
     def __call__(self, at_sources: Float32Array) -> Float32Array:
         out = np.zeros((len(self.neighbours), 3), np.float32)

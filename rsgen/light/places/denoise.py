@@ -26,7 +26,7 @@ def denoised(
     out = halves.mean(axis=0).astype(np.float32)
     if not len(noisy):
         return out
-    scaled = points.coordinates(_REACH * spacing)[which]
+    scaled = points.coordinates(_REACH * spacing, which)
     grey = halves.mean(axis=2)
     # Variance of one half: of a point that scatters more than its neighbours its own.
     half = np.maximum(2.0 * sigma**2, 0.5 * (grey[0] - grey[1]) ** 2)

@@ -25,8 +25,9 @@ class SurfacePoints:
     geometric: Float32Array
     piece: IntArray
 
-    def coordinates(self, spacing: float) -> NDArray:
-        """(n, 7): two points are near where positions, in units of `spacing` metres, and normals are, on one piece."""
-        return np.concatenate(
-            [self.position / spacing, self.normal / _NORMAL_SCALE, _APART * self.piece[:, None]], axis=1
-        )
+    def coordinates(self, spacing: float, which: IntArray) -> NDArray:
+        """(len(which), 7): two points are near where positions, in units of `spacing` metres, and normals are, on one
+        piece.
+        """
+        position, normal, piece = self.position[which], self.normal[which], self.piece[which]
+        return np.concatenate([position / spacing, normal / _NORMAL_SCALE, _APART * piece[:, None]], axis=1)

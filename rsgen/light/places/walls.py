@@ -41,35 +41,46 @@ class Barriers:
 
 
 def find_barriers(
-    scene: Any, lattice: Lattice, position: Float32Array, normal: Float32Array, index: IntArray, join: IntArray,
+    scene: Any, lattice: Lattice, position: Float32Array, normal: Float32Array, index: IntArray, place: IntArray,
     covered: tuple[NDArray[np.bool_], NDArray[np.bool_]],
 ) -> Barriers:  # fmt: skip
     """Barriers of a scene between its lattice's points.
 
     position, normal: (points, 3), world, m: where light is looked at, and the geometric normal of the front. index:
-    (2, points), the unique point of each one's front and back. join: (2, points), alike where points of the front, or
-    of the back, are at one place of one surface. covered: (points,) of front and back, see `find_covered`.
+    (2, points), the unique point of each one's front and back, the fronts' numbers before the backs'. place: (points,),
+    alike where points are at one place of one surface. covered: (points,) of front and back, see `find_covered`.
     """
     here, there, along = _neighbours(lattice)
-    levels = [np.full((lattice.points, 4), FREE, np.uint8) for _ in range(2)]
-    ends: list[NDArray] = [index[0], index[1]], [join[0] + index.max() + 1, join[1] + index.max() + 1]  # type: ignore[assignment]
-    a, b = [np.concatenate(e) for e in ends]
+    reach, piece, pieces = [], np.empty(int(index.max()) + 1, np.int64), 0
     for side, sign in enumerate((1.0, -1.0)):
         hidden = covered[side]
         apart = hidden[here] != hidden[there]
+        levels = np.full((lattice.points, 4), FREE, np.uint8)
         for begin in range(0, len(here), _CHUNK):
             part = slice(begin, begin + _CHUNK)
             blocked, forth, back = _between(scene, position, sign * normal, here[part], there[part])
             at = begin + blocked
             apart[at] = True
-            levels[side][here[at], along[at]] = forth
-            levels[side][there[at], along[at] + 1] = back
-        levels[side][hidden] = 0
-        a = np.concatenate([a, index[side][here[~apart]]])
-        b = np.concatenate([b, index[side][there[~apart]]])
+            levels[here[at], along[at]] = forth
+            levels[there[at], along[at] + 1] = back
+        levels[hidden] = 0
+        reach.append(packed_reach(levels))
+        del levels
+        # No point of the front is one of the back's, so each has its graph: half the memory at a time.
+        first = int(index[side].min())
+        nodes = (index[side] - first).astype(np.int32)
+        count = int(nodes.max()) + 1
+        label = _connected((nodes, (place + count).astype(np.int32)), (nodes[here[~apart]], nodes[there[~apart]]))
+        piece[first : first + count] = pieces + label[:count]
+        pieces += int(label.max()) + 1
+    return Barriers((reach[0], reach[1]), piece)
+
+
+def _connected(*edges: tuple[NDArray[np.int32], NDArray[np.int32]]) -> NDArray[np.int32]:
+    """(n,) label of the connected part that each node belongs to, given the nodes at both ends of edges."""
+    a, b = (np.concatenate(ends) for ends in zip(*edges, strict=True))
     size = int(max(a.max(), b.max())) + 1
-    label = connected_components(coo_array((np.ones(len(a), bool), (a, b)), shape=(size, size)), directed=False)[1]
-    return Barriers((packed_reach(levels[0]), packed_reach(levels[1])), label[: int(index.max()) + 1].astype(np.int64))
+    return connected_components(coo_array((np.ones(len(a), bool), (a, b)), shape=(size, size)), directed=False)[1]
 
 
 def find_covered(scene: Any, position: Float32Array, normal: Float32Array, within_m: float) -> NDArray[np.bool_]:
@@ -83,7 +94,7 @@ def find_covered(scene: Any, position: Float32Array, normal: Float32Array, withi
     return out
 
 
-def _neighbours(lattice: Lattice) -> tuple[IntArray, IntArray, IntArray]:
+def _neighbours(lattice: Lattice) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int8]]:
     """Pairs of neighbours in the grids of all triangles, and the way from the first to the second: 0 is u, 2 is v."""
     counts = (lattice.cells + 1).prod(axis=1)
     face = np.repeat(np.arange(len(counts)), counts)
@@ -91,13 +102,13 @@ def _neighbours(lattice: Lattice) -> tuple[IntArray, IntArray, IntArray]:
     nu, nv = lattice.cells[face].T
     row, column = np.divmod(point - lattice.first[face], nv + 1)
     down, right = point[row < nu], point[(column < nv) & (row > 0)]  # a triangle's apex is all of its first row
-    here = np.concatenate([down, right])
-    there = np.concatenate([down + nv[down] + 1, right + 1])
-    return here, there, np.repeat([0, 2], [len(down), len(right)])
+    here = np.concatenate([down, right]).astype(np.int32)
+    there = np.concatenate([down + nv[down] + 1, right + 1]).astype(np.int32)
+    return here, there, np.repeat(np.array([0, 2], np.int8), [len(down), len(right)])
 
 
 def _between(
-    scene: Any, position: Float32Array, normal: NDArray, here: IntArray, there: IntArray
+    scene: Any, position: Float32Array, normal: NDArray, here: NDArray[np.int32], there: NDArray[np.int32]
 ) -> tuple[IntArray, NDArray, NDArray]:
     """Which pairs something stands between, and how far it is from the first and from the second, in levels."""
     p = position[here] + np.float32(_HEIGHT_M) * normal[here]
