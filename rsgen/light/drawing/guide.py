@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from rsgen.array_types import IntArray
+from rsgen.array_types import FloatArray, IntArray
 from rsgen.device.arrays import aligned
 
 # Bins around the vertical and along it: of equal solid angle.
@@ -21,6 +21,7 @@ _BINS = _AROUND * _ALONG
 # Part of the directions that is drawn evenly, and part of a bin's light that its neighbours get: what the first look
 # missed must not be missed for ever.
 _EVENLY, _SPILL = 0.1, 0.15
+_CHUNK = 8192  # cells at a time
 
 
 class Guide:
@@ -33,16 +34,15 @@ class Guide:
     @classmethod
     def learned(cls, cell: IntArray, bins: IntArray, light: NDArray, cells: int) -> Guide:
         """From samples (n,): the cell that each was taken in, the bin of its direction, and what it brought."""
-        seen = np.bincount(cell * _BINS + bins, weights=light, minlength=cells * _BINS)
-        grid = seen.reshape(cells, _ALONG, _AROUND)
-        up, down = np.zeros_like(grid), np.zeros_like(grid)
-        up[:, 1:], down[:, :-1] = grid[:, :-1], grid[:, 1:]
-        spilt = np.roll(grid, 1, axis=2) + np.roll(grid, -1, axis=2) + up + down
-        flat = (grid + _SPILL * spilt).reshape(cells, _BINS)
-        total = flat.sum(axis=1, keepdims=True)
-        share = np.where(total > 0, flat / np.where(total > 0, total, 1.0), 1.0 / _BINS)
-        cumulative = np.cumsum((1.0 - _EVENLY) * share + _EVENLY / _BINS, axis=1)
-        cumulative[:, -1] = 1.0
+        order = np.argsort(cell, kind="stable")
+        cell, bins, light = cell[order], bins[order], light[order]
+        cumulative = np.empty((cells, _BINS), np.float32)
+        for begin in range(0, cells, _CHUNK):
+            count = min(_CHUNK, cells - begin)
+            part = slice(*np.searchsorted(cell, (begin, begin + count)))
+            where = (cell[part] - begin) * _BINS + bins[part]
+            seen: FloatArray = np.bincount(where, weights=light[part], minlength=count * _BINS).astype(float)
+            cumulative[begin : begin + count] = _distribution(seen.reshape(count, _ALONG, _AROUND))
         return cls(mi.Float(aligned(cumulative)))
 
     def sample(self, cell: Any, u: Any) -> Any:
@@ -64,6 +64,19 @@ class Guide:
         first = cell * _BINS
         begin = dr.select(bin_ > 0, dr.gather(mi.Float, self.cumulative, first + bin_ - 1, bin_ > 0), 0.0)
         return (dr.gather(mi.Float, self.cumulative, first + bin_) - begin) * (_BINS / (4.0 * dr.pi))
+
+
+def _distribution(grid: FloatArray) -> FloatArray:
+    """Distribution function (cells, bins) of what has been seen (cells, along, around)."""
+    up, down = np.zeros_like(grid), np.zeros_like(grid)
+    up[:, 1:], down[:, :-1] = grid[:, :-1], grid[:, 1:]
+    spilt = np.roll(grid, 1, axis=2) + np.roll(grid, -1, axis=2) + up + down
+    flat = (grid + _SPILL * spilt).reshape(len(grid), _BINS)
+    total = flat.sum(axis=1, keepdims=True)
+    share = np.where(total > 0, flat / np.where(total > 0, total, 1.0), 1.0 / _BINS)
+    cumulative: FloatArray = np.cumsum((1.0 - _EVENLY) * share + _EVENLY / _BINS, axis=1)
+    cumulative[:, -1] = 1.0
+    return cumulative
 
 
 def bin_of(d: Any) -> Any:

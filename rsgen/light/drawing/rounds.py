@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsgen.array_types import Float32Array, FloatArray, IntArray
-from rsgen.device.arrays import rows_of
 
 # Sums (2, n, 3) over two halves of the samples `begin` to `begin + count` at some of the points, which it is told.
 Draw = Callable[[IntArray, int, int, Callable[[float], None]], Float32Array]
@@ -97,7 +96,8 @@ def drawn_at(which: IntArray, chunks: Callable[..., Any], sample: Callable[..., 
             here = slice(first, first + len(part))
             sums = sample(at, todo[here], begin, count)
             dr.eval(sums)
-            out[:, here] = [rows_of(half) for half in sums]
+            for half, k in np.ndindex(2, 3):
+                out[half, here, k] = np.array(sums[half][k])
         return out
 
     return draw

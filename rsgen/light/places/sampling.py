@@ -10,10 +10,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from rsgen.device.arrays import aligned, vectors
+from rsgen.device.arrays import aligned
 from rsgen.light.places.surface_points import SurfacePoints
 
-OFFSET_M = 2e-4  # ray origins above their surface
 _CHUNK = 1 << 18
 
 
@@ -33,8 +32,9 @@ def chunks(
     points: SurfacePoints, which: NDArray, report: Callable[[float], None], size: int = _CHUNK
 ) -> Iterator[tuple[int, NDArray, Any, Any, Any]]:
     """(first of them, their numbers, ray origins, normals and numbers on the device) of `which`, `size` at a time."""
+    origin, normal = points.on_device
     for begin in range(0, len(which), size):
         part = which[begin : begin + size]
-        p, n, g = (vectors(mi.Vector3f, a[part]) for a in (points.position, points.normal, points.geometric))
-        yield begin, part, mi.Point3f(p + g * OFFSET_M), n, mi.UInt32(aligned(part, np.uint32))
+        number = mi.UInt32(aligned(part, np.uint32))
+        yield begin, part, dr.gather(mi.Point3f, origin, number), dr.gather(mi.Vector3f, normal, number), number
         report(min(1.0, (begin + len(part)) / len(which)))

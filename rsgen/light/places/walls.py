@@ -21,7 +21,7 @@ from scipy.sparse.csgraph import connected_components
 
 from rsgen.array_types import Float32Array, IntArray
 from rsgen.device.arrays import aligned
-from rsgen.light.places.sampling import OFFSET_M
+from rsgen.light.places.surface_points import OFFSET_M
 from rsgen.render.irradiance import FREE, REACH_LEVELS, Lattice, packed_reach
 from rsgen.render.rays import rays_from
 
