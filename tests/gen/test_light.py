@@ -27,7 +27,7 @@ from rsgen.config.config import LightConfig
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.light import cache as lighting
-from rsgen.light.drawing.guide import Guide, bin_of
+from rsgen.light.drawing.guide import BINS, Guide, bin_of
 from rsgen.light.drawing.rounds import PATCH, in_rounds, scatter_of
 from rsgen.light.places.bake_points import thin
 from rsgen.light.places.denoise import denoised
@@ -151,7 +151,7 @@ def test_a_guide_draws_what_it_says() -> None:
     toward = np.array([0.6, -0.48, 0.64])
     seen = toward + 0.1 * rng.normal(size=(4000, 3))
     bins = np.array(bin_of(mi.Vector3f((seen / np.linalg.norm(seen, axis=1, keepdims=True)).T))).astype(np.int64)
-    guide = Guide.learned(np.zeros(4000, np.int64), bins, np.ones(4000), 2)
+    guide = Guide.learned(np.stack([np.bincount(bins, minlength=BINS), np.zeros(BINS)]).astype(np.float32))
     n = 1 << 18
     even = rng.normal(size=(n, 3)).astype(np.float32)
     even /= np.linalg.norm(even, axis=1, keepdims=True)

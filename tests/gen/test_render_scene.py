@@ -353,7 +353,7 @@ def test_light_that_would_not_fit_is_refused_before_memory_is_taken(tmp_path: Pa
     tracemalloc.start()
     points = make_lattice(large, fits).points
     tracemalloc.stop()
-    assert 0.9 * 4e9 / 300 < points <= 4e9 / 300 and "\n" not in str(caught.value)
+    assert 0.9 * 4e9 / 400 < points <= 4e9 / 400 and "\n" not in str(caught.value)
     config = load_config(tiny.write_config(tmp_path, light={"texel_m": 0.015}))
     with pytest.raises(UserError, match=r"^scene .*scene\.xml: light\.texel_m"):
         make_integrator(mi, large, config, lambda *_: None)

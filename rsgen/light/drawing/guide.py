@@ -10,14 +10,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
-from rsgen.array_types import FloatArray, IntArray
+from rsgen.array_types import Float32Array, FloatArray
 from rsgen.device.arrays import aligned
 
 # Bins around the vertical and along it: of equal solid angle.
 _AROUND, _ALONG = 32, 16
-_BINS = _AROUND * _ALONG
+BINS = _AROUND * _ALONG
 # Part of the directions that is drawn evenly, and part of a bin's light that its neighbours get: what the first look
 # missed must not be missed for ever.
 _EVENLY, _SPILL = 0.1, 0.15
@@ -32,23 +31,18 @@ class Guide:
         self.cumulative = cumulative
 
     @classmethod
-    def learned(cls, cell: IntArray, bins: IntArray, light: NDArray, cells: int) -> Guide:
-        """From samples (n,): the cell that each was taken in, the bin of its direction, and what it brought."""
-        order = np.argsort(cell, kind="stable")
-        cell, bins, light = cell[order], bins[order], light[order]
-        cumulative = np.empty((cells, _BINS), np.float32)
-        for begin in range(0, cells, _CHUNK):
-            count = min(_CHUNK, cells - begin)
-            part = slice(*np.searchsorted(cell, (begin, begin + count)))
-            where = (cell[part] - begin) * _BINS + bins[part]
-            seen: FloatArray = np.bincount(where, weights=light[part], minlength=count * _BINS).astype(float)
-            cumulative[begin : begin + count] = _distribution(seen.reshape(count, _ALONG, _AROUND))
+    def learned(cls, seen: Float32Array) -> Guide:
+        """From the light (cells, BINS) that samples, drawn evenly, have brought from each bin."""
+        cumulative = np.empty_like(seen)
+        for begin in range(0, len(seen), _CHUNK):
+            part = slice(begin, begin + _CHUNK)
+            cumulative[part] = _distribution(seen[part].reshape(-1, _ALONG, _AROUND).astype(np.float64))
         return cls(mi.Float(aligned(cumulative)))
 
     def sample(self, cell: Any, u: Any) -> Any:
         """A direction (Vector3f, world frame) in each cell, by two uniform numbers."""
-        first = cell * _BINS
-        bin_ = dr.binary_search(0, _BINS - 1, lambda k: dr.gather(mi.Float, self.cumulative, first + k) <= u.x)
+        first = cell * BINS
+        bin_ = dr.binary_search(0, BINS - 1, lambda k: dr.gather(mi.Float, self.cumulative, first + k) <= u.x)
         begin = dr.select(bin_ > 0, dr.gather(mi.Float, self.cumulative, first + bin_ - 1, bin_ > 0), 0.0)
         end = dr.gather(mi.Float, self.cumulative, first + bin_)
         within = dr.clip((u.x - begin) / dr.maximum(end - begin, 1e-20), 0.0, 1.0)
@@ -61,9 +55,9 @@ class Guide:
     def density(self, cell: Any, d: Any) -> Any:
         """Of `sample`, per steradian."""
         bin_ = bin_of(d)
-        first = cell * _BINS
+        first = cell * BINS
         begin = dr.select(bin_ > 0, dr.gather(mi.Float, self.cumulative, first + bin_ - 1, bin_ > 0), 0.0)
-        return (dr.gather(mi.Float, self.cumulative, first + bin_) - begin) * (_BINS / (4.0 * dr.pi))
+        return (dr.gather(mi.Float, self.cumulative, first + bin_) - begin) * (BINS / (4.0 * dr.pi))
 
 
 def _distribution(grid: FloatArray) -> FloatArray:
@@ -71,10 +65,10 @@ def _distribution(grid: FloatArray) -> FloatArray:
     up, down = np.zeros_like(grid), np.zeros_like(grid)
     up[:, 1:], down[:, :-1] = grid[:, :-1], grid[:, 1:]
     spilt = np.roll(grid, 1, axis=2) + np.roll(grid, -1, axis=2) + up + down
-    flat = (grid + _SPILL * spilt).reshape(len(grid), _BINS)
+    flat = (grid + _SPILL * spilt).reshape(len(grid), BINS)
     total = flat.sum(axis=1, keepdims=True)
-    share = np.where(total > 0, flat / np.where(total > 0, total, 1.0), 1.0 / _BINS)
-    cumulative: FloatArray = np.cumsum((1.0 - _EVENLY) * share + _EVENLY / _BINS, axis=1)
+    share = np.where(total > 0, flat / np.where(total > 0, total, 1.0), 1.0 / BINS)
+    cumulative: FloatArray = np.cumsum((1.0 - _EVENLY) * share + _EVENLY / BINS, axis=1)
     cumulative[:, -1] = 1.0
     return cumulative
 

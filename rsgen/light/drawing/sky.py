@@ -17,7 +17,7 @@ import numpy as np
 
 from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.device.arrays import aligned
-from rsgen.light.drawing.guide import Guide, bin_of
+from rsgen.light.drawing.guide import BINS, Guide, bin_of
 from rsgen.light.drawing.rounds import drawn_at, in_rounds
 from rsgen.light.drawing.specular import first_scatterer, passes_light_on
 from rsgen.light.places.bake_points import thin
@@ -62,17 +62,13 @@ def _learned(
     scene: Any, points: SurfacePoints, which: IntArray, cell: IntArray, texel_m: float, follow: bool
 ) -> Guide:  # fmt: skip
     coarse = thin(points, _FIRST_LOOK_TEXELS * texel_m, which)[0]
-    cells, bins, light = [], [], []
+    seen = np.zeros((int(cell.max()) + 1, BINS), np.float32)
     for first, part, p, n, number in chunks(points, which[coarse], lambda _: None, (1 << 22) // _FIRST_LOOK_SAMPLES):
         found = _first_look(scene, p, n, number, follow)
         dr.eval(found)
         here = cell[coarse[first : first + len(part)]]
-        cells.append(np.repeat(here, _FIRST_LOOK_SAMPLES))
-        bins.append(np.array(found[0]))
-        light.append(np.array(found[1], dtype=np.float64))
-    return Guide.learned(
-        np.concatenate(cells), np.concatenate(bins).astype(np.int64), np.concatenate(light), int(cell.max()) + 1
-    )
+        np.add.at(seen, (np.repeat(here, _FIRST_LOOK_SAMPLES), np.array(found[0])), np.array(found[1]))
+    return Guide.learned(seen)
 
 
 def _first_look(scene: Any, p: Any, n: Any, number: Any, follow: bool) -> tuple[Any, Any]:
