@@ -13,7 +13,10 @@ from rsgen.render.moving import MovingObjects, ShadedField
 _DIFFUSE = int(mi.BSDFFlags.DiffuseReflection) | int(mi.BSDFFlags.DiffuseTransmission)
 _SPECULAR = int(mi.BSDFFlags.Glossy) | int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.Null)
 _GLOSSY = int(mi.BSDFFlags.Glossy)
+_FROSTED = int(mi.BSDFFlags.GlossyTransmission)
 _MOST_LIGHTS = 16  # light samples at a glossy hit
+_PANE = int(mi.BSDFFlags.DeltaReflection), int(mi.BSDFFlags.DeltaTransmission) | int(mi.BSDFFlags.Null)
+_CERTAINLY = 1 - 2**-20  # a random number that no pane reflects at, but where it reflects all
 _FAINT = 0.05  # of the matte light at a hit: reflections below are cast by lot, which saves most shadow rays
 
 
@@ -66,9 +69,10 @@ class BakedIntegrator(mi.SamplingIntegrator):
 def trace_baked(scene, field, sampler, ray, bounces, active):
     """Radiance (Color3f) along `ray` and whether it hit a surface; see `BakedIntegrator`.
 
-    A path follows mirrors and glass, then at most one glossy bounce, and ends at the next surface, where all of the
-    BSDF counts as diffuse. Emitters seen in a glossy lobe are found by sampling each of them and the lobe, with the
-    balance heuristic (Veach and Guibas 1995): small bright lamps would otherwise leave sparkles.
+    A path follows mirrors and glass, frosted too, then at most one glossy bounce, and ends at the next surface, where
+    all of the BSDF counts as diffuse. At a pane it goes on both ways, one after the other: by lot, a bright window that
+    shines in one would be speckle. Emitters seen in a glossy lobe are found by sampling each of them and the lobe, with
+    the balance heuristic (Veach and Guibas 1995): small bright lamps would otherwise leave sparkles.
     """
     everything = mi.BSDFContext()
     diffuse = mi.BSDFContext()
@@ -84,6 +88,10 @@ def trace_baked(scene, field, sampler, ray, bounces, active):
     last = mi.Bool(False)  # the path has had its glossy bounce
     glossy_hit = dr.zeros(mi.Interaction3f, dr.width(ray.o))
     lobe_pdf = mi.Float(1)  # of the direction sampled there
+    waiting = mi.Bool(False)  # what a pane reflects, until the way through it has ended
+    reflected = mi.Ray3f(ray)
+    reflected_throughput = mi.Color3f(0)
+    reflected_depth = mi.UInt32(0)
     while active:
         pi = scene.ray_intersect_preliminary(ray, coherent=depth == 0, active=active)
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
@@ -105,7 +113,9 @@ def trace_baked(scene, field, sampler, ray, bounces, active):
         radiance[active] += throughput * irradiance * dr.select(last, albedo * dr.inv_pi, lobe)
 
         active &= ((bsdf.flags() & _SPECULAR) != 0) & ~last & (depth < bounces)
-        smooth = active & ((bsdf.flags() & _GLOSSY) != 0)
+        flags = bsdf.flags()
+        frosted = (flags & _FROSTED) != 0
+        smooth = active & ((flags & _GLOSSY) != 0) & ~frosted
         faint = _FAINT * dr.max(irradiance * lobe)
         light = mi.UInt32(0)
         while smooth & (light < lights):
@@ -122,12 +132,28 @@ def trace_baked(scene, field, sampler, ray, bounces, active):
             radiance[seen] += throughput * gain / chance
             light += 1
 
-        bs, weight = bsdf.sample(specular, si, sampler.next_1d(active), sampler.next_2d(active), active)
-        throughput *= weight
-        last = (bs.sampled_type & _GLOSSY) != 0
+        pane = active & ~waiting & ((flags & _PANE[0]) != 0) & ((flags & _PANE[1]) != 0) & ((flags & _GLOSSY) == 0)
+        u = sampler.next_1d(active)
+        bs, weight = bsdf.sample(specular, si, dr.select(pane, _CERTAINLY, u), sampler.next_2d(active), active)
+        other, share = bsdf.sample(specular, si, 0, mi.Point2f(0.5), pane)
+        both = pane & (other.sampled_type != bs.sampled_type) & (other.pdf > 0)
+        reflected = dr.select(both, si.spawn_ray(si.to_world(other.wo)), reflected)
+        reflected_throughput = dr.select(both, throughput * share * other.pdf, reflected_throughput)
+        reflected_depth = dr.select(both, depth + 1, reflected_depth)
+        waiting |= both
+        throughput *= weight * dr.select(both, bs.pdf, 1)
+        last = ((bs.sampled_type & _GLOSSY) != 0) & ~frosted
         lobe_pdf = bs.pdf
         glossy_hit = mi.Interaction3f(si)
         ray = si.spawn_ray(si.to_world(bs.wo))
         active &= dr.max(throughput) > 0
         depth += 1
+
+        back = waiting & ~active
+        ray = dr.select(back, reflected, ray)
+        throughput = dr.select(back, reflected_throughput, throughput)
+        depth = dr.select(back, reflected_depth, depth)
+        last &= ~back
+        active |= back
+        waiting &= ~back
     return radiance, valid
