@@ -41,7 +41,7 @@ _KEYS = "color, depth, T_color_depth and stamps, each camera with width, height,
 
 Size = tuple[int, int]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Seconds = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
 Pixels = Annotated[int, Field(ge=1, le=16384)]
 Vector4 = tuple[Finite, Finite, Finite, Finite]
 Matrix4 = tuple[Vector4, Vector4, Vector4, Vector4]
@@ -79,8 +79,8 @@ class _Stream(_Section):
     intrinsics: Vector4
     model: Model = "pinhole"
     distortion: tuple[Finite, ...] = ()
-    readout_s: NonNegative
-    exposure_s: NonNegative = 0.0
+    readout_s: Seconds
+    exposure_s: Seconds = 0.0
     scan: Scan = "top-bottom"
 
     @property

@@ -151,7 +151,7 @@ def write_spoken(path: Path, talker: Talker, spoken: Spoken, storage: str = "") 
         if storage:
             writer.set_compression(getattr(Writer1.CompressionFormat, storage.upper()))
     else:
-        folder = path.with_suffix(".folder") if path.suffix in (".db3", ".mcap") else path
+        folder = path.with_suffix(f"{path.suffix}.folder") if path.suffix in (".db3", ".mcap") else path
         plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
         writer = Writer2(folder, version=9, storage_plugin=plugin)
         if storage == "mcap":
