@@ -84,6 +84,12 @@ def folders(folder: Path) -> Iterator[Case]:
     yield whole.case("all pictures of 670 MB", lambda path: [
         file.write_bytes(hostile.png_bomb(False)) for file in (path / "rgb").iterdir()])  # fmt: skip
     yield from _cameras(tum)
+    phone = Base("folders", Path(shutil.copytree(tum.whole, folder / "phone")), tracked)
+    table = "intrinsics.csv"
+    (phone.whole / table).write_text("".join(f"{k}000000000,{24 + k / 9},25,15.5,11.5\n" for k in range(4)))
+    yield from phone.damaged(table, 3)
+    yield phone.case("intrinsics of 8 GB", of_8_gb(table))
+    yield phone.case("intrinsics of a device", linked(table, "/dev/zero"))
     yield from _seven_scenes(folder)
 
 

@@ -20,9 +20,9 @@ from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.files import encode_png, listed_file, png_fault, read_bytes, read_text
 from rsgen.geometry.camera import Camera
-from rstrack.importing.phones.arkit import TRUTH, median_camera, resized
+from rstrack.importing.phones.arkit import TRUTH, intrinsics_items, median_camera, resized
 from rstrack.importing.pixels import check_size, decode, header_size
-from rstrack.importing.recording import Inertial, Intrinsics, Item, Picture, Pose, Recording, StreamCamera, pose_of
+from rstrack.importing.recording import Inertial, Item, Picture, Pose, Recording, StreamCamera, pose_of
 
 _MILLIMETRES = 1000.0
 _MAX_STAMP_S, _MOST_FRAMES = 1e11, 10**9
@@ -163,7 +163,7 @@ def _items(
             yield Picture("color", stamp_ns, encode_png(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)))
             yield Pose(stamp_ns, pose_of([row[n] for n in _POSE[3:]], [row[n] for n in _POSE[:3]]))
             if "fx" in row:
-                yield Intrinsics(stamp_ns, (row["fx"], row["fy"], row["cx"], row["cy"]))
+                yield from intrinsics_items(stamp_ns, (row["fx"], row["fy"], row["cx"], row["cy"]), color, depth)
             file = _depth_file(path, row)
             if file.is_file():  # a phone that is busy leaves some out
                 yield Picture("depth", stamp_ns, _depth(path, file, depth, confidence))
