@@ -22,8 +22,8 @@ def export(
     """Export the sequence at `path` and say in one line what was written. Raises UserError.
 
     out: default kalibr/, mav0/, registered/, NAME.bag, ros2/, NAME.mcap, colmap/, nerfstudio/, ncore/, shutter.mp4 or
-    NAME.rrd within the sequence's folder. copy: images, rather than linking them. scene: for the video, which renders again.
-    storage: of a ROS 2 bag.
+    NAME.rrd within the sequence's folder. copy: images, rather than linking them. scene: for the video, which renders
+    again. storage: of a ROS 2 bag.
     """
     sequence = read_sequence(path)
     if to == "kalibr":

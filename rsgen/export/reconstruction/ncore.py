@@ -1,9 +1,9 @@
 """A sequence in NVIDIA's NCore format (`nvidia-ncore`, an optional extra), whose readers know rolling shutters.
 
 NAME.ncore4.zarr.itar holds the cameras `color` and `depth` with their images as they are, and the poses of `rig`, the
-depth camera, in `world`. Times are whole microseconds, 10⁹ s after the sequence's. An image has those of its first and last
-line, at mid-exposure; NCore puts line i of n at i / (n - 1) between them, as a sensor's lines are. Poses are as dense
-as the loss of interpolating them is small: who looks one up for each line has that line's.
+depth camera, in `world`. Times are whole microseconds, 10⁹ s after the sequence's. An image has those of its first and
+its last line, at mid-exposure; NCore puts line i of n at i / (n - 1) between them, as a sensor's lines are. Poses are
+as dense as the loss of interpolating them is small: who looks one up for each line has that line's.
 """
 
 from __future__ import annotations
