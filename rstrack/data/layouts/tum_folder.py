@@ -31,7 +31,7 @@ from rstrack.data.own_intrinsics import OwnIntrinsics, SharedImages, read_own_in
 from rstrack.data.rig import Rig
 
 _ASSOCIATIONS = ("associations.txt", "associate.txt", "association.txt")
-_CAMERA_FILES = ("camera.yaml", "calibration.yaml")
+_CAMERA_FILES = ("camera.yaml", "calibration.yaml", "camchain-imucam.yaml", "camchain.yaml")
 ESTIMATED = "# estimated, not measured: "
 """Begins the first line of a groundtruth.txt whose poses are another estimate from the same images."""
 _MAX_STAMP_S = 1e11  # the year 5138; today in milliseconds, microseconds or nanoseconds is beyond
@@ -57,7 +57,8 @@ class TumFolder:
 def read_tum_folder(root: Path, camera_file: Path | None) -> TumFolder:
     """Read cameras, listings and ground truth; images are decoded when asked for, but all have to be there.
 
-    camera_file: default camera.yaml, else calibration.yaml in the folder. Raises UserError, one line.
+    camera_file: default camera.yaml, calibration.yaml or Kalibr's camchain-imucam.yaml or camchain.yaml in the folder.
+    Raises UserError, one line.
     """
     depth, color = _listings(root)
     (depth, depth_note), (color, color_note) = (
