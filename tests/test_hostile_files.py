@@ -29,6 +29,7 @@ LEAST = {
     "trajectories": 35,
     "configs": 18,
     "scenes": 100,
+    "usd": 60,
 }
 
 
@@ -66,7 +67,7 @@ def test_there_are_hundreds_of_every_kind(outcomes: list[Outcome]) -> None:
     counts = Counter(outcome.group for outcome in outcomes)
     print(dict(counts), len(outcomes), "in all;", Counter(outcome.kind for outcome in outcomes))
     names = Counter((outcome.group, outcome.name) for outcome in outcomes)
-    assert names.most_common(1)[0][1] == 1 and len(outcomes) >= 600, names.most_common(3)
+    assert names.most_common(1)[0][1] == 1 and len(outcomes) >= 700, names.most_common(3)
     assert {group: counts[group] >= least for group, least in LEAST.items()} == dict.fromkeys(LEAST, True), counts
 
 

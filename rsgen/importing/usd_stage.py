@@ -268,5 +268,8 @@ def _also(notes: Notes) -> str:
 
 def _reason(error: Exception) -> str:
     """What the first of USD's errors says, which names the line."""
-    first = " ".join(str(error.args[0] if error.args else error).split())
+    try:
+        first = " ".join(str(error.args[0] if error.args else error).split())
+    except UnicodeDecodeError:  # it quotes a line of bytes that are no text
+        return "it is no text"
     return first.rpartition(" : ")[2].strip("' ")[:200] or "no reason given"

@@ -12,6 +12,7 @@ from PIL import Image
 
 from rsgen import srgb
 from rsgen.array_types import ByteArray, Float32Array, FloatArray
+from rsgen.inputs import MOST_BYTES, MOST_PIXELS, image_size
 
 _WRAP = {"clamp": "clamp", "black": "clamp", "mirror": "mirror"}
 _FIRST_TILE = "1001"
@@ -54,7 +55,9 @@ def asset_bytes(attribute: Any, asset: Any) -> bytes | None:
     if not name:
         return None
     opened = resolver.OpenAsset(Ar.ResolvedPath(name))
-    return None if opened is None else bytes(opened.GetBuffer())
+    if opened is None or not 0 < opened.GetSize() <= MOST_BYTES:  # a device has no size
+        return None
+    return bytes(opened.GetBuffer())
 
 
 def decoded(data: bytes, space: str) -> Float32Array | None:
@@ -62,6 +65,9 @@ def decoded(data: bytes, space: str) -> Float32Array | None:
 
     auto is USD's rule: sRGB are 8-bit images of three or four channels.
     """
+    width, height = image_size(data) or (0, 0)
+    if width * height > MOST_PIXELS:
+        return None
     if data.startswith(_EXR_MAGIC):
         return _exr(data)
     try:

@@ -23,6 +23,7 @@ import hostile_folders
 import hostile_phones
 import hostile_scenes
 import hostile_sequences
+import hostile_usd
 
 from rsgen.errors import UserError
 
@@ -34,6 +35,7 @@ GROUPS: dict[str, Callable[[Path], Iterator[hostile_cases.Case]]] = {
     "trajectories": hostile_sequences.trajectories,
     "configs": hostile_sequences.configs,
     "scenes": hostile_scenes.scenes,
+    "usd": hostile_usd.usd,
 }
 _MOST_ADDRESSES = 12 << 30  # what stops a reader that would take all memory of the machine
 _CANARY = "a canary that belongs to nobody's recording"
