@@ -55,7 +55,7 @@ def outcomes(tmp_path_factory: pytest.TempPathFactory) -> list[Outcome]:
     places = os.pathsep.join([str(WORKER.parent), str(WORKER.parents[2])])
     environment = os.environ | {"TMPDIR": str(temporary), "PYTHONPATH": places}
     words = [sys.executable, str(WORKER), str(folder), *hostile_worker.GROUPS]
-    child = subprocess.run(words, capture_output=True, text=True, env=environment, timeout=300, check=False)
+    child = subprocess.run(words, capture_output=True, text=True, env=environment, timeout=180, check=False)
     rows: list[dict[str, Any]] = [json.loads(line) for line in child.stdout.splitlines()]
     assert child.returncode == 0, (rows[-1:], child.stderr[-2000:])
     assert "Traceback" not in child.stderr, child.stderr[-2000:]

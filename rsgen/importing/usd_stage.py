@@ -27,6 +27,7 @@ SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 _INSTALL = "install it with: pip install 'rolling-shutter-rgbd[usd]'"
 _HIDDEN = ("proxy", "guide")
 _DEEPEST = 200  # prims within prims: beyond, instancers hold themselves
+_TEXT, _MOST_NESTED = b"#usda", 1000  # brackets within brackets: many more overflow the stack of the parser
 
 
 def check_installed() -> None:
@@ -43,6 +44,7 @@ def read_usd(path: Path, scale: float | None, up: str | None) -> Content:
     check_installed()
     from pxr import Tf, Usd, UsdGeom, UsdUtils
 
+    _check_nesting(path)
     notes = Notes()
     messages = UsdUtils.CoalescingDiagnosticDelegate()  # else they would be printed
     try:
@@ -259,6 +261,18 @@ def _normals(prim: Any, mesh: Any, time: Any, surface: Any) -> FloatArray | None
     if at is None or length is None or not (np.isfinite(length).all() and length.all()):
         return None
     return np.asarray(at / length)
+
+
+def _check_nesting(path: Path) -> None:
+    """Raises UserError for text that nests so deep that USD's parser would overflow the stack and end the process."""
+    with path.open("rb") as file:
+        if file.read(len(_TEXT)) != _TEXT:
+            return
+        letters = np.frombuffer(file.read(), np.uint8)
+    steps = (letters == ord("{")).astype(np.int8) - (letters == ord("}")).astype(np.int8)
+    steps += (letters == ord("[")).astype(np.int8) - (letters == ord("]")).astype(np.int8)
+    if np.cumsum(steps, dtype=np.int32).max(initial=0) > _MOST_NESTED:
+        raise UserError(f"scene {path}: nests more than {_MOST_NESTED} deep: it is damaged")
 
 
 def _also(notes: Notes) -> str:

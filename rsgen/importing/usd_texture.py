@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -52,7 +53,7 @@ def asset_bytes(attribute: Any, asset: Any) -> bytes | None:
         path = asset.path.replace("<UDIM>", _FIRST_TILE)
         stack = attribute.GetPropertyStack()
         name = str(resolver.Resolve(Sdf.ComputeAssetPathRelativeToLayer(stack[0].layer, path) if stack else path))
-    if not name:
+    if not name or (Path(name).exists() and not Path(name).is_file()):  # a pipe would never end
         return None
     opened = resolver.OpenAsset(Ar.ResolvedPath(name))
     if opened is None or not 0 < opened.GetSize() <= MOST_BYTES:  # a device has no size
