@@ -323,14 +323,15 @@ def write_r3d(path: Path, content: Content, **change: Any) -> Path:
         "perFrameIntrinsicCoeffs": [[COLOR_K[0] + 0.1 * k, *COLOR_K[1:]] for k in range(COUNT)],
     } | change  # fmt: skip
     with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("metadata", json.dumps(meta))
+        put = lambda name, data: archive.writestr(zipfile.ZipInfo(name), data)  # noqa: E731 - of 1980, not of now
+        put("metadata", json.dumps(meta))
         for k in range(COUNT):
             z = content.units[k, :15, :20].astype(np.float32) / 1000
-            archive.writestr(f"rgbd/{k}.jpg", jpeg(content.colors[k]))
-            archive.writestr(f"rgbd/{k}.depth", stored_lzfse(z.tobytes()))
-            archive.writestr(f"rgbd/{k}.conf", stored_lzfse(np.full((15, 20), 2, np.uint8).tobytes()))
-        archive.writestr("../outside.txt", "x")
-        archive.writestr("/absolute.txt", "x")
+            put(f"rgbd/{k}.jpg", jpeg(content.colors[k]))
+            put(f"rgbd/{k}.depth", stored_lzfse(z.tobytes()))
+            put(f"rgbd/{k}.conf", stored_lzfse(np.full((15, 20), 2, np.uint8).tobytes()))
+        put("../outside.txt", "x")
+        put("/absolute.txt", "x")
     return path
 
 
