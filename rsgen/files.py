@@ -25,19 +25,19 @@ import OpenEXR
 import yaml
 
 from rsgen.errors import UserError
+from rsgen.inputs import EXR_START, MOST_BYTES, MOST_PIXELS, PNG_START, check_input, exr_size, image_size
 
 # Level 1 with run-length matching: 12 ms and 17 % smaller than the default strategy (15 ms) on a noisy 640x480 picture.
 _PNG_COLOR = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
 # Smooth 16-bit depth is the other way round: the default strategy is quicker (5 ms) and half the size.
 _PNG_DEPTH = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_DEFAULT]
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 # EXR has no checksum of its own (blocks that do not shrink are stored raw), so the file carries the CRC-32 of all its
 # bytes, taken with this field at zero, in a header attribute that other readers ignore.
 _CRC_NAME = "rsgenCrc32"
 _CRC_FIELD = _CRC_NAME.encode() + b"\0string\0\x08\0\0\0"
 _CRC_EMPTY = b"00000000"
-_EXR_MAGIC = b"\x76\x2f\x31\x01"
+_MOST_CHANNELS = 64
 
 _MOST_YAML_VALUES, _DEEPEST_YAML = 1_000_000, 200
 
@@ -176,8 +176,9 @@ _Dumper.add_representer(list, _represent_list)
 # reading
 
 
-def read_bytes(path: Path) -> bytes:
-    """The whole file. Raises UserError if it cannot be read or is empty."""
+def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
+    """The whole file, of `most` bytes at most. Raises UserError if it cannot be read, is empty, or no file."""
+    check_input(path, most)
     try:
         data = Path(path).read_bytes()
     except OSError as error:
@@ -262,6 +263,7 @@ def read_png(path: Path, shape: tuple[int, ...], dtype: type[np.generic]) -> np.
     data = read_bytes(path)
     if (fault := png_fault(data)) is not None:
         raise _damaged(path, "PNG", fault)
+    _check_pixels(path, data, shape)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
@@ -275,7 +277,7 @@ def read_png(path: Path, shape: tuple[int, ...], dtype: type[np.generic]) -> np.
 def read_exr(path: Path, shape: tuple[int, int], channels: tuple[str, ...] = ("Z",)) -> np.ndarray:
     """Channels of an EXR of exactly `shape` as float32 (h, w), or (h, w, n) if they are several. Raises UserError."""
     data = read_bytes(path)
-    if not data.startswith(_EXR_MAGIC):
+    if not data.startswith(EXR_START):
         raise _damaged(path, "EXR", "wrong signature")
     at = data.find(_CRC_FIELD) + len(_CRC_FIELD)
     if at >= len(_CRC_FIELD):  # absent in files of other programs
@@ -283,10 +285,14 @@ def read_exr(path: Path, shape: tuple[int, int], channels: tuple[str, ...] = ("Z
         if stored != b"%08x" % zlib.crc32(data[end:], zlib.crc32(_CRC_EMPTY, zlib.crc32(data[:at]))):
             raise _damaged(path, "EXR", "checksum differs")
     try:
+        height, width, count = exr_size(data)
+        if count > _MOST_CHANNELS:
+            raise _damaged(path, "EXR", f"it claims {count} channels")
+        _expect(path, np.broadcast_to(np.float32(0), (height, width)), shape, np.float32)
         with OpenEXR.File(io.BytesIO(data)) as file:
             stored = file.channels()
             planes = [np.array(stored[name].pixels) for name in channels]
-    except (RuntimeError, ValueError, KeyError, TypeError, MemoryError, OSError):
+    except (RuntimeError, ValueError, LookupError, TypeError, MemoryError, OSError, struct.error):
         raise _damaged(path, "EXR", "cannot be decoded") from None
     for plane in planes:
         _expect(path, plane, shape, np.float32)
@@ -295,7 +301,7 @@ def read_exr(path: Path, shape: tuple[int, int], channels: tuple[str, ...] = ("Z
 
 def read_npy(path: Path, shape: tuple[int, ...]) -> np.ndarray:
     """A finite float64 .npy of exactly that shape. Raises UserError."""
-    data = read_bytes(path)
+    data = read_bytes(path, max(MOST_BYTES, 8 * math.prod(shape) + 4096))
     try:
         array = np.load(io.BytesIO(data), allow_pickle=False)
     except (ValueError, OSError, EOFError, MemoryError, SyntaxError, zipfile.BadZipFile):
@@ -310,9 +316,9 @@ def read_npy(path: Path, shape: tuple[int, ...]) -> np.ndarray:
 
 def png_fault(data: bytes) -> str | None:
     """What is wrong with a PNG's structure or checksums, None if nothing is: decoders say it on stderr, or not."""
-    if not data.startswith(_PNG_SIGNATURE):
+    if not data.startswith(PNG_START):
         return "wrong signature"
-    view, at = memoryview(data), len(_PNG_SIGNATURE)
+    view, at = memoryview(data), len(PNG_START)
     while at + 12 <= len(data):
         (length,) = struct.unpack_from(">I", data, at)
         end = at + 12 + length
@@ -324,6 +330,13 @@ def png_fault(data: bytes) -> str | None:
             return None if end == len(data) else "data after its end"
         at = end
     return "truncated"
+
+
+def _check_pixels(path: Path, data: bytes, shape: tuple[int, ...]) -> None:
+    """Raises UserError where a picture is far larger than any of `shape` and would be decoded for nothing."""
+    width, height = image_size(data) or (0, 0)
+    if width * height > max(MOST_PIXELS, shape[0] * shape[1]):
+        raise _damaged(path, "PNG", f"it claims {width}x{height} pixels")
 
 
 def _expect(path: Path, array: np.ndarray, shape: tuple[int, ...], dtype: type[np.generic]) -> None:

@@ -18,7 +18,8 @@ SOURCES = sorted((ROOT / "rsgen").rglob("*.py"))
 TRACKER = sorted((ROOT / "rstrack").rglob("*.py"))
 # What rstrack builds on; the rest of rsgen renders, or is about rendering.
 SHARED = (
-    "array_types", "console", "device", "errors", "figures", "files", "geometry", "limits", "sequence", "srgb",
+    "array_types", "console", "device", "errors", "figures", "files", "geometry", "inputs", "limits", "sequence",
+    "srgb",
 )  # fmt: skip
 ENGINES = ("mitsuba", "drjit")
 WITHOUT_ENGINE = (
@@ -111,7 +112,7 @@ def test_the_tracker_imports_only_what_is_shared() -> None:
 
 
 def test_geometry_imports_numpy_and_scipy_only() -> None:
-    allowed = ("numpy", "scipy", "rsgen.array_types", "rsgen.errors", "rsgen.geometry")
+    allowed = ("numpy", "scipy", "rsgen.array_types", "rsgen.errors", "rsgen.inputs", "rsgen.geometry")
     for path in (ROOT / "rsgen/geometry").glob("*.py"):
         for module in imports(path):
             known = module.split(".")[0] in sys.stdlib_module_names or module == "rsgen"

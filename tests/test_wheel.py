@@ -25,7 +25,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 PACKAGES = {
     "PIL": "pillow", "cv2": "opencv-python-headless", "skimage": "scikit-image", "yaml": "PyYAML", "rerun": "rerun-sdk",
     "bpy": "bpy", "mathutils": "bpy", "pxr": "usd-core", "liblzfse": "pyliblzfse", "dask": "distributed",
-    "apsw": "rosbags", "lz4": "rosbags", "markupsafe": "jinja2",
+    "apsw": "rosbags", "lz4": "rosbags", "markupsafe": "jinja2", "ncore": "nvidia-ncore",
 }  # fmt: skip
 
 

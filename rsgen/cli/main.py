@@ -22,7 +22,7 @@ from rsgen.console.scheduler import Scheduler, open_workers
 from rsgen.errors import UserError
 
 Export = Literal[
-    "kalibr", "euroc", "registered", "ros1", "ros2", "mcap", "colmap", "nerfstudio", "video", "rerun"
+    "kalibr", "euroc", "registered", "ros1", "ros2", "mcap", "colmap", "nerfstudio", "ncore", "video", "rerun"
 ]  # fmt: skip
 Storage = Literal["sqlite3", "mcap"]
 BENCH_MODES = ("still", "rs-blur", "path", "rows", "averaged")
@@ -264,8 +264,8 @@ def export(
         "kalibr: camchain.yaml with line_delay, imu.yaml, with a target also target.yaml and images; euroc: mav0/ "
         "(ASL); registered: TUM folder with depth warped into the colour camera, its rows' times lost; ros1, ros2, "
         "mcap: a bag with images, IMU, tf and the lines' times; colmap: text model and images; nerfstudio: "
-        "transforms.json with poses and velocities for rolling-shutter splatting; video: global beside rolling shutter "
-        "(.mp4); rerun: .rrd recording",
+        "transforms.json with poses and velocities for rolling-shutter splatting; ncore: NVIDIA's format, "
+        "poses for every line; video: global beside rolling shutter (.mp4); rerun: .rrd recording",
         "|".join(get_args(Export)),
     ],
     sequence: SequenceFolder,

@@ -32,6 +32,7 @@ from rsgen.config.target import TargetConfig
 from rsgen.config.truth import TruthConfig
 from rsgen.errors import UserError
 from rsgen.files import parse_yaml
+from rsgen.inputs import check_input
 from rsgen.limits import Matrix4, RigidTransform
 from rsgen.sequence.format import STREAMS
 
@@ -144,6 +145,7 @@ def load_config(path: Path, overrides: dict[str, str] | None = None) -> Config:
     Raises UserError naming the file and every wrong field on one line.
     """
     path = Path(path)
+    check_input(path)
     try:
         data = parse_yaml(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:

@@ -10,7 +10,7 @@ from rsgen.export.bags.bag import Storage
 from rsgen.sequence.reader import Sequence, read_sequence
 
 Export = Literal[
-    "kalibr", "euroc", "registered", "ros1", "ros2", "mcap", "colmap", "nerfstudio", "video", "rerun"
+    "kalibr", "euroc", "registered", "ros1", "ros2", "mcap", "colmap", "nerfstudio", "ncore", "video", "rerun"
 ]  # fmt: skip
 
 _BAGS: dict[str, str] = {"ros1": "{}.bag", "ros2": "ros2", "mcap": "{}.mcap"}
@@ -21,9 +21,9 @@ def export(
 ) -> str:
     """Export the sequence at `path` and say in one line what was written. Raises UserError.
 
-    out: default kalibr/, mav0/, registered/, NAME.bag, ros2/, NAME.mcap, colmap/, nerfstudio/, shutter.mp4 or NAME.rrd
-    within the sequence's folder. copy: images, rather than linking them. scene: for the video, which renders again.
-    storage: of a ROS 2 bag.
+    out: default kalibr/, mav0/, registered/, NAME.bag, ros2/, NAME.mcap, colmap/, nerfstudio/, ncore/, shutter.mp4 or
+    NAME.rrd within the sequence's folder. copy: images, rather than linking them. scene: for the video, which renders
+    again. storage: of a ROS 2 bag.
     """
     sequence = read_sequence(path)
     if to == "kalibr":
@@ -50,6 +50,10 @@ def export(
         from rsgen.export.reconstruction.nerfstudio import export_nerfstudio
 
         return export_nerfstudio(sequence, out or path / "nerfstudio", copy, progress)
+    if to == "ncore":
+        from rsgen.export.reconstruction.ncore import export_ncore
+
+        return export_ncore(sequence, out or path / "ncore", progress)
     if to == "rerun":
         from rsgen.export.viewing.rerun import export_rerun
 

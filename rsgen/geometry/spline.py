@@ -7,7 +7,6 @@ Derivatives after Sommer et al., CVPR 2020, and Tirado & Civera, arXiv 2201.1060
 
 from __future__ import annotations
 
-import io
 import zipfile
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,6 +20,7 @@ from rsgen.array_types import FloatArray, IntArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.so3 import cross, powers
+from rsgen.inputs import read_arrays
 
 Side = Literal["left", "right"]
 
@@ -201,8 +201,8 @@ class Spline:
     def load(cls, path: str | Path) -> Spline:
         """Read what `save` wrote. Raises UserError for a missing, damaged or foreign file."""
         try:
-            with np.load(io.BytesIO(Path(path).read_bytes()), allow_pickle=False) as data:
-                return cls(data["control_points"], float(data["t0"]), float(data["dt"]))
+            data = read_arrays(Path(path), ("control_points", "t0", "dt"))
+            return cls(data["control_points"], float(data["t0"]), float(data["dt"]))
         except UserError as error:
             raise UserError(f"{path}: {error}") from None
         except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:

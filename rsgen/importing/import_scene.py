@@ -15,6 +15,7 @@ from rsgen.importing.blend import BLEND, read_blend
 from rsgen.importing.content import Content
 from rsgen.importing.folder import NAME, write_folder, write_scene
 from rsgen.importing.lamps import lamp_shapes
+from rsgen.inputs import check_input
 from rsgen.render.mesh_files.mesh_file import MeshOptions, finished, light_shapes, part_shapes, read_parts
 
 MESH_FILES = (".glb", ".gltf", ".obj", ".ply", ".stl")
@@ -45,8 +46,16 @@ def import_scene(
         raise UserError(f"scene {file}: is no file to import{hint}")
     if not file.is_file():
         raise UserError(f"scene {file}: no such file")
+    if not _is_mapped(file):
+        check_input(file)
     found, notes = write_folder(out, force, lambda folder: _fill(file, folder, scale, up))
     return Imported(out / NAME, found, notes)
+
+
+def _is_mapped(file: Path) -> bool:
+    """Whether no reader takes the whole file into memory: binary USD, and .blend, which Blender reads."""
+    with file.open("rb") as opened:
+        return file.suffix.lower() in (".usdz", BLEND) or opened.read(8) == b"PXR-USDC"
 
 
 def _fill(file: Path, folder: Path, scale: float | None, up: Up | None) -> tuple[tuple[str, ...], tuple[str, ...]]:

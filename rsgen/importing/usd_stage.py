@@ -27,6 +27,7 @@ SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 _INSTALL = "install it with: pip install 'rolling-shutter-rgbd[usd]'"
 _HIDDEN = ("proxy", "guide")
 _DEEPEST = 200  # prims within prims: beyond, instancers hold themselves
+_TEXT, _MOST_NESTED = b"#usda", 1000  # brackets within brackets: many more overflow the stack of the parser
 
 
 def check_installed() -> None:
@@ -43,6 +44,7 @@ def read_usd(path: Path, scale: float | None, up: str | None) -> Content:
     check_installed()
     from pxr import Tf, Usd, UsdGeom, UsdUtils
 
+    _check_nesting(path)
     notes = Notes()
     messages = UsdUtils.CoalescingDiagnosticDelegate()  # else they would be printed
     try:
@@ -261,6 +263,18 @@ def _normals(prim: Any, mesh: Any, time: Any, surface: Any) -> FloatArray | None
     return np.asarray(at / length)
 
 
+def _check_nesting(path: Path) -> None:
+    """Raises UserError for text that nests so deep that USD's parser would overflow the stack and end the process."""
+    with path.open("rb") as file:
+        if file.read(len(_TEXT)) != _TEXT:
+            return
+        letters = np.frombuffer(file.read(), np.uint8)
+    steps = (letters == ord("{")).astype(np.int8) - (letters == ord("}")).astype(np.int8)
+    steps += (letters == ord("[")).astype(np.int8) - (letters == ord("]")).astype(np.int8)
+    if np.cumsum(steps, dtype=np.int32).max(initial=0) > _MOST_NESTED:
+        raise UserError(f"scene {path}: nests more than {_MOST_NESTED} deep: it is damaged")
+
+
 def _also(notes: Notes) -> str:
     lines = notes.lines()
     return f" ({lines[0]})" if lines else ""
@@ -268,5 +282,8 @@ def _also(notes: Notes) -> str:
 
 def _reason(error: Exception) -> str:
     """What the first of USD's errors says, which names the line."""
-    first = " ".join(str(error.args[0] if error.args else error).split())
+    try:
+        first = " ".join(str(error.args[0] if error.args else error).split())
+    except UnicodeDecodeError:  # it quotes a line of bytes that are no text
+        return "it is no text"
     return first.rpartition(" : ")[2].strip("' ")[:200] or "no reason given"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from PIL import Image
 
 from rsgen import srgb
 from rsgen.array_types import ByteArray, Float32Array, FloatArray
+from rsgen.inputs import MOST_BYTES, MOST_PIXELS, image_size
 
 _WRAP = {"clamp": "clamp", "black": "clamp", "mirror": "mirror"}
 _FIRST_TILE = "1001"
@@ -51,10 +53,12 @@ def asset_bytes(attribute: Any, asset: Any) -> bytes | None:
         path = asset.path.replace("<UDIM>", _FIRST_TILE)
         stack = attribute.GetPropertyStack()
         name = str(resolver.Resolve(Sdf.ComputeAssetPathRelativeToLayer(stack[0].layer, path) if stack else path))
-    if not name:
+    if not name or (Path(name).exists() and not Path(name).is_file()):  # a pipe would never end
         return None
     opened = resolver.OpenAsset(Ar.ResolvedPath(name))
-    return None if opened is None else bytes(opened.GetBuffer())
+    if opened is None or not 0 < opened.GetSize() <= MOST_BYTES:  # a device has no size
+        return None
+    return bytes(opened.GetBuffer())
 
 
 def decoded(data: bytes, space: str) -> Float32Array | None:
@@ -62,6 +66,9 @@ def decoded(data: bytes, space: str) -> Float32Array | None:
 
     auto is USD's rule: sRGB are 8-bit images of three or four channels.
     """
+    width, height = image_size(data) or (0, 0)
+    if width * height > MOST_PIXELS:
+        return None
     if data.startswith(_EXR_MAGIC):
         return _exr(data)
     try:

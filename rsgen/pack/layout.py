@@ -5,6 +5,7 @@ Names and contents follow the loaders of the authors' code (DeepUnrollNet): ther
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 
 import cv2
@@ -32,7 +33,8 @@ class Pair:
     """A rolling image with its global ones; by time ('first', 'middle' line): sharp images (h, w, 3) uint8.
 
     flow: (h, w, 2) px from the rolling image into the global one, 0 where that does not hold the point. flow_valid:
-    (h, w) where it does and shows it. mask: (h, w) where what the global image shows is in the rolling one.
+    (h, w) where it does and shows it. mask: (h, w) where what the global image shows is in the rolling one. depth:
+    (h, w) planar z of the rolling image in m, 0 where there is none; None where it is not asked for.
     """
 
     rolling: ByteArray
@@ -40,12 +42,15 @@ class Pair:
     flow: dict[str, Float32Array]
     flow_valid: dict[str, BoolArray]
     mask: dict[str, BoolArray]
+    depth: Float32Array | None = None
 
 
 def pair_files(layout: Layout, k: int, pair: Pair) -> dict[str, bytes]:
     """Files of frame k, by name."""
     stem = f"{k:04d}" if layout == "carla-rs" else f"{k:03d}"
     files = {f"{stem}{_ROLLING[layout]}": encode_png(pair.rolling)}
+    if pair.depth is not None:
+        files[f"{stem}{_ROLLING[layout].replace('.png', '.pdepth')}"] = pdepth_text(pair.depth)
     for time in TIMES:
         files[f"{stem}{_GLOBAL[layout][time]}"] = encode_png(pair.images[time])
         files[f"{stem}{_SUFFIX[time]}.flow"] = flo_bytes(pair.flow[time])
@@ -59,6 +64,13 @@ def flo_bytes(flow: Float32Array) -> bytes:
     height, width = flow.shape[:2]
     head = np.array([_FLO_MAGIC], "<f4").tobytes() + np.array([width, height], "<i4").tobytes()
     return head + np.ascontiguousarray(flow[..., :2], "<f4").tobytes()
+
+
+def pdepth_text(z: Float32Array) -> bytes:
+    """Rows of planar z (h, w) in metres to a tenth of a millimetre, as the authors wrote it; 0 for what is no depth."""
+    stream = io.BytesIO()
+    np.savetxt(stream, np.where(np.isfinite(z) & (z > 0), z, 0.0), "%.4f")
+    return stream.getvalue()
 
 
 def mark_file(layout: Layout, drawn: Drawn, twist: FloatArray, rate_hz: float) -> tuple[str, bytes]:

@@ -99,7 +99,7 @@ def make_sequence(job: PackJob, progress: Progress) -> None:
     try:
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir(parents=True)
-        for k, pair in enumerate(render_pairs(stage, job.drawn, job.options.length)):
+        for k, pair in enumerate(render_pairs(stage, job.drawn, job.options.length, job.options.depth)):
             for name, data in pair_files(job.options.layout, k, pair).items():
                 (temporary / name).write_bytes(data)
         twist = mean_twist(stage, job.drawn, job.options.length)

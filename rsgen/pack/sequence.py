@@ -47,15 +47,15 @@ def load_stage(config: Config, spline: Spline, progress: Progress = no_progress)
     return Stage(config, scene, make_integrator(mi, scene, config, progress), spline)
 
 
-def render_pairs(stage: Stage, drawn: Drawn, length: int) -> Iterator[Pair]:
-    """The sequence's pairs, one after the other. Raises UserError."""
+def render_pairs(stage: Stage, drawn: Drawn, length: int, depth: bool = False) -> Iterator[Pair]:
+    """The sequence's pairs, one after the other. depth: of the rolling images, too. Raises UserError."""
     from rsgen.render.images import ColorRenderer
     from rsgen.truth.renderer import TruthRenderer, global_instant
 
     config = stage.config
     color = config.color.model_copy(update={"readout_s": drawn.readout_s, "exposure_s": drawn.exposure_s})
     still = color.model_copy(update={"readout_s": 0.0, "exposure_s": 0.0})
-    truth = TruthConfig(global_shutter=TIMES, flow=("global",), spp=config.truth.spp)
+    truth = TruthConfig(global_shutter=TIMES, flow=("global",), spp=config.truth.spp, color_depth=depth)
     camera, shutter = color.camera, color.shutter
     rolling = ColorRenderer(stage.scene, stage.integrator, camera, shutter, color.spp)
     twins = TruthRenderer(stage.scene, stage.integrator, color, truth)
@@ -76,6 +76,7 @@ def render_pairs(stage: Stage, drawn: Drawn, length: int) -> Iterator[Pair]:
             {time: np.ascontiguousarray(flow[time][..., :2]) for time in TIMES},
             {time: flow[time][..., 2] > 0.5 for time in TIMES},
             {time: into[time][..., 2] > 0.5 for time in TIMES},
+            images.get("color_depth"),
         )
 
 

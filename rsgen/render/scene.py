@@ -26,6 +26,7 @@ from rsgen.array_types import Float32Array
 from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
 from rsgen.files import encode_png
+from rsgen.inputs import check_input
 from rsgen.render.board import Board, drawing
 from rsgen.render.board import surface as board_surface
 from rsgen.render.mended import mend_meshes
@@ -89,6 +90,7 @@ def ensure_built(path: Path) -> None:
             )
     if not path.is_file():
         raise UserError(f"scene {path}: no such file: name a Mitsuba 3 .xml or a mesh file in scene.file")
+    check_input(path)
 
 
 def surface(scene: Any) -> tuple[Float32Array, NDArray[np.uint32]]:

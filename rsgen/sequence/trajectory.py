@@ -16,6 +16,7 @@ import numpy.typing as npt
 from rsgen.array_types import BoolArray, FloatArray, IntArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3
+from rsgen.inputs import check_input
 
 TrajectoryFormat = Literal["auto", "tum", "icl", "euroc"]
 
@@ -153,6 +154,7 @@ def read_trajectory(
 
 
 def _text(path: Path) -> str:
+    check_input(path)
     try:
         raw = path.read_bytes()
     except (OSError, ValueError) as error:  # ValueError: no file can have that name

@@ -65,7 +65,7 @@ rstrack estimates the continuous-time trajectory of a rolling-shutter RGB-D came
   rstrack bench --quick                                every method on some sequences, beside the paper's figures
 
 A sequence is a folder that 'rsgen render' wrote, or a TUM RGB-D, ICL-NUIM or 7-Scenes folder; the first two of those
-need their cameras in a camera.yaml or calibration.yaml inside, or in the file that --camera names.
+need their cameras in a camera.yaml, calibration.yaml or camchain.yaml inside, or in the file that --camera names.
 """
 _STATUS = (
     "exit status: 0 done, 1 frames were lost or cannot be read, 2 wrong input, 130 interrupted (what there is has been "

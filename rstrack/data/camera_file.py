@@ -13,7 +13,7 @@ T_color_depth (4x4) is the identity where it is left out. color.offset_s: second
 holds; both are what `rstrack calibrate` finds, which writes such a file. color.falloff: see `Rig`; auto: `track` finds
 it. stamps: auto, raw or regular, see there too.
 depth.registered: warped into the colour camera, see `rstrack.data.registered_rows`. calibration.yaml: see
-`rstrack.data.opencv_camera_file`.
+`rstrack.data.opencv_camera_file`; Kalibr's camchain.yaml: see `rstrack.data.kalibr_camera_file`.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.sequence.format import DEPTH_SCALE
 from rstrack.data.clocks.timing import StampsMode
 from rstrack.data.depth_error import NONE, DepthError
+from rstrack.data.kalibr_camera_file import Camchain, is_camchain, read_camchain
 from rstrack.data.opencv_camera_file import check_fy, extrinsic, is_opencv, read_opencv_rig
 from rstrack.data.registered_rows import DepthSensor, registered_shutter
 from rstrack.data.rig import Rig
@@ -41,7 +42,7 @@ _KEYS = "color, depth, T_color_depth and stamps, each camera with width, height,
 
 Size = tuple[int, int]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Seconds = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
 Pixels = Annotated[int, Field(ge=1, le=16384)]
 Vector4 = tuple[Finite, Finite, Finite, Finite]
 Matrix4 = tuple[Vector4, Vector4, Vector4, Vector4]
@@ -79,8 +80,8 @@ class _Stream(_Section):
     intrinsics: Vector4
     model: Model = "pinhole"
     distortion: tuple[Finite, ...] = ()
-    readout_s: NonNegative
-    exposure_s: NonNegative = 0.0
+    readout_s: Seconds
+    exposure_s: Seconds = 0.0
     scan: Scan = "top-bottom"
 
     @property
@@ -135,7 +136,7 @@ class _CameraYaml(_Section):
 
 
 def read_rig(path: Path, color_size: Size, depth_size: Size) -> RigFile:
-    """Read a camera.yaml or a calibration.yaml.
+    """Read a camera.yaml, a calibration.yaml or a camchain.yaml.
 
     color_size, depth_size: (width, height) in pixels of the first images: what a calibration.yaml may leave out.
     Raises UserError, one line, naming the file and what is missing or wrong in it.
@@ -144,8 +145,11 @@ def read_rig(path: Path, color_size: Size, depth_size: Size) -> RigFile:
     if is_opencv(text):
         rig, depth_scale = read_opencv_rig(path, text, color_size, depth_size)
         return RigFile(rig, depth_scale or DEPTH_SCALE, scale_named=depth_scale is not None)
+    content = read_yaml(path)
+    if is_camchain(content):
+        return _of_camchain(read_camchain(path, content))
     try:
-        data = _CameraYaml.model_validate(read_yaml(path))
+        data = _CameraYaml.model_validate(content)
     except ValidationError as error:
         raise UserError(f"{path}: {_first(error)}") from None
     depth = data.depth
@@ -178,6 +182,15 @@ def read_rig(path: Path, color_size: Size, depth_size: Size) -> RigFile:
         depth is not None and "depth_scale" in depth.model_fields_set,
         notes,
         NONE if depth is None else DepthError(**depth.error.model_dump()),
+    )
+
+
+def _of_camchain(chain: Camchain) -> RigFile:
+    color, depth = chain.color, chain.depth or chain.color
+    rig = Rig(depth.camera, depth.shutter, color.camera, color.shutter, chain.T_color_depth)
+    known = color.has_readout or depth.has_readout
+    return RigFile(
+        rig, DEPTH_SCALE, color_offset_s=chain.color_offset_s, scan_named=known, scale_named=False, notes=chain.notes
     )
 
 

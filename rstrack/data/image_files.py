@@ -16,6 +16,7 @@ from rsgen.array_types import ByteArray, Float32Array
 from rsgen.errors import UserError
 from rsgen.files import png_fault, read_bytes
 from rsgen.geometry.camera import Camera
+from rsgen.inputs import MOST_PIXELS, image_size
 from rstrack.data.rig import Rig
 
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
@@ -100,6 +101,9 @@ def decode_image(path: Path) -> npt.NDArray[Any]:
         fault = None if _JPEG_END in data[-64:] else "truncated"
     else:
         fault = "neither PNG nor JPEG"
+    width, height = image_size(data) or (0, 0)
+    if fault is None and width * height > MOST_PIXELS:
+        fault = f"it claims {width}x{height} pixels"
     image = None
     if fault is None:
         try:

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_npz
+from rsgen.inputs import MOST_PIXELS, read_arrays
 
 MOVING = "moving.npz"
 
@@ -92,9 +93,10 @@ class MovingMasks:
         if not path.exists():
             return cls()
         try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in ("frames", "ends", "packed", "shape", "stride")}
+            arrays = read_arrays(path, ("frames", "ends", "packed", "shape", "stride"))
             height, width = (int(size) for size in arrays["shape"])
+            if height * width > MOST_PIXELS:
+                raise ValueError(f"masks of {width}x{height} pixels")
             ends = [0, *(int(end) for end in arrays["ends"])]
             packed = arrays["packed"].astype(np.uint8).tobytes()
             out = cls((height, width), int(arrays["stride"]))
@@ -107,5 +109,6 @@ class MovingMasks:
 
 
 def _unpacked(packed: bytes, shape: tuple[int, int]) -> Mask:
-    bits = np.unpackbits(np.frombuffer(zlib.decompress(packed), np.uint8), count=shape[0] * shape[1])
+    data = zlib.decompressobj().decompress(packed, (shape[0] * shape[1] + 7) // 8)
+    bits = np.unpackbits(np.frombuffer(data, np.uint8), count=shape[0] * shape[1])
     return bits.reshape(shape).astype(bool)

@@ -3,7 +3,8 @@
 rgb/000000.png depth/000000.png rgb.txt depth.txt camera.yaml     see docs/format.md
 groundtruth.txt   poses of the colour camera, where the recording has any; its first line says whose
 imu.csv           EuRoC's columns; imu.yaml where the recording says where the IMU sits, or how noisy it is
-intrinsics.csv    stamp [ns], fx, fy, cx, cy of each colour image, where they change
+intrinsics.csv    stamp [ns], fx, fy, cx, cy of each colour image, where they change; intrinsics_depth.csv: of each
+                  depth image
 import.json       what was read of which file, and what was assumed
 """
 
@@ -29,6 +30,7 @@ from rsgen.sequence.trajectory import MAX_POSITION_M, MIN_POSES
 from rstrack.data.imu.description import imu_yaml
 from rstrack.data.imu.files import IMU_YAML
 from rstrack.data.layouts.tum_folder import ESTIMATED
+from rstrack.data.own_intrinsics import FILES
 from rstrack.importing.recording import Inertial, Intrinsics, Picture, Pose, Recording, StreamCamera
 
 RECORD = "import.json"
@@ -276,16 +278,18 @@ def _in_order(stamps: Any, values: FloatArray) -> tuple[Any, FloatArray]:
 
 
 def _intrinsics(changing: Sequence[Intrinsics], part: Path, notes: list[str]) -> None:
-    table = np.array([item.values for item in changing]).reshape(-1, 4)
-    if not len(table) or (table == table[0]).all():
-        return
-    lines = [",".join([str(item.stamp_ns), *map(repr, item.values)]) for item in changing]
-    (part / "intrinsics.csv").write_text("\n".join(["#timestamp [ns],fx,fy,cx,cy", *lines, ""]))
-    spread = np.ptp(table, axis=0)
-    notes.append(
-        f"intrinsics change (fx by {spread[0]:.2f}, cx by {spread[2]:.2f}, cy by {spread[3]:.2f} px): camera.yaml has "
-        "their medians, intrinsics.csv each image's"
-    )
+    for stream, name in FILES.items():
+        once = {item.stamp_ns: item.values for item in reversed(changing) if item.stream == stream}
+        table = np.array(list(once.values())).reshape(-1, 4)
+        if not len(table) or (table == table[0]).all():
+            continue
+        lines = [",".join([str(ns), *map(repr, once[ns])]) for ns in sorted(once)]
+        (part / name).write_text("\n".join(["#timestamp [ns],fx,fy,cx,cy", *lines, ""]))
+        spread = np.ptp(table, axis=0)
+        notes.append(
+            f"{'colour' if stream == 'color' else stream}'s intrinsics change (fx by {spread[0]:.2f}, cx by "
+            f"{spread[2]:.2f}, cy by {spread[3]:.2f} px): camera.yaml has their medians, {name} each image's"
+        )
 
 
 def _camera_file(recording: Recording, known: Sequence[float | None], unknown: Sequence[str], part: Path) -> None:

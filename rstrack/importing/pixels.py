@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import io
 import struct
 from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
-from PIL import Image as Pillow
 
 from rsgen.array_types import ByteArray
 from rsgen.errors import UserError
 from rsgen.files import encode_png, png_fault
 from rsgen.geometry.camera import Camera
+from rsgen.inputs import MOST_PIXELS, image_size
 from rstrack.importing.recording import FLOAT_DEPTH_SCALE
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
@@ -114,6 +113,9 @@ def compressed_depth(where: str, data: bytes, encoding: str, camera: Camera) -> 
 
 def decode(where: str, data: bytes) -> npt.NDArray[Any]:
     """An image as OpenCV has it. Raises UserError."""
+    width, height = header_size(where, data)
+    if width * height > MOST_PIXELS:
+        raise UserError(f"{where}: claims {width}x{height} pixels: it is damaged")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
@@ -125,12 +127,9 @@ def decode(where: str, data: bytes) -> npt.NDArray[Any]:
 
 def header_size(where: str, data: bytes) -> tuple[int, int]:
     """(width, height) as an image's header says, without decoding it. Raises UserError."""
-    try:
-        with Pillow.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
-            width, height = image.size
-    except Exception:  # whatever a damaged header makes of Pillow
-        raise UserError(f"{where}: the image cannot be decoded") from None
-    return int(width), int(height)
+    if (size := image_size(data)) is None:
+        raise UserError(f"{where}: the image cannot be decoded")
+    return size
 
 
 def check_size(where: str, size: tuple[int, int], camera: Camera) -> None:
@@ -147,6 +146,7 @@ def _rows(where: str, message: Any, camera: Camera, channels: int, size: int) ->
     check_size(where, (int(message.width), int(message.height)), camera)
     data = np.asarray(message.data).view(np.uint8).reshape(-1)
     wanted, step = camera.width * channels * size, int(message.step)
+    step = wanted if camera.height == 1 else step  # of one line it may be anything
     if step < wanted or len(data) < step * (camera.height - 1) + wanted:
         raise UserError(f"{where}: holds {len(data)} bytes in lines of {step}, too few for {message.encoding!r:.40}")
     padded = np.zeros(step * camera.height, np.uint8) if len(data) < step * camera.height else data

@@ -68,10 +68,11 @@ def pose_of(q: npt.ArrayLike, t: npt.ArrayLike) -> FloatArray:
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """fx, fy, cx, cy in pixels of the colour image of a time, where they change from one to the next."""
+    """fx, fy, cx, cy in pixels of a stream's image of a time, where they change from one to the next."""
 
     stamp_ns: int
     values: tuple[float, float, float, float]
+    stream: StreamName = "color"
 
 
 Item = Picture | Inertial | Pose | Intrinsics

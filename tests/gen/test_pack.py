@@ -17,7 +17,7 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3, so3
 from rsgen.geometry.spline import Spline
 from rsgen.pack.draw import Drawn, PackOptions, camera_spline, draw_sequence
-from rsgen.pack.layout import flo_bytes, mark_file
+from rsgen.pack.layout import flo_bytes, mark_file, pdepth_text
 
 SPAN = [(2.0, 12.0), (0.0, 1.0)]
 
@@ -79,6 +79,15 @@ def test_flow_files_are_middleburys() -> None:
     data = flo_bytes(flow)
     assert data[:4] == b"PIEH" and np.frombuffer(data[4:12], "<i4").tolist() == [4, 3]
     np.testing.assert_array_equal(np.frombuffer(data[12:], "<f4").reshape(3, 4, 2), flow)
+
+
+def test_depth_is_text_that_numpy_reads() -> None:
+    rng = np.random.default_rng(0)
+    z = (10 ** rng.uniform(-4, 4, (30, 40))).astype(np.float32)
+    z[0, :4] = (0.0, np.inf, np.nan, -1.0)
+    read = np.loadtxt(pdepth_text(z).decode().splitlines())
+    expected = np.where(np.isfinite(z) & (z > 0), z, 0).astype(float)
+    assert read.shape == z.shape and np.abs(read - expected).max() <= 0.5001e-4
 
 
 def test_the_velocity_log_is_one_line_of_six_numbers() -> None:
@@ -195,3 +204,30 @@ def test_another_pack_or_folder_is_not_written_into(
     assert main(["pack", str(small_config), "--out", str(tmp_path), "--quiet", *OPTIONS]) == 2
     told = capsys.readouterr().err
     assert "holds other files" in told and len(told.splitlines()) == 1
+
+
+def test_depth_puts_points_where_the_flow_does(packed: Path, small_config: Path, tmp_path: Path) -> None:
+    out = tmp_path / "deep"
+    words = ["pack", str(small_config), "--count", "2", "--out", str(out), "--quiet", "--depth", *OPTIONS]
+    assert main(words) == 0
+    folder = out / "000000"
+    extra = {path.name for path in folder.iterdir()} - {path.name for path in (packed / "000000").iterdir()}
+    assert extra == {"0000_rs.pdepth", "0001_rs.pdepth"}
+    assert (folder / "0001_rs.png").read_bytes() == (packed / "000000/0001_rs.png").read_bytes()
+
+    from rsgen.produce.generate import load_motion
+
+    about, config = json.loads((folder / "sequence.json").read_text()), load_config(small_config)
+    names = ("readout_s", "exposure_s", "start_s", "speed", "seed")
+    drawn = Drawn(config=0, turn=tuple(about["turn"]), **{name: about[name] for name in names})
+    spline = camera_spline(load_motion(config).spline, drawn, se3.inverse(np.array(config.T_color_depth, float)))
+    color = config.color.model_copy(update={"readout_s": drawn.readout_s, "exposure_s": drawn.exposure_s})
+    camera, shutter, stamp = color.camera, color.shutter, 1 / color.rate_hz
+    uv, z = camera.pixel_grid(), np.loadtxt(folder / "0001_rs.pdepth")
+    T = spline.pose(shutter.line_mid_time(stamp, shutter.line_of_pixel(uv, camera), camera))
+    p_world = se3.transform(T, camera.backproject(uv, z))
+    first = spline.pose(float(shutter.line_mid_time(stamp, 0.0, camera)))
+    at, _ = camera.project(se3.transform(se3.inverse(first), p_world))
+    valid = cv2.imread(str(folder / "0001_flow_mask.png"), cv2.IMREAD_UNCHANGED) == 255
+    off = np.abs(at - uv - read_flow(folder / "0001.flow"))[valid & (z > 0)]
+    assert valid.mean() > 0.5 and np.abs((at - uv)[valid]).max() > 1.0 and off.max() < 0.02

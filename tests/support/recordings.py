@@ -151,7 +151,7 @@ def write_spoken(path: Path, talker: Talker, spoken: Spoken, storage: str = "") 
         if storage:
             writer.set_compression(getattr(Writer1.CompressionFormat, storage.upper()))
     else:
-        folder = path.with_suffix(".folder") if path.suffix in (".db3", ".mcap") else path
+        folder = path.with_suffix(f"{path.suffix}.folder") if path.suffix in (".db3", ".mcap") else path
         plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
         writer = Writer2(folder, version=9, storage_plugin=plugin)
         if storage == "mcap":
@@ -323,14 +323,15 @@ def write_r3d(path: Path, content: Content, **change: Any) -> Path:
         "perFrameIntrinsicCoeffs": [[COLOR_K[0] + 0.1 * k, *COLOR_K[1:]] for k in range(COUNT)],
     } | change  # fmt: skip
     with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("metadata", json.dumps(meta))
+        put = lambda name, data: archive.writestr(zipfile.ZipInfo(name), data)  # noqa: E731 - of 1980, not of now
+        put("metadata", json.dumps(meta))
         for k in range(COUNT):
             z = content.units[k, :15, :20].astype(np.float32) / 1000
-            archive.writestr(f"rgbd/{k}.jpg", jpeg(content.colors[k]))
-            archive.writestr(f"rgbd/{k}.depth", stored_lzfse(z.tobytes()))
-            archive.writestr(f"rgbd/{k}.conf", stored_lzfse(np.full((15, 20), 2, np.uint8).tobytes()))
-        archive.writestr("../outside.txt", "x")
-        archive.writestr("/absolute.txt", "x")
+            put(f"rgbd/{k}.jpg", jpeg(content.colors[k]))
+            put(f"rgbd/{k}.depth", stored_lzfse(z.tobytes()))
+            put(f"rgbd/{k}.conf", stored_lzfse(np.full((15, 20), 2, np.uint8).tobytes()))
+        put("../outside.txt", "x")
+        put("/absolute.txt", "x")
     return path
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import pickle
 import signal
@@ -10,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import hostile
 import numpy as np
 import pytest
 import synthetic
@@ -23,8 +25,9 @@ from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.estimate import read_estimate
 from rstrack.options import Options
 from rstrack.tracking.runs import checkpoint
-from rstrack.tracking.runs.record import Noise
+from rstrack.tracking.runs.record import Done, Noise
 from rstrack.tracking.runs.run import track
+from rstrack.tracking.spline_tracker import Tracker
 
 FRAMES = 16
 NOISE = Noise(1e-3, 0.01, 3)
@@ -143,6 +146,47 @@ def test_only_the_same_run_goes_on(dataset: Dataset, tmp_path: Path, often: None
         track(dataset, OPTIONS, out, slice(0, 6), resume=True)
 
 
+def write_state(out: Path, data: bytes) -> None:
+    """As `save` does, with a right checksum."""
+    (out / checkpoint.FOLDER / "state.pickle").write_bytes(hashlib.sha256(data).digest() + data)
+
+
+def test_what_is_damaged_or_wants_all_memory_is_refused(dataset: Dataset, tmp_path: Path) -> None:
+    def begun() -> checkpoint.Checkpoint:
+        made = checkpoint.checkpoint_of(tmp_path, dataset, range(FRAMES), Tracker(dataset.rig, OPTIONS), {})
+        assert made is not None
+        return made
+
+    begun().save(Done())
+    path = tmp_path / checkpoint.FOLDER / "state.pickle"
+    whole = path.read_bytes()
+    assert begun().resume() == Done()
+    for way, data in hostile.damaged(whole, 0):
+        path.write_bytes(data)
+        with pytest.raises(UserError, match=r"state\.pickle: cannot be read \(.*checksum differs"):
+            begun().resume()
+        assert way
+    # Opcodes: a global, an integer of 8 bytes, a tuple of one, a call.
+    name = lambda module, text: f"c{module}\n{text}\n".encode()  # noqa: E731
+    number = lambda value: b"\x8a\x08" + int(value).to_bytes(8, "little")  # noqa: E731
+    call = b"\x85R"
+    for ops in (
+        name("builtins", "set") + name("builtins", "range") + number(10**11) + call + call,
+        name("builtins", "bytearray") + number(10**11) + call,
+        name("numpy", "ndarray") + number(10**13) + b"\x85" + call,
+        b"Nr\xff\xff\xff\x7f",  # a memo with 2^31 entries
+        b"\x8e" + b"\xff" * 8,  # 2^64 bytes
+        b"]" * 200_000 + b"a" * 199_999,
+    ):
+        write_state(tmp_path, b"\x80\x05" + ops + b".")
+        with pytest.raises(UserError, match=r"state\.pickle: cannot be read") as caught:
+            begun().resume()
+        assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
+    hostile.sparse(path)
+    with pytest.raises(UserError, match="more than"):
+        begun().resume()
+
+
 def test_nothing_is_run_by_reading(dataset: Dataset, tmp_path: Path, often: None) -> None:
     out = tmp_path / "run"
     (out / checkpoint.FOLDER).mkdir(parents=True)
@@ -159,13 +203,13 @@ def test_nothing_is_run_by_reading(dataset: Dataset, tmp_path: Path, often: None
 
     for evil in (Evil(os.system, f"touch {touched}"), Evil(eval, code), Evil(runstring, code, {}),
                  Evil(atomic_write, touched, b"")):  # fmt: skip
-        (out / checkpoint.FOLDER / "state.pickle").write_bytes(pickle.dumps(evil))
+        write_state(out, pickle.dumps(evil))
         with pytest.raises(UserError, match="which no run has"):
             track(dataset, OPTIONS, out, resume=True)
     # What a module of ours imports is not ours: a class, and one by a dotted name.
     for module, name in (("rstrack.keyframes.archive", "TemporaryDirectory"), ("pathlib", "os._wrap_close")):
         texts = b"".join(b"\x8c" + bytes([len(text)]) + text.encode() for text in (module, name))
-        (out / checkpoint.FOLDER / "state.pickle").write_bytes(b"\x80\x04" + texts + b"\x93)R.")
+        write_state(out, b"\x80\x04" + texts + b"\x93)R.")
         with pytest.raises(UserError, match="which no run has"):
             track(dataset, OPTIONS, out, resume=True)
     assert not touched.exists()

@@ -24,6 +24,7 @@ from rsgen.geometry import se3
 from rstrack.cli.info import describe
 from rstrack.cli.main import main
 from rstrack.data.dataset import Dataset, open_dataset
+from rstrack.data.own_intrinsics import SharedImages
 
 CONTENT = recordings.make_content()
 
@@ -410,16 +411,18 @@ def test_record3ds_files_come_back(
     recordings.write_r3d(place / "one.r3d", CONTENT)
     dataset, said = imported(capfd, "one.r3d")
     assert not (place.parent / "outside.txt").exists() and not Path("/absolute.txt").exists()
+    assert isinstance(dataset.images, SharedImages)
     for k in range(COUNT):
-        assert np.allclose(dataset.images.depth(k), CONTENT.units[k, :15, :20] / 1000, atol=1e-7)
+        assert np.allclose(dataset.images.images.depth(k), CONTENT.units[k, :15, :20] / 1000, atol=1e-7)
     check_truth(dataset, CONTENT.poses)
     assert dataset.rig.color_camera.fx == pytest.approx(COLOR_K[0] + 0.2) and "medians" in said
     depth = dataset.rig.depth_camera
     # A ray through the colour image's corner goes through depth's corner, whatever their pixels.
     corner = dataset.rig.color_camera.unproject([-0.5, -0.5])
     assert np.allclose(depth.project(corner)[0], [-0.5, -0.5]) and (depth.width, depth.height) == (20, 15)
-    table = np.loadtxt("out/intrinsics.csv", delimiter=",")
+    table, own = (np.loadtxt(f"out/{name}.csv", delimiter=",") for name in ("intrinsics", "intrinsics_depth"))
     assert np.allclose(table[:, 1], COLOR_K[0] + 0.1 * np.arange(COUNT)) and table.shape == (COUNT, 5)
+    assert np.allclose(own[:, 1], table[:, 1] * depth.width / COLOR_SIZE[0]) and (own[:, 0] == table[:, 0]).all()
     assert "ARKit" in describe(dataset)
 
 
@@ -445,15 +448,18 @@ def test_stray_scanners_folders_come_back(place: Path, capfd: pytest.CaptureFixt
     check_truth(dataset, CONTENT.poses)
     assert np.allclose(np.diff(dataset.stamps), 1 / 60, atol=1e-8)
     units = CONTENT.units[:, :15, :20]
+    images = dataset.images.images if isinstance(dataset.images, SharedImages) else dataset.images
+    assert isinstance(dataset.images, SharedImages) == per_frame
     for k in range(COUNT):
-        z = dataset.images.depth(k)
+        z = images.depth(k)
         sure = (np.arange(20) >= 10)[None]
         assert (z == np.where(sure, units[k], 0) / np.float32(1000)).all()
-        assert np.abs(dataset.images.color(k).astype(int) - (40 * k + 30)).max() < 6  # the video's own loss
+        assert np.abs(images.color(k).astype(int) - (40 * k + 30)).max() < 6  # the video's own loss
     assert Path("out/intrinsics.csv").exists() == per_frame
     assert np.loadtxt("out/imu.csv", delimiter=",")[0].tolist() == [1e11, 0.1, 0.2, 0.3, 1.0, 2.0, 3.0]
     dataset, _ = imported(capfd, "scan --force --confidence 0")
-    assert (dataset.images.depth(0) == units[0] / np.float32(1000)).all()
+    images = dataset.images.images if isinstance(dataset.images, SharedImages) else dataset.images
+    assert (images.depth(0) == units[0] / np.float32(1000)).all()
 
 
 def test_an_exported_euroc_folder_comes_back(place: Path, capfd: pytest.CaptureFixture[str]) -> None:

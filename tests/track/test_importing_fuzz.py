@@ -15,7 +15,7 @@ import recordings
 from recordings import Talker
 from test_importing import fake_lzfse
 
-import rstrack.importing.bags.bag
+import rstrack.importing.bags.bounds
 from rsgen.errors import UserError
 from rstrack.data.dataset import open_dataset
 from rstrack.importing.bags.topics import Named
@@ -116,7 +116,7 @@ def test_a_chunk_that_unpacks_to_too_much_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     path = BASES[name](tmp_path / name)
-    monkeypatch.setattr(rstrack.importing.bags.bag, "_MOST_CHUNK_BYTES", 1000)
+    monkeypatch.setattr(rstrack.importing.bags.bounds, "_MOST_CHUNK_BYTES", 1000)
     assert "unpacks to more than 1000 bytes" in attempt(path, tmp_path / "out")
 
 

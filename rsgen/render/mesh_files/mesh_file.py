@@ -21,6 +21,7 @@ from PIL import Image
 from rsgen.array_types import FloatArray
 from rsgen.config.sections import SceneLight, Up
 from rsgen.errors import UserError
+from rsgen.inputs import check_input
 from rsgen.limits import MOST_M
 from rsgen.render.mesh_files import gltf
 from rsgen.render.mesh_files.cutout import Mask, cut_away
@@ -198,6 +199,7 @@ def _beside(path: Path, name: str) -> Path:
     file = path.parent / name.replace("\\", "/")
     if not file.is_file():
         raise UserError(f"scene {path}: file '{name}' that it names is missing: put it there, or take its name out")
+    check_input(file)
     return file
 
 

@@ -16,12 +16,15 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from rsgen.errors import UserError
+from rsgen.inputs import MOST_BYTES, MOST_PIXELS, image_size
 from rsgen.render.scene_xml import old_xml
 from rsgen.render.scene_xml.instances import flatten
 from rsgen.render.scene_xml.old_plugins import Changes, Exists
 
 log = logging.getLogger("rsgen")
 
+# Where a JPEG with a preview in front of it has told its size.
+_HEADER_BYTES = 1 << 20
 _UNKNOWN = re.compile(r'(\w+) plugin of type "(\w+)":|- \w+ "(\w+)"')
 
 _FAILED = re.compile(r'At (.*?\(line \d+, col \d+\)): failed to instantiate (\w+) plugin of type "(\w+)": (.*)')
@@ -81,11 +84,18 @@ def prepare(mi: Any, config: Any, state: Any, path: Path) -> None:
 
 
 def check_files(mi: Any, state: Any, path: Path) -> None:
-    """Raise UserError if a mesh or an image that the scene names is not there."""
+    """Raise UserError if a mesh or an image that the scene names is not there, or too large to be read."""
     for node in state.nodes:
         name = str(node.props["filename"]) if "filename" in node.props else None
-        if name is not None and not Path(str(mi.file_resolver().resolve(name))).is_file():
+        if name is None:
+            continue
+        file = Path(str(mi.file_resolver().resolve(name)))
+        if not file.is_file():
             raise UserError(f"scene {path}: file '{name}' is missing: put it there, or mend its path in the scene")
+        with file.open("rb") as opened:
+            width, height = image_size(opened.read(_HEADER_BYTES)) or (0, 0)
+        if width * height > MOST_PIXELS or file.stat().st_size > MOST_BYTES:
+            raise UserError(f"scene {path}: file '{name}' is too large to be read: make it smaller")
 
 
 @contextlib.contextmanager

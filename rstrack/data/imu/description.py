@@ -25,6 +25,7 @@ from rsgen.files import parse_yaml, read_text, read_yaml
 from rsgen.geometry import se3
 from rsgen.limits import rigid
 from rstrack.data.imu.recording import ImuNoise
+from rstrack.data.kalibr_camera_file import is_camchain, read_camchain
 
 EXAMPLE = "T_imu_depth: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
 PHONE = ImuNoise(gyro_density=1.3e-4, gyro_walk=2.0e-5, accel_density=1.4e-3, accel_walk=2.0e-4)
@@ -92,8 +93,10 @@ class _ImuYaml(BaseModel):
 
 
 def read_imu_yaml(path: Path) -> ImuDescription:
-    """An imu.yaml. Raises UserError, one line: what is wrong in it."""
+    """An imu.yaml, or a camchain-imucam.yaml of Kalibr. Raises UserError, one line: what is wrong in it."""
     data = read_yaml(path)
+    if is_camchain(data):
+        return _of_camchain(path, data)
     inner = data.get("imu0")
     if len(data) == 1 and isinstance(inner, dict):
         data = inner
@@ -113,6 +116,18 @@ def read_imu_yaml(path: Path) -> ImuDescription:
         path.name, _noise(path, yaml), yaml.update_rate, _rigid(path, "T_imu_depth", yaml.T_imu_depth),
         _rigid(path, "T_cam_imu", yaml.T_cam_imu), yaml.gravity, yaml.offset_s, 1e-6 * yaml.drift_ppm, *matrices,
     )  # fmt: skip
+
+
+def _of_camchain(path: Path, data: dict[str, Any]) -> ImuDescription:
+    """Where and when by Kalibr's cameras; how noisy by the imu.yaml beside them, if there is one. Raises UserError."""
+    chain = read_camchain(path, data)
+    tracked = chain.depth or chain.color
+    if tracked.T_cam_imu is None:
+        raise UserError(f"{path}: tells no T_cam_imu: give the camchain-imucam.yaml of kalibr_calibrate_imu_camera")
+    beside = path.with_name("imu.yaml")
+    found = read_imu_yaml(beside) if beside.is_file() else ImuDescription(path.name)
+    T_imu_depth = se3.inverse(tracked.T_cam_imu)
+    return replace(found, source=path.name, T_imu_depth=T_imu_depth, offset_s=-(tracked.shift_s or 0.0))
 
 
 def of_sequence(path: Path, meta: Mapping[str, Any]) -> ImuDescription | None:

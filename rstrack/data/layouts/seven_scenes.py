@@ -162,7 +162,7 @@ def _pose(path: Path) -> FloatArray | None:
         raise UserError(f"{path}: expected the 16 numbers of a 4x4 pose") from None
     if not np.isfinite(T).all():
         return None
-    R = T[:3, :3]
+    R = np.clip(T[:3, :3], -2, 2)  # absurd numbers stay wrong, without overflow on the way
     if np.abs(R.T @ R - np.eye(3)).max() > _SKEW or np.linalg.det(R) < 0 or np.abs(T[3] - (0, 0, 0, 1)).max() > 1e-6:
         raise UserError(f"{path}: is not a rigid motion: expected camera-to-world, rotation and translation in metres")
     return T

@@ -1,6 +1,7 @@
 """Folders in the layout of TUM RGB-D, among them Kerl et al.'s rolling-shutter sets, and of ICL-NUIM.
 
     rgb.txt, depth.txt    'stamp path' lines; or associations.txt with 'stamp path stamp path', depth or colour first
+    intrinsics.csv        optional: of each image; see `rstrack.data.own_intrinsics`
     camera.yaml           the cameras: see `camera_file`; or an OpenCV calibration.yaml: see `opencv_camera_file`
     groundtruth.txt       optional: poses of the colour camera; ICL-NUIM's NAME.gt.freiburg also
 
@@ -25,10 +26,12 @@ from rsgen.files import listed_file, read_text
 from rsgen.sequence.trajectory import ICL_RATE_HZ, Trajectory, read_trajectory
 from rstrack.data.camera_file import EXAMPLE, RigFile, read_rig
 from rstrack.data.image_files import ImageFiles, decode_color, decode_depth, decode_image, first_size, repeated
+from rstrack.data.noise import ImageReader
+from rstrack.data.own_intrinsics import OwnIntrinsics, SharedImages, read_own_intrinsics
 from rstrack.data.rig import Rig
 
 _ASSOCIATIONS = ("associations.txt", "associate.txt", "association.txt")
-_CAMERA_FILES = ("camera.yaml", "calibration.yaml")
+_CAMERA_FILES = ("camera.yaml", "calibration.yaml", "camchain-imucam.yaml", "camchain.yaml")
 ESTIMATED = "# estimated, not measured: "
 """Begins the first line of a groundtruth.txt whose poses are another estimate from the same images."""
 _MAX_STAMP_S = 1e11  # the year 5138; today in milliseconds, microseconds or nanoseconds is beyond
@@ -45,7 +48,7 @@ class TumFolder:
     file: RigFile
     depth_stamps: FloatArray
     color_stamps: FloatArray
-    images: ImageFiles
+    images: ImageReader
     truth_poses: Trajectory | None
     notes: tuple[str, ...] = ()
     depth_numbers: FloatArray | None = None
@@ -54,17 +57,21 @@ class TumFolder:
 def read_tum_folder(root: Path, camera_file: Path | None) -> TumFolder:
     """Read cameras, listings and ground truth; images are decoded when asked for, but all have to be there.
 
-    camera_file: default camera.yaml, else calibration.yaml in the folder. Raises UserError, one line.
+    camera_file: default camera.yaml, calibration.yaml or Kalibr's camchain-imucam.yaml or camchain.yaml in the folder.
+    Raises UserError, one line.
     """
     depth, color = _listings(root)
     (depth, depth_note), (color, color_note) = (
         listing.without_repeats(name) for name, listing in (("depth", depth), ("colour", color.sorted()))
     )
     file = _rig_file(root, camera_file, color.paths, depth.paths)
-    images = ImageFiles(file.rig, file.depth_scale, color.paths, depth.paths)
+    files = ImageFiles(file.rig, file.depth_scale, color.paths, depth.paths)
     rate = ICL_RATE_HZ if depth.has_frame_numbers and color.has_frame_numbers else 1.0
     stamps = depth.stamps / rate, color.stamps / rate
-    notes = (*depth_note, *color_note, *_truth_note(root))
+    own_color = read_own_intrinsics(root, "color", stamps[1], file.rig.color_camera)
+    own_depth = read_own_intrinsics(root, "depth", stamps[0], file.rig.depth_camera)
+    images = files if own_color is own_depth is None else SharedImages(files, own_color, own_depth)
+    notes = (*depth_note, *color_note, *_own_notes(own_color, own_depth), *_truth_note(root))
     return TumFolder(file, *stamps, images, _truth(root, file.rig), notes)
 
 
@@ -152,6 +159,16 @@ class _Listing:
     def _path(self, entry: _Entry, real_root: Path) -> Path:
         missing = "unpack the dataset again or remove the line"
         return listed_file(self.root, real_root, entry.path, self._where(entry), missing)
+
+
+def _own_notes(*each: OwnIntrinsics | None) -> tuple[str, ...]:
+    """What there is to say of images that are taken to one camera, colour's and depth's."""
+    return tuple(
+        f"{name} images have intrinsics of their own, fx {own.own[:, 0].min():.1f} to {own.own[:, 0].max():.1f}: each "
+        f"is taken to fx {own.shared[0]:.1f}"
+        for name, own in zip(("colour", "depth"), each, strict=True)
+        if own is not None
+    )
 
 
 def repeats_note(name: str, again: npt.NDArray[np.bool_]) -> str:

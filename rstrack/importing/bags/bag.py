@@ -7,7 +7,6 @@ their own definition says, which `Message.rest` keeps.
 
 from __future__ import annotations
 
-import bz2
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,12 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from rsgen.errors import UserError
+from rstrack.importing.bags.bounds import METADATA, bound_chunks, bound_rows, bound_unpacking, check_folder
 
 _ROS1_START = b"#ROSBAG V"
 _MCAP_START = b"\x89MCAP0\r\n"
 _SQLITE_START = b"SQLite format 3\0"
-# A chunk of a bag that is larger than this once unpacked is refused: recorders write chunks of a few megabytes.
-_MOST_CHUNK_BYTES = 1 << 30
 # Of old bags: the same bytes under another name.
 _ALIASES = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
 INSTALL = "pip install 'rolling-shutter-rgbd[ros]'"
@@ -93,7 +91,7 @@ class Bag:
 def is_bag(path: Path) -> bool:
     """Whether a file or folder is a bag by its first bytes, or by a metadata.yaml in it."""
     if path.is_dir():
-        return (path / "metadata.yaml").is_file()
+        return (path / METADATA).is_file()
     with path.open("rb") as file:
         return file.read(16).startswith((_ROS1_START, _MCAP_START, _SQLITE_START))
 
@@ -111,14 +109,15 @@ def open_bag(path: Path) -> Iterator[Bag]:
         ending = ".mcap" if _starts(path, _MCAP_START) else ".db3"
         if path.suffix != ending:
             raise UserError(f"{path}: is a ROS 2 recording: call it {path.with_suffix(ending).name}")
+    if path.is_dir():
+        check_folder(path)
     reader: Any = None
     try:
         reader = Reader1(path) if is_ros1 else Reader2(path)
         if not is_ros1:
-            _bound_mcap()
+            bound_unpacking()
         reader.open()
-        if is_ros1:
-            _bound_chunks(reader)
+        bound_chunks(reader) if is_ros1 else bound_rows(reader)
         bag = Bag(path, reader, _standard_types(is_ros1), is_ros1)
     except Exception as error:
         _close(reader)
@@ -174,46 +173,3 @@ def _first_line(error: Exception) -> str:
 def _close(reader: Any) -> None:
     if getattr(reader, "bio", None) is not None or getattr(reader, "is_open", False):
         reader.close()
-
-
-def _bound_chunks(reader: Any) -> None:
-    """Let no chunk of a ROS 1 bag unpack to more than a bound, whatever it claims."""
-    from lz4.frame import LZ4FrameDecompressor
-    from rosbags.rosbag1.reader import decompressors
-
-    def unbz2(data: bytes) -> bytes:
-        return _bounded(bz2.BZ2Decompressor(), data, _MOST_CHUNK_BYTES)
-
-    def unlz4(data: bytes) -> bytes:
-        return _bounded(LZ4FrameDecompressor(), data, _MOST_CHUNK_BYTES)
-
-    ours = {decompressors["bz2"]: unbz2, decompressors["lz4"]: unlz4}
-    reader.chunks = {
-        at: chunk._replace(decompressor=ours.get(chunk.decompressor, chunk.decompressor))
-        for at, chunk in reader.chunks.items()
-    }
-
-
-@cache
-def _bound_mcap() -> None:
-    """Let no chunk of an MCAP unpack to more than it claims, nor that be more than a bound.
-
-    The library looks up in a table of its own how to unpack, and has no other place for that.
-    """
-    from lz4.frame import LZ4FrameDecompressor
-    from rosbags.rosbag2 import storage_mcap
-
-    def unzstd(data: bytes, size: int) -> bytes:
-        return _bounded(storage_mcap.zstd.ZstdDecompressor(), data, min(size, _MOST_CHUNK_BYTES))
-
-    def unlz4(data: bytes, size: int) -> bytes:
-        return _bounded(LZ4FrameDecompressor(), data, min(size, _MOST_CHUNK_BYTES))
-
-    storage_mcap.DECOMPRESSORS |= {"zstd": unzstd, "lz4": unlz4}
-
-
-def _bounded(decompressor: Any, data: bytes, most: int) -> bytes:
-    out: bytes = decompressor.decompress(data, most)
-    if not decompressor.eof:
-        raise ValueError(f"a chunk is cut short, or unpacks to more than {most} bytes")
-    return out

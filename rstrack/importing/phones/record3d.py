@@ -16,11 +16,10 @@ from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.files import encode_png
 from rsgen.geometry.camera import Camera
-from rstrack.importing.phones.arkit import FLIP, TRUTH, median_camera, resized
+from rstrack.importing.phones.arkit import FLIP, TRUTH, intrinsics_items, median_camera, resized
 from rstrack.importing.pixels import compressed_color, header_size, units_of_metres
 from rstrack.importing.recording import (
     FLOAT_DEPTH_SCALE,
-    Intrinsics,
     Item,
     Picture,
     Pose,
@@ -157,7 +156,8 @@ def _items(
             stamp_ns, where = meta.stamps_ns[k], f"{path}: rgbd/{number}"
             data, ending = compressed_color(f"{where}.jpg", _member(path, archive, f"rgbd/{number}.jpg"), color)
             yield Picture("color", stamp_ns, data, ending)
-            yield Intrinsics(stamp_ns, (*map(float, meta.intrinsics[k]),))  # type: ignore[arg-type]
+            fx, fy, cx, cy = meta.intrinsics[k].tolist()
+            yield from intrinsics_items(stamp_ns, (fx, fy, cx, cy), color, depth)
             yield Pose(stamp_ns, pose_of(meta.poses[k, :4], meta.poses[k, 4:]) @ FLIP)
             z = _floats(f"{where}.depth", _member(path, archive, f"rgbd/{number}.depth"), depth, np.float32, unpack)
             if confidence and f"rgbd/{number}.conf" in names:

@@ -18,13 +18,16 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
-from rsgen.files import encode_png, png_fault, read_bytes, read_text
+from rsgen.files import encode_png, listed_file, png_fault, read_bytes, read_text
 from rsgen.geometry.camera import Camera
-from rstrack.importing.phones.arkit import TRUTH, median_camera, resized
+from rstrack.importing.phones.arkit import TRUTH, intrinsics_items, median_camera, resized
 from rstrack.importing.pixels import check_size, decode, header_size
-from rstrack.importing.recording import Inertial, Intrinsics, Item, Picture, Pose, Recording, StreamCamera, pose_of
+from rstrack.importing.recording import Inertial, Item, Picture, Pose, Recording, StreamCamera, pose_of
 
 _MILLIMETRES = 1000.0
+_MAX_STAMP_S, _MOST_FRAMES = 1e11, 10**9
+# Kinds of the first box of a QuickTime or MP4 file. FFmpeg opens lists of other files, and addresses, by any name.
+_FIRST_BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
 _POSE, _INTRINSICS = ("x", "y", "z", "qx", "qy", "qz", "qw"), ("fx", "fy", "cx", "cy")
 _IMU = ("timestamp", "a_x", "a_y", "a_z", "alpha_x", "alpha_y", "alpha_z")
 
@@ -39,6 +42,7 @@ def read_stray_scanner(path: Path, confidence: int) -> Recording:
 
     Raises UserError, one line.
     """
+    _check_inside(path, ("rgb.mp4", "odometry.csv", "camera_matrix.csv", "imu.csv"))
     rows = _table(path / "odometry.csv", ("timestamp", "frame", *_POSE))
     if not rows:
         raise UserError(f"{path / 'odometry.csv'}: lists no frame")
@@ -61,12 +65,19 @@ def read_stray_scanner(path: Path, confidence: int) -> Recording:
     )
 
 
+def _check_inside(path: Path, names: Sequence[str]) -> None:
+    """Raises UserError where one of these files is there, but by a link to what lies outside."""
+    for name in names:
+        if (path / name).is_file():
+            listed_file(path, path.resolve(), name, str(path), "copy the folder again")
+
+
 def _table(path: Path, wanted: Sequence[str]) -> list[dict[str, float]]:
     """Rows of a CSV with a header, whatever the spaces in it. Raises UserError."""
     lines = list(csv.reader(read_text(path).splitlines()))
     names = [name.strip() for name in lines[0]] if lines else []
     if missing := [name for name in wanted if name not in names]:
-        raise UserError(f"{path}: has no column {missing[0]!r}; there are {', '.join(names)[:200]}")
+        raise UserError(f"{path}: has no column {missing[0]!r}; there are {', '.join(names)[:200]!r}")
     found = []
     for number, line in enumerate(lines[1:], 2):
         if not line:
@@ -80,6 +91,8 @@ def _table(path: Path, wanted: Sequence[str]) -> list[dict[str, float]]:
         needed = [*wanted, *(_INTRINSICS if "fx" in names else ())]
         if not all(math.isfinite(row.get(name, math.nan)) for name in needed if name not in _POSE):
             raise UserError(f"{path} line {number}: expected numbers for {', '.join(needed)}")
+        if abs(row["timestamp"]) > _MAX_STAMP_S or not 0 <= row.get("frame", 0.0) < _MOST_FRAMES:
+            raise UserError(f"{path} line {number}: no recording has that time or number of a frame: it is damaged")
         found.append({name: math.nan for name in names} | row)
     return found
 
@@ -102,6 +115,9 @@ class _Video:
     """A video that OpenCV can read, released at the end. Raises UserError."""
 
     def __init__(self, path: Path) -> None:
+        with path.open("rb") as file:
+            if file.read(8)[4:] not in _FIRST_BOXES:
+                raise UserError(f"{path}: is no MP4 video: copy it again")
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # what is wrong is said here, in one line
         before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         try:
@@ -122,6 +138,7 @@ class _Video:
 
 def _depth_file(path: Path, row: dict[str, float]) -> Path:
     number = f"{int(row['frame']):06d}"
+    _check_inside(path, (f"depth/{number}.png", f"confidence/{number}.png"))
     if (path / "depth" / f"{number}.npy").is_file():
         raise UserError(f"{path}: depth in .npy, of an old version of the app: export it again")
     return path / "depth" / f"{number}.png"
@@ -146,7 +163,7 @@ def _items(
             yield Picture("color", stamp_ns, encode_png(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)))
             yield Pose(stamp_ns, pose_of([row[n] for n in _POSE[3:]], [row[n] for n in _POSE[:3]]))
             if "fx" in row:
-                yield Intrinsics(stamp_ns, (row["fx"], row["fy"], row["cx"], row["cy"]))
+                yield from intrinsics_items(stamp_ns, (row["fx"], row["fy"], row["cx"], row["cy"]), color, depth)
             file = _depth_file(path, row)
             if file.is_file():  # a phone that is busy leaves some out
                 yield Picture("depth", stamp_ns, _depth(path, file, depth, confidence))

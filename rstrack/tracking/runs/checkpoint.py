@@ -6,6 +6,7 @@ images of keyframes that are put away go to files of their own, once (`rstrack.k
 
 from __future__ import annotations
 
+import hashlib
 import io
 import pickle
 import shutil
@@ -19,6 +20,7 @@ from typing import Any
 from rsgen.device.arrays import Engine
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, write_error
+from rsgen.inputs import check_input
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import INFO
 from rstrack.tracking.loop_tracker import LoopTracker
@@ -27,6 +29,7 @@ from rstrack.tracking.spline_tracker import Tracker
 
 FOLDER = "checkpoint"
 _STATE = "state.pickle"
+_DIGEST = hashlib.sha256().digest_size  # of what follows it
 # A run is written down so often at most (s), and takes this part of its time for it at most.
 _EVERY_S, _SHARE = 30.0, 0.03
 # What a checkpoint is made of, and nothing else is called when one is read: classes that these define, and these names.
@@ -39,9 +42,9 @@ _PACKAGES = (
 _NAMES = {
     ("numpy", "ndarray"), ("numpy", "dtype"), ("numpy._core.multiarray", "_reconstruct"),
     ("numpy._core.multiarray", "scalar"), ("numpy._core.numeric", "_frombuffer"),
-    *(("builtins", name) for name in ("slice", "range", "set", "frozenset", "complex", "bytearray")),
+    *(("builtins", name) for name in ("slice", "set", "frozenset", "complex")),
 }  # fmt: skip
-_DAMAGED = pickle.UnpicklingError, EOFError, AttributeError, ImportError, IndexError, KeyError, TypeError, ValueError
+_LONGEST_RANGE = 1_000_000
 
 
 def checkpoint_of(
@@ -108,7 +111,8 @@ class Checkpoint:
         self.tracker.archive.write()
         stream = io.BytesIO()
         _Writer(stream, self.tracker).dump({"key": dict(self.key), "done": done, "tracker": self.tracker.state})
-        atomic_write(self.root / _STATE, stream.getvalue())
+        data = stream.getvalue()
+        atomic_write(self.root / _STATE, hashlib.sha256(data).digest() + data)
 
     def resume(self) -> Done:
         """Bring the tracker, a new one, to where the run was; to its beginning where nothing was written down.
@@ -116,6 +120,7 @@ class Checkpoint:
         Raises UserError: damaged, of a run with other settings, or of one that has ended.
         """
         path = self.root / _STATE
+        check_input(path)
         try:
             data = path.read_bytes()
         except OSError:
@@ -125,10 +130,12 @@ class Checkpoint:
                 ) from None
             return self.begin()
         try:
-            found = _Reader(io.BytesIO(data), self.tracker).load()
-            key, done, state = found["key"], found["done"], found["tracker"]
-        except _DAMAGED as error:
-            raise UserError(f"{path}: cannot be read ({error}): track without --resume") from None
+            if hashlib.sha256(data[_DIGEST:]).digest() != data[:_DIGEST]:
+                raise ValueError("its checksum differs")
+            found = _Reader(io.BytesIO(data[_DIGEST:]), self.tracker).load()
+            key, done, state = found["key"], Done(**vars(found["done"])), found["tracker"]
+        except Exception as error:  # whatever bytes of somebody else's make of pickle
+            raise UserError(f"{path}: cannot be read ({_one_line(error)}): track without --resume") from None
         for name in sorted({*key, *self.key}):
             if key.get(name) != self.key.get(name):
                 raise UserError(
@@ -137,7 +144,7 @@ class Checkpoint:
                 )
         self.tracker.state = state
         self.tracker.archive.put_in(self.root)
-        return Done(**vars(done))
+        return done
 
     def remove(self) -> None:
         """The run has come to its end."""
@@ -170,6 +177,8 @@ class _Reader(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) == (__name__, "_Array"):
             return self._array
+        if (module, name) == ("builtins", "range"):
+            return _range
         if (module, name) in _NAMES:
             return super().find_class(module, name)
         # By the names that a module imports everything could be had.
@@ -181,6 +190,18 @@ class _Reader(pickle.Unpickler):
 
     def _array(self, kind: str, values: Any) -> Any:
         return self._engine.upload(values) if kind == "Float" else getattr(self._engine, kind)(values)
+
+
+def _range(*given: int) -> range:
+    """None that a set of its numbers could fill the memory with."""
+    found = range(*given)
+    if len(found) > _LONGEST_RANGE:
+        raise pickle.UnpicklingError(f"a range of {len(found)} numbers")
+    return found
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:120] or type(error).__name__
 
 
 class _Array:
