@@ -27,6 +27,7 @@ from rsgen.motion.gaze import choose_targets, seen_distances
 from rsgen.motion.make import least_turning
 from rsgen.motion.statistics import motion_statistics
 from rsgen.motion.walk import free_region, ring, walk_inside
+from rsgen.produce.exposure import suggested_gain
 from rsgen.produce.generate import scene_triangles
 from rsgen.produce.ground_truth import load_motion
 
@@ -163,7 +164,9 @@ def suggest_tour(
         least = clearance(spline, scene.triangles, max(_REACH_M, wish.clearance_m))
         if least >= wish.clearance_m:
             where = _room_text(aim, wish.clearance_m) if isinstance(aim, FloorPlan) else _thing_text(aim)
-            return Suggestion(config, (f"{file.name}: {where}", *_motion_text(scene, config, spline, least)))
+            found = [f"{file.name}: {where}", *_motion_text(scene, config, spline, least)]
+            config, how = _exposed(loaded, config, spline)
+            return Suggestion(config, (*found, *how))
     raise scene.wrong(f"no tour found that keeps {wish.clearance_m:g} m from all surfaces: reduce --clearance")
 
 
@@ -273,6 +276,16 @@ def _config(scene: _Scene, tours: Sequence[tuple[Waypoint, ...]], name: str, wis
         if least <= _BRISK_DEG_S:
             break
     return validate_config(data, "motion suggest")
+
+
+def _exposed(loaded: Any, config: Config, spline: Spline) -> tuple[Config, tuple[str, ...]]:
+    """The config with an exposure for the scene's light, where the one it has is far off, and what to say of it."""
+    assert config.motion is not None
+    gain = suggested_gain(loaded, config.color.camera, spline, config.motion.duration_s, config.color.exposure_gain)
+    if gain is None:
+        return config, ()
+    color = config.color.model_copy(update={"exposure_gain": gain})
+    return config.model_copy(update={"color": color}), (f"its light asks for an exposure gain of {gain:g}",)
 
 
 def _room_text(plan: FloorPlan, clearance_m: float) -> str:

@@ -1,0 +1,53 @@
+"""How a camera should be exposed in a scene that nobody has photographed: a quick, noisy look along the way."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from rsgen.array_types import Float32Array, FloatArray
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter
+from rsgen.geometry.spline import Spline
+
+_VIEWS, _WIDTH, _SPP, _DEPTH = 6, 48, 32, 16
+_BLOCK = 12  # pixels: noise of so few samples is averaged over blocks
+_GREY = 0.18  # what half of the blocks are to be brighter than
+_ENOUGH = 2.0  # a factor that is not worth the while
+
+
+def suggested_gain(scene: Any, camera: Camera, spline: Spline, until_s: float, gain: float) -> float | None:
+    """`color.exposure_gain` that makes the typical surface mid-grey; None if `gain` does so within a factor of 2.
+
+    Path traced at a few instants of the spline, 0 to `until_s`, which is the camera's pose T_world_cam(t). None too
+    where all is dark.
+    """
+    import mitsuba as mi
+
+    from rsgen.render.images import ColorRenderer
+
+    factor = _WIDTH / camera.width
+    small = replace(
+        camera, width=_WIDTH, height=max(_BLOCK, round(camera.height * factor)), fx=camera.fx * factor,
+        fy=camera.fy * factor, cx=(camera.cx + 0.5) * factor - 0.5, cy=(camera.cy + 0.5) * factor - 0.5,
+    )  # fmt: skip
+    path = mi.load_dict({"type": "path", "max_depth": _DEPTH})
+    renderer = ColorRenderer(scene, path, small, Shutter(), _SPP)
+    stamps = until_s * (np.arange(_VIEWS) + 0.5) / _VIEWS
+    light = np.concatenate([_blocks(renderer.render(spline.pose, float(t), k)) for k, t in enumerate(stamps)])
+    light = light[light > 0]
+    if not len(light):
+        return None
+    wanted = _GREY / float(np.median(light))
+    if 1 / _ENOUGH <= wanted / gain <= _ENOUGH:
+        return None
+    return float(f"{wanted:.2g}")
+
+
+def _blocks(image: Float32Array) -> FloatArray:
+    """Mean light (n,), all channels, of whole blocks of an image (h, w, 3)."""
+    rows, columns = (size // _BLOCK for size in image.shape[:2])
+    whole = image[: rows * _BLOCK, : columns * _BLOCK].reshape(rows, _BLOCK, columns, _BLOCK, 3)
+    return np.asarray(whole.mean(axis=(1, 3, 4), dtype=np.float64)).ravel()
