@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -34,7 +35,7 @@ class Belief:
         mean = np.concatenate([np.zeros(6), np.asarray(gravity, dtype=np.float64)])
         return cls(mean, np.asarray(np.diag(sigma**-2.0)))
 
-    @property
+    @cached_property
     def covariance(self) -> FloatArray:
         """(9, 9)."""
         return np.asarray(np.linalg.inv(self.information))

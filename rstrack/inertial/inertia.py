@@ -15,7 +15,7 @@ from rstrack.data.imu.recording import ImuRecording
 from rstrack.inertial.band import Band
 from rstrack.inertial.belief import GRAVITY, GYRO, Belief
 from rstrack.inertial.kept import Kept
-from rstrack.inertial.residuals import Samples, summed
+from rstrack.inertial.residuals import Rows, Samples
 from rstrack.inertial.smoother import Smoother
 
 # σ of the mean acceleration of a track's first moments, m/s².
@@ -27,6 +27,11 @@ _MEMORY, _EXPECTED = 100.0, 10.0
 _RARE = 3.0
 # Gravity in the world turns as the track drifts, beside what keyframes' covariances say: m/s² per √s.
 _DRIFT = 5e-4
+# Increments of control points (m, rad) that leave the rows of a frame's samples as they were linearised before it.
+_SAME = 1e-3
+# By how much a frame moves what is known of those before, σ in m and rad: before a wall images leave ways open of which
+# interpolation seems to tell something, though.
+_SLIDES = np.repeat([5e-4, 3e-4], 3)
 # Change of gravity (m/s²) that calls for new derivatives: turns of the spline and changes of gravity are told by their
 # product, which at the start, when gravity is a guess, no derivative knows.
 _SAME_GRAVITY = 0.1
@@ -56,6 +61,9 @@ class Inertia:
         self._smoother: Smoother | None = None
         self._until, self._next, self._tripled = -np.inf, -np.inf, 0
         self.belief = Belief.initial(np.array([0.0, recording.gravity, 0.0]))
+        # The rows `ahead` has linearised last: of a state, whose control points from a first one on had received so
+        # much by then.
+        self._ahead: tuple[SplineState, int, FloatArray, Rows] | None = None
 
     @property
     def state(self) -> dict[str, object]:
@@ -137,7 +145,7 @@ class Inertia:
         def around() -> tuple[Quadratic, float]:
             nonlocal nine
             for _ in range(2):
-                joint, _ = summed(state.spline, samples, self.recording.T_imu_depth, nine, self.sigma)
+                joint, _ = self._rows(state, samples, nine).summed(self.sigma)
                 if joint is None:
                     return Quadratic(state.end - 1, np.zeros((6, 6)), np.zeros(6)), 0.0
                 model, cost, best = joint.without_belief(belief, nine)
@@ -166,11 +174,16 @@ class Inertia:
         def around() -> tuple[Quadratic, float]:
             both = smoother.copy()
             cost = both.reach(state, both.first, state.end)
-            joint, _ = summed(state.spline, samples, self.recording.T_imu_depth, self.belief.mean, self.sigma)
+            rows = self._rows(state, samples, self.belief.mean)
+            self._ahead = state, both.first, both.at, rows
+            joint, _ = rows.summed(self.sigma)
             if joint is not None:
                 both.add(joint)
                 cost += joint.cost
             cost += self._regular(both, state.spline)
+            slid = state.received(both.first, both.first + 1).ravel() - smoother.at[0]
+            both.add(Quadratic(both.first, np.diag(_SLIDES**-2.0), slid / _SLIDES**2))
+            cost += 0.5 * float(np.sum((slid / _SLIDES) ** 2))
             model, gained = both.without_belief(self.recording.gravity)
             return model, cost - gained
 
@@ -201,7 +214,7 @@ class Inertia:
         self._tripled = smoother.last
         for model in models:
             smoother.add(model)
-        joint, scatter = summed(state.spline, fresh, self.recording.T_imu_depth, self.belief.mean, self.sigma)
+        joint, scatter = self._rows_known(state, fresh).summed(self.sigma)
         if joint is not None:
             smoother.add(joint)
             smoother.diffuse(self._walk * max(1e-6, float(self._until - begin)))
@@ -211,11 +224,27 @@ class Inertia:
         self._believe(smoother)
         if joint is not None and self.tells:
             self._learn_sigma(scatter.after(self.belief.mean - before), fresh.counts, state.dt)
-        R_imu_world = self.recording.T_imu_depth[:3, :3] @ state.spline.pose(self._until)[:3, :3].T
-        if not self.is_usable and self.belief.is_usable(R_imu_world):
-            self.usable_s = end
+        if not self.is_usable:
+            R_imu_world = self.recording.T_imu_depth[:3, :3] @ state.spline.pose(self._until)[:3, :3].T
+            self.usable_s = end if self.belief.is_usable(R_imu_world) else self.usable_s
         if not np.isfinite(self.determined_s) and self.belief.is_determined:
             self.determined_s = end
+
+    def _rows(self, state: SplineState, samples: Samples, nine: FloatArray) -> Rows:
+        return Rows.of(state.spline, samples, self.recording.T_imu_depth, nine)
+
+    def _rows_known(self, state: SplineState, fresh: Samples) -> Rows:
+        """Of fresh samples, those until now: from when the frame was solved for, if that was hardly elsewhere."""
+        known, self._ahead = self._ahead, None
+        if known is not None and known[0] is state:
+            _, first, at, rows = known
+            rows = rows.until(self._until)
+            if len(rows.r) == len(fresh) > 0:
+                count = int(rows.first[-1]) + 4 - first
+                moved = state.received(first, first + count) - at[:count]
+                if np.abs(moved).max() < _SAME:
+                    return rows.moved(first, moved)
+        return self._rows(state, fresh, self.belief.mean)
 
     def _started(self, state: SplineState, piece: int) -> Smoother | None:
         """A smoother that knows nothing; gravity is guessed from the first samples, so that turns are about right."""

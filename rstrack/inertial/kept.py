@@ -34,7 +34,9 @@ class Kept:
             moved = self.state.received(model.first, model.last) - self._at
             if np.abs(moved).max() < _SAME:
                 step = moved.ravel()
-                return model.moved(moved), cost + float(model.g @ step + 0.5 * step @ model.H @ step)
+                turned = model.H @ step
+                there = Quadratic(model.first, model.H, model.g + turned)
+                return there, cost + float(step @ (model.g + 0.5 * turned))
         self._known = self._summed()
         model, _ = self._known
         self._at = self.state.received(model.first, model.last)

@@ -272,8 +272,8 @@ class Tracker:
             uncertainty = track.covariances.uncertainty
             if ref.rolling is None:
                 # A rolling reference moves with what is aligned to it, which tells nothing of the two together.
-                seconds = new.stamp - track.found.stamps[-1]
-                uncertainty = uncertainty.after(seconds, pulled.information, *track.accelerations(window, seconds))
+                seconds, R = new.stamp - track.found.stamps[-1], T_predicted[:3, :3]
+                uncertainty = uncertainty.after(seconds, pulled.information, *track.accelerations(window, seconds, R))
         if not fault and implausible(T_predicted, window.spline.pose(mid), gap):
             fault = Fault.TOO_FAR
         elif not fault and not uncertainty.is_known:

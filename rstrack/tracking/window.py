@@ -39,7 +39,7 @@ _NEWEST_S = 0.05
 TRACKING_LEVELS, LEVELS = (1, 0), (2, 1, 0)
 # Steps from constant velocity to what an IMU says of the motion since the last frame, and a step (m, rad) that is the
 # last one.
-_LED_STEPS, _LED = 4, 1e-3
+_LED_STEPS, _LED = 4, 1e-2
 # Steps at most on the pyramid's levels, finest first.
 _MOST_STEPS = (15, 8, 30)
 

@@ -19,7 +19,7 @@ from rstrack.inertial.belief import SIZE, Belief
 from rstrack.inertial.belief import STRENGTH as STRENGTH_SIGMA
 from rstrack.inertial.inertia import Inertia
 from rstrack.inertial.kept import Kept
-from rstrack.inertial.residuals import Samples, summed
+from rstrack.inertial.residuals import Rows, Samples
 from rstrack.inertial.smoother import Smoother
 
 GRAVITY = np.array([2.0, -8.6, 4.262])
@@ -83,7 +83,7 @@ def test_a_small_problem_is_solved_as_by_scipy() -> None:
         smoother.reach(state, 0, count)
         for t, T in poses:
             smoother.add(pose_constraint(state.spline, t, T, POSE_SIGMA)[0])
-        joint, _ = summed(state.spline, samples, imu.T_imu_depth, belief, sigma)
+        joint, _ = Rows.of(state.spline, samples, imu.T_imu_depth, belief).summed(sigma)
         assert joint is not None
         smoother.add(joint)
         step = -np.linalg.solve(smoother.H, smoother.g)
