@@ -29,9 +29,8 @@ _RARE = 3.0
 _DRIFT = 5e-4
 # Increments of control points (m, rad) that leave the rows of a frame's samples as they were linearised before it.
 _SAME = 1e-3
-# By how much a frame moves what is known of those before, σ in m and rad: before a wall images leave ways open of which
-# interpolation seems to tell something, though.
-_SLIDES = np.repeat([5e-4, 3e-4], 3)
+# What images tell a pose by, σ in m and rad, where they leave a way open: there interpolation seems to tell something.
+_OPEN = np.repeat([1e-2, 5e-3], 3)
 # Change of gravity (m/s²) that calls for new derivatives: turns of the spline and changes of gravity are told by their
 # product, which at the start, when gravity is a guess, no derivative knows.
 _SAME_GRAVITY = 0.1
@@ -61,6 +60,7 @@ class Inertia:
         self._smoother: Smoother | None = None
         self._until, self._next, self._tripled = -np.inf, -np.inf, 0
         self.belief = Belief.initial(np.array([0.0, recording.gravity, 0.0]))
+        self._leaves_open = False
         # The rows `ahead` has linearised last: of a state, whose control points from a first one on had received so
         # much by then.
         self._ahead: tuple[SplineState, int, FloatArray, Rows] | None = None
@@ -158,9 +158,16 @@ class Inertia:
 
     def held(self, piece: int) -> int | None:
         """First control point of what is known of the newest ones, where the unit is of use and has seen enough of the
-        piece of the spline that begins at control point `piece`."""
+        piece of the spline that begins at control point `piece`. None where images left a way open: fixed control
+        points let the spline slide there by what readings leave open in a frame, a smoother by all that they do."""
         smoother = self._smoother
-        if smoother is None or not self.is_usable or len(smoother.at) < 4 or smoother.first < piece:
+        if (
+            smoother is None
+            or self._leaves_open
+            or not self.is_usable
+            or len(smoother.at) < 4
+            or smoother.first < piece
+        ):
             return None
         return smoother.first
 
@@ -181,9 +188,6 @@ class Inertia:
                 both.add(joint)
                 cost += joint.cost
             cost += self._regular(both, state.spline)
-            slid = state.received(both.first, both.first + 1).ravel() - smoother.at[0]
-            both.add(Quadratic(both.first, np.diag(_SLIDES**-2.0), slid / _SLIDES**2))
-            cost += 0.5 * float(np.sum((slid / _SLIDES) ** 2))
             model, gained = both.without_belief(self.recording.gravity)
             return model, cost - gained
 
@@ -212,6 +216,9 @@ class Inertia:
         smoother.reach(state, low, min(high, state.end))
         self._regular(smoother, state.spline)
         self._tripled = smoother.last
+        # As one body: by one left increment of all control points.
+        seen = sum(m.H.reshape(-1, 6, len(m.H) // 6, 6).sum(axis=(0, 2)) for m in models)
+        self._leaves_open = bool(np.linalg.eigvalsh(_OPEN[:, None] * seen * _OPEN)[0] < 1.0)
         for model in models:
             smoother.add(model)
         joint, scatter = self._rows_known(state, fresh).summed(self.sigma)

@@ -181,12 +181,13 @@ def learnt(seed: int, seconds: float, every: float = 1 / 30) -> tuple[Inertia, S
     return inertia, truth
 
 
-def learnt_until(truth: Spline, seed: int, end: float) -> Inertia:
-    """The same of a motion until a time, s."""
+def learnt_until(truth: Spline, seed: int, end: float, wall: float = np.inf) -> Inertia:
+    """The same of a motion until a time, s; a way along x is open from a time on."""
     inertia, state = Inertia(recording(truth, seed)), SplineState(truth)
     for t, T in seen_poses(truth, np.random.default_rng(seed)):
         if t < end:
-            inertia.learn(state, 0, [pose_constraint(state.spline, t, T, POSE_SIGMA)[0]], t + 0.015)
+            sigma = POSE_SIGMA * [1.0 if t < wall else 1e3, 1.0, 1.0, 1.0, 1.0, 1.0]
+            inertia.learn(state, 0, [pose_constraint(state.spline, t, T, sigma)[0]], t + 0.015)
     return inertia
 
 
@@ -259,6 +260,12 @@ def test_nothing_is_held_before_the_unit_is_of_use_or_of_another_piece() -> None
     assert held is not None and held > 10 and inertia.held(held + 1) is None
     inertia.begin_piece()
     assert inertia.held(0) is None
+
+
+def test_nothing_is_held_where_images_leave_a_way_open() -> None:
+    truth = hand_held(0.6, 5)
+    assert learnt_until(truth, 5, 0.5, wall=0.45).held(0) is None
+    assert learnt_until(truth, 5, 0.5, wall=0.51).held(0) is not None
 
 
 def test_another_world_has_its_own_gravity_and_the_same_biases() -> None:
