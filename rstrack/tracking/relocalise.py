@@ -122,7 +122,9 @@ class Relocaliser:
         """The keyframe and T_ref_cam (4, 4) whose turn it is; where an IMU has led, all that are near, best first."""
         newest = self._keyframes.newest if ref.rolling is not None else ref
         skip = (self._lost_in_a_row // 2) * (_PLACES - 1)
-        places = [newest, *self._keyframes.candidates(new, skip, _PLACES - 1)]
+        # What looks alike may be anywhere; where an IMU led, what is there comes first.
+        led = [] if T_led is None else self._keyframes.near(T_led, _PLACES - 1)
+        places = [newest, *(led or self._keyframes.candidates(new, skip, _PLACES - 1))]
         T_ends = [window.spline.pose(end), *(place.T_world_base for place in places[1:])]
         if T_led is not None:
             places, T_ends = [*places, *places], [*T_ends, *[T_led] * len(places)]
