@@ -23,6 +23,8 @@ from rstrack.alignment.spline_state import SplineState
 STOP_PX = (0.02, 0.1, 0.3)
 # Lines that have moved less since a linearisation keep it.
 RELINEARISE_PX = 0.02
+# The same where all but the noise is predicted.
+_PREDICTED_PX = 0.005
 # The same for noisy depth: part of what its σ moves a pixel by. (Noise-free depth is held to the pixels above,
 # and what does not fit must not end early for it.)
 _NOISE_SHARE, _MOST_TOLERANCE_PX = 0.1, 0.08
@@ -53,7 +55,9 @@ class Problem:
 
     `fresh` observations go through the pyramid's levels; `settled` ones keep their models of the finest level as long
     as these are good. `focal` in pixels, to tell how far lines move. `bandwidth`: of the system. rigid: the free
-    control points move as one body.
+    control points move as one body. predicted: all but the noise is known beforehand, so that how far lines move does
+    not tell whether weights and σ are those of the finest level: it is linearised twice there at least, and kept for a
+    quarter of the pixels.
     """
 
     fresh: Sequence[Observation]
@@ -63,6 +67,7 @@ class Problem:
     focal: float
     bandwidth: int = 24
     rigid: bool = False
+    predicted: bool = False
 
 
 def optimise(
@@ -96,8 +101,9 @@ def _optimise_level(terms: Terms, state: SplineState, problem: Problem, level: i
     step: FloatArray | None = None
     acceleration, is_plain = Acceleration(), True
     before = [o.linearisation for o in every]
-    for _ in range(most):
-        done.evaluations += _linearise(terms, state, problem, level)
+    once_more = problem.predicted and level == 0
+    for n in range(most):
+        done.evaluations += _linearise(terms, state, problem, level, once_more and n == 1)
         priors = [prior(state.spline) for prior in problem.priors]
         now = _cost(state, problem, weights) + sum(c for _, c in priors)
         if step is not None and now > cost + _WORSE * sum(weights.values()):
@@ -124,6 +130,8 @@ def _optimise_level(terms: Terms, state: SplineState, problem: Problem, level: i
         done.iterations += 1
         done.last_shift = max(_shift(problem, first, step), _shift(problem, first, plain))
         done.is_within_noise = -float(g @ plain.ravel()) < _LAST[level] and all(_is_noisy(o) for o in problem.fresh)
+        if once_more and n == 0:
+            continue
         if done.is_within_noise or done.last_shift < (_tolerance(problem) if level == 0 else STOP_PX[level]):
             break
 
@@ -150,10 +158,12 @@ def _damped_step(H: FloatArray, g: FloatArray, damping: float, problem: Problem)
     return np.tile(solve_damped(together.T @ H @ together, together.T @ g, problem.bandwidth, damping), (count, 1))
 
 
-def _linearise(terms: Terms, state: SplineState, problem: Problem, level: int) -> int:
-    """Anew what has moved; returns how many that were."""
+def _linearise(terms: Terms, state: SplineState, problem: Problem, level: int, once_more: bool) -> int:
+    """Anew what has moved; once_more: and all that is fresh. Returns how many that were."""
     tolerance = RELINEARISE_PX * (1 + 4 * level) if level else _tolerance(problem)
-    fresh = [o for o in problem.fresh if not o.is_linearised or _has_moved(o, state, problem.focal, tolerance)]
+    fresh = [
+        o for o in problem.fresh if once_more or not o.is_linearised or _has_moved(o, state, problem.focal, tolerance)
+    ]
     settled = [o for o in problem.settled if level == 0 and _has_moved(o, state, problem.focal, tolerance)]
     anew = (*fresh, *settled)
     terms.expect(state.spline, [o.image for o in anew], [(o.slopes_at(state), o.ref) for o in anew])
@@ -178,7 +188,8 @@ def _tolerance(problem: Problem) -> float:
     """Pixels that lines may move without mattering, at the finest level: less than noise moves them."""
     depth = [o for o in problem.fresh if o.is_depth and o.is_linearised]
     noise_px = min((problem.focal * o.lin.next_sigma / o.ref.median_depth for o in depth), default=0.0)
-    return min(max(RELINEARISE_PX, _NOISE_SHARE * noise_px), _MOST_TOLERANCE_PX)
+    least = _PREDICTED_PX if problem.predicted else RELINEARISE_PX
+    return min(max(least, _NOISE_SHARE * noise_px), _MOST_TOLERANCE_PX)
 
 
 def _cost(state: SplineState, problem: Problem, weights: dict[int, float]) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -13,8 +14,8 @@ SIZE = 9
 GYRO, ACCEL, GRAVITY = slice(0, 3), slice(3, 6), slice(6, 9)
 # σ of biases before anything is known: rad/s and m/s², as sheets of cheap units have them.
 _GYRO_BIAS, _ACCEL_BIAS = 0.1, 0.6
-# How well gravity's strength is known, m/s²: over the earth, and of a unit's scale.
-_STRENGTH = 0.03
+STRENGTH = 0.03
+"""How well gravity's strength is known, m/s²: over the earth, and of a unit's scale."""
 # σ of the gyroscope's bias (rad/s), and of the force (m/s²) that gravity and the accelerometer's bias make together in
 # an attitude, below which the unit is of use; and of gravity's direction, degrees, below which that is determined.
 _KNOWN_GYRO, _KNOWN_FORCE, _KNOWN_DEG = 5e-3, 0.15, 0.3
@@ -34,7 +35,7 @@ class Belief:
         mean = np.concatenate([np.zeros(6), np.asarray(gravity, dtype=np.float64)])
         return cls(mean, np.asarray(np.diag(sigma**-2.0)))
 
-    @property
+    @cached_property
     def covariance(self) -> FloatArray:
         """(9, 9)."""
         return np.asarray(np.linalg.inv(self.information))
@@ -78,7 +79,7 @@ class Belief:
         for _ in range(3):
             u = np.zeros(SIZE)
             u[GRAVITY] = mean[GRAVITY] / max(1e-9, float(np.linalg.norm(mean[GRAVITY])))
-            information = self.information + np.outer(u, u) / _STRENGTH**2
+            information = self.information + np.outer(u, u) / STRENGTH**2
             # |g| + u (g' − g) = strength, and u g = |g|.
-            mean = np.asarray(np.linalg.solve(information, start + u * strength / _STRENGTH**2))
+            mean = np.asarray(np.linalg.solve(information, start + u * strength / STRENGTH**2))
         return Belief(mean, 0.5 * (information + information.T))

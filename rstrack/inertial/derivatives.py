@@ -47,7 +47,8 @@ def motion(spline: Spline, t: FloatArray) -> Motion:
     """
     segment, u = spline.locate(t)
     held, n = segment - spline.first, len(u)
-    b, db, ddb = (powers(u, 4) @ basis / spline.dt**k for k, basis in enumerate(_BASES))
+    p = powers(u, 4)
+    b, db, ddb = (p @ basis / spline.dt**k for k, basis in enumerate(_BASES))
     three = held[:, None] + np.arange(3)
     omega = spline.increments[three]
     parts = b[..., None] * omega
@@ -62,9 +63,10 @@ def motion(spline: Spline, t: FloatArray) -> Motion:
     for j in range(3):
         bj, bbj = db[:, j, None, None], ddb[:, j, None, None]
         state, by = back[:, j] @ state, back[:, j] @ by
-        ad_y, ad_x = np.moveaxis(se3.ad(np.swapaxes(state, 1, 2)), 1, 0)
-        state[..., 0] += bj[..., 0] * omega[:, j]
-        ad_w = se3.ad(state[..., 0])
+        pushed = bj[..., 0] * omega[:, j]
+        # Of y, x and w_j = y + ḃ_j Ω_j at once: a call costs more than the numbers.
+        ad_y, ad_x, ad_w = se3.ad(np.stack([state[..., 0], state[..., 1], state[..., 0] + pushed]))
+        state[..., 0] += pushed
         state[..., 1] += ((bj * ad_w + bbj * one) @ omega[:, j, :, None])[..., 0]
         own = 6 * j
         by[:, :, own : own + 6] += ad_y @ turned[:, j] + bj * one
@@ -74,13 +76,11 @@ def motion(spline: Spline, t: FloatArray) -> Motion:
         T = T @ A[:, j]
     R = T[:, :3, :3]
     by[:, 3:, 36:] = R @ by[:, 3:, 36:]
-    gains = spline.left_gains[three]
-    by_turn = _by_points(by[:, 3:, 36:54], gains)
-    by_turn[:, :, :6] += by[:, 3:, 54:]
-    twist, rate = state[..., 0], state[..., 1]
-    return Motion(
-        segment, R, twist, rate, _by_points(by[:, :, :18], gains), _by_points(by[:, :, 18:36], gains), by_turn
-    )
+    # Twist, rate and turn, one below the other: a call costs more than the numbers.
+    rows = np.concatenate([by[:, :, :18], by[:, :, 18:36], by[:, 3:, 36:54]], axis=1)
+    points = _by_points(rows, spline.left_gains[three])
+    points[:, 12:, :6] += by[:, 3:, 54:]
+    return Motion(segment, R, state[..., 0], state[..., 1], points[:, :6], points[:, 6:12], points[:, 12:])
 
 
 def _by_points(by_increments: FloatArray, gains: FloatArray) -> FloatArray:

@@ -14,7 +14,8 @@ from rstrack.alignment.spline_state import SplineState
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.inertial.band import Band
 from rstrack.inertial.belief import GRAVITY, GYRO, Belief
-from rstrack.inertial.residuals import Samples, summed
+from rstrack.inertial.kept import Kept
+from rstrack.inertial.residuals import Rows, Samples
 from rstrack.inertial.smoother import Smoother
 
 # σ of the mean acceleration of a track's first moments, m/s².
@@ -26,10 +27,12 @@ _MEMORY, _EXPECTED = 100.0, 10.0
 _RARE = 3.0
 # Gravity in the world turns as the track drifts, beside what keyframes' covariances say: m/s² per √s.
 _DRIFT = 5e-4
-# Increments of control points (m, rad) that leave the samples' derivatives as they were.
-_SAME = 1e-2
-# The same for gravity (m/s²): turns of the spline and changes of gravity are told by their product, which at the start,
-# when gravity is a guess, no derivative knows.
+# Increments of control points (m, rad) that leave the rows of a frame's samples as they were linearised before it.
+_SAME = 1e-3
+# What images tell a pose by, σ in m and rad, where they leave a way open: there interpolation seems to tell something.
+_OPEN = np.repeat([1e-2, 5e-3], 3)
+# Change of gravity (m/s²) that calls for new derivatives: turns of the spline and changes of gravity are told by their
+# product, which at the start, when gravity is a guess, no derivative knows.
 _SAME_GRAVITY = 0.1
 # What follows from the recording alone.
 _GIVEN = "recording", "samples", "common", "_band"
@@ -57,6 +60,10 @@ class Inertia:
         self._smoother: Smoother | None = None
         self._until, self._next, self._tripled = -np.inf, -np.inf, 0
         self.belief = Belief.initial(np.array([0.0, recording.gravity, 0.0]))
+        self._leaves_open = False
+        # The rows `ahead` has linearised last: of a state, whose control points from a first one on had received so
+        # much by then.
+        self._ahead: tuple[SplineState, int, FloatArray, Rows] | None = None
 
     @property
     def state(self) -> dict[str, object]:
@@ -117,21 +124,74 @@ class Inertia:
 
     # -- what it says of the spline ---------------------------------------------------------------------------------
 
-    def prior(self, state: SplineState, piece: int, first: int) -> InertialPrior:
+    def prior(self, state: SplineState, piece: int, first: int) -> Kept:
         """All samples that depend on control points from `first` on, of the piece of the spline that begins at control
         point `piece`, while it moves with `state`; biases and gravity as far as they are known."""
         spline = state.spline
         self._expect(spline.dt)
         begin = max(spline.t0 + max(piece, first - 3) * spline.dt, spline.t_begin)
         samples = self.samples.between(begin, spline.t_end)
-        if self.is_usable:
-            return InertialPrior(self, samples, state, first, self.belief)
-        # A belief that is still wrong would draw the spline, and find itself confirmed: as good as none, so that it
-        # says how the motion changes. Only that a hand accelerates little in the mean holds where images tell little.
-        mean = np.concatenate([np.zeros(6), self._guessed(spline, samples)])
-        loose = Belief.initial(mean[GRAVITY]).information.copy()
-        loose[GRAVITY, GRAVITY] = np.eye(3) / _MEAN_ACCELERATION**2
-        return InertialPrior(self, samples, state, first, Belief(mean, loose))
+        belief = self.belief
+        if not self.is_usable:
+            # A belief that is still wrong would draw the spline, and find itself confirmed: as good as none, so that it
+            # says how the motion changes. Only that a hand accelerates little in the mean holds where images tell
+            # little.
+            mean = np.concatenate([np.zeros(6), self._guessed(spline, samples)])
+            loose = Belief.initial(mean[GRAVITY]).information.copy()
+            loose[GRAVITY, GRAVITY] = np.eye(3) / _MEAN_ACCELERATION**2
+            belief = Belief(mean, loose)
+        nine = belief.mean
+
+        def around() -> tuple[Quadratic, float]:
+            nonlocal nine
+            for _ in range(2):
+                joint, _ = self._rows(state, samples, nine).summed(self.sigma)
+                if joint is None:
+                    return Quadratic(state.end - 1, np.zeros((6, 6)), np.zeros(6)), 0.0
+                model, cost, best = joint.without_belief(belief, nine)
+                if np.abs(best - nine)[GRAVITY].max() < _SAME_GRAVITY:
+                    break
+                nine = best
+            return model, cost
+
+        return Kept(state, first, around)
+
+    def held(self, piece: int) -> int | None:
+        """First control point of what is known of the newest ones, where the unit is of use and has seen enough of the
+        piece of the spline that begins at control point `piece`. None where images left a way open: fixed control
+        points let the spline slide there by what readings leave open in a frame, a smoother by all that they do."""
+        smoother = self._smoother
+        if (
+            smoother is None
+            or self._leaves_open
+            or not self.is_usable
+            or len(smoother.at) < 4
+            or smoother.first < piece
+        ):
+            return None
+        return smoother.first
+
+    def ahead(self, state: SplineState) -> Kept:
+        """What all images and samples so far say of the control points that are `held`, and the samples since of those
+        that came anew, while they move with `state`."""
+        smoother = self._smoother
+        assert smoother is not None
+        samples = self.samples.between(self._until, state.spline.t_end)
+
+        def around() -> tuple[Quadratic, float]:
+            both = smoother.copy()
+            cost = both.reach(state, both.first, state.end)
+            rows = self._rows(state, samples, self.belief.mean)
+            self._ahead = state, both.first, both.at, rows
+            joint, _ = rows.summed(self.sigma)
+            if joint is not None:
+                both.add(joint)
+                cost += joint.cost
+            cost += self._regular(both, state.spline)
+            model, gained = both.without_belief(self.recording.gravity)
+            return model, cost - gained
+
+        return Kept(state, smoother.first, around)
 
     # -- what the track says of it ----------------------------------------------------------------------------------
 
@@ -155,9 +215,13 @@ class Inertia:
             self._tripled = low + 2
         smoother.reach(state, low, min(high, state.end))
         self._regular(smoother, state.spline)
+        self._tripled = smoother.last
+        # As one body: by one left increment of all control points.
+        seen = sum(m.H.reshape(-1, 6, len(m.H) // 6, 6).sum(axis=(0, 2)) for m in models)
+        self._leaves_open = bool(np.linalg.eigvalsh(_OPEN[:, None] * seen * _OPEN)[0] < 1.0)
         for model in models:
             smoother.add(model)
-        joint, scatter = summed(state.spline, fresh, self.recording.T_imu_depth, self.belief.mean, self.sigma)
+        joint, scatter = self._rows_known(state, fresh).summed(self.sigma)
         if joint is not None:
             smoother.add(joint)
             smoother.diffuse(self._walk * max(1e-6, float(self._until - begin)))
@@ -167,11 +231,27 @@ class Inertia:
         self._believe(smoother)
         if joint is not None and self.tells:
             self._learn_sigma(scatter.after(self.belief.mean - before), fresh.counts, state.dt)
-        R_imu_world = self.recording.T_imu_depth[:3, :3] @ state.spline.pose(self._until)[:3, :3].T
-        if not self.is_usable and self.belief.is_usable(R_imu_world):
-            self.usable_s = end
+        if not self.is_usable:
+            R_imu_world = self.recording.T_imu_depth[:3, :3] @ state.spline.pose(self._until)[:3, :3].T
+            self.usable_s = end if self.belief.is_usable(R_imu_world) else self.usable_s
         if not np.isfinite(self.determined_s) and self.belief.is_determined:
             self.determined_s = end
+
+    def _rows(self, state: SplineState, samples: Samples, nine: FloatArray) -> Rows:
+        return Rows.of(state.spline, samples, self.recording.T_imu_depth, nine)
+
+    def _rows_known(self, state: SplineState, fresh: Samples) -> Rows:
+        """Of fresh samples, those until now: from when the frame was solved for, if that was hardly elsewhere."""
+        known, self._ahead = self._ahead, None
+        if known is not None and known[0] is state:
+            _, first, at, rows = known
+            rows = rows.until(self._until)
+            if len(rows.r) == len(fresh) > 0:
+                count = int(rows.first[-1]) + 4 - first
+                moved = state.received(first, first + count) - at[:count]
+                if np.abs(moved).max() < _SAME:
+                    return rows.moved(first, moved)
+        return self._rows(state, fresh, self.belief.mean)
 
     def _started(self, state: SplineState, piece: int) -> Smoother | None:
         """A smoother that knows nothing; gravity is guessed from the first samples, so that turns are about right."""
@@ -189,13 +269,15 @@ class Inertia:
         up = (R @ samples.values[:, 3:, None])[..., 0].sum(axis=0)
         return np.asarray(-self.recording.gravity * up / max(1e-9, float(np.linalg.norm(up))))
 
-    def _regular(self, smoother: Smoother, spline: Spline) -> None:
-        """The weak prior of accelerations for control points that have come anew."""
+    def _regular(self, smoother: Smoother, spline: Spline) -> float:
+        """Add the weak prior of accelerations for control points that have come anew; its cost."""
         first, last = max(self._tripled - 2, smoother.first), smoother.last
-        if last - first >= 3:
-            sigma = np.repeat(self.common[None] * spline.dt**2, last - first - 2, axis=0)
-            smoother.add(acceleration_prior(spline, first, last, sigma)[0])
-            self._tripled = last
+        if last - first < 3:
+            return 0.0
+        sigma = np.repeat(self.common[None] * spline.dt**2, last - first - 2, axis=0)
+        model, cost = acceleration_prior(spline, first, last, sigma)
+        smoother.add(model)
+        return cost
 
     def _believe(self, smoother: Smoother) -> None:
         free = smoother.marginal()
@@ -223,36 +305,3 @@ class Inertia:
         seen = np.minimum(seen, 25.0 * self.sigma**2)
         mean = np.where(known, (1.0 - weight) * self.sigma**2 + weight * seen, self.sigma**2)
         self.sigma = np.maximum(self._noise, np.sqrt(mean))
-
-
-class InertialPrior:
-    """The samples' normal equations around a state, kept while it hardly moves: a `rstrack.alignment.priors.Prior`.
-
-    first, end: the control points that its samples depend on, and how many there were of all.
-    """
-
-    def __init__(self, inertia: Inertia, samples: Samples, state: SplineState, first: int, belief: Belief) -> None:
-        self._belief = belief
-        self._inertia, self._samples, self.state = inertia, samples, state
-        self.first, self.end = first, state.end
-        self._known: tuple[Quadratic, float] | None = None
-        self._at, self._nine = np.zeros((0, 6)), belief.mean
-
-    def __call__(self, spline: Spline) -> tuple[Quadratic, float]:
-        if self._known is not None:
-            model, cost = self._known
-            moved = self.state.received(model.first, model.last) - self._at
-            if np.abs(moved).max() < _SAME:
-                step = moved.ravel()
-                return model.moved(moved), cost + float(model.g @ step + 0.5 * step @ model.H @ step)
-        inertia = self._inertia
-        for _ in range(2):
-            joint, _ = summed(spline, self._samples, inertia.recording.T_imu_depth, self._nine, inertia.sigma)
-            if joint is None:
-                return Quadratic(self.state.end - 1, np.zeros((6, 6)), np.zeros(6)), 0.0
-            model, cost, best = joint.without_belief(self._belief, self._nine)
-            if np.abs(best - self._nine)[GRAVITY].max() < _SAME_GRAVITY:
-                break
-            self._nine = best
-        self._known, self._at = (model, cost), self.state.received(model.first, model.last)
-        return self._known

@@ -94,51 +94,64 @@ class Scatter:
         return self.r + self.by_belief @ change
 
 
-def residuals(
-    spline: Spline, samples: Samples, T_imu_depth: FloatArray, belief: FloatArray
-) -> tuple[FloatArray, FloatArray, IntArray]:
-    """r (n, 6), its derivatives (n, 6, 33) by the four control points and by the belief's nine numbers, and the first
-    of these control points (n,).
+@dataclass(frozen=True)
+class Rows:
+    """Residuals of n samples, linearised: r (n, 6), J (n, 6, 33) their derivatives by the four control points and by a
+    belief's nine numbers, first (n,) the first of these control points."""
 
-    belief (9,): see `Belief`. All samples' times must be within the spline.
-    """
-    at = motion(spline, samples.t)
-    Ad, n = se3.adjoint(T_imu_depth), len(samples)
-    twist, rate = at.twist @ Ad.T, at.rate @ Ad.T
-    by_twist, by_rate = Ad @ at.by_twist, Ad @ at.by_rate
-    v, omega = twist[:, :3], twist[:, 3:]
-    R_imu_world = T_imu_depth[:3, :3] @ np.swapaxes(at.rotation, 1, 2)
-    g = belief[GRAVITY]
-    r = np.concatenate([omega + belief[GYRO], rate[:, :3] + cross(omega, v) - R_imu_world @ g + belief[ACCEL]], axis=1)
-    J = np.zeros((n, 6, 24 + SIZE))
-    J[:, :3, :24] = by_twist[:, 3:]
-    J[:, 3:, :24] = by_rate[:, :3] + hat(omega) @ by_twist[:, :3] - hat(v) @ by_twist[:, 3:]
-    # R ← exp(φ) R turns Rᵀ g by Rᵀ g^ φ.
-    J[:, 3:, :24] -= (R_imu_world @ hat(g)) @ at.by_turn
-    J[:, :3, 24:27] = J[:, 3:, 27:30] = np.eye(3)
-    J[:, 3:, 30:] = -R_imu_world
-    return r - samples.values, J, at.first
+    samples: Samples
+    r: FloatArray
+    J: FloatArray
+    first: IntArray
 
+    @classmethod
+    def of(cls, spline: Spline, samples: Samples, T_imu_depth: FloatArray, belief: FloatArray) -> Rows:
+        """Around a spline and nine numbers (9,), see `Belief`. All samples' times must be within the spline."""
+        at = motion(spline, samples.t)
+        Ad, n = se3.adjoint(T_imu_depth), len(samples)
+        twist, rate = at.twist @ Ad.T, at.rate @ Ad.T
+        by_twist, by_rate = Ad @ at.by_twist, Ad @ at.by_rate
+        v, omega = twist[:, :3], twist[:, 3:]
+        R_imu_world = T_imu_depth[:3, :3] @ np.swapaxes(at.rotation, 1, 2)
+        g = belief[GRAVITY]
+        force = rate[:, :3] + cross(omega, v) - R_imu_world @ g + belief[ACCEL]
+        J = np.zeros((n, 6, 24 + SIZE))
+        J[:, :3, :24] = by_twist[:, 3:]
+        J[:, 3:, :24] = by_rate[:, :3] + hat(omega) @ by_twist[:, :3] - hat(v) @ by_twist[:, 3:]
+        # R ← exp(φ) R turns Rᵀ g by Rᵀ g^ φ.
+        J[:, 3:, :24] -= (R_imu_world @ hat(g)) @ at.by_turn
+        J[:, :3, 24:27] = J[:, 3:, 27:30] = np.eye(3)
+        J[:, 3:, 30:] = -R_imu_world
+        return cls(samples, np.concatenate([omega + belief[GYRO], force], axis=1) - samples.values, J, at.first)
 
-def summed(
-    spline: Spline, samples: Samples, T_imu_depth: FloatArray, belief: FloatArray, sigma: FloatArray
-) -> tuple[Joint | None, Scatter]:
-    """The samples' normal equations around the spline and a belief's nine numbers, and how they scatter about these.
+    def until(self, end: float) -> Rows:
+        """Those of samples before a time, s."""
+        n = int(np.searchsorted(self.samples.t, end))
+        samples = self.samples.between(-np.inf, end)
+        return Rows(samples, self.r[:n], self.J[:n], self.first[:n])
 
-    sigma (2,): of a gyroscope's reading (rad/s), of an accelerometer's (m/s²). None without samples.
-    """
-    if not len(samples):
-        return None, Scatter(np.zeros((0, 6)), np.zeros((0, 6, SIZE)))
-    r, J, segments = residuals(spline, samples, T_imu_depth, belief)
-    root = samples.counts / np.repeat(sigma, 3)
-    whitened = np.concatenate([J, r[..., None]], axis=2) * root[..., None]
-    starts = np.flatnonzero(np.diff(segments, prepend=segments[0] - 1))
-    first, count = int(segments[0]), int(segments[-1] - segments[0]) + 4
-    size = 6 * count + SIZE
-    total = np.zeros((size + 1, size + 1))
-    tail = np.arange(6 * count, size + 1)
-    for begin, end in zip(starts, [*starts[1:], len(segments)], strict=True):
-        rows = whitened[begin:end].reshape(-1, 24 + SIZE + 1)
-        at = np.concatenate([6 * (segments[begin] - first) + np.arange(24), tail])
-        total[np.ix_(at, at)] += rows.T @ rows
-    return Joint(first, total[:-1, :-1], total[:-1, -1], 0.5 * float(total[-1, -1])), Scatter(r, J[:, :, 24:])
+    def moved(self, first: int, increments: FloatArray) -> Rows:
+        """Where control points from number `first` on have moved by increments (k, 6)."""
+        step = increments[self.first[:, None] - first + np.arange(4)].reshape(len(self.r), 24, 1)
+        return Rows(self.samples, self.r + (self.J[:, :, :24] @ step)[..., 0], self.J, self.first)
+
+    def summed(self, sigma: FloatArray) -> tuple[Joint | None, Scatter]:
+        """Their normal equations, and how they scatter about the spline and the nine numbers.
+
+        sigma (2,): of a gyroscope's reading (rad/s), of an accelerometer's (m/s²). None without samples.
+        """
+        scatter = Scatter(self.r, self.J[:, :, 24:])
+        if not len(self.r):
+            return None, scatter
+        root = self.samples.counts / np.repeat(sigma, 3)
+        whitened = np.concatenate([self.J, self.r[..., None]], axis=2) * root[..., None]
+        starts = np.flatnonzero(np.diff(self.first, prepend=self.first[0] - 1))
+        first, count = int(self.first[0]), int(self.first[-1] - self.first[0]) + 4
+        size = 6 * count + SIZE
+        total = np.zeros((size + 1, size + 1))
+        tail = np.arange(6 * count, size + 1)
+        for begin, end in zip(starts, [*starts[1:], len(self.first)], strict=True):
+            rows = whitened[begin:end].reshape(-1, 24 + SIZE + 1)
+            at = np.concatenate([6 * (self.first[begin] - first) + np.arange(24), tail])
+            total[at[:, None], at] += rows.T @ rows
+        return Joint(first, total[:-1, :-1], total[:-1, -1], 0.5 * float(total[-1, -1])), scatter

@@ -13,7 +13,7 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rstrack.alignment.normal_equations import Quadratic
 from rstrack.alignment.spline_state import SplineState
-from rstrack.inertial.belief import GRAVITY, SIZE, Belief
+from rstrack.inertial.belief import GRAVITY, SIZE, STRENGTH, Belief
 from rstrack.inertial.residuals import Joint
 
 # Information of a control point that nothing tells (σ 100 m, rad): systems are never singular.
@@ -41,12 +41,19 @@ class Smoother:
         """One past the last control point."""
         return self.first + len(self.at)
 
-    def reach(self, state: SplineState, first: int, last: int) -> None:
-        """Be around a state, and hold its control points up to `last`; from `first` on, if there are none yet."""
+    def reach(self, state: SplineState, first: int, last: int) -> float:
+        """Be around a state, and hold its control points up to `last`; from `first` on, if there are none yet.
+
+        Returns how much more it costs there.
+        """
+        cost = 0.0
         if not len(self.at):
             self.first = first
         if len(self.at):
-            self.g = self.g + self.H[:, :-SIZE] @ (state.received(self.first, self.last) - self.at).ravel()
+            step = (state.received(self.first, self.last) - self.at).ravel()
+            change = self.H[:, :-SIZE] @ step
+            cost = float(step @ self.g[:-SIZE] + 0.5 * step @ change[:-SIZE])
+            self.g = self.g + change
         missing = 6 * max(0, last - self.last)
         if missing:
             c, size = len(self.g) - SIZE, len(self.g) + missing
@@ -55,6 +62,24 @@ class Smoother:
             H[np.ix_(order, order)], g[order] = self.H, self.g
             self.H, self.g = H, g
         self.at = state.received(self.first, max(last, self.last))
+        return cost
+
+    def copy(self) -> Smoother:
+        """One to which can be added without adding to this one."""
+        return Smoother(self.first, self.H.copy(), self.g.copy(), self.at, self.belief)
+
+    def without_belief(self, strength: float) -> tuple[Quadratic, float]:
+        """Over the control points alone, biases and gravity, of a known strength (m/s²), being best at every step; and
+        how much less that costs here than what is believed."""
+        z, c = slice(len(self.g) - SIZE, None), slice(0, len(self.g) - SIZE)
+        u, size = np.zeros(SIZE), float(np.linalg.norm(self.belief[GRAVITY]))
+        u[GRAVITY] = self.belief[GRAVITY] / max(1e-9, size)
+        pull = self.g[z] + u * (size - strength) / STRENGTH**2
+        information = self.H[z, z] + np.outer(u, u) / STRENGTH**2
+        solved = np.linalg.solve(information, np.column_stack([self.H[z, c], pull]))
+        H = self.H[c, c] - self.H[c, z] @ solved[:, :-1]
+        g = self.g[c] - self.H[c, z] @ solved[:, -1]
+        return Quadratic(self.first, 0.5 * (H + H.T), g), 0.5 * float(pull @ solved[:, -1])
 
     def around(self, belief: FloatArray) -> None:
         """Be around another belief (9,)."""

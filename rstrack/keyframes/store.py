@@ -21,6 +21,8 @@ _RECENT = 8
 _MODEL_KEYFRAMES = 256
 # Of the distance and angle at which a keyframe is left behind: an older one that is nearer becomes the reference again.
 _RETURN = 0.7
+# Within so many times these a keyframe may show what a camera sees that an IMU has led there.
+_NEAR = 1.5
 # Within so many times these, frames are aligned to the oldest keyframe too: fewer hops, less drift.
 _ANCHOR = 2.0
 
@@ -60,9 +62,20 @@ class KeyframeStore:
         The newest is not among them.
         """
         indices = self.archive.alike(frame, {self.newest.index})
-        chosen = [indices[(skip + i) % len(indices)] for i in range(min(most, len(indices)))]
+        return self._found([indices[(skip + i) % len(indices)] for i in range(min(most, len(indices)))])
+
+    def near(self, T_world_cam: FloatArray, most: int) -> list[Reference]:
+        """The `most` keyframes, ever made, nearest to a camera (4, 4) of those that it has not left far behind.
+
+        The newest is not among them.
+        """
+        indices = [k for k in self.archive.indices if k != self.newest.index]
+        far = {k: self._remoteness(self.archive.pose(k), T_world_cam) for k in indices}
+        return self._found([k for k in sorted(indices, key=far.__getitem__) if far[k] < _NEAR][:most])
+
+    def _found(self, indices: list[int]) -> list[Reference]:
         on_device = {ref.index: ref for ref in self._kept}
-        return [on_device[k] if k in on_device else self.archive.get(k) for k in chosen]
+        return [on_device[k] if k in on_device else self.archive.get(k) for k in indices]
 
     def use(self, ref: Reference) -> None:
         """A keyframe found again is the newest from now on."""

@@ -89,14 +89,19 @@ class Relocaliser:
         """Where a frame was taken, or why that cannot be told; the track ended at time `end` (s).
 
         Small images are aligned to some keyframes, and the whole one from the best of these poses; others take their
-        turn with the next frame. A pose that no hand can have brought the camera to is none until the next frame is
-        found beside it. torn: whether it was found where the motion led, but pulled away from it: under vibration depth
-        alone fits single frames anywhere nearby, and is not believed then. T_led (4, 4): where an IMU has it.
+        turn with the next frame, or at once where an IMU has led nearby. A pose that no hand can have brought the
+        camera to is none until the next frame is found beside it. torn: whether it was found where the motion led, but
+        pulled away from it: under vibration depth alone fits single frames anywhere nearby, and is not believed then.
+        T_led (4, 4): where an IMU has it.
         """
         jump, self._jump = self._jump, None
-        start = (jump.ref, jump.T_ref_cam) if jump else self._searched(new, window, ref, end, T_led)
+        starts = [(jump.ref, jump.T_ref_cam)] if jump else self._searched(new, window, ref, end, T_led)
         self._lost_in_a_row += 1
-        found = self._aligned(new, window, end, *start, uncertainty) if start else Fault.NO_PLACE
+        found: Found | Fault = Fault.NO_PLACE
+        for start in starts:
+            found = self._aligned(new, window, end, *start, uncertainty)
+            if isinstance(found, Found):
+                break
         if isinstance(found, Fault):
             return found
         if torn and all(o.is_depth for o in found.fresh):
@@ -113,11 +118,13 @@ class Relocaliser:
 
     def _searched(
         self, new: DeviceFrame, window: Window, ref: Reference, end: float, T_led: FloatArray | None
-    ) -> tuple[Reference, FloatArray] | None:
-        """The keyframe and T_ref_cam (4, 4) whose turn it is."""
+    ) -> list[tuple[Reference, FloatArray]]:
+        """The keyframe and T_ref_cam (4, 4) whose turn it is; where an IMU has led, all that are near, best first."""
         newest = self._keyframes.newest if ref.rolling is not None else ref
         skip = (self._lost_in_a_row // 2) * (_PLACES - 1)
-        places = [newest, *self._keyframes.candidates(new, skip, _PLACES - 1)]
+        # What looks alike may be anywhere; where an IMU led, what is there comes first.
+        led = [] if T_led is None else self._keyframes.near(T_led, _PLACES - 1)
+        places = [newest, *(led or self._keyframes.candidates(new, skip, _PLACES - 1))]
         T_ends = [window.spline.pose(end), *(place.T_world_base for place in places[1:])]
         if T_led is not None:
             places, T_ends = [*places, *places], [*T_ends, *[T_led] * len(places)]
@@ -126,12 +133,13 @@ class Relocaliser:
             [(coarse_search.small_keyframe(place), se3.inverse(place.T_world_base) @ T)
              for place, T in zip(places, T_ends, strict=True)],
         )  # fmt: skip
+        near = [] if T_led is None else where_led(T_led, places, ranked)
+        if near:
+            return [(places[k], T) for k, T in near]
         if not ranked:
-            return None
-        if T_led is not None:
-            ranked = where_led(T_led, places, ranked) or ranked
+            return []
         chosen, T_ref_cam = ranked[self._lost_in_a_row % len(ranked)]
-        return places[chosen], T_ref_cam
+        return [(places[chosen], T_ref_cam)]
 
     def _aligned(
         self, new: DeviceFrame, window: Window, end: float, ref: Reference, T_ref_cam: FloatArray, before: Uncertainty

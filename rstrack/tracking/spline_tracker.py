@@ -272,8 +272,8 @@ class Tracker:
             uncertainty = track.covariances.uncertainty
             if ref.rolling is None:
                 # A rolling reference moves with what is aligned to it, which tells nothing of the two together.
-                seconds = new.stamp - track.found.stamps[-1]
-                uncertainty = uncertainty.after(seconds, pulled.information, *track.accelerations(window, seconds))
+                seconds, R = new.stamp - track.found.stamps[-1], T_predicted[:3, :3]
+                uncertainty = uncertainty.after(seconds, pulled.information, *track.accelerations(window, seconds, R))
         if not fault and implausible(T_predicted, window.spline.pose(mid), gap):
             fault = Fault.TOO_FAR
         elif not fault and not uncertainty.is_known:
@@ -325,7 +325,8 @@ class Tracker:
         found.window.keep(found.fresh)
         track.window, track.covariances.uncertainty = found.window, found.uncertainty
         track.chain.cut(found.window.piece)
-        track.chain.add(found.ref, found.fresh, found.window.state, pulls(found.fresh, found.window.state).excess)
+        excess = pulls(found.fresh, found.window.state).excess
+        track.chain.add(found.ref, found.fresh, found.window.state, excess)
         new = replace(new, depth=found.depth)
         track.remember(new)
         track.succession.use(found.ref, new)
@@ -333,6 +334,7 @@ class Tracker:
         self._bridge.forget()
         if track.inertia is not None:
             track.inertia.begin_piece()
+            track.learn_inertia(found.fresh, found.window, excess, new.last_time)
         track.age = 1
         track.placed(new, found.fresh, joined=False)
         return track.report(new, found.fresh, found.solved, overlap=track.succession.overlap(found.fresh))

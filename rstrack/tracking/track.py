@@ -39,6 +39,9 @@ from rstrack.tracking.moving.leave_out import LeftOut, leave_out
 from rstrack.tracking.succession import Succession
 from rstrack.tracking.window import Window
 
+# Images in a row that are off alike: what interpolation, what shines and the keyframe's own noise do to them changes
+# slowly. So many tell how the camera has moved, beside an IMU's readings, as one would by its scatter.
+_ALIKE = 8.0
 # What a track of the same rig and options would make in the same way.
 _MADE_ANEW = "rig", "options", "device", "terms", "maker", "space"
 
@@ -151,16 +154,15 @@ class Track:
         """What a frame that ends at time `end` (s) says of an IMU's biases and of gravity. excess: see `Pulls`."""
         if self.inertia is not None:
             self._shift_inertia(fresh)
-            models = [o.model(window.state).scaled(1.0 / excess**2) for o in fresh if o.is_linearised]
+            models = [o.model(window.state).scaled(1.0 / (_ALIKE * excess**2)) for o in fresh if o.is_linearised]
             self.inertia.learn(window.state, window.piece, models, end)
 
-    def accelerations(self, window: Window, seconds: float) -> tuple[FloatArray, float]:
+    def accelerations(self, window: Window, seconds: float, R_world_depth: FloatArray) -> tuple[FloatArray, float]:
         """σ (6,) of accelerations over so many seconds, beyond what is known, m/s² and rad/s², and of the angular rate,
-        rad/s: an IMU tells most."""
+        rad/s: an IMU tells most. R_world_depth (3, 3): about how the camera is turned."""
         if self.inertia is None or seconds <= 0.0 or not window.is_led(self.found.end, self.found.end + seconds):
             return ACCELERATION, np.inf
-        R_depth_world = window.spline.pose(self.found.end)[:3, :3].T
-        told, rate = self.inertia.told(seconds, self.inertia.recording.T_imu_depth[:3, :3] @ R_depth_world)
+        told, rate = self.inertia.told(seconds, self.inertia.recording.T_imu_depth[:3, :3] @ R_world_depth.T)
         return np.minimum(ACCELERATION, told), rate
 
     def _shift_inertia(self, fresh: Sequence[Observation]) -> None:

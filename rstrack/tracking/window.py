@@ -22,7 +22,8 @@ from rstrack.alignment.priors import (
 )
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.device_frame import DeviceFrame
-from rstrack.inertial.inertia import Inertia, InertialPrior
+from rstrack.inertial.inertia import Inertia
+from rstrack.inertial.kept import Kept
 from rstrack.keyframes.keyframe import Reference
 
 # The newest control points, whose weight in the newest lines is only u³/6, are held a good deal tighter by the motion
@@ -32,17 +33,13 @@ _END_TRIPLES, _END_FACTOR = 2, 0.1
 _GAUGE = np.full(6, 1e-6)
 # Control points that are held beyond those that are needed, and how many are released at once.
 _HELD, _RELEASED = 8, 128
-# Seconds for which control points that no new image touches stay free beside an IMU: about as long as what images say
-# of the motion gets better by averaging along it. And degrees that the camera turns in them, at most: keyframes are
-# made of frozen frames, and must not be left behind by then.
-_LAG_S, _LAG_DEG = 0.1, 3.0
 # Seconds before the spline's end that an IMU has to tell, or the newest control points are held as if there were none.
 _NEWEST_S = 0.05
 # Levels to go through from a prediction by constant velocity, and from anything worse.
 TRACKING_LEVELS, LEVELS = (1, 0), (2, 1, 0)
 # Steps from constant velocity to what an IMU says of the motion since the last frame, and a step (m, rad) that is the
 # last one.
-_LED_STEPS, _LED = 4, 1e-3
+_LED_STEPS, _LED = 4, 1e-2
 # Steps at most on the pyramid's levels, finest first.
 _MOST_STEPS = (15, 8, 30)
 
@@ -62,7 +59,8 @@ class Window:
         self.state, self.piece = state, piece
         self.first_free = piece
         self.active: list[Observation] = []
-        self._led: InertialPrior | None = None
+        self._led: Kept | None = None
+        self._is_held = False
 
     @classmethod
     def still(
@@ -82,24 +80,31 @@ class Window:
     def copy(self) -> Window:
         """A window that can be changed without changing this one."""
         twin = Window(self._terms, self._focal, self.state.copy(), self.piece, self._inertia)
-        twin.first_free, twin.active = self.first_free, list(self.active)
+        twin.first_free, twin.active, twin._is_held = self.first_free, list(self.active), self._is_held
         return twin
 
     def predict(self, new: DeviceFrame, end: float, young: bool = False) -> None:
         """Go on with constant velocity, or as an IMU leads, from time `end` (s) until the frame is covered; what it
-        touches is free, and with an IMU what came shortly before.
+        touches is free, and with an IMU what is known of in `Inertia.ahead`, which the frames before are in.
 
         young: the piece's first frame alone does not tell its velocity; all of the piece stays free. Where frames are
         missing, and an IMU leads over the gap, all control points in it are free.
         """
-        begin = self.state.segment(new.first_time)
+        begin, held, self._led = self.state.segment(new.first_time), None, None
         if self.is_led(end, new.last_time):
             self.state.extend(new.last_time)
-            self._follow_lead(end)
-            begin = max(self.first_free, min(begin, self.state.segment(end)) - self._lag(end))
+            begin = min(begin, self.state.segment(end))
+            held = None if young or self._inertia is None else self._inertia.held(self.piece)
+            self._is_held = held is not None
+            first = max(self.piece, min(self.first_free, begin)) if held is None else held
+            self._follow_lead(first)
         else:
             self.state.smooth_end(end)
             self.state.extend(new.last_time)
+            self._is_held = False
+        if held is not None:
+            self.first_free, self.active = held, []
+            return
         self.first_free = self.piece if young else max(self.piece, begin)
         self.active = [o for o in self.active if o.is_linearised and o.lin.model.last > self.first_free]
 
@@ -107,18 +112,12 @@ class Window:
         """Whether an IMU tells the motion from time begin to end (s)."""
         return self._inertia is not None and self._inertia.is_usable and self._inertia.covers(begin, end)
 
-    def _lag(self, end: float) -> int:
-        """Knots for which control points stay free before time `end` (s)."""
-        turning = float(np.degrees(np.linalg.norm(self.spline.velocity(end)[3:])))
-        return int(min(_LAG_S, _LAG_DEG / max(turning, 1e-9)) / self.state.dt + 0.5)
-
-    def _follow_lead(self, end: float) -> None:
-        """Move the control points that lines until time `end` (s) left open to where the IMU has them; the images seen
-        before hold the others."""
-        first = max(self.piece, min(self.first_free, self.state.segment(end)))
+    def _follow_lead(self, first: int) -> None:
+        """Move the control points from `first` on to where the IMU has them; the images seen before hold those that
+        their lines told."""
         free = first, self.state.end
-        priors = [self._motion_prior(free), *self._inertial(free)]
-        active = [o for o in self.active if o.is_linearised]
+        priors = self._priors(free)
+        active = [] if self._is_held else [o for o in self.active if o.is_linearised]
         for _ in range(_LED_STEPS):
             models = [o.model(self.state) for o in active] + [prior(self.spline)[0] for prior in priors]
             H, g = assemble(models, *free)
@@ -155,12 +154,12 @@ class Window:
         solved for becomes active with `keep`.
         """
         free = self.first_free, self.state.end
-        inertial = self._inertial(free)
-        priors = [self._motion_prior(free), *inertial] + ([] if gauge is None else [_pose_prior(gauge)])
+        priors = self._priors(free)
+        bandwidth = 6 * (free[1] - free[0]) if coupled or isinstance(priors[-1], Kept) else 24
+        priors += [] if gauge is None else [_pose_prior(gauge)]
         if self.piece > 0 and self.first_free == self.piece:
             priors.append(self._velocity_prior(free))
-        bandwidth = 6 * (free[1] - free[0]) if coupled or inertial else 24
-        problem = Problem(fresh, self.active, free, priors, self._focal, bandwidth)
+        problem = Problem(fresh, self.active, free, priors, self._focal, bandwidth, predicted=self._is_held)
         try:
             with self._terms.timer("optimiser"):
                 return optimise(self._terms, self.state, problem, levels, _MOST_STEPS, hopeless, before_finest)
@@ -172,6 +171,15 @@ class Window:
         """Fresh observations take part from now on."""
         self.active += fresh
         self._led = None
+
+    def _priors(self, free: tuple[int, int]) -> list[Prior]:
+        """What is known beside the images; the IMU's last."""
+        if not self._is_held or self._inertia is None:
+            return [self._motion_prior(free), *self._inertial(free)]
+        known = self._led
+        if known is None or known.state is not self.state or known.end != self.state.end:
+            known = self._led = self._inertia.ahead(self.state)
+        return [known]
 
     def _motion_prior(self, free: tuple[int, int]) -> Prior:
         first, last = max(self.piece, free[0] - 2), free[1]

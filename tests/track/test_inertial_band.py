@@ -71,9 +71,10 @@ def test_what_is_missed_of_a_swing_follows_from_the_readings() -> None:
 def test_knots_are_as_dense_as_the_motion_needs() -> None:
     vibrating = np.repeat([3e-4 * 2**0.5, np.radians(0.05) * 2**0.5], 3)
     cases = [
-        (np.zeros(6), 1.0, (0.1,)),
-        (np.repeat([0.02, 0.1], 3), 1.0, (0.05, 1 / 30)),  # a hand's sway
-        (np.repeat([2e-3, 4e-3], 3), 5.0, (1 / 30, 0.025)),  # and its shake
+        (np.zeros(6), 1.0, (0.025,)),  # never wider than without a unit
+        (np.repeat([0.02, 0.1], 3), 1.0, (0.025,)),  # a hand's sway
+        (np.repeat([2e-3, 4e-3], 3), 5.0, (0.025,)),  # and its shake
+        (np.repeat([4e-3, 8e-3], 3), 8.0, (1 / 60, 0.0125)),
         (vibrating, 25.0, (0.0125, 1 / 120)),
         (30 * vibrating, 25.0, (0.00625,)),  # the densest that 200 Hz tell
     ]

@@ -12,7 +12,7 @@ from rsgen.sensors.imu import exact_imu
 from rstrack.data.imu.recording import ImuNoise, ImuRecording
 from rstrack.inertial.belief import SIZE, Belief
 from rstrack.inertial.derivatives import motion
-from rstrack.inertial.residuals import Samples, residuals, summed
+from rstrack.inertial.residuals import Rows, Samples
 
 T_IMU_DEPTH = se3.exp([0.03, -0.02, 0.05, 0.3, -1.2, 0.7])
 GRAVITY = np.array([1.0, -9.0, 3.5])
@@ -55,7 +55,7 @@ def test_motion_is_the_splines() -> None:
 def test_residuals_vanish_at_the_truth() -> None:
     spline = wild_spline()
     imu = recording(spline, np.linspace(spline.t_begin, spline.t_end, 40))
-    r, _, _ = residuals(spline, Samples.of(imu), T_IMU_DEPTH, np.concatenate([BIAS, GRAVITY]))
+    r = Rows.of(spline, Samples.of(imu), T_IMU_DEPTH, np.concatenate([BIAS, GRAVITY])).r
     assert np.abs(r).max() < 1e-11
 
 
@@ -63,11 +63,12 @@ def test_derivatives_by_control_points_are_finite_differences() -> None:
     spline = wild_spline(3)
     t = np.linspace(spline.t_begin, spline.t_end, 13)
     samples, belief = Samples.of(recording(wild_spline(4), t)), np.concatenate([BIAS, GRAVITY])
-    _, J, first = residuals(spline, samples, T_IMU_DEPTH, belief)
+    rows = Rows.of(spline, samples, T_IMU_DEPTH, belief)
+    J, first = rows.J, rows.first
     step, worst = 1e-5, np.zeros(2)
     for number in range(len(spline.control_points)):
         for axis in range(6):
-            ends = [residuals(moved(spline, number, axis, s * step), samples, T_IMU_DEPTH, belief)[0] for s in (-1, 1)]
+            ends = [Rows.of(moved(spline, number, axis, s * step), samples, T_IMU_DEPTH, belief).r for s in (-1, 1)]
             told = np.zeros((len(t), 6))
             for k in np.flatnonzero((first <= number) & (number < first + 4)):
                 told[k] = J[k, :, 6 * (number - first[k]) + axis]
@@ -81,9 +82,9 @@ def test_derivatives_by_biases_and_gravity_are_finite_differences() -> None:
     spline = wild_spline(3)
     samples = Samples.of(recording(spline, np.linspace(spline.t_begin, spline.t_end, 13)))
     belief = np.concatenate([BIAS, GRAVITY])
-    _, J, _ = residuals(spline, samples, T_IMU_DEPTH, belief)
+    J = Rows.of(spline, samples, T_IMU_DEPTH, belief).J
     for i, e in enumerate(np.eye(SIZE)):
-        ends = [residuals(spline, samples, T_IMU_DEPTH, belief + s * e)[0] for s in (-0.5, 0.5)]
+        ends = [Rows.of(spline, samples, T_IMU_DEPTH, belief + s * e).r for s in (-0.5, 0.5)]
         np.testing.assert_allclose(ends[1] - ends[0], J[:, :, 24 + i], atol=1e-9)
 
 
@@ -91,11 +92,12 @@ def test_sums_are_the_dense_least_squares() -> None:
     spline = wild_spline(3)
     samples = Samples.of(recording(wild_spline(4), np.linspace(spline.t_begin + 0.06, spline.t_end, 50)))
     belief, sigma = Belief.initial(GRAVITY), np.array([0.01, 0.2])
-    joint, scatter = summed(spline, samples, T_IMU_DEPTH, belief.mean, sigma)
+    rows = Rows.of(spline, samples, T_IMU_DEPTH, belief.mean)
+    joint, scatter = rows.summed(sigma)
     assert joint is not None and joint.first == 1 and joint.count == len(spline.control_points) - 1
-    r, J, first = residuals(spline, samples, T_IMU_DEPTH, belief.mean)
+    r, J, first = rows.r, rows.J, rows.first
     change = np.random.default_rng(5).normal(0.0, 0.1, SIZE)
-    expected, _, _ = residuals(spline, samples, T_IMU_DEPTH, belief.mean + change)
+    expected = Rows.of(spline, samples, T_IMU_DEPTH, belief.mean + change).r
     np.testing.assert_allclose(scatter.after(change), expected, atol=1e-9)
     dense = np.zeros((len(r), 6, 6 * joint.count + SIZE))
     for k, at in enumerate(first - 1):
@@ -112,7 +114,7 @@ def test_belief_is_eliminated_as_if_it_were_solved_for() -> None:
     samples = Samples.of(recording(wild_spline(4), np.linspace(spline.t_begin, spline.t_end, 50)))
     rng, belief = np.random.default_rng(0), Belief.initial(GRAVITY)
     at = belief.mean + rng.normal(0.0, 0.1, SIZE)
-    joint, _ = summed(spline, samples, T_IMU_DEPTH, at, np.array([0.01, 0.2]))
+    joint, _ = Rows.of(spline, samples, T_IMU_DEPTH, at).summed(np.array([0.01, 0.2]))
     assert joint is not None
     model, cost, nine = joint.without_belief(belief, at)
     H, g, known = joint.H, joint.g, belief.information
@@ -144,3 +146,21 @@ def test_gravity_of_a_known_strength_is_on_its_sphere() -> None:
     assert np.linalg.norm(found.mean[6:]) == pytest.approx(9.80665, abs=2e-3)
     # All directions were known alike: the nearest point of the sphere is the best.
     np.testing.assert_allclose(found.direction, told.direction, atol=1e-6)
+
+
+def test_rows_are_moved_as_if_they_were_linearised_anew() -> None:
+    """To second order: steps half as long are off by a quarter."""
+    spline = wild_spline(3)
+    imu = recording(spline, np.linspace(spline.t_begin, spline.t_end, 40))
+    belief = np.concatenate([BIAS, GRAVITY])
+    rows = Rows.of(spline, Samples.of(imu), T_IMU_DEPTH, belief)
+    step = np.random.default_rng(4).normal(0.0, 1e-3, (len(spline.control_points), 6))
+    off = []
+    for part in (1.0, 0.5):
+        T = se3.exp(part * step) @ spline.control_points
+        expected = Rows.of(Spline(T, spline.t0, spline.dt), rows.samples, T_IMU_DEPTH, belief)
+        off.append(np.abs(rows.moved(0, part * step).r - expected.r).max())
+    assert 0.0 < off[1] < 0.27 * off[0] < 0.05 * np.abs(expected.r - rows.r).max()
+    early = rows.until(float(imu.t[7]))
+    assert len(early.samples) == len(early.r) == 7
+    np.testing.assert_array_equal(early.r, rows.r[:7])

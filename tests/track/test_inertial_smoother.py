@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, minimize
 
 from rsgen.array_types import FloatArray
 from rsgen.config.imu import ImuConfig
@@ -16,8 +16,10 @@ from rstrack.alignment.priors import pose_constraint
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.imu.recording import ImuNoise, ImuRecording
 from rstrack.inertial.belief import SIZE, Belief
+from rstrack.inertial.belief import STRENGTH as STRENGTH_SIGMA
 from rstrack.inertial.inertia import Inertia
-from rstrack.inertial.residuals import Samples, summed
+from rstrack.inertial.kept import Kept
+from rstrack.inertial.residuals import Rows, Samples
 from rstrack.inertial.smoother import Smoother
 
 GRAVITY = np.array([2.0, -8.6, 4.262])
@@ -81,7 +83,7 @@ def test_a_small_problem_is_solved_as_by_scipy() -> None:
         smoother.reach(state, 0, count)
         for t, T in poses:
             smoother.add(pose_constraint(state.spline, t, T, POSE_SIGMA)[0])
-        joint, _ = summed(state.spline, samples, imu.T_imu_depth, belief, sigma)
+        joint, _ = Rows.of(state.spline, samples, imu.T_imu_depth, belief).summed(sigma)
         assert joint is not None
         smoother.add(joint)
         step = -np.linalg.solve(smoother.H, smoother.g)
@@ -139,6 +141,36 @@ def test_a_shift_less_than_nothing_takes_nothing_away() -> None:
     np.testing.assert_allclose(smoother.H, twin.H, rtol=1e-9, atol=1e-9)
 
 
+def test_without_biases_and_gravity_the_rest_is_as_if_these_were_best() -> None:
+    """Against SciPy's minimum over all nine, gravity's strength a measurement, at several places."""
+    smoother = filled(6)
+    model, gained = smoother.without_belief(STRENGTH)
+    u = np.concatenate([np.zeros(6), smoother.belief[6:] / np.linalg.norm(smoother.belief[6:])])
+
+    def cost(x: FloatArray) -> float:
+        off = (u @ (smoother.belief + x[-SIZE:]) - STRENGTH) / STRENGTH_SIGMA
+        return float(0.5 * x @ smoother.H @ x + smoother.g @ x + 0.5 * off**2)
+
+    assert (model.first, model.last) == (0, 6)
+    for seed in range(4):
+        step = np.random.default_rng(seed).normal(0.0, 0.3 * (seed > 0), 36)
+        best = minimize(lambda nine, step=step: cost(np.concatenate([step, nine])), np.zeros(SIZE), tol=1e-12).fun
+        told = float(model.g @ step + 0.5 * step @ model.H @ step) - gained
+        np.testing.assert_allclose(told, best, rtol=1e-6, atol=1e-6)
+
+
+def test_being_around_another_state_costs_what_the_quadratic_says() -> None:
+    state = SplineState.still(0.0, DT, np.eye(4), 6)
+    smoother, step = filled(7), np.random.default_rng(8).normal(0.0, 1e-2, (6, 6))
+    full = np.concatenate([step.ravel(), np.zeros(SIZE)])
+    expected = float(0.5 * full @ smoother.H @ full + smoother.g @ full)
+    state.apply(0, step)
+    twin = smoother.copy()
+    assert twin.reach(state, 0, 8) == pytest.approx(expected, rel=1e-12)
+    np.testing.assert_allclose(twin.g[:36], (smoother.g + smoother.H @ full)[:36], rtol=1e-12)
+    assert len(smoother.g) == 45 and len(twin.g) == 57
+
+
 def learnt(seed: int, seconds: float, every: float = 1 / 30) -> tuple[Inertia, Spline]:
     """A unit beside poses with noise, as the tracker would tell it of them."""
     truth = hand_held(seconds, seed)
@@ -147,6 +179,16 @@ def learnt(seed: int, seconds: float, every: float = 1 / 30) -> tuple[Inertia, S
         model, _ = pose_constraint(state.spline, t, T, POSE_SIGMA)
         inertia.learn(state, 0, [model], t + 0.015 if t + 0.015 < truth.t_end else t)
     return inertia, truth
+
+
+def learnt_until(truth: Spline, seed: int, end: float, wall: float = np.inf) -> Inertia:
+    """The same of a motion until a time, s; a way along x is open from a time on."""
+    inertia, state = Inertia(recording(truth, seed)), SplineState(truth)
+    for t, T in seen_poses(truth, np.random.default_rng(seed)):
+        if t < end:
+            sigma = POSE_SIGMA * [1.0 if t < wall else 1e3, 1.0, 1.0, 1.0, 1.0, 1.0]
+            inertia.learn(state, 0, [pose_constraint(state.spline, t, T, sigma)[0]], t + 0.015)
+    return inertia
 
 
 def test_biases_and_gravity_are_found_to_what_their_sigmas_say() -> None:
@@ -168,6 +210,62 @@ def test_a_second_look_knows_gravity_and_says_when() -> None:
     assert 0.1 < inertia.usable_s < 1.0 < inertia.determined_s < 4.5 < truth.t_end
     # The spline can follow all that there is: readings scatter by their noise.
     np.testing.assert_allclose(inertia.sigma, [7e-5 * 200**0.5, 1e-3 * 200**0.5], rtol=0.5)
+
+
+def ahead_of(inertia: Inertia, state: SplineState) -> tuple[Kept, FloatArray]:
+    """What is known ahead, and what of the control points after its first its minimum adds (k, 6)."""
+    known = inertia.ahead(state)
+    model, _ = known(state.spline)
+    return known, -np.linalg.solve(model.H, model.g).reshape(-1, 6)
+
+
+def test_what_is_ahead_has_the_derivatives_of_its_cost() -> None:
+    truth = hand_held(0.6, 5)
+    inertia = learnt_until(truth, 5, 0.5)
+    for seed in range(3):
+        state = SplineState(truth)
+        known = inertia.ahead(state)
+        model, cost = known(state.spline)
+        step = np.random.default_rng(seed).normal(0.0, 1e-4, (model.last - model.first, 6))
+        moved, ends = SplineState(truth), []
+        for side in (1.0, -2.0):
+            moved.apply(model.first, side * step)
+            ends.append(inertia.ahead(moved)(moved.spline)[1])
+        flat = step.ravel()
+        slope, bend = ends[0] - ends[1], ends[0] + ends[1] - 2.0 * cost
+        np.testing.assert_allclose(slope, 2.0 * float(model.g @ flat), rtol=2e-2, atol=1e-3 * abs(bend))
+        np.testing.assert_allclose(bend, float(flat @ model.H @ flat), rtol=1e-3)
+
+
+def test_what_is_ahead_leads_on_from_where_images_end() -> None:
+    """The newest control points, moved away, come back to where the readings have them: no image has seen these."""
+    for seed in range(4):
+        truth = hand_held(0.7, seed)
+        inertia, state = learnt_until(truth, seed, 0.6), SplineState(truth)
+        last = state.segment(0.6) + 4
+        state.apply(last, np.tile(np.repeat([0.01, 0.02], 3), (state.end - last, 1)))
+        for _ in range(4):
+            known, step = ahead_of(inertia, state)
+            state.apply(known.first, step)
+        t = np.linspace(0.5, 0.67, 30)
+        off = se3.log(state.spline.pose(t) @ se3.inverse(truth.pose(t)))
+        assert np.abs(off[:, :3]).max() < 2e-3 and np.abs(off[:, 3:]).max() < 5e-4
+
+
+def test_nothing_is_held_before_the_unit_is_of_use_or_of_another_piece() -> None:
+    truth = hand_held(0.6, 5)
+    assert learnt_until(truth, 5, 0.04).held(0) is None
+    inertia = learnt_until(truth, 5, 0.5)
+    held = inertia.held(0)
+    assert held is not None and held > 10 and inertia.held(held + 1) is None
+    inertia.begin_piece()
+    assert inertia.held(0) is None
+
+
+def test_nothing_is_held_where_images_leave_a_way_open() -> None:
+    truth = hand_held(0.6, 5)
+    assert learnt_until(truth, 5, 0.5, wall=0.45).held(0) is None
+    assert learnt_until(truth, 5, 0.5, wall=0.51).held(0) is not None
 
 
 def test_another_world_has_its_own_gravity_and_the_same_biases() -> None:

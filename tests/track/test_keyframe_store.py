@@ -76,6 +76,13 @@ class Shelf:
     def get(self, index: int) -> Any:
         return self.kept[index]
 
+    @property
+    def indices(self) -> list[int]:
+        return list(self.kept)
+
+    def pose(self, index: int) -> np.ndarray:
+        return np.asarray(self.kept[index].T_world_base)
+
     def alike(self, frame: Any, without: set[int]) -> list[int]:
         return [k for k in self.kept if k not in without]
 
@@ -116,6 +123,18 @@ def test_without_a_model_the_last_eight_are_kept_and_none_is_returned_to() -> No
         assert refs[-1].older is (refs[-2] if k else None)
     assert recent(kept) == refs[:2:-1]
     assert kept.return_to(np.eye(4), refs[-1]) is None and kept.anchor is None
+
+
+def test_near_a_camera_are_those_it_has_not_left_far_behind_the_nearest_first() -> None:
+    """A keyframe is left after 0.3 m or 20 degrees; the newest is asked for by itself."""
+    kept = keyframes()
+    turned = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, np.radians(28.0), 0.0]))
+    away = [se3.exp(np.array([x, 0.0, 0.0, 0.0, 0.0, 0.0])) for x in (3.0, 0.4, 0.1, 0.2, 0.5)]
+    for k, pose in enumerate([*away, turned, np.eye(4), *[away[0]] * 9, np.eye(4)]):
+        make(kept, k, pose)
+    assert [ref.index for ref in kept.near(np.eye(4), 9)] == [6, 2, 3, 1, 5]
+    assert [ref.index for ref in kept.near(np.eye(4), 2)] == [6, 2]
+    assert kept.near(away[0] @ away[0], 2) == []
 
 
 def test_any_keyframe_can_be_found_again_in_turn() -> None:

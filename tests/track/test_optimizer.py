@@ -147,6 +147,26 @@ def test_settled_models_are_of_the_finest_level_only() -> None:
     assert old.linearisation is not kept
 
 
+def test_what_is_predicted_takes_its_scale_from_the_finest_level_all_the_same() -> None:
+    """Lines that hardly move would keep the first linearisation, and with it the σ of a coarser level."""
+    for predicted, sigmas in ((False, [0.03]), (True, [0.03, 0.7])):
+        state, terms = SplineState(TRUTH), PoseTerms(next_sigma=0.7)
+        seen = [sighting(TIMES, aside(TRUTH, 0.004).pose(TIMES))]
+        done = run(terms, state, seen, state, predicted=predicted)
+        assert [sigma for _, sigma in terms.calls] == sigmas and done.iterations == len(sigmas)
+        assert shift_px(state.spline, aside(TRUTH, 0.004)) < 1e-4
+
+
+@pytest.mark.parametrize(("px", "is_kept"), [(0.0049, True), (0.0051, False)])
+def test_beside_a_prediction_settled_models_are_kept_for_a_quarter_of_the_pixels(px: float, is_kept: bool) -> None:
+    state = SplineState(TRUTH)
+    old, new = sighting(TIMES, TRUTH.pose(TIMES)), sighting(TIMES, aside(TRUTH, 2.0 * px).pose(TIMES))
+    old.linearise(PoseTerms(), state, 0)  # type: ignore[arg-type]
+    kept = old.linearisation
+    run(PoseTerms(), state, [new], state, [old], predicted=True)
+    assert (old.linearisation is kept) == is_kept
+
+
 # -- levels and stops --------------------------------------------------------------------------------------------------
 
 

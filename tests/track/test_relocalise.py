@@ -45,12 +45,13 @@ def test_what_fits_and_what_stands_alone_stays() -> None:
 class Sees(Relocaliser):
     """Finds each frame where it is told."""
 
-    def __init__(self, T_found: list[np.ndarray | None], fresh: Sequence[Any] = ()) -> None:
+    def __init__(self, T_found: list[np.ndarray | None], fresh: Sequence[Any] = (), places: int = 1) -> None:
         super().__init__(*[None] * 6)  # type: ignore[arg-type]
+        self.places = places
         self.T_found, self.fresh, self.started = list(T_found), list(fresh or [seen("depth"), seen("color")]), []
 
     def _searched(self, *_: Any) -> Any:
-        return REF, np.eye(4)
+        return [(REF, np.eye(4))] * self.places
 
     def _aligned(self, new: Any, window: Any, end: float, ref: Any, T_ref_cam: np.ndarray, before: Any) -> Any:
         self.started.append(T_ref_cam)
@@ -83,6 +84,12 @@ def told(relocaliser: Relocaliser, time: float, torn: bool = False) -> Found | F
 
 def test_near_the_end_of_the_track_one_look_is_enough() -> None:
     assert looked(Sees([away(0.1)]), 0.533)
+
+
+def test_where_several_places_are_to_be_tried_the_first_that_fits_is_taken() -> None:
+    for T_found, is_found, looks in (([None, away(0.1), None], True, 2), ([None] * 3, False, 3)):
+        relocaliser = Sees(T_found, places=3)
+        assert looked(relocaliser, 0.533) == is_found and len(relocaliser.started) == looks
 
 
 def test_depth_alone_does_not_find_what_was_pulled_from_where_the_motion_led() -> None:
