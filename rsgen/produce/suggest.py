@@ -107,10 +107,13 @@ class Suggestion:
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """A scene file's triangles (m, 3, 3), world, m, and rays into it. placed: fields of its config but the file."""
+    """A scene file's triangles (m, 3, 3), world, m, and rays into it. fineness (m,): how finely light is baked on each,
+    of what is asked. placed: fields of its config but the file.
+    """
 
     file: Path
     triangles: FloatArray
+    fineness: FloatArray
     cast: Cast
     placed: Mapping[str, Any]
 
@@ -143,6 +146,7 @@ def suggest_tour(
     camera, no floor, or no scene, and if it is a room in another unit than metres.
     """
     mitsuba()
+    from rsgen.render.land import coarser, inhabited
     from rsgen.render.mesh_files.mesh_file import AS_IT_IS, MeshOptions
     from rsgen.render.rays import cast_rays
     from rsgen.render.scene import load_scene
@@ -151,7 +155,9 @@ def suggest_tour(
     if placed and file.suffix.lower() == ".xml":
         raise UserError(f"--{next(iter(placed))}: is for mesh files: a Mitsuba scene says that itself")
     loaded = load_scene(file, options=MeshOptions(scale, up))
-    scene = _Scene(file, scene_triangles(loaded), partial(cast_rays, loaded), placed)
+    triangles = scene_triangles(loaded)
+    fineness = 1.0 / coarser(triangles, inhabited([shape for shape in loaded.shapes() if shape.is_mesh()]))
+    scene = _Scene(file, triangles, fineness, partial(cast_rays, loaded), placed)
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", file.stem) if name is None else name
     aim = _room(scene, wish.clearance_m) or _thing(scene)
     if (farthest := float(np.abs(scene.triangles).max())) > _FARTHEST_M:
@@ -253,7 +259,8 @@ def _sections(scene: _Scene, like: Config | None) -> dict[str, Any]:
     """What a config says beside its motion and scene: coarser light in a large one, and the cameras of another."""
     given = {} if like is None else like.model_dump(mode="json", include=set(_CAMERAS), exclude_unset=True)
     corners = scene.triangles
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    area = float((areas * scene.fineness**2).sum())
     if area > _LARGE_M2:
         given["light"] = {"texel_m": math.ceil(200.0 * math.sqrt(area / _TEXELS)) / 200.0}
     return given

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from rsgen.array_types import Float32Array, IntArray
 from rsgen.device.arrays import aligned, vectors
 from rsgen.errors import UserError
+from rsgen.render.land import coarser, inhabited
 from rsgen.render.scene import mesh_arrays
 
 REACH_LEVELS = 31  # how far a sample counts towards a neighbour: level / 30 of the way
@@ -54,7 +55,7 @@ def registry_id(shape: Any) -> int:
 
 
 def make_lattice(scene: Any, spacing: float) -> Lattice:
-    """Lattice over all meshes of `scene` with about `spacing` metres between samples.
+    """Lattice over all meshes of `scene` with about `spacing` metres between samples, more on land that is far.
 
     Raises UserError, before it takes the memory, if baking so many samples would need more than 4 GB.
     """
@@ -62,12 +63,13 @@ def make_lattice(scene: Any, spacing: float) -> Lattice:
     ids = [registry_id(shape) for shape in shapes]
     shape_first = np.full(max(ids) + 1, -1, np.int32)
     sides, apexes, faces_before = [], [], 0
+    box = inhabited(shapes)
     for shape, number in zip(shapes, ids, strict=True):
         vertices, faces = mesh_arrays(shape)
         corners = vertices[faces].astype(np.float64)
         # edge k is opposite corner k
         edges = np.linalg.norm(np.roll(corners, -1, axis=1) - np.roll(corners, -2, axis=1), axis=-1)
-        sides.append(np.stack([edges.max(axis=1), edges.min(axis=1)], axis=1))
+        sides.append(np.stack([edges.max(axis=1), edges.min(axis=1)], axis=1) / coarser(corners, box)[:, None])
         apexes.append(np.argmin(edges, axis=1))
         shape_first[number] = faces_before
         faces_before += len(faces)

@@ -29,6 +29,7 @@ from rsgen.files import encode_png
 from rsgen.inputs import check_input
 from rsgen.render.board import Board, drawing
 from rsgen.render.board import surface as board_surface
+from rsgen.render.land import split_land
 from rsgen.render.mended import mend_meshes
 from rsgen.render.mesh_files.mesh_file import AS_IT_IS, MeshOptions, hash_into, mesh_scene
 from rsgen.render.ply import joined_triangles, ply_bytes
@@ -67,7 +68,7 @@ def load_scene(path: Path, board: Board | None = None, options: MeshOptions = AS
             raise UserError(f"scene {path}: {_first_line(error)}") from None
     if not any(shape.is_mesh() for shape in scene.shapes()):
         raise UserError(f"scene {path}: has no surfaces to render: add a shape")
-    return mend_meshes(mi, scene, path)
+    return split_land(mi, mend_meshes(mi, scene, path))
 
 
 def ensure_built(path: Path) -> None:

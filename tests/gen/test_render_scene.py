@@ -341,7 +341,7 @@ def test_light_that_would_not_fit_is_refused_before_memory_is_taken(tmp_path: Pa
     scene = load_scene(write_scene(tmp_path, '<shape type="rectangle"/>'))
     size = '<transform name="to_world"><scale value="300"/></transform>'
     large = load_scene(write_scene(tmp_path, *(f'<shape type="cube">{size}</shape>' for _ in range(2))))
-    make_lattice(scene, 1e-3)
+    make_lattice(scene, 1.2e-3)
     tracemalloc.start()
     with pytest.raises(UserError, match=r"light.texel_m 0.015 needs .* GB.*set it to (\S+) or more") as caught:
         make_lattice(large, 0.015)
