@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from rendering import mi
-from test_render_scene import EVEN_POSE, MIRRORED, hits, rays_at, write_scene
+from scene_files import EVEN_POSE, MIRRORED, hits, rays_at, write_scene
 
 from rsgen.render.scene import load_scene, mesh_arrays, surface
 

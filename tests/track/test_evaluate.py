@@ -1,4 +1,4 @@
-"""Metrics against evo, closed forms and plain loops; run folders and foreign files, good and bad."""
+"""Drift, ATE and errors by line against evo, closed forms and plain loops, and what `rstrack evaluate` says of them."""
 
 from __future__ import annotations
 
@@ -11,61 +11,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 import synthetic
+from estimates import FRAMES, SPLINE, moved, noisy, one_line, rows_of, spline_estimate, truth, walk
 from evo.core import metrics as evo_metrics
 from evo.core.trajectory import PoseTrajectory3D
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import minimize
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from rsgen.errors import UserError
 from rsgen.geometry import se3, so3
-from rsgen.geometry.camera import Camera
-from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.trajectory import Trajectory
-from rstrack.data.estimate import Estimate, read_estimate, write_estimate
-from rstrack.metrics.association import Truth, align, compare
+from rstrack.data.estimate import Estimate, write_estimate
+from rstrack.metrics.association import compare
 from rstrack.metrics.evaluate import Metrics, compared, evaluate, pairs_one_second_apart
 from rstrack.metrics.run_evaluate import run_evaluate
-
-CAMERA = Camera(16, 12, 12.0, 12.0, 7.5, 5.5)
-SHUTTER = Shutter(0.028, 0.004)
-SPLINE = synthetic.make_spline()  # [-0.2, 1.3] s
-FRAMES = np.arange(39) / 30.0
-
-
-def walk(seed: int, n: int, step: float = 0.03) -> np.ndarray:
-    """Random poses (n, 4, 4), neighbours about `step` metres and radians apart."""
-    rng = np.random.default_rng(seed)
-    T = [se3.exp(rng.normal(size=6))]
-    for xi in step * rng.normal(size=(n - 1, 6)):
-        T.append(T[-1] @ se3.exp(xi))
-    return se3.orthonormalise(np.stack(T))
-
-
-def noisy(T: np.ndarray, seed: int, sigma: float = 0.01) -> np.ndarray:
-    xi = sigma * np.random.default_rng(seed).normal(size=(len(T), 6))
-    return se3.orthonormalise(T @ se3.exp(xi))
-
-
-def truth(motion: Spline | Trajectory, stamps: np.ndarray = FRAMES, interpolate: bool = False) -> Truth:
-    return Truth(motion, stamps, CAMERA, SHUTTER, interpolate)
-
-
-def moved(spline: Spline, T: np.ndarray) -> Spline:
-    return Spline(se3.orthonormalise(T @ spline.control_points), spline.t0, spline.dt)
-
-
-def spline_estimate(spline: Spline, stamps: np.ndarray = FRAMES, **info: object) -> Estimate:
-    return Estimate(stamps, se3.orthonormalise(spline.pose(stamps)), spline, dict(info))
-
-
-def one_line(error: pytest.ExceptionInfo[UserError]) -> str:
-    text = str(error.value)
-    assert text and "\n" not in text
-    return text
-
 
 # --- against evo and closed forms ------------------------------------------------------------------------------------
 
@@ -93,19 +53,6 @@ def test_ate_and_drift_are_those_of_evo(seed: int, n: int) -> None:
     for name in ("rmse", "mean", "median", "std", "max"):
         expected = ape.get_statistic(evo_metrics.StatisticsType(name))
         assert getattr(ours, f"ate_{name}_m") == pytest.approx(expected, abs=1e-9)
-
-
-def test_alignment_is_the_best_that_an_optimiser_finds() -> None:
-    true, est = walk(3, 40), noisy(walk(3, 40), 4, 0.1)
-    T, is_determined = align(true, est)
-    assert is_determined
-
-    def cost(xi: np.ndarray) -> float:
-        return float(np.sum((se3.transform(se3.exp(xi) @ T, est[:, :3, 3]) - true[:, :3, 3]) ** 2))
-
-    found = minimize(cost, 0.05 * np.ones(6), method="BFGS", options={"gtol": 1e-12})
-    assert cost(np.zeros(6)) <= found.fun * (1 + 1e-12)
-    assert cost(np.zeros(6)) > 0.0
 
 
 def test_constant_drift_has_a_closed_form() -> None:
@@ -213,125 +160,6 @@ def test_shorter_than_a_second_has_no_drift_but_says_so() -> None:
     assert " - " in result.text() + " "
 
 
-# --- association -----------------------------------------------------------------------------------------------------
-
-
-def test_a_spline_is_taken_at_the_stamps_and_those_outside_are_counted() -> None:
-    stamps = np.arange(-0.1, 1.5, 0.0137)
-    inside = stamps <= SPLINE.t_end
-    poses = walk(2, len(stamps))
-    poses[inside] = SPLINE.pose(stamps[inside])
-    result = evaluate(truth(SPLINE), Estimate(stamps, se3.orthonormalise(poses)))
-    assert result.ate_max_m < 1e-12
-    assert (result.poses, result.poses_compared) == (len(stamps), int(inside.sum()))
-    assert any(f"{int((~inside).sum())} of {len(stamps)}" in note for note in result.notes)
-
-
-def test_a_stamp_rounded_out_of_the_spline_still_counts() -> None:
-    stamps = np.array([SPLINE.t_begin - 4e-10, 0.1, 0.2, 0.3, SPLINE.t_end + 4e-10])
-    estimate = Estimate(stamps, SPLINE.pose(np.clip(stamps, SPLINE.t_begin, SPLINE.t_end)))
-    assert len(compare(truth(SPLINE), estimate).index) == 5
-
-
-def test_poses_are_associated_within_20_ms_one_to_one() -> None:
-    true = Trajectory(np.arange(20) * 0.1, walk(1, 20))
-    stamps = np.array([0.0, 0.119, 0.221, 0.305, 0.306, 0.5])
-    found = compare(truth(true), Estimate(stamps, walk(5, 6)))
-    assert found.index.tolist() == [0, 1, 3, 5]
-    np.testing.assert_array_equal(found.T_world_true, true.T_world_cam[[0, 1, 3, 5]])
-
-
-def test_interpolated_truth_is_scipys_in_rotation_and_exact_on_a_screw() -> None:
-    twist = np.array([0.4, -0.2, 0.3, 0.5, 0.2, -0.9])
-    knots = np.arange(40) / 30.0
-    true = Trajectory(knots, se3.exp(knots[:, None] * twist))
-    stamps = np.linspace(0.0, knots[-1], 71)
-    est = Estimate(stamps, se3.exp(stamps[:, None] * twist))
-    found = compare(truth(true, interpolate=True), est)
-    assert len(found.index) == 71
-    np.testing.assert_allclose(found.T_world_true, est.T_world_depth, atol=1e-12)
-    slerp = Slerp(knots, Rotation.from_matrix(true.T_world_cam[:, :3, :3]))
-    np.testing.assert_allclose(found.T_world_true[:, :3, :3], slerp(stamps).as_matrix(), atol=1e-12)
-    assert evaluate(truth(true, interpolate=True), est).ate_max_m < 1e-12
-    assert evaluate(truth(true), est).ate_max_m > 1e-3
-
-
-def test_interpolated_rotations_are_scipys_slerp_between_any_poses() -> None:
-    knots = np.cumsum(np.random.default_rng(1).uniform(0.01, 0.035, 40))
-    true = Trajectory(knots, walk(12, 40, 0.5))
-    stamps = np.linspace(knots[0], knots[-1], 97)
-    found = compare(truth(true, interpolate=True), Estimate(stamps, walk(13, 97)))
-    assert len(found.index) == 97
-    slerp = Slerp(knots, Rotation.from_matrix(true.T_world_cam[:, :3, :3]))
-    np.testing.assert_allclose(found.T_world_true[:, :3, :3], slerp(stamps).as_matrix(), atol=1e-9)
-
-
-def test_interpolation_stays_out_of_gaps() -> None:
-    true = Trajectory(np.array([0.0, 0.03, 0.06, 1.0, 1.03]), walk(1, 5))
-    stamps = np.array([0.01, 0.04, 0.07, 0.5, 0.97, 0.99, 1.01, 1.04])
-    found = compare(truth(true, interpolate=True), Estimate(stamps, walk(2, 8)))
-    assert found.index.tolist() == [0, 1, 2, 5, 6]
-
-
-@pytest.mark.parametrize("motion", [SPLINE, Trajectory(np.arange(20) * 0.1, walk(1, 20))], ids=["spline", "poses"])
-def test_too_few_common_stamps_is_one_line(motion: Spline | Trajectory) -> None:
-    stamps = np.array([0.1, 0.2, 50.0, 51.0])
-    with pytest.raises(UserError) as error:
-        evaluate(truth(motion), Estimate(stamps, walk(3, 4)))
-    assert "2 of 4 poses" in one_line(error)
-
-
-def test_frames_that_were_tracked_are_counted() -> None:
-    kept = np.r_[0:10, 15:30]
-    result = evaluate(truth(SPLINE), Estimate(FRAMES[kept], noisy(SPLINE.pose(FRAMES[kept]), 1)))
-    assert (result.frames, result.frames_tracked) == (39, 25)
-    assert result.coverage == pytest.approx(25 / 39)
-
-
-# --- degenerate positions --------------------------------------------------------------------------------------------
-
-
-def test_a_still_camera_is_aligned_by_its_orientations() -> None:
-    true = walk(4, 50)
-    true[:, :3, 3] = [1.0, 2.0, 3.0]
-    world = se3.exp(np.array([3.0, -1.0, 2.0, 0.9, -1.3, 0.4]))
-    result = compare(truth(Trajectory(FRAMES, true[:39])), Estimate(FRAMES, se3.orthonormalise(world @ true[:39])))
-    assert not result.is_determined
-    assert result.position_errors_m.max() < 1e-12 and result.rotation_errors_deg.max() < 1e-6
-
-
-@pytest.mark.parametrize("axis", [[1.0, 0.0, 0.0], [0.3, -0.5, 0.81]])
-def test_the_spin_about_a_straight_path_is_that_of_the_orientations(axis: list[float]) -> None:
-    true = walk(6, 39)
-    true[:, :3, 3] = np.linspace(0, 1, 39)[:, None] ** 2 * np.array(axis)
-    world = se3.exp(np.array([3.0, -1.0, 2.0, 0.9, -1.3, 0.4]))
-    est = se3.orthonormalise(world @ true)
-    result = compare(truth(Trajectory(FRAMES, true)), Estimate(FRAMES, est))
-    assert not result.is_determined
-    assert result.position_errors_m.max() < 1e-12 and result.rotation_errors_deg.max() < 1e-6
-
-    # With noisy orientations: no other spin brings them closer.
-    est = noisy(true, 7, 0.2)
-    est[:, :3, 3] = true[:, :3, 3]
-    T, _ = align(true, est)
-    spins = so3.exp(np.linspace(-0.5, 0.5, 1001)[:, None] * np.array(axis) / np.linalg.norm(axis))
-    fits = np.einsum("sij,njk,nik->s", spins @ T[:3, :3], est[:, :3, :3], true[:, :3, :3])
-    assert int(np.argmax(fits)) == 500
-    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
-
-
-def test_a_nearly_flat_path_is_not_mirrored() -> None:
-    # The little depth it has is inverted: a reflection would fit exactly, a rotation has to leave it.
-    true = walk(3, 39)
-    true[:, 2, 3] *= 0.01
-    est = true.copy()
-    est[:, 2, 3] *= -1.0
-    T, is_determined = align(true, est)
-    assert is_determined and np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
-    assert np.linalg.norm(so3.log(T[:3, :3])) < 0.1
-
-
 # --- errors by line --------------------------------------------------------------------------------------------------
 
 
@@ -384,117 +212,6 @@ def test_without_a_spline_there_are_no_errors_by_line() -> None:
     assert result.row_rmse_m is None and result.rows == 0
     poses = Trajectory(FRAMES, SPLINE.pose(FRAMES))
     assert evaluate(truth(poses), spline_estimate(SPLINE)).row_rot_rmse_deg is None
-
-
-# --- files -----------------------------------------------------------------------------------------------------------
-
-
-def test_a_run_folder_comes_back_as_it_was(tmp_path: Path) -> None:
-    stamps = 1_305_031_102.175304 + np.arange(40) / 30.0
-    T = walk(11, 40)
-    spline = Spline(SPLINE.control_points, stamps[0] - 0.1, 0.05)
-    info = {"method": "rs_pg", "sigma": np.float64(np.nan), "frames": [{"stamp": stamps[0], "keyframe": np.True_}]}
-    write_estimate(tmp_path / "run", stamps, T, spline, info)
-    back = read_estimate(tmp_path / "run")
-    np.testing.assert_allclose(back.stamps, stamps, atol=1e-9, rtol=0)
-    np.testing.assert_allclose(back.T_world_depth[:, :3, 3], T[:, :3, 3], atol=1e-9)
-    np.testing.assert_allclose(back.T_world_depth[:, :3, :3], T[:, :3, :3], atol=1e-11)
-    assert back.spline is not None
-    np.testing.assert_array_equal(back.spline.control_points, spline.control_points)
-    assert (back.spline.t0, back.spline.dt) == (spline.t0, spline.dt)
-    assert back.info == {"method": "rs_pg", "sigma": None, "frames": [{"stamp": stamps[0], "keyframe": True}]}
-    assert sorted(path.name for path in (tmp_path / "run").iterdir()) == ["run.json", "spline.npz", "trajectory.txt"]
-
-
-def test_a_run_without_spline_leaves_none_of_the_run_before(tmp_path: Path) -> None:
-    write_estimate(tmp_path, FRAMES, walk(1, 39), SPLINE, {"a": 1})
-    write_estimate(tmp_path, FRAMES[:9], walk(2, 9), None, {})
-    back = read_estimate(tmp_path)
-    assert back.spline is None and back.info == {} and len(back.stamps) == 9
-
-
-def test_a_foreign_tum_file_with_a_gap_is_read(tmp_path: Path) -> None:
-    file = tmp_path / "other.txt"
-    file.write_text("# x\n" + "".join(f"{t} {t},2,3 0 0 0.6 0.8\n" for t in (0.0, 0.1, 0.2, 9.0, 9.1)))
-    estimate = read_estimate(file)
-    assert estimate.stamps.tolist() == [0.0, 0.1, 0.2, 9.0, 9.1] and estimate.spline is None
-    np.testing.assert_allclose(estimate.T_world_depth[3, :3, 3], [9.0, 2.0, 3.0])
-    np.testing.assert_allclose(estimate.T_world_depth[0, :2, 0], [0.28, 0.96])
-
-
-def rows_of(stamps: list[float]) -> str:
-    return "".join(f"{t} 0 0 0 0 0 0 1\n" for t in stamps)
-
-
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        (rows_of([0.3, 0.2, 0.1, 0.0]), "other.txt:2: goes back"),
-        (rows_of([0.0, 0.2, 0.1, 0.3]), "other.txt:3: goes back"),
-        (rows_of([0.0, 0.1, 0.1, 0.3]), "other.txt:3: repeats"),
-        (rows_of([0.0, 0.1]), "needs at least 4"),
-        (rows_of([0.0, 0.1, 0.2]) + "0.3 nan 0 0 0 0 0 1\n", "other.txt:4: has a NaN"),
-        (rows_of([0.0, 0.1, 0.2]) + "0.3 1 0 0\n", "other.txt:4: 4 columns"),
-        (rows_of([0.0, 0.1, 0.2]) + "0.3 1 0 0 0 0 0 0\n", "other.txt:4: has a zero quaternion"),
-        ("", "holds no poses"),
-        ("stamp x y\n", "holds 1 poses"),
-    ],
-)
-def test_a_bad_tum_file_is_one_line(tmp_path: Path, text: str, says: str) -> None:
-    (tmp_path / "other.txt").write_text(text)
-    with pytest.raises(UserError) as error:
-        read_estimate(tmp_path / "other.txt")
-    assert says in one_line(error)
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "says"),
-    [
-        ("run.json", "{", "run.json: is not valid JSON"),
-        ("run.json", "[1]", "run.json: expected a JSON object"),
-        ("run.json", '{"spline_valid": [1, 2, 3]}', "spline_valid"),
-        ("run.json", '{"spline_valid": [[2, 1]]}', "spline_valid"),
-        ("run.json", '{"spline_valid": "all"}', "spline_valid"),
-        ("spline.npz", "no zip", "spline.npz: not a readable spline"),
-        ("trajectory.txt", None, "has no trajectory.txt"),
-    ],
-)
-def test_a_bad_run_folder_is_one_line(tmp_path: Path, name: str, text: str | None, says: str) -> None:
-    write_estimate(tmp_path, FRAMES, walk(1, 39), SPLINE, {})
-    (tmp_path / name).unlink()
-    if text is not None:
-        (tmp_path / name).write_text(text)
-    with pytest.raises(UserError) as error:
-        read_estimate(tmp_path)
-    assert says in one_line(error)
-
-
-def test_what_is_not_there_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(UserError) as error:
-        read_estimate(tmp_path / "nowhere")
-    assert "cannot read" in one_line(error)
-    (tmp_path / "file").write_text("x")
-    with pytest.raises(UserError) as error:
-        write_estimate(tmp_path / "file" / "run", FRAMES, walk(1, 39), None, {})
-    one_line(error)
-
-
-@pytest.mark.parametrize(
-    ("stamps", "poses", "says"),
-    [
-        (FRAMES[::-1], walk(1, 39), "pose 1 is stamped"),
-        (np.r_[FRAMES[:5], FRAMES[4:38]], walk(1, 39), "pose 5 is stamped"),
-        (np.r_[FRAMES[:-1], np.nan], walk(1, 39), "pose 38 has a NaN"),
-        (FRAMES, np.where(np.arange(39)[:, None, None] == 7, np.inf, walk(1, 39)), "pose 7 has a NaN"),
-        (FRAMES, 1.1 * walk(1, 39), "pose 0 is not a rigid"),
-        (FRAMES, walk(1, 38), "give (n,) stamps"),
-        (FRAMES, walk(1, 39)[:, :3], "give (n,) stamps"),
-    ],
-)
-def test_bad_arrays_are_one_line(stamps: np.ndarray, poses: np.ndarray, says: str) -> None:
-    with pytest.raises(UserError) as error:
-        Estimate(stamps, poses)
-    assert says in one_line(error)
 
 
 # --- whole commands --------------------------------------------------------------------------------------------------

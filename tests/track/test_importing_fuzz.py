@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import recordings
+from import_command import fake_lzfse
 from recordings import Talker
-from test_importing import fake_lzfse
 
 import rstrack.importing.bags.bounds
 from rsgen.errors import UserError

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import shutil
-import signal
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -15,32 +12,22 @@ import cv2
 import numpy as np
 import pytest
 import synthetic
+from rstrack_command import FRAMES, make_seq, read_info, refused, run
 
-import rsgen.console.progress
 import rstrack.alignment.normal_equations
 from rstrack.bench.speed import Stopwatch
 from rstrack.cli.main import main
 from rstrack.data.estimate import read_estimate
-from rstrack.data.rig import Frame
 from rstrack.options import METHODS, Options
-from rstrack.tracking.frame_report import FrameReport
-from rstrack.tracking.spline_tracker import Tracker
 
 COMMANDS = ("track", "evaluate", "plot", "info", "bench-speed")
-FRAMES = 14
-SPEED = 0.3  # of `synthetic`: 0.27 m/s and 0.3 rad/s
 
 
 @pytest.fixture(scope="module")
 def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a sequence seq/ and the default method's run of it, run/."""
     folder = tmp_path_factory.mktemp("rstrack")
-    writer = synthetic.open_writer(
-        folder / "seq", synthetic.make_config(160, 120), FRAMES, synthetic.make_spline(SPEED)
-    )
-    synthetic.write_frames(writer)
-    synthetic.write_scene(folder / "seq")
-    writer.finish()
+    make_seq(folder / "seq")
     assert main(["track", str(folder / "seq"), "--out", str(folder / "run"), "--quiet"]) == 0
     return folder
 
@@ -51,29 +38,6 @@ def place(original: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     shutil.copytree(original, tmp_path / "w")
     monkeypatch.chdir(tmp_path / "w")
     return tmp_path / "w"
-
-
-def run(capfd: pytest.CaptureFixture[str], words: str) -> tuple[int, str, str]:
-    capfd.readouterr()
-    status = main(words.split())
-    out, error = capfd.readouterr()
-    assert "Traceback" not in error
-    return status, out, error
-
-
-def refused(capfd: pytest.CaptureFixture[str], words: str, *parts: str) -> str:
-    """Run a command line that has to fail: status 2, nothing on stdout, one line that names the culprit."""
-    status, out, error = run(capfd, words)
-    assert status == 2 and out == ""
-    assert error.startswith("rstrack: ") and error.count("\n") == 1, error
-    for part in parts:
-        assert part in error, error
-    return error
-
-
-def read_info(folder: str) -> dict[str, Any]:
-    info: dict[str, Any] = json.loads(Path(folder, "run.json").read_text())
-    return info
 
 
 def without_times(folder: str) -> list[Any]:
@@ -255,68 +219,7 @@ def test_info_says_what_would_be_tracked(place: Path, capfd: pytest.CaptureFixtu
     assert f"{distance:.1f} mm" in out
 
 
-# --- what sequences may lack -----------------------------------------------------------------------------------------
-
-
-def test_a_tum_folder_without_truth_is_tracked_but_not_evaluated(
-    place: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    for name in ("sequence.yaml", "spline.npz", "groundtruth.txt"):
-        Path("seq", name).unlink()
-    refused(capfd, "track seq --out r", "seq", "camera")
-    camera = "{width: 160, height: 120, intrinsics: [120.0, 120.0, 79.5, 59.5], readout_s: 0.028}"
-    T = synthetic.T_COLOR_DEPTH.tolist()
-    Path("c.yaml").write_text(f"color: {camera}\ndepth: {camera}\nT_color_depth: {T}\n")
-    assert "truth    none" in run(capfd, "info seq --camera c.yaml")[1]
-    status, out, error = run(capfd, "track seq --camera c.yaml --out r --frames 0:8")
-    assert status == 0 and "ATE" not in out + error and read_info("r")["metrics"] is None
-    refused(capfd, "evaluate seq r --camera c.yaml", "ground truth")
-    assert run(capfd, "plot seq r --camera c.yaml --out p.png")[0] == 0
-
-
-def test_one_frame_is_a_run_that_cannot_be_evaluated(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    status, out, _ = run(capfd, "track seq --out r --frames 3 --quiet")
-    assert status == 0 and "1 frame" in out and "ATE" not in out
-    assert len(Path("r/trajectory.txt").read_text().splitlines()) == 3
-    refused(capfd, "evaluate seq r", "trajectory.txt", "1 poses")
-
-
-def test_depth_without_a_measurement_is_no_crash(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    for path in Path("seq/depth").iterdir():
-        cv2.imwrite(str(path), np.zeros((120, 160), np.uint16))
-    status, out, _ = run(capfd, "track seq --out r --method rs-g --quiet")
-    assert status == 1 and "rs-g on synthetic" in out and Path("r/run.json").exists()
-
-
-def test_damaged_images_are_left_out_counted_and_named(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    os.truncate("seq/depth/000007.png", 100)
-    os.truncate("seq/rgb/000009.png", 100)
-    status, out, error = run(capfd, "track seq --out r --method gs-pg --quiet")
-    assert status == 1 and error == "" and "13 of 14 frames" in out and "none lost" in out
-    assert "left out: 2 images that cannot be read, first seq/depth/000007.png: is not a whole PNG" in out
-    info = read_info("r")
-    assert info["end"] == "done" and info["lost"] == 0
-    assert [(left["frame"], left["error"].split(":")[0]) for left in info["unreadable"]] == [
-        (7, "seq/depth/000007.png"), (9, "seq/rgb/000009.png"),
-    ]  # fmt: skip
-    kept = [k / 30 for k in range(FRAMES) if k != 7]
-    np.testing.assert_allclose(read_estimate(Path("r")).stamps, kept, atol=1e-6)
-    assert [frame["stamp"] for frame in info["frames"]] == pytest.approx(kept)
-    assert info["frames"][8]["pixels_color"] == 0 < info["frames"][9]["pixels_color"]
-    assert info["metrics"]["frames_tracked"] == 13 and info["metrics"]["ate_rmse_m"] < 0.02
-
-
-def test_a_first_image_that_is_damaged_costs_one_frame_only(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    os.truncate("seq/depth/000000.png", 100)
-    assert run(capfd, "track seq --out r --method gs-g --quiet")[0] == 1
-    assert read_info("r")["timings"]["frame_ms"][13:] == [] and len(read_info("r")["frames"]) == 13
-
-
-def test_nothing_but_damaged_images_is_no_run(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    for path in Path("seq/depth").iterdir():
-        os.truncate(path, 100)
-    refused(capfd, "track seq --out r --quiet", "depth/000000.png", "no other frame of the 14")
-    assert not Path("r/run.json").exists()
+# --- folders that hold no run ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("content", ["", "garbage\n", "0 1 2\n" * 5, "\x00\xff" * 50, "nan 0 0 0 0 0 0 1\n" * 5])
@@ -330,98 +233,6 @@ def test_garbage_is_no_run(content: str, place: Path, capfd: pytest.CaptureFixtu
 def test_a_broken_run_json_is_named(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
     Path("run/run.json").write_text("{")
     refused(capfd, "evaluate seq run", "run.json", "JSON")
-
-
-def test_a_dataset_is_never_overwritten_by_a_run(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    before = Path("seq/spline.npz").read_bytes()
-    refused(capfd, "track seq --out seq", "seq", "sequence.yaml", "choose another --out")
-    assert Path("seq/spline.npz").read_bytes() == before
-
-
-# --- runs that end early or go wrong ---------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def interruptible() -> Iterator[None]:
-    """Ctrl-C as in a terminal: a shell starts its background jobs with SIGINT ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-@pytest.mark.usefixtures("interruptible")
-def test_ctrl_c_writes_what_there_is(
-    place: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    show = rsgen.console.progress.ProgressDisplay.__call__
-
-    def press(self: rsgen.console.progress.ProgressDisplay, stage: str, fraction: float, note: str) -> None:
-        show(self, stage, fraction, note)
-        if fraction == 8 / FRAMES:
-            signal.raise_signal(signal.SIGINT)
-
-    monkeypatch.setattr(rsgen.console.progress.ProgressDisplay, "__call__", press)
-    before = signal.getsignal(signal.SIGINT)
-    status, out, error = run(capfd, "track seq --out r --method gs-g --quiet")
-    assert status == 130 and "8 of 14 frames" in out and "interrupted" in error
-    assert read_info("r")["end"] == "interrupted" and len(read_estimate(Path("r")).stamps) == 8
-    assert signal.getsignal(signal.SIGINT) is before
-
-
-@pytest.mark.usefixtures("interruptible")
-def test_a_second_ctrl_c_breaks_off(
-    place: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    def press_twice(*_: object) -> None:
-        signal.raise_signal(signal.SIGINT)
-        signal.raise_signal(signal.SIGINT)
-
-    monkeypatch.setattr(rsgen.console.progress.ProgressDisplay, "__call__", press_twice)
-    status, out, error = run(capfd, "track seq --out r --method gs-g")
-    assert (status, out, error) == (130, "", "rstrack: interrupted; nothing was written\n")
-    assert not Path("r/run.json").exists()
-
-
-@pytest.mark.usefixtures("interruptible")
-def test_a_background_job_leaves_ctrl_c_to_others(
-    place: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    monkeypatch.setattr(
-        rsgen.console.progress.ProgressDisplay, "__call__", lambda *_: signal.raise_signal(signal.SIGINT)
-    )
-    status, out, _ = run(capfd, "track seq --out r --method gs-g")
-    assert status == 0 and "14 frames" in out and read_info("r")["end"] == "done"
-
-
-def test_lost_frames_are_left_out_and_reported(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    for k in (0, 1):
-        cv2.imwrite(f"seq/depth/{k:06d}.png", np.zeros((120, 160), np.uint16))
-    status, out, _ = run(capfd, "track seq --out r --method rs-g --quiet")
-    info, estimate = read_info("r"), read_estimate(Path("r"))
-    assert status == 1 and "2 lost" in out and "12 of 14" in out
-    assert "lost because: hardly any depth to begin with (2)" in out
-    assert [k for k, frame in enumerate(info["frames"]) if frame["lost"]] == [0, 1]
-    assert [frame["fault"] for frame in info["frames"]] == ["hardly any depth to begin with"] * 2 + [""] * 12
-    assert info["lost"] == 2 and info["end"] == "done" and info["metrics"]["frames_tracked"] == 12
-    np.testing.assert_allclose(estimate.stamps, np.arange(2, FRAMES) / 30, atol=1e-6)
-    assert not estimate.spline_covers(1.0 / 30) and estimate.spline_covers(5.0 / 30)
-
-
-def test_a_tracker_that_breaks_down_keeps_what_it_had(
-    place: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    feed = Tracker.feed
-
-    def fail(self: Tracker, frame: Frame) -> FrameReport:
-        if len(self.reports) == 8:
-            raise np.linalg.LinAlgError("33th leading minor not positive definite")
-        return feed(self, frame)
-
-    monkeypatch.setattr(Tracker, "feed", fail)
-    status, _, error = run(capfd, "track seq --out r --method gs-g --quiet")
-    assert status == 1 and error.count("\n") == 1 and "frame 8" in error
-    assert len(read_info("r")["timings"]["frame_ms"]) == 8 and read_info("r")["end"] == "broke down"
 
 
 # --- speed -----------------------------------------------------------------------------------------------------------

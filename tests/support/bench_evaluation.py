@@ -1,0 +1,68 @@
+"""A small evaluation of methods: two synthetic sequences, its config, its plan and `rstrack bench`."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import synthetic
+import yaml
+
+from rsgen.console.command_line import Commands, Parser, run_program
+from rsgen.geometry import se3
+from rsgen.sequence.format import pose_rows
+from rstrack.bench.methods.config import choose, load_bench_config
+from rstrack.bench.methods.plan import Plan, make_plan
+from rstrack.cli.bench_methods import bench
+
+FRAMES = 31
+NAMES = ("robot_t1", "lr_kt2")
+SPEEDS = (0.3, 0.25)
+VARIANTS = ("gs-g", "gs-g --fuse", "rs-g", "rs-g --no-fuse")
+
+
+def parser() -> Parser:
+    commands = Commands("rstrack", "test")
+    commands.add(bench, "")
+    return commands.parser
+
+
+def main(words: str) -> int:
+    return run_program("rstrack", parser, shlex.split(words), "nothing was written")
+
+
+def make_data(folder: Path) -> None:
+    """data/ with two sequences, and bench.yaml."""
+    config = synthetic.make_config(112, 84)
+    for name, speed in zip(NAMES, SPEEDS, strict=True):
+        writer = synthetic.open_writer(folder / "data" / name, config, FRAMES, synthetic.make_spline(speed))
+        synthetic.write_frames(writer)
+        synthetic.write_scene(folder / "data" / name)
+        writer.finish()
+    sequences = [
+        {"name": name, "group": group, "config": f"{name}.yaml"}
+        for name, group in zip(NAMES, ("hand-held", "living room"), strict=True)
+    ]
+    quick = {"sequences": ["lr_kt2"], "methods": ["rs-g"], "frames": 12}
+    text = yaml.safe_dump({"sequences": sequences, "methods": ["gs-g", "rs-g"], "quick": quick})
+    (folder / "bench.yaml").write_text(text)
+
+
+def plan(**how: Any) -> Plan:
+    """Of the working directory."""
+    narrow = {key: how.pop(key) for key in ("quick", "frames", "sequences", "methods", "peers") if key in how}
+    return make_plan(choose(load_bench_config(Path("bench.yaml")), **narrow), Path("data"), Path("bench"), **how)
+
+
+def write_tum(path: Path, sequence: str, kept: Sequence[int] | range = range(FRAMES), error_m: float = 0.001) -> None:
+    """A tracker's TUM file: the truth in another world with noise, of some frames."""
+    path.parent.mkdir(exist_ok=True)
+    stamps = np.asarray(list(kept)) / synthetic.RATE_HZ
+    spline = synthetic.make_spline(SPEEDS[NAMES.index(sequence)])
+    xi = error_m * np.random.default_rng(5).normal(size=(len(stamps), 6))
+    T = se3.orthonormalise(se3.exp(np.array([1.0, 2, 3, 0.3, 0.2, 0.1])) @ spline.pose(stamps) @ se3.exp(xi))
+    rows = np.column_stack([stamps, pose_rows(T)])
+    path.write_text("".join(" ".join(f"{value:.9f}" for value in row) + "\n" for row in rows))
