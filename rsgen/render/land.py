@@ -27,10 +27,9 @@ _SPLIT = ("vertex_positions", "vertex_normals", "vertex_texcoords", "faces")
 
 def inhabited(shapes: Sequence[Any]) -> FloatArray:
     """Least and largest corner (2, 3), world, m, of all meshes that are no land; of all if there is nothing else."""
-    boxes = np.array([[v.min(axis=0), v.max(axis=0)] for v in map(_vertices, shapes)])
-    size = np.linalg.norm(boxes[:, 1] - boxes[:, 0], axis=1)
-    if (size <= _BUILDING_M).any():
-        boxes = boxes[size <= _BUILDING_M]
+    all_of_it = [_vertices(shape) for shape in shapes]
+    things = [v for v in all_of_it if _across(v) <= _BUILDING_M]
+    boxes = np.array([[v.min(axis=0), v.max(axis=0)] for v in things or all_of_it])
     return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
 
 
@@ -42,11 +41,14 @@ def coarser(corners: FloatArray, box: FloatArray) -> FloatArray:
 def split_land(mi: Any, scene: Any) -> Any:
     """The scene with the triangles of its land in pieces, if it has any; meshes are changed in place."""
     shapes = [shape for shape in scene.shapes() if shape.is_mesh()]
+    land = [_across(_vertices(shape)) > _BUILDING_M for shape in shapes]
+    if all(land):
+        return scene  # and nothing that it is about
     box, changed = inhabited(shapes), False
-    for shape in shapes:
-        vertices = _vertices(shape)
-        if np.linalg.norm(np.ptp(vertices, axis=0)) <= _BUILDING_M or shape.is_emitter():
+    for shape, is_land in zip(shapes, land, strict=True):
+        if not is_land or shape.is_emitter():
             continue
+        vertices = _vertices(shape)
         parameters = mi.traverse(shape)
         if any(key.startswith(("vertex_", "face_")) and key not in _SPLIT for key in parameters.keys()):  # noqa: SIM118
             continue  # colours of its own
@@ -96,6 +98,10 @@ def _distance(corners: FloatArray, box: FloatArray) -> FloatArray:
     """Of the boxes about triangles (n, 3, 3) from `box`, m (n,)."""
     away = np.maximum(np.maximum(box[0] - corners.max(axis=1), corners.min(axis=1) - box[1]), 0.0)
     return np.asarray(np.linalg.norm(away, axis=1))
+
+
+def _across(vertices: FloatArray) -> float:
+    return float(np.linalg.norm(np.ptp(vertices, axis=0)))
 
 
 def _vertices(shape: Any) -> FloatArray:
