@@ -23,6 +23,7 @@ _STEP_M = 0.05
 _WAYPOINT_M = 0.6
 _LEAST_M2 = 0.25  # a camera cannot be carried about in less
 _LEAST_LOOP_M = 1.0
+_SHORTEST_M = 3.0  # to walk round: a shorter outline has too few cells to be smoothed
 _BISECTIONS = 12
 
 _FILLING = 1.9  # radii of a thing's sphere from its middle: it takes 60 degrees, and what matters of it less
@@ -40,7 +41,9 @@ def free_region(plan: FloorPlan, clearance_m: float) -> BoolArray | None:
 
 
 def walk_inside(plan: FloorPlan, length_m: float, clearance_m: float, rng: np.random.Generator) -> FloatArray | None:
-    """Camera centres (n, 3), world, m, of a closed walk of length_m at most; None where there is no room for one.
+    """Camera centres (n, 3), world, m, of a closed walk of length_m, or 3 m, at most; None if there is no room.
+
+    A motion that is shorter than its waypoints takes a likeness of them.
 
     The walk is the outline of the free region within reach of a place that rng draws. It stays as far from the walls,
     up to 1.2 m, as leaves it long enough: surfaces are then at the distances that depth cameras like.
@@ -58,7 +61,8 @@ def walk_inside(plan: FloorPlan, length_m: float, clearance_m: float, rng: np.ra
             fitting.append(cells)
     # The two that keep the farthest from the walls; by chance one of them, so that seeds differ.
     cells = [*fitting, widest, widest][int(rng.integers(2))]
-    loop = _smooth(_outline(_within(cells, plan, _SHRINKING * length_m, rng), plan), plan, need)
+    within = _within(cells, plan, _SHRINKING * max(length_m, _SHORTEST_M), rng)
+    loop = _smooth(_outline(within, plan), plan, need)
     if loop is None:
         return None
     loop = np.roll(loop, int(rng.integers(len(loop))), axis=0)[:: 1 if rng.random() < 0.5 else -1]

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from rsgen.array_types import Float32Array, FloatArray
+from rsgen.device.pose_table import PoseFunction
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.geometry.spline import Spline
 
 _VIEWS, _WIDTH, _SPP, _DEPTH = 6, 48, 32, 16
 _BLOCK = 12  # pixels: noise of so few samples is averaged over blocks
@@ -18,11 +18,10 @@ _GREY = 0.18  # what half of the blocks are to be brighter than
 _ENOUGH = 2.0  # a factor that is not worth the while
 
 
-def suggested_gain(scene: Any, camera: Camera, spline: Spline, until_s: float, gain: float) -> float | None:
+def suggested_gain(scene: Any, camera: Camera, T_world_cam: PoseFunction, until_s: float, gain: float) -> float | None:
     """`color.exposure_gain` that makes the typical surface mid-grey; None if `gain` does so within a factor of 2.
 
-    Path traced at a few instants of the spline, 0 to `until_s`, which is the camera's pose T_world_cam(t). None too
-    where all is dark.
+    Path traced at a few instants from 0 to `until_s`. None too where all is dark.
     """
     import mitsuba as mi
 
@@ -36,7 +35,7 @@ def suggested_gain(scene: Any, camera: Camera, spline: Spline, until_s: float, g
     path = mi.load_dict({"type": "path", "max_depth": _DEPTH})
     renderer = ColorRenderer(scene, path, small, Shutter(), _SPP)
     stamps = until_s * (np.arange(_VIEWS) + 0.5) / _VIEWS
-    light = np.concatenate([_blocks(renderer.render(spline.pose, float(t), k)) for k, t in enumerate(stamps)])
+    light = np.concatenate([_blocks(renderer.render(T_world_cam, float(t), k)) for k, t in enumerate(stamps)])
     light = light[light > 0]
     if not len(light):
         return None

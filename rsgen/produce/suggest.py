@@ -288,7 +288,9 @@ def _config(scene: _Scene, tours: Sequence[tuple[Waypoint, ...]], name: str, wis
 def _exposed(loaded: Any, config: Config, spline: Spline) -> tuple[Config, tuple[str, ...]]:
     """The config with an exposure for the scene's light, where the one it has is far off, and what to say of it."""
     assert config.motion is not None
-    gain = suggested_gain(loaded, config.color.camera, spline, config.motion.duration_s, config.color.exposure_gain)
+    gain = suggested_gain(
+        loaded, config.color.camera, spline.pose, config.motion.duration_s, config.color.exposure_gain
+    )
     if gain is None:
         return config, ()
     color = config.color.model_copy(update={"exposure_gain": gain})

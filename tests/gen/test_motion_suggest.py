@@ -162,6 +162,15 @@ def test_a_thing_is_gone_round_and_looked_at(folder: Path, seed: int) -> None:
     assert "a thing of 1.00 x" in suggestion.found[0]
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_slow_camera_hardly_moves(folder: Path, seed: int) -> None:
+    """Regression: where the way was shorter than a few cells of the plan, no walk was found in any room."""
+    wish = Wish(4.0, speed_m_s=0.15, clearance_m=CLEARANCE_M, seed=seed)
+    spline = spline_of(suggest_tour(folder / "furnished.ply", None, wish))
+    assert motion_statistics(spline, 0.0, 4.0).length_m == pytest.approx(0.6, rel=0.02)
+    assert trimesh.proximity.closest_point_naive(furnished(), way(spline))[1].min() >= CLEARANCE_M
+
+
 def test_a_seed_decides_every_byte(folder: Path) -> None:
     first = suggested(folder, "furnished", 1).yaml(folder)
     again = suggest_tour(folder / "furnished.ply", None, Wish(12.0, clearance_m=CLEARANCE_M, seed=1)).yaml(folder)
