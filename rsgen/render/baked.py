@@ -133,15 +133,17 @@ def trace_baked(scene, field, sampler, ray, bounces, active):
             light += 1
 
         pane = active & ~waiting & ((flags & _PANE[0]) != 0) & ((flags & _PANE[1]) != 0) & ((flags & _GLOSSY) == 0)
-        u = sampler.next_1d(active)
-        bs, weight = bsdf.sample(specular, si, dr.select(pane, _CERTAINLY, u), sampler.next_2d(active), active)
+        bs, weight = bsdf.sample(specular, si, sampler.next_1d(active), sampler.next_2d(active), active)
+        onward, kept = bsdf.sample(specular, si, _CERTAINLY, mi.Point2f(0.5), pane)
         other, share = bsdf.sample(specular, si, 0, mi.Point2f(0.5), pane)
-        both = pane & (other.sampled_type != bs.sampled_type) & (other.pdf > 0)
-        reflected = dr.select(both, si.spawn_ray(si.to_world(other.wo)), reflected)
-        reflected_throughput = dr.select(both, throughput * share * other.pdf, reflected_throughput)
-        reflected_depth = dr.select(both, depth + 1, reflected_depth)
-        waiting |= both
-        throughput *= weight * dr.select(both, bs.pdf, 1)
+        # All there is, or it is left to the lot: total reflection has one way, a blend may have three.
+        pane &= (other.sampled_type != onward.sampled_type) & (dr.abs(other.pdf + onward.pdf - 1) < 1e-3)
+        reflected = dr.select(pane, si.spawn_ray(si.to_world(other.wo)), reflected)
+        reflected_throughput = dr.select(pane, throughput * share * other.pdf, reflected_throughput)
+        reflected_depth = dr.select(pane, depth + 1, reflected_depth)
+        waiting |= pane
+        bs = dr.select(pane, onward, bs)
+        throughput *= dr.select(pane, kept * onward.pdf, weight)
         last = ((bs.sampled_type & _GLOSSY) != 0) & ~frosted
         lobe_pdf = bs.pdf
         glossy_hit = mi.Interaction3f(si)
