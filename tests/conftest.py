@@ -1,8 +1,12 @@
-"""Where several processes test at once, each has its share of the cores."""
+"""Where several processes test at once, each has its share of the cores; and a fixture that many files share."""
 
 from __future__ import annotations
 
 import os
+import shutil
+from pathlib import Path
+
+import pytest
 
 
 def pytest_configure() -> None:
@@ -15,3 +19,11 @@ def pytest_configure() -> None:
         import drjit
 
         drjit.set_thread_count(max(1, len(os.sched_getaffinity(0)) // workers))
+
+
+@pytest.fixture
+def place(original: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy, to change, of the folder that the test's own file has made as `original`, as the working directory."""
+    shutil.copytree(original, tmp_path / "w")
+    monkeypatch.chdir(tmp_path / "w")
+    return tmp_path / "w"

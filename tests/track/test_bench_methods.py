@@ -48,14 +48,6 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def place(original: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A copy of it to change, as the working directory."""
-    shutil.copytree(original, tmp_path / "w")
-    monkeypatch.chdir(tmp_path / "w")
-    return tmp_path / "w"
-
-
-@pytest.fixture
 def tracked(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     """What is tracked from now on, as 'SEQUENCE METHOD', and '+' where depth is fused."""
     calls: list[str] = []

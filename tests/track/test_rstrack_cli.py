@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import shutil
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -30,14 +29,6 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
     make_seq(folder / "seq")
     assert main(["track", str(folder / "seq"), "--out", str(folder / "run"), "--quiet"]) == 0
     return folder
-
-
-@pytest.fixture
-def place(original: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A copy of it to break, as the working directory."""
-    shutil.copytree(original, tmp_path / "w")
-    monkeypatch.chdir(tmp_path / "w")
-    return tmp_path / "w"
 
 
 def without_times(folder: str) -> list[Any]:
