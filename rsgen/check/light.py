@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +13,9 @@ from rsgen.config.config import Config
 from rsgen.console.progress import Progress
 from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
+from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.produce.frame_source import load_scene, make_integrator
+from rsgen.produce.frame_source import load_scene, make_integrator, small_camera
 from rsgen.produce.ground_truth import Motion, load_motion
 
 PSNR_FLOOR_DB = 36.0
@@ -112,15 +112,11 @@ def lit_scene(config: Config, progress: Progress) -> tuple[Any, Any, Any]:
     return scene, baked, mi
 
 
-def _scaled(config: Config, width: int) -> Any:
+def _scaled(config: Config, width: int) -> Camera:
     camera = config.color.camera
     if not 8 <= width <= camera.width:
         raise UserError(f"--width {width}: choose 8 to {camera.width}")
-    f = width / camera.width
-    return replace(
-        camera, width=width, height=round(camera.height * f), fx=camera.fx * f, fy=camera.fy * f,
-        cx=(camera.cx + 0.5) * f - 0.5, cy=(camera.cy + 0.5) * f - 0.5,
-    )  # fmt: skip
+    return small_camera(camera, width)
 
 
 def spread_times(motion: Motion, count: int) -> FloatArray:

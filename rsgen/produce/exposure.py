@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ from rsgen.array_types import Float32Array, FloatArray
 from rsgen.device.pose_table import PoseFunction
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
+from rsgen.produce.frame_source import small_camera
 
 _VIEWS, _WIDTH, _SPP, _DEPTH = 6, 48, 32, 16
 _BLOCK = 12  # pixels: noise of so few samples is averaged over blocks
@@ -21,19 +21,15 @@ _ENOUGH = 2.0  # a factor that is not worth the while
 def suggested_gain(scene: Any, camera: Camera, T_world_cam: PoseFunction, until_s: float, gain: float) -> float | None:
     """`color.exposure_gain` that makes the typical surface mid-grey; None if `gain` does so within a factor of 2.
 
-    Path traced at a few instants from 0 to `until_s`. None too where all is dark.
+    Path traced by `camera`, made small, at poses T_world_cam(t), at a few instants from 0 to `until_s`, in s. None too
+    where all is dark.
     """
     import mitsuba as mi
 
     from rsgen.render.images import ColorRenderer
 
-    factor = _WIDTH / camera.width
-    small = replace(
-        camera, width=_WIDTH, height=max(_BLOCK, round(camera.height * factor)), fx=camera.fx * factor,
-        fy=camera.fy * factor, cx=(camera.cx + 0.5) * factor - 0.5, cy=(camera.cy + 0.5) * factor - 0.5,
-    )  # fmt: skip
     path = mi.load_dict({"type": "path", "max_depth": _DEPTH})
-    renderer = ColorRenderer(scene, path, small, Shutter(), _SPP)
+    renderer = ColorRenderer(scene, path, small_camera(camera, _WIDTH), Shutter(), _SPP)
     stamps = until_s * (np.arange(_VIEWS) + 0.5) / _VIEWS
     light = np.concatenate([_blocks(renderer.render(T_world_cam, float(t), k)) for k, t in enumerate(stamps)])
     light = light[light > 0]
