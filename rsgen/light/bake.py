@@ -41,7 +41,7 @@ log = logging.getLogger("rsgen")
 
 
 # Raise when the method changes, so that older caches are not taken for new ones.
-METHOD = 4
+METHOD = 5
 _FINE_TEXELS = 0.9  # direct light is computed at points at least about this far apart
 _FIRST_LOOK_RAYS = 12
 _FIRST_LOOK_BOUNCES = 2
@@ -97,7 +97,7 @@ def _direct(
     if has_sky_light(scene):
         report = _reporter(progress, 0.07, 0.18, "light of the sky and off mirrors")
         means, left = sky_light(
-            scene, points, fine, patch, light.texel_m, light.direct_samples, follow, beside, scatter, report
+            scene, points, fine, patch, light.texel_m, light.direct_samples, beside, scatter, report
         )
         log.info("light of the sky: %.0f dB before smoothing", _as_db(left))
     seen = rough + means.mean(axis=0)
@@ -127,7 +127,7 @@ def _reached(
         if not len(dark):
             break
         field = surfaces.field(total[fine_of_point], everywhere)
-        draw = gathering(surfaces.scene, field, surfaces.points, fine[dark], surfaces.follow)
+        draw = gathering(surfaces.scene, field, surfaces.points, fine[dark])
 
         def share(f: float, k: int = bounce) -> None:
             report((k + f) / _FIRST_LOOK_BOUNCES)

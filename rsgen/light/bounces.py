@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsgen.array_types import Float32Array, IntArray
+from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.config.config import LightConfig
 from rsgen.light.drawing.gather import gathering
 from rsgen.light.drawing.rounds import PATCH, in_rounds, scatter_of
@@ -22,7 +22,9 @@ from rsgen.render.irradiance import IrradianceField, Lattice, make_field
 _COARSE_TEXELS = 3.0  # light off surfaces is gathered at points about this far apart
 _BOUNCE_RAYS = 32
 _LAST_ROUNDS = 4  # the last bounce's rays: an eighth of them at first
-_FEW_LEFT = 0.02  # of the light: bounces that bring less are extrapolated from those before
+_REGION_M = 2.0  # parts of the scene, of like normals on one piece of surface, that light fades by itself in
+_FEW_LEFT = 0.02  # of the light at nearly all places: bounces that bring less are extrapolated from those before
+_NEARLY_ALL = 0.9
 _MOST_KEPT = 0.97  # of the light by a bounce
 
 
@@ -69,10 +71,16 @@ def light_off_surfaces(
     to_fine = Interpolation.between(points, coarse, fine, spacing)
 
     def gather_from(off_surfaces: Float32Array) -> Any:
-        return gathering(surfaces.scene, lit_by(direct + off_surfaces), points, coarse, surfaces.follow)
+        return gathering(surfaces.scene, lit_by(direct + off_surfaces), points, coarse)
 
-    before = _bounced(gather_from, to_fine, direct, len(coarse), light, lambda f: report(0.5 * f))
     patch, beside = thin(points, PATCH * spacing, coarse)[1], direct[of_fine].mean(axis=1)
+    region = thin(points, _REGION_M, coarse)[1]
+
+    def thrown(off_surfaces: Float32Array, rays: int, share: Callable[[float], None]) -> Float32Array:
+        sums = gather_from(to_fine(off_surfaces))(np.arange(len(coarse)), 0, rays, share)
+        return (sums.sum(axis=0) / rays).astype(np.float32)
+
+    before = to_fine(_bounced(thrown, beside, region, light, lambda f: report(0.5 * f)))
     first = max(2, light.gather_rays >> (_LAST_ROUNDS - 1))
     means, left = in_rounds(
         gather_from(before), patch, lambda own: own + beside, 2 * scatter, first, _LAST_ROUNDS, math.inf,
@@ -83,27 +91,36 @@ def light_off_surfaces(
 
 
 def _bounced(
-    gather_from: Callable[[Float32Array], Any], to_fine: Interpolation, direct: Float32Array, count: int,
+    thrown: Callable[[Float32Array, int, Callable[[float], None]], Float32Array], beside: FloatArray, region: IntArray,
     light: LightConfig, report: Callable[[float], None],
 ) -> Float32Array:  # fmt: skip
-    """Light off surfaces after all bounces but the last; what comes after that, from the third on, is extrapolated."""
+    """Light off surfaces (n, 3) after all bounces but the last; from the third on, what comes after is extrapolated.
+
+    thrown: what surfaces throw on the n points if they get so much off others, by so many rays. beside: direct light
+    (n,) of the points, in grey. region: (n,) the part of the scene that each is in: in a white room behind a window
+    bounces go on long after the street outside, which has most of the light, has had all that it gets.
+    """
     rays = min(_BOUNCE_RAYS, light.gather_rays)
-    off_surfaces = np.zeros_like(direct)
-    brought = np.zeros(3)
+    off_surfaces = np.zeros((len(region), 3), np.float32)
+    brought: list[FloatArray] = []  # by each bounce to each region
     for bounce in range(light.bounces - 1):
 
         def share(f: float, k: int = bounce) -> None:
             report((k + f) / light.bounces)
 
-        sums = gather_from(off_surfaces)(np.arange(count), 0, rays, share)
-        gathered = to_fine((sums.sum(axis=0) / rays).astype(np.float32))
-        increase, before = gathered - off_surfaces, brought
-        brought, off_surfaces = increase.sum(axis=0, dtype=np.float64), gathered
+        gathered = thrown(off_surfaces, rays, share)
+        increase, off_surfaces = gathered - off_surfaces, gathered
+        brought.append(np.stack([np.bincount(region, channel) for channel in increase.T], axis=1))
         if not bounce:
             continue
-        # From one bounce to the next, what is added falls by the same part again and again.
-        kept = np.clip(brought / np.maximum(before, 1e-30), 0, _MOST_KEPT)
-        rest = kept / (1 - kept)
-        if bounce == light.bounces - 2 or (rest * brought).sum() < _FEW_LEFT * (direct + off_surfaces).sum():
-            return off_surfaces + (increase * rest).astype(np.float32)
+        # From one bounce to the next what is added falls by the same part again and again, in the end. Floors and
+        # ceilings take turns, so two bounces are compared with the two before.
+        recent, earlier = sum(brought[-2:]), sum(brought[-3:-1])
+        if bounce == 1:
+            recent, earlier = brought[1], brought[0]
+        kept = np.clip(recent / np.maximum(earlier, 1e-30), 0, _MOST_KEPT)
+        rest = (kept / (1 - kept))[region] * increase
+        part = rest.mean(axis=1) / np.maximum(beside + gathered.mean(axis=1), 1e-30)
+        if bounce == light.bounces - 2 or np.quantile(part, _NEARLY_ALL) < _FEW_LEFT:
+            return off_surfaces + rest.astype(np.float32)
     return off_surfaces

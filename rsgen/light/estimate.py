@@ -96,8 +96,6 @@ def _computed(scene: Any, field: IrradianceField, points: SurfacePoints, texel_m
 
     halves = lamp_light(scene, points, everywhere, everywhere, _LAMP_SAMPLES, follow, dark, 1.0, silent)[0]
     if has_sky_light(scene):
-        halves += sky_light(
-            scene, points, everywhere, everywhere, texel_m, _SKY_SAMPLES, follow, dark, math.inf, silent
-        )[0]
-    draw = gathering(scene, field, points, everywhere, follow)
+        halves += sky_light(scene, points, everywhere, everywhere, texel_m, _SKY_SAMPLES, dark, math.inf, silent)[0]
+    draw = gathering(scene, field, points, everywhere)
     return (halves + draw(everywhere, 0, _RAYS, silent) / (_RAYS / 2)).astype(np.float64)
