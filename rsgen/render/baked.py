@@ -69,10 +69,12 @@ class BakedIntegrator(mi.SamplingIntegrator):
 def trace_baked(scene, field, sampler, ray, bounces, active):
     """Radiance (Color3f) along `ray` and whether it hit a surface; see `BakedIntegrator`.
 
-    A path follows mirrors and glass, frosted too, then at most one glossy bounce, and ends at the next surface, where
-    all of the BSDF counts as diffuse. At a pane it goes on both ways, one after the other: by lot, a bright window that
-    shines in one would be speckle. Emitters seen in a glossy lobe are found by sampling each of them and the lobe, with
-    the balance heuristic (Veach and Guibas 1995): small bright lamps would otherwise leave sparkles.
+    A path follows mirrors and glass, frosted too, then a glossy bounce. Of the next surface it sees the matte lobe or,
+    by lot, what the others show of one more, all of which counts as diffuse, and of a lamp there no more than a sheet
+    of paper in its light would show: lamps in lacquer in lacquer would be speckle. At a pane it goes on both ways, one
+    after the other: by lot, a bright window that shines in one would be speckle. Emitters seen in a glossy lobe are
+    found by sampling each of them and the lobe, with the balance heuristic (Veach and Guibas 1995): small bright lamps
+    would otherwise leave sparkles.
     """
     everything = mi.BSDFContext()
     diffuse = mi.BSDFContext()
@@ -86,6 +88,8 @@ def trace_baked(scene, field, sampler, ray, bounces, active):
     depth = mi.UInt32(0)
     valid = mi.Bool(False)
     last = mi.Bool(False)  # the path has had its glossy bounce
+    beyond = mi.Bool(False)  # and one more
+    paper = mi.Color3f(0)  # what matte white would send from there
     glossy_hit = dr.zeros(mi.Interaction3f, dr.width(ray.o))
     lobe_pdf = mi.Float(1)  # of the direction sampled there
     waiting = mi.Bool(False)  # what a pane reflects, until the way through it has ended
@@ -99,8 +103,10 @@ def trace_baked(scene, field, sampler, ray, bounces, active):
         found = active & (emitter != dr.zeros(mi.EmitterPtr))
         towards = mi.DirectionSample3f(scene, si, glossy_hit)
         light_pdf = scene.pdf_emitter_direction(glossy_hit, towards, found & last)
-        share = dr.select(last, lobe_pdf / (lobe_pdf + lights * light_pdf), 1)
-        radiance[found] += throughput * share * emitter.eval(si, found)
+        share = dr.select(last & ~beyond, lobe_pdf / (lobe_pdf + lights * light_pdf), 1)
+        shown = emitter.eval(si, found)
+        shown = dr.select(beyond, dr.minimum(shown, paper), shown)
+        radiance[found] += throughput * share * shown
         active &= si.is_valid()
         valid |= active
 
@@ -108,9 +114,10 @@ def trace_baked(scene, field, sampler, ray, bounces, active):
         wo = mi.warp.square_to_cosine_hemisphere(sampler.next_2d(active))
         wo.z *= dr.sign(si.wi.z)
         lobe = bsdf.eval(diffuse, si, wo, active & ~last) / dr.maximum(dr.abs(wo.z), 1e-6)
-        _, albedo = bsdf.sample(everything, si, sampler.next_1d(active), sampler.next_2d(active), active & last)
+        once, albedo = bsdf.sample(everything, si, sampler.next_1d(active), sampler.next_2d(active), active & last)
+        further = active & last & ~beyond & ((once.sampled_type & _SPECULAR) != 0)
         irradiance = field.lookup(pi, si, -ray.d, active)
-        radiance[active] += throughput * irradiance * dr.select(last, albedo * dr.inv_pi, lobe)
+        radiance[active & ~further] += throughput * irradiance * dr.select(last, albedo * dr.inv_pi, lobe)
 
         active &= ((bsdf.flags() & _SPECULAR) != 0) & ~last & (depth < bounces)
         flags = bsdf.flags()
@@ -143,6 +150,7 @@ def trace_baked(scene, field, sampler, ray, bounces, active):
         reflected_depth = dr.select(pane, depth + 1, reflected_depth)
         waiting |= pane
         bs = dr.select(pane, onward, bs)
+        before = throughput
         throughput *= dr.select(pane, kept * onward.pdf, weight)
         last = ((bs.sampled_type & _GLOSSY) != 0) & ~frosted
         lobe_pdf = bs.pdf
@@ -151,11 +159,19 @@ def trace_baked(scene, field, sampler, ray, bounces, active):
         active &= dr.max(throughput) > 0
         depth += 1
 
+        paper = dr.select(further, irradiance * dr.inv_pi, paper)
+        throughput = dr.select(further, before * albedo, throughput)
+        ray = dr.select(further, si.spawn_ray(si.to_world(once.wo)), ray)
+        active |= further
+        last |= further
+        beyond |= further
+
         back = waiting & ~active
         ray = dr.select(back, reflected, ray)
         throughput = dr.select(back, reflected_throughput, throughput)
         depth = dr.select(back, reflected_depth, depth)
         last &= ~back
+        beyond &= ~back
         active |= back
         waiting &= ~back
     return radiance, valid

@@ -9,11 +9,15 @@ import numpy as np
 import pytest
 import trimesh
 from lit import FLOOR, bake, floor_grid, floor_light, lookup, scene_of, silent
-from rendering import dr, mi
+from rendering import constant_twist, dr, mi
 
 from rsgen.device.arrays import rows_of, vectors
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter
 from rsgen.light.drawing.gather import gathering
 from rsgen.light.places.surface_points import SurfacePoints
+from rsgen.render.baked import BakedIntegrator
+from rsgen.render.images import ColorRenderer
 from rsgen.render.irradiance import make_field, make_lattice
 
 WALL_X, LAMP_X = -0.9, -0.6
@@ -150,3 +154,26 @@ def test_bounces_go_on_in_a_white_room_beside_a_bright_street(tmp_path: Path) ->
     ways = ball.triangles_center[::20] - [0, 0, 5]
     got = lookup(scene, make_field(lattice, front, back), np.tile([0.0, 0.0, 5.0], (len(ways), 1)), ways)[1]
     assert np.abs(got.mean(axis=0) / (np.pi * glow / (1 - albedo)) - 1).max() < 0.01
+
+
+def test_a_lacquered_floor_in_brushed_metal_shows_what_it_mirrors(tmp_path: Path) -> None:
+    """The path tracer's picture of it: the floor, dark, in a lamp's light, mirrors a dark wall, not the lamp."""
+    floor = f'<shape type="rectangle">{SATIN.replace("0.2", "0.1")}</shape>'
+    metal = '<bsdf type="roughconductor"><string name="material" value="none"/><float name="alpha" value="0.1"/></bsdf>'
+    lamp = f"""<shape type="rectangle"><transform name="to_world"><rotate x="1" angle="180"/><scale value="0.2"/>
+        <translate x="-0.3" z="1"/></transform>{BLACK}
+        <emitter type="area"><rgb name="radiance" value="20,20,20"/></emitter></shape>"""
+    scene = scene_of(tmp_path, floor, wall(metal), lamp)
+    lattice, front, back = bake(scene, texel_m=0.05, bounces=4, gather_rays=256, direct_samples=256)
+    T_world_cam = np.eye(4)  # looks along -x, low above the floor
+    T_world_cam[:3, :3] = np.array([[0, 1, 0], [0, 0, -1], [-1, 0, 0]]).T
+    T_world_cam[:3, 3] = 0.8, 0, 0.15
+    view = constant_twist(np.zeros(6), T_world_cam)
+    camera = Camera(24, 8, 40.0, 40.0, 11.5, 8.0)
+    baked = BakedIntegrator(make_field(lattice, front, back), glossy_spp=512)
+    ours = ColorRenderer(scene, baked, camera, Shutter(), 512).render(view, 0.0, 1)
+    path = mi.load_dict({"type": "path", "max_depth": 12})
+    traced = ColorRenderer(scene, path, camera, Shutter(), 4096).render(view, 0.0, 2)
+    rows, expected = ours.mean(axis=(1, 2)), traced.mean(axis=(1, 2))
+    assert rows.sum() == pytest.approx(expected.sum(), rel=0.03)
+    assert np.abs(rows - expected).max() < 0.03 * expected.max()
