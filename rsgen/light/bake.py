@@ -1,7 +1,8 @@
 """Bake a scene's diffuse irradiance: direct light by emitter sampling, indirect by gathering over bounces.
 
 1. Every lattice point of `irradiance.Lattice` (both sides of each triangle; points that coincide are one) gets direct
-   light from each lamp with a stratified set of samples, and from the sky and off mirrors as `sky` has it.
+   light from each lamp with a stratified set of samples, from the sky and off mirrors as `sky` has it, and off lacquer
+   and brushed metal as `lacquer` has it.
    Where a mesh is finer than the texel, a thinned set of points is computed and the others are interpolated.
 2. Indirect light varies slowly, so it is gathered at a still thinner set, a few texels apart, by cosine-distributed
    rays that look the previous bounce up where they hit, and interpolated in position and normal.
@@ -29,13 +30,14 @@ from rsgen.console.progress import Progress
 from rsgen.errors import UserError
 from rsgen.light.bounces import Surfaces, light_off_surfaces
 from rsgen.light.drawing.gather import gathering
+from rsgen.light.drawing.lacquer import lacquer_light
 from rsgen.light.drawing.lamps import first_look, lamp_light
 from rsgen.light.drawing.rounds import GREY_SLOPE, PATCH, scatter_of, typical
 from rsgen.light.drawing.sky import has_sky_light, sky_light
 from rsgen.light.drawing.specular import passes_light_on
 from rsgen.light.places.bake_points import Interpolation, sample_points, thin
 from rsgen.light.places.denoise import denoised
-from rsgen.render.irradiance import Lattice
+from rsgen.render.irradiance import Lattice, lattice_area
 
 log = logging.getLogger("rsgen")
 
@@ -58,9 +60,10 @@ def bake(scene: Any, lattice: Lattice, light: LightConfig, progress: Progress) -
     points, index, reach = sample_points(scene, lattice, light.texel_m)
     surfaces = Surfaces(scene, lattice, points, index, reach, passes_light_on(scene))
     fine, fine_of_point = thin(points, light.texel_m * _FINE_TEXELS)
+    area = _summed(fine_of_point, _summed(index.ravel(), np.tile(lattice_area(scene, lattice), 2)))
     log.info("baking light: %d triangles, %d samples of %d stored", len(lattice.first), len(fine), len(fine_of_point))
     scatter = 10 ** (-light.target_db / 20) / GREY_SLOPE
-    direct, alive = _direct(surfaces, fine, fine_of_point, light, scatter, progress)
+    direct, alive = _direct(surfaces, fine, fine_of_point, area, light, scatter, progress)
     fine, alive_point = fine[alive], alive[fine_of_point]
 
     lit_points = np.flatnonzero(alive_point)
@@ -81,11 +84,12 @@ def bake(scene: Any, lattice: Lattice, light: LightConfig, progress: Progress) -
 
 
 def _direct(
-    surfaces: Surfaces, fine: IntArray, fine_of_point: IntArray, light: LightConfig, scatter: float, progress: Progress
-) -> tuple[Float32Array, NDArray[np.bool_]]:
+    surfaces: Surfaces, fine: IntArray, fine_of_point: IntArray, area: FloatArray, light: LightConfig, scatter: float,
+    progress: Progress,
+) -> tuple[Float32Array, NDArray[np.bool_]]:  # fmt: skip
     """Direct irradiance (m, 3) of those of the points `fine` that any light reaches, and which these are (n,).
 
-    Raises UserError if there are none.
+    area (n,): of the surface that each stands for, m². Raises UserError if there are none.
     """
     scene, points, follow = surfaces.scene, surfaces.points, surfaces.follow
     # A first look with few samples finds what any light reaches; only that gets the full effort.
@@ -100,7 +104,8 @@ def _direct(
             scene, points, fine, patch, light.texel_m, light.direct_samples, beside, scatter, report
         )
         log.info("light of the sky: %.0f dB before smoothing", _as_db(left))
-    seen = rough + means.mean(axis=0)
+    off_lacquer = lacquer_light(scene, points, fine, area, light.texel_m, follow)
+    seen = rough + means.mean(axis=0) + off_lacquer
     alive = _reached(surfaces, fine, fine_of_point, seen, _reporter(progress, 0.25, 0.05, "finding lit surfaces"))
     if not alive.any():
         raise UserError("the scene is dark: no light reaches any surface; add an emitter or move it into the open")
@@ -113,7 +118,8 @@ def _direct(
     )
     means += of_lamps
     noisy = np.flatnonzero(np.hypot(left, left_of_lamps) > part)
-    return denoised(points, fine, means, scatter_of(patch, means), light.texel_m, noisy), alive
+    direct = denoised(points, fine, means, scatter_of(patch, means), light.texel_m, noisy)
+    return direct + off_lacquer[alive], alive
 
 
 def _reached(
@@ -134,6 +140,10 @@ def _reached(
 
         total[dark] = draw(np.arange(len(dark)), 0, _FIRST_LOOK_RAYS, share).sum(axis=0)
     return total.max(axis=1) > 0
+
+
+def _summed(label: IntArray, values: FloatArray) -> FloatArray:
+    return np.bincount(label, values).astype(np.float64)
 
 
 def _renumbered(label: IntArray) -> IntArray:

@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.config.config import LightConfig
 from rsgen.light.drawing.gather import gathering
-from rsgen.light.drawing.rounds import PATCH, in_rounds, scatter_of
+from rsgen.light.drawing.rounds import PATCH, in_rounds, scatter_of, shown
 from rsgen.light.places.bake_points import Interpolation, thin
 from rsgen.light.places.denoise import denoised
 from rsgen.light.places.surface_points import SurfacePoints
 from rsgen.render.irradiance import IrradianceField, Lattice, make_field
 
 _COARSE_TEXELS = 3.0  # light off surfaces is gathered at points about this far apart
+_MOST_AGAIN = 1.0  # of so many points: those between them that are drawn for themselves
 _BOUNCE_RAYS = 32
 _LAST_ROUNDS = 4  # the last bounce's rays: an eighth of them at first
 _REGION_M = 2.0  # parts of the scene, of like normals on one piece of surface, that light fades by itself in
@@ -61,7 +62,8 @@ def light_off_surfaces(
     """Irradiance (n, 3) that surfaces throw on the points `fine` (n,), which have `direct` (n, 3) from elsewhere.
 
     lit_by: the field of a light (n, 3) at `fine`. Drawn until twice `scatter` is left (see `rounds`), which smoothing
-    and the interpolation bring down to about that: they reach over a dozen points.
+    and the interpolation bring down to about that: they reach over a dozen points. Where these differ much, as in
+    corners and where things touch, it is drawn at each point, at those where they differ most.
     """
     if not light.bounces:
         return np.zeros_like(direct)
@@ -70,24 +72,37 @@ def light_off_surfaces(
     coarse = fine[of_fine]
     to_fine = Interpolation.between(points, coarse, fine, spacing)
 
-    def gather_from(off_surfaces: Float32Array) -> Any:
-        return gathering(surfaces.scene, lit_by(direct + off_surfaces), points, coarse)
-
-    patch, beside = thin(points, PATCH * spacing, coarse)[1], direct[of_fine].mean(axis=1)
     region = thin(points, _REGION_M, coarse)[1]
 
     def thrown(off_surfaces: Float32Array, rays: int, share: Callable[[float], None]) -> Float32Array:
-        sums = gather_from(to_fine(off_surfaces))(np.arange(len(coarse)), 0, rays, share)
+        draw = gathering(surfaces.scene, lit_by(direct + to_fine(off_surfaces)), points, coarse)
+        sums = draw(np.arange(len(coarse)), 0, rays, share)
         return (sums.sum(axis=0) / rays).astype(np.float32)
 
-    before = to_fine(_bounced(thrown, beside, region, light, lambda f: report(0.5 * f)))
+    beside = direct.mean(axis=1)
+    before = to_fine(_bounced(thrown, beside[of_fine], region, light, lambda f: report(0.5 * f)))
+    field = lit_by(direct + before)
     first = max(2, light.gather_rays >> (_LAST_ROUNDS - 1))
-    means, left = in_rounds(
-        gather_from(before), patch, lambda own: own + beside, 2 * scatter, first, _LAST_ROUNDS, math.inf,
-        lambda f: report(0.5 + 0.5 * f),
-    )  # fmt: skip
-    noisy = np.flatnonzero(left > scatter)
-    return to_fine(denoised(points, coarse, means, scatter_of(patch, means), spacing, noisy))
+
+    def at_last(of: IntArray, apart: float, begin: float) -> Float32Array:
+        patch = thin(points, PATCH * apart, fine[of])[1]
+        means, left = in_rounds(
+            gathering(surfaces.scene, field, points, fine[of]), patch, lambda own: own + beside[of], 2 * scatter, first,
+            _LAST_ROUNDS, math.inf, lambda f: report(begin + 0.25 * f),
+        )  # fmt: skip
+        noisy = np.flatnonzero(left > scatter)
+        return denoised(points, fine[of], means, scatter_of(patch, means), apart, noisy)
+
+    own = at_last(of_fine, spacing, 0.5)
+    smooth = to_fine(own)
+    everywhere = thin(points, PATCH * spacing, fine)[1]
+    uneven = shown(everywhere, to_fine.spread(own.mean(axis=1)), smooth.mean(axis=1) + beside)
+    worst = np.argsort(-uneven, kind="stable")[: int(_MOST_AGAIN * len(coarse))]
+    again = np.sort(worst[uneven[worst] > 2 * scatter])
+    if len(again):
+        smooth[again] = at_last(again, light.texel_m, 0.75)
+    report(1.0)
+    return smooth
 
 
 def _bounced(

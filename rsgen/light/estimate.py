@@ -19,10 +19,11 @@ from rsgen import srgb
 from rsgen.array_types import BoolArray, FloatArray
 from rsgen.device.arrays import rows_of
 from rsgen.light.drawing.gather import gathering
+from rsgen.light.drawing.lacquer import lacquer_seen
 from rsgen.light.drawing.lamps import lamp_light
 from rsgen.light.drawing.rounds import typical
 from rsgen.light.drawing.sky import has_sky_light, sky_light
-from rsgen.light.drawing.specular import first_scatterer, passes_light_on
+from rsgen.light.drawing.specular import first_scatterer, passes_light_on, shines
 from rsgen.light.places.surface_points import SurfacePoints
 from rsgen.light.sight import Sight
 from rsgen.render.irradiance import IrradianceField
@@ -95,6 +96,8 @@ def _computed(scene: Any, field: IrradianceField, points: SurfacePoints, texel_m
         pass
 
     halves = lamp_light(scene, points, everywhere, everywhere, _LAMP_SAMPLES, follow, dark, 1.0, silent)[0]
+    if shines(scene):
+        halves += lacquer_seen(scene, points, everywhere, _SKY_SAMPLES)
     if has_sky_light(scene):
         halves += sky_light(scene, points, everywhere, everywhere, texel_m, _SKY_SAMPLES, dark, math.inf, silent)[0]
     draw = gathering(scene, field, points, everywhere)

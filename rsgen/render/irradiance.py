@@ -132,6 +132,22 @@ def lattice_barycentric(lattice: Lattice) -> tuple[IntArray, Float32Array]:
     return face, weights[:, 1:]
 
 
+def lattice_area(scene: Any, lattice: Lattice) -> NDArray[np.float64]:
+    """Area (points,) in m² that each lattice point stands for on one side: a triangle's points share out its own."""
+    meshes = [mesh_arrays(shape) for shape in scene.shapes() if shape.is_mesh()]
+    corners = np.concatenate([vertices[faces].astype(np.float64) for vertices, faces in meshes])
+    edges = corners[:, 1:] - corners[:, :1]
+    triangle = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    counts = (lattice.cells + 1).prod(axis=1)
+    face = np.repeat(np.arange(len(counts)), counts)
+    nu, nv = lattice.cells[face].T
+    row, column = np.divmod(np.arange(lattice.points) - lattice.first[face], nv + 1)
+    # Across a grid line at u a triangle is as wide as u: the strip about it, cut off at u = 1, has so much of the area.
+    strip = np.minimum(row + 0.5, nu) ** 2 - np.maximum(row - 0.5, 0) ** 2
+    along = np.where((column == 0) | (column == nv), 0.5, 1.0) / nv
+    return np.asarray(triangle[face] * strip / nu**2 * along)
+
+
 def at_triangles(shape: NDArray[np.uint32], face: NDArray[np.uint32], uv: Float32Array) -> tuple[Any, Any]:
     """(pi, si), as if met by rays, at barycentric uv (n, 2) of triangles of the meshes with these `registry_id`."""
     pi = dr.zeros(mi.PreliminaryIntersection3f, len(face))

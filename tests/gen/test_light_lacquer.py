@@ -95,7 +95,7 @@ def off_satin(scene: Any, xyz: np.ndarray) -> np.ndarray:
 def test_a_lamp_in_lacquer_lights_the_floor_by_fresnels_formula(tmp_path: Path) -> None:
     xyz = beyond_the_lamp(12)
     scene = scene_of(tmp_path, FLOOR, LAMP, wall(BLACK_LACQUER))
-    got = floor_light(scene, xyz, texel_m=0.03, direct_samples=1024, target_db=60)
+    got = floor_light(scene, xyz, texel_m=0.02, direct_samples=1024, target_db=60)
     ratio = (got / RADIANCE).mean(axis=1) / off_lacquer(xyz)
     assert abs(ratio.mean() - 1) < 0.02
     assert np.quantile(np.abs(ratio - 1), 0.9) < 0.12
@@ -104,7 +104,7 @@ def test_a_lamp_in_lacquer_lights_the_floor_by_fresnels_formula(tmp_path: Path) 
 def test_a_lamp_in_satin_lights_the_floor_as_its_lobe_says(tmp_path: Path) -> None:
     xyz = beyond_the_lamp(3)
     scene = scene_of(tmp_path, FLOOR, LAMP, wall(SATIN))
-    got = floor_light(scene, xyz, texel_m=0.03, direct_samples=1024, target_db=60)
+    got = floor_light(scene, xyz, texel_m=0.02, direct_samples=1024, target_db=60)
     ratio = (got / RADIANCE).mean(axis=1) / off_satin(scene, xyz)
     assert abs(ratio.mean() - 1) < 0.02
     assert np.abs(ratio - 1).max() < 0.08

@@ -11,8 +11,8 @@ import mitsuba as mi
 _MOST = 10
 _STRAIGHT = int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.Null)
 _NULL = int(mi.BSDFFlags.Null)
-_GLOSSY = int(mi.BSDFFlags.Glossy)
-_SPECULAR = _GLOSSY | _STRAIGHT
+GLOSSY = int(mi.BSDFFlags.Glossy)
+SPECULAR = GLOSSY | _STRAIGHT
 _DIFFUSE = int(mi.BSDFFlags.DiffuseReflection) | int(mi.BSDFFlags.DiffuseTransmission)
 
 
@@ -23,7 +23,13 @@ def passes_light_on(scene: Any) -> bool:
 
 def shines(scene: Any) -> bool:
     """Whether anything in a scene mirrors or lets through, be it faintly like lacquer or blurred like brushed metal."""
-    return any(f & _SPECULAR for f in _kinds(scene))
+    return any(f & SPECULAR for f in _kinds(scene))
+
+
+def lacquered(shape: Any) -> bool:
+    """Whether a surface is matte beneath what mirrors, or mirrors blurred: lacquer, satin, brushed metal."""
+    kind = int(shape.bsdf().flags()) if shape.bsdf() is not None else 0
+    return bool(kind & GLOSSY or (kind & _STRAIGHT and kind & _DIFFUSE and not kind & _NULL))
 
 
 def _kinds(scene: Any) -> list[int]:
@@ -87,7 +93,7 @@ def thrown_along(scene, field, ray, number, i, pick, follow, active):
         going &= si.is_valid()
         # The sampled weight's mean is the albedo ρ, exactly and without noise for Lambert's law.
         bs, weight = si.bsdf(ray).sample(context, si, pick, _drawn(number, i, passed), going)
-        onward = going & ((bs.sampled_type & _SPECULAR) != 0) & (passed < _MOST)
+        onward = going & ((bs.sampled_type & SPECULAR) != 0) & (passed < _MOST)
         if dr.hint(not follow, mode="scalar"):
             onward = mi.Bool(False)
         ends = going & ~onward
@@ -103,20 +109,19 @@ def thrown_along(scene, field, ray, number, i, pick, follow, active):
 
 
 @dr.syntax
-def emitted_along(scene, ray, number, i, pick, follow, active):
-    """Radiance (Color3f) that the sky sends along a ray, and lamps by ways with turns: of that what comes straight and
-    off mirrors, and what comes by way of lacquer or brushed metal.
+def shone_along(scene, ray, number, i, pick, active):
+    """Radiance (Color3f) of lamps and sky that comes along a ray by way of lacquer or brushed metal.
 
-    With `follow` by way of whatever mirrors or lets through; arguments as of `thrown_along`. What brushed metal blurs
-    is found by sampling lamps and lobe, with the balance heuristic (Veach and Guibas 1995).
+    Arguments as of `thrown_along`. What brushed metal blurs is found by sampling lamps and lobe, with the balance
+    heuristic (Veach and Guibas 1995).
     """
     specular = mi.BSDFContext()
-    specular.type_mask = _SPECULAR
-    sharp, faint = mi.Color3f(0), mi.Color3f(0)
+    specular.type_mask = SPECULAR
+    light = mi.Color3f(0)
     through = mi.Color3f(1)
     passed = mi.UInt32(0)
-    turned, lacquered = mi.Bool(False), mi.Bool(False)
-    blurred = mi.Bool(False)  # the last turn was, by a lobe of this density, there
+    thrown = mi.Bool(False)  # by lacquer or brushed metal
+    blurred = mi.Bool(False)  # at the last turn, by a lobe of this density, there
     density = mi.Float(1)
     there = dr.zeros(mi.Interaction3f, dr.width(ray.o))
     going = mi.Bool(active)
@@ -124,41 +129,33 @@ def emitted_along(scene, ray, number, i, pick, follow, active):
         pi = scene.ray_intersect_preliminary(ray, coherent=False, active=going)
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All, going)
         emitter = si.emitter(scene, going)
-        found = going & (emitter != dr.zeros(mi.EmitterPtr)) & (~si.is_valid() | turned)
+        found = going & (emitter != dr.zeros(mi.EmitterPtr)) & thrown
         towards = mi.DirectionSample3f(scene, si, there)
         drawn = scene.pdf_emitter_direction(there, towards, found & blurred)
         share = dr.select(blurred, density / dr.maximum(density + drawn, 1e-20), 1)
-        arrives = through * share * emitter.eval(si, found)
-        sharp += dr.select(found & ~lacquered, arrives, 0)
-        faint += dr.select(found & lacquered, arrives, 0)
-        going &= si.is_valid()
-        if dr.hint(not follow, mode="scalar"):
-            going &= False
-        else:
-            bsdf = si.bsdf(ray)
-            kind = bsdf.flags()
-            going &= ((kind & _SPECULAR) != 0) & (passed < _MOST)
-            brushed = going & ((kind & _GLOSSY) != 0)
-            ds, value = scene.sample_emitter_direction(si, _drawn(number, i, 2 * _MOST + passed), False, brushed)
-            cast, lobe = bsdf.eval_pdf(specular, si, si.to_local(ds.d), brushed)
-            gain = value * cast * dr.select(ds.delta, 1, ds.pdf / dr.maximum(ds.pdf + lobe, 1e-20))
-            lit = brushed & (ds.pdf > 0) & (dr.max(through * gain) > 0)
-            lit &= ~scene.ray_test(si.spawn_ray_to(ds.p), lit)
-            faint += dr.select(lit, through * gain, 0)
-            bs, weight = bsdf.sample(specular, si, pick, _drawn(number, i, passed), going)
-            through = dr.select(going, through * weight, through)
-            going &= dr.max(through) > 0
-            off = going & ((bs.sampled_type & _NULL) == 0)
-            turned |= off
-            lacquered |= off & ((kind & (_GLOSSY | _DIFFUSE)) != 0)
-            blurred = (bs.sampled_type & _GLOSSY) != 0
-            density = bs.pdf
-            there = mi.Interaction3f(si)
-            ray = si.spawn_ray(si.to_world(bs.wo))
-            passed += 1
-            pick += 0.6180339887498949
-            pick -= dr.floor(pick)
-    return sharp, faint
+        light += dr.select(found, through * share * emitter.eval(si, found), 0)
+        bsdf = si.bsdf(ray)
+        kind = bsdf.flags()
+        going &= si.is_valid() & ((kind & SPECULAR) != 0) & (passed < _MOST)
+        brushed = going & ((kind & GLOSSY) != 0)
+        ds, value = scene.sample_emitter_direction(si, _drawn(number, i, 2 * _MOST + passed), False, brushed)
+        cast, lobe = bsdf.eval_pdf(specular, si, si.to_local(ds.d), brushed)
+        gain = value * cast * dr.select(ds.delta, 1, ds.pdf / dr.maximum(ds.pdf + lobe, 1e-20))
+        lit = brushed & (ds.pdf > 0) & (dr.max(through * gain) > 0)
+        lit &= ~scene.ray_test(si.spawn_ray_to(ds.p), lit)
+        light += dr.select(lit, through * gain, 0)
+        bs, weight = bsdf.sample(specular, si, pick, _drawn(number, i, passed), going)
+        through = dr.select(going, through * weight, through)
+        going &= dr.max(through) > 0
+        thrown |= going & ((bs.sampled_type & _NULL) == 0) & ((kind & (GLOSSY | _DIFFUSE)) != 0)
+        blurred = (bs.sampled_type & GLOSSY) != 0
+        density = bs.pdf
+        there = mi.Interaction3f(si)
+        ray = si.spawn_ray(si.to_world(bs.wo))
+        passed += 1
+        pick += 0.6180339887498949
+        pick -= dr.floor(pick)
+    return light
 
 
 def _drawn(number: Any, i: Any, passed: Any) -> Any:

@@ -12,7 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from rsgen.array_types import Float32Array, IntArray
+from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.device.arrays import rows_of
 from rsgen.light.places.surface_points import SurfacePoints
 from rsgen.light.places.walls import find_barriers, find_covered
@@ -178,3 +178,11 @@ class Interpolation:
         for k in range(self.neighbours.shape[1]):
             out += self.weights[:, k, None] * at_sources[self.neighbours[:, k]]
         return out
+
+    def spread(self, at_sources: FloatArray) -> FloatArray:
+        """Standard deviation (n,), by their weights, of the values (m,) that each one is interpolated from."""
+        mean, square = np.zeros((2, len(self.neighbours)))
+        for weight, near in zip(self.weights.T, self.neighbours.T, strict=True):
+            mean += weight * at_sources[near]
+            square += weight * at_sources[near] ** 2
+        return np.sqrt(np.maximum(square - mean**2, 0.0))

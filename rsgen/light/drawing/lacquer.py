@@ -1,0 +1,151 @@
+"""Light that lacquer and brushed metal throw: from lit places on them along their lobes to where it lands.
+
+Looked for from where it lands, the sun in a varnished table is found by one ray in a thousand; from the table it is
+where it goes (photon mapping: Jensen 1996). What lands is averaged over decimetres, which is what there is little of.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from rsgen.array_types import Float32Array, FloatArray, IntArray
+from rsgen.device.arrays import rows_of
+from rsgen.light.drawing.rounds import drawn_at
+from rsgen.light.drawing.specular import SPECULAR, lacquered, shone_along, transmitted
+from rsgen.light.places.bake_points import Interpolation, thin
+from rsgen.light.places.sampling import chunks, r2, rotation
+from rsgen.light.places.surface_points import SurfacePoints
+from rsgen.render.irradiance import at_triangles, registry_id
+from rsgen.render.scene import mesh_arrays
+
+_PHOTONS, _BATCH = 1 << 21, 1 << 18
+_TURNS = 4  # surfaces that a photon is followed over
+_CELL_M = 0.12  # photons are counted in cells of this size, of like normals on one piece of surface
+_NEAR = 8  # cells that each is shared out among
+
+
+def lacquer_light(
+    scene: Any, points: SurfacePoints, which: IntArray, area: FloatArray, texel_m: float, follow: bool
+) -> Float32Array:
+    """Irradiance (n, 3) that lamps and sky send to the points `which` (n,) by way of lacquer and brushed metal.
+
+    area (n,): of the surface that each stands for, m². follow: whether lamps shine through panes.
+    """
+    shapes = [shape for shape in scene.shapes() if shape.is_mesh() and lacquered(shape)]
+    if not shapes:
+        return np.zeros((len(which), 3), np.float32)
+    coarse, stands_for = thin(points, 2 * texel_m, which)
+    cells = which[thin(points, _CELL_M, which)[0]]
+    tree = cKDTree(_places(points.position[cells], points.normal[cells]))
+
+    def spread(position: NDArray, normal: NDArray, what: NDArray) -> FloatArray:
+        near, weights = _shares(tree, _places(position, normal))
+        return np.stack([np.bincount(near.ravel(), (weights * w[:, None]).ravel(), len(cells)) for w in what.T], axis=1)
+
+    # What lands and the surface it lands on are shared out alike, so that it does not matter how cells lie.
+    flux = np.zeros((len(cells), 3))
+    for landed in _photons(scene, shapes, follow):
+        flux += spread(*landed)
+    each = np.bincount(stands_for, area)[:, None]
+    around = spread(points.position[which[coarse]], points.normal[which[coarse]], each)
+    light = (flux / np.maximum(around, 1e-12)).astype(np.float32)
+    return Interpolation.between(points, cells, which, _CELL_M)(light)
+
+
+def _places(position: NDArray, normal: NDArray) -> FloatArray:
+    return np.concatenate([position / _CELL_M, normal], axis=1).astype(np.float64)
+
+
+def _shares(tree: cKDTree, places: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Cells (n, k) near places and how each place is shared out among them, (n, k), in all 1."""
+    k = min(_NEAR, tree.n)
+    distance, near = (np.reshape(v, (-1, k)) for v in tree.query(places, k=k, workers=-1))
+    weights = np.exp(-(distance**2)) + 1e-9
+    return near, weights / weights.sum(axis=1, keepdims=True)
+
+
+def lacquer_seen(scene: Any, points: SurfacePoints, which: IntArray, samples: int) -> Float32Array:
+    """The same looked for from where it lands, in means of two halves (2, n, 3): it scatters, but blurs nothing."""
+
+    def sample(at: Any, _: IntArray, begin: int, count: int) -> Any:
+        return _seen_at(scene, *at, begin, count)
+
+    draw = drawn_at(which, lambda some, report: chunks(points, some, report), sample)
+    return draw(np.arange(len(which)), 0, samples, lambda _: None) / np.float32(samples / 2)
+
+
+@dr.syntax
+def _seen_at(scene, p, n, number, begin, samples):
+    frame = mi.Frame3f(n)
+    offset = mi.Point2f(rotation(number, 301), rotation(number, 302))
+    lobe = rotation(number, 303)
+    i = dr.opaque(mi.UInt32, begin)
+    end = i + dr.opaque(mi.UInt32, samples)
+    even, odd = mi.Color3f(0), mi.Color3f(0)
+    while i < end:
+        d = frame.to_world(mi.warp.square_to_cosine_hemisphere(r2(i, offset)))
+        pick = lobe + mi.Float(i) * 0.6180339887498949
+        # With pdf cosθ/π, ∫ L cosθ dω is the mean of πL.
+        light = dr.pi * shone_along(scene, mi.Ray3f(p, d), number, i, pick - dr.floor(pick), mi.Bool(True))
+        first = (i & 1) == 0
+        even += dr.select(first, light, 0)
+        odd += dr.select(first, 0, light)
+        i += 1
+    return mi.Vector3f(even), mi.Vector3f(odd)
+
+
+def _photons(scene: Any, shapes: list[Any], follow: bool) -> Any:
+    """Yields where photons land (n, 3), the normals (n, 3) of the sides they land on, and what they bring (n, 3), W."""
+    meshes = [mesh_arrays(shape) for shape in shapes]
+    corners = np.concatenate([vertices[faces].astype(np.float64) for vertices, faces in meshes])
+    face = np.concatenate([np.arange(len(faces), dtype=np.uint32) for _, faces in meshes])
+    of = np.repeat(np.array([registry_id(s) for s in shapes], np.uint32), [len(faces) for _, faces in meshes])
+    edges = corners[:, 1:] - corners[:, :1]
+    growing = np.cumsum(0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1))
+    for begin in range(0, _PHOTONS, _BATCH):
+        number = np.arange(begin, begin + _BATCH)
+        # Spread evenly over the area, and over each triangle (Osada et al. 2002).
+        at = np.searchsorted(growing, (number + 0.5) / _PHOTONS * growing[-1]).clip(max=len(growing) - 1)
+        u, v = (number * a % 1 for a in (0.7548776662466927, 0.5698402909980532))
+        root = np.sqrt(u)
+        uv = np.stack([root * (1 - v), root * v], axis=1).astype(np.float32)
+        yield from _thrown(scene, at_triangles(of[at], face[at], uv)[1], begin, growing[-1] / _PHOTONS, follow)
+
+
+def _thrown(scene: Any, si: Any, begin: int, area: float, follow: bool) -> Any:
+    """What photons from places on lacquer bring, each of which has `area`, surface after surface."""
+    specular = mi.BSDFContext()
+    specular.type_mask = SPECULAR
+    number = dr.arange(mi.UInt32, _BATCH) + dr.opaque(mi.UInt32, begin)
+
+    def drawn(dimension: int) -> Any:
+        return mi.Point2f(rotation(number, 310 + 2 * dimension), rotation(number, 311 + 2 * dimension))
+
+    ds, value = scene.sample_emitter_direction(si, drawn(0), False)
+    cosine = dr.abs(dr.dot(si.sh_frame.n, ds.d))
+    start = si.spawn_ray(ds.d).o
+    way = ds.p - start
+    distance = dr.norm(way)
+    flux = value * cosine * area * transmitted(scene, start, way / distance, distance, ds.pdf > 0, follow)
+    si.wi = si.to_local(ds.d)
+    for turn in range(_TURNS):
+        bs, weight = si.bsdf().sample(specular, si, drawn(2 * turn + 1).x, drawn(2 * turn + 2))
+        flux *= weight
+        alive = dr.compress(dr.max(flux) > 0)
+        if not len(alive):
+            return
+        ray = si.spawn_ray(si.to_world(bs.wo))
+        ray = mi.Ray3f(dr.gather(mi.Point3f, ray.o, alive), dr.gather(mi.Vector3f, ray.d, alive))
+        flux, number = dr.gather(mi.Color3f, flux, alive), dr.gather(mi.UInt32, number, alive)
+        si = scene.ray_intersect(ray)
+        flux &= si.is_valid()
+        normal = si.sh_frame.n * dr.select(dr.dot(si.sh_frame.n, ray.d) > 0, -1.0, 1.0)
+        dr.eval(si, flux, normal)
+        landed = np.array(si.is_valid())
+        yield rows_of(si.p)[landed], rows_of(normal)[landed], rows_of(mi.Vector3f(flux))[landed]
