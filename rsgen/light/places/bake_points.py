@@ -39,7 +39,7 @@ def sample_points(
     unique_geometric = sign * geometric[first]
     within = min(_COVERED_TEXELS * texel_m, _COVERED_M)
     covered = find_covered(scene, position[first], unique_geometric, within)[index]
-    barriers = find_barriers(scene, lattice, position, geometric, index, place, (covered[0], covered[1]))
+    barriers = find_barriers(scene, lattice, position, geometric, index, place, (covered[0], covered[1]), texel_m)
     points = SurfacePoints(position[first], sign * normal[first], unique_geometric, barriers.piece)
     return points, index, barriers.reach
 

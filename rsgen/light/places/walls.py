@@ -2,7 +2,7 @@
 
 Light must not be mixed across: outside of a wall the sky shines on the floor, a texel from the room. Between every two
 neighbours of a triangle's grid a ray runs just above the surface. Where something is in its way, each of the two counts
-as far as that alone (`Barriers.reach`, for the lookup), and pieces of surface that are joined nowhere else are kept
+as far as that alone (`Barriers.reach`, for the lookup), and pieces of surface that are joined nowhere nearby are kept
 apart while light is smoothed and interpolated (`Barriers.piece`). What has something right above it, as a desk has
 under a sheet of paper, is seen by nobody and counts for nothing beside it.
 """
@@ -26,7 +26,9 @@ from rsgen.render.irradiance import FREE, REACH_LEVELS, Lattice, packed_reach
 from rsgen.render.rays import rays_from
 
 _HEIGHT_M = 1e-3  # of the rays above the surface
-_SHORTEST_M = 2e-3  # neighbours nearer than this are taken for joined
+_SHORTEST_M = 2e-4  # neighbours nearer than this are taken for joined
+_NEARBY = 8.0  # spacings: what is joined only farther away, through a door, is two pieces here
+_OFF = np.array([0.37, 0.43, 0.41])  # of cells of that size: walls stand at round numbers
 _CHUNK = 1 << 20
 
 
@@ -42,13 +44,14 @@ class Barriers:
 
 def find_barriers(
     scene: Any, lattice: Lattice, position: Float32Array, normal: Float32Array, index: IntArray, place: IntArray,
-    covered: tuple[NDArray[np.bool_], NDArray[np.bool_]],
+    covered: tuple[NDArray[np.bool_], NDArray[np.bool_]], spacing: float,
 ) -> Barriers:  # fmt: skip
     """Barriers of a scene between its lattice's points.
 
     position, normal: (points, 3), world, m: where light is looked at, and the geometric normal of the front. index:
     (2, points), the unique point of each one's front and back, the fronts' numbers before the backs'. place: (points,),
     alike where points are at one place of one surface. covered: (points,) of front and back, see `find_covered`.
+    spacing: of the lattice, m.
     """
     here, there, along = _neighbours(lattice)
     reach, piece, pieces = [], np.empty(int(index.max()) + 1, np.int64), 0
@@ -70,16 +73,40 @@ def find_barriers(
         first = int(index[side].min())
         nodes = (index[side] - first).astype(np.int32)
         count = int(nodes.max()) + 1
-        label = _connected((nodes, (place + count).astype(np.int32)), (nodes[here[~apart]], nodes[there[~apart]]))
+        places = (place + count).astype(np.int32)
+        label = _pieces(nodes, places, nodes[here[~apart]], nodes[there[~apart]], position / (_NEARBY * spacing))
         piece[first : first + count] = pieces + label[:count]
         pieces += int(label.max()) + 1
     return Barriers((reach[0], reach[1]), piece)
 
 
-def _connected(*edges: tuple[NDArray[np.int32], NDArray[np.int32]]) -> NDArray[np.int32]:
-    """(n,) label of the connected part that each node belongs to, given the nodes at both ends of edges."""
+def _pieces(
+    nodes: NDArray[np.int32], places: NDArray[np.int32], here: NDArray[np.int32], there: NDArray[np.int32],
+    scaled: NDArray,
+) -> IntArray:  # fmt: skip
+    """(n,) label of the piece that each node belongs to; of what is joined only beyond the cell that it is in, several.
+
+    nodes, places: (points,) the nodes of lattice points and of where these are; here, there: those of neighbours that
+    nothing stands between; scaled (points, 3): positions in units of a cell.
+    """
+    whole = _connected((nodes, places), (here, there))
+    cell = np.zeros((len(whole), 3), np.int32)
+    cell[nodes] = cell[places] = np.floor(scaled + _OFF)
+    mixed = (cell * np.array([73856093, 19349663, 83492791])).sum(axis=1)  # as hashes do (Teschner et al. 2003)
+    inside = [mixed[a] == mixed[b] for a, b in ((nodes, places), (here, there))]
+    part = _connected((nodes[inside[0]], places[inside[0]]), (here[inside[1]], there[inside[1]]), size=len(whole))
+    # Each part is of one piece in one cell. A piece is split only where it is in several there.
+    of_part = np.zeros((int(part.max()) + 1, 2), np.int64)
+    of_part[part] = np.column_stack([whole, mixed])
+    _, group, parts = np.unique(of_part, axis=0, return_inverse=True, return_counts=True)
+    several = (parts[group.ravel()] > 1)[part]
+    return np.where(several, int(whole.max()) + 1 + part.astype(np.int64), whole)
+
+
+def _connected(*edges: tuple[NDArray[np.int32], NDArray[np.int32]], size: int = 0) -> NDArray[np.int32]:
+    """(n,) label of the connected part that each of `size` nodes, or all there are, belongs to, given edges' ends."""
     a, b = (np.concatenate(ends) for ends in zip(*edges, strict=True))
-    size = int(max(a.max(), b.max())) + 1
+    size = size or int(max(a.max(), b.max())) + 1
     return connected_components(coo_array((np.ones(len(a), bool), (a, b)), shape=(size, size)), directed=False)[1]
 
 
