@@ -20,8 +20,8 @@ from rsgen.light.places.surface_points import SurfacePoints
 from rsgen.render.irradiance import IrradianceField, Lattice, make_field
 
 _COARSE_TEXELS = 3.0  # light off surfaces is gathered at points about this far apart
-_MOST_AGAIN = 1.0  # of so many points: those between them that are drawn for themselves
-_BOUNCE_RAYS = 32
+_MOST_AGAIN = 0.5  # of so many points: those between them that are drawn for themselves
+_BOUNCE_RAYS = 16
 _LAST_ROUNDS = 4  # the last bounce's rays: an eighth of them at first
 _REGION_M = 2.0  # parts of the scene, of like normals on one piece of surface, that light fades by itself in
 _FEW_LEFT = 0.02  # of the light at nearly all places: bounces that bring less are extrapolated from those before
