@@ -23,7 +23,7 @@ from rsgen.files import encode_yaml
 from rsgen.geometry.spline import Spline
 from rsgen.motion.clearance import clearance, plan_tour
 from rsgen.motion.floor_plan import HIGHEST_M, Cast, FloorPlan, find_floors, floor_plan, share_without_floor
-from rsgen.motion.gaze import choose_targets, seen_distances
+from rsgen.motion.gaze import Seen, choose_targets, seen_from
 from rsgen.motion.make import least_turning
 from rsgen.motion.statistics import motion_statistics
 from rsgen.motion.walk import free_region, ring, walk_inside
@@ -55,6 +55,7 @@ _CAMERAS = ("color", "depth", "T_color_depth", "truth", "imu", "mocap", "tremor"
 _SEEN_M = (0.4, 5.0)
 _VIEWS = 40
 _EMPTY = 0.3
+_FLAT = 0.1  # of the views, that hold nothing but one plane: for fewer, other ways are tried
 
 
 @dataclass(frozen=True)
@@ -136,6 +137,21 @@ class _Thing:
     ground_y: float
 
 
+@dataclass(frozen=True, eq=False)
+class _Tour:
+    """A config, its spline, that one's least distance to surfaces in m, and what the camera sees along it."""
+
+    config: Config
+    spline: Spline
+    least: float
+    seen: Seen
+
+    @property
+    def flat(self) -> float:
+        """Share of the views that hold nothing but one plane."""
+        return float(np.mean(self.seen.flat))
+
+
 def suggest_tour(
     file: Path, name: str | None, wish: Wish, scale: float = 1.0, up: Up = "y", like: Config | None = None
 ) -> Suggestion:
@@ -163,17 +179,24 @@ def suggest_tour(
     if (farthest := float(np.abs(scene.triangles).max())) > _FARTHEST_M:
         raise scene.wrong(f"reaches {farthest:.0f} m from the origin: scale it to metres, or move it to the origin")
     rng = np.random.default_rng(wish.seed)
+    best: _Tour | None = None
     for _ in range(_ATTEMPTS):
         tours = _through(scene, aim, wish, rng) if isinstance(aim, FloorPlan) else [_round(scene, aim, wish, rng)]
         config = _config(scene, tours, name, wish, like)
         spline = load_motion(config).spline
         least = clearance(spline, scene.triangles, max(_REACH_M, wish.clearance_m))
-        if least >= wish.clearance_m:
-            where = _room_text(aim, wish.clearance_m) if isinstance(aim, FloorPlan) else _thing_text(aim)
-            found = [f"{file.name}: {where}", *_motion_text(scene, config, spline, least)]
-            config, how = _exposed(loaded, config, spline)
-            return Suggestion(config, (*found, *how))
-    raise scene.wrong(f"no tour found that keeps {wish.clearance_m:g} m from all surfaces: reduce --clearance")
+        if least < wish.clearance_m:
+            continue
+        tour = _Tour(config, spline, least, seen_from(spline.pose(_times(config)), scene.cast))
+        if best is None or tour.flat < best.flat:
+            best = tour
+        if best.flat <= _FLAT:
+            break
+    if best is None:
+        raise scene.wrong(f"no tour found that keeps {wish.clearance_m:g} m from all surfaces: reduce --clearance")
+    where = _room_text(aim, wish.clearance_m) if isinstance(aim, FloorPlan) else _thing_text(aim)
+    config, how = _exposed(loaded, best.config, best.spline)
+    return Suggestion(config, (f"{file.name}: {where}", *_motion_text(best), *how))
 
 
 def _room(scene: _Scene, clearance_m: float) -> FloorPlan | None:
@@ -313,12 +336,15 @@ def _thing_text(thing: _Thing) -> str:
     return f"{text}; if that is too large, it may be in centimetres: a mesh file takes --scale 0.01"
 
 
-def _motion_text(scene: _Scene, config: Config, spline: Spline, least: float) -> list[str]:
-    """What the spline is like, and what its camera sees."""
+def _times(config: Config) -> FloatArray:
     assert config.motion is not None
-    stats = motion_statistics(spline, 0.0, config.motion.duration_s)
-    times = np.linspace(0.0, config.motion.duration_s, _VIEWS)
-    distance = seen_distances(spline.pose(times), scene.cast)
+    return np.linspace(0.0, config.motion.duration_s, _VIEWS)
+
+
+def _motion_text(tour: _Tour) -> list[str]:
+    """What the spline is like, and what its camera sees."""
+    stats = motion_statistics(tour.spline, 0.0, float(_times(tour.config)[-1]))
+    distance, least = tour.seen.distance, tour.least
     near, far = _SEEN_M
     seen, nothing = np.mean((distance >= near) & (distance <= far)), np.mean(~np.isfinite(distance))
     lines = [
@@ -329,4 +355,7 @@ def _motion_text(scene: _Scene, config: Config, spline: Spline, least: float) ->
     ]
     if nothing > _EMPTY:
         lines.append("much of the views is empty: a floor and walls would help a tracker")
+    if tour.flat > 0:
+        flat = f"one plane fills {100 * tour.flat:.0f} % of the views"
+        lines.append(f"{flat}: depth alone does not tell how the camera moves there")
     return lines

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 import re
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
 import yaml
+from scipy.spatial.transform import Rotation
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from rsgen.cli.main import main
@@ -19,9 +21,12 @@ from rsgen.console.configs import config_file
 from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
 from rsgen.motion.clearance import check_clearance
+from rsgen.motion.gaze import seen_from
 from rsgen.motion.statistics import motion_statistics
 from rsgen.produce.ground_truth import load_motion
 from rsgen.produce.suggest import Suggestion, Wish, suggest_tour
+from rsgen.render.rays import cast_rays
+from rsgen.render.scene import load_scene
 from rsgen.sequence.trajectory import Trajectory
 
 CLEARANCE_M = 0.2
@@ -169,6 +174,47 @@ def test_a_slow_camera_hardly_moves(folder: Path, seed: int) -> None:
     spline = spline_of(suggest_tour(folder / "furnished.ply", None, wish))
     assert motion_statistics(spline, 0.0, 4.0).length_m == pytest.approx(0.6, rel=0.02)
     assert trimesh.proximity.closest_point_naive(furnished(), way(spline))[1].min() >= CLEARANCE_M
+
+
+def test_a_view_of_one_plane_is_flat_and_one_of_a_corner_is_not() -> None:
+    """Rays into a wall 2 m ahead, and into that with another one to the right, by arithmetic."""
+
+    def cast(side_m: float) -> Any:
+        def into(origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            with np.errstate(divide="ignore"):
+                ahead, right = (2 - origin[:, 2]) / direction[:, 2], (side_m - origin[:, 0]) / direction[:, 0]
+            right = np.where(right > 0, right, np.inf)
+            normal = np.where((ahead < right)[:, None], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0])
+            return np.minimum(ahead, right), normal
+
+        return into
+
+    poses = np.stack([np.eye(4)] * 3)
+    poses[1, 2, 3], poses[2, :3, :3] = 1.2, Rotation.from_euler("y", -20, degrees=True).as_matrix()
+    view = seen_from(poses, cast(np.inf))
+    assert view.flat.all()
+    assert view.distance[0].max() == pytest.approx(2 * math.sqrt(1 + 0.5266**2 + 0.3647**2), rel=1e-3)
+    # 0.7 m to the right: seen from 2 m, no more from 0.8 m nor by who looks left.
+    np.testing.assert_array_equal(seen_from(poses, cast(0.7)).flat, [False, True, True])
+    nothing = seen_from(poses, lambda o, d: (np.full(len(o), np.inf), np.tile([0.0, 0.0, -1.0], (len(o), 1))))
+    assert not nothing.flat.any()
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_where_a_way_sees_one_bare_wall_another_is_looked_for_or_it_is_said(tmp_path: Path, seed: int) -> None:
+    """A shaft of 1.3 x 6 m with nothing in it: who keeps off its walls looks at one of them, wherever they turn."""
+    parts = [
+        ((0, -0.1, 0), (6, 0, 1.3)), ((0, 12, 0), (6, 12.1, 1.3)), ((-0.1, 0, 0), (0, 12, 1.3)),
+        ((6, 0, 0), (6.1, 12, 1.3)), ((0, 0, -0.1), (6, 12, 0)), ((0, 0, 1.3), (6, 12, 1.4)),
+    ]  # fmt: skip
+    trimesh.util.concatenate([block(*part) for part in parts]).export(tmp_path / "shaft.ply")
+    suggestion = suggest_tour(tmp_path / "shaft.ply", None, Wish(6.0, clearance_m=CLEARANCE_M, seed=seed))
+    times = np.linspace(0, 6, 40)
+    scene = load_scene(tmp_path / "shaft.ply")
+    share = np.mean(seen_from(spline_of(suggestion).pose(times), partial(cast_rays, scene)).flat)
+    said = [line for line in suggestion.found if line.startswith("one plane fills ")]
+    assert (share > 0) == bool(said)
+    assert not said or f" {100 * share:.0f} %" in said[0]
 
 
 def test_a_seed_decides_every_byte(folder: Path) -> None:
