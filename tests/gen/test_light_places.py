@@ -30,7 +30,7 @@ from rsgen.light import cache as lighting
 from rsgen.light.estimate import estimated_quality
 from rsgen.light.places.walls import find_covered
 from rsgen.light.sight import Sight
-from rsgen.render.irradiance import lattice_barycentric, make_field, make_lattice
+from rsgen.render.irradiance import lattice_area, lattice_barycentric, make_field, make_lattice
 from rsgen.render.scene import surface
 
 
@@ -85,6 +85,25 @@ def test_lattice_covers_every_triangle_at_its_spacing(shapes: Any, spacing: floa
             step = np.linalg.norm(np.diff(rows, axis=axis), axis=-1).max()
             assert step <= 1.5 * spacing + 1e-9 or lattice.cells[k, axis] == 1
             assert lattice.cells[k, axis] == 1 or step >= 0.6 * spacing
+
+
+@pytest.mark.parametrize("spacing", [0.02, 0.11, 10.0])
+def test_a_lattices_points_share_out_each_triangles_area(shapes: Any, spacing: float) -> None:
+    """And evenly: as many of the places spread over a triangle lie about a point as its share says."""
+    lattice = make_lattice(shapes, spacing)
+    vertices, faces = surface(shapes)
+    area = lattice_area(shapes, lattice)
+    face, _ = lattice_barycentric(lattice)
+    np.testing.assert_allclose(np.bincount(face, area), trimesh.Trimesh(vertices, faces, process=False).area_faces)
+    k = int(np.argmax(lattice.cells[:, 0] * lattice.cells[:, 1]))
+    nu, nv = lattice.cells[k]
+    rng = np.random.default_rng(0)
+    # Even over a triangle: u, of which the part below is u², and v between its rims.
+    u, v = np.sqrt(rng.random(1_000_000)), rng.random(1_000_000)
+    near = np.rint(u * nu).astype(int) * (nv + 1) + np.rint(v * nv).astype(int)
+    counted = np.bincount(near, minlength=(nu + 1) * (nv + 1)) / len(u)
+    own = area[face == k] / area[face == k].sum()
+    assert np.abs(counted - own).max() < 5 * np.sqrt(own.max() / len(u))
 
 
 def smooth(p: np.ndarray) -> np.ndarray:
