@@ -6,6 +6,7 @@ where it goes (photon mapping: Jensen 1996). What lands is averaged over decimet
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -18,7 +19,7 @@ from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.device.arrays import rows_of
 from rsgen.light.drawing.rounds import drawn_at
 from rsgen.light.drawing.specular import SPECULAR, lacquered, shone_along, transmitted
-from rsgen.light.places.bake_points import Interpolation, thin
+from rsgen.light.places.bake_points import thin
 from rsgen.light.places.sampling import chunks, r2, rotation
 from rsgen.light.places.surface_points import SurfacePoints
 from rsgen.render.irradiance import at_triangles, registry_id
@@ -27,6 +28,7 @@ from rsgen.render.scene import mesh_arrays
 _PHOTONS, _BATCH = 1 << 21, 1 << 18
 _TURNS = 4  # surfaces that a photon is followed over
 _CELL_M = 0.12  # photons are counted in cells of this size, of like normals on one piece of surface
+_LEAST = 0.05  # of a cell's square: where there is less surface, a photon or two would be a spark
 _NEAR = 8  # cells that each is shared out among
 
 
@@ -40,8 +42,10 @@ def lacquer_light(
     shapes = [shape for shape in scene.shapes() if shape.is_mesh() and lacquered(shape)]
     if not shapes:
         return np.zeros((len(which), 3), np.float32)
-    coarse, stands_for = thin(points, 2 * texel_m, which)
-    cells = which[thin(points, _CELL_M, which)[0]]
+    # Whatever pieces of surface there are: where these are small, next to nothing would land on each.
+    whole = replace(points, piece=np.zeros_like(points.piece))
+    coarse, stands_for = thin(whole, 2 * texel_m, which)
+    cells = which[thin(whole, _CELL_M, which)[0]]
     tree = cKDTree(_places(points.position[cells], points.normal[cells]))
 
     def spread(position: NDArray, normal: NDArray, what: NDArray) -> FloatArray:
@@ -54,8 +58,13 @@ def lacquer_light(
         flux += spread(*landed)
     each = np.bincount(stands_for, area)[:, None]
     around = spread(points.position[which[coarse]], points.normal[which[coarse]], each)
-    light = (flux / np.maximum(around, 1e-12)).astype(np.float32)
-    return Interpolation.between(points, cells, which, _CELL_M)(light)
+    light = flux / np.maximum(around, _LEAST * _CELL_M**2)
+    out = np.empty((len(which), 3), np.float32)
+    for begin in range(0, len(which), _BATCH):
+        part = which[begin : begin + _BATCH]
+        near, weights = _shares(tree, _places(points.position[part], points.normal[part]))
+        out[begin : begin + _BATCH] = np.einsum("nk,nkc->nc", weights, light[near])
+    return out
 
 
 def _places(position: NDArray, normal: NDArray) -> FloatArray:
@@ -66,7 +75,7 @@ def _shares(tree: cKDTree, places: FloatArray) -> tuple[IntArray, FloatArray]:
     """Cells (n, k) near places and how each place is shared out among them, (n, k), in all 1."""
     k = min(_NEAR, tree.n)
     distance, near = (np.reshape(v, (-1, k)) for v in tree.query(places, k=k, workers=-1))
-    weights = np.exp(-(distance**2)) + 1e-9
+    weights = np.exp(-1.5 * distance**2) + 1e-9
     return near, weights / weights.sum(axis=1, keepdims=True)
 
 
