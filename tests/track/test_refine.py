@@ -22,7 +22,7 @@ from rstrack.metrics.tracked import load_run
 from rstrack.report.build import write_report
 from rstrack.tracking.runs import refining
 from rstrack.tracking.runs.record import Noise
-from rstrack.tracking.runs.refining import refine_run
+from rstrack.tracking.runs.refining import Refined, refine_run
 from rstrack.tracking.runs.run import track
 
 
@@ -42,7 +42,8 @@ def ate(run: Path) -> float:
 def test_refining_makes_a_run_better(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "refined"
     assert main(["refine", str(run), "--out", str(out), "--rounds", "3", "--quiet"]) == 0
-    assert "rounds in" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "rounds in" in said and "IMU" not in said
     assert ate(out) < 0.85 * ate(run)
     info = json.loads((out / "run.json").read_text())
     rounds = info["refined"]["rounds"]
@@ -56,6 +57,11 @@ def test_refining_makes_a_run_better(run: Path, tmp_path: Path, capsys: pytest.C
     # As the run saw it.
     assert info["dataset"]["color_falloff"] == 1e-5
     assert "refined" in write_report(out).read_text()
+
+
+def test_that_an_imu_is_not_looked_at_is_said(run: Path) -> None:
+    refined = Refined(read_estimate(run), [{"moved_m": 1e-3, "keyframes": 1, "pairs": 2}], None, None, 1.0, True)
+    assert "the IMU was not looked at" in refined.text()
 
 
 @pytest.mark.parametrize(

@@ -47,13 +47,16 @@ _TYPICAL_M = 1.5
 
 @dataclass(frozen=True)
 class Refined:
-    """estimate: refined. rounds: what each did. before, after: errors, None without a truth."""
+    """estimate: refined. rounds: what each did. before, after: errors, None without a truth. inertial: the run used an
+    IMU, which refining does not.
+    """
 
     estimate: Estimate
     rounds: list[dict[str, Any]]
     before: Evaluation | None
     after: Evaluation | None
     seconds: float
+    inertial: bool
 
     def text(self) -> str:
         """A summary of a few lines."""
@@ -63,6 +66,10 @@ class Refined:
             f"{len(self.rounds)} rounds in {self.seconds:.0f} s: {last['keyframes']} keyframes, {last['pairs']} pairs "
             f"of a frame and a keyframe; poses moved by up to {moved} mm"
         ]
+        if self.inertial:
+            lines.append(
+                "the IMU was not looked at: where images tell little, over gaps and at bare walls, keep the run"
+            )
         if self.before is not None and self.after is not None:
             lines += [f"ATE before {1e3 * self.before.metrics.ate_rmse_m:.3f} mm", "", self.after.text()]
         return "\n".join(lines)
@@ -106,7 +113,7 @@ def refine_run(
     info["truth_offset"] = None if after is None else after.truth_offset
     write_estimate(out, result.stamps, result.T_world_depth, spline, info, estimate)
     result.moving.write(out, range(len(dataset)))
-    return Refined(result, told, before, after, seconds)
+    return Refined(result, told, before, after, seconds, options.inertial)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
