@@ -104,7 +104,7 @@ def _direct(
             scene, points, fine, patch, light.texel_m, light.direct_samples, beside, scatter, report
         )
         log.info("light of the sky: %.0f dB before smoothing", _as_db(left))
-    off_lacquer = lacquer_light(scene, points, fine, area, light.texel_m, follow)
+    off_lacquer = lacquer_light(scene, points, fine, area, light.texel_m, light.direct_samples, follow)
     seen = rough + means.mean(axis=0) + off_lacquer
     alive = _reached(surfaces, fine, fine_of_point, seen, _reporter(progress, 0.25, 0.05, "finding lit surfaces"))
     if not alive.any():

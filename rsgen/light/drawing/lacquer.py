@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from rsgen.array_types import Float32Array, FloatArray, IntArray
-from rsgen.device.arrays import rows_of
+from rsgen.device.arrays import aligned, rows_of
 from rsgen.light.drawing.rounds import drawn_at
 from rsgen.light.drawing.specular import SPECULAR, lacquered, shone_along, transmitted
 from rsgen.light.places.bake_points import thin
@@ -25,7 +25,7 @@ from rsgen.light.places.surface_points import SurfacePoints
 from rsgen.render.irradiance import at_triangles, registry_id
 from rsgen.render.scene import mesh_arrays
 
-_PHOTONS, _BATCH = 1 << 21, 1 << 18
+_A_SAMPLE, _MOST, _BATCH = 1 << 15, 1 << 21, 1 << 18  # photons: for each of a point's samples, in all, at a time
 _TURNS = 4  # surfaces that a photon is followed over
 _CELL_M = 0.12  # photons are counted in cells of this size, of like normals on one piece of surface
 _LEAST = 0.05  # of a cell's square: where there is less surface, a photon or two would be a spark
@@ -33,11 +33,12 @@ _NEAR = 8  # cells that each is shared out among
 
 
 def lacquer_light(
-    scene: Any, points: SurfacePoints, which: IntArray, area: FloatArray, texel_m: float, follow: bool
+    scene: Any, points: SurfacePoints, which: IntArray, area: FloatArray, texel_m: float, samples: int, follow: bool
 ) -> Float32Array:
     """Irradiance (n, 3) that lamps and sky send to the points `which` (n,) by way of lacquer and brushed metal.
 
-    area (n,): of the surface that each stands for, m². follow: whether lamps shine through panes.
+    area (n,): of the surface that each stands for, m². samples: of each lamp at a point, which photons go by. follow:
+    whether lamps shine through panes.
     """
     shapes = [shape for shape in scene.shapes() if shape.is_mesh() and lacquered(shape)]
     if not shapes:
@@ -54,7 +55,7 @@ def lacquer_light(
 
     # What lands and the surface it lands on are shared out alike, so that it does not matter how cells lie.
     flux = np.zeros((len(cells), 3))
-    for landed in _photons(scene, shapes, follow):
+    for landed in _photons(scene, shapes, min(_MOST, samples * _A_SAMPLE), follow):
         flux += spread(*landed)
     each = np.bincount(stands_for, area)[:, None]
     around = spread(points.position[which[coarse]], points.normal[which[coarse]], each)
@@ -109,7 +110,7 @@ def _seen_at(scene, p, n, number, begin, samples):
     return mi.Vector3f(even), mi.Vector3f(odd)
 
 
-def _photons(scene: Any, shapes: list[Any], follow: bool) -> Any:
+def _photons(scene: Any, shapes: list[Any], photons: int, follow: bool) -> Any:
     """Yields where photons land (n, 3), the normals (n, 3) of the sides they land on, and what they bring (n, 3), W."""
     meshes = [mesh_arrays(shape) for shape in shapes]
     corners = np.concatenate([vertices[faces].astype(np.float64) for vertices, faces in meshes])
@@ -117,21 +118,21 @@ def _photons(scene: Any, shapes: list[Any], follow: bool) -> Any:
     of = np.repeat(np.array([registry_id(s) for s in shapes], np.uint32), [len(faces) for _, faces in meshes])
     edges = corners[:, 1:] - corners[:, :1]
     growing = np.cumsum(0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1))
-    for begin in range(0, _PHOTONS, _BATCH):
-        number = np.arange(begin, begin + _BATCH)
+    for begin in range(0, photons, _BATCH):
+        number = np.arange(begin, min(photons, begin + _BATCH))
         # Spread evenly over the area, and over each triangle (Osada et al. 2002).
-        at = np.searchsorted(growing, (number + 0.5) / _PHOTONS * growing[-1]).clip(max=len(growing) - 1)
+        at = np.searchsorted(growing, (number + 0.5) / photons * growing[-1]).clip(max=len(growing) - 1)
         u, v = (number * a % 1 for a in (0.7548776662466927, 0.5698402909980532))
         root = np.sqrt(u)
         uv = np.stack([root * (1 - v), root * v], axis=1).astype(np.float32)
-        yield from _thrown(scene, at_triangles(of[at], face[at], uv)[1], begin, growing[-1] / _PHOTONS, follow)
+        yield from _thrown(scene, at_triangles(of[at], face[at], uv)[1], number, growing[-1] / photons, follow)
 
 
-def _thrown(scene: Any, si: Any, begin: int, area: float, follow: bool) -> Any:
-    """What photons from places on lacquer bring, each of which has `area`, surface after surface."""
+def _thrown(scene: Any, si: Any, which: IntArray, area: float, follow: bool) -> Any:
+    """What the photons `which` from places on lacquer bring, each of which has `area`, surface after surface."""
     specular = mi.BSDFContext()
     specular.type_mask = SPECULAR
-    number = dr.arange(mi.UInt32, _BATCH) + dr.opaque(mi.UInt32, begin)
+    number = mi.UInt32(aligned(which, np.uint32))
 
     def drawn(dimension: int) -> Any:
         return mi.Point2f(rotation(number, 310 + 2 * dimension), rotation(number, 311 + 2 * dimension))
