@@ -23,13 +23,13 @@ from rsgen.files import encode_yaml
 from rsgen.geometry.spline import Spline
 from rsgen.motion.clearance import clearance, plan_tour
 from rsgen.motion.floor_plan import HIGHEST_M, Cast, FloorPlan, find_floors, floor_plan, share_without_floor
-from rsgen.motion.gaze import Seen, choose_targets, seen_from
+from rsgen.motion.gaze import choose_targets, seen_from
 from rsgen.motion.make import least_turning
-from rsgen.motion.statistics import motion_statistics
 from rsgen.motion.walk import free_region, ring, walk_inside
 from rsgen.produce.exposure import suggested_gain
 from rsgen.produce.generate import scene_triangles
 from rsgen.produce.ground_truth import load_motion
+from rsgen.produce.tour import REACH_M, Tour, motion_text, room_text, thing_text, view_times
 
 _STOREYS = 6  # floors that are looked at, the largest first
 _LARGE = 0.3  # of the scene's ground, what walls enclose where the scene is a room
@@ -37,11 +37,10 @@ _ATTEMPTS = 4
 _CALM = (0.08, 0.2, 1.0)
 _BRISK_DEG_S = 35.0  # mean rotational speed of hand-held recordings: 15 to 40
 _SWAY_SHARE, _SWAY_DEG_S = 1.08, 1.5  # what the slow turning adds to that of the tour
-_ROOM_M, _LARGEST_THING_M, _SMALLEST_M, _FARTHEST_M = 2.5, 50.0, 0.001, 9000.0
+_ROOM_M, _SMALLEST_M, _FARTHEST_M = 2.5, 0.001, 9000.0
 _UNITS = {"centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254}
 _SKIN = 0.01  # of a scene's size: what lies so flat is its ground
 _SLACK_M = 0.04
-_REACH_M = 1.0  # so near a surface's distance is told
 _HAND: dict[str, Any] = {
     "sway": [0.7, 1.0, 0.7],
     "sway_hz": 0.25,
@@ -52,9 +51,6 @@ _HAND: dict[str, Any] = {
 }
 _LARGE_M2, _TEXELS = 300.0, 1.15e6  # a larger surface gets coarser light than the default: about so many texels
 _CAMERAS = ("color", "depth", "T_color_depth", "truth", "imu", "mocap", "tremor")
-_SEEN_M = (0.4, 5.0)
-_VIEWS = 40
-_EMPTY = 0.3
 _FLAT = 0.1  # of the views, that hold nothing but one plane: for fewer, other ways are tried
 
 
@@ -137,21 +133,6 @@ class _Thing:
     ground_y: float
 
 
-@dataclass(frozen=True, eq=False)
-class _Tour:
-    """A config, its spline, that one's least distance to surfaces in m, and what the camera sees along it."""
-
-    config: Config
-    spline: Spline
-    least: float
-    seen: Seen
-
-    @property
-    def flat(self) -> float:
-        """Share of the views that hold nothing but one plane."""
-        return float(np.mean(self.seen.flat))
-
-
 def suggest_tour(
     file: Path, name: str | None, wish: Wish, scale: float = 1.0, up: Up = "y", like: Config | None = None
 ) -> Suggestion:
@@ -179,24 +160,24 @@ def suggest_tour(
     if (farthest := float(np.abs(scene.triangles).max())) > _FARTHEST_M:
         raise scene.wrong(f"reaches {farthest:.0f} m from the origin: scale it to metres, or move it to the origin")
     rng = np.random.default_rng(wish.seed)
-    best: _Tour | None = None
+    best: Tour | None = None
     for _ in range(_ATTEMPTS):
         tours = _through(scene, aim, wish, rng) if isinstance(aim, FloorPlan) else [_round(scene, aim, wish, rng)]
         config = _config(scene, tours, name, wish, like)
         spline = load_motion(config).spline
-        least = clearance(spline, scene.triangles, max(_REACH_M, wish.clearance_m))
+        least = clearance(spline, scene.triangles, max(REACH_M, wish.clearance_m))
         if least < wish.clearance_m:
             continue
-        tour = _Tour(config, spline, least, seen_from(spline.pose(_times(config)), scene.cast))
+        tour = Tour(config, spline, least, seen_from(spline.pose(view_times(config)), scene.cast))
         if best is None or tour.flat < best.flat:
             best = tour
         if best.flat <= _FLAT:
             break
     if best is None:
         raise scene.wrong(f"no tour found that keeps {wish.clearance_m:g} m from all surfaces: reduce --clearance")
-    where = _room_text(aim, wish.clearance_m) if isinstance(aim, FloorPlan) else _thing_text(aim)
+    where = room_text(aim, wish.clearance_m) if isinstance(aim, FloorPlan) else thing_text(aim.high - aim.low)
     config, how = _exposed(loaded, best.config, best.spline)
-    return Suggestion(config, (f"{file.name}: {where}", *_motion_text(best), *how))
+    return Suggestion(config, (f"{file.name}: {where}", *motion_text(best), *how))
 
 
 def _room(scene: _Scene, clearance_m: float) -> FloorPlan | None:
@@ -318,44 +299,3 @@ def _exposed(loaded: Any, config: Config, spline: Spline) -> tuple[Config, tuple
         return config, ()
     color = config.color.model_copy(update={"exposure_gain": gain})
     return config.model_copy(update={"color": color}), (f"its light asks for an exposure gain of {gain:g}",)
-
-
-def _room_text(plan: FloorPlan, clearance_m: float) -> str:
-    cells = free_region(plan, clearance_m)
-    assert cells is not None
-    area, gap = plan.area_m2(cells), plan.floor.gap_m
-    high = f"{gap:.2f} m high, {area * gap:.1f} m³ free" if math.isfinite(gap) else "without a ceiling"
-    return f"a room, {high}; {plan.eye_y - plan.floor.y:.2f} m above the floor a camera has {area:.1f} m²"
-
-
-def _thing_text(thing: _Thing) -> str:
-    size = thing.high - thing.low
-    text = "a thing of {:.2f} x {:.2f} x {:.2f} m, and a way round it".format(*size)
-    if size.max() <= _LARGEST_THING_M:
-        return text
-    return f"{text}; if that is too large, it may be in centimetres: a mesh file takes --scale 0.01"
-
-
-def _times(config: Config) -> FloatArray:
-    assert config.motion is not None
-    return np.linspace(0.0, config.motion.duration_s, _VIEWS)
-
-
-def _motion_text(tour: _Tour) -> list[str]:
-    """What the spline is like, and what its camera sees."""
-    stats = motion_statistics(tour.spline, 0.0, float(_times(tour.config)[-1]))
-    distance, least = tour.seen.distance, tour.least
-    near, far = _SEEN_M
-    seen, nothing = np.mean((distance >= near) & (distance <= far)), np.mean(~np.isfinite(distance))
-    lines = [
-        f"{stats.length_m:.1f} m in {stats.duration_s:.0f} s: {stats.mean_speed_m_s:.2f} m/s, "
-        f"{stats.mean_rotation_deg_s:.0f} deg/s in the mean; "
-        + (f"nearest surface {least:.2f} m" if math.isfinite(least) else f"no surface within {_REACH_M:g} m"),
-        f"surfaces {near:g} to {far:g} m away in {100 * seen:.0f} % of the views, nothing in {100 * nothing:.0f} %",
-    ]
-    if nothing > _EMPTY:
-        lines.append("much of the views is empty: a floor and walls would help a tracker")
-    if tour.flat > 0:
-        flat = f"one plane fills {100 * tour.flat:.0f} % of the views"
-        lines.append(f"{flat}: depth alone does not tell how the camera moves there")
-    return lines
