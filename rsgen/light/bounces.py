@@ -71,7 +71,6 @@ def light_off_surfaces(
     of_fine = thin(points, spacing, fine)[0]
     coarse = fine[of_fine]
     to_fine = Interpolation.between(points, coarse, fine, spacing)
-
     region = thin(points, _REGION_M, coarse)[1]
 
     def thrown(off_surfaces: Float32Array, rays: int, share: Callable[[float], None]) -> Float32Array:
@@ -129,10 +128,9 @@ def _bounced(
         if not bounce:
             continue
         # From one bounce to the next what is added falls by the same part again and again, in the end. Floors and
-        # ceilings take turns, so two bounces are compared with the two before.
-        recent, earlier = sum(brought[-2:]), sum(brought[-3:-1])
-        if bounce == 1:
-            recent, earlier = brought[1], brought[0]
+        # ceilings take turns, so two bounces, where there are enough, are compared with the two before the last.
+        span = min(bounce, 2)
+        recent, earlier = sum(brought[-span:]), sum(brought[-span - 1 : -1])
         kept = np.clip(recent / np.maximum(earlier, 1e-30), 0, _MOST_KEPT)
         rest = (kept / (1 - kept))[region] * increase
         part = rest.mean(axis=1) / np.maximum(beside + gathered.mean(axis=1), 1e-30)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 
 from rsgen.array_types import FloatArray
 from rsgen.config.config import Config, validate_config
@@ -262,9 +263,7 @@ def wish_like(config: Config, wish: Wish) -> Wish:
 def _sections(scene: _Scene, like: Config | None) -> dict[str, Any]:
     """What a config says beside its motion and scene: coarser light in a large one, and the cameras of another."""
     given = {} if like is None else like.model_dump(mode="json", include=set(_CAMERAS), exclude_unset=True)
-    corners = scene.triangles
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    area = float((areas * scene.fineness**2).sum())
+    area = float((trimesh.triangles.area(scene.triangles) * scene.fineness**2).sum())
     if area > _LARGE_M2:
         given["light"] = {"texel_m": math.ceil(200.0 * math.sqrt(area / _TEXELS)) / 200.0}
     return given

@@ -14,6 +14,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 from rsgen.array_types import Float32Array, IntArray
@@ -136,8 +137,7 @@ def lattice_area(scene: Any, lattice: Lattice) -> NDArray[np.float64]:
     """Area (points,) in m² that each lattice point stands for on one side: a triangle's points share out its own."""
     meshes = [mesh_arrays(shape) for shape in scene.shapes() if shape.is_mesh()]
     corners = np.concatenate([vertices[faces].astype(np.float64) for vertices, faces in meshes])
-    edges = corners[:, 1:] - corners[:, :1]
-    triangle = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    triangle = trimesh.triangles.area(corners)
     counts = (lattice.cells + 1).prod(axis=1)
     face = np.repeat(np.arange(len(counts)), counts)
     nu, nv = lattice.cells[face].T

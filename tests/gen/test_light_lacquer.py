@@ -15,6 +15,7 @@ from rsgen.device.arrays import rows_of, vectors
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.light.drawing.gather import gathering
+from rsgen.light.drawing.lacquer import lacquer_seen
 from rsgen.light.places.surface_points import SurfacePoints
 from rsgen.render.baked import BakedIntegrator
 from rsgen.render.images import ColorRenderer
@@ -48,6 +49,13 @@ def on_lamp(count: int) -> tuple[np.ndarray, float]:
     u = (np.arange(count) + 0.5) / count * 2 - 1
     y, z = np.meshgrid(0.2 * u, 0.6 + 0.1 * u)
     return np.stack([np.full(y.size, LAMP_X), y.ravel(), z.ravel()], axis=-1), 0.4 * 0.2 / count**2
+
+
+def repeated(xyz: np.ndarray, times: int) -> SurfacePoints:
+    """Points of the floor, each so many times, side by side, to be drawn at with other random numbers."""
+    position = np.repeat(xyz, times, axis=0).astype(np.float32)
+    up = np.tile(np.array([0, 0, 1], np.float32), (len(position), 1))
+    return SurfacePoints(position, up, up, np.zeros(len(position), np.int64))
 
 
 def fresnel(cosine: np.ndarray, ior: float) -> np.ndarray:
@@ -101,6 +109,18 @@ def test_a_lamp_in_lacquer_lights_the_floor_by_fresnels_formula(tmp_path: Path) 
     assert np.quantile(np.abs(ratio - 1), 0.9) < 0.12
 
 
+@pytest.mark.parametrize("bsdf", [BLACK_LACQUER, SATIN])
+def test_looked_for_from_the_floor_it_is_the_same(tmp_path: Path, bsdf: str) -> None:
+    """What the estimate compares with: no photons, and no blur."""
+    xyz = beyond_the_lamp(3)
+    scene = scene_of(tmp_path, FLOOR, LAMP, wall(bsdf))
+    points = repeated(xyz, 256)
+    halves = lacquer_seen(scene, points, np.arange(len(points.position)), 1 << 13) / RADIANCE
+    expected = off_lacquer(xyz) if bsdf is BLACK_LACQUER else off_satin(scene, xyz)
+    ratio = halves.mean(axis=(0, 2)).reshape(len(xyz), -1).mean(axis=1) / expected
+    assert np.abs(ratio - 1).max() < 0.03
+
+
 def test_a_lamp_in_satin_lights_the_floor_as_its_lobe_says(tmp_path: Path) -> None:
     xyz = beyond_the_lamp(3)
     scene = scene_of(tmp_path, FLOOR, LAMP, wall(SATIN))
@@ -117,9 +137,7 @@ def test_a_matte_board_in_lacquer_is_seen_in_it_as_a_lamp_is(tmp_path: Path, bsd
     lattice = make_lattice(scene, 0.1)
     lit = np.full((lattice.points, 4), [np.pi, np.pi, np.pi, 1], np.float32)
     xyz = beyond_the_lamp(3)
-    position = np.repeat(xyz, 32, axis=0).astype(np.float32)  # each drawn at 32 times
-    up = np.tile(np.array([0, 0, 1], np.float32), (len(position), 1))
-    points = SurfacePoints(position, up, up, np.zeros(len(position), np.int64))
+    points = repeated(xyz, 32)
     rays, every = 1 << 14, np.arange(len(points.position))
     drawn = gathering(scene, make_field(lattice, lit, lit), points, every)(every, 0, rays, silent)
     got = drawn.sum(axis=0)[:, 0].reshape(len(xyz), -1).mean(axis=1) / rays

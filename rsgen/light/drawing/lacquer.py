@@ -6,12 +6,15 @@ where it goes (photon mapping: Jensen 1996). What lands is averaged over decimet
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -20,14 +23,17 @@ from rsgen.device.arrays import aligned, rows_of
 from rsgen.light.drawing.rounds import drawn_at
 from rsgen.light.drawing.specular import SPECULAR, lacquered, shone_along, transmitted
 from rsgen.light.places.bake_points import thin
-from rsgen.light.places.sampling import chunks, r2, rotation
+from rsgen.light.places.sampling import about_normal, chunks, rotation
 from rsgen.light.places.surface_points import SurfacePoints
 from rsgen.render.irradiance import at_triangles, registry_id
 from rsgen.render.scene import mesh_arrays
 
+# Where photons land, the normals of the sides they land on, and what each brings, W: (n, 3) each.
+Landed = tuple[NDArray, NDArray, NDArray]
+
 _A_SAMPLE, _MOST, _BATCH = 1 << 15, 1 << 21, 1 << 18  # photons: for each of a point's samples, in all, at a time
 _TURNS = 4  # surfaces that a photon is followed over
-_CELL_M = 0.12  # photons are counted in cells of this size, of like normals on one piece of surface
+_CELL_M = 0.12  # photons are counted in cells of this size, of like normals
 _LEAST = 0.05  # of a cell's square: where there is less surface, a photon or two would be a spark
 _NEAR = 8  # cells that each is shared out among
 
@@ -83,41 +89,25 @@ def _shares(tree: cKDTree, places: FloatArray) -> tuple[IntArray, FloatArray]:
 def lacquer_seen(scene: Any, points: SurfacePoints, which: IntArray, samples: int) -> Float32Array:
     """The same looked for from where it lands, in means of two halves (2, n, 3): it scatters, but blurs nothing."""
 
-    def sample(at: Any, _: IntArray, begin: int, count: int) -> Any:
-        return _seen_at(scene, *at, begin, count)
+    def sample(at: Sequence[Any], _: IntArray, begin: int, count: int) -> Any:
+        p, n, number = at
 
-    draw = drawn_at(which, lambda some, report: chunks(points, some, report), sample)
+        def light_along(ray: Any, i: Any, pick: Any) -> Any:
+            return dr.pi * shone_along(scene, ray, number, i, pick, mi.Bool(True))
+
+        return about_normal(p, n, number, begin, count, 301, light_along)
+
+    draw = drawn_at(which, partial(chunks, points), sample)
     return draw(np.arange(len(which)), 0, samples, lambda _: None) / np.float32(samples / 2)
 
 
-@dr.syntax
-def _seen_at(scene, p, n, number, begin, samples):
-    frame = mi.Frame3f(n)
-    offset = mi.Point2f(rotation(number, 301), rotation(number, 302))
-    lobe = rotation(number, 303)
-    i = dr.opaque(mi.UInt32, begin)
-    end = i + dr.opaque(mi.UInt32, samples)
-    even, odd = mi.Color3f(0), mi.Color3f(0)
-    while i < end:
-        d = frame.to_world(mi.warp.square_to_cosine_hemisphere(r2(i, offset)))
-        pick = lobe + mi.Float(i) * 0.6180339887498949
-        # With pdf cosθ/π, ∫ L cosθ dω is the mean of πL.
-        light = dr.pi * shone_along(scene, mi.Ray3f(p, d), number, i, pick - dr.floor(pick), mi.Bool(True))
-        first = (i & 1) == 0
-        even += dr.select(first, light, 0)
-        odd += dr.select(first, 0, light)
-        i += 1
-    return mi.Vector3f(even), mi.Vector3f(odd)
-
-
-def _photons(scene: Any, shapes: list[Any], photons: int, follow: bool) -> Any:
-    """Yields where photons land (n, 3), the normals (n, 3) of the sides they land on, and what they bring (n, 3), W."""
+def _photons(scene: Any, shapes: list[Any], photons: int, follow: bool) -> Iterator[Landed]:
+    """Yields what lands of so many photons that start from lit places on `shapes`, a batch and a turn at a time."""
     meshes = [mesh_arrays(shape) for shape in shapes]
     corners = np.concatenate([vertices[faces].astype(np.float64) for vertices, faces in meshes])
     face = np.concatenate([np.arange(len(faces), dtype=np.uint32) for _, faces in meshes])
     of = np.repeat(np.array([registry_id(s) for s in shapes], np.uint32), [len(faces) for _, faces in meshes])
-    edges = corners[:, 1:] - corners[:, :1]
-    growing = np.cumsum(0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1))
+    growing = np.cumsum(trimesh.triangles.area(corners))
     for begin in range(0, photons, _BATCH):
         number = np.arange(begin, min(photons, begin + _BATCH))
         # Spread evenly over the area, and over each triangle (Osada et al. 2002).
@@ -128,7 +118,7 @@ def _photons(scene: Any, shapes: list[Any], photons: int, follow: bool) -> Any:
         yield from _thrown(scene, at_triangles(of[at], face[at], uv)[1], number, growing[-1] / photons, follow)
 
 
-def _thrown(scene: Any, si: Any, which: IntArray, area: float, follow: bool) -> Any:
+def _thrown(scene: Any, si: Any, which: IntArray, area: float, follow: bool) -> Iterator[Landed]:
     """What the photons `which` from places on lacquer bring, each of which has `area`, surface after surface."""
     specular = mi.BSDFContext()
     specular.type_mask = SPECULAR

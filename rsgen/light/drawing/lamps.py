@@ -18,7 +18,7 @@ import numpy as np
 from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.light.drawing.rounds import drawn_at, in_rounds
 from rsgen.light.drawing.specular import first_scatterer, transmitted
-from rsgen.light.places.sampling import chunks, r2, rotation
+from rsgen.light.places.sampling import about_normal, chunks, r2, rotation
 from rsgen.light.places.surface_points import SurfacePoints
 
 MANY_EMITTERS = 24  # more are sampled together, as one
@@ -85,7 +85,8 @@ def lamp_light(
         return means, np.sqrt(square)
 
     def sample(at: Sequence[Any], _: IntArray, begin: int, count: int) -> Any:
-        return _near_at(scene, *at, begin, count, follow)
+        p, n, number = at
+        return about_normal(p, n, number, begin, count, 111, _left_to_rays(scene, p, n, follow))
 
     draw = drawn_at(which, partial(chunks, points), sample)
     own, left = in_rounds(
@@ -157,36 +158,21 @@ def _light_share(light_pdf: Any, cosine: Any) -> Any:
     return dr.rcp(1 + dr.maximum(cosine, 0) * dr.inv_pi / trusted)
 
 
-@dr.syntax
-def _near_at(scene, p, n, number, begin, rays, follow):
-    """Sums over two halves of the rays `begin` to `begin + rays` of what `_from_emitter` leaves to rays."""
-    frame = mi.Frame3f(n)
-    offset = mi.Point2f(rotation(number, 111), rotation(number, 112))
-    lobe = rotation(number, 113)
+def _left_to_rays(scene: Any, p: Any, n: Any, follow: bool) -> Callable[[Any, Any, Any], Any]:
+    """What rays from p about n bring of the light that `_from_emitter` leaves to them (see `about_normal`)."""
     it = dr.zeros(mi.Interaction3f, dr.width(p))
     it.p = p
     it.n = mi.Normal3f(n)
-    many = len(scene.emitters()) > MANY_EMITTERS
-    i = dr.opaque(mi.UInt32, begin)
-    end = i + dr.opaque(mi.UInt32, rays)
-    even, odd = mi.Color3f(0), mi.Color3f(0)
-    while i < end:
-        d = frame.to_world(mi.warp.square_to_cosine_hemisphere(r2(i, offset)))
-        pick = lobe + mi.Float(i) * 0.6180339887498949
-        pick -= dr.floor(pick)
-        _, si, _, through, turned = first_scatterer(scene, mi.Ray3f(p, d), pick, follow, mi.Bool(True))
+    any_lamp = len(scene.emitters()) > MANY_EMITTERS
+
+    def light_along(ray: Any, _: Any, pick: Any) -> Any:
+        cosine = dr.dot(n, ray.d)
+        _, si, _, through, turned = first_scatterer(scene, ray, pick, follow, mi.Bool(True))
         emitter = si.emitter(scene)
         lamp = (emitter != dr.zeros(mi.EmitterPtr)) & si.is_valid() & ~turned  # the others are `sky_light`'s
         towards = mi.DirectionSample3f(scene, si, it)
-        if dr.hint(many, mode="scalar"):
-            light_pdf = scene.pdf_emitter_direction(it, towards, lamp)
-        else:
-            light_pdf = emitter.pdf_direction(it, towards, lamp)
-        # With pdf cosθ/π, ∫ L cosθ dω is the mean of πL.
-        left_out = 1 - _light_share(light_pdf, dr.dot(n, d))
-        light = dr.select(lamp, dr.pi * through * emitter.eval(si, lamp) * left_out, 0)
-        first = (i & 1) == 0
-        even += dr.select(first, light, 0)
-        odd += dr.select(first, 0, light)
-        i += 1
-    return mi.Vector3f(even), mi.Vector3f(odd)
+        density = scene.pdf_emitter_direction if any_lamp else emitter.pdf_direction
+        left_out = 1 - _light_share(density(it, towards, lamp), cosine)
+        return dr.select(lamp, dr.pi * through * emitter.eval(si, lamp) * left_out, 0)
+
+    return light_along

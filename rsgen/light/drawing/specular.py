@@ -28,12 +28,16 @@ def shines(scene: Any) -> bool:
 
 def lacquered(shape: Any) -> bool:
     """Whether a surface is matte beneath what mirrors, or mirrors blurred: lacquer, satin, brushed metal."""
-    kind = int(shape.bsdf().flags()) if shape.bsdf() is not None else 0
+    kind = _kind(shape)
     return bool(kind & GLOSSY or (kind & _STRAIGHT and kind & _DIFFUSE and not kind & _NULL))
 
 
 def _kinds(scene: Any) -> list[int]:
-    return [int(shape.bsdf().flags()) for shape in scene.shapes() if shape.bsdf() is not None]
+    return [_kind(shape) for shape in scene.shapes()]
+
+
+def _kind(shape: Any) -> int:
+    return int(shape.bsdf().flags()) if shape.bsdf() is not None else 0
 
 
 @dr.syntax

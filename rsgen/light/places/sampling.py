@@ -28,6 +28,31 @@ def r2(i: Any, offset: Any) -> Any:
     return mi.Point2f(x - dr.floor(x), y - dr.floor(y))
 
 
+@dr.syntax
+def about_normal(p, n, number, begin, count, dimension, light_along):
+    """Sums (Vector3f) over two halves of the cosine-distributed rays `begin` to `begin + count` from p about n.
+
+    dimension: the first of three for random numbers (see `rotation`). light_along: of (ray, its number i, a uniform
+    number for lots) π times the radiance that comes along it: with pdf cosθ/π, ∫ L cosθ dω is the mean of πL.
+    """
+    frame = mi.Frame3f(n)
+    offset = mi.Point2f(rotation(number, dimension), rotation(number, dimension + 1))
+    lobe = rotation(number, dimension + 2)
+    i = dr.opaque(mi.UInt32, begin)
+    end = i + dr.opaque(mi.UInt32, count)
+    even, odd = mi.Color3f(0), mi.Color3f(0)
+    while i < end:
+        d = frame.to_world(mi.warp.square_to_cosine_hemisphere(r2(i, offset)))
+        pick = lobe + mi.Float(i) * 0.6180339887498949
+        pick -= dr.floor(pick)
+        light = light_along(mi.Ray3f(p, d), i, pick)
+        first = (i & 1) == 0
+        even += dr.select(first, light, 0)
+        odd += dr.select(first, 0, light)
+        i += 1
+    return mi.Vector3f(even), mi.Vector3f(odd)
+
+
 def chunks(
     points: SurfacePoints, which: NDArray, report: Callable[[float], None], size: int = _CHUNK
 ) -> Iterator[tuple[int, NDArray, Any, Any, Any]]:
