@@ -24,6 +24,7 @@ from rstrack.options import Options
 from rstrack.tracking.judgement.fault import Fault
 from rstrack.tracking.judgement.lost_track import FitHistory, coarseness, doubted, implausible
 from rstrack.tracking.judgement.uncertainty import Uncertainty
+from rstrack.tracking.judgement.verdict import verdict
 from rstrack.tracking.moving.leave_out import LeftOut
 from rstrack.tracking.window import LEVELS, Window
 
@@ -164,11 +165,12 @@ class Relocaliser:
                 fresh, solved, ref.pixels, pulls(fresh, trial.state), True, colorless
             ):
                 depth, solved = left.depth, trial.solve(fresh, (0,))
-        pulled = pulls(fresh, trial.state)
+        fault, pulled, solved = verdict(
+            self._fits, fresh, solved, trial.state, ref.pixels, True, colorless, lambda: trial.solve(fresh, (0,))
+        )
         uncertainty = before.found_anew(pulled.information)
         # Depth alone is much alike in many places.
         is_sure = len(fresh) > 1 or _is_sure(fresh[0], denied=bool(new.colors and ref.points))
-        fault = self._fits.fault(fresh, solved, ref.pixels, pulled, True, colorless)
         if fault or not is_sure or not uncertainty.is_known:
             return fault or (Fault.LEFT_OPEN if is_sure else Fault.UNSURE)
         return Found(trial, fresh, solved, ref, uncertainty, depth)

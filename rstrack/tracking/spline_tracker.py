@@ -33,6 +33,7 @@ from rstrack.tracking.bridging import Bridge
 from rstrack.tracking.frame_report import FrameReport
 from rstrack.tracking.judgement.fault import Fault
 from rstrack.tracking.judgement.lost_track import doubted, draws, implausible, is_settled
+from rstrack.tracking.judgement.verdict import verdict
 from rstrack.tracking.moving.leave_out import LeftOut
 from rstrack.tracking.relocalise import Relocaliser, without_misfits
 from rstrack.tracking.track import Track
@@ -267,8 +268,10 @@ class Tracker:
         if doubted(fresh):
             solved = window.solve(fresh, (0,), gauge, coupled)
         with track.terms.timer("judgement"):
-            pulled = pulls(on_reference, window.state)
-            fault = fits.fault(on_reference, solved, ref.pixels, pulled, young, colorless)
+            fault, pulled, solved = verdict(
+                fits, on_reference, solved, window.state, ref.pixels, young, colorless,
+                lambda: window.solve(fresh, (0,), gauge, coupled),
+            )  # fmt: skip
             uncertainty = track.covariances.uncertainty
             if ref.rolling is None:
                 # A rolling reference moves with what is aligned to it, which tells nothing of the two together.

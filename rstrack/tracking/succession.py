@@ -46,8 +46,10 @@ class Succession:
         self.recent: deque[DeviceFrame] = deque()
         # The newest frame, while it is the reference and cannot be rectified yet.
         self._unconverged: DeviceFrame | None = None
-        # The most pixels that a frame saw of the reference, and frames in a row whose colours did not fit its own.
-        self._pixels, self._colorless = 0, 0
+        # The most pixels that a frame saw of each reference: who comes back to one may see half of it.
+        self._pixels: dict[int, int] = {}
+        # Frames in a row whose colours did not fit the reference's own.
+        self._colorless = 0
         # How often pixels of the reference's grid have been seen through.
         self._gone: npt.NDArray[np.uint8] | None = None
 
@@ -57,9 +59,11 @@ class Succession:
 
     def overlap(self, fresh: Sequence[Observation]) -> float:
         """Part of the reference that a frame sees, of the most that any has seen."""
-        count = next((o.pixels for o in fresh if o.is_linearised and o.lin.count), 0)
-        self._pixels = max(self._pixels, count)
-        return count / self._pixels if count else 0.0
+        seen = next((o for o in fresh if o.is_linearised and o.lin.count), None)
+        if seen is None:
+            return 0.0
+        most = self._pixels[seen.ref.index] = max(self._pixels.get(seen.ref.index, 0), seen.pixels)
+        return seen.pixels / most
 
     def judged_colors(self, is_colorless: bool) -> None:
         """Whether the newest frame's colours were left out."""
@@ -129,7 +133,7 @@ class Succession:
             if not self.is_unfit(new):
                 rolling = self._maker.rolling(new.index, new.depth, new.colors, window.spline)
                 self.reference = replace(rolling, brightness=self._gains.of(new))
-                self._unconverged, self._pixels, self._gone = new, 0, None
+                self._unconverged, self._gone = new, None
             return False
         old = self._store.return_to(window.spline.pose(frozen.depth.exposure.mid_time), ref)
         if old is not None:
@@ -142,5 +146,5 @@ class Succession:
 
     def _refer_to(self, ref: Reference) -> None:
         self.reference = ref
-        self._unconverged, self._pixels, self._colorless = None, 0, 0
+        self._unconverged, self._colorless = None, 0
         self._gone = None

@@ -77,6 +77,27 @@ def test_even_images_stay_as_they_are(on_its_path: Dataset, monkeypatch: pytest.
     assert estimate_color_falloff(replace(on_its_path, images=Darkened(on_its_path, 0.3))).falloff == 0.0
 
 
+def test_where_depth_alone_slides_colours_help_with_a_guess_of_what_they_lose(
+    shaken: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: before a wall nothing was found, and the uneven colours drew the track away without a word."""
+    assert shaken.truth is not None
+    truth = (shaken.truth, shaken.truth.t_begin, shaken.truth.t_end)
+    asked: list[tuple[str, float | None]] = []
+
+    def path(dataset: Dataset, _frames: range, _o: Options, _p: object, _s: str, colors: str) -> object:
+        asked.append((colors, dataset.rig.color_falloff))
+        return truth if len(asked) == helps else (None, 0.0, 0.0)
+
+    monkeypatch.setattr(color_falloff, "geometric_track", path)
+    dark, all_tracks = replace(shaken, images=Darkened(shaken, 0.2)), list(color_falloff._TRACKS)
+    for helps in (1, 2, 3):
+        asked.clear()
+        assert estimate_color_falloff(dark).falloff == pytest.approx(0.2, abs=4e-3)
+        assert asked == all_tracks[:helps]
+    assert {colors for colors, _ in all_tracks[1:]} == {"always"} and all_tracks[2][1] > 0.0
+
+
 @needs_rpy
 def test_a_kinect_darkens(tmp_path: Path) -> None:
     """Nobody has measured it otherwise; two halves of the recording agree."""

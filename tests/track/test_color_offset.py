@@ -96,9 +96,11 @@ def test_a_track_that_colour_contradicts_is_not_believed(shaken: Dataset, monkey
     assert "does not fit the track" in found.reason and found.offset_s == 0.0
 
 
-@pytest.mark.parametrize(("color_is_timed", "methods"), [(False, ["rs-g"]), (True, ["rs-g", "rs-pg"])])
+@pytest.mark.parametrize(
+    ("colors", "methods"), [("never", ["rs-g"]), ("moving", ["rs-g", "rs-pg"]), ("always", ["rs-pg"])]
+)
 def test_a_clock_is_not_looked_for_with_colours_whatever_seems_to_move(
-    shaken: Dataset, monkeypatch: pytest.MonkeyPatch, color_is_timed: bool, methods: list[str]
+    shaken: Dataset, monkeypatch: pytest.MonkeyPatch, colors: color_pairs.Colors, methods: list[str]
 ) -> None:
     """A track that follows colours agrees with whatever clock it takes them to have."""
     asked = []
@@ -108,7 +110,7 @@ def test_a_clock_is_not_looked_for_with_colours_whatever_seems_to_move(
         return SimpleNamespace(reports=[SimpleNamespace(moving=0.1)], spline_valid=(), spline=None)
 
     monkeypatch.setattr(rough_track, "rough_track", seeing_things)
-    found = color_pairs.geometric_track(shaken, range(9), Options(), no_progress, "", color_is_timed)
+    found = color_pairs.geometric_track(shaken, range(9), Options(), no_progress, "", colors)
     assert asked == methods and found == (None, 0.0, 0.0)
 
 

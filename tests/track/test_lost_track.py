@@ -296,6 +296,30 @@ def test_pulls_of_what_is_far_away_may_be_larger() -> None:
         assert fault(learnt, [term("depth", 1e-3)], pulled=pulled) == says
 
 
+@pytest.mark.parametrize(
+    ("metres", "sigmas", "distance", "new", "is_far"),
+    [
+        (0.16, 11.0, 1.0, False, True),
+        (0.14, 50.0, 2.5, False, False),
+        (0.9, 9.0, 1.0, False, False),
+        (0.16, 11.0, 3.0, False, False),
+        (0.22, 11.0, 3.0, False, True),
+        (0.07, 7.0, 1.0, True, True),
+        (0.05, 50.0, 1.0, True, False),
+        (0.9, 5.5, 1.0, True, False),
+    ],
+)
+def test_whatever_is_usual_images_may_not_pull_by_so_much(
+    metres: float, sigmas: float, distance: float, new: bool, is_far: bool
+) -> None:
+    """Regression: a track by depth alone that began before a wall slid by metres without a word."""
+    wall, slides = (
+        [term("depth", 1e-3, distance=distance)],
+        Pulls(metres, metres, float("nan"), (sigmas, sigmas, np.nan)),
+    )
+    assert fault(FitHistory(), wall, pulled=slides, new=new) == (Fault.PULLED if is_far else "")
+
+
 def test_what_three_quarters_of_the_frames_do_not_show_does_not_become_usual() -> None:
     odd_one = Pulls(0.1, 3e-3, 3e-3, (4.9,) * 3)  # far, but within noise
     for share, says in ((21, "the images do not agree with the motion"), (23, "")):

@@ -23,6 +23,7 @@ from rstrack.data.dataset import Dataset
 from rstrack.images.pyramid import corner_distance2
 from rstrack.options import Options
 from rstrack.tracking.first_look.color_pairs import (
+    Colors,
     geometric_track,
     image_of,
     looked_up,
@@ -43,6 +44,9 @@ _FEWEST_POINTS, _FEWEST_PAIRS = 400, 6
 # what no camera has.
 _SIGMAS, _LEAST, _MOST = 4.0, 0.02, 2.0
 _ROUNDS, _REWEIGHTED = 5, 4
+# Tracks along which pairs are compared, until one is enough, with what falloff until then: before a wall depth alone
+# slides, and with it colours that are taken for even.
+_TRACKS: tuple[tuple[Colors, float], ...] = (("moving", 0.0), ("always", 0.0), ("always", 0.15), ("always", 0.3))
 
 
 @dataclass(frozen=True)
@@ -88,17 +92,23 @@ def estimate_color_falloff(
     if len(frames) < _FEWEST_FRAMES:
         return found
     for part in moving_parts(dataset, frames)[:_PARTS]:
-        pairs += _compared(dataset, part, options or Options(), progress)
-        if len(pairs) >= _FEWEST_PAIRS:
-            found = _solved(pairs)
+        before, tried = pairs, found
+        for colors, guess in _TRACKS:
+            own = _compared(dataset.with_color_falloff(guess), part, options or Options(), progress, colors)
+            if len(before) + len(own) >= _FEWEST_PAIRS:
+                tried = _solved(before + own)
+            if tried.sigma < found.sigma:
+                pairs, found = before + own, tried
+            if found.sigma < _ENOUGH:
+                break
         if found.sigma < _ENOUGH:
             break
     is_believed = max(_LEAST, _SIGMAS * found.sigma) < abs(found.falloff) < _MOST
     return found if is_believed else ColorFalloff(0.0, found.sigma, found.pairs)
 
 
-def _compared(dataset: Dataset, part: range, options: Options, progress: Progress) -> list[_Pair]:
-    spline, begin, end = geometric_track(dataset, part, options, progress, _STAGE, True)
+def _compared(dataset: Dataset, part: range, options: Options, progress: Progress, colors: Colors) -> list[_Pair]:
+    spline, begin, end = geometric_track(dataset, part, options, progress, _STAGE, colors)
     if spline is None:
         return []
     camera = dataset.rig.color_camera

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from rstrack.images.pyramid import intensity
 from rstrack.options import Options
 
 Progress = Callable[[str, float, str], None]
+Colors = Literal["never", "moving", "always"]
 
 # Frames that are tracked; of these, every so manieth has its depth looked up in pairs of images so many frames apart.
 _TRACKED, _EVERY, _APART = 60, 4, (4, 8)
@@ -58,21 +60,22 @@ def _shift(dataset: Dataset, frames: range) -> float:
 
 
 def geometric_track(
-    dataset: Dataset, frames: range, options: Options, progress: Progress, stage: str, color_is_timed: bool = False
+    dataset: Dataset, frames: range, options: Options, progress: Progress, stage: str, colors: Colors = "never"
 ) -> tuple[Spline | None, float, float]:
     """T_world_depth(t) of the frames from depth alone, and the longest time (begin, end) in s that it covers.
 
-    color_is_timed: take colours too where something moves by itself, since depth alone hardly tells what rests. Not
+    colors: take them too; "moving": where something moves by itself, since depth alone hardly tells what rests. Not
     where colour's clock is what is looked for: a track that follows colours agrees with them whatever it is.
     """
     from rstrack.tracking.first_look.rough_track import rough_track
 
     def done(share: float) -> None:
-        progress(stage, 0.7 * share, "tracking depth")
+        progress(stage, 0.7 * share, "tracking depth and colour" if colors == "always" else "tracking depth")
 
-    tracker = rough_track(dataset, frames, Options(method="rs-g", backend=options.backend), done)
-    if color_is_timed and any(report.moving for report in tracker.reports):
-        tracker = rough_track(dataset, frames, Options(backend=options.backend), done)
+    by_depth, by_both = (Options(method=method, backend=options.backend) for method in ("rs-g", "rs-pg"))
+    tracker = rough_track(dataset, frames, by_both if colors == "always" else by_depth, done)
+    if colors == "moving" and any(report.moving for report in tracker.reports):
+        tracker = rough_track(dataset, frames, by_both, done)
     if not tracker.spline_valid or tracker.spline is None:
         return None, 0.0, 0.0
     begin, end = max(tracker.spline_valid, key=lambda span: span[1] - span[0])
