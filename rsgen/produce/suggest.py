@@ -35,9 +35,10 @@ from rsgen.produce.tour import REACH_M, Tour, motion_text, room_text, thing_text
 _STOREYS = 6  # floors that are looked at, the largest first
 _LARGE = 0.3  # of the scene's ground, what walls enclose where the scene is a room
 _ATTEMPTS = 4
-_CALM = (0.08, 0.2, 1.0)
+_CALM = (0.08, 0.2, 1.0, 4.0)
 _BRISK_DEG_S = 35.0  # mean rotational speed of hand-held recordings: 15 to 40
 _SWAY_SHARE, _SWAY_DEG_S = 1.08, 1.5  # what the slow turning adds to that of the tour
+_SWAY_DEG = 20.0  # it turns to either side by so much at most where more is to be added: it is made faster instead
 _ROOM_M, _SMALLEST_M, _FARTHEST_M = 2.5, 0.001, 9000.0
 _UNITS = {"centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254}
 _SKIN = 0.01  # of a scene's size: what lies so flat is its ground
@@ -59,13 +60,14 @@ _FLAT = 0.1  # of the views, that hold nothing but one plane: for fewer, other w
 class Wish:
     """What a tour should be like: seconds and m/s, least distance to surfaces in m, and a seed for all that is chance.
 
-    Raises UserError, naming the option, if one of them is out of bounds.
+    rotation_deg_s: mean rotational speed; None: as the tour has it, up to what people do. Raises UserError, naming the option, if one of them is out of bounds.
     """
 
     seconds: float = 20.0
     speed_m_s: float = 0.35
     clearance_m: float = 0.2
     seed: int = 0
+    rotation_deg_s: float | None = None
 
     def __post_init__(self) -> None:
         bounds = {
@@ -178,7 +180,7 @@ def suggest_tour(
         raise scene.wrong(f"no tour found that keeps {wish.clearance_m:g} m from all surfaces: reduce --clearance")
     where = room_text(aim, wish.clearance_m) if isinstance(aim, FloorPlan) else thing_text(aim.high - aim.low)
     config, how = _exposed(loaded, best.config, best.spline)
-    return Suggestion(config, (f"{file.name}: {where}", *motion_text(best), *how))
+    return Suggestion(config, (f"{file.name}: {where}", *motion_text(best, wish.rotation_deg_s), *how))
 
 
 def _room(scene: _Scene, clearance_m: float) -> FloorPlan | None:
@@ -253,11 +255,12 @@ def _waypoints(p_world: FloatArray, target: FloatArray) -> tuple[Waypoint, ...]:
 
 
 def wish_like(config: Config, wish: Wish) -> Wish:
-    """The wish with the length and mean speed of a config's made motion, if it has one that lasts long enough."""
+    """The wish with the length and mean speeds of a config's made motion, if it has one that lasts long enough."""
     motion = config.motion
     if motion is None:
         return wish
-    return replace(wish, seconds=round(max(2.0, motion.duration_s), 2), speed_m_s=motion.mean_speed_m_s)
+    seconds, turning = round(max(2.0, motion.duration_s), 2), motion.mean_rotation_deg_s
+    return replace(wish, seconds=seconds, speed_m_s=motion.mean_speed_m_s, rotation_deg_s=turning)
 
 
 def _sections(scene: _Scene, like: Config | None) -> dict[str, Any]:
@@ -270,7 +273,8 @@ def _sections(scene: _Scene, like: Config | None) -> dict[str, Any]:
 
 
 def _config(scene: _Scene, tours: Sequence[tuple[Waypoint, ...]], name: str, wish: Wish, like: Config | None) -> Config:
-    """The config of the first tour that turns no faster than people do, or of the last."""
+    """The config of the first tour that turns no faster than people do, or than is wished, or of the last."""
+    most = _BRISK_DEG_S if wish.rotation_deg_s is None else wish.rotation_deg_s
     sections = _sections(scene, like)
     for waypoints in tours:
         motion = {
@@ -282,8 +286,10 @@ def _config(scene: _Scene, tours: Sequence[tuple[Waypoint, ...]], name: str, wis
         asked = validate_config(data, "motion suggest").motion
         assert asked is not None
         least = least_turning(asked, wish.seed)
-        motion["mean_rotation_deg_s"] = round(max(_SWAY_SHARE * least, least + _SWAY_DEG_S), 1)
-        if least <= _BRISK_DEG_S:
+        turning = max(_SWAY_SHARE * least, least + _SWAY_DEG_S, wish.rotation_deg_s or 0.0)
+        motion["mean_rotation_deg_s"] = round(turning, 1)
+        motion["sway_hz"] = max(_HAND["sway_hz"], round((turning - least) / (4.0 * _SWAY_DEG), 2))
+        if _SWAY_SHARE * least <= most:
             break
     return validate_config(data, "motion suggest")
 

@@ -19,6 +19,7 @@ REACH_M = 1.0  # so near a surface's distance is told
 _LARGEST_THING_M = 50.0
 _SEEN_M = (0.4, 5.0)
 _VIEWS = 40
+_AS_WISHED = 1.1
 _EMPTY = 0.3
 
 
@@ -60,8 +61,8 @@ def thing_text(size: FloatArray) -> str:
     return f"{text}; if that is too large, it may be in centimetres: a mesh file takes --scale 0.01"
 
 
-def motion_text(tour: Tour) -> list[str]:
-    """What the spline is like, and what its camera sees."""
+def motion_text(tour: Tour, rotation_deg_s: float | None) -> list[str]:
+    """What the spline is like, and what its camera sees. rotation_deg_s: mean that was wished for, if any."""
     stats = motion_statistics(tour.spline, 0.0, float(view_times(tour.config)[-1]))
     distance, least = tour.seen.distance, tour.least
     near, far = _SEEN_M
@@ -72,6 +73,8 @@ def motion_text(tour: Tour) -> list[str]:
         + (f"nearest surface {least:.2f} m" if math.isfinite(least) else f"no surface within {REACH_M:g} m"),
         f"surfaces {near:g} to {far:g} m away in {100 * seen:.0f} % of the views, nothing in {100 * nothing:.0f} %",
     ]
+    if rotation_deg_s is not None and stats.mean_rotation_deg_s > _AS_WISHED * rotation_deg_s:
+        lines.append(f"turns faster than the {rotation_deg_s:.0f} deg/s of the other: what it looks at asks for it")
     if nothing > _EMPTY:
         lines.append("much of the views is empty: a floor and walls would help a tracker")
     if tour.flat > 0:
