@@ -20,9 +20,8 @@ from rsgen.array_types import FloatArray, IntArray
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.adjustment.band import Band
-from rstrack.adjustment.unit import Biases, Sums, Unit
+from rstrack.adjustment.unit import Found, Sums, Unit, UnitState
 from rstrack.alignment.priors import ACCELERATION
-from rstrack.inertial.belief import Belief
 
 # The motion prior decides where nothing else does: in gaps, and in what a wall leaves open. The first and last control
 # points, which hardly any line tells of, are held tighter.
@@ -64,11 +63,11 @@ class Sighting:
 
 @dataclass(frozen=True)
 class State:
-    """A spline T_world_cam(t) and keyframes' T_world_base (4, 4) by their numbers; biases and gravity of an IMU."""
+    """A spline T_world_cam(t) and keyframes' T_world_base (4, 4) by their numbers; what is believed of an IMU."""
 
     spline: Spline
     keyframes: dict[int, FloatArray]
-    biases: Biases | None = None
+    unit: UnitState | None = None
 
     def errors(self, sightings: Sequence[Sighting]) -> FloatArray:
         """Twists (n, 6) from where sightings put the camera to where it is, in the camera's axes."""
@@ -76,23 +75,23 @@ class State:
         T = se3.inverse(keyframes) @ self.spline.pose(np.array([s.t for s in sightings]))
         return se3.log(se3.inverse(np.array([s.T_ref_cam for s in sightings])) @ T)
 
-    def moved(self, points: FloatArray, keyframes: FloatArray, biases: FloatArray | None = None) -> State:
+    def moved(self, points: FloatArray, keyframes: FloatArray, unit: FloatArray | None = None) -> State:
         """With left increments of the control points (n, 6) and of the keyframes (m, 6), in their order, and a step of
-        the biases and of gravity (k, 6)."""
+        the unit's own blocks (k, 6)."""
         T = se3.orthonormalise(se3.exp(points) @ self.spline.control_points)
         spline = Spline(T, self.spline.t0, self.spline.dt)
         steps = se3.exp(keyframes)
         return State(
             spline,
             {k: se3.orthonormalise(steps[n] @ K) for n, (k, K) in enumerate(self.keyframes.items())},
-            self.biases if self.biases is None or biases is None else self.biases.moved(biases),
+            self.unit if self.unit is None or unit is None else self.unit.moved(unit),
         )
 
     def placed(self, T: FloatArray) -> State:
         """All of it moved by T (4, 4) in the world."""
         spline = Spline(se3.orthonormalise(T @ self.spline.control_points), self.spline.t0, self.spline.dt)
-        biases = None if self.biases is None else self.biases.turned(T[:3, :3])
-        return State(spline, {k: se3.orthonormalise(T @ K) for k, K in self.keyframes.items()}, biases)
+        unit = None if self.unit is None else self.unit.turned(T[:3, :3])
+        return State(spline, {k: se3.orthonormalise(T @ K) for k, K in self.keyframes.items()}, unit)
 
 
 @dataclass(frozen=True)
@@ -100,7 +99,7 @@ class Graph:
     """What is known.
 
     at: the state around which the models of `seen` were made. keeps_motion: accelerations are to stay what they are
-    there; else to be small. unit: an IMU's readings, of which a state has the biases then.
+    there; else to be small. unit: an IMU's readings, of which a state has a `UnitState` then.
     """
 
     at: State
@@ -122,16 +121,12 @@ class Graph:
         points, keyframes = len(state.spline.control_points), len(state.keyframes)
         return state.moved(x[:points], x[points : points + keyframes], x[points + keyframes :]), x
 
-    def belief(self, state: State) -> Belief:
-        """What is believed there of the unit's biases, as they are in the end, and of gravity."""
-        assert state.biases is not None
-        end = 6 * (len(state.spline.control_points) + len(state.keyframes) + len(state.biases))
-        numbers = np.arange(end - 12, end - 3)
-        covariance = self._system(state, None).covariance(numbers)
-        return Belief(state.biases.last, np.asarray(np.linalg.inv(0.5 * (covariance + covariance.T))))
+    def found(self, state: State) -> Found | None:
+        """What is known there of the unit, if there is one."""
+        return None if state.unit is None else Found.of(state.unit, self._system(state, None).covariance())
 
     def _system(self, state: State, weights: FloatArray | None) -> _System:
-        others = 0 if self.unit is None or state.biases is None else len(state.biases)
+        others = 0 if self.unit is None or state.unit is None else len(state.unit)
         system = _System(len(state.spline.control_points), list(state.keyframes), others)
         moved_points = state.spline.control_points @ se3.inverse(self.at.spline.control_points)
         for seen in self.seen:
@@ -139,9 +134,9 @@ class Graph:
         if self.sightings:
             system.add_sightings(self.sightings, state, np.ones(len(self.sightings)) if weights is None else weights)
         accelerations = ACCELERATION
-        if self.unit is not None and state.biases is not None:
+        if self.unit is not None and state.unit is not None:
             accelerations = self.unit.accelerations
-            for sums in (*self.unit.known(state.biases, state.spline.dt), *self.unit.said(state.spline, state.biases)):
+            for sums in (*self.unit.known(state.unit, state.spline.dt), *self.unit.said(state.spline, state.unit)):
                 system.add(sums)
         before = self.at.spline.increments if self.keeps_motion else np.zeros_like(state.spline.increments)
         system.add_smoothness(state.spline, before, accelerations)
@@ -247,11 +242,10 @@ class _System:
             raise np.linalg.LinAlgError("the graph's system has no finite solution")
         return np.asarray(x.reshape(-1, 6))
 
-    def covariance(self, numbers: IntArray) -> FloatArray:
+    def covariance(self) -> Callable[[IntArray], FloatArray]:
         """Of unknowns by their numbers (k,): (k, k). Raises numpy.linalg.LinAlgError."""
-        inverted, unit = self._inverted(), np.zeros((self.g.size, len(numbers)))
-        unit[numbers, np.arange(len(numbers))] = 1.0
-        return np.stack([inverted(column)[numbers] for column in unit.T])
+        inverted, size = self._inverted(), self.g.size
+        return lambda numbers: np.stack([inverted(np.eye(1, size, int(k) % size)[0])[numbers] for k in numbers])
 
     def _inverted(self) -> Callable[[FloatArray], FloatArray]:
         """Takes a vector to H⁻¹ times it."""

@@ -20,14 +20,14 @@ from rsgen.geometry.spline import Spline
 from rstrack.adjustment.band import Band
 from rstrack.adjustment.graph import Graph, Seen, State
 from rstrack.adjustment.rigid import Usual
-from rstrack.adjustment.unit import Biases, Unit
+from rstrack.adjustment.unit import Found, Unit, UnitState
 from rstrack.alignment import brightness
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.normal_equations import Quadratic
 from rstrack.alignment.observation import Observation, observe
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.device_frame import DeviceFrame
-from rstrack.inertial.belief import ALIKE, Belief
+from rstrack.inertial.belief import ALIKE
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.options import Options
@@ -73,7 +73,7 @@ class Refiner:
 
     frames, times: numbers of the frames whose poses the spline knows, and their mid readouts (n,) s. begin: when (s)
     the camera stays where it was. load: frames by their numbers, on the device. usual: scales of residuals to begin
-    with.
+    with. unit: an IMU beside the camera; found: what has been learnt of it.
     """
 
     terms: Terms
@@ -85,8 +85,7 @@ class Refiner:
     load: Callable[[Sequence[int]], Iterator[DeviceFrame]]
     usual: Usual
     unit: Unit | None = None
-    biases: Biases | None = None
-    belief: Belief | None = None
+    found: Found | None = None
     _inflations: tuple[float, float] = field(default=(1.0, 1.0))
     _sharing: float = 1.0
     # Gain and offset of the last colour image against each keyframe.
@@ -124,7 +123,7 @@ class Refiner:
                     against.setdefault(k, _Against()).add(self._model(o, state, frame).scaled(weight))
                     kept.append(_Figures.of(o))
             told(0.5 + 0.5 * (n + 1) / len(self.frames), f"{pairs} pairs")
-        at = State(spline, {k: keyframes[k].T_world_base for k in sorted(against)}, self.biases)
+        at = State(spline, {k: keyframes[k].T_world_base for k in sorted(against)}, self._unit_state(spline))
         seen = [against[k].seen(k) for k in at.keyframes]
         moved = self._solved(at, seen).spline
         shift = np.linalg.norm((moved.pose(self.times) - spline.pose(self.times))[:, :3, 3], axis=1)
@@ -145,10 +144,15 @@ class Refiner:
             if np.abs(x[: len(at.spline.control_points) + len(at.keyframes)]).max() < _SETTLED:
                 break
         state = self._placed(state, at)
-        self.biases, self.belief = state.biases, graph.belief(state)
-        if state.biases is not None:
-            self.unit = self.unit.learnt(state.spline, state.biases)
+        self.found = graph.found(state)
+        if state.unit is not None:
+            self.unit = self.unit.learnt(state.spline, state.unit)
         return state
+
+    def _unit_state(self, spline: Spline) -> UnitState | None:
+        if self.unit is None:
+            return None
+        return self.unit.start(spline) if self.found is None else self.found.state
 
     def _placed(self, state: State, before: State) -> State:
         """With the camera where it was in the beginning."""

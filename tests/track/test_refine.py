@@ -32,6 +32,8 @@ from rstrack.tracking.runs.refining import Refined, refine_run
 from rstrack.tracking.runs.run import track
 
 BIAS = (0.01, -0.008, 0.006)
+# By how much the description has the IMU wrong: m, rad.
+OFF = np.array([2e-3, -1e-3, 3e-3, 0.012, -0.006, 0.009])
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +70,7 @@ def test_refining_makes_a_run_better(run: Path, tmp_path: Path, capsys: pytest.C
 
 
 def with_imu(run: Path, folder: Path) -> Path:
-    """The same run as if an IMU had been used, whose description is elsewhere."""
+    """The same run as if an IMU had been used, whose description is elsewhere, and not quite right."""
     tracked = load_run(run)
     assert tracked.dataset is not None
     shutil.copytree(tracked.dataset.root, folder / "seq")
@@ -78,7 +80,7 @@ def with_imu(run: Path, folder: Path) -> Path:
     densities = "\n".join(
         f"{n}: {getattr(read, n)}" for n in sorted(ImuConfig.model_fields) if "noise" in n or "walk" in n
     )
-    (folder / "unit.yaml").write_text(f"{densities}\nT_imu_depth: {np.eye(4).tolist()}\n")
+    (folder / "unit.yaml").write_text(f"{densities}\nT_imu_depth: {se3.exp(OFF).tolist()}\n")
     info = json.loads((run / "run.json").read_text())
     info["options"]["method"] = "rs-pgi"
     info["dataset"] |= {"path": str(folder / "seq"), "imu_file": str(folder / "unit.yaml")}
@@ -103,7 +105,10 @@ def test_an_imu_is_looked_at(run: Path, tmp_path: Path) -> None:
     off = np.abs(np.array(told["gyro_bias"]) - BIAS) / told["gyro_bias_sigma"]
     assert (off < 4.0).all() and max(told["gyro_bias_sigma"]) < 2e-3
     assert np.linalg.norm(told["gravity"]) == pytest.approx(9.80665, abs=0.1)
-    assert "IMU: gravity known to" in refined.text()
+    turned = se3.log(np.array(told["T_imu_depth"]))[3:]
+    assert np.linalg.norm(turned) < 0.5 * np.linalg.norm(OFF[3:])
+    assert (np.abs(turned) < 4.0 * np.array(told["T_imu_depth_sigma"][3:])).all()
+    assert "IMU: gravity known to" in refined.text() and "from where T_imu_depth has it" in refined.text()
     # Described by a file that is not there, or not there at all.
     with pytest.raises(UserError, match="nowhere"):
         refine_run(used, tmp_path / "out", imu_file=tmp_path / "nowhere.yaml")

@@ -114,10 +114,10 @@ def refine_run(
     info = estimate.info | {"refined": {"of": str(run.resolve()), "rounds": told, "seconds": seconds}}
     poses = se3.orthonormalise(moved @ estimate.T_world_depth)
     imu = _NOT_LOOKED_AT if options.inertial else ""
-    if refiner.unit is not None and refiner.belief is not None:
-        told_imu = imu_record.believed(refiner.belief, refiner.unit.sigma)
-        info["imu"] = (estimate.info.get("imu") or {}) | told_imu
-        imu = imu_record.refined_text(told_imu)
+    if refiner.unit is not None and refiner.found is not None:
+        believed = imu_record.believed(refiner.found.belief, refiner.unit.sigma)
+        info["imu"] = (estimate.info.get("imu") or {}) | believed | refiner.found.as_dict()
+        imu = f"{imu_record.refined_text(believed)}, {refiner.found.text(refiner.unit.recording.T_imu_depth)}"
     result = Estimate(estimate.stamps, poses, spline, info, estimate.moving)
     truth = truth_of(dataset)
     before, after = (evaluated(truth, each) for each in (estimate, result))
@@ -174,8 +174,7 @@ def _refiner(dataset: Dataset, estimate: Estimate, options: Options, noise: Nois
     terms, maker = Terms.of(device, options), KeyframeMaker.of(device)
     begin = float(estimate.stamps[0])
     unit = _unit(dataset, estimate, options)
-    biases = None if unit is None or estimate.spline is None else unit.start(estimate.spline)
-    return Refiner(terms, maker, options, numbers, times, begin, load, _usual(estimate.info), unit, biases)
+    return Refiner(terms, maker, options, numbers, times, begin, load, _usual(estimate.info), unit)
 
 
 def _unit(dataset: Dataset, estimate: Estimate, options: Options) -> Unit | None:
