@@ -263,9 +263,22 @@ def test_a_counterpart_has_the_cameras_of_another_config_and_is_as_long_and_fast
     assert tour.motion is not None and model.motion is not None
     assert tour.motion.mean_speed_m_s == model.motion.mean_speed_m_s and tour.motion.kind == "tour"
     assert tour.motion.duration_s == pytest.approx(model.motion.duration_s, rel=1e-3)
+    assert tour.motion.mean_rotation_deg_s == pytest.approx(model.motion.mean_rotation_deg_s, rel=0.1)
     assert main([*words, "--like", "robot_t2", "--seconds", "5", "--speed", "0.2"]) == 0
     slow = load_config(out).motion
     assert slow is not None and slow.mean_speed_m_s == 0.2 and slow.duration_s == pytest.approx(5.0, rel=1e-3)
+
+
+def test_a_counterpart_turns_as_its_model_does_or_says_why_not(folder: Path) -> None:
+    """Regression: robot_r1, which turns by 62 degrees a second, had one that turned by 11, robot_t1 of 16 one of 31."""
+    said = {}
+    for asked in (62.0, 1.0):
+        wish = Wish(4.0, speed_m_s=0.15, clearance_m=CLEARANCE_M, seed=3, rotation_deg_s=asked)
+        suggestion = suggest_tour(folder / "furnished.ply", None, wish)
+        stats = motion_statistics(spline_of(suggestion), 0.0, 3.9)
+        said[asked] = [line for line in suggestion.found if line.startswith("turns faster")]
+        assert stats.mean_rotation_deg_s == pytest.approx(asked, rel=0.1) or (said[asked] and asked == 1.0)
+    assert not said[62.0] and said[1.0][0].startswith("turns faster than the 1 deg/s of the other")
 
 
 def test_a_large_scene_gets_light_that_fits_into_memory(tmp_path: Path) -> None:
