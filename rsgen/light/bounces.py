@@ -48,10 +48,11 @@ class Surfaces:
 
     def sides(self, values: NDArray, alive: NDArray[np.bool_]) -> tuple[Float32Array, Float32Array]:
         """The same as (points, 4) of the lattice's front and back, as `make_field` takes it."""
-        front, back = (
-            np.where(alive[i, None], np.column_stack([values[i], 1 + far.astype(np.float32)]), 0).astype(np.float32)
-            for i, far in zip(self.index, self.reach, strict=True)
-        )
+        front, back = (np.empty((len(far), 4), np.float32) for far in self.reach)
+        for side, i, far in zip((front, back), self.index, self.reach, strict=True):
+            side[:, :3] = values[i]
+            side[:, 3] = 1 + far.astype(np.float32)
+            side[~alive[i]] = 0
         return front, back
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
@@ -188,10 +188,10 @@ class Interpolation:
         return cls(near, weights)
 
     def __call__(self, at_sources: Float32Array) -> Float32Array:
-        out = np.zeros((len(self.neighbours), 3), np.float32)
-        for k in range(self.neighbours.shape[1]):
-            out += self.weights[:, k, None] * at_sources[self.neighbours[:, k]]
-        return out
+        n, k = self.neighbours.shape
+        rows = np.arange(0, n * k + 1, k)
+        flat = self.weights.ravel(), self.neighbours.ravel(), rows
+        return np.asarray(csr_array(flat, shape=(n, len(at_sources))) @ at_sources.astype(np.float32, copy=False))
 
     def spread(self, at_sources: FloatArray) -> FloatArray:
         """Standard deviation (n,), by their weights, of the values (m,) that each one is interpolated from."""
