@@ -23,6 +23,7 @@ from rsgen.light.places.surface_points import SurfacePoints
 
 MANY_EMITTERS = 24  # more are sampled together, as one
 _ROUNDS = 6  # the last one ends at twice as many samples as are asked for
+_AT_ONCE = 4  # lamps that scatter at a place: half shadows of more seldom meet
 _FIRST_LOOK = 2
 _NEAR_RAYS, _NEAR_ROUNDS = 8, 7
 # Samples on lamps are trusted this much more than rays about the normal, and altogether where less were left to these.
@@ -77,7 +78,7 @@ def lamp_light(
             report(0.9 * (k + f) / len(kinds))
 
         own, left = in_rounds(
-            draw, patch, lambda _: light, scatter / math.sqrt(len(kinds)), first, rounds, math.inf, share
+            draw, patch, lambda _: light, scatter / math.sqrt(min(len(kinds), _AT_ONCE)), first, rounds, math.inf, share
         )
         means += own
         square += left**2
