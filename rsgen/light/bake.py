@@ -43,8 +43,9 @@ log = logging.getLogger("rsgen")
 
 
 # Raise when the method changes, so that older caches are not taken for new ones.
-METHOD = 5
+METHOD = 6
 _FINE_TEXELS = 0.9  # direct light is computed at points at least about this far apart
+_FIRST_LOOK_TEXELS = 3.0
 _FIRST_LOOK_RAYS = 12
 _FIRST_LOOK_BOUNCES = 2
 _AMBIENT = 0.1  # light off surfaces, as a part of the typical light off lamps, until it is known
@@ -92,9 +93,10 @@ def _direct(
     area (n,): of the surface that each stands for, m². Raises UserError if there are none.
     """
     scene, points, follow = surfaces.scene, surfaces.points, surfaces.follow
-    # A first look with few samples finds what any light reaches; only that gets the full effort.
-    rough = first_look(scene, points, fine, follow, _reporter(progress, 0.03, 0.04, "finding lit surfaces"))
-    grey = rough.mean(axis=1)
+    # A first look at some of the points tells how bright it is about, which is what scatter is compared with.
+    looked_at, stands_for = thin(points, _FIRST_LOOK_TEXELS * light.texel_m, fine)
+    report = _reporter(progress, 0.03, 0.04, "a first look at the light")
+    grey = first_look(scene, points, fine[looked_at], follow, report).mean(axis=1)[stands_for]
     beside = grey + _AMBIENT * typical(grey)
     patch = thin(points, PATCH * light.texel_m, fine)[1]
     means, left = np.zeros((2, len(fine), 3), np.float32), np.zeros(len(fine))
@@ -104,20 +106,20 @@ def _direct(
             scene, points, fine, patch, light.texel_m, light.direct_samples, beside, scatter, report
         )
         log.info("light of the sky: %.0f dB before smoothing", _as_db(left))
-    off_lacquer = lacquer_light(scene, points, fine, area, light.texel_m, light.direct_samples, follow)
-    seen = rough + means.mean(axis=0) + off_lacquer
-    alive = _reached(surfaces, fine, fine_of_point, seen, _reporter(progress, 0.25, 0.05, "finding lit surfaces"))
-    if not alive.any():
-        raise UserError("the scene is dark: no light reaches any surface; add an emitter or move it into the open")
-    fine, patch, means, left = fine[alive], _renumbered(patch[alive]), means[:, alive], left[alive]
-
-    report, part = _reporter(progress, 0.3, 0.3, "direct light"), _OF_THE_WHOLE * scatter
-    all_light = beside[alive] + means.mean(axis=(0, 2))
+    report, part = _reporter(progress, 0.25, 0.3, "direct light"), _OF_THE_WHOLE * scatter
+    all_light = beside + means.mean(axis=(0, 2))
     of_lamps, left_of_lamps = lamp_light(
         scene, points, fine, patch, light.direct_samples, follow, all_light, part, report
     )
     means += of_lamps
-    noisy = np.flatnonzero(np.hypot(left, left_of_lamps) > part)
+    del of_lamps
+    off_lacquer = lacquer_light(scene, points, fine, area, light.texel_m, light.direct_samples, follow)
+    seen = means.mean(axis=0) + off_lacquer
+    alive = _reached(surfaces, fine, fine_of_point, seen, _reporter(progress, 0.55, 0.05, "finding lit surfaces"))
+    if not alive.any():
+        raise UserError("the scene is dark: no light reaches any surface; add an emitter or move it into the open")
+    fine, patch, means = fine[alive], _renumbered(patch[alive]), means[:, alive]
+    noisy = np.flatnonzero(np.hypot(left, left_of_lamps)[alive] > part)
     direct = denoised(points, fine, means, scatter_of(patch, means), light.texel_m, noisy)
     return direct + off_lacquer[alive], alive
 

@@ -20,6 +20,7 @@ from rsgen.light.places.surface_points import SurfacePoints
 from rsgen.render.irradiance import IrradianceField, Lattice, make_field
 
 _COARSE_TEXELS = 3.0  # light off surfaces is gathered at points about this far apart
+_BOUNCE_TEXELS = 6.0  # and by all bounces but the last, whose many rays average over what these blur
 _MOST_AGAIN = 0.5  # of so many points: those between them that are drawn for themselves
 _BOUNCE_RAYS = 16
 _LAST_ROUNDS = 4  # the last bounce's rays: an eighth of them at first
@@ -48,10 +49,11 @@ class Surfaces:
 
     def sides(self, values: NDArray, alive: NDArray[np.bool_]) -> tuple[Float32Array, Float32Array]:
         """The same as (points, 4) of the lattice's front and back, as `make_field` takes it."""
-        front, back = (
-            np.where(alive[i, None], np.column_stack([values[i], 1 + far.astype(np.float32)]), 0).astype(np.float32)
-            for i, far in zip(self.index, self.reach, strict=True)
-        )
+        front, back = (np.empty((len(far), 4), np.float32) for far in self.reach)
+        for side, i, far in zip((front, back), self.index, self.reach, strict=True):
+            side[:, :3] = values[i]
+            side[:, 3] = 1 + far.astype(np.float32)
+            side[~alive[i]] = 0
         return front, back
 
 
@@ -68,19 +70,12 @@ def light_off_surfaces(
     if not light.bounces:
         return np.zeros_like(direct)
     points, spacing = surfaces.points, light.texel_m * _COARSE_TEXELS
+    beside = direct.mean(axis=1)
+    before = _before_the_last(surfaces, fine, direct, lit_by, light, lambda f: report(0.5 * f))
+    field = lit_by(direct + before)
     of_fine = thin(points, spacing, fine)[0]
     coarse = fine[of_fine]
     to_fine = Interpolation.between(points, coarse, fine, spacing)
-    region = thin(points, _REGION_M, coarse)[1]
-
-    def thrown(off_surfaces: Float32Array, rays: int, share: Callable[[float], None]) -> Float32Array:
-        draw = gathering(surfaces.scene, lit_by(direct + to_fine(off_surfaces)), points, coarse)
-        sums = draw(np.arange(len(coarse)), 0, rays, share)
-        return (sums.sum(axis=0) / rays).astype(np.float32)
-
-    beside = direct.mean(axis=1)
-    before = to_fine(_bounced(thrown, beside[of_fine], region, light, lambda f: report(0.5 * f)))
-    field = lit_by(direct + before)
     first = max(2, light.gather_rays >> (_LAST_ROUNDS - 1))
 
     def at_last(of: IntArray, apart: float, begin: float) -> Float32Array:
@@ -102,6 +97,25 @@ def light_off_surfaces(
         smooth[again] = at_last(again, light.texel_m, 0.75)
     report(1.0)
     return smooth
+
+
+def _before_the_last(
+    surfaces: Surfaces, fine: IntArray, direct: Float32Array, lit_by: Callable[[Float32Array], IrradianceField],
+    light: LightConfig, report: Callable[[float], None],
+) -> Float32Array:  # fmt: skip
+    """Light off surfaces (n, 3) at the points `fine` after all bounces but the last; arguments as above."""
+    points, spacing = surfaces.points, light.texel_m * _BOUNCE_TEXELS
+    of_fine = thin(points, spacing, fine)[0]
+    coarse = fine[of_fine]
+    to_fine = Interpolation.between(points, coarse, fine, spacing)
+    region = thin(points, _REGION_M, coarse)[1]
+
+    def thrown(off_surfaces: Float32Array, rays: int, share: Callable[[float], None]) -> Float32Array:
+        draw = gathering(surfaces.scene, lit_by(direct + to_fine(off_surfaces)), points, coarse)
+        sums = draw(np.arange(len(coarse)), 0, rays, share)
+        return (sums.sum(axis=0) / rays).astype(np.float32)
+
+    return to_fine(_bounced(thrown, direct.mean(axis=1)[of_fine], region, light, report))
 
 
 def _bounced(

@@ -22,7 +22,7 @@ from rsgen.light.drawing.gather import gathering
 from rsgen.light.drawing.lacquer import lacquer_seen
 from rsgen.light.drawing.lamps import lamp_light
 from rsgen.light.drawing.rounds import typical
-from rsgen.light.drawing.sky import has_sky_light, sky_light
+from rsgen.light.drawing.sky import LESS, has_sky_light, sky_light
 from rsgen.light.drawing.specular import first_scatterer, passes_light_on, shines
 from rsgen.light.places.surface_points import SurfacePoints
 from rsgen.light.sight import Sight
@@ -99,6 +99,7 @@ def _computed(scene: Any, field: IrradianceField, points: SurfacePoints, texel_m
     if shines(scene):
         halves += lacquer_seen(scene, points, everywhere, _SKY_SAMPLES)
     if has_sky_light(scene):
-        halves += sky_light(scene, points, everywhere, everywhere, texel_m, _SKY_SAMPLES, dark, math.inf, silent)[0]
+        asked = LESS * _SKY_SAMPLES  # of which this draws the first round
+        halves += sky_light(scene, points, everywhere, everywhere, texel_m, asked, dark, math.inf, silent)[0]
     draw = gathering(scene, field, points, everywhere)
     return (halves + draw(everywhere, 0, _RAYS, silent) / (_RAYS / 2)).astype(np.float64)

@@ -28,9 +28,11 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.light import cache as lighting
 from rsgen.light.drawing.guide import BINS, Guide, bin_of
-from rsgen.light.drawing.rounds import PATCH, in_rounds, scatter_of
+from rsgen.light.drawing.lamps import left_to_rays, near_lamps
+from rsgen.light.drawing.rounds import PATCH, in_rounds, scatter_of, shown
 from rsgen.light.places.bake_points import thin
 from rsgen.light.places.denoise import denoised
+from rsgen.light.places.sampling import about_normal
 from rsgen.light.places.surface_points import SurfacePoints
 from rsgen.render.baked import BakedIntegrator
 from rsgen.render.images import ColorRenderer
@@ -73,6 +75,30 @@ def test_rectangle_emitter(tmp_path: Path) -> None:
 
 
 SKY = '<emitter type="constant"><rgb name="radiance" value="1,2,3"/></emitter>'
+
+
+@pytest.mark.parametrize("lamp", ["rectangle", "sphere", "far"])
+def test_rays_are_drawn_where_lamps_leave_them_something(tmp_path: Path, lamp: str) -> None:
+    """Beside a lamp what samples on it leave is brought by rays; where none are drawn they would bring nothing."""
+    shape, z = ("sphere" if lamp == "sphere" else "rectangle"), (0.06 if lamp != "far" else 3.0)
+    turn = '<rotate x="1" angle="180"/>' if shape == "rectangle" else ""
+    size = 0.1 if shape == "rectangle" else 0.05
+    scene = scene_of(
+        tmp_path,
+        FLOOR,
+        f"""<shape type="{shape}"><transform name="to_world">{turn}<scale value="{size}"/><translate z="{z}"/>
+        </transform>{BLACK}<emitter type="area"><rgb name="radiance" value="1"/></emitter></shape>""",
+    )
+    xyz = floor_grid(0.9, 40).astype(np.float32)
+    up = np.tile(np.float32([0, 0, 1]), (len(xyz), 1))
+    points = SurfacePoints(xyz, up, up, np.zeros(len(xyz), np.int64))
+    which = np.arange(len(xyz))
+    origin, normal = points.on_device
+    rays = about_normal(origin, normal, mi.UInt32(which), 0, 256, 111, left_to_rays(scene, origin, normal, False))
+    brought = np.array(rays[0]).reshape(3, -1)[0] + np.array(rays[1]).reshape(3, -1)[0]
+    near = np.isin(which, near_lamps(scene, xyz))
+    assert not brought[~near].any() and (~near).sum() > 0.5 * len(near)
+    assert near.any() == brought.any() == (lamp != "far")
 
 
 def dark_room_with_a_skylight(folder: Path) -> list[str]:
@@ -143,6 +169,7 @@ def test_samples_go_where_light_scatters_and_shows() -> None:
     assert drawn[:500].max() == 8 and 128 <= drawn[500:1000].min() <= 256 and drawn[1000:].max() <= 32
     assert left.max() <= 0.04 and left[500:1000].mean() == pytest.approx(0.5 / np.sqrt(drawn[600]), rel=0.1)
     assert np.abs(means.mean(axis=(0, 2)) / true - 1)[500:1000].std() < 0.04
+    np.testing.assert_allclose(left, shown(patch, scatter_of(patch, means), means.mean(axis=(0, 2))), rtol=1e-5)
 
 
 def test_a_guide_draws_what_it_says() -> None:

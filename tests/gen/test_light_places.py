@@ -28,6 +28,8 @@ from rsgen import srgb
 from rsgen.config.config import LightConfig
 from rsgen.light import cache as lighting
 from rsgen.light.estimate import estimated_quality
+from rsgen.light.places.bake_points import Interpolation, sample_points, thin
+from rsgen.light.places.surface_points import SurfacePoints
 from rsgen.light.places.walls import find_covered
 from rsgen.light.sight import Sight
 from rsgen.render.irradiance import lattice_area, lattice_barycentric, make_field, make_lattice
@@ -132,6 +134,18 @@ def test_lookup_reproduces_a_linear_function_on_both_sides(shapes: Any, spacing:
     np.testing.assert_allclose(got, np.where(front, 1, -1)[:, None] * smooth(hit), atol=1e-4)
 
 
+def test_interpolation_is_a_mean_of_what_is_near() -> None:
+    rng = np.random.default_rng(7)
+    position, normal = rng.random((500, 3), np.float32), np.tile(np.float32([0, 0, 1]), (500, 1))
+    points = SurfacePoints(position, normal, normal, np.zeros(500, np.int64))
+    sources = np.arange(0, 500, 3)
+    between = Interpolation.between(points, sources, np.arange(500), 0.1)
+    values = rng.random((len(sources), 3), np.float32)
+    expected = np.einsum("nk,nkc->nc", between.weights.astype(float), values.astype(float)[between.neighbours])
+    np.testing.assert_allclose(between(values), expected, rtol=1e-5)
+    np.testing.assert_allclose(between(np.ones_like(values)), 1, rtol=1e-5)
+
+
 def test_points_that_are_not_alive_do_not_count(shapes: Any) -> None:
     lattice = make_lattice(shapes, 0.02)
     values = smooth(lattice_positions(shapes, lattice))
@@ -189,6 +203,36 @@ def test_what_is_buried_does_not_darken_its_neighbours(tmp_path: Path) -> None:
     got = lookup(scene, make_field(lattice, front, back), xyz + 0.005 * UP, -UP)[1]
     d = np.array([0.3, -0.2, 0.8]) - xyz
     np.testing.assert_allclose(got[:, 0], 0.8 / np.linalg.norm(d, axis=-1) ** 3, rtol=0.06)
+
+
+def test_points_are_in_the_order_of_triangles(shapes: Any) -> None:
+    """So that neighbours are side by side in memory; whether thinned or not."""
+    points, index, _ = sample_points(shapes, make_lattice(shapes, 0.02), 0.02)
+    first = np.sort(np.unique(index[0], return_index=True)[1])
+    np.testing.assert_array_equal(index[0][first], np.arange(len(first)))
+    chosen, stands_for = thin(points, 0.05)
+    assert (np.diff(chosen) > 0).all() and len(chosen) < 0.7 * len(points.position)
+    np.testing.assert_array_equal(stands_for[chosen], np.arange(len(chosen)))
+
+
+def test_surface_is_split_only_where_something_stands(tmp_path: Path) -> None:
+    """A board is one piece on each side, though cells have its two faces, which are joined elsewhere, in them."""
+    board = """<shape type="cube" id="board"><transform name="to_world"><scale x="0.5" y="0.5" z="0.01"/></transform>
+        <bsdf type="diffuse"/></shape>"""
+    wall = f"""<shape type="rectangle"><transform name="to_world"><scale value="2"/><rotate y="1" angle="90"/>
+        <translate x="0.213"/></transform>{BLACK}</shape>"""
+    pieces = []
+    for k, elements in enumerate(([board], [board, wall])):
+        folder = tmp_path / str(k)
+        folder.mkdir()
+        scene = scene_of(folder, *elements)
+        points, _, _ = sample_points(scene, make_lattice(scene, 0.03), 0.03)
+        on_top = (np.abs(points.position[:, 2] - 0.01) < 1e-3) & (points.geometric[:, 2] > 0.9)
+        on_top &= np.abs(points.position[:, 0]) < 0.48
+        pieces.append((points.position[on_top, 0], points.piece[on_top]))
+    assert len(np.unique(pieces[0][1])) == 1
+    x, piece = pieces[1]
+    assert not np.intersect1d(piece[(x > 0.15) & (x < 0.213)], piece[(x > 0.213) & (x < 0.28)]).size
 
 
 @pytest.mark.parametrize("door", [False, True])

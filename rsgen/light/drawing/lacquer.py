@@ -56,6 +56,9 @@ def lacquer_light(
     tree = cKDTree(_places(points.position[cells], points.normal[cells]))
 
     def spread(position: NDArray, normal: NDArray, what: NDArray) -> FloatArray:
+        # Neighbours after each other: a tree is searched several times as fast as in no order.
+        order = np.lexsort(np.floor(position / _CELL_M).T)
+        position, normal, what = position[order], normal[order], what[order]
         near, weights = _shares(tree, _places(position, normal))
         return np.stack([np.bincount(near.ravel(), (weights * w[:, None]).ravel(), len(cells)) for w in what.T], axis=1)
 

@@ -23,10 +23,12 @@ from rsgen.light.places.surface_points import SurfacePoints
 
 MANY_EMITTERS = 24  # more are sampled together, as one
 _ROUNDS = 6  # the last one ends at twice as many samples as are asked for
+_AT_ONCE = 4  # lamps that scatter at a place: half shadows of more seldom meet
 _FIRST_LOOK = 2
 _NEAR_RAYS, _NEAR_ROUNDS = 8, 7
-# Samples on lamps are trusted this much more than rays about the normal.
+# Samples on lamps are trusted this much more than rays about the normal, and altogether where less were left to these.
 _LIGHT_TRUST = 64.0
+_LEAST_LEFT = 0.01
 
 
 def lamps_of(scene: Any) -> list[Any]:
@@ -76,23 +78,45 @@ def lamp_light(
             report(0.9 * (k + f) / len(kinds))
 
         own, left = in_rounds(
-            draw, patch, lambda _: light, scatter / math.sqrt(len(kinds)), first, rounds, math.inf, share
+            draw, patch, lambda _: light, scatter / math.sqrt(min(len(kinds), _AT_ONCE)), first, rounds, math.inf, share
         )
         means += own
         square += left**2
 
-    if all(lamp.get_shape() is None for lamp in lamps_of(scene)):
+    near = near_lamps(scene, points.position[which])
+    if not len(near):
         return means, np.sqrt(square)
 
     def sample(at: Sequence[Any], _: IntArray, begin: int, count: int) -> Any:
         p, n, number = at
-        return about_normal(p, n, number, begin, count, 111, _left_to_rays(scene, p, n, follow))
+        return about_normal(p, n, number, begin, count, 111, left_to_rays(scene, p, n, follow))
 
-    draw = drawn_at(which, partial(chunks, points), sample)
+    draw = drawn_at(which[near], partial(chunks, points), sample)
+    effort = 2.0 * samples * len(which) / len(near)
     own, left = in_rounds(
-        draw, patch, lambda _: light, scatter, _NEAR_RAYS, _NEAR_ROUNDS, 2.0 * samples, lambda f: report(0.9 + 0.1 * f)
-    )
-    return means + own, np.sqrt(square + left**2)
+        draw, patch[near], lambda _: light[near], scatter, _NEAR_RAYS, _NEAR_ROUNDS, effort,
+        lambda f: report(0.9 + 0.1 * f),
+    )  # fmt: skip
+    means[:, near] += own
+    square[near] += left**2
+    return means, np.sqrt(square)
+
+
+def near_lamps(scene: Any, position: Float32Array) -> IntArray:
+    """Which places (n, 3) are so near a lamp that anything can be left to rays there (see `_light_share`)."""
+    near = np.zeros(len(position), bool)
+    for lamp in lamps_of(scene):
+        shape = lamp.get_shape()
+        if shape is None:
+            continue
+        if len(scene.emitters()) > MANY_EMITTERS or int(lamp.flags()) & int(mi.EmitterFlags.SpatiallyVarying):
+            return np.arange(len(position))
+        # Of samples spread over an area A the density, by solid angle, is d² / A at least; so is a sphere's own.
+        reach = math.sqrt(float(shape.surface_area()[0]) / (math.pi * _LIGHT_TRUST * _LEAST_LEFT))
+        box = shape.bbox()
+        off = np.clip(position, np.float32(box.min), np.float32(box.max)) - position
+        near |= np.einsum("ij,ij->i", off, off) < reach**2
+    return np.flatnonzero(near)
 
 
 def _kinds(scene: Any) -> list[tuple[Any, int, bool]]:
@@ -154,11 +178,11 @@ def _from_emitter(scene, emitter, p, n, number, begin, samples, dimension, follo
 def _light_share(light_pdf: Any, cosine: Any) -> Any:
     """The light samples' part in the balance heuristic with cosine-distributed rays."""
     # Written so that a grazing emitter's infinite density gives 1, and 0 / 0 does not occur.
-    trusted = dr.maximum(_LIGHT_TRUST * light_pdf, 1e-20)
-    return dr.rcp(1 + dr.maximum(cosine, 0) * dr.inv_pi / trusted)
+    left = dr.maximum(cosine, 0) * dr.inv_pi / dr.maximum(_LIGHT_TRUST * light_pdf, 1e-20)
+    return dr.select(left < _LEAST_LEFT, 1, dr.rcp(1 + left))
 
 
-def _left_to_rays(scene: Any, p: Any, n: Any, follow: bool) -> Callable[[Any, Any, Any], Any]:
+def left_to_rays(scene: Any, p: Any, n: Any, follow: bool) -> Callable[[Any, Any, Any], Any]:
     """What rays from p about n bring of the light that `_from_emitter` leaves to them (see `about_normal`)."""
     it = dr.zeros(mi.Interaction3f, dr.width(p))
     it.p = p

@@ -30,9 +30,12 @@ def typical(light: FloatArray) -> float:
 
     Hardly any is a hundredth of what the place has that half of all light falls short of; 0 where there is none at all.
     """
-    rising = np.sort(light)
+    return _typical(np.sort(light))
+
+
+def _typical(rising: FloatArray) -> float:
     total = np.cumsum(rising)
-    if not len(light) or total[-1] <= 0:
+    if not len(rising) or total[-1] <= 0:
         return 0.0
     common = rising[np.searchsorted(total, 0.5 * total[-1])]
     return float(np.median(rising[rising >= 0.01 * common]))
@@ -44,12 +47,17 @@ def shown(patch: IntArray, sigma: FloatArray, grey: FloatArray) -> FloatArray:
     A camera is exposed for what is typical: in the shade of that, sRGB shows less of an error. In what is brighter than
     that, as in what is overexposed, it is taken for no more.
     """
-    light = (np.bincount(patch, grey) / np.bincount(patch))[patch]
-    exposed = typical(light)
+    size = np.bincount(patch)
+    return sigma * _shown_of_one(size, np.bincount(patch, grey) / np.maximum(size, 1))[patch]
+
+
+def _shown_of_one(size: IntArray, light: FloatArray) -> FloatArray:
+    """`shown` of an error of 1 in each of the patches, which have so many points and such light, (p,) each."""
+    order = np.argsort(light)
+    exposed = _typical(np.repeat(light[order], size[order]))
     if exposed <= 0:
-        return np.zeros(len(grey))
-    part = np.maximum(light / exposed, 1e-12)
-    return sigma / np.maximum(light, 1e-30) * np.minimum(part, 1.0) ** _TONE
+        return np.zeros(len(light))
+    return np.minimum(np.maximum(light / exposed, 1e-12), 1.0) ** _TONE / np.maximum(light, 1e-30)
 
 
 def in_rounds(
@@ -62,29 +70,36 @@ def in_rounds(
     brings. After the first round, each draws as much again as all before it, where more than `scatter` is left, the
     worst first while no more than `effort` samples a point are drawn on the average.
     """
-    n = len(patch)
+    n, size = len(patch), np.bincount(patch)
     sums, drawn = np.zeros((2, n, 3), np.float32), np.zeros(n, np.int64)
-    todo: IntArray = np.arange(n)
-    means: Float32Array = sums
-    left = np.zeros(n)
+    apart, grey, left = np.zeros((3, n))  # of a point's halves, squared; of their mean
+    todo: IntArray | slice = slice(None)
+    of_todo = np.arange(n)
     for k in range(rounds):
-        begin = int(drawn[todo[0]])
+        begin = int(drawn[of_todo[0]])
         count = first if k == 0 else begin
 
         def share(f: float, k: int = k) -> None:
             report((k + f) / rounds)
 
-        sums[:, todo] += draw(todo, begin, count, share)
+        own = sums[:, todo] + draw(of_todo, begin, count, share)
+        sums[:, todo] = own
         drawn[todo] += count
-        means = np.divide(sums, drawn[:, None] / 2, dtype=np.float32)
-        left = shown(patch, scatter_of(patch, means), light(means.mean(axis=(0, 2))))
-        todo = todo[left[todo] > scatter]
+        halves = own.mean(axis=2, dtype=np.float64) * (2 / (begin + count))
+        apart[todo], grey[todo] = (halves[0] - halves[1]) ** 2, halves.mean(axis=0)
+        # A patch's points have one error, so it is patches that are looked at.
+        sigma = np.sqrt(np.bincount(patch, apart) / np.maximum(4 * size, 1))
+        shows = sigma * _shown_of_one(size, np.bincount(patch, light(grey)) / np.maximum(size, 1))
+        left = shows[patch]
+        of_todo = of_todo[left[of_todo] > scatter]
         most = int(min(max(0.0, effort * n - drawn.sum()) / drawn.max(), n))
-        todo = np.sort(todo[np.argsort(-left[todo], kind="stable")[:most]])
-        if not len(todo):
+        if len(of_todo) > most:
+            of_todo = np.sort(of_todo[np.argsort(-left[of_todo], kind="stable")[:most]])
+        todo = of_todo
+        if not len(of_todo):
             break
     report(1.0)
-    return means, left
+    return np.divide(sums, drawn[:, None] / 2, out=sums), left
 
 
 def drawn_at(which: IntArray, chunks: Callable[..., Any], sample: Callable[..., Any]) -> Draw:

@@ -26,10 +26,10 @@ from rsgen.light.places.surface_points import SurfacePoints
 
 _CELL_M = 0.5  # parts of the scene that have one histogram, of like normals on one piece of surface
 _FIRST_LOOK_TEXELS, _FIRST_LOOK_SAMPLES = 3.0, 64
-_ROUNDS = 6
-# Directions drawn in all, of those of the first round: where light is hard to find the worst places get them.
+LESS = 4  # part of the samples that is drawn at first: most places see no sky, nor lamps by ways with turns
+_ROUNDS, _ROUNDS_OF_LAMPS = 8, 6
+# Directions drawn at most in all, of the samples asked for: where light is hard to find the worst places get them.
 _EFFORT = 4.0
-_LESS = 4  # without a sky, what comes is lamps' light off mirrors and through thick glass: mostly nothing
 
 
 def has_sky_light(scene: Any) -> bool:
@@ -43,9 +43,9 @@ def sky_light(
 ) -> tuple[Float32Array, FloatArray]:  # fmt: skip
     """Irradiance from the sky and from lamps by ways with turns: off mirrors and through thick glass.
 
-    samples: directions at each point at first; more where the standard error exceeds `scatter`, as far as the effort
-    allows; beside (n,): light that points have from elsewhere, in grey. Returns means (2, len(which), 3) of two halves
-    of what was drawn, and the error (n,) left (see `rounds`).
+    samples: directions at each point, one in `LESS` at first; more where the standard error exceeds `scatter`, as far
+    as the effort allows; beside (n,): light that points have from elsewhere, in grey. Returns means (2, len(which), 3)
+    of two halves of what was drawn, and the error (n,) left (see `rounds`).
     """
     cell, follow = thin(points, _CELL_M, which)[1], passes_light_on(scene)
     guide = _learned(scene, points, which, cell, texel_m, follow)
@@ -54,8 +54,8 @@ def sky_light(
         return _sky_at(scene, guide, mi.UInt32(aligned(cell[here], np.uint32)), *at, begin, count, follow)
 
     draw = drawn_at(which, partial(chunks, points), sample)
-    first = samples if scene.environment() is not None else max(4, samples // _LESS)
-    return in_rounds(draw, patch, lambda own: own + beside, scatter, first, _ROUNDS, _EFFORT * samples, report)
+    first, rounds = max(4, samples // LESS), _ROUNDS_OF_LAMPS if scene.environment() is None else _ROUNDS
+    return in_rounds(draw, patch, lambda own: own + beside, scatter, first, rounds, _EFFORT * samples, report)
 
 
 def _learned(
@@ -67,7 +67,8 @@ def _learned(
         found = _first_look(scene, p, n, number, follow)
         dr.eval(found)
         here = cell[coarse[first : first + len(part)]]
-        np.add.at(seen, (np.repeat(here, _FIRST_LOOK_SAMPLES), np.array(found[0])), np.array(found[1]))
+        bins = np.repeat(here * BINS, _FIRST_LOOK_SAMPLES) + np.array(found[0])
+        np.add.at(seen.reshape(-1), bins, np.array(found[1]))  # much faster by one index than by two
     return Guide.learned(seen)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
@@ -86,9 +86,22 @@ def _unique(position: NDArray, normal: NDArray, island: IntArray) -> tuple[list[
     index = np.empty((2, len(island)), np.int32)
     for side, sign in enumerate((1, -1)):
         _, first, inverse = np.unique(_mix(*position.T, *(sign * normal).T), return_index=True, return_inverse=True)
-        index[side] = inverse + sum(map(len, chosen))
+        first, rank = _in_order(first)
+        index[side] = rank[inverse] + sum(map(len, chosen))
         chosen.append(first)
     return chosen, index, np.unique(_mix(*position.T, island), return_inverse=True)[1]
+
+
+def _in_order(chosen: IntArray) -> tuple[IntArray, IntArray]:
+    """Numbers of points (n,) rising, and the place of each of `chosen` among them.
+
+    Points run along triangles then: neighbours are beside each other in memory, and rays from them go like ways. In the
+    order of hashes, which is none, searches take four times as long.
+    """
+    order = np.argsort(chosen)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return chosen[order], rank
 
 
 def _islands(vertices: NDArray, faces: NDArray) -> IntArray:
@@ -141,9 +154,10 @@ def thin(points: SurfacePoints, spacing: float, among: IntArray | None = None) -
     order = np.lexsort((off_centre, key))
     sorted_key = key[order]
     starts = np.concatenate([[True], sorted_key[1:] != sorted_key[:-1]])
+    chosen, rank = _in_order(order[starts])
     stands_for = np.empty(len(order), np.int64)
-    stands_for[order] = np.cumsum(starts) - 1
-    return order[starts], stands_for
+    stands_for[order] = rank[np.cumsum(starts) - 1]
+    return chosen, stands_for
 
 
 @dataclass(frozen=True)
@@ -174,10 +188,10 @@ class Interpolation:
         return cls(near, weights)
 
     def __call__(self, at_sources: Float32Array) -> Float32Array:
-        out = np.zeros((len(self.neighbours), 3), np.float32)
-        for k in range(self.neighbours.shape[1]):
-            out += self.weights[:, k, None] * at_sources[self.neighbours[:, k]]
-        return out
+        n, k = self.neighbours.shape
+        rows = np.arange(0, n * k + 1, k)
+        flat = self.weights.ravel(), self.neighbours.ravel(), rows
+        return np.asarray(csr_array(flat, shape=(n, len(at_sources))) @ at_sources.astype(np.float32, copy=False))
 
     def spread(self, at_sources: FloatArray) -> FloatArray:
         """Standard deviation (n,), by their weights, of the values (m,) that each one is interpolated from."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rsgen.device.arrays import aligned
 from rsgen.light.places.surface_points import SurfacePoints
 
-_CHUNK = 1 << 18
+_CHUNK = 1 << 20
 
 
 def rotation(index: Any, dimension: Any) -> Any:

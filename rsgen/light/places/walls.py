@@ -29,6 +29,7 @@ _HEIGHT_M = 1e-3  # of the rays above the surface
 _SHORTEST_M = 2e-4  # neighbours nearer than this are taken for joined
 _NEARBY = 8.0  # spacings: what is joined only farther away, through a door, is two pieces here
 _OFF = np.array([0.37, 0.43, 0.41])  # of cells of that size: walls stand at round numbers
+_HASHES = 1 << 26
 _CHUNK = 1 << 20
 
 
@@ -74,33 +75,47 @@ def find_barriers(
         nodes = (index[side] - first).astype(np.int32)
         count = int(nodes.max()) + 1
         places = (place + count).astype(np.int32)
-        label = _pieces(nodes, places, nodes[here[~apart]], nodes[there[~apart]], position / (_NEARBY * spacing))
+        label = _pieces((nodes, places), (nodes[here], nodes[there]), apart, position / (_NEARBY * spacing))
         piece[first : first + count] = pieces + label[:count]
         pieces += int(label.max()) + 1
     return Barriers((reach[0], reach[1]), piece)
 
 
 def _pieces(
-    nodes: NDArray[np.int32], places: NDArray[np.int32], here: NDArray[np.int32], there: NDArray[np.int32],
-    scaled: NDArray,
+    same: tuple[NDArray[np.int32], NDArray[np.int32]], beside: tuple[NDArray[np.int32], NDArray[np.int32]],
+    apart: NDArray[np.bool_], scaled: NDArray,
 ) -> IntArray:  # fmt: skip
     """(n,) label of the piece that each node belongs to; of what is joined only beyond the cell that it is in, several.
 
-    nodes, places: (points,) the nodes of lattice points and of where these are; here, there: those of neighbours that
-    nothing stands between; scaled (points, 3): positions in units of a cell.
+    same: (points,) the nodes of lattice points and of where these are; beside: those of neighbours, and apart: whether
+    anything stands between; scaled (points, 3): positions in units of a cell.
     """
-    whole = _connected((nodes, places), (here, there))
+    joined = beside[0][~apart], beside[1][~apart]
+    whole = _connected(same, joined).astype(np.int64)
     cell = np.zeros((len(whole), 3), np.int32)
-    cell[nodes] = cell[places] = np.floor(scaled + _OFF)
-    mixed = (cell * np.array([73856093, 19349663, 83492791])).sum(axis=1)  # as hashes do (Teschner et al. 2003)
-    inside = [mixed[a] == mixed[b] for a, b in ((nodes, places), (here, there))]
-    part = _connected((nodes[inside[0]], places[inside[0]]), (here[inside[1]], there[inside[1]]), size=len(whole))
+    cell[same[0]] = cell[same[1]] = np.floor(scaled + _OFF)
+    mixed = (cell * np.array([73856093, 19349663, 83492791])).sum(axis=1) % _HASHES  # Teschner et al. 2003
+    # What is several parts in a cell where nothing stands, as the sides of a board are, is no matter of walls.
+    crossed = np.zeros(_HASHES, bool)
+    for ends in beside:
+        crossed[mixed[ends[apart]]] = True
+    near = np.flatnonzero(crossed[mixed])
+    if not len(near):
+        return whole
+    number = np.full(len(whole), -1, np.int32)
+    number[near] = np.arange(len(near))
+    inside = [(number[a] >= 0) & (mixed[a] == mixed[b]) for a, b in (same, joined)]
+    edges = [(number[a[i]], number[b[i]]) for (a, b), i in zip((same, joined), inside, strict=True)]
+    part = _connected(*edges, size=len(near))
     # Each part is of one piece in one cell. A piece is split only where it is in several there.
-    of_part = np.zeros((int(part.max()) + 1, 2), np.int64)
-    of_part[part] = np.column_stack([whole, mixed])
-    _, group, parts = np.unique(of_part, axis=0, return_inverse=True, return_counts=True)
-    several = (parts[group.ravel()] > 1)[part]
-    return np.where(several, int(whole.max()) + 1 + part.astype(np.int64), whole)
+    of_part = np.zeros(int(part.max()) + 1, np.int64)
+    of_part[part] = whole[near] * _HASHES + mixed[near]
+    _, group, parts = np.unique(of_part, return_inverse=True, return_counts=True)
+    several = (parts[group] > 1)[part]
+    split = near[several]
+    first = int(whole.max()) + 1
+    whole[split] = first + part[several]
+    return whole
 
 
 def _connected(*edges: tuple[NDArray[np.int32], NDArray[np.int32]], size: int = 0) -> NDArray[np.int32]:
