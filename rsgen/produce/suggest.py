@@ -60,7 +60,9 @@ _FLAT = 0.1  # of the views, that hold nothing but one plane: for fewer, other w
 class Wish:
     """What a tour should be like: seconds and m/s, least distance to surfaces in m, and a seed for all that is chance.
 
-    rotation_deg_s: mean rotational speed; None: as the tour has it, up to what people do. Raises UserError, naming the option, if one of them is out of bounds.
+    rotation_deg_s: mean rotational speed; None: as the tour has it, up to what people do.
+
+    Raises UserError, naming the option, if one of them is out of bounds.
     """
 
     seconds: float = 20.0

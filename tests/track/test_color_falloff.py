@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rsgen.array_types import ByteArray
+from rsgen.array_types import ByteArray, FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
 from rstrack.data.camera_file import read_rig
@@ -96,6 +96,29 @@ def test_where_depth_alone_slides_colours_help_with_a_guess_of_what_they_lose(
         assert estimate_color_falloff(dark).falloff == pytest.approx(0.2, abs=4e-3)
         assert asked == all_tracks[:helps]
     assert {colors for colors, _ in all_tracks[1:]} == {"always"} and all_tracks[2][1] > 0.0
+
+
+class Covered:
+    """Images whose depth shows something half as far away in the left half."""
+
+    def __init__(self, dataset: Dataset) -> None:
+        self._images, self.color = dataset.images, dataset.images.color
+
+    def depth(self, k: int) -> FloatArray:
+        z = self._images.depth(k).copy()
+        z[:, : z.shape[1] // 2] *= 0.5
+        return z
+
+
+def test_points_that_depth_does_not_show_where_they_were_do_not_count(shaken: Dataset) -> None:
+    """Regression: beside things that move the corners were found to be 16 % brighter where they were darker."""
+    assert shaken.truth is not None
+    p_world, covered = color_pairs.points_of(shaken, shaken.truth, 0), replace(shaken, images=Covered(shaken))
+    still = color_pairs.rests(shaken, shaken.truth, p_world, 0)
+    hidden = color_pairs.rests(covered, shaken.truth, p_world, 0)
+    assert still.mean() > 0.97 and not (hidden & ~still).any() and 0.4 < hidden.mean() < 0.6
+    later = color_pairs.rests(shaken, shaken.truth, p_world, 6)
+    assert 0.5 < later.mean() < 1.0
 
 
 @needs_rpy

@@ -30,6 +30,7 @@ from rstrack.tracking.first_look.color_pairs import (
     moving_parts,
     pairs_in,
     points_of,
+    rests,
 )
 
 # For the progress bar.
@@ -123,7 +124,8 @@ def _compared(dataset: Dataset, part: range, options: Options, progress: Progres
             stamp = dataset.color_stamps[m : m + 1]
             seen.append(looked_up(dataset, spline, images(m), points(k), stamp)[0])
             at.append(looked_up(dataset, spline, distance2, points(k), stamp)[0])
-        good = np.isfinite([*seen, *at]).all(axis=0)
+        later = int(np.abs(dataset.stamps - dataset.color_stamps[j]).argmin())
+        good = np.isfinite([*seen, *at]).all(axis=0) & rests(dataset, spline, points(k), later)
         if np.count_nonzero(good) >= _FEWEST_POINTS:
             found.append(_Pair((seen[0][good], seen[1][good]), (at[0][good], at[1][good])))
         progress(_STAGE, 0.7 + 0.3 * (n + 1) / len(chosen), "comparing colour images")

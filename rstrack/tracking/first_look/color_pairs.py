@@ -11,6 +11,8 @@ import numpy.typing as npt
 
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rstrack.data.dataset import Dataset
 from rstrack.images.pyramid import intensity
@@ -29,6 +31,8 @@ _ACROSS = 106
 # 8-bit values that are clipped, and their neighbours; in any channel, since how bright images are is compared here.
 _BLACK, _WHITE = 4, 250
 _ROUNDS = 3
+# A depth image shows a point where it is no further off than this and this part of its distance: noise, and a pixel.
+_SAME_M, _SAME = 0.02, 0.02
 
 
 def moving_parts(dataset: Dataset, frames: range) -> list[range]:
@@ -113,6 +117,34 @@ def points_of(dataset: Dataset, spline: Spline, k: int) -> FloatArray:
     return se3.transform(T[lines.astype(np.int64)], rays[known] * z[known, None])
 
 
+def rests(dataset: Dataset, spline: Spline, p_world: FloatArray, k: int) -> npt.NDArray[np.bool_]:
+    """Which of points (n, 3) depth image k shows where they were: not what moves by itself, or what it hides."""
+    camera, shutter = dataset.rig.depth_camera, dataset.rig.depth_shutter
+    times = shutter.line_mid_time(dataset.stamps[k], np.arange(shutter.line_count(camera)), camera)
+    uv, p_cam = _projected(camera, shutter, se3.inverse(spline.pose(times)), p_world)
+    seen = camera.contains(uv)
+    u, v = np.rint(np.where(seen[:, None], uv, 0.0)).astype(np.int64).T
+    z = dataset.depth(k)[np.minimum(v, camera.height - 1), np.minimum(u, camera.width - 1)]
+    off = np.abs(z - p_cam[:, 2])
+    return np.asarray(seen & (z > 0.0) & (off < _SAME_M + _SAME * p_cam[:, 2]))
+
+
+def _projected(
+    camera: Camera, shutter: Shutter, T_cam_world: FloatArray, p_world: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Pixels (n, 2) and points (n, 3) in the camera of points (n, 3), whose lines have poses (lines, 4, 4).
+
+    Equation (3) by fixed-point iteration, with the pose of the nearest line: a hundredth of a pixel.
+    """
+    line = np.full(len(p_world), len(T_cam_world) // 2)
+    for _ in range(_ROUNDS):
+        p_cam = se3.transform(T_cam_world[line], p_world)
+        uv, _ = camera.project(p_cam)
+        at = np.nan_to_num(shutter.line_of_pixel(uv, camera))
+        line = np.clip(np.rint(at), 0, len(T_cam_world) - 1).astype(np.int64)
+    return uv, p_cam
+
+
 def image_of(color: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
     """Intensities (h/2, w/2), NaN near clipped pixels."""
     grey = np.asarray(cv2.pyrDown(intensity(color)))
@@ -124,20 +156,13 @@ def image_of(color: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
 def looked_up(
     dataset: Dataset, spline: Spline, image: npt.NDArray[np.float32], p_world: FloatArray, stamps: FloatArray
 ) -> FloatArray:
-    """Intensities (m, n) at points (n, 3) of an image stamped `stamps` (m,); NaN where not seen or clipped.
-
-    Equation (3) by fixed-point iteration, with the pose of the nearest line: a hundredth of a pixel.
-    """
+    """Intensities (m, n) at points (n, 3) of an image stamped `stamps` (m,); NaN where not seen or clipped."""
     camera, shutter, T_color_depth = dataset.rig.color_camera, dataset.rig.color_shutter, dataset.rig.T_color_depth
     lines = np.arange(shutter.line_count(camera))
     out = np.full((len(stamps), len(p_world)), np.nan)
     for m, stamp in enumerate(stamps):
         T = T_color_depth @ se3.inverse(spline.pose(shutter.line_mid_time(stamp, lines, camera)))
-        line = np.full(len(p_world), len(lines) // 2)
-        for _ in range(_ROUNDS):
-            uv, _ = camera.project(se3.transform(T[line], p_world))
-            at = np.nan_to_num(shutter.line_of_pixel(uv, camera))
-            line = np.clip(np.rint(at), 0, len(lines) - 1).astype(np.int64)
+        uv, _ = _projected(camera, shutter, T, p_world)
         uv = np.where(camera.contains(uv)[:, None], 0.5 * uv, -10.0).astype(np.float32)
         border = cv2.BORDER_CONSTANT
         u, v = (np.ascontiguousarray(x)[:, None] for x in uv.T)
