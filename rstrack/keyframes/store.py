@@ -37,7 +37,7 @@ class KeyframeStore:
     def __init__(self, maker: KeyframeMaker, options: Options) -> None:
         self._maker, self._options = maker, options
         self._bytes = 1e9 * options.memory_gb
-        self._model = SurfaceModel(maker, options.voxel_m, self._bytes) if options.models else None
+        self._model = self._no_model()
         self._kept: deque[Reference] = deque(maxlen=_RECENT if self._model is None else _MODEL_KEYFRAMES)
         self.archive = Archive(maker, self._bytes)
         self.anchor: Reference | None = None
@@ -45,6 +45,14 @@ class KeyframeStore:
 
     def __len__(self) -> int:
         return len(self._kept)
+
+    def _no_model(self) -> SurfaceModel | None:
+        return SurfaceModel(self._maker, self._options.voxel_m, self._bytes) if self._options.models else None
+
+    def forget_first(self) -> None:
+        """The first keyframe, and only one so far, is none."""
+        self._kept.clear()
+        self._model, self.anchor, self.made = self._no_model(), None, 0
 
     @property
     def newest(self) -> Reference:

@@ -12,6 +12,7 @@ from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.frame_report import FrameReport
 from rstrack.tracking.judgement.fault import Fault
+from rstrack.tracking.judgement.lost_track import slides
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.moving.leave_out import LeftOut, left_out_with, without
 from rstrack.tracking.moving.majority import not_with_most
@@ -95,7 +96,9 @@ def bootstrap(track: Track, new: DeviceFrame) -> FrameReport:
         return track.report(new, fresh, solved)
     if all(track.succession.is_unfit(f) for f in recent):
         return _begin_anew(track, new)  # none of them has a colour image to go on with
-    _leave(track, window)
+    if not _leave(track, window):
+        track.keyframes.forget_first()
+        return _begin_anew(track, new)
     return track.report(new, fresh, solved, keyframe=True)
 
 
@@ -151,8 +154,8 @@ def _leave_out_by_last(track: Track, window: Window) -> None:
     track.succession.recent = deque([*rest, last])
 
 
-def _leave(track: Track, window: Window) -> None:
-    """Rectify the middle frame and align all others to it."""
+def _leave(track: Track, window: Window) -> bool:
+    """Rectify the middle frame and align all others to it. Says whether they stay: before a wall depth alone slides."""
     if any(frame.depth.moving for frame in track.succession.recent):
         _leave_out_by_last(track, window)
     frames, covariances = list(track.succession.recent), track.covariances
@@ -172,12 +175,15 @@ def _leave(track: Track, window: Window) -> None:
             track.succession.saw_through(one.gone)
         cleaned = {frame.index: replace(frame, depth=one.depth) for frame, one in zip(rest, left, strict=True)}
         track.succession.recent = deque(cleaned.get(frame.index, frame) for frame in frames)
+    seen_of = {frame.index: [o for o in others if o.frame == frame.index] for frame in frames}
+    pulls_of = {index: pulls(seen, window.state) for index, seen in seen_of.items()}
+    if any(slides(own, ref.median_depth, True) for own in pulls_of.values()):
+        return False
     window.keep(others)
     for frame in track.succession.recent:
         track.remember(frame)
     for frame in frames:
-        seen = [o for o in others if o.frame == frame.index]
-        own = pulls(seen, window.state)
+        seen, own = seen_of[frame.index], pulls_of[frame.index]
         track.chain.add(ref, seen, window.state, own.excess)
         track.learn_inertia(seen, window, own.excess, frame.last_time)
         covariances.uncertainty = covariances.uncertainty.found_anew(own.information)
@@ -187,3 +193,4 @@ def _leave(track: Track, window: Window) -> None:
     for frame in frames[:-1]:
         report = track.reports[frame.index]
         track.reports[frame.index] = covariances.of(report, frame, window.spline, ref.index)
+    return True

@@ -16,7 +16,7 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.options import Method, Options
-from rstrack.tracking import spline_tracker
+from rstrack.tracking import bootstrap, spline_tracker
 from rstrack.tracking.judgement.fault import Fault
 from rstrack.tracking.spline_tracker import Tracker
 
@@ -149,6 +149,20 @@ def test_colour_may_come_late_but_there_is_no_keyframe_without_it() -> None:
     tracker = feed(tracker_of("rs-pg"), [blank(frame_at(0)), *list(frames(8))[1:]])
     assert lost(tracker) == [0, 1, 2, 3, 4, 5]
     assert [report.fault for report in tracker.reports[:6]] == [Fault.NO_DEPTH, *[Fault.NO_START] * 5]
+
+
+def test_first_frames_that_slide_are_lost_and_the_next_ones_begin_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regression: a track that began before a bare wall went on from a keyframe that was bent, without a word."""
+    looked_at: list[bool] = []
+
+    def slides_once(*_: object) -> bool:
+        looked_at.append(not looked_at)
+        return looked_at[-1]
+
+    monkeypatch.setattr(bootstrap, "slides", slides_once)
+    tracker = feed(tracker_of("rs-g"), (frame_at(k) for k in range(14)))
+    assert [report.fault for report in tracker.reports[:6]] == [*[Fault.NO_START] * 5, Fault.NONE]
+    assert lost(tracker) == [0, 1, 2, 3, 4] and tracker.keyframes >= 1 and worst_step(tracker) < 3e-3
 
 
 def test_a_keyframe_whose_colours_are_another_places_is_left() -> None:

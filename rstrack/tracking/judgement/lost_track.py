@@ -166,8 +166,7 @@ class FitHistory:
         """distance (m), `_CLOSE` at least: of what is seen; where noise grows with its square, so do pulls."""
         if not new and _is_vouched_for(now):
             return Fault.NONE
-        metres, sigmas = _NEW_PULL if new else _MOST_PULL
-        if now.sigmas[0] > sigmas and now.whole > metres * max(1.0, distance / _PULL_WITHIN) ** 2:
+        if slides(now, distance, new):
             return Fault.PULLED
         far = [self._is_far(name, n, now, distance, new) for n, name in enumerate(_PULLS)]
         if any(far[1:]) and np.isfinite([now.depth, now.color]).all():
@@ -233,6 +232,15 @@ def _oddness(o: Observation) -> float:
 def coarseness(o: Observation) -> float:
     """How many times larger than usual a reference's pixels are, at least 1: the less do corners count in them."""
     return max(1.0, _FINE_FOCAL / o.ref.lens.camera.fx)
+
+
+def slides(now: Pulls, distance: float, new: bool) -> bool:
+    """Whether a frame's images pull further than any do that have been found, whatever is usual.
+
+    distance (m): of what is seen. new: whether its piece of the track has just begun.
+    """
+    metres, sigmas = _NEW_PULL if new else _MOST_PULL
+    return now.sigmas[0] > sigmas and now.whole > metres * max(1.0, distance / _PULL_WITHIN) ** 2
 
 
 def _is_vouched_for(now: Pulls) -> bool:
