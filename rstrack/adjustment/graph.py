@@ -9,7 +9,7 @@ model was made.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,6 +20,7 @@ from rsgen.array_types import FloatArray, IntArray
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.adjustment.band import Band
+from rstrack.adjustment.unit import Found, Sums, Unit, UnitState
 from rstrack.alignment.priors import ACCELERATION
 
 # The motion prior decides where nothing else does: in gaps, and in what a wall leaves open. The first and last control
@@ -62,10 +63,11 @@ class Sighting:
 
 @dataclass(frozen=True)
 class State:
-    """A spline T_world_cam(t) and keyframes' T_world_base (4, 4) by their numbers."""
+    """A spline T_world_cam(t) and keyframes' T_world_base (4, 4) by their numbers; what is believed of an IMU."""
 
     spline: Spline
     keyframes: dict[int, FloatArray]
+    unit: UnitState | None = None
 
     def errors(self, sightings: Sequence[Sighting]) -> FloatArray:
         """Twists (n, 6) from where sightings put the camera to where it is, in the camera's axes."""
@@ -73,19 +75,23 @@ class State:
         T = se3.inverse(keyframes) @ self.spline.pose(np.array([s.t for s in sightings]))
         return se3.log(se3.inverse(np.array([s.T_ref_cam for s in sightings])) @ T)
 
-    def moved(self, points: FloatArray, keyframes: FloatArray) -> State:
-        """With left increments of the control points (n, 6) and of the keyframes (m, 6), in their order."""
+    def moved(self, points: FloatArray, keyframes: FloatArray, unit: FloatArray | None = None) -> State:
+        """With left increments of the control points (n, 6) and of the keyframes (m, 6), in their order, and a step of
+        the unit's own blocks (k, 6)."""
         T = se3.orthonormalise(se3.exp(points) @ self.spline.control_points)
         spline = Spline(T, self.spline.t0, self.spline.dt)
         steps = se3.exp(keyframes)
         return State(
-            spline, {k: se3.orthonormalise(steps[n] @ K) for n, (k, K) in enumerate(self.keyframes.items())}
-        )  # fmt: skip
+            spline,
+            {k: se3.orthonormalise(steps[n] @ K) for n, (k, K) in enumerate(self.keyframes.items())},
+            self.unit if self.unit is None or unit is None else self.unit.moved(unit),
+        )
 
     def placed(self, T: FloatArray) -> State:
         """All of it moved by T (4, 4) in the world."""
         spline = Spline(se3.orthonormalise(T @ self.spline.control_points), self.spline.t0, self.spline.dt)
-        return State(spline, {k: se3.orthonormalise(T @ K) for k, K in self.keyframes.items()})
+        unit = None if self.unit is None else self.unit.turned(T[:3, :3])
+        return State(spline, {k: se3.orthonormalise(T @ K) for k, K in self.keyframes.items()}, unit)
 
 
 @dataclass(frozen=True)
@@ -93,13 +99,14 @@ class Graph:
     """What is known.
 
     at: the state around which the models of `seen` were made. keeps_motion: accelerations are to stay what they are
-    there; else to be small.
+    there; else to be small. unit: an IMU's readings, of which a state has a `UnitState` then.
     """
 
     at: State
     seen: Sequence[Seen]
     sightings: Sequence[Sighting]
     keeps_motion: bool = True
+    unit: Unit | None = None
 
     def weakened(self, spread: float) -> Graph:
         """With what frames and sightings say taken as so many times as uncertain (σ)."""
@@ -109,32 +116,57 @@ class Graph:
 
     def step(self, state: State, weights: FloatArray | None = None) -> tuple[State, FloatArray]:
         """One Gauss-Newton step from a state; weights (n,) of the sightings. Returns the increments too (n, 6)."""
-        system = _System(len(state.spline.control_points), list(state.keyframes))
+        system = self._system(state, weights)
+        x = system.solved()
+        points, keyframes = len(state.spline.control_points), len(state.keyframes)
+        return state.moved(x[:points], x[points : points + keyframes], x[points + keyframes :]), x
+
+    def found(self, state: State) -> Found | None:
+        """What is known there of the unit, if there is one."""
+        return None if state.unit is None else Found.of(state.unit, self._system(state, None).covariance())
+
+    def _system(self, state: State, weights: FloatArray | None) -> _System:
+        others = 0 if self.unit is None or state.unit is None else len(state.unit)
+        system = _System(len(state.spline.control_points), list(state.keyframes), others)
         moved_points = state.spline.control_points @ se3.inverse(self.at.spline.control_points)
         for seen in self.seen:
             system.add_seen(seen, state, self.at, moved_points)
         if self.sightings:
             system.add_sightings(self.sightings, state, np.ones(len(self.sightings)) if weights is None else weights)
+        accelerations = ACCELERATION
+        if self.unit is not None and state.unit is not None:
+            accelerations = self.unit.accelerations
+            for sums in (*self.unit.known(state.unit, state.spline.dt), *self.unit.said(state.spline, state.unit)):
+                system.add(sums)
         before = self.at.spline.increments if self.keeps_motion else np.zeros_like(state.spline.increments)
-        system.add_smoothness(state.spline, before)
-        x = system.solved()
-        points = len(state.spline.control_points)
-        return state.moved(x[:points], x[points:]), x
+        system.add_smoothness(state.spline, before, accelerations)
+        return system
 
 
 @dataclass
 class _System:
-    """Blocks of the upper triangle of H and of g, of `points` control points and then the keyframes."""
+    """Blocks of the upper triangle of H and of g, of `points` control points, then the keyframes, then `others`."""
 
     points: int
     keyframes: list[int]
+    others: int = 0
     _rows: list[IntArray] = field(default_factory=list)
     _columns: list[IntArray] = field(default_factory=list)
     _blocks: list[FloatArray] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self._number = {k: self.points + n for n, k in enumerate(self.keyframes)}
-        self.g = np.zeros((self.points + len(self.keyframes), 6))
+        self.g = np.zeros((self.points + len(self.keyframes) + self.others, 6))
+
+    def add(self, sums: Sums) -> None:
+        """Sums of any blocks, of which numbers below zero count from the end."""
+        numbers = sums.numbers % len(self.g)
+        n, k = numbers.shape
+        np.add.at(self.g, numbers, sums.g.reshape(n, k, 6))
+        H = sums.H.reshape(n, k, 6, k, 6)
+        for a in range(k):
+            for b in range(a, k):
+                self._put(numbers[:, a], numbers[:, b], H[:, a, :, b])
 
     def add_seen(self, seen: Seen, state: State, at: State, moved_points: FloatArray) -> None:
         """A keyframe's frames."""
@@ -185,11 +217,12 @@ class _System:
             for b in range(a, 5):
                 self._put(numbers[:, a], numbers[:, b], weighted[:, a] @ J[:, b])
 
-    def add_smoothness(self, spline: Spline, before: FloatArray) -> None:
-        """Small accelerations beside those of increments `before` (n, 6) from control point to control point."""
+    def add_smoothness(self, spline: Spline, before: FloatArray, accelerations: FloatArray) -> None:
+        """Small accelerations, of σ (6,) in m/s² and rad/s², beside those of increments `before` (n, 6) from control
+        point to control point."""
         gains, omega = spline.left_gains, spline.increments - before
         r = omega[1:] - omega[:-1]
-        sigma = np.repeat(ACCELERATION[None] * spline.dt**2, len(r), axis=0)
+        sigma = np.repeat(accelerations[None] * spline.dt**2, len(r), axis=0)
         sigma[:_END_TRIPLES] *= _END_FACTOR
         sigma[-_END_TRIPLES:] *= _END_FACTOR
         inverse = 1.0 / sigma[:, None, None] ** 2
@@ -202,7 +235,20 @@ class _System:
                 self._put(np.arange(n) + a, np.arange(n) + b, weighted[:, a] @ J[:, b])
 
     def solved(self) -> FloatArray:
-        """Increments (n, 6) of control points and keyframes. Raises numpy.linalg.LinAlgError."""
+        """Increments (n, 6) of all blocks. Raises numpy.linalg.LinAlgError."""
+        inverted = self._inverted()
+        x = -inverted(self.g.ravel())
+        if not np.isfinite(x).all():
+            raise np.linalg.LinAlgError("the graph's system has no finite solution")
+        return np.asarray(x.reshape(-1, 6))
+
+    def covariance(self) -> Callable[[IntArray], FloatArray]:
+        """Of unknowns by their numbers (k,): (k, k). Raises numpy.linalg.LinAlgError."""
+        inverted, size = self._inverted(), self.g.size
+        return lambda numbers: np.stack([inverted(np.eye(1, size, int(k) % size)[0])[numbers] for k in numbers])
+
+    def _inverted(self) -> Callable[[FloatArray], FloatArray]:
+        """Takes a vector to H⁻¹ times it."""
         size = self.g.size
         self._put(np.zeros(1, int), np.zeros(1, int), _HELD * np.eye(6)[None])
         rows, columns, blocks = (np.concatenate(a) for a in (self._rows, self._columns, self._blocks))
@@ -221,10 +267,7 @@ class _System:
             factors = splu(scaled, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
         except RuntimeError as error:
             raise np.linalg.LinAlgError(f"the graph's system has no solution ({error})") from None
-        x = -scale * factors.solve(scale * self.g.ravel())
-        if not np.isfinite(x).all():
-            raise np.linalg.LinAlgError("the graph's system has no finite solution")
-        return np.asarray(x.reshape(-1, 6))
+        return lambda b: np.asarray(scale * factors.solve(scale * b))
 
     def _put(self, rows: IntArray, columns: IntArray, blocks: FloatArray) -> None:
         self._rows.append(np.asarray(rows))

@@ -20,12 +20,14 @@ from rsgen.geometry.spline import Spline
 from rstrack.adjustment.band import Band
 from rstrack.adjustment.graph import Graph, Seen, State
 from rstrack.adjustment.rigid import Usual
+from rstrack.adjustment.unit import Found, Unit, UnitState
 from rstrack.alignment import brightness
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.normal_equations import Quadratic
 from rstrack.alignment.observation import Observation, observe
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.device_frame import DeviceFrame
+from rstrack.inertial.belief import ALIKE
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.options import Options
@@ -48,6 +50,8 @@ _SHINE = 3e-4
 _UNMOVED = 1e14
 # Furthest that a pose moves (m) in a round after which no other is worth it.
 _STILL = 2e-5
+# Steps of one round beside an IMU, and of control points and keyframes (m, rad) after which no other is worth it.
+_STEPS, _SETTLED = 5, 1e-6
 
 # A keyframe that a frame is near, by its number, and the weight of what the frame says against it.
 Near = list[tuple[int, float]]
@@ -69,7 +73,7 @@ class Refiner:
 
     frames, times: numbers of the frames whose poses the spline knows, and their mid readouts (n,) s. begin: when (s)
     the camera stays where it was. load: frames by their numbers, on the device. usual: scales of residuals to begin
-    with.
+    with. unit: an IMU beside the camera; found: what has been learnt of it.
     """
 
     terms: Terms
@@ -80,6 +84,8 @@ class Refiner:
     begin: float
     load: Callable[[Sequence[int]], Iterator[DeviceFrame]]
     usual: Usual
+    unit: Unit | None = None
+    found: Found | None = None
     _inflations: tuple[float, float] = field(default=(1.0, 1.0))
     _sharing: float = 1.0
     # Gain and offset of the last colour image against each keyframe.
@@ -117,13 +123,40 @@ class Refiner:
                     against.setdefault(k, _Against()).add(self._model(o, state, frame).scaled(weight))
                     kept.append(_Figures.of(o))
             told(0.5 + 0.5 * (n + 1) / len(self.frames), f"{pairs} pairs")
-        at = State(spline, {k: keyframes[k].T_world_base for k in sorted(against)})
+        at = State(spline, {k: keyframes[k].T_world_base for k in sorted(against)}, self._unit_state(spline))
         seen = [against[k].seen(k) for k in at.keyframes]
-        after, _ = Graph(at, seen, (), keeps_motion=False).step(at)
-        moved = after.placed(spline.pose(self.begin) @ se3.inverse(after.spline.pose(self.begin))).spline
+        moved = self._solved(at, seen).spline
         shift = np.linalg.norm((moved.pose(self.times) - spline.pose(self.times))[:, :3, 3], axis=1)
         self._learn(kept)
         return moved, Round(float(shift.max()), len(seen), pairs, self.usual)
+
+    def _solved(self, at: State, seen: Sequence[Seen]) -> State:
+        """Where control points and keyframes belong.
+
+        Beside an IMU readings are linearised until nothing moves: they bend sooner than images do.
+        """
+        graph = Graph(at, seen, (), keeps_motion=False, unit=self.unit)
+        if self.unit is None:
+            return self._placed(graph.step(at)[0], at)
+        graph, state = graph.weakened(np.sqrt(ALIKE)), at
+        for _ in range(_STEPS):
+            state, x = graph.step(state)
+            if np.abs(x[: len(at.spline.control_points) + len(at.keyframes)]).max() < _SETTLED:
+                break
+        state = self._placed(state, at)
+        self.found = graph.found(state)
+        if state.unit is not None:
+            self.unit = self.unit.learnt(state.spline, state.unit)
+        return state
+
+    def _unit_state(self, spline: Spline) -> UnitState | None:
+        if self.unit is None:
+            return None
+        return self.unit.start(spline) if self.found is None else self.found.state
+
+    def _placed(self, state: State, before: State) -> State:
+        """With the camera where it was in the beginning."""
+        return state.placed(before.spline.pose(self.begin) @ se3.inverse(state.spline.pose(self.begin)))
 
     def _fused(
         self, spline: Spline, anchors: IntArray, near: list[Near], told: Callable[[float, str], None]

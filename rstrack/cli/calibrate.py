@@ -70,8 +70,8 @@ def calibrate(
                 "--free imu: stands alone, without other names, --device and --report: calibrate the cameras first, "
                 "and give what was found as --camera"
             )
-        if imu is not None and dataset.imu_files is not None:
-            dataset = replace(dataset, imu_files=replace(dataset.imu_files, given=imu))
+        if imu is not None:
+            dataset = dataset.with_imu_file(imu)
         return _imu(sequence, dataset, run, frames or slice(None), Options(backend=backend), out, json, quiet)
     if run is not None or imu is not None:
         raise UserError("--run and --imu: are for --free imu")

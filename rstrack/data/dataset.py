@@ -178,11 +178,19 @@ class Dataset:
         )
         return replace(self, rig=rig, timing=Timing(depth, color, 0.0))
 
+    def with_imu_file(self, given: Path) -> Dataset:
+        """The same recording with its IMU as a file describes it, which is read when the IMU is asked for."""
+        return self if self.imu_files is None else replace(self, imu_files=replace(self.imu_files, given=given))
+
     def as_seen_by(self, info: dict[str, Any]) -> Dataset:
-        """The same recording with colour's offset and darker corners as a run had them, whose run.json holds `info`."""
+        """The same recording with colour's offset, darker corners and the IMU's description as a run had them, whose
+        run.json holds `info`."""
         clocks, recorded = info.get("clocks"), info.get("dataset")
         offset_s = clocks.get("color_offset_s") if self.timing is not None and isinstance(clocks, dict) else None
         timed = self.with_color_offset(float(offset_s)) if isinstance(offset_s, float | int) else self
+        imu_file = recorded.get("imu_file") if isinstance(recorded, dict) else None
+        if isinstance(imu_file, str) and self.imu_files is not None and self.imu_files.given is None:
+            timed = timed.with_imu_file(Path(imu_file))
         falloff = recorded.get("color_falloff") if isinstance(recorded, dict) else None
         if self.rig.color_falloff is not None or not isinstance(falloff, float | int):
             return timed

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.signal import welch
 
 from rsgen.array_types import FloatArray
+from rstrack.alignment.priors import ACCELERATION
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.inertial.wild import wild
 from rstrack.options import Options
@@ -25,6 +26,9 @@ _SPACINGS_S = 0.025, 1 / 60, 0.0125, 1 / 120, 0.00625, 0.005
 _SAMPLES = 1.2
 # Root mean square by which lines of the depth image may be off their best spline, of what is 1 m away, px.
 _MOST_PX = 0.005
+# Accelerations that the motion prior allows for, over what the readings are in the mean: the prior must not hold what
+# they tell, nor what they tell be taken for scatter because the prior held it.
+_RARE = 3.0
 # Seconds whose spectrum is taken at once.
 _STRETCH_S = 1.0
 # Of the sum over k: what is left out is less than 1e-6 for lines (degree 1), and far less for the others.
@@ -77,6 +81,11 @@ class Band:
         """(6,): root mean square of an axis, m/s² and rad/s², of all that is faster than 1 Hz."""
         turning = self._root(self.rate * (2.0 * np.pi * self.hertz) ** 2 / 3.0)
         return np.repeat([self._root(self.force / 3.0), turning], 3)
+
+    @property
+    def allowed(self) -> FloatArray:
+        """σ (6,) of accelerations for the motion prior, m/s² and rad/s²."""
+        return np.maximum(ACCELERATION, _RARE * self.accelerations)
 
     def knots_s(self, focal: float, rate_hz: float) -> float:
         """The widest spacing (s) that misses less of the motion than lines of a camera with a focal length (px) tell,

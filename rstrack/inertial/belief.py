@@ -16,6 +16,11 @@ GYRO, ACCEL, GRAVITY = slice(0, 3), slice(3, 6), slice(6, 9)
 _GYRO_BIAS, _ACCEL_BIAS = 0.1, 0.6
 STRENGTH = 0.03
 """How well gravity's strength is known, m/s²: over the earth, and of a unit's scale."""
+ALIKE = 8.0
+"""Images in a row that are off alike: what interpolation, what shines and the keyframe's own noise do to them changes
+slowly. So many tell how the camera has moved, beside an IMU's readings, as one would by its scatter."""
+WARMS = 2e-5, 5e-4
+"""What a bias may do beside its walk while a unit warms up: in a second, rad/s and m/s²."""
 # σ of the gyroscope's bias (rad/s), and of the force (m/s²) that gravity and the accelerometer's bias make together in
 # an attitude, below which the unit is of use; and of gravity's direction, degrees, below which that is determined.
 _KNOWN_GYRO, _KNOWN_FORCE, _KNOWN_DEG = 5e-3, 0.15, 0.3

@@ -22,9 +22,6 @@ from rstrack.inertial.smoother import Smoother
 _MEAN_ACCELERATION = 1.0
 # Samples that tell how readings scatter about the spline, and that the scatter which is expected counts as.
 _MEMORY, _EXPECTED = 100.0, 10.0
-# Accelerations that the motion prior allows for, over what the readings are in the mean: the prior must not hold what
-# they tell, nor what they tell be taken for scatter because the prior held it.
-_RARE = 3.0
 # Gravity in the world turns as the track drifts, beside what keyframes' covariances say: m/s² per √s.
 _DRIFT = 5e-4
 # Increments of control points (m, rad) that leave the rows of a frame's samples as they were linearised before it.
@@ -55,7 +52,7 @@ class Inertia:
         walks = np.repeat([noise.gyro_walk, noise.accel_walk, _DRIFT], 3)
         self._walk = walks**2
         self._band, self._dt = Band.of(recording), 0.0
-        self.common = np.maximum(ACCELERATION, _RARE * self._band.accelerations) if self.tells else ACCELERATION
+        self.common = self._band.allowed if self.tells else ACCELERATION
         self.sigma, self._told = self._noise, np.zeros(2)
         self._smoother: Smoother | None = None
         self._until, self._next, self._tripled = -np.inf, -np.inf, 0

@@ -9,24 +9,28 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.geometry import so3
 from rsgen.geometry.spline import Spline
-from rstrack.inertial.belief import ACCEL, GRAVITY, GYRO
+from rstrack.inertial.belief import ACCEL, GRAVITY, GYRO, Belief
 from rstrack.inertial.inertia import Inertia
 
 
 def record(inertia: Inertia) -> dict[str, Any]:
-    """Gravity in the run's world (m/s²) and the biases (rad/s, m/s²), each with σ, and when they were known (s)."""
-    belief, sigmas = inertia.belief, inertia.belief.sigmas
+    """What is believed at the end, and when it was known (s)."""
+    known = {"usable_s": _known(inertia.usable_s), "gravity_determined_s": _known(inertia.determined_s)}
+    return known | believed(inertia.belief, inertia.sigma)
+
+
+def believed(belief: Belief, sigma: FloatArray) -> dict[str, Any]:
+    """Gravity in the run's world (m/s²) and the biases (rad/s, m/s²), each with σ; sigma (2,): of readings."""
+    sigmas = belief.sigmas
     return {
-        "usable_s": _known(inertia.usable_s),
-        "gravity_determined_s": _known(inertia.determined_s),
         "gravity": belief.mean[GRAVITY].tolist(),
         "gravity_sigma_deg": belief.direction_deg,
         "gyro_bias": belief.mean[GYRO].tolist(),
         "gyro_bias_sigma": sigmas[GYRO].tolist(),
         "accel_bias": belief.mean[ACCEL].tolist(),
         "accel_bias_sigma": sigmas[ACCEL].tolist(),
-        "gyro_residual": float(inertia.sigma[0]),
-        "accel_residual": float(inertia.sigma[1]),
+        "gyro_residual": float(sigma[0]),
+        "accel_residual": float(sigma[1]),
     }
 
 
@@ -36,9 +40,13 @@ def text(found: dict[str, Any], begin: float, bridged: int) -> str:
         return "IMU: it was of no use: too short a track to tell its biases"
     known = found["gravity_determined_s"]
     when = "" if known is None else f" (to 0.3° after {known - begin:.1f} s)"
-    biases = f"{_vector(found['gyro_bias'])} rad/s and {_vector(found['accel_bias'])} m/s²"
     over = f", {bridged} frames bridged" if bridged else ""
-    return f"IMU: gravity known to {found['gravity_sigma_deg']:.2f}°{when}, biases {biases}{over}"
+    return _summary(found, when) + over
+
+
+def refined_text(found: dict[str, Any]) -> str:
+    """One line of `believed`, of a whole recording."""
+    return _summary(found, "")
 
 
 def upright(gravity: FloatArray) -> FloatArray:
@@ -56,6 +64,11 @@ def upright(gravity: FloatArray) -> FloatArray:
 def turned(T_upright_world: FloatArray, spline: Spline) -> Spline:
     """T_upright_body(t) of T_world_body(t)."""
     return Spline(T_upright_world @ spline.control_points, spline.t0, spline.dt, spline.first)
+
+
+def _summary(found: dict[str, Any], when: str) -> str:
+    biases = f"{_vector(found['gyro_bias'])} rad/s and {_vector(found['accel_bias'])} m/s²"
+    return f"IMU: gravity known to {found['gravity_sigma_deg']:.2f}°{when}, biases {biases}"
 
 
 def _known(seconds: float) -> float | None:

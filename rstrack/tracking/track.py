@@ -24,6 +24,7 @@ from rstrack.data.rig import Rig
 from rstrack.images.device_frame import DeviceFrame, DeviceRig, Timer
 from rstrack.images.pyramid import DepthImage
 from rstrack.inertial.band import with_knots
+from rstrack.inertial.belief import ALIKE
 from rstrack.inertial.inertia import Inertia
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
@@ -39,9 +40,6 @@ from rstrack.tracking.moving.leave_out import LeftOut, leave_out
 from rstrack.tracking.succession import Succession
 from rstrack.tracking.window import Window
 
-# Images in a row that are off alike: what interpolation, what shines and the keyframe's own noise do to them changes
-# slowly. So many tell how the camera has moved, beside an IMU's readings, as one would by its scatter.
-_ALIKE = 8.0
 # What a track of the same rig and options would make in the same way.
 _MADE_ANEW = "rig", "options", "device", "terms", "maker", "space"
 
@@ -154,7 +152,7 @@ class Track:
         """What a frame that ends at time `end` (s) says of an IMU's biases and of gravity. excess: see `Pulls`."""
         if self.inertia is not None:
             self._shift_inertia(fresh)
-            models = [o.model(window.state).scaled(1.0 / (_ALIKE * excess**2)) for o in fresh if o.is_linearised]
+            models = [o.model(window.state).scaled(1.0 / (ALIKE * excess**2)) for o in fresh if o.is_linearised]
             self.inertia.learn(window.state, window.piece, models, end)
 
     def accelerations(self, window: Window, seconds: float, R_world_depth: FloatArray) -> tuple[FloatArray, float]:

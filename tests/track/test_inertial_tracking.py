@@ -135,7 +135,7 @@ def test_a_run_says_what_it_found_and_resumes_to_the_same_bits(tmp_path: Path, m
     read = simulate_imu(dataset.truth, ImuConfig(gyroscope_bias=BIAS), dataset.truth.t_begin, dataset.truth.t_end, 2)
     write_imu_csv(dataset.root / "imu.csv", read)
     (dataset.root / "imu.yaml").write_text(f"{_NOISE}T_imu_depth: {np.eye(4).tolist()}\n")
-    with_imu = open_dataset(dataset.root)
+    with_imu = open_dataset(dataset.root, imu_file=dataset.root / "imu.yaml")
     options = Options(**OPTIONS)
     with pytest.raises(UserError, match="has no IMU, which --method rs-gi needs: take rs-g"):
         track(dataset, options, tmp_path / "none")
@@ -156,7 +156,12 @@ def test_a_run_says_what_it_found_and_resumes_to_the_same_bits(tmp_path: Path, m
     track(with_imu, options, tmp_path / "cut", resume=True)
     for name in ("trajectory.txt", "spline.npz"):
         assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "cut" / name).read_bytes()
-    told = json.loads((tmp_path / "cut" / "run.json").read_text())["imu"]
+    info = json.loads((tmp_path / "cut" / "run.json").read_text())
+    told = info["imu"]
+    # Where it was described is said, and believed of the run from then on.
+    assert info["dataset"]["imu_file"] == str((dataset.root / "imu.yaml").resolve())
+    files = open_dataset(dataset.root).as_seen_by(info).imu_files
+    assert files is not None and files.given == (dataset.root / "imu.yaml").resolve()
     assert told == json.loads((tmp_path / "whole" / "run.json").read_text())["imu"]
     assert told["usable_s"] > 0.1 and np.linalg.norm(told["gravity"]) == pytest.approx(9.80665, abs=0.1)
     off = np.abs(np.array(told["gyro_bias"]) - BIAS) / told["gyro_bias_sigma"]

@@ -10,20 +10,30 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from loop_room import FRAMES, OPTIONS, make_dataset
+from loop_room import FRAMES, OPTIONS, make_dataset, to_and_fro
 
+from rsgen.config.imu import ImuConfig
 from rsgen.errors import UserError
 from rsgen.geometry import se3
+from rsgen.sensors.imu import simulate_imu, write_imu_csv
 from rstrack.adjustment.refine import doubted
 from rstrack.alignment.normal_equations import Quadratic
 from rstrack.cli.main import main
 from rstrack.data.estimate import read_estimate
+from rstrack.data.imu.description import PHONE
+from rstrack.data.imu.files import ReadImu
+from rstrack.data.imu.recording import ImuRecording
 from rstrack.metrics.tracked import load_run
+from rstrack.options import Options
 from rstrack.report.build import write_report
 from rstrack.tracking.runs import refining
 from rstrack.tracking.runs.record import Noise
 from rstrack.tracking.runs.refining import Refined, refine_run
 from rstrack.tracking.runs.run import track
+
+BIAS = (0.01, -0.008, 0.006)
+# By how much the description has the IMU wrong: m, rad.
+OFF = np.array([2e-3, -1e-3, 3e-3, 0.012, -0.006, 0.009])
 
 
 @pytest.fixture(scope="module")
@@ -59,9 +69,70 @@ def test_refining_makes_a_run_better(run: Path, tmp_path: Path, capsys: pytest.C
     assert "refined" in write_report(out).read_text()
 
 
-def test_that_an_imu_is_not_looked_at_is_said(run: Path) -> None:
-    refined = Refined(read_estimate(run), [{"moved_m": 1e-3, "keyframes": 1, "pairs": 2}], None, None, 1.0, True)
+def with_imu(run: Path, folder: Path) -> Path:
+    """The same run as if an IMU had been used, whose description is elsewhere, and not quite right."""
+    tracked = load_run(run)
+    assert tracked.dataset is not None
+    shutil.copytree(tracked.dataset.root, folder / "seq")
+    shutil.copytree(run, folder / "run")
+    truth, read = to_and_fro(), ImuConfig(gyroscope_bias=BIAS, accelerometer_bias=(0.1, -0.07, 0.05))
+    write_imu_csv(folder / "seq" / "imu.csv", simulate_imu(truth, read, 0.0, truth.t_end, 2))
+    densities = "\n".join(
+        f"{n}: {getattr(read, n)}" for n in sorted(ImuConfig.model_fields) if "noise" in n or "walk" in n
+    )
+    (folder / "unit.yaml").write_text(f"{densities}\nT_imu_depth: {se3.exp(OFF).tolist()}\n")
+    info = json.loads((run / "run.json").read_text())
+    info["options"]["method"] = "rs-pgi"
+    info["dataset"] |= {"path": str(folder / "seq"), "imu_file": str(folder / "unit.yaml")}
+    (folder / "run" / "run.json").write_text(json.dumps(info))
+    return folder / "run"
+
+
+def turned_off(run: Path) -> float:
+    """Root mean square of what lines' angular rates are off, rad/s."""
+    spline, truth, t = read_estimate(run).spline, to_and_fro(), np.linspace(0.1, 0.9, 200)
+    assert spline is not None
+    return float(np.sqrt(((spline.velocity(t) - truth.velocity(t))[:, 3:] ** 2).mean()))
+
+
+def test_an_imu_is_looked_at(run: Path, tmp_path: Path) -> None:
+    used = with_imu(run, tmp_path)
+    refined = refine_run(used, tmp_path / "refined", rounds=1)
+    assert refined.before is not None and refined.after is not None
+    assert refined.after.metrics.ate_rmse_m < 0.85 * refined.before.metrics.ate_rmse_m
+    assert turned_off(tmp_path / "refined") < 0.3 * turned_off(run)
+    told = json.loads((tmp_path / "refined" / "run.json").read_text())["imu"]
+    off = np.abs(np.array(told["gyro_bias"]) - BIAS) / told["gyro_bias_sigma"]
+    assert (off < 4.0).all() and max(told["gyro_bias_sigma"]) < 2e-3
+    assert np.linalg.norm(told["gravity"]) == pytest.approx(9.80665, abs=0.1)
+    turned = se3.log(np.array(told["T_imu_depth"]))[3:]
+    assert np.linalg.norm(turned) < 0.5 * np.linalg.norm(OFF[3:])
+    assert (np.abs(turned) < 4.0 * np.array(told["T_imu_depth_sigma"][3:])).all()
+    assert "IMU: gravity known to" in refined.text() and "from where T_imu_depth has it" in refined.text()
+    # Described by a file that is not there, or not there at all.
+    with pytest.raises(UserError, match="nowhere"):
+        refine_run(used, tmp_path / "out", imu_file=tmp_path / "nowhere.yaml")
+    (tmp_path / "seq" / "imu.csv").unlink()
+    with pytest.raises(UserError, match="has no IMU, which method rs-pgi"):
+        refine_run(used, tmp_path / "out")
+
+
+def test_an_accelerometer_alone_is_not_looked_at_and_that_is_said(run: Path, tmp_path: Path) -> None:
+    tracked = load_run(run)
+    assert tracked.dataset is not None
+    alone = ImuRecording(np.arange(0.0, 1.0, 0.01), None, np.ones((100, 3)), PHONE, np.eye(4), 100.0)
+    dataset = replace(tracked.dataset)
+    object.__setattr__(dataset, "read_imu", ReadImu(alone, ()))
+    assert refining._unit(dataset, tracked.estimate, Options(method="rs-pgi")) is None
+    refined = Refined(
+        tracked.estimate, [{"moved_m": 1e-3, "keyframes": 1, "pairs": 2}], None, None, 1.0, refining._NOT_LOOKED_AT
+    )
     assert "the IMU was not looked at" in refined.text()
+
+
+def test_an_imus_description_is_for_runs_that_use_one(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"is of rs-pg, which uses no IMU"):
+        refine_run(run, tmp_path / "out", imu_file=tmp_path / "imu.yaml")
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,7 @@ from rstrack.calibration.imu.unit import (
     unit_size,
 )
 from rstrack.data.imu.recording import ImuNoise
+from rstrack.inertial.belief import WARMS
 
 BAND = 24  # of four control points of six
 _HUBER = 2.5
@@ -31,8 +32,6 @@ PRIOR = np.array([*(1.0,) * 3, *(0.5,) * 3, 0.2, 5e-4, *(0.05,) * 3, *(1.0,) * 2
 _BIAS = np.array([*(0.3,) * 3, *(1.0,) * 3])
 # The drift begins with nothing: what is constant in it, gravity takes.
 _PINNED = (1e-6, 1e-6)
-# What a bias may do beside its walk, while it warms up: in a second, rad/s and m/s².
-_WARMS = (2e-5, 5e-4)
 
 
 @dataclass(frozen=True)
@@ -152,7 +151,7 @@ def known(
     D[np.arange(COUNT), np.arange(COUNT)] = PRIOR**-2.0
     walk = np.repeat([noise.gyro_walk, noise.accel_walk], 3)
     gaps = np.diff(unit.bias_times)[:, None]
-    _walking(D, b, COUNT, unit.biases, np.hypot(walk * np.sqrt(gaps), np.repeat(_WARMS, 3) * gaps))
+    _walking(D, b, COUNT, unit.biases, np.hypot(walk * np.sqrt(gaps), np.repeat(WARMS, 3) * gaps))
     at = np.arange(COUNT, size)
     D[at, at] += np.tile(_BIAS**-2.0, len(unit.biases))
     b[at] -= (unit.biases * _BIAS**-2.0).ravel()

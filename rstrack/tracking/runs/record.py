@@ -43,7 +43,9 @@ def settings(dataset: Dataset, chosen: range, options: Options, noise: Noise) ->
 
     read = dataset.read_imu if options.inertial else None
     assumed = [*dataset.notes, *(() if read is None else read.notes)]
-    notes = {"notes": assumed} if assumed else {}
+    notes: dict[str, Any] = {"notes": assumed} if assumed else {}
+    if read is not None and dataset.imu_files is not None and dataset.imu_files.given is not None:
+        notes["imu_file"] = str(dataset.imu_files.given.resolve())
     versions = {name: version(name) for name in ("numpy", "scipy", "drjit")}
     return {
         "method": options.method,

@@ -25,6 +25,7 @@ from rstrack.data.estimate import INFO, Estimate, write_estimate
 from rstrack.data.noise import with_noise
 from rstrack.data.prefetch import prefetched
 from rstrack.data.rig import Frame
+from rstrack.inertial import record as imu_record
 from rstrack.metrics.association import truth_of
 from rstrack.metrics.run_evaluate import Evaluation, evaluated
 from rstrack.metrics.tracked import load_run
@@ -33,12 +34,17 @@ from rstrack.tracking.runs.record import Noise
 
 if TYPE_CHECKING:
     from rstrack.adjustment.refine import Refiner
+    from rstrack.adjustment.unit import Unit
     from rstrack.images.device_frame import DeviceFrame
 
 Kind = TypeVar("Kind", Options, Noise)
 
 # Scales to begin with where a run does not tell any: depth at one metre (m), intensity.
 _USUAL_DEPTH, _USUAL_INTENSITY = 2e-3, 0.015
+_NOT_LOOKED_AT = (
+    "the IMU was not looked at (it has no gyroscope, or no samples of these frames): where images tell little, over "
+    "gaps and at bare walls, keep the run"
+)
 # Rounding of times.
 _SLACK_S = 1e-6
 # Distance (m) that things are taken to have had in the run: the first round is told better.
@@ -47,16 +53,15 @@ _TYPICAL_M = 1.5
 
 @dataclass(frozen=True)
 class Refined:
-    """estimate: refined. rounds: what each did. before, after: errors, None without a truth. inertial: the run used an
-    IMU, which refining does not.
-    """
+    """estimate: refined. rounds: what each did. before, after: errors, None without a truth. imu: a line on it, if the
+    run used one."""
 
     estimate: Estimate
     rounds: list[dict[str, Any]]
     before: Evaluation | None
     after: Evaluation | None
     seconds: float
-    inertial: bool
+    imu: str = ""
 
     def text(self) -> str:
         """A summary of a few lines."""
@@ -66,10 +71,8 @@ class Refined:
             f"{len(self.rounds)} rounds in {self.seconds:.0f} s: {last['keyframes']} keyframes, {last['pairs']} pairs "
             f"of a frame and a keyframe; poses moved by up to {moved} mm"
         ]
-        if self.inertial:
-            lines.append(
-                "the IMU was not looked at: where images tell little, over gaps and at bare walls, keep the run"
-            )
+        if self.imu:
+            lines.append(self.imu)
         if self.before is not None and self.after is not None:
             lines += [f"ATE before {1e3 * self.before.metrics.ate_rmse_m:.3f} mm", "", self.after.text()]
         return "\n".join(lines)
@@ -77,11 +80,12 @@ class Refined:
 
 def refine_run(
     run: Path, out: Path, sequence: Path | None = None, camera_file: Path | None = None, rounds: int = 3,
-    progress: Progress = no_progress,
+    progress: Progress = no_progress, imu_file: Path | None = None,
 ) -> Refined:  # fmt: skip
     """Refine the run of a spline tracker and write the result, a run folder: `out`, which may not be `run` itself.
 
-    sequence, camera_file: as in `load_run`. rounds: at most. Raises UserError.
+    sequence, camera_file: as in `load_run`. rounds: at most. imu_file: what describes the IMU of a run that used one;
+    without it as the run had it. Raises UserError.
     """
     if out.resolve() == run.resolve():
         raise UserError(f"{out}: is the run itself: choose another --out, so that both remain")
@@ -96,6 +100,9 @@ def refine_run(
         raise UserError(f"{run}: has no spline, so there is nothing to refine: track with one of the rs or gs methods")
     options = _settings(estimate.info, run, "options", Options).decided(dataset.rig.depth_shutter)
     noise = _settings(estimate.info, run, "noise", Noise)
+    if imu_file is not None and not options.inertial:
+        raise UserError(f"--imu {imu_file}: {run} is of {options.method}, which uses no IMU: track with one that does")
+    dataset = dataset if imu_file is None else dataset.with_imu_file(imu_file)
     refiner = _refiner(dataset, estimate, options, noise, run)
     try:
         spline, done = refiner.refined(estimate.spline, rounds, progress)
@@ -106,6 +113,11 @@ def refine_run(
     seconds = time.perf_counter() - begin
     info = estimate.info | {"refined": {"of": str(run.resolve()), "rounds": told, "seconds": seconds}}
     poses = se3.orthonormalise(moved @ estimate.T_world_depth)
+    imu = _NOT_LOOKED_AT if options.inertial else ""
+    if refiner.unit is not None and refiner.found is not None:
+        believed = imu_record.believed(refiner.found.belief, refiner.unit.sigma)
+        info["imu"] = (estimate.info.get("imu") or {}) | believed | refiner.found.as_dict()
+        imu = f"{imu_record.refined_text(believed)}, {refiner.found.text(refiner.unit.recording.T_imu_depth)}"
     result = Estimate(estimate.stamps, poses, spline, info, estimate.moving)
     truth = truth_of(dataset)
     before, after = (evaluated(truth, each) for each in (estimate, result))
@@ -113,7 +125,7 @@ def refine_run(
     info["truth_offset"] = None if after is None else after.truth_offset
     write_estimate(out, result.stamps, result.T_world_depth, spline, info, estimate)
     result.moving.write(out, range(len(dataset)))
-    return Refined(result, told, before, after, seconds, options.inertial)
+    return Refined(result, told, before, after, seconds, imu)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -161,7 +173,21 @@ def _refiner(dataset: Dataset, estimate: Estimate, options: Options, noise: Nois
     times = np.asarray(dataset.stamps)[numbers] + 0.5 * dataset.rig.depth_shutter.readout_s
     terms, maker = Terms.of(device, options), KeyframeMaker.of(device)
     begin = float(estimate.stamps[0])
-    return Refiner(terms, maker, options, numbers, times, begin, load, _usual(estimate.info))
+    unit = _unit(dataset, estimate, options)
+    return Refiner(terms, maker, options, numbers, times, begin, load, _usual(estimate.info), unit)
+
+
+def _unit(dataset: Dataset, estimate: Estimate, options: Options) -> Unit | None:
+    """The IMU of a run that used one, as far as its spline is known. None without a gyroscope: as when tracking, an
+    accelerometer alone is to change nothing."""
+    from rstrack.adjustment.unit import Unit
+
+    if not options.inertial or estimate.spline is None:
+        return None
+    if dataset.imu is None:
+        raise UserError(f"{dataset.root}: has no IMU, which method {options.method} of the run needs")
+    valid = estimate.info.get("spline_valid") or [[estimate.spline.t_begin, estimate.spline.t_end]]
+    return Unit.of(dataset.imu, estimate.spline, np.array(valid, np.float64).reshape(-1, 2))
 
 
 def _known_frames(dataset: Dataset, estimate: Estimate) -> list[int]:
