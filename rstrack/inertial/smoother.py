@@ -1,4 +1,4 @@
-"""A fixed-lag smoother over the newest control points, biases and gravity: what all images and samples so far say.
+"""A fixed-lag smoother over the newest control points and a belief: what all images and samples so far say.
 
 Each image's normal equations and each sample are added once. Control points that nothing new depends on are
 marginalised, not fixed: a spline held where it was estimated would make biases look far better known than they are.
@@ -22,8 +22,8 @@ _NOTHING = 1e-4
 
 @dataclass
 class Smoother:
-    """½ xᵀ H x + gᵀ x over control points `first`... and the nine numbers of a belief, as increments since the control
-    points had received `at` (k, 6) and around `belief` (9,)."""
+    """½ xᵀ H x + gᵀ x over control points `first`... and a belief's numbers, as increments since the control points had
+    received `at` (k, 6) and around `belief` (12,)."""
 
     first: int
     H: FloatArray
@@ -69,7 +69,7 @@ class Smoother:
         return Smoother(self.first, self.H.copy(), self.g.copy(), self.at, self.belief)
 
     def without_belief(self, strength: float) -> tuple[Quadratic, float]:
-        """Over the control points alone, biases and gravity, of a known strength (m/s²), being best at every step; and
+        """Over the control points alone, the belief, gravity of a known strength (m/s²), being best at every step; and
         how much less that costs here than what is believed."""
         z, c = slice(len(self.g) - SIZE, None), slice(0, len(self.g) - SIZE)
         u, size = np.zeros(SIZE), float(np.linalg.norm(self.belief[GRAVITY]))
@@ -82,7 +82,7 @@ class Smoother:
         return Quadratic(self.first, 0.5 * (H + H.T), g), 0.5 * float(pull @ solved[:, -1])
 
     def around(self, belief: FloatArray) -> None:
-        """Be around another belief (9,)."""
+        """Be around another belief (12,)."""
         self.g = self.g + self.H[:, -SIZE:] @ (belief - self.belief)
         self.belief = belief.copy()
 
@@ -101,7 +101,7 @@ class Smoother:
         self.g[to] += model.g[own]
 
     def diffuse(self, variance: FloatArray) -> None:
-        """The nine numbers walk on: variances (9,) of their steps."""
+        """The belief's numbers walk on: variances (12,) of their steps."""
         walks = np.flatnonzero(variance > 0.0)
         ways = np.zeros((len(self.g), len(walks)))
         ways[len(self.g) - SIZE + walks, np.arange(len(walks))] = 1.0
@@ -117,7 +117,7 @@ class Smoother:
         covariance = (axes * np.maximum(0.0, sizes)) @ axes.T
         x, y, z = self.belief[GRAVITY]
         ways = np.concatenate([np.tile(np.eye(6), (len(self.at), 1)), np.zeros((SIZE, 6))])
-        ways[-3:, 3:] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]  # φ × g
+        ways[6 * len(self.at) :][GRAVITY, 3:] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]  # φ × g
         self._loosen(ways, covariance)
 
     def _loosen(self, ways: FloatArray, covariance: FloatArray) -> None:
@@ -141,7 +141,7 @@ class Smoother:
         self.first += count // 6
 
     def marginal(self) -> Belief:
-        """What is believed of the nine numbers."""
+        """What is believed."""
         only = Smoother(self.first, self.H, self.g, self.at, self.belief)
         only.forget(self.last)
         return Belief(self.belief - np.linalg.solve(only.H, only.g), only.H)
