@@ -89,13 +89,13 @@ class Belief:
 
     def of_strength(self, strength: float) -> Belief:
         """With gravity on the sphere of a known strength, m/s²: |g| is a measurement, taken where it is in the end."""
-        mean, start = self.mean, self.information @ self.mean
+        mean, u = self.mean, np.zeros(SIZE)
         for _ in range(3):
-            u = np.zeros(SIZE)
             u[GRAVITY] = mean[GRAVITY] / max(1e-9, float(np.linalg.norm(mean[GRAVITY])))
-            information = self.information + np.outer(u, u) / STRENGTH**2
-            # |g| + u (g' − g) = strength, and u g = |g|.
-            mean = np.asarray(np.linalg.solve(information, start + u * strength / STRENGTH**2))
+            # |g| + u (g' − g) = strength, and u g = |g|: one number is measured, so nothing has to be solved.
+            along = self.covariance @ u
+            mean = self.mean + along * ((strength - u @ self.mean) / (STRENGTH**2 + u @ along))
+        information = self.information + np.outer(u, u) / STRENGTH**2
         return Belief(mean, 0.5 * (information + information.T))
 
     def _worst(self, J: FloatArray) -> float:
