@@ -57,9 +57,10 @@ class Smoother:
         missing = 6 * max(0, last - self.last)
         if missing:
             c, size = len(self.g) - SIZE, len(self.g) + missing
-            order = np.concatenate([np.arange(c), np.arange(c + missing, size)])
             H, g = np.diag(np.full(size, _NOTHING)), np.zeros(size)
-            H[order[:, None], order], g[order] = self.H, self.g
+            g[:c], g[c + missing :] = self.g[:c], self.g[c:]
+            H[:c, :c], H[c + missing :, c + missing :] = self.H[:c, :c], self.H[c:, c:]
+            H[:c, c + missing :], H[c + missing :, :c] = self.H[:c, c:], self.H[c:, :c]
             self.H, self.g = H, g
         self.at = state.received(self.first, max(last, self.last))
         return cost
@@ -93,13 +94,15 @@ class Smoother:
         low, high = max(model.first, self.first), min(model.first + count, self.last)
         if low >= high:
             return
-        size = len(self.g)
-        both = 6 * low + np.arange(6 * (high - low))
-        own = np.concatenate([both - 6 * model.first, 6 * count + np.arange(tail)])
-        to = np.concatenate([both - 6 * self.first, size - tail + np.arange(tail)])
-        # np.ix_ looks at its indices again, which takes longer than adding.
-        self.H[to[:, None], to] += model.H[own[:, None], own]
-        self.g[to] += model.g[own]
+        # Block by block: slices are added faster than arrays of indices.
+        to, own = (slice(6 * (low - first), 6 * (high - first)) for first in (self.first, model.first))
+        blocks = [(to, own)]
+        if tail:
+            blocks.append((slice(len(self.g) - tail, None), slice(6 * count, None)))
+        for to, own in blocks:
+            self.g[to] += model.g[own]
+            for to_other, own_other in blocks:
+                self.H[to, to_other] += model.H[own, own_other]
 
     def diffuse(self, variance: FloatArray) -> None:
         """The belief's numbers walk on: variances (12,) of their steps."""
