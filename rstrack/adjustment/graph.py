@@ -123,7 +123,9 @@ class Graph:
 
     def found(self, state: State) -> Found | None:
         """What is known there of the unit, if there is one."""
-        return None if state.unit is None else Found.of(state.unit, self._system(state, None).covariance())
+        if self.unit is None or state.unit is None:
+            return None
+        return Found.of(state.unit, self.unit.recording.T_imu_depth, self._system(state, None).covariance())
 
     def _system(self, state: State, weights: FloatArray | None) -> _System:
         others = 0 if self.unit is None or state.unit is None else len(state.unit)

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 
 from rsgen.array_types import FloatArray, IntArray
-from rsgen.geometry import se3
+from rsgen.geometry import se3, so3
 from rsgen.geometry.so3 import hat
 from rsgen.geometry.spline import Spline
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.inertial.band import Band
-from rstrack.inertial.belief import GRAVITY, SIZE, STRENGTH, WARMS, Belief
+from rstrack.inertial.belief import GRAVITY, SIZE, STRENGTH, TURN, WARMS, Belief
 from rstrack.inertial.residuals import Rows, Samples
 
 # About how far apart the biases' knots are, s.
@@ -69,20 +69,23 @@ class UnitState:
 
 @dataclass(frozen=True)
 class Found:
-    """What a recording tells of a unit: its state, with a belief of the biases in the end and of gravity; and sigmas
-    (12,) of T_imu_depth's left increment (m, rad) and of the scales."""
+    """What a recording tells of a unit: its state, with a belief of the biases in the end, of gravity and of the turn;
+    and sigmas (12,) of T_imu_depth's left increment (m, rad) and of the scales."""
 
     state: UnitState
     belief: Belief
     sigmas: FloatArray
 
     @classmethod
-    def of(cls, state: UnitState, inverse: Callable[[IntArray], FloatArray]) -> Found:
-        """inverse: the covariance of unknowns, whose numbers count from the end, below 0."""
-        last = inverse(np.arange(-12, -3))
-        sigmas = np.sqrt(np.diag(inverse(np.arange(12) - 6 * len(state))))
-        nine = np.concatenate([state.biases[-1], state.gravity])
-        return cls(state, Belief(nine, np.asarray(np.linalg.inv(0.5 * (last + last.T)))), sigmas)
+    def of(cls, state: UnitState, T_imu_depth: FloatArray, inverse: Callable[[IntArray], FloatArray]) -> Found:
+        """T_imu_depth (4, 4): as it was told. inverse: the covariance of unknowns, whose numbers count from the end,
+        below 0."""
+        own = np.arange(12) - 6 * len(state)
+        last = inverse(np.concatenate([np.arange(-12, -3), own[3:6]]))
+        turn = so3.log(state.T_imu_depth[:3, :3] @ T_imu_depth[:3, :3].T)
+        numbers = np.concatenate([state.biases[-1], state.gravity, turn])
+        belief = Belief(numbers, np.asarray(np.linalg.inv(0.5 * (last + last.T))))
+        return cls(state, belief, np.sqrt(np.diag(inverse(own))))
 
     def as_dict(self) -> dict[str, Any]:
         """T_imu_depth and scales, for run.json."""
@@ -198,8 +201,8 @@ class Unit:
     def _rows(self, spline: Spline, state: UnitState) -> Iterator[tuple[FloatArray, FloatArray, IntArray, IntArray]]:
         """Residuals (n, 6) and their derivatives (n, 6, 54), in σ, the first control point and knot (n,) of each: of
         whole segments, some at once."""
-        nine = np.zeros(SIZE)
-        nine[GRAVITY] = state.gravity
+        numbers = np.zeros(SIZE)
+        numbers[GRAVITY] = state.gravity
         R_imu_depth = state.T_imu_depth[:3, :3]
         segment, u = spline.locate(self.samples.t)
         begin = 0
@@ -210,17 +213,18 @@ class Unit:
                 end = end if end > begin else int(np.searchsorted(segment, segment[begin], side="right"))
             part = slice(begin, end)
             samples = Samples(self.samples.t[part], self.samples.values[part], self.samples.counts[part])
-            rows = Rows.of(spline, samples, state.T_imu_depth, nine)
+            rows = Rows.of(spline, samples, state.T_imu_depth, numbers)
             felt, scale = rows.r + samples.values, 1.0 + state.scales
             omega, turning = felt[:, :3], spline.acceleration(samples.t)[:, 3:] @ R_imu_depth.T
             knot, rest = np.divmod(segment[part] - self.segment, self.per)
             late = ((rest + u[part]) / self.per)[:, None]
             r = scale * felt + (1.0 - late) * state.biases[knot] + late * state.biases[knot + 1] - samples.values
             J = np.zeros((len(r), 6, 6 * _BLOCKS))
-            J[:, :, :24], J[:, :, 48:51] = rows.J[:, :, :24], rows.J[:, :, 24:][:, :, GRAVITY]
+            by_belief = rows.J[:, :, 24:]
+            J[:, :, :24], J[:, :, 48:51] = rows.J[:, :, :24], by_belief[:, :, GRAVITY]
             # A unit that is elsewhere by −ρ in its axes, and turned by φ.
             J[:, 3:, 24:27] = -(hat(turning) + hat(omega) @ hat(omega))
-            J[:, :3, 27:30], J[:, 3:, 27:30] = -hat(omega), -hat(felt[:, 3:])
+            J[:, :, 27:30] = by_belief[:, :, TURN]
             J *= scale[:, None]
             J[:, :, 30:36] = felt[..., None] * np.eye(6)
             J[:, :, 36:42] = (1.0 - late)[..., None] * np.eye(6)

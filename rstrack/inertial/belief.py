@@ -1,4 +1,4 @@
-"""What is believed of a unit's biases and of gravity: nine numbers, normally distributed."""
+"""What is believed of a unit's biases, of gravity and of how it is turned: twelve numbers, normally distributed."""
 
 from __future__ import annotations
 
@@ -8,10 +8,14 @@ from functools import cached_property
 import numpy as np
 
 from rsgen.array_types import FloatArray
+from rsgen.geometry.so3 import hat
 
-SIZE = 9
-"""Gyroscope's bias (rad/s), accelerometer's bias, gravity in the world (both m/s²)."""
-GYRO, ACCEL, GRAVITY = slice(0, 3), slice(3, 6), slice(6, 9)
+SIZE = 12
+"""Gyroscope's bias (rad/s), accelerometer's bias, gravity in the world (both m/s²), and the turn φ (rad, in the unit's
+axes) from where T_imu_depth has the unit: its axes are those of exp(φ) R_imu_depth."""
+GYRO, ACCEL, GRAVITY, TURN = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
+TURNED = 5e-3
+"""σ of that turn beforehand, rad: drawings and hands are right to some tenths of a degree."""
 # σ of biases before anything is known: rad/s and m/s², as sheets of cheap units have them.
 _GYRO_BIAS, _ACCEL_BIAS = 0.1, 0.6
 STRENGTH = 0.03
@@ -28,7 +32,7 @@ _KNOWN_GYRO, _KNOWN_FORCE, _KNOWN_DEG = 5e-3, 0.15, 0.3
 
 @dataclass(frozen=True)
 class Belief:
-    """mean (9,): gyroscope's bias, accelerometer's bias, gravity in the world. information (9, 9): around that."""
+    """mean (12,): gyroscope's bias, accelerometer's bias, gravity in the world, turn. information (12, 12): of it."""
 
     mean: FloatArray
     information: FloatArray
@@ -36,18 +40,18 @@ class Belief:
     @classmethod
     def initial(cls, gravity: FloatArray) -> Belief:
         """Before anything is known; gravity (3,) a guess in the world, whose strength alone counts."""
-        sigma = np.repeat([_GYRO_BIAS, _ACCEL_BIAS, 3.0 * float(np.linalg.norm(gravity))], 3)
-        mean = np.concatenate([np.zeros(6), np.asarray(gravity, dtype=np.float64)])
+        sigma = np.repeat([_GYRO_BIAS, _ACCEL_BIAS, 3.0 * float(np.linalg.norm(gravity)), TURNED], 3)
+        mean = np.concatenate([np.zeros(6), np.asarray(gravity, dtype=np.float64), np.zeros(3)])
         return cls(mean, np.asarray(np.diag(sigma**-2.0)))
 
     @cached_property
     def covariance(self) -> FloatArray:
-        """(9, 9)."""
+        """(12, 12)."""
         return np.asarray(np.linalg.inv(self.information))
 
     @property
     def sigmas(self) -> FloatArray:
-        """(9,)."""
+        """(12,)."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
@@ -68,23 +72,31 @@ class Belief:
         """Whether gravity's direction is known to 0.3° (one σ): until then it may be the accelerometer's bias."""
         return self.direction_deg < _KNOWN_DEG
 
-    def is_usable(self, R_imu_world: FloatArray) -> bool:
-        """Whether readings in an attitude (3, 3) tell accelerations to 0.15 m/s², and rates to 0.3 °/s."""
-        rates = np.diag(self.covariance)[GYRO]
-        return self.force_variance(R_imu_world) < _KNOWN_FORCE**2 and bool((rates < _KNOWN_GYRO**2).all())
+    def is_usable(self, R_imu_world: FloatArray, rate: FloatArray) -> bool:
+        """Whether readings in an attitude (3, 3), and at a rate (3,) of the unit in rad/s, tell accelerations to
+        0.15 m/s², and rates to 0.3 °/s."""
+        return self.force_variance(R_imu_world) < _KNOWN_FORCE**2 and self.rate_variance(rate) < _KNOWN_GYRO**2
 
     def force_variance(self, R_imu_world: FloatArray) -> float:
-        """Of what gravity and the accelerometer's bias make together in an attitude (3, 3), in the worst direction."""
-        J = np.concatenate([np.zeros((3, 3)), np.eye(3), -R_imu_world], axis=1)
-        return float(np.linalg.eigvalsh(J @ self.covariance @ J.T)[-1])
+        """Of what gravity, the accelerometer's bias and the turn make together in an attitude (3, 3), in the worst
+        direction."""
+        turned = hat(R_imu_world @ self.mean[GRAVITY])
+        return self._worst(np.concatenate([np.zeros((3, 3)), np.eye(3), -R_imu_world, turned], axis=1))
+
+    def rate_variance(self, rate: FloatArray) -> float:
+        """Of what the gyroscope's bias and the turn make together at a rate (3,), rad/s, in the worst direction."""
+        return self._worst(np.concatenate([np.eye(3), np.zeros((3, 6)), -hat(rate)], axis=1))
 
     def of_strength(self, strength: float) -> Belief:
         """With gravity on the sphere of a known strength, m/s²: |g| is a measurement, taken where it is in the end."""
-        mean, start = self.mean, self.information @ self.mean
+        mean, u = self.mean, np.zeros(SIZE)
         for _ in range(3):
-            u = np.zeros(SIZE)
             u[GRAVITY] = mean[GRAVITY] / max(1e-9, float(np.linalg.norm(mean[GRAVITY])))
-            information = self.information + np.outer(u, u) / STRENGTH**2
-            # |g| + u (g' − g) = strength, and u g = |g|.
-            mean = np.asarray(np.linalg.solve(information, start + u * strength / STRENGTH**2))
+            # |g| + u (g' − g) = strength, and u g = |g|: one number is measured, so nothing has to be solved.
+            along = self.covariance @ u
+            mean = self.mean + along * ((strength - u @ self.mean) / (STRENGTH**2 + u @ along))
+        information = self.information + np.outer(u, u) / STRENGTH**2
         return Belief(mean, 0.5 * (information + information.T))
+
+    def _worst(self, J: FloatArray) -> float:
+        return float(np.linalg.eigvalsh(J @ self.covariance @ J.T)[-1])

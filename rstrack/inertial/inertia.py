@@ -13,7 +13,7 @@ from rstrack.alignment.priors import ACCELERATION, acceleration_prior
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.inertial.band import Band
-from rstrack.inertial.belief import GRAVITY, GYRO, Belief
+from rstrack.inertial.belief import GRAVITY, GYRO, SIZE, Belief
 from rstrack.inertial.kept import Kept
 from rstrack.inertial.residuals import Rows, Samples
 from rstrack.inertial.smoother import Smoother
@@ -36,7 +36,7 @@ _GIVEN = "recording", "samples", "common", "_band"
 
 
 class Inertia:
-    """recording: of the unit. belief: of its biases and gravity as far as is known.
+    """recording: of the unit. belief: of its biases, gravity and turn as far as is known.
 
     common (6,): standard deviation of accelerations for the motion prior, m/s² and rad/s².
     sigma (2,): of a gyroscope's reading against the spline (rad/s), and of an accelerometer's (m/s²): never less than
@@ -49,7 +49,7 @@ class Inertia:
         self.usable_s = self.determined_s = float("nan")
         noise, root = recording.noise, np.sqrt(recording.rate_hz)
         self._noise = np.array([noise.gyro_density, noise.accel_density]) * root
-        walks = np.repeat([noise.gyro_walk, noise.accel_walk, _DRIFT], 3)
+        walks = np.repeat([noise.gyro_walk, noise.accel_walk, _DRIFT, 0.0], 3)
         self._walk = walks**2
         self._band, self._dt = Band.of(recording), 0.0
         self.common = self._band.allowed if self.tells else ACCELERATION
@@ -83,12 +83,12 @@ class Inertia:
         return self.is_usable or self.recording.gyro is not None
 
     def begin_world(self) -> None:
-        """The world is another one from now on; biases stay what they are."""
+        """The world is another one from now on; biases and turn stay what they are."""
         if self._smoother is None:
             return
-        information = np.linalg.inv(self.belief.covariance[:6, :6])
-        start = Belief.initial(np.array([0.0, self.recording.gravity, 0.0]))
-        start.information[:6, :6], start.mean[:6] = information, self.belief.mean[:6]
+        start, own = Belief.initial(np.array([0.0, self.recording.gravity, 0.0])), np.delete(np.arange(SIZE), GRAVITY)
+        start.information[np.ix_(own, own)] = np.linalg.inv(self.belief.covariance[np.ix_(own, own)])
+        start.mean[own] = self.belief.mean[own]
         self.belief, self._smoother = start, None
         self.usable_s = self.determined_s = float("nan")
         self._until = self._next = -np.inf
@@ -133,22 +133,20 @@ class Inertia:
             # A belief that is still wrong would draw the spline, and find itself confirmed: as good as none, so that it
             # says how the motion changes. Only that a hand accelerates little in the mean holds where images tell
             # little.
-            mean = np.concatenate([np.zeros(6), self._guessed(spline, samples)])
-            loose = Belief.initial(mean[GRAVITY]).information.copy()
-            loose[GRAVITY, GRAVITY] = np.eye(3) / _MEAN_ACCELERATION**2
-            belief = Belief(mean, loose)
-        nine = belief.mean
+            belief = Belief.initial(self._guessed(spline, samples))
+            belief.information[GRAVITY, GRAVITY] = np.eye(3) / _MEAN_ACCELERATION**2
+        numbers = belief.mean
 
         def around() -> tuple[Quadratic, float]:
-            nonlocal nine
+            nonlocal numbers
             for _ in range(2):
-                joint, _ = self._rows(state, samples, nine).summed(self.sigma)
+                joint, _ = self._rows(state, samples, numbers).summed(self.sigma)
                 if joint is None:
                     return Quadratic(state.end - 1, np.zeros((6, 6)), np.zeros(6)), 0.0
-                model, cost, best = joint.without_belief(belief, nine)
-                if np.abs(best - nine)[GRAVITY].max() < _SAME_GRAVITY:
+                model, cost, best = joint.without_belief(belief, numbers)
+                if np.abs(best - numbers)[GRAVITY].max() < _SAME_GRAVITY:
                     break
-                nine = best
+                numbers = best
             return model, cost
 
         return Kept(state, first, around)
@@ -229,13 +227,15 @@ class Inertia:
         if joint is not None and self.tells:
             self._learn_sigma(scatter.after(self.belief.mean - before), fresh.counts, state.dt)
         if not self.is_usable:
-            R_imu_world = self.recording.T_imu_depth[:3, :3] @ state.spline.pose(self._until)[:3, :3].T
-            self.usable_s = end if self.belief.is_usable(R_imu_world) else self.usable_s
+            T, twist = state.spline.pose_and_velocity(self._until)
+            R_imu_depth = self.recording.T_imu_depth[:3, :3]
+            usable = self.belief.is_usable(R_imu_depth @ T[:3, :3].T, R_imu_depth @ twist[3:])
+            self.usable_s = end if usable else self.usable_s
         if not np.isfinite(self.determined_s) and self.belief.is_determined:
             self.determined_s = end
 
-    def _rows(self, state: SplineState, samples: Samples, nine: FloatArray) -> Rows:
-        return Rows.of(state.spline, samples, self.recording.T_imu_depth, nine)
+    def _rows(self, state: SplineState, samples: Samples, numbers: FloatArray) -> Rows:
+        return Rows.of(state.spline, samples, self.recording.T_imu_depth, numbers)
 
     def _rows_known(self, state: SplineState, fresh: Samples) -> Rows:
         """Of fresh samples, those until now: from when the frame was solved for, if that was hardly elsewhere."""

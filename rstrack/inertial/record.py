@@ -5,12 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from scipy.stats import chi2
 
 from rsgen.array_types import FloatArray
 from rsgen.geometry import so3
 from rsgen.geometry.spline import Spline
-from rstrack.inertial.belief import ACCEL, GRAVITY, GYRO, Belief
+from rstrack.inertial.belief import ACCEL, GRAVITY, GYRO, TURN, Belief
 from rstrack.inertial.inertia import Inertia
+
+# χ² of three numbers that chance exceeds once in 10⁵, and a turn, rad, that is worth saying.
+_BEYOND, _WORTH_SAYING = float(chi2.isf(1e-5, 3)), np.radians(0.1)
 
 
 def record(inertia: Inertia) -> dict[str, Any]:
@@ -29,9 +33,20 @@ def believed(belief: Belief, sigma: FloatArray) -> dict[str, Any]:
         "gyro_bias_sigma": sigmas[GYRO].tolist(),
         "accel_bias": belief.mean[ACCEL].tolist(),
         "accel_bias_sigma": sigmas[ACCEL].tolist(),
+        "T_imu_depth_turn": belief.mean[TURN].tolist(),
+        "T_imu_depth_turn_sigma": sigmas[TURN].tolist(),
+        "T_imu_depth_is_contradicted": is_contradicted(belief),
         "gyro_residual": float(sigma[0]),
         "accel_residual": float(sigma[1]),
     }
+
+
+def is_contradicted(belief: Belief) -> bool:
+    """Whether readings and images say beyond chance that the unit is turned from where T_imu_depth has it, and by
+    more than what draws images by a thousandth of the motion passes for."""
+    turn = belief.mean[TURN]
+    beyond = float(turn @ np.linalg.solve(belief.covariance[TURN, TURN], turn))
+    return beyond > _BEYOND and bool(np.linalg.norm(turn) > _WORTH_SAYING)
 
 
 def text(found: dict[str, Any], begin: float, bridged: int) -> str:
@@ -41,7 +56,7 @@ def text(found: dict[str, Any], begin: float, bridged: int) -> str:
     known = found["gravity_determined_s"]
     when = "" if known is None else f" (to 0.3° after {known - begin:.1f} s)"
     over = f", {bridged} frames bridged" if bridged else ""
-    return _summary(found, when) + over
+    return _summary(found, when) + over + _contradiction(found)
 
 
 def refined_text(found: dict[str, Any]) -> str:
@@ -69,6 +84,16 @@ def turned(T_upright_world: FloatArray, spline: Spline) -> Spline:
 def _summary(found: dict[str, Any], when: str) -> str:
     biases = f"{_vector(found['gyro_bias'])} rad/s and {_vector(found['accel_bias'])} m/s²"
     return f"IMU: gravity known to {found['gravity_sigma_deg']:.2f}°{when}, biases {biases}"
+
+
+def _contradiction(found: dict[str, Any]) -> str:
+    if not found["T_imu_depth_is_contradicted"]:
+        return ""
+    degrees = np.degrees(np.linalg.norm(found["T_imu_depth_turn"]))
+    return (
+        f"\nIMU: turned by {degrees:.2f}° from where T_imu_depth has it, which the track takes into account; "
+        "rstrack calibrate SEQ --free imu writes one that fits"
+    )
 
 
 def _known(seconds: float) -> float | None:

@@ -1,7 +1,8 @@
 """Residuals of gyroscope and accelerometer at their own stamps, by the spline's control points, biases and gravity.
 
 r = [ω_imu + b_g − gyro; a_imu − R_imu_world g + b_a − accel], with twist and rate taken to the unit by the adjoint of
-T_imu_depth, lever arm included: a_imu = v̇ + ω × v there (DESIGN section 4).
+exp([0; φ]) T_imu_depth, lever arm included: a_imu = v̇ + ω × v there (DESIGN section 4). φ, a belief's turn, turns the
+unit where it sits.
 """
 
 from __future__ import annotations
@@ -11,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from rsgen.array_types import FloatArray, IntArray
-from rsgen.geometry import se3
+from rsgen.geometry import se3, so3
 from rsgen.geometry.so3 import cross, hat
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.normal_equations import Quadratic
 from rstrack.data.imu.recording import ImuRecording
-from rstrack.inertial.belief import ACCEL, GRAVITY, GYRO, SIZE, Belief
+from rstrack.inertial.belief import ACCEL, GRAVITY, GYRO, SIZE, TURN, Belief
 from rstrack.inertial.derivatives import motion
 from rstrack.inertial.wild import wild
 
@@ -56,7 +57,7 @@ class Samples:
 
 @dataclass(frozen=True)
 class Joint:
-    """½ xᵀ H x + gᵀ x over control points from `first` on and, last, the nine numbers of a `Belief`; cost: at x = 0."""
+    """½ xᵀ H x + gᵀ x over control points from `first` on and, last, the numbers of a `Belief`; cost: at x = 0."""
 
     first: int
     H: FloatArray
@@ -69,8 +70,8 @@ class Joint:
         return (len(self.g) - SIZE) // 6
 
     def without_belief(self, belief: Belief, at: FloatArray) -> tuple[Quadratic, float, FloatArray]:
-        """Over the control points alone, the nine numbers, here around `at` (9,), being best at every step and known
-        beforehand as `belief` says; the cost, and the best nine (9,) where no control point moves."""
+        """Over the control points alone, a belief's numbers, here around `at` (12,), being best at every step and known
+        beforehand as `belief` says; the cost, and the best ones (12,) where no control point moves."""
         z = slice(6 * self.count, None)
         c = slice(0, 6 * self.count)
         off = at - belief.mean
@@ -84,20 +85,20 @@ class Joint:
 
 @dataclass(frozen=True)
 class Scatter:
-    """Residuals r (n, 6), and by_belief (n, 6, 9) what a belief's nine numbers do to them."""
+    """Residuals r (n, 6), and by_belief (n, 6, 12) what a belief's numbers do to them."""
 
     r: FloatArray
     by_belief: FloatArray
 
     def after(self, change: FloatArray) -> FloatArray:
-        """(n, 6), where the nine numbers have changed by (9,)."""
+        """(n, 6), where these have changed by (12,), to first order in the turn."""
         return self.r + self.by_belief @ change
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Residuals of n samples, linearised: r (n, 6), J (n, 6, 33) their derivatives by the four control points and by a
-    belief's nine numbers, first (n,) the first of these control points."""
+    """Residuals of n samples, linearised: r (n, 6), J (n, 6, 36) their derivatives by the four control points and by a
+    belief's numbers, first (n,) the first of these control points."""
 
     samples: Samples
     r: FloatArray
@@ -106,23 +107,28 @@ class Rows:
 
     @classmethod
     def of(cls, spline: Spline, samples: Samples, T_imu_depth: FloatArray, belief: FloatArray) -> Rows:
-        """Around a spline and nine numbers (9,), see `Belief`. All samples' times must be within the spline."""
-        at = motion(spline, samples.t)
+        """Around a spline and a belief's numbers (12,). All samples' times must be within the spline."""
+        at, turn = motion(spline, samples.t), belief[TURN]
+        a, b, c = so3.exp_coefficients(so3.squared_norm(turn))
+        T_imu_depth = np.concatenate([so3.polynomial(turn, a, b) @ T_imu_depth[:3], T_imu_depth[3:]])
         Ad, n = se3.adjoint(T_imu_depth), len(samples)
         twist, rate = at.twist @ Ad.T, at.rate @ Ad.T
         by_twist, by_rate = Ad @ at.by_twist, Ad @ at.by_rate
         v, omega = twist[:, :3], twist[:, 3:]
         R_imu_world = T_imu_depth[:3, :3] @ np.swapaxes(at.rotation, 1, 2)
         g = belief[GRAVITY]
-        force = rate[:, :3] + cross(omega, v) - R_imu_world @ g + belief[ACCEL]
+        felt, across = rate[:, :3] + cross(omega, v) - R_imu_world @ g, hat(omega)
         J = np.zeros((n, 6, 24 + SIZE))
         J[:, :3, :24] = by_twist[:, 3:]
-        J[:, 3:, :24] = by_rate[:, :3] + hat(omega) @ by_twist[:, :3] - hat(v) @ by_twist[:, 3:]
+        J[:, 3:, :24] = by_rate[:, :3] + across @ by_twist[:, :3] - hat(v) @ by_twist[:, 3:]
         # R ← exp(φ) R turns Rᵀ g by Rᵀ g^ φ.
         J[:, 3:, :24] -= (R_imu_world @ hat(g)) @ at.by_turn
         J[:, :3, 24:27] = J[:, 3:, 27:30] = np.eye(3)
-        J[:, 3:, 30:] = -R_imu_world
-        return cls(samples, np.concatenate([omega + belief[GYRO], force], axis=1) - samples.values, J, at.first)
+        J[:, 3:, 30:33] = -R_imu_world
+        # exp(φ + δ) = exp(Jl(φ) δ) exp(φ).
+        J[:, :, 33:] = -np.concatenate([across, hat(felt)], axis=1) @ so3.polynomial(turn, b, c)
+        told = np.concatenate([omega + belief[GYRO], felt + belief[ACCEL]], axis=1)
+        return cls(samples, told - samples.values, J, at.first)
 
     def until(self, end: float) -> Rows:
         """Those of samples before a time, s."""
@@ -136,7 +142,7 @@ class Rows:
         return Rows(self.samples, self.r + (self.J[:, :, :24] @ step)[..., 0], self.J, self.first)
 
     def summed(self, sigma: FloatArray) -> tuple[Joint | None, Scatter]:
-        """Their normal equations, and how they scatter about the spline and the nine numbers.
+        """Their normal equations, and how they scatter about the spline and a belief's numbers.
 
         sigma (2,): of a gyroscope's reading (rad/s), of an accelerometer's (m/s²). None without samples.
         """
@@ -148,10 +154,12 @@ class Rows:
         starts = np.flatnonzero(np.diff(self.first, prepend=self.first[0] - 1))
         first, count = int(self.first[0]), int(self.first[-1] - self.first[0]) + 4
         size = 6 * count + SIZE
-        total = np.zeros((size + 1, size + 1))
-        tail = np.arange(6 * count, size + 1)
+        total, tail = np.zeros((size + 1, size + 1)), slice(6 * count, None)
         for begin, end in zip(starts, [*starts[1:], len(self.first)], strict=True):
             rows = whitened[begin:end].reshape(-1, 24 + SIZE + 1)
-            at = np.concatenate([6 * (self.first[begin] - first) + np.arange(24), tail])
-            total[at[:, None], at] += rows.T @ rows
+            squares, low = rows.T @ rows, 6 * (self.first[begin] - first)
+            # Slices are added faster than arrays of indices.
+            for to, own in ((slice(low, low + 24), slice(0, 24)), (tail, slice(24, None))):
+                total[to, tail] += squares[own, 24:]
+                total[to, low : low + 24] += squares[own, :24]
         return Joint(first, total[:-1, :-1], total[:-1, -1], 0.5 * float(total[-1, -1])), scatter

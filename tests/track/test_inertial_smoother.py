@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.optimize import least_squares, minimize
+from scipy.spatial.transform import Rotation
 
 from rsgen.array_types import FloatArray
 from rsgen.config.imu import ImuConfig
@@ -15,10 +16,11 @@ from rstrack.alignment.normal_equations import Quadratic
 from rstrack.alignment.priors import pose_constraint
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.imu.recording import ImuNoise, ImuRecording
-from rstrack.inertial.belief import SIZE, Belief
+from rstrack.inertial.belief import SIZE, TURN, TURNED, Belief
 from rstrack.inertial.belief import STRENGTH as STRENGTH_SIGMA
 from rstrack.inertial.inertia import Inertia
 from rstrack.inertial.kept import Kept
+from rstrack.inertial.record import is_contradicted, record, text
 from rstrack.inertial.residuals import Rows, Samples
 from rstrack.inertial.smoother import Smoother
 
@@ -38,7 +40,8 @@ def hand_held(seconds: float, seed: int) -> Spline:
     return Spline(se3.exp(twists), -DT, DT)
 
 
-def recording(spline: Spline, seed: int, walk: float = 1.0) -> ImuRecording:
+def recording(spline: Spline, seed: int, walk: float = 1.0, turn: FloatArray | None = None) -> ImuRecording:
+    """turn (3,): rad, in its axes, by which the unit is turned from where its T_imu_depth has it."""
     config = ImuConfig(
         gravity=tuple(GRAVITY), T_imu_depth=tuple(map(tuple, se3.exp([0.01, 0.02, -0.01, 0.1, 0.2, 1.5]).tolist())),
         gyroscope_noise_density=7e-5, gyroscope_random_walk=walk * 1e-5, accelerometer_noise_density=1e-3,
@@ -46,8 +49,15 @@ def recording(spline: Spline, seed: int, walk: float = 1.0) -> ImuRecording:
     )  # fmt: skip
     read = simulate_imu(spline, config, spline.t_begin, spline.t_end, seed)
     noise = ImuNoise(7e-5, max(walk, 1e-3) * 1e-5, 1e-3, max(walk, 1e-3) * 1e-4)
-    T_imu_depth = se3.inverse(config.T_depth_imu())
+    T_imu_depth = turned(se3.inverse(config.T_depth_imu()), np.zeros(3) if turn is None else -turn)
     return ImuRecording(read.t, read.gyro, read.accel, noise, T_imu_depth, 200.0, STRENGTH)
+
+
+def turned(T_imu_depth: FloatArray, turn: FloatArray) -> FloatArray:
+    """T_imu_depth of a unit that is turned in its place, rad in its axes."""
+    T = T_imu_depth.copy()
+    T[:3] = Rotation.from_rotvec(turn).as_matrix() @ T_imu_depth[:3]
+    return T
 
 
 def seen_poses(spline: Spline, rng: np.random.Generator, every: float = 1 / 30) -> list[tuple[float, FloatArray]]:
@@ -69,7 +79,7 @@ def test_a_small_problem_is_solved_as_by_scipy() -> None:
     def cost(x: FloatArray) -> FloatArray:
         moved = Spline(se3.exp(x[:-SIZE].reshape(-1, 6)) @ first.control_points, first.t0, first.dt)
         belief = start.mean + x[-SIZE:]
-        gyro, force = exact_imu(moved, imu.T_imu_depth, belief[6:], samples.t)
+        gyro, force = exact_imu(moved, turned(imu.T_imu_depth, belief[9:]), belief[6:9], samples.t)
         r = np.concatenate([gyro, force], axis=1) + belief[:6] - samples.values
         seen = se3.log(moved.pose(times) @ se3.inverse(T_seen)) / POSE_SIGMA
         known = (belief - start.mean) * np.sqrt(np.diag(start.information))
@@ -100,8 +110,9 @@ def filled(seed: int = 0) -> Smoother:
     rng = np.random.default_rng(seed)
     smoother = Smoother.start(Belief.initial(GRAVITY))
     smoother.reach(SplineState.still(0.0, DT, np.eye(4), 6), 0, 6)
-    root = rng.normal(0.0, 1.0, (90, 45))
-    smoother.H, smoother.g = smoother.H + root.T @ root, rng.normal(0.0, 1.0, 45)
+    size = 36 + SIZE
+    root = rng.normal(0.0, 1.0, (2 * size, size))
+    smoother.H, smoother.g = smoother.H + root.T @ root, rng.normal(0.0, 1.0, size)
     return smoother
 
 
@@ -119,13 +130,13 @@ def test_marginalising_leaves_the_rest_as_it_was() -> None:
 def test_walks_and_shifts_add_to_covariances_and_leave_means() -> None:
     smoother = filled(1)
     before, mean = np.linalg.inv(smoother.H), -np.linalg.solve(smoother.H, smoother.g)
-    variance = np.array([0.1, 0.2, 0.3, 0.0, 0.0, 0.4, 0.0, 0.0, 0.0])
+    variance = np.array([0.1, 0.2, 0.3, 0.0, 0.0, 0.4, 0.0, 0.0, 0.0, 0.0, 0.5, 0.0])
     smoother.diffuse(variance)
     root = np.random.default_rng(2).normal(0.0, 0.1, (6, 6))
     smoother.shift(root @ root.T)
-    ways = np.concatenate([np.tile(np.eye(6), (6, 1)), np.zeros((9, 6))])
+    ways = np.concatenate([np.tile(np.eye(6), (6, 1)), np.zeros((SIZE, 6))])
     for i, axis in enumerate(np.eye(3)):
-        ways[-3:, 3 + i] = np.cross(axis, smoother.belief[6:])
+        ways[42:45, 3 + i] = np.cross(axis, smoother.belief[6:9])
     expected = before + np.diag(np.concatenate([np.zeros(36), variance])) + ways @ root @ root.T @ ways.T
     np.testing.assert_allclose(np.linalg.inv(smoother.H), expected, rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(-np.linalg.solve(smoother.H, smoother.g), mean, atol=1e-8)
@@ -142,10 +153,10 @@ def test_a_shift_less_than_nothing_takes_nothing_away() -> None:
 
 
 def test_without_biases_and_gravity_the_rest_is_as_if_these_were_best() -> None:
-    """Against SciPy's minimum over all nine, gravity's strength a measurement, at several places."""
+    """Against SciPy's minimum over all of the belief, gravity's strength a measurement, at several places."""
     smoother = filled(6)
     model, gained = smoother.without_belief(STRENGTH)
-    u = np.concatenate([np.zeros(6), smoother.belief[6:] / np.linalg.norm(smoother.belief[6:])])
+    u = np.concatenate([np.zeros(6), smoother.belief[6:9] / STRENGTH, np.zeros(3)])
 
     def cost(x: FloatArray) -> float:
         off = (u @ (smoother.belief + x[-SIZE:]) - STRENGTH) / STRENGTH_SIGMA
@@ -154,7 +165,7 @@ def test_without_biases_and_gravity_the_rest_is_as_if_these_were_best() -> None:
     assert (model.first, model.last) == (0, 6)
     for seed in range(4):
         step = np.random.default_rng(seed).normal(0.0, 0.3 * (seed > 0), 36)
-        best = minimize(lambda nine, step=step: cost(np.concatenate([step, nine])), np.zeros(SIZE), tol=1e-12).fun
+        best = minimize(lambda rest, step=step: cost(np.concatenate([step, rest])), np.zeros(SIZE), tol=1e-12).fun
         told = float(model.g @ step + 0.5 * step @ model.H @ step) - gained
         np.testing.assert_allclose(told, best, rtol=1e-6, atol=1e-6)
 
@@ -168,13 +179,15 @@ def test_being_around_another_state_costs_what_the_quadratic_says() -> None:
     twin = smoother.copy()
     assert twin.reach(state, 0, 8) == pytest.approx(expected, rel=1e-12)
     np.testing.assert_allclose(twin.g[:36], (smoother.g + smoother.H @ full)[:36], rtol=1e-12)
-    assert len(smoother.g) == 45 and len(twin.g) == 57
+    assert len(smoother.g) == 36 + SIZE and len(twin.g) == 48 + SIZE
 
 
-def learnt(seed: int, seconds: float, every: float = 1 / 30) -> tuple[Inertia, Spline]:
+def learnt(
+    seed: int, seconds: float, every: float = 1 / 30, turn: FloatArray | None = None
+) -> tuple[Inertia, Spline]:  # fmt: skip
     """A unit beside poses with noise, as the tracker would tell it of them."""
     truth = hand_held(seconds, seed)
-    inertia, state = Inertia(recording(truth, seed)), SplineState(truth)
+    inertia, state = Inertia(recording(truth, seed, turn=turn)), SplineState(truth)
     for t, T in seen_poses(truth, np.random.default_rng(seed), every):
         model, _ = pose_constraint(state.spline, t, T, POSE_SIGMA)
         inertia.learn(state, 0, [model], t + 0.015 if t + 0.015 < truth.t_end else t)
@@ -191,16 +204,29 @@ def learnt_until(truth: Spline, seed: int, end: float, wall: float = np.inf) -> 
     return inertia
 
 
-def test_biases_and_gravity_are_found_to_what_their_sigmas_say() -> None:
+def test_biases_gravity_and_turn_are_found_to_what_their_sigmas_say() -> None:
     """Of 50 seeds: within 3 σ in 95 % and more, and the σ as large as the errors are."""
     scores = []
     for seed in range(50):
-        inertia, _ = learnt(seed, 0.8, 0.1)
-        off = inertia.belief.mean - np.concatenate([BIAS, GRAVITY])
+        turn = np.random.default_rng(100 + seed).normal(0.0, TURNED, 3)
+        inertia, _ = learnt(seed, 0.8, 0.1, turn)
+        off = inertia.belief.mean - np.concatenate([BIAS, GRAVITY, turn])
         scores.append(off / inertia.belief.sigmas)
     assert (np.abs(scores) < 3.0).mean() > 0.98
     np.testing.assert_allclose(np.sqrt(np.mean(np.square(scores)[:, :3])), 1.0, atol=0.2)
-    assert 0.3 < np.sqrt(np.mean(np.square(scores)[:, 3:])) < 1.2  # the prior of biases is wider than these are
+    assert 0.3 < np.sqrt(np.mean(np.square(scores)[:, 3:9])) < 1.2  # the prior of biases is wider than these are
+    np.testing.assert_allclose(np.sqrt(np.mean(np.square(scores)[:, TURN])), 1.0, atol=0.2)
+
+
+def test_a_place_that_readings_contradict_is_said() -> None:
+    """0.3° of turn are found, and said to be; without any nothing is."""
+    turn = np.radians([0.2, -0.2, 0.1])
+    (off, _), (right, _) = learnt(3, 2.0, turn=turn), learnt(3, 2.0)
+    assert is_contradicted(off.belief) and not is_contradicted(right.belief)
+    assert np.linalg.norm(off.belief.mean[TURN] - turn) < np.radians(0.1)
+    said, plain = (text(record(inertia), 0.0, 0) for inertia in (off, right))
+    degrees = np.degrees(np.linalg.norm(off.belief.mean[TURN]))
+    assert f"turned by {degrees:.2f}°" in said and "rstrack calibrate SEQ --free imu" in said and "turned" not in plain
 
 
 def test_a_second_look_knows_gravity_and_says_when() -> None:
@@ -249,7 +275,9 @@ def test_what_is_ahead_leads_on_from_where_images_end() -> None:
             state.apply(known.first, step)
         t = np.linspace(0.5, 0.67, 30)
         off = se3.log(state.spline.pose(t) @ se3.inverse(truth.pose(t)))
-        assert np.abs(off[:, :3]).max() < 2e-3 and np.abs(off[:, 3:]).max() < 5e-4
+        model, _ = known(state.spline)
+        told = np.sqrt(np.diag(np.linalg.inv(model.H))).reshape(-1, 6)[: last - model.first].max(axis=0)
+        assert (np.abs(off).max(axis=0) < 3.0 * told).all() and (told < np.repeat([1e-3, 6e-4], 3)).all()
 
 
 def test_nothing_is_held_before_the_unit_is_of_use_or_of_another_piece() -> None:
@@ -270,9 +298,10 @@ def test_nothing_is_held_where_images_leave_a_way_open() -> None:
 
 def test_another_world_has_its_own_gravity_and_the_same_biases() -> None:
     inertia, _ = learnt(3, 1.2)
-    sigmas = inertia.belief.sigmas[:6]
+    own, before = [*range(6), *range(9, 12)], inertia.belief
     inertia.begin_world()
-    np.testing.assert_allclose(inertia.belief.sigmas[:6], sigmas, rtol=1e-9)
+    np.testing.assert_allclose(inertia.belief.sigmas[own], before.sigmas[own], rtol=1e-9)
+    np.testing.assert_array_equal(inertia.belief.mean[own], before.mean[own])
     assert not inertia.is_usable and inertia.belief.direction_deg > 45.0
 
 

@@ -166,7 +166,9 @@ def test_a_run_says_what_it_found_and_resumes_to_the_same_bits(tmp_path: Path, m
     assert told["usable_s"] > 0.1 and np.linalg.norm(told["gravity"]) == pytest.approx(9.80665, abs=0.1)
     off = np.abs(np.array(told["gyro_bias"]) - BIAS) / told["gyro_bias_sigma"]
     assert (off < 3.0).all() and max(told["gyro_bias_sigma"]) < 5e-3
-    assert "IMU: gravity known to" in whole.text()
+    turn = np.abs(told["T_imu_depth_turn"]) / told["T_imu_depth_turn_sigma"]
+    assert (turn < 3.0).all() and told["T_imu_depth_is_contradicted"] is False
+    assert "IMU: gravity known to" in whole.text() and "turned by" not in whole.text()
     track(with_imu, options, tmp_path / "up", gravity=True)
     level, world = (read_estimate(tmp_path / name) for name in ("up", "whole"))
     T = level.T_world_depth @ se3.inverse(world.T_world_depth)
