@@ -188,7 +188,10 @@ def suggest(
     seconds: Annotated[float | None, "length of the sequence, s (default: 20, or as --like)", float] = None,
     speed: Annotated[float | None, "mean speed, m/s (default: 0.35, or as --like)", float] = None,
     like: Annotated[
-        Path | None, "a config, or its name: take over its length, speed, cameras, noise, truth", "CONFIG", config_file
+        Path | None,
+        "a config, or its name: take over its length, speed, turning, cameras, noise, truth",
+        "CONFIG",
+        config_file,
     ] = None,
     clearance: Annotated[float, "least distance to the scene's surfaces, m", float] = 0.2,
     seed: Annotated[int, "another seed, another tour (default: 0)", "N", int] = 0,

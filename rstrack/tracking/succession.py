@@ -46,7 +46,7 @@ class Succession:
         self.recent: deque[DeviceFrame] = deque()
         # The newest frame, while it is the reference and cannot be rectified yet.
         self._unconverged: DeviceFrame | None = None
-        # The most pixels that a frame saw of each reference: who comes back to one may see half of it.
+        # The most pixels that a frame saw of each reference, since it was made.
         self._pixels: dict[int, int] = {}
         # Frames in a row whose colours did not fit the reference's own.
         self._colorless = 0
@@ -89,7 +89,7 @@ class Succession:
     def use(self, found: Reference, frame: DeviceFrame) -> None:
         """Go on with a keyframe that a lost frame has been found by."""
         self._store.use(found)
-        self._refer_to(found)
+        self._refer_to(found, is_found=True)
         self.recent = deque([frame])
 
     def make(self, frame: DeviceFrame, spline: Spline, older: Reference | None) -> Reference:
@@ -144,7 +144,10 @@ class Succession:
         self.make(frozen, window.spline, ref if self._options.fuse else None)
         return True
 
-    def _refer_to(self, ref: Reference) -> None:
+    def _refer_to(self, ref: Reference, is_found: bool = False) -> None:
+        """is_found: by a lost frame, which may see half of it."""
+        if not is_found:
+            self._pixels.pop(ref.index, None)
         self.reference = ref
         self._unconverged, self._colorless = None, 0
         self._gone = None

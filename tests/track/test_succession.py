@@ -22,10 +22,14 @@ def test_who_comes_back_to_a_keyframe_may_see_half_of_it() -> None:
     None was made then, however little was left of it.
     """
     nothing = cast(Any, None)
-    succession = Succession(nothing, nothing, Options(), nothing, nothing)
+    store = cast(Any, SimpleNamespace(use=lambda found: None))
+    succession = Succession(nothing, store, Options(), nothing, nothing)
     assert [succession.overlap(seen(3, n)) for n in (800, 1000, 600)] == [1.0, 1.0, 0.6]
     succession._refer_to(cast(Any, SimpleNamespace(index=7)))
     assert [succession.overlap(seen(7, n)) for n in (500, 400)] == [1.0, pytest.approx(0.8)]
-    succession._refer_to(cast(Any, SimpleNamespace(index=3)))
+    succession.use(cast(Any, SimpleNamespace(index=3)), nothing)
     assert succession.overlap(seen(3, 500)) == 0.5
+    # One that is made again of the same frame, rectified, is another.
+    succession._refer_to(cast(Any, SimpleNamespace(index=3)))
+    assert succession.overlap(seen(3, 500)) == 1.0
     assert succession.overlap([SimpleNamespace(is_linearised=False)]) == 0.0  # type: ignore[list-item]
