@@ -37,13 +37,14 @@ from rsgen.light.drawing.sky import has_sky_light, sky_light
 from rsgen.light.drawing.specular import passes_light_on
 from rsgen.light.places.bake_points import Interpolation, sample_points, thin
 from rsgen.light.places.denoise import denoised
+from rsgen.light.places.sampling import CHANNELS
 from rsgen.render.irradiance import Lattice, lattice_area
 
 log = logging.getLogger("rsgen")
 
 
 # Raise when the method changes, so that older caches are not taken for new ones.
-METHOD = 6
+METHOD = 7
 _FINE_TEXELS = 0.9  # direct light is computed at points at least about this far apart
 _FIRST_LOOK_TEXELS = 3.0
 _FIRST_LOOK_RAYS = 12
@@ -53,9 +54,10 @@ _OF_THE_WHOLE = 0.25  # the scatter of each kind of light, of what is asked: the
 
 
 def bake(scene: Any, lattice: Lattice, light: LightConfig, progress: Progress) -> tuple[NDArray, NDArray]:
-    """Irradiance (points, 4) float32 of the front and back sides: E_r, E_g, E_b (scene units), w.
+    """Irradiance (points, 5) float32 of the front and back sides: E_r, E_g, E_b (scene units), w, share.
 
-    w: 0 where no light reaches, else 1 + how far the sample counts (see `render.irradiance.packed_reach`).
+    w: 0 where no light reaches, else 1 + how far the sample counts (see `render.irradiance.packed_reach`). share: what
+    lights the matte beneath lacquer, as a part of what would if the same light came from all sides alike.
     """
     progress("light", 0.0, "where light is looked at")
     points, index, reach = sample_points(scene, lattice, light.texel_m)
@@ -69,7 +71,7 @@ def bake(scene: Any, lattice: Lattice, light: LightConfig, progress: Progress) -
 
     lit_points = np.flatnonzero(alive_point)
     to_point = Interpolation.between(points, fine, lit_points, light.texel_m)
-    values = np.zeros((len(points.position), 3), np.float32)
+    values = np.zeros((len(points.position), CHANNELS), np.float32)
 
     def at_points(light_of_fine: Float32Array) -> Float32Array:
         values[lit_points] = to_point(light_of_fine)
@@ -88,7 +90,7 @@ def _direct(
     surfaces: Surfaces, fine: IntArray, fine_of_point: IntArray, area: FloatArray, light: LightConfig, scatter: float,
     progress: Progress,
 ) -> tuple[Float32Array, NDArray[np.bool_]]:  # fmt: skip
-    """Direct irradiance (m, 3) of those of the points `fine` that any light reaches, and which these are (n,).
+    """Direct irradiance (m, 4) of those of the points `fine` that any light reaches, and which these are (n,).
 
     area (n,): of the surface that each stands for, m². Raises UserError if there are none.
     """
@@ -99,7 +101,7 @@ def _direct(
     grey = first_look(scene, points, fine[looked_at], follow, report).mean(axis=1)[stands_for]
     beside = grey + _AMBIENT * typical(grey)
     patch = thin(points, PATCH * light.texel_m, fine)[1]
-    means, left = np.zeros((2, len(fine), 3), np.float32), np.zeros(len(fine))
+    means, left = np.zeros((2, len(fine), CHANNELS), np.float32), np.zeros(len(fine))
     if has_sky_light(scene):
         report = _reporter(progress, 0.07, 0.18, "light of the sky and off mirrors")
         means, left = sky_light(
@@ -127,7 +129,7 @@ def _direct(
 def _reached(
     surfaces: Surfaces, fine: IntArray, fine_of_point: IntArray, seen: Float32Array, report: Callable[[float], None]
 ) -> NDArray[np.bool_]:
-    """Which of `fine` (n,) any light reaches, given the direct light (n, 3) that a first look has seen there."""
+    """Which of `fine` (n,) any light reaches, given the direct light (n, 4) that a first look has seen there."""
     total = seen.copy()
     everywhere = np.ones(len(fine_of_point), bool)
     for bounce in range(_FIRST_LOOK_BOUNCES):

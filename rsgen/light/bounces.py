@@ -16,6 +16,7 @@ from rsgen.light.drawing.gather import gathering
 from rsgen.light.drawing.rounds import PATCH, in_rounds, scatter_of, shown
 from rsgen.light.places.bake_points import Interpolation, thin
 from rsgen.light.places.denoise import denoised
+from rsgen.light.places.sampling import CHANNELS
 from rsgen.light.places.surface_points import SurfacePoints
 from rsgen.render.irradiance import IrradianceField, Lattice, make_field
 
@@ -28,6 +29,7 @@ _REGION_M = 2.0  # parts of the scene, of like normals on one piece of surface, 
 _FEW_LEFT = 0.02  # of the light at nearly all places: bounces that bring less are extrapolated from those before
 _NEARLY_ALL = 0.9
 _MOST_KEPT = 0.97  # of the light by a bounce
+_LEAST_SHARE, _MOST_SHARE = 0.3, 1.06  # of light that gets into lacquer: at 86 degrees, and what comes straight
 
 
 @dataclass(frozen=True)
@@ -44,15 +46,19 @@ class Surfaces:
     follow: bool
 
     def field(self, values: NDArray, alive: NDArray[np.bool_]) -> IrradianceField:
-        """Irradiance (n, 3) of the unique points, as far as they are alive (n,)."""
+        """Irradiance (n, 4), see `in_channels`, of the unique points, as far as they are alive (n,)."""
         return make_field(self.lattice, *self.sides(values, alive))
 
     def sides(self, values: NDArray, alive: NDArray[np.bool_]) -> tuple[Float32Array, Float32Array]:
-        """The same as (points, 4) of the lattice's front and back, as `make_field` takes it."""
-        front, back = (np.empty((len(far), 4), np.float32) for far in self.reach)
+        """The same as (points, 5) of the lattice's front and back, as `make_field` takes it."""
+        # In half precision, as it is kept: light from the cache must be the same to the last bit.
+        share = values[:, 3] / np.maximum(values[:, :3].mean(axis=1), 1e-30)
+        share = share.clip(_LEAST_SHARE, _MOST_SHARE).astype(np.float16).astype(np.float32)
+        front, back = (np.empty((len(far), 5), np.float32) for far in self.reach)
         for side, i, far in zip((front, back), self.index, self.reach, strict=True):
-            side[:, :3] = values[i]
+            side[:, :3] = values[i, :3]
             side[:, 3] = 1 + far.astype(np.float32)
+            side[:, 4] = share[i]
             side[~alive[i]] = 0
         return front, back
 
@@ -61,9 +67,9 @@ def light_off_surfaces(
     surfaces: Surfaces, fine: IntArray, direct: Float32Array, lit_by: Callable[[Float32Array], IrradianceField],
     light: LightConfig, scatter: float, report: Callable[[float], None],
 ) -> Float32Array:  # fmt: skip
-    """Irradiance (n, 3) that surfaces throw on the points `fine` (n,), which have `direct` (n, 3) from elsewhere.
+    """Irradiance (n, 4) that surfaces throw on the points `fine` (n,), which have `direct` (n, 4) from elsewhere.
 
-    lit_by: the field of a light (n, 3) at `fine`. Drawn until twice `scatter` is left (see `rounds`), which smoothing
+    lit_by: the field of a light (n, 4) at `fine`. Drawn until twice `scatter` is left (see `rounds`), which smoothing
     and the interpolation bring down to about that: they reach over a dozen points. Where these differ much, as in
     corners and where things touch, it is drawn at each point, at those where they differ most.
     """
@@ -73,7 +79,7 @@ def light_off_surfaces(
     beside = direct.mean(axis=1)
     before = _before_the_last(surfaces, fine, direct, lit_by, light, lambda f: report(0.5 * f))
     field = lit_by(direct + before)
-    of_fine = thin(points, spacing, fine)[0]
+    of_fine = thin(points, spacing, fine, steps=True)[0]
     coarse = fine[of_fine]
     to_fine = Interpolation.between(points, coarse, fine, spacing)
     first = max(2, light.gather_rays >> (_LAST_ROUNDS - 1))
@@ -103,9 +109,9 @@ def _before_the_last(
     surfaces: Surfaces, fine: IntArray, direct: Float32Array, lit_by: Callable[[Float32Array], IrradianceField],
     light: LightConfig, report: Callable[[float], None],
 ) -> Float32Array:  # fmt: skip
-    """Light off surfaces (n, 3) at the points `fine` after all bounces but the last; arguments as above."""
+    """Light off surfaces (n, 4) at the points `fine` after all bounces but the last; arguments as above."""
     points, spacing = surfaces.points, light.texel_m * _BOUNCE_TEXELS
-    of_fine = thin(points, spacing, fine)[0]
+    of_fine = thin(points, spacing, fine, steps=True)[0]
     coarse = fine[of_fine]
     to_fine = Interpolation.between(points, coarse, fine, spacing)
     region = thin(points, _REGION_M, coarse)[1]
@@ -122,14 +128,14 @@ def _bounced(
     thrown: Callable[[Float32Array, int, Callable[[float], None]], Float32Array], beside: FloatArray, region: IntArray,
     light: LightConfig, report: Callable[[float], None],
 ) -> Float32Array:  # fmt: skip
-    """Light off surfaces (n, 3) after all bounces but the last; from the third on, what comes after is extrapolated.
+    """Light off surfaces (n, 4) after all bounces but the last; from the third on, what comes after is extrapolated.
 
     thrown: what surfaces throw on the n points if they get so much off others, by so many rays. beside: direct light
     (n,) of the points, in grey. region: (n,) the part of the scene that each is in: in a white room behind a window
     bounces go on long after the street outside, which has most of the light, has had all that it gets.
     """
     rays = min(_BOUNCE_RAYS, light.gather_rays)
-    off_surfaces = np.zeros((len(region), 3), np.float32)
+    off_surfaces = np.zeros((len(region), CHANNELS), np.float32)
     brought: list[FloatArray] = []  # by each bounce to each region
     for bounce in range(light.bounces - 1):
 

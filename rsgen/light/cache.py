@@ -81,8 +81,8 @@ def _load(path: Path, lattice: Lattice) -> tuple[NDArray, NDArray] | None:
         with np.load(path) as data:
             for side in _SIDES:
                 alive = np.unpackbits(data[f"{side}_alive"], count=lattice.points).astype(bool)
-                values = np.zeros((lattice.points, 4), np.float32)
-                values[alive, :3] = data[side]
+                values = np.zeros((lattice.points, 5), np.float32)
+                values[alive, :3], values[alive, 4] = data[side], data[f"{side}_share"]
                 values[alive, 3] = 1
                 values[data[f"{side}_parted"], 3] += data[f"{side}_reach"]
                 sides.append(values)
@@ -98,6 +98,7 @@ def _store(path: Path, front: NDArray, back: NDArray) -> None:
         alive = values[:, 3] > 0
         parted = np.flatnonzero(values[:, 3] > 1).astype(np.uint32)
         arrays |= {side: values[alive, :3], f"{side}_alive": np.packbits(alive)}
+        arrays[f"{side}_share"] = values[alive, 4].astype(np.float16)
         arrays |= {f"{side}_parted": parted, f"{side}_reach": (values[parted, 3] - 1).astype(np.uint32)}
     temporary = path.with_suffix(f".{os.getpid()}.tmp.npz")
     try:

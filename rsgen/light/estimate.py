@@ -102,4 +102,4 @@ def _computed(scene: Any, field: IrradianceField, points: SurfacePoints, texel_m
         asked = LESS * _SKY_SAMPLES  # of which this draws the first round
         halves += sky_light(scene, points, everywhere, everywhere, texel_m, asked, dark, math.inf, silent)[0]
     draw = gathering(scene, field, points, everywhere)
-    return (halves + draw(everywhere, 0, _RAYS, silent) / (_RAYS / 2)).astype(np.float64)
+    return (halves + draw(everywhere, 0, _RAYS, silent) / (_RAYS / 2))[..., :3].astype(np.float64)

@@ -36,13 +36,15 @@ class Lattice:
     """Where irradiance is sampled: per triangle a grid of (cells_u + 1) x (cells_v + 1) points, row by row.
 
     first (f,): index of each triangle's first point; cells (f, 2); apex (f,): corner 0..2; shape_first: by Dr.Jit
-    registry id, the first triangle of each shape (-1: none); points: total count.
+    registry id, the first triangle of each shape (-1: none); lacquered: by the same, whether a shape is matte beneath
+    lacquer; points: total count.
     """
 
     first: IntArray
     cells: IntArray
     apex: IntArray
     shape_first: NDArray[np.int32]
+    lacquered: NDArray[np.bool_]
     points: int
 
     def packed(self) -> NDArray[np.uint32]:
@@ -63,6 +65,7 @@ def make_lattice(scene: Any, spacing: float) -> Lattice:
     shapes = [shape for shape in scene.shapes() if shape.is_mesh()]
     ids = [registry_id(shape) for shape in shapes]
     shape_first = np.full(max(ids) + 1, -1, np.int32)
+    lacquered = np.zeros(len(shape_first), bool)
     sides, apexes, faces_before = [], [], 0
     box = inhabited(shapes)
     for shape, number in zip(shapes, ids, strict=True):
@@ -73,12 +76,20 @@ def make_lattice(scene: Any, spacing: float) -> Lattice:
         sides.append(np.stack([edges.max(axis=1), edges.min(axis=1)], axis=1) / coarser(corners, box)[:, None])
         apexes.append(np.argmin(edges, axis=1))
         shape_first[number] = faces_before
+        lacquered[number] = _lacquered(shape.bsdf())
         faces_before += len(faces)
     lengths = np.concatenate(sides)
     _check_size(lengths, spacing)
     cells = _cells(lengths, spacing)
     first = np.concatenate([[0], np.cumsum((cells + 1).prod(axis=1))])
-    return Lattice(first[:-1], cells, np.concatenate(apexes).astype(np.int64), shape_first, int(first[-1]))
+    apex = np.concatenate(apexes).astype(np.int64)
+    return Lattice(first[:-1], cells, apex, shape_first, lacquered, int(first[-1]))
+
+
+def _lacquered(bsdf: Any) -> bool:
+    """Whether it is one of Mitsuba's plastics, beneath whatever adapts it: these alone have light refracted in."""
+    kind = str(bsdf)
+    return "Plastic[" in kind and "Blend" not in kind
 
 
 def _cells(lengths: NDArray[np.float64], spacing: float) -> IntArray:
@@ -177,20 +188,29 @@ class IrradianceField:
     beyond a wall, or under what lies on the surface, does not count on this side of it (see `packed_reach`).
     """
 
-    def __init__(self, shape_first: Any, faces: Any, values: Any, face_count: int) -> None:
-        """`shape_first` Int32 by registry id; `faces` UInt32 pairs (first point, packed cells and apex), front sides
-        then back sides; `values` Float, (E_r, E_g, E_b, w) per lattice point of each stored side: w is 0 for a point
-        that is not alive, else 1 + its reach.
+    def __init__(
+        self, shape_first: Any, lacquered: Any, faces: Any, values: Any, share: Any, face_count: int
+    ) -> None:  # fmt: skip
+        """`shape_first` Int32 and `lacquered` UInt32 (0, 1) by registry id; `faces` UInt32 pairs (first point, packed
+        cells and apex), front sides then back sides; per lattice point of each stored side `values` Float, (E_r, E_g,
+        E_b, w): w is 0 for a point that is not alive, else 1 + its reach; and `share` Float, beneath lacquer (see
+        `light.bake`).
         """
         self.shape_first = shape_first
+        self.lacquered = lacquered
         self.faces = faces
         self.values = values
+        self.share = share
         self.back_first = dr.opaque(mi.UInt32, face_count)  # else kernels are compiled for each number of triangles
 
     def lookup(self, pi: Any, si: Any, wi_world: Any, active: Any = True) -> Any:
-        """Irradiance (Color3f, scene units) at hits `pi`/`si`, on the side where `wi_world`, towards the viewer, is."""
+        """Irradiance (Color3f, scene units) at hits `pi`/`si`, on the side where `wi_world`, towards the viewer, is.
+
+        On lacquer it is so much as from all sides alike would light what is beneath it as this does.
+        """
         shape = dr.reinterpret_array(mi.UInt32, si.shape)
         first_face = dr.gather(mi.Int32, self.shape_first, shape, active & si.is_valid())
+        lacquered = dr.gather(mi.UInt32, self.lacquered, shape, active & si.is_valid()) > 0
         active = active & si.is_valid() & (first_face >= 0)
         # Shading decides which side is lit: meshes exist whose winding and vertex normals disagree.
         back = dr.dot(si.n, wi_world) * dr.dot(si.n, si.sh_frame.n) < 0
@@ -218,7 +238,8 @@ class IrradianceField:
             taken = mi.UInt32(dr.maximum(value.w - 1, 0))
             reaches = (du <= _reach(taken >> u_bits)) & (dv <= _reach(taken >> v_bits))
             weight = (1 - du) * (1 - dv) * dr.select(value.w > 0, dr.select(reaches, 1, _BLOCKED), 0)
-            total += mi.Vector4f(value.x, value.y, value.z, 1) * weight
+            share = dr.select(lacquered, dr.gather(mi.Float, self.share, offset, active & lacquered), 1)
+            total += mi.Vector4f(value.x * share, value.y * share, value.z * share, 1) * weight
         return mi.Color3f(total.xyz) * dr.select(total.w > 0, dr.rcp(dr.maximum(total.w, 1e-12)), 0)
 
 
@@ -228,7 +249,9 @@ def _reach(code: Any) -> Any:
 
 
 def make_field(lattice: Lattice, front: Float32Array, back: Float32Array) -> IrradianceField:
-    """Upload values (points, 4) of both sides, as `IrradianceField` has them; unlit back sides share one dark cell."""
+    """Upload values (points, 4 or 5) of both sides, as `IrradianceField` has them, in the fifth column each one's share
+    (none: 1); unlit back sides share one dark cell.
+    """
     packed = lattice.packed()
     lit = np.maximum.reduceat(back[:, 3], lattice.first) > 0
     keep = np.repeat(lit, (lattice.cells + 1).prod(axis=1))
@@ -239,10 +262,13 @@ def make_field(lattice: Lattice, front: Float32Array, back: Float32Array) -> Irr
     faces = np.stack(
         [np.concatenate([lattice.first, back_first]), np.concatenate([packed, back_packed])], axis=1
     ).astype(np.uint32)
-    values = np.concatenate([front, np.zeros((4, 4), np.float32), back[keep]]).astype(np.float32)
+    values = np.concatenate([front, np.zeros((4, front.shape[1]), np.float32), back[keep]]).astype(np.float32)
+    share = values[:, 4] if values.shape[1] == 5 else np.ones(len(values))
     return IrradianceField(
         mi.Int32(aligned(lattice.shape_first, np.int32)),
+        mi.UInt32(aligned(lattice.lacquered, np.uint32)),
         mi.UInt32(aligned(faces, np.uint32)),
-        mi.Float(aligned(values)),
+        mi.Float(aligned(values[:, :4])),
+        mi.Float(aligned(share)),
         len(lattice.first),
     )

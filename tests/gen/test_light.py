@@ -32,7 +32,7 @@ from rsgen.light.drawing.lamps import left_to_rays, near_lamps
 from rsgen.light.drawing.rounds import PATCH, in_rounds, scatter_of, shown
 from rsgen.light.places.bake_points import thin
 from rsgen.light.places.denoise import denoised
-from rsgen.light.places.sampling import about_normal
+from rsgen.light.places.sampling import CHANNELS, about_normal
 from rsgen.light.places.surface_points import SurfacePoints
 from rsgen.render.baked import BakedIntegrator
 from rsgen.render.images import ColorRenderer
@@ -95,7 +95,7 @@ def test_rays_are_drawn_where_lamps_leave_them_something(tmp_path: Path, lamp: s
     which = np.arange(len(xyz))
     origin, normal = points.on_device
     rays = about_normal(origin, normal, mi.UInt32(which), 0, 256, 111, left_to_rays(scene, origin, normal, False))
-    brought = np.array(rays[0]).reshape(3, -1)[0] + np.array(rays[1]).reshape(3, -1)[0]
+    brought = np.array(rays[0].x) + np.array(rays[1].x)
     near = np.isin(which, near_lamps(scene, xyz))
     assert not brought[~near].any() and (~near).sum() > 0.5 * len(near)
     assert near.any() == brought.any() == (lamp != "far")
@@ -163,7 +163,7 @@ def test_samples_go_where_light_scatters_and_shows() -> None:
         assert (drawn[todo] == begin).all()
         drawn[todo] += count
         one = true[todo] * (1 + noise[todo] / np.sqrt(count / 2) * rng.normal(size=(2, len(todo))))
-        return np.repeat((count / 2 * one)[..., None], 3, axis=2)
+        return np.repeat((count / 2 * one)[..., None], CHANNELS, axis=2)
 
     means, left = in_rounds(draw, patch, lambda own: own, 0.04, 8, 7, np.inf, silent)
     assert drawn[:500].max() == 8 and 128 <= drawn[500:1000].min() <= 256 and drawn[1000:].max() <= 32

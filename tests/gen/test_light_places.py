@@ -310,7 +310,7 @@ def test_the_estimate_is_the_error_that_is_there(tmp_path: Path) -> None:
     xy = np.random.default_rng(5).uniform(-1, 1, (4000, 2))
     good = estimated_quality(scene, make_field(lattice, front, back), 0.04, from_above(xy))
     assert good.psnr_db > good.at_least_db > 44
-    off = np.array([1.1, 1.1, 1.1, 1.0], np.float32)
+    off = np.array([1.1, 1.1, 1.1, 1.0, 1.0], np.float32)
     light = quad_factor(np.column_stack([xy, np.zeros(len(xy))]))[:, None] * [1.0, 2.0, 3.0]
     shown = 0.18 * light / np.median(light.mean(axis=1))
     square = (srgb.encode(np.clip(1.1 * shown, 0, 1)) - srgb.encode(np.clip(shown, 0, 1))) ** 2

@@ -48,7 +48,9 @@ def test_a_ball_covers_its_form_factor(distance: float, tilt: float) -> None:
 def test_light_from_all_sides_is_even_and_light_from_above_is_above() -> None:
     """Under an even sky, E = pi L whichever way a surface faces; half a sky lights as the cosine has it."""
     sky = mi.load_dict({"type": "scene", "sky": {"type": "constant", "radiance": 0.7}})
-    dark = IrradianceField(mi.Int32([-1] * 64), mi.UInt32([0, 1]), mi.Float([0] * 16), 0)
+    dark = IrradianceField(
+        mi.Int32([-1] * 64), mi.UInt32([0] * 64), mi.UInt32([0, 1]), mi.Float([0] * 16), mi.Float([1] * 4), 0
+    )
     c = gathered_light(sky, dark, np.array([[0.0, 0, 0], [3, 1, 2]]))
     for n in np.eye(3):
         e = np.array(harmonics(n)) @ c[0]

@@ -23,17 +23,19 @@ from rsgen.device.arrays import aligned, rows_of
 from rsgen.light.drawing.rounds import drawn_at
 from rsgen.light.drawing.specular import SPECULAR, lacquered, shone_along, transmitted
 from rsgen.light.places.bake_points import thin
-from rsgen.light.places.sampling import about_normal, chunks, rotation
+from rsgen.light.places.sampling import CHANNELS, about_normal, chunks, in_channels, rotation, shaded_nearby
 from rsgen.light.places.surface_points import SurfacePoints
 from rsgen.render.irradiance import at_triangles, registry_id
 from rsgen.render.scene import mesh_arrays
 
-# Where photons land, the normals of the sides they land on, and what each brings, W: (n, 3) each.
+# Where photons land, the normals of the sides they land on, (n, 3) each, and what each brings, W: (n, CHANNELS).
 Landed = tuple[NDArray, NDArray, NDArray]
 
 _A_SAMPLE, _MOST, _BATCH = 1 << 15, 1 << 21, 1 << 18  # photons: for each of a point's samples, in all, at a time
 _TURNS = 4  # surfaces that a photon is followed over
 _CELL_M = 0.12  # photons are counted in cells of this size, of like normals
+# Rays; and the part of the light that what is in a cell with a place takes if it is behind that: no photon gets there.
+_LOOKS, _BURIED = 16, 0.8
 _LEAST = 0.05  # of a cell's square: where there is less surface, a photon or two would be a spark
 _NEAR = 8  # cells that each is shared out among
 
@@ -41,17 +43,17 @@ _NEAR = 8  # cells that each is shared out among
 def lacquer_light(
     scene: Any, points: SurfacePoints, which: IntArray, area: FloatArray, texel_m: float, samples: int, follow: bool
 ) -> Float32Array:
-    """Irradiance (n, 3) that lamps and sky send to the points `which` (n,) by way of lacquer and brushed metal.
+    """Irradiance (n, 4) that lamps and sky send to the points `which` (n,) by way of lacquer and brushed metal.
 
     area (n,): of the surface that each stands for, m². samples: of each lamp at a point, which photons go by. follow:
     whether lamps shine through panes.
     """
     shapes = [shape for shape in scene.shapes() if shape.is_mesh() and lacquered(shape)]
     if not shapes:
-        return np.zeros((len(which), 3), np.float32)
+        return np.zeros((len(which), CHANNELS), np.float32)
     # Whatever pieces of surface there are: where these are small, next to nothing would land on each.
     whole = replace(points, piece=np.zeros_like(points.piece))
-    coarse, stands_for = thin(whole, 2 * texel_m, which)
+    coarse, stands_for = thin(points, 2 * texel_m, which, steps=True)
     cells = which[thin(whole, _CELL_M, which)[0]]
     tree = cKDTree(_places(points.position[cells], points.normal[cells]))
 
@@ -63,13 +65,15 @@ def lacquer_light(
         return np.stack([np.bincount(near.ravel(), (weights * w[:, None]).ravel(), len(cells)) for w in what.T], axis=1)
 
     # What lands and the surface it lands on are shared out alike, so that it does not matter how cells lie.
-    flux = np.zeros((len(cells), 3))
+    flux = np.zeros((len(cells), CHANNELS))
     for landed in _photons(scene, shapes, min(_MOST, samples * _A_SAMPLE), follow):
         flux += spread(*landed)
-    each = np.bincount(stands_for, area)[:, None]
-    around = spread(points.position[which[coarse]], points.normal[which[coarse]], each)
+    there = which[coarse]
+    seen = shaded_nearby(scene, points, there, _CELL_M, _LOOKS) < _BURIED
+    each = np.where(seen, np.bincount(stands_for, area), 0)[:, None]
+    around = spread(points.position[there], points.normal[there], each)
     light = flux / np.maximum(around, _LEAST * _CELL_M**2)
-    out = np.empty((len(which), 3), np.float32)
+    out = np.empty((len(which), CHANNELS), np.float32)
     for begin in range(0, len(which), _BATCH):
         part = which[begin : begin + _BATCH]
         near, weights = _shares(tree, _places(points.position[part], points.normal[part]))
@@ -90,7 +94,7 @@ def _shares(tree: cKDTree, places: FloatArray) -> tuple[IntArray, FloatArray]:
 
 
 def lacquer_seen(scene: Any, points: SurfacePoints, which: IntArray, samples: int) -> Float32Array:
-    """The same looked for from where it lands, in means of two halves (2, n, 3): it scatters, but blurs nothing."""
+    """The same looked for from where it lands, in means of two halves (2, n, 4): it scatters, but blurs nothing."""
 
     def sample(at: Sequence[Any], _: IntArray, begin: int, count: int) -> Any:
         p, n, number = at
@@ -149,6 +153,7 @@ def _thrown(scene: Any, si: Any, which: IntArray, area: float, follow: bool) -> 
         si = scene.ray_intersect(ray)
         flux &= si.is_valid()
         normal = si.sh_frame.n * dr.select(dr.dot(si.sh_frame.n, ray.d) > 0, -1.0, 1.0)
-        dr.eval(si, flux, normal)
+        brought = in_channels(flux, -dr.dot(normal, ray.d))
+        dr.eval(si, flux, normal, brought)
         landed = np.array(si.is_valid())
-        yield rows_of(si.p)[landed], rows_of(normal)[landed], rows_of(mi.Vector3f(flux))[landed]
+        yield rows_of(si.p)[landed], rows_of(normal)[landed], rows_of(brought)[landed]

@@ -18,7 +18,7 @@ import numpy as np
 from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.light.drawing.rounds import drawn_at, in_rounds
 from rsgen.light.drawing.specular import first_scatterer, transmitted
-from rsgen.light.places.sampling import about_normal, chunks, r2, rotation
+from rsgen.light.places.sampling import CHANNELS, about_normal, chunks, in_channels, r2, rotation
 from rsgen.light.places.surface_points import SurfacePoints
 
 MANY_EMITTERS = 24  # more are sampled together, as one
@@ -39,12 +39,12 @@ def lamps_of(scene: Any) -> list[Any]:
 def first_look(
     scene: Any, points: SurfacePoints, which: IntArray, follow: bool, report: Callable[[float], None]
 ) -> Float32Array:
-    """Direct irradiance (n, 3) from all lamps by a sample of each, or by the second where the first found none."""
+    """Direct irradiance (n, 4) from all lamps by a sample of each, or by the second where the first found none."""
     kinds = _kinds(scene)
-    total = np.zeros((len(which), 3), np.float32)
+    total = np.zeros((len(which), CHANNELS), np.float32)
     for look in range(_FIRST_LOOK):
         dark = np.flatnonzero(total.max(axis=1) <= 0)
-        found = np.zeros((len(dark), 3), np.float32)
+        found = np.zeros((len(dark), CHANNELS), np.float32)
         for k, (emitter, dimension, _) in enumerate(kinds):
             draw = _draw(scene, emitter, dimension, points, which[dark], follow)
             count = 1 if emitter is not None else MANY_EMITTERS
@@ -64,11 +64,11 @@ def lamp_light(
     """Direct irradiance from all lamps but the sky, with `follow` through thin panes too.
 
     samples: of each lamp, at most twice as many where they scatter and a sixteenth where they do not; light (n,): all
-    light of the points, about, in grey. Returns means (2, n, 3) of two halves of what was drawn, and the error (n,)
+    light of the points, about, in grey. Returns means (2, n, 4) of two halves of what was drawn, and the error (n,)
     left (see `rounds`).
     """
     kinds = _kinds(scene)
-    means, square = np.zeros((2, len(which), 3), np.float32), np.zeros(len(which))
+    means, square = np.zeros((2, len(which), CHANNELS), np.float32), np.zeros(len(which))
     for k, (emitter, dimension, delta) in enumerate(kinds):
         draw = _draw(scene, emitter, dimension, points, which, follow)
         count = samples * (1 if emitter is not None else MANY_EMITTERS)
@@ -154,7 +154,7 @@ def _from_emitter(scene, emitter, p, n, number, begin, samples, dimension, follo
     lamp = dr.reinterpret_array(mi.EmitterPtr, dr.opaque(mi.UInt32, 0 if emitter is None else _registry_id(emitter)))
     i = dr.opaque(mi.UInt32, begin)
     end = i + dr.opaque(mi.UInt32, samples)
-    even, odd = mi.Color3f(0), mi.Color3f(0)
+    even, odd = mi.Vector4f(0), mi.Vector4f(0)
     while i < end:
         u = r2(i, offset)
         if dr.hint(emitter is None, mode="scalar"):
@@ -167,12 +167,12 @@ def _from_emitter(scene, emitter, p, n, number, begin, samples, dimension, follo
         lit = (cosine > 0) & (ds.pdf > 0) & (dr.max(value) > 0)
         arrives = transmitted(scene, p, ds.d, ds.dist, lit, follow)
         light = value * cosine * dr.select(ds.delta, 1, _light_share(ds.pdf, cosine))
-        light = dr.select(lit, light * arrives, 0)
+        light = in_channels(dr.select(lit, light * arrives, 0), cosine)
         first = (i & 1) == 0
         even += dr.select(first, light, 0)
         odd += dr.select(first, 0, light)
         i += 1
-    return mi.Vector3f(even), mi.Vector3f(odd)
+    return even, odd
 
 
 def _light_share(light_pdf: Any, cosine: Any) -> Any:

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsgen.array_types import Float32Array, FloatArray, IntArray
+from rsgen.light.places.sampling import CHANNELS
 
-# Sums (2, n, 3) over two halves of the samples `begin` to `begin + count` at some of the points, which it is told.
+# Sums (2, n, 4) over two halves of the samples `begin` to `begin + count` at some points, which it is told.
 Draw = Callable[[IntArray, int, int, Callable[[float], None]], Float32Array]
 
 GREY_SLOPE = 0.21  # of sRGB at its middle, by the logarithm of light
@@ -20,7 +21,7 @@ PATCH = 8.0  # spacings that noise's size is estimated over
 
 
 def scatter_of(patch: IntArray, halves: NDArray) -> FloatArray:
-    """Standard error (n,) of the mean of two independent estimates (2, n, 3) in grey, of each point's patch (n,)."""
+    """Standard error (n,) of the mean of two independent estimates (2, n, 4) in grey, of each point's patch (n,)."""
     a, b = halves.mean(axis=2)
     return np.sqrt((np.bincount(patch, (a - b) ** 2) / (4 * np.bincount(patch)))[patch])
 
@@ -64,14 +65,14 @@ def in_rounds(
     draw: Draw, patch: IntArray, light: Callable[[NDArray], NDArray], scatter: float, first: int, rounds: int,
     effort: float, report: Callable[[float], None],
 ) -> tuple[Float32Array, FloatArray]:  # fmt: skip
-    """Means (2, n, 3) of the halves of what `draw` drew at n points, and the errors (n,) left, as `shown` has them.
+    """Means (2, n, 4) of the halves of what `draw` drew at n points, and the errors (n,) left, as `shown` has them.
 
     patch: what each point's noise is estimated over. light: all the light (n,) of points, in grey, given what this kind
     brings. After the first round, each draws as much again as all before it, where more than `scatter` is left, the
     worst first while no more than `effort` samples a point are drawn on the average.
     """
     n, size = len(patch), np.bincount(patch)
-    sums, drawn = np.zeros((2, n, 3), np.float32), np.zeros(n, np.int64)
+    sums, drawn = np.zeros((2, n, CHANNELS), np.float32), np.zeros(n, np.int64)
     apart, grey, left = np.zeros((3, n))  # of a point's halves, squared; of their mean
     todo: IntArray | slice = slice(None)
     of_todo = np.arange(n)
@@ -106,12 +107,12 @@ def drawn_at(which: IntArray, chunks: Callable[..., Any], sample: Callable[..., 
     """A `Draw` at the points `which`, from `sample(points on the device, their places in `which`, begin, count)`."""
 
     def draw(todo: IntArray, begin: int, count: int, report: Callable[[float], None]) -> Float32Array:
-        out = np.zeros((2, len(todo), 3), np.float32)
+        out = np.zeros((2, len(todo), CHANNELS), np.float32)
         for first, part, *at in chunks(which[todo], report):
             here = slice(first, first + len(part))
             sums = sample(at, todo[here], begin, count)
             dr.eval(sums)
-            for half, k in np.ndindex(2, 3):
+            for half, k in np.ndindex(2, CHANNELS):
                 out[half, here, k] = np.array(sums[half][k])
         return out
 

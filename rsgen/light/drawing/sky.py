@@ -21,7 +21,7 @@ from rsgen.light.drawing.guide import BINS, Guide, bin_of
 from rsgen.light.drawing.rounds import drawn_at, in_rounds
 from rsgen.light.drawing.specular import first_scatterer, passes_light_on
 from rsgen.light.places.bake_points import thin
-from rsgen.light.places.sampling import chunks, r2, rotation
+from rsgen.light.places.sampling import chunks, in_channels, r2, rotation
 from rsgen.light.places.surface_points import SurfacePoints
 
 _CELL_M = 0.5  # parts of the scene that have one histogram, of like normals on one piece of surface
@@ -44,7 +44,7 @@ def sky_light(
     """Irradiance from the sky and from lamps by ways with turns: off mirrors and through thick glass.
 
     samples: directions at each point, one in `LESS` at first; more where the standard error exceeds `scatter`, as far
-    as the effort allows; beside (n,): light that points have from elsewhere, in grey. Returns means (2, len(which), 3)
+    as the effort allows; beside (n,): light that points have from elsewhere, in grey. Returns means (2, len(which), 4)
     of two halves of what was drawn, and the error (n,) left (see `rounds`).
     """
     cell, follow = thin(points, _CELL_M, which)[1], passes_light_on(scene)
@@ -122,15 +122,16 @@ def _sky_at(scene, guide, cell, p, n, number, begin, samples, follow):
     lobe = rotation(number, 206)
     i = dr.opaque(mi.UInt32, begin)
     end = i + dr.opaque(mi.UInt32, samples)
-    even, odd = mi.Color3f(0), mi.Color3f(0)
+    even, odd = mi.Vector4f(0), mi.Vector4f(0)
     while i < end:
         u = r2(i >> 1, offset)
         guided = (guide.sample(cell, u), lambda d: guide.density(cell, d))
         d, density = _drawn(scene, p, n, u, (i & 1) == 1, guided)
         found, light = _arriving(scene, p, n, d, lobe + mi.Float(i) * 0.6180339887498949, follow)
         light = dr.select(found & (density > 0), light / dr.maximum(density, 1e-20), 0)
+        light = in_channels(light, dr.dot(n, d))
         first = ((i >> 1) & 1) == 0
         even += dr.select(first, light, 0)
         odd += dr.select(first, 0, light)
         i += 1
-    return mi.Vector3f(even), mi.Vector3f(odd)
+    return even, odd

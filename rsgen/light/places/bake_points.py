@@ -23,6 +23,7 @@ _INSET_M = 2e-3  # samples on a triangle's rim move this far inwards: a corner e
 _COVERED_TEXELS, _COVERED_M = 0.3, 0.01  # what is nearer above a surface than either covers it
 _NEIGHBOURS = 8
 _SMOOTHING = 0.3  # spacings: closer sources than this count alike
+_STEP, _BEYOND = 0.15, 1e-3  # spacings: of a step in a surface; what is beyond one counts for so little
 _CHUNK = 1 << 20  # points looked at in one launch
 
 
@@ -138,10 +139,13 @@ def surface_at(
     return rows_of(si.p), rows_of(si.sh_frame.n), rows_of(si.n)
 
 
-def thin(points: SurfacePoints, spacing: float, among: IntArray | None = None) -> tuple[IntArray, IntArray]:
+def thin(
+    points: SurfacePoints, spacing: float, among: IntArray | None = None, steps: bool = False
+) -> tuple[IntArray, IntArray]:
     """Of `among` (default: all), one in each cell of `spacing` metres, of like normals on one piece of surface.
 
-    Returns the chosen ones as indices into `among`, and for each of `among` which of the chosen stands for it.
+    steps: none stands for what is a step above or below it, as the bottom of a groove is. Returns the chosen ones as
+    indices into `among`, and for each of `among` which of the chosen stands for it.
     """
     position, normal, piece = points.position, points.normal, points.piece
     if among is not None:
@@ -149,7 +153,11 @@ def thin(points: SurfacePoints, spacing: float, among: IntArray | None = None) -
     cell = np.floor(position / spacing)
     off_centre = ((position / spacing - cell - 0.5) ** 2).sum(axis=1)
     # A buried face must not stand for a lit one just in front of it, so pieces of surface are kept apart.
-    key = _mix(*cell.T, *np.round(normal).T, piece)
+    facing = np.round(normal)
+    key = _mix(*cell.T, *facing.T, piece)
+    if steps:
+        above = np.einsum("ij,ij->i", position / spacing - cell, facing / np.linalg.norm(facing, axis=1, keepdims=True))
+        key = _mix(key.view(np.int64), np.floor(above / _STEP).astype(np.int64))
     del cell
     order = np.lexsort((off_centre, key))
     sorted_key = key[order]
@@ -184,6 +192,9 @@ class Interpolation:
             # grows without bound towards a source, so that it passes through the sources.
             falling = np.clip(1 - (distance / (distance[:, -1:] * 1.0001 + 1e-9)) ** 2, 0, 1) ** 2
             weight = (falling + 1e-6) / (distance**2 + _SMOOTHING**2)
+            apart = points.position[sources[near[part]]] - points.position[targets[part], None]
+            step = np.einsum("nki,ni->nk", apart, points.normal[targets[part]]) / (_STEP * spacing)
+            weight *= np.exp(-(step**2)) + _BEYOND
             weights[part] = weight / weight.sum(axis=1, keepdims=True)
         return cls(near, weights)
 

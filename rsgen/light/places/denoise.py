@@ -17,7 +17,7 @@ _CHUNK = 1 << 17
 def denoised(
     points: SurfacePoints, which: IntArray, halves: NDArray, sigma: FloatArray, spacing: float, noisy: IntArray
 ) -> Float32Array:
-    """Mean (n, 3) of two independent estimates (2, n, 3) of irradiance, smoothed where noise hides any difference.
+    """Mean (n, 4) of two independent estimates (2, n, 4) of irradiance, smoothed where noise hides any difference.
 
     sigma: standard error (n,) of the mean, in grey. noisy: which of the points are looked at, the others stay.
     Each half is averaged with weights by the other (Rousselle, Manzi, Zwicker, PG 2013), so that noise does not choose
@@ -36,7 +36,7 @@ def denoised(
         part = noisy[begin : begin + _CHUNK]
         distance, near = (np.reshape(v, (-1, k)) for v in tree.query(scaled[part], k=k, workers=-1))
         spread = half[part, None] + half[near]
-        smoothed = np.zeros((len(near), 3))
+        smoothed = np.zeros((len(near), halves.shape[2]))
         for one, other in ((0, 1), (1, 0)):
             apart = (grey[other][part, None] - grey[other][near]) ** 2 - spread
             weight = np.exp(-0.5 * distance**2 - np.maximum(apart, 0) / np.maximum(spread, 1e-20))
