@@ -17,6 +17,7 @@ _FROSTED = int(mi.BSDFFlags.GlossyTransmission)
 _MOST_LIGHTS = 16  # light samples at a glossy hit
 _PANE = int(mi.BSDFFlags.DeltaReflection), int(mi.BSDFFlags.DeltaTransmission) | int(mi.BSDFFlags.Null)
 _CERTAINLY = 1 - 2**-20  # a random number that no pane reflects at, but where it reflects all
+_SHEETS = 8  # of paper in a lamp's light: what lacquer seen in lacquer shows of it at most
 _FAINT = 0.05  # of the matte light at a hit: reflections below are cast by lot, which saves most shadow rays
 
 
@@ -40,8 +41,20 @@ class BakedIntegrator(mi.SamplingIntegrator):
 
     def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True):
         """Mitsuba's interface: radiance along rays, whether they hit, no AOVs."""
-        radiance, valid = trace_baked(scene, self._field, sampler, mi.Ray3f(ray), self._bounces, mi.Bool(active))
+        u = sampler.next_2d(), sampler.next_2d()
+        radiance, valid = trace_baked(scene, self._field, sampler, mi.Ray3f(ray), self._bounces, mi.Bool(active), *u)
         return radiance, valid, []
+
+    def spread(self, scene: Any, sampler: Any, ray: Any, number: Any, scramble: list[Any]) -> Any:
+        """Radiance (Color3f) along the rays of pixels: `number` is the sample's in its pixel, `scramble` four UInt32 of
+        the pixel. Where a surface's lobe is looked along, and where on lamps, spreads evenly over a pixel (the first
+        two dimensions of Sobol' 1967).
+        """
+        lobe, lamp = (
+            mi.Point2f(mi.radical_inverse_2(number, one), mi.sobol_2(number, other))
+            for one, other in (scramble[:2], scramble[2:])
+        )
+        return trace_baked(scene, self._field, sampler, mi.Ray3f(ray), self._bounces, mi.Bool(True), lobe, lamp)[0]
 
     def matte(self, scene: Any, ray: Any) -> tuple[Any, Any]:
         """Radiance where the first hit is purely diffuse (or none), exact for Lambert's law, and a mask of the rest.
@@ -66,11 +79,13 @@ class BakedIntegrator(mi.SamplingIntegrator):
 
 
 @dr.syntax
-def trace_baked(scene, field, sampler, ray, bounces, active):
+def trace_baked(scene, field, sampler, ray, bounces, active, first_lobe, first_lamp):
     """Radiance (Color3f) along `ray` and whether it hit a surface; see `BakedIntegrator`.
 
+    first_lobe, first_lamp: uniform (Point2f), for the first surface's lobe and for each of the lamps that it mirrors.
+
     A path follows mirrors and glass, frosted too, then a glossy bounce. Of the next surface it sees the matte lobe or,
-    by lot, what the others show of one more, all of which counts as diffuse, and of a lamp there no more than a sheet
+    by lot, what the others show of one more, all of which counts as diffuse, and of a lamp there no more than `_SHEETS`
     of paper in its light would show: lamps in lacquer in lacquer would be speckle. At a pane it goes on both ways, one
     after the other: by lot, a bright window that shines in one would be speckle. Emitters seen in a glossy lobe are
     found by sampling each of them and the lobe, with the balance heuristic (Veach and Guibas 1995): small bright lamps
@@ -89,7 +104,7 @@ def trace_baked(scene, field, sampler, ray, bounces, active):
     valid = mi.Bool(False)
     last = mi.Bool(False)  # the path has had its glossy bounce
     beyond = mi.Bool(False)  # and one more
-    paper = mi.Color3f(0)  # what matte white would send from there
+    paper = mi.Color3f(0)  # what so many sheets of matte white would send from there
     glossy_hit = dr.zeros(mi.Interaction3f, dr.width(ray.o))
     lobe_pdf = mi.Float(1)  # of the direction sampled there
     waiting = mi.Bool(False)  # what a pane reflects, until the way through it has ended
@@ -126,7 +141,7 @@ def trace_baked(scene, field, sampler, ray, bounces, active):
         faint = _FAINT * dr.max(irradiance * lobe)
         light = mi.UInt32(0)
         while smooth & (light < lights):
-            u = sampler.next_2d(smooth)
+            u = dr.select(depth == 0, first_lamp, sampler.next_2d(smooth))
             u.x = (mi.Float(light) + u.x) / lights
             ds, value = scene.sample_emitter_direction(si, u, False, smooth)
             to_light = si.to_local(ds.d)
@@ -140,7 +155,8 @@ def trace_baked(scene, field, sampler, ray, bounces, active):
             light += 1
 
         pane = active & ~waiting & ((flags & _PANE[0]) != 0) & ((flags & _PANE[1]) != 0) & ((flags & _GLOSSY) == 0)
-        bs, weight = bsdf.sample(specular, si, sampler.next_1d(active), sampler.next_2d(active), active)
+        toward = dr.select(depth == 0, first_lobe, sampler.next_2d(active))
+        bs, weight = bsdf.sample(specular, si, sampler.next_1d(active), toward, active)
         onward, kept = bsdf.sample(specular, si, _CERTAINLY, mi.Point2f(0.5), pane)
         other, share = bsdf.sample(specular, si, 0, mi.Point2f(0.5), pane)
         # All there is, or it is left to the lot: total reflection has one way, a blend may have three.
@@ -150,7 +166,7 @@ def trace_baked(scene, field, sampler, ray, bounces, active):
         reflected_depth = dr.select(pane, depth + 1, reflected_depth)
         waiting |= pane
         bs = dr.select(pane, onward, bs)
-        before = throughput
+        before = mi.Color3f(throughput)  # else it would change with it
         throughput *= dr.select(pane, kept * onward.pdf, weight)
         last = ((bs.sampled_type & _GLOSSY) != 0) & ~frosted
         lobe_pdf = bs.pdf
@@ -159,7 +175,8 @@ def trace_baked(scene, field, sampler, ray, bounces, active):
         active &= dr.max(throughput) > 0
         depth += 1
 
-        paper = dr.select(further, irradiance * dr.inv_pi, paper)
+        matte = (flags & _DIFFUSE) != 0
+        paper = dr.select(further, dr.select(matte, _SHEETS * irradiance * dr.inv_pi, dr.inf), paper)
         throughput = dr.select(further, before * albedo, throughput)
         ray = dr.select(further, si.spawn_ray(si.to_world(once.wo)), ray)
         active |= further

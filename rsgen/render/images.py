@@ -82,7 +82,12 @@ class ColorRenderer:
             self._sampler.seed(sampler_key, dr.width(index))
             ray = self._rays(index, count, start, rotation)
             ray.scale_differential(mi.Float(1.0 / np.sqrt(self._spp)))
-            traced, _, _ = self._integrator.sample(self._scene, self._sampler, ray, None, mi.Bool(True))
+            if isinstance(self._integrator, BakedIntegrator):
+                number = (index % count + start) // step
+                scramble = [mi.sample_tea_32(index // count, rotation + len(_R3) + k, 4)[0] for k in range(4)]
+                traced = self._integrator.spread(self._scene, self._sampler, ray, number, scramble)
+            else:
+                traced, _, _ = self._integrator.sample(self._scene, self._sampler, ray, None, mi.Bool(True))
             dr.scatter(radiance, stands_for * mi.unpolarized_spectrum(traced), index)
         sums = [dr.block_sum(channel, count) for channel in radiance]
         dr.eval(sums)
