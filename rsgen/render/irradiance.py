@@ -35,9 +35,9 @@ _MOST_POINTS = int(4e9 / _POINT_BYTES)
 class Lattice:
     """Where irradiance is sampled: per triangle a grid of (cells_u + 1) x (cells_v + 1) points, row by row.
 
-    first (f,): index of each triangle's first point; cells (f, 2); apex (f,): corner 0..2; shape_first: by Dr.Jit
-    registry id, the first triangle of each shape (-1: none); lacquered: by the same, whether a shape is matte beneath
-    lacquer; points: total count.
+    first (f,): index of each triangle's first point; cells (f, 2), 0 where there is one in its middle alone; apex (f,):
+    corner 0..2; shape_first: by Dr.Jit registry id, the first triangle of each shape (-1: none); lacquered: by the
+    same, whether a shape is matte beneath lacquer; points: total count.
     """
 
     first: IntArray
@@ -93,8 +93,14 @@ def _lacquered(bsdf: Any) -> bool:
 
 
 def _cells(lengths: NDArray[np.float64], spacing: float) -> IntArray:
-    """Cells (f, 2) of triangles with edges (f, 2) of these lengths, longest and shortest."""
-    return np.clip(np.rint(lengths / spacing), 1, _MAX_CELLS).astype(np.int64)
+    """Cells (f, 2) of triangles with edges (f, 2) of these lengths, longest and shortest.
+
+    None in triangles smaller than the spacing, which have one point then, if four for each would be too many.
+    """
+    cells = np.clip(np.rint(lengths / spacing), 1, _MAX_CELLS).astype(np.int64)
+    if (cells + 1).prod(axis=1).sum() > _MOST_POINTS:
+        cells[lengths[:, 0] < spacing] = 0
+    return cells
 
 
 def _check_size(lengths: NDArray[np.float64], spacing: float) -> None:
@@ -104,9 +110,9 @@ def _check_size(lengths: NDArray[np.float64], spacing: float) -> None:
     asked = count(spacing)
     if asked <= _MOST_POINTS:
         return
-    if 4 * len(lengths) > _MOST_POINTS:
+    if len(lengths) > _MOST_POINTS:
         raise UserError(
-            f"its {len(lengths)} triangles are too many to bake light on ({_gigabytes(4 * len(lengths))} GB): "
+            f"its {len(lengths)} triangles are too many to bake light on ({_gigabytes(len(lengths))} GB): "
             "simplify its meshes, or use light.mode path"
         )
     low, high = spacing, 2 * spacing
@@ -133,8 +139,9 @@ def lattice_barycentric(lattice: Lattice) -> tuple[IntArray, Float32Array]:
     face = np.repeat(np.arange(len(counts)), counts)
     local = np.arange(lattice.points) - lattice.first[face]
     row, column = np.divmod(local, lattice.cells[face, 1] + 1)
-    u = row / lattice.cells[face, 0]
-    v = column / lattice.cells[face, 1]
+    u, v = (k / np.maximum(n, 1) for k, n in zip((row, column), lattice.cells[face].T, strict=True))
+    alone = lattice.cells[face, 0] == 0
+    u[alone], v[alone] = 2 / 3, 0.5  # the middle
     weights = np.zeros((lattice.points, 3), np.float32)
     apex = lattice.apex[face]
     points = np.arange(lattice.points)
@@ -155,8 +162,8 @@ def lattice_area(scene: Any, lattice: Lattice) -> NDArray[np.float64]:
     row, column = np.divmod(np.arange(lattice.points) - lattice.first[face], nv + 1)
     # Across a grid line at u a triangle is as wide as u: the strip about it, cut off at u = 1, has so much of the area.
     strip = np.minimum(row + 0.5, nu) ** 2 - np.maximum(row - 0.5, 0) ** 2
-    along = np.where((column == 0) | (column == nv), 0.5, 1.0) / nv
-    return np.asarray(triangle[face] * strip / nu**2 * along)
+    along = np.where((column == 0) | (column == nv), 0.5, 1.0) / np.maximum(nv, 1)
+    return np.asarray(triangle[face] * np.where(nu > 0, strip / np.maximum(nu, 1) ** 2 * along, 1.0))
 
 
 def at_triangles(shape: NDArray[np.uint32], face: NDArray[np.uint32], uv: Float32Array) -> tuple[Any, Any]:

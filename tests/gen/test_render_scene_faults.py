@@ -19,7 +19,8 @@ from rsgen.config.config import LightConfig, load_config
 from rsgen.errors import UserError
 from rsgen.light.bake import bake
 from rsgen.produce.frame_source import make_integrator
-from rsgen.render.irradiance import make_lattice
+from rsgen.render import irradiance
+from rsgen.render.irradiance import lattice_area, lattice_barycentric, make_field, make_lattice
 from rsgen.render.scene import load_scene, ply_bytes, surface
 from rsgen.render.scene_xml.parsed import messages_to_log
 
@@ -181,3 +182,28 @@ def test_nothing_reaches_the_screen_while_a_scene_loads(
         mi.Log(mi.LogLevel.Warn, "a warning")
     assert any("a warning" in message for message in seen) and "a warning" in caplog.text
     assert capfd.readouterr() == ("", "") and mi.logger().appender_count() == before
+
+
+def test_where_triangles_are_too_many_small_ones_have_one_sample(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fine ball on a floor under an even sky: the same light, from less than half of the samples."""
+    trimesh.creation.icosphere(5, 0.3).export(tmp_path / "ball.ply")
+    ball = """<shape type="ply"><string name="filename" value="ball.ply"/>
+        <transform name="to_world"><translate z="0.5"/></transform></shape>"""
+    sky = '<emitter type="constant"><rgb name="radiance" value="1"/></emitter>'
+    scene = load_scene(write_scene(tmp_path, '<shape type="rectangle"/>', ball, sky))
+    light = LightConfig(texel_m=0.025, bounces=0, direct_samples=1024)
+    every = make_lattice(scene, light.texel_m)
+    monkeypatch.setattr(irradiance, "_MOST_POINTS", 40_000)
+    few = make_lattice(scene, light.texel_m)
+    assert every.points > 2 * few.points and few.points <= 40_000
+    triangles = [np.bincount(lattice_barycentric(k)[0], lattice_area(scene, k)) for k in (few, every)]
+    np.testing.assert_allclose(*triangles)
+    fields = [make_field(k, *bake(scene, k, light, lambda *_: None)) for k in (few, every)]
+    ray = rays_at(np.array([0.0, 0.0, 0.5]), 0.3)
+    pi = scene.ray_intersect_preliminary(ray, coherent=False)
+    si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
+    got, expected = (np.array(f.lookup(pi, si, -ray.d))[0][np.array(si.is_valid())] for f in fields)
+    off = (got - expected) / np.pi
+    assert len(got) > 1000 and np.abs(off).max() < 0.1 and off.std() < 0.012 and abs(off.mean()) < 0.002

@@ -34,7 +34,9 @@ def sample_points(
     how far these count on either side (see `walls.Barriers`).
     """
     position, normal, geometric, key = _on_lattice(scene, lattice)
-    chosen, index, place = _unique(*key)
+    # Points that are their triangles' only ones have none in common, so all of a piece of mesh count as one place.
+    alone = np.repeat(lattice.cells[:, 0] == 0, (lattice.cells + 1).prod(axis=1))
+    chosen, index, place = _unique(key, alone)
     first = np.concatenate(chosen)
     sign = np.repeat(np.array([1, -1], np.float32), [len(side) for side in chosen])[:, None]
     unique_geometric = sign * geometric[first]
@@ -77,12 +79,13 @@ def _on_lattice(scene: Any, lattice: Lattice) -> tuple[Float32Array, Float32Arra
     return position, normal, geometric, key
 
 
-def _unique(position: NDArray, normal: NDArray, island: IntArray) -> tuple[list[IntArray], NDArray, NDArray]:
+def _unique(key: tuple[NDArray, ...], alone: NDArray[np.bool_]) -> tuple[list[IntArray], NDArray, NDArray]:
     """Which lattice points stand for all of the front and of the back; (2, points) which of these, fronts before backs,
     each is; and (points,) a number of the place on its piece of mesh.
 
     Points that triangles share are computed once, so that edges cannot show.
     """
+    position, normal, island = key
     chosen: list[IntArray] = []
     index = np.empty((2, len(island)), np.int32)
     for side, sign in enumerate((1, -1)):
@@ -90,7 +93,8 @@ def _unique(position: NDArray, normal: NDArray, island: IntArray) -> tuple[list[
         first, rank = _in_order(first)
         index[side] = rank[inverse] + sum(map(len, chosen))
         chosen.append(first)
-    return chosen, index, np.unique(_mix(*position.T, island), return_inverse=True)[1]
+    place = np.where(alone[:, None], 0, position)
+    return chosen, index, np.unique(_mix(*place.T, island), return_inverse=True)[1]
 
 
 def _in_order(chosen: IntArray) -> tuple[IntArray, IntArray]:
