@@ -25,6 +25,7 @@ from rsgen.config.config import Config
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
 from rsgen.geometry.shutter import Shutter
+from rsgen.produce.frame_source import mirrored_samples
 from rsgen.produce.generate import engine_versions
 from rsgen.produce.ground_truth import load_motion
 
@@ -61,6 +62,7 @@ def time_modes(config: Config, frames: int, spp: int, modes: Sequence[str], prog
     timed = config.color.model_copy(update={"readout_s": READOUT_S, "exposure_s": BLUR_S})
     motion = load_motion(config.model_copy(update={"color": timed}))
     scene, baked, mi = lit_scene(config, progress)
+    baked.glossy_spp = mirrored_samples(config.light, spp)
     stamps = spread_times(motion, frames + 1)
     camera = config.color.camera
     with ExitStack() as stack:

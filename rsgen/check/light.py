@@ -15,7 +15,7 @@ from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.produce.frame_source import load_scene, make_integrator, small_camera
+from rsgen.produce.frame_source import load_scene, make_integrator, mirrored_samples, small_camera
 from rsgen.produce.ground_truth import Motion, load_motion
 
 PSNR_FLOOR_DB = 36.0
@@ -40,6 +40,7 @@ def check_light(
     """
     motion = load_motion(config)
     scene, baked, mi = lit_scene(config, progress)
+    baked.glossy_spp = mirrored_samples(config.light, _BAKED_SPP)
     from rsgen.figures import save_grid
     from rsgen.render.images import ColorRenderer
 

@@ -106,8 +106,11 @@ class LightConfig(Section):
         le=32,
         description="indirect diffuse bounces, at most; from 3 on those that follow are extrapolated",
     )
-    glossy_spp: int = Field(
-        default=16, ge=1, le=65536, description="samples per pixel at most where a surface is not purely diffuse"
+    glossy_spp: int | None = Field(
+        default=None,
+        ge=1,
+        le=65536,
+        description="samples per pixel at most of what a surface mirrors; null: a quarter of color.spp, at least 4",
     )
     max_depth: int = Field(default=12, ge=1, le=64, description="path length of mode 'path'")
 

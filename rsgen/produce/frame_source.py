@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsgen.array_types import BoolArray, ByteArray, Float32Array, FloatArray
-from rsgen.config.config import Config
+from rsgen.config.config import Config, LightConfig
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.geometry import se3
@@ -34,6 +34,7 @@ from rsgen.sequence.frame_table import FrameTable
 
 # Light meters of cameras see no more than this of a picture.
 _METER_WIDTH, _METER_SPP = 64, 4
+_LEAST_MIRRORED = 4
 
 
 @dataclass(frozen=True)
@@ -219,7 +220,12 @@ def make_integrator(mi: Any, scene: Any, config: Config, progress: Progress, obj
         told = str(error)
         raise UserError(told if told.startswith("scene ") else f"scene {config.scene.file}: {told}") from None
     things = lit_objects(scene, field, load_meshes(config), objects) if objects else None
-    return BakedIntegrator(field, glossy_spp=light.glossy_spp, objects=things)
+    return BakedIntegrator(field, glossy_spp=mirrored_samples(light, config.color.spp), objects=things)
+
+
+def mirrored_samples(light: LightConfig, spp: int) -> int:
+    """Samples of what surfaces mirror, at most, of so many of a pixel."""
+    return light.glossy_spp or max(_LEAST_MIRRORED, spp // 4)
 
 
 def load_scene(config: Config) -> Any:

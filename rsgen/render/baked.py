@@ -26,7 +26,7 @@ class BakedIntegrator(mi.SamplingIntegrator):
 
     The diffuse lobe of a plastic is weighted with one cosine-distributed direction, which is nearly free of noise.
     Glossy lobes are sampled and traced onto the baked surfaces, behind up to `bounces` mirrors. They cost ten times as
-    much: of a pixel's samples only `glossy_spp` are traced there, the others are matte or left out.
+    much: of a pixel's samples only `glossy_spp` are traced there, of the others what is matte is shown.
     """
 
     def __init__(
@@ -46,22 +46,26 @@ class BakedIntegrator(mi.SamplingIntegrator):
         return radiance, valid, []
 
     def spread(self, scene: Any, sampler: Any, ray: Any, number: Any, scramble: list[Any]) -> Any:
-        """Radiance (Color3f) along the rays of pixels: `number` is the sample's in its pixel, `scramble` four UInt32 of
-        the pixel. Where a surface's lobe is looked along, and where on lamps, spreads evenly over a pixel (the first
-        two dimensions of Sobol' 1967).
+        """Radiance (Color3f) along the rays of pixels, but for what `matte` has: `number` is the sample's in its pixel,
+        `scramble` four UInt32 of the pixel. Where a surface's lobe is looked along, and where on lamps, spreads evenly
+        over a pixel (the first two dimensions of Sobol' 1967).
         """
         lobe, lamp = (
             mi.Point2f(mi.radical_inverse_2(number, one), mi.sobol_2(number, other))
             for one, other in (scramble[:2], scramble[2:])
         )
-        return trace_baked(scene, self._field, sampler, mi.Ray3f(ray), self._bounces, mi.Bool(True), lobe, lamp)[0]
+        ray, active = mi.Ray3f(ray), mi.Bool(True)
+        return trace_baked(scene, self._field, sampler, ray, self._bounces, active, lobe, lamp, matte_too=False)[0]
 
-    def matte(self, scene: Any, ray: Any) -> tuple[Any, Any]:
-        """Radiance where the first hit is purely diffuse (or none), exact for Lambert's law, and a mask of the rest.
+    def matte(self, scene: Any, ray: Any, u: Any) -> tuple[Any, Any]:
+        """Radiance where the first hit is purely diffuse (or none), exact for Lambert's law, and a mask of the rest:
+        of these what their matte lobe shows, for which u (Point2f) is uniform.
 
-        Most of a scene is matte: rendering that without a loop or random numbers, and only the rest with `sample`,
-        takes half the time of `sample` for all.
+        Most of a scene is matte: rendering that without a loop, and of the rest only some samples with `spread`, takes
+        less than half the time of `sample` for all.
         """
+        matte_lobe = mi.BSDFContext()
+        matte_lobe.type_mask = _DIFFUSE
         pi = scene.ray_intersect_preliminary(ray, coherent=True)
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
         hit = si.is_valid()
@@ -69,8 +73,13 @@ class BakedIntegrator(mi.SamplingIntegrator):
         rest = hit & ((bsdf.flags() & _SPECULAR) != 0)
         radiance = si.emitter(scene).eval(si)
         albedo = bsdf.eval_diffuse_reflectance(si, hit & ~rest)
-        irradiance = self._field.lookup(pi, si, -ray.d, hit & ~rest)
+        beneath = rest & ((bsdf.flags() & _DIFFUSE) != 0)
+        wo = mi.warp.square_to_cosine_hemisphere(u)
+        wo.z *= dr.sign(si.wi.z)
+        lobe = bsdf.eval(matte_lobe, si, wo, beneath) / dr.maximum(dr.abs(wo.z), 1e-6)
+        irradiance = self._field.lookup(pi, si, -ray.d, hit & (~rest | beneath))
         radiance = dr.select(rest, 0, radiance + dr.select(hit, albedo * irradiance * dr.inv_pi, 0))
+        radiance += dr.select(beneath, lobe * irradiance, 0)
         if self.objects is None or self.objects.now is None:
             return radiance, rest
         meeting = self.objects.now.meet(ray, dr.select(hit, pi.t, dr.inf))
@@ -79,10 +88,11 @@ class BakedIntegrator(mi.SamplingIntegrator):
 
 
 @dr.syntax
-def trace_baked(scene, field, sampler, ray, bounces, active, first_lobe, first_lamp):
+def trace_baked(scene, field, sampler, ray, bounces, active, first_lobe, first_lamp, matte_too=True):
     """Radiance (Color3f) along `ray` and whether it hit a surface; see `BakedIntegrator`.
 
     first_lobe, first_lamp: uniform (Point2f), for the first surface's lobe and for each of the lamps that it mirrors.
+    matte_too: whether the first surface's matte lobe counts.
 
     A path follows mirrors and glass, frosted too, then a glossy bounce. Of the next surface it sees the matte lobe or,
     by lot, what the others show of one more, all of which counts as diffuse, and of a lamp there no more than `_SHEETS`
@@ -132,7 +142,8 @@ def trace_baked(scene, field, sampler, ray, bounces, active, first_lobe, first_l
         once, albedo = bsdf.sample(everything, si, sampler.next_1d(active), sampler.next_2d(active), active & last)
         further = active & last & ~beyond & ((once.sampled_type & _SPECULAR) != 0)
         irradiance = field.lookup(pi, si, -ray.d, active)
-        radiance[active & ~further] += throughput * irradiance * dr.select(last, albedo * dr.inv_pi, lobe)
+        counts = active & ~further & ((depth > 0) | matte_too)
+        radiance[counts] += throughput * irradiance * dr.select(last, albedo * dr.inv_pi, lobe)
 
         active &= ((bsdf.flags() & _SPECULAR) != 0) & ~last & (depth < bounces)
         flags = bsdf.flags()

@@ -69,7 +69,9 @@ class ColorRenderer:
         start = dr.opaque(mi.UInt32, first)
         index = dr.arange(mi.UInt32, pixels * count)
         if isinstance(self._integrator, BakedIntegrator):
-            radiance, rest = self._integrator.matte(self._scene, mi.Ray3f(self._rays(index, count, start, rotation)))
+            u = self._spread(index, count, start, rotation, len(_R3), 2)
+            ray = mi.Ray3f(self._rays(index, count, start, rotation))
+            radiance, rest = self._integrator.matte(self._scene, ray, mi.Point2f(*u))
             # Evenly spread samples stand for all of them, whatever they show: no bias, but more noise.
             step = max(1, self._spp // self._integrator.glossy_spp)
             rest &= (index % count + start) % step == 0
@@ -77,28 +79,35 @@ class ColorRenderer:
             dr.eval(radiance, rest)
             index = dr.compress(rest)
         else:
-            radiance, stands_for = dr.zeros(mi.Color3f, pixels * count), 1.0
+            radiance = dr.zeros(mi.Color3f, pixels * count)
         if dr.width(index) > 0:
             self._sampler.seed(sampler_key, dr.width(index))
             ray = self._rays(index, count, start, rotation)
             ray.scale_differential(mi.Float(1.0 / np.sqrt(self._spp)))
             if isinstance(self._integrator, BakedIntegrator):
                 number = (index % count + start) // step
-                scramble = [mi.sample_tea_32(index // count, rotation + len(_R3) + k, 4)[0] for k in range(4)]
+                scramble = [mi.sample_tea_32(index // count, rotation + len(_R3) + 2 + k, 4)[0] for k in range(4)]
                 traced = self._integrator.spread(self._scene, self._sampler, ray, number, scramble)
+                traced = dr.gather(mi.Color3f, radiance, index) + stands_for * traced
             else:
                 traced, _, _ = self._integrator.sample(self._scene, self._sampler, ray, None, mi.Bool(True))
-            dr.scatter(radiance, stands_for * mi.unpolarized_spectrum(traced), index)
+            dr.scatter(radiance, mi.unpolarized_spectrum(traced), index)
         sums = [dr.block_sum(channel, count) for channel in radiance]
         dr.eval(sums)
         return np.stack([np.asarray(s) for s in sums], axis=1)
+
+    @staticmethod
+    def _spread(index: Any, count: int, start: Any, rotation: Any, first: int, dimensions: int) -> list[Any]:
+        """Uniform numbers, evenly spread over each pixel's samples; first: the first of their dimensions."""
+        pixel = index // count
+        sample = mi.Float(index - pixel * count + start)
+        return [_fraction(sample * _R3[k] + _hash(pixel, rotation, first + k)) for k in range(dimensions)]
 
     def _rays(self, index: Any, count: int, start: Any, rotation: Any) -> Any:
         """Camera rays of samples `index` of a launch: `count` neighbours share a pixel."""
         camera = self.sensor.camera
         pixel = index // count
-        sample = mi.Float(index - pixel * count + start)
-        u, v, w = (_fraction(sample * step + _hash(pixel, rotation, k)) for k, step in enumerate(_R3))
+        u, v, w = self._spread(index, count, start, rotation, 0, 3)
         x, y = mi.Float(pixel % camera.width) + u, mi.Float(pixel // camera.width) + v
         position = mi.Point2f(x / camera.width, y / camera.height)
         time = w * self.sensor.shutter.exposure_s

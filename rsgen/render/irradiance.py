@@ -269,13 +269,16 @@ def make_field(lattice: Lattice, front: Float32Array, back: Float32Array) -> Irr
     faces = np.stack(
         [np.concatenate([lattice.first, back_first]), np.concatenate([packed, back_packed])], axis=1
     ).astype(np.uint32)
-    values = np.concatenate([front, np.zeros((4, front.shape[1]), np.float32), back[keep]]).astype(np.float32)
-    share = values[:, 4] if values.shape[1] == 5 else np.ones(len(values))
+    parts = front, np.zeros((4, front.shape[1]), np.float32), back[keep]
+    # One after the other: each is copied twice on its way to the device.
+    values = mi.Float(aligned(np.concatenate([part[:, :4] for part in parts])))
+    has_share = front.shape[1] == 5
+    share = mi.Float(aligned(np.concatenate([part[:, 4] if has_share else np.ones(len(part)) for part in parts])))
     return IrradianceField(
         mi.Int32(aligned(lattice.shape_first, np.int32)),
         mi.UInt32(aligned(lattice.lacquered, np.uint32)),
         mi.UInt32(aligned(faces, np.uint32)),
-        mi.Float(aligned(values[:, :4])),
-        mi.Float(aligned(share)),
+        values,
+        share,
         len(lattice.first),
     )

@@ -188,8 +188,8 @@ class Interpolation:
         k = min(_NEIGHBOURS, len(sources))
         tree = cKDTree(points.coordinates(spacing, sources))
         near, weights = np.empty((len(targets), k), np.int32), np.empty((len(targets), k), np.float32)
-        for begin in range(0, len(targets), _CHUNK):
-            part = slice(begin, begin + _CHUNK)
+        for begin in range(0, len(targets), _CHUNK >> 2):
+            part = slice(begin, begin + (_CHUNK >> 2))
             found = tree.query(points.coordinates(spacing, targets[part]), k=k, workers=-1, eps=0.2)
             distance, near[part] = (np.reshape(v, (-1, k)) for v in found)
             # Falls to zero at the furthest neighbour, so that the interpolant is continuous as neighbours change, and
