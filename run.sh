@@ -70,19 +70,25 @@ demo() {
 }
 
 test_all() {
-  # On one core, while the other installs and looks at the rest.
-  .venv/bin/mypy &
-  local types=$!
+  # Beside all the rest, which leaves it enough of the cores: what it says is shown at the end.
+  local types told status=0
+  told=$(mktemp)
+  .venv/bin/mypy >"$told" 2>&1 &
+  types=$!
   command -v chromium >/dev/null || command -v google-chrome >/dev/null || apt_install chromium ||
     say "no chromium: the tests of the report in a browser are skipped"
   .venv/bin/ruff check .
   .venv/bin/ruff format --check .
   local contracts
   contracts=$(.venv/bin/lint-imports --no-cache) || { say "$contracts"; return 1; }
-  wait "$types"
   # One thread per process for the small solves; two processes share the rendering cores. Files in their own order: the
-  # slowest have few tests, and would come last and alone.
-  OPENBLAS_NUM_THREADS=1 .venv/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder "$@"
+  # slowest have few tests, and would come last and alone. Compiled modules are kept, for the processes that tests start.
+  env -u PYTHONDONTWRITEBYTECODE OPENBLAS_NUM_THREADS=1 \
+    .venv/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder "$@" || status=$?
+  wait "$types" || status=$?
+  cat "$told"
+  rm -f "$told"
+  return "$status"
 }
 
 case "${1:-}" in

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 from pathlib import Path
@@ -19,6 +20,12 @@ def pytest_configure() -> None:
         import drjit
 
         drjit.set_thread_count(max(1, len(os.sched_getaffinity(0)) // workers))
+
+
+def pytest_collection_finish() -> None:
+    """What all modules and tests have made stays: the collector need not look at it again and again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture

@@ -322,7 +322,7 @@ def test_no_entry_of_sequence_yaml_is_taken_on_trust(
 ) -> None:
     """Streams and extrinsics are all that a reader needs: those are refused where they cannot be; verify finds all."""
     path = sequence / "sequence.yaml"
-    data = yaml.safe_load(path.read_text())
+    data = yaml.load(path.read_text(), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     rng = np.random.default_rng([SEED, *entry.encode()])
     lines = list(READERS)
     for k in rng.permutation(len(ODD))[:count]:
@@ -340,7 +340,7 @@ def test_no_entry_of_sequence_yaml_is_taken_on_trust(
 
 def test_a_name_cannot_lead_out_of_the_folder(sequence: Path, use: Callable[[str], tuple[int, str]]) -> None:
     path = sequence / "sequence.yaml"
-    data = yaml.safe_load(path.read_text())
+    data = yaml.load(path.read_text(), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     for name in ("../../outside", "/tmp/outside", "a/b", "..", "a\x00b", ""):
         with fuzzing.replaced(path, fuzzing.yaml_bytes(data | {"name": name})):
             status, text = use("rsgen export rerun SEQ --quiet")

@@ -16,14 +16,14 @@ from scipy.spatial.transform import Rotation
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from rsgen.cli.main import main
-from rsgen.config.config import LightConfig, load_config
+from rsgen.config.config import Config, LightConfig, load_config
 from rsgen.console.configs import config_file
 from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
 from rsgen.motion.clearance import check_clearance
 from rsgen.motion.gaze import seen_from
 from rsgen.motion.statistics import motion_statistics
-from rsgen.produce.ground_truth import load_motion
+from rsgen.produce.ground_truth import Motion, load_motion
 from rsgen.produce.suggest import Suggestion, Wish, suggest_tour
 from rsgen.render.rays import cast_rays
 from rsgen.render.scene import load_scene
@@ -83,14 +83,32 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
+_MOTIONS: dict[str, Motion] = {}
+
+
+def motion_of(config: Config) -> Motion:
+    """Of a config, fitted once: to look for a tour is to fit it already."""
+    key = config.model_dump_json()
+    if key not in _MOTIONS:
+        _MOTIONS[key] = load_motion(config)
+    return _MOTIONS[key]
+
+
+def tour(file: Path, wish: Wish, **how: Any) -> Suggestion:
+    """What is suggested, but for the exposure, which is as long in the finding and has tests of its own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("rsgen.produce.suggest.suggested_gain", lambda *_: None)
+        patch.setattr("rsgen.produce.suggest.load_motion", motion_of)
+        return suggest_tour(file, None, wish, **how)
+
+
 @cache
 def suggested(folder: Path, name: str, seed: int, seconds: float = 12.0, speed: float = 0.35) -> Suggestion:
-    return suggest_tour(folder / f"{name}.ply", None, Wish(seconds, speed, CLEARANCE_M, seed))
+    return tour(folder / f"{name}.ply", Wish(seconds, speed, CLEARANCE_M, seed))
 
 
-@cache
 def spline_of(suggestion: Suggestion) -> Spline:
-    return load_motion(suggestion.config).spline
+    return motion_of(suggestion.config).spline
 
 
 def way(spline: Spline) -> np.ndarray:
@@ -171,7 +189,7 @@ def test_a_thing_is_gone_round_and_looked_at(folder: Path, seed: int) -> None:
 def test_a_slow_camera_hardly_moves(folder: Path, seed: int) -> None:
     """Regression: where the way was shorter than a few cells of the plan, no walk was found in any room."""
     wish = Wish(4.0, speed_m_s=0.15, clearance_m=CLEARANCE_M, seed=seed)
-    spline = spline_of(suggest_tour(folder / "furnished.ply", None, wish))
+    spline = spline_of(tour(folder / "furnished.ply", wish))
     assert motion_statistics(spline, 0.0, 4.0).length_m == pytest.approx(0.6, rel=0.02)
     assert trimesh.proximity.closest_point_naive(furnished(), way(spline))[1].min() >= CLEARANCE_M
 
@@ -205,21 +223,23 @@ def test_where_a_way_sees_one_bare_wall_another_is_looked_for_or_it_is_said(monk
     corridor = config_file("corridor1").parent.parent / "scenes" / "corridor" / "scene.xml"
     wish = Wish(6.0, speed_m_s=0.356, clearance_m=CLEARANCE_M, seed=2)
 
+    loaded = load_scene(corridor)
+    monkeypatch.setattr("rsgen.render.scene.load_scene", lambda *_, **__: loaded)  # once for all
+
     def flat(suggestion: Suggestion) -> tuple[float, list[str]]:
-        seen = seen_from(spline_of(suggestion).pose(np.linspace(0, 6, 40)), partial(cast_rays, load_scene(corridor)))
+        seen = seen_from(spline_of(suggestion).pose(np.linspace(0, 6, 40)), partial(cast_rays, loaded))
         return float(np.mean(seen.flat)), [line for line in suggestion.found if line.startswith("one plane fills ")]
 
-    monkeypatch.setattr("rsgen.produce.suggest.suggested_gain", lambda *_: None)  # which takes the longest
-    share, said = flat(suggest_tour(corridor, None, wish))
+    share, said = flat(tour(corridor, wish))
     assert share <= 0.1 and bool(said) == (share > 0)
     monkeypatch.setattr("rsgen.produce.suggest._ATTEMPTS", 1)
-    share, said = flat(suggest_tour(corridor, None, wish))
+    share, said = flat(tour(corridor, wish))
     assert share > 0.1 and said[0].startswith(f"one plane fills {100 * share:.0f} % of the views")
 
 
 def test_a_seed_decides_every_byte(folder: Path) -> None:
-    first = suggested(folder, "furnished", 1).yaml(folder)
-    again = suggest_tour(folder / "furnished.ply", None, Wish(12.0, clearance_m=CLEARANCE_M, seed=1)).yaml(folder)
+    wish = Wish(4.0, clearance_m=CLEARANCE_M, seed=1)
+    first, again = (suggest_tour(folder / "furnished.ply", None, wish).yaml(folder) for _ in range(2))
     assert first == again
     motions = [suggested(folder, "furnished", seed).config.motion for seed in range(2)]
     assert motions[0] and motions[1] and motions[0].waypoints != motions[1].waypoints
@@ -274,7 +294,7 @@ def test_a_counterpart_turns_as_its_model_does_or_says_why_not(folder: Path) -> 
     said = {}
     for asked in (62.0, 1.0):
         wish = Wish(4.0, speed_m_s=0.15, clearance_m=CLEARANCE_M, seed=3, rotation_deg_s=asked)
-        suggestion = suggest_tour(folder / "furnished.ply", None, wish)
+        suggestion = tour(folder / "furnished.ply", wish)
         stats = motion_statistics(spline_of(suggestion), 0.0, 3.9)
         said[asked] = [line for line in suggestion.found if line.startswith("turns faster")]
         assert stats.mean_rotation_deg_s == pytest.approx(asked, rel=0.1) or (said[asked] and asked == 1.0)
@@ -284,13 +304,13 @@ def test_a_counterpart_turns_as_its_model_does_or_says_why_not(folder: Path) -> 
 def test_a_large_scene_gets_light_that_fits_into_memory(tmp_path: Path) -> None:
     hall((0, 0, 0), (20, 6, 12)).export(tmp_path / "hall.ply")
     mesh = trimesh.load(tmp_path / "hall.ply")
-    suggestion = suggest_tour(tmp_path / "hall.ply", None, Wish(seconds=4.0))
+    suggestion = tour(tmp_path / "hall.ply", Wish(seconds=4.0))
     texel = suggestion.config.light.texel_m
     assert 0.02 <= texel <= 0.04 and mesh.area / texel**2 < 1.2e6
     (tmp_path / "hall.yaml").write_bytes(suggestion.yaml(tmp_path))
     assert load_config(tmp_path / "hall.yaml").light.texel_m == texel
     furnished().export(tmp_path / "room.ply")
-    assert suggest_tour(tmp_path / "room.ply", None, Wish(seconds=4.0)).config.light == LightConfig()
+    assert tour(tmp_path / "room.ply", Wish(seconds=4.0)).config.light == LightConfig()
 
 
 def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
@@ -334,11 +354,11 @@ def test_what_cannot_be_toured_is_said_in_a_line(tmp_path: Path, mesh: trimesh.T
 
 def test_a_room_in_centimetres_with_z_up_is_the_room(tmp_path: Path) -> None:
     furnished().export(tmp_path / "it.ply")
-    expected = suggest_tour(tmp_path / "it.ply", None, Wish())
+    expected = tour(tmp_path / "it.ply", Wish(4.0))
     mesh = scaled(furnished(), 100.0)
     mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
     mesh.export(tmp_path / "it.ply")
-    found = suggest_tour(tmp_path / "it.ply", None, Wish(), scale=0.01, up="z")
+    found = tour(tmp_path / "it.ply", Wish(4.0), scale=0.01, up="z")
     assert found.found[0] == expected.found[0]
     assert b"scale: 0.01" in found.yaml(tmp_path) and b"up: z" in found.yaml(tmp_path)
     assert b"scale" not in expected.yaml(tmp_path) and b"up: y" not in expected.yaml(tmp_path)

@@ -197,8 +197,9 @@ def test_a_seed_decides_everything(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(scene, "materials", small.__getitem__)
     monkeypatch.setattr(layout, "things", placed)
     one, two, other = (scene.build(tmp_path / name, seed) for name, seed in (("a", 0), ("b", 0), ("c", 1)))
-    assert digest(one.parent) == digest(two.parent)
-    changed = {name for name, state in digest(one.parent).items() if digest(other.parent).get(name) != state}
+    first, second, third = (digest(xml.parent) for xml in (one, two, other))
+    assert first == second
+    changed = {name for name, state in first.items() if third.get(name) != state}
     assert {"meshes/machine_a.ply", "textures/machine_a.png", "textures/sky_north.pfm", "scene.xml"} <= changed
     files = [p for p in one.parent.rglob("*.*") if p != one]
     assert len(files) > 100 and all(p.relative_to(one.parent).as_posix() in one.read_text() for p in files)

@@ -29,11 +29,11 @@ def to_and_fro() -> Spline:
 
 
 def make_dataset(root: Path) -> Dataset:
-    """80×60, with a rolling shutter."""
+    """80×60, with a rolling shutter, by a lens that is known to be even: looking for that takes longer than a track."""
     stream = {"readout_s": 0.02}
     config = synthetic.make_config(width=80, height=60, color=stream, depth=stream)
     writer = synthetic.open_writer(root, config, FRAMES, to_and_fro())
     synthetic.write_frames(writer)
     synthetic.write_scene(root)
     writer.finish()
-    return open_dataset(root)
+    return open_dataset(root).with_color_falloff(0.0)

@@ -34,8 +34,9 @@ from rstrack.data.noise import NoisyImages, with_noise
 
 @pytest.fixture(autouse=True)
 def few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A quarter of the pairs of frames, in a third of the time: what all find stands beside the derivatives."""
+    """A quarter of the pairs of frames, and one coarse level: what all find stands beside the derivatives."""
     monkeypatch.setattr(stretch, "_APART", (5,))
+    monkeypatch.setattr(calibration_run, "_COARSE", (1,))
 
 
 @pytest.mark.usefixtures("in_one_phase")

@@ -97,7 +97,8 @@ def test_the_gradient_changes_along_every_parameter_as_the_normal_equations_say(
         assert bend == pytest.approx(at.H[-COUNT + i, -COUNT + i], rel=0.25), NAMES[i]
 
 
-def test_scipy_finds_the_same_offset_by_the_cost_alone(shaken: Dataset) -> None:
+def test_scipy_finds_the_same_offset_by_the_cost_alone(shaken: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pairs_stretch, "_APART", (5,))
     terms, p = pair_terms(engine("llvm"), shaken), parameters_of(shaken)
     assert shaken.truth is not None
     stretches = [load_stretch(terms, shaken, range(4, 20), shaken.truth, p, OPTIONS)]

@@ -17,7 +17,7 @@ from rstrack.options import Method, Options
 from rstrack.tracking.spline_tracker import Tracker
 
 TRUTH = synthetic.make_spline(0.5)
-FRAMES = 20
+FRAMES = 16
 RADIUS = 0.27
 
 

@@ -28,7 +28,7 @@ from rstrack.metrics.evaluate import evaluate
 from rstrack.options import Options
 from rstrack.tracking.spline_tracker import Tracker
 
-WIDTH, HEIGHT, FRAMES = 80, 60, 30
+WIDTH, HEIGHT, FRAMES = 80, 60, 22  # two breaths
 SHARED = Camera(WIDTH, HEIGHT, 62.0, 61.0, 39.2, 29.8)
 SHUTTER, SPLINE = Shutter(0.02), synthetic.make_spline(0.3)
 T_COLOR_DEPTH = synthetic.T_COLOR_DEPTH

@@ -23,7 +23,7 @@ from rstrack.tracking.spline_tracker import Tracker
 
 CAMERA, SHUTTER = Camera(160, 120, 120.0, 120.0, 79.5, 59.5), Shutter(readout_s=0.028)
 RIG = Rig(CAMERA, SHUTTER, CAMERA, SHUTTER, synthetic.T_COLOR_DEPTH)
-FRAMES = 48
+FRAMES, RATE_HZ = 32, 20.0
 
 
 def there_and_back() -> Spline:
@@ -38,8 +38,8 @@ def there_and_back() -> Spline:
 TRUTH = there_and_back()
 
 
-def frame_at(k: int, noise: float = 0.0) -> Frame:
-    stamp = k / 30.0
+def frame_at(k: int, noise: float = 0.0, rate_hz: float = 30.0) -> Frame:
+    stamp = k / rate_hz
     depth = synthetic.render_depth(TRUTH, CAMERA, SHUTTER, stamp)
     depth = depth + noise * depth**2 * np.random.default_rng(k).standard_normal(depth.shape)
     color = synthetic.render_color(TRUTH, CAMERA, SHUTTER, stamp, synthetic.T_COLOR_DEPTH)
@@ -51,7 +51,7 @@ def tracked() -> dict[Source, Tracker]:
     sources: tuple[Source, ...] = ("keyframe", "model")
     trackers = {s: Tracker(RIG, Options(reference=s, keyframe_distance=0.12, voxel_m=0.02)) for s in sources}
     for k in range(FRAMES):
-        frame = frame_at(k)
+        frame = frame_at(k, rate_hz=RATE_HZ)
         for tracker in trackers.values():
             tracker.feed(frame)
     return trackers
