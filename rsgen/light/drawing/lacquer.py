@@ -78,6 +78,7 @@ def lacquer_light(
         part = which[begin : begin + _BATCH]
         near, weights = _shares(tree, _places(points.position[part], points.normal[part]))
         out[begin : begin + _BATCH] = np.einsum("nk,nkc->nc", weights, light[near])
+    out[~seen[stands_for]] = 0
     return out
 
 
