@@ -146,6 +146,19 @@ def test_interpolation_is_a_mean_of_what_is_near() -> None:
     np.testing.assert_allclose(between(np.ones_like(values)), 1, rtol=1e-5)
 
 
+def test_a_groove_lends_nothing_to_the_panel_that_it_is_in() -> None:
+    """Its bottom, 15 mm down, is bright as 0.2 where the panel is 1; no place between them is looked at."""
+    x, y = (k.ravel() for k in np.meshgrid(*2 * [0.005 * np.arange(120)], indexing="ij"))
+    groove = np.abs(x - 0.3) < 0.012
+    position = np.column_stack([x, y, np.where(groove, 0.03, 0.045)]).astype(np.float32)
+    normal = np.tile(np.float32([0, 0, 1]), (len(x), 1))
+    points = SurfacePoints(position, normal, normal, np.zeros(len(x), np.int64))
+    sources = thin(points, 0.06, steps=True)[0]
+    light = np.where(groove, 0.2, 1.0).astype(np.float32)
+    got = Interpolation.between(points, sources, np.arange(len(x)), 0.06)(light[sources, None])[:, 0]
+    assert np.abs(got - light).max() < 0.08
+
+
 def test_points_that_are_not_alive_do_not_count(shapes: Any) -> None:
     lattice = make_lattice(shapes, 0.02)
     values = smooth(lattice_positions(shapes, lattice))
