@@ -52,10 +52,13 @@ def estimated_quality(scene: Any, field: IrradianceField, texel_m: float, sight:
 
     Exposed so that `rounds.typical` light makes mid-grey. Infinite where nothing lit is seen.
     """
-    points, baked = _seen(scene, field, sight)
+    points, baked, lacquered = _seen(scene, field, sight)
     if not len(baked):
         return Quality(math.inf, math.inf)
     halves = _computed(scene, field, points, texel_m)
+    # What is baked there is beneath lacquer, by how much of the light gets in.
+    share = halves[..., 3].mean(axis=0) / np.maximum(halves[..., :3].mean(axis=(0, 2)), 1e-30)
+    halves = halves[..., :3] * np.where(lacquered, share, 1)[:, None]
     exposed = typical(halves.mean(axis=(0, 2)))
     if exposed <= 0:
         return Quality(math.inf, math.inf)
@@ -70,8 +73,10 @@ def _db(square: float) -> float:
     return -10 * math.log10(max(square, _LEAST_ERROR))
 
 
-def _seen(scene: Any, field: IrradianceField, sight: Sight) -> tuple[SurfacePoints, FloatArray]:
-    """Places seen, through panes and in mirrors too, as they face the eye, and the irradiance (n, 3) baked there."""
+def _seen(scene: Any, field: IrradianceField, sight: Sight) -> tuple[SurfacePoints, FloatArray, BoolArray]:
+    """Places seen, through panes and in mirrors too, as they face the eye, the irradiance (n, 3) baked there, and
+    whether it is beneath lacquer (n,).
+    """
     follow = passes_light_on(scene)
     pick = mi.Float(0.5)
     pi, si, ray, _, _ = first_scatterer(scene, rays_from(sight.eye, sight.direction), pick, follow, mi.Bool(True))
@@ -80,14 +85,16 @@ def _seen(scene: Any, field: IrradianceField, sight: Sight) -> tuple[SurfacePoin
     light = field.lookup(pi, si, -ray.d, shown)
     towards = dr.select(dr.dot(si.n, ray.d) > 0, -1.0, 1.0)
     normal = si.sh_frame.n * dr.select(dr.dot(si.sh_frame.n, si.n) * towards > 0, 1.0, -1.0)
-    dr.eval(shown, light, si.p, normal, towards)
+    lacquered = field.beneath_lacquer(si.shape, shown)
+    dr.eval(shown, light, si.p, normal, towards, lacquered)
     there: BoolArray = np.broadcast_to(np.array(shown).astype(bool), (len(sight.eye),))
     p, n, g, e = (rows_of(v)[there] for v in (si.p, normal, si.n * towards, light))
-    return SurfacePoints(p, n, g, np.zeros(len(p), np.int64)), e.astype(np.float64)
+    coat: BoolArray = np.broadcast_to(np.array(lacquered).astype(bool), (len(sight.eye),))
+    return SurfacePoints(p, n, g, np.zeros(len(p), np.int64)), e.astype(np.float64), coat[there]
 
 
 def _computed(scene: Any, field: IrradianceField, points: SurfacePoints, texel_m: float) -> NDArray[np.float64]:
-    """Irradiance (2, n, 3) at each of the points for itself, by two halves of many samples."""
+    """Irradiance (2, n, 4), see `in_channels`, at each of the points for itself, by two halves of many samples."""
     everywhere = np.arange(len(points.position))
     dark = np.zeros(len(everywhere))
     follow = passes_light_on(scene)
@@ -102,4 +109,4 @@ def _computed(scene: Any, field: IrradianceField, points: SurfacePoints, texel_m
         asked = LESS * _SKY_SAMPLES  # of which this draws the first round
         halves += sky_light(scene, points, everywhere, everywhere, texel_m, asked, dark, math.inf, silent)[0]
     draw = gathering(scene, field, points, everywhere)
-    return (halves + draw(everywhere, 0, _RAYS, silent) / (_RAYS / 2))[..., :3].astype(np.float64)
+    return (halves + draw(everywhere, 0, _RAYS, silent) / (_RAYS / 2)).astype(np.float64)

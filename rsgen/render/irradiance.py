@@ -210,6 +210,10 @@ class IrradianceField:
         self.share = share
         self.back_first = dr.opaque(mi.UInt32, face_count)  # else kernels are compiled for each number of triangles
 
+    def beneath_lacquer(self, shape: Any, active: Any) -> Any:
+        """Whether what is matte of a shape (ShapePtr) is lit by what gets into lacquer."""
+        return dr.gather(mi.UInt32, self.lacquered, dr.reinterpret_array(mi.UInt32, shape), active) > 0
+
     def lookup(self, pi: Any, si: Any, wi_world: Any, active: Any = True) -> Any:
         """Irradiance (Color3f, scene units) at hits `pi`/`si`, on the side where `wi_world`, towards the viewer, is.
 
@@ -217,7 +221,7 @@ class IrradianceField:
         """
         shape = dr.reinterpret_array(mi.UInt32, si.shape)
         first_face = dr.gather(mi.Int32, self.shape_first, shape, active & si.is_valid())
-        lacquered = dr.gather(mi.UInt32, self.lacquered, shape, active & si.is_valid()) > 0
+        lacquered = self.beneath_lacquer(si.shape, active & si.is_valid())
         active = active & si.is_valid() & (first_face >= 0)
         # Shading decides which side is lit: meshes exist whose winding and vertex normals disagree.
         back = dr.dot(si.n, wi_world) * dr.dot(si.n, si.sh_frame.n) < 0

@@ -52,7 +52,7 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="session")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Built:
-    """The room, built once for all tests, its textures painted at a quarter of their size, in a tenth of the time."""
+    """The room, built once for all tests, its textures painted at a quarter of their size: it takes less time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scene, "MATERIALS", painted_small(4))
         xml = scene.build(tmp_path_factory.mktemp("living_room"))
