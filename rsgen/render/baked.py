@@ -25,12 +25,13 @@ class BakedIntegrator(mi.SamplingIntegrator):
     """Radiance from baked irradiance: emission + diffuse lobe x E, and traced bounces for all other lobes.
 
     The diffuse lobe of a plastic is weighted with one cosine-distributed direction, which is nearly free of noise.
-    Glossy lobes are sampled and traced onto the baked surfaces, behind up to `bounces` mirrors. They cost ten times as
-    much: of a pixel's samples only `glossy_spp` are traced there, of the others what is matte is shown.
+    Glossy lobes are sampled and traced onto the baked surfaces, behind up to `bounces` mirrors: a glass of wine has
+    twelve. They cost ten times as much: of a pixel's samples only `glossy_spp` are traced there, of the others what is
+    matte is shown.
     """
 
     def __init__(
-        self, field: IrradianceField, bounces: int = 4, glossy_spp: int = 16, objects: MovingObjects | None = None
+        self, field: IrradianceField, bounces: int = 16, glossy_spp: int = 16, objects: MovingObjects | None = None
     ) -> None:
         """objects: that stand before the scene in `matte`, and take light from it; `sample` shows the scene alone."""
         super().__init__(mi.Properties())

@@ -200,6 +200,19 @@ def test_a_sheet_is_lit_on_the_side_that_faces_the_light(tmp_path: Path) -> None
     assert above.min() > 0.1 and not below.any()
 
 
+def test_corners_normals_that_are_opposites_leave_no_point_without_one(tmp_path: Path) -> None:
+    """As files have them that were smoothed over both sides of a sheet: halfway they add up to none."""
+    corners, normals = ((-1, -1), (1, -1), (-1, 1)), (1, -1, 1)
+    rows = "".join(f"v {x} {y} 0\nvn 0 0 {z}\n" for (x, y), z in zip(corners, normals, strict=True))
+    (tmp_path / "sheet.obj").write_text(rows + "f 1//1 2//2 3//3\n")
+    sheet = '<shape type="obj"><string name="filename" value="sheet.obj"/></shape>'
+    scene = scene_of(tmp_path, sheet, POINT)
+    points, _, _ = sample_points(scene, make_lattice(scene, 0.5), 0.5)
+    middle = np.hypot(points.position[:, 0], points.position[:, 1] + 1) < 0.2
+    assert middle.any()
+    np.testing.assert_allclose(np.abs(points.normal[:, 2]), 1, atol=1e-6)
+
+
 def test_what_is_buried_does_not_darken_its_neighbours(tmp_path: Path) -> None:
     """A slab sunk into the floor, too flat to throw a shadow: the floor right beside it is lit as if it were alone."""
     slab = """<shape type="cube"><transform name="to_world"><scale x="0.3" y="0.3" z="0.02"/><rotate z="1" angle="30"/>

@@ -56,8 +56,8 @@ def test_thick_glass_is_as_the_path_tracer_has_it(kind: str, tmp_path: Path) -> 
     block = f"""<shape type="cube"><transform name="to_world"><scale x="0.25" y="0.2" z="0.3"/><rotate y="1" x="0.4"
         angle="35"/><translate z="1.2"/></transform>{GLASS.format(kind)}</shape>"""
     scene = scene_of(tmp_path, *WALLS, block)
-    ours = BakedIntegrator(make_field(*bake(scene, texel_m=2.0, direct_samples=4)), bounces=12, glossy_spp=512)
-    path = mi.load_dict({"type": "path", "max_depth": 14})
+    ours = BakedIntegrator(make_field(*bake(scene, texel_m=2.0, direct_samples=4)), glossy_spp=512)
+    path = mi.load_dict({"type": "path", "max_depth": 18})
     baked, traced = (np.mean([seen(scene, i, 512, k) for k in range(2)], axis=0) for i in (ours, path))
     assert traced[8:16, 12:20].min() > 5 * BEHIND  # the block is in the middle, and both walls in it
     assert baked.mean() == pytest.approx(traced.mean(), rel=0.02)

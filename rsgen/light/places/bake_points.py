@@ -140,7 +140,9 @@ def surface_at(
     """
     si = at_triangles(shape, face, uv)[1]
     dr.eval(si.p, si.sh_frame.n, si.n)
-    return rows_of(si.p), rows_of(si.sh_frame.n), rows_of(si.n)
+    normal, geometric = rows_of(si.sh_frame.n), rows_of(si.n)
+    # Corners' normals that are each other's opposites have none in the middle between them.
+    return rows_of(si.p), np.where(np.isfinite(normal).all(axis=1, keepdims=True), normal, geometric), geometric
 
 
 def thin(
