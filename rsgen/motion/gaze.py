@@ -1,4 +1,4 @@
-"""What a camera on a closed walk looks at: surfaces at 1 to 3 m, with shape, and no sudden turns."""
+"""What a camera on a closed walk looks at: surfaces at 1 to 3 m, with shape and detail, and no sudden turns."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ _DISTANCE_M = (0.4, 0.9, 1.2, 3.0, 4.5, 10.0)
 _WORTH = (-3.0, 0.0, 1.0, 1.0, 0.3, -0.3)
 _NOTHING = -5.0
 _SHAPE = 0.8
+_DETAIL = 2.5
 _AHEAD = 0.7
 _CHANCE = 0.15
 _EASY_DEG = 30.0
@@ -35,8 +36,9 @@ def choose_targets(p_world: FloatArray, cast: Cast, calm: float, rng: np.random.
     """Points (n, 3), world, m, to look at from the camera centres (n, 3) of a closed walk, which are 60 cm apart.
 
     The best sum over all views of their worth, less what turning costs: calm for 30° from one to the next. Views are
-    worth more if surfaces are at 1 to 3 m and face different ways, and if they are ahead rather than behind: so the
-    camera comes to look at all sides. rng adds a little, so that seeds differ.
+    worth more if surfaces are at 1 to 3 m and face different ways, if these are many, as of furniture, rather than a
+    bare room's few, and if they are ahead rather than behind: so the camera comes to look at all sides. rng adds a
+    little, so that seeds differ.
     """
     worth = _views(p_world, cast)
     way = np.roll(p_world, -1, axis=0) - np.roll(p_world, 1, axis=0)
@@ -90,6 +92,8 @@ def _views(p_world: FloatArray, cast: Cast) -> FloatArray:
     distance, normal = cast(np.repeat(p_world, len(rays), axis=0), np.tile(rays, (len(p_world), 1)))
     shape = (len(p_world), _AZIMUTHS, len(elevation))
     worth = np.where(np.isfinite(distance), np.interp(distance, _DISTANCE_M, _WORTH), _NOTHING).reshape(shape)
+    planes = distance.reshape(shape), normal.reshape(*shape, 3), rays.reshape(*shape[1:], 3)
+    worth += _DETAIL * _beside_its_plane(*planes)
     towards = -np.sign(np.einsum("ij,ij->i", normal, np.tile(rays, (len(p_world), 1))))
     normal = (normal * towards[:, None]).reshape(*shape, 3)
     half = round(_HALF_WIDTH_DEG / 360.0 * _AZIMUTHS)
@@ -101,6 +105,19 @@ def _views(p_world: FloatArray, cast: Cast) -> FloatArray:
         alike = np.linalg.norm(np.mean([side[1] for side in sides], axis=0), axis=-1)
         views.append(np.mean([side[0] for side in sides], axis=0) + _SHAPE * (1.0 - alike))
     return np.stack(views, axis=-1)
+
+
+def _beside_its_plane(distance: FloatArray, normal: FloatArray, rays: FloatArray) -> FloatArray:
+    """(n, azimuths, elevations): the part of what the next two rays meet that is off the plane of what a ray meets."""
+    met = np.where(np.isfinite(distance), distance, 0.0)
+    off = np.zeros(distance.shape)
+    for axis in (0, 1):
+        beyond = np.roll(met, -1, axis=axis + 1)[..., None] * np.roll(rays, -1, axis=axis) - met[..., None] * rays
+        away = np.abs(np.einsum("naek,naek->nae", normal, beyond)) > _PLANE * met
+        if axis == 1:
+            away[:, :, -1] = False  # there is no ray above the highest
+        off += 0.5 * (away & (met > 0))
+    return off
 
 
 def _closed_way(worth: FloatArray, calm: float) -> FloatArray:
