@@ -21,6 +21,7 @@ from rsgen.config.config import LightConfig
 from rsgen.console.configs import user_cache
 from rsgen.console.progress import Progress
 from rsgen.light.bake import METHOD, bake
+from rsgen.light.drawing.bulbs import straight_through_bulbs
 from rsgen.light.estimate import estimated_quality
 from rsgen.light.sight import Sight
 from rsgen.render.irradiance import IrradianceField, Lattice, make_field, make_lattice
@@ -42,16 +43,18 @@ def baked_field(
     key = cache_key(scene_hash, light)
     path = cache / f"irradiance-{key}.npz"
     stored = _load(path, lattice)
-    if stored is None:
+    if stored is not None:
+        return make_field(lattice, *stored)
+    with straight_through_bulbs(scene) as glass:
+        if glass:
+            log.info("lamps in bulbs: their light goes straight through %d shapes of glass", len(glass))
         front, back = bake(scene, lattice, light, progress)
         _store(path, front, back)
-    else:
-        front, back = stored
-    field = make_field(lattice, front, back)
-    if stored is None and sight is not None:
-        progress("light", 1.0, "how right it is")
-        quality = estimated_quality(scene, field, light.texel_m, sight())
-        log.info("light baked: %s (light.target_db: %g)", quality, light.target_db)
+        field = make_field(lattice, front, back)
+        if sight is not None:
+            progress("light", 1.0, "how right it is")
+            quality = estimated_quality(scene, field, light.texel_m, sight())
+            log.info("light baked: %s (light.target_db: %g)", quality, light.target_db)
     return field
 
 
