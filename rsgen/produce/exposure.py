@@ -15,27 +15,31 @@ from rsgen.produce.frame_source import small_camera
 _VIEWS, _WIDTH, _SPP, _DEPTH = 6, 48, 32, 16
 _BLOCK = 12  # pixels: noise of so few samples is averaged over blocks
 _GREY = 0.18  # what half of the blocks are to be brighter than
+_MOST, _WHITE = 0.7, 0.6  # of the blocks, that are not to be brighter than this: windows may, white walls not
 _ENOUGH = 2.0  # a factor that is not worth the while
 
 
 def suggested_gain(scene: Any, camera: Camera, T_world_cam: PoseFunction, until_s: float, gain: float) -> float | None:
-    """`color.exposure_gain` that makes the typical surface mid-grey; None if `gain` does so within a factor of 2.
+    """`color.exposure_gain` that makes the typical surface mid-grey, or less where it would make most of a picture's
+    bright part white: dark floors below white walls. None if `gain` does so within a factor of 2.
 
     Path traced by `camera`, made small, at poses T_world_cam(t), at a few instants from 0 to `until_s`, in s. None too
     where all is dark.
     """
     import mitsuba as mi
 
+    from rsgen.light.drawing.bulbs import straight_through_bulbs
     from rsgen.render.images import ColorRenderer
 
     path = mi.load_dict({"type": "path", "max_depth": _DEPTH})
     renderer = ColorRenderer(scene, path, small_camera(camera, _WIDTH), Shutter(), _SPP)
     stamps = until_s * (np.arange(_VIEWS) + 0.5) / _VIEWS
-    light = np.concatenate([_blocks(renderer.render(T_world_cam, float(t), k)) for k, t in enumerate(stamps)])
+    with straight_through_bulbs(scene):
+        light = np.concatenate([_blocks(renderer.render(T_world_cam, float(t), k)) for k, t in enumerate(stamps)])
     light = light[light > 0]
     if not len(light):
         return None
-    wanted = _GREY / float(np.median(light))
+    wanted = min(_GREY / float(np.median(light)), _WHITE / float(np.quantile(light, _MOST)))
     if 1 / _ENOUGH <= wanted / gain <= _ENOUGH:
         return None
     return float(f"{wanted:.2g}")
