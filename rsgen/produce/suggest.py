@@ -39,7 +39,7 @@ _CALM = (0.08, 0.2, 1.0, 4.0)
 _BRISK_DEG_S = 35.0  # mean rotational speed of hand-held recordings: 15 to 40
 _SWAY_SHARE, _SWAY_DEG_S = 1.08, 1.5  # what the slow turning adds to that of the tour
 _SWAY_DEG = 20.0  # it turns to either side by so much at most where more is to be added: it is made faster instead
-_ROOM_M, _SMALLEST_M, _FARTHEST_M = 2.5, 0.001, 9000.0
+_ROOM_M, _ROOMS_M, _SMALLEST_M, _FARTHEST_M = 2.5, (2.0, 6.0), 0.001, 9000.0
 _UNITS = {"centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254}
 _SKIN = 0.01  # of a scene's size: what lies so flat is its ground
 _SLACK_M = 0.04
@@ -143,7 +143,7 @@ def suggest_tour(
 ) -> Suggestion:
     """A tour through the scene `file`: through its largest room, or round the thing that it holds.
 
-    name: of the sequence; None: after the file. scale, up: of a mesh file, see `MeshOptions`. like: whose cameras,
+    name: of the sequence; None: after the file. scale, up: see `MeshOptions`. like: whose cameras,
     noise and truth it is to have; None: the defaults. Raises UserError naming the file if there is no place for a
     camera, no floor, or no scene, and if it is a room in another unit than metres.
     """
@@ -154,8 +154,6 @@ def suggest_tour(
     from rsgen.render.scene import load_scene
 
     placed = {key: value for key, value in (("scale", scale), ("up", up)) if value != getattr(AS_IT_IS, key)}
-    if placed and file.suffix.lower() == ".xml":
-        raise UserError(f"--{next(iter(placed))}: is for mesh files: a Mitsuba scene says that itself")
     loaded = load_scene(file, options=MeshOptions(scale, up))
     triangles = scene_triangles(loaded)
     fineness = 1.0 / coarser(triangles, inhabited([shape for shape in loaded.shapes() if shape.is_mesh()]))
@@ -198,15 +196,13 @@ def _room(scene: _Scene, clearance_m: float) -> FloorPlan | None:
             best, most = plan, free
     if best is None:
         if share_without_floor(scene.cast, low, high) >= _LARGE:
-            raise scene.wrong("walls but no floor below them: add a floor, or have y up (a mesh file takes --up z)")
+            raise scene.wrong("walls but no floor below them: add a floor, or say which axis is up (--up z)")
         return None
     height = float(high[1] - low[1])
     if height > HIGHEST_M:
-        unit, scale = min(_UNITS.items(), key=lambda u: abs(math.log(u[1] * height / _ROOM_M)))
-        raise scene.wrong(
-            f"a room of {height:.0f} from bottom to top is one in {unit}, but scenes are in metres: a mesh file takes "
-            f"--scale {scale:g}, in a Mitsuba scene scale its shapes"
-        )
+        unit, scale = likely_unit(height)
+        scale *= scene.placed.get("scale", 1.0)
+        raise scene.wrong(f"a room of {height:.0f} m from bottom to top is rather one in {unit}: --scale {scale:g}")
     if free_region(best, clearance_m) is not None:
         return best
     if not best.solid and best.inside.mean() >= _LARGE:
@@ -215,6 +211,17 @@ def _room(scene: _Scene, clearance_m: float) -> FloorPlan | None:
             "reduce --clearance, or see that the scene is in metres and y up"
         )
     return None
+
+
+def likely_unit(height: float) -> tuple[str, float]:
+    """The unit, and how many metres it has, in which a room of that height is as high as rooms are."""
+
+    def unlike(metres: float) -> tuple[float, float]:
+        low, high = _ROOMS_M
+        outside = max(math.log(low / metres), math.log(metres / high), 0.0)
+        return outside, abs(math.log(metres / _ROOM_M))
+
+    return min(_UNITS.items(), key=lambda unit: unlike(unit[1] * height))
 
 
 def _thing(scene: _Scene) -> _Thing:

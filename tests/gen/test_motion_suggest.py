@@ -24,7 +24,7 @@ from rsgen.motion.clearance import check_clearance
 from rsgen.motion.gaze import seen_from
 from rsgen.motion.statistics import motion_statistics
 from rsgen.produce.ground_truth import Motion, load_motion
-from rsgen.produce.suggest import Suggestion, Wish, suggest_tour
+from rsgen.produce.suggest import Suggestion, Wish, likely_unit, suggest_tour
 from rsgen.render.rays import cast_rays
 from rsgen.render.scene import load_scene
 from rsgen.sequence.trajectory import Trajectory
@@ -362,8 +362,17 @@ def test_a_room_in_centimetres_with_z_up_is_the_room(tmp_path: Path) -> None:
     assert found.found[0] == expected.found[0]
     assert b"scale: 0.01" in found.yaml(tmp_path) and b"up: z" in found.yaml(tmp_path)
     assert b"scale" not in expected.yaml(tmp_path) and b"up: y" not in expected.yaml(tmp_path)
-    with pytest.raises(UserError, match="--scale: is for mesh files"):
-        suggest_tour(tmp_path / "it.xml", None, Wish(), scale=0.01)
+    xml = '<scene version="3.0.0"><shape type="ply"><string name="filename" value="it.ply"/></shape></scene>'
+    (tmp_path / "it.xml").write_text(xml)
+    with pytest.raises(UserError, match=r"rather one in centimetres: --scale 0\.01"):
+        suggest_tour(tmp_path / "it.xml", None, Wish(4.0), up="z")
+    of_xml = tour(tmp_path / "it.xml", Wish(4.0), scale=0.01, up="z")
+    assert of_xml.found[0] == found.found[0].replace("it.ply", "it.xml")
+
+
+def test_the_unit_is_that_in_which_it_is_as_high_as_rooms_are() -> None:
+    heights = {240.0: 0.01, 844.0: 0.01, 2500.0: 0.001, 96.0: 0.0254, 6000.0: 0.001, 110.0: 0.0254}
+    assert {height: likely_unit(height)[1] for height in heights} == heights
 
 
 def test_a_scene_without_surfaces(tmp_path: Path) -> None:

@@ -48,9 +48,9 @@ _UP = {
 
 @dataclass(frozen=True)
 class MeshOptions:
-    """How a mesh file becomes a scene: metres per unit of the file, which of its axes is up, what lights it.
+    """How a file becomes a scene: metres per unit of the file, which of its axes is up, what lights it.
 
-    light: see `rsgen.render.mesh_files.default_light`.
+    light: of a mesh file, see `rsgen.render.mesh_files.default_light`.
     """
 
     scale: float = 1.0
