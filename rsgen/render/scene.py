@@ -28,6 +28,7 @@ from rsgen.files import encode_png
 from rsgen.inputs import check_input
 from rsgen.render.board import Board, drawing
 from rsgen.render.board import surface as board_surface
+from rsgen.render.file_names import tell_renamed
 from rsgen.render.land import split_land
 from rsgen.render.mended import mend_meshes
 from rsgen.render.mesh_files.mesh_file import AS_IT_IS, MeshOptions, hash_into, mesh_scene
@@ -123,11 +124,12 @@ def content_hash(path: Path, options: MeshOptions = AS_IT_IS) -> str:
         mi = mitsuba()
         with tempfile.TemporaryDirectory(prefix="rsgen-scene-") as scratch, messages_to_log(mi):
             try:
-                state, changes = parse(mi, mi.parser.ParserConfig(mi.variant()), path, Path(scratch))
+                parsed = parse(mi, mi.parser.ParserConfig(mi.variant()), path, Path(scratch))
             except UserError:
                 raise
             except Exception as error:
                 raise UserError(f"scene {path}: {_first_line(error)}") from None
+        state, changes = parsed.state, parsed.changes
         if changes is not None:
             digest.update(OLD_XML)
         if options != AS_IT_IS:
@@ -149,12 +151,14 @@ def _load_xml(
     config = mi.parser.ParserConfig(mi.variant())
     # Merging orders meshes by memory address: emitters and shapes would be numbered anew in each process.
     config.merge_meshes = False
-    state, changes = parse(mi, config, path, scratch, None if board is None else _board_xml(board, scratch))
+    parsed = parse(mi, config, path, scratch, None if board is None else _board_xml(board, scratch))
+    changes = parsed.changes
+    tell_renamed(path, parsed.renamed)
     resolver = mi.file_resolver()
     resolver.prepend(str(path.resolve().parent))
     try:
         with _threads_to_read_with():
-            scene = _instantiated(mi, config, state, path, scratch, options)
+            scene = _instantiated(mi, config, parsed.state, path, scratch, options)
     finally:
         del resolver[0]  # else the next scene would find what it lacks, an include say, in this one's folder
     if changes is not None:

@@ -25,13 +25,16 @@ Exists = Callable[[str, str], bool]
 
 @dataclass
 class Changes:
-    """What an upgrade dropped and replaced, with counts; what rsgen never uses; and the files that it included."""
+    """What an upgrade dropped and replaced, with counts; what rsgen never uses; the files that it included, and which
+    of the files that it names were found under another name.
+    """
 
     version: str
     dropped: Counter[str] = field(default_factory=Counter)
     replaced: Counter[str] = field(default_factory=Counter)
     not_used: Counter[str] = field(default_factory=Counter)
     files: list[Path] = field(default_factory=list)
+    renamed: dict[str, str] = field(default_factory=dict)
 
     def summary(self) -> str:
         """'upgraded from Mitsuba 0.6; dropped: ...; replaced: ...; not used: ...', counted."""

@@ -9,6 +9,7 @@ import contextlib
 import logging
 import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -17,6 +18,7 @@ import numpy as np
 
 from rsgen.errors import UserError
 from rsgen.inputs import MOST_BYTES, MOST_PIXELS, image_size
+from rsgen.render.file_names import mend_names
 from rsgen.render.scene_xml import old_xml
 from rsgen.render.scene_xml.instances import flatten
 from rsgen.render.scene_xml.old_plugins import Changes, Exists
@@ -30,8 +32,19 @@ _UNKNOWN = re.compile(r'(\w+) plugin of type "(\w+)":|- \w+ "(\w+)"')
 _FAILED = re.compile(r'At (.*?\(line \d+, col \d+\)): failed to instantiate (\w+) plugin of type "(\w+)": (.*)')
 
 
-def parse(mi: Any, config: Any, path: Path, scratch: Path, shape: str | None = None) -> tuple[Any, Changes | None]:
-    """Parsed state of a scene file, and what an upgrade changed if it is older than Mitsuba 3 (None: it is not).
+@dataclass(frozen=True)
+class Parsed:
+    """A scene file's parsed state, what an upgrade changed if it is older than Mitsuba 3 (None: it is not), and files
+    that it names otherwise than they are called, by the names there.
+    """
+
+    state: Any
+    changes: Changes | None
+    renamed: dict[str, str]
+
+
+def parse(mi: Any, config: Any, path: Path, scratch: Path, shape: str | None = None) -> Parsed:
+    """A scene file parsed.
 
     config: a ParserConfig; scratch: a folder for files made on the way; shape: XML of one more shape, which is added as
     the last. Raises UserError, and what Mitsuba's parser raises.
@@ -48,7 +61,9 @@ def parse(mi: Any, config: Any, path: Path, scratch: Path, shape: str | None = N
         shape = shape.replace(' version="3.0.0"', "")
         whole.write_text(f"<scene version='3.0.0'><include filename={quoteattr(str(file))}/>{shape}</scene>")
         file = whole
-    return mi.parser.parse_file(config, str(file)), changes
+    state = mi.parser.parse_file(config, str(file))
+    renamed = {} if changes is None else changes.renamed
+    return Parsed(state, changes, renamed | mend_names(state, path.parent))
 
 
 def plugin_finder(mi: Any) -> Exists:
