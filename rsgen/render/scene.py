@@ -35,9 +35,12 @@ from rsgen.render.mesh_files.mesh_file import AS_IT_IS, MeshOptions, hash_into, 
 from rsgen.render.ply import joined_triangles, ply_bytes
 from rsgen.render.scene_xml.analytic import ANALYTIC, tessellated
 from rsgen.render.scene_xml.instances import turn_mirrored
+from rsgen.render.scene_xml.obj_polygons import METHOD as OBJ_POLYGONS
+from rsgen.render.scene_xml.obj_polygons import with_triangles
 from rsgen.render.scene_xml.old_xml import METHOD as OLD_XML
 from rsgen.render.scene_xml.parsed import check_files, explained, messages_to_log, parse, prepare, unknown_properties
 from rsgen.render.scene_xml.placed import place, place_lamps
+from rsgen.render.scene_xml.refused import read_polygons, read_refused
 
 log = logging.getLogger("rsgen")
 
@@ -141,7 +144,10 @@ def content_hash(path: Path, options: MeshOptions = AS_IT_IS) -> str:
             file = path.parent / name
             if not file.is_file():
                 raise UserError(f"scene {path}: file '{name}' that it names is missing")
-            digest.update(name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())
+            data = file.read_bytes()
+            digest.update(name.encode() + b"\0" + hashlib.sha256(data).digest())
+            if file.suffix.lower() == ".obj" and with_triangles(data) is not None:
+                digest.update(OBJ_POLYGONS)
     return digest.hexdigest()
 
 
@@ -195,11 +201,17 @@ def _instantiated(mi: Any, config: Any, state: Any, path: Path, scratch: Path, o
         if plugin in ANALYTIC:
             node.props = tessellated(mi, node.props, scratch / f"{index}.ply")
     check_files(mi, state, path)
+    read_polygons(mi, state, scratch)
     mi.parser.transform_all(config, state)
     try:
         scene = mi.parser.instantiate(config, state)
     except Exception as error:  # of whatever kind Mitsuba's plugins raise
-        raise UserError(f"scene {path}: {explained(mi, state, str(error))}") from None
+        if not read_refused(mi, state, path, scratch):
+            raise UserError(f"scene {path}: {explained(mi, state, str(error))}") from None
+        try:
+            scene = mi.parser.instantiate(config, state)
+        except Exception as another:
+            raise UserError(f"scene {path}: {explained(mi, state, str(another))}") from None
     scene = scene[0] if isinstance(scene, (list, tuple)) else scene
     place_lamps(mi, scene, options.scale)
     return turn_mirrored(mi, scene)
