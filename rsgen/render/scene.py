@@ -37,6 +37,7 @@ from rsgen.render.scene_xml.analytic import ANALYTIC, tessellated
 from rsgen.render.scene_xml.instances import turn_mirrored
 from rsgen.render.scene_xml.obj_polygons import METHOD as OBJ_POLYGONS
 from rsgen.render.scene_xml.obj_polygons import with_triangles
+from rsgen.render.scene_xml.old_factors import multiply_images
 from rsgen.render.scene_xml.old_xml import METHOD as OLD_XML
 from rsgen.render.scene_xml.parsed import check_files, explained, messages_to_log, parse, prepare, unknown_properties
 from rsgen.render.scene_xml.placed import place, place_lamps
@@ -202,6 +203,7 @@ def _instantiated(mi: Any, config: Any, state: Any, path: Path, scratch: Path, o
             node.props = tessellated(mi, node.props, scratch / f"{index}.ply")
     check_files(mi, state, path)
     read_polygons(mi, state, scratch)
+    multiply_images(mi, state)
     mi.parser.transform_all(config, state)
     try:
         scene = mi.parser.instantiate(config, state)

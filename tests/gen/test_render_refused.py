@@ -154,6 +154,17 @@ def test_texture_coordinates_of_corners(tmp_path: Path, ascii_file: bool, caplog
         np.testing.assert_allclose(turned["uv"][:, 1], 1 - expected[:, 1], atol=1e-5)
 
 
+def test_polygons_of_ply_files(tmp_path: Path) -> None:
+    """An arrow head, 10 in area, and a triangle of 2."""
+    corners = "0 0 0\n4 0 0\n4 4 0\n2 1 0\n0 4 0\n"
+    header = "ply\nformat ascii 1.0\nelement vertex 5\nproperty float x\nproperty float y\nproperty float z\n"
+    faces = "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+    (tmp_path / "it.ply").write_text(f"{header}{faces}{corners}5 0 1 2 3 4\n3 0 1 3\n")
+    scene = write_scene(tmp_path, '<shape type="ply"><string name="filename" value="it.ply"/></shape>')
+    area = 0.5 * twice_area(*surface(load_scene(scene)))[:, 2]
+    assert area.min() > 0 and area.sum() == pytest.approx(10 + 2)
+
+
 def test_what_nobody_can_read_is_refused_as_before(tmp_path: Path) -> None:
     scene = write_scene(tmp_path, '<shape type="ply"><string name="filename" value="it.ply"/></shape>')
     wedged(tmp_path, True, bad="nan 1.0 0.0 0.6")

@@ -17,9 +17,10 @@ from xml.etree.ElementTree import Element
 
 from rsgen.errors import UserError
 from rsgen.render.file_names import located
-from rsgen.render.scene_xml.old_plugins import Changes, Exists, Upgrade
+from rsgen.render.scene_xml.old_changes import Changes
+from rsgen.render.scene_xml.old_plugins import Exists, Upgrade
 
-METHOD = b"old-xml/1"
+METHOD = b"old-xml/2"
 """Raise when old files come out differently: their baked light is kept under it."""
 
 _DEEPEST = 15  # includes, as in Mitsuba

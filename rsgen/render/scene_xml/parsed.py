@@ -21,7 +21,8 @@ from rsgen.inputs import MOST_BYTES, MOST_PIXELS, image_size
 from rsgen.render.file_names import mend_names
 from rsgen.render.scene_xml import old_xml
 from rsgen.render.scene_xml.instances import flatten
-from rsgen.render.scene_xml.old_plugins import Changes, Exists
+from rsgen.render.scene_xml.old_changes import Changes
+from rsgen.render.scene_xml.old_plugins import Exists
 
 log = logging.getLogger("rsgen")
 
