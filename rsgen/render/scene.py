@@ -205,18 +205,23 @@ def _instantiated(mi: Any, config: Any, state: Any, path: Path, scratch: Path, o
     read_polygons(mi, state, scratch)
     multiply_images(mi, state)
     mi.parser.transform_all(config, state)
+    untouched = mi.parser.ParserState(state)  # objects made of it, also by an attempt that fails, stay in the other
     try:
-        scene = mi.parser.instantiate(config, state)
-    except Exception as error:  # of whatever kind Mitsuba's plugins raise
-        if not read_refused(mi, state, path, scratch):
-            raise UserError(f"scene {path}: {explained(mi, state, str(error))}") from None
-        try:
-            scene = mi.parser.instantiate(config, state)
-        except Exception as another:
-            raise UserError(f"scene {path}: {explained(mi, state, str(another))}") from None
+        scene = _made(mi, config, state, path)
+    except UserError:
+        if not read_refused(mi, untouched, path, scratch):
+            raise
+        scene = _made(mi, config, untouched, path)
     scene = scene[0] if isinstance(scene, (list, tuple)) else scene
     place_lamps(mi, scene, options.scale)
     return turn_mirrored(mi, scene)
+
+
+def _made(mi: Any, config: Any, state: Any, path: Path) -> Any:
+    try:
+        return mi.parser.instantiate(config, state)
+    except Exception as error:  # of whatever kind Mitsuba's plugins raise
+        raise UserError(f"scene {path}: {explained(mi, state, str(error))}") from None
 
 
 def _board_xml(board: Board, folder: Path) -> str:

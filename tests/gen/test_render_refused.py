@@ -137,12 +137,13 @@ def test_texture_coordinates_of_corners(tmp_path: Path, ascii_file: bool, caplog
         <string name="name" value="face_color"/></texture></bsdf>"""
     flipped = '<boolean name="flip_tex_coords" value="true"/>'
     with caplog.at_level(logging.INFO, "rsgen"):
-        scene = load_scene(write_scene(tmp_path, f'<shape type="ply" id="it">{inside}</shape>'))
+        lamp = '<shape type="disk"><emitter type="area"/></shape>'
+        scene = load_scene(write_scene(tmp_path, f'<shape type="ply" id="it">{inside}</shape>', lamp))
     assert [r.getMessage() for r in caplog.records] == [
         f"scene {tmp_path / 'scene.xml'}: read by trimesh, Mitsuba does not: it.ply"
     ]
     found = from_above(scene)
-    assert found["valid"].all() and scene.shapes()[0].id() == "it"
+    assert found["valid"].all() and scene.shapes()[0].id() == "it" and len(scene.emitters()) == 2
     expected = found["p"][:, :2] - [0, 3]
     expected += np.where(expected[:, 1] > expected[:, 0], 10, 0)[:, None]
     np.testing.assert_allclose(found["uv"], expected, atol=1e-5)
