@@ -179,6 +179,8 @@ def suggest_tour(
     if best is None:
         raise scene.wrong(f"no tour found that keeps {wish.clearance_m:g} m from all surfaces: reduce --clearance")
     where = room_text(aim, wish.clearance_m) if isinstance(aim, FloorPlan) else thing_text(aim.high - aim.low)
+    if isinstance(aim, FloorPlan) and _ROOMS_M[1] < aim.floor.gap_m < math.inf:
+        where += f"; if that is too high, --scale {scale * _ROOM_M / aim.floor.gap_m:.2g} makes it {_ROOM_M:g} m"
     config, how = _exposed(loaded, best.config, best.spline)
     return Suggestion(config, (f"{file.name}: {where}", *motion_text(best, wish.rotation_deg_s), *how))
 
