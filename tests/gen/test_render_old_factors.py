@@ -153,3 +153,15 @@ def test_ward_keeps_its_widths(tmp_path: Path) -> None:
     metal = str(scene.shapes()[0].bsdf())
     assert "RoughConductor" in metal and "0.3" in metal and "0.05" in metal
     np.testing.assert_allclose(albedo(scene.shapes()[0].bsdf(), 1.0), 0.7, rtol=0.03)
+
+
+@pytest.mark.parametrize("keeps", ["true", "false"])
+def test_a_mixture_of_more_than_all_of_each(tmp_path: Path, keeps: str) -> None:
+    parts = """<bsdf type="diffuse"><rgb name="reflectance" value="0.8, 0.4, 0.2"/></bsdf>
+        <bsdf type="conductor"><string name="material" value="none"/>
+        <rgb name="specularReflectance" value="0.1"/></bsdf>"""
+    flag = f'<boolean name="ensureEnergyConservation" value="{keeps}"/><string name="weights" value="1, 1"/>'
+    scene = loaded(tmp_path, f'<shape type="rectangle"><bsdf type="mixturebsdf">{flag}{parts}</bsdf></shape>')
+    found = [albedo(scene.shapes()[0].bsdf(), 0.7, k) for k in (mi.BSDFFlags.Diffuse, mi.BSDFFlags.Delta)]
+    expected = np.array([[0.8, 0.4, 0.2], 3 * [0.1]]) * (0.5 if keeps == "true" else 1)
+    np.testing.assert_allclose(found, expected, rtol=0.03)

@@ -13,6 +13,7 @@ from rsgen.render.scene_xml.old_factors import Factors
 
 PLUGINS = ("phong", "ward")
 
+_COLOR_OF = {"diffuse": "reflectance", "conductor": "specular_reflectance", "roughconductor": "specular_reflectance"}
 _MATTE, _MIRRORED = "0.5", "0.2"  # reflectances, where a file says nothing
 _EXPONENT, _ALPHA = "30", "0.1"
 _MOST = 0.99  # of both together, to which Mitsuba 0.x brought those that would make light
@@ -40,6 +41,27 @@ def two_lobes(e: Element, factors: Factors) -> Element | None:
     SubElement(blend, "float", name="weight", value=f"{most[1] / total:.6g}")
     blend.extend((_lobe("diffuse", "reflectance", colors[0]), _metal(e, colors[1])))
     return blend
+
+
+def added(parts: list[Element], weights: list[float], factors: Factors) -> list[float] | None:
+    """Shares by lot, 1 in all, of BSDFs that a mixture adds with weights that are more than 1 in all; their colours are
+    changed in place. None if one of them is none that has a single colour, or that cannot be multiplied.
+    """
+    colors = [old.named(part, _COLOR_OF.get(part.get("type", ""), "")) for part in parts]
+    most = [weight * factors.most(color, 0.0) for weight, color in zip(weights, colors, strict=True)]
+    if not all(most):
+        return None
+    brighter = min(sum(most), _MOST)
+    products = [
+        None if color is None else factors.times(color, [weight * brighter / part_most] * 3)
+        for color, weight, part_most in zip(colors, weights, most, strict=True)
+    ]
+    if None in products:
+        return None
+    for part, color, product in zip(parts, colors, products, strict=True):
+        assert color is not None and product is not None
+        part[list(part).index(color)] = product
+    return [part_most / sum(most) for part_most in most]
 
 
 def _given(e: Element, name: str, default: str) -> Element:

@@ -274,12 +274,18 @@ class Upgrade:
     def _mixture(self, e: Element) -> Element:
         """Blends of two; what weights below 1 in all would absorb is lost."""
         weights = old.numbers(old.take(e, "weights", ""))
+        keeps_energy = old.take(e, "ensure_energy_conservation", "true") == "true"
         parts = [child for child in e if child.tag in ("bsdf", "ref")]
         if not parts or len(parts) != len(weights) or sum(weights) <= 0:
             self._replaced["bsdf mixturebsdf by diffuse"] += 1
             return self._stand_in(e, Element("bsdf", type="diffuse"))
         if sum(weights) < 0.999:
             self._dropped["absorption of a mixturebsdf"] += 1
+        if sum(weights) > 1.001 and not keeps_energy:  # else weights are brought to 1 in all
+            shares = old_lobes.added(parts, weights, self._factors)
+            if shares is None:
+                self._dropped[f"sum of weights {sum(weights):g} of a mixturebsdf"] += 1
+            weights = weights if shares is None else shares
         mixed, total = old.renamed(parts[0], None), weights[0]
         if len(parts) == 1:
             return self._stand_in(e, self._bsdf(mixed) if mixed.tag == "bsdf" else mixed)
