@@ -24,7 +24,8 @@ from rsgen.motion.clearance import check_clearance
 from rsgen.motion.gaze import seen_from
 from rsgen.motion.statistics import motion_statistics
 from rsgen.produce.ground_truth import Motion, load_motion
-from rsgen.produce.suggest import Suggestion, Wish, likely_unit, suggest_tour
+from rsgen.produce.suggest import Suggestion, Wish, suggest_tour
+from rsgen.produce.units import likely_unit
 from rsgen.render.rays import cast_rays
 from rsgen.render.scene import load_scene
 from rsgen.sequence.trajectory import Trajectory
@@ -362,12 +363,17 @@ def test_a_room_in_centimetres_with_z_up_is_the_room(tmp_path: Path) -> None:
     assert found.found[0] == expected.found[0] and "if that is too high" not in found.found[0]
     assert b"scale: 0.01" in found.yaml(tmp_path) and b"up: z" in found.yaml(tmp_path)
     assert b"scale" not in expected.yaml(tmp_path) and b"up: y" not in expected.yaml(tmp_path)
-    xml = '<scene version="3.0.0"><shape type="ply"><string name="filename" value="it.ply"/></shape></scene>'
-    (tmp_path / "it.xml").write_text(xml)
-    with pytest.raises(UserError, match=r"rather one in centimetres: --scale 0\.01"):
-        suggest_tour(tmp_path / "it.xml", None, Wish(4.0), up="z")
+    pose = '<transform name="to_world"><lookat origin="0,0,0" target="0,1,0" up="0,0,1"/></transform>'
+    camera = f'<sensor type="perspective">{pose}</sensor>'
+    shape = '<shape type="ply"><string name="filename" value="it.ply"/></shape>'
+    (tmp_path / "it.xml").write_text(f'<scene version="3.0.0">{camera}{shape}</scene>')
+    with pytest.raises(
+        UserError, match=r"rather one in centimetres: --scale 0\.01.*\(its own camera has z up: --up z\)"
+    ):
+        suggest_tour(tmp_path / "it.xml", None, Wish(4.0))
     thrice = tour(tmp_path / "it.xml", Wish(4.0), scale=0.03, up="z")
     assert "a room, 7.80 m high" in thrice.found[0] and "too high, --scale 0.0096 makes it 2.5 m" in thrice.found[0]
+    assert "own camera" not in "".join(thrice.found) and "it has no light" in thrice.found[-1]
 
 
 def test_the_unit_is_that_in_which_it_is_as_high_as_rooms_are() -> None:

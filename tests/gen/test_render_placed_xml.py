@@ -18,6 +18,7 @@ from rsgen.render.images import ColorRenderer, DepthRenderer
 from rsgen.render.mesh_files.mesh_file import MeshOptions
 from rsgen.render.scene import content_hash, load_scene, mesh_arrays
 from rsgen.render.scene_xml import placed
+from rsgen.render.scene_xml.camera_up import camera_up
 
 CAMERA = Camera(48, 36, 40.0, 40.0, 23.5, 17.5)
 OPTIONS = MeshOptions(scale=0.01, up="z")
@@ -149,3 +150,20 @@ def test_a_light_that_cannot_be_placed_is_named(tmp_path: Path, monkeypatch: pyt
     with pytest.raises(UserError, match=r"emitter 'constant' cannot be scaled.*take another") as error:
         load_scene(write_scene(tmp_path, '<shape type="cube"/><emitter type="constant"/>'), options=OPTIONS)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("camera", "up"),
+    [
+        ('<lookat origin="1,2,3" target="0,0,0" up="0, 0.5, 0.9"/>', "z"),
+        ('<lookAt origin="1,2,3" target="0,0,0" up="-1 0 0"/>', "-x"),
+        ('<matrix value="1 0 0 5  0 0.9 0.4 5  0 -0.4 0.9 5  0 0 0 1"/>', "y"),
+        ('<lookat origin="1,2,3" target="0,0,0" up="1, 1, 0"/>', None),
+        ('<lookat origin="1,2,3" target="0,0,0"/>', None),
+        ('<rotate y="1" angle="30"/>', None),
+        ('<matrix value="what"/>', None),
+    ],
+)
+def test_the_camera_of_a_scene_tells_which_axis_is_up(tmp_path: Path, camera: str, up: str | None) -> None:
+    file = write_scene(tmp_path, f'<sensor type="perspective"><transform name="toWorld">{camera}</transform></sensor>')
+    assert camera_up(file) == up
