@@ -19,7 +19,7 @@ def camera_up(path: Path) -> Up | None:
     try:
         cameras = [e for e in ET.parse(path).getroot().iter() if e.tag in ("sensor", "camera")]
         placed = [e for camera in cameras for e in camera.iter() if e.tag in ("lookat", "lookAt", "look_at", "matrix")]
-        numbers = old.numbers(placed[0].get("up") or placed[0].get("value", ""))
+        numbers = old.numbers(placed[0].get("up") or placed[0].get("value") or "")
         up = np.array(numbers if len(numbers) == 3 else numbers[1:12:4])  # of a matrix (4, 4) the second column
         axis = int(np.argmax(np.abs(up)))
         upright = abs(up[axis]) > _UPRIGHT * np.linalg.norm(up)
