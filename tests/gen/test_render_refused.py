@@ -27,7 +27,7 @@ def twice_area(corners: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 def polygons() -> list[np.ndarray]:
     rng = np.random.default_rng(1)
     angle = np.sort(rng.uniform(0, 2 * np.pi, 30))
-    stars = [np.stack([np.cos(angle), np.sin(angle)], 1) * rng.uniform(0.2, 1, (30, 1)) for _ in range(20)]
+    stars = [np.stack([np.cos(angle), np.sin(angle)], 1) * rng.uniform(0.2, 1, (30, 1)) for _ in range(6)]
     holed = np.array([[0, 0], [4, 0], [4, 3], [0, 3], [0, 0], [1, 1], [1, 2], [3, 2], [3, 1], [1, 1]], float)
     comb = np.array([[59.5, -1], *((k + 0.5 * top, 5 * top) for k in range(59, -1, -1) for top in (1, 0)), [0, -1]])
     turns = np.linspace(0, 6 * np.pi, 100)[:, None]
