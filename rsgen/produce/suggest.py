@@ -156,6 +156,8 @@ def suggest_tour(
     from rsgen.render.scene_xml.camera_up import camera_up
 
     placed = {key: value for key, value in (("scale", scale), ("up", up)) if value != getattr(AS_IT_IS, key)}
+    if not 1e-9 <= scale <= 1e9:  # as scene.scale
+        raise UserError(f"--scale {scale:g}: must lie in 1e-09 to 1e+09")
     loaded = load_scene(file, options=MeshOptions(scale, up))
     triangles = scene_triangles(loaded)
     fineness = 1.0 / coarser(triangles, inhabited([shape for shape in loaded.shapes() if shape.is_mesh()]))

@@ -387,7 +387,9 @@ def test_a_scene_without_surfaces(tmp_path: Path) -> None:
         suggest_tour(tmp_path / "empty.xml", None, Wish())
 
 
-@pytest.mark.parametrize("words", ["--seconds 1", "--speed 0", "--clearance -1", "--seed -1", "--name a/b"])
+@pytest.mark.parametrize(
+    "words", ["--seconds 1", "--scale 0", "--scale nan", "--speed 0", "--clearance -1", "--seed -1", "--name a/b"]
+)
 def test_wishes_out_of_bounds(folder: Path, words: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["motion", "suggest", str(folder / "furnished.ply"), *words.split()]) == 2
     error = capsys.readouterr().err
