@@ -47,6 +47,7 @@ def matte(inner: str) -> str:
     return f'<shape type="rectangle"><bsdf type="diffuse">{inner}</bsdf></shape>'
 
 
+NAMED = 'id="it" name="diffuseReflectance"'
 HALF, TINT = 'float name="scale" value="0.5"', 'rgb name="scale" value="0.5, 1, 0.25"'
 
 
@@ -80,8 +81,17 @@ def test_scaled_textures(
     assert not caplog.records and len(content_hash(tmp_path / "scene.xml")) == 64
 
 
-def test_a_texture_that_is_scaled_where_it_is_defined_stays_as_it_is_for_others(tmp_path: Path) -> None:
-    scene = loaded(tmp_path, matte(scaled(HALF, BITMAP.format('id="it"'))), matte('<ref name="reflectance" id="it"/>'))
+@pytest.mark.parametrize(
+    "first",
+    [
+        matte(scaled(HALF, BITMAP.format('id="it"'))),
+        matte(scaled(TINT, scaled(HALF, BITMAP.format('id="it"'), "value"))),
+        f'<shape type="disk"><bsdf type="phong">{BITMAP.format(NAMED)}</bsdf></shape>',
+    ],
+    ids=["scaled", "twice", "phong"],
+)
+def test_a_texture_that_is_multiplied_where_it_is_defined_stays_as_it_is_for_others(tmp_path: Path, first: str) -> None:
+    scene = loaded(tmp_path, first, matte('<ref name="reflectance" id="it"/>'))
     np.testing.assert_allclose(shown(scene), COLOR.reshape(16, 3), rtol=2e-3, atol=1e-4)
 
 

@@ -25,10 +25,15 @@ class Factors:
 
     def __init__(self, root: Element) -> None:
         self._named = {e.get("id", ""): deepcopy(e) for e in root.iter("texture") if e.get("id")}
+        self.kept: list[Element] = []
+        """Textures as they were of which there is a product now: others may name them."""
 
     def times(self, e: Element, factor: Sequence[float]) -> Element | None:
         """A copy of a colour, a texture or a reference to one, times a factor (3); None if there is no way."""
         e = deepcopy(e)
+        if e.get("id") is not None and e.tag == "texture":
+            self.kept.append(old.renamed(deepcopy(e), None))
+            del e.attrib["id"]
         if e.tag in _COLORS:
             return _color_times(old.as_rgb(e), factor)
         if e.tag == "ref":

@@ -32,7 +32,6 @@ class Upgrade:
         self._version = tuple(map(int, changes.version.split(".")))
         self._alias: dict[str, str] = {}  # id of an object that went -> id of the one in its place
         self._gone: set[str] = set()
-        self._kept: list[Element] = []  # what others may name, though it went from its place
         self._factors = Factors(Element("scene"))
 
     def scene(self, root: Element) -> Element:
@@ -40,11 +39,10 @@ class Upgrade:
         self._names(root)
         self._factors = Factors(root)
         self._children(root)
-        while self._kept:
-            kept = self._element(self._kept.pop())
-            if kept is not None:
-                root.append(kept)
-                self._children(kept)
+        for kept in self._factors.kept:  # they may become more on the way
+            if all(element.get("id") != kept.get("id") or element.tag == "ref" for element in root.iter()):
+                root.append(self._texture(kept))
+                self._children(root[-1])
         root.set("version", "3.0.0")
         present = {element.get("id") for element in root.iter() if element.tag != "ref"}
         for parent in root.iter():
@@ -225,9 +223,6 @@ class Upgrade:
         if product is None:
             self._dropped[f"factor {old.joined(sorted(set(factor)))} of a scaled texture"] += 1
             product = inner
-        elif inner.get("id") is not None and inner.tag == "texture":
-            self._kept.append(old.renamed(inner, None))  # others may name it
-            del product.attrib["id"]
         return self._stand_in(e, self._texture(product) if product.tag == "texture" else product)
 
     def _bsdf(self, e: Element) -> Element:
