@@ -175,3 +175,14 @@ def test_a_mixture_of_more_than_all_of_each(tmp_path: Path, keeps: str) -> None:
     found = [albedo(scene.shapes()[0].bsdf(), 0.7, k) for k in (mi.BSDFFlags.Diffuse, mi.BSDFFlags.Delta)]
     expected = np.array([[0.8, 0.4, 0.2], 3 * [0.1]]) * (0.5 if keeps == "true" else 1)
     np.testing.assert_allclose(found, expected, rtol=0.03)
+
+
+@pytest.mark.parametrize("version", ["0.6.0", "3.0.0"])
+def test_blends_of_metal_are_black_from_behind_and_not_nan(tmp_path: Path, version: str) -> None:
+    """NaN there would spread in baked light, over all that sees it."""
+    blend = '<bsdf type="blendbsdf"><float name="weight" value="0.5"/><bsdf type="diffuse"/>{}</bsdf>'
+    blend = blend.format('<bsdf type="roughconductor"/>')
+    bsdf = '<bsdf type="phong"/>' if version < "3" else blend
+    scene = loaded(tmp_path, f'<shape type="rectangle">{bsdf}</shape>', version=version)
+    assert (albedo(scene.shapes()[0].bsdf(), -0.7) == 0).all()
+    assert (albedo(scene.shapes()[0].bsdf(), 0.7) > 0.3).all()

@@ -21,7 +21,7 @@ def flatten(mi: Any, state: Any) -> None:
     each belongs to one shape. Groups may hold instances of other groups. Groups that nobody instances vanish.
     """
     # The root is fetched anew each time: the list of nodes moves as it grows.
-    before = _children(mi, state.nodes[0].props)
+    before = children(mi, state.nodes[0].props)
     after: list[tuple[str, int]] = []
     for key, index in before:
         plugin = _shape_plugin(mi, state.nodes[index])
@@ -58,7 +58,7 @@ def turn_mirrored(mi: Any, scene: Any) -> Any:
     return rebuilt(mi, scene) if turned else scene
 
 
-def _children(mi: Any, props: Any) -> list[tuple[str, int]]:
+def children(mi: Any, props: Any) -> list[tuple[str, int]]:
     """Names and node numbers of the objects that a node holds, in their order."""
     kind = mi.Properties.Type.ResolvedReference
     return [(key, props[key].index()) for key in list(props.keys()) if props.type(key) == kind]
@@ -73,10 +73,10 @@ def _copies(mi: Any, state: Any, instance: int, pose: Any) -> list[int]:
     props = state.nodes[instance].props
     pose = pose @ pose_of(props)
     made: list[int] = []
-    for _, group in _children(mi, props):
+    for _, group in children(mi, props):
         if _shape_plugin(mi, state.nodes[group]) != "shapegroup":
             continue
-        for _, index in _children(mi, state.nodes[group].props):
+        for _, index in children(mi, state.nodes[group].props):
             plugin = _shape_plugin(mi, state.nodes[index])
             if plugin == "instance":
                 made += _copies(mi, state, index, pose)
@@ -93,7 +93,7 @@ def _copy(mi: Any, state: Any, index: int, pose: Any) -> int:
     if mirrored and plugin == "sphere":
         node.props["flip_normals"] = not node.props.get("flip_normals", False)
     node.props["to_world"] = mi.ScalarTransform4f(pose @ pose_of(node.props))
-    for key, child in _children(mi, node.props):
+    for key, child in children(mi, node.props):
         if state.nodes[child].type == mi.ObjectType.Emitter:
             state.nodes.append(mi.parser.SceneNode(state.nodes[child]))
             node.props[key] = mi.Properties.ResolvedReference(len(state.nodes) - 1)

@@ -20,7 +20,7 @@ from rsgen.errors import UserError
 from rsgen.inputs import MOST_BYTES, MOST_PIXELS, image_size
 from rsgen.render.file_names import mend_names
 from rsgen.render.scene_xml import old_xml
-from rsgen.render.scene_xml.instances import flatten
+from rsgen.render.scene_xml.instances import children, flatten
 from rsgen.render.scene_xml.old_changes import Changes
 from rsgen.render.scene_xml.old_plugins import Exists
 
@@ -86,6 +86,7 @@ def prepare(mi: Any, config: Any, state: Any, path: Path) -> None:
     mi.parser.transform_upgrade(config, state)
     mi.parser.transform_resolve(config, state)
     flatten(mi, state)
+    _sample_blends_from_behind(mi, state)
     for node in state.nodes:
         props = node.props
         if node.type == mi.ObjectType.Shape and "to_world" in props:
@@ -97,6 +98,25 @@ def prepare(mi: Any, config: Any, state: Any, path: Path) -> None:
                     f"scene {path}: to_world of shape '{what}' squashes it flat or is not finite: "
                     "scale no axis by 0, and mend its numbers"
                 )
+
+
+def _sample_blends_from_behind(mi: Any, state: Any) -> None:
+    """Have rough metals in a `blendbsdf` that is not `twosided` sample all their microfacets, not the visible alone.
+
+    Seen from behind, Mitsuba 3.9 samples the visible ones of Beckmann's to NaN, which a blend passes on to all light.
+    """
+
+    def below(index: int) -> set[int]:
+        inner = [child for _, child in children(mi, state.nodes[index].props)]
+        return set(inner).union(*(below(child) for child in inner))
+
+    plugins = [node.props.plugin_name() for node in state.nodes]
+    two_sided = set().union(*(below(k) for k, plugin in enumerate(plugins) if plugin == "twosided"))
+    for blend in (k for k, plugin in enumerate(plugins) if plugin == "blendbsdf" and k not in two_sided):
+        for metal in (k for k in below(blend) if plugins[k] == "roughconductor"):
+            props = state.nodes[metal].props
+            if str(props.get("distribution", "beckmann")) == "beckmann":
+                props["sample_visible"] = False
 
 
 def check_files(mi: Any, state: Any, path: Path) -> None:
