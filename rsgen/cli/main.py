@@ -180,11 +180,11 @@ def stats(
 
 
 def suggest(
-    scene: Annotated[Path, "Mitsuba scene .xml, or a mesh file; metres, y up"],
+    scene: Annotated[Path, "Mitsuba scene .xml, or a mesh file; metres, y up, or see --scale, --up"],
     *,
     out: Annotated[Path | None, "config to write (default: print it)", "YAML"] = None,
-    scale: Annotated[float, "metres per unit of a mesh file (default: 1)", float] = 1.0,
-    up: Annotated[Up, "axis of a mesh file that is up (default: y)"] = "y",
+    scale: Annotated[float, "metres per unit of the file: 0.01 for one in centimetres (default: 1)", float] = 1.0,
+    up: Annotated[Up, "axis of the file that is up (default: y)"] = "y",
     seconds: Annotated[float | None, "length of the sequence, s (default: 20, or as --like)", float] = None,
     speed: Annotated[float | None, "mean speed, m/s (default: 0.35, or as --like)", float] = None,
     like: Annotated[

@@ -63,18 +63,16 @@ class SceneConfig(Section):
     """What the camera sees."""
 
     file: Path = Field(description="Mitsuba 3 scene .xml, or a mesh file that trimesh reads (light added)")
-    scale: Annotated[float, limits(1e-9, 1e9, "m")] = Field(default=1.0, description="metres per unit of a mesh file")
-    up: Up = Field(default="y", description="axis of a mesh file that is up, the world's y")
+    scale: Annotated[float, limits(1e-9, 1e9, "m")] = Field(default=1.0, description="metres per unit of the file")
+    up: Up = Field(default="y", description="axis of the file that is up, the world's y")
     light: SceneLight = Field(
         default="auto", description="light of a mesh file; auto: lamps under a room's ceiling, a sky around objects"
     )
 
     @model_validator(mode="after")
-    def _is_a_mesh_if_placed(self) -> SceneConfig:
-        if self.file.suffix.lower() == ".xml":
-            for name in ("scale", "up", "light"):
-                if getattr(self, name) != type(self).model_fields[name].default:
-                    raise ValueError(f"{name}: is for mesh files: a Mitsuba scene says that itself")
+    def _is_a_mesh_if_lit(self) -> SceneConfig:
+        if self.file.suffix.lower() == ".xml" and self.light != "auto":
+            raise ValueError("light: is for mesh files: a Mitsuba scene says that itself")
         return self
 
 

@@ -31,6 +31,7 @@ from rsgen.produce.exposure import suggested_gain
 from rsgen.produce.generate import scene_triangles
 from rsgen.produce.ground_truth import load_motion
 from rsgen.produce.tour import REACH_M, Tour, motion_text, room_text, thing_text, view_times
+from rsgen.produce.units import doubt, likely_unit
 
 _STOREYS = 6  # floors that are looked at, the largest first
 _LARGE = 0.3  # of the scene's ground, what walls enclose where the scene is a room
@@ -39,8 +40,7 @@ _CALM = (0.08, 0.2, 1.0, 4.0)
 _BRISK_DEG_S = 35.0  # mean rotational speed of hand-held recordings: 15 to 40
 _SWAY_SHARE, _SWAY_DEG_S = 1.08, 1.5  # what the slow turning adds to that of the tour
 _SWAY_DEG = 20.0  # it turns to either side by so much at most where more is to be added: it is made faster instead
-_ROOM_M, _SMALLEST_M, _FARTHEST_M = 2.5, 0.001, 9000.0
-_UNITS = {"centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254}
+_SMALLEST_M, _FARTHEST_M = 0.001, 9000.0
 _SKIN = 0.01  # of a scene's size: what lies so flat is its ground
 _SLACK_M = 0.04
 _HAND: dict[str, Any] = {
@@ -110,7 +110,7 @@ class Suggestion:
 @dataclass(frozen=True, eq=False)
 class _Scene:
     """A scene file's triangles (m, 3, 3), world, m, and rays into it. fineness (m,): how finely light is baked on each,
-    of what is asked. placed: fields of its config but the file.
+    of what is asked. placed: fields of its config but the file. hint: what may be the matter where no tour is found.
     """
 
     file: Path
@@ -118,6 +118,7 @@ class _Scene:
     fineness: FloatArray
     cast: Cast
     placed: Mapping[str, Any]
+    hint: str = ""
 
     @property
     def box(self) -> tuple[FloatArray, FloatArray]:
@@ -126,7 +127,7 @@ class _Scene:
 
     def wrong(self, what: str) -> UserError:
         """An error of one line that names the file."""
-        return UserError(f"scene {self.file}: {what}")
+        return UserError(f"scene {self.file}: {what}" + (f" ({self.hint})" if self.hint else ""))
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +144,7 @@ def suggest_tour(
 ) -> Suggestion:
     """A tour through the scene `file`: through its largest room, or round the thing that it holds.
 
-    name: of the sequence; None: after the file. scale, up: of a mesh file, see `MeshOptions`. like: whose cameras,
+    name: of the sequence; None: after the file. scale, up: see `MeshOptions`. like: whose cameras,
     noise and truth it is to have; None: the defaults. Raises UserError naming the file if there is no place for a
     camera, no floor, or no scene, and if it is a room in another unit than metres.
     """
@@ -152,14 +153,17 @@ def suggest_tour(
     from rsgen.render.mesh_files.mesh_file import AS_IT_IS, MeshOptions
     from rsgen.render.rays import cast_rays
     from rsgen.render.scene import load_scene
+    from rsgen.render.scene_xml.camera_up import camera_up
 
     placed = {key: value for key, value in (("scale", scale), ("up", up)) if value != getattr(AS_IT_IS, key)}
-    if placed and file.suffix.lower() == ".xml":
-        raise UserError(f"--{next(iter(placed))}: is for mesh files: a Mitsuba scene says that itself")
+    if not 1e-9 <= scale <= 1e9:  # as scene.scale
+        raise UserError(f"--scale {scale:g}: must lie in 1e-09 to 1e+09")
     loaded = load_scene(file, options=MeshOptions(scale, up))
     triangles = scene_triangles(loaded)
     fineness = 1.0 / coarser(triangles, inhabited([shape for shape in loaded.shapes() if shape.is_mesh()]))
-    scene = _Scene(file, triangles, fineness, partial(cast_rays, loaded), placed)
+    own = camera_up(file) if file.suffix.lower() == ".xml" else None
+    hint = "" if own in (None, up) else f"its own camera has {own} up: --up {own}"
+    scene = _Scene(file, triangles, fineness, partial(cast_rays, loaded), placed, hint)
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", file.stem) if name is None else name
     aim = _room(scene, wish.clearance_m) or _thing(scene)
     if (farthest := float(np.abs(scene.triangles).max())) > _FARTHEST_M:
@@ -181,8 +185,11 @@ def suggest_tour(
     if best is None:
         raise scene.wrong(f"no tour found that keeps {wish.clearance_m:g} m from all surfaces: reduce --clearance")
     where = room_text(aim, wish.clearance_m) if isinstance(aim, FloorPlan) else thing_text(aim.high - aim.low)
+    if isinstance(aim, FloorPlan):
+        where += doubt(aim.floor.gap_m, scale)
     config, how = _exposed(loaded, best.config, best.spline)
-    return Suggestion(config, (f"{file.name}: {where}", *motion_text(best, wish.rotation_deg_s), *how))
+    found = (f"{file.name}: {where}", *((hint,) if hint else ()), *motion_text(best, wish.rotation_deg_s), *how)
+    return Suggestion(config, found)
 
 
 def _room(scene: _Scene, clearance_m: float) -> FloorPlan | None:
@@ -198,14 +205,14 @@ def _room(scene: _Scene, clearance_m: float) -> FloorPlan | None:
             best, most = plan, free
     if best is None:
         if share_without_floor(scene.cast, low, high) >= _LARGE:
-            raise scene.wrong("walls but no floor below them: add a floor, or have y up (a mesh file takes --up z)")
+            raise scene.wrong("walls but no floor below them: add a floor, or say which axis is up (--up z)")
         return None
     height = float(high[1] - low[1])
     if height > HIGHEST_M:
-        unit, scale = min(_UNITS.items(), key=lambda u: abs(math.log(u[1] * height / _ROOM_M)))
+        unit, scale = likely_unit(height)
+        scale *= scene.placed.get("scale", 1.0)
         raise scene.wrong(
-            f"a room of {height:.0f} from bottom to top is one in {unit}, but scenes are in metres: a mesh file takes "
-            f"--scale {scale:g}, in a Mitsuba scene scale its shapes"
+            f"a room of {height:.0f} m from bottom to top is rather one in {unit}: --scale {scale:g}, or see --up"
         )
     if free_region(best, clearance_m) is not None:
         return best
@@ -299,6 +306,8 @@ def _config(scene: _Scene, tours: Sequence[tuple[Waypoint, ...]], name: str, wis
 def _exposed(loaded: Any, config: Config, spline: Spline) -> tuple[Config, tuple[str, ...]]:
     """The config with an exposure for the scene's light, where the one it has is far off, and what to say of it."""
     assert config.motion is not None
+    if not loaded.emitters():
+        return config, ("it has no light, and what it shows is black: add an emitter",)
     gain = suggested_gain(
         loaded, config.color.camera, spline.pose, config.motion.duration_s, config.color.exposure_gain
     )

@@ -58,7 +58,7 @@ def thing_text(size: FloatArray) -> str:
     text = "a thing of {:.2f} x {:.2f} x {:.2f} m, and a way round it".format(*size)
     if size.max() <= _LARGEST_THING_M:
         return text
-    return f"{text}; if that is too large, it may be in centimetres: a mesh file takes --scale 0.01"
+    return f"{text}; if that is too large, it may be in centimetres: --scale 0.01"
 
 
 def motion_text(tour: Tour, rotation_deg_s: float | None) -> list[str]:

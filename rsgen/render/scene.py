@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from rsgen.array_types import Float32Array
@@ -29,33 +28,39 @@ from rsgen.files import encode_png
 from rsgen.inputs import check_input
 from rsgen.render.board import Board, drawing
 from rsgen.render.board import surface as board_surface
+from rsgen.render.file_names import tell_renamed
 from rsgen.render.land import split_land
 from rsgen.render.mended import mend_meshes
 from rsgen.render.mesh_files.mesh_file import AS_IT_IS, MeshOptions, hash_into, mesh_scene
 from rsgen.render.ply import joined_triangles, ply_bytes
+from rsgen.render.scene_xml.analytic import ANALYTIC, tessellated
 from rsgen.render.scene_xml.instances import turn_mirrored
+from rsgen.render.scene_xml.obj_polygons import METHOD as OBJ_POLYGONS
+from rsgen.render.scene_xml.obj_polygons import with_triangles
+from rsgen.render.scene_xml.old_factors import multiply_images
 from rsgen.render.scene_xml.old_xml import METHOD as OLD_XML
 from rsgen.render.scene_xml.parsed import check_files, explained, messages_to_log, parse, prepare, unknown_properties
+from rsgen.render.scene_xml.placed import place, place_lamps
+from rsgen.render.scene_xml.refused import read_polygons, read_refused
 
 log = logging.getLogger("rsgen")
 
-_ANALYTIC = ("rectangle", "disk", "sphere", "cylinder")
+_BOARD = "rsgen_target"
 _UNSUPPORTED = ("sdfgrid", "bsplinecurve", "linearcurve", "ellipsoids", "ellipsoidsmesh")
-_SEGMENTS = 96
 
 
 def load_scene(path: Path, board: Board | None = None, options: MeshOptions = AS_IT_IS) -> Any:
     """Mitsuba scene of the file at `path`: .xml, or a mesh that trimesh reads, with its colours and a light of ours.
 
-    board: to be put into it, as its last shape. options: how a mesh file is placed and lit. Raises UserError, naming
-    the file, if it is missing, unreadable, empty or of shapes that cannot become triangles.
+    board: to be put into it, as its last shape. options: how the file is placed, and a mesh file lit. Raises
+    UserError, naming the file, if it is missing, unreadable, empty or of shapes that cannot become triangles.
     """
     ensure_built(path)
     mi = mitsuba()
     with tempfile.TemporaryDirectory(prefix="rsgen-scene-") as scratch, messages_to_log(mi) as messages:
         try:
             if path.suffix.lower() == ".xml":
-                scene = _load_xml(mi, path, Path(scratch), board, messages)
+                scene = _load_xml(mi, path, Path(scratch), board, messages, options)
             else:
                 shapes = mesh_scene(mi, path, Path(scratch), options)
                 if board is not None:
@@ -108,7 +113,7 @@ def mesh_arrays(shape: Any) -> tuple[Float32Array, NDArray[np.uint32]]:
 
 
 def content_hash(path: Path, options: MeshOptions = AS_IT_IS) -> str:
-    """SHA-256 over the scene file, every file that it includes or names (meshes, textures), and a mesh file's options.
+    """SHA-256 over the scene file, every file that it includes or names (meshes, textures), and the options.
 
     Raises UserError if one is missing or the scene file is malformed.
     """
@@ -123,13 +128,16 @@ def content_hash(path: Path, options: MeshOptions = AS_IT_IS) -> str:
         mi = mitsuba()
         with tempfile.TemporaryDirectory(prefix="rsgen-scene-") as scratch, messages_to_log(mi):
             try:
-                state, changes = parse(mi, mi.parser.ParserConfig(mi.variant()), path, Path(scratch))
+                parsed = parse(mi, mi.parser.ParserConfig(mi.variant()), path, Path(scratch))
             except UserError:
                 raise
             except Exception as error:
                 raise UserError(f"scene {path}: {_first_line(error)}") from None
+        state, changes = parsed.state, parsed.changes
         if changes is not None:
             digest.update(OLD_XML)
+        if options != AS_IT_IS:
+            digest.update(f"\0{options.scale!r} {options.up}".encode())
         for included in state.files[1:] if changes is None else changes.files:
             digest.update(hashlib.sha256(Path(str(included)).read_bytes()).digest())
         names = {str(n.props["filename"]) for n in state.nodes if "filename" in n.props.keys()}  # noqa: SIM118
@@ -137,20 +145,27 @@ def content_hash(path: Path, options: MeshOptions = AS_IT_IS) -> str:
             file = path.parent / name
             if not file.is_file():
                 raise UserError(f"scene {path}: file '{name}' that it names is missing")
-            digest.update(name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())
+            data = file.read_bytes()
+            digest.update(name.encode() + b"\0" + hashlib.sha256(data).digest())
+            if file.suffix.lower() == ".obj" and with_triangles(data) is not None:
+                digest.update(OBJ_POLYGONS)
     return digest.hexdigest()
 
 
-def _load_xml(mi: Any, path: Path, scratch: Path, board: Board | None, messages: list[str]) -> Any:
+def _load_xml(
+    mi: Any, path: Path, scratch: Path, board: Board | None, messages: list[str], options: MeshOptions
+) -> Any:
     config = mi.parser.ParserConfig(mi.variant())
     # Merging orders meshes by memory address: emitters and shapes would be numbered anew in each process.
     config.merge_meshes = False
-    state, changes = parse(mi, config, path, scratch, None if board is None else _board_xml(board, scratch))
+    parsed = parse(mi, config, path, scratch, None if board is None else _board_xml(board, scratch))
+    changes = parsed.changes
+    tell_renamed(path, parsed.renamed)
     resolver = mi.file_resolver()
     resolver.prepend(str(path.resolve().parent))
     try:
         with _threads_to_read_with():
-            scene = _instantiated(mi, config, state, path, scratch)
+            scene = _instantiated(mi, config, parsed.state, path, scratch, options)
     finally:
         del resolver[0]  # else the next scene would find what it lacks, an include say, in this one's folder
     if changes is not None:
@@ -174,102 +189,39 @@ def _threads_to_read_with() -> Iterator[None]:
             dr.set_thread_count(before)
 
 
-def _instantiated(mi: Any, config: Any, state: Any, path: Path, scratch: Path) -> Any:
+def _instantiated(mi: Any, config: Any, state: Any, path: Path, scratch: Path, options: MeshOptions) -> Any:
     prepare(mi, config, state, path)
+    if options != AS_IT_IS:
+        place(mi, state, path, options, _BOARD)
     for index, node in enumerate(state.nodes):
         if node.type != mi.ObjectType.Shape:
             continue
         plugin = node.props.plugin_name()
         if plugin in _UNSUPPORTED:
             raise UserError(f"scene {path}: shape '{plugin}' cannot become triangles: export it as a mesh (.ply, .obj)")
-        if plugin in _ANALYTIC:
-            node.props = _tessellated(mi, node.props, scratch / f"{index}.ply")
+        if plugin in ANALYTIC:
+            node.props = tessellated(mi, node.props, scratch / f"{index}.ply")
     check_files(mi, state, path)
+    read_polygons(mi, state, scratch)
+    multiply_images(mi, state)
     mi.parser.transform_all(config, state)
+    untouched = mi.parser.ParserState(state)  # objects made of it, also by an attempt that fails, stay in the other
     try:
-        scene = mi.parser.instantiate(config, state)
-    except Exception as error:  # of whatever kind Mitsuba's plugins raise
-        raise UserError(f"scene {path}: {explained(mi, state, str(error))}") from None
+        scene = _made(mi, config, state, path)
+    except UserError:
+        if not read_refused(mi, untouched, path, scratch):
+            raise
+        scene = _made(mi, config, untouched, path)
     scene = scene[0] if isinstance(scene, (list, tuple)) else scene
+    place_lamps(mi, scene, options.scale)
     return turn_mirrored(mi, scene)
 
 
-def _tessellated(mi: Any, props: Any, file: Path) -> Any:
-    """Properties of a `ply` shape that stands for an analytic one: same id, BSDF and emitter, triangles in `file`."""
-    to_world = np.asarray(props["to_world"].matrix, float).reshape(4, 4) if "to_world" in props else np.eye(4)
-    plugin = props.plugin_name()
-    if plugin in ("sphere", "cylinder"):
-        radius = float(props.get("radius", 1.0))
-        local = np.diag([radius, radius, radius, 1.0])
-        if plugin == "sphere":
-            local[:3, 3] = np.asarray(props.get("center", [0, 0, 0]), float).ravel()
-        else:
-            p0, p1 = (np.asarray(props.get(k, d), float).ravel() for k, d in (("p0", [0, 0, 0]), ("p1", [0, 0, 1])))
-            local[:3, :3] = trimesh.geometry.align_vectors([0, 0, 1], p1 - p0)[:3, :3] @ np.diag(
-                [radius, radius, float(np.linalg.norm(p1 - p0))]
-            )
-            local[:3, 3] = p0
-        to_world = to_world @ local
-    uv_grid = {
-        "rectangle": (1, 1),
-        "disk": (8, _SEGMENTS),
-        "sphere": (_SEGMENTS // 2, _SEGMENTS),
-        "cylinder": (1, _SEGMENTS),
-    }
-    position, normal, uv, faces = _parametric(plugin, *uv_grid[plugin])
-    normal_matrix = np.linalg.inv(to_world[:3, :3]).T
-    mirrored = np.linalg.det(to_world[:3, :3]) < 0
-    # As Mitsuba does: mirroring turns its spheres inside out, the other shapes not.
-    turned = bool(props.get("flip_normals", False)) != (mirrored and plugin == "sphere")
-    flip = -1.0 if turned else 1.0
-    normal = flip * normal @ normal_matrix.T
-    if mirrored != turned:
-        faces = faces[:, ::-1]
-    file.write_bytes(ply_bytes(position @ to_world[:3, :3].T + to_world[:3, 3], faces, normal, uv))
-    out = mi.Properties("ply")
-    out.set_id(props.id())
-    out["filename"] = str(file)
-    for key in props.keys():  # noqa: SIM118 (Mitsuba's Properties is no dict)
-        if key not in ("to_world", "center", "radius", "p0", "p1", "flip_normals"):
-            out[key] = props[key]
-    return out
-
-
-def _parametric(plugin: str, nu: int, nv: int) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Vertices, unit normals, texture coordinates and faces of Mitsuba's unit shapes on a (nu + 1) x (nv + 1) grid."""
-    grid = np.meshgrid(np.linspace(0, 1, nu + 1), np.linspace(0, 1, nv + 1), indexing="ij")
-    a, b = (axis.ravel() for axis in grid)
-    phi = 2 * np.pi * b
-    zero, one = np.zeros_like(a), np.ones_like(a)
-    if plugin == "rectangle":
-        position, normal, uv = (
-            np.stack([2 * a - 1, 2 * b - 1, zero], -1),
-            np.stack([zero, zero, one], -1),
-            np.stack([a, b], -1),
-        )
-    elif plugin == "disk":
-        position, normal = np.stack([a * np.cos(phi), a * np.sin(phi), zero], -1), np.stack([zero, zero, one], -1)
-        uv = np.stack([a, b], -1)
-    elif plugin == "sphere":
-        theta = np.pi * a
-        position = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
-        normal, uv = position, np.stack([b, a], -1)
-    else:  # cylinder
-        normal = np.stack([np.cos(phi), np.sin(phi), zero], -1)
-        position, uv = normal + np.stack([zero, zero, a], -1), np.stack([b, a], -1)
-    i, j = (k.ravel() for k in np.meshgrid(np.arange(nu), np.arange(nv), indexing="ij"))
-    p = i * (nv + 1) + j
-    q = p + nv + 1
-    faces = np.concatenate([np.stack([p, q, q + 1], -1), np.stack([p, q + 1, p + 1], -1)])
-    corners = position[faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
-    faces = faces[area > 1e-12]  # the poles' and the disk centre's degenerate halves
-    corners = position[faces]
-    outward = np.einsum(
-        "ij,ij->i", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), normal[faces].sum(1)
-    )
-    faces[outward < 0] = faces[outward < 0][:, ::-1]
-    return position, normal, uv, faces
+def _made(mi: Any, config: Any, state: Any, path: Path) -> Any:
+    try:
+        return mi.parser.instantiate(config, state)
+    except Exception as error:  # of whatever kind Mitsuba's plugins raise
+        raise UserError(f"scene {path}: {explained(mi, state, str(error))}") from None
 
 
 def _board_xml(board: Board, folder: Path) -> str:
@@ -277,7 +229,7 @@ def _board_xml(board: Board, folder: Path) -> str:
     (folder / "board.ply").write_bytes(ply_bytes(*board_surface(board)))
     (folder / "board.png").write_bytes(encode_png(np.repeat(drawing(board.grid)[..., None], 3, axis=2)))
     return f"""\
-<shape version="3.0.0" type="ply" id="rsgen_target">
+<shape version="3.0.0" type="ply" id="{_BOARD}">
   <string name="filename" value="{folder / "board.ply"}"/>
   <bsdf type="twosided">
     <bsdf type="diffuse">

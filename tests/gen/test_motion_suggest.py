@@ -24,6 +24,7 @@ from rsgen.motion.gaze import seen_from
 from rsgen.motion.statistics import motion_statistics
 from rsgen.produce.ground_truth import Motion, load_motion
 from rsgen.produce.suggest import Suggestion, Wish, suggest_tour
+from rsgen.produce.units import doubt, likely_unit
 from rsgen.render.rays import cast_rays
 from rsgen.render.scene import load_scene
 from rsgen.sequence.trajectory import Trajectory
@@ -336,13 +337,27 @@ def test_a_room_in_centimetres_with_z_up_is_the_room(tmp_path: Path) -> None:
     expected = tour(tmp_path / "it.ply", Wish(4.0))
     mesh = scaled(furnished(), 100.0)
     mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
-    mesh.export(tmp_path / "it.ply")
-    found = tour(tmp_path / "it.ply", Wish(4.0), scale=0.01, up="z")
-    assert found.found[0] == expected.found[0]
+    mesh.export(tmp_path / "turned.ply")
+    pose = '<transform name="to_world"><lookat origin="0,0,0" target="0,1,0" up="0,0,1"/></transform>'
+    camera = f'<sensor type="perspective">{pose}</sensor>'
+    shape = '<shape type="ply"><string name="filename" value="turned.ply"/></shape>'
+    (tmp_path / "it.xml").write_text(f'<scene version="3.0.0">{camera}{shape}</scene>')
+    found = tour(tmp_path / "it.xml", Wish(4.0), scale=0.01, up="z")
+    assert found.found[0] == expected.found[0].replace("it.ply", "it.xml") and "too high" not in found.found[0]
+    assert "own camera" not in "".join(found.found) and "it has no light" in found.found[-1]
     assert b"scale: 0.01" in found.yaml(tmp_path) and b"up: z" in found.yaml(tmp_path)
     assert b"scale" not in expected.yaml(tmp_path) and b"up: y" not in expected.yaml(tmp_path)
-    with pytest.raises(UserError, match="--scale: is for mesh files"):
-        suggest_tour(tmp_path / "it.xml", None, Wish(), scale=0.01)
+    with pytest.raises(
+        UserError, match=r"rather one in centimetres: --scale 0\.01.*\(its own camera has z up: --up z\)"
+    ):
+        suggest_tour(tmp_path / "it.xml", None, Wish(4.0))
+
+
+def test_the_unit_is_that_in_which_it_is_as_high_as_rooms_are() -> None:
+    heights = {240.0: 0.01, 844.0: 0.01, 2500.0: 0.001, 96.0: 0.0254, 6000.0: 0.001, 110.0: 0.0254}
+    assert {height: likely_unit(height)[1] for height in heights} == heights
+    assert doubt(7.8, 0.03) == "; if that is too high, --scale 0.0096 makes it 2.5 m"
+    assert doubt(2.6, 1.0) == doubt(math.inf, 1.0) == ""
 
 
 def test_a_scene_without_surfaces(tmp_path: Path) -> None:
@@ -351,7 +366,9 @@ def test_a_scene_without_surfaces(tmp_path: Path) -> None:
         suggest_tour(tmp_path / "empty.xml", None, Wish())
 
 
-@pytest.mark.parametrize("words", ["--seconds 1", "--speed 0", "--clearance -1", "--seed -1", "--name a/b"])
+@pytest.mark.parametrize(
+    "words", ["--seconds 1", "--scale 0", "--scale nan", "--speed 0", "--clearance -1", "--seed -1", "--name a/b"]
+)
 def test_wishes_out_of_bounds(folder: Path, words: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["motion", "suggest", str(folder / "furnished.ply"), *words.split()]) == 2
     error = capsys.readouterr().err

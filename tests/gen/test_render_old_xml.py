@@ -17,7 +17,7 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.images import ColorRenderer
 from rsgen.render.scene import content_hash, load_scene
-from rsgen.render.scene_xml.old_plugins import Changes
+from rsgen.render.scene_xml.old_changes import Changes
 from rsgen.render.scene_xml.old_xml import old_version, upgrade
 from rsgen.render.scene_xml.parsed import plugin_finder
 
@@ -62,7 +62,10 @@ SURFACES = {
     ),
     "phong": (
         '<bsdf type="phong"><rgb name="diffuseReflectance" value="0.6 0.1 0.2"/></bsdf>',
-        '<bsdf type="diffuse"><rgb name="reflectance" value="0.6, 0.1, 0.2"/></bsdf>',
+        '<bsdf type="blendbsdf"><float name="weight" value="0.25"/><bsdf type="diffuse">'
+        '<rgb name="reflectance" value="0.8, 0.1333333, 0.2666667"/></bsdf><bsdf type="roughconductor">'
+        '<string name="material" value="none"/><float name="alpha" value="0.125"/>'
+        '<rgb name="specular_reflectance" value="0.8"/></bsdf></bsdf>',
     ),
     "coating": (
         '<bsdf type="coating"><float name="intIOR" value="1.7"/><bsdf type="diffuse">'
@@ -257,12 +260,12 @@ def test_textures_without_counterpart(tmp_path: Path) -> None:
         <bsdf type="normalmap"><texture type="bitmap"/><bsdf type="diffuse"/></bsdf>""",
     )
     assert '<texture type="srgb" id="wire"><rgb value="0.1" name="color" /></texture>' in xml
-    assert 'value="a/b.png"' in xml and '<ref name="reflectance" id="image"' in xml
-    assert xml.count('name="raw" value="true"') == 2 and 'type="bitmap" name="normalmap"' in xml
-    assert changes.dropped == {"factor 0.5 of a scaled texture": 1, "alpha texture of roughplastic": 1}
+    assert 'value="a/b.png"' in xml and '<ref name="reflectance" id="scaled"' in xml
+    assert xml.count('name="raw" value="true"') == 3 and 'type="bitmap" name="normalmap"' in xml
+    assert changes.dropped == {"alpha texture of roughplastic": 1}
     assert changes.replaced == {
         "texture wireframe by one colour": 1,
-        "wrap mode zero by clamp": 1,
+        "wrap mode zero by clamp": 2,
         "distribution as by beckmann": 1,
     }
 

@@ -23,6 +23,7 @@ from rsgen.config.sections import SceneLight, Up
 from rsgen.errors import UserError
 from rsgen.inputs import check_input
 from rsgen.limits import MOST_M
+from rsgen.render.file_names import located
 from rsgen.render.mesh_files import gltf
 from rsgen.render.mesh_files.cutout import Mask, cut_away
 from rsgen.render.mesh_files.default_light import SKY, Probe
@@ -48,9 +49,9 @@ _UP = {
 
 @dataclass(frozen=True)
 class MeshOptions:
-    """How a mesh file becomes a scene: metres per unit of the file, which of its axes is up, what lights it.
+    """How a file becomes a scene: metres per unit of the file, which of its axes is up, what lights it.
 
-    light: see `rsgen.render.mesh_files.default_light`.
+    light: of a mesh file, see `rsgen.render.mesh_files.default_light`.
     """
 
     scale: float = 1.0
@@ -196,8 +197,8 @@ def _named(text: bytes, keyword: bytes) -> list[str]:
 
 
 def _beside(path: Path, name: str) -> Path:
-    file = path.parent / name.replace("\\", "/")
-    if not file.is_file():
+    file = located(path.parent, name)
+    if file is None or not file.is_file():
         raise UserError(f"scene {path}: file '{name}' that it names is missing: put it there, or take its name out")
     check_input(file)
     return file

@@ -69,12 +69,12 @@ class Looks:
         vertices, faces = np.array(mesh.vertices, float), np.array(mesh.faces, np.int64)
         if faces.min() < 0 or faces.max() >= len(vertices):
             raise UserError(f"scene {self._path}: '{name}' has faces without vertices: export it again")
-        part, visual = Part(vertices, faces, _GREY, _given_normals(mesh)), mesh.visual
+        part, visual = Part(vertices, faces, _GREY, given_normals(mesh)), mesh.visual
         if not isinstance(visual, trimesh.visual.TextureVisuals):
             if visual.kind == "vertex":
-                return replace(part, material=_WHITE, vertex_colors=_from_srgb(visual.vertex_colors))
+                return replace(part, material=_WHITE, vertex_colors=from_srgb(visual.vertex_colors))
             if visual.kind == "face":
-                return replace(part, material=_WHITE, face_colors=_from_srgb(visual.face_colors))
+                return replace(part, material=_WHITE, face_colors=from_srgb(visual.face_colors))
             return part
         if visual.uv is not None and len(visual.uv) == len(vertices):
             # trimesh's v runs up. Mitsuba's runs down, as glTF's does.
@@ -181,7 +181,7 @@ class Looks:
             log.warning("scene %s: rendered without %s", self._path, ", ".join(left))
 
 
-def _given_normals(mesh: Any) -> FloatArray | None:
+def given_normals(mesh: Any) -> FloatArray | None:
     """The file's own vertex normals; trimesh would make some up, smooth over every edge."""
     if "vertex_normals" not in mesh._cache.cache:
         return None
@@ -191,6 +191,6 @@ def _given_normals(mesh: Any) -> FloatArray | None:
     return normals / length if usable else None
 
 
-def _from_srgb(colors: Any) -> FloatArray:
+def from_srgb(colors: Any) -> FloatArray:
     """Linear colours (n, 3) of trimesh's, bytes in sRGB as PLY and OBJ have them by custom."""
     return srgb.decode(np.array(colors, float)[:, :3] / 255)

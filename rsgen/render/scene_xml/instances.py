@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from rsgen.array_types import FloatArray
 from rsgen.device.arrays import aligned
 from rsgen.render.mended import rebuilt
 
@@ -20,7 +21,7 @@ def flatten(mi: Any, state: Any) -> None:
     each belongs to one shape. Groups may hold instances of other groups. Groups that nobody instances vanish.
     """
     # The root is fetched anew each time: the list of nodes moves as it grows.
-    before = _children(mi, state.nodes[0].props)
+    before = children(mi, state.nodes[0].props)
     after: list[tuple[str, int]] = []
     for key, index in before:
         plugin = _shape_plugin(mi, state.nodes[index])
@@ -57,7 +58,7 @@ def turn_mirrored(mi: Any, scene: Any) -> Any:
     return rebuilt(mi, scene) if turned else scene
 
 
-def _children(mi: Any, props: Any) -> list[tuple[str, int]]:
+def children(mi: Any, props: Any) -> list[tuple[str, int]]:
     """Names and node numbers of the objects that a node holds, in their order."""
     kind = mi.Properties.Type.ResolvedReference
     return [(key, props[key].index()) for key in list(props.keys()) if props.type(key) == kind]
@@ -70,12 +71,12 @@ def _shape_plugin(mi: Any, node: Any) -> str | None:
 def _copies(mi: Any, state: Any, instance: int, pose: Any) -> list[int]:
     """Numbers of new nodes: the shapes of an instance's group at `pose` (4, 4) times the instance's own."""
     props = state.nodes[instance].props
-    pose = pose @ _to_world(props)
+    pose = pose @ pose_of(props)
     made: list[int] = []
-    for _, group in _children(mi, props):
+    for _, group in children(mi, props):
         if _shape_plugin(mi, state.nodes[group]) != "shapegroup":
             continue
-        for _, index in _children(mi, state.nodes[group].props):
+        for _, index in children(mi, state.nodes[group].props):
             plugin = _shape_plugin(mi, state.nodes[index])
             if plugin == "instance":
                 made += _copies(mi, state, index, pose)
@@ -91,8 +92,8 @@ def _copy(mi: Any, state: Any, index: int, pose: Any) -> int:
     node.props.set_id(f"{_MIRRORED}{len(state.nodes)}" if mirrored and plugin in _MESHES else "")  # ids are unique
     if mirrored and plugin == "sphere":
         node.props["flip_normals"] = not node.props.get("flip_normals", False)
-    node.props["to_world"] = mi.ScalarTransform4f(pose @ _to_world(node.props))
-    for key, child in _children(mi, node.props):
+    node.props["to_world"] = mi.ScalarTransform4f(pose @ pose_of(node.props))
+    for key, child in children(mi, node.props):
         if state.nodes[child].type == mi.ObjectType.Emitter:
             state.nodes.append(mi.parser.SceneNode(state.nodes[child]))
             node.props[key] = mi.Properties.ResolvedReference(len(state.nodes) - 1)
@@ -100,5 +101,6 @@ def _copy(mi: Any, state: Any, index: int, pose: Any) -> int:
     return len(state.nodes) - 1
 
 
-def _to_world(props: Any) -> Any:
+def pose_of(props: Any) -> FloatArray:
+    """`to_world` (4, 4) of an object's properties; the identity if they say none."""
     return np.asarray(props["to_world"].matrix, float).reshape(4, 4) if "to_world" in props else np.eye(4)

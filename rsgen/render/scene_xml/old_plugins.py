@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement
 
+from rsgen.render.scene_xml import old_lobes
 from rsgen.render.scene_xml import old_values as old
+from rsgen.render.scene_xml.old_changes import Changes
+from rsgen.render.scene_xml.old_factors import Factors
 
 _OBJECTS = ("scene", "shape", "bsdf", "texture", "emitter")
 _VALUES = ("float", "integer", "boolean", "string", "point", "vector", "rgb", "spectrum", "transform", "ref", "alias")
@@ -23,28 +23,6 @@ Exists = Callable[[str, str], bool]
 """Whether Mitsuba 3 has a plugin: its kind, as a tag ("shape", "bsdf", "texture", "emitter"), and its name."""
 
 
-@dataclass
-class Changes:
-    """What an upgrade dropped and replaced, with counts; what rsgen never uses; and the files that it included."""
-
-    version: str
-    dropped: Counter[str] = field(default_factory=Counter)
-    replaced: Counter[str] = field(default_factory=Counter)
-    not_used: Counter[str] = field(default_factory=Counter)
-    files: list[Path] = field(default_factory=list)
-
-    def summary(self) -> str:
-        """'upgraded from Mitsuba 0.6; dropped: ...; replaced: ...; not used: ...', counted."""
-        lists = {"dropped": self.dropped, "replaced": self.replaced, "not used": self.not_used}
-        said = [f"{word}: {_listed(counts)}" for word, counts in lists.items() if counts]
-        return "; ".join([f"upgraded from Mitsuba {self.version}", *said])
-
-    @property
-    def lossy(self) -> bool:
-        """Whether images show the difference."""
-        return bool(self.dropped or self.replaced)
-
-
 class Upgrade:
     """One walk over a tree, parents before children, since some plugins take their children apart."""
 
@@ -54,11 +32,17 @@ class Upgrade:
         self._version = tuple(map(int, changes.version.split(".")))
         self._alias: dict[str, str] = {}  # id of an object that went -> id of the one in its place
         self._gone: set[str] = set()
+        self._factors = Factors(Element("scene"))
 
     def scene(self, root: Element) -> Element:
         """The tree, changed in place."""
         self._names(root)
+        self._factors = Factors(root)
         self._children(root)
+        for kept in self._factors.kept:  # they may become more on the way
+            if all(element.get("id") != kept.get("id") or element.tag == "ref" for element in root.iter()):
+                root.append(self._texture(kept))
+                self._children(root[-1])
         root.set("version", "3.0.0")
         present = {element.get("id") for element in root.iter() if element.tag != "ref"}
         for parent in root.iter():
@@ -102,9 +86,18 @@ class Upgrade:
                 self._leave_out(child)
                 continue
             kept.append(new)
+            if parent.tag == "bsdf" and new.tag == "rgb" and self._version < (2, 0):
+                self._bounded(new)
             if new.tag in _OBJECTS:
                 self._children(new)
         parent[:] = kept
+
+    def _bounded(self, color: Element) -> None:
+        """What would reflect more than there is, is darkened, as Mitsuba 0.x did."""
+        values = old.numbers(color.get("value", ""))
+        if color.get("name", "").endswith(("reflectance", "transmittance")) and max(values, default=0) > 1:
+            self._replaced[f"{color.get('name')} of {max(values):g} by 0.99"] += 1
+            color.set("value", old.joined(0.99 * value / max(values) for value in values))
 
     def _leave_out(self, e: Element) -> None:
         self._gone |= {inner.get("id", "") for inner in e.iter() if inner.tag != "ref"}
@@ -218,17 +211,19 @@ class Upgrade:
             self._dropped[f"gamma {gamma:g} of a bitmap"] += 1
 
     def _scale(self, e: Element) -> Element:
-        """A scaled colour is a colour; a scaled image has no counterpart."""
-        factor, inner = old.factor_of(e), old.nested(e, ("texture", "ref"))
-        if inner is not None:
-            self._dropped[f"factor {factor:g} of a scaled texture"] += 1
-            return self._stand_in(e, self._texture(inner) if inner.tag == "texture" else inner)
-        color = old.as_rgb(old.color_of(e))
-        if color.tag == "rgb":
-            color.set("value", old.joined(value * factor for value in old.numbers(color.get("value", ""))))
-        else:
-            self._dropped[f"factor {factor:g} of a scaled spectrum"] += 1
-        return self._stand_in(e, color)
+        """What it scales, times its factor."""
+        factor, inner = old.factor_of(e), old.scaled_by(e)
+        if (
+            inner.tag == "texture"
+            and not self._exists("texture", inner.get("type", ""))
+            and inner.get("type") != "scale"
+        ):
+            inner = self._texture(inner)
+        product = self._factors.times(inner, factor)
+        if product is None:
+            self._dropped[f"factor {old.joined(sorted(set(factor)))} of a scaled texture"] += 1
+            product = inner
+        return self._stand_in(e, self._texture(product) if product.tag == "texture" else product)
 
     def _bsdf(self, e: Element) -> Element:
         plugin = e.get("type", "")
@@ -238,6 +233,9 @@ class Upgrade:
             return self._stand_in(e, self._bsdf(inner) if inner.tag == "bsdf" else inner)
         if plugin == "mixturebsdf":
             return self._mixture(e)
+        if plugin in old_lobes.PLUGINS and (lobes := old_lobes.two_lobes(e, self._factors)) is not None:
+            self._replaced[f"bsdf {plugin} by diffuse and roughconductor"] += 1
+            return self._stand_in(e, lobes)
         if not self._exists(e.tag, plugin):
             self._replaced[f"bsdf {plugin} by diffuse"] += 1
             matte = Element("bsdf", type="diffuse")
@@ -259,7 +257,7 @@ class Upgrade:
         if plugin == "bumpmap" and texture is not None and texture.get("type") == "scale":
             heights = old.nested(texture, ("texture", "ref"))
             if heights is not None:
-                SubElement(e, "float", name="scale", value=f"{old.factor_of(texture):g}")
+                SubElement(e, "float", name="scale", value=f"{sum(old.factor_of(texture)) / 3:g}")
                 e[list(e).index(texture)] = heights
         if plugin == "normalmap" and texture is not None:
             texture.set("name", "normalmap")
@@ -271,12 +269,18 @@ class Upgrade:
     def _mixture(self, e: Element) -> Element:
         """Blends of two; what weights below 1 in all would absorb is lost."""
         weights = old.numbers(old.take(e, "weights", ""))
+        keeps_energy = old.take(e, "ensure_energy_conservation", "true") == "true"
         parts = [child for child in e if child.tag in ("bsdf", "ref")]
         if not parts or len(parts) != len(weights) or sum(weights) <= 0:
             self._replaced["bsdf mixturebsdf by diffuse"] += 1
             return self._stand_in(e, Element("bsdf", type="diffuse"))
         if sum(weights) < 0.999:
             self._dropped["absorption of a mixturebsdf"] += 1
+        if sum(weights) > 1.001 and not keeps_energy:  # else weights are brought to 1 in all
+            shares = old_lobes.added(parts, weights, self._factors)
+            if shares is None:
+                self._dropped[f"sum of weights {sum(weights):g} of a mixturebsdf"] += 1
+            weights = weights if shares is None else shares
         mixed, total = old.renamed(parts[0], None), weights[0]
         if len(parts) == 1:
             return self._stand_in(e, self._bsdf(mixed) if mixed.tag == "bsdf" else mixed)
@@ -287,7 +291,3 @@ class Upgrade:
             blend.extend((mixed, old.renamed(part, None)))
             mixed = blend
         return self._stand_in(e, mixed)
-
-
-def _listed(counts: Counter[str]) -> str:
-    return ", ".join(f"{count} x {what}" if count > 1 else what for what, count in counts.items())

@@ -55,11 +55,17 @@ def joined(values: Iterable[float]) -> str:
     return ", ".join(f"{value:.7g}" for value in values)
 
 
-def factor_of(scale: Element) -> float:
-    """Of a scale texture; the mean of a coloured one."""
+def factor_of(scale: Element) -> list[float]:
+    """Of a scale texture: three values, of the channels."""
     factor = named(scale, "scale")
-    values = [1.0] if factor is None else numbers(factor.get("value", "1"))
-    return sum(values) / len(values)
+    values = [1.0] if factor is None else numbers(as_rgb(factor).get("value", "1"))
+    return values if len(values) == 3 else [sum(values) / len(values)] * 3
+
+
+def scaled_by(scale: Element) -> Element:
+    """What a scale texture scales: a texture, a reference to one, or a colour."""
+    inner = nested(scale, ("texture", "ref"))
+    return color_of(scale) if inner is None else inner
 
 
 def color_of(e: Element) -> Element:

@@ -8,6 +8,7 @@ Properties that Mitsuba 3 does not know pass through here: it lists them itself 
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import xml.etree.ElementTree as ET
@@ -15,9 +16,11 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 from rsgen.errors import UserError
-from rsgen.render.scene_xml.old_plugins import Changes, Exists, Upgrade
+from rsgen.render.file_names import located
+from rsgen.render.scene_xml.old_changes import Changes
+from rsgen.render.scene_xml.old_plugins import Exists, Upgrade
 
-METHOD = b"old-xml/1"
+METHOD = b"old-xml/2"
 """Raise when old files come out differently: their baked light is kept under it."""
 
 _DEEPEST = 15  # includes, as in Mitsuba
@@ -74,15 +77,19 @@ def _read(
                 folders.insert(0, _found(folders, child.get("value", "")))
                 parent.remove(child)
             elif child.tag == "include":
-                name = _found(folders, child.get("filename", ""))
-                included = _read(scene, name, folders, defaults, changes, depth + 1)
+                part = _found(folders, child.get("filename", ""))
+                included = _read(scene, part, folders, defaults, changes, depth + 1)
                 place = list(parent).index(child)
                 parent.remove(child)
                 for offset, element in enumerate(list(included) if included.tag == "scene" else [included]):
                     parent.insert(place + offset, element)
             elif child.get("name") == "filename":
-                named = _found(folders, child.get("value", "").replace("\\", "/"))
-                child.set("value", os.path.relpath(named, scene.parent) if named.exists() else child.get("value", ""))
+                name = child.get("value", "")
+                file = _found(folders, name)
+                if file.exists():
+                    child.set("value", os.path.relpath(file, scene.parent))
+                    if not any((folder / name).exists() for folder in folders):
+                        changes.renamed[name] = child.get("value", "")
             else:
                 if "filename" in child.attrib:  # a spectrum, which the parser reads itself
                     named = _found(folders, child.attrib["filename"])
@@ -96,4 +103,6 @@ def _read(
 
 def _found(folders: list[Path], name: str) -> Path:
     """The file or folder of that name in the first of the folders that has one; if none has, in the first."""
-    return next((folder / name for folder in folders if (folder / name).exists()), folders[0] / name)
+    exact = (folder / name for folder in folders if (folder / name).exists())
+    alike = (file for folder in folders if (file := located(folder, name)) is not None)
+    return next(itertools.chain(exact, alike), folders[0] / name)

@@ -9,6 +9,7 @@ import contextlib
 import logging
 import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -17,9 +18,11 @@ import numpy as np
 
 from rsgen.errors import UserError
 from rsgen.inputs import MOST_BYTES, MOST_PIXELS, image_size
+from rsgen.render.file_names import mend_names
 from rsgen.render.scene_xml import old_xml
-from rsgen.render.scene_xml.instances import flatten
-from rsgen.render.scene_xml.old_plugins import Changes, Exists
+from rsgen.render.scene_xml.instances import children, flatten
+from rsgen.render.scene_xml.old_changes import Changes
+from rsgen.render.scene_xml.old_plugins import Exists
 
 log = logging.getLogger("rsgen")
 
@@ -30,8 +33,19 @@ _UNKNOWN = re.compile(r'(\w+) plugin of type "(\w+)":|- \w+ "(\w+)"')
 _FAILED = re.compile(r'At (.*?\(line \d+, col \d+\)): failed to instantiate (\w+) plugin of type "(\w+)": (.*)')
 
 
-def parse(mi: Any, config: Any, path: Path, scratch: Path, shape: str | None = None) -> tuple[Any, Changes | None]:
-    """Parsed state of a scene file, and what an upgrade changed if it is older than Mitsuba 3 (None: it is not).
+@dataclass(frozen=True)
+class Parsed:
+    """A scene file's parsed state, what an upgrade changed if it is older than Mitsuba 3 (None: it is not), and files
+    that it names otherwise than they are called, by the names there.
+    """
+
+    state: Any
+    changes: Changes | None
+    renamed: dict[str, str]
+
+
+def parse(mi: Any, config: Any, path: Path, scratch: Path, shape: str | None = None) -> Parsed:
+    """A scene file parsed.
 
     config: a ParserConfig; scratch: a folder for files made on the way; shape: XML of one more shape, which is added as
     the last. Raises UserError, and what Mitsuba's parser raises.
@@ -48,7 +62,9 @@ def parse(mi: Any, config: Any, path: Path, scratch: Path, shape: str | None = N
         shape = shape.replace(' version="3.0.0"', "")
         whole.write_text(f"<scene version='3.0.0'><include filename={quoteattr(str(file))}/>{shape}</scene>")
         file = whole
-    return mi.parser.parse_file(config, str(file)), changes
+    state = mi.parser.parse_file(config, str(file))
+    renamed = {} if changes is None else changes.renamed
+    return Parsed(state, changes, renamed | mend_names(state, path.parent))
 
 
 def plugin_finder(mi: Any) -> Exists:
@@ -70,6 +86,7 @@ def prepare(mi: Any, config: Any, state: Any, path: Path) -> None:
     mi.parser.transform_upgrade(config, state)
     mi.parser.transform_resolve(config, state)
     flatten(mi, state)
+    _sample_blends_from_behind(mi, state)
     for node in state.nodes:
         props = node.props
         if node.type == mi.ObjectType.Shape and "to_world" in props:
@@ -81,6 +98,25 @@ def prepare(mi: Any, config: Any, state: Any, path: Path) -> None:
                     f"scene {path}: to_world of shape '{what}' squashes it flat or is not finite: "
                     "scale no axis by 0, and mend its numbers"
                 )
+
+
+def _sample_blends_from_behind(mi: Any, state: Any) -> None:
+    """Have rough metals in a `blendbsdf` that is not `twosided` sample all their microfacets, not the visible alone.
+
+    Seen from behind, Mitsuba 3.9 samples the visible ones of Beckmann's to NaN, which a blend passes on to all light.
+    """
+
+    def below(index: int) -> set[int]:
+        inner = [child for _, child in children(mi, state.nodes[index].props)]
+        return set(inner).union(*(below(child) for child in inner))
+
+    plugins = [node.props.plugin_name() for node in state.nodes]
+    two_sided = set().union(*(below(k) for k, plugin in enumerate(plugins) if plugin == "twosided"))
+    for blend in (k for k, plugin in enumerate(plugins) if plugin == "blendbsdf" and k not in two_sided):
+        for metal in (k for k in below(blend) if plugins[k] == "roughconductor"):
+            props = state.nodes[metal].props
+            if str(props.get("distribution", "beckmann")) == "beckmann":
+                props["sample_visible"] = False
 
 
 def check_files(mi: Any, state: Any, path: Path) -> None:
