@@ -53,7 +53,8 @@ def _from_surfaces(scene: Any, field: IrradianceField, p_world: FloatArray, foll
     emitter = si.emitter(scene)
     lamp = (emitter != dr.zeros(mi.EmitterPtr)) & turned  # the others are sampled
     radiance = dr.select(lamp, through * emitter.eval(si, lamp), 0)
-    albedo = si.bsdf(ray).eval_diffuse_reflectance(si, hit)
+    # What a blend with metal mirrors straight back is in it, too.
+    albedo = dr.minimum(si.bsdf(ray).eval_diffuse_reflectance(si, hit), 1)
     radiance += dr.select(hit, through * albedo * field.lookup(pi, si, -ray.d, hit) * dr.inv_pi, 0)
     return _projected(radiance, d, _RAYS) * (4 * np.pi)
 

@@ -141,7 +141,7 @@ class ObjectsInFrame:
                 for e in range(2)
             ]  # fmt: skip
             light = mi.Color3f(*(dr.maximum(dr.lerp(a, b, share), 0) for a, b in zip(*ends, strict=True)))
-            albedo = si.bsdf(own).eval_diffuse_reflectance(si, here)
+            albedo = dr.minimum(si.bsdf(own).eval_diffuse_reflectance(si, here), 1)  # a blend's may be more
             total += dr.select(here, albedo * light * dr.inv_pi, 0)
         return total
 
