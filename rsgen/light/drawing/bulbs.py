@@ -14,8 +14,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
-from rsgen.array_types import IntArray
 from rsgen.device.arrays import aligned
 from rsgen.light.drawing.lamps import lamps_of
 from rsgen.light.places.surface_points import OFFSET_M
@@ -70,7 +70,7 @@ def bulbs(scene: Any) -> list[Any]:
     return [shapes[k] for k in sorted(found)]
 
 
-def _all_around(own: IntArray) -> Any:
+def _all_around(own: NDArray[np.uint32]) -> Any:
     """Rays from places on the shapes of these numbers (n,), in all directions."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, len(own))
