@@ -169,6 +169,18 @@ def test_a_thing_ends_where_another_surface_or_what_rests_begins() -> None:
     assert found[30:50, 60:72].all() and found.sum() < 900
 
 
+def test_a_thing_ends_at_its_rim_before_a_hole() -> None:
+    """The wall behind it, on all sides, of which the other image tells nothing: something was left out of that there."""
+    seen, box = still(), np.zeros(SHAPE, bool)
+    box[20:40, 20:40] = True
+    seen.z[box], seen.free[box], seen.apart[box] = 1.5, 0.5, 0.5
+    hole = np.zeros(SHAPE, bool)
+    hole[10:55, 8:65] = True
+    seen.apart[hole & ~box] = seen.free[hole & ~box] = np.nan
+    found = regions(seen)
+    assert found[box].all() and (found & ~box).sum() < 0.4 * box.sum()
+
+
 def test_what_another_frame_does_without_is_found_by_its_place() -> None:
     """Hardly moved since: it would not show in free space."""
     seen, box = still(), np.zeros(SHAPE, bool)
