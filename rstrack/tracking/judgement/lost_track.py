@@ -192,7 +192,9 @@ class FitHistory:
         moving: part of the pixels that need not fit, as they may be left out yet since they move by themselves.
         """
         return not any(
-            o.is_linearised and o.lin.fit >= (1.0 - moving) * _least_fit(o) and o.lin.next_sigma <= _HOPELESS * self._limit(o)
+            o.is_linearised
+            and o.lin.fit >= (1.0 - moving) * _least_fit(o)
+            and o.lin.next_sigma <= _HOPELESS * self._limit(o)
             for o in fresh
         )
 
