@@ -134,8 +134,14 @@ def test_nothing_passes_where_no_pose_is_known(dataset: Dataset) -> None:
     with pytest.raises(UserError, match="no true poses"):
         passed_by(dataclasses.replace(dataset, truth=None, sequence=None), 8, 9, seed=3)
     assert dataset.truth is not None
+    half = Trajectory(dataset.stamps[::2], SPLINE.pose(dataset.stamps[::2]))  # and at 15 Hz they are interpolated
+    made = passed_by(dataclasses.replace(dataset, truth=None, truth_poses=half, sequence=None), 8, 9, seed=3)
+    z, known = made.depth(12), passed_by(dataset, 8, 9, seed=3).depth(12)
+    assert np.median(np.abs(z - known)[z != dataset.depth(12)]) < 2e-3
+    one = passed_by(dataset, 8, 1, seed=3)
+    assert 0.15 < (one.depth(8) != dataset.depth(8)).mean() < 0.25
     few = Trajectory(dataset.stamps[:10], SPLINE.pose(dataset.stamps[:10]))
-    with pytest.raises(UserError, match="true poses all the time"):
+    with pytest.raises(UserError, match="needs true poses from"):
         passed_by(dataclasses.replace(dataset, truth=None, truth_poses=few, sequence=None), 8, 9, seed=3)
 
 
