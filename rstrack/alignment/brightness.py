@@ -76,6 +76,12 @@ def relative(image: FloatArray, reference: FloatArray) -> FloatArray:
     return np.array([gain - 1.0, image[1] - gain * reference[1]])
 
 
+def factor_and_offset(found: FloatArray) -> tuple[float, float]:
+    """What makes intensities of a reference those of an image with such a gain and offset (2,) against it: times the
+    first, plus the second."""
+    return 1.0 + float(found[0]), float(found[1] - found[0] * MID_GREY)
+
+
 def absolute(image: FloatArray, reference: FloatArray) -> FloatArray:
     """Those (2,) of an image against a third, from its own against a reference and that one's against the third."""
     gain = (1.0 + image[0]) * (1.0 + reference[0])

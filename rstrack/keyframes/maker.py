@@ -18,6 +18,7 @@ from rstrack.images.device_frame import DeviceRig, Timer, untimed
 from rstrack.images.left_out import MARGIN, thumbnail_without
 from rstrack.images.line_poses import from_base_table, to_base_table
 from rstrack.images.pyramid import ColorImage, DepthImage, thumbnail
+from rstrack.images.sampling import EDGE
 from rstrack.keyframes.keyframe import (
     Image,
     Points,
@@ -70,15 +71,20 @@ class KeyframeMaker:
         return self._finish(index, depth, colors, spline, t, spline.pose(t), lens, depth.inverse_z, rho, None)
 
     def rectified(
-        self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, older: Reference | None
-    ) -> Reference:
-        """A keyframe at mid readout, in which depth that the older one has is averaged in and fills holes."""
+        self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, older: Reference | None,
+        as_now: tuple[float, float] = (1.0, 0.0),
+    ) -> Reference:  # fmt: skip
+        """A keyframe at mid readout, in which depth that the older one has is averaged in and fills holes.
+
+        Where something moves before it, it has the older one's intensities, times the first of as_now plus the second.
+        """
         with self.timer("keyframes: make"):
-            return self._rectified(index, depth, colors, spline, older)
+            return self._rectified(index, depth, colors, spline, older, as_now)
 
     def _rectified(
-        self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, older: Reference | None
-    ) -> Reference:
+        self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, older: Reference | None,
+        as_now: tuple[float, float],
+    ) -> Reference:  # fmt: skip
         e = self.e
         t = depth.exposure.mid_time
         T_world_base, base, rho = self.rectify(depth, spline)
@@ -94,12 +100,19 @@ class KeyframeMaker:
         back = se3.inverse(T)
         to_base = e.upload(np.concatenate([back[:3, :3].ravel(), back[:3, 3]]))
         _, grid = self._pinhole_rays(base)
-        old, _, _ = self._kernel(rectify_kernel, older.lens, base)(older.inverse_depth, *grid, to_base)
+        old, *at = self._kernel(rectify_kernel, older.lens, base)(older.inverse_depth, *grid, to_base)
         host, old_host = e.download(rho, shape), e.download(old, shape)
         holes = (host <= 0) & (old_host > 0)
         host = np.where(holes, old_host, host)
         weights = np.where(holes, 1.0, e.download(weight, shape))
-        return self._finish(index, depth, colors, spline, t, T_world_base, base, e.upload(host), host, weights)
+        inherited = None
+        if depth.whole is not None and older.intensity is not None:
+            same = (old_host > 0) & (np.abs(old_host - host) < EDGE * host)
+            x, y = (e.download(values, shape) for values in at)
+            inherited = np.float32(as_now[0]) * _looked_up(older.intensity, x, y, same) + np.float32(as_now[1])
+        return self._finish(
+            index, depth, colors, spline, t, T_world_base, base, e.upload(host), host, weights, inherited
+        )
 
     def rectify(self, depth: DepthImage, spline: Spline) -> tuple[FloatArray, Lens, Any]:
         """T_world_base (4, 4) at mid readout, the lens, and inverse depth as seen from there at once, on the device."""
@@ -173,7 +186,9 @@ class KeyframeMaker:
     def _finish(
         self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, t: float,
         T_world_base: FloatArray, lens: Lens, device_rho: Any, rho: Image, weight: npt.NDArray[Any] | None,
+        inherited: Image | None = None,
     ) -> Reference:  # fmt: skip
+        """inherited (h, w): intensities of what rests, NaN where they are not known, for where something moves."""
         e = self.e
         rolling = depth.exposure if lens is depth.exposure.lens and lens.lines > 1 else None
         intensity, coarse, color_thumbnail, moments = None, None, None, np.zeros(2)
@@ -195,7 +210,7 @@ class KeyframeMaker:
                 coarse = look_up(color.finer)
             if depth.whole is not None:
                 hidden = self._hidden(depth, depth.whole, spline)
-                intensity[hidden] = np.nan
+                intensity[hidden] = np.nan if inherited is None else inherited[hidden]
                 if coarse is not None:
                     coarse[hidden] = np.nan
         small = Reference(
@@ -218,3 +233,9 @@ class KeyframeMaker:
             roughness=e.upload(roughness), weight=e.upload(weight), points=points, median_depth=median_depth,
             bound=bound, pixels=int(np.count_nonzero(rho)) // strides(camera.width, camera.height)[0] ** 2,
         )  # fmt: skip
+
+
+def _looked_up(image: Image, x: Image, y: Image, known: npt.NDArray[np.bool_]) -> Image:
+    """An image (h, w) at its pixels x, y (h, w); NaN where these are not known."""
+    at = np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan))
+    return np.where(known, at, np.float32(np.nan))

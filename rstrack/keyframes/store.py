@@ -91,13 +91,16 @@ class KeyframeStore:
         self._use(ref)
         self.anchor = None
 
-    def make(self, frame: DeviceFrame, spline: Spline, older: Reference | None, brightness: FloatArray) -> Reference:
+    def make(
+        self, frame: DeviceFrame, spline: Spline, older: Reference | None, brightness: FloatArray,
+        as_now: tuple[float, float] = (1.0, 0.0),
+    ) -> Reference:  # fmt: skip
         """A keyframe of a frame whose poses no longer change; inherits from `older`. It is the newest.
 
-        brightness (2,): gain and offset of its colour image, see `Reference`.
+        brightness (2,): gain and offset of its colour image, see `Reference`. as_now: see `KeyframeMaker.rectified`.
         """
         make = self._maker.rectified if self._model is None else self._model.keyframe
-        ref = replace(make(frame.index, frame.depth, frame.colors, spline, older), brightness=brightness)
+        ref = replace(make(frame.index, frame.depth, frame.colors, spline, older, as_now), brightness=brightness)
         if self._model is not None:
             self._model.add(frame.depth, spline)
         self.made += 1

@@ -32,14 +32,15 @@ class SurfaceModel:
         self.volume.integrate(rho, T_world_base, base)
 
     def keyframe(
-        self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, older: Reference | None
-    ) -> Reference:
+        self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, older: Reference | None,
+        as_now: tuple[float, float] = (1.0, 0.0),
+    ) -> Reference:  # fmt: skip
         """A keyframe as `KeyframeMaker.rectified` makes it, averaged with the model by variance, holes filled by it.
 
         What its depth scatters about the model's is taken as its noise, which grows with z². The model's own error is a
         part of a voxel: where frames are more exact than that, they are believed.
         """
-        made = self._maker.rectified(index, depth, colors, spline, older)
+        made = self._maker.rectified(index, depth, colors, spline, older, as_now)
         if not self.volume.blocks:
             return made
         seen, _ = self.volume.raycast(made.T_world_base, made.lens)

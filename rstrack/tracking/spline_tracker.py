@@ -8,6 +8,7 @@ stamps, T_world_depth = tracker.trajectory
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -19,6 +20,7 @@ from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
 from rstrack.adjustment.graph import Seen
 from rstrack.alignment.linearise import Terms
+from rstrack.alignment.observation import Observation
 from rstrack.alignment.pull import pulls
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.moving_masks import MovingMasks
@@ -245,14 +247,18 @@ class Tracker:
         mid, T_predicted = new.depth.exposure.mid_time, window.spline.pose(new.depth.exposure.mid_time)
         coupled = ref.rolling is not None
         levels = LEVELS if young or gap > (_LED_S if led else _SURE_S) else TRACKING_LEVELS
-        left = LeftOut(new.depth)
+        left, last = LeftOut(new.depth), track.succession.recent[-1].depth
+
+        def is_hopeless(seen: Sequence[Observation]) -> bool:
+            # What moved in the frame before does not fit here either, until it is left out.
+            return fits.is_hopeless(seen, last.moving)
 
         def leave_out() -> None:
             nonlocal left
-            if not fits.is_hopeless(fresh):
-                (left,) = track.leave_out([new], ref, fresh, window.state, track.succession.recent[-1].depth)
+            if not is_hopeless(fresh):
+                (left,) = track.leave_out([new], ref, fresh, window.state, last)
 
-        solved = window.solve(fresh, levels, gauge, coupled, fits.is_hopeless, leave_out)
+        solved = window.solve(fresh, levels, gauge, coupled, is_hopeless, leave_out)
         on_reference = [o for o in fresh if o.ref.index == ref.index]
         if not is_settled(solved) and not fits.is_hopeless(fresh):
             # Its steps went to and fro; that says nothing against the place.

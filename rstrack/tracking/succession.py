@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
+from rstrack.alignment.brightness import factor_and_offset, relative
 from rstrack.alignment.observation import Observation
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.images.left_out import Mask
@@ -94,7 +95,9 @@ class Succession:
 
     def make(self, frame: DeviceFrame, spline: Spline, older: Reference | None) -> Reference:
         """A keyframe, rectified with T_world_depth(t) and joined with what an older one saw."""
-        made = self._store.make(frame, spline, older, self._gains.of(frame))
+        own = self._gains.of(frame)
+        as_now = (1.0, 0.0) if older is None else factor_and_offset(relative(own, older.brightness))
+        made = self._store.make(frame, spline, older, own, as_now)
         self._covariances.keyframe(made)
         self._refer_to(made)
         return made

@@ -60,6 +60,8 @@ def test_brightness_is_chained_over_keyframes() -> None:
 
     np.testing.assert_allclose(seen(light, brightness.absolute(a, b)), seen(seen(light, b), a))
     np.testing.assert_allclose(brightness.relative(brightness.absolute(a, b), b), a, atol=1e-12)
+    factor, offset = brightness.factor_and_offset(a)
+    np.testing.assert_allclose(factor * light + offset, seen(light, a))
 
 
 def test_moments_match_and_small_changes_of_the_view_are_none() -> None:

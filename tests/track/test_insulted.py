@@ -11,13 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 import synthetic
+from scipy.optimize import least_squares
 
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3, so3
+from rsgen.sequence.trajectory import Trajectory
 from rstrack.bench.sensitivity import insulted, insults
+from rstrack.bench.sensitivity.changes import with_depth
 from rstrack.bench.sensitivity.insulted import InsultReport, Outcome, judged, mean_pose
 from rstrack.bench.sensitivity.insults import Insult
+from rstrack.bench.sensitivity.passing import passed_by
 from rstrack.bench.sensitivity.vibration import vibrating
 from rstrack.cli.main import main
 from rstrack.data.dataset import Dataset, open_dataset
@@ -72,6 +76,73 @@ def test_vibration_shows_what_a_turning_camera_sees(dataset: Dataset) -> None:
 
 def stamp_of(frame: Any) -> float:
     return float(frame.colors[0].stamp)
+
+
+# --- a thing that passes ---------------------------------------------------------------------------------------------
+
+
+def test_what_passes_is_one_ball_at_one_speed(dataset: Dataset) -> None:
+    """Points that it shows, moved to the world by their own lines' true poses, against a ball fitted to them."""
+    first, count, rig = 8, 9, dataset.rig
+    made = passed_by(dataset, first, count, seed=3)
+    camera, shutter = rig.depth_camera, rig.depth_shutter
+    lines, places, times, shares = shutter.line_of_pixel(camera.pixel_grid(), camera), [], [], []
+    for k in range(len(dataset)):
+        z, before = made.depth(k), dataset.depth(k)
+        shown = z != before
+        assert not shown.any() or first <= k < first + count
+        assert (z[shown] < before[shown]).all()  # the nearer of the two
+        t = shutter.line_mid_time(made.stamps[k], lines[shown], camera)
+        places.append(se3.transform(SPLINE.pose(t), camera.backproject(camera.pixel_grid()[shown], z[shown])))
+        times.append(t)
+        shares.append(shown.mean())
+    assert shares[first] < 0.01 and shares[first + count - 1] < 0.01 and 0.15 < shares[first + count // 2] < 0.25
+    p, t = np.concatenate(places), np.concatenate(times) - made.stamps[first + count // 2]
+
+    def off(ball: FloatArray) -> FloatArray:
+        return np.asarray(np.linalg.norm(p - ball[:3] - t[:, None] * ball[3:6], axis=1) - ball[6])
+
+    ball = least_squares(off, [*p.mean(axis=0), 0, 0, 0, 0.2]).x
+    assert np.abs(off(ball)).max() < 1e-4 and np.linalg.norm(ball[3:6]) > 1.0
+
+    # Colours, from beside and with lines of other times, show the same ball.
+    k = first + count // 2
+    i = dataset.groups[k][0]
+    shown = (made.images.color(i) != dataset.images.color(i)).any(axis=-1)
+    camera, shutter = rig.color_camera, rig.color_shutter
+    at, d = synthetic.pixel_rays(SPLINE, camera, shutter, dataset.color_stamps[i], rig.T_color_depth)
+    t = shutter.line_mid_time(dataset.color_stamps[i], shutter.line_of_pixel(camera.pixel_grid(), camera), camera)
+    to_ball = ball[:3] + (t - made.stamps[k])[..., None] * ball[3:6] - at
+    along = (to_ball * d).sum(axis=-1, keepdims=True) / (d**2).sum(axis=-1, keepdims=True) * d
+    hit = np.linalg.norm(to_ball - along, axis=-1) < ball[6]
+    assert hit.mean() > 0.1 and (shown != hit).mean() < 0.004
+
+
+def test_what_passes_is_hidden_by_what_is_nearer_and_keeps_its_texture(dataset: Dataset) -> None:
+    near = with_depth(dataset, lambda _, z: np.where(np.arange(64) < 28, np.float32(0.3), z))
+    bare, made = passed_by(near, 8, 9, seed=3), passed_by(dataset, 8, 9, seed=3)
+    for k in range(8, 17):
+        np.testing.assert_array_equal(bare.depth(k)[:, :28], near.depth(k)[:, :28])
+    i = dataset.groups[12][0]
+    shown = [(one.images.color(i) != dataset.images.color(i)).any(axis=-1) for one in (bare, made)]
+    assert shown[1][:, :22].any() and not shown[0][:, :22].any() and shown[0][:, 32:].any()
+    np.testing.assert_array_equal(made.images.color(i), passed_by(dataset, 8, 9, seed=3).images.color(i))
+    assert (made.images.color(i) != passed_by(dataset, 8, 9, seed=4).images.color(i)).any()
+
+
+def test_nothing_passes_where_no_pose_is_known(dataset: Dataset) -> None:
+    with pytest.raises(UserError, match="no true poses"):
+        passed_by(dataclasses.replace(dataset, truth=None, sequence=None), 8, 9, seed=3)
+    assert dataset.truth is not None
+    half = Trajectory(dataset.stamps[::2], SPLINE.pose(dataset.stamps[::2]))  # and at 15 Hz they are interpolated
+    made = passed_by(dataclasses.replace(dataset, truth=None, truth_poses=half, sequence=None), 8, 9, seed=3)
+    z, known = made.depth(12), passed_by(dataset, 8, 9, seed=3).depth(12)
+    assert np.median(np.abs(z - known)[z != dataset.depth(12)]) < 2e-3
+    one = passed_by(dataset, 8, 1, seed=3)
+    assert 0.15 < (one.depth(8) != dataset.depth(8)).mean() < 0.25
+    few = Trajectory(dataset.stamps[:10], SPLINE.pose(dataset.stamps[:10]))
+    with pytest.raises(UserError, match="needs true poses from"):
+        passed_by(dataclasses.replace(dataset, truth=None, truth_poses=few, sequence=None), 8, 9, seed=3)
 
 
 # --- what is counted -------------------------------------------------------------------------------------------------
@@ -212,7 +283,7 @@ def test_the_command_tracks_every_kind_once_and_resumes(
     assert main([*words, "3"]) == 0 and main([*words, "10"]) == 0
     assert made == list(range(5, 15))
     outcomes = json.loads(out.with_suffix(".json").read_text())["outcomes"]
-    assert [o["kind"] for o in outcomes[:9]] == list(insults.KINDS) and outcomes[0]["silent"] == [12]
+    assert [o["kind"] for o in outcomes] == list(insults.KINDS) and outcomes[0]["silent"] == [12]
     assert capsys.readouterr().out.splitlines()[-11].split()[:4] == ["all", "10", "10", "10"]
-    assert out.read_text().count("\n| ") == 2 + 9 + 1
+    assert out.read_text().count("\n| ") == 2 + 10 + 1
     assert main([*words, "0"]) == 2 and "at least 1" in capsys.readouterr().err

@@ -43,7 +43,9 @@ class Stub:
 class Maker:
     """Makes them."""
 
-    def rectified(self, index: int, depth: str, colors: Any, pose: np.ndarray, older: Any) -> Any:
+    def rectified(
+        self, index: int, depth: str, colors: Any, pose: np.ndarray, older: Any, as_now: tuple[float, float]
+    ) -> Any:
         return Stub(index, pose, depth, older, "maker")
 
     def fused(self, ref: Any, depth: str, pose: np.ndarray) -> Any:

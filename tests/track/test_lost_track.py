@@ -338,6 +338,9 @@ def test_a_coarse_level_is_hopeless_where_neither_term_fits() -> None:
     history = FitHistory()
     assert history.is_hopeless([bad]) and history.is_hopeless([]) and not history.is_hopeless([bad, good])
     assert history.is_hopeless([bad, term("color", 1e-3, fit=0.79)])
+    # Not where as much as is missing may be left out yet, since it moves.
+    assert not history.is_hopeless([term("depth", 1e-3, fit=0.4)], moving=0.4)
+    assert history.is_hopeless([term("depth", 1e-3, fit=0.4)], moving=0.3)
     assert history.is_hopeless([SimpleNamespace(is_linearised=False)])  # type: ignore[list-item]
 
 

@@ -29,7 +29,7 @@ from rstrack.alignment.spline_state import SplineState
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.images import line_poses as lines
 from rstrack.images.device_frame import DeviceRig, untimed
-from rstrack.images.left_out import Mask
+from rstrack.images.left_out import Mask, without_pixels
 from rstrack.options import Options
 from rstrack.tracking.moving.majority import not_with_most
 from rstrack.tracking.moving.regions import moving, moving_with
@@ -169,6 +169,18 @@ def test_a_thing_ends_where_another_surface_or_what_rests_begins() -> None:
     assert found[30:50, 60:72].all() and found.sum() < 900
 
 
+def test_a_thing_ends_at_its_rim_before_a_hole() -> None:
+    """The wall behind it, on all sides, of which the other image tells nothing, as something was left out there."""
+    seen, box = still(), np.zeros(SHAPE, bool)
+    box[20:40, 20:40] = True
+    seen.z[box], seen.free[box], seen.apart[box] = 1.5, 0.5, 0.5
+    hole = np.zeros(SHAPE, bool)
+    hole[10:55, 8:65] = True
+    seen.apart[hole & ~box] = seen.free[hole & ~box] = np.nan
+    found = regions(seen)
+    assert found[box].all() and (found & ~box).sum() < 0.4 * box.sum()
+
+
 def test_what_another_frame_does_without_is_found_by_its_place() -> None:
     """Hardly moved since: it would not show in free space."""
     seen, box = still(), np.zeros(SHAPE, bool)
@@ -242,8 +254,34 @@ def test_a_ball_that_passes_is_left_out_of_frame_and_keyframe(recording: Recordi
         for o in again:
             o.linearise(track.terms, state, 0)
         assert min(o.lin.fit for o in again) < 0.85
-    made = track.maker.rectified(5, left.depth, frames[5].colors, recording.truth, ref)
+    made = track.maker.rectified(5, left.depth, frames[5].colors, recording.truth, None)
     assert made.intensity is not None and np.isnan(made.intensity[_inner(recording.balls[5])]).all()
+
+
+def test_a_keyframe_has_an_older_ones_colours_where_something_moves(recording: Recording) -> None:
+    track = Track(recording.rig, Options(backend="llvm"), untimed)
+    e, truth = track.device.e, recording.truth
+    frames = [track.device.upload(k, recording.frames[k]) for k in (0, 5)]
+    first, last = (without_pixels(e, f.depth, recording.balls[k], 1) for f, k in zip(frames, (0, 5), strict=True))
+    older = track.maker.rectified(0, first, frames[0].colors, truth, None)
+    made, alone, darker = (
+        track.maker.rectified(5, last, frames[1].colors, truth, before, as_now).intensity
+        for before, as_now in ((older, (1.0, 0.0)), (None, (1.0, 0.0)), (older, (0.8, 0.05)))
+    )
+    _, color, _ = picture(truth, 10 / 30 + 0.004, T_COLOR_DEPTH, 1e-6)
+    z, _, _ = picture(truth, 10 / 30, np.eye(4), 1e-6)
+    empty = Frame(Image(10 / 30, z.astype(np.float32)), (Image(10 / 30 + 0.004, color.astype(np.uint8)),))
+    shot = track.device.upload(5, empty)
+    room = track.maker.rectified(5, shot.depth, shot.colors, truth, None).intensity
+    assert made is not None and alone is not None and darker is not None and room is not None
+    behind = _inner(recording.balls[5])
+    inherited = behind & np.isfinite(made)
+    assert inherited.sum() > 200 and not np.isfinite(alone[behind]).any()
+    off = np.abs(made - room)[inherited]
+    assert np.nanmedian(off) < 0.01 and np.nanpercentile(off, 90) < 0.04
+    # Elsewhere they are its own, looked up by averaged depth.
+    assert np.nanpercentile(np.abs(made - alone), 99.0) < 1e-2
+    np.testing.assert_allclose(darker[inherited], 0.8 * made[inherited] + 0.05, atol=1e-6)
 
 
 def test_what_moves_hides_a_little_more_of_colours_than_of_depth(recording: Recording) -> None:

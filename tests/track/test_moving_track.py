@@ -46,10 +46,11 @@ class Run:
         return float(np.sqrt(np.mean(errors**2)))
 
 
-def run(radius: float, moving: bool = True, method: Method = "rs-pg") -> Run:
+def run(radius: float, moving: bool = True, method: Method = "rs-pg", growth: float = 0.0) -> Run:
+    """growth: of the ball's radius with every frame after the start, m."""
     tracker, balls = Tracker(RIG, Options(method=method, backend="llvm", loops="off", moving=moving)), []
     for k in range(FRAMES):
-        frame, ball = made(k, radius)
+        frame, ball = made(k, radius + growth * max(0, k - 6))
         tracker.feed(frame)
         balls.append(ball)
     return Run(tracker, balls)
@@ -82,11 +83,13 @@ def test_without_looking_it_is_worse(beside_ball: Run) -> None:
 
 
 def test_depth_alone_does_without_the_ball_too() -> None:
-    """Where no colours tell which of two motions is the room's."""
-    beside = run(0.2, method="rs-g")
+    """Where no colours tell which of two motions is the room's; also once it fills so much that the frame as a whole
+    would not fit any more."""
+    beside = run(0.25, method="rs-g", growth=0.025)
     assert not any(report.lost for report in beside.tracker.reports)
     assert beside.ate_m < 1.5 * run(1e-6, method="rs-g").ate_m
-    assert beside.tracker.reports[-1].moving > 0.05
+    assert beside.balls[6].mean() < 0.12 and beside.balls[-1].mean() > 0.4
+    assert beside.tracker.reports[-1].moving > 0.4
 
 
 def test_a_frame_that_is_looked_at_again_does_without_it(beside_ball: Run) -> None:

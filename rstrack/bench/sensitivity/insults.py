@@ -1,4 +1,5 @@
-"""What happens to a camera in the field, put into a recording: jumps, blackouts, covered, frozen and shuffled images.
+"""What happens to a camera in the field, put into a recording: jumps, blackouts, covered, frozen and shuffled images,
+things that pass.
 
 insult = random_insult(dataset, seed=17)
 track(insult.dataset, options, out)        # frames insult.first to insult.last - 1 were touched
@@ -17,6 +18,7 @@ import numpy as np
 from rsgen.array_types import ByteArray, Float32Array
 from rsgen.errors import UserError
 from rstrack.bench.sensitivity.changes import reordered, with_color, with_depth
+from rstrack.bench.sensitivity.passing import passed_by
 from rstrack.bench.sensitivity.vibration import vibrating
 from rstrack.data.dataset import Dataset
 
@@ -156,6 +158,7 @@ KINDS: dict[str, Make] = {
     "sped up": lambda d, first, count, _: sped_up(d, first, count),
     "shaken": lambda d, first, count, rng: shaken(d, first, count, int(rng.integers(2**31))),
     "bare wall": lambda d, first, count, _: bare_wall(d, first, count),
+    "passed by": lambda d, first, count, rng: passed_by(d, first, count, int(rng.integers(2**31))),
 }
 """Kinds of insults, made of a dataset, a first frame, a number of frames and a generator for what else is random."""
 

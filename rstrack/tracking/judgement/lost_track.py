@@ -186,10 +186,15 @@ class FitHistory:
         is_odd = sigmas > max(least, times * known)
         return bool(is_odd and pull > max(always, growth * distance**2 * metres))
 
-    def is_hopeless(self, fresh: Sequence[Observation]) -> bool:
-        """Whether no term of a frame, aligned at a coarse level, fits so far that it could at a finer one."""
+    def is_hopeless(self, fresh: Sequence[Observation], moving: float = 0.0) -> bool:
+        """Whether no term of a frame, aligned at a coarse level, fits so far that it could at a finer one.
+
+        moving: part of the pixels that need not fit, as they may be left out yet since they move by themselves.
+        """
         return not any(
-            o.is_linearised and o.lin.fit >= _least_fit(o) and o.lin.next_sigma <= _HOPELESS * self._limit(o)
+            o.is_linearised
+            and o.lin.fit >= (1.0 - moving) * _least_fit(o)
+            and o.lin.next_sigma <= _HOPELESS * self._limit(o)
             for o in fresh
         )
 

@@ -111,7 +111,8 @@ def _grown(seeds: Mask, odd: Mask, unknown: Mask, beyond: Mask, z: Grid) -> Mask
     few steps only.
     """
     near = cv2.dilate(seeds.astype(np.uint8), np.ones((2 * _BEYOND_STEPS + 1,) * 2, np.uint8)) > 0
-    open_ = seeds | ((np.where(unknown, near | ~beyond, odd)) & ~_edges(z))
+    # Seeds end at edges as well: from a thing's own rim the surface behind it would be reached.
+    open_ = (seeds | np.where(unknown, near | ~beyond, odd)) & ~_edges(z)
     count, labels = cv2.connectedComponents(open_.astype(np.uint8), connectivity=4)
     told = np.bincount(labels[seeds | ~unknown], minlength=count)
     own = np.bincount(labels[seeds], minlength=count)
