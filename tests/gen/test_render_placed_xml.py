@@ -10,6 +10,7 @@ from rendering import dr, mi
 from scene_files import write_scene
 
 from rsgen.errors import UserError
+from rsgen.files import encode_exr
 from rsgen.geometry.aprilgrid import AprilGrid
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
@@ -126,7 +127,7 @@ def test_surroundings_turn_with_the_scene(tmp_path: Path, plugin: str) -> None:
         file = write_scene(
             tmp_path / folder, f'<emitter type="{plugin}">{turned}{inside}</emitter><shape type="cube"/>'
         )
-        mi.Bitmap(sky).write(str(file.parent / "sky.exr"))
+        (file.parent / "sky.exr").write_bytes(encode_exr(sky, ("R", "G", "B")))
         si = dr.zeros(mi.SurfaceInteraction3f, d.shape[1])
         si.wi = mi.Vector3f((-d / np.linalg.norm(d, axis=0)).astype(np.float32))
         seen.append(np.array(load_scene(file, options=options).emitters()[0].eval(si)))
