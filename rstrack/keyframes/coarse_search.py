@@ -145,7 +145,9 @@ class _Fit:
             R, t = frame.T_color_depth[:3, :3], frame.T_color_depth[:3, 3]
             value, slope = _sampled(frame.intensity, q @ R.T + t)
             gain, offset = _regression(keyframe.intensity, value)
-            scale = _SIGMA_COLOR * max(float(np.nanstd(frame.intensity.values)), 1e-3)
+            values = frame.intensity.values
+            spread = float(np.nanstd(values)) if np.isfinite(values).any() else 0.0
+            scale = _SIGMA_COLOR * max(spread, 1e-3)
             terms.append(((value - gain * keyframe.intensity - offset) / scale, slope @ R / scale))
         residuals = np.concatenate([r for r, _ in terms], axis=1)
         gradients = np.concatenate([g for _, g in terms], axis=1)
