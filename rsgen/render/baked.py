@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from rsgen.render.irradiance import IrradianceField
 from rsgen.render.moving import MovingObjects, ShadedField
+from rsgen.render.rays import proper
 
 _DIFFUSE = int(mi.BSDFFlags.DiffuseReflection) | int(mi.BSDFFlags.DiffuseTransmission)
 _SPECULAR = int(mi.BSDFFlags.Glossy) | int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.Null)
@@ -141,7 +142,8 @@ def trace_baked(scene, field, sampler, ray, bounces, active, first_lobe, first_l
         wo.z *= dr.sign(si.wi.z)
         lobe = bsdf.eval(diffuse, si, wo, active & ~last) / dr.maximum(dr.abs(wo.z), 1e-6)
         once, albedo = bsdf.sample(everything, si, sampler.next_1d(active), sampler.next_2d(active), active & last)
-        further = active & last & ~beyond & ((once.sampled_type & _SPECULAR) != 0)
+        # Of rough metal seen from behind Mitsuba says that it sends nothing along no direction.
+        further = active & last & ~beyond & ((once.sampled_type & _SPECULAR) != 0) & (dr.max(albedo) > 0)
         irradiance = field.lookup(pi, si, -ray.d, active)
         counts = active & ~further & ((depth > 0) | matte_too)
         radiance[counts] += throughput * irradiance * dr.select(last, albedo * dr.inv_pi, lobe)
@@ -158,7 +160,7 @@ def trace_baked(scene, field, sampler, ray, bounces, active, first_lobe, first_l
             ds, value = scene.sample_emitter_direction(si, u, False, smooth)
             to_light = si.to_local(ds.d)
             cast, pdf = bsdf.eval_pdf(specular, si, to_light, smooth)
-            share = dr.select(ds.delta, 1 / lights, dr.rcp(lights + pdf / dr.maximum(ds.pdf, 1e-20)))
+            share = dr.select(ds.delta, 1 / lights, dr.rcp(lights + proper(pdf) / dr.maximum(ds.pdf, 1e-20)))
             gain = cast * value * share
             chance = dr.minimum(dr.max(gain) / dr.maximum(faint, 1e-20), 1)
             cast_shadow = smooth & (ds.pdf > 0) & (sampler.next_1d(smooth) < chance)
@@ -181,7 +183,7 @@ def trace_baked(scene, field, sampler, ray, bounces, active, first_lobe, first_l
         before = mi.Color3f(throughput)  # else it would change with it
         throughput *= dr.select(pane, kept * onward.pdf, weight)
         last = ((bs.sampled_type & _GLOSSY) != 0) & ~frosted
-        lobe_pdf = bs.pdf
+        lobe_pdf = proper(bs.pdf)
         glossy_hit = mi.Interaction3f(si)
         ray = si.spawn_ray(si.to_world(bs.wo))
         active &= dr.max(throughput) > 0

@@ -1,4 +1,4 @@
-"""Single rays into a scene: how far the nearest surface is, and which way it faces."""
+"""Single rays into a scene: how far the nearest surface is, and which way it faces; densities of sampled ones."""
 
 from __future__ import annotations
 
@@ -30,3 +30,8 @@ def cast_rays(scene: Any, p_world: FloatArray, direction: FloatArray) -> tuple[F
 def rays_from(p_world: npt.ArrayLike, direction: npt.ArrayLike) -> Any:
     """Rays on the device from points (n, 3) along unit directions (n, 3)."""
     return mi.Ray3f(vectors(mi.Point3f, p_world), vectors(mi.Vector3f, direction))
+
+
+def proper(density: Any) -> Any:
+    """A density of sampled directions (Float), 0 where it is NaN: Mitsuba's is, of rough metal seen from behind."""
+    return dr.select(dr.isfinite(density), density, 0)

@@ -12,6 +12,7 @@ from rendering import constant_twist, dr, mi
 from scipy.integrate import quad
 
 from rsgen.device.arrays import vectors
+from rsgen.files import encode_exr
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.light.estimate import estimated_quality
@@ -120,3 +121,17 @@ def test_samples_of_a_pixel_spread_evenly_over_a_lobe(tmp_path: Path) -> None:
     means = [values.reshape(pixels, spp).mean(axis=1) for values in (spread, independent)]
     assert means[0].mean() == pytest.approx(means[1].mean(), rel=0.02)
     assert means[0].std() < 0.65 * means[1].std()
+
+
+def test_rough_metal_seen_from_behind_in_a_glossy_floor_is_dark_and_a_number(tmp_path: Path) -> None:
+    """Regression: one-sided, Beckmann's, Mitsuba 3.9 samples it to no direction and a density of NaN."""
+    metal = '<bsdf type="roughconductor"><float name="alpha" value="0.1"/></bsdf>'
+    floor = f'<shape type="rectangle"><transform name="to_world"><scale value="5"/></transform>{metal}</shape>'
+    away = f'<shape type="rectangle"><transform name="to_world"><scale value="0.4"/><translate z="0.5"/></transform>{metal}</shape>'
+    (tmp_path / "sky.exr").write_bytes(encode_exr(np.ones((4, 8, 3), np.float32), ("R", "G", "B")))
+    sky = '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>'
+    scene = scene_of(tmp_path, floor, away, sky)
+    baked = BakedIntegrator(make_field(*bake(scene, texel_m=1.0, direct_samples=4)))
+    camera = Camera(16, 12, 8.0, 8.0, 7.5, 5.5)
+    image = ColorRenderer(scene, baked, camera, Shutter(), 16).render(from_above(0.0, 0.0, 0.4), 0.0, 1)
+    assert np.isfinite(image).all() and image[5:7, 7:9].max() < 0.3 * image.max()

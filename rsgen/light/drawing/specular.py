@@ -7,6 +7,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from rsgen.render.rays import proper
+
 # Panes and mirrors that a ray is followed through: a double-glazed window seen in a mirror has nine.
 _MOST = 10
 _STRAIGHT = int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.Null)
@@ -97,7 +99,7 @@ def thrown_along(scene, field, ray, number, i, pick, follow, active):
         going &= si.is_valid()
         # The sampled weight's mean is the albedo ρ, exactly and without noise for Lambert's law.
         bs, weight = si.bsdf(ray).sample(context, si, pick, _drawn(number, i, passed), going)
-        onward = going & ((bs.sampled_type & SPECULAR) != 0) & (passed < _MOST)
+        onward = going & ((bs.sampled_type & SPECULAR) != 0) & (passed < _MOST) & (dr.max(weight) > 0)
         if dr.hint(not follow, mode="scalar"):
             onward = mi.Bool(False)
         ends = going & ~onward
@@ -144,7 +146,7 @@ def shone_along(scene, ray, number, i, pick, active):
         brushed = going & ((kind & GLOSSY) != 0)
         ds, value = scene.sample_emitter_direction(si, _drawn(number, i, 2 * _MOST + passed), False, brushed)
         cast, lobe = bsdf.eval_pdf(specular, si, si.to_local(ds.d), brushed)
-        gain = value * cast * dr.select(ds.delta, 1, ds.pdf / dr.maximum(ds.pdf + lobe, 1e-20))
+        gain = value * cast * dr.select(ds.delta, 1, ds.pdf / dr.maximum(ds.pdf + proper(lobe), 1e-20))
         lit = brushed & (ds.pdf > 0) & (dr.max(through * gain) > 0)
         lit &= ~scene.ray_test(si.spawn_ray_to(ds.p), lit)
         light += dr.select(lit, through * gain, 0)
@@ -153,7 +155,7 @@ def shone_along(scene, ray, number, i, pick, active):
         going &= dr.max(through) > 0
         thrown |= going & ((bs.sampled_type & _NULL) == 0) & ((kind & (GLOSSY | _DIFFUSE)) != 0)
         blurred = (bs.sampled_type & GLOSSY) != 0
-        density = bs.pdf
+        density = proper(bs.pdf)
         there = mi.Interaction3f(si)
         ray = si.spawn_ray(si.to_world(bs.wo))
         passed += 1
