@@ -127,7 +127,8 @@ def test_rough_metal_seen_from_behind_in_a_glossy_floor_is_dark_and_a_number(tmp
     """Regression: one-sided, Beckmann's, Mitsuba 3.9 samples it to no direction and a density of NaN."""
     metal = '<bsdf type="roughconductor"><float name="alpha" value="0.1"/></bsdf>'
     floor = f'<shape type="rectangle"><transform name="to_world"><scale value="5"/></transform>{metal}</shape>'
-    away = f'<shape type="rectangle"><transform name="to_world"><scale value="0.4"/><translate z="0.5"/></transform>{metal}</shape>'
+    above = '<transform name="to_world"><scale value="0.4"/><translate z="0.5"/></transform>'
+    away = f'<shape type="rectangle">{above}{metal}</shape>'
     (tmp_path / "sky.exr").write_bytes(encode_exr(np.ones((4, 8, 3), np.float32), ("R", "G", "B")))
     sky = '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>'
     scene = scene_of(tmp_path, floor, away, sky)
