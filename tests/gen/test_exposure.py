@@ -30,6 +30,16 @@ def test_the_typical_surface_is_mid_grey(radiance: float, gain: float, wanted: f
         assert suggested_gain(scene, CAMERA, still, 1.0, wanted) is None
 
 
+def test_bright_walls_above_a_dark_floor_are_not_white(tmp_path: Path) -> None:
+    """The lower two thirds of the picture send 0.01, the rest 1: mid-grey there would be 18 times white here."""
+    half = """<shape type="rectangle"><transform name="to_world"><rotate x="1" angle="180"/><scale value="9"/>
+        <translate y="{y}" z="{z}"/></transform><bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf>
+        <emitter type="area"><rgb name="radiance" value="{radiance}"/></emitter></shape>"""
+    scene = scene_of(tmp_path, half.format(y=0, z=2, radiance=1), half.format(y=9 - 1.9 / 6, z=1.9, radiance=0.01))
+    gain = suggested_gain(scene, CAMERA, constant_twist(np.zeros(6)), 1.0, 10.0)
+    assert gain == pytest.approx(0.6, rel=0.01)
+
+
 def test_a_tour_through_a_dim_room_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     room = """<shape type="cube"><transform name="to_world"><scale x="2.5" y="1.3" z="2"/></transform>
         <bsdf type="twosided"><bsdf type="diffuse"/></bsdf></shape>"""

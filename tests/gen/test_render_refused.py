@@ -13,9 +13,9 @@ from rendering import mi
 from scene_files import fails, hits, write_scene
 from trimesh.transformations import random_rotation_matrix
 
-from rsgen.render.polygons import is_convex, triangulated
 from rsgen.render.scene import content_hash, load_scene, surface
 from rsgen.render.scene_xml.obj_polygons import with_triangles
+from rsgen.render.scene_xml.polygons import is_convex, triangulated
 
 
 def twice_area(corners: np.ndarray, triangles: np.ndarray) -> np.ndarray:

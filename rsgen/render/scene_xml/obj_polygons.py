@@ -10,7 +10,7 @@ import re
 import numpy as np
 
 from rsgen.array_types import FloatArray
-from rsgen.render.polygons import is_convex, triangulated
+from rsgen.render.scene_xml.polygons import is_convex, triangulated
 
 METHOD = b"obj-polygons/1"
 """Raise when files come out differently: light baked on their surfaces is kept under it."""

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from rsgen.array_types import FloatArray, IntArray
 from rsgen.render.mesh_files.mesh_visual import from_srgb, given_normals
 from rsgen.render.ply import joined_triangles, ply_bytes
-from rsgen.render.polygons import triangulated
 from rsgen.render.scene_xml.obj_polygons import with_triangles
+from rsgen.render.scene_xml.polygons import triangulated
 
 log = logging.getLogger("rsgen")
 
