@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.special import chdtri
 
 from rsgen.array_types import FloatArray, IntArray
 from rsgen.console.tables import Table, fixed
@@ -44,7 +45,8 @@ class Metrics:
     frames, frames_tracked: of the sequence, and those among them with a pose within 0.02 s. poses, poses_compared: of
     the estimate, and those with a true counterpart. ate_*: absolute trajectory error. rpe_*: relative pose error over
     one second, `rpe_pairs` of them. row_*: over the depth images' lines, `rows` of them in `rows_total`. nees: mean of
-    those relative errors squared, normalised by the run's covariances, over 6: 1 if these are right.
+    those relative errors squared, normalised by the run's covariances, over 6: 1 if these are right. coverage_90: part
+    of them within the covariances' 90 % region: 0.9 if they are.
     """
 
     frames: int
@@ -65,6 +67,7 @@ class Metrics:
     rows_total: int
     notes: tuple[str, ...] = ()
     nees: float | None = None
+    coverage_90: float | None = None
 
     @property
     def coverage(self) -> float:
@@ -141,7 +144,7 @@ def evaluate(truth: Truth, estimate: Estimate) -> Metrics:
     error = found.position_errors_m
 
     step = drift(estimate, found)
-    nees = _nees(estimate, found)
+    nees, coverage_90 = _consistency(estimate, found)
     if not len(step.stamps):
         notes.append("no drift: no two poses are one second apart")
 
@@ -169,6 +172,7 @@ def evaluate(truth: Truth, estimate: Estimate) -> Metrics:
         rows_total=len(t),
         notes=tuple(notes),
         nees=nees,
+        coverage_90=coverage_90,
     )
 
 
@@ -206,13 +210,16 @@ def _pairs(estimate: Estimate, found: Comparison) -> tuple[FloatArray, IntArray,
     return estimate.stamps[i[both]], row[i[both]], row[j[both]]
 
 
-def _nees(estimate: Estimate, found: Comparison) -> float | None:
-    """Mean of `step_nees` over the pairs whose covariances are known; None without any."""
+def _consistency(estimate: Estimate, found: Comparison) -> tuple[float | None, float | None]:
+    """Mean of `step_nees` over the pairs whose covariances are known, and the part of them within the 90 % region."""
     pose, drifts = (c[found.index] for c in covariances(estimate))
     _, i, j = _pairs(estimate, found)
     known = np.isfinite(pose[i] + pose[j]).all(axis=(1, 2))
     nees = step_nees(found.T_world_true, found.T_world_est, pose, drifts, i[known], j[known])
-    return float(np.nanmean(nees)) if np.isfinite(nees).any() else None
+    nees = nees[np.isfinite(nees)]
+    if not nees.size:
+        return None, None
+    return float(nees.mean()), float((6.0 * nees <= chdtri(6.0, 0.1)).mean())
 
 
 def compared(run: Path, metrics: Metrics, other: Path, theirs: Metrics) -> str:

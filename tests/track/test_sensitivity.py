@@ -14,7 +14,7 @@ import rstrack.bench.sensitivity.run
 from rsgen.errors import UserError
 from rsgen.geometry.shutter import Scan
 from rstrack.bench.sensitivity import insults
-from rstrack.bench.sensitivity.cases import (
+from rstrack.bench.changes.named import (
     cases,
     color_late,
     darkened,
@@ -26,7 +26,7 @@ from rstrack.bench.sensitivity.cases import (
     readout_told,
     swinging_gain,
 )
-from rstrack.bench.sensitivity.changes import reduced, reordered, with_color, with_depth, with_stamps
+from rstrack.bench.changes.edits import reduced, reordered, with_color, with_depth, with_stamps
 from rstrack.bench.sensitivity.run import run_sensitivity
 from rstrack.cli.main import main
 from rstrack.data.dataset import Dataset, open_dataset

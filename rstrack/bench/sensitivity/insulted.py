@@ -25,7 +25,7 @@ from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
 from rsgen.files import atomic_write
 from rsgen.geometry import se3
-from rstrack.bench.sensitivity.changes import reordered
+from rstrack.bench.changes.edits import reordered
 from rstrack.bench.sensitivity.insults import KINDS, Insult, random_insult
 from rstrack.bench.sensitivity.settings import kept_results, settings_of
 from rstrack.data.dataset import Dataset

@@ -17,7 +17,7 @@ import numpy as np
 
 from rsgen.array_types import ByteArray, Float32Array
 from rsgen.errors import UserError
-from rstrack.bench.sensitivity.changes import reordered, with_color, with_depth
+from rstrack.bench.changes.edits import reordered, with_color, with_depth
 from rstrack.bench.sensitivity.passing import passed_by
 from rstrack.bench.sensitivity.vibration import vibrating
 from rstrack.data.dataset import Dataset

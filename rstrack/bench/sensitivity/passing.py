@@ -12,7 +12,7 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.trajectory import Trajectory
-from rstrack.bench.sensitivity.changes import with_color, with_depth
+from rstrack.bench.changes.edits import with_color, with_depth
 from rstrack.data.dataset import Dataset
 from rstrack.metrics.association import truth_of
 

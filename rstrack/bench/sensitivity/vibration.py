@@ -12,7 +12,7 @@ from rsgen.geometry import so3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.sequence.trajectory import Trajectory
-from rstrack.bench.sensitivity.changes import with_color, with_depth
+from rstrack.bench.changes.edits import with_color, with_depth
 from rstrack.data.dataset import Dataset
 from rstrack.metrics.association import true_poses, truth_of
 

@@ -70,6 +70,7 @@ def track(
     model). watch: looks on. gravity: write what an IMU has up as +z. Raises UserError: no such frames, `out` cannot be
     written or is a dataset, no frame was tracked, a run of other settings is to be resumed, no IMU where one is needed.
     """
+    asked = time.perf_counter()
     chosen = _chosen(dataset, frames)
     dataset = _with_color_evened(_with_color_timed(dataset, chosen, options, progress), chosen, options, progress)
     truth = truth_of(dataset)
@@ -101,6 +102,7 @@ def track(
     elif resume:
         raise UserError(f"{out}: --resume is for spline methods, not for the baseline: track anew")
     begin = time.perf_counter() - done.total_s
+    start_s = time.perf_counter() - asked
     end, error = _feed(tracker, load, chosen, done, checkpoint, truth, progress, watch)
     if not done.fed:
         raise UserError(error or f"{done.unreadable[0][1]}; no other frame of the {len(chosen)} can be read either")
@@ -116,7 +118,7 @@ def track(
         "lost": sum(report.lost for report in tracker.reports),
         "loops": None if closing is None else closing.info(),
         "spline_valid": tracker.spline_valid,
-        "timings": timings(time.perf_counter() - begin, done.seconds),
+        "timings": timings(time.perf_counter() - begin, done.seconds) | {"start_s": start_s},
         "frames": diagnostics(dataset, done.fed, tracker.reports, _spread(closing)),
     }
     if closing is not None:

@@ -1,69 +1,37 @@
-"""The cases of `rstrack sensitivity`: what a recording or its camera file may have wrong, one thing at a time.
+"""Changes of a recording or its camera file by name, as the cases of benchmarks have them.
 
-for case in cases(dataset, seed=0):
-    track(case.change(dataset), options, out)
+dataset = changed(dataset, "darkened", seed=0, arguments={"factor": 0.5})
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from rsgen.array_types import ByteArray, Float32Array, FloatArray
+from rsgen.errors import UserError
 from rsgen.geometry.shutter import Shutter
-from rstrack.bench.sensitivity.changes import (
-    reduced,
-    reordered,
-    with_color,
-    with_depth,
-    with_shutter,
-    with_stamps,
-)
+from rstrack.bench.changes.edits import reduced, reordered, with_color, with_depth, with_shutter, with_stamps
 from rstrack.data.dataset import Dataset
 
 # Blocks of missing depth are this part of an image's width.
 _BLOCK = 0.05
 
 
-@dataclass(frozen=True)
-class Case:
-    """One change. name: as the table has it."""
-
-    name: str
-    change: Callable[[Dataset], Dataset]
-
-
-def cases(dataset: Dataset, seed: int = 0) -> tuple[Case, ...]:
-    """All cases that a dataset can have, the untouched one first; a global shutter has no readout to tell wrongly."""
-    rolling = max(dataset.rig.depth_shutter.readout_s, dataset.rig.color_shutter.readout_s) > 0.0
-    readouts = [
-        Case("readout told 3 ms too short", lambda d: readout_told(d, shift_s=-0.003)),
-        Case("readout told 3 ms too long", lambda d: readout_told(d, shift_s=0.003)),
-        Case("readout told 5 ms too long", lambda d: readout_told(d, shift_s=0.005)),
-        Case("readout told x 0.7", lambda d: readout_told(d, factor=0.7)),
-        Case("depth global at its stamp, as registered", depth_told_global),
-    ]
-    return (
-        Case("untouched", lambda d: d),
-        Case("colour stamps 2 ms late", lambda d: color_late(d, 0.002)),
-        Case("colour stamps 5 ms late", lambda d: color_late(d, 0.005)),
-        Case("colour stamps 10 ms late", lambda d: color_late(d, 0.010)),
-        *(readouts if rolling else ()),
-        Case("depth scale 1 % off", lambda d: with_depth(d, lambda _, z: z * np.float32(1.01))),
-        Case("stamps jitter 2 ms RMS", lambda d: jittered(d, 0.002, seed)),
-        Case("depth only to 2 m", lambda d: with_depth(d, lambda _, z: np.where(z > 2.0, np.float32(0), z))),
-        Case("every second frame", lambda d: reordered(d, range(0, len(d), 2), d.stamps[::2])),
-        Case("every third frame", lambda d: reordered(d, range(0, len(d), 3), d.stamps[::3])),
-        Case("half the depth missing in blocks", lambda d: depth_in_blocks(d, seed)),
-        *(Case(f"colours x {g:g} after a third", partial(darkened, factor=g)) for g in (0.92, 0.5, 2.0)),
-        Case("a flash x 2 on every ninth image", flashed),
-        Case("gain +-35 % in a second's sinus", lambda d: swinging_gain(d, 0.35)),
-        Case("1/2 of the resolution", lambda d: reduced(d, 2)),
-        Case("1/4 of the resolution", lambda d: reduced(d, 4)),
-    )
+def changed(dataset: Dataset, name: str, seed: int, arguments: Mapping[str, Any]) -> Dataset:
+    """The dataset with one of `CHANGES`; those that are random take the seed. Raises UserError."""
+    if name not in CHANGES:
+        raise UserError(f"no change '{name}': choose {', '.join(CHANGES)}")
+    change = CHANGES[name]
+    drawn = {"seed": seed} if "seed" in inspect.signature(change).parameters else {}
+    try:
+        return change(dataset, **(drawn | dict(arguments)))
+    except TypeError as error:
+        raise UserError(f"change {name}: {error}") from None
 
 
 def color_late(dataset: Dataset, seconds: float) -> Dataset:
@@ -133,3 +101,28 @@ def swinging_gain(dataset: Dataset, swing: float, period_s: float = 1.0) -> Data
 def gained(pixels: ByteArray, gain: float) -> ByteArray:
     """Grey values times a gain, rounded and saturated."""
     return np.clip(np.rint(pixels * np.float32(gain)), 0, 255).astype(np.uint8)
+
+
+def depth_scaled(dataset: Dataset, factor: float) -> Dataset:
+    """Depth times a factor."""
+    return with_depth(dataset, lambda _, z: z * np.float32(factor))
+
+
+def depth_to(dataset: Dataset, metres: float) -> Dataset:
+    """No depth beyond so many metres."""
+    return with_depth(dataset, lambda _, z: np.where(z > metres, np.float32(0), z))
+
+
+def every(dataset: Dataset, nth: int) -> Dataset:
+    """Every nth frame."""
+    return reordered(dataset, range(0, len(dataset), nth), dataset.stamps[::nth])
+
+
+CHANGES: dict[str, Callable[..., Dataset]] = {
+    change.__name__: change
+    for change in (
+        color_late, jittered, readout_told, depth_told_global, depth_in_blocks, darkened, flashed, swinging_gain,
+        depth_scaled, depth_to, every, reduced,
+    )
+}  # fmt: skip
+"""What can be done, by name; each is a pure function of a dataset and its arguments."""

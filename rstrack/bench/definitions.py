@@ -1,0 +1,228 @@
+"""What a benchmark runs, as YAML: sequences, cases made of them, methods, and the cells that they make together.
+
+benchmark = load_benchmark([Path("benchmarks/cases.yaml"), Path("benchmarks/gate.yaml")])
+for cell in benchmark.cells:
+    print(cell.name)              # track/demo/rs-pg
+
+A *sequence* is rendered from a config, or lies in a folder. A *case* is a piece of one, with what is done to it. A
+*method* is one of ours with options, a peer, a command, or a folder of results. A *cell* measures a method on a case,
+for one seed or several. A sequence's name is a case too, and so is a method's or peer's own name a method.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from rsgen.errors import UserError, first_problem
+from rsgen.files import read_yaml
+from rstrack.metrics.clock import TruthOffset
+from rstrack.options import CLOUD_PEERS, METHODS, PEERS, SLAM_PEERS, Options
+
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]*$")]
+Frames = Annotated[str, Field(pattern=r"^\d*:\d*$")]
+OTHERS: tuple[str, ...] = (*PEERS, *CLOUD_PEERS, *SLAM_PEERS)
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class SequenceEntry(_Section):
+    """One sequence: `config`, or `path`."""
+
+    config: Path | None = Field(default=None, description="what 'rsgen render' makes it from: a name or a file")
+    set: dict[str, Any] = Field(default={}, description="fields of the config that are to be others")
+    data: dict[str, str] = Field(default={}, description="fields of the config that name files of --data")
+    width: int | None = Field(default=None, ge=32, le=16384, description="of all images, lenses in proportion, px")
+    frames: Frames | None = Field(default=None, description="A:B, which are rendered; default: all")
+    path: Path | None = Field(default=None, description="folder of a recording, relative to --data")
+    group: str = Field(default="", description="sequences that are averaged together")
+
+    @model_validator(mode="after")
+    def _one_source(self) -> SequenceEntry:
+        if (self.config is None) == (self.path is None):
+            raise ValueError("give either config, to be rendered, or path, of a folder that is there")
+        return self
+
+
+class NoiseEntry(_Section):
+    """What is added to images when they are read, see `rstrack.data.noise.with_noise`; from the run's seed."""
+
+    depth: float = Field(default=0.0, ge=0.0, description="sigma of depth z is this times z squared, 1/m")
+    intensity: float = Field(default=0.0, ge=0.0, description="sigma of grey values in [0, 1]")
+
+
+class CaseEntry(_Section):
+    """A piece of a sequence, and what is done to it."""
+
+    sequence: Name = Field(description="of `sequences`")
+    frames: Frames | None = Field(default=None, description="A:B, which are tracked; default: all")
+    changes: tuple[dict[str, dict[str, Any]], ...] = Field(default=(), description="of `rstrack.bench.changes`")
+    noise: NoiseEntry = Field(default=NoiseEntry(), description="added to the images")
+    camera: Path | None = Field(default=None, description="camera file to use, relative to the file that says so")
+    truth_offset: TruthOffset | None = Field(default=None, description="of the truth's clock: seconds, or auto")
+    group: str | None = Field(default=None, description="cases that are averaged together; default: the sequence's")
+
+
+class MethodEntry(_Section):
+    """What tracks: one of ours with options, a peer, a command, or a folder with results."""
+
+    method: Name | None = Field(default=None, description="of ours or of the peers; default: the entry's own name")
+    options: dict[str, Any] = Field(default={}, description="of `rstrack.options.Options`")
+    command: str = Field(default="", description="another tracker, as 'rstrack bench --peer-command' has it")
+    results: Path | None = Field(default=None, description="folder with CASE.txt (TUM) or CASE/ (a run) of another")
+
+
+class CellsEntry(_Section):
+    """Cells: every method on every case."""
+
+    cases: tuple[Name, ...] = Field(min_length=1, description="names, * allowed")
+    methods: tuple[Name, ...] = Field(min_length=1, description="names")
+    measure: Name = Field(default="track", description="what is measured")
+    seeds: int = Field(default=1, ge=1, le=10_000, description="runs, with seeds 0, 1, ...")
+    settings: dict[str, Any] = Field(default={}, description="of the measure")
+
+
+class BenchmarkFile(_Section):
+    """A file of definitions; several are put together."""
+
+    sequences: dict[Name, SequenceEntry] = {}
+    cases: dict[Name, CaseEntry] = {}
+    methods: dict[Name, MethodEntry] = {}
+    cells: tuple[CellsEntry, ...] = ()
+    every: Literal["code", "version"] = Field(
+        default="version", description="finished cells are run again when the code changes, or the version"
+    )
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One measure of one method on one case. methods and cases by name, as in the tables."""
+
+    measure: str
+    case: str
+    method: str
+    seeds: tuple[int, ...]
+    case_entry: CaseEntry
+    sequence: SequenceEntry
+    method_entry: MethodEntry
+    settings: Mapping[str, Any]
+
+    @property
+    def name(self) -> str:
+        """MEASURE/CASE/METHOD."""
+        return f"{self.measure}/{self.case}/{self.method}"
+
+    @property
+    def group(self) -> str:
+        """Cases that are averaged together."""
+        return self.sequence.group if self.case_entry.group is None else self.case_entry.group
+
+    @property
+    def program(self) -> str:
+        """The method or peer that runs: its own name."""
+        return self.method_entry.method or self.method
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether it is one of `rstrack.options.METHODS`."""
+        return self.program in METHODS and not self.method_entry.command and self.method_entry.results is None
+
+    @property
+    def options(self) -> Options:
+        """Of one of our methods. Raises UserError."""
+        try:
+            return Options(**({"method": self.program} if self.is_ours else {}) | self.method_entry.options)
+        except TypeError as error:
+            raise UserError(f"method {self.method}: {error}") from None
+
+    @property
+    def piece(self) -> slice:
+        """The frames that are tracked."""
+        return frames_of(self.case_entry.frames)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Everything that defines it, as plain data, without what is left at its default."""
+        entries = {"sequence": self.sequence, "case": self.case_entry, "method": self.method_entry}
+        plain = {name: entry.model_dump(mode="json", exclude_defaults=True) for name, entry in entries.items()}
+        return plain | {"settings": dict(self.settings), "group": self.group}
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """All cells of some definitions, in their order."""
+
+    cells: tuple[Cell, ...]
+    every: str = "version"
+
+    def only(self, patterns: Sequence[str]) -> Benchmark:
+        """The cells whose names match one of the patterns, all without one. Raises UserError: none does."""
+        chosen = [c for c in self.cells if not patterns or any(fnmatchcase(c.name, f"*{p}*") for p in patterns)]
+        if not chosen:
+            raise UserError(f"--only {' '.join(patterns)}: no cell has such a name: they are MEASURE/CASE/METHOD")
+        return Benchmark(tuple(chosen), self.every)
+
+
+def load_benchmark(paths: Sequence[Path]) -> Benchmark:
+    """Read and put together files of definitions, later ones on top. Raises UserError naming file and entry."""
+    files = [_load(Path(path)) for path in paths]
+    sequences = {name: entry for file in files for name, entry in file.sequences.items()}
+    cases = {name: CaseEntry(sequence=name) for name in sequences}
+    cases |= {name: entry for file in files for name, entry in file.cases.items()}
+    methods = {name: MethodEntry() for name in (*METHODS, *OTHERS)}
+    methods |= {name: entry for file in files for name, entry in file.methods.items()}
+    cells: dict[str, Cell] = {}
+    for entry in (entry for file in files for entry in file.cells):
+        for cell in _cells(entry, sequences, cases, methods):
+            if cell.name in cells:
+                raise UserError(f"{paths[-1]}: cell {cell.name} is there twice: give one of them another case's name")
+            cells[cell.name] = cell
+    return Benchmark(tuple(cells.values()), files[-1].every if files else "version")
+
+
+def frames_of(text: str | None) -> slice:
+    """The slice of 'A:B'."""
+    first, _, last = (text or ":").partition(":")
+    return slice(int(first) if first else None, int(last) if last else None)
+
+
+def _load(path: Path) -> BenchmarkFile:
+    try:
+        file = BenchmarkFile.model_validate(read_yaml(path))
+    except ValidationError as error:
+        raise UserError(f"{path}: {first_problem(error)} (benchmarks/gate.yaml is an example)") from None
+    cases = {
+        name: entry if entry.camera is None else entry.model_copy(update={"camera": path.parent / entry.camera})
+        for name, entry in file.cases.items()
+    }
+    return file.model_copy(update={"cases": cases})
+
+
+def _cells(
+    entry: CellsEntry, sequences: Mapping[str, SequenceEntry], cases: Mapping[str, CaseEntry],
+    methods: Mapping[str, MethodEntry],
+) -> list[Cell]:  # fmt: skip
+    found = []
+    for pattern in entry.cases:
+        names = [name for name in cases if fnmatchcase(name, pattern)]
+        if not names:
+            raise UserError(f"cells: no case or sequence '{pattern}'")
+        for case in names:
+            if cases[case].sequence not in sequences:
+                raise UserError(f"case {case}: no sequence '{cases[case].sequence}'")
+            for method in entry.methods:
+                if method not in methods:
+                    raise UserError(f"cells: no method '{method}': define it in methods")
+                found.append(
+                    Cell(
+                        entry.measure, case, method, tuple(range(entry.seeds)), cases[case],
+                        sequences[cases[case].sequence], methods[method], entry.settings,
+                    )  # fmt: skip
+                )
+    return found

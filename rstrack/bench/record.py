@@ -1,0 +1,173 @@
+"""What a cell of a benchmark came to, and where: one record, JSON on disk; many of them in one file.
+
+records = read_records(Path("benchmarks/results/gate.json"))
+print(records["track/demo/rs-pg"].figures["ate_mm"])
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import subprocess
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from rsgen.errors import UserError
+from rsgen.files import atomic_write, read_text
+from rstrack.data.estimate import plain
+
+Figures = dict[str, float | None]
+"""Of one run, flat; units are in the names (ate_mm, median_ms, psnr_db, lost); None: could not be had."""
+
+_DIGITS = 6
+
+
+@dataclass(frozen=True)
+class Record:
+    """One cell's outcome.
+
+    cell: MEASURE/CASE/METHOD. key: what the runs depend on. seeds, runs: one run of figures for each seed that is done;
+    complete: all of them are. settings: case, method and measure as they were defined. machine: CPU, cores, load before
+    the first run. error: why there is nothing; skipped: whether that is no fault (a recording or a package is absent).
+    """
+
+    cell: str
+    key: str
+    settings: dict[str, Any]
+    seeds: tuple[int, ...] = ()
+    runs: tuple[Figures, ...] = ()
+    complete: bool = False
+    error: str | None = None
+    skipped: bool = False
+    seconds: float = 0.0
+    version: str = ""
+    commit: str | None = None
+    date: str = ""
+    machine: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def measure(self) -> str:
+        """What was measured: the first part of the cell's name."""
+        return self.cell.split("/")[0]
+
+    @property
+    def case(self) -> str:
+        """On what: the second part."""
+        return self.cell.split("/")[1]
+
+    @property
+    def method(self) -> str:
+        """With what: the last part."""
+        return self.cell.split("/")[2]
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """The mean of every figure over the runs that have it."""
+        names = dict.fromkeys(name for run in self.runs for name in run)
+        values = {name: self.values(name) for name in names}
+        return {name: math.fsum(found) / len(found) for name, found in values.items() if found}
+
+    def values(self, name: str) -> list[float]:
+        """A figure of all runs that have it."""
+        return [value for run in self.runs if (value := run.get(name)) is not None]
+
+    def total(self, name: str) -> float:
+        """A count's sum over the runs."""
+        return math.fsum(self.values(name))
+
+
+def machine() -> dict[str, Any]:
+    """What figures are taken on, and how busy it is (load: average of the last minute)."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return {
+        "cpu": models[0] if models else platform.processor() or platform.machine(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
+        "system": platform.system(),
+        "python": platform.python_version(),
+    }
+
+
+def stamped(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Version, commit, date and machine, now."""
+    return dict(record) | {
+        "version": package_version(), "commit": commit(), "date": f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
+        "machine": machine(),
+    }  # fmt: skip
+
+
+def package_version() -> str:
+    """Of this project."""
+    return version("rolling-shutter-rgbd")
+
+
+@cache
+def commit() -> str | None:
+    """Of the checkout that this code is in, with a + where files have changed since; None outside of one."""
+    here = Path(__file__).parent
+    try:
+        told = subprocess.run(
+            ["git", "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"],
+            cwd=here, capture_output=True, text=True, check=False, timeout=10,
+        )  # fmt: skip
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return told.stdout.strip() or None
+
+
+def write_records(path: Path, records: Iterable[Record]) -> None:
+    """All records into one file, a line a cell, in the order of their names. Raises UserError."""
+    lines = [json.dumps(_short(record)) for record in sorted(records, key=lambda record: record.cell)]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    atomic_write(path, ("[\n" + ",\n".join(lines) + "\n]\n").encode())
+
+
+def read_records(path: Path) -> dict[str, Record]:
+    """The records of a file by their cells' names. Raises UserError: it is missing, or is not one of these files."""
+    try:
+        return {data["cell"]: _record(data) for data in json.loads(read_text(path))}
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise UserError(f"{path}: is no file of benchmark records ({error}): write it with --accept") from None
+
+
+def write_record(path: Path, record: Record) -> None:
+    """One record. Raises UserError."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    atomic_write(path, (json.dumps(_short(record), indent=1) + "\n").encode())
+
+
+def read_record(path: Path) -> Record | None:
+    """One record; None if there is none that can be read."""
+    try:
+        return _record(json.loads(read_text(path)))
+    except (UserError, ValueError, TypeError, KeyError, RecursionError):
+        return None
+
+
+def _record(data: Mapping[str, Any]) -> Record:
+    return Record(**{**data, "seeds": tuple(data["seeds"]), "runs": tuple(data["runs"])})
+
+
+def _short(record: Record) -> dict[str, Any]:
+    """Plain data, figures to six digits: more is not measured."""
+
+    def short(value: float | None) -> float | None:
+        if value is None or not math.isfinite(value):
+            return None
+        rounded = float(f"{value:.{_DIGITS}g}")
+        return int(rounded) if rounded.is_integer() and abs(rounded) < 1e15 else rounded
+
+    runs = [{name: short(value) for name, value in run.items()} for run in record.runs]
+    data: dict[str, Any] = plain(asdict(record) | {"runs": runs})
+    return data

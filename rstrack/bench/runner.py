@@ -1,0 +1,195 @@
+"""Runs the cells of a benchmark that are not there yet, one record each, and gathers all of them.
+
+records = run_cells(load_benchmark([Path("benchmarks/gate.yaml")]), Path("out/bench/gate"), Sources())
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from rsgen.console.progress import Progress, no_progress
+from rsgen.console.scheduler import InProcess, Workers
+from rsgen.errors import UserError
+from rstrack.bench.definitions import Benchmark, Cell
+from rstrack.bench.memory import peak_mb, reset_peak
+from rstrack.bench.record import Record, package_version, read_record, stamped, write_record
+from rstrack.bench.sequences import Absent, Sources
+from rstrack.bench.task import MEASURES, Task, measure_named
+from rstrack.data.estimate import TRAJECTORY
+
+RECORD = "record.json"
+# What describes a sequence, rsgen's or TUM's; the images themselves are not read for the key.
+_DESCRIPTIONS = (
+    "sequence.yaml", "rgb.txt", "depth.txt", "associations.txt", "groundtruth.txt", "camera.yaml", "calibration.yaml"
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Records by their cells' names, of those that are done; interrupted: some are missing."""
+
+    records: dict[str, Record]
+    interrupted: bool = False
+
+
+@dataclass(frozen=True)
+class Job:
+    """One cell to run; plain enough to be sent to another process that sees the same files."""
+
+    cell: Cell
+    out: Path
+    sources: Sources
+    measure: str
+    code: str
+
+
+def run_cells(
+    benchmark: Benchmark, out: Path, sources: Sources, workers: Workers | None = None, progress: Progress = no_progress,
+    measures: Mapping[str, str] | None = None, done: Callable[[Record], None] | None = None,
+) -> Outcome:  # fmt: skip
+    """Run what `out` does not hold yet, in this process or by `workers`; Ctrl-C ends it with what is finished.
+
+    measures: where more of them are found (`rstrack.bench.task`). done: told of each record. Raises UserError: a
+    measure that there is not, a folder that cannot be written or is not shared with the workers.
+    """
+    known = MEASURES | dict(measures or {})
+    unknown = [cell.measure for cell in benchmark.cells if cell.measure not in known]
+    if unknown:
+        raise UserError(f"no measure '{unknown[0]}': choose {', '.join(known)}")
+    code = code_digest() if benchmark.every == "code" else package_version()
+    jobs = [
+        Job(cell, (out / "cells" / cell.name).resolve(), sources, known[cell.measure], code)
+        for cell in benchmark.cells
+    ]
+    records: dict[str, Record] = {}
+    running: dict[str, float] = {}
+    todo = []
+    for job in jobs:
+        there = read_record(job.out / RECORD)
+        if there is not None and there.complete and there.error is None and there.key == _key(job):
+            records[job.cell.name] = there
+        else:
+            todo.append(job)
+
+    def report(name: str, fraction: float, note: str) -> None:
+        running[name] = fraction
+        progress("cells", min(1.0, (len(records) + sum(tuple(running.values()))) / len(jobs)), f"{name} {note}")
+
+    try:
+        for k, record in (workers or InProcess()).apply(run_cell, todo, report):
+            records[record.cell] = record
+            running.pop(record.cell, None)
+            if record.error is None and read_record(todo[k].out / RECORD) is None:
+                raise UserError(f"{todo[k].out}: a worker has written it, but not here: choose an --out that all share")
+            if done is not None:
+                done(record)
+            progress("cells", len(records) / len(jobs), f"{record.cell} done")
+    except KeyboardInterrupt:
+        return Outcome(_ordered(jobs, records), interrupted=True)
+    return Outcome(_ordered(jobs, records))
+
+
+def run_cell(job: Job, progress: Progress = no_progress) -> Record:
+    """Run the seeds of a cell that its record does not hold yet; the record is written after each.
+
+    What is missing or cannot be read is the record's error: such a cell is tried again the next time. Raises
+    KeyboardInterrupt, and UserError if the folder cannot be written.
+    """
+    cell, file = job.cell, job.out / RECORD
+    key = _key(job)
+    there = read_record(file)
+    record = there if there is not None and there.key == key and there.error is None else None
+    if record is None:
+        record = Record(**stamped({"cell": cell.name, "key": key, "settings": cell.as_dict()}))
+    if record.complete:
+        return record
+    measure = measure_named(job.measure)
+    try:
+        root = job.sources.folder(cell.sequence, cell.case_entry.sequence, progress)
+        # Once more: a sequence that was not there when the key was made is now.
+        record = dataclasses.replace(record, key=_key(job, root))
+        for n, seed in enumerate(cell.seeds):
+            if seed in record.seeds:
+                continue
+
+            def tell(stage: str, fraction: float, note: str, n: int = n) -> None:
+                progress(cell.name, (n + fraction) / len(cell.seeds), f"{stage} {note}")
+
+            reset_peak()
+            begin = time.perf_counter()
+            figures = measure(Task(cell, seed, root, job.out), tell)
+            figures = figures | {"peak_mb": figures.get("peak_mb") or peak_mb()}
+            record = dataclasses.replace(
+                record, seeds=(*record.seeds, seed), runs=(*record.runs, figures),
+                seconds=record.seconds + time.perf_counter() - begin,
+            )  # fmt: skip
+            record = dataclasses.replace(record, complete=len(record.seeds) == len(cell.seeds))
+            write_record(file, record)
+    except Absent as reason:
+        return dataclasses.replace(record, error=str(reason), skipped=True)
+    except UserError as error:
+        return dataclasses.replace(record, error=str(error))
+    return record
+
+
+@cache
+def code_digest() -> str:
+    """Of the product's source: what is measured depends on it."""
+    import rsgen
+    import rstrack
+
+    digest = hashlib.sha256()
+    for package in (rsgen, rstrack):
+        root = Path(package.__file__ or "").parent
+        for path in sorted(root.rglob("*.py")):
+            digest.update(f"{package.__name__}/{path.relative_to(root)}\n".encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
+def sequence_digest(root: Path) -> str:
+    """Of what describes a sequence: its lists, cameras and truth, not its images."""
+    return ",".join(f"{name} {_file_digest(root / name)}" for name in _DESCRIPTIONS if (root / name).is_file())
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _key(job: Job, root: Path | None = None) -> str:
+    """What the cell's runs depend on; the sequence's own part is empty where it is still to be rendered."""
+    cell = job.cell
+    if root is None:
+        try:
+            root = dataclasses.replace(job.sources, render=_not_now).folder(cell.sequence, cell.case_entry.sequence)
+        except UserError:
+            root = None
+    depends = [cell.name, cell.as_dict(), job.code, "" if root is None else sequence_digest(root)]
+    if cell.case_entry.camera is not None:
+        depends.append(_file_digest(cell.case_entry.camera))
+    if cell.method_entry.results is not None:
+        from rstrack.bench.measures.track import results_path
+
+        depends.append(_file_digest(results_path(cell)))
+    return hashlib.sha256(json.dumps(depends, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def _not_now(_: object) -> None:
+    raise UserError("the sequence is to be rendered")
+
+
+def _file_digest(path: Path) -> str | None:
+    file = path / TRAJECTORY if path.is_dir() else path
+    try:
+        return hashlib.sha256(file.read_bytes()).hexdigest()
+    except OSError:
+        return None
+
+
+def _ordered(jobs: list[Job], records: Mapping[str, Record]) -> dict[str, Record]:
+    return {job.cell.name: records[job.cell.name] for job in jobs if job.cell.name in records}

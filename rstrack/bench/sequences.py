@@ -1,0 +1,136 @@
+"""Where the sequences of a benchmark are: rendered once into a cache, or a folder that lies in --data.
+
+sources = Sources(data=Path("recordings"))
+folder = sources.folder(cell.sequence, "demo", progress)     # renders what is missing
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rsgen.console.configs import config_file
+from rsgen.console.progress import Progress, no_progress
+from rsgen.errors import UserError
+from rsgen.files import atomic_write, read_bytes, read_text, read_yaml
+from rsgen.sequence.reader import read_sequence
+from rstrack.bench.definitions import SequenceEntry, frames_of
+
+Render = Callable[[Sequence[str]], None]
+_STREAMS = ("color", "depth")
+
+
+class Absent(UserError):
+    """A recording or a package that is not at hand: the cell is skipped, which is no fault."""
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Where recordings lie (data) and rendered sequences are kept (cache); scheduler: of rsgen's, renders.
+
+    render: runs `rsgen` with arguments, None: in a process of its own.
+    """
+
+    data: Path | None = None
+    cache: Path | None = None
+    scheduler: str | None = None
+    render: Render | None = None
+
+    def folder(self, entry: SequenceEntry, name: str, progress: Progress = no_progress) -> Path:
+        """The folder of a sequence, rendered now if it is not there whole. Raises UserError, and Absent."""
+        if entry.path is not None:
+            return self._recording(entry.path)
+        words = self.words(entry)
+        recipe = self._recipe(entry, words)
+        home = (self.cache or default_cache()) / "sequences"
+        folder = home / f"{name}-{hashlib.sha256(recipe.encode()).hexdigest()[:8]}"
+        note = folder.with_name(folder.name + ".json")
+        if not (note.is_file() and read_text(note) == recipe and _is_whole(folder, entry)):
+            progress("rendering", 0.0, name)
+            run = self.render or run_rsgen
+            run([*words, "--out", str(folder), *([] if self.scheduler is None else ["--scheduler", self.scheduler])])
+            atomic_write(note, recipe.encode())
+        return folder
+
+    def words(self, entry: SequenceEntry) -> list[str]:
+        """What `rsgen` is called with, but for --out. Raises UserError, and Absent."""
+        assert entry.config is not None
+        path = config_file(str(entry.config))
+        overrides = dict(entry.set)
+        if entry.width is not None:
+            overrides = scaled(path, read_yaml(path), entry.width) | overrides
+        overrides |= {field: str(self._recording(Path(file))) for field, file in entry.data.items()}
+        few = [] if entry.frames is None else ["--frames", entry.frames]
+        words = [word for name, value in overrides.items() for word in (f"--{name}", json.dumps(value))]
+        return ["render", str(path), "--quiet", *few, *words]
+
+    def _recording(self, path: Path) -> Path:
+        if self.data is None:
+            raise Absent(f"{path}: is a recording: --data DIR names the folder that it lies in")
+        if not (self.data / path).exists():
+            raise Absent(f"{self.data / path}: is not there")
+        return (self.data / path).resolve()
+
+    def _recipe(self, entry: SequenceEntry, words: Sequence[str]) -> str:
+        """What a sequence is made with: words, and the content of the files they name, wherever these lie."""
+        path = Path(words[1])
+        files = [path, *(self._recording(Path(file)) for file in entry.data.values())]
+        given = read_yaml(path).get("trajectory") or {}
+        if "trajectory.file" not in {**entry.set, **entry.data} and given.get("file"):
+            files.append(path.parent / str(given["file"]))
+        hashes = {file.name: hashlib.sha256(read_bytes(file)).hexdigest() for file in files if file.is_file()}
+        says = entry.model_dump(mode="json", exclude_defaults=True, exclude={"group"}) | {"config": path.name}
+        return json.dumps({"sequence": says, "files": hashes}, indent=1, sort_keys=True) + "\n"
+
+
+def default_cache() -> Path:
+    """Where sequences are kept that are rendered for benchmarks: several gigabytes."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rolling-shutter-rgbd"
+
+
+def scaled(path: Path, config: Mapping[str, Any], width: int) -> dict[str, Any]:
+    """Fields of a config that make its images so wide, the same view in fewer or more pixels.
+
+    Pixel centres are at whole numbers. Raises UserError: the config (of the file `path`) says no size.
+    """
+    out: dict[str, Any] = {}
+    for stream in _STREAMS:
+        section = config.get(stream) or {}
+        try:
+            columns, rows = int(section["width"]), int(section["height"])
+            fx, fy, cx, cy = (float(value) for value in section["intrinsics"])
+        except (KeyError, TypeError, ValueError):
+            needed = "width, height and intrinsics [fx, fy, cx, cy] must be numbers to be scaled"
+            raise UserError(f"{path}: {stream}: {needed}") from None
+        height = max(1, round(rows * width / columns))
+        x, y = width / columns, height / rows
+        lens = (fx * x, fy * y, (cx + 0.5) * x - 0.5, (cy + 0.5) * y - 0.5)
+        out |= {f"{stream}.width": width, f"{stream}.height": height}
+        out[f"{stream}.intrinsics"] = [round(value, 9) for value in lens]
+    return out
+
+
+def run_rsgen(words: Sequence[str]) -> None:
+    """Run `rsgen` with these arguments in a process of its own. Raises UserError if it fails."""
+    # The tracker's process must not load the renderer.
+    done = subprocess.run([sys.executable, "-m", "rsgen", *words], capture_output=True, text=True, check=False)
+    if done.returncode:
+        told = (done.stderr.strip() or done.stdout.strip() or f"exit status {done.returncode}").splitlines()
+        raise UserError(f"rsgen {' '.join(words[:2])} failed: {told[-1]}")
+
+
+def _is_whole(folder: Path, entry: SequenceEntry) -> bool:
+    """Whether all frames that are wanted are there."""
+    try:
+        sequence = read_sequence(folder)
+    except UserError:
+        return False
+    asked = frames_of(entry.frames)
+    return all(len(s.paths) >= len(range(s.frames)[asked]) for s in sequence.streams.values())
