@@ -36,7 +36,7 @@ class _Section(BaseModel):
 class SequenceEntry(_Section):
     """One sequence: `config`, or `path`."""
 
-    config: Path | None = Field(default=None, description="what 'rsgen render' makes it from: a name or a file")
+    config: Path | None = Field(default=None, description="what 'rsgen render' makes it from: a name, or a file beside this one")
     set: dict[str, Any] = Field(default={}, description="fields of the config that are to be others")
     data: dict[str, str] = Field(default={}, description="fields of the config that name files of --data")
     width: int | None = Field(default=None, ge=32, le=16384, description="of all images, lenses in proportion, px")
@@ -201,7 +201,13 @@ def _load(path: Path) -> BenchmarkFile:
         name: entry if entry.camera is None else entry.model_copy(update={"camera": path.parent / entry.camera})
         for name, entry in file.cases.items()
     }
-    return file.model_copy(update={"cases": cases})
+    sequences = {
+        name: entry.model_copy(update={"config": path.parent / entry.config})
+        if entry.config is not None and entry.config.suffix
+        else entry
+        for name, entry in file.sequences.items()
+    }
+    return file.model_copy(update={"cases": cases, "sequences": sequences})
 
 
 def _cells(
