@@ -37,7 +37,7 @@ class _Section(BaseModel):
 class SequenceEntry(_Section):
     """One sequence: `config`, or `path`."""
 
-    config: Path | None = Field(default=None, description="what 'rsgen render' makes it from: a name, or a file beside this one")
+    config: Path | None = Field(default=None, description="what it is rendered from: a name, or a file beside this one")
     set: dict[str, Any] = Field(default={}, description="fields of the config that are to be others")
     data: dict[str, str] = Field(default={}, description="fields of the config that name files of --data")
     width: int | None = Field(default=None, ge=32, le=16384, description="of all images, lenses in proportion, px")
@@ -229,10 +229,8 @@ def _cells(
             for method in entry.methods:
                 if method not in methods:
                     raise UserError(f"cells: no method '{method}': define it in methods")
+                seeds, sequence = tuple(range(entry.seeds)), sequences[cases[case].sequence]
                 found.append(
-                    Cell(
-                        entry.measure, case, method, tuple(range(entry.seeds)), cases[case],
-                        sequences[cases[case].sequence], methods[method], entry.settings,
-                    )  # fmt: skip
+                    Cell(entry.measure, case, method, seeds, cases[case], sequence, methods[method], entry.settings)
                 )
     return found

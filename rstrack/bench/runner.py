@@ -10,9 +10,11 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from rsgen.console.progress import Progress, no_progress
 from rsgen.console.scheduler import InProcess, Workers
@@ -57,9 +59,9 @@ def run_cells(
 ) -> Outcome:  # fmt: skip
     """Run what `out` does not hold yet, in this process or by `workers`; Ctrl-C ends it with what is finished.
 
-    measures: where more of them are found (`rstrack.bench.task`). done: told of each record. expected_s: what cells took
-    before, by name, for the time that is left. Raises UserError: a measure that there is not, a folder that cannot be
-    written or is not shared with the workers.
+    measures: where more of them are found (`rstrack.bench.task`). done: told of each record. expected_s: what cells
+    took before, by name, for the time that is left. Raises UserError: a measure that there is not, a folder that cannot
+    be written or is not shared with the workers.
     """
     known = MEASURES | dict(measures or {})
     unknown = [cell.measure for cell in benchmark.cells if cell.measure not in known]
@@ -67,8 +69,7 @@ def run_cells(
         raise UserError(f"no measure '{unknown[0]}': choose {', '.join(known)}")
     code = code_digest() if benchmark.every == "code" else package_version()
     jobs = [
-        Job(cell, (out / "cells" / cell.name).resolve(), sources, known[cell.measure], code)
-        for cell in benchmark.cells
+        Job(cell, (out / "cells" / cell.name).resolve(), sources, known[cell.measure], code) for cell in benchmark.cells
     ]
     records: dict[str, Record] = {}
     known_s = dict(expected_s or {})
@@ -77,8 +78,8 @@ def run_cells(
     running: dict[str, float] = {}
     todo = []
     for job in jobs:
-        there = read_record(job.out / RECORD)
-        if there is not None and there.complete and there.error is None and there.key == _key(job):
+        there = _kept(job, _key(job))
+        if there is not None and there.complete:
             records[job.cell.name] = there
         else:
             todo.append(job)
@@ -95,6 +96,8 @@ def run_cells(
         show(f"{name} {note}")
 
     try:
+        if workers is not None and not isinstance(workers, InProcess):
+            _render(todo, progress)
         for k, record in (workers or InProcess()).apply(run_cell, todo, report):
             records[record.cell] = record
             running.pop(record.cell, None)
@@ -117,8 +120,7 @@ def run_cell(job: Job, progress: Progress = no_progress) -> Record:
     """
     cell, file = job.cell, job.out / RECORD
     key = _key(job)
-    there = read_record(file)
-    record = there if there is not None and there.key == key and there.error is None else None
+    record = _kept(job, key)
     if record is None:
         record = Record(**stamped({"cell": cell.name, "key": key, "settings": cell.as_dict()}))
     if record.complete:
@@ -182,7 +184,7 @@ def _key(job: Job, root: Path | None = None) -> str:
             root = dataclasses.replace(job.sources, render=_not_now).folder(cell.sequence, cell.case_entry.sequence)
         except UserError:
             root = None
-    depends = [cell.name, cell.as_dict(), job.code, "" if root is None else sequence_digest(root)]
+    depends: list[Any] = [cell.name, cell.as_dict(), job.code, "" if root is None else sequence_digest(root)]
     if cell.case_entry.camera is not None:
         depends.append(_file_digest(cell.case_entry.camera))
     if cell.method_entry.results is not None:
@@ -190,6 +192,23 @@ def _key(job: Job, root: Path | None = None) -> str:
 
         depends.append(_file_digest(results_path(cell)))
     return hashlib.sha256(json.dumps(depends, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def _kept(job: Job, key: str) -> Record | None:
+    """What there is of the seeds that are asked for; None: nothing, or of other inputs."""
+    there = read_record(job.out / RECORD)
+    if there is None or there.error is not None or there.key != key:
+        return None
+    runs = {seed: run for seed, run in zip(there.seeds, there.runs, strict=True) if seed in job.cell.seeds}
+    complete = len(runs) == len(job.cell.seeds)
+    return dataclasses.replace(there, seeds=tuple(runs), runs=tuple(runs.values()), complete=complete)
+
+
+def _render(jobs: list[Job], progress: Progress) -> None:
+    """Render what is missing, before workers begin: two of them would render a sequence into the same folder."""
+    for job in {job.cell.case_entry.sequence: job for job in jobs}.values():
+        with suppress(UserError):  # its cells say so
+            job.sources.folder(job.cell.sequence, job.cell.case_entry.sequence, progress)
 
 
 def _not_now(_: object) -> None:

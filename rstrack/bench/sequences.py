@@ -6,6 +6,7 @@ folder = sources.folder(cell.sequence, "demo", progress)     # renders what is m
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import os
@@ -43,14 +44,18 @@ class Sources:
     scheduler: str | None = None
     render: Render | None = None
 
+    @property
+    def home(self) -> Path:
+        """Where rendered sequences are kept."""
+        return (self.cache or default_cache()) / "sequences"
+
     def folder(self, entry: SequenceEntry, name: str, progress: Progress = no_progress) -> Path:
         """The folder of a sequence, rendered now if it is not there whole. Raises UserError, and Absent."""
         if entry.path is not None:
             return self._recording(entry.path)
         words = self.words(entry)
         recipe = self._recipe(entry, words)
-        home = (self.cache or default_cache()) / "sequences"
-        folder = home / f"{name}-{hashlib.sha256(recipe.encode()).hexdigest()[:8]}"
+        folder = self.home / f"{name}-{hashlib.sha256(recipe.encode()).hexdigest()[:8]}"
         note = folder.with_name(folder.name + ".json")
         if not (note.is_file() and read_text(note) == recipe and _is_whole(folder, entry)):
             progress("rendering", 0.0, name)
@@ -58,6 +63,14 @@ class Sources:
             run([*words, "--out", str(folder), *([] if self.scheduler is None else ["--scheduler", self.scheduler])])
             atomic_write(note, recipe.encode())
         return folder
+
+    def has(self, entry: SequenceEntry, name: str) -> bool:
+        """Whether a sequence is there, whole."""
+        try:
+            dataclasses.replace(self, render=_not_now).folder(entry, name)
+        except UserError:
+            return False
+        return True
 
     def words(self, entry: SequenceEntry) -> list[str]:
         """What `rsgen` is called with, but for --out. Raises UserError, and Absent."""
@@ -124,6 +137,10 @@ def run_rsgen(words: Sequence[str]) -> None:
     if done.returncode:
         told = (done.stderr.strip() or done.stdout.strip() or f"exit status {done.returncode}").splitlines()
         raise UserError(f"rsgen {' '.join(words[:2])} failed: {told[-1]}")
+
+
+def _not_now(_: object) -> None:
+    raise UserError("the sequence is to be rendered")
 
 
 def _is_whole(folder: Path, entry: SequenceEntry) -> bool:

@@ -28,6 +28,7 @@ from rstrack.tracking.runs.record import Noise
 Measure = Callable[["Task", Progress], Figures]
 MEASURES: dict[str, str] = {
     "track": "rstrack.bench.measures.track:track_cell",
+    "blur": "rstrack.bench.measures.blur:blur_cell",
     "speed": "rstrack.bench.measures.speed:speed_cell",
 }
 

@@ -1,4 +1,4 @@
-"""The commands that measure the tracker: bench-speed, -convergence, -bootstrap, -calibration, -long, and stress."""
+"""The commands that measure the tracker: bench-speed, -convergence, -bootstrap, -calibration, -long and -loops."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-from rsgen.console.command_line import Frames, Json, Quiet, print_figures
-from rsgen.console.configs import ConfigFile
+from rsgen.console.command_line import Frames, Json, print_figures
 from rsgen.device.backend import Backend
 from rstrack.cli.options import CameraFile, NoiseDepth, NoiseIntensity, SequenceFolder
 from rstrack.options import Method, Options, Peer
@@ -164,26 +163,4 @@ def bench_loops(
         elsewhere = None if other is None else open_dataset(other, camera)
         found = loop_quality(dataset, tracker, frames or slice(None), alike, progress, elsewhere)
     print_figures(found, json)
-    return 0
-
-
-def stress(
-    config: ConfigFile,
-    tracker: Options,
-    *,
-    out: Annotated[Path, "sequences, runs and tables go here", "DIR"],
-    frames: Annotated[int | None, "only the first N frames (default: all)", "N"] = None,
-    quiet: Quiet = False,
-) -> int:
-    """Blur stress test: one motion at several exposures and speeds, constant against blur-aware weights."""
-    from rsgen.console.progress import ProgressDisplay
-    from rstrack.bench.stress.cases import StressOptions
-    from rstrack.bench.stress.run import run_stress
-    from rstrack.bench.stress.tables import stress_text, write_stress
-
-    with ProgressDisplay(quiet) as progress:
-        result = run_stress(config, out, StressOptions(frames=frames, tracker=tracker), progress)
-    written = write_stress(result, out)
-    print(stress_text(result))
-    print(f"{out}: {len(written)} tables and pictures written")
     return 0

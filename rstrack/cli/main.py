@@ -21,10 +21,9 @@ from rstrack.cli.bench import (
     bench_long,
     bench_loops,
     bench_speed,
-    stress,
 )
-from rstrack.cli.bench_methods import STATUS as BENCH_STATUS
-from rstrack.cli.bench_methods import bench
+from rstrack.cli.benchmark import STATUS as BENCH_STATUS
+from rstrack.cli.benchmark import bench
 from rstrack.cli.calibrate import STATUS as CALIBRATE_STATUS
 from rstrack.cli.calibrate import calibrate
 from rstrack.cli.importing import import_
@@ -114,7 +113,6 @@ def _parser() -> Parser:
     add(bench_long, "out/demo --frames 100000 --method rs-g")
     add(bench_loops, "out/long2 --alike 200")
     add(sensitivity, "out/demo --method rs-pg --frames 0:60 --out sensitivity.json")
-    add(stress, "stress --out runs/stress --frames 60")
     return commands.parser
 
 

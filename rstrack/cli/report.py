@@ -12,8 +12,7 @@ from rstrack.cli.options import CameraFile, TruthOffset
 def report(
     run: Annotated[
         Path,
-        "folder that 'rstrack track', 'rstrack bench' or 'rstrack stress' wrote, a calibration.json, or a TUM file "
-        "with --sequence",
+        "folder that 'rstrack track' or 'rstrack bench' wrote, a calibration.json, or a TUM file with --sequence",
     ],
     *,
     sequence: Annotated[Path | None, "the run's sequence (default: where it was)", "DIR"] = None,

@@ -7,11 +7,18 @@ from pathlib import Path
 from rsgen.console.progress import Progress, no_progress
 from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
-from rstrack.bench.methods import paper
+from rstrack.bench.methods.config import SequenceInfo
 from rstrack.bench.methods.mesh_pictures import read_picture
-from rstrack.bench.methods.plan import SequenceInfo
 from rstrack.bench.methods.plots import ate_chart
-from rstrack.bench.methods.results import QUANTITIES, RESULTS, Results, averages, read_results
+from rstrack.bench.methods.results import (
+    QUANTITIES,
+    RESULTS,
+    Results,
+    averages,
+    folder_of,
+    read_results,
+    truth_offset_s,
+)
 from rstrack.bench.methods.tables import notes, sequence_table
 from rstrack.charts.runs import compared_errors, path_chart
 from rstrack.data.dataset import Dataset, open_dataset
@@ -21,7 +28,9 @@ from rstrack.report.pictures import frame_panels, map_pictures, shutter_sliders
 from rstrack.report.run import number, plots
 
 OURS = "rs-pg"
-_TITLES = {"ate_m": "position error (ATE)", "rpe_m_s": "drift in translation", "rpe_deg_s": "drift in rotation"}
+_TITLES = {
+    "ate_mm": "position error (ATE)", "drift_mm_s": "drift in translation", "drift_deg_s": "drift in rotation",
+}  # fmt: skip
 
 # Points of a path or curve, of which a page holds a hundred or so.
 _POINTS = 350
@@ -57,7 +66,7 @@ def bench_page(folder: Path, progress: Progress = no_progress) -> Page:
         title="Tracking benchmark",
         subtitle=", ".join(
             _counted(len(what), noun)
-            for what, noun in ((results.sequences, "sequence"), (results.methods, "method"), (results.cells, "run"))
+            for what, noun in ((results.sequences, "sequence"), (results.methods, "method"), (results.records, "run"))
         ),
         cards=_cards(results),
         sections=tuple(sections),
@@ -77,10 +86,10 @@ def _cards(results: Results) -> tuple[CardRow, ...]:
     rows, method = [], _shown(results)
     for mean in averages(results):
         if mean.method == method:
-            theirs, cards = paper.average(mean.sequences, method), []
+            theirs, cards = mean.theirs, []
             for q in QUANTITIES:
-                note = "" if theirs is None else f"paper: {number(getattr(theirs, q.name), q.scale)} {q.unit}"
-                value = f"{number(mean.values[q.name], q.scale)} {q.unit}"
+                note = "" if theirs is None else f"paper: {number(getattr(theirs, q.name))} {q.unit}"
+                value = f"{number(mean.values[q.name])} {q.unit}"
                 cards.append(Card(value, _TITLES[q.name], note))
             over = _counted(len(mean.sequences), "sequence")
             rows.append(CardRow(tuple(cards), f"{method}, {mean.group}: average of {over}"))
@@ -101,10 +110,9 @@ def _speed(results: Results) -> Table:
     """Milliseconds a frame, reading included."""
     rows = []
     for entry in results.sequences:
-        found = [results.cell(entry.name, method) for method in results.methods]
-        texts = [
-            fixed(None if cell is None or not cell.seconds else cell.seconds / cell.frames, 0, 1e3) for cell in found
-        ]
+        found = [results.record(entry.name, method) for method in results.methods]
+        seconds = [None if record is None else record.figures.get("total_s") for record in found]
+        texts = [fixed(None if value is None else value / entry.frames, 0, 1e3) for value in seconds]
         rows.append((f"{entry.name}, {entry.frames} frames", *texts))
     return Table(("ms a frame", *results.methods), tuple(rows), "Time of the whole run divided by its frames, ms")
 
@@ -154,10 +162,11 @@ def _runs(
     """The runs of a sequence that the tables show, by name, in the order of the tables."""
     runs = {}
     for method in results.shown(entry.group).values():
-        cell = results.cell(entry.name, method)
-        if cell is not None and cell.error is None:
+        record = results.record(entry.name, method)
+        if record is not None and record.error is None:
             try:
-                runs[method] = load_run(folder / cell.folder, dataset=dataset, truth_offset=cell.truth_offset_s)
+                where, offset_s = folder / folder_of(record), truth_offset_s(record)
+                runs[method] = load_run(where, dataset=dataset, truth_offset=offset_s)
             except UserError as error:
                 warnings.append(f"No plots of {method} on {entry.name}: {error}.")
     return runs

@@ -13,7 +13,7 @@ from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, write_error
 from rstrack.bench.methods.results import RESULTS
-from rstrack.bench.stress.tables import STRESS
+from rstrack.bench.stress.results import STRESS
 from rstrack.calibration.findings.record import read_record
 from rstrack.data.estimate import TRAJECTORY
 from rstrack.metrics.clock import TruthOffset
@@ -73,7 +73,7 @@ def _page(
         return calibration_page(read_record(folder))
     if folder.is_dir() and not (folder / TRAJECTORY).is_file():
         raise UserError(
-            f"{folder}: holds neither {TRAJECTORY}, {RESULTS} nor {STRESS}: give a folder that 'rstrack track', "
-            "'rstrack bench' or 'rstrack stress' wrote"
+            f"{folder}: holds neither {TRAJECTORY}, {RESULTS} nor {STRESS}: give a folder that 'rstrack track' "
+            "or 'rstrack bench' wrote"
         )
     return run_page(folder, sequence, camera_file, truth_offset)

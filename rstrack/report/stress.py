@@ -8,9 +8,17 @@ from pathlib import Path
 
 from rsgen.console.tables import Entry, Table, best_marked, fixed
 from rsgen.errors import UserError
-from rstrack.bench.stress.charts import color_charts, gain_db, gains_db, tracking_chart, weights_name
-from rstrack.bench.stress.run import ColorScore, Panels, StressResult
-from rstrack.bench.stress.tables import read_panels, read_stress, shade
+from rstrack.bench.measures.blur import PANELS, read_panels
+from rstrack.bench.stress.charts import color_charts, tracking_chart
+from rstrack.bench.stress.results import (
+    ColorScore,
+    StressResult,
+    gain_db,
+    gains_db,
+    ratio,
+    read_stress,
+    weights_name,
+)
 from rstrack.report.images import jpeg_uri
 from rstrack.report.page import Block, Card, CardRow, Chooser, Note, Page, Picture, Pictures, Plot, Section, Slider
 from rstrack.report.run import number, plots
@@ -35,11 +43,13 @@ def stress_page(folder: Path) -> Page:
     result = read_stress(folder)
     labels = _labels(result)
     warnings: list[str] = []
-    sections = [Section("color", "Fused colour against the sharp view", _color(result, labels))]
+    sections = []
+    if result.color:
+        sections.append(Section("color", "Fused colour against the sharp view", _color(result, labels)))
     try:
-        panels = read_panels(folder)
-        if panels is not None:
-            sections.append(Section("keyframe", "One keyframe", _pictures(panels, labels)))
+        if result.panels is not None:
+            pictures = _pictures(folder / result.panels, labels[result.panels_case])
+            sections.append(Section("keyframe", "One keyframe", pictures))
     except UserError as error:
         warnings.append(f"No pictures: {error}.")
     if result.depth:
@@ -48,10 +58,10 @@ def stress_page(folder: Path) -> Page:
     return Page(
         title="Blur stress test",
         subtitle=_subtitle(result),
-        cards=(_cards(result, labels),),
+        cards=(_cards(result, labels),) if result.color else (),
         sections=tuple(sections),
-        facts=(("motion", result.config),),
-        warnings=tuple(warnings),
+        facts=(("motion", result.motion),),
+        warnings=(*warnings, *(f"Failed: {line}." for line in result.failed)),
     )
 
 
@@ -90,12 +100,12 @@ def _cards(result: StressResult, labels: dict[str, str]) -> CardRow:
         cards.append(Card(f"{fixed(gain, 2, sign='+')} dB", "fused colour, gain of blur-aware weights (PSNR)", note))
     for depth in result.depth:
         if (depth.case, depth.poses) == (case, poses):
-            note = f"{fixed(depth.single_m, 2, 1e3)} mm in one frame"
-            cards.append(Card(f"{fixed(depth.fused_m, 2, 1e3)} mm", "depth of fused keyframes (RMSE)", note))
+            note = f"{fixed(depth.single_mm, 2)} mm in one frame"
+            cards.append(Card(f"{fixed(depth.fused_mm, 2)} mm", "depth of fused keyframes (RMSE)", note))
     tracked = [row for row in result.tracking if row.case == case]
     if tracked:
-        note = "; ".join(f"{fixed(row.ate_m, 2, 1e3)} mm: {row.variant}" for row in tracked[1:])
-        cards.append(Card(f"{fixed(tracked[0].ate_m, 2, 1e3)} mm", "position error of the tracker (ATE, RMSE)", note))
+        note = "; ".join(f"{fixed(row.ate_mm, 2)} mm: {row.variant}" for row in tracked[1:])
+        cards.append(Card(f"{fixed(tracked[0].ate_mm, 2)} mm", "position error of the tracker (ATE, RMSE)", note))
     return CardRow(tuple(cards), f"{labels[case]} exposure, {_POSES[poses]}")
 
 
@@ -121,7 +131,7 @@ def _score_table(
     lines: list[tuple[Entry | str, ...]] = []
     for case in dict.fromkeys(row.case for row in rows):
         scores = [found.get((case, sigma)) for sigma in sigmas]
-        values = [None if score is None else float(getattr(score, name)) for score in scores]
+        values = [None if score is None else getattr(score, name) for score in scores]
         gains = [gain_db(rows, score) if score is not None and name == "psnr_db" else None for score in scores]
         notes = ["" if gain is None else fixed(gain, 2, sign="+") for gain in gains]
         count = max(score.keyframes for score in scores if score is not None)
@@ -130,10 +140,8 @@ def _score_table(
     return Table(("sequence", *map(weights_name, sigmas)), tuple(lines), title)
 
 
-def _row(
-    values: Sequence[float | None], notes: Sequence[str], digits: int, ideal: float, scale: float = 1.0
-) -> list[Entry]:
-    entries = [Entry(fixed(v, digits, scale), note=note) for v, note in zip(values, notes, strict=True)]
+def _row(values: Sequence[float | None], notes: Sequence[str], digits: int, ideal: float) -> list[Entry]:
+    entries = [Entry(fixed(v, digits), note=note) for v, note in zip(values, notes, strict=True)]
     return best_marked(entries, values, ideal)
 
 
@@ -143,9 +151,8 @@ def _depth(result: StressResult, labels: dict[str, str]) -> tuple[Block, ...]:
         rows = []
         for row in result.depth:
             if row.poses == poses:
-                ratio = row.fused_m / row.single_m if row.single_m else None
-                errors = (fixed(row.single_m, 2, 1e3), fixed(row.fused_m, 2, 1e3))
-                rows.append((labels.get(row.case, row.case), *errors, fixed(ratio, 2)))
+                errors = fixed(row.single_mm, 2), fixed(row.fused_mm, 2)
+                rows.append((labels[row.case], *errors, fixed(ratio(row), 2)))
         if rows:
             head = ("sequence", "one frame, mm", "fused, mm", "ratio")
             tables.append(Table(head, tuple(rows), f"Depth against the noise-free depth, RMSE, {name}"))
@@ -160,31 +167,31 @@ def _tracking(result: StressResult, labels: dict[str, str]) -> tuple[Block, ...]
         runs = [found.get((case, variant)) for variant in variants]
         notes = []
         for run in runs:
-            drift = [f"{fixed(run.drift_m_per_s, 2, 1e3)} mm/s"] if run and run.drift_m_per_s is not None else []
+            drift = [f"{fixed(run.drift_mm_s, 2)} mm/s"] if run and run.drift_mm_s is not None else []
             notes.append(", ".join(drift + ([f"{run.lost} lost"] if run and run.lost else [])))
-        values = [None if run is None else run.ate_m for run in runs]
-        rows.append((labels[case], *_row(values, notes, 2, 0.0, 1e3)))
+        values = [None if run is None else run.ate_mm for run in runs]
+        rows.append((labels[case], *_row(values, notes, 2, 0.0)))
     table = Table(
         ("sequence", *variants), tuple(rows), "Position error (ATE, RMSE), mm; small print: drift a second, lost frames"
     )
     note = Note(
         "Where in a line's exposure the photometric term takes its pose, and whether it weights pixels by their blur. "
-        "Each folder in runs/ has a page of its own: rstrack report runs/NAME."
+        "Each folder in cells/ has a page of its own: rstrack report FOLDER."
     )
     chart = tracking_chart(result)
     return (table, note, Plot(chart)) if chart.lines else (table, note)
 
 
-def _pictures(panels: Panels, labels: dict[str, str]) -> tuple[Block, ...]:
-    picture, white = shade(panels.weights)
-    at = f"frame {panels.index} of the sequence {labels.get(panels.case, panels.case)}"
-    shown = (
-        (panels.blurred, "the frame that counts least of those fused, registered"),
-        (picture, f"its weights (white: {number(white)})"),
-        (panels.constant, "fused with constant weights"),
-        (panels.aware, "fused with blur-aware weights"),
-        (panels.truth, "sharp view"),
-    )
+def _pictures(folder: Path, label: str) -> tuple[Block, ...]:
+    panels = read_panels(folder)
+    if panels is None:
+        raise UserError(f"{folder}: is not there")
+    images, at = panels.images(folder), f"frame {panels.keyframe} of the sequence {label}"
+    captions = (
+        "the frame that counts least of those fused, registered", f"its weights (white: {number(panels.white)})",
+        "fused with constant weights", "fused with blur-aware weights", "sharp view",
+    )  # fmt: skip
+    shown = [(images[name], what) for name, what in zip(PANELS, captions, strict=True)]
     items = [Picture(jpeg_uri(image), f"{what[0].upper()}{what[1:]}", f"{what}, {at}") for image, what in shown]
     return (
         Note(f"The keyframe that gains most: {at}. Black: not known."),

@@ -65,6 +65,12 @@ def depth_told_global(dataset: Dataset) -> Dataset:
     return replace(dataset, rig=replace(dataset.rig, depth_shutter=Shutter(0.0, shutter.exposure_s, shutter.scan)))
 
 
+def color_told_sharp(dataset: Dataset) -> Dataset:
+    """Colour taken to have no exposure: lines' poses are then those at its end."""
+    shutter = dataset.rig.color_shutter
+    return replace(dataset, rig=replace(dataset.rig, color_shutter=Shutter(shutter.readout_s, 0.0, shutter.scan)))
+
+
 def depth_in_blocks(dataset: Dataset, seed: int) -> Dataset:
     """Every block of depth missing with a chance of one half, others in every frame."""
 
@@ -122,7 +128,7 @@ CHANGES: dict[str, Callable[..., Dataset]] = {
     change.__name__: change
     for change in (
         color_late, jittered, readout_told, depth_told_global, depth_in_blocks, darkened, flashed, swinging_gain,
-        depth_scaled, depth_to, every, reduced,
+        depth_scaled, depth_to, every, reduced, color_told_sharp,
     )
 }  # fmt: skip
 """What can be done, by name; each is a pure function of a dataset and its arguments."""

@@ -65,6 +65,7 @@ def accuracy(task: Task, estimate: Estimate) -> Figures:
         evaluation = evaluate_clocks(truth, estimate, offset)
     except UserError:
         # A track too short or too bad for its clock: clocks as they are, or nothing at all.
+        offset = None
         try:
             evaluation = evaluate_clocks(truth, estimate, 0.0)
         except UserError:
@@ -83,7 +84,7 @@ def accuracy(task: Task, estimate: Estimate) -> Figures:
         "line_deg": found.row_rot_rmse_deg,
         "nees": found.nees,
         "coverage_90": found.coverage_90,
-        "truth_offset_ms": _scaled(evaluation.offset_s) if offset == "auto" else None,
+        "truth_offset_ms": None if offset is None else _scaled(evaluation.offset_s),
     }
 
 

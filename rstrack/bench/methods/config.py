@@ -1,40 +1,35 @@
-"""What `rstrack bench` is to run: its YAML file, and which sequences, methods and frames of it are asked for.
+"""What `rstrack bench` is to run: its YAML file, and which cells of it are asked for.
 
-config = load_bench_config(Path("configs/evaluation.yaml"))
-choice = choose(config, quick=True)
+plan = make_plan(load_evaluation(Path("configs/evaluation.yaml")), Path("out"), quick=True)
+outcome = run_cells(plan.benchmark, Path("out/bench"), Sources(Path("out")))
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from rsgen.errors import UserError, first_problem
 from rsgen.files import read_yaml
-from rstrack.options import CLOUD_PEERS, METHODS, PEERS, SLAM_PEERS
-
-# Names of sequences and methods are folders too.
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]*$")]
+from rstrack.bench.definitions import OTHERS, Benchmark, CaseEntry, Cell, MethodEntry, Name, SequenceEntry
+from rstrack.bench.methods.variants import fuses, method_of, variants
+from rstrack.data.dataset import Dataset, open_dataset
+from rstrack.metrics.association import truth_of
+from rstrack.metrics.clock import TruthOffset
+from rstrack.options import METHODS, Options
 
 
 class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class SequenceEntry(_Section):
-    """One sequence."""
-
-    name: Name = Field(description="its folder within --data")
-    group: str = Field(min_length=1, description="sequences that are averaged together")
-    config: Path = Field(description="what 'rsgen render' makes it from, relative to this file")
-
-
-class QuickEntry(_Section):
+class Quick(_Section):
     """What --quick leaves of it."""
 
     sequences: tuple[Name, ...] = Field(min_length=1, description="names of sequences")
@@ -42,79 +37,152 @@ class QuickEntry(_Section):
     frames: int = Field(ge=10, description="frames of each sequence, from the first one on")
 
 
-class BenchConfig(_Section):
-    """The whole evaluation."""
+class Evaluation(_Section):
+    """The whole evaluation. Sequences lie in --data, in folders of their `path`, or of their name if they have none."""
 
-    sequences: tuple[SequenceEntry, ...] = Field(min_length=1, description="what is tracked")
+    sequences: dict[Name, SequenceEntry] = Field(min_length=1, description="what is tracked")
     methods: tuple[Name, ...] = Field(min_length=1, description="what tracks it, in the order of the tables")
-    quick: QuickEntry | None = Field(default=None, description="a subset that runs in minutes")
+    quick: Quick | None = Field(default=None, description="a subset that runs in minutes")
 
     @model_validator(mode="after")
-    def _names_are_consistent(self) -> BenchConfig:
-        names = [entry.name for entry in self.sequences]
-        for what, given in (("sequences", names), ("methods", self.methods)):
-            twice = [name for name, count in Counter(given).items() if count > 1]
-            if twice:
-                raise ValueError(f"{what}: '{twice[0]}' is there twice")
-        unknown = [name for name in (self.quick.sequences if self.quick else ()) if name not in names]
+    def _names_are_consistent(self) -> Evaluation:
+        twice = [name for name, count in Counter(self.methods).items() if count > 1]
+        if twice:
+            raise ValueError(f"methods: '{twice[0]}' is there twice")
+        unknown = [name for name in (self.quick.sequences if self.quick else ()) if name not in self.sequences]
         if unknown:
             raise ValueError(f"quick.sequences: '{unknown[0]}' is not among the sequences")
         return self
 
 
 @dataclass(frozen=True)
-class Choice:
-    """What is run: sequences and methods in the order of the tables; frames [first, last), None: to the end."""
+class SequenceInfo:
+    """A sequence as it is run; frames: how many of it are used."""
 
-    sequences: tuple[SequenceEntry, ...]
+    name: str
+    group: str
+    path: Path
+    frames: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All cells, sequence by sequence; methods: variants (`variants`), peers and other trackers."""
+
+    benchmark: Benchmark
+    sequences: tuple[SequenceInfo, ...]
     methods: tuple[str, ...]
-    first: int = 0
-    last: int | None = None
 
 
-def load_bench_config(path: Path) -> BenchConfig:
-    """Read and validate a file such as configs/evaluation.yaml; its paths come out relative to the working directory.
-
-    Raises UserError naming the file and the entry.
-    """
-    path = Path(path)
+def load_evaluation(path: Path) -> Evaluation:
+    """Read and validate a file such as configs/evaluation.yaml. Raises UserError naming the file and the entry."""
     try:
-        config = BenchConfig.model_validate(read_yaml(path))
+        config = Evaluation.model_validate(read_yaml(path))
     except ValidationError as error:
         raise UserError(f"{path}: {first_problem(error)} (configs/evaluation.yaml is an example)") from None
-    here = tuple(entry.model_copy(update={"config": path.parent / entry.config}) for entry in config.sequences)
-    return config.model_copy(update={"sequences": here})
+    beside = {
+        name: entry.model_copy(update={"config": path.parent / entry.config})
+        for name, entry in config.sequences.items()
+        if entry.config is not None and entry.config.suffix
+    }
+    return config.model_copy(update={"sequences": config.sequences | beside})
 
 
-def choose(
-    config: BenchConfig,
-    *,
-    quick: bool = False,
-    frames: slice | None = None,
-    sequences: Sequence[str] = (),
-    methods: Sequence[str] = (),
-    peers: bool = False,
-) -> Choice:
-    """Narrow the evaluation down; what is given beats what `quick` says.
+def make_plan(
+    config: Evaluation, data: Path, options: Options | None = None, *, quick: bool = False, frames: slice | None = None,
+    sequences: Sequence[str] = (), methods: Sequence[str] = (), peers: bool = False,
+    added: Mapping[str, Path] | None = None, commands: Mapping[str, str] | None = None,
+    truth_offset: TruthOffset | None = None, measure: str = "track",
+) -> Plan:  # fmt: skip
+    """Look the sequences up in the folder `data` and list the cells; what is given beats what `quick` says.
 
-    sequences, methods: names, none: all of the config; methods may name any of `rstrack.options.METHODS`, PEERS,
-    CLOUD_PEERS and SLAM_PEERS. peers: add all of the latter three. Raises UserError for names that there are not.
+    sequences, methods: names, none: all of the config; methods may name ours and all peers. peers: all of these too.
+    Each of our methods is run with and without fusion, unless options.fuse says which or it is not errors that are
+    measured. added: results of other trackers by name, each a folder with SEQUENCE.txt (TUM) or SEQUENCE/ (a run
+    folder). commands: other trackers by name, see `rstrack.peers.command`. truth_offset: of the truth's clock. Raises
+    UserError, one line: names that there are not; sequences that are missing or not whole, with how to make them.
     """
+    options, added, commands = options or Options(), added or {}, commands or {}
     subset = config.quick if quick else None
     if quick and subset is None:
         raise UserError("--quick: the config has no section 'quick'")
-    names = sequences or (subset.sequences if subset else [entry.name for entry in config.sequences])
-    known = [entry.name for entry in config.sequences]
-    for name in names:
-        if name not in known:
-            raise UserError(f"--sequence {name}: the config has no such sequence: it has {', '.join(known)}")
-    chosen = list(dict.fromkeys(methods or (subset.methods if subset else config.methods)))
-    others = (*PEERS, *CLOUD_PEERS, *SLAM_PEERS)
+    for name in sequences:
+        if name not in config.sequences:
+            raise UserError(f"--sequence {name}: the config has no such sequence: it has {', '.join(config.sequences)}")
+    asked = sequences or (subset.sequences if subset else tuple(config.sequences))
+    entries = {name: entry for name, entry in config.sequences.items() if name in asked}
+    chosen = chosen_methods(methods or (subset.methods if subset else config.methods), peers)
+    for option, name in (*(("--add", name) for name in added), *(("--peer-command", name) for name in commands)):
+        if name in (*chosen, *METHODS, *OTHERS) or (option == "--peer-command" and name in added):
+            raise UserError(f"{option} {name}=...: there is a method of that name: choose another name")
+    frames = frames or slice(0, subset.frames if subset else None)
+    missing = [name for name, entry in entries.items() if not (data / _folder(name, entry)).is_dir()]
+    if missing:
+        how = "; ".join(_render_command(name, entries[name], data, frames) for name in missing)
+        raise UserError(f"{data}: has no {', '.join(missing)}: leave them out with --sequence, or make them: {how}")
+    of_each = {name: variants(name, options.fuse) for name in chosen}
+    names = [v for found in of_each.values() for v in (found if measure == "track" else found[:1])]
+    run = {name: method_entry(name, options) for name in names}
+    run |= {name: MethodEntry(results=folder) for name, folder in added.items()}
+    run |= {name: MethodEntry(command=command) for name, command in commands.items()}
+    infos, cells = [], []
+    for name, entry in entries.items():
+        dataset = open_dataset(data / _folder(name, entry))
+        if truth_of(dataset) is None:
+            raise UserError(f"{dataset.root}: has no ground truth to compare with: leave it out with --sequence")
+        kept = _kept(dataset, _render_command(name, entry, data, frames), frames)
+        infos.append(SequenceInfo(name, entry.group, dataset.root.resolve(), len(kept)))
+        piece = None if len(kept) == len(dataset) else f"{kept.start}:{kept.stop}"
+        case = CaseEntry(sequence=name, frames=piece, truth_offset=truth_offset)
+        sequence = SequenceEntry(path=_folder(name, entry), group=entry.group)
+        cells += [Cell(measure, name, method, (0,), case, sequence, how, {}) for method, how in run.items()]
+    return Plan(Benchmark(tuple(cells)), tuple(infos), tuple(run))
+
+
+def chosen_methods(methods: Sequence[str], peers: bool = False) -> list[str]:
+    """The methods, each once, and all peers if asked for. Raises UserError for one that there is not."""
+    chosen = list(dict.fromkeys(methods))
     for method in chosen:
-        if method not in (*METHODS, *others):
-            raise UserError(f"no method '{method}': choose from {', '.join((*METHODS, *others))}")
-    chosen += [peer for peer in others if peers and peer not in chosen]
-    if frames is None:
-        frames = slice(0, subset.frames if subset else None)
-    entries = tuple(entry for entry in config.sequences if entry.name in names)
-    return Choice(entries, tuple(chosen), frames.start or 0, frames.stop)
+        if method not in (*METHODS, *OTHERS):
+            raise UserError(f"no method '{method}': choose from {', '.join((*METHODS, *OTHERS))}")
+    return chosen + [peer for peer in OTHERS if peers and peer not in chosen]
+
+
+def method_entry(name: str, options: Options) -> MethodEntry:
+    """The entry of a variant, or of a peer, which has no options."""
+    if method_of(name) not in METHODS:
+        return MethodEntry()
+    return MethodEntry(method=method_of(name), options=given_options(options) | {"fuse": fuses(name)})
+
+
+def given_options(options: Options) -> dict[str, Any]:
+    """Those that are not at their defaults, without the method."""
+    usual = dataclasses.asdict(Options())
+    return {k: v for k, v in dataclasses.asdict(options).items() if k != "method" and v != usual[k]}
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _folder(name: str, entry: SequenceEntry) -> Path:
+    return entry.path or Path(name)
+
+
+def _render_command(name: str, entry: SequenceEntry, data: Path, frames: slice) -> str:
+    few = "" if frames.stop is None else f" --frames {frames.start or 0}:{frames.stop}"
+    return f"rsgen render {entry.config or '...'} --out {data / _folder(name, entry)}{few}"
+
+
+def _kept(dataset: Dataset, command: str, frames: slice) -> range:
+    """The frames that are run. Raises UserError: there are none, or fewer than are wanted have been rendered."""
+    chosen = range(len(dataset))[frames]
+    if dataset.sequence is not None and (frames.stop is None or frames.stop > len(dataset)):
+        there, in_all = min((len(s.paths), s.frames) for s in dataset.sequence.streams.values())
+        if there < in_all:
+            raise UserError(
+                f"{dataset.root}: {there} of {in_all} frames are rendered: finish it with '{command}', leave it out "
+                f"with --sequence, or track what there is with --frames 0:{there}"
+            )
+    if not len(chosen):
+        raise UserError(f"{dataset.root}: has no frame {frames.start}: its frames are 0 to {len(dataset) - 1}")
+    return chosen

@@ -18,10 +18,11 @@ from typing import Any
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, read_text, write_error
-from rstrack.bench.methods.grid import CELL
-from rstrack.bench.methods.plan import SequenceInfo
-from rstrack.bench.methods.results import Cell, Results
-from rstrack.bench.methods.variants import folder_of, method_of
+from rstrack.bench.methods.config import SequenceInfo
+from rstrack.bench.methods.results import Results, figure, folder_of, is_good
+from rstrack.bench.methods.variants import method_of
+from rstrack.bench.record import Record, read_record
+from rstrack.bench.runner import RECORD
 from rstrack.mapping.map import run_map
 from rstrack.options import MapOptions
 
@@ -29,8 +30,8 @@ SHOWN = ("rs-pg", "gs-pg", "baseline")
 """The methods whose maps are compared: ours, the same without its model of the shutter, and the usual way."""
 
 MESH = "mesh.ply"
-# Beside a mesh: what it was made from. Beside a sequence's cells: what its picture shows.
-_MADE_FROM, _PICTURED = "mesh.json", "meshes.json"
+# Beside a mesh: what it was made from.
+_MADE_FROM = "mesh.json"
 
 # Enough to cover what a whole sequence saw; more frames cost time and change little.
 _FRAMES = 80
@@ -58,23 +59,24 @@ def draw_meshes(
     results: Results, out: Path, methods: Sequence[str] = SHOWN, progress: Progress = no_progress,
     warn: Callable[[str], None] = _say,
 ) -> list[Path]:  # fmt: skip
-    """Write cells/SEQUENCE/METHOD/mesh.ply and plots/meshes_SEQUENCE.jpg into `out`; returns the pictures.
+    """Write mesh.ply into the cells' folders, plots/meshes_SEQUENCE.jpg into `out`; returns the pictures.
 
-    out: the folder with the results' cells. methods: those of them whose cells count are shown, in this order, each
+    out: the folder with the results' cells. methods: those of them that kept the track are shown, in this order, each
     with the setting that the tables show. Meshes of the same cells, and pictures of the same meshes, are kept. What
     fails is left out and said to `warn` in one line. Raises KeyboardInterrupt; the same call goes on after that.
     """
-    rows = [(sequence, _cells(results, sequence, methods)) for sequence in results.sequences]
-    rows = [(sequence, cells) for sequence, cells in rows if cells]
-    steps, done, pictures = sum(len(cells) + 1 for _, cells in rows), 0, []
-    for sequence, cells in rows:
-        made: list[tuple[Cell, dict[str, Any]]] = []
-        for cell in cells:
-            report = partial(_report, progress, done, steps, f"{cell.sequence} {cell.method}")
+    rows = [(sequence, _records(results, sequence, methods)) for sequence in results.sequences]
+    rows = [(sequence, records) for sequence, records in rows if records]
+    steps, done, pictures = sum(len(records) + 1 for _, records in rows), 0, []
+    for sequence, records in rows:
+        made: list[dict[str, Any]] = []
+        for record in records:
+            report = partial(_report, progress, done, steps, f"{record.case} {record.method}")
             try:
-                made.append((cell, make_mesh(sequence, cell, out, report)))
+                mesh = make_mesh(sequence, record, out, report)
+                made.append({"cell": record.cell, "method": record.method, "label": _label(record), "mesh": mesh})
             except UserError as error:
-                warn(f"no mesh of {cell.method} on {cell.sequence}: {error}")
+                warn(f"no mesh of {record.method} on {record.case}: {error}")
             done += 1
         progress("meshes", done / steps, f"{sequence.name}, drawing")
         try:
@@ -88,38 +90,39 @@ def draw_meshes(
 
 
 def make_mesh(
-    sequence: SequenceInfo, cell: Cell, out: Path, progress: Callable[[float, str], None] = lambda *_: None
+    sequence: SequenceInfo, record: Record, out: Path, progress: Callable[[float, str], None] = lambda *_: None
 ) -> dict[str, Any]:
-    """Write a cell's mesh.ply, in the truth's world, unless it is there; returns the record of what it was made from.
+    """Write a cell's mesh.ply, in the truth's world, unless it is there; returns what it was made from.
 
     progress: called with the fraction done and a note. Raises UserError: a frame or the run cannot be read, or the mesh
     not be written.
     """
-    folder = out / cell.folder
+    folder = out / folder_of(record)
     every = max(1, round(sequence.frames / _FRAMES))
     # Where there is no spline a map takes the shutter for a global one anyway.
-    options = MapOptions(shutter="gs" if method_of(cell.method).startswith("gs-") else None, every=every)
-    record: dict[str, Any] = {"cell": cell.key, "options": dataclasses.asdict(options)}
-    if (folder / MESH).is_file() and _read(folder / _MADE_FROM) == record:
-        return record
+    options = MapOptions(shutter="gs" if method_of(record.method).startswith("gs-") else None, every=every)
+    made: dict[str, Any] = {"key": record.key, "options": dataclasses.asdict(options)}
+    if (folder / MESH).is_file() and _read(folder / _MADE_FROM) == made:
+        return made
     _remove(folder / _MADE_FROM)  # first: a mesh of another cell must not be taken for this one's after an interrupt
     run_map(
         sequence.path, folder, folder / MESH, options,
         progress=lambda stage, fraction, note: progress(0.9 * fraction if stage == "integrating" else 0.9, stage),
     )  # fmt: skip
-    atomic_write(folder / _MADE_FROM, _json(record))
-    return record
+    atomic_write(folder / _MADE_FROM, _json(made))
+    return made
 
 
 def read_picture(out: Path, sequence: str) -> MeshPicture | None:
     """What there is of a sequence; None if there is no picture, or only one of cells that have been run again since."""
-    record, path = _read(out / "cells" / sequence / _PICTURED), _picture_path(out, sequence)
+    path = _picture_path(out, sequence)
+    pictured = _read(path.with_suffix(".json"))
     try:
-        width, height = record["panel_px"]
-        parts = record["meshes"]
-        current = all(
-            _read(out / "cells" / sequence / folder_of(p["method"]) / CELL)["key"] == p["mesh"]["cell"] for p in parts
-        )
+        width, height = pictured["panel_px"]
+        parts = pictured["meshes"]
+        records = [read_record(out / "cells" / p["cell"] / RECORD) for p in parts]
+        pairs = zip(records, parts, strict=True)
+        current = all(record is not None and record.key == part["mesh"]["key"] for record, part in pairs)
         methods, labels = tuple(str(p["method"]) for p in parts), tuple(str(p["label"]) for p in parts)
         found = MeshPicture(path, (int(width), int(height)), methods, labels)
     except (KeyError, TypeError, ValueError):
@@ -134,41 +137,39 @@ def _report(progress: Progress, done: int, steps: int, name: str, fraction: floa
     progress("meshes", (done + fraction) / steps, f"{name}, {note}")
 
 
-def _cells(results: Results, sequence: SequenceInfo, methods: Sequence[str]) -> list[Cell]:
+def _records(results: Results, sequence: SequenceInfo, methods: Sequence[str]) -> list[Record]:
     shown = results.shown(sequence.group)
-    found = [results.cell(sequence.name, shown[method]) for method in methods if method in shown]
-    return [cell for cell in found if cell is not None and cell.counts]
+    found = [results.record(sequence.name, shown[method]) for method in methods if method in shown]
+    return [record for record in found if record is not None and is_good(record)]
 
 
-def _label(cell: Cell) -> str:
-    ate_m = cell.figure("ate_rmse_m")
-    return cell.method if ate_m is None else f"{cell.method}, ATE {1e3 * ate_m:.3g} mm"
+def _label(record: Record) -> str:
+    ate_mm = figure(record, "ate_mm")
+    return record.method if ate_mm is None else f"{record.method}, ATE {ate_mm:.3g} mm"
 
 
 def _picture_path(out: Path, sequence: str) -> Path:
     return out / "plots" / f"meshes_{sequence}.jpg"
 
 
-def _draw(sequence: str, made: Sequence[tuple[Cell, dict[str, Any]]], out: Path) -> Path:
+def _draw(sequence: str, parts: list[dict[str, Any]], out: Path) -> Path:
     """The picture of a sequence's meshes, drawn unless it is there. Raises UserError."""
-    path, pictured = _picture_path(out, sequence), out / "cells" / sequence / _PICTURED
-    parts: list[dict[str, Any]] = [
-        {"method": cell.method, "label": _label(cell), "mesh": record} for cell, record in made
-    ]
-    record: dict[str, Any] = {"panel_px": list(_PANEL_PX), "meshes": parts}
-    if path.is_file() and _read(pictured) == record:
+    path = _picture_path(out, sequence)
+    about = path.with_suffix(".json")
+    pictured: dict[str, Any] = {"panel_px": list(_PANEL_PX), "meshes": parts}
+    if path.is_file() and _read(about) == pictured:
         return path
-    _remove(pictured)
+    _remove(about)
     # Mitsuba draws, which the tracker's process never loads.
     command = [sys.executable, "-m", "rsgen", "picture", "--quiet", f"--out={path.resolve()}"]
     command += [f"--width={_PANEL_PX[0]}", f"--height={_PANEL_PX[1]}"]
     command += [f"--label={part['label']}" for part in parts]
-    command += [str((out / "cells" / sequence / folder_of(part["method"]) / MESH).resolve()) for part in parts]
+    command += [str((out / "cells" / part["cell"] / MESH).resolve()) for part in parts]
     done = subprocess.run(command, capture_output=True, text=True, errors="replace")
     if done.returncode != 0:
         said = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
         raise UserError(f"rsgen picture: {said[-1].removeprefix('rsgen: ')}")
-    atomic_write(pictured, _json(record))
+    atomic_write(about, _json(pictured))
     return path
 
 

@@ -18,11 +18,11 @@ NAMES: dict[str, str] = {
 
 @dataclass(frozen=True)
 class Figures:
-    """RMSE of one method on one sequence: drift over a second (RPE) in m/s and deg/s, ATE in m."""
+    """RMSE of one method on one sequence, named as those of our records; drift is over a second (RPE)."""
 
-    rpe_m_s: float
-    rpe_deg_s: float
-    ate_m: float
+    drift_mm_s: float
+    drift_deg_s: float
+    ate_mm: float
 
 
 # A line is a sequence; its columns are the methods in the order of NAMES, each "m/s deg/s m".
@@ -46,7 +46,8 @@ def _parse(table: str) -> dict[tuple[str, str], Figures]:
         sequence, *numbers = line.split()
         values = [float(number) for number in numbers]
         for k, method in enumerate(NAMES):
-            figures[sequence, method] = Figures(*values[3 * k : 3 * k + 3])
+            m_s, deg_s, m = values[3 * k : 3 * k + 3]
+            figures[sequence, method] = Figures(1e3 * m_s, deg_s, 1e3 * m)
     return figures
 
 
@@ -59,5 +60,5 @@ def average(sequences: Sequence[str], method: str) -> Figures | None:
     found = [FIGURES[sequence, method] for sequence in sequences if (sequence, method) in FIGURES]
     if not found or len(found) < len(sequences):
         return None
-    means = (statistics.fmean(getattr(f, name) for f in found) for name in ("rpe_m_s", "rpe_deg_s", "ate_m"))
+    means = (statistics.fmean(getattr(f, name) for f in found) for name in ("drift_mm_s", "drift_deg_s", "ate_mm"))
     return Figures(*means)

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from rsgen.console.progress import Progress, no_progress
 from rstrack.bench.methods import paper
-from rstrack.bench.methods.plan import SequenceInfo
-from rstrack.bench.methods.results import QUANTITIES, Results
+from rstrack.bench.methods.config import SequenceInfo
+from rstrack.bench.methods.results import QUANTITIES, Results, folder_of, truth_offset_s
 from rstrack.charts.chart import Bars, Chart, method_colors, numbers
 from rstrack.charts.runs import compared_errors, path_chart
 from rstrack.charts.to_file import write_charts
@@ -38,8 +38,8 @@ def ate_chart(results: Results) -> Chart:
     for row in rows:
         ours = [results.figure(name, variants[row], ate) for name, variants in zip(names, shown, strict=True)]
         figures = [paper.FIGURES.get((name, row)) for name in names]
-        theirs = numbers([None if f is None else f.ate_m for f in figures], ate.scale)
-        bars.append(Bars(row, colors[row], numbers(ours, ate.scale), theirs))
+        theirs = numbers([None if f is None else f.ate_mm for f in figures])
+        bars.append(Bars(row, colors[row], numbers(ours), theirs))
     note = "Logarithmic. Marks on the bars: the paper's figures for that method, in its own rooms."
     if any(row != name for variants in shown for row, name in variants.items()):
         note += " Without a model of the shutter: with or without fused keyframes, whichever is better in the group."
@@ -50,11 +50,11 @@ def ate_chart(results: Results) -> Chart:
 def draw_sequence(results: Results, sequence: SequenceInfo, out: Path, path: Path) -> bool:
     """Paths from above and errors over time of what the tables show of one sequence; False if there is none to draw."""
     dataset = open_dataset(sequence.path)
-    cells = [results.cell(sequence.name, variant) for variant in results.shown(sequence.group).values()]
+    records = [results.record(sequence.name, variant) for variant in results.shown(sequence.group).values()]
     runs = {
-        c.method: load_run(out / c.folder, dataset=dataset, truth_offset=c.truth_offset_s)
-        for c in cells
-        if c is not None and c.metrics
+        r.method: load_run(out / folder_of(r), dataset=dataset, truth_offset=truth_offset_s(r))
+        for r in records
+        if r is not None and r.error is None and QUANTITIES[0].name in r.figures
     }
     runs = {method: run for method, run in runs.items() if run.found is not None}
     if runs:

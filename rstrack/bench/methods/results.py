@@ -1,21 +1,19 @@
-"""What `rstrack bench` found: cells, their averages, and results.json, which is written and read again here."""
+"""What `rstrack bench` found: a view on its records, their averages, and results.json, written and read again here."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
 from rsgen.errors import UserError, first_problem
-from rsgen.files import read_text
+from rsgen.files import atomic_write, read_text
 from rstrack.bench.methods import paper
-from rstrack.bench.methods.plan import SequenceInfo
-from rstrack.bench.methods.variants import folder_of, fuses, method_of, row_of
-from rstrack.data.estimate import plain
-from rstrack.metrics.clock import TruthOffset
+from rstrack.bench.methods.config import SequenceInfo
+from rstrack.bench.methods.variants import method_of, row_of
+from rstrack.bench.record import Record
 from rstrack.options import METHODS
 
 RESULTS = "results.json"
@@ -27,80 +25,65 @@ _LEAST_COVERAGE = 0.5
 
 @dataclass(frozen=True)
 class Quantity:
-    """What a table is of. name: in files, with its unit; metric: in `Metrics`; the rest is for reading."""
+    """What a table is of. name: of the figure in records and in the paper's; the rest is for reading."""
 
     name: str
-    metric: str
     title: str
     unit: str
-    scale: float
     paper_digits: int
 
 
 QUANTITIES = (
-    Quantity("ate_m", "ate_rmse_m", "ATE", "mm", 1e3, 1),
-    Quantity("rpe_m_s", "rpe_trans_rmse_m_per_s", "drift", "mm/s", 1e3, 1),
-    Quantity("rpe_deg_s", "rpe_rot_rmse_deg_per_s", "drift", "deg/s", 1.0, 3),
+    Quantity("ate_mm", "ATE", "mm", 1),
+    Quantity("drift_mm_s", "drift", "mm/s", 1),
+    Quantity("drift_deg_s", "drift", "deg/s", 3),
 )
 """RMSE all of them; drift is the relative pose error over one second."""
 
 
-@dataclass(frozen=True)
-class Cell:
-    """What a job came to.
-
-    method: a variant, see `variants`. metrics: `Metrics.as_dict()`, None if fewer than three frames have a pose.
-    frames: asked for; lost: those of them without a pose. seconds: wall clock of tracking with reading, None if not
-    known. error: why it could not be run. truth_offset: of the truth's clock, as it was asked for; truth_offset_s: that
-    of the metrics, None for clocks as they are.
-    """
-
-    key: str
-    sequence: str
-    method: str
-    metrics: dict[str, Any] | None
-    frames: int
-    lost: int
-    seconds: float | None
-    error: str | None = None
-    truth_offset: TruthOffset | None = None
-    truth_offset_s: float | None = None
-
-    @property
-    def counts(self) -> bool:
-        """Whether its figures mean something: at least half of the frames have a pose."""
-        return self.metrics is not None and self.lost <= (1.0 - _LEAST_COVERAGE) * self.frames
-
-    @property
-    def folder(self) -> Path:
-        """Of its run, relative to that of the results."""
-        return Path("cells", self.sequence, folder_of(self.method))
-
-    def figure(self, name: str) -> float | None:
-        """A figure of `metrics` by name; None where the track is lost or lacks it."""
-        value = self.metrics.get(name) if self.metrics is not None and self.counts else None
-        return None if value is None else float(value)
+def counts(figures: Mapping[str, float | None]) -> bool:
+    """Whether a run's errors mean something: at least half of the frames have a pose."""
+    frames, lost = figures.get("frames") or 0.0, figures.get("lost") or 0.0
+    return figures.get(QUANTITIES[0].name) is not None and lost <= (1.0 - _LEAST_COVERAGE) * frames
 
 
-@dataclass(frozen=True)
-class Results:
-    """What there is of a plan. methods: variants of all methods; interrupted: some cells are missing."""
+def figure(record: Record | None, name: str) -> float | None:
+    """A figure of a record; None where it failed, the track is lost or lacks it."""
+    if record is None or record.error is not None:
+        return None
+    return record.figures.get(name) if counts(record.figures) else None
+
+
+def is_good(record: Record) -> bool:
+    """Whether it has run and kept the track."""
+    return record.error is None and counts(record.figures)
+
+
+def folder_of(record: Record) -> Path:
+    """Of its run, relative to that of the results."""
+    return Path("cells", record.cell)
+
+
+def truth_offset_s(record: Record) -> float | None:
+    """The offset of the truth's clock that the errors are for, s; None for clocks as they are."""
+    offset_ms = record.figures.get("truth_offset_ms")
+    return None if offset_ms is None else 1e-3 * offset_ms
+
+
+class Results(BaseModel, frozen=True):
+    """What there is of a plan, as results.json has it. methods: variants of all methods. records: by cells' order."""
 
     sequences: tuple[SequenceInfo, ...]
     methods: tuple[str, ...]
-    cells: tuple[Cell, ...]
-    machine: dict[str, Any]
-    version: str
-    interrupted: bool = False
+    records: tuple[Record, ...]
 
-    def cell(self, sequence: str, method: str) -> Cell | None:
-        """The cell, None if it was not run."""
-        return next((c for c in self.cells if (c.sequence, c.method) == (sequence, method)), None)
+    def record(self, sequence: str, method: str) -> Record | None:
+        """The record of a cell, None if it was not run."""
+        return next((r for r in self.records if (r.case, r.method) == (sequence, method)), None)
 
     def figure(self, sequence: str, method: str, quantity: Quantity) -> float | None:
         """Of a cell; None where it has none."""
-        cell = self.cell(sequence, method)
-        return None if cell is None else cell.figure(quantity.metric)
+        return figure(self.record(sequence, method), quantity.name)
 
     @property
     def groups(self) -> tuple[str, ...]:
@@ -145,6 +128,11 @@ class Average:
     values: dict[str, float | None]
     better_pct: dict[str, float | None]
 
+    @property
+    def theirs(self) -> paper.Figures | None:
+        """The paper's average over the same sequences."""
+        return paper.average(self.sequences, row_of(self.method))
+
 
 def averaged_sequences(results: Results, group: str) -> tuple[str, ...]:
     """The sequences of a group on which every one of our methods that are shown kept the track: averages are over them.
@@ -153,8 +141,8 @@ def averaged_sequences(results: Results, group: str) -> tuple[str, ...]:
     """
     shown = list(results.shown(group).values())
     ours = [name for name in shown if method_of(name) in METHODS] or shown
-    cells = {name: [results.cell(name, method) for method in ours] for name in results.names(group)}
-    return tuple(name for name, row in cells.items() if all(cell is not None and cell.counts for cell in row))
+    rows = {name: [results.record(name, method) for method in ours] for name in results.names(group)}
+    return tuple(name for name, row in rows.items() if all(r is not None and is_good(r) for r in row))
 
 
 def averages(results: Results) -> list[Average]:
@@ -178,74 +166,17 @@ def better_pct(value: float | None, baseline: float | None) -> float | None:
     return None if value is None or not baseline else 100.0 * (1.0 - value / baseline)
 
 
-def results_dict(results: Results) -> dict[str, Any]:
-    """For results.json: metres, m/s, deg/s; `run` is relative to its folder."""
-    names = [sequence.name for sequence in results.sequences]
-    data = {
-        "machine": results.machine,
-        "version": results.version,
-        "sequences": [vars(sequence) for sequence in results.sequences],
-        "methods": list(results.methods),
-        "cells": [
-            {"sequence": c.sequence, "method": c.method, "fuse": fuses(c.method), "run": c.folder.as_posix()}
-            | {q.name: c.figure(q.metric) for q in QUANTITIES}
-            | {"frames": c.frames, "lost": c.lost, "seconds": c.seconds, "error": c.error}
-            | {"truth_offset": c.truth_offset, "truth_offset_s": c.truth_offset_s}
-            for c in results.cells
-        ],
-        "shown": {group: list(results.shown(group).values()) for group in results.groups},
-        "averages": [
-            {"group": a.group, "method": a.method, "sequences": a.sequences, **a.values, "better_pct": a.better_pct}
-            for a in averages(results)
-        ],
-        "paper": [
-            {"sequence": name, "method": method} | {q.name: getattr(figures, q.name) for q in QUANTITIES}
-            for (name, method), figures in paper.FIGURES.items()
-            if name in names and method in {row_of(variant) for variant in results.methods}
-        ],
-    }
-    plain_data: dict[str, Any] = plain(data)
-    return plain_data
-
-
-class _StoredCell(BaseModel):
-    """Figures are None where the track is lost or the cell could not be run."""
-
-    sequence: str
-    method: str
-    ate_m: float | None = None
-    rpe_m_s: float | None = None
-    rpe_deg_s: float | None = None
-    frames: int
-    lost: int
-    seconds: float | None = None
-    error: str | None = None
-    truth_offset: TruthOffset | None = None
-    truth_offset_s: float | None = None
-
-    def cell(self) -> Cell:
-        figures = {q.metric: getattr(self, q.name) for q in QUANTITIES}
-        metrics = None if self.ate_m is None else figures
-        clock = (self.truth_offset, self.truth_offset_s)
-        return Cell("", self.sequence, self.method, metrics, self.frames, self.lost, self.seconds, self.error, *clock)
-
-
-class _StoredResults(BaseModel):
-    sequences: tuple[SequenceInfo, ...]
-    methods: tuple[str, ...]
-    cells: tuple[_StoredCell, ...]
-    machine: dict[str, Any] = {}
-    version: str = ""
+def write_json(results: Results, out: Path) -> None:
+    """Write results.json. Raises UserError."""
+    atomic_write(out / RESULTS, (results.model_dump_json(indent=1) + "\n").encode())
 
 
 def read_results(path: Path) -> Results:
-    """Read and check results.json, averages aside, which follow. Raises UserError naming the first wrong field."""
+    """Read and check results.json. Raises UserError naming the first wrong field."""
     try:
-        stored = _StoredResults.model_validate_json(read_text(path))
+        return Results.model_validate_json(read_text(path))
     except ValidationError as error:
         raise UserError(f"{path}: {first_problem(error)}: run 'rstrack bench' again") from None
-    cells = tuple(cell.cell() for cell in stored.cells)
-    return Results(stored.sequences, stored.methods, cells, stored.machine, stored.version)
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

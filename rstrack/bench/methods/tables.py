@@ -1,8 +1,7 @@
-"""The tables of `rstrack bench`: text, Markdown, CSV and JSON, with the paper's figures beside ours."""
+"""The tables of `rstrack bench`: text, Markdown and CSV, with the paper's figures beside ours; and those of speed."""
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,19 +11,23 @@ from typing import Any
 from rsgen.console.tables import NOTHING, Entry, Table, best_marked, csv_text, fixed, significant
 from rsgen.files import atomic_write
 from rstrack.bench.methods import paper
+from rstrack.bench.methods.config import SequenceInfo
 from rstrack.bench.methods.results import (
     BASELINE,
     QUANTITIES,
-    RESULTS,
-    Cell,
     Quantity,
     Results,
     averaged_sequences,
     averages,
     better_pct,
-    results_dict,
+    counts,
+    figure,
+    is_good,
+    truth_offset_s,
+    write_json,
 )
 from rstrack.bench.methods.variants import fuses, row_of
+from rstrack.bench.record import Record
 
 
 def write_results(results: Results, out: Path) -> str:
@@ -34,33 +37,26 @@ def write_results(results: Results, out: Path) -> str:
     atomic_write(out / "results.csv", results_csv(results).encode())
     atomic_write(out / "results.md", results_markdown(results).encode())
     atomic_write(out / "results.txt", (text + "\n").encode())
-    atomic_write(out / RESULTS, (json.dumps(results_dict(results), indent=1) + "\n").encode())
+    write_json(results, out)
     return text
 
 
 def results_csv(results: Results) -> str:
     """One line a cell, then one an average; better_*_pct: how much smaller than the baseline's, per cent."""
     groups = {sequence.name: sequence.group for sequence in results.sequences}
-    records: list[dict[str, Any]] = []
-    for c in results.cells:
-        values = {q.name: c.figure(q.metric) for q in QUANTITIES}
-        baseline = results.shown(groups[c.sequence]).get(BASELINE, "")
-        base = {q.name: results.figure(c.sequence, baseline, q) for q in QUANTITIES}
-        records.append(
-            {"group": groups[c.sequence], "sequence": c.sequence, "method": c.method, "fuse": fuses(c.method), **values}
-            | {f"better_{name}_pct": better_pct(value, base[name]) for name, value in values.items()}
-            | {"frames": c.frames, "lost": c.lost, "seconds": c.seconds, "error": c.error}
-            | {"truth_offset_s": c.truth_offset_s}
-            | _of_paper(paper.FIGURES.get((c.sequence, row_of(c.method))))
-        )
+    rows: list[dict[str, Any]] = []
+    for r in results.records:
+        group, figures = groups[r.case], r.figures
+        baseline = results.record(r.case, results.shown(group).get(BASELINE, ""))
+        values = {q.name: figure(r, q.name) for q in QUANTITIES}
+        better = {name: better_pct(value, figure(baseline, name)) for name, value in values.items()}
+        about = {name: figures.get(key) for name, key in (("frames", "frames"), ("lost", "lost"))}
+        about |= {"seconds": figures.get("total_s"), "truth_offset_ms": figures.get("truth_offset_ms")}
+        theirs = paper.FIGURES.get((r.case, row_of(r.method)))
+        rows.append(_csv_row(group, r.case, r.method, values, better, about | {"error": r.error}, theirs))
     for a in averages(results):
-        records.append(
-            {"group": a.group, "sequence": "average", "method": a.method, "fuse": fuses(a.method), **a.values}
-            | {f"better_{name}_pct": value for name, value in a.better_pct.items()}
-            | dict.fromkeys(("frames", "lost", "seconds", "error", "truth_offset_s"))
-            | _of_paper(paper.average(a.sequences, row_of(a.method)))
-        )
-    return csv_text(records)
+        rows.append(_csv_row(a.group, "average", a.method, a.values, a.better_pct, {}, a.theirs))
+    return csv_text(rows)
 
 
 def results_text(results: Results) -> str:
@@ -99,19 +95,17 @@ def sequence_table(results: Results, group: str, quantity: Quantity) -> Table:
 def notes(results: Results) -> list[str]:
     """What has to be said about the figures, one line each: frames, losses, failures, averages, the machine."""
     lines = ["frames: " + ", ".join(f"{sequence.name} {sequence.frames}" for sequence in results.sequences)]
-    some = [c for c in results.cells if c.counts and c.lost]
+    done = [(r, r.figures) for r in results.records if r.error is None]
+    some = [f"{_where(r)} {f['lost']:.0f}" for r, f in done if counts(f) and f["lost"]]
     if some:
-        lines.append("† frames lost: " + ", ".join(f"{c.method} on {c.sequence} {c.lost}" for c in some))
-    lost = [c for c in results.cells if not c.counts and c.error is None]
+        lines.append("† frames lost: " + ", ".join(some))
+    lost = [
+        f"{_where(r)} (poses for {f['frames'] - f['lost']:.0f} of {f['frames']:.0f})" for r, f in done if not counts(f)
+    ]
     if lost:
-        listed = ", ".join(f"{c.method} on {c.sequence} (poses for {c.frames - c.lost} of {c.frames})" for c in lost)
-        lines.append(f"lost (fewer than half of the frames have a pose): {listed}")
-    failed: dict[str, list[str]] = defaultdict(list)
-    for c in results.cells:
-        if c.error is not None:
-            failed[c.error].append(f"{c.method} on {c.sequence}")
-    lines += [f"failed: {', '.join(cells)}: {error}" for error, cells in failed.items()]
-    if len(results.cells) < len(results.sequences) * len(results.methods):
+        lines.append(f"lost (fewer than half of the frames have a pose): {', '.join(lost)}")
+    lines += failures(results.records)
+    if len(results.records) < len(results.sequences) * len(results.methods):
         lines.append("not run yet (-): the same command goes on where this one ended")
     for group in results.groups:
         names = averaged_sequences(results, group)
@@ -126,12 +120,57 @@ def notes(results: Results) -> list[str]:
             "recordings and renderings of such motions; rooms and images differ: compare the orders, not the digits"
         )
     lines.append("all figures are RMSE; drift is over one second; 'better by' compares averages with the baseline's")
-    m = results.machine
-    lines.append(f"version {results.version}; {m.get('cpu')}, {m.get('cpu_count')} CPUs, {m.get('system')}")
-    return lines
+    return [*lines, *made_on(results.records)]
+
+
+def failures(records: Sequence[Record]) -> list[str]:
+    """A line for each error, with the cells that have it."""
+    failed: dict[str, list[str]] = defaultdict(list)
+    for record in records:
+        if record.error is not None:
+            failed[record.error].append(_where(record))
+    return [f"failed: {', '.join(cells)}: {error}" for error, cells in failed.items()]
+
+
+def made_on(records: Sequence[Record]) -> list[str]:
+    """A line about version and machine; of the first record."""
+    machine = [(r.version, r.machine) for r in records][:1]
+    return [f"version {v}; {m.get('cpu')}, {m.get('cores')} CPUs, {m.get('system')}" for v, m in machine]
+
+
+_SPEED = (
+    ("median", "median_ms"), ("95 %", "p95_ms"), ("99 %", "p99_ms"), ("reading", "read_ms"), ("peer", "peer_ms"),
+    ("times peer", "ratio"),
+)  # fmt: skip
+
+
+def speed_text(records: Sequence[Record], sequences: Sequence[SequenceInfo]) -> str:
+    """Milliseconds a frame, a table for each sequence, of records of the measure `speed`."""
+    blocks = []
+    for sequence in sequences:
+        found = {r.method: r.figures for r in records if r.case == sequence.name and r.error is None}
+        columns = [(title, name) for title, name in _SPEED if any(name in figures for figures in found.values())]
+        rows = [(method, *(fixed(figures.get(name), 2) for _, name in columns)) for method, figures in found.items()]
+        head = (f"{sequence.name}, {sequence.frames} frames: ms a frame", *(title for title, _ in columns))
+        blocks.append(Table(head, tuple(rows)).text())
+    return "\n\n".join([*blocks, "\n".join([*failures(records), *made_on(records)])])
 
 
 # ---------------------------------------------------------------------------------------------------------------------
+
+
+def _where(record: Record) -> str:
+    return f"{record.method} on {record.case}"
+
+
+def _csv_row(
+    group: str, sequence: str, method: str, values: dict[str, float | None], better: dict[str, float | None],
+    about: dict[str, Any], theirs: paper.Figures | None,
+) -> dict[str, Any]:  # fmt: skip
+    row: dict[str, Any] = {"group": group, "sequence": sequence, "method": method, "fuse": fuses(method), **values}
+    row |= {f"better_{name}_pct": value for name, value in better.items()}
+    row |= {name: about.get(name) for name in ("frames", "lost", "seconds", "error", "truth_offset_ms")}
+    return row | {f"paper_{q.name}": None if theirs is None else getattr(theirs, q.name) for q in QUANTITIES}
 
 
 def _settings(results: Results) -> list[str]:
@@ -142,7 +181,7 @@ def _settings(results: Results) -> list[str]:
         shown = set(results.shown(group).values())
         others = [name for name in results.methods if name not in shown]
         if others:
-            listed = ", ".join(f"{name} {significant(by[group, name], 3, ate.scale)}" for name in others)
+            listed = ", ".join(f"{name} {significant(by[group, name], 3)}" for name in others)
             lines.append(
                 f"{group}: methods that take the rolling shutter for a global one are shown with or without fused "
                 f"keyframes, whichever is better (average {ate.title}, {ate.unit}; the other one: {listed})"
@@ -152,13 +191,13 @@ def _settings(results: Results) -> list[str]:
 
 def _clocks(results: Results) -> list[str]:
     """What was asked for of the truth's clock, and where no offset was found."""
-    asked = [c for c in results.cells if c.truth_offset is not None]
+    asked = [(r, offset) for r in results.records if (offset := r.settings["case"].get("truth_offset")) is not None]
     if not asked:
         return []
-    offset = asked[0].truth_offset
+    offset = asked[0][1]
     how = "the offset of least drift, for each cell" if offset == "auto" else f"looked up {offset:g} s after the stamps"
-    lines = [f"the truth's clock: {how} (truth_offset_s in results.csv)"]
-    without = ", ".join(f"{c.method} on {c.sequence}" for c in asked if c.counts and c.truth_offset_s is None)
+    lines = [f"the truth's clock: {how} (truth_offset_ms in results.csv)"]
+    without = ", ".join(_where(r) for r, _ in asked if is_good(r) and truth_offset_s(r) is None)
     if without:
         lines.append(f"no offset of the truth's clock was found, errors are those of the clocks as they are: {without}")
     return lines
@@ -173,24 +212,23 @@ def _columns(results: Results, group: str, quantity: Quantity) -> dict[str, list
     columns = {}
     shown = results.shown(group)
     for name in results.names(group):
-        cells = [results.cell(name, variant) for variant in shown.values()]
-        values = [results.figure(name, variant, quantity) for variant in shown.values()]
+        records = [results.record(name, variant) for variant in shown.values()]
+        values = [figure(record, quantity.name) for record in records]
         theirs = [paper.FIGURES.get((name, row)) for row in shown]
         entries = _entries(quantity, values, theirs)
-        entries = [_marked(entry, cell) for entry, cell in zip(entries, cells, strict=True)]
+        entries = [_marked(entry, record) for entry, record in zip(entries, records, strict=True)]
         columns[name] = best_marked(entries, values)
     by_name = {a.method: a for a in averages(results) if a.group == group}
     mean = [by_name[variant] for variant in shown.values()]
     values = [a.values[quantity.name] for a in mean]
-    theirs = [paper.average(a.sequences, row) for a, row in zip(mean, shown, strict=True)]
-    columns["average"] = best_marked(_entries(quantity, values, theirs), values)
+    columns["average"] = best_marked(_entries(quantity, values, [a.theirs for a in mean]), values)
     if BASELINE in shown and len(shown) > 1:
         base = paper.average(averaged_sequences(results, group), BASELINE)
         columns["better by"] = [
             Entry("")
             if a.method == shown[BASELINE]
-            else Entry(_percent(a.better_pct[quantity.name]), note=_better_in_paper(figures, base, quantity))
-            for a, figures in zip(mean, theirs, strict=True)
+            else Entry(_percent(a.better_pct[quantity.name]), note=_better_in_paper(a.theirs, base, quantity))
+            for a in mean
         ]
     return columns
 
@@ -199,17 +237,19 @@ def _entries(quantity: Quantity, values: Sequence[float | None], theirs: Sequenc
     entries = []
     for value, figures in zip(values, theirs, strict=True):
         of_paper = None if figures is None else getattr(figures, quantity.name)
-        note = "" if figures is None else fixed(of_paper, quantity.paper_digits, quantity.scale)
+        note = "" if figures is None else fixed(of_paper, quantity.paper_digits)
         is_worse = value is not None and of_paper is not None and value > of_paper
-        entries.append(Entry(significant(value, 3, quantity.scale), note=note, is_worse=is_worse))
+        entries.append(Entry(significant(value, 3), note=note, is_worse=is_worse))
     return entries
 
 
-def _marked(entry: Entry, cell: Cell | None) -> Entry:
+def _marked(entry: Entry, record: Record | None) -> Entry:
     """With what became of the cell."""
-    if cell is not None and not cell.counts:
-        return replace(entry, text="lost" if cell.error is None else "failed")
-    return replace(entry, mark="†" if cell is not None and cell.lost else "")
+    if record is None:
+        return entry
+    if not is_good(record):
+        return replace(entry, text="lost" if record.error is None else "failed")
+    return replace(entry, mark="†" if record.figures["lost"] else "")
 
 
 def _better_in_paper(figures: paper.Figures | None, base: paper.Figures | None, quantity: Quantity) -> str:
@@ -220,7 +260,3 @@ def _better_in_paper(figures: paper.Figures | None, base: paper.Figures | None, 
 
 def _percent(value: float | None) -> str:
     return NOTHING if value is None else f"{value:.0f} %"
-
-
-def _of_paper(figures: paper.Figures | None) -> dict[str, Any]:
-    return {f"paper_{q.name}": None if figures is None else getattr(figures, q.name) for q in QUANTITIES}

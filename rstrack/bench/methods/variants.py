@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from rstrack.options import METHODS
 
-_FUSE, _NO_FUSE = " --fuse", " --no-fuse"
+_FUSE, _NO_FUSE = "-fuse", "-no-fuse"
 
 
 def variants(method: str, fuse: bool | None) -> tuple[str, ...]:
@@ -19,7 +19,7 @@ def variants(method: str, fuse: bool | None) -> tuple[str, ...]:
     """
     if method not in METHODS:
         return (method,)
-    names = (method, method + _NO_FUSE) if _is_rolling(method) else (method, method + _FUSE)
+    names = (method, method + (_NO_FUSE if _is_rolling(method) else _FUSE))
     return tuple(name for name in names if fuse is None or fuses(name) == fuse)
 
 
@@ -32,12 +32,7 @@ def fuses(name: str) -> bool | None:
     """`Options.fuse` of a variant; None: not one of our methods."""
     if method_of(name) not in METHODS:
         return None
-    return name.endswith(_FUSE) or (_is_rolling(name) and not name.endswith(_NO_FUSE))
-
-
-def folder_of(name: str) -> str:
-    """The variant's folder within a sequence's cells."""
-    return name.replace(" --", "_")
+    return not name.endswith(_NO_FUSE) and (name.endswith(_FUSE) or _is_rolling(name))
 
 
 def row_of(name: str) -> str:

@@ -1,7 +1,7 @@
-"""What the readout sweep is to run: its YAML file, and what the command line narrows it down to.
+"""What the readout sweep is to run: its YAML file, what the command line narrows it down to, and its cells.
 
-config = load_sweep_config(Path("configs/readout_sweep.yaml"))
-sweep = narrow(config, width=320, readouts_s=(0.0, 0.028))
+config = narrow(load_sweep_config(Path("configs/readout_sweep.yaml")), width=320, readouts_s=(0.0, 0.028))
+outcome = run_cells(sweep_benchmark(config, config.methods), Path("out/readout_sweep"), Sources())
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,11 +17,14 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from rsgen.errors import UserError, first_problem
 from rsgen.files import read_yaml
-from rstrack.bench.methods.config import Name
-from rstrack.options import CLOUD_PEERS, METHODS, PEERS, SLAM_PEERS
+from rstrack.bench.definitions import OTHERS, Benchmark, CaseEntry, Cell, Name, NoiseEntry, SequenceEntry
+from rstrack.bench.measures.track import package_of
+from rstrack.bench.methods.config import method_entry
+from rstrack.bench.methods.variants import variants
+from rstrack.options import METHODS, Options
 
-_PACKAGES = {"kiss-icp": "kiss_icp", "small-gicp": "small_gicp", "orb-slam3": "pyorbslam3"}
 Seconds = Annotated[float, Field(ge=0.0, le=1.0)]
+STREAMS = ("color", "depth")
 
 
 class _Section(BaseModel):
@@ -35,11 +39,9 @@ class MotionEntry(_Section):
     overrides: dict[str, Any] = Field(default={}, description="fields of the config that are to be others")
 
 
-class NoiseEntry(_Section):
-    """What is added to images when they are read, see `rstrack.data.noise.with_noise`."""
+class SweepNoise(NoiseEntry):
+    """What is added to images when they are read, and how many times."""
 
-    depth: float = Field(default=0.0, ge=0.0, description="sigma of depth z is this times z squared, 1/m")
-    intensity: float = Field(default=0.0, ge=0.0, description="sigma of grey values in [0, 1]")
     seeds: int = Field(default=3, ge=1, le=1000, description="how many times, each with other noise")
 
 
@@ -50,7 +52,7 @@ class SweepConfig(_Section):
     overrides: dict[str, Any] = Field(default={}, description="fields of all their configs")
     readouts_s: tuple[Seconds, ...] = Field(min_length=1, description="of both cameras, s")
     exposures_s: tuple[Seconds, ...] = Field(default=(0.0,), min_length=1, description="of both cameras, s")
-    noise: NoiseEntry = Field(default=NoiseEntry(), description="of the images")
+    noise: SweepNoise = Field(default=SweepNoise(), description="of the images")
     methods: tuple[Name, ...] = Field(min_length=1, description="what tracks them, in the order of the tables")
     width: int | None = Field(default=None, ge=32, le=16384, description="of all images, px; default: their configs'")
     frames: int | None = Field(default=None, ge=10, description="of each sequence; default: all")
@@ -71,20 +73,10 @@ class SweepConfig(_Section):
             twice = [value for value, count in Counter(given).items() if count > 1]
             if twice:
                 raise ValueError(f"{what}: '{twice[0]}' is there twice")
-        unknown = [name for name in self.methods if name not in known_methods()]
+        unknown = [name for name in self.methods if name not in (*METHODS, *OTHERS)]
         if unknown:
-            raise ValueError(f"methods: no method '{unknown[0]}': choose from {', '.join(known_methods())}")
+            raise ValueError(f"methods: no method '{unknown[0]}': choose from {', '.join((*METHODS, *OTHERS))}")
         return self
-
-
-def known_methods() -> tuple[str, ...]:
-    """Ours and the peers'."""
-    return (*METHODS, *PEERS, *CLOUD_PEERS, *SLAM_PEERS)
-
-
-def is_sweep(path: Path) -> bool:
-    """Whether a config of 'rstrack bench' is one of a sweep. Raises UserError: it cannot be read."""
-    return "readouts_s" in read_yaml(Path(path))
 
 
 def load_sweep_config(path: Path) -> SweepConfig:
@@ -99,17 +91,12 @@ def load_sweep_config(path: Path) -> SweepConfig:
 
 
 def narrow(
-    config: SweepConfig,
-    *,
-    motions: Sequence[str] = (),
-    methods: Sequence[str] = (),
-    readouts_s: Sequence[float] = (),
-    exposures_s: Sequence[float] = (),
-    seeds: int | None = None,
-    width: int | None = None,
-    frames: int | None = None,
-) -> SweepConfig:
-    """The sweep with what is given in place of what its file says. Raises UserError: a value or name that is none."""
+    config: SweepConfig, *, motions: Sequence[str] = (), seeds: int | None = None, **given: Any
+) -> SweepConfig:  # fmt: skip
+    """The sweep with what is given in place of what its file says: motions by name, seeds, and fields by theirs.
+
+    Raises UserError: a value or name that is none.
+    """
     names = [entry.name for entry in config.motions]
     for name in motions:
         if name not in names:
@@ -118,9 +105,6 @@ def narrow(
         "motions": [entry.model_dump() for entry in config.motions if not motions or entry.name in motions],
         "noise": config.noise.model_dump() | ({} if seeds is None else {"seeds": seeds}),
     }
-    given = {
-        "methods": methods, "readouts_s": readouts_s, "exposures_s": exposures_s, "width": width, "frames": frames,
-    }  # fmt: skip
     chosen |= {name: value for name, value in given.items() if value}
     try:
         return SweepConfig.model_validate(chosen)
@@ -129,8 +113,49 @@ def narrow(
 
 
 def installed(methods: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The methods that can run here, and those whose packages are not installed."""
-    lacking = tuple(
-        name for name in methods if name not in METHODS and find_spec(_PACKAGES.get(name, "open3d")) is None
-    )
+    """The methods that can run here, and those whose packages are not installed. Raises UserError: none can."""
+    lacking = tuple(name for name in methods if name not in METHODS and find_spec(package_of(name)) is None)
+    if len(lacking) == len(methods):
+        raise UserError(f"the sweep: none of {', '.join(lacking)} is installed: pip install '.[peers]'")
     return tuple(name for name in methods if name not in lacking), lacking
+
+
+def sweep_benchmark(config: SweepConfig, methods: Sequence[str], options: Options | None = None) -> Benchmark:
+    """The cells, motion by motion; our methods in their usual setting, unless options.fuse says which.
+
+    Raises UserError: a motion's config cannot be read, or does not say what the sweep changes.
+    """
+    options = options or Options()
+    names = [variants(method, options.fuse)[0] for method in methods]
+    frames = None if config.frames is None else f"0:{config.frames}"
+    noise = NoiseEntry(depth=config.noise.depth, intensity=config.noise.intensity)
+    cells = []
+    for motion, exposure, readout in product(config.motions, config.exposures_s, config.readouts_s):
+        fields = shutter_fields(motion.config, readout, exposure) | config.overrides | motion.overrides
+        sequence = SequenceEntry(
+            config=motion.config, set=fields, width=config.width, frames=frames, group=motion.name
+        )  # fmt: skip
+        size = f"_{config.width}px" if config.width else ""
+        name = f"{motion.name}{size}_readout_{1e3 * readout:g}ms_exposure_{1e3 * exposure:g}ms"
+        case, seeds = CaseEntry(sequence=name, noise=noise), tuple(range(config.noise.seeds))
+        cells += [
+            Cell("track", name, method, seeds, case, sequence, method_entry(method, options), {}) for method in names
+        ]
+    return Benchmark(tuple(cells))
+
+
+def shutter_fields(path: Path, readout_s: float, exposure_s: float) -> dict[str, Any]:
+    """Fields of a config that give both cameras a readout and an exposure.
+
+    Colour's and depth's offsets count for the mid-exposure of their first line: at each exposure lines are taken at
+    the same times, and images differ in their blur alone. Raises UserError: the config's offsets are no numbers.
+    """
+    given, fields = read_yaml(path), dict[str, Any]()
+    for stream in STREAMS:
+        try:
+            offset = float((given.get(stream) or {}).get("offset_s", 0.0))
+        except (TypeError, ValueError, AttributeError):
+            raise UserError(f"{path}: {stream}: offset_s must be a number of seconds") from None
+        fields |= {f"{stream}.readout_s": readout_s, f"{stream}.exposure_s": exposure_s}
+        fields[f"{stream}.offset_s"] = round(offset + 0.5 * exposure_s, 9)
+    return fields

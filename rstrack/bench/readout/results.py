@@ -1,9 +1,9 @@
-"""What the readout sweep found: for each method and shutter the error over the seeds, with its interval, and tables."""
+"""What the readout sweep found: for each method and shutter the error over the seeds, with its interval."""
 
 from __future__ import annotations
 
-import json
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,44 +13,55 @@ import numpy as np
 
 from rsgen.console.tables import NOTHING, Entry, Table, csv_text, fixed, significant
 from rsgen.files import atomic_write
-from rstrack.bench.methods.results import QUANTITIES, Quantity
-from rstrack.bench.readout.cases import Case, cases_of
-from rstrack.bench.readout.run import SweepResult
-from rstrack.data.estimate import plain
+from rstrack.bench.methods.results import QUANTITIES, Quantity, counts
+from rstrack.bench.methods.tables import made_on
+from rstrack.bench.readout.config import SweepConfig
+from rstrack.bench.record import Record, write_records
+from rstrack.charts.chart import Chart, Line, method_colors, numbers
+from rstrack.charts.to_file import write_charts
 
 CONFIDENCE = 0.95
+_DASHED = "Dashed: the shutter is taken for a global one, or for a lidar's sweep."
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """records: in the cells' order, those missing of which an interrupt left none. lacking: methods left out, not being
+    installed."""
+
+    config: SweepConfig
+    records: tuple[Record, ...]
+    lacking: tuple[str, ...] = ()
+    interrupted: bool = False
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """In the order of the tables."""
+        return tuple(dict.fromkeys(record.method for record in self.records))
 
 
 @dataclass(frozen=True)
 class Point:
-    """Of one method with one shutter: geometric mean and interval over the seeds on which it kept the track.
+    """Of one method with one shutter: errors of the seeds on which it kept the track; lost: seeds without."""
 
-    mean, low, high: None where no seed counts; the interval is None too where but one does. lost: seeds without.
-    """
-
-    case: Case
+    motion: str
+    readout_s: float
+    exposure_s: float
     method: str
     values: tuple[float, ...]
     lost: int
 
     @property
-    def mean(self) -> float | None:
-        """Geometric: errors are compared by their ratios."""
-        return log_interval(self.values)[0]
-
-    @property
-    def low(self) -> float | None:
-        """Lower end of the interval."""
-        return log_interval(self.values)[1]
-
-    @property
-    def high(self) -> float | None:
-        """Its upper end."""
-        return log_interval(self.values)[2]
+    def interval(self) -> tuple[float | None, float | None, float | None]:
+        """Geometric mean, for errors are compared by their ratios, and its ends; see `log_interval`."""
+        return log_interval(self.values)
 
 
 def log_interval(values: Sequence[float]) -> tuple[float | None, float | None, float | None]:
-    """Geometric mean of positive values and its two-sided interval of CONFIDENCE by Student's t, in logarithms."""
+    """Geometric mean of positive values and its two-sided interval of CONFIDENCE by Student's t, in logarithms.
+
+    None where there are no values; the interval is None too where there is but one.
+    """
     from scipy.special import stdtrit
 
     logs = np.log(np.array([value for value in values if value > 0.0]))
@@ -63,61 +74,48 @@ def log_interval(values: Sequence[float]) -> tuple[float | None, float | None, f
     return math.exp(mean), math.exp(mean - half), math.exp(mean + half)
 
 
-def points_of(result: SweepResult, quantity: Quantity = QUANTITIES[0]) -> list[Point]:
-    """Of all cases and methods that were run, in order."""
+def points_of(sweep: Sweep, quantity: Quantity = QUANTITIES[0]) -> list[Point]:
+    """Of all records, in their order."""
     found = []
-    for case in cases_of(result.config):
-        for method in result.methods:
-            cells = result.cells.get((case, method), ())
-            values = [cell.figure(quantity.metric) for cell in cells]
-            if cells:
-                known = tuple(value for value in values if value is not None)
-                found.append(Point(case, method, known, len(values) - len(known)))
+    for record in sweep.records:
+        shutter = record.settings["sequence"]["set"]
+        at = float(shutter["depth.readout_s"]), float(shutter["depth.exposure_s"])
+        values = tuple(v for run in record.runs if counts(run) and (v := run.get(quantity.name)) is not None)
+        lost = sweep.config.noise.seeds - len(values)
+        found.append(Point(record.settings["group"], *at, record.method, values, lost))
     return found
 
 
 def growth(points: Sequence[Point]) -> float | None:
     """Largest over smallest mean of a method's points, one a readout; None if it was lost at one, or has but one."""
-    means = [point.mean for point in points]
-    if len(means) < 2 or any(mean is None for mean in means):
-        return None
+    means = [point.interval[0] for point in points]
     known = [mean for mean in means if mean is not None]
-    return max(known) / min(known)
+    return max(known) / min(known) if len(known) == len(means) > 1 else None
 
 
-def write_sweep(result: SweepResult, out: Path) -> str:
-    """Write results.json, .csv, .md and .txt into `out`; returns the text. Raises UserError."""
-    points = {quantity.name: points_of(result, quantity) for quantity in QUANTITIES}
-    tables = sweep_tables(result)
-    listed = sweep_notes(result)
+def write_sweep(sweep: Sweep, out: Path) -> str:
+    """Write records.json, results.csv, .md and .txt into `out`; returns the text. Raises UserError."""
+    tables, listed = sweep_tables(sweep), sweep_notes(sweep)
     text = "\n\n".join([*(f"{table.title}\n{table.text()}" for table in tables), "\n".join(listed)])
     notes = "\n".join(f"- {note}" for note in listed)
     markdown = "\n\n".join([*(f"**{table.title}**\n\n{table.markdown()}" for table in tables), notes]) + "\n"
-    out.mkdir(parents=True, exist_ok=True)
+    write_records(out / "records.json", sweep.records)
     atomic_write(out / "results.txt", (text + "\n").encode())
     atomic_write(out / "results.md", markdown.encode())
-    atomic_write(out / "results.csv", csv_text(_records(points)).encode())
-    data = {
-        "machine": result.machine, "version": result.version, "sweep": result.config.model_dump(mode="json"),
-        "left_out": list(result.lacking), "points": _records(points), "cells": _cell_records(result),
-    }  # fmt: skip
-    atomic_write(out / "results.json", (json.dumps(plain(data), indent=1) + "\n").encode())
+    atomic_write(out / "results.csv", csv_text(_rows(sweep)).encode())
     return text
 
 
-def sweep_tables(result: SweepResult, quantity: Quantity = QUANTITIES[0]) -> list[Table]:
+def sweep_tables(sweep: Sweep, quantity: Quantity = QUANTITIES[0]) -> list[Table]:
     """A table for each motion and exposure: a row for each method, a column for each readout, and the growth."""
-    points = points_of(result, quantity)
-    readouts = sorted(result.config.readouts_s)
+    points = {(p.motion, p.exposure_s, p.method, p.readout_s): p for p in points_of(sweep, quantity)}
+    readouts = sorted(sweep.config.readouts_s)
     tables = []
-    for entry in result.config.motions:
-        for exposure in result.config.exposures_s:
+    for entry in sweep.config.motions:
+        for exposure in sweep.config.exposures_s:
             rows: list[tuple[Entry | str, ...]] = []
-            for method in result.methods:
-                line = [
-                    next((p for p in points if _is_at(p, entry.name, exposure, readout, method)), None)
-                    for readout in readouts
-                ]
+            for method in sweep.methods:
+                line = [points.get((entry.name, exposure, method, readout)) for readout in readouts]
                 factor = growth([p for p in line if p is not None]) if None not in line else None
                 rows.append((method, *map(_entry, line), "" if len(line) < 2 else fixed(factor, 2)))
             head = ("method", *(f"{1e3 * readout:g} ms" for readout in readouts), "most / least")
@@ -126,10 +124,10 @@ def sweep_tables(result: SweepResult, quantity: Quantity = QUANTITIES[0]) -> lis
     return tables
 
 
-def sweep_notes(result: SweepResult) -> list[str]:
+def sweep_notes(sweep: Sweep) -> list[str]:
     """What has to be said about the figures, one line each."""
-    noise = result.config.noise
-    frames = sorted({*result.frames.values()})
+    noise = sweep.config.noise
+    frames = sorted({int(value) for r in sweep.records for value in r.values("frames")}) or [0]
     over = f"{frames[0]} frames" if len(frames) == 1 else f"{frames[0]} to {frames[-1]} frames"
     noisy = f"noise (depth {noise.depth:g} z² m, grey values {noise.intensity:g})"
     lines = [f"RMSE over {over}, one seed of {noisy}: no intervals"]
@@ -138,64 +136,64 @@ def sweep_notes(result: SweepResult) -> list[str]:
             f"RMSE over {over}; geometric mean over {noise.seeds} seeds of {noisy}, in brackets its "
             f"{100 * CONFIDENCE:.0f} % interval: what other noise would change, not what another motion would"
         ]
-    some = [p for p in points_of(result) if p.lost]
+    points = zip(sweep.records, points_of(sweep), strict=True)
+    some = [f"{r.method} on {r.case} {p.lost} of {p.lost + len(p.values)}" for r, p in points if p.lost]
     if some:
-        lost = ", ".join(f"{p.method} on {p.case.name} {p.lost} of {p.lost + len(p.values)}" for p in some)
-        lines.append(f"† lost or failed (poses for fewer than half of the frames): {lost}")
-    errors: dict[str, int] = {}
-    for cells in result.cells.values():
-        for cell in cells:
-            if cell.error is not None:
-                errors[f"{cell.method}: {cell.error}"] = errors.get(f"{cell.method}: {cell.error}", 0) + 1
+        lines.append(f"† lost or failed (poses for fewer than half of the frames): {', '.join(some)}")
+    errors = Counter(f"{r.method}: {r.error}" for r in sweep.records if r.error is not None)
     lines += [f"failed, {count} cells: {error}" for error, count in errors.items()]
-    if result.lacking:
-        lines.append(f"left out, not installed: {', '.join(result.lacking)} (pip install '.[peers]')")
-    if result.interrupted:
+    if sweep.lacking:
+        lines.append(f"left out, not installed: {', '.join(sweep.lacking)} (pip install '.[peers]')")
+    if sweep.interrupted:
         lines.append("not run yet (-): the same command goes on where this one ended")
-    m = result.machine
-    lines.append(f"version {result.version}; {m.get('cpu')}, {m.get('cpu_count')} CPUs, {m.get('system')}")
-    return lines
+    return [*lines, *made_on(sweep.records)]
+
+
+def sweep_charts(sweep: Sweep) -> list[Chart]:
+    """ATE over readout with its interval: motions, then exposures. Points that are lost are left out."""
+    ate, points, colors = QUANTITIES[0], points_of(sweep), method_colors(sweep.methods)
+    charts = []
+    for exposure in sweep.config.exposures_s:
+        for entry in sweep.config.motions:
+            lines = []
+            for method in sweep.methods:
+                mine = [p for p in points if (p.motion, p.exposure_s, p.method) == (entry.name, exposure, method)]
+                mine.sort(key=lambda p: p.readout_s)
+                mean, low, high = (numbers([p.interval[k] for p in mine]) for k in range(3))
+                x, is_dashed = numbers([p.readout_s for p in mine], 1e3), method not in ("rs-pg", "rs-g")
+                lines.append(Line(method, colors[method], x, mean, is_dashed, True, low, high))
+            at = f", exposure {1e3 * exposure:g} ms" if len(sweep.config.exposures_s) > 1 else ""
+            title = f"{entry.name}{at}: ATE (RMSE)"
+            charts.append(Chart(title, ate.unit, "readout, ms", tuple(lines), is_log=True, note=_DASHED))
+    return charts
+
+
+def draw_sweep(sweep: Sweep, path: Path) -> None:
+    """Write the picture: a panel for each motion and exposure. Raises UserError."""
+    write_charts(sweep_charts(sweep), path, "", columns=len(sweep.config.motions), one_legend=True)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _is_at(point: Point, motion: str, exposure_s: float, readout_s: float, method: str) -> bool:
-    case = point.case
-    return (case.motion, case.exposure_s, case.readout_s, point.method) == (motion, exposure_s, readout_s, method)
-
-
 def _entry(point: Point | None) -> Entry:
     if point is None:
         return Entry(NOTHING)
-    if point.mean is None:
+    mean, low, high = point.interval
+    if mean is None:
         return Entry("lost")
-    scale = QUANTITIES[0].scale
-    text = significant(point.mean, 3, scale)
-    if point.low is not None:
-        text += f" [{significant(point.low, 2, scale)}, {significant(point.high, 2, scale)}]"
+    text = significant(mean, 3) + ("" if low is None else f" [{significant(low, 2)}, {significant(high, 2)}]")
     return Entry(text, mark="†" if point.lost else "")
 
 
-def _records(points: dict[str, list[Point]]) -> list[dict[str, Any]]:
-    records: dict[tuple[Case, str], dict[str, Any]] = {}
-    for name, found in points.items():
-        for p in found:
-            case = p.case
-            first = {
-                "motion": case.motion, "readout_s": case.readout_s, "exposure_s": case.exposure_s, "method": p.method,
-                "seeds": len(p.values), "lost": p.lost,
-            }  # fmt: skip
-            record = records.setdefault((case, p.method), first)
-            record |= {name: p.mean, f"{name}_low": p.low, f"{name}_high": p.high}
-    return list(records.values())
-
-
-def _cell_records(result: SweepResult) -> list[dict[str, Any]]:
-    return [
-        {"sequence": c.sequence, "method": c.method, "frames": c.frames, "lost": c.lost, "error": c.error}
-        | {quantity.name: c.figure(quantity.metric) for quantity in QUANTITIES}
-        | {"seconds": c.seconds}
-        for cells in result.cells.values()
-        for c in cells
-    ]
+def _rows(sweep: Sweep) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = []
+    for of_each in zip(*(points_of(sweep, quantity) for quantity in QUANTITIES), strict=True):
+        p = of_each[0]
+        row: dict[str, Any] = {"motion": p.motion, "readout_s": p.readout_s, "exposure_s": p.exposure_s}
+        row |= {"method": p.method, "seeds": len(p.values), "lost": p.lost}
+        for quantity, point in zip(QUANTITIES, of_each, strict=True):
+            names = quantity.name, f"{quantity.name}_low", f"{quantity.name}_high"
+            row |= dict(zip(names, point.interval, strict=True))
+        rows.append(row)
+    return rows

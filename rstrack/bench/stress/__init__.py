@@ -1,1 +1,1 @@
-"""`rstrack stress`: what blur does, and what blur-aware weights gain."""
+"""`rstrack bench stress`: what blur does, and what blur-aware weights gain."""

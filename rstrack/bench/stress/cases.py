@@ -1,4 +1,4 @@
-"""The sequences of the blur stress test: one motion at several exposures and speeds, rendered by `rsgen render`.
+"""The cells of the blur stress test: one motion at several exposures and speeds, and what tracks it.
 
 Exposures differ in nothing but their blur: the colour camera's clock is shifted by half the exposure, so that every
 line's mid-exposure, and with it its pose, its depth image and the sharp truth stay the same.
@@ -6,33 +6,34 @@ line's mid-exposure, and with it its pose, its depth image and the sharp truth s
 
 from __future__ import annotations
 
-import subprocess
-import sys
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rsgen.console.progress import Progress
+from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_yaml, read_yaml
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.format import pose_rows
+from rstrack.bench.definitions import Benchmark, CaseEntry, Cell, MethodEntry, SequenceEntry
+from rstrack.bench.methods.config import given_options
+from rstrack.bench.sequences import Sources
 from rstrack.options import Options
 
 # Samples of the sped-up path per knot: the fit through them, in phase, gives the spline back.
 _SAMPLES_PER_KNOT = 8
-
-Render = Callable[[Sequence[str]], None]
+# Of the blur weight in the photometric term, as the paper has it for colour.
+_SIGMA_PX = 1.0
 
 
 @dataclass(frozen=True)
 class StressOptions:
     """exposures_s: at speed 1. speeds: other speeds, at `speed_exposure_s`. sigmas_px: of equation (13).
 
-    frames: only the first so many at speed 1, None: all (a faster sequence has so many fewer).
+    frames: only the first so many at speed 1, None: all (a faster sequence has so many fewer). width: of the images in
+    px, None: the config's.
     """
 
     exposures_s: tuple[float, ...] = (0.0, 0.005, 0.010, 0.020, 0.030)
@@ -40,6 +41,7 @@ class StressOptions:
     speed_exposure_s: float = 0.020
     sigmas_px: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
     frames: int | None = None
+    width: int | None = None
     tracker: Options = field(default_factory=Options)
 
     def __post_init__(self) -> None:
@@ -51,48 +53,64 @@ class StressOptions:
                 raise UserError(f"stress: {name} {getattr(self, name)} must lie between 0.01 and 100")
         if self.frames is not None and self.frames < 2:
             raise UserError(f"stress: frames {self.frames} must be 2 or more")
+        if self.width is not None and not 32 <= self.width <= 16384:
+            raise UserError(f"stress: width {self.width} must lie between 32 and 16384")
 
     @property
-    def cases(self) -> tuple[Case, ...]:
-        """All sequences; the first of each speed carries the sharp truth."""
-        first = [Case(1.0, t) for t in sorted(set(self.exposures_s))]
-        return (*first, *(Case(s, self.speed_exposure_s) for s in sorted({*self.speeds} - {1.0})))
+    def cases(self) -> tuple[tuple[float, float], ...]:
+        """Speed and exposure (s) of all sequences."""
+        first = [(1.0, t) for t in sorted(set(self.exposures_s))]
+        return (*first, *((s, self.speed_exposure_s) for s in sorted({*self.speeds} - {1.0})))
 
 
-@dataclass(frozen=True)
-class Case:
-    """One sequence of the test."""
-
-    speed: float
-    exposure_s: float
-
-    @property
-    def name(self) -> str:
-        """Its folder."""
-        return f"exposure_{1e3 * self.exposure_s:g}ms" + ("" if self.speed == 1.0 else f"_speed_{self.speed:g}x")
+def case_name(speed: float, exposure_s: float) -> str:
+    """What a sequence is called."""
+    return f"exposure_{1e3 * exposure_s:g}ms" + ("" if speed == 1.0 else f"_speed_{speed:g}x")
 
 
-def render_cases(
-    config: Path, out: Path, options: StressOptions, progress: Progress, render: Render
-) -> dict[Case, Path]:
-    """Folder of each case's sequence, rendered where it is not there yet. Raises UserError."""
+def stress_benchmark(
+    config: Path, sources: Sources, options: StressOptions, progress: Progress = no_progress
+) -> Benchmark:
+    """All cells. The first sequence is rendered now where there are other speeds, which take its path.
+
+    Of each sequence the measure `blur` is taken, which tracks it too, and where there is blur the measure `track` with
+    the colour lines' poses at the end of exposure, and with blur weights. Raises UserError: a config or a render that
+    does not do.
+    """
     text = read_yaml(config)
     clock = _clock(config, text)
-    folders: dict[Case, Path] = {}
-    for n, case in enumerate(options.cases):
-        progress("rendering", n / len(options.cases), case.name)
-        folder = folders[case] = out / "sequences" / case.name
-        source = config if case.speed == 1.0 else _sped_up(config, text, case.speed, folders[options.cases[0]], out)
-        sharp = not any(case.speed == before.speed for before in list(folders)[:-1])
-        overrides = {
-            "color.exposure_s": case.exposure_s,
-            "color.offset_s": round(clock + 0.5 * case.exposure_s, 9),
-            "truth.global_shutter": "[middle]" if sharp else "[]",
-        }
-        few = [] if options.frames is None else ["--frames", f"0:{max(2, round(options.frames / case.speed))}"]
-        words = [word for name, value in overrides.items() for word in (f"--{name}", str(value))]
-        render(["render", str(source), "--quiet", "--out", str(folder), *few, *words])
-    return folders
+    cells: list[Cell] = []
+    slow: Path | None = None
+    for speed, exposure in options.cases:
+        name = case_name(speed, exposure)
+        if slow is None and speed != 1.0:
+            slow = sources.folder(cells[0].sequence, cells[0].case_entry.sequence, progress)
+        made = config if speed == 1.0 or slow is None else _sped_up(config, text, speed, slow)
+        frames = None if options.frames is None else f"0:{max(2, round(options.frames / speed))}"
+        fields: dict[str, Any] = {"color.exposure_s": exposure, "color.offset_s": round(clock + 0.5 * exposure, 9)}
+        fields["truth.global_shutter"] = ["middle"]
+        sequence = SequenceEntry(config=made, set=fields, width=options.width, frames=frames, group="stress")
+        cells += _cells(config.stem, name, speed, exposure, sequence, options)
+    return Benchmark(tuple(cells))
+
+
+def _cells(
+    stem: str, name: str, speed: float, exposure_s: float, sequence: SequenceEntry, options: StressOptions
+) -> list[Cell]:
+    method, given = options.tracker.method, given_options(options.tracker)
+    about = {"sequence": name, "motion": stem, "speed": speed, "exposure_s": exposure_s}
+
+    def cell(measure: str, variant: str, case: str = "", change: str = "", also: str = "", **option: Any) -> Cell:
+        entry = CaseEntry(sequence=f"{stem}-{name}", changes=({change: {}},) if change else ())
+        settings = about | {"variant": variant} | ({"sigmas_px": options.sigmas_px} if measure == "blur" else {})
+        how = MethodEntry(method=method, options=given | option)
+        return Cell(measure, name + case, method + also, (0,), entry, sequence, how, settings)
+
+    cells = [cell("blur", "mid-exposure")]
+    if exposure_s > 0.0:
+        cells.append(cell("track", "end of exposure", "_told_sharp", "color_told_sharp"))
+        cells.append(cell("track", "mid-exposure, blur weight", also="-blur_weight", blur_sigma_px=_SIGMA_PX))
+    return cells
 
 
 def _clock(config: Path, text: dict[str, Any]) -> float:
@@ -104,32 +122,21 @@ def _clock(config: Path, text: dict[str, Any]) -> float:
         raise UserError(f"{config}: depth.offset_s and depth.exposure_s must be numbers of seconds") from None
 
 
-def _sped_up(config: Path, text: dict[str, Any], speed: float, slow: Path, out: Path) -> Path:
+def _sped_up(config: Path, text: dict[str, Any], speed: float, slow: Path) -> Path:
     """A config with the path of sequence `slow` at another speed: the same spline with its knots closer together."""
     spline = Spline.load(slow / "spline.npz")
     fast = Spline(spline.control_points, spline.t0 / speed, spline.dt / speed)
     steps = round((fast.t_end - fast.t_begin) / fast.dt) * _SAMPLES_PER_KNOT
     t = np.linspace(fast.t_begin, fast.t_end, steps + 1)
     rows = pose_rows(fast.pose(t))
-    path = out / "sequences" / f"speed_{speed:g}x.txt"
+    path = slow.with_name(f"{slow.name}-speed_{speed:g}x.txt")
     lines = [f"{a - t[0]:.12f} " + " ".join(f"{v:.12f}" for v in row) for a, row in zip(t, rows, strict=True)]
-    path.parent.mkdir(parents=True, exist_ok=True)
     atomic_write(path, ("\n".join(["# stamp tx ty tz qx qy qz qw", *lines]) + "\n").encode())
     changed = {key: value for key, value in text.items() if key not in ("motion", "trajectory")}
     changed["trajectory"] = {"file": str(path.resolve()), "format": "tum", "knot_spacing_s": fast.dt}
     scene = dict(text.get("scene") or {})
     if "file" in scene:
-        scene["file"] = str((Path(config).parent / scene["file"]).resolve())
-    changed["scene"] = scene
+        scene["file"] = str((config.parent / scene["file"]).resolve())
     made = path.with_suffix(".yaml")
-    atomic_write(made, encode_yaml(changed))
+    atomic_write(made, encode_yaml(changed | {"scene": scene}))
     return made
-
-
-def run_rsgen(words: Sequence[str]) -> None:
-    """Run `rsgen` with these arguments in a process of its own. Raises UserError if it fails."""
-    # The tracker's process must not load the renderer.
-    done = subprocess.run([sys.executable, "-m", "rsgen", *words], capture_output=True, text=True, check=False)
-    if done.returncode:
-        said = (done.stderr.strip() or done.stdout.strip() or f"exit status {done.returncode}").splitlines()
-        raise UserError(f"stress: rsgen {words[0]} {words[1]} failed: {said[-1]}")

@@ -1,11 +1,46 @@
-"""Charts of a blur stress test: what the weights gain by exposure and speed, and the tracking error by exposure."""
+"""Charts and files of a blur stress test: what the weights gain by exposure and speed, and the error by exposure.
+
+write_stress(outcome.records.values(), Path("runs/stress"))
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict
+from pathlib import Path
 
-from rstrack.bench.stress.run import ColorScore, StressResult
+from rsgen.console.tables import csv_text
+from rsgen.files import atomic_write
+from rstrack.bench.measures.blur import PANELS, read_panels
+from rstrack.bench.record import Record, write_records
+from rstrack.bench.stress.results import (
+    STRESS,
+    ColorScore,
+    StressResult,
+    gain_db,
+    stress_result,
+    stress_text,
+    weights_name,
+)
 from rstrack.charts.chart import COLORS, TRUE_COLOR, Chart, Line, numbers
+from rstrack.charts.to_file import write_charts
+
+
+def write_stress(records: Iterable[Record], out: Path) -> StressResult:
+    """Write stress.txt, stress.json (the records), stress_color.csv, _depth.csv, _tracking.csv, stress.png, panels.png.
+
+    Raises UserError if that cannot be done.
+    """
+    records = tuple(records)
+    result = stress_result(records)
+    write_records(out / STRESS, records)
+    atomic_write(out / "stress.txt", (stress_text(result) + "\n").encode())
+    for name in ("color", "depth", "tracking"):
+        atomic_write(out / f"stress_{name}.csv", csv_text([asdict(row) for row in getattr(result, name)]).encode())
+    title = f"{result.motion}: fused colour along the true path, and tracking"
+    write_charts([*color_charts(result, "true"), tracking_chart(result)], out / "stress.png", title)
+    _draw_panels(result, out)
+    return result
 
 
 def color_charts(result: StressResult, poses: str) -> list[Chart]:
@@ -42,28 +77,10 @@ def tracking_chart(result: StressResult) -> Chart:
     for k, variant in enumerate(dict.fromkeys(row.variant for row in result.tracking)):
         mine = [row for row in result.tracking if row.variant == variant and row.speed == 1.0]
         mine.sort(key=lambda row: row.exposure_s)
-        x, y = numbers([row.exposure_s for row in mine], 1e3), numbers([row.ate_m for row in mine], 1e3)
+        x, y = numbers([row.exposure_s for row in mine], 1e3), numbers([row.ate_mm for row in mine])
         if mine:
             lines.append(Line(variant, COLORS[k % len(COLORS)], x, y, has_points=True))
     return Chart("Position error (ATE) by exposure", "mm", "exposure, ms", tuple(lines), from_zero=False)
-
-
-def gains_db(result: StressResult, sigma_px: float = 1.0, poses: str = "true") -> dict[str, float]:
-    """PSNR of blur-aware over that of constant weights in dB, by sequence."""
-    rows = [row for row in result.color if (row.sigma_px, row.poses) == (sigma_px, poses)]
-    return {row.case: gain for row in rows if (gain := gain_db(result.color, row)) is not None}
-
-
-def gain_db(rows: Sequence[ColorScore], row: ColorScore) -> float | None:
-    """PSNR of `row` over that of constant weights, among `rows`, in dB; None if it is of constant weights itself."""
-    same = (r for r in rows if r.sigma_px is None and (r.case, r.poses) == (row.case, row.poses))
-    base = next(same, None)
-    return None if row.sigma_px is None or base is None else row.psnr_db - base.psnr_db
-
-
-def weights_name(sigma_px: float | None) -> str:
-    """What the weights of a σ are called; None: constant ones."""
-    return "constant" if sigma_px is None else f"σ {sigma_px:g} px"
 
 
 _Value = Callable[[ColorScore], float | None]
@@ -88,3 +105,15 @@ def _lines(along: Sequence[ColorScore], x: Callable[[ColorScore], float], value:
             at = numbers([x(row) for row in mine])
             lines.append(Line(weights_name(sigma), color, at, numbers(values), sigma is None, has_points=True))
     return tuple(lines)
+
+
+def _draw_panels(result: StressResult, out: Path) -> None:
+    folder = None if result.panels is None else out / result.panels
+    panels = None if folder is None else read_panels(folder)
+    if folder is None or panels is None:
+        return
+    names = dict(zip(PANELS, ("registered blurred input", f"weights (white: {panels.white:.2g})", "constant weights",
+                              "blur-aware weights", "sharp view (truth)"), strict=True))  # fmt: skip
+    from rsgen.figures import save_grid
+
+    save_grid([[image / 255.0 for image in panels.images(folder).values()]], tuple(names.values()), out / "panels.png")
