@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -157,14 +158,13 @@ def run_cell(job: Job, progress: Progress = no_progress) -> Record:
 @cache
 def code_digest() -> str:
     """Of the product's source: what is measured depends on it."""
-    import rsgen
-    import rstrack
-
     digest = hashlib.sha256()
-    for package in (rsgen, rstrack):
-        root = Path(package.__file__ or "").parent
+    for package in ("rsgen", "rstrack"):
+        spec = find_spec(package)
+        assert spec is not None and spec.origin is not None
+        root = Path(spec.origin).parent
         for path in sorted(root.rglob("*.py")):
-            digest.update(f"{package.__name__}/{path.relative_to(root)}\n".encode() + path.read_bytes())
+            digest.update(f"{package}/{path.relative_to(root)}\n".encode() + path.read_bytes())
     return digest.hexdigest()
 
 

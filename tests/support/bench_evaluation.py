@@ -14,14 +14,17 @@ import yaml
 from rsgen.console.command_line import Commands, Parser, run_program
 from rsgen.geometry import se3
 from rsgen.sequence.format import pose_rows
-from rstrack.bench.methods.config import choose, load_bench_config
-from rstrack.bench.methods.plan import Plan, make_plan
-from rstrack.cli.bench_methods import bench
+from rstrack.bench.methods.config import Plan, load_evaluation, make_plan
+from rstrack.bench.methods.results import Results
+from rstrack.bench.record import Record
+from rstrack.bench.runner import RECORD, Outcome, run_cells
+from rstrack.bench.sequences import Sources
+from rstrack.cli.benchmark import bench
 
 FRAMES = 31
 NAMES = ("robot_t1", "lr_kt2")
 SPEEDS = (0.3, 0.25)
-VARIANTS = ("gs-g", "gs-g --fuse", "rs-g", "rs-g --no-fuse")
+VARIANTS = ("gs-g", "gs-g-fuse", "rs-g", "rs-g-no-fuse")
 
 
 def parser() -> Parser:
@@ -42,19 +45,41 @@ def make_data(folder: Path) -> None:
         synthetic.write_frames(writer)
         synthetic.write_scene(folder / "data" / name)
         writer.finish()
-    sequences = [
-        {"name": name, "group": group, "config": f"{name}.yaml"}
-        for name, group in zip(NAMES, ("hand-held", "living room"), strict=True)
-    ]
+    groups = zip(NAMES, ("hand-held", "living room"), strict=True)
+    sequences = {name: {"group": group, "config": f"{name}.yaml"} for name, group in groups}
     quick = {"sequences": ["lr_kt2"], "methods": ["rs-g"], "frames": 12}
-    text = yaml.safe_dump({"sequences": sequences, "methods": ["gs-g", "rs-g"], "quick": quick})
+    text = yaml.safe_dump({"sequences": sequences, "methods": ["gs-g", "rs-g"], "quick": quick}, sort_keys=False)
     (folder / "bench.yaml").write_text(text)
 
 
 def plan(**how: Any) -> Plan:
     """Of the working directory."""
-    narrow = {key: how.pop(key) for key in ("quick", "frames", "sequences", "methods", "peers") if key in how}
-    return make_plan(choose(load_bench_config(Path("bench.yaml")), **narrow), Path("data"), Path("bench"), **how)
+    return make_plan(load_evaluation(Path("bench.yaml")), Path("data"), **how)
+
+
+def run(made: Plan, *more: Any) -> Outcome:
+    """Run into bench/ of the working directory."""
+    return run_cells(made.benchmark, Path("bench"), Sources(Path("data").resolve()), *more)
+
+
+def results(made: Plan) -> Results:
+    """Run, as `rstrack bench` sees it."""
+    records = tuple(run(made).records.values())
+    return Results(sequences=made.sequences, methods=made.methods, records=records)
+
+
+def record_file(sequence: str, method: str) -> Path:
+    """In the working directory."""
+    return Path("bench/cells/track", sequence, method, RECORD)
+
+
+def made_up_record(case: str, method: str, error: str | None = None, measure: str = "track", **figures: Any) -> Record:
+    """One that was never run."""
+    about = {"group": "", "case": {}}
+    return Record(
+        f"{measure}/{case}/{method}", "k", about, (0,), () if error else (figures,), not error, error,
+        version="1.2.3", machine={"cpu": "abacus", "cores": 2, "system": "Linux"},
+    )  # fmt: skip
 
 
 def write_tum(path: Path, sequence: str, kept: Sequence[int] | range = range(FRAMES), error_m: float = 0.001) -> None:

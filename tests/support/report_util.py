@@ -12,16 +12,16 @@ from typing import Any
 import cv2
 import numpy as np
 import synthetic
+from rstrack.bench.methods.plan import SequenceInfo
+from rstrack.bench.stress.run import ColorScore, DepthScore, Panels, StressResult, TrackScore
+from rstrack.bench.stress.tables import write_stress
 
 from rsgen.config.truth import TruthConfig
 from rsgen.geometry import se3
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
-from rstrack.bench.methods.plan import SequenceInfo
 from rstrack.bench.methods.results import Cell, Results
 from rstrack.bench.methods.tables import write_results
-from rstrack.bench.stress.run import ColorScore, DepthScore, Panels, StressResult, TrackScore
-from rstrack.bench.stress.tables import write_stress
 from rstrack.calibration.findings.record import CALIBRATION
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import write_estimate

@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 import pytest
 from report_util import NASTY, Parsed, make_stress, parse, picture
+from rstrack.bench.stress.run import StressResult
+from rstrack.bench.stress.tables import read_panels, read_stress
 
 from rsgen.console.command_line import Commands, run_program
 from rsgen.errors import UserError
-from rstrack.bench.stress.run import StressResult
-from rstrack.bench.stress.tables import read_panels, read_stress
 from rstrack.cli.report import report as report_command
 from rstrack.report.build import write_report
 

@@ -71,7 +71,7 @@ def check_comparable(dataset: Dataset) -> None:
 
 
 class Panels(BaseModel):
-    """The paper's Figure 2 for one keyframe. keyframe: its depth frame; white: the weight that the picture has white."""
+    """The paper's Figure 2 for one keyframe. white: the weight that is white in the picture."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 

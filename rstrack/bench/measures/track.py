@@ -67,7 +67,7 @@ def accuracy(task: Task, estimate: Estimate) -> Figures:
         # A track too short or too bad for its clock: clocks as they are, or nothing at all.
         offset = None
         try:
-            evaluation = evaluate_clocks(truth, estimate, 0.0)
+            evaluation = evaluate_clocks(truth, estimate, offset)
         except UserError:
             return {"frames": frames, "lost": frames, "silent": 0}
     found = evaluation.chosen

@@ -50,7 +50,7 @@ def results_csv(results: Results) -> str:
         baseline = results.record(r.case, results.shown(group).get(BASELINE, ""))
         values = {q.name: figure(r, q.name) for q in QUANTITIES}
         better = {name: better_pct(value, figure(baseline, name)) for name, value in values.items()}
-        about = {name: figures.get(key) for name, key in (("frames", "frames"), ("lost", "lost"))}
+        about: dict[str, Any] = {name: int(figures[name]) for name in ("frames", "lost") if name in figures}
         about |= {"seconds": figures.get("total_s"), "truth_offset_ms": figures.get("truth_offset_ms")}
         theirs = paper.FIGURES.get((r.case, row_of(r.method)))
         rows.append(_csv_row(group, r.case, r.method, values, better, about | {"error": r.error}, theirs))

@@ -8,19 +8,22 @@ from typing import Any
 
 import pytest
 import yaml
-from bench_evaluation import FRAMES, VARIANTS, main, make_data, plan, write_tum
+from bench_evaluation import FRAMES, VARIANTS, main, make_data, plan, record_file, results, run, write_tum
 
-import rstrack.bench.methods.grid
+import rstrack.bench.measures.track
 import rstrack.peers.clouds
 import rstrack.peers.open3d
 import rstrack.peers.orb_slam3
 from rsgen.config.config import load_config
+from rsgen.console.configs import config_file
 from rsgen.errors import UserError
 from rsgen.geometry import se3
+from rstrack.bench.definitions import OTHERS
 from rstrack.bench.methods import paper
-from rstrack.bench.methods.config import choose, load_bench_config
-from rstrack.bench.methods.grid import read_cell, run_cell, run_plan
+from rstrack.bench.methods.config import load_evaluation
+from rstrack.bench.methods.results import counts
 from rstrack.bench.methods.tables import results_text
+from rstrack.bench.record import read_record
 from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.options import CLOUD_PEERS, METHODS, PEERS, SLAM_PEERS, Options
 from rstrack.peers.command import run_command
@@ -40,30 +43,26 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # the plan
 
 
-def test_what_a_cell_depends_on(place: Path) -> None:
-    keys = [job.key for job in plan().jobs]
-    assert len(set(keys)) == 8
-    assert not {job.key for job in plan(options=Options(knot_spacing_s=0.03)).jobs} & set(keys)
-    assert not {job.key for job in plan(frames=slice(0, 20)).jobs} & set(keys)
-    assert [job.key for job in plan(options=Options(method="gs-p"), frames=slice(0, FRAMES)).jobs] == keys
-    # One setting that is asked for is that of a cell of its own, and the other one is not run.
-    for fuse, names in ((True, ["gs-g --fuse", "rs-g"]), (False, ["gs-g", "rs-g --no-fuse"])):
-        jobs = plan(options=Options(fuse=fuse), sequences=["robot_t1"]).jobs
-        assert [job.method for job in jobs] == names
-        assert [job.key for job in jobs] == [keys[VARIANTS.index(name)] for name in names]
-    rgb = place / "data/lr_kt2/rgb.txt"
-    rgb.write_text("# another\n" + rgb.read_text())
-    assert [job.key == key for job, key in zip(plan().jobs, keys, strict=True)] == 4 * [True] + 4 * [False]
+def test_one_setting_that_is_asked_for_is_that_of_a_cell_of_its_own(place: Path) -> None:
+    whole = {cell.name: cell for cell in plan(options=Options(method="gs-p")).benchmark.cells}
+    assert [cell.method for cell in whole.values()] == 2 * list(VARIANTS)
+    for fuse, names in ((True, ["gs-g-fuse", "rs-g"]), (False, ["gs-g", "rs-g-no-fuse"])):
+        cells = plan(options=Options(fuse=fuse), sequences=["robot_t1"]).benchmark.cells
+        assert [cell.method for cell in cells] == names
+        assert [cell.options for cell in cells] == [whole[cell.name].options for cell in cells]
+    (cell,) = plan(
+        options=Options(knot_spacing_s=0.03, fuse=True), sequences=["lr_kt2"], methods=["rs-g"]
+    ).benchmark.cells
+    assert (cell.options.knot_spacing_s, cell.options.method, cell.options.fuse) == (0.03, "rs-g", True)
 
 
 def test_quick_is_a_subset_and_words_beat_it(place: Path) -> None:
-    jobs = plan(quick=True).jobs
-    assert [(j.sequence, j.method, j.first, j.last) for j in jobs] == [("lr_kt2", m, 0, 12) for m in VARIANTS[2:]]
-    jobs = plan(quick=True, methods=["gs-pg", "rs-g"], frames=slice(3, 9)).jobs
-    names = ("gs-pg", "gs-pg --fuse", "rs-g", "rs-g --no-fuse")
-    assert [(j.sequence, j.method, j.first, j.last) for j in jobs] == [("lr_kt2", m, 3, 9) for m in names]
-    assert [(j.options.method, j.options.fuse) for j in jobs[:2]] == [("gs-pg", False), ("gs-pg", True)]
-    assert [j.out.name for j in jobs] == ["gs-pg", "gs-pg_fuse", "rs-g", "rs-g_no-fuse"]
+    cells = plan(quick=True).benchmark.cells
+    assert [(c.case, c.method, c.piece) for c in cells] == [("lr_kt2", m, slice(0, 12)) for m in VARIANTS[2:]]
+    cells = plan(quick=True, methods=["gs-pg", "rs-g"], frames=slice(3, 9)).benchmark.cells
+    names = ("gs-pg", "gs-pg-fuse", "rs-g", "rs-g-no-fuse")
+    assert [(c.case, c.method, c.piece) for c in cells] == [("lr_kt2", m, slice(3, 9)) for m in names]
+    assert [(c.options.method, c.options.fuse) for c in cells[:2]] == [("gs-pg", False), ("gs-pg", True)]
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -86,36 +85,40 @@ def test_commands_that_give_nothing(place: Path, command: str, message: str) -> 
 
 def test_poses_outside_the_frames_do_not_count(place: Path) -> None:
     write_tum(place / "mine/robot_t1.txt", "robot_t1")
-    job = plan(sequences=["robot_t1"], frames=slice(5, 20), added={"mine": Path("mine")}).jobs[-1]
-    cell = run_cell(job)
-    assert cell.metrics is not None and cell.metrics["poses"] == 15 and cell.metrics["frames"] == 15
+    made = plan(sequences=["robot_t1"], methods=["gs-g"], frames=slice(5, 20), added={"mine": Path("mine")})
+    figures = results(made).records[-1].figures
+    assert (figures["frames"], figures["lost"]) == (15, 0)
+    assert len(read_estimate(record_file("robot_t1", "mine").parent).stamps) == 15
 
 
 def test_a_track_that_never_began_is_a_finished_cell(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = rstrack.bench.methods.grid.track
+    real = rstrack.bench.measures.track.track
 
     def lost(*arguments: Any, **named: Any) -> Any:
         result = real(*arguments, **named)
-        few = Estimate(result.estimate.stamps[:2], result.estimate.T_world_depth[:2], None, result.estimate.info)
+        few = dataclasses.replace(
+            result.estimate, stamps=result.estimate.stamps[:2], T_world_depth=result.estimate.T_world_depth[:2]
+        )  # fmt: skip
         return dataclasses.replace(result, estimate=few, end="broke down")
 
-    monkeypatch.setattr(rstrack.bench.methods.grid, "track", lost)
-    made = plan(sequences=["robot_t1"], methods=["gs-g"], frames=slice(0, 12))
-    results = run_plan(made)
-    assert read_cell(made.jobs[0]) == results.cells[0]
-    assert (results.cells[0].metrics, results.cells[0].lost, results.cells[0].error) == (None, 12, None)
-    assert "lost (fewer than half" in results_text(results) and results.cells[0].figure("ate_rmse_m") is None
+    monkeypatch.setattr(rstrack.bench.measures.track, "track", lost)
+    made = plan(sequences=["robot_t1"], methods=["gs-g"], frames=slice(0, 12), options=Options(fuse=False))
+    found = results(made)
+    (record,) = found.records
+    assert record.error is None and not counts(record.figures) and record.figures["lost"] == 12
+    assert "ate_mm" not in record.figures and "lost (fewer than half" in results_text(found)
 
 
 def test_an_unreadable_image_is_not_kept_as_a_result(place: Path) -> None:
     image = place / "data/robot_t1/depth/000009.png"
     whole = image.read_bytes()
     image.write_bytes(whole[:100])
-    made = plan(sequences=["robot_t1"], methods=["gs-g"], frames=slice(0, 12))
-    cell = run_plan(made).cells[0]
-    assert cell.error is not None and "000009.png" in cell.error and read_cell(made.jobs[0]) is None
+    made = plan(sequences=["robot_t1"], methods=["gs-g"], frames=slice(0, 12), options=Options(fuse=False))
+    (record,) = results(made).records
+    assert record.error is not None and "000009.png" in record.error
+    assert read_record(record_file("robot_t1", "gs-g")) is None
     image.write_bytes(whole)
-    assert run_plan(made).cells[0].counts
+    assert counts(results(made).records[0].figures)
 
 
 def test_peers_are_methods(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -126,20 +129,27 @@ def test_peers_are_methods(place: Path, monkeypatch: pytest.MonkeyPatch) -> None
         assert dataset.root.name == "robot_t1" and frames == slice(0, FRAMES)
         return Estimate(dataset.stamps, se3.orthonormalise(dataset.truth.pose(dataset.stamps)))
 
-    monkeypatch.setattr(rstrack.peers.open3d, "run_peer", run_peer)
-    monkeypatch.setattr(rstrack.peers.clouds, "run_cloud_peer", run_peer)
-
     def run_slam(dataset: Any, frames: slice, progress: Any, seed: int) -> Estimate:
         return run_peer("orb-slam3", dataset, frames, progress)
 
+    monkeypatch.setattr(rstrack.peers.open3d, "run_peer", run_peer)
+    monkeypatch.setattr(rstrack.peers.clouds, "run_cloud_peer", run_peer)
     monkeypatch.setattr(rstrack.peers.orb_slam3, "run_orb_slam3", run_slam)
-    made = plan(sequences=["robot_t1"], methods=["gs-g"], peers=True)
-    assert made.methods == ("gs-g", "gs-g --fuse", *PEERS, *CLOUD_PEERS, *SLAM_PEERS)
-    for job in (made.jobs[2], made.jobs[-2], made.jobs[-1]):
-        cell = run_cell(job)
-        assert cell.metrics is not None and cell.metrics["ate_rmse_m"] < 1e-9 and cell.seconds is not None
-        assert read_estimate(job.out).info["method"] == job.method
-    assert asked == [PEERS[0], CLOUD_PEERS[-1], SLAM_PEERS[-1]]
+    monkeypatch.setattr(rstrack.bench.measures.track, "find_spec", lambda name: name)
+    made = plan(sequences=["robot_t1"], methods=[PEERS[0], "rs-g"], peers=True, options=Options(fuse=True))
+    assert made.methods == (PEERS[0], "rs-g", *OTHERS[1:])
+    found = {record.method: record for record in results(made).records}
+    for name in OTHERS:
+        assert found[name].figures["ate_mm"] < 1e-6 and found[name].figures["total_s"] > 0.0
+        assert read_estimate(record_file("robot_t1", name).parent).info["method"] == name
+    assert sorted(asked) == sorted((*PEERS, *CLOUD_PEERS, *SLAM_PEERS))
+
+
+def test_a_peer_that_is_not_installed_is_skipped(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rstrack.bench.measures.track, "find_spec", lambda name: None)
+    made = plan(sequences=["robot_t1"], methods=["kiss-icp"])
+    (record,) = run(made).records.values()
+    assert record.skipped and record.error == "kiss-icp: kiss_icp is not installed"
 
 
 @pytest.mark.parametrize(
@@ -152,6 +162,9 @@ def test_peers_are_methods(place: Path, monkeypatch: pytest.MonkeyPatch) -> None
         ("--add mine", ["--add mine", "NAME=DIR"]),
         ("--add ..=x", ["--add ..=x", "NAME=DIR"]),
         ("--add rs-g=x", ["--add rs-g", "another name"]),
+        ("--add kiss-icp=x", ["--add kiss-icp", "another name"]),
+        ("--speed --add mine=x", ["--add", "--speed"]),
+        ("--width 320", ["is no sweep"]),
         ("--peer-command mine", ["--peer-command mine", "NAME=COMMAND"]),
         ("--peer-command mine=track", ["'track'", "{sequence}"]),
         ("""--peer-command 'mine=track {sequence}'""", ["'track {sequence}'", "does not say {out}"]),
@@ -190,10 +203,11 @@ def test_a_sequence_without_a_truth(place: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "parts"),
     [
-        ({"sequences": []}, ["sequences"]),
+        ({"sequences": {}}, ["sequences"]),
         ({"extra": 1}, ["extra"]),
         ({"methods": ["rs-g", "rs-g"]}, ["methods", "'rs-g' is there twice"]),
         ({"methods": ["../x"]}, ["methods.0"]),
+        ({"sequences": {"a": {"group": "x"}}}, ["sequences.a", "config"]),
         ({"quick": {"sequences": ["nope"], "methods": ["rs-g"], "frames": 20}}, ["quick.sequences", "nope"]),
         ({"quick": {"sequences": ["lr_kt2"], "methods": ["rs-g"], "frames": 0}}, ["quick.frames"]),
     ],
@@ -202,21 +216,21 @@ def test_wrong_configs(place: Path, change: dict[str, Any], parts: list[str]) ->
     data = yaml.safe_load(Path("bench.yaml").read_text()) | change
     Path("wrong.yaml").write_text(yaml.safe_dump(data))
     with pytest.raises(UserError) as caught:
-        load_bench_config(Path("wrong.yaml"))
+        load_evaluation(Path("wrong.yaml"))
     assert all(part in str(caught.value) for part in ("wrong.yaml", *parts)), caught.value
 
 
 def test_quick_needs_its_section(place: Path) -> None:
     data = yaml.safe_load(Path("bench.yaml").read_text())
     del data["quick"]
-    Path("bare.yaml").write_text(yaml.safe_dump(data))
+    Path("bench.yaml").write_text(yaml.safe_dump(data))
     with pytest.raises(UserError, match="--quick"):
-        choose(load_bench_config(Path("bare.yaml")), quick=True)
+        plan(quick=True)
 
 
 def test_the_projects_own_config() -> None:
-    config = load_bench_config(ROOT / "configs/evaluation.yaml")
-    assert {(s.name, m) for s in config.sequences for m in config.methods} == set(paper.FIGURES)
-    assert all(load_config(s.config).name == s.name for s in config.sequences)
-    assert {s.group for s in config.sequences} == {"hand-held", "living room"} and config.quick is not None
+    config = load_evaluation(ROOT / "configs/evaluation.yaml")
+    assert {(name, method) for name in config.sequences for method in config.methods} == set(paper.FIGURES)
+    assert all(load_config(config_file(str(s.config))).name == name for name, s in config.sequences.items())
+    assert {s.group for s in config.sequences.values()} == {"hand-held", "living room"} and config.quick is not None
     assert [m for m in config.methods if m not in METHODS] == []

@@ -18,12 +18,12 @@ import pytest
 import synthetic
 import trimesh
 import yaml
+from rstrack.bench.methods.grid import Cell, Results
+from rstrack.bench.methods.plan import SequenceInfo
 
 import rstrack.bench.methods.mesh_pictures as mesh_pictures
 from rsgen.console.command_line import Commands, Parser, run_program
-from rstrack.bench.methods.grid import Cell, Results
 from rstrack.bench.methods.mesh_pictures import draw_meshes, make_mesh, read_picture
-from rstrack.bench.methods.plan import SequenceInfo
 from rstrack.bench.methods.tables import write_results
 from rstrack.cli import bench_methods
 from rstrack.data.estimate import write_estimate

@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 import synthetic
 import yaml
+from rstrack.bench.stress.run import StressResult, run_stress
+from rstrack.bench.stress.tables import stress_text, write_stress
 from scipy.ndimage import gaussian_filter
 
 from rsgen.config.config import Config, load_config
@@ -28,8 +30,6 @@ from rsgen.srgb import encode
 from rstrack.bench.stress import run as stress
 from rstrack.bench.stress.cases import Case, StressOptions, render_cases
 from rstrack.bench.stress.charts import gains_db
-from rstrack.bench.stress.run import StressResult, run_stress
-from rstrack.bench.stress.tables import stress_text, write_stress
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import Estimate
 from rstrack.metrics.images import gradient_energy, psnr_db, ssim

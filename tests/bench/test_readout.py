@@ -11,18 +11,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from rstrack.bench.methods.plan import Job, keyed
+from rstrack.bench.readout.cases import Case, case_overrides, cases_of, render_cases, render_words
+from rstrack.bench.readout.plot import draw_sweep, sweep_charts
+from rstrack.bench.readout.run import SweepResult
 from scipy import stats
 
 from rsgen.config.config import load_config
 from rsgen.errors import UserError
-from rstrack.bench.methods.plan import Job, keyed
 from rstrack.bench.methods.results import Cell
 from rstrack.bench.readout import cases as cases_module
-from rstrack.bench.readout.cases import Case, case_overrides, cases_of, render_cases, render_words
 from rstrack.bench.readout.config import SweepConfig, is_sweep, load_sweep_config, narrow
-from rstrack.bench.readout.plot import draw_sweep, sweep_charts
 from rstrack.bench.readout.results import Point, growth, log_interval, points_of, sweep_tables, write_sweep
-from rstrack.bench.readout.run import SweepResult
 from rstrack.cli.main import main
 from rstrack.options import Options
 from rstrack.tracking.runs.record import Noise

@@ -3,28 +3,28 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import io
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from bench_evaluation import made_up_record
 from matplotlib.figure import Figure
 
 import rsgen.figures
 from rstrack.bench.methods import paper
-from rstrack.bench.methods.plan import SequenceInfo
+from rstrack.bench.methods.config import SequenceInfo
 from rstrack.bench.methods.plots import ate_chart
-from rstrack.bench.methods.results import Cell, Results, averages
+from rstrack.bench.methods.results import Results, averages, read_results
 from rstrack.bench.methods.tables import notes, results_csv, results_markdown, results_text, write_results
+from rstrack.bench.record import Record
 from rstrack.charts.to_file import write_charts
 from rstrack.charts.to_page import figure_of
 
 
-def cell(sequence: str, method: str, ate_m: float, lost: int = 0, error: str | None = None) -> Cell:
-    metrics = {"ate_rmse_m": ate_m, "rpe_trans_rmse_m_per_s": 2 * ate_m, "rpe_rot_rmse_deg_per_s": 100 * ate_m}
-    return Cell("k", sequence, method, None if error else metrics, 100, lost, 5.0, error)
+def cell(sequence: str, method: str, ate_m: float, lost: int = 0, error: str | None = None) -> Record:
+    figures = {"ate_mm": 1e3 * ate_m, "drift_mm_s": 2e3 * ate_m, "drift_deg_s": 100 * ate_m}
+    return made_up_record(sequence, method, error, frames=100, lost=lost, total_s=5.0, **figures)
 
 
 def made_up() -> Results:
@@ -36,49 +36,48 @@ def made_up() -> Results:
     cells[6] = cell("c", "rs-pg", 0.004, lost=3)
     cells[10] = cell("c", "theirs", 0.0, error="c.txt: cannot be read")
     sequences = tuple(SequenceInfo(name, group, Path("/x") / name, 100) for name, group in infos)
-    machine = {"cpu": "abacus", "cpu_count": 2, "system": "Linux"}
-    return Results(sequences, tuple(ate), tuple(cells), machine, "1.2.3")
+    return Results(sequences=sequences, methods=tuple(ate), records=tuple(cells))
 
 
 def test_averages_by_hand() -> None:
     by = {(a.group, a.method): a for a in averages(made_up())}
     assert by["one", "rs-pg"].sequences == ("a", "c")  # rs-pg is lost on b, so b counts for nobody
-    assert by["one", "baseline"].values == pytest.approx({"ate_m": 0.02, "rpe_m_s": 0.04, "rpe_deg_s": 2.0})
-    assert by["one", "rs-pg"].values["ate_m"] == pytest.approx(0.0025)
-    assert by["one", "rs-pg"].better_pct["ate_m"] == pytest.approx(87.5)
-    assert by["one", "theirs"].values["ate_m"] is None and by["one", "theirs"].better_pct["ate_m"] is None
-    assert by["two", "rs-pg"].values["ate_m"] == 0.0001234 and by["two", "theirs"].values["ate_m"] is None
+    assert by["one", "baseline"].values == pytest.approx({"ate_mm": 20.0, "drift_mm_s": 40.0, "drift_deg_s": 2.0})
+    assert by["one", "rs-pg"].values["ate_mm"] == pytest.approx(2.5)
+    assert by["one", "rs-pg"].better_pct["ate_mm"] == pytest.approx(87.5)
+    assert by["one", "theirs"].values["ate_mm"] is None and by["one", "theirs"].better_pct["ate_mm"] is None
+    assert by["two", "rs-pg"].values["ate_mm"] == pytest.approx(0.1234) and by["two", "theirs"].values["ate_mm"] is None
 
 
 def test_the_better_setting_is_shown_and_the_other_one_kept() -> None:
     """Group one: fusing helps the baseline on two of three, and loses gs-g's track on c; group two: it harms both."""
     infos = (("a", "one"), ("b", "one"), ("c", "one"), ("robot_t1", "two"))
     ate = {
-        "baseline": (0.01, 0.02, 0.03, 0.05), "baseline --fuse": (0.012, 0.001, 0.02, 0.06),
-        "gs-g": (0.02, 0.02, 0.02, 0.02), "gs-g --fuse": (0.001, 0.001, 0.001, 0.03),
-        "rs-g": (0.001, 0.001, 0.001, 0.001), "rs-g --no-fuse": (0.0005, 0.0005, 0.0005, 0.0005),
+        "baseline": (0.01, 0.02, 0.03, 0.05), "baseline-fuse": (0.012, 0.001, 0.02, 0.06),
+        "gs-g": (0.02, 0.02, 0.02, 0.02), "gs-g-fuse": (0.001, 0.001, 0.001, 0.03),
+        "rs-g": (0.001, 0.001, 0.001, 0.001), "rs-g-no-fuse": (0.0005, 0.0005, 0.0005, 0.0005),
     }  # fmt: skip
     cells = [cell(infos[k][0], name, value) for name, values in ate.items() for k, value in enumerate(values)]
-    cells[14] = cell("c", "gs-g --fuse", 0.001, lost=80)
+    cells[14] = cell("c", "gs-g-fuse", 0.001, lost=80)
     sequences = tuple(SequenceInfo(name, group, Path("/x") / name, 100) for name, group in infos)
-    results = Results(sequences, tuple(ate), tuple(cells), {}, "1")
+    results = Results(sequences=sequences, methods=tuple(ate), records=tuple(cells))
     assert list(results.shown("one").items()) == [
-        ("baseline", "baseline --fuse"), ("gs-g", "gs-g"), ("rs-g", "rs-g"), ("rs-g --no-fuse", "rs-g --no-fuse"),
+        ("baseline", "baseline-fuse"), ("gs-g", "gs-g"), ("rs-g", "rs-g"), ("rs-g-no-fuse", "rs-g-no-fuse"),
     ]  # fmt: skip
-    assert list(results.shown("two").values()) == ["baseline", "gs-g", "rs-g", "rs-g --no-fuse"]
+    assert list(results.shown("two").values()) == ["baseline", "gs-g", "rs-g", "rs-g-no-fuse"]
     by = {(a.group, a.method): a for a in averages(results)}
-    assert by["one", "baseline --fuse"].values["ate_m"] == pytest.approx(0.011)
-    assert by["one", "gs-g"].sequences == ("a", "b", "c") and by["one", "gs-g --fuse"].values["ate_m"] is None
-    assert by["one", "rs-g"].better_pct["ate_m"] == pytest.approx(100 * (1 - 0.001 / 0.011))
+    assert by["one", "baseline-fuse"].values["ate_mm"] == pytest.approx(11.0)
+    assert by["one", "gs-g"].sequences == ("a", "b", "c") and by["one", "gs-g-fuse"].values["ate_mm"] is None
+    assert by["one", "rs-g"].better_pct["ate_mm"] == pytest.approx(100 * (1 - 0.001 / 0.011))
     lines = [line.split() for line in results_text(results).split("\n\n")[3].splitlines()]
     assert lines[1:] == [
         ["baseline", "50.0", "50.0"], ["paper:", "Baseline", "12.9", "12.9"],
         ["gs-g", "20.0", "20.0", "60", "%"], ["paper:", "Spline", "GS", "G", "16.9", "16.9", "-31", "%"],
         ["rs-g", "1.00", "1.00", "98", "%"], ["paper:", "Spline", "RS", "G", "12.9", "12.9", "0", "%"],
-        ["rs-g", "--no-fuse", "0.500", "0.500", "99", "%"],
+        ["rs-g-no-fuse", "0.500", "0.500", "99", "%"],
     ]  # fmt: skip
     said = "\n".join(notes(results))
-    assert "the other one: baseline 20.0, gs-g --fuse -" in said and "baseline --fuse 60.0, gs-g --fuse 30.0" in said
+    assert "the other one: baseline 20.0, gs-g-fuse -" in said and "baseline-fuse 60.0, gs-g-fuse 30.0" in said
     bars = {bar.name: list(bar.values) for bar in ate_chart(results).bars}
     assert bars["baseline"] == pytest.approx([12.0, 1.0, 20.0, 50.0]) and len(bars) == 4
 
@@ -119,16 +118,15 @@ def test_markdown_and_csv_by_hand() -> None:
     rows = list(csv.DictReader(io.StringIO(results_csv(made_up()))))
     assert len(rows) == 11 + 6
     lost = rows[5]
-    assert (lost["sequence"], lost["method"], lost["ate_m"], lost["lost"]) == ("b", "rs-pg", "", "51")
+    assert (lost["sequence"], lost["method"], lost["ate_mm"], lost["lost"]) == ("b", "rs-pg", "", "51")
     (average,) = [r for r in rows if (r["group"], r["sequence"], r["method"]) == ("one", "average", "rs-pg")]
-    assert float(average["better_rpe_m_s_pct"]) == pytest.approx(87.5)
+    assert float(average["better_drift_mm_s_pct"]) == pytest.approx(87.5)
 
 
-def test_json_has_no_numbers_that_are_none(tmp_path: Path) -> None:
-    write_results(made_up(), tmp_path)
-    data = json.loads((tmp_path / "results.json").read_text())
-    assert data["cells"][5]["ate_m"] is None and data["cells"][5]["run"] == "cells/b/rs-pg"
-    assert {p["method"] for p in data["paper"]} == {"baseline", "rs-pg"}
+def test_what_is_written_is_read_again(tmp_path: Path) -> None:
+    text = write_results(made_up(), tmp_path)
+    found = read_results(tmp_path / "results.json")
+    assert found == made_up() and results_text(found) == text == (tmp_path / "results.txt").read_text()[:-1]
 
 
 def test_the_papers_averages_are_those_of_its_rows() -> None:
@@ -145,7 +143,8 @@ def test_the_papers_averages_are_those_of_its_rows() -> None:
         for method, expected in zip(paper.NAMES, rows, strict=True):
             mean = paper.average(groups[group], method)
             assert mean is not None
-            assert dataclasses.astuple(mean) == pytest.approx(expected, abs=1.01e-4), (group, method)
+            found = (1e-3 * mean.drift_mm_s, mean.drift_deg_s, 1e-3 * mean.ate_mm)
+            assert found == pytest.approx(expected, abs=1.01e-4), (group, method)
     assert paper.average([], "rs-pg") is None and paper.average(["table1", "mine"], "rs-pg") is None
     assert paper.average(["table1"], "gs-p") is None
 
