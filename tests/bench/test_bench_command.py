@@ -86,7 +86,11 @@ def test_figures_are_those_of_evaluate(original: Path) -> None:
         assert figures["drift_deg_s"] == pytest.approx(metrics.rpe_rot_rmse_deg_per_s, rel=1e-4)
         assert (figures["frames"], figures["lost"], record.error) == (FRAMES, 0, None) and figures["total_s"] > 0.0
         kept = read_record(folder / "record.json")
-        assert kept is not None and kept.figures["ate_mm"] == pytest.approx(figures["ate_mm"], rel=1e-5) and len(kept.key) == 64
+        assert (
+            kept is not None
+            and kept.figures["ate_mm"] == pytest.approx(figures["ate_mm"], rel=1e-5)
+            and len(kept.key) == 64
+        )
         info = read_estimate(folder).info
         assert info["method"] == record.method[:4] and len(info["frames"]) == FRAMES
         assert info["options"]["fuse"] == (record.method in ("gs-g-fuse", "rs-g"))

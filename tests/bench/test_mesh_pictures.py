@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import dataclasses
-import json
 import re
 import shutil
 import subprocess
@@ -18,14 +17,15 @@ import pytest
 import synthetic
 import trimesh
 import yaml
-from rstrack.bench.methods.grid import Cell, Results
-from rstrack.bench.methods.plan import SequenceInfo
+from bench_evaluation import made_up_record, main
 
 import rstrack.bench.methods.mesh_pictures as mesh_pictures
-from rsgen.console.command_line import Commands, Parser, run_program
+from rstrack.bench.methods.config import SequenceInfo
 from rstrack.bench.methods.mesh_pictures import draw_meshes, make_mesh, read_picture
+from rstrack.bench.methods.results import Results
 from rstrack.bench.methods.tables import write_results
-from rstrack.cli import bench_methods
+from rstrack.bench.record import write_record
+from rstrack.bench.runner import Outcome
 from rstrack.data.estimate import write_estimate
 from rstrack.report.build import write_report
 
@@ -43,7 +43,7 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
     spline = synthetic.make_spline()
     stamps = np.arange(FRAMES) / synthetic.RATE_HZ
     for method in METHODS:
-        run = folder / "bench/cells/a" / method
+        run = folder / "bench/cells/track/a" / method
         write_estimate(run, stamps, spline.pose(stamps), None if method == "baseline" else spline, {"method": method})
     draw_meshes(of(folder), folder / "bench")
     return folder
@@ -79,17 +79,17 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
 
 
 def of(folder: Path, **changes: Any) -> Results:
-    """Results with the cells, each with cell.json; `changes`: fields of the baseline's."""
-    cells = []
+    """Results with the cells, each with its record; `changes`: fields of the baseline's."""
+    records = []
     for method in METHODS:
-        metrics = {"ate_rmse_m": ATE_M[method], "rpe_trans_rmse_m_per_s": 0.1, "rpe_rot_rmse_deg_per_s": 1.0}
-        cell = Cell(f"key of {method}", "a", method, metrics, FRAMES, 0, 1.0)
-        if method == "baseline":
-            cell = dataclasses.replace(cell, **changes)
-        (folder / "bench/cells/a" / method / "cell.json").write_text(json.dumps(dataclasses.asdict(cell)))
-        cells.append(cell)
+        figures = {"ate_mm": 1e3 * ATE_M[method], "drift_mm_s": 100.0, "drift_deg_s": 1.0, "frames": FRAMES, "lost": 0}
+        record = made_up_record("a", method, total_s=1.0, **figures)
+        change = {"key": f"key of {method}"} | (changes if method == "baseline" else {})
+        record = dataclasses.replace(record, **change)
+        write_record(folder / "bench/cells" / record.cell / "record.json", record)
+        records.append(record)
     sequence = SequenceInfo("a", "hand-held", folder / "seq", FRAMES)
-    return Results((sequence,), METHODS, tuple(cells), {"cpu": "imaginary", "cpu_count": 1}, "0")
+    return Results(sequences=(sequence,), methods=METHODS, records=tuple(records))
 
 
 def panel(folder: Path, k: int) -> np.ndarray:
@@ -101,7 +101,7 @@ def panel(folder: Path, k: int) -> np.ndarray:
 
 def distance_to_box(folder: Path, method: str) -> np.ndarray:
     """How far (n,) m a map's vertices, less those of the ball and near it, are from the walls of the true room."""
-    mesh = trimesh.load(folder / "bench/cells/a" / method / "mesh.ply", process=False)
+    mesh = trimesh.load(folder / "bench/cells/track/a" / method / "mesh.ply", process=False)
     p = np.asarray(mesh.vertices)
     p = p[np.linalg.norm(p - synthetic.BALL, axis=1) > 1.5 * synthetic.BALL_RADIUS]
     return np.abs(p[:, None] - synthetic.BOX).min(axis=(1, 2))
@@ -113,8 +113,8 @@ def distance_to_box(folder: Path, method: str) -> np.ndarray:
 def test_lines_have_poses_of_their_own_where_the_method_says_so(original: Path) -> None:
     ours, baseline = distance_to_box(original, "rs-pg"), distance_to_box(original, "baseline")
     assert np.median(ours) < 0.001 < np.median(baseline)
-    assert not (original / "bench/cells/a/gs-g/mesh.ply").exists()
-    cell = of(original).cells[2]
+    assert not (original / "bench/cells/track/a/gs-g/mesh.ply").exists()
+    cell = of(original).records[2]
     options = make_mesh(of(original).sequences[0], cell, original / "bench")["options"]
     assert options["shutter"] == "gs", "gs-g has a spline, and takes the shutter for a global one all the same"
     assert np.median(distance_to_box(original, "gs-g")) > 0.001
@@ -135,9 +135,9 @@ def test_a_long_sequence_is_thinned(place: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(mesh_pictures, "run_map", lambda _, __, ___, options, **____: seen.append(options.every))
     results = of(place)
     for frames in (30, 80, 648, 1509):
-        shutil.rmtree(place / "bench/cells/a/gs-g", ignore_errors=True)
-        (place / "bench/cells/a/gs-g").mkdir()
-        make_mesh(dataclasses.replace(results.sequences[0], frames=frames), results.cells[2], place / "bench")
+        shutil.rmtree(place / "bench/cells/track/a/gs-g", ignore_errors=True)
+        (place / "bench/cells/track/a/gs-g").mkdir()
+        make_mesh(dataclasses.replace(results.sequences[0], frames=frames), results.records[2], place / "bench")
     assert seen == [1, 1, 8, 19]
 
 
@@ -175,12 +175,12 @@ def test_what_fails_is_said_and_the_others_are_drawn(
     place: Path, calls: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out, said = place / "bench", list[str]()
-    (out / "cells/a/baseline/trajectory.txt").write_text("not a trajectory\n")
+    (out / "cells/track/a/baseline/trajectory.txt").write_text("not a trajectory\n")
     draw_meshes(of(place, key="another"), out, ("baseline", "rs-pg"), warn=said.append)
     assert len(said) == 1 and said[0].startswith("no mesh of baseline on a: ") and "trajectory.txt" in said[0]
     found = read_picture(out, "a")
     assert found is not None and found.methods == ("rs-pg",) and calls == ["baseline", "picture"]
-    (out / "cells/a/rs-pg/mesh.ply").write_text("no mesh")
+    (out / "cells/track/a/rs-pg/mesh.ply").write_text("no mesh")
     said.clear()
     assert draw_meshes(of(place), out, ("rs-pg",), warn=said.append) != [] and said == []
     (out / "plots/meshes_a.jpg").unlink()
@@ -190,7 +190,8 @@ def test_what_fails_is_said_and_the_others_are_drawn(
 
 
 def test_lost_tracks_are_not_shown(place: Path, calls: list[str]) -> None:
-    draw_meshes(of(place, lost=FRAMES - 1), place / "bench")
+    lost = {"ate_mm": 1.0, "frames": FRAMES, "lost": FRAMES - 1}
+    draw_meshes(of(place, runs=(lost,)), place / "bench")
     found = read_picture(place / "bench", "a")
     assert found is not None and found.methods == ("rs-pg",) and calls == ["picture"]
 
@@ -223,15 +224,6 @@ def test_the_report_leaves_out_maps_of_cells_that_were_run_again(place: Path) ->
     assert "No maps of a: " in page and "map from above" not in page
 
 
-def bench(words: str) -> int:
-    def parser() -> Parser:
-        commands = Commands("rstrack", "test")
-        commands.add(bench_methods.bench, "")
-        return commands.parser
-
-    return run_program("rstrack", parser, words.split(), "nothing was written")
-
-
 @pytest.mark.parametrize(
     ("words", "drawn"), [("", True), ("--no-meshes", False), ("--quick", False), ("--quick --meshes", True)]
 )
@@ -239,28 +231,28 @@ def test_the_command(
     place: Path, words: str, drawn: bool, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     results, called = of(place), []
-    monkeypatch.setattr("rstrack.bench.methods.grid.run_plan", lambda *_: results)
+    outcome = Outcome({record.cell: record for record in results.records})
+    monkeypatch.setattr("rstrack.bench.runner.run_cells", lambda *_: outcome)
     monkeypatch.setattr("rstrack.bench.methods.plots.draw_plots", lambda *_: [])
 
     def draw(given: Results, out: Path, progress: Any, warn: Any) -> list[Path]:
-        called.append((given, out))
+        called.append((given.records, out))
         warn("no mesh of this one")
         raise KeyboardInterrupt
 
     monkeypatch.setattr(mesh_pictures, "draw_meshes", draw)
-    entry = {"name": "seq", "group": "g", "config": "seq.yaml"}
-    quick = {"sequences": ["seq"], "methods": ["rs-pg"], "frames": 10}
-    (place / "c.yaml").write_text(yaml.safe_dump({"sequences": [entry], "methods": ["rs-pg"], "quick": quick}))
-    status = bench(f"bench {place}/c.yaml --data {place} --out {place}/bench --quiet {words}")
+    entry = {"path": "seq", "group": "hand-held"}
+    quick = {"sequences": ["a"], "methods": ["rs-pg"], "frames": 10}
+    (place / "c.yaml").write_text(yaml.safe_dump({"sequences": {"a": entry}, "methods": ["rs-pg"], "quick": quick}))
+    status = main(f"bench {place}/c.yaml --data {place} --out {place}/bench --quiet {words}")
     out, error = capfd.readouterr()
-    assert called == ([(results, place / "bench")] if drawn else [])
+    assert called == ([(results.records, place / "bench")] if drawn else [])
     assert status == (130 if drawn else 0) and "rs-pg" in out
     assert ("no mesh of this one\n" in error and "the same command goes on" in error) == drawn
 
 
 def test_meshes_of_methods_that_have_none_are_refused(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    entry = {"name": "seq", "group": "g", "config": "seq.yaml"}
-    (place / "c.yaml").write_text(yaml.safe_dump({"sequences": [entry], "methods": ["rs-g"]}))
-    assert bench(f"bench {place}/c.yaml --data {place} --out {place}/new --meshes") == 2
+    (place / "c.yaml").write_text(yaml.safe_dump({"sequences": {"a": {"path": "seq"}}, "methods": ["rs-g"]}))
+    assert main(f"bench {place}/c.yaml --data {place} --out {place}/new --meshes") == 2
     assert capfd.readouterr().err == "rstrack: --meshes: is for rs-pg, gs-pg, baseline: add one of them to --method\n"
     assert not (place / "new").exists()

@@ -2,48 +2,59 @@
 
 from __future__ import annotations
 
-import json
+import csv
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import synthetic
 import yaml
-from rstrack.bench.methods.plan import Job, keyed
-from rstrack.bench.readout.cases import Case, case_overrides, cases_of, render_cases, render_words
-from rstrack.bench.readout.plot import draw_sweep, sweep_charts
-from rstrack.bench.readout.run import SweepResult
 from scipy import stats
 
+import rstrack.bench.measures.track
 from rsgen.config.config import load_config
 from rsgen.errors import UserError
-from rstrack.bench.methods.results import Cell
-from rstrack.bench.readout import cases as cases_module
-from rstrack.bench.readout.config import SweepConfig, is_sweep, load_sweep_config, narrow
-from rstrack.bench.readout.results import Point, growth, log_interval, points_of, sweep_tables, write_sweep
+from rstrack.bench.readout.config import SweepConfig, installed, load_sweep_config, narrow, sweep_benchmark
+from rstrack.bench.readout.results import (
+    Point,
+    Sweep,
+    draw_sweep,
+    growth,
+    log_interval,
+    points_of,
+    sweep_charts,
+    sweep_tables,
+    write_sweep,
+)
+from rstrack.bench.record import Record, read_records
+from rstrack.bench.runner import run_cells
+from rstrack.bench.sequences import Sources
 from rstrack.cli.main import main
 from rstrack.options import Options
-from rstrack.tracking.runs.record import Noise
 
 ROOT = Path(__file__).parents[2]
 SWEEP = ROOT / "configs/readout_sweep.yaml"
 
 
 def test_the_sweep_that_ships_is_the_one_asked_for() -> None:
-    assert is_sweep(SWEEP) and not is_sweep(ROOT / "configs/evaluation.yaml")
     config = load_sweep_config(SWEEP)
     assert config.readouts_s == (0.0, 0.007, 0.014, 0.021, 0.028) and config.exposures_s == (0.0, 0.01)
-    assert len(config.motions) == 3 and config.noise.seeds == 3 and len(cases_of(config)) == 30
-    assert len({case.name for case in cases_of(config)}) == 30
+    cells = sweep_benchmark(config, config.methods).cells
+    assert len(config.motions) == 3 and len({cell.name for cell in cells}) == len(cells) == 30 * 10
+    assert len({cell.case for cell in cells}) == 30 and all(cell.seeds == (0, 1, 2) for cell in cells)
 
 
 @pytest.mark.parametrize("motion", ["demo", "table1"])
 def test_rsgen_reads_what_it_is_told_of_a_case(motion: str) -> None:
     config = narrow(load_sweep_config(SWEEP), motions=[motion], width=160, frames=20)
-    case = Case(motion, 0.014, 0.010, 160)
-    words = render_words(config, case, Path("x"))
+    config = narrow(config, readouts_s=(0.014,), exposures_s=(0.010,))
+    (cell,) = sweep_benchmark(config, ["rs-pg"], Options(fuse=False)).cells
+    assert (cell.name, cell.options.fuse) == (f"track/{motion}_160px_readout_14ms_exposure_10ms/rs-pg-no-fuse", False)
+    words = Sources().words(cell.sequence)
     assert words[words.index("--frames") + 1] == "0:20"
     fields = {name[2:]: value for name, value in pairwise(words) if name.startswith("--")}
     given = {name: value for name, value in fields.items() if "." in name}
@@ -56,11 +67,6 @@ def test_rsgen_reads_what_it_is_told_of_a_case(motion: str) -> None:
         ends = [np.array([[-0.5, -0.5], [c.width - 0.5, c.height - 0.5]]) for c in (a.camera, b.camera)]
         rays = [c.unproject(end) for c, end in zip((a.camera, b.camera), ends, strict=True)]
         np.testing.assert_allclose(*rays, atol=1e-6)
-
-
-def test_a_config_without_a_size_cannot_be_scaled() -> None:
-    with pytest.raises(UserError, match=r"mine\.yaml: color: width"):
-        case_overrides(Path("mine.yaml"), {"color": {}}, Case("mine", 0.0, 0.0, 160))
 
 
 @pytest.mark.parametrize(
@@ -89,7 +95,7 @@ def test_a_wrong_sweep_is_refused_in_one_line(
     [
         (["--quick"], "--quick: is not for a readout sweep"), (["--frames", "5:20"], "begins with frame 0"),
         (["--sequence", "nowhere"], "no such motion"), (["--method", "rs-x"], "no method 'rs-x'"),
-        (["--seeds", "0"], "--seeds"),
+        (["--seeds", "0"], "seeds"),
     ],
 )  # fmt: skip
 def test_options_that_a_sweep_has_not_are_refused(
@@ -105,33 +111,44 @@ def test_options_of_a_sweep_are_for_sweeps(capsys: pytest.CaptureFixture[str]) -
     assert "is no sweep" in capsys.readouterr().err
 
 
-def test_only_what_is_missing_or_changed_is_rendered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    config = narrow(load_sweep_config(SWEEP), motions=["demo"], readouts_s=(0.0, 0.028), exposures_s=(0.0,), frames=20)
-    called: list[Sequence[str]] = []
-    said: list[str] = []
-    monkeypatch.setattr(cases_module, "_is_whole", lambda folder, frames: folder.is_dir())
+def test_noise_is_of_the_seed_and_more_seeds_are_added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rendered once, by a stand-in; tracked once for each seed, with that seed's noise."""
+    config = narrow(
+        load_sweep_config(SWEEP), motions=["demo"], readouts_s=(0.02,), exposures_s=(0.0,), seeds=2, frames=12
+    )
+    made: list[Sequence[str]] = []
+    seeds: list[int] = []
 
     def render(words: Sequence[str]) -> None:
-        called.append(words)
-        Path(words[words.index("--out") + 1]).mkdir(parents=True, exist_ok=True)
+        made.append(words)
+        synthetic.make_sequence(Path(words[words.index("--out") + 1]), synthetic.make_config(), 12)
 
-    def run(sweep: SweepConfig) -> int:
-        before = len(called)
-        render_cases(sweep, tmp_path, render, lambda *what: None, said.append, "local:2")
-        return len(called) - before
+    def track(task: Any, progress: Any) -> dict[str, float]:
+        noise = task.noise
+        seeds.append(noise.seed)
+        assert (noise.sigma_depth, noise.sigma_intensity) == (1.2e-3, 0.01) and len(task.dataset) == 12
+        return {"frames": 12, "lost": 0, "ate_mm": 1.0 + noise.seed}
 
-    assert run(config) == 2 and called[0][-2:] == ["--scheduler", "local:2"] and "2 sequences of 20 frames" in said[0]
-    assert run(config) == 0 and len(said) == 1
-    assert run(narrow(config, frames=30)) == 2
-    assert run(narrow(config, frames=30, readouts_s=(0.028, 0.014))) == 1
-    next(iter((tmp_path / "sequences").glob("*28ms*.json"))).unlink()
-    assert run(narrow(config, frames=30)) == 1
+    monkeypatch.setattr(rstrack.bench.measures.track, "track_cell", track)
+
+    def run(sweep: SweepConfig) -> Sweep:
+        sources = Sources(cache=tmp_path / "cache", render=render)
+        found = run_cells(sweep_benchmark(sweep, ["gs-pg", "rs-pg"]), tmp_path / "out", sources)
+        return Sweep(sweep, tuple(found.records.values()))
+
+    first = run(config)
+    assert len(made) == 1 and "--frames" in made[0] and seeds == [0, 1, 0, 1]
+    run(narrow(config, seeds=3))
+    assert len(made) == 1 and seeds[4:] == [2, 2]
+    (point, _) = points_of(run(config))
+    assert point.values == (1.0, 2.0) and len(seeds) == 6 and points_of(first)[0] == point
 
 
-def test_noise_is_part_of_a_cells_key_and_none_leaves_it_as_it_was() -> None:
-    job = Job("a", "rs-pg", Path("a"), 0, 9, Options(), None, Path("o"), "")
-    keys = [keyed(replace(job, noise=noise), "d").key for noise in (None, Noise(1e-3, 0.0, 0), Noise(1e-3, 0.0, 1))]
-    assert len(set(keys)) == 3 and keyed(job, "d").key == keys[0]
+def test_what_is_not_installed_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rstrack.bench.readout.config.find_spec", lambda name: None)
+    assert installed(["rs-pg", "kiss-icp"]) == (("rs-pg",), ("kiss-icp",))
+    with pytest.raises(UserError, match="none of kiss-icp, open3d-icp is installed"):
+        installed(["kiss-icp", "open3d-icp"])
 
 
 def test_intervals_are_students_in_logarithms() -> None:
@@ -150,22 +167,20 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     assert abs(np.mean(held) - 0.95) < 0.012
 
 
-def result() -> SweepResult:
+def result() -> Sweep:
     """Two readouts and two methods, three seeds; gs-pg loses one of them, and all at the second readout of 'b'."""
     config = narrow(load_sweep_config(SWEEP), readouts_s=(0.028, 0.0), exposures_s=(0.0,), motions=["demo", "table1"])
     ate = {("rs-pg", 0.0): 1.0, ("rs-pg", 0.028): 1.2, ("gs-pg", 0.0): 1.0, ("gs-pg", 0.028): 8.0}
-    cells = {}
-    for case in cases_of(config):
-        for method in ("gs-pg", "rs-pg"):
-            found = []
-            for seed in range(3):
-                is_lost = method == "gs-pg" and (seed == 2 or (case.motion, case.readout_s) == ("table1", 0.028))
-                metrics = {"ate_rmse_m": 1e-3 * ate[method, case.readout_s] * 1.1 ** (seed - 1)}
-                lost = 60 if is_lost else 0
-                found.append(Cell("", f"{case.name}_seed_{seed}", method, None if is_lost else metrics, 60, lost, 1.0))
-            cells[case, method] = tuple(found)
-    frames = dict.fromkeys(cases_of(config), 60)
-    return SweepResult(config, ("gs-pg", "rs-pg"), ("orb-slam3",), cells, frames, {}, "1")
+    records = []
+    for cell in sweep_benchmark(config, ["gs-pg", "rs-pg"]).cells:
+        readout = cell.sequence.set["depth.readout_s"]
+        runs: list[dict[str, float | None]] = []
+        for seed in range(3):
+            is_lost = cell.method == "gs-pg" and (seed == 2 or (cell.group, readout) == ("table1", 0.028))
+            found = {"ate_mm": ate[cell.method, readout] * 1.1 ** (seed - 1), "lost": 0}
+            runs.append({"frames": 60, "lost": 60} if is_lost else {"frames": 60, **found})
+        records.append(Record(cell.name, "", cell.as_dict(), (0, 1, 2), tuple(runs), True))
+    return Sweep(config, tuple(records), ("orb-slam3",))
 
 
 def test_tables_say_means_growth_and_what_was_lost(tmp_path: Path) -> None:
@@ -180,20 +195,19 @@ def test_tables_say_means_growth_and_what_was_lost(tmp_path: Path) -> None:
     text = write_sweep(found, tmp_path)
     assert "left out, not installed: orb-slam3" in text
     assert "gs-pg on table1_320px_readout_28ms_exposure_0ms 3 of 3" in text
-    data = json.loads((tmp_path / "results.json").read_text())
-    assert len(data["points"]) == 8 and len(data["cells"]) == 24
-    assert {p["ate_m"] for p in data["points"] if p["lost"] == 3} == {None}
-    assert len((tmp_path / "results.csv").read_text().splitlines()) == 9
+    records = read_records(tmp_path / "records.json")
+    assert points_of(replace(found, records=tuple(records[r.cell] for r in found.records)))[1].lost == 0
+    rows = list(csv.DictReader((tmp_path / "results.csv").open()))
+    assert len(rows) == 8 and {row["ate_mm"] for row in rows if row["lost"] == "3"} == {""}
 
 
 def test_growth_is_unknown_where_a_track_is_lost() -> None:
-    points = [p for p in points_of(result()) if p.method == "gs-pg" and p.case.motion == "table1"]
+    points = [p for p in points_of(result()) if p.method == "gs-pg" and p.motion == "table1"]
     assert growth(points) is None and growth(points[:1]) is None
 
 
 def test_growth_is_the_largest_over_the_smallest_wherever_they_are() -> None:
-    case = Case("a", 0.0, 0.0)
-    assert growth([Point(case, "m", (value,), 0) for value in (2.0, 6.0, 1.5, 3.0)]) == pytest.approx(4.0)
+    assert growth([Point("a", 0.0, 0.0, "m", (value,), 0) for value in (2.0, 6.0, 1.5, 3.0)]) == pytest.approx(4.0)
 
 
 def test_the_picture_has_a_line_with_its_interval_for_each_method(tmp_path: Path) -> None:

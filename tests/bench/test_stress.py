@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,10 +12,9 @@ import numpy as np
 import pytest
 import synthetic
 import yaml
-from rstrack.bench.stress.run import StressResult, run_stress
-from rstrack.bench.stress.tables import stress_text, write_stress
 from scipy.ndimage import gaussian_filter
 
+import rstrack.bench.measures.track
 from rsgen.config.config import Config, load_config
 from rsgen.console.command_line import parse_frames
 from rsgen.errors import UserError
@@ -27,9 +25,14 @@ from rsgen.produce.writer import SequenceWriter
 from rsgen.sequence.format import stream_stamps
 from rsgen.sequence.trajectory import read_trajectory
 from rsgen.srgb import encode
-from rstrack.bench.stress import run as stress
-from rstrack.bench.stress.cases import Case, StressOptions, render_cases
-from rstrack.bench.stress.charts import gains_db
+from rstrack.bench.measures import blur
+from rstrack.bench.record import Record
+from rstrack.bench.runner import run_cells
+from rstrack.bench.sequences import Sources
+from rstrack.bench.stress.cases import StressOptions, case_name, stress_benchmark
+from rstrack.bench.stress.charts import write_stress
+from rstrack.bench.stress.results import StressResult, gains_db, read_stress, stress_result, stress_text
+from rstrack.cli.main import main
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import Estimate
 from rstrack.metrics.images import gradient_energy, psnr_db, ssim
@@ -111,22 +114,34 @@ def render(words: Sequence[str]) -> None:
 
 
 def told_truth(dataset: Any, options: Any, out: Path, *_: Any) -> Any:
-    """A tracker that finds the truth, in a world of its own."""
+    """A tracker that finds the truth, in a world of its own, but for an error of a tenth of the exposure it is told."""
     spline = dataset.truth
     moved = Spline(T_EST_WORLD @ spline.control_points, spline.t0, spline.dt)
-    info = {"lost": 0, "metrics": {"ate_rmse_m": 1e-3 * dataset.rig.color_shutter.exposure_s}}
-    return SimpleNamespace(estimate=Estimate(dataset.stamps, moved.pose(dataset.stamps), moved, info))
+    T = moved.pose(dataset.stamps)
+    T[::2, 0, 3] += 0.1 * dataset.rig.color_shutter.exposure_s
+    info = {"keyframes": 1, "timings": {"frame_ms": [1.0], "start_s": 0.0, "total_s": 1.0}}
+    estimate = Estimate(dataset.stamps, T, None if options.blur_sigma_px else moved, info)
+    return SimpleNamespace(estimate=estimate, end="done", unreadable=())
+
+
+def run_stress(config: Path, out: Path, options: StressOptions) -> tuple[Record, ...]:
+    sources = Sources(cache=out, render=render)
+    return tuple(run_cells(stress_benchmark(config, sources, options), out, sources).records.values())
 
 
 @pytest.fixture(scope="module")
-def stressed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, StressResult]:
+def records(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[Record, ...]]:
     out = tmp_path_factory.mktemp("stress")
     config = write_config(out / "tiny.yaml")
     options = StressOptions(exposures_s=(0.0, 0.02), speeds=(), sigmas_px=(1.0, 2.0), frames=FRAMES)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stress, "track", told_truth)
-        report = run_stress(config, out / "made", options, render=render)
-    return out / "made", report
+        patch.setattr(rstrack.bench.measures.track, "track", told_truth)
+        return out / "made", run_stress(config, out / "made", options)
+
+
+@pytest.fixture(scope="module")
+def stressed(records: tuple[Path, tuple[Record, ...]]) -> tuple[Path, StressResult]:
+    return records[0], stress_result(records[1])
 
 
 def test_blur_aware_colour_is_better_by_two_decibels(stressed: tuple[Path, StressResult]) -> None:
@@ -146,9 +161,9 @@ def test_fused_depth_has_half_the_error_of_a_frames(stressed: tuple[Path, Stress
     _, report = stressed
     assert len(report.depth) == 4
     for row in report.depth:
-        assert row.fused_m < 0.5 * row.single_m
+        assert row.fused_mm is not None and row.single_mm is not None and row.fused_mm < 0.5 * row.single_mm
         # σ = 1.2e-3 z² with walls at 1.5 to 3 m, rectified by bilinear interpolation, which averages a little.
-        assert 1.5e-3 < row.single_m < 8e-3
+        assert 1.5 < row.single_mm < 8.0
 
 
 def test_scores_do_not_depend_on_the_world(stressed: tuple[Path, StressResult]) -> None:
@@ -164,36 +179,39 @@ def test_scores_do_not_depend_on_the_world(stressed: tuple[Path, StressResult]) 
 
 def test_tracking_is_compared_with_poses_at_the_end_of_exposure(stressed: tuple[Path, StressResult]) -> None:
     _, report = stressed
-    rows = [(row.case, row.variant, row.ate_m) for row in report.tracking if "blur weight" not in row.variant]
-    assert rows == [
-        ("exposure_0ms", "mid-exposure", 0.0),
-        ("exposure_20ms", "mid-exposure", 2e-5),
-        ("exposure_20ms", "end of exposure", 0.0),  # told_truth repeats the exposure it was given
+    assert [(row.case, row.variant, row.lost) for row in report.tracking] == [
+        ("exposure_0ms", "mid-exposure", 0),
+        ("exposure_20ms", "mid-exposure", 0),
+        ("exposure_20ms", "mid-exposure, blur weight", 0),
+        ("exposure_20ms", "end of exposure", 0),
     ]
+    found = [row.ate_mm for row in report.tracking]
+    # An error of a tenth of the exposure that the tracker is told, in every second pose.
+    assert found == pytest.approx([0.0, 1.0, 1.0, 0.0], abs=0.05)
 
 
 def test_exposures_differ_in_blur_only(stressed: tuple[Path, StressResult]) -> None:
     out, _ = stressed
-    sharp, blurred = (open_dataset(out / "sequences" / f"exposure_{ms}ms") for ms in (0, 20))
+    sharp, blurred = (open_dataset(next((out / "sequences").glob(f"tiny-exposure_{ms}ms-*[!n]"))) for ms in (0, 20))
     np.testing.assert_allclose(sharp.rows("color"), blurred.rows("color"), atol=1e-9)  # type: ignore[arg-type]
     assert np.array_equal(sharp.images.depth(5), blurred.images.depth(5))
     assert not np.array_equal(sharp.images.color(5), blurred.images.color(5))
 
 
-def test_a_report_can_be_read_again(stressed: tuple[Path, StressResult]) -> None:
-    out, report = stressed
-    files = write_stress(report, out)
-    assert all(path.stat().st_size > 0 for path in files) and len({*files}) == len(files) == 12
-    read = json.loads((out / "stress.json").read_text())
-    assert len(read["color"]) == len(report.color) and read["color"][0]["sigma_px"] is None
+def test_what_is_written_can_be_read_again(records: tuple[Path, tuple[Record, ...]]) -> None:
+    out, found = records
+    report = write_stress(found, out)
+    names = ("stress.txt", "stress.json", "stress_color.csv", "stress_depth.csv", "stress_tracking.csv", "stress.png")
+    assert all((out / name).stat().st_size > 0 for name in (*names, "panels.png"))
+    read = read_stress(out)
+    assert len(read.color) == len(report.color) == 12 and read.color[0].sigma_px is None
     rows = list(csv.DictReader((out / "stress_color.csv").open()))
-    assert [float(row["psnr_db"]) for row in rows] == pytest.approx([row.psnr_db for row in report.color])
+    assert [float(row["psnr_db"]) for row in rows] == pytest.approx([row.psnr_db for row in read.color], rel=1e-5)
     text = stress_text(report)
     assert f"{gains_db(report)['exposure_20ms']:+.2f}" in text and "nan" not in text
-    panels = report.panels
-    assert panels is not None and panels.case == "exposure_20ms"
-    weights = panels.weights[panels.weights > 0]
-    assert weights.min() > 0.0 and weights.max() <= 1.0 and weights.mean() < 0.2
+    assert read.panels_case == "exposure_20ms" and read.panels is not None
+    panels = blur.read_panels(out / read.panels)
+    assert panels is not None and 0.0 < panels.white <= 1.0 and len(panels.images(out / read.panels)) == 5
 
 
 def test_a_faster_sequence_takes_the_same_path(tmp_path: Path) -> None:
@@ -201,13 +219,16 @@ def test_a_faster_sequence_takes_the_same_path(tmp_path: Path) -> None:
 
     def record(words: Sequence[str]) -> None:
         asked.append(list(words))
-        folder = Path(words[words.index("--out") + 1])
-        folder.mkdir(parents=True, exist_ok=True)
-        shaken().save(folder / "spline.npz")
+        if "--out" in words:
+            folder = Path(words[words.index("--out") + 1])
+            folder.mkdir(parents=True, exist_ok=True)
+            shaken().save(folder / "spline.npz")
 
     options = StressOptions(exposures_s=(0.0,), speeds=(2.0,), frames=20)
-    folders = render_cases(config, tmp_path / "out", options, lambda *_: None, record)
-    assert [case.name for case in folders] == ["exposure_0ms", "exposure_20ms_speed_2x"]
+    sources = Sources(cache=tmp_path / "out", render=record)
+    cells = {cell.case: cell for cell in stress_benchmark(config, sources, options).cells}
+    assert list(cells) == ["exposure_0ms", "exposure_20ms_speed_2x", "exposure_20ms_speed_2x_told_sharp"]
+    record(sources.words(cells["exposure_20ms_speed_2x"].sequence))
     fast = load_config(Path(asked[1][1]))
     assert fast.trajectory.file is not None and fast.scene.file == (tmp_path / "box.ply").resolve()
     spline = fit_spline(read_trajectory(fast.trajectory.file), fast.trajectory.knot_spacing_s).spline
@@ -218,7 +239,7 @@ def test_a_faster_sequence_takes_the_same_path(tmp_path: Path) -> None:
         np.testing.assert_allclose(found, want, atol=2e-6)
     assert spline.t_end - spline.t_begin == pytest.approx(0.5 * (slow.t_end - slow.t_begin))
     # Both carry the truth of their speed, and half the frames are as long a way.
-    assert all("[middle]" in words for words in asked)
+    assert all('["middle"]' in words for words in asked)
     assert ["0:20" in asked[0], "0:10" in asked[1]] == [True, True]
     assert "--color.offset_s 0.03" in " ".join(asked[1]) and "--color.exposure_s 0.02" in " ".join(asked[1])
 
@@ -230,8 +251,9 @@ def test_a_faster_sequence_takes_the_same_path(tmp_path: Path) -> None:
 def test_what_cannot_be_compared_is_refused(tmp_path: Path, change: dict[str, Any], complaint: str) -> None:
     config = write_config(tmp_path / "tiny.yaml", **change)
     options = StressOptions(exposures_s=(0.0,), speeds=(), frames=2)
-    with pytest.raises(UserError, match=complaint):
-        run_stress(config, tmp_path / "out", options, render=render)
+    (record,) = run_stress(config, tmp_path / "out", options)
+    assert record.error is not None and complaint in record.error
+    assert stress_result([record]).failed == (f"blur/exposure_0ms/rs-pg: {record.error}",)
 
 
 @pytest.mark.parametrize(
@@ -243,16 +265,34 @@ def test_absurd_settings_are_refused(wrong: dict[str, Any]) -> None:
         StressOptions(**wrong)
 
 
-def test_a_failing_render_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "wrong.yaml").write_text("name: wrong\nscene: {}\n")
-    with pytest.raises(UserError, match=r"rsgen render .*wrong.yaml failed: [^\n]*$"):
-        run_stress(tmp_path / "wrong.yaml", tmp_path / "out", StressOptions(exposures_s=(0.0,), speeds=()))
+def test_a_failing_render_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    (tmp_path / "wrong.yaml").write_text("name: wrong\nscene: {}\nmotion: {}\n")
+    assert main(["bench", str(tmp_path / "wrong.yaml"), "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.startswith("rstrack: rsgen render ") and "wrong.yaml failed: " in said
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--sequence", "a"], "--sequence: is not for a stress test"), (["--frames", "5:20"], "begins with frame 0"),
+        (["--method", "rs-pg", "gs-pg"], "one method"), (["--method", "kiss-icp"], "one method"),
+        (["--exposure", "2"], "between 0 and 1 s"), (["--width", "3"], "width 3"), (["--seeds", "2"], "--seeds"),
+    ],
+)  # fmt: skip
+def test_wrong_words_are_refused(words: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "stress", *words]) == 2
+    said = capsys.readouterr().err
+    assert told in said and len(said.splitlines()) == 1
 
 
 def test_cases_are_named_and_sorted() -> None:
     options = StressOptions(exposures_s=(0.02, 0.0), speeds=(4.0, 1.0, 2.0))
-    assert options.cases == (Case(1.0, 0.0), Case(1.0, 0.02), Case(2.0, 0.02), Case(4.0, 0.02))
-    assert Case(2.5, 0.0125).name == "exposure_12.5ms_speed_2.5x"
+    assert options.cases == ((1.0, 0.0), (1.0, 0.02), (2.0, 0.02), (4.0, 0.02))
+    assert case_name(2.5, 0.0125) == "exposure_12.5ms_speed_2.5x"
 
 
 def test_image_scores_against_numpy_and_scipy() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import json
 from dataclasses import dataclass, field
 from html.parser import HTMLParser
@@ -12,16 +13,20 @@ from typing import Any
 import cv2
 import numpy as np
 import synthetic
-from rstrack.bench.methods.plan import SequenceInfo
-from rstrack.bench.stress.run import ColorScore, DepthScore, Panels, StressResult, TrackScore
-from rstrack.bench.stress.tables import write_stress
+from bench_evaluation import made_up_record
 
 from rsgen.config.truth import TruthConfig
+from rsgen.files import encode_png
 from rsgen.geometry import se3
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
-from rstrack.bench.methods.results import Cell, Results
+from rstrack.bench.measures.blur import PANELS, Panels
+from rstrack.bench.methods.config import SequenceInfo
+from rstrack.bench.methods.results import Results
 from rstrack.bench.methods.tables import write_results
+from rstrack.bench.record import Record
+from rstrack.bench.stress.charts import write_stress
+from rstrack.bench.stress.results import StressResult
 from rstrack.calibration.findings.record import CALIBRATION
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import write_estimate
@@ -141,18 +146,31 @@ def shown(value: float | None, scale: float = 1.0) -> str:
 
 def make_bench(root: Path, sequence: Path, twin: Path) -> Results:
     """A benchmark of two sequences and three methods, one of which has failed on one of them."""
-    methods, errors, cells = ("baseline", "rs-pg", "open3d-icp"), (0.05, 0.001, 0.01), []
+    methods, errors, records = ("baseline", "rs-pg", "open3d-icp"), (0.05, 0.001, 0.01), []
     infos = SequenceInfo("robot_t1", "hand-held", sequence, FRAMES), SequenceInfo("lr_kt2", "living room", twin, FRAMES)
     for info in infos:
         for k, method in enumerate(methods):
             if (info.name, method) == ("lr_kt2", "open3d-icp"):
-                cells.append(Cell("k", info.name, method, None, FRAMES, FRAMES, None, "is not here"))
+                records.append(made_up_record(info.name, method, "is not here"))
                 continue
-            run = make_run(root / "cells" / info.name / method, info.path, seed=k, error_m=errors[k])
-            cells.append(Cell("k", info.name, method, run_evaluate(info.path, run).metrics.as_dict(), FRAMES, 4, 3.1))
-    results = Results(infos, methods, tuple(cells), {"cpu": "imaginary"}, "0")
+            run = make_run(root / "cells/track" / info.name / method, info.path, seed=k, error_m=errors[k])
+            found = run_evaluate(info.path, run).metrics
+            assert found.rpe_trans_rmse_m_per_s is not None
+            figures = {"ate_mm": 1e3 * found.ate_rmse_m, "drift_mm_s": 1e3 * found.rpe_trans_rmse_m_per_s}
+            figures |= {"drift_deg_s": found.rpe_rot_rmse_deg_per_s, "frames": FRAMES, "lost": 4, "total_s": 3.1}
+            records.append(made_up_record(info.name, method, **figures))
+    results = Results(sequences=infos, methods=methods, records=tuple(records))
     write_results(results, root)
     return results
+
+
+def stress_record(
+    case: str, speed: float, exposure_s: float, variant: str, figures: dict[str, Any], measure: str = "track"
+) -> Record:
+    """One of a stress test."""
+    record = made_up_record(case, f"rs-pg-{variant.replace(' ', '_').replace(',', '')}", measure=measure, **figures)
+    about = {"sequence": case, "motion": NASTY, "speed": speed, "exposure_s": exposure_s, "variant": variant}
+    return dataclasses.replace(record, settings={"settings": about | {"sigmas_px": [0.5, 1.0]}})
 
 
 def make_stress(root: Path, seed: int = 5) -> StressResult:
@@ -160,26 +178,32 @@ def make_stress(root: Path, seed: int = 5) -> StressResult:
     rng = np.random.default_rng(seed)
     cases = [("exposure_0ms", 1.0, 0.0), ("exposure_20ms", 1.0, 0.02), ("exposure_30ms", 1.0, 0.03)]
     cases.append(("exposure_20ms_speed_2x", 2.0, 0.02))
-    color, depth, tracking = [], [], []
+    records = []
     for case, speed, exposure in cases:
+        figures: dict[str, Any] = {}
         for poses in ("true", "estimated"):
-            for sigma in (None, 0.5, 1.0):
-                psnr, least = rng.uniform(30, 35), rng.uniform(25, 30)
-                likeness = np.nan if (case, poses) == ("exposure_0ms", "estimated") else rng.uniform(0.5, 1)
-                color.append(
-                    ColorScore(case, speed, exposure, poses, sigma, psnr, least, likeness, rng.uniform(0.1, 0.9), 4)
-                )
-            depth.append(DepthScore(case, poses, rng.uniform(2e-3, 3e-3), rng.uniform(1e-3, 2e-3), 1000))
-        for variant in ("mid-exposure", "end of exposure"):
-            drift = None if speed > 1.0 else rng.uniform(1e-3, 2e-3)
-            tracking.append(TrackScore(case, speed, exposure, variant, rng.uniform(1e-4, 4e-3), drift, int(speed) - 1))
-    tracking.append(TrackScore("exposure_30ms", 1.0, 0.03, "blur weight", None, None, 31))
-    images = [cv2.blur(rng.integers(0, 256, (48, 64, 3)).astype(np.uint8), (5, 5)) for _ in range(4)]
-    weights = np.tile(np.linspace(0.0, 0.25, 64, dtype=np.float32), (48, 1))
-    panels = Panels("exposure_20ms", 12, images[0], weights, *images[1:])
-    report = StressResult(NASTY, tuple(color), tuple(depth), tuple(tracking), panels)
-    write_stress(report, root)
-    return report
+            for weights in ("constant", "sigma0.5", "sigma1"):
+                key = f"{poses}_{weights}"
+                figures |= {f"psnr_db_{key}": rng.uniform(30, 35), f"psnr_db_least_{key}": rng.uniform(25, 30)}
+                figures |= {f"ssim_{key}": rng.uniform(0.5, 1), f"gradient_{key}": rng.uniform(0.1, 0.9)}
+                if (case, poses) == ("exposure_0ms", "estimated"):
+                    figures[f"ssim_{key}"] = None
+            figures |= {f"keyframes_{poses}": 4, f"pixels_{poses}": 1000}
+            figures |= {f"single_mm_{poses}": rng.uniform(2, 3), f"fused_mm_{poses}": rng.uniform(1, 2)}
+        for variant, measure in (("mid-exposure", "blur"), ("end of exposure", "track")):
+            drift = None if speed > 1.0 else rng.uniform(1, 2)
+            tracked = {"ate_mm": rng.uniform(0.1, 4), "drift_mm_s": drift, "lost": int(speed) - 1, "frames": 31}
+            of_measure = tracked | (figures if measure == "blur" else {})
+            records.append(stress_record(case, speed, exposure, variant, of_measure, measure))
+    records.append(stress_record("exposure_30ms", 1.0, 0.03, "blur weight", {"lost": 31, "frames": 31}))
+    folder = root / "cells/blur/exposure_20ms/rs-pg-mid-exposure/panels"
+    folder.mkdir(parents=True)
+    for name in PANELS:
+        image = cv2.blur(rng.integers(0, 256, (48, 64, 3)).astype(np.uint8), (5, 5))
+        (folder / f"{name}.png").write_bytes(encode_png(image))
+    about = Panels(keyframe=12, width=64, height=48, white=0.25)
+    (folder / "panels.json").write_text(about.model_dump_json())
+    return write_stress(records, root)
 
 
 def calibration() -> dict[str, Any]:

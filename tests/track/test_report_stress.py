@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import shutil
@@ -12,14 +13,14 @@ import cv2
 import numpy as np
 import pytest
 from report_util import NASTY, Parsed, make_stress, parse, picture
-from rstrack.bench.stress.run import StressResult
-from rstrack.bench.stress.tables import read_panels, read_stress
 
 from rsgen.console.command_line import Commands, run_program
 from rsgen.errors import UserError
+from rstrack.bench.stress.results import StressResult, read_stress
 from rstrack.cli.report import report as report_command
 from rstrack.report.build import write_report
 
+PANELS = Path("cells/blur/exposure_20ms/rs-pg-mid-exposure/panels")
 LABELS = {
     "exposure_0ms": "0 ms", "exposure_20ms": "20 ms", "exposure_30ms": "30 ms",
     "exposure_20ms_speed_2x": "20 ms, 2× speed",
@@ -35,7 +36,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, StressResult]:
 
 @pytest.fixture(scope="module")
 def stored(made: tuple[Path, StressResult]) -> dict[str, Any]:
-    return dict(json.loads((made[0] / "stress.json").read_text()))
+    read = read_stress(made[0])
+    return {name: [dataclasses.asdict(row) for row in getattr(read, name)] for name in ("color", "depth", "tracking")}
 
 
 @pytest.fixture(scope="module")
@@ -58,16 +60,11 @@ def tables(page: Parsed) -> list[list[list[str]]]:
 def test_what_was_written_is_read_again(made: tuple[Path, StressResult]) -> None:
     root, report = made
     read = read_stress(root)
-    assert (read.config, read.depth, read.tracking) == (report.config, report.depth, report.tracking)
-    assert len(read.color) == len(report.color)
-    for a, b in zip(read.color, report.color, strict=True):
-        assert repr(a) == repr(b)  # NaN too
-    panels = read_panels(root)
-    assert panels is not None and report.panels is not None
-    assert (panels.case, panels.index) == ("exposure_20ms", 12)
-    np.testing.assert_allclose(panels.weights, report.panels.weights, atol=0.25 / 255)
-    for name in ("blurred", "constant", "aware", "truth"):
-        np.testing.assert_array_equal(getattr(panels, name), getattr(report.panels, name))
+    assert (read.motion, read.panels, read.panels_case) == (NASTY, report.panels, "exposure_20ms")
+    for name in ("color", "depth", "tracking"):
+        for a, b in zip(getattr(read, name), getattr(report, name), strict=True):
+            for read_value, value in zip(dataclasses.astuple(a), dataclasses.astuple(b), strict=True):
+                assert read_value == (pytest.approx(value, rel=1e-5) if isinstance(value, float) else value)
 
 
 def test_the_colour_tables_numbers_are_those_of_the_file(page: Parsed, stored: dict[str, Any]) -> None:
@@ -94,8 +91,8 @@ def test_the_depth_and_tracking_tables_numbers_are_those_of_the_file(page: Parse
     for table, poses in ((true, "true"), (estimated, "estimated")):
         rows = [r for r in stored["depth"] if r["poses"] == poses]
         assert table[1:] == [
-            [LABELS[r["case"]], f"{1e3 * r['single_m']:.2f}", f"{1e3 * r['fused_m']:.2f}",
-             f"{r['fused_m'] / r['single_m']:.2f}"]
+            [LABELS[r["case"]], f"{r['single_mm']:.2f}", f"{r['fused_mm']:.2f}",
+             f"{r['fused_mm'] / r['single_mm']:.2f}"]
             for r in rows
         ]  # fmt: skip
     assert tracking[0] == ["sequence", "mid-exposure", "end of exposure", "blur weight"]
@@ -107,8 +104,8 @@ def test_the_depth_and_tracking_tables_numbers_are_those_of_the_file(page: Parse
                 assert text == "-"
                 continue
             r = runs[variant]
-            ate = "-" if r["ate_m"] is None else f"{1e3 * r['ate_m']:.2f}"
-            drift = "" if r["drift_m_per_s"] is None else f" {1e3 * r['drift_m_per_s']:.2f} mm/s"
+            ate = "-" if r["ate_mm"] is None else f"{r['ate_mm']:.2f}"
+            drift = "" if r["drift_mm_s"] is None else f" {r['drift_mm_s']:.2f} mm/s"
             assert text == f"{ate}{drift}" + (f" {r['lost']} lost" if r["lost"] else "")
 
 
@@ -122,8 +119,8 @@ def test_the_best_of_a_row_is_marked(made: tuple[Path, StressResult], stored: di
                 rows = [r[name] for r in stored["color"] if (r["case"], r["poses"]) == (case, poses)]
                 expected += [f"{max(rows):.{digits}f}"] if None not in rows else []
     for case in LABELS:
-        ate = [r["ate_m"] for r in stored["tracking"] if r["case"] == case and r["ate_m"] is not None]
-        expected.append(f"{1e3 * min(ate):.2f}")
+        ate = [r["ate_mm"] for r in stored["tracking"] if r["case"] == case and r["ate_mm"] is not None]
+        expected.append(f"{min(ate):.2f}")
     assert marked == expected and len(marked) == 4 * 8 - 1 + 4
 
 
@@ -131,11 +128,11 @@ def test_the_headline_is_of_the_longest_exposure(page: Parsed, stored: dict[str,
     rows = [r for r in stored["color"] if (r["case"], r["poses"]) == ("exposure_30ms", "true")]
     constant, aware = (next(r["psnr_db"] for r in rows if r["sigma_px"] == sigma) for sigma in (None, 1.0))
     depth = next(r for r in stored["depth"] if (r["case"], r["poses"]) == ("exposure_30ms", "true"))
-    ate = next(r["ate_m"] for r in stored["tracking"] if r["case"] == "exposure_30ms")
+    ate = next(r["ate_mm"] for r in stored["tracking"] if r["case"] == "exposure_30ms")
     top = page.text[: page.text.index("Green")]
     for text in (
         "30 ms exposure, true path", f"{aware - constant:+.2f} dB", f"{constant:.2f} dB with constant weights",
-        f"{1e3 * depth['fused_m']:.2f} mm", f"{1e3 * depth['single_m']:.2f} mm in one frame", f"{1e3 * ate:.2f} mm",
+        f"{depth['fused_mm']:.2f} mm", f"{depth['single_mm']:.2f} mm in one frame", f"{ate:.2f} mm",
         "0, 20, 30 ms, at 1×, 2× speed",
     ):  # fmt: skip
         assert text in top
@@ -171,7 +168,7 @@ def test_the_pictures_are_the_panels(page: Parsed, made: tuple[Path, StressResul
     uris = page.uris()
     assert len(uris) == 5 + 2
     for uri, name in zip(uris[:5], ("registered", "weights", "constant", "blur_aware", "sharp_view"), strict=True):
-        panel = cv2.imread(str(made[0] / "panels" / f"{name}.png")).astype(float)
+        panel = cv2.imread(str(made[0] / PANELS / f"{name}.png")).astype(float)
         others = [picture(uri).astype(float) - panel for uri in uris[:5]]
         errors = [np.mean(other**2) for other in others]
         assert np.argmin(errors) == uris.index(uri)
@@ -182,21 +179,19 @@ def test_the_pictures_are_the_panels(page: Parsed, made: tuple[Path, StressResul
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        (lambda d: d.pop("color"), "color: Field required"),
-        (lambda d: d.update(color=[]), "color: Tuple should have at least 1 item"),
-        (lambda d: d["color"][3].update(psnr_db="high"), "color.3.psnr_db"),
-        (lambda d: d["color"][0].update(poses="guessed"), "color.0.poses"),
-        (lambda d: d["depth"][1].update(extra=1), "depth.1.extra"),
-        (lambda d: d["tracking"][2].update(lost=-1), "tracking.2.lost"),
-        (lambda d: d["panels"].update(white=True), "panels.white"),
-        (lambda d: d["tracking"][0].update(exposure_s=float("nan")), "tracking.0.exposure_s"),
+        (lambda d: d[0].pop("cell"), "0.cell: Field required"),
+        (lambda d: d.clear(), "holds no records"),
+        (lambda d: d[3].update(runs=[{"ate_mm": "high"}]), "3.runs.0.ate_mm"),
+        (lambda d: d[2].update(settings={}), "is no stress test's"),
+        (lambda d: d[2]["settings"]["settings"].update(speed="fast"), "is no stress test's"),
+        (lambda d: d[0]["settings"]["settings"].update(sigmas_px=3), "is no stress test's"),
     ],
 )
 def test_a_broken_file_is_refused_in_one_line(copy: Path, change: Any, complaint: str) -> None:
     data = json.loads((copy / "stress.json").read_text())
     change(data)
     (copy / "stress.json").write_text(json.dumps(data))
-    with pytest.raises(UserError, match=rf"stress\.json: {complaint}.*: run 'rstrack stress' again$") as error:
+    with pytest.raises(UserError, match=rf"stress\.json: {complaint}.*: run 'rstrack bench stress' again$") as error:
         write_report(copy)
     assert "\n" not in str(error.value)
 
@@ -214,23 +209,23 @@ def test_a_missing_damaged_or_unexplained_picture_costs_the_pictures_only(copy: 
         assert "No pictures: " in page.text and why in page.text and not page.uris()
         assert len(tables(page)) == 11
 
-    path = copy / "panels" / "constant.png"
+    path = copy / PANELS / "constant.png"
     path.write_bytes(path.read_bytes()[:-40])
     without_pictures("constant.png")
     path.unlink()
     without_pictures("constant.png: cannot be read")
-    data = json.loads((copy / "stress.json").read_text())
-    (copy / "stress.json").write_text(json.dumps(data | {"panels": None}))
-    without_pictures("run 'rstrack stress' again")
-    shutil.rmtree(copy / "panels")
-    assert "No pictures" not in parse(write_report(copy)).text
+    (copy / PANELS / "panels.json").write_text('{"keyframe": 12, "width": 64, "height": 48, "white": true}')
+    without_pictures("panels.json: white")
+    shutil.rmtree(copy / PANELS)
+    without_pictures("is not there")
 
 
 def test_a_test_without_depth_or_other_speeds_has_a_page(copy: Path) -> None:
-    data = json.loads((copy / "stress.json").read_text())
-    for name in ("color", "tracking"):
-        data[name] = [r for r in data[name] if r["speed"] == 1.0 and r.get("poses") != "estimated"]
-    (copy / "stress.json").write_text(json.dumps(data | {"depth": []}))
+    data = [r for r in json.loads((copy / "stress.json").read_text()) if r["settings"]["settings"]["speed"] == 1.0]
+    for record in data:
+        figures = record["runs"][0]
+        record["runs"] = [{name: figures[name] for name in figures if "estimated" not in name and "fused" not in name}]
+    (copy / "stress.json").write_text(json.dumps(data))
     page = parse(write_report(copy))
     assert len(tables(page)) == 4 + 1 and len(page.figures) == 3 + 1
     assert "speed" not in page.text[: page.text.index("Tracking")]

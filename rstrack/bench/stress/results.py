@@ -87,7 +87,7 @@ def stress_result(records: Iterable[Record]) -> StressResult:
     tracking: list[TrackScore] = []
     failed: list[str] = []
     motion, shown = "", None
-    for r in records:
+    for r in sorted(records, key=_place):
         about, f = r.settings["settings"], r.figures
         case, motion = str(about["sequence"]), str(about["motion"])
         speed, exposure = float(about["speed"]), float(about["exposure_s"])
@@ -112,6 +112,11 @@ def stress_result(records: Iterable[Record]) -> StressResult:
     panels = None if shown is None else Path("cells", shown[1].cell, "panels")
     of_case = "" if shown is None else str(shown[1].settings["settings"]["sequence"])
     return StressResult(motion, tuple(color), tuple(depth), tuple(tracking), panels, of_case, tuple(failed))
+
+
+def _place(record: Record) -> tuple[bool, float, float, str]:
+    about = record.settings["settings"]
+    return float(about["speed"]) != 1.0, float(about["speed"]), float(about["exposure_s"]), record.cell
 
 
 def read_stress(out: Path) -> StressResult:
