@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -142,6 +143,31 @@ def test_noise_is_of_the_seed_and_more_seeds_are_added(tmp_path: Path, monkeypat
     assert len(made) == 1 and seeds[4:] == [2, 2]
     (point, _) = points_of(run(config))
     assert point.values == (1.0, 2.0) and len(seeds) == 6 and points_of(first)[0] == point
+
+
+def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def render(words: Sequence[str]) -> None:
+        assert json.loads(words[words.index("--color.width") + 1]) == 64
+        synthetic.make_sequence(Path(words[words.index("--out") + 1]), synthetic.make_config(), 12)
+
+    def track(task: Any, progress: Any) -> dict[str, float]:
+        if task.cell.method == "gs-pg" and task.seed == 1:
+            return {"frames": 12, "lost": 12}
+        return {"frames": 12, "lost": 0, "ate_mm": 2.0, "drift_mm_s": 3.0, "drift_deg_s": 4.0}
+
+    monkeypatch.setattr("rstrack.bench.sequences.run_rsgen", render)
+    monkeypatch.setattr(rstrack.bench.measures.track, "track_cell", track)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    words = ["bench", str(SWEEP), "--sequence", "demo", "--width", "64", "--readout", "0", "0.01", "--exposure", "0"]
+    words += ["--seeds", "2", "--frames", "0:12", "--out", str(tmp_path / "out")]
+    assert main([*words, "--method", "rs-pg"]) == 0
+    said = capsys.readouterr()
+    assert "2 of 2 sequences are to be rendered first" in said.err and "2.00 [2.0, 2.0]" in said.out
+    assert main([*words, "--method", "rs-pg", "gs-pg", "--quiet"]) == 1
+    said = capsys.readouterr()
+    assert said.err == "" and "gs-pg on demo_64px_readout_10ms_exposure_0ms 1 of 2" in said.out
+    for name in ("records.json", "results.csv", "results.md", "results.txt", "plots/readout.png"):
+        assert (tmp_path / "out" / name).stat().st_size > 100
 
 
 def test_what_is_not_installed_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -275,6 +275,24 @@ def test_a_failing_render_is_one_line(
     assert said.startswith("rstrack: rsgen render ") and "wrong.yaml failed: " in said
 
 
+def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr("rstrack.bench.sequences.run_rsgen", render)
+    monkeypatch.setattr(rstrack.bench.measures.track, "track", told_truth)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    config = write_config(tmp_path / "tiny.yaml")
+    words = ["bench", str(config), "--frames", "0:8", "--exposure", "0", "--method", "rs-pg", "--quiet"]
+    assert main([*words, "--out", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr()
+    assert said.err == "" and "exposure_20ms_speed_4x" in said.out and "end of exposure" in said.out
+    assert len(read_stress(tmp_path / "out").tracking) == 1 + 2 * 3
+
+
+def test_an_interrupt_before_anything_is_done(tmp_path: Path) -> None:
+    assert write_stress([], tmp_path).tracking == ()
+    with pytest.raises(UserError, match="holds no records"):
+        read_stress(tmp_path)
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [
