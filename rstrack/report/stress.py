@@ -70,11 +70,9 @@ def stress_page(folder: Path) -> Page:
 
 def _labels(result: StressResult) -> dict[str, str]:
     """What a sequence is called on the page, by its name."""
-    cases = {row.case: (row.exposure_s, row.speed) for row in result.color}
-    cases |= {row.case: (row.exposure_s, row.speed) for row in result.tracking}
     return {
-        case: f"{1e3 * exposure:g} ms" + ("" if speed == 1.0 else f", {speed:g}× speed")
-        for case, (exposure, speed) in cases.items()
+        row.case: f"{1e3 * row.exposure_s:g} ms" + ("" if row.speed == 1.0 else f", {row.speed:g}× speed")
+        for row in result.tracking
     }
 
 

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -24,12 +24,16 @@ from rstrack.metrics.association import truth_of
 from rstrack.metrics.clock import TruthOffset
 from rstrack.options import METHODS, Options
 
+Config = TypeVar("Config", bound=BaseModel)
 
-class _Section(BaseModel):
+
+class Section(BaseModel):
+    """Of a config: nothing but what it declares."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class Quick(_Section):
+class Quick(Section):
     """What --quick leaves of it."""
 
     sequences: tuple[Name, ...] = Field(min_length=1, description="names of sequences")
@@ -37,7 +41,7 @@ class Quick(_Section):
     frames: int = Field(ge=10, description="frames of each sequence, from the first one on")
 
 
-class Evaluation(_Section):
+class Evaluation(Section):
     """The whole evaluation. Sequences lie in --data, in folders of their `path`, or of their name if they have none."""
 
     sequences: dict[Name, SequenceEntry] = Field(min_length=1, description="what is tracked")
@@ -76,16 +80,21 @@ class Plan:
 
 def load_evaluation(path: Path) -> Evaluation:
     """Read and validate a file such as configs/evaluation.yaml. Raises UserError naming the file and the entry."""
-    try:
-        config = Evaluation.model_validate(read_yaml(path))
-    except ValidationError as error:
-        raise UserError(f"{path}: {first_problem(error)} (configs/evaluation.yaml is an example)") from None
+    config = validated(Evaluation, path, "configs/evaluation.yaml")
     beside = {
         name: entry.model_copy(update={"config": path.parent / entry.config})
         for name, entry in config.sequences.items()
         if entry.config is not None and entry.config.suffix
     }
     return config.model_copy(update={"sequences": config.sequences | beside})
+
+
+def validated(model: type[Config], path: Path, example: str) -> Config:
+    """A YAML file as a model. Raises UserError naming the file and the entry."""
+    try:
+        return model.model_validate(read_yaml(path))
+    except ValidationError as error:
+        raise UserError(f"{path}: {first_problem(error)} ({example} is an example)") from None
 
 
 def make_plan(

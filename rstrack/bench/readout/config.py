@@ -13,13 +13,13 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from rsgen.errors import UserError, first_problem
 from rsgen.files import read_yaml
 from rstrack.bench.definitions import OTHERS, Benchmark, CaseEntry, Cell, Name, NoiseEntry, SequenceEntry
 from rstrack.bench.measures.track import package_of
-from rstrack.bench.methods.config import method_entry
+from rstrack.bench.methods.config import Section, method_entry, validated
 from rstrack.bench.methods.variants import variants
 from rstrack.options import METHODS, Options
 
@@ -27,11 +27,7 @@ Seconds = Annotated[float, Field(ge=0.0, le=1.0)]
 STREAMS = ("color", "depth")
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class MotionEntry(_Section):
+class MotionEntry(Section):
     """One motion."""
 
     name: Name = Field(description="of its panel, and the beginning of its folders' names")
@@ -45,7 +41,7 @@ class SweepNoise(NoiseEntry):
     seeds: int = Field(default=3, ge=1, le=1000, description="how many times, each with other noise")
 
 
-class SweepConfig(_Section):
+class SweepConfig(Section):
     """The whole sweep: every readout with every exposure, motion and seed, for every method."""
 
     motions: tuple[MotionEntry, ...] = Field(min_length=1, description="what is rendered")
@@ -81,11 +77,7 @@ class SweepConfig(_Section):
 
 def load_sweep_config(path: Path) -> SweepConfig:
     """Read and validate; paths come out relative to the working directory. Raises UserError naming file and entry."""
-    path = Path(path)
-    try:
-        config = SweepConfig.model_validate(read_yaml(path))
-    except ValidationError as error:
-        raise UserError(f"{path}: {first_problem(error)} (configs/readout_sweep.yaml is an example)") from None
+    config = validated(SweepConfig, path, "configs/readout_sweep.yaml")
     here = tuple(entry.model_copy(update={"config": path.parent / entry.config}) for entry in config.motions)
     return config.model_copy(update={"motions": here})
 

@@ -54,7 +54,7 @@ def color_charts(result: StressResult, poses: str) -> list[Chart]:
         return gain_db(rows, row)
 
     def chart(title: str, unit: str, along: Sequence[ColorScore], value: _Value, note: str = "") -> Chart:
-        lines = _lines(along, _speed if along is by_speed else _exposure_ms, value)
+        lines = _lines(along, [row.speed if along is by_speed else 1e3 * row.exposure_s for row in along], value)
         x_label = "speed, times" if along is by_speed else "exposure, ms"
         return Chart(title, unit, x_label, lines, from_zero=False, note=note)
 
@@ -86,23 +86,14 @@ def tracking_chart(result: StressResult) -> Chart:
 _Value = Callable[[ColorScore], float | None]
 
 
-def _exposure_ms(row: ColorScore) -> float:
-    return 1e3 * row.exposure_s
-
-
-def _speed(row: ColorScore) -> float:
-    return row.speed
-
-
-def _lines(along: Sequence[ColorScore], x: Callable[[ColorScore], float], value: _Value) -> tuple[Line, ...]:
+def _lines(along: Sequence[ColorScore], x: Sequence[float], value: _Value) -> tuple[Line, ...]:
     """One for each σ that has values."""
     lines = []
     for k, sigma in enumerate(sorted({row.sigma_px for row in along}, key=lambda s: -1.0 if s is None else s)):
-        mine = [row for row in along if row.sigma_px == sigma]
-        values = [value(row) for row in mine]
+        at = numbers([at for at, row in zip(x, along, strict=True) if row.sigma_px == sigma])
+        values = [value(row) for row in along if row.sigma_px == sigma]
         if any(v is not None for v in values):
             color = TRUE_COLOR if sigma is None else COLORS[(k - 1) % len(COLORS)]
-            at = numbers([x(row) for row in mine])
             lines.append(Line(weights_name(sigma), color, at, numbers(values), sigma is None, has_points=True))
     return tuple(lines)
 
