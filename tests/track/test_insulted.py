@@ -17,8 +17,8 @@ from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3, so3
 from rsgen.sequence.trajectory import Trajectory
-from rstrack.bench.changes.edits import with_depth
 from rstrack.bench.sensitivity import insulted, insults
+from rstrack.bench.changes.edits import with_depth
 from rstrack.bench.sensitivity.insulted import InsultReport, Outcome, judged, mean_pose
 from rstrack.bench.sensitivity.insults import Insult
 from rstrack.bench.sensitivity.passing import passed_by

@@ -8,13 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rstrack.bench.sensitivity.run
 import synthetic
-from rstrack.bench.sensitivity.run import run_sensitivity
 
+import rstrack.bench.sensitivity.run
 from rsgen.errors import UserError
 from rsgen.geometry.shutter import Scan
-from rstrack.bench.changes.edits import reduced, reordered, with_color, with_depth, with_stamps
+from rstrack.bench.sensitivity import insults
 from rstrack.bench.changes.named import (
     cases,
     color_late,
@@ -27,7 +26,8 @@ from rstrack.bench.changes.named import (
     readout_told,
     swinging_gain,
 )
-from rstrack.bench.sensitivity import insults
+from rstrack.bench.changes.edits import reduced, reordered, with_color, with_depth, with_stamps
+from rstrack.bench.sensitivity.run import run_sensitivity
 from rstrack.cli.main import main
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.options import Options
