@@ -39,8 +39,8 @@ def group_of(record: Record) -> str:
 
 
 def is_change(record: Record) -> bool:
-    """Whether something was done to a sequence: its case is named SEQUENCE-CHANGE."""
-    return record.case.startswith(f"{sequence_of(record)}-")
+    """Whether something was done to a sequence: its case is named SEQUENCE-CHANGE, or of the group `changes`."""
+    return group_of(record) == "changes" or record.case.startswith(f"{sequence_of(record)}-")
 
 
 def is_done(record: Record | None) -> bool:

@@ -36,9 +36,11 @@ from scipy import special
 from benchmarks.cells import is_others
 from benchmarks.exact import fisher_p, poisson_p, signed_rank_p
 from benchmarks.figures import Figure, figure_of
-from benchmarks.scatter import Prior, priors, spread_of
+from benchmarks.scatter import Prior, priors, spread_of, tolerances
 from rsgen.console.tables import significant
 from rstrack.bench.record import Record
+
+__all__ = ["Change", "Comparison", "compare", "tolerances"]
 
 SIGNIFICANCE = 0.05
 """Chance of any false alarm over all tests of a comparison."""

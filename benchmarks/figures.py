@@ -79,9 +79,12 @@ FIGURES: tuple[Figure, ...] = (
     # `loops`: a false one ruins a map.
     Figure("false*", "false", "loops", "less", "count", outright=True),
     Figure("accepted", "look-alikes taken for one", "pairs", "less", "count", outright=True),
+    Figure("median_mrad", "median", "mrad", "less", "log"),
     # Times of the machine, and ratios of times of one run, of which a machine's speed falls out.
     Figure("ratio", "over the peer's", "", "less", "log"),
-    Figure("ratio_*", "over the peer's", "", "less", "log"),
+    Figure("ratio_*", "", "", "less", "log"),
+    Figure("*_ratio", "", "", "less", "log"),
+    Figure("*_msamples_s", "", "million samples/s", "unjudged", "log"),
     Figure("median_ms", "median", "ms", "unjudged", "log", is_time=True),
     Figure("mean_ms", "mean", "ms", "unjudged", "log", is_time=True),
     Figure("p95_ms", "95 %", "ms", "unjudged", "log", is_time=True),
@@ -92,6 +95,7 @@ FIGURES: tuple[Figure, ...] = (
     Figure("*_s", "", "s", "unjudged", "log", is_time=True),
     # Memory.
     Figure("peak_mb", "peak memory", "MB", "less", "log"),
+    Figure("growth_mb", "growth", "MB", "less", "linear"),
     Figure("*_mb", "memory", "MB", "less", "log"),
     # Light: decibels are logarithms already, and a bias has a sign.
     Figure("psnr_db", "PSNR", "dB", "more", "linear"),
@@ -104,10 +108,22 @@ FIGURES: tuple[Figure, ...] = (
     Figure("found_pct*", "found", "%", "more", "linear"),
     Figure("lost_pct*", "lost", "%", "less", "linear"),
     Figure("wrong_pct*", "wrong", "%", "less", "linear"),
+    Figure("within_2_sigma_pct*", "within 2 σ", "%", "nominal", "linear", nominal=95.45),
+    Figure("rms_over_sigma*", "RMS over σ", "", "nominal", "log", nominal=1.0),
+    # Numbers of trials.
     Figure("wrong*", "wrong", "", "less", "count", outright=True),
-    # All other errors.
+    Figure("failed", "failed", "starts", "less", "count"),
+    Figure("broken", "broken down", "starts", "less", "count"),
+    Figure("over_*_mm", "", "starts", "less", "count"),
+    Figure("not_converged_*", "", "", "less", "count"),
+    Figure("refused_*", "", "", "unjudged", "count"),
+    Figure("lost_last", "lost of the last", "frames", "less", "count"),
+    # All other errors, at multiples of a distance too (median_error_mm_2x).
     Figure("*_mm", "", "mm", "less", "log"),
     Figure("*_deg", "", "deg", "less", "log"),
+    Figure("*_mm_*x", "", "mm", "less", "log"),
+    Figure("*_deg_*x", "", "deg", "less", "log"),
+    Figure("*_ms_*x", "", "ms", "less", "log"),
 )
 
 
@@ -122,7 +138,9 @@ def figure_of(name: str) -> Figure:
 def heading(name: str) -> str:
     """A table's heading: title and unit."""
     figure = figure_of(name)
-    is_one = figure.pattern == name and figure.title
-    words = figure.title if is_one else name.removesuffix(f"_{figure.unit.replace('/', '_')}")
-    words = words.removesuffix("_pct").removesuffix("_mb").replace("_pct_", " ").replace("_", " ")
+    if figure.pattern == name and figure.title:
+        words = figure.title
+    else:
+        unit = {"%": "pct", "dB": "db", "MB": "mb"}.get(figure.unit, figure.unit.replace("/", "_"))
+        words = " ".join(f"{name}_".replace(f"_{unit}_", "_", 1).strip("_").split("_")) if unit else name.replace("_", " ")
     return f"{words}, {figure.unit}" if figure.unit else words
