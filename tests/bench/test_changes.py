@@ -151,6 +151,7 @@ def test_half_the_depth_is_missing_in_blocks(dataset: Dataset) -> None:
 
 
 def test_changes_by_name_and_what_is_wrong_with_them(dataset: Dataset) -> None:
+    arguments: dict[str, float]
     for name, arguments in [("depth_scaled", {"factor": 2.0}), ("depth_to", {"metres": 1e-3}), ("every", {"nth": 3})]:
         made = changed(dataset, name, 0, arguments)
         shown = depths(dataset)[:: 3 if name == "every" else 1] * {"depth_scaled": 2, "depth_to": 0}.get(name, 1)
