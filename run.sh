@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Set-up and the two commands of this project: ./run.sh demo, ./run.sh test (and ./run.sh setup alone).
+# Set-up and the two commands of this project: ./run.sh demo, ./run.sh test (and ./run.sh setup alone, and for who
+# changes it ./run.sh bench smoke|gate|full).
 # Installs into .venv, and a libLLVM (16 or newer) from the system's packages if there is none. A second run is quick.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")"
@@ -91,9 +92,14 @@ test_all() {
   return "$status"
 }
 
+bench() {
+  OPENBLAS_NUM_THREADS=1 .venv/bin/python -m benchmarks "$@"
+}
+
 case "${1:-}" in
   setup) setup ;;
   demo) setup; demo ;;
   test) shift; setup; test_all "$@" ;;
-  *) die "usage: ./run.sh demo | test [pytest arguments] | setup" ;;
+  bench) shift; setup; bench "$@" ;;
+  *) die "usage: ./run.sh demo | test [pytest arguments] | bench TIER | setup" ;;
 esac

@@ -1,1 +1,4 @@
-"""What this project measures of itself: measures beside those of `rstrack.bench`, and what they need."""
+"""The scoreboard: what the project claims, measured by one command, compared with the last time, and shown.
+
+python -m benchmarks gate --against benchmarks/results/gate.json
+"""

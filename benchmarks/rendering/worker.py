@@ -27,11 +27,11 @@ def main(job: dict[str, Any]) -> None:
     def tell(*progress: object) -> None:
         print(json.dumps(progress), file=answers)
 
-    measured = {"light": light_figures, "render": render_figures}[job["what"]]
+    figures_of = {"light": light_figures, "render": render_figures}[job["what"]]
+    answer: dict[str, Any]
     try:
-        answer: dict[str, Any] = {
-            "figures": measured(load_config(Path(job["config"]), job["fields"]), job["settings"], tell)
-        }
+        config = load_config(Path(job["config"]), job["fields"])
+        answer = {"figures": figures_of(config, job["settings"], tell)}
     except UserError as error:
         answer = {"error": str(error)}
     print(json.dumps(answer), file=answers)

@@ -25,6 +25,7 @@ from rstrack.metrics.clock import TruthOffset
 from rstrack.options import CLOUD_PEERS, METHODS, PEERS, SLAM_PEERS, Options
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]*$")]
+Pattern = Annotated[str, Field(pattern=r"^[A-Za-z0-9_*?-][A-Za-z0-9_.*?-]*$")]
 Frames = Annotated[str, Field(pattern=r"^\d*:\d*$")]
 OTHERS: tuple[str, ...] = (*PEERS, *CLOUD_PEERS, *SLAM_PEERS)
 RENDERER = "rsgen"
@@ -38,7 +39,7 @@ class _Section(BaseModel):
 class SequenceEntry(_Section):
     """One sequence: `config`, or `path`."""
 
-    config: Path | None = Field(default=None, description="what 'rsgen render' makes it from: a name or a file")
+    config: Path | None = Field(default=None, description="what 'rsgen render' makes it from: a name, or a file beside this one")
     set: dict[str, Any] = Field(default={}, description="fields of the config that are to be others")
     data: dict[str, str] = Field(default={}, description="fields of the config that name files of --data")
     width: int | None = Field(default=None, ge=32, le=16384, description="of all images, lenses in proportion, px")
@@ -84,7 +85,7 @@ class MethodEntry(_Section):
 class CellsEntry(_Section):
     """Cells: every method on every case."""
 
-    cases: tuple[Name, ...] = Field(min_length=1, description="names, * allowed")
+    cases: tuple[Pattern, ...] = Field(min_length=1, description="names, * and ? allowed")
     methods: tuple[Name, ...] = Field(min_length=1, description="names")
     measure: Name = Field(default="track", description="what is measured")
     seeds: int = Field(default=1, ge=1, le=10_000, description="runs, with seeds 0, 1, ...")
@@ -155,9 +156,12 @@ class Cell:
         return frames_of(self.case_entry.frames)
 
     def as_dict(self) -> dict[str, Any]:
-        """Everything that defines it, as plain data, without what is left at its default."""
+        """Everything that defines it, as plain data, without what is left at its default; of files the names alone."""
         entries = {"sequence": self.sequence, "case": self.case_entry, "method": self.method_entry}
-        plain = {name: entry.model_dump(mode="json", exclude_defaults=True) for name, entry in entries.items()}
+        plain: dict[str, dict[str, Any]] = {}
+        for name, entry in entries.items():
+            fields = entry.model_dump(exclude_defaults=True)
+            plain[name] = {field: v.name if isinstance(v, Path) else v for field, v in fields.items()}
         return plain | {"settings": dict(self.settings), "group": self.group}
 
 
@@ -208,7 +212,13 @@ def _load(path: Path) -> BenchmarkFile:
         name: entry if entry.camera is None else entry.model_copy(update={"camera": path.parent / entry.camera})
         for name, entry in file.cases.items()
     }
-    return file.model_copy(update={"cases": cases})
+    sequences = {
+        name: entry.model_copy(update={"config": path.parent / entry.config})
+        if entry.config is not None and entry.config.suffix
+        else entry
+        for name, entry in file.sequences.items()
+    }
+    return file.model_copy(update={"cases": cases, "sequences": sequences})
 
 
 def _cells(

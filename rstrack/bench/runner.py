@@ -55,11 +55,13 @@ class Job:
 def run_cells(
     benchmark: Benchmark, out: Path, sources: Sources, workers: Workers | None = None, progress: Progress = no_progress,
     measures: Mapping[str, str] | None = None, done: Callable[[Record], None] | None = None,
+    expected_s: Mapping[str, float] | None = None,
 ) -> Outcome:  # fmt: skip
     """Run what `out` does not hold yet, in this process or by `workers`; Ctrl-C ends it with what is finished.
 
-    measures: where more of them are found (`rstrack.bench.task`). done: told of each record. Raises UserError: a
-    measure that there is not, a folder that cannot be written or is not shared with the workers.
+    measures: where more of them are found (`rstrack.bench.task`). done: told of each record. expected_s: what cells took
+    before, by name, for the time that is left. Raises UserError: a measure that there is not, a folder that cannot be
+    written or is not shared with the workers.
     """
     known = MEASURES | dict(measures or {})
     unknown = [cell.measure for cell in benchmark.cells if cell.measure not in known]
@@ -70,6 +72,9 @@ def run_cells(
         Job(cell, (out / "cells" / cell.name).resolve(), sources, known[cell.measure], code) for cell in benchmark.cells
     ]
     records: dict[str, Record] = {}
+    known_s = dict(expected_s or {})
+    usual_s = sorted(known_s.values())[len(known_s) // 2] if known_s else 1.0
+    weight = {job.cell.name: known_s.get(job.cell.name, usual_s) for job in jobs}
     running: dict[str, float] = {}
     todo = []
     for job in jobs:
@@ -79,9 +84,16 @@ def run_cells(
         else:
             todo.append(job)
 
+    to_do_s = sum(weight[job.cell.name] for job in todo)
+    finished_s = 0.0
+
+    def show(note: str) -> None:
+        under_way_s = sum(weight.get(name, 0.0) * fraction for name, fraction in tuple(running.items()))
+        progress("cells", min(1.0, (finished_s + under_way_s) / max(to_do_s, 1e-9)), note)
+
     def report(name: str, fraction: float, note: str) -> None:
         running[name] = fraction
-        progress("cells", min(1.0, (len(records) + sum(tuple(running.values()))) / len(jobs)), f"{name} {note}")
+        show(f"{name} {note}")
 
     try:
         for k, record in (workers or InProcess()).apply(run_cell, todo, report):
@@ -91,7 +103,8 @@ def run_cells(
                 raise UserError(f"{todo[k].out}: a worker has written it, but not here: choose an --out that all share")
             if done is not None:
                 done(record)
-            progress("cells", len(records) / len(jobs), f"{record.cell} done")
+            finished_s += weight[record.cell]
+            show(f"{record.cell} done")
     except KeyboardInterrupt:
         return Outcome(_ordered(jobs, records), interrupted=True)
     return Outcome(_ordered(jobs, records))

@@ -1,0 +1,124 @@
+"""`./run.sh bench TIER`: run a tier's cells, compare them with committed records, and keep them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from rsgen.console.command_line import Commands, Parser, Quiet, run_program
+from rsgen.console.scheduler import Scheduler, open_workers
+from rstrack.bench.record import Record, read_records, write_records
+from benchmarks.compare import compare, tolerances
+
+HERE = Path(__file__).parent
+RESULTS = HERE / "results"
+TIERS = ("smoke", "gate", "full")
+
+_DESCRIPTION = """\
+Runs what the project claims and compares it with the last time.
+
+  ./run.sh bench smoke                                        that every measure runs: minutes, part of the tests
+  ./run.sh bench gate --data DIR                              what guards every change: at most 25 minutes
+  ./run.sh bench gate --against benchmarks/results/gate.json  says what changed beyond chance; 1 if anything is worse
+  ./run.sh bench full --only 'track/table1/*'                 everything, or some of it: hours, resumable
+  ./run.sh bench gate --accept                                keeps the records as the committed ones
+"""
+_STATUS = "exit status: 0 done, 1 something is worse or failed, 2 wrong input, 130 interrupted (run it again to go on)"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status."""
+    return run_program("bench", _parser, arguments, "the same command goes on where it was")
+
+
+def _parser() -> Parser:
+    commands = Commands("bench", _DESCRIPTION)
+    for function in (smoke, gate, full):
+        commands.add(function, "--only 'track/*'", _STATUS)
+    return commands.parser
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What of a tier is run, where, and what becomes of it."""
+
+    only: Annotated[tuple[str, ...] | None, "cells whose names (MEASURE/CASE/METHOD) match, * allowed", "GLOB"] = None
+    data: Annotated[Path | None, "folder of recordings; what needs one is skipped where it is absent", "DIR"] = None
+    cache: Annotated[Path | None, "where rendered sequences are kept (default: in ~/.cache)", "DIR"] = None
+    out: Annotated[Path | None, "where cells are kept while they are made (default: out/bench/TIER)", "DIR"] = None
+    against: Annotated[Path | None, "records to compare with", "FILE"] = None
+    accept: Annotated[bool, "keep the records as benchmarks/results/TIER.json: the commit that does it says why"] = False
+
+
+def smoke(choice: Choice, *, scheduler: Scheduler = None, quiet: Quiet = False) -> int:
+    """That every measure runs: minutes."""
+    return run_tier("smoke", choice, scheduler, quiet)
+
+
+def gate(choice: Choice, *, scheduler: Scheduler = None, quiet: Quiet = False) -> int:
+    """What guards every change: at most 25 minutes on two cores."""
+    return run_tier("gate", choice, scheduler, quiet)
+
+
+def full(choice: Choice, *, scheduler: Scheduler = None, quiet: Quiet = False) -> int:
+    """Everything at full size: hours."""
+    return run_tier("full", choice, scheduler, quiet)
+
+
+def run_tier(tier: str, choice: Choice, scheduler: str | None, quiet: bool) -> int:
+    """Run, compare, keep; returns the exit status. Raises UserError."""
+    from benchmarks.measures import MEASURES
+    from rsgen.console.progress import ProgressDisplay
+    from rstrack.bench.definitions import load_benchmark
+    from rstrack.bench.runner import run_cells
+    from rstrack.bench.sequences import Sources
+
+    benchmark = load_benchmark([HERE / "cases.yaml", HERE / f"{tier}.yaml"]).only(choice.only or ())
+    before = None if choice.against is None else read_records(choice.against)
+    sources = Sources(None if choice.data is None else choice.data.resolve(), choice.cache, scheduler)
+
+    def done(record: Record) -> None:
+        if record.error is not None and not quiet:
+            print(f"bench: {record.cell}: {'skipped' if record.skipped else 'FAILED'}: {record.error}", file=sys.stderr)
+
+    out = choice.out or Path("out/bench") / tier
+    with ProgressDisplay(quiet) as progress, open_workers(scheduler) as workers:
+        outcome = run_cells(benchmark, out, sources, workers, progress, MEASURES, done, expected_s(tier))
+    records = outcome.records
+    failed = [record.cell for record in records.values() if record.error is not None and not record.skipped]
+    skipped = sum(record.skipped for record in records.values())
+    print(f"{tier}: {len(records)} of {len(benchmark.cells)} cells, {skipped} skipped, {len(failed)} failed")
+    if before is not None and not outcome.interrupted:
+        chosen = {cell.name for cell in benchmark.cells}
+        comparison = compare({name: r for name, r in before.items() if name in chosen or not choice.only}, records)
+        print(comparison.text())
+        if comparison.worse:
+            failed.append("worse")
+    if choice.accept:
+        print(accept(tier, records, is_part=bool(choice.only)))
+    if outcome.interrupted:
+        print(f"bench: interrupted; {out} holds what is finished, and the same command goes on", file=sys.stderr)
+        return 130
+    return 1 if failed else 0
+
+
+def expected_s(tier: str) -> dict[str, float]:
+    """What the tier's cells took when their records were accepted."""
+    target = RESULTS / f"{tier}.json"
+    return {name: r.seconds for name, r in read_records(target).items()} if target.is_file() else {}
+
+
+def accept(tier: str, records: Mapping[str, Record], is_part: bool) -> str:
+    """Write the records as the committed ones; a part of a tier replaces its own. Returns what to say."""
+    target = RESULTS / f"{tier}.json"
+    kept = read_records(target) if target.is_file() and is_part else {}
+    good = {name: record for name, record in records.items() if record.error is None}
+    write_records(target, tolerances(kept | good).values())
+    return f"{target}: {len(good)} records written"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
