@@ -28,6 +28,8 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]*$")]
 Pattern = Annotated[str, Field(pattern=r"^[A-Za-z0-9_*?-][A-Za-z0-9_.*?-]*$")]
 Frames = Annotated[str, Field(pattern=r"^\d*:\d*$")]
 OTHERS: tuple[str, ...] = (*PEERS, *CLOUD_PEERS, *SLAM_PEERS)
+RENDERER = "rsgen"
+"""The method of cells that measure the renderer, on the config of a sequence: nothing tracks."""
 
 
 class _Section(BaseModel):
@@ -74,7 +76,7 @@ class CaseEntry(_Section):
 class MethodEntry(_Section):
     """What tracks: one of ours with options, a peer, a command, or a folder with results."""
 
-    method: Name | None = Field(default=None, description="of ours or of the peers; default: the entry's own name")
+    method: Name | None = Field(default=None, description="of ours, of the peers, or rsgen; default: the entry's name")
     options: dict[str, Any] = Field(default={}, description="of `rstrack.options.Options`")
     command: str = Field(default="", description="another tracker, as 'rstrack bench --peer-command' has it")
     results: Path | None = Field(default=None, description="folder with CASE.txt (TUM) or CASE/ (a run) of another")
@@ -136,6 +138,11 @@ class Cell:
         return self.program in METHODS and not self.method_entry.command and self.method_entry.results is None
 
     @property
+    def renders(self) -> bool:
+        """Whether the renderer is measured: the sequence itself is not needed."""
+        return self.program == RENDERER
+
+    @property
     def options(self) -> Options:
         """Of one of our methods. Raises UserError."""
         try:
@@ -179,7 +186,7 @@ def load_benchmark(paths: Sequence[Path]) -> Benchmark:
     sequences = {name: entry for file in files for name, entry in file.sequences.items()}
     cases = {name: CaseEntry(sequence=name) for name in sequences}
     cases |= {name: entry for file in files for name, entry in file.cases.items()}
-    methods = {name: MethodEntry() for name in (*METHODS, *OTHERS)}
+    methods = {name: MethodEntry() for name in (*METHODS, *OTHERS, RENDERER)}
     methods |= {name: entry for file in files for name, entry in file.methods.items()}
     cells: dict[str, Cell] = {}
     for entry in (entry for file in files for entry in file.cells):
@@ -229,10 +236,8 @@ def _cells(
             for method in entry.methods:
                 if method not in methods:
                     raise UserError(f"cells: no method '{method}': define it in methods")
+                seeds, sequence = tuple(range(entry.seeds)), sequences[cases[case].sequence]
                 found.append(
-                    Cell(
-                        entry.measure, case, method, tuple(range(entry.seeds)), cases[case],
-                        sequences[cases[case].sequence], methods[method], entry.settings,
-                    )  # fmt: skip
+                    Cell(entry.measure, case, method, seeds, cases[case], sequence, methods[method], entry.settings)
                 )
     return found

@@ -12,7 +12,9 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from rsgen.console.progress import Progress, no_progress
 from rsgen.console.scheduler import InProcess, Workers
@@ -67,8 +69,7 @@ def run_cells(
         raise UserError(f"no measure '{unknown[0]}': choose {', '.join(known)}")
     code = code_digest() if benchmark.every == "code" else package_version()
     jobs = [
-        Job(cell, (out / "cells" / cell.name).resolve(), sources, known[cell.measure], code)
-        for cell in benchmark.cells
+        Job(cell, (out / "cells" / cell.name).resolve(), sources, known[cell.measure], code) for cell in benchmark.cells
     ]
     records: dict[str, Record] = {}
     known_s = dict(expected_s or {})
@@ -125,7 +126,7 @@ def run_cell(job: Job, progress: Progress = no_progress) -> Record:
         return record
     measure = measure_named(job.measure)
     try:
-        root = job.sources.folder(cell.sequence, cell.case_entry.sequence, progress)
+        root = None if cell.renders else job.sources.folder(cell.sequence, cell.case_entry.sequence, progress)
         # Once more: a sequence that was not there when the key was made is now.
         record = dataclasses.replace(record, key=_key(job, root))
         for n, seed in enumerate(cell.seeds):
@@ -137,7 +138,7 @@ def run_cell(job: Job, progress: Progress = no_progress) -> Record:
 
             reset_peak()
             begin = time.perf_counter()
-            figures = measure(Task(cell, seed, root, job.out), tell)
+            figures = measure(Task(cell, seed, job.sources, job.out), tell)
             figures = figures | {"peak_mb": figures.get("peak_mb") or peak_mb()}
             record = dataclasses.replace(
                 record, seeds=(*record.seeds, seed), runs=(*record.runs, figures),
@@ -155,14 +156,13 @@ def run_cell(job: Job, progress: Progress = no_progress) -> Record:
 @cache
 def code_digest() -> str:
     """Of the product's source: what is measured depends on it."""
-    import rsgen
-    import rstrack
-
     digest = hashlib.sha256()
-    for package in (rsgen, rstrack):
-        root = Path(package.__file__ or "").parent
+    for package in ("rsgen", "rstrack"):
+        spec = find_spec(package)
+        assert spec is not None and spec.origin is not None
+        root = Path(spec.origin).parent
         for path in sorted(root.rglob("*.py")):
-            digest.update(f"{package.__name__}/{path.relative_to(root)}\n".encode() + path.read_bytes())
+            digest.update(f"{package}/{path.relative_to(root)}\n".encode() + path.read_bytes())
     return digest.hexdigest()
 
 
@@ -175,14 +175,9 @@ def sequence_digest(root: Path) -> str:
 
 
 def _key(job: Job, root: Path | None = None) -> str:
-    """What the cell's runs depend on; the sequence's own part is empty where it is still to be rendered."""
+    """What the cell's runs depend on."""
     cell = job.cell
-    if root is None:
-        try:
-            root = dataclasses.replace(job.sources, render=_not_now).folder(cell.sequence, cell.case_entry.sequence)
-        except UserError:
-            root = None
-    depends = [cell.name, cell.as_dict(), job.code, "" if root is None else sequence_digest(root)]
+    depends: list[Any] = [cell.name, cell.as_dict(), job.code, _made_of(job, root)]
     if cell.case_entry.camera is not None:
         depends.append(_file_digest(cell.case_entry.camera))
     if cell.method_entry.results is not None:
@@ -190,6 +185,18 @@ def _key(job: Job, root: Path | None = None) -> str:
 
         depends.append(_file_digest(results_path(cell)))
     return hashlib.sha256(json.dumps(depends, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def _made_of(job: Job, root: Path | None) -> str:
+    """Of the sequence in `root`: empty where it is still to be rendered. Of the renderer's cells: what it renders."""
+    entry = job.cell.sequence
+    try:
+        if job.cell.renders:
+            return job.sources.recipe(entry)
+        there = dataclasses.replace(job.sources, render=_not_now)
+        return sequence_digest(root or there.folder(entry, job.cell.case_entry.sequence))
+    except UserError:
+        return ""
 
 
 def _not_now(_: object) -> None:

@@ -48,7 +48,7 @@ class Sources:
         if entry.path is not None:
             return self._recording(entry.path)
         words = self.words(entry)
-        recipe = self._recipe(entry, words)
+        recipe = self.recipe(entry)
         home = (self.cache or default_cache()) / "sequences"
         folder = home / f"{name}-{hashlib.sha256(recipe.encode()).hexdigest()[:8]}"
         note = folder.with_name(folder.name + ".json")
@@ -71,16 +71,12 @@ class Sources:
         words = [word for name, value in overrides.items() for word in (f"--{name}", json.dumps(value))]
         return ["render", str(path), "--quiet", *few, *words]
 
-    def _recording(self, path: Path) -> Path:
-        if self.data is None:
-            raise Absent(f"{path}: is a recording: --data DIR names the folder that it lies in")
-        if not (self.data / path).exists():
-            raise Absent(f"{self.data / path}: is not there")
-        return (self.data / path).resolve()
+    def recipe(self, entry: SequenceEntry) -> str:
+        """What a sequence is made with: its entry, and the content of the files it names, wherever these lie.
 
-    def _recipe(self, entry: SequenceEntry, words: Sequence[str]) -> str:
-        """What a sequence is made with: words, and the content of the files they name, wherever these lie."""
-        path = Path(words[1])
+        Raises UserError, and Absent.
+        """
+        path = config_file(str(entry.config))
         files = [path, *(self._recording(Path(file)) for file in entry.data.values())]
         given = read_yaml(path).get("trajectory") or {}
         if "trajectory.file" not in {**entry.set, **entry.data} and given.get("file"):
@@ -88,6 +84,13 @@ class Sources:
         hashes = {file.name: hashlib.sha256(read_bytes(file)).hexdigest() for file in files if file.is_file()}
         says = entry.model_dump(mode="json", exclude_defaults=True, exclude={"group"}) | {"config": path.name}
         return json.dumps({"sequence": says, "files": hashes}, indent=1, sort_keys=True) + "\n"
+
+    def _recording(self, path: Path) -> Path:
+        if self.data is None:
+            raise Absent(f"{path}: is a recording: --data DIR names the folder that it lies in")
+        if not (self.data / path).exists():
+            raise Absent(f"{self.data / path}: is not there")
+        return (self.data / path).resolve()
 
 
 def default_cache() -> Path:

@@ -43,7 +43,6 @@ from rstrack.cli.options import (
 )
 from rstrack.cli.refine import refine
 from rstrack.cli.report import report
-from rstrack.cli.sensitivity import sensitivity
 from rstrack.options import Options
 
 if TYPE_CHECKING:
@@ -113,7 +112,6 @@ def _parser() -> Parser:
     add(bench_calibration, "out/demo --starts 5 --noise-depth 1.2e-3 --noise-intensity 0.01")
     add(bench_long, "out/demo --frames 100000 --method rs-g")
     add(bench_loops, "out/long2 --alike 200")
-    add(sensitivity, "out/demo --method rs-pg --frames 0:60 --out sensitivity.json")
     add(stress, "stress --out runs/stress --frames 60")
     return commands.parser
 

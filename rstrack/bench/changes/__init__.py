@@ -1,4 +1,4 @@
-"""What may be done to a recording or its camera file, one thing at a time, by name: see `rstrack.bench.changes.named`."""
+"""What may be done to a recording or its camera file, one thing at a time: see `rstrack.bench.changes.named`."""
 
 from rstrack.bench.changes.named import CHANGES, changed
 

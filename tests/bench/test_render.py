@@ -1,8 +1,7 @@
-"""`rsgen bench`: other ways to the same picture show the same, times are counted right, and Blender agrees with us."""
+"""Other ways to the same picture show the same, times are counted right, and Blender agrees with us; light measured."""
 
 from __future__ import annotations
 
-import json
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -13,24 +12,31 @@ import pytest
 import tiny
 from rendering import CAMERA, constant_twist, emission_integrator, mi, room_xml
 
-from rsgen.bench.blender import BlenderRenderer, check_installed, export_scene, exposure
-from rsgen.bench.modes import (
+from benchmarks.measures import MEASURES
+from benchmarks.rendering.blender import BlenderRenderer, check_installed, export_scene, exposure
+from benchmarks.rendering.modes import (
     BLENDER_MODES,
     MODES,
     Mode,
+    ModeTimes,
     _measure,
+    figures_of,
     render_averaged,
+    render_figures,
     render_rows,
     row_renderer,
     time_modes,
 )
-from rsgen.bench.table import BenchTimes, ModeTimes
 from rsgen.config.config import load_config
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.images import ColorRenderer
 from rsgen.render.scene import load_scene
+from rstrack.bench.definitions import load_benchmark
+from rstrack.bench.record import Record
+from rstrack.bench.runner import run_cells
+from rstrack.bench.sequences import Sources
 
 MOTION = constant_twist((0.5, 0.2, 0.0, 0.4, 3.0, 2.0))
 STAMP = 0.05
@@ -73,27 +79,22 @@ def test_averaged_sharp_renders_make_the_blurred_picture(glowing: Any) -> None:
     assert rms(got, blurred) < 0.015 < 0.03 < rms(got, late)
 
 
-def report(**seconds: list[list[float]]) -> BenchTimes:
-    modes = (ModeTimes(n.replace("_", "-"), n, 8, "all", np.array(s)) for n, s in seconds.items())
-    return BenchTimes(100, 50, {"cores": 2}, tuple(modes), {"blender": "no such luck"})
+def times(**seconds: list[list[float]]) -> dict[str, ModeTimes]:
+    return {name.replace("_", "-"): ModeTimes(np.array(s), 0.04) for name, s in seconds.items()}
 
 
 def test_ratios_are_of_the_same_round_or_else_of_the_same_frame() -> None:
     # The machine slows down tenfold between the frames: pairs do not see it.
-    result = report(still=[[1, 2], [10, 20]], rs_blur=[[1.5, 3], [15, 30]], path=[[20.25], [202.5]])
-    ratios = {(r.mode, r.against): r for r in result.ratios()}
-    assert set(ratios) == {("rs-blur", "still"), ("path", "rs-blur")}
-    assert ratios["rs-blur", "still"].median == pytest.approx(1.5) and ratios["rs-blur", "still"].pairs == 4
-    assert ratios["path", "rs-blur"].median == pytest.approx(9.0) and ratios["path", "rs-blur"].pairs == 2
+    found = figures_of(times(still=[[1, 2], [10, 20]], rs_blur=[[1.5, 3], [15, 30]], path=[[20.25], [202.5]]))
+    assert found["rs_blur_ratio"] == pytest.approx(1.5) and found["path_ratio"] == pytest.approx(13.5)
+    assert found["path_to_rs_blur_ratio"] == pytest.approx(9.0)
+    assert {name for name in found if "ratio" in name} == {"rs_blur_ratio", "path_ratio", "path_to_rs_blur_ratio"}
 
 
-def test_a_report_counts_samples_and_says_what_is_only_computed() -> None:
-    result = report(still=[[0.1, 0.1]], rs_blur=[[0.2, 0.2]])
-    first = json.loads(json.dumps(result.as_dict()))["modes"][0]
-    assert first["frames_per_s"] == pytest.approx(10) and first["samples_per_s"] == pytest.approx(100 * 50 * 8 / 0.1)
-    text = " ".join(result.text().split())
-    assert "computed, not measured: a whole still for each row: 5.0 s a frame, 25x" in text
-    assert "no such luck" in text
+def test_times_are_medians_and_samples_are_counted() -> None:
+    found = figures_of(times(still=[[0.1, 0.3]], blender_still=[[0.5]]))
+    assert found["still_s"] == pytest.approx(0.2) and found["still_msamples_s"] == pytest.approx(0.2)
+    assert found["blender_still_s"] == 0.5 and found["blender_still_ratio"] == pytest.approx(2.5)
 
 
 def test_modes_take_turns_and_a_broken_one_does_not_stop_the_others() -> None:
@@ -106,7 +107,7 @@ def test_modes_take_turns_and_a_broken_one_does_not_stop_the_others() -> None:
                 raise UserError("gone")
             return 100.0 * k + len(calls)
 
-        return Mode(name, name, 1, seconds, rounds)
+        return Mode(name, 1, seconds, rounds)
 
     modes = [mode("a", 4), mode("long"), mode("b", 4), mode("bad", breaks=True)]
     seconds, failed = _measure(modes, np.arange(3.0), lambda *_: None)
@@ -119,19 +120,94 @@ def test_modes_take_turns_and_a_broken_one_does_not_stop_the_others() -> None:
 
 def test_all_modes_are_timed_on_a_tiny_config(tmp_path: Path) -> None:
     config = load_config(tiny.write_config(tmp_path))
-    result = time_modes(config, 1, 4, MODES, lambda *_: None)
-    assert [m.name for m in result.modes] == list(MODES) and not result.failed
-    times = {m.name: m for m in result.modes}
-    assert times["still"].seconds.shape == (1, 4) and times["path"].seconds.shape == (1, 1)
-    assert times["rows"].measured == f"32 of {tiny.HEIGHT} rows" and times["path"].measured == "1 of 4 spp"
+    timed, failed = time_modes(config, 1, 4, MODES, lambda *_: None)
+    assert list(timed) == list(MODES) and not failed
+    assert timed["still"].seconds.shape == (1, 4) and timed["path"].seconds.shape == (1, 1)
+    pixels = 1e-6 * tiny.WIDTH * tiny.HEIGHT
+    assert timed["path"].msamples == pytest.approx(4 * pixels) and timed["averaged"].msamples == pytest.approx(
+        64 * pixels
+    )
     # Many launches cannot be quicker than one of the same size.
-    assert times["rows"].median > times["still"].median and times["averaged"].median > times["still"].median
+    found = figures_of(timed)
+    assert found["rows_ratio"] > 1 and found["averaged_ratio"] > 1 and found["averaged_to_rs_blur_ratio"] > 0
 
 
-def test_only_the_modes_asked_for_are_timed(tmp_path: Path) -> None:
+def test_only_the_modes_asked_for_are_timed_and_none_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     config = load_config(tiny.write_config(tmp_path))
-    result = time_modes(config, 1, 1, ["still"], lambda *_: None)
-    assert [m.name for m in result.modes] == ["still"] and result.ratios() == []
+    settings = {"frames": 1, "spp": 1, "modes": ["still"]}
+    assert set(render_figures(config, settings, lambda *_: None)) == {"still_s", "still_msamples_s", "peak_mb"}
+    monkeypatch.setattr("benchmarks.rendering.modes._measure", lambda *_: ({}, {"still": "gone"}))
+    with pytest.raises(UserError, match="still: gone"):
+        render_figures(config, settings, lambda *_: None)
+
+
+# --- the measures ----------------------------------------------------------------------------------------------------
+
+
+def measured(
+    folder: Path, measure: str, settings: str, method: str = "rsgen", set: str = "light.bounces: 0", frames: int = 6
+) -> Record:
+    text = f"""
+sequences: {{tiny: {{config: {tiny.write_config(folder, frames)}, set: {{{set}}}, frames: "0:2"}}}}
+cells: [{{cases: [tiny], methods: [{method}], measure: {measure}, settings: {settings}}}]
+"""
+    (folder / "bench.yaml").write_text(text)
+
+    def render(_: object) -> None:
+        raise AssertionError("the sequence is not needed")
+
+    sources = Sources(cache=folder / "cache", render=render)
+    cells = run_cells(load_benchmark([folder / "bench.yaml"]), folder / "out", sources, measures=MEASURES)
+    return cells.records[f"{measure}/tiny/{method}"]
+
+
+def test_light_is_baked_anew_and_compared(tmp_path: Path) -> None:
+    record = measured(tmp_path, "light", "{views: 2, spp: 256, width: 24}")
+    assert record.error is None and not list(tmp_path.rglob(".rsgen-cache")) and not (tmp_path / "cache").exists()
+    found = record.figures
+    assert 10 < found["surely_least_db"] < found["psnr_least_db"] <= found["psnr_db"] < 60
+    assert found["bake_s"] > 0 and 50 < found["bake_mb"] <= found["peak_mb"] and abs(found["bias_pct"]) < 50
+    assert found["estimate_least_db"] <= found["estimate_db"] < 61
+    assert (tmp_path / "out/cells/light/tiny/rsgen/light.png").stat().st_size > 1000
+
+
+def test_frames_are_timed_by_a_process_of_its_own(tmp_path: Path) -> None:
+    settings = "{modes: [still, rs-blur], frames: 1, spp: 2}"
+    record = measured(tmp_path, "render", settings)
+    assert record.error is None and record.figures["rs_blur_ratio"] > 0
+    still = record.figures["still_s"]
+    # It is finished; of another motion it is not.
+    assert measured(tmp_path, "render", settings).figures["still_s"] == pytest.approx(still, rel=1e-5)
+    assert measured(tmp_path, "render", settings, frames=7).key != record.key
+
+
+@pytest.mark.parametrize(
+    ("measure", "settings", "how", "part"),
+    [
+        ("render", "{modes: [fast]}", {}, "settings: modes"),
+        ("light", "{views: 0}", {}, "settings: views"),
+        ("light", "{}", {"method": "rs-g"}, "its method is rsgen"),
+        ("light", "{width: 24}", {"set": "light.mode: path"}, "light.mode"),
+        ("render", "{modes: [still]}", {"set": "color.sp: 1"}, "color.sp"),
+        ("render", "{modes: [blender]}", {}, "bpy is not installed"),
+    ],
+)
+def test_what_cannot_be_measured(
+    measure: str, settings: str, how: dict[str, Any], part: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("benchmarks.measures.render.find_spec", lambda _: None)
+    if how.get("method"):
+        monkeypatch.setattr(Sources, "folder", lambda *_: tmp_path)
+    record = measured(tmp_path, measure, settings, **how)
+    assert part in (record.error or "") and record.skipped == ("bpy" in part)
+
+
+def test_a_process_that_dies_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("benchmarks.rendering.run.sys.executable", "/bin/false")
+    record = measured(tmp_path, "render", "{modes: [still]}")
+    assert record.error == "the renderer's process ended: no message"
 
 
 # --- Blender ---------------------------------------------------------------------------------------------------------
@@ -180,7 +256,7 @@ def test_an_exposure_spans_from_the_first_lines_opening_to_the_last_ones_closing
 
 
 def test_a_missing_blender_is_one_line_before_any_work(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("rsgen.bench.blender.find_spec", lambda _: None)
+    monkeypatch.setattr("benchmarks.rendering.blender.find_spec", lambda _: None)
     with pytest.raises(UserError, match="pip install") as caught:
         check_installed()
     assert "\n" not in str(caught.value)
@@ -219,7 +295,7 @@ def test_a_blender_that_dies_is_one_line(lit: Any) -> None:
 
 
 def test_a_lens_with_distortion_is_refused(lit: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rsgen.bench.blender.find_spec", lambda _: object())
+    monkeypatch.setattr("benchmarks.rendering.blender.find_spec", lambda _: object())
     camera = Camera(8, 8, 8.0, 8.0, 3.5, 3.5, "radtan", (0.1, 0, 0, 0))
     with pytest.raises(UserError, match="without distortion"):
         BlenderRenderer(lit, camera, [], spp=1, max_depth=2)

@@ -97,7 +97,7 @@ class BlenderRenderer(AbstractContextManager["BlenderRenderer"]):
             np.savez(root / "job.npz", allow_pickle=False, **arrays)
             (root / "job.json").write_text(json.dumps(job))
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "rsgen.bench.blender_worker", str(root)],
+                [sys.executable, "-m", "benchmarks.rendering.blender_worker", str(root)],
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._log, text=True,
             )  # fmt: skip
             self.version: str = self._answer()["version"]

@@ -1,9 +1,8 @@
-"""What is counted of insulted recordings, with a tracker that does as it is told; vibration against a renderer."""
+"""Faults by their seeds, and what is counted of them with a tracker that does as it is told."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,19 +10,24 @@ from typing import Any
 import numpy as np
 import pytest
 import synthetic
+from changed_frames import colors, depths, true_positions
 from scipy.optimize import least_squares
 
+from benchmarks.faults import faults
+from benchmarks.faults.faults import Fault
+from benchmarks.faults.passing import passed_by
+from benchmarks.faults.vibration import vibrating
+from benchmarks.measures import MEASURES
+from benchmarks.measures import faults as measure
+from benchmarks.measures.faults import judged, mean_pose
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3, so3
 from rsgen.sequence.trajectory import Trajectory
-from rstrack.bench.sensitivity import insulted, insults
-from rstrack.bench.changes.edits import with_depth
-from rstrack.bench.sensitivity.insulted import InsultReport, Outcome, judged, mean_pose
-from rstrack.bench.sensitivity.insults import Insult
-from rstrack.bench.sensitivity.passing import passed_by
-from rstrack.bench.sensitivity.vibration import vibrating
-from rstrack.cli.main import main
+from rstrack.bench.changes.edits import reordered, with_depth
+from rstrack.bench.definitions import Benchmark, load_benchmark
+from rstrack.bench.runner import run_cells
+from rstrack.bench.sequences import Sources
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.metrics.association import true_poses
 from rstrack.options import Options
@@ -34,11 +38,93 @@ SPLINE = synthetic.make_spline(0.3)
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    folder = tmp_path_factory.mktemp("insulted") / "seq"
+    folder = tmp_path_factory.mktemp("faults") / "seq"
     writer = synthetic.open_writer(folder, synthetic.make_config(64, 48), FRAMES, SPLINE)
     synthetic.write_frames(writer)
     writer.finish()
     return open_dataset(folder)
+
+
+def at(stamps: np.ndarray) -> np.ndarray:
+    return SPLINE.pose(stamps)[:, :3, 3]
+
+
+# --- kinds -----------------------------------------------------------------------------------------------------------
+
+
+def test_what_the_faults_do(dataset: Dataset) -> None:
+    whole, shots = depths(dataset), colors(dataset)
+
+    taken = faults.kidnapped(dataset, 10, 8)
+    assert len(taken) == 22
+    np.testing.assert_array_equal(taken.stamps, dataset.stamps[:22])
+    np.testing.assert_array_equal(depths(taken)[10:], whole[18:])
+    np.testing.assert_allclose(true_positions(taken)[10:], at(dataset.stamps[18:]), atol=1e-9)
+
+    black = faults.blacked_out(dataset, 10, 3)
+    assert not depths(black)[10:13].any() and not colors(black)[10:13].any()
+    assert depths(black)[[9, 13]].any(axis=(1, 2)).all() and colors(black)[[9, 13]].any(axis=(1, 2, 3)).all()
+
+    hand = faults.covered(dataset, 10, 3)
+    assert not depths(hand)[10:13].any() and depths(hand)[[9, 13]].all()
+    np.testing.assert_array_equal(colors(hand), shots)
+
+    stuck = faults.frozen(dataset, 10, 3)
+    np.testing.assert_array_equal(depths(stuck)[9:14], whole[[9, 9, 9, 9, 13]])
+    np.testing.assert_array_equal(colors(stuck)[9:14], shots[[9, 9, 9, 9, 13]])
+    np.testing.assert_array_equal(stuck.stamps, dataset.stamps)
+    np.testing.assert_allclose(true_positions(stuck)[9:14], at(dataset.stamps[[9, 9, 9, 9, 13]]), atol=1e-9)
+
+    for count, seed in ((2, 0), (2, 1), (2, 2), (10, 3)):
+        mixed = faults.shuffled(dataset, 10, count, seed)
+        order = [int(np.argmin(np.abs(whole - z).sum(axis=(1, 2)))) for z in depths(mixed)]
+        assert order != list(range(FRAMES)) and sorted(order) == list(range(FRAMES))
+        assert order[:10] == list(range(10)) and order[10 + count :] == list(range(10 + count, FRAMES))
+        np.testing.assert_allclose(true_positions(mixed), at(dataset.stamps[order]), atol=1e-9)
+
+    odd = faults.mismatched(dataset, 10, 3, 12)
+    np.testing.assert_array_equal(depths(odd), whole)
+    np.testing.assert_array_equal(colors(odd), shots[[*range(10), 22, 23, 24, *range(13, FRAMES)]])
+
+    fast = faults.sped_up(dataset, 10, 3)
+    np.testing.assert_array_equal(depths(fast), whole[[*range(10), 10, 14, 18, *range(22, FRAMES)]])
+    np.testing.assert_array_equal(fast.stamps, dataset.stamps[:21])
+
+    wall = faults.bare_wall(dataset, 10, 3)
+    for k in range(10, 13):
+        assert depths(wall)[k, 0, 0] == np.median(whole[k])
+        assert len(np.unique(depths(wall)[k])) == 1 and len(np.unique(colors(wall)[k].reshape(-1, 3), axis=0)) == 1
+    np.testing.assert_array_equal(depths(wall)[13:], whole[13:])
+    for wrong in ((0, 3), (28, 3), (10, 0)):
+        with pytest.raises(UserError, match="cannot be touched"):
+            faults.covered(dataset, *wrong)
+
+
+@pytest.mark.parametrize("kind", faults.KINDS)
+def test_random_faults_are_pure_and_leave_both_ends_alone(kind: str, dataset: Dataset) -> None:
+    before = colors(dataset), depths(dataset)
+    made = [faults.random_fault(dataset, seed, kind) for seed in range(6)]
+    assert len({(fault.first, fault.last) for fault in made}) > 1
+    for fault, again in zip(made, (faults.random_fault(dataset, seed, kind) for seed in range(6)), strict=True):
+        assert (fault.kind, fault.first, fault.last) == (again.kind, again.first, again.last) and kind == again.kind
+        # After a jump the first of the frames that stay counts as touched.
+        assert 12 <= fault.first < fault.last <= len(fault.dataset) - 12 + (kind == "kidnapped")
+        shown, seen = depths(fault.dataset), colors(fault.dataset)
+        np.testing.assert_array_equal(shown, depths(again.dataset))
+        np.testing.assert_array_equal(shown[:12], before[1][:12])
+        np.testing.assert_array_equal(shown[-12:], before[1][-12:])
+        same = all(np.array_equal(*pair) for pair in zip((seen, shown), (c[: len(shown)] for c in before), strict=True))
+        assert not same or (kind == "sped up" and fault.last - fault.first == 1)
+    np.testing.assert_array_equal(depths(dataset), before[1])
+
+
+def test_kinds_are_drawn_and_short_recordings_refused(dataset: Dataset) -> None:
+    drawn = {faults.random_fault(dataset, seed).kind for seed in range(60)}
+    assert drawn == set(faults.KINDS)
+    with pytest.raises(UserError, match="too few"):
+        faults.random_fault(reordered(dataset, range(24), dataset.stamps[:24]), 0)
+    with pytest.raises(UserError, match="unknown fault 'rain'"):
+        faults.random_fault(dataset, 0, "rain")
 
 
 # --- vibration -------------------------------------------------------------------------------------------------------
@@ -190,51 +276,53 @@ class Told:
 
 @pytest.fixture
 def outcome(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> Any:
-    def make(off: dict[int, float | None], first: int = 10, last: int = 13, **told: Any) -> Outcome:
+    def make(off: dict[int, float | None], first: int = 10, last: int = 13, **told: Any) -> SimpleNamespace:
         _, truth = true_poses(SPLINE, dataset.stamps, interpolate=True)
-        monkeypatch.setattr(insulted, "make_tracker", lambda *_, **__: Told(truth, off, **told))
-        return judged(Insult("covered", dataset, first, last), Options(), seed=4)
+        monkeypatch.setattr(measure, "make_tracker", lambda *_, **__: Told(truth, off, **told))
+        return SimpleNamespace(**judged(Fault("covered", dataset, first, last), Options()))
 
     return make
 
 
 def test_a_tracker_that_does_nothing_wrong(outcome: Any) -> None:
     found = outcome({})
-    assert (found.lost, found.silent, found.found_after, found.is_place_known) == (0, (), 0, False)
-    assert found.worst_m < 1e-9 and found.worst_deg < 1e-6 and found.moved_m == found.rewritten_m == 0.0
-    assert found.lost_ms is None and found.tracked_ms > 0.0 and (found.seed, found.kind) == (4, "covered")
+    assert (found.lost, found.silent, found.silent_fault, found.frames) == (0, 0, 0, FRAMES)
+    assert (found.place_known, found.found_in_5, found.kind) == (0, None, list(faults.KINDS).index("covered"))
+    assert found.worst_mm < 1e-6 and found.worst_deg < 1e-6 and found.moved_mm == found.rewritten_mm == 0.0
+    assert found.lost_ms is None and found.tracked_ms > 0.0
 
 
 def test_frames_that_are_off_without_a_word(outcome: Any) -> None:
     found = outcome({8: 0.0, 11: 0.019, 12: 0.021, 20: 0.03})
-    assert found.silent == (12, 20) and found.worst_m == pytest.approx(0.03, abs=1e-9)
+    assert (found.silent, found.silent_fault) == (2, 1) and found.worst_mm == pytest.approx(30, abs=1e-6)
     # A pose that was wrong when it was given, and one that is wrong in the end.
-    assert outcome({11: 0.03}, moves={12: (11, 0.0)}).silent == (11,)
+    assert outcome({11: 0.03}, moves={12: (11, 0.0)}).silent == 1
     found = outcome({}, moves={12: (11, 0.05)})
-    assert found.silent == (11,) and found.moved_m == 0.0  # it had not converged
+    assert found.silent == 1 and found.moved_mm == 0.0  # it had not converged
 
 
-@pytest.mark.parametrize(("back", "is_found"), [(13, True), (17, True), (18, False)])
-def test_lost_and_found_again(back: int, is_found: bool, outcome: Any) -> None:
+@pytest.mark.parametrize(("back", "is_found"), [(13, 1), (17, 1), (18, 0)])
+def test_lost_and_found_again(back: int, is_found: int, outcome: Any) -> None:
     found = outcome({k: None for k in range(10, back)})
-    assert found.lost == back - 10 and found.silent == () and found.is_place_known
-    assert found.found_after == back - 13 and found.is_found == is_found and found.lost_ms is not None
+    assert (found.lost, found.silent, found.place_known) == (back - 10, 0, 1)
+    assert found.found_in_5 == is_found and found.lost_ms is not None
     # A frame that is given but wrong has not been found.
     wrong = outcome({k: None for k in range(10, back)} | {back: 0.5})
-    assert wrong.found_after == back - 12 and wrong.silent == (back,)
+    assert (wrong.found_in_5, wrong.silent) == (int(back < 17), 1)
 
 
 def test_never_found_and_a_place_that_no_keyframe_has_seen(outcome: Any) -> None:
     lost: dict[int, float | None] = dict.fromkeys(range(10, FRAMES))
-    assert outcome(lost).found_after is None and not outcome(lost).is_found and outcome(lost).is_place_known
-    assert not outcome(lost, keyframes=(20,)).is_place_known
+    assert (outcome(lost).found_in_5, outcome(lost).place_known) == (0, 1)
+    found = outcome(lost, keyframes=(20,))
+    assert (found.found_in_5, found.place_known) == (None, 0)
 
 
 def test_poses_that_move_later(outcome: Any) -> None:
-    assert outcome({}, moves={14: (4, 0.01)}).moved_m == 0.0
-    assert outcome({}, moves={15: (4, 0.01)}).moved_m == pytest.approx(0.01)
-    assert outcome({}, moves={14: (13, 0.01)}).rewritten_m == 0.0
-    assert outcome({}, moves={14: (13, 0.01)}, again=(14,)).rewritten_m == pytest.approx(0.01)
+    assert outcome({}, moves={14: (4, 0.01)}).moved_mm == 0.0
+    assert outcome({}, moves={15: (4, 0.01)}).moved_mm == pytest.approx(10)
+    assert outcome({}, moves={14: (13, 0.01)}).rewritten_mm == 0.0
+    assert outcome({}, moves={14: (13, 0.01)}, again=(14,)).rewritten_mm == pytest.approx(10)
 
 
 def test_a_start_that_fails_is_told(outcome: Any) -> None:
@@ -248,42 +336,49 @@ def test_the_mean_of_poses() -> None:
     np.testing.assert_allclose(mean_pose(T @ se3.exp(turns)), T, atol=1e-12)
 
 
-def test_one_row_a_kind_and_a_line_a_silent_error() -> None:
-    base = Outcome(7, "frozen", 12, 15, 60, 2, (), 0.001, 0.1, True, 3, 0.0, 0.0, 30.0, 20.0)
-    late = dataclasses.replace(base, seed=8, found_after=5, silent=(14, 15, 17), worst_m=0.123, worst_deg=4.56)
-    other = dataclasses.replace(base, seed=9, kind="kidnapped", lost_ms=None, is_place_known=False)
-    settings = {"options": {"method": "rs-pg"}, "dataset": "room", "frames": [0, 60], "seed": 7}
-    report = InsultReport(settings, (base, late, other))
-    lines = report.text().splitlines()
-    assert lines[0] == "rs-pg on room, frames 0 to 59, insults of seeds 7 and on"
-    assert [line.split()[0] for line in lines[3:6]] == ["kidnapped", "frozen", "all"]
-    assert lines[4].split() == ["frozen", "2", "1", "3", "123.0", "4.56", "4", "2", "1", "0.000", "0.000", "1.50"]
-    assert lines[6] == "wrong without a word: seed 8, frozen in frames 12 to 14: 3 frames from 14 to 17, 123 mm and " \
-        "4.6 degrees at worst"  # fmt: skip
-    assert report.markdown().count("|") == 5 * 13
+# --- the measure -----------------------------------------------------------------------------------------------------
 
 
-# --- the command -----------------------------------------------------------------------------------------------------
+def benchmark(folder: Path, method: str, seeds: int) -> Benchmark:
+    text = f"""
+sequences: {{room: {{path: seq}}}}
+cases: {{piece: {{sequence: room, frames: "1:29"}}}}
+cells: [{{cases: [piece], methods: [{method}], measure: faults, seeds: {seeds}}}]
+"""
+    (folder / "bench.yaml").write_text(text)
+    return load_benchmark([folder / "bench.yaml"])
 
 
-def test_the_command_tracks_every_kind_once_and_resumes(
-    dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+def test_each_seed_is_a_fault_of_the_next_kind(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made: list[int] = []
+    made: list[Fault] = []
 
-    def told(insult: Insult, options: Options, seed: int) -> Outcome:
-        made.append(seed)
-        return Outcome(
-            seed, insult.kind, insult.first, insult.last, 30, 0, (12,), 0.1, 0.0, False, 0, 0.0, 0.0, 1.0, 2.0
-        )
+    def watched(fault: Fault, options: Options) -> dict[str, float]:
+        assert options.method == "rs-g"
+        made.append(fault)
+        return {"silent": 0, "kind": len(made) - 1}
 
-    monkeypatch.setattr(insulted, "judged", told)
-    out = tmp_path / "t.md"
-    words = ["sensitivity", str(dataset.root), "--quiet", "--seed", "5", "--out", str(out), "--insults"]
-    assert main([*words, "3"]) == 0 and main([*words, "10"]) == 0
-    assert made == list(range(5, 15))
-    outcomes = json.loads(out.with_suffix(".json").read_text())["outcomes"]
-    assert [o["kind"] for o in outcomes] == list(insults.KINDS) and outcomes[0]["silent"] == [12]
-    assert capsys.readouterr().out.splitlines()[-11].split()[:4] == ["all", "10", "10", "10"]
-    assert out.read_text().count("\n| ") == 2 + 10 + 1
-    assert main([*words, "0"]) == 2 and "at least 1" in capsys.readouterr().err
+    monkeypatch.setattr(measure, "judged", watched)
+    # Four frames between both ends, as 'sped up' needs.
+    sources = Sources(data=dataset.root.parent)
+    record = run_cells(benchmark(tmp_path, "rs-g", 10), tmp_path, sources, measures=MEASURES).records[
+        "faults/piece/rs-g"
+    ]
+    assert record.error is None and record.complete and [fault.kind for fault in made] == list(faults.KINDS)
+    assert record.values("kind") == list(range(10))
+    cut = reordered(dataset, range(1, 29), dataset.stamps[1:29])
+    for seed, fault in enumerate(made):
+        again = faults.random_fault(cut, seed, fault.kind)
+        assert (again.first, again.last) == (fault.first, fault.last)
+        np.testing.assert_array_equal(depths(again.dataset), depths(fault.dataset))
+
+
+def test_faults_are_for_our_methods(dataset: Dataset, tmp_path: Path) -> None:
+    cells = run_cells(benchmark(tmp_path, "orb-slam3", 1), tmp_path, Sources(dataset.root.parent), measures=MEASURES)
+    assert "methods of ours" in (cells.records["faults/piece/orb-slam3"].error or "")
+
+
+def test_a_fault_in_the_recording_is_tracked(dataset: Dataset) -> None:
+    found = judged(faults.random_fault(dataset, 2, "covered"), Options(method="baseline"))
+    assert found["frames"] == FRAMES and found["kind"] == 2 and (found["tracked_ms"] or 0) > 0

@@ -1,8 +1,7 @@
-"""What happens to a camera in the field, put into a recording: jumps, blackouts, covered, frozen and shuffled images,
-things that pass.
+"""Faults injected into a recording: jumps, blackouts, covered, frozen and shuffled images, things that pass.
 
-insult = random_insult(dataset, seed=17)
-track(insult.dataset, options, out)        # frames insult.first to insult.last - 1 were touched
+fault = random_fault(dataset, seed=17)
+track(fault.dataset, options, out)         # frames fault.first to fault.last - 1 were touched
 
 All are pure functions of dataset and seed. The truth of a frame is where its depth image was really taken, whatever is
 shown in it: `Dataset.truth_poses` says it at every stamp.
@@ -15,20 +14,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks.faults.passing import passed_by
+from benchmarks.faults.vibration import vibrating
 from rsgen.array_types import ByteArray, Float32Array
 from rsgen.errors import UserError
 from rstrack.bench.changes.edits import reordered, with_color, with_depth
-from rstrack.bench.sensitivity.passing import passed_by
-from rstrack.bench.sensitivity.vibration import vibrating
 from rstrack.data.dataset import Dataset
 
-# Frames before the first insult, for the tracker to begin with, and after the last one, to be found again.
+# Frames before the fault, for the tracker to begin with, and after it, to be found again.
 _BEFORE, _AFTER = 12, 12
 _MOST_FRAMES = 60
 
 
 @dataclass(frozen=True)
-class Insult:
+class Fault:
     """A recording with something done to it.
 
     kind: of `KINDS`. first, last: frames [first, last) of `dataset` were touched; where frames are missing, first is
@@ -120,15 +119,15 @@ def shaken(dataset: Dataset, first: int, count: int, seed: int) -> Dataset:
     return vibrating(dataset, first, count, swing, float(rng.uniform(12.0, 40.0)))
 
 
-def random_insult(dataset: Dataset, seed: int, kind: str | None = None) -> Insult:
-    """An insult of a random kind (or a given one of `KINDS`), place, length and strength, by its seed alone.
+def random_fault(dataset: Dataset, seed: int, kind: str | None = None) -> Fault:
+    """A fault of a random kind (or a given one of `KINDS`), place, length and strength, by its seed alone.
 
     The first 12 frames and the last 12 stay as they are. Raises UserError: a recording that is too short, no such kind.
     """
     rng = np.random.default_rng([seed, 9])
     kind = kind or str(rng.choice(list(KINDS)))
     if kind not in KINDS:
-        raise UserError(f"unknown insult '{kind}': choose {', '.join(KINDS)}")
+        raise UserError(f"unknown fault '{kind}': choose {', '.join(KINDS)}")
     room = len(dataset) - _BEFORE - _AFTER
     factor = 4 if kind == "sped up" else 1
     most = min(_MOST_FRAMES, room // factor)
@@ -138,7 +137,7 @@ def random_insult(dataset: Dataset, seed: int, kind: str | None = None) -> Insul
     count = int(rng.integers(least, most + 1))
     first = _BEFORE + int(rng.integers(0, room - factor * count + 1))
     touched = 1 if kind == "kidnapped" else count
-    return Insult(kind, KINDS[kind](dataset, first, count, rng), first, first + touched)
+    return Fault(kind, KINDS[kind](dataset, first, count, rng), first, first + touched)
 
 
 def _mismatched(dataset: Dataset, first: int, count: int, rng: np.random.Generator) -> Dataset:
@@ -160,7 +159,7 @@ KINDS: dict[str, Make] = {
     "bare wall": lambda d, first, count, _: bare_wall(d, first, count),
     "passed by": lambda d, first, count, rng: passed_by(d, first, count, int(rng.integers(2**31))),
 }
-"""Kinds of insults, made of a dataset, a first frame, a number of frames and a generator for what else is random."""
+"""Kinds of faults, made of a dataset, a first frame, a number of frames and a generator for what else is random."""
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -169,7 +168,7 @@ KINDS: dict[str, Make] = {
 def _check(dataset: Dataset, first: int, count: int) -> None:
     if not (first > 0 and count > 0 and first + count <= len(dataset)):
         raise UserError(
-            f"{dataset.name}: frames {first} to {first + count - 1} cannot be insulted: it has frames 0 to "
+            f"{dataset.name}: frames {first} to {first + count - 1} cannot be touched: it has frames 0 to "
             f"{len(dataset) - 1}, and the first stays"
         )
 

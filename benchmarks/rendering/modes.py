@@ -1,6 +1,7 @@
 """What a colour frame costs in each mode, and the ratios, all measured in one run on the same frames.
 
-    print(time_modes(config, frames=5, spp=64, modes=MODES, progress=progress).text())
+times, failed = time_modes(config, frames=5, spp=64, modes=MODES, progress=progress)
+print(figures_of(times))          # {"still_s": ..., "rs_blur_s": ..., "rs_blur_ratio": ...}
 
 Beside the generator's own modes stand other ways to the same picture: a render for each line, many sharp renders
 averaged, and Blender.
@@ -8,10 +9,8 @@ averaged, and Blender.
 
 from __future__ import annotations
 
-import os
-import platform
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,18 +18,24 @@ from typing import Any
 import numpy as np
 
 from rsgen.array_types import Float32Array, FloatArray
-from rsgen.bench.table import AVERAGED, BLUR_S, READOUT_S, BenchTimes, ModeTimes
 from rsgen.check.light import lit_scene, spread_times
 from rsgen.config.config import Config
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
 from rsgen.geometry.shutter import Shutter
 from rsgen.produce.frame_source import mirrored_samples
-from rsgen.produce.generate import engine_versions
 from rsgen.produce.ground_truth import load_motion
+from rstrack.bench.memory import peak_mb
 
 MODES = ("still", "rs-blur", "path", "rows", "averaged")
 BLENDER_MODES = ("blender-still", "blender")
+BLUR_S, READOUT_S = 0.020, 0.028
+AVERAGED = 64  # sharp renders in the place of a blurred one
+# Modes that are divided by others than the still.
+_RATIOS = (
+    ("path", "rs-blur"), ("rows", "rs-blur"), ("averaged", "rs-blur"), ("blender", "rs-blur"), ("blender", "path"),
+    ("blender", "blender-still"),
+)  # fmt: skip
 _ROWS = 32  # rows measured of mode 'rows'; the others cost the same
 _PATH_SHARE = 4  # path tracing is slow and its time proportional to its samples: a quarter of them is measured
 _ROUNDS = 4  # of the modes that are compared most closely, after one to warm up: what ran before leaves caches cold
@@ -41,21 +46,29 @@ class Mode:
     """A way to make a frame. seconds: (frame's index, stamp in s) → seconds that the whole frame takes."""
 
     name: str
-    title: str
     spp: int
     seconds: Callable[[int, float], float]
     rounds: int = 1
-    measured: str = "all"
 
 
-def time_modes(config: Config, frames: int, spp: int, modes: Sequence[str], progress: Progress) -> BenchTimes:
+@dataclass(frozen=True)
+class ModeTimes:
+    """Seconds a frame of one mode (frames, rounds), and the samples that a frame has, in millions."""
+
+    seconds: FloatArray
+    msamples: float
+
+
+def time_modes(
+    config: Config, frames: int, spp: int, modes: Sequence[str], progress: Progress
+) -> tuple[dict[str, ModeTimes], dict[str, str]]:
     """Time the modes, names of MODES and BLENDER_MODES, on `frames` frames spread over the config's trajectory.
 
     All modes render each frame before the next frame's turn comes; a frame before the first compiles kernels. spp:
-    samples per pixel. Raises UserError.
+    samples per pixel. Returns the times by mode, and why a mode failed, by mode. Raises UserError.
     """
     if set(modes) & set(BLENDER_MODES):
-        from rsgen.bench.blender import check_installed
+        from benchmarks.rendering.blender import check_installed
 
         check_installed()
     # Fitted for the shutter that is timed here, so that its lines find a pose in the shortest trajectory.
@@ -73,11 +86,37 @@ def time_modes(config: Config, frames: int, spp: int, modes: Sequence[str], prog
             chosen += _blender_modes(config, scene, motion.spline.pose, stamps, spp, names, stack)
             progress("starting Blender", 1.0, "ready")
         seconds, failed = _measure(chosen, stamps, progress)
-    times = tuple(
-        ModeTimes(m.name, m.title, m.spp, m.measured, np.array(seconds[m.name])) for m in chosen if m.name not in failed
-    )
-    machine = {"cores": os.cpu_count(), "processor": platform.machine()}
-    return BenchTimes(camera.width, camera.height, machine | engine_versions(config), times, failed)
+    pixels = camera.width * camera.height
+    times = {
+        m.name: ModeTimes(np.array(seconds[m.name]), 1e-6 * pixels * m.spp) for m in chosen if m.name not in failed
+    }
+    return times, failed
+
+
+def figures_of(times: Mapping[str, ModeTimes]) -> dict[str, float]:
+    """Flat figures: of every mode its median seconds a frame and millions of samples a second, and ratios of times.
+
+    MODE_ratio: over the still; MODE_to_OTHER_ratio: over another mode. Names have _ for -.
+    """
+    found: dict[str, float] = {}
+    for mode, t in times.items():
+        median = float(np.median(t.seconds))
+        found |= {f"{mode}_s": median, f"{mode}_msamples_s": t.msamples / median}
+    for mode, against, name in (
+        *((mode, "still", f"{mode}_ratio") for mode in times if mode != "still"),
+        *((mode, against, f"{mode}_to_{against}_ratio") for mode, against in _RATIOS),
+    ):
+        if mode in times and against in times:
+            found[name] = _ratio(times[mode].seconds, times[against].seconds)
+    return {name.replace("-", "_"): value for name, value in found.items()}
+
+
+def render_figures(config: Config, settings: Mapping[str, Any], progress: Progress) -> dict[str, float]:
+    """The figures of the measure `render`, with its settings. Raises UserError, if no mode could be timed too."""
+    times, failed = time_modes(config, settings["frames"], settings["spp"], settings["modes"], progress)
+    if not times:
+        raise UserError("; ".join(f"{mode}: {why}" for mode, why in failed.items()))
+    return figures_of(times) | {"peak_mb": peak_mb()}
 
 
 def row_renderer(scene: Any, integrator: Any, camera: Any, spp: int) -> Any:
@@ -133,42 +172,26 @@ def _our_modes(config: Config, scene: Any, baked: Any, mi: Any, pose: Any, spp: 
     sharp = ColorRenderer(scene, baked, camera, still, each)
     delay = moving.line_delay(camera)
     return [
-        Mode("still", "baked, sharp, all rows at once", spp, lambda k, t: _time(one.render, pose, t, k), _ROUNDS),
-        Mode(
-            "rs-blur", "baked, rolling shutter + blur", spp, lambda k, t: _time(blurred.render, pose, t, k), _ROUNDS
-        ),
-        Mode(
-            "path", f"path traced to depth {config.light.max_depth}, rolling shutter + blur", spp,
-            lambda k, t: _time(traced.render, pose, t, k) * spp / path_spp, measured=f"{path_spp} of {spp} spp",
-        ),
-        Mode(
-            "rows", "baked, a render for each row, sharp", spp,
-            lambda _, t: _time(render_rows, by_row, pose, t, delay, rows) * h / n, measured=f"{n} of {h} rows",
-        ),
-        Mode(
-            "averaged", f"baked, {AVERAGED} sharp renders averaged", each * AVERAGED,
-            lambda _, t: _time(render_averaged, sharp, pose, t, BLUR_S, AVERAGED),
-        ),
-    ]  # fmt: skip
+        Mode("still", spp, lambda k, t: _time(one.render, pose, t, k), _ROUNDS),
+        Mode("rs-blur", spp, lambda k, t: _time(blurred.render, pose, t, k), _ROUNDS),
+        Mode("path", spp, lambda k, t: _time(traced.render, pose, t, k) * spp / path_spp),
+        Mode("rows", spp, lambda _, t: _time(render_rows, by_row, pose, t, delay, rows) * h / n),
+        Mode("averaged", each * AVERAGED, lambda _, t: _time(render_averaged, sharp, pose, t, BLUR_S, AVERAGED)),
+    ]
 
 
 def _blender_modes(
     config: Config, scene: Any, pose: Any, stamps: FloatArray, spp: int, names: Sequence[str], stack: ExitStack
 ) -> list[Mode]:
     """Blender's modes; the process lives as long as the stack. Frame k's exposure in mode i is number k · modes + i."""
-    from rsgen.bench.blender import BlenderRenderer, exposure
+    from benchmarks.rendering.blender import BlenderRenderer, exposure
 
-    kinds = {
-        "blender-still": (Shutter(), "sharp, all rows at once"),
-        "blender": (Shutter(READOUT_S, BLUR_S), "rolling shutter + blur"),
-    }
-    exposures = [exposure(pose, kinds[name][0], float(t)) for t in stamps for name in names]
-    depth = config.light.max_depth
-    blender = stack.enter_context(BlenderRenderer(scene, config.color.camera, exposures, spp, depth))
+    shutters = {"blender-still": Shutter(), "blender": Shutter(READOUT_S, BLUR_S)}
+    exposures = [exposure(pose, shutters[name], float(t)) for t in stamps for name in names]
+    blender = stack.enter_context(BlenderRenderer(scene, config.color.camera, exposures, spp, config.light.max_depth))
 
     def mode(i: int, name: str) -> Mode:
-        title = f"Blender {blender.version}, Cycles on the CPU to depth {depth}, {kinds[name][1]}"
-        return Mode(name, title, spp, lambda k, _: blender.time(k * len(names) + i))
+        return Mode(name, spp, lambda k, _: blender.time(k * len(names) + i))
 
     return [mode(i, name) for i, name in enumerate(names)]
 
@@ -202,3 +225,9 @@ def _time(function: Callable[..., object], *arguments: Any) -> float:
     begin = time.perf_counter()
     function(*arguments)
     return time.perf_counter() - begin
+
+
+def _ratio(a: FloatArray, b: FloatArray) -> float:
+    """Median over pairs of the same frame: round by round where both have as many, else the frames' medians."""
+    pairs = a / b if a.shape == b.shape else np.median(a, axis=1) / np.median(b, axis=1)
+    return float(np.median(pairs))

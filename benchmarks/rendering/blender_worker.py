@@ -1,4 +1,4 @@
-"""The child process that renders with Blender Cycles: `python -m rsgen.bench.blender_worker JOB` (see `blender`).
+"""The process that renders with Blender Cycles: `python -m benchmarks.rendering.blender_worker JOB` (see `blender`).
 
 JOB holds job.json and job.npz. Each line on standard input asks for one picture and is answered by one line of JSON on
 standard output, seconds and all. Blender's own chatter goes to standard error.
