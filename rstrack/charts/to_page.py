@@ -77,7 +77,7 @@ def _line(line: Line, points: int) -> dict[str, Any]:
         return _scatter(line.name, _short(line.x, 6), _short(line.y, 4), mode="lines+markers", marker=marker, **style)
     index = _thinned(len(line.x), points)
     x, y = broken(line.x[index], line.y[index])
-    return _scatter(line.name, _short(x, 6), _short(y, 4), mode="lines", **style)
+    return _scatter(line.name, _short(x), _short(y, 4), mode="lines", **style)
 
 
 def _scatter(name: str, x: Any, y: Any, **style: Any) -> dict[str, Any]:
@@ -131,6 +131,6 @@ def _thinned(n: int, most: int) -> np.ndarray:
 
 
 def _short(values: FloatArray, digits: int | None = None) -> list[float | None]:
-    """Numbers for the page, NaN as None: to a tenth of a millimetre, or to so many significant digits."""
+    """Numbers for the page, NaN as None: to tenths of a millimetre or millisecond, or to so many significant digits."""
     short = (round(v, 4) if digits is None else float(f"{v:.{digits}g}") for v in np.asarray(values, float).tolist())
     return [v if np.isfinite(v) else None for v in short]

@@ -41,6 +41,11 @@ class Tracked:
         return self.estimate.stamps, T if self.found is None else self.found.T_true_est @ T
 
     @property
+    def begin_s(self) -> float:
+        """Stamp of the first frame, s; of the first pose where the run does not tell its frames."""
+        return float(self.frames[0]["stamp"] if self.frames else self.estimate.stamps[0])
+
+    @property
     def frames(self) -> list[dict[str, Any]]:
         """The tracker's diagnostics, one dict a frame."""
         frames = self.estimate.info.get("frames")
