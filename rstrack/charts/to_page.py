@@ -91,7 +91,11 @@ def _paths(chart: PathChart, points: int) -> Figure:
     distance = 0.62 + 0.72 * float(np.linalg.norm(size))
     scene: dict[str, Any] = {
         "aspectmode": "manual", "aspectratio": dict(zip("xyz", size.tolist(), strict=True)),
-        "camera": {"eye": dict(zip("xyz", [distance * v for v in _EYE], strict=True)), "up": {"x": 0, "y": 0, "z": 1}},
+        "camera": {
+            "eye": dict(zip("xyz", [distance * v for v in _EYE], strict=True)), "up": {"x": 0, "y": 0, "z": 1},
+            # Room below for the labels of the axes.
+            "center": {"x": 0, "y": 0, "z": -0.15},
+        },
         "dragmode": "turntable",
     }  # fmt: skip
     labels = (*chart.labels[:2], f"{chart.labels[2]} (up)")
