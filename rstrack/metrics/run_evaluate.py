@@ -98,6 +98,17 @@ class Evaluation:
             lines.append(f"least by {self.fit.criterion}; each error is least at, ms: {where}")
         return tuple(lines)
 
+    @property
+    def by_clock(self) -> tuple[tuple[str, Metrics], ...]:
+        """The truth's clock in words, and the errors with it: as stored, and with its offset where there is one."""
+        stored = ("truth's clock as stored", self.metrics)
+        if self.moved is None or self.offset_s is None:
+            return (stored,)
+        if self.fit is None:
+            return stored, (f"truth's clock moved, {1e3 * self.offset_s:+.1f} ms", self.moved)
+        offset = f"{1e3 * self.offset_s:+.1f} ± {1e3 * self.fit.sigma_s:.1f} ms"
+        return stored, (f"truth's clock fitted, {offset}", self.moved)
+
     def _clock(self) -> str:
         assert self.offset_s is not None
         size, side = f"{abs(1e3 * self.offset_s):.1f}", "after" if self.offset_s > 0 else "before"
