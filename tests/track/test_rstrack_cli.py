@@ -119,7 +119,7 @@ def test_a_run_folder_holds_the_trajectory_and_what_made_it(place: Path, origina
     chosen = Options(fuse=True, knot_spacing_s=0.025, loops="end")
     assert info["options"] == dataclasses.asdict(chosen) and info["method"] == "rs-pg"
     where = str((original / "seq").resolve())
-    frames = {"frames": [0, FRAMES], "frames_in_all": FRAMES, "color_falloff": 0.0}
+    frames = {"frames": [0, FRAMES], "frames_in_all": FRAMES, "color_falloff": 0.0, "camera": None}
     assert info["dataset"] == {"name": "synthetic", "path": where, **frames}
     assert set(info["versions"]) == {"rstrack", "numpy", "scipy", "drjit"} and info["backend"] in ("llvm", "cuda")
     assert (info["end"], info["error"], info["lost"]) == ("done", None, 0) and info["keyframes"] >= 1
