@@ -142,5 +142,7 @@ def heading(name: str) -> str:
         words = figure.title
     else:
         unit = {"%": "pct", "dB": "db", "MB": "mb"}.get(figure.unit, figure.unit.replace("/", "_"))
-        words = " ".join(f"{name}_".replace(f"_{unit}_", "_", 1).strip("_").split("_")) if unit else name.replace("_", " ")
+        words = (
+            " ".join(f"{name}_".replace(f"_{unit}_", "_", 1).strip("_").split("_")) if unit else name.replace("_", " ")
+        )
     return f"{words}, {figure.unit}" if figure.unit else words
