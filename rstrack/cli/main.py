@@ -14,15 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from rsgen.console.command_line import Alone, Commands, Frames, Json, Parser, Quiet, run_program
 from rsgen.errors import UserError
-from rstrack.cli.bench import (
-    bench_bootstrap,
-    bench_calibration,
-    bench_convergence,
-    bench_long,
-    bench_loops,
-    bench_speed,
-    stress,
-)
+from rstrack.cli.bench import stress
 from rstrack.cli.bench_methods import STATUS as BENCH_STATUS
 from rstrack.cli.bench_methods import bench
 from rstrack.cli.calibrate import STATUS as CALIBRATE_STATUS
@@ -106,12 +98,6 @@ def _parser() -> Parser:
     add(map_eval, "lr_kt2.ply out/lr_kt2/scene.ply")
     add(keyframes, "out/table1 runs/table1 --out keyframes")
     add(bench, "--data out --out out/bench --sequence robot_t1 robot_r1 --method baseline rs-pg", BENCH_STATUS)
-    add(bench_speed, "out/lr_kt2 --frames 150 --method rs-pg")
-    add(bench_convergence, "out/lr_kt2 --pairs 50 --method rs-pg")
-    add(bench_bootstrap, "out/lr_kt2 --starts 50 --frames 20")
-    add(bench_calibration, "out/demo --starts 5 --noise-depth 1.2e-3 --noise-intensity 0.01")
-    add(bench_long, "out/demo --frames 100000 --method rs-g")
-    add(bench_loops, "out/long2 --alike 200")
     add(stress, "stress --out runs/stress --frames 60")
     return commands.parser
 

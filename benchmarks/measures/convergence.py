@@ -1,29 +1,27 @@
-"""How far off a frame may start and still be aligned to a keyframe.
-
-print(convergence(dataset, Options(), pairs=50).text())
-"""
+"""The measure `convergence`: how far off a frame may start and still be aligned to a keyframe."""
 
 from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from pydantic import Field
 
 from rsgen.array_types import FloatArray
-from rsgen.console.progress import Progress, no_progress
-from rsgen.console.tables import Table, fixed
+from rsgen.console.progress import Progress
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.observation import observe
 from rstrack.alignment.spline_state import SplineState
-from rstrack.bench.bootstrap import generator
+from rstrack.bench.record import Figures
+from rstrack.bench.settings import Settings, settings_of
+from rstrack.bench.task import Task
 from rstrack.data.dataset import Dataset
-from rstrack.data.estimate import plain
 from rstrack.data.rig import Frame, Rig
 from rstrack.images.device_frame import DeviceFrame, DeviceRig
 from rstrack.keyframes.keyframe import Reference
@@ -36,12 +34,17 @@ from rstrack.tracking.window import Window
 # What a frame is moved by, in metres and degrees, and multiples of it; 0 tells how good the truth itself is as a start.
 UNIT_M, UNIT_DEG = 0.02, 1.0
 FACTORS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
-# Errors within which a frame has converged, and part of the frames below which it is no use to move them further.
+# Errors within which a frame has converged.
 _FOUND_M, _FOUND_DEG = 1e-3, 0.05
-_FEW = 0.1
 _GAPS = range(1, 11)
 # Knots after which the ends of a resampled spline have no influence any more (a quarter is left with every knot).
 _END_KNOTS = 6
+
+
+class ConvergenceSettings(Settings):
+    """How many keyframes with a frame."""
+
+    pairs: int = Field(default=50, ge=1)
 
 
 @dataclass(frozen=True)
@@ -58,8 +61,6 @@ class Pair:
 class Trial:
     """Where a moved frame ended: errors at mid readout. believed: the tracker would have gone on with it."""
 
-    keyframe: int
-    frame: int
     factor: float
     error_m: float
     error_deg: float
@@ -72,72 +73,7 @@ class Trial:
         return self.error_m < _FOUND_M and self.error_deg < _FOUND_DEG
 
 
-@dataclass(frozen=True)
-class ConvergenceResult:
-    """All trials. resampling_m: largest error of the spline that stands for the truth, at the middle of a readout."""
-
-    name: str
-    method: str
-    pairs: int
-    knot_spacing_s: float
-    resampling_m: float
-    trials: tuple[Trial, ...]
-
-    def rows(self) -> list[dict[str, Any]]:
-        """One dict for each distance, up to the first at which less than a tenth converges."""
-        rows = [self.row(factor) for factor in FACTORS]
-        failing = [i for i, row in enumerate(rows) if row["converged"] < _FEW]
-        return rows[: failing[0] + 1] if failing else rows
-
-    def row(self, factor: float) -> dict[str, Any]:
-        """What came of the frames that were moved by a multiple of 2 cm and 1 degree."""
-        trials = [t for t in self.trials if t.factor == factor]
-        return {
-            "moved_m": factor * UNIT_M,
-            "moved_deg": factor * UNIT_DEG,
-            "converged": float(np.mean([t.converged for t in trials])),
-            "median_error_m": float(np.median([t.error_m for t in trials])),
-            "median_error_deg": float(np.median([t.error_deg for t in trials])),
-            "median_steps": float(np.median([t.steps for t in trials])),
-            "wrong_but_believed": sum(t.believed and not t.converged for t in trials),
-        }
-
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON; units are in the names."""
-        head = {"dataset": self.name, "method": self.method, "pairs": self.pairs}
-        truth = {"knot_spacing_s": self.knot_spacing_s, "resampling_m": self.resampling_m}
-        trials = [vars(t) | {"converged": t.converged} for t in self.trials]
-        data: dict[str, Any] = plain(head | truth | {"rows": self.rows(), "trials": trials})
-        return data
-
-    def text(self) -> str:
-        """A table, one line for each distance."""
-        found = 100 * self.row(1.0)["converged"]
-        rows = tuple(
-            (
-                f"{100 * row['moved_m']:g} cm, {row['moved_deg']:g} deg",
-                f"{100 * row['converged']:.0f} %",
-                f"{fixed(row['median_error_m'], 3, 1e3)} mm, {fixed(row['median_error_deg'], 4)} deg",
-                fixed(row["median_steps"], 0),
-                str(row["wrong_but_believed"]),
-            )
-            for row in self.rows()
-        )
-        head = ("moved by", "converged", "median error", "steps", "wrong, not noticed")
-        lines = (
-            f"{self.name}, {self.method}: {found:.0f} % of {self.pairs} frames converge from "
-            f"{100 * UNIT_M:g} cm and {UNIT_DEG:g} deg, to within {1e3 * _FOUND_M:g} mm and {_FOUND_DEG:g} deg",
-            f"truth resampled at knots {1e3 * self.knot_spacing_s:g} ms apart: {1e3 * self.resampling_m:.3f} mm off at "
-            "most",
-            "",
-            Table(head, rows, words=()).text(),
-        )
-        return "\n".join(lines)
-
-
-def convergence(
-    dataset: Dataset, options: Options, pairs: int = 50, seed: int = 0, progress: Progress = no_progress
-) -> ConvergenceResult:
+def convergence_cell(task: Task, progress: Progress) -> Figures:
     """Align single frames to keyframes one to ten frames older, from poses ever farther off.
 
     The keyframe is rectified with the true motion. The frame starts with its true motion (resampled at the tracker's
@@ -145,21 +81,31 @@ def convergence(
     coarse to fine as it does when it relocalises: all control points that it touches are free, and the motion prior
     does not reach beyond them, so that it cannot pull the frame back to where the frames before it are.
 
-    Frames at the very ends of the truth are left out. Raises UserError: no true spline, no frames to choose from, a
-    method without a spline, a seed below 0, an image that cannot be read.
+    A frame has converged within 1 mm and 0.05 degrees. resampling_mm: largest error of the spline that stands for the
+    truth, at the middle of a readout. Frames at the very ends of the truth are left out. Raises UserError: no true
+    spline, no frames to choose from, a method without a spline, an image that cannot be read.
     """
+    pairs, options, dataset = settings_of(task, ConvergenceSettings).pairs, task.options, task.noisy
     truth = dataset.truth
     if truth is None:
         raise UserError(f"{dataset.root}: convergence needs the true motion: use a sequence that rsgen wrote")
     if options.method == "baseline":
         raise UserError("convergence: the baseline aligns no spline: choose an rs or gs method")
-    chosen = choose_pairs(dataset, truth, options, pairs, seed)
-    aligner = _Aligner(dataset.rig, options)
+    chosen = choose_pairs(dataset, task.frames, truth, options, pairs, task.seed)
+    trials, off_m = run_trials(dataset, truth, options, chosen, progress)
+    return figures_of(trials) | {"pairs": pairs, "knots_ms": 1e3 * options.knots_s(), "resampling_mm": 1e3 * off_m}
+
+
+def run_trials(
+    dataset: Dataset, truth: Spline, options: Options, pairs: Sequence[Pair], progress: Progress
+) -> tuple[list[Trial], float]:
+    """All pairs from all distances; and the largest error (m) of the spline that stands for the truth."""
+    aligner = Aligner(dataset.rig, options)
     t0 = _span(dataset, 0)[0] - options.knot_phase * options.knots_s()
     spline = resampled(truth, t0, options.knots_s())
     trials: list[Trial] = []
     off_m = 0.0
-    for done, pair in enumerate(chosen, 1):
+    for done, pair in enumerate(pairs, 1):
         ref = aligner.keyframe(pair.keyframe, dataset.frame(pair.keyframe), truth)
         new = aligner.prepare(pair.frame, dataset.frame(pair.frame))
         t = new.depth.exposure.mid_time
@@ -172,19 +118,35 @@ def convergence(
             steps, believed = aligner.align(new, ref, state, copy.deepcopy(fits) if factor else fits)
             T = state.spline.pose(t)
             error = float(np.linalg.norm(T[:3, 3] - T_true[:3, 3])), float(angles_deg(T_true[None], T[None])[0])
-            trials.append(Trial(pair.keyframe, pair.frame, factor, *error, steps, believed))
+            trials.append(Trial(factor, *error, steps, believed))
         found = sum(trial.converged for trial in trials if trial.factor == 1.0)
-        progress("aligning", done / len(chosen), f"{found} of {done} converged")
-    settings = options.method, len(chosen), options.knots_s()
-    return ConvergenceResult(dataset.name, *settings, off_m, tuple(trials))
+        progress("aligning", done / len(pairs), f"{found} of {done} converged")
+    return trials, off_m
 
 
-def choose_pairs(dataset: Dataset, truth: Spline, options: Options, count: int, seed: int) -> list[Pair]:
-    """Random pairs of frames one to ten apart; raises UserError if there are none, or for a seed below 0."""
-    rng = generator(seed)
+def figures_of(trials: Sequence[Trial]) -> Figures:
+    """By factor; wrong_unnoticed: trials that have not converged, with which the tracker would have gone on."""
+    figures: Figures = {}
+    for factor in dict.fromkeys(trial.factor for trial in trials):
+        these = [trial for trial in trials if trial.factor == factor]
+        figures |= {
+            f"converged_pct_{factor:g}x": 100.0 * float(np.mean([trial.converged for trial in these])),
+            f"wrong_unnoticed_{factor:g}x": sum(trial.believed and not trial.converged for trial in these),
+            f"median_error_mm_{factor:g}x": 1e3 * float(np.median([trial.error_m for trial in these])),
+            f"median_error_deg_{factor:g}x": float(np.median([trial.error_deg for trial in these])),
+            f"median_steps_{factor:g}x": float(np.median([trial.steps for trial in these])),
+        }
+    return figures
+
+
+def choose_pairs(
+    dataset: Dataset, frames: range, truth: Spline, options: Options, count: int, seed: int
+) -> list[Pair]:  # fmt: skip
+    """Random pairs of `frames` one to ten apart. Raises UserError if there are none."""
+    rng = np.random.default_rng(seed)
     margin = _END_KNOTS * options.knots_s()
     usable = []
-    for k in range(len(dataset)):
+    for k in frames:
         begin, end = _span(dataset, k)
         inside = begin - margin >= truth.t_begin and end + margin <= truth.t_end
         if inside and (dataset.groups[k] or not options.photometric):
@@ -236,7 +198,7 @@ def moved_state(spline: Spline, new: DeviceFrame, pair: Pair, factor: float) -> 
     return SplineState(Spline(points, spline.t0, spline.dt))
 
 
-class _Aligner:
+class Aligner:
     """Aligns single frames as the tracker does, without a track."""
 
     def __init__(self, rig: Rig, options: Options) -> None:

@@ -1,0 +1,309 @@
+"""What changed between two sets of records, beyond what chance scatters by.
+
+comparison = compare(read_records(Path("benchmarks/results/gate.json")), outcome.records)
+print(comparison.text())
+sys.exit(bool(comparison.worse))
+
+Seeds, and with them the noise, are the same in both, so that unchanged code gives unchanged errors: figures that are
+alike in all runs are no comparison at all. The others are tested one-sidedly, and over all of these tests together
+there is a false alarm in at most one comparison of twenty (Holm 1979). The tests:
+
+- Figures with three runs or so: t-test of the means with a moderated variance (`benchmarks.scatter`), errors and ratios
+  in logarithms. It is not paired: a changed program's errors under the same noise may be alike, or may not, and where
+  they are, the test says less than it could. Of what has a nominal value, the distance of the mean from it.
+- Ten runs and more, as of faults, one a seed: exact signed-rank test (Wilcoxon 1945) of the runs' differences, since
+  lost frames are mostly none and sometimes hundreds, of which no mean knows anything. Counts by their differences.
+- Counts of fewer runs: exact test of two binomial shares of the frames (Fisher), without frames of two Poisson counts.
+- Silently wrong frames, and others that `benchmarks.figures` has as outright: any increase of their sum.
+- A cell that failed, or has lost figures that all of its runs had: worse.
+
+Milliseconds are never judged, since machines differ, and one machine from one day to the next: ratios of times in one
+run are. Other people's trackers are shown, and not judged.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import special
+
+from benchmarks.cells import is_others
+from benchmarks.exact import fisher_p, poisson_p, signed_rank_p
+from benchmarks.figures import Figure, figure_of
+from benchmarks.scatter import Prior, priors, spread_of, tolerances
+from rsgen.console.tables import significant
+from rstrack.bench.record import Record
+
+__all__ = ["Change", "Comparison", "compare", "tolerances"]
+
+SIGNIFICANCE = 0.05
+"""Chance of any false alarm over all tests of a comparison."""
+PAIRED_FROM = 10
+"""Runs from which these are compared one by one: fewer cannot be told from chance by ranks (2⁻¹⁰ at the least)."""
+_DIGITS = 6
+
+
+@dataclass(frozen=True)
+class Change:
+    """One figure of a cell: means, sums of counts. p: chance of as much without a change; why: other reasons."""
+
+    cell: str
+    figure: str = ""
+    old: float | None = None
+    new: float | None = None
+    p: float | None = None
+    why: str = ""
+
+    def text(self) -> str:
+        """One line."""
+        figure = figure_of(self.figure)
+        if not self.figure:
+            return f"{self.cell}: {self.why}"
+        values = " -> ".join(significant(value) for value in (self.old, self.new))
+        parts = [f"{values} {figure.unit}".rstrip()]
+        if figure.scale == "log" and self.old and self.new:
+            parts.append(f"{100.0 * (self.new / self.old - 1.0):+.1f} %")
+        parts += [self.why] if self.why else []
+        parts += [] if self.p is None else [f"p {self.p:.1g}"]
+        return f"{self.cell} {self.figure}: {', '.join(parts)}"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """worse, better: beyond chance. unknown: changed, but what chance does there was never measured. cells: names by
+    what became of them, where there is nothing to compare. times: lines. tests: how many; same: cells all alike.
+    """
+
+    worse: tuple[Change, ...] = ()
+    better: tuple[Change, ...] = ()
+    unknown: tuple[Change, ...] = ()
+    cells: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    times: tuple[str, ...] = ()
+    tests: int = 0
+    same: int = 0
+    compared: int = 0
+
+    def text(self) -> str:
+        """For the screen: worse first, then better, then what was not compared."""
+        lines: list[str] = []
+        for name, changes in (("WORSE", self.worse), ("better", self.better)):
+            lines += [f"{name}: {len(changes)}", *(f"  {change.text()}" for change in changes)] if changes else []
+        if self.unknown:
+            lines.append("changed, and not judged: how chance scatters these is not known")
+            lines += [f"  {change.text()}" for change in self.unknown]
+        lines += [f"{what}: {', '.join(names)}" for what, names in self.cells.items()]
+        lines += self.times
+        verdict = "nothing got worse" if not self.worse else f"{len({c.cell for c in self.worse})} cells got worse"
+        lines.append(
+            f"{verdict}: {self.compared} cells compared, {self.same} of them alike in every run; {self.tests} tests, "
+            f"a false alarm in {100 * SIGNIFICANCE:g} % of such comparisons"
+        )
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class _Test:
+    change: Change
+    p_worse: float
+    p_better: float
+
+
+@dataclass
+class _Judged:
+    """Changes so far; what tests say of theirs is known once all are there."""
+
+    worse: list[Change] = field(default_factory=list)
+    better: list[Change] = field(default_factory=list)
+    unknown: list[Change] = field(default_factory=list)
+    tests: list[_Test] = field(default_factory=list)
+
+
+def compare(old: Mapping[str, Record], new: Mapping[str, Record]) -> Comparison:
+    """Compare all cells that both have. `Comparison.worse` is empty where nothing got worse beyond chance."""
+    usual = priors([old, new])
+    judged, cells = _Judged(), defaultdict[str, list[str]](list)
+    pairs: list[tuple[Record, Record]] = []
+    same = 0
+    for name in dict.fromkeys((*old, *new)):
+        before, after = old.get(name), new.get(name)
+        fate = _fate(before, after)
+        if fate:
+            cells[fate].append(name)
+        if before is None or after is None:
+            continue
+        if fate == _FAILED and before.error is None and before.runs and not is_others(after):
+            judged.worse.append(Change(name, why=f"failed: {after.error}"))
+        if not fate:
+            pairs.append(_shared(before, after))
+            if not is_others(after):
+                same += not _judge(*pairs[-1], usual, judged)
+    tests = judged.tests
+    worse = [dataclasses.replace(tests[k].change, p=tests[k].p_worse) for k in _holm([t.p_worse for t in tests])]
+    better = [dataclasses.replace(tests[k].change, p=tests[k].p_better) for k in _holm([t.p_better for t in tests])]
+    return Comparison(
+        (*judged.worse, *worse), (*judged.better, *better), tuple(judged.unknown),
+        {what: tuple(cells[what]) for what in _FATES if cells[what]}, tuple(_times(pairs)), len(tests), same,
+        sum(not is_others(after) for _, after in pairs),
+    )  # fmt: skip
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+_FAILED, _OTHERWISE = "failed", "defined otherwise now, not compared"
+_FATES = (_FAILED, "not run", "skipped", "not finished", _OTHERWISE, "new", "had failed before")
+
+
+def _fate(before: Record | None, after: Record | None) -> str:
+    """Why two records cannot be compared; empty if they can."""
+    if after is None:
+        return "not run"
+    if after.error is not None:
+        return "skipped" if after.skipped else _FAILED
+    if before is None:
+        return "new"
+    if before.error is not None:
+        return "had failed before"
+    if not after.complete:
+        return "not finished"
+    definitions = [json.dumps(record.settings, sort_keys=True, default=str) for record in (before, after)]
+    return _OTHERWISE if definitions[0] != definitions[1] or not {*before.seeds} & {*after.seeds} else ""
+
+
+def _judge(one: Record, other: Record, usual: Mapping[str, Prior], judged: _Judged) -> bool:
+    """Add what changed between two records of the same runs to `judged`; whether anything did."""
+    names = [n for n in _names(one) if figure_of(n).is_judged and one.values(n) != other.values(n)]
+    for name in names:
+        missing = len(other.runs) - len(other.values(name))
+        if missing and len(one.values(name)) == len(one.runs):
+            why = f"missing in {missing} of its runs"
+            judged.worse.append(Change(one.cell, name, _shown(one, name), _shown(other, name), why=why))
+        elif figure_of(name).outright:
+            before, after = one.total(name), other.total(name)
+            if after > before:
+                judged.worse.append(Change(one.cell, name, before, after, why="any increase is worse"))
+            elif after < before:
+                judged.better.append(Change(one.cell, name, before, after))
+        else:
+            test = _test(one, other, name, usual.get(name))
+            if test is None:
+                judged.unknown.append(Change(one.cell, name, _shown(one, name), _shown(other, name)))
+            else:
+                judged.tests.append(test)
+    return bool(names)
+
+
+def _shared(before: Record, after: Record) -> tuple[Record, Record]:
+    """Both with the runs of the seeds that both have, to the digits that files keep."""
+    seeds = [seed for seed in before.seeds if seed in after.seeds]
+
+    def only(record: Record) -> Record:
+        runs = dict(zip(record.seeds, record.runs, strict=True))
+        rounded = ({name: _rounded(value) for name, value in runs[seed].items()} for seed in seeds)
+        return dataclasses.replace(record, seeds=tuple(seeds), runs=tuple(rounded))
+
+    return only(before), only(after)
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else float(f"{value:.{_DIGITS}g}")
+
+
+def _names(record: Record) -> list[str]:
+    return list(dict.fromkeys(name for run in record.runs for name in run))
+
+
+def _shown(record: Record, name: str) -> float | None:
+    """A count's sum, or a figure's mean."""
+    return record.total(name) if figure_of(name).scale == "count" else record.figures.get(name)
+
+
+def _test(one: Record, other: Record, name: str, usual: Prior | None) -> _Test | None:
+    """Old against new of one figure; None: there is no scatter to compare the difference with."""
+    figure = figure_of(name)
+    change = Change(one.cell, name, _shown(one, name), _shown(other, name))
+    pairs = [(a.get(name), b.get(name)) for a, b in zip(one.runs, other.runs, strict=True)]
+    both = [(a, b) for a, b in pairs if a is not None and b is not None]
+    if len(both) >= PAIRED_FROM:
+        differences = [_cost(figure, b) - _cost(figure, a) for a, b in both]
+        return _Test(change, signed_rank_p(differences), signed_rank_p([-d for d in differences]))
+    if figure.scale == "count":
+        return _count_test(change, one, other)
+    return _t_test(change, one, other, usual)
+
+
+def _cost(figure: Figure, value: float) -> float:
+    """One run's badness, of ranks' use only: what has no logarithm is below all that have one."""
+    scaled = figure.on_scale(value)
+    return figure.badness([-1e3 if scaled is None else scaled])
+
+
+def _t_test(change: Change, one: Record, other: Record, usual: Prior | None) -> _Test | None:
+    figure = figure_of(change.figure)
+    values = [
+        [x for value in record.values(change.figure) if (x := figure.on_scale(value)) is not None]
+        for record in (one, other)
+    ]
+    if not all(values):
+        return None
+    own = [spread_of(figure, record.values(change.figure)) for record in (one, other)]
+    variance, dof = (0.0, 0.0) if usual is None else usual.with_own(own[0] + own[1])
+    sd, kept = one.scatter.get(change.figure, (0.0, 0.0))
+    if kept > (0.0 if usual is None else usual.pooled):
+        # Measured on more cells, when the old ones were accepted, than are here; their own runs are in it.
+        variance, dof = Prior(sd**2, kept, kept + own[1].dof).with_own(own[1])
+    if variance <= 0.0 or dof <= 0.0:
+        return None
+    difference = figure.badness(values[1]) - figure.badness(values[0])
+    t = difference / math.sqrt(variance * (1 / len(values[0]) + 1 / len(values[1])))
+    return _Test(change, float(special.stdtr(dof, -t)), float(special.stdtr(dof, t)))
+
+
+def _count_test(change: Change, one: Record, other: Record) -> _Test:
+    sign = 1 if figure_of(change.figure).better == "less" else -1
+    counts = [round(record.total(change.figure)) for record in (one, other)]
+    frames = [round(record.total("frames")) for record in (one, other)]
+    if all(0 <= count <= of for count, of in zip(counts, frames, strict=True)):
+        more = fisher_p(counts[0], frames[0], counts[1], frames[1])
+        fewer = fisher_p(counts[1], frames[1], counts[0], frames[0])
+    else:
+        more = poisson_p(counts[0], len(one.runs), counts[1], len(other.runs))
+        fewer = poisson_p(counts[1], len(other.runs), counts[0], len(one.runs))
+    return _Test(change, *((more, fewer) if sign > 0 else (fewer, more)))
+
+
+def _holm(p: Sequence[float]) -> list[int]:
+    """Which are significant together, the most first (Holm 1979)."""
+    chosen: list[int] = []
+    for rank, k in enumerate(np.argsort(p, kind="stable").tolist()):
+        if p[k] * (len(p) - rank) > SIGNIFICANCE:
+            break
+        chosen.append(k)
+    return chosen
+
+
+def _times(pairs: Sequence[tuple[Record, Record]]) -> list[str]:
+    """A line for each kind of time: its change over all cells, and on which machines."""
+    factors: dict[str, list[float]] = defaultdict(list)
+    for one, other in pairs:
+        after = other.figures
+        for name, before in one.figures.items():
+            if figure_of(name).is_time and before > 0.0 and after.get(name, 0.0) > 0.0:
+                factors[name].append(after[name] / before)
+    lines = []
+    for name in ("median_ms", "p95_ms", "p99_ms", "total_s"):
+        if name in factors:
+            of = np.array(factors[name])
+            middle = math.exp(float(np.log(of).mean()))
+            lines.append(f"  {name}: x {middle:.2f} over {of.size} cells ({of.min():.2f} to {of.max():.2f})")
+    if not lines:
+        return []
+    machines = [sorted({str(pair[k].machine.get("cpu", "?")) for pair in pairs}) for k in (0, 1)]
+    loads = [max((float(pair[k].machine.get("load") or 0.0) for pair in pairs), default=0.0) for k in (0, 1)]
+    told = " -> ".join(f"{', '.join(m)}, load up to {load:g}" for m, load in zip(machines, loads, strict=True))
+    return [f"times, shown and not judged ({told}):", *lines]

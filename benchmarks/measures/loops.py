@@ -1,0 +1,177 @@
+"""The measure `loops`: how good the loops of a track are, and whether places that look alike are taken for one.
+
+The places may be those of another recording by the same cameras, of a room that looks the same and is another:
+mirrored, or furnished with the same things elsewhere.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from pydantic import Field
+
+from rsgen.array_types import FloatArray
+from rsgen.console.progress import Progress
+from rsgen.errors import UserError
+from rsgen.geometry import se3
+from rsgen.geometry.spline import Spline
+from rstrack.adjustment.loops import Loop, LoopSearch
+from rstrack.bench.changes.edits import with_color, with_depth
+from rstrack.bench.record import Figures
+from rstrack.bench.sequences import Absent
+from rstrack.bench.settings import Settings, settings_of
+from rstrack.bench.task import Task
+from rstrack.data.dataset import Dataset, open_dataset
+from rstrack.options import Options
+from rstrack.tracking.any_tracker import make_tracker
+from rstrack.tracking.loop_closing import search_of
+from rstrack.tracking.spline_tracker import Tracker
+
+MIRRORED = "mirrored"
+# Two keyframes whose places are further apart than so many times where a keyframe is left behind are two places.
+_APART = 2.5
+# A loop that is further off is a false one, m and rad.
+_FALSE = np.array([0.02, np.radians(2.0)])
+# A pair of look-alikes may be anywhere, as after any drift (m, rad).
+_ANYWHERE = np.array([1e3, 10.0])
+_Ranked = tuple[int, int, int]
+
+
+class LoopsSettings(Settings):
+    """alike: pairs of different places that look alike to try. other: try those with another room.
+
+    That is 'mirrored', the same recording with left and right exchanged, or a recording's folder, relative to the
+    sequence's own.
+    """
+
+    alike: int = Field(default=200, ge=0)
+    other: str | None = None
+
+
+def loops_cell(task: Task, progress: Progress) -> Figures:
+    """Track the case, look for loops, then try look-alikes, its own or another recording's.
+
+    median_mm, median_mrad, worst_mm: errors of what each frame says of the other keyframe, against the truth. nees:
+    squared errors over the covariances, over six (1: as large as they say), median. false: loops further off than 20 mm
+    or 2 degrees. alike: pairs of different places that were tried, those that look most alike; accepted: of these,
+    taken for one. Raises UserError: no true spline, no frame, a method without a spline, another recording by other
+    cameras; Absent: that recording is not there.
+    """
+    settings, dataset = settings_of(task, LoopsSettings), task.noisy
+    truth = dataset.truth
+    if not isinstance(truth, Spline):
+        raise UserError(f"{dataset.root}: has no true spline to compare loops with: give a sequence of rsgen's")
+    other = None if settings.other is None else _other(task, settings.other)
+    search = _tracked(dataset, task.options, task.frames, progress)
+    begin = time.perf_counter()
+    loops = search.find(progress)
+    seconds = time.perf_counter() - begin
+    times = {k: search.archive.small(k).t for k in search.archive.indices}
+    if other is None:
+        tried, accepted = _look_alikes(search, truth, times, settings.alike, progress)
+    else:
+        there = _tracked(other, task.options, range(len(other))[task.cell.piece], progress)
+        tried, accepted = _across(search, there, settings.alike, progress)
+    return {
+        "keyframes": len(times), "loops": len(loops), **_accuracy(loops, truth, times),
+        "false": sum(_is_false(loop, truth, times) for loop in loops), "alike": tried, "accepted": accepted,
+        "search_s": seconds,
+    }  # fmt: skip
+
+
+def mirrored(dataset: Dataset) -> Dataset:
+    """A room whose left is the other's right, by the same cameras, if these see it alike left and right."""
+    return with_color(with_depth(dataset, lambda _, z: z[:, ::-1].copy()), lambda _, pixels: pixels[:, ::-1].copy())
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _other(task: Task, where: str) -> Dataset:
+    if where == MIRRORED:
+        return mirrored(task.noisy)
+    root = task.root / where
+    if not root.exists():
+        raise Absent(f"{root}: is not there")
+    other = open_dataset(root, task.cell.case_entry.camera)
+    a, b = task.dataset.rig, other.rig
+    same = (a.depth_camera, a.color_camera) == (b.depth_camera, b.color_camera)
+    if not (same and np.allclose(a.T_color_depth, b.T_color_depth)):
+        raise UserError(f"{root}: its cameras are not those of {task.root}: render both with the same ones")
+    return other
+
+
+def _tracked(dataset: Dataset, options: Options, frames: range, progress: Progress) -> LoopSearch:
+    """The search among the keyframes of a track without loops."""
+    if not len(frames):
+        raise UserError(f"{dataset.root}: has no frame {frames.start}")
+    interval_s, without = dataset.interval_s(frames), replace(options, loops="off")
+    tracker = make_tracker(dataset.rig, without, interval_s=interval_s, imu=dataset.imu if options.inertial else None)
+    if not isinstance(tracker, Tracker):
+        raise UserError("loops: the baseline has no spline: choose an rs or gs method")
+    for n, k in enumerate(frames):
+        tracker.feed(dataset.frame(k))
+        progress("tracking", (n + 1) / len(frames), dataset.name)
+    spline = tracker.spline
+    assert spline is not None
+    return search_of(tracker, tracker.all_keyframes(), spline, lambda index: dataset.frame(frames[index]))
+
+
+def _accuracy(loops: Sequence[Loop], truth: Spline, times: dict[int, float]) -> Figures:
+    if not loops:
+        return dict.fromkeys(("median_mm", "median_mrad", "worst_mm", "nees"))
+    sightings = [s for loop in loops for s in loop.sightings]
+    errors = np.array([_error(s.T_ref_cam, truth, times[s.keyframe], s.t) for s in sightings])
+    sizes = 1e3 * np.linalg.norm(errors.reshape(-1, 2, 3), axis=2)
+    nees = [float(e @ s.information @ e) / 6.0 for e, s in zip(errors, sightings, strict=True)]
+    mm, mrad = np.median(sizes, axis=0).tolist()
+    return {"median_mm": mm, "median_mrad": mrad, "worst_mm": float(sizes[:, 0].max()), "nees": float(np.median(nees))}
+
+
+def _across(here: LoopSearch, there: LoopSearch, most: int, progress: Progress) -> tuple[int, int]:
+    """Pairs of keyframes of two recordings that were tried, those that look most alike, and those taken for one."""
+    by_rank: list[_Ranked] = []
+    for late in there.archive.indices:
+        ranked = here.archive.alike(there.load(late), set(), least=-1.0)
+        by_rank += [(rank, early, late) for rank, early in enumerate(ranked)]
+    chosen = sorted(by_rank)[:most]
+    accepted = 0
+    for n, (_, early, late) in enumerate(chosen):
+        accepted += here.pair_across(there, early, late, _ANYWHERE)
+        progress("look-alikes", (n + 1) / len(chosen), f"{accepted} taken for one place")
+    return len(chosen), accepted
+
+
+def _look_alikes(
+    search: LoopSearch, truth: Spline, times: dict[int, float], most: int, progress: Progress
+) -> tuple[int, int]:  # fmt: skip
+    """Pairs of keyframes of different places that were tried as if they were at one, and those taken for one."""
+    by_rank: list[_Ranked] = []
+    for late in times:
+        ranked = search.archive.alike(search.load(late), {late})
+        apart = [k for k in ranked if search.options.remoteness(_between(truth, times[k], times[late])) > _APART]
+        by_rank += [(rank, early, late) for rank, early in enumerate(apart)]
+    chosen = sorted(by_rank)[:most]
+    accepted = 0
+    for n, (_, early, late) in enumerate(chosen):
+        loop = search.pair(early, late, np.eye(4), _ANYWHERE)
+        accepted += loop is not None and _is_false(loop, truth, times)
+        progress("look-alikes", (n + 1) / len(chosen), f"{accepted} taken for one place")
+    return len(chosen), accepted
+
+
+def _is_false(loop: Loop, truth: Spline, times: dict[int, float]) -> bool:
+    errors = [_error(s.T_ref_cam, truth, times[s.keyframe], s.t) for s in loop.sightings]
+    return bool((np.linalg.norm(np.reshape(errors, (-1, 2, 3)), axis=2) > _FALSE).any())
+
+
+def _between(truth: Spline, t_ref: float, t: float) -> FloatArray:
+    return np.asarray(se3.inverse(truth.pose(t_ref)) @ truth.pose(t))
+
+
+def _error(T_ref_cam: FloatArray, truth: Spline, t_ref: float, t: float) -> FloatArray:
+    """Twist (6,) from the true pose at time t in the keyframe of time t_ref to T_ref_cam (4, 4)."""
+    return se3.log(se3.inverse(_between(truth, t_ref, t)) @ T_ref_cam)
