@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rsgen.check.light import compare_light
+from rsgen.check.light import compare_light, view_camera
 from rsgen.config.config import Config
 from rsgen.console.progress import Progress
 from rsgen.device.backend import mitsuba
@@ -27,6 +27,7 @@ def light_figures(config: Config, settings: Mapping[str, Any], progress: Progres
     """
     if config.light.mode != "baked":
         raise UserError("light.mode is 'path': what is measured is baked light")
+    view_camera(config, settings["width"])  # a wrong width would else be told after the bake
     mi = mitsuba(config.backend)
     from rsgen.light.cache import baked_field
     from rsgen.light.drawing.bulbs import straight_through_bulbs

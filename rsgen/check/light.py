@@ -69,12 +69,12 @@ def compare_light(
     returns, if it is at hand. seed: of all samples. Raises UserError.
     """
     motion = load_motion(config)
-    camera = _scaled(config, width)
     scene, baked, mi = lit or lit_scene(config, progress)
     baked.glossy_spp = mirrored_samples(config.light, _BAKED_SPP)
     from rsgen.figures import save_grid
     from rsgen.render.images import ColorRenderer
 
+    camera = view_camera(config, width)
     reference = mi.load_dict({"type": "path", "max_depth": _REFERENCE_DEPTH})
     ours = ColorRenderer(scene, baked, camera, Shutter(), _BAKED_SPP)
     theirs = ColorRenderer(scene, reference, camera, Shutter(), _REFERENCE_PASS)
@@ -139,7 +139,8 @@ def lit_scene(config: Config, progress: Progress) -> tuple[Any, Any, Any]:
     return scene, baked, mi
 
 
-def _scaled(config: Config, width: int) -> Camera:
+def view_camera(config: Config, width: int) -> Camera:
+    """The colour camera with images `width` pixels wide. Raises UserError for more than it has, or less than 8."""
     camera = config.color.camera
     if not 8 <= width <= camera.width:
         raise UserError(f"--width {width}: choose 8 to {camera.width}")

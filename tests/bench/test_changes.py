@@ -151,11 +151,11 @@ def test_half_the_depth_is_missing_in_blocks(dataset: Dataset) -> None:
 
 
 def test_changes_by_name_and_what_is_wrong_with_them(dataset: Dataset) -> None:
-    arguments: dict[str, float]
-    for name, arguments in [("depth_scaled", {"factor": 2.0}), ("depth_to", {"metres": 1e-3}), ("every", {"nth": 3})]:
+    wanted: dict[str, dict[str, float]] = {"depth_scaled": {"factor": 2.0}, "depth_to": {"metres": 1e-3}}
+    for (name, arguments), factor in zip(wanted.items(), (2, 0), strict=True):
         made = changed(dataset, name, 0, arguments)
-        shown = depths(dataset)[:: 3 if name == "every" else 1] * {"depth_scaled": 2, "depth_to": 0}.get(name, 1)
-        np.testing.assert_allclose(depths(made), shown, rtol=1e-6)
+        np.testing.assert_allclose(depths(made), factor * depths(dataset), rtol=1e-6)
+    np.testing.assert_array_equal(depths(changed(dataset, "every", 0, {"nth": 3})), depths(dataset)[::3])
     holed = [depths(changed(dataset, "depth_in_blocks", seed, {})) for seed in (1, 2)]
     np.testing.assert_array_equal(holed[0], depths(depth_in_blocks(dataset, 1)))
     assert (holed[0] != holed[1]).any()

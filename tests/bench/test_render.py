@@ -188,8 +188,9 @@ def test_frames_are_timed_by_a_process_of_its_own(tmp_path: Path) -> None:
     [
         ("render", "{modes: [fast]}", {}, "settings: modes"),
         ("light", "{views: 0}", {}, "settings: views"),
+        ("light", "{width: 49}", {}, "choose 8 to 48"),
         ("light", "{}", {"method": "rs-g"}, "its method is rsgen"),
-        ("light", "{width: 24}", {"set": "light.mode: path"}, "light.mode"),
+        ("light", "{}", {"set": "light.mode: path"}, "light.mode"),
         ("render", "{modes: [still]}", {"set": "color.sp: 1"}, "color.sp"),
         ("render", "{modes: [blender]}", {}, "bpy is not installed"),
     ],
