@@ -39,13 +39,9 @@ class _Section(BaseModel):
 class SequenceEntry(_Section):
     """One sequence: `config`, or `path`."""
 
-<<<<<<< HEAD
     config: Path | None = Field(
         default=None, description="what 'rsgen render' makes it from: a name, or a file beside this one"
     )
-=======
-    config: Path | None = Field(default=None, description="what it is rendered from: a name, or a file beside this one")
->>>>>>> faults
     set: dict[str, Any] = Field(default={}, description="fields of the config that are to be others")
     data: dict[str, str] = Field(default={}, description="fields of the config that name files of --data")
     width: int | None = Field(default=None, ge=32, le=16384, description="of all images, lenses in proportion, px")
