@@ -7,8 +7,9 @@ mirrored, or furnished with the same things elsewhere.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -20,35 +21,32 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.adjustment.loops import Loop, LoopSearch
 from rstrack.bench.changes.edits import with_color, with_depth
+from rstrack.bench.definitions import SequenceEntry
 from rstrack.bench.record import Figures
-from rstrack.bench.sequences import Absent
 from rstrack.bench.settings import Settings, settings_of
 from rstrack.bench.task import Task
-from rstrack.data.dataset import Dataset, open_dataset
+from rstrack.data.dataset import Dataset
 from rstrack.options import Options
 from rstrack.tracking.any_tracker import make_tracker
 from rstrack.tracking.loop_closing import search_of
 from rstrack.tracking.spline_tracker import Tracker
 
-MIRRORED = "mirrored"
 # Two keyframes whose places are further apart than so many times where a keyframe is left behind are two places.
 _APART = 2.5
 # A loop that is further off is a false one, m and rad.
 _FALSE = np.array([0.02, np.radians(2.0)])
 # A pair of look-alikes may be anywhere, as after any drift (m, rad).
 _ANYWHERE = np.array([1e3, 10.0])
-_Ranked = tuple[int, int, int]
 
 
 class LoopsSettings(Settings):
     """alike: pairs of different places that look alike to try. other: try those with another room.
 
-    That is 'mirrored', the same recording with left and right exchanged, or a recording's folder, relative to the
-    sequence's own.
+    That is another sequence, defined as they are in `sequences`, or the same one with left and right exchanged.
     """
 
     alike: int = Field(default=200, ge=0)
-    other: str | None = None
+    other: Literal["mirrored"] | SequenceEntry | None = None
 
 
 def loops_cell(task: Task, progress: Progress) -> Figures:
@@ -90,18 +88,15 @@ def mirrored(dataset: Dataset) -> Dataset:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _other(task: Task, where: str) -> Dataset:
-    if where == MIRRORED:
+def _other(task: Task, other: Literal["mirrored"] | SequenceEntry) -> Dataset:
+    if other == "mirrored":
         return mirrored(task.noisy)
-    root = task.root / where
-    if not root.exists():
-        raise Absent(f"{root}: is not there")
-    other = open_dataset(root, task.cell.case_entry.camera)
-    a, b = task.dataset.rig, other.rig
+    there = replace(task, cell=replace(task.cell, sequence=other))
+    a, b = task.dataset.rig, there.dataset.rig
     same = (a.depth_camera, a.color_camera) == (b.depth_camera, b.color_camera)
     if not (same and np.allclose(a.T_color_depth, b.T_color_depth)):
-        raise UserError(f"{root}: its cameras are not those of {task.root}: render both with the same ones")
-    return other
+        raise UserError(f"{there.root}: its cameras are not those of {task.root}: render both with the same ones")
+    return there.noisy
 
 
 def _tracked(dataset: Dataset, options: Options, frames: range, progress: Progress) -> LoopSearch:
@@ -132,35 +127,38 @@ def _accuracy(loops: Sequence[Loop], truth: Spline, times: dict[int, float]) -> 
 
 
 def _across(here: LoopSearch, there: LoopSearch, most: int, progress: Progress) -> tuple[int, int]:
-    """Pairs of keyframes of two recordings that were tried, those that look most alike, and those taken for one."""
-    by_rank: list[_Ranked] = []
-    for late in there.archive.indices:
-        ranked = here.archive.alike(there.load(late), set(), least=-1.0)
-        by_rank += [(rank, early, late) for rank, early in enumerate(ranked)]
-    chosen = sorted(by_rank)[:most]
-    accepted = 0
-    for n, (_, early, late) in enumerate(chosen):
-        accepted += here.pair_across(there, early, late, _ANYWHERE)
-        progress("look-alikes", (n + 1) / len(chosen), f"{accepted} taken for one place")
-    return len(chosen), accepted
+    """Pairs of keyframes of two recordings that were tried, and those taken for one place."""
+    ranked = {late: here.archive.alike(there.load(late), set(), least=-1.0) for late in there.archive.indices}
+    return _tried(ranked, most, lambda early, late: here.pair_across(there, early, late, _ANYWHERE), progress)
 
 
 def _look_alikes(
     search: LoopSearch, truth: Spline, times: dict[int, float], most: int, progress: Progress
 ) -> tuple[int, int]:  # fmt: skip
     """Pairs of keyframes of different places that were tried as if they were at one, and those taken for one."""
-    by_rank: list[_Ranked] = []
-    for late in times:
-        ranked = search.archive.alike(search.load(late), {late})
-        apart = [k for k in ranked if search.options.remoteness(_between(truth, times[k], times[late])) > _APART]
-        by_rank += [(rank, early, late) for rank, early in enumerate(apart)]
-    chosen = sorted(by_rank)[:most]
-    accepted = 0
-    for n, (_, early, late) in enumerate(chosen):
+
+    def is_apart(early: int, late: int) -> bool:
+        return search.options.remoteness(_between(truth, times[early], times[late])) > _APART
+
+    def is_taken(early: int, late: int) -> bool:
         loop = search.pair(early, late, np.eye(4), _ANYWHERE)
-        accepted += loop is not None and _is_false(loop, truth, times)
-        progress("look-alikes", (n + 1) / len(chosen), f"{accepted} taken for one place")
-    return len(chosen), accepted
+        return loop is not None and _is_false(loop, truth, times)
+
+    alike = {late: search.archive.alike(search.load(late), {late}) for late in times}
+    ranked = {late: [early for early in earlier if is_apart(early, late)] for late, earlier in alike.items()}
+    return _tried(ranked, most, is_taken, progress)
+
+
+def _tried(
+    ranked: Mapping[int, Sequence[int]], most: int, is_taken: Callable[[int, int], bool], progress: Progress
+) -> tuple[int, int]:
+    """How many pairs were tried, those that look most alike of each keyframe first, and how many were taken for one."""
+    by_rank = sorted((rank, early, late) for late, found in ranked.items() for rank, early in enumerate(found))[:most]
+    taken = 0
+    for n, (_, early, late) in enumerate(by_rank):
+        taken += is_taken(early, late)
+        progress("look-alikes", (n + 1) / len(by_rank), f"{taken} taken for one place")
+    return len(by_rank), taken
 
 
 def _is_false(loop: Loop, truth: Spline, times: dict[int, float]) -> bool:

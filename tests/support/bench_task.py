@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from rstrack.bench.definitions import CaseEntry, Cell, MethodEntry, SequenceEntry
+from rstrack.bench.sequences import Sources
 from rstrack.bench.task import Task
 
 
@@ -15,6 +16,6 @@ def make_task(
 ) -> Task:  # fmt: skip
     """case: of `CaseEntry`."""
     entry = CaseEntry(sequence="seq", **case)
-    sequence = SequenceEntry(path=root)
+    sequence = SequenceEntry(path=Path(root.name))
     cell = Cell("measure", "seq", method, (seed,), entry, sequence, MethodEntry(options=options or {}), settings or {})
-    return Task(cell, seed, root, root.parent / "out")
+    return Task(cell, seed, Sources(root.parent), root.parent / "out")
