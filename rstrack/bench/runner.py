@@ -18,6 +18,7 @@ from typing import Any
 
 from rsgen.console.progress import Progress, no_progress
 from rsgen.console.scheduler import InProcess, Workers
+from rsgen.device.backend import select
 from rsgen.errors import UserError
 from rstrack.bench.definitions import Benchmark, Cell
 from rstrack.bench.memory import peak_mb, reset_peak
@@ -124,6 +125,7 @@ def run_cell(job: Job, progress: Progress = no_progress) -> Record:
         record = Record(**stamped({"cell": cell.name, "key": key, "settings": cell.as_dict()}))
     if record.complete:
         return record
+    select()  # a libLLVM that works, before a measure imports Dr.Jit
     measure = measure_named(job.measure)
     try:
         root = None if cell.renders else job.sources.folder(cell.sequence, cell.case_entry.sequence, progress)
