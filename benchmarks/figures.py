@@ -81,10 +81,10 @@ FIGURES: tuple[Figure, ...] = (
     Figure("accepted", "look-alikes taken for one", "pairs", "less", "count", outright=True),
     Figure("median_mrad", "median", "mrad", "less", "log"),
     # Times of the machine, and ratios of times of one run, of which a machine's speed falls out.
-    Figure("ratio", "over the peer's", "", "less", "log"),
+    Figure("ratio", "ratio", "", "less", "log"),
     Figure("ratio_*", "", "", "less", "log"),
     Figure("*_ratio", "", "", "less", "log"),
-    Figure("*_msamples_s", "", "million samples/s", "unjudged", "log"),
+    Figure("*_msamples_s", "", "Msamples/s", "unjudged", "log"),
     Figure("median_ms", "median", "ms", "unjudged", "log", is_time=True),
     Figure("mean_ms", "mean", "ms", "unjudged", "log", is_time=True),
     Figure("p95_ms", "95 %", "ms", "unjudged", "log", is_time=True),
@@ -126,6 +126,8 @@ FIGURES: tuple[Figure, ...] = (
     Figure("*_ms_*x", "", "ms", "less", "log"),
 )
 
+_IN_NAMES = {"%": "pct", "dB": "db", "MB": "mb", "Msamples/s": "msamples_s"}
+
 
 @cache
 def figure_of(name: str) -> Figure:
@@ -138,9 +140,10 @@ def figure_of(name: str) -> Figure:
 def heading(name: str) -> str:
     """A table's heading: title and unit."""
     figure = figure_of(name)
-    if figure.pattern == name and figure.title:
-        words = figure.title
-    else:
-        unit = {"%": "pct", "dB": "db", "MB": "mb"}.get(figure.unit, figure.unit.replace("/", "_"))
-        words = " ".join(f"{name}_".replace(f"_{unit}_", "_", 1).strip("_").split("_")) if unit else name.replace("_", " ")
+    words = figure.title
+    if figure.pattern != name or not words:
+        # The unit in the name, wherever it stands.
+        in_name = _IN_NAMES.get(figure.unit, figure.unit.replace("/", "_"))
+        words = f"_{name}_".replace(f"_{in_name}_", "_", 1) if in_name else name
+        words = words.strip("_").replace("_", " ")
     return f"{words}, {figure.unit}" if figure.unit else words
