@@ -15,7 +15,7 @@ there is a false alarm in at most one comparison of twenty (Holm 1979). The test
   lost frames are mostly none and sometimes hundreds, of which no mean knows anything. Counts by their differences.
 - Counts of fewer runs: exact test of two binomial shares of the frames (Fisher), without frames of two Poisson counts.
 - Silently wrong frames, and others that `benchmarks.figures` has as outright: any increase of their sum.
-- A cell that failed, or has lost figures that all of its runs had: worse.
+- A cell that failed, or has no error in a run or in all of them where there was one: worse.
 
 Milliseconds are never judged, since machines differ, and one machine from one day to the next: ratios of times in one
 run are. Other people's trackers are shown, and not judged.
@@ -34,7 +34,7 @@ import numpy as np
 from scipy import special
 
 from benchmarks.cells import is_others
-from benchmarks.exact import fisher_p, poisson_p, signed_rank_p
+from benchmarks.exact import fisher_p, holm, poisson_p, signed_rank_p
 from benchmarks.figures import Figure, figure_of
 from benchmarks.scatter import Prior, priors, spread_of, tolerances
 from rsgen.console.tables import significant
@@ -144,8 +144,10 @@ def compare(old: Mapping[str, Record], new: Mapping[str, Record]) -> Comparison:
             if not is_others(after):
                 same += not _judge(*pairs[-1], usual, judged)
     tests = judged.tests
-    worse = [dataclasses.replace(tests[k].change, p=tests[k].p_worse) for k in _holm([t.p_worse for t in tests])]
-    better = [dataclasses.replace(tests[k].change, p=tests[k].p_better) for k in _holm([t.p_better for t in tests])]
+    worse, better = (
+        [dataclasses.replace(tests[k].change, p=p[k]) for k in holm(p, SIGNIFICANCE)]
+        for p in ([test.p_worse for test in tests], [test.p_better for test in tests])
+    )
     return Comparison(
         (*judged.worse, *worse), (*judged.better, *better), tuple(judged.unknown),
         {what: tuple(cells[what]) for what in _FATES if cells[what]}, tuple(_times(pairs)), len(tests), same,
@@ -179,8 +181,10 @@ def _judge(one: Record, other: Record, usual: Mapping[str, Prior], judged: _Judg
     """Add what changed between two records of the same runs to `judged`; whether anything did."""
     names = [n for n in _names(one) if figure_of(n).is_judged and one.values(n) != other.values(n)]
     for name in names:
-        missing = len(other.runs) - len(other.values(name))
-        if missing and len(one.values(name)) == len(one.runs):
+        had, missing = len(one.values(name)), len(other.runs) - len(other.values(name))
+        # Counts of some cases only may have none of these; an error is missing where the track is gone.
+        is_gone = had > 0 and (missing == len(other.runs) or (missing > 0 and had == len(one.runs)))
+        if is_gone and figure_of(name).scale != "count":
             why = f"missing in {missing} of its runs"
             judged.worse.append(Change(one.cell, name, _shown(one, name), _shown(other, name), why=why))
         elif figure_of(name).outright:
@@ -275,16 +279,6 @@ def _count_test(change: Change, one: Record, other: Record) -> _Test:
         more = poisson_p(counts[0], len(one.runs), counts[1], len(other.runs))
         fewer = poisson_p(counts[1], len(other.runs), counts[0], len(one.runs))
     return _Test(change, *((more, fewer) if sign > 0 else (fewer, more)))
-
-
-def _holm(p: Sequence[float]) -> list[int]:
-    """Which are significant together, the most first (Holm 1979)."""
-    chosen: list[int] = []
-    for rank, k in enumerate(np.argsort(p, kind="stable").tolist()):
-        if p[k] * (len(p) - rank) > SIGNIFICANCE:
-            break
-        chosen.append(k)
-    return chosen
 
 
 def _times(pairs: Sequence[tuple[Record, Record]]) -> list[str]:

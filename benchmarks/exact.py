@@ -1,4 +1,4 @@
-"""Exact one-sided tests of counts and of paired runs, by counting cases: no distribution is assumed beyond theirs."""
+"""Exact one-sided tests of counts and of paired runs, by counting cases; and many tests together."""
 
 from __future__ import annotations
 
@@ -34,3 +34,13 @@ def fisher_p(old: int, old_of: int, new: int, new_of: int) -> float:
 def poisson_p(old: int, old_runs: int, new: int, new_runs: int) -> float:
     """Chance of so many or more in the new runs, if old and new have the same rate."""
     return float(stats.binom.sf(new - 1, old + new, new_runs / (old_runs + new_runs)))
+
+
+def holm(p: Sequence[float], significance: float) -> list[int]:
+    """Which of some tests are significant together, the most first (Holm 1979)."""
+    chosen: list[int] = []
+    for rank, k in enumerate(np.argsort(p, kind="stable").tolist()):
+        if p[k] * (len(p) - rank) > significance:
+            break
+        chosen.append(k)
+    return chosen

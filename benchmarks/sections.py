@@ -283,7 +283,7 @@ def _with_scatter(record: Record | None) -> str:
     if record is None:
         return NOTHING
     scatter, _ = record.scatter.get("ate_mm", (0.0, 0.0))
-    return cell_text(record, "ate_mm") + (f" ± {100 * scatter:.2g} %" if scatter else "")
+    return cell_text(record, "ate_mm") + (f" ± {significant(scatter, 2, 100.0)} %" if scatter else "")
 
 
 def _measured(records: Sequence[Record], measure: str) -> list[str]:

@@ -204,6 +204,8 @@ def test_a_cell_that_fails_or_loses_its_figures_is_worse() -> None:
     assert not found.worse and found.cells == {"skipped": ("track/it/rs-pg",)}
     lost = old | by_cell(record("it", {"ate_mm": 1.0}, {"ate_mm": 1.02}, {"ate_mm": None}))
     assert compare(old, lost).worse[0].why == "missing in 1 of its runs"
+    gone = old | by_cell(record("it", {"ate_mm": None}, {"ate_mm": None}, {"ate_mm": None}))
+    assert compare(lost, gone).worse[0].why == "missing in 3 of its runs"
     assert not compare(failed, failed).worse
 
 
