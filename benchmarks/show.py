@@ -100,8 +100,8 @@ def readme_block(full: Records) -> str:
         "Cells are ATE in mm · drift in mm/s · drift in degrees/s, all RMSE. † frames were lost; (n of m) has so many.",
         "", table, "", _PAPERS,
         f"Settings are defaults; loops are off{but}. `rstrack track` closes them in the end unless told otherwise.",
-        *_provenance("Measured", full), *(["", words] if words else []),
-        "", "Every sequence, recording and measure is in [docs/results.md](docs/results.md).",
+        *_provenance("Measured", full), *([words] if words else []),
+        "Every sequence, recording and measure is in [docs/results.md](docs/results.md).",
     ])  # fmt: skip
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -27,6 +28,7 @@ Records = Mapping[str, Record]
 ERRORS = ("ate_mm", "drift_mm_s", "drift_deg_s")
 """Shown together, in this order: mm · mm/s · deg/s."""
 _DOT = " · "
+_NUMBERED = re.compile(r"(\D+)(\d*)")
 _SIDE_BY_SIDE, _MOST_COLUMNS = 12, 10
 
 
@@ -51,8 +53,9 @@ class Average:
 
 
 def of_measure(records: Records, measure: str) -> list[Record]:
-    """Finished ones, in the order of the file."""
-    return [record for record in records.values() if record.measure == measure and is_done(record)]
+    """Finished ones, by their names, numbers in these in their order."""
+    found = [record for record in records.values() if record.measure == measure and is_done(record)]
+    return sorted(found, key=lambda record: [(text, int(n or -1)) for text, n in _NUMBERED.findall(record.cell)])
 
 
 def of_group(records: Records, group: str, changes: bool = False) -> list[Record]:

@@ -204,5 +204,14 @@ def test_the_readouts_picture(full: dict[str, Record], tmp_path: Path) -> None:
     assert not draw_readout({}, tmp_path / "none.png") and not (tmp_path / "none.png").exists()
 
 
+def test_numbers_in_names_are_in_their_order(full: dict[str, Record], gate: dict[str, Record]) -> None:
+    changes = section(results_markdown(gate, full), "What may be wrong")
+    assert changes.index("demo-late_9ms") < changes.index("demo-late_10ms")
+    shuffled = dict(sorted(full.items(), reverse=True))
+    assert (
+        results_markdown(gate, shuffled).partition("Skipped")[2] == results_markdown(gate, full).partition("Skipped")[2]
+    )
+
+
 def test_groups_are_those_of_the_paper() -> None:
     assert PAPERS_GROUPS == ("hand-held", "living room")
