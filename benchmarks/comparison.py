@@ -67,7 +67,7 @@ class Comparison:
             lines += [f"  {change.text()}" for change in self.unknown]
         lines += [f"{what}: {', '.join(names)}" for what, names in self.cells.items()]
         lines += self.times
-        verdict = "nothing got worse" if not self.worse else f"{len({c.cell for c in self.worse})} cells got worse"
+        verdict = "nothing got worse" if not self.worse else f"{len(self.worse)} figures got worse"
         lines.append(
             f"{verdict}: {self.compared} cells compared, {self.same} of them alike in every run; {self.tests} tests, "
             f"a false alarm in {100 * SIGNIFICANCE:g} % of such comparisons at most"

@@ -263,7 +263,7 @@ def test_text_has_worse_first_and_times_beside() -> None:
     old, new = (cells("ate_mm", [f * v for v in NOISE], silent=f - 1, median_ms=40 * f) for f in (1.0, 2.0))
     text = compare(old, new).text()
     assert text.startswith("WORSE: 2")
-    assert "+100.0 %" in text and "median_ms: x 2.00 over 1 cells" in text and "1 cells got worse" in text
+    assert "+100.0 %" in text and "median_ms: x 2.00 over 1 cells" in text and "2 figures got worse" in text
 
 
 def test_every_figure_has_one_entry_and_a_heading() -> None:
