@@ -11,11 +11,14 @@ there is a false alarm in at most one comparison of twenty (Holm 1979). The test
 - Figures with three runs or so: t-test of the means with a moderated variance (`benchmarks.scatter`), errors and ratios
   in logarithms. It is not paired: a changed program's errors under the same noise may be alike, or may not, and where
   they are, the test says less than it could. Of what has a nominal value, the distance of the mean from it.
+- The same tests together, for each figure of each method over all cells (Stouffer 1949): what makes everything a little
+  worse is seen there, long before it is in any one cell. Half of the false alarms are theirs.
 - Ten runs and more, as of faults, one a seed: exact signed-rank test (Wilcoxon 1945) of the runs' differences, since
   lost frames are mostly none and sometimes hundreds, of which no mean knows anything. Counts by their differences.
 - Counts of fewer runs: exact test of two binomial shares of the frames (Fisher), without frames of two Poisson counts.
-- Silently wrong frames, and others that `benchmarks.figures` has as outright: any increase of their sum.
-- A cell that failed, or has lost figures that all of its runs had: worse.
+- Silently wrong frames, and others that `benchmarks.figures` has as outright: the first of them, where there was none.
+  Where there were some, as of methods that take a rolling shutter for a global one, they are counts like others.
+- A cell that failed, or has no error in a run or in all of them where there was one: worse.
 
 Milliseconds are never judged, since machines differ, and one machine from one day to the next: ratios of times in one
 run are. Other people's trackers are shown, and not judged.
@@ -29,82 +32,22 @@ import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter
 
-import numpy as np
 from scipy import special
 
 from benchmarks.cells import is_others
-from benchmarks.exact import fisher_p, poisson_p, signed_rank_p
+from benchmarks.comparison import SIGNIFICANCE, Change, Comparison, times
+from benchmarks.exact import fisher_p, holm, poisson_p, signed_rank_p, stouffer_p
 from benchmarks.figures import Figure, figure_of
 from benchmarks.scatter import Prior, priors, spread_of, tolerances
-from rsgen.console.tables import significant
 from rstrack.bench.record import Record
 
 __all__ = ["Change", "Comparison", "compare", "tolerances"]
 
-SIGNIFICANCE = 0.05
-"""Chance of any false alarm over all tests of a comparison."""
 PAIRED_FROM = 10
 """Runs from which these are compared one by one: fewer cannot be told from chance by ranks (2⁻¹⁰ at the least)."""
 _DIGITS = 6
-
-
-@dataclass(frozen=True)
-class Change:
-    """One figure of a cell: means, sums of counts. p: chance of as much without a change; why: other reasons."""
-
-    cell: str
-    figure: str = ""
-    old: float | None = None
-    new: float | None = None
-    p: float | None = None
-    why: str = ""
-
-    def text(self) -> str:
-        """One line."""
-        figure = figure_of(self.figure)
-        if not self.figure:
-            return f"{self.cell}: {self.why}"
-        values = " -> ".join(significant(value) for value in (self.old, self.new))
-        parts = [f"{values} {figure.unit}".rstrip()]
-        if figure.scale == "log" and self.old and self.new:
-            parts.append(f"{100.0 * (self.new / self.old - 1.0):+.1f} %")
-        parts += [self.why] if self.why else []
-        parts += [] if self.p is None else [f"p {self.p:.1g}"]
-        return f"{self.cell} {self.figure}: {', '.join(parts)}"
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """worse, better: beyond chance. unknown: changed, but what chance does there was never measured. cells: names by
-    what became of them, where there is nothing to compare. times: lines. tests: how many; same: cells all alike.
-    """
-
-    worse: tuple[Change, ...] = ()
-    better: tuple[Change, ...] = ()
-    unknown: tuple[Change, ...] = ()
-    cells: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    times: tuple[str, ...] = ()
-    tests: int = 0
-    same: int = 0
-    compared: int = 0
-
-    def text(self) -> str:
-        """For the screen: worse first, then better, then what was not compared."""
-        lines: list[str] = []
-        for name, changes in (("WORSE", self.worse), ("better", self.better)):
-            lines += [f"{name}: {len(changes)}", *(f"  {change.text()}" for change in changes)] if changes else []
-        if self.unknown:
-            lines.append("changed, and not judged: how chance scatters these is not known")
-            lines += [f"  {change.text()}" for change in self.unknown]
-        lines += [f"{what}: {', '.join(names)}" for what, names in self.cells.items()]
-        lines += self.times
-        verdict = "nothing got worse" if not self.worse else f"{len({c.cell for c in self.worse})} cells got worse"
-        lines.append(
-            f"{verdict}: {self.compared} cells compared, {self.same} of them alike in every run; {self.tests} tests, "
-            f"a false alarm in {100 * SIGNIFICANCE:g} % of such comparisons"
-        )
-        return "\n".join(lines)
 
 
 @dataclass(frozen=True)
@@ -112,6 +55,7 @@ class _Test:
     change: Change
     p_worse: float
     p_better: float
+    is_of_means: bool = False
 
 
 @dataclass
@@ -143,12 +87,19 @@ def compare(old: Mapping[str, Record], new: Mapping[str, Record]) -> Comparison:
             pairs.append(_shared(before, after))
             if not is_others(after):
                 same += not _judge(*pairs[-1], usual, judged)
-    tests = judged.tests
-    worse = [dataclasses.replace(tests[k].change, p=tests[k].p_worse) for k in _holm([t.p_worse for t in tests])]
-    better = [dataclasses.replace(tests[k].change, p=tests[k].p_better) for k in _holm([t.p_better for t in tests])]
+    together = _together(judged.tests)
+    tests = [*together, *judged.tests]
+    worse, better = (
+        [
+            dataclasses.replace(family[k].change, p=p(family[k]))
+            for family in (together, judged.tests)
+            for k in holm([p(test) for test in family], SIGNIFICANCE / 2)
+        ]
+        for p in (attrgetter("p_worse"), attrgetter("p_better"))
+    )
     return Comparison(
         (*judged.worse, *worse), (*judged.better, *better), tuple(judged.unknown),
-        {what: tuple(cells[what]) for what in _FATES if cells[what]}, tuple(_times(pairs)), len(tests), same,
+        {what: tuple(cells[what]) for what in _FATES if cells[what]}, tuple(times(pairs)), len(tests), same,
         sum(not is_others(after) for _, after in pairs),
     )  # fmt: skip
 
@@ -179,16 +130,15 @@ def _judge(one: Record, other: Record, usual: Mapping[str, Prior], judged: _Judg
     """Add what changed between two records of the same runs to `judged`; whether anything did."""
     names = [n for n in _names(one) if figure_of(n).is_judged and one.values(n) != other.values(n)]
     for name in names:
-        missing = len(other.runs) - len(other.values(name))
-        if missing and len(one.values(name)) == len(one.runs):
+        had, missing = len(one.values(name)), len(other.runs) - len(other.values(name))
+        # Counts of some cases only may have none of these; an error is missing where the track is gone.
+        is_gone = had > 0 and (missing == len(other.runs) or (missing > 0 and had == len(one.runs)))
+        if is_gone and figure_of(name).scale != "count":
             why = f"missing in {missing} of its runs"
             judged.worse.append(Change(one.cell, name, _shown(one, name), _shown(other, name), why=why))
-        elif figure_of(name).outright:
-            before, after = one.total(name), other.total(name)
-            if after > before:
-                judged.worse.append(Change(one.cell, name, before, after, why="any increase is worse"))
-            elif after < before:
-                judged.better.append(Change(one.cell, name, before, after))
+        elif figure_of(name).outright and one.total(name) == 0.0 < other.total(name):
+            why = "there was none"
+            judged.worse.append(Change(one.cell, name, 0.0, other.total(name), why=why))
         else:
             test = _test(one, other, name, usual.get(name))
             if test is None:
@@ -261,7 +211,7 @@ def _t_test(change: Change, one: Record, other: Record, usual: Prior | None) -> 
         return None
     difference = figure.badness(values[1]) - figure.badness(values[0])
     t = difference / math.sqrt(variance * (1 / len(values[0]) + 1 / len(values[1])))
-    return _Test(change, float(special.stdtr(dof, -t)), float(special.stdtr(dof, t)))
+    return _Test(change, float(special.stdtr(dof, -t)), float(special.stdtr(dof, t)), is_of_means=True)
 
 
 def _count_test(change: Change, one: Record, other: Record) -> _Test:
@@ -277,33 +227,24 @@ def _count_test(change: Change, one: Record, other: Record) -> _Test:
     return _Test(change, *((more, fewer) if sign > 0 else (fewer, more)))
 
 
-def _holm(p: Sequence[float]) -> list[int]:
-    """Which are significant together, the most first (Holm 1979)."""
-    chosen: list[int] = []
-    for rank, k in enumerate(np.argsort(p, kind="stable").tolist()):
-        if p[k] * (len(p) - rank) > SIGNIFICANCE:
-            break
-        chosen.append(k)
-    return chosen
+def _together(tests: Sequence[_Test]) -> list[_Test]:
+    """Each figure of each method, over all cells whose means were tested."""
+    families: dict[tuple[str, str], list[_Test]] = defaultdict(list)
+    for test in tests:
+        if test.is_of_means:
+            measure, _, method = test.change.cell.split("/")
+            families[f"{measure}/*/{method}", test.change.figure].append(test)
+    out = []
+    for (cell, name), of in families.items():
+        if len(of) > 1:
+            old, new = (_mean(figure_of(name), [getattr(test.change, when) for test in of]) for when in ("old", "new"))
+            change = Change(cell, name, old, new, why=f"mean of {len(of)} cells")
+            out.append(_Test(change, stouffer_p([t.p_worse for t in of]), stouffer_p([t.p_better for t in of])))
+    return out
 
 
-def _times(pairs: Sequence[tuple[Record, Record]]) -> list[str]:
-    """A line for each kind of time: its change over all cells, and on which machines."""
-    factors: dict[str, list[float]] = defaultdict(list)
-    for one, other in pairs:
-        after = other.figures
-        for name, before in one.figures.items():
-            if figure_of(name).is_time and before > 0.0 and after.get(name, 0.0) > 0.0:
-                factors[name].append(after[name] / before)
-    lines = []
-    for name in ("median_ms", "p95_ms", "p99_ms", "total_s"):
-        if name in factors:
-            of = np.array(factors[name])
-            middle = math.exp(float(np.log(of).mean()))
-            lines.append(f"  {name}: x {middle:.2f} over {of.size} cells ({of.min():.2f} to {of.max():.2f})")
-    if not lines:
-        return []
-    machines = [sorted({str(pair[k].machine.get("cpu", "?")) for pair in pairs}) for k in (0, 1)]
-    loads = [max((float(pair[k].machine.get("load") or 0.0) for pair in pairs), default=0.0) for k in (0, 1)]
-    told = " -> ".join(f"{', '.join(m)}, load up to {load:g}" for m, load in zip(machines, loads, strict=True))
-    return [f"times, shown and not judged ({told}):", *lines]
+def _mean(figure: Figure, values: Sequence[float]) -> float | None:
+    """On the figure's scale."""
+    scaled = [x for value in values if (x := figure.on_scale(value)) is not None]
+    mean = math.fsum(scaled) / len(scaled) if scaled else math.nan
+    return None if not scaled else math.exp(mean) if figure.scale == "log" else mean

@@ -1,11 +1,14 @@
-"""Exact one-sided tests of counts and of paired runs, by counting cases: no distribution is assumed beyond theirs."""
+"""Exact one-sided tests of counts and of paired runs, by counting cases; and many tests together."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import stats
+from scipy import special, stats
+
+# Deviates are finite, to eight sigma.
+_LEAST_P = 1e-15
 
 
 def signed_rank_p(differences: Sequence[float]) -> float:
@@ -34,3 +37,19 @@ def fisher_p(old: int, old_of: int, new: int, new_of: int) -> float:
 def poisson_p(old: int, old_runs: int, new: int, new_runs: int) -> float:
     """Chance of so many or more in the new runs, if old and new have the same rate."""
     return float(stats.binom.sf(new - 1, old + new, new_runs / (old_runs + new_runs)))
+
+
+def stouffer_p(p: Sequence[float]) -> float:
+    """Chance of as much in some independent tests together (Stouffer 1949): their normal deviates are added."""
+    deviates = special.ndtri(np.clip(p, _LEAST_P, 1.0 - _LEAST_P))
+    return float(special.ndtr(deviates.sum() / np.sqrt(len(p))))
+
+
+def holm(p: Sequence[float], significance: float) -> list[int]:
+    """Which of some tests are significant together, the most first (Holm 1979)."""
+    chosen: list[int] = []
+    for rank, k in enumerate(np.argsort(p, kind="stable").tolist()):
+        if p[k] * (len(p) - rank) > significance:
+            break
+        chosen.append(k)
+    return chosen

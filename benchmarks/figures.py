@@ -23,7 +23,7 @@ Scale = Literal["log", "linear", "count"]
 class Figure:
     """pattern: of names, * allowed. better: which way, or near `nominal`. scale: of its scatter and its differences.
 
-    outright: any increase of the sum over runs is worse, whatever chance does. is_time: of the machine as well.
+    outright: the first one is worse, whatever chance does, where there was none. is_time: of the machine as well.
     """
 
     pattern: str
@@ -81,10 +81,10 @@ FIGURES: tuple[Figure, ...] = (
     Figure("accepted", "look-alikes taken for one", "pairs", "less", "count", outright=True),
     Figure("median_mrad", "median", "mrad", "less", "log"),
     # Times of the machine, and ratios of times of one run, of which a machine's speed falls out.
-    Figure("ratio", "over the peer's", "", "less", "log"),
+    Figure("ratio", "ratio", "", "less", "log"),
     Figure("ratio_*", "", "", "less", "log"),
     Figure("*_ratio", "", "", "less", "log"),
-    Figure("*_msamples_s", "", "million samples/s", "unjudged", "log"),
+    Figure("*_msamples_s", "", "Msamples/s", "unjudged", "log"),
     Figure("median_ms", "median", "ms", "unjudged", "log", is_time=True),
     Figure("mean_ms", "mean", "ms", "unjudged", "log", is_time=True),
     Figure("p95_ms", "95 %", "ms", "unjudged", "log", is_time=True),
@@ -93,10 +93,10 @@ FIGURES: tuple[Figure, ...] = (
     Figure("*_deg_s", "", "deg/s", "less", "log"),
     Figure("*_mm_s", "", "mm/s", "less", "log"),
     Figure("*_s", "", "s", "unjudged", "log", is_time=True),
-    # Memory.
-    Figure("peak_mb", "peak memory", "MB", "less", "log"),
+    # Memory: what a process ran before moves its peak; what a long run adds is judged.
+    Figure("peak_mb", "peak memory", "MB", "unjudged", "log"),
     Figure("growth_mb", "growth", "MB", "less", "linear"),
-    Figure("*_mb", "memory", "MB", "less", "log"),
+    Figure("*_mb", "memory", "MB", "unjudged", "log"),
     # Light: decibels are logarithms already, and a bias has a sign.
     Figure("psnr_db", "PSNR", "dB", "more", "linear"),
     Figure("psnr_least_db", "least PSNR", "dB", "more", "linear"),
@@ -126,6 +126,8 @@ FIGURES: tuple[Figure, ...] = (
     Figure("*_ms_*x", "", "ms", "less", "log"),
 )
 
+_IN_NAMES = {"%": "pct", "dB": "db", "MB": "mb", "Msamples/s": "msamples_s"}
+
 
 @cache
 def figure_of(name: str) -> Figure:
@@ -138,11 +140,10 @@ def figure_of(name: str) -> Figure:
 def heading(name: str) -> str:
     """A table's heading: title and unit."""
     figure = figure_of(name)
-    if figure.pattern == name and figure.title:
-        words = figure.title
-    else:
-        unit = {"%": "pct", "dB": "db", "MB": "mb"}.get(figure.unit, figure.unit.replace("/", "_"))
-        words = (
-            " ".join(f"{name}_".replace(f"_{unit}_", "_", 1).strip("_").split("_")) if unit else name.replace("_", " ")
-        )
+    words = figure.title
+    if figure.pattern != name or not words:
+        # The unit in the name, wherever it stands.
+        in_name = _IN_NAMES.get(figure.unit, figure.unit.replace("/", "_"))
+        words = f"_{name}_".replace(f"_{in_name}_", "_", 1) if in_name else name
+        words = words.strip("_").replace("_", " ")
     return f"{words}, {figure.unit}" if figure.unit else words

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from benchmarks.compare import SIGNIFICANCE, compare
-from benchmarks.exact import fisher_p, poisson_p, signed_rank_p
+from benchmarks.compare import compare
+from benchmarks.comparison import SIGNIFICANCE
+from benchmarks.exact import fisher_p, poisson_p, signed_rank_p, stouffer_p
 from benchmarks.figures import FIGURES, figure_of, heading
 from benchmarks.scatter import Spread, fit_prior, tolerances
 from rstrack.bench.record import Record, read_records, write_records
@@ -65,9 +66,19 @@ def test_a_fifth_more_is_found_where_chance_is_a_twentieth() -> None:
     for _ in range(100):
         worse = compare(tolerances(drawn(rng, sigmas)), drawn(rng, sigmas, {3: 1.2})).worse
         found += any(change.cell == "track/case3/rs-pg" for change in worse)
-        others += any(change.cell != "track/case3/rs-pg" for change in worse)
+        others += any(change.cell not in ("track/case3/rs-pg", "track/*/rs-pg") for change in worse)
     assert found >= 70
     assert others <= stats.binom.ppf(0.999, 100, SIGNIFICANCE)
+
+
+def test_a_little_more_everywhere_is_found_in_the_mean() -> None:
+    rng = np.random.default_rng(6)
+    sigmas = 0.05 * np.sqrt(4.0 / rng.chisquare(4.0, 20))
+    found = 0
+    for _ in range(30):
+        worse = compare(drawn(rng, sigmas), drawn(rng, sigmas, dict.fromkeys(range(20), 1.06))).worse
+        found += any(change.cell == "track/*/rs-pg" for change in worse)
+    assert found >= 27
 
 
 def test_the_usual_variance_is_found_again() -> None:
@@ -91,6 +102,8 @@ def test_exact_tests_are_those_of_scipy_and_of_counting() -> None:
     assert signed_rank_p([0.0, 0.0]) == 1.0
     table = np.array([[9, 91], [2, 98]])
     assert fisher_p(2, 100, 9, 100) == pytest.approx(stats.fisher_exact(table, alternative="greater")[1])
+    assert stouffer_p([0.2, 0.01, 0.7]) == pytest.approx(stats.combine_pvalues([0.2, 0.01, 0.7], "stouffer").pvalue)
+    assert 0.0 < stouffer_p([0.0, 0.5]) < 1e-6
     assert poisson_p(0, 3, 5, 3) == pytest.approx(0.5**5)
 
 
@@ -204,6 +217,8 @@ def test_a_cell_that_fails_or_loses_its_figures_is_worse() -> None:
     assert not found.worse and found.cells == {"skipped": ("track/it/rs-pg",)}
     lost = old | by_cell(record("it", {"ate_mm": 1.0}, {"ate_mm": 1.02}, {"ate_mm": None}))
     assert compare(old, lost).worse[0].why == "missing in 1 of its runs"
+    gone = old | by_cell(record("it", {"ate_mm": None}, {"ate_mm": None}, {"ate_mm": None}))
+    assert compare(lost, gone).worse[0].why == "missing in 3 of its runs"
     assert not compare(failed, failed).worse
 
 
@@ -248,7 +263,7 @@ def test_text_has_worse_first_and_times_beside() -> None:
     old, new = (cells("ate_mm", [f * v for v in NOISE], silent=f - 1, median_ms=40 * f) for f in (1.0, 2.0))
     text = compare(old, new).text()
     assert text.startswith("WORSE: 2")
-    assert "+100.0 %" in text and "median_ms: x 2.00 over 1 cells" in text and "1 cells got worse" in text
+    assert "+100.0 %" in text and "median_ms: x 2.00 over 1 cells" in text and "2 figures got worse" in text
 
 
 def test_every_figure_has_one_entry_and_a_heading() -> None:
