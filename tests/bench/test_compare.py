@@ -140,7 +140,6 @@ def test_digits_that_files_do_not_keep_are_no_change(tmp_path: Path) -> None:
         ("ate_mm", [1.0, 1.02, 0.98], [1.01, 1.03, 0.98], ""),
         ("ate_mm", [1.0], [1.5], "worse"),  # one run: the others' scatter
         ("ratio", [0.5, 0.51, 0.49], [0.9, 0.91, 0.89], "worse"),
-        ("peak_mb", [500.0, 505.0, 495.0], [900.0, 905.0, 895.0], "worse"),
         ("median_ms", [10.0, 10.1, 9.9], [90.0, 90.1, 89.9], ""),  # milliseconds are not judged
         ("nees", [1.2, 1.21, 1.19], [1 / 1.2, 1 / 1.21, 1 / 1.19], ""),  # as far from 1 as before
         ("nees", [1.0, 1.01, 0.99], [0.4, 0.41, 0.39], "worse"),
@@ -271,3 +270,9 @@ def test_every_figure_has_one_entry_and_a_heading() -> None:
     assert heading("ate_mm") == "ATE, mm" and heading("bake_s") == "bake, s" and heading("kind") == "kind"
     assert heading("converged_pct_1x") == "converged 1x, %"
     assert not figure_of("lost_ms").is_judged and figure_of("ratio_p99").is_judged
+
+
+def test_more_silently_wrong_frames_are_counts_where_there_were_some() -> None:
+    old, new, many = (cells("ate_mm", [1.0], silent=v, frames=100.0) for v in (4.0, 5.0, 60.0))
+    assert not compare(old, new).worse
+    assert [change.figure for change in compare(old, many).worse] == ["silent"]
