@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,8 @@ from rstrack.bench.task import MEASURES, Task, measure_named
 from rstrack.data.estimate import TRAJECTORY
 
 RECORD = "record.json"
+# Parts of both packages that show things, or read and write for other programs: figures do not depend on them.
+_SHOWING = ("bench", "charts", "cli", "export", "importing", "pack", "pictures", "report", "share", "view")
 # What describes a sequence, rsgen's or TUM's; the images themselves are not read for the key.
 _DESCRIPTIONS = (
     "sequence.yaml", "rgb.txt", "depth.txt", "associations.txt", "groundtruth.txt", "camera.yaml", "calibration.yaml"
@@ -68,9 +69,11 @@ def run_cells(
     unknown = [cell.measure for cell in benchmark.cells if cell.measure not in known]
     if unknown:
         raise UserError(f"no measure '{unknown[0]}': choose {', '.join(known)}")
-    code = code_digest() if benchmark.every == "code" else package_version()
+    by_code, release = benchmark.every == "code", package_version()
     jobs = [
-        Job(cell, (out / "cells" / cell.name).resolve(), sources, known[cell.measure], code) for cell in benchmark.cells
+        Job(cell, (out / "cells" / cell.name).resolve(), sources, where, code_digest(where) if by_code else release)
+        for cell in benchmark.cells
+        for where in [known[cell.measure]]
     ]
     records: dict[str, Record] = {}
     known_s = dict(expected_s or {})
@@ -156,15 +159,17 @@ def run_cell(job: Job, progress: Progress = no_progress) -> Record:
 
 
 @cache
-def code_digest() -> str:
-    """Of the product's source: what is measured depends on it."""
-    digest = hashlib.sha256()
+def code_digest(measure: str) -> str:
+    """Of the source that figures of a measure ('package.module:function') depend on: the product's, and its own."""
+    own = find_spec(measure.partition(":")[0])
+    files = [] if own is None or own.origin is None else [Path(own.origin)]
     for package in ("rsgen", "rstrack"):
         spec = find_spec(package)
-        assert spec is not None and spec.origin is not None
-        root = Path(spec.origin).parent
-        for path in sorted(root.rglob("*.py")):
-            digest.update(f"{package}/{path.relative_to(root)}\n".encode() + path.read_bytes())
+        root = Path((spec and spec.origin) or "").parent
+        files += [path for path in sorted(root.rglob("*.py")) if path.relative_to(root).parts[0] not in _SHOWING]
+    digest = hashlib.sha256()
+    for path in files:
+        digest.update(path.name.encode() + path.read_bytes())
     return digest.hexdigest()
 
 

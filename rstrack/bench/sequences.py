@@ -78,9 +78,13 @@ class Sources:
         """
         path = config_file(str(entry.config))
         files = [path, *(self._recording(Path(file)) for file in entry.data.values())]
-        given = read_yaml(path).get("trajectory") or {}
+        config = read_yaml(path)
+        given = config.get("trajectory") or {}
         if "trajectory.file" not in {**entry.set, **entry.data} and given.get("file"):
             files.append(path.parent / str(given["file"]))
+        scene = path.parent / str((config.get("scene") or {}).get("file", ""))
+        # A room of ours is made by scripts beside it, and is not there before.
+        files += sorted(scene.parent.glob("*.py")) or [scene]
         hashes = {file.name: hashlib.sha256(read_bytes(file)).hexdigest() for file in files if file.is_file()}
         says = entry.model_dump(mode="json", exclude_defaults=True, exclude={"group"}) | {"config": path.name}
         return json.dumps({"sequence": says, "files": hashes}, indent=1, sort_keys=True) + "\n"
