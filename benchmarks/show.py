@@ -28,7 +28,7 @@ BEGIN, END = "<!-- results:begin (python -m benchmarks.show writes this) -->", "
 _BEGIN = "<!-- results:begin"
 _ABOUT = """\
 Written by `python -m benchmarks.show` from the records in `benchmarks/results`: change nothing here. How to measure it
-again is in [its README](../benchmarks/README.md), what was learnt on the way in [measured.md](measured.md)."""
+again is in [its README](../benchmarks/README.md), what was learnt on the way in [the notebook](notebook/README.md)."""
 _PAPERS = (
     "The paper's figures are of its own recordings and renderings of such motions: compare the orders, not the digits."
 )
