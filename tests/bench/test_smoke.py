@@ -10,7 +10,9 @@ from benchmarks.__main__ import main
 from rstrack.bench.record import read_records
 
 
-def test_every_measure_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_measure_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr("benchmarks.__main__.RESULTS", tmp_path)
     where = ["--out", str(tmp_path / "out"), "--cache", str(tmp_path / "cache"), "--quiet"]
     assert main(["smoke", *where, "--accept"]) == 0
