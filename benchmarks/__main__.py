@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+from benchmarks.compare import compare, tolerances
 from rsgen.console.command_line import Commands, Parser, Quiet, run_program
 from rsgen.console.scheduler import Scheduler, open_workers
 from rstrack.bench.record import Record, read_records, write_records
-from benchmarks.compare import compare, tolerances
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results"
@@ -50,7 +50,9 @@ class Choice:
     cache: Annotated[Path | None, "where rendered sequences are kept (default: in ~/.cache)", "DIR"] = None
     out: Annotated[Path | None, "where cells are kept while they are made (default: out/bench/TIER)", "DIR"] = None
     against: Annotated[Path | None, "records to compare with", "FILE"] = None
-    accept: Annotated[bool, "keep the records as benchmarks/results/TIER.json: the commit that does it says why"] = False
+    accept: Annotated[bool, "keep the records as benchmarks/results/TIER.json: the commit that does it says why"] = (
+        False
+    )
 
 
 def smoke(choice: Choice, *, scheduler: Scheduler = None, quiet: Quiet = False) -> int:

@@ -16,6 +16,7 @@ from rsgen.sequence.trajectory import read_trajectory
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted((ROOT / "rsgen").rglob("*.py"))
 TRACKER = sorted((ROOT / "rstrack").rglob("*.py"))
+BENCHMARKS = sorted((ROOT / "benchmarks").rglob("*.py"))
 # What rstrack builds on; the rest of rsgen renders, or is about rendering.
 SHARED = (
     "array_types", "console", "device", "errors", "figures", "files", "geometry", "inputs", "limits", "sequence",
@@ -125,13 +126,13 @@ def test_nothing_in_rsgen_imports_rstrack() -> None:
 
 
 def test_every_file_says_what_it_is_for() -> None:
-    for path in {*SOURCES, *TRACKER, *(ROOT / "tests").glob("*.py"), *(ROOT / "scenes").rglob("*.py")}:
+    for path in {*SOURCES, *TRACKER, *BENCHMARKS, *(ROOT / "tests").glob("*.py"), *(ROOT / "scenes").rglob("*.py")}:
         text = ast.get_docstring(parsed(path))
         assert text is not None and len(text.splitlines()[0]) > 15, name(path)
 
 
 def test_every_public_function_and_class_is_documented() -> None:
-    for path in (*SOURCES, *TRACKER):
+    for path in (*SOURCES, *TRACKER, *BENCHMARKS):
         for node in parsed(path).body:
             if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
                 assert ast.get_docstring(node), f"{name(path)}: {node.name}"
@@ -141,6 +142,7 @@ def test_no_path_of_one_machine_is_in_the_project() -> None:
     here = [
         *SOURCES,
         *TRACKER,
+        *BENCHMARKS,
         *CONFIGS,
         *(ROOT / "scenes").rglob("*.py"),
         *(ROOT / "tests").glob("*.py"),

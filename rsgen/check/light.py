@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,58 +24,83 @@ _REFERENCE_DEPTH = 64  # path length of the reference; Russian roulette ends mos
 _REFERENCE_PASS = 64  # samples per pixel of one pass, for progress
 _LEAST_ERROR = 1e-6  # squared: less than that cannot be told from none
 _SURE = 2.0  # standard errors
+_SEEDS = 1_000_000  # of one run's samples
 _BAKED_SPP = 256  # samples of the baked picture: what is compared is its light, not its noise
+
+
+@dataclass(frozen=True)
+class LightView:
+    """Baked light against path tracing in one view, `stamp` (s).
+
+    psnr_db: in 8-bit-range sRGB before quantisation. surely_db: what it is at least (two standard errors). bias_pct: by
+    how much brighter the baked picture is.
+    """
+
+    stamp: float
+    psnr_db: float
+    surely_db: float
+    bias_pct: float
 
 
 def check_light(
     config: Config, views: int, spp: int, width: int, picture: Path | None, progress: Progress
 ) -> tuple[str, bool]:
-    """PSNR (dB, in 8-bit-range sRGB before quantisation) of baked against path-traced global-shutter views.
+    """`compare_light` as a table, and whether every view is sure to reach PSNR_FLOOR_DB. Raises UserError."""
+    table: list[tuple[str, ...]] = []
+    found = compare_light(config, views, spp, width, picture, progress)
+    for k, v in enumerate(found):
+        numbers = fixed(v.stamp, 2), fixed(v.psnr_db, 1), fixed(v.surely_db, 1), fixed(v.bias_pct, 2, sign="+")
+        sure, likely = v.surely_db >= PSNR_FLOOR_DB, v.psnr_db >= PSNR_FLOOR_DB
+        table.append((str(k), *numbers, "yes" if sure else "unsure: more --spp" if likely else "no"))
+    head = ("view", "time, s", "PSNR, dB", "surely, dB", "bias, %", f"at least {PSNR_FLOOR_DB:g}")
+    return Table(head, tuple(table)).text(), min(v.surely_db for v in found) >= PSNR_FLOOR_DB
+
+
+def compare_light(
+    config: Config, views: int, spp: int, width: int, picture: Path | None, progress: Progress,
+    lit: tuple[Any, Any, Any] | None = None, seed: int = 0,
+) -> list[LightView]:  # fmt: skip
+    """Baked against path-traced global-shutter views, spread evenly over the config's trajectory, `width` pixels wide.
 
     Noise is taken out, both pictures': the squared error is the product of two errors, of different samples throughout.
     So is what sRGB's bend makes of the reference's noise (see `_encoded`).
-    How much of it that leaves unsure is told from its scatter over pixels, by two standard errors.
-    The views are spread evenly over the config's trajectory and scaled to `width` pixels. Writes baked, path-traced and
-    eight times their difference as one picture if a path is given. Returns a table, and whether every view is sure to
-    reach PSNR_FLOOR_DB. Raises UserError.
+    How much of it that leaves unsure is told from its scatter over pixels.
+    Writes baked, path-traced and eight times their difference as one picture if a path is given. lit: what `lit_scene`
+    returns, if it is at hand. seed: of all samples. Raises UserError.
     """
     motion = load_motion(config)
-    scene, baked, mi = lit_scene(config, progress)
+    scene, baked, mi = lit or lit_scene(config, progress)
     baked.glossy_spp = mirrored_samples(config.light, _BAKED_SPP)
     from rsgen.figures import save_grid
     from rsgen.render.images import ColorRenderer
 
-    camera = _scaled(config, width)
+    camera = view_camera(config, width)
     reference = mi.load_dict({"type": "path", "max_depth": _REFERENCE_DEPTH})
     ours = ColorRenderer(scene, baked, camera, Shutter(), _BAKED_SPP)
     theirs = ColorRenderer(scene, reference, camera, Shutter(), _REFERENCE_PASS)
-    table: list[tuple[str, ...]] = []
+    found: list[LightView] = []
     rows: list[list[FloatArray]] = []
-    surely: list[float] = []
-    passes = 4 * max(1, round(spp / (4 * _REFERENCE_PASS)))
+    passes, pose = 4 * max(1, round(spp / (4 * _REFERENCE_PASS))), motion.spline.pose
     for view, stamp in enumerate(spread_times(motion, views)):
-        mine = [ours.render(motion.spline.pose, float(stamp), 2 * view + k).astype(np.float64) for k in (0, 1)]
+        first_seed = seed * _SEEDS
+        mine = [ours.render(pose, float(stamp), first_seed + 2 * view + k).astype(np.float64) for k in (0, 1)]
         quarters = np.zeros((4, *mine[0].shape))
         for k in range(passes):
-            quarters[k % 4] += theirs.render(motion.spline.pose, float(stamp), 1000 * (view + 1) + k)
+            quarters[k % 4] += theirs.render(pose, float(stamp), first_seed + 1000 * (view + 1) + k)
             progress("path tracing", (view * passes + k + 1) / (views * passes), f"view {view + 1} of {views}")
         ours_linear, whole = (mine[0] + mine[1]) / 2, quarters.sum(axis=0) / passes
         quarters *= (4 / passes) * config.color.exposure_gain
         one, other = _encoded(quarters[::2]), _encoded(quarters[1::2])
         exposed = [np.clip(image * config.color.exposure_gain, 0, 1) for image in (*mine, ours_linear, whole)]
         first, second, ours_srgb, their_srgb = map(srgb.encode, exposed)
-        difference = ours_srgb - their_srgb
         psnr, least = psnr_without_noise((first, second), (one, other))
-        surely.append(least)
         # Of what is exposed: a lamp in the picture, a few pixels of a hundred times the light, would be all there is.
-        bias = 100 * (exposed[2].mean() / exposed[3].mean() - 1)
-        reached = "yes" if least >= PSNR_FLOOR_DB else "unsure: more --spp" if psnr >= PSNR_FLOOR_DB else "no"
-        table.append((str(view), fixed(stamp, 2), fixed(psnr, 1), fixed(least, 1), fixed(bias, 2, sign="+"), reached))
-        rows.append([ours_srgb, their_srgb, np.clip(0.5 + 8 * difference, 0, 1)])
+        bias = 100 * float(exposed[2].mean() / exposed[3].mean() - 1)
+        found.append(LightView(float(stamp), psnr, least, bias))
+        rows.append([ours_srgb, their_srgb, np.clip(0.5 + 8 * (ours_srgb - their_srgb), 0, 1)])
     if picture is not None:
         save_grid(rows, ["baked", f"path traced, {passes * _REFERENCE_PASS} spp", "difference x 8"], picture)
-    head = ("view", "time, s", "PSNR, dB", "surely, dB", "bias, %", f"at least {PSNR_FLOOR_DB:g}")
-    return Table(head, tuple(table)).text(), min(surely) >= PSNR_FLOOR_DB
+    return found
 
 
 def psnr_without_noise(
@@ -113,7 +139,8 @@ def lit_scene(config: Config, progress: Progress) -> tuple[Any, Any, Any]:
     return scene, baked, mi
 
 
-def _scaled(config: Config, width: int) -> Camera:
+def view_camera(config: Config, width: int) -> Camera:
+    """The colour camera with images `width` pixels wide. Raises UserError for more than it has, or less than 8."""
     camera = config.color.camera
     if not 8 <= width <= camera.width:
         raise UserError(f"--width {width}: choose 8 to {camera.width}")

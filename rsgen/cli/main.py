@@ -25,9 +25,6 @@ Export = Literal[
     "kalibr", "euroc", "registered", "ros1", "ros2", "mcap", "colmap", "nerfstudio", "ncore", "video", "rerun"
 ]  # fmt: skip
 Storage = Literal["sqlite3", "mcap"]
-BENCH_MODES = ("still", "rs-blur", "path", "rows", "averaged")
-_BLENDER_MODES = ("blender-still", "blender")  # asked for by name: they need bpy and take long
-Mode = Literal["still", "rs-blur", "path", "rows", "averaged", "blender-still", "blender", "all"]
 _DESCRIPTION = """\
 rsgen makes rolling-shutter RGB-D benchmark sequences with exact continuous-time ground truth.
 
@@ -73,7 +70,6 @@ def _parser() -> Parser:
     add(export, "euroc out/table1")
     with_fields += [add(pack, "demo office1 --count 1000 --out packs/rooms --color.spp 8 --truth.spp 8")]
     with_fields += [add(check_light, "demo --spp 1024 --out light.png")]
-    with_fields += [add(bench, "demo --spp 16 --mode still --mode rs-blur")]
     for command in with_fields:
         _add_fields(command)
     return commands.parser
@@ -308,29 +304,3 @@ def check_light(
         table, ok = check(chosen, views, spp, width, out, progress)
     print(table)
     return 0 if ok else 1
-
-
-def bench(
-    config: ConfigFile,
-    *,
-    frames: Annotated[int, "timed frames, each in all modes"] = 5,
-    spp: Annotated[int, "samples per pixel"] = 64,
-    mode: Annotated[
-        list[Mode] | None,
-        f"{', '.join(BENCH_MODES)} (the default), {', '.join(_BLENDER_MODES)} (need bpy), all; may be repeated",
-        "MODE",
-    ] = None,
-    json: Json = False,
-    **fields: str,
-) -> int:
-    """What a frame costs in each mode, and the ratios: blur, baked light, other ways to render it."""
-    from rsgen.bench.modes import time_modes
-    from rsgen.config.config import load_config
-    from rsgen.console.progress import ProgressDisplay
-
-    modes = (*BENCH_MODES, *_BLENDER_MODES) if "all" in (mode or ()) else mode or BENCH_MODES
-    chosen = load_config(config, fields)
-    with ProgressDisplay() as progress:
-        times = time_modes(chosen, frames, spp, modes, progress)
-    print_figures(times, json)
-    return 0

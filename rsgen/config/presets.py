@@ -10,8 +10,8 @@ Preset = Literal["kinect_v1"]
 # calibration (Sturm et al., IROS 2012). Infrared camera: OpenNI's nominal lens, which seen through that colour lens has
 # the borders of fr1_rpy's registered depth to 10 px; its projector, of a wider field of view, is 7.5 cm beside it, the
 # colour camera 2.5 cm, between the two. Periods, grid, jitter and delays of stamps, brightness and its steps as
-# measured on fr1_rpy (docs/measured.md); readouts within the 15 to 30 ms that trials on it allow. Lasting depth errors
-# and tremor are assumed; with them its twin is about as hard to track.
+# measured on fr1_rpy (docs/notebook/real-recordings.md); readouts within the 15 to 30 ms that trials on it allow.
+# Lasting depth errors and tremor are assumed; with them its twin is about as hard to track.
 _KINECT_V1: dict[str, Any] = {
     "color": {
         "width": 640,

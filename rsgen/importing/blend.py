@@ -63,7 +63,7 @@ def lamp_of(entry: dict[str, Any], T_world_blender: FloatArray, folder: Path) ->
     """The lamp of a light as the worker tells it.
 
     Of P W, a point or a spot has the intensity P / 4π, a surface of area A the radiance P / πA; a sun's irradiance is
-    its strength: so Cycles 4.2 renders them (docs/measured.md). T_world_blender (4, 4): to the
+    its strength: so Cycles 4.2 renders them (docs/notebook/scenes.md). T_world_blender (4, 4): to the
     world, m; lengths of the entry are Blender's units.
     """
     T = T_world_blender @ np.array(entry["T_blender_light"], float)

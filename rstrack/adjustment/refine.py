@@ -44,7 +44,7 @@ _LEAST_SHARE, _LEAST_FIT, _WORST = 0.15, 0.6, 2.5
 # Gain or offset that have changed by more call for another look, of so many at most.
 _BRIGHTER, _LOOKS = 0.004, 5
 # By how much colours may be drawn along, of what the way to the keyframe moves the picture: what shines shows things
-# that lie behind it, which move less (measured on a lacquered table, docs/measured.md).
+# that lie behind it, which move less (measured on a lacquered table, docs/notebook/hand-held.md).
 _SHINE = 3e-4
 # Information (m⁻², rad⁻²) of a frame that has not moved from its keyframe that its colours are not drawn along.
 _UNMOVED = 1e14

@@ -28,6 +28,8 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]*$")]
 Pattern = Annotated[str, Field(pattern=r"^[A-Za-z0-9_*?-][A-Za-z0-9_.*?-]*$")]
 Frames = Annotated[str, Field(pattern=r"^\d*:\d*$")]
 OTHERS: tuple[str, ...] = (*PEERS, *CLOUD_PEERS, *SLAM_PEERS)
+RENDERER = "rsgen"
+"""The method of cells that measure the renderer, on the config of a sequence: nothing tracks."""
 
 
 class _Section(BaseModel):
@@ -37,7 +39,9 @@ class _Section(BaseModel):
 class SequenceEntry(_Section):
     """One sequence: `config`, or `path`."""
 
-    config: Path | None = Field(default=None, description="what it is rendered from: a name, or a file beside this one")
+    config: Path | None = Field(
+        default=None, description="what 'rsgen render' makes it from: a name, or a file beside this one"
+    )
     set: dict[str, Any] = Field(default={}, description="fields of the config that are to be others")
     data: dict[str, str] = Field(default={}, description="fields of the config that name files of --data")
     width: int | None = Field(default=None, ge=32, le=16384, description="of all images, lenses in proportion, px")
@@ -74,7 +78,7 @@ class CaseEntry(_Section):
 class MethodEntry(_Section):
     """What tracks: one of ours with options, a peer, a command, or a folder with results."""
 
-    method: Name | None = Field(default=None, description="of ours or of the peers; default: the entry's own name")
+    method: Name | None = Field(default=None, description="of ours, of the peers, or rsgen; default: the entry's name")
     options: dict[str, Any] = Field(default={}, description="of `rstrack.options.Options`")
     command: str = Field(default="", description="another tracker, as 'rstrack bench --peer-command' has it")
     results: Path | None = Field(default=None, description="folder with CASE.txt (TUM) or CASE/ (a run) of another")
@@ -136,6 +140,11 @@ class Cell:
         return self.program in METHODS and not self.method_entry.command and self.method_entry.results is None
 
     @property
+    def renders(self) -> bool:
+        """Whether the renderer is measured: the sequence itself is not needed."""
+        return self.program == RENDERER
+
+    @property
     def options(self) -> Options:
         """Of one of our methods. Raises UserError."""
         try:
@@ -179,7 +188,7 @@ def load_benchmark(paths: Sequence[Path]) -> Benchmark:
     sequences = {name: entry for file in files for name, entry in file.sequences.items()}
     cases = {name: CaseEntry(sequence=name) for name in sequences}
     cases |= {name: entry for file in files for name, entry in file.cases.items()}
-    methods = {name: MethodEntry() for name in (*METHODS, *OTHERS)}
+    methods = {name: MethodEntry() for name in (*METHODS, *OTHERS, RENDERER)}
     methods |= {name: entry for file in files for name, entry in file.methods.items()}
     cells: dict[str, Cell] = {}
     for entry in (entry for file in files for entry in file.cells):

@@ -36,6 +36,8 @@ class Record:
     cell: MEASURE/CASE/METHOD. key: what the runs depend on. seeds, runs: one run of figures for each seed that is done;
     complete: all of them are. settings: case, method and measure as they were defined. machine: CPU, cores, load before
     the first run. error: why there is nothing; skipped: whether that is no fault (a recording or a package is absent).
+    scatter: by figure, what chance is measured to do to one run of this cell: a standard deviation (of logarithms,
+    where `benchmarks.figures` compares in these) and its degrees of freedom; set when the records are accepted.
     """
 
     cell: str
@@ -51,6 +53,7 @@ class Record:
     commit: str | None = None
     date: str = ""
     machine: dict[str, Any] = field(default_factory=dict)
+    scatter: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def measure(self) -> str:
@@ -156,7 +159,8 @@ def read_record(path: Path) -> Record | None:
 
 
 def _record(data: Mapping[str, Any]) -> Record:
-    return Record(**{**data, "seeds": tuple(data["seeds"]), "runs": tuple(data["runs"])})
+    scatter = {name: (float(sd), float(dof)) for name, (sd, dof) in data.get("scatter", {}).items()}
+    return Record(**{**data, "seeds": tuple(data["seeds"]), "runs": tuple(data["runs"]), "scatter": scatter})
 
 
 def _short(record: Record) -> dict[str, Any]:

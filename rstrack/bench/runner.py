@@ -19,6 +19,7 @@ from typing import Any
 
 from rsgen.console.progress import Progress, no_progress
 from rsgen.console.scheduler import InProcess, Workers
+from rsgen.device.backend import select
 from rsgen.errors import UserError
 from rstrack.bench.definitions import Benchmark, Cell
 from rstrack.bench.memory import peak_mb, reset_peak
@@ -28,6 +29,8 @@ from rstrack.bench.task import MEASURES, Task, measure_named
 from rstrack.data.estimate import TRAJECTORY
 
 RECORD = "record.json"
+# Parts of both packages that show things, or read and write for other programs: figures do not depend on them.
+_SHOWING = ("bench", "charts", "cli", "export", "importing", "pack", "pictures", "report", "share", "view")
 # What describes a sequence, rsgen's or TUM's; the images themselves are not read for the key.
 _DESCRIPTIONS = (
     "sequence.yaml", "rgb.txt", "depth.txt", "associations.txt", "groundtruth.txt", "camera.yaml", "calibration.yaml"
@@ -68,9 +71,11 @@ def run_cells(
     unknown = [cell.measure for cell in benchmark.cells if cell.measure not in known]
     if unknown:
         raise UserError(f"no measure '{unknown[0]}': choose {', '.join(known)}")
-    code = code_digest() if benchmark.every == "code" else package_version()
+    by_code, release = benchmark.every == "code", package_version()
     jobs = [
-        Job(cell, (out / "cells" / cell.name).resolve(), sources, known[cell.measure], code) for cell in benchmark.cells
+        Job(cell, (out / "cells" / cell.name).resolve(), sources, where, code_digest(where) if by_code else release)
+        for cell in benchmark.cells
+        for where in [known[cell.measure]]
     ]
     records: dict[str, Record] = {}
     known_s = dict(expected_s or {})
@@ -126,9 +131,10 @@ def run_cell(job: Job, progress: Progress = no_progress) -> Record:
         record = Record(**stamped({"cell": cell.name, "key": key, "settings": cell.as_dict()}))
     if record.complete:
         return record
+    select()  # a libLLVM that works, before a measure imports Dr.Jit
     measure = measure_named(job.measure)
     try:
-        root = job.sources.folder(cell.sequence, cell.case_entry.sequence, progress)
+        root = None if cell.renders else job.sources.folder(cell.sequence, cell.case_entry.sequence, progress)
         # Once more: a sequence that was not there when the key was made is now.
         record = dataclasses.replace(record, key=_key(job, root))
         for n, seed in enumerate(cell.seeds):
@@ -140,7 +146,7 @@ def run_cell(job: Job, progress: Progress = no_progress) -> Record:
 
             reset_peak()
             begin = time.perf_counter()
-            figures = measure(Task(cell, seed, root, job.out), tell)
+            figures = measure(Task(cell, seed, job.sources, job.out), tell)
             figures = figures | {"peak_mb": figures.get("peak_mb") or peak_mb()}
             record = dataclasses.replace(
                 record, seeds=(*record.seeds, seed), runs=(*record.runs, figures),
@@ -156,15 +162,17 @@ def run_cell(job: Job, progress: Progress = no_progress) -> Record:
 
 
 @cache
-def code_digest() -> str:
-    """Of the product's source: what is measured depends on it."""
-    digest = hashlib.sha256()
+def code_digest(measure: str) -> str:
+    """Of the source that figures of a measure ('package.module:function') depend on: the product's, and its own."""
+    own = find_spec(measure.partition(":")[0])
+    files = [] if own is None or own.origin is None else [Path(own.origin)]
     for package in ("rsgen", "rstrack"):
         spec = find_spec(package)
-        assert spec is not None and spec.origin is not None
-        root = Path(spec.origin).parent
-        for path in sorted(root.rglob("*.py")):
-            digest.update(f"{package}/{path.relative_to(root)}\n".encode() + path.read_bytes())
+        root = Path((spec and spec.origin) or "").parent
+        files += [path for path in sorted(root.rglob("*.py")) if path.relative_to(root).parts[0] not in _SHOWING]
+    digest = hashlib.sha256()
+    for path in files:
+        digest.update(path.name.encode() + path.read_bytes())
     return digest.hexdigest()
 
 
@@ -177,14 +185,9 @@ def sequence_digest(root: Path) -> str:
 
 
 def _key(job: Job, root: Path | None = None) -> str:
-    """What the cell's runs depend on; the sequence's own part is empty where it is still to be rendered."""
+    """What the cell's runs depend on."""
     cell = job.cell
-    if root is None:
-        try:
-            root = dataclasses.replace(job.sources, render=_not_now).folder(cell.sequence, cell.case_entry.sequence)
-        except UserError:
-            root = None
-    depends: list[Any] = [cell.name, cell.as_dict(), job.code, "" if root is None else sequence_digest(root)]
+    depends: list[Any] = [cell.name, cell.as_dict(), job.code, _made_of(job, root)]
     if cell.case_entry.camera is not None:
         depends.append(_file_digest(cell.case_entry.camera))
     if cell.method_entry.results is not None:
@@ -206,9 +209,21 @@ def _kept(job: Job, key: str) -> Record | None:
 
 def _render(jobs: list[Job], progress: Progress) -> None:
     """Render what is missing, before workers begin: two of them would render a sequence into the same folder."""
-    for job in {job.cell.case_entry.sequence: job for job in jobs}.values():
+    for job in {job.cell.case_entry.sequence: job for job in jobs if not job.cell.renders}.values():
         with suppress(UserError):  # its cells say so
             job.sources.folder(job.cell.sequence, job.cell.case_entry.sequence, progress)
+
+
+def _made_of(job: Job, root: Path | None) -> str:
+    """Of the sequence in `root`: empty where it is still to be rendered. Of the renderer's cells: what it renders."""
+    entry = job.cell.sequence
+    try:
+        if job.cell.renders:
+            return job.sources.recipe(entry)
+        there = dataclasses.replace(job.sources, render=_not_now)
+        return sequence_digest(root or there.folder(entry, job.cell.case_entry.sequence))
+    except UserError:
+        return ""
 
 
 def _not_now(_: object) -> None:

@@ -54,7 +54,7 @@ class Sources:
         if entry.path is not None:
             return self._recording(entry.path)
         words = self.words(entry)
-        recipe = self._recipe(entry, words)
+        recipe = self.recipe(entry)
         folder = self.home / f"{name}-{hashlib.sha256(recipe.encode()).hexdigest()[:8]}"
         note = folder.with_name(folder.name + ".json")
         if not (note.is_file() and read_text(note) == recipe and _is_whole(folder, entry)):
@@ -84,23 +84,30 @@ class Sources:
         words = [word for name, value in overrides.items() for word in (f"--{name}", json.dumps(value))]
         return ["render", str(path), "--quiet", *few, *words]
 
+    def recipe(self, entry: SequenceEntry) -> str:
+        """What a sequence is made with: its entry, and the content of the files it names, wherever these lie.
+
+        Raises UserError, and Absent.
+        """
+        path = config_file(str(entry.config))
+        files = [path, *(self._recording(Path(file)) for file in entry.data.values())]
+        config = read_yaml(path)
+        given = config.get("trajectory") or {}
+        if "trajectory.file" not in {**entry.set, **entry.data} and given.get("file"):
+            files.append(path.parent / str(given["file"]))
+        scene = path.parent / str((config.get("scene") or {}).get("file", ""))
+        # A room of ours is made by scripts beside it, and is not there before.
+        files += sorted(scene.parent.glob("*.py")) or [scene]
+        hashes = {file.name: hashlib.sha256(read_bytes(file)).hexdigest() for file in files if file.is_file()}
+        says = entry.model_dump(mode="json", exclude_defaults=True, exclude={"group"}) | {"config": path.name}
+        return json.dumps({"sequence": says, "files": hashes}, indent=1, sort_keys=True) + "\n"
+
     def _recording(self, path: Path) -> Path:
         if self.data is None:
             raise Absent(f"{path}: is a recording: --data DIR names the folder that it lies in")
         if not (self.data / path).exists():
             raise Absent(f"{self.data / path}: is not there")
         return (self.data / path).resolve()
-
-    def _recipe(self, entry: SequenceEntry, words: Sequence[str]) -> str:
-        """What a sequence is made with: words, and the content of the files they name, wherever these lie."""
-        path = Path(words[1])
-        files = [path, *(self._recording(Path(file)) for file in entry.data.values())]
-        given = read_yaml(path).get("trajectory") or {}
-        if "trajectory.file" not in {**entry.set, **entry.data} and given.get("file"):
-            files.append(path.parent / str(given["file"]))
-        hashes = {file.name: hashlib.sha256(read_bytes(file)).hexdigest() for file in files if file.is_file()}
-        says = entry.model_dump(mode="json", exclude_defaults=True, exclude={"group"}) | {"config": path.name}
-        return json.dumps({"sequence": says, "files": hashes}, indent=1, sort_keys=True) + "\n"
 
 
 def default_cache() -> Path:

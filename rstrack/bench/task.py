@@ -20,6 +20,7 @@ from rsgen.console.progress import Progress
 from rstrack.bench.changes import changed
 from rstrack.bench.definitions import Cell
 from rstrack.bench.record import Figures
+from rstrack.bench.sequences import Sources
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.noise import NoisyImages
 from rstrack.options import Options
@@ -35,12 +36,17 @@ MEASURES: dict[str, str] = {
 
 @dataclass(frozen=True)
 class Task:
-    """One run of a cell. root: the sequence's folder. out: a folder for what is kept beside the record."""
+    """One run of a cell. sources: of its sequence. out: a folder for what is kept beside the record."""
 
     cell: Cell
     seed: int
-    root: Path
+    sources: Sources
     out: Path
+
+    @cached_property
+    def root(self) -> Path:
+        """The sequence's folder, rendered now if it is not there. Raises UserError, and Absent."""
+        return self.sources.folder(self.cell.sequence, self.cell.case_entry.sequence)
 
     @property
     def options(self) -> Options:

@@ -77,7 +77,7 @@ def _line(line: Line, points: int) -> dict[str, Any]:
         return _scatter(line.name, _short(line.x, 6), _short(line.y, 4), mode="lines+markers", marker=marker, **style)
     index = _thinned(len(line.x), points)
     x, y = broken(line.x[index], line.y[index])
-    return _scatter(line.name, _short(x, 6), _short(y, 4), mode="lines", **style)
+    return _scatter(line.name, _short(x), _short(y, 4), mode="lines", **style)
 
 
 def _scatter(name: str, x: Any, y: Any, **style: Any) -> dict[str, Any]:
@@ -91,7 +91,11 @@ def _paths(chart: PathChart, points: int) -> Figure:
     distance = 0.62 + 0.72 * float(np.linalg.norm(size))
     scene: dict[str, Any] = {
         "aspectmode": "manual", "aspectratio": dict(zip("xyz", size.tolist(), strict=True)),
-        "camera": {"eye": dict(zip("xyz", [distance * v for v in _EYE], strict=True)), "up": {"x": 0, "y": 0, "z": 1}},
+        "camera": {
+            "eye": dict(zip("xyz", [distance * v for v in _EYE], strict=True)), "up": {"x": 0, "y": 0, "z": 1},
+            # Room below for the labels of the axes.
+            "center": {"x": 0, "y": 0, "z": -0.15},
+        },
         "dragmode": "turntable",
     }  # fmt: skip
     labels = (*chart.labels[:2], f"{chart.labels[2]} (up)")
@@ -131,6 +135,6 @@ def _thinned(n: int, most: int) -> np.ndarray:
 
 
 def _short(values: FloatArray, digits: int | None = None) -> list[float | None]:
-    """Numbers for the page, NaN as None: to a tenth of a millimetre, or to so many significant digits."""
+    """Numbers for the page, NaN as None: to tenths of a millimetre or millisecond, or to so many significant digits."""
     short = (round(v, 4) if digits is None else float(f"{v:.{digits}g}") for v in np.asarray(values, float).tolist())
     return [v if np.isfinite(v) else None for v in short]

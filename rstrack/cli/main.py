@@ -14,14 +14,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from rsgen.console.command_line import Alone, Commands, Frames, Json, Parser, Quiet, run_program
 from rsgen.errors import UserError
-from rstrack.cli.bench import (
-    bench_bootstrap,
-    bench_calibration,
-    bench_convergence,
-    bench_long,
-    bench_loops,
-    bench_speed,
-)
 from rstrack.cli.benchmark import STATUS as BENCH_STATUS
 from rstrack.cli.benchmark import bench
 from rstrack.cli.calibrate import STATUS as CALIBRATE_STATUS
@@ -42,7 +34,6 @@ from rstrack.cli.options import (
 )
 from rstrack.cli.refine import refine
 from rstrack.cli.report import report
-from rstrack.cli.sensitivity import sensitivity
 from rstrack.options import Options
 
 if TYPE_CHECKING:
@@ -106,13 +97,6 @@ def _parser() -> Parser:
     add(map_eval, "lr_kt2.ply out/lr_kt2/scene.ply")
     add(keyframes, "out/table1 runs/table1 --out keyframes")
     add(bench, "--data out --out out/bench --sequence robot_t1 robot_r1 --method baseline rs-pg", BENCH_STATUS)
-    add(bench_speed, "out/lr_kt2 --frames 150 --method rs-pg")
-    add(bench_convergence, "out/lr_kt2 --pairs 50 --method rs-pg")
-    add(bench_bootstrap, "out/lr_kt2 --starts 50 --frames 20")
-    add(bench_calibration, "out/demo --starts 5 --noise-depth 1.2e-3 --noise-intensity 0.01")
-    add(bench_long, "out/demo --frames 100000 --method rs-g")
-    add(bench_loops, "out/long2 --alike 200")
-    add(sensitivity, "out/demo --method rs-pg --frames 0:60 --out sensitivity.json")
     return commands.parser
 
 

@@ -58,12 +58,12 @@ def keyframes(
 ) -> int:
     """Fuse every frame into rectified keyframes: writes a TUM RGB-D folder of them."""
     from rsgen.console.progress import ProgressDisplay
-    from rstrack.data.dataset import open_dataset
+    from rstrack.data.dataset import open_tracked
     from rstrack.data.estimate import read_estimate
     from rstrack.mapping.keyframes import write_keyframes
 
     estimate = read_estimate(run)
-    dataset = open_dataset(sequence, camera).as_seen_by(estimate.info)
+    dataset = open_tracked(sequence, run, estimate.info, camera)
     with ProgressDisplay(quiet) as progress:
         count = write_keyframes(dataset, estimate, out, sigma_px or None, progress=progress)
     print(f"{out}: {count} keyframes written")

@@ -12,15 +12,17 @@ T_color_depth (4x4) is the identity where it is left out. color.offset_s: second
 `rstrack.data.clocks.timing`; color.drift_ppm: millionths by which that grows over the recording, in whose middle it
 holds; both are what `rstrack calibrate` finds, which writes such a file. color.falloff: see `Rig`; auto: `track` finds
 it. stamps: auto, raw or regular, see there too.
-depth.registered: warped into the colour camera, see `rstrack.data.registered_rows`. calibration.yaml: see
-`rstrack.data.opencv_camera_file`; Kalibr's camchain.yaml: see `rstrack.data.kalibr_camera_file`.
+depth.registered: warped into the colour camera, see `rstrack.data.registered_rows`. depth.offset_s: seconds added to
+depth's stamps. calibration.yaml: see `rstrack.data.opencv_camera_file`; Kalibr's camchain.yaml: see
+`rstrack.data.kalibr_camera_file`. A run.json holds the cameras of its run in the same form (`camera_content`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -32,6 +34,7 @@ from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.sequence.format import DEPTH_SCALE
 from rstrack.data.clocks.timing import StampsMode
 from rstrack.data.depth_error import NONE, DepthError
+from rstrack.data.estimate import read_info
 from rstrack.data.kalibr_camera_file import Camchain, is_camchain, read_camchain
 from rstrack.data.opencv_camera_file import check_fy, extrinsic, is_opencv, read_opencv_rig
 from rstrack.data.registered_rows import DepthSensor, registered_shutter
@@ -116,6 +119,7 @@ class _DepthError(_Section):
 
 class _DepthStream(_Stream):
     depth_scale: Annotated[float, Field(ge=1, allow_inf_nan=False)] = DEPTH_SCALE
+    offset_s: Finite = 0.0
     error: _DepthError = _DepthError()
     # Warped into the colour camera; sensor: the camera it was warped from, whose lines readout_s and scan are about.
     registered: bool = False
@@ -136,11 +140,16 @@ class _CameraYaml(_Section):
 
 
 def read_rig(path: Path, color_size: Size, depth_size: Size) -> RigFile:
-    """Read a camera.yaml, a calibration.yaml or a camchain.yaml.
+    """Read a camera.yaml, a calibration.yaml, a camchain.yaml, or the cameras of a run from its run.json.
 
     color_size, depth_size: (width, height) in pixels of the first images: what a calibration.yaml may leave out.
     Raises UserError, one line, naming the file and what is missing or wrong in it.
     """
+    if path.suffix == ".json":
+        content = run_cameras(read_info(path))
+        if content is None:
+            raise UserError(f"{path}: tells no cameras: its run went by those of its sequence")
+        return _of_content(path, content)
     text = read_text(path)
     if is_opencv(text):
         rig, depth_scale = read_opencv_rig(path, text, color_size, depth_size)
@@ -148,6 +157,37 @@ def read_rig(path: Path, color_size: Size, depth_size: Size) -> RigFile:
     content = read_yaml(path)
     if is_camchain(content):
         return _of_camchain(read_camchain(path, content))
+    return _of_content(path, content)
+
+
+def run_cameras(info: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The cameras of a run whose run.json holds `info`, as a camera.yaml has them; None where it does not tell."""
+    dataset = info.get("dataset")
+    cameras = dataset.get("camera") if isinstance(dataset, dict) else None
+    return cameras if isinstance(cameras, dict) else None
+
+
+def camera_content(file: RigFile) -> dict[str, Any]:
+    """What a camera.yaml that says the same holds, but for `color.falloff`."""
+
+    def stream(camera: Camera, shutter: Shutter) -> dict[str, Any]:
+        intrinsics = [camera.fx, camera.fy, camera.cx, camera.cy]
+        lens = {"intrinsics": intrinsics, "model": camera.model, "distortion": list(camera.distortion)}
+        return {"width": camera.width, "height": camera.height} | lens | asdict(shutter)
+
+    rig = file.rig
+    offset = {} if file.color_offset_s is None else {"offset_s": file.color_offset_s}
+    return {
+        "color": stream(rig.color_camera, rig.color_shutter) | offset | {"drift_ppm": 1e6 * file.color_drift},
+        "depth": stream(rig.depth_camera, rig.depth_shutter)
+        | {"offset_s": file.depth_offset_s, "depth_scale": file.depth_scale, "error": asdict(file.depth_error)},
+        "T_color_depth": rig.T_color_depth.tolist(),
+        "stamps": file.stamps,
+    }
+
+
+def _of_content(path: Path, content: Mapping[str, Any]) -> RigFile:
+    """A camera.yaml. Raises UserError, one line, naming the file."""
     try:
         data = _CameraYaml.model_validate(content)
     except ValidationError as error:
@@ -161,7 +201,7 @@ def read_rig(path: Path, color_size: Size, depth_size: Size) -> RigFile:
         raise UserError(f"{path}: {error}") from None
     color_shutter = data.color.shutter
     try:
-        depth_shutter, depth_offset_s, notes = _depth_shutter(depth, depth_camera, color_shutter)
+        depth_shutter, late_s, notes = _depth_shutter(depth, depth_camera, color_shutter)
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
     return RigFile(
@@ -175,7 +215,7 @@ def read_rig(path: Path, color_size: Size, depth_size: Size) -> RigFile:
         ),
         DEPTH_SCALE if depth is None else depth.depth_scale,
         data.stamps,
-        depth_offset_s,
+        late_s if depth is None else late_s + depth.offset_s,
         None if data.color.offset_s == "auto" else data.color.offset_s,
         1e-6 * data.color.drift_ppm,
         any("scan" in stream.model_fields_set for stream in (data.color, depth) if stream is not None),

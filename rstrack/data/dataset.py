@@ -22,9 +22,10 @@ from rsgen.geometry.spline import Spline
 from rsgen.sequence.format import DEPTH_SCALE, StreamName
 from rsgen.sequence.reader import Sequence, read_sequence
 from rsgen.sequence.trajectory import Trajectory
-from rstrack.data.camera_file import read_rig
+from rstrack.data.camera_file import RigFile, camera_content, read_rig, run_cameras
 from rstrack.data.clocks.timing import Timing, stream_timing
 from rstrack.data.depth_error import NONE, DepthError
+from rstrack.data.estimate import INFO
 from rstrack.data.imu.files import ImuFiles, ReadImu, find_imu
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.layouts.generated import as_recorded, is_exact, with_depth_scale
@@ -34,7 +35,7 @@ from rstrack.data.noise import ImageReader
 from rstrack.data.prefetch import prefetched
 from rstrack.data.rig import Frame, Image, Rig
 
-__all__ = ["Dataset", "Frame", "Image", "Rig", "group_colors", "open_dataset"]
+__all__ = ["Dataset", "Frame", "Image", "Rig", "group_colors", "open_dataset", "open_tracked"]
 
 # Streams that are half a period apart tie, whatever the last digits of their stamps say.
 _TIE_S = 1e-6
@@ -182,6 +183,15 @@ class Dataset:
         """The same recording with its IMU as a file describes it, which is read when the IMU is asked for."""
         return self if self.imu_files is None else replace(self, imu_files=replace(self.imu_files, given=given))
 
+    @property
+    def cameras(self) -> dict[str, Any] | None:
+        """For run.json: the cameras as a camera.yaml has them; None of a generated sequence with the cameras that took
+        it, which it holds itself."""
+        if self.timing is None:
+            return None
+        clocks = self.timing.mode, self.depth_offset_s, self.timing.color_offset_s, self.color_drift
+        return camera_content(RigFile(self.rig, self.depth_scale, *clocks, depth_error=self.depth_error))
+
     def as_seen_by(self, info: dict[str, Any]) -> Dataset:
         """The same recording with colour's offset, darker corners and the IMU's description as a run had them, whose
         run.json holds `info`."""
@@ -228,6 +238,16 @@ def open_dataset(path: Path, camera_file: Path | None = None, imu_file: Path | N
     if imu_file is not None:
         _ = found.read_imu  # what was named has to be right
     return found
+
+
+def open_tracked(path: Path, run: Path, info: dict[str, Any], camera_file: Path | None = None) -> Dataset:
+    """A folder as a run saw it, whose run.json holds `info`: by the camera file that is named, else by the run's own
+    cameras, else, of runs that do not tell them, by the folder's.
+
+    Arguments as in `open_dataset`. Raises UserError.
+    """
+    recorded = None if run_cameras(info) is None else run / INFO
+    return open_dataset(path, camera_file or recorded).as_seen_by(info)
 
 
 def _seen_as(dataset: Dataset, camera_file: Path) -> Dataset:

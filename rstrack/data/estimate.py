@@ -132,12 +132,23 @@ def read_estimate(path: Path) -> Estimate:
     file = path / TRAJECTORY if is_folder else path
     poses = read_trajectory(file, format="tum", max_gap_s=math.inf)
     spline = Spline.load(path / SPLINE) if is_folder and (path / SPLINE).exists() else None
-    info = _read_info(path / INFO) if is_folder and (path / INFO).exists() else {}
+    info = read_info(path / INFO) if is_folder and (path / INFO).exists() else {}
     moving = MovingMasks.read(path) if is_folder else MovingMasks()
     try:
         return Estimate(poses.stamps, poses.T_world_cam, spline, info, moving)
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
+
+
+def read_info(path: Path) -> dict[str, Any]:
+    """What a run.json holds. Raises UserError."""
+    try:
+        info = json.loads(read_text(path))
+    except (ValueError, RecursionError):
+        raise UserError(f"{path}: is not valid JSON: run the tracker again") from None
+    if not isinstance(info, dict):
+        raise UserError(f"{path}: expected a JSON object: run the tracker again")
+    return info
 
 
 def plain(value: Any) -> Any:
@@ -151,16 +162,6 @@ def plain(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return str(value) if isinstance(value, Path) else value
-
-
-def _read_info(path: Path) -> dict[str, Any]:
-    try:
-        info = json.loads(read_text(path))
-    except (ValueError, RecursionError):
-        raise UserError(f"{path}: is not valid JSON: run the tracker again") from None
-    if not isinstance(info, dict):
-        raise UserError(f"{path}: expected a JSON object: run the tracker again")
-    return info
 
 
 def _refuse(bad: npt.NDArray[np.bool_], complaint: Any) -> None:

@@ -62,7 +62,7 @@ class DeviceFrame:
 
 
 Timer = Callable[[str], AbstractContextManager[Any]]
-"""Watches a part of the work by its name: `with timer("linear algebra: solve"):`; `bench-speed` has one that counts."""
+"""Watches a part of the work by its name: `with timer("linear algebra: solve"):`; the measure `speed` counts."""
 
 
 def untimed(_: str) -> AbstractContextManager[None]:

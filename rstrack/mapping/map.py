@@ -189,9 +189,9 @@ def run_map(
 ) -> Reconstruction:  # fmt: skip
     """Map a sequence folder with a run folder or TUM file: writes a mesh, and a point cloud where `cloud` says.
 
-    Arguments as in `reconstruct`, `read_estimate` and `rstrack.data.dataset.open_dataset`. Raises UserError.
+    Arguments as in `reconstruct`, `read_estimate` and `rstrack.data.dataset.open_tracked`. Raises UserError.
     """
-    from rstrack.data.dataset import open_dataset
+    from rstrack.data.dataset import open_tracked
 
     for path in (out, cloud):
         if path is not None and path.suffix.lower() != ".ply":
@@ -199,7 +199,7 @@ def run_map(
         if path is not None and not path.parent.is_dir():
             raise UserError(f"{path}: there is no folder {path.parent}: make it or choose another name")
     estimate = read_estimate(estimate_path)
-    dataset = open_dataset(seq_path, camera_file).as_seen_by(estimate.info)
+    dataset = open_tracked(seq_path, estimate_path, estimate.info, camera_file)
     result = reconstruct(dataset, estimate, options, progress)
     comment = f"rstrack map, world {result.world}, shutter {result.shutter}, voxels {options.voxel_m:g} m"
     write_ply(out, result.surface, comment)

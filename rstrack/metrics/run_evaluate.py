@@ -16,7 +16,7 @@ import numpy as np
 from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.trajectory import read_trajectory
-from rstrack.data.dataset import open_dataset
+from rstrack.data.dataset import open_tracked
 from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.metrics.association import Truth, truth_of
 from rstrack.metrics.clock import ClockFit, TruthOffset, fit_clock, shifted
@@ -98,6 +98,17 @@ class Evaluation:
             lines.append(f"least by {self.fit.criterion}; each error is least at, ms: {where}")
         return tuple(lines)
 
+    @property
+    def by_clock(self) -> tuple[tuple[str, Metrics], ...]:
+        """The truth's clock in words, and the errors with it: as stored, and with its offset where there is one."""
+        stored = ("truth's clock as stored", self.metrics)
+        if self.moved is None or self.offset_s is None:
+            return (stored,)
+        if self.fit is None:
+            return stored, (f"truth's clock moved, {1e3 * self.offset_s:+.1f} ms", self.moved)
+        offset = f"{1e3 * self.offset_s:+.1f} ± {1e3 * self.fit.sigma_s:.1f} ms"
+        return stored, (f"truth's clock fitted, {offset}", self.moved)
+
     def _clock(self) -> str:
         assert self.offset_s is not None
         size, side = f"{abs(1e3 * self.offset_s):.1f}", "after" if self.offset_s > 0 else "before"
@@ -156,11 +167,11 @@ def run_evaluate(
 ) -> Evaluation:  # fmt: skip
     """Evaluate a run folder or TUM file against the truth of a sequence folder, or against another TUM file.
 
-    Arguments as in `read_estimate`, `rstrack.data.dataset.open_dataset`, `evaluate_clocks` and `evaluate_extrinsics`.
+    Arguments as in `read_estimate`, `rstrack.data.dataset.open_tracked`, `evaluate_clocks` and `evaluate_extrinsics`.
     Raises UserError.
     """
-    truth = _truth(truth_path, camera_file)
     estimate = read_estimate(estimate_path)
+    truth = _truth(truth_path, estimate_path, estimate, camera_file)
     try:
         how = evaluate_clocks if truth_extrinsics is None else evaluate_extrinsics
         return how(truth, estimate, truth_offset)
@@ -171,12 +182,12 @@ def run_evaluate(
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _truth(path: Path, camera_file: Path | None) -> Truth:
+def _truth(path: Path, run: Path, estimate: Estimate, camera_file: Path | None) -> Truth:
     if Path(path).is_file():
         if camera_file is not None:
             raise UserError(f"{path}: a file of poses needs no cameras: leave the camera file {camera_file} out")
         return Truth(read_trajectory(path, max_gap_s=math.inf), np.empty(0))
-    truth = truth_of(open_dataset(path, camera_file))
+    truth = truth_of(open_tracked(path, run, estimate.info, camera_file))
     if truth is None:
         raise UserError(
             f"{path}: has no ground truth to compare with: add a groundtruth.txt, or only plot the estimate"

@@ -11,7 +11,7 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
-from rstrack.data.dataset import Dataset, open_dataset
+from rstrack.data.dataset import Dataset, open_tracked
 from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.metrics.association import Comparison, Truth, compare, truth_of
 from rstrack.metrics.clock import TruthOffset
@@ -41,6 +41,11 @@ class Tracked:
         return self.estimate.stamps, T if self.found is None else self.found.T_true_est @ T
 
     @property
+    def begin_s(self) -> float:
+        """Stamp of the first frame, s; of the first pose where the run does not tell its frames."""
+        return float(self.frames[0]["stamp"] if self.frames else self.estimate.stamps[0])
+
+    @property
     def frames(self) -> list[dict[str, Any]]:
         """The tracker's diagnostics, one dict a frame."""
         frames = self.estimate.info.get("frames")
@@ -56,13 +61,14 @@ def load_run(
     """Read a run folder and compare it with the truth of its sequence.
 
     sequence: the folder where the sequence is; by default the one that run.json names, and if that is gone there is no
-    comparison. dataset: the same, already open. truth_offset: of the truth's clock, see `run_evaluate.aligned_clock`.
-    Raises UserError: no run, a given sequence cannot be read, no such offset is found.
+    comparison. camera_file: see `rstrack.data.dataset.open_tracked`. dataset: the same, already open. truth_offset: of
+    the truth's clock, see `run_evaluate.aligned_clock`. Raises UserError: no run, a given sequence cannot be read, no
+    such offset is found.
     """
     estimate = read_estimate(run)
     notes: list[str] = []
     if dataset is None:
-        dataset = _dataset(estimate, sequence, camera_file, notes)
+        dataset = _dataset(run, estimate, sequence, camera_file, notes)
     if dataset is None:
         return Tracked(estimate, notes=tuple(notes))
     truth = truth_of(dataset)
@@ -90,9 +96,11 @@ def true_path(truth: Truth, begin: float, end: float) -> tuple[FloatArray, Float
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _dataset(estimate: Estimate, sequence: Path | None, camera_file: Path | None, notes: list[str]) -> Dataset | None:
+def _dataset(
+    run: Path, estimate: Estimate, sequence: Path | None, camera_file: Path | None, notes: list[str]
+) -> Dataset | None:
     if sequence is not None:
-        return open_dataset(sequence, camera_file).as_seen_by(estimate.info)
+        return open_tracked(sequence, run, estimate.info, camera_file)
     recorded = estimate.info.get("dataset")
     path = recorded.get("path") if isinstance(recorded, dict) else None
     if not isinstance(path, str):
@@ -100,7 +108,7 @@ def _dataset(estimate: Estimate, sequence: Path | None, camera_file: Path | None
                      "--sequence.")  # fmt: skip
         return None
     try:
-        return open_dataset(Path(path), camera_file).as_seen_by(estimate.info)
+        return open_tracked(Path(path), run, estimate.info, camera_file)
     except UserError as error:
         notes.append(f"No errors and no images: {error}. If the sequence has moved, name it with --sequence.")
         return None

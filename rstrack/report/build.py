@@ -34,7 +34,7 @@ def write_report(
     of a stress test.
 
     Returns its path. sequence: where the run's sequence is, by default where run.json says. out: the file, by default
-    report.html in the folder. camera_file: as in `open_dataset`. progress: called with a stage, the
+    report.html in the folder. camera_file: as in `open_tracked`. progress: called with a stage, the
     fraction done (0 to 1) and a note. truth_offset: of the truth's clock, as in `evaluate_clocks`; a benchmark has its
     own. Raises UserError: `folder` is none of these, something that was named cannot be read, no such offset is found,
     or the page cannot be written.

@@ -15,6 +15,7 @@
     const changed = {
       ...layout, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
       font: { color: ink, size: 12, family: getComputedStyle(document.body).fontFamily },
+      modebar: { bgcolor: "rgba(0,0,0,0)", color: color("--soft"), activecolor: ink },
       hoverlabel: { bgcolor: color("--panel"), bordercolor: line, font: { color: ink } },
     };
     for (const name of Object.keys(layout)) {

@@ -30,10 +30,15 @@ def frame_panels(tracked: Tracked, dataset: Dataset, width: int = 640) -> tuple[
     depth, low, high = colored_depth(frame.depth.pixels)
     at = f"frame {k or 0}"
     items = [
-        Picture(jpeg_uri(image.pixels, width), f"Colour, {at}, {image.stamp:.3f} s", f"colour image of {at}")
+        Picture(
+            jpeg_uri(image.pixels, width),
+            f"Colour, {at}, {image.stamp - tracked.begin_s:.3f} s",
+            f"colour image of {at}",
+        )
         for image in frame.colors
     ]
-    caption = f"Depth, {at}, {frame.depth.stamp:.3f} s: {low:.2f} m (dark) to {high:.2f} m (bright); grey: not measured"
+    t = frame.depth.stamp - tracked.begin_s
+    caption = f"Depth, {at}, {t:.3f} s: {low:.2f} m (dark) to {high:.2f} m (bright); grey: not measured"
     return (Pictures((*items, Picture(jpeg_uri(depth, width), caption, f"depth image of {at}"))),)
 
 
@@ -49,7 +54,7 @@ def shutter_sliders(tracked: Tracked, dataset: Dataset, width: int = 640) -> tup
     if k is None:
         return (Note("No frame has a colour image to compare."),)
     i = dataset.groups[k][0]
-    at = f"frame {k}, {dataset.color_stamps[i]:.3f} s"
+    at = f"frame {k}, {dataset.color_stamps[i] - tracked.begin_s:.3f} s"
     sequence = dataset.sequence
     twin = next((name for name in _TWINS if sequence is not None and name in sequence.truth_images), None)
     if sequence is not None and twin is not None:

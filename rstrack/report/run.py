@@ -14,11 +14,13 @@ from rstrack.charts.chart import Chart, PathChart
 from rstrack.charts.runs import error_charts, inlier_charts, path_chart, time_charts
 from rstrack.metrics.clock import TruthOffset
 from rstrack.metrics.evaluate import Metrics
-from rstrack.metrics.run_evaluate import evaluate_clocks
+from rstrack.metrics.run_evaluate import Evaluation, evaluate_clocks
 from rstrack.metrics.tracked import Tracked, load_run
 from rstrack.report.calibration import calibration_section, calibration_warnings
 from rstrack.report.page import Card, CardRow, Note, Page, Plot, Section
 from rstrack.report.pictures import frame_panels, shutter_sliders
+
+_AS_STORED = "table, path and curves go by the truth's clock as stored; --truth-offset auto: by the fitted one"
 
 
 def run_page(
@@ -33,20 +35,22 @@ def run_page(
         raise UserError(f"{run}: there is no truth whose clock could be moved: name its --sequence, or leave "
                         "--truth-offset out")  # fmt: skip
     info = tracked.estimate.info
-    sections, metrics, hint = [], None, None
+    sections: list[Section] = []
+    evaluation = None
     if tracked.truth is not None and (tracked.found is not None or truth_offset is not None):
         evaluation = evaluate_clocks(tracked.truth, tracked.estimate, truth_offset)
-        metrics, hint = evaluation.chosen, evaluation.hint
-        clocks = (Note(f"{line[0].upper()}{line[1:]}.") for line in evaluation.clocks)
-        sections.append(Section("errors", "Errors", (metrics.table(), *clocks, *_notes(metrics))))
+        metrics = evaluation.chosen
+        lines = (*evaluation.clocks, *([_AS_STORED] if evaluation.hint else []), *metrics.notes)
+        notes = (Note(f"{line[0].upper()}{line[1:]}.") for line in lines)
+        sections.append(Section("errors", "Errors", (metrics.table(), *notes)))
         if evaluation.asked:
             tracked = load_run(run, dataset=tracked.dataset, truth_offset=evaluation.offset_s)
     sections.append(Section("path", "Path", (Plot(path_chart({"estimated": tracked})),)))
-    if metrics is not None:
+    if evaluation is not None:
         sections.append(Section("time", "Errors over time", plots(error_charts(tracked))))
     if charts := (*inlier_charts(tracked), *time_charts(tracked)):
         sections.append(Section("tracker", "What the tracker said", plots(charts)))
-    warnings = list(tracked.notes) + ([hint] if hint else [])
+    warnings = list(tracked.notes)
     if tracked.dataset is not None:
         try:
             blocks = (*frame_panels(tracked, tracked.dataset), *shutter_sliders(tracked, tracked.dataset))
@@ -63,9 +67,9 @@ def run_page(
     return Page(
         title=f"{name or run.resolve().stem}, tracked" + (f" with {info['method']}" if "method" in info else ""),
         subtitle=_subtitle(tracked),
-        cards=(CardRow(_cards(tracked, metrics)),),
+        cards=_cards(tracked, evaluation),
         sections=tuple(sections),
-        facts=_facts(info),
+        facts=(("first frame", f"stamped {tracked.begin_s:.3f} s"), *_facts(info)),
         warnings=tuple(warnings),
     )
 
@@ -86,18 +90,21 @@ def number(value: float | None, scale: float = 1.0) -> str:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _cards(tracked: Tracked, m: Metrics | None) -> tuple[Card, ...]:
+def _cards(tracked: Tracked, evaluation: Evaluation | None) -> tuple[CardRow, ...]:
+    """A row of errors for each of the truth's clocks where there are two, and what else there is to say."""
     info = tracked.estimate.info
     frames, lost = len(tracked.frames), info.get("lost")
-    cards = []
-    if m is not None:
-        at_most = f"{number(m.ate_max_m, 1e3)} mm at most"
-        cards += [
-            Card(f"{number(m.ate_rmse_m, 1e3)} mm", "position error (ATE, RMSE)", at_most),
-            Card(f"{number(m.rpe_trans_rmse_m_per_s, 1e3)} mm/s", "drift in translation (RPE, RMSE)"),
-            Card(f"{number(m.rpe_rot_rmse_deg_per_s)} °/s", "drift in rotation (RPE, RMSE)"),
-        ]  # fmt: skip
-        cards.append(Card(f"{m.frames_tracked} of {m.frames}", "frames tracked", "" if not lost else f"{lost} lost"))
+    rows: list[CardRow] = []
+    cards: list[Card] = []
+    if evaluation is not None:
+        m, by_clock = evaluation.metrics, evaluation.by_clock
+        if len(by_clock) > 1:
+            rows = [CardRow(_errors(each), f"{clock[0].upper()}{clock[1:]}") for clock, each in by_clock]
+        else:
+            cards += _errors(m)
+        notes = [f"{lost} lost"] if lost else []
+        notes += [f"the run is of {frames}"] if 0 < frames < m.frames else []
+        cards.append(Card(f"{m.frames_tracked} of {m.frames}", "frames tracked", ", ".join(notes)))
     else:
         T = tracked.estimate.T_world_depth
         length = float(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1).sum())
@@ -106,7 +113,15 @@ def _cards(tracked: Tracked, m: Metrics | None) -> tuple[Card, ...]:
     median = _of(info, "timings").get("median_ms")
     if isinstance(median, int | float):
         cards.append(Card(f"{number(median)} ms", "to track a frame (median)"))
-    return tuple(cards)
+    return *rows, CardRow(tuple(cards))
+
+
+def _errors(m: Metrics) -> tuple[Card, ...]:
+    return (
+        Card(f"{number(m.ate_rmse_m, 1e3)} mm", "position error (ATE, RMSE)", f"{number(m.ate_max_m, 1e3)} mm at most"),
+        Card(f"{number(m.rpe_trans_rmse_m_per_s, 1e3)} mm/s", "drift in translation (RPE, RMSE)"),
+        Card(f"{number(m.rpe_rot_rmse_deg_per_s)} °/s", "drift in rotation (RPE, RMSE)"),
+    )
 
 
 def _subtitle(tracked: Tracked) -> str:
@@ -123,10 +138,6 @@ def _subtitle(tracked: Tracked) -> str:
         )  # fmt: skip
         text += f"; {shutters}"
     return text
-
-
-def _notes(metrics: Metrics) -> tuple[Note, ...]:
-    return tuple(Note(f"{note[0].upper()}{note[1:]}.") for note in metrics.notes)
 
 
 def _facts(info: dict[str, Any]) -> tuple[tuple[str, str], ...]:

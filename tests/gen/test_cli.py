@@ -138,11 +138,8 @@ def refused(capfd: pytest.CaptureFixture[str], words: str | list[str], *parts: s
         ("check-light tiny.yaml --views 0", ["--views"]),
         ("check-light tiny.yaml --spp 0", ["--spp"]),
         ("check-light nowhere.yaml", ["nowhere.yaml"]),
-        ("bench tiny.yaml --nonsense 3", ["--nonsense"]),
-        ("bench tiny.yaml --light.mode path", ["light.mode"]),
-        ("bench tiny.yaml --trajectory.file nowhere.txt", ["nowhere.txt"]),
-        ("bench tiny.yaml --frames 0", ["--frames"]),
-        ("bench tiny.yaml --spp 0", ["--spp"]),
+        ("check-light tiny.yaml --nonsense 3", ["--nonsense"]),
+        ("check-light tiny.yaml --trajectory.file nowhere.txt", ["nowhere.txt"]),
     ],
 )  # fmt: skip
 def test_wrong_words_give_one_line_and_change_nothing(
@@ -167,7 +164,7 @@ def test_wrong_inputs_give_one_line_that_names_the_file(
     assert tiny.digests(place / "seq") == before
     refused(capfd, "render tiny.yaml --out new --quiet", *parts)
     assert not (place / "new").exists()
-    refused(capfd, "bench tiny.yaml --frames 1 --spp 1", *parts)
+    refused(capfd, "check-light tiny.yaml --views 1 --spp 1 --width 8", *parts)
 
 
 @pytest.mark.parametrize("fault", SEQUENCES)
@@ -259,15 +256,12 @@ def test_a_folder_that_may_not_be_written_is_named(
 # --- what works ------------------------------------------------------------------------------------------------------
 
 
-def test_check_light_and_bench_take_the_overrides_of_render(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_check_light_takes_the_overrides_of_render(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
     (place / "motion.txt").rename("moved.txt")
     overrides = ["--trajectory.file", "moved.txt", "--light.texel_m=0.3"]
     words = ["check-light", *overrides, "tiny.yaml", "--views", "1", "--spp", "64", "--width", "24", "--out", "l.png"]
     status, out, _ = run(capfd, *words)
     assert status in (0, 1) and "PSNR" in out and Path("l.png").stat().st_size > 1000
-    words = ["bench", "tiny.yaml", *overrides, "--frames", "1", "--spp", "2", "--mode", "still", "--mode", "rs-blur"]
-    status, out, _ = run(capfd, *words)
-    assert status == 0 and "against a still" in out
 
 
 def test_overrides_may_come_in_any_order_and_the_last_one_counts(

@@ -7,7 +7,7 @@ import pytest
 from rsgen.cli.main import main
 from rsgen.config.config import describe_fields
 
-COMMANDS = ("configs", "render", "fit", "info", "verify", "compare", "preview", "check-light", "bench")
+COMMANDS = ("configs", "render", "fit", "info", "verify", "compare", "preview", "check-light")
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -19,7 +19,7 @@ def test_help_teaches(command: str, capfd: pytest.CaptureFixture[str]) -> None:
     assert f"example: rsgen {command}" in out
 
 
-@pytest.mark.parametrize("command", ["render", "check-light", "bench"])
+@pytest.mark.parametrize("command", ["render", "check-light"])
 def test_help_lists_every_field_of_the_config(command: str, capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main([command, "--help"])

@@ -13,6 +13,8 @@ from typing import Any
 import cv2
 import numpy as np
 import synthetic
+import tum_recording as tum
+import yaml
 from bench_evaluation import made_up_record
 
 from rsgen.config.truth import TruthConfig
@@ -20,6 +22,7 @@ from rsgen.files import encode_png
 from rsgen.geometry import se3
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
+from rsgen.sequence.format import pose_rows
 from rstrack.bench.measures.blur import PANELS, Panels
 from rstrack.bench.methods.config import SequenceInfo
 from rstrack.bench.methods.results import Results
@@ -137,6 +140,41 @@ def make_run(run: Path, sequence: Path, seed: int = 1, error_m: float = 0.004, *
     } | info  # fmt: skip
     write_estimate(run, stamps[kept], spline.pose(stamps[kept]), spline, info)
     return run
+
+
+EPOCH, EPOCH_FRAMES, TRUTH_OFFSET_S = 1305031453.371, 96, -0.03
+
+
+def make_epoch_run(folder: Path) -> tuple[Path, Path]:
+    """A TUM recording with stamps of 2011, whose truth is stamped 30 ms early, and a run of it: both folders.
+
+    The recording's camera file says 30 ms for both readouts; the run was told 26 (colour) and 34 (depth).
+    """
+    root, run = folder / "recording", folder / "run"
+    lens = {"width": tum.WIDTH, "height": tum.HEIGHT, "intrinsics": tum.INTRINSICS}
+    both = {name: lens | {"readout_s": 0.03} for name in ("color", "depth")}
+    tum.make_tum(root, both | {"stamps": "raw"})
+    t = np.arange(EPOCH_FRAMES) / 30.0
+    for name in ("depth", "rgb"):
+        tum.write_listing(root / f"{name}.txt", [f"{EPOCH + s:.6f} {name}/{tum.STAMPS[0]:.4f}.png" for s in t])
+    wiggle = np.random.default_rng(1).normal(size=(50, 6)) * [0.05, 0.05, 0.05, 0.06, 0.06, 0.06]
+    motion = Spline(se3.exp(wiggle), -0.5, 0.1)
+    mocap = np.arange(-0.4, 3.9, 0.01)
+    rows = np.column_stack([EPOCH + mocap + TRUTH_OFFSET_S, pose_rows(se3.orthonormalise(motion.pose(mocap)))])
+    np.savetxt(root / "groundtruth.txt", rows, fmt="%.9f")
+    other = {"color": lens | {"readout_s": 0.026}, "depth": lens | {"readout_s": 0.034}, "stamps": "raw"}
+    (folder / "other.yaml").write_text(yaml.safe_dump(other))
+    dataset = open_dataset(root, folder / "other.yaml")
+    frames = [
+        {"stamp": float(s), "inliers_depth": 0.8, "inliers_color": 0.7, "keyframe": k % 8 == 0, "lost": False}
+        for k, s in enumerate(dataset.stamps)
+    ]
+    info = {
+        "method": "rs-pg", "frames": frames, "timings": {"median_ms": 12.5, "frame_ms": [12.5] * len(frames)},
+        "dataset": {"name": dataset.name, "path": str(root), "camera": dataset.cameras},
+    }  # fmt: skip
+    write_estimate(run, dataset.stamps, se3.orthonormalise(motion.pose(t)), None, info)
+    return root, run
 
 
 def shown(value: float | None, scale: float = 1.0) -> str:

@@ -39,7 +39,7 @@ def test_every_word_on_a_shutter_has_a_source_and_numbers_have_an_error() -> Non
     names = [device.name for device in DEVICES]
     assert len(set(names)) == len(names) >= 6 and names[:8] == sorted(names[:8])
     for stream in (stream for device in DEVICES for stream in (device.depth, device.color)):
-        assert re.match(r"https://\S+$|measured\.md#", stream.source)
+        assert re.match(r"https://\S+$|notebook/calibration\.md#", stream.source)
         assert (stream.readout_s is None) == (stream.sigma_s is None)
         assert stream.kind
         if stream.readout_s is not None and stream.sigma_s is not None:

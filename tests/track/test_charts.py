@@ -20,7 +20,7 @@ from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.charts.chart import Chart, Line, PathChart, Ticks
-from rstrack.charts.runs import error_charts, inlier_charts, path_chart, run_plot
+from rstrack.charts.runs import compared_errors, error_charts, inlier_charts, path_chart, run_plot
 from rstrack.charts.to_file import write_charts
 from rstrack.charts.to_page import figure_of
 from rstrack.data.estimate import Estimate, write_estimate
@@ -92,7 +92,7 @@ def test_panels_and_their_values(drawn: Callable[..., Figure]) -> None:
         "Inliers, %",
     ]  # fmt: skip
     assert all(position.get_shared_x_axes().joined(position, axis) for axis in (rotation, frames))
-    assert frames.get_xlabel() == "time, s" and path.get_aspect() == 1.0
+    assert frames.get_xlabel() == "time since the first frame, s" and path.get_aspect() == 1.0
     np.testing.assert_allclose(line(frames, "depth")[:, 1], 100 * (0.9 - 0.3 * STAMPS))
     assert np.isnan(line(frames, "colour")[:3, 1]).all()
     ticks = {c.get_label(): [s[0, 0] for s in c.get_segments()] for c in frames.collections}
@@ -178,6 +178,29 @@ def test_both_drawers_draw_the_same_numbers(drawn: Callable[..., Figure]) -> Non
     for line, trace in zip(axes[0].lines, figure_of(paths, 1500)["data"], strict=False):
         in_space = np.array([trace["x"], trace["y"]], np.float64).T
         np.testing.assert_allclose(np.asarray(line.get_xydata(), float), in_space, atol=1e-4)
+
+
+def test_time_is_counted_from_the_first_frame_by_both_drawers(
+    drawn: Callable[..., Figure], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    epoch = 1305031453.371
+    poses = estimate()
+    run = Estimate(epoch + STAMPS, poses.T_world_depth, None, {"frames": diagnostics(epoch + STAMPS)})
+    of = Truth(Trajectory(epoch + STAMPS, SPLINE.pose(STAMPS)), epoch + STAMPS)
+    for axis in drawn(of, run).axes[1:]:
+        np.testing.assert_allclose(axis.lines[0].get_xdata(), STAMPS, atol=1e-6)
+    tracked = Tracked(run, None, of, compare(of, run))
+    path, *others = [*charts(of, run), compared_errors({"a": tracked, "b": tracked})]
+    for chart in others:
+        np.testing.assert_allclose(figure_of(chart, 1500)["data"][0]["x"], STAMPS, atol=1e-4)
+    assert all(trace["text"][-1].startswith("1.27 s") for trace in figure_of(path, 1500)["data"])
+    write_estimate(tmp_path / "run", run.stamps, run.T_world_depth, None, run.info)
+    labels: list[str] = []
+    monkeypatch.setattr(
+        "rstrack.charts.runs.write_charts", lambda charts, out, title: labels.append(charts[-1].x_label)
+    )
+    run_plot(None, tmp_path / "run", tmp_path / "a.png")
+    assert labels == ["time since the first frame at 1305031453.371 s, s"]
 
 
 def test_a_line_of_many_points_is_thinned_on_the_page() -> None:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from loop_room import FRAMES, NOISE, OPTIONS
@@ -17,7 +15,6 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.adjustment.rigid import Usual, align
-from rstrack.cli.main import main
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import read_estimate
 from rstrack.data.rig import Frame
@@ -144,36 +141,3 @@ def test_what_shows_another_place_closes_no_loop(dataset: Dataset, tracker: Trac
     wrong = close_loops(tracker, lambda k: dataset.frame((k + 7) % FRAMES))
     assert not wrong.loops and wrong.tried > 10 and sum(wrong.faults.values()) > 0.8 * wrong.tried
     assert wrong.moves is None and "none found" in wrong.text(0.0)
-
-
-def test_the_benchmark_tells_true_loops_from_false_ones(dataset: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--keyframe-distance", "0.04", "--bootstrap-frames", "3", "--backend", "llvm", "--alike", "8"]
-    assert main(["bench-loops", str(dataset.root), *arguments, "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["loops"] > 3 and found["false"] == 0 and found["worst_mm"] < 5.0
-    assert found["alike"] == 8 and found["accepted"] == 0
-
-
-def test_look_alikes_of_another_recording(
-    dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:  # fmt: skip
-    """In a mirror the room is another one; the room itself is the same place, though it is called another's."""
-    arguments = ["--keyframe-distance", "0.04", "--bootstrap-frames", "3", "--backend", "llvm", "--alike", "5"]
-    arguments += ["--frames", "0:20"]
-    accepted = {}
-    for name, other in (("itself", dataset.root), ("mirrored", mirrored(dataset.root, tmp_path / "mirrored"))):
-        assert main(["bench-loops", str(dataset.root), *arguments, "--other", str(other), "--json"]) == 0
-        found = json.loads(capsys.readouterr().out)
-        assert found["alike"] == 5 and found["other"]
-        accepted[name] = found["accepted"]
-    assert accepted["mirrored"] == 0 and accepted["itself"] >= 4
-
-
-def mirrored(root: Path, out: Path) -> Path:
-    """The recording of a room whose left is its right, by the same cameras (these see it without distortion)."""
-    shutil.copytree(root, out)
-    for path in [*out.glob("rgb/*.png"), *out.glob("depth/*.png")]:
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        assert image is not None
-        cv2.imwrite(str(path), image[:, ::-1])
-    return out

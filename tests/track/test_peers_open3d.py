@@ -1,4 +1,4 @@
-"""Open3D as a peer, with a stand-in and with Open3D itself: the rules of tracking, accuracy and speed."""
+"""Open3D as a peer, with a stand-in and with Open3D itself: the rules of tracking, and accuracy."""
 
 from __future__ import annotations
 
@@ -12,13 +12,11 @@ import numpy as np
 import pytest
 import synthetic
 
-import rstrack.bench.speed
 import rstrack.peers.open3d
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rstrack.bench.speed import MethodTimes, SpeedResult
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.estimate import Estimate, read_estimate, write_estimate
 from rstrack.data.registered import RegisteredImage
@@ -239,35 +237,3 @@ def test_a_global_shutter_sequence_is_tracked(name: str, moving: Dataset, tmp_pa
     written = read_estimate(tmp_path / "run")
     assert written.info["method"] == name and written.info["backend"].startswith("Open3D")
     assert evaluate(truth, written).ate_rmse_m == pytest.approx(metrics.ate_rmse_m, abs=1e-8)
-
-
-# --- speed -----------------------------------------------------------------------------------------------------------
-
-
-def times(method: str, ms: tuple[float, ...]) -> MethodTimes:
-    return MethodTimes(method, ms, 1.0, {"all": float(np.mean(ms))}, 1, 0)
-
-
-def test_the_speed_table_has_ratios_to_every_peer() -> None:
-    methods = (times("rs-pg", (30.0, 31.0, 29.0)), times("open3d-hybrid-keyframe", (60.0, 59.0, 80.0)))
-    report = SpeedResult("x", PLAIN, (20, 23), "llvm", 2, methods)
-    assert report.as_dict()["ratios"] == {"open3d-hybrid-keyframe": {"rs-pg": 0.5, "open3d-hybrid-keyframe": 1.0}}
-    lines = report.text().splitlines()
-    table = lines[1:-1]
-    assert len({len(line) for line in table}) == 1
-    ratio = next(line for line in table if line.startswith("times open3d-hybrid-keyframe"))
-    assert ratio.split()[-2:] == ["0.50", "1.00"]
-    assert SpeedResult("x", PLAIN, (20, 23), "llvm", 2, methods[:1]).as_dict()["ratios"] == {}
-
-
-def test_a_peer_is_timed_on_the_same_frames(moving: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rstrack.peers.open3d, "open3d", lambda: stand_in(Script([(STEP, 0.9)] * 5)))
-    fed: list[float] = []
-    feed = PeerTracker.feed
-    monkeypatch.setattr(PeerTracker, "feed", lambda self, t, image: (fed.append(t), feed(self, t, image))[1])
-    monkeypatch.setattr(rstrack.bench.speed, "_time", lambda d, o, *_: times(o.method, (2.0,) * 3))
-    options = rstrack.bench.speed.Options(method="rs-g")
-    report = rstrack.bench.speed.time_methods(moving, [options], 6, peers=["open3d-icp"])
-    assert [m.method for m in report.methods] == ["rs-g", "open3d-icp"] and fed == moving.stamps[:6].tolist()
-    peer = report.methods[1]
-    assert len(peer.frame_ms) == 3 and sum(peer.parts_ms.values()) == pytest.approx(peer.mean_ms) and peer.read_ms > 0

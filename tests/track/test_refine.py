@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from loop_room import FRAMES, OPTIONS, make_dataset, to_and_fro
 
 from rsgen.config.imu import ImuConfig
@@ -67,6 +68,19 @@ def test_refining_makes_a_run_better(run: Path, tmp_path: Path, capsys: pytest.C
     # As the run saw it.
     assert info["dataset"]["color_falloff"] == 1e-5
     assert "refined" in write_report(out).read_text()
+
+
+def test_a_run_refined_with_other_cameras_goes_by_them(run: Path, tmp_path: Path) -> None:
+    tracked = load_run(run)
+    assert tracked.dataset is not None and tracked.dataset.cameras is None
+    rig = tracked.dataset.rig
+    late = replace(rig.depth_shutter, readout_s=rig.depth_shutter.readout_s + 1e-3)
+    other = tmp_path / "other.yaml"
+    other.write_text(yaml.safe_dump(tracked.dataset.seen_with(replace(rig, depth_shutter=late)).cameras))
+    refine_run(run, tmp_path / "refined", camera_file=other, rounds=1)
+    again = load_run(tmp_path / "refined").dataset
+    assert again is not None and again.rig.depth_shutter == late and again.rig.color_shutter == rig.color_shutter
+    assert again.truth is not None and again.sequence is not None
 
 
 def with_imu(run: Path, folder: Path) -> Path:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import synthetic
+import yaml
 from report_util import (
     FRAMES,
     NASTY,
@@ -19,6 +20,7 @@ from report_util import (
     Parsed,
     global_image,
     make_bench,
+    make_epoch_run,
     make_run,
     make_sequence,
     parse,
@@ -265,6 +267,7 @@ def test_the_truths_clock_can_be_moved(sequence: Path, tmp_path: Path) -> None:
     asked = run_evaluate(sequence, tmp_path / "late.txt", truth_offset=-0.02)
     assert moved.row("ATE, mm")[1] == fixed(asked.chosen.ate_rmse_m, 3, 1e3)
     assert float(moved.row("ATE, mm")[1]) < 0.2 * float(plain.row("ATE, mm")[1])
+    assert "Truth's clock as stored" in moved.text and "Truth's clock moved, -20.0 ms" in moved.text
     assert asked.clocks and all(f"{line[0].upper()}{line[1:]}." in moved.text for line in asked.clocks)
     assert "Clocks as they are" not in plain.text
     # The curves are those of the moved clock too.
@@ -273,6 +276,41 @@ def test_the_truths_clock_can_be_moved(sequence: Path, tmp_path: Path) -> None:
     write_estimate(tmp_path / "alone", rows[:, 0], SPLINE.pose(rows[:, 0]), None, {})
     with pytest.raises(UserError, match="there is no truth whose clock could be moved"):
         write_report(tmp_path / "alone", truth_offset=0.0)
+
+
+def test_a_run_goes_by_its_own_cameras(tmp_path: Path) -> None:
+    """A recording whose camera file says otherwise, says nothing, or is told by hand; an old run goes by the folder."""
+    root, run = make_epoch_run(tmp_path)
+    told = {"color": {"width": 32, "height": 24, "intrinsics": [24.0, 25.0, 15.5, 11.5], "readout_s": 0.01}}
+    told["T_color_depth"] = se3.exp(np.array([0.2, 0.0, 0.1, 0.0, 0.0, 0.3])).tolist()  # type: ignore[assignment]
+    by_hand = tmp_path / "by_hand.yaml"
+    by_hand.write_text(yaml.safe_dump(told))
+
+    def readouts(camera: Path | None = None) -> list[str]:
+        text = parse(write_report(run, None, tmp_path / "page.html", camera)).text
+        return re.findall(r"(\d+) ms readout", text)
+
+    assert readouts() == ["26", "34"] and readouts(by_hand) == ["10", "10"]
+    ours = run_evaluate(root, run).metrics
+    # The folder's extrinsics would turn the colour camera's true poses into others for depth's.
+    (root / "camera.yaml").write_text(by_hand.read_text())
+    assert run_evaluate(root, run).metrics == ours and run_evaluate(root, run, by_hand).metrics != ours
+    (root / "camera.yaml").unlink()
+    assert readouts() == ["26", "34"] and run_evaluate(root, run).metrics == ours
+    (root / "camera.yaml").write_text(by_hand.read_text())
+    info = json.loads((run / "run.json").read_text())
+    del info["dataset"]["camera"]
+    (run / "run.json").write_text(json.dumps(info))
+    assert readouts() == ["10", "10"] and run_evaluate(root, run).metrics != ours
+
+
+def test_without_a_clock_to_fit_there_is_one_row_of_errors(report: Path, tmp_path: Path) -> None:
+    text = parse(report).text
+    assert (
+        text.count("position error (ATE, RMSE)") == 1 and "Truth's clock" not in text and "--truth-offset" not in text
+    )
+    two = parse(write_report(make_epoch_run(tmp_path)[1])).text
+    assert two.count("position error (ATE, RMSE)") == 2 and "go by the truth's clock as stored" in two
 
 
 def test_an_early_end_is_said_at_the_top(sequence: Path, tmp_path: Path) -> None:

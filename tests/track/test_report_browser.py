@@ -10,7 +10,16 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from report_util import calibration, make_bench, make_run, make_sequence, make_stress, write_calibration
+from report_util import (
+    EPOCH_FRAMES,
+    calibration,
+    make_bench,
+    make_epoch_run,
+    make_run,
+    make_sequence,
+    make_stress,
+    write_calibration,
+)
 
 from rstrack.report.build import write_report
 
@@ -110,6 +119,29 @@ def test_the_slider_moves_the_picture_by_keyboard_mouse_and_button(tab: Any, rep
     tab.mouse.move(box["x"] + 0.25 * box["width"], box["y"] + 50)
     tab.mouse.up()
     assert abs(float(slider.input_value()) - 25) <= 1
+
+
+def test_a_recordings_page_counts_from_its_first_frame_and_goes_by_the_run(tab: Any, tmp_path: Path) -> None:
+    tab.goto(write_report(make_epoch_run(tmp_path)[1]).as_uri())
+    tab.wait_for_function(DRAWN)
+    plots = tab.locator("#time .plot, #tracker .plot")
+    length_s = (EPOCH_FRAMES - 1) / 30
+    assert plots.count() == 6
+    for k in range(plots.count()):
+        heading = plots.nth(k).get_attribute("aria-label")
+        x, seen = plots.nth(k).evaluate("e => [e.data[0].x, e._fullLayout.xaxis.range]")
+        wanted = length_s - (1.0 if heading.startswith("Drift") else 0.0)
+        assert len(set(x)) > 60 and (x[0], x[-1]) == pytest.approx((0.0, wanted), abs=1e-3), heading
+        assert -0.5 < seen[0] <= 0.0 and wanted - 1e-3 <= seen[1] < wanted + 0.5, heading
+    assert tab.locator("#facts dd").first.text_content() == "stamped 1305031453.371 s"
+    assert "colour 32×24, 26 ms readout and depth 32×24, 34 ms readout" in tab.locator(".subtitle").text_content()
+    clocks = tab.locator("h2.row").all_text_contents()
+    assert clocks[0] == "Truth's clock as stored" and clocks[1].startswith("Truth's clock fitted, -30.0 ± ")
+    cards = tab.locator(".card", has_text="position error")
+    assert cards.count() == 2 and all(cards.nth(k).is_visible() for k in range(2))
+    sizes = cards.locator(".value").evaluate_all("all => all.map(e => getComputedStyle(e).fontSize)")
+    stored_mm, fitted_mm = (float(text.split()[0]) for text in cards.locator(".value").all_text_contents())
+    assert sizes[0] == sizes[1] and fitted_mm < 0.1 * stored_mm
 
 
 def test_the_path_is_drawn_in_3d_and_can_be_turned(tab: Any, report: Path) -> None:

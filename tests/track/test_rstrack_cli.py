@@ -13,13 +13,11 @@ import pytest
 import synthetic
 from rstrack_command import FRAMES, make_seq, read_info, refused, run
 
-import rstrack.alignment.normal_equations
-from rstrack.bench.speed import Stopwatch
 from rstrack.cli.main import main
 from rstrack.data.estimate import read_estimate
 from rstrack.options import METHODS, Options
 
-COMMANDS = ("track", "evaluate", "plot", "info", "bench-speed")
+COMMANDS = ("track", "evaluate", "plot", "info")
 
 
 @pytest.fixture(scope="module")
@@ -102,9 +100,6 @@ def test_every_option_of_the_tracker_is_explained(capfd: pytest.CaptureFixture[s
         ("plot seq run --out run/run.json/p.png", ["run.json/p.png"]),
         ("plot seq run --out p.docx", ["p.docx"]),
         ("info run/run.json", ["run.json"]),
-        ("bench-speed seq --frames 0", ["--frames", "0"]),
-        ("bench-speed seq --frames 1", ["seq", "2 frames"]),
-        ("bench-speed seq --method fast", ["fast"]),
     ],
 )  # fmt: skip
 def test_what_is_given_wrongly_is_named_in_one_line(
@@ -124,7 +119,7 @@ def test_a_run_folder_holds_the_trajectory_and_what_made_it(place: Path, origina
     chosen = Options(fuse=True, knot_spacing_s=0.025, loops="end")
     assert info["options"] == dataclasses.asdict(chosen) and info["method"] == "rs-pg"
     where = str((original / "seq").resolve())
-    frames = {"frames": [0, FRAMES], "frames_in_all": FRAMES, "color_falloff": 0.0}
+    frames = {"frames": [0, FRAMES], "frames_in_all": FRAMES, "color_falloff": 0.0, "camera": None}
     assert info["dataset"] == {"name": "synthetic", "path": where, **frames}
     assert set(info["versions"]) == {"rstrack", "numpy", "scipy", "drjit"} and info["backend"] in ("llvm", "cuda")
     assert (info["end"], info["error"], info["lost"]) == ("done", None, 0) and info["keyframes"] >= 1
@@ -224,39 +219,3 @@ def test_garbage_is_no_run(content: str, place: Path, capfd: pytest.CaptureFixtu
 def test_a_broken_run_json_is_named(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
     Path("run/run.json").write_text("{")
     refused(capfd, "evaluate seq run", "run.json", "JSON")
-
-
-# --- speed -----------------------------------------------------------------------------------------------------------
-
-
-def test_the_speed_benchmark_accounts_for_all_time(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    solve = rstrack.alignment.normal_equations.solve
-    status, out, _ = run(capfd, "bench-speed seq --frames 12 --method rs-pg --method rs-g --json")
-    report = json.loads(out)
-    assert status == 0 and report["frames"] == [6, 12] and report["depth_size"] == [160, 120]
-    for method in ("rs-pg", "rs-g"):
-        times = report["methods"][method]
-        parts = times["parts_ms"]
-        assert sum(parts.values()) == pytest.approx(times["mean_ms"])
-        needed = {f"geometric kernel, level {level}" for level in range(2)} | {"preparing images", "poses of lines"}
-        needed |= {f"linear algebra: {what}" for what in ("chain", "assemble", "solve")}
-        assert needed <= set(parts) and all(parts[name] > 0 for name in needed)
-        assert ("photometric kernel, level 0" in parts) == (method == "rs-pg")
-        assert parts["other"] < 0.5 * times["mean_ms"] and times["read_ms"] > 0
-    assert rstrack.alignment.normal_equations.solve is solve
-
-
-def test_the_speed_table(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    status, out, error = run(capfd, "bench-speed seq --frames 8 --method gs-g --method baseline")
-    lines = out.splitlines()
-    assert status == 0 and "frames 4 to 7" in lines[0] and lines[1].split() == ["ms", "a", "frame", "gs-g", "baseline"]
-    median = next(line for line in lines if line.startswith("median"))
-    assert all(float(word) > 0 for word in median.split()[1:]) and "baseline 100 %" in error
-
-
-def test_a_stopwatch_counts_an_inner_part_once() -> None:
-    now = iter([0.0, 1.0, 4.0, 10.0])
-    watch = Stopwatch(clock=lambda: next(now))
-    with watch.timed("outer"), watch.timed("inner"):
-        pass
-    assert watch.seconds == {"inner": 3.0, "outer": 7.0}

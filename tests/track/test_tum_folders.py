@@ -26,8 +26,11 @@ from tum_recording import (
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.shutter import Shutter
-from rstrack.data.dataset import open_dataset
+from rstrack.data.dataset import open_dataset, open_tracked
+from rstrack.data.estimate import read_estimate, write_estimate
 from rstrack.data.image_files import repeated
+from rstrack.options import Options
+from rstrack.tracking.runs.record import Noise, settings
 
 
 def test_tum_folder_with_colour_only_in_camera_yaml(tmp_path: Path) -> None:
@@ -106,6 +109,50 @@ def jittered_tum(root: Path, **camera: Any) -> tuple[np.ndarray, np.ndarray]:
         stamps = times + rng.uniform(0.0, 4e-3, 40)
         write_listing(root / f"{name}.txt", [f"{t:.6f} {name}/{STAMPS[0]:.4f}.png" for t in stamps])
     return depth, color
+
+
+def test_a_run_json_opens_the_folder_as_the_run_saw_it(tmp_path: Path) -> None:
+    """Readouts, lenses, extrinsics, clocks, depth's scale and error, and offsets of registered depth, to the bit."""
+    lens = {"model": "radtan", "distortion": [0.1, -0.05, 0.001, 0.002], "scan": "bottom-top", "exposure_s": 0.004}
+    sensor = {"width": 64, "height": 48, "intrinsics": [48.0, 50.0, 31.0, 23.0]}
+    moved = se3.exp(np.array([0.05, 0.01, 0.0, 0.02, -0.01, 0.03])).tolist()
+    error = {"offset_m": 0.01, "inverse_offset": 0.02, "radial": -0.01}
+    asked: list[dict[str, Any]] = [
+        {"depth": COLOR | lens | {"depth_scale": 1000, "error": error}, "T_color_depth": moved, "stamps": "regular"},
+        {"depth": REGISTERED | {"sensor": sensor}, "stamps": "raw"},
+        {"depth": REGISTERED | {"readout_s": 0.0, "offset_s": 0.003}, "color": COLOR | {"drift_ppm": 900.0}},
+        {},
+    ]
+    for k, camera in enumerate(asked):
+        root, run = tmp_path / f"tum{k}", tmp_path / f"run{k}"
+        jittered_tum(root, **camera)
+        (root / "groundtruth.txt").write_text("".join(f"{t:.4f} {t - STAMPS[0]} 0 0 0 0 0 1\n" for t in STAMPS))
+        seen = open_dataset(root)
+        info = settings(seen, range(40), Options(), Noise())
+        write_estimate(run, STAMPS, np.tile(np.eye(4), (4, 1, 1)), None, info)
+        write_camera(root, {"color": COLOR | {"readout_s": 0.001, "offset_s": 0.5}})
+        again = open_tracked(root, run, read_estimate(run).info)
+        assert again.rig.depth_camera == seen.rig.depth_camera and again.rig.depth_shutter == seen.rig.depth_shutter
+        assert again.rig.color_camera == seen.rig.color_camera and again.rig.color_shutter == seen.rig.color_shutter
+        assert again.rig.is_registered == seen.rig.is_registered and again.depth_error == seen.depth_error
+        np.testing.assert_allclose(again.rig.T_color_depth, seen.rig.T_color_depth, atol=1e-15)
+        np.testing.assert_array_equal(again.stamps, seen.stamps)
+        np.testing.assert_allclose(again.color_stamps, seen.color_stamps, rtol=0, atol=1e-6)
+        np.testing.assert_array_equal(again.depth(0), seen.depth(0))
+        assert again.truth_poses is not None and seen.truth_poses is not None
+        np.testing.assert_allclose(again.truth_poses.T_world_cam, seen.truth_poses.T_world_cam, atol=1e-12)
+        named = open_tracked(root, run, info, root / "camera.yaml")
+        assert named.rig.color_shutter.readout_s == 0.001 and named.rig != seen.rig
+        del info["dataset"]["camera"]
+        assert open_tracked(root, run, info).rig.color_shutter.readout_s == 0.001
+    write_estimate(run, STAMPS, np.tile(np.eye(4), (4, 1, 1)), None, info)
+    with pytest.raises(UserError, match=r"run\.json: tells no cameras"):
+        open_dataset(root, run / "run.json")
+    write_estimate(
+        run, STAMPS, np.tile(np.eye(4), (4, 1, 1)), None, {"dataset": {"camera": {"color": COLOR | {"x": 1}}}}
+    )
+    with pytest.raises(UserError, match=r"run\.json: color\.x: no such entry"):
+        open_tracked(root, run, read_estimate(run).info)
 
 
 def test_arrival_times_are_straightened_and_colour_is_shifted_and_grouped(tmp_path: Path) -> None:

@@ -14,6 +14,8 @@ import numpy as np
 
 from rsgen.array_types import ByteArray, Float32Array, FloatArray
 from rsgen.errors import UserError
+from rsgen.geometry import se3
+from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rstrack.bench.changes.edits import reduced, reordered, with_color, with_depth, with_shutter, with_stamps
 from rstrack.data.dataset import Dataset
@@ -57,6 +59,32 @@ def readout_told(dataset: Dataset, shift_s: float = 0.0, factor: float = 1.0) ->
         return max(0.0, factor * readout_s + shift_s) if readout_s > 0.0 else 0.0
 
     return with_shutter(dataset, told, told)
+
+
+def camera_told(
+    dataset: Dataset, *, focal: float = 1.0, cx_px: float = 0.0, cy_px: float = 0.0, readout_ms: float = 0.0,
+    rotation_deg: float = 0.0, undistorted: bool = False, color_ms: float = 0.0,
+) -> Dataset:  # fmt: skip
+    """What the camera file says of both cameras is wrong by that much.
+
+    focal: factor of focal lengths. cx_px, cy_px: added to principal points. readout_ms: added to readouts, as
+    `readout_told` does. rotation_deg: the colour camera is told turned about its own y axis. undistorted: no lens
+    distortion is told. color_ms: added to colour stamps. Raises UserError: a registered recording, whose two cameras
+    are one, told turned; a focal length that is not positive.
+    """
+
+    def told(camera: Camera) -> Camera:
+        moved = replace(camera, fx=focal * camera.fx, fy=focal * camera.fy, cx=camera.cx + cx_px, cy=camera.cy + cy_px)
+        return replace(moved, model="pinhole", distortion=()) if undistorted else moved
+
+    rig = dataset.rig
+    if rotation_deg and rig.is_registered:
+        raise UserError(f"{dataset.name}: depth is registered: no rotation between its cameras could be told wrongly")
+    T_told_color = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, np.radians(rotation_deg), 0.0]))
+    cameras = replace(rig, depth_camera=told(rig.depth_camera), color_camera=told(rig.color_camera))
+    T_color_depth = T_told_color @ rig.T_color_depth if rotation_deg else rig.T_color_depth
+    made = readout_told(replace(dataset, rig=replace(cameras, T_color_depth=T_color_depth)), shift_s=1e-3 * readout_ms)
+    return color_late(made, 1e-3 * color_ms) if color_ms else made
 
 
 def depth_told_global(dataset: Dataset) -> Dataset:
@@ -127,8 +155,8 @@ def every(dataset: Dataset, nth: int) -> Dataset:
 CHANGES: dict[str, Callable[..., Dataset]] = {
     change.__name__: change
     for change in (
-        color_late, jittered, readout_told, depth_told_global, depth_in_blocks, darkened, flashed, swinging_gain,
-        depth_scaled, depth_to, every, reduced, color_told_sharp,
+        color_late, jittered, readout_told, camera_told, depth_told_global, depth_in_blocks, darkened, flashed,
+        swinging_gain, depth_scaled, depth_to, every, reduced, color_told_sharp,
     )
 }  # fmt: skip
 """What can be done, by name; each is a pure function of a dataset and its arguments."""

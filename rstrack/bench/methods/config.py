@@ -22,7 +22,7 @@ from rstrack.bench.methods.variants import fuses, method_of, variants
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.metrics.association import truth_of
 from rstrack.metrics.clock import TruthOffset
-from rstrack.options import METHODS, Options
+from rstrack.options import METHODS, PEERS, Options
 
 Config = TypeVar("Config", bound=BaseModel)
 
@@ -105,7 +105,8 @@ def make_plan(
 ) -> Plan:  # fmt: skip
     """Look the sequences up in the folder `data` and list the cells; what is given beats what `quick` says.
 
-    sequences, methods: names, none: all of the config; methods may name ours and all peers. peers: all of these too.
+    sequences, methods: names, none: all of the config; methods may name ours and all peers. peers: all of these too,
+    or those that can be timed.
     Each of our methods is run with and without fusion, unless options.fuse says which or it is not errors that are
     measured. added: results of other trackers by name, each a folder with SEQUENCE.txt (TUM) or SEQUENCE/ (a run
     folder). commands: other trackers by name, see `rstrack.peers.command`. truth_offset: of the truth's clock. Raises
@@ -120,7 +121,8 @@ def make_plan(
             raise UserError(f"--sequence {name}: the config has no such sequence: it has {', '.join(config.sequences)}")
     asked = sequences or (subset.sequences if subset else tuple(config.sequences))
     entries = {name: entry for name, entry in config.sequences.items() if name in asked}
-    chosen = chosen_methods(methods or (subset.methods if subset else config.methods), peers)
+    more = (OTHERS if measure == "track" else PEERS) if peers else ()
+    chosen = chosen_methods(methods or (subset.methods if subset else config.methods), more)
     for option, name in (*(("--add", name) for name in added), *(("--peer-command", name) for name in commands)):
         if name in (*chosen, *METHODS, *OTHERS) or (option == "--peer-command" and name in added):
             raise UserError(f"{option} {name}=...: there is a method of that name: choose another name")
@@ -148,13 +150,13 @@ def make_plan(
     return Plan(Benchmark(tuple(cells)), tuple(infos), tuple(run))
 
 
-def chosen_methods(methods: Sequence[str], peers: bool = False) -> list[str]:
-    """The methods, each once, and all peers if asked for. Raises UserError for one that there is not."""
+def chosen_methods(methods: Sequence[str], more: Sequence[str]) -> list[str]:
+    """The methods, each once, and more behind them. Raises UserError for one that there is not."""
     chosen = list(dict.fromkeys(methods))
     for method in chosen:
         if method not in (*METHODS, *OTHERS):
             raise UserError(f"no method '{method}': choose from {', '.join((*METHODS, *OTHERS))}")
-    return chosen + [peer for peer in OTHERS if peers and peer not in chosen]
+    return chosen + [peer for peer in more if peer not in chosen]
 
 
 def method_entry(name: str, options: Options) -> MethodEntry:

@@ -105,6 +105,7 @@ def _zed2(title: str, lines: int, line_s: float) -> Device:
 
 
 _REALSENSE, _SUPPORT = "https://github.com/realsenseai", "maker's support"
+_KINECT_V1 = "notebook/calibration.md#a-kinects-readouts-fr1_rpy-070-080"
 _OAK = "https://docs.luxonis.com/hardware/products/OAK-D%20S2.md"
 _GEMINI_305 = "https://wiki.seeedstudio.com/orbbec_gemini305/"
 
@@ -126,8 +127,8 @@ DEVICES = (
     ),
     Device(
         "kinect-v1", "Kinect of 2010, 640×480, 30 Hz",
-        Stream("rolling", "measured by this project on one of them", "measured.md#o-calibration", 0.0339, 2e-3),
-        Stream("rolling", "measured by this project on one of them", "measured.md#o-calibration", 0.0263, 2e-3),
+        Stream("rolling", "measured by this project on one of them", _KINECT_V1, 0.0339, 2e-3),
+        Stream("rolling", "measured by this project on one of them", _KINECT_V1, 0.0263, 2e-3),
     ),
     Device(
         "oak-d-s2", "Luxonis OAK-D S2", _global("maker's documentation", _OAK),

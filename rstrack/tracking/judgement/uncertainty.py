@@ -19,7 +19,7 @@ from rsgen.geometry import se3
 from rstrack.alignment.priors import ACCELERATION, VELOCITY
 
 # Systematic error of a pose in pixels of the depth camera, σ: steps not taken to the end, interpolation, knots.
-# Measured on hand-held renderings with noise (docs/measured.md).
+# Measured on hand-held renderings with noise (docs/notebook/hand-held.md).
 SYSTEMATIC_PX = 0.01
 # σ (m, rad) above which a pose is not known.
 _WORST = np.array([0.02, np.radians(2.0)])

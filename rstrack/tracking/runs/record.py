@@ -57,7 +57,7 @@ def settings(dataset: Dataset, chosen: range, options: Options, noise: Noise) ->
         "dataset": {
             "name": dataset.name, "path": str(dataset.root.resolve()),
             "frames": [chosen.start, chosen.stop], "frames_in_all": len(dataset),
-            "color_falloff": dataset.rig.color_falloff, **notes,
+            "color_falloff": dataset.rig.color_falloff, "camera": dataset.cameras, **notes,
         },
     }  # fmt: skip
 

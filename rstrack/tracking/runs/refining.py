@@ -112,6 +112,8 @@ def refine_run(
     told = [asdict(r) for r in done]
     seconds = time.perf_counter() - begin
     info = estimate.info | {"refined": {"of": str(run.resolve()), "rounds": told, "seconds": seconds}}
+    if isinstance(recorded := info.get("dataset"), dict):
+        info["dataset"] = recorded | {"camera": dataset.cameras}
     poses = se3.orthonormalise(moved @ estimate.T_world_depth)
     imu = _NOT_LOOKED_AT if options.inertial else ""
     if refiner.unit is not None and refiner.found is not None:

@@ -1,0 +1,123 @@
+"""Where ours is not the best: every case and error in which a peer, or the paper, beats `rs-pg`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from benchmarks.cells import is_others, sequence_of
+from benchmarks.shown import ERRORS, Records, of_measure
+from rsgen.console.tables import Entry, Table, significant
+from rstrack.bench.methods import paper
+from rstrack.bench.record import Record
+
+OURS = "rs-pg"
+_PAPER = {"ate_mm": ("ate_m", 1e3), "drift_mm_s": ("rpe_m_s", 1e3), "drift_deg_s": ("rpe_deg_s", 1.0)}
+
+
+@dataclass(frozen=True)
+class Beaten:
+    """On one case, in one error: ours, None where it has none at all, and the best of the others. lost: its frames."""
+
+    case: str
+    figure: str
+    ours: float | None
+    theirs: float
+    who: str
+    lost: int = 0
+
+    def text(self) -> str:
+        """'ours > theirs (who)'."""
+        lost = f", {self.lost} frames lost" if self.lost else ""
+        ours = "lost" if self.ours is None else significant(self.ours)
+        return f"{ours} > {significant(self.theirs)} ({self.who}{lost})"
+
+
+def beaten(full: Records) -> list[Beaten]:
+    """All of them, in the order of the cases. The paper's best method counts, on its own recording of that name."""
+    tracks = of_measure(full, "track")
+    out = []
+    for ours in (record for record in tracks if record.method == OURS):
+        peers = [record for record in tracks if record.case == ours.case and is_others(record)]
+        for name in ERRORS:
+            found = [*_of_peers(peers, name), *_of_paper(ours, name)]
+            own = ours.figures.get(name)
+            best = min(found, key=lambda item: item[0], default=None)
+            if best is not None and (own is None or best[0] < own):
+                out.append(Beaten(ours.case, name, own, *best))
+    return out
+
+
+def compared(full: Records) -> int:
+    """Cases of `rs-pg` that there is a peer or the paper for."""
+    tracks = of_measure(full, "track")
+    others = {record.case for record in tracks if is_others(record)}
+    return sum(r.method == OURS and (r.case in others or bool(_of_paper(r, "ate_mm"))) for r in tracks)
+
+
+def slower(full: Records) -> list[Record]:
+    """Cells of the measure `speed` of our methods that take longer than the peer beside them."""
+    timed = [record for record in of_measure(full, "speed") if not is_others(record)]
+    return [record for record in timed if record.figures.get("ratio", 0.0) > 1.0]
+
+
+def beaten_table(found: Sequence[Beaten]) -> Table:
+    """A row for each case."""
+    cases = list(dict.fromkeys(each.case for each in found))
+    texts = {(each.case, each.figure): each.text() for each in found}
+    rows: list[tuple[Entry | str, ...]] = [(case, *(texts.get((case, name), "") for name in ERRORS)) for case in cases]
+    return Table(("case", "ATE, mm", "mm/s", "deg/s"), tuple(rows))
+
+
+def sentences(full: Records) -> str:
+    """One to three sentences, with the figures; empty where nothing was measured beside others."""
+    found, cases = beaten(full), compared(full)
+    if not cases:
+        return ""
+    parts = []
+    if not found:
+        parts.append(f"In the {cases} cases that others were measured on, or the paper, `rs-pg` has the least errors.")
+    else:
+        by = ", ".join(f"{who} {count}" for who, count in Counter(each.who for each in found).most_common())
+        known = [each for each in found if each.ours is not None]
+        parts.append(
+            f"**Where ours is not the best:** others beat `rs-pg` in {len(found)} of {3 * cases} errors (ATE, mm/s and "
+            f"deg/s of {cases} cases): {by}."
+        )
+        if known:
+            worst = max(known, key=lambda each: (each.ours or 0.0) / each.theirs)
+            unit = {"ate_mm": "mm of ATE", "drift_mm_s": "mm/s", "drift_deg_s": "deg/s"}[worst.figure]
+            parts.append(
+                f"Furthest behind it is on {worst.case}: {significant(worst.ours)} {unit}, {worst.who} "
+                f"{significant(worst.theirs)}."
+            )
+    slow, timed = slower(full), [r for r in of_measure(full, "speed") if "ratio" in r.figures]
+    if slow:
+        most = max(slow, key=lambda record: record.figures["ratio"])
+        parts.append(
+            f"In {len(slow)} of {len(timed)} timings a frame takes longer than {peer_of(most)}'s, up to "
+            f"{most.figures['ratio']:.2f} times as long ({most.method} on {most.case})."
+        )
+    return " ".join(parts)
+
+
+def peer_of(record: Record) -> str:
+    """Whose times a cell of `speed` has beside its own."""
+    settings = record.settings.get("settings") or {}
+    return str(settings.get("peer", "the peer"))
+
+
+def _of_peers(peers: Sequence[Record], name: str) -> list[tuple[float, str, int]]:
+    return [(r.figures[name], r.method, round(r.total("lost"))) for r in peers if name in r.figures]
+
+
+def _of_paper(ours: Record, name: str) -> list[tuple[float, str, int]]:
+    if ours.case != sequence_of(ours):  # its figures are of whole sequences
+        return []
+    field, scale = _PAPER[name]
+    return [
+        (scale * getattr(figures, field), "the paper", 0)
+        for (sequence, _), figures in paper.FIGURES.items()
+        if sequence == ours.case
+    ]

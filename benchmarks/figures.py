@@ -1,0 +1,149 @@
+"""What the figures of records are: title, unit, which way is better, and on what scale they are compared.
+
+figure = figure_of("ate_mm")
+print(figure.title, figure.unit, figure.better)         # ATE mm less
+
+This table is the one place where that is said. A name that it does not have is shown, and never judged.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from functools import cache
+from typing import Literal
+
+Better = Literal["less", "more", "nominal", "unjudged"]
+Scale = Literal["log", "linear", "count"]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """pattern: of names, * allowed. better: which way, or near `nominal`. scale: of its scatter and its differences.
+
+    outright: the first one is worse, whatever chance does, where there was none. is_time: of the machine as well.
+    """
+
+    pattern: str
+    title: str
+    unit: str
+    better: Better
+    scale: Scale
+    nominal: float = 0.0
+    outright: bool = False
+    is_time: bool = False
+
+    @property
+    def is_judged(self) -> bool:
+        """Whether it can get worse."""
+        return self.better != "unjudged"
+
+    def on_scale(self, value: float) -> float | None:
+        """The value as it is compared; None: it has no logarithm."""
+        if self.scale != "log":
+            return value
+        return math.log(value) if value > 0.0 else None
+
+    def badness(self, values: Sequence[float]) -> float:
+        """How bad the mean of some values, of this scale, is: more is worse."""
+        mean = math.fsum(values) / len(values)
+        if self.better == "nominal":
+            return abs(mean - (math.log(self.nominal) if self.scale == "log" else self.nominal))
+        return -mean if self.better == "more" else mean
+
+
+FIGURES: tuple[Figure, ...] = (
+    # The measure `track`.
+    Figure("ate_mm", "ATE", "mm", "less", "log"),
+    Figure("ate_max_mm", "largest error", "mm", "less", "log"),
+    Figure("drift_mm_s", "drift", "mm/s", "less", "log"),
+    Figure("drift_deg_s", "drift", "deg/s", "less", "log"),
+    Figure("line_mm", "error of a line", "mm", "less", "log"),
+    Figure("line_deg", "error of a line", "deg", "less", "log"),
+    Figure("nees", "NEES/6", "", "nominal", "log", nominal=1.0),
+    Figure("coverage_90", "within 90 %", "", "nominal", "linear", nominal=0.9),
+    Figure("silent", "silently wrong", "frames", "less", "count", outright=True),
+    Figure("lost", "lost", "frames", "less", "count"),
+    Figure("frames", "frames", "", "unjudged", "count"),
+    Figure("keyframes", "keyframes", "", "unjudged", "count"),
+    Figure("truth_offset_ms", "truth's clock", "ms", "unjudged", "linear"),
+    # `faults`, one run a fault.
+    Figure("silent_fault", "silently wrong", "faults", "less", "count", outright=True),
+    Figure("found_in_5", "found in 5 frames", "faults", "more", "count"),
+    Figure("place_known", "place known", "faults", "unjudged", "count"),
+    Figure("worst_mm", "worst", "mm", "less", "log"),
+    Figure("worst_deg", "worst", "deg", "less", "log"),
+    Figure("kind", "kind", "", "unjudged", "count"),
+    # `loops`: a false one ruins a map.
+    Figure("false*", "false", "loops", "less", "count", outright=True),
+    Figure("accepted", "look-alikes taken for one", "pairs", "less", "count", outright=True),
+    Figure("median_mrad", "median", "mrad", "less", "log"),
+    # Times of the machine, and ratios of times of one run, of which a machine's speed falls out.
+    Figure("ratio", "ratio", "", "less", "log"),
+    Figure("ratio_*", "", "", "less", "log"),
+    Figure("*_ratio", "", "", "less", "log"),
+    Figure("*_msamples_s", "", "Msamples/s", "unjudged", "log"),
+    Figure("median_ms", "median", "ms", "unjudged", "log", is_time=True),
+    Figure("mean_ms", "mean", "ms", "unjudged", "log", is_time=True),
+    Figure("p95_ms", "95 %", "ms", "unjudged", "log", is_time=True),
+    Figure("p99_ms", "99 %", "ms", "unjudged", "log", is_time=True),
+    Figure("*_ms", "", "ms", "unjudged", "log", is_time=True),
+    Figure("*_deg_s", "", "deg/s", "less", "log"),
+    Figure("*_mm_s", "", "mm/s", "less", "log"),
+    Figure("*_s", "", "s", "unjudged", "log", is_time=True),
+    # Memory: what a process ran before moves its peak; what a long run adds is judged.
+    Figure("peak_mb", "peak memory", "MB", "unjudged", "log"),
+    Figure("growth_mb", "growth", "MB", "less", "linear"),
+    Figure("*_mb", "memory", "MB", "unjudged", "log"),
+    # Light: decibels are logarithms already, and a bias has a sign.
+    Figure("psnr_db", "PSNR", "dB", "more", "linear"),
+    Figure("psnr_least_db", "least PSNR", "dB", "more", "linear"),
+    Figure("surely_least_db", "surely, least", "dB", "more", "linear"),
+    Figure("*_db", "", "dB", "more", "linear"),
+    Figure("bias_pct", "bias", "%", "nominal", "linear"),
+    # Shares of what was tried.
+    Figure("converged_pct*", "converged", "%", "more", "linear"),
+    Figure("found_pct*", "found", "%", "more", "linear"),
+    Figure("lost_pct*", "lost", "%", "less", "linear"),
+    Figure("wrong_pct*", "wrong", "%", "less", "linear"),
+    Figure("within_2_sigma_pct*", "within 2 σ", "%", "nominal", "linear", nominal=95.45),
+    Figure("rms_over_sigma*", "RMS over σ", "", "nominal", "log", nominal=1.0),
+    # Numbers of trials.
+    Figure("wrong*", "wrong", "", "less", "count", outright=True),
+    Figure("failed", "failed", "starts", "less", "count"),
+    Figure("broken", "broken down", "starts", "less", "count"),
+    Figure("over_*_mm", "", "starts", "less", "count"),
+    Figure("not_converged_*", "", "", "less", "count"),
+    Figure("refused_*", "", "", "unjudged", "count"),
+    Figure("lost_last", "lost of the last", "frames", "less", "count"),
+    # All other errors, at multiples of a distance too (median_error_mm_2x).
+    Figure("*_mm", "", "mm", "less", "log"),
+    Figure("*_deg", "", "deg", "less", "log"),
+    Figure("*_mm_*x", "", "mm", "less", "log"),
+    Figure("*_deg_*x", "", "deg", "less", "log"),
+    Figure("*_ms_*x", "", "ms", "less", "log"),
+)
+
+_IN_NAMES = {"%": "pct", "dB": "db", "MB": "mb", "Msamples/s": "msamples_s"}
+
+
+@cache
+def figure_of(name: str) -> Figure:
+    """The entry that a name matches first; one without unit that is not judged, where there is none."""
+    return next(
+        (figure for figure in FIGURES if fnmatchcase(name, figure.pattern)), Figure(name, "", "", "unjudged", "linear")
+    )
+
+
+def heading(name: str) -> str:
+    """A table's heading: title and unit."""
+    figure = figure_of(name)
+    words = figure.title
+    if figure.pattern != name or not words:
+        # The unit in the name, wherever it stands.
+        in_name = _IN_NAMES.get(figure.unit, figure.unit.replace("/", "_"))
+        words = f"_{name}_".replace(f"_{in_name}_", "_", 1) if in_name else name
+        words = words.strip("_").replace("_", " ")
+    return f"{words}, {figure.unit}" if figure.unit else words

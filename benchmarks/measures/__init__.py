@@ -1,0 +1,12 @@
+"""Measures beside those of `rstrack.bench.task`, by name: 'package.module:function', a function of a task."""
+
+MEASURES: dict[str, str] = {
+    "bootstrap": "benchmarks.measures.bootstrap:bootstrap_cell",
+    "calibration": "benchmarks.measures.calibration:calibration_cell",
+    "convergence": "benchmarks.measures.convergence:convergence_cell",
+    "faults": "benchmarks.measures.faults:fault_cell",
+    "light": "benchmarks.measures.light:light_cell",
+    "long": "benchmarks.measures.long:long_cell",
+    "loops": "benchmarks.measures.loops:loops_cell",
+    "render": "benchmarks.measures.render:render_cell",
+}

@@ -1,0 +1,294 @@
+"""The sections of docs/results.md, each from records alone: a heading, a table, a line about it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from importlib import import_module
+
+from benchmarks.beaten import beaten, beaten_table, peer_of, sentences
+from benchmarks.cells import group_of, is_change, is_others, methods_in_order, options_of, program_of, sequence_of
+from benchmarks.shown import (
+    ERRORS,
+    Records,
+    averages,
+    by_case,
+    by_sequence,
+    cases_of,
+    cell_text,
+    joined,
+    measured_table,
+    of_group,
+    of_measure,
+    paper_triple,
+    sequences_of,
+    triple,
+)
+from rsgen.console.tables import NOTHING, Entry, Table, best_marked, significant
+from rstrack.bench.record import Record
+
+PAPERS_GROUPS = ("hand-held", "living room")
+_IMU = ("rs-pgi", "rs-gi")
+_COLUMNS: dict[str, tuple[str, ...]] = {
+    "speed": ("median_ms", "p95_ms", "p99_ms", "ratio", "ratio_p95", "ratio_p99", "peer_ms", "read_ms", "lost"),
+    "loops": ("keyframes", "loops", "false", "alike", "accepted", "median_mm", "median_mrad", "worst_mm", "nees"),
+    "calibration": (
+        "found_pct*", "not_converged*+", "refused*+", "wrong*+", "within_2_sigma_pct", "rms_over_sigma",
+        "calibration_s",
+    ),
+    "convergence": ("converged_pct*", "wrong*+", "starts", "failed", "silent", "ate_mm", "ate_max_mm"),
+    "light": (
+        "psnr_db", "psnr_least_db", "surely_least_db", "bias_pct", "estimate_db", "bake_s", "bake_mb", "*_s", "*_ratio"
+    ),
+    "long": ("frames", "median_second_ms", "median_last_ms", "ratio", "lost", "keyframes", "peak_mb", "growth_mb"),
+}  # fmt: skip
+"""Of each measure, what is shown of its figures; of one that is not here, or has none of them, the first ten."""
+
+
+def methods(full: Records) -> list[str]:
+    """Averages of the two groups that the paper has, all methods: a row a method."""
+    lines = ["## Methods", ""]
+    groups = {group: of_group(full, group) for group in PAPERS_GROUPS}
+    for group, records in groups.items():
+        lines.append(f"{group}: averages over {', '.join(cases_of(records)) or 'nothing yet'}.")
+    every = [record for records in groups.values() for record in records]
+    columns = [_averages(records, methods_in_order(every)) for records in groups.values()]
+    head = ("ATE, mm", "mm/s", "deg/s", "the paper", "lost", "silent", "NEES/6", "in 90 %")
+    rows = [(method, *(entry for column in columns for entry in column[method])) for method in methods_in_order(every)]
+    named = [f"{group}: {head[0]}" for group in PAPERS_GROUPS]
+    table = Table(("method", named[0], *head[1:], named[1], *head[1:]), tuple(rows))
+    return [*lines, "", *_table(table, every), ""]
+
+
+def per_sequence(full: Records) -> list[str]:
+    """ATE of every method on every sequence of these groups."""
+    records = [record for group in PAPERS_GROUPS for record in of_group(full, group)]
+    return ["## ATE by sequence, mm", "", *_table(by_sequence(records), records), ""]
+
+
+def real(full: Records) -> list[str]:
+    """Recordings: all methods and peers, errors with the truth's clock fitted."""
+    records = of_group(full, "real", changes=True)
+    plain = [record for record in records if not is_change(record)]
+    found = {(record.method, record.case): record for record in records}
+    cases = cases_of(records)
+    rows: list[tuple[Entry | str, ...]] = []
+    for method in methods_in_order(records):
+        cells = [found.get((method, case)) for case in cases]
+        texts = [NOTHING if c is None else triple(c.figures, "†" if c.total("lost") else "") for c in cells]
+        mine = [record for record in records if record.method == method]
+        silent = sum(round(record.total("silent")) for record in mine)
+        lost = sum(round(record.total("lost")) for record in mine)
+        frames = sum(round(record.total("frames")) for record in mine)
+        rows.append((method, *map(Entry, texts), f"{lost} of {frames}", str(silent)))
+    table = Table(("method", *cases, "lost", "silently wrong"), tuple(rows))
+    clocks = [
+        f"{record.case} {significant(record.figures['truth_offset_ms'])}"
+        for record in plain
+        if record.method == "rs-pg" and "truth_offset_ms" in record.figures
+    ]
+    about = f" Offsets with `rs-pg`, ms: {', '.join(clocks)}." if clocks else ""
+    head = ["## Real recordings: ATE mm · mm/s · deg/s", ""]
+    told = f"The truth has a clock of its own, which is fitted for each track.{about}"
+    return [*head, told, "", *_table(table, records), ""]
+
+
+def imu(full: Records) -> list[str]:
+    """With an IMU and without: averages of groups, and the cases of no group above."""
+    tracks = [record for record in of_measure(full, "track") if _is_close(record)]
+    return ["## With an IMU: ATE mm · mm/s · deg/s", "", *_beside(tracks, lambda r: program_of(r) in _IMU), ""]
+
+
+def loops(full: Records) -> list[str]:
+    """With loops closed and without, and how true loops are."""
+    tracks = of_measure(full, "track")
+    closing = {record.method: program_of(record) for record in tracks if "loops" in options_of(record)}
+    shown = [record for record in tracks if record.method in {*closing, *closing.values()}]
+    lines = ["## Loops closed, and not: ATE mm · mm/s · deg/s", ""]
+    lines += [*_beside(shown, lambda record: record.method in closing), ""]
+    found = of_measure(full, "loops")
+    return [*lines, "Loops against the truth, and places that look alike:", "", *_measured(found, "loops"), ""]
+
+
+def faults(full: Records) -> list[str]:
+    """Injected faults, those of a kind together."""
+    lines = ["## Faults", ""]
+    records = of_measure(full, "faults")
+    names = _kinds()
+    for method in methods_in_order(records):
+        runs = [run for record in records if record.method == method for run in record.runs]
+        kinds = list(dict.fromkeys(run.get("kind") for run in runs))
+        rows: list[tuple[Entry | str, ...]] = [
+            (_kind(kind, names), *_fault_entries([run for run in runs if run.get("kind") == kind]))
+            for kind in sorted(kinds, key=lambda kind: -1.0 if kind is None else float(kind))
+        ]
+        rows.append(("all", *_fault_entries(runs)))
+        head = ("kind", "faults", "silently wrong", "frames of these", "lost frames", "found in 5", "worst, mm")
+        cases = ", ".join(cases_of([record for record in records if record.method == method]))
+        lines += [f"`{method}`, one fault a run, on {cases}:", "", Table(head, tuple(rows)).markdown(), ""]
+    return lines if records else [*lines, NOTHING, ""]
+
+
+def changes(full: Records) -> list[str]:
+    """What may be wrong with a recording, beside the same as it is."""
+    tracks = [record for record in of_measure(full, "track") if group_of(record) != "real"]
+    changed = [record for record in tracks if is_change(record)]
+    bases = {sequence_of(record) for record in changed}
+    records = [r for r in tracks if r.case in bases and any(c.method == r.method for c in changed)] + changed
+    places = list(dict.fromkeys(map(sequence_of, records)))
+    records.sort(key=lambda record: places.index(sequence_of(record)))
+    table = by_case(records, triples=True)
+    return ["## What may be wrong: ATE mm · mm/s · deg/s", "", *_table(table, records), ""]
+
+
+def readout(full: Records) -> list[str]:
+    """Error against readout."""
+    records = [record for record in of_measure(full, "track") if record.case.startswith("readout-")]
+    return ["## Readout: ATE, mm", "", *_table(by_case(records), records), ""]
+
+
+def others(full: Records) -> list[str]:
+    """Sequences of no group above."""
+    shown = {*PAPERS_GROUPS, "real", ""}
+    tracks = of_measure(full, "track")
+    records = [record for record in tracks if group_of(record) not in shown and not is_change(record)]
+    return ["## Other sequences: ATE, mm", "", *_table(by_case(records), records), ""]
+
+
+def speed(full: Records) -> list[str]:
+    """Times, and ratios to the peer's in the same run."""
+    records = of_measure(full, "speed")
+    peers = ", ".join(dict.fromkeys(peer_of(record) for record in records))
+    title = f"## Speed, ms a frame; ratios to {peers}, in turns on the same frames" if records else "## Speed"
+    return [title, "", *_measured(records, "speed"), ""]
+
+
+def memory(full: Records) -> list[str]:
+    """Most memory of a track, by method and group."""
+    tracks = [record for record in of_measure(full, "track") if record.values("peak_mb")]
+    shown = methods_in_order(tracks)
+    found = {average.method: average for average in averages(tracks)}
+    row: tuple[Entry | str, ...] = ("most", *(Entry(f"{found[method].peak_mb or 0:.0f}") for method in shown))
+    about = "## Memory, MB: the process with all it holds, most of all tracks"
+    return [about, "", *_table(Table(("", *shown), (row,)), tracks), ""]
+
+
+def convergence(full: Records) -> list[str]:
+    """How far off a frame may start, and how well tracks begin anywhere."""
+    records = joined([*of_measure(full, "convergence"), *of_measure(full, "bootstrap")])
+    return ["## Convergence and start", "", *_measured(records, "convergence"), ""]
+
+
+def light(full: Records) -> list[str]:
+    """Baked light against path tracing by room, and what a picture takes."""
+    records = joined([*of_measure(full, "light"), *of_measure(full, "render")])
+    return ["## Light and rendering", "", *_measured(records, "light"), ""]
+
+
+def measured(measure: str, title: str) -> Callable[[Records], list[str]]:
+    """The section of a measure."""
+
+    def section(full: Records) -> list[str]:
+        return [f"## {title}", "", *_measured(of_measure(full, measure), measure), ""]
+
+    return section
+
+
+def gate(records: Records) -> list[str]:
+    """What guards every change, with what chance does to it."""
+    tracks = of_measure(records, "track")
+    found = {(record.case, record.method): record for record in tracks}
+    cases = cases_of(tracks)
+    rows = [(m, *(_with_scatter(found.get((case, m))) for case in cases)) for m in methods_in_order(tracks)]
+    about = "## The gate: ATE, mm, and what chance does to one run (moderated)"
+    return [about, "", *_table(Table(("method", *cases), tuple(rows)), tracks), ""]
+
+
+def not_the_best(full: Records) -> list[str]:
+    """In words and figures."""
+    found = beaten(full)
+    words = sentences(full) or "Nothing is measured beside others yet."
+    table = ["", "`rs-pg` > the best of the others:", "", beaten_table(found).markdown()] if found else []
+    return ["## Where ours is not the best", "", words, *table, ""]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _averages(records: Sequence[Record], shown: Sequence[str]) -> dict[str, list[Entry | str]]:
+    """Of each method: errors, the paper's, counts, and how true its covariances are."""
+    found = {average.method: average for average in averages(records)}
+    errors = []
+    for name in ERRORS:
+        values = [found[method].figures.get(name) if method in found else None for method in shown]
+        marks = [found[method].mark if method in found and name == "ate_mm" else "" for method in shown]
+        entries = [Entry(significant(v), mark=mark) for v, mark in zip(values, marks, strict=True)]
+        errors.append(best_marked(entries, values))
+    out: dict[str, list[Entry | str]] = {}
+    for k, method in enumerate(shown):
+        mine = next((record for record in records if record.method == method), None)
+        if mine is None:
+            out[method] = [NOTHING, NOTHING, NOTHING, "", *[NOTHING] * 4]
+            continue
+        average = found[method]
+        theirs = "" if is_others(mine) else paper_triple(sequences_of(records), program_of(mine))
+        silent = NOTHING if average.silent is None else str(average.silent)
+        told = significant(average.figures.get("nees")), significant(average.figures.get("coverage_90"), 2)
+        out[method] = [*(column[k] for column in errors), theirs, str(average.lost), silent, *told]
+    return out
+
+
+def _beside(tracks: Sequence[Record], chosen: Callable[[Record], bool]) -> list[str]:
+    """Averages of groups, over the cases that the chosen methods ran on."""
+    methods = methods_in_order(tracks)
+    rows: list[tuple[Entry | str, ...]] = []
+    for group in dict.fromkeys(group_of(record) for record in tracks if not is_change(record)):
+        cases = {r.case for r in tracks if group_of(r) == group and chosen(r) and not is_change(r)}
+        means = {average.method: average for average in averages([r for r in tracks if r.case in cases])}
+        texts = [triple(means[m].figures, means[m].mark) if m in means else NOTHING for m in methods]
+        rows += [(group or "others", *map(Entry, texts))] if cases else []
+    return _table(Table(("average of", *methods), tuple(rows)), tracks if rows else ())
+
+
+def _is_close(record: Record) -> bool:
+    """Whether it is with an IMU, or the same without."""
+    plain = [program.removesuffix("i") for program in _IMU]
+    return not is_others(record) and program_of(record) in (*_IMU, *plain) and "fuse" not in options_of(record)
+
+
+def _fault_entries(runs: Sequence[dict[str, float | None]]) -> list[Entry]:
+    def values(name: str) -> list[float]:
+        return [value for run in runs if (value := run.get(name)) is not None]
+
+    found, worst = values("found_in_5"), values("worst_mm")
+    wrong = values("silent_fault") or [float(value > 0) for value in values("silent")]
+    texts = [str(len(runs)), f"{sum(wrong):.0f}", f"{sum(values('silent')):.0f}", f"{sum(values('lost')):.0f}"]
+    texts += [f"{sum(found):.0f} of {len(found)}" if found else NOTHING, significant(max(worst, default=None))]
+    return [Entry(text) for text in texts]
+
+
+def _kinds() -> list[str]:
+    try:
+        return list(import_module("benchmarks.faults.faults").KINDS)
+    except (ImportError, AttributeError):
+        return []
+
+
+def _kind(kind: float | None, names: Sequence[str]) -> str:
+    if kind is None:
+        return "any"
+    return names[int(kind)] if int(kind) < len(names) else f"kind {kind:g}"
+
+
+def _with_scatter(record: Record | None) -> str:
+    if record is None:
+        return NOTHING
+    scatter, _ = record.scatter.get("ate_mm", (0.0, 0.0))
+    return cell_text(record, "ate_mm") + (f" ± {significant(scatter, 2, 100.0)} %" if scatter else "")
+
+
+def _measured(records: Sequence[Record], measure: str) -> list[str]:
+    return _table(measured_table(records, _COLUMNS.get(measure, ())), records)
+
+
+def _table(table: Table, records: Sequence[Record]) -> list[str]:
+    return [table.markdown()] if records else [NOTHING]

@@ -1,0 +1,189 @@
+"""Writes what the committed records say: docs/results.md, the README's block, docs/readout.png.
+
+python -m benchmarks.show              # writes them
+python -m benchmarks.show --check      # 1 where the texts differ from what the records say
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+
+from benchmarks import sections
+from benchmarks.beaten import sentences
+from benchmarks.cells import is_others, methods_in_order, program_of
+from benchmarks.pictures import draw_readout
+from benchmarks.shown import Records, averages, closes_loops, is_default, of_group, paper_triple, sequences_of, triple
+from rsgen.console.tables import Entry, Table
+from rsgen.errors import UserError
+from rsgen.files import atomic_write, read_text
+from rstrack.bench.record import read_records
+
+ROOT = Path(__file__).parents[1]
+GATE, FULL = (ROOT / "benchmarks/results" / f"{tier}.json" for tier in ("gate", "full"))
+RESULTS, README, READOUT = ROOT / "docs/results.md", ROOT / "README.md", ROOT / "docs/readout.png"
+BEGIN, END = "<!-- results:begin (python -m benchmarks.show writes this) -->", "<!-- results:end -->"
+_BEGIN = "<!-- results:begin"
+_ABOUT = """\
+Written by `python -m benchmarks.show` from the records in `benchmarks/results`: change nothing here. How to measure it
+again is in [its README](../benchmarks/README.md), what was learnt on the way in [the notebook](notebook/README.md)."""
+_PAPERS = (
+    "The paper's figures are of its own recordings and renderings of such motions: compare the orders, not the digits."
+)
+_WORDS = f"""\
+ATE and drift over a second are RMSE, means over seeds; counts are sums. † frames were lost; silent: frames given, not
+lost, though 20 mm or 2° off. NEES/6 is 1 where errors are as large as the covariances say, and 90 % should lie in 90 %.
+{_PAPERS}"""
+_WHAT = {
+    "rs-pg": "rolling shutter, depth and colour",
+    "rs-g": "rolling shutter, depth",
+    "rs-p": "rolling shutter, colour",
+    "rs-pgi": "rolling shutter, depth, colour, IMU",
+    "rs-gi": "rolling shutter, depth, IMU",
+    "gs-pg": "global shutter, depth and colour",
+    "gs-g": "global shutter, depth",
+    "gs-p": "global shutter, colour",
+    "baseline": "one pose a frame, depth",
+    "open3d-icp": "Open3D, point-to-plane, to the frame before",
+    "open3d-hybrid": "Open3D, hybrid, to the frame before",
+    "open3d-icp-keyframe": "Open3D, point-to-plane, to a keyframe",
+    "open3d-hybrid-keyframe": "Open3D, hybrid, to a keyframe",
+    "kiss-icp": "lidar odometry",
+    "small-gicp": "lidar odometry",
+    "orb-slam3": "SLAM with loops, depth and colour",
+}
+
+
+def results_markdown(gate: Records, full: Records) -> str:
+    """All of docs/results.md. Cells that are not measured show '-'."""
+    parts = (
+        sections.methods, sections.per_sequence, sections.real, sections.not_the_best, sections.imu, sections.loops,
+        sections.faults, sections.changes, sections.readout, sections.others, sections.speed,
+        sections.measured("calibration", "Calibration"), sections.convergence, sections.light, sections.memory,
+        sections.measured("long", "Long runs"),
+    )  # fmt: skip
+    lines = [
+        "# Results", "", _ABOUT, "", *_provenance("Full tier", full), *_provenance("Gate", gate), *_absent(full),
+        *_absent(gate), "", _WORDS, "", *(line for part in parts for line in part(full)), *sections.gate(gate),
+    ]  # fmt: skip
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def readme_block(full: Records) -> str:
+    """The README's table with its sentences, without the markers."""
+    groups = {name: of_group(full, name) for name in (*sections.PAPERS_GROUPS, "real")}
+    every = [record for records in groups.values() for record in records]
+    shown = [record for record in every if is_default(record) or closes_loops(record)]
+    means = {name: {a.method: a for a in averages(records)} for name, records in groups.items()}
+    rows = []
+    for method in methods_in_order(shown):
+        record = next(record for record in shown if record.method == method)
+        cells: list[Entry | str] = [_what(method, program_of(record), closes_loops(record))]
+        for name, records in groups.items():
+            average = means[name].get(method)
+            cells.append(Entry("-" if average is None else triple(average.figures, average.mark)))
+            if name != "real":
+                is_papers = is_default(record) and not is_others(record)
+                cells.append(paper_triple(sequences_of(records), method) if is_papers else "")
+        rows.append((method, *cells))
+    head = ("method", "what it does", "hand-held", "the paper", "living room", "the paper", "real recordings")
+    table = Table(head, tuple(rows), words=(0, 1)).markdown() if rows else "-"
+    told = {name: ", ".join(sequences_of(records)) or "nothing yet" for name, records in groups.items()}
+    loops = sorted({record.method for record in shown if closes_loops(record)})
+    but = f", and closed in the end in {' and '.join(f'`{method}`' for method in loops)}" if loops else ""
+    words = sentences(full)
+    return "\n".join([
+        f"Averages over sequences: hand-held (blurred, noisy, unregistered: {told['hand-held']}),",
+        f"living room (noise-free: {told['living room']}), real recordings ({told['real']}, the truth's clock fitted).",
+        "Cells are ATE in mm · drift in mm/s · drift in degrees/s, all RMSE. † frames were lost; (n of m) has so many.",
+        "", table, "", _PAPERS,
+        f"Settings are defaults; loops are off{but}. `rstrack track` closes them in the end unless told otherwise.",
+        *_provenance("Measured", full), *([words] if words else []),
+        "Every sequence, recording and measure is in [docs/results.md](docs/results.md).",
+    ])  # fmt: skip
+
+
+def with_block(readme: str, block: str) -> str:
+    """The README with another block between its markers. Raises UserError: it has none."""
+    head, begin, rest = readme.partition(_BEGIN)
+    _, end, tail = rest.partition(END)
+    if not begin or not end:
+        raise UserError(f"README.md: has no lines '{BEGIN}' and '{END}': put them around the results")
+    return f"{head}{BEGIN}\n{block.strip()}\n{END}{tail}"
+
+
+def documents(gate: Records, full: Records) -> dict[Path, str]:
+    """Every text that shows records, as it should be. Raises UserError."""
+    return {
+        RESULTS: results_markdown(gate, full),
+        README: with_block(read_text(README), readme_block(full)),
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if given not in ([], ["--check"]):
+        print("usage: python -m benchmarks.show [--check]", file=sys.stderr)
+        return 2
+    try:
+        gate, full = (read_records(path) if path.is_file() else {} for path in (GATE, FULL))
+        if not gate and not full:
+            raise UserError(f"{GATE.parent}: has no records: make them with './run.sh bench gate --accept'")
+        wanted = documents(gate, full)
+        stale = [path for path, text in wanted.items() if not path.is_file() or read_text(path) != text]
+        if given:
+            for path in stale:
+                print(f"{path.relative_to(ROOT)}: is not what the records say: run 'python -m benchmarks.show'")
+            return int(bool(stale))
+        for path in stale:
+            atomic_write(path, wanted[path].encode())
+        drawn = [READOUT] if draw_readout(full, READOUT) else []
+        print("written: " + (", ".join(str(path.relative_to(ROOT)) for path in (*stale, *drawn)) or "nothing new"))
+    except UserError as error:
+        print(f"show: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _what(method: str, program: str, with_loops: bool) -> str:
+    """What a row's method does, in a few words."""
+    said = _WHAT.get(program, "")
+    return f"{said}, loops closed" if with_loops and method != program else said
+
+
+def _provenance(tier: str, records: Records) -> list[str]:
+    """A line: version, commit, dates, machine, how many cells."""
+    if not records:
+        return [f"{tier}: not measured yet."]
+    made = list(records.values())
+
+    def each(values: list[str]) -> str:
+        return ", ".join(dict.fromkeys(value for value in values if value)) or "?"
+
+    dates = sorted({record.date[:10] for record in made if record.date})
+    when = " to ".join(dict.fromkeys((dates[0], dates[-1]))) if dates else "?"
+    machines = each([f"{r.machine.get('cpu', '?')}, {r.machine.get('cores', '?')} cores" for r in made if r.machine])
+    load = max(float(record.machine.get("load") or 0.0) for record in made)
+    return [
+        f"{tier}: version {each([r.version for r in made])}, commit {each([r.commit or '' for r in made])}, {when}; "
+        f"{machines}, load before at most {load:.3g}; {len(made)} cells."
+    ]
+
+
+def _absent(records: Records) -> list[str]:
+    """Lines of what was skipped or has failed, and why."""
+    missing: dict[str, list[str]] = defaultdict(list)
+    for record in records.values():
+        if record.error is not None:
+            missing[f"{'Skipped' if record.skipped else 'Failed'} ({record.error})"].append(record.cell)
+    return [f"{why}: {', '.join(cells)}." for why, cells in missing.items()]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,200 @@
+"""Records as the tables show them: triples of errors, averages over groups, methods' rows."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+
+from benchmarks.cells import (
+    group_of,
+    is_change,
+    is_done,
+    is_others,
+    methods_in_order,
+    options_of,
+    program_of,
+    sequence_of,
+)
+from benchmarks.figures import heading
+from rsgen.console.tables import NOTHING, Entry, Table, best_marked, significant
+from rstrack.bench.methods import paper
+from rstrack.bench.record import Record
+
+Records = Mapping[str, Record]
+ERRORS = ("ate_mm", "drift_mm_s", "drift_deg_s")
+"""Shown together, in this order: mm · mm/s · deg/s."""
+_DOT = " · "
+_NUMBERED = re.compile(r"(\D+)(\d*)")
+_SIDE_BY_SIDE, _MOST_COLUMNS = 12, 10
+
+
+@dataclass(frozen=True)
+class Average:
+    """Of one method over the cases of a group that it has figures of: `cases` of `of`. Counts are sums of all runs."""
+
+    method: str
+    figures: dict[str, float]
+    cases: int
+    of: int
+    lost: int
+    frames: int
+    silent: int | None
+    peak_mb: float | None
+
+    @property
+    def mark(self) -> str:
+        """† for lost frames, and how many cases there are figures of where it is not all."""
+        few = f" ({self.cases} of {self.of})" if 0 < self.cases < self.of else ""
+        return ("†" if self.lost else "") + few
+
+
+def of_measure(records: Records, measure: str) -> list[Record]:
+    """Finished ones, by their names, numbers in these in their order."""
+    found = [record for record in records.values() if record.measure == measure and is_done(record)]
+    return sorted(found, key=lambda record: [(text, int(n or -1)) for text, n in _NUMBERED.findall(record.cell)])
+
+
+def of_group(records: Records, group: str, changes: bool = False) -> list[Record]:
+    """Tracks of a group of sequences, as they are."""
+    tracks = of_measure(records, "track")
+    return [record for record in tracks if group_of(record) == group and (changes or not is_change(record))]
+
+
+def cases_of(records: Iterable[Record]) -> list[str]:
+    """Their cases."""
+    return list(dict.fromkeys(record.case for record in records))
+
+
+def averages(records: Sequence[Record]) -> list[Average]:
+    """Of each method, over cases."""
+    cases = cases_of(records)
+    out = []
+    for method in methods_in_order(records):
+        mine = [record for record in records if record.method == method]
+        names = dict.fromkeys(name for record in mine for name in record.figures)
+        means = {}
+        for name in names:
+            values = [record.figures[name] for record in mine if name in record.figures]
+            means[name] = math.fsum(values) / len(values)
+        totals = {name: round(math.fsum(r.total(name) for r in mine)) for name in ("lost", "frames", "silent")}
+        has_truth = sum("ate_mm" in record.figures for record in mine)
+        silent = totals["silent"] if any(record.values("silent") for record in mine) else None
+        peak = max((value for record in mine for value in record.values("peak_mb")), default=None)
+        out.append(Average(method, means, has_truth, len(cases), totals["lost"], totals["frames"], silent, peak))
+    return out
+
+
+def triple(figures: Mapping[str, float], mark: str = "") -> str:
+    """'mm · mm/s · deg/s', a dash where there is nothing at all."""
+    values = [significant(figures.get(name)) for name in ERRORS]
+    return NOTHING if set(values) == {NOTHING} else _DOT.join(values) + mark
+
+
+def paper_triple(sequences: Sequence[str], method: str) -> str:
+    """The paper's averages, empty where it has none."""
+    theirs = paper.average(sequences, method) if sequences else None
+    if theirs is None:
+        return ""
+    return triple({name: getattr(theirs, name) for name in ERRORS})
+
+
+def sequences_of(records: Iterable[Record]) -> list[str]:
+    """Of some cells, each once."""
+    return list(dict.fromkeys(sequence_of(record) for record in records))
+
+
+def cell_text(record: Record | None, name: str) -> str:
+    """A figure of one cell: † where frames were lost, 'lost' where nothing could be compared."""
+    if record is None or not is_done(record):
+        return NOTHING
+    value = record.figures.get(name)
+    if value is None:
+        return "lost" if record.total("lost") else NOTHING
+    return significant(value) + ("†" if record.total("lost") else "")
+
+
+def by_sequence(records: Sequence[Record], name: str = "ate_mm") -> Table:
+    """A row for each method, a column for each case."""
+    cases, found = cases_of(records), {(r.method, r.case): r for r in records}
+    methods = methods_in_order(records)
+    columns = []
+    for case in cases:
+        cells = [found.get((method, case)) for method in methods]
+        values = [None if cell is None else cell.figures.get(name) for cell in cells]
+        columns.append(best_marked([Entry(cell_text(cell, name)) for cell in cells], values))
+    rows: list[tuple[Entry | str, ...]] = [
+        (method, *(column[k] for column in columns)) for k, method in enumerate(methods)
+    ]
+    return Table(("method", *cases), tuple(rows))
+
+
+def by_case(records: Sequence[Record], triples: bool = False) -> Table:
+    """A row for each case, a column for each method; side by side where there is one method alone."""
+    cases, found = cases_of(records), {(r.method, r.case): r for r in records}
+    methods = methods_in_order(records)
+    rows: list[tuple[Entry | str, ...]] = []
+    for case in cases:
+        cells = [found.get((method, case)) for method in methods]
+        if triples:
+            texts = [NOTHING if c is None else triple(c.figures, "†" if c.total("lost") else "") for c in cells]
+        else:
+            texts = [cell_text(cell, "ate_mm") for cell in cells]
+        rows.append((case, *map(Entry, texts)))
+    if len(methods) > 1 or len(rows) < _SIDE_BY_SIDE:
+        return Table(("case", *methods), tuple(rows))
+    half = -(-len(rows) // 2)
+    beside = [*(tuple((f"`{case}`", *entries)) for case, *entries in rows[half:]), ("", "")]
+    both = tuple((*left, *right) for left, right in zip(rows[:half], beside, strict=False))
+    return Table(("case", *methods, "case", *methods), both, words=(0, 2))
+
+
+def measured_table(records: Sequence[Record], patterns: Sequence[str]) -> Table:
+    """A row for each cell, a column for each figure that matches one of the patterns; 'x*+': the sum of those."""
+    names = list(dict.fromkeys(name for record in records for name in record.figures if name != "peak_mb"))
+    columns: dict[str, list[str]] = {}
+    for pattern in patterns:
+        matching = [name for name in names if fnmatchcase(name, pattern.removesuffix("+"))]
+        if pattern.endswith("+") and matching:
+            columns[pattern.removesuffix("+").rstrip("*_").replace("_", " ")] = matching
+        else:
+            columns |= {heading(name): [name] for name in matching}
+    columns = columns or {heading(name): [name] for name in names[:_MOST_COLUMNS]}
+    are_many = len({record.method for record in records}) > 1
+    rows: list[tuple[Entry | str, ...]] = []
+    for record in records:
+        figures = record.figures
+        values = [[figures[name] for name in of if name in figures] for of in columns.values()]
+        entries = [Entry(plainly(math.fsum(v)) if v else NOTHING) for v in values]
+        rows.append((f"{record.case} {record.method}" if are_many else record.case, *entries))
+    first = "case" if are_many or not records else f"case ({records[0].method})"
+    return Table((first, *columns), tuple(rows))
+
+
+def joined(records: Sequence[Record]) -> list[Record]:
+    """Cells of several measures on the same case and method as one."""
+    figures: dict[tuple[str, str], dict[str, float | None]] = {}
+    first: dict[tuple[str, str], Record] = {}
+    for record in records:
+        place = record.case, record.method
+        first.setdefault(place, record)
+        figures[place] = {**figures.get(place, {}), **record.figures}
+    return [dataclasses.replace(first[place], seeds=(0,), runs=(figures[place],)) for place in first]
+
+
+def plainly(value: float) -> str:
+    """Whole numbers as they are, others to three digits."""
+    return f"{value:.0f}" if value == round(value) else significant(value)
+
+
+def is_default(record: Record) -> bool:
+    """Whether a method of ours is its own name's, or a peer."""
+    return is_others(record) or (record.method == program_of(record) and not options_of(record))
+
+
+def closes_loops(record: Record) -> bool:
+    """Whether it is one of ours as `rstrack track` has it by default: loops closed at the end, all else as ever."""
+    return not is_others(record) and options_of(record) == {"loops": "end"}

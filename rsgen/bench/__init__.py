@@ -1,1 +1,0 @@
-"""Timings of the generator against other ways to render the same frame."""

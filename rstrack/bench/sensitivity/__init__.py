@@ -1,1 +1,0 @@
-"""`rstrack sensitivity`: what wrong stamps, cameras, images and frames do to a track."""

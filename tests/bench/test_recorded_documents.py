@@ -1,0 +1,64 @@
+"""docs/results.md and the README's block say what the committed records say, and these are of nearly this version."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from benchmarks.show import FULL, GATE, README, RESULTS, documents
+from rstrack.bench.record import Record, read_records
+
+ROOT = Path(__file__).parents[2]
+MEASURED = ROOT / "docs/measured.md"
+OLDEST_FULL = 2
+"""Minor versions that the full tier, hours of it, may be behind."""
+
+
+def records(path: Path) -> dict[str, Record]:
+    if not path.is_file():
+        pytest.skip(f"{path.relative_to(ROOT)} is not there yet: './run.sh bench {path.stem} --accept' writes it")
+    return read_records(path)
+
+
+def minor(version: str) -> tuple[int, int]:
+    major, second, *_ = version.split(".")
+    return int(major), int(second)
+
+
+def behind(path: Path) -> list[tuple[str, int]]:
+    """Cells of records, and how many minor versions older they are than the code; 999: of another major one."""
+    now = minor(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"])
+    then = {name: minor(record.version) for name, record in records(path).items()}
+    return [(name, now[1] - of[1] if of[0] == now[0] else 999) for name, of in then.items()]
+
+
+@pytest.mark.parametrize("path", [RESULTS, README], ids=lambda path: path.name)
+def test_documents_say_what_the_records_say(path: Path) -> None:
+    wanted = documents(records(GATE), records(FULL))[path]
+    assert path.is_file() and path.read_text() == wanted, "run 'python -m benchmarks.show'"
+
+
+def test_the_results_are_short() -> None:
+    records(GATE)
+    assert len(RESULTS.read_text().splitlines()) <= 250
+
+
+def test_the_gate_is_of_this_version() -> None:
+    assert not [(name, by) for name, by in behind(GATE) if by != 0], "run './run.sh bench gate --accept'"
+
+
+def test_the_full_tier_is_not_old() -> None:
+    late = [(name, by) for name, by in behind(FULL) if not 0 <= by <= OLDEST_FULL]
+    assert not late, "run './run.sh bench full --accept'"
+
+
+def test_the_readmes_figures_are_measured_ones() -> None:
+    sources = [path.read_text() for path in (RESULTS, MEASURED, FULL) if path.is_file()]
+    block = README.read_text().partition("<!-- results:begin")[2].partition("<!-- results:end")[0]
+    shown = README.read_text().replace(block, "") if FULL.is_file() else README.read_text()
+    cells = re.findall(r"[\d.]+ · [\d.]+ · [\d.]+", shown)
+    assert FULL.is_file() or len(cells) > 20
+    assert not [c for c in cells if not any(re.search(rf"(?<![\d.]){re.escape(c)}(?![\d.])", text) for text in sources)]
