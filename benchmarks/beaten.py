@@ -13,7 +13,6 @@ from rstrack.bench.methods import paper
 from rstrack.bench.record import Record
 
 OURS = "rs-pg"
-_PAPER = {"ate_mm": ("ate_m", 1e3), "drift_mm_s": ("rpe_m_s", 1e3), "drift_deg_s": ("rpe_deg_s", 1.0)}
 
 
 @dataclass(frozen=True)
@@ -115,9 +114,8 @@ def _of_peers(peers: Sequence[Record], name: str) -> list[tuple[float, str, int]
 def _of_paper(ours: Record, name: str) -> list[tuple[float, str, int]]:
     if ours.case != sequence_of(ours):  # its figures are of whole sequences
         return []
-    field, scale = _PAPER[name]
     return [
-        (scale * getattr(figures, field), "the paper", 0)
+        (getattr(figures, name), "the paper", 0)
         for (sequence, _), figures in paper.FIGURES.items()
         if sequence == ours.case
     ]

@@ -140,7 +140,7 @@ def read_records(path: Path) -> dict[str, Record]:
     """The records of a file by their cells' names. Raises UserError: it is missing, or is not one of these files."""
     try:
         return {data["cell"]: _record(data) for data in json.loads(read_text(path))}
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise UserError(f"{path}: is no file of benchmark records ({error}): write it with --accept") from None
 
 
@@ -154,7 +154,7 @@ def read_record(path: Path) -> Record | None:
     """One record; None if there is none that can be read."""
     try:
         return _record(json.loads(read_text(path)))
-    except (UserError, ValueError, TypeError, KeyError, RecursionError):
+    except (UserError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return None
 
 
