@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import logging
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -27,6 +28,8 @@ from rstrack.bench.record import Record, package_version, read_record, stamped, 
 from rstrack.bench.sequences import Absent, Sources
 from rstrack.bench.task import MEASURES, Task, measure_named
 from rstrack.data.estimate import TRAJECTORY
+
+log = logging.getLogger("rstrack")
 
 RECORD = "record.json"
 # Parts of both packages that show things, or read and write for other programs: figures do not depend on them.
@@ -158,6 +161,9 @@ def run_cell(job: Job, progress: Progress = no_progress) -> Record:
         return dataclasses.replace(record, error=str(reason), skipped=True)
     except UserError as error:
         return dataclasses.replace(record, error=str(error))
+    except Exception as error:  # one cell that breaks down must not end hours of others
+        log.exception("%s", cell.name)
+        return dataclasses.replace(record, error=f"broke down: {type(error).__name__}: {error}")
     return record
 
 

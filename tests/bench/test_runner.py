@@ -210,3 +210,10 @@ def test_files_that_are_no_records_are_refused_in_one_line(tmp_path: Path) -> No
         with pytest.raises(UserError, match=r"r\.json: is no file of benchmark records[^\n]*$"):
             read_records(tmp_path / "r.json")
         assert read_record(tmp_path / "r.json") is None
+
+
+def test_a_cell_that_breaks_down_does_not_end_the_others(data: Path) -> None:
+    FAILURES["rs-g 0"] = ZeroDivisionError("a defect")
+    found = run(data, cell(), cell("gs-g"))
+    assert found.records["counted/a/rs-g"].error == "broke down: ZeroDivisionError: a defect"
+    assert found.records["counted/a/gs-g"].complete
