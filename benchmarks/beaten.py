@@ -6,11 +6,11 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from benchmarks.cells import is_others, sequence_of
-from benchmarks.shown import ERRORS, Records, of_measure
 from rsgen.console.tables import Entry, Table, significant
-from rstrack.bench.methods import paper
 from rstrack.bench.record import Record
+from rstrack.bench.tables import paper
+from rstrack.bench.tables.cells import is_others, sequence_of
+from rstrack.bench.tables.shown import ERRORS, Records, of_measure
 
 OURS = "rs-pg"
 

@@ -6,9 +6,9 @@ import re
 from collections import defaultdict
 from pathlib import Path
 
-from benchmarks.cells import methods_in_order
-from benchmarks.shown import Records, of_measure
 from rstrack.bench.record import Record
+from rstrack.bench.tables.cells import methods_in_order
+from rstrack.bench.tables.shown import Records, of_measure
 from rstrack.charts.chart import Chart, Line, method_colors, numbers
 from rstrack.charts.to_file import write_charts
 

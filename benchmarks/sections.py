@@ -6,8 +6,18 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 
 from benchmarks.beaten import beaten, beaten_table, peer_of, sentences
-from benchmarks.cells import group_of, is_change, is_others, methods_in_order, options_of, program_of, sequence_of
-from benchmarks.shown import (
+from rsgen.console.tables import NOTHING, Entry, Table, best_marked, significant
+from rstrack.bench.record import Record
+from rstrack.bench.tables.cells import (
+    group_of,
+    is_change,
+    is_others,
+    methods_in_order,
+    options_of,
+    program_of,
+    sequence_of,
+)
+from rstrack.bench.tables.shown import (
     ERRORS,
     Records,
     averages,
@@ -23,8 +33,6 @@ from benchmarks.shown import (
     sequences_of,
     triple,
 )
-from rsgen.console.tables import NOTHING, Entry, Table, best_marked, significant
-from rstrack.bench.record import Record
 
 PAPERS_GROUPS = ("hand-held", "living room")
 _IMU = ("rs-pgi", "rs-gi")

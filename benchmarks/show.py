@@ -13,13 +13,22 @@ from pathlib import Path
 
 from benchmarks import sections
 from benchmarks.beaten import sentences
-from benchmarks.cells import is_others, methods_in_order, program_of
 from benchmarks.pictures import draw_readout
-from benchmarks.shown import Records, averages, closes_loops, is_default, of_group, paper_triple, sequences_of, triple
 from rsgen.console.tables import Entry, Table
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, read_text
 from rstrack.bench.record import read_records
+from rstrack.bench.tables.cells import is_others, methods_in_order, program_of
+from rstrack.bench.tables.shown import (
+    Records,
+    averages,
+    closes_loops,
+    is_default,
+    of_group,
+    paper_triple,
+    sequences_of,
+    triple,
+)
 
 ROOT = Path(__file__).parents[1]
 GATE, FULL = (ROOT / "benchmarks/results" / f"{tier}.json" for tier in ("gate", "full"))

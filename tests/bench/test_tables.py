@@ -12,12 +12,12 @@ from bench_evaluation import made_up_record
 from matplotlib.figure import Figure
 
 import rsgen.figures
-from rstrack.bench.methods import paper
 from rstrack.bench.methods.config import SequenceInfo
 from rstrack.bench.methods.plots import ate_chart
 from rstrack.bench.methods.results import Results, averages, read_results
 from rstrack.bench.methods.tables import notes, results_csv, results_markdown, results_text, write_results
 from rstrack.bench.record import Record
+from rstrack.bench.tables import paper
 from rstrack.charts.to_file import write_charts
 from rstrack.charts.to_page import figure_of
 

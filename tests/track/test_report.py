@@ -34,8 +34,8 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rstrack.bench.methods import paper
 from rstrack.bench.methods.results import QUANTITIES, read_results
+from rstrack.bench.tables import paper
 from rstrack.charts.chart import CameraPath, PathChart, upright_axes
 from rstrack.cli.report import report as report_command
 from rstrack.data.dataset import open_dataset

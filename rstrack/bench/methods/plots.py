@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from rsgen.console.progress import Progress, no_progress
-from rstrack.bench.methods import paper
 from rstrack.bench.methods.config import SequenceInfo
 from rstrack.bench.methods.results import QUANTITIES, Results, folder_of, truth_offset_s
+from rstrack.bench.tables import paper
 from rstrack.charts.chart import Bars, Chart, method_colors, numbers
 from rstrack.charts.runs import compared_errors, path_chart
 from rstrack.charts.to_file import write_charts

@@ -10,10 +10,10 @@ from pydantic import BaseModel, ValidationError
 
 from rsgen.errors import UserError, first_problem
 from rsgen.files import atomic_write, read_text
-from rstrack.bench.methods import paper
 from rstrack.bench.methods.config import SequenceInfo
 from rstrack.bench.methods.variants import method_of, row_of
 from rstrack.bench.record import Record
+from rstrack.bench.tables import paper
 from rstrack.options import METHODS
 
 RESULTS = "results.json"

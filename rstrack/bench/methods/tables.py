@@ -10,7 +10,6 @@ from typing import Any
 
 from rsgen.console.tables import NOTHING, Entry, Table, best_marked, csv_text, fixed, significant
 from rsgen.files import atomic_write
-from rstrack.bench.methods import paper
 from rstrack.bench.methods.config import SequenceInfo
 from rstrack.bench.methods.results import (
     BASELINE,
@@ -28,6 +27,7 @@ from rstrack.bench.methods.results import (
 )
 from rstrack.bench.methods.variants import fuses, row_of
 from rstrack.bench.record import Record
+from rstrack.bench.tables import paper
 
 
 def write_results(results: Results, out: Path) -> str:

@@ -9,7 +9,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
-from benchmarks.cells import (
+from rsgen.console.tables import NOTHING, Entry, Table, best_marked, significant
+from rstrack.bench.record import Record
+from rstrack.bench.tables import paper
+from rstrack.bench.tables.cells import (
     group_of,
     is_change,
     is_done,
@@ -19,10 +22,7 @@ from benchmarks.cells import (
     program_of,
     sequence_of,
 )
-from benchmarks.figures import heading
-from rsgen.console.tables import NOTHING, Entry, Table, best_marked, significant
-from rstrack.bench.methods import paper
-from rstrack.bench.record import Record
+from rstrack.bench.tables.figures import heading
 
 Records = Mapping[str, Record]
 ERRORS = ("ate_mm", "drift_mm_s", "drift_deg_s")
