@@ -114,8 +114,4 @@ def _of_peers(peers: Sequence[Record], name: str) -> list[tuple[float, str, int]
 def _of_paper(ours: Record, name: str) -> list[tuple[float, str, int]]:
     if ours.case != sequence_of(ours):  # its figures are of whole sequences
         return []
-    return [
-        (getattr(figures, name), "the paper", 0)
-        for (sequence, _), figures in paper.FIGURES.items()
-        if sequence == ours.case
-    ]
+    return [(figures[name], "the paper", 0) for (case, _), figures in paper.FIGURES.items() if case == ours.case]

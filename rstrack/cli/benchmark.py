@@ -162,10 +162,11 @@ def bench(
     from rstrack.bench.methods.config import load_evaluation, make_plan
     from rstrack.bench.methods.mesh_pictures import SHOWN, draw_meshes
     from rstrack.bench.methods.plots import draw_plots
-    from rstrack.bench.methods.results import Results, is_good
+    from rstrack.bench.methods.results import Results
     from rstrack.bench.methods.tables import speed_text, write_results
     from rstrack.bench.record import write_records
     from rstrack.bench.sequences import Sources
+    from rstrack.bench.tables.cells import is_good
 
     run = Run(out or Path("out/bench_quick" if quick else "out/bench"), scheduler, quiet)
     plan = make_plan(
@@ -214,10 +215,10 @@ def _sweep(
     methods: tuple[str, ...],
 ) -> int:  # fmt: skip
     from rsgen.console.progress import ProgressDisplay
-    from rstrack.bench.methods.results import counts
     from rstrack.bench.readout.config import installed, load_sweep_config, narrow, sweep_benchmark
     from rstrack.bench.readout.results import Sweep, draw_sweep, write_sweep
     from rstrack.bench.sequences import Sources
+    from rstrack.bench.tables.cells import counts
 
     chosen = narrow(
         load_sweep_config(config), motions=motions, seeds=narrowed.seeds, methods=methods, readouts_s=narrowed.readout,

@@ -10,16 +10,11 @@ from rsgen.errors import UserError
 from rstrack.bench.methods.config import SequenceInfo
 from rstrack.bench.methods.mesh_pictures import read_picture
 from rstrack.bench.methods.plots import ate_chart
-from rstrack.bench.methods.results import (
-    QUANTITIES,
-    RESULTS,
-    Results,
-    averages,
-    folder_of,
-    read_results,
-    truth_offset_s,
-)
+from rstrack.bench.methods.results import RESULTS, Results, averages, read_results
 from rstrack.bench.methods.tables import notes, sequence_table
+from rstrack.bench.tables.cells import folder_of, truth_offset_s
+from rstrack.bench.tables.figures import figure_of
+from rstrack.bench.tables.shown import ERRORS
 from rstrack.charts.runs import compared_errors, path_chart
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.metrics.tracked import Tracked, load_run
@@ -86,12 +81,12 @@ def _cards(results: Results) -> tuple[CardRow, ...]:
     rows, method = [], _shown(results)
     for mean in averages(results):
         if mean.method == method:
-            theirs, cards = mean.theirs, []
-            for q in QUANTITIES:
-                note = "" if theirs is None else f"paper: {number(getattr(theirs, q.name))} {q.unit}"
-                value = f"{number(mean.values[q.name])} {q.unit}"
-                cards.append(Card(value, _TITLES[q.name], note))
-            over = _counted(len(mean.sequences), "sequence")
+            cards = []
+            for name in ERRORS:
+                unit, theirs = figure_of(name).unit, mean.theirs.get(name)
+                note = "" if theirs is None else f"paper: {number(theirs)} {unit}"
+                cards.append(Card(f"{number(mean.values[name])} {unit}", _TITLES[name], note))
+            over = _counted(len(mean.over), "sequence")
             rows.append(CardRow(tuple(cards), f"{method}, {mean.group}: average of {over}"))
     return tuple(rows)
 
@@ -101,7 +96,7 @@ def _counted(count: int, noun: str) -> str:
 
 
 def _tables(results: Results) -> tuple[Block, ...]:
-    tables = [sequence_table(results, group, quantity) for quantity in QUANTITIES for group in results.groups]
+    tables = [sequence_table(results, group, name) for name in ERRORS for group in results.groups]
     note = "Green: the best of its row. Small print: the paper's figure. ▲: worse than that."
     return (*tables, Note(note), *(Note(text) for text in notes(results)))
 

@@ -6,8 +6,9 @@ from pathlib import Path
 
 from rsgen.console.progress import Progress, no_progress
 from rstrack.bench.methods.config import SequenceInfo
-from rstrack.bench.methods.results import QUANTITIES, Results, folder_of, truth_offset_s
+from rstrack.bench.methods.results import Results
 from rstrack.bench.tables import paper
+from rstrack.bench.tables.cells import folder_of, truth_offset_s
 from rstrack.charts.chart import Bars, Chart, method_colors, numbers
 from rstrack.charts.runs import compared_errors, path_chart
 from rstrack.charts.to_file import write_charts
@@ -31,19 +32,18 @@ def draw_plots(results: Results, out: Path, progress: Progress = no_progress) ->
 
 def ate_chart(results: Results) -> Chart:
     """The ATE of every cell as a bar on a logarithmic scale, the paper's as a mark on it."""
-    names, ate, bars = [s.name for s in results.sequences], QUANTITIES[0], []
+    names, bars = [s.name for s in results.sequences], []
     shown = [results.shown(s.group) for s in results.sequences]
     rows = list(dict.fromkeys(row for variants in shown for row in variants))
     colors = method_colors(rows)
     for row in rows:
-        ours = [results.figure(name, variants[row], ate) for name, variants in zip(names, shown, strict=True)]
-        figures = [paper.FIGURES.get((name, row)) for name in names]
-        theirs = numbers([None if f is None else f.ate_mm for f in figures])
+        ours = [results.figure(name, variants[row], "ate_mm") for name, variants in zip(names, shown, strict=True)]
+        theirs = numbers([paper.FIGURES.get((name, row), {}).get("ate_mm") for name in names])
         bars.append(Bars(row, colors[row], numbers(ours), theirs))
     note = "Logarithmic. Marks on the bars: the paper's figures for that method, in its own rooms."
     if any(row != name for variants in shown for row, name in variants.items()):
         note += " Without a model of the shutter: with or without fused keyframes, whichever is better in the group."
-    return Chart("ATE (RMSE) by sequence and method", ate.unit, bars=tuple(bars), groups=tuple(names), is_log=True,
+    return Chart("ATE (RMSE) by sequence and method", "mm", bars=tuple(bars), groups=tuple(names), is_log=True,
                  note=note)  # fmt: skip
 
 
@@ -54,7 +54,7 @@ def draw_sequence(results: Results, sequence: SequenceInfo, out: Path, path: Pat
     runs = {
         r.method: load_run(out / folder_of(r), dataset=dataset, truth_offset=truth_offset_s(r))
         for r in records
-        if r is not None and r.error is None and QUANTITIES[0].name in r.figures
+        if r is not None and r.error is None and "ate_mm" in r.figures
     }
     runs = {method: run for method, run in runs.items() if run.found is not None}
     if runs:

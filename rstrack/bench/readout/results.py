@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,12 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from rsgen.console.tables import NOTHING, Entry, Table, csv_text, fixed, significant
-from rsgen.files import atomic_write
-from rstrack.bench.methods.results import QUANTITIES, Quantity, counts
-from rstrack.bench.methods.tables import made_on
+from rsgen.console.tables import NOTHING, Entry, Table, fixed, significant
 from rstrack.bench.readout.config import SweepConfig
 from rstrack.bench.record import Record, write_records
+from rstrack.bench.tables.cells import counts
+from rstrack.bench.tables.figures import heading
+from rstrack.bench.tables.files import failures, provenance, write_tables
+from rstrack.bench.tables.shown import ERRORS
 from rstrack.charts.chart import Chart, Line, method_colors, numbers
 from rstrack.charts.to_file import write_charts
 
@@ -74,13 +74,13 @@ def log_interval(values: Sequence[float]) -> tuple[float | None, float | None, f
     return math.exp(mean), math.exp(mean - half), math.exp(mean + half)
 
 
-def points_of(sweep: Sweep, quantity: Quantity = QUANTITIES[0]) -> list[Point]:
+def points_of(sweep: Sweep, name: str = "ate_mm") -> list[Point]:
     """Of all records, in their order."""
     found = []
     for record in sweep.records:
         shutter = record.settings["sequence"]["set"]
         at = float(shutter["depth.readout_s"]), float(shutter["depth.exposure_s"])
-        values = tuple(v for run in record.runs if counts(run) and (v := run.get(quantity.name)) is not None)
+        values = tuple(v for run in record.runs if counts(run) and (v := run.get(name)) is not None)
         lost = sweep.config.noise.seeds - len(values)
         found.append(Point(record.settings["group"], *at, record.method, values, lost))
     return found
@@ -95,20 +95,13 @@ def growth(points: Sequence[Point]) -> float | None:
 
 def write_sweep(sweep: Sweep, out: Path) -> str:
     """Write records.json, results.csv, .md and .txt into `out`; returns the text. Raises UserError."""
-    tables, listed = sweep_tables(sweep), sweep_notes(sweep)
-    text = "\n\n".join([*(f"{table.title}\n{table.text()}" for table in tables), "\n".join(listed)])
-    notes = "\n".join(f"- {note}" for note in listed)
-    markdown = "\n\n".join([*(f"**{table.title}**\n\n{table.markdown()}" for table in tables), notes]) + "\n"
     write_records(out / "records.json", sweep.records)
-    atomic_write(out / "results.txt", (text + "\n").encode())
-    atomic_write(out / "results.md", markdown.encode())
-    atomic_write(out / "results.csv", csv_text(_rows(sweep)).encode())
-    return text
+    return write_tables(out, sweep_tables(sweep), sweep_notes(sweep), _rows(sweep))
 
 
-def sweep_tables(sweep: Sweep, quantity: Quantity = QUANTITIES[0]) -> list[Table]:
+def sweep_tables(sweep: Sweep) -> list[Table]:
     """A table for each motion and exposure: a row for each method, a column for each readout, and the growth."""
-    points = {(p.motion, p.exposure_s, p.method, p.readout_s): p for p in points_of(sweep, quantity)}
+    points = {(p.motion, p.exposure_s, p.method, p.readout_s): p for p in points_of(sweep)}
     readouts = sorted(sweep.config.readouts_s)
     tables = []
     for entry in sweep.config.motions:
@@ -119,7 +112,7 @@ def sweep_tables(sweep: Sweep, quantity: Quantity = QUANTITIES[0]) -> list[Table
                 factor = growth([p for p in line if p is not None]) if None not in line else None
                 rows.append((method, *map(_entry, line), "" if len(line) < 2 else fixed(factor, 2)))
             head = ("method", *(f"{1e3 * readout:g} ms" for readout in readouts), "most / least")
-            title = f"{entry.name}, exposure {1e3 * exposure:g} ms: {quantity.title}, {quantity.unit}, by readout"
+            title = f"{entry.name}, exposure {1e3 * exposure:g} ms: {heading('ate_mm')}, by readout"
             tables.append(Table(head, tuple(rows), title))
     return tables
 
@@ -140,18 +133,17 @@ def sweep_notes(sweep: Sweep) -> list[str]:
     some = [f"{r.method} on {r.case} {p.lost} of {p.lost + len(p.values)}" for r, p in points if p.lost]
     if some:
         lines.append(f"† lost or failed (poses for fewer than half of the frames): {', '.join(some)}")
-    errors = Counter(f"{r.method}: {r.error}" for r in sweep.records if r.error is not None)
-    lines += [f"failed, {count} cells: {error}" for error, count in errors.items()]
+    lines += failures(sweep.records)
     if sweep.lacking:
         lines.append(f"left out, not installed: {', '.join(sweep.lacking)} (pip install '.[peers]')")
     if sweep.interrupted:
         lines.append("not run yet (-): the same command goes on where this one ended")
-    return [*lines, *made_on(sweep.records)]
+    return [*lines, provenance(sweep.records)]
 
 
 def sweep_charts(sweep: Sweep) -> list[Chart]:
     """ATE over readout with its interval: motions, then exposures. Points that are lost are left out."""
-    ate, points, colors = QUANTITIES[0], points_of(sweep), method_colors(sweep.methods)
+    points, colors = points_of(sweep), method_colors(sweep.methods)
     charts = []
     for exposure in sweep.config.exposures_s:
         for entry in sweep.config.motions:
@@ -164,7 +156,7 @@ def sweep_charts(sweep: Sweep) -> list[Chart]:
                 lines.append(Line(method, colors[method], x, mean, is_dashed, True, low, high))
             at = f", exposure {1e3 * exposure:g} ms" if len(sweep.config.exposures_s) > 1 else ""
             title = f"{entry.name}{at}: ATE (RMSE)"
-            charts.append(Chart(title, ate.unit, "readout, ms", tuple(lines), is_log=True, note=_DASHED))
+            charts.append(Chart(title, "mm", "readout, ms", tuple(lines), is_log=True, note=_DASHED))
     return charts
 
 
@@ -188,12 +180,11 @@ def _entry(point: Point | None) -> Entry:
 
 def _rows(sweep: Sweep) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
-    for of_each in zip(*(points_of(sweep, quantity) for quantity in QUANTITIES), strict=True):
+    for of_each in zip(*(points_of(sweep, name) for name in ERRORS), strict=True):
         p = of_each[0]
         row: dict[str, Any] = {"motion": p.motion, "readout_s": p.readout_s, "exposure_s": p.exposure_s}
         row |= {"method": p.method, "seeds": len(p.values), "lost": p.lost}
-        for quantity, point in zip(QUANTITIES, of_each, strict=True):
-            names = quantity.name, f"{quantity.name}_low", f"{quantity.name}_high"
-            row |= dict(zip(names, point.interval, strict=True))
+        for name, point in zip(ERRORS, of_each, strict=True):
+            row |= dict(zip((name, f"{name}_low", f"{name}_high"), point.interval, strict=True))
         rows.append(row)
     return rows

@@ -96,10 +96,8 @@ def triple(figures: Mapping[str, float], mark: str = "") -> str:
 
 def paper_triple(sequences: Sequence[str], method: str) -> str:
     """The paper's averages, empty where it has none."""
-    theirs = paper.average(sequences, method) if sequences else None
-    if theirs is None:
-        return ""
-    return triple({name: getattr(theirs, name) for name in ERRORS})
+    theirs = paper.average(sequences, method)
+    return triple(theirs) if theirs else ""
 
 
 def sequences_of(records: Iterable[Record]) -> list[str]:
@@ -152,7 +150,7 @@ def by_case(records: Sequence[Record], triples: bool = False) -> Table:
     return Table(("case", *methods, "case", *methods), both, words=(0, 2))
 
 
-def measured_table(records: Sequence[Record], patterns: Sequence[str]) -> Table:
+def measured_table(records: Sequence[Record], patterns: Sequence[str], title: str = "") -> Table:
     """A row for each cell, a column for each figure that matches one of the patterns; 'x*+': the sum of those."""
     names = list(dict.fromkeys(name for record in records for name in record.figures if name != "peak_mb"))
     columns: dict[str, list[str]] = {}
@@ -171,7 +169,7 @@ def measured_table(records: Sequence[Record], patterns: Sequence[str]) -> Table:
         entries = [Entry(plainly(math.fsum(v)) if v else NOTHING) for v in values]
         rows.append((f"{record.case} {record.method}" if are_many else record.case, *entries))
     first = "case" if are_many or not records else f"case ({records[0].method})"
-    return Table((first, *columns), tuple(rows))
+    return Table((first, *columns), tuple(rows), title)
 
 
 def joined(records: Sequence[Record]) -> list[Record]:
