@@ -244,7 +244,6 @@ def _stress(
     from rstrack.bench.sequences import Sources
     from rstrack.bench.stress.cases import StressOptions, stress_benchmark
     from rstrack.bench.stress.charts import write_stress
-    from rstrack.bench.stress.results import stress_text
 
     if len(methods) > 1 or not {*methods} <= {*METHODS}:
         raise UserError(f"--method {' '.join(methods)}: the stress test has one method of {', '.join(METHODS)}")
@@ -255,6 +254,6 @@ def _stress(
     sources = Sources(scheduler=run.scheduler)
     with ProgressDisplay(run.quiet) as progress:
         outcome = run.cells(stress_benchmark(config, sources, options, progress), sources, progress)
-        result = write_stress(outcome.records.values(), run.out)
-    written = "stress.txt, .json, .png, stress_*.csv, panels.png and cells/MEASURE/CASE/METHOD"
-    return run.end(stress_text(result), written, not result.failed, outcome.interrupted)
+        result, text = write_stress(outcome.records.values(), run.out)
+    written = "stress.txt, .md, .csv, .json, .png, panels.png and cells/MEASURE/CASE/METHOD"
+    return run.end(text, written, not result.failed, outcome.interrupted)

@@ -24,17 +24,17 @@ def tables_markdown(tables: Sequence[Table], notes: Sequence[str]) -> str:
 
 
 def write_tables(
-    out: Path, tables: Sequence[Table], notes: Sequence[str], rows: Sequence[Mapping[str, Any]]
-) -> str:  # fmt: skip
-    """Write results.txt, results.md and results.csv, which has the rows, into `out`; returns the text.
+    out: Path, tables: Sequence[Table], notes: Sequence[str], rows: Sequence[Mapping[str, Any]], name: str = "results"
+) -> str:
+    """Write NAME.txt, NAME.md and NAME.csv, which has the rows, into `out`; returns the text.
 
     Raises UserError.
     """
     text = tables_text(tables, notes)
     out.mkdir(parents=True, exist_ok=True)
-    atomic_write(out / "results.txt", (text + "\n").encode())
-    atomic_write(out / "results.md", tables_markdown(tables, notes).encode())
-    atomic_write(out / "results.csv", csv_text(rows).encode())
+    atomic_write(out / f"{name}.txt", (text + "\n").encode())
+    atomic_write(out / f"{name}.md", tables_markdown(tables, notes).encode())
+    atomic_write(out / f"{name}.csv", csv_text(rows).encode())
     return text
 
 
