@@ -70,8 +70,10 @@ def results_markdown(gate: Records, full: Records) -> str:
     parts = (
         sections.methods, sections.per_sequence, sections.real, sections.not_the_best, sections.imu, sections.loops,
         sections.faults, sections.changes, sections.readout, sections.others, sections.speed,
-        sections.measured("calibration", "Calibration"), sections.convergence, sections.light, sections.memory,
-        sections.measured("long", "Long runs"),
+        sections.measured("Calibration", "calibration"),
+        sections.measured("Convergence and start", "convergence", "bootstrap"),
+        sections.measured("Light and rendering", "light", "render"), sections.memory,
+        sections.measured("Long runs", "long"),
     )  # fmt: skip
     tiers = [*_provenance("Full tier", full), *_provenance("Gate", gate)]
     missing = [*failures(full.values()), *failures(gate.values())]

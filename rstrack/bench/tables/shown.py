@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
@@ -94,6 +94,11 @@ def triple(figures: Mapping[str, float], mark: str = "") -> str:
     return NOTHING if set(values) == {NOTHING} else _DOT.join(values) + mark
 
 
+def cell_triple(record: Record | None) -> str:
+    """Of one cell: † where frames were lost."""
+    return NOTHING if record is None else triple(record.figures, "†" if record.total("lost") else "")
+
+
 def paper_triple(sequences: Sequence[str], method: str) -> str:
     """The paper's averages, empty where it has none."""
     theirs = paper.average(sequences, method)
@@ -115,39 +120,50 @@ def cell_text(record: Record | None, name: str) -> str:
     return significant(value) + ("†" if record.total("lost") else "")
 
 
-def by_sequence(records: Sequence[Record], name: str = "ate_mm") -> Table:
-    """A row for each method, a column for each case."""
-    cases, found = cases_of(records), {(r.method, r.case): r for r in records}
-    methods = methods_in_order(records)
-    columns = []
-    for case in cases:
-        cells = [found.get((method, case)) for method in methods]
-        values = [None if cell is None else cell.figures.get(name) for cell in cells]
-        columns.append(best_marked([Entry(cell_text(cell, name)) for cell in cells], values))
-    rows: list[tuple[Entry | str, ...]] = [
-        (method, *(column[k] for column in columns)) for k, method in enumerate(methods)
-    ]
-    return Table(("method", *cases), tuple(rows))
+def pivot(
+    head: str, rows: Sequence[str], columns: Sequence[str], entry: Callable[[str, str], Entry],
+    value: Callable[[str, str], float | None] | None = None, title: str = "",
+) -> Table:  # fmt: skip
+    """A table of entries by the names of rows and columns. value: of an entry, the least of a column being the best."""
+    found = []
+    for column in columns:
+        entries = [entry(row, column) for row in rows]
+        found.append(entries if value is None else best_marked(entries, [value(row, column) for row in rows]))
+    lines = tuple((row, *(entries[k] for entries in found)) for k, row in enumerate(rows))
+    return Table((head, *columns), lines, title)
+
+
+def by_sequence(records: Sequence[Record]) -> Table:
+    """ATE: a row for each method, a column for each case."""
+    found = {(r.method, r.case): r for r in records}
+
+    def ate_mm(method: str, case: str) -> float | None:
+        cell = found.get((method, case))
+        return None if cell is None else cell.figures.get("ate_mm")
+
+    def entry(method: str, case: str) -> Entry:
+        return Entry(cell_text(found.get((method, case)), "ate_mm"))
+
+    return pivot("method", methods_in_order(records), cases_of(records), entry, ate_mm)
 
 
 def by_case(records: Sequence[Record], triples: bool = False) -> Table:
     """A row for each case, a column for each method; side by side where there is one method alone."""
-    cases, found = cases_of(records), {(r.method, r.case): r for r in records}
-    methods = methods_in_order(records)
-    rows: list[tuple[Entry | str, ...]] = []
-    for case in cases:
-        cells = [found.get((method, case)) for method in methods]
-        if triples:
-            texts = [NOTHING if c is None else triple(c.figures, "†" if c.total("lost") else "") for c in cells]
-        else:
-            texts = [cell_text(cell, "ate_mm") for cell in cells]
-        rows.append((case, *map(Entry, texts)))
-    if len(methods) > 1 or len(rows) < _SIDE_BY_SIDE:
-        return Table(("case", *methods), tuple(rows))
-    half = -(-len(rows) // 2)
-    beside = [*(tuple((f"`{case}`", *entries)) for case, *entries in rows[half:]), ("", "")]
-    both = tuple((*left, *right) for left, right in zip(rows[:half], beside, strict=False))
-    return Table(("case", *methods, "case", *methods), both, words=(0, 2))
+    found = {(r.method, r.case): r for r in records}
+
+    def entry(case: str, method: str) -> Entry:
+        cell = found.get((method, case))
+        return Entry(cell_triple(cell) if triples else cell_text(cell, "ate_mm"))
+
+    table = pivot("case", cases_of(records), methods_in_order(records), entry)
+    if len(table.head) > 2 or len(table.rows) < _SIDE_BY_SIDE:
+        return table
+    half = -(-len(table.rows) // 2)
+    beside: list[tuple[Entry | str, ...]] = [(f"`{case}`", *cells) for case, *cells in table.rows[half:]]
+    both: tuple[tuple[Entry | str, ...], ...] = tuple(
+        (*left, *right) for left, right in zip(table.rows[:half], [*beside, ("", "")], strict=False)
+    )
+    return Table((*table.head, *table.head), both, words=(0, 2))
 
 
 def measured_table(records: Sequence[Record], patterns: Sequence[str], title: str = "") -> Table:
