@@ -10,7 +10,7 @@ from rsgen.errors import UserError
 from rstrack.bench.methods.config import SequenceInfo
 from rstrack.bench.methods.mesh_pictures import read_picture
 from rstrack.bench.methods.plots import ate_chart
-from rstrack.bench.methods.results import RESULTS, Results, averages, read_results
+from rstrack.bench.methods.results import AVERAGE, RESULTS, Results, read_results
 from rstrack.bench.methods.tables import notes, sequence_table
 from rstrack.bench.tables.cells import folder_of, truth_offset_s
 from rstrack.bench.tables.figures import figure_of
@@ -79,15 +79,15 @@ def _shown(results: Results) -> str:
 
 def _cards(results: Results) -> tuple[CardRow, ...]:
     rows, method = [], _shown(results)
-    for mean in averages(results):
-        if mean.method == method:
-            cards = []
-            for name in ERRORS:
-                unit, theirs = figure_of(name).unit, mean.theirs.get(name)
-                note = "" if theirs is None else f"paper: {number(theirs)} {unit}"
-                cards.append(Card(f"{number(mean.values[name])} {unit}", _TITLES[name], note))
-            over = _counted(len(mean.over), "sequence")
-            rows.append(CardRow(tuple(cards), f"{method}, {mean.group}: average of {over}"))
+    for group in results.groups if results.methods else ():
+        ours, theirs = results.average(group, method).figures, results.theirs(group, AVERAGE, method)
+        cards = []
+        for name in ERRORS:
+            unit = figure_of(name).unit
+            note = f"paper: {number(theirs[name])} {unit}" if theirs else ""
+            cards.append(Card(f"{number(ours.get(name))} {unit}", _TITLES[name], note))
+        over = _counted(len(results.averaged(group)), "sequence")
+        rows.append(CardRow(tuple(cards), f"{method}, {group}: average of {over}"))
     return tuple(rows)
 
 

@@ -39,7 +39,7 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.sequence.format import pose_rows
 from rstrack.bench.methods.plots import draw_sequence
-from rstrack.bench.methods.results import averages, read_results
+from rstrack.bench.methods.results import read_results
 from rstrack.bench.methods.tables import results_text
 from rstrack.bench.record import Record, read_record
 from rstrack.bench.tables.cells import truth_offset_s
@@ -295,10 +295,8 @@ def test_lost_frames_are_marked_and_lost_tracks_do_not_count(
     assert record is not None and record.figures["lost"] == lost and record.error is None
     (line,) = [line for line in results_text(found).split("\n\n")[0].splitlines() if line.startswith("mine")]
     assert word in line.split()[1]
-    (ours,) = [a for a in averages(found) if (a.group, a.method) == ("hand-held", "rs-g")]
-    (theirs,) = [a for a in averages(found) if (a.group, a.method) == ("hand-held", "mine")]
-    assert ours.over == ("robot_t1",) and ours.values["ate_mm"] is not None
-    assert (theirs.values["ate_mm"] is None) == (word == "lost")
+    assert found.averaged("hand-held") == ("robot_t1",) and found.average("hand-held", "rs-g").figures
+    assert ("ate_mm" not in found.average("hand-held", "mine").figures) == (word == "lost")
 
 
 def test_paths_and_errors(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:

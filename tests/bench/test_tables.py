@@ -15,7 +15,7 @@ import rsgen.figures
 from rsgen.console.tables import csv_text
 from rstrack.bench.methods.config import SequenceInfo
 from rstrack.bench.methods.plots import ate_chart
-from rstrack.bench.methods.results import Results, averages, read_results
+from rstrack.bench.methods.results import Results, better_pct, read_results
 from rstrack.bench.methods.tables import csv_rows, method_tables, notes, results_text, write_results
 from rstrack.bench.record import Record
 from rstrack.bench.tables import paper
@@ -42,13 +42,13 @@ def made_up() -> Results:
 
 
 def test_averages_by_hand() -> None:
-    by = {(a.group, a.method): a for a in averages(made_up())}
-    assert by["one", "rs-pg"].over == ("a", "c")  # rs-pg is lost on b, so b counts for nobody
-    assert by["one", "baseline"].values == pytest.approx({"ate_mm": 20.0, "drift_mm_s": 40.0, "drift_deg_s": 2.0})
-    assert by["one", "rs-pg"].values["ate_mm"] == pytest.approx(2.5)
-    assert by["one", "rs-pg"].better_pct["ate_mm"] == pytest.approx(87.5)
-    assert by["one", "theirs"].values["ate_mm"] is None and by["one", "theirs"].better_pct["ate_mm"] is None
-    assert by["two", "rs-pg"].values["ate_mm"] == pytest.approx(0.1234) and by["two", "theirs"].values["ate_mm"] is None
+    found = made_up()
+    assert found.averaged("one") == ("a", "c")  # rs-pg is lost on b, so b counts for nobody
+    baseline, ours = (found.average("one", method).figures for method in ("baseline", "rs-pg"))
+    assert baseline == pytest.approx({"ate_mm": 20.0, "drift_mm_s": 40.0, "drift_deg_s": 2.0})
+    assert ours["ate_mm"] == pytest.approx(2.5) and better_pct(2.5, 20.0) == pytest.approx(87.5)
+    assert found.average("one", "theirs").figures == found.average("two", "theirs").figures == {}
+    assert found.average("two", "rs-pg").figures["ate_mm"] == pytest.approx(0.1234)
 
 
 def test_the_better_setting_is_shown_and_the_other_one_kept() -> None:
@@ -67,10 +67,10 @@ def test_the_better_setting_is_shown_and_the_other_one_kept() -> None:
         ("baseline", "baseline-fuse"), ("gs-g", "gs-g"), ("rs-g", "rs-g"), ("rs-g-no-fuse", "rs-g-no-fuse"),
     ]  # fmt: skip
     assert list(results.shown("two").values()) == ["baseline", "gs-g", "rs-g", "rs-g-no-fuse"]
-    by = {(a.group, a.method): a for a in averages(results)}
-    assert by["one", "baseline-fuse"].values["ate_mm"] == pytest.approx(11.0)
-    assert by["one", "gs-g"].over == ("a", "b", "c") and by["one", "gs-g-fuse"].values["ate_mm"] is None
-    assert by["one", "rs-g"].better_pct["ate_mm"] == pytest.approx(100 * (1 - 0.001 / 0.011))
+    assert results.average("one", "baseline-fuse").figures["ate_mm"] == pytest.approx(11.0)
+    assert results.averaged("one") == ("a", "b", "c") and not results.average("one", "gs-g-fuse").figures
+    (row,) = [r for r in csv_rows(results) if (r["group"], r["sequence"], r["method"]) == ("one", "average", "rs-g")]
+    assert row["better_ate_mm_pct"] == pytest.approx(100 * (1 - 0.001 / 0.011))
     lines = [line.split() for line in results_text(results).split("\n\n")[3].splitlines()]
     assert lines[2:] == [
         ["baseline", "50.0", "50.0"], ["paper:", "Baseline", "12.9", "12.9"],

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from pydantic import BaseModel, ValidationError
@@ -12,7 +12,7 @@ from rsgen.errors import UserError, first_problem
 from rsgen.files import atomic_write, read_text
 from rstrack.bench.methods.config import SequenceInfo
 from rstrack.bench.methods.variants import method_of, row_of
-from rstrack.bench.record import Record
+from rstrack.bench.record import Figures, Record
 from rstrack.bench.tables import paper
 from rstrack.bench.tables.cells import figure, is_good
 from rstrack.bench.tables.shown import ERRORS
@@ -20,7 +20,7 @@ from rstrack.options import METHODS
 
 RESULTS = "results.json"
 AVERAGE = "average"
-"""Stands where a sequence's name would."""
+"""The case that averages are records of."""
 BASELINE = "baseline"
 
 
@@ -78,39 +78,24 @@ class Results(BaseModel, frozen=True):
         rows = {name: [self.record(name, method) for method in ours] for name in self.names(group)}
         return tuple(name for name, row in rows.items() if all(r is not None and is_good(r) for r in row))
 
+    def average(self, group: str, method: str) -> Record:
+        """A record of means over `averaged`, of the errors that it has on all of these."""
+        records = [self.record(name, method) for name in self.averaged(group)]
+        means: Figures = {}
+        for name in ERRORS:
+            values = [value for record in records if (value := figure(record, name)) is not None]
+            if values and len(values) == len(records):
+                means[name] = math.fsum(values) / len(values)
+        return Record(f"track/{AVERAGE}/{method}", "", {"group": group}, (0,), (means,), True)
 
-@dataclass(frozen=True)
-class Line:
-    """Of one variant on one sequence, or averaged over several (`over`), by the errors' names.
+    def of_group(self, group: str) -> dict[tuple[str, str], Record]:
+        """Cells of a group and then its averages, by case and method."""
+        found = {(record.case, record.method): record for record in self.records if record.case in self.names(group)}
+        return found | {(AVERAGE, method): self.average(group, method) for method in self.methods}
 
-    values: None where it lacks one of them. better_pct: how much smaller than that of the baseline that is shown, in
-    per cent; None without a baseline. theirs: the paper's over the same sequences; empty: none.
-    """
-
-    group: str
-    sequence: str
-    method: str
-    over: tuple[str, ...]
-    values: dict[str, float | None]
-    better_pct: dict[str, float | None]
-    theirs: paper.Figures
-
-
-def lines(results: Results, group: str) -> list[Line]:
-    """All cells of a group, sequence by sequence, and then the averages."""
-    found, baseline = [], results.shown(group).get(BASELINE, "")
-    for name, over in [*((name, (name,)) for name in results.names(group)), (AVERAGE, results.averaged(group))]:
-        values = {method: _means(results, over, method) for method in (*results.methods, baseline)}
-        for method in results.methods:
-            better = {error: better_pct(values[method][error], values[baseline][error]) for error in ERRORS}
-            theirs = paper.average(over, row_of(method))
-            found.append(Line(group, name, method, over, values[method], better, theirs))
-    return found
-
-
-def averages(results: Results) -> list[Line]:
-    """All groups' averages of all variants."""
-    return [line for group in results.groups for line in lines(results, group) if line.sequence == AVERAGE]
+    def theirs(self, group: str, case: str, method: str) -> paper.Figures:
+        """The paper's figures of the same; empty: none."""
+        return paper.average(self.averaged(group) if case == AVERAGE else (case,), row_of(method))
 
 
 def better_pct(value: float | None, baseline: float | None) -> float | None:
@@ -129,13 +114,3 @@ def read_results(path: Path) -> Results:
         return Results.model_validate_json(read_text(path))
     except ValidationError as error:
         raise UserError(f"{path}: {first_problem(error)}: run 'rstrack bench' again") from None
-
-
-def _means(results: Results, sequences: Sequence[str], method: str) -> dict[str, float | None]:
-    """Of the errors over some sequences; None where one is missing."""
-    means: dict[str, float | None] = {}
-    for error in ERRORS:
-        values = [results.figure(sequence, method, error) for sequence in sequences]
-        there = [value for value in values if value is not None]
-        means[error] = sum(there) / len(there) if there and len(there) == len(values) else None
-    return means

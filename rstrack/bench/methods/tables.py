@@ -6,16 +6,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rsgen.console.tables import Entry, Table, best_marked, fixed, significant
+from rsgen.console.tables import Entry, Table, fixed, significant
 from rstrack.bench.methods.config import SequenceInfo
-from rstrack.bench.methods.results import AVERAGE, BASELINE, Line, Results, averages, better_pct, lines, write_json
+from rstrack.bench.methods.results import AVERAGE, BASELINE, Results, better_pct, write_json
 from rstrack.bench.methods.variants import fuses, row_of
 from rstrack.bench.record import Record
 from rstrack.bench.tables import paper
-from rstrack.bench.tables.cells import counts, is_good, truth_offset_s
+from rstrack.bench.tables.cells import counts, figure, is_good, truth_offset_s
 from rstrack.bench.tables.figures import heading
 from rstrack.bench.tables.files import failures, provenance, tables_text, write_tables
-from rstrack.bench.tables.shown import ERRORS, cell_text, measured_table
+from rstrack.bench.tables.shown import ERRORS, cell_text, measured_table, pivot
 
 _SPEED = ("median_ms", "p95_ms", "p99_ms", "read_ms", "peer_ms", "ratio")
 
@@ -29,19 +29,19 @@ def write_results(results: Results, out: Path) -> str:
 
 def csv_rows(results: Results) -> list[dict[str, Any]]:
     """One a cell and one an average; better_*_pct: how much smaller than the baseline's, per cent."""
-    rows: list[dict[str, Any]] = []
-    for line in (line for group in results.groups for line in lines(results, group)):
-        record = results.record(line.sequence, line.method)
-        if record is None and line.sequence != AVERAGE:
-            continue
-        figures = {} if record is None else record.figures
-        row: dict[str, Any] = {"group": line.group, "sequence": line.sequence, "method": line.method}
-        row |= {"fuse": fuses(line.method), **line.values}
-        row |= {f"better_{name}_pct": value for name, value in line.better_pct.items()}
-        row |= {name: int(figures[name]) if name in figures else None for name in ("frames", "lost")}
-        row |= {"seconds": figures.get("total_s"), "error": None if record is None else record.error}
-        row |= {"truth_offset_ms": figures.get("truth_offset_ms")}
-        rows.append(row | {f"paper_{name}": line.theirs.get(name) for name in ERRORS})
+    rows = []
+    for group in results.groups:
+        found, base = results.of_group(group), results.shown(group).get(BASELINE, "")
+        for (case, method), record in found.items():
+            figures, theirs = record.figures, results.theirs(group, case, method)
+            values = {name: figure(record, name) for name in ERRORS}
+            better = {name: better_pct(values[name], figure(found.get((case, base)), name)) for name in ERRORS}
+            row: dict[str, Any] = {"group": group, "sequence": case, "method": method, "fuse": fuses(method), **values}
+            row |= {f"better_{name}_pct": value for name, value in better.items()}
+            row |= {name: int(figures[name]) if name in figures else None for name in ("frames", "lost")}
+            row |= {"seconds": figures.get("total_s"), "error": record.error}
+            row |= {"truth_offset_ms": figures.get("truth_offset_ms")}
+            rows.append(row | {f"paper_{name}": theirs.get(name) for name in ERRORS})
     return rows
 
 
@@ -57,23 +57,29 @@ def method_tables(results: Results) -> list[Table]:
 
 def method_table(results: Results, group: str, name: str) -> Table:
     """Of one error: a row for each method shown, a column for each sequence of a group; notes: the paper's figures."""
-    shown = results.shown(group)
-    by = {(line.sequence, line.method): line for line in lines(results, group)}
-    columns = {}
-    for sequence in (*results.names(group), AVERAGE):
-        found = [by[sequence, method] for method in shown.values()]
-        entries = [_entry(line, name, results.record(sequence, line.method)) for line in found]
-        columns[sequence] = best_marked(entries, [line.values[name] for line in found])
-    base = by.get((AVERAGE, shown.get(BASELINE, "")))
-    if base is not None and len(shown) > 1:
-        mean = [by[AVERAGE, method] for method in shown.values()]
-        columns["better by"] = [Entry("") if line is base else _better(line, base, name) for line in mean]
-    rows: list[tuple[Entry, ...]] = []
-    for k, (row, method) in enumerate(shown.items()):
-        of_method = [column[k] for column in columns.values()]
-        note = f"paper: {paper.NAMES[row]}" if any(entry.note for entry in of_method) else ""
-        rows.append((Entry(method, note=note), *of_method))
-    return Table(("method", *columns), tuple(rows), f"{group}, {heading(name)}")
+    shown, found = results.shown(group), results.of_group(group)
+
+    def value(row: str, case: str) -> float | None:
+        return figure(found.get((case, shown[row])), name)
+
+    def entry(row: str, case: str) -> Entry:
+        record, theirs = found.get((case, shown[row])), results.theirs(group, case, row).get(name)
+        is_lost = record is not None and record.error is None and not is_good(record) and case != AVERAGE
+        is_worse = theirs is not None and (value(row, case) or 0.0) > theirs
+        text = "lost" if is_lost else cell_text(record, name)
+        return Entry(text, note="" if theirs is None else significant(theirs), is_worse=is_worse)
+
+    def better(row: str) -> Entry:
+        theirs = better_pct(*(results.theirs(group, AVERAGE, of).get(name) for of in (row, BASELINE)))
+        values = _percent(better_pct(value(row, AVERAGE), value(BASELINE, AVERAGE))), _percent(theirs)
+        return Entry("") if row == BASELINE else Entry(values[0], note="" if theirs is None else values[1])
+
+    table = pivot("method", list(shown), [*results.names(group), AVERAGE], entry, value)
+    beside, rows = ("better by",) if BASELINE in shown and len(shown) > 1 else (), []
+    for row, (_, *entries) in zip(shown, table.rows, strict=True):
+        note = f"paper: {paper.NAMES[row]}" if any(results.theirs(group, at, row) for at in table.head[1:]) else ""
+        rows.append((Entry(shown[row], note=note), *entries, *(better(row) for _ in beside)))
+    return Table((*table.head, *beside), tuple(rows), f"{group}, {heading(name)}")
 
 
 def sequence_table(results: Results, group: str, name: str) -> Table:
@@ -81,7 +87,7 @@ def sequence_table(results: Results, group: str, name: str) -> Table:
     table = method_table(results, group, name)
     methods, *columns = zip(*table.rows, strict=True)
     rows = tuple((head, *column) for head, column in zip(table.head[1:], columns, strict=True))
-    return Table(("sequence", *(entry.text for entry in methods)), rows, table.title)
+    return Table(("sequence", *map(str, methods)), rows, table.title)
 
 
 def notes(results: Results) -> list[str]:
@@ -129,25 +135,8 @@ def _where(record: Record) -> str:
     return f"{record.method} on {record.case}"
 
 
-def _entry(line: Line, name: str, record: Record | None) -> Entry:
-    """The figure, or what became of the cell; the paper's as its note."""
-    value, theirs = line.values[name], line.theirs.get(name)
-    if record is None:
-        text = significant(value)
-    elif record.error is not None:
-        text = "failed"
-    else:
-        text = cell_text(record, name) if is_good(record) else "lost"
-    is_worse = value is not None and theirs is not None and value > theirs
-    return Entry(text, note="" if theirs is None else significant(theirs), is_worse=is_worse)
-
-
-def _better(line: Line, base: Line, name: str) -> Entry:
-    """How much better than the baseline, and in the paper."""
-    theirs = better_pct(line.theirs.get(name), base.theirs.get(name))
-    note = "" if not line.theirs or not base.theirs else fixed(theirs, 0) + " %"
-    value = line.better_pct[name]
-    return Entry(fixed(value, 0) + ("" if value is None else " %"), note=note)
+def _percent(value: float | None) -> str:
+    return fixed(value, 0) + ("" if value is None else " %")
 
 
 def _settings(results: Results) -> list[str]:
@@ -155,9 +144,10 @@ def _settings(results: Results) -> list[str]:
     found = []
     for group in results.groups:
         shown = set(results.shown(group).values())
-        others = [line for line in averages(results) if line.group == group and line.method not in shown]
+        others = [name for name in results.methods if name not in shown]
         if others:
-            listed = ", ".join(f"{line.method} {significant(line.values['ate_mm'])}" for line in others)
+            ate = {name: results.average(group, name).figures.get("ate_mm") for name in others}
+            listed = ", ".join(f"{name} {significant(value)}" for name, value in ate.items())
             found.append(
                 f"{group}: methods that take the rolling shutter for a global one are shown with or without fused "
                 f"keyframes, whichever is better (average {heading('ate_mm')}; the other one: {listed})"

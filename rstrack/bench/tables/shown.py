@@ -113,7 +113,7 @@ def sequences_of(records: Iterable[Record]) -> list[str]:
 def cell_text(record: Record | None, name: str) -> str:
     """A figure of one cell: † where frames were lost, 'lost' where nothing could be compared."""
     if record is None or not is_done(record):
-        return NOTHING
+        return NOTHING if record is None or record.error is None else "failed"
     value = record.figures.get(name)
     if value is None:
         return "lost" if record.total("lost") else NOTHING
@@ -129,8 +129,8 @@ def pivot(
     for column in columns:
         entries = [entry(row, column) for row in rows]
         found.append(entries if value is None else best_marked(entries, [value(row, column) for row in rows]))
-    lines = tuple((row, *(entries[k] for entries in found)) for k, row in enumerate(rows))
-    return Table((head, *columns), lines, title)
+    lines: list[tuple[Entry | str, ...]] = [(row, *(entries[k] for entries in found)) for k, row in enumerate(rows)]
+    return Table((head, *columns), tuple(lines), title)
 
 
 def by_sequence(records: Sequence[Record]) -> Table:
