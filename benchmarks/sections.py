@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 
 from benchmarks.beaten import beaten, beaten_table, peer_of, sentences
-from rsgen.console.tables import NOTHING, Entry, Table, best_marked, significant
+from rsgen.console.tables import NOTHING, Entry, Table, significant
 from rstrack.bench.record import Record
 from rstrack.bench.tables.cells import (
     group_of,
@@ -39,6 +39,7 @@ from rstrack.bench.tables.shown import (
 
 PAPERS_GROUPS = ("hand-held", "living room")
 _IMU = ("rs-pgi", "rs-gi")
+_ERRORS = ("ATE, mm", "mm/s", "deg/s")
 _COLUMNS: dict[str, tuple[str, ...]] = {
     "speed": ("median_ms", "p95_ms", "p99_ms", "ratio", "ratio_p95", "ratio_p99", "peer_ms", "read_ms", "lost"),
     "loops": ("keyframes", "loops", "false", "alike", "accepted", "median_mm", "median_mrad", "worst_mm", "nees"),
@@ -62,12 +63,10 @@ def methods(full: Records) -> list[str]:
     for group, records in groups.items():
         lines.append(f"{group}: averages over {', '.join(cases_of(records)) or 'nothing yet'}.")
     every = [record for records in groups.values() for record in records]
-    columns = [_averages(records, methods_in_order(every)) for records in groups.values()]
-    head = ("ATE, mm", "mm/s", "deg/s", "the paper", "lost", "silent", "NEES/6", "in 90 %")
-    rows = [(method, *(entry for column in columns for entry in column[method])) for method in methods_in_order(every)]
-    named = [f"{group}: {head[0]}" for group in PAPERS_GROUPS]
-    table = Table(("method", named[0], *head[1:], named[1], *head[1:]), tuple(rows))
-    return _section("Methods", table, every, *lines, "")
+    first, second = (_averages(records, methods_in_order(every)) for records in groups.values())
+    rows = tuple((*left, *right[1:]) for left, right in zip(first.rows, second.rows, strict=True))
+    one, two = (f"{group}: {_ERRORS[0]}" for group in PAPERS_GROUPS)
+    return _section("Methods", Table(("method", one, *first.head[2:], two, *first.head[2:]), rows), every, *lines, "")
 
 
 def per_sequence(full: Records) -> list[str]:
@@ -168,7 +167,7 @@ def memory(full: Records) -> list[str]:
     """Most memory of a track, by method and group."""
     tracks = [record for record in of_measure(full, "track") if record.values("peak_mb")]
     shown = methods_in_order(tracks)
-    found = {average.method: average for average in averages(tracks)}
+    found = averages(tracks)
     row: tuple[Entry | str, ...] = ("most", *(Entry(f"{found[method].peak_mb or 0:.0f}") for method in shown))
     about = "Memory, MB: the process with all it holds, most of all tracks"
     return _section(about, Table(("", *shown), (row,)), tracks)
@@ -204,27 +203,27 @@ def not_the_best(full: Records) -> list[str]:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _averages(records: Sequence[Record], shown: Sequence[str]) -> dict[str, list[Entry | str]]:
+def _averages(records: Sequence[Record], shown: Sequence[str]) -> Table:
     """Of each method: errors, the paper's, counts, and how true its covariances are."""
-    found = {average.method: average for average in averages(records)}
-    errors = []
-    for name in ERRORS:
-        values = [found[method].figures.get(name) if method in found else None for method in shown]
-        marks = [found[method].mark if method in found and name == "ate_mm" else "" for method in shown]
-        entries = [Entry(significant(v), mark=mark) for v, mark in zip(values, marks, strict=True)]
-        errors.append(best_marked(entries, values))
-    out: dict[str, list[Entry | str]] = {}
-    for k, method in enumerate(shown):
-        mine = next((record for record in records if record.method == method), None)
-        if mine is None:
-            out[method] = [NOTHING, NOTHING, NOTHING, "", *[NOTHING] * 4]
-            continue
+    found, names = averages(records), dict(zip(_ERRORS, ERRORS, strict=True))
+    ours = {record.method: program_of(record) for record in records if not is_others(record)}
+
+    def value(method: str, column: str) -> float | None:
+        return found[method].figures.get(names.get(column, "")) if method in found else None
+
+    def entry(method: str, column: str) -> Entry:
+        if column == "the paper":
+            return Entry(paper_triple(sequences_of(records), ours[method]) if method in ours else "")
+        if method not in found:
+            return Entry(NOTHING)
+        if column in names:
+            return Entry(significant(value(method, column)), mark=found[method].mark if column == _ERRORS[0] else "")
         average = found[method]
-        theirs = "" if is_others(mine) else paper_triple(sequences_of(records), program_of(mine))
-        silent = NOTHING if average.silent is None else str(average.silent)
-        told = significant(average.figures.get("nees")), significant(average.figures.get("coverage_90"), 2)
-        out[method] = [*(column[k] for column in errors), theirs, str(average.lost), silent, *told]
-    return out
+        told = {"NEES/6": significant(average.figures.get("nees")), "lost": str(average.lost)}
+        told["in 90 %"] = significant(average.figures.get("coverage_90"), 2)
+        return Entry(told.get(column, NOTHING if average.silent is None else str(average.silent)))
+
+    return pivot("method", shown, (*_ERRORS, "the paper", "lost", "silent", "NEES/6", "in 90 %"), entry, value)
 
 
 def _beside(title: str, tracks: Sequence[Record], chosen: Callable[[Record], bool]) -> list[str]:
@@ -232,7 +231,8 @@ def _beside(title: str, tracks: Sequence[Record], chosen: Callable[[Record], boo
     means: dict[tuple[str, str], Average] = {}
     for group in dict.fromkeys(group_of(record) for record in tracks if not is_change(record)):
         cases = {r.case for r in tracks if group_of(r) == group and chosen(r) and not is_change(r)}
-        means |= {(group or "others", a.method): a for a in averages([r for r in tracks if r.case in cases])}
+        found = averages([record for record in tracks if record.case in cases])
+        means |= {(group or "others", method): average for method, average in found.items()}
 
     def entry(*at: str) -> Entry:
         return Entry(triple(means[at].figures, means[at].mark) if at in means else NOTHING)

@@ -87,7 +87,7 @@ def readme_block(full: Records) -> str:
     groups = {name: of_group(full, name) for name in (*sections.PAPERS_GROUPS, "real")}
     every = [record for records in groups.values() for record in records]
     shown = [record for record in every if is_default(record) or closes_loops(record)]
-    means = {name: {a.method: a for a in averages(records)} for name, records in groups.items()}
+    means = {name: averages(records) for name, records in groups.items()}
     rows = []
     for method in methods_in_order(shown):
         record = next(record for record in shown if record.method == method)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from rsgen.errors import UserError, first_problem
 from rsgen.files import atomic_write, read_text
 from rstrack.bench.methods.config import SequenceInfo
 from rstrack.bench.methods.variants import method_of, row_of
-from rstrack.bench.record import Figures, Record
+from rstrack.bench.record import Record
 from rstrack.bench.tables import paper
 from rstrack.bench.tables.cells import figure, is_good
 from rstrack.bench.tables.shown import ERRORS
@@ -81,12 +80,9 @@ class Results(BaseModel, frozen=True):
     def average(self, group: str, method: str) -> Record:
         """A record of means over `averaged`, of the errors that it has on all of these."""
         records = [self.record(name, method) for name in self.averaged(group)]
-        means: Figures = {}
-        for name in ERRORS:
-            values = [value for record in records if (value := figure(record, name)) is not None]
-            if values and len(values) == len(records):
-                means[name] = math.fsum(values) / len(values)
-        return Record(f"track/{AVERAGE}/{method}", "", {"group": group}, (0,), (means,), True)
+        names = [name for name in ERRORS if all(figure(record, name) is not None for record in records)]
+        runs = tuple({name: figure(record, name) for name in names} for record in records)
+        return Record(f"track/{AVERAGE}/{method}", "", {"group": group}, runs=runs, complete=True)
 
     def of_group(self, group: str) -> dict[tuple[str, str], Record]:
         """Cells of a group and then its averages, by case and method."""

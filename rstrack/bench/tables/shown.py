@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
 from rsgen.console.tables import NOTHING, Entry, Table, best_marked, significant
-from rstrack.bench.record import Record
+from rstrack.bench.record import Figures, Record
 from rstrack.bench.tables import paper
 from rstrack.bench.tables.cells import (
     group_of,
@@ -36,12 +36,10 @@ _SIDE_BY_SIDE, _MOST_COLUMNS = 12, 10
 class Average:
     """Of one method over the cases of a group that it has figures of: `cases` of `of`. Counts are sums of all runs."""
 
-    method: str
     figures: dict[str, float]
     cases: int
     of: int
     lost: int
-    frames: int
     silent: int | None
     peak_mb: float | None
 
@@ -69,23 +67,17 @@ def cases_of(records: Iterable[Record]) -> list[str]:
     return list(dict.fromkeys(record.case for record in records))
 
 
-def averages(records: Sequence[Record]) -> list[Average]:
+def averages(records: Sequence[Record]) -> dict[str, Average]:
     """Of each method, over cases."""
-    cases = cases_of(records)
-    out = []
+    found, of = {}, len(cases_of(records))
     for method in methods_in_order(records):
         mine = [record for record in records if record.method == method]
-        names = dict.fromkeys(name for record in mine for name in record.figures)
-        means = {}
-        for name in names:
-            values = [record.figures[name] for record in mine if name in record.figures]
-            means[name] = math.fsum(values) / len(values)
-        totals = {name: round(math.fsum(r.total(name) for r in mine)) for name in ("lost", "frames", "silent")}
-        has_truth = sum("ate_mm" in record.figures for record in mine)
-        silent = totals["silent"] if any(record.values("silent") for record in mine) else None
+        means = Record("", "", {}, runs=tuple({**record.figures} for record in mine)).figures
+        lost, silent = (round(math.fsum(record.total(name) for record in mine)) for name in ("lost", "silent"))
         peak = max((value for record in mine for value in record.values("peak_mb")), default=None)
-        out.append(Average(method, means, has_truth, len(cases), totals["lost"], totals["frames"], silent, peak))
-    return out
+        has_truth = sum("ate_mm" in record.figures for record in mine)
+        found[method] = Average(means, has_truth, of, lost, silent if "silent" in means else None, peak)
+    return found
 
 
 def triple(figures: Mapping[str, float], mark: str = "") -> str:
@@ -190,13 +182,12 @@ def measured_table(records: Sequence[Record], patterns: Sequence[str], title: st
 
 def joined(records: Sequence[Record]) -> list[Record]:
     """Cells of several measures on the same case and method as one."""
-    figures: dict[tuple[str, str], dict[str, float | None]] = {}
-    first: dict[tuple[str, str], Record] = {}
+    found: dict[tuple[str, str], Record] = {}
     for record in records:
-        place = record.case, record.method
-        first.setdefault(place, record)
-        figures[place] = {**figures.get(place, {}), **record.figures}
-    return [dataclasses.replace(first[place], seeds=(0,), runs=(figures[place],)) for place in first]
+        first = found.get((record.case, record.method), dataclasses.replace(record, runs=()))
+        both: Figures = {**first.figures, **record.figures}
+        found[record.case, record.method] = dataclasses.replace(first, seeds=(0,), runs=(both,))
+    return list(found.values())
 
 
 def plainly(value: float) -> str:
