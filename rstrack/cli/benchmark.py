@@ -190,7 +190,7 @@ def bench(
         warnings: list[str] = []
         try:
             if not interrupted:
-                draw_plots(results, run.out, progress)
+                draw_plots(results, run.out, progress, warnings.append)
                 if with_meshes:
                     draw_meshes(results, run.out, progress=progress, warn=warnings.append)
         except KeyboardInterrupt:

@@ -305,7 +305,7 @@ def test_paths_and_errors(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_tum(place / "mine/robot_t1.txt", "robot_t1", range(4, 25))
     made = plan(sequences=["robot_t1"], added={"mine": Path("mine")})
     found = results(made)
-    assert draw_sequence(found, made.sequences[0], Path("bench"), Path("x.png"))
+    assert draw_sequence(found, made.sequences[0], Path("bench"), Path("x.png"), pytest.fail)
     path, errors = drawn[0].axes
     shown = list(found.shown("hand-held").values())
     assert shown[1:] == ["rs-g", "rs-g-no-fuse", "mine"]
