@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 
 from pydantic import BaseModel, ValidationError
@@ -30,9 +31,14 @@ class Results(BaseModel, frozen=True):
     methods: tuple[str, ...]
     records: tuple[Record, ...]
 
+    @cached_property
+    def cells(self) -> dict[tuple[str, str], Record]:
+        """The records by case and method."""
+        return {(record.case, record.method): record for record in self.records}
+
     def record(self, sequence: str, method: str) -> Record | None:
         """The record of a cell, None if it was not run."""
-        return next((r for r in self.records if (r.case, r.method) == (sequence, method)), None)
+        return self.cells.get((sequence, method))
 
     def figure(self, sequence: str, method: str, name: str) -> float | None:
         """Of a cell; None where it has none."""
@@ -86,7 +92,7 @@ class Results(BaseModel, frozen=True):
 
     def of_group(self, group: str) -> dict[tuple[str, str], Record]:
         """Cells of a group and then its averages, by case and method."""
-        found = {(record.case, record.method): record for record in self.records if record.case in self.names(group)}
+        found = {at: record for at, record in self.cells.items() if at[0] in self.names(group)}
         return found | {(AVERAGE, method): self.average(group, method) for method in self.methods}
 
     def theirs(self, group: str, case: str, method: str) -> paper.Figures:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rsgen.console.tables import Entry, Table, fixed, significant
+from rsgen.console.tables import NOTHING, Entry, Table, fixed, significant
 from rstrack.bench.methods.config import SequenceInfo
 from rstrack.bench.methods.results import AVERAGE, BASELINE, Results, better_pct, write_json
 from rstrack.bench.methods.variants import fuses, row_of
@@ -64,9 +64,10 @@ def method_table(results: Results, group: str, name: str) -> Table:
 
     def entry(row: str, case: str) -> Entry:
         record, theirs = found.get((case, shown[row])), results.theirs(group, case, row).get(name)
-        is_lost = record is not None and record.error is None and not is_good(record) and case != AVERAGE
         is_worse = theirs is not None and (value(row, case) or 0.0) > theirs
-        text = "lost" if is_lost else cell_text(record, name)
+        text = cell_text(record, name)
+        if record is not None and record.error is None and value(row, case) is None:
+            text = NOTHING if case == AVERAGE or is_good(record) else "lost"
         return Entry(text, note="" if theirs is None else significant(theirs), is_worse=is_worse)
 
     def better(row: str) -> Entry:
