@@ -118,7 +118,8 @@ def sweep_notes(sweep: Sweep) -> list[str]:
 def sweep_charts(sweep: Sweep) -> list[Chart]:
     """ATE over readout with its interval: motions, then exposures. Points that are lost are left out."""
     charts = []
-    for (motion, exposure), methods in sorted(_panels(sweep).items(), key=lambda item: item[0][1]):
+    order = sweep.config.exposures_s.index
+    for (motion, exposure), methods in sorted(_panels(sweep).items(), key=lambda item: order(item[0][1])):
         at = f", exposure {1e3 * exposure:g} ms" if len(sweep.config.exposures_s) > 1 else ""
         charts.append(readout_chart(f"{motion}{at}", methods))
     return charts
