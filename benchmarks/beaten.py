@@ -6,11 +6,11 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from benchmarks.cells import is_others, sequence_of
-from benchmarks.shown import ERRORS, Records, of_measure
 from rsgen.console.tables import Entry, Table, significant
-from rstrack.bench.methods import paper
 from rstrack.bench.record import Record
+from rstrack.bench.tables import paper
+from rstrack.bench.tables.cells import is_others, sequence_of
+from rstrack.bench.tables.shown import ERRORS, Records, of_measure
 
 OURS = "rs-pg"
 
@@ -114,8 +114,4 @@ def _of_peers(peers: Sequence[Record], name: str) -> list[tuple[float, str, int]
 def _of_paper(ours: Record, name: str) -> list[tuple[float, str, int]]:
     if ours.case != sequence_of(ours):  # its figures are of whole sequences
         return []
-    return [
-        (getattr(figures, name), "the paper", 0)
-        for (sequence, _), figures in paper.FIGURES.items()
-        if sequence == ours.case
-    ]
+    return [(figures[name], "the paper", 0) for (case, _), figures in paper.FIGURES.items() if case == ours.case]

@@ -16,7 +16,7 @@ there is a false alarm in at most one comparison of twenty (Holm 1979). The test
 - Ten runs and more, as of faults, one a seed: exact signed-rank test (Wilcoxon 1945) of the runs' differences, since
   lost frames are mostly none and sometimes hundreds, of which no mean knows anything. Counts by their differences.
 - Counts of fewer runs: exact test of two binomial shares of the frames (Fisher), without frames of two Poisson counts.
-- Silently wrong frames, and others that `benchmarks.figures` has as outright: the first of them, where there was none.
+- Silently wrong frames, and others that `tables.figures` has as outright: the first of them, where there was none.
   Where there were some, as of methods that take a rolling shutter for a global one, they are counts like others.
 - A cell that failed, or has no error in a run or in all of them where there was one: worse.
 
@@ -36,12 +36,12 @@ from operator import attrgetter
 
 from scipy import special
 
-from benchmarks.cells import is_others
 from benchmarks.comparison import SIGNIFICANCE, Change, Comparison, times
 from benchmarks.exact import fisher_p, holm, poisson_p, signed_rank_p, stouffer_p
-from benchmarks.figures import Figure, figure_of
 from benchmarks.scatter import Prior, priors, spread_of, tolerances
 from rstrack.bench.record import Record
+from rstrack.bench.tables.cells import is_others
+from rstrack.bench.tables.figures import Figure, figure_of
 
 __all__ = ["Change", "Comparison", "compare", "tolerances"]
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from benchmarks.figures import figure_of
 from rsgen.console.tables import significant
 from rstrack.bench.record import Record
+from rstrack.bench.tables.figures import figure_of
 
 SIGNIFICANCE = 0.05
 """Chance of any false alarm over all tests of a comparison."""

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
-from benchmarks.cells import is_others
-from benchmarks.figures import Figure, figure_of
 from rstrack.bench.record import Record
+from rstrack.bench.tables.cells import is_others
+from rstrack.bench.tables.figures import Figure, figure_of
 
 _NEWTON = 50
 

@@ -6,28 +6,40 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 
 from benchmarks.beaten import beaten, beaten_table, peer_of, sentences
-from benchmarks.cells import group_of, is_change, is_others, methods_in_order, options_of, program_of, sequence_of
-from benchmarks.shown import (
+from rsgen.console.tables import NOTHING, Entry, Table, significant
+from rstrack.bench.record import Record
+from rstrack.bench.tables.cells import (
+    group_of,
+    is_change,
+    is_others,
+    methods_in_order,
+    options_of,
+    program_of,
+    sequence_of,
+)
+from rstrack.bench.tables.shown import (
     ERRORS,
+    Average,
     Records,
     averages,
     by_case,
     by_sequence,
     cases_of,
     cell_text,
+    cell_triple,
     joined,
     measured_table,
     of_group,
     of_measure,
     paper_triple,
+    pivot,
     sequences_of,
     triple,
 )
-from rsgen.console.tables import NOTHING, Entry, Table, best_marked, significant
-from rstrack.bench.record import Record
 
 PAPERS_GROUPS = ("hand-held", "living room")
 _IMU = ("rs-pgi", "rs-gi")
+_ERRORS = ("ATE, mm", "mm/s", "deg/s")
 _COLUMNS: dict[str, tuple[str, ...]] = {
     "speed": ("median_ms", "p95_ms", "p99_ms", "ratio", "ratio_p95", "ratio_p99", "peer_ms", "read_ms", "lost"),
     "loops": ("keyframes", "loops", "false", "alike", "accepted", "median_mm", "median_mrad", "worst_mm", "nees"),
@@ -46,56 +58,48 @@ _COLUMNS: dict[str, tuple[str, ...]] = {
 
 def methods(full: Records) -> list[str]:
     """Averages of the two groups that the paper has, all methods: a row a method."""
-    lines = ["## Methods", ""]
+    lines = []
     groups = {group: of_group(full, group) for group in PAPERS_GROUPS}
     for group, records in groups.items():
         lines.append(f"{group}: averages over {', '.join(cases_of(records)) or 'nothing yet'}.")
     every = [record for records in groups.values() for record in records]
-    columns = [_averages(records, methods_in_order(every)) for records in groups.values()]
-    head = ("ATE, mm", "mm/s", "deg/s", "the paper", "lost", "silent", "NEES/6", "in 90 %")
-    rows = [(method, *(entry for column in columns for entry in column[method])) for method in methods_in_order(every)]
-    named = [f"{group}: {head[0]}" for group in PAPERS_GROUPS]
-    table = Table(("method", named[0], *head[1:], named[1], *head[1:]), tuple(rows))
-    return [*lines, "", *_table(table, every), ""]
+    first, second = (_averages(records, methods_in_order(every)) for records in groups.values())
+    rows = tuple((*left, *right[1:]) for left, right in zip(first.rows, second.rows, strict=True))
+    one, two = (f"{group}: {_ERRORS[0]}" for group in PAPERS_GROUPS)
+    return _section("Methods", Table(("method", one, *first.head[2:], two, *first.head[2:]), rows), every, *lines, "")
 
 
 def per_sequence(full: Records) -> list[str]:
     """ATE of every method on every sequence of these groups."""
     records = [record for group in PAPERS_GROUPS for record in of_group(full, group)]
-    return ["## ATE by sequence, mm", "", *_table(by_sequence(records), records), ""]
+    return _section("ATE by sequence, mm", by_sequence(records), records)
 
 
 def real(full: Records) -> list[str]:
     """Recordings: all methods and peers, errors with the truth's clock fitted."""
     records = of_group(full, "real", changes=True)
-    plain = [record for record in records if not is_change(record)]
     found = {(record.method, record.case): record for record in records}
-    cases = cases_of(records)
+    table = pivot("method", methods_in_order(records), cases_of(records), lambda *at: Entry(cell_triple(found.get(at))))
     rows: list[tuple[Entry | str, ...]] = []
-    for method in methods_in_order(records):
-        cells = [found.get((method, case)) for case in cases]
-        texts = [NOTHING if c is None else triple(c.figures, "†" if c.total("lost") else "") for c in cells]
-        mine = [record for record in records if record.method == method]
-        silent = sum(round(record.total("silent")) for record in mine)
-        lost = sum(round(record.total("lost")) for record in mine)
-        frames = sum(round(record.total("frames")) for record in mine)
-        rows.append((method, *map(Entry, texts), f"{lost} of {frames}", str(silent)))
-    table = Table(("method", *cases, "lost", "silently wrong"), tuple(rows))
+    for row in table.rows:
+        mine = [record for record in records if record.method == row[0]]
+        lost, frames, silent = (sum(round(r.total(name)) for r in mine) for name in ("lost", "frames", "silent"))
+        rows.append((*row, f"{lost} of {frames}", str(silent)))
     clocks = [
         f"{record.case} {significant(record.figures['truth_offset_ms'])}"
-        for record in plain
-        if record.method == "rs-pg" and "truth_offset_ms" in record.figures
+        for record in records
+        if record.method == "rs-pg" and "truth_offset_ms" in record.figures and not is_change(record)
     ]
     about = f" Offsets with `rs-pg`, ms: {', '.join(clocks)}." if clocks else ""
-    head = ["## Real recordings: ATE mm · mm/s · deg/s", ""]
     told = f"The truth has a clock of its own, which is fitted for each track.{about}"
-    return [*head, told, "", *_table(table, records), ""]
+    table = Table((*table.head, "lost", "silently wrong"), tuple(rows))
+    return _section("Real recordings: ATE mm · mm/s · deg/s", table, records, told, "")
 
 
 def imu(full: Records) -> list[str]:
     """With an IMU and without: averages of groups, and the cases of no group above."""
     tracks = [record for record in of_measure(full, "track") if _is_close(record)]
-    return ["## With an IMU: ATE mm · mm/s · deg/s", "", *_beside(tracks, lambda r: program_of(r) in _IMU), ""]
+    return _beside("With an IMU", tracks, lambda record: program_of(record) in _IMU)
 
 
 def loops(full: Records) -> list[str]:
@@ -103,10 +107,10 @@ def loops(full: Records) -> list[str]:
     tracks = of_measure(full, "track")
     closing = {record.method: program_of(record) for record in tracks if "loops" in options_of(record)}
     shown = [record for record in tracks if record.method in {*closing, *closing.values()}]
-    lines = ["## Loops closed, and not: ATE mm · mm/s · deg/s", ""]
-    lines += [*_beside(shown, lambda record: record.method in closing), ""]
+    lines = _beside("Loops closed, and not", shown, lambda record: record.method in closing)
     found = of_measure(full, "loops")
-    return [*lines, "Loops against the truth, and places that look alike:", "", *_measured(found, "loops"), ""]
+    table = _table(measured_table(found, _COLUMNS["loops"]), found)
+    return [*lines, "Loops against the truth, and places that look alike:", "", table, ""]
 
 
 def faults(full: Records) -> list[str]:
@@ -136,14 +140,13 @@ def changes(full: Records) -> list[str]:
     records = [r for r in tracks if r.case in bases and any(c.method == r.method for c in changed)] + changed
     places = list(dict.fromkeys(map(sequence_of, records)))
     records.sort(key=lambda record: places.index(sequence_of(record)))
-    table = by_case(records, triples=True)
-    return ["## What may be wrong: ATE mm · mm/s · deg/s", "", *_table(table, records), ""]
+    return _section("What may be wrong: ATE mm · mm/s · deg/s", by_case(records, triples=True), records)
 
 
 def readout(full: Records) -> list[str]:
     """Error against readout."""
     records = [record for record in of_measure(full, "track") if record.case.startswith("readout-")]
-    return ["## Readout: ATE, mm", "", *_table(by_case(records), records), ""]
+    return _section("Readout: ATE, mm", by_case(records), records)
 
 
 def others(full: Records) -> list[str]:
@@ -151,44 +154,32 @@ def others(full: Records) -> list[str]:
     shown = {*PAPERS_GROUPS, "real", ""}
     tracks = of_measure(full, "track")
     records = [record for record in tracks if group_of(record) not in shown and not is_change(record)]
-    return ["## Other sequences: ATE, mm", "", *_table(by_case(records), records), ""]
+    return _section("Other sequences: ATE, mm", by_case(records), records)
 
 
 def speed(full: Records) -> list[str]:
     """Times, and ratios to the peer's in the same run."""
-    records = of_measure(full, "speed")
-    peers = ", ".join(dict.fromkeys(peer_of(record) for record in records))
-    title = f"## Speed, ms a frame; ratios to {peers}, in turns on the same frames" if records else "## Speed"
-    return [title, "", *_measured(records, "speed"), ""]
+    peers = ", ".join(dict.fromkeys(peer_of(record) for record in of_measure(full, "speed"))) or "the peer"
+    return measured(f"Speed, ms a frame; ratios to {peers}, in turns on the same frames", "speed")(full)
 
 
 def memory(full: Records) -> list[str]:
     """Most memory of a track, by method and group."""
     tracks = [record for record in of_measure(full, "track") if record.values("peak_mb")]
     shown = methods_in_order(tracks)
-    found = {average.method: average for average in averages(tracks)}
+    found = averages(tracks)
     row: tuple[Entry | str, ...] = ("most", *(Entry(f"{found[method].peak_mb or 0:.0f}") for method in shown))
-    about = "## Memory, MB: the process with all it holds, most of all tracks"
-    return [about, "", *_table(Table(("", *shown), (row,)), tracks), ""]
+    about = "Memory, MB: the process with all it holds, most of all tracks"
+    return _section(about, Table(("", *shown), (row,)), tracks)
 
 
-def convergence(full: Records) -> list[str]:
-    """How far off a frame may start, and how well tracks begin anywhere."""
-    records = joined([*of_measure(full, "convergence"), *of_measure(full, "bootstrap")])
-    return ["## Convergence and start", "", *_measured(records, "convergence"), ""]
-
-
-def light(full: Records) -> list[str]:
-    """Baked light against path tracing by room, and what a picture takes."""
-    records = joined([*of_measure(full, "light"), *of_measure(full, "render")])
-    return ["## Light and rendering", "", *_measured(records, "light"), ""]
-
-
-def measured(measure: str, title: str) -> Callable[[Records], list[str]]:
-    """The section of a measure."""
+def measured(title: str, *measures: str) -> Callable[[Records], list[str]]:
+    """The section of a measure, or of several on the same cases."""
 
     def section(full: Records) -> list[str]:
-        return [f"## {title}", "", *_measured(of_measure(full, measure), measure), ""]
+        records = [record for measure in measures for record in of_measure(full, measure)]
+        records = joined(records) if len(measures) > 1 else records
+        return _section(title, measured_table(records, _COLUMNS[measures[0]]), records)
 
     return section
 
@@ -196,11 +187,9 @@ def measured(measure: str, title: str) -> Callable[[Records], list[str]]:
 def gate(records: Records) -> list[str]:
     """What guards every change, with what chance does to it."""
     tracks = of_measure(records, "track")
-    found = {(record.case, record.method): record for record in tracks}
-    cases = cases_of(tracks)
-    rows = [(m, *(_with_scatter(found.get((case, m))) for case in cases)) for m in methods_in_order(tracks)]
-    about = "## The gate: ATE, mm, and what chance does to one run (moderated)"
-    return [about, "", *_table(Table(("method", *cases), tuple(rows)), tracks), ""]
+    found = {(record.method, record.case): record for record in tracks}
+    table = pivot("method", methods_in_order(tracks), cases_of(tracks), lambda *at: _with_scatter(found.get(at)))
+    return _section("The gate: ATE, mm, and what chance does to one run (moderated)", table, tracks)
 
 
 def not_the_best(full: Records) -> list[str]:
@@ -214,39 +203,42 @@ def not_the_best(full: Records) -> list[str]:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _averages(records: Sequence[Record], shown: Sequence[str]) -> dict[str, list[Entry | str]]:
+def _averages(records: Sequence[Record], shown: Sequence[str]) -> Table:
     """Of each method: errors, the paper's, counts, and how true its covariances are."""
-    found = {average.method: average for average in averages(records)}
-    errors = []
-    for name in ERRORS:
-        values = [found[method].figures.get(name) if method in found else None for method in shown]
-        marks = [found[method].mark if method in found and name == "ate_mm" else "" for method in shown]
-        entries = [Entry(significant(v), mark=mark) for v, mark in zip(values, marks, strict=True)]
-        errors.append(best_marked(entries, values))
-    out: dict[str, list[Entry | str]] = {}
-    for k, method in enumerate(shown):
-        mine = next((record for record in records if record.method == method), None)
-        if mine is None:
-            out[method] = [NOTHING, NOTHING, NOTHING, "", *[NOTHING] * 4]
-            continue
+    found, names = averages(records), dict(zip(_ERRORS, ERRORS, strict=True))
+    ours = {record.method: program_of(record) for record in records if not is_others(record)}
+
+    def value(method: str, column: str) -> float | None:
+        return found[method].figures.get(names.get(column, "")) if method in found else None
+
+    def entry(method: str, column: str) -> Entry:
+        if column == "the paper":
+            return Entry(paper_triple(sequences_of(records), ours[method]) if method in ours else "")
+        if method not in found:
+            return Entry(NOTHING)
+        if column in names:
+            return Entry(significant(value(method, column)), mark=found[method].mark if column == _ERRORS[0] else "")
         average = found[method]
-        theirs = "" if is_others(mine) else paper_triple(sequences_of(records), program_of(mine))
-        silent = NOTHING if average.silent is None else str(average.silent)
-        told = significant(average.figures.get("nees")), significant(average.figures.get("coverage_90"), 2)
-        out[method] = [*(column[k] for column in errors), theirs, str(average.lost), silent, *told]
-    return out
+        told = {"NEES/6": significant(average.figures.get("nees")), "lost": str(average.lost)}
+        told["in 90 %"] = significant(average.figures.get("coverage_90"), 2)
+        return Entry(told.get(column, NOTHING if average.silent is None else str(average.silent)))
+
+    return pivot("method", shown, (*_ERRORS, "the paper", "lost", "silent", "NEES/6", "in 90 %"), entry, value)
 
 
-def _beside(tracks: Sequence[Record], chosen: Callable[[Record], bool]) -> list[str]:
+def _beside(title: str, tracks: Sequence[Record], chosen: Callable[[Record], bool]) -> list[str]:
     """Averages of groups, over the cases that the chosen methods ran on."""
-    methods = methods_in_order(tracks)
-    rows: list[tuple[Entry | str, ...]] = []
+    means: dict[tuple[str, str], Average] = {}
     for group in dict.fromkeys(group_of(record) for record in tracks if not is_change(record)):
         cases = {r.case for r in tracks if group_of(r) == group and chosen(r) and not is_change(r)}
-        means = {average.method: average for average in averages([r for r in tracks if r.case in cases])}
-        texts = [triple(means[m].figures, means[m].mark) if m in means else NOTHING for m in methods]
-        rows += [(group or "others", *map(Entry, texts))] if cases else []
-    return _table(Table(("average of", *methods), tuple(rows)), tracks if rows else ())
+        found = averages([record for record in tracks if record.case in cases])
+        means |= {(group or "others", method): average for method, average in found.items()}
+
+    def entry(*at: str) -> Entry:
+        return Entry(triple(means[at].figures, means[at].mark) if at in means else NOTHING)
+
+    table = pivot("average of", list(dict.fromkeys(group for group, _ in means)), methods_in_order(tracks), entry)
+    return _section(f"{title}: ATE mm · mm/s · deg/s", table, tracks if means else ())
 
 
 def _is_close(record: Record) -> bool:
@@ -279,16 +271,15 @@ def _kind(kind: float | None, names: Sequence[str]) -> str:
     return names[int(kind)] if int(kind) < len(names) else f"kind {kind:g}"
 
 
-def _with_scatter(record: Record | None) -> str:
-    if record is None:
-        return NOTHING
-    scatter, _ = record.scatter.get("ate_mm", (0.0, 0.0))
-    return cell_text(record, "ate_mm") + (f" ± {significant(scatter, 2, 100.0)} %" if scatter else "")
+def _with_scatter(record: Record | None) -> Entry:
+    scatter, _ = (0.0, 0.0) if record is None else record.scatter.get("ate_mm", (0.0, 0.0))
+    return Entry(cell_text(record, "ate_mm") + (f" ± {significant(scatter, 2, 100.0)} %" if scatter else ""))
 
 
-def _measured(records: Sequence[Record], measure: str) -> list[str]:
-    return _table(measured_table(records, _COLUMNS.get(measure, ())), records)
+def _section(title: str, table: Table, records: Sequence[Record], *told: str) -> list[str]:
+    return [f"## {title}", "", *told, _table(table, records), ""]
 
 
-def _table(table: Table, records: Sequence[Record]) -> list[str]:
-    return [table.markdown()] if records else [NOTHING]
+def _table(table: Table, records: Sequence[Record]) -> str:
+    """A dash where there are no records."""
+    return table.markdown() if records else NOTHING

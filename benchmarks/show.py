@@ -7,19 +7,28 @@ python -m benchmarks.show --check      # 1 where the texts differ from what the 
 from __future__ import annotations
 
 import sys
-from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks import sections
 from benchmarks.beaten import sentences
-from benchmarks.cells import is_others, methods_in_order, program_of
 from benchmarks.pictures import draw_readout
-from benchmarks.shown import Records, averages, closes_loops, is_default, of_group, paper_triple, sequences_of, triple
 from rsgen.console.tables import Entry, Table
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, read_text
 from rstrack.bench.record import read_records
+from rstrack.bench.tables.cells import is_others, methods_in_order, program_of
+from rstrack.bench.tables.files import failures, provenance
+from rstrack.bench.tables.shown import (
+    Records,
+    averages,
+    closes_loops,
+    is_default,
+    of_group,
+    paper_triple,
+    sequences_of,
+    triple,
+)
 
 ROOT = Path(__file__).parents[1]
 GATE, FULL = (ROOT / "benchmarks/results" / f"{tier}.json" for tier in ("gate", "full"))
@@ -61,13 +70,15 @@ def results_markdown(gate: Records, full: Records) -> str:
     parts = (
         sections.methods, sections.per_sequence, sections.real, sections.not_the_best, sections.imu, sections.loops,
         sections.faults, sections.changes, sections.readout, sections.others, sections.speed,
-        sections.measured("calibration", "Calibration"), sections.convergence, sections.light, sections.memory,
-        sections.measured("long", "Long runs"),
+        sections.measured("Calibration", "calibration"),
+        sections.measured("Convergence and start", "convergence", "bootstrap"),
+        sections.measured("Light and rendering", "light", "render"), sections.memory,
+        sections.measured("Long runs", "long"),
     )  # fmt: skip
-    lines = [
-        "# Results", "", _ABOUT, "", *_provenance("Full tier", full), *_provenance("Gate", gate), *_absent(full),
-        *_absent(gate), "", _WORDS, "", *(line for part in parts for line in part(full)), *sections.gate(gate),
-    ]  # fmt: skip
+    tiers = [*_provenance("Full tier", full), *_provenance("Gate", gate)]
+    missing = [*failures(full.values()), *failures(gate.values())]
+    lines = ["# Results", "", _ABOUT, "", *tiers, *missing, "", _WORDS, ""]
+    lines += [*(line for part in parts for line in part(full)), *sections.gate(gate)]
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -76,7 +87,7 @@ def readme_block(full: Records) -> str:
     groups = {name: of_group(full, name) for name in (*sections.PAPERS_GROUPS, "real")}
     every = [record for records in groups.values() for record in records]
     shown = [record for record in every if is_default(record) or closes_loops(record)]
-    means = {name: {a.method: a for a in averages(records)} for name, records in groups.items()}
+    means = {name: averages(records) for name, records in groups.items()}
     rows = []
     for method in methods_in_order(shown):
         record = next(record for record in shown if record.method == method)
@@ -158,31 +169,7 @@ def _what(method: str, program: str, with_loops: bool) -> str:
 
 
 def _provenance(tier: str, records: Records) -> list[str]:
-    """A line: version, commit, dates, machine, how many cells."""
-    if not records:
-        return [f"{tier}: not measured yet."]
-    made = list(records.values())
-
-    def each(values: list[str]) -> str:
-        return ", ".join(dict.fromkeys(value for value in values if value)) or "?"
-
-    dates = sorted({record.date[:10] for record in made if record.date})
-    when = " to ".join(dict.fromkeys((dates[0], dates[-1]))) if dates else "?"
-    machines = each([f"{r.machine.get('cpu', '?')}, {r.machine.get('cores', '?')} cores" for r in made if r.machine])
-    load = max(float(record.machine.get("load") or 0.0) for record in made)
-    return [
-        f"{tier}: version {each([r.version for r in made])}, commit {each([r.commit or '' for r in made])}, {when}; "
-        f"{machines}, load before at most {load:.3g}; {len(made)} cells."
-    ]
-
-
-def _absent(records: Records) -> list[str]:
-    """Lines of what was skipped or has failed, and why."""
-    missing: dict[str, list[str]] = defaultdict(list)
-    for record in records.values():
-        if record.error is not None:
-            missing[f"{'Skipped' if record.skipped else 'Failed'} ({record.error})"].append(record.cell)
-    return [f"{why}: {', '.join(cells)}." for why, cells in missing.items()]
+    return [f"{tier}: {provenance(records.values()) if records else 'not measured yet.'}"]
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ class Record:
     complete: all of them are. settings: case, method and measure as they were defined. machine: CPU, cores, load before
     the first run. error: why there is nothing; skipped: whether that is no fault (a recording or a package is absent).
     scatter: by figure, what chance is measured to do to one run of this cell: a standard deviation (of logarithms,
-    where `benchmarks.figures` compares in these) and its degrees of freedom; set when the records are accepted.
+    where `tables.figures` compares in these) and its degrees of freedom; set when the records are accepted.
     """
 
     cell: str

@@ -162,10 +162,11 @@ def bench(
     from rstrack.bench.methods.config import load_evaluation, make_plan
     from rstrack.bench.methods.mesh_pictures import SHOWN, draw_meshes
     from rstrack.bench.methods.plots import draw_plots
-    from rstrack.bench.methods.results import Results, is_good
+    from rstrack.bench.methods.results import Results
     from rstrack.bench.methods.tables import speed_text, write_results
     from rstrack.bench.record import write_records
     from rstrack.bench.sequences import Sources
+    from rstrack.bench.tables.cells import is_good
 
     run = Run(out or Path("out/bench_quick" if quick else "out/bench"), scheduler, quiet)
     plan = make_plan(
@@ -189,7 +190,7 @@ def bench(
         warnings: list[str] = []
         try:
             if not interrupted:
-                draw_plots(results, run.out, progress)
+                draw_plots(results, run.out, progress, warnings.append)
                 if with_meshes:
                     draw_meshes(results, run.out, progress=progress, warn=warnings.append)
         except KeyboardInterrupt:
@@ -214,10 +215,10 @@ def _sweep(
     methods: tuple[str, ...],
 ) -> int:  # fmt: skip
     from rsgen.console.progress import ProgressDisplay
-    from rstrack.bench.methods.results import counts
     from rstrack.bench.readout.config import installed, load_sweep_config, narrow, sweep_benchmark
     from rstrack.bench.readout.results import Sweep, draw_sweep, write_sweep
     from rstrack.bench.sequences import Sources
+    from rstrack.bench.tables.cells import counts
 
     chosen = narrow(
         load_sweep_config(config), motions=motions, seeds=narrowed.seeds, methods=methods, readouts_s=narrowed.readout,
@@ -243,7 +244,6 @@ def _stress(
     from rstrack.bench.sequences import Sources
     from rstrack.bench.stress.cases import StressOptions, stress_benchmark
     from rstrack.bench.stress.charts import write_stress
-    from rstrack.bench.stress.results import stress_text
 
     if len(methods) > 1 or not {*methods} <= {*METHODS}:
         raise UserError(f"--method {' '.join(methods)}: the stress test has one method of {', '.join(METHODS)}")
@@ -254,6 +254,6 @@ def _stress(
     sources = Sources(scheduler=run.scheduler)
     with ProgressDisplay(run.quiet) as progress:
         outcome = run.cells(stress_benchmark(config, sources, options, progress), sources, progress)
-        result = write_stress(outcome.records.values(), run.out)
-    written = "stress.txt, .json, .png, stress_*.csv, panels.png and cells/MEASURE/CASE/METHOD"
-    return run.end(stress_text(result), written, not result.failed, outcome.interrupted)
+        result, text = write_stress(outcome.records.values(), run.out)
+    written = "stress.txt, .md, .csv, .json, .png, panels.png and cells/MEASURE/CASE/METHOD"
+    return run.end(text, written, not result.failed, outcome.interrupted)

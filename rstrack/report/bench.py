@@ -7,22 +7,15 @@ from pathlib import Path
 from rsgen.console.progress import Progress, no_progress
 from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
-from rstrack.bench.methods.config import SequenceInfo
 from rstrack.bench.methods.mesh_pictures import read_picture
-from rstrack.bench.methods.plots import ate_chart
-from rstrack.bench.methods.results import (
-    QUANTITIES,
-    RESULTS,
-    Results,
-    averages,
-    folder_of,
-    read_results,
-    truth_offset_s,
-)
+from rstrack.bench.methods.plots import ate_chart, shown_runs
+from rstrack.bench.methods.results import AVERAGE, RESULTS, Results, read_results
 from rstrack.bench.methods.tables import notes, sequence_table
+from rstrack.bench.tables.figures import figure_of
+from rstrack.bench.tables.shown import ERRORS
 from rstrack.charts.runs import compared_errors, path_chart
-from rstrack.data.dataset import Dataset, open_dataset
-from rstrack.metrics.tracked import Tracked, load_run
+from rstrack.data.dataset import open_dataset
+from rstrack.metrics.tracked import Tracked
 from rstrack.report.page import Block, Card, CardRow, Chooser, Note, Page, Plot, Section
 from rstrack.report.pictures import frame_panels, map_pictures, shutter_sliders
 from rstrack.report.run import number, plots
@@ -84,15 +77,15 @@ def _shown(results: Results) -> str:
 
 def _cards(results: Results) -> tuple[CardRow, ...]:
     rows, method = [], _shown(results)
-    for mean in averages(results):
-        if mean.method == method:
-            theirs, cards = mean.theirs, []
-            for q in QUANTITIES:
-                note = "" if theirs is None else f"paper: {number(getattr(theirs, q.name))} {q.unit}"
-                value = f"{number(mean.values[q.name])} {q.unit}"
-                cards.append(Card(value, _TITLES[q.name], note))
-            over = _counted(len(mean.sequences), "sequence")
-            rows.append(CardRow(tuple(cards), f"{method}, {mean.group}: average of {over}"))
+    for group in results.groups if results.methods else ():
+        ours, theirs = results.average(group, method).figures, results.theirs(group, AVERAGE, method)
+        cards = []
+        for name in ERRORS:
+            unit = figure_of(name).unit
+            note = f"paper: {number(theirs[name])} {unit}" if theirs else ""
+            cards.append(Card(f"{number(ours.get(name))} {unit}", _TITLES[name], note))
+        over = _counted(len(results.averaged(group)), "sequence")
+        rows.append(CardRow(tuple(cards), f"{method}, {group}: average of {over}"))
     return tuple(rows)
 
 
@@ -101,7 +94,7 @@ def _counted(count: int, noun: str) -> str:
 
 
 def _tables(results: Results) -> tuple[Block, ...]:
-    tables = [sequence_table(results, group, quantity) for quantity in QUANTITIES for group in results.groups]
+    tables = [sequence_table(results, group, name) for name in ERRORS for group in results.groups]
     note = "Green: the best of its row. Small print: the paper's figure. ▲: worse than that."
     return (*tables, Note(note), *(Note(text) for text in notes(results)))
 
@@ -129,7 +122,7 @@ def _sequences(
         except UserError as error:
             warnings.append(f"No plots and images of {entry.name}: {error}.")
             continue
-        runs = _runs(folder, results, entry, dataset, warnings)
+        runs = shown_runs(results, entry, folder, dataset, warnings.append)
         if runs:
             charts.append((entry.name, _sequence_plots(runs)))
         best = runs.get(_shown(results)) or next(iter(runs.values()), None)
@@ -154,22 +147,6 @@ def _maps(folder: Path, results: Results, warnings: list[str]) -> tuple[tuple[st
             except UserError as error:
                 warnings.append(f"No maps of {entry.name}: {error}.")
     return tuple(maps)
-
-
-def _runs(
-    folder: Path, results: Results, entry: SequenceInfo, dataset: Dataset, warnings: list[str]
-) -> dict[str, Tracked]:  # fmt: skip
-    """The runs of a sequence that the tables show, by name, in the order of the tables."""
-    runs = {}
-    for method in results.shown(entry.group).values():
-        record = results.record(entry.name, method)
-        if record is not None and record.error is None:
-            try:
-                where, offset_s = folder / folder_of(record), truth_offset_s(record)
-                runs[method] = load_run(where, dataset=dataset, truth_offset=offset_s)
-            except UserError as error:
-                warnings.append(f"No plots of {method} on {entry.name}: {error}.")
-    return runs
 
 
 def _sequence_plots(runs: dict[str, Tracked]) -> tuple[Block, ...]:

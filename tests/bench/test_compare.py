@@ -16,9 +16,9 @@ from scipy import stats
 from benchmarks.compare import compare
 from benchmarks.comparison import SIGNIFICANCE
 from benchmarks.exact import fisher_p, poisson_p, signed_rank_p, stouffer_p
-from benchmarks.figures import FIGURES, figure_of, heading
 from benchmarks.scatter import Spread, fit_prior, tolerances
 from rstrack.bench.record import Record, read_records, write_records
+from rstrack.bench.tables.figures import FIGURES, figure_of, heading
 
 
 def record(case: str, *runs: Mapping[str, Any], method: str = "rs-pg", measure: str = "track", **fields: Any) -> Record:

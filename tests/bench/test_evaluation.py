@@ -19,11 +19,11 @@ from rsgen.console.configs import config_file
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rstrack.bench.definitions import OTHERS
-from rstrack.bench.methods import paper
 from rstrack.bench.methods.config import load_evaluation
-from rstrack.bench.methods.results import counts
 from rstrack.bench.methods.tables import results_text
 from rstrack.bench.record import read_record
+from rstrack.bench.tables import paper
+from rstrack.bench.tables.cells import counts
 from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.options import CLOUD_PEERS, METHODS, PEERS, SLAM_PEERS, Options
 from rstrack.peers.command import run_command

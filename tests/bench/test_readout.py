@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -21,12 +20,11 @@ from rsgen.config.config import load_config
 from rsgen.errors import UserError
 from rstrack.bench.readout.config import SweepConfig, installed, load_sweep_config, narrow, sweep_benchmark
 from rstrack.bench.readout.results import (
-    Point,
     Sweep,
     draw_sweep,
+    errors,
     growth,
     log_interval,
-    points_of,
     sweep_charts,
     sweep_tables,
     write_sweep,
@@ -141,8 +139,8 @@ def test_noise_is_of_the_seed_and_more_seeds_are_added(tmp_path: Path, monkeypat
     assert len(made) == 1 and "--frames" in made[0] and seeds == [0, 1, 0, 1]
     run(narrow(config, seeds=3))
     assert len(made) == 1 and seeds[4:] == [2, 2]
-    (point, _) = points_of(run(config))
-    assert point.values == (1.0, 2.0) and len(seeds) == 6 and points_of(first)[0] == point
+    record, _ = run(config).records
+    assert errors(record) == errors(first.records[0]) == [1.0, 2.0] and len(seeds) == 6
 
 
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -222,18 +220,14 @@ def test_tables_say_means_growth_and_what_was_lost(tmp_path: Path) -> None:
     assert "left out, not installed: orb-slam3" in text
     assert "gs-pg on table1_320px_readout_28ms_exposure_0ms 3 of 3" in text
     records = read_records(tmp_path / "records.json")
-    assert points_of(replace(found, records=tuple(records[r.cell] for r in found.records)))[1].lost == 0
+    assert all(errors(records[r.cell]) == pytest.approx(errors(r), rel=1e-5) for r in found.records)
     rows = list(csv.DictReader((tmp_path / "results.csv").open()))
     assert len(rows) == 8 and {row["ate_mm"] for row in rows if row["lost"] == "3"} == {""}
 
 
-def test_growth_is_unknown_where_a_track_is_lost() -> None:
-    points = [p for p in points_of(result()) if p.method == "gs-pg" and p.motion == "table1"]
-    assert growth(points) is None and growth(points[:1]) is None
-
-
 def test_growth_is_the_largest_over_the_smallest_wherever_they_are() -> None:
-    assert growth([Point("a", 0.0, 0.0, "m", (value,), 0) for value in (2.0, 6.0, 1.5, 3.0)]) == pytest.approx(4.0)
+    assert growth([2.0, 6.0, 1.5, 3.0]) == pytest.approx(4.0)
+    assert growth([1.0, None]) is None and growth([1.0]) is None  # lost at one, or but one
 
 
 def test_the_picture_has_a_line_with_its_interval_for_each_method(tmp_path: Path) -> None:

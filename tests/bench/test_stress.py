@@ -31,7 +31,7 @@ from rstrack.bench.runner import run_cells
 from rstrack.bench.sequences import Sources
 from rstrack.bench.stress.cases import StressOptions, case_name, stress_benchmark
 from rstrack.bench.stress.charts import write_stress
-from rstrack.bench.stress.results import StressResult, gains_db, read_stress, stress_result, stress_text
+from rstrack.bench.stress.results import PATHS, StressResult, read_stress, stress_result
 from rstrack.cli.main import main
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import Estimate
@@ -146,46 +146,50 @@ def stressed(records: tuple[Path, tuple[Record, ...]]) -> tuple[Path, StressResu
 
 def test_blur_aware_colour_is_better_by_two_decibels(stressed: tuple[Path, StressResult]) -> None:
     _, report = stressed
-    gain = gains_db(report)
-    assert gain["exposure_20ms"] > 2.0
-    assert gain["exposure_0ms"] == 0.0  # nothing is blurred: all weights are 1
-    blurred = {row.sigma_px: row for row in report.color if row.case == "exposure_20ms" and row.poses == "true"}
-    sharp = {row.sigma_px: row for row in report.color if row.case == "exposure_0ms" and row.poses == "true"}
-    assert set(blurred) == {None, 1.0, 2.0}
-    assert blurred[None].gradient < blurred[1.0].gradient < 1.0 and blurred[None].ssim < blurred[1.0].ssim
-    assert sharp[None].psnr_db > blurred[1.0].psnr_db
-    assert all(row.keyframes == blurred[None].keyframes >= 1 for row in report.color)
+    sharp, blurred = report.fused("true")
+    assert [(cell.case, cell.sigmas_px) for cell in report.fused("true")] == [
+        ("exposure_0ms", (None, 1.0, 2.0)),
+        ("exposure_20ms", (None, 1.0, 2.0)),
+    ]
+    assert sharp.gain_db("true", 1.0) == 0.0  # nothing is blurred: all weights are 1
+    gain = blurred.gain_db("true", 1.0)
+    assert gain is not None and gain > 2.0 and blurred.gain_db("true", None) is None
+    found = blurred.figures
+    assert found["gradient_true_constant"] < found["gradient_true_sigma1"] < 1.0
+    assert found["ssim_true_constant"] < found["ssim_true_sigma1"]
+    assert sharp.figures["psnr_db_true_constant"] > found["psnr_db_true_sigma1"]
+    counts = {cell.figures[f"keyframes_{poses}"] for cell in (sharp, blurred) for poses in PATHS}
+    assert len(counts) == 1 and min(counts) >= 1
 
 
 def test_fused_depth_has_half_the_error_of_a_frames(stressed: tuple[Path, StressResult]) -> None:
     _, report = stressed
-    assert len(report.depth) == 4
-    for row in report.depth:
-        assert row.fused_mm is not None and row.single_mm is not None and row.fused_mm < 0.5 * row.single_mm
-        # σ = 1.2e-3 z² with walls at 1.5 to 3 m, rectified by bilinear interpolation, which averages a little.
-        assert 1.5 < row.single_mm < 8.0
+    for cell in report.fused("true"):
+        for poses in PATHS:
+            assert cell.figures[f"fused_mm_{poses}"] < 0.5 * cell.figures[f"single_mm_{poses}"]
+            # σ = 1.2e-3 z² with walls at 1.5 to 3 m, rectified by bilinear interpolation, which averages a little.
+            assert 1.5 < cell.figures[f"single_mm_{poses}"] < 8.0
 
 
 def test_scores_do_not_depend_on_the_world(stressed: tuple[Path, StressResult]) -> None:
     _, report = stressed
-    true, found = ([r for r in report.color if r.poses == poses] for poses in ("true", "estimated"))
-    assert len(true) == len(found) == 6
-    for a, b in zip(true, found, strict=True):
-        assert (a.case, a.sigma_px, a.keyframes) == (b.case, b.sigma_px, b.keyframes)
-        assert b.psnr_db == pytest.approx(a.psnr_db, abs=0.02)
-        assert b.psnr_db_least == pytest.approx(a.psnr_db_least, abs=0.05)
-        assert (b.ssim, b.gradient) == pytest.approx((a.ssim, a.gradient), abs=2e-3)
+    assert report.fused("true") == report.fused("estimated")
+    for cell in report.fused("true"):
+        for weights in ("constant", "sigma1", "sigma2"):
+            for name, tolerance in (("psnr_db", 0.02), ("psnr_db_least", 0.05), ("ssim", 2e-3), ("gradient", 2e-3)):
+                true, found = (cell.figures[f"{name}_{poses}_{weights}"] for poses in PATHS)
+                assert found == pytest.approx(true, abs=tolerance)
 
 
 def test_tracking_is_compared_with_poses_at_the_end_of_exposure(stressed: tuple[Path, StressResult]) -> None:
     _, report = stressed
-    assert [(row.case, row.variant, row.lost) for row in report.tracking] == [
+    assert [(cell.case, cell.variant, cell.figures["lost"]) for cell in report.cells] == [
         ("exposure_0ms", "mid-exposure", 0),
         ("exposure_20ms", "mid-exposure", 0),
         ("exposure_20ms", "mid-exposure, blur weight", 0),
         ("exposure_20ms", "end of exposure", 0),
     ]
-    found = [row.ate_mm for row in report.tracking]
+    found = [cell.figures["ate_mm"] for cell in report.cells]
     # An error of a tenth of the exposure that the tracker is told, in every second pose.
     assert found == pytest.approx([0.0, 1.0, 1.0, 0.0], abs=0.05)
 
@@ -200,16 +204,18 @@ def test_exposures_differ_in_blur_only(stressed: tuple[Path, StressResult]) -> N
 
 def test_what_is_written_can_be_read_again(records: tuple[Path, tuple[Record, ...]]) -> None:
     out, found = records
-    report = write_stress(found, out)
-    names = ("stress.txt", "stress.json", "stress_color.csv", "stress_depth.csv", "stress_tracking.csv", "stress.png")
-    assert all((out / name).stat().st_size > 0 for name in (*names, "panels.png"))
+    report, text = write_stress(found, out)
+    names = ("stress.txt", "stress.md", "stress.csv", "stress.json", "stress.png", "panels.png")
+    assert all((out / name).stat().st_size > 0 for name in names)
     read = read_stress(out)
-    assert len(read.color) == len(report.color) == 12 and read.color[0].sigma_px is None
-    rows = list(csv.DictReader((out / "stress_color.csv").open()))
-    assert [float(row["psnr_db"]) for row in rows] == pytest.approx([row.psnr_db for row in read.color], rel=1e-5)
-    text = stress_text(report)
-    assert f"{gains_db(report)['exposure_20ms']:+.2f}" in text and "nan" not in text
-    assert read.panels_case == "exposure_20ms" and read.panels is not None
+    assert [cell.case for cell in read.cells] == [cell.case for cell in report.cells] and len(read.cells) == 4
+    rows = list(csv.DictReader((out / "stress.csv").open()))
+    psnr = [cell.figures["psnr_db_true_sigma1"] for cell in read.fused("true")]
+    assert [float(row["psnr_db_true_sigma1"]) for row in rows[:2]] == pytest.approx(psnr, rel=1e-5)
+    assert rows[2]["psnr_db_true_sigma1"] == "" and float(rows[2]["ate_mm"]) > 0.9
+    gain = report.fused("true")[1].gain_db("true", 1.0)
+    assert f"{gain:+.2f}" in text and "nan" not in text and text == (out / "stress.txt").read_text()[:-1]
+    assert read.pictured is not None and read.pictured.case == "exposure_20ms" and read.panels is not None
     panels = blur.read_panels(out / read.panels)
     assert panels is not None and 0.0 < panels.white <= 1.0 and len(panels.images(out / read.panels)) == 5
 
@@ -253,7 +259,7 @@ def test_what_cannot_be_compared_is_refused(tmp_path: Path, change: dict[str, An
     options = StressOptions(exposures_s=(0.0,), speeds=(), frames=2)
     (record,) = run_stress(config, tmp_path / "out", options)
     assert record.error is not None and complaint in record.error
-    assert stress_result([record]).failed == (f"blur/exposure_0ms/rs-pg: {record.error}",)
+    assert stress_result([record]).failed == [f"Failed ({record.error}): blur/exposure_0ms/rs-pg."]
 
 
 @pytest.mark.parametrize(
@@ -283,12 +289,12 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     words = ["bench", str(config), "--frames", "0:8", "--exposure", "0", "--method", "rs-pg", "--quiet"]
     assert main([*words, "--out", str(tmp_path / "out")]) == 0
     said = capsys.readouterr()
-    assert said.err == "" and "exposure_20ms_speed_4x" in said.out and "end of exposure" in said.out
-    assert len(read_stress(tmp_path / "out").tracking) == 1 + 2 * 3
+    assert said.err == "" and "20 ms, 4× speed" in said.out and "end of exposure" in said.out
+    assert len(read_stress(tmp_path / "out").cells) == 1 + 2 * 3
 
 
 def test_an_interrupt_before_anything_is_done(tmp_path: Path) -> None:
-    assert write_stress([], tmp_path).tracking == ()
+    assert write_stress([], tmp_path)[0].cells == ()
     with pytest.raises(UserError, match="holds no records"):
         read_stress(tmp_path)
 

@@ -12,12 +12,14 @@ from bench_evaluation import made_up_record
 from matplotlib.figure import Figure
 
 import rsgen.figures
-from rstrack.bench.methods import paper
+from rsgen.console.tables import csv_text
 from rstrack.bench.methods.config import SequenceInfo
 from rstrack.bench.methods.plots import ate_chart
-from rstrack.bench.methods.results import Results, averages, read_results
-from rstrack.bench.methods.tables import notes, results_csv, results_markdown, results_text, write_results
+from rstrack.bench.methods.results import Results, better_pct, read_results
+from rstrack.bench.methods.tables import csv_rows, method_tables, notes, results_text, write_results
 from rstrack.bench.record import Record
+from rstrack.bench.tables import paper
+from rstrack.bench.tables.files import tables_markdown
 from rstrack.charts.to_file import write_charts
 from rstrack.charts.to_page import figure_of
 
@@ -40,13 +42,13 @@ def made_up() -> Results:
 
 
 def test_averages_by_hand() -> None:
-    by = {(a.group, a.method): a for a in averages(made_up())}
-    assert by["one", "rs-pg"].sequences == ("a", "c")  # rs-pg is lost on b, so b counts for nobody
-    assert by["one", "baseline"].values == pytest.approx({"ate_mm": 20.0, "drift_mm_s": 40.0, "drift_deg_s": 2.0})
-    assert by["one", "rs-pg"].values["ate_mm"] == pytest.approx(2.5)
-    assert by["one", "rs-pg"].better_pct["ate_mm"] == pytest.approx(87.5)
-    assert by["one", "theirs"].values["ate_mm"] is None and by["one", "theirs"].better_pct["ate_mm"] is None
-    assert by["two", "rs-pg"].values["ate_mm"] == pytest.approx(0.1234) and by["two", "theirs"].values["ate_mm"] is None
+    found = made_up()
+    assert found.averaged("one") == ("a", "c")  # rs-pg is lost on b, so b counts for nobody
+    baseline, ours = (found.average("one", method).figures for method in ("baseline", "rs-pg"))
+    assert baseline == pytest.approx({"ate_mm": 20.0, "drift_mm_s": 40.0, "drift_deg_s": 2.0})
+    assert ours["ate_mm"] == pytest.approx(2.5) and better_pct(2.5, 20.0) == pytest.approx(87.5)
+    assert found.average("one", "theirs").figures == found.average("two", "theirs").figures == {}
+    assert found.average("two", "rs-pg").figures["ate_mm"] == pytest.approx(0.1234)
 
 
 def test_the_better_setting_is_shown_and_the_other_one_kept() -> None:
@@ -65,12 +67,12 @@ def test_the_better_setting_is_shown_and_the_other_one_kept() -> None:
         ("baseline", "baseline-fuse"), ("gs-g", "gs-g"), ("rs-g", "rs-g"), ("rs-g-no-fuse", "rs-g-no-fuse"),
     ]  # fmt: skip
     assert list(results.shown("two").values()) == ["baseline", "gs-g", "rs-g", "rs-g-no-fuse"]
-    by = {(a.group, a.method): a for a in averages(results)}
-    assert by["one", "baseline-fuse"].values["ate_mm"] == pytest.approx(11.0)
-    assert by["one", "gs-g"].sequences == ("a", "b", "c") and by["one", "gs-g-fuse"].values["ate_mm"] is None
-    assert by["one", "rs-g"].better_pct["ate_mm"] == pytest.approx(100 * (1 - 0.001 / 0.011))
+    assert results.average("one", "baseline-fuse").figures["ate_mm"] == pytest.approx(11.0)
+    assert results.averaged("one") == ("a", "b", "c") and not results.average("one", "gs-g-fuse").figures
+    (row,) = [r for r in csv_rows(results) if (r["group"], r["sequence"], r["method"]) == ("one", "average", "rs-g")]
+    assert row["better_ate_mm_pct"] == pytest.approx(100 * (1 - 0.001 / 0.011))
     lines = [line.split() for line in results_text(results).split("\n\n")[3].splitlines()]
-    assert lines[1:] == [
+    assert lines[2:] == [
         ["baseline", "50.0", "50.0"], ["paper:", "Baseline", "12.9", "12.9"],
         ["gs-g", "20.0", "20.0", "60", "%"], ["paper:", "Spline", "GS", "G", "16.9", "16.9", "-31", "%"],
         ["rs-g", "1.00", "1.00", "98", "%"], ["paper:", "Spline", "RS", "G", "12.9", "12.9", "0", "%"],
@@ -86,39 +88,42 @@ def test_text_by_hand() -> None:
     blocks = results_text(made_up()).split("\n\n")
     lines = [line.split() for line in blocks[0].splitlines()]
     assert lines == [
-        ["one,", "ATE,", "mm", "a", "b", "c", "average", "better", "by"],
+        ["one,", "ATE,", "mm"],
+        ["method", "a", "b", "c", "average", "better", "by"],
         ["baseline", "10.0", "20.0", "30.0", "20.0"],
         ["rs-pg", "1.00", "lost", "4.00†", "2.50", "88", "%"],
         ["theirs", "0.500", "1000", "failed", "-", "-"],
     ]
     # Of robot_t1 the paper has figures: .0129 and .0092 m, 29 % less.
     assert [line.split() for line in blocks[3].splitlines()] == [
-        ["two,", "ATE,", "mm", "robot_t1", "average", "better", "by"],
+        ["two,", "ATE,", "mm"],
+        ["method", "robot_t1", "average", "better", "by"],
         ["baseline", "1267", "1267"],
         ["paper:", "Baseline", "12.9", "12.9"],
         ["rs-pg", "0.123", "0.123", "100", "%"],
-        ["paper:", "Spline", "RS", "P+G", "9.2", "9.2", "29", "%"],
+        ["paper:", "Spline", "RS", "P+G", "9.20", "9.20", "29", "%"],
         ["theirs", "-", "-", "-"],
     ]
-    assert "12.3" in blocks[5].splitlines()[3] or "0.0123" in blocks[5].splitlines()[3]
+    assert "0.0123" in blocks[5].splitlines()[4]
     said = "\n".join(notes(made_up()))
     for part in (
-        "rs-pg on c 3", "rs-pg on b (poses for 49 of 100)", "theirs on c: c.txt: cannot be read", "not run yet",
+        "rs-pg on c 3", "rs-pg on b (poses for 49 of 100)", "(c.txt: cannot be read): track/c/theirs", "not run yet",
         "average of one: only over a, c", "abacus", "1.2.3", "compare the orders",
     ):  # fmt: skip
         assert part in said, part
 
 
 def test_markdown_and_csv_by_hand() -> None:
-    table = results_markdown(made_up()).split("\n\n")[1].splitlines()
+    text = tables_markdown(method_tables(made_up()), notes(made_up()))
+    table = text.split("\n\n")[1].splitlines()
     assert table[0] == "| method | a | b | c | average | better by |" and set(table[1]) <= set("| -:")
     assert table[3] == "| `rs-pg` | 1.00 | lost | **4.00†** | **2.50** | 88 % |"
     assert table[4] == "| `theirs` | **0.500** | 1000 | failed | - | - |"
-    assert "| **0.123** (9.2) |" in results_markdown(made_up())
-    rows = list(csv.DictReader(io.StringIO(results_csv(made_up()))))
+    assert "| **0.123** (9.20) |" in text and "**One, ATE, mm**" in text
+    rows = list(csv.DictReader(io.StringIO(csv_text(csv_rows(made_up())))))
     assert len(rows) == 11 + 6
-    lost = rows[5]
-    assert (lost["sequence"], lost["method"], lost["ate_mm"], lost["lost"]) == ("b", "rs-pg", "", "51")
+    (lost,) = [r for r in rows if (r["sequence"], r["method"]) == ("b", "rs-pg")]
+    assert (lost["ate_mm"], lost["lost"]) == ("", "51")
     (average,) = [r for r in rows if (r["group"], r["sequence"], r["method"]) == ("one", "average", "rs-pg")]
     assert float(average["better_drift_mm_s_pct"]) == pytest.approx(87.5)
 
@@ -142,11 +147,10 @@ def test_the_papers_averages_are_those_of_its_rows() -> None:
     for group, rows in published.items():
         for method, expected in zip(paper.NAMES, rows, strict=True):
             mean = paper.average(groups[group], method)
-            assert mean is not None
-            found = (1e-3 * mean.drift_mm_s, mean.drift_deg_s, 1e-3 * mean.ate_mm)
+            found = (1e-3 * mean["drift_mm_s"], mean["drift_deg_s"], 1e-3 * mean["ate_mm"])
             assert found == pytest.approx(expected, abs=1.01e-4), (group, method)
-    assert paper.average([], "rs-pg") is None and paper.average(["table1", "mine"], "rs-pg") is None
-    assert paper.average(["table1"], "gs-p") is None
+    assert paper.average([], "rs-pg") == paper.average(["table1", "mine"], "rs-pg") == {}
+    assert paper.average(["table1"], "gs-p") == {}
 
 
 @pytest.fixture

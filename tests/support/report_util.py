@@ -241,7 +241,7 @@ def make_stress(root: Path, seed: int = 5) -> StressResult:
         (folder / f"{name}.png").write_bytes(encode_png(image))
     about = Panels(keyframe=12, width=64, height=48, white=0.25)
     (folder / "panels.json").write_text(about.model_dump_json())
-    return write_stress(records, root)
+    return write_stress(records, root)[0]
 
 
 def calibration() -> dict[str, Any]:

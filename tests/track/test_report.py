@@ -34,8 +34,8 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rstrack.bench.methods import paper
-from rstrack.bench.methods.results import QUANTITIES, read_results
+from rstrack.bench.methods.results import read_results
+from rstrack.bench.tables import paper
 from rstrack.charts.chart import CameraPath, PathChart, upright_axes
 from rstrack.cli.report import report as report_command
 from rstrack.data.dataset import open_dataset
@@ -358,20 +358,20 @@ def test_the_benchmarks_tables(bench: Path, bench_report: Path) -> None:
     for name in ("robot_t1", "lr_kt2"):
         paired = zip(results.methods, page.row(name)[1:], strict=True)
         for method, text in paired:
-            ate, theirs = results.figure(name, method, QUANTITIES[0]), paper.FIGURES.get((name, method))
-            note = "" if theirs is None else f" {theirs.ate_mm:.1f}"
-            mark = "" if ate is None or theirs is None or ate < theirs.ate_mm else " ▲"
+            ate, theirs = results.figure(name, method, "ate_mm"), paper.FIGURES.get((name, method), {}).get("ate_mm")
+            note = "" if theirs is None else f" {significant(theirs)}"
+            mark = "" if ate is None or theirs is None or ate < theirs else " ▲"
             assert text == ("failed" if ate is None else f"{significant(ate, 3)}†{mark}{note}")
     better = page.row("better by")
     assert better[1] == "" and better[2].split()[1] == "%" and better[2].endswith("29 %") and better[3].endswith("%")
     assert page.row("robot_t1, 31 frames")[1:] == ["100"] * 3 and page.row("lr_kt2, 31 frames")[3] == "-"
     top = page.text[: page.text.index("Small print")]
-    ate = results.figure("robot_t1", "rs-pg", QUANTITIES[0])
+    ate = results.figure("robot_t1", "rs-pg", "ate_mm")
     assert f"{shown(ate)} mm" in top and "paper: 9.2 mm" in top and "abacus" in page.text
     bars = next(f for f in page.figures if f["data"][0]["type"] == "bar")
     ours = next(t for t in bars["data"] if t["name"] == "rs-pg")
     assert ours["x"] == ["robot_t1", "lr_kt2"]
-    figures = [results.figure(name, "rs-pg", QUANTITIES[0]) for name in ours["x"]]
+    figures = [results.figure(name, "rs-pg", "ate_mm") for name in ours["x"]]
     assert ours["y"] == pytest.approx([figure or 0.0 for figure in figures], rel=1e-3)
     names = [[t["name"] for t in f["data"]] for f in page.figures if "scene" in f["layout"]]
     assert names == [["true", "baseline", "rs-pg", "open3d-icp"], ["true", "baseline", "rs-pg"]]

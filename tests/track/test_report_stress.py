@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import re
 import shutil
@@ -26,6 +25,15 @@ LABELS = {
     "exposure_20ms_speed_2x": "20 ms, 2× speed",
 }  # fmt: skip
 
+SCORES = (("psnr_db", 2), ("psnr_db_least", 2), ("ssim", 4), ("gradient", 3))
+Stored = dict[str, dict[str, dict[str, float]]]
+
+
+def scores(stored: Stored, case: str, name: str, poses: str) -> list[float | None]:
+    """By weights, the constant ones first."""
+    figures = stored[case]["mid-exposure"]
+    return [figures.get(f"{name}_{poses}_{weights}") for weights in ("constant", "sigma0.5", "sigma1")]
+
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, StressResult]:
@@ -35,9 +43,12 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, StressResult]:
 
 
 @pytest.fixture(scope="module")
-def stored(made: tuple[Path, StressResult]) -> dict[str, Any]:
-    read = read_stress(made[0])
-    return {name: [dataclasses.asdict(row) for row in getattr(read, name)] for name in ("color", "depth", "tracking")}
+def stored(made: tuple[Path, StressResult]) -> Stored:
+    """Figures in the file by sequence and photometric term."""
+    found: Stored = {case: {} for case in LABELS}
+    for cell in read_stress(made[0]).cells:
+        found[cell.case][cell.variant] = cell.figures
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -60,95 +71,93 @@ def tables(page: Parsed) -> list[list[list[str]]]:
 def test_what_was_written_is_read_again(made: tuple[Path, StressResult]) -> None:
     root, report = made
     read = read_stress(root)
-    assert (read.motion, read.panels, read.panels_case) == (NASTY, report.panels, "exposure_20ms")
-    for name in ("color", "depth", "tracking"):
-        for a, b in zip(getattr(read, name), getattr(report, name), strict=True):
-            for read_value, value in zip(dataclasses.astuple(a), dataclasses.astuple(b), strict=True):
-                assert read_value == (pytest.approx(value, rel=1e-5) if isinstance(value, float) else value)
+    assert (read.motion, read.panels, report.panels) == (NASTY, PANELS, PANELS)
+    for a, b in zip(read.cells, report.cells, strict=True):
+        assert (a.case, a.speed, a.exposure_s, a.variant, a.sigmas_px) == (
+            b.case, b.speed, b.exposure_s, b.variant, b.sigmas_px,
+        )  # fmt: skip
+        assert a.figures == pytest.approx(b.figures, rel=1e-5)
 
 
-def test_the_colour_tables_numbers_are_those_of_the_file(page: Parsed, stored: dict[str, Any]) -> None:
+def test_the_colour_tables_numbers_are_those_of_the_file(page: Parsed, stored: Stored) -> None:
     found = tables(page)
     assert len(found) == 4 + 4 + 2 + 1
-    scores = (("psnr_db", 2), ("psnr_db_least", 2), ("ssim", 4), ("gradient", 3))
     for n, poses in enumerate(("true", "estimated")):
-        for k, (name, digits) in enumerate(scores):
+        for k, (name, digits) in enumerate(SCORES):
             head, *rows = found[4 * n + k]
             assert head == ["sequence", "constant", "σ 0.5 px", "σ 1 px"]
             assert len(rows) == len(LABELS)
             for row, (case, label) in zip(rows, LABELS.items(), strict=True):
-                values = [r[name] for r in stored["color"] if (r["case"], r["poses"]) == (case, poses)]
+                values = scores(stored, case, name, poses)
                 texts = ["-" if value is None else f"{value:.{digits}f}" for value in values]
                 if name == "psnr_db":
                     label += " 4 keyframes"
-                    texts[1:] = [f"{text} {v - values[0]:+.2f}" for text, v in zip(texts[1:], values[1:], strict=True)]
+                    gains = [f"{v - (values[0] or 0.0):+.2f}" for v in values[1:] if v is not None]
+                    texts[1:] = [f"{text} {gain}" for text, gain in zip(texts[1:], gains, strict=True)]
                 assert row == [label, *texts]
     assert found[6][1][1:] == ["-"] * 3, "no score, no number"
 
 
-def test_the_depth_and_tracking_tables_numbers_are_those_of_the_file(page: Parsed, stored: dict[str, Any]) -> None:
+def test_the_depth_and_tracking_tables_numbers_are_those_of_the_file(page: Parsed, stored: Stored) -> None:
     *_, true, estimated, tracking = tables(page)
     for table, poses in ((true, "true"), (estimated, "estimated")):
-        rows = [r for r in stored["depth"] if r["poses"] == poses]
-        assert table[1:] == [
-            [LABELS[r["case"]], f"{r['single_mm']:.2f}", f"{r['fused_mm']:.2f}",
-             f"{r['fused_mm'] / r['single_mm']:.2f}"]
-            for r in rows
-        ]  # fmt: skip
+        for row, (case, label) in zip(table[1:], LABELS.items(), strict=True):
+            single, fused = (stored[case]["mid-exposure"][f"{what}_mm_{poses}"] for what in ("single", "fused"))
+            assert row == [label, f"{single:.2f}", f"{fused:.2f}", f"{fused / single:.2f}"]
     assert tracking[0] == ["sequence", "mid-exposure", "end of exposure", "blur weight"]
     for row, (case, label) in zip(tracking[1:], LABELS.items(), strict=True):
         assert row[0] == label
-        runs = {r["variant"]: r for r in stored["tracking"] if r["case"] == case}
         for text, variant in zip(row[1:], tracking[0][1:], strict=True):
-            if variant not in runs:
+            figures = stored[case].get(variant)
+            if figures is None:
                 assert text == "-"
                 continue
-            r = runs[variant]
-            ate = "-" if r["ate_mm"] is None else f"{r['ate_mm']:.2f}"
-            drift = "" if r["drift_mm_s"] is None else f" {r['drift_mm_s']:.2f} mm/s"
-            assert text == f"{ate}{drift}" + (f" {r['lost']} lost" if r["lost"] else "")
+            ate = f"{figures['ate_mm']:.2f}" if "ate_mm" in figures else "-"
+            drift = f" {figures['drift_mm_s']:.2f} mm/s" if "drift_mm_s" in figures else ""
+            assert text == f"{ate}{drift}" + (f" {figures['lost']:.0f} lost" if figures["lost"] else "")
 
 
-def test_the_best_of_a_row_is_marked(made: tuple[Path, StressResult], stored: dict[str, Any]) -> None:
+def test_the_best_of_a_row_is_marked(made: tuple[Path, StressResult], stored: Stored) -> None:
     html = write_report(made[0]).read_text("utf-8")
     marked = re.findall(r'<td class="best">\s*([-+.\d]+)', html)
     expected = []
     for poses in ("true", "estimated"):
-        for name, digits in (("psnr_db", 2), ("psnr_db_least", 2), ("ssim", 4), ("gradient", 3)):
+        for name, digits in SCORES:
             for case in LABELS:
-                rows = [r[name] for r in stored["color"] if (r["case"], r["poses"]) == (case, poses)]
-                expected += [f"{max(rows):.{digits}f}"] if None not in rows else []
+                values = [value for value in scores(stored, case, name, poses) if value is not None]
+                expected += [f"{max(values):.{digits}f}"] if values else []
     for case in LABELS:
-        ate = [r["ate_mm"] for r in stored["tracking"] if r["case"] == case and r["ate_mm"] is not None]
+        ate = [figures["ate_mm"] for figures in stored[case].values() if "ate_mm" in figures]
         expected.append(f"{min(ate):.2f}")
     assert marked == expected and len(marked) == 4 * 8 - 1 + 4
 
 
-def test_the_headline_is_of_the_longest_exposure(page: Parsed, stored: dict[str, Any]) -> None:
-    rows = [r for r in stored["color"] if (r["case"], r["poses"]) == ("exposure_30ms", "true")]
-    constant, aware = (next(r["psnr_db"] for r in rows if r["sigma_px"] == sigma) for sigma in (None, 1.0))
-    depth = next(r for r in stored["depth"] if (r["case"], r["poses"]) == ("exposure_30ms", "true"))
-    ate = next(r["ate_mm"] for r in stored["tracking"] if r["case"] == "exposure_30ms")
+def test_the_headline_is_of_the_longest_exposure(page: Parsed, stored: Stored) -> None:
+    figures = stored["exposure_30ms"]["mid-exposure"]
+    constant, aware = (figures[f"psnr_db_true_{weights}"] for weights in ("constant", "sigma1"))
     top = page.text[: page.text.index("Green")]
     for text in (
         "30 ms exposure, true path", f"{aware - constant:+.2f} dB", f"{constant:.2f} dB with constant weights",
-        f"{depth['fused_mm']:.2f} mm", f"{depth['single_mm']:.2f} mm in one frame", f"{ate:.2f} mm",
+        f"{figures['fused_mm_true']:.2f} mm", f"{figures['single_mm_true']:.2f} mm in one frame",
+        f"{figures['ate_mm']:.2f} mm",
         "0, 20, 30 ms, at 1×, 2× speed",
     ):  # fmt: skip
         assert text in top
     assert NASTY in page.text
 
 
-def test_the_curves_are_the_gains_by_exposure_and_by_speed(page: Parsed, stored: dict[str, Any]) -> None:
+def test_the_curves_are_the_gains_by_exposure_and_by_speed(page: Parsed, stored: Stored) -> None:
     from plotly.graph_objects import Figure  # type: ignore[import-untyped]
 
     for figure in page.figures:
         Figure(figure)  # raises ValueError for a wrong name or value
     assert len(page.figures) == 4 + 4 + 1
-    psnr = {(r["case"], r["poses"], r["sigma_px"]): r["psnr_db"] for r in stored["color"]}
+
+    def psnr(poses: str, weights: str, cases: tuple[str, ...]) -> Any:
+        return np.array([stored[case]["mid-exposure"][f"psnr_db_{poses}_{weights}"] for case in cases])
 
     def gains(poses: str, sigma: float, cases: tuple[str, ...]) -> Any:
-        return pytest.approx([psnr[c, poses, sigma] - psnr[c, poses, None] for c in cases], abs=2e-3)
+        return pytest.approx(psnr(poses, f"sigma{sigma:g}", cases) - psnr(poses, "constant", cases), abs=2e-3)
 
     slow, fast = ("exposure_0ms", "exposure_20ms", "exposure_30ms"), ("exposure_20ms", "exposure_20ms_speed_2x")
     for n, poses in enumerate(("true", "estimated")):
@@ -159,7 +168,7 @@ def test_the_curves_are_the_gains_by_exposure_and_by_speed(page: Parsed, stored:
         for trace, sigma in zip(by_speed["data"], (0.5, 1.0), strict=True):
             assert trace["x"] == [1.0, 2.0] and trace["y"] == gains(poses, sigma, fast)
         assert [trace["name"] for trace in absolute["data"]] == ["constant", "σ 0.5 px", "σ 1 px"]
-        assert absolute["data"][0]["y"] == pytest.approx([psnr[c, poses, None] for c in slow], abs=5e-3)
+        assert absolute["data"][0]["y"] == pytest.approx(psnr(poses, "constant", slow), abs=5e-3)
     lost = page.figures[-1]["data"][2]
     assert lost["name"] == "blur weight" and lost["y"] == [None]
 

@@ -19,10 +19,11 @@ from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, read_text, write_error
 from rstrack.bench.methods.config import SequenceInfo
-from rstrack.bench.methods.results import Results, figure, folder_of, is_good
+from rstrack.bench.methods.results import Results
 from rstrack.bench.methods.variants import method_of
 from rstrack.bench.record import Record, read_record
 from rstrack.bench.runner import RECORD
+from rstrack.bench.tables.cells import figure, folder_of, is_good
 from rstrack.mapping.map import run_map
 from rstrack.options import MapOptions
 

@@ -2,72 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 
 from pydantic import BaseModel, ValidationError
 
 from rsgen.errors import UserError, first_problem
 from rsgen.files import atomic_write, read_text
-from rstrack.bench.methods import paper
 from rstrack.bench.methods.config import SequenceInfo
 from rstrack.bench.methods.variants import method_of, row_of
 from rstrack.bench.record import Record
+from rstrack.bench.tables import paper
+from rstrack.bench.tables.cells import figure, is_good
+from rstrack.bench.tables.shown import ERRORS
 from rstrack.options import METHODS
 
 RESULTS = "results.json"
+AVERAGE = "average"
+"""The case that averages are records of."""
 BASELINE = "baseline"
-
-# A track with poses for fewer of the frames says little of its error: it counts as lost.
-_LEAST_COVERAGE = 0.5
-
-
-@dataclass(frozen=True)
-class Quantity:
-    """What a table is of. name: of the figure in records and in the paper's; the rest is for reading."""
-
-    name: str
-    title: str
-    unit: str
-    paper_digits: int
-
-
-QUANTITIES = (
-    Quantity("ate_mm", "ATE", "mm", 1),
-    Quantity("drift_mm_s", "drift", "mm/s", 1),
-    Quantity("drift_deg_s", "drift", "deg/s", 3),
-)
-"""RMSE all of them; drift is the relative pose error over one second."""
-
-
-def counts(figures: Mapping[str, float | None]) -> bool:
-    """Whether a run's errors mean something: at least half of the frames have a pose."""
-    frames, lost = figures.get("frames") or 0.0, figures.get("lost") or 0.0
-    return figures.get(QUANTITIES[0].name) is not None and lost <= (1.0 - _LEAST_COVERAGE) * frames
-
-
-def figure(record: Record | None, name: str) -> float | None:
-    """A figure of a record; None where it failed, the track is lost or lacks it."""
-    if record is None or record.error is not None:
-        return None
-    return record.figures.get(name) if counts(record.figures) else None
-
-
-def is_good(record: Record) -> bool:
-    """Whether it has run and kept the track."""
-    return record.error is None and counts(record.figures)
-
-
-def folder_of(record: Record) -> Path:
-    """Of its run, relative to that of the results."""
-    return Path("cells", record.cell)
-
-
-def truth_offset_s(record: Record) -> float | None:
-    """The offset of the truth's clock that the errors are for, s; None for clocks as they are."""
-    offset_ms = record.figures.get("truth_offset_ms")
-    return None if offset_ms is None else 1e-3 * offset_ms
 
 
 class Results(BaseModel, frozen=True):
@@ -77,13 +31,18 @@ class Results(BaseModel, frozen=True):
     methods: tuple[str, ...]
     records: tuple[Record, ...]
 
+    @cached_property
+    def cells(self) -> dict[tuple[str, str], Record]:
+        """The records by case and method."""
+        return {(record.case, record.method): record for record in self.records}
+
     def record(self, sequence: str, method: str) -> Record | None:
         """The record of a cell, None if it was not run."""
-        return next((r for r in self.records if (r.case, r.method) == (sequence, method)), None)
+        return self.cells.get((sequence, method))
 
-    def figure(self, sequence: str, method: str, quantity: Quantity) -> float | None:
+    def figure(self, sequence: str, method: str, name: str) -> float | None:
         """Of a cell; None where it has none."""
-        return figure(self.record(sequence, method), quantity.name)
+        return figure(self.record(sequence, method), name)
 
     @property
     def groups(self) -> tuple[str, ...]:
@@ -98,15 +57,15 @@ class Results(BaseModel, frozen=True):
         """What the tables of a group show: a variant for each of their lines (`variants.row_of`).
 
         Of two settings, that which keeps the track on more sequences, and then that of the smaller mean ATE over those
-        where both do: one setting for the whole group and all quantities, not the luckier one of every cell.
+        where both do: one setting for the whole group and all errors, not the luckier one of every cell.
         """
-        lines: dict[str, list[str]] = {}
+        rows: dict[str, list[str]] = {}
         for name in self.methods:
-            lines.setdefault(row_of(name), []).append(name)
-        return {row: self._best(self.names(group), names) for row, names in lines.items()}
+            rows.setdefault(row_of(name), []).append(name)
+        return {row: self._best(self.names(group), names) for row, names in rows.items()}
 
     def _best(self, sequences: Sequence[str], names: Sequence[str]) -> str:
-        ate = {name: [self.figure(sequence, name, QUANTITIES[0]) for sequence in sequences] for name in names}
+        ate = {name: [self.figure(sequence, name, "ate_mm") for sequence in sequences] for name in names}
         common = [k for k in range(len(sequences)) if all(ate[name][k] is not None for name in names)]
 
         def badness(name: str) -> tuple[int, float]:
@@ -114,51 +73,31 @@ class Results(BaseModel, frozen=True):
 
         return min(names, key=badness)
 
+    def averaged(self, group: str) -> tuple[str, ...]:
+        """The sequences that averages are over: those on which every one of our methods that are shown kept the track.
 
-@dataclass(frozen=True)
-class Average:
-    """Of one variant over the sequences of a group; None where it lacks one of them.
+        Other trackers and settings are averaged over the same ones, or not at all, so that they cannot change ours.
+        """
+        shown = list(self.shown(group).values())
+        ours = [name for name in shown if method_of(name) in METHODS] or shown
+        rows = {name: [self.record(name, method) for method in ours] for name in self.names(group)}
+        return tuple(name for name, row in rows.items() if all(r is not None and is_good(r) for r in row))
 
-    better_pct: how much smaller than that of the baseline that is shown, in per cent; None without a baseline.
-    """
+    def average(self, group: str, method: str) -> Record:
+        """A record of means over `averaged`, of the errors that it has on all of these."""
+        records = [self.record(name, method) for name in self.averaged(group)]
+        names = [name for name in ERRORS if all(figure(record, name) is not None for record in records)]
+        runs = tuple({name: figure(record, name) for name in names} for record in records)
+        return Record(f"track/{AVERAGE}/{method}", "", {"group": group}, runs=runs, complete=True)
 
-    group: str
-    method: str
-    sequences: tuple[str, ...]
-    values: dict[str, float | None]
-    better_pct: dict[str, float | None]
+    def of_group(self, group: str) -> dict[tuple[str, str], Record]:
+        """Cells of a group and then its averages, by case and method."""
+        found = {at: record for at, record in self.cells.items() if at[0] in self.names(group)}
+        return found | {(AVERAGE, method): self.average(group, method) for method in self.methods}
 
-    @property
-    def theirs(self) -> paper.Figures | None:
-        """The paper's average over the same sequences."""
-        return paper.average(self.sequences, row_of(self.method))
-
-
-def averaged_sequences(results: Results, group: str) -> tuple[str, ...]:
-    """The sequences of a group on which every one of our methods that are shown kept the track: averages are over them.
-
-    Other trackers and settings are averaged over the same ones, or not at all, so that they cannot change ours.
-    """
-    shown = list(results.shown(group).values())
-    ours = [name for name in shown if method_of(name) in METHODS] or shown
-    rows = {name: [results.record(name, method) for method in ours] for name in results.names(group)}
-    return tuple(name for name, row in rows.items() if all(r is not None and is_good(r) for r in row))
-
-
-def averages(results: Results) -> list[Average]:
-    """All groups' averages of all variants."""
-    found = []
-    for group in results.groups:
-        names = averaged_sequences(results, group)
-        values = {
-            method: {q.name: _mean([results.figure(name, method, q) for name in names]) for q in QUANTITIES}
-            for method in results.methods
-        }
-        base = values.get(results.shown(group).get(BASELINE, ""), {})
-        for method in results.methods:
-            better = {q.name: better_pct(values[method][q.name], base.get(q.name)) for q in QUANTITIES}
-            found.append(Average(group, method, names, values[method], better))
-    return found
+    def theirs(self, group: str, case: str, method: str) -> paper.Figures:
+        """The paper's figures of the same; empty: none."""
+        return paper.average(self.averaged(group) if case == AVERAGE else (case,), row_of(method))
 
 
 def better_pct(value: float | None, baseline: float | None) -> float | None:
@@ -177,8 +116,3 @@ def read_results(path: Path) -> Results:
         return Results.model_validate_json(read_text(path))
     except ValidationError as error:
         raise UserError(f"{path}: {first_problem(error)}: run 'rstrack bench' again") from None
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    there = [value for value in values if value is not None]
-    return sum(there) / len(there) if there and len(there) == len(values) else None

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rsgen.console.tables import NOTHING, Entry, Table, csv_text, fixed, significant
-from rsgen.files import atomic_write
-from rstrack.bench.methods.results import QUANTITIES, Quantity, counts
-from rstrack.bench.methods.tables import made_on
+from rsgen.console.tables import NOTHING, Entry, Table, fixed, significant
 from rstrack.bench.readout.config import SweepConfig
 from rstrack.bench.record import Record, write_records
+from rstrack.bench.tables.cells import counts
+from rstrack.bench.tables.figures import heading
+from rstrack.bench.tables.files import failures, provenance, write_tables
+from rstrack.bench.tables.shown import ERRORS
 from rstrack.charts.chart import Chart, Line, method_colors, numbers
 from rstrack.charts.to_file import write_charts
 
@@ -40,23 +40,6 @@ class Sweep:
         return tuple(dict.fromkeys(record.method for record in self.records))
 
 
-@dataclass(frozen=True)
-class Point:
-    """Of one method with one shutter: errors of the seeds on which it kept the track; lost: seeds without."""
-
-    motion: str
-    readout_s: float
-    exposure_s: float
-    method: str
-    values: tuple[float, ...]
-    lost: int
-
-    @property
-    def interval(self) -> tuple[float | None, float | None, float | None]:
-        """Geometric mean, for errors are compared by their ratios, and its ends; see `log_interval`."""
-        return log_interval(self.values)
-
-
 def log_interval(values: Sequence[float]) -> tuple[float | None, float | None, float | None]:
     """Geometric mean of positive values and its two-sided interval of CONFIDENCE by Student's t, in logarithms.
 
@@ -74,53 +57,38 @@ def log_interval(values: Sequence[float]) -> tuple[float | None, float | None, f
     return math.exp(mean), math.exp(mean - half), math.exp(mean + half)
 
 
-def points_of(sweep: Sweep, quantity: Quantity = QUANTITIES[0]) -> list[Point]:
-    """Of all records, in their order."""
-    found = []
-    for record in sweep.records:
-        shutter = record.settings["sequence"]["set"]
-        at = float(shutter["depth.readout_s"]), float(shutter["depth.exposure_s"])
-        values = tuple(v for run in record.runs if counts(run) and (v := run.get(quantity.name)) is not None)
-        lost = sweep.config.noise.seeds - len(values)
-        found.append(Point(record.settings["group"], *at, record.method, values, lost))
-    return found
+def errors(record: Record, name: str = "ate_mm") -> list[float]:
+    """Of the seeds on which it kept the track."""
+    return [value for run in record.runs if counts(run) and (value := run.get(name)) is not None]
 
 
-def growth(points: Sequence[Point]) -> float | None:
-    """Largest over smallest mean of a method's points, one a readout; None if it was lost at one, or has but one."""
-    means = [point.interval[0] for point in points]
+def growth(means: Sequence[float | None]) -> float | None:
+    """Largest over smallest of a method's means, one a readout; None if it was lost at one, or has but one."""
     known = [mean for mean in means if mean is not None]
     return max(known) / min(known) if len(known) == len(means) > 1 else None
 
 
 def write_sweep(sweep: Sweep, out: Path) -> str:
     """Write records.json, results.csv, .md and .txt into `out`; returns the text. Raises UserError."""
-    tables, listed = sweep_tables(sweep), sweep_notes(sweep)
-    text = "\n\n".join([*(f"{table.title}\n{table.text()}" for table in tables), "\n".join(listed)])
-    notes = "\n".join(f"- {note}" for note in listed)
-    markdown = "\n\n".join([*(f"**{table.title}**\n\n{table.markdown()}" for table in tables), notes]) + "\n"
     write_records(out / "records.json", sweep.records)
-    atomic_write(out / "results.txt", (text + "\n").encode())
-    atomic_write(out / "results.md", markdown.encode())
-    atomic_write(out / "results.csv", csv_text(_rows(sweep)).encode())
-    return text
+    return write_tables(out, sweep_tables(sweep), sweep_notes(sweep), _rows(sweep))
 
 
-def sweep_tables(sweep: Sweep, quantity: Quantity = QUANTITIES[0]) -> list[Table]:
-    """A table for each motion and exposure: a row for each method, a column for each readout, and the growth."""
-    points = {(p.motion, p.exposure_s, p.method, p.readout_s): p for p in points_of(sweep, quantity)}
-    readouts = sorted(sweep.config.readouts_s)
-    tables = []
-    for entry in sweep.config.motions:
-        for exposure in sweep.config.exposures_s:
-            rows: list[tuple[Entry | str, ...]] = []
-            for method in sweep.methods:
-                line = [points.get((entry.name, exposure, method, readout)) for readout in readouts]
-                factor = growth([p for p in line if p is not None]) if None not in line else None
-                rows.append((method, *map(_entry, line), "" if len(line) < 2 else fixed(factor, 2)))
-            head = ("method", *(f"{1e3 * readout:g} ms" for readout in readouts), "most / least")
-            title = f"{entry.name}, exposure {1e3 * exposure:g} ms: {quantity.title}, {quantity.unit}, by readout"
-            tables.append(Table(head, tuple(rows), title))
+def sweep_tables(sweep: Sweep) -> list[Table]:
+    """A table for each motion and exposure: a row for each method, a column for each readout, and the growth.
+
+    Entries are geometric means, for errors are compared by their ratios.
+    """
+    readouts, tables = sorted(sweep.config.readouts_s), []
+    for (motion, exposure), methods in _panels(sweep).items():
+        rows: list[tuple[Entry | str, ...]] = []
+        for method, found in methods.items():
+            line = [found.get(readout) for readout in readouts]
+            factor = growth([None if r is None else log_interval(errors(r))[0] for r in line])
+            rows.append((method, *(_entry(sweep, r) for r in line), "" if len(line) < 2 else fixed(factor, 2)))
+        head = ("method", *(f"{1e3 * readout:g} ms" for readout in readouts), "most / least")
+        title = f"{motion}, exposure {1e3 * exposure:g} ms: {heading('ate_mm')}, by readout"
+        tables.append(Table(head, tuple(rows), title))
     return tables
 
 
@@ -136,36 +104,35 @@ def sweep_notes(sweep: Sweep) -> list[str]:
             f"RMSE over {over}; geometric mean over {noise.seeds} seeds of {noisy}, in brackets its "
             f"{100 * CONFIDENCE:.0f} % interval: what other noise would change, not what another motion would"
         ]
-    points = zip(sweep.records, points_of(sweep), strict=True)
-    some = [f"{r.method} on {r.case} {p.lost} of {p.lost + len(p.values)}" for r, p in points if p.lost]
+    some = [f"{r.method} on {r.case} {lost} of {noise.seeds}" for r in sweep.records if (lost := _lost(sweep, r))]
     if some:
         lines.append(f"† lost or failed (poses for fewer than half of the frames): {', '.join(some)}")
-    errors = Counter(f"{r.method}: {r.error}" for r in sweep.records if r.error is not None)
-    lines += [f"failed, {count} cells: {error}" for error, count in errors.items()]
+    lines += failures(sweep.records)
     if sweep.lacking:
         lines.append(f"left out, not installed: {', '.join(sweep.lacking)} (pip install '.[peers]')")
     if sweep.interrupted:
         lines.append("not run yet (-): the same command goes on where this one ended")
-    return [*lines, *made_on(sweep.records)]
+    return [*lines, provenance(sweep.records)]
 
 
 def sweep_charts(sweep: Sweep) -> list[Chart]:
     """ATE over readout with its interval: motions, then exposures. Points that are lost are left out."""
-    ate, points, colors = QUANTITIES[0], points_of(sweep), method_colors(sweep.methods)
     charts = []
-    for exposure in sweep.config.exposures_s:
-        for entry in sweep.config.motions:
-            lines = []
-            for method in sweep.methods:
-                mine = [p for p in points if (p.motion, p.exposure_s, p.method) == (entry.name, exposure, method)]
-                mine.sort(key=lambda p: p.readout_s)
-                mean, low, high = (numbers([p.interval[k] for p in mine]) for k in range(3))
-                x, is_dashed = numbers([p.readout_s for p in mine], 1e3), method not in ("rs-pg", "rs-g")
-                lines.append(Line(method, colors[method], x, mean, is_dashed, True, low, high))
-            at = f", exposure {1e3 * exposure:g} ms" if len(sweep.config.exposures_s) > 1 else ""
-            title = f"{entry.name}{at}: ATE (RMSE)"
-            charts.append(Chart(title, ate.unit, "readout, ms", tuple(lines), is_log=True, note=_DASHED))
+    order = sweep.config.exposures_s.index
+    for (motion, exposure), methods in sorted(_panels(sweep).items(), key=lambda item: order(item[0][1])):
+        at = f", exposure {1e3 * exposure:g} ms" if len(sweep.config.exposures_s) > 1 else ""
+        charts.append(readout_chart(f"{motion}{at}", methods))
     return charts
+
+
+def readout_chart(title: str, methods: Mapping[str, Mapping[float, Record]]) -> Chart:
+    """ATE of methods by readout (s): geometric mean of the seeds and its interval, as `log_interval` has them."""
+    colors, lines = method_colors(list(methods)), []
+    for method, found in methods.items():
+        mean, low, high = (numbers([log_interval(errors(r))[k] for _, r in sorted(found.items())]) for k in range(3))
+        x, is_dashed = numbers(sorted(found), 1e3), method not in ("rs-pg", "rs-g")
+        lines.append(Line(method, colors[method], x, mean, is_dashed, True, low, high))
+    return Chart(f"{title}: ATE (RMSE)", "mm", "readout, ms", tuple(lines), is_log=True, note=_DASHED)
 
 
 def draw_sweep(sweep: Sweep, path: Path) -> None:
@@ -176,24 +143,47 @@ def draw_sweep(sweep: Sweep, path: Path) -> None:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _entry(point: Point | None) -> Entry:
-    if point is None:
+def _shutter(record: Record) -> tuple[float, float]:
+    """Readout and exposure, s."""
+    given = record.settings["sequence"]["set"]
+    return float(given["depth.readout_s"]), float(given["depth.exposure_s"])
+
+
+def _panels(sweep: Sweep) -> dict[tuple[str, float], dict[str, dict[float, Record]]]:
+    """By motion and exposure, then by method and readout."""
+    panels: dict[tuple[str, float], dict[str, dict[float, Record]]] = {
+        (entry.name, exposure): {method: {} for method in sweep.methods}
+        for entry in sweep.config.motions
+        for exposure in sweep.config.exposures_s
+    }
+    for record in sweep.records:
+        readout, exposure = _shutter(record)
+        panels[record.settings["group"], exposure][record.method][readout] = record
+    return panels
+
+
+def _lost(sweep: Sweep, record: Record) -> int:
+    """Seeds without an error."""
+    return sweep.config.noise.seeds - len(errors(record))
+
+
+def _entry(sweep: Sweep, record: Record | None) -> Entry:
+    if record is None:
         return Entry(NOTHING)
-    mean, low, high = point.interval
+    mean, low, high = log_interval(errors(record))
     if mean is None:
         return Entry("lost")
-    text = significant(mean, 3) + ("" if low is None else f" [{significant(low, 2)}, {significant(high, 2)}]")
-    return Entry(text, mark="†" if point.lost else "")
+    text = significant(mean) + ("" if low is None else f" [{significant(low, 2)}, {significant(high, 2)}]")
+    return Entry(text, mark="†" if _lost(sweep, record) else "")
 
 
 def _rows(sweep: Sweep) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = []
-    for of_each in zip(*(points_of(sweep, quantity) for quantity in QUANTITIES), strict=True):
-        p = of_each[0]
-        row: dict[str, Any] = {"motion": p.motion, "readout_s": p.readout_s, "exposure_s": p.exposure_s}
-        row |= {"method": p.method, "seeds": len(p.values), "lost": p.lost}
-        for quantity, point in zip(QUANTITIES, of_each, strict=True):
-            names = quantity.name, f"{quantity.name}_low", f"{quantity.name}_high"
-            row |= dict(zip(names, point.interval, strict=True))
+    rows = []
+    for record in sweep.records:
+        readout, exposure = _shutter(record)
+        row: dict[str, Any] = {"motion": record.settings["group"], "readout_s": readout, "exposure_s": exposure}
+        row |= {"method": record.method, "seeds": len(errors(record)), "lost": _lost(sweep, record)}
+        for name in ERRORS:
+            row |= dict(zip((name, f"{name}_low", f"{name}_high"), log_interval(errors(record, name)), strict=True))
         rows.append(row)
     return rows

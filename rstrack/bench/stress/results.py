@@ -1,122 +1,111 @@
-"""What the blur stress test found, read from its records: rows of scores, and their text.
+"""What the blur stress test found, read from its records, and its tables.
 
 result = read_stress(Path("runs/stress"))
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from rsgen.console.tables import Table, fixed
+from rsgen.console.tables import Entry, Table, best_marked, fixed
 from rsgen.errors import UserError, first_problem
 from rsgen.files import read_text
-from rstrack.bench.measures.blur import POSES, weights_key
+from rstrack.bench.measures.blur import weights_key
 from rstrack.bench.record import Record
+from rstrack.bench.tables.files import failures, provenance
 
 STRESS = "stress.json"
+PATHS = {"true": "true path", "estimated": "estimated path"}
+"""What frames are registered along, by its name in figures."""
 # Exposure whose keyframe is shown.
 _SHOWN_S = 0.020
-_SCORES = ("psnr_db", "psnr_db_least", "ssim", "gradient")
+# What a score is, its digits after the point, and the value that none is better than.
+_SCORES = (
+    ("psnr_db", "PSNR, dB: mean over the keyframes; small print: gain over constant weights", 2, math.inf),
+    ("psnr_db_least", "PSNR of the worst keyframe, dB", 2, math.inf),
+    ("ssim", "Structural similarity (SSIM)", 4, 1.0),
+    ("gradient", "Gradient energy over that of the sharp view", 3, 1.0),
+)
 _STORED = TypeAdapter(tuple[Record, ...])
 
 
 @dataclass(frozen=True)
-class ColorScore:
-    """Means over a sequence's keyframes, poses 'true' or 'estimated', for one σ (None: constant weights).
-
-    gradient: gradient energy over that of the sharp truth. psnr_db_least: of the worst keyframe.
-    """
-
-    case: str
-    speed: float
-    exposure_s: float
-    poses: str
-    sigma_px: float | None
-    psnr_db: float | None
-    psnr_db_least: float | None
-    ssim: float | None
-    gradient: float | None
-    keyframes: int
-
-
-@dataclass(frozen=True)
-class DepthScore:
-    """RMSE over a sequence's keyframes: one frame's depth, and the fused keyframes'."""
-
-    case: str
-    poses: str
-    single_mm: float | None
-    fused_mm: float | None
-    pixels: float | None
-
-
-@dataclass(frozen=True)
-class TrackScore:
-    """Tracking errors of a sequence. variant: which photometric term. lost: frames, None if it could not be run."""
+class Tested:
+    """A cell. case: its sequence. variant: which photometric term. sigmas_px: of the weights (None: constant ones)."""
 
     case: str
     speed: float
     exposure_s: float
     variant: str
-    ate_mm: float | None
-    drift_mm_s: float | None
-    lost: int | None
+    sigmas_px: tuple[float | None, ...]
+    figures: dict[str, float]
+    record: Record
+
+    @property
+    def label(self) -> str:
+        """What its sequence is called on a page."""
+        return f"{1e3 * self.exposure_s:g} ms" + ("" if self.speed == 1.0 else f", {self.speed:g}× speed")
+
+    def score(self, name: str, poses: str, sigma_px: float | None) -> float | None:
+        """Of the colour fused along a path with some weights: 'psnr_db', 'psnr_db_least', 'ssim', 'gradient'."""
+        return self.figures.get(f"{name}_{poses}_{weights_key(sigma_px)}")
+
+    def gain_db(self, poses: str, sigma_px: float | None) -> float | None:
+        """PSNR over that of constant weights, in dB; None if it is of constant weights itself."""
+        value, base = (self.score("psnr_db", poses, sigma) for sigma in (sigma_px, None))
+        return None if sigma_px is None or value is None or base is None else value - base
 
 
 @dataclass(frozen=True)
 class StressResult:
-    """Everything that was measured. panels: folder of the pictures of one keyframe, and its sequence; relative."""
+    """Everything that was measured, by speed and exposure, the motion's own speed first."""
 
     motion: str
-    color: tuple[ColorScore, ...]
-    depth: tuple[DepthScore, ...]
-    tracking: tuple[TrackScore, ...]
-    panels: Path | None
-    panels_case: str
-    failed: tuple[str, ...]
+    cells: tuple[Tested, ...]
+
+    @property
+    def failed(self) -> list[str]:
+        """A line for each error."""
+        return failures(cell.record for cell in self.cells)
+
+    @property
+    def pictured(self) -> Tested | None:
+        """The cell whose keyframe is shown, of which `panels` has the pictures."""
+        found = [cell for cell in self.fused("true") if cell.speed == 1.0]
+        return min(found, key=lambda cell: abs(cell.exposure_s - _SHOWN_S), default=None)
+
+    @property
+    def panels(self) -> Path | None:
+        """Folder of the pictures of one keyframe, relative to the test's."""
+        return None if self.pictured is None else Path("cells", self.pictured.record.cell, "panels")
+
+    def fused(self, poses: str) -> list[Tested]:
+        """The cells that have keyframes fused along a path."""
+        return [cell for cell in self.cells if cell.figures.get(f"keyframes_{poses}")]
+
+    @property
+    def sigmas_px(self) -> list[float | None]:
+        """All weights, the constant ones first."""
+        found = {sigma for cell in self.cells for sigma in cell.sigmas_px}
+        return sorted(found, key=lambda sigma: -1.0 if sigma is None else sigma)
 
 
 def stress_result(records: Iterable[Record]) -> StressResult:
-    """The scores in records. Raises KeyError, TypeError or ValueError: they are not of a stress test."""
-    color: list[ColorScore] = []
-    depth: list[DepthScore] = []
-    tracking: list[TrackScore] = []
-    failed: list[str] = []
-    motion, shown = "", None
-    for r in sorted(records, key=_place):
-        about, f = r.settings["settings"], r.figures
-        case, motion = str(about["sequence"]), str(about["motion"])
-        speed, exposure = float(about["speed"]), float(about["exposure_s"])
-        failed += [] if r.error is None else [f"{r.cell}: {r.error}"]
-        lost = int(f["lost"]) if "lost" in f else None
-        at = case, speed, exposure
-        tracking.append(TrackScore(*at, str(about["variant"]), f.get("ate_mm"), f.get("drift_mm_s"), lost))
-        if r.measure != "blur":
-            continue
-        if speed == 1.0 and "keyframes_true" in f and (shown is None or abs(exposure - _SHOWN_S) <= shown[0]):
-            shown = abs(exposure - _SHOWN_S), r
-        for poses in POSES:
-            for sigma in (None, *map(float, about["sigmas_px"])):
-                key = f"{poses}_{weights_key(sigma)}"
-                psnr, least, likeness, gradient = (f.get(f"{name}_{key}") for name in _SCORES)
-                count = int(f.get(f"keyframes_{poses}", 0))
-                if count:
-                    color.append(ColorScore(*at, poses, sigma, psnr, least, likeness, gradient, count))
-            if f"fused_mm_{poses}" in f:
-                figures = (f.get(f"{name}_{poses}") for name in ("single_mm", "fused_mm", "pixels"))
-                depth.append(DepthScore(case, poses, *figures))
-    panels = None if shown is None else Path("cells", shown[1].cell, "panels")
-    of_case = "" if shown is None else str(shown[1].settings["settings"]["sequence"])
-    return StressResult(motion, tuple(color), tuple(depth), tuple(tracking), panels, of_case, tuple(failed))
-
-
-def _place(record: Record) -> tuple[bool, float, float, str]:
-    about = record.settings["settings"]
-    return float(about["speed"]) != 1.0, float(about["speed"]), float(about["exposure_s"]), record.cell
+    """The records as a result. Raises KeyError, TypeError or ValueError: they are not of a stress test."""
+    motion, cells = "", []
+    for r in records:
+        about: dict[str, Any] = r.settings["settings"]
+        sigmas = (None, *map(float, about["sigmas_px"])) if r.measure == "blur" else ()
+        motion, at = str(about["motion"]), (str(about["sequence"]), float(about["speed"]), float(about["exposure_s"]))
+        cells.append(Tested(*at, str(about["variant"]), sigmas, r.figures, r))
+    cells.sort(key=lambda cell: (cell.speed != 1.0, cell.speed, cell.exposure_s, cell.record.cell))
+    return StressResult(motion, tuple(cells))
 
 
 def read_stress(out: Path) -> StressResult:
@@ -128,58 +117,86 @@ def read_stress(out: Path) -> StressResult:
         raise UserError(f"{path}: {first_problem(error)}: run 'rstrack bench stress' again") from None
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{path}: is no stress test's ({error!r}): run 'rstrack bench stress' again") from None
-    if not result.tracking:
+    if not result.cells:
         raise UserError(f"{path}: holds no records: run 'rstrack bench stress' again")
     return result
 
 
-def stress_text(result: StressResult) -> str:
-    """Tables with units."""
-    head = ("sequence", "poses", "weights", "PSNR dB", "gain dB", "worst dB", "SSIM", "gradient", "keyframes")
-    color = tuple(
-        (row.case, row.poses, weights_name(row.sigma_px), fixed(row.psnr_db, 2),
-         fixed(gain_db(result.color, row), 2, sign="+"), fixed(row.psnr_db_least, 2), fixed(row.ssim, 4),
-         fixed(row.gradient, 3), str(row.keyframes))
-        for row in result.color
-    )  # fmt: skip
-    depth = tuple(
-        (d.case, d.poses, *(fixed(value, 2) for value in (d.single_mm, d.fused_mm, ratio(d)))) for d in result.depth
-    )
-    tracking = tuple(
-        (t.case, t.variant, fixed(t.ate_mm, 2), fixed(t.drift_mm_s, 2), fixed(t.lost, 0)) for t in result.tracking
-    )
-    tables = (
-        Table(head, color, "fused colour against the sharp view (means over keyframes)", words=(0, 1, 2)),
-        Table(("sequence", "poses", "one frame mm", "fused mm", "ratio"), depth,
-              "depth of keyframes, RMSE against the noise-free depth", words=(0, 1)),
-        Table(("sequence", "photometric term", "ATE mm", "drift mm/s", "lost"), tracking, "tracking", words=(0, 1)),
-    )  # fmt: skip
-    colors, *others = (f"{table.title}\n{table.text()}" for table in tables)
-    about = "gradient: energy over that of the sharp view; gain: over constant weights"
-    failed = [f"failed: {line}" for line in result.failed]
-    return "\n\n".join((f"blur stress test of {result.motion}", f"{colors}\n{about}", *others, *failed))
+def stress_tables(result: StressResult) -> list[Table]:
+    """All of them."""
+    color = [table for poses in PATHS for table in color_tables(result, poses)]
+    return [*color, *depth_tables(result), tracking_table(result)]
 
 
-def ratio(row: DepthScore) -> float | None:
-    """Fused over single depth error."""
-    return row.fused_mm / row.single_mm if row.single_mm and row.fused_mm is not None else None
+def stress_notes(result: StressResult) -> list[str]:
+    """What has to be said about them, one line each."""
+    about = f"blur stress test of {result.motion}: colour against the sharp view, means over keyframes"
+    return [about, *result.failed, provenance(cell.record for cell in result.cells)]
 
 
-def gains_db(result: StressResult, sigma_px: float = 1.0, poses: str = "true") -> dict[str, float]:
-    """PSNR of blur-aware over that of constant weights in dB, by sequence."""
-    rows = [row for row in result.color if (row.sigma_px, row.poses) == (sigma_px, poses)]
-    return {row.case: gain for row in rows if (gain := gain_db(result.color, row)) is not None}
+def color_tables(result: StressResult, poses: str) -> list[Table]:
+    """The fused colour's scores: a row for each sequence, a column for each σ; none without keyframes."""
+    tables, sigmas, cells = [], result.sigmas_px, result.fused(poses)
+    for name, title, digits, ideal in _SCORES if cells else ():
+        rows: list[tuple[Entry | str, ...]] = []
+        for cell in cells:
+            values = [cell.score(name, poses, sigma) for sigma in sigmas]
+            gains = [cell.gain_db(poses, sigma) if name == "psnr_db" else None for sigma in sigmas]
+            notes = ["" if gain is None else fixed(gain, 2, sign="+") for gain in gains]
+            count = f"{cell.figures[f'keyframes_{poses}']:.0f} keyframe"
+            heading = Entry(cell.label, note=count + "s" * (count != "1 keyframe") if name == "psnr_db" else "")
+            rows.append((heading, *_row(values, notes, digits, ideal)))
+        tables.append(Table(("sequence", *map(weights_name, sigmas)), tuple(rows), f"{title}; {PATHS[poses]}"))
+    return tables
 
 
-def gain_db(rows: Sequence[ColorScore], row: ColorScore) -> float | None:
-    """PSNR of `row` over that of constant weights, among `rows`, in dB; None if it is of constant weights itself."""
-    same = (r for r in rows if r.sigma_px is None and (r.case, r.poses) == (row.case, row.poses))
-    base = next(same, None)
-    if row.sigma_px is None or base is None or row.psnr_db is None or base.psnr_db is None:
-        return None
-    return row.psnr_db - base.psnr_db
+def depth_tables(result: StressResult) -> list[Table]:
+    """Depth errors of one frame and of the fused ones, a table for each path that has some."""
+    tables = []
+    for poses, name in PATHS.items():
+        rows = []
+        for cell in result.cells:
+            single, fused = (cell.figures.get(f"{what}_mm_{poses}") for what in ("single", "fused"))
+            if fused is not None:
+                ratio = fused / single if single else None
+                rows.append((cell.label, fixed(single, 2), fixed(fused, 2), fixed(ratio, 2)))
+        if rows:
+            head = ("sequence", "one frame, mm", "fused, mm", "ratio")
+            tables.append(Table(head, tuple(rows), f"Depth against the noise-free depth, RMSE, {name}"))
+    return tables
+
+
+def tracking_table(result: StressResult) -> Table:
+    """The tracker's errors: a row for each sequence, a column for each photometric term."""
+    found = {(cell.label, cell.variant): cell.figures for cell in result.cells}
+    variants = list(dict.fromkeys(cell.variant for cell in result.cells))
+    rows: list[tuple[Entry | str, ...]] = []
+    for label in dict.fromkeys(cell.label for cell in result.cells):
+        runs = [found.get((label, variant), {}) for variant in variants]
+        notes = []
+        for run in runs:
+            drift = [f"{fixed(run['drift_mm_s'], 2)} mm/s"] if "drift_mm_s" in run else []
+            notes.append(", ".join(drift + ([f"{run['lost']:.0f} lost"] if run.get("lost") else [])))
+        rows.append((label, *_row([run.get("ate_mm") for run in runs], notes, 2, 0.0)))
+    title = "Position error (ATE, RMSE), mm; small print: drift a second, lost frames"
+    return Table(("sequence", *variants), tuple(rows), title)
+
+
+def csv_rows(result: StressResult) -> list[dict[str, Any]]:
+    """One a cell, with all its figures."""
+    names = dict.fromkeys(name for cell in result.cells for name in cell.figures)
+    return [
+        {"sequence": c.case, "speed": c.speed, "exposure_s": c.exposure_s, "variant": c.variant}
+        | {name: c.figures.get(name) for name in names} | {"error": c.record.error}
+        for c in result.cells
+    ]  # fmt: skip
 
 
 def weights_name(sigma_px: float | None) -> str:
     """What the weights of a σ are called; None: constant ones."""
     return "constant" if sigma_px is None else f"σ {sigma_px:g} px"
+
+
+def _row(values: Sequence[float | None], notes: Sequence[str], digits: int, ideal: float) -> list[Entry]:
+    entries = [Entry(fixed(v, digits), note=note) for v, note in zip(values, notes, strict=True)]
+    return best_marked(entries, values, ideal)

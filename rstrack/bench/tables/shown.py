@@ -5,11 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
-from benchmarks.cells import (
+from rsgen.console.tables import NOTHING, Entry, Table, best_marked, significant
+from rstrack.bench.record import Figures, Record
+from rstrack.bench.tables import paper
+from rstrack.bench.tables.cells import (
     group_of,
     is_change,
     is_done,
@@ -19,10 +22,7 @@ from benchmarks.cells import (
     program_of,
     sequence_of,
 )
-from benchmarks.figures import heading
-from rsgen.console.tables import NOTHING, Entry, Table, best_marked, significant
-from rstrack.bench.methods import paper
-from rstrack.bench.record import Record
+from rstrack.bench.tables.figures import heading
 
 Records = Mapping[str, Record]
 ERRORS = ("ate_mm", "drift_mm_s", "drift_deg_s")
@@ -36,12 +36,10 @@ _SIDE_BY_SIDE, _MOST_COLUMNS = 12, 10
 class Average:
     """Of one method over the cases of a group that it has figures of: `cases` of `of`. Counts are sums of all runs."""
 
-    method: str
     figures: dict[str, float]
     cases: int
     of: int
     lost: int
-    frames: int
     silent: int | None
     peak_mb: float | None
 
@@ -69,23 +67,17 @@ def cases_of(records: Iterable[Record]) -> list[str]:
     return list(dict.fromkeys(record.case for record in records))
 
 
-def averages(records: Sequence[Record]) -> list[Average]:
+def averages(records: Sequence[Record]) -> dict[str, Average]:
     """Of each method, over cases."""
-    cases = cases_of(records)
-    out = []
+    found, of = {}, len(cases_of(records))
     for method in methods_in_order(records):
         mine = [record for record in records if record.method == method]
-        names = dict.fromkeys(name for record in mine for name in record.figures)
-        means = {}
-        for name in names:
-            values = [record.figures[name] for record in mine if name in record.figures]
-            means[name] = math.fsum(values) / len(values)
-        totals = {name: round(math.fsum(r.total(name) for r in mine)) for name in ("lost", "frames", "silent")}
-        has_truth = sum("ate_mm" in record.figures for record in mine)
-        silent = totals["silent"] if any(record.values("silent") for record in mine) else None
+        means = Record("", "", {}, runs=tuple({**record.figures} for record in mine)).figures
+        lost, silent = (round(math.fsum(record.total(name) for record in mine)) for name in ("lost", "silent"))
         peak = max((value for record in mine for value in record.values("peak_mb")), default=None)
-        out.append(Average(method, means, has_truth, len(cases), totals["lost"], totals["frames"], silent, peak))
-    return out
+        has_truth = sum("ate_mm" in record.figures for record in mine)
+        found[method] = Average(means, has_truth, of, lost, silent if "silent" in means else None, peak)
+    return found
 
 
 def triple(figures: Mapping[str, float], mark: str = "") -> str:
@@ -94,12 +86,15 @@ def triple(figures: Mapping[str, float], mark: str = "") -> str:
     return NOTHING if set(values) == {NOTHING} else _DOT.join(values) + mark
 
 
+def cell_triple(record: Record | None) -> str:
+    """Of one cell: † where frames were lost."""
+    return NOTHING if record is None else triple(record.figures, "†" if record.total("lost") else "")
+
+
 def paper_triple(sequences: Sequence[str], method: str) -> str:
     """The paper's averages, empty where it has none."""
-    theirs = paper.average(sequences, method) if sequences else None
-    if theirs is None:
-        return ""
-    return triple({name: getattr(theirs, name) for name in ERRORS})
+    theirs = paper.average(sequences, method)
+    return triple(theirs) if theirs else ""
 
 
 def sequences_of(records: Iterable[Record]) -> list[str]:
@@ -110,49 +105,60 @@ def sequences_of(records: Iterable[Record]) -> list[str]:
 def cell_text(record: Record | None, name: str) -> str:
     """A figure of one cell: † where frames were lost, 'lost' where nothing could be compared."""
     if record is None or not is_done(record):
-        return NOTHING
+        return NOTHING if record is None or record.error is None else "failed"
     value = record.figures.get(name)
     if value is None:
         return "lost" if record.total("lost") else NOTHING
     return significant(value) + ("†" if record.total("lost") else "")
 
 
-def by_sequence(records: Sequence[Record], name: str = "ate_mm") -> Table:
-    """A row for each method, a column for each case."""
-    cases, found = cases_of(records), {(r.method, r.case): r for r in records}
-    methods = methods_in_order(records)
-    columns = []
-    for case in cases:
-        cells = [found.get((method, case)) for method in methods]
-        values = [None if cell is None else cell.figures.get(name) for cell in cells]
-        columns.append(best_marked([Entry(cell_text(cell, name)) for cell in cells], values))
-    rows: list[tuple[Entry | str, ...]] = [
-        (method, *(column[k] for column in columns)) for k, method in enumerate(methods)
-    ]
-    return Table(("method", *cases), tuple(rows))
+def pivot(
+    head: str, rows: Sequence[str], columns: Sequence[str], entry: Callable[[str, str], Entry],
+    value: Callable[[str, str], float | None] | None = None, title: str = "",
+) -> Table:  # fmt: skip
+    """A table of entries by the names of rows and columns. value: of an entry, the least of a column being the best."""
+    found = []
+    for column in columns:
+        entries = [entry(row, column) for row in rows]
+        found.append(entries if value is None else best_marked(entries, [value(row, column) for row in rows]))
+    lines: list[tuple[Entry | str, ...]] = [(row, *(entries[k] for entries in found)) for k, row in enumerate(rows)]
+    return Table((head, *columns), tuple(lines), title)
+
+
+def by_sequence(records: Sequence[Record]) -> Table:
+    """ATE: a row for each method, a column for each case."""
+    found = {(r.method, r.case): r for r in records}
+
+    def ate_mm(method: str, case: str) -> float | None:
+        cell = found.get((method, case))
+        return None if cell is None else cell.figures.get("ate_mm")
+
+    def entry(method: str, case: str) -> Entry:
+        return Entry(cell_text(found.get((method, case)), "ate_mm"))
+
+    return pivot("method", methods_in_order(records), cases_of(records), entry, ate_mm)
 
 
 def by_case(records: Sequence[Record], triples: bool = False) -> Table:
     """A row for each case, a column for each method; side by side where there is one method alone."""
-    cases, found = cases_of(records), {(r.method, r.case): r for r in records}
-    methods = methods_in_order(records)
-    rows: list[tuple[Entry | str, ...]] = []
-    for case in cases:
-        cells = [found.get((method, case)) for method in methods]
-        if triples:
-            texts = [NOTHING if c is None else triple(c.figures, "†" if c.total("lost") else "") for c in cells]
-        else:
-            texts = [cell_text(cell, "ate_mm") for cell in cells]
-        rows.append((case, *map(Entry, texts)))
-    if len(methods) > 1 or len(rows) < _SIDE_BY_SIDE:
-        return Table(("case", *methods), tuple(rows))
-    half = -(-len(rows) // 2)
-    beside = [*(tuple((f"`{case}`", *entries)) for case, *entries in rows[half:]), ("", "")]
-    both = tuple((*left, *right) for left, right in zip(rows[:half], beside, strict=False))
-    return Table(("case", *methods, "case", *methods), both, words=(0, 2))
+    found = {(r.method, r.case): r for r in records}
+
+    def entry(case: str, method: str) -> Entry:
+        cell = found.get((method, case))
+        return Entry(cell_triple(cell) if triples else cell_text(cell, "ate_mm"))
+
+    table = pivot("case", cases_of(records), methods_in_order(records), entry)
+    if len(table.head) > 2 or len(table.rows) < _SIDE_BY_SIDE:
+        return table
+    half = -(-len(table.rows) // 2)
+    beside: list[tuple[Entry | str, ...]] = [(f"`{case}`", *cells) for case, *cells in table.rows[half:]]
+    both: tuple[tuple[Entry | str, ...], ...] = tuple(
+        (*left, *right) for left, right in zip(table.rows[:half], [*beside, ("", "")], strict=False)
+    )
+    return Table((*table.head, *table.head), both, words=(0, 2))
 
 
-def measured_table(records: Sequence[Record], patterns: Sequence[str]) -> Table:
+def measured_table(records: Sequence[Record], patterns: Sequence[str], title: str = "") -> Table:
     """A row for each cell, a column for each figure that matches one of the patterns; 'x*+': the sum of those."""
     names = list(dict.fromkeys(name for record in records for name in record.figures if name != "peak_mb"))
     columns: dict[str, list[str]] = {}
@@ -171,18 +177,17 @@ def measured_table(records: Sequence[Record], patterns: Sequence[str]) -> Table:
         entries = [Entry(plainly(math.fsum(v)) if v else NOTHING) for v in values]
         rows.append((f"{record.case} {record.method}" if are_many else record.case, *entries))
     first = "case" if are_many or not records else f"case ({records[0].method})"
-    return Table((first, *columns), tuple(rows))
+    return Table((first, *columns), tuple(rows), title)
 
 
 def joined(records: Sequence[Record]) -> list[Record]:
     """Cells of several measures on the same case and method as one."""
-    figures: dict[tuple[str, str], dict[str, float | None]] = {}
-    first: dict[tuple[str, str], Record] = {}
+    found: dict[tuple[str, str], Record] = {}
     for record in records:
-        place = record.case, record.method
-        first.setdefault(place, record)
-        figures[place] = {**figures.get(place, {}), **record.figures}
-    return [dataclasses.replace(first[place], seeds=(0,), runs=(figures[place],)) for place in first]
+        first = found.get((record.case, record.method), dataclasses.replace(record, runs=()))
+        both: Figures = {**first.figures, **record.figures}
+        found[record.case, record.method] = dataclasses.replace(first, seeds=(0,), runs=(both,))
+    return list(found.values())
 
 
 def plainly(value: float) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 NAMES: dict[str, str] = {
     "baseline": "Baseline",
@@ -16,14 +15,8 @@ NAMES: dict[str, str] = {
 """What the paper calls our methods, in the order of its columns."""
 
 
-@dataclass(frozen=True)
-class Figures:
-    """RMSE of one method on one sequence, named as those of our records; drift is over a second (RPE)."""
-
-    drift_mm_s: float
-    drift_deg_s: float
-    ate_mm: float
-
+Figures = dict[str, float]
+"""RMSE of one method on one sequence, named as in records: drift_mm_s and drift_deg_s over a second (RPE), ate_mm."""
 
 # A line is a sequence; its columns are the methods in the order of NAMES, each "m/s deg/s m".
 _TABLES_2_AND_3 = """\
@@ -47,7 +40,7 @@ def _parse(table: str) -> dict[tuple[str, str], Figures]:
         values = [float(number) for number in numbers]
         for k, method in enumerate(NAMES):
             m_s, deg_s, m = values[3 * k : 3 * k + 3]
-            figures[sequence, method] = Figures(1e3 * m_s, deg_s, 1e3 * m)
+            figures[sequence, method] = {"drift_mm_s": 1e3 * m_s, "drift_deg_s": deg_s, "ate_mm": 1e3 * m}
     return figures
 
 
@@ -55,10 +48,9 @@ FIGURES: dict[tuple[str, str], Figures] = _parse(_TABLES_2_AND_3)
 """By sequence and method. The hand-held ones are recordings, of other rooms than our renderings of such motions."""
 
 
-def average(sequences: Sequence[str], method: str) -> Figures | None:
-    """Mean over sequences; None if there are none, or the paper lacks one of them."""
-    found = [FIGURES[sequence, method] for sequence in sequences if (sequence, method) in FIGURES]
-    if not found or len(found) < len(sequences):
-        return None
-    means = (statistics.fmean(getattr(f, name) for f in found) for name in ("drift_mm_s", "drift_deg_s", "ate_mm"))
-    return Figures(*means)
+def average(sequences: Sequence[str], method: str) -> Figures:
+    """Mean over sequences; empty if there are none, or the paper lacks one of them."""
+    found = [FIGURES.get((sequence, method), {}) for sequence in sequences]
+    if not found or not all(found):
+        return {}
+    return {name: statistics.fmean(figures[name] for figures in found) for name in found[0]}

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 from rstrack.bench.definitions import OTHERS
@@ -10,6 +11,8 @@ from rstrack.bench.record import Record
 from rstrack.options import METHODS
 
 _ORDER = ("rs-pg", "rs-g", "rs-p", "rs-pgi", "rs-gi", "gs-pg", "gs-g", "gs-p", "baseline")
+# A track with poses for fewer of the frames says little of its error: it counts as lost.
+_LEAST_COVERAGE = 0.5
 
 
 def is_others(record: Record) -> bool:
@@ -46,6 +49,33 @@ def is_change(record: Record) -> bool:
 def is_done(record: Record | None) -> bool:
     """Whether there are figures."""
     return record is not None and record.error is None and bool(record.runs)
+
+
+def counts(figures: Mapping[str, float | None]) -> bool:
+    """Whether a run's errors mean something: at least half of the frames have a pose."""
+    frames, lost = figures.get("frames") or 0.0, figures.get("lost") or 0.0
+    return figures.get("ate_mm") is not None and lost <= (1.0 - _LEAST_COVERAGE) * frames
+
+
+def is_good(record: Record) -> bool:
+    """Whether it has run and kept the track."""
+    return record.error is None and counts(record.figures)
+
+
+def figure(record: Record | None, name: str) -> float | None:
+    """A figure of a record; None where it failed, the track is lost or lacks it."""
+    return record.figures.get(name) if record is not None and is_good(record) else None
+
+
+def folder_of(record: Record) -> Path:
+    """Of its run, relative to that of the results."""
+    return Path("cells", record.cell)
+
+
+def truth_offset_s(record: Record) -> float | None:
+    """The offset of the truth's clock that the errors are for, s; None for clocks as they are."""
+    offset_ms = record.figures.get("truth_offset_ms")
+    return None if offset_ms is None else 1e-3 * offset_ms
 
 
 def methods_in_order(records: Iterable[Record]) -> list[str]:
