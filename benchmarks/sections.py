@@ -188,7 +188,9 @@ def gate(records: Records) -> list[str]:
     """What guards every change, with what chance does to it."""
     tracks = of_measure(records, "track")
     found = {(record.method, record.case): record for record in tracks}
-    table = pivot("method", methods_in_order(tracks), cases_of(tracks), lambda *at: _with_scatter(found.get(at)))
+    table = pivot(
+        "case", cases_of(tracks), methods_in_order(tracks), lambda case, m: _with_scatter(found.get((m, case)))
+    )
     return _section("The gate: ATE, mm, and what chance does to one run (moderated)", table, tracks)
 
 

@@ -66,7 +66,7 @@ _WHAT = {
 
 
 def results_markdown(gate: Records, full: Records) -> str:
-    """All of docs/results.md. Cells that are not measured show '-'."""
+    """All of docs/results.md. Cells that the full tier has not are the gate's; what neither has shows '-'."""
     parts = (
         sections.methods, sections.per_sequence, sections.real, sections.not_the_best, sections.imu, sections.loops,
         sections.faults, sections.changes, sections.readout, sections.others, sections.speed,
@@ -78,13 +78,14 @@ def results_markdown(gate: Records, full: Records) -> str:
     tiers = [*_provenance("Full tier", full), *_provenance("Gate", gate)]
     missing = [*failures(full.values()), *failures(gate.values())]
     lines = ["# Results", "", _ABOUT, "", *tiers, *missing, "", _WORDS, ""]
-    lines += [*(line for part in parts for line in part(full)), *sections.gate(gate)]
+    lines += [*(line for part in parts for line in part({**gate, **full})), *sections.gate(gate)]
     return "\n".join(lines).rstrip() + "\n"
 
 
-def readme_block(full: Records) -> str:
-    """The README's table with its sentences, without the markers."""
-    groups = {name: of_group(full, name) for name in (*sections.PAPERS_GROUPS, "real")}
+def readme_block(gate: Records, full: Records) -> str:
+    """The README's table with its sentences, without the markers; real recordings are the gate's if not in full."""
+    groups = {name: of_group(full, name) for name in sections.PAPERS_GROUPS}
+    groups["real"] = of_group(full, "real") or of_group(gate, "real")
     every = [record for records in groups.values() for record in records]
     shown = [record for record in every if is_default(record) or closes_loops(record)]
     means = {name: averages(records) for name, records in groups.items()}
@@ -104,14 +105,14 @@ def readme_block(full: Records) -> str:
     told = {name: ", ".join(sequences_of(records)) or "nothing yet" for name, records in groups.items()}
     loops = sorted({record.method for record in shown if closes_loops(record)})
     but = f", and closed in the end in {' and '.join(f'`{method}`' for method in loops)}" if loops else ""
-    words = sentences(full)
+    words = sentences({**gate, **full})
     return "\n".join([
         f"Averages over sequences: hand-held (blurred, noisy, unregistered: {told['hand-held']}),",
         f"living room (noise-free: {told['living room']}), real recordings ({told['real']}, the truth's clock fitted).",
         "Cells are ATE in mm · drift in mm/s · drift in degrees/s, all RMSE. † frames were lost; (n of m) has so many.",
         "", table, "", _PAPERS,
         f"Settings are defaults; loops are off{but}. `rstrack track` closes them in the end unless told otherwise.",
-        *_provenance("Measured", full), *([words] if words else []),
+        *_provenance("Measured", full or gate), *([words] if words else []),
         "Every sequence, recording and measure is in [docs/results.md](docs/results.md).",
     ])  # fmt: skip
 
@@ -129,7 +130,7 @@ def documents(gate: Records, full: Records) -> dict[Path, str]:
     """Every text that shows records, as it should be. Raises UserError."""
     return {
         RESULTS: results_markdown(gate, full),
-        README: with_block(read_text(README), readme_block(full)),
+        README: with_block(read_text(README), readme_block(gate, full)),
     }
 
 

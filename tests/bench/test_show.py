@@ -116,13 +116,13 @@ def test_what_is_not_measured_is_a_dash() -> None:
     text = results_markdown({}, {})
     assert "not measured yet" in text and "\n-\n" in section(text, "Faults")
     assert "Nothing is measured beside others yet." in text
-    assert "not measured yet" in readme_block({})
+    assert "not measured yet" in readme_block({}, {})
     only = by_cell(cell("table1", "rs-pg", errors(0.5), group="hand-held"))
     assert "| `rs-pg` |" in results_markdown({}, only)
 
 
 def test_all_rows_of_a_table_are_as_long(gate: dict[str, Record], full: dict[str, Record]) -> None:
-    lines = (results_markdown(gate, full) + readme_block(full)).splitlines()
+    lines = (results_markdown(gate, full) + readme_block({}, full)).splitlines()
     for above, line in itertools.pairwise(lines):
         if above.startswith("|") and line.startswith("|"):
             assert above.count("|") == line.count("|"), line
@@ -152,7 +152,7 @@ def test_losing_the_track_is_being_beaten(full: dict[str, Record]) -> None:
 
 
 def test_the_readmes_block(full: dict[str, Record]) -> None:
-    text = readme_block(full)
+    text = readme_block({}, full)
     ours = row(text, "rs-pg")
     assert "rolling shutter, depth and colour" in ours and "13.2 · 5.28 · 0.122" in ours and "0.500 · 0.300" in ours
     assert "loops closed" in row(text, "rs-pg_loops") and "Open3D" in row(text, "open3d-icp-keyframe")
@@ -162,9 +162,9 @@ def test_the_readmes_block(full: dict[str, Record]) -> None:
 
 def test_the_block_is_put_between_its_markers(full: dict[str, Record]) -> None:
     readme = f"# Title\n\n{BEGIN}\nold\n{END}\n\nrest\n"
-    new = with_block(readme, readme_block(full))
+    new = with_block(readme, readme_block({}, full))
     assert new.startswith("# Title\n") and new.endswith(f"{END}\n\nrest\n") and "\nold" not in new
-    assert with_block(new, readme_block(full)) == new
+    assert with_block(new, readme_block({}, full)) == new
     with pytest.raises(UserError, match="results:begin"):
         with_block("# Title\n", "")
 
