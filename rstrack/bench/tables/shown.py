@@ -16,6 +16,7 @@ from rstrack.bench.tables.cells import (
     group_of,
     is_change,
     is_done,
+    is_good,
     is_others,
     methods_in_order,
     options_of,
@@ -68,15 +69,17 @@ def cases_of(records: Iterable[Record]) -> list[str]:
 
 
 def averages(records: Sequence[Record]) -> dict[str, Average]:
-    """Of each method, over cases."""
+    """Of each method, over the cases whose track it kept."""
     found, of = {}, len(cases_of(records))
     for method in methods_in_order(records):
         mine = [record for record in records if record.method == method]
-        means = Record("", "", {}, runs=tuple({**record.figures} for record in mine)).figures
+        good = [record for record in mine if is_good(record)]
+        means = Record("", "", {}, runs=tuple({**record.figures} for record in good)).figures
         lost, silent = (round(math.fsum(record.total(name) for record in mine)) for name in ("lost", "silent"))
         peak = max((value for record in mine for value in record.values("peak_mb")), default=None)
-        has_truth = sum("ate_mm" in record.figures for record in mine)
-        found[method] = Average(means, has_truth, of, lost, silent if "silent" in means else None, peak)
+        found[method] = Average(
+            means, len(good), of, lost, silent if any(record.values("silent") for record in mine) else None, peak
+        )
     return found
 
 
@@ -87,8 +90,10 @@ def triple(figures: Mapping[str, float], mark: str = "") -> str:
 
 
 def cell_triple(record: Record | None) -> str:
-    """Of one cell: † where frames were lost."""
-    return NOTHING if record is None else triple(record.figures, "†" if record.total("lost") else "")
+    """Of one cell: † where frames were lost, 'lost' where most were."""
+    if record is None or not is_done(record):
+        return NOTHING
+    return triple(record.figures, "†" if record.total("lost") else "") if is_good(record) else "lost"
 
 
 def paper_triple(sequences: Sequence[str], method: str) -> str:
@@ -103,12 +108,14 @@ def sequences_of(records: Iterable[Record]) -> list[str]:
 
 
 def cell_text(record: Record | None, name: str) -> str:
-    """A figure of one cell: † where frames were lost, 'lost' where nothing could be compared."""
+    """A figure of one cell: † where frames were lost, 'lost' where most were."""
     if record is None or not is_done(record):
         return NOTHING if record is None or record.error is None else "failed"
     value = record.figures.get(name)
+    if not is_good(record) and record.total("lost"):
+        return "lost"
     if value is None:
-        return "lost" if record.total("lost") else NOTHING
+        return NOTHING
     return significant(value) + ("†" if record.total("lost") else "")
 
 
