@@ -134,9 +134,10 @@ def run_cell(job: Job, progress: Progress = no_progress) -> Record:
         record = Record(**stamped({"cell": cell.name, "key": key, "settings": cell.as_dict()}))
     if record.complete:
         return record
-    select()  # a libLLVM that works, before a measure imports Dr.Jit
-    measure = measure_named(job.measure)
     try:
+        if not cell.renders:
+            select()  # a libLLVM that works, before a measure imports Dr.Jit
+        measure = measure_named(job.measure)
         root = None if cell.renders else job.sources.folder(cell.sequence, cell.case_entry.sequence, progress)
         # Once more: a sequence that was not there when the key was made is now.
         record = dataclasses.replace(record, key=_key(job, root))
