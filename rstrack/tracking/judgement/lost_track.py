@@ -130,9 +130,9 @@ class FitHistory:
         misfits = self.misfits(fresh, expected)
         if misfits:
             return misfits[0][1]
-        if self.is_modelled and self._together(fresh, colorless) > _WORST_TOGETHER:
+        if new and self.is_modelled and self._together(fresh, colorless) > _WORST_TOGETHER:
             return Fault.BOTH_ODD
-        if all(o.is_depth for o in fresh) and any(self._is_doubtful(o) for o in fresh):
+        if new and all(o.is_depth for o in fresh) and any(self._is_doubtful(o) for o in fresh):
             return Fault.DOUBTFUL
         if new:
             if any(_oddness(o) > _UNSTEADY for o in fresh if not o.is_depth):
@@ -142,7 +142,7 @@ class FitHistory:
                 return Fault.ODD_DEPTH if odd[0] else Fault.ODD_COLOR
         if pulls is not None:
             distance = max(_CLOSE, fresh[0].ref.median_depth)
-            torn = self._torn(pulls, distance, new)
+            torn = self._torn(pulls, distance, new) if new else Fault.NONE
             if torn:
                 return torn
             self._pulls.append(pulls.scaled(distance**-2))

@@ -1,0 +1,116 @@
+"""Whether an image agrees with what is known without it: the normalised innovation of a Kalman filter, per image.
+
+State: the pose [m; rad] in the depth camera's axes at mid readout, and its velocity, against the predicted ones. An
+image whose errors hang together, as no scatter of its pixels shows (steps of depth on a wall, a lens, clocks), is off as
+a whole: its innovation is too large for its covariance. It then counts as far less as makes the innovation what it may
+be (covariance inflation; Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001,
+section 5.4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from scipy.special import chdtri
+
+from rsgen.array_types import FloatArray
+from rsgen.geometry import se3
+from rsgen.geometry.spline import Spline
+from rstrack.alignment.observation import Observation
+from rstrack.alignment.pull import steady
+from rstrack.alignment.spline_state import SplineState
+
+# Chance with which an innovation that is nothing but chance counts as too large.
+_LEVEL = 1e-3
+# σ of what camera files have of colour's clock, s, and of readouts, as part of them: those that are told, not calibrated.
+_CLOCK_S, _READOUT = 3e-3, 0.13
+# σ of what an image alone leaves open, m and rad.
+_OPEN = np.tile([0.05, 0.05, 0.05, *np.radians([3.0, 3.0, 3.0])], 2)
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What is known before a frame's images: an extrapolated spline, and the state's covariance (12, 12)."""
+
+    spline: Spline
+    covariance: FloatArray
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """What one image says of the state: deviation z (12,) from the prediction and covariance R (12, 12)."""
+
+    observation: Observation
+    z: FloatArray
+    R: FloatArray
+
+
+def weighed(fresh: Sequence[Observation], state: SplineState, predicted: Prediction) -> bool:
+    """Let the image that is off as a whole count as little as its innovation says; whether there is one.
+
+    fresh: a frame's observations, aligned, of a spline in this state. Of two that disagree it is the one that is further
+    from the prediction; it is held against the prediction and the others together.
+    """
+    seen = [_measured(o, state, predicted) for o in fresh if o.is_linearised]
+    if not seen:
+        return False
+    P = predicted.covariance
+    odd = max(seen, key=lambda one: _innovation(one, np.zeros(12), P))
+    mean, P_rest = np.zeros(12), P
+    for other in seen:
+        if other is not odd:
+            gain = P_rest @ np.linalg.inv(P_rest + other.R)
+            mean, P_rest = mean + gain @ (other.z - mean), P_rest - gain @ P_rest
+    excess = _inflation(odd.z - mean, 0.5 * (P_rest + P_rest.T), odd.R)
+    if excess > 1.0:
+        odd.observation.count_as(odd.observation.independent / excess)
+    return excess > 1.0
+
+
+def _innovation(one: _Measured, mean: FloatArray, P: FloatArray) -> float:
+    off = one.z - mean
+    return float(off @ np.linalg.solve(P + one.R, off))
+
+
+def _inflation(off: FloatArray, P: FloatArray, R: FloatArray) -> float:
+    """The least s >= 1 with offᵀ (P + s R)⁻¹ off at most the quantile of chance."""
+    limit = float(chdtri(len(off), _LEVEL))
+    spread, basis = scipy.linalg.eigh(P, R)  # basisᵀ R basis = 1
+    y2, spread = (basis.T @ off) ** 2, np.maximum(spread, 0.0)
+
+    def beyond(s: float) -> float:
+        return float((y2 / (spread + s)).sum()) - limit
+
+    if beyond(1.0) <= 0.0:
+        return 1.0
+    low, high = 1.0, 1.0 + float(y2.sum()) / limit
+    for _ in range(50):
+        middle = np.sqrt(low * high)
+        low, high = (middle, high) if beyond(middle) > 0.0 else (low, middle)
+    return float(high)
+
+
+def _measured(o: Observation, state: SplineState, predicted: Prediction) -> _Measured:
+    exposure = o.image.exposure
+    mid, half = exposure.mid_time, 0.5 * (exposure.last_time - exposure.first_time)
+    H, g = steady(o, state)
+    pose, velocity = state.spline.pose_and_velocity(mid)
+    turn = np.kron(np.eye(4), pose[:3, :3])
+    H, g = turn.T @ H @ turn, turn.T @ g
+    # `steady` has the change over half a readout where the state has the velocity.
+    by = np.concatenate([np.ones(6), np.full(6, max(half, 1e-3))])
+    # Scaled by what is open, since gain and offset, taken out of H, may leave rounding below zero.
+    spread, basis = np.linalg.eigh(H * np.outer(_OPEN, _OPEN))
+    R = (basis / (1.0 + np.maximum(spread, 0.0))) @ basis.T * np.outer(_OPEN, _OPEN)
+    moved = -R @ g / by
+    R = R / np.outer(by, by)
+    T_predicted, velocity_predicted = predicted.spline.pose_and_velocity(mid)
+    deviation = np.concatenate([se3.log(se3.inverse(T_predicted) @ pose), velocity - velocity_predicted])
+    # What the cameras' times may be wrong by moves all of an image alike, as far as the camera moves meanwhile.
+    if not o.is_depth:
+        R[:6, :6] += _CLOCK_S**2 * np.outer(velocity, velocity)
+    R[6:, 6:] += _READOUT**2 * np.outer(velocity, velocity)
+    return _Measured(o, deviation + moved, 0.5 * (R + R.T))
