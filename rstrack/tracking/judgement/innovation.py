@@ -1,10 +1,9 @@
 """Whether an image agrees with what is known without it: the normalised innovation of a Kalman filter, per image.
 
 State: the pose [m; rad] in the depth camera's axes at mid readout, and its velocity, against the predicted ones. An
-image whose errors hang together, as no scatter of its pixels shows (steps of depth on a wall, a lens, clocks), is off as
-a whole: its innovation is too large for its covariance. It then counts as far less as makes the innovation what it may
-be (covariance inflation; Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001,
-section 5.4).
+image whose errors hang together, which no scatter of its pixels shows (steps of depth on a wall, a lens, clocks), is
+off as a whole: its innovation is too large for its covariance. Its covariance is then inflated until the innovation is
+what it may be (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, 5.4).
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from rstrack.alignment.spline_state import SplineState
 
 # Chance with which an innovation that is nothing but chance counts as too large.
 _LEVEL = 1e-3
-# σ of what camera files have of colour's clock, s, and of readouts, as part of them: those that are told, not calibrated.
+# σ of colour's clock, s, and of readouts, as a part of them, where they are told and not calibrated.
 _CLOCK_S, _READOUT = 3e-3, 0.13
 # σ of what an image alone leaves open, m and rad.
 _OPEN = np.tile([0.05, 0.05, 0.05, *np.radians([3.0, 3.0, 3.0])], 2)
@@ -51,8 +50,8 @@ class _Measured:
 def weighed(fresh: Sequence[Observation], state: SplineState, predicted: Prediction) -> bool:
     """Let the image that is off as a whole count as little as its innovation says; whether there is one.
 
-    fresh: a frame's observations, aligned, of a spline in this state. Of two that disagree it is the one that is further
-    from the prediction; it is held against the prediction and the others together.
+    fresh: a frame's observations, aligned, of a spline in this state. Of two that disagree it is the one that is
+    further from the prediction; it is held against the prediction and the others together.
     """
     seen = [_measured(o, state, predicted) for o in fresh if o.is_linearised]
     if not seen:
