@@ -30,6 +30,7 @@ from rstrack.cli.options import (
     Seed,
     SequenceFolder,
     TruthExtrinsics,
+    TruthNoise,
     TruthOffset,
 )
 from rstrack.cli.refine import refine
@@ -190,6 +191,7 @@ def evaluate(
     camera: CameraFile = None,
     truth_offset: TruthOffset = None,
     truth_extrinsics: TruthExtrinsics = None,
+    truth_noise: TruthNoise = None,
     against: Annotated[
         Path | None,
         "another run of the sequence: ends with one line that compares the two, for example of gs-pg",
@@ -197,11 +199,12 @@ def evaluate(
     ] = None,
     json: Json = False,
 ) -> int:
-    """Errors of a run against the ground truth: ATE, drift per second, lines' poses."""
+    """Errors of a run against the ground truth: ATE, drift per second, lines' poses, and whether the run's covariances
+    are as large."""
     from rstrack.metrics.evaluate import compared
     from rstrack.metrics.run_evaluate import run_evaluate
 
-    how = camera, truth_offset, truth_extrinsics
+    how = camera, truth_offset, truth_extrinsics, truth_noise
     ours = run_evaluate(sequence, run, *how)
     theirs = None if against is None else run_evaluate(sequence, against, *how)
     if json:
