@@ -130,9 +130,9 @@ class Metrics:
             return []
         noise = self.truth_noise
         counted = "" if noise is None else (
-            f", with the truth's own errors, {noise.translation_mm:g} mm and {noise.rotation_deg:g} deg in 1 s"
+            f", the truth's own errors of {noise.translation_mm:g} mm and {noise.rotation_deg:g} deg in 1 s counted"
         )  # fmt: skip
-        title = f"errors beside their covariances{counted} (NEES/6 is 1 where these are as large):"
+        title = f"errors beside their covariances{counted} (NEES/6: 1 if as large):"
         return ["", title, consistency_table(self.consistency).text()]
 
 

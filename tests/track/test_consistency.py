@@ -126,7 +126,7 @@ def test_horizons_without_pairs_are_left_out_and_so_is_all_of_it_without_covaria
     assert list(told["consistency"][0]["axes"]) == ["x", "y", "z", "rx", "ry", "rz"] and told["truth_noise"] is None
     lines = short.text().splitlines()
     head = next(n for n, line in enumerate(lines) if line.startswith("motions over"))
-    assert lines[head - 1] == "errors beside their covariances (NEES/6 is 1 where these are as large):"
+    assert lines[head - 1] == "errors beside their covariances (NEES/6: 1 if as large):"
     first = lines[head + 1].split()
     one = short.consistency[0]
     assert first == ["0.1", "s", "87", f"{one.nees:.2f}", *(f"{100 * part:.1f}" for part in one.within.values())]
@@ -154,7 +154,7 @@ def test_errors_of_the_truth_itself_are_counted_where_they_are_told() -> None:
     assert exact.nees is not None and exact.nees > 1e3
     np.testing.assert_allclose([h.nees for h in counted.consistency], 1.0, atol=0.15)
     np.testing.assert_allclose(within(counted), [[0.5, 0.9, 0.99]] * 3, atol=0.08)
-    assert ", with the truth's own errors, 2 mm and 0.25 deg in 1 s (" in counted.text()
+    assert ", the truth's own errors of 2 mm and 0.25 deg in 1 s counted (" in counted.text()
     assert counted.ate_rmse_m == exact.ate_rmse_m
 
 
