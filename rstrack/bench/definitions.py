@@ -17,11 +17,12 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, ValidationError, model_validator
 
 from rsgen.errors import UserError, first_problem
 from rsgen.files import read_yaml
 from rstrack.metrics.clock import TruthOffset
+from rstrack.metrics.extrinsics import TruthExtrinsics
 from rstrack.options import CLOUD_PEERS, METHODS, PEERS, SLAM_PEERS, Options
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]*$")]
@@ -72,6 +73,13 @@ class CaseEntry(_Section):
     noise: NoiseEntry = Field(default=NoiseEntry(), description="added to the images")
     camera: Path | None = Field(default=None, description="camera file to use, relative to the file that says so")
     truth_offset: TruthOffset | None = Field(default=None, description="of the truth's clock: seconds, or auto")
+    truth_extrinsics: TruthExtrinsics | None = Field(
+        default=None, description="auto: NEES and coverage with those of the truth fitted; all other errors without"
+    )
+    truth_noise: tuple[NonNegativeFloat, NonNegativeFloat] | None = Field(
+        default=None,
+        description="sigma of the truth's own motions of one second, mm and degrees, for NEES and coverage",
+    )
     group: str | None = Field(default=None, description="cases that are averaged together; default: the sequence's")
 
 
