@@ -29,7 +29,8 @@ def image(is_depth: bool, R: np.ndarray, off: np.ndarray) -> Any:
     H = np.linalg.inv(R)
     exposure = SimpleNamespace(mid_time=0.1, first_time=0.1 - HALF, last_time=0.1 + HALF)
     o = SimpleNamespace(
-        is_depth=is_depth, is_linearised=True, independent=0.5, image=SimpleNamespace(exposure=exposure), H=H, g=-H @ off
+        is_depth=is_depth, is_linearised=True, independent=0.5, image=SimpleNamespace(exposure=exposure),
+        H=H, g=-H @ off, ref=SimpleNamespace(median_depth=0.0, lens=SimpleNamespace(camera=SimpleNamespace(fx=1e9))),
     )  # fmt: skip
     o.count_as = lambda independent: setattr(o, "independent", independent)
     return o

@@ -21,6 +21,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.pull import steady
 from rstrack.alignment.spline_state import SplineState
+from rstrack.tracking.judgement.uncertainty import SYSTEMATIC_PX
 
 # Chance with which an innovation that is nothing but chance counts as too large.
 _LEVEL = 1e-3
@@ -97,14 +98,16 @@ def _measured(o: Observation, state: SplineState, predicted: Prediction) -> _Mea
     mid, half = exposure.mid_time, 0.5 * (exposure.last_time - exposure.first_time)
     H, g = steady(o, state)
     pose, velocity = state.spline.pose_and_velocity(mid)
-    turn = np.kron(np.eye(4), pose[:3, :3])
-    H, g = turn.T @ H @ turn, turn.T @ g
+    to_camera = np.kron(np.eye(4), pose[:3, :3].T)
+    H, g = to_camera @ H @ to_camera.T, to_camera @ g
     # `steady` has the change over half a readout where the state has the velocity.
     by = np.concatenate([np.ones(6), np.full(6, max(half, 1e-3))])
     # Scaled by what is open, since gain and offset, taken out of H, may leave rounding below zero.
     spread, basis = np.linalg.eigh(H * np.outer(_OPEN, _OPEN))
     R = (basis / (1.0 + np.maximum(spread, 0.0))) @ basis.T * np.outer(_OPEN, _OPEN)
     moved = -R @ g / by
+    turn = SYSTEMATIC_PX / o.ref.lens.camera.fx
+    R += np.diag(np.tile(np.repeat([turn * o.ref.median_depth, turn], 3), 2) ** 2)
     R = R / np.outer(by, by)
     T_predicted, velocity_predicted = predicted.spline.pose_and_velocity(mid)
     deviation = np.concatenate([se3.log(se3.inverse(T_predicted) @ pose), velocity - velocity_predicted])
