@@ -9,7 +9,7 @@ what it may be (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tra
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
@@ -27,8 +27,9 @@ from rstrack.tracking.judgement.uncertainty import SYSTEMATIC_PX
 _LEVEL = 1e-3
 # σ of colour's clock, s, and of readouts, as a part of them, where they are told and not calibrated.
 _CLOCK_S, _READOUT = 3e-3, 0.13
-# σ of what an image alone leaves open, m and rad.
+# σ of what an image alone leaves open, m and rad; and of a state of which nothing is known, with velocities in 1/s.
 _OPEN = np.tile([0.05, 0.05, 0.05, *np.radians([3.0, 3.0, 3.0])], 2)
+_UNKNOWN = np.full(12, 100.0)
 
 
 @dataclass(frozen=True)
@@ -47,36 +48,47 @@ class _Measured:
     z: FloatArray
     R: FloatArray
 
+    def inflated(self, factor: float) -> _Measured:
+        return replace(self, R=factor * self.R)
+
 
 def weighed(fresh: Sequence[Observation], state: SplineState, predicted: Prediction) -> bool:
-    """Let the image that is off as a whole count as little as its innovation says; whether there is one.
+    """Let images that are off as a whole count as little as their innovations say; whether there are any.
 
     fresh: a frame's observations, aligned, of a spline in this state. Of two that disagree it is the one that is
-    further from the prediction; it is held against the prediction and the others together.
+    further from the prediction: it is held against the prediction and the others. Then all of them together are held
+    against the prediction.
     """
     seen = [_measured(o, state, predicted) for o in fresh if o.is_linearised]
     if not seen:
         return False
-    P = predicted.covariance
-    odd = max(seen, key=lambda one: _innovation(one, np.zeros(12), P))
-    mean, P_rest = np.zeros(12), P
-    for other in seen:
-        if other is not odd:
-            gain = P_rest @ np.linalg.inv(P_rest + other.R)
-            mean, P_rest = mean + gain @ (other.z - mean), P_rest - gain @ P_rest
-    excess = _inflation(odd.z - mean, 0.5 * (P_rest + P_rest.T), odd.R)
-    if excess > 1.0:
-        odd.observation.count_as(odd.observation.independent / excess)
-    return excess > 1.0
+    P, nothing = predicted.covariance, np.zeros(12)
+    odd = max(seen, key=lambda one: _innovation(one, P))
+    rest = [one for one in seen if one is not odd]
+    excess = _inflation(odd, *_updated(nothing, P, rest))
+    z, R = _updated(nothing, np.diag(_UNKNOWN**2), [*rest, odd.inflated(excess)])
+    together = _inflation(_Measured(odd.observation, z, R), nothing, P)
+    for one in seen:
+        one.observation.count_as(one.observation.independent / (together * (excess if one is odd else 1.0)))
+    return max(excess, together) > 1.0
 
 
-def _innovation(one: _Measured, mean: FloatArray, P: FloatArray) -> float:
-    off = one.z - mean
-    return float(off @ np.linalg.solve(P + one.R, off))
+def _updated(mean: FloatArray, P: FloatArray, images: Sequence[_Measured]) -> tuple[FloatArray, FloatArray]:
+    """Mean (12,) and covariance (12, 12) of the state after images."""
+    for one in images:
+        gain = np.linalg.solve(P + one.R, P).T
+        mean, P = mean + gain @ (one.z - mean), P - gain @ P
+        P = 0.5 * (P + P.T)
+    return mean, P
 
 
-def _inflation(off: FloatArray, P: FloatArray, R: FloatArray) -> float:
-    """The least s >= 1 with offᵀ (P + s R)⁻¹ off at most the quantile of chance."""
+def _innovation(one: _Measured, P: FloatArray) -> float:
+    return float(one.z @ np.linalg.solve(P + one.R, one.z))
+
+
+def _inflation(one: _Measured, mean: FloatArray, P: FloatArray) -> float:
+    """The least s >= 1 with which s R leaves the image's innovation against a state within the quantile of chance."""
+    off, R = one.z - mean, one.R
     limit = float(chdtri(len(off), _LEVEL))
     spread, basis = scipy.linalg.eigh(P, R)  # basisᵀ R basis = 1
     y2, spread = (basis.T @ off) ** 2, np.maximum(spread, 0.0)
