@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 
 from benchmarks.beaten import beaten, beaten_table, peer_of, sentences
+from benchmarks.cliff import FAMILY
 from rsgen.console.tables import NOTHING, Entry, Table, significant
 from rstrack.bench.record import Record
 from rstrack.bench.tables.cells import (
@@ -151,7 +152,7 @@ def readout(full: Records) -> list[str]:
 
 def others(full: Records) -> list[str]:
     """Sequences of no group above."""
-    shown = {*PAPERS_GROUPS, "real", ""}
+    shown = {*PAPERS_GROUPS, "real", "", FAMILY}
     tracks = of_measure(full, "track")
     records = [record for record in tracks if group_of(record) not in shown and not is_change(record)]
     return _section("Other sequences: ATE, mm", by_case(records), records)
@@ -186,7 +187,7 @@ def measured(title: str, *measures: str) -> Callable[[Records], list[str]]:
 
 def gate(records: Records) -> list[str]:
     """What guards every change, with what chance does to it."""
-    tracks = of_measure(records, "track")
+    tracks = [record for record in of_measure(records, "track") if group_of(record) != FAMILY]
     found = {(record.method, record.case): record for record in tracks}
     table = pivot(
         "case", cases_of(tracks), methods_in_order(tracks), lambda case, m: _with_scatter(found.get((m, case)))

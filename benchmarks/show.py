@@ -12,6 +12,7 @@ from pathlib import Path
 
 from benchmarks import sections
 from benchmarks.beaten import sentences
+from benchmarks.cliff import cliff
 from benchmarks.pictures import draw_readout
 from rsgen.console.tables import Entry, Table
 from rsgen.errors import UserError
@@ -69,7 +70,7 @@ def results_markdown(gate: Records, full: Records) -> str:
     """All of docs/results.md. Cells that the full tier has not are the gate's; what neither has shows '-'."""
     parts = (
         sections.methods, sections.per_sequence, sections.real, sections.not_the_best, sections.imu, sections.loops,
-        sections.faults, sections.changes, sections.readout, sections.others, sections.speed,
+        sections.faults, sections.changes, cliff, sections.readout, sections.others, sections.speed,
         sections.measured("Calibration", "calibration"),
         sections.measured("Convergence and start", "convergence", "bootstrap"),
         sections.measured("Light and rendering", "light", "render"), sections.memory,

@@ -86,6 +86,8 @@ def geometric_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int) -> Call
             seen = project_rolling(ref_lens, given.from_base, p, e.UInt, e.Int)
             value, active = surface(e, ref, given.inverse_depth, seen.x, seen.y, active & seen.valid)
             r, g, is_smooth = plane_distance(e, given, ref, seen, value, active, even)
+            # What lies behind the surface is hidden from the reference: nothing that it shows speaks for it or against.
+            active &= r > -parameters[1]
             slot = block_slot(line, seen.row, lens, ref_lens, pixels.y)
             return contribution(e, g, p, 1.0, r, active, parameters, slot, judged=is_smooth)
 

@@ -6,7 +6,8 @@ for cell in benchmark.cells:
 
 A *sequence* is rendered from a config, or lies in a folder. A *case* is a piece of one, with what is done to it. A
 *method* is one of ours with options, a peer, a command, or a folder of results. A *cell* measures a method on a case,
-for one seed or several. A sequence's name is a case too, and so is a method's or peer's own name a method.
+for one seed or several. A sequence's name is a case too, and so is a method's or peer's own name a method. A *family*
+makes many cases of a few: pieces of each, with one thing after another done to them.
 """
 
 from __future__ import annotations
@@ -17,16 +18,19 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, ValidationError, model_validator
 
 from rsgen.errors import UserError, first_problem
 from rsgen.files import read_yaml
 from rstrack.metrics.clock import TruthOffset
+from rstrack.metrics.extrinsics import TruthExtrinsics
 from rstrack.options import CLOUD_PEERS, METHODS, PEERS, SLAM_PEERS, Options
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]*$")]
 Pattern = Annotated[str, Field(pattern=r"^[A-Za-z0-9_*?-][A-Za-z0-9_.*?-]*$")]
 Frames = Annotated[str, Field(pattern=r"^\d*:\d*$")]
+Changes = tuple[dict[str, dict[str, Any]], ...]
 OTHERS: tuple[str, ...] = (*PEERS, *CLOUD_PEERS, *SLAM_PEERS)
 RENDERER = "rsgen"
 """The method of cells that measure the renderer, on the config of a sequence: nothing tracks."""
@@ -68,11 +72,32 @@ class CaseEntry(_Section):
 
     sequence: Name = Field(description="of `sequences`")
     frames: Frames | None = Field(default=None, description="A:B, which are tracked; default: all")
-    changes: tuple[dict[str, dict[str, Any]], ...] = Field(default=(), description="of `rstrack.bench.changes`")
+    changes: Changes = Field(default=(), description="of `rstrack.bench.changes`")
     noise: NoiseEntry = Field(default=NoiseEntry(), description="added to the images")
     camera: Path | None = Field(default=None, description="camera file to use, relative to the file that says so")
     truth_offset: TruthOffset | None = Field(default=None, description="of the truth's clock: seconds, or auto")
+    truth_extrinsics: TruthExtrinsics | None = Field(
+        default=None, description="auto: NEES and coverage with those of the truth fitted; all other errors without"
+    )
+    truth_noise: tuple[NonNegativeFloat, NonNegativeFloat] | None = Field(
+        default=None,
+        description="sigma of the truth's own motions of one second, mm and degrees, for NEES and coverage",
+    )
     group: str | None = Field(default=None, description="cases that are averaged together; default: the sequence's")
+
+
+class MemberEntry(_Section):
+    """A case that a family takes pieces of."""
+
+    frames: tuple[Frames, ...] = Field(min_length=1, description="A:B of each piece")
+    but: dict[Name, Changes | None] = Field(default={}, description="perturbations that are others here; null: none")
+
+
+class FamilyEntry(_Section):
+    """Every perturbation of every piece of some cases: cases FAMILY-CASE-PERTURBATION-from_A, one group."""
+
+    cases: dict[Name, MemberEntry] = Field(min_length=1, description="cases or sequences, of this file or those before")
+    perturbations: dict[Name, Changes] = Field(min_length=1, description="changes that are made after the case's own")
 
 
 class MethodEntry(_Section):
@@ -92,6 +117,8 @@ class CellsEntry(_Section):
     measure: Name = Field(default="track", description="what is measured")
     seeds: int = Field(default=1, ge=1, le=10_000, description="runs, with seeds 0, 1, ...")
     settings: dict[str, Any] = Field(default={}, description="of the measure")
+    draw: int | None = Field(default=None, ge=1, description="so many of these cells, drawn by chance; default: all")
+    draw_seed: int = Field(default=0, ge=0, description="of that chance")
 
 
 class BenchmarkFile(_Section):
@@ -99,6 +126,7 @@ class BenchmarkFile(_Section):
 
     sequences: dict[Name, SequenceEntry] = {}
     cases: dict[Name, CaseEntry] = {}
+    families: dict[Name, FamilyEntry] = {}
     methods: dict[Name, MethodEntry] = {}
     cells: tuple[CellsEntry, ...] = ()
     every: Literal["code", "version"] = Field(
@@ -187,7 +215,10 @@ def load_benchmark(paths: Sequence[Path]) -> Benchmark:
     files = [_load(Path(path)) for path in paths]
     sequences = {name: entry for file in files for name, entry in file.sequences.items()}
     cases = {name: CaseEntry(sequence=name) for name in sequences}
-    cases |= {name: entry for file in files for name, entry in file.cases.items()}
+    for file in files:
+        cases |= file.cases
+        for name, family in file.families.items():
+            cases |= _family_cases(name, family, cases)
     methods = {name: MethodEntry() for name in (*METHODS, *OTHERS, RENDERER)}
     methods |= {name: entry for file in files for name, entry in file.methods.items()}
     cells: dict[str, Cell] = {}
@@ -223,6 +254,26 @@ def _load(path: Path) -> BenchmarkFile:
     return file.model_copy(update={"cases": cases, "sequences": sequences})
 
 
+def _family_cases(name: str, family: FamilyEntry, cases: Mapping[str, CaseEntry]) -> dict[str, CaseEntry]:
+    found: dict[str, CaseEntry] = {}
+    for case, member in family.cases.items():
+        if case not in cases:
+            raise UserError(f"family {name}: no case or sequence '{case}': define it in this file or one before")
+        unknown = [what for what in member.but if what not in family.perturbations]
+        if unknown:
+            raise UserError(f"family {name}: {case}: no perturbation '{unknown[0]}' that could be another here")
+        for what, changes in {**family.perturbations, **member.but}.items():
+            if changes is None:
+                continue
+            for frames in member.frames:
+                made = f"{name}-{case}-{what}-from_{frames_of(frames).start or 0}"
+                if made in found:
+                    raise UserError(f"family {name}: {made} is there twice: begin each piece at another frame")
+                own = {"frames": frames, "changes": (*cases[case].changes, *changes), "group": name}
+                found[made] = cases[case].model_copy(update=own)
+    return found
+
+
 def _cells(
     entry: CellsEntry, sequences: Mapping[str, SequenceEntry], cases: Mapping[str, CaseEntry],
     methods: Mapping[str, MethodEntry],
@@ -242,4 +293,13 @@ def _cells(
                 found.append(
                     Cell(entry.measure, case, method, seeds, cases[case], sequence, methods[method], entry.settings)
                 )
-    return found
+    return found if entry.draw is None else _drawn(found, entry.draw, entry.draw_seed)
+
+
+def _drawn(cells: Sequence[Cell], count: int, seed: int) -> list[Cell]:
+    """So many of the cells, in their order; which ones depends on all their names and the seed alone."""
+    if count > len(cells):
+        raise UserError(f"cells: draw: {count} of {len(cells)} cells: draw at most as many as there are")
+    names = sorted(cell.name for cell in cells)
+    kept = {names[k] for k in np.random.default_rng(seed).choice(len(names), count, replace=False)}
+    return [cell for cell in cells if cell.name in kept]

@@ -10,7 +10,7 @@ from dataclasses import replace
 from functools import cache
 from json import dumps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from rsgen.console.command_line import Alone, Commands, Frames, Json, Parser, Quiet, run_program
 from rsgen.errors import UserError
@@ -30,6 +30,7 @@ from rstrack.cli.options import (
     Seed,
     SequenceFolder,
     TruthExtrinsics,
+    TruthNoise,
     TruthOffset,
 )
 from rstrack.cli.refine import refine
@@ -49,6 +50,7 @@ rstrack estimates the continuous-time trajectory of a rolling-shutter RGB-D came
   rstrack calibrate out/demo --out camera.yaml         readouts, clocks and extrinsics out of the recording itself
   rstrack refine runs/demo --out runs/refined          every frame against all that saw the same: slow, and the best
   rstrack evaluate out/demo runs/demo                  errors against the ground truth
+  rstrack export runs/demo covariance --out demo.cov   poses with their covariances, for smfeval
   rstrack plot out/demo runs/demo --out demo.png       path and errors as a picture
   rstrack report runs/demo                             all of it as one HTML page
   rstrack map out/demo runs/demo --out mesh.ply        the surfaces that it saw, as a coloured mesh
@@ -90,6 +92,7 @@ def _parser() -> Parser:
     add(refine, "runs/table1 --out runs/table1-refined")
     add(evaluate, "out/lr_kt2 runs/lr_kt2 --json")
     add(plot, "out/lr_kt2 runs/lr_kt2 --out lr_kt2.png")
+    add(export, "runs/lr_kt2 covariance --out lr_kt2.cov")
     add(info, "out/lr_kt2")
     add(import_, "mine.bag mine --color /camera/color/image_raw --device realsense-d435")
     add(report, "runs/lr_kt2 --sequence out/lr_kt2")
@@ -190,6 +193,7 @@ def evaluate(
     camera: CameraFile = None,
     truth_offset: TruthOffset = None,
     truth_extrinsics: TruthExtrinsics = None,
+    truth_noise: TruthNoise = None,
     against: Annotated[
         Path | None,
         "another run of the sequence: ends with one line that compares the two, for example of gs-pg",
@@ -197,11 +201,12 @@ def evaluate(
     ] = None,
     json: Json = False,
 ) -> int:
-    """Errors of a run against the ground truth: ATE, drift per second, lines' poses."""
+    """Errors of a run against the ground truth: ATE, drift per second, lines' poses, and whether the run's covariances
+    are as large."""
     from rstrack.metrics.evaluate import compared
     from rstrack.metrics.run_evaluate import run_evaluate
 
-    how = camera, truth_offset, truth_extrinsics
+    how = camera, truth_offset, truth_extrinsics, truth_noise
     ours = run_evaluate(sequence, run, *how)
     theirs = None if against is None else run_evaluate(sequence, against, *how)
     if json:
@@ -226,6 +231,24 @@ def plot(
 
     run_plot(sequence, run, out, camera, truth_offset)
     print(f"{out}: written")
+    return 0
+
+
+def export(
+    run: Annotated[Path, "folder that 'rstrack track' wrote"],
+    what: Annotated[
+        Literal["covariance"],
+        "covariance: TUM lines with the pose's covariance against the first frame, in the depth camera's frame, as "
+        "smfeval reads them",
+        "covariance",
+    ],
+    *,
+    out: Annotated[Path, "file to write", "FILE"],
+) -> int:
+    """Write what a run knows of itself for other tools."""
+    from rstrack.metrics.covariance_file import write_covariances
+
+    print(f"{out}: {write_covariances(run, out)} poses written")
     return 0
 
 

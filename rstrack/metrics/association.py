@@ -17,6 +17,7 @@ from rsgen.geometry.spline import Spline
 from rsgen.sequence.format import STAMP_TOLERANCE_S, associate
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.estimate import Estimate
+from rstrack.metrics.truth_noise import TruthNoise
 
 if TYPE_CHECKING:
     from rstrack.data.dataset import Dataset
@@ -38,6 +39,7 @@ class Truth:
     motion: T_world_depth(t), or poses. frame_stamps: (n,) seconds, the sequence's depth frames; none where the truth is
     a mere file of poses. camera, shutter: of the depth stream, for errors by line. interpolate: poses are interpolated
     on SE(3) where one of them is within 0.02 s of a stamp; else the nearest is taken, as TUM's associate.py does.
+    noise: how far off the truth's own motions are, which counts where covariances are compared with errors.
     """
 
     motion: Spline | Trajectory
@@ -45,6 +47,7 @@ class Truth:
     camera: Camera | None = None
     shutter: Shutter | None = None
     interpolate: bool = False
+    noise: TruthNoise | None = None
 
     @property
     def line_times(self) -> FloatArray:

@@ -1,61 +1,177 @@
-"""Whether an estimate's covariances are as large as its errors are."""
+"""Whether an estimate's covariances are as large as its errors are, over motions of a tenth of a second to five.
+
+C = motion_covariance(estimate.T_world_depth, covariances(estimate), i, j)
+horizon = horizon_of(1.0, motion_errors(T_true, estimate.T_world_depth, i, j), C)
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import chdtri
 
 from rsgen.array_types import FloatArray
+from rsgen.console.tables import Table, fixed
+from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rstrack.data.estimate import Estimate
+from rstrack.data.estimate import INFO, Estimate
+
+HORIZONS_S = (0.1, 1.0, 5.0)
+AXES = ("x", "y", "z", "rx", "ry", "rz")
+LEVELS = (50, 90, 99)
+"""Regions and intervals by the part of the errors that should lie within, per cent."""
 
 # Part of the drift by which it may seem to be less later on.
 _SAME = 0.02
 
 
-def covariances(estimate: Estimate) -> tuple[FloatArray, FloatArray]:
-    """Of each pose against its keyframe, and of the keyframe's drift (n, 6, 6) each; NaN where none is known.
+@dataclass(frozen=True, eq=False)
+class Covariances:
+    """What is known of the errors of n poses; increments [m; rad] in the depth camera's frame, T_world_depth exp(ξ).
 
-    Increments [m; rad] in the depth camera's frame, from run.json's `covariance` and `drift` of the frames.
+    pose: (n, 6, 6) of a pose against its keyframe. drift: (n, 6, 6) of the keyframe against the first frame. NaN where
+    they are not known. common: (n, 6, m) by how much m standard normals, the same ones for all poses, move each: the
+    errors of the camera's calibration; 0 where they are not known.
     """
-    out = np.full((2, len(estimate.stamps), 6, 6), np.nan)
+
+    pose: FloatArray
+    drift: FloatArray
+    common: FloatArray
+
+    def at(self, index: npt.NDArray[Any]) -> Covariances:
+        """Those of some poses, by index or mask."""
+        return Covariances(self.pose[index], self.drift[index], self.common[index])
+
+
+def covariances(estimate: Estimate) -> Covariances:
+    """Those of run.json's `covariance`, `drift` and `common` of the frames. Raises UserError: they are malformed."""
+    pose, drift = np.full((2, len(estimate.stamps), 6, 6), np.nan)
+    shared: dict[int, FloatArray] = {}
     at = {round(float(t), 6): n for n, t in enumerate(estimate.stamps)}
     frames: list[dict[str, Any]] = estimate.info.get("frames") or []
-    for frame in frames:
-        n = at.get(round(float(frame["stamp"]), 6))
-        if n is not None and frame.get("covariance") is not None and frame.get("drift") is not None:
-            out[:, n] = _full(frame["covariance"]), _full(frame["drift"])
-    return out[0], out[1]
+    try:
+        for frame in frames:
+            n = at.get(round(float(frame["stamp"]), 6))
+            if n is not None and frame.get("covariance") is not None and frame.get("drift") is not None:
+                pose[n], drift[n] = _full(frame["covariance"]), _full(frame["drift"])
+                if frame.get("common") is not None:
+                    shared[n] = _rows(frame["common"])
+        common = np.zeros((len(pose), 6, max((rows.shape[1] for rows in shared.values()), default=0)))
+        if shared:
+            common[list(shared)] = np.stack([*shared.values()])
+    except (AttributeError, KeyError, TypeError, ValueError):
+        raise UserError(
+            f"estimate: covariance and drift of the frames in {INFO} must be 21 numbers each, common six rows as long "
+            "as in all other frames: run the tracker again"
+        ) from None
+    return Covariances(pose, drift, common)
 
 
-def step_nees(
-    T_true: FloatArray, T_est: FloatArray, pose: FloatArray, drift: FloatArray, i: npt.NDArray[Any], j: npt.NDArray[Any]
+def motion_covariance(
+    T_world_depth: FloatArray, known: Covariances, i: npt.NDArray[Any], j: npt.NDArray[Any]
 ) -> FloatArray:
-    """Normalised errors squared (k,), over 6, of motions from poses i to j (k,): 1 in the mean if all is right.
+    """Covariances (k, 6, 6) of the motions T_i⁻¹ T_j between poses i and j (k,) of (n, 4, 4).
 
-    T_true, T_est (n, 4, 4); pose, drift (n, 6, 6): see `covariances`. Of the motion's covariance the two poses' own are
-    parts, and the drift that comes in between. (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking
-    and Navigation, 2001, section 5.4.) NaN where the drift is less at the end: the track has gone back to an older
-    keyframe, and what the two have in common is not known.
+    Increments [m; rad] in the frame of pose j. The covariance is the sum of the two poses' own, of the drift that comes
+    in between, and of what errors of the calibration change of the one pose and not of the other. NaN where nothing is
+    known of one of the poses, and where the drift is less at the end: the track has gone back to an older keyframe, and
+    what the two have in common is not known.
     """
-    step = se3.inverse(T_est[i]) @ T_est[j]
-    error = se3.log(se3.inverse(se3.inverse(T_true[i]) @ T_true[j]) @ step)
-    Ad = se3.adjoint(se3.inverse(step))
+    out = np.full((len(i), 6, 6), np.nan)
+    both = np.flatnonzero(np.isfinite(known.pose[i] + known.pose[j]).all(axis=(1, 2)))
+    i, j = i[both], j[both]
+    Ad = se3.adjoint(se3.inverse(T_world_depth[j]) @ T_world_depth[i])
     turned = np.swapaxes(Ad, 1, 2)
-    between = drift[j] - Ad @ drift[i] @ turned
-    motion = pose[j] + between + Ad @ pose[i] @ turned
-    weighted = np.linalg.solve(motion, error[..., None])[..., 0]
+    between = known.drift[j] - Ad @ known.drift[i] @ turned
+    own = known.pose[j] + between + Ad @ known.pose[i] @ turned
     # Drift is given at mid readout, poses at stamps: what the camera moves by in between is no less drift.
-    parts = [np.trace(c[:, at, at], axis1=1, axis2=2) for at in (slice(3), slice(3, 6)) for c in (between, drift[j])]
+    parts = [
+        np.trace(c[:, at, at], axis1=1, axis2=2) for at in (slice(3), slice(3, 6)) for c in (between, known.drift[j])
+    ]
     is_more = (parts[0] >= -_SAME * parts[1]) & (parts[2] >= -_SAME * parts[3])
     # Less in one direction, though not in all together, leaves no covariance either.
-    is_more &= np.linalg.eigvalsh(motion)[:, 0] > 0
-    return np.where(is_more, np.einsum("ka,ka->k", error, weighted) / 6.0, np.nan)
+    is_more &= np.linalg.eigvalsh(own)[:, 0] > 0
+    common = known.common[j] - Ad @ known.common[i]
+    out[both[is_more]] = (own + common @ np.swapaxes(common, 1, 2))[is_more]
+    return out
+
+
+def motion_errors(
+    T_true: FloatArray, T_est: FloatArray, i: npt.NDArray[Any], j: npt.NDArray[Any]
+) -> FloatArray:  # fmt: skip
+    """Errors (k, 6), [m; rad], of the estimated motions between poses i and j (k,): true motion exp(ξ) = estimate."""
+    true = se3.inverse(T_true[i]) @ T_true[j]
+    return se3.log(se3.inverse(true) @ se3.inverse(T_est[i]) @ T_est[j])
+
+
+def step_nees(errors: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Errors squared (k,), normalised and over 6, of errors (k, 6): 1 in the mean if their covariances are right.
+
+    (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4.)
+    """
+    weighted = np.linalg.solve(covariance, errors[..., None])[..., 0]
+    return np.asarray(np.einsum("ka,ka->k", errors, weighted) / 6.0)
+
+
+@dataclass(frozen=True)
+class Horizon:
+    """Errors of motions over some seconds beside their covariances.
+
+    pairs: motions whose covariances are known. nees: mean of `step_nees`, 1 if the covariances are right. within: part
+    of the errors within the covariances' regions, by their `LEVELS`, per cent; axes: the same of each axis alone, by
+    its name in `AXES`: along and about the depth camera's own.
+    """
+
+    seconds: float
+    pairs: int
+    nees: float
+    within: dict[int, float]
+    axes: dict[str, dict[int, float]]
+
+
+def horizon_of(seconds: float, errors: FloatArray, covariance: FloatArray) -> Horizon | None:
+    """Compare errors (k, 6) with covariances (k, 6, 6); None where no covariance is known (NaN)."""
+    known = np.isfinite(covariance).all(axis=(1, 2))
+    if not known.any():
+        return None
+    errors, covariance = errors[known], covariance[known]
+    nees = step_nees(errors, covariance)
+    squares = errors**2 / np.diagonal(covariance, axis1=1, axis2=2)
+    axes = {name: _within(squares[:, a], 1) for a, name in enumerate(AXES)}
+    return Horizon(seconds, len(nees), float(nees.mean()), _within(6.0 * nees, 6), axes)
+
+
+def consistency_table(horizons: Sequence[Horizon]) -> Table:
+    """A row a horizon, and one for each axis over one second."""
+
+    def row(name: str, pairs: str, nees: str, within: dict[int, float]) -> tuple[str, ...]:
+        return name, pairs, nees, *(fixed(within[level], 1, 100.0) for level in LEVELS)
+
+    rows = [row(f"{h.seconds:g} s", str(h.pairs), fixed(h.nees, 2), h.within) for h in horizons]
+    rows += [row(f"{h.seconds:g} s, {a}", "", "", h.axes[a]) for h in horizons if h.seconds == 1.0 for a in AXES]
+    head = ("motions over", "pairs", "NEES/6", *(f"in {level} %" for level in LEVELS))
+    return Table(head, tuple(rows), "NEES, and per cent of the truths within the covariances' regions")
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _within(squares: FloatArray, freedoms: int) -> dict[int, float]:
+    return {level: float((squares <= chdtri(freedoms, 1.0 - level / 100.0)).mean()) for level in LEVELS}
 
 
 def _full(upper: npt.ArrayLike) -> FloatArray:
     out = np.zeros((6, 6))
     out[np.triu_indices(6)] = upper
     return out + np.triu(out, 1).T
+
+
+def _rows(six: npt.ArrayLike) -> FloatArray:
+    out = np.asarray(six, np.float64)
+    if out.ndim != 2 or len(out) != 6:
+        raise ValueError
+    return out

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtri
 
 from rsgen.array_types import FloatArray, IntArray
 from rsgen.console.tables import Table, fixed
@@ -29,9 +28,17 @@ from rstrack.metrics.association import (
     compare,
     nearest,
 )
-from rstrack.metrics.consistency import covariances, step_nees
+from rstrack.metrics.consistency import (
+    HORIZONS_S,
+    Horizon,
+    consistency_table,
+    covariances,
+    horizon_of,
+    motion_covariance,
+    motion_errors,
+)
+from rstrack.metrics.truth_noise import TruthNoise
 
-_RPE_DELTA_S = 1.0
 _PAIR_WITHIN_S = 0.1
 # Stamps rounded to TUM's four digits still are one second apart.
 _STAMP_ROUNDING_S = 1e-3
@@ -44,9 +51,9 @@ class Metrics:
 
     frames, frames_tracked: of the sequence, and those among them with a pose within 0.02 s. poses, poses_compared: of
     the estimate, and those with a true counterpart. ate_*: absolute trajectory error. rpe_*: relative pose error over
-    one second, `rpe_pairs` of them. row_*: over the depth images' lines, `rows` of them in `rows_total`. nees: mean of
-    those relative errors squared, normalised by the run's covariances, over 6: 1 if these are right. coverage_90: part
-    of them within the covariances' 90 % region: 0.9 if they are.
+    one second, `rpe_pairs` of them. row_*: over the depth images' lines, `rows` of them in `rows_total`. consistency:
+    errors beside the run's covariances, of the horizons over which both are known; truth_noise: what is counted there
+    of the truth's own errors.
     """
 
     frames: int
@@ -66,8 +73,18 @@ class Metrics:
     rows: int
     rows_total: int
     notes: tuple[str, ...] = ()
-    nees: float | None = None
-    coverage_90: float | None = None
+    consistency: tuple[Horizon, ...] = ()
+    truth_noise: TruthNoise | None = None
+
+    @property
+    def nees(self) -> float | None:
+        """NEES/6 over one second: 1 if the run's covariances are right."""
+        return None if (found := self.over(1.0)) is None else found.nees
+
+    @property
+    def coverage_90(self) -> float | None:
+        """Part of the motions of one second within the covariances' 90 % region: 0.9 if these are right."""
+        return None if (found := self.over(1.0)) is None else found.within[90]
 
     @property
     def coverage(self) -> float:
@@ -76,8 +93,13 @@ class Metrics:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers for JSON; units are in the names."""
-        data: dict[str, Any] = plain(dataclasses.asdict(self) | {"coverage": self.coverage})
+        more = {name: getattr(self, name) for name in ("coverage", "nees", "coverage_90")}
+        data: dict[str, Any] = plain(dataclasses.asdict(self) | more)
         return data
+
+    def over(self, seconds: float) -> Horizon | None:
+        """What `consistency` has of motions over so many seconds."""
+        return next((found for found in self.consistency if found.seconds == seconds), None)
 
     def table(self) -> Table:
         """Errors in millimetres, degrees, and both per second."""
@@ -101,8 +123,17 @@ class Metrics:
         tracked = f"{self.frames_tracked} of {self.frames} ({100 * self.coverage:.1f} %)"
         head = [f"frames tracked: {tracked}", ""] if self.frames else []
         notes = [f"note: {note}" for note in self.notes]
-        sure = "" if self.nees is None else f"covariances: NEES/6 {self.nees:.2f} over 1 s (1: as large as errors are)"
-        return "\n".join([*head, self.table().text(), *([sure] if sure else []), *notes])
+        return "\n".join([*head, self.table().text(), *self._sure(), *notes])
+
+    def _sure(self) -> list[str]:
+        if not self.consistency:
+            return []
+        noise = self.truth_noise
+        counted = "" if noise is None else (
+            f", the truth's own errors of {noise.translation_mm:g} mm and {noise.rotation_deg:g} deg in 1 s counted"
+        )  # fmt: skip
+        title = f"errors beside their covariances{counted} (NEES/6: 1 if as large):"
+        return ["", title, consistency_table(self.consistency).text()]
 
 
 @dataclass(frozen=True)
@@ -131,7 +162,7 @@ def evaluate(truth: Truth, estimate: Estimate) -> Metrics:
     Errors by line: positions and rotations at all depth lines' mid-exposures where both splines are known, after the
     alignment of the frames' poses.
 
-    Raises UserError if fewer than three poses have a true counterpart.
+    Raises UserError if fewer than three poses have a true counterpart, or the run's covariances are malformed.
     """
     notes = []
     found = compare(truth, estimate)
@@ -144,7 +175,9 @@ def evaluate(truth: Truth, estimate: Estimate) -> Metrics:
     error = found.position_errors_m
 
     step = drift(estimate, found)
-    nees, coverage_90 = _consistency(estimate, found)
+    consistency = _consistency(truth, estimate, found)
+    if truth.noise is not None and not consistency:
+        notes.append("the truth's own errors change nothing: there are no covariances to compare with errors")
     if not len(step.stamps):
         notes.append("no drift: no two poses are one second apart")
 
@@ -171,55 +204,64 @@ def evaluate(truth: Truth, estimate: Estimate) -> Metrics:
         rows=row_count,
         rows_total=len(t),
         notes=tuple(notes),
-        nees=nees,
-        coverage_90=coverage_90,
+        consistency=consistency,
+        truth_noise=truth.noise,
     )
 
 
 def pairs_one_second_apart(stamps: FloatArray) -> tuple[IntArray, IntArray]:
-    """Indices i, j (k,) with stamp j the nearest to stamp i + 1 s, of increasing stamps (n,) in seconds.
+    """The pairs of TUM's evaluate_rpe.py with --fixed_delta --delta 1 --delta_unit s --max_pairs 0, see `pairs_apart`.
 
-    The pairs of TUM's evaluate_rpe.py with --fixed_delta --delta 1 --delta_unit s --max_pairs 0 (Sturm et al., IROS
-    2012), with two differences. That script drops every pair that ends on the last pose, since all i in the last second
-    would end there; here only those whose i + 1 s lies after it (by over 1 ms) are dropped. And where the nearest pose
-    is more than 0.1 s off, in a gap, there is no pair: it might be i itself, with an error of zero. At even 30 Hz these
-    are evo's pairs for `--delta 30 --delta_unit f --all_pairs`.
+    (Sturm et al., IROS 2012.) There are two differences. That script drops every pair that ends on the last pose, since
+    all i in the last second would end there; here only those whose i + 1 s lies after it (by over 1 ms) are dropped.
+    And where the nearest pose is more than 0.1 s off, in a gap, there is no pair: it might be i itself, with an error
+    of zero. At even 30 Hz these are evo's pairs for `--delta 30 --delta_unit f --all_pairs`.
+    """
+    return pairs_apart(stamps, 1.0)
+
+
+def pairs_apart(stamps: FloatArray, seconds: float) -> tuple[IntArray, IntArray]:
+    """Indices i, j (k,) with stamp j the nearest to stamp i plus so many seconds, of increasing stamps (n,), s.
+
+    None where the nearest is more than 0.1 s, or half of the seconds, off; see `pairs_one_second_apart`.
     """
     if not len(stamps):
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    target = stamps + _RPE_DELTA_S
+    target = stamps + seconds
     j = nearest(stamps, target)
-    keep = (target <= stamps[-1] + _STAMP_ROUNDING_S) & (np.abs(stamps[j] - target) <= _PAIR_WITHIN_S)
+    within = min(_PAIR_WITHIN_S, 0.5 * seconds)
+    keep = (target <= stamps[-1] + _STAMP_ROUNDING_S) & (np.abs(stamps[j] - target) <= within)
     return np.flatnonzero(keep), j[keep]
 
 
 def drift(estimate: Estimate, found: Comparison) -> Drift:
     """The relative pose errors whose RMS `evaluate` gives, with the time at which each second begins."""
-    stamps, i, j = _pairs(estimate, found)
+    i, j = _pairs(estimate, found, 1.0)
     true_step = se3.inverse(found.T_world_true[i]) @ found.T_world_true[j]
     est_step = se3.inverse(found.T_world_est[i]) @ found.T_world_est[j]
-    return Drift(stamps, *_pose_errors(true_step, est_step))
+    return Drift(estimate.stamps[found.index[i]], *_pose_errors(true_step, est_step))
 
 
-def _pairs(estimate: Estimate, found: Comparison) -> tuple[FloatArray, IntArray, IntArray]:
-    """Stamps (k,) at which pairs one second apart begin, and their indices (k,) among the poses that were compared."""
+def _pairs(estimate: Estimate, found: Comparison, seconds: float) -> tuple[IntArray, IntArray]:
+    """Pairs (k,) so many seconds apart, by their indices among the poses that were compared."""
     row = np.full(len(estimate.stamps), -1)
     row[found.index] = np.arange(len(found.index))
-    i, j = pairs_one_second_apart(estimate.stamps)
+    i, j = pairs_apart(estimate.stamps, seconds)
     both = (row[i] >= 0) & (row[j] >= 0)
-    return estimate.stamps[i[both]], row[i[both]], row[j[both]]
+    return row[i[both]], row[j[both]]
 
 
-def _consistency(estimate: Estimate, found: Comparison) -> tuple[float | None, float | None]:
-    """Mean of `step_nees` over the pairs whose covariances are known, and the part of them within the 90 % region."""
-    pose, drifts = (c[found.index] for c in covariances(estimate))
-    _, i, j = _pairs(estimate, found)
-    known = np.isfinite(pose[i] + pose[j]).all(axis=(1, 2))
-    nees = step_nees(found.T_world_true, found.T_world_est, pose, drifts, i[known], j[known])
-    nees = nees[np.isfinite(nees)]
-    if not nees.size:
-        return None, None
-    return float(nees.mean()), float((6.0 * nees <= chdtri(6.0, 0.1)).mean())
+def _consistency(truth: Truth, estimate: Estimate, found: Comparison) -> tuple[Horizon, ...]:
+    """Of the horizons that have pairs whose covariances are known."""
+    known, stamps = covariances(estimate).at(found.index), estimate.stamps[found.index]
+    horizons = []
+    for seconds in HORIZONS_S:
+        i, j = _pairs(estimate, found, seconds)
+        covariance = motion_covariance(found.T_world_est, known, i, j)
+        if truth.noise is not None:
+            covariance += truth.noise.covariance(stamps[j] - stamps[i])
+        horizons.append(horizon_of(seconds, motion_errors(found.T_world_true, found.T_world_est, i, j), covariance))
+    return tuple(horizon for horizon in horizons if horizon is not None)
 
 
 def compared(run: Path, metrics: Metrics, other: Path, theirs: Metrics) -> str:

@@ -22,6 +22,7 @@ from rstrack.metrics.association import Truth, truth_of
 from rstrack.metrics.clock import ClockFit, TruthOffset, fit_clock, shifted
 from rstrack.metrics.evaluate import Metrics, evaluate
 from rstrack.metrics.extrinsics import ExtrinsicsFit, TruthExtrinsics, fit_extrinsics, mounted
+from rstrack.metrics.truth_noise import TruthNoise
 
 
 @dataclass(frozen=True)
@@ -163,15 +164,15 @@ def aligned_clock(truth: Truth, estimate: Estimate, offset: TruthOffset | None) 
 
 def run_evaluate(
     truth_path: Path, estimate_path: Path, camera_file: Path | None = None, truth_offset: TruthOffset | None = None,
-    truth_extrinsics: TruthExtrinsics | None = None,
+    truth_extrinsics: TruthExtrinsics | None = None, truth_noise: TruthNoise | None = None,
 ) -> Evaluation:  # fmt: skip
     """Evaluate a run folder or TUM file against the truth of a sequence folder, or against another TUM file.
 
-    Arguments as in `read_estimate`, `rstrack.data.dataset.open_tracked`, `evaluate_clocks` and `evaluate_extrinsics`.
-    Raises UserError.
+    Arguments as in `read_estimate`, `rstrack.data.dataset.open_tracked`, `evaluate_clocks`, `evaluate_extrinsics` and
+    `Truth`. Raises UserError.
     """
     estimate = read_estimate(estimate_path)
-    truth = _truth(truth_path, estimate_path, estimate, camera_file)
+    truth = replace(_truth(truth_path, estimate_path, estimate, camera_file), noise=truth_noise)
     try:
         how = evaluate_clocks if truth_extrinsics is None else evaluate_extrinsics
         return how(truth, estimate, truth_offset)

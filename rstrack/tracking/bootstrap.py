@@ -177,7 +177,7 @@ def _leave(track: Track, window: Window) -> bool:
         track.succession.recent = deque(cleaned.get(frame.index, frame) for frame in frames)
     seen_of = {frame.index: [o for o in others if o.frame == frame.index] for frame in frames}
     pulls_of = {index: pulls(seen, window.state) for index, seen in seen_of.items()}
-    if any(slides(own, ref.median_depth, True) for own in pulls_of.values()):
+    if any(slides(own, ref.median_depth) for own in pulls_of.values()):
         return False
     window.keep(others)
     for frame in track.succession.recent:

@@ -34,7 +34,8 @@ from rstrack.tracking.bootstrap import bootstrap, fit_knots, start
 from rstrack.tracking.bridging import Bridge
 from rstrack.tracking.frame_report import FrameReport
 from rstrack.tracking.judgement.fault import Fault
-from rstrack.tracking.judgement.lost_track import doubted, draws, implausible, is_settled
+from rstrack.tracking.judgement.innovation import Prediction, weighed
+from rstrack.tracking.judgement.lost_track import draws, implausible, is_settled
 from rstrack.tracking.judgement.verdict import verdict
 from rstrack.tracking.moving.leave_out import LeftOut
 from rstrack.tracking.relocalise import Relocaliser, without_misfits
@@ -244,7 +245,8 @@ class Tracker:
         fresh = on_reference + ([] if anchor is None else track.observe(new, anchor))
         # The first keyframe of a global shutter: no other frame tells where it was taken.
         gauge = ref if not window.is_frozen(ref.t) and new.depth.exposure.lens.lines == 1 else None
-        mid, T_predicted = new.depth.exposure.mid_time, window.spline.pose(new.depth.exposure.mid_time)
+        led_to, mid = window.spline, new.depth.exposure.mid_time
+        T_predicted = led_to.pose(mid)
         coupled = ref.rolling is not None
         levels = LEVELS if young or gap > (_LED_S if led else _SURE_S) else TRACKING_LEVELS
         left, last = LeftOut(new.depth), track.succession.recent[-1].depth
@@ -271,18 +273,21 @@ class Tracker:
             window.predict(new, track.found.end, young)
             fresh, on_reference = fitting, [o for o in fitting if o.ref.index == ref.index]
             solved = window.solve(fresh, levels, gauge, coupled, before_finest=leave_out)
-        if doubted(fresh):
-            solved = window.solve(fresh, (0,), gauge, coupled)
+        seconds = new.stamp - track.found.stamps[-1]
+        accelerations = track.accelerations(window, seconds, T_predicted[:3, :3])
+        uncertainty = track.covariances.uncertainty
+        if ref.rolling is None and not young and not fits.is_hopeless(fresh):
+            predicted = Prediction(led_to, uncertainty.predicted(seconds, *accelerations))
+            if weighed(fresh, window.state, predicted):
+                solved = window.solve(fresh, (0,), gauge, coupled)
         with track.terms.timer("judgement"):
             fault, pulled, solved = verdict(
                 fits, on_reference, solved, window.state, ref.pixels, young, colorless,
                 lambda: window.solve(fresh, (0,), gauge, coupled),
             )  # fmt: skip
-            uncertainty = track.covariances.uncertainty
             if ref.rolling is None:
                 # A rolling reference moves with what is aligned to it, which tells nothing of the two together.
-                seconds, R = new.stamp - track.found.stamps[-1], T_predicted[:3, :3]
-                uncertainty = uncertainty.after(seconds, pulled.information, *track.accelerations(window, seconds, R))
+                uncertainty = uncertainty.after(seconds, pulled.information, *accelerations)
         if not fault and implausible(T_predicted, window.spline.pose(mid), gap):
             fault = Fault.TOO_FAR
         elif not fault and not uncertainty.is_known:

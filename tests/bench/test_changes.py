@@ -27,6 +27,7 @@ from rstrack.bench.changes.named import (
     readout_told,
     swinging_gain,
 )
+from rstrack.data.clocks.timing import Timing, stream_timing
 from rstrack.data.dataset import Dataset, open_dataset
 
 FRAMES = 30
@@ -186,6 +187,18 @@ def test_a_wrong_camera_file(dataset: Dataset) -> None:
     late = camera_told(dataset, color_ms=5.0)
     np.testing.assert_allclose(late.color_stamps, dataset.color_stamps + 0.005)
     np.testing.assert_array_equal(late.stamps, dataset.stamps)
+
+
+def test_colour_is_not_told_late_where_its_offset_is_looked_for(dataset: Dataset) -> None:
+    late_s = 0.001 * np.random.default_rng(0).uniform(0.0, 2.0, (2, FRAMES))
+    depth, color = (stream_timing("a", dataset.stamps + late, "auto", 0.0) for late in late_s)
+    recording = dataclasses.replace(dataset, timing=Timing(depth, color, None))
+    assert recording.timing is not None and recording.timing.wants_color_offset
+    with pytest.raises(UserError, match=r"^[^\n]*offset is looked for[^\n]*$"):
+        camera_told(recording, color_ms=3.0)
+    camera_told(recording, readout_ms=3.0)
+    known = dataclasses.replace(dataset, timing=Timing(depth, color, 0.0))
+    np.testing.assert_allclose(camera_told(known, color_ms=3.0).color_stamps, dataset.color_stamps + 0.003)
 
 
 def test_a_camera_file_without_distortion_and_one_camera_for_both(dataset: Dataset) -> None:

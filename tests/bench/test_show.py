@@ -112,6 +112,31 @@ def test_results_have_every_section_and_are_short(gate: dict[str, Record], full:
     assert all(len(line.split("|")) > 2 for line in text.splitlines() if line.startswith("|"))
 
 
+def test_the_cliff_test_has_a_row_for_each_sequence_the_worst_first(gate: dict[str, Record]) -> None:
+    def told(sequence: str, *figures: dict[str, Any]) -> list[Record]:
+        names = (f"cliff-{sequence}-as_told-from_{k}" for k in range(len(figures)))
+        return [cell(n, "rs-pg", f, sequence=sequence, group="cliff") for n, f in zip(names, figures, strict=True)]
+
+    lost = {"frames": 100, "lost": 100, "silent": 0}
+    found = by_cell(
+        # Median 4 mm: 15 is not above 2.5 medians + 5 mm, 15.1 is.
+        *told("demo", errors(3.9), errors(15.0), errors(4.0), errors(15.1), errors(1.0)),
+        # Half the frames are too few for an error: these are off.
+        *told("desk", errors(8.0, lost=1), errors(2.0, lost=2), errors(2.0, lost=60), lost),
+        *told("gone", lost),
+    )
+    text = results_markdown(gate | found, {})
+    told_by = section(text, "The cliff test")
+    assert [line.split(" | ")[0] for line in told_by.splitlines() if line.startswith("| `")] == [
+        "| `gone`", "| `desk`", "| `demo`",
+    ]  # fmt: skip
+    assert row(told_by, "gone") == "| `gone` | 1 | 0.0 | 1 | - | 1 |"
+    assert row(told_by, "desk") == "| `desk` | 4 | 0.0 | 3 | 5.00 | 2 |"
+    assert row(told_by, "demo") == "| `demo` | 5 | 100.0 | 0 | 4.00 | 1 |"
+    # Nowhere else, and nowhere at all before it has run.
+    assert "cliff-" not in text and "## The cliff test" not in results_markdown(gate, {})
+
+
 def test_what_is_not_measured_is_a_dash() -> None:
     text = results_markdown({}, {})
     assert "not measured yet" in text and "\n-\n" in section(text, "Faults")

@@ -24,7 +24,7 @@ from rsgen.geometry.spline import Spline
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.estimate import Estimate, write_estimate
 from rstrack.metrics.association import compare
-from rstrack.metrics.evaluate import Metrics, compared, evaluate, pairs_one_second_apart
+from rstrack.metrics.evaluate import Metrics, compared, evaluate, pairs_apart, pairs_one_second_apart
 from rstrack.metrics.run_evaluate import run_evaluate
 
 # --- against evo and closed forms ------------------------------------------------------------------------------------
@@ -95,12 +95,12 @@ def test_another_world_frame_of_the_estimate_changes_nothing(seed: int) -> None:
 # --- pairs -----------------------------------------------------------------------------------------------------------
 
 
-def loop_pairs(stamps: np.ndarray) -> list[tuple[int, int]]:
+def loop_pairs(stamps: np.ndarray, seconds: float = 1.0, within: float = 0.1) -> list[tuple[int, int]]:
     """The definition in words, as a loop."""
     pairs = []
     for i, stamp in enumerate(stamps):
-        j = min(range(len(stamps)), key=lambda k: abs(stamps[k] - (stamp + 1.0)))
-        if stamp + 1.0 <= stamps[-1] + 1e-3 and abs(stamps[j] - (stamp + 1.0)) <= 0.1:
+        j = min(range(len(stamps)), key=lambda k: abs(stamps[k] - (stamp + seconds)))
+        if stamp + seconds <= stamps[-1] + 1e-3 and abs(stamps[j] - (stamp + seconds)) <= within:
             pairs.append((i, j))
     return pairs
 
@@ -118,6 +118,8 @@ def test_pairs_on_unequal_stamps_are_those_of_a_plain_loop(steps: list[float], g
     stamps = np.concatenate([[100.0], 100.0 + np.cumsum(steps)])
     i, j = pairs_one_second_apart(stamps)
     assert list(zip(i.tolist(), j.tolist(), strict=True)) == loop_pairs(stamps)
+    i, j = pairs_apart(stamps, 0.1)
+    assert list(zip(i.tolist(), j.tolist(), strict=True)) == loop_pairs(stamps, 0.1, 0.05) and (i < j).all()
 
 
 @given(st.integers(0, 2**32 - 1))

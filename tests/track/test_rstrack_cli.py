@@ -17,7 +17,7 @@ from rstrack.cli.main import main
 from rstrack.data.estimate import read_estimate
 from rstrack.options import METHODS, Options
 
-COMMANDS = ("track", "evaluate", "plot", "info")
+COMMANDS = ("track", "evaluate", "export", "plot", "info")
 
 
 @pytest.fixture(scope="module")

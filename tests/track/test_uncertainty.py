@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rstrack.data.estimate import Estimate
-from rstrack.metrics.consistency import covariances, step_nees
+from rstrack.metrics.consistency import Covariances, covariances, motion_covariance, motion_errors, step_nees
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 
 DT = 1.0 / 30.0
@@ -96,6 +98,7 @@ def test_errors_of_a_chain_of_keyframes_are_as_large_as_their_covariances() -> N
         if k in (2, 5):
             uncertainty = uncertainty.with_keyframe(k, keyframe[k], true[k], pose[k])
     i, j = np.array([1, 1, 4]), np.array([4, 7, 8])
+    known = Covariances(pose, drift, np.zeros((9, 6, 0)))
     found = []
     for _ in range(1500):
         off = [rng.multivariate_normal(np.zeros(6), C) for C in pose]
@@ -106,9 +109,8 @@ def test_errors_of_a_chain_of_keyframes_are_as_large_as_their_covariances() -> N
             est[k] = world[keyframe[k]] @ true[k] @ se3.exp(off[k])
             if k in (2, 5):
                 world[k] = est[k] @ se3.inverse(true[k])
-        found.append(step_nees(true, est, pose, drift, i, j))
-    back = step_nees(true, est, pose, drift, j, i)
-    assert np.isnan(back[1:]).all()  # from a later keyframe to an earlier one
+        found.append(step_nees(motion_errors(true, est, i, j), motion_covariance(est, known, i, j)))
+    assert np.isnan(motion_covariance(est, known, j, i)[1:]).all()  # from a later keyframe to an earlier one
     # Of 6 degrees of freedom: σ of the mean over 1500 is 0.015.
     np.testing.assert_allclose(np.mean(found, axis=0), 1.0, atol=0.06)
 
@@ -117,23 +119,32 @@ def test_motions_whose_drift_shrinks_in_one_direction_alone_are_left_out() -> No
     T, one, two = np.tile(np.eye(4), (2, 1, 1)), np.array([0]), np.array([1])
     pose, drift = np.tile(1e-4 * np.eye(6), (2, 1, 1)), np.tile(1e-2 * np.eye(6), (2, 1, 1))
     drift[1] = np.diag([3e-2, 3e-2, 1e-3, 3e-2, 3e-2, 3e-2])
-    assert np.isnan(step_nees(T, T, pose, drift, one, two)).all()
+    known = Covariances(pose, drift, np.zeros((2, 6, 0)))
+    assert np.isnan(motion_covariance(T, known, one, two)).all()
     drift[1] = 3e-2 * np.eye(6)
-    assert step_nees(T, T, pose, drift, one, two).tolist() == [0.0]
+    np.testing.assert_allclose(motion_covariance(T, known, one, two), [2.02e-2 * np.eye(6)], rtol=1e-12)
 
 
 def test_covariances_are_read_from_a_runs_frames() -> None:
     C = np.arange(36.0).reshape(6, 6)
     C = C + C.T
     upper = C[np.triu_indices(6)].tolist()
-    frames = [
+    frames: list[dict[str, Any]] = [
         {"stamp": 1.0, "covariance": upper, "drift": upper},
         {"stamp": 2.0, "covariance": None, "drift": None},
     ]
     estimate = Estimate(np.array([1.0, 2.0, 3.0]), np.tile(np.eye(4), (3, 1, 1)), None, {"frames": frames})
-    pose, drift = covariances(estimate)
-    np.testing.assert_array_equal(pose[0], C)
-    np.testing.assert_array_equal(drift[0], C)
-    assert np.isnan(pose[1:]).all()
-    nothing, _ = covariances(replace(estimate, info={}))
-    assert np.isnan(nothing).all()
+    known = covariances(estimate)
+    np.testing.assert_array_equal(known.pose[0], C)
+    np.testing.assert_array_equal(known.drift[0], C)
+    assert np.isnan(known.pose[1:]).all() and known.common.shape == (3, 6, 0)
+    assert np.isnan(covariances(replace(estimate, info={})).pose).all()
+
+    common = np.arange(12.0).reshape(6, 2)
+    frames[0]["common"] = common.tolist()
+    frames.append({"stamp": 3.0, "covariance": upper, "drift": upper})
+    known = covariances(estimate)
+    np.testing.assert_array_equal(known.common, [common, 0.0 * common, 0.0 * common])
+    for wrong in ({"covariance": upper[:20]}, {"drift": "much"}, {"common": [[1.0] * 3] * 6}, {"common": [1.0] * 7}):
+        with pytest.raises(UserError, match=r"^estimate: covariance and drift of the frames in run\.json [^\n]*$"):
+            covariances(replace(estimate, info={"frames": [frames[0], frames[2] | wrong]}))

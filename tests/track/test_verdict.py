@@ -42,7 +42,7 @@ def test_depth_yields_to_colours_that_tell_the_motion(
         return Solved(last_shift=0.01)
 
     before = Solved(last_shift=0.02)
-    fault, pulled, after = verdict(pulled_before(), [depth, color], before, None, 5000, False, False, again)  # type: ignore[arg-type]
+    fault, pulled, after = verdict(pulled_before(), [depth, color], before, None, 5000, True, False, again)  # type: ignore[arg-type]
     assert fault is says
     if then is None:
         assert not solved and pulled is first and after is before and depth.independent == color.independent

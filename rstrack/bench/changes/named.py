@@ -70,7 +70,8 @@ def camera_told(
     focal: factor of focal lengths. cx_px, cy_px: added to principal points. readout_ms: added to readouts, as
     `readout_told` does. rotation_deg: the colour camera is told turned about its own y axis. undistorted: no lens
     distortion is told. color_ms: added to colour stamps. Raises UserError: a registered recording, whose two cameras
-    are one, told turned; a focal length that is not positive.
+    are one, told turned; colour told late where its offset is looked for, which would undo it; a focal length that is
+    not positive.
     """
 
     def told(camera: Camera) -> Camera:
@@ -80,6 +81,8 @@ def camera_told(
     rig = dataset.rig
     if rotation_deg and rig.is_registered:
         raise UserError(f"{dataset.name}: depth is registered: no rotation between its cameras could be told wrongly")
+    if color_ms and dataset.timing is not None and dataset.timing.wants_color_offset:
+        raise UserError(f"{dataset.name}: colour's offset is looked for: name one in a camera file to tell it wrongly")
     T_told_color = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, np.radians(rotation_deg), 0.0]))
     cameras = replace(rig, depth_camera=told(rig.depth_camera), color_camera=told(rig.color_camera))
     T_color_depth = T_told_color @ rig.T_color_depth if rotation_deg else rig.T_color_depth

@@ -19,7 +19,10 @@ from rstrack.bench.task import Task
 from rstrack.data.estimate import Estimate, read_estimate, write_estimate
 from rstrack.metrics.association import ASSOCIATE_WITHIN_S, Truth, angles_deg, compare, truth_of
 from rstrack.metrics.clock import shifted
-from rstrack.metrics.run_evaluate import evaluate_clocks
+from rstrack.metrics.consistency import LEVELS
+from rstrack.metrics.evaluate import Metrics
+from rstrack.metrics.run_evaluate import evaluate_clocks, evaluate_extrinsics
+from rstrack.metrics.truth_noise import TruthNoise
 from rstrack.options import CLOUD_PEERS, SLAM_PEERS
 from rstrack.peers.command import run_command
 from rstrack.tracking.runs.run import track
@@ -54,14 +57,18 @@ def estimated(task: Task, progress: Progress) -> tuple[Estimate, Figures]:
 
 
 def accuracy(task: Task, estimate: Estimate) -> Figures:
-    """Errors over the case's frames; those of too few poses are missing, and then all frames are lost."""
-    chosen = task.frames
+    """Errors over the case's frames; those of too few poses are missing, and then all frames are lost.
+
+    The truth's own errors and extrinsics, where the case tells of them, count in NEES and coverage only.
+    """
+    chosen, case = task.frames, task.cell.case_entry
     frames = len(chosen)
     truth = truth_of(task.dataset)
     if truth is None:
         return {"frames": frames, "lost": frames - len(estimate.stamps)}
-    truth = dataclasses.replace(truth, frame_stamps=task.dataset.stamps[chosen.start : chosen.stop])
-    offset = task.cell.case_entry.truth_offset
+    noise = None if case.truth_noise is None else TruthNoise(*case.truth_noise)
+    truth = dataclasses.replace(truth, frame_stamps=task.dataset.stamps[chosen.start : chosen.stop], noise=noise)
+    offset = case.truth_offset
     try:
         evaluation = evaluate_clocks(truth, estimate, offset)
     except UserError:
@@ -72,7 +79,7 @@ def accuracy(task: Task, estimate: Estimate) -> Figures:
         except UserError:
             return {"frames": frames, "lost": frames, "silent": 0}
     found = evaluation.chosen
-    shift = evaluation.offset_s if evaluation.asked else 0.0
+    shift = evaluation.offset_s if evaluation.asked else None
     return {
         "frames": frames,
         "lost": frames - found.frames_tracked,
@@ -83,8 +90,7 @@ def accuracy(task: Task, estimate: Estimate) -> Figures:
         "drift_deg_s": found.rpe_rot_rmse_deg_per_s,
         "line_mm": _scaled(found.row_rmse_m),
         "line_deg": found.row_rot_rmse_deg,
-        "nees": found.nees,
-        "coverage_90": found.coverage_90,
+        **_consistency(found if case.truth_extrinsics is None else _mounted(truth, estimate, shift)),
         "truth_offset_ms": None if offset is None else _scaled(evaluation.offset_s),
     }
 
@@ -162,6 +168,22 @@ def _others(task: Task, progress: Progress) -> Estimate:
     from rstrack.peers.open3d import run_peer
 
     return run_peer(cell.program, task.noisy, frames, progress)
+
+
+def _mounted(truth: Truth, estimate: Estimate, offset_s: float | None) -> Metrics | None:
+    """With the truth's extrinsics; None: the track is too short or too bad for them, or the motion leaves them open."""
+    try:
+        return evaluate_extrinsics(truth, estimate, offset_s).chosen
+    except UserError:
+        return None
+
+
+def _consistency(metrics: Metrics | None) -> Figures:
+    horizons = {} if metrics is None else {horizon.seconds: horizon for horizon in metrics.consistency}
+    named = {"nees_01": 0.1, "nees": 1.0, "nees_5": 5.0}
+    nees = {name: horizons[seconds].nees if seconds in horizons else None for name, seconds in named.items()}
+    within = horizons[1.0].within if 1.0 in horizons else {}
+    return nees | {f"coverage_{level}": within.get(level) for level in LEVELS}
 
 
 def _scaled(value: float | None) -> float | None:

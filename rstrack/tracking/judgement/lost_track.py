@@ -52,22 +52,19 @@ _ALWAYS = np.array([0.05, np.radians(4.0)])
 # more slowly than 25 a second.
 _MOST_DRAWN, _DRAWN_WITHIN_S = np.array([1e-2, np.radians(1.0)]), 0.04
 _MEMORY = 30
-# How far a frame's images, or one term alone, may pull (see `alignment.pull`): so many times the usual, and always so
-# many metres; and so many times the usual number of σ, and always so many. Further in both is too far. Usual is what a
-# quarter of the last frames stays below, lest bad becomes usual; in the first frames nothing is.
+# How far a frame's images, or one term alone, may pull (see `alignment.pull`) where a piece of the track has just begun
+# and no prediction says whether it is right: so many times the usual, and always so many metres; and so many times the
+# usual number of σ, and always so many. Further in both is too far. Usual is what a quarter of the last frames stays
+# below, lest bad becomes usual; in the first frames nothing is.
 _PULLS = "whole", "depth", "color"
-_PULL_WHOLE, _PULL_ALONE, _PULL_SIGMAS = (4.0, 1.5e-2), (7.0, 2e-2), (4.0, 5.0)
-# Where a piece of the track has just begun nothing of its own says yet whether it is right: always so many metres only,
-# and fewer times the usual number of σ.
-_NEW_WHOLE, _NEW_ALONE, _NEW_SIGMAS = 6e-3, 8e-3, 3.0
+_PULL_WHOLE, _PULL_ALONE, _PULL_SIGMAS = (4.0, 6e-3), (7.0, 8e-3), (3.0, 5.0)
 # So far (m, of what is within so many metres; noise of depth grows with the square beyond) and so many σ is too far
 # whatever is usual: where a track begins before a wall, depth alone slides from the first frame on, and that would be
-# usual: 0.25 to 1 m at 14 to 23 σ; where that wall was taken for another place 0.06 to 0.12 m at 6 to 8 σ. (As far as
-# fr1_rpy is tracked there are 0.08 m at 10 σ, with depth alone 0.12 m at 9; found anew 0.16 m at 3.4.)
-_MOST_PULL, _NEW_PULL, _PULL_WITHIN = (0.15, 10.0), (0.06, 6.0), 2.5
+# usual: 0.25 to 1 m at 14 to 23 σ; where that wall was taken for another place 0.06 to 0.12 m at 6 to 8 σ.
+_MOST_PULL, _PULL_WITHIN = (0.06, 6.0), 2.5
 # Depth's errors hang together over an image, as no count of its pixels shows: where colour tells the motion better than
-# depth, to so many metres, and is content to so many σ, it is believed against what depth says.
-VOUCHES, _CONTENT = 1.5e-2, 10.0
+# depth, to so many metres, it is believed against what depth says.
+VOUCHES = 1.5e-2
 _USUAL, _FEW = 0.25, 5
 # By how much less than usual an image's pixels tell where that is no chance, and where its lines do not hang together.
 _ODD, _UNSTEADY = 3.0, 10.0
@@ -130,11 +127,11 @@ class FitHistory:
         misfits = self.misfits(fresh, expected)
         if misfits:
             return misfits[0][1]
-        if self.is_modelled and self._together(fresh, colorless) > _WORST_TOGETHER:
-            return Fault.BOTH_ODD
-        if all(o.is_depth for o in fresh) and any(self._is_doubtful(o) for o in fresh):
-            return Fault.DOUBTFUL
         if new:
+            if self.is_modelled and self._together(fresh, colorless) > _WORST_TOGETHER:
+                return Fault.BOTH_ODD
+            if all(o.is_depth for o in fresh) and any(self._is_doubtful(o) for o in fresh):
+                return Fault.DOUBTFUL
             if any(_oddness(o) > _UNSTEADY for o in fresh if not o.is_depth):
                 return Fault.UNSTEADY
             odd = [o.is_depth for o in fresh if o.lin.next_sigma > self._limit(o, _NEW_GROWTH)]
@@ -142,8 +139,7 @@ class FitHistory:
                 return Fault.ODD_DEPTH if odd[0] else Fault.ODD_COLOR
         if pulls is not None:
             distance = max(_CLOSE, fresh[0].ref.median_depth)
-            torn = self._torn(pulls, distance, new)
-            if torn:
+            if new and (torn := self._torn(pulls, distance)):
                 return torn
             self._pulls.append(pulls.scaled(distance**-2))
         for o in fresh:
@@ -162,18 +158,16 @@ class FitHistory:
         is_weak = o.lin.observability < _WEAKLY_SEEN * coarseness(o) ** -2
         return is_weak and o.lin.next_sigma > _WORST_WEAK * self._limit(o)
 
-    def _torn(self, now: Pulls, distance: float, new: bool) -> Fault:
+    def _torn(self, now: Pulls, distance: float) -> Fault:
         """distance (m), `_CLOSE` at least: of what is seen; where noise grows with its square, so do pulls."""
-        if not new and _is_vouched_for(now):
-            return Fault.NONE
-        if slides(now, distance, new):
+        if slides(now, distance):
             return Fault.PULLED
-        far = [self._is_far(name, n, now, distance, new) for n, name in enumerate(_PULLS)]
+        far = [self._is_far(name, n, now, distance) for n, name in enumerate(_PULLS)]
         if any(far[1:]) and np.isfinite([now.depth, now.color]).all():
             return Fault.DIVIDED
         return Fault.PULLED if any(far) else Fault.NONE
 
-    def _is_far(self, name: str, n: int, now: Pulls, distance: float, new: bool) -> bool:
+    def _is_far(self, name: str, n: int, now: Pulls, distance: float) -> bool:
         """Of the pull of that name, the nth: whether it is too far."""
         usual = [(pull, before.sigmas[n]) for before in self._pulls if np.isfinite(pull := getattr(before, name))]
         pull, sigmas = getattr(now, name), now.sigmas[n]
@@ -181,8 +175,6 @@ class FitHistory:
             return False
         metres, known = np.quantile(usual, _USUAL, axis=0)
         (growth, always), (times, least) = _PULL_WHOLE if name == "whole" else _PULL_ALONE, _PULL_SIGMAS
-        if new:
-            always, times = _NEW_WHOLE if name == "whole" else _NEW_ALONE, _NEW_SIGMAS
         is_odd = sigmas > max(least, times * known)
         return bool(is_odd and pull > max(always, growth * distance**2 * metres))
 
@@ -239,19 +231,13 @@ def coarseness(o: Observation) -> float:
     return max(1.0, _FINE_FOCAL / o.ref.lens.camera.fx)
 
 
-def slides(now: Pulls, distance: float, new: bool) -> bool:
-    """Whether a frame's images pull further than any do that have been found, whatever is usual.
+def slides(now: Pulls, distance: float) -> bool:
+    """Whether images of a piece of the track that has just begun pull further than any do that have been found.
 
-    distance (m): of what is seen. new: whether its piece of the track has just begun.
+    distance (m): of what is seen.
     """
-    metres, sigmas = _NEW_PULL if new else _MOST_PULL
+    metres, sigmas = _MOST_PULL
     return now.sigmas[0] > sigmas and now.whole > metres * max(1.0, distance / _PULL_WITHIN) ** 2
-
-
-def _is_vouched_for(now: Pulls) -> bool:
-    """Whether colour alone tells that a frame has been found."""
-    is_told = now.color_spread < min(VOUCHES, now.depth_spread)
-    return is_told and now.color < _PULL_ALONE[1] and now.sigmas[2] < _CONTENT
 
 
 def _least_fit(o: Observation) -> float:

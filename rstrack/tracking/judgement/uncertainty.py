@@ -68,12 +68,16 @@ class Uncertainty:
         accelerations (6,): σ of what the velocity changes by beyond what is known, m/s² and rad/s². rate: σ of the
         angular rate itself, rad/s, where a gyroscope tells it: it does not wander, as what is told by its changes does.
         """
+        updated = _told(self.predicted(seconds, accelerations, rate), slice(0, 6), seen)
+        return replace(self, state=0.5 * (updated + updated.T), seen=seen)
+
+    def predicted(self, seconds: float, accelerations: FloatArray = ACCELERATION, rate: float = np.inf) -> FloatArray:
+        """The state's covariance (12, 12) so many seconds later, before any image; arguments as in `after`."""
         F = np.eye(12)
         F[:6, 6:] = seconds * np.eye(6)
         gain = np.concatenate([0.5 * seconds**2 * np.eye(6), seconds * np.eye(6)])
         predicted = F @ self.state @ F.T + gain @ np.diag(accelerations**2) @ gain.T
-        updated = _told(_told(predicted, slice(9, 12), np.eye(3) / rate**2), slice(0, 6), seen)
-        return replace(self, state=0.5 * (updated + updated.T), seen=seen)
+        return _told(predicted, slice(9, 12), np.eye(3) / rate**2)
 
     @classmethod
     def of_first(cls) -> Uncertainty:

@@ -1,0 +1,101 @@
+"""Images that are off as a whole: how often by chance, how much less they count, and which of two it is."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from rsgen.geometry.spline import Spline
+from rstrack.tracking.judgement import innovation as module
+from rstrack.tracking.judgement.innovation import Prediction, weighed
+
+HALF = 0.015
+LIMIT = float(chi2.ppf(0.999, 12))
+
+
+def spread(metres: float, radians: float, rng: np.random.Generator) -> np.ndarray:
+    """A covariance (12, 12) of pose and change over half a readout, with correlations."""
+    size = np.tile([metres] * 3 + [radians] * 3, 2)
+    A = np.eye(12) + 0.3 * rng.normal(size=(12, 12))
+    return np.asarray(A @ A.T * np.outer(size, size))
+
+
+def image(is_depth: bool, R: np.ndarray, off: np.ndarray) -> Any:
+    """An image that has its own minimum at `off` (12,), with covariance R, in `steady`'s unknowns."""
+    H = np.linalg.inv(R)
+    exposure = SimpleNamespace(mid_time=0.1, first_time=0.1 - HALF, last_time=0.1 + HALF)
+    o = SimpleNamespace(
+        is_depth=is_depth, is_linearised=True, independent=0.5, image=SimpleNamespace(exposure=exposure),
+        H=H, g=-H @ off, ref=SimpleNamespace(median_depth=0.0, lens=SimpleNamespace(camera=SimpleNamespace(fx=1e9))),
+    )  # fmt: skip
+    o.count_as = lambda independent: setattr(o, "independent", independent)
+    return o
+
+
+@pytest.fixture(autouse=True)
+def _steady(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "steady", lambda o, _: (o.H, o.g))
+
+
+def at_rest() -> tuple[Any, Spline]:
+    spline = Spline(np.repeat(np.eye(4)[None], 12, axis=0), 0.0, 0.025)
+    return SimpleNamespace(spline=spline), spline
+
+
+# The state has the velocity where `steady` has what it changes over half a readout.
+BY = np.concatenate([np.ones(6), np.full(6, HALF)])
+
+
+def predicted(P: np.ndarray) -> Prediction:
+    return Prediction(at_rest()[1], P / np.outer(BY, BY))
+
+
+def test_chance_alone_is_called_odd_as_seldom_as_the_level_says() -> None:
+    """Against draws: at 1 in 1,000 for one image, whatever its covariance and the prediction's."""
+    rng, odd, trials = np.random.default_rng(3), 0, 4000
+    P, R = spread(4e-3, 5e-3, rng), spread(3e-4, 4e-4, rng)
+    draw_P, draw_R = np.linalg.cholesky(P), np.linalg.cholesky(R)
+    for _ in range(trials):
+        off = draw_P @ rng.normal(size=12) + draw_R @ rng.normal(size=12)
+        odd += weighed([image(True, R, off)], at_rest()[0], predicted(P))
+    assert odd <= chi2.ppf(0.999, 2 * (4 + 1)) / 2, "four are expected"
+
+
+@pytest.mark.parametrize("times", [3.0, 30.0])
+def test_what_is_off_counts_so_little_that_its_innovation_is_just_what_may_be(times: float) -> None:
+    rng = np.random.default_rng(7)
+    P, R = spread(4e-3, 5e-3, rng), spread(1e-3, 1e-3, rng)
+    off = times * np.linalg.cholesky(P) @ rng.normal(size=12)
+    one = image(True, R, off)
+    assert off @ np.linalg.solve(P + R, off) > LIMIT
+    assert weighed([one], at_rest()[0], predicted(P))
+    factor = 0.5 / one.independent
+    assert factor > 1.0
+    # What an image leaves open is bounded, which matters where it counts for nothing.
+    assert off @ np.linalg.solve(P + factor * R, off) == pytest.approx(LIMIT, rel=0.02)
+
+
+@pytest.mark.parametrize("is_depth_off", [True, False])
+def test_of_two_that_disagree_it_is_the_one_that_is_further_from_the_prediction(is_depth_off: bool) -> None:
+    rng = np.random.default_rng(11)
+    P, R = spread(4e-3, 5e-3, rng), spread(3e-4, 4e-4, rng)
+    true = 0.5 * np.linalg.cholesky(P) @ rng.normal(size=12)
+    wrong = true + 0.03 * np.eye(12)[0]
+    depth = image(True, R, wrong if is_depth_off else true)
+    color = image(False, R, true if is_depth_off else wrong)
+    assert weighed([depth, color], at_rest()[0], predicted(P))
+    off, good = (depth, color) if is_depth_off else (color, depth)
+    assert off.independent < 0.01 and good.independent == 0.5
+
+
+def test_two_that_agree_are_followed_where_the_prediction_allows_it_and_none_says_nothing() -> None:
+    rng = np.random.default_rng(13)
+    P, R = spread(4e-3, 5e-3, rng), spread(3e-4, 4e-4, rng)
+    true = np.linalg.cholesky(P) @ rng.normal(size=12)
+    both = [image(True, R, true), image(False, R, true)]
+    assert not weighed(both, at_rest()[0], predicted(P)) and [o.independent for o in both] == [0.5, 0.5]
+    assert not weighed([SimpleNamespace(is_linearised=False)], at_rest()[0], predicted(P))  # type: ignore[list-item]
