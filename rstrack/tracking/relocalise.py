@@ -150,7 +150,7 @@ class Relocaliser:
 
         trial, fresh = restarted(), self.observe(new, ref, _matched(new, ref))
         solved = trial.solve(fresh, LEVELS, hopeless=self._fits.is_hopeless)
-        fitting, colorless = without_misfits(self._fits, fresh, fresh, ref, True), False
+        fitting, colorless = without_misfits(self._fits, fresh, fresh, ref), False
         if len(fitting) < len(fresh) and not self._fits.is_hopeless(fresh):
             colorless = all(o.is_depth for o in fitting)
             trial, fresh = restarted(), fitting
@@ -191,13 +191,13 @@ def _is_sure(alone: Observation, denied: bool) -> bool:
 
 
 def without_misfits(
-    fits: FitHistory, fresh: list[Observation], on_reference: Sequence[Observation], ref: Reference, new: bool
+    fits: FitHistory, fresh: list[Observation], on_reference: Sequence[Observation], ref: Reference
 ) -> list[Observation]:
     """What is left to align by if a frame's colour images do not fit, or its depth has none to show.
 
-    Where depth does not fit either, the colours may be what drew it away. new: see `FitHistory.misfits`.
+    Where depth does not fit either, the colours may be what drew it away.
     """
-    misfits = [o for o, _ in fits.misfits(on_reference, ref.pixels, new)]
+    misfits = [o for o, _ in fits.misfits(on_reference, ref.pixels)]
     empty = [o for o in fresh if isinstance(o.image, DepthImage) and o.image.count == 0]
     odd_colors = [o for o in misfits if not o.is_depth]
     if odd_colors and len(odd_colors) < len(on_reference) and not empty:

@@ -265,7 +265,7 @@ class Tracker:
         if not is_settled(solved) and not fits.is_hopeless(fresh):
             # Its steps went to and fro; that says nothing against the place.
             solved = window.solve(fresh, (0,), gauge, coupled)
-        fitting = without_misfits(fits, fresh, on_reference, ref, young)
+        fitting = without_misfits(fits, fresh, on_reference, ref)
         colorless = False
         if len(fitting) < len(fresh) and not fits.is_hopeless(on_reference):
             colorless = all(o.is_depth for o in fitting)

@@ -32,14 +32,14 @@ def seen(kind: str, fit: float = 1.0) -> Any:
 @pytest.mark.parametrize("depth_fit", [1.0, 0.3])
 def test_colours_that_do_not_fit_are_left_out_whatever_depth_does(depth_fit: float) -> None:
     depth, odd, good = seen("depth", depth_fit), seen("color", 0.1), seen("color")
-    assert without_misfits(FitHistory(), [depth, odd, good], [depth, odd, good], REF, False) == [depth, good]
+    assert without_misfits(FitHistory(), [depth, odd, good], [depth, odd, good], REF) == [depth, good]
 
 
 def test_what_fits_and_what_stands_alone_stays() -> None:
     depth, color = seen("depth"), seen("color")
-    assert without_misfits(FitHistory(), [depth, color], [depth, color], REF, False) == [depth, color]
+    assert without_misfits(FitHistory(), [depth, color], [depth, color], REF) == [depth, color]
     odd = seen("color", 0.1)
-    assert without_misfits(FitHistory(), [odd], [odd], REF, False) == [odd]
+    assert without_misfits(FitHistory(), [odd], [odd], REF) == [odd]
 
 
 class Sees(Relocaliser):

@@ -107,14 +107,9 @@ class FitHistory:
         self._color = _Usual(_WORST_INTENSITY, _HARMLESS_INTENSITY)
         self._pulls: deque[Pulls] = deque(maxlen=_MEMORY)
 
-    def misfits(
-        self, fresh: Sequence[Observation], expected: int, new: bool = False
-    ) -> list[tuple[Observation, Fault]]:  # fmt: skip
-        """Observations that do not fit, and why. expected: pixels that a whole image puts on the reference.
-
-        new: as in `fault`: then, since no prediction says whether they are off, they have to fit about as usual.
-        """
-        return [(o, why) for o in fresh if (why := self._misfit(o, expected, _GROWTH if new else np.inf))]
+    def misfits(self, fresh: Sequence[Observation], expected: int) -> list[tuple[Observation, Fault]]:
+        """Observations that do not fit, and why. expected: pixels that a whole image puts on the reference."""
+        return [(o, why) for o in fresh if (why := self._misfit(o, expected))]
 
     def fault(
         self, fresh: Sequence[Observation], solved: Solved, expected: int, pulls: Pulls | None = None,
@@ -129,7 +124,7 @@ class FitHistory:
             return Fault.NOTHING_SEEN
         if not is_settled(solved):
             return Fault.UNSETTLED
-        misfits = self.misfits(fresh, expected, new)
+        misfits = self.misfits(fresh, expected)
         if misfits:
             return misfits[0][1]
         if new:
@@ -191,18 +186,18 @@ class FitHistory:
         return not any(
             o.is_linearised
             and o.lin.fit >= (1.0 - moving) * _least_fit(o)
-            and o.lin.next_sigma <= _HOPELESS * self._limit(o, np.inf)
+            and o.lin.next_sigma <= _HOPELESS * self._limit(o)
             for o in fresh
         )
 
-    def _misfit(self, o: Observation, expected: int, growth: float) -> Fault:
+    def _misfit(self, o: Observation, expected: int) -> Fault:
         if not o.is_linearised or o.pixels < max(_LEAST_PIXELS, _LEAST_SHARE * expected):
             return Fault.LITTLE_DEPTH if o.is_depth else Fault.LITTLE_COLOR
         if o.lin.fit < _least_fit(o):
             return Fault.OTHER_DEPTH if o.is_depth else Fault.OTHER_COLOR
         if max(o.lin.contrast, _HARMLESS_INTENSITY) < o.lin.next_sigma:
             return Fault.OTHER_COLOR  # what it is expected to show is not in it
-        if o.lin.next_sigma > self._limit(o, growth):
+        if o.lin.next_sigma > self._limit(o):
             return Fault.ODD_DEPTH if o.is_depth else Fault.ODD_COLOR
         return Fault.NONE
 
