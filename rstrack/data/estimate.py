@@ -27,6 +27,8 @@ SPLINE = "spline.npz"
 ONLINE_TRAJECTORY, ONLINE_SPLINE = "trajectory_online.txt", "spline_online.npz"
 """The track as it was found frame by frame, where the whole of it has been corrected since."""
 INFO = "run.json"
+SEGMENTS = "segments"
+"""A TUM file of each segment of the track of which it is not known where it lies, by its number."""
 
 _ORTHONORMAL_WITHIN = 1e-6
 
@@ -69,6 +71,13 @@ class Estimate:
         _refuse(skew, lambda i: "is not a rigid motion: pass the poses through se3.orthonormalise")
         _intervals(self.info)
 
+    @property
+    def untied(self) -> list[str]:
+        """A line on segments of the track of which nobody knows where they lie; none where there are none."""
+        apart = [s for s in self.info.get("segments") or [] if isinstance(s, dict) and s.get("tie") is None]
+        poses = sum(int(s.get("poses", 0)) for s in apart)
+        return [f"{poses} poses more in {SEGMENTS}/ are tied to nothing and not compared"] if apart else []
+
     def spline_covers(self, t: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Whether the spline is an estimate at times (...,) in seconds; nowhere if there is none."""
         t = np.asarray(t, np.float64)
@@ -102,17 +111,22 @@ def write_estimate(
             (folder / name).unlink(missing_ok=True)
     except OSError as error:
         raise write_error(folder, error) from None
-    _write_poses(folder, estimate, TRAJECTORY, SPLINE)
+    _write_run(folder, estimate, TRAJECTORY, SPLINE)
     if online is not None:
-        _write_poses(folder, online, ONLINE_TRAJECTORY, ONLINE_SPLINE)
+        _write_run(folder, online, ONLINE_TRAJECTORY, ONLINE_SPLINE)
     atomic_write(folder / INFO, (json.dumps(plain(info), indent=1, allow_nan=False) + "\n").encode())
 
 
-def _write_poses(folder: Path, estimate: Estimate, trajectory: str, spline_name: str) -> None:
-    lines = ["# T_world_depth", "# stamp tx ty tz qx qy qz qw"]
-    for stamp, row in zip(estimate.stamps, pose_rows(estimate.T_world_depth), strict=True):
+def write_poses(file: Path, stamps: FloatArray, T_world_depth: FloatArray, name: str = "T_world_depth") -> None:
+    """Poses (n, 4, 4) at stamps (n,) as a TUM file, nanometres and nanoseconds; name: of what. Raises UserError."""
+    lines = [f"# {name}", "# stamp tx ty tz qx qy qz qw"]
+    for stamp, row in zip(stamps, pose_rows(T_world_depth), strict=True):
         lines.append(f"{stamp:.9f} {row[0]:.9f} {row[1]:.9f} {row[2]:.9f} " + " ".join(f"{q:.12f}" for q in row[3:]))
-    atomic_write(folder / trajectory, ("\n".join(lines) + "\n").encode())
+    atomic_write(file, ("\n".join(lines) + "\n").encode())
+
+
+def _write_run(folder: Path, estimate: Estimate, trajectory: str, spline_name: str) -> None:
+    write_poses(folder / trajectory, estimate.stamps, estimate.T_world_depth)
     spline = estimate.spline
     if spline is not None:
         arrays = {"control_points": spline.control_points, "t0": np.array(spline.t0), "dt": np.array(spline.dt)}

@@ -164,7 +164,7 @@ def evaluate(truth: Truth, estimate: Estimate) -> Metrics:
 
     Raises UserError if fewer than three poses have a true counterpart, or the run's covariances are malformed.
     """
-    notes = []
+    notes = estimate.untied
     found = compare(truth, estimate)
     missing = len(estimate.stamps) - len(found.index)
     if missing:

@@ -25,7 +25,7 @@ class FrameReport:
     frames, and with the baseline. held_by_motion: largest part (0..1) that the motion before, not the images, has in
     what is known of any direction. moving: part of the depth image that was left out since it moves by itself.
     bridged: its images were of no use, as fault says, and it has its pose from an IMU and from frames after it: until
-    these came, it was lost.
+    these came, it was lost. segment: number, from 1, of the `segments.Segment` that has the frame; 0: the first track.
     """
 
     stamp: float
@@ -46,6 +46,7 @@ class FrameReport:
     moving: float = 0.0
     fault: Fault = Fault.NONE
     bridged: bool = False
+    segment: int = 0
 
     def as_lost(self, fault: Fault) -> FrameReport:
         """The same frame, given up later on; one that is lost already stays so for its own reason."""

@@ -276,7 +276,9 @@ class Tracker:
         seconds = new.stamp - track.found.stamps[-1]
         accelerations = track.accelerations(window, seconds, T_predicted[:3, :3])
         uncertainty = track.covariances.uncertainty
-        if ref.rolling is None and not young and not fits.is_hopeless(fresh):
+        # An IMU sees what the filter's accelerations do not: how lines move within an image that vibrates.
+        is_told = ref.rolling is None and not young and not track.has_gyro
+        if is_told and not fits.is_hopeless(fresh):
             predicted = Prediction(led_to, uncertainty.predicted(seconds, *accelerations))
             if weighed(fresh, window.state, predicted):
                 solved = window.solve(fresh, (0,), gauge, coupled)

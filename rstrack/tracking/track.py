@@ -99,6 +99,11 @@ class Track:
         self.device.resolution = own.pop("resolution")
         vars(self).update(own)
 
+    @property
+    def has_gyro(self) -> bool:
+        """Whether a gyroscope tells the motion beside the images."""
+        return self.inertia is not None and self.inertia.recording.gyro is not None
+
     def known(self) -> tuple[Window, Reference]:
         """The window and what new frames are aligned to, which there must be."""
         ref = self.succession.reference

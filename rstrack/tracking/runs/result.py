@@ -24,7 +24,7 @@ class Result:
 
     end: why it stopped; `error` says where the tracker broke down. evaluation: None without a truth, or with too few
     poses. lost: number of frames. unreadable: what was wrong with each image that was left out; where that was a depth
-    image, its frame was. timing: of recordings, how stamps came about. loops, imu: a line each.
+    image, its frame was. timing: of recordings, how stamps came about. loops, imu, segments: a line each.
     """
 
     estimate: Estimate
@@ -36,6 +36,7 @@ class Result:
     timing: Timing | None = None
     loops: str = ""
     imu: str = ""
+    segments: str = ""
 
     @property
     def metrics(self) -> Metrics | None:
@@ -55,7 +56,7 @@ class Result:
             f"{times['median_ms']:.1f} ms (median), {times['mean_ms']:.1f} (mean), {times['p95_ms']:.1f} (95 %)",
         ]
         lines += [why] if (why := _faults_text(info["frames"])) else []
-        lines += [line for line in (self.loops, self.imu) if line]
+        lines += [line for line in (self.segments, self.loops, self.imu) if line]
         weak = sum(not f["lost"] and 0.0 < f["observability"] < _WEAK for f in info["frames"])
         if weak and info["method"] in ("rs-g", "gs-g", "baseline"):
             lines.append(f"in {weak} of {done} frames the geometry hardly fixes all six degrees of freedom (a wall?)")

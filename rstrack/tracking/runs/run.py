@@ -34,6 +34,7 @@ from rstrack.options import Options
 from rstrack.tracking.any_tracker import AnyTracker, make_tracker
 from rstrack.tracking.runs.record import Done, Noise, diagnostics, settings, timings
 from rstrack.tracking.runs.result import End, Result, keyframes_text
+from rstrack.tracking.segments import Segments
 
 if TYPE_CHECKING:
     from rstrack.tracking.frame_report import FrameReport
@@ -103,23 +104,27 @@ def track(
         raise UserError(f"{out}: --resume is for spline methods, not for the baseline: track anew")
     begin = time.perf_counter() - done.total_s
     start_s = time.perf_counter() - asked
-    end, error = _feed(tracker, load, chosen, done, checkpoint, truth, progress, watch)
+    segments = Segments(lambda: make_tracker(dataset.rig, dataclasses.replace(options, loops="off"), imu=imu))
+    end, error = _feed(tracker, segments, load, chosen, done, checkpoint, truth, progress, watch)
+    segments.end()
     if not done.fed:
         raise UserError(error or f"{done.unreadable[0][1]}; no other frame of the {len(chosen)} can be read either")
     closing, end = _closed(tracker, again, end, progress)
-    if checkpoint is not None and end == "interrupted":
+    if checkpoint is not None and end == "interrupted" and not segments.found:
         checkpoint.save(done)
+    reports = segments.told(tracker.reports)
     info = settings(dataset, chosen, tracker.options, noise) | {
         "end": end,
         "error": error or None,
         "keyframes": tracker.keyframes,
         "checkpoint_error": (checkpoint.problem if checkpoint is not None else "") or None,
         "unreadable": [{"frame": k, "error": problem} for k, problem in done.unreadable],
-        "lost": sum(report.lost for report in tracker.reports),
+        "lost": sum(report.lost for report in reports),
+        "segments": segments.info(),
         "loops": None if closing is None else closing.info(),
         "spline_valid": tracker.spline_valid,
         "timings": timings(time.perf_counter() - begin, done.seconds) | {"start_s": start_s},
-        "frames": diagnostics(dataset, done.fed, tracker.reports, _spread(closing)),
+        "frames": diagnostics(dataset, done.fed, reports, _spread(closing)),
     }
     if closing is not None:
         info["timings"]["loops_s"] = closing.seconds
@@ -137,6 +142,9 @@ def track(
             online = _upright(online)
             estimate = online if is_same else _upright(estimate)
             info["imu"]["gravity"] = [0.0, 0.0, -float(np.linalg.norm(info["imu"]["gravity"]))]
+    is_same = estimate is online
+    online = _with_segments(online, segments)
+    estimate = online if is_same else _with_segments(estimate, segments)
     evaluation, before = evaluated(truth, estimate), None
     info["metrics"] = None if evaluation is None else evaluation.metrics.as_dict()
     info["truth_offset"] = None if evaluation is None else evaluation.truth_offset
@@ -146,13 +154,16 @@ def track(
     write_estimate(
         out, estimate.stamps, estimate.T_world_depth, estimate.spline, info, None if estimate is online else online
     )
+    segments.write(out)
     if isinstance(found, Tracker):
         found.left_out.write(out, done.fed)
     if checkpoint is not None and end != "interrupted":
         checkpoint.remove()
     left_out = tuple(problem for _, problem in done.unreadable)
     loops = "" if closing is None else _loops_text(closing, online, estimate, before)
-    return Result(estimate, evaluation, end, error, info["lost"], left_out, dataset.timing, loops, unit)
+    return Result(
+        estimate, evaluation, end, error, info["lost"], left_out, dataset.timing, loops, unit, segments.text()
+    )  # fmt: skip
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -171,8 +182,8 @@ def _loader(dataset: Dataset, options: Options, noise: Noise) -> Load:
 
 
 def _feed(
-    tracker: AnyTracker, load: Load, chosen: range, done: Done, checkpoint: Checkpoint | None, truth: Truth | None,
-    progress: Progress, watch: Watch | None,
+    tracker: AnyTracker, segments: Segments, load: Load, chosen: range, done: Done, checkpoint: Checkpoint | None,
+    truth: Truth | None, progress: Progress, watch: Watch | None,
 ) -> tuple[End, str]:  # fmt: skip
     """The frames that are not done yet through the tracker, told in `done`; how that ended, and what broke down."""
     note, told_at = "", 0
@@ -186,6 +197,7 @@ def _feed(
                 start = time.perf_counter()
                 try:
                     report = tracker.feed(frame)
+                    segments.feed(frame, report.lost)
                 except (UserError, np.linalg.LinAlgError) as problem:
                     return "broke down", f"the tracker broke down at frame {k}: {problem}"
                 done.seconds.append(time.perf_counter() - start)
@@ -202,7 +214,7 @@ def _feed(
             done.count, done.total_s = count, time.perf_counter() - begin
             if stopped.is_set() and count < len(chosen):
                 return "interrupted", ""
-            if checkpoint is not None:
+            if checkpoint is not None and not segments.is_open and not segments.found:
                 checkpoint.save_when_due(done)
     return "done", ""
 
@@ -243,6 +255,10 @@ def _corrected(online: Estimate, closing: Closing) -> Estimate:
         return online
     poses = closing.moves.poses(online.spline, online.stamps, online.T_world_depth)
     return Estimate(online.stamps, poses, closing.moves.spline(online.spline), online.info)
+
+
+def _with_segments(estimate: Estimate, segments: Segments) -> Estimate:
+    return Estimate(*segments.joined(estimate.stamps, estimate.T_world_depth), estimate.spline, estimate.info)
 
 
 def _upright(estimate: Estimate) -> Estimate:
