@@ -277,7 +277,7 @@ class Tracker:
         accelerations = track.accelerations(window, seconds, T_predicted[:3, :3])
         uncertainty = track.covariances.uncertainty
         # An IMU sees what the filter's accelerations do not: how lines move within an image that vibrates.
-        is_told = ref.rolling is None and not young and not track.has_gyro
+        is_told = ref.rolling is None and not young and not track.has_gyro and fits.is_modelled
         if is_told and not fits.is_hopeless(fresh):
             predicted = Prediction(led_to, uncertainty.predicted(seconds, *accelerations))
             if weighed(fresh, window.state, predicted):

@@ -253,7 +253,8 @@ def test_a_ball_that_passes_is_left_out_of_frame_and_keyframe(recording: Recordi
         again = track.observe(frames[k], ref)
         for o in again:
             o.linearise(track.terms, state, 0)
-        assert min(o.lin.fit for o in again) < 0.85
+        # Where it has been in the keyframe it hides what is behind, which is no misfit.
+        assert min(o.lin.fit for o in again) < 0.93
     made = track.maker.rectified(5, left.depth, frames[5].colors, recording.truth, None)
     assert made.intensity is not None and np.isnan(made.intensity[_inner(recording.balls[5])]).all()
 
