@@ -29,6 +29,7 @@ from rstrack.images.device_frame import DeviceFrame, Timer, untimed
 from rstrack.images.left_out import frame_without
 from rstrack.inertial.inertia import Inertia
 from rstrack.keyframes.archive import Archive
+from rstrack.keyframes.keyframe import Reference
 from rstrack.options import Options
 from rstrack.tracking.bootstrap import bootstrap, fit_knots, start
 from rstrack.tracking.bridging import Bridge
@@ -276,11 +277,9 @@ class Tracker:
         seconds = new.stamp - track.found.stamps[-1]
         accelerations = track.accelerations(window, seconds, T_predicted[:3, :3])
         uncertainty = track.covariances.uncertainty
-        # An IMU sees what the filter's accelerations do not: how lines move within an image that vibrates.
-        is_told = ref.rolling is None and not young and not track.has_gyro and fits.is_modelled
-        if is_told and not fits.is_hopeless(fresh):
-            predicted = Prediction(led_to, uncertainty.predicted(seconds, *accelerations))
-            if weighed(fresh, window.state, predicted):
+        if not young and self._weighs(fresh, ref):
+            state = uncertainty.predicted(seconds, *accelerations)
+            if weighed(fresh, window.state, Prediction.of(led_to, mid, state, track.last_two(new))):
                 solved = window.solve(fresh, (0,), gauge, coupled)
         with track.terms.timer("judgement"):
             fault, pulled, solved = verdict(
@@ -322,6 +321,16 @@ class Tracker:
         renewed = track.succession.renew(window, new, frozen, overlap)
         track.found.release(window, min(min(f.first_time, f.stamp) for f in track.succession.recent))
         return track.report(new, on_reference, solved, keyframe=renewed, overlap=overlap)
+
+    def _weighs(self, fresh: Sequence[Observation], ref: Reference) -> bool:
+        """Whether the filter's prediction is one to hold images against.
+
+        A rolling reference moves with them; a gyroscope sees how lines move within an image that vibrates, which the
+        filter does not; and under the wrong shutter all images are off.
+        """
+        fits = self._track.fits
+        is_told = ref.rolling is None and not self._track.has_gyro and fits.is_modelled
+        return is_told and not fits.is_hopeless(fresh)
 
     def _relocalise(
         self, new: DeviceFrame, fault: Fault = Fault.NONE, T_led: FloatArray | None = None

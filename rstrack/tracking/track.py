@@ -104,6 +104,13 @@ class Track:
         """Whether a gyroscope tells the motion beside the images."""
         return self.inertia is not None and self.inertia.recording.gyro is not None
 
+    def last_two(self, new: DeviceFrame) -> tuple[float, float] | None:
+        """When the last two frames were taken (s), where a new one is exposed at once and there are two."""
+        recent = self.succession.recent
+        if new.depth.exposure.lens.lines > 1 or len(recent) < 2:
+            return None
+        return recent[-2].depth.exposure.mid_time, recent[-1].depth.exposure.mid_time
+
     def known(self) -> tuple[Window, Reference]:
         """The window and what new frames are aligned to, which there must be."""
         ref = self.succession.reference

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.tracking.judgement import innovation as module
 from rstrack.tracking.judgement.innovation import Prediction, weighed
@@ -51,7 +52,7 @@ BY = np.concatenate([np.ones(6), np.full(6, HALF)])
 
 
 def predicted(P: np.ndarray) -> Prediction:
-    return Prediction(at_rest()[1], P / np.outer(BY, BY))
+    return Prediction.of(at_rest()[1], 0.1, P / np.outer(BY, BY))
 
 
 def test_chance_alone_is_called_odd_as_seldom_as_the_level_says() -> None:
@@ -99,3 +100,20 @@ def test_two_that_agree_are_followed_where_the_prediction_allows_it_and_none_say
     both = [image(True, R, true), image(False, R, true)]
     assert not weighed(both, at_rest()[0], predicted(P)) and [o.independent for o in both] == [0.5, 0.5]
     assert not weighed([SimpleNamespace(is_linearised=False)], at_rest()[0], predicted(P))  # type: ignore[list-item]
+
+
+def test_of_images_exposed_at_once_the_last_two_poses_say_where_the_next_one_is() -> None:
+    twist = np.array([0.4, -0.2, 0.3, 0.5, 0.1, -0.6])
+    points = se3.exp(0.025 * np.arange(12)[:, None] * twist)
+    spline = Spline(points, 0.0, 0.025)
+    for earlier in (None, (0.05, 0.08)):
+        predicted = Prediction.of(spline, 0.1, np.eye(12), earlier)
+        np.testing.assert_allclose(predicted.velocity, twist, atol=1e-9)
+        for t in (0.1, 0.12):
+            np.testing.assert_allclose(predicted.pose(t), spline.pose(t), atol=1e-9)
+    # A last control point that alternates leads the spline astray, not the two poses before it.
+    points[-1] = points[-1] @ se3.exp(np.array([0.1, 0, 0, 0, 0, 0]))
+    astray, t = Spline(points, 0.0, 0.025), 0.22
+    assert np.linalg.norm((Prediction.of(astray, t, np.eye(12)).pose(t) - spline.pose(t))[:3, 3]) > 1e-3
+    told = Prediction.of(astray, t, np.eye(12), (0.1, 0.13)).pose(t)
+    np.testing.assert_allclose(told, spline.pose(t), atol=1e-9)

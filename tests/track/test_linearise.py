@@ -231,6 +231,19 @@ def test_depth_beyond_the_gate_is_left_out(level: int, sigma: float, gate: float
     assert s.term(off_by(s, 1.1 * gate), sigma, level).count == 0
 
 
+def test_what_lies_behind_the_keyframes_surface_is_hidden_and_no_misfit() -> None:
+    s = frontal()
+    assert isinstance(s.image, DepthImage)
+    z = ENGINE.download(s.image.z, (48, 64))
+    counts = []
+    for by in (-0.3, 0.3):  # in front of the wall it contradicts it
+        part = np.where(np.arange(64) < 32, z + by, z) * (z > 0)
+        seen = replace(s, image=replace(s.image, z=ENGINE.upload(part))).term(s.truth, 1e-3)
+        counts.append((seen.count, seen.compared))
+    (front, front_of), (behind, behind_of) = counts
+    assert front < 0.6 * front_of and behind == behind_of and behind == pytest.approx(front, rel=0.02)
+
+
 def test_intensities_beyond_the_gate_are_left_out() -> None:
     s = frontal("photometric")
     assert isinstance(s.image, ColorImage)

@@ -175,7 +175,7 @@ def test_a_lens_that_breathes_is_tracked_as_well_as_a_fixed_one(recordings: tupl
         (ignored / name).unlink()
     errors = [error_mm(root) for root in (fixed, breathes, ignored)]
     print("ATE in mm, fixed, breathing, ignored:", errors)
-    # What is lost is the rim, which the shortest focal length alone has seen; there the two agree less.
+    # What is lost is the rim, which the shortest focal length alone has seen; 0.2 more would do without innovations.
     assert errors[1] < errors[0] + 0.3 and errors[2] > 50 * errors[1], errors
 
 

@@ -15,7 +15,7 @@ from rstrack.data.estimate import SEGMENTS, Estimate
 from rstrack.data.rig import Frame
 from rstrack.tracking.frame_report import frame_report
 from rstrack.tracking.judgement.fault import Fault
-from rstrack.tracking.segments import Segments
+from rstrack.tracking.runs.segments import Segments
 
 
 def true_poses(stamps: np.ndarray) -> np.ndarray:
@@ -65,7 +65,8 @@ def test_half_a_second_after_the_last_pose_a_segment_begins_and_the_next_pose_ti
     (segment,) = made.found
     # The last pose is frame 9's; half a second later is frame 24, and the next is beyond.
     assert np.rint(30.0 * segment.stamps).tolist() == [*range(25, 41)] and segment.tie == 40 / 30.0
-    stamps, T = made.joined(*first_track(lost))
+    joined = made.joined(Estimate(*first_track(lost)))
+    stamps, T = joined.stamps, joined.T_world_depth
     assert np.rint(30.0 * stamps).tolist() == [*range(10), *range(25, 60)]
     np.testing.assert_allclose(T, true_poses(stamps), atol=1e-12)
     reports = [Scripted(set(range(60)) - set(lost)).feed(frame) for frame in FRAMES]
@@ -78,9 +79,8 @@ def test_without_a_frame_in_common_nobody_knows_where_a_segment_lies(tmp_path: P
     for finds, lost in ((set(range(40)), range(10, 40)), (set(range(60)), range(10, 60))):
         made = segments_of(finds, lost)
         assert [one.tie for one in made.found] == [None]
-        own = first_track(lost)
-        for a, b in zip(made.joined(*own), own, strict=True):
-            np.testing.assert_array_equal(a, b)
+        own = Estimate(*first_track(lost), None, {"segments": made.info()})
+        np.testing.assert_array_equal(made.joined(own).T_world_depth, own.T_world_depth)
         reports = made.told([Scripted(set()).feed(frame) for frame in FRAMES])
         assert all(r.lost for r in reports) and reports[30].segment == 1 and reports[5].segment == 0
         made.write(tmp_path)
@@ -90,7 +90,7 @@ def test_without_a_frame_in_common_nobody_knows_where_a_segment_lies(tmp_path: P
         assert made.text().startswith(
             f"lost for more than 0.5 s: {poses} poses in a segment of its own, 1 of them tied"
         )
-        (note,) = Estimate(*own, None, {"segments": made.info()}).untied
+        (note,) = own.untied
         assert note.startswith(f"{poses} poses more in segments/ are tied to nothing")
 
 
@@ -111,7 +111,7 @@ def test_a_real_tracker_goes_on_where_the_first_one_is_lost() -> None:
     for k in range(36):
         made.feed(frame_at(k), k in lost)
     stamps = np.array([k for k in range(36) if k not in lost]) / 30.0
-    joined, T = made.joined(stamps, TRUTH.pose(stamps))
-    assert np.rint(30.0 * joined).tolist() == [*range(5), *range(20, 36)]
-    error = se3.inverse(TRUTH.pose(joined)) @ T
+    joined = made.joined(Estimate(stamps, TRUTH.pose(stamps)))
+    assert np.rint(30.0 * joined.stamps).tolist() == [*range(5), *range(20, 36)]
+    error = se3.inverse(TRUTH.pose(joined.stamps)) @ joined.T_world_depth
     assert np.linalg.norm(error[:, :3, 3], axis=1).max() < 3e-3

@@ -9,10 +9,11 @@ what it may be (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tra
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
+from scipy.optimize import brentq
 from scipy.special import chdtri
 
 from rsgen.array_types import FloatArray
@@ -23,21 +24,43 @@ from rstrack.alignment.pull import steady
 from rstrack.alignment.spline_state import SplineState
 from rstrack.tracking.judgement.uncertainty import SYSTEMATIC_PX
 
-# Chance with which an innovation that is nothing but chance counts as too large.
-_LEVEL = 1e-3
+# What an innovation of 12 numbers, over its covariance, exceeds by chance once in a thousand times.
+_LIMIT = float(chdtri(12, 1e-3))
 # σ of colour's clock, s, and of readouts, as a part of them, where they are told and not calibrated.
 _CLOCK_S, _READOUT = 3e-3, 0.13
-# σ of what an image alone leaves open, m and rad; and of a state of which nothing is known, with velocities in 1/s.
+# σ of what an image alone leaves open, m and rad.
 _OPEN = np.tile([0.05, 0.05, 0.05, *np.radians([3.0, 3.0, 3.0])], 2)
-_UNKNOWN = np.full(12, 100.0)
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """What is known before a frame's images: an extrapolated spline, and the state's covariance (12, 12)."""
+    """What is known before a frame's images: T_world_depth (4, 4) at a time t (s), the velocity [m; rad]/s (6,) in the
+    camera's axes, which goes on, and the covariance (12, 12) of both."""
 
-    spline: Spline
+    t: float
+    T_world_depth: FloatArray
+    velocity: FloatArray
     covariance: FloatArray
+
+    @classmethod
+    def of(
+        cls, extrapolated: Spline, t: float, covariance: FloatArray, earlier: tuple[float, float] | None = None
+    ) -> Prediction:  # fmt: skip
+        """At t (s), from where a spline goes on; or from its poses at two earlier times (s).
+
+        Of images that are exposed at once a knot has one pose, and control points may alternate between them: what a
+        spline is extrapolated to from those means little.
+        """
+        if earlier is None:
+            T_world_depth, velocity = extrapolated.pose_and_velocity(t)
+            return cls(t, T_world_depth, velocity, covariance)
+        before, last = extrapolated.pose(np.array(earlier))
+        velocity = se3.log(se3.inverse(before) @ last) / (earlier[1] - earlier[0])
+        return cls(t, last @ se3.exp((t - earlier[1]) * velocity), velocity, covariance)
+
+    def pose(self, t: float) -> FloatArray:
+        """T_world_depth (4, 4) at a time (s)."""
+        return np.asarray(self.T_world_depth @ se3.exp((t - self.t) * self.velocity))
 
 
 @dataclass(frozen=True)
@@ -47,9 +70,6 @@ class _Measured:
     observation: Observation
     z: FloatArray
     R: FloatArray
-
-    def inflated(self, factor: float) -> _Measured:
-        return replace(self, R=factor * self.R)
 
 
 def weighed(fresh: Sequence[Observation], state: SplineState, predicted: Prediction) -> bool:
@@ -63,13 +83,16 @@ def weighed(fresh: Sequence[Observation], state: SplineState, predicted: Predict
     if not seen:
         return False
     P, nothing = predicted.covariance, np.zeros(12)
-    odd = max(seen, key=lambda one: _innovation(one, P))
+    odd = max(seen, key=lambda one: float(one.z @ np.linalg.solve(P + one.R, one.z)))
     rest = [one for one in seen if one is not odd]
-    excess = _inflation(odd, *_updated(nothing, P, rest))
-    z, R = _updated(nothing, np.diag(_UNKNOWN**2), [*rest, odd.inflated(excess)])
-    together = _inflation(_Measured(odd.observation, z, R), nothing, P)
+    mean, spread = _updated(nothing, P, rest)
+    excess = _inflation(odd.z - mean, spread, odd.R)
+    z, R = _updated(odd.z, excess * odd.R, rest)
+    together = _inflation(z, P, R)
     for one in seen:
-        one.observation.count_as(one.observation.independent / (together * (excess if one is odd else 1.0)))
+        factor = together * (excess if one is odd else 1.0)
+        if factor > 1.0:
+            one.observation.count_as(one.observation.independent / factor)
     return max(excess, together) > 1.0
 
 
@@ -82,27 +105,15 @@ def _updated(mean: FloatArray, P: FloatArray, images: Sequence[_Measured]) -> tu
     return mean, P
 
 
-def _innovation(one: _Measured, P: FloatArray) -> float:
-    return float(one.z @ np.linalg.solve(P + one.R, one.z))
-
-
-def _inflation(one: _Measured, mean: FloatArray, P: FloatArray) -> float:
-    """The least s >= 1 with which s R leaves the image's innovation against a state within the quantile of chance."""
-    off, R = one.z - mean, one.R
-    limit = float(chdtri(len(off), _LEVEL))
+def _inflation(off: FloatArray, P: FloatArray, R: FloatArray) -> float:
+    """The least s >= 1 for which an innovation `off` (12,) of covariance P + s R is within the limit."""
     spread, basis = scipy.linalg.eigh(P, R)  # basisᵀ R basis = 1
     y2, spread = (basis.T @ off) ** 2, np.maximum(spread, 0.0)
 
     def beyond(s: float) -> float:
-        return float((y2 / (spread + s)).sum()) - limit
+        return float((y2 / (spread + s)).sum()) - _LIMIT
 
-    if beyond(1.0) <= 0.0:
-        return 1.0
-    low, high = 1.0, 1.0 + float(y2.sum()) / limit
-    for _ in range(50):
-        middle = np.sqrt(low * high)
-        low, high = (middle, high) if beyond(middle) > 0.0 else (low, middle)
-    return float(high)
+    return 1.0 if beyond(1.0) <= 0.0 else float(brentq(beyond, 1.0, 1.0 + y2.sum() / _LIMIT, rtol=1e-6))
 
 
 def _measured(o: Observation, state: SplineState, predicted: Prediction) -> _Measured:
@@ -121,8 +132,8 @@ def _measured(o: Observation, state: SplineState, predicted: Prediction) -> _Mea
     turn = SYSTEMATIC_PX / o.ref.lens.camera.fx
     R += np.diag(np.tile(np.repeat([turn * o.ref.median_depth, turn], 3), 2) ** 2)
     R = R / np.outer(by, by)
-    T_predicted, velocity_predicted = predicted.spline.pose_and_velocity(mid)
-    deviation = np.concatenate([se3.log(se3.inverse(T_predicted) @ pose), velocity - velocity_predicted])
+    off = se3.log(se3.inverse(predicted.pose(mid)) @ pose)
+    deviation = np.concatenate([off, velocity - predicted.velocity])
     # What the cameras' times may be wrong by moves all of an image alike, as far as the camera moves meanwhile.
     if not o.is_depth:
         R[:6, :6] += _CLOCK_S**2 * np.outer(velocity, velocity)

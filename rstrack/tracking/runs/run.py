@@ -32,9 +32,10 @@ from rstrack.metrics.association import Truth, compare, truth_of
 from rstrack.metrics.run_evaluate import Evaluation, evaluated
 from rstrack.options import Options
 from rstrack.tracking.any_tracker import AnyTracker, make_tracker
+from rstrack.tracking.first_look.looked_at import looked_at
 from rstrack.tracking.runs.record import Done, Noise, diagnostics, settings, timings
 from rstrack.tracking.runs.result import End, Result, keyframes_text
-from rstrack.tracking.segments import Segments
+from rstrack.tracking.runs.segments import Segments
 
 if TYPE_CHECKING:
     from rstrack.tracking.frame_report import FrameReport
@@ -73,7 +74,7 @@ def track(
     """
     asked = time.perf_counter()
     chosen = _chosen(dataset, frames)
-    dataset = _with_color_evened(_with_color_timed(dataset, chosen, options, progress), chosen, options, progress)
+    dataset = looked_at(dataset, chosen, options, progress)
     truth = truth_of(dataset)
     if truth is not None:
         truth = dataclasses.replace(truth, frame_stamps=dataset.stamps[chosen])
@@ -104,7 +105,8 @@ def track(
         raise UserError(f"{out}: --resume is for spline methods, not for the baseline: track anew")
     begin = time.perf_counter() - done.total_s
     start_s = time.perf_counter() - asked
-    segments = Segments(lambda: make_tracker(dataset.rig, dataclasses.replace(options, loops="off"), imu=imu))
+    alone = dataclasses.replace(options, loops="off")
+    segments = Segments(lambda: make_tracker(dataset.rig, alone, interval_s=dataset.interval_s(chosen), imu=imu))
     end, error = _feed(tracker, segments, load, chosen, done, checkpoint, truth, progress, watch)
     segments.end()
     if not done.fed:
@@ -138,13 +140,9 @@ def track(
         info["imu"] = imu_record.record(found.inertia)
         unit = imu_record.text(info["imu"], dataset.stamps[chosen[0]], sum(r.bridged for r in tracker.reports))
         if gravity:
-            is_same = estimate is online
-            online = _upright(online)
-            estimate = online if is_same else _upright(estimate)
+            online, estimate = _both(_upright, online, estimate)
             info["imu"]["gravity"] = [0.0, 0.0, -float(np.linalg.norm(info["imu"]["gravity"]))]
-    is_same = estimate is online
-    online = _with_segments(online, segments)
-    estimate = online if is_same else _with_segments(estimate, segments)
+    online, estimate = _both(segments.joined, online, estimate)
     evaluation, before = evaluated(truth, estimate), None
     info["metrics"] = None if evaluation is None else evaluation.metrics.as_dict()
     info["truth_offset"] = None if evaluation is None else evaluation.truth_offset
@@ -257,8 +255,12 @@ def _corrected(online: Estimate, closing: Closing) -> Estimate:
     return Estimate(online.stamps, poses, closing.moves.spline(online.spline), online.info)
 
 
-def _with_segments(estimate: Estimate, segments: Segments) -> Estimate:
-    return Estimate(*segments.joined(estimate.stamps, estimate.T_world_depth), estimate.spline, estimate.info)
+def _both(
+    change: Callable[[Estimate], Estimate], online: Estimate, estimate: Estimate
+) -> tuple[Estimate, Estimate]:  # fmt: skip
+    """Both changed; the second may be the first."""
+    changed = change(online)
+    return changed, changed if estimate is online else change(estimate)
 
 
 def _upright(estimate: Estimate) -> Estimate:
@@ -279,26 +281,6 @@ def _chosen(dataset: Dataset, frames: slice) -> range:
     if not len(chosen):
         raise UserError(f"{dataset.root}: has no frame {frames.start}: its frames are 0 to {len(dataset) - 1}")
     return chosen
-
-
-def _with_color_timed(dataset: Dataset, chosen: range, options: Options, progress: Progress) -> Dataset:
-    """The dataset with its colour stamps' offset found, where it is not known, may not be 0 and matters."""
-    if dataset.timing is None or not dataset.timing.wants_color_offset or not options.photometric:
-        return dataset
-    from rstrack.tracking.first_look.color_offset import estimate_color_offset
-
-    found = estimate_color_offset(dataset, chosen, options, progress)
-    return dataset.with_color_offset(found.offset_s, found.text())
-
-
-def _with_color_evened(dataset: Dataset, chosen: range, options: Options, progress: Progress) -> Dataset:
-    """The dataset with what its colour images lose towards their corners, where that is not known and matters."""
-    if dataset.rig.color_falloff is not None or not options.photometric:
-        return dataset
-    from rstrack.tracking.first_look.color_falloff import estimate_color_falloff
-
-    found = estimate_color_falloff(dataset, chosen, options, progress)
-    return dataset.with_color_falloff(found.falloff, found.text())
 
 
 def _make_folder(out: Path) -> None:

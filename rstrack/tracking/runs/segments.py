@@ -4,7 +4,7 @@ segments = Segments(lambda: make_tracker(rig, options))
 for frame in frames:
     report = tracker.feed(frame)
     segments.feed(frame, report.lost)
-stamps, T_world_depth = segments.joined(*tracker.trajectory)
+estimate = segments.joined(Estimate(*tracker.trajectory))
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rsgen.array_types import FloatArray
+from rsgen.files import write_error
 from rsgen.geometry import se3
-from rstrack.data.estimate import SEGMENTS, write_poses
+from rstrack.data.estimate import SEGMENTS, Estimate, write_poses
 from rstrack.data.rig import Frame
 from rstrack.tracking.any_tracker import AnyTracker
 
 if TYPE_CHECKING:
     from rstrack.tracking.frame_report import FrameReport
-
 
 # Seconds without a pose after which the camera begins a segment.
 _LOST_S = 0.5
@@ -50,7 +50,9 @@ class Segments:
     make: Callable[[], AnyTracker]
     found: list[Segment] = field(default_factory=list)
     _tracker: AnyTracker | None = None
-    _last: float | None = None
+    # Stamps of the first track's last pose, and of the segment's (or of where it began).
+    _found: float = np.inf
+    _own: float = np.inf
 
     @property
     def is_open(self) -> bool:
@@ -60,21 +62,19 @@ class Segments:
     def feed(self, frame: Frame, is_lost: bool) -> None:
         """A frame that the first track has lost, or found. Raises UserError as `Tracker.feed`."""
         stamp = frame.depth.stamp
-        if self._tracker is None:
-            if not is_lost:
-                self._last = stamp
-            if not is_lost or self._last is None or stamp - self._last <= _LOST_S:
-                return
-            self._tracker, self._last = self.make(), stamp
-        own = self._tracker.feed(frame)
+        if self._tracker is None and is_lost and stamp - self._found > _LOST_S:
+            self._tracker, self._own = self.make(), stamp
         if not is_lost:
-            self.end(None if own.lost else stamp)
-            self._last = stamp
-        elif not own.lost:
-            self._last = stamp
-        elif stamp - (self._last or stamp) > _LOST_S:
+            self._found = stamp
+        if self._tracker is None:
+            return
+        report = self._tracker.feed(frame)
+        if not report.lost:
+            self._own = stamp
+        if not is_lost:
+            self.end(None if report.lost else stamp)
+        elif stamp - self._own > _LOST_S:
             self.end()
-            self._last = stamp - 2.0 * _LOST_S
 
     def end(self, tie: float | None = None) -> None:
         """The camera's segment, if it is in one, is over; one of a single pose is none. tie: as in `Segment`."""
@@ -84,8 +84,9 @@ class Segments:
                 self.found.append(Segment(stamps, T_segment_depth, tie))
             self._tracker = None
 
-    def joined(self, stamps: FloatArray, T_world_depth: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The first track's poses (n, 4, 4) at stamps (n,), and those of segments that are tied to it."""
+    def joined(self, track: Estimate) -> Estimate:
+        """The first track, and the poses of segments that are tied to it, which have no spline."""
+        stamps, T_world_depth = track.stamps, track.T_world_depth
         for segment in self.found:
             if segment.tie is None:
                 continue
@@ -96,7 +97,7 @@ class Segments:
             poses = se3.orthonormalise(T_world_segment @ segment.T_segment_depth[missing])
             T_world_depth = np.concatenate([T_world_depth, poses])
         order = np.argsort(stamps)
-        return stamps[order], T_world_depth[order]
+        return Estimate(stamps[order], T_world_depth[order], track.spline, track.info)
 
     def told(self, reports: Sequence[FrameReport]) -> list[FrameReport]:
         """The first track's reports, with the segments of frames that it has lost."""
@@ -123,8 +124,14 @@ class Segments:
 
     def write(self, run: Path) -> None:
         """The segments that are tied to nothing, into a run's folder; an earlier run's go. Raises UserError."""
-        shutil.rmtree(run / SEGMENTS, ignore_errors=True)
+        folder = run / SEGMENTS
+        try:
+            if folder.exists():
+                shutil.rmtree(folder)
+            if any(one.tie is None for one in self.found):
+                folder.mkdir()
+        except OSError as error:
+            raise write_error(folder, error) from None
         for k, one in enumerate(self.found, 1):
             if one.tie is None:
-                (run / SEGMENTS).mkdir(exist_ok=True)
-                write_poses(run / SEGMENTS / f"{k}.txt", one.stamps, one.T_segment_depth, "T_segment_depth")
+                write_poses(folder / f"{k}.txt", one.stamps, one.T_segment_depth, "T_segment_depth")
