@@ -115,6 +115,12 @@ def package_version() -> str:
     return version("rolling-shutter-rgbd")
 
 
+def versions_behind(version: str) -> int:
+    """Minor versions by which another one of this project is older; many where the major one is another."""
+    then, now = (tuple(int(part) for part in text.split(".")[:2]) for text in (version, package_version()))
+    return now[1] - then[1] if then[0] == now[0] else 999
+
+
 @cache
 def commit() -> str | None:
     """Of the checkout that this code is in, with a + where files have changed since; None outside of one."""

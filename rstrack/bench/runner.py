@@ -24,7 +24,7 @@ from rsgen.device.backend import select
 from rsgen.errors import UserError
 from rstrack.bench.definitions import Benchmark, Cell
 from rstrack.bench.memory import peak_mb, reset_peak
-from rstrack.bench.record import Record, package_version, read_record, stamped, write_record
+from rstrack.bench.record import Record, package_version, read_record, stamped, versions_behind, write_record
 from rstrack.bench.sequences import Absent, Sources
 from rstrack.bench.task import MEASURES, Task, measure_named
 from rstrack.data.estimate import TRAJECTORY
@@ -32,6 +32,8 @@ from rstrack.data.estimate import TRAJECTORY
 log = logging.getLogger("rstrack")
 
 RECORD = "record.json"
+OLDEST = 2
+"""Minor versions that what takes hours may be behind."""
 # Parts of both packages that show things, or read and write for other programs: figures do not depend on them.
 _SHOWING = ("bench", "charts", "cli", "export", "importing", "pack", "pictures", "report", "share", "view")
 # What describes a sequence, rsgen's or TUM's; the images themselves are not read for the key.
@@ -50,7 +52,10 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Job:
-    """One cell to run; plain enough to be sent to another process that sees the same files."""
+    """One cell to run; plain enough to be sent to another process that sees the same files.
+
+    code: what the code was that its figures depend on; empty: any of the last `OLDEST` minor versions'.
+    """
 
     cell: Cell
     out: Path
@@ -74,12 +79,15 @@ def run_cells(
     unknown = [cell.measure for cell in benchmark.cells if cell.measure not in known]
     if unknown:
         raise UserError(f"no measure '{unknown[0]}': choose {', '.join(known)}")
-    by_code, release = benchmark.every == "code", package_version()
+    known_by = {"version": package_version(), "third": ""}
     jobs = [
-        Job(cell, (out / "cells" / cell.name).resolve(), sources, where, code_digest(where) if by_code else release)
+        Job(
+            cell, (out / "cells" / cell.name).resolve(), sources, where,
+            code_digest(where) if benchmark.every == "code" else known_by[benchmark.every],
+        )
         for cell in benchmark.cells
         for where in [known[cell.measure]]
-    ]
+    ]  # fmt: skip
     records: dict[str, Record] = {}
     known_s = dict(expected_s or {})
     usual_s = sorted(known_s.values())[len(known_s) // 2] if known_s else 1.0
@@ -208,6 +216,8 @@ def _kept(job: Job, key: str) -> Record | None:
     """What there is of the seeds that are asked for; None: nothing, or of other inputs."""
     there = read_record(job.out / RECORD)
     if there is None or there.error is not None or there.key != key:
+        return None
+    if not job.code and not 0 <= versions_behind(there.version) <= OLDEST:
         return None
     runs = {seed: run for seed, run in zip(there.seeds, there.runs, strict=True) if seed in job.cell.seeds}
     complete = len(runs) == len(job.cell.seeds)

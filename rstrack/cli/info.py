@@ -13,6 +13,7 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rstrack.data.dataset import Dataset
+from rstrack.data.rig import Rig
 from rstrack.metrics.association import truth_of
 
 
@@ -28,6 +29,7 @@ def describe(dataset: Dataset) -> str:
         ("", _camera(rig.color_camera)),
         ("", _shutter(rig.color_shutter, rig.color_camera)),
         ("colour", f"{_relative_pose(rig.T_color_depth)} from the depth camera"),
+        ("sigma", _sigma(rig)),
         ("frames", f"{len(dataset)}, {_groups(dataset)}"),
         ("truth", _truth(dataset)),
         *_imu(dataset),
@@ -60,6 +62,19 @@ def _shutter(shutter: Shutter, camera: Camera) -> str:
 def _relative_pose(T: FloatArray) -> str:
     angle = np.degrees(np.linalg.norm(se3.log(T)[3:]))
     return f"{1e3 * np.linalg.norm(T[:3, 3]):.1f} mm and {angle:.2f} degrees"
+
+
+def _sigma(rig: Rig) -> str:
+    """How far the cameras may be wrong."""
+    s, fx = rig.sigma, rig.color_camera.fx
+    if s.is_exact:
+        return "the cameras are exact"
+    apart = "" if rig.is_registered else f", extrinsics {1e3 * s.translation_m:.3g} mm {s.rotation_deg:.3g} degrees"
+    return (
+        f"focal length {100 * s.focal:.3g} %, aspect {100 * s.aspect:.3g} %, center {s.center * fx:.3g} px, "
+        f"k1 {s.k1:.3g}, readout {1e3 * s.readout_s:.3g} ms, clock {1e3 * s.offset_s:.3g} ms{apart}, "
+        f"depth {100 * s.depth_scale:.3g} % and {s.depth_inverse_offset:.3g}/m (camera file: 'sigma')"
+    )
 
 
 def _imu(dataset: Dataset) -> list[tuple[str, str]]:

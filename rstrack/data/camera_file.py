@@ -12,6 +12,7 @@ T_color_depth (4x4) is the identity where it is left out. color.offset_s: second
 `rstrack.data.clocks.timing`; color.drift_ppm: millionths by which that grows over the recording, in whose middle it
 holds; both are what `rstrack calibrate` finds, which writes such a file. color.falloff: see `Rig`; auto: `track` finds
 it. stamps: auto, raw or regular, see there too.
+sigma: {focal: 0.01, center_px: 3, ...}: how far this may be wrong, see `CalibrationSigma`; the rest is as usual.
 depth.registered: warped into the colour camera, see `rstrack.data.registered_rows`. depth.offset_s: seconds added to
 depth's stamps. calibration.yaml: see `rstrack.data.opencv_camera_file`; Kalibr's camchain.yaml: see
 `rstrack.data.kalibr_camera_file`. A run.json holds the cameras of its run in the same form (`camera_content`).
@@ -20,7 +21,7 @@ depth's stamps. calibration.yaml: see `rstrack.data.opencv_camera_file`; Kalibr'
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -32,6 +33,7 @@ from rsgen.files import read_text, read_yaml
 from rsgen.geometry.camera import Camera, Model
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.sequence.format import DEPTH_SCALE
+from rstrack.data.calibration_sigma import STATED, UNDISTORTED_K1, CalibrationSigma
 from rstrack.data.clocks.timing import StampsMode
 from rstrack.data.depth_error import NONE, DepthError
 from rstrack.data.estimate import read_info
@@ -41,7 +43,7 @@ from rstrack.data.registered_rows import DepthSensor, registered_shutter
 from rstrack.data.rig import Rig
 
 EXAMPLE = "color: {width: 640, height: 480, intrinsics: [fx, fy, cx, cy], readout_s: 0.028}"
-_KEYS = "color, depth, T_color_depth and stamps, each camera with width, height, intrinsics, readout_s"
+_KEYS = "color, depth, T_color_depth, stamps and sigma, each camera with width, height, intrinsics, readout_s"
 
 Size = tuple[int, int]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -132,11 +134,28 @@ class _DepthStream(_Stream):
         return self
 
 
+Sigma = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+
+
+class _Sigma(_Section):
+    focal: Sigma | None = None
+    aspect: Sigma | None = None
+    center_px: Annotated[float, Field(ge=0, le=1e3, allow_inf_nan=False)] | None = None
+    k1: Sigma | None = None
+    rotation_deg: Annotated[float, Field(ge=0, le=30, allow_inf_nan=False)] | None = None
+    translation_m: Sigma | None = None
+    readout_s: Sigma | None = None
+    offset_s: Sigma | None = None
+    depth_scale: Sigma | None = None
+    depth_inverse_offset: Sigma | None = None
+
+
 class _CameraYaml(_Section):
     color: _ColorStream
     depth: _DepthStream | None = None
     T_color_depth: Matrix4 | None = None
     stamps: StampsMode = "auto"
+    sigma: _Sigma = _Sigma()
 
 
 def read_rig(path: Path, color_size: Size, depth_size: Size) -> RigFile:
@@ -153,11 +172,20 @@ def read_rig(path: Path, color_size: Size, depth_size: Size) -> RigFile:
     text = read_text(path)
     if is_opencv(text):
         rig, depth_scale = read_opencv_rig(path, text, color_size, depth_size)
+        rig = replace(rig, sigma=usual(rig.color_camera))
         return RigFile(rig, depth_scale or DEPTH_SCALE, scale_named=depth_scale is not None)
     content = read_yaml(path)
     if is_camchain(content):
         return _of_camchain(read_camchain(path, content))
     return _of_content(path, content)
+
+
+def usual(camera: Camera, stated: Mapping[str, float] | None = None) -> CalibrationSigma:
+    """How far a camera file may be wrong that states these σ, by the names that it has for them."""
+    found = dict(stated or {})
+    if "center_px" in found:
+        found["center"] = found.pop("center_px") / camera.fx
+    return replace(STATED if any(camera.distortion) else replace(STATED, k1=UNDISTORTED_K1), **found)
 
 
 def run_cameras(info: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -183,7 +211,12 @@ def camera_content(file: RigFile) -> dict[str, Any]:
         | {"offset_s": file.depth_offset_s, "depth_scale": file.depth_scale, "error": asdict(file.depth_error)},
         "T_color_depth": rig.T_color_depth.tolist(),
         "stamps": file.stamps,
-    }
+    } | ({} if rig.sigma.is_exact else {"sigma": _stated(rig)})
+
+
+def _stated(rig: Rig) -> dict[str, float]:
+    sigma = asdict(rig.sigma)
+    return sigma | {"center_px": sigma.pop("center") * rig.color_camera.fx}
 
 
 def _of_content(path: Path, content: Mapping[str, Any]) -> RigFile:
@@ -212,6 +245,7 @@ def _of_content(path: Path, content: Mapping[str, Any]) -> RigFile:
             color_shutter,
             T_color_depth,
             None if data.color.falloff == "auto" else data.color.falloff,
+            usual(color_camera, data.sigma.model_dump(exclude_none=True)),
         ),
         DEPTH_SCALE if depth is None else depth.depth_scale,
         data.stamps,
@@ -227,7 +261,8 @@ def _of_content(path: Path, content: Mapping[str, Any]) -> RigFile:
 
 def _of_camchain(chain: Camchain) -> RigFile:
     color, depth = chain.color, chain.depth or chain.color
-    rig = Rig(depth.camera, depth.shutter, color.camera, color.shutter, chain.T_color_depth)
+    sigma = usual(color.camera)
+    rig = Rig(depth.camera, depth.shutter, color.camera, color.shutter, chain.T_color_depth, sigma=sigma)
     known = color.has_readout or depth.has_readout
     return RigFile(
         rig, DEPTH_SCALE, color_offset_s=chain.color_offset_s, scan_named=known, scale_named=False, notes=chain.notes

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from rsgen.array_types import FloatArray
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
+from rstrack.data.calibration_sigma import EXACT, CalibrationSigma
 
 
 @dataclass(frozen=True)
@@ -18,7 +19,7 @@ class Rig:
     """The cameras: everything the tracker must know beside the images.
 
     T_color_depth (4, 4): p_color from p_depth. color_falloff: f, where colour's intensities are those of an even image
-    over 1 + f ρ² at ρ of the way from the centre to a corner; None: not known.
+    over 1 + f ρ² at ρ of the way from the centre to a corner; None: not known. sigma: how far this may be wrong.
     """
 
     depth_camera: Camera
@@ -27,6 +28,7 @@ class Rig:
     color_shutter: Shutter
     T_color_depth: FloatArray
     color_falloff: float | None = None
+    sigma: CalibrationSigma = EXACT
 
     @property
     def is_registered(self) -> bool:

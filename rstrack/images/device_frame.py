@@ -74,20 +74,21 @@ class DeviceRig:
     """Lenses and rays of a rig as a method sees them; takes its frames to the device.
 
     rays (h, w, 2): normalised coordinates of the depth camera's pixels; device_rays: the same on the device.
-    resolution: step of the depth camera (1/m), 0 until its first images have shown one.
+    depth_lens, color_lens: the cameras. resolution: step of the depth camera (1/m), 0 until its first images have shown
+    one.
     """
 
     def __init__(self, rig: Rig, options: Options, timer: Timer = untimed) -> None:
         self.timer = timer
         self._rig, self._options = rig, options
         self.e = engine(options.backend)
-        self._depth_lens = Lens(rig.depth_camera, _seen_as(rig.depth_shutter, options.rolling))
-        self._color_lens = Lens(rig.color_camera, _seen_as(rig.color_shutter, options.rolling))
+        self.depth_lens = Lens(rig.depth_camera, _seen_as(rig.depth_shutter, options.rolling))
+        self.color_lens = Lens(rig.color_camera, _seen_as(rig.color_shutter, options.rolling))
         self._seen = lens_sees(rig.depth_camera)
         self._finer = octaves_finer(rig.color_camera, rig.depth_camera)
         size = rig.color_camera.width, rig.color_camera.height
         self._evening = 1.0 + np.float32(rig.color_falloff) * corner_distance2(*size) if rig.color_falloff else None
-        self.rays = camera_rays(Exposure(self._depth_lens, 0.0, np.eye(4)))
+        self.rays = camera_rays(Exposure(self.depth_lens, 0.0, np.eye(4)))
         self.device_rays = self.e.upload(self.rays[..., 0]), self.e.upload(self.rays[..., 1])
         self.resolution = 0.0
 
@@ -101,12 +102,12 @@ class DeviceRig:
         z = _checked(frame.depth, rig.depth_camera, "depth", (), "float metres, 0 = missing", np.floating)
         if self.resolution == 0.0 and index < _SETTLED:
             self.resolution = depth_resolution(z)
-        exposure = self._exposure(frame.depth, self._depth_lens, rig.depth_shutter, np.eye(4))
+        exposure = self._exposure(frame.depth, self.depth_lens, rig.depth_shutter, np.eye(4))
         depth = depth_image(self.e, exposure, np.where(self._seen, z, 0.0), options.max_depth, self.resolution)
         colors = []
         for image in frame.colors if options.photometric else ():
             pixels = _checked(image, rig.color_camera, "colour", (3,), "uint8 RGB", np.uint8)
-            exposure = self._exposure(image, self._color_lens, rig.color_shutter, rig.T_color_depth)
+            exposure = self._exposure(image, self.color_lens, rig.color_shutter, rig.T_color_depth)
             colors.append(color_image(self.e, exposure, pixels, self._finer, self._evening))
         return DeviceFrame(index, frame.depth.stamp, depth, tuple(colors), depth.count / z.size)
 

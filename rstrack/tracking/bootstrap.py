@@ -176,6 +176,7 @@ def _leave(track: Track, window: Window) -> bool:
         cleaned = {frame.index: replace(frame, depth=one.depth) for frame, one in zip(rest, left, strict=True)}
         track.succession.recent = deque(cleaned.get(frame.index, frame) for frame in frames)
     seen_of = {frame.index: [o for o in others if o.frame == frame.index] for frame in frames}
+    covariances.look_at(ref, window.spline)
     pulls_of = {index: pulls(seen, window.state) for index, seen in seen_of.items()}
     if any(slides(own, ref.median_depth) for own in pulls_of.values()):
         return False
@@ -187,8 +188,9 @@ def _leave(track: Track, window: Window) -> bool:
         track.chain.add(ref, seen, window.state, own.excess)
         track.learn_inertia(seen, window, own.excess, frame.last_time)
         covariances.uncertainty = covariances.uncertainty.found_anew(own.information)
+        covariances.common = covariances.after(0.0, covariances.uncertainty, seen, window.state, own)
         if frame is not middle:
-            covariances.add(frame, ref)
+            covariances.add(frame, ref, window.spline)
     covariances.begin(ref, frames, window.spline)
     for frame in frames[:-1]:
         report = track.reports[frame.index]

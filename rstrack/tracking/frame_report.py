@@ -21,8 +21,9 @@ class FrameReport:
     observability: smallest eigenvalue of Σ w j jᵀ per pixel, rotations scaled by the scene's depth; near 0 where the
     images leave a motion open. overlap: pixels that fall on the keyframe, against the first frame after it was made.
     covariance: of the pose against its keyframe, (6, 6) [m; rad] in the depth camera's frame at mid readout; drift:
-    what the errors of the keyframes before add to that against the first frame; None where there are none: of lost
-    frames, and with the baseline. held_by_motion: largest part (0..1) that the motion before, not the images, has in
+    what the errors of the keyframes before add to that against the first frame; common (6, m): what one σ of each
+    parameter of the calibration that may be wrong moves it by; None where there are none: of lost frames, and with the
+    baseline. held_by_motion: largest part (0..1) that the motion before, not the images, has in
     what is known of any direction. moving: part of the depth image that was left out since it moves by itself.
     bridged: its images were of no use, as fault says, and it has its pose from an IMU and from frames after it: until
     these came, it was lost. segment: number, from 1, of the `segments.Segment` that has the frame; 0: the first track.
@@ -42,6 +43,7 @@ class FrameReport:
     overlap: float
     covariance: FloatArray | None = None
     drift: FloatArray | None = None
+    common: FloatArray | None = None
     held_by_motion: float = float("nan")
     moving: float = 0.0
     fault: Fault = Fault.NONE
@@ -51,7 +53,7 @@ class FrameReport:
     def as_lost(self, fault: Fault) -> FrameReport:
         """The same frame, given up later on; one that is lost already stays so for its own reason."""
         lost = replace(self, lost=True, keyframe=False, fault=self.fault or fault)
-        return replace(lost, covariance=None, drift=None, held_by_motion=float("nan"))
+        return replace(lost, covariance=None, drift=None, common=None, held_by_motion=float("nan"))
 
 
 def frame_report(

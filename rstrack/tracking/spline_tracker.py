@@ -276,10 +276,11 @@ class Tracker:
             solved = window.solve(fresh, levels, gauge, coupled, before_finest=leave_out)
         seconds = new.stamp - track.found.stamps[-1]
         accelerations = track.accelerations(window, seconds, T_predicted[:3, :3])
-        uncertainty = track.covariances.uncertainty
+        uncertainty, common = track.covariances.uncertainty, track.covariances.common
         if not young and self._weighs(fresh, ref):
             state = uncertainty.predicted(seconds, *accelerations)
-            if weighed(fresh, window.state, Prediction.of(led_to, mid, state, track.last_two(new))):
+            predicted = Prediction.of(led_to, mid, state, track.last_two(new))
+            if weighed(fresh, window.state, predicted, track.covariances.considered(seconds)):
                 solved = window.solve(fresh, (0,), gauge, coupled)
         with track.terms.timer("judgement"):
             fault, pulled, solved = verdict(
@@ -289,6 +290,7 @@ class Tracker:
             if ref.rolling is None:
                 # A rolling reference moves with what is aligned to it, which tells nothing of the two together.
                 uncertainty = uncertainty.after(seconds, pulled.information, *accelerations)
+                common = track.covariances.after(seconds, uncertainty, on_reference, window.state, pulled)
         if not fault and implausible(T_predicted, window.spline.pose(mid), gap):
             fault = Fault.TOO_FAR
         elif not fault and not uncertainty.is_known:
@@ -306,7 +308,7 @@ class Tracker:
                 self._bridge.put(track, new)
             return report
         self._bridge.close(track)
-        track.window, track.covariances.uncertainty = window, uncertainty
+        track.window, track.covariances.uncertainty, track.covariances.common = window, uncertainty, common
         new = replace(new, depth=left.depth)
         track.remember(new)
         window.keep(fresh)
@@ -350,7 +352,9 @@ class Tracker:
         found.window.keep(found.fresh)
         track.window, track.covariances.uncertainty = found.window, found.uncertainty
         track.chain.cut(found.window.piece)
-        excess = pulls(found.fresh, found.window.state).excess
+        pulled = pulls(found.fresh, found.window.state)
+        excess, covariances = pulled.excess, track.covariances
+        covariances.common = covariances.after(0.0, found.uncertainty, found.fresh, found.window.state, pulled)
         track.chain.add(found.ref, found.fresh, found.window.state, excess)
         new = replace(new, depth=found.depth)
         track.remember(new)

@@ -10,6 +10,7 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rstrack.adjustment.chain import Chain
+from rstrack.alignment.consider import Rays
 from rstrack.alignment.free_space import FreeSpace
 from rstrack.alignment.independence import Independence
 from rstrack.alignment.linearise import Terms
@@ -33,6 +34,7 @@ from rstrack.options import Options
 from rstrack.tracking.found_poses import FoundPoses
 from rstrack.tracking.frame_report import FrameReport, frame_report
 from rstrack.tracking.gains import Gains
+from rstrack.tracking.judgement.common import Calibration
 from rstrack.tracking.judgement.fault import Fault
 from rstrack.tracking.judgement.lost_track import FitHistory
 from rstrack.tracking.judgement.pose_covariances import PoseCovariances
@@ -76,7 +78,10 @@ class Track:
         if self.inertia is not None:
             self.inertia.begin_world()
         self.found, self.chain, self.left_out = FoundPoses(), Chain(), MovingMasks()
-        self.covariances = PoseCovariances(self.rig.depth_camera.fx)
+        rig, device = self.rig, self.device
+        rays = Rays(device.depth_lens, device.color_lens, rig.T_color_depth, rig.is_registered)
+        calibration = Calibration(rays, rig.sigma.vector(rig.is_registered))
+        self.covariances = PoseCovariances(rig.depth_camera.fx, calibration)
         self.succession = Succession(self.maker, self.keyframes, self.options, self.gains, self.covariances)
 
     @property
@@ -196,7 +201,7 @@ class Track:
         oldest = self.succession.recent[0].index if self.succession.recent else new.index
         self.gains.learn(new, fresh, window.state, oldest)
         if ref.rolling is None:
-            self.covariances.add(new, ref, oldest)
+            self.covariances.add(new, ref, window.spline, oldest)
 
     def report(
         self, new: DeviceFrame, fresh: Sequence[Observation] = (), solved: Solved | None = None, *,

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from pathlib import Path
 
 import pytest
 
 from benchmarks.show import FULL, GATE, README, RESULTS, documents
-from rstrack.bench.record import Record, read_records
+from rstrack.bench.record import Record, read_records, versions_behind
+from rstrack.bench.runner import OLDEST
 
 ROOT = Path(__file__).parents[2]
 NOTEBOOK = sorted((ROOT / "docs/notebook").glob("*.md"))
-OLDEST_FULL = 2
-"""Minor versions that the full tier, hours of it, may be behind."""
 
 
 def records(path: Path) -> dict[str, Record]:
@@ -23,16 +21,9 @@ def records(path: Path) -> dict[str, Record]:
     return read_records(path)
 
 
-def minor(version: str) -> tuple[int, int]:
-    major, second, *_ = version.split(".")
-    return int(major), int(second)
-
-
 def behind(path: Path) -> list[tuple[str, int]]:
-    """Cells of records, and how many minor versions older they are than the code; 999: of another major one."""
-    now = minor(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"])
-    then = {name: minor(record.version) for name, record in records(path).items()}
-    return [(name, now[1] - of[1] if of[0] == now[0] else 999) for name, of in then.items()]
+    """Cells of records, and how many minor versions older they are than the code."""
+    return [(name, versions_behind(record.version)) for name, record in records(path).items()]
 
 
 @pytest.mark.parametrize("path", [RESULTS, README], ids=lambda path: path.name)
@@ -51,7 +42,7 @@ def test_the_gate_is_of_this_version() -> None:
 
 
 def test_the_full_tier_is_not_old() -> None:
-    late = [(name, by) for name, by in behind(FULL) if not 0 <= by <= OLDEST_FULL]
+    late = [(name, by) for name, by in behind(FULL) if not 0 <= by <= OLDEST]
     assert not late, "run './run.sh bench full --accept'"
 
 

@@ -57,13 +57,13 @@ def predicted(P: np.ndarray) -> Prediction:
 
 def test_chance_alone_is_called_odd_as_seldom_as_the_level_says() -> None:
     """Against draws: at 1 in 1,000 for one image, whatever its covariance and the prediction's."""
-    rng, odd, trials = np.random.default_rng(3), 0, 4000
+    rng, odd, trials = np.random.default_rng(3), 0, 2000
     P, R = spread(4e-3, 5e-3, rng), spread(3e-4, 4e-4, rng)
     draw_P, draw_R = np.linalg.cholesky(P), np.linalg.cholesky(R)
     for _ in range(trials):
         off = draw_P @ rng.normal(size=12) + draw_R @ rng.normal(size=12)
         odd += weighed([image(True, R, off)], at_rest()[0], predicted(P))
-    assert odd <= chi2.ppf(0.999, 2 * (4 + 1)) / 2, "four are expected"
+    assert odd <= chi2.ppf(0.999, 2 * (2 + 1)) / 2, "two are expected"
 
 
 @pytest.mark.parametrize("times", [3.0, 30.0])
@@ -117,3 +117,32 @@ def test_of_images_exposed_at_once_the_last_two_poses_say_where_the_next_one_is(
     assert np.linalg.norm((Prediction.of(astray, t, np.eye(12)).pose(t) - spline.pose(t))[:3, 3]) > 1e-3
     told = Prediction.of(astray, t, np.eye(12), (0.1, 0.13)).pose(t)
     np.testing.assert_allclose(told, spline.pose(t), atol=1e-9)
+
+
+@pytest.mark.parametrize("what", ["image", "keyframe", "prediction"])
+def test_what_a_wrong_calibration_explains_is_not_odd(what: str) -> None:
+    """An image that is off along what one parameter does, by one σ of it, wherever it does that."""
+    rng = np.random.default_rng(5)
+    P, R = spread(1e-4, 1e-4, rng), spread(1e-4, 1e-4, rng)
+    by = np.zeros((12, 1))
+    by[:6, 0] = 1e-2 * rng.normal(size=6)
+
+    def odd(given: Any) -> bool:
+        return weighed([image(True, R, -by[:, 0])], at_rest()[0], predicted(P), given)
+
+    considered = SimpleNamespace(
+        moved=lambda *_: by * (what == "image"), of_keyframe=lambda *_: by[:6] * (what == "keyframe"),
+        predicted=lambda *_: by * (what == "prediction"),
+    )  # fmt: skip
+    assert odd(None) and not odd(considered)
+
+
+def test_what_all_images_and_the_prediction_have_in_common_explains_nothing() -> None:
+    rng = np.random.default_rng(5)
+    P, R = spread(1e-4, 1e-4, rng), spread(1e-4, 1e-4, rng)
+    by = np.zeros((12, 1))
+    by[:6, 0] = 1e-2 * rng.normal(size=6)
+    considered: Any = SimpleNamespace(
+        moved=lambda *_: by, of_keyframe=lambda *_: 0.0 * by[:6], predicted=lambda *_: by
+    )  # fmt: skip
+    assert weighed([image(True, R, -by[:, 0])], at_rest()[0], predicted(P), considered)

@@ -30,6 +30,7 @@ from rstrack.calibration.unknowns.parameters import (
     Parameters,
     changed,
 )
+from rstrack.data.camera_file import usual
 from rstrack.data.dataset import Dataset
 
 _OPPOSITE: dict[str, Scan] = {
@@ -128,6 +129,7 @@ class Calibration:
             depth_shutter=replace(rig.depth_shutter, readout_s=found.depth_readout_s, scan=scans[0]),
             color_shutter=replace(rig.color_shutter, readout_s=found.color_readout_s, scan=scans[1]),
             T_color_depth=found.T_color_depth,
+            sigma=usual(color, self._stated()),
         )
         found_dataset = replace(self.dataset, rig=rig, depth_error=found.error)
         return found_dataset.with_color_offset(found.color_offset_s, drift=found.color_drift)
@@ -212,8 +214,26 @@ class Calibration:
         return "\n".join([
             *names, *(() if mode == "auto" else (f"stamps: {mode}",)), color + (drift if found.color_drift else ""),
             depth + f"\n  depth_scale: {self.dataset.depth_scale:g}" + self._error_entry(),
-            "T_color_depth:" + ("  # " + ", ".join(shown) if self.asked[EXTRINSICS].any() else ""), *rows, "",
+            "T_color_depth:" + ("  # " + ", ".join(shown) if self.asked[EXTRINSICS].any() else ""), *rows,
+            "sigma: {" + ", ".join(f"{name}: {sigma:.3g}" for name, sigma in self._stated().items()) + "}", "",
         ])  # fmt: skip
+
+    def _stated(self) -> dict[str, float]:
+        """σ of what was found, as a camera file has them: of each kind the largest, lenses' by the colour camera's."""
+        lens = [f"color.{name}" for name in LENS]
+        kinds = {
+            "focal": (lens[:2], 1.0), "aspect": (lens[:2], 1.0), "center_px": (lens[2:4], self._cameras()[1].fx),
+            "k1": (lens[4:5], 1.0), "translation_m": (NAMES[EXTRINSICS][:3], 1.0),
+            "rotation_deg": (NAMES[EXTRINSICS][3:], float(np.degrees(1.0))),
+            "readout_s": (NAMES[:2], 1.0), "offset_s": (NAMES[2:3], 1.0),
+            "depth_inverse_offset": (("depth.error.inverse_offset",), 1.0),
+        }  # fmt: skip
+        found = {}
+        for kind, (names, factor) in kinds.items():
+            at = [NAMES.index(name) for name in names]
+            if self.asked[at].all() and not self.undetermined[at].any():
+                found[kind] = float(f"{factor * self.sigmas[at].max():.3g}")
+        return found
 
     def _error_entry(self) -> str:
         """The depth camera's error in the camera file, if there is any."""

@@ -9,7 +9,7 @@ what it may be (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tra
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
@@ -22,6 +22,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.pull import steady
 from rstrack.alignment.spline_state import SplineState
+from rstrack.tracking.judgement.common import Considered
 from rstrack.tracking.judgement.uncertainty import SYSTEMATIC_PX
 
 # What an innovation of 12 numbers, over its covariance, exceeds by chance once in a thousand times.
@@ -65,30 +66,36 @@ class Prediction:
 
 @dataclass(frozen=True)
 class _Measured:
-    """What one image says of the state: deviation z (12,) from the prediction and covariance R (12, 12)."""
+    """What one image says of the state: deviation z (12,) from the prediction and its covariance R (12, 12).
+
+    D (12, m): by how much one σ of each parameter of the calibration changes it more than the prediction.
+    """
 
     observation: Observation
     z: FloatArray
     R: FloatArray
+    D: FloatArray
 
 
-def weighed(fresh: Sequence[Observation], state: SplineState, predicted: Prediction) -> bool:
+def weighed(
+    fresh: Sequence[Observation], state: SplineState, predicted: Prediction, considered: Considered | None = None
+) -> bool:
     """Let images that are off as a whole count as little as their innovations say; whether there are any.
 
     fresh: a frame's observations, aligned, of a spline in this state. Of two that disagree it is the one that is
     further from the prediction: it is held against the prediction and the others. Then all of them together are held
-    against the prediction.
+    against the prediction. considered: how far the calibration may be wrong; None: times alone, a little.
     """
-    seen = [_measured(o, state, predicted) for o in fresh if o.is_linearised]
+    seen = [_measured(o, state, predicted, considered) for o in fresh if o.is_linearised]
     if not seen:
         return False
-    P, nothing = predicted.covariance, np.zeros(12)
-    odd = max(seen, key=lambda one: float(one.z @ np.linalg.solve(P + one.R, one.z)))
+    P = predicted.covariance
+    odd = max(seen, key=lambda one: float(one.z @ np.linalg.solve(P + one.D @ one.D.T + one.R, one.z)))
     rest = [one for one in seen if one is not odd]
-    mean, spread = _updated(nothing, P, rest)
-    excess = _inflation(odd.z - mean, spread, odd.R)
-    z, R = _updated(odd.z, excess * odd.R, rest)
-    together = _inflation(z, P, R)
+    off, spread = _expected(odd, P, rest)
+    excess = _inflation(off, spread, odd.R)
+    z, R, D = _combined(replace(odd, R=excess * odd.R), rest)
+    together = _inflation(z, P + D @ D.T, R)
     for one in seen:
         factor = together * (excess if one is odd else 1.0)
         if factor > 1.0:
@@ -96,13 +103,30 @@ def weighed(fresh: Sequence[Observation], state: SplineState, predicted: Predict
     return max(excess, together) > 1.0
 
 
-def _updated(mean: FloatArray, P: FloatArray, images: Sequence[_Measured]) -> tuple[FloatArray, FloatArray]:
-    """Mean (12,) and covariance (12, 12) of the state after images."""
-    for one in images:
-        gain = np.linalg.solve(P + one.R, P).T
-        mean, P = mean + gain @ (one.z - mean), P - gain @ P
+def _expected(odd: _Measured, P: FloatArray, rest: Sequence[_Measured]) -> tuple[FloatArray, FloatArray]:
+    """How far an image is off (12,) where the others are known, and the covariance (12, 12) of that but for its own R.
+
+    State and parameters together: of these the images say the same.
+    """
+    mean = np.zeros(12 + odd.D.shape[1])
+    P = scipy.linalg.block_diag(P, np.eye(odd.D.shape[1]))
+    for one in rest:
+        A = np.hstack([np.eye(12), one.D])
+        gain = np.linalg.solve(A @ P @ A.T + one.R, A @ P).T
+        mean, P = mean + gain @ (one.z - A @ mean), P - gain @ A @ P
         P = 0.5 * (P + P.T)
-    return mean, P
+    A = np.hstack([np.eye(12), odd.D])
+    return odd.z - A @ mean, A @ P @ A.T
+
+
+def _combined(first: _Measured, rest: Sequence[_Measured]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """z, R and D of images as the solver weighs them: by R alone."""
+    both, R = np.column_stack([first.z, first.D]), first.R
+    for one in rest:
+        gain = np.linalg.solve(R + one.R, R).T
+        both, R = both + gain @ (np.column_stack([one.z, one.D]) - both), R - gain @ R
+        R = 0.5 * (R + R.T)
+    return both[:, 0], R, both[:, 1:]
 
 
 def _inflation(off: FloatArray, P: FloatArray, R: FloatArray) -> float:
@@ -116,7 +140,9 @@ def _inflation(off: FloatArray, P: FloatArray, R: FloatArray) -> float:
     return 1.0 if beyond(1.0) <= 0.0 else float(brentq(beyond, 1.0, 1.0 + y2.sum() / _LIMIT, rtol=1e-6))
 
 
-def _measured(o: Observation, state: SplineState, predicted: Prediction) -> _Measured:
+def _measured(
+    o: Observation, state: SplineState, predicted: Prediction, considered: Considered | None
+) -> _Measured:  # fmt: skip
     exposure = o.image.exposure
     mid, half = exposure.mid_time, 0.5 * (exposure.last_time - exposure.first_time)
     H, g = steady(o, state)
@@ -129,13 +155,19 @@ def _measured(o: Observation, state: SplineState, predicted: Prediction) -> _Mea
     spread, basis = np.linalg.eigh(H * np.outer(_OPEN, _OPEN))
     R = (basis / (1.0 + np.maximum(spread, 0.0))) @ basis.T * np.outer(_OPEN, _OPEN)
     moved = -R @ g / by
+    D = np.zeros((12, 0))
+    if considered is not None:
+        D = R @ H @ considered.moved(o, state) / by[:, None]
+        D[:6] += considered.of_keyframe(o, pose)
+        D -= considered.predicted(pose)
     turn = SYSTEMATIC_PX / o.ref.lens.camera.fx
     R += np.diag(np.tile(np.repeat([turn * o.ref.median_depth, turn], 3), 2) ** 2)
     R = R / np.outer(by, by)
     off = se3.log(se3.inverse(predicted.pose(mid)) @ pose)
     deviation = np.concatenate([off, velocity - predicted.velocity])
     # What the cameras' times may be wrong by moves all of an image alike, as far as the camera moves meanwhile.
-    if not o.is_depth:
-        R[:6, :6] += _CLOCK_S**2 * np.outer(velocity, velocity)
-    R[6:, 6:] += _READOUT**2 * np.outer(velocity, velocity)
-    return _Measured(o, deviation + moved, 0.5 * (R + R.T))
+    if considered is None:
+        if not o.is_depth:
+            R[:6, :6] += _CLOCK_S**2 * np.outer(velocity, velocity)
+        R[6:, 6:] += _READOUT**2 * np.outer(velocity, velocity)
+    return _Measured(o, deviation + moved, 0.5 * (R + R.T), D)

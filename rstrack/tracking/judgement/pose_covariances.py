@@ -3,45 +3,91 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from rsgen.array_types import FloatArray
+from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.observation import Observation
+from rstrack.alignment.pull import Pulls
+from rstrack.alignment.spline_state import SplineState
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.frame_report import FrameReport
+from rstrack.tracking.judgement.common import Calibration, Common, Considered
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 
 
+@dataclass(frozen=True, eq=False)
+class _Recent:
+    """Of a frame: the keyframe, the covariance (6, 6) against it, `Common.pose` and the camera's velocity (6,)."""
+
+    ref: int
+    covariance: FloatArray
+    common: FloatArray
+    velocity: FloatArray
+
+
+@dataclass
 class PoseCovariances:
-    """uncertainty: of the newest frame. Of frames that may become keyframes their covariance is remembered."""
+    """uncertainty, common: of the newest frame. Of frames that may become keyframes theirs are remembered.
 
-    def __init__(self, focal_px: float) -> None:
-        """focal_px: the depth camera's."""
-        self.uncertainty = Uncertainty()
-        self._focal = focal_px
-        # Of recent frames: the keyframe and the covariance against it.
-        self._recent: dict[int, tuple[int, FloatArray]] = {}
+    focal_px: the depth camera's.
+    """
 
-    def add(self, frame: DeviceFrame, ref: Reference, oldest: int = 0) -> None:
+    focal_px: float
+    calibration: Calibration
+    uncertainty: Uncertainty = field(default_factory=Uncertainty)
+    common: Common = field(default_factory=Common)
+    _recent: dict[int, _Recent] = field(default_factory=dict)
+
+    def considered(self, seconds: float) -> Considered | None:
+        """What the calibration does to the next frame, so many seconds later; None where it is exact."""
+        return None if self.calibration.is_exact else Considered(self.calibration, self.common, seconds)
+
+    def after(
+        self, seconds: float, uncertainty: Uncertainty, fresh: Sequence[Observation], state: SplineState, pulled: Pulls
+    ) -> Common:  # fmt: skip
+        """`common` so many seconds later (0: found anew), of a frame then so uncertain; pulled: by its images."""
+        if self.calibration.is_exact or not fresh:
+            return self.common
+        at = state.spline.pose(fresh[0].image.exposure.mid_time)
+        own = self.calibration.pulled(fresh, state, self.common, at, pulled.excess)
+        before = self.common if seconds else self.common.at_rest()
+        return before.after(seconds, at, uncertainty.state, pulled.information, own)
+
+    def add(self, frame: DeviceFrame, ref: Reference, spline: Spline, oldest: int = 0) -> None:
         """A frame that has been found against a keyframe; what is before frame `oldest` is forgotten."""
-        kept = {k: c for k, c in self._recent.items() if k >= oldest}
-        self._recent = kept | {frame.index: (ref.index, self._of(ref))}
+        kept = {k: one for k, one in self._recent.items() if k >= oldest}
+        _, velocity = spline.pose_and_velocity(frame.depth.exposure.mid_time)
+        covariance = self.uncertainty.covariance(self.focal_px, ref.median_depth)
+        self._recent = kept | {frame.index: _Recent(ref.index, covariance, self.common.pose, velocity)}
+
+    def look_at(self, ref: Reference, spline: Spline) -> None:
+        """The first keyframe, before anything is found at it."""
+        self._keep(ref.index, np.zeros_like(self.common.pose), spline.pose_and_velocity(ref.t)[1])
 
     def begin(self, ref: Reference, frames: Sequence[DeviceFrame], spline: Spline) -> None:
         """The first keyframe, made of one of the first frames; the world is the first of them."""
-        _, covariance = self._recent.get(frames[0].index, (ref.index, np.zeros((6, 6))))
+        first = self._recent.get(frames[0].index)
         T_world_first = spline.pose(frames[0].depth.exposure.mid_time)
+        covariance = np.zeros((6, 6)) if first is None else first.covariance
         self.uncertainty = self.uncertainty.with_keyframe(ref.index, -1, T_world_first, covariance)
+        if first is None:
+            return
+        # Found at a keyframe that was taken for exact, it is the first frame that is.
+        self._keep(ref.index, -first.common, self.common.velocities[ref.index])
+        self.common = replace(self.common, pose=self.common.pose - first.common)
+        self._recent = {k: replace(one, common=one.common - first.common) for k, one in self._recent.items()}
 
     def keyframe(self, ref: Reference) -> None:
         """A keyframe made of a recent frame."""
         if ref.index in self._recent:
-            before, covariance = self._recent[ref.index]
-            self.uncertainty = self.uncertainty.with_keyframe(ref.index, before, ref.T_world_base, covariance)
+            own = self._recent[ref.index]
+            self.uncertainty = self.uncertainty.with_keyframe(ref.index, own.ref, ref.T_world_base, own.covariance)
+            self._keep(ref.index, own.common, own.velocity)
 
     def report(
         self, report: FrameReport, frame: DeviceFrame, fresh: Sequence[Observation], spline: Spline
@@ -56,9 +102,21 @@ class PoseCovariances:
 
     def of(self, report: FrameReport, frame: DeviceFrame, spline: Spline, at: int = -1) -> FrameReport:
         """The same where it has none, too: that it is then as good as keyframe `at`."""
-        at, covariance = self._recent.get(frame.index, (at, np.zeros((6, 6))))
-        drift = self.uncertainty.drift_of(at, spline.pose(frame.depth.exposure.mid_time))
-        return replace(report, covariance=covariance, drift=drift)
+        T_world_depth = spline.pose(frame.depth.exposure.mid_time)
+        own = self._recent.get(frame.index)
+        if own is None:
+            common = self.common.of_keyframe(at, T_world_depth)
+            covariance = np.zeros((6, 6))
+        else:
+            at, covariance = own.ref, own.covariance
+            common = se3.adjoint(se3.inverse(T_world_depth)) @ own.common
+        drift = self.uncertainty.drift_of(at, T_world_depth)
+        is_told = self.calibration.sigmas > 0.0
+        shared = common[:, is_told] if is_told.any() else None
+        return replace(report, covariance=covariance, drift=drift, common=shared)
 
-    def _of(self, ref: Reference) -> FloatArray:
-        return self.uncertainty.covariance(self._focal, ref.median_depth)
+    def _keep(self, index: int, common: FloatArray, velocity: FloatArray) -> None:
+        known = self.common
+        self.common = replace(
+            known, keyframes=known.keyframes | {index: common}, velocities=known.velocities | {index: velocity}
+        )

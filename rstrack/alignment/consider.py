@@ -1,0 +1,141 @@
+"""What a wrong camera file does to a pose: consider parameters (Schmidt 1966; Woodbury and Junkins, AIAA 2010).
+
+An error of the calibration moves the point of a pixel by some `a` in the image and by some `b` in the keyframe, which
+has it too. A residual changes by g·(a − b), g its derivative by a shift of the point, and an aligned pose by −H⁻¹ Jᵀ c
+of these. c is made of some points of the keyframe, as the frame sees them: that is smooth, and they are enough.
+
+Increments are [m; rad] in the depth camera's frame at mid readout; parameters in the order of `calibration_sigma.NAMES`
+and in their units.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rsgen.array_types import FloatArray
+from rsgen.device.lens import Lens
+from rstrack.alignment.landmarks import NEAR, Landmarks
+from rstrack.alignment.observation import Observation
+from rstrack.data.calibration_sigma import NAMES
+from rstrack.images.sampling import NEAREST
+
+COUNT = len(NAMES)
+_DEPTH_LENS, _COLOR_LENS, _EXTRINSICS = slice(0, 5), slice(5, 10), slice(10, 16)
+_DEPTH_READOUT, _COLOR_READOUT, _CLOCK, _SCALE, _INVERSE = range(16, COUNT)
+# Part of what the points see in all directions below which a direction is not seen.
+_LEAST = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Coupling:
+    """Of one image: J (n, 12), the residuals' derivatives by a twist of all lines, and by one that grows from the first
+    line, −1, to the last, 1; c (n, 21), those by the parameters."""
+
+    J: FloatArray
+    c: FloatArray
+
+    def twists(self, count: int, lever: float) -> FloatArray:
+        """What the first `count`, 6 or 12, of the twists have to be for each parameter (count, 21) to undo it.
+
+        lever: m, that makes turns comparable to shifts.
+        """
+        size = np.tile(np.repeat([1.0, 1.0 / lever], 3), 2)[:count]
+        J = self.J[:, :count] * size
+        H = J.T @ J
+        return -size[:, None] * np.linalg.solve(H + (_LEAST * np.trace(H) + 1e-12) * np.eye(count), J.T @ self.c)
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """How the cameras see: depth's and colour's lens and T_color_depth (4, 4); is_one: depth is registered."""
+
+    depth: Lens
+    color: Lens
+    T_color_depth: FloatArray
+    is_one: bool
+
+
+def coupling(
+    o: Observation, landmarks: Landmarks, rays: Rays, T_cam_ref: FloatArray, velocity: FloatArray
+) -> Coupling:  # fmt: skip
+    """Of an image against a keyframe. T_cam_ref (4, 4), velocity (6,): of the depth camera at mid readout."""
+    R = T_cam_ref[:3, :3]
+    p = landmarks.p @ R.T + T_cam_ref[:3, 3]
+    T_color_depth = np.eye(4) if o.is_depth else rays.T_color_depth
+    lens = o.image.exposure.lens
+    q = p @ T_color_depth[:3, :3].T + T_color_depth[:3, 3]
+    uv, seen = lens.camera.project(q)
+    seen &= lens.camera.contains(uv) & (q[:, 2] > NEAR)
+    ref_lens = rays.depth if o.is_depth else rays.color
+    q_ref = landmarks.p @ T_color_depth[:3, :3].T + T_color_depth[:3, 3]
+    uv_ref, seen_ref = ref_lens.camera.project(q_ref)
+    seen &= seen_ref
+    p, q, uv, P, q_ref, uv_ref = (some[seen] for some in (p, q, uv, landmarks.p, q_ref, uv_ref))
+    normal, line = landmarks.normal[seen] @ R.T, _line(lens, uv)
+    if o.is_depth:
+        even = np.minimum((landmarks.median_depth / p[:, 2]) ** 2, NEAREST)
+        g = g_ref = normal * even[:, None]
+    else:
+        gradient, center = landmarks.gradient[seen] @ R.T, -T_color_depth[:3, :3].T @ T_color_depth[:3, 3]
+        g = _across(gradient, normal, p - center)
+        g_ref = _across(gradient, normal, (P - center) @ R.T)
+    here = _moves(rays, o.is_depth, p, q, velocity, line, lens)
+    there = _moves(rays, o.is_depth, P, q_ref, landmarks.velocity, _line(ref_lens, uv_ref), lens) @ R.T
+    c = np.einsum("kni,ni->nk", here, g) - np.einsum("kni,ni->nk", there, g_ref)
+    if not o.is_depth:
+        # Where the keyframe's depth has a point, colour has it in both images: only its parallax tells.
+        placed = _moves(rays, True, P, P, landmarks.velocity, _line(rays.depth, uv_ref), rays.depth) @ R.T
+        c -= np.einsum("kni,ni->nk", placed, g - g_ref)
+    if rays.is_one:
+        c[:, _COLOR_LENS] += c[:, _DEPTH_LENS]
+    j = np.column_stack([g, np.cross(p, g)])
+    return Coupling(np.column_stack([j, 2.0 * line[:, None] * j]), c)
+
+
+def _moves(
+    rays: Rays, is_depth: bool, p: FloatArray, q: FloatArray, velocity: FloatArray, line: FloatArray, lens: Lens
+) -> FloatArray:  # fmt: skip
+    """By how much errors of the parameters move points (21, n, 3) in the depth camera's axes, if a camera sees them.
+
+    p, q (n, 3): the points in the depth camera's frame and in that camera's; velocity (6,): of the depth camera; line
+    (n,): when they are seen, see `_line`.
+    """
+    out = np.zeros((COUNT, *p.shape))
+    x, y, z = (q / q[:, 2:]).T[0], (q / q[:, 2:]).T[1], q[:, 2]
+    r2, nothing = x * x + y * y, np.zeros_like(x)
+    by_lens = -z * np.array([[x, y], [nothing, y], [nothing + 1, nothing], [nothing, nothing + 1], [x * r2, y * r2]])
+    turned = by_lens.transpose(0, 2, 1) @ (np.eye(3) if is_depth else rays.T_color_depth[:3, :3])[:2]
+    rolled = velocity[:3] + np.cross(velocity[3:], p)
+    if is_depth:
+        out[_DEPTH_LENS] = turned
+        out[_SCALE], out[_INVERSE] = p, -p[:, 2:] * p
+        out[_DEPTH_READOUT] = rolled * line[:, None] if lens.lines > 1 else 0.0
+        return out
+    R = rays.T_color_depth[:3, :3]
+    out[_COLOR_LENS] = turned
+    for axis in range(3):
+        unit = np.eye(3)[axis]
+        out[_EXTRINSICS.start + axis] = -unit @ R
+        out[_EXTRINSICS.start + 3 + axis] = -np.cross(unit, q) @ R
+    out[_COLOR_READOUT] = rolled * line[:, None] if lens.lines > 1 else 0.0
+    out[_CLOCK] = rolled
+    return out
+
+
+def _across(gradient: FloatArray, normal: FloatArray, ray: FloatArray) -> FloatArray:
+    """Derivatives (n, 3) of what a camera sees along rays (n, 3) by a shift of the points: as `gradient` (n, 3) along
+    the surface, none along the ray."""
+    slant = (normal * ray).sum(axis=1, keepdims=True)
+    slant = np.where(np.abs(slant) > 0.1 * np.linalg.norm(ray, axis=1, keepdims=True), slant, np.inf)
+    return gradient - normal * (gradient * ray).sum(axis=1, keepdims=True) / slant
+
+
+def _line(lens: Lens, uv: FloatArray) -> FloatArray:
+    """When pixels (n, 2) are read, from −½, the first line, to ½: (n,)."""
+    if lens.lines == 1:
+        return np.zeros(len(uv))
+    along = uv[:, 1] if lens.shutter.by_rows else uv[:, 0]
+    part = along / (lens.lines - 1.0) - 0.5
+    return np.asarray(part if lens.shutter.direction > 0.0 else -part)

@@ -1,0 +1,162 @@
+"""What a wrong camera file does to a track is what the model of it says: by tracking with wrong cameras."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import synthetic
+
+from rsgen.errors import UserError
+from rsgen.geometry import se3
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter
+from rstrack.data.calibration_sigma import EXACT, NAMES, STATED, UNDISTORTED_K1, CalibrationSigma
+from rstrack.data.camera_file import camera_content, read_rig
+from rstrack.data.rig import Frame, Image, Rig
+from rstrack.options import Options
+from rstrack.tracking.spline_tracker import Tracker
+
+CAMERA = Camera(160, 120, 120.0, 120.0, 79.5, 59.5)
+SHUTTER = Shutter(readout_s=0.028)
+TRUTH = synthetic.make_spline(0.3)
+FRAMES = 12
+# Every parameter by itself: one σ is one unit.
+UNIT = CalibrationSigma(1.0, 1.0, 1.0, 1.0, float(np.degrees(1.0)), 1.0, 1.0, 1.0, 1.0, 1.0)
+RIG = Rig(CAMERA, SHUTTER, CAMERA, SHUTTER, synthetic.T_COLOR_DEPTH)
+
+
+@cache
+def frames() -> tuple[Frame, ...]:
+    def at(stamp: float) -> Frame:
+        depth = synthetic.render_depth(TRUTH, CAMERA, SHUTTER, stamp)
+        color = synthetic.render_color(TRUTH, CAMERA, SHUTTER, stamp, synthetic.T_COLOR_DEPTH)
+        return Frame(Image(stamp, depth), (Image(stamp, color),))
+
+    return tuple(at(k / 30.0) for k in range(FRAMES))
+
+
+def tracked(rig: Rig, method: str = "rs-pg", scale: float = 1.0, late_s: float = 0.0) -> Tracker:
+    tracker = Tracker(rig, Options(method=method))  # type: ignore[arg-type]
+    for frame in frames():
+        depth = replace(frame.depth, pixels=np.float32(scale) * frame.depth.pixels)
+        tracker.feed(Frame(depth, tuple(replace(image, stamp=image.stamp + late_s) for image in frame.colors)))
+    assert not any(report.lost for report in tracker.reports)
+    return tracker
+
+
+@cache
+def told(method: str) -> tuple[np.ndarray, np.ndarray]:
+    """Poses of frames, and what one unit of each parameter does to them (n, 6, 21)."""
+    tracker = tracked(replace(RIG, sigma=UNIT), method)
+    return tracker.trajectory[1][-6:], np.stack([report.common for report in tracker.reports[-6:]])  # type: ignore[misc]
+
+
+def wrong(name: str, by: float) -> tuple[Rig, float, float]:
+    """The rig with one parameter told wrongly, depth's scale, and by how much colours' stamps are late."""
+    kind, _, own = name.partition(".")
+    if name == "depth.scale":
+        return RIG, 1.0 + by, 0.0
+    if name == "color.offset_s":
+        return RIG, 1.0, by
+    if kind == "T_color_depth":
+        step = np.zeros(6)
+        step[["x", "y", "z", "rx", "ry", "rz"].index(own)] = by
+        return replace(RIG, T_color_depth=se3.exp(step) @ RIG.T_color_depth), 1.0, 0.0
+    camera = {
+        "focal": replace(CAMERA, fx=CAMERA.fx * (1.0 + by), fy=CAMERA.fy * (1.0 + by)),
+        "aspect": replace(CAMERA, fy=CAMERA.fy * (1.0 + by)),
+        "cx": replace(CAMERA, cx=CAMERA.cx + by * CAMERA.fx),
+        "cy": replace(CAMERA, cy=CAMERA.cy + by * CAMERA.fx),
+        "k1": replace(CAMERA, model="radtan", distortion=(by, 0.0, 0.0, 0.0)),
+    }[own]  # fmt: skip
+    return (replace(RIG, depth_camera=camera) if kind == "depth" else replace(RIG, color_camera=camera)), 1.0, 0.0
+
+
+@pytest.mark.parametrize(
+    ("name", "by", "method", "part"),
+    [
+        ("depth.focal", 0.01, "rs-g", 0.5), ("depth.aspect", 0.01, "rs-g", 0.5), ("depth.cx", 0.01, "rs-g", 0.5),
+        ("depth.cy", 0.01, "rs-g", 0.5), ("depth.k1", 0.05, "rs-g", 0.5), ("depth.scale", 0.01, "rs-g", 0.1),
+        ("depth.focal", 0.01, "rs-pg", 0.5), ("depth.scale", 0.01, "rs-pg", 0.1), ("depth.scale", 0.01, "rs-p", 0.1),
+        ("color.focal", 0.01, "rs-p", 0.6), ("color.k1", 0.03, "rs-p", 0.6),
+    ],
+)  # fmt: skip
+def test_a_wrong_camera_moves_poses_as_the_model_says(name: str, by: float, method: str, part: float) -> None:
+    """To that part: the model is of first order, and made of some hundred points."""
+    T, common = told(method)
+    rig, scale, late_s = wrong(name, by)
+    moved = se3.log(se3.inverse(T) @ tracked(rig, method, scale, late_s).trajectory[1][-6:])
+    expected = by * common[:, :, NAMES.index(name)]
+    weight = np.repeat([1.0, 2.0], 3)  # m, rad: things are some two metres away
+    assert np.linalg.norm((moved - expected) * weight) < part * np.linalg.norm(moved * weight)
+
+
+def test_colours_that_are_late_are_so_by_how_far_the_camera_moves_meanwhile() -> None:
+    """Of one image: a camera that moves as the keyframe's did sees nothing odd, another is off by the difference."""
+    tracker = tracked(replace(RIG, sigma=UNIT))
+    track = tracker._track
+    calibration, common = track.covariances.calibration, track.covariances.common
+    window, ref = track.known()
+    (color,) = [o for o in window.active if not o.is_depth and o.ref.index == ref.index][-1:]
+    _, velocity = window.spline.pose_and_velocity(color.image.exposure.mid_time)
+    relative = se3.inverse(window.spline.pose(color.image.exposure.mid_time)) @ ref.T_world_base
+    of_keyframe = se3.adjoint(relative) @ common.velocities[ref.index]
+    moved = calibration.moved(color, window.state, common)[:, NAMES.index("color.offset_s")]
+    assert moved == pytest.approx(of_keyframe - velocity, abs=0.15 * np.linalg.norm(velocity))
+
+
+def test_an_exact_camera_file_costs_nothing_and_says_nothing() -> None:
+    tracker = tracked(RIG)
+    assert all(report.common is None for report in tracker.reports)
+    assert tracker._track.covariances.considered(0.03) is None
+
+
+def test_only_what_may_be_wrong_has_a_column() -> None:
+    tracker = tracked(replace(RIG, sigma=CalibrationSigma(focal=0.01, offset_s=0.002)))
+    common = tracker.reports[-1].common
+    assert common is not None and common.shape == (6, 3)  # both cameras' focal lengths, and the clock
+    _, unit = told("rs-pg")
+    at = [NAMES.index(name) for name in ("depth.focal", "color.focal", "color.offset_s")]
+    assert common == pytest.approx(unit[-1][:, at] * (0.01, 0.01, 0.002), rel=0.2, abs=2e-4)
+
+
+def test_registered_depth_has_one_lens_and_no_extrinsics() -> None:
+    sigmas = STATED.vector(is_registered=True)
+    assert not sigmas[:5].any() and not sigmas[10:16].any() and sigmas[5:10].all()
+    assert STATED.vector()[:16].all() and not EXACT.vector().any()
+
+
+FILE = "color: {width: 640, height: 480, intrinsics: [500.0, 500.0, 319.5, 239.5], readout_s: 0.03%s}\n%s"
+
+
+def read(tmp_path: Path, lens: str, sigma: str) -> Rig:
+    (tmp_path / "camera.yaml").write_text(FILE % (lens, sigma))
+    return read_rig(tmp_path / "camera.yaml", (640, 480), (640, 480)).rig
+
+
+def test_a_camera_file_states_what_it_knows_and_the_rest_is_as_usual(tmp_path: Path) -> None:
+    bent = ", model: radtan, distortion: [0.1, 0.0, 0.0, 0.0]"
+    assert read(tmp_path, bent, "").sigma == STATED
+    assert read(tmp_path, "", "").sigma == replace(STATED, k1=UNDISTORTED_K1)
+    stated = read(tmp_path, bent, "sigma: {focal: 0.002, center_px: 1.5}").sigma
+    assert stated == replace(STATED, focal=0.002, center=0.003)
+
+
+def test_a_run_keeps_the_sigmas_that_it_went_by(tmp_path: Path) -> None:
+    (tmp_path / "camera.yaml").write_text(FILE % ("", "sigma: {k1: 0.03, readout_s: 0.001}"))
+    file = read_rig(tmp_path / "camera.yaml", (640, 480), (640, 480))
+    run = {"dataset": {"camera": camera_content(file)}}
+    (tmp_path / "run.json").write_text(json.dumps(run))
+    again = read_rig(tmp_path / "run.json", (640, 480), (640, 480)).rig.sigma
+    assert asdict(again) == pytest.approx(asdict(file.rig.sigma))
+
+
+@pytest.mark.parametrize("sigma", ["sigma: {focal: -0.1}", "sigma: {focus: 0.1}", "sigma: {k1: .nan}"])
+def test_what_no_sigma_is_ends_in_one_line(tmp_path: Path, sigma: str) -> None:
+    with pytest.raises(UserError, match=r"camera\.yaml: sigma"):
+        read(tmp_path, "", sigma)
