@@ -16,12 +16,18 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.device.lens import Lens
+from rsgen.geometry import se3
 from rstrack.alignment.landmarks import NEAR, Landmarks
 from rstrack.alignment.observation import Observation
+from rstrack.alignment.spline_state import SplineState
 from rstrack.data.calibration_sigma import NAMES
+from rstrack.data.rig import Rig
 from rstrack.images.sampling import NEAREST
+from rstrack.keyframes.keyframe import Reference
 
 COUNT = len(NAMES)
+# Keyframes whose landmarks are remembered.
+_REMEMBERED = 4
 _DEPTH_LENS, _COLOR_LENS, _EXTRINSICS = slice(0, 5), slice(5, 10), slice(10, 16)
 _DEPTH_READOUT, _COLOR_READOUT, _CLOCK, _SCALE, _INVERSE = range(16, COUNT)
 # Part of what the points see in all directions below which a direction is not seen.
@@ -92,6 +98,50 @@ def coupling(
         c[:, _COLOR_LENS] += c[:, _DEPTH_LENS]
     j = np.column_stack([g, np.cross(p, g)])
     return Coupling(np.column_stack([j, 2.0 * line[:, None] * j]), c)
+
+
+class Calibration:
+    """A rig whose camera file may be wrong. rays: as a method sees it; sigmas (21,): of the parameters."""
+
+    def __init__(self, rays: Rays, sigmas: FloatArray) -> None:
+        self._rays, self.sigmas = rays, sigmas
+        self._landmarks: dict[int, Landmarks] = {}
+        # Of the newest frame's images: what they are like changes little while it is aligned.
+        self._couplings: dict[tuple[int, int, float, bool], Coupling] = {}
+
+    @classmethod
+    def of(cls, rig: Rig, depth: Lens, color: Lens) -> Calibration:
+        """Of a rig whose cameras a method sees through these lenses."""
+        is_one = rig.is_registered
+        return cls(Rays(depth, color, rig.T_color_depth, is_one), rig.sigma.vector(is_one))
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether nothing may be wrong: then nothing is worked out."""
+        return not self.sigmas.any()
+
+    def moved(self, o: Observation, state: SplineState, velocity: FloatArray, count: int = 6) -> FloatArray:
+        """How one σ of each parameter would have an image move its lines (count, 21), against a rectified keyframe.
+
+        velocity (6,): at which that was taken. count: 6 for all lines alike, 12 as of `pull.steady`.
+        """
+        key = o.frame, o.ref.index, o.image.exposure.first_time, o.is_depth
+        if key not in self._couplings:
+            if any(frame != o.frame for frame, *_ in self._couplings):
+                self._couplings.clear()
+            T_world_cam, own = state.spline.pose_and_velocity(o.image.exposure.mid_time)
+            T_cam_ref = se3.inverse(T_world_cam) @ o.ref.T_world_base
+            self._couplings[key] = coupling(o, self._seen(o.ref, velocity), self._rays, T_cam_ref, own)
+        return self._couplings[key].twists(count, o.ref.median_depth) * self.sigmas
+
+    def _seen(self, ref: Reference, velocity: FloatArray) -> Landmarks:
+        found = self._landmarks.get(ref.index)
+        if found is None:
+            found = Landmarks.of(ref, velocity)
+            for oldest in list(self._landmarks)[: len(self._landmarks) - _REMEMBERED + 1]:
+                del self._landmarks[oldest]
+            self._landmarks[ref.index] = found
+        return found
 
 
 def _moves(

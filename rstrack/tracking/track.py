@@ -10,7 +10,7 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rstrack.adjustment.chain import Chain
-from rstrack.alignment.consider import Rays
+from rstrack.alignment.consider import Calibration
 from rstrack.alignment.free_space import FreeSpace
 from rstrack.alignment.independence import Independence
 from rstrack.alignment.linearise import Terms
@@ -34,7 +34,6 @@ from rstrack.options import Options
 from rstrack.tracking.found_poses import FoundPoses
 from rstrack.tracking.frame_report import FrameReport, frame_report
 from rstrack.tracking.gains import Gains
-from rstrack.tracking.judgement.common import Calibration
 from rstrack.tracking.judgement.fault import Fault
 from rstrack.tracking.judgement.lost_track import FitHistory
 from rstrack.tracking.judgement.pose_covariances import PoseCovariances
@@ -79,8 +78,7 @@ class Track:
             self.inertia.begin_world()
         self.found, self.chain, self.left_out = FoundPoses(), Chain(), MovingMasks()
         rig, device = self.rig, self.device
-        rays = Rays(device.depth_lens, device.color_lens, rig.T_color_depth, rig.is_registered)
-        calibration = Calibration(rays, rig.sigma.vector(rig.is_registered))
+        calibration = Calibration.of(rig, device.depth_lens, device.color_lens)
         self.covariances = PoseCovariances(rig.depth_camera.fx, calibration)
         self.succession = Succession(self.maker, self.keyframes, self.options, self.gains, self.covariances)
 

@@ -10,13 +10,14 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
+from rstrack.alignment.consider import Calibration
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.pull import Pulls
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.frame_report import FrameReport
-from rstrack.tracking.judgement.common import Calibration, Common, Considered
+from rstrack.tracking.judgement.common import Common, Considered
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 
 
@@ -54,7 +55,7 @@ class PoseCovariances:
         if self.calibration.is_exact or not fresh:
             return self.common
         at = state.spline.pose(fresh[0].image.exposure.mid_time)
-        own = self.calibration.pulled(fresh, state, self.common, at, pulled.excess)
+        own = self.common.pulled(self.calibration, fresh, state, at, pulled.excess)
         before = self.common if seconds else self.common.at_rest()
         return before.after(seconds, at, uncertainty.state, pulled.information, own)
 
