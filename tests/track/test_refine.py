@@ -16,11 +16,12 @@ from loop_room import FRAMES, OPTIONS, make_dataset, to_and_fro
 from rsgen.config.imu import ImuConfig
 from rsgen.errors import UserError
 from rsgen.geometry import se3
+from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import simulate_imu, write_imu_csv
 from rstrack.adjustment.refine import doubted
 from rstrack.alignment.normal_equations import Quadratic
 from rstrack.cli.main import main
-from rstrack.data.estimate import read_estimate
+from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.data.imu.description import PHONE
 from rstrack.data.imu.files import ReadImu
 from rstrack.data.imu.recording import ImuRecording
@@ -29,7 +30,7 @@ from rstrack.options import Options
 from rstrack.report.build import write_report
 from rstrack.tracking.runs import refining
 from rstrack.tracking.runs.record import Noise
-from rstrack.tracking.runs.refining import Refined, refine_run
+from rstrack.tracking.runs.refining import Refined, contradiction, refine_run
 from rstrack.tracking.runs.run import track
 
 BIAS = (0.01, -0.008, 0.006)
@@ -218,3 +219,31 @@ def test_a_frame_whose_colours_come_too_late_for_the_spline_is_refined_by_its_de
     end = tracked.estimate.info["spline_valid"][-1][1]
     assert refining._is_covered(tracked.estimate, end - 0.02, 0.019)
     assert not refining._is_covered(tracked.estimate, end - 0.02, 0.03)
+
+
+def run_of(metres: float, off_m: float, common_m: float = 0.0) -> tuple[Estimate, Spline]:
+    """A run at rest whose frames are known to `metres`, and what they have in common to `common_m`; and the same spline
+    but for every other second, which is `off_m` away."""
+    rng = np.random.default_rng(3)
+    spline = Spline(np.repeat(np.eye(4)[None], 130, axis=0), 0.0, 0.05)
+    stamps = np.arange(0.0, 6.0, 1.0 / 30.0)
+    upper = (np.diag(np.repeat([metres**2, 1e-6], 3)))[np.triu_indices(6)].tolist()
+    common = np.outer([1, 0, 0, 0, 0, 0], np.sin(np.pi * stamps)).T[:, :, None] * common_m
+    frames = [
+        {"stamp": t, "covariance": upper, "drift": [0.0] * 21, "common": c.tolist()}
+        for t, c in zip(stamps, common, strict=True)
+    ]  # fmt: skip
+    moved = spline.control_points.copy()
+    moved[:, 0, 3] = off_m * np.sin(np.pi * (np.arange(130) - 1) * 0.05) + 1e-5 * rng.normal(size=130)
+    return Estimate(stamps, spline.pose(stamps), spline, {"frames": frames}), Spline(moved, 0.0, 0.05)
+
+
+@pytest.mark.parametrize(
+    ("metres", "off_m", "common_m", "is_ruled_out"),
+    [(1e-3, 1e-3, 0.0, False), (1e-3, 2e-2, 0.0, True), (1e-3, 2e-2, 2e-2, False)],
+)
+def test_what_a_run_rules_out_is_given_back_unless_the_calibration_explains_it(
+    metres: float, off_m: float, common_m: float, is_ruled_out: bool
+) -> None:
+    why = contradiction(*run_of(metres, off_m, common_m))
+    assert bool(why) is is_ruled_out and ("calibrate" in why) is is_ruled_out

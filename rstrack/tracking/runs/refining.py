@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+from scipy.special import chdtri
 
 from rsgen.console.progress import Progress, no_progress
 from rsgen.device.arrays import engine
@@ -19,6 +20,7 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
+from rsgen.geometry.spline import Spline
 from rstrack.adjustment.rigid import Usual
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import INFO, Estimate, write_estimate
@@ -27,6 +29,8 @@ from rstrack.data.prefetch import prefetched
 from rstrack.data.rig import Frame
 from rstrack.inertial import record as imu_record
 from rstrack.metrics.association import truth_of
+from rstrack.metrics.consistency import HORIZONS_S, covariances, motion_covariance, motion_errors, step_nees
+from rstrack.metrics.evaluate import pairs_apart
 from rstrack.metrics.run_evaluate import Evaluation, evaluated
 from rstrack.metrics.tracked import load_run
 from rstrack.options import Options
@@ -45,6 +49,8 @@ _NOT_LOOKED_AT = (
     "the IMU was not looked at (it has no gyroscope, or no samples of these frames): where images tell little, over "
     "gaps and at bare walls, keep the run"
 )
+# Chance of a motion that counts as ruled out.
+_RULED_OUT = 0.01
 # Rounding of times.
 _SLACK_S = 1e-6
 # Distance (m) that things are taken to have had in the run: the first round is told better.
@@ -54,7 +60,7 @@ _TYPICAL_M = 1.5
 @dataclass(frozen=True)
 class Refined:
     """estimate: refined. rounds: what each did. before, after: errors, None without a truth. imu: a line on it, if the
-    run used one."""
+    run used one. kept: why the run is given back as it was, if so."""
 
     estimate: Estimate
     rounds: list[dict[str, Any]]
@@ -62,6 +68,7 @@ class Refined:
     after: Evaluation | None
     seconds: float
     imu: str = ""
+    kept: str = ""
 
     def text(self) -> str:
         """A summary of a few lines."""
@@ -71,8 +78,7 @@ class Refined:
             f"{len(self.rounds)} rounds in {self.seconds:.0f} s: {last['keyframes']} keyframes, {last['pairs']} pairs "
             f"of a frame and a keyframe; poses moved by up to {moved} mm"
         ]
-        if self.imu:
-            lines.append(self.imu)
+        lines += [line for line in (self.imu, self.kept) if line]
         if self.before is not None and self.after is not None:
             lines += [f"ATE before {1e3 * self.before.metrics.ate_rmse_m:.3f} mm", "", self.after.text()]
         return "\n".join(lines)
@@ -108,15 +114,18 @@ def refine_run(
         spline, done = refiner.refined(estimate.spline, rounds, progress)
     except np.linalg.LinAlgError as error:
         raise UserError(f"{run}: cannot be refined: {error}") from None
+    kept = contradiction(estimate, spline)
+    if kept:
+        spline = estimate.spline
     moved = spline.pose(estimate.stamps) @ se3.inverse(estimate.spline.pose(estimate.stamps))
     told = [asdict(r) for r in done]
     seconds = time.perf_counter() - begin
-    info = estimate.info | {"refined": {"of": str(run.resolve()), "rounds": told, "seconds": seconds}}
+    info = estimate.info | {"refined": {"of": str(run.resolve()), "rounds": told, "seconds": seconds, "kept": kept}}
     if isinstance(recorded := info.get("dataset"), dict):
         info["dataset"] = recorded | {"camera": dataset.cameras}
     poses = se3.orthonormalise(moved @ estimate.T_world_depth)
     imu = _NOT_LOOKED_AT if options.inertial else ""
-    if refiner.unit is not None and refiner.found is not None:
+    if refiner.unit is not None and refiner.found is not None and not kept:
         believed = imu_record.believed(refiner.found.belief, refiner.unit.sigma)
         info["imu"] = (estimate.info.get("imu") or {}) | believed | refiner.found.as_dict()
         imu = f"{imu_record.refined_text(believed)}, {refiner.found.text(refiner.unit.recording.T_imu_depth)}"
@@ -127,7 +136,31 @@ def refine_run(
     info["truth_offset"] = None if after is None else after.truth_offset
     write_estimate(out, result.stamps, result.T_world_depth, spline, info, estimate)
     result.moving.write(out, range(len(dataset)))
-    return Refined(result, told, before, after, seconds, imu)
+    return Refined(result, told, before, after, seconds, imu, kept)
+
+
+def contradiction(estimate: Estimate, spline: Spline) -> str:
+    """Why a run's refined spline is not to be had: most of its motions are ones that the run rules out; else empty.
+
+    A wrong camera bends a track until all of it fits, and its own cost cannot tell; the run's covariances, which know
+    that the camera may be wrong, can.
+    """
+    stamps, T = estimate.stamps, estimate.T_world_depth
+    assert estimate.spline is not None
+    refined = spline.pose(stamps) @ se3.inverse(estimate.spline.pose(stamps)) @ T
+    for seconds in HORIZONS_S[:2]:
+        i, j = pairs_apart(stamps, seconds)
+        C = motion_covariance(T, covariances(estimate), i, j)
+        known = np.isfinite(C).all(axis=(1, 2))
+        if not known.any():
+            continue
+        off = 6.0 * step_nees(motion_errors(T, refined, i[known], j[known]), C[known])
+        if np.median(off) > chdtri(6, _RULED_OUT):
+            return (
+                f"given back as it was: most motions over {seconds:g} s became ones that the run rules out (99 %): is "
+                "the camera file right? (rstrack calibrate)"
+            )
+    return ""
 
 
 # ---------------------------------------------------------------------------------------------------------------------
