@@ -142,7 +142,7 @@ def test_the_tracker_sees_even_images(shaken: Dataset) -> None:
     np.testing.assert_allclose(seen[1][good], seen[0][good] * (1.0 + 0.1 * np.sin(3)), atol=0.006)
 
 
-def test_a_run_finds_it_unless_the_camera_file_says_it(
+def test_a_run_finds_it_unless_the_camera_file_says_it_or_it_was_rendered_without(
     shaken: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[range] = []
@@ -152,11 +152,14 @@ def test_a_run_finds_it_unless_the_camera_file_says_it(
         return ColorFalloff(0.25, 0.002, 20)
 
     monkeypatch.setattr(color_falloff, "estimate_color_falloff", estimate)
-    track(shaken, Options(backend="llvm", loops="off"), tmp_path / "run", slice(0, 8))
+    assert shaken.rig.color_falloff == 0.0
+    recorded = replace(shaken, rig=replace(shaken.rig, color_falloff=None))
+    track(recorded, Options(backend="llvm", loops="off"), tmp_path / "run", slice(0, 8))
     notes = read_estimate(tmp_path / "run").info["dataset"]["notes"]
     assert asked == [range(8)] and "20.0 % darker" in notes[0]
     track(shaken.with_color_falloff(0.1), Options(backend="llvm", loops="off"), tmp_path / "run", slice(0, 8))
-    track(shaken, Options(backend="llvm", method="rs-g", loops="off"), tmp_path / "run", slice(0, 8))
+    track(shaken, Options(backend="llvm", loops="off"), tmp_path / "run", slice(0, 8))
+    track(recorded, Options(backend="llvm", method="rs-g", loops="off"), tmp_path / "run", slice(0, 8))
     assert len(asked) == 1
     file = tmp_path / "camera.yaml"
     stream = "width: 160, height: 120, intrinsics: [120, 120, 79.5, 59.5], readout_s: 0.01"
