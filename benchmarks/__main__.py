@@ -89,7 +89,7 @@ def run_tier(tier: str, choice: Choice, scheduler: str | None, quiet: bool) -> i
             print(f"bench: {record.cell}: {'skipped' if record.skipped else 'FAILED'}: {record.error}", file=sys.stderr)
 
     out = choice.out or Path("out/bench") / tier
-    if benchmark.every == "third":
+    if benchmark.every == "third version":
         # Hours of others' work: what is committed and still good need not be run again.
         for name, record in known(tier).items():
             if not (out / "cells" / name / RECORD).exists():

@@ -129,9 +129,9 @@ class BenchmarkFile(_Section):
     families: dict[Name, FamilyEntry] = {}
     methods: dict[Name, MethodEntry] = {}
     cells: tuple[CellsEntry, ...] = ()
-    every: Literal["code", "version", "third"] = Field(
+    every: Literal["code", "version", "third version"] = Field(
         default="version",
-        description="finished cells are run again when the code changes, or the version, or with the third minor one",
+        description="finished cells are run again when the code changes, or the version, or by three minor versions",
     )
 
 

@@ -79,7 +79,7 @@ def run_cells(
     unknown = [cell.measure for cell in benchmark.cells if cell.measure not in known]
     if unknown:
         raise UserError(f"no measure '{unknown[0]}': choose {', '.join(known)}")
-    known_by = {"version": package_version(), "third": ""}
+    known_by = {"version": package_version(), "third version": ""}
     jobs = [
         Job(
             cell, (out / "cells" / cell.name).resolve(), sources, where,

@@ -63,8 +63,7 @@ EXACT = CalibrationSigma()
 """Of renderings."""
 
 STATED = CalibrationSigma(0.01, 0.003, 0.01, 0.02, 0.3, 0.005, 0.003, 0.003, 0.01, 0.005)
-"""Of a camera file that does not say: by about so much do focal lengths, centres and times of one Kinect differ from
-source to source (docs/notebook/calibration.md)."""
+"""Of a camera file that does not say: a judgement of what such files have wrong, not a measurement."""
 
 UNDISTORTED_K1 = 0.1
-"""σ of k1 where a real lens is said to have no distortion: a webcam's has this much."""
+"""σ of k1 where a real lens is said to have no distortion, as it hardly ever is."""

@@ -10,7 +10,6 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rstrack.adjustment.chain import Chain
-from rstrack.alignment.consider import Calibration
 from rstrack.alignment.free_space import FreeSpace
 from rstrack.alignment.independence import Independence
 from rstrack.alignment.linearise import Terms
@@ -34,6 +33,7 @@ from rstrack.options import Options
 from rstrack.tracking.found_poses import FoundPoses
 from rstrack.tracking.frame_report import FrameReport, frame_report
 from rstrack.tracking.gains import Gains
+from rstrack.tracking.judgement.consider import Calibration
 from rstrack.tracking.judgement.fault import Fault
 from rstrack.tracking.judgement.lost_track import FitHistory
 from rstrack.tracking.judgement.pose_covariances import PoseCovariances

@@ -13,8 +13,10 @@ import synthetic
 import yaml
 
 from rsgen.errors import UserError
+from rstrack.bench import record as bench_record
+from rstrack.bench import runner
 from rstrack.bench.definitions import Benchmark, CaseEntry, Cell, MethodEntry, NoiseEntry, SequenceEntry
-from rstrack.bench.record import Record, read_record, read_records, write_records
+from rstrack.bench.record import Record, read_record, read_records, versions_behind, write_records
 from rstrack.bench.runner import Outcome, run_cells
 from rstrack.bench.sequences import Absent, Sources
 from rstrack.bench.task import Task
@@ -50,8 +52,8 @@ def cell(method: str = "rs-g", seeds: int = 1, measure: str = "counted", **chang
     return Cell(measure, "a", method, tuple(range(seeds)), case, sequence, how, changes)
 
 
-def run(data: Path, *cells: Cell, **how: Any) -> Outcome:
-    return run_cells(Benchmark(cells), data.parent / "out", Sources(data), measures=MEASURES, **how)
+def run(data: Path, *cells: Cell, every: str = "version", **how: Any) -> Outcome:
+    return run_cells(Benchmark(cells, every), data.parent / "out", Sources(data), measures=MEASURES, **how)
 
 
 def record(outcome: Outcome) -> Record:
@@ -121,6 +123,22 @@ def test_a_cell_is_run_again_with_other_code(data: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr("rstrack.bench.runner.package_version", lambda: "99.0")
     run(data, cell())
     assert len(CALLS) == 2
+
+
+@pytest.mark.parametrize(("behind", "is_run_again"), [(0, False), (2, False), (3, True), (-1, True)])
+def test_what_takes_hours_stands_for_three_minor_versions(
+    data: Path, monkeypatch: pytest.MonkeyPatch, behind: int, is_run_again: bool
+) -> None:
+    run(data, cell(), every="third version")
+    monkeypatch.setattr(runner, "versions_behind", lambda _: behind)
+    run(data, cell(), every="third version")
+    assert len(CALLS) == 1 + is_run_again
+
+
+def test_versions_are_counted_by_their_second_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench_record, "package_version", lambda: "0.27.1")
+    assert [versions_behind(v) for v in ("0.27.0", "0.25.3", "0.28.0")] == [0, 2, -1]
+    assert versions_behind("1.27.0") > 2
 
 
 def test_seeds_that_are_missing_are_run(data: Path) -> None:

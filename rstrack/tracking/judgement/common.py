@@ -13,11 +13,11 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
-from rstrack.alignment.consider import Calibration
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.pull import steady
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.calibration_sigma import NAMES
+from rstrack.tracking.judgement.consider import Calibration
 
 
 def _nothing() -> FloatArray:

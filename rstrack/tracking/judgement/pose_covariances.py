@@ -10,7 +10,6 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.alignment.consider import Calibration
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.pull import Pulls
 from rstrack.alignment.spline_state import SplineState
@@ -18,6 +17,7 @@ from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.frame_report import FrameReport
 from rstrack.tracking.judgement.common import Common, Considered
+from rstrack.tracking.judgement.consider import Calibration
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 
 

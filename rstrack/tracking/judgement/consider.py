@@ -17,13 +17,13 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.device.lens import Lens
 from rsgen.geometry import se3
-from rstrack.alignment.landmarks import NEAR, Landmarks
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.calibration_sigma import NAMES
 from rstrack.data.rig import Rig
 from rstrack.images.sampling import NEAREST
 from rstrack.keyframes.keyframe import Reference
+from rstrack.tracking.judgement.landmarks import NEAR, Landmarks
 
 COUNT = len(NAMES)
 # Keyframes whose landmarks are remembered.
