@@ -170,12 +170,13 @@ class Contribution:
 
 def contribution(
     e: Engine, g: Vector, p: Vector, sign: float, r: Any, active: Any, parameters: list[Any], slot: Any,
-    c: Sequence[Any] = (), judged: Any = True,
+    c: Sequence[Any] = (), judged: Any = True, curved: int = 0,
 ) -> Contribution:  # fmt: skip
     """w j jᵀ and so on of pixels, from `slot` on (`block_slot`); j = sign [g, p × g].
 
     c: see `ColumnSums`, each at most 1. judged: pixels that tell σ and are counted; others only add to the system
-    and the cost.
+    and the cost. curved: so many columns, the first, have Newton's curvature as j has: what they share with a motion
+    would pass for information if the two had different ones.
     """
     inv_sigma, gate, inv_lever, bound, unit_H, unit_g, unit_cost = parameters
     compared = active & dr.isfinite(r)
@@ -197,8 +198,9 @@ def contribution(
     counted = [dr.select(which & judged, e.Int(1), e.Int(0)) for which in (active, compared)]
     c = [dr.select(active, bound * column, 0.0) for column in c]
     more = [sign * one * column for column in c for one in hj]
-    # Their own curvature is that of reweighted least squares: Newton's would overshoot a large step of brightness.
-    more += [unit_H * w * c[a] * c[b] for a, b in zip(*np.triu_indices(len(c)), strict=True)]
+    # The others' own is that of reweighted least squares: Newton's would overshoot a large step of brightness.
+    bends = [h * w if k < curved else unit_H * w for k in range(len(c))]
+    more += [bends[a] * c[a] * c[b] for a, b in zip(*np.triu_indices(len(c)), strict=True)]
     more += [w * s * unit_g * column for column in c]
     whole = [[e.Int(dr.round(value)) for value in part] for part in ((*sums, *told), more)]
     return Contribution(slot, (*whole[0], *counted, *whole[1]), compared)

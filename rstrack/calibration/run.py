@@ -28,7 +28,7 @@ from rstrack.calibration.pairs.load import like, load_stretch, pair_terms
 from rstrack.calibration.pairs.stretch import Stretch
 from rstrack.calibration.pairs.terms import PairTerms
 from rstrack.calibration.pairs.trust import trust_in
-from rstrack.calibration.solve import Solution, solve
+from rstrack.calibration.solve import Solution, Watch, solve
 from rstrack.calibration.unknowns.devices import Device, device_notes
 from rstrack.calibration.unknowns.known import Known
 from rstrack.calibration.unknowns.parameters import COLOR_LENS, COUNT, DEPTH_LENS, DRIFT, GROUPS, Parameters, free_of
@@ -45,18 +45,16 @@ _SEVERAL = 6
 # Part of the largest σ, over what is of use, from which on parameters are held together.
 _DRAGS = 0.5
 # Levels of the pyramid, coarse ones first.
-_COARSE, _FINE = (2, 1), (0,)
+_COARSE, _FINE = (2,), (0,)
 # See `trust_in`: 0.83 to 0.99 where there is something to see, with a Kinect's noise too, below 0.3 on bare walls.
 _TRUST = 0.5
 # Ways in which images may be read, and stretches with which they are tried.
 _AXES: tuple[Scan, ...] = ("top-bottom", "left-right")
-_TRIED = 4
+_TRIED = 2
 # Unknowns of a lens that are its distortion, of radial-tangential ones.
 _COEFFICIENTS = 4
-# By how much the solution with other knots, of which half counts, may end earlier.
-_ROUGHLY = 3.0
 # For the progress bar.
-_ABOUT_STEPS = 20
+_ABOUT_STEPS = 10
 
 
 def calibrate(
@@ -65,7 +63,8 @@ def calibrate(
 ) -> Calibration:  # fmt: skip
     """Readouts, colour's clock, extrinsics, lenses and depth of a dataset, from the values of its cameras on.
 
-    groups: of GROUPS, what may change; by default the first three, but extrinsics where depth is registered to colour.
+    groups: of GROUPS, what may change; by default all but depth, but no extrinsics where depth is registered to colour,
+    and no lenses where they are exact.
     device: what is published of its readouts is where they start and what they are drawn to, unless the recording
     contradicts it.
     Where Ctrl-C is pressed while it solves, the best so far is returned, marked so. Raises UserError: too few frames,
@@ -91,17 +90,18 @@ def calibrate(
     terms, stretches = _loaded(dataset, parts, track.spline, start, free, options, progress)
     looked_at = some_of(stretches)
     residuals = residuals_at(looked_at, terms, start)
-    known = before = replace(before, values=start)
-    solution, drifts = _solved(stretches, terms, known, free, progress)
-    if solution.finished:
-        kept = _trusted(dataset, stretches, terms, solution.values)
-        if len(kept) < len(parts):
-            parts, stretches = [parts[k] for k in kept], [stretches[k] for k in kept]
-            solution, drifts = _solved(stretches, terms, known, free, progress)
-    contradicted = known.contradicted(solution.values, solution.sigmas)
+    before = replace(before, values=start)
+    known = before.with_lenses()
+    coarse = solve(stretches, terms, start, free, _COARSE, _watch(progress, 0.15), known)
+    solution, drifts = coarse, True
+    if coarse.finished:
+        kept = _trusted(dataset, stretches, terms, coarse.values)
+        parts, stretches = [parts[k] for k in kept], [stretches[k] for k in kept]
+        solution, drifts = _solved(stretches, terms, known, coarse.values, free, progress)
+    contradicted = before.contradicted(solution.values, solution.sigmas)
     if solution.finished and contradicted.any():
         known = known.without(contradicted)
-        solution, drifts = _solved(stretches, terms, known, free, progress)
+        solution, drifts = _solved(stretches, terms, known, solution.values, free, progress)
     if solution.finished:
         solution = _at_other_knots(stretches, terms, known, solution, progress)
     progress("calibrating", 1.0, "done")
@@ -167,35 +167,40 @@ def _bent(dataset: Dataset) -> Dataset:
 
 
 def _solved(
-    stretches: Sequence[Stretch], terms: PairTerms, known: Known, free: BoolArray, progress: Progress
+    stretches: Sequence[Stretch], terms: PairTerms, known: Known, p: Parameters, free: BoolArray, progress: Progress
 ) -> tuple[Solution, bool]:
-    """From the known values on: with all that may change, then without what this recording turns out not to tell.
+    """On the finest level from values `p` on: with all that may change, then without what the recording does not tell.
 
     And whether colour's clock may drift: one that is within its error of the file's is held there, since it would take
-    colour away at both ends of the recording. What else is told only the finest level says.
+    colour away at both ends of the recording.
     """
-    levels: tuple[int, ...] = _COARSE
-    file = known.values
-    start, done, drifts = file, 0, True
+    file, drifts, watch = known.values, True, _watch(progress, 0.5)
+    while True:
+        start = file.moved(np.where(free, p.since(file), 0.0))
+        solution = solve(stretches, terms, start, free, _FINE, watch, known)
+        unsure, p = solution.unsure, solution.values
+        if not solution.finished:
+            return solution, drifts
+        if free[DRIFT] and abs(p.color_drift - file.color_drift) < 2.0 * solution.sigmas[DRIFT]:
+            drifts, free = False, free & (np.arange(COUNT) != DRIFT)
+        elif unsure.max() > 1.0:
+            # What is told least drags others along: they may be told once it is held.
+            free = free & (unsure <= max(1.0, _DRAGS * unsure.max()))
+        else:
+            return solution, drifts
 
-    def watch(level: int, _: int, p: Parameters) -> None:
+
+def _watch(progress: Progress, begin: float) -> Watch:
+    """Tells a progress bar, from a part of it on, of every step."""
+    done = 0
+
+    def watch(_level: int, _step: int, p: Parameters) -> None:
         nonlocal done
         done += 1
         note = f"readouts {1e3 * p.depth_readout_s:.2f} and {1e3 * p.color_readout_s:.2f} ms"
-        progress("calibrating", min(0.9, 0.15 + 0.75 * done / _ABOUT_STEPS), note)
+        progress("calibrating", min(0.95, begin + 0.4 * done / _ABOUT_STEPS), note)
 
-    while True:
-        solution = solve(stretches, terms, start, free, levels, watch, known)
-        sigmas = solution.sigmas
-        unsure, drift = solution.unsure, abs(solution.values.color_drift - file.color_drift)
-        if solution.finished and free[DRIFT] and drift < 2.0 * sigmas[DRIFT]:
-            drifts, free = False, free & (np.arange(COUNT) != DRIFT)
-        elif solution.finished and levels == _FINE and unsure.max() > 1.0:
-            # What is told least drags others along: they may be told once it is held.
-            free = free & (unsure <= max(1.0, _DRAGS * unsure.max()))
-        elif not solution.finished or levels == _FINE:
-            return solution, drifts
-        start, levels = file.moved(np.where(free, solution.values.since(file), 0.0)), _FINE
+    return watch
 
 
 def _at_other_knots(
@@ -212,11 +217,8 @@ def _at_other_knots(
         spline = like(s, s.t0 - 0.5 * s.dt, s.dt, len(s.control_points) + 1)
         return replace(each, spline=spline, brightness=dict(each.brightness))
 
-    def watch(_level: int, n: int, _p: Parameters) -> None:
-        progress("calibrating", 0.9, f"with other knots, step {n + 1}")
-
     later = [shifted(each) for each in stretches]
-    other = solve(later, terms, solution.values, solution.free, _FINE, watch, known, _ROUGHLY)
+    other = solve(later, terms, solution.values, solution.free, _FINE, _watch(progress, 0.9), known)
     if not other.finished:
         return replace(solution, finished=False)
     half = 0.5 * other.values.since(solution.values)
@@ -276,9 +278,10 @@ def _free(dataset: Dataset, groups: Sequence[str], parts: Sequence[range]) -> Bo
 def _usual(dataset: Dataset) -> tuple[str, ...]:
     """What can be told of a recording: of registered depth, which the driver has moved, nothing about where it was.
 
-    Lenses and depth only on request.
+    Lenses where they are not known exactly, as a rendering's are; depth only on request.
     """
-    return GROUPS[:2] if dataset.rig.is_registered else GROUPS[:3]
+    extrinsics = () if dataset.rig.is_registered else ("extrinsics",)
+    return "readout", "offset", *extrinsics, *(() if dataset.rig.sigma.is_exact else ("intrinsics",))
 
 
 def _check(dataset: Dataset, groups: Sequence[str], frames: slice) -> None:

@@ -9,17 +9,13 @@ import numpy as np
 from scipy import stats
 
 from rsgen.array_types import BoolArray, FloatArray
-from rstrack.alignment.acceleration import Acceleration
-from rstrack.calibration.pairs.stretch import Stretch, Sums
+from rstrack.calibration.pairs.stretch import Stretch
 from rstrack.calibration.pairs.terms import PairTerms
 from rstrack.calibration.unknowns.known import Known
 from rstrack.calibration.unknowns.parameters import COUNT, DEPTH, DRIFT, PRIOR, USEFUL, Parameters
 
-# Steps at most on the pyramid's levels, finest first, and part of the formal σ that ends a level.
-_MOST_STEPS, _SMALL = (14, 10, 15), (1.0, 5.0, 10.0)
-# About how many times too large the normal equations' information is: a frame counts in several pairs, and pixels are
-# not independent. For the prior's share only; what is said of σ is measured.
-_COUNTED = 25.0
+# Steps at most on a level, and the part of the standard errors, as the stretches' scatter shows them, that ends it.
+_MOST_STEPS, _SMALL = 15, 0.1
 # Stretches that what is known of all unknowns together counts for, beside the scatter of one.
 _POOLED = 4.0
 # Systematic error of the colour camera's pose, px, σ: interpolation, spline, surfaces. Seen on renderings.
@@ -31,7 +27,7 @@ _BLIND_S = 3e-5
 # were seen above a thousandth.
 _MOVES = np.full(COUNT, 0.0015)
 _MOVES[:DRIFT] = 0.0075
-# Times that the scales of errors are estimated before the first step of a level; once at the finest.
+# Times that the scales of errors are estimated before the first step.
 _ROUNDS = 3
 
 Watch = Callable[[int, int, Parameters], None]
@@ -43,8 +39,8 @@ class Solution:
     """values; normal equations of the free parameters at them: A (s, n, n), b (s, n) of the s stretches, free (29,).
 
     cost: negative log-likelihood a pixel. sigma_depth_m, sigma_intensity: of the residuals, medians. last_step (29,):
-    the last one that was taken. blind (29,): σ of what no scatter shows. finished: nobody interrupted it. known (29,):
-    σ of what was known beforehand, infinite where nothing was. pixels: that were compared.
+    the last one that was taken. blind (29,): σ of what no scatter shows. finished: nobody interrupted it. known
+    (29, 29): `Known.information`. pixels: that were compared.
     """
 
     values: Parameters
@@ -57,7 +53,7 @@ class Solution:
     last_step: FloatArray = field(default_factory=lambda: np.zeros(COUNT))
     blind: FloatArray = field(default_factory=lambda: np.zeros(COUNT))
     finished: bool = True
-    known: FloatArray = field(default_factory=lambda: np.full(COUNT, np.inf))
+    known: FloatArray = field(default_factory=lambda: np.zeros((COUNT, COUNT)))
     pixels: int = 1
 
     @property
@@ -69,25 +65,15 @@ class Solution:
     def sigmas(self) -> FloatArray:
         """Standard errors (29,) as the scatter of the stretches shows them; 0 of what is not free.
 
-        At the solution the stretches' gradients add up to nothing; how far each is from nothing tells how far the next
-        recording's solution may lie (the "sandwich" of White, Econometrica 1980, by clusters, of which a stretch is
-        one). With few stretches one parameter's scatter says little, so that of all counts too, and Student's factor
-        makes two of these σ hold 95 %. What was known beforehand draws the solution to itself, and errs with its own σ.
+        Student's factor, for there are few of these, makes two σ hold 95 %.
         """
-        count, n = self.b.shape
-        told, lent = self.A.sum(axis=0), _COUNTED / self.known[self.free] ** 2
-        inverse = np.linalg.pinv(told + np.diag(lent), hermitian=True)
-        formal = np.maximum(np.diag(inverse @ told @ inverse), 0.0)
-        scatter = self.b - self.b.mean(axis=0)
-        spread = np.diag(inverse @ (scatter.T @ scatter) @ inverse) * count / max(1, count - 1)
-        ratio = np.divide(spread, formal, out=np.ones(n), where=formal > 0.0)
-        all_of_them = np.exp(np.mean(np.log(np.maximum(ratio, 1e-6)))) if n else 1.0
-        dof = max(1.0, count - 1.0)
-        inflation = np.maximum((_POOLED * all_of_them + dof * ratio) / (_POOLED + dof), 1.0)
-        factor = float(stats.t.ppf(0.975, dof)) / 1.96
+        known = self.known[np.ix_(self.free, self.free)]
+        C, _ = _posterior(self.A, self.b, known)
+        factor = float(stats.t.ppf(0.975, max(1.0, len(self.b) - 1.0))) / 1.96
         sigmas = np.zeros(COUNT)
-        borrowed = np.sqrt(inverse**2 @ (_COUNTED * lent))
-        sigmas[self.free] = np.hypot(np.hypot(factor * np.sqrt(formal * inflation), borrowed), self.blind[self.free])
+        told = factor * np.sqrt(np.diag(C))
+        bound = np.sqrt(np.divide(1.0, np.diag(known), out=np.full(len(told), np.inf), where=np.diag(known) > 0.0))
+        sigmas[self.free] = np.hypot(np.minimum(told, bound), self.blind[self.free])
         return sigmas
 
     @property
@@ -96,13 +82,13 @@ class Solution:
 
         By σ, and by how far a change that is just of use would move residuals, in the mean over pixels and with all
         else moved to make up for it: what moves them by less than a hundredth of their noise is at the mercy of a
-        hundred small errors of interpolation, which no scatter shows.
+        hundred small errors of interpolation, which no scatter shows. What was known beforehand is sure enough.
         """
         unsure, sigmas = np.zeros(COUNT), self.sigmas
         formal = np.diag(np.linalg.pinv(self.A.sum(axis=0), hermitian=True))
         moved = USEFUL[self.free] / np.sqrt(np.maximum(formal, 1e-30) * self.pixels)
-        unsure[self.free] = np.where(np.isfinite(self.known[self.free]), 0.0, _MOVES[self.free] / moved)
-        return np.maximum(unsure, sigmas / USEFUL)
+        unsure[self.free] = _MOVES[self.free] / moved
+        return np.where(np.diag(self.known) > 0.0, 0.0, np.maximum(unsure, sigmas / USEFUL))
 
     @property
     def shares(self) -> FloatArray:
@@ -115,43 +101,42 @@ class Solution:
 
 def solve(
     stretches: Sequence[Stretch], terms: PairTerms, start: Parameters, free: BoolArray, levels: Sequence[int],
-    watch: Watch = lambda *_: None, known: Known | None = None, ends: float = 1.0,
+    watch: Watch = lambda *_: None, known: Known | None = None,
 ) -> Solution:  # fmt: skip
     """Parameters and all control points jointly, coarse to fine; the stretches' splines are moved.
 
     free (29,): which parameters may change; the others stay at `start`, to which weak ones are held by PRIOR, and to
-    what is `known` as firmly as that is. ends: steps so many times larger than usual end a level. Where `watch` raises
-    KeyboardInterrupt, what has been found so far is returned, `finished` False. Raises numpy.linalg.LinAlgError where
-    images say nothing at all.
+    what is `known` as firmly as that is. Where `watch` raises KeyboardInterrupt, what has been found so far is
+    returned, `finished` False. Raises numpy.linalg.LinAlgError where images say nothing at all.
     """
     known = known or Known.nothing(start)
-    p, acceleration, finished, step = start, Acceleration(), True, np.zeros(COUNT)
+    p, finished, step = start, True, np.zeros(COUNT)
     try:
+        for stretch in stretches:
+            for _ in range(_ROUNDS):
+                stretch.sums(terms, p, levels[0])
         for level in levels:
-            for stretch in stretches:
-                for _ in range(_ROUNDS if level else 1):
-                    stretch.sums(terms, p, level)
-            acceleration.forget()
-            for n in range(_MOST_STEPS[level]):
+            for n in range(_MOST_STEPS):
                 watch(level, n, p)
                 sums = [stretch.sums(terms, p, level) for stretch in stretches]
-                step, information = _step(sums, p, start, known, free, acceleration)
+                step, sigmas = _step([one.reduced() for one in sums], p, start, known, free)
                 for stretch, one in zip(stretches, sums, strict=True):
                     stretch.move(one.points_step(step))
                 p = p.moved(step)
-                if (step[free] ** 2 * np.diag(information) < (ends * _SMALL[level]) ** 2).all():
+                if (np.abs(step[free]) <= _SMALL * sigmas).all():
                     break
     except KeyboardInterrupt:
         finished = False
     sums = [stretch.sums(terms, p, levels[-1]) for stretch in stretches]
     reduced = [one.reduced() for one in sums]
-    A = np.array([one[np.ix_(free, free)] for one, _ in reduced])
+    A, b = _of_free(reduced, free)
     depth, intensity = np.median([stretch.sigma for stretch in stretches], axis=0)
     pixels = max(1, sum(one.pixels for one in sums))
     cost = sum(one.cost for one in sums) / pixels
-    b = np.array([one[free] for _, one in reduced])
     blind = _blind(stretches, terms)
-    return Solution(p, free, A, b, cost, float(depth), float(intensity), step, blind, finished, known.sigmas, pixels)
+    return Solution(
+        p, free, A, b, cost, float(depth), float(intensity), step, blind, finished, known.information, pixels
+    )
 
 
 def _blind(stretches: Sequence[Stretch], terms: PairTerms) -> FloatArray:
@@ -170,16 +155,41 @@ def _blind(stretches: Sequence[Stretch], terms: PairTerms) -> FloatArray:
 
 
 def _step(
-    sums: Sequence[Sums], p: Parameters, start: Parameters, known: Known, free: BoolArray, acceleration: Acceleration
+    reduced: Sequence[tuple[FloatArray, FloatArray]], p: Parameters, start: Parameters, known: Known, free: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """The step (29,) of the parameters, and what is known of the free ones."""
-    reduced = [one.reduced() for one in sums]
-    prior, lent = _COUNTED / PRIOR[free] ** 2, _COUNTED / known.sigmas[free] ** 2
-    at = p.since(start)[free]
-    information = np.sum([A for A, _ in reduced], axis=0)[np.ix_(free, free)] + np.diag(prior + lent)
-    gradient = np.sum([b for _, b in reduced], axis=0)[free] + prior * at
-    gradient += lent * p.since(known.values)[free]
+    """The step (29,) of the parameters, and the standard errors of the free ones."""
+    A, b = _of_free(reduced, free)
+    weak, information = np.diag(PRIOR[free] ** -2.0), known.information[np.ix_(free, free)]
+    C, gain = _posterior(A, b, weak + information)
+    drawn = weak @ p.since(start)[free] + information @ p.since(known.values)[free]
     step = np.zeros(COUNT)
-    if free.any():
-        step[free] = acceleration.extrapolated(at, -np.linalg.solve(information, gradient), information)
-    return step, information
+    step[free] = -C @ (gain @ b.sum(axis=0) + drawn)
+    return step, np.sqrt(np.diag(C))
+
+
+def _of_free(reduced: Sequence[tuple[FloatArray, FloatArray]], free: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """A (s, n, n) and b (s, n) of the free parameters alone."""
+    return np.array([A[np.ix_(free, free)] for A, _ in reduced]), np.array([b[free] for _, b in reduced])
+
+
+def _posterior(A: FloatArray, b: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Covariance (n, n) of parameters by stretches' A (s, n, n) and b (s, n) and a prior's information (n, n); and what
+    the gradient counts for beside the prior's (n, n): A N⁻¹, N the covariance of the gradient.
+
+    At the solution the stretches' gradients add up to nothing; how far each is from nothing shows N (the "sandwich" of
+    White, Econometrica 1980, by clusters, of which a stretch is one). A says far too little: a frame counts in several
+    pairs, pixels are not independent, and what no model has is in all of them. The scatter of few stretches is shrunk
+    towards A times what the two differ by in the mean over parameters.
+    """
+    told, dof = A.sum(axis=0), max(1.0, len(b) - 1.0)
+    unit = 1.0 / np.sqrt(np.maximum(np.diag(told), 1e-300))
+    told, scatter = told * np.outer(unit, unit), (b - b.mean(axis=0)) * unit
+    scatter = scatter.T @ scatter * (len(b) / dof)
+    inverse = np.linalg.pinv(told, hermitian=True)
+    formal, shown = np.diag(inverse), np.diag(inverse @ scatter @ inverse)
+    ratio = np.divide(shown, formal, out=np.ones(len(formal)), where=formal > 0.0)
+    counted = max(1.0, float(np.exp(np.mean(np.log(np.maximum(ratio, 1e-6)))))) if len(ratio) else 1.0
+    N = (_POOLED * counted * told + dof * scatter) / (_POOLED + dof)
+    gain = told @ np.linalg.pinv(N, hermitian=True)
+    C = np.linalg.pinv(gain @ told + prior * np.outer(unit, unit), hermitian=True)
+    return np.outer(unit, unit) * C, gain * unit / unit[:, None]

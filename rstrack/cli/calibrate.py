@@ -28,8 +28,9 @@ def calibrate(
     camera: CameraFile = None,
     free: Annotated[
         str | None,
-        "what to estimate, of readout, offset, extrinsics, depth, intrinsics (default: the first three; depth that is "
-        "registered to colour has no extrinsics); or imu alone: place, clock, biases and scale of an IMU",
+        "what to estimate, of readout, offset, extrinsics, intrinsics, depth (default: all but depth; depth that is "
+        "registered to colour has no extrinsics, a rendering's lens is exact); or imu alone: place, clock, biases and "
+        "scale of an IMU",
         "NAMES",
     ] = None,
     device: DeviceName = None,
@@ -47,7 +48,7 @@ def calibrate(
     json: Json = False,
     quiet: Quiet = False,
 ) -> int:
-    """Readouts, clocks and extrinsics of a recording's cameras, from the recording alone, with their errors."""
+    """A recording's cameras from the recording alone: lenses, readouts, clocks and extrinsics, with their errors."""
     from rsgen.console.progress import ProgressDisplay
     from rsgen.files import atomic_write
     from rstrack.calibration.findings.record import record_of

@@ -115,7 +115,7 @@ def track(
     noise_intensity: NoiseIntensity = 0.0,
     seed: Seed = 0,
     calibrate: Annotated[
-        bool, "estimate readouts, colour's clock and extrinsics first, as 'rstrack calibrate' does, and track with them"
+        bool, "first find lenses, readouts, clocks and extrinsics, as 'rstrack calibrate' does, and track with them"
     ] = False,
     device: DeviceName = None,
     gravity: Annotated[
@@ -138,6 +138,7 @@ def track(
     from rstrack.calibration.findings.record import CALIBRATION, write_record
     from rstrack.calibration.run import calibrate as run_calibration
     from rstrack.calibration.unknowns.devices import device_named
+    from rstrack.data.calibration_sigma import UNDISTORTED_K1
     from rstrack.data.dataset import open_dataset
     from rstrack.tracking.runs import run
 
@@ -167,6 +168,11 @@ def track(
         write_record(found, out / CALIBRATION)
         print(found.text())
     print(result.text())
+    if found is None and dataset.rig.sigma.k1 >= UNDISTORTED_K1:
+        print(
+            "the camera file has no distortion, which hardly any camera is without: --calibrate finds lens, clocks and "
+            "readouts first, and often halves errors"
+        )
     print(f"{out}: written (rstrack evaluate {sequence} {out}, rstrack plot ...)")
     sys.stdout.flush()
     if result.end == "interrupted":

@@ -330,3 +330,23 @@ def test_sums_have_the_same_bits_on_every_run(room: tuple) -> None:
     for other in runs[1:]:
         assert np.array_equal(runs[0].H, other.H) and np.array_equal(runs[0].g, other.g)
         assert (runs[0].cost, runs[0].weighted, runs[0].count) == (other.cost, other.weighted, other.count)
+
+
+@pytest.mark.parametrize("curved", [1, 0])
+def test_a_column_that_moves_pixels_as_a_shift_does_has_the_curvature_of_one(curved: int) -> None:
+    # Otherwise what the two have in common would be known of each alone.
+    e, rng, bound = ENGINE, np.random.default_rng(1), 2.0
+    scaling = Scaling(1.0, bound, 100)
+    g, p = rng.uniform(-0.5, 0.5, (3, 50)), rng.uniform(-1.0, 1.0, (3, 50))
+    r = rng.standard_normal(50) * 2.0
+    device = [tuple(e.Float(row.astype(np.float32)) for row in rows) for rows in (g, p)]
+    parameters = [e.Float(x) for x in scaling.parameters(1.0, 10.0)]
+    given = e.Float(r.astype(np.float32)), e.Bool(True), parameters, e.UInt(0), [device[0][0] / bound], True, curved
+    values = block_sums_module.contribution(e, *device, 1.0, *given).values
+    raw = np.array([[np.broadcast_to(np.array(v, float), 50).sum() for v in values]])
+    sums = scaling.unpack(np.pad(raw, ((0, 0), (0, 48 - raw.shape[1]))), 1, 1, 1)
+    assert sums.columns is not None
+    own, shared, moved = sums.columns.H[0, 0], sums.columns.coupling[0, 0, 0, 0], sums.H[0, 0, 0, 0]
+    # A column's unit is `bound` here, whatever it is called.
+    assert shared == pytest.approx(moved / bound, rel=1e-4)
+    assert (own == pytest.approx(moved / bound**2, rel=1e-4)) == bool(curved) and own > 0.99 * moved / bound**2

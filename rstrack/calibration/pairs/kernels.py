@@ -180,7 +180,8 @@ def depth_pair_kernel(e: Engine, depth: Lens, stride: int, asked: Asked) -> Call
                 shifts = zip(there, here, strict=True)
                 columns = unknown_columns(e, of.g, shifts, seen.M, point.T_base_cam, given.constants)
             slot = block_slot(point.line, seen.row, depth, depth, point.row, len(names))
-            return contribution(e, of.g, point.p, 1.0, of.r, of.active, parameters, slot, columns, of.is_smooth)
+            judged = of.is_smooth, len(names)
+            return contribution(e, of.g, point.p, 1.0, of.r, of.active, parameters, slot, columns, *judged)
 
         return _summed(e, depth, depth, stride, len(names), at)
 
@@ -210,7 +211,7 @@ def color_pair_kernel(
             columns += [-of.contrast, e.Float(-1.0)]
             slot = block_slot(here.row, there.row, color, color, here.y, len(columns))
             # A twist of the camera moves the point the other way.
-            return contribution(e, (a, b, c), of.p, -1.0, of.r, of.active, parameters, slot, columns)
+            return contribution(e, (a, b, c), of.p, -1.0, of.r, of.active, parameters, slot, columns, True, len(names))
 
         return _summed(e, depth, color, stride, len(names) + 2, at)
 

@@ -130,7 +130,7 @@ class Stretch:
             for k in others:
                 view = self.views[k]
                 to_base = depths[k].to_base(T_base_world)
-                started = terms.by_depth(view.z, surface, to_base, ref_from_base, optics, self.sigma[0], level)
+                started = terms.by_depth(view.z, surface, to_base, ref_from_base, optics, self.sigma[0])
                 waiting.append((0, (k, r), started, depths[k], depths[r], T_base_world))
                 color = colors[k]
                 if color is None or ref_color is None or color_from_base is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -20,13 +21,14 @@ from rstrack.calibration.unknowns.parameters import Parameters, changed
 from rstrack.data.depth_error import DepthError
 from rstrack.images.line_poses import Exposure
 from rstrack.images.pyramid import camera_rays
-from rstrack.keyframes.keyframe import strides
 
 # Gates: residuals beyond are outliers for certain, in σ (depth) and intensity; and smallest credible σ (m, intensity).
 GATE_SIGMAS, GATE_INTENSITY = 5.0, 0.3
 FLOOR_DEPTH, FLOOR_INTENSITY = 2e-4, 1.0 / 255.0
 # Part of σ by which the averaging may have bent a pixel's surface.
 _SMOOTH = 0.25
+# Points of a depth image that are compared, about: what a calibration does not know is far more than their noise.
+_POINTS = 4800
 # Pixels that may fall into a block of lines, over its share.
 _CROWDED = 4
 
@@ -62,11 +64,10 @@ class PairTerms:
         return changed(self.depth.camera, depth), changed(self.color.camera, p.color_lens)
 
     def by_depth(
-        self, z: Any, surface: Surface, to_base: FloatArray, ref_from_base: FloatArray, optics: Optics, sigma: float,
-        level: int,
-    ) -> Callable[[], BlockSums]:  # fmt: skip
+        self, z: Any, surface: Surface, to_base: FloatArray, ref_from_base: FloatArray, optics: Optics, sigma: float
+    ) -> Callable[[], BlockSums]:
         """A depth image's z against a surface; σ in m. The device works until what this returns is called."""
-        asked, stride, bound = self.asked, self.stride(level), surface.bound
+        asked, stride, bound = self.asked, self.stride, surface.bound
         scaling = self._scaling(surface.median_depth, bound, stride, self.depth)
         given = self.depth_input(z, surface, to_base, ref_from_base, optics, sigma, scaling)
         raw = self._kernel(depth_pair_kernel, self.depth, stride, asked)(given)
@@ -82,7 +83,7 @@ class PairTerms:
 
         bound: see `Scaling`, from the reference's gradients. brightness (2,): gain and offset; σ: of intensities.
         """
-        asked, stride = self.asked, self.stride(level)
+        asked, stride = self.asked, self.stride
         scaling = self._scaling(surface.median_depth, bound, stride, self.color)
         lines = to_base, from_base, ref_from_base
         given = self.color_input(images, surface, lines, optics, brightness, sigma, scaling)
@@ -116,9 +117,10 @@ class PairTerms:
         seen = images[0], own, images[1], other, optics.color_camera
         return ColorPairInput(*points, *seen, self.e.upload(constants))
 
-    def stride(self, level: int) -> int:
-        """Of the pixels of depth images that count on a level."""
-        return strides(self.depth.camera.width, self.depth.camera.height)[level]
+    @property
+    def stride(self) -> int:
+        """Of the pixels of depth images that count."""
+        return max(1, math.isqrt(self.depth.camera.width * self.depth.camera.height // _POINTS))
 
     def _scaling(self, median_depth: float, bound: float, stride: int, lens: Lens) -> Scaling:
         camera = self.depth.camera

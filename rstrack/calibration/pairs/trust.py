@@ -89,7 +89,7 @@ def _by_color(
 
 def _pixels(terms: PairTerms) -> Pixels:
     camera = terms.depth.camera
-    return every(terms.e, camera.width, camera.height, terms.stride(0))
+    return every(terms.e, camera.width, camera.height, terms.stride)
 
 
 def _scaling(surface: Surface) -> Scaling:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rsgen.array_types import BoolArray, FloatArray
-from rstrack.calibration.unknowns.parameters import COUNT, Parameters
+from rstrack.calibration.unknowns.parameters import ASPECT_SIGMA, COLOR_LENS, COUNT, DEPTH_LENS, LENS_SIGMA, Parameters
 
 # How far, in σ, what a recording says may lie from what was known before it is taken to contradict it.
 _CONTRADICTS = 3.0
@@ -17,15 +17,34 @@ _LEAST = 0.1
 
 @dataclass(frozen=True)
 class Known:
-    """values, and how sure they are: σ (29,) in the order of NAMES, in their units, infinite where nothing is known."""
+    """values, and how sure they are: σ (29,) in the order of NAMES, in their units, infinite where nothing is known.
+
+    aspect: σ of fy over fx, of both lenses.
+    """
 
     values: Parameters
     sigmas: FloatArray
+    aspect: float = np.inf
+
+    @property
+    def information(self) -> FloatArray:
+        """The inverse covariance (29, 29), zero where nothing is known."""
+        found = np.diag(self.sigmas**-2.0)
+        for lens in (DEPTH_LENS, COLOR_LENS):
+            focal = slice(lens.start, lens.start + 2)
+            found[focal, focal] += self.aspect**-2.0 * np.array([[1.0, -1.0], [-1.0, 1.0]])
+        return found
 
     @staticmethod
     def nothing(start: Parameters) -> Known:
         """Nothing is known; `start` is where to begin."""
         return Known(start, np.full(COUNT, np.inf))
+
+    def with_lenses(self) -> Known:
+        """With what lenses are like, where nothing else is known of them."""
+        usual = np.full(COUNT, np.inf)
+        usual[DEPTH_LENS] = usual[COLOR_LENS] = LENS_SIGMA
+        return replace(self, sigmas=np.where(np.isfinite(self.sigmas), self.sigmas, usual), aspect=ASPECT_SIGMA)
 
     def contradicted(self, found: Parameters, sigmas: FloatArray) -> BoolArray:
         """Which (29,) of the known values a recording contradicts, by what was found with them and its σ (10,).

@@ -42,10 +42,16 @@ _SIZES: tuple[tuple[Group, int], ...] = (
     ("readout", 2), ("offset", 2), ("extrinsics", 6), ("intrinsics", 2 * len(LENS)), ("depth", len(DEPTH)),
 )  # fmt: skip
 _GROUP_OF = tuple(group for group, size in _SIZES for _ in range(size))
-# What is known of each beforehand (σ): s, s, s, s/s, m, rad; of lenses and depth: see NAMES.
+# How far off a camera file's lens usually is (σ): a principal point that is said to be the middle by 8 of 525 px, and
+# elements are centred, so that tangential distortion stays small. A recording that hardly turns about some axis tells
+# no principal point from tangential distortion and a turn; what lenses are like then does.
+LENS_SIGMA = np.array([0.03, 0.03, 0.015, 0.015, 0.2, 0.5, 3e-3, 3e-3])
+# And its pixels are as wide as high.
+ASPECT_SIGMA = 3e-3
+# What holds each (σ) that nothing is known of, while it is looked for: s, s, s, s/s, m, rad; of depth: see NAMES.
 PRIOR = np.array([
-    0.03, 0.03, 0.05, 5e-4, *(0.05,) * 3, *np.radians((5.0,) * 3),
-    *(0.05, 0.05, 0.05, 0.05, 0.3, 0.5, 0.01, 0.01) * 2, 0.03, 0.02, 0.02,
+    0.03, 0.03, 0.05, 5e-3, *(0.05,) * 3, *np.radians((5.0,) * 3), *(10.0 * LENS_SIGMA), *(10.0 * LENS_SIGMA),
+    0.03, 0.02, 0.02,
 ])  # fmt: skip
 # σ above which a value is of no use: it is called undetermined and keeps what it was.
 USEFUL = np.array([
