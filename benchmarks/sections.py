@@ -48,6 +48,8 @@ _COLUMNS: dict[str, tuple[str, ...]] = {
         "found_pct*", "not_converged*+", "refused*+", "wrong*+", "within_2_sigma_pct", "rms_over_sigma",
         "calibration_s",
     ),
+    "crossed": ("ate_mm", "drift_mm_s", "drift_deg_s", "nees", "coverage_90", "lost", "silent", "calibration_s"),
+    "lens": ("before_px", "after_px", "after_px_max", "within_2_sigma_pct", "rms_over_sigma", "calibration_s"),
     "convergence": ("converged_pct*", "wrong*+", "starts", "failed", "silent", "ate_mm", "ate_max_mm"),
     "light": (
         "psnr_db", "psnr_least_db", "surely_least_db", "bias_pct", "estimate_db", "bake_s", "bake_mb", "*_s", "*_ratio"

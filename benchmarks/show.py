@@ -72,6 +72,8 @@ def results_markdown(gate: Records, full: Records) -> str:
         sections.methods, sections.per_sequence, sections.real, sections.not_the_best, sections.imu, sections.loops,
         sections.faults, sections.changes, cliff, sections.readout, sections.others, sections.speed,
         sections.measured("Calibration", "calibration"),
+        sections.measured("Lenses told wrong, found: RMS over the image", "lens"),
+        sections.measured("With the camera found on another recording", "crossed"),
         sections.measured("Convergence and start", "convergence", "bootstrap"),
         sections.measured("Light and rendering", "light", "render"), sections.memory,
         sections.measured("Long runs", "long"),

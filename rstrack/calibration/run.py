@@ -63,8 +63,8 @@ def calibrate(
 ) -> Calibration:  # fmt: skip
     """Readouts, colour's clock, extrinsics, lenses and depth of a dataset, from the values of its cameras on.
 
-    groups: of GROUPS, what may change; by default all but depth, but no extrinsics where depth is registered to colour,
-    and no lenses where they are exact.
+    groups: of GROUPS, what may change; by default the first three, but where depth is registered to colour the lens in
+    place of extrinsics, unless it is exact.
     device: what is published of its readouts is where they start and what they are drawn to, unless the recording
     contradicts it.
     Where Ctrl-C is pressed while it solves, the best so far is returned, marked so. Raises UserError: too few frames,
@@ -91,7 +91,7 @@ def calibrate(
     looked_at = some_of(stretches)
     residuals = residuals_at(looked_at, terms, start)
     before = replace(before, values=start)
-    known = before.with_lenses()
+    known = before.with_lenses() if "intrinsics" in groups else before
     coarse = solve(stretches, terms, start, free, _COARSE, _watch(progress, 0.15), known)
     solution, drifts = coarse, True
     if coarse.finished:
@@ -278,10 +278,11 @@ def _free(dataset: Dataset, groups: Sequence[str], parts: Sequence[range]) -> Bo
 def _usual(dataset: Dataset) -> tuple[str, ...]:
     """What can be told of a recording: of registered depth, which the driver has moved, nothing about where it was.
 
-    Lenses where they are not known exactly, as a rendering's are; depth only on request.
+    Its lens then, where it is not exact as a rendering's is. Two lenses, which makers measure, and depth on request.
     """
-    extrinsics = () if dataset.rig.is_registered else ("extrinsics",)
-    return "readout", "offset", *extrinsics, *(() if dataset.rig.sigma.is_exact else ("intrinsics",))
+    if dataset.rig.is_registered:
+        return "readout", "offset", *(() if dataset.rig.sigma.is_exact else ("intrinsics",))
+    return GROUPS[:3]
 
 
 def _check(dataset: Dataset, groups: Sequence[str], frames: slice) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from scipy import stats
 
 from rsgen.array_types import BoolArray, FloatArray
+from rstrack.alignment.acceleration import Acceleration
 from rstrack.calibration.pairs.stretch import Stretch
 from rstrack.calibration.pairs.terms import PairTerms
 from rstrack.calibration.unknowns.known import Known
@@ -67,14 +68,20 @@ class Solution:
 
         Student's factor, for there are few of these, makes two σ hold 95 %.
         """
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance (29, 29), to which `sigmas` belong; 0 of what is not free."""
         known = self.known[np.ix_(self.free, self.free)]
-        C, _ = _posterior(self.A, self.b, known)
+        C, _, _ = _posterior(self.A, self.b, known)
         factor = float(stats.t.ppf(0.975, max(1.0, len(self.b) - 1.0))) / 1.96
-        sigmas = np.zeros(COUNT)
-        told = factor * np.sqrt(np.diag(C))
-        bound = np.sqrt(np.divide(1.0, np.diag(known), out=np.full(len(told), np.inf), where=np.diag(known) > 0.0))
-        sigmas[self.free] = np.hypot(np.minimum(told, bound), self.blind[self.free])
-        return sigmas
+        formal = np.sqrt(np.maximum(np.diag(C), 1e-300))
+        bound = np.sqrt(np.divide(1.0, np.diag(known), out=np.full(len(C), np.inf), where=np.diag(known) > 0.0))
+        scale = np.minimum(factor * formal, bound) / formal
+        found = np.diag(np.where(self.free, self.blind, 0.0) ** 2)
+        found[np.ix_(self.free, self.free)] += C * np.outer(scale, scale)
+        return found
 
     @property
     def unsure(self) -> FloatArray:
@@ -110,21 +117,27 @@ def solve(
     returned, `finished` False. Raises numpy.linalg.LinAlgError where images say nothing at all.
     """
     known = known or Known.nothing(start)
-    p, finished, step = start, True, np.zeros(COUNT)
+    p, acceleration, finished, step = start, Acceleration(), True, np.zeros(COUNT)
     try:
         for stretch in stretches:
             for _ in range(_ROUNDS):
                 stretch.sums(terms, p, levels[0])
         for level in levels:
+            acceleration.forget()
             for n in range(_MOST_STEPS):
                 watch(level, n, p)
                 sums = [stretch.sums(terms, p, level) for stretch in stretches]
-                step, sigmas = _step([one.reduced() for one in sums], p, start, known, free)
+                step, sigmas = _step([one.reduced() for one in sums], p, start, known, free, acceleration)
                 for stretch, one in zip(stretches, sums, strict=True):
                     stretch.move(one.points_step(step))
                 p = p.moved(step)
                 if (np.abs(step[free]) <= _SMALL * sigmas).all():
                     break
+        sums = [stretch.sums(terms, p, levels[-1]) for stretch in stretches]
+        last, _ = _step([one.reduced() for one in sums], p, start, known, free)
+        for stretch, one in zip(stretches, sums, strict=True):
+            stretch.move(one.points_step(last))
+        p = p.moved(last)
     except KeyboardInterrupt:
         finished = False
     sums = [stretch.sums(terms, p, levels[-1]) for stretch in stretches]
@@ -155,15 +168,25 @@ def _blind(stretches: Sequence[Stretch], terms: PairTerms) -> FloatArray:
 
 
 def _step(
-    reduced: Sequence[tuple[FloatArray, FloatArray]], p: Parameters, start: Parameters, known: Known, free: BoolArray
-) -> tuple[FloatArray, FloatArray]:
-    """The step (29,) of the parameters, and the standard errors of the free ones."""
+    reduced: Sequence[tuple[FloatArray, FloatArray]], p: Parameters, start: Parameters, known: Known, free: BoolArray,
+    acceleration: Acceleration | None = None,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """The step (29,) of the parameters, and the standard errors of the free ones.
+
+    Gauss-Newton's, accelerated, the prior against as much as A says too much in the mean. Without `acceleration` the
+    last one, against what A says too much in each direction: that only shows where gradients add up to nothing.
+    """
     A, b = _of_free(reduced, free)
     weak, information = np.diag(PRIOR[free] ** -2.0), known.information[np.ix_(free, free)]
-    C, gain = _posterior(A, b, weak + information)
     drawn = weak @ p.since(start)[free] + information @ p.since(known.values)[free]
+    C, gain, counted = _posterior(A, b, weak + information)
     step = np.zeros(COUNT)
-    step[free] = -C @ (gain @ b.sum(axis=0) + drawn)
+    if acceleration is None:
+        step[free] = -C @ (gain @ b.sum(axis=0) + drawn)
+    elif free.any():
+        told = A.sum(axis=0) + counted * (weak + information)
+        plain = -np.linalg.solve(told, b.sum(axis=0) + counted * drawn)
+        step[free] = acceleration.extrapolated(p.since(start)[free], plain, told)
     return step, np.sqrt(np.diag(C))
 
 
@@ -172,9 +195,10 @@ def _of_free(reduced: Sequence[tuple[FloatArray, FloatArray]], free: BoolArray) 
     return np.array([A[np.ix_(free, free)] for A, _ in reduced]), np.array([b[free] for _, b in reduced])
 
 
-def _posterior(A: FloatArray, b: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Covariance (n, n) of parameters by stretches' A (s, n, n) and b (s, n) and a prior's information (n, n); and what
-    the gradient counts for beside the prior's (n, n): A N⁻¹, N the covariance of the gradient.
+def _posterior(A: FloatArray, b: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Covariance (n, n) of parameters by stretches' A (s, n, n) and b (s, n) and a prior's information (n, n); what
+    the gradient counts for beside the prior's (n, n): A N⁻¹, N the covariance of the gradient; and how many times too
+    large A is in the mean.
 
     At the solution the stretches' gradients add up to nothing; how far each is from nothing shows N (the "sandwich" of
     White, Econometrica 1980, by clusters, of which a stretch is one). A says far too little: a frame counts in several
@@ -192,4 +216,4 @@ def _posterior(A: FloatArray, b: FloatArray, prior: FloatArray) -> tuple[FloatAr
     N = (_POOLED * counted * told + dof * scatter) / (_POOLED + dof)
     gain = told @ np.linalg.pinv(N, hermitian=True)
     C = np.linalg.pinv(gain @ told + prior * np.outer(unit, unit), hermitian=True)
-    return np.outer(unit, unit) * C, gain * unit / unit[:, None]
+    return np.outer(unit, unit) * C, gain * unit / unit[:, None], counted

@@ -28,9 +28,9 @@ def calibrate(
     camera: CameraFile = None,
     free: Annotated[
         str | None,
-        "what to estimate, of readout, offset, extrinsics, intrinsics, depth (default: all but depth; depth that is "
-        "registered to colour has no extrinsics, a rendering's lens is exact); or imu alone: place, clock, biases and "
-        "scale of an IMU",
+        "what to estimate, of readout, offset, extrinsics, depth, intrinsics (default: the first three; where depth is "
+        "registered to colour, intrinsics in place of extrinsics); or imu alone: place, clock, biases and scale of an "
+        "IMU",
         "NAMES",
     ] = None,
     device: DeviceName = None,

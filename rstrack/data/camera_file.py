@@ -10,7 +10,8 @@ Each may have model (pinhole, radtan, rational, fisheye, double_sphere), distort
 configs.
 T_color_depth (4x4) is the identity where it is left out. color.offset_s: seconds added to colour's stamps; auto: see
 `rstrack.data.clocks.timing`; color.drift_ppm: millionths by which that grows over the recording, in whose middle it
-holds; both are what `rstrack calibrate` finds, which writes such a file. color.falloff: see `Rig`; auto: `track` finds
+holds; both are what `rstrack calibrate` finds, which writes such a file; clocks: {NAME: {offset_s: 0.02, drift_ppm: 3}}
+of the recording in a folder of that name alone. color.falloff: see `Rig`; auto: `track` finds
 it. stamps: auto, raw or regular, see there too.
 sigma: {focal: 0.01, center_px: 3, ...}: how far this may be wrong, see `CalibrationSigma`; the rest is as usual.
 depth.registered: warped into the colour camera, see `rstrack.data.registered_rows`. depth.offset_s: seconds added to
@@ -21,7 +22,7 @@ depth's stamps. calibration.yaml: see `rstrack.data.opencv_camera_file`; Kalibr'
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -43,11 +44,12 @@ from rstrack.data.registered_rows import DepthSensor, registered_shutter
 from rstrack.data.rig import Rig
 
 EXAMPLE = "color: {width: 640, height: 480, intrinsics: [fx, fy, cx, cy], readout_s: 0.028}"
-_KEYS = "color, depth, T_color_depth, stamps and sigma, each camera with width, height, intrinsics, readout_s"
+_KEYS = "color, depth, T_color_depth, stamps, clocks and sigma, each camera with width, height, intrinsics, readout_s"
 
 Size = tuple[int, int]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Seconds = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
+Drift = Annotated[float, Field(ge=-1e4, le=1e4, allow_inf_nan=False)]
 Pixels = Annotated[int, Field(ge=1, le=16384)]
 Vector4 = tuple[Finite, Finite, Finite, Finite]
 Matrix4 = tuple[Vector4, Vector4, Vector4, Vector4]
@@ -60,7 +62,8 @@ class RigFile:
     depth_offset_s: to be added to depth's stamps, so that they belong to the first row of the image as it is.
     color_offset_s: to be added to colour's; None: to be found. color_drift: what that grows by, s/s. scan_named,
     scale_named: whether it says which way images are read, and depth_scale. notes: what was assumed, for the screen.
-    depth_error: of its images.
+    depth_error: of its images. clocks: (color_offset_s, color_drift) of recordings by their folders' names, in place of
+    those two.
     """
 
     rig: Rig
@@ -73,6 +76,14 @@ class RigFile:
     scale_named: bool = True
     notes: tuple[str, ...] = ()
     depth_error: DepthError = NONE
+    clocks: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    def of(self, recording: str) -> RigFile:
+        """With the clocks of one recording."""
+        if recording not in self.clocks:
+            return self
+        offset_s, drift = self.clocks[recording]
+        return replace(self, color_offset_s=offset_s, color_drift=drift)
 
 
 class _Section(BaseModel):
@@ -101,7 +112,12 @@ class _Stream(_Section):
 class _ColorStream(_Stream):
     offset_s: Finite | Literal["auto"] = "auto"
     falloff: Annotated[float, Field(ge=-0.5, le=2.0, allow_inf_nan=False)] | Literal["auto"] = "auto"
-    drift_ppm: Annotated[float, Field(ge=-1e4, le=1e4, allow_inf_nan=False)] = 0.0
+    drift_ppm: Drift = 0.0
+
+
+class _Clock(_Section):
+    offset_s: Finite
+    drift_ppm: Drift = 0.0
 
 
 class _Sensor(_Section):
@@ -155,6 +171,7 @@ class _CameraYaml(_Section):
     depth: _DepthStream | None = None
     T_color_depth: Matrix4 | None = None
     stamps: StampsMode = "auto"
+    clocks: dict[str, _Clock] = {}
     sigma: _Sigma = _Sigma()
 
 
@@ -256,6 +273,7 @@ def _of_content(path: Path, content: Mapping[str, Any]) -> RigFile:
         depth is not None and "depth_scale" in depth.model_fields_set,
         notes,
         NONE if depth is None else DepthError(**depth.error.model_dump()),
+        {name: (clock.offset_s, 1e-6 * clock.drift_ppm) for name, clock in data.clocks.items()},
     )
 
 

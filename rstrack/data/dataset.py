@@ -253,7 +253,7 @@ def open_tracked(path: Path, run: Path, info: dict[str, Any], camera_file: Path 
 def _seen_as(dataset: Dataset, camera_file: Path) -> Dataset:
     """A generated sequence with other cameras than it was taken with. Raises UserError: not of its images' size."""
     sizes = [(c.width, c.height) for c in (dataset.rig.color_camera, dataset.rig.depth_camera)]
-    file = read_rig(camera_file, *sizes)
+    file = read_rig(camera_file, *sizes).of(dataset.name)
     found = [(c.width, c.height) for c in (file.rig.color_camera, file.rig.depth_camera)]
     if found != sizes:
         shown = [" and ".join(f"{w}x{h}" for w, h in pair) for pair in (found, sizes)]
@@ -304,7 +304,8 @@ def _of_recorded(root: Path, sequence: Sequence) -> Dataset:
 
 def _of_tum(root: Path, tum: TumFolder) -> Dataset:
     """A recording with its stamps as its camera file wants them. Raises UserError."""
-    file = tum.file
+    name = root.resolve().name
+    file = tum.file.of(name)
     try:
         depth = stream_timing("depth", tum.depth_stamps, file.stamps, file.depth_offset_s)
         color = stream_timing("colour", tum.color_stamps, file.stamps, 0.0)
@@ -314,7 +315,7 @@ def _of_tum(root: Path, tum: TumFolder) -> Dataset:
         depth = replace(depth, listed=tum.depth_numbers)
     timing = Timing(depth, color, file.color_offset_s, file.notes)
     dataset = Dataset(
-        root.resolve().name, root, file.rig, depth.used, color.used, (), tum.images, truth_poses=tum.truth_poses,
+        name, root, file.rig, depth.used, color.used, (), tum.images, truth_poses=tum.truth_poses,
         notes=tum.notes, timing=timing, scan_named=file.scan_named, depth_scale=file.depth_scale,
         depth_offset_s=file.depth_offset_s, depth_error=file.depth_error,
     )  # fmt: skip

@@ -102,7 +102,8 @@ def _values(record: Record) -> tuple[Block, ...]:
     head = ("value", "found", "± 2 σ", "began at", "change", "unit")
     rows = tuple(_row(p) for p in record.parameters.values())
     notes = (Note(f"{text[0].upper()}{text[1:]}.") for text in record.notes)
-    return Table(head, rows, "Found, and where it began"), Note(_SIGMA), *notes, Plot(change_chart(record))
+    lenses = (Note(f"{name.capitalize()} lens: {text}.") for name, text in record.lenses_px.items())
+    return Table(head, rows, "Found, and where it began"), Note(_SIGMA), *lenses, *notes, Plot(change_chart(record))
 
 
 def _row(p: Parameter) -> tuple[Entry | str, ...]:

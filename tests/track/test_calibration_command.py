@@ -27,6 +27,7 @@ from rstrack.calibration.unknowns.parameters import (
     changed,
 )
 from rstrack.cli.main import main
+from rstrack.data.camera_file import read_rig
 from rstrack.data.clocks.timing import Timing, stream_timing
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.depth_error import DepthError
@@ -112,6 +113,15 @@ def test_the_camera_file_says_what_was_found(shaken: Dataset, tmp_path: Path) ->
     clock = stream_timing("depth", shaken.stamps, "regular", 0.0)
     regular = replace(made, dataset=replace(shaken, timing=Timing(clock, clock, 0.0)))
     assert "\nstamps: regular" in regular.camera_file() and "\nstamps" not in made.camera_file()
+    # Of stamps that are arrival times the offset is this recording's alone.
+    jittered = replace(clock, clock=replace(clock.clock, verdict="jittered"))
+    arrived = replace(made, dataset=replace(shaken, timing=Timing(jittered, clock, 0.0))).camera_file()
+    (tmp_path / "clocks.yaml").write_text(arrived)
+    own = open_dataset(shaken.root, tmp_path / "clocks.yaml")
+    np.testing.assert_allclose(own.color_stamps, expected.color_stamps, atol=2e-7)
+    sizes = [(camera.width, camera.height) for camera in (shaken.rig.color_camera, shaken.rig.depth_camera)]
+    another = read_rig(tmp_path / "clocks.yaml", *sizes).of("another")
+    assert another.color_offset_s is None and another.color_drift == 0.0
     text = (tmp_path / "camera.yaml").read_text()
     assert "±" in text and "undetermined, kept" in text
     parameters = made.as_dict()["parameters"]

@@ -84,6 +84,9 @@ FIGURES: tuple[Figure, ...] = (
     Figure("false*", "false", "loops", "less", "count", outright=True),
     Figure("accepted", "look-alikes taken for one", "pairs", "less", "count", outright=True),
     Figure("median_mrad", "median", "mrad", "less", "log"),
+    # `lens`: what it was told wrong by, and what is left of that.
+    Figure("before_px", "told wrong by", "px", "unjudged", "log"),
+    Figure("after_px*", "left", "px", "less", "log"),
     # Times of the machine, and ratios of times of one run, of which a machine's speed falls out.
     Figure("ratio", "ratio", "", "less", "log"),
     Figure("ratio_*", "", "", "less", "log"),

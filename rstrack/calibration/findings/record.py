@@ -82,6 +82,7 @@ class Record(_Stored):
     finished: bool
     converged: bool
     notes: tuple[str, ...]
+    lenses_px: dict[str, str] = {}
     seconds: _Positive
     camera_file: str
 

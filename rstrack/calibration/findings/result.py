@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from json import dumps
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
+from rstrack.calibration.findings.lens_pixels import displacement_px, rms, sigma_px
 from rstrack.calibration.findings.pace import Pace, since_begin
 from rstrack.calibration.findings.residuals import Residuals
 from rstrack.calibration.solve import Solution
@@ -148,12 +150,24 @@ class Calibration:
                 lines.append(f"{name:<28}{found}   {factor * before[i]:>10.3f} {unit}")
         if self.undetermined.any():
             lines.append(self.motion.text())
+        lines += [f"{name} lens: {text}" for name, text in self._lenses_px().items()]
         lines += self._notes()
         lines.append(
             f"from {len(self.parts)} stretches of {len(self.parts[0])} frames in {self.seconds:.0f} s; residuals "
             f"{1e3 * self.solution.sigma_depth_m:.2f} mm and {self.solution.sigma_intensity:.4f} of intensity"
         )
         return "\n".join(lines)
+
+    def _lenses_px(self) -> dict[str, str]:
+        """How far the lenses that were asked for put points from where they were, and how well that is known."""
+        before, after = self._changed(self.start), self._cameras()
+        found = {}
+        for name, at, old, new in zip(("depth", "colour"), (DEPTH_LENS, COLOR_LENS), before, after, strict=True):
+            if self.asked[at].any():
+                moved = rms(displacement_px(old, new))
+                sigma = rms(sigma_px(new, self.solution.covariance[at, at]))
+                found[name] = f"moves points by {moved:.2f} ± {2.0 * sigma:.2f} px (2 sigma; RMS over the image)"
+        return found
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON: values in SI units; sigma None where undetermined.
@@ -189,7 +203,7 @@ class Calibration:
             "motion": {"m_s": self.motion.speed, "rad_s": self.motion.rotation, "rad_s2": self.motion.change},
             "sigma_depth_m": solution.sigma_depth_m, "sigma_intensity": solution.sigma_intensity,
             "finished": solution.finished, "converged": solution.is_settled, "seconds": self.seconds,
-            "notes": self._notes(), "device": list(self.device_notes),
+            "lenses_px": self._lenses_px(), "notes": self._notes(), "device": list(self.device_notes),
             "camera_file": self.camera_file(),
         }  # fmt: skip
 
@@ -203,16 +217,22 @@ class Calibration:
         depth_camera, color_camera = self._cameras()
         color = _stream("color", color_camera, rig.color_shutter, found.color_readout_s, scans[1], beside[COLOR_LENS])
         color += beside[1]
-        offset_s = found.color_offset_s - self.dataset.depth_offset_s
-        color += f"\n  offset_s: {offset_s:.7f}{beside[2]}"
+        clock = f"offset_s: {found.color_offset_s - self.dataset.depth_offset_s:.7f}"
+        timing = self.dataset.timing
+        if timing is not None and timing.is_jittered:
+            # Of stamps that are arrival times: every recording has another.
+            if found.color_drift:
+                clock += f", drift_ppm: {1e6 * found.color_drift:.3f}"
+            clocks, color_clock = [f"clocks: {{{dumps(self.dataset.name)}: {{{clock}}}}}{beside[2]}"], ""
+        else:
+            clocks, color_clock = [], f"\n  {clock}{beside[2]}" + (drift if found.color_drift else "")
         depth = _stream("depth", depth_camera, rig.depth_shutter, found.depth_readout_s, scans[0], beside[DEPTH_LENS])
         depth += beside[0]
         rows = ["  - [" + ", ".join(f"{x:.12g}" for x in row) + "]" for row in found.T_color_depth]
         shown = [f"{_SHOWN[i][0].split(', ')[1]}{beside[i][3:]}" for i in range(COUNT)[EXTRINSICS]]
-        timing = self.dataset.timing
         mode = "auto" if timing is None else timing.mode
         return "\n".join([
-            *names, *(() if mode == "auto" else (f"stamps: {mode}",)), color + (drift if found.color_drift else ""),
+            *names, *(() if mode == "auto" else (f"stamps: {mode}",)), *clocks, color + color_clock,
             depth + f"\n  depth_scale: {self.dataset.depth_scale:g}" + self._error_entry(),
             "T_color_depth:" + ("  # " + ", ".join(shown) if self.asked[EXTRINSICS].any() else ""), *rows,
             "sigma: {" + ", ".join(f"{name}: {sigma:.3g}" for name, sigma in self._stated().items()) + "}", "",

@@ -7,7 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rsgen.array_types import BoolArray, FloatArray
-from rstrack.calibration.unknowns.parameters import ASPECT_SIGMA, COLOR_LENS, COUNT, DEPTH_LENS, LENS_SIGMA, Parameters
+from rstrack.calibration.unknowns.parameters import (
+    ASPECT_SIGMA,
+    COLOR_LENS,
+    COUNT,
+    DEPTH_LENS,
+    EXTRINSICS,
+    EXTRINSICS_SIGMA,
+    LENS_SIGMA,
+    Parameters,
+)
 
 # How far, in σ, what a recording says may lie from what was known before it is taken to contradict it.
 _CONTRADICTS = 3.0
@@ -41,9 +50,10 @@ class Known:
         return Known(start, np.full(COUNT, np.inf))
 
     def with_lenses(self) -> Known:
-        """With what lenses are like, where nothing else is known of them."""
+        """With what lenses are like and where two cameras sit, where nothing else is known of them."""
         usual = np.full(COUNT, np.inf)
         usual[DEPTH_LENS] = usual[COLOR_LENS] = LENS_SIGMA
+        usual[EXTRINSICS] = EXTRINSICS_SIGMA
         return replace(self, sigmas=np.where(np.isfinite(self.sigmas), self.sigmas, usual), aspect=ASPECT_SIGMA)
 
     def contradicted(self, found: Parameters, sigmas: FloatArray) -> BoolArray:

@@ -48,6 +48,8 @@ _GROUP_OF = tuple(group for group, size in _SIZES for _ in range(size))
 LENS_SIGMA = np.array([0.03, 0.03, 0.015, 0.015, 0.2, 0.5, 3e-3, 3e-3])
 # And its pixels are as wide as high.
 ASPECT_SIGMA = 3e-3
+# And where the colour camera sits, which a lens can make up for: m, rad.
+EXTRINSICS_SIGMA = np.array([*(0.01,) * 3, *np.radians((1.0,) * 3)])
 # What holds each (σ) that nothing is known of, while it is looked for: s, s, s, s/s, m, rad; of depth: see NAMES.
 PRIOR = np.array([
     0.03, 0.03, 0.05, 5e-3, *(0.05,) * 3, *np.radians((5.0,) * 3), *(10.0 * LENS_SIGMA), *(10.0 * LENS_SIGMA),
