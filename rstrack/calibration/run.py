@@ -31,7 +31,16 @@ from rstrack.calibration.pairs.trust import trust_in
 from rstrack.calibration.solve import Solution, Watch, solve
 from rstrack.calibration.unknowns.devices import Device, device_notes
 from rstrack.calibration.unknowns.known import Known
-from rstrack.calibration.unknowns.parameters import COLOR_LENS, COUNT, DEPTH_LENS, DRIFT, GROUPS, Parameters, free_of
+from rstrack.calibration.unknowns.parameters import (
+    COLOR_LENS,
+    COUNT,
+    DEPTH_LENS,
+    DRIFT,
+    GROUPS,
+    LENSES,
+    Parameters,
+    free_of,
+)
 from rstrack.data.dataset import Dataset
 from rstrack.options import Options
 from rstrack.tracking.first_look.color_offset import estimate_color_offset
@@ -53,6 +62,8 @@ _AXES: tuple[Scan, ...] = ("top-bottom", "left-right")
 _TRIED = 2
 # Unknowns of a lens that are its distortion, of radial-tangential ones.
 _COEFFICIENTS = 4
+# Of a lens that is no better than the file's to be taken for one, the level of the tracker's tests.
+_CHANCE = 1e-3
 # For the progress bar.
 _ABOUT_STEPS = 10
 
@@ -102,6 +113,10 @@ def calibrate(
     if solution.finished and contradicted.any():
         known = known.without(contradicted)
         solution, drifts = _solved(stretches, terms, known, solution.values, free, progress)
+    kept_lens = False
+    if solution.finished and solution.free[LENSES].any():
+        stretches, solution, kept_lens = _paid(stretches, terms, known, solution, progress)
+        free[LENSES] &= not kept_lens
     if solution.finished:
         solution = _at_other_knots(stretches, terms, known, solution, progress)
     progress("calibrating", 1.0, "done")
@@ -110,7 +125,7 @@ def calibrate(
     notes = device_notes(device, before, known, solution.sigmas) if device else ()
     pace = pace_of(dataset, track.frames(dataset, chosen), track.spline)
     both, seconds = (residuals, residuals_now(looked_at)), time.perf_counter() - begun
-    return Calibration(dataset, start, solution, free, tuple(parts), motion, seconds, both, pace, notes)
+    return Calibration(dataset, start, solution, free, tuple(parts), motion, seconds, both, pace, notes, kept_lens)
 
 
 def _loaded(
@@ -188,6 +203,23 @@ def _solved(
             free = free & (unsure <= max(1.0, _DRAGS * unsure.max()))
         else:
             return solution, drifts
+
+
+def _paid(
+    stretches: Sequence[Stretch], terms: PairTerms, known: Known, solution: Solution, progress: Progress
+) -> tuple[list[Stretch], Solution, bool]:
+    """The solution with the lens that was found, or that with the file's where another does not pay, and which.
+
+    It pays if chance makes the images so much more likely in one of a thousand recordings at most.
+    """
+    without = solution.free & ~LENSES
+    plain = [replace(each, brightness=dict(each.brightness)) for each in stretches]
+    start = known.values.moved(np.where(without, solution.values.since(known.values), 0.0))
+    other = solve(plain, terms, start, without, _FINE, _watch(progress, 0.8), known)
+    gain = (other.cost - solution.cost) * solution.pixels
+    if not other.finished or solution.chance(gain, LENSES) < _CHANCE:
+        return list(stretches), replace(solution, finished=other.finished), False
+    return plain, other, True
 
 
 def _watch(progress: Progress, begin: float) -> Watch:

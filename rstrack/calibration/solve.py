@@ -83,6 +83,20 @@ class Solution:
         found[np.ix_(self.free, self.free)] += C * np.outer(scale, scale)
         return found
 
+    def chance(self, gain: float, which: BoolArray) -> float:
+        """How often freeing `which` (29,) of the unknowns makes images more likely by as much, though none is needed.
+
+        gain: of the log-likelihood, which counts far too much. Twice that is then a sum of squares of normals, each
+        times an eigenvalue of [(A⁻¹)]⁻¹ [A⁻¹ N A⁻¹] of these unknowns (Kent, Biometrika 1982), here by its first two
+        moments (Satterthwaite).
+        """
+        of = which[self.free]
+        C = _posterior(self.A, self.b, np.zeros(self.A.shape[1:]))[0]
+        formal = np.linalg.pinv(self.A.sum(axis=0), hermitian=True)
+        M = np.linalg.solve(formal[np.ix_(of, of)], C[np.ix_(of, of)])
+        trace, square = float(np.trace(M)), float(np.trace(M @ M))
+        return float(stats.chi2.sf(2.0 * max(gain, 0.0) * trace / square, trace**2 / square))
+
     @property
     def unsure(self) -> FloatArray:
         """How much less sure the parameters (29,) are than is of use: above 1 they are not told; 0 of what is not free.

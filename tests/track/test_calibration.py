@@ -24,6 +24,7 @@ from rstrack.calibration.run import calibrate, parameters_of
 from rstrack.calibration.unknowns.parameters import (
     COUNT,
     DRIFT,
+    LENSES,
     USEFUL,
 )
 from rstrack.cli.main import main
@@ -56,6 +57,15 @@ def test_a_lens_and_depth_are_put_right(shaken: Dataset) -> None:
     assert found.values.error.offset_m == pytest.approx(0.02, abs=1e-3)
     text = found.text()
     assert "colour fx" in text and "depth offset" in text and "depth's scale cannot be told" in text
+
+
+@pytest.mark.usefixtures("in_one_phase")
+def test_a_lens_that_is_right_is_left_as_it_is(shaken: Dataset) -> None:
+    noisy = replace(shaken, images=NoisyImages(shaken.images, 1.2e-3, 0.01, 1))
+    found = calibrate(noisy, ("readout", "intrinsics"), SHORT, OPTIONS)
+    assert found.kept_lens and not found.asked[LENSES].any() and found.asked[:2].all()
+    assert pytest.approx(shaken.rig.color_camera.K) == found.calibrated().rig.color_camera.K
+    assert "the lens is the file's" in found.text()
 
 
 @pytest.mark.usefixtures("in_one_phase")

@@ -230,6 +230,19 @@ def test_sigmas_are_those_of_the_scatter() -> None:
     assert (sigmas[:2] / formal > 2.0).all() and (sigmas[:2] / formal < 4.6).all() and not sigmas[2:].any()
 
 
+def test_gains_that_chance_makes_are_called_chance() -> None:
+    rng, free, p = np.random.default_rng(2), np.arange(COUNT) < 4, Parameters(0.02, 0.02, 0.0, 0.0, np.eye(4))
+    which = np.arange(COUNT) < 2
+    # Information that counts 50 times too much: what two unknowns gain is 50 halves of a chi-square of two.
+    A, found = np.array([np.diag([4e4, 1e4, 9e4, 1e4])] * 60), []
+    for _ in range(400):
+        b = np.sqrt(50.0 * np.einsum("snn->sn", A)) * rng.standard_normal((60, 4))
+        gain = 0.5 * float((b.sum(axis=0)[:2] ** 2 / np.einsum("snn->n", A)[:2]).sum())
+        found.append(Solution(p, free, A, b, 0.0, 1e-3, 1e-2).chance(gain, which))
+    assert np.mean(np.array(found) < 0.1) == pytest.approx(0.1, abs=0.05)
+    assert np.mean(np.array(found) < 0.5) == pytest.approx(0.5, abs=0.08)
+
+
 def test_a_spline_like_another_passes_through_its_poses() -> None:
     track = shaking()
     made = like(track, -0.013, 0.025, 44)

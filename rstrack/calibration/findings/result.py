@@ -90,7 +90,8 @@ class Calibration:
 
     residuals: of a few stretches, with the values before along the first track, and with those found. pace: by the
     first track.
-    device_notes: what became of what is published of the device, if one was named.
+    device_notes: what became of what is published of the device, if one was named. kept_lens: another was asked for,
+    but explains the images no better than the file's.
     """
 
     dataset: Dataset
@@ -103,6 +104,7 @@ class Calibration:
     residuals: tuple[Residuals, Residuals]
     pace: Pace
     device_notes: tuple[str, ...] = ()
+    kept_lens: bool = False
 
     @property
     def undetermined(self) -> BoolArray:
@@ -339,6 +341,8 @@ class Calibration:
         if self.dataset.rig.is_registered and sigma > 0.0 and readout > 2.0 * sigma:
             far = f"{readout / sigma:.0f} sigma"
             notes.append(f"registered depth has kept its rows' times: one time for all of them is {far} off")
+        if self.kept_lens:
+            notes.append("the lens is the file's: another explains these images no better than chance does")
         if self.asked[2]:
             notes.append("a delay of both streams alike cannot be told from images: offsets are against depth's stamps")
         if self.asked[DEPTH_ERROR].any():

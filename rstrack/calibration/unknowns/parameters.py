@@ -36,6 +36,8 @@ COUNT, POSES = len(NAMES), len(_POSES)
 DRIFT = NAMES.index("color.drift")
 EXTRINSICS = slice(DRIFT + 1, POSES)
 DEPTH_LENS, COLOR_LENS = slice(POSES, POSES + len(LENS)), slice(POSES + len(LENS), POSES + 2 * len(LENS))
+LENSES = np.isin(np.arange(COUNT), np.r_[DEPTH_LENS, COLOR_LENS])
+"""Which of the unknowns (29,) are lenses'."""
 DEPTH_ERROR = slice(POSES + 2 * len(LENS), COUNT)
 
 _SIZES: tuple[tuple[Group, int], ...] = (
