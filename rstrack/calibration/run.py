@@ -99,8 +99,7 @@ def calibrate(
     if not dataset.scan_named and "readout" in groups:
         dataset = _oriented(dataset, parts, track.spline, start, options, progress)
     terms, stretches = _loaded(dataset, parts, track.spline, start, free, options, progress)
-    looked_at = some_of(stretches)
-    residuals = residuals_at(looked_at, terms, start)
+    residuals = residuals_at(some_of(stretches), terms, start)
     before = replace(before, values=start)
     known = before.with_lenses() if "intrinsics" in groups else before
     coarse = solve(stretches, terms, start, free, _COARSE, _watch(progress, 0.15), known)
@@ -124,7 +123,7 @@ def calibrate(
     motion = motion_of(dataset, parts, track.spline)
     notes = device_notes(device, before, known, solution.sigmas) if device else ()
     pace = pace_of(dataset, track.frames(dataset, chosen), track.spline)
-    both, seconds = (residuals, residuals_now(looked_at)), time.perf_counter() - begun
+    both, seconds = (residuals, residuals_now(some_of(stretches))), time.perf_counter() - begun
     return Calibration(dataset, start, solution, free, tuple(parts), motion, seconds, both, pace, notes, kept_lens)
 
 

@@ -74,7 +74,7 @@ class Solution:
     def covariance(self) -> FloatArray:
         """Covariance (29, 29), to which `sigmas` belong; 0 of what is not free."""
         known = self.known[np.ix_(self.free, self.free)]
-        C, _, _ = _posterior(self.A, self.b, known)
+        C, _, _ = posterior(self.A, self.b, known)
         factor = float(stats.t.ppf(0.975, max(1.0, len(self.b) - 1.0))) / 1.96
         formal = np.sqrt(np.maximum(np.diag(C), 1e-300))
         bound = np.sqrt(np.divide(1.0, np.diag(known), out=np.full(len(C), np.inf), where=np.diag(known) > 0.0))
@@ -87,11 +87,11 @@ class Solution:
         """How often freeing `which` (29,) of the unknowns makes images more likely by as much, though none is needed.
 
         gain: of the log-likelihood, which counts far too much. Twice that is then a sum of squares of normals, each
-        times an eigenvalue of [(A⁻¹)]⁻¹ [A⁻¹ N A⁻¹] of these unknowns (Kent, Biometrika 1982), here by its first two
-        moments (Satterthwaite).
+        times an eigenvalue of (A⁻¹)⁻¹ (A⁻¹ N A⁻¹), both of these unknowns' blocks (Kent, Biometrika 1982), here by its
+        first two moments (Satterthwaite, Biometrics 1946). N: see `posterior`.
         """
         of = which[self.free]
-        C = _posterior(self.A, self.b, np.zeros(self.A.shape[1:]))[0]
+        C = posterior(self.A, self.b, np.zeros(self.A.shape[1:]))[0]
         formal = np.linalg.pinv(self.A.sum(axis=0), hermitian=True)
         M = np.linalg.solve(formal[np.ix_(of, of)], C[np.ix_(of, of)])
         trace, square = float(np.trace(M)), float(np.trace(M @ M))
@@ -193,7 +193,7 @@ def _step(
     A, b = _of_free(reduced, free)
     weak, information = np.diag(PRIOR[free] ** -2.0), known.information[np.ix_(free, free)]
     drawn = weak @ p.since(start)[free] + information @ p.since(known.values)[free]
-    C, gain, counted = _posterior(A, b, weak + information)
+    C, gain, counted = posterior(A, b, weak + information)
     step = np.zeros(COUNT)
     if acceleration is None:
         step[free] = -C @ (gain @ b.sum(axis=0) + drawn)
@@ -209,7 +209,7 @@ def _of_free(reduced: Sequence[tuple[FloatArray, FloatArray]], free: BoolArray) 
     return np.array([A[np.ix_(free, free)] for A, _ in reduced]), np.array([b[free] for _, b in reduced])
 
 
-def _posterior(A: FloatArray, b: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+def posterior(A: FloatArray, b: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray, float]:
     """Covariance (n, n) of parameters by stretches' A (s, n, n) and b (s, n) and a prior's information (n, n); what
     the gradient counts for beside the prior's (n, n): A N⁻¹, N the covariance of the gradient; and how many times too
     large A is in the mean.

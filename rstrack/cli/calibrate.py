@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 from rsgen.console.command_line import Frames, Json, Quiet
 from rsgen.device.backend import Backend
 from rsgen.errors import UserError
-from rstrack.cli.options import CameraFile, DeviceName, ImuFile, NoiseDepth, NoiseIntensity, Seed, SequenceFolder
+from rstrack.cli.options import CameraFile, DeviceName, ImuFile, NoiseDepth, NoiseIntensity, Seed
 
 if TYPE_CHECKING:
     from rstrack.data.dataset import Dataset
@@ -23,7 +23,9 @@ STATUS = (
 
 
 def calibrate(
-    sequence: SequenceFolder,
+    sequence: Annotated[
+        tuple[Path, ...], "rsgen sequence, TUM RGB-D, ICL-NUIM or 7-Scenes folder; several: recordings of one camera"
+    ],
     *,
     camera: CameraFile = None,
     free: Annotated[
@@ -53,6 +55,7 @@ def calibrate(
     from rsgen.files import atomic_write
     from rstrack.calibration.findings.record import record_of
     from rstrack.calibration.run import calibrate as calibrate_cameras
+    from rstrack.calibration.several import check_alike, together
     from rstrack.calibration.unknowns.devices import device_named
     from rstrack.data.dataset import open_dataset
     from rstrack.data.noise import NoisyImages
@@ -62,9 +65,15 @@ def calibrate(
 
     known = None if device is None else device_named(device)
     groups = None if free is None else tuple(name.strip() for name in free.split(",") if name.strip())
-    dataset = open_dataset(sequence, camera)
+    datasets = [open_dataset(path, camera) for path in sequence]
     if noise_depth or noise_intensity:
-        dataset = replace(dataset, images=NoisyImages(dataset.images, noise_depth, noise_intensity, seed))
+        datasets = [
+            replace(each, images=NoisyImages(each.images, noise_depth, noise_intensity, seed)) for each in datasets
+        ]
+    dataset, first = datasets[0], sequence[0]
+    if len(datasets) > 1 and (report is not None or json or groups == ("imu",)):
+        raise UserError("--report, --json and --free imu: are of one recording: give one")
+    check_alike(datasets)
     if groups is not None and "imu" in groups:
         if groups != ("imu",) or device is not None or report is not None:
             raise UserError(
@@ -73,16 +82,23 @@ def calibrate(
             )
         if imu is not None:
             dataset = dataset.with_imu_file(imu)
-        return _imu(sequence, dataset, run, frames or slice(None), Options(backend=backend), out, json, quiet)
+        return _imu(first, dataset, run, frames or slice(None), Options(backend=backend), out, json, quiet)
     if run is not None or imu is not None:
         raise UserError("--run and --imu: are for --free imu")
     with ProgressDisplay(quiet) as progress:
-        found = calibrate_cameras(dataset, groups, frames or slice(None), Options(backend=backend), progress, known)
+        each = []
+        for one in datasets:
+            each.append(
+                calibrate_cameras(one, groups, frames or slice(None), Options(backend=backend), progress, known)
+            )
+            if not each[-1].solution.finished:
+                break
+        found = each[-1] if not each[-1].solution.finished else each[0] if len(each) == 1 else together(each)
     if out is not None:
         atomic_write(out, found.camera_file().encode())
     print(dumps(found.as_dict(), indent=2) if json else found.text())
     if out is not None and not json:
-        print(f"{out}: written (rstrack track {sequence} --camera {out} --out RUN)")
+        print(f"{out}: written (rstrack track {first} --camera {out} --out RUN)")
     if report is not None:
         write_page(calibration_page(record_of(found)), report)
         if not json:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from json import dumps
 from typing import Any
 
@@ -91,7 +91,8 @@ class Calibration:
     residuals: of a few stretches, with the values before along the first track, and with those found. pace: by the
     first track.
     device_notes: what became of what is published of the device, if one was named. kept_lens: another was asked for,
-    but explains the images no better than the file's.
+    but explains the images no better than the file's. clocks: of several recordings together, by their folders' names,
+    offset (s) and drift of each one's colour; else empty.
     """
 
     dataset: Dataset
@@ -105,6 +106,7 @@ class Calibration:
     pace: Pace
     device_notes: tuple[str, ...] = ()
     kept_lens: bool = False
+    clocks: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def undetermined(self) -> BoolArray:
@@ -213,21 +215,22 @@ class Calibration:
         """A camera.yaml that `rstrack track` takes, with 2 σ beside each value."""
         rig, found, scans = self.dataset.rig, self._upright(), self._scans()
         beside = self._beside()
-        names = [f"# rstrack calibrate {self.dataset.name}, {len(self.parts)} stretches; ± is 2 sigma"]
+        recordings = " ".join(self.clocks or (self.dataset.name,))
+        names = [f"# rstrack calibrate {recordings}, {len(self.parts)} stretches; ± is 2 sigma"]
         names += [f"# {note}" for note in self._notes()]
         drift = f"\n  drift_ppm: {1e6 * found.color_drift:.3f}{beside[DRIFT]}"
         depth_camera, color_camera = self._cameras()
         color = _stream("color", color_camera, rig.color_shutter, found.color_readout_s, scans[1], beside[COLOR_LENS])
         color += beside[1]
-        clock = f"offset_s: {found.color_offset_s - self.dataset.depth_offset_s:.7f}"
-        timing = self.dataset.timing
-        if timing is not None and timing.is_jittered:
+        timing, clocks, color_clock = self.dataset.timing, [], ""
+        if self.clocks or (timing is not None and timing.is_jittered):
             # Of stamps that are arrival times: every recording has another.
-            if found.color_drift:
-                clock += f", drift_ppm: {1e6 * found.color_drift:.3f}"
-            clocks, color_clock = [f"clocks: {{{dumps(self.dataset.name)}: {{{clock}}}}}{beside[2]}"], ""
+            own = {self.dataset.name: (found.color_offset_s, found.color_drift)}
+            clocks = ["clocks:", *(self._clock(name, *clock) for name, clock in (self.clocks or own).items())]
+            clocks[-1] += beside[2]
         else:
-            clocks, color_clock = [], f"\n  {clock}{beside[2]}" + (drift if found.color_drift else "")
+            color_clock = f"\n  offset_s: {found.color_offset_s - self.dataset.depth_offset_s:.7f}{beside[2]}"
+            color_clock += drift if found.color_drift else ""
         depth = _stream("depth", depth_camera, rig.depth_shutter, found.depth_readout_s, scans[0], beside[DEPTH_LENS])
         depth += beside[0]
         rows = ["  - [" + ", ".join(f"{x:.12g}" for x in row) + "]" for row in found.T_color_depth]
@@ -239,6 +242,10 @@ class Calibration:
             "T_color_depth:" + ("  # " + ", ".join(shown) if self.asked[EXTRINSICS].any() else ""), *rows,
             "sigma: {" + ", ".join(f"{name}: {sigma:.3g}" for name, sigma in self._stated().items()) + "}", "",
         ])  # fmt: skip
+
+    def _clock(self, name: str, offset_s: float, drift: float) -> str:
+        more = f", drift_ppm: {1e6 * drift:.3f}" if drift else ""
+        return f"  {dumps(name)}: {{offset_s: {offset_s - self.dataset.depth_offset_s:.7f}{more}}}"
 
     def _stated(self) -> dict[str, float]:
         """σ of what was found, as a camera file has them: of each kind the largest, lenses' by the colour camera's."""
@@ -343,7 +350,8 @@ class Calibration:
             notes.append(f"registered depth has kept its rows' times: one time for all of them is {far} off")
         if self.kept_lens:
             notes.append("the lens is the file's: another explains these images no better than chance does")
-        if self.asked[2]:
+        notes += [f"colour's clock in {name}: {1e3 * offset:+.3f} ms" for name, (offset, _) in self.clocks.items()]
+        if self.asked[2] or self.clocks:
             notes.append("a delay of both streams alike cannot be told from images: offsets are against depth's stamps")
         if self.asked[DEPTH_ERROR].any():
             notes.append("depth's scale cannot be told from images: path, map and extrinsics grow with it")
