@@ -33,9 +33,7 @@ def check_alike(datasets: Sequence[Dataset]) -> None:
             raise UserError(f"{other.root}: has other cameras than {first.root}: give one --camera for all of them")
     names = [dataset.name for dataset in datasets]
     if len(set(names)) < len(names):
-        raise UserError(
-            f"{', '.join(names)}: recordings of one name, by which their clocks are told: rename them"
-        )
+        raise UserError(f"{', '.join(names)}: recordings of one name, by which their clocks are told: rename them")
 
 
 def together(found: Sequence[Calibration]) -> Calibration:
