@@ -21,7 +21,7 @@ from rstrack.bench.task import Task
 from rstrack.calibration.findings.lens_pixels import displacement_px, rms
 from rstrack.calibration.findings.result import Calibration
 from rstrack.calibration.run import calibrate, parameters_of
-from rstrack.calibration.unknowns.parameters import COLOR_LENS, LENS
+from rstrack.calibration.unknowns.parameters import COLOR_LENS
 from rstrack.data.camera_file import usual
 from rstrack.data.dataset import open_dataset
 
@@ -105,13 +105,12 @@ def _wrong(camera: Camera, rng: np.random.Generator) -> Camera:
 
 def _errors_over_sigma(found: Calibration, true: Camera, task: Task) -> list[float]:
     """Of the lens, the readouts and colour's clock, of those that are told."""
-    lens, cameras = found.calibrated().rig.color_camera, found.solution.covariance[COLOR_LENS, COLOR_LENS]
-    truth = parameters_of(task.dataset)
+    lens, truth = found.calibrated().rig.color_camera, parameters_of(task.dataset)
     bent = (*true.distortion, *(0.0,) * 4)[:4]
     errors = [
         lens.fx / true.fx - 1.0, lens.fy / true.fy - 1.0, (lens.cx - true.cx) / true.fx, (lens.cy - true.cy) / true.fy,
         *(a - b for a, b in zip(lens.distortion, bent, strict=False)),
     ]  # fmt: skip
-    sigmas = np.sqrt(np.diag(cameras))[: len(LENS)]
+    sigmas = np.sqrt(np.diag(found.solution.covariance))[COLOR_LENS]
     clocks = found.values.since(truth)[:3] / np.where(found.sigmas[:3] > 0.0, found.sigmas[:3], np.nan)
     return [float(x) for x in (*(np.array(errors) / sigmas), *clocks) if np.isfinite(x)]

@@ -41,9 +41,12 @@ def together(found: Sequence[Calibration]) -> Calibration:
 
     Their stretches' normal equations stand side by side, each recording's clock eliminated, and are solved once more,
     with the same prior: what one recording does not tell another may. Recordings have clocks of their own still, at the
-    camera that all have found.
+    camera that all have found. Raises UserError: it was read by rows here and by columns there.
     """
     first = found[0]
+    scans = {each.dataset.rig.color_shutter.scan for each in found}
+    if len(scans) > 1:
+        raise UserError(f"{' and '.join(sorted(scans))} were found in different recordings: write 'scan' in the file")
     free = np.logical_or.reduce([each.solution.free for each in found]) & ~_CLOCK
     at, origin = first.values, first.start
     reduced = [_without_clock(each.solution) for each in found]

@@ -93,7 +93,7 @@ def calibrate(
             )
             if not each[-1].solution.finished:
                 break
-        found = each[-1] if not each[-1].solution.finished else each[0] if len(each) == 1 else together(each)
+        found = together(each) if len(each) > 1 and each[-1].solution.finished else each[-1]
     if out is not None:
         atomic_write(out, found.camera_file().encode())
     print(dumps(found.as_dict(), indent=2) if json else found.text())

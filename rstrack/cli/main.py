@@ -171,7 +171,7 @@ def track(
     if found is None and dataset.rig.sigma.k1 >= UNDISTORTED_K1:
         print(
             "the camera file has no distortion, which hardly any camera is without: --calibrate finds lens, clocks and "
-            "readouts first, and often halves errors"
+            "readouts first"
         )
     print(f"{out}: written (rstrack evaluate {sequence} {out}, rstrack plot ...)")
     sys.stdout.flush()

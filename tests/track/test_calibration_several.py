@@ -29,7 +29,8 @@ def calibrated(name: str, true: np.ndarray, own: np.ndarray, sure: np.ndarray, r
     A = root @ root.swapaxes(1, 2)
     b = A @ (own - true)[free] + 0.01 * (A @ rng.standard_normal((8, 4, 1)))[..., 0] * 1e-3
     solution = Solution(START.moved(own), free, A, b, 0.0, 1e-3, 1e-2)
-    dataset: Any = SimpleNamespace(name=name)
+    shutter = SimpleNamespace(scan="top-bottom")
+    dataset: Any = SimpleNamespace(name=name, rig=SimpleNamespace(color_shutter=shutter))
     unused: Any = None
     return Calibration(dataset, START, solution, free, (range(30),), unused, 1.0, unused, unused)
 
@@ -62,15 +63,24 @@ def test_recordings_of_different_cameras_or_of_one_name_are_refused() -> None:
     check_alike([recording("a", 50.0), recording("b", 50.0)])
     with pytest.raises(UserError, match=r"^b: has other cameras than a: give one --camera"):
         check_alike([recording("a", 50.0), recording("b", 51.0)])
+    one = calibrated("one", np.zeros(COUNT), np.zeros(COUNT), np.full(4, 1e3), np.random.default_rng(1))
+    rig = SimpleNamespace(color_shutter=SimpleNamespace(scan="left-right"))
+    with pytest.raises(UserError, match="^left-right and top-bottom were found"):
+        together([one, replace(one, dataset=SimpleNamespace(name="two", rig=rig))])  # type: ignore[arg-type]
     with pytest.raises(UserError, match="of one name"):
         check_alike([recording("a", 50.0), recording("a", 50.0)])
 
 
-def test_what_moves_with_the_camera_is_the_clock_too() -> None:
-    rng, zero = np.random.default_rng(5), np.zeros(COUNT)
-    sure = np.full(4, 1e3)
-    one = calibrated("one", zero, zero, sure, rng)
-    made = together([one, replace(one, dataset=SimpleNamespace(name="two"))])  # type: ignore[arg-type]
-    assert made.clocks["one"] == pytest.approx(made.clocks["two"]) and made.clocks["one"][0] == pytest.approx(
-        0, abs=1e-4
-    )
+def test_a_clock_moves_as_the_camera_that_all_have_found_wants_it() -> None:
+    rng, true = np.random.default_rng(5), np.zeros(COUNT)
+    true[OFFSET] = 0.018
+    weak = calibrated("weak", true, true, np.full(4, 1e2), rng)
+    A = weak.solution.A.sum(axis=0)
+    off = np.zeros(COUNT)
+    off[READOUT] = 0.02
+    off[OFFSET] = -A[1, 0] / A[1, 1] * off[READOUT]  # the best clock for a readout that is wrong
+    assert abs(off[OFFSET]) > 1e-4
+    wrong = replace(weak, solution=replace(weak.solution, values=START.moved(true + off), b=weak.solution.A @ off[AT]))
+    made = together([wrong, calibrated("sure", true, true, np.full(4, 1e5), rng)])
+    assert made.values.since(START)[READOUT] == pytest.approx(0.0, abs=2e-5)
+    assert made.clocks["weak"][0] == pytest.approx(true[OFFSET], abs=2e-5)
