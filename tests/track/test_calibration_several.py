@@ -65,7 +65,7 @@ def test_recordings_of_different_cameras_or_of_one_name_are_refused() -> None:
         check_alike([recording("a", 50.0), recording("b", 51.0)])
     one = calibrated("one", np.zeros(COUNT), np.zeros(COUNT), np.full(4, 1e3), np.random.default_rng(1))
     rig = SimpleNamespace(color_shutter=SimpleNamespace(scan="left-right"))
-    with pytest.raises(UserError, match="^left-right and top-bottom were found"):
+    with pytest.raises(UserError, match=r"^left-right and top-bottom were found"):
         together([one, replace(one, dataset=SimpleNamespace(name="two", rig=rig))])  # type: ignore[arg-type]
     with pytest.raises(UserError, match="of one name"):
         check_alike([recording("a", 50.0), recording("a", 50.0)])
