@@ -35,8 +35,6 @@ class Pulls:
     depth: float
     color: float
     sigmas: tuple[float, float, float] = (np.inf, np.inf, np.inf)
-    depth_spread: float = np.inf
-    color_spread: float = np.inf
     told: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
 
     @property
@@ -63,7 +61,7 @@ def pulls(fresh: Sequence[Observation], state: SplineState) -> Pulls:
     seen = [(o, *steady(o, state)) for o in fresh if o.is_linearised]
     depth, color = [s for s in seen if s[0].is_depth], [s for s in seen if not s[0].is_depth]
     (whole, a), (depth_alone, b), (color_alone, c) = (_pull(some) for some in (seen, depth, color))
-    return Pulls(whole, depth_alone, color_alone, (a, b, c), _spread(depth), _spread(color), _told(seen, state))
+    return Pulls(whole, depth_alone, color_alone, (a, b, c), _told(seen, state))
 
 
 def _told(seen: Sequence[tuple[Observation, FloatArray, FloatArray]], state: SplineState) -> FloatArray:
@@ -86,18 +84,6 @@ def _pull(seen: Sequence[tuple[Observation, FloatArray, FloatArray]]) -> tuple[f
     ends = (twist[:6] - twist[6:], twist[:6] + twist[6:])
     metres = max(np.linalg.norm(end[:3]) + distance * np.linalg.norm(end[3:]) for end in ends)
     return float(metres), float(np.sqrt(max(0.0, float(g @ twist))))
-
-
-def _spread(seen: Sequence[tuple[Observation, FloatArray, FloatArray]]) -> float:
-    """`Pulls.depth_spread` of one term's observations, each with its H (12, 12) and g of `steady`."""
-    if not seen:
-        return float("inf")
-    covariance = np.linalg.inv(np.diag(1.0 / _PRIOR**2) + sum(own for _, own, _ in seen))
-    distance = seen[0][0].ref.median_depth
-    lines = (np.hstack([np.eye(6), side * np.eye(6)]) for side in (-1.0, 1.0))
-    # Rounding may leave less than nothing of what is told best.
-    ends = (np.maximum(np.diag(line @ covariance @ line.T), 0.0).reshape(2, 3).sum(axis=1) for line in lines)
-    return float(max(np.sqrt(shift) + distance * np.sqrt(turn) for shift, turn in ends))
 
 
 def rigid_pull(fresh: Sequence[Observation], state: SplineState) -> tuple[float, float]:

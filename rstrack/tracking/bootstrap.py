@@ -30,7 +30,7 @@ _AFTER_KNOT = 0.1
 def start(track: Track, new: DeviceFrame) -> FrameReport:
     """The first frame. Its depth is enough to begin with: the first colour image often comes a little later."""
     if new.depth_share < LEAST_DEPTH or not (track.options.geometric or new.colors):
-        return track.report(new, fault=Fault.NO_DEPTH)
+        return track.report(new, fault=Fault.NO_START)
     window = _begin(track, new, track.options.knots_s(), track.options.knot_phase)
     track.succession.recent.append(new)
     if new.depth.exposure.lens.lines == 1:

@@ -65,7 +65,7 @@ class Alignment:
             return Fault.NOTHING_SEEN
         if self.shift < _SETTLED_PX:
             return Fault.NONE
-        return Fault.LEFT_OPEN if self.observability < _LEAST_SEEN else Fault.UNSETTLED
+        return Fault.UNKNOWN if self.observability < _LEAST_SEEN else Fault.UNSETTLED
 
     @property
     def is_good(self) -> bool:
@@ -132,7 +132,7 @@ class BaselineTracker:
             self._found(new, np.eye(4))
             self._set_keyframe(new, np.eye(4), None)
         nowhere = Alignment(np.eye(4), float("nan"), 0, 0.0, 0, 0.0, 0.0)
-        return _report(new, nowhere, 1.0, keyframe=not is_lost, fault=Fault.NO_DEPTH if is_lost else Fault.NONE)
+        return _report(new, nowhere, 1.0, keyframe=not is_lost, fault=Fault.NO_START if is_lost else Fault.NONE)
 
     def _track(self, new: DeviceFrame, ref: Reference) -> FrameReport:
         found = self._search(new, ref)

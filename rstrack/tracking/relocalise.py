@@ -22,9 +22,8 @@ from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.store import KeyframeStore
 from rstrack.options import Options
 from rstrack.tracking.judgement.fault import Fault
-from rstrack.tracking.judgement.lost_track import FitHistory, coarseness, doubted, implausible
+from rstrack.tracking.judgement.lost_track import FitHistory, coarseness, implausible
 from rstrack.tracking.judgement.uncertainty import Uncertainty
-from rstrack.tracking.judgement.verdict import verdict
 from rstrack.tracking.moving.leave_out import LeftOut
 from rstrack.tracking.window import LEVELS, Window
 
@@ -106,7 +105,7 @@ class Relocaliser:
         if isinstance(found, Fault):
             return found
         if torn and all(o.is_depth for o in found.fresh):
-            return Fault.UNSURE
+            return Fault.UNKNOWN
         mid = new.depth.exposure.mid_time
         T_found = found.window.spline.pose(mid)
         near = [(window.spline.pose(end), end)]
@@ -155,8 +154,6 @@ class Relocaliser:
             colorless = all(o.is_depth for o in fitting)
             trial, fresh = restarted(), fitting
             solved = trial.solve(fresh, LEVELS, hopeless=self._fits.is_hopeless)
-        if doubted(fresh):
-            solved = trial.solve(fresh, (0,))
         depth = new.depth
         if not self._fits.is_hopeless(fresh):
             # Only now: at a wrong place a good deal would seem to move, and what is left might fit.
@@ -165,14 +162,13 @@ class Relocaliser:
                 fresh, solved, ref.pixels, pulls(fresh, trial.state), True, colorless
             ):
                 depth, solved = left.depth, trial.solve(fresh, (0,))
-        fault, pulled, solved = verdict(
-            self._fits, fresh, solved, trial.state, ref.pixels, True, colorless, lambda: trial.solve(fresh, (0,))
-        )
+        pulled = pulls(fresh, trial.state)
+        fault = self._fits.fault(fresh, solved, ref.pixels, pulled, True, colorless)
         uncertainty = before.found_anew(pulled.information)
         # Depth alone is much alike in many places.
         is_sure = len(fresh) > 1 or _is_sure(fresh[0], denied=bool(new.colors and ref.points))
         if fault or not is_sure or not uncertainty.is_known:
-            return fault or (Fault.LEFT_OPEN if is_sure else Fault.UNSURE)
+            return fault or Fault.UNKNOWN
         return Found(trial, fresh, solved, ref, uncertainty, depth)
 
 

@@ -35,9 +35,8 @@ from rstrack.tracking.bootstrap import bootstrap, fit_knots, start
 from rstrack.tracking.bridging import Bridge
 from rstrack.tracking.frame_report import FrameReport
 from rstrack.tracking.judgement.fault import Fault
-from rstrack.tracking.judgement.innovation import Prediction, weighed
-from rstrack.tracking.judgement.lost_track import draws, implausible, is_settled
-from rstrack.tracking.judgement.verdict import verdict
+from rstrack.tracking.judgement.innovation import Innovation, Prediction, doubt, weighed
+from rstrack.tracking.judgement.lost_track import implausible, is_settled
 from rstrack.tracking.moving.leave_out import LeftOut
 from rstrack.tracking.relocalise import Relocaliser, without_misfits
 from rstrack.tracking.track import Track
@@ -277,32 +276,33 @@ class Tracker:
         seconds = new.stamp - track.found.stamps[-1]
         accelerations = track.accelerations(window, seconds, T_predicted[:3, :3])
         uncertainty, common = track.covariances.uncertainty, track.covariances.common
-        if not young and self._weighs(fresh, ref):
-            state = uncertainty.predicted(seconds, *accelerations)
-            predicted = Prediction.of(led_to, mid, state, track.last_two(new))
-            if weighed(fresh, window.state, predicted, track.covariances.considered(seconds)):
+        state, considered = uncertainty.predicted(seconds, *accelerations), track.covariances.considered(seconds)
+        predicted, innovation = Prediction.of(led_to, mid, state, track.last_two(new)), Innovation()
+        weighs = self._weighs(fresh, ref)
+        if weighs and not young:
+            innovation = weighed(fresh, window.state, predicted, considered)
+            if innovation.inflation > 1.0:
                 solved = window.solve(fresh, (0,), gauge, coupled)
         with track.terms.timer("judgement"):
-            fault, pulled, solved = verdict(
-                fits, on_reference, solved, window.state, ref.pixels, young, colorless,
-                lambda: window.solve(fresh, (0,), gauge, coupled),
-            )  # fmt: skip
+            pulled = pulls(on_reference, window.state)
+            fault = fits.fault(on_reference, solved, ref.pixels, pulled, young, colorless)
             if ref.rolling is None:
                 # A rolling reference moves with what is aligned to it, which tells nothing of the two together.
                 uncertainty = uncertainty.after(seconds, pulled.information, *accelerations)
                 common = track.covariances.after(seconds, uncertainty, on_reference, window.state, pulled)
+            if weighs:
+                more = doubt(innovation, on_reference, window.state, predicted, considered)
+                uncertainty = replace(uncertainty, doubt=more)
         if not fault and implausible(T_predicted, window.spline.pose(mid), gap):
-            fault = Fault.TOO_FAR
+            fault = Fault.MOTION
         elif not fault and not uncertainty.is_known:
-            fault = Fault.LEFT_OPEN
-        elif not fault and young and draws(*track.given(before, window), gap):
-            fault = Fault.DRAWS
+            fault = Fault.UNKNOWN
         if fault:
             track.window = before
             if not led:
                 return self._relocalise(new, fault)
             # Where the camera has turned away from the keyframe meanwhile another one may show what it sees.
-            others = (fault.is_elsewhere or gap > _GAP_S) and not track.succession.is_unfit(new)
+            others = (fault is Fault.NOTHING_SEEN or gap > _GAP_S) and not track.succession.is_unfit(new)
             report = self._relocalise(new, fault, T_predicted) if others else track.report(new, fault=fault)
             if report.lost:
                 self._bridge.put(track, new)
@@ -344,7 +344,7 @@ class Tracker:
         track = self._track
         window, ref = track.known()
         uncertainty = track.covariances.uncertainty
-        found = self._relocaliser.find(new, window, ref, track.found.end, uncertainty, fault.is_pull, T_led)
+        found = self._relocaliser.find(new, window, ref, track.found.end, uncertainty, fault is Fault.MOTION, T_led)
         if isinstance(found, Fault):
             return track.report(new, fault=fault or found)
         # The new piece may need control points of the last frames before: their poses are kept, not their spline.

@@ -187,11 +187,6 @@ class Track:
             self.inertia.shift(drift[newer] - drift[older])
         self._told_by = index
 
-    def given(self, before: Window, after: Window) -> tuple[FloatArray, FloatArray]:
-        """Poses (n, 4, 4) of the frames that still move, before and after a new one has been aligned."""
-        stamps = np.array([max(frame.stamp, before.spline.t_begin) for frame in self.succession.recent])
-        return before.spline.pose(stamps), after.spline.pose(stamps)
-
     def placed(self, new: DeviceFrame, fresh: Sequence[Observation] = (), joined: bool = True) -> None:
         """A frame has been found: its stamp, its brightness, and until when the spline is known."""
         self.found.add(new, joined)

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.tracking.judgement import innovation as module
-from rstrack.tracking.judgement.innovation import Prediction, weighed
+from rstrack.tracking.judgement.innovation import Prediction, doubt, weighed
 
 HALF = 0.015
 LIMIT = float(chi2.ppf(0.999, 12))
@@ -33,7 +33,11 @@ def image(is_depth: bool, R: np.ndarray, off: np.ndarray) -> Any:
         is_depth=is_depth, is_linearised=True, independent=0.5, image=SimpleNamespace(exposure=exposure),
         H=H, g=-H @ off, ref=SimpleNamespace(median_depth=0.0, lens=SimpleNamespace(camera=SimpleNamespace(fx=1e9))),
     )  # fmt: skip
-    o.count_as = lambda independent: setattr(o, "independent", independent)
+
+    def count_as(independent: float) -> None:
+        o.H, o.g, o.independent = (part * independent / o.independent for part in (o.H, o.g, o.independent))
+
+    o.count_as = count_as
     return o
 
 
@@ -62,7 +66,7 @@ def test_chance_alone_is_called_odd_as_seldom_as_the_level_says() -> None:
     draw_P, draw_R = np.linalg.cholesky(P), np.linalg.cholesky(R)
     for _ in range(trials):
         off = draw_P @ rng.normal(size=12) + draw_R @ rng.normal(size=12)
-        odd += weighed([image(True, R, off)], at_rest()[0], predicted(P))
+        odd += weighed([image(True, R, off)], at_rest()[0], predicted(P)).inflation > 1.0
     assert odd <= chi2.ppf(0.999, 2 * (1 + 1)) / 2, "one is expected"
 
 
@@ -73,7 +77,7 @@ def test_what_is_off_counts_so_little_that_its_innovation_is_just_what_may_be(ti
     off = times * np.linalg.cholesky(P) @ rng.normal(size=12)
     one = image(True, R, off)
     assert off @ np.linalg.solve(P + R, off) > LIMIT
-    assert weighed([one], at_rest()[0], predicted(P))
+    assert weighed([one], at_rest()[0], predicted(P)).inflation > 1.0
     factor = 0.5 / one.independent
     assert factor > 1.0
     # What an image leaves open is bounded, which matters where it counts for nothing.
@@ -88,7 +92,7 @@ def test_of_two_that_disagree_it_is_the_one_that_is_further_from_the_prediction(
     wrong = true + 0.03 * np.eye(12)[0]
     depth = image(True, R, wrong if is_depth_off else true)
     color = image(False, R, true if is_depth_off else wrong)
-    assert weighed([depth, color], at_rest()[0], predicted(P))
+    assert weighed([depth, color], at_rest()[0], predicted(P)).inflation > 1.0
     off, good = (depth, color) if is_depth_off else (color, depth)
     assert off.independent < 0.01 and good.independent == 0.5
 
@@ -98,8 +102,9 @@ def test_two_that_agree_are_followed_where_the_prediction_allows_it_and_none_say
     P, R = spread(4e-3, 5e-3, rng), spread(3e-4, 4e-4, rng)
     true = np.linalg.cholesky(P) @ rng.normal(size=12)
     both = [image(True, R, true), image(False, R, true)]
-    assert not weighed(both, at_rest()[0], predicted(P)) and [o.independent for o in both] == [0.5, 0.5]
-    assert not weighed([SimpleNamespace(is_linearised=False)], at_rest()[0], predicted(P))  # type: ignore[list-item]
+    assert weighed(both, at_rest()[0], predicted(P)).inflation == 1.0 and [o.independent for o in both] == [0.5, 0.5]
+    unseen: Any = SimpleNamespace(is_linearised=False)
+    assert weighed([unseen], at_rest()[0], predicted(P)).inflation == 1.0
 
 
 def test_of_images_exposed_at_once_the_last_two_poses_say_where_the_next_one_is() -> None:
@@ -128,7 +133,7 @@ def test_what_a_wrong_calibration_explains_is_not_odd(what: str) -> None:
     by[:6, 0] = 1e-2 * rng.normal(size=6)
 
     def odd(given: Any) -> bool:
-        return weighed([image(True, R, -by[:, 0])], at_rest()[0], predicted(P), given)
+        return weighed([image(True, R, -by[:, 0])], at_rest()[0], predicted(P), given).inflation > 1.0
 
     considered = SimpleNamespace(
         moved=lambda *_: by * (what == "image"), of_keyframe=lambda *_: by[:6] * (what == "keyframe"),
@@ -145,4 +150,35 @@ def test_what_all_images_and_the_prediction_have_in_common_explains_nothing() ->
     considered: Any = SimpleNamespace(
         moved=lambda *_: by, of_keyframe=lambda *_: 0.0 * by[:6], predicted=lambda *_: by
     )  # fmt: skip
-    assert weighed([image(True, R, -by[:, 0])], at_rest()[0], predicted(P), considered)
+    assert weighed([image(True, R, -by[:, 0])], at_rest()[0], predicted(P), considered).inflation > 1.0
+
+
+def sigmas(images: list[Any], P: np.ndarray) -> np.ndarray:
+    """σ (12,) of `doubt` where the camera was found as predicted; in `steady`'s unknowns."""
+    state, prediction = at_rest()[0], predicted(P)
+    return np.asarray(np.sqrt(np.diag(doubt(weighed(images, state, prediction), images, state, prediction))) * BY)
+
+
+def test_images_that_agree_far_from_the_prediction_leave_open_which_is_wrong() -> None:
+    """The camera may have been moved while nothing was seen: a jump of 0.2 m that all images show is no outlier."""
+    rng = np.random.default_rng(17)
+    P, R = spread(3e-3, 3e-3, rng), spread(3e-4, 4e-4, rng)
+    jump = 0.2 * np.eye(12)[0]
+    for images in ([image(True, R, jump)], [image(True, R, jump), image(False, R, jump)]):
+        assert sigmas(images, P)[0] == pytest.approx(0.2, rel=0.05)
+
+
+def test_of_images_that_disagree_the_prediction_says_which_is_wrong() -> None:
+    rng = np.random.default_rng(17)
+    P, R = spread(3e-3, 3e-3, rng), spread(3e-4, 4e-4, rng)
+    images = [image(True, R, 0.2 * np.eye(12)[0]), image(False, R, np.zeros(12))]
+    assert sigmas(images, P)[0] < 0.01
+
+
+def test_a_state_that_is_not_the_filters_mean_is_off_by_as_much() -> None:
+    """Where the spline cannot follow, the camera is not found where its images and the prediction have it."""
+    rng = np.random.default_rng(19)
+    P, R, off = spread(5e-2, 5e-2, rng), spread(3e-4, 4e-4, rng), 0.03 * np.eye(12)[1]
+    both = [image(True, R, off), image(False, R, off)]
+    assert weighed(both, at_rest()[0], predicted(P)).inflation == 1.0
+    np.testing.assert_allclose(sigmas(both, P)[1], P @ np.linalg.solve(P + R / 2, off) @ np.eye(12)[1], rtol=1e-3)

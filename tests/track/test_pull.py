@@ -102,20 +102,6 @@ def test_pulls_are_counted_in_sigmas_of_what_the_images_tell() -> None:
     np.testing.assert_allclose(found.sigmas, [0.5e-3 / one * np.sqrt(2), 3e-3 / one, 2e-3 / one], rtol=0.01)
 
 
-def test_how_far_off_what_is_seen_may_be_by_one_term_alone() -> None:
-    about = np.eye(4)
-    about[:3, 3] = TRUTH.pose(MID)[:3, 3]
-    to_camera = se3.adjoint(se3.inverse(about))
-    # The end of a straight line through nine twists, each known to 1 mm and 1 mrad about the world's origin.
-    share = np.linspace(-1.0, 1.0, len(TIMES))
-    variance = 1e-6 * (1.0 / len(TIMES) + 1.0 / np.sum(share**2)) * np.diag(to_camera @ to_camera.T)
-    shift, turn = np.sqrt(variance.reshape(2, 3).sum(axis=1))
-    found = pulls([sight(kind=OfDepth), sight(weight=4e6)], SplineState(TRUTH))
-    assert found.depth_spread == pytest.approx(shift + DEPTH_M * turn, rel=0.01)
-    assert found.color_spread == pytest.approx(0.5 * found.depth_spread, rel=0.01)
-    assert pulls([sight(kind=OfDepth)], SplineState(TRUTH)).color_spread == np.inf
-
-
 def test_what_images_tell_of_the_pose_is_what_all_their_lines_do() -> None:
     # Every line's twist in the world is known to 1 m and 1 rad; an increment of the pose at mid readout moves them all.
     Ad = se3.adjoint(TRUTH.pose(MID))

@@ -96,7 +96,7 @@ def test_depth_alone_does_not_find_what_was_pulled_from_where_the_motion_led() -
     """Shaken: each frame fits by itself, up to 58 mm off."""
     for fresh, is_found in (([seen("depth")], False), ([seen("color")], True), ([seen("depth"), seen("color")], True)):
         found = told(Sees([away(0.1)], fresh), 0.533, torn=True)
-        assert isinstance(found, Found) if is_found else found is Fault.UNSURE
+        assert isinstance(found, Found) if is_found else found is Fault.UNKNOWN
         assert looked(Sees([away(0.1)], fresh), 0.533)
 
 

@@ -4,12 +4,16 @@ State: the pose [m; rad] in the depth camera's axes at mid readout, and its velo
 image whose errors hang together, which no scatter of its pixels shows (steps of depth on a wall, a lens, clocks), is
 off as a whole: its innovation is too large for its covariance. Its covariance is then inflated until the innovation is
 what it may be (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, 5.4).
+
+But the prediction may be what is wrong: the camera was moved while nothing was seen, or moves as no hand does. Images
+that agree with each other better than with the prediction leave that open. The pose is then one of two, and their
+distance is part of its covariance (a mixture's, as in probabilistic data association, ibid. 6.4).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.linalg
@@ -23,7 +27,7 @@ from rstrack.alignment.observation import Observation
 from rstrack.alignment.pull import steady
 from rstrack.alignment.spline_state import SplineState
 from rstrack.tracking.judgement.common import Considered
-from rstrack.tracking.judgement.uncertainty import SYSTEMATIC_PX
+from rstrack.tracking.judgement.uncertainty import SYSTEMATIC_PX, Uncertainty
 
 # What an innovation of 12 numbers, over its covariance, exceeds by chance once in a thousand times.
 _LIMIT = float(chdtri(12, 1e-3))
@@ -68,19 +72,34 @@ class Prediction:
 class _Measured:
     """What one image says of the state: deviation z (12,) from the prediction and its covariance R (12, 12).
 
-    D (12, m): by how much one σ of each parameter of the calibration changes it more than the prediction.
+    at (12,): the deviation of what was found. D (12, m): by how much one σ of each parameter of the calibration changes
+    z more than the prediction.
     """
 
     observation: Observation
+    at: FloatArray
     z: FloatArray
     R: FloatArray
     D: FloatArray
 
 
+@dataclass(frozen=True)
+class Innovation:
+    """What a frame's images are inflated by against a prediction, 1 where nothing is odd.
+
+    own: what they would be if nothing were predicted, and the state that they would say then, alone (12,), as its
+    deviation from the prediction.
+    """
+
+    inflation: float = 1.0
+    own: float = 1.0
+    alone: FloatArray = field(default_factory=lambda: np.zeros(12))
+
+
 def weighed(
     fresh: Sequence[Observation], state: SplineState, predicted: Prediction, considered: Considered | None = None
-) -> bool:
-    """Let images that are off as a whole count as little as their innovations say; whether there are any.
+) -> Innovation:  # fmt: skip
+    """Let images that are off as a whole count as little as their innovations say.
 
     fresh: a frame's observations, aligned, of a spline in this state. Of two that disagree it is the one that is
     further from the prediction: it is held against the prediction and the others. Then all of them together are held
@@ -88,19 +107,44 @@ def weighed(
     """
     seen = [_measured(o, state, predicted, considered) for o in fresh if o.is_linearised]
     if not seen:
-        return False
+        return Innovation()
     P = predicted.covariance
     odd = max(seen, key=lambda one: float(one.z @ np.linalg.solve(P + one.D @ one.D.T + one.R, one.z)))
     rest = [one for one in seen if one is not odd]
-    off, spread = _expected(odd, P, rest)
-    excess = _inflation(off, spread, odd.R)
-    z, R, D = _combined(replace(odd, R=excess * odd.R), rest)
+    excess = _inflation(*_expected(odd, P, rest), odd.R)
+    z, R, D = _combined([replace(odd, R=excess * odd.R), *rest])
     together = _inflation(z, P + D @ D.T, R)
     for one in seen:
         factor = together * (excess if one is odd else 1.0)
         if factor > 1.0:
             one.observation.count_as(one.observation.independent / factor)
-    return max(excess, together) > 1.0
+    if excess * together == 1.0:
+        return Innovation()
+    own = _inflation(*_expected(odd, Uncertainty().state, rest), odd.R)
+    return Innovation(excess * together, own, _combined([replace(odd, R=own * odd.R), *rest])[0])
+
+
+def doubt(
+    innovation: Innovation, fresh: Sequence[Observation], state: SplineState, predicted: Prediction,
+    considered: Considered | None = None,
+) -> FloatArray:  # fmt: skip
+    """Covariance (12, 12) that the state which was found has beyond the filter's.
+
+    It is not the filter's mean where the spline cannot follow; and what else it may be, each as likely as the inverse
+    of its inflation, makes a mixture. Of observations as they count after `weighed`, aligned again.
+    """
+    seen = [_measured(o, state, predicted, considered) for o in fresh if o.is_linearised]
+    if not seen:
+        return np.zeros((12, 12))
+    P = predicted.covariance
+    z, R, _ = _combined(seen)
+    at = seen[0].at
+    apart = P @ np.linalg.solve(P + R, z) - at
+    total = np.outer(apart, apart)
+    if innovation.inflation > 1.0:
+        off = innovation.alone - at
+        total += max(0.0, 1.0 - innovation.own / innovation.inflation) * np.outer(off, off)
+    return np.asarray(total)
 
 
 def _expected(odd: _Measured, P: FloatArray, rest: Sequence[_Measured]) -> tuple[FloatArray, FloatArray]:
@@ -119,8 +163,9 @@ def _expected(odd: _Measured, P: FloatArray, rest: Sequence[_Measured]) -> tuple
     return odd.z - A @ mean, A @ P @ A.T
 
 
-def _combined(first: _Measured, rest: Sequence[_Measured]) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _combined(seen: Sequence[_Measured]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """z, R and D of images as the solver weighs them: by R alone."""
+    first, *rest = seen
     both, R = np.column_stack([first.z, first.D]), first.R
     for one in rest:
         gain = np.linalg.solve(R + one.R, R).T
@@ -170,4 +215,4 @@ def _measured(
         if not o.is_depth:
             R[:6, :6] += _CLOCK_S**2 * np.outer(velocity, velocity)
         R[6:, 6:] += _READOUT**2 * np.outer(velocity, velocity)
-    return _Measured(o, deviation + moved, 0.5 * (R + R.T), D)
+    return _Measured(o, deviation, deviation + moved, 0.5 * (R + R.T), D)

@@ -47,10 +47,6 @@ _WORST_SHIFT_PX = 2.0
 # and rad/s, and what is always allowed.
 _MOST_ACCELERATION, _MOST_VELOCITY = np.array([100.0, 200.0]), np.array([4.0, 8.0])
 _ALWAYS = np.array([0.05, np.radians(4.0)])
-# How far (m, rad) a new frame may draw those before it from where they were given, in a piece of the track that has
-# just begun (an older one knows better: 17 mm are nothing unusual on fr1_rpy), as many times further as frames come
-# more slowly than 25 a second.
-_MOST_DRAWN, _DRAWN_WITHIN_S = np.array([1e-2, np.radians(1.0)]), 0.04
 _MEMORY = 30
 # How far a frame's images, or one term alone, may pull (see `alignment.pull`) where a piece of the track has just begun
 # and no prediction says whether it is right: so many times the usual, and always so many metres; and so many times the
@@ -62,12 +58,9 @@ _PULL_WHOLE, _PULL_ALONE, _PULL_SIGMAS = (4.0, 6e-3), (7.0, 8e-3), (3.0, 5.0)
 # whatever is usual: where a track begins before a wall, depth alone slides from the first frame on, and that would be
 # usual: 0.25 to 1 m at 14 to 23 σ; where that wall was taken for another place 0.06 to 0.12 m at 6 to 8 σ.
 _MOST_PULL, _PULL_WITHIN = (0.06, 6.0), 2.5
-# Depth's errors hang together over an image, as no count of its pixels shows: where colour tells the motion better than
-# depth, to so many metres, it is believed against what depth says.
-VOUCHES = 1.5e-2
 _USUAL, _FEW = 0.25, 5
-# By how much less than usual an image's pixels tell where that is no chance, and where its lines do not hang together.
-_ODD, _UNSTEADY = 3.0, 10.0
+# By how much less than usual a colour image's pixels tell where its lines do not show one motion.
+_UNSTEADY = 10.0
 # Frames from which on their median says what is best, and the distance (m) below which limits shrink no further.
 _SETTLED, _CLOSE = 15, 0.5
 
@@ -129,18 +122,17 @@ class FitHistory:
             return misfits[0][1]
         if new:
             if self.is_modelled and self._together(fresh, colorless) > _WORST_TOGETHER:
-                return Fault.BOTH_ODD
+                return Fault.MISFIT
             if all(o.is_depth for o in fresh) and any(self._is_doubtful(o) for o in fresh):
-                return Fault.DOUBTFUL
+                return Fault.MISFIT
             if any(_oddness(o) > _UNSTEADY for o in fresh if not o.is_depth):
-                return Fault.UNSTEADY
-            odd = [o.is_depth for o in fresh if o.lin.next_sigma > self._limit(o, _NEW_GROWTH)]
-            if odd:
-                return Fault.ODD_DEPTH if odd[0] else Fault.ODD_COLOR
+                return Fault.MOTION
+            if any(o.lin.next_sigma > self._limit(o, _NEW_GROWTH) for o in fresh):
+                return Fault.MISFIT
         if pulls is not None:
             distance = max(_CLOSE, fresh[0].ref.median_depth)
-            if new and (torn := self._torn(pulls, distance)):
-                return torn
+            if new and self._pulls_away(pulls, distance):
+                return Fault.MOTION
             self._pulls.append(pulls.scaled(distance**-2))
         for o in fresh:
             if o.is_depth:
@@ -158,14 +150,9 @@ class FitHistory:
         is_weak = o.lin.observability < _WEAKLY_SEEN * coarseness(o) ** -2
         return is_weak and o.lin.next_sigma > _WORST_WEAK * self._limit(o)
 
-    def _torn(self, now: Pulls, distance: float) -> Fault:
+    def _pulls_away(self, now: Pulls, distance: float) -> bool:
         """distance (m), `_CLOSE` at least: of what is seen; where noise grows with its square, so do pulls."""
-        if slides(now, distance):
-            return Fault.PULLED
-        far = [self._is_far(name, n, now, distance) for n, name in enumerate(_PULLS)]
-        if any(far[1:]) and np.isfinite([now.depth, now.color]).all():
-            return Fault.DIVIDED
-        return Fault.PULLED if any(far) else Fault.NONE
+        return slides(now, distance) or any(self._is_far(name, n, now, distance) for n, name in enumerate(_PULLS))
 
     def _is_far(self, name: str, n: int, now: Pulls, distance: float) -> bool:
         """Of the pull of that name, the nth: whether it is too far."""
@@ -192,33 +179,18 @@ class FitHistory:
 
     def _misfit(self, o: Observation, expected: int) -> Fault:
         if not o.is_linearised or o.pixels < max(_LEAST_PIXELS, _LEAST_SHARE * expected):
-            return Fault.LITTLE_DEPTH if o.is_depth else Fault.LITTLE_COLOR
+            return Fault.NOTHING_SEEN
         if o.lin.fit < _least_fit(o):
-            return Fault.OTHER_DEPTH if o.is_depth else Fault.OTHER_COLOR
+            return Fault.MISFIT
         if max(o.lin.contrast, _HARMLESS_INTENSITY) < o.lin.next_sigma:
-            return Fault.OTHER_COLOR  # what it is expected to show is not in it
+            return Fault.MISFIT  # what it is expected to show is not in it
         if o.lin.next_sigma > self._limit(o):
-            return Fault.ODD_DEPTH if o.is_depth else Fault.ODD_COLOR
+            return Fault.MISFIT
         return Fault.NONE
 
     def _limit(self, o: Observation, growth: float = _GROWTH) -> float:
         usual, distance = (self._depth, o.ref.median_depth) if o.is_depth else (self._color, 1.0)
         return usual.limit(o.lin.floor, distance, growth)
-
-
-def doubted(fresh: Sequence[Observation]) -> bool:
-    """Let a depth image's pixels count as far as it says itself, where that is far less than usual; whether any does.
-
-    A wall that is seen head-on comes in a few steps of depth, which now and again are off together. Only where colours
-    hold the pose that are not odd themselves: else they may show another place, or the lines may not be where the
-    spline has them.
-    """
-    odd = [o for o in fresh if _oddness(o) > _ODD]
-    if all(o.is_depth for o in fresh) or not all(o.is_depth for o in odd):
-        return False
-    for o in odd:
-        o.count_as(1.0 / o.inflation)
-    return bool(odd)
 
 
 def _oddness(o: Observation) -> float:
@@ -254,10 +226,3 @@ def implausible(T_predicted: FloatArray, T_found: FloatArray, dt: float) -> bool
     off = se3.log(se3.inverse(T_predicted) @ T_found)
     most = _ALWAYS + np.minimum(_MOST_ACCELERATION * dt**2, _MOST_VELOCITY * dt)
     return bool((np.linalg.norm(off.reshape(2, 3), axis=1) > most).any())
-
-
-def draws(T_given: FloatArray, T_now: FloatArray, gap: float) -> bool:
-    """Whether a frame that came gap s after the one before has drawn poses (n, 4, 4) of earlier ones too far from where
-    they were."""
-    moved = np.linalg.norm(se3.log(se3.inverse(T_given) @ T_now).reshape(-1, 2, 3), axis=-1)
-    return bool((moved > _MOST_DRAWN * max(1.0, gap / _DRAWN_WITHIN_S)).any())

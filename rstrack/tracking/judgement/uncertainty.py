@@ -29,20 +29,22 @@ _NOWHERE = np.array([10.0, 10.0, 10.0, 3.0, 3.0, 3.0])
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Of the newest frame. state (12, 12): covariance of pose and velocity against its keyframe.
+    """Of the newest frame. state (12, 12): the filter's covariance of pose and velocity against its keyframe; doubt
+    (12, 12): what they have beyond it, see `innovation.doubt`.
 
     seen (6, 6): what its images say of its pose, the information. drift: for each keyframe by its index the covariance
     (6, 6) of its pose, as left increments in the world.
     """
 
     state: FloatArray = field(default_factory=lambda: _lost())
+    doubt: FloatArray = field(default_factory=lambda: np.zeros((12, 12)))
     seen: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
     drift: dict[int, FloatArray] = field(default_factory=dict)
 
     @property
     def pose(self) -> FloatArray:
         """Covariance (6, 6) of the pose against the keyframe."""
-        return self.state[:6, :6]
+        return np.asarray((self.state + self.doubt)[:6, :6])
 
     def covariance(self, focal_px: float, depth_m: float) -> FloatArray:
         """The same with what is systematic, for a depth camera of such a focal length and things so far away."""
@@ -69,14 +71,14 @@ class Uncertainty:
         angular rate itself, rad/s, where a gyroscope tells it: it does not wander, as what is told by its changes does.
         """
         updated = _told(self.predicted(seconds, accelerations, rate), slice(0, 6), seen)
-        return replace(self, state=0.5 * (updated + updated.T), seen=seen)
+        return replace(self, state=0.5 * (updated + updated.T), seen=seen, doubt=np.zeros((12, 12)))
 
     def predicted(self, seconds: float, accelerations: FloatArray = ACCELERATION, rate: float = np.inf) -> FloatArray:
         """The state's covariance (12, 12) so many seconds later, before any image; arguments as in `after`."""
         F = np.eye(12)
         F[:6, 6:] = seconds * np.eye(6)
         gain = np.concatenate([0.5 * seconds**2 * np.eye(6), seconds * np.eye(6)])
-        predicted = F @ self.state @ F.T + gain @ np.diag(accelerations**2) @ gain.T
+        predicted = F @ (self.state + self.doubt) @ F.T + gain @ np.diag(accelerations**2) @ gain.T
         return _told(predicted, slice(9, 12), np.eye(3) / rate**2)
 
     @classmethod
@@ -86,7 +88,7 @@ class Uncertainty:
 
     def found_anew(self, seen: FloatArray) -> Uncertainty:
         """Of a frame of which nothing is known but what its images (6, 6) say."""
-        return replace(self, state=_lost()).after(0.0, seen)
+        return replace(self, state=_lost(), doubt=np.zeros((12, 12))).after(0.0, seen)
 
     def with_keyframe(self, index: int, before: int, T_world_depth: FloatArray, pose: FloatArray) -> Uncertainty:
         """With a keyframe made of a frame at T_world_depth (4, 4), whose covariance was `pose` against another one."""
