@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rsgen.array_types import FloatArray
-from rstrack.calibration.findings.record import Parameter, Record
+from rstrack.calibration.findings.record import LensMap, Parameter, Record
 from rstrack.charts.chart import COLORS, Line, broken
 
 BLUE, ORANGE = COLORS[:2]
@@ -66,6 +66,41 @@ class StripChart:
     def heading(self) -> str:
         """As a `Chart` has one."""
         return self.title
+
+
+@dataclass(frozen=True)
+class LensChart:
+    """Points of an image at (n, 2), how far the lens has moved them (n, 2), drawn `magnified` times as far, and their
+    2 σ (n,); px."""
+
+    title: str
+    at: FloatArray
+    moved: FloatArray
+    two_sigma: FloatArray
+    magnified: float
+    note: str = ""
+
+    @property
+    def heading(self) -> str:
+        """As a `Chart` has one."""
+        return self.title
+
+
+def lens_charts(record: Record) -> tuple[LensChart, ...]:
+    """Where each lens that was looked for puts points, against what it began with."""
+    return tuple(_lens_chart(name, lens) for name, lens in record.lens_maps.items() if lens.at_px)
+
+
+def _lens_chart(name: str, lens: LensMap) -> LensChart:
+    at, moved = np.array(lens.at_px), np.array(lens.moved_px)
+    longest = float(np.linalg.norm(moved, axis=1).max())
+    spacing = float(np.diff(np.unique(at[:, 0])).min(initial=np.inf))
+    magnified = spacing / longest if np.isfinite(spacing) and longest > 0.0 else 1.0
+    note = (
+        f"From where the lens before had a point of the scene, a dot, to where the new one has it: {longest:.2g} px at "
+        f"most, drawn {magnified:.2g} times as long. Colour: 2 σ of that place."
+    )
+    return LensChart(f"The {name} camera's lens", at, moved, 2.0 * np.array(lens.sigma_px)[:, 0], magnified, note)
 
 
 def change_chart(record: Record) -> ChangeChart:

@@ -8,13 +8,15 @@ from typing import Any
 import numpy as np
 
 from rsgen.array_types import FloatArray
-from rstrack.charts.calibration import ChangeChart, Moved, StripChart
+from rstrack.charts.calibration import ChangeChart, LensChart, Moved, StripChart
 from rstrack.charts.chart import COLORS, TRUE_COLOR
 
 # Heights in pixels: of a row, of an axis with its title below rows, of a curve and what is above it, and the margins.
 _ROW, _AXIS, _CURVE, _GAP, _TOP, _BOTTOM = 36, 52, 92, 20, 12, 50
 # Seen on white and on black, and text of the page's colour on it.
 _STRIP_COLORS = [[0.0, "rgba(42,127,201,0.05)"], [1.0, "rgba(42,127,201,0.75)"]]
+# Of the picture of a lens: its height, px.
+_LENS = 460
 # Characters after which a row's name goes on in a second line.
 _LONG = 18
 
@@ -27,6 +29,37 @@ def change_height(chart: ChangeChart) -> int:
 def strip_height(chart: StripChart) -> int:
     """Of its figure, px."""
     return _TOP + len(chart.names) * _ROW + len(chart.curves) * (_CURVE + _GAP) + _BOTTOM
+
+
+def lens_height(_: LensChart) -> int:
+    """Of its figure, px."""
+    return _LENS
+
+
+def lens_figure(chart: LensChart) -> dict[str, Any]:
+    """A line from each point to where it has moved, and a dot at its beginning with the colour of its 2 σ."""
+    ends = chart.at + chart.magnified * chart.moved
+    between = np.full(len(chart.at), np.nan)
+    x, y = (np.stack([chart.at[:, k], ends[:, k], between], axis=1).ravel() for k in (0, 1))
+    lines = {
+        "type": "scatter", "mode": "lines", "x": _gaps(x), "y": _gaps(y), "hoverinfo": "skip", "showlegend": False,
+        "line": {"color": TRUE_COLOR, "width": 1.6},
+    }  # fmt: skip
+    length = np.linalg.norm(chart.moved, axis=1)
+    dots = {
+        "type": "scatter", "mode": "markers", "x": _gaps(chart.at[:, 0]), "y": _gaps(chart.at[:, 1]),
+        "showlegend": False,
+        "marker": {"size": 7, "color": _gaps(chart.two_sigma), "colorscale": "Viridis", "cmin": 0.0,
+                   "colorbar": {"title": {"text": "2 σ, px"}, "thickness": 12}},
+        "text": [f"{a:.2f} ± {b:.2f} px" for a, b in zip(length, chart.two_sigma, strict=True)],
+        "hovertemplate": "(%{x:.0f}, %{y:.0f}): moved by %{text}<extra></extra>",
+    }  # fmt: skip
+    layout = _layout()
+    layout["xaxis"] = {"title": {"text": "x, px"}, "zeroline": False, "fixedrange": True}
+    layout["yaxis"] = {
+        "title": {"text": "y, px"}, "zeroline": False, "fixedrange": True, "autorange": "reversed", "scaleanchor": "x",
+    }  # fmt: skip
+    return {"data": [lines, dots], "layout": layout}
 
 
 def change_figure(chart: ChangeChart) -> dict[str, Any]:
@@ -63,7 +96,7 @@ def strip_figure(chart: StripChart) -> dict[str, Any]:
     for n, (unit, line) in enumerate(chart.curves, 1):
         top = bottom - _GAP / inner
         bottom = top - _CURVE / inner
-        x, y = ([_short(v) if np.isfinite(v) else None for v in values.tolist()] for values in (line.x, line.y))
+        x, y = _gaps(line.x), _gaps(line.y)
         data.append({
             "type": "scatter", "mode": "lines", "name": line.name, "x": x, "y": y, "yaxis": _axis("y", n),
             "line": {"color": line.color, "width": 1.4},
@@ -152,6 +185,10 @@ def _axis(name: str, n: int) -> str:
 def _two_lines(name: str) -> str:
     head, comma, rest = name.partition(", ")
     return f"{head},<br>{rest}" if comma and len(name) > _LONG else name
+
+
+def _gaps(values: FloatArray) -> list[float | None]:
+    return [_short(v) if np.isfinite(v) else None for v in values.tolist()]
 
 
 def _short(value: float) -> float:

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from rsgen.geometry.so3 import FloatArray
-from rstrack.charts.calibration import ChangeChart, StripChart
-from rstrack.charts.calibration_to_page import change_figure, strip_figure
+from rstrack.charts.calibration import ChangeChart, LensChart, StripChart
+from rstrack.charts.calibration_to_page import change_figure, lens_figure, strip_figure
 from rstrack.charts.chart import CameraPath, Chart, Line, PathChart, broken
 
 Figure = dict[str, Any]
@@ -20,12 +20,14 @@ _LEGEND: dict[str, Any] = {"orientation": "h", "x": 0, "y": 1.02, "yanchor": "bo
 _LEGEND_3D: dict[str, Any] = {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "top"}
 
 
-def figure_of(chart: Chart | PathChart | ChangeChart | StripChart, points: int) -> Figure:
+def figure_of(chart: Chart | PathChart | ChangeChart | StripChart | LensChart, points: int) -> Figure:
     """points: at most so many of each line and path."""
     if isinstance(chart, ChangeChart):
         return change_figure(chart)
     if isinstance(chart, StripChart):
         return strip_figure(chart)
+    if isinstance(chart, LensChart):
+        return lens_figure(chart)
     return _paths(chart, points) if isinstance(chart, PathChart) else _chart(chart, points)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 from rsgen.console.tables import Entry, Table, fixed, significant
 from rstrack.calibration.findings.record import Change, Parameter, Record
-from rstrack.charts.calibration import change_chart, strip_chart
+from rstrack.charts.calibration import change_chart, lens_charts, strip_chart
 from rstrack.report.page import Block, Card, CardRow, Note, Page, Plot, Section, TextFile
 
 _BEFORE = (
@@ -103,7 +103,9 @@ def _values(record: Record) -> tuple[Block, ...]:
     rows = tuple(_row(p) for p in record.parameters.values())
     notes = (Note(f"{text[0].upper()}{text[1:]}.") for text in record.notes)
     lenses = (Note(f"{name.capitalize()} lens: {text}.") for name, text in record.lenses_px.items())
-    return Table(head, rows, "Found, and where it began"), Note(_SIGMA), *lenses, *notes, Plot(change_chart(record))
+    pictures = (Plot(chart) for chart in lens_charts(record))
+    table = Table(head, rows, "Found, and where it began")
+    return table, Note(_SIGMA), *lenses, *notes, Plot(change_chart(record)), *pictures
 
 
 def _row(p: Parameter) -> tuple[Entry | str, ...]:

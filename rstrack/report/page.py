@@ -12,8 +12,8 @@ from importlib.resources import files
 from typing import Any, Literal
 
 from rsgen.console.tables import Table
-from rstrack.charts.calibration import ChangeChart, StripChart
-from rstrack.charts.calibration_to_page import change_height, strip_height
+from rstrack.charts.calibration import ChangeChart, LensChart, StripChart
+from rstrack.charts.calibration_to_page import change_height, lens_height, strip_height
 from rstrack.charts.chart import Chart, PathChart
 from rstrack.charts.to_page import Figure, figure_of
 from rstrack.data.estimate import plain
@@ -44,7 +44,7 @@ class CardRow:
 class Plot:
     """A chart of at most so many points a line. Paths are drawn from above where the browser has no WebGL."""
 
-    chart: Chart | PathChart | ChangeChart | StripChart
+    chart: Chart | PathChart | ChangeChart | StripChart | LensChart
     points: int = 1500
     block: Literal["plot"] = "plot"
 
@@ -58,6 +58,8 @@ class Plot:
         """In px where it goes by the number of rows."""
         if isinstance(self.chart, ChangeChart):
             return change_height(self.chart)
+        if isinstance(self.chart, LensChart):
+            return lens_height(self.chart)
         return strip_height(self.chart) if isinstance(self.chart, StripChart) else None
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rsgen.geometry.camera import Camera
-from rstrack.calibration.findings.lens_pixels import displacement_px, rms, sigma_px
+from rstrack.calibration.findings.lens_pixels import displacement_px, lens_map, rms, sigma_px
 from rstrack.calibration.unknowns.parameters import LENS, changed
 
 BENT = Camera(640, 480, 525.0, 524.0, 318.0, 241.0, "radtan", (0.1, -0.2, 1e-3, -2e-3, 0.0))
@@ -32,3 +32,13 @@ def test_sigma_of_points_is_what_drawn_lenses_scatter_by() -> None:
     inside = np.isfinite(scatter)
     np.testing.assert_allclose(sigma_px(BENT, root @ root.T)[inside], scatter[inside], rtol=0.15)
     assert np.count_nonzero(inside) > 500
+
+
+def test_a_picture_has_some_of_the_points_each_with_its_displacement_and_sigma() -> None:
+    moved = replace(BENT, cx=BENT.cx + 2.0)
+    shown = lens_map(BENT, moved, 1e-6 * np.eye(len(LENS)))
+    at, by, sigma = (np.array(shown[name]) for name in ("at_px", "moved_px", "sigma_px"))
+    assert at.shape == by.shape == (16 * 12, 2) and sigma.shape == (16 * 12, 1)
+    assert set(at[:, 0]) == set(range(0, 640, 40)) and set(at[:, 1]) == set(range(0, 480, 40))
+    np.testing.assert_allclose(by, [[2.0, 0.0]] * len(by), atol=1e-3)
+    assert (sigma > 0.5).all() and sigma[0] > sigma[len(sigma) // 2 + 8]

@@ -43,6 +43,19 @@ def test_values_stand_beside_their_starts_in_units_that_are_read(tmp_path: Path)
     assert max(v for v in strips["data"][2]["y"] if v) == pytest.approx(np.degrees(0.5), rel=1e-3)
 
 
+def test_a_lens_is_drawn_by_where_it_puts_points(tmp_path: Path) -> None:
+    points = [[0.0, 0.0], [40.0, 0.0], [0.0, 40.0], [40.0, 40.0]]
+    moved = [[4.0, 0.0], [0.0, -8.0], [2.0, 2.0], [0.0, 0.0]]
+    lens = {"at_px": points, "moved_px": moved, "sigma_px": [[0.1], [0.2], [0.3], [0.4]]}
+    figure = page(tmp_path, calibration() | {"lens_maps": {"colour": lens}}).figures[1]
+    lines, dots = figure["data"]
+    # Five times as long as they are, so that the longest reaches the next point.
+    assert lines["x"] == [0, 20, None, 40, 40, None, 0, 10, None, 40, 40, None]
+    assert lines["y"] == [0, 0, None, 0, -40, None, 40, 50, None, 40, 40, None]
+    assert dots["marker"]["color"] == [0.2, 0.4, 0.6, 0.8] and dots["text"][1] == "8.00 ± 0.40 px"
+    assert figure["layout"]["yaxis"]["autorange"] == "reversed"
+
+
 def test_curves_are_broken_where_the_track_was_lost(tmp_path: Path) -> None:
     data = calibration()
     data["pace"] = {"time_s": [0, 0.1, 0.2, 3.0, 3.1], "m_s": [1] * 5, "rad_s": [0] * 5}

@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from rsgen.array_types import FloatArray
+from rsgen.array_types import BoolArray, FloatArray
 from rsgen.geometry.camera import Camera
 from rstrack.calibration.unknowns.parameters import LENS, changed
 
 # Points looked at: every so many px of a 640 px wide image, in both directions.
 _EVERY = 20
 _STEP = 1e-5
+# Of these points one in so many, in both directions, is in a picture of the lens.
+_PICTURED = 2
 
 
 def displacement_px(before: Camera, after: Camera) -> FloatArray:
@@ -41,6 +43,20 @@ def rms(pixels: FloatArray) -> float:
     """Root mean square length of displacements (n, 2) or of lengths (n,), over those that there are."""
     squares = np.square(pixels) if pixels.ndim == 1 else np.square(pixels).sum(axis=1)
     return float(np.sqrt(np.nanmean(squares)))
+
+
+def lens_map(before: Camera, after: Camera, covariance: FloatArray) -> dict[str, list[list[float]]]:
+    """For JSON: points [x, y] of the image of `before`, how far they have moved, [x, y], and σ of that, [σ]; px."""
+    pixels, moved, sigma = _grid(before), displacement_px(before, after), sigma_px(after, covariance)
+    kept = _pictured(pixels) & np.isfinite(moved).all(axis=1) & np.isfinite(sigma)
+    parts = {"at_px": pixels, "moved_px": moved, "sigma_px": sigma[:, None]}
+    return {name: np.round(values[kept], 3).tolist() for name, values in parts.items()}
+
+
+def _pictured(pixels: FloatArray) -> BoolArray:
+    """Which of a grid's points (n, 2) are in a picture."""
+    of_axis = (np.unique(values, return_inverse=True)[1] % _PICTURED == 0 for values in pixels.T)
+    return np.logical_and(*of_axis)
 
 
 def _grid(camera: Camera) -> FloatArray:

@@ -70,6 +70,20 @@ class StoredPace(_Stored):
     rad_s: tuple[_Positive, ...]
 
 
+class LensMap(_Stored):
+    """Points of an image (n, 2), how far a lens has moved them (n, 2), and σ of that (n, 1); px."""
+
+    at_px: tuple[tuple[_Finite, _Finite], ...]
+    moved_px: tuple[tuple[_Finite, _Finite], ...]
+    sigma_px: tuple[tuple[_Positive], ...]
+
+    @model_validator(mode="after")
+    def _fits(self) -> LensMap:
+        if not len(self.at_px) == len(self.moved_px) == len(self.sigma_px):
+            raise ValueError("lens_maps: every point must have a displacement and a sigma")
+        return self
+
+
 class Record(_Stored):
     """A calibration; `parameters` by name, in the order in which they are shown."""
 
@@ -83,6 +97,7 @@ class Record(_Stored):
     converged: bool
     notes: tuple[str, ...]
     lenses_px: dict[str, str] = {}
+    lens_maps: dict[str, LensMap] = {}
     seconds: _Positive
     camera_file: str
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from json import dumps
 from typing import Any
@@ -14,7 +14,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
-from rstrack.calibration.findings.lens_pixels import displacement_px, rms, sigma_px
+from rstrack.calibration.findings.lens_pixels import displacement_px, lens_map, rms, sigma_px
 from rstrack.calibration.findings.pace import Pace, since_begin
 from rstrack.calibration.findings.residuals import Residuals
 from rstrack.calibration.solve import Solution
@@ -164,14 +164,18 @@ class Calibration:
 
     def _lenses_px(self) -> dict[str, str]:
         """How far the lenses that were asked for put points from where they were, and how well that is known."""
-        before, after = self._changed(self.start), self._cameras()
         found = {}
+        for name, old, new, covariance in self._lenses():
+            moved, sigma = rms(displacement_px(old, new)), rms(sigma_px(new, covariance))
+            found[name] = f"moves points by {moved:.2f} ± {2.0 * sigma:.2f} px (2 sigma; RMS over the image)"
+        return found
+
+    def _lenses(self) -> Iterator[tuple[str, Camera, Camera, FloatArray]]:
+        """Of those that were asked for the name, the lens before and after, and its covariance (8, 8)."""
+        before, after = self._changed(self.start), self._cameras()
         for name, at, old, new in zip(("depth", "colour"), (DEPTH_LENS, COLOR_LENS), before, after, strict=True):
             if self.asked[at].any():
-                moved = rms(displacement_px(old, new))
-                sigma = rms(sigma_px(new, self.solution.covariance[at, at]))
-                found[name] = f"moves points by {moved:.2f} ± {2.0 * sigma:.2f} px (2 sigma; RMS over the image)"
-        return found
+                yield name, old, new, self.solution.covariance[at, at]
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON: values in SI units; sigma None where undetermined.
@@ -207,7 +211,9 @@ class Calibration:
             "motion": {"m_s": self.motion.speed, "rad_s": self.motion.rotation, "rad_s2": self.motion.change},
             "sigma_depth_m": solution.sigma_depth_m, "sigma_intensity": solution.sigma_intensity,
             "finished": solution.finished, "converged": solution.is_settled, "seconds": self.seconds,
-            "lenses_px": self._lenses_px(), "notes": self._notes(), "device": list(self.device_notes),
+            "lenses_px": self._lenses_px(),
+            "lens_maps": {name: lens_map(old, new, C) for name, old, new, C in self._lenses()},
+            "notes": self._notes(), "device": list(self.device_notes),
             "camera_file": self.camera_file(),
         }  # fmt: skip
 
