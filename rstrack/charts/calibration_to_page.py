@@ -55,9 +55,10 @@ def lens_figure(chart: LensChart) -> dict[str, Any]:
         "hovertemplate": "(%{x:.0f}, %{y:.0f}): moved by %{text}<extra></extra>",
     }  # fmt: skip
     layout = _layout()
-    layout["xaxis"] = {"title": {"text": "x, px"}, "zeroline": False, "fixedrange": True}
+    layout["xaxis"] = {"title": {"text": "x, px"}, "zeroline": False, "fixedrange": True, "constrain": "domain"}
     layout["yaxis"] = {
         "title": {"text": "y, px"}, "zeroline": False, "fixedrange": True, "autorange": "reversed", "scaleanchor": "x",
+        "automargin": True,
     }  # fmt: skip
     return {"data": [lines, dots], "layout": layout}
 
