@@ -150,6 +150,15 @@ def test_lost_frames_are_not_what_is_usual() -> None:
     assert fault(history, [term("depth", 6.1e-3)]) == Fault.MISFIT
 
 
+def test_nothing_is_usual_of_a_start_that_failed() -> None:
+    """Regression: a Kinect at rest repeats its steps. When it moved depth fitted ten times worse, and no start was good
+    enough ever after."""
+    history = after("depth", [1e-3] * 15)
+    assert fault(history, [term("depth", 1e-2)]) == Fault.MISFIT
+    history.forget()
+    assert fault(history, [term("depth", 1e-2)]) == ""
+
+
 def test_depth_and_colour_are_remembered_apart() -> None:
     history = FitHistory()
     for _ in range(5):

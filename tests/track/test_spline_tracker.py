@@ -161,7 +161,10 @@ def test_first_frames_that_slide_are_lost_and_the_next_ones_begin_anew(monkeypat
         return looked_at[-1]
 
     monkeypatch.setattr(bootstrap, "slides", slides_once)
-    tracker = feed(tracker_of("rs-g"), (frame_at(k) for k in range(14)))
+    tracker, forgotten = tracker_of("rs-g"), []
+    monkeypatch.setattr(tracker._track.fits, "forget", lambda: forgotten.append(True))
+    feed(tracker, (frame_at(k) for k in range(14)))
+    assert forgotten == [True], "what was usual in them"
     assert [report.fault for report in tracker.reports[:6]] == [*[Fault.NO_START] * 5, Fault.NONE]
     assert lost(tracker) == [0, 1, 2, 3, 4] and tracker.keyframes >= 1 and worst_step(tracker) < 3e-3
 

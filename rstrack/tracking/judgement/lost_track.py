@@ -96,6 +96,10 @@ class FitHistory:
 
     def __init__(self, is_modelled: bool = True) -> None:
         self.is_modelled = is_modelled
+        self.forget()
+
+    def forget(self) -> None:
+        """Nothing is usual yet."""
         self._depth = _Usual(_WORST_DEPTH, _HARMLESS_DEPTH)
         self._color = _Usual(_WORST_INTENSITY, _HARMLESS_INTENSITY)
         self._pulls: deque[Pulls] = deque(maxlen=_MEMORY)
