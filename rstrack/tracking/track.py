@@ -71,7 +71,7 @@ class Track:
         self.begin_anew()
 
     def begin_anew(self) -> None:
-        """Nothing has been found, of what was fed, and nothing is usual: at rest depth repeats its steps and fits too well."""
+        """Nothing has been found, of what was fed, nor is anything usual: at rest depth repeats its steps."""
         self.fits.forget()
         self.window: Window | None = None
         self._told_by = -1
