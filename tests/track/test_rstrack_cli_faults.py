@@ -17,6 +17,7 @@ import rsgen.console.progress
 from rstrack.data.estimate import read_estimate
 from rstrack.data.rig import Frame
 from rstrack.tracking.frame_report import FrameReport
+from rstrack.tracking.judgement.fault import Fault
 from rstrack.tracking.spline_tracker import Tracker
 
 
@@ -160,9 +161,9 @@ def test_lost_frames_are_left_out_and_reported(place: Path, capfd: pytest.Captur
     status, out, _ = run(capfd, "track seq --out r --method rs-g --quiet")
     info, estimate = read_info("r"), read_estimate(Path("r"))
     assert status == 1 and "2 lost" in out and "12 of 14" in out
-    assert "lost because: hardly any depth to begin with (2)" in out
+    assert f"lost because: {Fault.NO_START} (2)" in out
     assert [k for k, frame in enumerate(info["frames"]) if frame["lost"]] == [0, 1]
-    assert [frame["fault"] for frame in info["frames"]] == ["hardly any depth to begin with"] * 2 + [""] * 12
+    assert [frame["fault"] for frame in info["frames"]] == [Fault.NO_START] * 2 + [""] * 12
     assert info["lost"] == 2 and info["end"] == "done" and info["metrics"]["frames_tracked"] == 12
     np.testing.assert_allclose(estimate.stamps, np.arange(2, FRAMES) / 30, atol=1e-6)
     assert not estimate.spline_covers(1.0 / 30) and estimate.spline_covers(5.0 / 30)
