@@ -130,8 +130,8 @@ def doubt(
 ) -> FloatArray:  # fmt: skip
     """Covariance (12, 12) that the state which was found has beyond the filter's.
 
-    It is not the filter's mean where the spline cannot follow. And the state may be what the images have it to be alone,
-    the more likely the less inflation they need then. Of observations as they count after `weighed`, aligned again.
+    It is not the filter's mean where the spline cannot follow. And it may be what the images alone have it to be, the
+    more likely the less inflation they need then. Of observations as they count after `weighed`, aligned again.
     """
     seen = [_measured(o, state, predicted, considered) for o in fresh if o.is_linearised]
     if not seen:
