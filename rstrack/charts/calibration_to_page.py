@@ -15,8 +15,8 @@ from rstrack.charts.chart import COLORS, TRUE_COLOR
 _ROW, _AXIS, _CURVE, _GAP, _TOP, _BOTTOM = 36, 52, 92, 20, 12, 50
 # Seen on white and on black, and text of the page's colour on it.
 _STRIP_COLORS = [[0.0, "rgba(42,127,201,0.05)"], [1.0, "rgba(42,127,201,0.75)"]]
-# Of the picture of a lens: its height, px.
-_LENS = 460
+# Height of the picture of a lens, px.
+LENS_HEIGHT = 460
 # Characters after which a row's name goes on in a second line.
 _LONG = 18
 
@@ -29,11 +29,6 @@ def change_height(chart: ChangeChart) -> int:
 def strip_height(chart: StripChart) -> int:
     """Of its figure, px."""
     return _TOP + len(chart.names) * _ROW + len(chart.curves) * (_CURVE + _GAP) + _BOTTOM
-
-
-def lens_height(_: LensChart) -> int:
-    """Of its figure, px."""
-    return _LENS
 
 
 def lens_figure(chart: LensChart) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from rsgen.console.tables import Table
 from rstrack.charts.calibration import ChangeChart, LensChart, StripChart
-from rstrack.charts.calibration_to_page import change_height, lens_height, strip_height
+from rstrack.charts.calibration_to_page import LENS_HEIGHT, change_height, strip_height
 from rstrack.charts.chart import Chart, PathChart
 from rstrack.charts.to_page import Figure, figure_of
 from rstrack.data.estimate import plain
@@ -59,7 +59,7 @@ class Plot:
         if isinstance(self.chart, ChangeChart):
             return change_height(self.chart)
         if isinstance(self.chart, LensChart):
-            return lens_height(self.chart)
+            return LENS_HEIGHT
         return strip_height(self.chart) if isinstance(self.chart, StripChart) else None
 
 

@@ -7,27 +7,25 @@ from __future__ import annotations
 
 import numpy as np
 
-from rsgen.array_types import BoolArray, FloatArray
+from rsgen.array_types import FloatArray
 from rsgen.geometry.camera import Camera
 from rstrack.calibration.unknowns.parameters import LENS, changed
 
-# Points looked at: every so many px of a 640 px wide image, in both directions.
-_EVERY = 20
+# Points looked at, and those in a picture: every so many px of a 640 px wide image, in both directions.
+_EVERY, _PICTURED = 20, 40
 _STEP = 1e-5
-# Of these points one in so many, in both directions, is in a picture of the lens.
-_PICTURED = 2
 
 
-def displacement_px(before: Camera, after: Camera) -> FloatArray:
+def displacement_px(before: Camera, after: Camera, every: int = _EVERY) -> FloatArray:
     """By how much (n, 2) points that `before` sees all over its image lie elsewhere in that of `after`, NaN outside."""
-    pixels = _grid(before)
+    pixels = _grid(before, every)
     rays = before.backproject(pixels, np.ones(len(pixels)))
     return np.asarray(after.project(rays)[0] - pixels)
 
 
-def sigma_px(camera: Camera, covariance: FloatArray) -> FloatArray:
+def sigma_px(camera: Camera, covariance: FloatArray, every: int = _EVERY) -> FloatArray:
     """σ (n,) of where the lens puts the points of its image, both axes together, by the covariance (8, 8) of LENS."""
-    pixels = _grid(camera)
+    pixels = _grid(camera, every)
     rays = camera.backproject(pixels, np.ones(len(pixels)))
     slopes = []
     for i in range(len(LENS)):
@@ -47,18 +45,12 @@ def rms(pixels: FloatArray) -> float:
 
 def lens_map(before: Camera, after: Camera, covariance: FloatArray) -> dict[str, list[list[float]]]:
     """For JSON: points [x, y] of the image of `before`, how far they have moved, [x, y], and σ of that, [σ]; px."""
-    pixels, moved, sigma = _grid(before), displacement_px(before, after), sigma_px(after, covariance)
-    kept = _pictured(pixels) & np.isfinite(moved).all(axis=1) & np.isfinite(sigma)
-    parts = {"at_px": pixels, "moved_px": moved, "sigma_px": sigma[:, None]}
-    return {name: np.round(values[kept], 3).tolist() for name, values in parts.items()}
+    moved, sigma = displacement_px(before, after, _PICTURED), sigma_px(after, covariance, _PICTURED)
+    known = np.isfinite(moved).all(axis=1) & np.isfinite(sigma)
+    parts = {"at_px": _grid(before, _PICTURED), "moved_px": moved, "sigma_px": sigma[:, None]}
+    return {name: np.round(values[known], 3).tolist() for name, values in parts.items()}
 
 
-def _pictured(pixels: FloatArray) -> BoolArray:
-    """Which of a grid's points (n, 2) are in a picture."""
-    of_axis = (np.unique(values, return_inverse=True)[1] % _PICTURED == 0 for values in pixels.T)
-    return np.logical_and(*of_axis)
-
-
-def _grid(camera: Camera) -> FloatArray:
-    every = max(1, round(_EVERY * camera.width / 640))
-    return np.asarray(camera.pixel_grid()[::every, ::every].reshape(-1, 2))
+def _grid(camera: Camera, every: int) -> FloatArray:
+    step = max(1, round(every * camera.width / 640))
+    return np.asarray(camera.pixel_grid()[::step, ::step].reshape(-1, 2))

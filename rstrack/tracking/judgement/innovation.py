@@ -88,12 +88,13 @@ class Innovation:
     """What a frame's images are inflated by against a prediction, 1 where nothing is odd.
 
     own: what they would be if nothing were predicted, and the state that they would say then, alone (12,), as its
-    deviation from the prediction.
+    deviation from the prediction. measured: where nothing is odd, what each image says, which `doubt` asks for again.
     """
 
     inflation: float = 1.0
     own: float = 1.0
     alone: FloatArray = field(default_factory=lambda: np.zeros(12))
+    measured: tuple[_Measured, ...] = ()
 
 
 def weighed(
@@ -119,7 +120,7 @@ def weighed(
         if factor > 1.0:
             one.observation.count_as(one.observation.independent / factor)
     if excess * together == 1.0:
-        return Innovation()
+        return Innovation(measured=tuple(seen))
     own = _inflation(*_expected(odd, Uncertainty().state, rest), odd.R)
     return Innovation(excess * together, own, _combined([replace(odd, R=own * odd.R), *rest])[0])
 
@@ -131,9 +132,13 @@ def doubt(
     """Covariance (12, 12) that the state which was found has beyond the filter's.
 
     It is not the filter's mean where the spline cannot follow. And it may be what the images alone have it to be, the
-    more likely the less inflation they need then. Of observations as they count after `weighed`, aligned again.
+    more likely the less inflation they need then. Of observations as they count after `weighed`, aligned again if any
+    is odd.
     """
-    seen = [_measured(o, state, predicted, considered) for o in fresh if o.is_linearised]
+    known = {id(one.observation): one for one in innovation.measured}
+    seen = [
+        known.get(id(o)) or _measured(o, state, predicted, considered) for o in fresh if o.is_linearised
+    ]  # fmt: skip
     if not seen:
         return np.zeros((12, 12))
     P = predicted.covariance

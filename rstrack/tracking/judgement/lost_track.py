@@ -129,7 +129,7 @@ class FitHistory:
                 return Fault.MISFIT
             if all(o.is_depth for o in fresh) and any(self._is_doubtful(o) for o in fresh):
                 return Fault.MISFIT
-            if any(_oddness(o) > _UNSTEADY for o in fresh if not o.is_depth):
+            if any(o.inflation * o.independent > _UNSTEADY for o in fresh if not o.is_depth):
                 return Fault.MOTION
             if any(o.lin.next_sigma > self._limit(o, _NEW_GROWTH) for o in fresh):
                 return Fault.MISFIT
@@ -195,11 +195,6 @@ class FitHistory:
     def _limit(self, o: Observation, growth: float = _GROWTH) -> float:
         usual, distance = (self._depth, o.ref.median_depth) if o.is_depth else (self._color, 1.0)
         return usual.limit(o.lin.floor, distance, growth)
-
-
-def _oddness(o: Observation) -> float:
-    """How many times less than usual an image's pixels tell; NaN where it cannot be told."""
-    return o.inflation * o.independent if o.is_linearised else float("nan")
 
 
 def coarseness(o: Observation) -> float:
