@@ -24,7 +24,7 @@ from rstrack.calibration.findings.pace import pace_of
 from rstrack.calibration.findings.residuals import residuals_at, residuals_now, some_of
 from rstrack.calibration.findings.result import Calibration, motion_of
 from rstrack.calibration.first_track import Track, first_track
-from rstrack.calibration.pairs.load import like, load_stretch, pair_terms
+from rstrack.calibration.pairs.load import load_stretch, pair_terms
 from rstrack.calibration.pairs.stretch import Stretch
 from rstrack.calibration.pairs.terms import PairTerms
 from rstrack.calibration.pairs.trust import trust_in
@@ -57,9 +57,9 @@ _DRAGS = 0.5
 _COARSE, _FINE = (2,), (0,)
 # See `trust_in`: 0.83 to 0.99 where there is something to see, with a Kinect's noise too, below 0.3 on bare walls.
 _TRUST = 0.5
-# Ways in which images may be read, and stretches with which they are tried.
+# Ways in which images may be read, stretches with which they are tried, and steps at most.
 _AXES: tuple[Scan, ...] = ("top-bottom", "left-right")
-_TRIED = 2
+_TRIED, _TRIED_STEPS = 2, 5
 # Unknowns of a lens that are its distortion, of radial-tangential ones.
 _COEFFICIENTS = 4
 # Of a lens that is no better than the file's to be taken for one, the level of the tracker's tests.
@@ -96,9 +96,12 @@ def calibrate(
     track = first_track(dataset, chosen, options, progress)
     parts = _stretches(dataset, chosen, track)
     free = _free(dataset, groups, parts)
+    terms = pair_terms(engine(options.backend), dataset, free)
+    stretches = _loaded(dataset, terms, parts, track.spline, start, options, progress)
     if not dataset.scan_named and "readout" in groups:
-        dataset = _oriented(dataset, parts, track.spline, start, options, progress)
-    terms, stretches = _loaded(dataset, parts, track.spline, start, free, options, progress)
+        dataset = _oriented(dataset, stretches, start, options, progress)
+        terms = pair_terms(engine(options.backend), dataset, free)
+        stretches = [each.read_by(terms) for each in stretches]
     residuals = residuals_at(some_of(stretches), terms, start)
     before = replace(before, values=start)
     known = before.with_lenses() if "intrinsics" in groups else before
@@ -116,8 +119,6 @@ def calibrate(
     if solution.finished and solution.free[LENSES].any():
         stretches, solution, kept_lens = _paid(stretches, terms, known, solution, progress)
         free[LENSES] &= not kept_lens
-    if solution.finished:
-        solution = _at_other_knots(stretches, terms, known, solution, progress)
     progress("calibrating", 1.0, "done")
     free[DRIFT] &= drifts
     motion = motion_of(dataset, parts, track.spline)
@@ -128,36 +129,46 @@ def calibrate(
 
 
 def _loaded(
-    dataset: Dataset, parts: Sequence[range], track: Spline, start: Parameters, free: BoolArray, options: Options,
+    dataset: Dataset, terms: PairTerms, parts: Sequence[range], track: Spline, start: Parameters, options: Options,
     progress: Progress,
-) -> tuple[PairTerms, list[Stretch]]:  # fmt: skip
-    base = dataset.with_color_offset(0.0, drift=0.0)
-    terms, stretches = pair_terms(engine(options.backend), base, free), []
+) -> list[Stretch]:  # fmt: skip
+    """Knots of every other stretch lie half a spacing later.
+
+    No spline follows a hand quite, and what it leaves passes for other clocks: one way for these knots, another way for
+    those. So it averages out, and the stretches' scatter has it.
+    """
+    base, stretches = dataset.with_color_offset(0.0, drift=0.0), []
     for n, part in enumerate(parts):
         progress("calibrating", 0.15 * n / len(parts), "reading images")
-        stretches.append(load_stretch(terms, base, part, track, start, options))
-    return terms, stretches
+        phase = replace(options, knot_phase=(options.knot_phase + 0.5 * (n % 2)) % 1.0)
+        stretches.append(load_stretch(terms, base, part, track, start, phase))
+    return stretches
 
 
 def _oriented(
-    dataset: Dataset, parts: Sequence[range], track: Spline, start: Parameters, options: Options, progress: Progress
+    dataset: Dataset, stretches: Sequence[Stretch], start: Parameters, options: Options, progress: Progress
 ) -> Dataset:
-    """The dataset with images that are read by rows or by columns, whichever fits better.
+    """The dataset with images that are read by rows or by columns, whichever fits better after some steps.
 
     Which of the two ways round is told by the readout's sign.
     """
-    few = parts[:: -(-len(parts) // _TRIED)]
+    few = stretches[:: -(-len(stretches) // _TRIED)]
     free, found = free_of(("readout", "offset")), []
     free[DRIFT] = False
     for count, scan in enumerate(_AXES):
         progress("scan direction", count / len(_AXES), scan)
-        rig = dataset.rig
-        shutters = [replace(shutter, scan=scan) for shutter in (rig.depth_shutter, rig.color_shutter)]
-        turned = replace(dataset, rig=replace(rig, depth_shutter=shutters[0], color_shutter=shutters[1]))
-        terms, stretches = _loaded(turned, few, track, start, free, options, no_progress)
-        found.append((solve(stretches, terms, start, free, _COARSE).cost, turned))
+        turned = _scanned(dataset, scan)
+        terms = pair_terms(engine(options.backend), turned, free)
+        tried = solve([each.read_by(terms) for each in few], terms, start, free, _COARSE, steps=_TRIED_STEPS)
+        found.append((tried.cost, turned))
     progress("scan direction", 1.0, "")
     return min(found, key=lambda each: each[0])[1]
+
+
+def _scanned(dataset: Dataset, scan: Scan) -> Dataset:
+    rig = dataset.rig
+    depth, color = (replace(shutter, scan=scan) for shutter in (rig.depth_shutter, rig.color_shutter))
+    return replace(dataset, rig=replace(rig, depth_shutter=depth, color_shutter=color))
 
 
 def parameters_of(dataset: Dataset) -> Parameters:
@@ -232,29 +243,6 @@ def _watch(progress: Progress, begin: float) -> Watch:
         progress("calibrating", min(0.95, begin + 0.4 * done / _ABOUT_STEPS), note)
 
     return watch
-
-
-def _at_other_knots(
-    stretches: Sequence[Stretch], terms: PairTerms, known: Known, solution: Solution, progress: Progress
-) -> Solution:
-    """The middle between the solution and that with knots half a spacing later.
-
-    No spline follows a hand quite, and what it leaves passes for other clocks: one way for these knots, another way for
-    those. So half of what the two differ by counts as an error too.
-    """
-
-    def shifted(each: Stretch) -> Stretch:
-        s = each.spline
-        spline = like(s, s.t0 - 0.5 * s.dt, s.dt, len(s.control_points) + 1)
-        return replace(each, spline=spline, brightness=dict(each.brightness))
-
-    later = [shifted(each) for each in stretches]
-    other = solve(later, terms, solution.values, solution.free, _FINE, _watch(progress, 0.9), known)
-    if not other.finished:
-        return replace(solution, finished=False)
-    half = 0.5 * other.values.since(solution.values)
-    blind = np.hypot(np.hypot(solution.blind, other.blind) / np.sqrt(2.0), half)
-    return replace(solution, values=solution.values.moved(half), blind=blind, last_step=other.last_step)
 
 
 def _trusted(dataset: Dataset, stretches: Sequence[Stretch], terms: PairTerms, p: Parameters) -> list[int]:

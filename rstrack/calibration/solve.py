@@ -28,7 +28,7 @@ _BLIND_S = 3e-5
 # were seen above a thousandth.
 _MOVES = np.full(COUNT, 0.0015)
 _MOVES[:DRIFT] = 0.0075
-# Times that the scales of errors are estimated before the first step.
+# Times that the scales of a stretch's errors are estimated before its first step.
 _ROUNDS = 3
 
 Watch = Callable[[int, int, Parameters], None]
@@ -122,7 +122,7 @@ class Solution:
 
 def solve(
     stretches: Sequence[Stretch], terms: PairTerms, start: Parameters, free: BoolArray, levels: Sequence[int],
-    watch: Watch = lambda *_: None, known: Known | None = None,
+    watch: Watch = lambda *_: None, known: Known | None = None, steps: int = _MOST_STEPS,
 ) -> Solution:  # fmt: skip
     """Parameters and all control points jointly, coarse to fine; the stretches' splines are moved.
 
@@ -134,11 +134,11 @@ def solve(
     p, acceleration, finished, step = start, Acceleration(), True, np.zeros(COUNT)
     try:
         for stretch in stretches:
-            for _ in range(_ROUNDS):
+            for _ in range(_ROUNDS if stretch.is_new else 0):
                 stretch.sums(terms, p, levels[0])
         for level in levels:
             acceleration.forget()
-            for n in range(_MOST_STEPS):
+            for n in range(steps):
                 watch(level, n, p)
                 sums = [stretch.sums(terms, p, level) for stretch in stretches]
                 step, sigmas = _step([one.reduced() for one in sums], p, start, known, free, acceleration)

@@ -8,7 +8,6 @@ import pytest
 from loop_room import NOISE, OPTIONS, make_dataset
 from shaken_recording import FRAMES, recording, shaking
 
-from rstrack.calibration import run as calibration_run
 from rstrack.data.dataset import Dataset
 from rstrack.tracking.runs.run import track
 
@@ -32,9 +31,3 @@ def closed_at_end(to_and_fro: Dataset, tmp_path_factory: pytest.TempPathFactory)
     result = track(to_and_fro, OPTIONS, out, noise=NOISE)
     assert result.lost == 0 and "closed" in result.loops
     return out
-
-
-@pytest.fixture
-def in_one_phase(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With these knots only, in three quarters of the time: for what is found either way."""
-    monkeypatch.setattr(calibration_run, "_at_other_knots", lambda *given: given[3])

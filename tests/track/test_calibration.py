@@ -40,7 +40,6 @@ def few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(calibration_run, "_COARSE", (1,))
 
 
-@pytest.mark.usefixtures("in_one_phase")
 def test_a_lens_and_depth_are_put_right(shaken: Dataset) -> None:
     rig, color = shaken.rig, shaken.rig.color_camera
     lens = replace(color, fx=1.02 * color.fx, fy=1.018 * color.fy, cx=color.cx + 1.5, cy=color.cy - 1.0)
@@ -59,7 +58,6 @@ def test_a_lens_and_depth_are_put_right(shaken: Dataset) -> None:
     assert "colour fx" in text and "depth offset" in text and "depth's scale cannot be told" in text
 
 
-@pytest.mark.usefixtures("in_one_phase")
 def test_a_lens_that_is_right_is_left_as_it_is(shaken: Dataset) -> None:
     noisy = replace(shaken, images=NoisyImages(shaken.images, 1.2e-3, 0.01, 1))
     found = calibrate(noisy, ("readout", "intrinsics"), SHORT, OPTIONS)
@@ -68,7 +66,6 @@ def test_a_lens_that_is_right_is_left_as_it_is(shaken: Dataset) -> None:
     assert "the lens is the file's" in found.text()
 
 
-@pytest.mark.usefixtures("in_one_phase")
 def test_a_camera_at_rest_tells_nothing_and_that_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -122,7 +119,6 @@ def test_a_drift_is_found_or_else_held(shaken: Dataset, monkeypatch: pytest.Monk
     assert ("colour drift" in found.text()) == (drift > 0.0)
 
 
-@pytest.mark.usefixtures("in_one_phase")
 def test_noise_is_that_of_track_and_makes_sigmas_grow(shaken: Dataset) -> None:
     noisy = replace(shaken, images=NoisyImages(shaken.images, 2e-3, 0.02, 7))
     frame = with_noise(shaken.frame(9), 9, 2e-3, 0.02, 7)

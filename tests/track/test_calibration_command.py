@@ -40,7 +40,6 @@ def few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(calibration_run, "_COARSE", (1,))
 
 
-@pytest.mark.usefixtures("in_one_phase")
 def test_lines_that_are_read_the_other_way_are_seen_to_be(tmp_path: Path) -> None:
     upward = recording(tmp_path / "seq", shaking(), scan="bottom-top")
     found = calibrate(told(upward, 0.004, 0.0, np.zeros(6)), frames=SHORT, options=OPTIONS)
@@ -53,7 +52,6 @@ def test_lines_that_are_read_the_other_way_are_seen_to_be(tmp_path: Path) -> Non
     assert "depth is read bottom-top, not top-bottom" in found.text()
 
 
-@pytest.mark.usefixtures("in_one_phase")
 def test_columns_are_told_from_rows_where_nobody_names_them(tmp_path: Path) -> None:
     sideways = recording(tmp_path / "seq", shaking(), scan="right-left")
     unnamed = replace(told(sideways, 0.0, 0.0, np.zeros(6)), scan_named=False)
@@ -62,7 +60,6 @@ def test_columns_are_told_from_rows_where_nobody_names_them(tmp_path: Path) -> N
         assert shutter.scan == "right-left" and shutter.readout_s == pytest.approx(READOUT_S, abs=2e-4)
 
 
-@pytest.mark.usefixtures("in_one_phase")
 def test_an_image_exposed_at_once_has_no_readout(tmp_path: Path) -> None:
     at_once = recording(tmp_path / "seq", shaking(), readout_s=0.0)
     found = calibrate(told(at_once, 0.012, 0.0, np.zeros(6)), ("readout",), SHORT, OPTIONS)
@@ -190,7 +187,6 @@ def test_a_sequence_is_calibrated_and_tracked_by_command(
     assert not (tmp_path / "again/calibration.json").exists(), "it is of another run"
 
 
-@pytest.mark.usefixtures("in_one_phase")
 def test_a_device_that_the_recording_contradicts_is_left_out(shaken: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(calibration_run, "_COARSE", (1,))
     wrong = told(shaken, 0.01, 0.0, np.zeros(6))

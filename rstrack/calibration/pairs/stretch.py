@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -86,6 +86,11 @@ class Stretch:
     sigma: tuple[float, float] = (START_DEPTH, START_INTENSITY)
     brightness: dict[tuple[int, int], FloatArray] = field(default_factory=dict)
 
+    @property
+    def is_new(self) -> bool:
+        """Whether nothing says yet how large its errors are."""
+        return self.sigma == (START_DEPTH, START_INTENSITY)
+
     def sums(self, terms: PairTerms, p: Parameters, level: int) -> Sums:
         """Around the current spline; re-estimates σ and brightness on the way."""
         size = 6 * len(self.spline.control_points) + COUNT
@@ -109,6 +114,15 @@ class Stretch:
         found = [scale_step(self.sigma[k], weighted[k], int(counted[k]), floors[k]) for k in range(2)]
         self.sigma = found[0], found[1]
         return Sums(H, g, cost, int(counted.sum()))
+
+    def read_by(self, terms: PairTerms) -> Stretch:
+        """The same images and spline, to be changed by themselves, if cameras read their lines as those of `terms`."""
+
+        def taken(one: Taken) -> Taken:
+            return replace(one, lens=terms.depth if one.is_depth else terms.color)
+
+        views = [replace(v, depth=taken(v.depth), color=v.color and taken(v.color)) for v in self.views]
+        return replace(self, views=views, brightness=dict(self.brightness))
 
     def move(self, increments: FloatArray) -> None:
         """T_i ← exp(δ_i) T_i for increments (k, 6) of all control points."""
