@@ -10,7 +10,7 @@ the first line to the last.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -24,17 +24,13 @@ _PRIOR = np.tile([0.05, 0.05, 0.05, *np.radians([3.0, 3.0, 3.0])], 2)
 
 @dataclass(frozen=True)
 class Pulls:
-    """Metres by which points at the median depth would move: by all of a frame's images, by depth and by colour alone.
+    """sigmas: how many σ of what they know all images of a frame pull by, and depth and colour alone; NaN without any.
 
-    In the line that moves furthest; NaN where there is no such image. sigmas: how many σ of what these images know each
-    of the three is. told (6, 6): what the normal equations say that all of them know of the pose, all lines moved at
-    once, as increments [m; rad] in the depth camera's axes at mid readout.
+    told (6, 6): what the normal equations say that all of them know of the pose, all lines moved at once, as increments
+    [m; rad] in the depth camera's axes at mid readout.
     """
 
-    whole: float
-    depth: float
-    color: float
-    sigmas: tuple[float, float, float] = (np.inf, np.inf, np.inf)
+    sigmas: tuple[float, float, float] = (np.nan, np.nan, np.nan)
     told: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
 
     @property
@@ -51,21 +47,19 @@ class Pulls:
         """What the images know of the pose (6, 6), as far as they agree with what it was found to be."""
         return self.told / self.excess**2
 
-    def scaled(self, factor: float) -> Pulls:
-        """All pulls times a factor."""
-        return replace(self, whole=factor * self.whole, depth=factor * self.depth, color=factor * self.color)
+
+_Seen = tuple[Observation, FloatArray, FloatArray]
+"""An observation with its H (12, 12) and g (12,) of `steady`."""
 
 
 def pulls(fresh: Sequence[Observation], state: SplineState) -> Pulls:
     """Of a frame's observations in the current state."""
     seen = [(o, *steady(o, state)) for o in fresh if o.is_linearised]
-    depth, color = [s for s in seen if s[0].is_depth], [s for s in seen if not s[0].is_depth]
-    (whole, a), (depth_alone, b), (color_alone, c) = (_pull(some) for some in (seen, depth, color))
-    return Pulls(whole, depth_alone, color_alone, (a, b, c), _told(seen, state))
+    kinds = [[s for s in seen if s[0].is_depth is is_depth] for is_depth in (True, False)]
+    return Pulls((_pull(seen), _pull(kinds[0]), _pull(kinds[1])), _told(seen, state))
 
 
-def _told(seen: Sequence[tuple[Observation, FloatArray, FloatArray]], state: SplineState) -> FloatArray:
-    """`Pulls.told`, of observations, each with its H (12, 12) and g of `steady`."""
+def _told(seen: Sequence[_Seen], state: SplineState) -> FloatArray:
     total = np.zeros((6, 6))
     for o, H, _ in seen:
         turn = np.kron(np.eye(2), state.spline.pose(o.image.exposure.mid_time)[:3, :3])
@@ -73,17 +67,12 @@ def _told(seen: Sequence[tuple[Observation, FloatArray, FloatArray]], state: Spl
     return total
 
 
-def _pull(seen: Sequence[tuple[Observation, FloatArray, FloatArray]]) -> tuple[float, float]:
-    """Metres and σ that observations pull by, each with its H (12, 12) and g (12,) as of `steady`; NaN without any."""
+def _pull(seen: Sequence[_Seen]) -> float:
     if not seen:
-        return float("nan"), float("nan")
+        return float("nan")
     H = np.diag(1.0 / _PRIOR**2) + sum(own for _, own, _ in seen)
     g = np.sum([own for _, _, own in seen], axis=0)
-    twist = np.linalg.solve(H, g)
-    distance = seen[0][0].ref.median_depth
-    ends = (twist[:6] - twist[6:], twist[:6] + twist[6:])
-    metres = max(np.linalg.norm(end[:3]) + distance * np.linalg.norm(end[3:]) for end in ends)
-    return float(metres), float(np.sqrt(max(0.0, float(g @ twist))))
+    return float(np.sqrt(max(0.0, float(g @ np.linalg.solve(H, g)))))
 
 
 def rigid_pull(fresh: Sequence[Observation], state: SplineState) -> tuple[float, float]:

@@ -6,13 +6,15 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.pull import pulls
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.frame_report import FrameReport
 from rstrack.tracking.judgement.fault import Fault
-from rstrack.tracking.judgement.lost_track import slides
+from rstrack.tracking.judgement.innovation import unled
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.moving.leave_out import LeftOut, left_out_with, without
 from rstrack.tracking.moving.majority import not_with_most
@@ -25,6 +27,9 @@ _WIDEST = 2.0
 # Where depth gives one pose a knot, how far after a knot, in knots: half-way between two it would not see control
 # points that alternate, of which rolling colours then tell little and wrongly.
 _AFTER_KNOT = 0.1
+# How far images may be apart that begin a track, m: before a wall depth alone slides by 0.25 to 1, a wrong camera file
+# in fast motion puts them 0.03 apart.
+_MOST_APART_M = 0.1
 
 
 def start(track: Track, new: DeviceFrame) -> FrameReport:
@@ -178,7 +183,8 @@ def _leave(track: Track, window: Window) -> bool:
     seen_of = {frame.index: [o for o in others if o.frame == frame.index] for frame in frames}
     covariances.look_at(ref, window.spline)
     pulls_of = {index: pulls(seen, window.state) for index, seen in seen_of.items()}
-    if any(slides(own, ref.median_depth) for own in pulls_of.values()):
+    anew = [unled(seen_of[frame.index], window.state) for frame in rest if seen_of[frame.index]]
+    if any(np.trace(apart[:3, :3]) > _MOST_APART_M**2 for apart in anew):
         return False
     window.keep(others)
     for frame in track.succession.recent:

@@ -8,7 +8,6 @@ stamps, T_world_depth = tracker.trajectory
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -20,8 +19,6 @@ from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
 from rstrack.adjustment.graph import Seen
 from rstrack.alignment.linearise import Terms
-from rstrack.alignment.observation import Observation
-from rstrack.alignment.pull import pulls
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.moving_masks import MovingMasks
 from rstrack.data.rig import Frame, Rig
@@ -29,18 +26,15 @@ from rstrack.images.device_frame import DeviceFrame, Timer, untimed
 from rstrack.images.left_out import frame_without
 from rstrack.inertial.inertia import Inertia
 from rstrack.keyframes.archive import Archive
-from rstrack.keyframes.keyframe import Reference
 from rstrack.options import Options
 from rstrack.tracking.bootstrap import bootstrap, fit_knots, start
 from rstrack.tracking.bridging import Bridge
 from rstrack.tracking.frame_report import FrameReport
 from rstrack.tracking.judgement.fault import Fault
-from rstrack.tracking.judgement.innovation import Innovation, Prediction, doubt, weighed
-from rstrack.tracking.judgement.lost_track import implausible, is_settled
-from rstrack.tracking.moving.leave_out import LeftOut
-from rstrack.tracking.relocalise import Relocaliser, without_misfits
+from rstrack.tracking.matching import Match, Verdict, follows, match
+from rstrack.tracking.relocalise import Relocaliser
 from rstrack.tracking.track import Track
-from rstrack.tracking.window import LEVELS, TRACKING_LEVELS
+from rstrack.tracking.window import LEVELS, TRACKING_LEVELS, Window
 
 # Seconds without a frame after which the motion before says nothing about where the camera is, and beyond which
 # frames hardly belong to one recording.
@@ -67,8 +61,8 @@ class Tracker:
         options = options or Options()
         if options.inertial and imu is None:
             raise UserError(f"method {options.method}: needs an IMU's recording, and there is none")
-        self._track = track = Track(rig, options, timer, imu if options.inertial else None)
-        self._relocaliser = Relocaliser(rig, track.options, track.keyframes, track.fits, track.observe, track.leave_out)
+        self._track = Track(rig, options, timer, imu if options.inertial else None)
+        self._relocaliser = Relocaliser()
         self._bridge = Bridge()
         self._last_fed: float | None = None
 
@@ -121,10 +115,7 @@ class Tracker:
     @property
     def shared(self) -> dict[str, object]:
         """What another tracker of the same rig and options has as well, by name."""
-        return self._track.shared | {
-            "observe": self._relocaliser.observe,
-            "leave out": self._relocaliser.leave_out,
-        }
+        return self._track.shared
 
     @property
     def state(self) -> dict[str, Any]:
@@ -235,104 +226,49 @@ class Tracker:
 
     def _follow(self, new: DeviceFrame, gap: float, led: bool = False) -> FrameReport:
         """Go on with a frame where the motion leads, `gap` s after the one before; led: by an IMU."""
-        track, fits = self._track, self._track.fits
-        window, ref = track.known()
-        before = window.copy()
-        young = window.piece > 0 and track.age < _YOUNG
-        window.predict(new, track.found.end, young)
-        on_reference = track.observe(new, ref)
-        anchor = track.keyframes.anchor
-        fresh = on_reference + ([] if anchor is None else track.observe(new, anchor))
-        # The first keyframe of a global shutter: no other frame tells where it was taken.
-        gauge = ref if not window.is_frozen(ref.t) and new.depth.exposure.lens.lines == 1 else None
-        led_to, mid = window.spline, new.depth.exposure.mid_time
-        T_predicted = led_to.pose(mid)
-        coupled = ref.rolling is not None
-        levels = LEVELS if young or gap > (_LED_S if led else _SURE_S) else TRACKING_LEVELS
-        left, last = LeftOut(new.depth), track.succession.recent[-1].depth
+        track = self._track
+        before, ref = track.known()
+        young = before.piece > 0 and track.age < _YOUNG
 
-        def is_hopeless(seen: Sequence[Observation]) -> bool:
-            # What moved in the frame before does not fit here either, until it is left out.
-            return fits.is_hopeless(seen, last.moving)
-
-        def leave_out() -> None:
-            nonlocal left
-            if not is_hopeless(fresh):
-                (left,) = track.leave_out([new], ref, fresh, window.state, last)
-
-        solved = window.solve(fresh, levels, gauge, coupled, is_hopeless, leave_out)
-        on_reference = [o for o in fresh if o.ref.index == ref.index]
-        if not is_settled(solved) and not fits.is_hopeless(fresh):
-            # Its steps went to and fro; that says nothing against the place.
-            solved = window.solve(fresh, (0,), gauge, coupled)
-        fitting = without_misfits(fits, fresh, on_reference, ref)
-        colorless = False
-        if len(fitting) < len(fresh) and not fits.is_hopeless(on_reference):
-            colorless = all(o.is_depth for o in fitting)
+        def begin() -> Window:
             window = before.copy()
             window.predict(new, track.found.end, young)
-            fresh, on_reference = fitting, [o for o in fitting if o.ref.index == ref.index]
-            solved = window.solve(fresh, levels, gauge, coupled, before_finest=leave_out)
-        seconds = new.stamp - track.found.stamps[-1]
-        accelerations = track.accelerations(window, seconds, T_predicted[:3, :3])
-        uncertainty, common = track.covariances.uncertainty, track.covariances.common
-        state, considered = uncertainty.predicted(seconds, *accelerations), track.covariances.considered(seconds)
-        predicted, innovation = Prediction.of(led_to, mid, state, track.last_two(new)), Innovation()
-        weighs = self._weighs(fresh, ref)
-        if weighs and not young:
-            innovation = weighed(fresh, window.state, predicted, considered)
-            if innovation.inflation > 1.0:
-                solved = window.solve(fresh, (0,), gauge, coupled)
-        with track.terms.timer("judgement"):
-            pulled = pulls(on_reference, window.state)
-            fault = fits.fault(on_reference, solved, ref.pixels, pulled, young, colorless)
-            if ref.rolling is None:
-                # A rolling reference moves with what is aligned to it, which tells nothing of the two together.
-                uncertainty = uncertainty.after(seconds, pulled.information, *accelerations)
-                common = track.covariances.after(seconds, uncertainty, on_reference, window.state, pulled)
-            if weighs:
-                more = doubt(innovation, on_reference, window.state, predicted, considered)
-                uncertainty = replace(uncertainty, doubt=more)
-        if not fault and implausible(T_predicted, window.spline.pose(mid), gap):
-            fault = Fault.MOTION
-        elif not fault and not uncertainty.is_known:
-            fault = Fault.UNKNOWN
-        if fault:
-            track.window = before
-            if not led:
-                return self._relocalise(new, fault)
-            # Where the camera has turned away from the keyframe meanwhile another one may show what it sees.
-            others = (fault is Fault.NOTHING_SEEN or gap > _GAP_S) and not track.succession.is_unfit(new)
-            report = self._relocalise(new, fault, T_predicted) if others else track.report(new, fault=fault)
-            if report.lost:
-                self._bridge.put(track, new)
-            return report
+            return window
+
+        anchor = track.keyframes.anchor
+        fresh = track.observe(new, ref) + ([] if anchor is None else track.observe(new, anchor))
+        levels = LEVELS if young or gap > (_LED_S if led else _SURE_S) else TRACKING_LEVELS
+        found = match(track, begin, new, ref, fresh, levels, track.succession.recent[-1].depth)
+        verdict = follows(track, found, gap, young)
+        if not verdict.fault:
+            return self._go_on(found, verdict)
+        if not led:
+            return self._relocalise(new, verdict.fault)
+        # Where the camera has turned away from the keyframe meanwhile another one may show what it sees.
+        others = (verdict.fault is Fault.NOTHING_SEEN or gap > _GAP_S) and not track.succession.is_unfit(new)
+        T_led = found.predicted.pose(new.depth.exposure.mid_time)
+        report = self._relocalise(new, verdict.fault, T_led) if others else track.report(new, fault=verdict.fault)
+        if report.lost:
+            self._bridge.put(track, new)
+        return report
+
+    def _go_on(self, found: Match, verdict: Verdict) -> FrameReport:
+        """A frame was found where the motion led: learn from it, and renew the keyframe."""
+        track, window, on_reference = self._track, found.window, found.on_reference
+        new = replace(found.frame, depth=found.left.depth)
         self._bridge.close(track)
-        track.window, track.covariances.uncertainty, track.covariances.common = window, uncertainty, common
-        new = replace(new, depth=left.depth)
-        track.remember(new)
-        window.keep(fresh)
-        track.learn(ref, on_reference, window, pulled, new.last_time)
+        self._take(new, found, verdict)
+        track.learn(found.ref, on_reference, window, verdict.pulled, new.last_time)
         track.succession.recent.append(new)
-        track.placed(new, fresh)
+        track.placed(new, found.fresh)
         track.age += 1
-        track.succession.judged_colors(bool(new.colors and ref.points) and all(o.is_depth for o in on_reference))
+        track.succession.judged_colors(bool(new.colors and found.ref.points) and all(o.is_depth for o in on_reference))
         overlap = track.succession.overlap(on_reference)
-        track.succession.saw_through(left.gone)
+        track.succession.saw_through(found.left.gone)
         frozen = track.succession.fuse_frozen(window)
         renewed = track.succession.renew(window, new, frozen, overlap)
         track.found.release(window, min(min(f.first_time, f.stamp) for f in track.succession.recent))
-        return track.report(new, on_reference, solved, keyframe=renewed, overlap=overlap)
-
-    def _weighs(self, fresh: Sequence[Observation], ref: Reference) -> bool:
-        """Whether the filter's prediction is one to hold images against.
-
-        A rolling reference moves with them; a gyroscope sees how lines move within an image that vibrates, which the
-        filter does not; and under the wrong shutter all images are off.
-        """
-        fits = self._track.fits
-        is_told = ref.rolling is None and not self._track.has_gyro and fits.is_modelled
-        return is_told and not fits.is_hopeless(fresh)
+        return track.report(new, on_reference, found.solved, keyframe=renewed, overlap=overlap)
 
     def _relocalise(
         self, new: DeviceFrame, fault: Fault = Fault.NONE, T_led: FloatArray | None = None
@@ -342,22 +278,17 @@ class Tracker:
         fault: why it is not where the motion led, if it was looked for there. T_led (4, 4): where an IMU led it.
         """
         track = self._track
-        window, ref = track.known()
-        uncertainty = track.covariances.uncertainty
-        found = self._relocaliser.find(new, window, ref, track.found.end, uncertainty, fault is Fault.MOTION, T_led)
-        if isinstance(found, Fault):
-            return track.report(new, fault=fault or found)
+        where = self._relocaliser.find(track, new, T_led)
+        if isinstance(where, Fault):
+            return track.report(new, fault=fault or where)
+        found, verdict = where
         # The new piece may need control points of the last frames before: their poses are kept, not their spline.
-        track.found.begin_piece(window.spline, found.window.state.untouched)
-        found.window.keep(found.fresh)
-        track.window, track.covariances.uncertainty = found.window, found.uncertainty
+        track.found.begin_piece(track.known()[0].spline, found.window.state.untouched)
+        new = replace(new, depth=found.left.depth)
+        self._take(new, found, verdict)
         track.chain.cut(found.window.piece)
-        pulled = pulls(found.fresh, found.window.state)
-        excess, covariances = pulled.excess, track.covariances
-        covariances.common = covariances.after(0.0, found.uncertainty, found.fresh, found.window.state, pulled)
+        excess = verdict.pulled.excess
         track.chain.add(found.ref, found.fresh, found.window.state, excess)
-        new = replace(new, depth=found.depth)
-        track.remember(new)
         track.succession.use(found.ref, new)
         self._relocaliser.forget()
         self._bridge.forget()
@@ -367,3 +298,12 @@ class Tracker:
         track.age = 1
         track.placed(new, found.fresh, joined=False)
         return track.report(new, found.fresh, found.solved, overlap=track.succession.overlap(found.fresh))
+
+    def _take(self, new: DeviceFrame, found: Match, verdict: Verdict) -> None:
+        """The track has the frame's pose and what is known of it."""
+        track = self._track
+        track.window, track.covariances.uncertainty, track.covariances.common = (
+            found.window, verdict.uncertainty, verdict.common,
+        )  # fmt: skip
+        track.remember(new)
+        found.window.keep(found.fresh)

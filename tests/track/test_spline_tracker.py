@@ -154,15 +154,10 @@ def test_colour_may_come_late_but_there_is_no_keyframe_without_it() -> None:
 
 def test_first_frames_that_slide_are_lost_and_the_next_ones_begin_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     """Regression: a track that began before a bare wall went on from a keyframe that was bent, without a word."""
-    looked_at: list[bool] = []
-
-    def slides_once(*_: object) -> bool:
-        looked_at.append(not looked_at)
-        return looked_at[-1]
-
-    monkeypatch.setattr(bootstrap, "slides", slides_once)
     tracker, forgotten = tracker_of("rs-g"), []
     monkeypatch.setattr(tracker._track.fits, "forget", lambda: forgotten.append(True))
+
+    monkeypatch.setattr(bootstrap, "unled", lambda *_: np.eye(12) * (not forgotten))
     feed(tracker, (frame_at(k) for k in range(14)))
     assert forgotten == [True], "what was usual in them"
     assert [report.fault for report in tracker.reports[:6]] == [*[Fault.NO_START] * 5, Fault.NONE]

@@ -152,6 +152,29 @@ def doubt(
     return np.asarray(total)
 
 
+def unled(fresh: Sequence[Observation], state: SplineState, considered: Considered | None = None) -> FloatArray:
+    """Covariance (12, 12) that a pose has beyond the filter's which nothing predicts, of the line that is furthest off.
+
+    Its images all pull it somewhere else where the spline cannot follow. And where they disagree by more than they, and
+    the calibration, explain, either of them may be right: each counts as if it were.
+    """
+    first = max((o for o in fresh if o.is_linearised), key=lambda o: o.is_depth)
+    exposure, distance = first.image.exposure, first.ref.median_depth
+    mid, half = exposure.mid_time, 0.5 * (exposure.last_time - exposure.first_time)
+    here = Prediction(mid, *state.spline.pose_and_velocity(mid), Uncertainty().state)
+    seen = [_measured(o, state, here, considered) for o in fresh if o.is_linearised]
+
+    def squared(z: FloatArray) -> FloatArray:
+        ends = z[:6] - half * z[6:], z[:6] + half * z[6:]
+        off = max(ends, key=lambda end: float(np.linalg.norm(end[:3]) + distance * np.linalg.norm(end[3:])))
+        return np.outer(np.concatenate([off, z[6:]]), np.concatenate([off, z[6:]]))
+
+    odd, *rest = seen
+    inflation = _inflation(*_expected(odd, here.covariance, rest), odd.R)
+    apart = np.sum([squared(one.z) for one in seen], axis=0)
+    return np.asarray(squared(_combined(seen)[0]) + (1.0 - 1.0 / inflation) * apart)
+
+
 def _expected(odd: _Measured, P: FloatArray, rest: Sequence[_Measured]) -> tuple[FloatArray, FloatArray]:
     """How far an image is off (12,) where the others are known, and the covariance (12, 12) of that but for its own R.
 

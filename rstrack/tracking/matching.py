@@ -1,0 +1,174 @@
+"""One way to align a frame to a keyframe, and to judge what comes of it, wherever its start comes from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rsgen.geometry.spline import Spline
+from rstrack.alignment.observation import Observation
+from rstrack.alignment.optimizer import Solved
+from rstrack.alignment.pull import Pulls, pulls
+from rstrack.images.device_frame import DeviceFrame
+from rstrack.images.pyramid import DepthImage
+from rstrack.keyframes.keyframe import Reference
+from rstrack.tracking.judgement.common import Common
+from rstrack.tracking.judgement.fault import Fault
+from rstrack.tracking.judgement.innovation import Innovation, Prediction, doubt, unled, weighed
+from rstrack.tracking.judgement.lost_track import implausible, is_settled
+from rstrack.tracking.judgement.uncertainty import Uncertainty
+from rstrack.tracking.moving.leave_out import LeftOut
+from rstrack.tracking.track import Track
+from rstrack.tracking.window import Window
+
+
+@dataclass(eq=False)
+class Match:
+    """A frame aligned to `ref`.
+
+    window: with its pose; predicted: T_world_depth(t) before any image. fresh: what took part; whole: nothing had to be
+    left out for it. left: what moves by itself.
+    """
+
+    frame: DeviceFrame
+    ref: Reference
+    window: Window
+    predicted: Spline
+    fresh: list[Observation]
+    solved: Solved
+    left: LeftOut
+    whole: bool = True
+
+    @property
+    def on_reference(self) -> list[Observation]:
+        """What the frame's images say against `ref`, not against other keyframes."""
+        return [o for o in self.fresh if o.ref.index == self.ref.index]
+
+    def again(self) -> None:
+        """Align at full size from where it is: its observations count otherwise now, or its steps went to and fro."""
+        self.solved = self.window.solve(self.fresh, (0,), _gauge(self.window, self.frame, self.ref), _rolls(self.ref))
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """fault: why a frame has not been found. pulled: by its images; uncertainty, common: of it, if it has been."""
+
+    fault: Fault
+    pulled: Pulls
+    uncertainty: Uncertainty
+    common: Common
+
+
+def match(
+    track: Track, begin: Callable[[], Window], new: DeviceFrame, ref: Reference, fresh: list[Observation],
+    levels: Sequence[int], last: DepthImage | None = None,
+) -> Match:  # fmt: skip
+    """Align a frame's observations, coarse to fine, from where a window has it; once more without images that misfit.
+
+    begin: makes that window. last: depth of the frame before, since what moved in it does not fit here either.
+    """
+    fits, moving = track.fits, 0.0 if last is None else last.moving
+
+    def is_hopeless(seen: Sequence[Observation]) -> bool:
+        return fits.is_hopeless(seen, moving)
+
+    def leave_out() -> None:
+        if not is_hopeless(found.fresh):
+            (found.left,) = track.leave_out([new], ref, found.fresh, found.window.state, last)
+
+    def solve(hopeless: Callable[[Sequence[Observation]], bool] | None) -> None:
+        gauge = _gauge(found.window, new, ref)
+        found.solved = found.window.solve(found.fresh, levels, gauge, _rolls(ref), hopeless, leave_out)
+
+    window = begin()
+    found = Match(new, ref, window, window.spline, fresh, Solved(), LeftOut(new.depth))
+    solve(is_hopeless)
+    if not is_settled(found.solved) and not fits.is_hopeless(fresh):
+        found.again()
+    fitting = without_misfits(track, fresh, ref)
+    if len(fitting) < len(fresh) and not fits.is_hopeless(found.on_reference):
+        found.window, found.fresh, found.whole = begin(), fitting, False
+        solve(None)
+    return found
+
+
+def follows(track: Track, found: Match, gap: float, young: bool) -> Verdict:
+    """Whether a frame was found where the motion led; gap: s since the one before.
+
+    young: its piece of the spline has just begun, and predicts little. A rolling reference moves with what is aligned
+    to it, which tells nothing of the two together; a gyroscope sees how lines move within an image that vibrates, which
+    the filter does not; and under the wrong shutter all images are off: then no prediction is held against them.
+    """
+    fits, new, fresh, window = track.fits, found.frame, found.fresh, found.window
+    uncertainty, common = track.covariances.uncertainty, track.covariances.common
+    mid, rolls = new.depth.exposure.mid_time, _rolls(found.ref)
+    T_predicted, seconds = found.predicted.pose(mid), new.stamp - track.found.stamps[-1]
+    accelerations = track.accelerations(window, seconds, T_predicted[:3, :3])
+    considered = track.covariances.considered(seconds)
+    state = uncertainty.predicted(seconds, *accelerations)
+    predicted, innovation = Prediction.of(found.predicted, mid, state, track.last_two(new)), Innovation()
+    weighs = not rolls and not track.has_gyro and fits.is_modelled and not fits.is_hopeless(fresh)
+    if weighs and not young:
+        innovation = weighed(fresh, window.state, predicted, considered)
+        if innovation.inflation > 1.0:
+            found.again()
+    on_reference = found.on_reference
+    with track.terms.timer("judgement"):
+        pulled = pulls(on_reference, window.state)
+        fault = fits.fault(on_reference, found.solved, found.ref.pixels, young)
+        if not rolls:
+            uncertainty = uncertainty.after(seconds, pulled.information, *accelerations)
+            common = track.covariances.after(seconds, uncertainty, on_reference, window.state, pulled)
+        more = np.zeros((12, 12))
+        if weighs:
+            more += doubt(innovation, on_reference, window.state, predicted, considered)
+        if young and not fault:
+            more += unled(on_reference, window.state, considered)
+        uncertainty = replace(uncertainty, doubt=more)
+    if not fault and implausible(T_predicted, window.spline.pose(mid), gap):
+        fault = Fault.MOTION
+    return Verdict(fault or _unknown(uncertainty), pulled, uncertainty, common)
+
+
+def begins(track: Track, found: Match) -> Verdict:
+    """Whether a frame was found where nothing led: by all of its images, as one alone is alike in many places."""
+    pulled = pulls(found.fresh, found.window.state)
+    fault = Fault.MISFIT if not found.whole else Fault.NONE
+    fault = fault or track.fits.fault(found.fresh, found.solved, found.ref.pixels, new=True)
+    uncertainty = track.covariances.uncertainty.found_anew(pulled.information)
+    if not fault:
+        more = unled(found.fresh, found.window.state, track.covariances.considered(0.0))
+        uncertainty = replace(uncertainty, doubt=more)
+    common = track.covariances.after(0.0, uncertainty, found.fresh, found.window.state, pulled)
+    return Verdict(fault or _unknown(uncertainty), pulled, uncertainty, common)
+
+
+def without_misfits(track: Track, fresh: list[Observation], ref: Reference) -> list[Observation]:
+    """What is left to align by if a frame's colour images do not fit, or its depth has none to show.
+
+    Where depth does not fit either, the colours may be what drew it away.
+    """
+    on_reference = [o for o in fresh if o.ref.index == ref.index]
+    misfits = [o for o, _ in track.fits.misfits(on_reference, ref.pixels)]
+    empty = [o for o in fresh if isinstance(o.image, DepthImage) and o.image.count == 0]
+    odd_colors = [o for o in misfits if not o.is_depth]
+    if odd_colors and len(odd_colors) < len(on_reference) and not empty:
+        return [o for o in fresh if all(o.image is not odd.image for odd in odd_colors)]
+    if empty and len(misfits) == 1 and misfits[0].is_depth:
+        return [o for o in fresh if not o.is_depth]
+    return fresh
+
+
+def _unknown(uncertainty: Uncertainty) -> Fault:
+    return Fault.NONE if uncertainty.is_known else Fault.UNKNOWN
+
+
+def _rolls(ref: Reference) -> bool:
+    return ref.rolling is not None
+
+
+def _gauge(window: Window, new: DeviceFrame, ref: Reference) -> Reference | None:
+    """The first keyframe of a global shutter: no other frame tells where it was taken."""
+    return ref if not window.is_frozen(ref.t) and new.depth.exposure.lens.lines == 1 else None
