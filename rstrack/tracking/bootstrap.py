@@ -27,8 +27,7 @@ _WIDEST = 2.0
 # Where depth gives one pose a knot, how far after a knot, in knots: half-way between two it would not see control
 # points that alternate, of which rolling colours then tell little and wrongly.
 _AFTER_KNOT = 0.1
-# How far images may be apart that begin a track, m: before a wall depth alone slides by 0.25 to 1, a wrong camera file
-# in fast motion puts them 0.03 apart.
+# How far depth alone may slide in frames that begin a track, m: before a wall by 0.25 to 1.
 _MOST_APART_M = 0.1
 
 
@@ -183,8 +182,8 @@ def _leave(track: Track, window: Window) -> bool:
     seen_of = {frame.index: [o for o in others if o.frame == frame.index] for frame in frames}
     covariances.look_at(ref, window.spline)
     pulls_of = {index: pulls(seen, window.state) for index, seen in seen_of.items()}
-    anew = [unled(seen_of[frame.index], window.state) for frame in rest if seen_of[frame.index]]
-    if any(np.trace(apart[:3, :3]) > _MOST_APART_M**2 for apart in anew):
+    by_depth = [seen for seen in seen_of.values() if seen and all(o.is_depth for o in seen)]
+    if any(np.trace(unled(seen, window.state)[:3, :3]) > _MOST_APART_M**2 for seen in by_depth):
         return False
     window.keep(others)
     for frame in track.succession.recent:

@@ -155,8 +155,8 @@ def doubt(
 def unled(fresh: Sequence[Observation], state: SplineState, considered: Considered | None = None) -> FloatArray:
     """Covariance (12, 12) that a pose has beyond the filter's which nothing predicts, of the line that is furthest off.
 
-    Its images all pull it somewhere else where the spline cannot follow. And where they disagree by more than they, and
-    the calibration, explain, either of them may be right: each counts as if it were.
+    Its images all pull it somewhere else, beyond noise, where the spline cannot follow. And where they disagree by more
+    than they, and the calibration, explain, either of them may be right: each counts as if it were.
     """
     first = max((o for o in fresh if o.is_linearised), key=lambda o: o.is_depth)
     exposure, distance = first.image.exposure, first.ref.median_depth
@@ -172,7 +172,9 @@ def unled(fresh: Sequence[Observation], state: SplineState, considered: Consider
     odd, *rest = seen
     inflation = _inflation(*_expected(odd, here.covariance, rest), odd.R)
     apart = np.sum([squared(one.z) for one in seen], axis=0)
-    return np.asarray(squared(_combined(seen)[0]) + (1.0 - 1.0 / inflation) * apart)
+    z, R, _ = _combined(seen)
+    beyond = max(0.0, 1.0 - len(z) / max(float(z @ np.linalg.solve(R, z)), 1e-12))
+    return np.asarray(beyond * squared(z) + (1.0 - 1.0 / inflation) * apart)
 
 
 def _expected(odd: _Measured, P: FloatArray, rest: Sequence[_Measured]) -> tuple[FloatArray, FloatArray]:
