@@ -14,7 +14,7 @@ from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.frame_report import FrameReport
 from rstrack.tracking.judgement.fault import Fault
-from rstrack.tracking.judgement.innovation import unled
+from rstrack.tracking.judgement.innovation import disagreement
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.moving.leave_out import LeftOut, left_out_with, without
 from rstrack.tracking.moving.majority import not_with_most
@@ -183,7 +183,7 @@ def _leave(track: Track, window: Window) -> bool:
     covariances.look_at(ref, window.spline)
     pulls_of = {index: pulls(seen, window.state) for index, seen in seen_of.items()}
     by_depth = [seen for seen in seen_of.values() if seen and all(o.is_depth for o in seen)]
-    if any(np.trace(unled(seen, window.state)[:3, :3]) > _MOST_APART_M**2 for seen in by_depth):
+    if any(np.trace(disagreement(seen, window.state)[:3, :3]) > _MOST_APART_M**2 for seen in by_depth):
         return False
     window.keep(others)
     for frame in track.succession.recent:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Solved
@@ -16,7 +14,7 @@ from rstrack.images.pyramid import DepthImage
 from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.judgement.common import Common
 from rstrack.tracking.judgement.fault import Fault
-from rstrack.tracking.judgement.innovation import Innovation, Prediction, doubt, unled, weighed
+from rstrack.tracking.judgement.innovation import Innovation, Prediction, disagreement, doubt, weighed
 from rstrack.tracking.judgement.lost_track import implausible, is_settled
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.moving.leave_out import LeftOut
@@ -94,7 +92,7 @@ def match(
     return found
 
 
-def follows(track: Track, found: Match, gap: float, young: bool) -> Verdict:
+def judge_predicted(track: Track, found: Match, gap: float, young: bool) -> Verdict:
     """Whether a frame was found where the motion led; gap: s since the one before.
 
     young: its piece of the spline has just begun, and predicts little. A rolling reference moves with what is aligned
@@ -121,25 +119,25 @@ def follows(track: Track, found: Match, gap: float, young: bool) -> Verdict:
         if not rolls:
             uncertainty = uncertainty.after(seconds, pulled.information, *accelerations)
             common = track.covariances.after(seconds, uncertainty, on_reference, window.state, pulled)
-        more = np.zeros((12, 12))
         if weighs:
-            more += doubt(innovation, on_reference, window.state, predicted, considered)
+            more = doubt(innovation, on_reference, window.state, predicted, considered)
+            uncertainty = replace(uncertainty, doubt=more)
         if young and not fault:
-            more += unled(on_reference, window.state, considered)
-        uncertainty = replace(uncertainty, doubt=more)
+            more = uncertainty.doubt + disagreement(on_reference, window.state, considered)
+            uncertainty = replace(uncertainty, doubt=more)
     if not fault and implausible(T_predicted, window.spline.pose(mid), gap):
         fault = Fault.MOTION
     return Verdict(fault or _unknown(uncertainty), pulled, uncertainty, common)
 
 
-def begins(track: Track, found: Match) -> Verdict:
+def judge_unpredicted(track: Track, found: Match) -> Verdict:
     """Whether a frame was found where nothing led: by all of its images, as one alone is alike in many places."""
     pulled = pulls(found.fresh, found.window.state)
     fault = Fault.MISFIT if not found.whole else Fault.NONE
     fault = fault or track.fits.fault(found.fresh, found.solved, found.ref.pixels, new=True)
     uncertainty = track.covariances.uncertainty.found_anew(pulled.information)
     if not fault:
-        more = unled(found.fresh, found.window.state, track.covariances.considered(0.0))
+        more = disagreement(found.fresh, found.window.state, track.covariances.considered(0.0))
         uncertainty = replace(uncertainty, doubt=more)
     common = track.covariances.after(0.0, uncertainty, found.fresh, found.window.state, pulled)
     return Verdict(fault or _unknown(uncertainty), pulled, uncertainty, common)

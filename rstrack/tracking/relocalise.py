@@ -15,7 +15,7 @@ from rstrack.keyframes import coarse_search
 from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.judgement.fault import Fault
 from rstrack.tracking.judgement.lost_track import implausible
-from rstrack.tracking.matching import Match, Verdict, begins, match
+from rstrack.tracking.matching import Match, Verdict, judge_unpredicted, match
 from rstrack.tracking.track import Track
 from rstrack.tracking.window import LEVELS, Window
 
@@ -111,7 +111,7 @@ class Relocaliser:
             return window.restarted(new, track.found.end, ref.T_world_base @ T_ref_cam)
 
         found = match(track, begin, new, ref, fresh, LEVELS)
-        return found, begins(track, found)
+        return found, judge_unpredicted(track, found)
 
 
 def where_led(

@@ -31,7 +31,7 @@ from rstrack.tracking.bootstrap import bootstrap, fit_knots, start
 from rstrack.tracking.bridging import Bridge
 from rstrack.tracking.frame_report import FrameReport
 from rstrack.tracking.judgement.fault import Fault
-from rstrack.tracking.matching import Match, Verdict, follows, match
+from rstrack.tracking.matching import Match, Verdict, judge_predicted, match
 from rstrack.tracking.relocalise import Relocaliser
 from rstrack.tracking.track import Track
 from rstrack.tracking.window import LEVELS, TRACKING_LEVELS, Window
@@ -239,7 +239,7 @@ class Tracker:
         fresh = track.observe(new, ref) + ([] if anchor is None else track.observe(new, anchor))
         levels = LEVELS if young or gap > (_LED_S if led else _SURE_S) else TRACKING_LEVELS
         found = match(track, begin, new, ref, fresh, levels, track.succession.recent[-1].depth)
-        verdict = follows(track, found, gap, young)
+        verdict = judge_predicted(track, found, gap, young)
         if not verdict.fault:
             return self._go_on(found, verdict)
         if not led:

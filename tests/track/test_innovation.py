@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.tracking.judgement import innovation as module
-from rstrack.tracking.judgement.innovation import Prediction, doubt, unled, weighed
+from rstrack.tracking.judgement.innovation import Prediction, disagreement, doubt, weighed
 
 HALF = 0.015
 LIMIT = float(chi2.ppf(0.999, 12))
@@ -188,17 +188,17 @@ def test_of_images_that_nothing_predicts_either_may_be_right_where_they_disagree
     """Each counts as if it were, and no more than what is beyond chance."""
     R, state = np.diag(np.full(12, 1e-8)), at_rest()[0]
     off = 0.02 * np.eye(12)[1]
-    apart = unled([image(True, R, off), image(False, R, -off)], state)
+    apart = disagreement([image(True, R, off), image(False, R, -off)], state)
     np.testing.assert_allclose(apart[:3, :3], 2.0 * np.outer(off, off)[:3, :3], rtol=0.01, atol=1e-9)
     agree = 1e-4 * np.eye(12)[1]
-    assert np.abs(unled([image(True, R, agree), image(False, R, -agree)], state)).max() < 1e-9
+    assert np.abs(disagreement([image(True, R, agree), image(False, R, -agree)], state)).max() < 1e-9
 
 
 @pytest.mark.parametrize("kinds", [[True], [False], [True, False]])
 def test_where_all_of_a_frame_s_images_pull_it_away_it_may_be_there(kinds: list[bool]) -> None:
     """Before a wall depth alone slides: what the spline has is not what the image says."""
     R, off = np.diag(np.full(12, 1e-8)), 0.3 * np.eye(12)[0]
-    apart = unled([image(is_depth, R, off) for is_depth in kinds], at_rest()[0])
+    apart = disagreement([image(is_depth, R, off) for is_depth in kinds], at_rest()[0])
     np.testing.assert_allclose(apart[:3, :3], np.outer(off, off)[:3, :3], rtol=0.02, atol=1e-6)
 
 
@@ -211,4 +211,4 @@ def test_what_a_wrong_calibration_explains_divides_no_images() -> None:
         moved=lambda o, _: by if o.is_depth else -by, of_keyframe=lambda *_: np.zeros((6, 1)),
         predicted=lambda *_: np.zeros((12, 1)),
     )  # fmt: skip
-    assert np.abs(unled(images, at_rest()[0], sides)[:3, :3]).max() < 0.1 * 0.02**2
+    assert np.abs(disagreement(images, at_rest()[0], sides)[:3, :3]).max() < 0.1 * 0.02**2

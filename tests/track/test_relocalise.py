@@ -18,7 +18,7 @@ from rstrack.tracking import matching
 from rstrack.tracking.judgement.fault import Fault
 from rstrack.tracking.judgement.lost_track import FitHistory
 from rstrack.tracking.judgement.uncertainty import Uncertainty
-from rstrack.tracking.matching import Match, begins, without_misfits
+from rstrack.tracking.matching import Match, judge_unpredicted, without_misfits
 from rstrack.tracking.relocalise import Relocaliser, where_led
 
 REF: Any = SimpleNamespace(index=0, pixels=5000, T_world_base=np.eye(4), median_depth=1.0)
@@ -51,12 +51,12 @@ def test_what_fits_and_what_stands_alone_stays() -> None:
 def test_a_place_is_found_by_all_of_a_frame_s_images_only(monkeypatch: pytest.MonkeyPatch) -> None:
     """Depth alone fits many places: an iPhone's was found 1.5 m and 180 degrees off, shaken ones up to 58 mm."""
     monkeypatch.setattr(matching, "pulls", lambda *_: Pulls((1.0,) * 3, 1e8 * np.eye(6)))
-    monkeypatch.setattr(matching, "unled", lambda *_: np.zeros((12, 12)))
+    monkeypatch.setattr(matching, "disagreement", lambda *_: np.zeros((12, 12)))
     covariances = SimpleNamespace(uncertainty=Uncertainty(), after=lambda *_: None, considered=lambda _: None)
     track: Any = SimpleNamespace(fits=FitHistory(), covariances=covariances)
     for whole, says in ((True, Fault.NONE), (False, Fault.MISFIT)):
         given: list[Any] = [None, REF, SimpleNamespace(state=None), None, [seen("depth")], Solved(last_shift=0.0), None]
-        assert begins(track, Match(*given, whole)).fault is says
+        assert judge_unpredicted(track, Match(*given, whole)).fault is says
 
 
 class Sees(Relocaliser):

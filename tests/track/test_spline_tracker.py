@@ -157,7 +157,7 @@ def test_first_frames_that_slide_are_lost_and_the_next_ones_begin_anew(monkeypat
     tracker, forgotten = tracker_of("rs-g"), []
     monkeypatch.setattr(tracker._track.fits, "forget", lambda: forgotten.append(True))
 
-    monkeypatch.setattr(bootstrap, "unled", lambda *_: np.eye(12) * (not forgotten))
+    monkeypatch.setattr(bootstrap, "disagreement", lambda *_: np.eye(12) * (not forgotten))
     feed(tracker, (frame_at(k) for k in range(14)))
     assert forgotten == [True], "what was usual in them"
     assert [report.fault for report in tracker.reports[:6]] == [*[Fault.NO_START] * 5, Fault.NONE]

@@ -152,7 +152,7 @@ def doubt(
     return np.asarray(total)
 
 
-def unled(fresh: Sequence[Observation], state: SplineState, considered: Considered | None = None) -> FloatArray:
+def disagreement(fresh: Sequence[Observation], state: SplineState, considered: Considered | None = None) -> FloatArray:
     """Covariance (12, 12) that a pose has beyond the filter's which nothing predicts, of the line that is furthest off.
 
     Its images all pull it somewhere else, beyond noise, where the spline cannot follow. And where they disagree by more
