@@ -73,8 +73,9 @@ def methods(full: Records) -> list[str]:
 
 
 def per_sequence(full: Records) -> list[str]:
-    """ATE of every method on every sequence of these groups."""
+    """ATE of every method, with the fusion that it has by default, on every sequence of these groups."""
     records = [record for group in PAPERS_GROUPS for record in of_group(full, group)]
+    records = [record for record in records if not {"fuse", "no-fuse"} & set(options_of(record))]
     return _section("ATE by sequence, mm", by_sequence(records), records)
 
 
@@ -112,7 +113,9 @@ def loops(full: Records) -> list[str]:
     shown = [record for record in tracks if record.method in {*closing, *closing.values()}]
     lines = _beside("Loops closed, and not", shown, lambda record: record.method in closing)
     found = of_measure(full, "loops")
-    table = _table(measured_table(found, _COLUMNS["loops"]), found)
+    if not found:
+        return lines
+    table = measured_table(found, _COLUMNS["loops"]).markdown()
     return [*lines, "Loops against the truth, and places that look alike:", "", table, ""]
 
 
@@ -132,7 +135,7 @@ def faults(full: Records) -> list[str]:
         head = ("kind", "faults", "silently wrong", "frames of these", "lost frames", "found in 5", "worst, mm")
         cases = ", ".join(cases_of([record for record in records if record.method == method]))
         lines += [f"`{method}`, one fault a run, on {cases}:", "", Table(head, tuple(rows)).markdown(), ""]
-    return lines if records else [*lines, NOTHING, ""]
+    return lines if records else []
 
 
 def changes(full: Records) -> list[str]:
@@ -167,13 +170,11 @@ def speed(full: Records) -> list[str]:
 
 
 def memory(full: Records) -> list[str]:
-    """Most memory of a track, by method and group."""
+    """Most memory of a track, by method: a line."""
     tracks = [record for record in of_measure(full, "track") if record.values("peak_mb")]
-    shown = methods_in_order(tracks)
     found = averages(tracks)
-    row: tuple[Entry | str, ...] = ("most", *(Entry(f"{found[method].peak_mb or 0:.0f}") for method in shown))
-    about = "Memory, MB: the process with all it holds, most of all tracks"
-    return _section(about, Table(("", *shown), (row,)), tracks)
+    most = ", ".join(f"`{method}` {found[method].peak_mb or 0:.0f}" for method in methods_in_order(tracks))
+    return [f"Memory of the process with all it holds, most of all tracks, MB: {most}.", ""] if tracks else []
 
 
 def measured(title: str, *measures: str) -> Callable[[Records], list[str]]:
@@ -189,7 +190,7 @@ def measured(title: str, *measures: str) -> Callable[[Records], list[str]]:
 
 def gate(records: Records) -> list[str]:
     """What guards every change, with what chance does to it."""
-    tracks = [record for record in of_measure(records, "track") if group_of(record) != FAMILY]
+    tracks = [record for record in of_measure(records, "track") if group_of(record) != FAMILY and not is_change(record)]
     found = {(record.method, record.case): record for record in tracks}
     table = pivot(
         "case", cases_of(tracks), methods_in_order(tracks), lambda case, m: _with_scatter(found.get((m, case)))
@@ -282,9 +283,5 @@ def _with_scatter(record: Record | None) -> Entry:
 
 
 def _section(title: str, table: Table, records: Sequence[Record], *told: str) -> list[str]:
-    return [f"## {title}", "", *told, _table(table, records), ""]
-
-
-def _table(table: Table, records: Sequence[Record]) -> str:
-    """A dash where there are no records."""
-    return table.markdown() if records else NOTHING
+    """Nothing where there are no records."""
+    return [f"## {title}", "", *told, table.markdown(), ""] if records else []

@@ -67,21 +67,25 @@ _WHAT = {
 
 
 def results_markdown(gate: Records, full: Records) -> str:
-    """All of docs/results.md. Cells that the full tier has not are the gate's; what neither has shows '-'."""
+    """All of docs/results.md. Cells that the full tier has not are the gate's; empty sections are left out."""
     parts = (
         sections.methods, sections.per_sequence, sections.real, sections.not_the_best, sections.imu, sections.loops,
-        sections.faults, sections.changes, cliff, sections.readout, sections.others, sections.speed,
+        sections.faults, sections.changes, cliff, sections.readout, sections.speed, sections.memory,
         sections.measured("Calibration", "calibration"),
         sections.measured("Lenses told wrong, found: RMS over the image", "lens"),
         sections.measured("With the camera found on another recording", "crossed"),
         sections.measured("Convergence and start", "convergence", "bootstrap"),
-        sections.measured("Light and rendering", "light", "render"), sections.memory,
+        sections.measured("Light and rendering", "light", "render"),
         sections.measured("Long runs", "long"),
     )  # fmt: skip
     tiers = [*_provenance("Full tier", full), *_provenance("Gate", gate)]
     missing = [*failures(full.values()), *failures(gate.values())]
     lines = ["# Results", "", _ABOUT, "", *tiers, *missing, "", _WORDS, ""]
-    lines += [*(line for part in parts for line in part({**gate, **full})), *sections.gate(gate)]
+    lines += [
+        *(line for part in parts for line in part({**gate, **full})),
+        *sections.others(full),
+        *sections.gate(gate),
+    ]
     return "\n".join(lines).rstrip() + "\n"
 
 
