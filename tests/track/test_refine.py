@@ -247,3 +247,17 @@ def test_what_a_run_rules_out_is_given_back_unless_the_calibration_explains_it(
 ) -> None:
     why = contradiction(*run_of(metres, off_m, common_m))
     assert bool(why) is is_ruled_out and ("calibrate" in why) is is_ruled_out
+
+
+@pytest.mark.parametrize(("common_m", "is_outweighed"), [(0.0, False), (1e-3, False), (5e-3, True)])
+def test_a_run_whose_camera_may_be_further_off_than_its_noise_is_not_refined(
+    common_m: float, is_outweighed: bool, monkeypatch: pytest.MonkeyPatch, run: Path, tmp_path: Path
+) -> None:
+    why = refining.outweighed(run_of(1e-3, 0.0, common_m)[0])
+    assert bool(why) is is_outweighed and ("calibrate" in why) is is_outweighed
+    if is_outweighed:
+        monkeypatch.setattr(refining, "outweighed", lambda _: why)
+        refined = refine_run(run, tmp_path / "refined")
+        before = load_run(run).estimate
+        np.testing.assert_array_equal(refined.estimate.T_world_depth, before.T_world_depth)
+        assert refined.text().startswith(why) and load_run(tmp_path / "refined").estimate.info["refined"]["kept"] == why

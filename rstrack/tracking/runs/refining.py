@@ -37,7 +37,7 @@ from rstrack.options import Options
 from rstrack.tracking.runs.record import Noise
 
 if TYPE_CHECKING:
-    from rstrack.adjustment.refine import Refiner
+    from rstrack.adjustment.refine import Refiner, Round
     from rstrack.adjustment.unit import Unit
     from rstrack.images.device_frame import DeviceFrame
 
@@ -49,6 +49,8 @@ _NOT_LOOKED_AT = (
     "the IMU was not looked at (it has no gyroscope, or no samples of these frames): where images tell little, over "
     "gaps and at bare walls, keep the run"
 )
+# Over which a run's errors are compared, s.
+_SECOND_S = 1.0
 # Chance of a motion that counts as ruled out.
 _RULED_OUT = 0.01
 # Rounding of times.
@@ -72,12 +74,13 @@ class Refined:
 
     def text(self) -> str:
         """A summary of a few lines."""
-        moved = ", ".join(f"{1e3 * r['moved_m']:.3f}" for r in self.rounds)
-        last = self.rounds[-1]
-        lines = [
-            f"{len(self.rounds)} rounds in {self.seconds:.0f} s: {last['keyframes']} keyframes, {last['pairs']} pairs "
-            f"of a frame and a keyframe; poses moved by up to {moved} mm"
-        ]
+        moved, lines = ", ".join(f"{1e3 * r['moved_m']:.3f}" for r in self.rounds), []
+        if self.rounds:
+            last = self.rounds[-1]
+            lines.append(
+                f"{len(self.rounds)} rounds in {self.seconds:.0f} s: {last['keyframes']} keyframes, {last['pairs']} "
+                f"pairs of a frame and a keyframe; poses moved by up to {moved} mm"
+            )
         lines += [line for line in (self.imu, self.kept) if line]
         if self.before is not None and self.after is not None:
             lines += [f"ATE before {1e3 * self.before.metrics.ate_rmse_m:.3f} mm", "", self.after.text()]
@@ -110,11 +113,14 @@ def refine_run(
         raise UserError(f"--imu {imu_file}: {run} is of {options.method}, which uses no IMU: track with one that does")
     dataset = dataset if imu_file is None else dataset.with_imu_file(imu_file)
     refiner = _refiner(dataset, estimate, options, noise, run)
-    try:
-        spline, done = refiner.refined(estimate.spline, rounds, progress)
-    except np.linalg.LinAlgError as error:
-        raise UserError(f"{run}: cannot be refined: {error}") from None
-    kept = contradiction(estimate, spline)
+    spline, kept = estimate.spline, outweighed(estimate)
+    done: list[Round] = []
+    if not kept:
+        try:
+            spline, done = refiner.refined(estimate.spline, rounds, progress)
+        except np.linalg.LinAlgError as error:
+            raise UserError(f"{run}: cannot be refined: {error}") from None
+        kept = contradiction(estimate, spline)
     if kept:
         spline = estimate.spline
     moved = spline.pose(estimate.stamps) @ se3.inverse(estimate.spline.pose(estimate.stamps))
@@ -123,7 +129,7 @@ def refine_run(
     info = estimate.info | {"refined": {"of": str(run.resolve()), "rounds": told, "seconds": seconds, "kept": kept}}
     if isinstance(recorded := info.get("dataset"), dict):
         info["dataset"] = recorded | {"camera": dataset.cameras}
-    poses = se3.orthonormalise(moved @ estimate.T_world_depth)
+    poses = estimate.T_world_depth if kept else se3.orthonormalise(moved @ estimate.T_world_depth)
     imu = _NOT_LOOKED_AT if options.inertial else ""
     if refiner.unit is not None and refiner.found is not None and not kept:
         believed = imu_record.believed(refiner.found.belief, refiner.unit.sigma)
@@ -137,6 +143,29 @@ def refine_run(
     write_estimate(out, result.stamps, result.T_world_depth, spline, info, estimate)
     result.moving.write(out, range(len(dataset)))
     return Refined(result, told, before, after, seconds, imu, kept)
+
+
+def outweighed(estimate: Estimate) -> str:
+    """Why refining a run is of no use: over a second its camera file may be further off than its noise; else empty.
+
+    Refining averages noise. What all images have wrong alike it does not take away, but may bend the track by it.
+    """
+    T, known = estimate.T_world_depth, covariances(estimate)
+    i, j = pairs_apart(estimate.stamps, _SECOND_S)
+    both = motion_covariance(T, known, i, j)
+    noise = motion_covariance(T, replace(known, common=np.zeros_like(known.common)), i, j)
+    finite = np.isfinite(both).all(axis=(1, 2))
+    if not finite.any():
+        return ""
+    camera_mm, noise_mm = (
+        1e3 * float(np.sqrt(np.median(np.trace(C[finite][:, :3, :3], axis1=1, axis2=2)))) for C in (both - noise, noise)
+    )
+    if camera_mm <= noise_mm:
+        return ""
+    return (
+        f"given back as it was: errors of the camera file may move it by {camera_mm:.1f} mm over a second, noise, all "
+        f"that refining averages, by {noise_mm:.1f} mm: find the camera (rstrack calibrate) and track again with it"
+    )
 
 
 def contradiction(estimate: Estimate, spline: Spline) -> str:
