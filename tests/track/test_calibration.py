@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ import synthetic
 from shaken_recording import CORNER, OPTIONS, SHORT, FaultyDepth, recording, shaking
 
 from rsgen.array_types import ByteArray
+from rsgen.console.progress import no_progress
 from rsgen.device.arrays import engine
 from rsgen.errors import UserError
 from rsgen.geometry import se3
@@ -31,6 +34,7 @@ from rstrack.cli.main import main
 from rstrack.data.dataset import Dataset
 from rstrack.data.depth_error import DepthError
 from rstrack.data.noise import NoisyImages, with_noise
+from rstrack.options import Options
 
 
 @pytest.fixture(autouse=True)
@@ -127,3 +131,13 @@ def test_noise_is_that_of_track_and_makes_sigmas_grow(shaken: Dataset) -> None:
     plain, grown = (calibrate(each, ("readout",), SHORT, OPTIONS) for each in (shaken, noisy))
     assert (grown.sigmas[:2] > 2.0 * plain.sigmas[:2]).all()
     assert (np.abs(grown.values.since(grown.start)[:2]) < 5.0 * grown.sigmas[:2]).all()
+
+
+def test_knots_of_every_other_stretch_lie_half_a_spacing_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever phase is asked for: what a spline cannot follow then averages out of the clocks."""
+    monkeypatch.setattr(calibration_run, "load_stretch", lambda *given: given[-1].knot_phase)
+    dataset: Any = SimpleNamespace(with_color_offset=lambda *_, **__: None)
+    for asked in (0.0, 0.5, 0.8):
+        given: list[Any] = [dataset, None, [range(30)] * 4, None, None, Options(knot_phase=asked)]
+        first, second, *rest = calibration_run._loaded(*given, no_progress)
+        assert first == asked and abs(second - first) == pytest.approx(0.5) and rest == [first, second]

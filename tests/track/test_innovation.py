@@ -190,6 +190,8 @@ def test_of_images_that_nothing_predicts_either_may_be_right_where_they_disagree
     off = 0.02 * np.eye(12)[1]
     apart = disagreement([image(True, R, off), image(False, R, -off)], state)
     np.testing.assert_allclose(apart[:3, :3], 2.0 * np.outer(off, off)[:3, :3], rtol=0.01, atol=1e-9)
+    unseen: Any = SimpleNamespace(is_linearised=False)
+    assert not disagreement([unseen], state).any() and not disagreement([], state).any()
     agree = 1e-4 * np.eye(12)[1]
     assert np.abs(disagreement([image(True, R, agree), image(False, R, -agree)], state)).max() < 1e-9
 

@@ -158,11 +158,14 @@ def disagreement(fresh: Sequence[Observation], state: SplineState, considered: C
     Its images all pull it somewhere else, beyond noise, where the spline cannot follow. And where they disagree by more
     than they, and the calibration, explain, either of them may be right: each counts as if it were.
     """
-    first = max((o for o in fresh if o.is_linearised), key=lambda o: o.is_depth)
+    aligned = [o for o in fresh if o.is_linearised]
+    if not aligned:
+        return np.zeros((12, 12))
+    first = max(aligned, key=lambda o: o.is_depth)
     exposure, distance = first.image.exposure, first.ref.median_depth
     mid, half = exposure.mid_time, 0.5 * (exposure.last_time - exposure.first_time)
     here = Prediction(mid, *state.spline.pose_and_velocity(mid), Uncertainty().state)
-    seen = [_measured(o, state, here, considered) for o in fresh if o.is_linearised]
+    seen = [_measured(o, state, here, considered) for o in aligned]
 
     def squared(z: FloatArray) -> FloatArray:
         ends = z[:6] - half * z[6:], z[:6] + half * z[6:]

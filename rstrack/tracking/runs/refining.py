@@ -49,8 +49,6 @@ _NOT_LOOKED_AT = (
     "the IMU was not looked at (it has no gyroscope, or no samples of these frames): where images tell little, over "
     "gaps and at bare walls, keep the run"
 )
-# Over which a run's errors are compared, s.
-_SECOND_S = 1.0
 # Chance of a motion that counts as ruled out.
 _RULED_OUT = 0.01
 # Rounding of times.
@@ -151,7 +149,7 @@ def outweighed(estimate: Estimate) -> str:
     Refining averages noise. What all images have wrong alike it does not take away, but may bend the track by it.
     """
     T, known = estimate.T_world_depth, covariances(estimate)
-    i, j = pairs_apart(estimate.stamps, _SECOND_S)
+    i, j = pairs_apart(estimate.stamps, HORIZONS_S[1])
     both = motion_covariance(T, known, i, j)
     noise = motion_covariance(T, replace(known, common=np.zeros_like(known.common)), i, j)
     finite = np.isfinite(both).all(axis=(1, 2))
