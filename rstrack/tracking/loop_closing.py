@@ -26,7 +26,7 @@ from rstrack.adjustment.moves import Moves
 from rstrack.adjustment.rigid import Usual
 from rstrack.data.rig import Frame
 from rstrack.keyframes.archive import Archive
-from rstrack.tracking.judgement.uncertainty import SYSTEMATIC_PX
+from rstrack.tracking.judgement.systematic import SYSTEMATIC_PX
 from rstrack.tracking.spline_tracker import Tracker
 
 # Loops that `info` lists at most.

@@ -14,7 +14,7 @@ from rstrack.images.pyramid import DepthImage
 from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.judgement.common import Common
 from rstrack.tracking.judgement.fault import Fault
-from rstrack.tracking.judgement.innovation import Innovation, Prediction, disagreement, doubt, weighed
+from rstrack.tracking.judgement.innovation import Innovation, Prediction, disagreement, doubt, systematic, weighed
 from rstrack.tracking.judgement.lost_track import implausible, is_settled
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.moving.leave_out import LeftOut
@@ -121,7 +121,8 @@ def judge_predicted(track: Track, found: Match, gap: float, young: bool) -> Verd
             common = track.covariances.after(seconds, uncertainty, on_reference, window.state, pulled)
         if weighs:
             more = doubt(innovation, on_reference, window.state, predicted, considered)
-            uncertainty = replace(uncertainty, doubt=more)
+            learnt = systematic(innovation, uncertainty.systematic, pulled.excess)
+            uncertainty = replace(uncertainty, doubt=more, systematic=learnt)
         if young and not fault:
             more = uncertainty.doubt + disagreement(on_reference, window.state, considered)
             uncertainty = replace(uncertainty, doubt=more)

@@ -27,7 +27,8 @@ from rstrack.alignment.observation import Observation
 from rstrack.alignment.pull import steady
 from rstrack.alignment.spline_state import SplineState
 from rstrack.tracking.judgement.common import Considered
-from rstrack.tracking.judgement.uncertainty import SYSTEMATIC_PX, Uncertainty
+from rstrack.tracking.judgement.systematic import SYSTEMATIC_PX, Systematic, of_pixels
+from rstrack.tracking.judgement.uncertainty import Uncertainty
 
 # What an innovation of 12 numbers, over its covariance, exceeds by chance once in a thousand times.
 _LIMIT = float(chdtri(12, 1e-3))
@@ -180,6 +181,19 @@ def disagreement(fresh: Sequence[Observation], state: SplineState, considered: C
     return np.asarray(beyond * squared(z) + (1.0 - 1.0 / inflation) * apart)
 
 
+def systematic(innovation: Innovation, known: Systematic, excess: float) -> Systematic:
+    """With what the depth and the colour of a frame say of it where nothing is odd; excess: see `Pulls`."""
+    kinds = [
+        next((one for one in innovation.measured if one.observation.is_depth is kind), None) for kind in (True, False)
+    ]
+    depth, color = kinds
+    if depth is None or color is None:
+        return known
+    focal_px, depth_m = depth.observation.ref.lens.camera.fx, depth.observation.ref.median_depth
+    both, D = (depth.R + color.R)[:6, :6] - 2.0 * of_pixels(SYSTEMATIC_PX, focal_px, depth_m), (depth.D - color.D)[:6]
+    return known.with_frame((depth.z - color.z)[:6], excess**2 * both + D @ D.T, focal_px, depth_m)
+
+
 def _expected(odd: _Measured, P: FloatArray, rest: Sequence[_Measured]) -> tuple[FloatArray, FloatArray]:
     """How far an image is off (12,) where the others are known, and the covariance (12, 12) of that but for its own R.
 
@@ -238,8 +252,7 @@ def _measured(
         D = R @ H @ considered.moved(o, state) / by[:, None]
         D[:6] += considered.of_keyframe(o, pose)
         D -= considered.predicted(pose)
-    turn = SYSTEMATIC_PX / o.ref.lens.camera.fx
-    R += np.diag(np.tile(np.repeat([turn * o.ref.median_depth, turn], 3), 2) ** 2)
+    R += np.kron(np.eye(2), of_pixels(SYSTEMATIC_PX, o.ref.lens.camera.fx, o.ref.median_depth))
     R = R / np.outer(by, by)
     off = se3.log(se3.inverse(predicted.pose(mid)) @ pose)
     deviation = np.concatenate([off, velocity - predicted.velocity])

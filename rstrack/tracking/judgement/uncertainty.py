@@ -2,7 +2,7 @@
 
 A frame's images give an information matrix, that of the normal equations with pixels counted as far as they are
 independent; what they leave open, the motion before holds, ever less (a Kalman filter over pose and velocity with white
-acceleration). What all pixels have in common, and no scatter of theirs shows, is added as a hundredth of a pixel. Where
+acceleration). What all pixels have in common, and no scatter of theirs shows, is added (`systematic.py`). Where
 a frame becomes a keyframe its covariance is added to all that follows: drift.
 
 Increments are [m; rad] in the depth camera's own frame at mid readout, T_world_depth exp(ξ), unless named otherwise.
@@ -17,10 +17,8 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rstrack.alignment.priors import ACCELERATION, VELOCITY
+from rstrack.tracking.judgement.systematic import Systematic, of_pixels
 
-# Systematic error of a pose in pixels of the depth camera, σ: steps not taken to the end, interpolation, knots.
-# Measured on hand-held renderings with noise (docs/notebook/hand-held.md).
-SYSTEMATIC_PX = 0.01
 # σ (m, rad) above which a pose is not known.
 _WORST = np.array([0.02, np.radians(2.0)])
 # A pose that nothing tells, m and rad.
@@ -33,13 +31,14 @@ class Uncertainty:
     (12, 12): what they have beyond it, see `innovation.doubt`.
 
     seen (6, 6): what its images say of its pose, the information. drift: for each keyframe by its index the covariance
-    (6, 6) of its pose, as left increments in the world.
+    (6, 6) of its pose, as left increments in the world. systematic: what images so far have told of such errors.
     """
 
     state: FloatArray = field(default_factory=lambda: _lost())
     doubt: FloatArray = field(default_factory=lambda: np.zeros((12, 12)))
     seen: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
     drift: dict[int, FloatArray] = field(default_factory=dict)
+    systematic: Systematic = field(default_factory=Systematic)
 
     @property
     def pose(self) -> FloatArray:
@@ -48,8 +47,7 @@ class Uncertainty:
 
     def covariance(self, focal_px: float, depth_m: float) -> FloatArray:
         """The same with what is systematic, for a depth camera of such a focal length and things so far away."""
-        turn = SYSTEMATIC_PX / focal_px
-        return np.asarray(self.pose + np.diag(np.repeat([turn * depth_m, turn], 3) ** 2))
+        return np.asarray(self.pose + of_pixels(self.systematic.px, focal_px, depth_m))
 
     @property
     def is_known(self) -> bool:
