@@ -121,10 +121,13 @@ def judge_predicted(track: Track, found: Match, gap: float, young: bool) -> Verd
             common = track.covariances.after(seconds, uncertainty, on_reference, window.state, pulled)
         if weighs:
             more = doubt(innovation, on_reference, window.state, predicted, considered)
+            uncertainty = replace(uncertainty, doubt=more)
+        if weighs and not young:
             learnt = systematic(innovation, uncertainty.systematic, pulled.excess)
-            uncertainty = replace(uncertainty, doubt=more, systematic=learnt)
+            uncertainty = replace(uncertainty, systematic=learnt)
         if young and not fault:
-            more = uncertainty.doubt + disagreement(on_reference, window.state, considered)
+            usual = uncertainty.systematic.usual_inflation
+            more = uncertainty.doubt + disagreement(on_reference, window.state, considered, usual)
             uncertainty = replace(uncertainty, doubt=more)
     if not fault and implausible(T_predicted, window.spline.pose(mid), gap):
         fault = Fault.MOTION
@@ -138,7 +141,8 @@ def judge_unpredicted(track: Track, found: Match) -> Verdict:
     fault = fault or track.fits.fault(found.fresh, found.solved, found.ref.pixels, new=True)
     uncertainty = track.covariances.uncertainty.found_anew(pulled.information)
     if not fault:
-        more = disagreement(found.fresh, found.window.state, track.covariances.considered(0.0))
+        considered, usual = track.covariances.considered(0.0), uncertainty.systematic.usual_inflation
+        more = disagreement(found.fresh, found.window.state, considered, usual)
         uncertainty = replace(uncertainty, doubt=more)
     common = track.covariances.after(0.0, uncertainty, found.fresh, found.window.state, pulled)
     return Verdict(fault or _unknown(uncertainty), pulled, uncertainty, common)

@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 from scipy.stats import chi2
 
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.tracking.judgement import innovation as module
-from rstrack.tracking.judgement.innovation import Prediction, disagreement, doubt, weighed
+from rstrack.tracking.judgement.innovation import Prediction, disagreement, doubt, systematic, weighed
+from rstrack.tracking.judgement.systematic import Systematic
 
 HALF = 0.015
 LIMIT = float(chi2.ppf(0.999, 12))
@@ -214,3 +216,29 @@ def test_what_a_wrong_calibration_explains_divides_no_images() -> None:
         predicted=lambda *_: np.zeros((12, 1)),
     )  # fmt: skip
     assert np.abs(disagreement(images, at_rest()[0], sides)[:3, :3]).max() < 0.1 * 0.02**2
+
+
+def test_images_that_disagree_as_they_always_do_say_nothing_of_this_frame() -> None:
+    """With a wrong camera file depth and colour are apart in all frames, and lost ones are found all the same."""
+    R, off = np.diag(np.full(12, 1e-8)), 0.02 * np.eye(12)[1]
+    images, state = [image(True, R, off), image(False, R, -off)], at_rest()[0]
+    alone = disagreement(images, state)
+    twice = disagreement([image(True, R, 2.0 * off), image(False, R, -2.0 * off)], state)
+    # The inflation that these need is some (2 off)² over their covariances, and is what has been usual.
+    inflation = brentq(lambda s: disagreement(images, state, None, s)[1, 1] - 0.5 * alone[1, 1], 1.0, 1e9)
+    assert not disagreement(images, state, None, 2.1 * inflation).any()
+    assert disagreement(images, state, None, 0.2 * inflation)[1, 1] == pytest.approx(0.9 * alone[1, 1], rel=0.02)
+    assert twice[1, 1] == pytest.approx(4.0 * alone[1, 1], rel=0.01)
+
+
+def test_inflations_of_predicted_frames_are_learnt() -> None:
+    R, P = np.diag(np.full(12, 1e-8)), np.diag(np.full(12, 1e-2))
+    off, known = 0.02 * np.eye(12)[1], Systematic()
+    assert known.usual_inflation == 1.0
+    for apart, usual in ((0.0, 1.0), (1.0, 1.0), (1.0, 10.0), (1.0, 10.0)):
+        images = [image(True, R, apart * off), image(False, R, -apart * off)]
+        for o in images:
+            o.ref.median_depth, o.ref.lens.camera.fx = 2.0, 500.0
+        found = weighed(images, at_rest()[0], predicted(P))
+        known = systematic(found, known, 1.0)
+        assert known.usual_inflation >= usual

@@ -153,11 +153,14 @@ def doubt(
     return np.asarray(total)
 
 
-def disagreement(fresh: Sequence[Observation], state: SplineState, considered: Considered | None = None) -> FloatArray:
+def disagreement(
+    fresh: Sequence[Observation], state: SplineState, considered: Considered | None = None, usual: float = 1.0
+) -> FloatArray:  # fmt: skip
     """Covariance (12, 12) that a pose has beyond the filter's which nothing predicts, of the line that is furthest off.
 
     Its images all pull it somewhere else, beyond noise, where the spline cannot follow. And where they disagree by more
-    than they, and the calibration, explain, either of them may be right: each counts as if it were.
+    than they, the calibration and what is usual explain, either of them may be right: each counts as if it were.
+    usual: see `Systematic.usual_inflation`; a wrong camera file makes all frames' images disagree.
     """
     aligned = [o for o in fresh if o.is_linearised]
     if not aligned:
@@ -178,11 +181,12 @@ def disagreement(fresh: Sequence[Observation], state: SplineState, considered: C
     apart = np.sum([squared(one.z) for one in seen], axis=0)
     z, R, _ = _combined(seen)
     beyond = max(0.0, 1.0 - len(z) / max(float(z @ np.linalg.solve(R, z)), 1e-12))
-    return np.asarray(beyond * squared(z) + (1.0 - 1.0 / inflation) * apart)
+    return np.asarray(beyond * squared(z) + max(0.0, 1.0 - usual / inflation) * apart)
 
 
 def systematic(innovation: Innovation, known: Systematic, excess: float) -> Systematic:
     """With what the depth and the colour of a frame say of it where nothing is odd; excess: see `Pulls`."""
+    known = known.with_inflation(innovation.own)
     kinds = [
         next((one for one in innovation.measured if one.observation.is_depth is kind), None) for kind in (True, False)
     ]

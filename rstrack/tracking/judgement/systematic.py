@@ -7,7 +7,8 @@ Variance Components, 1992, chapter 9). Images that are noisy, or of a camera lit
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from statistics import median
 
 import numpy as np
 import scipy.linalg
@@ -30,9 +31,10 @@ def of_pixels(sigma_px: float, focal_px: float, depth_m: float) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Systematic:
-    """What the last frames say: logarithms of the likelihoods (17,) of σ."""
+    """What the last frames say: logarithms of the likelihoods (17,) of σ; inflations: see `usual_inflation`."""
 
     likelihoods: FloatArray = field(default_factory=lambda: np.zeros(len(_GRID)))
+    inflations: tuple[float, ...] = ()
 
     @property
     def px(self) -> float:
@@ -40,11 +42,20 @@ class Systematic:
         first = _likelihoods(np.full(6, 2.0 * SYSTEMATIC_PX**2), np.zeros(6))
         return float(_GRID[np.argmax(first + self.likelihoods)])
 
+    @property
+    def usual_inflation(self) -> float:
+        """Median of what makes images agree with each other: a wrong camera file has it large."""
+        return median(self.inflations) if self.inflations else 1.0
+
+    def with_inflation(self, inflation: float) -> Systematic:
+        """With a frame that was found, whose images had to be inflated by so much."""
+        return replace(self, inflations=(*self.inflations, inflation)[-_MEMORY:])
+
     def with_frame(self, apart: FloatArray, covariance: FloatArray, focal_px: float, depth_m: float) -> Systematic:
         """With a frame whose two images' poses are `apart` (6,), [m; rad], of covariance (6, 6) by all else."""
         spread, basis = scipy.linalg.eigh(covariance, of_pixels(1.0, focal_px, depth_m))
         found = _likelihoods((basis.T @ apart) ** 2, np.maximum(spread, 0.0))
-        return Systematic((1.0 - 1.0 / _MEMORY) * self.likelihoods + found)
+        return replace(self, likelihoods=(1.0 - 1.0 / _MEMORY) * self.likelihoods + found)
 
 
 def _likelihoods(squares: FloatArray, spread: FloatArray) -> FloatArray:
