@@ -26,7 +26,6 @@ from rstrack.bench.tables.shown import (
     by_case,
     by_sequence,
     cases_of,
-    cell_text,
     cell_triple,
     joined,
     measured_table,
@@ -188,16 +187,6 @@ def measured(title: str, *measures: str) -> Callable[[Records], list[str]]:
     return section
 
 
-def gate(records: Records) -> list[str]:
-    """What guards every change, with what chance does to it."""
-    tracks = [record for record in of_measure(records, "track") if group_of(record) != FAMILY and not is_change(record)]
-    found = {(record.method, record.case): record for record in tracks}
-    table = pivot(
-        "case", cases_of(tracks), methods_in_order(tracks), lambda case, m: _with_scatter(found.get((m, case)))
-    )
-    return _section("The gate: ATE, mm, and what chance does to one run (moderated)", table, tracks)
-
-
 def not_the_best(full: Records) -> list[str]:
     """In words and figures."""
     found = beaten(full)
@@ -275,11 +264,6 @@ def _kind(kind: float | None, names: Sequence[str]) -> str:
     if kind is None:
         return "any"
     return names[int(kind)] if int(kind) < len(names) else f"kind {kind:g}"
-
-
-def _with_scatter(record: Record | None) -> Entry:
-    scatter, _ = (0.0, 0.0) if record is None else record.scatter.get("ate_mm", (0.0, 0.0))
-    return Entry(cell_text(record, "ate_mm") + (f" ± {significant(scatter, 2, 100.0)} %" if scatter else ""))
 
 
 def _section(title: str, table: Table, records: Sequence[Record], *told: str) -> list[str]:

@@ -81,11 +81,7 @@ def results_markdown(gate: Records, full: Records) -> str:
     tiers = [*_provenance("Full tier", full), *_provenance("Gate", gate)]
     missing = [*failures(full.values()), *failures(gate.values())]
     lines = ["# Results", "", _ABOUT, "", *tiers, *missing, "", _WORDS, ""]
-    lines += [
-        *(line for part in parts for line in part({**gate, **full})),
-        *sections.others(full),
-        *sections.gate(gate),
-    ]
+    lines += [*(line for part in parts for line in part({**gate, **full})), *sections.others(full)]
     return "\n".join(lines).rstrip() + "\n"
 
 
