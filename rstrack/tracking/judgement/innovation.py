@@ -187,10 +187,9 @@ def disagreement(
 def systematic(innovation: Innovation, known: Systematic, excess: float) -> Systematic:
     """With what the depth and the colour of a frame say of it where nothing is odd; excess: see `Pulls`."""
     known = known.with_inflation(innovation.own)
-    kinds = [
+    depth, color = (
         next((one for one in innovation.measured if one.observation.is_depth is kind), None) for kind in (True, False)
-    ]
-    depth, color = kinds
+    )
     if depth is None or color is None:
         return known
     focal_px, depth_m = depth.observation.ref.lens.camera.fx, depth.observation.ref.median_depth
