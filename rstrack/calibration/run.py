@@ -44,6 +44,7 @@ from rstrack.calibration.unknowns.parameters import (
 from rstrack.data.dataset import Dataset
 from rstrack.options import Options
 from rstrack.tracking.first_look.color_offset import estimate_color_offset
+from rstrack.tracking.first_look.color_pairs import GeometricTracks
 
 # Frames of a stretch, the fewest that one may have, and how many stretches there are at least and at most.
 _FRAMES, _FEWEST_FRAMES, _FEWEST, _MOST = 30, 14, 3, 12
@@ -92,7 +93,8 @@ def calibrate(
     before = device.known(parameters_of(dataset)) if device else Known.nothing(parameters_of(dataset))
     start = before.values
     if dataset.timing is not None and dataset.timing.wants_color_offset and "offset" in groups:
-        start = replace(start, color_offset_s=estimate_color_offset(dataset, chosen, options, progress).offset_s)
+        tracks = GeometricTracks(dataset, chosen, options, progress)
+        start = replace(start, color_offset_s=estimate_color_offset(dataset, tracks, progress).offset_s)
     track = first_track(dataset, chosen, options, progress)
     parts = _stretches(dataset, chosen, track)
     free = _free(dataset, groups, parts)

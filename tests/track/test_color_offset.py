@@ -19,8 +19,9 @@ from rsgen.sequence.format import StreamName
 from rstrack.data.dataset import Dataset, group_colors, open_dataset
 from rstrack.data.estimate import read_estimate
 from rstrack.options import Options
-from rstrack.tracking.first_look import color_offset, color_pairs, rough_track
+from rstrack.tracking.first_look import color_offset, color_pairs
 from rstrack.tracking.first_look.color_offset import estimate_color_offset
+from rstrack.tracking.first_look.color_pairs import GeometricTrack, GeometricTracks
 from rstrack.tracking.runs.run import track
 
 WRONG_S = 0.0173
@@ -73,45 +74,40 @@ def wrongly_stamped(dataset: Dataset, by_s: float) -> Dataset:
     )
 
 
+def along(path: Spline | None) -> list[GeometricTrack | None]:
+    return [None if path is None else GeometricTrack(range(30), path, path.t_begin, path.t_end)]
+
+
 @pytest.mark.parametrize("wrong_s", [WRONG_S, -0.025, 0.0])
-def test_the_offset_is_found_along_the_true_path(
-    shaken: Dataset, monkeypatch: pytest.MonkeyPatch, wrong_s: float
-) -> None:
-    truth = shaken.truth
-    assert truth is not None
-    span = (truth.t_begin, truth.t_end)
-    monkeypatch.setattr(color_offset, "geometric_track", lambda *_: (truth, *span))
-    found = estimate_color_offset(wrongly_stamped(shaken, wrong_s))
+def test_the_offset_is_found_along_the_true_path(shaken: Dataset, wrong_s: float) -> None:
+    found = estimate_color_offset(wrongly_stamped(shaken, wrong_s), along(shaken.truth))
     assert not found.reason and found.pairs > 10
     assert found.offset_s == pytest.approx(wrong_s, abs=0.5e-3) and found.sigma_s < 0.5e-3
     assert abs(found.offset_s - wrong_s) < 5.0 * found.sigma_s + 0.1e-3
 
 
-def test_a_track_that_colour_contradicts_is_not_believed(shaken: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_track_that_colour_contradicts_is_not_believed(shaken: Dataset) -> None:
     truth = shaken.truth
     assert truth is not None
     other = replace(truth, control_points=truth.control_points[::-1].copy())
-    monkeypatch.setattr(color_offset, "geometric_track", lambda *_: (other, truth.t_begin, truth.t_end))
-    found = estimate_color_offset(wrongly_stamped(shaken, WRONG_S))
+    found = estimate_color_offset(wrongly_stamped(shaken, WRONG_S), along(other))
     assert "does not fit the track" in found.reason and found.offset_s == 0.0
 
 
-@pytest.mark.parametrize(
-    ("colors", "methods"), [("never", ["rs-g"]), ("moving", ["rs-g", "rs-pg"]), ("always", ["rs-pg"])]
-)
-def test_a_clock_is_not_looked_for_with_colours_whatever_seems_to_move(
-    shaken: Dataset, monkeypatch: pytest.MonkeyPatch, colors: color_pairs.Colors, methods: list[str]
+def test_a_clock_is_looked_for_by_depth_alone_along_a_track_that_is_made_once(
+    shaken: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A track that follows colours agrees with whatever clock it takes them to have."""
-    asked = []
+    asked: list[tuple[range, str]] = []
 
-    def seeing_things(dataset: Dataset, frames: range, options: Options, done: Callable[[float], None]) -> object:
-        asked.append(options.method)
-        return SimpleNamespace(reports=[SimpleNamespace(moving=0.1)], spline_valid=(), spline=None)
+    def lost(_: Dataset, frames: range, options: Options, done: Callable[[float], None]) -> object:
+        asked.append((frames, options.method))
+        done(1.0)
+        return SimpleNamespace(spline_valid=(), spline=None)
 
-    monkeypatch.setattr(rough_track, "rough_track", seeing_things)
-    found = color_pairs.geometric_track(shaken, range(9), Options(), no_progress, "", colors)
-    assert asked == methods and found == (None, 0.0, 0.0)
+    monkeypatch.setattr(color_pairs, "rough_track", lost)
+    tracks = GeometricTracks(shaken, range(9), Options(), no_progress)
+    assert list(tracks) == list(tracks) == [None] and asked == [(range(9), "rs-g")]
 
 
 @needs_rpy
@@ -122,41 +118,41 @@ def test_the_offset_of_a_kinect(tmp_path: Path, frames: range, sigma_s: float) -
     """SOURCE.md: about 22 ms, found by trial with stamps straightened over all of the recording."""
     camera = "color: {width: 640, height: 480, intrinsics: [525, 525, 319.5, 239.5], readout_s: 0.03}"
     (tmp_path / "camera.yaml").write_text(camera)
-    found = estimate_color_offset(open_dataset(RPY, tmp_path / "camera.yaml"), frames)
+    dataset = open_dataset(RPY, tmp_path / "camera.yaml")
+    found = estimate_color_offset(dataset, GeometricTracks(dataset, frames, Options(), no_progress))
     assert not found.reason and 0.015 < found.offset_s < 0.026 and found.sigma_s < sigma_s
 
 
-def test_what_the_motion_does_not_tell_is_left_open(shaken: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_motion_does_not_tell_is_left_open(shaken: Dataset) -> None:
     truth = shaken.truth
     assert truth is not None
     still = replace(truth, control_points=np.broadcast_to(np.eye(4), truth.control_points.shape).copy())
-    monkeypatch.setattr(color_offset, "geometric_track", lambda *_: (still, truth.t_begin, truth.t_end))
-    found = estimate_color_offset(replace(shaken, images=_Same(shaken)))
+    found = estimate_color_offset(replace(shaken, images=_Same(shaken)), along(still))
     assert found.reason and found.offset_s == 0.0 and "used as stamped" in found.text()
-    monkeypatch.setattr(color_offset, "geometric_track", lambda *_: (truth, truth.t_begin, truth.t_end))
-    found = estimate_color_offset(wrongly_stamped(shaken, 0.09))
+    found = estimate_color_offset(wrongly_stamped(shaken, 0.09), along(truth))
     assert found.reason and found.offset_s == 0.0
-    monkeypatch.setattr(color_offset, "geometric_track", lambda *_: (None, 0.0, 0.0))
-    assert "no track" in estimate_color_offset(shaken).reason
+    assert "no track" in estimate_color_offset(shaken, along(None)).reason
 
 
 def test_where_one_part_does_not_tell_others_are_asked(shaken: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(color_pairs, "_TRACKED", 8)
     asked: list[range] = []
-    silent = color_offset.ColorOffset(0.0, np.inf, 0, "the camera moves too evenly")
-    told = color_offset.ColorOffset(0.01, 1e-3, 20)
 
-    def estimate(_: Dataset, part: range, *__: object) -> color_offset.ColorOffset:
+    def lost(_: Dataset, part: range, *__: object) -> object:
         asked.append(part)
-        return told if len(asked) == 2 else silent
+        return SimpleNamespace(spline_valid=(), spline=None)
 
-    monkeypatch.setattr(color_offset, "_estimate", estimate)
-    assert estimate_color_offset(shaken) is told and len(asked) == 2
+    monkeypatch.setattr(color_pairs, "rough_track", lost)
+    tracks = GeometricTracks(shaken, range(len(shaken)), Options(), no_progress)
+    found = estimate_color_offset(replace(shaken, images=Brightness(shaken)), (*tracks, *along(shaken.truth)))
+    assert not found.reason and abs(found.offset_s) < 1e-3
     assert not set(asked[0]) & set(asked[1]) and {len(part) for part in asked} == {8}
+    asked.clear()
     monkeypatch.setattr(color_pairs, "_shift", lambda _, part: 0.012 if 20 in part else 1e-4 * part[0])
-    assert estimate_color_offset(shaken) is silent, "none of three told"
-    assert len(asked) == 5 and 20 in asked[2] and asked[3][0] > asked[4][0]
-    assert len(set().union(*asked[2:])) == 24
+    tracks = GeometricTracks(shaken, range(len(shaken)), Options(), no_progress)
+    assert estimate_color_offset(shaken, tracks).reason, "none of three told"
+    assert len(asked) == 3 and 20 in asked[0] and asked[1][0] > asked[2][0]
+    assert len(set().union(*asked)) == 24
 
 
 class _Same:

@@ -1,17 +1,21 @@
 """How much darker colour images are towards their corners (vignetting): from the recording itself.
 
-found = estimate_color_falloff(dataset)
+found = estimate_color_falloff(dataset, GeometricTracks(dataset, range(len(dataset)), Options(), no_progress))
 dataset = dataset.with_color_falloff(found.falloff, found.text())
 
 It stays where it is while the scene passes by, which draws every alignment of colours towards no motion at all. A point
 that moves from the middle of an image to its edge gets darker than others that do not, whatever gain and offset the
 image has: so the falloff f in I = I_even / (1 + f ρ²) is told, with ρ the distance from the image's centre over that of
 its corners. Near enough to what lenses do (cos⁴ and a camera's response) to one per cent of the intensity.
+
+What shines changes its brightness with the direction it is seen from, as if by a lens: along the true path parts of a
+recording differ by far more than their pairs do. So the estimate is one of a normal distribution, with that in its
+standard error, and with what is known of lenses before any image is seen.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -21,53 +25,39 @@ from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rstrack.data.dataset import Dataset
 from rstrack.images.pyramid import corner_distance2
-from rstrack.options import Options
 from rstrack.tracking.first_look.color_pairs import (
-    Colors,
-    geometric_track,
+    GeometricTrack,
     image_of,
     looked_up,
-    moving_parts,
     pairs_in,
     points_of,
     rests,
 )
 
-# For the progress bar.
-_STAGE = "colour's corners"
-# Fewer frames are not looked at; parts of a recording that are, at most; and the standard error that is enough.
-_FEWEST_FRAMES, _PARTS, _ENOUGH = 30, 2, 7e-3
-# What all pairs have wrong alike: renderings of cameras without any were told 0.002 to 0.005.
-_SYSTEMATIC = 4e-3
 # The fewest points that a pair of images may share, and pairs.
 _FEWEST_POINTS, _FEWEST_PAIRS = 400, 6
-# A falloff is believed beyond so many standard errors, beyond what interpolation makes of a camera without, and up to
-# what no camera has.
-_SIGMAS, _LEAST, _MOST = 4.0, 0.02, 2.0
+# Mean and σ of the falloff of a lens that nothing is known of: TUM's cameras have 0.09 and 0.45.
+_PRIOR, _PRIOR_SIGMA = 0.15, 0.15
+# σ of what all pairs of a part have wrong alike: of one camera parts told 0.09, 0.09 and 0.02, of another, whose
+# truth is 0.15, -0.24 to 0.16.
+_SYSTEMATIC = 0.05
 _ROUNDS, _REWEIGHTED = 5, 4
-# Tracks along which pairs are compared, until one is enough, with what falloff until then: before a wall depth alone
-# slides, and with it colours that are taken for even.
-_TRACKS: tuple[tuple[Colors, float], ...] = (("moving", 0.0), ("always", 0.0), ("always", 0.15), ("always", 0.3))
 
 
 @dataclass(frozen=True)
 class ColorFalloff:
-    """falloff: f, 0 if there is none to speak of. sigma: its standard error, from leaving tenths of the pairs out and
-    what they have wrong alike. pairs: of images compared.
-    """
+    """falloff: f, not below 0. sigma: its standard error. pairs: of images compared, 0 where only the prior tells."""
 
     falloff: float
     sigma: float
     pairs: int
 
     def text(self) -> str:
-        """One line for the screen; empty where colours are taken as they are."""
-        if not self.falloff:
-            return ""
-        percent = 100.0 * (1.0 - 1.0 / (1.0 + self.falloff))
+        """One line for the screen."""
+        percent, error = (100.0 * x / (1.0 + self.falloff) for x in (self.falloff, self.sigma / (1.0 + self.falloff)))
+        source = f"by {self.pairs} pairs of images" if self.pairs else "as lenses do"
         return (
-            f"colours of the corners are {abs(percent):.1f} % {'darker' if percent > 0.0 else 'brighter'} "
-            f"(± {100.0 * self.sigma:.1f}, by {self.pairs} pairs of images): evened out; "
+            f"colours of the corners are {percent:.1f} % darker (± {error:.1f}, {source}): evened out; "
             f"color.falloff: {self.falloff:.3f} in the camera file fixes it"
         )
 
@@ -81,43 +71,29 @@ class _Pair:
 
 
 def estimate_color_falloff(
-    dataset: Dataset, frames: range | None = None, options: Options | None = None, progress: Progress = no_progress
+    dataset: Dataset, tracks: Iterable[GeometricTrack | None], progress: Progress = no_progress
 ) -> ColorFalloff:
-    """The falloff of a dataset's colour images. frames: those to look at, default all.
+    """The falloff of a dataset's colour images, from the part that moves most of those where enough pairs overlap.
 
     Raises UserError: an image that cannot be read.
     """
-    frames = range(len(dataset)) if frames is None else frames
-    pairs: list[_Pair] = []
-    found = ColorFalloff(0.0, np.inf, 0)
-    if len(frames) < _FEWEST_FRAMES:
-        return found
-    for part in moving_parts(dataset, frames)[:_PARTS]:
-        before, tried = pairs, found
-        for colors, guess in _TRACKS:
-            own = _compared(dataset.with_color_falloff(guess), part, options or Options(), progress, colors)
-            if len(before) + len(own) >= _FEWEST_PAIRS:
-                tried = _solved(before + own)
-            if tried.sigma < found.sigma:
-                pairs, found = before + own, tried
-            if found.sigma < _ENOUGH:
-                break
-        if found.sigma < _ENOUGH:
-            break
-    is_believed = max(_LEAST, _SIGMAS * found.sigma) < abs(found.falloff) < _MOST
-    return found if is_believed else ColorFalloff(0.0, found.sigma, found.pairs)
+    for track in tracks:
+        pairs = [] if track is None else _compared(dataset, track, progress)
+        if len(pairs) >= _FEWEST_PAIRS:
+            measured, sigma = _solved(pairs)
+            information, prior = sigma**-2, _PRIOR_SIGMA**-2
+            mean = (information * measured + prior * _PRIOR) / (information + prior)
+            return ColorFalloff(max(mean, 0.0), (information + prior) ** -0.5, len(pairs))
+    return ColorFalloff(_PRIOR, _PRIOR_SIGMA, 0)
 
 
-def _compared(dataset: Dataset, part: range, options: Options, progress: Progress, colors: Colors) -> list[_Pair]:
-    spline, begin, end = geometric_track(dataset, part, options, progress, _STAGE, colors)
-    if spline is None:
-        return []
-    camera = dataset.rig.color_camera
+def _compared(dataset: Dataset, track: GeometricTrack, progress: Progress) -> list[_Pair]:
+    camera, spline = dataset.rig.color_camera, track.spline
     distance2 = corner_distance2(camera.width, camera.height)[::2, ::2]
     points = lru_cache(maxsize=2)(lambda k: points_of(dataset, spline, k))
     images = lru_cache(maxsize=16)(lambda i: image_of(dataset.images.color(i)))
     found = []
-    chosen = pairs_in(dataset, part, begin, end)
+    chosen = pairs_in(dataset, track.frames, track.begin, track.end)
     for n, (k, i, j) in enumerate(chosen):
         seen, at = [], []
         for m in (i, j):
@@ -128,23 +104,24 @@ def _compared(dataset: Dataset, part: range, options: Options, progress: Progres
         good = np.isfinite([*seen, *at]).all(axis=0) & rests(dataset, spline, points(k), later)
         if np.count_nonzero(good) >= _FEWEST_POINTS:
             found.append(_Pair((seen[0][good], seen[1][good]), (at[0][good], at[1][good])))
-        progress(_STAGE, 0.7 + 0.3 * (n + 1) / len(chosen), "comparing colour images")
+        progress("colour's corners", (n + 1) / len(chosen), "comparing colour images")
     return found
 
 
-def _solved(pairs: Sequence[_Pair]) -> ColorFalloff:
-    """Gauss-Newton for the one falloff, with gain and offset of every pair eliminated."""
+def _solved(pairs: Sequence[_Pair]) -> tuple[float, float]:
+    """Gauss-Newton for the one falloff, with gain and offset of every pair eliminated: it and its standard error, from
+    leaving tenths of the pairs out and what all have wrong alike."""
     f = 0.0
     for _ in range(_ROUNDS):
         sums = np.array([_linearised(pair, f) for pair in pairs])
         f -= float(sums[:, 1].sum() / max(float(sums[:, 0].sum()), 1e-12))
-        f = float(np.clip(f, -0.5, _MOST))
+        f = float(np.clip(f, -0.5, 2.0))
     parts = np.array_split(np.arange(len(pairs)), min(10, len(pairs)))
     without = [np.delete(sums, part, axis=0).sum(axis=0) for part in parts]
     steps = np.array([g / max(H, 1e-12) for H, g in without])
     n = len(parts)
     scatter = float(np.sqrt((n - 1) / n * ((steps - steps.mean()) ** 2).sum()))
-    return ColorFalloff(f, float(np.hypot(scatter, _SYSTEMATIC)), len(pairs))
+    return f, float(np.hypot(scatter, _SYSTEMATIC))
 
 
 def _linearised(pair: _Pair, f: float) -> tuple[float, float]:

@@ -1,6 +1,6 @@
 """How much later than its stamps say colour was taken, against depth: from the recording itself.
 
-found = estimate_color_offset(dataset)
+found = estimate_color_offset(dataset, GeometricTracks(dataset, range(len(dataset)), Options(), no_progress))
 dataset = dataset.with_color_offset(found.offset_s)
 
 A few seconds with motion are tracked by geometry alone, which leaves colour out. Points of depth images are then looked
@@ -11,22 +11,20 @@ pair has. What tells is that the camera turns differently at the two times: stea
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
 from rsgen.array_types import FloatArray
+from rsgen.console.progress import Progress, no_progress
 from rsgen.geometry.spline import Spline
 from rstrack.data.dataset import Dataset
-from rstrack.options import Options
 from rstrack.tracking.first_look.color_pairs import (
-    Progress,
-    geometric_track,
+    GeometricTrack,
     image_of,
     looked_up,
-    moving_parts,
     pairs_in,
     points_of,
 )
@@ -68,27 +66,22 @@ class ColorOffset:
 
 
 def estimate_color_offset(
-    dataset: Dataset, frames: range | None = None, options: Options | None = None, progress: Progress = lambda *_: None
+    dataset: Dataset, tracks: Iterable[GeometricTrack | None], progress: Progress = no_progress
 ) -> ColorOffset:
-    """Seconds to add to a dataset's colour stamps.
-
-    frames: those to look at, default all. options: say which backend to use. Raises UserError: an image that
-    cannot be read.
-    """
-    parts = moving_parts(dataset, range(len(dataset)) if frames is None else frames)
+    """Seconds to add to a dataset's colour stamps. Raises UserError: an image that cannot be read."""
     tried = []
-    for part in parts:
-        tried.append(_estimate(dataset, part, options or Options(), progress))
+    for track in tracks:
+        tried.append(_estimate(dataset, track, progress))
         if not tried[-1].reason:
             return tried[-1]
     return tried[0]
 
 
-def _estimate(dataset: Dataset, chosen: range, options: Options, progress: Progress) -> ColorOffset:
-    spline, begin, end = geometric_track(dataset, chosen, options, progress, _STAGE)
-    if spline is None:
+def _estimate(dataset: Dataset, track: GeometricTrack | None, progress: Progress) -> ColorOffset:
+    if track is None:
         return ColorOffset(0.0, np.inf, 0, "the geometry alone gives no track")
-    pairs = pairs_in(dataset, chosen, begin + _MOST_S, end - _MOST_S)
+    spline = track.spline
+    pairs = pairs_in(dataset, track.frames, track.begin + _MOST_S, track.end - _MOST_S)
     if len(pairs) < 6:
         return ColorOffset(0.0, np.inf, len(pairs), "too few images overlap")
     coarse = np.arange(-_MOST_S, _MOST_S + 1e-9, _COARSE_S)
@@ -146,7 +139,7 @@ def _costs(
         if np.count_nonzero(good) >= _FEWEST:
             cost, noise = _disagreement(a[:, good], b[:, good])
             found.append((cost[None], np.array([noise])))
-        progress(_STAGE, 0.7 + 0.3 * (n + 1) / len(pairs), "comparing colour images")
+        progress(_STAGE, (n + 1) / len(pairs), "comparing colour images")
     return np.concatenate([costs for costs, _ in found]), np.concatenate([noise for _, noise in found])
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Literal
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -17,9 +18,9 @@ from rsgen.geometry.spline import Spline
 from rstrack.data.dataset import Dataset
 from rstrack.images.pyramid import intensity
 from rstrack.options import Options
+from rstrack.tracking.first_look.rough_track import rough_track
 
 Progress = Callable[[str, float, str], None]
-Colors = Literal["never", "moving", "always"]
 
 # Frames that are tracked; of these, every so manieth has its depth looked up in pairs of images so many frames apart.
 _TRACKED, _EVERY, _APART = 60, 4, (4, 8)
@@ -63,27 +64,47 @@ def _shift(dataset: Dataset, frames: range) -> float:
     return float(np.mean(shifts)) if shifts else 0.0
 
 
-def geometric_track(
-    dataset: Dataset, frames: range, options: Options, progress: Progress, stage: str, colors: Colors = "never"
-) -> tuple[Spline | None, float, float]:
-    """T_world_depth(t) of the frames from depth alone, and the longest time (begin, end) in s that it covers.
+@dataclass(frozen=True)
+class GeometricTrack:
+    """T_world_depth(t) of frames from depth alone, and the longest time (begin, end) in s that it covers."""
 
-    colors: take them too; "moving": where something moves by itself, since depth alone hardly tells what rests. Not
-    where colour's clock is what is looked for: a track that follows colours agrees with them whatever it is.
+    frames: range
+    spline: Spline
+    begin: float
+    end: float
+
+
+class GeometricTracks:
+    """Those of the parts of a recording that move, the one that moves most first, each made when it is first asked for.
+
+    By depth alone: a track that follows colours agrees with whatever clock and lens it takes them to have.
     """
-    from rstrack.tracking.first_look.rough_track import rough_track
 
-    def done(share: float) -> None:
-        progress(stage, 0.7 * share, "tracking depth and colour" if colors == "always" else "tracking depth")
+    def __init__(self, dataset: Dataset, frames: range, options: Options, progress: Progress) -> None:
+        self._dataset, self._frames, self._progress = dataset, frames, progress
+        self._options = Options(method="rs-g", backend=options.backend)
+        self._made: dict[range, GeometricTrack | None] = {}
 
-    by_depth, by_both = (Options(method=method, backend=options.backend) for method in ("rs-g", "rs-pg"))
-    tracker = rough_track(dataset, frames, by_both if colors == "always" else by_depth, done)
-    if colors == "moving" and any(report.moving for report in tracker.reports):
-        tracker = rough_track(dataset, frames, by_both, done)
-    if not tracker.spline_valid or tracker.spline is None:
-        return None, 0.0, 0.0
-    begin, end = max(tracker.spline_valid, key=lambda span: span[1] - span[0])
-    return tracker.spline, begin, end
+    @cached_property
+    def _parts(self) -> list[range]:
+        return moving_parts(self._dataset, self._frames)
+
+    def __iter__(self) -> Iterator[GeometricTrack | None]:
+        """None for a part that depth alone does not track."""
+        for part in self._parts:
+            if part not in self._made:
+                self._made[part] = self._tracked(part)
+            yield self._made[part]
+
+    def _tracked(self, part: range) -> GeometricTrack | None:
+        def done(share: float) -> None:
+            self._progress("first look: depth", share, "tracking what moves most")
+
+        tracker = rough_track(self._dataset, part, self._options, done)
+        if not tracker.spline_valid or tracker.spline is None:
+            return None
+        begin, end = max(tracker.spline_valid, key=lambda span: span[1] - span[0])
+        return GeometricTrack(part, tracker.spline, begin, end)
 
 
 def pairs_in(dataset: Dataset, frames: range, begin: float, end: float) -> list[tuple[int, int, int]]:

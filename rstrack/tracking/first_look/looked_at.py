@@ -12,16 +12,18 @@ def looked_at(dataset: Dataset, chosen: range, options: Options, progress: Progr
 
     Each is found from the chosen frames only where it is not known and matters to the method. Raises UserError.
     """
-    if not options.photometric:
+    wants_offset = dataset.timing is not None and dataset.timing.wants_color_offset
+    wants_falloff = dataset.rig.color_falloff is None
+    if not options.photometric or not (wants_offset or wants_falloff):
         return dataset
-    if dataset.timing is not None and dataset.timing.wants_color_offset:
-        from rstrack.tracking.first_look.color_offset import estimate_color_offset
+    from rstrack.tracking.first_look import color_falloff, color_offset
+    from rstrack.tracking.first_look.color_pairs import GeometricTracks
 
-        offset = estimate_color_offset(dataset, chosen, options, progress)
+    tracks = GeometricTracks(dataset, chosen, options, progress)
+    if wants_offset:
+        offset = color_offset.estimate_color_offset(dataset, tracks, progress)
         dataset = dataset.with_color_offset(offset.offset_s, offset.text())
-    if dataset.rig.color_falloff is None:
-        from rstrack.tracking.first_look.color_falloff import estimate_color_falloff
-
-        falloff = estimate_color_falloff(dataset, chosen, options, progress)
+    if wants_falloff:
+        falloff = color_falloff.estimate_color_falloff(dataset, tracks, progress)
         dataset = dataset.with_color_falloff(falloff.falloff, falloff.text())
     return dataset
