@@ -28,7 +28,7 @@ from rstrack.data.depth_error import NONE, DepthError
 from rstrack.data.estimate import INFO
 from rstrack.data.imu.files import ImuFiles, ReadImu, find_imu
 from rstrack.data.imu.recording import ImuRecording
-from rstrack.data.layouts.generated import as_recorded, is_exact, with_depth_scale
+from rstrack.data.layouts.generated import as_recorded, is_exact, sigma_of, with_depth_scale
 from rstrack.data.layouts.seven_scenes import is_seven_scenes, read_seven_scenes
 from rstrack.data.layouts.tum_folder import TumFolder, read_tum_folder
 from rstrack.data.noise import ImageReader
@@ -145,11 +145,13 @@ class Dataset:
         """The stamp in s at which colour's offset is what it is called, whatever it grows by."""
         return float(self.stamps[len(self) // 2])
 
-    def with_color_offset(self, offset_s: float, note: str = "", drift: float | None = None) -> Dataset:
+    def with_color_offset(
+        self, offset_s: float, note: str = "", drift: float | None = None, sigma_s: float | None = None
+    ) -> Dataset:
         """The same recording with `offset_s` added to the stamps that colour would have without any offset.
 
-        note: for the screen, where the offset comes from. drift: what it grows by, s/s, if not as it did. Without a
-        `timing` it is added to the stamps as they are.
+        note: for the screen, where the offset comes from. drift: what it grows by, s/s, if not as it did. sigma_s: how
+        far it may be wrong, if not as far as the rig says. Without a `timing` it is added to the stamps as they are.
         """
         drift = self.color_drift if drift is None else drift
         before = self.color_stamps if self.timing is None else self.timing.color.used
@@ -159,7 +161,11 @@ class Dataset:
             notes = (*timing.notes, note) if note else timing.notes
             timing = replace(timing, color_offset_s=offset_s, notes=notes)
         groups = group_colors(self.stamps, color_stamps)
-        return replace(self, color_stamps=color_stamps, groups=groups, timing=timing, color_drift=drift)
+        sigma = self.rig.sigma if sigma_s is None else replace(self.rig.sigma, offset_s=sigma_s)
+        return replace(
+            self, rig=replace(self.rig, sigma=sigma), color_stamps=color_stamps, groups=groups, timing=timing,
+            color_drift=drift,
+        )  # fmt: skip
 
     def with_color_falloff(self, falloff: float, note: str = "") -> Dataset:
         """The same recording with colours that are known to darken so towards the corners, see `Rig`.
@@ -280,6 +286,7 @@ def _of_generated(root: Path, sequence: Sequence) -> Dataset:
     # What is rendered without a camera's noise has no corners that are darker: they need not be looked at.
     falloff = 0.0 if color_noise in (None, "none") else None
     rig = Rig(depth.camera, depth.shutter, color.camera, color.shutter, sequence.T_color_depth, falloff)
+    rig = replace(rig, sigma=sigma_of(sequence))
     groups = group_colors(depth.stamps, color.stamps)
     stamps = (depth.stamps, color.stamps)
     return Dataset(

@@ -16,12 +16,14 @@ from rsgen.console.progress import no_progress
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.format import StreamName
+from rstrack.data.clocks.timing import Timing, stream_timing
 from rstrack.data.dataset import Dataset, group_colors, open_dataset
 from rstrack.data.estimate import read_estimate
 from rstrack.options import Options
 from rstrack.tracking.first_look import color_offset, color_pairs
-from rstrack.tracking.first_look.color_offset import estimate_color_offset
+from rstrack.tracking.first_look.color_offset import ColorOffset, estimate_color_offset
 from rstrack.tracking.first_look.color_pairs import GeometricTrack, GeometricTracks
+from rstrack.tracking.first_look.looked_at import looked_at
 from rstrack.tracking.runs.run import track
 
 WRONG_S = 0.0173
@@ -169,6 +171,35 @@ class _Same:
         return np.clip(self._images.color(0).astype(int) + noise, 0, 255).astype(np.uint8)
 
 
+@pytest.mark.parametrize(
+    ("found", "sigma_s"),
+    [
+        (ColorOffset(0.017, 2e-3, 20), 2.5e-3),
+        (ColorOffset(0.0, np.inf, 0, "the geometry alone gives no track"), 1 / 30 / np.sqrt(3.0)),
+    ],
+    ids=["found", "not found: up to a frame"],
+)
+def test_the_tracker_is_told_how_well_the_clock_is_known(
+    shaken: Dataset, monkeypatch: pytest.MonkeyPatch, found: ColorOffset, sigma_s: float
+) -> None:
+    """Regression: a rendering with a driver's stamps was exact, and 3 σ off where its clock was not found."""
+    late_s = 0.001 * np.random.default_rng(0).uniform(0.0, 2.0, (2, len(shaken)))
+    depth, color = (stream_timing("any", shaken.stamps + late, "auto", 0.0) for late in late_s)
+    unknown = replace(shaken, timing=Timing(depth, color, None))
+    assert unknown.rig.sigma.is_exact
+    monkeypatch.setattr(color_offset, "estimate_color_offset", lambda *_: found)
+    seen = looked_at(unknown, range(30), Options(method="rs-pg"), no_progress)
+    assert seen.rig.sigma.offset_s == pytest.approx(sigma_s, rel=1e-3) and seen.rig.sigma.focal == 0.0
+    assert looked_at(unknown, range(30), Options(method="rs-g"), no_progress) is unknown
+
+
+def test_the_part_whose_pairs_differ_least_tells(shaken: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    by_part = iter([ColorOffset(0.0, np.inf, 0, "no"), ColorOffset(0.02, 3e-3, 9), ColorOffset(0.01, 1e-3, 9)])
+    monkeypatch.setattr(color_offset, "_estimate", lambda *_: next(by_part))
+    assert estimate_color_offset(shaken, 4 * along(shaken.truth)) == ColorOffset(0.01, 1e-3, 9)
+    assert next(by_part, None) is None, "the fourth part is not asked"
+
+
 def test_stamps_of_a_sequence_are_no_guess(shaken: Dataset) -> None:
     assert shaken.timing is None
     later = shaken.with_color_offset(0.1, drift=1e-4)
@@ -193,7 +224,7 @@ def test_a_run_says_and_holds_the_clocks(shaken: Dataset, tmp_path: Path, monkey
         (root / f"{name}.txt").write_text("\n".join(lines) + "\n")
     camera = "{width: 160, height: 120, intrinsics: [120.0, 120.0, 79.5, 59.5], readout_s: 0.028}"
     (root / "camera.yaml").write_text(f"color: {camera}\ndepth: {camera}\n")
-    found = color_offset.ColorOffset(0.0171, 0.001, 12)
+    found = ColorOffset(0.0171, 0.001, 12)
     monkeypatch.setattr(color_offset, "estimate_color_offset", lambda *_: found)
     result = track(open_dataset(root), Options(method="rs-pg"), tmp_path / "run", slice(0, 4))
     info = read_estimate(tmp_path / "run").info

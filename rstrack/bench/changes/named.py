@@ -18,6 +18,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rstrack.bench.changes.edits import reduced, reordered, with_color, with_depth, with_shutter, with_stamps
+from rstrack.data.camera_file import usual
 from rstrack.data.dataset import Dataset
 
 # Blocks of missing depth are this part of an image's width.
@@ -65,7 +66,7 @@ def camera_told(
     dataset: Dataset, *, focal: float = 1.0, cx_px: float = 0.0, cy_px: float = 0.0, readout_ms: float = 0.0,
     rotation_deg: float = 0.0, undistorted: bool = False, color_ms: float = 0.0,
 ) -> Dataset:  # fmt: skip
-    """What the camera file says of both cameras is wrong by that much.
+    """What the camera file says of both cameras is wrong by that much, and may be, as far as its user knows.
 
     focal: factor of focal lengths. cx_px, cy_px: added to principal points. readout_ms: added to readouts, as
     `readout_told` does. rotation_deg: the colour camera is told turned about its own y axis. undistorted: no lens
@@ -86,7 +87,9 @@ def camera_told(
     T_told_color = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, np.radians(rotation_deg), 0.0]))
     cameras = replace(rig, depth_camera=told(rig.depth_camera), color_camera=told(rig.color_camera))
     T_color_depth = T_told_color @ rig.T_color_depth if rotation_deg else rig.T_color_depth
-    made = readout_told(replace(dataset, rig=replace(cameras, T_color_depth=T_color_depth)), shift_s=1e-3 * readout_ms)
+    sigma = usual(cameras.color_camera) if rig.sigma.is_exact else rig.sigma
+    cameras = replace(cameras, T_color_depth=T_color_depth, sigma=sigma)
+    made = readout_told(replace(dataset, rig=cameras), shift_s=1e-3 * readout_ms)
     return color_late(made, 1e-3 * color_ms) if color_ms else made
 
 

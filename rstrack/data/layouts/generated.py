@@ -15,6 +15,8 @@ import numpy as np
 from rsgen.geometry import se3
 from rsgen.sequence.reader import Sequence
 from rsgen.sequence.trajectory import Trajectory
+from rstrack.data.calibration_sigma import EXACT, CalibrationSigma
+from rstrack.data.camera_file import usual
 from rstrack.data.clocks.timing import StampsMode, Timing, stream_timing
 from rstrack.data.registered_rows import DepthSensor, registered_shutter
 from rstrack.data.rig import Rig
@@ -35,6 +37,11 @@ def is_exact(sequence: Sequence) -> bool:
     return not any(s.registered or (s.listed != s.stamps).any() for s in streams)
 
 
+def sigma_of(sequence: Sequence) -> CalibrationSigma:
+    """How far the cameras that sequence.yaml tells may be wrong: not at all, unless declared so on purpose."""
+    return usual(sequence.streams["color"].camera) if sequence.meta.get("declared") else EXACT
+
+
 def with_depth_scale(sequence: Sequence, depth_scale: float) -> Sequence:
     """The sequence with its depth images read at so many units per metre."""
     depth = replace(sequence.streams["depth"], depth_scale=depth_scale)
@@ -49,7 +56,9 @@ def as_recorded(sequence: Sequence) -> Recorded:
         sensor = DepthSensor(depth.camera, depth.shutter, sequence.T_color_depth)
         shutter, late_s = registered_shutter(color.camera, sensor)
         T_color_depth = np.eye(4)
-    rig = Rig(sequence.depth_image_camera, shutter, color.camera, color.shutter, T_color_depth)
+    rig = Rig(
+        sequence.depth_image_camera, shutter, color.camera, color.shutter, T_color_depth, sigma=sigma_of(sequence)
+    )
     has_driver = any((s.listed != s.stamps).any() for s in (color, depth))
     mode: StampsMode = "auto" if has_driver else "raw"
     timing = Timing(
