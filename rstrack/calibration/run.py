@@ -92,10 +92,10 @@ def calibrate(
         dataset = _bent(dataset)
     before = device.known(parameters_of(dataset)) if device else Known.nothing(parameters_of(dataset))
     start = before.values
-    if dataset.timing is not None and dataset.timing.wants_color_offset and "offset" in groups:
-        tracks = GeometricTracks(dataset, chosen, options, progress)
-        start = replace(start, color_offset_s=estimate_color_offset(dataset, tracks, progress).offset_s)
     track = first_track(dataset, chosen, options, progress)
+    if dataset.timing is not None and dataset.timing.wants_color_offset and "offset" in groups:
+        tracks = track.by_depth(dataset, chosen) or GeometricTracks(dataset, chosen, options, progress)
+        start = replace(start, color_offset_s=estimate_color_offset(dataset, tracks, progress).offset_s)
     parts = _stretches(dataset, chosen, track)
     free = _free(dataset, groups, parts)
     terms = pair_terms(engine(options.backend), dataset, free)
