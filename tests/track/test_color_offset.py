@@ -176,9 +176,9 @@ class _Same:
     ("found", "sigma_s"),
     [
         (ColorOffset(0.017, 2e-3, 20), 2.5e-3),
-        (ColorOffset(0.0, np.inf, 0, "the geometry alone gives no track"), 1 / 30 / np.sqrt(3.0)),
+        (ColorOffset(0.0, np.inf, 0, "the geometry alone gives no track"), 3e-3),
     ],
-    ids=["found", "not found: up to a frame"],
+    ids=["found", "not found"],
 )
 def test_the_tracker_is_told_how_well_the_clock_is_known(
     shaken: Dataset, monkeypatch: pytest.MonkeyPatch, found: ColorOffset, sigma_s: float

@@ -22,8 +22,7 @@ def looked_at(dataset: Dataset, chosen: range, options: Options, progress: Progr
     tracks = GeometricTracks(dataset, chosen, options, progress)
     if wants_offset:
         offset = color_offset.estimate_color_offset(dataset, tracks, progress)
-        sigma_s = offset.sigma_in_all_s(dataset.interval_s(chosen) or 0.0)
-        dataset = dataset.with_color_offset(offset.offset_s, offset.text(), sigma_s=sigma_s)
+        dataset = dataset.with_color_offset(offset.offset_s, offset.text(), sigma_s=offset.sigma_in_all_s)
     if wants_falloff:
         falloff = color_falloff.estimate_color_falloff(dataset, tracks, progress)
         dataset = dataset.with_color_falloff(falloff.falloff, falloff.text())
