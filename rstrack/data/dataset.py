@@ -285,8 +285,9 @@ def _of_generated(root: Path, sequence: Sequence) -> Dataset:
     color_noise = noise.get("color") if isinstance(noise, dict) else None
     # What is rendered without a camera's noise has no corners that are darker: they need not be looked at.
     falloff = 0.0 if color_noise in (None, "none") else None
-    rig = Rig(depth.camera, depth.shutter, color.camera, color.shutter, sequence.T_color_depth, falloff)
-    rig = replace(rig, sigma=sigma_of(sequence))
+    rig = Rig(
+        depth.camera, depth.shutter, color.camera, color.shutter, sequence.T_color_depth, falloff, sigma_of(sequence)
+    )
     groups = group_colors(depth.stamps, color.stamps)
     stamps = (depth.stamps, color.stamps)
     return Dataset(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsgen.array_types import FloatArray
+from rsgen.console.progress import Progress
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
@@ -19,8 +20,6 @@ from rstrack.data.dataset import Dataset
 from rstrack.images.pyramid import intensity
 from rstrack.options import Options
 from rstrack.tracking.first_look.rough_track import rough_track
-
-Progress = Callable[[str, float, str], None]
 
 # Frames that are tracked; of these, every so manieth has its depth looked up in pairs of images so many frames apart.
 _TRACKED, _EVERY, _APART = 60, 4, (4, 8)
@@ -75,9 +74,10 @@ class GeometricTrack:
 
 
 class GeometricTracks:
-    """Those of the parts of a recording that move, the one that moves most first, each made when it is first asked for.
+    """The parts of a recording, the one that moves most first, each tracked once, when it is first asked for.
 
-    By depth alone: a track that follows colours agrees with whatever clock and lens it takes them to have.
+    By depth alone: a track that follows colours agrees with whatever clock and lens it takes them to have. Iterating
+    raises UserError: a colour image that cannot be read.
     """
 
     def __init__(self, dataset: Dataset, frames: range, options: Options, progress: Progress) -> None:
