@@ -22,7 +22,7 @@ from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, read_bytes, read_text, read_yaml
 from rsgen.sequence.reader import read_sequence
-from rstrack.bench.definitions import SequenceEntry, frames_of
+from rstrack.bench.definitions import SequenceEntry
 
 Render = Callable[[Sequence[str]], None]
 _STREAMS = ("color", "depth")
@@ -57,7 +57,7 @@ class Sources:
         recipe = self.recipe(entry)
         folder = self.home / f"{name}-{hashlib.sha256(recipe.encode()).hexdigest()[:8]}"
         note = folder.with_name(folder.name + ".json")
-        if not (note.is_file() and read_text(note) == recipe and _is_whole(folder, entry)):
+        if not (note.is_file() and read_text(note) == recipe and _can_be_read(folder)):
             progress("rendering", 0.0, name)
             run = self.render or run_rsgen
             run([*words, "--out", str(folder), *([] if self.scheduler is None else ["--scheduler", self.scheduler])])
@@ -150,11 +150,10 @@ def _not_now(_: object) -> None:
     raise UserError("the sequence is to be rendered")
 
 
-def _is_whole(folder: Path, entry: SequenceEntry) -> bool:
-    """Whether all frames that are wanted are there."""
+def _can_be_read(folder: Path) -> bool:
+    """Whether every image that its listings name is there: how many those are, its cameras say, which drop some."""
     try:
-        sequence = read_sequence(folder)
+        read_sequence(folder)
     except UserError:
         return False
-    asked = frames_of(entry.frames)
-    return all(len(s.paths) >= len(range(s.frames)[asked]) for s in sequence.streams.values())
+    return True
