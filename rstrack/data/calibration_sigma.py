@@ -65,5 +65,8 @@ EXACT = CalibrationSigma()
 STATED = CalibrationSigma(0.01, 0.003, 0.01, 0.02, 0.3, 0.005, 0.003, 0.003, 0.01, 0.005)
 """Of a camera file that does not say: a judgement of what such files have wrong, not a measurement."""
 
+UNFOUND_OFFSET_S = 0.015
+"""σ of colour's clock where it is looked for and not found: half a frame at 30 Hz, as cameras run that nothing ties."""
+
 UNDISTORTED_K1 = 0.1
 """σ of k1 where a real lens is said to have no distortion, as it hardly ever is."""

@@ -199,11 +199,14 @@ class Dataset:
         return camera_content(RigFile(self.rig, self.depth_scale, *clocks, depth_error=self.depth_error))
 
     def as_seen_by(self, info: dict[str, Any]) -> Dataset:
-        """The same recording with colour's offset, darker corners and the IMU's description as a run had them, whose
-        run.json holds `info`."""
-        clocks, recorded = info.get("clocks"), info.get("dataset")
+        """The same recording with colour's offset, darker corners and the IMU's description as a run had them in the
+        end, whose run.json holds `info`."""
+        clocks, recorded, late = (info.get(name) for name in ("clocks", "dataset", "color_late"))
         offset_s = clocks.get("color_offset_s") if self.timing is not None and isinstance(clocks, dict) else None
-        timed = self.with_color_offset(float(offset_s)) if isinstance(offset_s, float | int) else self
+        late_s = late.get("seconds") if isinstance(late, dict) else None
+        timed = self
+        if isinstance(offset_s, float | int) or isinstance(late_s, float | int):
+            timed = self.with_color_offset(float(offset_s or 0.0) + float(late_s or 0.0))
         imu_file = recorded.get("imu_file") if isinstance(recorded, dict) else None
         if isinstance(imu_file, str) and self.imu_files is not None and self.imu_files.given is None:
             timed = timed.with_imu_file(Path(imu_file))

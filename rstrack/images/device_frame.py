@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -37,13 +37,15 @@ _SETTLED = 3
 
 @dataclass(frozen=True)
 class DeviceFrame:
-    """A frame on the device. depth_share: part of its depth pixels that have a value."""
+    """A frame on the device. depth_share: part of its depth pixels that have a value. color_late_s: what has been added
+    to the stamps of its colours."""
 
     index: int
     stamp: float
     depth: DepthImage
     colors: tuple[ColorImage, ...]
     depth_share: float
+    color_late_s: float = 0.0
 
     @property
     def exposures(self) -> list[Exposure]:
@@ -92,12 +94,15 @@ class DeviceRig:
         self.device_rays = self.e.upload(self.rays[..., 0]), self.e.upload(self.rays[..., 1])
         self.resolution = 0.0
 
-    def upload(self, index: int, frame: Frame) -> DeviceFrame:
-        """Frame `index` of a recording. Raises UserError if an image's size or type is not the rig's."""
-        with self.timer("preparing images"):
-            return self._upload(index, frame)
+    def upload(self, index: int, frame: Frame, color_late_s: float = 0.0) -> DeviceFrame:
+        """Frame `index` of a recording, whose colour was taken so much later than its stamps say.
 
-    def _upload(self, index: int, frame: Frame) -> DeviceFrame:
+        Raises UserError if an image's size or type is not the rig's.
+        """
+        with self.timer("preparing images"):
+            return self._upload(index, frame, color_late_s)
+
+    def _upload(self, index: int, frame: Frame, color_late_s: float) -> DeviceFrame:
         rig, options = self._rig, self._options
         z = _checked(frame.depth, rig.depth_camera, "depth", (), "float metres, 0 = missing", np.floating)
         if self.resolution == 0.0 and index < _SETTLED:
@@ -107,9 +112,10 @@ class DeviceRig:
         colors = []
         for image in frame.colors if options.photometric else ():
             pixels = _checked(image, rig.color_camera, "colour", (3,), "uint8 RGB", np.uint8)
-            exposure = self._exposure(image, self.color_lens, rig.color_shutter, rig.T_color_depth)
+            late = replace(image, stamp=image.stamp + color_late_s)
+            exposure = self._exposure(late, self.color_lens, rig.color_shutter, rig.T_color_depth)
             colors.append(color_image(self.e, exposure, pixels, self._finer, self._evening))
-        return DeviceFrame(index, frame.depth.stamp, depth, tuple(colors), depth.count / z.size)
+        return DeviceFrame(index, frame.depth.stamp, depth, tuple(colors), depth.count / z.size, color_late_s)
 
     @staticmethod
     def _exposure(image: Image, lens: Lens, true: Shutter, T_cam_body: FloatArray) -> Exposure:

@@ -14,7 +14,7 @@ from rstrack.images.pyramid import DepthImage
 from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.judgement.common import Common
 from rstrack.tracking.judgement.fault import Fault
-from rstrack.tracking.judgement.innovation import Innovation, Prediction, disagreement, doubt, systematic, weighed
+from rstrack.tracking.judgement.innovation import Innovation, Prediction, disagreement, doubt, learnt, weighed
 from rstrack.tracking.judgement.lost_track import implausible, is_settled
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.moving.leave_out import LeftOut
@@ -123,8 +123,8 @@ def judge_predicted(track: Track, found: Match, gap: float, young: bool) -> Verd
             more = doubt(innovation, on_reference, window.state, predicted, considered)
             uncertainty = replace(uncertainty, doubt=more)
         if weighs and not young:
-            learnt = systematic(innovation, uncertainty.systematic, pulled.excess)
-            uncertainty = replace(uncertainty, systematic=learnt)
+            known = learnt(innovation, uncertainty.systematic, uncertainty.calibration, pulled.excess)
+            uncertainty = replace(uncertainty, systematic=known[0], calibration=known[1])
         if young and not fault:
             usual = uncertainty.systematic.usual_inflation
             more = uncertainty.doubt + disagreement(on_reference, window.state, considered, usual)

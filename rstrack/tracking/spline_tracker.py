@@ -163,6 +163,11 @@ class Tracker:
         return depth.inflation, color.inflation
 
     @property
+    def color_late(self) -> tuple[float, float]:
+        """See `PoseCovariances`."""
+        return self._track.covariances.color_late
+
+    @property
     def terms(self) -> Terms:
         """Its kernels."""
         return self._track.terms
@@ -191,7 +196,7 @@ class Tracker:
 
     def upload(self, index: int, frame: Frame) -> DeviceFrame:
         """A frame of the recording as it is aligned: without what has been found to move in it."""
-        new, masks = self._track.device.upload(index, frame), self._track.left_out
+        new, masks = self._track.upload(index, frame), self._track.left_out
         mask = masks.grid(index)
         return new if mask is None else frame_without(self._track.device.e, new, mask, masks.stride)
 
@@ -207,7 +212,7 @@ class Tracker:
                 f"order of time and less than {_BREAK_S:.0f} s apart; cut the recording there"
             )
         track = self._track
-        new = track.device.upload(len(track.reports), frame)
+        new = track.upload(len(track.reports), frame)
         self._last_fed = stamp
         if len(track.found.stamps) == 1 and track.succession.recent:
             fit_knots(track, gap)

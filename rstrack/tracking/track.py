@@ -20,7 +20,7 @@ from rstrack.alignment.pull import Pulls
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.moving_masks import MovingMasks
-from rstrack.data.rig import Rig
+from rstrack.data.rig import Frame, Rig
 from rstrack.images.device_frame import DeviceFrame, DeviceRig, Timer
 from rstrack.images.pyramid import DepthImage
 from rstrack.inertial.band import with_knots
@@ -120,6 +120,10 @@ class Track:
         ref = self.succession.reference
         assert self.window is not None and ref is not None
         return self.window, ref
+
+    def upload(self, index: int, frame: Frame) -> DeviceFrame:
+        """Frame `index` on the device, its colour taken when it is known to have been by now."""
+        return self.device.upload(index, frame, self.covariances.color_late[0])
 
     def observe(self, frame: DeviceFrame, ref: Reference, expected: FloatArray | None = None) -> list[Observation]:
         """What the frame's images say against a reference, as far as their pixels are independent.

@@ -176,7 +176,7 @@ class _Same:
     ("found", "sigma_s"),
     [
         (ColorOffset(0.017, 2e-3, 20), 2.5e-3),
-        (ColorOffset(0.0, np.inf, 0, "the geometry alone gives no track"), 3e-3),
+        (ColorOffset(0.0, np.inf, 0, "the geometry alone gives no track"), 15e-3),
     ],
     ids=["found", "not found"],
 )

@@ -19,14 +19,16 @@ from rstrack.data.calibration_sigma import EXACT, NAMES, STATED, UNDISTORTED_K1,
 from rstrack.data.camera_file import camera_content, read_rig
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.options import Options
+from rstrack.tracking.judgement.consider import CLOCK, COUNT
 from rstrack.tracking.spline_tracker import Tracker
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 79.5, 59.5)
 SHUTTER = Shutter(readout_s=0.028)
 TRUTH = synthetic.make_spline(0.3)
 FRAMES = 12
-# Every parameter by itself: one σ is one unit.
-UNIT = CalibrationSigma(1.0, 1.0, 1.0, 1.0, float(np.degrees(1.0)), 1.0, 1.0, 1.0, 1.0, 1.0)
+# Every parameter by itself: one σ is one unit, but of the clock, which is put right where it may be off by much.
+UNIT = CalibrationSigma(1.0, 1.0, 1.0, 1.0, float(np.degrees(1.0)), 1.0, 1.0, 1e-6, 1.0, 1.0)
+UNITS = np.where(np.arange(COUNT) == CLOCK, UNIT.offset_s, 1.0)
 RIG = Rig(CAMERA, SHUTTER, CAMERA, SHUTTER, synthetic.T_COLOR_DEPTH)
 
 
@@ -53,7 +55,8 @@ def tracked(rig: Rig, method: str = "rs-pg", scale: float = 1.0, late_s: float =
 def told(method: str) -> tuple[np.ndarray, np.ndarray]:
     """Poses of frames, and what one unit of each parameter does to them (n, 6, 21)."""
     tracker = tracked(replace(RIG, sigma=UNIT), method)
-    return tracker.trajectory[1][-6:], np.stack([report.common for report in tracker.reports[-6:]])  # type: ignore[misc]
+    common = np.stack([report.common for report in tracker.reports[-6:]])  # type: ignore[misc]
+    return tracker.trajectory[1][-6:], common / UNITS
 
 
 def wrong(name: str, by: float) -> tuple[Rig, float, float]:
@@ -105,9 +108,12 @@ def test_colours_that_are_late_are_so_by_how_far_the_camera_moves_meanwhile() ->
     (color,) = [o for o in window.active if not o.is_depth and o.ref.index == ref.index][-1:]
     _, velocity = window.spline.pose_and_velocity(color.image.exposure.mid_time)
     relative = se3.inverse(window.spline.pose(color.image.exposure.mid_time)) @ ref.T_world_base
-    of_keyframe = se3.adjoint(relative) @ common.velocities[ref.index]
-    moved = calibration.moved(color, window.state, common)[:, NAMES.index("color.offset_s")]
+    at = common.velocities[ref.index]
+    of_keyframe = se3.adjoint(relative) @ at
+    moved = calibration.moved(color, window.state, at)[:, CLOCK] / UNITS[CLOCK]
     assert moved == pytest.approx(of_keyframe - velocity, abs=0.15 * np.linalg.norm(velocity))
+    lagging = calibration.lagging(color, window.state, at)[:6] / UNITS[CLOCK]
+    assert lagging == pytest.approx(-of_keyframe, abs=0.15 * np.linalg.norm(velocity)), "the keyframe alone is late"
 
 
 def test_an_exact_camera_file_costs_nothing_and_says_nothing() -> None:

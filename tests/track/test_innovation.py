@@ -13,7 +13,8 @@ from scipy.stats import chi2
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.tracking.judgement import innovation as module
-from rstrack.tracking.judgement.innovation import Prediction, disagreement, doubt, systematic, weighed
+from rstrack.tracking.judgement.calibration_errors import CalibrationErrors
+from rstrack.tracking.judgement.innovation import Prediction, disagreement, doubt, learnt, weighed
 from rstrack.tracking.judgement.systematic import Systematic
 
 HALF = 0.015
@@ -241,6 +242,7 @@ def test_inflations_of_predicted_frames_are_learnt() -> None:
         for o in images:
             o.ref.median_depth, o.ref.lens.camera.fx = 2.0, 500.0
         found = weighed(images, at_rest()[0], predicted(P))
-        known = systematic(found, known, 1.0)
+        known, errors = learnt(found, known, CalibrationErrors(), 1.0)
+        assert not errors.mean.any(), "of an exact calibration"
         usual.append(known.usual_inflation)
     assert usual[:5] == [1.0] * 5 and usual[6] == found.own > 1e3  # a median: two of five frames do not move it

@@ -21,7 +21,7 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.geometry.spline import Spline
-from rstrack.data.calibration_sigma import STATED
+from rstrack.data.calibration_sigma import UNFOUND_OFFSET_S
 from rstrack.data.dataset import Dataset
 from rstrack.tracking.first_look.color_pairs import (
     GeometricTrack,
@@ -62,8 +62,8 @@ class ColorOffset:
     @property
     def sigma_in_all_s(self) -> float:
         """Its standard error with what the pairs of a part have wrong alike; where it is not determined, that of a
-        camera file that does not say."""
-        return STATED.offset_s if self.reason else math.hypot(self.sigma_s, _SYSTEMATIC_S)
+        clock of which nothing is known."""
+        return UNFOUND_OFFSET_S if self.reason else math.hypot(self.sigma_s, _SYSTEMATIC_S)
 
     def text(self) -> str:
         """One line for the screen."""

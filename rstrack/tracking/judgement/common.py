@@ -28,13 +28,15 @@ def _nothing() -> FloatArray:
 class Common:
     """By how much one σ of each parameter moves pose and velocity (6, m) of the newest frame, and keyframes' poses.
 
-    velocity: in the depth camera's axes, [m; rad]/s. velocities: those (6,) at which keyframes were taken.
+    velocity: in the depth camera's axes, [m; rad]/s. Of keyframes, velocities: those (6,) at which they were taken;
+    clocks: what colour's offset was taken to be too large by, in its σ.
     """
 
     pose: FloatArray = field(default_factory=_nothing)
     velocity: FloatArray = field(default_factory=_nothing)
     keyframes: dict[int, FloatArray] = field(default_factory=dict)
     velocities: dict[int, FloatArray] = field(default_factory=dict)
+    clocks: dict[int, float] = field(default_factory=dict)
 
     def predicted(self, seconds: float, T_world_depth: FloatArray) -> FloatArray:
         """Of pose and velocity (12, m) in the camera's axes so many seconds later, at T_world_depth (4, 4)."""
@@ -80,15 +82,25 @@ class Common:
 
 @dataclass(frozen=True, eq=False)
 class Considered:
-    """The calibration of a frame, and what it has done to the one so many seconds before; all by one σ of it."""
+    """The calibration of a frame, and what it has done to the one so many seconds before; all by one σ of it.
+
+    clock: what colour's offset is taken to be too large by.
+    """
 
     calibration: Calibration
     common: Common
     seconds: float
+    clock: float = 0.0
 
     def moved(self, o: Observation, state: SplineState) -> FloatArray:
         """How it would have an image move its lines (12, m), see `Calibration.moved`."""
         return self.common.moved(self.calibration, o, state, 12)
+
+    def lag(self, o: Observation, state: SplineState) -> FloatArray:
+        """What an image's lines (12,) are moved by since its keyframe has colour by an older clock."""
+        index, known = o.ref.index, self.common
+        velocity = known.velocities.get(index, np.zeros(6))
+        return (known.clocks.get(index, 0.0) - self.clock) * self.calibration.lagging(o, state, velocity)
 
     def of_keyframe(self, o: Observation, T_world_depth: FloatArray) -> FloatArray:
         """What it has done to the image's keyframe (6, m), in the axes of the camera at T_world_depth (4, 4)."""

@@ -29,7 +29,7 @@ COUNT = len(NAMES)
 # Keyframes whose landmarks are remembered.
 _REMEMBERED = 4
 _DEPTH_LENS, _COLOR_LENS, _EXTRINSICS = slice(0, 5), slice(5, 10), slice(10, 16)
-_DEPTH_READOUT, _COLOR_READOUT, _CLOCK, _SCALE, _INVERSE = range(16, COUNT)
+_DEPTH_READOUT, _COLOR_READOUT, CLOCK, _SCALE, _INVERSE = range(16, COUNT)
 # Part of what the points see in all directions below which a direction is not seen.
 _LEAST = 1e-6
 
@@ -37,13 +37,13 @@ _LEAST = 1e-6
 @dataclass(frozen=True, eq=False)
 class Coupling:
     """Of one image: J (n, 12), the residuals' derivatives by a twist of all lines, and by one that grows from the first
-    line, −1, to the last, 1; c (n, 21), those by the parameters."""
+    line, −1, to the last, 1; c (n, 22), those by the parameters, and by colour's clock in the keyframe alone."""
 
     J: FloatArray
     c: FloatArray
 
     def twists(self, count: int, lever: float) -> FloatArray:
-        """What the first `count`, 6 or 12, of the twists have to be for each parameter (count, 21) to undo it.
+        """What the first `count`, 6 or 12, of the twists have to be for each of c (count, 22) to undo it.
 
         lever: m, that makes turns comparable to shifts.
         """
@@ -89,7 +89,8 @@ def coupling(
         g_ref = _across(gradient, normal, (P - center) @ R.T)
     here = _moves(rays, o.is_depth, p, q, velocity, line, lens)
     there = _moves(rays, o.is_depth, P, q_ref, landmarks.velocity, _line(ref_lens, uv_ref), lens) @ R.T
-    c = np.einsum("kni,ni->nk", here, g) - np.einsum("kni,ni->nk", there, g_ref)
+    by_keyframe = np.einsum("kni,ni->nk", there, g_ref)
+    c = np.einsum("kni,ni->nk", here, g) - by_keyframe
     if not o.is_depth:
         # Where the keyframe's depth has a point, colour has it in both images: only its parallax tells.
         placed = _moves(rays, True, P, P, landmarks.velocity, _line(rays.depth, uv_ref), rays.depth) @ R.T
@@ -97,7 +98,7 @@ def coupling(
     if rays.is_one:
         c[:, _COLOR_LENS] += c[:, _DEPTH_LENS]
     j = np.column_stack([g, np.cross(p, g)])
-    return Coupling(np.column_stack([j, 2.0 * line[:, None] * j]), c)
+    return Coupling(np.column_stack([j, 2.0 * line[:, None] * j]), np.column_stack([c, by_keyframe[:, CLOCK]]))
 
 
 class Calibration:
@@ -125,6 +126,13 @@ class Calibration:
 
         velocity (6,): at which that was taken. count: 6 for all lines alike, 12 as of `pull.steady`.
         """
+        return self._twists(o, state, velocity, count)[:, :COUNT] * self.sigmas
+
+    def lagging(self, o: Observation, state: SplineState, velocity: FloatArray) -> FloatArray:
+        """How one σ of colour's clock moves lines (12,) if the keyframe alone has it, and has it less."""
+        return self._twists(o, state, velocity, 12)[:, COUNT] * self.sigmas[CLOCK]
+
+    def _twists(self, o: Observation, state: SplineState, velocity: FloatArray, count: int) -> FloatArray:
         key = o.frame, o.ref.index, o.image.exposure.first_time, o.is_depth
         if key not in self._couplings:
             if any(frame != o.frame for frame, *_ in self._couplings):
@@ -132,7 +140,7 @@ class Calibration:
             T_world_cam, own = state.spline.pose_and_velocity(o.image.exposure.mid_time)
             T_cam_ref = se3.inverse(T_world_cam) @ o.ref.T_world_base
             self._couplings[key] = coupling(o, self._seen(o.ref, velocity), self._rays, T_cam_ref, own)
-        return self._couplings[key].twists(count, o.ref.median_depth) * self.sigmas
+        return self._couplings[key].twists(count, o.ref.median_depth)
 
     def _seen(self, ref: Reference, velocity: FloatArray) -> Landmarks:
         found = self._landmarks.get(ref.index)
@@ -170,7 +178,7 @@ def _moves(
         out[_EXTRINSICS.start + axis] = -unit @ R
         out[_EXTRINSICS.start + 3 + axis] = -np.cross(unit, q) @ R
     out[_COLOR_READOUT] = rolled * line[:, None] if lens.lines > 1 else 0.0
-    out[_CLOCK] = rolled
+    out[CLOCK] = rolled
     return out
 
 

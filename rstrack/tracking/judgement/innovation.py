@@ -26,6 +26,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.pull import steady
 from rstrack.alignment.spline_state import SplineState
+from rstrack.tracking.judgement.calibration_errors import CalibrationErrors
 from rstrack.tracking.judgement.common import Considered
 from rstrack.tracking.judgement.systematic import SYSTEMATIC_PX, Systematic, of_pixels
 from rstrack.tracking.judgement.uncertainty import Uncertainty
@@ -89,7 +90,7 @@ class Innovation:
     """What a frame's images are inflated by against a prediction, 1 where nothing is odd.
 
     own: what they would be if nothing were predicted, and the state that they would say then, alone (12,), as its
-    deviation from the prediction. measured: where nothing is odd, what each image says, which `doubt` asks for again.
+    deviation from the prediction. measured: what each image says, of a covariance that is inflated so.
     """
 
     inflation: float = 1.0
@@ -122,8 +123,9 @@ def weighed(
             one.observation.count_as(one.observation.independent / factor)
     if excess * together == 1.0:
         return Innovation(measured=tuple(seen))
+    inflated = tuple(replace(one, R=together * (excess if one is odd else 1.0) * one.R) for one in seen)
     own = _inflation(*_expected(odd, Uncertainty().state, rest), odd.R)
-    return Innovation(excess * together, own, _combined([replace(odd, R=own * odd.R), *rest])[0])
+    return Innovation(excess * together, own, _combined([replace(odd, R=own * odd.R), *rest])[0], inflated)
 
 
 def doubt(
@@ -136,7 +138,7 @@ def doubt(
     more likely the less inflation they need then. Of observations as they count after `weighed`, aligned again if any
     is odd.
     """
-    known = {id(one.observation): one for one in innovation.measured}
+    known = {id(one.observation): one for one in innovation.measured if innovation.inflation == 1.0}
     seen = [
         known.get(id(o)) or _measured(o, state, predicted, considered) for o in fresh if o.is_linearised
     ]  # fmt: skip
@@ -184,17 +186,27 @@ def disagreement(
     return np.asarray(beyond * squared(z) + max(0.0, 1.0 - usual / inflation) * apart)
 
 
-def systematic(innovation: Innovation, known: Systematic, excess: float) -> Systematic:
-    """With what the depth and the colour of a frame say of it where nothing is odd; excess: see `Pulls`."""
+def learnt(
+    innovation: Innovation, known: Systematic, errors: CalibrationErrors, excess: float
+) -> tuple[Systematic, CalibrationErrors]:  # fmt: skip
+    """With what a frame's depth and colour, which are apart, say of both: of the first only where nothing is odd.
+
+    excess: see `Pulls`.
+    """
     known = known.with_inflation(innovation.own)
     depth, color = (
         next((one for one in innovation.measured if one.observation.is_depth is kind), None) for kind in (True, False)
     )
     if depth is None or color is None:
-        return known
+        return known, errors
+    apart, D = (depth.z - color.z)[:6], (depth.D - color.D)[:6]
+    if D.size:
+        errors = errors.with_frame(apart, D, excess**2 * (depth.R + color.R)[:6, :6])
+    if innovation.inflation > 1.0:
+        return known, errors
     focal_px, depth_m = depth.observation.ref.lens.camera.fx, depth.observation.ref.median_depth
-    both, D = (depth.R + color.R)[:6, :6] - 2.0 * of_pixels(SYSTEMATIC_PX, focal_px, depth_m), (depth.D - color.D)[:6]
-    return known.with_frame((depth.z - color.z)[:6], excess**2 * both + D @ D.T, focal_px, depth_m)
+    both = (depth.R + color.R)[:6, :6] - 2.0 * of_pixels(SYSTEMATIC_PX, focal_px, depth_m)
+    return known.with_frame(apart, excess**2 * both + D @ D.T, focal_px, depth_m), errors
 
 
 def _expected(odd: _Measured, P: FloatArray, rest: Sequence[_Measured]) -> tuple[FloatArray, FloatArray]:
@@ -253,6 +265,7 @@ def _measured(
     D = np.zeros((12, 0))
     if considered is not None:
         D = R @ H @ considered.moved(o, state) / by[:, None]
+        moved -= R @ H @ considered.lag(o, state) / by
         D[:6] += considered.of_keyframe(o, pose)
         D -= considered.predicted(pose)
     R += np.kron(np.eye(2), of_pixels(SYSTEMATIC_PX, o.ref.lens.camera.fx, o.ref.median_depth))

@@ -17,18 +17,20 @@ from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.frame_report import FrameReport
 from rstrack.tracking.judgement.common import Common, Considered
-from rstrack.tracking.judgement.consider import Calibration
+from rstrack.tracking.judgement.consider import CLOCK, Calibration
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 
 
 @dataclass(frozen=True, eq=False)
 class _Recent:
-    """Of a frame: the keyframe, the covariance (6, 6) against it, `Common.pose` and the camera's velocity (6,)."""
+    """Of a frame: the keyframe, the covariance (6, 6) against it, `Common.pose`, the camera's velocity (6,), and its
+    colours' clock as in `Common`."""
 
     ref: int
     covariance: FloatArray
     common: FloatArray
     velocity: FloatArray
+    clock: float
 
 
 @dataclass
@@ -44,9 +46,18 @@ class PoseCovariances:
     common: Common = field(default_factory=Common)
     _recent: dict[int, _Recent] = field(default_factory=dict)
 
+    @property
+    def color_late(self) -> tuple[float, float]:
+        """Seconds that colour was found to be later than its stamps, and σ of that."""
+        mean, sigma = self.uncertainty.calibration.clock
+        file_s = self.calibration.sigmas[CLOCK]
+        return -file_s * mean, file_s * sigma
+
     def considered(self, seconds: float) -> Considered | None:
         """What the calibration does to the next frame, so many seconds later; None where it is exact."""
-        return None if self.calibration.is_exact else Considered(self.calibration, self.common, seconds)
+        if self.calibration.is_exact:
+            return None
+        return Considered(self.calibration, self.common, seconds, self.uncertainty.calibration.clock[0])
 
     def after(
         self, seconds: float, uncertainty: Uncertainty, fresh: Sequence[Observation], state: SplineState, pulled: Pulls
@@ -64,7 +75,10 @@ class PoseCovariances:
         kept = {k: one for k, one in self._recent.items() if k >= oldest}
         _, velocity = spline.pose_and_velocity(frame.depth.exposure.mid_time)
         covariance = self.uncertainty.covariance(self.focal_px, ref.median_depth)
-        self._recent = kept | {frame.index: _Recent(ref.index, covariance, self.common.pose, velocity)}
+        file_s = self.calibration.sigmas[CLOCK]
+        clock = -frame.color_late_s / file_s if file_s > 0.0 else 0.0
+        own = _Recent(ref.index, covariance, self.common.pose, velocity, clock)
+        self._recent = kept | {frame.index: own}
 
     def look_at(self, ref: Reference, spline: Spline) -> None:
         """The first keyframe, before anything is found at it."""
@@ -88,7 +102,7 @@ class PoseCovariances:
         if ref.index in self._recent:
             own = self._recent[ref.index]
             self.uncertainty = self.uncertainty.with_keyframe(ref.index, own.ref, ref.T_world_base, own.covariance)
-            self._keep(ref.index, own.common, own.velocity)
+            self._keep(ref.index, own.common, own.velocity, own.clock)
 
     def report(
         self, report: FrameReport, frame: DeviceFrame, fresh: Sequence[Observation], spline: Spline
@@ -116,8 +130,9 @@ class PoseCovariances:
         shared = common[:, is_told] if is_told.any() else None
         return replace(report, covariance=covariance, drift=drift, common=shared)
 
-    def _keep(self, index: int, common: FloatArray, velocity: FloatArray) -> None:
+    def _keep(self, index: int, common: FloatArray, velocity: FloatArray, clock: float = 0.0) -> None:
         known = self.common
         self.common = replace(
-            known, keyframes=known.keyframes | {index: common}, velocities=known.velocities | {index: velocity}
-        )
+            known, keyframes=known.keyframes | {index: common}, velocities=known.velocities | {index: velocity},
+            clocks=known.clocks | {index: clock},
+        )  # fmt: skip

@@ -17,6 +17,7 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rstrack.alignment.priors import ACCELERATION, VELOCITY
+from rstrack.tracking.judgement.calibration_errors import CalibrationErrors
 from rstrack.tracking.judgement.systematic import Systematic, of_pixels
 
 # σ (m, rad) above which a pose is not known.
@@ -31,7 +32,8 @@ class Uncertainty:
     (12, 12): what they have beyond it, see `innovation.doubt`.
 
     seen (6, 6): what its images say of its pose, the information. drift: for each keyframe by its index the covariance
-    (6, 6) of its pose, as left increments in the world. systematic: what images so far have told of such errors.
+    (6, 6) of its pose, as left increments in the world. systematic: what images so far have told of such errors;
+    calibration: and of the calibration's.
     """
 
     state: FloatArray = field(default_factory=lambda: _lost())
@@ -39,6 +41,7 @@ class Uncertainty:
     seen: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
     drift: dict[int, FloatArray] = field(default_factory=dict)
     systematic: Systematic = field(default_factory=Systematic)
+    calibration: CalibrationErrors = field(default_factory=CalibrationErrors)
 
     @property
     def pose(self) -> FloatArray:

@@ -67,6 +67,9 @@ class Result:
             lines.append(f"cannot be resumed: {info['checkpoint_error']}")
         lines += [f"assumed: {note}" for note in info["dataset"].get("notes", ())]
         lines += [] if self.timing is None else self.timing.lines()
+        if late := info.get("color_late"):
+            seconds, sigma_s = (1e3 * late[name] for name in ("seconds", "sigma_s"))
+            lines.append(f"colour: found to be {seconds:+.1f} ± {sigma_s:.1f} ms later than that while tracking")
         return "\n".join(lines + ([] if self.evaluation is None else ["", self.evaluation.text()]))
 
 

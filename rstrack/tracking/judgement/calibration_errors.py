@@ -1,0 +1,44 @@
+"""What a track's images tell of the calibration itself: a Kalman filter of its errors, beside the poses.
+
+Depth and colour of a frame each find its pose. They are apart by D θ and noise: θ are the errors of all parameters, in
+σ of the camera file, which stay the same; D is what one σ of each moves the one image by, less what it moves the other.
+Colour's clock is the one that is put right while tracking: it moves with every turn of the camera, and no keyframe
+needs to be made again for it. All others are estimated along so that the clock is not taken for what a lens does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rsgen.array_types import FloatArray
+from rstrack.tracking.judgement.consider import CLOCK, COUNT
+
+# Frames that tell as much as one of them does: what noise and a keyframe have wrong stays for as long.
+_ALIKE = 30.0
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationErrors:
+    """mean (21,), covariance (21, 21): of what the parameters are too large by, in σ of the camera file."""
+
+    mean: FloatArray = field(default_factory=lambda: np.zeros(COUNT))
+    covariance: FloatArray = field(default_factory=lambda: np.eye(COUNT))
+
+    @property
+    def clock(self) -> tuple[float, float]:
+        """Colour's clock: what its offset is too large by, and how far that may be wrong."""
+        return float(self.mean[CLOCK]), float(np.sqrt(self.covariance[CLOCK, CLOCK]))
+
+    def with_frame(self, apart: FloatArray, D: FloatArray, R: FloatArray) -> CalibrationErrors:
+        """With a frame whose two images' poses are `apart` (6,), though the clock was put right by its mean.
+
+        D (6, 21): by how much one σ of each parameter has them apart. R (6, 6): covariance of all else.
+        """
+        P, R = self.covariance, _ALIKE * R
+        still_wrong = np.where(np.arange(len(self.mean)) == CLOCK, 0.0, self.mean)
+        gain = np.linalg.solve(D @ P @ D.T + R, D @ P).T
+        # Joseph's form: the covariance stays positive where D is large.
+        left = np.eye(len(P)) - gain @ D
+        return CalibrationErrors(self.mean + gain @ (apart - D @ still_wrong), left @ P @ left.T + gain @ R @ gain.T)
