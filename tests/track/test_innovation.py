@@ -127,9 +127,10 @@ def test_of_images_exposed_at_once_the_last_two_poses_say_where_the_next_one_is(
     np.testing.assert_allclose(told, spline.pose(t), atol=1e-9)
 
 
-@pytest.mark.parametrize("what", ["image", "keyframe", "prediction"])
+@pytest.mark.parametrize("what", ["image", "keyframe", "prediction", "lag"])
 def test_what_a_wrong_calibration_explains_is_not_odd(what: str) -> None:
-    """An image that is off along what one parameter does, by one σ of it, wherever it does that."""
+    """An image that is off along what one parameter does, by one σ of it, wherever it does that; or by a keyframe's
+    older clock."""
     rng = np.random.default_rng(5)
     P, R = spread(1e-4, 1e-4, rng), spread(1e-4, 1e-4, rng)
     by = np.zeros((12, 1))
@@ -140,7 +141,7 @@ def test_what_a_wrong_calibration_explains_is_not_odd(what: str) -> None:
 
     considered = SimpleNamespace(
         moved=lambda *_: by * (what == "image"), of_keyframe=lambda *_: by[:6] * (what == "keyframe"),
-        predicted=lambda *_: by * (what == "prediction"),
+        predicted=lambda *_: by * (what == "prediction"), lag=lambda *_: -by[:, 0] * (what == "lag"),
     )  # fmt: skip
     assert odd(None) and not odd(considered)
 
@@ -151,7 +152,7 @@ def test_what_all_images_and_the_prediction_have_in_common_explains_nothing() ->
     by = np.zeros((12, 1))
     by[:6, 0] = 1e-2 * rng.normal(size=6)
     considered: Any = SimpleNamespace(
-        moved=lambda *_: by, of_keyframe=lambda *_: 0.0 * by[:6], predicted=lambda *_: by
+        moved=lambda *_: by, of_keyframe=lambda *_: 0.0 * by[:6], predicted=lambda *_: by, lag=lambda *_: np.zeros(12)
     )  # fmt: skip
     assert weighed([image(True, R, -by[:, 0])], at_rest()[0], predicted(P), considered).inflation > 1.0
 
@@ -214,7 +215,7 @@ def test_what_a_wrong_calibration_explains_divides_no_images() -> None:
     images = [image(True, R, off), image(False, R, -off)]
     sides: Any = SimpleNamespace(
         moved=lambda o, _: by if o.is_depth else -by, of_keyframe=lambda *_: np.zeros((6, 1)),
-        predicted=lambda *_: np.zeros((12, 1)),
+        predicted=lambda *_: np.zeros((12, 1)), lag=lambda *_: np.zeros(12),
     )  # fmt: skip
     assert np.abs(disagreement(images, at_rest()[0], sides)[:3, :3]).max() < 0.1 * 0.02**2
 
