@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from shaken_recording import OPTIONS, told
+from shaken_recording import OPTIONS, SHORT, told
 
 from rstrack.data.calibration_sigma import CalibrationSigma
 from rstrack.data.dataset import Dataset
@@ -36,18 +36,15 @@ def test_it_is_the_solution_of_all_frames_at_once() -> None:
 def test_a_clock_is_found_while_tracking(shaken: Dataset, tmp_path: Path, late_s: float) -> None:
     """As far as σ says, though the first keyframes have the old one; what is done with the run later goes by it."""
     wrong = told(shaken, shaken.rig.color_shutter.readout_s, late_s, np.zeros(6))
-    sure = track(wrong, OPTIONS, tmp_path / "sure")
     unsure = replace(wrong, rig=replace(wrong.rig, sigma=CalibrationSigma(offset_s=0.015)))
-    found = track(unsure, OPTIONS, tmp_path / "unsure")
+    found = track(unsure, OPTIONS, tmp_path, SHORT)
     late = found.estimate.info["color_late"]
-    assert "color_late" not in sure.estimate.info and "color_late" not in sure.text()
     assert late["seconds"] == pytest.approx(-late_s, abs=min(2e-3, 3.0 * late["sigma_s"])) and late["sigma_s"] < 4e-3
-    assert found.metrics is not None and sure.metrics is not None
-    assert found.metrics.ate_rmse_m < 1.05 * sure.metrics.ate_rmse_m, "without noise depth alone has it right"
     assert f"{1e3 * late['seconds']:+.1f} ±" in found.text()
     again = wrong.as_seen_by(found.estimate.info)
     np.testing.assert_allclose(again.color_stamps, wrong.color_stamps + late["seconds"], atol=1e-9)
 
 
 def test_a_clock_that_is_exact_stays(shaken: Dataset, tmp_path: Path) -> None:
-    assert "color_late" not in track(shaken, OPTIONS, tmp_path, slice(0, 4)).estimate.info
+    found = track(shaken, OPTIONS, tmp_path, slice(0, 4))
+    assert "color_late" not in found.estimate.info and "while tracking" not in found.text()
