@@ -107,7 +107,7 @@ def test_shiny_surfaces_look_the_same_traced_and_in_baked_light(tmp_path: Path) 
     """Balls of plastic, of metal and of something between."""
     scene = trimesh.Scene([textured(quad((-2, -0.55, 2), (2, -0.55, 2), (2, -0.55, -2), (-2, -0.55, -2)))])
     for k, (metallic, roughness) in enumerate([(0.0, 0.4), (1.0, 0.5), (0.5, 0.6)]):
-        ball = trimesh.creation.icosphere(3, 0.4)
+        ball = trimesh.creation.icosphere(2, 0.4)
         shiny = PBRMaterial(baseColorFactor=[200, 120, 60, 255], metallicFactor=metallic, roughnessFactor=roughness)
         visual = TextureVisuals(uv=np.zeros((len(ball.vertices), 2)), material=shiny)
         smooth = trimesh.Trimesh(ball.vertices, ball.faces, vertex_normals=ball.vertices / 0.4, visual=visual)

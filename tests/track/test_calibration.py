@@ -62,12 +62,22 @@ def test_a_lens_and_depth_are_put_right(shaken: Dataset) -> None:
     assert "colour fx" in text and "depth offset" in text and "depth's scale cannot be told" in text
 
 
-def test_a_lens_that_is_right_is_left_as_it_is(shaken: Dataset) -> None:
+def test_a_lens_that_is_right_is_left_as_it_is_and_noise_makes_sigmas_grow(shaken: Dataset) -> None:
     noisy = replace(shaken, images=NoisyImages(shaken.images, 1.2e-3, 0.01, 1))
-    found = calibrate(noisy, ("readout", "intrinsics"), SHORT, OPTIONS)
-    assert found.kept_lens and not found.asked[LENSES].any() and found.asked[:2].all()
-    assert pytest.approx(shaken.rig.color_camera.K) == found.calibrated().rig.color_camera.K
-    assert "the lens is the file's" in found.text()
+    plain = calibrate(shaken, ("readout",), SHORT, OPTIONS)
+    grown = calibrate(noisy, ("readout", "intrinsics"), SHORT, OPTIONS)
+    assert grown.kept_lens and not grown.asked[LENSES].any() and grown.asked[:2].all()
+    assert pytest.approx(shaken.rig.color_camera.K) == grown.calibrated().rig.color_camera.K
+    assert "the lens is the file's" in grown.text()
+    assert (grown.sigmas[:2] > 2.0 * plain.sigmas[:2]).all()
+    assert (np.abs(grown.values.since(grown.start)[:2]) < 5.0 * grown.sigmas[:2]).all()
+
+
+def test_noise_is_that_of_track(shaken: Dataset) -> None:
+    noisy = replace(shaken, images=NoisyImages(shaken.images, 2e-3, 0.02, 7))
+    frame = with_noise(shaken.frame(9), 9, 2e-3, 0.02, 7)
+    np.testing.assert_array_equal(noisy.images.depth(9), frame.depth.pixels)
+    np.testing.assert_array_equal(noisy.images.color(9), frame.colors[0].pixels)
 
 
 def test_a_camera_at_rest_tells_nothing_and_that_is_said(
@@ -121,16 +131,6 @@ def test_a_drift_is_found_or_else_held(shaken: Dataset, monkeypatch: pytest.Monk
     assert found.asked[DRIFT] == (drift > 0.0) and not found.undetermined.any()
     assert found.values.color_drift == pytest.approx(drift, abs=2e-4 if drift else 0.0)
     assert ("colour drift" in found.text()) == (drift > 0.0)
-
-
-def test_noise_is_that_of_track_and_makes_sigmas_grow(shaken: Dataset) -> None:
-    noisy = replace(shaken, images=NoisyImages(shaken.images, 2e-3, 0.02, 7))
-    frame = with_noise(shaken.frame(9), 9, 2e-3, 0.02, 7)
-    np.testing.assert_array_equal(noisy.images.depth(9), frame.depth.pixels)
-    np.testing.assert_array_equal(noisy.images.color(9), frame.colors[0].pixels)
-    plain, grown = (calibrate(each, ("readout",), SHORT, OPTIONS) for each in (shaken, noisy))
-    assert (grown.sigmas[:2] > 2.0 * plain.sigmas[:2]).all()
-    assert (np.abs(grown.values.since(grown.start)[:2]) < 5.0 * grown.sigmas[:2]).all()
 
 
 def test_knots_of_every_other_stretch_lie_half_a_spacing_later(monkeypatch: pytest.MonkeyPatch) -> None:
