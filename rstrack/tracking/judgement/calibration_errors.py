@@ -1,9 +1,9 @@
 """What a track's images tell of the calibration itself: a Kalman filter of its errors, beside the poses.
 
-Depth and colour of a frame each find its pose. They are apart by D θ and noise: θ are the errors of all parameters, in
-σ of the camera file, which stay the same; D is what one σ of each moves the one image by, less what it moves the other.
-Colour's clock is the one that is put right while tracking: it moves with every turn of the camera, and no keyframe
-needs to be made again for it. All others are estimated along so that the clock is not taken for what a lens does.
+Depth and colour of a frame each find its pose. The two are apart by D θ and noise. θ are the errors of all parameters,
+in σ of the camera file; they stay the same. D is what one σ of each moves the one image by, less what it moves the
+other. Colour's clock alone is put right while tracking: for a lens all keyframes would have to be made again. The
+others are estimated beside it, so that it is not taken for what they do.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rstrack.tracking.judgement.consider import CLOCK, COUNT
 
-# Frames that tell as much as one of them does: what noise and a keyframe have wrong stays for as long.
+# Frames that tell as much as one: they share a keyframe, with what its noise and depth have wrong. wild2's clock is the
+# same from three starts by 30; by 1 it is several of its σ apart.
 _ALIKE = 30.0
 
 

@@ -97,7 +97,7 @@ class Considered:
         return self.common.moved(self.calibration, o, state, 12)
 
     def lag(self, o: Observation, state: SplineState) -> FloatArray:
-        """What an image's lines (12,) are moved by since its keyframe has colour by an older clock."""
+        """What an image's lines (12,) are moved by since its keyframe was made with an older clock."""
         index, known = o.ref.index, self.common
         velocity = known.velocities.get(index, np.zeros(6))
         return (known.clocks.get(index, 0.0) - self.clock) * self.calibration.lagging(o, state, velocity)

@@ -129,7 +129,7 @@ class Calibration:
         return self._twists(o, state, velocity, count)[:, :COUNT] * self.sigmas
 
     def lagging(self, o: Observation, state: SplineState, velocity: FloatArray) -> FloatArray:
-        """How one σ of colour's clock moves lines (12,) if the keyframe alone has it, and has it less."""
+        """How the lines (12,) of an image move whose keyframe alone has colour's offset one σ too small."""
         return self._twists(o, state, velocity, 12)[:, COUNT] * self.sigmas[CLOCK]
 
     def _twists(self, o: Observation, state: SplineState, velocity: FloatArray, count: int) -> FloatArray:
