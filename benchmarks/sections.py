@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from importlib import import_module
 
@@ -138,11 +139,13 @@ def faults(full: Records) -> list[str]:
 
 
 def changes(full: Records) -> list[str]:
-    """What may be wrong with a recording, beside the same as it is."""
+    """What may be wrong with a recording, beside the same as it is, by the method that most of it was asked of."""
     tracks = [record for record in of_measure(full, "track") if group_of(record) != "real"]
+    asked = Counter(record.method for record in tracks if is_change(record)).most_common(1)
+    tracks = [record for record in tracks if asked and record.method == asked[0][0]]
     changed = [record for record in tracks if is_change(record)]
     bases = {sequence_of(record) for record in changed}
-    records = [r for r in tracks if r.case in bases and any(c.method == r.method for c in changed)] + changed
+    records = [record for record in tracks if record.case in bases] + changed
     places = list(dict.fromkeys(map(sequence_of, records)))
     records.sort(key=lambda record: places.index(sequence_of(record)))
     return _section("What may be wrong: ATE mm · mm/s · deg/s", by_case(records, triples=True), records)
