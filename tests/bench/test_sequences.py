@@ -67,11 +67,21 @@ def test_what_is_not_whole_is_finished(tmp_path: Path, config: Path) -> None:
     assert not sources.has(entry(config), "tiny") and render.called == []
     folder = sources.folder(entry(config), "tiny")
     assert sources.has(entry(config), "tiny")
-    for name in ("rgb.txt", "depth.txt"):
-        (folder / name).write_text("".join((folder / name).read_text().splitlines(keepends=True)[:-1]))
-    assert not sources.has(entry(config), "tiny")
-    assert sources.folder(entry(config), "tiny") == folder and len(render.called) == 2
-    assert sources.has(entry(config), "tiny")
+    for count, stream in enumerate(("rgb", "depth"), 2):
+        sorted((folder / stream).glob("*.png"))[-1].unlink()
+        assert not sources.has(entry(config), "tiny")
+        assert sources.folder(entry(config), "tiny") == folder and len(render.called) == count
+        assert sources.has(entry(config), "tiny")
+
+
+def test_a_camera_may_drop_frames(tmp_path: Path, config: Path) -> None:
+    """Regression: such a sequence was rendered again for every cell."""
+    render = Renderer()
+    sources = Sources(cache=tmp_path, render=render)
+    folder = sources.folder(entry(config), "tiny")
+    listing = folder / "depth.txt"
+    listing.write_text("".join(listing.read_text().splitlines(keepends=True)[:-1]))
+    assert sources.has(entry(config), "tiny") and len(render.called) == 1
 
 
 def test_an_interrupted_render_is_not_taken_for_a_whole_one(tmp_path: Path, config: Path) -> None:
