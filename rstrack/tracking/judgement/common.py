@@ -29,14 +29,14 @@ class Common:
     """By how much one σ of each parameter moves pose and velocity (6, m) of the newest frame, and keyframes' poses.
 
     velocity: in the depth camera's axes, [m; rad]/s. Of keyframes, velocities: those (6,) at which they were taken;
-    clocks: what colour's offset was taken to be too large by, in its σ.
+    color_late_s: what was added to their colours' stamps.
     """
 
     pose: FloatArray = field(default_factory=_nothing)
     velocity: FloatArray = field(default_factory=_nothing)
     keyframes: dict[int, FloatArray] = field(default_factory=dict)
     velocities: dict[int, FloatArray] = field(default_factory=dict)
-    clocks: dict[int, float] = field(default_factory=dict)
+    color_late_s: dict[int, float] = field(default_factory=dict)
 
     def predicted(self, seconds: float, T_world_depth: FloatArray) -> FloatArray:
         """Of pose and velocity (12, m) in the camera's axes so many seconds later, at T_world_depth (4, 4)."""
@@ -84,13 +84,13 @@ class Common:
 class Considered:
     """The calibration of a frame, and what it has done to the one so many seconds before; all by one σ of it.
 
-    clock: what colour's offset is taken to be too large by.
+    color_late_s: what is added to its colours' stamps.
     """
 
     calibration: Calibration
     common: Common
     seconds: float
-    clock: float = 0.0
+    color_late_s: float
 
     def moved(self, o: Observation, state: SplineState) -> FloatArray:
         """How it would have an image move its lines (12, m), see `Calibration.moved`."""
@@ -100,7 +100,8 @@ class Considered:
         """What an image's lines (12,) are moved by since its keyframe was made with an older clock."""
         index, known = o.ref.index, self.common
         velocity = known.velocities.get(index, np.zeros(6))
-        return (known.clocks.get(index, 0.0) - self.clock) * self.calibration.lagging(o, state, velocity)
+        later_s = self.color_late_s - known.color_late_s.get(index, 0.0)
+        return later_s * self.calibration.lagging(o, state, velocity)
 
     def of_keyframe(self, o: Observation, T_world_depth: FloatArray) -> FloatArray:
         """What it has done to the image's keyframe (6, m), in the axes of the camera at T_world_depth (4, 4)."""

@@ -129,8 +129,8 @@ class Calibration:
         return self._twists(o, state, velocity, count)[:, :COUNT] * self.sigmas
 
     def lagging(self, o: Observation, state: SplineState, velocity: FloatArray) -> FloatArray:
-        """How the lines (12,) of an image move whose keyframe alone has colour's offset one σ too small."""
-        return self._twists(o, state, velocity, 12)[:, COUNT] * self.sigmas[CLOCK]
+        """How the lines (12,) of an image move by each second that its keyframe alone has colour stamped too early."""
+        return self._twists(o, state, velocity, 12)[:, COUNT]
 
     def _twists(self, o: Observation, state: SplineState, velocity: FloatArray, count: int) -> FloatArray:
         key = o.frame, o.ref.index, o.image.exposure.first_time, o.is_depth

@@ -23,14 +23,14 @@ from rstrack.tracking.judgement.uncertainty import Uncertainty
 
 @dataclass(frozen=True, eq=False)
 class _Recent:
-    """Of a frame: the keyframe, the covariance (6, 6) against it, `Common.pose`, the camera's velocity (6,), and its
-    colours' clock as in `Common`."""
+    """Of a frame: the keyframe, the covariance (6, 6) against it, `Common.pose`, the camera's velocity (6,), and what
+    was added to its colours' stamps."""
 
     ref: int
     covariance: FloatArray
     common: FloatArray
     velocity: FloatArray
-    clock: float
+    color_late_s: float
 
 
 @dataclass
@@ -57,7 +57,7 @@ class PoseCovariances:
         """What the calibration does to the next frame, so many seconds later; None where it is exact."""
         if self.calibration.is_exact:
             return None
-        return Considered(self.calibration, self.common, seconds, self.uncertainty.calibration.clock[0])
+        return Considered(self.calibration, self.common, seconds, self.color_late[0])
 
     def after(
         self, seconds: float, uncertainty: Uncertainty, fresh: Sequence[Observation], state: SplineState, pulled: Pulls
@@ -75,9 +75,7 @@ class PoseCovariances:
         kept = {k: one for k, one in self._recent.items() if k >= oldest}
         _, velocity = spline.pose_and_velocity(frame.depth.exposure.mid_time)
         covariance = self.uncertainty.covariance(self.focal_px, ref.median_depth)
-        file_s = self.calibration.sigmas[CLOCK]
-        clock = -frame.color_late_s / file_s if file_s > 0.0 else 0.0
-        own = _Recent(ref.index, covariance, self.common.pose, velocity, clock)
+        own = _Recent(ref.index, covariance, self.common.pose, velocity, frame.color_late_s)
         self._recent = kept | {frame.index: own}
 
     def look_at(self, ref: Reference, spline: Spline) -> None:
@@ -102,7 +100,7 @@ class PoseCovariances:
         if ref.index in self._recent:
             own = self._recent[ref.index]
             self.uncertainty = self.uncertainty.with_keyframe(ref.index, own.ref, ref.T_world_base, own.covariance)
-            self._keep(ref.index, own.common, own.velocity, own.clock)
+            self._keep(ref.index, own.common, own.velocity, own.color_late_s)
 
     def report(
         self, report: FrameReport, frame: DeviceFrame, fresh: Sequence[Observation], spline: Spline
@@ -130,9 +128,9 @@ class PoseCovariances:
         shared = common[:, is_told] if is_told.any() else None
         return replace(report, covariance=covariance, drift=drift, common=shared)
 
-    def _keep(self, index: int, common: FloatArray, velocity: FloatArray, clock: float = 0.0) -> None:
+    def _keep(self, index: int, common: FloatArray, velocity: FloatArray, color_late_s: float = 0.0) -> None:
         known = self.common
         self.common = replace(
             known, keyframes=known.keyframes | {index: common}, velocities=known.velocities | {index: velocity},
-            clocks=known.clocks | {index: clock},
+            color_late_s=known.color_late_s | {index: color_late_s},
         )  # fmt: skip
