@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -23,9 +23,11 @@ from rstrack.bench.measures.track import WRONG_DEG, WRONG_M
 from rstrack.bench.record import Figures
 from rstrack.bench.task import Task
 from rstrack.data.dataset import Dataset
+from rstrack.data.estimate import Estimate
 from rstrack.metrics.association import angles_deg, true_poses, truth_of
 from rstrack.options import Options
-from rstrack.tracking.any_tracker import AnyTracker, make_tracker
+from rstrack.tracking.any_tracker import make_tracker
+from rstrack.tracking.runs.segments import Segments
 
 # Frames within which a camera has to be found again, and after which a pose moves no more.
 _AGAIN, _CONVERGED = 5, 10
@@ -58,8 +60,9 @@ def judged(fault: Fault, options: Options) -> Figures:
     dataset, first, last = fault.dataset, fault.first, fault.last
     watched = _watch(dataset, options)
     T_true = _truth(dataset)
-    given = [k for k, T in enumerate(watched.at_once) if T is not None]
+    at_once = {k for k, T in enumerate(watched.at_once) if T is not None}
     final = watched.final
+    given = sorted(at_once | final.keys())
     before = [k for k in given if k < first]
     if not before:
         raise UserError(f"{dataset.name}: its first {first} frames were all lost: take another sequence")
@@ -70,7 +73,7 @@ def judged(fault: Fault, options: Options) -> Figures:
     lost = [k for k in range(len(dataset)) if k not in final]
     near = [options.remoteness(se3.inverse(T_true[k]) @ T_true[last]) for k in watched.keyframes if k < last]
     is_place_known = any(first <= k <= last for k in lost) and min(near, default=np.inf) < 1.0
-    is_found = any(last <= k < last + _AGAIN for k in errors.keys() - silent)
+    is_found = any(last <= k < last + _AGAIN for k in at_once & (errors.keys() - silent))
     tracked = [s for k, s in enumerate(watched.seconds) if k not in lost and k > first // 2]
     return {
         "silent": len(silent),
@@ -105,7 +108,8 @@ def mean_pose(T: FloatArray) -> FloatArray:
 class _Watched:
     """A tracker's words: the pose (4, 4) of every frame when it was fed, None where it was lost, and its seconds.
 
-    final: poses in the end. keyframes: frames at which one was made. moved_m, rewritten_m: see `judged`.
+    final: poses in the end, segments' with them. keyframes: frames at which one was made. moved_m, rewritten_m: see
+    `judged`.
     """
 
     at_once: list[FloatArray | None] = field(default_factory=list)
@@ -119,13 +123,20 @@ class _Watched:
 def _watch(dataset: Dataset, options: Options) -> _Watched:
     interval_s = dataset.interval_s(range(len(dataset)))
     tracker = make_tracker(dataset.rig, options, interval_s=interval_s, imu=dataset.imu if options.inertial else None)
+    alone = replace(options, loops="off")
+    segments = Segments(
+        lambda: make_tracker(dataset.rig, alone, interval_s=interval_s, after=tracker),
+        dataset.frame,
+        options.bootstrap_frames,
+    )
     seen = _Watched()
     settled: dict[int, FloatArray] = {}
     for k, frame in enumerate(dataset.frames()):
         begin, pieces = time.perf_counter(), len(tracker.spline_valid)
         tracker.feed(frame)
         seen.seconds.append(time.perf_counter() - begin)
-        now = _poses(dataset, tracker)
+        segments.feed(frame, tracker.reports)
+        now = _poses(dataset, *tracker.trajectory)
         seen.at_once.append(now.get(k))
         if len(tracker.spline_valid) > pieces:
             seen.rewritten_m = max(seen.rewritten_m, _largest_move(seen.final, now))
@@ -134,13 +145,15 @@ def _watch(dataset: Dataset, options: Options) -> _Watched:
             settled[k - _CONVERGED] = now[k - _CONVERGED]
     # Frames that the start gave up were never converged.
     seen.moved_m = _largest_move(settled, seen.final)
+    segments.end(tracker.reports)
+    joined = segments.joined(Estimate(*tracker.trajectory))
+    seen.final = _poses(dataset, joined.stamps, joined.T_world_depth)
     seen.keyframes = tuple(k for k, report in enumerate(tracker.reports) if report.keyframe)
     return seen
 
 
-def _poses(dataset: Dataset, tracker: AnyTracker) -> dict[int, FloatArray]:
-    """Poses (4, 4) so far by their frames."""
-    stamps, T = tracker.trajectory
+def _poses(dataset: Dataset, stamps: FloatArray, T: FloatArray) -> dict[int, FloatArray]:
+    """Poses T (n, 4, 4) at stamps (n,) by their frames."""
     return dict(zip(np.searchsorted(dataset.stamps, stamps).tolist(), T, strict=True))
 
 

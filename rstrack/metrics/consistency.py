@@ -25,30 +25,30 @@ AXES = ("x", "y", "z", "rx", "ry", "rz")
 LEVELS = (50, 90, 99)
 """Regions and intervals by the part of the errors that should lie within, per cent."""
 
-# Part of the drift by which it may seem to be less later on.
-_SAME = 0.02
+# Part of the drift that rounding may be.
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Covariances:
     """What is known of the errors of n poses; increments [m; rad] in the depth camera's frame, T_world_depth exp(ξ).
 
-    pose: (n, 6, 6) of a pose against its keyframe. drift: (n, 6, 6) of the keyframe against the first frame. NaN where
-    they are not known. common: (n, 6, m) by how much m standard normals, the same ones for all poses, move each: the
-    errors of the camera's calibration; 0 where they are not known.
+    pose: (n, 6, 6) of a pose against its keyframe. drift_world: (n, 6, 6) of the keyframe against the first frame, in
+    the world: exp(ξ) T_world_depth. NaN where they are not known. common: (n, 6, m) by how much m standard normals, the
+    same ones for all poses, move each: the errors of the camera's calibration; 0 where they are not known.
     """
 
     pose: FloatArray
-    drift: FloatArray
+    drift_world: FloatArray
     common: FloatArray
 
     def at(self, index: npt.NDArray[Any]) -> Covariances:
         """Those of some poses, by index or mask."""
-        return Covariances(self.pose[index], self.drift[index], self.common[index])
+        return Covariances(self.pose[index], self.drift_world[index], self.common[index])
 
 
 def covariances(estimate: Estimate) -> Covariances:
-    """Those of run.json's `covariance`, `drift` and `common` of the frames. Raises UserError: they are malformed."""
+    """Those of the frames in run.json. Raises UserError: they are malformed."""
     pose, drift = np.full((2, len(estimate.stamps), 6, 6), np.nan)
     shared: dict[int, FloatArray] = {}
     at = {round(float(t), 6): n for n, t in enumerate(estimate.stamps)}
@@ -56,8 +56,8 @@ def covariances(estimate: Estimate) -> Covariances:
     try:
         for frame in frames:
             n = at.get(round(float(frame["stamp"]), 6))
-            if n is not None and frame.get("covariance") is not None and frame.get("drift") is not None:
-                pose[n], drift[n] = _full(frame["covariance"]), _full(frame["drift"])
+            if n is not None and frame.get("covariance") is not None and frame.get("drift_world") is not None:
+                pose[n], drift[n] = _full(frame["covariance"]), _full(frame["drift_world"])
                 if frame.get("common") is not None:
                     shared[n] = _rows(frame["common"])
         common = np.zeros((len(pose), 6, max((rows.shape[1] for rows in shared.values()), default=0)))
@@ -65,8 +65,8 @@ def covariances(estimate: Estimate) -> Covariances:
             common[list(shared)] = np.stack([*shared.values()])
     except (AttributeError, KeyError, TypeError, ValueError):
         raise UserError(
-            f"estimate: covariance and drift of the frames in {INFO} must be 21 numbers each, common six rows as long "
-            "as in all other frames: run the tracker again"
+            f"estimate: covariance and drift_world of the frames in {INFO} must be 21 numbers each, common six rows as "
+            "long as in all other frames: run the tracker again"
         ) from None
     return Covariances(pose, drift, common)
 
@@ -76,28 +76,29 @@ def motion_covariance(
 ) -> FloatArray:
     """Covariances (k, 6, 6) of the motions T_i⁻¹ T_j between poses i and j (k,) of (n, 4, 4).
 
-    Increments [m; rad] in the frame of pose j. The covariance is the sum of the two poses' own, of the drift that comes
-    in between, and of what errors of the calibration change of the one pose and not of the other. NaN where nothing is
-    known of one of the poses, and where the drift is less at the end: the track has gone back to an older keyframe, and
-    what the two have in common is not known.
+    Increments [m; rad] in the frame of pose j. The covariance is the sum of the two poses' own, of the drift between
+    their keyframes, and of what errors of the calibration change of the one pose and not of the other. NaN where
+    nothing is known of one of the poses, and where neither keyframe was found by way of the other: what the drifts of
+    the two have in common is not known then.
     """
     out = np.full((len(i), 6, 6), np.nan)
     both = np.flatnonzero(np.isfinite(known.pose[i] + known.pose[j]).all(axis=(1, 2)))
     i, j = i[both], j[both]
-    Ad = se3.adjoint(se3.inverse(T_world_depth[j]) @ T_world_depth[i])
-    turned = np.swapaxes(Ad, 1, 2)
-    between = known.drift[j] - Ad @ known.drift[i] @ turned
-    own = known.pose[j] + between + Ad @ known.pose[i] @ turned
-    # Drift is given at mid readout, poses at stamps: what the camera moves by in between is no less drift.
-    parts = [
-        np.trace(c[:, at, at], axis1=1, axis2=2) for at in (slice(3), slice(3, 6)) for c in (between, known.drift[j])
-    ]
-    is_more = (parts[0] >= -_SAME * parts[1]) & (parts[2] >= -_SAME * parts[3])
-    # Less in one direction, though not in all together, leaves no covariance either.
-    is_more &= np.linalg.eigvalsh(own)[:, 0] > 0
+    grown = known.drift_world[j] - known.drift_world[i]
+    spread, noise = np.linalg.eigvalsh(grown), _ROUNDING * np.trace(known.drift_world[i], axis1=1, axis2=2)
+    is_later, is_earlier = spread[:, 0] >= -noise, spread[:, -1] <= noise
+    between = np.where(is_later[:, None, None], grown, -grown)
+    from_world, Ad = (se3.adjoint(se3.inverse(T_world_depth[j]) @ T) for T in (np.eye(4), T_world_depth[i]))
     common = known.common[j] - Ad @ known.common[i]
-    out[both[is_more]] = (own + common @ np.swapaxes(common, 1, 2))[is_more]
+    total = turned(from_world, between) + known.pose[j] + turned(Ad, known.pose[i]) + common @ np.swapaxes(common, 1, 2)
+    is_known = is_later | is_earlier
+    out[both[is_known]] = total[is_known]
     return out
+
+
+def turned(A: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Covariances (n, 6, 6) of A ξ (n, 6, 6)."""
+    return np.asarray(A @ covariance @ np.swapaxes(A, 1, 2))
 
 
 def motion_errors(

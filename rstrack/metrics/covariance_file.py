@@ -15,7 +15,7 @@ from rsgen.files import atomic_write
 from rsgen.geometry import se3
 from rsgen.sequence.format import pose_rows
 from rstrack.data.estimate import Estimate, read_estimate
-from rstrack.metrics.consistency import Covariances, covariances
+from rstrack.metrics.consistency import Covariances, covariances, turned
 
 # The truth is T_world_depth exp(ξ), ξ = [m; rad] in the depth camera's frame, and the world is whatever fits best.
 _HEADER = """\
@@ -62,6 +62,7 @@ def against_first(T_world_depth: FloatArray, known: Covariances) -> FloatArray:
 
     Errors of the calibration count as far as they change a pose otherwise than the first one.
     """
-    Ad = se3.adjoint(se3.inverse(T_world_depth) @ T_world_depth[0])
+    from_world, Ad = (se3.adjoint(se3.inverse(T_world_depth) @ T) for T in (np.eye(4), T_world_depth[0]))
     common = known.common - Ad @ known.common[0]
-    return np.asarray(known.pose + known.drift + common @ np.swapaxes(common, 1, 2))
+    drift = turned(from_world, known.drift_world)
+    return np.asarray(known.pose + drift + common @ np.swapaxes(common, 1, 2))

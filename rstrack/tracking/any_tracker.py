@@ -54,12 +54,13 @@ class AnyTracker(Protocol):
 
 def make_tracker(
     rig: Rig, options: Options, timer: Timer | None = None, load: Callable[[int], Frame] | None = None,
-    interval_s: float | None = None, imu: ImuRecording | None = None,
+    interval_s: float | None = None, imu: ImuRecording | None = None, after: AnyTracker | None = None,
 ) -> AnyTracker:  # fmt: skip
     """The tracker of options.method; `timer` watches the parts of its work. load: as in `LoopTracker`.
 
     interval_s: the usual time between frames, where that is known; otherwise the first two tell. imu: of a unit
-    on the cameras; methods that use none take no notice.
+    on the cameras; methods that use none take no notice. after: a tracker of the same recording; what it has learnt of
+    the cameras is known from the start, where the method's tracker learns that.
 
     Raises UserError if its backend cannot work on this machine, or the method needs an IMU and there is none.
     """
@@ -75,10 +76,12 @@ def make_tracker(
         from rstrack.tracking.pose_tracker import BaselineTracker
 
         return BaselineTracker(rig, options, timer)
-    if options.loops == "online":
-        from rstrack.tracking.loop_tracker import LoopTracker
-
-        return LoopTracker(rig, options, timer, load, imu)
+    from rstrack.tracking.loop_tracker import LoopTracker
     from rstrack.tracking.spline_tracker import Tracker
 
-    return Tracker(rig, options, timer, imu)
+    if options.loops == "online":
+        return LoopTracker(rig, options, timer, load, imu)
+    made, first = Tracker(rig, options, timer, imu), after.uncorrected if isinstance(after, LoopTracker) else after
+    if isinstance(first, Tracker):
+        made.learn_cameras(first)
+    return made

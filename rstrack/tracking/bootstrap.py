@@ -9,13 +9,12 @@ from dataclasses import replace
 import numpy as np
 
 from rstrack.alignment.observation import Observation
-from rstrack.alignment.pull import pulls
+from rstrack.alignment.pull import Pulls, pulls
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.frame_report import FrameReport
 from rstrack.tracking.judgement.fault import Fault
 from rstrack.tracking.judgement.innovation import disagreement
-from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.moving.leave_out import LeftOut, left_out_with, without
 from rstrack.tracking.moving.majority import not_with_most
 from rstrack.tracking.succession import LEAST_DEPTH
@@ -42,7 +41,7 @@ def start(track: Track, new: DeviceFrame) -> FrameReport:
         # whose motion is known, has colours.
         colors = () if _colors_roll(track) else new.colors
         track.succession.make(replace(new, colors=colors), window.spline, None)
-        track.covariances.uncertainty = Uncertainty.of_first()
+        track.covariances.uncertainty = track.covariances.uncertainty.of_first()
     track.placed(new)
     return track.report(new, keyframe=True)
 
@@ -185,6 +184,8 @@ def _leave(track: Track, window: Window) -> bool:
     by_depth = [seen for seen in seen_of.values() if seen and all(o.is_depth for o in seen)]
     if any(np.trace(disagreement(seen, window.state)[:3, :3]) > _MOST_APART_M**2 for seen in by_depth):
         return False
+    if not all(_agree(track, seen_of[f.index], pulls_of[f.index], window) for f in rest):
+        return False
     window.keep(others)
     for frame in track.succession.recent:
         track.remember(frame)
@@ -201,3 +202,13 @@ def _leave(track: Track, window: Window) -> bool:
         report = track.reports[frame.index]
         track.reports[frame.index] = covariances.of(report, frame, window.spline, ref.index)
     return True
+
+
+def _agree(track: Track, seen: Sequence[Observation], pulled: Pulls, window: Window) -> bool:
+    """Whether a frame's pose is known in spite of what its images are apart, beyond what was usual before."""
+    covariances, usual = track.covariances, track.covariances.uncertainty.systematic.usual_inflation
+    if not covariances.uncertainty.systematic.inflations:
+        return True  # a wrong camera file has them apart in every frame, and no frame has told yet
+    considered, state = covariances.considered(0.0), window.state
+    apart = disagreement(seen, state, considered, usual) - disagreement(seen, state, considered, np.inf)
+    return replace(covariances.uncertainty.found_anew(pulled.information), doubt=apart).is_known

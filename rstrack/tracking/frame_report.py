@@ -20,11 +20,12 @@ class FrameReport:
     step still moved a line. keyframe: a new one was made; lost: no pose was found, and none is given; fault: why.
     observability: smallest eigenvalue of Σ w j jᵀ per pixel, rotations scaled by the scene's depth; near 0 where the
     images leave a motion open. overlap: pixels that fall on the keyframe, against the first frame after it was made.
-    covariance: of the pose against its keyframe, (6, 6) [m; rad] in the depth camera's frame at mid readout; drift:
-    what the errors of the keyframes before add to that against the first frame; common (6, m): what one σ of each
-    parameter of the calibration that may be wrong moves it by; None where there are none: of lost frames, and with the
-    baseline. held_by_motion: largest part (0..1) that the motion before, not the images, has in
-    what is known of any direction. moving: part of the depth image that was left out since it moves by itself.
+    covariance: of the pose at its stamp against its keyframe, (6, 6) [m; rad], T_world_depth exp(ξ). drift_world: of
+    the keyframe against the first frame, exp(ξ) T_world_depth: the errors of the keyframes before. common (6, m): what
+    one σ of each parameter of the calibration that may be wrong moves the pose by, as ξ of its own. None where there
+    are none: of lost frames, and with the baseline. held_by_motion: largest part (0..1) that the motion before, not the
+    images, has in what is known of any direction. moving: part of the depth image that was left out since it moves by
+    itself.
     bridged: its images were of no use, as fault says, and it has its pose from an IMU and from frames after it: until
     these came, it was lost. segment: number, from 1, of the `segments.Segment` that has the frame; 0: the first track.
     """
@@ -42,7 +43,7 @@ class FrameReport:
     observability: float
     overlap: float
     covariance: FloatArray | None = None
-    drift: FloatArray | None = None
+    drift_world: FloatArray | None = None
     common: FloatArray | None = None
     held_by_motion: float = float("nan")
     moving: float = 0.0
@@ -53,7 +54,7 @@ class FrameReport:
     def as_lost(self, fault: Fault) -> FrameReport:
         """The same frame, given up later on; one that is lost already stays so for its own reason."""
         lost = replace(self, lost=True, keyframe=False, fault=self.fault or fault)
-        return replace(lost, covariance=None, drift=None, common=None, held_by_motion=float("nan"))
+        return replace(lost, covariance=None, drift_world=None, common=None, held_by_motion=float("nan"))
 
 
 def frame_report(

@@ -66,6 +66,10 @@ class Tracker:
         self._bridge = Bridge()
         self._last_fed: float | None = None
 
+    def learn_cameras(self, other: Tracker) -> None:
+        """Before the first frame: begin with what another tracker of the same recording has learnt of the cameras."""
+        self._track.covariances.uncertainty = other._track.covariances.uncertainty.begun_anew()
+
     # -- what it has found ------------------------------------------------------------------------------------------
 
     @property

@@ -68,6 +68,8 @@ class Track:
         self.age = 0
         self.reports: list[FrameReport] = []
         self.inertia = None if imu is None else Inertia(imu)
+        calibration = Calibration.of(rig, self.device.depth_lens, self.device.color_lens)
+        self.covariances = PoseCovariances(rig.depth_camera.fx, calibration)
         self.begin_anew()
 
     def begin_anew(self) -> None:
@@ -78,9 +80,7 @@ class Track:
         if self.inertia is not None:
             self.inertia.begin_world()
         self.found, self.chain, self.left_out = FoundPoses(), Chain(), MovingMasks()
-        rig, device = self.rig, self.device
-        calibration = Calibration.of(rig, device.depth_lens, device.color_lens)
-        self.covariances = PoseCovariances(rig.depth_camera.fx, calibration)
+        self.covariances = self.covariances.begun_anew()
         self.succession = Succession(self.maker, self.keyframes, self.options, self.gains, self.covariances)
 
     @property

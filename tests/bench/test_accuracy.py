@@ -31,7 +31,7 @@ def figures(free: slice = slice(6), stamps: np.ndarray = STAMPS, **case: Any) ->
     truth = Trajectory(at, se3.orthonormalise(spline.pose(at) @ body))
     T = spline.pose(stamps) @ se3.exp(SIGMA * np.random.default_rng(2).normal(size=(len(stamps), 6)))
     upper = (SIGMA**2 * np.eye(6))[np.triu_indices(6)].tolist()
-    told = [{"stamp": float(t), "covariance": upper, "drift": [0.0] * 21} for t in stamps]
+    told = [{"stamp": float(t), "covariance": upper, "drift_world": [0.0] * 21} for t in stamps]
     estimate = Estimate(stamps, se3.orthonormalise(T), None, {"frames": told})
     rig = SimpleNamespace(depth_camera=CAMERA, depth_shutter=SHUTTER)
     dataset: Any = SimpleNamespace(truth=None, truth_poses=truth, rig=rig, sequence=None, stamps=stamps)

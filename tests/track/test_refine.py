@@ -230,7 +230,7 @@ def run_of(metres: float, off_m: float, common_m: float = 0.0) -> tuple[Estimate
     upper = (np.diag(np.repeat([metres**2, 1e-6], 3)))[np.triu_indices(6)].tolist()
     common = np.outer([1, 0, 0, 0, 0, 0], np.sin(np.pi * stamps)).T[:, :, None] * common_m
     frames = [
-        {"stamp": t, "covariance": upper, "drift": [0.0] * 21, "common": c.tolist()}
+        {"stamp": t, "covariance": upper, "drift_world": [0.0] * 21, "common": c.tolist()}
         for t, c in zip(stamps, common, strict=True)
     ]  # fmt: skip
     moved = spline.control_points.copy()

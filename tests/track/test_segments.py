@@ -13,9 +13,9 @@ from rsgen.geometry import se3
 from rsgen.sequence.trajectory import read_trajectory
 from rstrack.data.estimate import SEGMENTS, Estimate
 from rstrack.data.rig import Frame
-from rstrack.tracking.frame_report import frame_report
+from rstrack.tracking.frame_report import FrameReport, frame_report
 from rstrack.tracking.judgement.fault import Fault
-from rstrack.tracking.runs.segments import Segments
+from rstrack.tracking.runs.segments import Segment, Segments
 
 
 def true_poses(stamps: np.ndarray) -> np.ndarray:
@@ -33,12 +33,14 @@ class Scripted:
 
     finds: set[int]
     at: list[int] = field(default_factory=list)
+    reports: list[FrameReport] = field(default_factory=list)
 
     def feed(self, frame: Frame) -> Any:
         k = round(30.0 * frame.depth.stamp)
         self.at += [k] if k in self.finds else []
         fault = Fault.NONE if k in self.finds else Fault.NO_PLACE
-        return frame_report(frame.depth.stamp, [], None, keyframe=False, fault=fault, overlap=1.0)
+        self.reports.append(frame_report(frame.depth.stamp, [], None, keyframe=False, fault=fault, overlap=1.0))
+        return self.reports[-1]
 
     @property
     def trajectory(self) -> tuple[np.ndarray, np.ndarray]:
@@ -46,11 +48,20 @@ class Scripted:
         return stamps, se3.inverse(POSE) @ true_poses(stamps)
 
 
-def segments_of(finds: set[int], lost: range, frames: int = 60) -> Segments:
-    made = Segments(lambda: Scripted(finds))  # type: ignore[arg-type, return-value]
-    for k in range(frames):
-        made.feed(FRAMES[k], k in lost)
-    made.end()
+def reports_of(finds: set[int], frames: int = 60) -> list[FrameReport]:
+    tracker = Scripted(finds)
+    for frame in FRAMES[:frames]:
+        tracker.feed(frame)
+    return tracker.reports
+
+
+def segments_of(finds: set[int], lost: range) -> Segments:
+    """Of a first track that loses some frames, where others are there to be found."""
+    made = Segments(lambda: Scripted(finds), FRAMES.__getitem__, 6)  # type: ignore[arg-type, return-value]
+    reports = reports_of(set(range(60)) - set(lost))
+    for k in range(60):
+        made.feed(FRAMES[k], reports[: k + 1])
+    made.end(reports)
     return made
 
 
@@ -59,29 +70,86 @@ def first_track(lost: range) -> tuple[np.ndarray, np.ndarray]:
     return stamps, true_poses(stamps)
 
 
-def test_half_a_second_after_the_last_pose_a_segment_begins_and_the_next_pose_ties_it() -> None:
+def test_after_half_a_second_a_segment_begins_with_the_last_frames_found_and_ends_with_the_next() -> None:
     lost = range(10, 40)
     made = segments_of(set(range(60)), lost)
     (segment,) = made.found
-    # The last pose is frame 9's; half a second later is frame 24, and the next is beyond.
-    assert np.rint(30.0 * segment.stamps).tolist() == [*range(25, 41)] and segment.tie == 40 / 30.0
+    assert np.rint(30.0 * segment.stamps).tolist() == [*range(4, 41)]
+    assert np.rint(30.0 * segment.ties).tolist() == [*range(4, 10), 40]
     joined = made.joined(Estimate(*first_track(lost)))
-    stamps, T = joined.stamps, joined.T_world_depth
-    assert np.rint(30.0 * stamps).tolist() == [*range(10), *range(25, 60)]
-    np.testing.assert_allclose(T, true_poses(stamps), atol=1e-12)
-    reports = [Scripted(set(range(60)) - set(lost)).feed(frame) for frame in FRAMES]
-    told = made.told(reports)
-    assert [k for k, r in enumerate(told) if r.lost] == [*range(10, 25)]
-    assert [k for k, r in enumerate(told) if r.segment] == [*range(25, 40)]
+    assert np.rint(30.0 * joined.stamps).tolist() == [*range(60)]
+    np.testing.assert_allclose(joined.T_world_depth, true_poses(joined.stamps), atol=1e-12)
+    told = made.told(reports_of(set(range(60)) - set(lost)), Estimate(*first_track(lost)))
+    assert not any(r.lost for r in told)
+    assert [k for k, r in enumerate(told) if r.segment] == [*lost]
+
+
+def test_where_the_first_track_finds_the_camera_the_way_there_bends_to_it() -> None:
+    lost = range(10, 40)
+    stamps, T = first_track(lost)
+    T[stamps > 0.5, 0, 3] += 0.031  # frames 9 and 40 are 31 frames apart
+    joined = segments_of(set(range(60)), lost).joined(Estimate(stamps, T))
+    off = joined.T_world_depth - true_poses(joined.stamps)
+    np.testing.assert_allclose(off[10:40, 0, 3], 0.001 * np.arange(1, 31), atol=1e-12)
+    assert np.abs(off[10:40, :, :3]).max() < 1e-12
+
+
+def test_a_segment_knows_its_errors_and_those_of_the_frame_that_ties_it() -> None:
+    rng, tie, frame = np.random.default_rng(4), 9, 20
+    factors = 1e-3 * rng.normal(size=(6, 6, 6))  # of covariances: own and drift of the tie in both tracks and the frame
+    common = rng.normal(size=(3, 6, 2))
+
+    def known(report: FrameReport, k: int) -> FrameReport:
+        own, drift = (factors[i] @ factors[i].T for i in (2 * k, 2 * k + 1))
+        return replace(report, covariance=own, drift_world=drift, common=common[k])
+
+    stamps, found = np.array([tie, frame]) / 30.0, reports_of({tie, frame})
+    first = [*found[:tie], known(found[tie], 0), *reports_of(set())[tie + 1 :]]
+    own = {stamps[0]: known(found[tie], 1), stamps[1]: known(found[frame], 2)}
+
+    def segments(twists: np.ndarray) -> tuple[Segments, Estimate]:
+        """Of poses with an error (3, 6) each of their own, and one (3, 6) of their keyframe's in its world."""
+        poses = np.concatenate([true_poses(stamps[:1]), se3.inverse(POSE) @ true_poses(stamps)])
+        off = se3.exp(twists[1]) @ poses @ se3.exp(twists[0])
+        made = segments_of(set(), range(0))
+        made.found = [Segment(stamps, off[1:], own, stamps[:1])]
+        return made, Estimate(stamps[:1], off[:1])
+
+    # By differences: what each of these errors does to the frame.
+    made, track = segments(np.zeros((2, 3, 6)))
+    at, step, J = made.joined(track).T_world_depth[1], 1e-6, np.zeros((2, 3, 6, 6))
+    for index in np.ndindex(2, 3, 6):
+        twists = np.zeros((2, 3, 6))
+        twists[index] = step
+        moved, by = segments(twists)
+        J[index[0], index[1], :, index[2]] = se3.log(se3.inverse(at) @ moved.joined(by).T_world_depth[1]) / step
+    told = made.told(first, track)[frame]
+    assert not told.lost and told.segment == 1
+    assert told.covariance is not None and told.drift_world is not None and told.common is not None
+    expected = sum(J[k % 2, k // 2] @ f @ f.T @ J[k % 2, k // 2].T for k, f in enumerate(factors))
+    from_world = se3.adjoint(se3.inverse(at))
+    np.testing.assert_allclose(told.covariance + from_world @ told.drift_world @ from_world.T, expected, atol=1e-10)
+    np.testing.assert_allclose(told.common, sum(J[0, k] @ common[k] for k in range(3)), atol=1e-5)
+
+
+def test_frames_that_a_segment_could_make_nothing_of_are_not_tried_twice() -> None:
+    fed: list[int] = []
+    made = Segments(lambda: Scripted({*range(46, 60)}), lambda k: (fed.append(k), FRAMES[k])[1], 6)  # type: ignore[arg-type, func-returns-value, return-value]
+    reports = reports_of(set(range(10)))
+    for k in range(60):
+        made.feed(FRAMES[k], reports[: k + 1])
+    made.end(reports)
+    assert fed == [*range(4, 25)]
+    assert [np.rint(30.0 * one.stamps).tolist() for one in made.found] == [[*range(46, 60)]]
 
 
 def test_without_a_frame_in_common_nobody_knows_where_a_segment_lies(tmp_path: Path) -> None:
-    for finds, lost in ((set(range(40)), range(10, 40)), (set(range(60)), range(10, 60))):
+    for finds, lost in ((set(range(25, 40)), range(10, 41)), (set(range(25, 60)), range(10, 60))):
         made = segments_of(finds, lost)
-        assert [one.tie for one in made.found] == [None]
+        assert [one.is_tied for one in made.found] == [False]
         own = Estimate(*first_track(lost), None, {"segments": made.info()})
         np.testing.assert_array_equal(made.joined(own).T_world_depth, own.T_world_depth)
-        reports = made.told([Scripted(set()).feed(frame) for frame in FRAMES])
+        reports = made.told(reports_of(set()), own)
         assert all(r.lost for r in reports) and reports[30].segment == 1 and reports[5].segment == 0
         made.write(tmp_path)
         poses = read_trajectory(tmp_path / SEGMENTS / "1.txt", format="tum")
@@ -103,15 +171,17 @@ def test_short_losses_and_tracks_that_never_began_have_none() -> None:
     assert segments_of(set(range(60)), range(10, 25)).found == []
     assert segments_of(set(range(60)), range(60)).found == []
     assert segments_of({30}, range(10, 60)).found == [], "one pose is no track"
-    assert Segments(lambda: Scripted(set())).text() == ""  # type: ignore[arg-type, return-value]
+    assert segments_of(set(range(10)), range(10, 60)).found == [], "all of its poses are the first track's"
+    assert Segments(lambda: Scripted(set()), FRAMES.__getitem__, 6).text() == ""  # type: ignore[arg-type, return-value]
 
 
 def test_a_real_tracker_goes_on_where_the_first_one_is_lost() -> None:
-    made, lost = Segments(lambda: tracker_of("rs-g")), range(5, 34)
+    made, lost = Segments(lambda: tracker_of("rs-g"), frame_at, 6), range(8, 34)
+    reports = reports_of(set(range(36)) - set(lost), 36)
     for k in range(36):
-        made.feed(frame_at(k), k in lost)
+        made.feed(frame_at(k), reports[: k + 1])
     stamps = np.array([k for k in range(36) if k not in lost]) / 30.0
     joined = made.joined(Estimate(stamps, TRUTH.pose(stamps)))
-    assert np.rint(30.0 * joined.stamps).tolist() == [*range(5), *range(20, 36)]
+    assert np.rint(30.0 * joined.stamps).tolist() == [*range(36)]
     error = se3.inverse(TRUTH.pose(joined.stamps)) @ joined.T_world_depth
     assert np.linalg.norm(error[:, :3, 3], axis=1).max() < 3e-3

@@ -69,7 +69,7 @@ def test_a_gyroscope_knows_turns_as_its_noise_adds_up_and_nothing_of_places() ->
     """On imu_walls turns about the wall's normal were held to be unknown by degrees, and gravity's direction too."""
     rate, told, steps = 4e-4, np.repeat([0.1, 2 * 4e-4 / DT], 3), 180
     seen = np.diag([1e8, 1e8, 1e8, 1e10, 1e10, 1e10])
-    start = Uncertainty.of_first().after(DT, seen).after(DT, seen)
+    start = Uncertainty().of_first().after(DT, seen).after(DT, seen)
     known = wandering = start
     for _ in range(steps):
         known = known.after(DT, np.zeros((6, 6)), told, rate)
@@ -94,10 +94,10 @@ def test_errors_of_a_chain_of_keyframes_are_as_large_as_their_covariances() -> N
     keyframe = [0, 0, 0, 2, 2, 2, 5, 5, 5]
     for k in range(9):
         pose[k] = noise[k] if k else 0.0
-        drift[k] = uncertainty.drift_of(keyframe[k], true[k])
+        drift[k] = uncertainty.drift_of(keyframe[k])
         if k in (2, 5):
             uncertainty = uncertainty.with_keyframe(k, keyframe[k], true[k], pose[k])
-    i, j = np.array([1, 1, 4]), np.array([4, 7, 8])
+    i, j = np.array([1, 1, 4, 7]), np.array([4, 7, 8, 3])
     known = Covariances(pose, drift, np.zeros((9, 6, 0)))
     found = []
     for _ in range(1500):
@@ -110,12 +110,11 @@ def test_errors_of_a_chain_of_keyframes_are_as_large_as_their_covariances() -> N
             if k in (2, 5):
                 world[k] = est[k] @ se3.inverse(true[k])
         found.append(step_nees(motion_errors(true, est, i, j), motion_covariance(est, known, i, j)))
-    assert np.isnan(motion_covariance(est, known, j, i)[1:]).all()  # from a later keyframe to an earlier one
     # Of 6 degrees of freedom: σ of the mean over 1500 is 0.015.
     np.testing.assert_allclose(np.mean(found, axis=0), 1.0, atol=0.06)
 
 
-def test_motions_whose_drift_shrinks_in_one_direction_alone_are_left_out() -> None:
+def test_motions_between_keyframes_neither_of_which_hangs_on_the_other_are_left_out() -> None:
     T, one, two = np.tile(np.eye(4), (2, 1, 1)), np.array([0]), np.array([1])
     pose, drift = np.tile(1e-4 * np.eye(6), (2, 1, 1)), np.tile(1e-2 * np.eye(6), (2, 1, 1))
     drift[1] = np.diag([3e-2, 3e-2, 1e-3, 3e-2, 3e-2, 3e-2])
@@ -130,21 +129,28 @@ def test_covariances_are_read_from_a_runs_frames() -> None:
     C = C + C.T
     upper = C[np.triu_indices(6)].tolist()
     frames: list[dict[str, Any]] = [
-        {"stamp": 1.0, "covariance": upper, "drift": upper},
-        {"stamp": 2.0, "covariance": None, "drift": None},
+        {"stamp": 1.0, "covariance": upper, "drift_world": upper},
+        {"stamp": 2.0, "covariance": None, "drift_world": None},
     ]
     estimate = Estimate(np.array([1.0, 2.0, 3.0]), np.tile(np.eye(4), (3, 1, 1)), None, {"frames": frames})
     known = covariances(estimate)
     np.testing.assert_array_equal(known.pose[0], C)
-    np.testing.assert_array_equal(known.drift[0], C)
+    np.testing.assert_array_equal(known.drift_world[0], C)
     assert np.isnan(known.pose[1:]).all() and known.common.shape == (3, 6, 0)
     assert np.isnan(covariances(replace(estimate, info={})).pose).all()
 
     common = np.arange(12.0).reshape(6, 2)
     frames[0]["common"] = common.tolist()
-    frames.append({"stamp": 3.0, "covariance": upper, "drift": upper})
+    frames.append({"stamp": 3.0, "covariance": upper, "drift_world": upper})
     known = covariances(estimate)
     np.testing.assert_array_equal(known.common, [common, 0.0 * common, 0.0 * common])
-    for wrong in ({"covariance": upper[:20]}, {"drift": "much"}, {"common": [[1.0] * 3] * 6}, {"common": [1.0] * 7}):
-        with pytest.raises(UserError, match=r"^estimate: covariance and drift of the frames in run\.json [^\n]*$"):
+    for wrong in (
+        {"covariance": upper[:20]},
+        {"drift_world": "much"},
+        {"common": [[1.0] * 3] * 6},
+        {"common": [1.0] * 7},
+    ):
+        with pytest.raises(
+            UserError, match=r"^estimate: covariance and drift_world of the frames in run\.json [^\n]*$"
+        ):
             covariances(replace(estimate, info={"frames": [frames[0], frames[2] | wrong]}))

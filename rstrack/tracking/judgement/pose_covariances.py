@@ -53,6 +53,10 @@ class PoseCovariances:
         file_s = self.calibration.sigmas[CLOCK]
         return -file_s * mean, file_s * sigma
 
+    def begun_anew(self) -> PoseCovariances:
+        """Of a track that begins, with what is known of the cameras."""
+        return PoseCovariances(self.focal_px, self.calibration, self.uncertainty.begun_anew())
+
     def considered(self, seconds: float) -> Considered | None:
         """What the calibration does to the next frame, so many seconds later; None where it is exact."""
         if self.calibration.is_exact:
@@ -115,18 +119,18 @@ class PoseCovariances:
 
     def of(self, report: FrameReport, frame: DeviceFrame, spline: Spline, at: int = -1) -> FrameReport:
         """The same where it has none, too: that it is then as good as keyframe `at`."""
-        T_world_depth = spline.pose(frame.depth.exposure.mid_time)
-        own = self._recent.get(frame.index)
+        T_world_depth, own = spline.pose(frame.stamp), self._recent.get(frame.index)
+        from_world = se3.adjoint(se3.inverse(T_world_depth))
         if own is None:
             common = self.common.of_keyframe(at, T_world_depth)
             covariance = np.zeros((6, 6))
         else:
-            at, covariance = own.ref, own.covariance
-            common = se3.adjoint(se3.inverse(T_world_depth)) @ own.common
-        drift = self.uncertainty.drift_of(at, T_world_depth)
+            to_stamp = from_world @ se3.adjoint(spline.pose(frame.depth.exposure.mid_time))
+            at, covariance = own.ref, to_stamp @ own.covariance @ to_stamp.T
+            common = from_world @ own.common
         is_told = self.calibration.sigmas > 0.0
         shared = common[:, is_told] if is_told.any() else None
-        return replace(report, covariance=covariance, drift=drift, common=shared)
+        return replace(report, covariance=covariance, drift_world=self.uncertainty.drift_of(at), common=shared)
 
     def _keep(self, index: int, common: FloatArray, velocity: FloatArray, color_late_s: float = 0.0) -> None:
         known = self.common

@@ -82,10 +82,13 @@ class Uncertainty:
         predicted = F @ (self.state + self.doubt) @ F.T + gain @ np.diag(accelerations**2) @ gain.T
         return _told(predicted, slice(9, 12), np.eye(3) / rate**2)
 
-    @classmethod
-    def of_first(cls) -> Uncertainty:
+    def begun_anew(self) -> Uncertainty:
+        """Nothing is known of any pose; of the cameras it is what was."""
+        return Uncertainty(systematic=self.systematic, calibration=self.calibration)
+
+    def of_first(self) -> Uncertainty:
         """Of the frame that the world is taken from, which may move."""
-        return cls(np.diag(np.concatenate([np.zeros(6), VELOCITY]) ** 2))
+        return replace(self.begun_anew(), state=np.diag(np.concatenate([np.zeros(6), VELOCITY]) ** 2))
 
     def found_anew(self, seen: FloatArray) -> Uncertainty:
         """Of a frame of which nothing is known but what its images (6, 6) say."""
@@ -94,13 +97,12 @@ class Uncertainty:
     def with_keyframe(self, index: int, before: int, T_world_depth: FloatArray, pose: FloatArray) -> Uncertainty:
         """With a keyframe made of a frame at T_world_depth (4, 4), whose covariance was `pose` against another one."""
         Ad = se3.adjoint(T_world_depth)
-        drift = self.drift.get(before, np.zeros((6, 6))) + Ad @ pose @ Ad.T
+        drift = self.drift_of(before) + Ad @ pose @ Ad.T
         return replace(self, drift=self.drift | {index: drift})
 
-    def drift_of(self, index: int, T_world_depth: FloatArray) -> FloatArray:
-        """Covariance (6, 6) that a keyframe's own error gives the pose T_world_depth (4, 4)."""
-        Ad = se3.adjoint(se3.inverse(T_world_depth))
-        return np.asarray(Ad @ self.drift.get(index, np.zeros((6, 6))) @ Ad.T)
+    def drift_of(self, index: int) -> FloatArray:
+        """Covariance (6, 6) of a keyframe's pose, see `drift`."""
+        return self.drift.get(index, np.zeros((6, 6)))
 
 
 def _told(P: FloatArray, part: slice, information: FloatArray) -> FloatArray:

@@ -84,7 +84,7 @@ def diagnostics(
     """
     frames = [dataclasses.asdict(report) for report in reports]
     for k, frame in zip(used, frames, strict=True):
-        frame |= {name: _upper(frame[name], spread) for name in ("covariance", "drift")}
+        frame |= {name: _upper(frame[name], spread) for name in ("covariance", "drift_world")}
         frame["common"] = None if frame["common"] is None else np.float32(frame["common"])
         frame["stamp"] = float(dataset.stamps[k])
         if dataset.timing is not None:

@@ -106,15 +106,20 @@ def track(
     begin = time.perf_counter() - done.total_s
     start_s = time.perf_counter() - asked
     alone = dataclasses.replace(options, loops="off")
-    segments = Segments(lambda: make_tracker(dataset.rig, alone, interval_s=dataset.interval_s(chosen), imu=imu))
+    segments = Segments(
+        lambda: make_tracker(dataset.rig, alone, interval_s=dataset.interval_s(chosen), imu=imu, after=tracker),
+        again,
+        tracker.options.bootstrap_frames,
+    )
     end, error = _feed(tracker, segments, load, chosen, done, checkpoint, truth, progress, watch)
-    segments.end()
+    segments.end(tracker.reports)
     if not done.fed:
         raise UserError(error or f"{done.unreadable[0][1]}; no other frame of the {len(chosen)} can be read either")
     closing, end = _closed(tracker, again, end, progress)
     if checkpoint is not None and end == "interrupted" and not segments.found:
         checkpoint.save(done)
-    reports = segments.told(tracker.reports)
+    found = tracker.uncorrected if isinstance(tracker, LoopTracker) else tracker
+    reports = segments.told(tracker.reports, Estimate(*found.trajectory))
     info = settings(dataset, chosen, tracker.options, noise) | {
         "end": end,
         "error": error or None,
@@ -132,7 +137,6 @@ def track(
         info["timings"]["loops_s"] = closing.seconds
     if dataset.timing is not None:
         info["clocks"] = dataset.timing.as_dict()
-    found = tracker.uncorrected if isinstance(tracker, LoopTracker) else tracker
     online = Estimate(*found.trajectory, found.spline, info)
     estimate = online if closing is None else _corrected(online, closing)
     unit = ""
@@ -197,7 +201,7 @@ def _feed(
                 start = time.perf_counter()
                 try:
                     report = tracker.feed(frame)
-                    segments.feed(frame, report.lost)
+                    segments.feed(frame, tracker.reports)
                 except (UserError, np.linalg.LinAlgError) as problem:
                     return "broke down", f"the tracker broke down at frame {k}: {problem}"
                 done.seconds.append(time.perf_counter() - start)

@@ -1,17 +1,18 @@
-"""A camera that is lost goes on in a track of its own: a segment, tied to the first where that finds the camera again.
+"""A camera that is lost goes on in a track of its own: a segment, begun with the last frames that were found.
 
-segments = Segments(lambda: make_tracker(rig, options))
+segments = Segments(lambda: make_tracker(rig, options), load)
 for frame in frames:
-    report = tracker.feed(frame)
-    segments.feed(frame, report.lost)
+    tracker.feed(frame)
+    segments.feed(frame, tracker.reports)
 estimate = segments.joined(Estimate(*tracker.trajectory))
 """
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,81 +36,131 @@ _LOST_S = 0.5
 class Segment:
     """Poses T_segment_depth (n, 4, 4) at stamps (n,), in a world of their own.
 
-    tie: stamp of a frame that the first track has found too, which ties the two; None: where it lies is not known.
+    reports: of each, by its stamp. ties (m,): stamps of those that the first track has found too. Without one it is not
+    known where the segment lies.
     """
 
     stamps: FloatArray
     T_segment_depth: FloatArray
-    tie: float | None = None
+    reports: Mapping[float, FrameReport]
+    ties: FloatArray
+
+    @property
+    def is_tied(self) -> bool:
+        """Whether the first track and this one share a frame."""
+        return len(self.ties) > 0
+
+    def report(self, stamp: float, first: Mapping[float, FrameReport], track: Estimate) -> FrameReport:
+        """Of the frame at a stamp (s), where the nearest tie has the segment; first: the first track's reports.
+
+        The errors that both tracks have at the tie, as far as they are noise, come on top of the segment's own.
+        """
+        own, tie = self.reports[stamp], self.ties[np.argmin(np.abs(self.ties - stamp))]
+        there, here = first[tie], self.reports[tie]
+        parts = there.drift_world, there.covariance, here.covariance, here.drift_world, own.drift_world
+        known = [part for part in parts if part is not None]
+        if len(known) < len(parts):
+            return own  # of a method without covariances
+        T_world_tie = track.T_world_depth[np.searchsorted(track.stamps, tie)]
+        T, T_tie = (self.T_segment_depth[np.searchsorted(self.stamps, t)] for t in (stamp, tie))
+        tie_to_world, segment_to_world = se3.adjoint(T_world_tie), se3.adjoint(T_world_tie @ se3.inverse(T_tie))
+        to_world = np.eye(6), tie_to_world, tie_to_world, segment_to_world, segment_to_world
+        drift = np.sum([A @ C @ A.T for A, C in zip(to_world, known, strict=True)], axis=0)
+        common = own.common
+        if common is not None and there.common is not None and here.common is not None:
+            common = common + se3.adjoint(se3.inverse(T) @ T_tie) @ (there.common - here.common)
+        return replace(own, drift_world=drift, common=common)
 
 
 @dataclass
 class Segments:
-    """make: a tracker like the first one. found: the segments that have ended, in their order."""
+    """make: a tracker like the first one. load: a frame that was fed, by its number. overlap: frames that the first
+    track found last and a segment begins with. found: the segments that have ended, in their order."""
 
     make: Callable[[], AnyTracker]
+    load: Callable[[int], Frame]
+    overlap: int
     found: list[Segment] = field(default_factory=list)
     _tracker: AnyTracker | None = None
-    # Stamps of the first track's last pose, and of the segment's (or of where it began).
-    _found: float = np.inf
+    # Stamp of the segment's last pose (or of where it began), and the first frame that no segment has been fed.
     _own: float = np.inf
+    _next: int = 0
 
     @property
     def is_open(self) -> bool:
         """Whether the camera is in one now."""
         return self._tracker is not None
 
-    def feed(self, frame: Frame, is_lost: bool) -> None:
-        """A frame that the first track has lost, or found. Raises UserError as `Tracker.feed`."""
-        stamp = frame.depth.stamp
-        if self._tracker is None and is_lost and stamp - self._found > _LOST_S:
-            self._tracker, self._own = self.make(), stamp
-        if not is_lost:
-            self._found = stamp
+    def feed(self, frame: Frame, reports: Sequence[FrameReport]) -> None:
+        """The newest frame, and the first track's reports of all frames. Raises UserError as `Tracker.feed`."""
+        stamp, newest = frame.depth.stamp, len(reports) - 1
+        if self._tracker is None and reports[-1].lost:
+            last = list(islice((k for k in range(newest, -1, -1) if not reports[k].lost), self.overlap))
+            if last and stamp - reports[last[0]].stamp > _LOST_S:
+                self._tracker, self._own = self.make(), stamp
+                # Frames that an earlier segment could make nothing of are not tried twice.
+                for k in range(max(last[-1], self._next), newest):
+                    self._follow(self.load(k))
         if self._tracker is None:
             return
-        report = self._tracker.feed(frame)
-        if not report.lost:
-            self._own = stamp
-        if not is_lost:
-            self.end(None if report.lost else stamp)
-        elif stamp - self._own > _LOST_S:
-            self.end()
+        self._follow(frame)
+        self._next = newest + 1
+        if not reports[-1].lost or stamp - self._own > _LOST_S:
+            self.end(reports)
 
-    def end(self, tie: float | None = None) -> None:
-        """The camera's segment, if it is in one, is over; one of a single pose is none. tie: as in `Segment`."""
+    def _follow(self, frame: Frame) -> None:
+        assert self._tracker is not None
+        if not self._tracker.feed(frame).lost:
+            self._own = frame.depth.stamp
+
+    def end(self, reports: Sequence[FrameReport]) -> None:
+        """The camera's segment, if it is in one, is over. One with a single pose that is its own is none."""
         if self._tracker is not None:
             stamps, T_segment_depth = self._tracker.trajectory
-            if len(stamps) > 1:
-                self.found.append(Segment(stamps, T_segment_depth, tie))
+            is_tie = np.isin(stamps, [r.stamp for r in reports if not r.lost])
+            if len(stamps) > 1 and not is_tie.all():
+                own = {r.stamp: r for r in self._tracker.reports if not r.lost}
+                self.found.append(Segment(stamps, T_segment_depth, own, stamps[is_tie]))
             self._tracker = None
 
     def joined(self, track: Estimate) -> Estimate:
-        """The first track, and the poses of segments that are tied to it, which have no spline."""
+        """The first track, and the poses of segments that are tied to it, which have no spline.
+
+        Each tie says where the segment lies; between two of them it is interpolated.
+        """
         stamps, T_world_depth = track.stamps, track.T_world_depth
         for segment in self.found:
-            if segment.tie is None:
+            if not segment.is_tied:
                 continue
-            at, own = (int(np.argmin(np.abs(some - segment.tie))) for some in (stamps, segment.stamps))
-            T_world_segment = T_world_depth[at] @ se3.inverse(segment.T_segment_depth[own])
-            missing = ~np.isin(segment.stamps, stamps)
-            stamps = np.concatenate([stamps, segment.stamps[missing]])
-            poses = se3.orthonormalise(T_world_segment @ segment.T_segment_depth[missing])
-            T_world_depth = np.concatenate([T_world_depth, poses])
-        order = np.argsort(stamps)
-        return Estimate(stamps[order], T_world_depth[order], track.spline, track.info)
+            is_tie, own = np.isin(segment.stamps, segment.ties), segment.T_segment_depth
+            T_world_segment = T_world_depth[np.searchsorted(stamps, segment.ties)] @ se3.inverse(own[is_tie])
+            missing = segment.stamps[~is_tie]
+            at = np.clip(missing, segment.ties[0], segment.ties[-1])
+            poses = se3.orthonormalise(se3.interpolated(segment.ties, T_world_segment, at) @ own[~is_tie])
+            order = np.argsort(np.concatenate([stamps, missing]))
+            stamps = np.concatenate([stamps, missing])[order]
+            T_world_depth = np.concatenate([T_world_depth, poses])[order]
+        return Estimate(stamps, T_world_depth, track.spline, track.info)
 
-    def told(self, reports: Sequence[FrameReport]) -> list[FrameReport]:
-        """The first track's reports, with the segments of frames that it has lost."""
-        of = {float(t): (k, one.tie is None) for k, one in enumerate(self.found, 1) for t in one.stamps}
-        return [
-            replace(r, segment=of[r.stamp][0], lost=of[r.stamp][1]) if r.lost and r.stamp in of else r for r in reports
-        ]
+    def told(self, reports: Sequence[FrameReport], track: Estimate) -> list[FrameReport]:
+        """The first track's reports, with those of segments of frames that it has lost. track: the first one."""
+        told = {r.stamp: r for r in reports}
+        for k, segment in enumerate(self.found, 1):
+            for t in segment.stamps.tolist():
+                if told[t].lost:
+                    found = segment.report(t, told, track) if segment.is_tied else told[t]
+                    told[t] = replace(found, segment=k, keyframe=False)
+        return list(told.values())
 
     def info(self) -> list[dict[str, Any]]:
-        """For run.json: of each segment its number of poses, the stamps of the first and the last, s, and the tie."""
+        """For run.json: of each segment its number of poses, and stamps, s: of the first, the last, the first tie."""
         return [
-            {"poses": len(one.stamps), "begin": one.stamps[0], "end": one.stamps[-1], "tie": one.tie}
+            {
+                "poses": len(one.stamps),
+                "begin": one.stamps[0],
+                "end": one.stamps[-1],
+                "tie": one.ties[0] if one.is_tied else None,
+            }
             for one in self.found
         ]
 
@@ -117,7 +168,7 @@ class Segments:
         """One line; empty where there are none."""
         if not self.found:
             return ""
-        count, tied = len(self.found), sum(one.tie is not None for one in self.found)
+        count, tied = len(self.found), sum(one.is_tied for one in self.found)
         of = "a segment of its own" if count == 1 else f"{count} segments of their own"
         where = f", {count - tied} of them tied to nothing: {SEGMENTS}/" if tied < count else ""
         return f"lost for more than {_LOST_S} s: {sum(len(one.stamps) for one in self.found)} poses in {of}{where}"
@@ -128,10 +179,10 @@ class Segments:
         try:
             if folder.exists():
                 shutil.rmtree(folder)
-            if any(one.tie is None for one in self.found):
+            if not all(one.is_tied for one in self.found):
                 folder.mkdir()
         except OSError as error:
             raise write_error(folder, error) from None
         for k, one in enumerate(self.found, 1):
-            if one.tie is None:
+            if not one.is_tied:
                 write_poses(folder / f"{k}.txt", one.stamps, one.T_segment_depth, "T_segment_depth")
