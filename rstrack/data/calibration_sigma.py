@@ -60,7 +60,7 @@ class CalibrationSigma:
 
 
 EXACT = CalibrationSigma()
-"""Of renderings."""
+"""Of renderings, but for depth cameras with fixed errors."""
 
 STATED = CalibrationSigma(0.01, 0.003, 0.01, 0.02, 0.3, 0.005, 0.003, 0.003, 0.01, 0.005)
 """Of a camera file that does not say: a judgement of what such files have wrong, not a measurement."""

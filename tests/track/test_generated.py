@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,10 @@ import tiny
 from rsgen.cli.main import main
 from rsgen.geometry import se3
 from rsgen.sequence.reader import read_sequence
+from rstrack.data.calibration_sigma import STATED
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import Estimate
+from rstrack.data.layouts.generated import sigma_of
 from rstrack.metrics.association import truth_of
 from rstrack.metrics.evaluate import evaluate
 
@@ -88,3 +91,14 @@ def test_the_exported_folder_is_tracked_alike(wild: Path, tmp_path: Path) -> Non
     np.testing.assert_allclose(exported.stamps, own.stamps, atol=1e-9)
     assert exported.timing is not None and exported.timing.wants_color_offset
     np.testing.assert_array_equal(exported.frame(5).depth.pixels, own.frame(5).depth.pixels)
+
+
+def test_a_depth_camera_with_fixed_errors_is_not_exact(wild: Path) -> None:
+    sequence = read_sequence(wild)
+    assert sigma_of(sequence).is_exact
+    for name in ("scale_error", "distortion_px"):
+        depth = sequence.meta["config"]["depth"] | {"noise": {"model": "kinect", name: 0.01}}
+        faulty = replace(sequence, meta=sequence.meta | {"config": sequence.meta["config"] | {"depth": depth}})
+        found = sigma_of(faulty)
+        assert (found.depth_scale, found.depth_inverse_offset) == (STATED.depth_scale, STATED.depth_inverse_offset)
+        assert replace(found, depth_scale=0.0, depth_inverse_offset=0.0).is_exact

@@ -15,7 +15,7 @@ import numpy as np
 from rsgen.geometry import se3
 from rsgen.sequence.reader import Sequence
 from rsgen.sequence.trajectory import Trajectory
-from rstrack.data.calibration_sigma import EXACT, CalibrationSigma
+from rstrack.data.calibration_sigma import EXACT, STATED, CalibrationSigma
 from rstrack.data.camera_file import usual
 from rstrack.data.clocks.timing import StampsMode, Timing, stream_timing
 from rstrack.data.registered_rows import DepthSensor, registered_shutter
@@ -38,8 +38,17 @@ def is_exact(sequence: Sequence) -> bool:
 
 
 def sigma_of(sequence: Sequence) -> CalibrationSigma:
-    """How far the cameras that sequence.yaml tells may be wrong: not at all, unless declared so on purpose."""
-    return usual(sequence.streams["color"].camera) if sequence.meta.get("declared") else EXACT
+    """How far the cameras that sequence.yaml tells may be wrong: not at all, unless they are declared so on purpose.
+
+    A depth camera with fixed errors of its own has them though its lens is told: as usual, since a user of such a
+    camera knows no more.
+    """
+    sigma = usual(sequence.streams["color"].camera) if sequence.meta.get("declared") else EXACT
+    depth = (sequence.meta.get("config") or {}).get("depth") or {}
+    noise = depth.get("noise") if isinstance(depth, dict) else None
+    if isinstance(noise, dict) and any(noise.get(name) for name in ("scale_error", "distortion_px")):
+        return replace(sigma, depth_scale=STATED.depth_scale, depth_inverse_offset=STATED.depth_inverse_offset)
+    return sigma
 
 
 def with_depth_scale(sequence: Sequence, depth_scale: float) -> Sequence:
