@@ -194,7 +194,7 @@ def not_the_best(full: Records) -> list[str]:
     """In words and figures."""
     found = beaten(full)
     words = sentences(full) or "Nothing is measured beside others yet."
-    table = ["", "`rs-pg` > the best of the others:", "", beaten_table(found).markdown()] if found else []
+    table = ["", beaten_table(found).markdown()] if found else []
     return ["## Where ours is not the best", "", words, *table, ""]
 
 
@@ -225,11 +225,11 @@ def _averages(records: Sequence[Record], shown: Sequence[str]) -> Table:
 
 
 def _beside(title: str, tracks: Sequence[Record], chosen: Callable[[Record], bool]) -> list[str]:
-    """Averages of groups, over the cases that the chosen methods ran on."""
+    """Averages of groups of some cases, over those that the chosen methods ran on; `others` has single ones."""
     means: dict[tuple[str, str], Average] = {}
     for group in dict.fromkeys(group_of(record) for record in tracks if not is_change(record)):
         cases = {r.case for r in tracks if group_of(r) == group and chosen(r) and not is_change(r)}
-        found = averages([record for record in tracks if record.case in cases])
+        found = averages([record for record in tracks if record.case in cases]) if len(cases) > 2 else {}
         means |= {(group or "others", method): average for method, average in found.items()}
 
     def entry(*at: str) -> Entry:
