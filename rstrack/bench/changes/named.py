@@ -87,7 +87,8 @@ def camera_told(
     T_told_color = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, np.radians(rotation_deg), 0.0]))
     cameras = replace(rig, depth_camera=told(rig.depth_camera), color_camera=told(rig.color_camera))
     T_color_depth = T_told_color @ rig.T_color_depth if rotation_deg else rig.T_color_depth
-    sigma = usual(cameras.color_camera) if rig.sigma.is_exact else rig.sigma
+    # A rendering's lenses count as exact, whatever its depth camera has wrong.
+    sigma = usual(cameras.color_camera) if rig.sigma.focal == 0.0 else rig.sigma
     cameras = replace(cameras, T_color_depth=T_color_depth, sigma=sigma)
     made = readout_told(replace(dataset, rig=cameras), shift_s=1e-3 * readout_ms)
     return color_late(made, 1e-3 * color_ms) if color_ms else made
