@@ -79,7 +79,7 @@ def test_after_half_a_second_a_segment_begins_with_the_last_frames_found_and_end
     joined = made.joined(Estimate(*first_track(lost)))
     assert np.rint(30.0 * joined.stamps).tolist() == [*range(60)]
     np.testing.assert_allclose(joined.T_world_depth, true_poses(joined.stamps), atol=1e-12)
-    told = made.told(reports_of(set(range(60)) - set(lost)), Estimate(*first_track(lost)))
+    told = made.told(reports_of(set(range(60)) - set(lost)), joined)
     assert not any(r.lost for r in told)
     assert [k for k, r in enumerate(told) if r.segment] == [*lost]
 
@@ -123,7 +123,7 @@ def test_a_segment_knows_its_errors_and_those_of_the_frame_that_ties_it() -> Non
         twists[index] = step
         moved, by = segments(twists)
         J[index[0], index[1], :, index[2]] = se3.log(se3.inverse(at) @ moved.joined(by).T_world_depth[1]) / step
-    told = made.told(first, track)[frame]
+    told = made.told(first, made.joined(track))[frame]
     assert not told.lost and told.segment == 1
     assert told.covariance is not None and told.drift_world is not None and told.common is not None
     expected = sum(J[k % 2, k // 2] @ f @ f.T @ J[k % 2, k // 2].T for k, f in enumerate(factors))
@@ -165,6 +165,22 @@ def test_without_a_frame_in_common_nobody_knows_where_a_segment_lies(tmp_path: P
 def test_a_segment_that_is_lost_itself_ends_and_another_begins() -> None:
     made = segments_of({*range(25, 30), *range(46, 60)}, range(10, 60))
     assert [np.rint(30.0 * one.stamps).tolist() for one in made.found] == [[*range(25, 30)], [*range(46, 60)]]
+
+
+def test_where_a_tied_segment_is_lost_the_next_one_is_tied_to_it() -> None:
+    finds = iter([set(range(30)), set(range(60))])
+    made = Segments(lambda: Scripted(next(finds)), FRAMES.__getitem__, 6)  # type: ignore[arg-type, return-value]
+    reports = reports_of(set(range(10)))
+    for k in range(60):
+        made.feed(FRAMES[k], reports[: k + 1])
+    made.end(reports)
+    _, second = made.found
+    assert np.rint(30.0 * second.stamps).tolist() == [*range(24, 60)]
+    assert np.rint(30.0 * second.ties).tolist() == [*range(24, 30)]
+    joined = made.joined(Estimate(*first_track(range(10, 60))))
+    assert np.rint(30.0 * joined.stamps).tolist() == [*range(60)]
+    np.testing.assert_allclose(joined.T_world_depth, true_poses(joined.stamps), atol=1e-12)
+    assert [r.segment for r in made.told(reports, joined)] == [*[0] * 10, *[1] * 20, *[2] * 30]
 
 
 def test_short_losses_and_tracks_that_never_began_have_none() -> None:

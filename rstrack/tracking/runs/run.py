@@ -119,7 +119,7 @@ def track(
     if checkpoint is not None and end == "interrupted" and not segments.found:
         checkpoint.save(done)
     found = tracker.uncorrected if isinstance(tracker, LoopTracker) else tracker
-    reports = segments.told(tracker.reports, Estimate(*found.trajectory))
+    reports = segments.told(tracker.reports, segments.joined(Estimate(*found.trajectory)))
     info = settings(dataset, chosen, tracker.options, noise) | {
         "end": end,
         "error": error or None,

@@ -36,8 +36,8 @@ _LOST_S = 0.5
 class Segment:
     """Poses T_segment_depth (n, 4, 4) at stamps (n,), in a world of their own.
 
-    reports: of each, by its stamp. ties (m,): stamps of those that the first track has found too. Without one it is not
-    known where the segment lies.
+    reports: of each, by its stamp. ties (m,): stamps of those that the first track has found too, or a segment before
+    that is tied. Without one it is not known where the segment lies.
     """
 
     stamps: FloatArray
@@ -47,16 +47,16 @@ class Segment:
 
     @property
     def is_tied(self) -> bool:
-        """Whether the first track and this one share a frame."""
+        """Whether it shares a frame with what is known before."""
         return len(self.ties) > 0
 
-    def report(self, stamp: float, first: Mapping[float, FrameReport], track: Estimate) -> FrameReport:
-        """Of the frame at a stamp (s), where the nearest tie has the segment; first: the first track's reports.
+    def report(self, stamp: float, before: Mapping[float, FrameReport], track: Estimate) -> FrameReport:
+        """Of the frame at a stamp (s), where the nearest tie has the segment; before: reports of what it is tied to.
 
         The errors that both tracks have at the tie, as far as they are noise, come on top of the segment's own.
         """
         own, tie = self.reports[stamp], self.ties[np.argmin(np.abs(self.ties - stamp))]
-        there, here = first[tie], self.reports[tie]
+        there, here = before[tie], self.reports[tie]
         parts = there.drift_world, there.covariance, here.covariance, here.drift_world, own.drift_world
         known = [part for part in parts if part is not None]
         if len(known) < len(parts):
@@ -74,16 +74,18 @@ class Segment:
 
 @dataclass
 class Segments:
-    """make: a tracker like the first one. load: a frame that was fed, by its number. overlap: frames that the first
-    track found last and a segment begins with. found: the segments that have ended, in their order."""
+    """make: a tracker like the first one. load: a frame that was fed, by its number. overlap: the last frames with a
+    pose, which a segment begins with. found: the segments that have ended, in their order."""
 
     make: Callable[[], AnyTracker]
     load: Callable[[int], Frame]
     overlap: int
     found: list[Segment] = field(default_factory=list)
     _tracker: AnyTracker | None = None
-    # Stamp of the segment's last pose (or of where it began), and the first frame that no segment has been fed.
+    # Stamp of the segment's last pose (or of where it began); stamps of the tied ones' poses; the first frame that none
+    # has been fed in vain.
     _own: float = np.inf
+    _known: set[float] = field(default_factory=set)
     _next: int = 0
 
     @property
@@ -95,7 +97,8 @@ class Segments:
         """The newest frame, and the first track's reports of all frames. Raises UserError as `Tracker.feed`."""
         stamp, newest = frame.depth.stamp, len(reports) - 1
         if self._tracker is None and reports[-1].lost:
-            last = list(islice((k for k in range(newest, -1, -1) if not reports[k].lost), self.overlap))
+            known = (k for k in range(newest, -1, -1) if self._has_pose(reports[k]))
+            last = list(islice(known, self.overlap))
             if last and stamp - reports[last[0]].stamp > _LOST_S:
                 self._tracker, self._own = self.make(), stamp
                 # Frames that an earlier segment could make nothing of are not tried twice.
@@ -104,24 +107,34 @@ class Segments:
         if self._tracker is None:
             return
         self._follow(frame)
-        self._next = newest + 1
-        if not reports[-1].lost or stamp - self._own > _LOST_S:
+        if stamp - self._own > _LOST_S:
+            # Another one begins with what a tied one has found last, and with new frames after others.
+            ended = self.end(reports)
+            self._next = self._next if ended is not None and ended.is_tied else newest + 1
+        elif not reports[-1].lost:
             self.end(reports)
+
+    def _has_pose(self, report: FrameReport) -> bool:
+        return not report.lost or report.stamp in self._known
 
     def _follow(self, frame: Frame) -> None:
         assert self._tracker is not None
         if not self._tracker.feed(frame).lost:
             self._own = frame.depth.stamp
 
-    def end(self, reports: Sequence[FrameReport]) -> None:
-        """The camera's segment, if it is in one, is over. One with a single pose that is its own is none."""
-        if self._tracker is not None:
-            stamps, T_segment_depth = self._tracker.trajectory
-            is_tie = np.isin(stamps, [r.stamp for r in reports if not r.lost])
-            if len(stamps) > 1 and not is_tie.all():
-                own = {r.stamp: r for r in self._tracker.reports if not r.lost}
-                self.found.append(Segment(stamps, T_segment_depth, own, stamps[is_tie]))
-            self._tracker = None
+    def end(self, reports: Sequence[FrameReport]) -> Segment | None:
+        """The camera's segment, if it is in one, is over. Without two poses, and one of its own, it is none."""
+        tracker, self._tracker = self._tracker, None
+        if tracker is None:
+            return None
+        stamps, T_segment_depth = tracker.trajectory
+        is_tie = np.isin(stamps, [r.stamp for r in reports if self._has_pose(r)])
+        if len(stamps) < 2 or is_tie.all():
+            return None
+        own = {r.stamp: r for r in tracker.reports if not r.lost}
+        self.found.append(Segment(stamps, T_segment_depth, own, stamps[is_tie]))
+        self._known |= set(stamps.tolist()) if is_tie.any() else set()
+        return self.found[-1]
 
     def joined(self, track: Estimate) -> Estimate:
         """The first track, and the poses of segments that are tied to it, which have no spline.
@@ -134,16 +147,17 @@ class Segments:
                 continue
             is_tie, own = np.isin(segment.stamps, segment.ties), segment.T_segment_depth
             T_world_segment = T_world_depth[np.searchsorted(stamps, segment.ties)] @ se3.inverse(own[is_tie])
-            missing = segment.stamps[~is_tie]
+            is_missing = ~np.isin(segment.stamps, stamps)  # an IMU may have bridged some since
+            missing = segment.stamps[is_missing]
             at = np.clip(missing, segment.ties[0], segment.ties[-1])
-            poses = se3.orthonormalise(se3.interpolated(segment.ties, T_world_segment, at) @ own[~is_tie])
+            poses = se3.orthonormalise(se3.interpolated(segment.ties, T_world_segment, at) @ own[is_missing])
             order = np.argsort(np.concatenate([stamps, missing]))
             stamps = np.concatenate([stamps, missing])[order]
             T_world_depth = np.concatenate([T_world_depth, poses])[order]
         return Estimate(stamps, T_world_depth, track.spline, track.info)
 
     def told(self, reports: Sequence[FrameReport], track: Estimate) -> list[FrameReport]:
-        """The first track's reports, with those of segments of frames that it has lost. track: the first one."""
+        """The first track's reports, with those of segments of frames that it has lost. track: `joined`."""
         told = {r.stamp: r for r in reports}
         for k, segment in enumerate(self.found, 1):
             for t in segment.stamps.tolist():
