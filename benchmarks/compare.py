@@ -20,8 +20,8 @@ there is a false alarm in at most one comparison of twenty (Holm 1979). The test
   Where there were some, as of methods that take a rolling shutter for a global one, they are counts like others.
 - A cell that failed, or has no error in a run or in all of them where there was one: worse.
 
-Milliseconds are never judged, since machines differ, and one machine from one day to the next: ratios of times in one
-run are. Other people's trackers are shown, and not judged.
+Milliseconds are never judged, since machines differ, and one machine from one day to the next: the ratio of median
+times in one run is. Other people's trackers are shown, and not judged.
 """
 
 from __future__ import annotations
