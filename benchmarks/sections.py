@@ -229,7 +229,9 @@ def _beside(title: str, tracks: Sequence[Record], chosen: Callable[[Record], boo
     means: dict[tuple[str, str], Average] = {}
     for group in dict.fromkeys(group_of(record) for record in tracks if not is_change(record)):
         cases = {r.case for r in tracks if group_of(r) == group and chosen(r) and not is_change(r)}
-        found = averages([record for record in tracks if record.case in cases]) if len(cases) > 2 else {}
+        if group not in (*PAPERS_GROUPS, "real") and len(cases) < 3:
+            continue
+        found = averages([record for record in tracks if record.case in cases])
         means |= {(group or "others", method): average for method, average in found.items()}
 
     def entry(*at: str) -> Entry:

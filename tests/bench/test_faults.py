@@ -265,7 +265,7 @@ class Told:
             self._poses[moved][1][1, 3] += by
         if k in self._again:
             self.spline_valid.append((0.0, 0.0))
-        self.reports.append(SimpleNamespace(lost=off is None, keyframe=k in self._keyframes))
+        self.reports.append(SimpleNamespace(stamp=frame.depth.stamp, lost=off is None, keyframe=k in self._keyframes))
         return self.reports[-1]
 
     @property
@@ -278,7 +278,12 @@ class Told:
 def outcome(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> Any:
     def make(off: dict[int, float | None], first: int = 10, last: int = 13, **told: Any) -> SimpleNamespace:
         _, truth = true_poses(SPLINE, dataset.stamps, interpolate=True)
-        monkeypatch.setattr(measure, "make_tracker", lambda *_, **__: Told(truth, off, **told))
+
+        def make_tracker(*_: Any, after: Any = None, **__: Any) -> Told:
+            """A segment's finds nothing."""
+            return Told(truth, off if after is None else dict.fromkeys(range(FRAMES)), **told)
+
+        monkeypatch.setattr(measure, "make_tracker", make_tracker)
         return SimpleNamespace(**judged(Fault("covered", dataset, first, last), Options()))
 
     return make

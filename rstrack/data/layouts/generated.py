@@ -9,6 +9,7 @@ declared wrong on purpose are given as they are declared; the truth is that of t
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -44,8 +45,9 @@ def sigma_of(sequence: Sequence) -> CalibrationSigma:
     camera knows no more.
     """
     sigma = usual(sequence.streams["color"].camera) if sequence.meta.get("declared") else EXACT
-    depth = (sequence.meta.get("config") or {}).get("depth") or {}
-    noise = depth.get("noise") if isinstance(depth, dict) else None
+    noise: Any = sequence.meta
+    for name in ("config", "depth", "noise"):
+        noise = noise.get(name) if isinstance(noise, dict) else None
     if isinstance(noise, dict) and any(noise.get(name) for name in ("scale_error", "distortion_px")):
         return replace(sigma, depth_scale=STATED.depth_scale, depth_inverse_offset=STATED.depth_inverse_offset)
     return sigma
