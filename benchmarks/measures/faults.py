@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from rstrack.data.estimate import Estimate
 from rstrack.metrics.association import angles_deg, true_poses, truth_of
 from rstrack.options import Options
 from rstrack.tracking.any_tracker import make_tracker
-from rstrack.tracking.runs.segments import Segments
+from rstrack.tracking.runs.segments import segments_beside
 
 # Frames within which a camera has to be found again, and after which a pose moves no more.
 _AGAIN, _CONVERGED = 5, 10
@@ -123,12 +123,7 @@ class _Watched:
 def _watch(dataset: Dataset, options: Options) -> _Watched:
     interval_s = dataset.interval_s(range(len(dataset)))
     tracker = make_tracker(dataset.rig, options, interval_s=interval_s, imu=dataset.imu if options.inertial else None)
-    alone = replace(options, loops="off")
-    segments = Segments(
-        lambda: make_tracker(dataset.rig, alone, interval_s=interval_s, after=tracker),
-        dataset.frame,
-        options.bootstrap_frames,
-    )
+    segments = segments_beside(tracker, dataset.rig, options, dataset.frame, interval_s)
     seen = _Watched()
     settled: dict[int, FloatArray] = {}
     for k, frame in enumerate(dataset.frames()):

@@ -31,6 +31,7 @@ from rstrack.bench.sequences import Sources
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.metrics.association import true_poses
 from rstrack.options import Options
+from rstrack.tracking.runs import segments
 
 FRAMES = 30
 SPLINE = synthetic.make_spline(0.3)
@@ -278,12 +279,9 @@ class Told:
 def outcome(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> Any:
     def make(off: dict[int, float | None], first: int = 10, last: int = 13, **told: Any) -> SimpleNamespace:
         _, truth = true_poses(SPLINE, dataset.stamps, interpolate=True)
-
-        def make_tracker(*_: Any, after: Any = None, **__: Any) -> Told:
-            """A segment's finds nothing."""
-            return Told(truth, off if after is None else dict.fromkeys(range(FRAMES)), **told)
-
-        monkeypatch.setattr(measure, "make_tracker", make_tracker)
+        nothing = dict.fromkeys(range(FRAMES))
+        monkeypatch.setattr(measure, "make_tracker", lambda *_, **__: Told(truth, off, **told))
+        monkeypatch.setattr(segments, "make_tracker", lambda *_, **__: Told(truth, nothing, **told))
         return SimpleNamespace(**judged(Fault("covered", dataset, first, last), Options()))
 
     return make

@@ -35,7 +35,7 @@ from rstrack.tracking.any_tracker import AnyTracker, make_tracker
 from rstrack.tracking.first_look.looked_at import looked_at
 from rstrack.tracking.runs.record import Done, Noise, diagnostics, settings, timings
 from rstrack.tracking.runs.result import End, Result, keyframes_text
-from rstrack.tracking.runs.segments import Segments
+from rstrack.tracking.runs.segments import Segments, segments_beside
 
 if TYPE_CHECKING:
     from rstrack.tracking.frame_report import FrameReport
@@ -105,12 +105,7 @@ def track(
         raise UserError(f"{out}: --resume is for spline methods, not for the baseline: track anew")
     begin = time.perf_counter() - done.total_s
     start_s = time.perf_counter() - asked
-    alone = dataclasses.replace(options, loops="off")
-    segments = Segments(
-        lambda: make_tracker(dataset.rig, alone, interval_s=dataset.interval_s(chosen), imu=imu, after=tracker),
-        again,
-        tracker.options.bootstrap_frames,
-    )
+    segments = segments_beside(tracker, dataset.rig, options, again, dataset.interval_s(chosen), imu)
     end, error = _feed(tracker, segments, load, chosen, done, checkpoint, truth, progress, watch)
     segments.end(tracker.reports)
     if not done.fed:

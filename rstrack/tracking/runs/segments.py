@@ -1,6 +1,6 @@
 """A camera that is lost goes on in a track of its own: a segment, begun with the last frames that were found.
 
-segments = Segments(lambda: make_tracker(rig, options), load)
+segments = segments_beside(tracker, rig, options, load)
 for frame in frames:
     tracker.feed(frame)
     segments.feed(frame, tracker.reports)
@@ -22,8 +22,10 @@ from rsgen.array_types import FloatArray
 from rsgen.files import write_error
 from rsgen.geometry import se3
 from rstrack.data.estimate import SEGMENTS, Estimate, write_poses
-from rstrack.data.rig import Frame
-from rstrack.tracking.any_tracker import AnyTracker
+from rstrack.data.imu.recording import ImuRecording
+from rstrack.data.rig import Frame, Rig
+from rstrack.options import Options
+from rstrack.tracking.any_tracker import AnyTracker, make_tracker
 
 if TYPE_CHECKING:
     from rstrack.tracking.frame_report import FrameReport
@@ -123,7 +125,7 @@ class Segments:
             self._own = frame.depth.stamp
 
     def end(self, reports: Sequence[FrameReport]) -> Segment | None:
-        """The camera's segment, if it is in one, is over. Without two poses, and one of its own, it is none."""
+        """The camera's segment, if it is in one, is over. Without two poses, one of them its own, it is none."""
         tracker, self._tracker = self._tracker, None
         if tracker is None:
             return None
@@ -200,3 +202,15 @@ class Segments:
         for k, one in enumerate(self.found, 1):
             if not one.is_tied:
                 write_poses(folder / f"{k}.txt", one.stamps, one.T_segment_depth, "T_segment_depth")
+
+
+def segments_beside(
+    tracker: AnyTracker, rig: Rig, options: Options, load: Callable[[int], Frame], interval_s: float | None = None,
+    imu: ImuRecording | None = None,
+) -> Segments:  # fmt: skip
+    """Of a track by a tracker that was made with the same: each by one like it, without loops, that begins with what it
+    has learnt of the cameras. load: a frame that was fed, by its number."""
+    alone = replace(options, loops="off")
+    return Segments(
+        lambda: make_tracker(rig, alone, interval_s=interval_s, imu=imu, after=tracker), load, alone.bootstrap_frames
+    )
