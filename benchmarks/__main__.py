@@ -8,15 +8,20 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
+
 from benchmarks.compare import compare, tolerances
 from rsgen.console.command_line import Commands, Parser, Quiet, run_program
+from rsgen.console.progress import Progress
 from rsgen.console.scheduler import Scheduler, open_workers
+from rstrack.bench.definitions import Cell
 from rstrack.bench.record import Record, read_records, write_record, write_records
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results"
 TIERS = ("smoke", "gate", "full")
-# What is timed runs in this process, after all else; the gate's other cells share the cores, one process each.
+# Its repetitions run alone, each in a process of its own, before, amid and after all else, which shares the cores: in
+# a row they would have the machine's state in common, and scatter less than what another day's scatter by.
 SPEED = "speed"
 
 _DESCRIPTION = """\
@@ -95,19 +100,19 @@ def run_tier(tier: str, choice: Choice, scheduler: str | None, quiet: bool) -> i
             if not (out / "cells" / name / RECORD).exists():
                 write_record(out / "cells" / name / RECORD, record)
     expected_s = {name: record.seconds for name, record in known(tier).items()}
-    timed = tuple(cell for cell in benchmark.cells if cell.measure == SPEED)
-    rest = tuple(cell for cell in benchmark.cells if cell.measure != SPEED)
     with ProgressDisplay(quiet) as progress:
-        outcome = Outcome({})
-        if rest:
-            with open_workers(scheduler) as workers:
-                some = replace(benchmark, cells=rest)
-                outcome = run_cells(some, out, sources, workers, progress, MEASURES, done, expected_s)
-        if timed and not outcome.interrupted:
-            alone = run_cells(
-                replace(benchmark, cells=timed), out, sources, None, progress, MEASURES, done, expected_s
-            )  # fmt: skip
-            outcome = Outcome(outcome.records | alone.records, alone.interrupted)
+        outcome, planned = Outcome({}), parts(benchmark.cells, scheduler, expected_s)
+        ends = np.cumsum([0.0, *(sum(expected_s.get(cell.name, 1.0) for cell in cells) for cells, _ in planned)])
+        ends /= ends[-1]
+        for n, (cells, where) in enumerate(planned):
+            with open_workers(where) as workers:
+                part = run_cells(
+                    replace(benchmark, cells=cells), out, sources, workers, _within(progress, *ends[n : n + 2]),
+                    MEASURES, done, expected_s,
+                )  # fmt: skip
+            outcome = Outcome(outcome.records | part.records, part.interrupted)
+            if part.interrupted:
+                break
     records = {cell.name: outcome.records[cell.name] for cell in benchmark.cells if cell.name in outcome.records}
     failed = [record.cell for record in records.values() if record.error is not None and not record.skipped]
     skipped = sum(record.skipped for record in records.values())
@@ -124,6 +129,34 @@ def run_tier(tier: str, choice: Choice, scheduler: str | None, quiet: bool) -> i
         print(f"bench: interrupted; {out} holds what is finished, and the same command goes on", file=sys.stderr)
         return 130
     return 1 if failed else 0
+
+
+def parts(
+    cells: Sequence[Cell], scheduler: str | None, expected_s: Mapping[str, float]
+) -> list[tuple[tuple[Cell, ...], str | None]]:
+    """Cells that run together, and where: the first repetition of all that is timed, some others, the second, …"""
+    timed = [cell for cell in cells if cell.measure == SPEED]
+    rest = [cell for cell in cells if cell.measure != SPEED]
+    repetitions = max((len(cell.seeds) for cell in timed), default=0)
+    between = max(1, repetitions - 1)
+    ends = np.cumsum([expected_s.get(cell.name, 1.0) for cell in rest])
+    part_of = np.minimum(ends / max(ends[-1:].sum(), 1e-9) * between, between - 1).astype(int)
+    out: list[tuple[tuple[Cell, ...], str | None]] = []
+    for n in range(max(between, repetitions)):
+        if timed:
+            out.append((tuple(replace(cell, seeds=cell.seeds[: n + 1]) for cell in timed), scheduler and "local:1"))
+        if some := tuple(cell for cell, part in zip(rest, part_of, strict=True) if part == n):
+            out.append((some, scheduler))
+    return out
+
+
+def _within(progress: Progress, begin: float, end: float) -> Progress:
+    """Shows cells of a part as a piece of all."""
+
+    def show(stage: str, fraction: float, note: str) -> None:
+        progress(stage, begin + (end - begin) * fraction if stage == "cells" else fraction, note)
+
+    return show
 
 
 def known(tier: str) -> dict[str, Record]:

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.__main__ import main
+from benchmarks.__main__ import HERE, main, parts
+from rstrack.bench.definitions import load_benchmark
 from rstrack.bench.record import read_records
 
 
@@ -30,3 +31,21 @@ def test_every_measure_runs(
 def test_a_glob_that_names_no_cell(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["gate", "--only", "track/nothing"]) == 2
     assert "no cell has such a name" in capsys.readouterr().err
+
+
+def test_repetitions_of_what_is_timed_are_far_apart() -> None:
+    cells = load_benchmark([HERE / "cases.yaml", HERE / "gate.yaml"]).cells
+    planned = parts(cells, "local", {})
+    timed = [part for part, where in planned if where == "local:1"]
+    rest = [part for part, where in planned if where == "local"]
+    assert [where for _, where in planned] == ["local:1", "local", "local:1", "local", "local:1"]
+    assert [{cell.seeds for cell in part} for part in timed] == [{(0,)}, {(0, 1)}, {(0, 1, 2)}]
+    assert all(cell.measure == "speed" for part in timed for cell in part)
+    assert [*rest[0], *rest[1]] == [cell for cell in cells if cell.measure != "speed"]
+    assert abs(len(rest[0]) - len(rest[1])) <= 2
+
+
+def test_one_timed_cell_alone_and_none() -> None:
+    cells = load_benchmark([HERE / "cases.yaml", HERE / "smoke.yaml"]).cells
+    assert [where for _, where in parts(cells, None, {})] == [None, None]
+    assert parts([cell for cell in cells if cell.measure != "speed"], "local", {})[0][1] == "local"
