@@ -16,7 +16,7 @@ from rstrack.keyframes.keyframe import Reference
 class Chain:
     """Frames' normal equations, summed over those aligned to one keyframe: 1.5 kB a frame.
 
-    Only the Hessians: where the frames were found, nothing pulls at them any more. Frames against references that are
+    Only the Hessians: where the frames were found, gradients are zero. Frames against references that are
     rolling still are put together under None.
     """
 
@@ -30,7 +30,7 @@ class Chain:
         return [*self._done, Seen(self._keyframe, self._band.packed())] if len(self._band) else list(self._done)
 
     def add(self, ref: Reference, fresh: Sequence[Observation], state: SplineState, excess: float) -> None:
-        """A frame that has been found. excess: by how much σ of its images are too small, see `Pulls.excess`."""
+        """A frame that has been found. excess: by how much σ of its images are too small, see `Scores.excess`."""
         keyframe = ref.index if ref.rolling is None else None
         if keyframe != self._keyframe:
             self._put_away()

@@ -34,18 +34,18 @@ _HELD = 1e14
 class Seen:
     """What frames say of control points against a keyframe; None: against others of them, by the model itself.
 
-    pull (n, 6): gradient of what they say, of the band's control points, where the models were made; None: zero, as
+    gradient (n, 6): gradient of what they say, of the band's control points, where the models were made; None: zero, as
     after the tracker's own steps.
     """
 
     keyframe: int | None
     band: Band
-    pull: FloatArray | None = None
+    gradient: FloatArray | None = None
 
     def weakened(self, spread: float) -> Seen:
         """Taken as so many times as uncertain (σ)."""
-        pull = None if self.pull is None else self.pull / spread**2
-        return Seen(self.keyframe, Band(self.band.first, self.band.blocks / spread**2), pull)
+        gradient = None if self.gradient is None else self.gradient / spread**2
+        return Seen(self.keyframe, Band(self.band.first, self.band.blocks / spread**2), gradient)
 
 
 @dataclass(frozen=True)
@@ -182,8 +182,8 @@ class _System:
         x = se3.log(se3.inverse(E) @ own)
         A = se3.left_jacobian_inv(x) @ se3.adjoint(se3.inverse(E))
         Hx, whole = np.zeros((n, 6)), np.zeros((n, 6, 6))
-        if seen.pull is not None:
-            Hx += seen.pull[:n]
+        if seen.gradient is not None:
+            Hx += seen.gradient[:n]
         for d in range(band.blocks.shape[1]):
             rows = np.arange(n - d)
             if not len(rows):

@@ -15,7 +15,7 @@ from rsgen.console.progress import Progress, no_progress
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.adjustment.graph import Sighting
-from rstrack.adjustment.rigid import Alignment, Usual, align
+from rstrack.adjustment.rigid import Alignment, Judge, align
 from rstrack.alignment.linearise import Terms
 from rstrack.data.rig import Rig
 from rstrack.images.device_frame import DeviceFrame
@@ -75,7 +75,7 @@ class LoopSearch:
     load: Callable[[int], DeviceFrame]
     motion: Spline
     drift: dict[int, FloatArray]
-    usual: Usual
+    judge: Judge
     inflations: tuple[float, float] = (1.0, 1.0)
     poses: Mapping[int, FloatArray] = field(default_factory=dict)
     tried: int = 0
@@ -204,7 +204,7 @@ class LoopSearch:
             self._refuse("a keyframe without depth")
             return None
         result = align(
-            self.terms, self.options, frame, ref, self.motion, start, levels, self.usual, self.inflations
+            self.terms, self.options, frame, ref, self.motion, start, levels, self.judge, self.inflations
         )  # fmt: skip
         if result.fault:
             self._refuse(result.fault)

@@ -19,7 +19,6 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.adjustment.band import Band
 from rstrack.adjustment.graph import Graph, Seen, State
-from rstrack.adjustment.rigid import Usual
 from rstrack.adjustment.unit import Found, Unit, UnitState
 from rstrack.alignment import brightness
 from rstrack.alignment.linearise import Terms
@@ -53,8 +52,17 @@ _STILL = 2e-5
 # Steps of one round beside an IMU, and of control points and keyframes (m, rad) after which no other is worth it.
 _STEPS, _SETTLED = 5, 1e-6
 
+
 # A keyframe that a frame is near, by its number, and the weight of what the frame says against it.
 Near = list[tuple[int, float]]
+
+
+@dataclass(frozen=True)
+class Usual:
+    """Scales of residuals that a track has: of depth at one metre (m), and of intensity; NaN where there is none."""
+
+    depth: float
+    intensity: float
 
 
 @dataclass(frozen=True)
@@ -245,10 +253,10 @@ class _Against:
 
     def seen(self, keyframe: int) -> Seen:
         """All of it."""
-        pull = np.zeros((len(self.band), 6))
+        gradient = np.zeros((len(self.band), 6))
         for first, g in self.models:
-            pull[first - self.band.first :][: len(g)] += g
-        return Seen(keyframe, self.band, pull)
+            gradient[first - self.band.first :][: len(g)] += g
+        return Seen(keyframe, self.band, gradient)
 
 
 def doubted(model: Quadratic, to_world: FloatArray, information: FloatArray) -> Quadratic:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,30 +14,15 @@ from rstrack.alignment import brightness
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.observation import Observation, observe
 from rstrack.alignment.optimizer import Problem, Solved, optimise
-from rstrack.alignment.pull import pulls, rigid_pull
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference
 from rstrack.options import Options
 
-# Part of the keyframe's pixels that each image has to see, and of the compared ones that must not be outliers.
-_LEAST_SHARE, _LEAST_FIT_DEPTH, _LEAST_FIT_COLOR = 0.25, 0.7, 0.8
-# Scales of the residuals beyond so many times the track's own are another place's.
-_WORSE = 2.0
-# Pixels that the last step may move a line by, where noise does not move it further.
-_SETTLED_PX = 0.5
-# Metres, at one metre and growing with the square of the distance, by which depth or colour alone may want to go
-# elsewhere, where that is more than so many σ.
-_TORN, _TORN_SIGMAS = 0.02, 5.0
 _MOST_STEPS = (15, 8, 30)
 
-
-@dataclass(frozen=True)
-class Usual:
-    """Scales of residuals that a track has: of depth at one metre (m), and of intensity; NaN where there is none."""
-
-    depth: float
-    intensity: float
+Judge = Callable[[Sequence[Observation], Solved, SplineState, Reference], tuple[str, FloatArray]]
+"""Why a frame's images have not been found at a keyframe, empty if they have; and what they know of its pose (6, 6)."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +39,7 @@ class Alignment:
 
 def align(
     terms: Terms, options: Options, frame: DeviceFrame, ref: Reference, motion: Spline, T_ref_cam: FloatArray,
-    levels: Sequence[int], usual: Usual, inflations: tuple[float, float] = (1.0, 1.0),
+    levels: Sequence[int], judge: Judge, inflations: tuple[float, float] = (1.0, 1.0),
 ) -> Alignment:  # fmt: skip
     """Align a frame to a rectified keyframe from T_ref_cam (4, 4) on, through the levels of the pyramid.
 
@@ -75,10 +60,8 @@ def align(
     except np.linalg.LinAlgError:
         solved = Solved()
     T = se3.inverse(ref.T_world_base) @ state.spline.pose(mid)
-    if not any(o.is_linearised for o in fresh):
-        return Alignment(T, np.zeros((6, 6)), "no pixel of it falls on the keyframe")
-    fault = _fault(fresh, solved, ref, usual) or _torn(fresh, state, ref)
-    return Alignment(T, pulls(fresh, state).information, fault)
+    fault, information = judge(fresh, solved, state, ref)
+    return Alignment(T, information, fault)
 
 
 def _placed(motion: Spline, frame: DeviceFrame, G: FloatArray) -> SplineState:
@@ -87,28 +70,3 @@ def _placed(motion: Spline, frame: DeviceFrame, G: FloatArray) -> SplineState:
     last = int(motion.locate(frame.last_time)[0]) + 4
     points = se3.orthonormalise(G @ motion.control_points[first - motion.first : last - motion.first])
     return SplineState(Spline(points, motion.t0 + first * motion.dt, motion.dt))
-
-
-def _torn(fresh: Sequence[Observation], state: SplineState, ref: Reference) -> str:
-    """Whether depth alone, or colour alone, would put the frame elsewhere, as one body."""
-    limit = _TORN * max(1.0, ref.median_depth) ** 2
-    for is_depth in (True, False):
-        metres, sigmas = rigid_pull([o for o in fresh if o.is_depth is is_depth], state)
-        if metres > limit and sigmas > _TORN_SIGMAS:
-            return "depth and colour do not agree"
-    return ""
-
-
-def _fault(fresh: Sequence[Observation], solved: Solved, ref: Reference, usual: Usual) -> str:
-    if not (solved.is_within_noise or solved.last_shift <= _SETTLED_PX):
-        return "the alignment does not settle"
-    for o in fresh:
-        name = "depth" if o.is_depth else "colour"
-        if not o.is_linearised or o.pixels < _LEAST_SHARE * ref.pixels:
-            return f"the {name} image sees too little of the keyframe"
-        if o.lin.fit < (_LEAST_FIT_DEPTH if o.is_depth else _LEAST_FIT_COLOR):
-            return f"the {name} image shows something else"
-        known = usual.depth * max(0.5, ref.median_depth) ** 2 if o.is_depth else usual.intensity
-        if o.lin.next_sigma > _WORSE * max(known, 3.0 * o.lin.floor):
-            return f"the {name} image does not fit"
-    return ""

@@ -13,7 +13,6 @@ from rsgen.geometry.spline import Spline
 from rstrack.calibration.pairs.load import through
 from rstrack.data.dataset import Dataset
 from rstrack.options import Method, Options
-from rstrack.tracking.first_look.color_pairs import GeometricTrack, moving_parts
 from rstrack.tracking.first_look.rough_track import rough_track
 
 # How frames are followed. The second is rougher, but takes more: where the readout is far off, what the first makes of
@@ -27,31 +26,15 @@ _GAP = 2.5
 
 @dataclass(frozen=True)
 class Track:
-    """A rough T_world_depth(t), and the times (begin, end) in s within which it was followed.
-
-    is_geometric: by lines' depth alone.
-    """
+    """A rough T_world_depth(t), and the times (begin, end) in s within which it was followed."""
 
     spline: Spline
     valid: tuple[tuple[float, float], ...]
-    is_geometric: bool = False
 
     @property
     def seconds(self) -> float:
         """How much was followed."""
         return sum(end - begin for begin, end in self.valid)
-
-    def by_depth(self, dataset: Dataset, chosen: range) -> list[GeometricTrack]:
-        """The parts of it that move most, each where it was followed; none where colour took part."""
-        if not self.is_geometric:
-            return []
-        found = []
-        for part in moving_parts(dataset, chosen):
-            first, last = dataset.stamps[part[0]], dataset.stamps[part[-1]]
-            begin, end = max(((max(a, first), min(b, last)) for a, b in self.valid), key=lambda span: span[1] - span[0])
-            if begin < end:
-                found.append(GeometricTrack(part, self.spline, float(begin), float(end)))
-        return found
 
     def frames(self, dataset: Dataset, chosen: range) -> list[range]:
         """Frames in a row that are stamped within one of these times, without a gap between them."""
@@ -88,7 +71,7 @@ def first_track(dataset: Dataset, chosen: range, options: Options, progress: Pro
 def _tracked(dataset: Dataset, chosen: range, options: Options, progress: Progress) -> Track | None:
     tracker = rough_track(dataset, chosen, options, lambda done: progress(f"first track ({options.method})", done, ""))
     if tracker.spline is not None and tracker.spline_valid:
-        return Track(tracker.spline, tuple(tracker.spline_valid), options.method == "rs-g")
+        return Track(tracker.spline, tuple(tracker.spline_valid))
     stamps, poses = tracker.trajectory
     if len(stamps) < 2:
         return None

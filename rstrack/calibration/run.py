@@ -43,8 +43,6 @@ from rstrack.calibration.unknowns.parameters import (
 )
 from rstrack.data.dataset import Dataset
 from rstrack.options import Options
-from rstrack.tracking.first_look.color_offset import estimate_color_offset
-from rstrack.tracking.first_look.color_pairs import GeometricTracks
 
 # Frames of a stretch, the fewest that one may have, and how many stretches there are at least and at most.
 _FRAMES, _FEWEST_FRAMES, _FEWEST, _MOST = 30, 14, 3, 12
@@ -93,9 +91,6 @@ def calibrate(
     before = device.known(parameters_of(dataset)) if device else Known.nothing(parameters_of(dataset))
     start = before.values
     track = first_track(dataset, chosen, options, progress)
-    if dataset.timing is not None and dataset.timing.wants_color_offset and "offset" in groups:
-        tracks = track.by_depth(dataset, chosen) or GeometricTracks(dataset, chosen, options, progress)
-        start = replace(start, color_offset_s=estimate_color_offset(dataset, tracks, progress).offset_s)
     parts = _stretches(dataset, chosen, track)
     free = _free(dataset, groups, parts)
     terms = pair_terms(engine(options.backend), dataset, free)
@@ -105,7 +100,6 @@ def calibrate(
         terms = pair_terms(engine(options.backend), dataset, free)
         stretches = [each.read_by(terms) for each in stretches]
     residuals = residuals_at(some_of(stretches), terms, start)
-    before = replace(before, values=start)
     known = before.with_lenses() if "intrinsics" in groups else before
     coarse = solve(stretches, terms, start, free, _COARSE, _watch(progress, 0.15), known)
     solution, drifts = coarse, True

@@ -75,11 +75,11 @@ class Joint:
         z = slice(6 * self.count, None)
         c = slice(0, 6 * self.count)
         off = at - belief.mean
-        pull = self.g[z] + belief.information @ off
-        solved = np.linalg.solve(self.H[z, z] + belief.information, np.column_stack([self.H[z, c], pull]))
+        gradient = self.g[z] + belief.information @ off
+        solved = np.linalg.solve(self.H[z, z] + belief.information, np.column_stack([self.H[z, c], gradient]))
         H = self.H[c, c] - self.H[c, z] @ solved[:, :-1]
         g = self.g[c] - self.H[c, z] @ solved[:, -1]
-        cost = self.cost + 0.5 * float(off @ belief.information @ off) - 0.5 * float(pull @ solved[:, -1])
+        cost = self.cost + 0.5 * float(off @ belief.information @ off) - 0.5 * float(gradient @ solved[:, -1])
         return Quadratic(self.first, 0.5 * (H + H.T), g), cost, at - solved[:, -1]
 
 

@@ -75,12 +75,12 @@ class Smoother:
         z, c = slice(len(self.g) - SIZE, None), slice(0, len(self.g) - SIZE)
         u, size = np.zeros(SIZE), float(np.linalg.norm(self.belief[GRAVITY]))
         u[GRAVITY] = self.belief[GRAVITY] / max(1e-9, size)
-        pull = self.g[z] + u * (size - strength) / STRENGTH**2
+        gradient = self.g[z] + u * (size - strength) / STRENGTH**2
         information = self.H[z, z] + np.outer(u, u) / STRENGTH**2
-        solved = np.linalg.solve(information, np.column_stack([self.H[z, c], pull]))
+        solved = np.linalg.solve(information, np.column_stack([self.H[z, c], gradient]))
         H = self.H[c, c] - self.H[c, z] @ solved[:, :-1]
         g = self.g[c] - self.H[c, z] @ solved[:, -1]
-        return Quadratic(self.first, 0.5 * (H + H.T), g), 0.5 * float(pull @ solved[:, -1])
+        return Quadratic(self.first, 0.5 * (H + H.T), g), 0.5 * float(gradient @ solved[:, -1])
 
     def around(self, belief: FloatArray) -> None:
         """Be around another belief (12,)."""

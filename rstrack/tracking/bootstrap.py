@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from rstrack.alignment.observation import Observation
-from rstrack.alignment.pull import Pulls, pulls
+from rstrack.alignment.score import Scores, scores
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.frame_report import FrameReport
@@ -88,6 +88,7 @@ def bootstrap(track: Track, new: DeviceFrame) -> FrameReport:
         window.active = earlier
     if track.fits.fault(fresh, solved, ref.pixels):
         return _begin_anew(track, new)
+    track.fits.learn(fresh)
     window.keep(fresh)
     recent = track.succession.recent
     recent.append(new)
@@ -180,17 +181,17 @@ def _leave(track: Track, window: Window) -> bool:
         track.succession.recent = deque(cleaned.get(frame.index, frame) for frame in frames)
     seen_of = {frame.index: [o for o in others if o.frame == frame.index] for frame in frames}
     covariances.look_at(ref, window.spline)
-    pulls_of = {index: pulls(seen, window.state) for index, seen in seen_of.items()}
+    scores_of = {index: scores(seen, window.state) for index, seen in seen_of.items()}
     by_depth = [seen for seen in seen_of.values() if seen and all(o.is_depth for o in seen)]
     if any(np.trace(disagreement(seen, window.state)[:3, :3]) > _MOST_APART_M**2 for seen in by_depth):
         return False
-    if not all(_agree(track, seen_of[f.index], pulls_of[f.index], window) for f in rest):
+    if not all(_agree(track, seen_of[f.index], scores_of[f.index], window) for f in rest):
         return False
     window.keep(others)
     for frame in track.succession.recent:
         track.remember(frame)
     for frame in frames:
-        seen, own = seen_of[frame.index], pulls_of[frame.index]
+        seen, own = seen_of[frame.index], scores_of[frame.index]
         track.chain.add(ref, seen, window.state, own.excess)
         track.learn_inertia(seen, window, own.excess, frame.last_time)
         covariances.uncertainty = covariances.uncertainty.found_anew(own.information)
@@ -204,11 +205,11 @@ def _leave(track: Track, window: Window) -> bool:
     return True
 
 
-def _agree(track: Track, seen: Sequence[Observation], pulled: Pulls, window: Window) -> bool:
+def _agree(track: Track, seen: Sequence[Observation], score: Scores, window: Window) -> bool:
     """Whether a frame's pose is known in spite of what its images are apart, beyond what was usual before."""
     covariances, usual = track.covariances, track.covariances.uncertainty.systematic.usual_inflation
     if not covariances.uncertainty.systematic.inflations:
         return True  # a wrong camera file has them apart in every frame, and no frame has told yet
     considered, state = covariances.considered(0.0), window.state
     apart = disagreement(seen, state, considered, usual) - disagreement(seen, state, considered, np.inf)
-    return replace(covariances.uncertainty.found_anew(pulled.information), doubt=apart).is_known
+    return replace(covariances.uncertainty.found_anew(score.information), doubt=apart).is_known

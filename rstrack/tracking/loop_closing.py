@@ -8,7 +8,7 @@ T_world_depth = closing.moves.poses(tracker.spline, stamps, T_world_depth)
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,10 +23,15 @@ from rstrack.adjustment.closing import Closed, closed
 from rstrack.adjustment.graph import Graph, Sighting, State
 from rstrack.adjustment.loops import Loop, LoopSearch
 from rstrack.adjustment.moves import Moves
-from rstrack.adjustment.rigid import Usual
+from rstrack.adjustment.rigid import Judge
+from rstrack.alignment.observation import Observation
+from rstrack.alignment.optimizer import Solved
+from rstrack.alignment.spline_state import SplineState
 from rstrack.data.rig import Frame
 from rstrack.keyframes.archive import Archive
+from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.judgement.systematic import SYSTEMATIC_PX
+from rstrack.tracking.matching import judge_alone
 from rstrack.tracking.spline_tracker import Tracker
 
 # Loops that `info` lists at most.
@@ -112,7 +117,7 @@ def search_of(
     """The search for loops of a track; load: a frame by its number in the track; poses: as in `LoopSearch`."""
     return LoopSearch(
         tracker.terms, tracker.rig, tracker.options, keyframes, lambda k: tracker.upload(k, load(k)), spline,
-        tracker.drift, _usual(tracker, keyframes), tracker.inflations, poses or {},
+        tracker.drift, judge_of(tracker), tracker.inflations, poses or {},
     )  # fmt: skip
 
 
@@ -130,10 +135,14 @@ def graph_of(tracker: Tracker, keyframes: Archive) -> Graph:
     return Graph(State(spline, poses), tracker.seen, ties)
 
 
-def _usual(tracker: Tracker, keyframes: Archive) -> Usual:
-    """The median scales of residuals in a track."""
-    depth = np.median([keyframes.small(k).median_depth for k in keyframes.indices])
-    kept = [report for report in tracker.reports if not report.lost]
-    sigmas = np.array([[report.sigma_depth_m, report.sigma_intensity] for report in kept], dtype=float).reshape(-1, 2)
-    median = [float(np.median(s[np.isfinite(s)])) if np.isfinite(s).any() else float("nan") for s in sigmas.T]
-    return Usual(median[0] / max(0.5, float(depth)) ** 2, median[1])
+def judge_of(tracker: Tracker) -> Judge:
+    """By what the track has learnt of how its images fit, as a frame that is looked for anywhere."""
+    fits, covariances = tracker.fits, tracker.covariances
+
+    def judge(
+        fresh: Sequence[Observation], solved: Solved, state: SplineState, ref: Reference
+    ) -> tuple[str, FloatArray]:  # fmt: skip
+        fault, score, _ = judge_alone(fits, covariances, fresh, solved, state, ref.pixels)
+        return fault.value, score.information
+
+    return judge

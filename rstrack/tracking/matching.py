@@ -8,14 +8,16 @@ from dataclasses import dataclass, replace
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Solved
-from rstrack.alignment.pull import Pulls, pulls
+from rstrack.alignment.score import Scores, scores
+from rstrack.alignment.spline_state import SplineState
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.images.pyramid import DepthImage
 from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.judgement.common import Common
 from rstrack.tracking.judgement.fault import Fault
 from rstrack.tracking.judgement.innovation import Innovation, Prediction, disagreement, doubt, learnt, weighed
-from rstrack.tracking.judgement.lost_track import implausible, is_settled
+from rstrack.tracking.judgement.lost_track import FitHistory, implausible, is_settled
+from rstrack.tracking.judgement.pose_covariances import PoseCovariances
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.moving.leave_out import LeftOut
 from rstrack.tracking.track import Track
@@ -51,10 +53,10 @@ class Match:
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """fault: why a frame has not been found. pulled: by its images; uncertainty, common: of it, if it has been."""
+    """fault: why a frame has not been found. score: by its images; uncertainty, common: of it, if it has been."""
 
     fault: Fault
-    pulled: Pulls
+    score: Scores
     uncertainty: Uncertainty
     common: Common
 
@@ -114,38 +116,58 @@ def judge_predicted(track: Track, found: Match, gap: float, young: bool) -> Verd
             found.again()
     on_reference = found.on_reference
     with track.terms.timer("judgement"):
-        pulled = pulls(on_reference, window.state)
+        score = scores(on_reference, window.state)
         fault = fits.fault(on_reference, found.solved, found.ref.pixels, young)
         if not rolls:
-            uncertainty = uncertainty.after(seconds, pulled.information, *accelerations)
-            common = track.covariances.after(seconds, uncertainty, on_reference, window.state, pulled)
+            uncertainty = uncertainty.after(seconds, score.information, *accelerations)
+            common = track.covariances.after(seconds, uncertainty, on_reference, window.state, score)
         if weighs:
             more = doubt(innovation, on_reference, window.state, predicted, considered)
             uncertainty = replace(uncertainty, doubt=more)
         if weighs and not young:
-            known = learnt(innovation, uncertainty.systematic, uncertainty.calibration, pulled.excess)
+            known = learnt(innovation, uncertainty.systematic, uncertainty.calibration, score.excess)
             uncertainty = replace(uncertainty, systematic=known[0], calibration=known[1])
         if young and not fault:
             usual = uncertainty.systematic.usual_inflation
             more = uncertainty.doubt + disagreement(on_reference, window.state, considered, usual)
             uncertainty = replace(uncertainty, doubt=more)
-    if not fault and implausible(T_predicted, window.spline.pose(mid), gap):
-        fault = Fault.MOTION
-    return Verdict(fault or _unknown(uncertainty), pulled, uncertainty, common)
+    if not fault:
+        fits.learn(on_reference)
+        if implausible(T_predicted, window.spline.pose(mid), gap):
+            fault = Fault.MOTION
+    return Verdict(fault or _unknown(uncertainty), score, uncertainty, common)
 
 
 def judge_unpredicted(track: Track, found: Match) -> Verdict:
-    """Whether a frame was found where nothing led: by all of its images, as one alone is alike in many places."""
-    pulled = pulls(found.fresh, found.window.state)
-    fault = Fault.MISFIT if not found.whole else Fault.NONE
-    fault = fault or track.fits.fault(found.fresh, found.solved, found.ref.pixels, new=True)
-    uncertainty = track.covariances.uncertainty.found_anew(pulled.information)
+    """Whether a frame was found where nothing led."""
+    covariances, state = track.covariances, found.window.state
+    fault, score, uncertainty = judge_alone(
+        track.fits, covariances, found.fresh, found.solved, state, found.ref.pixels
+    )  # fmt: skip
+    if not found.whole:
+        fault = Fault.MISFIT
     if not fault:
-        considered, usual = track.covariances.considered(0.0), uncertainty.systematic.usual_inflation
-        more = disagreement(found.fresh, found.window.state, considered, usual)
-        uncertainty = replace(uncertainty, doubt=more)
-    common = track.covariances.after(0.0, uncertainty, found.fresh, found.window.state, pulled)
-    return Verdict(fault or _unknown(uncertainty), pulled, uncertainty, common)
+        track.fits.learn(found.fresh)
+    common = covariances.after(0.0, uncertainty, found.fresh, state, score)
+    return Verdict(fault, score, uncertainty, common)
+
+
+def judge_alone(
+    fits: FitHistory, covariances: PoseCovariances, fresh: Sequence[Observation], solved: Solved, state: SplineState,
+    expected: int,
+) -> tuple[Fault, Scores, Uncertainty]:  # fmt: skip
+    """Whether a frame was found, by its images alone: by all of them, as one is alike in many places.
+
+    expected: pixels that a whole image puts on the keyframe.
+    """
+    score = scores(fresh, state)
+    uncertainty = covariances.uncertainty.found_anew(score.information)
+    fault = fits.fault(fresh, solved, expected, new=True)
+    if not fault:
+        usual = uncertainty.systematic.usual_inflation
+        apart = disagreement(fresh, state, covariances.considered(0.0), usual)
+        uncertainty = replace(uncertainty, doubt=apart)
+    return fault or _unknown(uncertainty), score, uncertainty
 
 
 def without_misfits(track: Track, fresh: list[Observation], ref: Reference) -> list[Observation]:

@@ -31,6 +31,8 @@ from rstrack.tracking.bootstrap import bootstrap, fit_knots, start
 from rstrack.tracking.bridging import Bridge
 from rstrack.tracking.frame_report import FrameReport
 from rstrack.tracking.judgement.fault import Fault
+from rstrack.tracking.judgement.lost_track import FitHistory
+from rstrack.tracking.judgement.pose_covariances import PoseCovariances
 from rstrack.tracking.matching import Match, Verdict, judge_predicted, match
 from rstrack.tracking.relocalise import Relocaliser
 from rstrack.tracking.track import Track
@@ -161,6 +163,16 @@ class Tracker:
         return self._track.covariances.uncertainty.drift
 
     @property
+    def fits(self) -> FitHistory:
+        """How well its images fit."""
+        return self._track.fits
+
+    @property
+    def covariances(self) -> PoseCovariances:
+        """How far off its poses may be."""
+        return self._track.covariances
+
+    @property
     def inflations(self) -> tuple[float, float]:
         """By how much the covariances that depth's pixels give are too small, and colour's."""
         depth, color = self._track.independence
@@ -267,7 +279,7 @@ class Tracker:
         new = replace(found.frame, depth=found.left.depth)
         self._bridge.close(track)
         self._take(new, found, verdict)
-        track.learn(found.ref, on_reference, window, verdict.pulled, new.last_time)
+        track.learn(found.ref, on_reference, window, verdict.score, new.last_time)
         track.succession.recent.append(new)
         track.placed(new, found.fresh)
         track.age += 1
@@ -296,7 +308,7 @@ class Tracker:
         new = replace(new, depth=found.left.depth)
         self._take(new, found, verdict)
         track.chain.cut(found.window.piece)
-        excess = verdict.pulled.excess
+        excess = verdict.score.excess
         track.chain.add(found.ref, found.fresh, found.window.state, excess)
         track.succession.use(found.ref, new)
         self._relocaliser.forget()

@@ -16,7 +16,7 @@ from rstrack.alignment.linearise import Terms
 from rstrack.alignment.observation import Observation, observe
 from rstrack.alignment.optimizer import Solved
 from rstrack.alignment.priors import ACCELERATION
-from rstrack.alignment.pull import Pulls
+from rstrack.alignment.score import Scores
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.moving_masks import MovingMasks
@@ -138,14 +138,14 @@ class Track:
         return observations
 
     def learn(
-        self, ref: Reference, on_reference: Sequence[Observation], window: Window, pulled: Pulls, end: float
+        self, ref: Reference, on_reference: Sequence[Observation], window: Window, score: Scores, end: float
     ) -> None:  # fmt: skip
         """What a frame that was found, and ends at time `end` (s), says of the spline and of its pixels.
 
         on_reference: its observations of `ref`.
         """
-        self.chain.add(ref, on_reference, window.state, pulled.excess)
-        self.learn_inertia(on_reference, window, pulled.excess, end)
+        self.chain.add(ref, on_reference, window.state, score.excess)
+        self.learn_inertia(on_reference, window, score.excess, end)
         for is_color, term in enumerate(self.independence):
             term.learn(o.inflation for o in on_reference if o.is_depth != is_color)
 
@@ -169,7 +169,7 @@ class Track:
             self.left_out.put(frame.index, frame.depth.left_out, frame.depth.left_out_stride)
 
     def learn_inertia(self, fresh: Sequence[Observation], window: Window, excess: float, end: float) -> None:
-        """What a frame that ends at time `end` (s) says of an IMU's biases and of gravity. excess: see `Pulls`."""
+        """What a frame that ends at time `end` (s) says of an IMU's biases and of gravity. excess: see `Scores`."""
         if self.inertia is not None:
             self._shift_inertia(fresh)
             models = [o.model(window.state).scaled(1.0 / (ALIKE * excess**2)) for o in fresh if o.is_linearised]

@@ -95,8 +95,8 @@ def test_steps_end_where_least_squares_do() -> None:
         T_ref_cam = se3.inverse(at.keyframes[k]) @ spline.pose(mid + after) @ se3.exp(off)
         sightings.append(Sighting(k, mid + after, T_ref_cam, 1e6 * A @ A.T))
     # One keyframe's frames were not where they wanted to be when their models were made.
-    pulls = {4: 1e3 * rng.normal(size=(5, 6)), 9: np.zeros((6, 6))}
-    seen = [Seen(4, summed([models[4]]), pulls[4]), Seen(9, summed([models[9]]))]
+    gradients = {4: 1e3 * rng.normal(size=(5, 6)), 9: np.zeros((6, 6))}
+    seen = [Seen(4, summed([models[4]]), gradients[4]), Seen(9, summed([models[9]]))]
     graph = Graph(at, seen, sightings)
 
     def residuals(x: FloatArray) -> FloatArray:
@@ -108,7 +108,7 @@ def test_steps_end_where_least_squares_do() -> None:
             E = state.keyframes[k] @ se3.inverse(at.keyframes[k])
             own = se3.log(se3.inverse(E) @ D).ravel()
             root = np.linalg.cholesky(m.H)
-            out.append(root.T @ own + np.linalg.solve(root, pulls[k].ravel()))
+            out.append(root.T @ own + np.linalg.solve(root, gradients[k].ravel()))
         for s in sightings:
             T = se3.inverse(state.keyframes[s.keyframe]) @ state.spline.pose(s.t)
             out.append(np.linalg.cholesky(s.information).T @ se3.log(se3.inverse(s.T_ref_cam) @ T))

@@ -75,10 +75,10 @@ def summed(unit: Unit, spline: Spline, told: UnitState) -> tuple[FloatArray, Flo
     H, g = np.zeros((size, 6, size, 6)), np.zeros((size, 6))
     parts: list[Sums] = list(unit.said(spline, told))
     for sums in parts:
-        for numbers, block, pull in zip(sums.numbers, sums.H, sums.g, strict=True):
+        for numbers, block, gradient in zip(sums.numbers, sums.H, sums.g, strict=True):
             k = len(numbers)
             for a in range(k):
-                g[numbers[a]] += pull.reshape(k, 6)[a]
+                g[numbers[a]] += gradient.reshape(k, 6)[a]
                 for b in range(k):
                     H[numbers[a], :, numbers[b]] += block.reshape(k, 6, k, 6)[a, :, b]
     return H.reshape(6 * size, -1), g.ravel()

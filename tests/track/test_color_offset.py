@@ -16,7 +16,6 @@ from rsgen.console.progress import no_progress
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.format import StreamName
-from rstrack.calibration.first_track import Track
 from rstrack.data.clocks.timing import Timing, stream_timing
 from rstrack.data.dataset import Dataset, group_colors, open_dataset
 from rstrack.data.estimate import read_estimate
@@ -196,16 +195,6 @@ def test_the_part_whose_pairs_differ_least_tells(shaken: Dataset, monkeypatch: p
     monkeypatch.setattr(color_offset, "_estimate", lambda *_: next(by_part))
     assert estimate_color_offset(shaken, 4 * along(shaken.truth)) == ColorOffset(0.01, 1e-3, 9)
     assert next(by_part, None) is None, "the fourth part is not asked"
-
-
-def test_a_track_of_the_whole_recording_is_looked_along_where_it_was_followed(shaken: Dataset) -> None:
-    assert shaken.truth is not None
-    begin, end = float(shaken.stamps[3]), float(shaken.stamps[20])
-    followed = Track(shaken.truth, ((0.0, 0.01), (begin, end)), is_geometric=True)
-    (seen,) = followed.by_depth(shaken, range(len(shaken)))
-    assert (seen.frames, seen.spline, seen.begin, seen.end) == (range(len(shaken)), shaken.truth, begin, end)
-    assert followed.by_depth(shaken, range(21, 30)) == []
-    assert replace(followed, is_geometric=False).by_depth(shaken, range(30)) == [], "colours agree with any clock"
 
 
 def test_stamps_of_a_sequence_are_no_guess(shaken: Dataset) -> None:

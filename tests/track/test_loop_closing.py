@@ -14,7 +14,7 @@ from loop_room import FRAMES, NOISE, OPTIONS
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.adjustment.rigid import Usual, align
+from rstrack.adjustment.rigid import align
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import read_estimate
 from rstrack.data.rig import Frame
@@ -22,7 +22,7 @@ from rstrack.options import Options
 from rstrack.report.build import write_report
 from rstrack.tracking import loop_closing
 from rstrack.tracking.any_tracker import make_tracker
-from rstrack.tracking.loop_closing import close_loops
+from rstrack.tracking.loop_closing import close_loops, judge_of
 from rstrack.tracking.runs.run import track
 from rstrack.tracking.spline_tracker import Tracker
 
@@ -119,7 +119,7 @@ def test_a_frame_is_aligned_to_a_keyframe_of_another_time(dataset: Dataset, trac
     T_true = se3.inverse(truth.pose(early.t)) @ truth.pose(mid)
     start = T_true @ se3.exp(np.array([0.015, -0.01, 0.01, 0.01, -0.01, 0.01]))
     found = align(
-        tracker.terms, tracker.options, frame, early, tracker.spline, start, (2, 1, 0), Usual(2e-3, 0.01)
+        tracker.terms, tracker.options, frame, early, tracker.spline, start, (2, 1, 0), judge_of(tracker)
     )  # fmt: skip
     assert found.fault == ""
     off = np.abs(se3.log(se3.inverse(T_true) @ found.T_ref_cam))
@@ -129,7 +129,7 @@ def test_a_frame_is_aligned_to_a_keyframe_of_another_time(dataset: Dataset, trac
     # Another place is none.
     elsewhere = align(
         tracker.terms, tracker.options, frame, early, tracker.spline,
-        T_true @ se3.exp(np.array([0.6, 0.0, 0.0, 0.0, 0.5, 0.0])), (1, 0), Usual(2e-3, 0.01),
+        T_true @ se3.exp(np.array([0.6, 0.0, 0.0, 0.0, 0.5, 0.0])), (1, 0), judge_of(tracker),
     )  # fmt: skip
     assert elsewhere.fault
 

@@ -12,7 +12,7 @@ from rstrack_util import hand_held
 
 from rsgen.geometry import se3
 from rstrack.alignment.optimizer import Solved
-from rstrack.alignment.pull import Pulls
+from rstrack.alignment.score import Scores
 from rstrack.images.pyramid import DepthImage
 from rstrack.tracking import matching
 from rstrack.tracking.judgement.fault import Fault
@@ -50,7 +50,7 @@ def test_what_fits_and_what_stands_alone_stays() -> None:
 
 def test_a_place_is_found_by_all_of_a_frame_s_images_only(monkeypatch: pytest.MonkeyPatch) -> None:
     """Depth alone fits many places: an iPhone's was found 1.5 m and 180 degrees off, shaken ones up to 58 mm."""
-    monkeypatch.setattr(matching, "pulls", lambda *_: Pulls((1.0,) * 3, 1e8 * np.eye(6)))
+    monkeypatch.setattr(matching, "scores", lambda *_: Scores((1.0,) * 3, 1e8 * np.eye(6)))
     monkeypatch.setattr(matching, "disagreement", lambda *_: np.zeros((12, 12)))
     covariances = SimpleNamespace(uncertainty=Uncertainty(), after=lambda *_: None, considered=lambda _: None)
     track: Any = SimpleNamespace(fits=FitHistory(), covariances=covariances)

@@ -145,7 +145,7 @@ def tracked_poses(
 def known(
     unit: Unit, slow: FloatArray, slow_times: FloatArray, sizes: Sizes, noise: ImuNoise
 ) -> tuple[FloatArray, FloatArray]:
-    """Information (q, q) and its pull (q,) on unit and drift: priors, walks of biases, steps of the drift."""
+    """Information (q, q) and its gradient (q,) on unit and drift: priors, walks of biases, steps of the drift."""
     size, q = unit_size(unit), unit_size(unit) + slow.size
     D, b = np.zeros((q, q)), np.zeros(q)
     D[np.arange(COUNT), np.arange(COUNT)] = PRIOR**-2.0

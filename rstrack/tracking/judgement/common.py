@@ -14,7 +14,7 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rstrack.alignment.observation import Observation
-from rstrack.alignment.pull import steady
+from rstrack.alignment.score import steady
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.calibration_sigma import NAMES
 from rstrack.tracking.judgement.consider import Calibration
@@ -55,10 +55,13 @@ class Common:
         """How the calibration would have an image move its lines (count, m), see `Calibration.moved`."""
         return calibration.moved(o, state, self.velocities.get(o.ref.index, np.zeros(6)), count)
 
-    def pulled(
+    def cross_information(
         self, calibration: Calibration, fresh: Sequence[Observation], state: SplineState, at: FloatArray, excess: float
     ) -> FloatArray:  # fmt: skip
-        """What errors pull a frame by at `at`, T_world_depth (4, 4), see `after`; excess: see `Pulls`."""
+        """Information (6, m) that a frame at `at`, T_world_depth (4, 4), has of its pose and the parameters together.
+
+        excess: see `Scores`.
+        """
         total = _nothing()
         turn = np.kron(np.eye(2), at[:3, :3])
         for o in fresh:
@@ -69,14 +72,14 @@ class Common:
         return total / excess**2
 
     def after(
-        self, seconds: float, T_world_depth: FloatArray, P: FloatArray, seen: FloatArray, pulled: FloatArray
+        self, seconds: float, T_world_depth: FloatArray, P: FloatArray, seen: FloatArray, cross: FloatArray
     ) -> Common:  # fmt: skip
         """With a frame that was found at T_world_depth (4, 4); its covariance (12, 12) is then P.
 
-        seen (6, 6): the information of its images; pulled (6, m): what an error of each parameter pulls it by.
+        seen (6, 6): the information of its images; cross (6, m): see `cross_information`.
         """
         now = self.predicted(seconds, T_world_depth)
-        now = now + P[:, :6] @ (pulled - seen @ now[:6])
+        now = now + P[:, :6] @ (cross - seen @ now[:6])
         return replace(self, pose=se3.adjoint(T_world_depth) @ now[:6], velocity=now[6:])
 
 

@@ -124,7 +124,7 @@ class Calibration:
     def moved(self, o: Observation, state: SplineState, velocity: FloatArray, count: int = 6) -> FloatArray:
         """How one σ of each parameter would have an image move its lines (count, 21), against a rectified keyframe.
 
-        velocity (6,): at which that was taken. count: 6 for all lines alike, 12 as of `pull.steady`.
+        velocity (6,): at which that was taken. count: 6 for all lines alike, 12 as of `score.steady`.
         """
         return self._twists(o, state, velocity, count)[:, :COUNT] * self.sigmas
 

@@ -24,7 +24,7 @@ from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.observation import Observation
-from rstrack.alignment.pull import steady
+from rstrack.alignment.score import steady
 from rstrack.alignment.spline_state import SplineState
 from rstrack.tracking.judgement.calibration_errors import CalibrationErrors
 from rstrack.tracking.judgement.common import Considered
@@ -33,8 +33,6 @@ from rstrack.tracking.judgement.uncertainty import Uncertainty
 
 # What an innovation of 12 numbers, over its covariance, exceeds by chance once in a thousand times.
 _LIMIT = float(chdtri(12, 1e-3))
-# σ of colour's clock, s, and of readouts, as a part of them, where they are told and not calibrated.
-_CLOCK_S, _READOUT = 3e-3, 0.13
 # σ of what an image alone leaves open, m and rad.
 _OPEN = np.tile([0.05, 0.05, 0.05, *np.radians([3.0, 3.0, 3.0])], 2)
 
@@ -106,7 +104,7 @@ def weighed(
 
     fresh: a frame's observations, aligned, of a spline in this state. Of two that disagree it is the one that is
     further from the prediction: it is held against the prediction and the others. Then all of them together are held
-    against the prediction. considered: how far the calibration may be wrong; None: times alone, a little.
+    against the prediction. considered: how far the calibration may be wrong.
     """
     seen = [_measured(o, state, predicted, considered) for o in fresh if o.is_linearised]
     if not seen:
@@ -160,7 +158,7 @@ def disagreement(
 ) -> FloatArray:  # fmt: skip
     """Covariance (12, 12) that a pose has beyond the filter's which nothing predicts, of the line that is furthest off.
 
-    Its images all pull it somewhere else, beyond noise, where the spline cannot follow. And where they disagree by more
+    All of its images have a gradient beyond noise where the spline cannot follow. And where they disagree by more
     than they, the calibration and what is usual explain, either of them may be right: each counts as if it were.
     usual: see `Systematic.usual_inflation`; a wrong camera file makes all frames' images disagree.
     """
@@ -191,7 +189,7 @@ def learnt(
 ) -> tuple[Systematic, CalibrationErrors]:  # fmt: skip
     """With what a frame's depth and colour, which are apart, say of both: of the first only where nothing is odd.
 
-    excess: see `Pulls`.
+    excess: see `Scores`.
     """
     known = known.with_inflation(innovation.own)
     depth, color = (
@@ -272,9 +270,4 @@ def _measured(
     R = R / np.outer(by, by)
     off = se3.log(se3.inverse(predicted.pose(mid)) @ pose)
     deviation = np.concatenate([off, velocity - predicted.velocity])
-    # What the cameras' times may be wrong by moves all of an image alike, as far as the camera moves meanwhile.
-    if considered is None:
-        if not o.is_depth:
-            R[:6, :6] += _CLOCK_S**2 * np.outer(velocity, velocity)
-        R[6:, 6:] += _READOUT**2 * np.outer(velocity, velocity)
     return _Measured(o, deviation, deviation + moved, 0.5 * (R + R.T), D)

@@ -60,7 +60,7 @@ class FitHistory:
         return [(o, why) for o in fresh if (why := self._misfit(o, expected))]
 
     def fault(self, fresh: Sequence[Observation], solved: Solved, expected: int, new: bool = False) -> Fault:
-        """Why a frame has not been found, `Fault.NONE` if it has: then it is learnt from.
+        """Why a frame has not been found, `Fault.NONE` if it has.
 
         expected: as in `misfits`. new: whether its piece has just begun.
         """
@@ -73,12 +73,15 @@ class FitHistory:
             return misfits[0][1]
         if new and any(o.lin.next_sigma > self._usual(o) for o in fresh):
             return Fault.MISFIT
+        return Fault.NONE
+
+    def learn(self, fresh: Sequence[Observation]) -> None:
+        """A frame has been found."""
         for o in fresh:
             if o.is_depth:
                 self._depth.append(o.lin.next_sigma / o.ref.median_depth**2)
             else:
                 self._color.append(o.lin.next_sigma)
-        return Fault.NONE
 
     def is_hopeless(self, fresh: Sequence[Observation], moving: float = 0.0) -> bool:
         """Whether no term of a frame, aligned at a coarse level, fits so far that it could at a finer one.

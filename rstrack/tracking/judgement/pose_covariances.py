@@ -11,7 +11,7 @@ from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.observation import Observation
-from rstrack.alignment.pull import Pulls
+from rstrack.alignment.score import Scores
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference
@@ -64,15 +64,15 @@ class PoseCovariances:
         return Considered(self.calibration, self.common, seconds, self.color_late[0])
 
     def after(
-        self, seconds: float, uncertainty: Uncertainty, fresh: Sequence[Observation], state: SplineState, pulled: Pulls
+        self, seconds: float, uncertainty: Uncertainty, fresh: Sequence[Observation], state: SplineState, score: Scores
     ) -> Common:  # fmt: skip
-        """`common` so many seconds later (0: found anew), of a frame then so uncertain; pulled: by its images."""
+        """`common` so many seconds later (0: found anew), of a frame then so uncertain; score: by its images."""
         if self.calibration.is_exact or not fresh:
             return self.common
         at = state.spline.pose(fresh[0].image.exposure.mid_time)
-        own = self.common.pulled(self.calibration, fresh, state, at, pulled.excess)
+        own = self.common.cross_information(self.calibration, fresh, state, at, score.excess)
         before = self.common if seconds else self.common.at_rest()
-        return before.after(seconds, at, uncertainty.state, pulled.information, own)
+        return before.after(seconds, at, uncertainty.state, score.information, own)
 
     def add(self, frame: DeviceFrame, ref: Reference, spline: Spline, oldest: int = 0) -> None:
         """A frame that has been found against a keyframe; what is before frame `oldest` is forgotten."""

@@ -21,7 +21,6 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
-from rstrack.adjustment.rigid import Usual
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import INFO, Estimate, write_estimate
 from rstrack.data.noise import with_noise
@@ -37,7 +36,7 @@ from rstrack.options import Options
 from rstrack.tracking.runs.record import Noise
 
 if TYPE_CHECKING:
-    from rstrack.adjustment.refine import Refiner, Round
+    from rstrack.adjustment.refine import Refiner, Round, Usual
     from rstrack.adjustment.unit import Unit
     from rstrack.images.device_frame import DeviceFrame
 
@@ -275,6 +274,8 @@ def _is_covered(estimate: Estimate, stamp: float, span_s: float) -> bool:
 
 def _usual(info: dict[str, Any]) -> Usual:
     """Scales of residuals as the run had them, of depth as if it were at one metre."""
+    from rstrack.adjustment.refine import Usual
+
     frames = [f for f in info.get("frames", ()) if isinstance(f, dict)]
     of = {
         name: [f[name] for f in frames if isinstance(f.get(name), float)]

@@ -12,7 +12,7 @@ from rstrack_util import hand_held
 
 from rsgen.geometry import se3
 from rstrack.alignment.observation import Observation
-from rstrack.alignment.pull import Pulls, pulls
+from rstrack.alignment.score import Scores, scores
 from rstrack.alignment.spline_state import SplineState
 
 TRUTH = hand_held(3)
@@ -50,28 +50,30 @@ def sight(
 def test_lines_that_are_exposed_at_once_have_no_first_and_last() -> None:
     one = sight((3e-3, 0, 0), growing=True)
     one.image.exposure = SimpleNamespace(first_time=MID, mid_time=MID, last_time=MID)
-    assert pulls([one], SplineState(TRUTH)).sigmas[0] < 0.1 < pulls([sight((3e-3, 0, 0))], SplineState(TRUTH)).sigmas[0]
+    assert (
+        scores([one], SplineState(TRUTH)).sigmas[0] < 0.1 < scores([sight((3e-3, 0, 0))], SplineState(TRUTH)).sigmas[0]
+    )
 
 
 def test_images_that_disagree_balance_each_other_but_pull_alone() -> None:
-    found = pulls([sight((2e-3, 0, 0), kind=OfDepth), sight((-2e-3, 0, 0))], SplineState(TRUTH))
+    found = scores([sight((2e-3, 0, 0), kind=OfDepth), sight((-2e-3, 0, 0))], SplineState(TRUTH))
     assert found.sigmas[0] < 0.1 < 5.0 < min(found.sigmas[1:])
 
 
 def test_what_is_hardly_seen_hardly_pulls_and_what_was_not_seen_at_all() -> None:
-    assert pulls([sight((2e-3, 0, 0), weight=0.1)], SplineState(TRUTH)).sigmas[0] < 0.01
-    none = pulls([sighting(TIMES, TRUTH.pose(TIMES))], SplineState(TRUTH))
+    assert scores([sight((2e-3, 0, 0), weight=0.1)], SplineState(TRUTH)).sigmas[0] < 0.01
+    none = scores([sighting(TIMES, TRUTH.pose(TIMES))], SplineState(TRUTH))
     assert np.isnan(none.sigmas).all()
 
 
 def test_they_are_those_of_the_state_not_of_the_linearisation() -> None:
     state, one = SplineState(TRUTH), sight((2e-3, 0, 0))
     state.apply(0, np.tile([2e-3, 0.0, 0.0, 0.0, 0.0, 0.0], (len(state.points), 1)))
-    assert pulls([one], state).sigmas[0] < 0.1
+    assert scores([one], state).sigmas[0] < 0.1
 
 
 def test_pulls_are_counted_in_sigmas_of_what_the_images_tell() -> None:
-    found = pulls([sight((3e-3, 0, 0), kind=OfDepth), sight((-2e-3, 0, 0))], SplineState(TRUTH))
+    found = scores([sight((3e-3, 0, 0), kind=OfDepth), sight((-2e-3, 0, 0))], SplineState(TRUTH))
     one = 1e-3 / np.sqrt(len(TIMES))  # σ of nine lines, each known to 1 m and counted a million times
     np.testing.assert_allclose(found.sigmas, [0.5e-3 / one * np.sqrt(2), 3e-3 / one, 2e-3 / one], rtol=0.01)
 
@@ -79,20 +81,20 @@ def test_pulls_are_counted_in_sigmas_of_what_the_images_tell() -> None:
 def test_what_images_tell_of_the_pose_is_what_all_their_lines_do() -> None:
     # Every line's twist in the world is known to 1 m and 1 rad; an increment of the pose at mid readout moves them all.
     Ad = se3.adjoint(TRUTH.pose(MID))
-    found = pulls([sight()], SplineState(TRUTH))
+    found = scores([sight()], SplineState(TRUTH))
     H = 1e6 * len(TIMES) * Ad.T @ Ad
-    np.testing.assert_allclose(found.told, H, rtol=1e-3, atol=1e-6 * H.max())
-    assert (found.information == found.told).all()
+    np.testing.assert_allclose(found.formal, H, rtol=1e-3, atol=1e-6 * H.max())
+    assert (found.information == found.formal).all()
 
 
 def test_images_that_pull_further_than_noise_tell_less() -> None:
-    found = pulls([sight((3e-3, 0, 0), weight=1e8)], SplineState(TRUTH))
+    found = scores([sight((3e-3, 0, 0), weight=1e8)], SplineState(TRUTH))
     assert found.excess > 5.0
-    np.testing.assert_allclose(found.information * found.excess**2, found.told)
+    np.testing.assert_allclose(found.information * found.excess**2, found.formal)
 
 
 def test_sigmas_are_too_small_by_as_much_as_images_pull_further_than_noise() -> None:
     nan = float("nan")
     # Twelve numbers: χ² is about that.
-    assert Pulls((3.0, 2.0, nan)).excess == Pulls().excess == 1.0
-    assert Pulls((1.0, 12.0, 5.0)).excess == pytest.approx(12.0 / np.sqrt(12.0))
+    assert Scores((3.0, 2.0, nan)).excess == Scores().excess == 1.0
+    assert Scores((1.0, 12.0, 5.0)).excess == pytest.approx(12.0 / np.sqrt(12.0))
