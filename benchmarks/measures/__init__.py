@@ -10,5 +10,6 @@ MEASURES: dict[str, str] = {
     "light": "benchmarks.measures.light:light_cell",
     "long": "benchmarks.measures.long:long_cell",
     "loops": "benchmarks.measures.loops:loops_cell",
+    "refined": "benchmarks.measures.refined:refined_cell",
     "render": "benchmarks.measures.render:render_cell",
 }
