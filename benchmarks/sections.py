@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from importlib import import_module
+from statistics import geometric_mean
 
 from benchmarks.beaten import beaten, beaten_table, peer_of, sentences
 from benchmarks.cliff import FAMILY
@@ -40,6 +41,7 @@ from rstrack.bench.tables.shown import (
 
 PAPERS_GROUPS = ("hand-held", "living room")
 _IMU = ("rs-pgi", "rs-gi")
+_REFINED = {"ATE": "ate_mm_ratio", "drift": "drift_mm_s_ratio"}
 _ERRORS = ("ATE, mm", "mm/s", "deg/s")
 _COLUMNS: dict[str, tuple[str, ...]] = {
     "speed": ("median_ms", "p95_ms", "p99_ms", "ratio", "ratio_p95", "ratio_p99", "peer_ms", "read_ms", "lost"),
@@ -113,10 +115,10 @@ def loops(full: Records) -> list[str]:
     shown = [record for record in tracks if record.method in {*closing, *closing.values()}]
     lines = _beside("Loops closed, and not", shown, lambda record: record.method in closing)
     found = of_measure(full, "loops")
-    if not found:
-        return lines
-    table = measured_table(found, _COLUMNS["loops"]).markdown()
-    return [*lines, "Loops against the truth, and places that look alike:", "", table, ""]
+    if found:
+        table = measured_table(found, _COLUMNS["loops"]).markdown()
+        lines += ["Loops against the truth, and places that look alike:", "", table, ""]
+    return [*lines, *_refined(of_measure(full, "refined"))]
 
 
 def faults(full: Records) -> list[str]:
@@ -222,6 +224,20 @@ def _averages(records: Sequence[Record], shown: Sequence[str]) -> Table:
         return Entry(told.get(column, NOTHING if average.silent is None else str(average.silent)))
 
     return pivot("method", shown, (*_ERRORS, "the paper", "lost", "silent", "NEES/6", "in 90 %"), entry, value)
+
+
+def _refined(records: Sequence[Record]) -> list[str]:
+    """What refining runs came to, in a sentence."""
+    changed = [record for record in records if not record.figures.get("given_back")]
+    ratios = {what: [r.figures[name] for r in changed if name in r.figures] for what, name in _REFINED.items()}
+    told = [
+        f"{what} × {min(of):.2f} to {max(of):.2f}, {geometric_mean(of):.2f} in the mean"
+        for what, of in ratios.items()
+        if of
+    ]
+    given_back = len(records) - len(changed)
+    text = f"`rstrack refine` of {len(records)} runs: {'; '.join(told)}; {given_back} were given back as they were."
+    return [text, ""] if told else []
 
 
 def _beside(title: str, tracks: Sequence[Record], chosen: Callable[[Record], bool]) -> list[str]:

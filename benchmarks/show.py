@@ -43,8 +43,8 @@ _PAPERS = (
     "The paper's figures are of its own recordings and renderings of such motions: compare the orders, not the digits."
 )
 _WORDS = f"""\
-ATE and drift over a second are RMSE, means over seeds; counts are sums. † frames were lost; silent: frames given, not
-lost, though 20 mm or 2° off. NEES/6 is 1 where errors are as large as the covariances say, and 90 % should lie in 90 %.
+ATE and drift over a second are RMSE, means over seeds; counts are sums. † frames were lost; silent: frames given, not \
+lost, though 20 mm or 2° off. NEES/6 is 1 where errors are as large as covariances say, and 90 % should lie in 90 %. \
 {_PAPERS}"""
 _WHAT = {
     "rs-pg": "rolling shutter, depth and colour",

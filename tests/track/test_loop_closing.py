@@ -134,6 +134,20 @@ def test_a_frame_is_aligned_to_a_keyframe_of_another_time(dataset: Dataset, trac
     assert elsewhere.fault
 
 
+def test_a_frame_whose_depth_and_colour_are_of_two_places_is_found_at_none(dataset: Dataset, tracker: Tracker) -> None:
+    assert dataset.truth is not None and tracker.spline is not None
+    keyframes = tracker.all_keyframes()
+    early = keyframes.get(min(keyframes.indices))
+    own, other = dataset.frame(FRAMES - 3), dataset.frame(FRAMES - 8)
+    colors = tuple(replace(a, pixels=b.pixels) for a, b in zip(own.colors, other.colors, strict=True))
+    frame = tracker.upload(FRAMES - 3, replace(own, colors=colors))
+    T_true = se3.inverse(dataset.truth.pose(early.t)) @ dataset.truth.pose(frame.depth.exposure.mid_time)
+    given = tracker.terms, tracker.options, frame, early, tracker.spline, T_true, (1, 0)
+    assert align(*given, judge_of(tracker)).fault
+    frame = tracker.upload(FRAMES - 3, own)
+    assert not align(*given[:2], frame, *given[3:], judge_of(tracker)).fault
+
+
 def test_what_shows_another_place_closes_no_loop(dataset: Dataset, tracker: Tracker) -> None:
     """Frames of other moments stand in for the keyframes': they fit, but elsewhere, and the two ways contradict."""
     honest = close_loops(tracker, dataset.frame)
