@@ -117,7 +117,7 @@ def search_of(
     """The search for loops of a track; load: a frame by its number in the track; poses: as in `LoopSearch`."""
     return LoopSearch(
         tracker.terms, tracker.rig, tracker.options, keyframes, lambda k: tracker.upload(k, load(k)), spline,
-        tracker.drift, judge_of(tracker), tracker.inflations, poses or {},
+        tracker.covariances.uncertainty.drift, judge_of(tracker), tracker.inflations, poses or {},
     )  # fmt: skip
 
 

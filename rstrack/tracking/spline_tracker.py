@@ -158,11 +158,6 @@ class Tracker:
         return self._track.inertia
 
     @property
-    def drift(self) -> dict[int, FloatArray]:
-        """Covariances of the keyframes' poses, see `Uncertainty`."""
-        return self._track.covariances.uncertainty.drift
-
-    @property
     def fits(self) -> FitHistory:
         """How well its images fit."""
         return self._track.fits
@@ -177,11 +172,6 @@ class Tracker:
         """By how much the covariances that depth's pixels give are too small, and colour's."""
         depth, color = self._track.independence
         return depth.inflation, color.inflation
-
-    @property
-    def color_late(self) -> tuple[float, float]:
-        """See `PoseCovariances`."""
-        return self._track.covariances.color_late
 
     @property
     def terms(self) -> Terms:

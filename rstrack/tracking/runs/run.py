@@ -135,8 +135,8 @@ def track(
     online = Estimate(*found.trajectory, found.spline, info)
     estimate = online if closing is None else _corrected(online, closing)
     unit = ""
-    if isinstance(found, Tracker) and found.color_late[1] > 0.0:
-        info["color_late"] = dict(zip(("seconds", "sigma_s"), found.color_late, strict=True))
+    if isinstance(found, Tracker) and (late := found.covariances.color_late)[1] > 0.0:
+        info["color_late"] = dict(zip(("seconds", "sigma_s"), late, strict=True))
     if isinstance(found, Tracker) and found.inertia is not None:
         info["imu"] = imu_record.record(found.inertia)
         unit = imu_record.text(info["imu"], dataset.stamps[chosen[0]], sum(r.bridged for r in tracker.reports))
