@@ -230,14 +230,14 @@ def _refined(records: Sequence[Record]) -> list[str]:
     """What refining runs came to, in a sentence."""
     changed = [record for record in records if not record.figures.get("given_back")]
     ratios = {what: [r.figures[name] for r in changed if name in r.figures] for what, name in _REFINED.items()}
-    told = [
+    parts = [
         f"{what} × {min(of):.2f} to {max(of):.2f}, {geometric_mean(of):.2f} in the mean"
         for what, of in ratios.items()
         if of
     ]
     given_back = len(records) - len(changed)
-    text = f"`rstrack refine` of {len(records)} runs: {'; '.join(told)}; {given_back} were given back as they were."
-    return [text, ""] if told else []
+    text = f"`rstrack refine` of {len(records)} runs: {'; '.join(parts)}; {given_back} were given back as they were."
+    return [text, ""] if parts else []
 
 
 def _beside(title: str, tracks: Sequence[Record], chosen: Callable[[Record], bool]) -> list[str]:

@@ -16,8 +16,8 @@ from rstrack.keyframes.keyframe import Reference
 class Chain:
     """Frames' normal equations, summed over those aligned to one keyframe: 1.5 kB a frame.
 
-    Only the Hessians: where the frames were found, gradients are zero. Frames against references that are
-    rolling still are put together under None.
+    Only the Hessians: where the frames were found, gradients are zero. Frames against references that are rolling still
+    are put together under None.
     """
 
     _done: list[Seen] = field(default_factory=list)

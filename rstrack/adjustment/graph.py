@@ -34,7 +34,7 @@ _HELD = 1e14
 class Seen:
     """What frames say of control points against a keyframe; None: against others of them, by the model itself.
 
-    gradient (n, 6): gradient of what they say, of the band's control points, where the models were made; None: zero, as
+    gradient (n, 6): of what they say, of the band's control points, where the models were made; None: zero, as
     after the tracker's own steps.
     """
 

@@ -64,8 +64,8 @@ class LoopSearch:
     """Looks for loops of a track. load: a frame on the device by its number.
 
     motion: T_world_cam(t) of the track. poses: T_world_base (4, 4) of keyframes, where they are better known than the
-    archive has them. drift: covariances of keyframes' poses, as in `Uncertainty`. inflations: as in `align`. tried,
-    faults: pairs that were aligned, and why some are none.
+    archive has them. drift: covariances of keyframes' poses, as in `Uncertainty`. judge, inflations: as in `align`.
+    tried, faults: pairs that were aligned, and why some are none.
     """
 
     terms: Terms

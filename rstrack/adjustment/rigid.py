@@ -43,8 +43,8 @@ def align(
 ) -> Alignment:  # fmt: skip
     """Align a frame to a rectified keyframe from T_ref_cam (4, 4) on, through the levels of the pyramid.
 
-    motion: T_world_cam(t) while the frame is exposed, of which only the shape matters. inflations: by how much the
-    covariances of depth and of colour are too small, see `Independence`.
+    motion: T_world_cam(t) while the frame is exposed, of which only the shape matters. judge: decides whether it was
+    found. inflations: by how much the covariances of depth and of colour are too small, see `Independence`.
     """
     mid = frame.depth.exposure.mid_time
     state = _placed(motion, frame, ref.T_world_base @ T_ref_cam @ se3.inverse(motion.pose(mid)))

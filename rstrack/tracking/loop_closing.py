@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -136,8 +136,10 @@ def graph_of(tracker: Tracker, keyframes: Archive) -> Graph:
 
 
 def judge_of(tracker: Tracker) -> Judge:
-    """By what the track has learnt of how its images fit, as a frame that is looked for anywhere."""
+    """Judges a loop as a frame that nothing predicts, by what the track has learnt of its images and cameras."""
     fits, covariances = tracker.fits, tracker.covariances
+    # The tracker must go on to the same bits, whether or not loops are looked for.
+    covariances = replace(covariances, calibration=covariances.calibration.anew())
 
     def judge(
         fresh: Sequence[Observation], solved: Solved, state: SplineState, ref: Reference

@@ -15,6 +15,7 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.adjustment.rigid import align
+from rstrack.data.calibration_sigma import STATED
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import read_estimate
 from rstrack.data.rig import Frame
@@ -146,6 +147,18 @@ def test_a_frame_whose_depth_and_colour_are_of_two_places_is_found_at_none(datas
     assert align(*given, judge_of(tracker)).fault
     frame = tracker.upload(FRAMES - 3, own)
     assert not align(*given[:2], frame, *given[3:], judge_of(tracker)).fault
+
+
+def test_the_search_leaves_what_the_tracker_remembers_of_keyframes(dataset: Dataset) -> None:
+    """A keyframe's landmarks are of when it was first looked at; since then other depth was fused in."""
+    tracker = make_tracker(replace(dataset.rig, sigma=STATED), OPTIONS)
+    assert isinstance(tracker, Tracker)
+    for k in range(FRAMES):
+        tracker.feed(dataset.frame(k))
+    calibration = tracker.covariances.calibration
+    before = dict(calibration._landmarks)
+    assert before and close_loops(tracker, dataset.frame).loops
+    assert calibration._landmarks == before
 
 
 def test_what_shows_another_place_closes_no_loop(dataset: Dataset, tracker: Tracker) -> None:

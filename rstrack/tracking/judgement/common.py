@@ -58,9 +58,10 @@ class Common:
     def cross_information(
         self, calibration: Calibration, fresh: Sequence[Observation], state: SplineState, at: FloatArray, excess: float
     ) -> FloatArray:  # fmt: skip
-        """Information (6, m) that a frame at `at`, T_world_depth (4, 4), has of its pose and the parameters together.
+        """H D (6, m) of a frame at `at`, T_world_depth (4, 4): minus the information of pose and parameters both.
 
-        excess: see `Scores`.
+        H: the information of the pose, in the camera's axes; D: what one σ of each parameter moves an image by. excess:
+        see `Scores`.
         """
         total = _nothing()
         turn = np.kron(np.eye(2), at[:3, :3])

@@ -116,6 +116,10 @@ class Calibration:
         is_one = rig.is_registered
         return cls(Rays(depth, color, rig.T_color_depth, is_one), rig.sigma.vector(is_one))
 
+    def anew(self) -> Calibration:
+        """The same with nothing remembered: a keyframe's landmarks are of when it was first looked at."""
+        return Calibration(self._rays, self.sigmas)
+
     @property
     def is_exact(self) -> bool:
         """Whether nothing may be wrong: then nothing is worked out."""
