@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rsgen.geometry.so3 import FloatArray
+from rstrack.alignment import normal_equations
 from rstrack.alignment.normal_equations import Quadratic
 
 MID_GREY = 0.5
@@ -51,13 +52,9 @@ def eliminate(
     coupling (6k, 2), H (2, 2), g (2,): theirs with the control points and among themselves, over σ² as the model is.
     at, expected (2,): their values here, and their prior's mean.
     """
-    prior = np.array(_SIGMA)
-    off = (at - expected) / prior
-    solved = -np.linalg.solve(H + np.diag(1.0 / prior**2), np.column_stack([g + off / prior, coupling.T]))
-    step, follow = solved[:, 0], solved[:, 1:]
-    reduced = model.H + coupling @ follow
-    left = Quadratic(model.first, 0.5 * (reduced + reduced.T), model.g + coupling @ step)
-    return left, Eliminated(at, step, follow), 0.5 * float(off @ off)
+    sigma, off = np.array(_SIGMA), at - expected
+    left, step, follow = normal_equations.eliminate(model, coupling, H, g, sigma, off)
+    return left, Eliminated(at, step, follow), 0.5 * float(np.sum((off / sigma) ** 2))
 
 
 def contrast(H: FloatArray, at: FloatArray) -> float:

@@ -15,16 +15,19 @@ from rsgen.device.lens import Lens
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import BlockSums, Scaling, block_counts
-from rstrack.alignment.brightness import SAME, Eliminated, contrast, eliminate
+from rstrack.alignment.brightness import SAME, Eliminated, contrast
+from rstrack.alignment.brightness import eliminate as without_brightness
 from rstrack.alignment.independence import inflation
-from rstrack.alignment.normal_equations import Quadratic, Slopes, chain, prepare_jacobians
+from rstrack.alignment.normal_equations import Quadratic, Slopes, chain, eliminate, prepare_jacobians
 from rstrack.alignment.residuals import (
+    WHOLE,
     GeometricInput,
     PhotometricInput,
     VisibilityInput,
     geometric_kernel,
     photometric_kernel,
     visibility_kernel,
+    whole_image_unit,
 )
 from rstrack.alignment.student_t import scale_step
 from rstrack.images.device_frame import DeviceRig, Timer, untimed
@@ -101,6 +104,8 @@ class Terms:
     gate_intensity: float = 0.3
     floor_depth: float = _CREDIBLE_DEPTH
     floor_intensity: float = 1.0 / 255.0
+    # See `CalibrationSigma`: what depth images are off by as a whole is solved for with every pose; 0: nothing is.
+    depth_image: float = 0.0
     # σ of equation (13) in the photometric term; 0: blurred points count like sharp ones.
     blur_sigma_px: float = 0.0
     # Part of σ by which interpolation may err: beyond that pixels are left out, or weigh less in coarse images.
@@ -117,8 +122,8 @@ class Terms:
     def of(cls, device: DeviceRig, options: Options) -> Terms:
         """The terms of a rig as a method has them."""
         return cls(
-            device.e, device.device_rays, blur_sigma_px=options.blur_sigma_px, counts_rough=not options.photometric,
-            timer=device.timer,
+            device.e, device.device_rays, depth_image=device.sigma.depth_image, blur_sigma_px=options.blur_sigma_px,
+            counts_rough=not options.photometric, timer=device.timer,
         )  # fmt: skip
 
     def expect(
@@ -145,7 +150,8 @@ class Terms:
         """
         with self.timer(f"geometric kernel, level {level}"):
             to_base = self._to_base(spline, ref.T_world_base, image.exposure)
-            sums = self._geometric_sums(image, ref, to_base, self._seen_from(spline, ref), level, sigma)
+            seen_from, shifts = self._seen_from(spline, ref), self.depth_image > 0.0
+            sums = self._geometric_sums(image, ref, to_base, seen_from, level, sigma, shifts)
         slopes, floor = self._slopes(slopes_at or spline, image.exposure, ref), self._floor_depth(image, ref)
 
         def finish() -> Linearised:
@@ -163,11 +169,12 @@ class Terms:
         return sums, scale_step(sigma, sums.weighted, sums.count, self._floor_depth(image, ref))
 
     def _geometric_sums(
-        self, image: DepthImage, ref: Reference, to_base: Any, from_base: Any, level: int, sigma: float
-    ) -> Callable[[], BlockSums]:
+        self, image: DepthImage, ref: Reference, to_base: Any, from_base: Any, level: int, sigma: float,
+        shifts: bool = False,
+    ) -> Callable[[], BlockSums]:  # fmt: skip
         e, lens = self.e, image.exposure.lens
         stride = _stride(lens, level)
-        kernel = self._kernel(geometric_kernel, lens, ref.lens, stride)
+        kernel = self._kernel(geometric_kernel, lens, ref.lens, stride, shifts)
         scaling = self._scaling(ref, lens, lens.camera, ref, stride, 1)
         gate = self.gate_depth[pyramid_level(level)] * max(1.0, ref.median_depth)
         if pyramid_level(level) == 0:
@@ -179,7 +186,7 @@ class Terms:
         surface = ref.inverse_depth, ref.slope_x, ref.slope_y, ref.roughness
         raw = kernel(GeometricInput(image.z, *self.rays, to_base, *surface, from_base, constants))
         current, reference, _, _ = block_counts(lens, ref.lens)
-        return lambda: scaling.unpack(raw.numpy(), current, reference)
+        return lambda: scaling.unpack(raw.numpy(), current, reference, WHOLE if shifts else 0)
 
     def _floor_depth(self, image: DepthImage, ref: Reference) -> float:
         # A camera at rest repeats its rounding, so that depth would seem far better than it is.
@@ -260,7 +267,7 @@ class Terms:
 
     def _finish(
         self, sums: BlockSums, slopes: Slopes, sigma: float, floor: float, median_depth: float,
-        brightness: FloatArray = SAME, expected: FloatArray = SAME,
+        brightness: FloatArray | None = None, expected: FloatArray = SAME,
     ) -> Linearised:  # fmt: skip
         # Lines that are exposed at once move alike.
         moved = sums.summed() if len(sums.H) > len(slopes.current) else sums
@@ -270,10 +277,14 @@ class Terms:
         model = Quadratic(model.first, model.H / sigma**2, model.g / sigma)
         cost, eliminated, spread = sums.cost, None, np.inf
         if own is not None:
-            spread = contrast(own.H, brightness)
             scaled = coupling / sigma**2, own.H / sigma**2, own.g / sigma
-            model, eliminated, surprise = eliminate(model, *scaled, brightness, expected)
-            cost += surprise
+            if brightness is None:
+                prior = np.full(WHOLE, self.depth_image / whole_image_unit(median_depth))
+                model, _, _ = eliminate(model, *scaled, prior, np.zeros(WHOLE))
+            else:
+                spread = contrast(own.H, brightness)
+                model, eliminated, surprise = without_brightness(model, *scaled, brightness, expected)
+                cost += surprise
         next_sigma = scale_step(sigma, sums.weighted, sums.count, floor)
         seen = seen_motions(sums, median_depth)
         counts = sums.count, sums.compared

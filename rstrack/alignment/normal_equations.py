@@ -122,6 +122,21 @@ def chain(sums: BlockSums, slopes: Slopes, coupling: FloatArray | None = None) -
     return Quadratic(first, 0.5 * (dense + dense.T), flat @ g.ravel()), flat @ blocks.reshape(-1, blocks.shape[-1])
 
 
+def eliminate(
+    model: Quadratic, coupling: FloatArray, H: FloatArray, g: FloatArray, sigma: FloatArray, off: FloatArray
+) -> tuple[Quadratic, FloatArray, FloatArray]:
+    """The model without n further unknowns of prior N(0, diag σ²), by Schur complement.
+
+    coupling (6k, n), H (n, n), g (n,): theirs with the control points and among themselves. sigma, off (n,): the prior,
+    and where they are now. Returns their step (n,), too, and how they follow control points (n, 6k).
+    """
+    system = H + np.diag(1.0 / sigma**2)
+    solved = -np.asarray(np.linalg.solve(system, np.column_stack([g + off / sigma**2, coupling.T])))
+    step, follow = solved[:, 0], solved[:, 1:]
+    reduced = model.H + coupling @ follow
+    return Quadratic(model.first, 0.5 * (reduced + reduced.T), model.g + coupling @ step), step, follow
+
+
 def assemble(models: Iterable[Quadratic], first: int, last: int) -> tuple[FloatArray, FloatArray]:
     """Sum of quadratic models restricted to the free control points first..last; the others are held fixed."""
     size = 6 * (last - first)

@@ -33,6 +33,10 @@ from rstrack.alignment.pixel_runs import Pixels, summed
 from rstrack.images.blur import blur_length, blur_weight
 from rstrack.images.sampling import EDGE, NEAREST, grid, level_size, nearest, surface, value_and_slope
 
+WHOLE = 3
+"""Unknowns of a depth image as a whole: offset and two tilts of its inverse depth."""
+# Length of a ray, z being 1, times its x or y: of pixels 60° off the axis.
+_WIDEST = 4.0
 # Metres that a point has to lie behind what is seen there to count as hidden, beside EDGE of its depth.
 _BEHIND = 0.02
 
@@ -64,13 +68,16 @@ class GeometricInput:
     constants: Any
 
 
-def geometric_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int) -> Callable[[GeometricInput], Any]:
+def geometric_kernel(
+    e: Engine, lens: Lens, ref_lens: Lens, stride: int, shifts: bool = False
+) -> Callable[[GeometricInput], Any]:
     """Kernel of the geometric term, equations (6) and (15): sums over blocks, as `Scaling.unpack` takes them.
 
     lens: the current depth camera. ref_lens: the reference's camera; global shutter if it is rectified (then the base
-    frame is the reference's own).
+    frame is the reference's own). shifts: with columns by what all of the image's inverse depth may be off by, see
+    `whole_image`.
     """
-    camera, ref = lens.camera, ref_lens.camera
+    camera, ref, count = lens.camera, ref_lens.camera, WHOLE if shifts else 0
 
     @recorded_from(GeometricInput)
     def kernel(given: GeometricInput) -> Any:
@@ -80,22 +87,43 @@ def geometric_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int) -> Call
             z = dr.gather(e.Float, given.depth, pixels.index)
             active = pixels.meant & (z > 0.0)
             even = evened(z, parameters[2])
-            q = *(dr.gather(e.Float, ray, pixels.index) * z for ray in (given.rays_x, given.rays_y)), z
+            xn, yn = (dr.gather(e.Float, ray, pixels.index) for ray in (given.rays_x, given.rays_y))
             line = _line_index(e, lens, pixels.x, pixels.y)
-            p = move(gather(given.to_base, line, TO_BASE, stride=TO_BASE), q)
+            to_base = gather(given.to_base, line, TO_BASE, stride=TO_BASE)
+            p = move(to_base, (xn * z, yn * z, z))
             seen = project_rolling(ref_lens, given.from_base, p, e.UInt, e.Int)
             value, active = surface(e, ref, given.inverse_depth, seen.x, seen.y, active & seen.valid)
             r, g, is_smooth = plane_distance(e, given, ref, seen, value, active, even)
             # What lies behind the surface is hidden from the reference: nothing that it shows speaks for it or against.
             active &= r > -parameters[1]
-            slot = block_slot(line, seen.row, lens, ref_lens, pixels.y)
-            return contribution(e, g, p, 1.0, r, active, parameters, slot, judged=is_smooth)
+            slot = block_slot(line, seen.row, lens, ref_lens, pixels.y, columns=count)
+            columns = whole_image(g, p, to_base, z, (xn, yn), parameters[2]) if shifts else ()
+            return contribution(
+                e, g, p, 1.0, r, active, parameters, slot, columns, judged=is_smooth, curved=count
+            )  # fmt: skip
 
         down = lens.lines > 1 and not lens.shutter.by_rows
         shape, is_steady = (camera.width, camera.height, stride), ref_lens.lines == 1
-        return summed(e, shape, layout(lens, ref_lens), at, down, is_steady)
+        return summed(e, shape, layout(lens, ref_lens, count), at, down, is_steady)
 
     return kernel
+
+
+def whole_image(g: Vector, p: Vector, to_base: list[Any], z: Any, ray: tuple[Any, Any], inv_median: Any) -> list[Any]:
+    """Derivatives of r by an offset and two tilts of the image's inverse depth, in units of `whole_image_unit`.
+
+    g: derivative by a shift of the point p = R q + t, which the pose to_base has of q; z, ray: of q. ∂q/∂ρ = −z q.
+    """
+    along = [one - t for one, t in zip(p, to_base[9:], strict=True)]
+    by_offset = dr.fma(g[0], along[0], dr.fma(g[1], along[1], g[2] * along[2])) * -z
+    by_offset *= dr.square(inv_median) / _WIDEST
+    # No pixel reaches 1 but one that is seen at a slant beyond 60°.
+    return [dr.clip(column, -1.0, 1.0) for column in (by_offset, by_offset * ray[0], by_offset * ray[1])]
+
+
+def whole_image_unit(median_depth: float) -> float:
+    """1/m that the columns of `whole_image` are in: r changes by no more than by a metre."""
+    return 1.0 / (_WIDEST * median_depth**2)
 
 
 def plane_distance(

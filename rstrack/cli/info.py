@@ -73,7 +73,8 @@ def _sigma(rig: Rig) -> str:
     return (
         f"focal length {100 * s.focal:.3g} %, aspect {100 * s.aspect:.3g} %, center {s.center * fx:.3g} px, "
         f"k1 {s.k1:.3g}, readout {1e3 * s.readout_s:.3g} ms, clock {1e3 * s.offset_s:.3g} ms{apart}, "
-        f"depth {100 * s.depth_scale:.3g} % and {s.depth_inverse_offset:.3g}/m (camera file: 'sigma')"
+        f"depth {100 * s.depth_scale:.3g} % and {s.depth_inverse_offset:.3g}/m, each image {s.depth_image:.3g}/m "
+        "(camera file: 'sigma')"
     )
 
 

@@ -31,7 +31,8 @@ class CalibrationSigma:
 
     focal: part of the focal lengths; aspect: part of fy beyond that; center: principal point, in focal lengths; k1:
     distortion; rotation_deg, translation_m: of T_color_depth, an axis; readout_s; offset_s: colour's clock;
-    depth_scale: part; depth_inverse_offset: 1/m.
+    depth_scale: part; depth_inverse_offset: 1/m. depth_image: 1/m, what inverse depth of each image is off by as a
+    whole, by an offset and by two tilts: no parameter, but solved for with every pose.
     """
 
     focal: float = 0.0
@@ -44,6 +45,7 @@ class CalibrationSigma:
     offset_s: float = 0.0
     depth_scale: float = 0.0
     depth_inverse_offset: float = 0.0
+    depth_image: float = 0.0
 
     def vector(self, is_registered: bool = False) -> FloatArray:
         """In the order of NAMES (21,). is_registered: depth is seen through the colour camera, and the two are one."""
@@ -62,7 +64,7 @@ class CalibrationSigma:
 EXACT = CalibrationSigma()
 """Of renderings, but for depth cameras with fixed errors."""
 
-STATED = CalibrationSigma(0.01, 0.003, 0.01, 0.02, 0.3, 0.005, 0.003, 0.003, 0.01, 0.005)
+STATED = CalibrationSigma(0.01, 0.003, 0.01, 0.02, 0.3, 0.005, 0.003, 0.003, 0.01, 0.005, 0.001)
 """Of a camera file that does not say: a judgement of what such files have wrong, not a measurement."""
 
 UNFOUND_OFFSET_S = 0.015

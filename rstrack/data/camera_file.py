@@ -164,6 +164,7 @@ class _Sigma(_Section):
     offset_s: Sigma | None = None
     depth_scale: Sigma | None = None
     depth_inverse_offset: Sigma | None = None
+    depth_image: Sigma | None = None
 
 
 class _CameraYaml(_Section):

@@ -76,13 +76,14 @@ class DeviceRig:
     """Lenses and rays of a rig as a method sees them; takes its frames to the device.
 
     rays (h, w, 2): normalised coordinates of the depth camera's pixels; device_rays: the same on the device.
-    depth_lens, color_lens: the cameras. resolution: step of the depth camera (1/m), 0 until its first images have shown
-    one.
+    depth_lens, color_lens: the cameras. sigma: how far the rig may be wrong. resolution: step of the depth camera
+    (1/m), 0 until its first images have shown one.
     """
 
     def __init__(self, rig: Rig, options: Options, timer: Timer = untimed) -> None:
         self.timer = timer
         self._rig, self._options = rig, options
+        self.sigma = rig.sigma
         self.e = engine(options.backend)
         self.depth_lens = Lens(rig.depth_camera, _seen_as(rig.depth_shutter, options.rolling))
         self.color_lens = Lens(rig.color_camera, _seen_as(rig.color_shutter, options.rolling))

@@ -149,6 +149,7 @@ def test_another_clock_of_the_truth(place: Path) -> None:
     (root / "groundtruth.txt").write_text("".join(" ".join(f"{v:.9f}" for v in row) + "\n" for row in rows))
     camera = {"width": 112, "height": 84, "intrinsics": [84.0, 84.0, 55.5, 41.5], "readout_s": 0.028}
     cameras = {"color": camera, "depth": camera, "T_color_depth": synthetic.T_COLOR_DEPTH.tolist()}
+    cameras |= {"sigma": {"depth_image": 0.0}}
     (root / "camera.yaml").write_text(yaml.safe_dump(cameras))
     (root / "sequence.yaml").unlink()
     how: dict[str, Any] = {"sequences": ["robot_t1"], "methods": ["rs-g"], "options": Options(fuse=True)}

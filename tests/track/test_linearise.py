@@ -28,6 +28,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.alignment import block_sums, brightness
 from rstrack.alignment.block_sums import BlockSums
 from rstrack.alignment.linearise import Linearised, Terms, seen_motions, weakest_motion
+from rstrack.alignment.residuals import whole_image_unit
 from rstrack.images import line_poses as lines
 from rstrack.images.pyramid import ColorImage, DepthImage, depth_image
 
@@ -189,6 +190,28 @@ def test_errors_of_neighbouring_lines_are_seen_where_all_are_exposed_at_once_too
     terms = Terms(ENGINE, maker(camera).device_rays)
     lin = terms.geometric(depth_image(ENGINE, image, z + noise, 100.0), ref, still(T), 0, 2e-3)()
     assert least < lin.inflation < most
+
+
+@pytest.mark.parametrize("off_by", [1e-9, 1e-3, 1.0])
+def test_what_a_depth_image_is_off_by_as_a_whole_is_no_part_of_the_model(off_by: float) -> None:
+    truth, image = synthetic.make_spline(), exposure(0.30, "top-bottom", DEPTH)
+    ref, seen = exact_reference(synthetic.cast, truth, exposure(0.25, None)), depth_input(synthetic.cast, truth, image)
+    sigma, spline = 0.02, disturbed(truth, 11, 0.02)
+    plain, lin = (
+        shipped(depth_image=depth_image).geometric(seen, ref, spline, 0, sigma)() for depth_image in (0.0, off_by)
+    )
+    together = np.tile(np.eye(6), (len(lin.model.g) // 6, 1)) @ se3.adjoint(ref.T_world_base)
+    own, unit = lin.sums.columns, whole_image_unit(ref.median_depth)
+    assert own is not None
+    coupling = own.coupling.sum(axis=(0, 1)) / unit / sigma**2
+    system = own.H / (sigma * unit) ** 2 + np.eye(3) / off_by**2
+    H = lin.sums.H.sum(axis=(0, 1)) / sigma**2 - coupling @ np.linalg.solve(system, coupling.T)
+    g = lin.sums.g.sum(axis=(0, 1)) / sigma - coupling @ np.linalg.solve(system, own.g / unit / sigma)
+    np.testing.assert_allclose(together.T @ lin.model.H @ together, H, rtol=1e-6, atol=1e-9 * np.abs(H).max())
+    np.testing.assert_allclose(together.T @ lin.model.g, g, rtol=1e-6, atol=1e-9 * np.abs(g).max())
+    assert lin.cost == plain.cost
+    lost = np.linalg.norm(plain.model.H - lin.model.H) / np.linalg.norm(plain.model.H)
+    assert lost < 1e-6 if off_by == 1e-9 else lost > 0.1
 
 
 # -- gates, floors and what is left out -----------------------------------------------------------------------------

@@ -141,6 +141,7 @@ def write_recording(root: Path, breathes: bool) -> Path:
     stream = {"width": WIDTH, "height": HEIGHT, "intrinsics": medians, "readout_s": SHUTTER.readout_s}
     color = stream | {"offset_s": 0.0, "falloff": 0.0}
     camera_yaml = {"color": color, "depth": stream | {"depth_scale": 20000.0}, "stamps": "raw"}
+    camera_yaml |= {"sigma": {"depth_image": 0.0}}
     (root / "camera.yaml").write_text(yaml.safe_dump(camera_yaml | {"T_color_depth": T_COLOR_DEPTH.tolist()}))
     poses = pose_rows(SPLINE.pose(np.arange(FRAMES) / 30) @ se3.inverse(T_COLOR_DEPTH))
     truth = [" ".join([f"{s:.9f}", *map(repr, row.tolist())]) for s, row in zip(stamps, poses, strict=True)]

@@ -155,10 +155,10 @@ def test_sums_equal_those_of_a_loop_over_pixels(room: tuple, monkeypatch: pytest
 
 def block_sums(
     image: DepthImage, ref: Reference, spline: Spline, gate: float, sigma: float, roughness: float = np.inf,
-    coarse: float = 1.0,
+    coarse: float = 1.0, shifts: bool = False,
 ) -> BlockSums:  # fmt: skip
     """The kernel itself, with a gate of one's own."""
-    kernel = residuals.geometric_kernel(ENGINE, image.exposure.lens, ref.lens, 2)
+    kernel = residuals.geometric_kernel(ENGINE, image.exposure.lens, ref.lens, 2, shifts)
     camera = image.exposure.lens.camera
     scaling = Scaling(ref.median_depth, ref.bound, camera.width * camera.height // 4)
     to_base = ENGINE.upload(to_base_table(spline, ref.T_world_base, image.exposure))
@@ -166,7 +166,31 @@ def block_sums(
     surface = ref.inverse_depth, ref.slope_x, ref.slope_y, ref.roughness, ENGINE.upload(IDENTITY_FROM_BASE)
     raw = kernel(residuals.GeometricInput(image.z, *maker(DEPTH).device_rays, to_base, *surface, constants))
     current, reference, _, _ = block_counts(image.exposure.lens, ref.lens)
-    return scaling.unpack(raw.numpy(), current, reference)
+    return scaling.unpack(raw.numpy(), current, reference, residuals.WHOLE if shifts else 0)
+
+
+def test_what_an_image_is_off_by_as_a_whole_is_what_its_columns_say(room: tuple) -> None:
+    as_input, ref, _, z = room
+    x, y = np.moveaxis(DEPTH.unproject(DEPTH.pixel_grid())[..., :2], -1, 0)
+    rho = np.divide(1.0, z, out=np.zeros_like(z), where=z > 0)
+    sigma, unit = 0.05, residuals.whole_image_unit(ref.median_depth)
+
+    def found(off: np.ndarray) -> np.ndarray:
+        bent = np.where(z > 0, rho + off[0] + off[1] * x + off[2] * y, 0.0)
+        image = as_input(np.divide(1.0, bent, out=np.zeros_like(z), where=z > 0).astype(np.float32))
+        own = block_sums(image, ref, synthetic.make_spline(), 10.0, sigma, shifts=True).columns
+        assert own is not None
+        return -sigma * unit * np.linalg.solve(own.H, own.g)
+
+    for off in 2e-3 * np.eye(3):
+        np.testing.assert_allclose(0.5 * (found(-off) - found(off)), off, atol=6e-5)
+
+
+def test_further_columns_change_no_other_sum(room: tuple) -> None:
+    as_input, ref, spline, z = room
+    plain, more = (block_sums(as_input(z), ref, spline, 10.0, 0.01, shifts=shifts) for shifts in (False, True))
+    np.testing.assert_array_equal(more.H, plain.H)
+    assert (more.g == plain.g).all() and more.cost == plain.cost
 
 
 def test_the_gate_drops_what_lies_beyond_it(room: tuple) -> None:

@@ -49,7 +49,8 @@ def sigma_of(sequence: Sequence) -> CalibrationSigma:
     for name in ("config", "depth", "noise"):
         noise = noise.get(name) if isinstance(noise, dict) else None
     if isinstance(noise, dict) and any(noise.get(name) for name in ("scale_error", "distortion_px")):
-        return replace(sigma, depth_scale=STATED.depth_scale, depth_inverse_offset=STATED.depth_inverse_offset)
+        own = "depth_scale", "depth_inverse_offset", "depth_image"
+        return replace(sigma, **{name: getattr(STATED, name) for name in own})
     return sigma
 
 
