@@ -125,10 +125,10 @@ def chain(sums: BlockSums, slopes: Slopes, coupling: FloatArray | None = None) -
 def eliminate(
     model: Quadratic, coupling: FloatArray, H: FloatArray, g: FloatArray, sigma: FloatArray, off: FloatArray
 ) -> tuple[Quadratic, FloatArray, FloatArray]:
-    """The model without n further unknowns of prior N(0, diag σ²), by Schur complement.
+    """The model without n further unknowns that have a prior N(mean, diag σ²), by Schur complement.
 
-    coupling (6k, n), H (n, n), g (n,): theirs with the control points and among themselves. sigma, off (n,): the prior,
-    and where they are now. Returns their step (n,), too, and how they follow control points (n, 6k).
+    coupling (6k, n), H (n, n), g (n,): theirs with the control points and among themselves. sigma (n,): the prior's;
+    off (n,): how far from its mean they are. Returns their step (n,), too, and how they follow control points (n, 6k).
     """
     system = H + np.diag(1.0 / sigma**2)
     solved = -np.asarray(np.linalg.solve(system, np.column_stack([g + off / sigma**2, coupling.T])))

@@ -112,7 +112,8 @@ def geometric_kernel(
 def whole_image(g: Vector, p: Vector, to_base: list[Any], z: Any, ray: tuple[Any, Any], inv_median: Any) -> list[Any]:
     """Derivatives of r by an offset and two tilts of the image's inverse depth, in units of `whole_image_unit`.
 
-    g: derivative by a shift of the point p = R q + t, which the pose to_base has of q; z, ray: of q. ∂q/∂ρ = −z q.
+    The tilts are along the ray's x and y. g: derivative by a shift of the point p = R q + t, which the pose to_base has
+    of q; z (m), ray: of q. ∂q/∂ρ = −z q. inv_median: 1/m, of the reference.
     """
     along = [one - t for one, t in zip(p, to_base[9:], strict=True)]
     by_offset = dr.fma(g[0], along[0], dr.fma(g[1], along[1], g[2] * along[2])) * -z
@@ -122,7 +123,7 @@ def whole_image(g: Vector, p: Vector, to_base: list[Any], z: Any, ray: tuple[Any
 
 
 def whole_image_unit(median_depth: float) -> float:
-    """1/m that the columns of `whole_image` are in: r changes by no more than by a metre."""
+    """What one of a column of `whole_image` stands for, in 1/m, so that none exceeds 1 in fixed point."""
     return 1.0 / (_WIDEST * median_depth**2)
 
 
