@@ -26,7 +26,7 @@ from rstrack.data.camera_file import usual
 from rstrack.data.dataset import open_dataset
 
 # How far lenses are told wrong: parts, px of 640, and σ of distortion as OpenCV counts it.
-_FOCAL, _CENTER_PX, _DISTORTION = 0.03, 15.0, (0.06, 0.06, 0.002, 0.002)
+_FOCAL, _CENTER_PX, _DISTORTION = 0.03, 15.0, (0.06, 0.06, 0.002, 0.002, 0.06)
 _WITHIN = 2.0
 
 
@@ -96,17 +96,17 @@ def lens_cell(task: Task, progress: Progress) -> Figures:
 def _wrong(camera: Camera, rng: np.random.Generator) -> Camera:
     sign, scale = rng.choice((-1.0, 1.0), 3), camera.width / 640
     focal = 1.0 + _FOCAL * sign[0]
-    bent = tuple(float(x) for x in rng.standard_normal(4) * _DISTORTION)
+    bent = tuple(float(x) for x in rng.standard_normal(5) * _DISTORTION)
     return replace(
         camera, fx=camera.fx * focal, fy=camera.fy * focal, cx=camera.cx + _CENTER_PX * scale * sign[1],
-        cy=camera.cy + _CENTER_PX * scale * sign[2], model="radtan", distortion=(*bent, 0.0),
+        cy=camera.cy + _CENTER_PX * scale * sign[2], model="radtan", distortion=bent,
     )  # fmt: skip
 
 
 def _errors_over_sigma(found: Calibration, true: Camera, task: Task) -> list[float]:
     """Of the lens, the readouts and colour's clock, of those that are told."""
     lens, truth = found.calibrated().rig.color_camera, parameters_of(task.dataset)
-    bent = (*true.distortion, *(0.0,) * 4)[:4]
+    bent = (*true.distortion, *(0.0,) * 5)[:5]
     errors = [
         lens.fx / true.fx - 1.0, lens.fy / true.fy - 1.0, (lens.cx - true.cx) / true.fx, (lens.cy - true.cy) / true.fy,
         *(a - b for a, b in zip(lens.distortion, bent, strict=False)),

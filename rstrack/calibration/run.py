@@ -28,12 +28,12 @@ from rstrack.calibration.pairs.load import load_stretch, pair_terms
 from rstrack.calibration.pairs.stretch import Stretch
 from rstrack.calibration.pairs.terms import PairTerms
 from rstrack.calibration.pairs.trust import trust_in
-from rstrack.calibration.solve import Solution, Watch, solve
+from rstrack.calibration.solve import solve
+from rstrack.calibration.stages import Stage, in_stages, progress_watch
 from rstrack.calibration.unknowns.devices import Device, device_notes
 from rstrack.calibration.unknowns.known import Known
 from rstrack.calibration.unknowns.parameters import (
     COLOR_LENS,
-    COUNT,
     DEPTH_LENS,
     DRIFT,
     GROUPS,
@@ -50,21 +50,15 @@ _FRAMES, _FEWEST_FRAMES, _FEWEST, _MOST = 30, 14, 3, 12
 _DRIFT_S = 4.0
 # Stretches that short recordings are cut into.
 _SEVERAL = 6
-# Part of the largest σ, over what is of use, from which on parameters are held together.
-_DRAGS = 0.5
-# Levels of the pyramid, coarse ones first.
-_COARSE, _FINE = (2,), (0,)
+# Levels of the pyramid that it begins on.
+_COARSE = (2,)
 # See `trust_in`: 0.83 to 0.99 where there is something to see, with a Kinect's noise too, below 0.3 on bare walls.
 _TRUST = 0.5
 # Ways in which images may be read, stretches with which they are tried, and steps at most.
 _AXES: tuple[Scan, ...] = ("top-bottom", "left-right")
 _TRIED, _TRIED_STEPS = 2, 5
 # Unknowns of a lens that are its distortion, of radial-tangential ones.
-_COEFFICIENTS = 4
-# Of a lens that is no better than the file's to be taken for one, the level of the tracker's tests.
-_CHANCE = 1e-3
-# For the progress bar.
-_ABOUT_STEPS = 10
+_COEFFICIENTS = 5
 
 
 def calibrate(
@@ -101,26 +95,31 @@ def calibrate(
         stretches = [each.read_by(terms) for each in stretches]
     residuals = residuals_at(some_of(stretches), terms, start)
     known = before.with_lenses() if "intrinsics" in groups else before
-    coarse = solve(stretches, terms, start, free, _COARSE, _watch(progress, 0.15), known)
-    solution, drifts = coarse, True
+    coarse = solve(stretches, terms, start, free, _COARSE, progress_watch(progress, 0.15), known)
+    stage = Stage(stretches, coarse, True, False)
     if coarse.finished:
         kept = _trusted(dataset, stretches, terms, coarse.values)
         parts, stretches = [parts[k] for k in kept], [stretches[k] for k in kept]
-        solution, drifts = _solved(stretches, terms, known, coarse.values, free, progress)
-    contradicted = before.contradicted(solution.values, solution.sigmas)
-    if solution.finished and contradicted.any():
-        known = known.without(contradicted)
-        solution, drifts = _solved(stretches, terms, known, solution.values, free, progress)
-    kept_lens = False
-    if solution.finished and solution.free[LENSES].any():
-        stretches, solution, kept_lens = _paid(stretches, terms, known, solution, progress)
-        free[LENSES] &= not kept_lens
+
+        def staged(known: Known, p: Parameters) -> Stage:
+            def terms_of(free: BoolArray) -> PairTerms:
+                return pair_terms(engine(options.backend), dataset, free)
+
+            return in_stages(stretches, terms_of, known, p, free, dataset.rig.sigma.depth_inverse_offset, progress)
+
+        stage = staged(known, coarse.values)
+        contradicted = before.contradicted(stage.solution.values, stage.solution.sigmas)
+        if stage.solution.finished and contradicted.any():
+            known = known.without(contradicted)
+            stage = staged(known, stage.solution.values)
+    solution, kept_lens = stage.solution, stage.kept_lens
+    free[LENSES] &= not kept_lens
     progress("calibrating", 1.0, "done")
-    free[DRIFT] &= drifts
+    free[DRIFT] &= stage.drifts
     motion = motion_of(dataset, parts, track.spline)
     notes = device_notes(device, before, known, solution.sigmas) if device else ()
     pace = pace_of(dataset, track.frames(dataset, chosen), track.spline)
-    both, seconds = (residuals, residuals_now(some_of(stretches))), time.perf_counter() - begun
+    both, seconds = (residuals, residuals_now(some_of(stage.stretches))), time.perf_counter() - begun
     return Calibration(dataset, start, solution, free, tuple(parts), motion, seconds, both, pace, notes, kept_lens)
 
 
@@ -187,60 +186,6 @@ def _bent(dataset: Dataset) -> Dataset:
     return replace(dataset, rig=replace(rig, depth_camera=bent(rig.depth_camera), color_camera=bent(rig.color_camera)))
 
 
-def _solved(
-    stretches: Sequence[Stretch], terms: PairTerms, known: Known, p: Parameters, free: BoolArray, progress: Progress
-) -> tuple[Solution, bool]:
-    """On the finest level from values `p` on: with all that may change, then without what the recording does not tell.
-
-    And whether colour's clock may drift: one that is within its error of the file's is held there, since it would take
-    colour away at both ends of the recording.
-    """
-    file, drifts, watch = known.values, True, _watch(progress, 0.5)
-    while True:
-        start = file.moved(np.where(free, p.since(file), 0.0))
-        solution = solve(stretches, terms, start, free, _FINE, watch, known)
-        unsure, p = solution.unsure, solution.values
-        if not solution.finished:
-            return solution, drifts
-        if free[DRIFT] and abs(p.color_drift - file.color_drift) < 2.0 * solution.sigmas[DRIFT]:
-            drifts, free = False, free & (np.arange(COUNT) != DRIFT)
-        elif unsure.max() > 1.0:
-            # What is told least drags others along: they may be told once it is held.
-            free = free & (unsure <= max(1.0, _DRAGS * unsure.max()))
-        else:
-            return solution, drifts
-
-
-def _paid(
-    stretches: Sequence[Stretch], terms: PairTerms, known: Known, solution: Solution, progress: Progress
-) -> tuple[list[Stretch], Solution, bool]:
-    """The solution with the lens that was found, or that with the file's where another does not pay, and which.
-
-    It pays if chance makes the images so much more likely in one of a thousand recordings at most.
-    """
-    without = solution.free & ~LENSES
-    plain = [replace(each, brightness=dict(each.brightness)) for each in stretches]
-    start = known.values.moved(np.where(without, solution.values.since(known.values), 0.0))
-    other = solve(plain, terms, start, without, _FINE, _watch(progress, 0.8), known)
-    gain = (other.cost - solution.cost) * solution.pixels
-    if not other.finished or solution.chance(gain, LENSES) < _CHANCE:
-        return list(stretches), replace(solution, finished=other.finished), False
-    return plain, other, True
-
-
-def _watch(progress: Progress, begin: float) -> Watch:
-    """Tells a progress bar, from a part of it on, of every step."""
-    done = 0
-
-    def watch(_level: int, _step: int, p: Parameters) -> None:
-        nonlocal done
-        done += 1
-        note = f"readouts {1e3 * p.depth_readout_s:.2f} and {1e3 * p.color_readout_s:.2f} ms"
-        progress("calibrating", min(0.95, begin + 0.4 * done / _ABOUT_STEPS), note)
-
-    return watch
-
-
 def _trusted(dataset: Dataset, stretches: Sequence[Stretch], terms: PairTerms, p: Parameters) -> list[int]:
     """Those stretches (counted from 0) of whose motion more is known than noise makes up. Raises UserError: too few."""
     kept = [k for k, stretch in enumerate(stretches) if trust_in(stretch, terms, p) > _TRUST]
@@ -275,7 +220,7 @@ def _motion(dataset: Dataset, part: range, track: Spline) -> float:
 
 
 def _free(dataset: Dataset, groups: Sequence[str], parts: Sequence[range]) -> BoolArray:
-    """What may change (29,).
+    """What may change (31,).
 
     Drift only where colour's clock is seen for long enough, and of lenses what our distortion has: of registered
     depth's only the colour camera's.

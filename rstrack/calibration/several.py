@@ -82,8 +82,8 @@ def _camera(step: FloatArray) -> FloatArray:
 
 
 def _without_clock(solution: Solution) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A (s, 29, 29) and b (s, 29) of the stretches with the recording's clock where it is best for any camera, and K
-    (2, 29): by how much the clock then moves, −K x, with the camera."""
+    """A (s, 31, 31) and b (s, 31) of the stretches with the recording's clock where it is best for any camera, and K
+    (2, 31): by how much the clock then moves, −K x, with the camera."""
     of = solution.free
     A, b = np.zeros((len(solution.b), COUNT, COUNT)), np.zeros((len(solution.b), COUNT))
     A[:, np.outer(of, of)], b[:, of] = solution.A.reshape(len(A), -1), solution.b
@@ -96,7 +96,7 @@ def _without_clock(solution: Solution) -> tuple[FloatArray, FloatArray, FloatArr
 
 
 def _clock(found: Calibration, moved: FloatArray, K: FloatArray) -> tuple[float, float]:
-    """Offset (s) and drift of a recording's colour for a camera that has moved by so much (29,) from its own."""
+    """Offset (s) and drift of a recording's colour for a camera that has moved by so much (31,) from its own."""
     step = np.zeros(COUNT)
     step[_CLOCK] = -K @ moved
     step[_CLOCK & ~found.solution.free] = 0.0

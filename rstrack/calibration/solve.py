@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import stats
@@ -37,11 +37,11 @@ Watch = Callable[[int, int, Parameters], None]
 
 @dataclass(frozen=True)
 class Solution:
-    """values; normal equations of the free parameters at them: A (s, n, n), b (s, n) of the s stretches, free (29,).
+    """values; normal equations of the free parameters at them: A (s, n, n), b (s, n) of the s stretches, free (31,).
 
-    cost: negative log-likelihood a pixel. sigma_depth_m, sigma_intensity: of the residuals, medians. last_step (29,):
-    the last one that was taken. blind (29,): σ of what no scatter shows. finished: nobody interrupted it. known
-    (29, 29): `Known.information`. pixels: that were compared.
+    cost: negative log-likelihood a pixel. sigma_depth_m, sigma_intensity: of the residuals, medians. last_step (31,):
+    the last one that was taken. blind (31,): σ of what no scatter shows. finished: nobody interrupted it. known
+    (31, 31): `Known.information`. pixels: that were compared.
     """
 
     values: Parameters
@@ -64,7 +64,7 @@ class Solution:
 
     @property
     def sigmas(self) -> FloatArray:
-        """Standard errors (29,) as the scatter of the stretches shows them; 0 of what is not free.
+        """Standard errors (31,) as the scatter of the stretches shows them; 0 of what is not free.
 
         Student's factor, for there are few of these, makes two σ hold 95 %.
         """
@@ -72,7 +72,7 @@ class Solution:
 
     @property
     def covariance(self) -> FloatArray:
-        """Covariance (29, 29), to which `sigmas` belong; 0 of what is not free."""
+        """Covariance (31, 31), to which `sigmas` belong; 0 of what is not free."""
         known = self.known[np.ix_(self.free, self.free)]
         C, _, _ = posterior(self.A, self.b, known)
         factor = float(stats.t.ppf(0.975, max(1.0, len(self.b) - 1.0))) / 1.96
@@ -84,7 +84,7 @@ class Solution:
         return found
 
     def chance(self, gain: float, which: BoolArray) -> float:
-        """How often freeing `which` (29,) of the unknowns makes images more likely by as much, though none is needed.
+        """How often freeing `which` (31,) of the unknowns makes images more likely by as much, though none is needed.
 
         gain: of the log-likelihood, which counts far too much. Twice that is then a sum of squares of normals, each
         times an eigenvalue of (A⁻¹)⁻¹ (A⁻¹ N A⁻¹), both of these unknowns' blocks (Kent, Biometrika 1982), here by its
@@ -99,7 +99,7 @@ class Solution:
 
     @property
     def unsure(self) -> FloatArray:
-        """How much less sure the parameters (29,) are than is of use: above 1 they are not told; 0 of what is not free.
+        """How much less sure the parameters (31,) are than is of use: above 1 they are not told; 0 of what is not free.
 
         By σ, and by how far a change that is just of use would move residuals, in the mean over pixels and with all
         else moved to make up for it: what moves them by less than a hundredth of their noise is at the mercy of a
@@ -113,7 +113,7 @@ class Solution:
 
     @property
     def shares(self) -> FloatArray:
-        """Part (s, 29) of what is known of each parameter that each stretch tells, all others known."""
+        """Part (s, 31) of what is known of each parameter that each stretch tells, all others known."""
         own = np.einsum("snn->sn", self.A)
         shares = np.zeros((len(own), COUNT))
         shares[:, self.free] = own / np.maximum(own.sum(axis=0), 1e-300)
@@ -122,39 +122,39 @@ class Solution:
 
 def solve(
     stretches: Sequence[Stretch], terms: PairTerms, start: Parameters, free: BoolArray, levels: Sequence[int],
-    watch: Watch = lambda *_: None, known: Known | None = None, steps: int = _MOST_STEPS,
+    watch: Watch = lambda *_: None, known: Known | None = None, steps: int = _MOST_STEPS, lasting: float = 0.0,
 ) -> Solution:  # fmt: skip
     """Parameters and all control points jointly, coarse to fine; the stretches' splines are moved.
 
-    free (29,): which parameters may change; the others stay at `start`, to which weak ones are held by PRIOR, and to
-    what is `known` as firmly as that is. Where `watch` raises KeyboardInterrupt, what has been found so far is
-    returned, `finished` False. Raises numpy.linalg.LinAlgError where images say nothing at all.
+    free (31,): which parameters may change; the others stay at `start`, to which weak ones are held by PRIOR, and to
+    what is `known` as firmly as that is. lasting: see `Stretch.sums`. Where `watch` raises KeyboardInterrupt, what has
+    been found so far is returned, `finished` False. Raises numpy.linalg.LinAlgError where images say nothing at all.
     """
     known = known or Known.nothing(start)
     p, acceleration, finished, step = start, Acceleration(), True, np.zeros(COUNT)
     try:
         for stretch in stretches:
             for _ in range(_ROUNDS if stretch.is_new else 0):
-                stretch.sums(terms, p, levels[0])
+                stretch.sums(terms, p, levels[0], lasting)
         for level in levels:
             acceleration.forget()
             for n in range(steps):
                 watch(level, n, p)
-                sums = [stretch.sums(terms, p, level) for stretch in stretches]
+                sums = [stretch.sums(terms, p, level, lasting) for stretch in stretches]
                 step, sigmas = _step([one.reduced() for one in sums], p, start, known, free, acceleration)
                 for stretch, one in zip(stretches, sums, strict=True):
                     stretch.move(one.points_step(step))
                 p = p.moved(step)
                 if (np.abs(step[free]) <= _SMALL * sigmas).all():
                     break
-        sums = [stretch.sums(terms, p, levels[-1]) for stretch in stretches]
+        sums = [stretch.sums(terms, p, levels[-1], lasting) for stretch in stretches]
         last, _ = _step([one.reduced() for one in sums], p, start, known, free)
         for stretch, one in zip(stretches, sums, strict=True):
             stretch.move(one.points_step(last))
         p = p.moved(last)
     except KeyboardInterrupt:
         finished = False
-    sums = [stretch.sums(terms, p, levels[-1]) for stretch in stretches]
+    sums = [stretch.sums(terms, p, levels[-1], lasting) for stretch in stretches]
     reduced = [one.reduced() for one in sums]
     A, b = _of_free(reduced, free)
     depth, intensity = np.median([stretch.sigma for stretch in stretches], axis=0)
@@ -166,8 +166,24 @@ def solve(
     )
 
 
+def joined(first: Solution, then: Solution) -> Solution:
+    """Of two solutions one: `then`'s, found with the parameters that `first` had found held, and `first`'s of these.
+
+    What is unknown of the others is in `first`'s covariance, what is unknown of `first`'s not in that of the others.
+    """
+    free, A, b = first.free | then.free, [], []
+    for one in (first, then):
+        own, full = np.nonzero(one.free[free])[0], np.zeros((len(one.A), int(free.sum()), int(free.sum())))
+        full[:, own[:, None], own] = one.A
+        A.append(full)
+        b.append(np.zeros(full.shape[:2]))
+        b[-1][:, own] = one.b
+    last_step = np.where(first.free, first.last_step, then.last_step)
+    return replace(then, free=free, A=A[0] + A[1], b=b[0] + b[1], last_step=last_step)
+
+
 def _blind(stretches: Sequence[Stretch], terms: PairTerms) -> FloatArray:
-    """σ (29,) of what no disagreement shows.
+    """σ (31,) of what no disagreement shows.
 
     Of the extrinsics, so many pixels as an angle and as a shift; of the drift, so many seconds from the middle to an
     end.
@@ -176,7 +192,7 @@ def _blind(stretches: Sequence[Stretch], terms: PairTerms) -> FloatArray:
     depth = float(np.median([view.surface.median_depth for stretch in stretches for view in stretch.views]))
     stamps = [view.depth.stamp for stretch in stretches for view in stretch.views]
     drift = _BLIND_S / max(0.5 * (max(stamps) - min(stamps)), 1e-3)
-    lens = turn * np.array([1.0, 1.0, 1.0, 1.0, 4.0, 8.0, 1.0, 1.0])
+    lens = turn * np.array([1.0, 1.0, 1.0, 1.0, 4.0, 8.0, 1.0, 1.0, 16.0])
     poses = np.zeros(3), [drift], np.full(3, turn * depth), np.full(3, turn)
     return np.concatenate([*poses, lens, lens, np.zeros(len(DEPTH))])
 
@@ -185,7 +201,7 @@ def _step(
     reduced: Sequence[tuple[FloatArray, FloatArray]], p: Parameters, start: Parameters, known: Known, free: BoolArray,
     acceleration: Acceleration | None = None,
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """The step (29,) of the parameters, and the standard errors of the free ones.
+    """The step (31,) of the parameters, and the standard errors of the free ones.
 
     Gauss-Newton's, accelerated, the prior against as much as A says too much in the mean. Without `acceleration` the
     last one, against what A says too much in each direction: that only shows where gradients add up to nothing.

@@ -24,7 +24,7 @@ def displacement_px(before: Camera, after: Camera, every: int = _EVERY) -> Float
 
 
 def sigma_px(camera: Camera, covariance: FloatArray, every: int = _EVERY) -> FloatArray:
-    """σ (n,) of where the lens puts the points of its image, both axes together, by the covariance (8, 8) of LENS."""
+    """σ (n,) of where the lens puts the points of its image, both axes together, by the covariance (9, 9) of LENS."""
     pixels = _grid(camera, every)
     rays = camera.backproject(pixels, np.ones(len(pixels)))
     slopes = []

@@ -86,7 +86,7 @@ def motion_of(dataset: Dataset, parts: Sequence[range], track: Spline) -> Motion
 
 @dataclass(frozen=True)
 class Calibration:
-    """start: the values before; asked (29,): which might change; parts: the stretches of frames that told.
+    """start: the values before; asked (31,): which might change; parts: the stretches of frames that told.
 
     residuals: of a few stretches, with the values before along the first track, and with those found. pace: by the
     first track.
@@ -110,7 +110,7 @@ class Calibration:
 
     @property
     def undetermined(self) -> BoolArray:
-        """Which (29,) were asked for but are not told by this recording: they have the values that they had."""
+        """Which (31,) were asked for but are not told by this recording: they have the values that they had."""
         return self.asked & ~self.solution.free
 
     @property
@@ -120,7 +120,7 @@ class Calibration:
 
     @property
     def sigmas(self) -> FloatArray:
-        """Their standard errors (29,); NaN where undetermined, 0 where not asked for."""
+        """Their standard errors (31,); NaN where undetermined, 0 where not asked for."""
         return np.where(self.undetermined, np.nan, self.solution.sigmas)
 
     def calibrated(self) -> Dataset:
@@ -268,6 +268,9 @@ class Calibration:
             at = [NAMES.index(name) for name in names]
             if self.asked[at].all() and not self.undetermined[at].any():
                 found[kind] = float(f"{factor * self.sigmas[at].max():.3g}")
+        if "focal" in found:
+            # What depth images seemed to be off by, each as a whole, came with a lens that was wrong.
+            found["depth_image"] = 0.0
         return found
 
     def _error_entry(self) -> str:
@@ -302,7 +305,7 @@ class Calibration:
         return changed(rig.depth_camera, depth), changed(rig.color_camera, p.color_lens)
 
     def _absolute(self, p: Parameters) -> FloatArray:
-        """The values (29,), SI and px: the extrinsics by position and rotation vector of T_color_depth."""
+        """The values (31,), SI and px: the extrinsics by position and rotation vector of T_color_depth."""
         T = p.T_color_depth
         clocks = p.depth_readout_s, p.color_readout_s, p.color_offset_s, p.color_drift
         lenses = [_lens(camera) for camera in self._changed(p)]
@@ -310,12 +313,12 @@ class Calibration:
 
     @property
     def _absolute_sigmas(self) -> FloatArray:
-        """Their standard errors (29,)."""
+        """Their standard errors (31,)."""
         return self.sigmas * self._units
 
     @property
     def _units(self) -> FloatArray:
-        """What a unit of each of NAMES comes to (29,)."""
+        """What a unit of each of NAMES comes to (31,)."""
         units, rig = np.ones(COUNT), self.dataset.rig
         for camera, lens in ((rig.depth_camera, DEPTH_LENS), (rig.color_camera, COLOR_LENS)):
             units[lens][:4] = camera.fx, camera.fy, camera.fx, camera.fy
@@ -369,8 +372,8 @@ class Calibration:
 
 
 def _lens(camera: Camera) -> FloatArray:
-    """LENS (8,) of a camera."""
-    bent = (*camera.distortion, 0.0, 0.0, 0.0, 0.0)[:4] if camera.model == "radtan" else (0.0,) * 4
+    """LENS (9,) of a camera."""
+    bent = (*camera.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5] if camera.model == "radtan" else (0.0,) * 5
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *bent])
 
 

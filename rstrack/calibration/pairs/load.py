@@ -31,7 +31,7 @@ _ROUNDS = 6
 
 
 def pair_terms(e: Engine, dataset: Dataset, free: BoolArray | None = None) -> PairTerms:
-    """The kernels of a dataset's rig, with columns for those lens and depth unknowns (29,) that are free."""
+    """The kernels of a dataset's rig, with columns for those lens and depth unknowns (31,) that are free."""
     rig = dataset.rig
     depth, color = pair_lens(rig.depth_camera, rig.depth_shutter), pair_lens(rig.color_camera, rig.color_shutter)
     return PairTerms(e, depth, color, _asked(dataset, np.zeros(COUNT, bool) if free is None else free))

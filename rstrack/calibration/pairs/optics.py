@@ -23,7 +23,7 @@ _BENDS = 8
 # About how far a change of one moves points at the image's edge, m at 1 m, and of depth 1/m² more; a fifth of it is the
 # unit of its column, since two images that nearly agree show little of it.
 _MOVES = {
-    "fx": 0.6, "fy": 0.6, "cx": 1.0, "cy": 1.0, "k1": 0.3, "k2": 0.15, "p1": 0.7, "p2": 0.7,
+    "fx": 0.6, "fy": 0.6, "cx": 1.0, "cy": 1.0, "k1": 0.3, "k2": 0.15, "p1": 0.7, "p2": 0.7, "k3": 0.08,
     "offset_m": 1.0, "inverse_offset": 1.0, "radial": 0.5,
 }  # fmt: skip
 _SHOWN = 0.2
@@ -112,6 +112,7 @@ def moves(names: Sequence[str], camera: Camera, at: Projection) -> list[Vector]:
         "fx": lambda: pixel(bent[0], zero), "fy": lambda: pixel(zero, bent[1]),
         "cx": lambda: pixel(zero + 1.0, zero), "cy": lambda: pixel(zero, zero + 1.0),
         "k1": lambda: pixel(x * r2, y * r2), "k2": lambda: pixel(x * r2 * r2, y * r2 * r2),
+        "k3": lambda: pixel(x * r2 * r2 * r2, y * r2 * r2 * r2),
         "p1": lambda: pixel(2.0 * x * y, r2 + 2.0 * y * y), "p2": lambda: pixel(r2 + 2.0 * x * x, 2.0 * x * y),
         "offset_m": lambda: along(zero + 1.0), "inverse_offset": lambda: along(-z * z),
         "radial": lambda: along(-z * z * r2),

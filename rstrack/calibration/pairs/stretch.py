@@ -25,6 +25,8 @@ from rstrack.calibration.unknowns.parameters import COUNT, POSES, Parameters
 _ACCELERATION = 3.0 * ACCELERATION
 _ENDS, _END_FACTOR = 2, 0.1
 _GAUGE = np.full(6, 1e-6)
+# Regions of an image over which a depth camera's errors are alike: a quarter of it either way.
+_REGIONS = 16
 # Frames between those that are compared: near ones tell the clocks, far ones the extrinsics.
 _APART = (1, 4, 9, 16)
 # σ at the start, m and intensity, and of gain and offset of an image against another.
@@ -60,7 +62,7 @@ class Sums:
     pixels: int
 
     def reduced(self) -> tuple[FloatArray, FloatArray]:
-        """A (29, 29) and b (29,) of the parameters alone: the control points are what the images then make of them."""
+        """A (31, 31) and b (31,) of the parameters alone: the control points are what the images then make of them."""
         x = len(self.g) - COUNT
         solved = np.linalg.solve(self.H[:x, :x], np.column_stack([self.H[:x, x:], self.g[:x]]))
         A = self.H[x:, x:] - self.H[x:, :x] @ solved[:, :COUNT]
@@ -68,7 +70,7 @@ class Sums:
         return np.asarray(0.5 * (A + A.T)), b
 
     def points_step(self, step: FloatArray) -> FloatArray:
-        """Increments (k, 6) of the control points that go with a step (29,) of the parameters."""
+        """Increments (k, 6) of the control points that go with a step (31,) of the parameters."""
         x = len(self.g) - COUNT
         moved = np.linalg.solve(self.H[:x, :x], self.g[:x] + self.H[:x, x:] @ step)
         return np.asarray(-moved.reshape(-1, 6))
@@ -91,8 +93,11 @@ class Stretch:
         """Whether nothing says yet how large its errors are."""
         return self.sigma == (START_DEPTH, START_INTENSITY)
 
-    def sums(self, terms: PairTerms, p: Parameters, level: int) -> Sums:
-        """Around the current spline; re-estimates σ and brightness on the way."""
+    def sums(self, terms: PairTerms, p: Parameters, level: int, lasting: float = 0.0) -> Sums:
+        """Around the current spline; re-estimates σ and brightness on the way.
+
+        lasting: σ of what inverse depth is off by over whole regions of all images, 1/m; see `independent_part`.
+        """
         size = 6 * len(self.spline.control_points) + COUNT
         H, g = np.zeros((size, size)), np.zeros(size)
         optics = terms.optics(p)
@@ -103,12 +108,16 @@ class Stretch:
         for kind, pair, sums, current, reference, T_base_world in self._pairs(terms, optics, p, level, depths, colors):
             sigma = self.sigma[kind]
             own, own_g = _system(sums, current, reference, T_base_world, sigma)
+            weight = 1.0
             if kind:
                 own, own_g = self._without_brightness(pair, own, own_g)
+            else:
+                weight = independent_part(sums.count, sigma, self.views[pair[1]].surface.median_depth, lasting)
+                own, own_g = weight * own, weight * own_g
             _add(H, g, own, own_g, current, reference, terms.asked.at[kind])
             weighted[kind] += sums.weighted
             counted[kind] += sums.count
-            cost += sums.cost + sums.count * np.log(sigma)
+            cost += weight * (sums.cost + sums.count * np.log(sigma))
         self._add_priors(H, g, p)
         floors = FLOOR_DEPTH, FLOOR_INTENSITY
         found = [scale_step(self.sigma[k], weighted[k], int(counted[k]), floors[k]) for k in range(2)]
@@ -181,6 +190,15 @@ class Stretch:
             at = slice(6 * model.first, 6 * model.last)
             H[at, at] += model.H
             g[at] += model.g
+
+
+def independent_part(count: int, sigma: float, median_depth: float, lasting: float) -> float:
+    """What part of `count` pixels of depth are independent measurements.
+
+    A pixel's error is noise of its own, σ in m, and what its whole region is off by, `lasting` in 1/m of inverse depth:
+    the mean over a region of n pixels has the variance σ² / n + (z² lasting)².
+    """
+    return 1.0 / (1.0 + count / _REGIONS * (lasting * median_depth**2 / sigma) ** 2)
 
 
 def partners(count: int) -> list[list[int]]:

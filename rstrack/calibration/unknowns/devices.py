@@ -77,7 +77,7 @@ def device_named(name: str) -> Device:
 
 
 def device_notes(device: Device, before: Known, used: Known, sigmas: Iterable[float]) -> tuple[str, ...]:
-    """What became of what is known of the device, `before`, when a solution was drawn to `used`; σ (29,) after."""
+    """What became of what is known of the device, `before`, when a solution was drawn to `used`; σ (31,) after."""
     notes = [f"device: {device.title}: depth {device.depth.text()}; colour {device.color.text()}"]
     for i, (sigma, known, kept) in enumerate(zip(sigmas, before.sigmas, used.sigmas, strict=True)):
         name = NAMES[i].replace("_s", "").replace("color", "colour").replace(".", " ")

@@ -26,7 +26,7 @@ _LEAST = 0.1
 
 @dataclass(frozen=True)
 class Known:
-    """values, and how sure they are: σ (29,) in the order of NAMES, in their units, infinite where nothing is known.
+    """values, and how sure they are: σ (31,) in the order of NAMES, in their units, infinite where nothing is known.
 
     aspect: σ of fy over fx, of both lenses.
     """
@@ -37,7 +37,7 @@ class Known:
 
     @property
     def information(self) -> FloatArray:
-        """The inverse covariance (29, 29), zero where nothing is known."""
+        """The inverse covariance (31, 31), zero where nothing is known."""
         found = np.diag(self.sigmas**-2.0)
         for lens in (DEPTH_LENS, COLOR_LENS):
             focal = slice(lens.start, lens.start + 2)
@@ -57,7 +57,7 @@ class Known:
         return replace(self, sigmas=np.where(np.isfinite(self.sigmas), self.sigmas, usual), aspect=ASPECT_SIGMA)
 
     def contradicted(self, found: Parameters, sigmas: FloatArray) -> BoolArray:
-        """Which (29,) of the known values a recording contradicts, by what was found with them and its σ (10,).
+        """Which (31,) of the known values a recording contradicts, by what was found with them and its σ (10,).
 
         A solution that was drawn to a right value moves away from it by as much as it gained: σ² before less σ² after.
         """
@@ -67,5 +67,5 @@ class Known:
         return is_known & (np.abs(found.since(self.values)) > _CONTRADICTS * gained)
 
     def without(self, dropped: BoolArray) -> Known:
-        """The same values, those of `dropped` (29,) for a start only."""
+        """The same values, those of `dropped` (31,) for a start only."""
         return replace(self, sigmas=np.where(dropped, np.inf, self.sigmas))

@@ -16,7 +16,7 @@ from rstrack.data.depth_error import DepthError
 Group = Literal["readout", "offset", "extrinsics", "depth", "intrinsics"]
 GROUPS: tuple[str, ...] = get_args(Group)
 
-LENS = "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"
+LENS = "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"
 DEPTH = "offset_m", "inverse_offset", "radial"
 _POSES = (
     "depth.readout_s", "color.readout_s", "color.offset_s", "color.drift",
@@ -37,7 +37,9 @@ DRIFT = NAMES.index("color.drift")
 EXTRINSICS = slice(DRIFT + 1, POSES)
 DEPTH_LENS, COLOR_LENS = slice(POSES, POSES + len(LENS)), slice(POSES + len(LENS), POSES + 2 * len(LENS))
 LENSES = np.isin(np.arange(COUNT), np.r_[DEPTH_LENS, COLOR_LENS])
-"""Which of the unknowns (29,) are lenses'."""
+"""Which of the unknowns (31,) are lenses'."""
+BY_COLOR = np.isin(np.arange(COUNT), [NAMES.index("color.readout_s"), *range(COUNT)[COLOR_LENS]])
+"""Those (31,) that are seen in colour images."""
 DEPTH_ERROR = slice(POSES + 2 * len(LENS), COUNT)
 
 _SIZES: tuple[tuple[Group, int], ...] = (
@@ -47,7 +49,7 @@ _GROUP_OF = tuple(group for group, size in _SIZES for _ in range(size))
 # How far off a camera file's lens usually is (σ): a principal point that is said to be the middle by 8 of 525 px, and
 # elements are centred, so that tangential distortion stays small. A recording that hardly turns about some axis tells
 # no principal point from tangential distortion and a turn; what lenses are like then does.
-LENS_SIGMA = np.array([0.03, 0.03, 0.015, 0.015, 0.2, 0.5, 3e-3, 3e-3])
+LENS_SIGMA = np.array([0.03, 0.03, 0.015, 0.015, 0.2, 0.5, 3e-3, 3e-3, 1.0])
 # And its pixels are as wide as high.
 ASPECT_SIGMA = 3e-3
 # And where the colour camera sits, which a lens can make up for: m, rad.
@@ -60,7 +62,7 @@ PRIOR = np.array([
 # σ above which a value is of no use: it is called undetermined and keeps what it was.
 USEFUL = np.array([
     2e-3, 2e-3, 2e-3, 5e-5, *(5e-3,) * 3, *np.radians((0.3,) * 3),
-    *(0.01, 0.01, 0.01, 0.01, 0.05, 0.2, 5e-3, 5e-3) * 2, 0.01, 5e-3, 5e-3,
+    *(0.01, 0.01, 0.01, 0.01, 0.05, 0.2, 5e-3, 5e-3, 0.5) * 2, 0.01, 5e-3, 5e-3,
 ])  # fmt: skip
 
 
@@ -70,7 +72,7 @@ class Parameters:
 
     *_readout_s: from the first line of an image to after its last, in the camera file's scan; negative: the other way
     round. Colour's stamps t are late or early: taken at t + color_offset_s + color_drift (t − epoch_s). T_color_depth
-    (4, 4): p_color from p_depth. depth_lens, color_lens (8,): changes of the cameras; depth_error (3,): see DEPTH.
+    (4, 4): p_color from p_depth. depth_lens, color_lens (9,): changes of the cameras; depth_error (3,): see DEPTH.
     """
 
     depth_readout_s: float
@@ -84,7 +86,7 @@ class Parameters:
     depth_error: FloatArray = field(default_factory=lambda: np.zeros(len(DEPTH)))
 
     def moved(self, step: FloatArray) -> Parameters:
-        """After a step (29,) in the order of NAMES."""
+        """After a step (31,) in the order of NAMES."""
         return replace(
             self,
             depth_readout_s=self.depth_readout_s + float(step[0]),
@@ -98,7 +100,7 @@ class Parameters:
         )
 
     def since(self, start: Parameters) -> FloatArray:
-        """The step (29,) that leads here from `start`."""
+        """The step (31,) that leads here from `start`."""
         T = se3.log(self.T_color_depth @ se3.inverse(start.T_color_depth))
         clocks = (
             self.depth_readout_s - start.depth_readout_s, self.color_readout_s - start.color_readout_s,
@@ -118,13 +120,13 @@ class Parameters:
 
 
 def changed(camera: Camera, lens: FloatArray) -> Camera:
-    """The camera after changes (8,) of its LENS. Raises UserError: focal lengths of nothing."""
+    """The camera after changes (9,) of its LENS. Raises UserError: focal lengths of nothing."""
     if not lens.any():
         return camera
     fx, fy, cx, cy, *bent = (float(x) for x in lens)
     distortion = camera.distortion
     if camera.model == "radtan":
-        distortion = tuple(a + b for a, b in zip(distortion, (*bent, 0.0), strict=False))
+        distortion = tuple(a + b for a, b in zip(distortion, bent, strict=False))
     return replace(
         camera, fx=camera.fx * (1.0 + fx), fy=camera.fy * (1.0 + fy), cx=camera.cx + cx * camera.fx,
         cy=camera.cy + cy * camera.fy, distortion=distortion,
@@ -132,5 +134,5 @@ def changed(camera: Camera, lens: FloatArray) -> Camera:
 
 
 def free_of(groups: Sequence[str]) -> BoolArray:
-    """Which of the unknowns (29,) belong to the groups."""
+    """Which of the unknowns (31,) belong to the groups."""
     return np.array([group in groups for group in _GROUP_OF])

@@ -1,0 +1,131 @@
+"""In which order the unknowns of a recording are found on the finest level: what colour shows first, then the rest.
+
+A depth camera is off by the same amount over whole regions of its image, in every image. That bends all poses that
+depth has a say in, and a lens bends with them: by 2 % of the focal length on a rendering of a Kinect. So where depth is
+not exact its pixels count as few measurements while the lens is looked for. Clocks, which errors that stay where they
+are do not resemble, are then found with all that depth says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rsgen.array_types import BoolArray
+from rsgen.console.progress import Progress
+from rstrack.calibration.pairs.stretch import Stretch
+from rstrack.calibration.pairs.terms import PairTerms
+from rstrack.calibration.solve import Solution, Watch, joined, solve
+from rstrack.calibration.unknowns.known import Known
+from rstrack.calibration.unknowns.parameters import BY_COLOR, COLOR_LENS, COUNT, DRIFT, LENSES, Parameters
+
+FINE = (0,)
+"""Levels of the pyramid."""
+# Part of the largest σ, over what is of use, from which on parameters are held together.
+_DRAGS = 0.5
+# Of a lens that is no better than the file's to be taken for one, the level of the tracker's tests.
+_CHANCE = 1e-3
+# For the progress bar.
+_ABOUT_STEPS = 10
+_NONE = np.zeros(COUNT, bool)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What is found so far. drifts: colour's clock may drift; kept_lens: another explains no more than the file's."""
+
+    stretches: Sequence[Stretch]
+    solution: Solution
+    drifts: bool
+    kept_lens: bool
+
+
+def in_stages(
+    stretches: Sequence[Stretch], terms_of: Callable[[BoolArray], PairTerms], known: Known, p: Parameters,
+    free: BoolArray, lasting: float, progress: Progress,
+) -> Stage:  # fmt: skip
+    """From values `p` on, with all that may change (31,).
+
+    terms_of: kernels with columns for so many of the unknowns. lasting: see `Stretch.sums`; 0: depth is exact, and all
+    is found at once.
+    """
+    terms, lens, held = terms_of(free), None, _NONE
+    if lasting and free[COLOR_LENS].any():
+        watch = progress_watch(progress, 0.3)
+        lens = solve(stretches, terms, p, free & BY_COLOR, FINE, watch, known, lasting=lasting)
+        stretches, lens, kept_lens = _paid(stretches, terms, known, lens, ~LENSES, progress, lasting)
+        held, free = (_NONE, free & ~LENSES) if kept_lens else (lens.free, free & ~BY_COLOR)
+        if not lens.finished:
+            return Stage(stretches, lens, True, kept_lens)
+        solution, drifts = _solved(stretches, terms_of(free), known, lens.values, free, held, progress)
+        return Stage(stretches, solution if kept_lens else joined(lens, solution), drifts, kept_lens)
+    solution, drifts = _solved(stretches, terms, known, p, free, _NONE, progress)
+    if not solution.finished or not solution.free[LENSES].any():
+        return Stage(stretches, solution, drifts, False)
+    stretches, solution, kept_lens = _paid(stretches, terms, known, solution, _NONE, progress)
+    return Stage(stretches, solution, drifts, kept_lens)
+
+
+def progress_watch(progress: Progress, begin: float) -> Watch:
+    """Tells a progress bar, from a part of it on, of every step."""
+    done = 0
+
+    def watch(_level: int, _step: int, p: Parameters) -> None:
+        nonlocal done
+        done += 1
+        note = f"readouts {1e3 * p.depth_readout_s:.2f} and {1e3 * p.color_readout_s:.2f} ms"
+        progress("calibrating", min(0.95, begin + 0.4 * done / _ABOUT_STEPS), note)
+
+    return watch
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _solved(
+    stretches: Sequence[Stretch], terms: PairTerms, known: Known, p: Parameters, free: BoolArray, held: BoolArray,
+    progress: Progress,
+) -> tuple[Solution, bool]:  # fmt: skip
+    """With all that may change, those `held` (31,) at `p`, then without what the recording does not tell.
+
+    And whether colour's clock may drift: one that is within its error of the file's is held there, since it would take
+    colour away at both ends of the recording.
+    """
+    file, drifts, watch = known.values, True, progress_watch(progress, 0.5)
+    while True:
+        start = file.moved(np.where(free | held, p.since(file), 0.0))
+        solution = solve(stretches, terms, start, free, FINE, watch, known)
+        unsure, p = solution.unsure, solution.values
+        if not solution.finished:
+            return solution, drifts
+        if free[DRIFT] and abs(p.color_drift - file.color_drift) < 2.0 * solution.sigmas[DRIFT]:
+            drifts, free = False, free & (np.arange(COUNT) != DRIFT)
+        elif unsure.max() > 1.0:
+            # What is told least drags others along: they may be told once it is held.
+            free = free & (unsure <= max(1.0, _DRAGS * unsure.max()))
+        else:
+            return solution, drifts
+
+
+def _paid(
+    stretches: Sequence[Stretch], terms: PairTerms, known: Known, solution: Solution, held: BoolArray,
+    progress: Progress, lasting: float = 0.0,
+) -> tuple[Sequence[Stretch], Solution, bool]:  # fmt: skip
+    """The solution with the lens that was found, or that with the file's where another does not pay, and which.
+
+    It pays if chance makes the images so much more likely in one of a thousand recordings at most. held (31,): what
+    stays as it is beside the lens.
+    """
+    if not solution.finished:
+        return stretches, solution, False
+    without = solution.free & ~LENSES
+    plain = [replace(each, brightness=dict(each.brightness)) for each in stretches]
+    start = known.values.moved(np.where(without | held, solution.values.since(known.values), 0.0))
+    watch = progress_watch(progress, 0.8)
+    other = solve(plain, terms, start, without, FINE, watch, known, lasting=lasting)
+    gain = (other.cost - solution.cost) * solution.pixels
+    if not other.finished or solution.chance(gain, LENSES) < _CHANCE:
+        return stretches, replace(solution, finished=other.finished), False
+    return plain, other, True

@@ -1,0 +1,110 @@
+"""Lenses are found by colour where depth is off by the same amount over whole regions of all its images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import yaml
+from shaken_recording import OPTIONS, READOUT_S, SHORT
+
+from rsgen.array_types import ByteArray, Float32Array
+from rstrack.calibration import run as calibration_run
+from rstrack.calibration.pairs import stretch
+from rstrack.calibration.pairs.stretch import independent_part
+from rstrack.calibration.run import calibrate
+from rstrack.calibration.solve import Solution, joined
+from rstrack.calibration.unknowns.parameters import BY_COLOR, COUNT, NAMES, Parameters
+from rstrack.data.calibration_sigma import STATED
+from rstrack.data.dataset import Dataset
+from rstrack.data.noise import ImageReader
+
+LASTING = 0.01
+
+
+@dataclass(frozen=True)
+class UnevenDepth:
+    """Images of which depth is off by a wave over the image, alike in all of them, by as much of inverse depth."""
+
+    images: ImageReader
+    by: float = LASTING
+
+    def color(self, k: int) -> ByteArray:
+        return self.images.color(k)
+
+    def depth(self, k: int) -> Float32Array:
+        z = self.images.depth(k)
+        y, x = np.mgrid[: z.shape[0], : z.shape[1]] / z.shape[1]
+        wave = np.sin(2 * np.pi * x / 0.5 + 1.0) * np.cos(2 * np.pi * y / 0.5 + 0.5) + np.sin(2 * np.pi * x)
+        return np.where(z > 0, 1 / (1 / np.maximum(z, 1e-3) + self.by * wave), 0.0).astype(np.float32)
+
+
+@pytest.fixture(autouse=True)
+def few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stretch, "_APART", (5,))
+    monkeypatch.setattr(calibration_run, "_COARSE", (1,))
+
+
+def uneven(dataset: Dataset, sigma: float) -> Dataset:
+    """With such depth and a focal length that is told wrong by 2 %; sigma: of what is said of depth, 1/m."""
+    rig, color = dataset.rig, dataset.rig.color_camera
+    lens = replace(color, fx=1.02 * color.fx, fy=1.02 * color.fy)
+    told = replace(rig, color_camera=lens, sigma=replace(STATED, depth_inverse_offset=sigma))
+    return replace(dataset, images=UnevenDepth(dataset.images), rig=told)
+
+
+def test_a_lens_is_not_bent_by_depth_that_is_off_in_the_same_way_in_all_images(shaken: Dataset) -> None:
+    true = shaken.rig.color_camera
+    errors = []
+    for sigma in (0.0, LASTING):
+        found = calibrate(uneven(shaken, sigma), ("readout", "offset", "intrinsics"), SHORT, OPTIONS)
+        assert found.solution.finished and not found.undetermined[BY_COLOR].any()
+        lens = found.calibrated().rig.color_camera
+        errors.append(abs(lens.fx / true.fx - 1.0) + abs(lens.fy / true.fy - 1.0) + abs(lens.cx - true.cx) / true.fx)
+    at_once, in_stages = errors
+    assert in_stages < 0.25 * at_once
+    assert found.values.color_readout_s == pytest.approx(READOUT_S, abs=3e-4)
+    told = yaml.safe_load(found.camera_file())
+    assert told["sigma"]["depth_image"] == 0.0 and told["sigma"]["focal"] > 0.0
+
+
+def test_independent_pixels_are_those_that_leave_the_mean_its_scatter() -> None:
+    rng = np.random.default_rng(0)
+    sigma, z, lasting, per = 4e-3, 1.5, 2e-3, 25
+    own = sigma * rng.standard_normal((4000, 16, per))
+    shared = z**2 * lasting * rng.standard_normal((4000, 16, 1))
+    count = 16 * per
+    effective = count * independent_part(count, sigma, z, lasting)
+    assert np.var((own + shared).mean(axis=(1, 2))) == pytest.approx(sigma**2 / effective, rel=0.08)
+    assert independent_part(count, sigma, z, 0.0) == 1.0
+
+
+def test_two_solutions_are_joined_with_each_others_unknowns_apart() -> None:
+    rng, p = np.random.default_rng(1), Parameters(0.02, 0.02, 0.0, 0.0, np.eye(4))
+    masks = (np.isin(NAMES, names) for names in (("color.fx", "color.readout_s"), ("depth.readout_s", "color.fy")))
+    parts = [
+        Solution(
+            p,
+            free,
+            np.array([np.diag(rng.uniform(1e4, 4e4, 2))] * 8),
+            90.0 * rng.standard_normal((8, 2)),
+            0.0,
+            1e-3,
+            1e-2,
+        )
+        for free in masks
+    ]
+    parts = [
+        replace(one, b=one.b - one.b.mean(axis=0), last_step=np.where(one.free, k + 1.0, 9.0))
+        for k, one in enumerate(parts)
+    ]
+    both = joined(*parts)
+    assert both.A.shape == (8, 4, 4) and both.b.shape == (8, 4) and (both.free == parts[0].free | parts[1].free).all()
+    for k, one in enumerate(parts):
+        own = np.ix_(range(8), one.free[both.free], one.free[both.free])
+        np.testing.assert_array_equal(both.A[own], one.A)
+        np.testing.assert_array_equal(both.b[:, one.free[both.free]], one.b)
+        assert (both.last_step[one.free] == k + 1.0).all()
+    apart = parts[0].free[both.free]
+    assert not both.A[:, apart][:, :, ~apart].any() and both.covariance.shape == (COUNT, COUNT)
