@@ -105,7 +105,8 @@ def calibrate(
             def terms_of(free: BoolArray) -> PairTerms:
                 return pair_terms(engine(options.backend), dataset, free)
 
-            return in_stages(stretches, terms_of, known, p, free, dataset.rig.sigma.depth_inverse_offset, progress)
+            is_exact = not dataset.rig.sigma.depth_inverse_offset
+            return in_stages(stretches, terms_of, known, p, free, is_exact, progress)
 
         stage = staged(known, coarse.values)
         contradicted = before.contradicted(stage.solution.values, stage.solution.sigmas)

@@ -41,7 +41,7 @@ class Solution:
 
     cost: negative log-likelihood a pixel. sigma_depth_m, sigma_intensity: of the residuals, medians. last_step (31,):
     the last one that was taken. blind (31,): σ of what no scatter shows. finished: nobody interrupted it. known
-    (31, 31): `Known.information`. pixels: that were compared.
+    (31, 31): `Known.information`. pixels: that were compared. depth_overcounts: mean over the stretches, see `Sums`.
     """
 
     values: Parameters
@@ -56,6 +56,7 @@ class Solution:
     finished: bool = True
     known: FloatArray = field(default_factory=lambda: np.zeros((COUNT, COUNT)))
     pixels: int = 1
+    depth_overcounts: float = 1.0
 
     @property
     def is_settled(self) -> bool:
@@ -97,6 +98,13 @@ class Solution:
         trace, square = float(np.trace(M)), float(np.trace(M @ M))
         return float(stats.chi2.sf(2.0 * max(gain, 0.0) * trace / square, trace**2 / square))
 
+    def gain_over(self, values: Parameters, which: BoolArray) -> float:
+        """By how much less likely images are with `which` (31,) of the unknowns at `values`, all else moved to make up
+        for it: as the log-likelihood's curvature here has it."""
+        which, step = which & self.free, self.values.since(values)
+        C = np.linalg.pinv(self.A.sum(axis=0), hermitian=True)[np.ix_(which[self.free], which[self.free])]
+        return 0.5 * float(step[which] @ np.linalg.pinv(C, hermitian=True) @ step[which])
+
     @property
     def unsure(self) -> FloatArray:
         """How much less sure the parameters (31,) are than is of use: above 1 they are not told; 0 of what is not free.
@@ -122,39 +130,39 @@ class Solution:
 
 def solve(
     stretches: Sequence[Stretch], terms: PairTerms, start: Parameters, free: BoolArray, levels: Sequence[int],
-    watch: Watch = lambda *_: None, known: Known | None = None, steps: int = _MOST_STEPS, lasting: float = 0.0,
+    watch: Watch = lambda *_: None, known: Known | None = None, steps: int = _MOST_STEPS, depth_counts: float = 1.0,
 ) -> Solution:  # fmt: skip
     """Parameters and all control points jointly, coarse to fine; the stretches' splines are moved.
 
     free (31,): which parameters may change; the others stay at `start`, to which weak ones are held by PRIOR, and to
-    what is `known` as firmly as that is. lasting: see `Stretch.sums`. Where `watch` raises KeyboardInterrupt, what has
-    been found so far is returned, `finished` False. Raises numpy.linalg.LinAlgError where images say nothing at all.
+    what is `known` as firmly as that is. depth_counts: see `Stretch.sums`. Where `watch` raises KeyboardInterrupt, what
+    has been found so far is returned, `finished` False. Raises numpy.linalg.LinAlgError where images say nothing.
     """
     known = known or Known.nothing(start)
     p, acceleration, finished, step = start, Acceleration(), True, np.zeros(COUNT)
     try:
         for stretch in stretches:
             for _ in range(_ROUNDS if stretch.is_new else 0):
-                stretch.sums(terms, p, levels[0], lasting)
+                stretch.sums(terms, p, levels[0], depth_counts)
         for level in levels:
             acceleration.forget()
             for n in range(steps):
                 watch(level, n, p)
-                sums = [stretch.sums(terms, p, level, lasting) for stretch in stretches]
+                sums = [stretch.sums(terms, p, level, depth_counts) for stretch in stretches]
                 step, sigmas = _step([one.reduced() for one in sums], p, start, known, free, acceleration)
                 for stretch, one in zip(stretches, sums, strict=True):
                     stretch.move(one.points_step(step))
                 p = p.moved(step)
                 if (np.abs(step[free]) <= _SMALL * sigmas).all():
                     break
-        sums = [stretch.sums(terms, p, levels[-1], lasting) for stretch in stretches]
+        sums = [stretch.sums(terms, p, levels[-1], depth_counts) for stretch in stretches]
         last, _ = _step([one.reduced() for one in sums], p, start, known, free)
         for stretch, one in zip(stretches, sums, strict=True):
             stretch.move(one.points_step(last))
         p = p.moved(last)
     except KeyboardInterrupt:
         finished = False
-    sums = [stretch.sums(terms, p, levels[-1], lasting) for stretch in stretches]
+    sums = [stretch.sums(terms, p, levels[-1], depth_counts) for stretch in stretches]
     reduced = [one.reduced() for one in sums]
     A, b = _of_free(reduced, free)
     depth, intensity = np.median([stretch.sigma for stretch in stretches], axis=0)
@@ -162,7 +170,19 @@ def solve(
     cost = sum(one.cost for one in sums) / pixels
     blind = _blind(stretches, terms)
     return Solution(
-        p, free, A, b, cost, float(depth), float(intensity), step, blind, finished, known.information, pixels
+        p,
+        free,
+        A,
+        b,
+        cost,
+        float(depth),
+        float(intensity),
+        step,
+        blind,
+        finished,
+        known.information,
+        pixels,
+        float(np.mean([one.depth_overcounts for one in sums])),
     )
 
 

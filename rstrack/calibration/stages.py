@@ -2,8 +2,9 @@
 
 A depth camera is off by the same amount over whole regions of its image, in every image. That bends all poses that
 depth has a say in, and a lens bends with them: by 2 % of the focal length on a rendering of a Kinect. So where depth is
-not exact its pixels count as few measurements while the lens is looked for. Clocks, which errors that stay where they
-are do not resemble, are then found with all that depth says.
+not exact colour alone finds the poses and the lens first. How far depth contradicts these poses says how many of its
+pixels count, and with so many the lens is found again. Clocks, which errors that stay where they are do not resemble,
+are then found with all of them.
 """
 
 from __future__ import annotations
@@ -30,6 +31,10 @@ _CHANCE = 1e-3
 # For the progress bar.
 _ABOUT_STEPS = 10
 _NONE = np.zeros(COUNT, bool)
+# Part of depth's pixels that counts where colour is to find the poses: it holds what no colour shows.
+_HARDLY = 1e-3
+# Steps that show what depth counts for.
+_FEW_STEPS = 4
 
 
 @dataclass(frozen=True)
@@ -44,18 +49,20 @@ class Stage:
 
 def in_stages(
     stretches: Sequence[Stretch], terms_of: Callable[[BoolArray], PairTerms], known: Known, p: Parameters,
-    free: BoolArray, lasting: float, progress: Progress,
+    free: BoolArray, is_exact: bool, progress: Progress,
 ) -> Stage:  # fmt: skip
     """From values `p` on, with all that may change (31,).
 
-    terms_of: kernels with columns for so many of the unknowns. lasting: see `Stretch.sums`; 0: depth is exact, and all
-    is found at once.
+    terms_of: kernels with columns for so many of the unknowns. is_exact: depth is, and all is found at once.
     """
     terms, lens, held = terms_of(free), None, _NONE
-    if lasting and free[COLOR_LENS].any():
+    if not is_exact and free[COLOR_LENS].any():
         watch = progress_watch(progress, 0.3)
-        lens = solve(stretches, terms, p, free & BY_COLOR, FINE, watch, known, lasting=lasting)
-        stretches, lens, kept_lens = _paid(stretches, terms, known, lens, ~LENSES, progress, lasting)
+        lens = solve(stretches, terms, p, free & BY_COLOR, FINE, watch, known, _FEW_STEPS, _HARDLY)
+        counts = 1.0 / max(1.0, lens.depth_overcounts)
+        if lens.finished:
+            lens = solve(stretches, terms, lens.values, free & BY_COLOR, FINE, watch, known, depth_counts=counts)
+        stretches, lens, kept_lens = _paid(stretches, terms, known, lens, ~LENSES, progress, counts)
         held, free = (_NONE, free & ~LENSES) if kept_lens else (lens.free, free & ~BY_COLOR)
         if not lens.finished:
             return Stage(stretches, lens, True, kept_lens)
@@ -111,20 +118,21 @@ def _solved(
 
 def _paid(
     stretches: Sequence[Stretch], terms: PairTerms, known: Known, solution: Solution, held: BoolArray,
-    progress: Progress, lasting: float = 0.0,
+    progress: Progress, depth_counts: float = 1.0,
 ) -> tuple[Sequence[Stretch], Solution, bool]:  # fmt: skip
     """The solution with the lens that was found, or that with the file's where another does not pay, and which.
 
-    It pays if chance makes the images so much more likely in one of a thousand recordings at most. held (31,): what
-    stays as it is beside the lens.
+    It pays if chance makes the images so much more likely in one of a thousand recordings at most. How likely the
+    file's lens makes them is found out unless it is plain. held (31,): what stays as it is beside the lens.
     """
-    if not solution.finished:
+    plainly = solution.chance(solution.gain_over(known.values, LENSES), LENSES) < _CHANCE**2
+    if plainly or not solution.finished:
         return stretches, solution, False
     without = solution.free & ~LENSES
     plain = [replace(each, brightness=dict(each.brightness)) for each in stretches]
     start = known.values.moved(np.where(without | held, solution.values.since(known.values), 0.0))
     watch = progress_watch(progress, 0.8)
-    other = solve(plain, terms, start, without, FINE, watch, known, lasting=lasting)
+    other = solve(plain, terms, start, without, FINE, watch, known, depth_counts=depth_counts)
     gain = (other.cost - solution.cost) * solution.pixels
     if not other.finished or solution.chance(gain, LENSES) < _CHANCE:
         return stretches, replace(solution, finished=other.finished), False

@@ -25,8 +25,6 @@ from rstrack.calibration.unknowns.parameters import COUNT, POSES, Parameters
 _ACCELERATION = 3.0 * ACCELERATION
 _ENDS, _END_FACTOR = 2, 0.1
 _GAUGE = np.full(6, 1e-6)
-# Regions of an image over which a depth camera's errors are alike: a quarter of it either way.
-_REGIONS = 16
 # Frames between those that are compared: near ones tell the clocks, far ones the extrinsics.
 _APART = (1, 4, 9, 16)
 # σ at the start, m and intensity, and of gain and offset of an image against another.
@@ -53,13 +51,15 @@ class View:
 class Sums:
     """What a stretch says at some spline and parameters, as least squares: H, g over [control points, parameters].
 
-    cost: negative log-likelihood but for its constant; pixels: that were compared.
+    cost: negative log-likelihood but for its constant; pixels: that were compared. depth_overcounts: see `overcounted`;
+    1 where all of depth's pixels count.
     """
 
     H: FloatArray
     g: FloatArray
     cost: float
     pixels: int
+    depth_overcounts: float = 1.0
 
     def reduced(self) -> tuple[FloatArray, FloatArray]:
         """A (31, 31) and b (31,) of the parameters alone: the control points are what the images then make of them."""
@@ -93,10 +93,10 @@ class Stretch:
         """Whether nothing says yet how large its errors are."""
         return self.sigma == (START_DEPTH, START_INTENSITY)
 
-    def sums(self, terms: PairTerms, p: Parameters, level: int, lasting: float = 0.0) -> Sums:
+    def sums(self, terms: PairTerms, p: Parameters, level: int, depth_counts: float = 1.0) -> Sums:
         """Around the current spline; re-estimates σ and brightness on the way.
 
-        lasting: σ of what inverse depth is off by over whole regions of all images, 1/m; see `independent_part`.
+        depth_counts: part of depth's pixels that count, as the others only repeat them.
         """
         size = 6 * len(self.spline.control_points) + COUNT
         H, g = np.zeros((size, size)), np.zeros(size)
@@ -105,24 +105,26 @@ class Stretch:
         seen = iter(lines_of([view.color for view in self.views if view.color is not None], self.spline, p))
         colors = [None if view.color is None else next(seen) for view in self.views]
         weighted, counted, cost = np.zeros(2), np.zeros(2, int), 0.0
+        by_depth = np.zeros_like(H), np.zeros_like(g)
         for kind, pair, sums, current, reference, T_base_world in self._pairs(terms, optics, p, level, depths, colors):
             sigma = self.sigma[kind]
             own, own_g = _system(sums, current, reference, T_base_world, sigma)
-            weight = 1.0
+            counts = 1.0
             if kind:
                 own, own_g = self._without_brightness(pair, own, own_g)
-            else:
-                weight = independent_part(sums.count, sigma, self.views[pair[1]].surface.median_depth, lasting)
-                own, own_g = weight * own, weight * own_g
+            elif depth_counts < 1.0:
+                counts = depth_counts
+                _add(*by_depth, own, own_g, current, reference, terms.asked.at[kind])
+                own, own_g = counts * own, counts * own_g
             _add(H, g, own, own_g, current, reference, terms.asked.at[kind])
             weighted[kind] += sums.weighted
             counted[kind] += sums.count
-            cost += weight * (sums.cost + sums.count * np.log(sigma))
+            cost += counts * (sums.cost + sums.count * np.log(sigma))
         self._add_priors(H, g, p)
         floors = FLOOR_DEPTH, FLOOR_INTENSITY
         found = [scale_step(self.sigma[k], weighted[k], int(counted[k]), floors[k]) for k in range(2)]
         self.sigma = found[0], found[1]
-        return Sums(H, g, cost, int(counted.sum()))
+        return Sums(H, g, cost, int(counted.sum()), overcounted(*by_depth) if depth_counts < 1.0 else 1.0)
 
     def read_by(self, terms: PairTerms) -> Stretch:
         """The same images and spline, to be changed by themselves, if cameras read their lines as those of `terms`."""
@@ -192,13 +194,14 @@ class Stretch:
             g[at] += model.g
 
 
-def independent_part(count: int, sigma: float, median_depth: float, lasting: float) -> float:
-    """What part of `count` pixels of depth are independent measurements.
+def overcounted(H: FloatArray, g: FloatArray) -> float:
+    """How many times too much a term counts by its H and g (see `Sums`), around control points known from elsewhere.
 
-    A pixel's error is noise of its own, σ in m, and what its whole region is off by, `lasting` in 1/m of inverse depth:
-    the mean over a region of n pixels has the variance σ² / n + (z² lasting)².
+    gᵀ H⁺ g over the rank of H, both of the control points alone: 1 in the mean where its pixels are independent.
     """
-    return 1.0 / (1.0 + count / _REGIONS * (lasting * median_depth**2 / sigma) ** 2)
+    x = len(g) - COUNT
+    inverse = np.linalg.pinv(H[:x, :x], rcond=1e-6, hermitian=True)
+    return float(g[:x] @ inverse @ g[:x] / max(1.0, np.trace(inverse @ H[:x, :x])))
 
 
 def partners(count: int) -> list[list[int]]:
