@@ -95,7 +95,9 @@ def calibrate(
         stretches = [each.read_by(terms) for each in stretches]
     residuals = residuals_at(some_of(stretches), terms, start)
     known = before.with_lenses() if "intrinsics" in groups else before
-    coarse = solve(stretches, terms, start, free, _COARSE, progress_watch(progress, 0.15), known)
+    rough = [replace(each, is_rough=True) for each in stretches]
+    coarse = solve(rough, terms, start, free, _COARSE, progress_watch(progress, 0.15), known)
+    stretches = [replace(each, is_rough=False) for each in rough]
     stage = Stage(stretches, coarse, True, False)
     if coarse.finished:
         kept = _trusted(dataset, stretches, terms, coarse.values)
@@ -148,7 +150,7 @@ def _oriented(
 
     Which of the two ways round is told by the readout's sign.
     """
-    few = stretches[:: -(-len(stretches) // _TRIED)]
+    few = [replace(each, is_rough=True) for each in stretches[:: -(-len(stretches) // _TRIED)]]
     free, found = free_of(("readout", "offset")), []
     free[DRIFT] = False
     for count, scan in enumerate(_AXES):

@@ -61,7 +61,7 @@ def in_stages(
         lens = solve(stretches, terms, p, free & BY_COLOR, FINE, watch, known, _FEW_STEPS, _HARDLY)
         counts = 1.0 / max(1.0, lens.depth_overcounts)
         if lens.finished:
-            lens = solve(stretches, terms, lens.values, free & BY_COLOR, FINE, watch, known, depth_counts=counts)
+            lens, _ = _solved(stretches, terms, known, lens.values, free & BY_COLOR, ~BY_COLOR, progress, counts)
         stretches, lens, kept_lens = _paid(stretches, terms, known, lens, ~LENSES, progress, counts)
         held, free = (_NONE, free & ~LENSES) if kept_lens else (lens.free, free & ~BY_COLOR)
         if not lens.finished:
@@ -93,7 +93,7 @@ def progress_watch(progress: Progress, begin: float) -> Watch:
 
 def _solved(
     stretches: Sequence[Stretch], terms: PairTerms, known: Known, p: Parameters, free: BoolArray, held: BoolArray,
-    progress: Progress,
+    progress: Progress, depth_counts: float = 1.0,
 ) -> tuple[Solution, bool]:  # fmt: skip
     """With all that may change, those `held` (31,) at `p`, then without what the recording does not tell.
 
@@ -103,7 +103,7 @@ def _solved(
     file, drifts, watch = known.values, True, progress_watch(progress, 0.5)
     while True:
         start = file.moved(np.where(free | held, p.since(file), 0.0))
-        solution = solve(stretches, terms, start, free, FINE, watch, known)
+        solution = solve(stretches, terms, start, free, FINE, watch, known, depth_counts=depth_counts)
         unsure, p = solution.unsure, solution.values
         if not solution.finished:
             return solution, drifts

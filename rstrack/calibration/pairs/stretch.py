@@ -80,13 +80,15 @@ class Sums:
 class Stretch:
     """Views in order of time, and the spline T_world_depth(t) that covers them all.
 
-    sigma: of depth (m) and of intensity. brightness: gain and offset of each pair (view, reference).
+    sigma: of depth (m) and of intensity. brightness: gain and offset of each pair (view, reference). is_rough: every
+    second distance between views is enough.
     """
 
     views: list[View]
     spline: Spline
     sigma: tuple[float, float] = (START_DEPTH, START_INTENSITY)
     brightness: dict[tuple[int, int], FloatArray] = field(default_factory=dict)
+    is_rough: bool = False
 
     @property
     def is_new(self) -> bool:
@@ -146,7 +148,7 @@ class Stretch:
     ) -> Iterator[tuple[int, tuple[int, int], BlockSums, Lines, Lines, FloatArray]]:  # fmt: skip
         """Kind (0 depth, 1 colour), pair, sums, lines of the current image and the reference's, T_base_world."""
         waiting = []
-        for r, others in enumerate(partners(len(self.views))):
+        for r, others in enumerate(partners(len(self.views), _APART[::2] if self.is_rough else _APART)):
             ref, surface = self.views[r], self.views[r].surface
             T_base_world = se3.inverse(self.spline.pose(ref.depth.mid_time(p)))
             ref_to_base, ref_from_base = depths[r].to_base(T_base_world), depths[r].from_base(T_base_world)
@@ -204,14 +206,14 @@ def overcounted(H: FloatArray, g: FloatArray) -> float:
     return float(g[:x] @ inverse @ g[:x] / max(1.0, np.trace(inverse @ H[:x, :x])))
 
 
-def partners(count: int) -> list[list[int]]:
-    """For each of `count` views as a reference the views that are compared with it.
+def partners(count: int, distances: Sequence[int]) -> list[list[int]]:
+    """For each of `count` views as a reference the views that are compared with it, so many frames apart.
 
     Every view is a reference as often as any other: the noise of a few would be in all that is compared with them. Of a
     pair the earlier and the later one take turns.
     """
     found: list[list[int]] = [[] for _ in range(count)]
-    for n, apart in enumerate(_APART):
+    for n, apart in enumerate(distances):
         for k in range(count - apart):
             a, b = (k, k + apart) if (k + n) % 2 else (k + apart, k)
             found[a].append(b)
