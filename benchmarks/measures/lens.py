@@ -104,7 +104,7 @@ def _wrong(camera: Camera, rng: np.random.Generator) -> Camera:
 
 
 def _errors_over_sigma(found: Calibration, true: Camera, task: Task) -> list[float]:
-    """Of the lens, the readouts and colour's clock, of those that are told."""
+    """Of the lens, the readouts and, unless a driver's stamps hide it, colour's clock, of those that are told."""
     lens, truth = found.calibrated().rig.color_camera, parameters_of(task.dataset)
     bent = (*true.distortion, *(0.0,) * 5)[:5]
     errors = [
@@ -112,5 +112,7 @@ def _errors_over_sigma(found: Calibration, true: Camera, task: Task) -> list[flo
         *(a - b for a, b in zip(lens.distortion, bent, strict=False)),
     ]  # fmt: skip
     sigmas = np.sqrt(np.diag(found.solution.covariance))[COLOR_LENS]
-    clocks = found.values.since(truth)[:3] / np.where(found.sigmas[:3] > 0.0, found.sigmas[:3], np.nan)
+    timing = task.dataset.timing
+    known = slice(0, 2 if timing is not None and timing.is_jittered else 3)
+    clocks = found.values.since(truth)[known] / np.where(found.sigmas[known] > 0.0, found.sigmas[known], np.nan)
     return [float(x) for x in (*(np.array(errors) / sigmas), *clocks) if np.isfinite(x)]
