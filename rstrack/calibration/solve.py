@@ -170,26 +170,15 @@ def solve(
     cost = sum(one.cost for one in sums) / pixels
     blind = _blind(stretches, terms)
     return Solution(
-        p,
-        free,
-        A,
-        b,
-        cost,
-        float(depth),
-        float(intensity),
-        step,
-        blind,
-        finished,
-        known.information,
-        pixels,
+        p, free, A, b, cost, float(depth), float(intensity), step, blind, finished, known.information, pixels,
         float(np.mean([one.depth_overcounts for one in sums])),
-    )
+    )  # fmt: skip
 
 
 def joined(first: Solution, then: Solution) -> Solution:
     """Of two solutions one: `then`'s, found with the parameters that `first` had found held, and `first`'s of these.
 
-    What is unknown of the others is in `first`'s covariance, what is unknown of `first`'s not in that of the others.
+    What is unknown of either's is not in the covariance of the other's.
     """
     free, A, b = first.free | then.free, [], []
     for one in (first, then):

@@ -22,8 +22,8 @@ from rstrack.calibration.solve import Solution, Watch, joined, solve
 from rstrack.calibration.unknowns.known import Known
 from rstrack.calibration.unknowns.parameters import BY_COLOR, COLOR_LENS, COUNT, DRIFT, LENSES, Parameters
 
-FINE = (0,)
-"""Levels of the pyramid."""
+# Levels of the pyramid.
+_FINE = (0,)
 # Part of the largest σ, over what is of use, from which on parameters are held together.
 _DRAGS = 0.5
 # Of a lens that is no better than the file's to be taken for one, the level of the tracker's tests.
@@ -55,24 +55,24 @@ def in_stages(
 
     terms_of: kernels with columns for so many of the unknowns. is_exact: depth is, and all is found at once.
     """
-    terms, lens, held = terms_of(free), None, _NONE
-    if not is_exact and free[COLOR_LENS].any():
-        watch = progress_watch(progress, 0.3)
-        lens = solve(stretches, terms, p, free & BY_COLOR, FINE, watch, known, _FEW_STEPS, _HARDLY)
-        counts = 1.0 / max(1.0, lens.depth_overcounts)
-        if lens.finished:
-            lens, _ = _solved(stretches, terms, known, lens.values, free & BY_COLOR, ~BY_COLOR, progress, counts)
-        stretches, lens, kept_lens = _paid(stretches, terms, known, lens, ~LENSES, progress, counts)
-        held, free = (_NONE, free & ~LENSES) if kept_lens else (lens.free, free & ~BY_COLOR)
-        if not lens.finished:
-            return Stage(stretches, lens, True, kept_lens)
-        solution, drifts = _solved(stretches, terms_of(free), known, lens.values, free, held, progress)
-        return Stage(stretches, solution if kept_lens else joined(lens, solution), drifts, kept_lens)
-    solution, drifts = _solved(stretches, terms, known, p, free, _NONE, progress)
-    if not solution.finished or not solution.free[LENSES].any():
-        return Stage(stretches, solution, drifts, False)
-    stretches, solution, kept_lens = _paid(stretches, terms, known, solution, _NONE, progress)
-    return Stage(stretches, solution, drifts, kept_lens)
+    terms = terms_of(free)
+    if is_exact or not free[COLOR_LENS].any():
+        solution, drifts = _solved(stretches, terms, known, p, free, _NONE, progress)
+        if not solution.finished or not solution.free[LENSES].any():
+            return Stage(stretches, solution, drifts, False)
+        stretches, solution, kept_lens = _paid(stretches, terms, known, solution, _NONE, progress)
+        return Stage(stretches, solution, drifts, kept_lens)
+    watch = progress_watch(progress, 0.3)
+    lens = solve(stretches, terms, p, free & BY_COLOR, _FINE, watch, known, _FEW_STEPS, _HARDLY)
+    counts = 1.0 / max(1.0, lens.depth_overcounts)
+    if lens.finished:
+        lens, _ = _solved(stretches, terms, known, lens.values, free & BY_COLOR, ~BY_COLOR, progress, counts)
+    stretches, lens, kept_lens = _paid(stretches, terms, known, lens, ~LENSES, progress, counts)
+    if not lens.finished:
+        return Stage(stretches, lens, True, kept_lens)
+    held, rest = (_NONE, free & ~LENSES) if kept_lens else (lens.free, free & ~BY_COLOR)
+    solution, drifts = _solved(stretches, terms_of(rest), known, lens.values, rest, held, progress)
+    return Stage(stretches, solution if kept_lens else joined(lens, solution), drifts, kept_lens)
 
 
 def progress_watch(progress: Progress, begin: float) -> Watch:
@@ -103,7 +103,7 @@ def _solved(
     file, drifts, watch = known.values, True, progress_watch(progress, 0.5)
     while True:
         start = file.moved(np.where(free | held, p.since(file), 0.0))
-        solution = solve(stretches, terms, start, free, FINE, watch, known, depth_counts=depth_counts)
+        solution = solve(stretches, terms, start, free, _FINE, watch, known, depth_counts=depth_counts)
         unsure, p = solution.unsure, solution.values
         if not solution.finished:
             return solution, drifts
@@ -132,7 +132,7 @@ def _paid(
     plain = [replace(each, brightness=dict(each.brightness)) for each in stretches]
     start = known.values.moved(np.where(without | held, solution.values.since(known.values), 0.0))
     watch = progress_watch(progress, 0.8)
-    other = solve(plain, terms, start, without, FINE, watch, known, depth_counts=depth_counts)
+    other = solve(plain, terms, start, without, _FINE, watch, known, depth_counts=depth_counts)
     gain = (other.cost - solution.cost) * solution.pixels
     if not other.finished or solution.chance(gain, LENSES) < _CHANCE:
         return stretches, replace(solution, finished=other.finished), False

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+import scipy.optimize
 import yaml
 from shaken_recording import OPTIONS, READOUT_S, SHORT
 
@@ -80,6 +81,22 @@ def test_a_term_that_repeats_itself_counts_so_many_times_too_much() -> None:
         H[:x, :x], g[:x] = times * J.T @ J, times * J.T @ rng.standard_normal(40)
         found.append(overcounted(H, g))
     assert np.mean(found) == pytest.approx(times, rel=0.05)
+
+
+def test_what_a_parameter_gains_is_what_the_cost_grows_by_without_it() -> None:
+    rng, free = np.random.default_rng(2), np.arange(COUNT) < 3
+    J = rng.standard_normal((50, 3)) * [1e2, 2e2, 50.0]
+    A = (J.T @ J)[None]
+    p = Parameters(0.03, 0.02, 0.01, 0.0, np.eye(4))
+    found = Solution(p, free, A, np.zeros((1, 3)), 0.0, 1e-3, 1e-2)
+    held = np.array([0.03 - 0.02, 0.02 - 0.025])  # of both readouts, from what is found
+
+    def cost(offset: float) -> float:
+        return 0.5 * float(np.square(J @ [-held[0], -held[1], offset]).sum())
+
+    wanted = scipy.optimize.minimize_scalar(cost, tol=1e-12).fun
+    other = replace(p, depth_readout_s=0.02, color_readout_s=0.025)
+    assert found.gain_over(other, np.arange(COUNT) < 2) == pytest.approx(wanted, rel=1e-6)
 
 
 def test_two_solutions_are_joined_with_each_others_unknowns_apart() -> None:
