@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rstrack.calibration.findings.lens_pixels import displacement_px, lens_map, rms, sigma_px
 from rstrack.calibration.unknowns.parameters import LENS, changed
@@ -32,6 +33,14 @@ def test_sigma_of_points_is_what_drawn_lenses_scatter_by() -> None:
     inside = np.isfinite(scatter)
     np.testing.assert_allclose(sigma_px(BENT, root @ root.T)[inside], scatter[inside], rtol=0.15)
     assert np.count_nonzero(inside) > 500
+
+
+@pytest.mark.parametrize("part", [-1.2, float("nan")])
+def test_a_lens_that_nothing_holds_is_said_in_one_line(part: float) -> None:
+    step = np.zeros(len(LENS))
+    step[1] = part
+    with pytest.raises(UserError, match=r"nothing in these frames holds the focal length: choose --frames"):
+        changed(BENT, step)
 
 
 def test_a_picture_has_some_of_the_points_each_with_its_displacement_and_sigma() -> None:

@@ -9,6 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from rsgen.array_types import BoolArray, FloatArray
+from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rstrack.data.depth_error import DepthError
@@ -120,10 +121,15 @@ class Parameters:
 
 
 def changed(camera: Camera, lens: FloatArray) -> Camera:
-    """The camera after changes (9,) of its LENS. Raises UserError: focal lengths of nothing."""
+    """The camera after changes (9,) of its LENS. Raises UserError: focal lengths that nothing holds."""
     if not lens.any():
         return camera
     fx, fy, cx, cy, *bent = (float(x) for x in lens)
+    if not (fx > -1.0 and fy > -1.0):
+        raise UserError(
+            "nothing in these frames holds the focal length: choose --frames that turn before print, or leave "
+            "'intrinsics' out of --free"
+        )
     distortion = camera.distortion
     if camera.model == "radtan":
         distortion = tuple(a + b for a, b in zip(distortion, bent, strict=False))
