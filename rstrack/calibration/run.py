@@ -20,9 +20,10 @@ from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan
 from rsgen.geometry.spline import Spline
+from rstrack.calibration.findings.motion import motion_of
 from rstrack.calibration.findings.pace import pace_of
 from rstrack.calibration.findings.residuals import residuals_at, residuals_now, some_of
-from rstrack.calibration.findings.result import Calibration, motion_of
+from rstrack.calibration.findings.result import Calibration
 from rstrack.calibration.first_track import Track, first_track
 from rstrack.calibration.pairs.load import load_stretch, pair_terms
 from rstrack.calibration.pairs.stretch import Stretch

@@ -13,8 +13,8 @@ from rsgen.array_types import BoolArray, FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter
-from rsgen.geometry.spline import Spline
 from rstrack.calibration.findings.lens_pixels import displacement_px, lens_map, rms, sigma_px
+from rstrack.calibration.findings.motion import Motion
 from rstrack.calibration.findings.pace import Pace, since_begin
 from rstrack.calibration.findings.residuals import Residuals
 from rstrack.calibration.solve import Solution
@@ -58,30 +58,6 @@ _NEEDS = (
     *(("turning about all axes, so that all of the image sees texture",) * len(LENS)),
     *(("surfaces near and far, seen from near and far",) * 3),
 )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Motion:
-    """Mean speeds in the stretches that were used, m/s and rad/s, and the changes of the latter, rad/s²."""
-
-    speed: float
-    rotation: float
-    change: float
-
-    def text(self) -> str:
-        """In plain words."""
-        return (
-            f"this recording moves at {self.speed:.2f} m/s and turns at {np.degrees(self.rotation):.1f} deg/s, which "
-            f"changes by {np.degrees(self.change):.0f} deg/s a second"
-        )
-
-
-def motion_of(dataset: Dataset, parts: Sequence[range], track: Spline) -> Motion:
-    """Of the stretches of frames that were used, by the track."""
-    stamps = np.concatenate([dataset.stamps[part.start : part.stop] for part in parts])
-    v, a = track.velocity(stamps), track.acceleration(stamps)
-    means = [float(np.linalg.norm(x, axis=1).mean()) for x in (v[:, :3], v[:, 3:], a[:, 3:])]
-    return Motion(*means)
 
 
 @dataclass(frozen=True)
