@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,7 +27,7 @@ from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.metrics.association import angles_deg
 from rstrack.options import Options
-from rstrack.tracking.judgement.lost_track import FitHistory
+from rstrack.tracking.judgement.lost_track import lost
 from rstrack.tracking.window import Window
 
 # What a frame is moved by, in metres and degrees, and multiples of it; 0 tells how good the truth itself is as a start.
@@ -111,11 +110,9 @@ def run_trials(
         t = new.depth.exposure.mid_time
         T_true = truth.pose(t)
         off_m = max(off_m, float(np.linalg.norm(spline.pose(t)[:3, 3] - T_true[:3, 3])))
-        fits = FitHistory()
         for factor in FACTORS:
             state = moved_state(spline, new, pair, factor)
-            # The start from the truth itself comes first: from it the tracker knows how well frames fit as a rule.
-            steps, believed = aligner.align(new, ref, state, copy.deepcopy(fits) if factor else fits)
+            steps, believed = aligner.align(new, ref, state)
             T = state.spline.pose(t)
             error = float(np.linalg.norm(T[:3, 3] - T_true[:3, 3])), float(angles_deg(T_true[None], T[None])[0])
             trials.append(Trial(factor, *error, steps, believed))
@@ -216,12 +213,12 @@ class Aligner:
         """Onto the device."""
         return self._device.upload(k, frame)
 
-    def align(self, new: DeviceFrame, ref: Reference, state: SplineState, fits: FitHistory) -> tuple[int, bool]:
-        """Move the state's control points that the frame touches; steps, and whether `fits` accepts the result."""
+    def align(self, new: DeviceFrame, ref: Reference, state: SplineState) -> tuple[int, bool]:
+        """Move the state's control points that the frame touches; steps, and whether the tracker accepts the result."""
         window = Window(self._terms, self._focal, state, state.segment(new.first_time))
         fresh = observe(new, ref, self._options)
         solved = window.solve(fresh)
-        return solved.iterations, not fits.fault(fresh, solved, ref.pixels)
+        return solved.iterations, not lost(fresh, solved, ref.pixels)
 
 
 def _span(dataset: Dataset, k: int) -> tuple[float, float]:

@@ -13,13 +13,11 @@ from rsgen.geometry.spline import Spline
 from rstrack.alignment import brightness
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.observation import Observation, observe
-from rstrack.alignment.optimizer import Problem, Solved, optimise
+from rstrack.alignment.optimizer import MOST_STEPS, Problem, Solved, optimise
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference
 from rstrack.options import Options
-
-_MOST_STEPS = (15, 8, 30)
 
 Judge = Callable[[Sequence[Observation], Solved, SplineState, Reference], tuple[str, FloatArray]]
 """Why a frame's images have not been found at a keyframe, empty if they have; and what they know of its pose (6, 6)."""
@@ -30,11 +28,24 @@ class Alignment:
     """T_ref_cam (4, 4) of a frame at mid readout in a keyframe, and what is known of it.
 
     information (6, 6): of increments T_ref_cam exp(ξ) as far as the images agree. fault: why it is none; '' if it is.
+    fresh, solved: its images, and what the optimisation did.
     """
 
     T_ref_cam: FloatArray
     information: FloatArray
     fault: str
+    fresh: Sequence[Observation]
+    solved: Solved
+
+    @property
+    def pixels(self) -> int:
+        """Of its images that count."""
+        return sum(o.pixels for o in self.fresh if o.is_linearised)
+
+    @property
+    def sigma_m(self) -> float:
+        """Scale of its depth's residuals, m; infinite without any."""
+        return min((o.lin.next_sigma for o in self.fresh if o.is_depth and o.is_linearised), default=np.inf)
 
 
 def align(
@@ -56,12 +67,12 @@ def align(
         o.independent = 1.0 / inflations[not o.is_depth]
     problem = Problem(fresh, (), (state.first, state.end), (), ref.lens.camera.fx, rigid=True)
     try:
-        solved = optimise(terms, state, problem, levels, _MOST_STEPS)
+        solved = optimise(terms, state, problem, levels, MOST_STEPS)
     except np.linalg.LinAlgError:
         solved = Solved()
     T = se3.inverse(ref.T_world_base) @ state.spline.pose(mid)
     fault, information = judge(fresh, solved, state, ref)
-    return Alignment(T, information, fault)
+    return Alignment(T, information, fault, fresh, solved)
 
 
 def _placed(motion: Spline, frame: DeviceFrame, G: FloatArray) -> SplineState:

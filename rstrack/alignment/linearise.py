@@ -160,17 +160,9 @@ class Terms:
 
         return finish
 
-    def geometric_pose(
-        self, image: DepthImage, ref: Reference, T_base_cam: FloatArray, level: int, sigma: float
-    ) -> tuple[BlockSums, float]:
-        """The same for a global-shutter image at one pose (4, 4) against a rectified reference: sums and next σ (m)."""
-        to_base = self.e.upload(np.concatenate([T_base_cam[:3, :3].ravel(), T_base_cam[:3, 3]]))
-        sums = self._geometric_sums(image, ref, to_base, self.e.upload(IDENTITY_FROM_BASE), level, sigma)().summed()
-        return sums, scale_step(sigma, sums.weighted, sums.count, self._floor_depth(image, ref))
-
     def _geometric_sums(
         self, image: DepthImage, ref: Reference, to_base: Any, from_base: Any, level: int, sigma: float,
-        shifts: bool = False,
+        shifts: bool,
     ) -> Callable[[], BlockSums]:  # fmt: skip
         e, lens = self.e, image.exposure.lens
         stride = _stride(lens, level)

@@ -33,6 +33,8 @@ _NOISE_SHARE, _MOST_TOLERANCE_PX = 0.1, 0.08
 _NOISY, _LAST, _MATTERS = 2.0, (1.0, 10.0, 10.0), 2.0
 # Rise of the negative log-likelihood per pixel from which on a step has made things worse: less is noise of gating.
 _WORSE = 2e-5
+MOST_STEPS = (15, 8, 30)
+"""Steps at most on the levels of the pyramid, finest first."""
 
 
 @dataclass

@@ -61,7 +61,9 @@ def _information(seen: Sequence[_Seen], state: SplineState) -> FloatArray:
     for o, H, _ in seen:
         turn = np.kron(np.eye(2), state.spline.pose(o.image.exposure.mid_time)[:3, :3])
         total += turn.T @ H[:6, :6] @ turn
-    return total
+    values, basis = np.linalg.eigh(total)
+    # Of a motion that no pixel sees rounding may leave less than nothing, which would pass for knowledge when inverted.
+    return total if values[0] >= 0.0 else np.asarray((basis * np.maximum(values, 0.0)) @ basis.T)
 
 
 def _score(seen: Sequence[_Seen]) -> float:

@@ -15,6 +15,7 @@ from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.frame_report import FrameReport
 from rstrack.tracking.judgement.fault import Fault
 from rstrack.tracking.judgement.innovation import disagreement
+from rstrack.tracking.judgement.lost_track import lost
 from rstrack.tracking.moving.leave_out import LeftOut, left_out_with, without
 from rstrack.tracking.moving.majority import not_with_most
 from rstrack.tracking.succession import LEAST_DEPTH
@@ -86,9 +87,8 @@ def bootstrap(track: Track, new: DeviceFrame) -> FrameReport:
         levels = LEVELS if moves else (1, 0)
         solved = window.solve([*earlier, *fresh], levels, gauge=ref, coupled=True, before_finest=leave_out_all)
         window.active = earlier
-    if track.fits.fault(fresh, solved, ref.pixels):
+    if lost(fresh, solved, ref.pixels):
         return _begin_anew(track, new)
-    track.fits.learn(fresh)
     window.keep(fresh)
     recent = track.succession.recent
     recent.append(new)

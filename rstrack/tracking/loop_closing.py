@@ -137,14 +137,13 @@ def graph_of(tracker: Tracker, keyframes: Archive) -> Graph:
 
 def judge_of(tracker: Tracker) -> Judge:
     """Judges a loop as a frame that nothing predicts, by what the track has learnt of its images and cameras."""
-    fits, covariances = tracker.fits, tracker.covariances
     # The tracker must go on to the same bits, whether or not loops are looked for.
-    covariances = replace(covariances, calibration=covariances.calibration.anew())
+    covariances = replace(tracker.covariances, calibration=tracker.covariances.calibration.anew())
 
     def judge(
         fresh: Sequence[Observation], solved: Solved, state: SplineState, ref: Reference
     ) -> tuple[str, FloatArray]:  # fmt: skip
-        fault, score, _ = judge_alone(fits, covariances, fresh, solved, state, ref.pixels)
+        fault, score, _ = judge_alone(covariances, fresh, solved, state, ref.pixels)
         return fault.value, score.information
 
     return judge

@@ -16,7 +16,7 @@ from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.judgement.common import Common
 from rstrack.tracking.judgement.fault import Fault
 from rstrack.tracking.judgement.innovation import Innovation, Prediction, disagreement, doubt, learnt, weighed
-from rstrack.tracking.judgement.lost_track import FitHistory, implausible, is_settled
+from rstrack.tracking.judgement.lost_track import implausible, is_hopeless, is_settled, lost, misfits
 from rstrack.tracking.judgement.pose_covariances import PoseCovariances
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.moving.leave_out import LeftOut
@@ -69,26 +69,26 @@ def match(
 
     begin: makes that window. last: depth of the frame before, since what moved in it does not fit here either.
     """
-    fits, moving = track.fits, 0.0 if last is None else last.moving
+    moving = 0.0 if last is None else last.moving
 
-    def is_hopeless(seen: Sequence[Observation]) -> bool:
-        return fits.is_hopeless(seen, moving)
+    def hopeless(seen: Sequence[Observation]) -> bool:
+        return is_hopeless(seen, moving)
 
     def leave_out() -> None:
-        if not is_hopeless(found.fresh):
+        if not hopeless(found.fresh):
             (found.left,) = track.leave_out([new], ref, found.fresh, found.window.state, last)
 
-    def solve(hopeless: Callable[[Sequence[Observation]], bool] | None) -> None:
+    def solve(stops: Callable[[Sequence[Observation]], bool] | None) -> None:
         gauge = _gauge(found.window, new, ref)
-        found.solved = found.window.solve(found.fresh, levels, gauge, _rolls(ref), hopeless, leave_out)
+        found.solved = found.window.solve(found.fresh, levels, gauge, _rolls(ref), stops, leave_out)
 
     window = begin()
     found = Match(new, ref, window, window.spline, fresh, Solved(), LeftOut(new.depth))
-    solve(is_hopeless)
-    if not is_settled(found.solved) and not fits.is_hopeless(fresh):
+    solve(hopeless)
+    if not is_settled(found.solved) and not is_hopeless(fresh):
         found.again()
-    fitting = without_misfits(track, fresh, ref)
-    if len(fitting) < len(fresh) and not fits.is_hopeless(found.on_reference):
+    fitting = without_misfits(fresh, ref)
+    if len(fitting) < len(fresh) and not is_hopeless(found.on_reference):
         found.window, found.fresh, found.whole = begin(), fitting, False
         solve(None)
     return found
@@ -101,7 +101,7 @@ def judge_predicted(track: Track, found: Match, gap: float, young: bool) -> Verd
     to it, which tells nothing of the two together; a gyroscope sees how lines move within an image that vibrates, which
     the filter does not; and under the wrong shutter all images are off: then no prediction is held against them.
     """
-    fits, new, fresh, window = track.fits, found.frame, found.fresh, found.window
+    new, fresh, window = found.frame, found.fresh, found.window
     uncertainty, common = track.covariances.uncertainty, track.covariances.common
     mid, rolls = new.depth.exposure.mid_time, _rolls(found.ref)
     T_predicted, seconds = found.predicted.pose(mid), new.stamp - track.found.stamps[-1]
@@ -109,7 +109,7 @@ def judge_predicted(track: Track, found: Match, gap: float, young: bool) -> Verd
     considered = track.covariances.considered(seconds)
     state = uncertainty.predicted(seconds, *accelerations)
     predicted, innovation = Prediction.of(found.predicted, mid, state, track.last_two(new)), Innovation()
-    weighs = not rolls and not track.has_gyro and fits.is_modelled and not fits.is_hopeless(fresh)
+    weighs = not rolls and not track.has_gyro and track.is_modelled and not is_hopeless(fresh)
     if weighs and not young:
         innovation = weighed(fresh, window.state, predicted, considered)
         if innovation.inflation > 1.0:
@@ -117,7 +117,7 @@ def judge_predicted(track: Track, found: Match, gap: float, young: bool) -> Verd
     on_reference = found.on_reference
     with track.terms.timer("judgement"):
         score = scores(on_reference, window.state)
-        fault = fits.fault(on_reference, found.solved, found.ref.pixels, young)
+        fault = lost(on_reference, found.solved, found.ref.pixels)
         if not rolls:
             uncertainty = uncertainty.after(seconds, score.information, *accelerations)
             common = track.covariances.after(seconds, uncertainty, on_reference, window.state, score)
@@ -131,30 +131,23 @@ def judge_predicted(track: Track, found: Match, gap: float, young: bool) -> Verd
             usual = uncertainty.systematic.usual_inflation
             more = uncertainty.doubt + disagreement(on_reference, window.state, considered, usual)
             uncertainty = replace(uncertainty, doubt=more)
-    if not fault:
-        fits.learn(on_reference)
-        if implausible(T_predicted, window.spline.pose(mid), gap):
-            fault = Fault.MOTION
+    if not fault and implausible(T_predicted, window.spline.pose(mid), gap):
+        fault = Fault.MOTION
     return Verdict(fault or _unknown(uncertainty), score, uncertainty, common)
 
 
 def judge_unpredicted(track: Track, found: Match) -> Verdict:
     """Whether a frame was found where nothing led."""
     covariances, state = track.covariances, found.window.state
-    fault, score, uncertainty = judge_alone(
-        track.fits, covariances, found.fresh, found.solved, state, found.ref.pixels
-    )  # fmt: skip
+    fault, score, uncertainty = judge_alone(covariances, found.fresh, found.solved, state, found.ref.pixels)
     if not found.whole:
         fault = Fault.MISFIT
-    if not fault:
-        track.fits.learn(found.fresh)
     common = covariances.after(0.0, uncertainty, found.fresh, state, score)
     return Verdict(fault, score, uncertainty, common)
 
 
 def judge_alone(
-    fits: FitHistory, covariances: PoseCovariances, fresh: Sequence[Observation], solved: Solved, state: SplineState,
-    expected: int,
+    covariances: PoseCovariances, fresh: Sequence[Observation], solved: Solved, state: SplineState, expected: int
 ) -> tuple[Fault, Scores, Uncertainty]:  # fmt: skip
     """Whether a frame was found, by its images alone: by all of them, as one is alike in many places.
 
@@ -162,7 +155,7 @@ def judge_alone(
     """
     score = scores(fresh, state)
     uncertainty = covariances.uncertainty.found_anew(score.information)
-    fault = fits.fault(fresh, solved, expected, new=True)
+    fault = lost(fresh, solved, expected)
     if not fault:
         usual = uncertainty.systematic.usual_inflation
         apart = disagreement(fresh, state, covariances.considered(0.0), usual)
@@ -170,18 +163,18 @@ def judge_alone(
     return fault or _unknown(uncertainty), score, uncertainty
 
 
-def without_misfits(track: Track, fresh: list[Observation], ref: Reference) -> list[Observation]:
+def without_misfits(fresh: list[Observation], ref: Reference) -> list[Observation]:
     """What is left to align by if a frame's colour images do not fit, or its depth has none to show.
 
     Where depth does not fit either, the colours may be what drew it away.
     """
     on_reference = [o for o in fresh if o.ref.index == ref.index]
-    misfits = [o for o, _ in track.fits.misfits(on_reference, ref.pixels)]
+    unfit = [o for o, _ in misfits(on_reference, ref.pixels)]
     empty = [o for o in fresh if isinstance(o.image, DepthImage) and o.image.count == 0]
-    odd_colors = [o for o in misfits if not o.is_depth]
+    odd_colors = [o for o in unfit if not o.is_depth]
     if odd_colors and len(odd_colors) < len(on_reference) and not empty:
         return [o for o in fresh if all(o.image is not odd.image for odd in odd_colors)]
-    if empty and len(misfits) == 1 and misfits[0].is_depth:
+    if empty and len(unfit) == 1 and unfit[0].is_depth:
         return [o for o in fresh if not o.is_depth]
     return fresh
 

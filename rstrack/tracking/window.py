@@ -11,7 +11,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.normal_equations import assemble, solve_damped
 from rstrack.alignment.observation import Observation
-from rstrack.alignment.optimizer import Problem, Solved, optimise
+from rstrack.alignment.optimizer import MOST_STEPS, Problem, Solved, optimise
 from rstrack.alignment.priors import (
     ACCELERATION,
     VELOCITY,
@@ -40,8 +40,6 @@ TRACKING_LEVELS, LEVELS = (1, 0), (2, 1, 0)
 # Steps from constant velocity to what an IMU says of the motion since the last frame, and a step (m, rad) that is the
 # last one.
 _LED_STEPS, _LED = 4, 1e-2
-# Steps at most on the pyramid's levels, finest first.
-_MOST_STEPS = (15, 8, 30)
 
 
 class Window:
@@ -162,7 +160,7 @@ class Window:
         problem = Problem(fresh, self.active, free, priors, self._focal, bandwidth, predicted=self._is_held)
         try:
             with self._terms.timer("optimiser"):
-                return optimise(self._terms, self.state, problem, levels, _MOST_STEPS, hopeless, before_finest)
+                return optimise(self._terms, self.state, problem, levels, MOST_STEPS, hopeless, before_finest)
         except np.linalg.LinAlgError:
             # The images say nothing about some motion, not even with the prior: as lost as can be.
             return Solved()

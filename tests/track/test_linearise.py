@@ -151,29 +151,8 @@ def test_row_shift_is_the_movement_in_pixels() -> None:
     assert lin.row_shift(own(turn), 48.0, 2.0) == 0.0
 
 
-# -- one pose ---------------------------------------------------------------------------------------------------------
-
-
 def still(T_world_depth: np.ndarray) -> Spline:
     return Spline(np.repeat(T_world_depth[None], 5, axis=0), -1.0, 2.0)
-
-
-@pytest.mark.parametrize("level", [0, 2])
-def test_geometric_pose_is_the_geometric_term_of_a_camera_at_rest(level: int) -> None:
-    # By four control points that move alike, increments of the spline are those of the pose, but in the world frame.
-    motion, image = synthetic.make_spline(0.7), exposure(0.02, None)
-    terms, T_a, T_b = shipped(), motion.pose(0.0), motion.pose(0.02)
-    seen = depth_input(synthetic.cast, still(T_b), image)
-    ref = maker(image.lens.camera).rectified(1, depth_input(synthetic.cast, still(T_a), image), (), still(T_a), None)
-    T_off = T_b @ se3.exp(np.array([1e-3, -2e-3, 1e-3, 2e-3, 1e-3, -1e-3]))
-    sigma = 2e-3
-    sums, next_sigma = terms.geometric_pose(seen, ref, se3.inverse(T_a) @ T_off, level, sigma)
-    whole = terms.geometric(seen, ref, still(T_off), level, sigma)()
-    assert (sums.count, sums.cost, next_sigma) == (whole.count, whole.cost, whole.next_sigma)
-    together = np.tile(np.eye(6), (4, 1)) @ se3.adjoint(T_a)
-    H, g = together.T @ whole.model.H @ together, together.T @ whole.model.g
-    np.testing.assert_allclose(sums.H[0, 0] / sigma**2, H, rtol=1e-9, atol=1e-9 * np.abs(H).max())
-    np.testing.assert_allclose(sums.g[0, 0] / sigma, g, rtol=1e-9, atol=1e-9 * np.abs(g).max())
 
 
 @pytest.mark.parametrize(("rows", "least", "most"), [(1, 0.3, 2.5), (8, 3.0, 40.0)])
@@ -315,8 +294,6 @@ def test_rounding_of_depth_is_a_floor_too() -> None:
         want = max(2e-4, step * median_depth**2 / np.sqrt(12.0))
         lin = coarse.term(s.truth, 1e-3)
         assert lin.floor == pytest.approx(want) and lin.next_sigma >= want
-        _, next_sigma = s.terms.geometric_pose(coarse.image, s.ref, np.eye(4), 0, 1e-3)  # type: ignore[arg-type]
-        assert next_sigma >= want
     assert want > 1e-3  # the second one counted, the first did not
 
 

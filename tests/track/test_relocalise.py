@@ -16,7 +16,6 @@ from rstrack.alignment.score import Scores
 from rstrack.images.pyramid import DepthImage
 from rstrack.tracking import matching
 from rstrack.tracking.judgement.fault import Fault
-from rstrack.tracking.judgement.lost_track import FitHistory
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.matching import Match, judge_unpredicted, without_misfits
 from rstrack.tracking.relocalise import Relocaliser, where_led
@@ -32,20 +31,17 @@ def seen(kind: str, fit: float = 1.0) -> Any:
     return SimpleNamespace(is_depth=kind == "depth", is_linearised=True, lin=lin, pixels=5000, ref=REF, image=image)
 
 
-TRACK: Any = SimpleNamespace(fits=FitHistory())
-
-
 @pytest.mark.parametrize("depth_fit", [1.0, 0.3])
 def test_colours_that_do_not_fit_are_left_out_whatever_depth_does(depth_fit: float) -> None:
     depth, odd, good = seen("depth", depth_fit), seen("color", 0.1), seen("color")
-    assert without_misfits(TRACK, [depth, odd, good], REF) == [depth, good]
+    assert without_misfits([depth, odd, good], REF) == [depth, good]
 
 
 def test_what_fits_and_what_stands_alone_stays() -> None:
     depth, color = seen("depth"), seen("color")
-    assert without_misfits(TRACK, [depth, color], REF) == [depth, color]
+    assert without_misfits([depth, color], REF) == [depth, color]
     odd = seen("color", 0.1)
-    assert without_misfits(TRACK, [odd], REF) == [odd]
+    assert without_misfits([odd], REF) == [odd]
 
 
 def test_a_place_is_found_by_all_of_a_frame_s_images_only(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -53,7 +49,7 @@ def test_a_place_is_found_by_all_of_a_frame_s_images_only(monkeypatch: pytest.Mo
     monkeypatch.setattr(matching, "scores", lambda *_: Scores((1.0,) * 3, 1e8 * np.eye(6)))
     monkeypatch.setattr(matching, "disagreement", lambda *_: np.zeros((12, 12)))
     covariances = SimpleNamespace(uncertainty=Uncertainty(), after=lambda *_: None, considered=lambda _: None)
-    track: Any = SimpleNamespace(fits=FitHistory(), covariances=covariances)
+    track: Any = SimpleNamespace(covariances=covariances)
     for whole, says in ((True, Fault.NONE), (False, Fault.MISFIT)):
         given: list[Any] = [None, REF, SimpleNamespace(state=None), None, [seen("depth")], Solved(last_shift=0.0), None]
         assert judge_unpredicted(track, Match(*given, whole)).fault is says

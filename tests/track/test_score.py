@@ -11,6 +11,7 @@ from pose_terms import PoseTerms, sighting
 from rstrack_util import hand_held
 
 from rsgen.geometry import se3
+from rstrack.alignment import score
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.score import Scores, scores
 from rstrack.alignment.spline_state import SplineState
@@ -70,6 +71,16 @@ def test_they_are_those_of_the_state_not_of_the_linearisation() -> None:
     state, one = SplineState(TRUTH), sight((2e-3, 0, 0))
     state.apply(0, np.tile([2e-3, 0.0, 0.0, 0.0, 0.0, 0.0], (len(state.points), 1)))
     assert scores([one], state).sigmas[0] < 0.1
+
+
+def test_what_rounding_leaves_of_an_unseen_motion_is_no_information(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regression: inverted, an information below zero is a small covariance, and a pose that slid was known."""
+    H = np.diag([4.0, 3.0, -1e-3, 5.0, 6.0, 7.0, *np.ones(6)])
+    monkeypatch.setattr(score, "steady", lambda *_: (H, np.zeros(12)))
+    R = SplineState(TRUTH).spline.pose(MID)[:3, :3]
+    turn = np.kron(np.eye(2), R)
+    want = turn.T @ np.diag([4.0, 3.0, 0.0, 5.0, 6.0, 7.0]) @ turn
+    np.testing.assert_allclose(scores([sight()], SplineState(TRUTH)).formal, want, atol=1e-12)
 
 
 def test_pulls_are_counted_in_sigmas_of_what_the_images_tell() -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
-from statistics import median
 
 import numpy as np
 
@@ -14,17 +12,14 @@ from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Solved
 from rstrack.tracking.judgement.fault import Fault
 
-# A term has to see this share of the reference's pixels, and so many at least, to say anything.
+# A term has to see this share of the reference's pixels to say anything.
 _LEAST_SHARE = 0.08
-_LEAST_PIXELS = 60
 # Part of the compared pixels that must not be outliers for certain (real recordings: 0.88 and 0.98 at least).
 _LEAST_FIT_DEPTH, _LEAST_FIT_COLOR = 0.65, 0.8
 # Scales that no aligned images have (m at one metre, growing with the distance; intensity).
 _WORST_DEPTH, _WORST_INTENSITY = 0.03, 0.12
-# In a piece of the track that has just begun nothing of its own says yet what is right: growth there over the last
-# frames' median (of 481 frames found under vibration all but one stayed within 3.0; that one, at 4.5, was 26 mm off),
-# and what is harmless anyway, since a camera at rest repeats its rounding.
-_NEW_GROWTH, _HARMLESS_DEPTH, _HARMLESS_INTENSITY = 3.5, 2e-3, 0.03
+# A scale of the intensities that says nothing about a keyframe without contrast.
+_HARMLESS_INTENSITY = 0.03
 # At coarse levels, before all is aligned, scales are up to 1.3 times these limits, and 2 to 50 where nothing fits.
 _HOPELESS = 2.0
 # Lines that still move so far (pixels) have not been found.
@@ -33,84 +28,45 @@ _WORST_SHIFT_PX = 2.0
 # and rad/s, and what is always allowed.
 _MOST_ACCELERATION, _MOST_VELOCITY = np.array([100.0, 200.0]), np.array([4.0, 8.0])
 _ALWAYS = np.array([0.05, np.radians(4.0)])
-_MEMORY = 30
 # The distance (m) below which limits shrink no further.
 _CLOSE = 0.5
 
 
-class FitHistory:
-    """Remembers how well the last good frames fitted.
+def misfits(fresh: Sequence[Observation], expected: int) -> list[tuple[Observation, Fault]]:
+    """Observations that do not fit, and why. expected: pixels that a whole image puts on the reference."""
+    return [(o, why) for o in fresh if (why := _misfit(o, expected))]
 
-    is_modelled: whether the lines' times are; taken for a global one, a rolling shutter makes both terms fit worse
-    whenever the camera moves fast.
+
+def lost(fresh: Sequence[Observation], solved: Solved, expected: int) -> Fault:
+    """Why a frame has not been found, `Fault.NONE` if it has. expected: as in `misfits`."""
+    if not any(o.is_linearised and o.pixels for o in fresh):
+        return Fault.NOTHING_SEEN
+    if not is_settled(solved):
+        return Fault.UNSETTLED
+    return next((why for _, why in misfits(fresh, expected)), Fault.NONE)
+
+
+def is_hopeless(fresh: Sequence[Observation], moving: float = 0.0) -> bool:
+    """Whether no term of a frame, aligned at a coarse level, fits so far that it could at a finer one.
+
+    moving: part of the pixels that need not fit, as they may be left out yet since they move by themselves.
     """
+    return not any(
+        o.is_linearised and o.lin.fit >= (1.0 - moving) * _least_fit(o) and o.lin.next_sigma <= _HOPELESS * _limit(o)
+        for o in fresh
+    )
 
-    def __init__(self, is_modelled: bool = True) -> None:
-        self.is_modelled = is_modelled
-        self.forget()
 
-    def forget(self) -> None:
-        """Nothing is usual yet."""
-        # Depth's scales as they would be at one metre.
-        self._depth: deque[float] = deque(maxlen=_MEMORY)
-        self._color: deque[float] = deque(maxlen=_MEMORY)
-
-    def misfits(self, fresh: Sequence[Observation], expected: int) -> list[tuple[Observation, Fault]]:
-        """Observations that do not fit, and why. expected: pixels that a whole image puts on the reference."""
-        return [(o, why) for o in fresh if (why := self._misfit(o, expected))]
-
-    def fault(self, fresh: Sequence[Observation], solved: Solved, expected: int, new: bool = False) -> Fault:
-        """Why a frame has not been found, `Fault.NONE` if it has.
-
-        expected: as in `misfits`. new: whether its piece has just begun.
-        """
-        if not fresh or not any(o.is_linearised for o in fresh):
-            return Fault.NOTHING_SEEN
-        if not is_settled(solved):
-            return Fault.UNSETTLED
-        misfits = self.misfits(fresh, expected)
-        if misfits:
-            return misfits[0][1]
-        if new and any(o.lin.next_sigma > self._usual(o) for o in fresh):
-            return Fault.MISFIT
-        return Fault.NONE
-
-    def learn(self, fresh: Sequence[Observation]) -> None:
-        """A frame has been found."""
-        for o in fresh:
-            if o.is_depth:
-                self._depth.append(o.lin.next_sigma / o.ref.median_depth**2)
-            else:
-                self._color.append(o.lin.next_sigma)
-
-    def is_hopeless(self, fresh: Sequence[Observation], moving: float = 0.0) -> bool:
-        """Whether no term of a frame, aligned at a coarse level, fits so far that it could at a finer one.
-
-        moving: part of the pixels that need not fit, as they may be left out yet since they move by themselves.
-        """
-        return not any(
-            o.is_linearised
-            and o.lin.fit >= (1.0 - moving) * _least_fit(o)
-            and o.lin.next_sigma <= _HOPELESS * _limit(o)
-            for o in fresh
-        )
-
-    def _misfit(self, o: Observation, expected: int) -> Fault:
-        if not o.is_linearised or o.pixels < max(_LEAST_PIXELS, _LEAST_SHARE * expected):
-            return Fault.NOTHING_SEEN
-        if o.lin.fit < _least_fit(o):
-            return Fault.MISFIT
-        if max(o.lin.contrast, _HARMLESS_INTENSITY) < o.lin.next_sigma:
-            return Fault.MISFIT  # what it is expected to show is not in it
-        if o.lin.next_sigma > _limit(o):
-            return Fault.MISFIT
-        return Fault.NONE
-
-    def _usual(self, o: Observation) -> float:
-        """Scale beyond which a frame found anew does not fit as others do."""
-        usual, harmless = (self._depth, _HARMLESS_DEPTH) if o.is_depth else (self._color, _HARMLESS_INTENSITY)
-        distance = o.ref.median_depth if o.is_depth else 1.0
-        return distance**2 * max(harmless, _NEW_GROWTH * median(usual)) if usual else _limit(o)
+def _misfit(o: Observation, expected: int) -> Fault:
+    if not o.is_linearised or o.pixels < max(1.0, _LEAST_SHARE * expected):
+        return Fault.NOTHING_SEEN
+    if o.lin.fit < _least_fit(o):
+        return Fault.MISFIT
+    if max(o.lin.contrast, _HARMLESS_INTENSITY) < o.lin.next_sigma:
+        return Fault.MISFIT  # what it is expected to show is not in it
+    if o.lin.next_sigma > _limit(o):
+        return Fault.MISFIT
+    return Fault.NONE
 
 
 def _limit(o: Observation) -> float:
