@@ -16,7 +16,7 @@ from rstrack.tracking.judgement.fault import Fault
 _LEAST_SHARE = 0.08
 # Part of the compared pixels that must not be outliers for certain (real recordings: 0.88 and 0.98 at least).
 _LEAST_FIT_DEPTH, _LEAST_FIT_COLOR = 0.65, 0.8
-# Scales that no aligned images have (m at one metre, growing with the distance; intensity).
+# Scales that no aligned images have at the finest level (m at one metre, growing with the distance; intensity).
 _WORST_DEPTH, _WORST_INTENSITY = 0.03, 0.12
 # A scale of the intensities that says nothing about a keyframe without contrast.
 _HARMLESS_INTENSITY = 0.03
@@ -60,11 +60,8 @@ def is_hopeless(fresh: Sequence[Observation], moving: float = 0.0) -> bool:
 def _misfit(o: Observation, expected: int) -> Fault:
     if not o.is_linearised or o.pixels < max(1.0, _LEAST_SHARE * expected):
         return Fault.NOTHING_SEEN
-    if o.lin.fit < _least_fit(o):
-        return Fault.MISFIT
-    if max(o.lin.contrast, _HARMLESS_INTENSITY) < o.lin.next_sigma:
-        return Fault.MISFIT  # what it is expected to show is not in it
-    if o.lin.next_sigma > _limit(o):
+    # What it is expected to show is not in it, or most of that is something else.
+    if o.lin.fit < _least_fit(o) or max(o.lin.contrast, _HARMLESS_INTENSITY) < o.lin.next_sigma:
         return Fault.MISFIT
     return Fault.NONE
 
