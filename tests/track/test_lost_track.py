@@ -18,13 +18,12 @@ NOTHING, UNSETTLED = Fault.NOTHING_SEEN, Fault.UNSETTLED
 
 
 def term(
-    kind: str, sigma: float, count: int = 5000, fit: float = 1.0, distance: float = 1.0, contrast: float = np.inf
+    kind: str, sigma: float, count: int = 5000, fit: float = 1.0, contrast: float = np.inf
 ) -> Any:  # fmt: skip
-    """An observation of a linearised image: its scale, pixels, part that fits, how far away (m) what it shows is, and
-    what colours are expected to differ by."""
+    """An observation of a linearised image: its scale, pixels, part that fits, and what colours are expected to differ
+    by."""
     lin = SimpleNamespace(count=count, next_sigma=sigma, fit=fit, contrast=contrast)
-    ref = SimpleNamespace(median_depth=distance)
-    return SimpleNamespace(is_depth=kind == "depth", is_linearised=True, lin=lin, pixels=count, ref=ref)
+    return SimpleNamespace(is_depth=kind == "depth", is_linearised=True, lin=lin, pixels=count)
 
 
 def fault(terms: Iterable[Any], shift: float = 0.05, expected: int = 5000) -> str:
@@ -89,9 +88,3 @@ def test_no_hand_moves_so_fast(axis: int, limit: float, share: float) -> None:
     dt = np.sqrt(1e-3)
     T = se3.exp(np.array([0.3, -0.2, 0.1, 0.5, 0.4, -0.3]))
     assert implausible(T, T @ se3.exp(share * limit * np.eye(6)[axis]), dt) == (share > 1.0)
-
-
-def test_a_coarse_level_is_hopeless_where_neither_term_is_near_its_limit() -> None:
-    near, far = term("depth", 0.059), term("depth", 0.061)
-    assert is_hopeless([far]) and not is_hopeless([near])
-    assert not is_hopeless([far, term("color", 0.23)]) and is_hopeless([far, term("color", 0.25)])

@@ -16,20 +16,14 @@ from rstrack.tracking.judgement.fault import Fault
 _LEAST_SHARE = 0.08
 # Part of the compared pixels that must not be outliers for certain (real recordings: 0.88 and 0.98 at least).
 _LEAST_FIT_DEPTH, _LEAST_FIT_COLOR = 0.65, 0.8
-# Scales that no aligned images have at the finest level (m at one metre, growing with the distance; intensity).
-_WORST_DEPTH, _WORST_INTENSITY = 0.03, 0.12
 # A scale of the intensities that says nothing about a keyframe without contrast.
 _HARMLESS_INTENSITY = 0.03
-# At coarse levels, before all is aligned, scales are up to 1.3 times these limits, and 2 to 50 where nothing fits.
-_HOPELESS = 2.0
 # Lines that still move so far (pixels) have not been found.
 _WORST_SHIFT_PX = 2.0
 # Changes of velocity that no hand makes, m/s² and rad/s² (hand-held cameras reach 35 m/s²), nor over a longer time, m/s
 # and rad/s, and what is always allowed.
 _MOST_ACCELERATION, _MOST_VELOCITY = np.array([100.0, 200.0]), np.array([4.0, 8.0])
 _ALWAYS = np.array([0.05, np.radians(4.0)])
-# The distance (m) below which limits shrink no further.
-_CLOSE = 0.5
 
 
 def misfits(fresh: Sequence[Observation], expected: int) -> list[tuple[Observation, Fault]]:
@@ -51,10 +45,7 @@ def is_hopeless(fresh: Sequence[Observation], moving: float = 0.0) -> bool:
 
     moving: part of the pixels that need not fit, as they may be left out yet since they move by themselves.
     """
-    return not any(
-        o.is_linearised and o.lin.fit >= (1.0 - moving) * _least_fit(o) and o.lin.next_sigma <= _HOPELESS * _limit(o)
-        for o in fresh
-    )
+    return not any(o.is_linearised and o.lin.fit >= (1.0 - moving) * _least_fit(o) for o in fresh)
 
 
 def _misfit(o: Observation, expected: int) -> Fault:
@@ -64,10 +55,6 @@ def _misfit(o: Observation, expected: int) -> Fault:
     if o.lin.fit < _least_fit(o) or max(o.lin.contrast, _HARMLESS_INTENSITY) < o.lin.next_sigma:
         return Fault.MISFIT
     return Fault.NONE
-
-
-def _limit(o: Observation) -> float:
-    return _WORST_DEPTH * max(_CLOSE, o.ref.median_depth) if o.is_depth else _WORST_INTENSITY
 
 
 def _least_fit(o: Observation) -> float:
