@@ -163,6 +163,12 @@ def run_program(name: str, parser: Callable[[], Parser], words: Sequence[str] | 
     except UserError as error:
         print(f"{name}: {_one_line(str(error))}", file=sys.stderr)
         return 2
+    except ModuleNotFoundError as error:  # a package's description counts as one: it is told with what was computed
+        print(
+            f"{name}: {error.name} is not installed for {sys.executable}: ./run.sh setup, or pip install .",
+            file=sys.stderr,
+        )
+        return 2
     except BrokenPipeError:
         # Whoever read our output has seen enough; the interpreter would complain when it flushes the rest.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

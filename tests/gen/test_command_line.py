@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -86,3 +87,15 @@ def test_help_says_name_meaning_and_default_once(capfd: pytest.CaptureFixture[st
     ):  # fmt: skip
         assert part in text, part
     assert text.count("--label") == 2  # in the usage, and with its help
+
+
+def test_a_package_that_is_missing_is_one_line(capfd: pytest.CaptureFixture[str]) -> None:
+    """Regression: run from its folder, without being installed, `rstrack track` ended in a traceback."""
+
+    def parser() -> Any:
+        return version("a-package-that-nobody-has")
+
+    assert run_program("program", parser, [], "") == 2
+    out, error = capfd.readouterr()
+    assert out == "" and error.startswith("program: a-package-that-nobody-has is not installed for ")
+    assert error.count("\n") == 1
