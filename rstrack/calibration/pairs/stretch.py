@@ -126,7 +126,7 @@ class Stretch:
         floors = FLOOR_DEPTH, FLOOR_INTENSITY
         found = [scale_step(self.sigma[k], weighted[k], int(counted[k]), floors[k]) for k in range(2)]
         self.sigma = found[0], found[1]
-        return Sums(H, g, cost, int(counted.sum()), overcounted(*by_depth) if depth_counts < 1.0 else 1.0)
+        return Sums(H, g, cost, int(counted.sum()), overcounted(*by_depth, H) if depth_counts < 1.0 else 1.0)
 
     def read_by(self, terms: PairTerms) -> Stretch:
         """The same images and spline, to be changed by themselves, if cameras read their lines as those of `terms`."""
@@ -196,14 +196,17 @@ class Stretch:
             g[at] += model.g
 
 
-def overcounted(H: FloatArray, g: FloatArray) -> float:
+def overcounted(H: FloatArray, g: FloatArray, told: FloatArray) -> float:
     """How many times too much a term counts by its H and g (see `Sums`), around control points known from elsewhere.
 
-    gᵀ H⁺ g over the rank of H, both of the control points alone: 1 in the mean where its pixels are independent.
+    gᵀ H⁺ g is in the mean the rank of H times that, and what these points are off by: tr(H C), C their covariance by
+    what is `told` of them (like H). All of the control points alone. 1 where its pixels are independent.
     """
     x = len(g) - COUNT
-    inverse = np.linalg.pinv(H[:x, :x], rcond=1e-6, hermitian=True)
-    return float(g[:x] @ inverse @ g[:x] / max(1.0, np.trace(inverse @ H[:x, :x])))
+    own = H[:x, :x]
+    inverse = np.linalg.pinv(own, rcond=1e-6, hermitian=True)
+    off = float(np.trace(np.linalg.solve(told[:x, :x], own)))
+    return (float(g[:x] @ inverse @ g[:x]) - off) / max(1.0, float(np.trace(inverse @ own)))
 
 
 def partners(count: int, distances: Sequence[int]) -> list[list[int]]:
