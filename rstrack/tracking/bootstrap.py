@@ -87,6 +87,7 @@ def bootstrap(track: Track, new: DeviceFrame) -> FrameReport:
         window.active = earlier
     if lost(fresh, solved, ref.pixels):
         return _begin_anew(track, new)
+    track.usual.learn(fresh)
     window.keep(fresh)
     recent = track.succession.recent
     recent.append(new)

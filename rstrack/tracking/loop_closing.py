@@ -143,7 +143,7 @@ def judge_of(tracker: Tracker) -> Judge:
     def judge(
         fresh: Sequence[Observation], solved: Solved, state: SplineState, ref: Reference
     ) -> tuple[str, FloatArray]:  # fmt: skip
-        fault, score, _ = judge_alone(covariances, fresh, solved, state, ref.pixels)
+        fault, score, _ = judge_alone(tracker.usual, covariances, fresh, solved, state, ref.pixels)
         return fault.value, score.information
 
     return judge

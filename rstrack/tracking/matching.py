@@ -16,7 +16,7 @@ from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.judgement.common import Common
 from rstrack.tracking.judgement.fault import Fault
 from rstrack.tracking.judgement.innovation import Innovation, Prediction, disagreement, doubt, learnt, weighed
-from rstrack.tracking.judgement.lost_track import implausible, is_hopeless, is_settled, lost, misfits
+from rstrack.tracking.judgement.lost_track import UsualScales, implausible, is_hopeless, is_settled, lost, misfits
 from rstrack.tracking.judgement.pose_covariances import PoseCovariances
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.moving.leave_out import LeftOut
@@ -118,6 +118,8 @@ def judge_predicted(track: Track, found: Match, gap: float, young: bool) -> Verd
     with track.terms.timer("judgement"):
         score = scores(on_reference, window.state)
         fault = lost(on_reference, found.solved, found.ref.pixels)
+        if young and not fault and track.usual.exceeded(on_reference):
+            fault = Fault.MISFIT
         if not rolls:
             uncertainty = uncertainty.after(seconds, score.information, *accelerations)
             common = track.covariances.after(seconds, uncertainty, on_reference, window.state, score)
@@ -131,23 +133,29 @@ def judge_predicted(track: Track, found: Match, gap: float, young: bool) -> Verd
             usual = uncertainty.systematic.usual_inflation
             more = uncertainty.doubt + disagreement(on_reference, window.state, considered, usual)
             uncertainty = replace(uncertainty, doubt=more)
-    if not fault and implausible(T_predicted, window.spline.pose(mid), gap):
-        fault = Fault.MOTION
+    if not fault:
+        track.usual.learn(on_reference)
+        if implausible(T_predicted, window.spline.pose(mid), gap):
+            fault = Fault.MOTION
     return Verdict(fault or _unknown(uncertainty), score, uncertainty, common)
 
 
 def judge_unpredicted(track: Track, found: Match) -> Verdict:
     """Whether a frame was found where nothing led."""
     covariances, state = track.covariances, found.window.state
-    fault, score, uncertainty = judge_alone(covariances, found.fresh, found.solved, state, found.ref.pixels)
+    solved, expected = found.solved, found.ref.pixels
+    fault, score, uncertainty = judge_alone(track.usual, covariances, found.fresh, solved, state, expected)
     if not found.whole:
         fault = Fault.MISFIT
+    if not fault:
+        track.usual.learn(found.fresh)
     common = covariances.after(0.0, uncertainty, found.fresh, state, score)
     return Verdict(fault, score, uncertainty, common)
 
 
 def judge_alone(
-    covariances: PoseCovariances, fresh: Sequence[Observation], solved: Solved, state: SplineState, expected: int
+    usual: UsualScales, covariances: PoseCovariances, fresh: Sequence[Observation], solved: Solved, state: SplineState,
+    expected: int,
 ) -> tuple[Fault, Scores, Uncertainty]:  # fmt: skip
     """Whether a frame was found, by its images alone: by all of them, as one is alike in many places.
 
@@ -156,9 +164,11 @@ def judge_alone(
     score = scores(fresh, state)
     uncertainty = covariances.uncertainty.found_anew(score.information)
     fault = lost(fresh, solved, expected)
+    if not fault and usual.exceeded(fresh):
+        fault = Fault.MISFIT
     if not fault:
-        usual = uncertainty.systematic.usual_inflation
-        apart = disagreement(fresh, state, covariances.considered(0.0), usual)
+        inflation = uncertainty.systematic.usual_inflation
+        apart = disagreement(fresh, state, covariances.considered(0.0), inflation)
         uncertainty = replace(uncertainty, doubt=apart)
     return fault or _unknown(uncertainty), score, uncertainty
 

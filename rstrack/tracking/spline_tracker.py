@@ -31,6 +31,7 @@ from rstrack.tracking.bootstrap import bootstrap, fit_knots, start
 from rstrack.tracking.bridging import Bridge
 from rstrack.tracking.frame_report import FrameReport
 from rstrack.tracking.judgement.fault import Fault
+from rstrack.tracking.judgement.lost_track import UsualScales
 from rstrack.tracking.judgement.pose_covariances import PoseCovariances
 from rstrack.tracking.matching import Match, Verdict, judge_predicted, match
 from rstrack.tracking.relocalise import Relocaliser
@@ -155,6 +156,11 @@ class Tracker:
     def inertia(self) -> Inertia | None:
         """What has been found of an IMU, where the method uses one."""
         return self._track.inertia
+
+    @property
+    def usual(self) -> UsualScales:
+        """How well its images fit."""
+        return self._track.usual
 
     @property
     def covariances(self) -> PoseCovariances:

@@ -35,6 +35,7 @@ from rstrack.tracking.frame_report import FrameReport, frame_report
 from rstrack.tracking.gains import Gains
 from rstrack.tracking.judgement.consider import Calibration
 from rstrack.tracking.judgement.fault import Fault
+from rstrack.tracking.judgement.lost_track import UsualScales
 from rstrack.tracking.judgement.pose_covariances import PoseCovariances
 from rstrack.tracking.moving.leave_out import LeftOut, leave_out
 from rstrack.tracking.succession import Succession
@@ -50,7 +51,7 @@ class Track:
     window: None until there is a first frame. age: frames of the current piece of the spline. independence: of depth
     pixels, and of colour pixels. chain: what all frames said of the spline. reports: one of every frame fed.
     inertia: what an IMU says beside them, or None. left_out: of frames, since it moves by itself. is_modelled: whether
-    the times of the lines are.
+    the times of the lines are. usual: how well frames fit.
     """
 
     def __init__(self, rig: Rig, options: Options, timer: Timer, imu: ImuRecording | None = None) -> None:
@@ -63,6 +64,7 @@ class Track:
         self.keyframes = KeyframeStore(self.maker, self.options)
         # Taken for a global one, a rolling shutter makes both terms fit worse whenever the camera moves fast.
         self.is_modelled = self.options.rolling or rig.depth_shutter.readout_s == 0.0
+        self.usual = UsualScales()
         self.independence = Independence(), Independence()
         self.gains = Gains()
         self._finds_moving = self.options.moving and self.is_modelled
@@ -74,7 +76,8 @@ class Track:
         self.begin_anew()
 
     def begin_anew(self) -> None:
-        """Nothing has been found of what was fed."""
+        """Nothing has been found of what was fed, nor is anything usual: at rest depth repeats its steps."""
+        self.usual.forget()
         self.window: Window | None = None
         self._told_by = -1
         if self.inertia is not None:

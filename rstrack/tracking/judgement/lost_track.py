@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
+from statistics import median
 
 import numpy as np
 
@@ -16,14 +18,47 @@ from rstrack.tracking.judgement.fault import Fault
 _LEAST_SHARE = 0.08
 # Part of the compared pixels that must not be outliers for certain (real recordings: 0.88 and 0.98 at least).
 _LEAST_FIT_DEPTH, _LEAST_FIT_COLOR = 0.65, 0.8
-# A scale of the intensities that says nothing about a keyframe without contrast.
-_HARMLESS_INTENSITY = 0.03
+# In a piece of the track that has just begun nothing of its own says yet what is right: growth there over the last
+# frames' median (without it fr1_rpy, from frame 24, runs away after a place is found again), and what is harmless
+# anyway: a camera at rest repeats its rounding, and a keyframe without contrast shows nothing.
+_NEW_GROWTH, _HARMLESS_DEPTH, _HARMLESS_INTENSITY = 3.5, 2e-3, 0.03
+_MEMORY = 30
 # Lines that still move so far (pixels) have not been found.
 _WORST_SHIFT_PX = 2.0
 # Changes of velocity that no hand makes, m/s² and rad/s² (hand-held cameras reach 35 m/s²), nor over a longer time, m/s
 # and rad/s, and what is always allowed.
 _MOST_ACCELERATION, _MOST_VELOCITY = np.array([100.0, 200.0]), np.array([4.0, 8.0])
 _ALWAYS = np.array([0.05, np.radians(4.0)])
+
+
+class UsualScales:
+    """Of the last good frames: how far their pixels were off."""
+
+    def __init__(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
+        """Nothing is usual yet."""
+        # Depth's as they would be at one metre.
+        self._depth: deque[float] = deque(maxlen=_MEMORY)
+        self._color: deque[float] = deque(maxlen=_MEMORY)
+
+    def learn(self, fresh: Sequence[Observation]) -> None:
+        """A frame has been found."""
+        for o in fresh:
+            if o.is_depth:
+                self._depth.append(o.lin.next_sigma / o.ref.median_depth**2)
+            else:
+                self._color.append(o.lin.next_sigma)
+
+    def exceeded(self, fresh: Sequence[Observation]) -> bool:
+        """Whether an image of a frame that nothing predicts fits worse than they did."""
+        return any(o.lin.next_sigma > self._most(o) for o in fresh)
+
+    def _most(self, o: Observation) -> float:
+        usual, harmless = (self._depth, _HARMLESS_DEPTH) if o.is_depth else (self._color, _HARMLESS_INTENSITY)
+        distance = o.ref.median_depth if o.is_depth else 1.0
+        return distance**2 * max(harmless, _NEW_GROWTH * median(usual)) if usual else np.inf
 
 
 def misfits(fresh: Sequence[Observation], expected: int) -> list[tuple[Observation, Fault]]:
