@@ -27,6 +27,8 @@ _WIDEST = 2.0
 # Where depth gives one pose a knot, how far after a knot, in knots: half-way between two it would not see control
 # points that alternate, of which rolling colours then tell little and wrongly.
 _AFTER_KNOT = 0.1
+# How far depth alone may slide in frames that begin a track, m: before a wall by 0.25 to 1.
+_MOST_APART_M = 0.1
 
 
 def start(track: Track, new: DeviceFrame) -> FrameReport:
@@ -181,6 +183,9 @@ def _leave(track: Track, window: Window) -> bool:
     seen_of = {frame.index: [o for o in others if o.frame == frame.index] for frame in frames}
     covariances.look_at(ref, window.spline)
     scores_of = {index: scores(seen, window.state) for index, seen in seen_of.items()}
+    by_depth = [seen for seen in seen_of.values() if seen and all(o.is_depth for o in seen)]
+    if any(np.trace(disagreement(seen, window.state)[:3, :3]) > _MOST_APART_M**2 for seen in by_depth):
+        return False
     if not all(_agree(track, seen_of[f.index], scores_of[f.index], window) for f in rest):
         return False
     window.keep(others)
@@ -202,16 +207,10 @@ def _leave(track: Track, window: Window) -> bool:
 
 
 def _agree(track: Track, seen: Sequence[Observation], score: Scores, window: Window) -> bool:
-    """Whether a frame's pose is known in spite of what its images are apart, beyond what was usual before; or what
-    depth alone is off by, which slides before a wall by 0.25 to 1 m."""
-    covariances, state = track.covariances, window.state
-    known = covariances.uncertainty.systematic
-    if all(o.is_depth for o in seen):
-        apart = disagreement(seen, state)
-    elif known.inflations:
-        considered = covariances.considered(0.0)
-        apart = disagreement(seen, state, considered, known.usual_inflation)
-        apart = apart - disagreement(seen, state, considered, np.inf)
-    else:
+    """Whether a frame's pose is known in spite of what its images are apart, beyond what was usual before."""
+    covariances, usual = track.covariances, track.covariances.uncertainty.systematic.usual_inflation
+    if not covariances.uncertainty.systematic.inflations:
         return True  # a wrong camera file has them apart in every frame, and no frame has told yet
+    considered, state = covariances.considered(0.0), window.state
+    apart = disagreement(seen, state, considered, usual) - disagreement(seen, state, considered, np.inf)
     return replace(covariances.uncertainty.found_anew(score.information), doubt=apart).is_known

@@ -16,6 +16,7 @@ from rstrack.alignment.score import Scores
 from rstrack.images.pyramid import DepthImage
 from rstrack.tracking import matching
 from rstrack.tracking.judgement.fault import Fault
+from rstrack.tracking.judgement.lost_track import UsualScales
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.matching import Match, judge_unpredicted, without_misfits
 from rstrack.tracking.relocalise import Relocaliser, where_led
@@ -49,7 +50,7 @@ def test_a_place_is_found_by_all_of_a_frame_s_images_only(monkeypatch: pytest.Mo
     monkeypatch.setattr(matching, "scores", lambda *_: Scores((1.0,) * 3, 1e8 * np.eye(6)))
     monkeypatch.setattr(matching, "disagreement", lambda *_: np.zeros((12, 12)))
     covariances = SimpleNamespace(uncertainty=Uncertainty(), after=lambda *_: None, considered=lambda _: None)
-    track: Any = SimpleNamespace(covariances=covariances)
+    track: Any = SimpleNamespace(covariances=covariances, usual=UsualScales())
     for whole, says in ((True, Fault.NONE), (False, Fault.MISFIT)):
         given: list[Any] = [None, REF, SimpleNamespace(state=None), None, [seen("depth")], Solved(last_shift=0.0), None]
         assert judge_unpredicted(track, Match(*given, whole)).fault is says
