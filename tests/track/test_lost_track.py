@@ -12,18 +12,19 @@ import pytest
 from rsgen.geometry import se3
 from rstrack.alignment.optimizer import Solved
 from rstrack.tracking.judgement.fault import Fault
-from rstrack.tracking.judgement.lost_track import implausible, is_hopeless, is_settled, lost, misfits
+from rstrack.tracking.judgement.lost_track import UsualScales, implausible, is_hopeless, is_settled, lost, misfits
 
 NOTHING, UNSETTLED = Fault.NOTHING_SEEN, Fault.UNSETTLED
 
 
 def term(
-    kind: str, sigma: float, count: int = 5000, fit: float = 1.0, contrast: float = np.inf
+    kind: str, sigma: float, count: int = 5000, fit: float = 1.0, distance: float = 1.0, contrast: float = np.inf
 ) -> Any:  # fmt: skip
-    """An observation of a linearised image: its scale, pixels, part that fits, and what colours are expected to differ
-    by."""
+    """An observation of a linearised image: its scale, pixels, part that fits, how far away (m) what it shows is, and
+    what colours are expected to differ by."""
     lin = SimpleNamespace(count=count, next_sigma=sigma, fit=fit, contrast=contrast)
-    return SimpleNamespace(is_depth=kind == "depth", is_linearised=True, lin=lin, pixels=count)
+    ref = SimpleNamespace(median_depth=distance)
+    return SimpleNamespace(is_depth=kind == "depth", is_linearised=True, lin=lin, pixels=count, ref=ref)
 
 
 def fault(terms: Iterable[Any], shift: float = 0.05, expected: int = 5000) -> str:
@@ -88,3 +89,35 @@ def test_no_hand_moves_so_fast(axis: int, limit: float, share: float) -> None:
     dt = np.sqrt(1e-3)
     T = se3.exp(np.array([0.3, -0.2, 0.1, 0.5, 0.4, -0.3]))
     assert implausible(T, T @ se3.exp(share * limit * np.eye(6)[axis]), dt) == (share > 1.0)
+
+
+def after(kind: str, sigmas: Iterable[float]) -> UsualScales:
+    """With frames of such scales behind it."""
+    usual = UsualScales()
+    for sigma in sigmas:
+        usual.learn([term(kind, sigma)])
+    return usual
+
+
+@pytest.mark.parametrize(
+    ("kind", "usual", "limit"),
+    [("depth", 2e-3, 7e-3), ("depth", 1e-4, 2e-3), ("color", 0.01, 0.035), ("color", 1e-3, 0.03)],
+)
+def test_where_a_piece_begins_images_have_to_fit_nearly_as_usual(kind: str, usual: float, limit: float) -> None:
+    before, other = after(kind, [usual] * 3), term("color" if kind == "depth" else "depth", 0.5)
+    assert not before.exceeded([other, term(kind, 0.99 * limit)]), "nothing is usual of the other one"
+    assert before.exceeded([other, term(kind, 1.01 * limit)])
+
+
+def test_the_usual_is_the_median_of_the_last_thirty_good_frames_depth_s_at_one_metre() -> None:
+    usual = after("depth", [1e-3] * 16 + [2e-3] * 15)
+    for sigma, is_more in ((5.2e-3, False), (5.3e-3, True)):
+        assert usual.exceeded([term("depth", sigma)]) is is_more
+        assert usual.exceeded([term("depth", 4.0 * sigma, distance=2.0)]) is is_more
+
+
+def test_nothing_is_usual_of_a_start_that_failed() -> None:
+    usual = after("depth", [1e-3] * 15)
+    assert usual.exceeded([term("depth", 1e-2)])
+    usual.forget()
+    assert not usual.exceeded([term("depth", 1e-2)])

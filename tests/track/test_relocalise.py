@@ -54,6 +54,16 @@ def test_a_place_is_found_by_all_of_a_frame_s_images_only(monkeypatch: pytest.Mo
     for whole, says in ((True, Fault.NONE), (False, Fault.MISFIT)):
         given: list[Any] = [None, REF, SimpleNamespace(state=None), None, [seen("depth")], Solved(last_shift=0.0), None]
         assert judge_unpredicted(track, Match(*given, whole)).fault is says
+    # Where frames have fitted ten times better it is another place.
+    track.usual.forget()
+    for _ in range(3):
+        better = seen("depth")
+        better.lin.next_sigma = 1e-4
+        track.usual.learn([better])
+    worse = seen("depth")
+    worse.lin.next_sigma = 3e-3
+    given = [None, REF, SimpleNamespace(state=None), None, [worse], Solved(last_shift=0.0), None]
+    assert judge_unpredicted(track, Match(*given, True)).fault is Fault.MISFIT
 
 
 class Sees(Relocaliser):

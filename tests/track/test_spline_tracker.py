@@ -154,12 +154,12 @@ def test_colour_may_come_late_but_there_is_no_keyframe_without_it() -> None:
 
 def test_first_frames_that_slide_are_lost_and_the_next_ones_begin_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     """Regression: a track that began before a bare wall went on from a keyframe that was bent, without a word."""
-    tracker, begun = tracker_of("rs-g"), []
-    begin_anew = tracker._track.begin_anew
-    monkeypatch.setattr(tracker._track, "begin_anew", lambda: (begun.append(True), begin_anew()))
-    monkeypatch.setattr(bootstrap, "disagreement", lambda *_: np.eye(12) * (not begun))
+    tracker, forgotten = tracker_of("rs-g"), []
+    monkeypatch.setattr(tracker._track.usual, "forget", lambda: forgotten.append(True))
+
+    monkeypatch.setattr(bootstrap, "disagreement", lambda *_: np.eye(12) * (not forgotten))
     feed(tracker, (frame_at(k) for k in range(14)))
-    assert begun == [True]
+    assert forgotten == [True], "what was usual in them"
     assert [report.fault for report in tracker.reports[:6]] == [*[Fault.NO_START] * 5, Fault.NONE]
     assert lost(tracker) == [0, 1, 2, 3, 4] and tracker.keyframes >= 1 and worst_step(tracker) < 3e-3
 

@@ -20,8 +20,10 @@ _LEAST_SHARE = 0.08
 _LEAST_FIT_DEPTH, _LEAST_FIT_COLOR = 0.65, 0.8
 # In a piece of the track that has just begun nothing of its own says yet what is right: growth there over the last
 # frames' median (without it fr1_rpy, from frame 24, runs away after a place is found again), and what is harmless
-# anyway: a camera at rest repeats its rounding, and a keyframe without contrast shows nothing.
+# anyway (m at one metre, intensity): a camera at rest repeats its rounding, and a keyframe without contrast shows
+# nothing.
 _NEW_GROWTH, _HARMLESS_DEPTH, _HARMLESS_INTENSITY = 3.5, 2e-3, 0.03
+# Frames whose median is usual.
 _MEMORY = 30
 # Lines that still move so far (pixels) have not been found.
 _WORST_SHIFT_PX = 2.0
@@ -32,7 +34,7 @@ _ALWAYS = np.array([0.05, np.radians(4.0)])
 
 
 class UsualScales:
-    """Of the last good frames: how far their pixels were off."""
+    """How far pixels of the last good frames were off: what a frame that nothing predicts is held against."""
 
     def __init__(self) -> None:
         self.forget()
@@ -52,7 +54,7 @@ class UsualScales:
                 self._color.append(o.lin.next_sigma)
 
     def exceeded(self, fresh: Sequence[Observation]) -> bool:
-        """Whether an image of a frame that nothing predicts fits worse than they did."""
+        """Whether an image of a frame fits worse than they did; never where nothing is usual yet."""
         return any(o.lin.next_sigma > self._most(o) for o in fresh)
 
     def _most(self, o: Observation) -> float:
