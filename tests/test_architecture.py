@@ -25,14 +25,14 @@ SHARED = (
 ENGINES = ("mitsuba", "drjit")
 WITHOUT_ENGINE = (
     "rsgen.geometry.so3", "rsgen.geometry.se3", "rsgen.geometry.spline", "rsgen.geometry.camera",
-    "rsgen.geometry.shutter", "rsgen.sequence.reader", "rsgen.check.verify",
-    "rsgen.config.config", "rsgen.sequence.trajectory", "rsgen.motion.fit",
-    "rsgen.motion.fit_summary", "rsgen.device.backend", "rsgen.console.scheduler", "rsgen.produce.distribute",
-    "rsgen.produce.generate", "rsgen.produce.frame_source", "rsgen.pictures.frames", "rsgen.cli.main",
-    "rsgen.motion.make", "rsgen.sensors.color", "rsgen.sensors.depth", "rsgen.sensors.imu", "rsgen.config.truth",
-    "rsgen.export.folders.kalibr", "rsgen.export.folders.euroc", "rsgen.export.folders.registered",
-    "rsgen.export.viewing.video", "rsgen.export.bags.ros", "rsgen.export.reconstruction.colmap",
-    "rsgen.export.reconstruction.nerfstudio",
+    "rsgen.geometry.shutter", "rsgen.sequence.reader", "rsgen.check.verify", "rsgen.config.config",
+    "rsgen.sequence.trajectory", "rsgen.motion.fit", "rsgen.motion.fit_summary", "rsgen.device.backend",
+    "rsgen.console.scheduler", "rsgen.produce.distribute", "rsgen.produce.generate", "rsgen.produce.frame_source",
+    "rsgen.pictures.frames", "rsgen.cli.main", "rsgen.motion.make", "rsgen.sensors.color", "rsgen.sensors.depth",
+    "rsgen.sensors.imu", "rsgen.config.truth", "rsgen.formats.export.folders.kalibr",
+    "rsgen.formats.export.folders.euroc", "rsgen.formats.export.folders.registered",
+    "rsgen.formats.export.viewing.video", "rsgen.formats.export.bags.ros",
+    "rsgen.formats.export.reconstruction.colmap", "rsgen.formats.export.reconstruction.nerfstudio",
 )  # fmt: skip
 CONFIGS = sorted(path for path in (ROOT / "configs").glob("*.yaml") if path.stem not in ("evaluation", "readout_sweep"))
 

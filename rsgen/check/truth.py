@@ -11,8 +11,8 @@ import numpy as np
 
 from rsgen.check.objects import check_objects
 from rsgen.errors import UserError
-from rsgen.export.folder import sequence_imu, sequence_target
 from rsgen.files import is_temporary, read_text, read_yaml
+from rsgen.formats.export.folder import sequence_imu, sequence_target
 from rsgen.sensors.imu import imu_csv
 from rsgen.sensors.imu_truth import IMU_TRUTH_CSV, IMU_TRUTH_YAML, imu_truth_csv
 from rsgen.sequence.camera_yaml import TRUE_CAMERAS

@@ -22,8 +22,8 @@ from rsgen.array_types import FloatArray
 from rsgen.check.reprojection import depth_points, reproject_depth
 from rsgen.check.truth import extra_checks
 from rsgen.errors import UserError
-from rsgen.export.folder import sequence_mocap
 from rsgen.files import is_temporary, read_text
+from rsgen.formats.export.folder import sequence_mocap
 from rsgen.geometry import se3
 from rsgen.produce.identity import fingerprint
 from rsgen.sensors.mocap import reported_poses

@@ -227,7 +227,7 @@ def import_scene(
     """Make a Mitsuba scene of one of another program, in a folder with its meshes and textures: name its scene.xml in
     scene.file of a config. Says what has been left out. USD needs the package usd-core, .blend files bpy.
     """
-    from rsgen.importing.import_scene import import_scene as make
+    from rsgen.formats.scenes.import_scene import import_scene as make
 
     made = make(file, out, force, scale, up)
     print("\n".join([*made.found, *(f"note: {line}" for line in made.notes)]))
@@ -277,7 +277,7 @@ def export(
 ) -> int:
     """Write a sequence in the layout of other tools."""
     from rsgen.console.progress import ProgressDisplay
-    from rsgen.export.all import export as write
+    from rsgen.formats.export.all import export as write
 
     with ProgressDisplay(quiet) as progress:
         done = write(to, sequence, out, copy, scene, storage, progress)

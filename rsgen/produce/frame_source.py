@@ -252,7 +252,7 @@ def scene_hash(config: Config) -> str:
 
 
 def _mesh_options(config: Config) -> Any:
-    from rsgen.render.mesh_files.mesh_file import MeshOptions
+    from rsgen.formats.meshes.mesh_file import MeshOptions
 
     return MeshOptions(config.scene.scale, config.scene.up, config.scene.light)
 

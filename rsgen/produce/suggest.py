@@ -149,11 +149,11 @@ def suggest_tour(
     camera, no floor, or no scene, and if it is a room in another unit than metres.
     """
     mitsuba()
+    from rsgen.formats.meshes.mesh_file import AS_IT_IS, MeshOptions
+    from rsgen.formats.mitsuba_xml.camera_up import camera_up
     from rsgen.render.land import coarser, inhabited
-    from rsgen.render.mesh_files.mesh_file import AS_IT_IS, MeshOptions
     from rsgen.render.rays import cast_rays
     from rsgen.render.scene import load_scene
-    from rsgen.render.scene_xml.camera_up import camera_up
 
     placed = {key: value for key, value in (("scale", scale), ("up", up)) if value != getattr(AS_IT_IS, key)}
     if not 1e-9 <= scale <= 1e9:  # as scene.scale

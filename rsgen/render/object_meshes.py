@@ -15,9 +15,9 @@ from rsgen.array_types import BoolArray, FloatArray, IntArray
 from rsgen.config.objects import ObjectConfig, ShapeConfig
 from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
+from rsgen.formats.meshes.material import Material, bsdf
+from rsgen.formats.meshes.mesh_file import MeshOptions, hash_into, mesh_scene
 from rsgen.render.mended import mend_meshes
-from rsgen.render.mesh_files.material import Material, bsdf
-from rsgen.render.mesh_files.mesh_file import MeshOptions, hash_into, mesh_scene
 from rsgen.render.ply import joined_triangles, ply_bytes
 from rsgen.render.scene import surface
 

@@ -25,23 +25,23 @@ from rsgen.array_types import Float32Array
 from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
 from rsgen.files import encode_png
+from rsgen.formats.meshes.mesh_file import AS_IT_IS, MeshOptions, hash_into, mesh_scene
+from rsgen.formats.mitsuba_xml.analytic import ANALYTIC, tessellated
+from rsgen.formats.mitsuba_xml.instances import turn_mirrored
+from rsgen.formats.mitsuba_xml.obj_polygons import METHOD as OBJ_POLYGONS
+from rsgen.formats.mitsuba_xml.obj_polygons import with_triangles
+from rsgen.formats.mitsuba_xml.old_factors import multiply_images
+from rsgen.formats.mitsuba_xml.old_xml import METHOD as OLD_XML
+from rsgen.formats.mitsuba_xml.parsed import check_files, explained, messages_to_log, parse, prepare, unknown_properties
+from rsgen.formats.mitsuba_xml.placed import place, place_lamps
+from rsgen.formats.mitsuba_xml.refused import read_polygons, read_refused
 from rsgen.inputs import check_input
 from rsgen.render.board import Board, drawing
 from rsgen.render.board import surface as board_surface
 from rsgen.render.file_names import tell_renamed
 from rsgen.render.land import split_land
 from rsgen.render.mended import mend_meshes
-from rsgen.render.mesh_files.mesh_file import AS_IT_IS, MeshOptions, hash_into, mesh_scene
 from rsgen.render.ply import joined_triangles, ply_bytes
-from rsgen.render.scene_xml.analytic import ANALYTIC, tessellated
-from rsgen.render.scene_xml.instances import turn_mirrored
-from rsgen.render.scene_xml.obj_polygons import METHOD as OBJ_POLYGONS
-from rsgen.render.scene_xml.obj_polygons import with_triangles
-from rsgen.render.scene_xml.old_factors import multiply_images
-from rsgen.render.scene_xml.old_xml import METHOD as OLD_XML
-from rsgen.render.scene_xml.parsed import check_files, explained, messages_to_log, parse, prepare, unknown_properties
-from rsgen.render.scene_xml.placed import place, place_lamps
-from rsgen.render.scene_xml.refused import read_polygons, read_refused
 
 log = logging.getLogger("rsgen")
 

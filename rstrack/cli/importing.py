@@ -34,9 +34,9 @@ def import_(
     """Turn a recording of another format into a folder that can be tracked: images, stamps, cameras, truth, IMU."""
     from rsgen.console.progress import ProgressDisplay
     from rstrack.calibration.unknowns.devices import device_named
-    from rstrack.importing.bags.topics import Named
-    from rstrack.importing.folder import check_place, write_folder
-    from rstrack.importing.formats import open_recording
+    from rstrack.formats.bags.topics import Named
+    from rstrack.formats.folder import check_place, write_folder
+    from rstrack.formats.formats import open_recording
 
     known = None if device is None else device_named(device)
     check_place(out, force)

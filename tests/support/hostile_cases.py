@@ -21,9 +21,9 @@ from rsgen.device.backend import mitsuba
 from rsgen.render.scene import load_scene
 from rsgen.sequence.reader import read_sequence
 from rstrack.data.dataset import open_dataset
-from rstrack.importing.bags.topics import Named
-from rstrack.importing.folder import write_folder
-from rstrack.importing.formats import open_recording
+from rstrack.formats.bags.topics import Named
+from rstrack.formats.folder import write_folder
+from rstrack.formats.formats import open_recording
 
 CONTENT = recordings.make_content()
 Read = Callable[[Path, Path], object]

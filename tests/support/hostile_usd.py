@@ -11,7 +11,7 @@ import numpy as np
 from hostile_cases import Base, Case, of_8_gb, piped, replaced_by, text_edited
 
 from rsgen.files import encode_png
-from rsgen.importing.import_scene import import_scene
+from rsgen.formats.scenes.import_scene import import_scene
 
 
 def usd(folder: Path) -> Iterator[Case]:

@@ -17,13 +17,13 @@ from trimesh.visual.material import PBRMaterial
 from rsgen import srgb
 from rsgen.config.config import LightConfig
 from rsgen.console.progress import no_progress
+from rsgen.formats.meshes.mesh_file import MeshOptions
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.light.bake import bake
 from rsgen.render.baked import BakedIntegrator
 from rsgen.render.images import ColorRenderer
 from rsgen.render.irradiance import make_field, make_lattice
-from rsgen.render.mesh_files.mesh_file import MeshOptions
 
 WIDTH, HEIGHT, FOCAL = 80, 60, 70.0
 CAMERA = Camera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from rendering import mi
 
-from rsgen.importing.import_scene import import_scene
+from rsgen.formats.scenes.import_scene import import_scene
 from rsgen.render.scene import load_scene, surface
 
 needs_usd = pytest.mark.skipif(find_spec("pxr") is None, reason="needs USD: pip install usd-core")

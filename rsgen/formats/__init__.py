@@ -1,0 +1,1 @@
+"""Formats of other programs, read and written: guests, which the generator itself works without."""

@@ -1,0 +1,160 @@
+"""A sequence as an EuRoC/ASL folder `mav0/` (Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016).
+
+    mav0/body.yaml
+    mav0/cam0/    data/STAMP.png (colour), data.csv, sensor.yaml
+    mav0/depth0/  data/STAMP.png (16-bit), data.csv, sensor.yaml
+    mav0/imu0/    data.csv, sensor.yaml                                where the sequence has an IMU
+    mav0/state_groundtruth_estimate0/  data.csv, sensor.yaml           pose, velocity and biases of the body
+
+The body is the IMU, without one the depth camera. EuRoC has one stamp an image and no time of a row: the stamp stays
+ours, the end of line 0's exposure, and sensor.yaml has an entry of our own, `rolling_shutter`, with the rest. The world
+is the sequence's: gravity need not point along −z as in EuRoC's own sets; `body.yaml` has it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsgen.array_types import FloatArray
+from rsgen.config.imu import ImuConfig
+from rsgen.console.progress import Progress, no_progress
+from rsgen.errors import UserError
+from rsgen.files import atomic_write, encode_yaml
+from rsgen.formats.export.folder import (
+    EPOCH_S,
+    four_coefficients,
+    image_streams,
+    make_folders,
+    new_folder,
+    place_images,
+    sequence_imu,
+)
+from rsgen.geometry import se3
+from rsgen.sensors.imu import ImuSamples, nanoseconds, write_imu_csv
+from rsgen.sequence.format import ground_truth, pose_rows
+from rsgen.sequence.reader import Sequence, Stream
+
+_MODELS = {"pinhole": "radial-tangential", "fisheye": "equidistant"} | dict.fromkeys(
+    ("radtan", "rational"), "radial-tangential"
+)
+_TRUTH = "state_groundtruth_estimate0"
+_TRUTH_HEADER = (
+    "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], "
+    "v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], "
+    "b_w_RS_S_x [rad s^-1], b_w_RS_S_y [rad s^-1], b_w_RS_S_z [rad s^-1], "
+    "b_a_RS_S_x [m s^-2], b_a_RS_S_y [m s^-2], b_a_RS_S_z [m s^-2]"
+)
+
+
+def export_euroc(
+    sequence: Sequence, out: Path, copy: bool = False, epoch_s: int = EPOCH_S, progress: Progress = no_progress
+) -> str:
+    """Write `out`/mav0; returns one line. Images are hard links where the disk allows, or copies with `copy`.
+
+    epoch_s: whole seconds added to all stamps. Raises UserError if `out`/mav0 is there and not empty, if a stamp is
+    negative, if a stream's distortion does not fit EuRoC's four coefficients, or if the disk refuses.
+    """
+    imu = sequence_imu(sequence)
+    T_depth_body = imu[0].T_depth_imu() if imu else np.eye(4)
+    root = Path(out) / "mav0"
+    streams = zip(("cam0", "depth0"), image_streams(sequence), strict=True)
+    sensors = {name: (stream, se3.inverse(T @ T_depth_body)) for name, (stream, T) in streams}
+    described = {name: _camera_yaml(stream, T_BS) for name, (stream, T_BS) in sensors.items()}
+    stamps = {name: nanoseconds(stream.listed, epoch_s) for name, (stream, _) in sensors.items()}
+    times = imu[1].t if imu else ground_truth(sequence.spline)[:, 0]
+    if min(*(ns[0] for ns in stamps.values()), nanoseconds(times[:1], epoch_s)[0]) < 0:
+        raise UserError(f"{out}: EuRoC's stamps cannot be negative: give an epoch of a second or more")
+
+    new_folder(root)
+    make_folders(*(root / name / "data" for name in sensors), root / _TRUTH)
+    atomic_write(root / "body.yaml", encode_yaml(_body_yaml(sequence, imu[0] if imu else None, epoch_s)))
+    truth = truth_csv(sequence, times, T_depth_body, imu[1] if imu else None, epoch_s)
+    atomic_write(root / _TRUTH / "data.csv", truth)
+    atomic_write(root / _TRUTH / "sensor.yaml", encode_yaml(_truth_yaml()))
+    if imu:
+        make_folders(root / "imu0")
+        write_imu_csv(root / "imu0" / "data.csv", imu[1], epoch_s)
+        atomic_write(root / "imu0" / "sensor.yaml", encode_yaml(_imu_yaml(imu[0])))
+    for k, (name, (stream, _)) in enumerate(sensors.items()):
+        files = [f"{ns}.png" for ns in stamps[name]]
+        rows = [f"{ns},{file}" for ns, file in zip(stamps[name], files, strict=True)]
+        atomic_write(root / name / "data.csv", "\n".join(["#timestamp [ns],filename", *rows, ""]).encode())
+        atomic_write(root / name / "sensor.yaml", encode_yaml(described[name]))
+        targets = [root / name / "data" / file for file in files]
+        place_images(stream.paths, targets, copy, progress, (0.5 * k, 0.5 * (k + 1)))
+    counts = f"{len(stamps['cam0'])} colour and {len(stamps['depth0'])} depth images"
+    return f"{root}: {counts}, {f'{len(times)} IMU samples' if imu else 'no IMU'}, stamps + {epoch_s} s"
+
+
+def truth_csv(
+    sequence: Sequence, t: FloatArray, T_depth_body: FloatArray, imu: ImuSamples | None, epoch_s: int = 0
+) -> bytes:
+    """EuRoC's ground truth at times t (n,) s: the body's pose, its velocity in the world, and the IMU's biases.
+
+    T_depth_body (4, 4): body to depth-camera coordinates. Biases are those of `imu`, whose times are t; zero without.
+    """
+    T_world_depth, twist = sequence.spline.pose_and_velocity(t)
+    T_world_body = T_world_depth @ T_depth_body
+    v_body = (twist @ se3.adjoint(se3.inverse(T_depth_body)).T)[:, :3]
+    v_world = np.einsum("nij,nj->ni", T_world_body[:, :3, :3], v_body)
+    rows = pose_rows(T_world_body)[:, [0, 1, 2, 6, 3, 4, 5]]
+    biases = np.zeros((len(t), 6)) if imu is None else np.column_stack([imu.gyro_bias, imu.accel_bias])
+    table = np.column_stack([rows, v_world, biases]).tolist()
+    lines = [
+        ",".join([str(stamp), *(f"{value:.12f}" for value in row)])
+        for stamp, row in zip(nanoseconds(t, epoch_s), table, strict=True)
+    ]
+    return "\n".join([_TRUTH_HEADER, *lines, ""]).encode()
+
+
+def _camera_yaml(stream: Stream, T_BS: FloatArray) -> dict[str, Any]:
+    camera, shutter = stream.camera, stream.shutter
+    coefficients = four_coefficients(stream.name, camera)
+    data: dict[str, Any] = {
+        "sensor_type": "camera",
+        "comment": f"rsgen {stream.name}; stamps are the end of line 0's exposure, see rolling_shutter",
+        "T_BS": _matrix(T_BS),
+        "rate_hz": stream.rate_hz,
+        "resolution": [camera.width, camera.height],
+        "camera_model": "pinhole",
+        "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
+        "distortion_model": _MODELS[camera.model],
+        "distortion_coefficients": coefficients,
+        "rolling_shutter": {
+            "readout_s": shutter.readout_s,
+            "exposure_s": shutter.exposure_s,
+            "line_delay_s": shutter.line_delay(camera),
+            "scan": shutter.scan,
+        },
+    }
+    return data | ({"depth_scale": stream.depth_scale} if stream.depth_scale else {})
+
+
+def _imu_yaml(imu: ImuConfig) -> dict[str, Any]:
+    return {
+        "sensor_type": "imu",
+        "comment": "rsgen: the body frame",
+        "T_BS": _matrix(np.eye(4)),
+        "rate_hz": imu.rate_hz,
+        "gyroscope_noise_density": imu.gyroscope_noise_density,
+        "gyroscope_random_walk": imu.gyroscope_random_walk,
+        "accelerometer_noise_density": imu.accelerometer_noise_density,
+        "accelerometer_random_walk": imu.accelerometer_random_walk,
+    }
+
+
+def _truth_yaml() -> dict[str, Any]:
+    return {"sensor_type": "visual-inertial", "comment": "rsgen: exact, from the spline", "T_BS": _matrix(np.eye(4))}
+
+
+def _body_yaml(sequence: Sequence, imu: ImuConfig | None, epoch_s: int) -> dict[str, Any]:
+    frame = "the IMU" if imu else "the depth camera"
+    data: dict[str, Any] = {"comment": f"rsgen {sequence.name}: the body is {frame}", "epoch_s": epoch_s}
+    return data | ({"gravity": list(imu.gravity)} if imu else {})
+
+
+def _matrix(T: FloatArray) -> dict[str, Any]:
+    return {"cols": 4, "rows": 4, "data": [float(value) + 0.0 for value in T.ravel()]}  # no negative zeros

@@ -1,0 +1,132 @@
+"""Kalibr's calibration files of a sequence: camchain.yaml with `line_delay`, imu.yaml, and for a target all it needs.
+
+Names and checks after Kalibr's `kalibr_common/ConfigReader.py`; formats: its wiki, "Yaml formats". Images and IMU as
+`kalibr_bagcreater` reads them: cam0/STAMP.png and imu0.csv, nanoseconds.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rsgen.array_types import FloatArray
+from rsgen.config.imu import ImuConfig
+from rsgen.console.progress import Progress, no_progress
+from rsgen.files import atomic_write, encode_yaml
+from rsgen.formats.export.folder import (
+    EPOCH_S,
+    four_coefficients,
+    make_folders,
+    new_folder,
+    place_images,
+    row_clock,
+    sequence_imu,
+    sequence_target,
+)
+from rsgen.geometry import se3
+from rsgen.geometry.aprilgrid import AprilGrid
+from rsgen.sensors.imu import nanoseconds, write_imu_csv
+from rsgen.sequence.reader import Sequence, Stream
+
+COLOR_TOPIC, DEPTH_TOPIC, IMU_TOPIC = "/cam0/image_raw", "/cam1/image_raw", "/imu0"
+_MODELS = {"pinhole": "radtan", "radtan": "radtan", "rational": "radtan", "fisheye": "equidistant"}
+
+
+def export_kalibr(sequence: Sequence, out: Path, copy: bool = False, progress: Progress = no_progress) -> str:
+    """Write camchain.yaml, and imu.yaml where the sequence has an IMU, into the new folder `out`; returns one line.
+
+    Where a target is in the scene, also target.yaml, colour's images as cam0/STAMP.png (hard links where the disk
+    allows, or copies with `copy`) and imu0.csv, their stamps EPOCH_S later.
+    cam0 is the colour camera, cam1 the depth camera. line_delay: s from one row to the next (negative from bottom to
+    top). timeshift_cam_imu takes a stamp to row 0's mid-exposure (t_imu = t_cam + shift): row v is exposed at
+    stamp + timeshift_cam_imu + v · line_delay. Raises UserError for what Kalibr has no words for (k3, columns read one
+    by one), and if `out` is there and not empty.
+    """
+    imu, target = sequence_imu(sequence), sequence_target(sequence)
+    chain = camchain(sequence, imu[0] if imu else None)
+    new_folder(out)
+    atomic_write(out / "camchain.yaml", encode_yaml(chain))
+    written, note = ["camchain.yaml"], "" if imu else " (the sequence has no IMU)"
+    if imu:
+        atomic_write(out / "imu.yaml", encode_yaml(imu_yaml(imu[0])))
+        written.append("imu.yaml")
+        zero = [name for name in _DENSITIES if getattr(imu[0], name) == 0.0]
+        note = f"; Kalibr itself refuses a {zero[0]} of 0" if zero else ""
+    if target:
+        atomic_write(out / "target.yaml", encode_yaml(target_yaml(target.grid)))
+        color = sequence.streams["color"]
+        make_folders(out / "cam0")
+        targets = [out / "cam0" / f"{ns}.png" for ns in nanoseconds(color.listed, EPOCH_S)]
+        place_images(color.paths, targets, copy, progress)
+        written += ["target.yaml", f"cam0/ with {len(targets)} images"]
+        if imu:
+            write_imu_csv(out / "imu0.csv", imu[1], EPOCH_S)
+            written.append("imu0.csv")
+    progress("export", 1.0, written[-1])
+    return f"{out}: {', '.join(written)}{note}"
+
+
+def target_yaml(grid: AprilGrid) -> dict[str, Any]:
+    """Content of target.yaml."""
+    return {
+        "target_type": "aprilgrid",
+        "tagCols": grid.columns,
+        "tagRows": grid.rows,
+        "tagSize": grid.tag_size_m,
+        "tagSpacing": grid.spacing,
+    }
+
+
+def camchain(sequence: Sequence, imu: ImuConfig | None) -> dict[str, Any]:
+    """Content of camchain.yaml; with extrinsics and time shift to the IMU where there is one. Raises UserError."""
+    color, depth = sequence.streams["color"], sequence.streams["depth"]
+    T_depth_color = se3.inverse(sequence.T_color_depth)
+    cameras = {
+        "cam0": _camera(color, COLOR_TOPIC) | {"cam_overlaps": [1]},
+        "cam1": _camera(depth, DEPTH_TOPIC) | {"cam_overlaps": [0], "T_cn_cnm1": _matrix(T_depth_color)},
+    }
+    if imu is not None:
+        T_depth_imu = imu.T_depth_imu()
+        for name, stream, T_cam_depth in (("cam0", color, sequence.T_color_depth), ("cam1", depth, None)):
+            T_cam_imu = T_depth_imu if T_cam_depth is None else T_cam_depth @ T_depth_imu
+            shift = row_clock(stream.name, stream.camera, stream.shutter).first_s + imu.clock_offset_s
+            cameras[name] |= {"T_cam_imu": _matrix(T_cam_imu), "timeshift_cam_imu": shift}
+    return cameras
+
+
+def imu_yaml(imu: ImuConfig) -> dict[str, Any]:
+    """Content of imu.yaml."""
+    return {name: float(getattr(imu, name)) for name in _DENSITIES} | {
+        "rostopic": IMU_TOPIC,
+        "update_rate": float(imu.rate_hz),
+    }
+
+
+_DENSITIES = (
+    "accelerometer_noise_density",
+    "accelerometer_random_walk",
+    "gyroscope_noise_density",
+    "gyroscope_random_walk",
+)
+
+
+def _camera(stream: Stream, topic: str) -> dict[str, Any]:
+    camera = stream.camera
+    pinhole = [camera.fx, camera.fy, camera.cx, camera.cy]
+    if camera.model == "double_sphere":
+        lens = {"camera_model": "ds", "intrinsics": [*camera.distortion, *pinhole], "distortion_model": "none"}
+        bent: list[float] = []
+    else:
+        lens = {"camera_model": "pinhole", "intrinsics": pinhole, "distortion_model": _MODELS[camera.model]}
+        bent = four_coefficients(stream.name, camera)
+    return {
+        **lens,
+        "distortion_coeffs": bent,
+        "resolution": [camera.width, camera.height],
+        "rostopic": topic,
+        "line_delay": row_clock(stream.name, camera, stream.shutter).delay_s,
+    }
+
+
+def _matrix(T: FloatArray) -> list[list[float]]:
+    return [[float(value) + 0.0 for value in row] for row in T]  # no negative zeros

@@ -1,0 +1,82 @@
+"""Registered depth, as drivers deliver it: warped into the colour camera by geometry alone, motion ignored.
+
+Writes a plain TUM RGB-D folder. A row of a registered image mixes pixels of neighbouring depth rows; where the cameras
+lie beside each other their order hardly changes, and camera.yaml says whose lines' times they have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rsgen.console.progress import Progress, no_progress
+from rsgen.files import atomic_write, encode_png, encode_yaml
+from rsgen.formats.export.folder import make_folders, new_folder, place_images, sequence_mocap
+from rsgen.produce.writer import quantise
+from rsgen.sensors.mocap import reported_poses
+from rsgen.sensors.registration import register_depth
+from rsgen.sequence.camera_yaml import Cameras, ColorClock, camera_yaml
+from rsgen.sequence.format import associate, ground_truth, pose_lines
+from rsgen.sequence.reader import Sequence
+
+_MARK = "registered to the colour camera"
+
+
+def export_registered(sequence: Sequence, out: Path, copy: bool = False, progress: Progress = no_progress) -> str:
+    """Write the new folder `out` in TUM's layout with registered depth; returns one line.
+
+    rgb/ holds hard links where the disk allows, or copies with `copy`. camera.yaml (as rstrack reads it) says that
+    depth has the colour camera, and which camera with which shutter it was warped from; groundtruth.txt holds poses of
+    the colour camera at true times, or what the sequence's motion capture reports of it. Stamps are the sequence's
+    listed ones; depth that is registered already is linked like colour. Warped, and said in camera.yaml, is what the
+    sequence declares; the poses are the true colour camera's. Raises UserError if `out` is not empty, or an
+    image cannot be read.
+    """
+    color, depth = sequence.streams["color"], sequence.streams["depth"]
+    sequence.depth(0)  # of the size that sequence.yaml says, or all below would take memory for another one
+    new_folder(out)
+    make_folders(out / "rgb", out / "depth")
+    place_images(color.paths, [out / "rgb" / path.name for path in color.paths], copy, progress, (0.0, 0.1))
+    rays = depth.camera.unproject(depth.camera.pixel_grid())
+    filled = 0.0
+    if depth.registered:
+        place_images(depth.paths, [out / "depth" / path.name for path in depth.paths], copy, progress, (0.1, 0.2))
+    for k, path in enumerate(depth.paths):
+        z = sequence.depth(k)
+        if not depth.registered:
+            z = register_depth(rays, z, color.camera, sequence.T_color_depth)
+            atomic_write(out / "depth" / path.name, encode_png(quantise(z, depth.depth_scale)))
+        filled += float((z > 0).mean()) / len(depth.paths)
+        progress("export", 0.2 + 0.8 * (k + 1) / len(depth.paths), path.name)
+
+    entries = {
+        folder: [f"{t:.9f} {folder}/{path.name}" for t, path in zip(stream.listed, stream.paths, strict=True)]
+        for folder, stream in (("rgb", color), ("depth", depth))
+    }
+    _write(out / "rgb.txt", [f"# colour images of {sequence.name}", "# stamp path", *entries["rgb"]])
+    _write(out / "depth.txt", [f"# depth images of {sequence.name}, {_MARK}", "# stamp path", *entries["depth"]])
+    pairs = associate(color.listed, depth.listed, 0.5 / min(color.rate_hz, depth.rate_hz))
+    _write(out / "associations.txt", [f"{entries['rgb'][i]} {entries['depth'][j]}" for i, j in pairs])
+    title = f"ground truth of {sequence.name}: T_world_color"
+    T_color_depth = sequence.as_taken.T_color_depth
+    if (mocap := sequence_mocap(sequence)) is None:
+        rows = ground_truth(sequence.spline, color.stamps, depth.stamps, T_cam_body=T_color_depth)
+    else:
+        rows = reported_poses(sequence.spline, *mocap, T_color_depth)
+        title += ", as a motion capture reports it"
+    _write(out / "groundtruth.txt", pose_lines(title, rows))
+    atomic_write(out / "camera.yaml", f"# depth is {_MARK}\n".encode() + encode_yaml(_camera_yaml(sequence)))
+    return f"{out}: {len(depth.paths)} depth images {_MARK}; {100 * filled:.0f} % of pixels have depth"
+
+
+def _camera_yaml(sequence: Sequence) -> Mapping[str, Any]:
+    color, depth = sequence.streams["color"], sequence.streams["depth"]
+    sensors = color.camera, color.shutter, depth.camera, depth.shutter
+    driver = any((stream.listed != stream.stamps).any() for stream in (color, depth))
+    clock = ColorClock("auto", is_exact=False) if driver else ColorClock()
+    return camera_yaml(Cameras(*sensors, depth.depth_scale, sequence.T_color_depth), clock, is_registered=True)
+
+
+def _write(path: Path, lines: list[str]) -> None:
+    atomic_write(path, "".join(f"{line}\n" for line in lines).encode())

@@ -1,0 +1,119 @@
+"""A sequence as a rerun recording (.rrd): cameras, images, path, IMU and the scene's surface on one timeline.
+
+Needs rerun-sdk, an optional extra. Rerun's cameras are pinholes: images are shown as recorded, distortion and all, at
+the pose in the middle of their readout.
+"""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsgen.array_types import FloatArray
+from rsgen.console.progress import Progress, no_progress
+from rsgen.errors import UserError
+from rsgen.files import read_bytes, whole_file
+from rsgen.formats.export.folder import image_streams, sequence_imu
+from rsgen.geometry import se3
+from rsgen.sequence.format import ground_truth
+from rsgen.sequence.reader import Sequence, Stream
+
+TIMELINE = "time"
+_UP = {(0, 1): "X_DOWN", (0, -1): "X_UP", (1, 1): "Y_DOWN", (1, -1): "Y_UP", (2, 1): "Z_DOWN", (2, -1): "Z_UP"}
+_PATH_COLOR, _SCENE_COLOR = [230, 120, 30], [190, 190, 190]
+
+
+def export_rerun(sequence: Sequence, out: Path, progress: Progress = no_progress) -> str:
+    """Write the recording `out` (.rrd), whole or not at all; returns one line. Timeline "time": the sequence's seconds.
+
+    Raises UserError if rerun-sdk is not installed, if `out` is there already or not named .rrd, or a file of the
+    sequence cannot be read.
+    """
+    rr = _rerun()
+    out = Path(out)
+    if out.suffix != ".rrd":
+        raise UserError(f"{out}: a rerun recording is named .rrd: choose another --out")
+    if out.exists():
+        raise UserError(f"{out}: is there already: choose another --out or delete it")
+    if not out.parent.is_dir():
+        raise UserError(f"{out.parent}: no such folder: make it or choose another --out")
+    recording = rr.RecordingStream("rsgen", recording_id=sequence.name)
+    with whole_file(out) as temporary:
+        try:
+            recording.save(temporary)
+            _log(rr, recording, sequence, progress)
+            recording.flush()
+        finally:
+            recording.disconnect()
+    return f"{out}: {out.stat().st_size / 1e6:.1f} MB, open it with 'rerun {out.name}'"
+
+
+def _rerun() -> Any:
+    try:
+        return importlib.import_module("rerun")
+    except ImportError:
+        raise UserError("rerun is not installed: pip install rerun-sdk") from None
+
+
+def _log(rr: Any, recording: Any, sequence: Sequence, progress: Progress) -> None:
+    imu = sequence_imu(sequence)
+    gravity = np.array(imu[0].gravity) if imu else np.zeros(3)
+    axis = int(np.argmax(np.abs(gravity)))
+    up = _UP[axis, int(np.sign(gravity[axis]))] if gravity.any() else "Y_UP"
+    recording.log("world", getattr(rr.ViewCoordinates, f"RIGHT_HAND_{up}"), static=True)
+    _log_scene(rr, recording, sequence.root / "scene.ply")
+    path = sequence.spline.pose(ground_truth(sequence.spline)[:, 0])[:, :3, 3]
+    recording.log("world/path", rr.LineStrips3D([path], colors=[_PATH_COLOR]), static=True)
+    for name, channels in (("gyro", "rad/s"), ("accel", "m/s^2")):
+        if imu:
+            names = [f"{axis} {channels}" for axis in "xyz"]
+            recording.log(f"imu/{name}", rr.SeriesLines(names=names), static=True)
+            times = [rr.TimeColumn(TIMELINE, duration=imu[1].t)]
+            recording.send_columns(f"imu/{name}", times, rr.Scalars.columns(scalars=getattr(imu[1], name)))
+
+    color, depth = image_streams(sequence)
+    count = len(color[0].paths) + len(depth[0].paths)
+    for (stream, T_cam_depth), first in ((color, 0), (depth, len(color[0].paths))):
+        where, camera = f"world/{stream.name}", stream.camera
+        pinhole = rr.Pinhole(
+            image_from_camera=camera.K,
+            resolution=[camera.width, camera.height],
+            camera_xyz=rr.ViewCoordinates.RDF,
+            image_plane_distance=0.2,
+        )
+        recording.log(where, pinhole, static=True)
+        poses = _middle_poses(sequence, stream, T_cam_depth)
+        for k, file in enumerate(stream.paths):
+            recording.set_time(TIMELINE, duration=float(stream.stamps[k]))
+            recording.log(where, rr.Transform3D(translation=poses[k, :3, 3], mat3x3=poses[k, :3, :3]))
+            data = read_bytes(file)
+            if stream.depth_scale:
+                picture = rr.EncodedDepthImage(data, media_type="image/png", meter=stream.depth_scale)
+            else:
+                picture = rr.EncodedImage(contents=data, media_type="image/png")
+            recording.log(f"{where}/image", picture)
+            progress("export", (first + k + 1) / count, file.name)
+
+
+def _middle_poses(sequence: Sequence, stream: Stream, T_cam_depth: FloatArray) -> FloatArray:
+    """T_world_cam (n, 4, 4) of the frames in the middle of their readout."""
+    middle = 0.5 * (stream.line_count - 1)
+    times = stream.shutter.line_mid_time(stream.stamps, middle, stream.camera)
+    return np.asarray(sequence.spline.pose(times) @ se3.inverse(T_cam_depth))
+
+
+def _log_scene(rr: Any, recording: Any, path: Path) -> None:
+    if not path.is_file():
+        return
+    import trimesh
+
+    try:
+        mesh = trimesh.load_mesh(path, process=False)
+        vertices, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32)
+    except (ValueError, IndexError, KeyError, AttributeError, TypeError, EOFError, OSError):
+        raise UserError(f"{path}: cannot be read as a mesh: delete it and render again") from None
+    mesh3d = rr.Mesh3D(vertex_positions=vertices, triangle_indices=faces, albedo_factor=_SCENE_COLOR)
+    recording.log("world/scene", mesh3d, static=True)

@@ -1,0 +1,194 @@
+"""A scene file parsed by Mitsuba and made ready for it: old files upgraded, instances flattened, broken parts named.
+
+Also where Mitsuba's own messages go meanwhile: to the logger, never onto the screen.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from rsgen.errors import UserError
+from rsgen.formats.mitsuba_xml import old_xml
+from rsgen.formats.mitsuba_xml.instances import children, flatten
+from rsgen.formats.mitsuba_xml.old_changes import Changes
+from rsgen.formats.mitsuba_xml.old_plugins import Exists
+from rsgen.inputs import MOST_BYTES, MOST_PIXELS, image_size
+from rsgen.render.file_names import mend_names
+
+log = logging.getLogger("rsgen")
+
+# Where a JPEG with a preview in front of it has told its size.
+_HEADER_BYTES = 1 << 20
+_UNKNOWN = re.compile(r'(\w+) plugin of type "(\w+)":|- \w+ "(\w+)"')
+
+_FAILED = re.compile(r'At (.*?\(line \d+, col \d+\)): failed to instantiate (\w+) plugin of type "(\w+)": (.*)')
+
+
+@dataclass(frozen=True)
+class Parsed:
+    """A scene file's parsed state, what an upgrade changed if it is older than Mitsuba 3 (None: it is not), and files
+    that it names otherwise than they are called, by the names there.
+    """
+
+    state: Any
+    changes: Changes | None
+    renamed: dict[str, str]
+
+
+def parse(mi: Any, config: Any, path: Path, scratch: Path, shape: str | None = None) -> Parsed:
+    """A scene file parsed.
+
+    config: a ParserConfig; scratch: a folder for files made on the way; shape: XML of one more shape, which is added as
+    the last. Raises UserError, and what Mitsuba's parser raises.
+    """
+    version = old_xml.old_version(path)
+    file, changes = path.resolve(), None
+    if version is not None:
+        text, changes = old_xml.upgrade(path, version, plugin_finder(mi))
+        file = scratch / "upgraded.xml"
+        file.write_bytes(text)
+        config.unused_properties = mi.LogLevel.Warn  # listed as dropped, later
+    if shape is not None:
+        whole = scratch / "with_shape.xml"
+        shape = shape.replace(' version="3.0.0"', "")
+        whole.write_text(f"<scene version='3.0.0'><include filename={quoteattr(str(file))}/>{shape}</scene>")
+        file = whole
+    state = mi.parser.parse_file(config, str(file))
+    renamed = {} if changes is None else changes.renamed
+    return Parsed(state, changes, renamed | mend_names(state, path.parent))
+
+
+def plugin_finder(mi: Any) -> Exists:
+    """Tells whether Mitsuba has a plugin of a kind and a name."""
+    manager, kind = mi.PluginManager.instance(), mi.ObjectType
+    kinds = {"shape": kind.Shape, "bsdf": kind.BSDF, "texture": kind.Texture, "emitter": kind.Emitter}
+
+    def exists(tag: str, plugin: str) -> bool:
+        try:
+            return manager.plugin_type(plugin) == kinds[tag]
+        except RuntimeError:  # there is none of that name
+            return False
+
+    return exists
+
+
+def prepare(mi: Any, config: Any, state: Any, path: Path) -> None:
+    """Resolve references and flatten instances, in place. Raises UserError if a transform squashes a shape flat."""
+    mi.parser.transform_upgrade(config, state)
+    mi.parser.transform_resolve(config, state)
+    flatten(mi, state)
+    _sample_blends_from_behind(mi, state)
+    for node in state.nodes:
+        props = node.props
+        if node.type == mi.ObjectType.Shape and "to_world" in props:
+            pose = np.asarray(props["to_world"].matrix, float).reshape(4, 4)
+            linear, size = pose[:3, :3], float(np.linalg.norm(pose[:3, :3]))
+            if not np.isfinite(pose).all() or abs(float(np.linalg.det(linear))) <= 1e-12 * size**3:
+                what = props.id() or props.plugin_name()
+                raise UserError(
+                    f"scene {path}: to_world of shape '{what}' squashes it flat or is not finite: "
+                    "scale no axis by 0, and mend its numbers"
+                )
+
+
+def _sample_blends_from_behind(mi: Any, state: Any) -> None:
+    """Have rough metals in a `blendbsdf` that is not `twosided` sample all their microfacets, not the visible alone.
+
+    Seen from behind, Mitsuba 3.9 samples the visible ones of Beckmann's to NaN, which a blend passes on to all light.
+    """
+
+    def below(index: int) -> set[int]:
+        inner = [child for _, child in children(mi, state.nodes[index].props)]
+        return set(inner).union(*(below(child) for child in inner))
+
+    plugins = [node.props.plugin_name() for node in state.nodes]
+    two_sided = set().union(*(below(k) for k, plugin in enumerate(plugins) if plugin == "twosided"))
+    for blend in (k for k, plugin in enumerate(plugins) if plugin == "blendbsdf" and k not in two_sided):
+        for metal in (k for k in below(blend) if plugins[k] == "roughconductor"):
+            props = state.nodes[metal].props
+            if str(props.get("distribution", "beckmann")) == "beckmann":
+                props["sample_visible"] = False
+
+
+def check_files(mi: Any, state: Any, path: Path) -> None:
+    """Raise UserError if a mesh or an image that the scene names is not there, or too large to be read."""
+    for node in state.nodes:
+        name = str(node.props["filename"]) if "filename" in node.props else None
+        if name is None:
+            continue
+        file = Path(str(mi.file_resolver().resolve(name)))
+        if not file.is_file():
+            raise UserError(f"scene {path}: file '{name}' is missing: put it there, or mend its path in the scene")
+        with file.open("rb") as opened:
+            width, height = image_size(opened.read(_HEADER_BYTES)) or (0, 0)
+        if width * height > MOST_PIXELS or file.stat().st_size > MOST_BYTES:
+            raise UserError(f"scene {path}: file '{name}' is too large to be read: make it smaller")
+
+
+@contextlib.contextmanager
+def messages_to_log(mi: Any) -> Iterator[list[str]]:
+    """While open, what Mitsuba would print goes to the logger at debug level, and into the list that this yields."""
+    seen: list[str] = []
+
+    class ToLog(mi.Appender):
+        def append(self, level: Any, text: str) -> None:
+            seen.append(text)
+            log.debug("mitsuba: %s", text)
+
+        def log_progress(self, *_: Any) -> None:
+            pass
+
+    logger = mi.logger()
+    before = [logger.appender(k) for k in range(logger.appender_count())]
+    logger.clear_appenders()
+    logger.add_appender(ToLog())
+    try:
+        yield seen
+    finally:
+        logger.clear_appenders()
+        for appender in before:
+            logger.add_appender(appender)
+
+
+def explained(mi: Any, state: Any, error: str) -> str:
+    """Mitsuba's message about an object that it could not make, in one line: which one, why, and how to mend it."""
+    text = " ".join(error.split())
+    found = _FAILED.search(text)
+    if found is None:
+        return text[:300]
+    place, kind, plugin, why = found.groups()
+    node = next((n for n in state.nodes if str(mi.parser.file_location(state, n)) == place), None)
+    props = None if node is None else node.props
+    name = "" if props is None else str(props["filename"]) if "filename" in props else props.id()
+    why = re.sub(r"\[[\w.:]+\] ?", "", why).rstrip("!. ")
+    if "not found" in why and "Plugin" in why:
+        why, mend = "Mitsuba 3 has no such plugin", "name another, or leave it out"
+    elif kind == "shape":
+        mend = "export it anew, whole, as triangles with finite vertices"
+    elif plugin in ("bitmap", "envmap"):
+        mend = "save the image anew"
+    else:
+        mend = "mend it in the scene"
+    which = f" '{name}'" if name else ""
+    return f"{kind} {plugin}{which}: {why[:200]}: {mend}"
+
+
+def unknown_properties(messages: list[str]) -> list[str]:
+    """'NAME of PLUGIN' for each property that Mitsuba's messages call unreferenced."""
+    found, plugin = [], ""
+    for message in messages:
+        for match in _UNKNOWN.finditer(message) if "unreferenced" in message else ():
+            if match[3] is None:
+                plugin = match[2]
+            else:
+                found.append(f"{match[3]} of {plugin}")
+    return sorted(found)

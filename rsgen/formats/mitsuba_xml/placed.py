@@ -1,0 +1,79 @@
+"""A Mitsuba scene in another unit than metres, or with another axis up: everything in it that has a place or a length.
+
+What it looks like stays: radiance and irradiance have no length in them, the intensity of points does (W/sr meets m²).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsgen.array_types import FloatArray
+from rsgen.errors import UserError
+from rsgen.formats.meshes.mesh_file import MeshOptions, world_from_file
+from rsgen.formats.mitsuba_xml.instances import pose_of
+
+_AROUND = ("envmap", "sunsky", "timed_sunsky", "directional")  # directions, and no place
+_POINTS = ("point", "spot", "projector")
+_NO_PLACE = ("area", "directionalarea", "constant")  # those of shapes go with them
+_DIRECTIONS = ("direction", "sun_direction")  # of the world: `to_world` does not turn them
+_INTENSITY = {"PointLight": "intensity.", "SpotLight": "intensity.", "Projector": "scale"}
+
+
+def place(mi: Any, state: Any, path: Path, options: MeshOptions, left: str) -> None:
+    """Bring the nodes of a parsed scene, instances flattened, to metres and y up as `options` say, in place.
+
+    left: id of a shape that is in the world already. `place_lamps` does what can be done on the finished scene only.
+    Raises UserError naming `path` if the scene has a light that is not known here.
+    """
+    scale, T_world_file = options.scale, world_from_file(options)
+    turn = world_from_file(replace(options, scale=1.0))
+    for node in state.nodes:
+        props, plugin = node.props, node.props.plugin_name()
+        if node.type in (mi.ObjectType.Shape, mi.ObjectType.Volume):
+            if props.id() != left and plugin not in ("merge", "shapegroup", "constvolume"):
+                _premultiply(mi, props, T_world_file)
+        elif node.type == mi.ObjectType.Emitter:
+            if plugin not in _AROUND + _POINTS + _NO_PLACE:
+                raise UserError(
+                    f"scene {path}: emitter '{plugin}' cannot be scaled or turned: "
+                    "take another, or bring the scene to metres and y up yourself"
+                )
+            _place_emitter(mi, props, turn, scale)
+        elif plugin == "bumpmap":  # its heights are lengths
+            props["scale"] = float(props.get("scale", 1.0)) * scale
+
+
+def place_lamps(mi: Any, scene: Any, scale: float) -> None:
+    """Points of light as bright as they were, where all that they shine on is `scale` times as far away."""
+    for emitter in scene.emitters():
+        start = _INTENSITY.get(emitter.class_name())
+        if start is None:
+            continue
+        parameters = mi.traverse(emitter)
+        for key in [key for key in parameters.keys() if key.startswith(start)]:  # noqa: SIM118 (no dict)
+            parameters[key] = parameters[key] * scale**2
+        parameters.update()
+
+
+def _place_emitter(mi: Any, props: Any, turn: FloatArray, scale: float) -> None:
+    given = [name for name in _DIRECTIONS if name in props]
+    for name in given:
+        props[name] = mi.ScalarVector3f(turn[:3, :3] @ np.asarray(props[name], float).ravel())
+    plugin = props.plugin_name()
+    if "position" in props:
+        props["position"] = mi.ScalarPoint3f(scale * turn[:3, :3] @ np.asarray(props["position"], float).ravel())
+    elif plugin in _POINTS:
+        # Not scaled but moved: a projector's picture and a spot's cone have no size.
+        pose = turn @ pose_of(props)
+        pose[:3, 3] *= scale
+        props["to_world"] = mi.ScalarTransform4f(pose)
+    elif plugin in _AROUND and "direction" not in given:
+        _premultiply(mi, props, turn)
+
+
+def _premultiply(mi: Any, props: Any, T: FloatArray) -> None:
+    props["to_world"] = mi.ScalarTransform4f(T @ pose_of(props))

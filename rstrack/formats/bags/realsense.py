@@ -1,0 +1,197 @@
+"""What librealsense records, from a program or its viewer: a ROS 1 bag, or since 2.57 a ROS 2 recording in SQLite.
+
+    /device_0/sensor_0/Depth_0/image/data            sensor_msgs/Image, mono16; then the unit of depth in m, float32,
+                                                     which the definition in the bag does not tell of
+    /device_0/sensor_0/Depth_0/info/camera_info      distortion by librealsense's names
+    /device_0/sensor_0/Depth_0/tf/1                  geometry_msgs/Transform: p_stream from p_reference, by its number
+    /device_0/sensor_1/Color_0/...                   likewise; /device_0/sensor_2/Gyro_0/imu/data, Accel_0
+
+and in SQLite .../image/data/compressedDepth, .../image/data/compressed, .../image/camera_info, and std_msgs/String for
+/tf/ref_1 and .../image/metadata. There headers have the time of recording since its start: the frame's own is in the
+metadata. Found by recording with librealsense 2.56 and 2.59.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from rsgen.array_types import FloatArray
+from rsgen.errors import UserError
+from rsgen.geometry import se3
+from rsgen.geometry.camera import Camera
+from rstrack.formats.bags.bag import Bag, Message, open_bag
+from rstrack.formats.bags.frames import transform_of
+from rstrack.formats.bags.messages import inertial, nanoseconds, picture_of
+from rstrack.formats.bags.topics import COMPRESSED, IMAGE, IMU, Named, listed
+from rstrack.formats.lens import camera_of
+from rstrack.formats.recording import Item, Picture, Recording, StreamCamera
+
+_DATA = re.compile(
+    r"(/device_\d+/sensor_\d+/(Depth|Color|Gyro|Accel)_\d+)/(?:image|imu)/data(?:/compressed|/compressedDepth)?"
+)
+_TF = re.compile(r"/tf/(?:ref_)?(\d+)")
+_DEFAULT_UNIT_M = 0.001
+
+
+def is_realsense(bag: Bag) -> bool:
+    """Whether librealsense wrote it."""
+    return any(_DATA.fullmatch(topic) for topic in bag.of_kind(IMAGE, COMPRESSED))
+
+
+def read_realsense(bag: Bag, named: Named) -> Recording:
+    """The recording of one device. Raises UserError, one line."""
+    topics = {"color": _topic(bag, "Color", named.color), "depth": _topic(bag, "Depth", named.depth)}
+    prefixes = {name: _prefix(topic) for name, topic in topics.items()}
+    color = _camera(bag, prefixes["color"], named.color_info)
+    depth = _camera(bag, prefixes["depth"], named.depth_info)
+    from_reference = {name: _from_reference(bag, prefix) for name, prefix in prefixes.items()}
+    T = _between(from_reference["color"], from_reference["depth"])
+    alone = "the streams' transforms have no common reference: T_color_depth is taken for the identity"
+    images = {topics["color"]: ("color", color), topics["depth"]: ("depth", depth)}
+    imu = tuple(topic for topic in bag.of_kind(IMU) if _DATA.fullmatch(topic))
+    placed = [_between(_from_reference(bag, _prefix(topic)), from_reference["depth"]) for topic in imu]
+    device = _text(bag, prefixes["depth"].split("/sensor_")[0] + "/info")
+    return Recording(
+        kind="RealSense recording",
+        color=StreamCamera(color),
+        depth=StreamCamera(depth),
+        T_color_depth=T,
+        is_registered=False,
+        depth_scale=float(f"{1.0 / _unit(bag, topics['depth'], prefixes['depth']):.6g}"),
+        items=_items(bag.path, images, imu),
+        pictures=sum(bag.topics[topic].count for topic in images),
+        notes=(alone,) if T is None else (),
+        source=topics | ({"imu": ", ".join(imu)} if imu else {}) | ({"device": device} if device else {}),
+        T_imu_depth=next((T for T in placed if T is not None), None),
+    )
+
+
+def _topic(bag: Bag, stream: str, named: str | None) -> str:
+    found = [t for t in bag.of_kind(IMAGE, COMPRESSED) if (match := _DATA.fullmatch(t)) and match[2] == stream]
+    if named is None:
+        if not found:
+            raise UserError(f"{bag.path}: librealsense recorded no {stream.lower()} stream; {listed(bag)}")
+        return found[0]
+    if named not in found:
+        raise UserError(f"{bag.path}: {named}: no such {stream.lower()} stream; {listed(bag)}")
+    return named
+
+
+def _prefix(topic: str) -> str:
+    match = _DATA.fullmatch(topic)
+    assert match is not None
+    return match[1]
+
+
+def _camera(bag: Bag, prefix: str, named: str | None) -> Camera:
+    for topic in (named,) if named else (f"{prefix}/info/camera_info", f"{prefix}/image/camera_info"):
+        if topic in bag.topics and (message := bag.first(topic)) is not None:
+            data = message.content
+            K, D = (data.K, data.D) if bag.is_ros1 else (data.k, data.d)
+            size, K = (int(data.width), int(data.height)), np.ravel(K)
+            model = str(data.distortion_model)
+            return camera_of(f"{bag.path}: {topic}", *size, K[[0, 4, 2, 5]], model, np.ravel(D))
+    raise UserError(
+        f"{bag.path}: nothing tells the camera of {prefix}: record it again with librealsense 2.10 or newer"
+    )
+
+
+def _from_reference(bag: Bag, prefix: str) -> dict[int, FloatArray]:
+    """T_stream_reference (4, 4) by the number of the reference."""
+    found = {}
+    for topic in bag.topics:
+        match = _TF.fullmatch(topic.removeprefix(prefix)) if topic.startswith(prefix) else None
+        message = bag.first(topic) if match else None
+        if match is None or message is None:
+            continue
+        T = transform_of(message.content) if bag.is_ros1 else _of_text(str(message.content.data))
+        if T is not None:
+            found[int(match[1])] = T
+    return found
+
+
+def _of_text(text: str) -> FloatArray | None:
+    """'rotation=<9 numbers, column by column>;translation=<3 numbers>' as (4, 4)."""
+    try:
+        parts = dict(part.split("=", 1) for part in text.strip("; ").split(";"))
+        T = np.eye(4)
+        T[:3, :3] = np.array(parts["rotation"].split(","), float).reshape(3, 3).T
+        T[:3, 3] = np.array(parts["translation"].split(","), float)
+    except (ValueError, KeyError):
+        return None
+    R = T[:3, :3]
+    if not np.isfinite(T).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
+        return None
+    return se3.orthonormalise(T)
+
+
+def _between(to: dict[int, FloatArray], from_: dict[int, FloatArray]) -> FloatArray | None:
+    """T_to_from (4, 4) of two streams' poses against their references; None if they have none in common."""
+    common = sorted(set(to) & set(from_))
+    return to[common[0]] @ se3.inverse(from_[common[0]]) if common else None
+
+
+def _unit(bag: Bag, topic: str, prefix: str) -> float:
+    """Metres of a unit of depth: told by the image, else by the sensor's option, else a millimetre."""
+    first = bag.first(topic)
+    if first is not None and bag.is_ros1 and len(first.rest) >= 4:
+        (unit,) = struct.unpack("<f", first.rest[-4:])
+        if 1e-6 < unit < 1.0:
+            return float(unit)
+    sensor = prefix.rpartition("/")[0]
+    for option in (f"{sensor}/option/Depth_Units/value", f"{sensor}/option/Depth Units/value"):
+        message = bag.first(option) if option in bag.topics else None
+        try:
+            unit = float(message.content.data) if message is not None else 0.0
+        except ValueError:
+            continue
+        if 1e-6 < unit < 1.0:
+            return unit
+    return _DEFAULT_UNIT_M
+
+
+def _text(bag: Bag, topic: str) -> str:
+    """The device's name, as far as it is told."""
+    for message in islice(bag.messages([topic]), 20) if topic in bag.topics else ():
+        content = message.content
+        if getattr(content, "key", None) == "Name":
+            return str(content.value)
+        if match := re.search(r"(?:^|;)Name=([^;]+)", str(getattr(content, "data", ""))):
+            return match[1]
+    return ""
+
+
+def _items(path: Path, images: dict[str, tuple[str, Camera]], imu: tuple[str, ...]) -> Iterator[Item]:
+    with open_bag(path) as bag:
+        taken = {} if bag.is_ros1 else {topic: _stamps(bag, _prefix(topic)) for topic in (*images, *imu)}
+        for message in bag.messages([*images, *imu]):
+            stamp_ns = _stamp(message, taken.get(message.topic))
+            if message.topic not in images:
+                yield inertial(message, stamp_ns)
+                continue
+            stream, camera = images[message.topic]
+            data, ending = picture_of(message, stream == "depth", camera)
+            yield Picture("depth" if stream == "depth" else "color", stamp_ns, data, ending, message.arrival_ns)
+
+
+def _stamp(message: Message, taken: dict[int, int] | None) -> int:
+    """When a frame was taken, ns. taken: by the time of its recording, where headers do not tell."""
+    return nanoseconds(message.content.header.stamp) if taken is None else taken.get(message.arrival_ns, 0)
+
+
+def _stamps(bag: Bag, prefix: str) -> dict[int, int]:
+    """Frames' own stamps in ns by the time at which they were recorded, from their metadata."""
+    found = {}
+    topics = [topic for topic in bag.topics if topic in (f"{prefix}/image/metadata", f"{prefix}/imu/metadata")]
+    for message in bag.messages(topics):
+        match = re.search(r"(?:^|;)timestamp=([0-9.]+)(?:;|$)", str(message.content.data))
+        if match is not None:
+            whole, _, part = match[1].partition(".")
+            found[message.arrival_ns] = int(whole or 0) * 10**6 + int((part + "000000")[:6])
+    return found
