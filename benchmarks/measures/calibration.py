@@ -18,7 +18,7 @@ from rstrack.bench.task import Task
 from rstrack.calibration.run import calibrate, parameters_of
 from rstrack.calibration.unknowns.parameters import DRIFT, EXTRINSICS, NAMES, POSES, Parameters
 from rstrack.data.dataset import Dataset
-from rstrack.data.noise import NoisyImages
+from rstrack.data.image_files import NoisyImages
 
 # What cameras are told wrong by, and multiples of it: readouts by half, colour's clock in s, extrinsics.
 UNIT_READOUT, UNIT_OFFSET_S, UNIT_M, UNIT_RAD = 0.5, 0.015, 5e-3, float(np.radians(0.5))

@@ -39,7 +39,7 @@ def camera_of(stream: Any) -> Camera:
     """librealsense's intrinsics as ours: pixel centres at integers in both."""
     K = stream.get_intrinsics()
     if any(K.coeffs) and K.model not in (rs.distortion.brown_conrady, rs.distortion.inverse_brown_conrady):
-        raise SystemExit(f"lens model {K.model} is not that of a D400: see rstrack/formats/lens.py for others")
+        raise SystemExit(f"lens model {K.model} is not that of a D400: see rstrack/formats/recording.py for others")
     lens = ("radtan", tuple(K.coeffs)) if any(K.coeffs) else ()
     return Camera(K.width, K.height, K.fx, K.fy, K.ppx, K.ppy, *lens)
 

@@ -61,7 +61,7 @@ class SequenceEntry(_Section):
 
 
 class NoiseEntry(_Section):
-    """What is added to images when they are read, see `rstrack.data.noise.with_noise`; from the run's seed."""
+    """What is added to images when they are read, see `rstrack.data.image_files.with_noise`; from the run's seed."""
 
     depth: float = Field(default=0.0, ge=0.0, description="sigma of depth z is this times z squared, 1/m")
     intensity: float = Field(default=0.0, ge=0.0, description="sigma of grey values in [0, 1]")

@@ -22,7 +22,7 @@ from rstrack.bench.definitions import Cell
 from rstrack.bench.record import Figures
 from rstrack.bench.sequences import Sources
 from rstrack.data.dataset import Dataset, open_dataset
-from rstrack.data.noise import NoisyImages
+from rstrack.data.image_files import NoisyImages
 from rstrack.options import Options
 from rstrack.tracking.runs.record import Noise
 

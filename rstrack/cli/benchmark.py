@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     from rstrack.bench.runner import Outcome
     from rstrack.bench.sequences import Sources
 
-STATUS = "exit status: 0 done, 1 a track was lost or failed, 2 wrong input, 130 interrupted (the same command resumes)"
+BENCH_STATUS = (
+    "exit status: 0 done, 1 a track was lost or failed, 2 wrong input, 130 interrupted (the same command resumes)"
+)
 
 
 def _added(text: str) -> tuple[str, Path]:

@@ -9,12 +9,12 @@ camera.yaml (depth left out: registered to colour, read out as colour is, 5000 u
 Each may have model (pinhole, radtan, rational, fisheye, double_sphere), distortion, exposure_s and scan as in rsgen's
 configs.
 T_color_depth (4x4) is the identity where it is left out. color.offset_s: seconds added to colour's stamps; auto: see
-`rstrack.data.clocks.timing`; color.drift_ppm: millionths by which that grows over the recording, in whose middle it
+`rstrack.data.timing`; color.drift_ppm: millionths by which that grows over the recording, in whose middle it
 holds; both are what `rstrack calibrate` finds, which writes such a file; clocks: {NAME: {offset_s: 0.02, drift_ppm: 3}}
 of the recording in a folder of that name alone. color.falloff: see `Rig`; auto: `track` finds
 it. stamps: auto, raw or regular, see there too.
 sigma: {focal: 0.01, center_px: 3, ...}: how far this may be wrong, see `CalibrationSigma`; the rest is as usual.
-depth.registered: warped into the colour camera, see `rstrack.data.registered_rows`. depth.offset_s: seconds added to
+depth.registered: warped into the colour camera, see `rstrack.data.registration`. depth.offset_s: seconds added to
 depth's stamps. calibration.yaml: see `rstrack.data.opencv_camera_file`; Kalibr's camchain.yaml: see
 `rstrack.data.kalibr_camera_file`. A run.json holds the cameras of its run in the same form (`camera_content`).
 """
@@ -34,14 +34,12 @@ from rsgen.files import read_text, read_yaml
 from rsgen.geometry.camera import Camera, Model
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.sequence.format import DEPTH_SCALE
-from rstrack.data.calibration_sigma import STATED, UNDISTORTED_K1, CalibrationSigma
-from rstrack.data.clocks.timing import StampsMode
-from rstrack.data.depth_error import NONE, DepthError
 from rstrack.data.estimate import read_info
 from rstrack.data.kalibr_camera_file import Camchain, is_camchain, read_camchain
 from rstrack.data.opencv_camera_file import check_fy, extrinsic, is_opencv, read_opencv_rig
-from rstrack.data.registered_rows import DepthSensor, registered_shutter
-from rstrack.data.rig import Rig
+from rstrack.data.registration import DepthSensor, registered_shutter
+from rstrack.data.rig import DEFAULT_SIGMA, NO_DEPTH_ERROR, UNDISTORTED_K1, CalibrationSigma, DepthError, Rig
+from rstrack.data.timing import StampsMode
 
 EXAMPLE = "color: {width: 640, height: 480, intrinsics: [fx, fy, cx, cy], readout_s: 0.028}"
 _KEYS = "color, depth, T_color_depth, stamps, clocks and sigma, each camera with width, height, intrinsics, readout_s"
@@ -75,7 +73,7 @@ class RigFile:
     scan_named: bool = True
     scale_named: bool = True
     notes: tuple[str, ...] = ()
-    depth_error: DepthError = NONE
+    depth_error: DepthError = NO_DEPTH_ERROR
     clocks: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def of(self, recording: str) -> RigFile:
@@ -203,7 +201,7 @@ def usual(camera: Camera, stated: Mapping[str, float] | None = None) -> Calibrat
     found = dict(stated or {})
     if "center_px" in found:
         found["center"] = found.pop("center_px") / camera.fx
-    return replace(STATED if any(camera.distortion) else replace(STATED, k1=UNDISTORTED_K1), **found)
+    return replace(DEFAULT_SIGMA if any(camera.distortion) else replace(DEFAULT_SIGMA, k1=UNDISTORTED_K1), **found)
 
 
 def run_cameras(info: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -273,7 +271,7 @@ def _of_content(path: Path, content: Mapping[str, Any]) -> RigFile:
         any("scan" in stream.model_fields_set for stream in (data.color, depth) if stream is not None),
         depth is not None and "depth_scale" in depth.model_fields_set,
         notes,
-        NONE if depth is None else DepthError(**depth.error.model_dump()),
+        NO_DEPTH_ERROR if depth is None else DepthError(**depth.error.model_dump()),
         {name: (clock.offset_s, 1e-6 * clock.drift_ppm) for name, clock in data.clocks.items()},
     )
 

@@ -23,17 +23,14 @@ from rsgen.sequence.format import DEPTH_SCALE, StreamName
 from rsgen.sequence.reader import Sequence, read_sequence
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.camera_file import RigFile, camera_content, read_rig, run_cameras
-from rstrack.data.clocks.timing import Timing, stream_timing
-from rstrack.data.depth_error import NONE, DepthError
 from rstrack.data.estimate import INFO
-from rstrack.data.imu.files import ImuFiles, ReadImu, find_imu
-from rstrack.data.imu.recording import ImuRecording
+from rstrack.data.image_files import ImageReader, prefetched
+from rstrack.data.imu.recording import ImuFiles, ImuRecording, ReadImu, find_imu
 from rstrack.data.layouts.generated import as_recorded, is_exact, sigma_of, with_depth_scale
 from rstrack.data.layouts.seven_scenes import is_seven_scenes, read_seven_scenes
 from rstrack.data.layouts.tum_folder import TumFolder, read_tum_folder
-from rstrack.data.noise import ImageReader
-from rstrack.data.prefetch import prefetched
-from rstrack.data.rig import Frame, Image, Rig
+from rstrack.data.rig import NO_DEPTH_ERROR, DepthError, Frame, Image, Rig
+from rstrack.data.timing import Timing, stream_timing
 
 __all__ = ["Dataset", "Frame", "Image", "Rig", "group_colors", "open_dataset", "open_tracked"]
 
@@ -72,7 +69,7 @@ class Dataset:
     scan_named: bool = True
     depth_scale: float = DEPTH_SCALE
     depth_offset_s: float = 0.0
-    depth_error: DepthError = NONE
+    depth_error: DepthError = NO_DEPTH_ERROR
     imu_files: ImuFiles | None = None
 
     def __len__(self) -> int:

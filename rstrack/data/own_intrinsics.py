@@ -20,7 +20,7 @@ from rsgen.errors import UserError
 from rsgen.files import read_text
 from rsgen.geometry.camera import Camera
 from rsgen.sequence.format import StreamName
-from rstrack.data.noise import ImageReader
+from rstrack.data.image_files import ImageReader
 
 FILES: dict[StreamName, str] = {"color": "intrinsics.csv", "depth": "intrinsics_depth.csv"}
 # Neighbours are of one surface if their 1/z differs by less, or goes on as beside them but for less; relative.

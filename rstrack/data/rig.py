@@ -1,17 +1,113 @@
-"""What the tracker is fed: the cameras (`Rig`) and one `Frame` for each depth image."""
+"""What the tracker is fed: the cameras (`Rig`), how far they may be wrong, and one `Frame` for each depth image."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, fields
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from rsgen.array_types import FloatArray
+from rsgen.array_types import Float32Array, FloatArray
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rstrack.data.calibration_sigma import EXACT, CalibrationSigma
+
+_LENS = "focal", "aspect", "cx", "cy", "k1"
+CALIBRATION_NAMES = (
+    *(f"depth.{name}" for name in _LENS), *(f"color.{name}" for name in _LENS),
+    *(f"T_color_depth.{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz")),
+    "depth.readout_s", "color.readout_s", "color.offset_s", "depth.scale", "depth.inverse_offset",
+)  # fmt: skip
+"""The parameters, in the order of vectors.
+
+Lenses: focal lengths as a part of themselves, aspect as a part of fy alone, cx and cy in focal lengths, k1 as OpenCV
+counts it. T_color_depth ← exp(ε) T_color_depth. Depth's scale as a part, its inverse offset in 1/m (`DepthError`).
+"""
+
+
+@dataclass(frozen=True)
+class CalibrationSigma:
+    """Standard deviations of what a camera file says, of both cameras alike; 0: exact.
+
+    focal: part of the focal lengths; aspect: part of fy beyond that; center: principal point, in focal lengths; k1:
+    distortion; rotation_deg, translation_m: of T_color_depth, an axis; readout_s; offset_s: colour's clock;
+    depth_scale: part; depth_inverse_offset: 1/m. depth_image: 1/m, what inverse depth of each image is off by as a
+    whole, by an offset and by two tilts: no parameter, but solved for with every pose.
+    """
+
+    focal: float = 0.0
+    aspect: float = 0.0
+    center: float = 0.0
+    k1: float = 0.0
+    rotation_deg: float = 0.0
+    translation_m: float = 0.0
+    readout_s: float = 0.0
+    offset_s: float = 0.0
+    depth_scale: float = 0.0
+    depth_inverse_offset: float = 0.0
+    depth_image: float = 0.0
+
+    def vector(self, is_registered: bool = False) -> FloatArray:
+        """In the order of CALIBRATION_NAMES (21,). is_registered: both streams are seen through the colour camera."""
+        lens = np.array([self.focal, self.aspect, self.center, self.center, self.k1])
+        pose = np.array([self.translation_m, math.radians(self.rotation_deg)]).repeat(3)
+        own = 0.0 if is_registered else 1.0
+        times = self.readout_s, self.readout_s, self.offset_s
+        return np.concatenate([own * lens, lens, own * pose, times, [self.depth_scale, self.depth_inverse_offset]])
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether nothing may be wrong."""
+        return not any(getattr(self, field.name) for field in fields(self))
+
+
+EXACT_SIGMA = CalibrationSigma()
+"""Of renderings, but for depth cameras with fixed errors."""
+
+DEFAULT_SIGMA = CalibrationSigma(0.01, 0.003, 0.01, 0.02, 0.3, 0.005, 0.003, 0.003, 0.01, 0.005, 0.001)
+"""Of a camera file that does not say: a judgement of what such files have wrong, not a measurement."""
+
+UNFOUND_OFFSET_S = 0.015
+"""σ of colour's clock where it is looked for and not found: half a frame at 30 Hz, as cameras run that nothing ties."""
+
+UNDISTORTED_K1 = 0.1
+"""σ of k1 where a real lens is said to have no distortion, as it hardly ever is."""
+
+
+@dataclass(frozen=True)
+class DepthError:
+    """True depth is 1 / (1 / z + inverse_offset + radial r²) + offset_m.
+
+    z: as measured, m; r: of the pixel's ray, in normalised coordinates. inverse_offset and radial in 1/m: an error of
+    the disparity of structured light, whose effect grows with z² (Teichman et al., RSS 2013); offset_m: of time of
+    flight.
+    """
+
+    offset_m: float = 0.0
+    inverse_offset: float = 0.0
+    radial: float = 0.0
+
+    def corrected(self, z: Float32Array, camera: Camera) -> Float32Array:
+        """True planar z (h, w) in m of what the camera measured; 0, and what would lie beyond infinity, is 0."""
+        if self == NO_DEPTH_ERROR:
+            return z
+        bent = np.float32(self.inverse_offset) + np.float32(self.radial) * _squared_radius(camera)
+        inverse = np.divide(np.float32(1), z, out=np.zeros_like(z), where=z > 0) + bent
+        found = (z > 0) & (inverse > 0)
+        true = np.divide(np.float32(1), inverse, out=np.zeros_like(z), where=found) + np.float32(self.offset_m)
+        return np.where(found & (true > 0), true, np.float32(0))
+
+
+NO_DEPTH_ERROR = DepthError()
+
+
+@lru_cache(maxsize=4)
+def _squared_radius(camera: Camera) -> Float32Array:
+    x, y = np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float))
+    rays = camera.unproject(np.stack([x, y], axis=-1))
+    return np.nan_to_num((rays[..., :2] ** 2).sum(axis=-1)).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -28,7 +124,7 @@ class Rig:
     color_shutter: Shutter
     T_color_depth: FloatArray
     color_falloff: float | None = None
-    sigma: CalibrationSigma = EXACT
+    sigma: CalibrationSigma = EXACT_SIGMA
 
     @property
     def is_registered(self) -> bool:

@@ -28,7 +28,7 @@ from rsgen.files import encode_yaml, write_error
 from rsgen.sequence.format import pose_rows
 from rsgen.sequence.trajectory import MAX_POSITION_M, MIN_POSES
 from rstrack.data.imu.description import imu_yaml
-from rstrack.data.imu.files import IMU_YAML
+from rstrack.data.imu.recording import IMU_YAML
 from rstrack.data.layouts.tum_folder import ESTIMATED
 from rstrack.data.own_intrinsics import FILES
 from rstrack.formats.recording import Inertial, Intrinsics, Picture, Pose, Recording, StreamCamera

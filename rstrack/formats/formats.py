@@ -8,11 +8,11 @@ from rsgen.errors import UserError
 from rstrack.formats.bags.bag import is_bag
 from rstrack.formats.bags.ros import read_bag
 from rstrack.formats.bags.topics import Named
-from rstrack.formats.datasets.euroc import is_euroc, read_euroc
-from rstrack.formats.datasets.scannet import is_sens, read_sens
-from rstrack.formats.phones.record3d import is_r3d, read_r3d
-from rstrack.formats.phones.stray_scanner import is_stray_scanner, read_stray_scanner
+from rstrack.formats.euroc import is_euroc, read_euroc
+from rstrack.formats.record3d import is_r3d, read_r3d
 from rstrack.formats.recording import Recording
+from rstrack.formats.scannet import is_sens, read_sens
+from rstrack.formats.stray_scanner import is_stray_scanner, read_stray_scanner
 
 _KNOWN = (
     "a ROS 1 or ROS 2 bag, an MCAP file, what librealsense recorded, a .sens or .r3d file, or a folder of Stray "

@@ -1,22 +1,29 @@
 """What every reader of a foreign recording gives: the cameras, and a stream of items in the order of the file.
 
 Readers hold one image at a time: items come from a generator that reads as it is asked, and closes the file at its end.
+Lens models and shutters by the names that others give them, and what phones' recordings share, are below.
+
+What Apple's ARKit gives and two apps store: its frames, and depth of 256x192 that is aligned with the colour image.
+ARKit's camera has y up and looks along −z; ours y down and along z. Pixel centres are at integers in both. A depth
+image covers the colour image's field exactly, so that its camera is colour's with fewer pixels.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any, get_args
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from rsgen.array_types import FloatArray
+from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan
 from rsgen.sequence.format import StreamName
-from rstrack.data.imu.recording import ImuNoise
+from rstrack.data.imu.description import ImuNoise
 
 FLOAT_DEPTH_SCALE = 5000.0
 """Units per metre of depth that was stored as floats."""
@@ -113,3 +120,90 @@ class Recording:
     source: Mapping[str, str | float] = field(default_factory=dict)
     T_imu_depth: FloatArray | None = None
     imu_noise: ImuNoise | None = None
+
+
+# Larger than any camera's: a damaged file, which must not decide how much memory is taken.
+_MOST_PIXELS = 1 << 26
+_PINHOLE = ("", "none", "pinhole")
+_RADTAN = ("plumb_bob", "radtan", "radial-tangential", "brown_conrady", "modified_brown_conrady")
+_INVERSE = ("inverse_brown_conrady",)
+_RATIONAL = ("rational_polynomial", "rational")
+_DOUBLE_SPHERE = ("double_sphere", "ds")
+_FISHEYE = ("equidistant", "fisheye", "kannala_brandt", "kannala_brandt4")
+
+
+def camera_of(
+    name: str, width: int, height: int, intrinsics: npt.ArrayLike, model: str, coefficients: npt.ArrayLike
+) -> Camera:
+    """The camera of a ROS camera_info, of librealsense or of an ASL sensor.yaml.
+
+    name: for messages. intrinsics: fx, fy, cx, cy in pixels, pixel centres at integers. coefficients: in OpenCV's
+    order, k1 k2 p1 p2 k3 k4 k5 k6 of the rational model, xi alpha of the double sphere; zeros at the end are no matter.
+    librealsense's inverse Brown-Conrady is what its own projection makes of it, radtan. Raises UserError: a model that
+    there is none of.
+    """
+    d = np.ravel(np.asarray(coefficients, float)).tolist()
+    key = model.strip().lower().replace(" ", "_")
+    fx, fy, cx, cy = np.ravel(np.asarray(intrinsics, float)).tolist()
+    if width * height > _MOST_PIXELS:
+        raise UserError(f"{name}: {width}x{height} pixels are absurd: the file is damaged")
+    try:
+        if not any(d) and key not in (*_FISHEYE, *_DOUBLE_SPHERE):
+            return Camera(width, height, fx, fy, cx, cy)
+        if key in _PINHOLE:
+            raise UserError(f"distortion {d} without a model")
+        if key in _FISHEYE:
+            return Camera(width, height, fx, fy, cx, cy, "fisheye", tuple((d + [0.0] * 4)[:4]))
+        if key in _DOUBLE_SPHERE and len(d) == 2:
+            return Camera(width, height, fx, fy, cx, cy, "double_sphere", (d[0], d[1]))
+        if key in (*_RADTAN, *_INVERSE, *_RATIONAL) and not any(d[5:]):
+            return Camera(width, height, fx, fy, cx, cy, "radtan", tuple((d + [0.0] * 4)[: 5 if any(d[4:]) else 4]))
+        if key in _RATIONAL and len(d) >= 8 and not any(d[8:]):
+            return Camera(width, height, fx, fy, cx, cy, "rational", tuple(d[:8]))
+    except UserError as error:
+        raise UserError(f"{name}: {error}") from None
+    raise UserError(
+        f"{name}: lens model {model!r} with {len(d)} coefficients is not supported: undistort the images (OpenCV's "
+        "initUndistortRectifyMap, or image_proc) and import those with the new camera matrix"
+    )
+
+
+def with_shutter(where: str, camera: Camera, facts: dict[str, Any]) -> StreamCamera:
+    """A camera with the shutter of an entry `rolling_shutter` as `rsgen export` writes it.
+
+    Raises UserError naming `where`: times that are none, or an unknown scan.
+    """
+    times = [facts.get(name, 0.0) for name in ("readout_s", "exposure_s")]
+    scan: Scan = facts.get("scan", "top-bottom")
+    if not all(isinstance(t, int | float) and 0 <= t < 10 for t in times) or scan not in get_args(Scan):
+        raise UserError(f"{where}: rolling_shutter needs readout_s and exposure_s in seconds, and a scan")
+    return StreamCamera(camera, float(times[0]), float(times[1]), scan)
+
+
+TRUTH = "ARKit's poses, from the same images and the phone's IMU"
+Four = tuple[float, float, float, float]
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+"""T_arkit_camera: coordinates of our camera in ARKit's."""
+
+
+def median_camera(name: str, size: tuple[int, int], intrinsics: npt.ArrayLike) -> Camera:
+    """The camera (width, height) with the medians of fx, fy, cx, cy (n, 4). Raises UserError."""
+    return camera_of(name, *size, np.median(np.asarray(intrinsics, float), axis=0), "", ())
+
+
+def resized(name: str, camera: Camera, size: tuple[int, int]) -> Camera:
+    """The same field of view with other pixels: (width, height). Raises UserError."""
+    own = resized_intrinsics((camera.fx, camera.fy, camera.cx, camera.cy), (camera.width, camera.height), size)
+    return camera_of(name, *size, own, "", ())
+
+
+def resized_intrinsics(own: Four, size: tuple[int, int], new: tuple[int, int]) -> Four:
+    """fx, fy, cx, cy of an image of `size` (width, height), for its field of view in `new` pixels."""
+    (fx, fy, cx, cy), (sx, sy) = own, (new[0] / size[0], new[1] / size[1])
+    return fx * sx, fy * sy, (cx + 0.5) * sx - 0.5, (cy + 0.5) * sy - 0.5
+
+
+def intrinsics_items(stamp_ns: int, own: Four, color: Camera, depth: Camera) -> tuple[Intrinsics, Intrinsics]:
+    """Those of the colour image of a time, and what they are for the depth image of that time."""
+    beside = resized_intrinsics(own, (color.width, color.height), (depth.width, depth.height))
+    return Intrinsics(stamp_ns, own), Intrinsics(stamp_ns, beside, "depth")

@@ -21,7 +21,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.shutter import Shutter
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate, read_estimate
-from rstrack.data.prefetch import prefetched
+from rstrack.data.image_files import prefetched
 from rstrack.data.rig import Frame, Rig
 from rstrack.images.left_out import MARGIN
 from rstrack.images.line_poses import Exposure, from_base_table, to_base_table

@@ -22,7 +22,7 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate
-from rstrack.data.prefetch import prefetched
+from rstrack.data.image_files import prefetched
 from rstrack.options import CLOUD_PEERS, Options
 from rstrack.peers.record import run_info
 

@@ -20,8 +20,8 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate
-from rstrack.data.prefetch import prefetched
-from rstrack.data.registered import RegisteredImage, Registrar, registered_image
+from rstrack.data.image_files import prefetched
+from rstrack.data.registration import RegisteredImage, Registrar, registered_image
 from rstrack.options import PEERS, Options
 from rstrack.peers.record import run_info
 
@@ -140,7 +140,7 @@ class PeerTracker:
 def run_peer(name: str, dataset: Dataset, frames: slice = slice(None), progress: Progress = no_progress) -> Estimate:
     """Track frames of a dataset with one of PEERS; its poses at the depth frames' stamps.
 
-    Its input is registered by `rstrack.data.registered`. A pose is taken for that of the middle of the depth image's
+    Its input is registered by `rstrack.data.registration`. A pose is taken for that of the middle of the depth image's
     readout, as our baseline's are, and interpolated to the stamp: at the stamp itself all of them would be half a
     readout late.
 

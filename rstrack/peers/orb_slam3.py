@@ -29,8 +29,8 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate, read_estimate
-from rstrack.data.prefetch import prefetched
-from rstrack.data.registered import RegisteredImage, Registrar, registered_image
+from rstrack.data.image_files import prefetched
+from rstrack.data.registration import RegisteredImage, Registrar, registered_image
 from rstrack.options import Options
 from rstrack.peers.orb_vocabulary import orb_descriptors, train_vocabulary, write_vocabulary
 from rstrack.peers.record import run_info
@@ -49,8 +49,8 @@ def run_orb_slam3(
 ) -> Estimate:
     """Track frames of a dataset; poses at the depth frames' stamps, of its final trajectory.
 
-    Its input is registered by `rstrack.data.registered`; as of our baseline, a pose is taken for that of the middle of
-    the readout, and interpolated to the stamp. seed: of the vocabulary. Raises UserError: it is not installed, no such
+    Its input is registered by `rstrack.data.registration`. As of our baseline, a pose is taken for that of mid
+    readout, and interpolated to the stamp. seed: of the vocabulary. Raises UserError: it is not installed, no such
     frames, an image cannot be read, its process fails, nothing was tracked.
     """
     chosen = range(len(dataset))[frames]

@@ -19,7 +19,7 @@ from rsgen.errors import UserError
 from rstrack.calibration.run import parameters_of
 from rstrack.calibration.unknowns.parameters import COUNT, DRIFT, EXTRINSICS, POSES
 from rstrack.data.dataset import Dataset, open_dataset
-from rstrack.data.noise import NoisyImages
+from rstrack.data.image_files import NoisyImages
 
 UNIT = [1.0, -1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
 

@@ -28,8 +28,8 @@ from rstrack.bench.changes.named import (
     swinging_gain,
 )
 from rstrack.data.camera_file import usual
-from rstrack.data.clocks.timing import Timing, stream_timing
 from rstrack.data.dataset import Dataset, open_dataset
+from rstrack.data.timing import Timing, stream_timing
 
 FRAMES = 30
 SPLINE = synthetic.make_spline()

@@ -30,7 +30,7 @@ from hostile_cases import (
 
 import rsgen.cli.main
 from rsgen.files import encode_png
-from rstrack.data.imu.files import find_imu
+from rstrack.data.imu.recording import find_imu
 
 
 def folders(folder: Path) -> Iterator[Case]:

@@ -16,8 +16,8 @@ from rsgen.geometry.spline import Spline
 from rstrack.calibration.findings.pace import Pace
 from rstrack.calibration.findings.residuals import Residuals
 from rstrack.data.dataset import Dataset, open_dataset
-from rstrack.data.depth_error import DepthError
-from rstrack.data.noise import ImageReader
+from rstrack.data.image_files import ImageReader
+from rstrack.data.rig import DepthError
 from rstrack.options import Options
 
 READOUT_S, RATE_HZ, FRAMES = 0.014, 60.0, 60

@@ -22,7 +22,7 @@ from rstrack.bench.record import Figures
 from rstrack.bench.sequences import Absent
 from rstrack.bench.settings import Settings, settings_of
 from rstrack.bench.task import Task
-from rstrack.data.registered import Registrar, registered_image
+from rstrack.data.registration import Registrar, registered_image
 from rstrack.options import PEERS, Peer
 from rstrack.peers.open3d import PeerTracker
 from rstrack.tracking.any_tracker import AnyTracker, make_tracker

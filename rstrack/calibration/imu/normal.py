@@ -21,7 +21,7 @@ from rstrack.calibration.imu.unit import (
     readings,
     unit_size,
 )
-from rstrack.data.imu.recording import ImuNoise
+from rstrack.data.imu.description import ImuNoise
 from rstrack.inertial.belief import WARMS
 
 BAND = 24  # of four control points of six

@@ -12,8 +12,7 @@ from rsgen.geometry import so3
 from rsgen.geometry.so3 import hat
 from rstrack.calibration.imu.solve import Solution
 from rstrack.calibration.imu.unit import COUNT, DRIFT, LEVER, OFFSET, ROTATION, SCALE
-from rstrack.data.imu.description import ImuDescription, imu_yaml
-from rstrack.data.imu.recording import ImuNoise
+from rstrack.data.imu.description import ImuDescription, ImuNoise, imu_yaml
 
 # σ above which a value is of no use: rad, m, s, s/s, parts, rad.
 USEFUL = np.array([*np.radians((0.3,) * 3), *(0.01,) * 3, 1e-3, 5e-5, *(0.01,) * 3, *np.radians((0.3,) * 2)])

@@ -17,7 +17,7 @@ from rstrack.calibration.pairs.surfaces import averaged, intensity_bound, surfac
 from rstrack.calibration.pairs.terms import PairTerms
 from rstrack.calibration.unknowns.parameters import COLOR_LENS, COUNT, DEPTH, DEPTH_ERROR, DEPTH_LENS, LENS, Parameters
 from rstrack.data.dataset import Dataset
-from rstrack.data.depth_error import NONE
+from rstrack.data.rig import NO_DEPTH_ERROR
 from rstrack.images.line_poses import Exposure
 from rstrack.images.pyramid import color_image, intensity
 from rstrack.options import Options
@@ -42,7 +42,7 @@ def _asked(dataset: Dataset, free: BoolArray) -> Asked:
     color = tuple(name for name, asked in zip(LENS, free[COLOR_LENS], strict=True) if asked)
     depth = color if one else tuple(name for name, asked in zip(LENS, free[DEPTH_LENS], strict=True) if asked)
     depth += tuple(name for name, asked in zip(DEPTH, free[DEPTH_ERROR], strict=True) if asked)
-    return Asked(depth, color, bool(free[DEPTH_ERROR].any()) or dataset.depth_error != NONE, one)
+    return Asked(depth, color, bool(free[DEPTH_ERROR].any()) or dataset.depth_error != NO_DEPTH_ERROR, one)
 
 
 def load_stretch(

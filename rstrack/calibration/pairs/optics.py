@@ -16,7 +16,7 @@ from rsgen.device.projection import Projection, Vector
 from rsgen.geometry.camera import Camera
 from rstrack.alignment.block_sums import BlockSums, ColumnSums
 from rstrack.calibration.unknowns.parameters import DEPTH, LENS, NAMES
-from rstrack.data.depth_error import DepthError
+from rstrack.data.rig import DepthError
 
 # Coefficients of distortion at most.
 _BENDS = 8

@@ -18,7 +18,7 @@ from rstrack.calibration.pairs.kernels import ColorPairInput, DepthPairInput, co
 from rstrack.calibration.pairs.optics import Asked, Optics, camera_table, error_table, in_units, units
 from rstrack.calibration.pairs.surfaces import Surface
 from rstrack.calibration.unknowns.parameters import Parameters, changed
-from rstrack.data.depth_error import DepthError
+from rstrack.data.rig import DepthError
 from rstrack.images.line_poses import Exposure
 from rstrack.images.pyramid import camera_rays
 

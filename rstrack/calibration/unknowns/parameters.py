@@ -12,7 +12,7 @@ from rsgen.array_types import BoolArray, FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
-from rstrack.data.depth_error import DepthError
+from rstrack.data.rig import DepthError
 
 Group = Literal["readout", "offset", "extrinsics", "depth", "intrinsics"]
 GROUPS: tuple[str, ...] = get_args(Group)

@@ -24,8 +24,24 @@ from rsgen.errors import UserError, first_problem
 from rsgen.files import parse_yaml, read_text, read_yaml
 from rsgen.geometry import se3
 from rsgen.limits import rigid
-from rstrack.data.imu.recording import ImuNoise
 from rstrack.data.kalibr_camera_file import is_camchain, read_camchain
+
+
+@dataclass(frozen=True)
+class ImuNoise:
+    """Densities as Kalibr states them (its wiki, "IMU Noise Model"), per axis.
+
+    gyro_density rad/s/√Hz, gyro_walk rad/s²/√Hz, accel_density m/s²/√Hz, accel_walk m/s³/√Hz. gyro_range (rad/s) and
+    accel_range (m/s²): the largest readings of an axis, where the unit saturates; None: not known.
+    """
+
+    gyro_density: float
+    gyro_walk: float
+    accel_density: float
+    accel_walk: float
+    gyro_range: float | None = None
+    accel_range: float | None = None
+
 
 EXAMPLE = "T_imu_depth: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
 PHONE = ImuNoise(gyro_density=1.3e-4, gyro_walk=2.0e-5, accel_density=1.4e-3, accel_walk=2.0e-4)

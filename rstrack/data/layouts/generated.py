@@ -1,7 +1,7 @@
 """Sequences of rsgen as a tracker gets them: exact, or as what a driver and a registration leave of them.
 
 Where a sequence's listed stamps are a driver's, or its depth is registered, it is a recording like any other: cameras
-as sequence.yaml tells them, stamps that are arrival times (`rstrack.data.clocks.timing`), colour's offset not known.
+as sequence.yaml tells them, stamps that are arrival times (`rstrack.data.timing`), colour's offset not known.
 Its truth is the pose of each depth frame when it was taken, under the stamp at which it is tracked. Cameras that are
 declared wrong on purpose are given as they are declared; the truth is that of the cameras that took the images.
 """
@@ -16,11 +16,10 @@ import numpy as np
 from rsgen.geometry import se3
 from rsgen.sequence.reader import Sequence
 from rsgen.sequence.trajectory import Trajectory
-from rstrack.data.calibration_sigma import EXACT, STATED, CalibrationSigma
 from rstrack.data.camera_file import usual
-from rstrack.data.clocks.timing import StampsMode, Timing, stream_timing
-from rstrack.data.registered_rows import DepthSensor, registered_shutter
-from rstrack.data.rig import Rig
+from rstrack.data.registration import DepthSensor, registered_shutter
+from rstrack.data.rig import DEFAULT_SIGMA, EXACT_SIGMA, CalibrationSigma, Rig
+from rstrack.data.timing import StampsMode, Timing, stream_timing
 
 
 @dataclass(frozen=True)
@@ -44,13 +43,13 @@ def sigma_of(sequence: Sequence) -> CalibrationSigma:
     A depth camera with fixed errors of its own has them though its lens is told: as usual, since a user of such a
     camera knows no more.
     """
-    sigma = usual(sequence.streams["color"].camera) if sequence.meta.get("declared") else EXACT
+    sigma = usual(sequence.streams["color"].camera) if sequence.meta.get("declared") else EXACT_SIGMA
     noise: Any = sequence.meta
     for name in ("config", "depth", "noise"):
         noise = noise.get(name) if isinstance(noise, dict) else None
     if isinstance(noise, dict) and any(noise.get(name) for name in ("scale_error", "distortion_px")):
         own = "depth_scale", "depth_inverse_offset", "depth_image"
-        return replace(sigma, **{name: getattr(STATED, name) for name in own})
+        return replace(sigma, **{name: getattr(DEFAULT_SIGMA, name) for name in own})
     return sigma
 
 

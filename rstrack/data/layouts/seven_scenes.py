@@ -28,11 +28,10 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.sequence.trajectory import Trajectory
-from rstrack.data.calibration_sigma import STATED
 from rstrack.data.camera_file import RigFile, read_rig
 from rstrack.data.image_files import ImageFiles, decode_color, decode_depth, first_size, repeated
 from rstrack.data.layouts.tum_folder import TumFolder, find_camera_file, repeats_note
-from rstrack.data.rig import Rig
+from rstrack.data.rig import DEFAULT_SIGMA, Rig
 
 IntArray = npt.NDArray[np.int64]
 
@@ -142,7 +141,7 @@ def _cameras(
         f"{_COLOR[0]:g} and not registered: write {root / 'camera.yaml'} if you know them"
     )
     depth_camera, color_camera = (Camera(*_SIZE, *intrinsics) for intrinsics in (_DEPTH, _COLOR))
-    rig = Rig(depth_camera, Shutter(), color_camera, Shutter(), se3.orthonormalise(_T_COLOR_DEPTH), sigma=STATED)
+    rig = Rig(depth_camera, Shutter(), color_camera, Shutter(), se3.orthonormalise(_T_COLOR_DEPTH), sigma=DEFAULT_SIGMA)
     return RigFile(rig, _UNITS_PER_M, color_offset_s=0.0), (note,)
 
 

@@ -25,8 +25,15 @@ from rsgen.errors import UserError
 from rsgen.files import listed_file, read_text
 from rsgen.sequence.trajectory import ICL_RATE_HZ, Trajectory, read_trajectory
 from rstrack.data.camera_file import EXAMPLE, RigFile, read_rig
-from rstrack.data.image_files import ImageFiles, decode_color, decode_depth, decode_image, first_size, repeated
-from rstrack.data.noise import ImageReader
+from rstrack.data.image_files import (
+    ImageFiles,
+    ImageReader,
+    decode_color,
+    decode_depth,
+    decode_image,
+    first_size,
+    repeated,
+)
 from rstrack.data.own_intrinsics import OwnIntrinsics, SharedImages, read_own_intrinsics
 from rstrack.data.rig import Rig
 

@@ -26,11 +26,9 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rstrack.formats.bags.bag import Bag, Message, open_bag
-from rstrack.formats.bags.frames import transform_of
-from rstrack.formats.bags.messages import inertial, nanoseconds, picture_of
+from rstrack.formats.bags.messages import inertial, nanoseconds, picture_of, transform_of
 from rstrack.formats.bags.topics import COMPRESSED, IMAGE, IMU, Named, listed
-from rstrack.formats.lens import camera_of
-from rstrack.formats.recording import Item, Picture, Recording, StreamCamera
+from rstrack.formats.recording import Item, Picture, Recording, StreamCamera, camera_of
 
 _DATA = re.compile(
     r"(/device_\d+/sensor_\d+/(Depth|Color|Gyro|Accel)_\d+)/(?:image|imu)/data(?:/compressed|/compressedDepth)?"

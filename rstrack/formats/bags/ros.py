@@ -13,9 +13,7 @@ from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rstrack.formats.bags import realsense
 from rstrack.formats.bags.bag import Bag, Message, open_bag
-from rstrack.formats.bags.frames import between
-from rstrack.formats.bags.messages import inertial, nanoseconds, picture_of
-from rstrack.formats.bags.readout import stated_shutter
+from rstrack.formats.bags.messages import between, inertial, nanoseconds, picture_of, stated_shutter
 from rstrack.formats.bags.topics import (
     Named,
     base_of,
@@ -26,9 +24,8 @@ from rstrack.formats.bags.topics import (
     is_rectified,
     is_registered,
 )
-from rstrack.formats.lens import camera_of
 from rstrack.formats.pixels import is_float_depth
-from rstrack.formats.recording import FLOAT_DEPTH_SCALE, Item, Picture, Recording
+from rstrack.formats.recording import FLOAT_DEPTH_SCALE, Item, Picture, Recording, camera_of
 
 _MILLIMETRES = 1000.0
 

@@ -21,8 +21,8 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.geometry.spline import Spline
-from rstrack.data.calibration_sigma import UNFOUND_OFFSET_S
 from rstrack.data.dataset import Dataset
+from rstrack.data.rig import UNFOUND_OFFSET_S
 from rstrack.tracking.first_look.color_pairs import (
     GeometricTrack,
     image_of,

@@ -16,12 +16,12 @@ from rsgen.geometry import se3
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.score import steady
 from rstrack.alignment.spline_state import SplineState
-from rstrack.data.calibration_sigma import NAMES
+from rstrack.data.rig import CALIBRATION_NAMES
 from rstrack.tracking.judgement.consider import Calibration
 
 
 def _nothing() -> FloatArray:
-    return np.zeros((6, len(NAMES)))
+    return np.zeros((6, len(CALIBRATION_NAMES)))
 
 
 @dataclass(frozen=True, eq=False)

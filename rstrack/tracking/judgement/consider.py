@@ -4,7 +4,7 @@ An error of the calibration moves the point of a pixel by some `a` in the image 
 has it too. A residual changes by g·(a − b), g its derivative by a shift of the point, and an aligned pose by −H⁻¹ Jᵀ c
 of these. c is made of some points of the keyframe, as the frame sees them: that is smooth, and they are enough.
 
-Increments are [m; rad] in the depth camera's frame at mid readout; parameters in the order of `calibration_sigma.NAMES`
+Increments are [m; rad] in the depth camera's frame at mid readout; parameters in the order of `rig.CALIBRATION_NAMES`
 and in their units.
 """
 
@@ -19,13 +19,12 @@ from rsgen.device.lens import Lens
 from rsgen.geometry import se3
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.spline_state import SplineState
-from rstrack.data.calibration_sigma import NAMES
-from rstrack.data.rig import Rig
+from rstrack.data.rig import CALIBRATION_NAMES, Rig
 from rstrack.images.sampling import NEAREST
 from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.judgement.landmarks import NEAR, Landmarks
 
-COUNT = len(NAMES)
+COUNT = len(CALIBRATION_NAMES)
 # Keyframes whose landmarks are remembered.
 _REMEMBERED = 4
 _DEPTH_LENS, _COLOR_LENS, _EXTRINSICS = slice(0, 5), slice(5, 10), slice(10, 16)

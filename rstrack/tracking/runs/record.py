@@ -19,7 +19,7 @@ from rstrack.tracking.frame_report import FrameReport
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise added to the frames; see `rstrack.data.noise.with_noise`."""
+    """Noise added to the frames; see `rstrack.data.image_files.with_noise`."""
 
     sigma_depth: float = 0.0
     sigma_intensity: float = 0.0

@@ -23,8 +23,7 @@ from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import INFO, Estimate, write_estimate
-from rstrack.data.noise import with_noise
-from rstrack.data.prefetch import prefetched
+from rstrack.data.image_files import prefetched, with_noise
 from rstrack.data.rig import Frame
 from rstrack.inertial import record as imu_record
 from rstrack.metrics.association import truth_of

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from rstrack.data.clocks.timing import Timing
 from rstrack.data.estimate import Estimate
+from rstrack.data.timing import Timing
 from rstrack.metrics.evaluate import Metrics
 from rstrack.metrics.run_evaluate import Evaluation
 

@@ -24,8 +24,7 @@ from rsgen.errors import UserError
 from rsgen.files import write_error
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate, write_estimate
-from rstrack.data.noise import with_noise
-from rstrack.data.prefetch import prefetched
+from rstrack.data.image_files import prefetched, with_noise
 from rstrack.data.rig import Frame
 from rstrack.inertial import record as imu_record
 from rstrack.metrics.association import Truth, compare, truth_of

@@ -16,7 +16,8 @@ from rstrack.adjustment import graph as graph_module
 from rstrack.adjustment import unit as unit_module
 from rstrack.adjustment.graph import Graph, Sighting, State
 from rstrack.adjustment.unit import Sums, Unit, UnitState
-from rstrack.data.imu.recording import ImuNoise, ImuRecording
+from rstrack.data.imu.description import ImuNoise
+from rstrack.data.imu.recording import ImuRecording
 from rstrack.inertial.belief import STRENGTH, WARMS
 
 T_IMU_DEPTH = se3.exp([0.03, -0.02, 0.05, 0.3, -1.2, 0.7])

@@ -23,8 +23,7 @@ from rstrack.alignment.normal_equations import Quadratic
 from rstrack.cli.main import main
 from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.data.imu.description import PHONE
-from rstrack.data.imu.files import ReadImu
-from rstrack.data.imu.recording import ImuRecording
+from rstrack.data.imu.recording import ImuRecording, ReadImu
 from rstrack.metrics.tracked import load_run
 from rstrack.options import Options
 from rstrack.report.build import write_report

@@ -32,8 +32,8 @@ from rstrack.calibration.unknowns.parameters import (
 )
 from rstrack.cli.main import main
 from rstrack.data.dataset import Dataset
-from rstrack.data.depth_error import DepthError
-from rstrack.data.noise import NoisyImages, with_noise
+from rstrack.data.image_files import NoisyImages, with_noise
+from rstrack.data.rig import DepthError
 from rstrack.options import Options
 
 

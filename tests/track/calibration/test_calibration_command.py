@@ -28,9 +28,9 @@ from rstrack.calibration.unknowns.parameters import (
 )
 from rstrack.cli.main import main
 from rstrack.data.camera_file import read_rig
-from rstrack.data.clocks.timing import Timing, stream_timing
 from rstrack.data.dataset import Dataset, open_dataset
-from rstrack.data.depth_error import DepthError
+from rstrack.data.rig import DepthError
+from rstrack.data.timing import Timing, stream_timing
 
 
 @pytest.fixture(autouse=True)

@@ -37,8 +37,8 @@ from rstrack.calibration.unknowns.parameters import (
     free_of,
 )
 from rstrack.data.dataset import Dataset
-from rstrack.data.depth_error import DepthError
-from rstrack.data.noise import NoisyImages
+from rstrack.data.image_files import NoisyImages
+from rstrack.data.rig import DepthError
 
 
 @pytest.mark.parametrize("is_depth", [True, False])

@@ -17,9 +17,9 @@ from rstrack.calibration.pairs.stretch import overcounted
 from rstrack.calibration.run import calibrate
 from rstrack.calibration.solve import Solution, joined
 from rstrack.calibration.unknowns.parameters import BY_COLOR, COUNT, NAMES, Parameters
-from rstrack.data.calibration_sigma import STATED
 from rstrack.data.dataset import Dataset
-from rstrack.data.noise import ImageReader
+from rstrack.data.image_files import ImageReader
+from rstrack.data.rig import DEFAULT_SIGMA
 
 LASTING = 0.005
 
@@ -51,7 +51,7 @@ def uneven(dataset: Dataset, sigma: float) -> Dataset:
     """With such depth and a focal length that is told wrong by 2 %; sigma: of what is said of depth."""
     rig, color = dataset.rig, dataset.rig.color_camera
     lens = replace(color, fx=1.02 * color.fx, fy=1.02 * color.fy)
-    told = replace(rig, color_camera=lens, sigma=replace(STATED, depth_inverse_offset=sigma))
+    told = replace(rig, color_camera=lens, sigma=replace(DEFAULT_SIGMA, depth_inverse_offset=sigma))
     return replace(dataset, images=UnevenDepth(dataset.images), rig=told)
 
 

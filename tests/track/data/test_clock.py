@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rstrack.data.clocks.clock import Clock, RunningClock, drift_ppm, estimate_clock, regular, straightened
+from rstrack.data.clock import Clock, RunningClock, drift_ppm, estimate_clock, regular, straightened
 
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
 needs_rpy = pytest.mark.skipif(not (DATA / "tum_fr1_rpy").is_dir(), reason="../shared/data/tum_fr1_rpy is not here")

@@ -16,7 +16,7 @@ from tum_recording import (
 from rsgen.errors import UserError
 from rsgen.sequence.reader import read_sequence
 from rstrack.data.dataset import group_colors, open_dataset
-from rstrack.data.prefetch import prefetched
+from rstrack.data.image_files import prefetched
 
 
 @pytest.fixture(scope="module")

@@ -12,10 +12,10 @@ import tiny
 from rsgen.cli.main import main
 from rsgen.geometry import se3
 from rsgen.sequence.reader import read_sequence
-from rstrack.data.calibration_sigma import STATED
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import Estimate
 from rstrack.data.layouts.generated import sigma_of
+from rstrack.data.rig import DEFAULT_SIGMA
 from rstrack.metrics.association import truth_of
 from rstrack.metrics.evaluate import evaluate
 
@@ -101,5 +101,5 @@ def test_a_depth_camera_with_fixed_errors_is_not_exact(wild: Path) -> None:
         faulty = replace(sequence, meta=sequence.meta | {"config": sequence.meta["config"] | {"depth": depth}})
         found = sigma_of(faulty)
         own = "depth_scale", "depth_inverse_offset", "depth_image"
-        assert all(getattr(found, name) == getattr(STATED, name) for name in own)
+        assert all(getattr(found, name) == getattr(DEFAULT_SIGMA, name) for name in own)
         assert replace(found, **dict.fromkeys(own, 0.0)).is_exact

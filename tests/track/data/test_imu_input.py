@@ -344,8 +344,7 @@ def test_info_says_it_in_a_line(folder: Path, capsys: pytest.CaptureFixture[str]
 
 def test_units_are_right_for_every_shipped_motion_and_a_bad_sensor() -> None:
     """No false alarm where biases and noise are many times what units have."""
-    from rstrack.data.imu.checks import check_units
-    from rstrack.data.imu.samples import Samples
+    from rstrack.data.imu.samples import Samples, check_units
 
     for seed in range(6):
         bad = CONFIG.model_copy(update={"gyroscope_noise_density": 5e-3, "accelerometer_noise_density": 2e-2,

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from rsgen.errors import UserError
-from rstrack.data.noise import with_noise
+from rstrack.data.image_files import with_noise
 from rstrack.data.rig import Frame, Image
 
 SHAPE = (240, 320)

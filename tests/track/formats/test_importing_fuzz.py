@@ -15,7 +15,7 @@ import recordings
 from import_command import fake_lzfse
 from recordings import Talker
 
-import rstrack.formats.bags.bounds
+import rstrack.formats.bags.bag
 from rsgen.errors import UserError
 from rstrack.data.dataset import open_dataset
 from rstrack.formats.bags.topics import Named
@@ -116,7 +116,7 @@ def test_a_chunk_that_unpacks_to_too_much_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     path = BASES[name](tmp_path / name)
-    monkeypatch.setattr(rstrack.formats.bags.bounds, "_MOST_CHUNK_BYTES", 1000)
+    monkeypatch.setattr(rstrack.formats.bags.bag, "_MOST_CHUNK_BYTES", 1000)
     assert "unpacks to more than 1000 bytes" in attempt(path, tmp_path / "out")
 
 

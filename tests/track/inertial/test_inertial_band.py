@@ -13,7 +13,8 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import simulate_imu
-from rstrack.data.imu.recording import ImuNoise, ImuRecording
+from rstrack.data.imu.description import ImuNoise
+from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.rig import Rig
 from rstrack.inertial.band import Band, missed, with_knots
 from rstrack.inertial.inertia import Inertia

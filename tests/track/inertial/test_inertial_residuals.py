@@ -10,7 +10,8 @@ from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import exact_imu
-from rstrack.data.imu.recording import ImuNoise, ImuRecording
+from rstrack.data.imu.description import ImuNoise
+from rstrack.data.imu.recording import ImuRecording
 from rstrack.inertial.belief import SIZE, Belief
 from rstrack.inertial.derivatives import motion
 from rstrack.inertial.residuals import Rows, Samples

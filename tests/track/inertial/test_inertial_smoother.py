@@ -15,7 +15,8 @@ from rsgen.sensors.imu import exact_imu, simulate_imu
 from rstrack.alignment.normal_equations import Quadratic
 from rstrack.alignment.priors import pose_constraint
 from rstrack.alignment.spline_state import SplineState
-from rstrack.data.imu.recording import ImuNoise, ImuRecording
+from rstrack.data.imu.description import ImuNoise
+from rstrack.data.imu.recording import ImuRecording
 from rstrack.inertial.belief import SIZE, TURN, TURNED, Belief
 from rstrack.inertial.belief import STRENGTH as STRENGTH_SIGMA
 from rstrack.inertial.inertia import Inertia

@@ -20,7 +20,8 @@ from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import simulate_imu, write_imu_csv
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import read_estimate
-from rstrack.data.imu.recording import ImuNoise, ImuRecording
+from rstrack.data.imu.description import ImuNoise
+from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.inertial.band import Band
 from rstrack.inertial.record import upright

@@ -19,7 +19,7 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.estimate import Estimate, read_estimate, write_estimate
-from rstrack.data.registered import RegisteredImage
+from rstrack.data.registration import RegisteredImage
 from rstrack.metrics.association import truth_of
 from rstrack.metrics.evaluate import evaluate
 from rstrack.peers.open3d import PeerTracker, open3d, run_peer

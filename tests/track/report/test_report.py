@@ -37,7 +37,7 @@ from rsgen.geometry.shutter import Shutter
 from rstrack.bench.methods.results import read_results
 from rstrack.bench.tables import paper
 from rstrack.charts.chart import CameraPath, PathChart, upright_axes
-from rstrack.cli.report import report as report_command
+from rstrack.cli.results import report as report_command
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import Estimate, write_estimate
 from rstrack.data.rig import Image, Rig

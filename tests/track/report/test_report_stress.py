@@ -16,7 +16,7 @@ from report_util import NASTY, Parsed, make_stress, parse, picture
 from rsgen.console.command_line import Commands, run_program
 from rsgen.errors import UserError
 from rstrack.bench.stress.results import StressResult, read_stress
-from rstrack.cli.report import report as report_command
+from rstrack.cli.results import report as report_command
 from rstrack.report.build import write_report
 
 PANELS = Path("cells/blur/exposure_20ms/rs-pg-mid-exposure/panels")

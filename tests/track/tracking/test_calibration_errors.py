@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from shaken_recording import OPTIONS, SHORT, told
 
-from rstrack.data.calibration_sigma import CalibrationSigma
 from rstrack.data.dataset import Dataset
+from rstrack.data.rig import CalibrationSigma
 from rstrack.tracking.judgement.calibration_errors import CalibrationErrors
 from rstrack.tracking.judgement.consider import CLOCK, COUNT
 from rstrack.tracking.runs.run import track

@@ -16,9 +16,9 @@ from rsgen.console.progress import no_progress
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.format import StreamName
-from rstrack.data.clocks.timing import Timing, stream_timing
 from rstrack.data.dataset import Dataset, group_colors, open_dataset
 from rstrack.data.estimate import read_estimate
+from rstrack.data.timing import Timing, stream_timing
 from rstrack.options import Options
 from rstrack.tracking.first_look import color_offset, color_pairs
 from rstrack.tracking.first_look.color_offset import ColorOffset, estimate_color_offset

@@ -15,9 +15,17 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rstrack.data.calibration_sigma import EXACT, NAMES, STATED, UNDISTORTED_K1, CalibrationSigma
 from rstrack.data.camera_file import camera_content, read_rig
-from rstrack.data.rig import Frame, Image, Rig
+from rstrack.data.rig import (
+    CALIBRATION_NAMES,
+    DEFAULT_SIGMA,
+    EXACT_SIGMA,
+    UNDISTORTED_K1,
+    CalibrationSigma,
+    Frame,
+    Image,
+    Rig,
+)
 from rstrack.options import Options
 from rstrack.tracking.judgement.consider import CLOCK, COUNT
 from rstrack.tracking.spline_tracker import Tracker
@@ -94,7 +102,7 @@ def test_a_wrong_camera_moves_poses_as_the_model_says(name: str, by: float, meth
     T, common = told(method)
     rig, scale, late_s = wrong(name, by)
     moved = se3.log(se3.inverse(T) @ tracked(rig, method, scale, late_s).trajectory[1][-6:])
-    expected = by * common[:, :, NAMES.index(name)]
+    expected = by * common[:, :, CALIBRATION_NAMES.index(name)]
     weight = np.repeat([1.0, 2.0], 3)  # m, rad: things are some two metres away
     assert np.linalg.norm((moved - expected) * weight) < part * np.linalg.norm(moved * weight)
 
@@ -127,14 +135,14 @@ def test_only_what_may_be_wrong_has_a_column() -> None:
     common = tracker.reports[-1].common
     assert common is not None and common.shape == (6, 3)  # both cameras' focal lengths, and the clock
     _, unit = told("rs-pg")
-    at = [NAMES.index(name) for name in ("depth.focal", "color.focal", "color.offset_s")]
+    at = [CALIBRATION_NAMES.index(name) for name in ("depth.focal", "color.focal", "color.offset_s")]
     assert common == pytest.approx(unit[-1][:, at] * (0.01, 0.01, 0.002), rel=0.2, abs=2e-4)
 
 
 def test_registered_depth_has_one_lens_and_no_extrinsics() -> None:
-    sigmas = STATED.vector(is_registered=True)
+    sigmas = DEFAULT_SIGMA.vector(is_registered=True)
     assert not sigmas[:5].any() and not sigmas[10:16].any() and sigmas[5:10].all()
-    assert STATED.vector()[:16].all() and not EXACT.vector().any()
+    assert DEFAULT_SIGMA.vector()[:16].all() and not EXACT_SIGMA.vector().any()
 
 
 FILE = "color: {width: 640, height: 480, intrinsics: [500.0, 500.0, 319.5, 239.5], readout_s: 0.03%s}\n%s"
@@ -147,10 +155,10 @@ def read(tmp_path: Path, lens: str, sigma: str) -> Rig:
 
 def test_a_camera_file_states_what_it_knows_and_the_rest_is_as_usual(tmp_path: Path) -> None:
     bent = ", model: radtan, distortion: [0.1, 0.0, 0.0, 0.0]"
-    assert read(tmp_path, bent, "").sigma == STATED
-    assert read(tmp_path, "", "").sigma == replace(STATED, k1=UNDISTORTED_K1)
+    assert read(tmp_path, bent, "").sigma == DEFAULT_SIGMA
+    assert read(tmp_path, "", "").sigma == replace(DEFAULT_SIGMA, k1=UNDISTORTED_K1)
     stated = read(tmp_path, bent, "sigma: {focal: 0.002, center_px: 1.5}").sigma
-    assert stated == replace(STATED, focal=0.002, center=0.003)
+    assert stated == replace(DEFAULT_SIGMA, focal=0.002, center=0.003)
 
 
 def test_a_run_keeps_the_sigmas_that_it_went_by(tmp_path: Path) -> None:

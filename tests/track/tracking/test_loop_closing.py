@@ -15,10 +15,9 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.adjustment.rigid import align
-from rstrack.data.calibration_sigma import STATED
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import read_estimate
-from rstrack.data.rig import Frame
+from rstrack.data.rig import DEFAULT_SIGMA, Frame
 from rstrack.options import Options
 from rstrack.report.build import write_report
 from rstrack.tracking import loop_closing
@@ -151,7 +150,7 @@ def test_a_frame_whose_depth_and_colour_are_of_two_places_is_found_at_none(datas
 
 def test_the_search_leaves_what_the_tracker_remembers_of_keyframes(dataset: Dataset) -> None:
     """A keyframe's landmarks are of when it was first looked at; since then other depth was fused in."""
-    tracker = make_tracker(replace(dataset.rig, sigma=STATED), OPTIONS)
+    tracker = make_tracker(replace(dataset.rig, sigma=DEFAULT_SIGMA), OPTIONS)
     assert isinstance(tracker, Tracker)
     for k in range(FRAMES):
         tracker.feed(dataset.frame(k))

@@ -17,7 +17,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.adjustment.moves import Moves
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import read_estimate
-from rstrack.data.noise import with_noise
+from rstrack.data.image_files import with_noise
 from rstrack.data.rig import Frame, Image
 from rstrack.keyframes.kept_frames import KeptFrames
 from rstrack.tracking import loop_tracker

@@ -16,16 +16,20 @@ from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.files import encode_png
 from rsgen.geometry.camera import Camera
-from rstrack.formats.phones.arkit import FLIP, TRUTH, intrinsics_items, median_camera, resized
 from rstrack.formats.pixels import compressed_color, header_size, units_of_metres
 from rstrack.formats.recording import (
+    FLIP,
     FLOAT_DEPTH_SCALE,
+    TRUTH,
     Item,
     Picture,
     Pose,
     Recording,
     StreamCamera,
+    intrinsics_items,
+    median_camera,
     pose_of,
+    resized,
 )
 
 _NAME = re.compile(r"rgbd/(\d{1,9})\.(jpg|depth|conf)")

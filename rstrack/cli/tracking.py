@@ -1,23 +1,120 @@
-"""The command `rstrack calibrate`."""
+"""The commands that estimate: `rstrack track`, `calibrate` and `refine`."""
 
 from __future__ import annotations
 
 import sys
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from rsgen.console.command_line import Frames, Json, Quiet
+from rsgen.console.command_line import Alone, Frames, Json, Quiet
 from rsgen.device.backend import Backend
 from rsgen.errors import UserError
-from rstrack.cli.options import CameraFile, DeviceName, ImuFile, NoiseDepth, NoiseIntensity, Seed
+from rstrack.cli.options import CameraFile, DeviceName, ImuFile, NoiseDepth, NoiseIntensity, Seed, SequenceFolder
+from rstrack.options import Options
 
 if TYPE_CHECKING:
     from rstrack.data.dataset import Dataset
-    from rstrack.options import Options
+    from rstrack.view.viewer import Viewer
 
-STATUS = (
+TRACK_STATUS = (
+    "exit status: 0 done, 1 frames were lost or cannot be read, 2 wrong input, 130 interrupted (what there is has been "
+    "written)"
+)
+
+
+def track(
+    sequence: SequenceFolder,
+    tracker: Options,
+    *,
+    camera: CameraFile = None,
+    imu: ImuFile = None,
+    out: Annotated[Path, "folder for the run, made if need be", "DIR"],
+    frames: Frames = None,
+    noise_depth: NoiseDepth = 0.0,
+    noise_intensity: NoiseIntensity = 0.0,
+    seed: Seed = 0,
+    calibrate: Annotated[
+        bool, "first find lenses, readouts, clocks and extrinsics, as 'rstrack calibrate' does, and track with them"
+    ] = False,
+    device: DeviceName = None,
+    gravity: Annotated[
+        bool, "write the trajectory in a world whose z axis points up, as an IMU tells (rs-pgi, rs-gi)"
+    ] = False,
+    resume: Annotated[
+        bool, "go on with a run of the same settings in DIR that was stopped or killed, to the same bits"
+    ] = False,
+    view: Annotated[
+        Path | None, "watch it in rerun's window: images, residuals, path, keyframes, map; or keep that in FILE.rrd",
+        "FILE.rrd", Alone(Path()),
+    ] = None,
+    quiet: Quiet = False,
+) -> int:  # fmt: skip
+    """Track a sequence: writes trajectory.txt, spline.npz and run.json; with --calibrate camera.yaml and
+    calibration.json too.
+    """
+    from rsgen.console.progress import ProgressDisplay
+    from rsgen.files import atomic_write
+    from rstrack.calibration.findings.record import CALIBRATION, write_record
+    from rstrack.calibration.run import calibrate as run_calibration
+    from rstrack.calibration.unknowns.devices import device_named
+    from rstrack.data.dataset import open_dataset
+    from rstrack.data.rig import UNDISTORTED_K1
+    from rstrack.tracking.runs import run
+
+    if device is not None and not calibrate:
+        raise UserError(f"--device {device}: is for --calibrate, which is not given")
+    if resume and calibrate:
+        raise UserError("--resume --calibrate: 'rstrack calibrate --out camera.yaml' first, and track with --camera")
+    tracker = replace(tracker, loops=tracker.loops or "end")
+    known = None if device is None else device_named(device)
+    noise = run.Noise(noise_depth, noise_intensity, seed)
+    dataset = open_dataset(sequence, camera, imu)
+    with ProgressDisplay(quiet) as progress:
+        found = None
+        if calibrate:
+            found = run_calibration(dataset, None, frames or slice(None), tracker, progress, known)
+            if not found.solution.finished:
+                raise KeyboardInterrupt
+            dataset = found.calibrated()
+        with _viewed(view, dataset) as viewer:
+            watch = None if viewer is None else viewer.see
+            result = run.track(dataset, tracker, out, frames or slice(None), noise, progress, resume, watch, gravity)
+            if viewer is not None:
+                viewer.corrected(result.estimate.T_world_depth)
+    (out / CALIBRATION).unlink(missing_ok=True)  # of an earlier run in this folder
+    if found is not None:
+        atomic_write(out / "camera.yaml", found.camera_file().encode())
+        write_record(found, out / CALIBRATION)
+        print(found.text())
+    print(result.text())
+    if found is None and dataset.rig.sigma.k1 >= UNDISTORTED_K1:
+        print(
+            "the camera file has no distortion, which hardly any camera is without: --calibrate finds lens, clocks and "
+            "readouts first"
+        )
+    print(f"{out}: written (rstrack evaluate {sequence} {out}, rstrack plot ...)")
+    sys.stdout.flush()
+    if result.end == "interrupted":
+        print("rstrack: interrupted; the frames before are in the run folder", file=sys.stderr)
+        return 130
+    if result.end == "broke down":
+        print(f"rstrack: {result.error}; the frames before it are in {out}", file=sys.stderr)
+        return 1
+    return 1 if result.lost or result.unreadable else 0
+
+
+def _viewed(view: Path | None, dataset: Dataset) -> AbstractContextManager[Viewer | None]:
+    if view is None:
+        return nullcontext()
+    from rstrack.view.viewer import open_view
+
+    return open_view(None if view == Path() else view, dataset.rig, dataset.name)
+
+
+CALIBRATE_STATUS = (
     "exit status: 0 done, 1 some values are not told by the recording, or not converged, 2 wrong input, 130 interrupted"
 )
 
@@ -58,8 +155,7 @@ def calibrate(
     from rstrack.calibration.several import check_alike, together
     from rstrack.calibration.unknowns.devices import device_named
     from rstrack.data.dataset import open_dataset
-    from rstrack.data.noise import NoisyImages
-    from rstrack.options import Options
+    from rstrack.data.image_files import NoisyImages
     from rstrack.report.build import write_page
     from rstrack.report.calibration import calibration_page
 
@@ -129,3 +225,25 @@ def _imu(
     if out is not None and not json:
         print(f"{out}: written (rstrack track {sequence} --imu {out} --out RUN)")
     return 1 if found.undetermined.any() else 0
+
+
+def refine(
+    run: Annotated[Path, "folder that 'rstrack track' wrote, of a method with a spline"],
+    *,
+    sequence: Annotated[Path | None, "the run's sequence (default: where it was)", "DIR"] = None,
+    camera: CameraFile = None,
+    imu: ImuFile = None,
+    out: Annotated[Path, "folder for the refined run, made if need be", "DIR"],
+    rounds: Annotated[int, "rounds at most; fewer where nothing moves any more", "N"] = 3,
+    quiet: Quiet = False,
+) -> int:
+    """Align every frame of a run to all keyframes that see it, at once, beside its IMU: writes a run folder with the
+    refined spline."""
+    from rsgen.console.progress import ProgressDisplay
+    from rstrack.tracking.runs.refining import refine_run
+
+    with ProgressDisplay(quiet) as progress:
+        result = refine_run(run, out, sequence, camera, rounds, progress, imu)
+    print(result.text())
+    print(f"{out}: written")
+    return 0

@@ -18,10 +18,18 @@ from rsgen.files import listed_file, read_bytes, read_text
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rstrack.data.imu.description import body_pose, read_asl_yaml, read_sensor_yaml
-from rstrack.formats.lens import camera_of
 from rstrack.formats.pixels import compressed_color, compressed_depth
-from rstrack.formats.recording import Inertial, Item, Picture, Pose, Recording, StreamCamera, pose_of
-from rstrack.formats.shutter import with_shutter
+from rstrack.formats.recording import (
+    Inertial,
+    Item,
+    Picture,
+    Pose,
+    Recording,
+    StreamCamera,
+    camera_of,
+    pose_of,
+    with_shutter,
+)
 
 _MILLIMETRES = 1000.0
 _TRUTH = "state_groundtruth_estimate0"

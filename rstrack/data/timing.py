@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
-from rstrack.data.clocks.clock import Clock, drift_ppm, straightened
+from rstrack.data.clock import Clock, drift_ppm, straightened
 
 StampsMode = Literal["auto", "raw", "regular"]
 

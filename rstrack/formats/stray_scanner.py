@@ -20,9 +20,20 @@ from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.files import encode_png, listed_file, png_fault, read_bytes, read_text
 from rsgen.geometry.camera import Camera
-from rstrack.formats.phones.arkit import TRUTH, intrinsics_items, median_camera, resized
 from rstrack.formats.pixels import check_size, decode, header_size
-from rstrack.formats.recording import Inertial, Item, Picture, Pose, Recording, StreamCamera, pose_of
+from rstrack.formats.recording import (
+    TRUTH,
+    Inertial,
+    Item,
+    Picture,
+    Pose,
+    Recording,
+    StreamCamera,
+    intrinsics_items,
+    median_camera,
+    pose_of,
+    resized,
+)
 
 _MILLIMETRES = 1000.0
 _MAX_STAMP_S, _MOST_FRAMES = 1e11, 10**9

@@ -20,9 +20,8 @@ from rsgen.errors import UserError
 from rsgen.files import encode_png
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
-from rstrack.formats.lens import camera_of
 from rstrack.formats.pixels import compressed_color
-from rstrack.formats.recording import Item, Picture, Pose, Recording, StreamCamera
+from rstrack.formats.recording import Item, Picture, Pose, Recording, StreamCamera, camera_of
 
 _VERSION = 4
 _HEADER = struct.Struct("<64f2i4If")

@@ -1,1 +1,0 @@
-"""When images were taken: clocks behind stamps that are times of arrival."""

@@ -1,1 +1,0 @@
-"""Layouts of datasets: EuRoC/ASL and ScanNet."""

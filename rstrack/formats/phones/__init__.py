@@ -1,1 +1,0 @@
-"""Recordings of phones' apps: Record3D and Stray Scanner, on ARKit."""
