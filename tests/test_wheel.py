@@ -61,6 +61,7 @@ def test_the_wheel_has_all_configs_and_scripts_and_nothing_built(site: Path) -> 
     assert {path.name for path in site.iterdir() if "dist-info" not in path.name} == {"rsgen", "rstrack"}
     assert not [path for path in site.rglob("*") if path.suffix in (".xml", ".ply", ".npz")]
     assert (site / "rstrack/report/page.html").is_file()
+    assert (site / "rsgen/py.typed").is_file() and (site / "rstrack/py.typed").is_file()
 
 
 def test_configs_of_the_wheel_are_found_by_name_and_kept_in_the_users_cache(site: Path, tmp_path: Path) -> None:
