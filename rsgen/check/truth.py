@@ -12,13 +12,13 @@ import numpy as np
 from rsgen.check.objects import check_objects
 from rsgen.errors import UserError
 from rsgen.files import is_temporary, read_text, read_yaml
-from rsgen.formats.export.folder import sequence_imu, sequence_target
 from rsgen.sensors.imu import imu_csv
 from rsgen.sensors.imu_truth import IMU_TRUTH_CSV, IMU_TRUTH_YAML, imu_truth_csv
 from rsgen.sequence.camera_yaml import TRUE_CAMERAS
 from rsgen.sequence.format import STREAMS, color_truth_path
 from rsgen.sequence.reader import Sequence
 from rsgen.sequence.target_corners import TARGET_CORNERS, target_corners_text
+from rsgen.truth.settings import sequence_imu, sequence_target
 
 
 def check_truth_images(sequence: Sequence) -> tuple[bool, str]:

@@ -23,7 +23,6 @@ from rsgen.check.reprojection import depth_points, reproject_depth
 from rsgen.check.truth import extra_checks
 from rsgen.errors import UserError
 from rsgen.files import is_temporary, read_text
-from rsgen.formats.export.folder import sequence_mocap
 from rsgen.geometry import se3
 from rsgen.produce.identity import fingerprint
 from rsgen.sensors.mocap import reported_poses
@@ -38,6 +37,7 @@ from rsgen.sequence.format import (
     pose_rows,
 )
 from rsgen.sequence.reader import Sequence, Stream, read_sequence
+from rsgen.truth.settings import sequence_mocap
 
 # Rows' poses and groundtruth.txt come from the same spline: only the rounding of stamps (5e-10 s) and digits is left.
 POSE_TOLERANCE_M = 1e-7

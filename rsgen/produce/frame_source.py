@@ -252,9 +252,9 @@ def scene_hash(config: Config) -> str:
 
 
 def _mesh_options(config: Config) -> Any:
-    from rsgen.formats.meshes.mesh_file import MeshOptions
+    from rsgen.render.placement import SceneOptions
 
-    return MeshOptions(config.scene.scale, config.scene.up, config.scene.light)
+    return SceneOptions(config.scene.scale, config.scene.up, config.scene.light)
 
 
 def surfaces_hash(config: Config) -> str:

@@ -144,21 +144,20 @@ def suggest_tour(
 ) -> Suggestion:
     """A tour through the scene `file`: through its largest room, or round the thing that it holds.
 
-    name: of the sequence; None: after the file. scale, up: see `MeshOptions`. like: whose cameras,
+    name: of the sequence; None: after the file. scale, up: see `SceneOptions`. like: whose cameras,
     noise and truth it is to have; None: the defaults. Raises UserError naming the file if there is no place for a
     camera, no floor, or no scene, and if it is a room in another unit than metres.
     """
     mitsuba()
-    from rsgen.formats.meshes.mesh_file import AS_IT_IS, MeshOptions
-    from rsgen.formats.mitsuba_xml.camera_up import camera_up
     from rsgen.render.land import coarser, inhabited
+    from rsgen.render.placement import AS_IT_IS, SceneOptions, camera_up
     from rsgen.render.rays import cast_rays
     from rsgen.render.scene import load_scene
 
     placed = {key: value for key, value in (("scale", scale), ("up", up)) if value != getattr(AS_IT_IS, key)}
     if not 1e-9 <= scale <= 1e9:  # as scene.scale
         raise UserError(f"--scale {scale:g}: must lie in 1e-09 to 1e+09")
-    loaded = load_scene(file, options=MeshOptions(scale, up))
+    loaded = load_scene(file, options=SceneOptions(scale, up))
     triangles = scene_triangles(loaded)
     fineness = 1.0 / coarser(triangles, inhabited([shape for shape in loaded.shapes() if shape.is_mesh()]))
     own = camera_up(file) if file.suffix.lower() == ".xml" else None

@@ -15,9 +15,10 @@ from rsgen.array_types import BoolArray, FloatArray, IntArray
 from rsgen.config.objects import ObjectConfig, ShapeConfig
 from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
-from rsgen.formats.meshes.material import Material, bsdf
-from rsgen.formats.meshes.mesh_file import MeshOptions, hash_into, mesh_scene
+from rsgen.formats import scene_reader
+from rsgen.render.material import Material, bsdf
 from rsgen.render.mended import mend_meshes
+from rsgen.render.placement import SceneOptions
 from rsgen.render.ply import joined_triangles, ply_bytes
 from rsgen.render.scene import surface
 
@@ -79,7 +80,7 @@ def object_hash(thing: ObjectConfig) -> str:
     if thing.mesh is not None:
         try:
             digest.update(_mesh_file(thing).read_bytes())
-            hash_into(digest, thing.mesh, MeshOptions(thing.scale, thing.up, "none"))
+            scene_reader(thing.mesh.suffix).hash_into(digest, thing.mesh, SceneOptions(thing.scale, thing.up, "none"))
         except (AttributeError, KeyError, TypeError, UserError) as error:
             raise UserError(f"objects.{thing.name}: {str(error).removeprefix('scene ')}") from None
     return digest.hexdigest()
@@ -94,7 +95,11 @@ def _mesh_file(thing: ObjectConfig) -> Path:
 
 def _shapes(mi: Any, thing: ObjectConfig, scratch: Path) -> dict[str, Any]:
     if thing.shape is None:
-        return mesh_scene(mi, _mesh_file(thing), scratch, MeshOptions(thing.scale, thing.up, "none"))
+        file = _mesh_file(thing)
+        shapes: dict[str, Any] = scene_reader(file.suffix).scene_dict(
+            mi, file, scratch, SceneOptions(thing.scale, thing.up, "none")
+        )
+        return shapes
     vertices, faces, odd = built_in(thing.shape)
     size, other = np.asarray(thing.shape.size_m), thing.shape.check_color
     smooth = thing.shape.kind == "sphere"

@@ -25,23 +25,17 @@ from rsgen.array_types import Float32Array
 from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
 from rsgen.files import encode_png
-from rsgen.formats.meshes.mesh_file import AS_IT_IS, MeshOptions, hash_into, mesh_scene
-from rsgen.formats.mitsuba_xml.analytic import ANALYTIC, tessellated
-from rsgen.formats.mitsuba_xml.instances import turn_mirrored
-from rsgen.formats.mitsuba_xml.obj_polygons import METHOD as OBJ_POLYGONS
-from rsgen.formats.mitsuba_xml.obj_polygons import with_triangles
-from rsgen.formats.mitsuba_xml.old_factors import multiply_images
-from rsgen.formats.mitsuba_xml.old_xml import METHOD as OLD_XML
-from rsgen.formats.mitsuba_xml.parsed import check_files, explained, messages_to_log, parse, prepare, unknown_properties
-from rsgen.formats.mitsuba_xml.placed import place, place_lamps
-from rsgen.formats.mitsuba_xml.refused import read_polygons, read_refused
+from rsgen.formats import scene_reader, xml_helper
 from rsgen.inputs import check_input
 from rsgen.render.board import Board, drawing
 from rsgen.render.board import surface as board_surface
 from rsgen.render.file_names import tell_renamed
 from rsgen.render.land import split_land
 from rsgen.render.mended import mend_meshes
+from rsgen.render.placement import AS_IT_IS, SceneOptions, place, place_lamps
 from rsgen.render.ply import joined_triangles, ply_bytes
+from rsgen.render.xml_scene import Parsed, check_files, explained, messages_to_log, parse, prepare, unknown_properties
+from rsgen.render.xml_shapes import ANALYTIC, tessellated, turn_mirrored
 
 log = logging.getLogger("rsgen")
 
@@ -49,7 +43,7 @@ _BOARD = "rsgen_target"
 _UNSUPPORTED = ("sdfgrid", "bsplinecurve", "linearcurve", "ellipsoids", "ellipsoidsmesh")
 
 
-def load_scene(path: Path, board: Board | None = None, options: MeshOptions = AS_IT_IS) -> Any:
+def load_scene(path: Path, board: Board | None = None, options: SceneOptions = AS_IT_IS) -> Any:
     """Mitsuba scene of the file at `path`: .xml, or a mesh that trimesh reads, with its colours and a light of ours.
 
     board: to be put into it, as its last shape. options: how the file is placed, and a mesh file lit. Raises
@@ -62,7 +56,7 @@ def load_scene(path: Path, board: Board | None = None, options: MeshOptions = AS
             if path.suffix.lower() == ".xml":
                 scene = _load_xml(mi, path, Path(scratch), board, messages, options)
             else:
-                shapes = mesh_scene(mi, path, Path(scratch), options)
+                shapes = scene_reader(path.suffix).scene_dict(mi, path, Path(scratch), options)
                 if board is not None:
                     shapes["target"] = mi.load_string(_board_xml(board, Path(scratch)))
                 # Else shapes would be merged, and ordered by memory address.
@@ -112,7 +106,7 @@ def mesh_arrays(shape: Any) -> tuple[Float32Array, NDArray[np.uint32]]:
     return v, f
 
 
-def content_hash(path: Path, options: MeshOptions = AS_IT_IS) -> str:
+def content_hash(path: Path, options: SceneOptions = AS_IT_IS) -> str:
     """SHA-256 over the scene file, every file that it includes or names (meshes, textures), and the options.
 
     Raises UserError if one is missing or the scene file is malformed.
@@ -121,7 +115,7 @@ def content_hash(path: Path, options: MeshOptions = AS_IT_IS) -> str:
     digest = hashlib.sha256(path.read_bytes())
     if path.suffix.lower() != ".xml":
         try:
-            hash_into(digest, path, options)
+            scene_reader(path.suffix).hash_into(digest, path, options)
         except (AttributeError, KeyError, TypeError) as error:  # JSON of another shape than glTF's
             raise UserError(f"scene {path}: is malformed ({_first_line(error)}): export it again") from None
     else:
@@ -135,7 +129,7 @@ def content_hash(path: Path, options: MeshOptions = AS_IT_IS) -> str:
                 raise UserError(f"scene {path}: {_first_line(error)}") from None
         state, changes = parsed.state, parsed.changes
         if changes is not None:
-            digest.update(OLD_XML)
+            digest.update(xml_helper("older version").METHOD)
         if options != AS_IT_IS:
             digest.update(f"\0{options.scale!r} {options.up}".encode())
         for included in state.files[1:] if changes is None else changes.files:
@@ -147,13 +141,13 @@ def content_hash(path: Path, options: MeshOptions = AS_IT_IS) -> str:
                 raise UserError(f"scene {path}: file '{name}' that it names is missing")
             data = file.read_bytes()
             digest.update(name.encode() + b"\0" + hashlib.sha256(data).digest())
-            if file.suffix.lower() == ".obj" and with_triangles(data) is not None:
-                digest.update(OBJ_POLYGONS)
+            if file.suffix.lower() == ".obj":
+                digest.update(xml_helper("mesh files").triangles_mark(data))
     return digest.hexdigest()
 
 
 def _load_xml(
-    mi: Any, path: Path, scratch: Path, board: Board | None, messages: list[str], options: MeshOptions
+    mi: Any, path: Path, scratch: Path, board: Board | None, messages: list[str], options: SceneOptions
 ) -> Any:
     config = mi.parser.ParserConfig(mi.variant())
     # Merging orders meshes by memory address: emitters and shapes would be numbered anew in each process.
@@ -165,7 +159,7 @@ def _load_xml(
     resolver.prepend(str(path.resolve().parent))
     try:
         with _threads_to_read_with():
-            scene = _instantiated(mi, config, parsed.state, path, scratch, options)
+            scene = _instantiated(mi, config, parsed, path, scratch, options)
     finally:
         del resolver[0]  # else the next scene would find what it lacks, an include say, in this one's folder
     if changes is not None:
@@ -189,7 +183,8 @@ def _threads_to_read_with() -> Iterator[None]:
             dr.set_thread_count(before)
 
 
-def _instantiated(mi: Any, config: Any, state: Any, path: Path, scratch: Path, options: MeshOptions) -> Any:
+def _instantiated(mi: Any, config: Any, parsed: Parsed, path: Path, scratch: Path, options: SceneOptions) -> Any:
+    state = parsed.state
     prepare(mi, config, state, path)
     if options != AS_IT_IS:
         place(mi, state, path, options, _BOARD)
@@ -202,14 +197,16 @@ def _instantiated(mi: Any, config: Any, state: Any, path: Path, scratch: Path, o
         if plugin in ANALYTIC:
             node.props = tessellated(mi, node.props, scratch / f"{index}.ply")
     check_files(mi, state, path)
-    read_polygons(mi, state, scratch)
-    multiply_images(mi, state)
+    if any(node.type == mi.ObjectType.Shape and node.props.plugin_name() == "obj" for node in state.nodes):
+        xml_helper("mesh files").read_polygons(mi, state, scratch)
+    if parsed.changes is not None:
+        xml_helper("older version").multiply_images(mi, state)
     mi.parser.transform_all(config, state)
     untouched = mi.parser.ParserState(state)  # objects made of it, also by an attempt that fails, stay in the other
     try:
         scene = _made(mi, config, state, path)
     except UserError:
-        if not read_refused(mi, untouched, path, scratch):
+        if not xml_helper("mesh files").read_refused(mi, untouched, path, scratch):
             raise
         scene = _made(mi, config, untouched, path)
     scene = scene[0] if isinstance(scene, (list, tuple)) else scene

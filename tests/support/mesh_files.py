@@ -17,13 +17,13 @@ from trimesh.visual.material import PBRMaterial
 from rsgen import srgb
 from rsgen.config.config import LightConfig
 from rsgen.console.progress import no_progress
-from rsgen.formats.meshes.mesh_file import MeshOptions
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.light.bake import bake
 from rsgen.render.baked import BakedIntegrator
 from rsgen.render.images import ColorRenderer
 from rsgen.render.irradiance import make_field, make_lattice
+from rsgen.render.placement import SceneOptions
 
 WIDTH, HEIGHT, FOCAL = 80, 60, 70.0
 CAMERA = Camera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5)
@@ -32,7 +32,7 @@ DIRECT = {"type": "direct", "emitter_samples": 0, "bsdf_samples": 1}
 SKY = {"type": "constant", "radiance": {"type": "rgb", "value": 0.8}}
 AXES = {"x": 0, "y": 1, "z": 2}
 # What is up in these glTF files is along the world's z, from where they are looked at.
-TURNED = MeshOptions(up="-z")
+TURNED = SceneOptions(up="-z")
 
 
 def looking(eye: Any, target: Any) -> np.ndarray:

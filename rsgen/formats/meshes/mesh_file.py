@@ -10,7 +10,7 @@ import io
 import logging
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +19,17 @@ import trimesh
 from PIL import Image
 
 from rsgen.array_types import FloatArray
-from rsgen.config.sections import SceneLight, Up
+from rsgen.config.sections import SceneLight
 from rsgen.errors import UserError
 from rsgen.formats.meshes import gltf
 from rsgen.formats.meshes.cutout import Mask, cut_away
 from rsgen.formats.meshes.default_light import SKY, Probe
-from rsgen.formats.meshes.material import bsdf, emitter
 from rsgen.formats.meshes.mesh_visual import Looks, Part, joined
 from rsgen.inputs import check_input
 from rsgen.limits import MOST_M
 from rsgen.render.file_names import located
+from rsgen.render.material import bsdf, emitter
+from rsgen.render.placement import SceneOptions, world_from_file
 from rsgen.render.ply import joined_triangles, ply_bytes
 
 log = logging.getLogger("rsgen")
@@ -36,33 +37,9 @@ log = logging.getLogger("rsgen")
 # Raise when files are read in another way, so that light baked for the older one is not taken for the new one's.
 _READING = 1
 _USUAL_M = (0.02, 300.0)  # sizes outside are rather wrong units
-# Rotations that bring an axis of the file up, the world's y.
-_UP = {
-    "y": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-    "-y": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
-    "z": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
-    "-z": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
-    "x": [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
-    "-x": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
-}
 
 
-@dataclass(frozen=True)
-class MeshOptions:
-    """How a file becomes a scene: metres per unit of the file, which of its axes is up, what lights it.
-
-    light: of a mesh file, see `rsgen.formats.meshes.default_light`.
-    """
-
-    scale: float = 1.0
-    up: Up = "y"
-    light: SceneLight = "auto"
-
-
-AS_IT_IS = MeshOptions()
-
-
-def read_parts(path: Path, options: MeshOptions) -> list[Part]:
+def read_parts(path: Path, options: SceneOptions) -> list[Part]:
     """All parts of a mesh file. Raises UserError if it holds nothing that can be rendered, or a file of it is missing.
 
     What trimesh's parsers raise on damaged files comes through.
@@ -114,7 +91,7 @@ def finished(path: Path, parts: Sequence[Part]) -> list[Part]:
     return left
 
 
-def mesh_scene(mi: Any, path: Path, scratch: Path, options: MeshOptions) -> dict[str, Any]:
+def scene_dict(mi: Any, path: Path, scratch: Path, options: SceneOptions) -> dict[str, Any]:
     """Scene dictionary of a mesh file and of the light that it gets; files go into `scratch`."""
     parts = read_parts(path, options)
     return {"type": "scene", **part_shapes(mi, parts, scratch), **light_shapes(mi, path, parts, options.light, scratch)}
@@ -183,7 +160,7 @@ def referenced_files(path: Path) -> dict[str, Path]:
     return {}
 
 
-def hash_into(digest: Any, path: Path, options: MeshOptions) -> None:
+def hash_into(digest: Any, path: Path, options: SceneOptions) -> None:
     """Add to a hash of the file itself all else that decides its scene. Raises UserError if a file is missing."""
     digest.update(f"\0{_READING} {options.scale!r} {options.up} {options.light}".encode())
     for name, file in sorted(referenced_files(path).items()):
@@ -211,13 +188,6 @@ def _refuse_unreadable_texture(path: Path, name: str, data: bytes) -> None:
             image.load()
     except Exception:  # Pillow raises whatever its decoders do
         raise UserError(f"scene {path}: texture '{name}' cannot be read: make it a PNG or a JPEG") from None
-
-
-def world_from_file(options: MeshOptions) -> FloatArray:
-    """T_world_file (4, 4): scaled to metres and turned y up."""
-    T_world_file = np.eye(4)
-    T_world_file[:3, :3] = options.scale * np.array(_UP[options.up], float)
-    return T_world_file
 
 
 def _moved(part: Part, T: FloatArray) -> Part:

@@ -15,7 +15,7 @@ from rsgen import srgb
 from rsgen.array_types import FloatArray, IntArray
 from rsgen.errors import UserError
 from rsgen.formats.meshes import gltf
-from rsgen.formats.meshes.material import Material, Texture
+from rsgen.render.material import Material, Texture
 
 log = logging.getLogger("rsgen")
 

@@ -17,8 +17,9 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
-from rsgen.formats.meshes.mesh_file import MeshOptions, read_parts, world_from_file
+from rsgen.formats.meshes.mesh_file import read_parts
 from rsgen.formats.scenes.content import Content, Lamp
+from rsgen.render.placement import SceneOptions, world_from_file
 
 BLEND = ".blend"
 
@@ -49,7 +50,7 @@ def read_blend(path: Path, scale: float | None, up: Any) -> Content:
         told = json.loads((folder / "told.json").read_text(encoding="utf-8"))
         if not (folder / "scene.glb").is_file():
             raise UserError(f"scene {path}: holds no surface that its render shows: add a mesh, or unhide one")
-        options = MeshOptions(scale or float(told["metres_per_unit"]), up or "y")
+        options = SceneOptions(scale or float(told["metres_per_unit"]), up or "y")
         try:
             parts = read_parts(folder / "scene.glb", options)
         except UserError as error:

@@ -10,13 +10,14 @@ import numpy as np
 from rsgen.config.sections import Up
 from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
-from rsgen.formats.meshes.mesh_file import MeshOptions, finished, light_shapes, part_shapes, read_parts
+from rsgen.formats.meshes.mesh_file import finished, light_shapes, part_shapes, read_parts
 from rsgen.formats.scenes import usd_stage
 from rsgen.formats.scenes.blend import BLEND, read_blend
 from rsgen.formats.scenes.content import Content
 from rsgen.formats.scenes.folder import NAME, write_folder, write_scene
 from rsgen.formats.scenes.lamps import lamp_shapes
 from rsgen.inputs import check_input
+from rsgen.render.placement import SceneOptions
 
 MESH_FILES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 
@@ -86,5 +87,5 @@ def _content(file: Path, scale: float | None, up: Up | None) -> Content:
         return usd_stage.read_usd(file, scale, up)
     if suffix == BLEND:
         return read_blend(file, scale, up)
-    parts = read_parts(file, MeshOptions(scale or 1.0, up or "y"))
+    parts = read_parts(file, SceneOptions(scale or 1.0, up or "y"))
     return Content(parts, [], ["scene.file of a config takes a mesh file as it is, too"])

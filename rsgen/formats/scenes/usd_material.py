@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from rsgen.array_types import Float32Array, FloatArray
-from rsgen.formats.meshes.material import Material, Texture
 from rsgen.formats.scenes.content import Notes
 from rsgen.formats.scenes.usd_texture import (
     Picture,
@@ -19,6 +18,7 @@ from rsgen.formats.scenes.usd_texture import (
     transform_of,
     wrap_of,
 )  # fmt: skip
+from rsgen.render.material import Material, Texture
 
 COORDINATES = "st"
 COLORS = "displayColor"

@@ -10,11 +10,11 @@ import numpy as np
 import trimesh
 
 from rsgen.array_types import BoolArray, FloatArray, IntArray
-from rsgen.formats.meshes.material import Material
 from rsgen.formats.meshes.mesh_visual import Part
 from rsgen.formats.scenes.content import Notes
 from rsgen.formats.scenes.triangulate import triangulate
 from rsgen.formats.scenes.usd_material import Look
+from rsgen.render.material import Material
 
 SOLIDS = ("Cube", "Sphere", "Cylinder", "Cone", "Capsule", "Plane")
 

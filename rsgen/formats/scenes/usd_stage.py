@@ -15,12 +15,13 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
-from rsgen.formats.meshes.mesh_file import MeshOptions, placed, world_from_file
+from rsgen.formats.meshes.mesh_file import placed
 from rsgen.formats.meshes.mesh_visual import Part
 from rsgen.formats.scenes import usd_light
 from rsgen.formats.scenes.content import MOST_TRIANGLES, Content, Lamp, Notes
 from rsgen.formats.scenes.usd_material import UNBOUND, Looks
 from rsgen.formats.scenes.usd_mesh import SOLIDS, mesh_surface, parts, smooth_normals, solid
+from rsgen.render.placement import SceneOptions, world_from_file
 
 SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 
@@ -52,7 +53,7 @@ def read_usd(path: Path, scale: float | None, up: str | None) -> Content:
         if stage is None:
             raise UserError(f"scene {path}: is no USD file: export it again")
         own_scale, own_up = UsdGeom.GetStageMetersPerUnit(stage), str(UsdGeom.GetStageUpAxis(stage)).lower()
-        T_world_stage = world_from_file(MeshOptions(scale or float(own_scale), up or own_up))  # type: ignore[arg-type]
+        T_world_stage = world_from_file(SceneOptions(scale or float(own_scale), up or own_up))  # type: ignore[arg-type]
         time = Usd.TimeCode.EarliestTime()
         if stage.HasAuthoredTimeCodeRange():
             time = Usd.TimeCode(stage.GetStartTimeCode())

@@ -19,7 +19,7 @@ from rsgen.config.config import Config
 from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
 from rsgen.formats.export import folder
-from rsgen.formats.export.folder import place_images, sequence_imu
+from rsgen.formats.export.folder import place_images
 from rsgen.formats.export.folders.euroc import export_euroc
 from rsgen.formats.export.folders.kalibr import export_kalibr
 from rsgen.formats.export.folders.registered import export_registered
@@ -27,6 +27,7 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.sensors.imu import exact_imu
 from rsgen.sequence.reader import Sequence, read_sequence
+from rsgen.truth.settings import sequence_imu
 
 
 @pytest.fixture(scope="module")

@@ -19,12 +19,12 @@ from rsgen.errors import UserError
 from rsgen.formats.export.bags import bag
 from rsgen.formats.export.bags.bag import Kind, Storage
 from rsgen.formats.export.bags.ros import export_ros, loss_of_tf
-from rsgen.formats.export.folder import sequence_imu
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.format import ground_truth, poses_of_rows
 from rsgen.sequence.reader import Sequence, read_sequence
+from rsgen.truth.settings import sequence_imu
 
 KINDS: list[tuple[Kind, Storage, str]] = [
     ("ros1", "sqlite3", "a.bag"),

@@ -20,7 +20,7 @@ from rendering import mi
 from rsgen.config.config import load_config
 from rsgen.errors import UserError
 from rsgen.formats.meshes.default_light import Probe
-from rsgen.formats.meshes.mesh_file import MeshOptions
+from rsgen.render.placement import SceneOptions
 from rsgen.render.scene import content_hash, load_scene, mesh_arrays, surface
 
 # --- where things are
@@ -32,7 +32,7 @@ def test_scale_and_up_place_every_point(tmp_path: Path, up: Any) -> None:
     mesh = trimesh.creation.icosphere(1)
     mesh.vertices *= rng.uniform(0.5, 2.0, (len(mesh.vertices), 1)) * [1, 2, 3]
     mesh.export(tmp_path / "blob.stl")
-    scene = load_scene(tmp_path / "blob.stl", options=MeshOptions(scale=0.25, up=up))
+    scene = load_scene(tmp_path / "blob.stl", options=SceneOptions(scale=0.25, up=up))
     axis, sign = up[-1], -1 if up[0] == "-" else 1
     vertices, faces = surface(scene)
     heights = np.sort(vertices[faces][..., 1].ravel())
@@ -94,7 +94,7 @@ def test_normals_turn_with_their_surfaces(tmp_path: Path) -> None:
         T = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3]) @ np.diag([-1.0, 2.0, 0.5, 1.0])
         scene.add_geometry(smooth, transform=T)
         scene.export(tmp_path / "ball.glb", include_normals=normals)
-        loaded = load_scene(tmp_path / "ball.glb", options=MeshOptions())
+        loaded = load_scene(tmp_path / "ball.glb", options=SceneOptions())
         si, _ = seen_from_above(loaded, np.random.default_rng(2).uniform(-0.4, 0.4, (500, 2)))
         # The ellipsoid's own normal is the gradient of |T⁻¹ p|².
         gradient = np.array(si.p).T @ np.linalg.inv(T[:3, :3] @ T[:3, :3].T)
@@ -131,7 +131,7 @@ def test_rooms_get_lamps_and_objects_a_sky(tmp_path: Path) -> None:
     def lights(name: str, light: Any = "auto") -> list[bool]:
         return [
             bool(e.is_environment())
-            for e in load_scene(files[name], options=MeshOptions(up="z", light=light)).emitters()
+            for e in load_scene(files[name], options=SceneOptions(up="z", light=light)).emitters()
         ]
 
     assert lights("ball") == [True] and lights("open") == [True] and lights("turned") == [True]
@@ -139,10 +139,10 @@ def test_rooms_get_lamps_and_objects_a_sky(tmp_path: Path) -> None:
     assert lights("room", "sky") == [True] and lights("room", "none") == []
     assert lights("turned", "ceiling") == [False] * 2  # walls that face outwards: an object, unless one says so
     with pytest.raises(UserError, match=r"open\.ply: has no ceiling.*scene\.light"):
-        load_scene(files["open"], options=MeshOptions(up="z", light="ceiling"))
+        load_scene(files["open"], options=SceneOptions(up="z", light="ceiling"))
     bare = room(open_top=True)
     assert not Probe(mi, np.array(bare.vertices), np.array(bare.faces)).encloses()
-    scene = load_scene(files["room"], options=MeshOptions(up="z"))
+    scene = load_scene(files["room"], options=SceneOptions(up="z"))
     lamps = [shape for shape in scene.shapes() if shape.is_emitter()]
     for shape in lamps:
         vertices, faces = mesh_arrays(shape)
@@ -227,7 +227,7 @@ def test_the_content_hash_covers_files_and_placement(tmp_path: Path) -> None:
     gltf = write_gltf(tmp_path / "b.gltf", flat_arrays(), {}, images=[{"uri": "maps/paint.png"}])
     seen = {content_hash(path) for path in (tmp_path / "a.obj", gltf)}
     assert seen == {content_hash(path) for path in (tmp_path / "a.obj", gltf)} and len(seen) == 2
-    seen |= {content_hash(gltf, MeshOptions(**how)) for how in ({"scale": 2.0}, {"up": "x"}, {"light": "sky"})}
+    seen |= {content_hash(gltf, SceneOptions(**how)) for how in ({"scale": 2.0}, {"up": "x"}, {"light": "sky"})}
     assert len(seen) == 5
     Image.fromarray(np.full((2, 2, 3), 81, np.uint8)).save(paint)
     seen |= {content_hash(path) for path in (tmp_path / "a.obj", gltf)}

@@ -13,13 +13,13 @@ import trimesh
 from rendering import dr, mi
 
 from rsgen.errors import UserError
-from rsgen.formats.mitsuba_xml.old_changes import Changes
-from rsgen.formats.mitsuba_xml.old_xml import old_version, upgrade
-from rsgen.formats.mitsuba_xml.parsed import plugin_finder
+from rsgen.formats.mitsuba_xml.plugins import Changes
+from rsgen.formats.mitsuba_xml.upgrade import upgrade
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.images import ColorRenderer
 from rsgen.render.scene import content_hash, load_scene
+from rsgen.render.xml_scene import older_version, plugin_finder
 
 CAMERA = Camera(80, 60, 60.0, 60.0, 39.5, 29.5)
 
@@ -33,7 +33,7 @@ def write(folder: Path, text: str, version: str = "0.6.0", name: str = "scene.xm
 
 def upgraded(folder: Path, text: str, version: str = "0.6.0") -> tuple[str, Changes]:
     path = write(folder, text, version)
-    number = old_version(path)
+    number = older_version(path)
     assert number is not None
     xml, changes = upgrade(path, number, plugin_finder(mi))
     return xml.decode(), changes

@@ -13,8 +13,7 @@ from rendering import mi
 from scene_files import fails, hits, write_scene
 from trimesh.transformations import random_rotation_matrix
 
-from rsgen.formats.mitsuba_xml.obj_polygons import with_triangles
-from rsgen.formats.mitsuba_xml.polygons import is_convex, triangulated
+from rsgen.formats.mitsuba_xml.mesh_files import is_convex, triangulated, with_triangles
 from rsgen.render.scene import content_hash, load_scene, surface
 
 

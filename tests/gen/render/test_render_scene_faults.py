@@ -17,12 +17,12 @@ from scene_files import fails, hits, rays_at, write_scene
 
 from rsgen.config.config import LightConfig, load_config
 from rsgen.errors import UserError
-from rsgen.formats.mitsuba_xml.parsed import messages_to_log
 from rsgen.light.bake import bake
 from rsgen.produce.frame_source import make_integrator
 from rsgen.render import irradiance
 from rsgen.render.irradiance import lattice_area, lattice_barycentric, make_field, make_lattice
 from rsgen.render.scene import load_scene, ply_bytes, surface
+from rsgen.render.xml_scene import messages_to_log
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_vertices_that_are_not_finite(tmp_path: Path, value: str) -> None:
     fails(path, "bad.ply.*invalid vertex position")
 
 
-def mesh_scene(folder: Path, name: str, content: bytes, more: str = "") -> Path:
+def scene_dict(folder: Path, name: str, content: bytes, more: str = "") -> Path:
     path = write_scene(folder, f'<shape type="{name[-3:]}"><string name="filename" value="{name}"/>{more}</shape>')
     (folder / name).write_bytes(content)
     return path
@@ -97,7 +97,7 @@ def mesh_scene(folder: Path, name: str, content: bytes, more: str = "") -> Path:
     ids=["cut", "empty", "indices", "line", "words"],
 )
 def test_meshes_that_are_broken(tmp_path: Path, name: str, content: bytes, words: str) -> None:
-    fails(mesh_scene(tmp_path, name, content), words)
+    fails(scene_dict(tmp_path, name, content), words)
 
 
 def test_images_that_are_missing_or_broken(tmp_path: Path) -> None:
@@ -130,7 +130,7 @@ def test_triangles_without_area_and_normals_without_direction_are_harmless(tmp_p
     table[1, 3:], table[2, 3:] = np.nan, 0
     line = '<shape type="ply" id="line"><string name="filename" value="line.ply"/></shape>'
     (tmp_path / "line.ply").write_bytes(ply_bytes(corners, np.array([[0, 4, 1]])))
-    path = mesh_scene(tmp_path, "it.ply", good[:start] + table.tobytes() + good[start + 120 :])
+    path = scene_dict(tmp_path, "it.ply", good[:start] + table.tobytes() + good[start + 120 :])
     path.write_text(path.read_text().replace("</scene>", f'{line}<emitter type="constant"/></scene>'))
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -24,7 +24,7 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.formats.export.bags.bag import TF, Bag, Kind, Storage, new_bag
-from rsgen.formats.export.folder import image_streams, sequence_imu
+from rsgen.formats.export.folder import image_streams
 from rsgen.formats.export.poses.approximation import Loss, between, loss_of_poses, sightings
 from rsgen.formats.export.poses.shutter_facts import loss_words, shutter_facts
 from rsgen.geometry import se3
@@ -32,6 +32,7 @@ from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import nanoseconds
 from rsgen.sequence.format import ground_truth, pose_rows, poses_of_rows
 from rsgen.sequence.reader import Sequence, Stream
+from rsgen.truth.settings import sequence_imu
 
 COLOR_FRAME, DEPTH_FRAME, IMU_FRAME = (
     "camera_color_optical_frame",

@@ -30,12 +30,12 @@ from rsgen.formats.export.folder import (
     make_folders,
     new_folder,
     place_images,
-    sequence_imu,
 )
 from rsgen.geometry import se3
 from rsgen.sensors.imu import ImuSamples, nanoseconds, write_imu_csv
 from rsgen.sequence.format import ground_truth, pose_rows
 from rsgen.sequence.reader import Sequence, Stream
+from rsgen.truth.settings import sequence_imu
 
 _MODELS = {"pinhole": "radial-tangential", "fisheye": "equidistant"} | dict.fromkeys(
     ("radtan", "rational"), "radial-tangential"

@@ -13,20 +13,12 @@ from rsgen.array_types import FloatArray
 from rsgen.config.imu import ImuConfig
 from rsgen.console.progress import Progress, no_progress
 from rsgen.files import atomic_write, encode_yaml
-from rsgen.formats.export.folder import (
-    EPOCH_S,
-    four_coefficients,
-    make_folders,
-    new_folder,
-    place_images,
-    row_clock,
-    sequence_imu,
-    sequence_target,
-)
+from rsgen.formats.export.folder import EPOCH_S, four_coefficients, make_folders, new_folder, place_images, row_clock
 from rsgen.geometry import se3
 from rsgen.geometry.aprilgrid import AprilGrid
 from rsgen.sensors.imu import nanoseconds, write_imu_csv
 from rsgen.sequence.reader import Sequence, Stream
+from rsgen.truth.settings import sequence_imu, sequence_target
 
 COLOR_TOPIC, DEPTH_TOPIC, IMU_TOPIC = "/cam0/image_raw", "/cam1/image_raw", "/imu0"
 _MODELS = {"pinhole": "radtan", "radtan": "radtan", "rational": "radtan", "fisheye": "equidistant"}

@@ -16,10 +16,11 @@ from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import read_bytes, whole_file
-from rsgen.formats.export.folder import image_streams, sequence_imu
+from rsgen.formats.export.folder import image_streams
 from rsgen.geometry import se3
 from rsgen.sequence.format import ground_truth
 from rsgen.sequence.reader import Sequence, Stream
+from rsgen.truth.settings import sequence_imu
 
 TIMELINE = "time"
 _UP = {(0, 1): "X_DOWN", (0, -1): "X_UP", (1, 1): "Y_DOWN", (1, -1): "Y_UP", (2, 1): "Z_DOWN", (2, -1): "Z_UP"}

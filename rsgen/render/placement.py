@@ -1,29 +1,64 @@
-"""A Mitsuba scene in another unit than metres, or with another axis up: everything in it that has a place or a length.
+"""How a scene file is placed: scaled to metres and turned y up, everything in it that has a place or a length.
 
 What it looks like stays: radiance and irradiance have no length in them, the intensity of points does (W/sr meets m²).
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+import re
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rsgen.array_types import FloatArray
+from rsgen.config.sections import SceneLight, Up
 from rsgen.errors import UserError
-from rsgen.formats.meshes.mesh_file import MeshOptions, world_from_file
-from rsgen.formats.mitsuba_xml.instances import pose_of
+from rsgen.render.xml_shapes import pose_of
 
+# Rotations that bring an axis of the file up, the world's y.
+_UP = {
+    "y": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    "-y": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
+    "z": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+    "-z": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+    "x": [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
+    "-x": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
+}
 _AROUND = ("envmap", "sunsky", "timed_sunsky", "directional")  # directions, and no place
 _POINTS = ("point", "spot", "projector")
 _NO_PLACE = ("area", "directionalarea", "constant")  # those of shapes go with them
 _DIRECTIONS = ("direction", "sun_direction")  # of the world: `to_world` does not turn them
 _INTENSITY = {"PointLight": "intensity.", "SpotLight": "intensity.", "Projector": "scale"}
+_UPRIGHT = 0.8  # cosine: a camera may be tilted, not rolled
+_AXES: tuple[tuple[Up, Up], ...] = (("x", "-x"), ("y", "-y"), ("z", "-z"))
 
 
-def place(mi: Any, state: Any, path: Path, options: MeshOptions, left: str) -> None:
+@dataclass(frozen=True)
+class SceneOptions:
+    """How a file becomes a scene: metres per unit of the file, which of its axes is up, what lights it.
+
+    light: of a mesh file only, see `rsgen.formats.meshes.default_light`.
+    """
+
+    scale: float = 1.0
+    up: Up = "y"
+    light: SceneLight = "auto"
+
+
+AS_IT_IS = SceneOptions()
+
+
+def world_from_file(options: SceneOptions) -> FloatArray:
+    """T_world_file (4, 4): scaled to metres and turned y up."""
+    T_world_file = np.eye(4)
+    T_world_file[:3, :3] = options.scale * np.array(_UP[options.up], float)
+    return T_world_file
+
+
+def place(mi: Any, state: Any, path: Path, options: SceneOptions, left: str) -> None:
     """Bring the nodes of a parsed scene, instances flattened, to metres and y up as `options` say, in place.
 
     left: id of a shape that is in the world already. `place_lamps` does what can be done on the finished scene only.
@@ -77,3 +112,18 @@ def _place_emitter(mi: Any, props: Any, turn: FloatArray, scale: float) -> None:
 
 def _premultiply(mi: Any, props: Any, T: FloatArray) -> None:
     props["to_world"] = mi.ScalarTransform4f(T @ pose_of(props))
+
+
+def camera_up(path: Path) -> Up | None:
+    """The axis of the file that the first of its cameras has up; None if it has none, or one that leans."""
+    try:
+        cameras = [e for e in ET.parse(path).getroot().iter() if e.tag in ("sensor", "camera")]
+        placed = [e for camera in cameras for e in camera.iter() if e.tag in ("lookat", "lookAt", "look_at", "matrix")]
+        text = placed[0].get("up") or placed[0].get("value") or ""
+        numbers = [float(word) for word in re.split(r"[\s,;]+", text.strip()) if word]
+        up = np.array(numbers if len(numbers) == 3 else numbers[1:12:4])  # of a matrix (4, 4) the second column
+        axis = int(np.argmax(np.abs(up)))
+        upright = abs(up[axis]) > _UPRIGHT * np.linalg.norm(up)
+    except (ET.ParseError, OSError, ValueError, LookupError):
+        return None
+    return _AXES[axis][int(up[axis] < 0)] if upright else None

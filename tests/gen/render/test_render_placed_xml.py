@@ -11,18 +11,17 @@ from scene_files import write_scene
 
 from rsgen.errors import UserError
 from rsgen.files import encode_exr
-from rsgen.formats.meshes.mesh_file import MeshOptions
-from rsgen.formats.mitsuba_xml import placed
-from rsgen.formats.mitsuba_xml.camera_up import camera_up
 from rsgen.geometry.aprilgrid import AprilGrid
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
+from rsgen.render import placement
 from rsgen.render.board import Board
 from rsgen.render.images import ColorRenderer, DepthRenderer
+from rsgen.render.placement import SceneOptions, camera_up
 from rsgen.render.scene import content_hash, load_scene, mesh_arrays
 
 CAMERA = Camera(48, 36, 40.0, 40.0, 23.5, 17.5)
-OPTIONS = MeshOptions(scale=0.01, up="z")
+OPTIONS = SceneOptions(scale=0.01, up="z")
 T_WORLD_CAM = np.array([[1.0, 0, 0, 0], [0, -1, 0, 1], [0, 0, -1, 3], [0, 0, 0, 1]])
 
 
@@ -120,7 +119,7 @@ def test_surroundings_turn_with_the_scene(tmp_path: Path, plugin: str) -> None:
     d = np.random.default_rng(4).normal(size=(3, 2000))
     seen = []
     for folder, also, inside, options in (
-        ("m", "", in_metres, MeshOptions()),
+        ("m", "", in_metres, SceneOptions()),
         ("cm", '<rotate x="1" angle="90"/>', in_file, OPTIONS),
     ):
         turned = f'<transform name="to_world">{pose}{also}</transform>'
@@ -140,14 +139,16 @@ def test_a_board_stays_where_it_is_and_the_options_are_in_the_hash(tmp_path: Pat
     T_world_board = np.eye(4)
     T_world_board[:3, 3] = 1, 2, 3
     grid = AprilGrid(2, 2, 0.1, 0.3)
-    boards = [load_scene(file, Board(grid, T_world_board), options).shapes()[1] for options in (MeshOptions(), OPTIONS)]
+    boards = [
+        load_scene(file, Board(grid, T_world_board), options).shapes()[1] for options in (SceneOptions(), OPTIONS)
+    ]
     np.testing.assert_array_equal(*(mesh_arrays(board)[0] for board in boards))
-    hashes = [content_hash(file)] + [content_hash(file, o) for o in (MeshOptions(scale=0.01), MeshOptions(up="z"))]
+    hashes = [content_hash(file)] + [content_hash(file, o) for o in (SceneOptions(scale=0.01), SceneOptions(up="z"))]
     assert len(set(hashes)) == 3
 
 
 def test_a_light_that_cannot_be_placed_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(placed, "_NO_PLACE", ())
+    monkeypatch.setattr(placement, "_NO_PLACE", ())
     with pytest.raises(UserError, match=r"emitter 'constant' cannot be scaled.*take another") as error:
         load_scene(write_scene(tmp_path, '<shape type="cube"/><emitter type="constant"/>'), options=OPTIONS)
     assert "\n" not in str(error.value)

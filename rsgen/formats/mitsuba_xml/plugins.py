@@ -1,14 +1,14 @@
-"""The walk that rewrites an old scene's tree (see `old_xml`): what became of every plugin of Mitsuba 0.x."""
+"""The walk that rewrites an old scene's tree (see `upgrade`): what became of every plugin of Mitsuba 0.x."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement
 
-from rsgen.formats.mitsuba_xml import old_lobes
-from rsgen.formats.mitsuba_xml import old_values as old
-from rsgen.formats.mitsuba_xml.old_changes import Changes
-from rsgen.formats.mitsuba_xml.old_factors import Factors
+from rsgen.formats.mitsuba_xml import colors as old
 
 _OBJECTS = ("scene", "shape", "bsdf", "texture", "emitter")
 _VALUES = ("float", "integer", "boolean", "string", "point", "vector", "rgb", "spectrum", "transform", "ref", "alias")
@@ -23,6 +23,35 @@ Exists = Callable[[str, str], bool]
 """Whether Mitsuba 3 has a plugin: its kind, as a tag ("shape", "bsdf", "texture", "emitter"), and its name."""
 
 
+@dataclass
+class Changes:
+    """What an upgrade dropped and replaced, with counts; what rsgen never uses; the files that it included, and which
+    of the files that it names were found under another name.
+    """
+
+    version: str
+    dropped: Counter[str] = field(default_factory=Counter)
+    replaced: Counter[str] = field(default_factory=Counter)
+    not_used: Counter[str] = field(default_factory=Counter)
+    files: list[Path] = field(default_factory=list)
+    renamed: dict[str, str] = field(default_factory=dict)
+
+    def summary(self) -> str:
+        """'upgraded from Mitsuba 0.6; dropped: ...; replaced: ...; not used: ...', counted."""
+        lists = {"dropped": self.dropped, "replaced": self.replaced, "not used": self.not_used}
+        said = [f"{word}: {_listed(counts)}" for word, counts in lists.items() if counts]
+        return "; ".join([f"upgraded from Mitsuba {self.version}", *said])
+
+    @property
+    def lossy(self) -> bool:
+        """Whether images show the difference."""
+        return bool(self.dropped or self.replaced)
+
+
+def _listed(counts: Counter[str]) -> str:
+    return ", ".join(f"{count} x {what}" if count > 1 else what for what, count in counts.items())
+
+
 class Upgrade:
     """One walk over a tree, parents before children, since some plugins take their children apart."""
 
@@ -32,12 +61,12 @@ class Upgrade:
         self._version = tuple(map(int, changes.version.split(".")))
         self._alias: dict[str, str] = {}  # id of an object that went -> id of the one in its place
         self._gone: set[str] = set()
-        self._factors = Factors(Element("scene"))
+        self._factors = old.Factors(Element("scene"))
 
     def scene(self, root: Element) -> Element:
         """The tree, changed in place."""
         self._names(root)
-        self._factors = Factors(root)
+        self._factors = old.Factors(root)
         self._children(root)
         for kept in self._factors.kept:  # they may become more on the way
             if all(element.get("id") != kept.get("id") or element.tag == "ref" for element in root.iter()):
@@ -233,7 +262,7 @@ class Upgrade:
             return self._stand_in(e, self._bsdf(inner) if inner.tag == "bsdf" else inner)
         if plugin == "mixturebsdf":
             return self._mixture(e)
-        if plugin in old_lobes.PLUGINS and (lobes := old_lobes.two_lobes(e, self._factors)) is not None:
+        if plugin in old.TWO_LOBES and (lobes := old.two_lobes(e, self._factors)) is not None:
             self._replaced[f"bsdf {plugin} by diffuse and roughconductor"] += 1
             return self._stand_in(e, lobes)
         if not self._exists(e.tag, plugin):
@@ -277,7 +306,7 @@ class Upgrade:
         if sum(weights) < 0.999:
             self._dropped["absorption of a mixturebsdf"] += 1
         if sum(weights) > 1.001 and not keeps_energy:  # else weights are brought to 1 in all
-            shares = old_lobes.added(parts, weights, self._factors)
+            shares = old.added(parts, weights, self._factors)
             if shares is None:
                 self._dropped[f"sum of weights {sum(weights):g} of a mixturebsdf"] += 1
             weights = weights if shares is None else shares

@@ -13,11 +13,14 @@ import os
 import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from typing import Any
 from xml.etree.ElementTree import Element
 
+import numpy as np
+
 from rsgen.errors import UserError
-from rsgen.formats.mitsuba_xml.old_changes import Changes
-from rsgen.formats.mitsuba_xml.old_plugins import Exists, Upgrade
+from rsgen.formats.mitsuba_xml.colors import FACTOR, numbers
+from rsgen.formats.mitsuba_xml.plugins import Changes, Exists, Upgrade
 from rsgen.render.file_names import located
 
 METHOD = b"old-xml/2"
@@ -26,17 +29,11 @@ METHOD = b"old-xml/2"
 _DEEPEST = 15  # includes, as in Mitsuba
 
 
-def old_version(path: Path) -> str | None:
-    """Major and minor number, '0.6', of a scene file older than Mitsuba 3; None of any other file."""
-    found = re.search(rb"<scene\b[^>]*?\bversion\s*=\s*[\"']\s*(\d+)\.(\d+)", path.read_bytes())
-    return None if found is None or int(found[1]) >= 3 else f"{int(found[1])}.{int(found[2])}"
-
-
 def upgrade(path: Path, version: str, exists: Exists) -> tuple[bytes, Changes]:
     """The scene file as XML of Mitsuba 3, its includes within it, and what that changed.
 
-    version: from `old_version`; exists: which plugins Mitsuba 3 has. Raises UserError if it is no XML, if an included
-    file is missing, or if a number is none.
+    version: its major and minor number, '0.6'; exists: which plugins Mitsuba 3 has. Raises UserError if it
+    is no XML, if an included file is missing, or if a number is none.
     """
     changes = Changes(version)
     root = _read(path, path, [], {}, changes, 0)
@@ -106,3 +103,36 @@ def _found(folders: list[Path], name: str) -> Path:
     exact = (folder / name for folder in folders if (folder / name).exists())
     alike = (file for folder in folders if (file := located(folder, name)) is not None)
     return next(itertools.chain(exact, alike), folders[0] / name)
+
+
+def multiply_images(mi: Any, state: Any) -> None:
+    """Multiply the bitmaps of a parsed scene that have a factor, in place; at most to 1, but for what lamps emit."""
+    of_lamps = {
+        node.props[key].index()
+        for node in state.nodes
+        if node.type == mi.ObjectType.Emitter
+        for key in node.props.keys()  # noqa: SIM118 (Mitsuba's Properties is no dict)
+        if node.props.type(key) == mi.Properties.Type.ResolvedReference
+    }
+    for number, node in enumerate(state.nodes):
+        if FACTOR not in node.props:
+            continue
+        props, factor = node.props, np.array(numbers(node.props[FACTOR]), np.float32)
+        file = Path(str(mi.file_resolver().resolve(str(props["filename"]))))
+        pixels = _pixels(mi, file, bool(props.get("raw", False)), bool((factor != factor[0]).any()))
+        channels = min(3, pixels.shape[2] - (pixels.shape[2] in (2, 4)))  # but not alpha
+        pixels[..., :channels] *= factor[:channels]
+        if number not in of_lamps:
+            np.minimum(pixels, 1, out=pixels)
+        del props["filename"], props[FACTOR]
+        props["bitmap"] = mi.Bitmap(pixels)
+
+
+def _pixels(mi: Any, file: Path, raw: bool, coloured: bool) -> Any:
+    """(h, w, channels) float32 as Mitsuba looks them up: linear, unless raw; of three channels at least if coloured."""
+    image = mi.Bitmap(str(file))
+    format = image.pixel_format()
+    if coloured and format == mi.Bitmap.PixelFormat.Y:
+        format = mi.Bitmap.PixelFormat.RGB
+    image = image.convert(format, mi.Struct.Type.Float32, srgb_gamma=image.srgb_gamma() and raw)
+    return np.atleast_3d(np.array(image, np.float32))

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,12 +17,10 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from rsgen.errors import UserError
-from rsgen.formats.mitsuba_xml import old_xml
-from rsgen.formats.mitsuba_xml.instances import children, flatten
-from rsgen.formats.mitsuba_xml.old_changes import Changes
-from rsgen.formats.mitsuba_xml.old_plugins import Exists
+from rsgen.formats import xml_helper
 from rsgen.inputs import MOST_BYTES, MOST_PIXELS, image_size
 from rsgen.render.file_names import mend_names
+from rsgen.render.xml_shapes import children, flatten
 
 log = logging.getLogger("rsgen")
 
@@ -40,7 +38,7 @@ class Parsed:
     """
 
     state: Any
-    changes: Changes | None
+    changes: Any
     renamed: dict[str, str]
 
 
@@ -50,10 +48,10 @@ def parse(mi: Any, config: Any, path: Path, scratch: Path, shape: str | None = N
     config: a ParserConfig; scratch: a folder for files made on the way; shape: XML of one more shape, which is added as
     the last. Raises UserError, and what Mitsuba's parser raises.
     """
-    version = old_xml.old_version(path)
+    version = older_version(path)
     file, changes = path.resolve(), None
     if version is not None:
-        text, changes = old_xml.upgrade(path, version, plugin_finder(mi))
+        text, changes = xml_helper("older version").upgrade(path, version, plugin_finder(mi))
         file = scratch / "upgraded.xml"
         file.write_bytes(text)
         config.unused_properties = mi.LogLevel.Warn  # listed as dropped, later
@@ -67,7 +65,13 @@ def parse(mi: Any, config: Any, path: Path, scratch: Path, shape: str | None = N
     return Parsed(state, changes, renamed | mend_names(state, path.parent))
 
 
-def plugin_finder(mi: Any) -> Exists:
+def older_version(path: Path) -> str | None:
+    """Major and minor number, '0.6', of a scene file older than Mitsuba 3; None of any other file."""
+    found = re.search(rb"<scene\b[^>]*?\bversion\s*=\s*[\"']\s*(\d+)\.(\d+)", path.read_bytes())
+    return None if found is None or int(found[1]) >= 3 else f"{int(found[1])}.{int(found[2])}"
+
+
+def plugin_finder(mi: Any) -> Callable[[str, str], bool]:
     """Tells whether Mitsuba has a plugin of a kind and a name."""
     manager, kind = mi.PluginManager.instance(), mi.ObjectType
     kinds = {"shape": kind.Shape, "bsdf": kind.BSDF, "texture": kind.Texture, "emitter": kind.Emitter}
