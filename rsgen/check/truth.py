@@ -54,7 +54,7 @@ def check_imu(sequence: Sequence) -> tuple[bool, str]:
         return False, f"{path}: {len(rows)} samples, {len(expected)} expected"
     worst = float(np.abs(rows - expected)[:, 1:].max())
     ok = np.array_equal(rows[:, 0], expected[:, 0]) and worst < 1e-9
-    if found[0].has_truth:
+    if found.config.has_truth(found.faults):
         truth = sequence.root / IMU_TRUTH_CSV
         if read_text(truth) != imu_truth_csv(found[1]):
             return False, f"{truth}: is not what the spline and the settings give: render again to write it"

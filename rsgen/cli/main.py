@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from rsgen.cli.pack import pack
 from rsgen.cli.pictures import SequenceFolder, compare, picture, preview
@@ -50,9 +50,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return run_program("rsgen", _parser, arguments, "the same command resumes")
 
 
+class _Parser(Parser):
+    """Says of a field of the config that has moved what it is called now."""
+
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
+        from rsgen.config.faults import moved_to
+
+        for word in args or ():
+            name = word.partition("=")[0]
+            if name.startswith("--") and (now := moved_to(name[2:])) is not None:
+                self.error(f"{name}: is now --{now}")
+        return super().parse_args(args, namespace)
+
+
 @cache  # of some hundred options: whoever calls `main` often would wait for it each time
 def _parser() -> Parser:
-    commands = Commands("rsgen", _DESCRIPTION)
+    raw = argparse.RawDescriptionHelpFormatter
+    commands = Commands("rsgen", _DESCRIPTION, _Parser("rsgen", description=_DESCRIPTION, formatter_class=raw))
     add = commands.add
     add(configs, "")
     add(scenes, "workshop, or: rsgen scenes workshop --seed 3 --out rooms/workshop3")

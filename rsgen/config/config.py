@@ -13,23 +13,20 @@ from typing import Any, Literal, Union, get_args, get_origin
 import yaml
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
-from rsgen.config.declared import DeclaredConfig, as_declared
+from rsgen.config.cameras import ColorConfig, DepthConfig, StreamConfig
+from rsgen.config.faults import FaultsConfig, as_declared, from_recorded, moved_to, to_recorded
 from rsgen.config.imu import ImuConfig
-from rsgen.config.mocap import MocapConfig
-from rsgen.config.motion import MotionConfig, TremorConfig
-from rsgen.config.objects import MOST_OBJECTS, ObjectConfig, content_of
-from rsgen.config.presets import Preset, with_preset
+from rsgen.config.motion import MOST_OBJECTS, MotionConfig, ObjectConfig, TremorConfig, content_of
+from rsgen.config.presets import Preset, with_presets
 from rsgen.config.sections import (
-    ColorConfig,
-    DepthConfig,
     LightConfig,
+    MocapConfig,
     SceneConfig,
     Section,
-    StreamConfig,
+    TargetConfig,
     TrajectoryConfig,
+    TruthConfig,
 )
-from rsgen.config.target import TargetConfig
-from rsgen.config.truth import TruthConfig
 from rsgen.errors import UserError
 from rsgen.files import parse_yaml
 from rsgen.inputs import check_input
@@ -39,9 +36,9 @@ from rsgen.sequence.format import STREAMS
 __all__ = ["Config", "StreamConfig", "describe_fields", "load_config", "validate_config"]
 
 # Fields that change how fast or where a sequence is made, never one byte of it.
-_NOT_CONTENT = {"backend"}
+_NOT_CONTENT = {"backend", "faults"}
 # Sections that are left out where they are not set: sequences rendered before there were any stay the same.
-_LATER = ("declared", "target", "objects")
+_LATER = ("target", "objects")
 # Fields that hold paths, by section.
 _PATHS = (("trajectory", "file"), ("scene", "file"))
 # PyYAML lets impossible dates, endless digits and endless nesting through as these.
@@ -76,7 +73,7 @@ class Config(Section):
     truth: TruthConfig = TruthConfig()
     imu: ImuConfig | None = None
     mocap: MocapConfig | None = None
-    declared: DeclaredConfig | None = None
+    faults: FaultsConfig | None = None
     seed: int = Field(default=0, ge=0, lt=2**31, description="seed of every random number")
     backend: Literal["auto", "llvm", "cuda"] = Field(default="auto", description="where Dr.Jit runs")
 
@@ -97,32 +94,41 @@ class Config(Section):
         return self
 
     @model_validator(mode="after")
-    def _declares_possible_cameras(self) -> Config:
+    def _has_possible_faults(self) -> Config:
         for name in STREAMS:
             try:
                 _ = self.declared_color if name == "color" else self.declared_depth
             except ValueError as error:
-                raise ValueError(f"declared.{name}.{error}") from None
+                raise ValueError(f"faults.declared.{name}.{error}") from None
+        if self.imu is None and self.injected.imu is not None:
+            raise ValueError("faults.imu: there is no IMU: add a section imu, or remove it")
         return self
 
     @property
+    def injected(self) -> FaultsConfig:
+        """The faults; none where the section is left out."""
+        return self.faults or FaultsConfig()
+
+    @property
     def declared_color(self) -> ColorConfig:
-        """What the sequence says of its colour camera: the truth, unless `declared` says otherwise."""
-        return as_declared(self.color, None if self.declared is None else self.declared.color)
+        """What the sequence states of its colour camera: the truth, unless `faults.declared` says otherwise."""
+        declared = self.injected.declared
+        return as_declared(self.color, None if declared is None else declared.color)
 
     @property
     def declared_depth(self) -> DepthConfig:
-        """What the sequence says of its depth camera: the truth, unless `declared` says otherwise."""
-        return as_declared(self.depth, None if self.declared is None else self.declared.depth)
+        """What the sequence states of its depth camera: the truth, unless `faults.declared` says otherwise."""
+        declared = self.injected.declared
+        return as_declared(self.depth, None if declared is None else declared.depth)
 
     @property
     def declared_T_color_depth(self) -> Matrix4:
-        """What the sequence says of the pose between the cameras: the truth, unless `declared` says otherwise."""
-        said = None if self.declared is None else self.declared.T_color_depth
-        return self.T_color_depth if said is None else said
+        """What the sequence states of the pose between the cameras."""
+        declared = self.injected.declared
+        return self.T_color_depth if declared is None or declared.T_color_depth is None else declared.T_color_depth
 
     def content(self) -> dict[str, Any]:
-        """Everything that decides the sequence's bytes, as plain YAML types (the trajectory and scene by file name)."""
+        """All that decides the sequence's bytes, as sequence.yaml records it: plain YAML types, files by name."""
         unset = {name for name in _LATER if not getattr(self, name)}
         content = self.model_dump(mode="json", exclude=_NOT_CONTENT | unset)
         for section, name in _PATHS:
@@ -130,13 +136,10 @@ class Config(Section):
                 content[section][name] = Path(content[section][name]).name
         if self.imu is not None:
             content["imu"] = self.imu.content()
-        for name in STREAMS:  # a driver without blackouts is what it was before there were any
-            if (driver := content[name]["driver"]) is not None and not driver["blackouts"]:
-                del driver["blackouts"]
         if self.objects:
             content["objects"] = [content_of(thing) for thing in self.objects]
         content["scene"] = {k: v for k, v in content["scene"].items() if v != SceneConfig.model_fields[k].default}
-        return content
+        return to_recorded(content, self.injected)
 
 
 def load_config(path: Path, overrides: dict[str, str] | None = None) -> Config:
@@ -179,10 +182,15 @@ def _paths_in(data: dict[str, Any]) -> list[tuple[str, dict[str, Any], str]]:
             if isinstance(part, dict) and isinstance(part.get(name), str)]  # fmt: skip
 
 
+def recorded_config(data: dict[str, Any], where: str) -> Config:
+    """A config as a sequence.yaml records it (`Config.content`). Raises UserError as `validate_config` does."""
+    return validate_config(from_recorded(data), where)
+
+
 def validate_config(data: dict[str, Any], where: str) -> Config:
     """A config from plain YAML types; `where` begins the message. Raises UserError naming every wrong field."""
     try:
-        return Config.model_validate(with_preset(data))
+        return Config.model_validate(with_presets(data))
     except ValidationError as error:
         problems = "; ".join(_problem(e) for e in error.errors())
         raise _error(f"{where}: {problems}") from None
@@ -211,6 +219,8 @@ def _problem(error: Any) -> str:
     where = ".".join(str(part) for part in error["loc"]) or "config"
     message = error["msg"].removeprefix("Value error, ")
     if error["type"] == "extra_forbidden":
+        if (now := moved_to(where)) is not None:
+            return f"{where}: is now {now}"
         return f"{where}: no such field (see 'rsgen render --help')"
     if error["type"] == "missing":
         return f"{where}: is required"

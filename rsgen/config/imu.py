@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from rsgen.array_types import FloatArray
-from rsgen.config.imu_presets import ImuPreset, with_imu_preset
+from rsgen.config.faults import ImuFaults
+from rsgen.config.presets import ImuPreset, with_imu_preset
+from rsgen.config.sections import Section
 from rsgen.geometry import se3
 from rsgen.limits import Matrix4, RigidTransform, limits
 
@@ -24,16 +26,11 @@ _IDENTITY4: Matrix4 = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.
 
 
 # Fields that are left out of sequence.yaml where they are not set: what was rendered before there were any stays same.
-_LATER = (
-    "preset", "warmup_s", "gyroscope_warmup", "accelerometer_warmup", "jitter_s", "dropped", "dropped_run",
-    "clock_offset_s", "clock_drift_ppm", "stamp_error_s",
-)  # fmt: skip
+_LATER = ("preset", "warmup_s", "gyroscope_warmup", "accelerometer_warmup")
 
 
-class ImuConfig(BaseModel):
+class ImuConfig(Section):
     """An inertial measurement unit fixed to the depth camera; the noise defaults are those of EuRoC's (ADIS16448)."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     preset: ImuPreset | None = Field(
         default=None,
@@ -64,32 +61,15 @@ class ImuConfig(BaseModel):
     )
     gyroscope_warmup: Density = Field(default=0.0, description="size of that drift, an axis, by the seed, RMS, rad/s")
     accelerometer_warmup: Density = Field(default=0.0, description="size of that drift, an axis, RMS, m/s^2")
-    jitter_s: Annotated[float, limits(0, 1, "s")] = Field(
-        default=0.0, description="samples are taken early or late by this, RMS, at most a fifth of a period, s"
-    )
-    dropped: Annotated[float, Field(ge=0, le=0.9)] = Field(default=0.0, description="part of the samples that is lost")
-    dropped_run: Annotated[float, Field(ge=1, le=1e4)] = Field(
-        default=1.0, description="how many are lost in a row, in the mean"
-    )
-    clock_offset_s: Annotated[float, limits(-10, 10, "s")] = Field(
-        default=0.0, description="the IMU's stamps minus true time at the first sample, s"
-    )
-    clock_drift_ppm: Annotated[float, limits(-1e4, 1e4, "ppm")] = Field(
-        default=0.0, description="how fast the IMU's clock runs against the images', parts per million"
-    )
-    stamp_error_s: Annotated[float, limits(0, 1, "s")] = Field(
-        default=0.0, description="white error of the stamps, RMS, at most a fifth of a period, s"
-    )
 
     @model_validator(mode="before")
     @classmethod
     def _fills_in_the_preset(cls, data: Any) -> Any:
         return with_imu_preset(data)
 
-    @property
-    def has_truth(self) -> bool:
-        """Whether truth/ tells of its samples' true times and biases, and of what it is: if any later field is set."""
-        return bool(set(self.content()) & set(_LATER))
+    def has_truth(self, faults: ImuFaults | None) -> bool:
+        """Whether truth/ has its samples' true times and biases: where they are more than white noise and a walk."""
+        return bool(set(self.content()) & set(_LATER)) or (faults is not None and faults != ImuFaults())
 
     def content(self) -> dict[str, Any]:
         """What decides its bytes, as plain YAML types."""

@@ -1,30 +1,21 @@
-"""The sections of a sequence's configuration: trajectory, scene, light and the two streams."""
+"""Sections of a sequence's configuration: trajectory, scene, light, target, exact images, motion capture."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Annotated, Literal
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from rsgen.config.adaptation import AutoExposureConfig, AutoWhiteBalanceConfig
-from rsgen.config.driver import DriverConfig
-from rsgen.config.sensors import ColorNoiseConfig, DepthNoiseConfig
-from rsgen.errors import UserError
-from rsgen.geometry.camera import Camera, Model
-from rsgen.geometry.shutter import Scan, Shutter
+from rsgen.geometry.aprilgrid import AprilGrid
 from rsgen.limits import MOST_M, RigidTransform, limits
-from rsgen.sequence.format import DEPTH_SCALE
 
 Coordinate = Annotated[float, limits(-MOST_M, MOST_M, "m")]
-Pixels = Annotated[float, limits(-1e6, 1e6, "px")]
-Seconds = Annotated[float, limits(1e-9, 3600, "s", or_zero=True)]
+Position = tuple[Coordinate, Coordinate, Coordinate]
 Row34 = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 Matrix34 = tuple[Row34, Row34, Row34]
 Up = Literal["x", "y", "z", "-x", "-y", "-z"]
 SceneLight = Literal["auto", "sky", "ceiling", "none"]
-_LEAST_FOCAL_PX = 0.01
 
 
 class Section(BaseModel):
@@ -113,129 +104,114 @@ class LightConfig(Section):
     max_depth: int = Field(default=12, ge=1, le=64, description="path length of mode 'path'")
 
 
-def _pixel_without_ray(camera: Camera) -> tuple[float, float] | None:
-    """A position in the image, its outermost edges included, that the distortion sees nothing at; None if all see."""
-    u, v = np.arange(camera.width + 1) - 0.5, np.arange(camera.height + 1) - 0.5
-    rows = [np.stack([u, np.full_like(u, edge)], axis=-1) for edge in (v[0], v[-1])]
-    columns = [np.stack([np.full_like(v, edge), v], axis=-1) for edge in (u[0], u[-1])]
-    centre = np.array([[(camera.width - 1) / 2, (camera.height - 1) / 2]])
-    uv = np.concatenate([*rows, *columns, centre])
-    blind = uv[~np.isfinite(camera.unproject(uv)).all(axis=-1)]
-    return (float(blind[0, 0]), float(blind[0, 1])) if len(blind) else None
+MOST_TAGS = 587  # in the family 36h11
 
 
-class StreamConfig(Section):
-    """One camera with its own clock."""
+class TargetConfig(Section):
+    """An AprilGrid of Kalibr's (tags 36h11) in the scene; truth/target_corners.txt has its corners."""
 
-    width: int = Field(default=640, ge=8, le=16384, description="columns, px")
-    height: int = Field(default=480, ge=8, le=16384, description="rows, px")
-    intrinsics: tuple[Pixels, Pixels, Pixels, Pixels] = Field(
-        default=(481.2, 480.0, 319.5, 239.5), description="fx, fy, cx, cy, px; pixel centres integer"
+    rows: int = Field(default=6, ge=1, le=MOST_TAGS, description="tags above each other")
+    columns: int = Field(default=6, ge=1, le=MOST_TAGS, description="tags beside each other")
+    tag_size_m: Annotated[float, limits(1e-3, 100, "m")] = Field(
+        default=0.088, description="edge of a tag, its black border included, m"
     )
-    model: Model = Field(default="pinhole", description="distortion model")
-    distortion: tuple[Annotated[float, limits(-1e6, 1e6, "(coefficient)")], ...] = Field(
+    spacing: Annotated[float, limits(0.01, 1, "(tag sizes)")] = Field(
+        default=0.3, description="gap between tags, tag sizes: whole hundredths"
+    )
+    T_world_target: RigidTransform = Field(
+        description="target to world coordinates: origin in tag 0's lower left corner, x right, y up, z out of it"
+    )
+
+    @property
+    def grid(self) -> AprilGrid:
+        """Its geometry."""
+        return AprilGrid(self.rows, self.columns, self.tag_size_m, self.spacing)
+
+    @model_validator(mode="after")
+    def _can_be_drawn(self) -> TargetConfig:
+        if self.rows * self.columns > MOST_TAGS:
+            raise ValueError(f"rows x columns: {self.rows * self.columns} tags, there are {MOST_TAGS}")
+        if abs(100 * self.spacing - round(100 * self.spacing)) > 1e-9:
+            raise ValueError(f"spacing: {self.spacing:g} is no whole number of hundredths")
+        return self
+
+
+GlobalTime = Literal["first", "middle", "last"]
+FlowTarget = Literal["global", "next"]
+
+FLOW_CHANNELS = ("u", "v", "valid")
+
+
+class TruthConfig(Section):
+    """Exact images beside every colour frame, in truth/NAME/; all off by default."""
+
+    sharp: bool = Field(
+        default=False, description="the frame without blur, each line at its mid-exposure; truth/sharp, 8-bit sRGB PNG"
+    )
+    global_shutter: tuple[GlobalTime, ...] = Field(
         default=(),
-        description="radtan k1 k2 p1 p2 [k3]; rational k1 k2 p1 p2 k3 k4 k5 k6; "
-        "fisheye k1 k2 k3 k4; double_sphere xi alpha",
+        description="first, middle, last: the frame without blur, all lines at that line's mid-exposure; "
+        "truth/global_TIME, 8-bit sRGB PNG",
     )
-    rate_hz: Annotated[float, limits(1e-4, 1e5, "Hz")] = Field(default=30.0, description="frames per second")
-    offset_s: Annotated[float, limits(-1e9, 1e9, "s")] = Field(
-        default=0.0, description="stamp of the first frame after the trajectory's first pose, s"
+    spp: int = Field(default=16, ge=1, le=65536, description="samples per pixel of sharp and global_shutter")
+    flow: tuple[FlowTarget, ...] = Field(
+        default=(),
+        description="global: flow to every frame in global_shutter, truth/flow_global_TIME; next: to the next frame, "
+        "line by line, truth/flow_next; px, EXR u v valid",
     )
-    readout_s: Seconds = Field(
-        default=0.028, description="time from first to one past the last line, s; 0: global shutter"
-    )
-    exposure_s: Seconds = Field(default=0.0, description="exposure of each line, s; 0: no motion blur")
-    scan: Scan = Field(default="top-bottom", description="order in which lines are read out")
-    driver: DriverConfig | None = None
-
-    @property
-    def camera(self) -> Camera:
-        fx, fy, cx, cy = self.intrinsics
-        return Camera(self.width, self.height, fx, fy, cx, cy, self.model, tuple(self.distortion))
-
-    @property
-    def shutter(self) -> Shutter:
-        return Shutter(self.readout_s, self.exposure_s, self.scan)
-
-    @property
-    def longest_exposure_s(self) -> float:
-        """Of any frame, s."""
-        return self.exposure_s
-
-    @property
-    def has_frame_table(self) -> bool:
-        """Whether stamps or exposures of single frames are another matter than the clock and the shutter."""
-        return self.driver is not None
-
-    @model_validator(mode="after")
-    def _geometry_is_valid(self) -> StreamConfig:
-        try:
-            camera, _ = self.camera, self.shutter
-        except UserError as error:
-            raise ValueError(str(error)) from None
-        if min(self.intrinsics[:2]) < _LEAST_FOCAL_PX:
-            raise ValueError(f"intrinsics: fx and fy must be at least {_LEAST_FOCAL_PX} px")
-        blind = _pixel_without_ray(camera)
-        if blind is not None:
-            raise ValueError(
-                f"distortion: no ray reaches pixel {blind}, where {self.model} folds back or sees 180 degrees: "
-                "take a smaller image, longer focal lengths or other coefficients"
-            )
-        return self
-
-
-class ColorConfig(StreamConfig):
-    """The colour camera."""
-
-    spp: int = Field(default=16, ge=1, le=65536, description="samples per pixel (footprint and exposure window)")
-    exposure_gain: Annotated[float, limits(1e-6, 1e6, "(factor)")] = Field(
-        default=1.0, description="factor on linear radiance before sRGB quantisation"
-    )
-    noise: ColorNoiseConfig = ColorNoiseConfig()
-    auto_exposure: AutoExposureConfig | None = None
-    auto_white_balance: AutoWhiteBalanceConfig | None = None
-
-    @property
-    def adapts(self) -> bool:
-        """Whether exposure, gain or white balance change from frame to frame."""
-        return self.auto_exposure is not None or self.auto_white_balance is not None
-
-    @property
-    def longest_exposure_s(self) -> float:
-        return self.exposure_s if self.auto_exposure is None else self.auto_exposure.exposure_s[1]
-
-    @property
-    def has_frame_table(self) -> bool:
-        return self.driver is not None or self.adapts
-
-    @model_validator(mode="after")
-    def _has_a_reference(self) -> ColorConfig:
-        if self.auto_exposure is not None and self.exposure_s == 0:
-            raise ValueError("auto_exposure: exposure_s must be above 0: at that exposure exposure_gain holds")
-        return self
-
-
-class DepthConfig(StreamConfig):
-    """The depth camera: planar z through each pixel's centre, 16 bit."""
-
-    depth_scale: Annotated[float, limits(1e-3, 1e9, "units per metre")] = Field(
-        default=DEPTH_SCALE, description="stored units per metre"
-    )
-    noise: DepthNoiseConfig = DepthNoiseConfig()
-    blur_samples: int = Field(
-        default=1,
-        ge=1,
-        le=64,
-        description="instants of each line's exposure that a reported depth mixes; 1: its middle",
-    )
-    registered: bool = Field(
+    normals: bool = Field(
         default=False,
-        description="warp reported depth into the colour camera, as drivers do; truth/depth stays as it is",
+        description="unit surface normals in the camera frame of the pixel's line; truth/normals, EXR x y z",
+    )
+    blur_length: bool = Field(
+        default=False, description="how far a pixel's point moves in its line's exposure, px; truth/blur_length, EXR"
+    )
+    color_depth: bool = Field(
+        default=False, description="planar z seen by the colour camera itself, m; truth/color_depth, EXR"
     )
 
     @model_validator(mode="after")
-    def _has_an_exposure_to_mix(self) -> DepthConfig:
-        if self.blur_samples > 1 and self.exposure_s == 0:
-            raise ValueError("blur_samples: exposure_s must be above 0 to be mixed over")
+    def _flow_has_a_target(self) -> TruthConfig:
+        if "global" in self.flow and not self.global_shutter:
+            raise ValueError("flow 'global' needs a time in global_shutter: add first, middle or last")
+        for name in ("global_shutter", "flow"):
+            if len(set(getattr(self, name))) < len(getattr(self, name)):
+                raise ValueError(f"{name} names one twice: name each once")
         return self
+
+    @property
+    def images(self) -> dict[str, tuple[str, ...]]:
+        """Names of the images of a frame, each with its EXR channels; no channels: an 8-bit sRGB PNG."""
+        images: dict[str, tuple[str, ...]] = {"sharp": ()} if self.sharp else {}
+        images |= {f"global_{time}": () for time in self.global_shutter}
+        if "global" in self.flow:
+            images |= {f"flow_global_{time}": FLOW_CHANNELS for time in self.global_shutter}
+        if "next" in self.flow:
+            images["flow_next"] = FLOW_CHANNELS
+        single = {"normals": ("x", "y", "z"), "blur_length": ("Y",), "color_depth": ("Z",)}
+        return images | {name: channels for name, channels in single.items() if getattr(self, name)}
+
+
+Metres = Annotated[float, limits(-100, 100, "m")]
+Degrees = Annotated[float, limits(-180, 180, "deg")]
+
+
+class MocapConfig(Section):
+    """Errors of a motion capture in groundtruth.txt alone; spline.npz and all of truth/ stay exact."""
+
+    rate_hz: Annotated[float, limits(1, 2000, "Hz")] = Field(default=100.0, description="poses per second")
+    offset_s: Annotated[float, limits(-10, 10, "s")] = Field(
+        default=0.0, description="listed minus true stamp, s: the motion capture has a clock of its own"
+    )
+    translation_m: tuple[Metres, Metres, Metres] = Field(
+        default=(0.0, 0.0, 0.0), description="where the body that it reports lies in the camera's frame, m"
+    )
+    rotation_deg: tuple[Degrees, Degrees, Degrees] = Field(
+        default=(0.0, 0.0, 0.0), description="how that body is turned in the camera's frame, rotation vector, deg"
+    )
+    position_sigma_m: Annotated[float, limits(0, 1, "m")] = Field(
+        default=0.0, description="white noise along each axis, m RMS"
+    )
+    rotation_sigma_deg: Annotated[float, limits(0, 30, "deg")] = Field(
+        default=0.0, description="white noise about each axis, deg RMS"
+    )

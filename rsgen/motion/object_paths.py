@@ -11,8 +11,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from rsgen.array_types import FloatArray
-from rsgen.config.motion import Waypoint
-from rsgen.config.objects import ObjectConfig, ObjectMotionConfig
+from rsgen.config.motion import ObjectConfig, ObjectMotionConfig, Waypoint
 from rsgen.errors import UserError
 from rsgen.geometry import se3, so3
 from rsgen.geometry.spline import Spline

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from rsgen.array_types import BoolArray, ByteArray, Float32Array, FloatArray
-from rsgen.config.truth import GlobalTime
+from rsgen.config.sections import GlobalTime
 from rsgen.files import encode_png
 from rsgen.pack.draw import Drawn, Layout
 

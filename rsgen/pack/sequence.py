@@ -13,7 +13,7 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.config.config import Config
-from rsgen.config.truth import TruthConfig
+from rsgen.config.sections import TruthConfig
 from rsgen.console.progress import Progress, no_progress
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rsgen.config.config import Config, validate_config
+from rsgen.config.config import Config, recorded_config
 from rsgen.console.progress import ProgressDisplay
 from rsgen.errors import UserError
 from rsgen.files import read_yaml
@@ -91,7 +91,7 @@ def config_of(path: Path, meta: dict[str, Any], scene: Path | None) -> Config:
         if (mesh := origin.get(f"object {thing.get('name')}")) is not None:
             thing["mesh"] = str(mesh)
     recorded["objects"] = things
-    return validate_config(recorded, f"{path}/sequence.yaml: config")
+    return recorded_config(recorded, f"{path}/sequence.yaml: config")
 
 
 def _mapping(value: Any) -> dict[str, Any]:

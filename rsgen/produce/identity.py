@@ -12,6 +12,7 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.config.config import Config, StreamConfig
+from rsgen.config.faults import moved_to
 from rsgen.errors import UserError
 from rsgen.files import is_temporary, read_yaml
 from rsgen.geometry.spline import Spline
@@ -43,18 +44,18 @@ def describe(
     inputs: Mapping[str, str],
 ) -> dict[str, Any]:
     """What sequence.yaml says. stamps: (n,) s of all frames of each stream."""
-    registered = {"registered": True} if config.depth.registered else {}
-    color, depth = config.declared_color, config.declared_depth
+    color, depth, faults = config.declared_color, config.declared_depth, config.injected
+    depth_only = {"depth_scale": depth.depth_scale} | ({"registered": True} if depth.registered else {})
     identity = {"config": config.content(), "inputs": dict(inputs), "versions": dict(versions)}
     return {
         "format": FORMAT,
         "name": config.name,
         "streams": {
-            "color": _stream_yaml(color, stamps["color"]),
-            "depth": _stream_yaml(depth, stamps["depth"]) | {"depth_scale": depth.depth_scale} | registered,
+            "color": _stream_yaml(color, stamps["color"], faults.color is not None),
+            "depth": _stream_yaml(depth, stamps["depth"], faults.depth is not None) | depth_only,
         },
         "T_color_depth": [[float(value) for value in row] for row in config.declared_T_color_depth],
-        **({} if config.declared is None else {"declared": True}),
+        **({} if faults.declared is None else {"declared": True}),
         "spline": {"knot_spacing_s": spline.dt, "t0_s": spline.t0, "control_points": len(spline.control_points)},
         "noise": noise_yaml(config),
         **({"objects": [thing.name for thing in config.objects]} if config.objects else {}),
@@ -66,7 +67,7 @@ def describe(
 
 
 def true_cameras(config: Config) -> Cameras:
-    """The cameras that take the images, whatever `declared` says."""
+    """The cameras that take the images, whatever `faults.declared` says."""
     color, depth = config.color, config.depth
     T_color_depth = np.array(config.T_color_depth, float)
     return Cameras(color.camera, color.shutter, depth.camera, depth.shutter, depth.depth_scale, T_color_depth)
@@ -85,8 +86,8 @@ def noise_yaml(config: Config) -> dict[str, str] | None:
     return models if set(models.values()) != {"none"} else None
 
 
-def _stream_yaml(stream: StreamConfig, stamps: FloatArray) -> dict[str, Any]:
-    table = {"frame_table": True} if stream.has_frame_table else {}
+def _stream_yaml(stream: StreamConfig, stamps: FloatArray, is_faulty: bool) -> dict[str, Any]:
+    table = {"frame_table": True} if is_faulty or stream.adapts else {}
     return {
         "size": [stream.width, stream.height],
         "intrinsics": list(stream.intrinsics),
@@ -122,6 +123,7 @@ def refuse_foreign_folder(out: Path, new: Mapping[str, Any]) -> None:
     if old.get("fingerprint") == new["fingerprint"] and old == new:
         return
     field, before, now = _first_difference(old, new) or ("fingerprint", old.get("fingerprint"), new["fingerprint"])
+    field = moved_to(field) or field
     raise UserError(f"{out}: holds another sequence, {field} is {_short(before)} there and {_short(now)} now: {cure}")
 
 

@@ -52,7 +52,7 @@ _HAND: dict[str, Any] = {
     "shake_rotation_deg": 0.4,
 }
 _LARGE_M2, _TEXELS = 300.0, 1.15e6  # a larger surface gets coarser light than the default: about so many texels
-_CAMERAS = ("color", "depth", "T_color_depth", "truth", "imu", "mocap", "tremor")
+_CAMERAS = ("color", "depth", "T_color_depth", "truth", "imu", "mocap", "tremor", "faults")
 _FLAT = 0.1  # of the views, that hold nothing but one plane: for fewer, other ways are tried
 
 

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from rsgen.array_types import BoolArray, ByteArray, Float32Array, FloatArray
 from rsgen.config.config import Config, StreamConfig
+from rsgen.config.faults import StreamFaults
 from rsgen.config.imu import ImuConfig
 from rsgen.errors import UserError
 from rsgen.files import (
@@ -73,15 +74,17 @@ class _Stream:
     writes_table: bool
 
     @classmethod
-    def of(cls, stream: StreamConfig, name: StreamName, stamps: npt.ArrayLike, seed: int) -> _Stream:
+    def of(
+        cls, stream: StreamConfig, faults: StreamFaults | None, name: StreamName, stamps: npt.ArrayLike, seed: int
+    ) -> _Stream:
         stamps = round_stamps(stamps)
-        came = deliver(stamps, stream.driver, seed, name)
+        came = deliver(stamps, faults, seed, name)
         ones = np.ones(len(stamps))
         table = FrameTable(
             np.arange(len(stamps)), came.shows, stamps[came.shows], came.listed, stream.exposure_s * ones,
             ones, ones, np.ones((len(stamps), 3)),
         )  # fmt: skip
-        return cls(stream.camera, stream.shutter, stamps, table, came.is_delivered, stream.has_frame_table)
+        return cls(stream.camera, stream.shutter, stamps, table, came.is_delivered, stream.adapts or faults is not None)
 
     def line_poses(self, spline: Spline, T_cam_body: FloatArray | None = None) -> FloatArray:
         """Rows (frames, lines, 7), as in truth/rows_STREAM.npy. Raises UserError."""
@@ -133,8 +136,8 @@ class SequenceWriter:
         """
         out = Path(out)
         streams = {
-            "color": _Stream.of(config.color, "color", stamps_color, config.seed),
-            "depth": _Stream.of(config.depth, "depth", stamps_depth, config.seed),
+            "color": _Stream.of(config.color, config.injected.color, "color", stamps_color, config.seed),
+            "depth": _Stream.of(config.depth, config.injected.depth, "depth", stamps_depth, config.seed),
         }
         for stream in streams.values():
             line_poses(spline, stream.camera, stream.shutter, stream.stamps[[0, -1]])
@@ -271,16 +274,16 @@ class SequenceWriter:
             if stream.writes_table:
                 table = stream.table.of(np.flatnonzero(stream.is_delivered))
                 atomic_write(self.out / FRAME_TABLES[s], table.text().encode())
-        if self.config.declared is not None:
+        if self.config.injected.declared is not None:
             atomic_write(self.out / TRUE_CAMERAS, encode_yaml(self._true_cameras()))
         if (target := self.config.target) is not None:
             text = target_corners_text(target.grid, np.array(target.T_world_target, float))
             atomic_write(self.out / TARGET_CORNERS, text.encode())
         if self.config.imu is not None:
-            spline = self.spline
-            samples = simulate_imu(spline, self.config.imu, spline.t_begin, spline.t_end, self.config.seed)
+            spline, faults = self.spline, self.config.injected.imu
+            samples = simulate_imu(spline, self.config.imu, spline.t_begin, spline.t_end, self.config.seed, faults)
             write_imu_csv(self.out / "imu.csv", samples)
-            if self.config.imu.has_truth:
+            if self.config.imu.has_truth(faults):
                 atomic_write(self.out / IMU_TRUTH_CSV, imu_truth_csv(samples).encode())
                 atomic_write(self.out / IMU_TRUTH_YAML, encode_yaml(self._true_imu(self.config.imu)))
 
@@ -288,7 +291,7 @@ class SequenceWriter:
         """Content of truth/cameras.yaml."""
         config, listed = self.config, self.depth.table.listed_s[self.depth.is_delivered]
         times = (float(t) for t in (self.color.stamps[0], self.depth.stamps[0], listed[len(listed) // 2]))
-        clock = color_clock(config.color.driver, config.depth.driver, *times)
+        clock = color_clock(config.injected.color, config.injected.depth, *times)
         return camera_yaml(true_cameras(config), clock, config.depth.registered)
 
     def _true_imu(self, imu: ImuConfig) -> dict[str, Any]:
@@ -296,7 +299,7 @@ class SequenceWriter:
         start, _ = sample_clock(imu, self.spline.t_begin, self.spline.t_end)
         listed = self.depth.table.listed_s[self.depth.is_delivered]
         T_image_depth = np.array(self.config.T_color_depth, float) if self.config.depth.registered else np.eye(4)
-        return imu_truth_yaml(imu, start, float(listed[len(listed) // 2]), T_image_depth)
+        return imu_truth_yaml(imu, self.config.injected.imu, start, float(listed[len(listed) // 2]), T_image_depth)
 
     def _stream(self, stream: StreamName) -> _Stream:
         return self.color if stream == "color" else self.depth

@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 
 from rsgen.array_types import BoolArray, FloatArray, IntArray
-from rsgen.config.objects import ObjectConfig, ShapeConfig
+from rsgen.config.motion import ObjectConfig, ShapeConfig
 from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
 from rsgen.formats import scene_reader

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rsgen.array_types import ByteArray, Float32Array
-from rsgen.config.adaptation import AutoExposureConfig, AutoWhiteBalanceConfig
+from rsgen.config.cameras import AutoExposureConfig, AutoWhiteBalanceConfig
 
 # Intensity rises with about this power of the light: an error of the intensity in stops, times it, is one of the light.
 _GAMMA = 2.2

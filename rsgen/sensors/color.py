@@ -12,7 +12,7 @@ import numpy as np
 
 from rsgen import srgb
 from rsgen.array_types import ByteArray, Float32Array
-from rsgen.config.sensors import ColorNoiseConfig
+from rsgen.config.cameras import ColorNoiseConfig
 from rsgen.sensors.adaptation import Setting
 from rsgen.sensors.response import power_law, quantise8, s_curve, to_srgb8
 

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from rsgen.array_types import BoolArray, Float32Array
-from rsgen.config.sensors import DepthNoiseConfig
+from rsgen.config.cameras import DepthNoiseConfig
 from rsgen.geometry.camera import Camera
 
 # px. A jump of the disparity by this much within three pixels is an edge, e.g. from 2.0 to 2.05 m for a Kinect.

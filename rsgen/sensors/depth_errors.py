@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from rsgen.array_types import Float32Array
-from rsgen.config.sensors import DepthNoiseConfig
+from rsgen.config.cameras import DepthNoiseConfig
 from rsgen.geometry.camera import Camera
 from rsgen.sensors.seed import device_generator
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rsgen.array_types import BoolArray, FloatArray, IntArray
-from rsgen.config.driver import DriverConfig
+from rsgen.config.faults import StreamFaults
 from rsgen.sensors.seed import driver_generator
 from rsgen.sequence.camera_yaml import ColorClock
 from rsgen.sequence.format import StreamName, round_stamps
@@ -29,7 +29,7 @@ class Delivery:
     is_delivered: BoolArray
 
 
-def deliver(stamps: FloatArray, config: DriverConfig | None, seed: int, stream: StreamName) -> Delivery:
+def deliver(stamps: FloatArray, config: StreamFaults | None, seed: int, stream: StreamName) -> Delivery:
     """What the driver makes of frames whose true stamps are `stamps` (n,), s, rising; without a config: all as it is.
 
     listed = ⌈t + (t − t_0) drift + offset + N(0, jitter²)⌉ to the grid, less half a grid's step so that the mean delay
@@ -60,7 +60,7 @@ def deliver(stamps: FloatArray, config: DriverConfig | None, seed: int, stream: 
 
 
 def color_clock(
-    color: DriverConfig | None, depth: DriverConfig | None, color_first: float, depth_first: float, middle: float
+    color: StreamFaults | None, depth: StreamFaults | None, color_first: float, depth_first: float, middle: float
 ) -> ColorClock:
     """What colour's listed stamps need, in the mean, to agree with depth's.
 
@@ -69,7 +69,7 @@ def color_clock(
     """
     if color is None and depth is None:
         return ColorClock()
-    color, depth = color or DriverConfig(), depth or DriverConfig()
+    color, depth = color or StreamFaults(), depth or StreamFaults()
     color_rate, depth_rate = 1.0 + 1e-6 * color.drift_ppm, 1.0 + 1e-6 * depth.drift_ppm
     # What colour's driver lists at `middle` was taken at t, when depth's would have listed `as_depth`.
     t = color_first + (middle - color.offset_s - color_first) / color_rate

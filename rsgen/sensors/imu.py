@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsgen.array_types import FloatArray
+from rsgen.config.faults import ImuFaults
 from rsgen.config.imu import ImuConfig, Vector3
 from rsgen.errors import UserError
 from rsgen.files import atomic_write
@@ -95,17 +96,20 @@ def sample_clock(config: ImuConfig, t_begin: float, t_end: float) -> tuple[float
     return start, math.floor(steps + 1e-6) + 1
 
 
-def simulate_imu(spline: Spline, config: ImuConfig, t_begin: float, t_end: float, seed: int) -> ImuSamples:
+def simulate_imu(
+    spline: Spline, config: ImuConfig, t_begin: float, t_end: float, seed: int, faults: ImuFaults | None = None
+) -> ImuSamples:
     """What the IMU reads from `t_begin` to `t_end` seconds, both within the spline T_world_depth(t).
 
     Sample k is at t_begin + k / rate, to the nanosecond, but for jitter. Random numbers depend on `seed` and k alone,
     so that a longer recording begins with the samples of a shorter one. Raises UserError for times outside the spline
     and absurd counts.
     """
+    faults = faults or ImuFaults()
     start, count = sample_clock(config, t_begin, t_end)
     t = start + np.arange(count) / config.rate_hz
-    if config.jitter_s:
-        t = np.maximum(t + _bounded(count, config.jitter_s, config.rate_hz, _generator(seed, _JITTER)), start)
+    if faults.jitter_s:
+        t = np.maximum(t + _bounded(count, faults.jitter_s, config.rate_hz, _generator(seed, _JITTER)), start)
     t = round_stamps(t)
     t = np.minimum(t, t_end)  # the last one may have been rounded up
     gyro, force = exact_imu(spline, se3.inverse(config.T_depth_imu()), config.gravity, t)
@@ -127,8 +131,8 @@ def simulate_imu(spline: Spline, config: ImuConfig, t_begin: float, t_end: float
     accel = _clip(
         force @ np.array(config.accelerometer_matrix).T + accel_bias + accel_noise, config.accelerometer_range
     )
-    stamps = _stamped(t, start, config, seed)
-    kept = _kept(count, config, seed)
+    stamps = _stamped(t, start, config.rate_hz, faults, seed)
+    kept = _kept(count, faults, seed)
     return ImuSamples(t[kept], gyro[kept], accel[kept], gyro_bias[kept], accel_bias[kept], stamps[kept])
 
 
@@ -171,20 +175,20 @@ def _bounded(count: int, sigma: float, rate_hz: float, rng: np.random.Generator)
     return np.asarray(np.clip(sigma * rng.standard_normal(count), -most, most))
 
 
-def _stamped(t: FloatArray, start: float, config: ImuConfig, seed: int) -> FloatArray:
+def _stamped(t: FloatArray, start: float, rate_hz: float, faults: ImuFaults, seed: int) -> FloatArray:
     """What the unit's own clock says at times t (n,), s; t itself where that is the images' clock."""
-    if not (config.clock_offset_s or config.clock_drift_ppm or config.stamp_error_s):
+    if not (faults.clock_offset_s or faults.clock_drift_ppm or faults.stamp_error_s):
         return t
-    error = _bounded(len(t), config.stamp_error_s, config.rate_hz, _generator(seed, _STAMPS))
-    return round_stamps(t + config.clock_offset_s + 1e-6 * config.clock_drift_ppm * (t - start) + error)
+    error = _bounded(len(t), faults.stamp_error_s, rate_hz, _generator(seed, _STAMPS))
+    return round_stamps(t + faults.clock_offset_s + 1e-6 * faults.clock_drift_ppm * (t - start) + error)
 
 
-def _kept(count: int, config: ImuConfig, seed: int) -> npt.NDArray[np.bool_]:
+def _kept(count: int, faults: ImuFaults, seed: int) -> npt.NDArray[np.bool_]:
     """Which samples (count,) arrive: losses begin anywhere and last for geometrically many."""
     kept = np.ones(count, bool)
-    if config.dropped:
-        begins = _generator(seed, _LOST).random(count) < -math.log1p(-config.dropped) / config.dropped_run
-        runs = _generator(seed, _RUNS).geometric(1.0 / config.dropped_run, count)
+    if faults.dropped:
+        begins = _generator(seed, _LOST).random(count) < -math.log1p(-faults.dropped) / faults.dropped_run
+        runs = _generator(seed, _RUNS).geometric(1.0 / faults.dropped_run, count)
         first = np.flatnonzero(begins)
         changes = np.zeros(count + 1, np.int64)
         np.add.at(changes, first, 1)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from rsgen.array_types import FloatArray
+from rsgen.config.faults import ImuFaults
 from rsgen.config.imu import ImuConfig
 from rsgen.geometry import se3
 from rsgen.sensors.imu import ImuSamples, nanoseconds
@@ -38,14 +39,17 @@ def imu_truth_csv(samples: ImuSamples) -> str:
     return "\n".join([IMU_TRUTH_HEADER, *lines, ""])
 
 
-def imu_truth_yaml(config: ImuConfig, start: float, middle: float, T_image_depth: FloatArray) -> dict[str, Any]:
+def imu_truth_yaml(
+    config: ImuConfig, faults: ImuFaults | None, start: float, middle: float, T_image_depth: FloatArray
+) -> dict[str, Any]:
     """Content of truth/imu.yaml.
 
-    start: true time of the first sample, s, at which config.clock_offset_s holds. middle: the stamp of the middle depth
+    start: true time of the first sample, s, at which faults.clock_offset_s holds. middle: the stamp of the middle depth
     image, s, at which that file's offset does. T_image_depth (4, 4): the depth images' camera, of registered ones.
     """
-    drift = 1e-6 * config.clock_drift_ppm
-    taken = start + (middle - config.clock_offset_s - start) / (1.0 + drift)  # what is stamped `middle`
+    faults = faults or ImuFaults()
+    drift = 1e-6 * faults.clock_drift_ppm
+    taken = start + (middle - faults.clock_offset_s - start) / (1.0 + drift)  # what is stamped `middle`
     T_imu_depth = se3.inverse(config.T_depth_imu()) @ se3.inverse(T_image_depth)
     return {
         **{name: value for name in _SAME if (value := getattr(config, name)) is not None},

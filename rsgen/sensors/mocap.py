@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from rsgen.array_types import FloatArray
-from rsgen.config.mocap import MocapConfig
+from rsgen.config.sections import MocapConfig
 from rsgen.geometry import se3, so3
 from rsgen.geometry.spline import Spline
 from rsgen.sensors.seed import mocap_generator

@@ -30,8 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsgen.array_types import Float32Array, FloatArray
-from rsgen.config.sections import ColorConfig
-from rsgen.config.truth import GlobalTime, TruthConfig
+from rsgen.config.cameras import ColorConfig
+from rsgen.config.sections import GlobalTime, TruthConfig
 from rsgen.device.lens import Lens, contains
 from rsgen.device.pose_table import PoseFunction, PoseTable
 from rsgen.device.projection import MovingCamera, rotated_back

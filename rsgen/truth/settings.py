@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
+from rsgen.config.faults import ImuFaults, split_imu
 from rsgen.config.imu import ImuConfig
-from rsgen.config.mocap import MocapConfig
-from rsgen.config.target import TargetConfig
+from rsgen.config.sections import MocapConfig, TargetConfig
 from rsgen.errors import UserError, first_problem
 from rsgen.sensors.imu import ImuSamples, simulate_imu
 from rsgen.sequence.reader import Sequence
@@ -16,16 +17,25 @@ from rsgen.sequence.reader import Sequence
 SectionT = TypeVar("SectionT", bound=BaseModel)
 
 
-def sequence_imu(sequence: Sequence) -> tuple[ImuConfig, ImuSamples] | None:
-    """The IMU of a sequence and its samples over the whole spline; None where the sequence has none.
+class SequenceImu(NamedTuple):
+    """The IMU of a sequence, its samples over the whole spline, and what is wrong with them."""
+
+    config: ImuConfig
+    samples: ImuSamples
+    faults: ImuFaults
+
+
+def sequence_imu(sequence: Sequence) -> SequenceImu | None:
+    """The IMU of a sequence; None where it has none.
 
     Equal to what imu.csv was written from. Raises UserError if sequence.yaml's config.imu is not one.
     """
-    found = _section(sequence, "imu", ImuConfig)
-    if found is None:
+    found = _section(sequence, "imu", ImuConfig, lambda recorded: split_imu(recorded)[0])
+    wrong = _section(sequence, "imu", ImuFaults, lambda recorded: split_imu(recorded)[1] or {})
+    if found is None or wrong is None:
         return None
-    imu, seed = found
-    return imu, simulate_imu(sequence.spline, imu, sequence.spline.t_begin, sequence.spline.t_end, seed)
+    (imu, seed), (faults, _), spline = found, wrong, sequence.spline
+    return SequenceImu(imu, simulate_imu(spline, imu, spline.t_begin, spline.t_end, seed, faults), faults)
 
 
 def sequence_mocap(sequence: Sequence) -> tuple[MocapConfig, int] | None:
@@ -45,15 +55,20 @@ def sequence_target(sequence: Sequence) -> TargetConfig | None:
     return None if found is None else found[0]
 
 
-def _section(sequence: Sequence, name: str, model: type[SectionT]) -> tuple[SectionT, int] | None:
-    """A section of the config in sequence.yaml, and the seed; None where there is no such section. Raises UserError."""
+def _section(
+    sequence: Sequence, name: str, model: type[SectionT], part: Callable[[dict[str, Any]], Any] = dict
+) -> tuple[SectionT, int] | None:
+    """A section of the config in sequence.yaml, or a part of it, and the seed; None where there is no such section.
+
+    Raises UserError.
+    """
     where = sequence.root / "sequence.yaml"
     config: Any = sequence.meta.get("config")
     data = config.get(name) if isinstance(config, dict) else None
     if data is None:
         return None
     try:
-        section = model.model_validate(data)
+        section = model.model_validate(part(data) if isinstance(data, dict) else data)
     except ValidationError as error:
         problem = first_problem(error, "config", name)
         raise UserError(f"{where}: {problem}: restore the file or render again") from None

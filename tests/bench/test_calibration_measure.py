@@ -104,7 +104,7 @@ def test_each_start_has_its_own_noise_and_errors_are_those_of_what_is_found(
 def test_declared_cameras_are_not_the_truth(tmp_path: Path) -> None:
     stream = {"readout_s": 0.02}
     settings = synthetic.make_config(width=32, height=24, color=stream, depth=stream).model_dump()
-    config = Config.model_validate(settings | {"declared": {"color": {"readout_s": 0.0}}})
+    config = Config.model_validate(settings | {"faults": {"declared": {"color": {"readout_s": 0.0}}}})
     root = synthetic.make_sequence(tmp_path / "seq", config, 4)
     task = make_task(root, "rs-pg")
     assert parameters_of(task.dataset).color_readout_s == 0.0

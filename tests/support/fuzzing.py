@@ -89,15 +89,20 @@ def base_config(motion: dict[str, Any] | None = None) -> dict[str, Any]:
         "scene": {"file": "scene.xml"},
         "light": tiny.QUICK_LIGHT,
         "color": tiny.CAMERA
-        | {"spp": 1, "exposure_s": 0.005, "noise": {"model": "camera"}, "driver": {}}
+        | {"spp": 1, "exposure_s": 0.005, "noise": {"model": "camera"}}
         | {"auto_exposure": {}, "auto_white_balance": {}},
-        "depth": tiny.CAMERA | {"noise": {"model": "kinect"}, "driver": {}},
+        "depth": tiny.CAMERA | {"noise": {"model": "kinect"}},
         "tremor": {},
         "truth": TRUTH,
         "imu": {},
         "mocap": {},
         "target": {"T_world_target": _POSE},
-        "declared": {"color": _SAID, "depth": _SAID | {"depth_scale": 5000.0}, "T_color_depth": _POSE},
+        "faults": {
+            "declared": {"color": _SAID, "depth": _SAID | {"depth_scale": 5000.0}, "T_color_depth": _POSE},
+            "color": {},
+            "depth": {},
+            "imu": {},
+        },
     }
     data |= {"motion": motion} if motion else {"trajectory": {"file": "motion.txt"}}
     every: dict[str, Any] = Config.model_validate(data).model_dump(mode="json")

@@ -6,7 +6,7 @@ from typing import Any
 
 from rendering import RADTAN
 
-from rsgen.config.objects import ObjectConfig
+from rsgen.config.motion import ObjectConfig
 from rsgen.geometry.camera import Camera
 from rsgen.motion.object_paths import object_spline
 

@@ -17,7 +17,7 @@ import tum_recording as tum
 import yaml
 from bench_evaluation import made_up_record
 
-from rsgen.config.truth import TruthConfig
+from rsgen.config.sections import TruthConfig
 from rsgen.files import encode_png
 from rsgen.geometry import se3
 from rsgen.geometry.shutter import Shutter

@@ -9,8 +9,8 @@ import numpy as np
 import synthetic
 from rendering import emission_integrator
 
-from rsgen.config.sections import ColorConfig
-from rsgen.config.truth import TruthConfig
+from rsgen.config.cameras import ColorConfig
+from rsgen.config.sections import TruthConfig
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter

@@ -14,7 +14,8 @@ import yaml
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from rsgen.config.config import Config, describe_fields, load_config, validate_config
+from rsgen.cli.main import main
+from rsgen.config.config import Config, describe_fields, load_config, recorded_config, validate_config
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
@@ -121,7 +122,7 @@ def test_a_motion_or_a_file(tmp_path: Path) -> None:
     made = {key: value for key, value in MINIMAL.items() if key != "trajectory"} | {"motion": motion}
     config = load(tmp_path, made)
     assert config.motion is not None and config.motion.kind == "line" and config.trajectory.file is None
-    again = validate_config(config.content(), "again")  # defaults written out, the scene by its name
+    again = recorded_config(config.content(), "again")  # defaults written out, the scene by its name
     assert again.model_copy(update={"scene": config.scene}) == config and again.scene.file == Path("s.xml")
     refused(tmp_path, MINIMAL | {"motion": motion}, "trajectory.file", "not both")
     refused(tmp_path, made | {"motion": motion | {"kind": "jump"}}, "motion.kind", "'jump'")
@@ -195,7 +196,7 @@ def test_content_is_what_decides_the_bytes(tmp_path: Path) -> None:
 def test_content_loads_again(tmp_path: Path) -> None:
     color = {"model": "fisheye", "distortion": [0, 0, 0, 0]}
     config = load(tmp_path, MINIMAL | {"T_color_depth": ROTATED, "color": color})
-    assert load(tmp_path, config.content()).content() == config.content()
+    assert recorded_config(config.content(), "again").content() == config.content()
 
 
 def test_every_field_is_described() -> None:
@@ -250,7 +251,7 @@ def test_numbers_are_taken_up_to_their_limits(name: str, low: float, high: float
 def test_zero_switches_off_what_else_has_a_least_value() -> None:
     base = fuzzing.with_entry(fuzzing.base_config(), "color.auto_exposure", None)  # it needs an exposure to begin with
     names = ("color.readout_s", "color.exposure_s", "color.noise.gain", "depth.noise.disparity_step_px")
-    for name in (*names, "color.driver.grid_s"):
+    for name in (*names, "faults.color.grid_s"):
         validate_config(fuzzing.with_entry(base, name, 0), "here")
 
 
@@ -377,3 +378,34 @@ def test_a_pixel_that_no_ray_reaches_is_refused(
     tmp_path: Path, stream: str, fields: dict[str, Any], pixel: str
 ) -> None:
     refused(tmp_path, MINIMAL | {stream: fields}, f"{stream}: distortion: no ray reaches pixel {pixel}")
+
+
+# --- former names -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("old", "now"),
+    [
+        ("declared.color.readout_s", "faults.declared"),
+        ("color.driver.jitter_s", "faults.color"),
+        ("depth.driver", "faults.depth"),
+        ("imu.clock_offset_s", "faults.imu.clock_offset_s"),
+    ],
+)
+def test_a_fault_by_its_former_name_is_told_the_new_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, now: str
+) -> None:
+    refused(tmp_path, MINIMAL, f"{'.'.join(old.split('.')[:2]) if 'declared' not in old else 'declared'}: is now {now}",
+            overrides={old: "1"})  # fmt: skip
+    assert main(["render", "demo", f"--{old}", "1"]) == 2
+    assert f"rsgen: --{old}: is now --{now}" in capsys.readouterr().err
+
+
+def test_a_recorded_config_keeps_its_faults_under_their_former_names(tmp_path: Path) -> None:
+    faults = {"color": {"blackouts": [[1.0, 0.5]]}, "imu": {"dropped": 0.0}, "declared": {"depth": {"readout_s": 0.01}}}
+    config = load(tmp_path, MINIMAL | {"imu": {"preset": "phone"}, "faults": faults})
+    content = config.content()
+    assert "faults" not in content and content["color"]["driver"]["blackouts"] and content["depth"]["driver"] is None
+    assert content["imu"]["jitter_s"] == 5e-5 and content["declared"]["depth"]["readout_s"] == 0.01
+    again = recorded_config(content, "again")
+    assert again.content() == content and again.injected.imu == config.injected.imu  # none of the preset's losses

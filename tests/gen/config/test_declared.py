@@ -37,7 +37,7 @@ DECLARED: dict[str, Any] = {
 
 
 def config_with(declared: Any, **sections: Any) -> Config:
-    said = {} if declared is None else {"declared": declared}
+    said = {} if declared is None else {"faults": {"declared": declared}}
     return Config.model_validate(synthetic.make_config(color={"offset_s": 0.004}).model_dump() | said | sections)
 
 
@@ -58,7 +58,7 @@ def test_only_what_is_said_differs(pair: tuple[Path, Path]) -> None:
 
 
 def test_the_renderer_sees_nothing_of_what_is_declared(tmp_path: Path) -> None:
-    declared = {"declared": {"color": {"readout_s": 0.0}, "depth": {"readout_s": 0.05}}}
+    declared = {"faults": {"declared": {"color": {"readout_s": 0.0}, "depth": {"readout_s": 0.05}}}}
     for name, sections in (("honest", {}), ("wrong", declared)):
         config = tiny.write_config(tmp_path, 4, name, **sections)
         assert main(["render", str(config), "--out", str(tmp_path / "out" / name), "--quiet"]) == 0
@@ -106,11 +106,9 @@ def test_a_tracker_gets_what_is_declared_and_the_truth_with_the_true_camera_file
 
 def test_the_truth_has_colours_clock_against_depths(tmp_path: Path) -> None:
     """Colour's listed stamps with the true offset and drift are what depth's driver would have listed."""
-    drivers = {"color": {"offset_s": 0.008, "drift_ppm": 300.0}, "depth": {"offset_s": 0.030, "drift_ppm": -200.0}}
-    config = synthetic.make_config(color={"driver": drivers["color"]}, depth={"driver": drivers["depth"]})
-    root = synthetic.make_sequence(
-        tmp_path / "seq", config_with({}, **config.model_dump(include={"color", "depth"})), 20
-    )
+    clocks = {"color": {"offset_s": 0.008, "drift_ppm": 300.0}, "depth": {"offset_s": 0.030, "drift_ppm": -200.0}}
+    config = config_with(None, faults={"declared": {}, **clocks}, color=synthetic.make_config().color.model_dump())
+    root = synthetic.make_sequence(tmp_path / "seq", config, 20)
     dataset, sequence = open_dataset(root, root / TRUE_CAMERAS), read_sequence(root)
     true = sequence.streams["color"].stamps
     first = sequence.streams["depth"].stamps[0]
@@ -170,7 +168,7 @@ def test_verify_goes_by_the_truth_and_finds_edits(pair: tuple[Path, Path], tmp_p
 def test_a_run_that_declares_something_else_is_another_sequence(pair: tuple[Path, Path]) -> None:
     with pytest.raises(UserError, match="declared"):
         synthetic.open_writer(pair[0], config_with(DECLARED), 4)
-    with pytest.raises(UserError, match=r"declared\.color\.readout_s is 0\.01 there and 0\.011 now"):
+    with pytest.raises(UserError, match=r"faults\.declared\.color\.readout_s is 0\.01 there and 0\.011 now"):
         changed = DECLARED | {"color": DECLARED["color"] | {"readout_s": 0.011}}
         synthetic.open_writer(pair[1], config_with(changed), 4)
 
@@ -178,17 +176,20 @@ def test_a_run_that_declares_something_else_is_another_sequence(pair: tuple[Path
 @pytest.mark.parametrize(
     ("declared", "complaint"),
     [
-        ({"color": {"scan": "left-right"}}, "declared.color.scan: left-right is across the true one, top-bottom"),
-        ({"depth": {"model": "radtan"}}, "declared.depth.* radtan takes 4 or 5 finite distortion coefficients"),
-        ({"color": {"intrinsics": [-5, 5, 1, 1]}}, "declared.color.* fx"),
-        ({"depth": {"depth_scale": 0}}, "declared.depth.*depth_scale: must lie in"),
-        ({"color": {"readout_s": -1}}, "declared.color.readout_s: must be 0 or lie in"),
-        ({"color": {"offset_s": 0.01}}, "declared.color.offset_s: no such field"),
-        ({"color": {"distortion": [float("nan")] * 4, "model": "radtan"}}, "declared.color.*distortion"),
+        (
+            {"color": {"scan": "left-right"}},
+            "faults.declared.color.scan: left-right is across the true one",
+        ),
+        ({"depth": {"model": "radtan"}}, "faults.declared.depth.* radtan takes 4 or 5 finite distortion coefficients"),
+        ({"color": {"intrinsics": [-5, 5, 1, 1]}}, "faults.declared.color.* fx"),
+        ({"depth": {"depth_scale": 0}}, "faults.declared.depth.*depth_scale: must lie in"),
+        ({"color": {"readout_s": -1}}, "faults.declared.color.readout_s: must be 0 or lie in"),
+        ({"color": {"offset_s": 0.01}}, "faults.declared.color.offset_s: no such field"),
+        ({"color": {"distortion": [float("nan")] * 4, "model": "radtan"}}, "faults.declared.color.*distortion"),
     ],
 )
 def test_impossible_cameras_are_refused_in_one_line(declared: Any, complaint: str, tmp_path: Path) -> None:
-    config = tiny.write_config(tmp_path, 2, declared=declared)
+    config = tiny.write_config(tmp_path, 2, faults={"declared": declared})
     with pytest.raises(UserError, match=complaint) as error:
         load_config(config)
     assert "\n" not in str(error.value)

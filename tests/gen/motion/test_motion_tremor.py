@@ -10,7 +10,7 @@ import tiny
 from pydantic import ValidationError
 
 from rsgen.cli.main import main
-from rsgen.config.config import load_config, validate_config
+from rsgen.config.config import load_config, recorded_config, validate_config
 from rsgen.config.motion import TremorConfig
 from rsgen.errors import UserError
 from rsgen.geometry import se3
@@ -81,7 +81,7 @@ def test_configs_of_real_motions_stand_upright_and_check_their_way(name: str) ->
     T = np.array(config.trajectory.T_world_file)
     assert T[1, :3].tolist() == [0, 0, 1] and np.linalg.det(T[:3, :3]) == pytest.approx(1)  # their z is our y
     assert config.preset == "kinect_v1" and config.trajectory.clearance_m == 0.3
-    assert config.color.driver is not None and config.color.auto_exposure is not None and config.depth.registered
+    assert config.injected.color is not None and config.color.auto_exposure is not None and config.depth.registered
 
 
 # --- the preset
@@ -90,13 +90,15 @@ BASE = {"name": "a", "trajectory": {"file": "x.txt"}, "scene": {"file": "y.xml"}
 
 
 def test_the_preset_fills_in_what_is_not_said() -> None:
-    config = validate_config(BASE | {"preset": "kinect_v1", "color": {"spp": 3, "driver": {"grid_s": 0.0}}}, "here")
-    color, depth = config.color, config.depth
-    assert color.spp == 3 and color.driver is not None and color.driver.grid_s == 0
-    assert color.driver.offset_s != 0 and color.auto_exposure and color.auto_white_balance and config.tremor
-    assert depth.registered and depth.blur_samples > 1 and depth.driver and depth.noise.model == "kinect"
+    config = validate_config(
+        BASE | {"preset": "kinect_v1", "color": {"spp": 3}, "faults": {"color": {"grid_s": 0.0}}}, "here"
+    )
+    color, depth, faults = config.color, config.depth, config.injected
+    assert color.spp == 3 and faults.color is not None and faults.color.grid_s == 0
+    assert faults.color.offset_s != 0 and color.auto_exposure and color.auto_white_balance and config.tremor
+    assert depth.registered and depth.blur_samples > 1 and faults.depth and depth.noise.model == "kinect"
     assert min(depth.noise.scale_error, depth.noise.distortion_px, depth.noise.pattern_px) > 0
-    assert validate_config(config.content(), "again").content() == config.content()
+    assert recorded_config(config.content(), "again").content() == config.content()
 
 
 def test_null_switches_a_part_of_the_preset_off_and_a_config_without_it_is_plain(tmp_path: Path) -> None:
@@ -104,9 +106,9 @@ def test_null_switches_a_part_of_the_preset_off_and_a_config_without_it_is_plain
     words = {"preset": "kinect_v1", "tremor": "null", "color.auto_exposure": "null", "depth.registered": "false"}
     config = load_config(path, words)
     assert config.tremor is None and config.color.auto_exposure is None and not config.depth.registered
-    assert config.color.driver is not None and config.color.width == tiny.WIDTH
+    assert config.injected.color is not None and config.color.width == tiny.WIDTH
     plain = load_config(path)
-    assert plain.color.driver is None and plain.depth.driver is None and plain.tremor is None
+    assert plain.faults is None and plain.tremor is None
 
 
 def test_an_unknown_preset_is_named() -> None:

@@ -12,8 +12,8 @@ from moving_things import BALL, CAMERA, CIRCLE, SWING, spline_of, thing
 from rendering import emission_integrator, pixel_rays, pixel_times, room_meshes, room_xml
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from rsgen.config.sections import ColorConfig
-from rsgen.config.truth import TruthConfig
+from rsgen.config.cameras import ColorConfig
+from rsgen.config.sections import TruthConfig
 from rsgen.geometry import se3
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.images import DepthRenderer

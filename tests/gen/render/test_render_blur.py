@@ -15,7 +15,7 @@ from rendering import constant_twist, mi
 from scipy import stats
 
 from rsgen.config.config import load_config
-from rsgen.config.truth import TruthConfig
+from rsgen.config.sections import TruthConfig
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter

@@ -11,9 +11,8 @@ from pydantic import ValidationError
 
 from rsgen.check.verify import verify_sequence
 from rsgen.cli.main import main
-from rsgen.config.adaptation import AutoExposureConfig, AutoWhiteBalanceConfig
+from rsgen.config.cameras import AutoExposureConfig, AutoWhiteBalanceConfig, ColorNoiseConfig
 from rsgen.config.config import load_config
-from rsgen.config.sensors import ColorNoiseConfig
 from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
 from rsgen.produce.distribute import RenderJob, SequenceRecipe, engine_versions, render_block

@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 from rendering import SCANS, constant_twist, mi, pixel_rays, pixel_times
 
-from rsgen.config.sensors import DepthNoiseConfig
+from rsgen.config.cameras import DepthNoiseConfig
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter

@@ -12,9 +12,8 @@ from pydantic import ValidationError
 
 from rsgen.check.verify import verify_sequence
 from rsgen.cli.main import main
+from rsgen.config.cameras import DepthConfig, DepthNoiseConfig
 from rsgen.config.config import load_config
-from rsgen.config.sections import DepthConfig
-from rsgen.config.sensors import DepthNoiseConfig
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.produce.frame_source import FrameSource

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from rsgen.check.verify import verify_sequence
 from rsgen.cli.main import main
-from rsgen.config.driver import DriverConfig
+from rsgen.config.faults import StreamFaults
 from rsgen.files import read_png
 from rsgen.sensors.driver import deliver
 from rsgen.sequence.reader import read_sequence
@@ -21,7 +21,7 @@ FRAMES = 24
 
 
 def listed(**settings: float) -> np.ndarray:
-    return deliver(STAMPS, DriverConfig(**settings), 4, "color").listed
+    return deliver(STAMPS, StreamFaults(**settings), 4, "color").listed
 
 
 def test_without_a_driver_all_is_as_it_is() -> None:
@@ -57,7 +57,7 @@ def test_two_images_never_share_a_step_of_the_grid() -> None:
 
 
 def test_losses_and_repetitions_have_their_share_and_show_an_earlier_image() -> None:
-    came = deliver(STAMPS, DriverConfig(dropped=0.1, repeated=0.05), 4, "color")
+    came = deliver(STAMPS, StreamFaults(dropped=0.1, repeated=0.05), 4, "color")
     frames = np.arange(len(STAMPS))
     again = came.is_delivered & (came.shows != frames)
     # Binomial: standard deviations 0.55 % and 0.4 % of 3000.
@@ -69,7 +69,7 @@ def test_losses_and_repetitions_have_their_share_and_show_an_earlier_image() -> 
 
 
 def test_fates_depend_on_seed_stream_and_number_only() -> None:
-    config = DriverConfig(dropped=0.2, jitter_s=0.003)
+    config = StreamFaults(dropped=0.2, jitter_s=0.003)
     whole, part = deliver(STAMPS, config, 4, "color"), deliver(STAMPS[:100], config, 4, "color")
     assert (whole.listed[:100] == part.listed).all() and (whole.is_delivered[:100] == part.is_delivered).all()
     for seed, stream in ((5, "color"), (4, "depth")):
@@ -78,7 +78,7 @@ def test_fates_depend_on_seed_stream_and_number_only() -> None:
 
 def test_nearly_all_lost_is_refused() -> None:
     with pytest.raises(ValidationError, match="together at most"):
-        DriverConfig(dropped=0.5, repeated=0.5)
+        StreamFaults(dropped=0.5, repeated=0.5)
 
 
 # --- whole sequences
@@ -90,8 +90,8 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tiny.write_config(
         tmp_path_factory.mktemp("driver"),
         FRAMES,
-        color={"driver": lossy, "noise": {"model": "camera"}},
-        depth={"driver": lossy | {"drift_ppm": -500.0}},
+        color={"noise": {"model": "camera"}},
+        faults={"color": lossy, "depth": lossy | {"drift_ppm": -500.0}},
         truth={"flow": ["next"]},
     )
 
@@ -136,7 +136,7 @@ def test_flow_leads_to_the_next_image_that_is_listed(whole: Path) -> None:
 
 def test_images_are_those_of_the_same_config_without_a_driver(config: Path, whole: Path, tmp_path: Path) -> None:
     plain = tmp_path / "plain"
-    words = ["--color.driver", "null", "--depth.driver", "null", "--frames", "0:6"]
+    words = ["--faults", "null", "--frames", "0:6"]
     assert main(["render", str(config), "--out", str(plain), "--quiet", *words]) == 0
     lossy, exact = read_sequence(whole), read_sequence(plain)
     assert not (plain / "truth/frames_color.txt").exists()

@@ -7,15 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 from synthetic import make_config, make_sequence, make_spline
-from test_sensors_imu import SILENT, config, hand_held
+from test_sensors_imu import config, hand_held
 
 from rsgen.check.verify import verify_sequence
 from rsgen.cli.main import main
-from rsgen.config.config import load_config
+from rsgen.config.config import Config, load_config
+from rsgen.config.faults import FaultsConfig, ImuFaults, StreamFaults
 from rsgen.config.imu import ImuConfig
-from rsgen.config.imu_presets import _PRESETS
+from rsgen.config.presets import _IMU_FAULTS, _IMU_PRESETS
 from rsgen.geometry import se3
 from rsgen.sensors.driver import deliver
 from rsgen.sensors.imu import exact_imu, imu_csv, simulate_imu
@@ -26,23 +27,30 @@ BEGIN, END = SPLINE.t_begin, SPLINE.t_end
 CLOCK = {"clock_offset_s": 0.0125, "clock_drift_ppm": 80.0}
 
 
+def with_imu(imu: ImuConfig, **faults: float) -> Config:
+    """`synthetic`'s config with an IMU and its faults."""
+    return make_config().model_copy(update={"imu": imu, "faults": FaultsConfig(imu=ImuFaults(**faults))})
+
+
 def test_a_config_that_says_nothing_of_it_stays_what_it_was() -> None:
     before = {
         "rate_hz", "T_imu_depth", "gravity", "gyroscope_noise_density", "gyroscope_random_walk",
         "accelerometer_noise_density", "accelerometer_random_walk", "gyroscope_bias", "accelerometer_bias",
         "gyroscope_matrix", "accelerometer_matrix", "gyroscope_range", "accelerometer_range",
     }  # fmt: skip
-    assert set(ImuConfig().content()) == before and not ImuConfig().has_truth
+    assert set(ImuConfig().content()) == before and not ImuConfig().has_truth(None)
     samples = simulate_imu(SPLINE, ImuConfig(), BEGIN, END, 0)
     np.testing.assert_array_equal(samples.stamps, samples.t)
 
 
-@pytest.mark.parametrize("name", sorted(_PRESETS))
+@pytest.mark.parametrize("name", sorted(_IMU_PRESETS))
 def test_a_preset_fills_in_what_is_not_said_and_reads_back(name: str) -> None:
-    plain, bent = ImuConfig(preset=name), ImuConfig.model_validate({"preset": name, "rate_hz": 333.0, "dropped": 0.0})
-    assert plain.rate_hz == 200.0 and bent.rate_hz == 333.0 and bent.dropped == 0.0
-    assert plain.gyroscope_noise_density == bent.gyroscope_noise_density == _PRESETS[name]["gyroscope_noise_density"]
-    assert plain.gyroscope_range is not None and plain.has_truth
+    plain, bent = ImuConfig(preset=name), ImuConfig.model_validate({"preset": name, "rate_hz": 333.0})
+    assert plain.rate_hz == 200.0 and bent.rate_hz == 333.0
+    assert (
+        plain.gyroscope_noise_density == bent.gyroscope_noise_density == _IMU_PRESETS[name]["gyroscope_noise_density"]
+    )
+    assert plain.gyroscope_range is not None and plain.has_truth(None)
     assert ImuConfig.model_validate(yaml.safe_load(yaml.safe_dump(plain.content()))) == plain
     np.testing.assert_allclose(plain.T_depth_imu() @ np.array(plain.T_imu_depth), np.eye(4), atol=1e-12)
     one, again, other = (simulate_imu(SPLINE, plain, BEGIN, BEGIN + 3.0, seed) for seed in (0, 0, 1))
@@ -69,7 +77,7 @@ def test_biases_warm_up_along_an_exponential() -> None:
 
 
 def test_jittered_samples_are_exact_at_their_own_times() -> None:
-    samples = simulate_imu(SPLINE, config(jitter_s=4e-4), BEGIN, END, 1)
+    samples = simulate_imu(SPLINE, config(), BEGIN, END, 1, ImuFaults(jitter_s=4e-4))
     late = samples.t - (BEGIN + np.arange(len(samples.t)) / 200.0)
     assert 3.5e-4 < late[1:-1].std() < 4.2e-4 and np.abs(late).max() <= 1e-3 + 1e-9  # cut off at 2.5 σ
     assert (np.diff(samples.t) > 0).all() and samples.t[0] >= BEGIN and samples.t[-1] <= END
@@ -81,9 +89,9 @@ def test_jittered_samples_are_exact_at_their_own_times() -> None:
 
 @pytest.mark.parametrize("run", [1.0, 6.0])
 def test_the_part_that_is_lost_and_how_many_in_a_row(run: float) -> None:
-    settings = config(dropped=0.1, dropped_run=run, rate_hz=2000.0)
+    faults = ImuFaults(dropped=0.1, dropped_run=run)
     whole = simulate_imu(SPLINE, config(rate_hz=2000.0), BEGIN, END, 2)
-    samples = simulate_imu(SPLINE, settings, BEGIN, END, 2)
+    samples = simulate_imu(SPLINE, config(rate_hz=2000.0), BEGIN, END, 2, faults)
     index = np.searchsorted(whole.t, samples.t)
     np.testing.assert_array_equal(whole.t[index], samples.t)
     np.testing.assert_array_equal(whole.gyro[index], samples.gyro)  # what is left is as it was
@@ -93,24 +101,24 @@ def test_the_part_that_is_lost_and_how_many_in_a_row(run: float) -> None:
     lengths = gaps[gaps > 1] - 1
     mean = run / (1.0 - 0.1) if run > 1 else 1.0 / 0.9  # runs that meet are one
     assert abs(lengths.mean() - mean) < 5.0 * lengths.std() / np.sqrt(len(lengths)) + 0.2
-    shorter = simulate_imu(SPLINE, settings, BEGIN, BEGIN + 5.0, 2)
+    shorter = simulate_imu(SPLINE, config(rate_hz=2000.0), BEGIN, BEGIN + 5.0, 2, faults)
     np.testing.assert_array_equal(samples.t[: len(shorter.t) - 1], shorter.t[:-1])
 
 
 def test_a_clock_of_its_own_shows_in_stamps_alone() -> None:
     right = simulate_imu(SPLINE, config(), BEGIN, END, 0)
-    wrong = simulate_imu(SPLINE, config(**CLOCK), BEGIN, END, 0)
+    wrong = simulate_imu(SPLINE, config(), BEGIN, END, 0, ImuFaults(**CLOCK))
     np.testing.assert_array_equal(wrong.t, right.t)
     np.testing.assert_array_equal(wrong.gyro, right.gyro)
     np.testing.assert_allclose(wrong.stamps - wrong.t, 0.0125 + 80e-6 * (wrong.t - BEGIN), atol=1e-9)
-    erring = simulate_imu(SPLINE, config(stamp_error_s=3e-4), BEGIN, END, 0)
+    erring = simulate_imu(SPLINE, config(), BEGIN, END, 0, ImuFaults(stamp_error_s=3e-4))
     assert 2.7e-4 < (erring.stamps - erring.t).std() < 3.3e-4 and (np.diff(erring.stamps) > 0).all()
     assert f"\n{round(wrong.stamps[7] * 1e9)}," in imu_csv(wrong)
 
 
 def test_the_sequence_keeps_the_truth_and_the_tracker_reads_it(tmp_path: Path) -> None:
-    imu = ImuConfig.model_validate({"preset": "phone", "dropped": 0.02, **CLOCK})
-    root = make_sequence(tmp_path / "seq", make_config().model_copy(update={"imu": imu}), frames=4)
+    imu = ImuConfig(preset="phone")
+    root = make_sequence(tmp_path / "seq", with_imu(imu, dropped=0.02, **CLOCK), frames=4)
     truth, rows = (np.loadtxt(root / name, delimiter=",") for name in ("truth/imu.csv", "imu.csv"))
     np.testing.assert_array_equal(truth[:, 1], rows[:, 0])
     own, true = open_dataset(root).imu, open_dataset(root, imu_file=root / "truth/imu.yaml").imu
@@ -132,7 +140,7 @@ def test_the_sequence_keeps_the_truth_and_the_tracker_reads_it(tmp_path: Path) -
 
 
 def test_exports_take_the_units_stamps(tmp_path: Path) -> None:
-    root = make_sequence(tmp_path / "seq", make_config().model_copy(update={"imu": config(**CLOCK)}), frames=2)
+    root = make_sequence(tmp_path / "seq", with_imu(config(), **CLOCK), frames=2)
     assert main(["export", "euroc", str(root)]) == 0 and main(["export", "kalibr", str(root)]) == 0
     stamps = np.loadtxt(root / "imu.csv", delimiter=",")[:, 0]
     euroc = np.loadtxt(root / "mav0/imu0/data.csv", delimiter=",")[:, 0]
@@ -144,26 +152,35 @@ def test_exports_take_the_units_stamps(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"preset": "watch"}, {"dropped": 1.0}, {"dropped_run": 0.5}, {"warmup_s": 0.0}, {"jitter_s": -1e-3}]
+    ("section", "wrong"),
+    [
+        (ImuConfig, {"preset": "watch"}),
+        (ImuConfig, {"warmup_s": 0.0}),
+        (ImuFaults, {"dropped": 1.0}),
+        (ImuFaults, {"dropped_run": 0.5}),
+        (ImuFaults, {"jitter_s": -1e-3}),
+    ],
 )
-def test_absurd_settings_are_refused(wrong: dict[str, object]) -> None:
+def test_absurd_settings_are_refused(section: type[BaseModel], wrong: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
-        ImuConfig.model_validate(SILENT | wrong)
+        section.model_validate(wrong)
 
 
 def test_blackouts_lose_all_images_of_their_time_and_nothing_else() -> None:
     stamps = np.arange(90) / 30.0
-    config = make_config(color={"driver": {"blackouts": [[0.5, 0.5], [2.0, 0.25]]}})
-    delivery = deliver(stamps, config.color.driver, 0, "color")
+    faults = FaultsConfig(color=StreamFaults(blackouts=((0.5, 0.5), (2.0, 0.25))), depth=StreamFaults())
+    delivery = deliver(stamps, faults.color, 0, "color")
     dark = ((stamps >= 0.5) & (stamps < 1.0)) | ((stamps >= 2.0) & (stamps < 2.25))
     np.testing.assert_array_equal(delivery.is_delivered, ~dark)
     np.testing.assert_allclose(delivery.listed, stamps, atol=1e-9)
-    assert "blackouts" in config.content()["color"]["driver"]
-    assert "blackouts" not in make_config(color={"driver": {}}).content()["color"]["driver"]
+    content = make_config().model_copy(update={"faults": faults}).content()
+    assert "blackouts" in content["color"]["driver"] and "blackouts" not in content["depth"]["driver"]
 
 
 @pytest.mark.parametrize("name", ["imu_fast", "imu_walls"])
 def test_shipped_configs_have_a_phones_imu(name: str) -> None:
-    imu = load_config(Path(__file__).parents[3] / f"configs/{name}.yaml").imu
+    shipped = load_config(Path(__file__).parents[3] / f"configs/{name}.yaml")
+    imu, faults = shipped.imu, shipped.injected.imu
     assert imu is not None and imu.preset == "phone"
+    assert faults is not None and faults.model_dump(exclude_defaults=True) == _IMU_FAULTS["phone"]
     assert not np.allclose(se3.log(np.array(imu.T_imu_depth)), 0.0)

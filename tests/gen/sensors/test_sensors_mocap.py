@@ -11,7 +11,7 @@ import tiny
 from rsgen.check.verify import verify_sequence
 from rsgen.cli.main import main
 from rsgen.config.config import load_config
-from rsgen.config.mocap import MocapConfig
+from rsgen.config.sections import MocapConfig
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from rendering import CAMERA, SCANS, RayProbe, constant_twist, emission_integrator, pixel_times, room_xml
 from truth_frames import EVERYTHING, NEXT, SPLINE, STAMP, bilinear, motion, render, stream
 
-from rsgen.config.truth import TruthConfig
+from rsgen.config.sections import TruthConfig
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter

@@ -11,6 +11,7 @@ from test_imu_input import swung
 from tum_recording import make_tum
 from util import random_spline
 
+from rsgen.config.faults import ImuFaults
 from rsgen.config.imu import ImuConfig
 from rsgen.errors import UserError
 from rsgen.geometry import se3, so3
@@ -38,13 +39,11 @@ from rstrack.cli.main import main
 from rstrack.data.dataset import Dataset, open_dataset
 
 SCALES = np.array([1.01, 0.995, 1.004])
-CONFIG = ImuConfig.model_validate({
-    "preset": "phone", "clock_offset_s": 0.0125, "clock_drift_ppm": 80.0, "gyroscope_matrix": np.diag(SCALES).tolist(),
-    "dropped": 0.01,
-})  # fmt: skip
+CONFIG = ImuConfig.model_validate({"preset": "phone", "gyroscope_matrix": np.diag(SCALES).tolist()})
+FAULTS = ImuFaults(jitter_s=5e-5, clock_offset_s=0.0125, clock_drift_ppm=80.0, dropped=0.01)
 SECONDS = 12.0
 TRUE = swung(SECONDS)
-SAMPLES = simulate_imu(TRUE, CONFIG, 0.0, SECONDS, seed=1)
+SAMPLES = simulate_imu(TRUE, CONFIG, 0.0, SECONDS, 1, FAULTS)
 
 
 def unit_of(spline: Spline, rng: np.random.Generator) -> Unit:
@@ -196,7 +195,7 @@ def test_what_tells_nothing_is_one_line(dataset: Dataset, tmp_path: Path) -> Non
         calibrate_imu(dataset, Followed(track.spline, ((1.0, 4.0),)))
     with pytest.raises(UserError, match="has no IMU"):
         calibrate_imu(replace(dataset, imu_files=None), track)
-    other = simulate_imu(swung(40.0), CONFIG, 27.0, 27.0 + SECONDS, 0)
+    other = simulate_imu(swung(40.0), CONFIG, 27.0, 27.0 + SECONDS, 0, FAULTS)
     root = make_tum(tmp_path / "other")
     (root / "imu.csv").write_text(imu_csv(replace(other, stamps=SAMPLES.t[0] + other.t - other.t[0])))
     with pytest.raises(UserError, match="does not turn as the track does"):
@@ -215,7 +214,7 @@ def test_turning_about_one_axis_tells_no_axes() -> None:
     twist = np.zeros((len(t), 6))
     twist[:, 4] = np.sin(2.0 * t)
     spline = Spline(se3.exp(twist), 0.0, 0.05)
-    samples = simulate_imu(spline, CONFIG, 0.0, spline.t_end, 0)
+    samples = simulate_imu(spline, CONFIG, 0.0, spline.t_end, 0, FAULTS)
     given = samples.stamps, samples.gyro, samples.accel, 9.80665, np.array([0.0, 9.0]), 4.0
     with pytest.raises(UserError, match="one axis only"):
         begin(Track(spline), (0.0, 9.0), *given)

@@ -21,7 +21,7 @@ from rstrack.metrics.evaluate import evaluate
 
 T = se3.exp(np.array([-0.03, 0.002, 0.001, 0.01, -0.02, 0.005]))
 FRAMES = 40
-DRIVER = {"jitter_s": 0.0015, "grid_s": 0.004, "dropped": 0.05}
+LATE = {"jitter_s": 0.0015, "grid_s": 0.004, "dropped": 0.05}
 SENSOR = {"width": 64, "height": 48, "intrinsics": [52.0, 52.0, 31.5, 23.5], "registered": True}
 
 
@@ -29,8 +29,8 @@ SENSOR = {"width": 64, "height": 48, "intrinsics": [52.0, 52.0, 31.5, 23.5], "re
 def wild(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("wild")
     config = tiny.write_config(
-        folder, FRAMES, color={"spp": 1, "driver": DRIVER | {"offset_s": 0.02}},
-        depth=SENSOR | {"driver": DRIVER | {"offset_s": 0.04, "drift_ppm": 200.0}}, T_color_depth=T.tolist(),
+        folder, FRAMES, color={"spp": 1}, depth=SENSOR, T_color_depth=T.tolist(),
+        faults={"color": LATE | {"offset_s": 0.02}, "depth": LATE | {"offset_s": 0.04, "drift_ppm": 200.0}},
     )  # fmt: skip
     assert main(["render", str(config), "--out", str(folder / "seq"), "--quiet"]) == 0
     return folder / "seq"

@@ -10,6 +10,7 @@ import pytest
 import synthetic
 import yaml
 
+from rsgen.config.faults import FaultsConfig, ImuFaults
 from rsgen.config.imu import ImuConfig
 from rsgen.errors import UserError
 from rsgen.formats.export.folders.kalibr import export_kalibr
@@ -28,8 +29,9 @@ SHIFT_S = 0.013
 def exported(folder: Path, color: dict[str, Any], depth: dict[str, Any]) -> tuple[Sequence, Path]:
     """A sequence with an IMU whose clock is SHIFT_S ahead, and its folder for Kalibr."""
     config = synthetic.make_config(color=color, depth=depth)
-    imu = ImuConfig(T_imu_depth=T_IMU_DEPTH.tolist(), clock_offset_s=SHIFT_S, accelerometer_range=60.0)
-    writer = synthetic.open_writer(folder / "seq", config.model_copy(update={"imu": imu}), 4)
+    imu = ImuConfig(T_imu_depth=T_IMU_DEPTH.tolist(), accelerometer_range=60.0)
+    faults = FaultsConfig(imu=ImuFaults(clock_offset_s=SHIFT_S))
+    writer = synthetic.open_writer(folder / "seq", config.model_copy(update={"imu": imu, "faults": faults}), 4)
     synthetic.write_frames(writer)
     synthetic.write_scene(folder / "seq")
     writer.finish()

@@ -7,6 +7,7 @@ import pytest
 from scipy.interpolate import make_lsq_spline
 
 from rsgen.array_types import FloatArray
+from rsgen.config.faults import ImuFaults
 from rsgen.config.imu import ImuConfig
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
@@ -36,9 +37,9 @@ def swinging(size: FloatArray, hertz: float, seconds: float = 8.0) -> Spline:
 def recording(spline: Spline, noise: ImuNoise = NOISE, gravity: float = 9.80665) -> ImuRecording:
     config = ImuConfig(
         gravity=(0.0, -gravity, 0.0), gyroscope_noise_density=noise.gyro_density, gyroscope_random_walk=0.0,
-        accelerometer_noise_density=noise.accel_density, accelerometer_random_walk=0.0, dropped=1e-3, jitter_s=5e-5,
+        accelerometer_noise_density=noise.accel_density, accelerometer_random_walk=0.0,
     )  # fmt: skip
-    read = simulate_imu(spline, config, spline.t_begin, spline.t_end, 1)
+    read = simulate_imu(spline, config, spline.t_begin, spline.t_end, 1, ImuFaults(dropped=1e-3, jitter_s=5e-5))
     return ImuRecording(read.t, read.gyro, read.accel, noise, np.eye(4), 200.0, gravity)
 
 

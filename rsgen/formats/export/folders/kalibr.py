@@ -18,7 +18,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.aprilgrid import AprilGrid
 from rsgen.sensors.imu import nanoseconds, write_imu_csv
 from rsgen.sequence.reader import Sequence, Stream
-from rsgen.truth.settings import sequence_imu, sequence_target
+from rsgen.truth.settings import SequenceImu, sequence_imu, sequence_target
 
 COLOR_TOPIC, DEPTH_TOPIC, IMU_TOPIC = "/cam0/image_raw", "/cam1/image_raw", "/imu0"
 _MODELS = {"pinhole": "radtan", "radtan": "radtan", "rational": "radtan", "fisheye": "equidistant"}
@@ -35,7 +35,7 @@ def export_kalibr(sequence: Sequence, out: Path, copy: bool = False, progress: P
     by one), and if `out` is there and not empty.
     """
     imu, target = sequence_imu(sequence), sequence_target(sequence)
-    chain = camchain(sequence, imu[0] if imu else None)
+    chain = camchain(sequence, imu)
     new_folder(out)
     atomic_write(out / "camchain.yaml", encode_yaml(chain))
     written, note = ["camchain.yaml"], "" if imu else " (the sequence has no IMU)"
@@ -69,7 +69,7 @@ def target_yaml(grid: AprilGrid) -> dict[str, Any]:
     }
 
 
-def camchain(sequence: Sequence, imu: ImuConfig | None) -> dict[str, Any]:
+def camchain(sequence: Sequence, imu: SequenceImu | None) -> dict[str, Any]:
     """Content of camchain.yaml; with extrinsics and time shift to the IMU where there is one. Raises UserError."""
     color, depth = sequence.streams["color"], sequence.streams["depth"]
     T_depth_color = se3.inverse(sequence.T_color_depth)
@@ -78,10 +78,10 @@ def camchain(sequence: Sequence, imu: ImuConfig | None) -> dict[str, Any]:
         "cam1": _camera(depth, DEPTH_TOPIC) | {"cam_overlaps": [0], "T_cn_cnm1": _matrix(T_depth_color)},
     }
     if imu is not None:
-        T_depth_imu = imu.T_depth_imu()
+        T_depth_imu = imu.config.T_depth_imu()
         for name, stream, T_cam_depth in (("cam0", color, sequence.T_color_depth), ("cam1", depth, None)):
             T_cam_imu = T_depth_imu if T_cam_depth is None else T_cam_depth @ T_depth_imu
-            shift = row_clock(stream.name, stream.camera, stream.shutter).first_s + imu.clock_offset_s
+            shift = row_clock(stream.name, stream.camera, stream.shutter).first_s + imu.faults.clock_offset_s
             cameras[name] |= {"T_cam_imu": _matrix(T_cam_imu), "timeshift_cam_imu": shift}
     return cameras
 
