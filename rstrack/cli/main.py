@@ -98,13 +98,13 @@ def import_(
     """Turn a recording of another format into a folder that can be tracked: images, stamps, cameras, truth, IMU."""
     from rsgen.console.progress import ProgressDisplay
     from rstrack.calibration.unknowns.devices import device_named
-    from rstrack.formats.bags.topics import Named
+    from rstrack.formats import open_recording
     from rstrack.formats.folder import check_place, write_folder
-    from rstrack.formats.formats import open_recording
+    from rstrack.formats.recording import ReadOptions
 
     known = None if device is None else device_named(device)
     check_place(out, force)
-    recording = open_recording(file, Named(color, depth, color_info, depth_info), int(confidence))
+    recording = open_recording(file, ReadOptions(color, depth, color_info, depth_info, int(confidence)))
     readout_s = (None, None) if known is None else (known.color.readout_s, known.depth.readout_s)
     with ProgressDisplay(quiet) as progress:
         written = write_folder(recording, out, file=file.name, readout_s=readout_s, force=force, progress=progress)

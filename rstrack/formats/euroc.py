@@ -20,10 +20,11 @@ from rsgen.geometry.camera import Camera
 from rstrack.data.imu.description import body_pose, read_asl_yaml, read_sensor_yaml
 from rstrack.formats.pixels import compressed_color, compressed_depth
 from rstrack.formats.recording import (
-    Inertial,
+    ImuSample,
     Item,
-    Picture,
-    Pose,
+    ReadOptions,
+    RecordedImage,
+    RecordedPose,
     Recording,
     StreamCamera,
     camera_of,
@@ -35,12 +36,12 @@ _MILLIMETRES = 1000.0
 _TRUTH = "state_groundtruth_estimate0"
 
 
-def is_euroc(path: Path) -> bool:
+def matches(path: Path) -> bool:
     """Whether a folder is mav0, or has it."""
     return (_root(path) / "cam0" / "sensor.yaml").is_file()
 
 
-def read_euroc(path: Path) -> Recording:
+def read(path: Path, _: ReadOptions) -> Recording:
     """The cameras of a folder; images are read as asked for. Raises UserError, also where there is no depth."""
     root = _root(path)
     if not (root / "depth0" / "sensor.yaml").is_file():
@@ -66,7 +67,7 @@ def read_euroc(path: Path) -> Recording:
         is_registered=False,
         depth_scale=float(scale),
         items=_items(root, listed, color.camera, depth.camera, T_body["cam0"]),
-        pictures=sum(len(files) for files in listed.values()),
+        images=sum(len(files) for files in listed.values()),
         truth=f"{_TRUTH} of {root}".replace(str(root), root.name),
         is_measured=True,
         source={"color": "cam0", "depth": "depth0"},
@@ -136,12 +137,12 @@ def _items(
     truth, imu = root / _TRUTH / "data.csv", root / "imu0" / "data.csv"
     for row in _rows(truth, 8) if truth.is_file() else ():
         x, y, z, qw, qx, qy, qz = _numbers(truth, row, 7)
-        yield Pose(int(row[0]), pose_of((qx, qy, qz, qw), (x, y, z)) @ T_body_color)
+        yield RecordedPose(int(row[0]), pose_of((qx, qy, qz, qw), (x, y, z)) @ T_body_color)
     for row in _rows(imu, 7) if imu.is_file() else ():
         w1, w2, w3, a1, a2, a3 = _numbers(imu, row, 6)
-        yield Inertial(int(row[0]), (w1, w2, w3), (a1, a2, a3))
+        yield ImuSample(int(row[0]), (w1, w2, w3), (a1, a2, a3))
     for stamp_ns, path in listed["cam0"]:
         data, ending = compressed_color(str(path), read_bytes(path), color)
-        yield Picture("color", stamp_ns, data, ending)
+        yield RecordedImage("color", stamp_ns, data, ending)
     for stamp_ns, path in listed["depth0"]:
-        yield Picture("depth", stamp_ns, compressed_depth(str(path), read_bytes(path), "16UC1", depth))
+        yield RecordedImage("depth", stamp_ns, compressed_depth(str(path), read_bytes(path), "16UC1", depth))

@@ -18,12 +18,12 @@ from rsgen.files import encode_png
 from rsgen.geometry.camera import Camera
 from rstrack.formats.pixels import compressed_color, header_size, units_of_metres
 from rstrack.formats.recording import (
-    FLIP,
+    ARKIT_TRUTH,
     FLOAT_DEPTH_SCALE,
-    TRUTH,
     Item,
-    Picture,
-    Pose,
+    ReadOptions,
+    RecordedImage,
+    RecordedPose,
     Recording,
     StreamCamera,
     intrinsics_items,
@@ -32,6 +32,8 @@ from rstrack.formats.recording import (
     resized,
 )
 
+# T_arkit_camera: coordinates of our camera in ARKit's.
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _NAME = re.compile(r"rgbd/(\d{1,9})\.(jpg|depth|conf)")
 # A file in the zip that unpacks to more is refused: they hold a photograph or 200 kB of depth.
 _MOST_BYTES = 1 << 26
@@ -48,14 +50,16 @@ class _Metadata:
     depth_size: tuple[int, int]
 
 
-def is_r3d(path: Path) -> bool:
-    """Whether a file is a zip."""
+def matches(path: Path) -> bool:
+    """Whether it is a zip file."""
+    if not path.is_file():
+        return False
     with path.open("rb") as file:
         return file.read(4) == b"PK\x03\x04"
 
 
-def read_r3d(path: Path, confidence: int) -> Recording:
-    """The cameras of an .r3d file; frames are read as asked for. confidence: least of depth that is kept, 0 to 2.
+def read(path: Path, options: ReadOptions) -> Recording:
+    """The cameras of an .r3d file; frames are read as asked for.
 
     Nothing is unpacked to the disk. Raises UserError: damaged, or `pyliblzfse` is not installed.
     """
@@ -73,10 +77,10 @@ def read_r3d(path: Path, confidence: int) -> Recording:
         T_color_depth=np.eye(4),
         is_registered=False,
         depth_scale=FLOAT_DEPTH_SCALE,
-        items=_items(path, frames, meta, color, depth, unpack, confidence),
-        pictures=2 * len(frames),
-        truth=TRUTH,
-        source={"confidence": confidence},
+        items=_items(path, frames, meta, color, depth, unpack, options.confidence),
+        images=2 * len(frames),
+        truth=ARKIT_TRUTH,
+        source={"confidence": options.confidence},
     )
 
 
@@ -159,15 +163,15 @@ def _items(
         for k, number in enumerate(frames):
             stamp_ns, where = meta.stamps_ns[k], f"{path}: rgbd/{number}"
             data, ending = compressed_color(f"{where}.jpg", _member(path, archive, f"rgbd/{number}.jpg"), color)
-            yield Picture("color", stamp_ns, data, ending)
+            yield RecordedImage("color", stamp_ns, data, ending)
             fx, fy, cx, cy = meta.intrinsics[k].tolist()
             yield from intrinsics_items(stamp_ns, (fx, fy, cx, cy), color, depth)
-            yield Pose(stamp_ns, pose_of(meta.poses[k, :4], meta.poses[k, 4:]) @ FLIP)
+            yield RecordedPose(stamp_ns, pose_of(meta.poses[k, :4], meta.poses[k, 4:]) @ _FLIP)
             z = _floats(f"{where}.depth", _member(path, archive, f"rgbd/{number}.depth"), depth, np.float32, unpack)
             if confidence and f"rgbd/{number}.conf" in names:
                 conf = _floats(f"{where}.conf", _member(path, archive, f"rgbd/{number}.conf"), depth, np.uint8, unpack)
                 z = np.where(conf >= confidence, z, 0.0)
-            yield Picture("depth", stamp_ns, encode_png(units_of_metres(z)))
+            yield RecordedImage("depth", stamp_ns, encode_png(units_of_metres(z)))
 
 
 def _floats(where: str, packed: bytes, camera: Camera, kind: type[np.generic], unpack: Unpack) -> FloatArray:

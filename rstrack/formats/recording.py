@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, get_args
 
 import numpy as np
@@ -20,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
-from rsgen.geometry.camera import Camera
+from rsgen.geometry.camera import Camera, Model
 from rsgen.geometry.shutter import Scan
 from rsgen.sequence.format import StreamName
 from rstrack.data.imu.description import ImuNoise
@@ -32,11 +33,11 @@ Vector3 = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Picture:
+class RecordedImage:
     """One image as a file: PNG or JPEG colour, 16-bit PNG depth.
 
-    stamp_ns: when it was taken, as the recording says; 0 where it does not. arrival_ns: when it was recorded, None
-    where nothing tells. ending: of the file's name.
+    stamp_ns: when it was taken, as the recording states; 0 where it does not. arrival_ns: when it was recorded, None
+    where it is not known. ending: of the file's name.
     """
 
     stream: StreamName
@@ -47,7 +48,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Inertial:
+class ImuSample:
     """A sample of an IMU: gyro rad/s, accel m/s²; None for the one that comes on its own."""
 
     stamp_ns: int
@@ -56,7 +57,7 @@ class Inertial:
 
 
 @dataclass(frozen=True)
-class Pose:
+class RecordedPose:
     """T_world_color (4, 4) at a time."""
 
     stamp_ns: int
@@ -74,7 +75,7 @@ def pose_of(q: npt.ArrayLike, t: npt.ArrayLike) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class Intrinsics:
+class ImageIntrinsics:
     """fx, fy, cx, cy in pixels of a stream's image of a time, where they change from one to the next."""
 
     stamp_ns: int
@@ -82,12 +83,12 @@ class Intrinsics:
     stream: StreamName = "color"
 
 
-Item = Picture | Inertial | Pose | Intrinsics
+Item = RecordedImage | ImuSample | RecordedPose | ImageIntrinsics
 
 
 @dataclass(frozen=True)
 class StreamCamera:
-    """A camera, and of its shutter what the recording says. readout_s: None where it says nothing."""
+    """A camera, and of its shutter what the recording states. readout_s: None where it does not."""
 
     camera: Camera
     readout_s: float | None = None
@@ -99,11 +100,11 @@ class StreamCamera:
 class Recording:
     """A recording that has been opened.
 
-    kind: its format in words. T_color_depth (4, 4): p_color from p_depth; None where nothing tells it. is_registered:
-    depth images have been warped into the colour camera. depth_scale: units per metre. pictures: how many `items` will
+    kind: its format in words. T_color_depth (4, 4): p_color from p_depth; None where it is not known. is_registered:
+    depth images have been warped into the colour camera. depth_scale: units per metre. images: how many `items` will
     give, for the progress. truth: whose poses those among the items are, if any; is_measured: by another instrument,
     not estimated from the same images. notes: what was assumed, a line each. source: what was read of what, for
-    import.json. T_imu_depth (4, 4): p_imu from p of the depth images' camera, and the IMU's noise; None: not told.
+    import.json. T_imu_depth (4, 4): p_imu from p of the depth images' camera, and the IMU's noise; None: not known.
     """
 
     kind: str
@@ -113,7 +114,7 @@ class Recording:
     is_registered: bool
     depth_scale: float
     items: Iterator[Item]
-    pictures: int
+    images: int
     truth: str = ""
     is_measured: bool = False
     notes: tuple[str, ...] = ()
@@ -122,14 +123,37 @@ class Recording:
     imu_noise: ImuNoise | None = None
 
 
+@dataclass(frozen=True)
+class ReadOptions:
+    """What the user states of a recording.
+
+    color, depth, color_info, depth_info: topics of bags; None: to be found. confidence: least of ARKit's depth that is
+    kept, 0 to 2.
+    """
+
+    color: str | None = None
+    depth: str | None = None
+    color_info: str | None = None
+    depth_info: str | None = None
+    confidence: int = 1
+
+    @property
+    def topics(self) -> list[str]:
+        """Those that are named."""
+        return [name for name in (self.color, self.depth, self.color_info, self.depth_info) if name is not None]
+
+
 # Larger than any camera's: a damaged file, which must not decide how much memory is taken.
 _MOST_PIXELS = 1 << 26
-_PINHOLE = ("", "none", "pinhole")
-_RADTAN = ("plumb_bob", "radtan", "radial-tangential", "brown_conrady", "modified_brown_conrady")
-_INVERSE = ("inverse_brown_conrady",)
-_RATIONAL = ("rational_polynomial", "rational")
-_DOUBLE_SPHERE = ("double_sphere", "ds")
-_FISHEYE = ("equidistant", "fisheye", "kannala_brandt", "kannala_brandt4")
+_LENSES: dict[str, Model] = {
+    **dict.fromkeys(("", "none", "pinhole"), "pinhole"),
+    **dict.fromkeys(("plumb_bob", "radtan", "radial-tangential", "brown_conrady", "modified_brown_conrady"), "radtan"),
+    "inverse_brown_conrady": "radtan",
+    **dict.fromkeys(("rational_polynomial", "rational"), "rational"),
+    **dict.fromkeys(("double_sphere", "ds"), "double_sphere"),
+    **dict.fromkeys(("equidistant", "fisheye", "kannala_brandt", "kannala_brandt4"), "fisheye"),
+}
+"""Our models by others' names."""
 
 
 def camera_of(
@@ -143,23 +167,24 @@ def camera_of(
     there is none of.
     """
     d = np.ravel(np.asarray(coefficients, float)).tolist()
-    key = model.strip().lower().replace(" ", "_")
+    lens = _LENSES.get(model.strip().lower().replace(" ", "_"))
     fx, fy, cx, cy = np.ravel(np.asarray(intrinsics, float)).tolist()
+    pinhole = partial(Camera, width, height, fx, fy, cx, cy)
     if width * height > _MOST_PIXELS:
         raise UserError(f"{name}: {width}x{height} pixels are absurd: the file is damaged")
     try:
-        if not any(d) and key not in (*_FISHEYE, *_DOUBLE_SPHERE):
-            return Camera(width, height, fx, fy, cx, cy)
-        if key in _PINHOLE:
+        if not any(d) and lens not in ("fisheye", "double_sphere"):
+            return pinhole()
+        if lens == "pinhole":
             raise UserError(f"distortion {d} without a model")
-        if key in _FISHEYE:
-            return Camera(width, height, fx, fy, cx, cy, "fisheye", tuple((d + [0.0] * 4)[:4]))
-        if key in _DOUBLE_SPHERE and len(d) == 2:
-            return Camera(width, height, fx, fy, cx, cy, "double_sphere", (d[0], d[1]))
-        if key in (*_RADTAN, *_INVERSE, *_RATIONAL) and not any(d[5:]):
-            return Camera(width, height, fx, fy, cx, cy, "radtan", tuple((d + [0.0] * 4)[: 5 if any(d[4:]) else 4]))
-        if key in _RATIONAL and len(d) >= 8 and not any(d[8:]):
-            return Camera(width, height, fx, fy, cx, cy, "rational", tuple(d[:8]))
+        if lens == "fisheye":
+            return pinhole("fisheye", tuple((d + [0.0] * 4)[:4]))
+        if lens == "double_sphere" and len(d) == 2:
+            return pinhole("double_sphere", (d[0], d[1]))
+        if lens in ("radtan", "rational") and not any(d[5:]):
+            return pinhole("radtan", tuple((d + [0.0] * 4)[: 5 if any(d[4:]) else 4]))
+        if lens == "rational" and len(d) >= 8 and not any(d[8:]):
+            return pinhole("rational", tuple(d[:8]))
     except UserError as error:
         raise UserError(f"{name}: {error}") from None
     raise UserError(
@@ -180,10 +205,8 @@ def with_shutter(where: str, camera: Camera, facts: dict[str, Any]) -> StreamCam
     return StreamCamera(camera, float(times[0]), float(times[1]), scan)
 
 
-TRUTH = "ARKit's poses, from the same images and the phone's IMU"
+ARKIT_TRUTH = "ARKit's poses, from the same images and the phone's IMU"
 Four = tuple[float, float, float, float]
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-"""T_arkit_camera: coordinates of our camera in ARKit's."""
 
 
 def median_camera(name: str, size: tuple[int, int], intrinsics: npt.ArrayLike) -> Camera:
@@ -203,7 +226,7 @@ def resized_intrinsics(own: Four, size: tuple[int, int], new: tuple[int, int]) -
     return fx * sx, fy * sy, (cx + 0.5) * sx - 0.5, (cy + 0.5) * sy - 0.5
 
 
-def intrinsics_items(stamp_ns: int, own: Four, color: Camera, depth: Camera) -> tuple[Intrinsics, Intrinsics]:
+def intrinsics_items(stamp_ns: int, own: Four, color: Camera, depth: Camera) -> tuple[ImageIntrinsics, ImageIntrinsics]:
     """Those of the colour image of a time, and what they are for the depth image of that time."""
     beside = resized_intrinsics(own, (color.width, color.height), (depth.width, depth.height))
-    return Intrinsics(stamp_ns, own), Intrinsics(stamp_ns, beside, "depth")
+    return ImageIntrinsics(stamp_ns, own), ImageIntrinsics(stamp_ns, beside, "depth")

@@ -21,7 +21,7 @@ from rsgen.files import encode_png
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rstrack.formats.pixels import compressed_color
-from rstrack.formats.recording import Item, Picture, Pose, Recording, StreamCamera, camera_of
+from rstrack.formats.recording import Item, ReadOptions, RecordedImage, RecordedPose, Recording, StreamCamera, camera_of
 
 _VERSION = 4
 _HEADER = struct.Struct("<64f2i4If")
@@ -44,8 +44,10 @@ class _Head:
     sensor: str
 
 
-def is_sens(path: Path) -> bool:
-    """Whether a file begins as version 4 of the format does."""
+def matches(path: Path) -> bool:
+    """Whether it is a file that begins as version 4 of the format does."""
+    if not path.is_file():
+        return False
     with path.open("rb") as file:
         start = file.read(12)
     return path.suffix == ".sens" or (
@@ -53,7 +55,7 @@ def is_sens(path: Path) -> bool:
     )
 
 
-def read_sens(path: Path) -> Recording:
+def read(path: Path, _: ReadOptions) -> Recording:
     """The cameras of a .sens file, whose frames are all there; they are read as asked for. Raises UserError."""
     with path.open("rb") as file:
         head = _head(path, file)
@@ -67,7 +69,7 @@ def read_sens(path: Path) -> Recording:
         is_registered=False,
         depth_scale=head.depth_scale,
         items=_items(path, head, stamped),
-        pictures=2 * head.frames,
+        images=2 * head.frames,
         truth="BundleFusion's poses, as ScanNet has them",
         notes=notes,
         source={"sensor": head.sensor},
@@ -136,12 +138,12 @@ def _items(path: Path, head: _Head, stamped: bool) -> Iterator[Item]:
             where, most = f"{path}: frame {k}", path.stat().st_size
             if color_bytes:
                 data, ending = compressed_color(where, _take(path, file, color_bytes, most), head.color)
-                yield Picture("color", 1000 * color_us, data, ending)
+                yield RecordedImage("color", 1000 * color_us, data, ending)
                 T = np.array(frame[:16], float).reshape(4, 4)
-                yield Pose(1000 * color_us, _world_color(T, head))
+                yield RecordedPose(1000 * color_us, _world_color(T, head))
             if depth_bytes:
                 png = _depth(where, _take(path, file, depth_bytes, most), head)
-                yield Picture("depth", 1000 * depth_us, png)
+                yield RecordedImage("depth", 1000 * depth_us, png)
 
 
 def _world_color(T_world_depth: FloatArray, head: _Head) -> FloatArray:

@@ -22,11 +22,12 @@ from rsgen.files import encode_png, listed_file, png_fault, read_bytes, read_tex
 from rsgen.geometry.camera import Camera
 from rstrack.formats.pixels import check_size, decode, header_size
 from rstrack.formats.recording import (
-    TRUTH,
-    Inertial,
+    ARKIT_TRUTH,
+    ImuSample,
     Item,
-    Picture,
-    Pose,
+    ReadOptions,
+    RecordedImage,
+    RecordedPose,
     Recording,
     StreamCamera,
     intrinsics_items,
@@ -43,16 +44,13 @@ _POSE, _INTRINSICS = ("x", "y", "z", "qx", "qy", "qz", "qw"), ("fx", "fy", "cx",
 _IMU = ("timestamp", "a_x", "a_y", "a_z", "alpha_x", "alpha_y", "alpha_z")
 
 
-def is_stray_scanner(path: Path) -> bool:
+def matches(path: Path) -> bool:
     """Whether a folder is one of the app's."""
     return (path / "rgb.mp4").is_file() and (path / "odometry.csv").is_file()
 
 
-def read_stray_scanner(path: Path, confidence: int) -> Recording:
-    """The cameras of a folder; images are read as asked for. confidence: least of depth that is kept, 0 to 2.
-
-    Raises UserError, one line.
-    """
+def read(path: Path, options: ReadOptions) -> Recording:
+    """The cameras of a folder; images are read as asked for. Raises UserError, one line."""
     _check_inside(path, ("rgb.mp4", "odometry.csv", "camera_matrix.csv", "imu.csv"))
     rows = _table(path / "odometry.csv", ("timestamp", "frame", *_POSE))
     if not rows:
@@ -69,10 +67,10 @@ def read_stray_scanner(path: Path, confidence: int) -> Recording:
         T_color_depth=np.eye(4),
         is_registered=False,
         depth_scale=_MILLIMETRES,
-        items=_items(path, rows, imu, color, depth, confidence),
-        pictures=2 * len(rows),
-        truth=TRUTH,
-        source={"confidence": confidence},
+        items=_items(path, rows, imu, color, depth, options.confidence),
+        images=2 * len(rows),
+        truth=ARKIT_TRUTH,
+        source={"confidence": options.confidence},
     )
 
 
@@ -161,7 +159,7 @@ def _items(
 ) -> Iterator[Item]:  # fmt: skip
     for sample in imu:
         values = [sample[name] for name in _IMU]
-        yield Inertial(_ns(values[0]), (values[4], values[5], values[6]), (values[1], values[2], values[3]))
+        yield ImuSample(_ns(values[0]), (values[4], values[5], values[6]), (values[1], values[2], values[3]))
     with _Video(path / "rgb.mp4") as video:
         for k, row in enumerate(rows):
             ok, bgr = video.read()
@@ -171,13 +169,13 @@ def _items(
                 return
             check_size(f"{path / 'rgb.mp4'}: frame {k}", (bgr.shape[1], bgr.shape[0]), color)
             stamp_ns = _ns(row["timestamp"])
-            yield Picture("color", stamp_ns, encode_png(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)))
-            yield Pose(stamp_ns, pose_of([row[n] for n in _POSE[3:]], [row[n] for n in _POSE[:3]]))
+            yield RecordedImage("color", stamp_ns, encode_png(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)))
+            yield RecordedPose(stamp_ns, pose_of([row[n] for n in _POSE[3:]], [row[n] for n in _POSE[:3]]))
             if "fx" in row:
                 yield from intrinsics_items(stamp_ns, (row["fx"], row["fy"], row["cx"], row["cy"]), color, depth)
             file = _depth_file(path, row)
             if file.is_file():  # a phone that is busy leaves some out
-                yield Picture("depth", stamp_ns, _depth(path, file, depth, confidence))
+                yield RecordedImage("depth", stamp_ns, _depth(path, file, depth, confidence))
 
 
 def _depth(path: Path, file: Path, camera: Camera, confidence: int) -> bytes:

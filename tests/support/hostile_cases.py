@@ -21,9 +21,9 @@ from rsgen.device.backend import mitsuba
 from rsgen.render.scene import load_scene
 from rsgen.sequence.reader import read_sequence
 from rstrack.data.dataset import open_dataset
-from rstrack.formats.bags.topics import Named
+from rstrack.formats import open_recording
 from rstrack.formats.folder import write_folder
-from rstrack.formats.formats import open_recording
+from rstrack.formats.recording import ReadOptions
 
 CONTENT = recordings.make_content()
 Read = Callable[[Path, Path], object]
@@ -51,7 +51,7 @@ def prepare() -> None:
 
 
 def imported(path: Path, out: Path) -> None:
-    write_folder(open_recording(path, Named(), 1), out, file=path.name)
+    write_folder(open_recording(path, ReadOptions()), out, file=path.name)
     open_dataset(out).readable_frame(0)
 
 

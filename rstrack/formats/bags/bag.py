@@ -48,7 +48,7 @@ class Message:
     where: str
 
 
-class Bag:
+class BagReader:
     """An open bag; see `open_bag`."""
 
     def __init__(self, path: Path, reader: Any, store: Any, is_ros1: bool) -> None:
@@ -101,7 +101,7 @@ def is_bag(path: Path) -> bool:
 
 
 @contextmanager
-def open_bag(path: Path) -> Iterator[Bag]:
+def open_bag(path: Path) -> Iterator[BagReader]:
     """The bag at a path, closed at the end. Raises UserError: damaged, cut short, or `rosbags` is not installed."""
     try:
         from rosbags.rosbag1 import Reader as Reader1
@@ -122,7 +122,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
             bound_unpacking()
         reader.open()
         bound_chunks(reader) if is_ros1 else bound_rows(reader)
-        bag = Bag(path, reader, _standard_types(is_ros1), is_ros1)
+        bag = BagReader(path, reader, _standard_types(is_ros1), is_ros1)
     except Exception as error:
         _close(reader)
         raise _damaged(path, error) from None

@@ -11,23 +11,55 @@ from __future__ import annotations
 import json
 import re
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from rsgen.array_types import FloatArray
+from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.sequence.format import StreamName
-from rstrack.formats.bags.bag import Bag, Message
+from rstrack.formats.bags.bag import BagReader, Message, open_bag
+from rstrack.formats.bags.topics import is_rectified
 from rstrack.formats.pixels import color_png, compressed_color, compressed_depth, depth_png
-from rstrack.formats.recording import Inertial, StreamCamera, with_shutter
+from rstrack.formats.recording import (
+    ImuSample,
+    Item,
+    RecordedImage,
+    StreamCamera,
+    camera_of,
+    pose_of,
+    with_shutter,
+)  # fmt: skip
+
+OwnStamps = Callable[[BagReader, str], Mapping[int, int]]
+"""From a bag and a topic to stamps in ns by the time of recording, where headers do not have them."""
 
 
-def picture_of(message: Message, is_depth: bool, camera: Camera) -> tuple[bytes, str]:
+def items_of(
+    path: Path, images: Mapping[str, tuple[StreamName, Camera]], imu: Sequence[str], own_stamps: OwnStamps | None = None
+) -> Iterator[Item]:
+    """Images and samples of a bag in its order. images: stream and camera by topic. Raises UserError."""
+    with open_bag(path) as bag:
+        stamps = {topic: own_stamps(bag, topic) for topic in (*images, *imu)} if own_stamps else {}
+        for message in bag.messages([*images, *imu]):
+            header = message.content.header.stamp
+            stamp_ns = int(header.sec) * 10**9 + int(header.nanosec)
+            if message.topic in stamps:
+                stamp_ns = stamps[message.topic].get(message.arrival_ns, 0)
+            if message.topic in images:
+                stream, camera = images[message.topic]
+                data, ending = _picture(message, stream == "depth", camera)
+                yield RecordedImage(stream, stamp_ns, data, ending, message.arrival_ns)
+            else:
+                yield _sample(message, stamp_ns)
+
+
+def _picture(message: Message, is_depth: bool, camera: Camera) -> tuple[bytes, str]:
     """The image of a message as a file, and its ending. Raises UserError."""
     content = message.content
     if not hasattr(content, "format"):
@@ -39,22 +71,30 @@ def picture_of(message: Message, is_depth: bool, camera: Camera) -> tuple[bytes,
     return compressed_color(message.where, data, camera)
 
 
-def inertial(message: Message, stamp_ns: int) -> Inertial:
+def _sample(message: Message, stamp_ns: int) -> ImuSample:
     """A sensor_msgs/Imu; of topics of one sensor alone, that one."""
-    values = [
+    gyro, accel = (
         (float(v.x), float(v.y), float(v.z))
         for v in (message.content.angular_velocity, message.content.linear_acceleration)
-    ]
-    name = message.topic.lower()
-    is_gyro, is_accel = "gyro" in name, "accel" in name
-    return Inertial(
-        stamp_ns, None if is_accel and not is_gyro else values[0], None if is_gyro and not is_accel else values[1]
     )
+    is_gyro, is_accel = (word in message.topic.lower() for word in ("gyro", "accel"))
+    return ImuSample(stamp_ns, None if is_accel and not is_gyro else gyro, None if is_gyro and not is_accel else accel)
 
 
-def nanoseconds(stamp: Any) -> int:
-    """A ROS time as one number."""
-    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+def camera_of_info(bag: BagReader, image: str, info: str) -> Camera:
+    """The camera of an image's topic by its camera_info. Raises UserError."""
+    message = bag.first(info)
+    if message is None:
+        raise UserError(f"{bag.path}: {info} has no messages")
+    data = message.content
+    K, D, P = (np.ravel(getattr(data, name if bag.is_ros1 else name.lower())) for name in ("K", "D", "P"))
+    if is_rectified(image) and P[0] > 0:
+        K, D = P[[0, 1, 2, 4, 5, 6, 8, 9, 10]], np.zeros(0)
+    if not K[0] > 0:
+        raise UserError(f"{bag.path}: {info} has no focal length: the camera was not calibrated; write a camera.yaml")
+    return camera_of(
+        f"{bag.path}: {info}", int(data.width), int(data.height), K[[0, 4, 2, 5]], str(data.distortion_model), D
+    )
 
 
 _TF = "tf2_msgs/TFMessage"
@@ -65,16 +105,12 @@ _FIRST_OF_TF = 500
 
 def transform_of(message: Any) -> FloatArray | None:
     """A geometry_msgs/Transform as (4, 4): coordinates of the child in the parent; None if it is no rigid transform."""
-    q = np.array([getattr(message.rotation, axis) for axis in "xyzw"], float)
-    t = np.array([getattr(message.translation, axis) for axis in "xyz"], float)
-    if not (np.isfinite(q).all() and np.isfinite(t).all()) or abs(np.linalg.norm(q) - 1.0) > 1e-2:
-        return None
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.from_quat(q).as_matrix(), t
-    return T
+    q, t = message.rotation, message.translation
+    T = pose_of([getattr(q, axis) for axis in "xyzw"], [getattr(t, axis) for axis in "xyz"])
+    return T if np.isfinite(T).all() else None
 
 
-def between(bag: Bag, target: str, source: str) -> FloatArray | None:
+def between(bag: BagReader, target: str, source: str) -> FloatArray | None:
     """T_target_source (4, 4) of two frames by their names; None where no transforms connect them. Raises UserError."""
     names = [name for name in bag.of_kind(_TF, _OLD_TF) if name.rpartition("/")[2] in ("tf_static", "tf")]
     static = [name for name in names if name.endswith("tf_static")]
@@ -113,10 +149,10 @@ _FIRST = 200
 _LONGEST_NS = 1e9
 
 
-def stated_shutter(bag: Bag, image: str, stream: StreamName, camera: Camera) -> StreamCamera:
-    """The camera of an image's topic with what the bag says of its shutter: of `rsgen export` all, of others the skew.
+def stated_shutter(bag: BagReader, image: str, stream: StreamName, camera: Camera) -> StreamCamera:
+    """The camera of an image's topic with the shutter that the bag states: of `rsgen export` all, of others the skew.
 
-    Raises UserError: what is said of it is no shutter.
+    Raises UserError: what is stated is no shutter.
     """
     for topic in bag.of_kind("std_msgs/String"):
         if topic.endswith("/rolling_shutter") and (message := bag.first(topic)) is not None:
@@ -124,10 +160,10 @@ def stated_shutter(bag: Bag, image: str, stream: StreamName, camera: Camera) -> 
             own = facts.get(stream) if isinstance(facts, dict) else None
             if isinstance(own, dict):
                 return with_shutter(f"{bag.path}: {topic}", camera, own)
-    return StreamCamera(camera, rolling_shutter_skew(bag, image))
+    return StreamCamera(camera, _rolling_shutter_skew(bag, image))
 
 
-def rolling_shutter_skew(bag: Bag, image: str) -> float | None:
+def _rolling_shutter_skew(bag: BagReader, image: str) -> float | None:
     """Seconds that the metadata beside an image's topic state as its readout, None where there is nothing.
 
     The median, where it is stated for several frames. Raises UserError.

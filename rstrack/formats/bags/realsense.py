@@ -15,9 +15,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterator
 from itertools import islice
-from pathlib import Path
 
 import numpy as np
 
@@ -25,10 +23,11 @@ from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
-from rstrack.formats.bags.bag import Bag, Message, open_bag
-from rstrack.formats.bags.messages import inertial, nanoseconds, picture_of, transform_of
-from rstrack.formats.bags.topics import COMPRESSED, IMAGE, IMU, Named, listed
-from rstrack.formats.recording import Item, Picture, Recording, StreamCamera, camera_of
+from rsgen.sequence.format import StreamName
+from rstrack.formats.bags.bag import BagReader
+from rstrack.formats.bags.messages import camera_of_info, items_of, transform_of
+from rstrack.formats.bags.topics import COMPRESSED, IMAGE, IMU, listed
+from rstrack.formats.recording import ReadOptions, Recording, StreamCamera
 
 _DATA = re.compile(
     r"(/device_\d+/sensor_\d+/(Depth|Color|Gyro|Accel)_\d+)/(?:image|imu)/data(?:/compressed|/compressedDepth)?"
@@ -37,21 +36,24 @@ _TF = re.compile(r"/tf/(?:ref_)?(\d+)")
 _DEFAULT_UNIT_M = 0.001
 
 
-def is_realsense(bag: Bag) -> bool:
+def is_realsense(bag: BagReader) -> bool:
     """Whether librealsense wrote it."""
     return any(_DATA.fullmatch(topic) for topic in bag.of_kind(IMAGE, COMPRESSED))
 
 
-def read_realsense(bag: Bag, named: Named) -> Recording:
+def read_bag(bag: BagReader, named: ReadOptions) -> Recording:
     """The recording of one device. Raises UserError, one line."""
     topics = {"color": _topic(bag, "Color", named.color), "depth": _topic(bag, "Depth", named.depth)}
     prefixes = {name: _prefix(topic) for name, topic in topics.items()}
-    color = _camera(bag, prefixes["color"], named.color_info)
-    depth = _camera(bag, prefixes["depth"], named.depth_info)
+    color = _camera(bag, topics["color"], named.color_info)
+    depth = _camera(bag, topics["depth"], named.depth_info)
     from_reference = {name: _from_reference(bag, prefix) for name, prefix in prefixes.items()}
     T = _between(from_reference["color"], from_reference["depth"])
     alone = "the streams' transforms have no common reference: T_color_depth is taken for the identity"
-    images = {topics["color"]: ("color", color), topics["depth"]: ("depth", depth)}
+    images: dict[str, tuple[StreamName, Camera]] = {
+        topics["color"]: ("color", color),
+        topics["depth"]: ("depth", depth),
+    }
     imu = tuple(topic for topic in bag.of_kind(IMU) if _DATA.fullmatch(topic))
     placed = [_between(_from_reference(bag, _prefix(topic)), from_reference["depth"]) for topic in imu]
     device = _text(bag, prefixes["depth"].split("/sensor_")[0] + "/info")
@@ -62,15 +64,15 @@ def read_realsense(bag: Bag, named: Named) -> Recording:
         T_color_depth=T,
         is_registered=False,
         depth_scale=float(f"{1.0 / _unit(bag, topics['depth'], prefixes['depth']):.6g}"),
-        items=_items(bag.path, images, imu),
-        pictures=sum(bag.topics[topic].count for topic in images),
+        items=items_of(bag.path, images, imu, None if bag.is_ros1 else _own_stamps),
+        images=sum(bag.topics[topic].count for topic in images),
         notes=(alone,) if T is None else (),
         source=topics | ({"imu": ", ".join(imu)} if imu else {}) | ({"device": device} if device else {}),
         T_imu_depth=next((T for T in placed if T is not None), None),
     )
 
 
-def _topic(bag: Bag, stream: str, named: str | None) -> str:
+def _topic(bag: BagReader, stream: str, named: str | None) -> str:
     found = [t for t in bag.of_kind(IMAGE, COMPRESSED) if (match := _DATA.fullmatch(t)) and match[2] == stream]
     if named is None:
         if not found:
@@ -87,20 +89,17 @@ def _prefix(topic: str) -> str:
     return match[1]
 
 
-def _camera(bag: Bag, prefix: str, named: str | None) -> Camera:
+def _camera(bag: BagReader, image: str, named: str | None) -> Camera:
+    prefix = _prefix(image)
     for topic in (named,) if named else (f"{prefix}/info/camera_info", f"{prefix}/image/camera_info"):
-        if topic in bag.topics and (message := bag.first(topic)) is not None:
-            data = message.content
-            K, D = (data.K, data.D) if bag.is_ros1 else (data.k, data.d)
-            size, K = (int(data.width), int(data.height)), np.ravel(K)
-            model = str(data.distortion_model)
-            return camera_of(f"{bag.path}: {topic}", *size, K[[0, 4, 2, 5]], model, np.ravel(D))
+        if topic in bag.topics and bag.topics[topic].count:
+            return camera_of_info(bag, image, topic)
     raise UserError(
-        f"{bag.path}: nothing tells the camera of {prefix}: record it again with librealsense 2.10 or newer"
+        f"{bag.path}: nothing states the camera of {prefix}: record it again with librealsense 2.10 or newer"
     )
 
 
-def _from_reference(bag: Bag, prefix: str) -> dict[int, FloatArray]:
+def _from_reference(bag: BagReader, prefix: str) -> dict[int, FloatArray]:
     """T_stream_reference (4, 4) by the number of the reference."""
     found = {}
     for topic in bag.topics:
@@ -135,8 +134,8 @@ def _between(to: dict[int, FloatArray], from_: dict[int, FloatArray]) -> FloatAr
     return to[common[0]] @ se3.inverse(from_[common[0]]) if common else None
 
 
-def _unit(bag: Bag, topic: str, prefix: str) -> float:
-    """Metres of a unit of depth: told by the image, else by the sensor's option, else a millimetre."""
+def _unit(bag: BagReader, topic: str, prefix: str) -> float:
+    """Metres of a unit of depth: stated by the image, else by the sensor's option, else a millimetre."""
     first = bag.first(topic)
     if first is not None and bag.is_ros1 and len(first.rest) >= 4:
         (unit,) = struct.unpack("<f", first.rest[-4:])
@@ -154,8 +153,8 @@ def _unit(bag: Bag, topic: str, prefix: str) -> float:
     return _DEFAULT_UNIT_M
 
 
-def _text(bag: Bag, topic: str) -> str:
-    """The device's name, as far as it is told."""
+def _text(bag: BagReader, topic: str) -> str:
+    """The device's name, as far as it is stated."""
     for message in islice(bag.messages([topic]), 20) if topic in bag.topics else ():
         content = message.content
         if getattr(content, "key", None) == "Name":
@@ -165,27 +164,9 @@ def _text(bag: Bag, topic: str) -> str:
     return ""
 
 
-def _items(path: Path, images: dict[str, tuple[str, Camera]], imu: tuple[str, ...]) -> Iterator[Item]:
-    with open_bag(path) as bag:
-        taken = {} if bag.is_ros1 else {topic: _stamps(bag, _prefix(topic)) for topic in (*images, *imu)}
-        for message in bag.messages([*images, *imu]):
-            stamp_ns = _stamp(message, taken.get(message.topic))
-            if message.topic not in images:
-                yield inertial(message, stamp_ns)
-                continue
-            stream, camera = images[message.topic]
-            data, ending = picture_of(message, stream == "depth", camera)
-            yield Picture("depth" if stream == "depth" else "color", stamp_ns, data, ending, message.arrival_ns)
-
-
-def _stamp(message: Message, taken: dict[int, int] | None) -> int:
-    """When a frame was taken, ns. taken: by the time of its recording, where headers do not tell."""
-    return nanoseconds(message.content.header.stamp) if taken is None else taken.get(message.arrival_ns, 0)
-
-
-def _stamps(bag: Bag, prefix: str) -> dict[int, int]:
-    """Frames' own stamps in ns by the time at which they were recorded, from their metadata."""
-    found = {}
+def _own_stamps(bag: BagReader, data: str) -> dict[int, int]:
+    """Stamps of a topic's frames in ns by the time at which they were recorded, from their metadata."""
+    found, prefix = {}, _prefix(data)
     topics = [topic for topic in bag.topics if topic in (f"{prefix}/image/metadata", f"{prefix}/imu/metadata")]
     for message in bag.messages(topics):
         match = re.search(r"(?:^|;)timestamp=([0-9.]+)(?:;|$)", str(message.content.data))

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 from rsgen.errors import UserError
-from rstrack.formats.bags.bag import Bag
+from rstrack.formats.bags.bag import BagReader
 
 IMAGE, COMPRESSED, INFO, IMU = (
     "sensor_msgs/Image", "sensor_msgs/CompressedImage", "sensor_msgs/CameraInfo", "sensor_msgs/Imu",
@@ -16,16 +15,6 @@ _TRANSPORTS = ("/compressedDepth", "/compressed")
 _NOT_COLOR = ("depth", "infra", "/ir", "confidence", "disparity", "left", "right", "mono", "fisheye", "mask")
 _REGISTERED = ("aligned_depth", "depth_registered", "depth_to_rgb", "depth_to_color", "registered")
 _MOST_NAMED = 12
-
-
-@dataclass(frozen=True)
-class Named:
-    """Topics that the user names; None: to be found."""
-
-    color: str | None = None
-    depth: str | None = None
-    color_info: str | None = None
-    depth_info: str | None = None
 
 
 def base_of(topic: str) -> str:
@@ -43,7 +32,7 @@ def is_rectified(topic: str) -> bool:
     return "rect" in base_of(topic).rpartition("/")[2].lower()
 
 
-def find_color(bag: Bag, named: str | None) -> str:
+def find_color(bag: BagReader, named: str | None) -> str:
     """The topic of the colour images. Raises UserError."""
 
     def rank(topic: str) -> tuple[bool, ...]:
@@ -53,7 +42,7 @@ def find_color(bag: Bag, named: str | None) -> str:
     return _chosen(bag, named, "--color", "colour", _is_color, rank)
 
 
-def find_depth(bag: Bag, named: str | None) -> list[str]:
+def find_depth(bag: BagReader, named: str | None) -> list[str]:
     """Topics of depth images: the sensor's own, or one warped into the colour camera, or both in this order.
 
     Raises UserError.
@@ -71,7 +60,7 @@ def find_depth(bag: Bag, named: str | None) -> list[str]:
     ]
 
 
-def find_info(bag: Bag, image: str, named: str | None, option: str) -> str:
+def find_info(bag: BagReader, image: str, named: str | None, option: str) -> str:
     """The topic of the camera_info that goes with an image's. Raises UserError."""
     known = bag.of_kind(INFO)
     if named is not None:
@@ -88,7 +77,7 @@ def find_info(bag: Bag, image: str, named: str | None, option: str) -> str:
     )
 
 
-def find_imu(bag: Bag) -> tuple[str, ...]:
+def find_imu(bag: BagReader) -> tuple[str, ...]:
     """Topics of the IMU: one that has both, or those of gyro and accelerometer; none where there is no IMU."""
     topics = bag.of_kind(IMU)
     pair = [next((t for t in topics if word in t.lower()), None) for word in ("gyro", "accel")]
@@ -98,7 +87,7 @@ def find_imu(bag: Bag) -> tuple[str, ...]:
     return tuple(t for t in pair if t is not None)
 
 
-def listed(bag: Bag) -> str:
+def listed(bag: BagReader) -> str:
     """The image topics there are, or all topics where there are none."""
     return _some(bag.of_kind(IMAGE, COMPRESSED) or list(bag.topics))
 
@@ -113,7 +102,7 @@ def _is_color(topic: str) -> bool:
 
 
 def _chosen(
-    bag: Bag, named: str | None, option: str, what: str, fits: Callable[[str], bool],
+    bag: BagReader, named: str | None, option: str, what: str, fits: Callable[[str], bool],
     rank: Callable[[str], tuple[bool, ...]],
 ) -> str:  # fmt: skip
     images = bag.of_kind(IMAGE, COMPRESSED)
@@ -128,7 +117,7 @@ def _chosen(
 
 
 def _only(
-    bag: Bag, found: Sequence[str], option: str, what: str, rank: Callable[[str], tuple[bool, ...]]
+    bag: BagReader, found: Sequence[str], option: str, what: str, rank: Callable[[str], tuple[bool, ...]]
 ) -> str:  # fmt: skip
     """The first by rank, of several transports of the same images the plainest. Raises UserError where two tie."""
 

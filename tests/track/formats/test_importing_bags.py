@@ -70,7 +70,7 @@ def test_where_the_imu_sits_comes_along_by_tf(place: Path, capfd: pytest.Capture
     assert np.allclose(T_imu, recordings.T_IMU_DEPTH, atol=1e-6) and "--free imu" not in said
     recordings.write_spoken(place / "none.bag", talker, recordings.speak(talker, CONTENT))
     dataset, said = imported(capfd, "none.bag --force")
-    assert not Path("out/imu.yaml").exists() and "where the IMU sits is not told" in said
+    assert not Path("out/imu.yaml").exists() and "where the IMU sits is not known" in said
 
 
 def test_the_unit_of_depth_is_the_cameras(place: Path, capfd: pytest.CaptureFixture[str]) -> None:

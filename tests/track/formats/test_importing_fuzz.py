@@ -18,9 +18,9 @@ from recordings import Talker
 import rstrack.formats.bags.bag
 from rsgen.errors import UserError
 from rstrack.data.dataset import open_dataset
-from rstrack.formats.bags.topics import Named
+from rstrack.formats import open_recording
 from rstrack.formats.folder import write_folder
-from rstrack.formats.formats import open_recording
+from rstrack.formats.recording import ReadOptions
 
 CONTENT = recordings.make_content()
 # Of a format that keeps images as they are, a flipped byte within one is no matter of the import's.
@@ -74,7 +74,7 @@ def attempt(path: Path, out: Path) -> str:
     """What was said, or nothing if it was imported. Whatever else is raised is the test's failure."""
     before = sorted(path.parent.iterdir())
     try:
-        write_folder(open_recording(path, Named(), 1), out, file=path.name)
+        write_folder(open_recording(path, ReadOptions()), out, file=path.name)
     except UserError as error:
         assert sorted(path.parent.iterdir()) == before, error
         assert ("\n" not in str(error) and str(path) in str(error)) or path.name in str(error)
