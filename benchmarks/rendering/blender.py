@@ -168,7 +168,7 @@ def export_scene(scene: Any) -> tuple[dict[str, NDArray], list[str], list[float]
     """
     import mitsuba as mi
 
-    from rsgen.render.scene import mesh_arrays
+    from rsgen.render.meshes import mesh_arrays
 
     arrays: dict[str, NDArray] = {}
     names: list[str] = []

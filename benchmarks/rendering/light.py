@@ -30,8 +30,8 @@ def light_figures(config: Config, settings: Mapping[str, Any], progress: Progres
     view_camera(config, settings["width"])  # a wrong width would else be told after the bake
     mi = mitsuba(config.backend)
     from rsgen.light.cache import baked_field
-    from rsgen.light.drawing.bulbs import straight_through_bulbs
-    from rsgen.light.estimate import estimated_quality
+    from rsgen.light.lamps import straight_through_bulbs
+    from rsgen.light.quality import estimated_quality
     from rsgen.render.baked import BakedIntegrator
 
     scene = load_scene(config)

@@ -5,7 +5,6 @@ What moves by itself is cast in its own frame, with each ray moved to where the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,44 +20,27 @@ TOLERANCE_M = 1e-4
 REQUIRED_SHARE = 0.999
 
 
-@dataclass(frozen=True)
-class RaycastErrors:
-    """Share of pixels within TOLERANCE_M, of the right object, per frame, and the median difference of all, metres."""
-
-    frames: tuple[int, ...]
-    shares: tuple[float, ...]
-    median_m: float
-
-    @property
-    def ok(self) -> bool:
-        """True if every frame has at least REQUIRED_SHARE of its pixels within TOLERANCE_M."""
-        return min(self.shares) >= REQUIRED_SHARE
-
-    def text(self) -> str:
-        """The figures in one line."""
-        return (
-            f"{len(self.frames)} frames, worst: {100 * min(self.shares):.4f} % of pixels within "
-            f"{1000 * TOLERANCE_M:g} mm, median difference {1e6 * self.median_m:.2f} um"
-        )
-
-
-def raycast_sequence(sequence: Sequence, count: int) -> RaycastErrors:
+def check_raycast(sequence: Sequence, count: int) -> tuple[bool, str]:
     """Cast every pixel of `count` depth frames, spread over the sequence, again on scene.ply and compare.
 
-    Raises UserError if embreex is not installed, or scene.ply or a frame cannot be read.
+    True if in every frame at least REQUIRED_SHARE of the pixels are within TOLERANCE_M and of the right object. Raises
+    UserError if embreex is not installed, or scene.ply or a frame cannot be read.
     """
     casters = [_caster(path) for path in (sequence.root / "scene.ply", *(o.mesh for o in sequence.objects))]
     total = len(sequence.streams["depth"].stamps)
     if count < 1 or total == 0:
         raise UserError(f"{sequence.root}: no depth frames to cast: ask for at least one")
-    frames = tuple(int(k) for k in np.unique(np.linspace(0, total - 1, count).round().astype(int)))
+    frames = np.unique(np.linspace(0, total - 1, count).round().astype(int)).tolist()
     differences, shares = [], []
     for k in frames:
         z, number = _cast(casters, sequence, k)
         differences.append(np.abs(z - sequence.truth_depth(k)))
         right = (differences[-1] <= TOLERANCE_M) & (number == sequence.object_ids("depth", k))
         shares.append(float(np.mean(right)))
-    return RaycastErrors(frames, tuple(shares), float(np.median(differences)))
+    return min(shares) >= REQUIRED_SHARE, (
+        f"{len(frames)} frames, worst: {100 * min(shares):.4f} % of pixels within {1000 * TOLERANCE_M:g} mm, "
+        f"median difference {1e6 * float(np.median(differences)):.2f} um"
+    )
 
 
 def _caster(path: Path) -> Any:

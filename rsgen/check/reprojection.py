@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 
 from rsgen.array_types import BoolArray, FloatArray, IntArray
-from rsgen.check.objects import RelativeMotion
+from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.shutter import project_rolling
+from rsgen.geometry.spline import Spline
 from rsgen.sequence.reader import Sequence
 
 # Depth is interpolated bilinearly in 1/z, exact on planes. Where second differences say that this is off by more, there
@@ -19,8 +22,46 @@ from rsgen.sequence.reader import Sequence
 INTERPOLATION_M = 0.0005
 # A point this much (relative to its depth) behind the surface seen at its place is hidden by that surface.
 OCCLUDED = 0.02
+# Exact depth leaves the interpolation's error: micrometres on planes, tens of them on curved things. Another frame's
+# depth or time leaves millimetres: at a walking pace of 0.5 m/s a frame is 17 mm and mid readout 7 mm.
+MEDIAN_TOLERANCE_M = 0.0002
+INLIER_M = 0.002
+INLIER_SHARE = 0.95
+MINIMUM_PIXELS = 50
+OCCLUDED_SHARE = 0.5
+_SCENE_FRAMES = 5
 _STEP_PX = 4
 _TARGET_PIXELS = 3000  # small images are sampled more densely than every fourth pixel
+
+
+@dataclass(frozen=True, eq=False)
+class RelativeMotion:
+    """T_object_body(t) of a body and a thing along splines; `project_rolling` takes it in the place of a spline."""
+
+    body: Spline
+    thing: Spline
+
+    @property
+    def t_begin(self) -> float:
+        """First time at which both are known, s."""
+        return max(self.body.t_begin, self.thing.t_begin)
+
+    @property
+    def t_end(self) -> float:
+        """Last time at which both are known, s."""
+        return min(self.body.t_end, self.thing.t_end)
+
+    def pose(self, t: FloatArray) -> FloatArray:
+        """T_object_body (..., 4, 4) at times (...,) s."""
+        return np.asarray(se3.inverse(self.thing.pose(t)) @ self.body.pose(t))
+
+    def pose_and_velocity(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """`pose`, and the body's twist (..., 6) against the thing in the body's frame, m/s and rad/s."""
+        T_world_body, w_body = self.body.pose_and_velocity(t)
+        T_world_object, w_object = self.thing.pose_and_velocity(t)
+        T_object_body = se3.inverse(T_world_object) @ T_world_body
+        back = se3.adjoint(se3.inverse(T_object_body))
+        return T_object_body, w_body - np.einsum("...ij,...j->...i", back, w_object)
 
 
 @dataclass(frozen=True)
@@ -35,6 +76,65 @@ class Reprojection:
     number: IntArray
 
 
+def check_reprojection(sequence: Sequence, pairs: int) -> tuple[bool, str]:
+    """The worst pair decides: one frame that does not fit must not drown in nineteen that do."""
+    neighbours = _neighbours(sequence, pairs)
+    if not neighbours:
+        return True, "no two neighbouring depth frames: nothing to compare"
+    sizes, worst, ok = [], (-1.0, ""), True
+    for k, next_k in neighbours:
+        result = reproject_depth(sequence, k, next_k)
+        size = np.abs(result.residual)
+        frame = f"frames {sequence.streams['depth'].indices[k]}-{sequence.streams['depth'].indices[next_k]}"
+        if len(size) < max(MINIMUM_PIXELS, OCCLUDED_SHARE * (len(size) + result.occluded)):
+            return False, f"{frame}: only {len(size)} pixels agree on a surface, {result.occluded} are hidden"
+        median, share = float(np.median(size)), float((size <= INLIER_M).mean())
+        ok &= median <= MEDIAN_TOLERANCE_M and share >= INLIER_SHARE
+        for which in np.unique(result.number[result.number > 0]):  # nor a thing that moves another way
+            part = size[result.number == which]
+            if len(part) >= MINIMUM_PIXELS and not np.median(part) <= INLIER_M:
+                name = sequence.objects[which - 1].name
+                return False, f"{frame}: object {name} is off by {np.median(part) * 1e3:.1f} mm in the median"
+        sizes.append(size)
+        worst = max(worst, (median, f"{frame}: median {median * 1e3:.4f} mm, {share:.2%} within"))
+    size = np.concatenate(sizes)
+    return ok, (
+        f"{len(neighbours)} pairs, {len(size)} pixels: median {np.median(size) * 1e3:.4f} mm, 95 % "
+        f"{np.quantile(size, 0.95) * 1e3:.4f} mm, {(size <= INLIER_M).mean():.2%} within {INLIER_M * 1e3:g} mm; "
+        f"worst {worst[1]}"
+    )
+
+
+def check_scene(sequence: Sequence) -> tuple[bool, str]:
+    """scene.ply is whole, and what a few depth frames show lies within its bounds."""
+    path = sequence.root / "scene.ply"
+    if not path.is_file():
+        raise UserError(f"{path}: is missing")
+    try:
+        mesh = trimesh.load(path, process=False, force="mesh")
+        counts, bounds = (len(mesh.vertices), len(mesh.faces)), np.asarray(mesh.bounds, float)
+        whole = counts == _ply_counts(path) and np.isfinite(mesh.vertices).all() and mesh.faces.max() < counts[0]
+    except Exception as error:  # trimesh raises whatever its parsers run into
+        raise UserError(f"{path}: cannot be read ({type(error).__name__})") from None
+    if not whole:
+        raise UserError(f"{path}: is not a whole mesh: write it again")
+    outside = 0.0
+    for k in np.unique(np.linspace(0, len(sequence.streams["depth"].paths) - 1, _SCENE_FRAMES).round().astype(int)):
+        p_world = depth_points(sequence, int(k))
+        outside = max(outside, float(np.maximum(bounds[0] - p_world, p_world - bounds[1]).max(initial=0.0)))
+    size = " x ".join(f"{length:.2f}" for length in bounds[1] - bounds[0])
+    detail = f"{counts[1]} triangles, {size} m, depth at most {outside * 1e3:.3f} mm outside"
+    return outside <= INLIER_M, detail
+
+
+def _ply_counts(path: Path) -> tuple[int, int]:
+    """Vertices and faces that the header promises."""
+    with path.open("rb") as file:
+        header = file.read(4096).split(b"end_header")[0].decode("ascii", "replace").split()
+    elements = {header[i + 1]: int(header[i + 2]) for i in range(len(header) - 2) if header[i] == "element"}
+    return elements.get("vertex", 0), elements.get("face", 0)
+
+
 def reproject_depth(sequence: Sequence, k: int, next_k: int) -> Reprojection:
     """Compare exact depth of listed frame k with that of frame next_k, every fourth pixel and row by row.
 
@@ -47,7 +147,7 @@ def reproject_depth(sequence: Sequence, k: int, next_k: int) -> Reprojection:
     stream = sequence.streams["depth"]
     stamp = float(stream.stamps[next_k])
     next_z = sequence.truth_depth(next_k).astype(np.float64)
-    seen = _seen(sequence, k)
+    seen = _depth_pixels(sequence, k)
     residuals, numbers, occluded = [np.zeros(0)], [np.zeros(0, np.int64)], 0
     for which in range(len(sequence.objects) + 1):
         here = seen.number == which
@@ -76,12 +176,12 @@ def depth_points(sequence: Sequence, k: int) -> FloatArray:
 
     Without those on things that move by themselves. Raises UserError for unreadable files.
     """
-    seen = _seen(sequence, k)
+    seen = _depth_pixels(sequence, k)
     return seen.p_world[seen.number == 0]
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _DepthPixels:
     """n pixels: points (n, 3) in the world, numbers (n,) of the objects they are on, and their lines' times (n,), s."""
 
     p_world: FloatArray
@@ -89,7 +189,7 @@ class _Seen:
     t: FloatArray
 
 
-def _seen(sequence: Sequence, k: int) -> _Seen:
+def _depth_pixels(sequence: Sequence, k: int) -> _DepthPixels:
     """What every fourth row and column of exact depth k shows."""
     stream = sequence.streams["depth"]
     camera = stream.camera
@@ -98,7 +198,7 @@ def _seen(sequence: Sequence, k: int) -> _Seen:
     uv = camera.pixel_grid()[::step, ::step][z > 0]
     p_world = se3.transform(sequence.pixel_poses("depth", k, uv), camera.backproject(uv, z[z > 0]))
     t = stream.shutter.line_mid_time(float(stream.stamps[k]), stream.shutter.line_of_pixel(uv, camera), camera)
-    return _Seen(p_world, sequence.object_ids("depth", k)[::step, ::step][z > 0].astype(np.int64), np.asarray(t))
+    return _DepthPixels(p_world, sequence.object_ids("depth", k)[::step, ::step][z > 0].astype(np.int64), np.asarray(t))
 
 
 def _interpolate_inverse(z: FloatArray, uv: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -116,3 +216,10 @@ def _interpolate_inverse(z: FloatArray, uv: FloatArray) -> tuple[FloatArray, Boo
     weights = [(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b]
     sum_inverse = sum(weight * inverse[i] for weight, i in zip(weights, at, strict=True))
     return 1 / np.where(holds, sum_inverse, 1.0), holds
+
+
+def _neighbours(sequence: Sequence, pairs: int) -> list[tuple[int, int]]:
+    """Up to `pairs` pairs of consecutive depth frames, spread evenly."""
+    first = np.flatnonzero(np.diff(sequence.streams["depth"].indices) == 1)
+    chosen = np.unique(np.linspace(0, max(len(first) - 1, 0), min(pairs, len(first))).round().astype(int))
+    return [(int(first[i]), int(first[i]) + 1) for i in chosen]

@@ -16,11 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 
 from rsgen.array_types import FloatArray
-from rsgen.check.reprojection import depth_points, reproject_depth
-from rsgen.check.truth import extra_checks
+from rsgen.check.extras import extra_checks
+from rsgen.check.reprojection import check_reprojection, check_scene
 from rsgen.errors import UserError
 from rsgen.files import is_temporary, read_text
 from rsgen.geometry import se3
@@ -42,14 +41,6 @@ from rsgen.truth.settings import sequence_mocap
 # Rows' poses and groundtruth.txt come from the same spline: only the rounding of stamps (5e-10 s) and digits is left.
 POSE_TOLERANCE_M = 1e-7
 POSE_TOLERANCE_RAD = 1e-7
-# Exact depth leaves the interpolation's error: micrometres on planes, tens of them on curved things. Another frame's
-# depth or time leaves millimetres: at a walking pace of 0.5 m/s a frame is 17 mm and mid readout 7 mm.
-MEDIAN_TOLERANCE_M = 0.0002
-INLIER_M = 0.002
-INLIER_SHARE = 0.95
-MINIMUM_PIXELS = 50
-OCCLUDED_SHARE = 0.5
-_SCENE_FRAMES = 5
 
 
 @dataclass(frozen=True)
@@ -101,12 +92,14 @@ def verify_sequence(path: Path, pairs: int = 20, raycast: int = 0) -> Verificati
         ("images", partial(_check_images, sequence)),
         *((f"rows {name}", partial(_check_rows, sequence, name)) for name in STREAMS),
         ("ground truth", partial(_check_ground_truth, sequence)),
-        ("scene", partial(_check_scene, sequence)),
-        ("reprojection", partial(_check_reprojection, sequence, pairs)),
+        ("scene", partial(check_scene, sequence)),
+        ("reprojection", partial(check_reprojection, sequence, pairs)),
     ]
     checks += extra_checks(sequence)
     if raycast:
-        checks.append(("ray casting", partial(_check_raycast, sequence, raycast)))
+        from rsgen.check.raycast import check_raycast
+
+        checks.append(("ray casting", partial(check_raycast, sequence, raycast)))
     return Verification(path, tuple(_run(name, check) for name, check in checks))
 
 
@@ -283,76 +276,3 @@ def _check_ground_truth(sequence: Sequence) -> tuple[bool, str]:
     T = sequence.spline.pose(rows[:, 0]) @ se3.inverse(sequence.T_image_depth)
     ok, detail, _ = _pose_errors(rows[:, 1:], pose_rows(T))
     return ok, f"{len(rows)} poses, against the spline {detail}"
-
-
-def _check_scene(sequence: Sequence) -> tuple[bool, str]:
-    """scene.ply is whole, and what a few depth frames show lies within its bounds."""
-    path = sequence.root / "scene.ply"
-    if not path.is_file():
-        raise UserError(f"{path}: is missing")
-    try:
-        mesh = trimesh.load(path, process=False, force="mesh")
-        counts, bounds = (len(mesh.vertices), len(mesh.faces)), np.asarray(mesh.bounds, float)
-        whole = counts == _ply_counts(path) and np.isfinite(mesh.vertices).all() and mesh.faces.max() < counts[0]
-    except Exception as error:  # trimesh raises whatever its parsers run into
-        raise UserError(f"{path}: cannot be read ({type(error).__name__})") from None
-    if not whole:
-        raise UserError(f"{path}: is not a whole mesh: write it again")
-    outside = 0.0
-    for k in np.unique(np.linspace(0, len(sequence.streams["depth"].paths) - 1, _SCENE_FRAMES).round().astype(int)):
-        p_world = depth_points(sequence, int(k))
-        outside = max(outside, float(np.maximum(bounds[0] - p_world, p_world - bounds[1]).max(initial=0.0)))
-    size = " x ".join(f"{length:.2f}" for length in bounds[1] - bounds[0])
-    detail = f"{counts[1]} triangles, {size} m, depth at most {outside * 1e3:.3f} mm outside"
-    return outside <= INLIER_M, detail
-
-
-def _ply_counts(path: Path) -> tuple[int, int]:
-    """Vertices and faces that the header promises."""
-    with path.open("rb") as file:
-        header = file.read(4096).split(b"end_header")[0].decode("ascii", "replace").split()
-    elements = {header[i + 1]: int(header[i + 2]) for i in range(len(header) - 2) if header[i] == "element"}
-    return elements.get("vertex", 0), elements.get("face", 0)
-
-
-def _neighbours(sequence: Sequence, pairs: int) -> list[tuple[int, int]]:
-    """Up to `pairs` pairs of consecutive depth frames, spread evenly."""
-    first = np.flatnonzero(np.diff(sequence.streams["depth"].indices) == 1)
-    chosen = np.unique(np.linspace(0, max(len(first) - 1, 0), min(pairs, len(first))).round().astype(int))
-    return [(int(first[i]), int(first[i]) + 1) for i in chosen]
-
-
-def _check_reprojection(sequence: Sequence, pairs: int) -> tuple[bool, str]:
-    """The worst pair decides: one frame that does not fit must not drown in nineteen that do."""
-    neighbours = _neighbours(sequence, pairs)
-    if not neighbours:
-        return True, "no two neighbouring depth frames: nothing to compare"
-    sizes, worst, ok = [], (-1.0, ""), True
-    for k, next_k in neighbours:
-        result = reproject_depth(sequence, k, next_k)
-        size = np.abs(result.residual)
-        frame = f"frames {sequence.streams['depth'].indices[k]}-{sequence.streams['depth'].indices[next_k]}"
-        if len(size) < max(MINIMUM_PIXELS, OCCLUDED_SHARE * (len(size) + result.occluded)):
-            return False, f"{frame}: only {len(size)} pixels agree on a surface, {result.occluded} are hidden"
-        median, share = float(np.median(size)), float((size <= INLIER_M).mean())
-        ok &= median <= MEDIAN_TOLERANCE_M and share >= INLIER_SHARE
-        for which in np.unique(result.number[result.number > 0]):  # nor a thing that moves another way
-            part = size[result.number == which]
-            if len(part) >= MINIMUM_PIXELS and not np.median(part) <= INLIER_M:
-                name = sequence.objects[which - 1].name
-                return False, f"{frame}: object {name} is off by {np.median(part) * 1e3:.1f} mm in the median"
-        sizes.append(size)
-        worst = max(worst, (median, f"{frame}: median {median * 1e3:.4f} mm, {share:.2%} within"))
-    size = np.concatenate(sizes)
-    return ok, (
-        f"{len(neighbours)} pairs, {len(size)} pixels: median {np.median(size) * 1e3:.4f} mm, 95 % "
-        f"{np.quantile(size, 0.95) * 1e3:.4f} mm, {(size <= INLIER_M).mean():.2%} within {INLIER_M * 1e3:g} mm; "
-        f"worst {worst[1]}"
-    )
-
-
-def _check_raycast(sequence: Sequence, count: int) -> tuple[bool, str]:
-    from rsgen.check.raycast import raycast_sequence
-
-    report = raycast_sequence(sequence, count)
-    return report.ok, report.text()

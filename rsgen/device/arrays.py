@@ -3,15 +3,21 @@
 The same kernels run on `llvm` (CPU) and `cuda`. Sums over pixels are kept in 32-bit integers (fixed point): integer
 addition does not depend on the order in which threads arrive, so a run gives the same bits every time and the two
 backends differ only by the rounding of single pixels.
+
+Kernels are traced once and replayed (`drjit.freeze`). While Dr.Jit records, it cannot release an array that was made
+from a NumPy array, nor a Mitsuba scene: a destructor throws, and that ends the process ("enqueue_host_func(): this
+function cannot be recorded"). The garbage collector may release objects in reference cycles, such as the locals of a
+traceback, at any moment, so it is off meanwhile.
 """
 
 from __future__ import annotations
 
+import gc
 import importlib
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import cache
-from typing import Any
+from dataclasses import dataclass, field, fields
+from functools import cache, wraps
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +26,7 @@ from rsgen.device.backend import VARIANTS, Backend, select
 
 # Dr.Jit keys recorded kernels on the alignment of the buffers it is handed.
 _ALIGNMENT = 64
+Inputs = TypeVar("Inputs")
 
 
 def aligned(array: npt.ArrayLike, dtype: npt.DTypeLike = np.float32) -> npt.NDArray[Any]:
@@ -92,3 +99,36 @@ def engine(backend: Backend = "auto") -> Engine:
     name = next(key for key, value in VARIANTS.items() if value == variant)
     module = importlib.import_module(f"drjit.{name}")
     return Engine(name, module.Float, module.UInt, module.Int, module.Bool)
+
+
+def recorded_from(inputs: type[Inputs]) -> Callable[[Callable[[Inputs], Any]], Callable[[Inputs], Any]]:
+    """`recorded` for a function whose one argument is a dataclass of Dr.Jit arrays: named, not in an order to remember.
+
+    The arrays are handed over one by one: `drjit.freeze` takes 50 µs to look into a dataclass.
+    """
+    names = [field.name for field in fields(inputs)]  # type: ignore[arg-type]
+
+    def decorate(function: Callable[[Inputs], Any]) -> Callable[[Inputs], Any]:
+        frozen = recorded(lambda *arrays: function(inputs(*arrays)))
+        return lambda given: frozen(*(getattr(given, name) for name in names))
+
+    return decorate
+
+
+def recorded(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function` of Dr.Jit arrays, traced on its first call with arguments of a kind and replayed on the others."""
+    import drjit as dr
+
+    frozen = dr.freeze(function)
+
+    @wraps(function)
+    def call(*args: Any) -> Any:
+        collecting = gc.isenabled()
+        gc.disable()
+        try:
+            return frozen(*args)
+        finally:
+            if collecting:
+                gc.enable()
+
+    return call

@@ -48,13 +48,13 @@ class Projection:
     xn: Any
     yn: Any
 
-    def pull(self, ax: Any, ay: Any) -> Vector:
+    def vjp(self, ax: Any, ay: Any) -> Vector:
         """(ax, ay) times the 2x3 derivative by q."""
         bx = (ax * self._du[0] + ay * self._dv[0]) * self._inv_z
         by = (ax * self._du[1] + ay * self._dv[1]) * self._inv_z
         return bx, by, -(bx * self.xn + by * self.yn)
 
-    def push(self, v: Vector) -> tuple[Any, Any]:
+    def jvp(self, v: Vector) -> tuple[Any, Any]:
         """The 2x3 derivative by q times v."""
         nx, ny = (v[0] - self.xn * v[2]) * self._inv_z, (v[1] - self.yn * v[2]) * self._inv_z
         return self._du[0] * nx + self._du[1] * ny, self._dv[0] * nx + self._dv[1] * ny
@@ -105,7 +105,7 @@ def cross(a: Vector, b: Vector) -> Vector:
 
 
 @dataclass(frozen=True)
-class Sighting:
+class RollingProjection:
     """Where a rolling shutter sees points: projection at the line's time, the line, and how all that moves.
 
     `line` is the continuous line coordinate, `row` the table entry whose pose was used (a line nearby).
@@ -128,11 +128,11 @@ class Sighting:
     def chain(self, ax: Any, ay: Any, az: Any) -> Vector:
         """Total derivative, by a shift of the point in the *base* frame, of a quantity with the derivatives (ax, ay)
         by the pixel and az by the depth q_z; the line's own change of time is included (DESIGN: total derivative)."""
-        bx, by, bz = self.at.pull(ax, ay)
+        bx, by, bz = self.at.vjp(ax, ay)
         bz = bz + az
         if self.lens.lines > 1:
             rate = (ax * self.pixel_speed[0] + ay * self.pixel_speed[1] + az * self.speed[2]) * self.gain
-            lx, ly, lz = self.at.pull(*self.lens.line_gradient)
+            lx, ly, lz = self.at.vjp(*self.lens.line_gradient)
             bx, by, bz = bx + rate * lx, by + rate * ly, bz + rate * lz
         M = self.M
         return (
@@ -142,7 +142,7 @@ class Sighting:
         )
 
 
-def project_rolling(lens: Lens, table: Any, p_base: Vector, UInt: Any, Int: Any) -> Sighting:
+def project_rolling(lens: Lens, table: Any, p_base: Vector, UInt: Any, Int: Any) -> RollingProjection:
     """Solve equation (3) for points of the base frame; `table` holds FROM_BASE floats for each line.
 
     Newton from the middle line with constant velocity, then from the line that this finds (paper, section 3.7), at most
@@ -153,7 +153,7 @@ def project_rolling(lens: Lens, table: Any, p_base: Vector, UInt: Any, Int: Any)
         M = gather(table, UInt(0), 12)
         at = project(lens.camera, move(M, p_base))
         zero = Float(0.0)
-        return Sighting(
+        return RollingProjection(
             at, at.x, at.y, at.q[2], zero, UInt(0), M, (zero, zero, zero), (zero, zero), Float(1.0), at.valid, lens
         )
     last = lens.lines - 1
@@ -169,7 +169,7 @@ def project_rolling(lens: Lens, table: Any, p_base: Vector, UInt: Any, Int: Any)
     valid &= at.valid & (slope < 0.5) & (slope > -2.0)
     x, y = dr.fma(pixel_speed[0], ahead, at.x), dr.fma(pixel_speed[1], ahead, at.y)
     z = dr.fma(speed[2], ahead, at.q[2])
-    return Sighting(at, x, y, z, Float(row) + ahead, row, M, speed, pixel_speed, gain, valid, lens)
+    return RollingProjection(at, x, y, z, Float(row) + ahead, row, M, speed, pixel_speed, gain, valid, lens)
 
 
 def _look(
@@ -179,7 +179,7 @@ def _look(
     at = project(lens.camera, move(M, p_base))
     omega_q = cross((M[15], M[16], M[17]), at.q)
     speed = (-(M[12] + omega_q[0]), -(M[13] + omega_q[1]), -(M[14] + omega_q[2]))
-    pixel_speed = at.push(speed)
+    pixel_speed = at.jvp(speed)
     gx, gy = lens.line_gradient
     return at, M, speed, pixel_speed, gx * pixel_speed[0] + gy * pixel_speed[1]
 

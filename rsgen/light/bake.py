@@ -2,16 +2,16 @@
 
 1. Every lattice point of `irradiance.Lattice` (both sides of each triangle; points that coincide are one) gets direct
    light from each lamp with a stratified set of samples, from the sky and off mirrors as `sky` has it, and off lacquer
-   and brushed metal as `lacquer` has it.
+   and brushed metal as `caustics` has it.
    Where a mesh is finer than the texel, a thinned set of points is computed and the others are interpolated.
 2. Indirect light varies slowly, so it is gathered at a still thinner set, a few texels apart, by cosine-distributed
    rays that look the previous bounce up where they hit, and interpolated in position and normal.
 3. Points that never get any light (buried in another object) are marked as not alive, and how far others count where
-   something stands on their surface (`walls`).
+   something stands on their surface (`barriers`).
 
-How many samples a point gets depends on what their scatter would show as (`rounds`); what is left is smoothed where it
-hides any difference (`denoise`). All randomness is a fixed low-discrepancy sequence rotated by a hash of the point's
-number: a scene bakes to the same bytes each time on one backend.
+How many samples a point gets depends on what their scatter would show as (`sampling`); what is left is smoothed where
+it hides any difference (`interpolation`). All randomness is a fixed low-discrepancy sequence rotated by a hash of the
+point's number: a scene bakes to the same bytes each time on one backend.
 """
 
 from __future__ import annotations
@@ -28,16 +28,14 @@ from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.config.config import LightConfig
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
-from rsgen.light.bounces import Surfaces, light_off_surfaces
-from rsgen.light.drawing.gather import gathering
-from rsgen.light.drawing.lacquer import lacquer_light
-from rsgen.light.drawing.lamps import first_look, lamp_light
-from rsgen.light.drawing.rounds import GREY_SLOPE, PATCH, scatter_of, typical
-from rsgen.light.drawing.sky import has_sky_light, sky_light
-from rsgen.light.drawing.specular import passes_light_on
-from rsgen.light.places.bake_points import Interpolation, sample_points, thin
-from rsgen.light.places.denoise import denoised
-from rsgen.light.places.sampling import CHANNELS
+from rsgen.light.caustics import caustic_light
+from rsgen.light.indirect import Surfaces, gathering, light_off_surfaces
+from rsgen.light.interpolation import Interpolation, denoised, thin
+from rsgen.light.lamps import first_look, lamp_light
+from rsgen.light.sampling import CHANNELS, GREY_SLOPE, PATCH, part_of, standard_error, typical
+from rsgen.light.sky import has_sky_light, sky_light
+from rsgen.light.specular_paths import passes_light_on
+from rsgen.light.surface_points import sample_points
 from rsgen.render.irradiance import Lattice, lattice_area
 
 log = logging.getLogger("rsgen")
@@ -115,14 +113,14 @@ def _direct(
     )
     means += of_lamps
     del of_lamps
-    off_lacquer = lacquer_light(scene, points, fine, area, light.texel_m, light.direct_samples, follow)
+    off_lacquer = caustic_light(scene, points, fine, area, light.texel_m, light.direct_samples, follow)
     seen = means.mean(axis=0) + off_lacquer
     alive = _reached(surfaces, fine, fine_of_point, seen, _reporter(progress, 0.55, 0.05, "finding lit surfaces"))
     if not alive.any():
         raise UserError("the scene is dark: no light reaches any surface; add an emitter or move it into the open")
     fine, patch, means = fine[alive], _renumbered(patch[alive]), means[:, alive]
     noisy = np.flatnonzero(np.hypot(left, left_of_lamps)[alive] > part)
-    direct = denoised(points, fine, means, scatter_of(patch, means), light.texel_m, noisy)
+    direct = denoised(points, fine, means, standard_error(patch, means), light.texel_m, noisy)
     return direct + off_lacquer[alive], alive
 
 
@@ -138,11 +136,8 @@ def _reached(
             break
         field = surfaces.field(total[fine_of_point], everywhere)
         draw = gathering(surfaces.scene, field, surfaces.points, fine[dark])
-
-        def share(f: float, k: int = bounce) -> None:
-            report((k + f) / _FIRST_LOOK_BOUNCES)
-
-        total[dark] = draw(np.arange(len(dark)), 0, _FIRST_LOOK_RAYS, share).sum(axis=0)
+        part = part_of(report, bounce / _FIRST_LOOK_BOUNCES, 1 / _FIRST_LOOK_BOUNCES)
+        total[dark] = draw(np.arange(len(dark)), 0, _FIRST_LOOK_RAYS, part).sum(axis=0)
     return total.max(axis=1) > 0
 
 

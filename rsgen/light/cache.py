@@ -21,9 +21,8 @@ from rsgen.config.config import LightConfig
 from rsgen.console.configs import user_cache
 from rsgen.console.progress import Progress
 from rsgen.light.bake import METHOD, bake
-from rsgen.light.drawing.bulbs import straight_through_bulbs
-from rsgen.light.estimate import estimated_quality
-from rsgen.light.sight import Sight
+from rsgen.light.lamps import straight_through_bulbs
+from rsgen.light.quality import ViewRays, estimated_quality
 from rsgen.render.irradiance import IrradianceField, Lattice, make_field, make_lattice
 
 log = logging.getLogger("rsgen")
@@ -33,7 +32,7 @@ _SIDES = ("front", "back")
 
 def baked_field(
     scene: Any, scene_hash: str, light: LightConfig, cache: Path, progress: Progress,
-    sight: Callable[[], Sight] | None = None,
+    sight: Callable[[], ViewRays] | None = None,
 ) -> IrradianceField:  # fmt: skip
     """The scene's irradiance: from `cache` (a folder) if it was baked with the same inputs before, else baked now.
 

@@ -1,13 +1,18 @@
-"""Look at a sequence: a preview of some frames, and one frame rendered again with a global shutter beside it."""
+"""Pictures of a sequence: a preview of some frames, and one frame rendered again with a global shutter beside it.
+
+The latter is the paper's Figure 3: global shutter, rolling shutter, signed difference.
+"""
 
 from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from rsgen.array_types import ByteArray, Float32Array
 from rsgen.config.config import Config, recorded_config
 from rsgen.console.progress import ProgressDisplay
 from rsgen.errors import UserError
@@ -15,6 +20,10 @@ from rsgen.files import read_yaml
 from rsgen.produce.frame_source import FrameSource, scene_hash, setting_of
 from rsgen.produce.generate import ORIGIN
 from rsgen.sequence.reader import read_sequence
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 log = logging.getLogger("rsgen")
 
@@ -25,7 +34,6 @@ def preview_sequence(path: Path, out: Path | None, count: int) -> Path:
     Raises UserError if the sequence cannot be read or the picture not be written.
     """
     from rsgen.figures import save
-    from rsgen.pictures.figures import preview
 
     sequence = read_sequence(path)
     streams = sequence.streams
@@ -48,7 +56,6 @@ def compare_frame(path: Path, frame: int, out: Path | None, scene: Path | None) 
     longer where it was. Raises UserError.
     """
     from rsgen.figures import save
-    from rsgen.pictures.figures import comparison
 
     sequence = read_sequence(path).as_taken
     color, depth = (sequence.streams[name] for name in ("color", "depth"))
@@ -101,3 +108,61 @@ def _mapping(value: Any) -> dict[str, Any]:
 
 def _span(indices: Any) -> str:
     return f"{min(indices)} to {max(indices)}" if len(indices) else "none: it is empty"
+
+
+def comparison(
+    color: tuple[ByteArray, ByteArray], depth: tuple[Float32Array, Float32Array], title: str
+) -> Figure:  # fmt: skip
+    """Figure 3 of the paper. `color` (h, w, 3) sRGB and `depth` (h, w) metres, each (global, rolling shutter)."""
+    figure, axes = _axes(3, (13.5, 7.2), title)
+    grey = [image.astype(float).mean(axis=-1) for image in color]
+    span = max(float(np.percentile(np.abs(grey[1] - grey[0]), 99.5)), 1.0)
+    for axis, image, name in zip(axes[0], color, ("global shutter", "rolling shutter"), strict=False):
+        axis.imshow(image)
+        axis.set_title(f"colour, {name}")
+    _draw_signed(figure, axes[0, 2], grey[1] - grey[0], span, "rolling − global, grey levels (of 255)")
+    axes[0, 2].set_title("colour, difference")
+
+    measured = [np.where(z > 0, z, np.nan) for z in depth]
+    low, high = np.nanpercentile(measured, [0.5, 99.5]) if np.isfinite(measured).any() else (0.0, 1.0)
+    for axis, z, name in zip(axes[1], measured, ("global shutter", "rolling shutter"), strict=False):
+        axis.imshow(z, cmap="viridis", vmin=low, vmax=high)
+        axis.set_title(f"depth, {name}")
+    figure.colorbar(axes[1, 1].images[0], ax=axes[1, 1], label="planar depth, m", shrink=0.9)
+    difference = 1000 * (measured[1] - measured[0])
+    finite = np.abs(difference[np.isfinite(difference)])
+    # Depth edges jump by whole objects; the scale is set by surfaces.
+    span = max(float(np.percentile(finite, 90)), 0.1) if finite.size else 1.0
+    _draw_signed(figure, axes[1, 2], difference, span, "rolling − global, mm")
+    axes[1, 2].set_title("depth, difference")
+    return figure
+
+
+def preview(color: list[ByteArray], depth: list[Float32Array], title: str) -> Figure:
+    """Frames of a sequence over their depth: images (h, w, 3) sRGB, planar z (h, w) in metres, equally many."""
+    figure, axes = _axes(len(color), (3.9 * len(color) + 0.9, 6.2), title)
+    measured = [np.where(z > 0, z, np.nan) for z in depth]
+    high = max(float(np.nanmax(z)) if np.isfinite(z).any() else 1.0 for z in measured)
+    for k, (image, z) in enumerate(zip(color, measured, strict=True)):
+        axes[0, k].imshow(image)
+        axes[1, k].imshow(z, cmap="viridis", vmin=0, vmax=high)
+    figure.colorbar(axes[1, -1].images[0], ax=axes[1, -1], label="planar depth, m", shrink=0.9)
+    return figure
+
+
+def _axes(columns: int, size: tuple[float, float], title: str) -> tuple[Figure, Any]:
+    """A figure of two rows of axes without ticks."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(2, columns, figsize=size, layout="constrained", squeeze=False)
+    for axis in axes.ravel():
+        axis.set_xticks([])
+        axis.set_yticks([])
+    figure.suptitle(title)
+    return figure, axes
+
+
+def _draw_signed(figure: Figure, axis: Axes, difference: NDArray, span: float, label: str) -> None:
+    drawn = axis.imshow(difference, cmap="RdBu_r", vmin=-span, vmax=span)
+    axis.set_facecolor("0.8")
+    figure.colorbar(drawn, ax=axis, label=label, shrink=0.9)

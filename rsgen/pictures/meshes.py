@@ -69,7 +69,7 @@ class ColoredMesh:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class PinholeView:
     """A pinhole camera and its pose T_world_cam (4, 4): x right, y down, z forward."""
 
     camera: Camera
@@ -152,7 +152,7 @@ def read_mesh(path: Path) -> ColoredMesh:
 
 def frame_meshes(
     meshes: Sequence[ColoredMesh], eye: Point | None, target: Point | None, width: int, height: int
-) -> View:
+) -> PinholeView:
     """The view of `picture_meshes`. From above, it takes in all vertices but strays, and a longer side lies level."""
     focal = 0.5 * height / math.tan(_FIELD_OF_VIEW / 2)
     camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
@@ -167,7 +167,7 @@ def frame_meshes(
         except UserError:
             where = " ".join(f"{x:.4g}" for x in at)
             raise UserError(f"--from: looks straight up or down, or at itself, at {where}: move it or --at") from None
-        return View(camera, T_world_cam)
+        return PinholeView(camera, T_world_cam)
     points = points[((points >= low) & (points <= high)).all(axis=1)]
     horizontal = np.array([0.0, 0.0, 1.0] if high[0] - low[0] >= high[2] - low[2] else [1.0, 0.0, 0.0])
     backward = math.sin(_ABOVE) * np.array([0.0, 1.0, 0.0]) + math.cos(_ABOVE) * horizontal
@@ -179,16 +179,16 @@ def frame_meshes(
     right, left = (x - half * z).max(axis=0), (-x - half * z).max(axis=0)
     z0 = float((-(right + left) / (2 * half)).min())
     T_world_cam[:3, :3], T_world_cam[:3, 3] = R, R @ np.array([*(right - left) / 2, z0])
-    return View(camera, T_world_cam)
+    return PinholeView(camera, T_world_cam)
 
 
-def render_mesh(mesh: ColoredMesh, view: View, reach: float) -> ByteArray:
+def render_mesh(mesh: ColoredMesh, view: PinholeView, reach: float) -> ByteArray:
     """8-bit sRGB picture (h, w, 3) of a mesh on white: every triangle of it, whichever way it faces.
 
     reach: m, within which a surface darkens its neighbours.
     """
     from rsgen.device.backend import mitsuba
-    from rsgen.render.scene import ply_bytes
+    from rsgen.render.meshes import ply_bytes
 
     mi = mitsuba()
     with tempfile.TemporaryDirectory(prefix="rsgen-mesh-") as folder:
@@ -208,7 +208,7 @@ def render_mesh(mesh: ColoredMesh, view: View, reach: float) -> ByteArray:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _launch(scene: Any, colors: Any, view: View, reach: float, first: int, count: int) -> FloatArray:
+def _launch(scene: Any, colors: Any, view: PinholeView, reach: float, first: int, count: int) -> FloatArray:
     """Sum (pixels, 3), linear, of samples first..first+count of every pixel."""
     import drjit as dr
     import mitsuba as mi

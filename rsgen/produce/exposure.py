@@ -28,7 +28,7 @@ def suggested_gain(scene: Any, camera: Camera, T_world_cam: PoseFunction, until_
     """
     import mitsuba as mi
 
-    from rsgen.light.drawing.bulbs import straight_through_bulbs
+    from rsgen.light.lamps import straight_through_bulbs
     from rsgen.render.images import ColorRenderer
 
     path = mi.load_dict({"type": "path", "max_depth": _DEPTH})

@@ -119,7 +119,7 @@ def _chosen(missing: Iterable[int], frames: slice, count: int) -> list[int]:
 
 def scene_triangles(scene: Any) -> FloatArray:
     """Corners (m, 3, 3) of all triangles of a Mitsuba scene, world frame, metres."""
-    from rsgen.render.scene import surface
+    from rsgen.render.meshes import surface
 
     vertices, faces = surface(scene)
     return np.asarray(vertices, float)[faces]
@@ -127,7 +127,7 @@ def scene_triangles(scene: Any) -> FloatArray:
 
 def write_scene_ply(scene: Any, path: Path) -> None:
     """All triangles of the scene, world frame, metres, as binary PLY. Raises UserError if it cannot be written."""
-    from rsgen.render.scene import ply_bytes, surface
+    from rsgen.render.meshes import ply_bytes, surface
 
     vertices, faces = surface(scene)
     atomic_write(path, ply_bytes(vertices, faces))

@@ -304,8 +304,9 @@ def _lit(scene: ShippedScene) -> tuple[int, int]:
 def _room(file: Path) -> Room | None:
     """The largest floor of a built scene with a ceiling over it, as `motion suggest` finds it; without one, of all."""
     from rsgen.motion.floor_plan import find_floors
+    from rsgen.render.meshes import surface
     from rsgen.render.rays import cast_rays
-    from rsgen.render.scene import load_scene, surface
+    from rsgen.render.scene import load_scene
 
     loaded = load_scene(file)
     corners = surface(loaded)[0].astype(np.float64)

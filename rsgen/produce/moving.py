@@ -40,7 +40,7 @@ def load_meshes(config: Config) -> tuple[Any, ...]:
 def lit_objects(scene: Any, field: Any, meshes: Sequence[Any], splines: Sequence[Spline]) -> Any:
     """`MovingObjects` of meshes along splines in a scene whose baked irradiance is `field`."""
     from rsgen.light.probes import gathered_light
-    from rsgen.render.moving import MovingObject, MovingObjects, ObjectLight
+    from rsgen.render.moving_objects import MovingObject, MovingObjects, ObjectLight
 
     things = []
     for mesh, spline in zip(meshes, splines, strict=True):
@@ -91,6 +91,6 @@ def _file_hash(path: Path, name: str) -> str:
 
 def object_mesh_ply(mesh: Any) -> bytes:
     """Triangles of an object in its own frame, m, as binary PLY."""
-    from rsgen.render.ply import ply_bytes
+    from rsgen.render.meshes import ply_bytes
 
     return ply_bytes(mesh.vertices, mesh.faces)

@@ -149,10 +149,10 @@ def suggest_tour(
     camera, no floor, or no scene, and if it is a room in another unit than metres.
     """
     mitsuba()
-    from rsgen.render.land import coarser, inhabited
     from rsgen.render.placement import AS_IT_IS, SceneOptions, camera_up
     from rsgen.render.rays import cast_rays
     from rsgen.render.scene import load_scene
+    from rsgen.render.terrain import coarser, inhabited
 
     placed = {key: value for key, value in (("scale", scale), ("up", up)) if value != getattr(AS_IT_IS, key)}
     if not 1e-9 <= scale <= 1e9:  # as scene.scale

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from rsgen.render.irradiance import IrradianceField
-from rsgen.render.moving import MovingObjects, ShadedField
+from rsgen.render.moving_objects import MovingObjects, ShadedField
 from rsgen.render.rays import proper
 
 _DIFFUSE = int(mi.BSDFFlags.DiffuseReflection) | int(mi.BSDFFlags.DiffuseTransmission)

@@ -7,14 +7,18 @@ between them.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 
 from rsgen.array_types import ByteArray, FloatArray, IntArray
+from rsgen.files import encode_png
 from rsgen.geometry import se3
 from rsgen.geometry.aprilgrid import AprilGrid
+from rsgen.render.meshes import ply_bytes
 
+BOARD_ID = "rsgen_target"  # of its shape in a scene
 _TAG_PX = 100  # ten cells of a tag; a hundredth of a tag is one pixel
 _CELLS, _BORDER_CELLS = 10, 2
 _WHITE, _BLACK = 217, 13  # reflectances of paper and toner, of 255
@@ -62,3 +66,24 @@ def _tag(number: int) -> ByteArray:
     cells = np.rot90(cv2.aruco.generateImageMarker(family, number, _CELLS, borderBits=_BORDER_CELLS), 2)
     scale = _TAG_PX // _CELLS
     return np.where(cells > 0, _WHITE, _BLACK).astype(np.uint8).repeat(scale, axis=0).repeat(scale, axis=1)
+
+
+def board_xml(board: Board, folder: Path) -> str:
+    """A Mitsuba <shape> of the board, matte, its back grey; its files go into `folder`."""
+    (folder / "board.ply").write_bytes(ply_bytes(*surface(board)))
+    (folder / "board.png").write_bytes(encode_png(np.repeat(drawing(board.grid)[..., None], 3, axis=2)))
+    return f"""\
+<shape version="3.0.0" type="ply" id="{BOARD_ID}">
+  <string name="filename" value="{folder / "board.ply"}"/>
+  <bsdf type="twosided">
+    <bsdf type="diffuse">
+      <texture type="bitmap" name="reflectance">
+        <string name="filename" value="{folder / "board.png"}"/>
+        <string name="filter_type" value="nearest"/>
+        <boolean name="raw" value="true"/>
+      </texture>
+    </bsdf>
+    <bsdf type="diffuse"><rgb name="reflectance" value="0.5"/></bsdf>
+  </bsdf>
+</shape>
+"""

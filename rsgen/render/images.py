@@ -17,7 +17,7 @@ from rsgen.device.pose_table import PoseFunction
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.baked import BakedIntegrator
-from rsgen.render.moving import MovingObjects
+from rsgen.render.moving_objects import MovingObjects
 from rsgen.render.sensor import RollingShutterSensor
 
 # Samples in one launch; more are rendered in several and averaged, which bounds memory.

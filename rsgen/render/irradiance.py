@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from rsgen.array_types import Float32Array, IntArray
 from rsgen.device.arrays import aligned, vectors
 from rsgen.errors import UserError
-from rsgen.render.land import coarser, inhabited
-from rsgen.render.scene import mesh_arrays
+from rsgen.render.meshes import mesh_arrays
+from rsgen.render.terrain import coarser, inhabited
 
 REACH_LEVELS = 31  # how far a sample counts towards a neighbour: level / 30 of the way
 FREE = REACH_LEVELS  # and this, beyond the neighbour: nothing stands between

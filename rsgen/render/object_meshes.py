@@ -17,10 +17,8 @@ from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
 from rsgen.formats import scene_reader
 from rsgen.render.material import Material, bsdf
-from rsgen.render.mended import mend_meshes
+from rsgen.render.meshes import joined_triangles, ply_bytes, repair_meshes, surface
 from rsgen.render.placement import SceneOptions
-from rsgen.render.ply import joined_triangles, ply_bytes
-from rsgen.render.scene import surface
 
 _SEGMENTS = 96  # squares around a ball or cylinder, at least
 _MOST_CHECKS = 20_000
@@ -48,7 +46,7 @@ def load_object(thing: ObjectConfig) -> ObjectMesh:
     with tempfile.TemporaryDirectory(prefix="rsgen-object-") as scratch:
         try:
             shapes = _shapes(mi, thing, Path(scratch))
-            scene = mend_meshes(mi, mi.load_dict(shapes, parallel=False, optimize=False), Path(thing.name))
+            scene = repair_meshes(mi, mi.load_dict(shapes, parallel=False, optimize=False), Path(thing.name))
         except UserError as error:
             raise UserError(f"objects.{thing.name}: {str(error).removeprefix('scene ')}") from None
         except Exception as error:  # Mitsuba and trimesh raise whatever their parsers do

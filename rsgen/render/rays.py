@@ -12,6 +12,8 @@ import numpy.typing as npt
 from rsgen.array_types import FloatArray
 from rsgen.device.arrays import rows_of, vectors
 
+RAY_OFFSET_M = 2e-4  # of rays that start on a surface: so far above it
+
 
 def cast_rays(scene: Any, p_world: FloatArray, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Distance (n,) in metres from points (n, 3) along unit directions (n, 3), world frame, and normals (n, 3) there.

@@ -18,28 +18,20 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from rsgen.array_types import Float32Array
 from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
-from rsgen.files import encode_png
 from rsgen.formats import scene_reader, xml_helper
 from rsgen.inputs import check_input
-from rsgen.render.board import Board, drawing
-from rsgen.render.board import surface as board_surface
+from rsgen.render.board import BOARD_ID, Board, board_xml
 from rsgen.render.file_names import tell_renamed
-from rsgen.render.land import split_land
-from rsgen.render.mended import mend_meshes
+from rsgen.render.meshes import repair_meshes
 from rsgen.render.placement import AS_IT_IS, SceneOptions, place, place_lamps
-from rsgen.render.ply import joined_triangles, ply_bytes
+from rsgen.render.terrain import split_terrain
 from rsgen.render.xml_scene import Parsed, check_files, explained, messages_to_log, parse, prepare, unknown_properties
 from rsgen.render.xml_shapes import ANALYTIC, tessellated, turn_mirrored
 
 log = logging.getLogger("rsgen")
 
-_BOARD = "rsgen_target"
 _UNSUPPORTED = ("sdfgrid", "bsplinecurve", "linearcurve", "ellipsoids", "ellipsoidsmesh")
 
 
@@ -58,7 +50,7 @@ def load_scene(path: Path, board: Board | None = None, options: SceneOptions = A
             else:
                 shapes = scene_reader(path.suffix).scene_dict(mi, path, Path(scratch), options)
                 if board is not None:
-                    shapes["target"] = mi.load_string(_board_xml(board, Path(scratch)))
+                    shapes["target"] = mi.load_string(board_xml(board, Path(scratch)))
                 # Else shapes would be merged, and ordered by memory address.
                 scene = mi.load_dict(shapes, parallel=False, optimize=False)
         except UserError:
@@ -67,7 +59,7 @@ def load_scene(path: Path, board: Board | None = None, options: SceneOptions = A
             raise UserError(f"scene {path}: {_first_line(error)}") from None
     if not any(shape.is_mesh() for shape in scene.shapes()):
         raise UserError(f"scene {path}: has no surfaces to render: add a shape")
-    return split_land(mi, mend_meshes(mi, scene, path))
+    return split_terrain(mi, repair_meshes(mi, scene, path))
 
 
 def ensure_built(path: Path) -> None:
@@ -91,19 +83,6 @@ def ensure_built(path: Path) -> None:
     if not path.is_file():
         raise UserError(f"scene {path}: no such file: name a Mitsuba 3 .xml or a mesh file in scene.file")
     check_input(path)
-
-
-def surface(scene: Any) -> tuple[Float32Array, NDArray[np.uint32]]:
-    """All triangles of a scene: vertices (n, 3) in the world frame, metres, and faces (m, 3)."""
-    vertices, faces = zip(*(mesh_arrays(shape) for shape in scene.shapes() if shape.is_mesh()), strict=True)
-    return joined_triangles(vertices, faces)
-
-
-def mesh_arrays(shape: Any) -> tuple[Float32Array, NDArray[np.uint32]]:
-    """Vertices (n, 3) float32 in the world frame and faces (m, 3) uint32 of one Mitsuba mesh."""
-    v = np.asarray(shape.vertex_positions_buffer(), np.float32).reshape(-1, 3)
-    f = np.asarray(shape.faces_buffer(), np.uint32).reshape(-1, 3)
-    return v, f
 
 
 def content_hash(path: Path, options: SceneOptions = AS_IT_IS) -> str:
@@ -152,7 +131,7 @@ def _load_xml(
     config = mi.parser.ParserConfig(mi.variant())
     # Merging orders meshes by memory address: emitters and shapes would be numbered anew in each process.
     config.merge_meshes = False
-    parsed = parse(mi, config, path, scratch, None if board is None else _board_xml(board, scratch))
+    parsed = parse(mi, config, path, scratch, None if board is None else board_xml(board, scratch))
     changes = parsed.changes
     tell_renamed(path, parsed.renamed)
     resolver = mi.file_resolver()
@@ -187,7 +166,7 @@ def _instantiated(mi: Any, config: Any, parsed: Parsed, path: Path, scratch: Pat
     state = parsed.state
     prepare(mi, config, state, path)
     if options != AS_IT_IS:
-        place(mi, state, path, options, _BOARD)
+        place(mi, state, path, options, BOARD_ID)
     for index, node in enumerate(state.nodes):
         if node.type != mi.ObjectType.Shape:
             continue
@@ -219,27 +198,6 @@ def _made(mi: Any, config: Any, state: Any, path: Path) -> Any:
         return mi.parser.instantiate(config, state)
     except Exception as error:  # of whatever kind Mitsuba's plugins raise
         raise UserError(f"scene {path}: {explained(mi, state, str(error))}") from None
-
-
-def _board_xml(board: Board, folder: Path) -> str:
-    """A Mitsuba <shape> of the board, matte, its back grey; its files go into `folder`."""
-    (folder / "board.ply").write_bytes(ply_bytes(*board_surface(board)))
-    (folder / "board.png").write_bytes(encode_png(np.repeat(drawing(board.grid)[..., None], 3, axis=2)))
-    return f"""\
-<shape version="3.0.0" type="ply" id="{_BOARD}">
-  <string name="filename" value="{folder / "board.ply"}"/>
-  <bsdf type="twosided">
-    <bsdf type="diffuse">
-      <texture type="bitmap" name="reflectance">
-        <string name="filename" value="{folder / "board.png"}"/>
-        <string name="filter_type" value="nearest"/>
-        <boolean name="raw" value="true"/>
-      </texture>
-    </bsdf>
-    <bsdf type="diffuse"><rgb name="reflectance" value="0.5"/></bsdf>
-  </bsdf>
-</shape>
-"""
 
 
 def _first_line(error: object) -> str:

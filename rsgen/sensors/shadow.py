@@ -14,7 +14,7 @@ import numpy as np
 from rsgen.array_types import BoolArray, Float32Array
 from rsgen.device.arrays import aligned
 from rsgen.device.pose_table import PoseFunction
-from rsgen.render.moving import MovingObjects
+from rsgen.render.moving_objects import MovingObjects
 from rsgen.render.sensor import RollingShutterSensor
 
 # Shadow rays end this much short of the surface, as a fraction of their length: 0.1 mm at 1 m. Depth is exact to 1e-6.

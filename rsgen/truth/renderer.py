@@ -38,7 +38,7 @@ from rsgen.device.projection import MovingCamera, rotated_back
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.images import ColorRenderer
-from rsgen.render.moving import MovingObjects, ObjectsInFrame
+from rsgen.render.moving_objects import MovingObjects, ObjectsInFrame
 from rsgen.render.sensor import RollingShutterSensor
 from rsgen.sensors.response import to_srgb8
 from rsgen.sequence.format import OBJECT_IDS
@@ -100,34 +100,30 @@ class TruthRenderer:
         self, T_world_cam: PoseFunction, stamp: float, next_stamp: float | None, shutter: Shutter, next_shutter: Shutter
     ) -> dict[str, Float32Array]:
         camera, truth = self._camera, self._truth
-        self._sensor.expose(T_world_cam, stamp, shutter.exposure_s)
-        reference = np.asarray(T_world_cam(np.array([stamp])), float).reshape(4, 4)[:3, 3]
-        now = _moving(camera, shutter, T_world_cam, stamp, reference)
-        things = self._in_frame(shutter, stamp, reference)
-        seen = self._cast(now, shutter, things)
-        now = _carrying(now, things, seen)
+        reference, now, things, hits = self._cast_frame(T_world_cam, stamp, shutter)
+        now = _carrying(now, things, hits)
         images: dict[str, list[Any]] = {}
         if things is not None:
-            images[OBJECT_IDS] = [mi.Float(seen.number)]
+            images[OBJECT_IDS] = [mi.Float(hits.number)]
         if truth.color_depth:
-            images["color_depth"] = [seen.z]
+            images["color_depth"] = [hits.z]
         if truth.normals:
-            images["normals"] = list(seen.n_cam)
+            images["normals"] = list(hits.n_cam)
         if truth.blur_length:
-            ends = (shutter.exposure_s + seen.begin, seen.begin)
-            (x_end, ok_end), (x_begin, ok_begin) = (now.project_at(t, seen.p, seen.w) for t in ends)
+            ends = (shutter.exposure_s + hits.begin, hits.begin)
+            (x_end, ok_end), (x_begin, ok_begin) = (now.project_at(t, hits.p, hits.w) for t in ends)
             length = dr.norm(mi.Point2f(x_end) - mi.Point2f(x_begin))
             images["blur_length"] = [dr.select(ok_end & ok_begin, length, 0)]
         if "global" in truth.flow:
             for time in truth.global_shutter:
                 instant = global_instant(camera, shutter, stamp, time)
                 things = self._in_frame(Shutter(), instant, reference)
-                still = _carrying(_moving(camera, Shutter(), T_world_cam, instant, reference), things, seen)
-                uv, defined = still.project_at(mi.Float(0), seen.p, seen.w)
+                still = _carrying(_moving(camera, Shutter(), T_world_cam, instant, reference), things, hits)
+                uv, defined = still.project_at(mi.Float(0), hits.p, hits.w)
                 found = defined & contains(camera, *uv)
-                images[f"flow_global_{time}"] = self._flow(seen, uv, found, still, mi.Float(0), reference, things)
+                images[f"flow_global_{time}"] = self._flow(hits, uv, found, still, mi.Float(0), reference, things)
         if "next" in truth.flow and next_stamp is not None:
-            images["flow_next"] = self._flow_into(T_world_cam, seen, next_stamp, next_shutter, reference)
+            images["flow_next"] = self._flow_into(T_world_cam, hits, next_stamp, next_shutter, reference)
         dr.eval(images)
         shape = (camera.height, camera.width)
         out = {name: np.stack([np.array(c, np.float32) for c in images[name]], axis=-1) for name in images}
@@ -139,30 +135,37 @@ class TruthRenderer:
         """Flow (h, w, 3), u v valid, from the frame at `stamp` (s) into one that the same camera takes with the shutter
         `other` at other_stamp (s). T_world_cam: as in `render`.
         """
-        camera, shutter = self._camera, self._shutter
+        reference, _, _, hits = self._cast_frame(T_world_cam, stamp, self._shutter)
+        flow = self._flow_into(T_world_cam, hits, other_stamp, other, reference)
+        dr.eval(flow)
+        size = self._camera.height, self._camera.width
+        return np.stack([np.array(c, np.float32) for c in flow], axis=-1).reshape(*size, 3)
+
+    def _cast_frame(
+        self, T_world_cam: PoseFunction, stamp: float, shutter: Shutter
+    ) -> tuple[FloatArray, MovingCamera, ObjectsInFrame | None, _PixelHits]:
+        """Of the frame at `stamp` (s): what positions are relative to, its camera, its moving objects, its hits."""
         self._sensor.expose(T_world_cam, stamp, shutter.exposure_s)
         reference = np.asarray(T_world_cam(np.array([stamp])), float).reshape(4, 4)[:3, 3]
-        now = _moving(camera, shutter, T_world_cam, stamp, reference)
-        seen = self._cast(now, shutter, self._in_frame(shutter, stamp, reference))
-        flow = self._flow_into(T_world_cam, seen, other_stamp, other, reference)
-        dr.eval(flow)
-        return np.stack([np.array(c, np.float32) for c in flow], axis=-1).reshape(camera.height, camera.width, 3)
+        camera = _moving(self._camera, shutter, T_world_cam, stamp, reference)
+        things = self._in_frame(shutter, stamp, reference)
+        return reference, camera, things, self._cast(camera, shutter, things)
 
     def _flow_into(
-        self, T_world_cam: PoseFunction, seen: _Seen, stamp: float, shutter: Shutter, reference: FloatArray
+        self, T_world_cam: PoseFunction, hits: _PixelHits, stamp: float, shutter: Shutter, reference: FloatArray
     ) -> list[Any]:
-        """u, v, valid of the flow of what is seen into the frame at `stamp`, each of whose lines has its own time."""
+        """u, v, valid of the flow of the points hit into the frame at `stamp`, each of whose lines has its own time."""
         things = self._in_frame(shutter, stamp, reference)
-        following = _carrying(_moving(self._camera, shutter, T_world_cam, stamp, reference), things, seen)
-        uv, t, found = following.project(following.lens.line_of(*seen.uv), seen.p, seen.w)
-        return self._flow(seen, uv, found, following, t, reference, things)
+        following = _carrying(_moving(self._camera, shutter, T_world_cam, stamp, reference), things, hits)
+        uv, t, found = following.project(following.lens.line_of(*hits.uv), hits.p, hits.w)
+        return self._flow(hits, uv, found, following, t, reference, things)
 
     def _in_frame(self, shutter: Shutter, stamp: float, reference: FloatArray) -> ObjectsInFrame | None:
         if not self._things:
             return None
         return ObjectsInFrame(self._things, self._camera, shutter, stamp, reference)
 
-    def _cast(self, now: MovingCamera, shutter: Shutter, things: ObjectsInFrame | None) -> _Seen:
+    def _cast(self, now: MovingCamera, shutter: Shutter, things: ObjectsInFrame | None) -> _PixelHits:
         """What the pixels' centres see at their lines' mid-exposure. The sensor must be exposed to the frame."""
         camera = self._camera
         pixel = dr.arange(mi.UInt32, camera.width * camera.height)
@@ -178,7 +181,7 @@ class TruthRenderer:
         p = dr.select(hit.is_valid(), mi.Point3f(origin) + hit.t * ray.d, ray.d)
         z = dr.select(hit.is_valid(), hit.t * self._sensor.planar_depth_scale(uv.x, uv.y), 0)
         if things is None:
-            return _Seen(uv, begin, p, w, normal, rotated_back(R_world_cam, normal), z)
+            return _PixelHits(uv, begin, p, w, normal, rotated_back(R_world_cam, normal), z)
         meeting = things.meet(ray, dr.select(hit.is_valid(), hit.t, dr.inf))
         met, number = meeting.number > 0, meeting.number
         p = dr.select(met, things.place(meeting), p)
@@ -186,28 +189,28 @@ class TruthRenderer:
         _, n_world = things.carried(number, begin + 0.5 * shutter.exposure_s, p, normal)
         z = dr.select(met, meeting.t * self._sensor.planar_depth_scale(uv.x, uv.y), z)
         dr.eval(p, normal, number, z, w)
-        return _Seen(uv, begin, p, dr.select(met, 1, w), normal, rotated_back(R_world_cam, n_world), z, number)
+        return _PixelHits(uv, begin, p, dr.select(met, 1, w), normal, rotated_back(R_world_cam, n_world), z, number)
 
     def _flow(
-        self, seen: _Seen, uv: tuple[Any, Any], found: Any, other: MovingCamera, t: Any, reference: FloatArray,
+        self, hits: _PixelHits, uv: tuple[Any, Any], found: Any, other: MovingCamera, t: Any, reference: FloatArray,
         things: ObjectsInFrame | None,
     ) -> list[Any]:  # fmt: skip
         """u, v, valid of the flow to pixels `uv`, where `found`, of another camera at its times t; things: of its."""
         camera = mi.Point3f(other.pose(t)[0])
-        p, normal = (seen.p, seen.normal) if things is None else things.carried(seen.number, t, seen.p, seen.normal)
-        towards = p - seen.w * camera
+        p, normal = (hits.p, hits.normal) if things is None else things.carried(hits.number, t, hits.p, hits.normal)
+        towards = p - hits.w * camera
         distance = dr.norm(towards)
         at = mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in reference))
         ray = mi.Ray3f(camera + at, towards / distance)
-        ray.maxt = dr.select(seen.w > 0, distance * (1 - _SHORT), dr.inf)
-        front = (seen.w == 0) | (dr.dot(normal, towards) < 0)
+        ray.maxt = dr.select(hits.w > 0, distance * (1 - _SHORT), dr.inf)
+        front = (hits.w == 0) | (dr.dot(normal, towards) < 0)
         valid = found & front
         valid &= ~self._scene.ray_test(ray, coherent=True, active=valid)
         if things is not None:
             ray.time = t - other.lens.shutter.exposure_s
             dr.eval(valid)
             valid &= ~things.hide(ray, valid)
-        flow = mi.Point2f(uv) - seen.uv
+        flow = mi.Point2f(uv) - hits.uv
         keep = dr.isfinite(flow.x) & dr.isfinite(flow.y) & found
         return [dr.select(keep, flow.x, 0), dr.select(keep, flow.y, 0), dr.select(valid, mi.Float(1), 0)]
 
@@ -221,15 +224,15 @@ def _moving(
     )
 
 
-def _carrying(camera: MovingCamera, things: ObjectsInFrame | None, seen: _Seen) -> MovingCamera:
-    """The camera of a frame over which the points seen move with the things that they are on."""
+def _carrying(camera: MovingCamera, things: ObjectsInFrame | None, hits: _PixelHits) -> MovingCamera:
+    """The camera of a frame over which the points hit move with the things that they are on."""
     if things is None:
         return camera
-    return replace(camera, carry=lambda t, p: tuple(things.carried(seen.number, t, mi.Point3f(p), mi.Normal3f(0))[0]))
+    return replace(camera, carry=lambda t, p: tuple(things.carried(hits.number, t, mi.Point3f(p), mi.Normal3f(0))[0]))
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _PixelHits:
     """Per pixel, on the device: what its ray meets. Positions relative to the reference, m, world axes.
 
     Those on things that move, and the normals there, are in the things' own frames.

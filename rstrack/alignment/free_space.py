@@ -17,10 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rsgen.array_types import FloatArray
-from rsgen.device.arrays import Engine, Kernels
+from rsgen.device.arrays import Engine, Kernels, recorded_from
 from rsgen.device.lens import Lens
 from rsgen.device.projection import TO_BASE, gather, move, project_rolling
-from rsgen.device.recording import recorded_from
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.brightness import MID_GREY
 from rstrack.images.device_frame import DeviceRig

@@ -22,10 +22,9 @@ from typing import Any
 
 import drjit as dr
 
-from rsgen.device.arrays import Engine
+from rsgen.device.arrays import Engine, recorded_from
 from rsgen.device.lens import Lens
-from rsgen.device.projection import TO_BASE, Sighting, Vector, gather, move, project_rolling
-from rsgen.device.recording import recorded_from
+from rsgen.device.projection import TO_BASE, RollingProjection, Vector, gather, move, project_rolling
 from rsgen.geometry.camera import Camera
 from rstrack.alignment.block_sums import Contribution, block_slot, contribution, layout
 from rstrack.alignment.brightness import MID_GREY
@@ -128,7 +127,7 @@ def whole_image_unit(median_depth: float) -> float:
 
 
 def plane_distance(
-    e: Engine, given: GeometricInput, ref: Camera, seen: Sighting, value: Any, active: Any, even: Any
+    e: Engine, given: GeometricInput, ref: Camera, seen: RollingProjection, value: Any, active: Any, even: Any
 ) -> tuple[Any, Vector, Any]:
     """Equation (6): points' distances to the plane that inverse depth, `value` (1/m) where they are seen, has there.
 

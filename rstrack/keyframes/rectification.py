@@ -12,10 +12,9 @@ from typing import Any
 
 import drjit as dr
 
-from rsgen.device.arrays import Engine
+from rsgen.device.arrays import Engine, recorded, recorded_from
 from rsgen.device.lens import Lens
 from rsgen.device.projection import TO_BASE, gather, move, project, project_rolling
-from rsgen.device.recording import recorded, recorded_from
 from rstrack.images.sampling import bilinear, grid, level_size, nearest, surface
 
 # Each iteration shrinks the error by the picture's stretching, a few per cent.
@@ -83,7 +82,7 @@ def rectify_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
             ok = at.valid & dr.isfinite(dx + dy)
             if lens.camera.model != "pinhole":
                 # A fisheye's pixels are up to twice as wide as the keyframe's: the step would overshoot and swing.
-                dx, dy = project(lens.camera, (rx, ry, e.Float(1.0))).push((dx / camera.fx, dy / camera.fy, 0.0))
+                dx, dy = project(lens.camera, (rx, ry, e.Float(1.0))).jvp((dx / camera.fx, dy / camera.fy, 0.0))
             x, y = dr.select(ok, x + dr.clip(dx, -40.0, 40.0), x), dr.select(ok, y + dr.clip(dy, -40.0, 40.0), y)
         return dr.select(active, value, 0.0), x, y
 

@@ -22,10 +22,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rsgen import srgb
-from rsgen.device.arrays import Engine, Kernels
+from rsgen.device.arrays import Engine, Kernels, recorded, recorded_from
 from rsgen.device.lens import Lens
-from rsgen.device.projection import Sighting, cross, gather, move, project, project_rolling
-from rsgen.device.recording import recorded, recorded_from
+from rsgen.device.projection import RollingProjection, cross, gather, move, project, project_rolling
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.images.blur import blur_weight
@@ -142,7 +141,7 @@ def _points(e: Engine, base: Lens, rho: Any) -> tuple[Any, tuple[Any, Any, Any]]
     )
 
 
-def _hidden(e: Engine, lens: Lens, depth: Any, seen: Sighting, active: Any) -> Any:
+def _hidden(e: Engine, lens: Lens, depth: Any, seen: RollingProjection, active: Any) -> Any:
     """Points behind the nearest of the four depths around them: a pixel next to an edge shows both sides."""
     *around, _, _, inside = bilinear(
         e, depth, lens.camera.width, lens.camera.height, seen.x, seen.y, active & seen.valid
@@ -222,7 +221,7 @@ def _add_kernel(e: Engine, lens: Lens, depth_lens: Lens, base: Lens) -> Callable
         turn = gather(given.sweep, seen.row, 6, stride=6)
         q = seen.at.q
         omega_q = cross((turn[3], turn[4], turn[5]), q)
-        dx, dy = seen.at.push((-(turn[0] + omega_q[0]), -(turn[1] + omega_q[1]), -(turn[2] + omega_q[2])))
+        dx, dy = seen.at.jvp((-(turn[0] + omega_q[0]), -(turn[1] + omega_q[1]), -(turn[2] + omega_q[2])))
         w = dr.maximum(blur_weight(dr.sqrt(dx * dx + dy * dy), inv_sigma2), least)
 
         width, height = lens.camera.width, lens.camera.height

@@ -14,10 +14,9 @@ from typing import Any
 
 import drjit as dr
 
-from rsgen.device.arrays import Engine
+from rsgen.device.arrays import Engine, recorded
 from rsgen.device.lens import Lens
 from rsgen.device.projection import Vector, gather, move, project, project_rolling
-from rsgen.device.recording import recorded
 from rstrack.images.sampling import EDGE, bilinear, grid, nearest, surface
 
 BLOCK = 8

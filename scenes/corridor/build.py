@@ -27,14 +27,14 @@ from scenes.corridor.materials import materials  # noqa: E402
 from scenes.kit import scene_files  # noqa: E402
 from scenes.kit.pieces import Piece, surfaces  # noqa: E402
 from scenes.kit.prints import town  # noqa: E402
-from scenes.kit.room_files import Lamp, look_at, write_room  # noqa: E402
+from scenes.kit.room_files import AreaLamp, look_at, write_room  # noqa: E402
 from scenes.kit.variants import command, draw, kelvin  # noqa: E402
 
 LAMP_RADIANCE = 58.0
 SKY, GROUND = 2.0, 0.6
 
 
-def contents(seed: int) -> tuple[list[Piece], list[Lamp]]:
+def contents(seed: int) -> tuple[list[Piece], list[AreaLamp]]:
     """Everything in the corridor of this seed: the shell and pieces, and what shines."""
     rng = draw(seed, "light")
     pieces = [Piece("shell", room.shell()), *room.fixtures(), *layout.arrange(seed)]
@@ -48,9 +48,9 @@ def contents(seed: int) -> tuple[list[Piece], list[Lamp]]:
         else:
             pieces.append(Piece(f"lamp {i}", housing))
             power = LAMP_RADIANCE * float(rng.uniform(0.8, 1.15))  # some tubes are older
-            lamps.append(Lamp(f"lamp_{i}", "diffuser", face, scene_files.radiance(tuple(power * colour))))
+            lamps.append(AreaLamp(f"lamp_{i}", "diffuser", face, scene_files.radiance(tuple(power * colour))))
     view = scene_files.radiance_map("textures/town.pfm")
-    lamps.append(Lamp("window", "black", room.pane(), view, atlas=True))
+    lamps.append(AreaLamp("window", "black", room.pane(), view, atlas=True))
     return pieces, lamps
 
 

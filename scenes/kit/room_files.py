@@ -18,7 +18,7 @@ ICL_FOV = float(np.degrees(2 * np.arctan(320 / 481.2)))  # width of ICL-NUIM's i
 
 
 @dataclass(frozen=True)
-class Lamp:
+class AreaLamp:
     """A luminous `mesh` named `name` with the BSDF `material` and an emitter's `radiance` (XML, see scene_files).
 
     `atlas`: its texture coordinates are those of a picture, not metres.
@@ -46,7 +46,7 @@ def write_room(
     out: Path,
     surfaces: Parts,
     materials: Mapping[str, Material],
-    lamps: Sequence[Lamp],
+    lamps: Sequence[AreaLamp],
     *,
     camera: np.ndarray,
     pictures: Mapping[str, np.ndarray] | None = None,

@@ -25,7 +25,7 @@ if str(_ROOT) not in sys.path:  # so that it also runs as a script from anywhere
     sys.path.insert(0, str(_ROOT))
 
 from scenes.kit import scene_files  # noqa: E402
-from scenes.kit.room_files import Lamp, look_at, write_room  # noqa: E402
+from scenes.kit.room_files import AreaLamp, look_at, write_room  # noqa: E402
 from scenes.kit.shapes import Mesh, Parts  # noqa: E402
 from scenes.living_room import layout, pictures, room  # noqa: E402
 from scenes.living_room.materials import MATERIALS  # noqa: E402
@@ -50,13 +50,13 @@ def build(out: Path) -> Path:
     """
     surfaces, shades, discs = parts()
     shade, spot = scene_files.radiance(SHADE_RADIANCE), SPOT_COLOUR
-    lamps = [Lamp(f"lamp_shade_{i}", "shade", mesh, shade) for i, mesh in enumerate(shades)]
+    lamps = [AreaLamp(f"lamp_shade_{i}", "shade", mesh, shade) for i, mesh in enumerate(shades)]
     lamps += [
-        Lamp(f"spot_{i}", "black", mesh, scene_files.radiance(tuple(power * spot)))
+        AreaLamp(f"spot_{i}", "black", mesh, scene_files.radiance(tuple(power * spot)))
         for i, (mesh, power) in enumerate(discs)
     ]
     garden = scene_files.radiance_map("textures/garden.pfm")
-    lamps.append(Lamp("window_pane", "black", room.pane(), garden, atlas=True))
+    lamps.append(AreaLamp("window_pane", "black", room.pane(), garden, atlas=True))
     return write_room(
         out,
         surfaces,

@@ -25,7 +25,7 @@ if str(_ROOT) not in sys.path:  # so that it also runs as a script from anywhere
 from scenes.kit import scene_files  # noqa: E402
 from scenes.kit.pieces import Piece, surfaces  # noqa: E402
 from scenes.kit.prints import town  # noqa: E402
-from scenes.kit.room_files import Lamp, look_at, write_room  # noqa: E402
+from scenes.kit.room_files import AreaLamp, look_at, write_room  # noqa: E402
 from scenes.kit.variants import command, draw, kelvin  # noqa: E402
 from scenes.office import layout, pictures, room  # noqa: E402
 from scenes.office.materials import materials  # noqa: E402
@@ -35,7 +35,7 @@ SCREEN_RADIANCE = 0.75  # of a white pixel
 SKY, GROUND = 1.7, 0.6
 
 
-def contents(seed: int) -> tuple[list[Piece], list[Lamp]]:
+def contents(seed: int) -> tuple[list[Piece], list[AreaLamp]]:
     """Everything in the office of this seed: the shell and pieces, and what shines."""
     arrangement = layout.arrange(seed)
     rng = draw(seed, "light")
@@ -49,15 +49,15 @@ def contents(seed: int) -> tuple[list[Piece], list[Lamp]]:
         housing, face = room.panel(*place)
         pieces.append(Piece(f"panel {i}", housing if on[i] else [*housing, ("diffuser", face)]))
         if on[i]:
-            lamps.append(Lamp(f"panel_{i}", "diffuser", face, scene_files.radiance(tuple(power * colour))))
+            lamps.append(AreaLamp(f"panel_{i}", "diffuser", face, scene_files.radiance(tuple(power * colour))))
     glow = scene_files.radiance_map("textures/screens.pfm")
     for i, screen in enumerate(arrangement.screens):
         if rng.uniform() < 0.75:
-            lamps.append(Lamp(f"screen_{i}", "plastic", screen, glow, atlas=True))
+            lamps.append(AreaLamp(f"screen_{i}", "plastic", screen, glow, atlas=True))
         else:
             pieces.append(Piece(f"dark screen {i}", [("dark_glass", screen)]))
     view = scene_files.radiance_map("textures/town.pfm")
-    lamps += [Lamp(f"window_{i}", "black", pane, view, atlas=True) for i, pane in enumerate(room.panes())]
+    lamps += [AreaLamp(f"window_{i}", "black", pane, view, atlas=True) for i, pane in enumerate(room.panes())]
     return pieces, lamps
 
 

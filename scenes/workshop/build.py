@@ -29,7 +29,7 @@ if str(_ROOT) not in sys.path:  # so that it also runs as a script from anywhere
     sys.path.insert(0, str(_ROOT))
 
 from scenes.kit import scene_files  # noqa: E402
-from scenes.kit.room_files import Lamp, look_at, write_room  # noqa: E402
+from scenes.kit.room_files import AreaLamp, look_at, write_room  # noqa: E402
 from scenes.kit.shapes import Mesh, Parts  # noqa: E402
 from scenes.workshop import drawings, hall, layout  # noqa: E402
 from scenes.workshop.materials import materials  # noqa: E402
@@ -57,13 +57,13 @@ def build(out: Path, seed: int = 0) -> Path:
     tone = np.array([1.0, 0.94, 0.82]) if rng.uniform() < 0.5 else np.array([0.94, 1.0, 0.98])
     day = float(rng.uniform(0.8, 1.2))
     lamps = [
-        Lamp(f"lamp_{i}", "black", mesh, scene_files.radiance(tuple(LAMP_RADIANCE * share * tone)))
+        AreaLamp(f"lamp_{i}", "black", mesh, scene_files.radiance(tuple(LAMP_RADIANCE * share * tone)))
         for i, (mesh, share) in enumerate(discs)
     ]
     pictures = {}
     for name, side, light in (("south", -1, 1.1), ("north", 1, 0.8)):
         sky = scene_files.radiance_map(f"textures/sky_{name}.pfm")
-        lamps.append(Lamp(f"panes_{name}", "black", hall.panes(side), sky, atlas=True))
+        lamps.append(AreaLamp(f"panes_{name}", "black", hall.panes(side), sky, atlas=True))
         level = day * light
         pictures[f"sky_{name}"] = drawings.sky((64, 1024), 900 + 10 * seed + side, SKY * level, HORIZON * level)
     return write_room(

@@ -29,8 +29,8 @@ from rsgen.inputs import check_input
 from rsgen.limits import MOST_M
 from rsgen.render.file_names import located
 from rsgen.render.material import bsdf, emitter
+from rsgen.render.meshes import joined_triangles, ply_bytes
 from rsgen.render.placement import SceneOptions, world_from_file
-from rsgen.render.ply import joined_triangles, ply_bytes
 
 log = logging.getLogger("rsgen")
 

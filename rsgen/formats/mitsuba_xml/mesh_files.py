@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from rsgen.array_types import BoolArray, FloatArray, IntArray
 from rsgen.formats.meshes.mesh_visual import from_srgb, given_normals
-from rsgen.render.ply import joined_triangles, ply_bytes
+from rsgen.render.meshes import joined_triangles, ply_bytes
 
 _OBJ_METHOD = b"obj-polygons/1"
 """Raise when files come out differently: light baked on their surfaces is kept under it."""

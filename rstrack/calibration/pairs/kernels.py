@@ -16,10 +16,9 @@ from typing import Any
 
 import drjit as dr
 
-from rsgen.device.arrays import Engine
+from rsgen.device.arrays import Engine, recorded_from
 from rsgen.device.lens import Lens
-from rsgen.device.projection import TO_BASE, Sighting, Vector, gather, move, project, project_rolling
-from rsgen.device.recording import recorded_from
+from rsgen.device.projection import TO_BASE, RollingProjection, Vector, gather, move, project, project_rolling
 from rstrack.alignment.block_sums import Contribution, block_slot, contribution, layout
 from rstrack.alignment.brightness import MID_GREY
 from rstrack.alignment.pixel_runs import Pixels, summed
@@ -97,7 +96,7 @@ class DepthResidual:
 
     at: Point
     lens: Lens
-    seen: Sighting
+    seen: RollingProjection
     r: Any
     g: Vector
     even: Any
@@ -129,8 +128,8 @@ class ColorResidual:
 
     lens: Lens
     p: Vector
-    here: Sighting
-    there: Sighting
+    here: RollingProjection
+    there: RollingProjection
     r: Any
     own: Vector
     other: Vector
@@ -146,7 +145,7 @@ def color_residual(
     width, height = level_size(color.camera.width, level), level_size(color.camera.height, level)
     shrink = 0.5**level
 
-    def looked_up(image: Any, seen: Sighting, active: Any) -> tuple[Any, Vector, Any]:
+    def looked_up(image: Any, seen: RollingProjection, active: Any) -> tuple[Any, Vector, Any]:
         x, y = seen.x * shrink, seen.y * shrink
         value, dx, dy, active = cubic_value_and_slope(e, image, width, height, x, y, active & seen.valid)
         return value, seen.chain(dx * shrink, dy * shrink, 0.0), active

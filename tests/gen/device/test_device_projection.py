@@ -12,7 +12,7 @@ from rsgen.device.lens import Lens
 from rsgen.device.projection import (
     TO_BASE,
     Projection,
-    Sighting,
+    RollingProjection,
     cross,
     gather,
     move,
@@ -88,8 +88,8 @@ def test_projection_and_its_derivatives_equal_those_of_the_camera(name: str) -> 
     J = camera.project_jacobian(p[on])
     size = np.abs(J).max(axis=(1, 2))[:, None]
     a, v = rng.normal(size=(len(p), 2)), rng.normal(size=(len(p), 3))
-    pulled = host(*at.pull(*(ENGINE.upload(c) for c in a.T)))[on]
-    pushed = host(*at.push(device(v)))[on]
+    pulled = host(*at.vjp(*(ENGINE.upload(c) for c in a.T)))[on]
+    pushed = host(*at.jvp(device(v)))[on]
     assert np.abs((pulled - np.einsum("ni,nij->nj", a[on], J)) / size).max() < 2e-5
     assert np.abs((pushed - np.einsum("nij,nj->ni", J, v[on])) / size).max() < 2e-5
 
@@ -104,7 +104,7 @@ def test_push_is_the_transpose_of_pull() -> None:
     rng = np.random.default_rng(2)
     p, a, v = rng.normal(size=(50, 3)) * 0.3 + (0, 0, 2), rng.normal(size=(50, 2)), rng.normal(size=(50, 3))
     at = project(CAMERAS["radtan k3"], device(p))
-    pulled, pushed = host(*at.pull(*(ENGINE.upload(c) for c in a.T))), host(*at.push(device(v)))
+    pulled, pushed = host(*at.vjp(*(ENGINE.upload(c) for c in a.T))), host(*at.jvp(device(v)))
     np.testing.assert_allclose((pulled * v).sum(axis=1), (a * pushed).sum(axis=1), rtol=1e-3, atol=1e-2)
 
 
@@ -136,7 +136,7 @@ def scene(spline: Spline, image: Exposure, n: int, seed: int = 5) -> np.ndarray:
     return se3.transform(T, q[np.isfinite(q).all(axis=1)])
 
 
-def look(spline: Spline, image: Exposure, T_world_base: np.ndarray, p_world: np.ndarray) -> Sighting:
+def look(spline: Spline, image: Exposure, T_world_base: np.ndarray, p_world: np.ndarray) -> RollingProjection:
     p_base = se3.transform(se3.inverse(T_world_base), p_world)
     table = ENGINE.upload(from_base_table(spline, T_world_base, image))
     return project_rolling(image.lens, table, device(p_base), ENGINE.UInt, ENGINE.Int)
@@ -254,4 +254,4 @@ def test_a_picture_that_outruns_the_shutter_is_refused() -> None:
 
 def test_projection_of_a_pinhole_has_constant_slopes() -> None:
     at: Projection = project(CAMERAS["pinhole"], device(np.array([[0.2, 0.1, 2.0]])))
-    assert host(*at.pull(1.0, 0.0)).tolist() == [pytest.approx([262.5, 0.0, -26.25])]
+    assert host(*at.vjp(1.0, 0.0)).tolist() == [pytest.approx([262.5, 0.0, -26.25])]

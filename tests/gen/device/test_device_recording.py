@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from rstrack_util import ENGINE
 
-from rsgen.device.recording import recorded
+from rsgen.device.arrays import recorded
 
 ROOT = Path(__file__).parents[3]
 
@@ -21,7 +21,7 @@ import sys
 import drjit as dr
 import numpy as np
 from rsgen.device.arrays import engine
-from rsgen.device.recording import recorded
+from rsgen.device.arrays import recorded
 
 e = engine("llvm")
 freeze = {"recorded": recorded, "freeze": dr.freeze}[sys.argv[1]]

@@ -14,7 +14,8 @@ from scene_files import fails, hits, write_scene
 from trimesh.transformations import random_rotation_matrix
 
 from rsgen.formats.mitsuba_xml.mesh_files import is_convex, triangulated, with_triangles
-from rsgen.render.scene import content_hash, load_scene, surface
+from rsgen.render.meshes import surface
+from rsgen.render.scene import content_hash, load_scene
 
 
 def twice_area(corners: np.ndarray, triangles: np.ndarray) -> np.ndarray:

@@ -27,13 +27,11 @@ from rsgen.config.config import LightConfig
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.light import cache as lighting
-from rsgen.light.drawing.guide import BINS, Guide, bin_of
-from rsgen.light.drawing.lamps import left_to_rays, near_lamps
-from rsgen.light.drawing.rounds import PATCH, in_rounds, scatter_of, shown
-from rsgen.light.places.bake_points import thin
-from rsgen.light.places.denoise import denoised
-from rsgen.light.places.sampling import CHANNELS, about_normal
-from rsgen.light.places.surface_points import SurfacePoints
+from rsgen.light.interpolation import denoised, thin
+from rsgen.light.lamps import left_to_rays, near_lamps
+from rsgen.light.sampling import CHANNELS, PATCH, about_normal, sampled_adaptively, standard_error, visible_error
+from rsgen.light.sky import BINS, Guide, bin_of
+from rsgen.light.surface_points import SurfacePoints
 from rsgen.render.baked import BakedIntegrator
 from rsgen.render.images import ColorRenderer
 from rsgen.render.irradiance import make_field, make_lattice
@@ -165,11 +163,13 @@ def test_samples_go_where_light_scatters_and_shows() -> None:
         one = true[todo] * (1 + noise[todo] / np.sqrt(count / 2) * rng.normal(size=(2, len(todo))))
         return np.repeat((count / 2 * one)[..., None], CHANNELS, axis=2)
 
-    means, left = in_rounds(draw, patch, lambda own: own, 0.04, 8, 7, np.inf, silent)
+    means, left = sampled_adaptively(draw, patch, lambda own: own, 0.04, 8, 7, np.inf, silent)
     assert drawn[:500].max() == 8 and 128 <= drawn[500:1000].min() <= 256 and drawn[1000:].max() <= 32
     assert left.max() <= 0.04 and left[500:1000].mean() == pytest.approx(0.5 / np.sqrt(drawn[600]), rel=0.1)
     assert np.abs(means.mean(axis=(0, 2)) / true - 1)[500:1000].std() < 0.04
-    np.testing.assert_allclose(left, shown(patch, scatter_of(patch, means), means.mean(axis=(0, 2))), rtol=1e-5)
+    np.testing.assert_allclose(
+        left, visible_error(patch, standard_error(patch, means), means.mean(axis=(0, 2))), rtol=1e-5
+    )
 
 
 def test_a_guide_draws_what_it_says() -> None:
@@ -204,7 +204,7 @@ def test_noise_is_smoothed_and_edges_of_shadows_are_not() -> None:
     true = np.where(x < 0.405, 1.0, 0.2)
     halves = true[None, :, None] * (1 + rng.normal(scale=0.05, size=(2, len(x), 1))) * np.ones(3)
     which = np.arange(len(x))
-    sigma = scatter_of(thin(points, PATCH * 0.01)[1], halves)
+    sigma = standard_error(thin(points, PATCH * 0.01)[1], halves)
     error = denoised(points, which, halves, sigma, 0.01, which)[:, 0] / true - 1
     away = np.abs(x - 0.405) > 0.08
     noise = 0.05 / np.sqrt(2)

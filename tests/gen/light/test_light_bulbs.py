@@ -13,7 +13,7 @@ from rendering import mi
 from rsgen.config.config import LightConfig
 from rsgen.device.arrays import vectors
 from rsgen.light.cache import baked_field
-from rsgen.light.drawing.bulbs import bulbs
+from rsgen.light.lamps import bulbs
 
 HEIGHT_M = 0.6
 XYZ = floor_grid(count=9) + 0.005 * UP

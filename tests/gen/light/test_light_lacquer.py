@@ -14,9 +14,9 @@ from rendering import constant_twist, dr, mi
 from rsgen.device.arrays import rows_of, vectors
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.light.drawing.gather import gathering
-from rsgen.light.drawing.lacquer import lacquer_seen
-from rsgen.light.places.surface_points import SurfacePoints
+from rsgen.light.caustics import gathered_caustics
+from rsgen.light.indirect import gathering
+from rsgen.light.surface_points import SurfacePoints
 from rsgen.render.baked import BakedIntegrator
 from rsgen.render.images import ColorRenderer
 from rsgen.render.irradiance import make_field, make_lattice
@@ -128,7 +128,7 @@ def test_looked_for_from_the_floor_it_is_the_same(tmp_path: Path, bsdf: str) -> 
     xyz = beyond_the_lamp(3)
     scene = scene_of(tmp_path, FLOOR, LAMP, wall(bsdf))
     points = repeated(xyz, 256)
-    halves = lacquer_seen(scene, points, np.arange(len(points.position)), 1 << 13)[..., :3] / RADIANCE
+    halves = gathered_caustics(scene, points, np.arange(len(points.position)), 1 << 13)[..., :3] / RADIANCE
     expected = off_lacquer(xyz) if bsdf is BLACK_LACQUER else off_satin(scene, xyz)
     ratio = halves.mean(axis=(0, 2)).reshape(len(xyz), -1).mean(axis=1) / expected
     assert np.abs(ratio - 1).max() < 0.03

@@ -27,13 +27,12 @@ from lit import (
 from rsgen import srgb
 from rsgen.config.config import LightConfig
 from rsgen.light import cache as lighting
-from rsgen.light.estimate import estimated_quality
-from rsgen.light.places.bake_points import Interpolation, sample_points, thin
-from rsgen.light.places.surface_points import SurfacePoints
-from rsgen.light.places.walls import find_covered
-from rsgen.light.sight import Sight
+from rsgen.light.barriers import find_covered
+from rsgen.light.interpolation import Interpolation, thin
+from rsgen.light.quality import ViewRays, estimated_quality
+from rsgen.light.surface_points import SurfacePoints, sample_points
 from rsgen.render.irradiance import lattice_area, lattice_barycentric, make_field, make_lattice
-from rsgen.render.scene import surface
+from rsgen.render.meshes import surface
 
 
 @pytest.fixture(scope="module")
@@ -324,9 +323,9 @@ def test_what_lies_right_under_a_sheet_is_covered(tmp_path: Path) -> None:
     assert not find_covered(scene, p, up, 0.003).any() and not find_covered(scene, p, -up, 0.005).any()
 
 
-def from_above(xy: np.ndarray) -> Sight:
+def from_above(xy: np.ndarray) -> ViewRays:
     """Down on the floor at xy (n, 2)."""
-    return Sight(np.column_stack([xy, np.full(len(xy), 0.3)]), np.tile(-UP, (len(xy), 1)))
+    return ViewRays(np.column_stack([xy, np.full(len(xy), 0.3)]), np.tile(-UP, (len(xy), 1)))
 
 
 def test_the_estimate_is_the_error_that_is_there(tmp_path: Path) -> None:
@@ -357,7 +356,7 @@ def test_the_estimate_counts_what_is_seen(tmp_path: Path) -> None:
     for x, right in ((-0.05 - abs(xy[:, 0] * 0.9), False), (0.05 + abs(xy[:, 0] * 0.9), True)):
         quality = estimated_quality(scene, field, 0.04, from_above(np.column_stack([x, xy[:, 1]])))
         assert (quality.at_least_db > 44) == right and (quality.psnr_db < 30) != right
-    none = Sight(np.array([[0.0, 0.0, 2.0]]), UP[None])
+    none = ViewRays(np.array([[0.0, 0.0, 2.0]]), UP[None])
     assert estimated_quality(scene, field, 0.04, none).psnr_db == np.inf  # nothing is seen
 
 

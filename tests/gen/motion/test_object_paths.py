@@ -12,7 +12,7 @@ import tiny
 from moving_things import BOX, CIRCLE, SWING, spline_of, thing
 from scipy.spatial.transform import Rotation
 
-from rsgen.check.objects import RelativeMotion
+from rsgen.check.reprojection import RelativeMotion
 from rsgen.config.config import Config, load_config
 from rsgen.errors import UserError
 from rsgen.geometry import se3

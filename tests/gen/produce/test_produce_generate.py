@@ -389,7 +389,7 @@ def test_pictures_bear_any_sizes_and_views_of_nothing(
     tmp_path: Path, shapes: tuple[tuple[int, int], tuple[int, int]], distance: float
 ) -> None:
     from rsgen.figures import save
-    from rsgen.pictures.figures import comparison, preview
+    from rsgen.pictures.frames import comparison, preview
 
     color = [np.full((*shapes[0], 3), 90, np.uint8)] * 2
     depth = [np.full(shapes[1], distance, np.float32)] * 2

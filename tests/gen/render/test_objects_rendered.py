@@ -23,8 +23,7 @@ from rsgen.light.probes import gathered_light
 from rsgen.produce.frame_source import FrameSource
 from rsgen.produce.ground_truth import load_motion
 from rsgen.render.irradiance import IrradianceField, make_field, make_lattice
-from rsgen.render.moving import MovingObject, ObjectsInFrame
-from rsgen.render.object_light import covered, harmonics, irradiance_coefficients
+from rsgen.render.moving_objects import MovingObject, ObjectsInFrame, covered, harmonics, irradiance_coefficients
 from rsgen.render.object_meshes import load_object
 from rsgen.sequence.reader import read_sequence
 

@@ -12,7 +12,8 @@ from rendering import mi
 from scene_files import fails
 
 from rsgen.render.file_names import located
-from rsgen.render.scene import content_hash, load_scene, surface
+from rsgen.render.meshes import surface
+from rsgen.render.scene import content_hash, load_scene
 
 NAMED = """<scene version="{}"><shape type="ply"><string name="filename" value="MESHES\\Box.PLY"/><bsdf type="diffuse">
     <texture type="bitmap" name="reflectance"><string name="filename" value="textures/darkOAK.PNG"/></texture></bsdf>

@@ -10,7 +10,8 @@ import trimesh
 from rendering import mi
 from scene_files import EVEN_POSE, MIRRORED, hits, rays_at, write_scene
 
-from rsgen.render.scene import load_scene, mesh_arrays, surface
+from rsgen.render.meshes import mesh_arrays, surface
+from rsgen.render.scene import load_scene
 
 
 def instanced(group: str, *poses: str) -> list[str]:

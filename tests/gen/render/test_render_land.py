@@ -10,9 +10,9 @@ from lit import scene_of
 from rsgen.array_types import FloatArray
 from rsgen.device.arrays import rows_of
 from rsgen.render.irradiance import make_lattice
-from rsgen.render.land import coarser, inhabited, pieces
+from rsgen.render.meshes import mesh_arrays
 from rsgen.render.rays import rays_from
-from rsgen.render.scene import mesh_arrays
+from rsgen.render.terrain import coarser, inhabited, pieces
 
 HOUSE = """<shape type="cube"><transform name="to_world"><scale x="3" y="2" z="1.5"/><translate z="1.4"/></transform>
     <bsdf type="diffuse"/></shape>"""

@@ -17,8 +17,9 @@ from rsgen.geometry.shutter import Shutter
 from rsgen.render import placement
 from rsgen.render.board import Board
 from rsgen.render.images import ColorRenderer, DepthRenderer
+from rsgen.render.meshes import mesh_arrays
 from rsgen.render.placement import SceneOptions, camera_up
-from rsgen.render.scene import content_hash, load_scene, mesh_arrays
+from rsgen.render.scene import content_hash, load_scene
 
 CAMERA = Camera(48, 36, 40.0, 40.0, 23.5, 17.5)
 OPTIONS = SceneOptions(scale=0.01, up="z")

@@ -15,7 +15,8 @@ from scene_files import ANY_POSE, EVEN_POSE, MIRRORED, SHAPES, fails, hits, rays
 
 from rsgen.errors import UserError
 from rsgen.files import encode_exr
-from rsgen.render.scene import content_hash, ensure_built, load_scene, mesh_arrays, surface
+from rsgen.render.meshes import mesh_arrays, surface
+from rsgen.render.scene import content_hash, ensure_built, load_scene
 
 # What 96 segments around leave between chord and circle: radius · (1 − cos(π / 96)).
 SAGITTA = 1 - np.cos(np.pi / 96)

@@ -21,7 +21,8 @@ from rsgen.light.bake import bake
 from rsgen.produce.frame_source import make_integrator
 from rsgen.render import irradiance
 from rsgen.render.irradiance import lattice_area, lattice_barycentric, make_field, make_lattice
-from rsgen.render.scene import load_scene, ply_bytes, surface
+from rsgen.render.meshes import ply_bytes, surface
+from rsgen.render.scene import load_scene
 from rsgen.render.xml_scene import messages_to_log
 
 

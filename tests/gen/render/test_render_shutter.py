@@ -15,7 +15,8 @@ from room_frames import MOTION, STAMP, color, z_spread
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.images import DepthRenderer, global_shutter
-from rsgen.render.scene import load_scene, ply_bytes
+from rsgen.render.meshes import ply_bytes
+from rsgen.render.scene import load_scene
 
 
 @pytest.fixture(scope="module")

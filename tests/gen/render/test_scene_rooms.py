@@ -16,7 +16,7 @@ import trimesh
 from scenes.corridor import build as corridor
 from scenes.kit.materials import Material, texture
 from scenes.kit.pieces import Piece
-from scenes.kit.room_files import Lamp
+from scenes.kit.room_files import AreaLamp
 from scenes.kit.shapes import box
 from scenes.kit.variants import kelvin
 from scenes.office import build as office
@@ -39,7 +39,7 @@ class Room:
     """A room's triangles (m, 3, 3), and of each its piece, whether it is glass, and its corners' mean normal (m, 3)."""
 
     pieces: list[Piece]
-    lamps: list[Lamp]
+    lamps: list[AreaLamp]
     triangles: np.ndarray
     owner: np.ndarray
     glass: np.ndarray

@@ -1,23 +1,35 @@
-"""Light from surface to surface: bounce by bounce with few rays, then once more with as many as it takes."""
+"""Indirect light, from surface to surface: bounce by bounce with few rays, then once more with as many as it takes.
+
+It is gathered by cosine-distributed rays that look up how what they meet is lit.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
 from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.config.config import LightConfig
-from rsgen.light.drawing.gather import gathering
-from rsgen.light.drawing.rounds import PATCH, in_rounds, scatter_of, shown
-from rsgen.light.places.bake_points import Interpolation, thin
-from rsgen.light.places.denoise import denoised
-from rsgen.light.places.sampling import CHANNELS
-from rsgen.light.places.surface_points import SurfacePoints
+from rsgen.light.interpolation import Interpolation, denoised, thin
+from rsgen.light.sampling import (
+    CHANNELS,
+    PATCH,
+    Sampler,
+    about_normal,
+    part_of,
+    sampled_adaptively,
+    sampler_at,
+    standard_error,
+    visible_error,
+)
+from rsgen.light.specular_paths import shines, surface_radiance
+from rsgen.light.surface_points import SurfacePoints
 from rsgen.render.irradiance import IrradianceField, Lattice, make_field
 
 _COARSE_TEXELS = 3.0  # light off surfaces is gathered at points about this far apart
@@ -35,7 +47,7 @@ _LEAST_SHARE, _MOST_SHARE = 0.3, 1.06  # of light that gets into lacquer: at 86 
 @dataclass(frozen=True)
 class Surfaces:
     """What is baked: a scene's lattice, its unique points, (2, points) which of them each lattice point's front and
-    back is, how far these count (see `walls.Barriers`), and whether light is followed through panes.
+    back is, how far these count (see `barriers.Barriers`), and whether light is followed through panes.
     """
 
     scene: Any
@@ -63,21 +75,39 @@ class Surfaces:
         return front, back
 
 
+def gathering(scene: Any, field: IrradianceField, points: SurfacePoints, which: IntArray) -> Sampler:
+    """Samples the irradiance that arrives from other surfaces, each lit as `field` states, but no emitter's own.
+
+    By way of panes and whatever mirrors too.
+    """
+    follow = shines(scene)
+
+    def sample(at: Sequence[Any], _: IntArray, begin: int, count: int) -> Any:
+        p, n, number = at
+
+        def light_along(ray: Any, i: Any, pick: Any) -> Any:
+            return surface_radiance(scene, field, ray, number, i, pick, follow, mi.Bool(True))
+
+        return about_normal(p, n, number, begin, count, 101, light_along)
+
+    return sampler_at(points, which, sample)
+
+
 def light_off_surfaces(
     surfaces: Surfaces, fine: IntArray, direct: Float32Array, lit_by: Callable[[Float32Array], IrradianceField],
     light: LightConfig, scatter: float, report: Callable[[float], None],
 ) -> Float32Array:  # fmt: skip
     """Irradiance (n, 4) that surfaces throw on the points `fine` (n,), which have `direct` (n, 4) from elsewhere.
 
-    lit_by: the field of a light (n, 4) at `fine`. Drawn until twice `scatter` is left (see `rounds`), which smoothing
-    and the interpolation bring down to about that: they reach over a dozen points. Where these differ much, as in
-    corners and where things touch, it is drawn at each point, at those where they differ most.
+    lit_by: the field of a light (n, 4) at `fine`. Sampled until twice `scatter` is left (see `sampled_adaptively`),
+    which smoothing and interpolation bring down to about that: they reach over a dozen points. Where these differ most,
+    as in corners and where things touch, light is sampled at each point itself.
     """
     if not light.bounces:
         return np.zeros_like(direct)
     points, spacing = surfaces.points, light.texel_m * _COARSE_TEXELS
     beside = direct.mean(axis=1)
-    before = _before_the_last(surfaces, fine, direct, lit_by, light, lambda f: report(0.5 * f))
+    before = _before_the_last(surfaces, fine, direct, lit_by, light, part_of(report, 0.0, 0.5))
     field = lit_by(direct + before)
     of_fine = thin(points, spacing, fine, steps=True)[0]
     coarse = fine[of_fine]
@@ -86,17 +116,17 @@ def light_off_surfaces(
 
     def at_last(of: IntArray, apart: float, begin: float) -> Float32Array:
         patch = thin(points, PATCH * apart, fine[of])[1]
-        means, left = in_rounds(
+        means, left = sampled_adaptively(
             gathering(surfaces.scene, field, points, fine[of]), patch, lambda own: own + beside[of], 2 * scatter, first,
-            _LAST_ROUNDS, math.inf, lambda f: report(begin + 0.25 * f),
+            _LAST_ROUNDS, math.inf, part_of(report, begin, 0.25),
         )  # fmt: skip
         noisy = np.flatnonzero(left > scatter)
-        return denoised(points, fine[of], means, scatter_of(patch, means), apart, noisy)
+        return denoised(points, fine[of], means, standard_error(patch, means), apart, noisy)
 
     own = at_last(of_fine, spacing, 0.5)
     smooth = to_fine(own)
     everywhere = thin(points, PATCH * spacing, fine)[1]
-    uneven = shown(everywhere, to_fine.spread(own.mean(axis=1)), smooth.mean(axis=1) + beside)
+    uneven = visible_error(everywhere, to_fine.spread(own.mean(axis=1)), smooth.mean(axis=1) + beside)
     worst = np.argsort(-uneven, kind="stable")[: int(_MOST_AGAIN * len(coarse))]
     again = np.sort(worst[uneven[worst] > 2 * scatter])
     if len(again):
@@ -138,11 +168,7 @@ def _bounced(
     off_surfaces = np.zeros((len(region), CHANNELS), np.float32)
     brought: list[FloatArray] = []  # by each bounce to each region
     for bounce in range(light.bounces - 1):
-
-        def share(f: float, k: int = bounce) -> None:
-            report((k + f) / light.bounces)
-
-        gathered = thrown(off_surfaces, rays, share)
+        gathered = thrown(off_surfaces, rays, part_of(report, bounce / light.bounces, 1 / light.bounces))
         increase, off_surfaces = gathered - off_surfaces, gathered
         brought.append(np.stack([np.bincount(region, channel) for channel in increase.T], axis=1))
         if not bounce:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -20,13 +19,12 @@ from scipy.spatial import cKDTree
 
 from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.device.arrays import aligned, rows_of
-from rsgen.light.drawing.rounds import drawn_at
-from rsgen.light.drawing.specular import SPECULAR, lacquered, shone_along, transmitted
-from rsgen.light.places.bake_points import thin
-from rsgen.light.places.sampling import CHANNELS, about_normal, chunks, in_channels, rotation, shaded_nearby
-from rsgen.light.places.surface_points import SurfacePoints
+from rsgen.light.interpolation import thin
+from rsgen.light.sampling import CHANNELS, about_normal, in_channels, rotation, sampler_at, shaded_nearby
+from rsgen.light.specular_paths import SPECULAR, casts_caustics, caustic_radiance, transmitted
+from rsgen.light.surface_points import SurfacePoints
 from rsgen.render.irradiance import at_triangles, registry_id
-from rsgen.render.scene import mesh_arrays
+from rsgen.render.meshes import mesh_arrays
 
 # Where photons land, the normals of the sides they land on, (n, 3) each, and what each brings, W: (n, CHANNELS).
 Landed = tuple[NDArray, NDArray, NDArray]
@@ -40,7 +38,7 @@ _LEAST = 0.05  # of a cell's square: where there is less surface, a photon or tw
 _NEAR = 8  # cells that each is shared out among
 
 
-def lacquer_light(
+def caustic_light(
     scene: Any, points: SurfacePoints, which: IntArray, area: FloatArray, texel_m: float, samples: int, follow: bool
 ) -> Float32Array:
     """Irradiance (n, 4) that lamps and sky send to the points `which` (n,) by way of lacquer and brushed metal.
@@ -48,7 +46,7 @@ def lacquer_light(
     area (n,): of the surface that each stands for, m². samples: of each lamp at a point, which photons go by. follow:
     whether lamps shine through panes.
     """
-    shapes = [shape for shape in scene.shapes() if shape.is_mesh() and lacquered(shape)]
+    shapes = [shape for shape in scene.shapes() if shape.is_mesh() and casts_caustics(shape)]
     if not shapes:
         return np.zeros((len(which), CHANNELS), np.float32)
     # Whatever pieces of surface there are: where these are small, next to nothing would land on each.
@@ -94,18 +92,18 @@ def _shares(tree: cKDTree, places: FloatArray) -> tuple[IntArray, FloatArray]:
     return near, weights / weights.sum(axis=1, keepdims=True)
 
 
-def lacquer_seen(scene: Any, points: SurfacePoints, which: IntArray, samples: int) -> Float32Array:
+def gathered_caustics(scene: Any, points: SurfacePoints, which: IntArray, samples: int) -> Float32Array:
     """The same looked for from where it lands, in means of two halves (2, n, 4): it scatters, but blurs nothing."""
 
     def sample(at: Sequence[Any], _: IntArray, begin: int, count: int) -> Any:
         p, n, number = at
 
         def light_along(ray: Any, i: Any, pick: Any) -> Any:
-            return dr.pi * shone_along(scene, ray, number, i, pick, mi.Bool(True))
+            return dr.pi * caustic_radiance(scene, ray, number, i, pick, mi.Bool(True))
 
         return about_normal(p, n, number, begin, count, 301, light_along)
 
-    draw = drawn_at(which, partial(chunks, points), sample)
+    draw = sampler_at(points, which, sample)
     return draw(np.arange(len(which)), 0, samples, lambda _: None) / np.float32(samples / 2)
 
 

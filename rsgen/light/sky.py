@@ -1,14 +1,13 @@
 """Light from the sky, and lamps' light that comes off mirrors or through thick glass, on points of surfaces.
 
 In a room a sky is seen through a window only: most directions that are drawn from the whole of it end at a wall. So a
-first look tells where light comes from in each part of the scene, and half of the directions are drawn from that. How
-much is drawn depends on how much it still scatters.
+first look learns where light comes from in each part of the scene, as a histogram over directions, and half of the
+directions are drawn from that: path guiding (Müller, Gross, Novák, CGF 2017), with cells and bins of one size.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -17,12 +16,10 @@ import numpy as np
 
 from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.device.arrays import aligned
-from rsgen.light.drawing.guide import BINS, Guide, bin_of
-from rsgen.light.drawing.rounds import drawn_at, in_rounds
-from rsgen.light.drawing.specular import first_scatterer, passes_light_on
-from rsgen.light.places.bake_points import thin
-from rsgen.light.places.sampling import chunks, in_channels, r2, rotation
-from rsgen.light.places.surface_points import SurfacePoints
+from rsgen.light.interpolation import thin
+from rsgen.light.sampling import chunks, in_channels, r2, rotation, sampled_adaptively, sampler_at
+from rsgen.light.specular_paths import first_scatterer, passes_light_on
+from rsgen.light.surface_points import SurfacePoints
 
 _CELL_M = 0.5  # parts of the scene that have one histogram, of like normals on one piece of surface
 _FIRST_LOOK_TEXELS, _FIRST_LOOK_SAMPLES = 3.0, 64
@@ -30,6 +27,13 @@ LESS = 4  # part of the samples that is drawn at first: most places see no sky, 
 _ROUNDS, _ROUNDS_OF_LAMPS = 8, 6
 # Directions drawn at most in all, of the samples asked for: where light is hard to find the worst places get them.
 _EFFORT = 4.0
+# Bins around the vertical and along it: of equal solid angle.
+_AROUND, _ALONG = 32, 16
+BINS = _AROUND * _ALONG
+# Part of the directions that is drawn evenly, and part of a bin's light that its neighbours get: what the first look
+# missed must not be missed for ever.
+_EVENLY, _SPILL = 0.1, 0.15
+_GUIDE_CHUNK = 8192  # cells at a time
 
 
 def has_sky_light(scene: Any) -> bool:
@@ -45,7 +49,7 @@ def sky_light(
 
     samples: directions at each point, one in `LESS` at first; more where the standard error exceeds `scatter`, as far
     as the effort allows; beside (n,): light that points have from elsewhere, in grey. Returns means (2, len(which), 4)
-    of two halves of what was drawn, and the error (n,) left (see `rounds`).
+    of two halves of what was drawn, and the error (n,) left (see `sampled_adaptively`).
     """
     cell, follow = thin(points, _CELL_M, which)[1], passes_light_on(scene)
     guide = _learned(scene, points, which, cell, texel_m, follow)
@@ -53,9 +57,9 @@ def sky_light(
     def sample(at: Sequence[Any], here: IntArray, begin: int, count: int) -> Any:
         return _sky_at(scene, guide, mi.UInt32(aligned(cell[here], np.uint32)), *at, begin, count, follow)
 
-    draw = drawn_at(which, partial(chunks, points), sample)
+    draw = sampler_at(points, which, sample)
     first, rounds = max(4, samples // LESS), _ROUNDS_OF_LAMPS if scene.environment() is None else _ROUNDS
-    return in_rounds(draw, patch, lambda own: own + beside, scatter, first, rounds, _EFFORT * samples, report)
+    return sampled_adaptively(draw, patch, lambda own: own + beside, scatter, first, rounds, _EFFORT * samples, report)
 
 
 def _learned(
@@ -135,3 +139,62 @@ def _sky_at(scene, guide, cell, p, n, number, begin, samples, follow):
         odd += dr.select(first, 0, light)
         i += 1
     return even, odd
+
+
+class Guide:
+    """Densities of directions for each cell; no dataclass, which Dr.Jit's loops would take apart as their state."""
+
+    def __init__(self, cumulative: Any) -> None:
+        """cumulative: Float, for each cell its bins' distribution function, the last being 1."""
+        self.cumulative = cumulative
+
+    @classmethod
+    def learned(cls, seen: Float32Array) -> Guide:
+        """From the light (cells, BINS) that samples, drawn evenly, have brought from each bin."""
+        cumulative = np.empty_like(seen)
+        for begin in range(0, len(seen), _GUIDE_CHUNK):
+            part = slice(begin, begin + _GUIDE_CHUNK)
+            cumulative[part] = _distribution(seen[part].reshape(-1, _ALONG, _AROUND).astype(np.float64))
+        return cls(mi.Float(aligned(cumulative)))
+
+    def sample(self, cell: Any, u: Any) -> Any:
+        """A direction (Vector3f, world frame) in each cell, by two uniform numbers."""
+        first = cell * BINS
+        bin_ = dr.binary_search(0, BINS - 1, lambda k: dr.gather(mi.Float, self.cumulative, first + k) <= u.x)
+        begin = dr.select(bin_ > 0, dr.gather(mi.Float, self.cumulative, first + bin_ - 1, bin_ > 0), 0.0)
+        end = dr.gather(mi.Float, self.cumulative, first + bin_)
+        within = dr.clip((u.x - begin) / dr.maximum(end - begin, 1e-20), 0.0, 1.0)
+        around = (mi.Float(bin_ % _AROUND) + within) * (2.0 * dr.pi / _AROUND)
+        z = (mi.Float(bin_ // _AROUND) + u.y) * (2.0 / _ALONG) - 1.0
+        r = dr.safe_sqrt(1.0 - z * z)
+        sine, cosine = dr.sincos(around)
+        return mi.Vector3f(r * cosine, r * sine, z)
+
+    def density(self, cell: Any, d: Any) -> Any:
+        """Of `sample`, per steradian."""
+        bin_ = bin_of(d)
+        first = cell * BINS
+        begin = dr.select(bin_ > 0, dr.gather(mi.Float, self.cumulative, first + bin_ - 1, bin_ > 0), 0.0)
+        return (dr.gather(mi.Float, self.cumulative, first + bin_) - begin) * (BINS / (4.0 * dr.pi))
+
+
+def _distribution(grid: FloatArray) -> FloatArray:
+    """Distribution function (cells, bins) of what has been seen (cells, along, around)."""
+    up, down = np.zeros_like(grid), np.zeros_like(grid)
+    up[:, 1:], down[:, :-1] = grid[:, :-1], grid[:, 1:]
+    spilt = np.roll(grid, 1, axis=2) + np.roll(grid, -1, axis=2) + up + down
+    flat = (grid + _SPILL * spilt).reshape(len(grid), BINS)
+    total = flat.sum(axis=1, keepdims=True)
+    share = np.where(total > 0, flat / np.where(total > 0, total, 1.0), 1.0 / BINS)
+    cumulative: FloatArray = np.cumsum((1.0 - _EVENLY) * share + _EVENLY / BINS, axis=1)
+    cumulative[:, -1] = 1.0
+    return cumulative
+
+
+def bin_of(d: Any) -> Any:
+    """The bin (UInt32) that a direction lies in."""
+    around = dr.atan2(d.y, d.x) * (0.5 * dr.inv_pi)
+    around -= dr.floor(around)
+    k = dr.minimum(mi.UInt32(around * _AROUND), _AROUND - 1)
+    j = dr.minimum(mi.UInt32(dr.clip(0.5 * (d.z + 1.0), 0.0, 1.0) * _ALONG), _ALONG - 1)
+    return j * _AROUND + k

@@ -21,9 +21,8 @@ from scipy.sparse.csgraph import connected_components
 
 from rsgen.array_types import Float32Array, IntArray
 from rsgen.device.arrays import aligned
-from rsgen.light.places.surface_points import OFFSET_M
 from rsgen.render.irradiance import FREE, REACH_LEVELS, Lattice, packed_reach
-from rsgen.render.rays import rays_from
+from rsgen.render.rays import RAY_OFFSET_M, rays_from
 
 _HEIGHT_M = 1e-3  # of the rays above the surface
 _SHORTEST_M = 2e-4  # neighbours nearer than this are taken for joined
@@ -130,7 +129,7 @@ def find_covered(scene: Any, position: Float32Array, normal: Float32Array, withi
     out = np.zeros(len(position), bool)
     for begin in range(0, len(position), _CHUNK):
         part = slice(begin, begin + _CHUNK)
-        rays = rays_from(position[part] + OFFSET_M * normal[part], normal[part])
+        rays = rays_from(position[part] + RAY_OFFSET_M * normal[part], normal[part])
         rays.maxt = dr.opaque(mi.Float, within_m)
         out[part] = np.array(scene.ray_test(rays)).astype(bool)
     return out

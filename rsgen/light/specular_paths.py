@@ -28,7 +28,7 @@ def shines(scene: Any) -> bool:
     return any(f & SPECULAR for f in _kinds(scene))
 
 
-def lacquered(shape: Any) -> bool:
+def casts_caustics(shape: Any) -> bool:
     """Whether a surface is matte beneath what mirrors, or mirrors blurred: lacquer, satin, brushed metal."""
     kind = _kind(shape)
     return bool(kind & GLOSSY or (kind & _STRAIGHT and kind & _DIFFUSE and not kind & _NULL))
@@ -81,7 +81,7 @@ def first_scatterer(scene, ray, pick, follow, active):
 
 
 @dr.syntax
-def thrown_along(scene, field, ray, number, i, pick, follow, active):
+def surface_radiance(scene, field, ray, number, i, pick, follow, active):
     """Radiance times π (Color3f) that matte surfaces send along a ray, lit as `field` says.
 
     With `follow` by way of whatever mirrors or lets through, which of a surface's lobes by lot; without, the first
@@ -115,10 +115,10 @@ def thrown_along(scene, field, ray, number, i, pick, follow, active):
 
 
 @dr.syntax
-def shone_along(scene, ray, number, i, pick, active):
+def caustic_radiance(scene, ray, number, i, pick, active):
     """Radiance (Color3f) of lamps and sky that comes along a ray by way of lacquer or brushed metal.
 
-    Arguments as of `thrown_along`. What brushed metal blurs is found by sampling lamps and lobe, with the balance
+    Arguments as of `surface_radiance`. What brushed metal blurs is found by sampling lamps and lobe, with the balance
     heuristic (Veach and Guibas 1995).
     """
     specular = mi.BSDFContext()

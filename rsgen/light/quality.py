@@ -18,14 +18,13 @@ from numpy.typing import NDArray
 from rsgen import srgb
 from rsgen.array_types import BoolArray, FloatArray
 from rsgen.device.arrays import rows_of
-from rsgen.light.drawing.gather import gathering
-from rsgen.light.drawing.lacquer import lacquer_seen
-from rsgen.light.drawing.lamps import lamp_light
-from rsgen.light.drawing.rounds import typical
-from rsgen.light.drawing.sky import LESS, has_sky_light, sky_light
-from rsgen.light.drawing.specular import first_scatterer, passes_light_on, shines
-from rsgen.light.places.surface_points import SurfacePoints
-from rsgen.light.sight import Sight
+from rsgen.light.caustics import gathered_caustics
+from rsgen.light.indirect import gathering
+from rsgen.light.lamps import lamp_light
+from rsgen.light.sampling import typical
+from rsgen.light.sky import LESS, has_sky_light, sky_light
+from rsgen.light.specular_paths import first_scatterer, passes_light_on, shines
+from rsgen.light.surface_points import SurfacePoints
 from rsgen.render.irradiance import IrradianceField
 from rsgen.render.rays import rays_from
 
@@ -34,6 +33,14 @@ _GREY = 0.18  # reflectance of the surface that is looked at, where light is typ
 _LAMP_SAMPLES, _SKY_SAMPLES, _RAYS = 16 * 512, 4096, 512
 _LEAST_ERROR = 1e-6
 _SURE = 2.0  # standard errors
+
+
+@dataclass(frozen=True)
+class ViewRays:
+    """Lines of view: eyes (n, 3), world, m, and unit directions (n, 3)."""
+
+    eye: FloatArray
+    direction: FloatArray
 
 
 @dataclass(frozen=True)
@@ -47,12 +54,12 @@ class Quality:
         return f"about {self.psnr_db:.0f} dB where cameras look, at least {self.at_least_db:.0f}"
 
 
-def estimated_quality(scene: Any, field: IrradianceField, texel_m: float, sight: Sight) -> Quality:
+def estimated_quality(scene: Any, field: IrradianceField, texel_m: float, view: ViewRays) -> Quality:
     """Quality of the light on the surfaces that are seen, lamps left out, as if these were mid-grey.
 
-    Exposed so that `rounds.typical` light makes mid-grey. Infinite where nothing lit is seen.
+    Exposed so that `typical` light makes mid-grey. Infinite where nothing lit is seen.
     """
-    points, baked, lacquered = _seen(scene, field, sight)
+    points, baked, lacquered = _seen(scene, field, view)
     if not len(baked):
         return Quality(math.inf, math.inf)
     halves = _computed(scene, field, points, texel_m)
@@ -73,13 +80,13 @@ def _db(square: float) -> float:
     return -10 * math.log10(max(square, _LEAST_ERROR))
 
 
-def _seen(scene: Any, field: IrradianceField, sight: Sight) -> tuple[SurfacePoints, FloatArray, BoolArray]:
+def _seen(scene: Any, field: IrradianceField, view: ViewRays) -> tuple[SurfacePoints, FloatArray, BoolArray]:
     """Places seen, through panes and in mirrors too, as they face the eye, the irradiance (n, 3) baked there, and
     whether it is beneath lacquer (n,).
     """
     follow = passes_light_on(scene)
     pick = mi.Float(0.5)
-    pi, si, ray, _, _ = first_scatterer(scene, rays_from(sight.eye, sight.direction), pick, follow, mi.Bool(True))
+    pi, si, ray, _, _ = first_scatterer(scene, rays_from(view.eye, view.direction), pick, follow, mi.Bool(True))
     lamp = si.emitter(scene) != dr.zeros(mi.EmitterPtr)
     shown = si.is_valid() & ~lamp
     light = field.lookup(pi, si, -ray.d, shown)
@@ -87,9 +94,9 @@ def _seen(scene: Any, field: IrradianceField, sight: Sight) -> tuple[SurfacePoin
     normal = si.sh_frame.n * dr.select(dr.dot(si.sh_frame.n, si.n) * towards > 0, 1.0, -1.0)
     lacquered = field.beneath_lacquer(si.shape, shown)
     dr.eval(shown, light, si.p, normal, towards, lacquered)
-    there: BoolArray = np.broadcast_to(np.array(shown).astype(bool), (len(sight.eye),))
+    there: BoolArray = np.broadcast_to(np.array(shown).astype(bool), (len(view.eye),))
     p, n, g, e = (rows_of(v)[there] for v in (si.p, normal, si.n * towards, light))
-    coat: BoolArray = np.broadcast_to(np.array(lacquered).astype(bool), (len(sight.eye),))
+    coat: BoolArray = np.broadcast_to(np.array(lacquered).astype(bool), (len(view.eye),))
     return SurfacePoints(p, n, g, np.zeros(len(p), np.int64)), e.astype(np.float64), coat[there]
 
 
@@ -104,7 +111,7 @@ def _computed(scene: Any, field: IrradianceField, points: SurfacePoints, texel_m
 
     halves = lamp_light(scene, points, everywhere, everywhere, _LAMP_SAMPLES, follow, dark, 1.0, silent)[0]
     if shines(scene):
-        halves += lacquer_seen(scene, points, everywhere, _SKY_SAMPLES)
+        halves += gathered_caustics(scene, points, everywhere, _SKY_SAMPLES)
     if has_sky_light(scene):
         asked = LESS * _SKY_SAMPLES  # of which this draws the first round
         halves += sky_light(scene, points, everywhere, everywhere, texel_m, asked, dark, math.inf, silent)[0]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rsgen.array_types import FloatArray, IntArray
 from rsgen.device.arrays import aligned
-from rsgen.render.mended import rebuilt
+from rsgen.render.meshes import rebuilt
 
 log = logging.getLogger("rsgen")
 
@@ -38,7 +38,7 @@ def coarser(corners: FloatArray, box: FloatArray) -> FloatArray:
     return np.maximum(_distance(corners, box) / _NEAR_M, 1.0)
 
 
-def split_land(mi: Any, scene: Any) -> Any:
+def split_terrain(mi: Any, scene: Any) -> Any:
     """The scene with the triangles of its land in pieces, if it has any; meshes are changed in place."""
     shapes = [shape for shape in scene.shapes() if shape.is_mesh()]
     land = [_across(_vertices(shape)) > _BUILDING_M for shape in shapes]

@@ -1,12 +1,13 @@
-"""Meshes as they come from files, mended on loading: no triangle without area, no vertex normal without direction.
+"""Triangle meshes: as arrays and PLY files, and repaired as they are loaded.
 
-Either would put NaN into the baked light, and from there into images.
+A triangle without area or a vertex normal without direction would put NaN into the baked light, and from there into
+images.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,62 @@ log = logging.getLogger("rsgen")
 _FLAT = 1e-7  # twice a triangle's area over its longest edge squared: below lies what float32 makes of a line
 
 
-def mend_meshes(mi: Any, scene: Any, path: Path) -> Any:
+def ply_bytes(
+    vertices: NDArray, faces: NDArray, normals: NDArray | None = None, uv: NDArray | None = None,
+    vertex_colors: NDArray | None = None, face_colors: NDArray | None = None,
+) -> bytes:  # fmt: skip
+    """Binary PLY of triangles: vertices (n, 3), faces (m, 3), unit normals (n, 3) and texture coordinates (n, 2).
+
+    Colours (n, 3), (m, 3) become Mitsuba's attributes `vertex_color` and `face_color`, as they are.
+    """
+    names = ["x", "y", "z"]
+    parts = [vertices]
+    if normals is not None:
+        names += ["nx", "ny", "nz"]
+        parts.append(normals / np.linalg.norm(normals, axis=-1, keepdims=True))
+    if uv is not None:
+        names += ["u", "v"]
+        parts.append(uv)
+    if vertex_colors is not None:
+        names += ["r", "g", "b"]
+        parts.append(vertex_colors)
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    header += [f"property float {name}" for name in names]
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    columns: list[tuple[Any, ...]] = [("n", "u1"), ("v", "<i4", 3)]
+    if face_colors is not None:
+        header += [f"property float {name}" for name in "rgb"]
+        columns.append(("c", "<f4", 3))
+    header += ["end_header", ""]
+    face_rows = np.empty(len(faces), dtype=columns)
+    face_rows["n"], face_rows["v"] = 3, faces
+    if face_colors is not None:
+        face_rows["c"] = face_colors
+    data = np.concatenate(parts, axis=1).astype("<f4")
+    return "\n".join(header).encode() + data.tobytes() + face_rows.tobytes()
+
+
+def joined_triangles(vertices: Sequence[NDArray], faces: Sequence[NDArray]) -> tuple[NDArray, NDArray]:
+    """Vertices (n, 3) and faces (m, 3) of several meshes as those of one."""
+    first = np.cumsum([0, *(len(v) for v in vertices)])
+    moved = [f + f.dtype.type(k) for f, k in zip(faces, first[:-1], strict=True)]
+    return np.concatenate(vertices), np.concatenate(moved)
+
+
+def surface(scene: Any) -> tuple[Float32Array, NDArray[np.uint32]]:
+    """All triangles of a scene: vertices (n, 3) in the world frame, metres, and faces (m, 3)."""
+    vertices, faces = zip(*(mesh_arrays(shape) for shape in scene.shapes() if shape.is_mesh()), strict=True)
+    return joined_triangles(vertices, faces)
+
+
+def mesh_arrays(shape: Any) -> tuple[Float32Array, NDArray[np.uint32]]:
+    """Vertices (n, 3) float32 in the world frame and faces (m, 3) uint32 of one Mitsuba mesh."""
+    v = np.asarray(shape.vertex_positions_buffer(), np.float32).reshape(-1, 3)
+    f = np.asarray(shape.faces_buffer(), np.uint32).reshape(-1, 3)
+    return v, f
+
+
+def repair_meshes(mi: Any, scene: Any, path: Path) -> Any:
     """The loaded scene without triangles that have no area, and with normals where a mesh's own are useless.
 
     Meshes are changed in place; one that has no area at all is left out of the scene that this returns. Raises
@@ -41,7 +97,7 @@ def mend_meshes(mi: Any, scene: Any, path: Path) -> Any:
             raise UserError(f"{what} has vertices that are not finite: export it anew")
         keep = has_area(vertices, faces)
         if keep.any():
-            changed |= _mend(mi, shape, vertices, faces, keep)
+            changed |= _repair(mi, shape, vertices, faces, keep)
         else:
             log.debug("mesh '%s': left out, it has no area", shape.id() or number)
             flat.add(number)
@@ -69,8 +125,8 @@ def has_area(vertices: Float32Array, faces: NDArray[np.uint32]) -> NDArray[np.bo
     return np.einsum("ij,ij->i", normal, normal) > (_FLAT * longest) ** 2
 
 
-def _mend(mi: Any, shape: Any, vertices: Float32Array, faces: NDArray, keep: NDArray[np.bool_]) -> bool:
-    """Whether anything was to be mended."""
+def _repair(mi: Any, shape: Any, vertices: Float32Array, faces: NDArray, keep: NDArray[np.bool_]) -> bool:
+    """Whether anything was to be repaired."""
     normals = np.zeros((0, 3), np.float32)
     useless = np.zeros(len(vertices), bool)
     if shape.has_vertex_normals():
@@ -91,8 +147,8 @@ def _mend(mi: Any, shape: Any, vertices: Float32Array, faces: NDArray, keep: NDA
             parameters["vertex_normals"] = mi.Float(aligned(normals))  # else made anew, from the triangles
         log.debug("mesh '%s': %d triangles without area dropped", shape.id(), np.count_nonzero(~keep))
     if useless.any():
-        mended = np.where(useless[:, None], _vertex_normals(vertices, faces[keep]), normals)
-        parameters["vertex_normals"] = mi.Float(aligned(mended))
+        repaired = np.where(useless[:, None], _vertex_normals(vertices, faces[keep]), normals)
+        parameters["vertex_normals"] = mi.Float(aligned(repaired))
         log.debug("mesh '%s': %d vertex normals without direction replaced", shape.id(), np.count_nonzero(useless))
     parameters.update()
     return True

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from rsgen.check.objects import check_objects
 from rsgen.errors import UserError
 from rsgen.files import is_temporary, read_text, read_yaml
 from rsgen.sensors.imu import imu_csv
 from rsgen.sensors.imu_truth import IMU_TRUTH_CSV, IMU_TRUTH_YAML, imu_truth_csv
 from rsgen.sequence.camera_yaml import TRUE_CAMERAS
-from rsgen.sequence.format import STREAMS, color_truth_path
+from rsgen.sequence.format import STREAMS, color_truth_path, ground_truth, pose_lines
+from rsgen.sequence.object_files import poses_file
 from rsgen.sequence.reader import Sequence
 from rsgen.sequence.target_corners import TARGET_CORNERS, target_corners_text
 from rsgen.truth.settings import sequence_imu, sequence_target
@@ -88,6 +88,32 @@ def check_target(sequence: Sequence) -> tuple[bool, str]:
     if read_text(sequence.root / TARGET_CORNERS) != expected:
         return False, f"{TARGET_CORNERS} is not that of config.target: render again to write it"
     return True, f"{target.grid.tag_count} tags, corners as config.target has them"
+
+
+def check_objects(sequence: Sequence) -> tuple[bool, str]:
+    """Poses of all objects are what their splines give, and every exact image has a mask that decodes.
+
+    Raises UserError.
+    """
+    stamps = [stream.stamps for stream in sequence.streams.values()]
+    for thing in sequence.objects:
+        path = sequence.root / poses_file(thing.name)
+        try:
+            found = np.loadtxt(read_text(path).splitlines(), ndmin=2)
+        except ValueError:
+            raise UserError(f"{path}: expected lines of 8 numbers 'stamp tx ty tz qx qy qz qw'") from None
+        expected = np.loadtxt(pose_lines("", ground_truth(thing.spline, *stamps)), ndmin=2)
+        at = np.isin(found[:, 0], expected[:, 0]) if found.ndim == 2 and found.shape[1] == 8 else np.zeros(1, bool)
+        if at.sum() != len(expected) or np.abs(found[at] - expected).max() > 1e-9:
+            return False, f"{path}: is not what the object's spline gives: render again to write it"
+    seen = [
+        np.bincount(np.concatenate([sequence.object_ids(name, k).ravel() for k in range(len(stream.paths))]),
+                    minlength=len(sequence.objects) + 1)
+        for name, stream in sequence.streams.items()
+    ]  # fmt: skip
+    share = [100 * (1 - count[0] / max(count.sum(), 1)) for count in seen]
+    names = ", ".join(thing.name for thing in sequence.objects)
+    return True, f"{names}: {share[0]:.1f} % of colour's pixels, {share[1]:.1f} % of depth's"
 
 
 def extra_checks(sequence: Sequence) -> list[tuple[str, Callable[[], tuple[bool, str]]]]:

@@ -1,25 +1,41 @@
-"""Direct light of lamps on points of surfaces, drawn from each lamp in rounds.
+"""Direct light of lamps on points of surfaces, sampled from each lamp as much as its scatter needs.
 
 Where a lamp all but touches a surface, samples on it scatter without bound (1 / d²): there rays about the normal take
 over, by the balance heuristic (Veach and Guibas 1995).
+
+While light is baked, the glass of a bulb bends nothing: rays from a wall find a filament through curved glass one time
+in a hundred thousand, which makes specks a hundred times too bright and darkness between them. What a bulb holds back
+on one side it sends out at the other, so nearly all its light gets out, in the glass's colour. Cameras see the glass.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from rsgen.array_types import Float32Array, FloatArray, IntArray
-from rsgen.light.drawing.rounds import drawn_at, in_rounds
-from rsgen.light.drawing.specular import first_scatterer, transmitted
-from rsgen.light.places.sampling import CHANNELS, about_normal, chunks, in_channels, r2, rotation
-from rsgen.light.places.surface_points import SurfacePoints
+from rsgen.device.arrays import aligned
+from rsgen.light.sampling import (
+    CHANNELS,
+    about_normal,
+    in_channels,
+    part_of,
+    r2,
+    rotation,
+    sampled_adaptively,
+    sampler_at,
+)
+from rsgen.light.specular_paths import first_scatterer, transmitted
+from rsgen.light.surface_points import SurfacePoints
+from rsgen.render.irradiance import registry_id
+from rsgen.render.rays import RAY_OFFSET_M
 
 MANY_EMITTERS = 24  # more are sampled together, as one
 _ROUNDS = 6  # the last one ends at twice as many samples as are asked for
@@ -29,6 +45,13 @@ _NEAR_RAYS, _NEAR_ROUNDS = 8, 7
 # Samples on lamps are trusted this much more than rays about the normal, and altogether where less were left to these.
 _LIGHT_TRUST = 64.0
 _LEAST_LEFT = 0.01
+_BULB_M = 0.3  # a lamp in a room of glass is in no bulb
+_BULB_RAYS = 512  # from each lamp, all around
+_ENCLOSED = 0.7  # of those that leave the lamp: the rest may meet its socket
+_BULB_PART = 0.02  # of them, that meet what is a part of a bulb
+_BULB_WALLS = 4  # of glass, one within the other
+_BENDS = int(mi.BSDFFlags.DeltaTransmission) | int(mi.BSDFFlags.GlossyTransmission)
+_NO_GLASS = int(mi.BSDFFlags.Null) | int(mi.BSDFFlags.DiffuseReflection) | int(mi.BSDFFlags.DiffuseTransmission)
 
 
 def lamps_of(scene: Any) -> list[Any]:
@@ -48,11 +71,8 @@ def first_look(
         for k, (emitter, dimension, _) in enumerate(kinds):
             draw = _draw(scene, emitter, dimension, points, which[dark], follow)
             count = 1 if emitter is not None else MANY_EMITTERS
-
-            def share(f: float, done: float = look + k / len(kinds)) -> None:
-                report((done + f / len(kinds)) / _FIRST_LOOK)
-
-            found += draw(np.arange(len(dark)), look * count, count, share).sum(axis=0) / count
+            part = part_of(report, (look + k / len(kinds)) / _FIRST_LOOK, 1 / len(kinds) / _FIRST_LOOK)
+            found += draw(np.arange(len(dark)), look * count, count, part).sum(axis=0) / count
         total[dark] = found
     return total
 
@@ -65,7 +85,7 @@ def lamp_light(
 
     samples: of each lamp, at most twice as many where they scatter and a sixteenth where they do not; light (n,): all
     light of the points, about, in grey. Returns means (2, n, 4) of two halves of what was drawn, and the error (n,)
-    left (see `rounds`).
+    left (see `sampled_adaptively`).
     """
     kinds = _kinds(scene)
     means, square = np.zeros((2, len(which), CHANNELS), np.float32), np.zeros(len(which))
@@ -73,13 +93,9 @@ def lamp_light(
         draw = _draw(scene, emitter, dimension, points, which, follow)
         count = samples * (1 if emitter is not None else MANY_EMITTERS)
         first, rounds = (2, 1) if delta else (max(2, count >> (_ROUNDS - 2)), _ROUNDS)
-
-        def share(f: float, k: int = k) -> None:
-            report(0.9 * (k + f) / len(kinds))
-
-        own, left = in_rounds(
-            draw, patch, lambda _: light, scatter / math.sqrt(min(len(kinds), _AT_ONCE)), first, rounds, math.inf, share
-        )
+        most = scatter / math.sqrt(min(len(kinds), _AT_ONCE))
+        part = part_of(report, 0.9 * k / len(kinds), 0.9 / len(kinds))
+        own, left = sampled_adaptively(draw, patch, lambda _: light, most, first, rounds, math.inf, part)
         means += own
         square += left**2
 
@@ -91,11 +107,11 @@ def lamp_light(
         p, n, number = at
         return about_normal(p, n, number, begin, count, 111, left_to_rays(scene, p, n, follow))
 
-    draw = drawn_at(which[near], partial(chunks, points), sample)
+    draw = sampler_at(points, which[near], sample)
     effort = 2.0 * samples * len(which) / len(near)
-    own, left = in_rounds(
+    own, left = sampled_adaptively(
         draw, patch[near], lambda _: light[near], scatter, _NEAR_RAYS, _NEAR_ROUNDS, effort,
-        lambda f: report(0.9 + 0.1 * f),
+        part_of(report, 0.9, 0.1),
     )  # fmt: skip
     means[:, near] += own
     square[near] += left**2
@@ -135,7 +151,7 @@ def _draw(scene: Any, emitter: Any, dimension: int, points: SurfacePoints, which
     def sample(at: Sequence[Any], _: IntArray, begin: int, count: int) -> Any:
         return _from_emitter(scene, emitter, *at, begin, count, dimension, follow)
 
-    return drawn_at(which, partial(chunks, points), sample)
+    return sampler_at(points, which, sample)
 
 
 @dr.syntax
@@ -200,3 +216,70 @@ def left_to_rays(scene: Any, p: Any, n: Any, follow: bool) -> Callable[[Any, Any
         return dr.select(lamp, dr.pi * through * emitter.eval(si, lamp) * left_out, 0)
 
     return light_along
+
+
+@contextlib.contextmanager
+def straight_through_bulbs(scene: Any) -> Iterator[list[Any]]:
+    """While open, light goes straight through the glass around lamps; yields the shapes that it is."""
+    shapes = bulbs(scene)
+    glass = [shape.bsdf() for shape in shapes]
+    try:
+        for shape, own in zip(shapes, glass, strict=True):
+            shape.set_bsdf(_colour_alone(own))
+        yield shapes
+    finally:
+        for shape, own in zip(shapes, glass, strict=True):
+            shape.set_bsdf(own)
+
+
+def bulbs(scene: Any) -> list[Any]:
+    """Shapes of glass that are less than 30 cm around a lamp on nearly all sides, up to four within each other."""
+    shapes = {registry_id(shape): shape for shape in scene.shapes()}
+    lamps = [lamp.get_shape() for lamp in lamps_of(scene) if lamp.get_shape() is not None]
+    if not lamps or not any(_is_glass(shape) for shape in shapes.values()):
+        return []
+    lamp = np.repeat(np.arange(len(lamps)), _BULB_RAYS)
+    own = np.array([registry_id(shape) for shape in lamps], np.uint32)[lamp]
+    ray = _all_around(own)
+    found: set[int] = set()
+    going = np.ones(len(lamp), bool)
+    for _ in range(_BULB_WALLS):
+        si = scene.ray_intersect(ray, mi.Bool(aligned(going)))
+        met, near = np.array(dr.reinterpret_array(mi.UInt32, si.shape)), np.array(si.t) < _BULB_M
+        leaves = going & (met != own)
+        glass = leaves & near & np.isin(met, [k for k, shape in shapes.items() if _is_glass(shape)])
+        share = np.bincount(lamp, glass) / np.maximum(np.bincount(lamp, leaves), 1)
+        going = glass & (share >= _ENCLOSED)[lamp]
+        if not going.any():
+            break
+        number, count = np.unique(met[going], return_counts=True)
+        found |= {int(k) for k, n in zip(number, count, strict=True) if n >= _BULB_PART * _BULB_RAYS}
+        ray = si.spawn_ray(ray.d)
+    return [shapes[k] for k in sorted(found)]
+
+
+def _all_around(own: NDArray[np.uint32]) -> Any:
+    """Rays from places on the shapes of these numbers (n,), in all directions."""
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, len(own))
+    place = dr.reinterpret_array(mi.ShapePtr, mi.UInt32(aligned(own, np.uint32))).sample_position(0, sampler.next_2d())
+    d = mi.warp.square_to_uniform_sphere(sampler.next_2d())
+    return mi.Ray3f(place.p + RAY_OFFSET_M * dr.sign(dr.dot(place.n, d)) * place.n, d)
+
+
+def _is_glass(shape: Any) -> bool:
+    flags = 0 if shape.bsdf() is None else int(shape.bsdf().flags())
+    return bool(flags & _BENDS) and not flags & _NO_GLASS
+
+
+def _colour_alone(glass: Any) -> Any:
+    """What lets light straight on, with this glass's mean colour."""
+    parameters = mi.traverse(glass)
+    colour = np.ones(1)
+    for name in parameters.keys():  # noqa: SIM118
+        if name.endswith("specular_transmittance.value"):
+            colour = np.array(parameters[name]).ravel()
+        elif name.endswith("specular_transmittance.data"):
+            colour = np.array(parameters[name]).mean(axis=(0, 1))
+    tint = {"type": "rgb", "value": np.broadcast_to(colour, 3).tolist()}
+    return mi.load_dict({"type": "thindielectric", "int_ior": 1.0, "ext_ior": 1.0, "specular_transmittance": tint})

@@ -1,0 +1,205 @@
+"""Sampling at surface points: random numbers that are the same each time, and adaptive numbers of samples.
+
+Each point gets as many samples as what their scatter shows needs, and no more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from rsgen.array_types import Float32Array, FloatArray, IntArray
+from rsgen.device.arrays import aligned
+from rsgen.light.surface_points import SurfacePoints
+
+CHANNELS = 4  # of light: see `in_channels`
+_ETA = 1.5  # of lacquer
+_GETS_IN = 0.90822  # of light from all sides alike: the mean over cosine-distributed directions of what Fresnel lets in
+_CHUNK = 1 << 20
+
+
+def in_channels(light: Any, cosine: Any) -> Any:
+    """(Vector4f) irradiance by one direction, of this cosine: red, green, blue, and how much of it gets into lacquer.
+
+    The last as a part of what would get in were it from all sides, in grey: what is beneath lacquer is lit by so much
+    less by what comes at a glance, and by 6 % more by what comes straight.
+    """
+    gets_in = (1 - mi.fresnel(dr.clip(cosine, 0, 1), _ETA)[0]) / _GETS_IN
+    return mi.Vector4f(light.x, light.y, light.z, dr.mean(light) * gets_in)
+
+
+def rotation(index: Any, dimension: Any) -> Any:
+    """Uniform offset in [0, 1) from a hash of a point's number and a dimension."""
+    return mi.sample_tea_float32(index, mi.UInt32(dimension), 4)
+
+
+def r2(i: Any, offset: Any) -> Any:
+    """Point i of the R2 low-discrepancy sequence (Roberts 2018), rotated by `offset`."""
+    x = offset.x + mi.Float(i) * 0.7548776662466927
+    y = offset.y + mi.Float(i) * 0.5698402909980532
+    return mi.Point2f(x - dr.floor(x), y - dr.floor(y))
+
+
+@dr.syntax
+def about_normal(p, n, number, begin, count, dimension, light_along):
+    """Sums (Vector4f) over two halves of the cosine-distributed rays `begin` to `begin + count` from p about n.
+
+    dimension: the first of three for random numbers (see `rotation`). light_along: of (ray, its number i, a uniform
+    number for lots) π times the radiance that comes along it: with pdf cosθ/π, ∫ L cosθ dω is the mean of πL.
+    """
+    frame = mi.Frame3f(n)
+    offset = mi.Point2f(rotation(number, dimension), rotation(number, dimension + 1))
+    lobe = rotation(number, dimension + 2)
+    i = dr.opaque(mi.UInt32, begin)
+    end = i + dr.opaque(mi.UInt32, count)
+    even, odd = mi.Vector4f(0), mi.Vector4f(0)
+    while i < end:
+        d = mi.warp.square_to_cosine_hemisphere(r2(i, offset))
+        pick = lobe + mi.Float(i) * 0.6180339887498949
+        pick -= dr.floor(pick)
+        light = in_channels(light_along(mi.Ray3f(p, frame.to_world(d)), i, pick), d.z)
+        first = (i & 1) == 0
+        even += dr.select(first, light, 0)
+        odd += dr.select(first, 0, light)
+        i += 1
+    return even, odd
+
+
+def shaded_nearby(scene: Any, points: SurfacePoints, which: NDArray, within_m: float, rays: int) -> FloatArray:
+    """Part (n,) of the light from all sides that things less than `within_m` away would take, the farther the less."""
+    within, out = dr.opaque(mi.Float, within_m), np.zeros(len(which))
+
+    def taken_along(ray: Any, _: Any, __: Any) -> Any:
+        ray.maxt = within
+        pi = scene.ray_intersect_preliminary(ray, coherent=False)
+        return mi.Color3f(dr.select(pi.is_valid(), 1 - dr.square(pi.t / within), 0))
+
+    for begin, part, p, n, number in chunks(points, which, lambda _: None):
+        even, odd = about_normal(p, n, number, 0, rays, 0, taken_along)
+        out[begin : begin + len(part)] = np.array(even.x + odd.x) / rays
+    return out
+
+
+def chunks(
+    points: SurfacePoints, which: NDArray, report: Callable[[float], None], size: int = _CHUNK
+) -> Iterator[tuple[int, NDArray, Any, Any, Any]]:
+    """(first of them, their numbers, ray origins, normals and numbers on the device) of `which`, `size` at a time."""
+    origin, normal = points.on_device
+    for begin in range(0, len(which), size):
+        part = which[begin : begin + size]
+        number = mi.UInt32(aligned(part, np.uint32))
+        yield begin, part, dr.gather(mi.Point3f, origin, number), dr.gather(mi.Vector3f, normal, number), number
+        report(min(1.0, (begin + len(part)) / len(which)))
+
+
+# Sums (2, n, 4) over two halves of the samples `begin` to `begin + count` at some points, which it is told.
+Sampler = Callable[[IntArray, int, int, Callable[[float], None]], Float32Array]
+
+GREY_SLOPE = 0.21  # of sRGB at its middle, by the logarithm of light
+_TONE = 1 / 2.4  # sRGB goes by this power of light
+PATCH = 8.0  # spacings that noise's size is estimated over
+
+
+def part_of(report: Callable[[float], None], begin: float, span: float) -> Callable[[float], None]:
+    """Reports the progress of one part of a whole, which begins at `begin` of that and is `span` of it."""
+    return lambda fraction: report(begin + span * fraction)
+
+
+def standard_error(patch: IntArray, halves: NDArray) -> FloatArray:
+    """Standard error (n,) of the mean of two independent estimates (2, n, 4) in grey, of each point's patch (n,)."""
+    a, b = halves.mean(axis=2)
+    return np.sqrt((np.bincount(patch, (a - b) ** 2) / (4 * np.bincount(patch)))[patch])
+
+
+def typical(light: FloatArray) -> float:
+    """The light (n,) that a camera is exposed for: half of the places have more, those left out that hardly have any.
+
+    Hardly any is a hundredth of what the place has that half of all light falls short of; 0 where there is none at all.
+    """
+    return _typical(np.sort(light))
+
+
+def _typical(rising: FloatArray) -> float:
+    total = np.cumsum(rising)
+    if not len(rising) or total[-1] <= 0:
+        return 0.0
+    common = rising[np.searchsorted(total, 0.5 * total[-1])]
+    return float(np.median(rising[rising >= 0.01 * common]))
+
+
+def visible_error(patch: IntArray, sigma: FloatArray, grey: FloatArray) -> FloatArray:
+    """What an error sigma (n,) beside light `grey` (n,) amounts to, as a part of a mid-grey surface's light.
+
+    A camera is exposed for what is typical: in the shade of that, sRGB shows less of an error. In what is brighter than
+    that, as in what is overexposed, it is taken for no more.
+    """
+    size = np.bincount(patch)
+    return sigma * _visible_unit_error(size, np.bincount(patch, grey) / np.maximum(size, 1))[patch]
+
+
+def _visible_unit_error(size: IntArray, light: FloatArray) -> FloatArray:
+    """`visible_error` of an error of 1 in each of the patches, which have so many points and such light, (p,) each."""
+    order = np.argsort(light)
+    exposed = _typical(np.repeat(light[order], size[order]))
+    if exposed <= 0:
+        return np.zeros(len(light))
+    return np.minimum(np.maximum(light / exposed, 1e-12), 1.0) ** _TONE / np.maximum(light, 1e-30)
+
+
+def sampled_adaptively(
+    draw: Sampler, patch: IntArray, light: Callable[[NDArray], NDArray], scatter: float, first: int, rounds: int,
+    effort: float, report: Callable[[float], None],
+) -> tuple[Float32Array, FloatArray]:  # fmt: skip
+    """Means (2, n, 4) of the halves of what `draw` drew at n points, and the `visible_error` (n,) left.
+
+    patch: what each point's noise is estimated over. light: all the light (n,) of points, in grey, given what this kind
+    brings. After the first round, each draws as much again as all before it, where more than `scatter` is left, the
+    worst first while no more than `effort` samples a point are drawn on the average.
+    """
+    n, size = len(patch), np.bincount(patch)
+    sums, drawn = np.zeros((2, n, CHANNELS), np.float32), np.zeros(n, np.int64)
+    apart, grey, left = np.zeros((3, n))  # of a point's halves, squared; of their mean
+    todo: IntArray | slice = slice(None)
+    of_todo = np.arange(n)
+    for k in range(rounds):
+        begin = int(drawn[of_todo[0]])
+        count = first if k == 0 else begin
+        own = sums[:, todo] + draw(of_todo, begin, count, part_of(report, k / rounds, 1 / rounds))
+        sums[:, todo] = own
+        drawn[todo] += count
+        halves = own.mean(axis=2, dtype=np.float64) * (2 / (begin + count))
+        apart[todo], grey[todo] = (halves[0] - halves[1]) ** 2, halves.mean(axis=0)
+        # A patch's points have one error, so it is patches that are looked at.
+        sigma = np.sqrt(np.bincount(patch, apart) / np.maximum(4 * size, 1))
+        shows = sigma * _visible_unit_error(size, np.bincount(patch, light(grey)) / np.maximum(size, 1))
+        left = shows[patch]
+        of_todo = of_todo[left[of_todo] > scatter]
+        most = int(min(max(0.0, effort * n - drawn.sum()) / drawn.max(), n))
+        if len(of_todo) > most:
+            of_todo = np.sort(of_todo[np.argsort(-left[of_todo], kind="stable")[:most]])
+        todo = of_todo
+        if not len(of_todo):
+            break
+    report(1.0)
+    return np.divide(sums, drawn[:, None] / 2, out=sums), left
+
+
+def sampler_at(points: SurfacePoints, which: IntArray, sample: Callable[..., Any]) -> Sampler:
+    """A `Sampler` at the points `which`, from `sample(points on the device, their places in `which`, begin, count)`."""
+
+    def draw(todo: IntArray, begin: int, count: int, report: Callable[[float], None]) -> Float32Array:
+        out = np.zeros((2, len(todo), CHANNELS), np.float32)
+        for first, part, *at in chunks(points, which[todo], report):
+            here = slice(first, first + len(part))
+            sums = sample(at, todo[here], begin, count)
+            dr.eval(sums)
+            for half, k in np.ndindex(2, CHANNELS):
+                out[half, here, k] = np.array(sums[half][k])
+        return out
+
+    return draw
