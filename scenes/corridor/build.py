@@ -24,11 +24,10 @@ if str(_ROOT) not in sys.path:  # so that it also runs as a script from anywhere
 
 from scenes.corridor import layout, room  # noqa: E402
 from scenes.corridor.materials import materials  # noqa: E402
-from scenes.kit import scene_files  # noqa: E402
-from scenes.kit.pieces import Piece, surfaces  # noqa: E402
+from scenes.kit import room_files  # noqa: E402
+from scenes.kit.pieces import Piece, draw, kelvin, surfaces  # noqa: E402  # noqa: E402
 from scenes.kit.prints import town  # noqa: E402
-from scenes.kit.room_files import AreaLamp, look_at, write_room  # noqa: E402
-from scenes.kit.variants import command, draw, kelvin  # noqa: E402
+from scenes.kit.room_files import AreaLamp, Room, command, write_room  # noqa: E402
 
 LAMP_RADIANCE = 58.0
 SKY, GROUND = 2.0, 0.6
@@ -48,8 +47,8 @@ def contents(seed: int) -> tuple[list[Piece], list[AreaLamp]]:
         else:
             pieces.append(Piece(f"lamp {i}", housing))
             power = LAMP_RADIANCE * float(rng.uniform(0.8, 1.15))  # some tubes are older
-            lamps.append(AreaLamp(f"lamp_{i}", "diffuser", face, scene_files.radiance(tuple(power * colour))))
-    view = scene_files.radiance_map("textures/town.pfm")
+            lamps.append(AreaLamp(f"lamp_{i}", "diffuser", face, room_files.radiance(tuple(power * colour))))
+    view = room_files.radiance_map("textures/town.pfm")
     lamps.append(AreaLamp("window", "black", room.pane(), view, atlas=True))
     return pieces, lamps
 
@@ -63,13 +62,15 @@ def build(out: Path, seed: int = 0) -> Path:
     sky = float(draw(seed, "sky").uniform(0.6, 1.1))
     return write_room(
         out,
-        surfaces(pieces),
-        materials(seed),
-        lamps,
-        camera=look_at((9.5, 1.6, 0.2), (14.5, 1.2, -0.2)),
-        pictures={"town": town((768, 640), 920 + seed, SKY * sky, GROUND * sky)},
+        Room(
+            surfaces(pieces),
+            materials(seed),
+            lamps,
+            view=((9.5, 1.6, 0.2), (14.5, 1.2, -0.2)),
+            pictures={"town": town((768, 640), 920 + seed, SKY * sky, GROUND * sky)},
+        ),
     )
 
 
 if __name__ == "__main__":
-    command(build, "the corridor", Path(__file__).resolve().parent)
+    command(build, "the corridor", __file__)

@@ -8,10 +8,9 @@ from scenes.corridor import room
 from scenes.corridor.pictures import EXIT, FIRE, FLOOR_1, FLOOR_2, NOTICES, PLATES
 from scenes.corridor.stairs import LANDING
 from scenes.kit.fittings import bin_, board, cabinet, extinguisher, radiator, sign, switch
-from scenes.kit.pieces import Piece, stand
+from scenes.kit.pieces import Piece, draw, stand
 from scenes.kit.prints import atlas_rect
 from scenes.kit.shapes import Mesh, Parts, atlas_uv, box, merge, move_parts, quad, rotation, superellipsoid
-from scenes.kit.variants import draw
 from scenes.kit.walls import GAP
 
 _PINS = ("red", "black")

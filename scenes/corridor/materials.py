@@ -10,8 +10,8 @@ from scenes.corridor import pictures
 from scenes.kit import prints
 from scenes.kit import textures as tx
 from scenes.kit.materials import Material, plain, wood
+from scenes.kit.pieces import draw
 from scenes.kit.textures import Colour, Image
-from scenes.kit.variants import draw
 
 Painter = Callable[[tuple[int, int]], Image]
 Pair = tuple[Colour, Colour]

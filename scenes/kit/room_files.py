@@ -1,20 +1,113 @@
-"""Puts a room's surfaces, materials and lamps into the folder of a Mitsuba 3 scene: scene.xml, meshes/, textures/."""
+"""A room's folder, scene.xml, meshes/ and textures/, from its surfaces, materials and lamps; and its build command."""
 
 from __future__ import annotations
 
+import argparse
+import inspect
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from xml.sax.saxutils import quoteattr
 
 import cv2
 import numpy as np
 
-from scenes.kit import scene_files
 from scenes.kit.materials import Material, texture
 from scenes.kit.shapes import Mesh, Parts, merge
 
+Point = tuple[float, float, float]
 ICL_FOV = float(np.degrees(2 * np.arctan(320 / 481.2)))  # width of ICL-NUIM's image, degrees
+_HEADER = """ply
+format binary_little_endian 1.0
+element vertex {vertices}
+property float x
+property float y
+property float z
+property float nx
+property float ny
+property float nz
+property float u
+property float v
+element face {faces}
+property list uchar int vertex_indices
+end_header
+"""
+
+
+def write_ply(path: Path, mesh: Mesh, tile: tuple[float, float]) -> None:
+    """Binary PLY with normals and texture coordinates (metres / tile; v downwards, as Mitsuba's bitmaps want it)."""
+    table = np.concatenate([mesh.v, mesh.n, mesh.uv / np.asarray(tile)], axis=1).astype("<f4")
+    faces = np.empty(len(mesh.f), dtype=[("n", "u1"), ("i", "<i4", 3)])
+    faces["n"], faces["i"] = 3, mesh.f
+    head = _HEADER.format(vertices=len(table), faces=len(faces)).encode()
+    path.write_bytes(head + table.tobytes() + faces.tobytes())
+
+
+def write_pfm(path: Path, image: np.ndarray) -> None:
+    """Portable float map of a linear (h, w, 3) image, rows bottom up as the format says."""
+    h, w, _ = image.shape
+    path.write_bytes(f"PF\n{w} {h}\n-1.0\n".encode() + np.ascontiguousarray(image[::-1], "<f4").tobytes())
+
+
+def bsdf(name: str, material: Material) -> str:
+    """XML of one BSDF with the id `name`, two-sided but for glass."""
+    if material.glass:
+        return f'  <bsdf type="thindielectric" id={quoteattr(name)}/>'
+    if material.metal:
+        inner = (
+            f'<bsdf type="roughconductor"><string name="material" value="{material.metal}"/>'
+            f'<string name="distribution" value="ggx"/><float name="alpha" value="{material.alpha}"/></bsdf>'
+        )
+    else:
+        kind, slot, extra = "diffuse", "reflectance", ""
+        if material.alpha > 0:
+            kind, slot = "roughplastic", "diffuse_reflectance"
+            extra = f'<string name="distribution" value="ggx"/><float name="alpha" value="{material.alpha}"/>'
+        image = f'<string name="filename" value="textures/{name}.png"/>'
+        inner = f'<bsdf type="{kind}">{extra}<texture type="bitmap" name="{slot}">{image}</texture></bsdf>'
+    return f'  <bsdf type="twosided" id={quoteattr(name)}>{inner}</bsdf>'
+
+
+def shape(name: str, material: str, emitter: str = "") -> str:
+    """XML of the shape meshes/`name`.ply with the BSDF `material` and, if any, an area emitter's radiance."""
+    light = f'<emitter type="area">{emitter}</emitter>' if emitter else ""
+    return (
+        f'  <shape type="ply" id={quoteattr("mesh_" + name)}><string name="filename" value="meshes/{name}.ply"/>'
+        f"<ref id={quoteattr(material)}/>{light}</shape>"
+    )
+
+
+def radiance(rgb: tuple[float, float, float]) -> str:
+    """Constant radiance (linear sRGB) of an area emitter."""
+    return f'<rgb name="radiance" value="{rgb[0]:g} {rgb[1]:g} {rgb[2]:g}"/>'
+
+
+def radiance_map(filename: str) -> str:
+    """Radiance from a float image of linear values."""
+    return (
+        f'<texture type="bitmap" name="radiance"><string name="filename" value="{filename}"/>'
+        '<boolean name="raw" value="true"/></texture>'
+    )
+
+
+def document(bsdfs: list[str], shapes: list[str], to_world: np.ndarray, fov: float) -> str:
+    """The scene file: path integrator, ICL-NUIM's camera at `to_world` (4, 4), `fov` its width in degrees."""
+    matrix = " ".join(f"{x:.9g}" for x in np.asarray(to_world).reshape(-1))
+    lines = [
+        '<scene version="3.0.0">',
+        '  <default name="spp" value="64"/>',
+        '  <integrator type="path"><integer name="max_depth" value="12"/></integrator>',
+        f'  <sensor type="perspective"><float name="fov" value="{fov:.9g}"/><string name="fov_axis" value="x"/>',
+        f'    <transform name="to_world"><matrix value="{matrix}"/></transform>',
+        '    <sampler type="independent"><integer name="sample_count" value="$spp"/></sampler>',
+        '    <film type="hdrfilm"><integer name="width" value="640"/><integer name="height" value="480"/>',
+        '      <rfilter type="box"/></film></sensor>',
+        *bsdfs,
+        *shapes,
+        "</scene>",
+    ]
+    return "\n".join(lines) + "\n"
 
 
 @dataclass(frozen=True)
@@ -31,7 +124,7 @@ class AreaLamp:
     atlas: bool = False
 
 
-def look_at(eye: tuple[float, float, float], target: tuple[float, float, float]) -> np.ndarray:
+def look_at(eye: Point, target: Point) -> np.ndarray:
     """(4, 4) to_world of a Mitsuba camera (x left, y up, z forward) that looks from `eye` to `target`."""
     forward = np.subtract(target, eye)
     forward /= np.linalg.norm(forward)
@@ -42,44 +135,68 @@ def look_at(eye: tuple[float, float, float], target: tuple[float, float, float])
     return pose
 
 
-def write_room(
-    out: Path,
-    surfaces: Parts,
-    materials: Mapping[str, Material],
-    lamps: Sequence[AreaLamp],
-    *,
-    camera: np.ndarray,
-    pictures: Mapping[str, np.ndarray] | None = None,
-) -> Path:
-    """Write the scene into the folder `out` (made if need be) and return the path of its scene.xml, written last.
+@dataclass(frozen=True)
+class Room:
+    """A room's surfaces by material, its materials by name, its lamps, and the view that its file opens with.
 
-    One mesh for all surfaces of a material. `camera`: (4, 4) to_world of the view that the file opens with; `pictures`:
-    linear (h, w, 3) images by name, written as textures/NAME.pfm, for lamps' radiance. Raises OSError if the folder
-    cannot be written, KeyError for a material that is not in `materials`.
+    view: eye and target, m. pictures: linear (h, w, 3) images by name, for lamps' radiance.
     """
-    out = Path(out)
+
+    surfaces: Parts
+    materials: Mapping[str, Material]
+    lamps: Sequence[AreaLamp]
+    view: tuple[Point, Point]
+    pictures: Mapping[str, np.ndarray]
+
+
+def write_room(out: Path, room: Room) -> Path:
+    """Write the room into the folder `out` (made if need be) and return the path of its scene.xml, written last.
+
+    One mesh for all surfaces of a material; pictures as textures/NAME.pfm. Raises OSError if the folder cannot be
+    written, KeyError for a material that is not in the room's.
+    """
+    materials = room.materials
     (out / "scene.xml").unlink(missing_ok=True)
     for folder in ("meshes", "textures"):
         shutil.rmtree(out / folder, ignore_errors=True)
         (out / folder).mkdir(parents=True)
-    used = sorted({name for name, _ in surfaces} | {lamp.material for lamp in lamps})
+    used = sorted({name for name, _ in room.surfaces} | {lamp.material for lamp in room.lamps})
     shapes = []
     for name in used:
-        own = [mesh for material, mesh in surfaces if material == name]
+        own = [mesh for material, mesh in room.surfaces if material == name]
         if own:
-            scene_files.write_ply(out / "meshes" / f"{name}.ply", merge(own), materials[name].tile)
-            shapes.append(scene_files.shape(name, name))
-    for lamp in lamps:
+            write_ply(out / "meshes" / f"{name}.ply", merge(own), materials[name].tile)
+            shapes.append(shape(name, name))
+    for lamp in room.lamps:
         tile = (1.0, 1.0) if lamp.atlas else materials[lamp.material].tile
-        scene_files.write_ply(out / "meshes" / f"{lamp.name}.ply", lamp.mesh, tile)
-        shapes.append(scene_files.shape(lamp.name, lamp.material, lamp.radiance))
+        write_ply(out / "meshes" / f"{lamp.name}.ply", lamp.mesh, tile)
+        shapes.append(shape(lamp.name, lamp.material, lamp.radiance))
     for name in used:
         if materials[name].paint is not None:
             image = texture(materials[name])
             cv2.imwrite(str(out / "textures" / f"{name}.png"), image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 6])
-    for name, image in (pictures or {}).items():
-        scene_files.write_pfm(out / "textures" / f"{name}.pfm", image)
-    bsdfs = [scene_files.bsdf(name, materials[name]) for name in used]
+    for name, image in room.pictures.items():
+        write_pfm(out / "textures" / f"{name}.pfm", image)
+    bsdfs = [bsdf(name, materials[name]) for name in used]
     path = out / "scene.xml"
-    path.write_text(scene_files.document(bsdfs, shapes, camera, ICL_FOV))
+    path.write_text(document(bsdfs, shapes, look_at(*room.view), ICL_FOV))
     return path
+
+
+def command(build: Callable[..., Path], what: str, script: str) -> None:
+    """Command line of a build script: --out, by default the script's folder, and --seed where `build` takes one.
+
+    Prints the path of the scene's file.
+    """
+    folder = Path(script).resolve().parent
+    parser = argparse.ArgumentParser(description=f"Build {what} as a Mitsuba 3 scene.")
+    parser.add_argument("--out", type=Path, help="folder to write to (default: this script's, or its seedN)")
+    if "seed" in inspect.signature(build).parameters:
+        parser.epilog = "A config names a variant by its folder: ROOM/seed3/scene.xml is built with --seed 3 if absent."
+        parser.add_argument("--seed", type=int, default=0, help="variant: arrangement, colours, lamps (default: 0)")
+    words = vars(parser.parse_args())
+    seed = words.get("seed", 0)
+    if seed < 0:
+        parser.error(f"--seed {seed}: give 0 or more")
+    words["out"] = words["out"] or (folder / f"seed{seed}" if seed else folder)
+    print(build(**words))

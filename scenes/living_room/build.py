@@ -14,7 +14,6 @@ Solids, noise, wood, cloth and the writing of files are in scenes/kit.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 
@@ -24,8 +23,8 @@ _ROOT = Path(__file__).resolve().parents[2]
 if str(_ROOT) not in sys.path:  # so that it also runs as a script from anywhere
     sys.path.insert(0, str(_ROOT))
 
-from scenes.kit import scene_files  # noqa: E402
-from scenes.kit.room_files import AreaLamp, look_at, write_room  # noqa: E402
+from scenes.kit import room_files  # noqa: E402
+from scenes.kit.room_files import AreaLamp, Room, command, write_room  # noqa: E402
 from scenes.kit.shapes import Mesh, Parts  # noqa: E402
 from scenes.living_room import layout, pictures, room  # noqa: E402
 from scenes.living_room.materials import MATERIALS  # noqa: E402
@@ -49,30 +48,25 @@ def build(out: Path) -> Path:
     Raises OSError if the folder cannot be written.
     """
     surfaces, shades, discs = parts()
-    shade, spot = scene_files.radiance(SHADE_RADIANCE), SPOT_COLOUR
+    shade, spot = room_files.radiance(SHADE_RADIANCE), SPOT_COLOUR
     lamps = [AreaLamp(f"lamp_shade_{i}", "shade", mesh, shade) for i, mesh in enumerate(shades)]
     lamps += [
-        AreaLamp(f"spot_{i}", "black", mesh, scene_files.radiance(tuple(power * spot)))
+        AreaLamp(f"spot_{i}", "black", mesh, room_files.radiance(tuple(power * spot)))
         for i, (mesh, power) in enumerate(discs)
     ]
-    garden = scene_files.radiance_map("textures/garden.pfm")
+    garden = room_files.radiance_map("textures/garden.pfm")
     lamps.append(AreaLamp("window_pane", "black", room.pane(), garden, atlas=True))
     return write_room(
         out,
-        surfaces,
-        MATERIALS,
-        lamps,
-        camera=look_at((-1.6, 1.55, 1.9), (0.7, 0.75, -0.9)),
-        pictures={"garden": pictures.garden((512, 512), 901, SKY, GROUND)},
+        Room(
+            surfaces,
+            MATERIALS,
+            lamps,
+            view=((-1.6, 1.55, 1.9), (0.7, 0.75, -0.9)),
+            pictures={"garden": pictures.garden((512, 512), 901, SKY, GROUND)},
+        ),
     )
 
 
-def main() -> None:
-    """Command line: build into --out, by default this script's own folder."""
-    parser = argparse.ArgumentParser(description="Build the living room as a Mitsuba 3 scene.")
-    parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parent, help="folder to write to")
-    print(build(parser.parse_args().out))
-
-
 if __name__ == "__main__":
-    main()
+    command(build, "the living room", __file__)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from scenes.kit.plants import bowl, thrown
 from scenes.kit.shapes import (
     Mesh,
     Parts,
@@ -19,7 +20,6 @@ from scenes.kit.shapes import (
     superellipsoid,
     tube,
 )
-from scenes.kit.vessels import bowl, thrown
 from scenes.living_room.pictures import painting_rect
 from scenes.living_room.room import GAP
 

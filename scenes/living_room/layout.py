@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from scenes.kit.plants import palm
+from scenes.kit.plants import bowl, mug, palm, vase
 from scenes.kit.shapes import Mesh, Parts, move, move_parts, rotation
-from scenes.kit.vessels import bowl, mug, vase
 from scenes.living_room import furniture as fu
 from scenes.living_room.decor import RUG, basket, fruit_bowl, picture, rug, wall_clock
 from scenes.living_room.room import BACK, FLOOR, FRONT, GAP, LEFT, RIGHT

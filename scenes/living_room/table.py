@@ -10,10 +10,8 @@ equal byte for byte. All of it is diffuse.
 
 from __future__ import annotations
 
-import argparse
 import shutil
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -22,7 +20,9 @@ _ROOT = Path(__file__).resolve().parents[2]
 if str(_ROOT) not in sys.path:  # so that it also runs as a script from anywhere
     sys.path.insert(0, str(_ROOT))
 
-from scenes.kit import materials, scene_files  # noqa: E402
+from scenes.kit import materials  # noqa: E402
+from scenes.kit.pieces import Piece  # noqa: E402
+from scenes.kit.room_files import command, write_ply  # noqa: E402
 from scenes.kit.shapes import Parts, merge, move_parts, rotation  # noqa: E402
 from scenes.living_room import build as room  # noqa: E402
 from scenes.living_room import table_objects as ob  # noqa: E402
@@ -35,20 +35,6 @@ ABOUT = "The living room with its table set: everyday things with fine print"
 REST = 0.0003  # kept between a thing and what it stands on
 TABLE = (0.50, 0.72)  # x, z of the table's middle; its top is 0.70 m by 1.15 m
 LEVELS = {"table": 0.54, "rug": ON_FLOOR + RUG - 0.0009, "floor": FLOOR}  # heights; the rug's is its crests'
-
-
-@dataclass(frozen=True)
-class Thing:
-    """A thing in its place in the world frame, and the name of what it stands on (a level or another thing)."""
-
-    name: str
-    parts: Parts
-    on: str
-
-    @property
-    def top(self) -> float:
-        """Height of its highest point, m."""
-        return max(float(mesh.v[:, 1].max()) for _, mesh in self.parts)
 
 
 def _arrangement() -> list[tuple[str, Parts, str, float, float, float]]:
@@ -90,13 +76,13 @@ def _arrangement() -> list[tuple[str, Parts, str, float, float, float]]:
     ]  # fmt: skip
 
 
-def things() -> list[Thing]:
+def things() -> list[Piece]:
     """Everything that table.xml adds to the room, in place."""
     tops, out = dict(LEVELS), []
     for name, parts, on, x, z, turn in _arrangement():
         at = (TABLE[0] + x, tops[on] + REST, TABLE[1] + z)
-        thing = Thing(name, move_parts(parts, at, rotation("y", turn)), on)
-        tops[name] = thing.top
+        thing = Piece(name, move_parts(parts, at, rotation("y", turn)), on)
+        tops[name] = float(thing.bounds[1, 1])
         out.append(thing)
     return out
 
@@ -106,7 +92,6 @@ def build(out: Path) -> Path:
 
     Returns the path of table.xml, written last. Raises OSError if the folder cannot be written.
     """
-    out = Path(out)
     (out / "table.xml").unlink(missing_ok=True)
     folder = out / "objects"
     shutil.rmtree(folder, ignore_errors=True)
@@ -114,7 +99,7 @@ def build(out: Path) -> Path:
     parts = [part for thing in things() for part in thing.parts]
     lines = ['<scene version="3.0.0">', '  <include filename="scene.xml"/>']
     for name, material in OBJECT_MATERIALS.items():
-        scene_files.write_ply(folder / f"{name}.ply", merge([m for used, m in parts if used == name]), material.tile)
+        write_ply(folder / f"{name}.ply", merge([m for used, m in parts if used == name]), material.tile)
         image = materials.texture(material)[..., ::-1]
         # A quarter of the PNG's size; without the halved chroma that blurs small coloured print.
         quality = [cv2.IMWRITE_JPEG_QUALITY, 92, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
@@ -130,15 +115,12 @@ def build(out: Path) -> Path:
     return path
 
 
-def main() -> None:
-    """Command line: build into --out, by default this script's own folder; the room too where it is missing."""
-    parser = argparse.ArgumentParser(description="Build the living room's table scene for Mitsuba 3.")
-    parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parent, help="folder to write to")
-    out = parser.parse_args().out
+def build_with_room(out: Path) -> Path:
+    """`build`, and the room beside it if its scene.xml is missing."""
     if not (out / "scene.xml").is_file():
         room.build(out)
-    print(build(out))
+    return build(out)
 
 
 if __name__ == "__main__":
-    main()
+    command(build_with_room, "the living room with its table set", __file__)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from scenes.kit.plants import mug
 from scenes.kit.shapes import (
     Array,
     Mesh,
@@ -25,7 +26,6 @@ from scenes.kit.shapes import (
     superellipsoid,
     tube,
 )
-from scenes.kit.vessels import mug
 from scenes.living_room.table_prints import CARDS, CARTONS, COVERS, LETTERS, SPINE, Rect, cell
 
 _WRAP = (1.0, 0.0, 0.0, 1.0)  # a lathe's azimuth runs to the left of who looks at it

@@ -22,11 +22,10 @@ _ROOT = Path(__file__).resolve().parents[2]
 if str(_ROOT) not in sys.path:  # so that it also runs as a script from anywhere
     sys.path.insert(0, str(_ROOT))
 
-from scenes.kit import scene_files  # noqa: E402
-from scenes.kit.pieces import Piece, surfaces  # noqa: E402
+from scenes.kit import room_files  # noqa: E402
+from scenes.kit.pieces import Piece, draw, kelvin, surfaces  # noqa: E402  # noqa: E402
 from scenes.kit.prints import town  # noqa: E402
-from scenes.kit.room_files import AreaLamp, look_at, write_room  # noqa: E402
-from scenes.kit.variants import command, draw, kelvin  # noqa: E402
+from scenes.kit.room_files import AreaLamp, Room, command, write_room  # noqa: E402
 from scenes.office import layout, pictures, room  # noqa: E402
 from scenes.office.materials import materials  # noqa: E402
 
@@ -49,14 +48,14 @@ def contents(seed: int) -> tuple[list[Piece], list[AreaLamp]]:
         housing, face = room.panel(*place)
         pieces.append(Piece(f"panel {i}", housing if on[i] else [*housing, ("diffuser", face)]))
         if on[i]:
-            lamps.append(AreaLamp(f"panel_{i}", "diffuser", face, scene_files.radiance(tuple(power * colour))))
-    glow = scene_files.radiance_map("textures/screens.pfm")
+            lamps.append(AreaLamp(f"panel_{i}", "diffuser", face, room_files.radiance(tuple(power * colour))))
+    glow = room_files.radiance_map("textures/screens.pfm")
     for i, screen in enumerate(arrangement.screens):
         if rng.uniform() < 0.75:
             lamps.append(AreaLamp(f"screen_{i}", "plastic", screen, glow, atlas=True))
         else:
             pieces.append(Piece(f"dark screen {i}", [("dark_glass", screen)]))
-    view = scene_files.radiance_map("textures/town.pfm")
+    view = room_files.radiance_map("textures/town.pfm")
     lamps += [AreaLamp(f"window_{i}", "black", pane, view, atlas=True) for i, pane in enumerate(room.panes())]
     return pieces, lamps
 
@@ -70,16 +69,18 @@ def build(out: Path, seed: int = 0) -> Path:
     sky = float(draw(seed, "sky").uniform(0.6, 1.1))
     return write_room(
         out,
-        surfaces(pieces),
-        materials(seed),
-        lamps,
-        camera=look_at((-3.2, 1.6, -2.5), (0.4, 0.8, 0.9)),
-        pictures={
-            "screens": SCREEN_RADIANCE * pictures.screens((640, 2048), 900 + seed),
-            "town": town((512, 768), 910 + seed, SKY * sky, GROUND * sky),
-        },
+        Room(
+            surfaces(pieces),
+            materials(seed),
+            lamps,
+            view=((-3.2, 1.6, -2.5), (0.4, 0.8, 0.9)),
+            pictures={
+                "screens": SCREEN_RADIANCE * pictures.screens((640, 2048), 900 + seed),
+                "town": town((512, 768), 910 + seed, SKY * sky, GROUND * sky),
+            },
+        ),
     )
 
 
 if __name__ == "__main__":
-    command(build, "the office", Path(__file__).resolve().parent)
+    command(build, "the office", __file__)

@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 
+from scenes.kit.plants import mug
 from scenes.kit.prints import atlas_rect
 from scenes.kit.shapes import (
     Mesh,
@@ -22,7 +23,6 @@ from scenes.kit.shapes import (
     superellipsoid,
     tube,
 )
-from scenes.kit.vessels import mug
 from scenes.kit.walls import GAP
 from scenes.office.pictures import PAGES, SCREENS
 

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from scenes.kit.fittings import cabinet
-from scenes.kit.pieces import Piece, stand
+from scenes.kit.pieces import Piece, draw, stand
 from scenes.kit.plants import palm
 from scenes.kit.shapes import Mesh, Parts, move, move_parts, rotation
-from scenes.kit.variants import draw
 from scenes.kit.walls import GAP
 from scenes.office import equipment as eq
 from scenes.office import furniture as fu

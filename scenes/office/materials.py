@@ -10,8 +10,8 @@ from scipy.special import expit
 from scenes.kit import prints
 from scenes.kit import textures as tx
 from scenes.kit.materials import Material, fabric, plain, wood
+from scenes.kit.pieces import draw
 from scenes.kit.textures import Colour, Image
-from scenes.kit.variants import draw
 from scenes.office import pictures
 
 Painter = Callable[[tuple[int, int]], Image]

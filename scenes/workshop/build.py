@@ -18,7 +18,6 @@ Solids, noise, wood, cloth and the writing of files are in scenes/kit.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 
@@ -28,8 +27,8 @@ _ROOT = Path(__file__).resolve().parents[2]
 if str(_ROOT) not in sys.path:  # so that it also runs as a script from anywhere
     sys.path.insert(0, str(_ROOT))
 
-from scenes.kit import scene_files  # noqa: E402
-from scenes.kit.room_files import AreaLamp, look_at, write_room  # noqa: E402
+from scenes.kit import room_files  # noqa: E402
+from scenes.kit.room_files import AreaLamp, Room, command, write_room  # noqa: E402
 from scenes.kit.shapes import Mesh, Parts  # noqa: E402
 from scenes.workshop import drawings, hall, layout  # noqa: E402
 from scenes.workshop.materials import materials  # noqa: E402
@@ -57,33 +56,26 @@ def build(out: Path, seed: int = 0) -> Path:
     tone = np.array([1.0, 0.94, 0.82]) if rng.uniform() < 0.5 else np.array([0.94, 1.0, 0.98])
     day = float(rng.uniform(0.8, 1.2))
     lamps = [
-        AreaLamp(f"lamp_{i}", "black", mesh, scene_files.radiance(tuple(LAMP_RADIANCE * share * tone)))
+        AreaLamp(f"lamp_{i}", "black", mesh, room_files.radiance(tuple(LAMP_RADIANCE * share * tone)))
         for i, (mesh, share) in enumerate(discs)
     ]
     pictures = {}
     for name, side, light in (("south", -1, 1.1), ("north", 1, 0.8)):
-        sky = scene_files.radiance_map(f"textures/sky_{name}.pfm")
+        sky = room_files.radiance_map(f"textures/sky_{name}.pfm")
         lamps.append(AreaLamp(f"panes_{name}", "black", hall.panes(side), sky, atlas=True))
         level = day * light
         pictures[f"sky_{name}"] = drawings.sky((64, 1024), 900 + 10 * seed + side, SKY * level, HORIZON * level)
     return write_room(
         out,
-        surfaces,
-        materials(seed),
-        lamps,
-        camera=look_at((-8.9, 1.65, 0.6), (0.0, 1.2, -0.8)),
-        pictures=pictures,
+        Room(
+            surfaces,
+            materials(seed),
+            lamps,
+            view=((-8.9, 1.65, 0.6), (0.0, 1.2, -0.8)),
+            pictures=pictures,
+        ),
     )
 
 
-def main() -> None:
-    """Command line: build into --out, by default this script's own folder."""
-    parser = argparse.ArgumentParser(description="Build the workshop as a Mitsuba 3 scene.")
-    parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parent, help="folder to write to")
-    parser.add_argument("--seed", type=int, default=0, help="another seed, another workshop (default: 0)")
-    given = parser.parse_args()
-    print(build(given.out, given.seed))
-
-
 if __name__ == "__main__":
-    main()
+    command(build, "the workshop", __file__)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from scenes.kit.pieces import Piece
 from scenes.kit.shapes import Mesh, Parts, box, move_parts, rotation
 from scenes.workshop import benches as be
 from scenes.workshop import hall, services
@@ -22,17 +21,8 @@ LAMPS_X, LAMP_Z, LAMP_Y = (-8.0, -4.0, 0.0, 4.0, 8.0), 2.5, 4.16
 _LONGEST_DROP = 0.5
 
 
-@dataclass(frozen=True)
-class Thing:
-    """A thing in its place in the world frame. hangs: on a wall, a column or the roof rather than standing."""
-
-    name: str
-    parts: Parts
-    hangs: bool = False
-
-
-def things(seed: int) -> list[Thing]:
-    """Everything that could be carried out of the hall."""
+def things(seed: int) -> list[Piece]:
+    """Everything that could be carried out of the hall; `on` is "building" where it hangs on a wall or the roof."""
     rng = np.random.default_rng([seed, 2])
     return [*_islands(rng), *_along_walls(rng), *_end_wall(rng), *_on_walls(rng)]
 
@@ -71,7 +61,7 @@ def _machine_paint(rng: np.random.Generator) -> str:
     return f"machine_{'abc'[int(rng.integers(3))]}"
 
 
-def _islands(rng: np.random.Generator) -> list[Thing]:
+def _islands(rng: np.random.Generator) -> list[Piece]:
     """Two rows of six islands: machine tools, a bench, pallets."""
     kinds = [
         "lathe", "lathe", "mill", "mill", "drill grinder", "saw pallet", "press drum", "drill drill", "bench", "lathe",
@@ -95,7 +85,7 @@ def _islands(rng: np.random.Generator) -> list[Thing]:
                 half = 0.75 if long else 0.45
                 mat = box([-half, 0.001, 0.0], [half, 0.013, 0.42])
                 placed = move_parts([("mat", mat)], (at, 0, z + front * 0.56), rotation("y", facing))
-                out.append(Thing(f"mat of {name}", placed))
+                out.append(Piece(f"mat of {name}", placed))
             elif word == "bench":
                 out += _bench(name, at, z, facing, rng)
                 continue
@@ -103,21 +93,21 @@ def _islands(rng: np.random.Generator) -> list[Thing]:
                 parts, turn = st.loaded_pallet(rng), float(rng.choice([90, 270])) + float(rng.uniform(-3, 3))
             else:
                 parts = st.drum(("drum_a", "drum_b")[int(rng.integers(2))])
-            out.append(Thing(name, move_parts(parts, (at, GAP, z + shift), rotation("y", turn))))
+            out.append(Piece(name, move_parts(parts, (at, GAP, z + shift), rotation("y", turn))))
     return out
 
 
-def _bench(name: str, x: float, z: float, facing: float, rng: np.random.Generator) -> list[Thing]:
+def _bench(name: str, x: float, z: float, facing: float, rng: np.random.Generator) -> list[Piece]:
     """A workbench with its vice and what lies on it; (x, z): its middle."""
     turn = rotation("y", facing)
     left = bool(rng.integers(2))
     width = 2.0
 
-    def put(what: str, parts: Parts, along: float, across: float, degrees: float, level: float = be.BENCH_TOP) -> Thing:
+    def put(what: str, parts: Parts, along: float, across: float, degrees: float, level: float = be.BENCH_TOP) -> Piece:
         local = move_parts(parts, (along, level + 2 * GAP, across), rotation("y", degrees))
-        return Thing(f"{what} on {name}", move_parts(local, (x, 0, z), turn))
+        return Piece(f"{what} on {name}", move_parts(local, (x, 0, z), turn))
 
-    out = [Thing(name, move_parts(be.workbench(width, "drawer", left), (x, GAP, z), turn))]
+    out = [Piece(name, move_parts(be.workbench(width, "drawer", left), (x, GAP, z), turn))]
     end = 0.80 if left else -0.80
     out.append(put("vice", be.vice(_machine_paint(rng)), end, 0.18, 0.0))
     slots = np.linspace(-0.84, 0.84, 7)
@@ -147,32 +137,32 @@ def _bench(name: str, x: float, z: float, facing: float, rng: np.random.Generato
     return out
 
 
-def _along_walls(rng: np.random.Generator) -> list[Thing]:
+def _along_walls(rng: np.random.Generator) -> list[Piece]:
     """What stands in the ten bays between the columns: benches under their tool boards, racks, lockers, stock."""
     kinds = ["bench", "bench", "bench", "bench", "racks", "racks", "racks", "lockers", "bars", "pallets"]
     places = [(x, side) for side in (-1, 1) for x in BAYS_X]
-    out: list[Thing] = []
+    out: list[Piece] = []
     for (x, side), i in zip(places, rng.permutation(len(kinds)).tolist(), strict=True):
         out += _bay(kinds[i], x, side, rng)
     return out
 
 
-def _bay(kind: str, x: float, side: int, rng: np.random.Generator) -> list[Thing]:
+def _bay(kind: str, x: float, side: int, rng: np.random.Generator) -> list[Piece]:
     """What stands in the bay about x at the wall z = side * WIDE."""
     facing, name = 0 if side < 0 else 180, f"{kind} at wall {x:g} {side}"
     flip, jitter = -1.0 if rng.uniform() < 0.5 else 1.0, float(rng.uniform(-0.06, 0.06))
-    out: list[Thing] = []
+    out: list[Piece] = []
 
     def stand(what: str, parts: Parts, along: float, half_depth: float, degrees: float = 0.0) -> None:
         where = (x + flip * along, GAP, side * (BACK - half_depth))
-        out.append(Thing(f"{what} of {name}", move_parts(parts, where, rotation("y", facing + degrees))))
+        out.append(Piece(f"{what} of {name}", move_parts(parts, where, rotation("y", facing + degrees))))
 
     if kind == "bench":
         middle = x + flip * (0.55 + jitter)
         out += _bench(name, middle, side * (BACK - 0.37), facing, rng)
         wall = (middle, 1.56, side * (hall.WIDE - GAP))
         board = be.tool_board(1.9, 0.88, rng)
-        out.append(Thing(f"board of {name}", move_parts(board, wall, rotation("y", facing)), True))
+        out.append(Piece(f"board of {name}", move_parts(board, wall, rotation("y", facing)), "building"))
         other = int(rng.integers(4))
         if other == 0:
             stand("locker", st.locker("locker"), -1.15, 0.24)
@@ -200,32 +190,32 @@ def _bay(kind: str, x: float, side: int, rng: np.random.Generator) -> list[Thing
     return out
 
 
-def _end_wall(rng: np.random.Generator) -> list[Thing]:
+def _end_wall(rng: np.random.Generator) -> list[Piece]:
     """Switch cabinets, a notice board and a few things at the wall x = -LONG; pallets and drums beside the door."""
     turn, wall = rotation("y", 90), -hall.LONG
     out = [
-        Thing(f"cabinet {k}", move_parts(services.cabinet(2 + k), (wall + GAP, GAP, 1.6 + 0.85 * k), turn))
+        Piece(f"cabinet {k}", move_parts(services.cabinet(2 + k), (wall + GAP, GAP, 1.6 + 0.85 * k), turn))
         for k in range(2)
     ]
-    out.append(Thing("notice board", move_parts(services.notice_board(rng), (wall, 1.65, -0.2), turn), True))
-    out.append(Thing("wall rack", move_parts(st.rack(1.6, "rack", rng), (wall + 0.38, GAP, -2.6), turn)))
+    out.append(Piece("notice board", move_parts(services.notice_board(rng), (wall, 1.65, -0.2), turn), "building"))
+    out.append(Piece("wall rack", move_parts(st.rack(1.6, "rack", rng), (wall + 0.38, GAP, -2.6), turn)))
     for k, z in enumerate((-4.0, -4.75)):
         if rng.uniform() < 0.8:
-            out.append(Thing(f"drum at end {k}", move_parts(st.drum(f"drum_{'ab'[k]}"), (wall + 0.42, GAP, z))))
+            out.append(Piece(f"drum at end {k}", move_parts(st.drum(f"drum_{'ab'[k]}"), (wall + 0.42, GAP, z))))
     turn, wall = rotation("y", -90), hall.LONG
-    out.append(Thing("door bin", move_parts(st.waste_bin("drum_b"), (wall - 0.36, GAP, 2.2), turn)))
+    out.append(Piece("door bin", move_parts(st.waste_bin("drum_b"), (wall - 0.36, GAP, 2.2), turn)))
     for k, (z, index) in enumerate(((2.0, 5), (2.5, 8), (4.6, 3), (4.6, 4), (-3.3, 1), (-3.8, 0))):
         high = 1.75 if k != 3 else 1.32
-        out.append(Thing(f"door sign {k}", move_parts(services.sign(index, 0.40), (wall, high, z), turn), True))
+        out.append(Piece(f"door sign {k}", move_parts(services.sign(index, 0.40), (wall, high, z), turn), "building"))
     return out
 
 
-def _on_walls(rng: np.random.Generator) -> list[Thing]:
-    out = [Thing(name, parts, True) for name, parts in services.on_columns(rng)]
+def _on_walls(rng: np.random.Generator) -> list[Piece]:
+    out = [Piece(name, parts, "building") for name, parts in services.on_columns(rng)]
     for side in (-1, 1):
         turn = rotation("y", 0 if side < 0 else 180)
-        out.append(Thing(f"pipes {side}", services.pipes(side), True))
+        out.append(Piece(f"pipes {side}", services.pipes(side), "building"))
         for i, c in enumerate(hall.COLUMNS):
             at = (c + 0.0, 0.0, side * (hall.WIDE - GAP))
-            out.append(Thing(f"switch box {side} {i}", move_parts(services.switch_box(rng), at, turn), True))
+            out.append(Piece(f"switch box {side} {i}", move_parts(services.switch_box(rng), at, turn), "building"))
     return out

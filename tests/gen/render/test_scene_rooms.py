@@ -15,10 +15,9 @@ import trimesh
 
 from scenes.corridor import build as corridor
 from scenes.kit.materials import Material, texture
-from scenes.kit.pieces import Piece
+from scenes.kit.pieces import Piece, kelvin
 from scenes.kit.room_files import AreaLamp
 from scenes.kit.shapes import box
-from scenes.kit.variants import kelvin
 from scenes.office import build as office
 
 BOUNDS = {

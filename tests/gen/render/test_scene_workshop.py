@@ -14,6 +14,7 @@ from test_scene_living_room import digest
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from scenes.kit.materials import Material, texture
+from scenes.kit.pieces import Piece
 from scenes.kit.shapes import Mesh, box, merge, move
 from scenes.workshop import build as scene
 from scenes.workshop import hall, layout
@@ -24,14 +25,14 @@ EMBEDDED = 5e-4  # m; rays start so far before a surface
 
 
 @cache
-def placed(seed: int) -> list[layout.Thing]:
+def placed(seed: int) -> list[Piece]:
     return layout.things(seed)
 
 
 @cache
 def things(seed: int) -> list[tuple[str, Mesh, bool]]:
     """Name, mesh and whether it hangs: all things, and the building's columns, crane, doors."""
-    out = [(t.name, merge([m for _, m in t.parts]), t.hangs) for t in placed(seed)]
+    out = [(t.name, merge([m for _, m in t.parts]), t.on == "building") for t in placed(seed)]
     for name, parts in (("steelwork", hall.steelwork()), ("crane", layout.crane(seed)), ("doors", hall.doors())):
         out.append((name, merge([m for _, m in parts]), True))
     return [*out, ("bars", merge([m for _, m in hall.window_bars()]), True)]
