@@ -41,7 +41,7 @@ def light_figures(config: Config, settings: Mapping[str, Any], progress: Progres
         field = baked_field(scene, surfaces_hash(config), config.light, Path(folder), progress)
     figures = {"bake_s": time.perf_counter() - begin, "bake_mb": peak_mb()}
     with straight_through_bulbs(scene):
-        estimate = estimated_quality(scene, field, config.light.texel_m, lines_of_sight(config))
+        estimate = estimated_quality(scene, field, config.light.texel_m, *lines_of_sight(config))
     views = compare_light(
         config, settings["views"], settings["spp"], settings["width"], Path(settings["picture"]), progress,
         lit=(scene, BakedIntegrator(field), mi), seed=settings["seed"],

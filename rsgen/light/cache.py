@@ -17,12 +17,13 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from rsgen.array_types import FloatArray
 from rsgen.config.config import LightConfig
 from rsgen.console.configs import user_cache
 from rsgen.console.progress import Progress
 from rsgen.light.bake import METHOD, bake
 from rsgen.light.lamps import straight_through_bulbs
-from rsgen.light.quality import ViewRays, estimated_quality
+from rsgen.light.quality import estimated_quality
 from rsgen.render.irradiance import IrradianceField, Lattice, make_field, make_lattice
 
 log = logging.getLogger("rsgen")
@@ -32,11 +33,11 @@ _SIDES = ("front", "back")
 
 def baked_field(
     scene: Any, scene_hash: str, light: LightConfig, cache: Path, progress: Progress,
-    sight: Callable[[], ViewRays] | None = None,
+    view: Callable[[], tuple[FloatArray, FloatArray]] | None = None,
 ) -> IrradianceField:  # fmt: skip
     """The scene's irradiance: from `cache` (a folder) if it was baked with the same inputs before, else baked now.
 
-    sight: lines along which it will be seen; with them, how right a new bake is there is told.
+    view: eyes and directions (n, 3) of rays along which it will be seen; with them, how right a new bake is is logged.
     """
     lattice = make_lattice(scene, light.texel_m)
     key = cache_key(scene_hash, light)
@@ -50,9 +51,9 @@ def baked_field(
         front, back = bake(scene, lattice, light, progress)
         _store(path, front, back)
         field = make_field(lattice, front, back)
-        if sight is not None:
+        if view is not None:
             progress("light", 1.0, "how right it is")
-            quality = estimated_quality(scene, field, light.texel_m, sight())
+            quality = estimated_quality(scene, field, light.texel_m, *view())
             log.info("light baked: %s (light.target_db: %g)", quality, light.target_db)
     return field
 

@@ -36,14 +36,6 @@ _SURE = 2.0  # standard errors
 
 
 @dataclass(frozen=True)
-class ViewRays:
-    """Lines of view: eyes (n, 3), world, m, and unit directions (n, 3)."""
-
-    eye: FloatArray
-    direction: FloatArray
-
-
-@dataclass(frozen=True)
 class Quality:
     """PSNR in dB, in sRGB, of mid-grey surfaces, by estimate, and what it is at least (two standard errors)."""
 
@@ -54,12 +46,15 @@ class Quality:
         return f"about {self.psnr_db:.0f} dB where cameras look, at least {self.at_least_db:.0f}"
 
 
-def estimated_quality(scene: Any, field: IrradianceField, texel_m: float, view: ViewRays) -> Quality:
+def estimated_quality(
+    scene: Any, field: IrradianceField, texel_m: float, eye: FloatArray, direction: FloatArray
+) -> Quality:
     """Quality of the light on the surfaces that are seen, lamps left out, as if these were mid-grey.
 
-    Exposed so that `typical` light makes mid-grey. Infinite where nothing lit is seen.
+    eye (n, 3), world, m, and unit direction (n, 3): the rays that they are seen along. Exposed so that `typical` light
+    makes mid-grey. Infinite where nothing lit is seen.
     """
-    points, baked, lacquered = _seen(scene, field, view)
+    points, baked, lacquered = _seen(scene, field, eye, direction)
     if not len(baked):
         return Quality(math.inf, math.inf)
     halves = _computed(scene, field, points, texel_m)
@@ -80,13 +75,15 @@ def _db(square: float) -> float:
     return -10 * math.log10(max(square, _LEAST_ERROR))
 
 
-def _seen(scene: Any, field: IrradianceField, view: ViewRays) -> tuple[SurfacePoints, FloatArray, BoolArray]:
+def _seen(
+    scene: Any, field: IrradianceField, eye: FloatArray, direction: FloatArray
+) -> tuple[SurfacePoints, FloatArray, BoolArray]:
     """Places seen, through panes and in mirrors too, as they face the eye, the irradiance (n, 3) baked there, and
     whether it is beneath lacquer (n,).
     """
     follow = passes_light_on(scene)
     pick = mi.Float(0.5)
-    pi, si, ray, _, _ = first_scatterer(scene, rays_from(view.eye, view.direction), pick, follow, mi.Bool(True))
+    pi, si, ray, _, _ = first_scatterer(scene, rays_from(eye, direction), pick, follow, mi.Bool(True))
     lamp = si.emitter(scene) != dr.zeros(mi.EmitterPtr)
     shown = si.is_valid() & ~lamp
     light = field.lookup(pi, si, -ray.d, shown)
@@ -94,9 +91,9 @@ def _seen(scene: Any, field: IrradianceField, view: ViewRays) -> tuple[SurfacePo
     normal = si.sh_frame.n * dr.select(dr.dot(si.sh_frame.n, si.n) * towards > 0, 1.0, -1.0)
     lacquered = field.beneath_lacquer(si.shape, shown)
     dr.eval(shown, light, si.p, normal, towards, lacquered)
-    there: BoolArray = np.broadcast_to(np.array(shown).astype(bool), (len(view.eye),))
+    there: BoolArray = np.broadcast_to(np.array(shown).astype(bool), (len(eye),))
     p, n, g, e = (rows_of(v)[there] for v in (si.p, normal, si.n * towards, light))
-    coat: BoolArray = np.broadcast_to(np.array(lacquered).astype(bool), (len(view.eye),))
+    coat: BoolArray = np.broadcast_to(np.array(lacquered).astype(bool), (len(eye),))
     return SurfacePoints(p, n, g, np.zeros(len(p), np.int64)), e.astype(np.float64), coat[there]
 
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rsgen.array_types import FloatArray
 from rsgen.config.config import Config, TrajectoryConfig
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rsgen.light.quality import ViewRays
 from rsgen.motion.fit import FitResult, fit_spline
 from rsgen.motion.make import make_motion
 from rsgen.motion.tremor import with_tremor
@@ -74,7 +74,7 @@ def _recorded(settings: TrajectoryConfig) -> Trajectory:
     return trajectory
 
 
-def lines_of_sight(config: Config) -> ViewRays:
+def lines_of_sight(config: Config) -> tuple[FloatArray, FloatArray]:
     """What the config's colour camera looks along, at random over picture and recording. Raises UserError."""
     motion = load_motion(config)
     camera = config.color.camera
@@ -87,4 +87,4 @@ def lines_of_sight(config: Config) -> ViewRays:
     direction = np.einsum("nij,nkj->nki", T_world_color[:, :3, :3], ray)
     seen = np.isfinite(direction).all(axis=-1)  # a lens may see nothing in its corners
     eye = np.broadcast_to(T_world_color[:, None, :3, 3], direction.shape)
-    return ViewRays(eye[seen], direction[seen])
+    return eye[seen], direction[seen]

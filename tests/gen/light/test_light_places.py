@@ -29,7 +29,7 @@ from rsgen.config.config import LightConfig
 from rsgen.light import cache as lighting
 from rsgen.light.barriers import find_covered
 from rsgen.light.interpolation import Interpolation, thin
-from rsgen.light.quality import ViewRays, estimated_quality
+from rsgen.light.quality import estimated_quality
 from rsgen.light.surface_points import SurfacePoints, sample_points
 from rsgen.render.irradiance import lattice_area, lattice_barycentric, make_field, make_lattice
 from rsgen.render.meshes import surface
@@ -323,9 +323,9 @@ def test_what_lies_right_under_a_sheet_is_covered(tmp_path: Path) -> None:
     assert not find_covered(scene, p, up, 0.003).any() and not find_covered(scene, p, -up, 0.005).any()
 
 
-def from_above(xy: np.ndarray) -> ViewRays:
+def from_above(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Down on the floor at xy (n, 2)."""
-    return ViewRays(np.column_stack([xy, np.full(len(xy), 0.3)]), np.tile(-UP, (len(xy), 1)))
+    return np.column_stack([xy, np.full(len(xy), 0.3)]), np.tile(-UP, (len(xy), 1))
 
 
 def test_the_estimate_is_the_error_that_is_there(tmp_path: Path) -> None:
@@ -333,13 +333,13 @@ def test_the_estimate_is_the_error_that_is_there(tmp_path: Path) -> None:
     scene = scene_of(tmp_path, FLOOR, QUAD)
     lattice, front, back = bake(scene, texel_m=0.04, direct_samples=256, target_db=50)
     xy = np.random.default_rng(5).uniform(-1, 1, (4000, 2))
-    good = estimated_quality(scene, make_field(lattice, front, back), 0.04, from_above(xy))
+    good = estimated_quality(scene, make_field(lattice, front, back), 0.04, *from_above(xy))
     assert good.psnr_db > good.at_least_db > 44
     off = np.array([1.1, 1.1, 1.1, 1.0, 1.0], np.float32)
     light = quad_factor(np.column_stack([xy, np.zeros(len(xy))]))[:, None] * [1.0, 2.0, 3.0]
     shown = 0.18 * light / np.median(light.mean(axis=1))
     square = (srgb.encode(np.clip(1.1 * shown, 0, 1)) - srgb.encode(np.clip(shown, 0, 1))) ** 2
-    poor = estimated_quality(scene, make_field(lattice, front * off, back * off), 0.04, from_above(xy))
+    poor = estimated_quality(scene, make_field(lattice, front * off, back * off), 0.04, *from_above(xy))
     assert poor.psnr_db == pytest.approx(-10 * np.log10(square.mean()), abs=0.3)
     sure = square.mean() + 2 * square.mean(axis=1).std() / np.sqrt(len(xy))
     assert poor.at_least_db == pytest.approx(-10 * np.log10(sure), abs=0.3)
@@ -354,10 +354,10 @@ def test_the_estimate_counts_what_is_seen(tmp_path: Path) -> None:
     field = make_field(lattice, front, back)
     xy = np.random.default_rng(6).uniform(-1, 1, (1000, 2))
     for x, right in ((-0.05 - abs(xy[:, 0] * 0.9), False), (0.05 + abs(xy[:, 0] * 0.9), True)):
-        quality = estimated_quality(scene, field, 0.04, from_above(np.column_stack([x, xy[:, 1]])))
+        quality = estimated_quality(scene, field, 0.04, *from_above(np.column_stack([x, xy[:, 1]])))
         assert (quality.at_least_db > 44) == right and (quality.psnr_db < 30) != right
-    none = ViewRays(np.array([[0.0, 0.0, 2.0]]), UP[None])
-    assert estimated_quality(scene, field, 0.04, none).psnr_db == np.inf  # nothing is seen
+    none = np.array([[0.0, 0.0, 2.0]]), UP[None]
+    assert estimated_quality(scene, field, 0.04, *none).psnr_db == np.inf  # nothing is seen
 
 
 def test_the_dark_inside_of_a_thin_sheet_does_not_darken_its_outside(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from rsgen.device.arrays import vectors
 from rsgen.files import encode_exr
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.light.quality import ViewRays, estimated_quality
+from rsgen.light.quality import estimated_quality
 from rsgen.light.sampling import in_channels
 from rsgen.render.baked import BakedIntegrator
 from rsgen.render.images import ColorRenderer
@@ -72,9 +72,9 @@ def test_the_estimate_knows_of_lacquer(tmp_path: Path) -> None:
         </emitter>"""
     scene = scene_of(tmp_path, floor, lamp)
     xy = np.random.default_rng(1).uniform(-0.9, 0.9, (500, 2))
-    sight = ViewRays(np.column_stack([xy, np.full(500, 0.3)]), np.tile([0.0, 0.0, -1.0], (500, 1)))
+    view = np.column_stack([xy, np.full(500, 0.3)]), np.tile([0.0, 0.0, -1.0], (500, 1))
     field = make_field(*bake(scene, texel_m=0.1, direct_samples=4))
-    assert estimated_quality(scene, field, 0.1, sight).psnr_db > 40
+    assert estimated_quality(scene, field, 0.1, *view).psnr_db > 40
 
 
 def test_lacquer_in_lacquer_shows_the_sky(tmp_path: Path) -> None:
