@@ -21,11 +21,8 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.adjustment.band import Band
 from rstrack.adjustment.unit import Found, Sums, Unit, UnitState
-from rstrack.alignment.priors import ACCELERATION
+from rstrack.alignment.priors import ACCELERATION, acceleration_sigmas
 
-# The motion prior decides where nothing else does: in gaps, and in what a wall leaves open. The first and last control
-# points, which hardly any line tells of, are held tighter.
-_END_TRIPLES, _END_FACTOR = 2, 0.1
 # Information that holds the first control point, in m⁻² and rad⁻²: the gauge.
 _HELD = 1e14
 
@@ -224,10 +221,8 @@ class _System:
         point to control point."""
         gains, omega = spline.left_gains, spline.increments - before
         r = omega[1:] - omega[:-1]
-        sigma = np.repeat(accelerations[None] * spline.dt**2, len(r), axis=0)
-        sigma[:_END_TRIPLES] *= _END_FACTOR
-        sigma[-_END_TRIPLES:] *= _END_FACTOR
-        inverse = 1.0 / sigma[:, None, None] ** 2
+        # It decides where nothing else does: in gaps, and in what a wall leaves open.
+        inverse = 1.0 / acceleration_sigmas(accelerations, spline.dt, len(r))[:, None, None] ** 2
         J = np.stack([gains[:-1], -gains[1:] - gains[:-1], gains[1:]], axis=1)
         n = len(r)
         weighted = np.swapaxes(J, 2, 3) * inverse

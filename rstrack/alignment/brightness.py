@@ -6,20 +6,17 @@ equations (Schur complement), so that the control points are solved for jointly 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from rsgen.geometry.so3 import FloatArray
-from rstrack.alignment import normal_equations
-from rstrack.alignment.normal_equations import Quadratic
+from rsgen.array_types import FloatArray
+from rstrack.alignment.normal_equations import Eliminated
 
 MID_GREY = 0.5
 """Intensity about which the gain turns: gain and offset are then told apart best."""
 
-# What gain and offset may change from one frame to the next without any reason, as σ; it holds them where an image is
-# too plain to tell them apart.
-_SIGMA = 0.3, 0.15
+SIGMA = np.array([0.3, 0.15])
+"""σ by which gain and offset change from one frame to the next without any reason: it holds them where an image is too
+plain to tell them apart."""
 # Gains and offsets that no camera shows: it is another place.
 _LEAST, _MOST = np.array([-0.7, -0.6]), np.array([2.0, 0.6])
 # Change of an image's mean or standard deviation that its moving view explains from one frame to the next.
@@ -28,33 +25,9 @@ SAME = np.zeros(2)
 """As bright as the reference."""
 
 
-@dataclass(frozen=True)
-class Eliminated:
-    """Gain and offset that were eliminated from a model.
-
-    at (2,): where it was made; the best ones are `at` + step + follow δ after increments δ (6k,) of its control points.
-    """
-
-    at: FloatArray
-    step: FloatArray
-    follow: FloatArray
-
-    def best(self, increments: FloatArray) -> FloatArray:
-        """Gain and offset (2,) after increments (6k,)."""
-        return np.clip(self.at + self.step + self.follow @ increments, _LEAST, _MOST)
-
-
-def eliminate(
-    model: Quadratic, coupling: FloatArray, H: FloatArray, g: FloatArray, at: FloatArray, expected: FloatArray
-) -> tuple[Quadratic, Eliminated, float]:  # fmt: skip
-    """The model without gain and offset; what was eliminated; and the cost of the prior.
-
-    coupling (6k, 2), H (2, 2), g (2,): theirs with the control points and among themselves, over σ² as the model is.
-    at, expected (2,): their values here, and their prior's mean.
-    """
-    sigma, off = np.array(_SIGMA), at - expected
-    left, step, follow = normal_equations.eliminate(model, coupling, H, g, sigma, off)
-    return left, Eliminated(at, step, follow), 0.5 * float(np.sum((off / sigma) ** 2))
+def best(at: FloatArray, found: Eliminated, increments: FloatArray) -> FloatArray:
+    """Gain and offset (2,) that were eliminated `at` (2,), after increments (6k,) of the control points."""
+    return np.clip(at + found.step + found.follow @ increments, _LEAST, _MOST)
 
 
 def contrast(H: FloatArray, at: FloatArray) -> float:

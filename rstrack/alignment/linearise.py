@@ -1,4 +1,8 @@
-"""One image against one reference: run a kernel, chain it to the control points, remember the result."""
+"""One image against one reference: its part of the normal equations of (12).
+
+A kernel of `residuals` sums the pixels, the sums are chained to the control points, what is unknown of the image alone
+is eliminated, and σ is estimated anew.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +19,8 @@ from rsgen.device.lens import Lens
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import BlockSums, Scaling, block_counts
-from rstrack.alignment.brightness import SAME, Eliminated, contrast
-from rstrack.alignment.brightness import eliminate as without_brightness
-from rstrack.alignment.independence import inflation
-from rstrack.alignment.normal_equations import Quadratic, Slopes, chain, eliminate, prepare_jacobians
+from rstrack.alignment.brightness import SAME, SIGMA, contrast
+from rstrack.alignment.normal_equations import Eliminated, Quadratic, Slopes, chain, eliminate, prepare_jacobians
 from rstrack.alignment.residuals import (
     WHOLE,
     GeometricInput,
@@ -29,23 +31,32 @@ from rstrack.alignment.residuals import (
     visibility_kernel,
     whole_image_unit,
 )
-from rstrack.alignment.student_t import scale_step
+from rstrack.alignment.weights import (
+    FLOOR_DEPTH,
+    FLOOR_INTENSITY,
+    GATE_INTENSITY,
+    GATE_SIGMAS,
+    inflation,
+    scale_step,
+)
 from rstrack.images.device_frame import DeviceRig, Timer, untimed
 from rstrack.images.line_poses import IDENTITY_FROM_BASE, Exposure, from_base_table, prepare, to_base_table
 from rstrack.images.pyramid import ColorImage, DepthImage
 from rstrack.keyframes.keyframe import Points, Reference, pyramid_level, strides
 from rstrack.options import Options
 
-# Smallest credible σ of depth (m): quantisation and interpolation leave about as much. Where pixels are larger than
-# those of this focal length (320×240) interpolation errs more, by the square of their size.
-_CREDIBLE_DEPTH, _FINE_FOCAL = 2e-4, 240.0
+# Where pixels are larger than those of this focal length (320×240), interpolation errs by the square of their size.
+_FINE_FOCAL = 240.0
 
 
 @dataclass(frozen=True)
 class Linearised:
-    """A term around a state: `model` divided by σ², and what the kernel saw.
+    """A term around a state: `model` divided by σ², and the sums over blocks of lines from which it was made.
 
-    motion (n, 6, 6k): derivative of the blocks' twists, to tell how far rows have moved since.
+    motion (n, 6, 6k): derivative of the blocks' twists by the model's control points. cost: of the pixels' weights and
+    the brightness's prior. floor: smallest credible σ of this camera and reference. median_depth (m): of the points.
+    brightness: a colour image's gain and offset, eliminated from the model. contrast: see `brightness.contrast`;
+    infinite for depth.
     """
 
     model: Quadratic
@@ -53,33 +64,33 @@ class Linearised:
     sigma: float
     next_sigma: float
     cost: float
-    count: int
-    compared: int
-    # Smallest credible σ of this term, this camera and this reference.
     floor: float
-    # Σ w j jᵀ / count (6, 6) with rotations scaled by the scene's depth.
-    seen: FloatArray
-    # Of the blocks of lines, from which it was made.
+    median_depth: float
     sums: BlockSums
-    # Of a colour image: its gain and offset, which the model no longer holds.
     brightness: Eliminated | None = None
-    # The spread of the intensities that are expected in it, see `brightness.contrast`; infinite for depth.
     contrast: float = np.inf
+
+    @property
+    def count(self) -> int:
+        """Pixels that are within the gate."""
+        return self.sums.count
 
     @cached_property
     def inflation(self) -> float:
-        """See `independence.inflation`: asked for once a frame, not at every step."""
-        return inflation(self.sums)
+        """See `weights.inflation`: asked for once a frame, not at every step."""
+        return inflation(self.sums.H, self.sums.g, self.sums.count)
 
     @property
     def fit(self) -> float:
         """Part of the pixels that were compared whose residuals are no outliers for certain."""
-        return self.count / max(1, self.compared)
+        return self.sums.count / max(1, self.sums.compared)
 
     @property
     def observability(self) -> float:
-        """Smallest eigenvalue of `seen`: 0 where a motion is not seen."""
-        return weakest_motion(self.seen)
+        """Smallest eigenvalue of H (6, 6) per pixel, rotations divided by the depth: 0 where a motion is not seen."""
+        scale = 1.0 / np.array([1.0, 1.0, 1.0, *[self.median_depth] * 3])
+        seen = self.sums.H.sum(axis=(0, 1)) * np.outer(scale, scale) / max(1, self.sums.count)
+        return float(np.linalg.eigvalsh(seen)[0])
 
     def row_shift(self, increments: FloatArray, focal: float, depth: float) -> float:
         """Largest movement of a block in pixels under increments (k, 6) of the model's control points."""
@@ -101,9 +112,9 @@ class Terms:
     # Residual beyond which a pixel is an outlier for certain (m up to a distance of 1 m and growing with it, by level;
     # intensity), and smallest credible σ.
     gate_depth: tuple[float, ...] = (0.05, 0.05, 0.3)
-    gate_intensity: float = 0.3
-    floor_depth: float = _CREDIBLE_DEPTH
-    floor_intensity: float = 1.0 / 255.0
+    gate_intensity: float = GATE_INTENSITY
+    floor_depth: float = FLOOR_DEPTH
+    floor_intensity: float = FLOOR_INTENSITY
     # See `CalibrationSigma`: what depth images are off by as a whole is solved for with every pose; 0: nothing is.
     depth_image: float = 0.0
     # σ of equation (13) in the photometric term; 0: blurred points count like sharp ones.
@@ -148,37 +159,30 @@ class Terms:
         slopes_at: spline at which the lines' poses are differentiated by control points, if not `spline`: that changes
         by no more than the increments between the two (relative), which Gauss-Newton steps do not notice.
         """
+        e, lens, shifts, floor = self.e, image.exposure.lens, self.depth_image > 0.0, self._floor_depth(image, ref)
         with self.timer(f"geometric kernel, level {level}"):
             to_base = self._to_base(spline, ref.T_world_base, image.exposure)
-            seen_from, shifts = self._seen_from(spline, ref), self.depth_image > 0.0
-            sums = self._geometric_sums(image, ref, to_base, seen_from, level, sigma, shifts)
-        slopes, floor = self._slopes(slopes_at or spline, image.exposure, ref), self._floor_depth(image, ref)
+            from_base = self._seen_from(spline, ref)
+            stride = _stride(lens, level)
+            kernel = self._kernel(geometric_kernel, lens, ref.lens, stride, shifts)
+            scaling = self._scaling(ref, lens, lens.camera, ref, stride, 1)
+            gate = self.gate_depth[pyramid_level(level)] * max(1.0, ref.median_depth)
+            if pyramid_level(level) == 0:
+                gate = min(gate, max(GATE_SIGMAS * sigma, 10 * floor))
+            larger = max(1.0, _FINE_FOCAL / ref.lens.camera.fx) ** 2
+            smooth = self.smooth * max(sigma, FLOOR_DEPTH * larger)
+            rough = min(1.0, larger - 1.0) if self.counts_rough else 0.0
+            constants = e.upload(np.append(scaling.parameters(sigma, gate), [smooth, rough]))
+            surface = ref.inverse_depth, ref.slope_x, ref.slope_y, ref.roughness
+            raw = kernel(GeometricInput(image.z, *self.rays, to_base, *surface, from_base, constants))
+        slopes = self._slopes(slopes_at or spline, image.exposure, ref)
 
         def finish() -> Linearised:
             with self.timer(f"geometric kernel, level {level}"):
-                return self._finish(sums(), slopes, sigma, floor, ref.median_depth)
+                sums = scaling.unpack(raw.numpy(), *block_counts(lens, ref.lens)[:2], WHOLE if shifts else 0)
+                return self._finish(sums, slopes, sigma, floor, ref.median_depth)
 
         return finish
-
-    def _geometric_sums(
-        self, image: DepthImage, ref: Reference, to_base: Any, from_base: Any, level: int, sigma: float,
-        shifts: bool,
-    ) -> Callable[[], BlockSums]:  # fmt: skip
-        e, lens = self.e, image.exposure.lens
-        stride = _stride(lens, level)
-        kernel = self._kernel(geometric_kernel, lens, ref.lens, stride, shifts)
-        scaling = self._scaling(ref, lens, lens.camera, ref, stride, 1)
-        gate = self.gate_depth[pyramid_level(level)] * max(1.0, ref.median_depth)
-        if pyramid_level(level) == 0:
-            gate = min(gate, max(5.0 * sigma, 10 * self._floor_depth(image, ref)))
-        larger = max(1.0, _FINE_FOCAL / ref.lens.camera.fx) ** 2
-        smooth = self.smooth * max(sigma, _CREDIBLE_DEPTH * larger)
-        rough = min(1.0, larger - 1.0) if self.counts_rough else 0.0
-        constants = e.upload(np.append(scaling.parameters(sigma, gate), [smooth, rough]))
-        surface = ref.inverse_depth, ref.slope_x, ref.slope_y, ref.roughness
-        raw = kernel(GeometricInput(image.z, *self.rays, to_base, *surface, from_base, constants))
-        current, reference, _, _ = block_counts(lens, ref.lens)
-        return lambda: scaling.unpack(raw.numpy(), current, reference, WHOLE if shifts else 0)
 
     def _floor_depth(self, image: DepthImage, ref: Reference) -> float:
         # A camera at rest repeats its rounding, so that depth would seem far better than it is.
@@ -216,11 +220,9 @@ class Terms:
 
         def finish() -> Linearised:
             with self.timer(f"photometric kernel, level {level}"):
-                current, reference, _, _ = block_counts(lens, ref.lens)
-                sums = scaling.unpack(raw.numpy(), current, reference, len(brightness))
-                return self._finish(
-                    sums, slopes, sigma, self.floor_intensity, points.median_depth, brightness, expected
-                )
+                sums = scaling.unpack(raw.numpy(), *block_counts(lens, ref.lens)[:2], len(brightness))
+                floor, median_depth = self.floor_intensity, points.median_depth
+                return self._finish(sums, slopes, sigma, floor, median_depth, brightness, expected)
 
         return finish
 
@@ -266,23 +268,20 @@ class Terms:
         with self.timer("linear algebra: chain"):
             own = moved.columns
             model, coupling = chain(moved, slopes, None if own is None else own.coupling)
-        model = Quadratic(model.first, model.H / sigma**2, model.g / sigma)
-        cost, eliminated, spread = sums.cost, None, np.inf
+        H, g, cost, found, spread = model.H / sigma**2, model.g / sigma, sums.cost, None, np.inf
         if own is not None:
-            scaled = coupling / sigma**2, own.H / sigma**2, own.g / sigma
+            scaled = H, g, coupling / sigma**2, own.H / sigma**2, own.g / sigma
             if brightness is None:
                 prior = np.full(WHOLE, self.depth_image / whole_image_unit(median_depth))
-                model, _, _ = eliminate(model, *scaled, prior, np.zeros(WHOLE))
+                left = eliminate(*scaled, prior, np.zeros(WHOLE))
             else:
-                spread = contrast(own.H, brightness)
-                model, eliminated, surprise = without_brightness(model, *scaled, brightness, expected)
-                cost += surprise
+                spread, off = contrast(own.H, brightness), brightness - expected
+                left = found = eliminate(*scaled, SIGMA, off)
+                cost += 0.5 * float(np.sum((off / SIGMA) ** 2))
+            H, g = left.H, left.g
         next_sigma = scale_step(sigma, sums.weighted, sums.count, floor)
-        seen = seen_motions(sums, median_depth)
-        counts = sums.count, sums.compared
-        return Linearised(
-            model, slopes.current, sigma, next_sigma, cost, *counts, floor, seen, sums, eliminated, spread
-        )
+        model = Quadratic(model.first, H, g)
+        return Linearised(model, slopes.current, sigma, next_sigma, cost, floor, median_depth, sums, found, spread)
 
 
 def _block_times(exposure: Exposure, ref: Reference) -> FloatArray:
@@ -292,14 +291,3 @@ def _block_times(exposure: Exposure, ref: Reference) -> FloatArray:
 
 def _stride(lens: Lens, level: int) -> int:
     return strides(lens.camera.width, lens.camera.height)[level]
-
-
-def seen_motions(sums: BlockSums, median_depth: float) -> FloatArray:
-    """Summed H (6, 6) per pixel, with rotations divided by `median_depth` (m); zero without pixels."""
-    scale = 1.0 / np.array([1.0, 1.0, 1.0, median_depth, median_depth, median_depth])
-    return sums.H.sum(axis=(0, 1)) * np.outer(scale, scale) / max(1, sums.count)
-
-
-def weakest_motion(seen: FloatArray) -> float:
-    """Smallest eigenvalue of `seen_motions`: how well the motion that is seen least is seen."""
-    return float(np.linalg.eigvalsh(seen)[0])

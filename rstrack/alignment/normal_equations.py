@@ -1,4 +1,4 @@
-"""From per-block 6×6 systems to the control points: chain rule, motion prior, banded solve.
+"""Normal equations of the step, equation (12): per-block 6×6 systems chained to the control points, and solved.
 
 Unknowns are left increments δ_i in se(3): T_i ← exp(δ_i) T_i in the world frame. A block of lines at time t moves by
 η = Σ J_i(t) δ_i over the four control points of its segment (DESIGN section 4), so its 6×6 system becomes 24×24.
@@ -6,6 +6,7 @@ Unknowns are left increments δ_i in se(3): T_i ← exp(δ_i) T_i in the world f
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -122,19 +123,33 @@ def chain(sums: BlockSums, slopes: Slopes, coupling: FloatArray | None = None) -
     return Quadratic(first, 0.5 * (dense + dense.T), flat @ g.ravel()), flat @ blocks.reshape(-1, blocks.shape[-1])
 
 
-def eliminate(
-    model: Quadratic, coupling: FloatArray, H: FloatArray, g: FloatArray, sigma: FloatArray, off: FloatArray
-) -> tuple[Quadratic, FloatArray, FloatArray]:
-    """The model without n further unknowns that have a prior N(mean, diag σ²), by Schur complement.
+@dataclass(frozen=True)
+class Eliminated:
+    """Normal equations H (m, m), g (m,) without n further unknowns (Schur complement).
 
-    coupling (6k, n), H (n, n), g (n,): theirs with the control points and among themselves. sigma (n,): the prior's;
-    off (n,): how far from its mean they are. Returns their step (n,), too, and how they follow control points (n, 6k).
+    step (n,): of these where the others stay; follow (n, m): what they move by with the others.
     """
-    system = H + np.diag(1.0 / sigma**2)
-    solved = -np.asarray(np.linalg.solve(system, np.column_stack([g + off / sigma**2, coupling.T])))
+
+    H: FloatArray
+    g: FloatArray
+    step: FloatArray
+    follow: FloatArray
+
+
+def eliminate(
+    H: FloatArray, g: FloatArray, coupling: FloatArray, own: FloatArray, own_g: FloatArray, sigma: FloatArray,
+    off: FloatArray,
+) -> Eliminated:  # fmt: skip
+    """Take n nuisance unknowns with a prior N(mean, diag σ²), such as an image's brightness, out of H (m, m), g (m,).
+
+    coupling (m, n), own (n, n), own_g (n,): theirs with the others and among themselves. sigma (n,): the prior's; off
+    (n,): how far from its mean they are.
+    """
+    system = own + np.diag(1.0 / sigma**2)
+    solved = -np.asarray(np.linalg.solve(system, np.column_stack([own_g + off / sigma**2, coupling.T])))
     step, follow = solved[:, 0], solved[:, 1:]
-    reduced = model.H + coupling @ follow
-    return Quadratic(model.first, 0.5 * (reduced + reduced.T), model.g + coupling @ step), step, follow
+    reduced = H + coupling @ follow
+    return Eliminated(0.5 * (reduced + reduced.T), g + coupling @ step, step, follow)
 
 
 def assemble(models: Iterable[Quadratic], first: int, last: int) -> tuple[FloatArray, FloatArray]:
@@ -183,3 +198,47 @@ def solve_damped(H: FloatArray, g: FloatArray, bandwidth: int, damping: float = 
             return step
         damping = max(1e-9, 100.0 * damping)
     raise np.linalg.LinAlgError("the normal equations have no finite solution")
+
+
+# Steps that are remembered, and how many times as far as the plain step one goes at most.
+_MEMORY, _FURTHEST = 3, 4.0
+# A step this part of the one before, or less, shows that Gauss-Newton needs no help.
+_FAST = 0.3
+
+
+class AndersonMixing:
+    """Longer steps where Gauss-Newton's are too short, from the last iterations of one optimisation.
+
+    The Hessian of Gauss and Newton takes gradients of noise for gradients of the scene: on a real recording it is 1.6
+    times too large for colour, several times in motions that are hardly seen, and steps then shrink by a tenth at a
+    time. Anderson's mixing (J. ACM 1965; Walker and Ni, SIAM J. Numer. Anal. 2011) takes them for a fixed-point
+    iteration and extrapolates from the last few.
+    """
+
+    def __init__(self) -> None:
+        self._at: deque[FloatArray] = deque(maxlen=_MEMORY)
+        self._steps: deque[FloatArray] = deque(maxlen=_MEMORY)
+
+    def reset(self) -> None:
+        """Begin anew, as where a step has been taken back."""
+        self._at.clear()
+        self._steps.clear()
+
+    def extrapolated(self, at: FloatArray, step: FloatArray, H: FloatArray) -> FloatArray:
+        """The step to take at increments `at` (6n,), where Gauss-Newton's with the Hessian H (6n, 6n) is `step` (6n,).
+
+        Of all mixtures of the last iterations it begins from the one whose mixed step is least, measured by H.
+        """
+        # Copies: the optimiser moves its increments in place.
+        self._at.append(at.copy())
+        self._steps.append(step.copy())
+        if len(self._steps) < 2:
+            return step
+        length, before = step @ H @ step, self._steps[-2] @ H @ self._steps[-2]
+        if length < _FAST**2 * before:
+            return step
+        moves, changes = np.diff(np.array(self._at), axis=0).T, np.diff(np.array(self._steps), axis=0).T
+        share = np.linalg.lstsq(changes.T @ H @ changes, changes.T @ (H @ step), rcond=1e-6)[0]
+        further = step - (moves + changes) @ share
+        longer = np.sqrt(max(float(further @ H @ further), 0.0) / max(float(length), 1e-300))
+        return further if longer <= _FURTHEST else np.asarray(further * (_FURTHEST / longer))

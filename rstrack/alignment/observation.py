@@ -10,10 +10,11 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.geometry.spline import Spline
-from rstrack.alignment.brightness import SAME
+from rstrack.alignment.brightness import SAME, best
 from rstrack.alignment.linearise import Linearised, Terms
 from rstrack.alignment.normal_equations import Quadratic
 from rstrack.alignment.spline_state import SplineState
+from rstrack.alignment.weights import START_DEPTH, START_INTENSITY
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.images.pyramid import ColorImage, DepthImage
 from rstrack.keyframes.keyframe import THINNED, Reference
@@ -25,8 +26,6 @@ _SAME_SLOPES = 2e-2
 _SAME = 0.2
 # Part of the pixels that count below which a quarter of them tells as much as all.
 THIN_BELOW = 1.0 / 16.0
-# Errors at the start of a level, as σ: m and intensity; re-estimated with every linearisation.
-START_DEPTH, START_INTENSITY = 5e-3, 0.03
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,7 @@ class Observation:
 
     @property
     def inflation(self) -> float:
-        """That of the linearisation, by pixels of the finest level; see `independence.inflation`."""
+        """That of the linearisation, by pixels of the finest level; see `weights.inflation`."""
         return self.linearisation.stands_for * self.lin.inflation
 
     @property
@@ -150,9 +149,9 @@ class Observation:
     def brightness(self, state: SplineState) -> FloatArray:
         """Gain and offset (2,) of a colour image in the current state; at first those expected."""
         lin, before = self.linearisation.lin, self.linearisation.brightness
-        if lin is None or lin.brightness is None:
+        if before is None or lin is None or lin.brightness is None:
             return self.expected if before is None else before
-        return lin.brightness.best(self._since(state).ravel())
+        return best(before, lin.brightness, self._since(state).ravel())
 
     def shift(self, state: SplineState, focal: float) -> float:
         """Pixels that the lines have moved since the linearisation; infinite where the brightness has changed too."""

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rsgen.array_types import FloatArray
-from rstrack.alignment.acceleration import Acceleration
 from rstrack.alignment.linearise import Terms
-from rstrack.alignment.normal_equations import assemble, solve_damped
+from rstrack.alignment.normal_equations import AndersonMixing, assemble, solve_damped
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.priors import Prior
 from rstrack.alignment.spline_state import SplineState
@@ -101,7 +100,7 @@ def _optimise_level(terms: Terms, state: SplineState, problem: Problem, level: i
     every = (*problem.fresh, *problem.settled)
     weights: dict[int, float] = {}
     step: FloatArray | None = None
-    acceleration, is_plain = Acceleration(), True
+    acceleration, is_plain = AndersonMixing(), True
     before = [o.linearisation for o in every]
     once_more = problem.predicted and level == 0
     for n in range(most):
@@ -115,7 +114,7 @@ def _optimise_level(terms: Terms, state: SplineState, problem: Problem, level: i
                 observation.linearisation = kept
             priors = [prior(state.spline) for prior in problem.priors]
             damping = max(1e-3, 10.0 * damping) if is_plain else damping
-            acceleration.forget()
+            acceleration.reset()
             done.refused += 1
         else:
             damping, cost = 0.1 * damping if damping > 1e-4 else 0.0, now

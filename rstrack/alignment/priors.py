@@ -17,8 +17,23 @@ ACCELERATION = np.array([5.0, 5.0, 5.0, 10.0, 10.0, 10.0])
 VELOCITY = np.array([1.5, 1.5, 1.5, 3.0, 3.0, 3.0])
 """And of velocities, m/s and rad/s, where nothing is known."""
 
+ENDS = 2
+"""Second differences at an end of a spline that are held tighter: few lines touch its outermost control points (in the
+newest lines they weigh u³/6), so that small systematic errors of the lines would throw them about."""
+_END_FACTOR = 0.1
+
 Prior = Callable[[Spline], tuple[Quadratic, float]]
 """The quadratic model of a prior around a spline, and its cost there."""
+
+
+def acceleration_sigmas(
+    accelerations: FloatArray, dt: float, count: int, first: int = ENDS, last: int = ENDS
+) -> FloatArray:
+    """σ (count, 6) of `acceleration_prior` by those (6,) of accelerations; tighter for the first and last so many."""
+    sigma = np.repeat(accelerations[None] * dt**2, count, axis=0)
+    sigma[:first] *= _END_FACTOR
+    sigma[max(0, count - last) :] *= _END_FACTOR
+    return sigma
 
 
 def acceleration_prior(spline: Spline, first: int, last: int, sigma: FloatArray) -> tuple[Quadratic, float]:

@@ -26,9 +26,8 @@ from rsgen.device.arrays import Engine, recorded_from
 from rsgen.device.lens import Lens
 from rsgen.device.projection import TO_BASE, RollingProjection, Vector, gather, move, project_rolling
 from rsgen.geometry.camera import Camera
-from rstrack.alignment.block_sums import Contribution, block_slot, contribution, layout
+from rstrack.alignment.block_sums import Contribution, Pixels, block_slot, contribution, sizes, summed
 from rstrack.alignment.brightness import MID_GREY
-from rstrack.alignment.pixel_runs import Pixels, summed
 from rstrack.images.blur import blur_length, blur_weight
 from rstrack.images.sampling import EDGE, NEAREST, grid, level_size, nearest, surface, value_and_slope
 
@@ -103,7 +102,7 @@ def geometric_kernel(
 
         down = lens.lines > 1 and not lens.shutter.by_rows
         shape, is_steady = (camera.width, camera.height, stride), ref_lens.lines == 1
-        return summed(e, shape, layout(lens, ref_lens, count), at, down, is_steady)
+        return summed(e, shape, sizes(lens, ref_lens, count), at, down, is_steady)
 
     return kernel
 
@@ -222,7 +221,7 @@ def photometric_kernel(
             return contribution(e, g, p, -1.0, r, active, parameters, slot, columns)
 
         down = lens.lines > 1 and not lens.shutter.by_rows
-        return summed(e, (ref.width, ref.height, stride), layout(lens, ref_lens, 2), at, down, False)
+        return summed(e, (ref.width, ref.height, stride), sizes(lens, ref_lens, 2), at, down, False)
 
     return kernel
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import stats
 
 from rsgen.array_types import BoolArray, FloatArray
-from rstrack.alignment.acceleration import Acceleration
+from rstrack.alignment.normal_equations import AndersonMixing
 from rstrack.calibration.pairs.stretch import Stretch
 from rstrack.calibration.pairs.terms import PairTerms
 from rstrack.calibration.unknowns.known import Known
@@ -139,13 +139,13 @@ def solve(
     has been found so far is returned, `finished` False. Raises numpy.linalg.LinAlgError where images say nothing.
     """
     known = known or Known.nothing(start)
-    p, acceleration, finished, step = start, Acceleration(), True, np.zeros(COUNT)
+    p, acceleration, finished, step = start, AndersonMixing(), True, np.zeros(COUNT)
     try:
         for stretch in stretches:
             for _ in range(_ROUNDS if stretch.is_new else 0):
                 stretch.sums(terms, p, levels[0], depth_counts)
         for level in levels:
-            acceleration.forget()
+            acceleration.reset()
             for n in range(steps):
                 watch(level, n, p)
                 sums = [stretch.sums(terms, p, level, depth_counts) for stretch in stretches]
@@ -208,7 +208,7 @@ def _blind(stretches: Sequence[Stretch], terms: PairTerms) -> FloatArray:
 
 def _step(
     reduced: Sequence[tuple[FloatArray, FloatArray]], p: Parameters, start: Parameters, known: Known, free: BoolArray,
-    acceleration: Acceleration | None = None,
+    acceleration: AndersonMixing | None = None,
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     """The step (31,) of the parameters, and the standard errors of the free ones.
 

@@ -11,13 +11,13 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rstrack.adjustment.chain import Chain
 from rstrack.alignment.free_space import FreeSpace
-from rstrack.alignment.independence import Independence
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.observation import Observation, observe
 from rstrack.alignment.optimizer import Solved
 from rstrack.alignment.priors import ACCELERATION
 from rstrack.alignment.score import Scores
 from rstrack.alignment.spline_state import SplineState
+from rstrack.alignment.weights import Independence
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.moving_masks import MovingMasks
 from rstrack.data.rig import Frame, Rig

@@ -14,9 +14,11 @@ from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import MOST_STEPS, Problem, Solved, optimise
 from rstrack.alignment.priors import (
     ACCELERATION,
+    ENDS,
     VELOCITY,
     Prior,
     acceleration_prior,
+    acceleration_sigmas,
     pose_constraint,
     velocity_prior,
 )
@@ -26,9 +28,6 @@ from rstrack.inertial.inertia import Inertia
 from rstrack.inertial.kept import Kept
 from rstrack.keyframes.keyframe import Reference
 
-# The newest control points, whose weight in the newest lines is only u³/6, are held a good deal tighter by the motion
-# prior: small systematic errors of the lines would throw them about. So are a piece's first.
-_END_TRIPLES, _END_FACTOR = 2, 0.1
 # Metres and radians within which the reference's pose is held while its own control points are free.
 _GAUGE = np.full(6, 1e-6)
 # Control points that are held beyond those that are needed, and how many are released at once.
@@ -182,11 +181,10 @@ class Window:
     def _motion_prior(self, free: tuple[int, int]) -> Prior:
         first, last = max(self.piece, free[0] - 2), free[1]
         common = ACCELERATION if self._inertia is None else self._inertia.common
-        sigma = np.repeat(common[None] * self.state.dt**2, last - first - 2, axis=0)
-        if not self._inertial(free):
-            sigma[-_END_TRIPLES:] *= _END_FACTOR
+        count, newest, oldest = last - first - 2, 0 if self._inertial(free) else ENDS, 0
         if free[0] == self.piece and not self._tells_from(self.spline.t0 + self.piece * self.state.dt):
-            sigma[: max(0, min(_END_TRIPLES, len(sigma) - _END_TRIPLES))] *= _END_FACTOR
+            oldest = max(0, min(ENDS, count - ENDS))
+        sigma = acceleration_sigmas(common, self.state.dt, count, oldest, newest)
         return lambda spline: acceleration_prior(spline, first, last, sigma)
 
     def _inertial(self, free: tuple[int, int]) -> list[Prior]:

@@ -74,8 +74,8 @@ class PoseTerms:
         cost = 0.5 * float((e**2).sum())
         self.costs.append(cost)
         model = Quadratic(first, H, np.einsum("nia,ni->a", rows, e))
-        sums = BlockSums(np.zeros((1, 1, 6, 6)), np.zeros((1, 1, 6)), 0.0, cost, len(at))
-        found = Linearised(model, motion, 1.0, self.next_sigma, cost, len(at), len(at), self.floor, np.eye(6), sums)
+        sums = BlockSums(np.zeros((1, 1, 6, 6)), np.zeros((1, 1, 6)), 0.0, cost, len(at), len(at))
+        found = Linearised(model, motion, 1.0, self.next_sigma, cost, self.floor, 1.0, sums)
         return lambda: found
 
 

@@ -19,9 +19,8 @@ import drjit as dr
 from rsgen.device.arrays import Engine, recorded_from
 from rsgen.device.lens import Lens
 from rsgen.device.projection import TO_BASE, RollingProjection, Vector, gather, move, project, project_rolling
-from rstrack.alignment.block_sums import Contribution, block_slot, contribution, layout
+from rstrack.alignment.block_sums import Contribution, Pixels, block_slot, contribution, sizes, summed
 from rstrack.alignment.brightness import MID_GREY
-from rstrack.alignment.pixel_runs import Pixels, summed
 from rstrack.alignment.residuals import GeometricInput, evened, plane_distance
 from rstrack.calibration.pairs.optics import Asked, moves, traced, turned_round, unknown_columns, without_error
 from rstrack.images.sampling import cubic_value_and_slope, level_size, surface
@@ -220,4 +219,4 @@ def color_pair_kernel(
 def _summed(e: Engine, depth: Lens, lens: Lens, stride: int, columns: int, at: Callable[[Pixels], Contribution]) -> Any:
     """Sums over a depth image's pixels, in blocks of a lens's lines."""
     shape = depth.camera.width, depth.camera.height, stride
-    return summed(e, shape, layout(lens, lens, columns), at, not lens.shutter.by_rows, False)
+    return summed(e, shape, sizes(lens, lens, columns), at, not lens.shutter.by_rows, False)

@@ -14,7 +14,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import BlockSums
 from rstrack.alignment.brightness import SAME
 from rstrack.alignment.priors import ACCELERATION, acceleration_prior, pose_constraint
-from rstrack.alignment.student_t import scale_step
+from rstrack.alignment.weights import scale_step
 from rstrack.calibration.pairs.images import Lines, Taken, lines_of
 from rstrack.calibration.pairs.optics import Optics
 from rstrack.calibration.pairs.surfaces import Surface

@@ -17,9 +17,8 @@ import scipy.linalg
 
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
-from rstrack.alignment.block_sums import Scaling
+from rstrack.alignment.block_sums import Pixels, Scaling, every
 from rstrack.alignment.brightness import SAME
-from rstrack.alignment.pixel_runs import Pixels, every
 from rstrack.calibration.pairs.images import Lines, lines_of
 from rstrack.calibration.pairs.kernels import color_residual, depth_residual
 from rstrack.calibration.pairs.optics import turn

@@ -14,8 +14,9 @@ from rsgen.device.arrays import Engine
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.brightness import SAME
 from rstrack.alignment.free_space import Free, FreeSpace, Seen, grid_of
-from rstrack.alignment.observation import START_DEPTH, Observation
+from rstrack.alignment.observation import Observation
 from rstrack.alignment.spline_state import SplineState
+from rstrack.alignment.weights import START_DEPTH
 from rstrack.images.left_out import full_size, without_pixels
 from rstrack.images.pyramid import DepthImage
 from rstrack.keyframes.keyframe import Reference, strides

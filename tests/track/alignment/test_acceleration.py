@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rstrack.alignment.acceleration import Acceleration
+from rstrack.alignment.normal_equations import AndersonMixing
 
 RNG = np.random.default_rng(4)
 A = RNG.normal(size=(12, 12))
@@ -14,7 +14,7 @@ GOAL = RNG.normal(size=12)
 
 def iterations(H: np.ndarray, accelerated: bool, most: int = 5000) -> int:
     """Steps with the Hessian H until the quadratic cost with the Hessian TRUE is at its minimum."""
-    x, acceleration = np.zeros(12), Acceleration()
+    x, acceleration = np.zeros(12), AndersonMixing()
     for n in range(most):
         if np.linalg.norm(x - GOAL) < 1e-4:
             return n
@@ -39,7 +39,7 @@ def test_one_slow_motion_is_found_in_two_more_steps() -> None:
 def test_increments_may_be_moved_in_place_afterwards() -> None:
     found = []
     for in_place in (False, True):
-        at, acceleration = np.zeros(12), Acceleration()
+        at, acceleration = np.zeros(12), AndersonMixing()
         for n in range(4):
             given = at if in_place else at.copy()
             step = acceleration.extrapolated(given, 0.9**n * np.linspace(0.1, 0.5, 12), TRUE)
@@ -49,21 +49,21 @@ def test_increments_may_be_moved_in_place_afterwards() -> None:
 
 
 def test_fast_steps_stay_as_they_are() -> None:
-    acceleration, step = Acceleration(), np.full(12, 0.5)
+    acceleration, step = AndersonMixing(), np.full(12, 0.5)
     assert acceleration.extrapolated(np.zeros(12), step, TRUE) is step
     shorter = 0.2 * step
     assert acceleration.extrapolated(step, shorter, TRUE) is shorter
 
 
 def test_it_goes_four_times_as_far_as_the_plain_step_at_most() -> None:
-    acceleration, step = Acceleration(), np.full(12, 0.5)
+    acceleration, step = AndersonMixing(), np.full(12, 0.5)
     acceleration.extrapolated(np.zeros(12), step, TRUE)
     further = acceleration.extrapolated(step, 0.99 * step, TRUE)
     np.testing.assert_allclose(further, 4.0 * 0.99 * step)
 
 
 def test_what_is_forgotten_is_not_extrapolated_from() -> None:
-    acceleration, step = Acceleration(), np.full(12, 0.5)
+    acceleration, step = AndersonMixing(), np.full(12, 0.5)
     acceleration.extrapolated(np.zeros(12), step, TRUE)
-    acceleration.forget()
+    acceleration.reset()
     np.testing.assert_array_equal(acceleration.extrapolated(step, 0.9 * step, TRUE), 0.9 * step)

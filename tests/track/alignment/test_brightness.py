@@ -10,7 +10,7 @@ from rstrack_util import ENGINE
 from term_setting import setting
 
 from rstrack.alignment import brightness
-from rstrack.alignment.normal_equations import Quadratic
+from rstrack.alignment.normal_equations import eliminate
 from rstrack.images.pyramid import ColorImage
 
 
@@ -24,11 +24,10 @@ def test_what_is_eliminated_is_what_a_joint_solution_gives() -> None:
     joint[12:, 12:] += np.diag(prior)
     right[12:] += prior * (at - expected)
     x = -np.linalg.solve(joint, right)
-    model = Quadratic(4, H[:12, :12], g[:12])
-    left, gone, cost = brightness.eliminate(model, H[:12, 12:], H[12:, 12:], g[12:], at, expected)
+    left = eliminate(H[:12, :12], g[:12], H[:12, 12:], H[12:, 12:], g[12:], brightness.SIGMA, at - expected)
     np.testing.assert_allclose(-np.linalg.solve(left.H, left.g), x[:12], rtol=1e-8)
-    np.testing.assert_allclose(gone.at + gone.step + gone.follow @ x[:12], at + x[12:], rtol=1e-8)
-    assert cost == pytest.approx(0.5 * float(((at - expected) ** 2 * prior).sum())) and left.first == 4
+    np.testing.assert_allclose(left.step + left.follow @ x[:12], x[12:], rtol=1e-8)
+    np.testing.assert_allclose(brightness.best(at, left, 1e-3 * x[:12]), at + left.step + 1e-3 * left.follow @ x[:12])
 
 
 def brighter(image: ColorImage, gain: float, offset: float) -> ColorImage:
@@ -46,7 +45,7 @@ def test_gain_and_offset_of_an_image_are_found(gain: float, offset: float, ref_s
         known = np.array([gain, offset])
         lin = s.terms.photometric(image, s.ref, s.truth, 0, sigma, brightness=at, expected=known)()
         assert lin.brightness is not None
-        at, sigma = lin.brightness.best(np.zeros(len(lin.model.g))), lin.next_sigma
+        at, sigma = brightness.best(at, lin.brightness, np.zeros(len(lin.model.g))), lin.next_sigma
     # Interpolation of such small images leaves errors of 2e-4 in intensity, which the gain takes for contrast.
     np.testing.assert_allclose(at, [gain, offset], atol=3e-3)
 

@@ -25,9 +25,10 @@ from util import numeric_jacobian
 
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.alignment import block_sums, brightness
+from rstrack.alignment import block_sums, linearise
 from rstrack.alignment.block_sums import BlockSums
-from rstrack.alignment.linearise import Linearised, Terms, seen_motions, weakest_motion
+from rstrack.alignment.linearise import Linearised, Terms
+from rstrack.alignment.normal_equations import Quadratic
 from rstrack.alignment.residuals import whole_image_unit
 from rstrack.images import line_poses as lines
 from rstrack.images.pyramid import ColorImage, DepthImage, depth_image
@@ -49,7 +50,7 @@ def one_line_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def known_brightness(monkeypatch: pytest.MonkeyPatch) -> None:
     """Gain and offset are not estimated, so that the gradient is that of the motion alone."""
-    monkeypatch.setattr(brightness, "_SIGMA", (1e-9, 1e-9))
+    monkeypatch.setattr(linearise, "SIGMA", np.full(2, 1e-9))
 
 
 # -- the chain to the control points ----------------------------------------------------------------------------------
@@ -241,7 +242,7 @@ def test_what_lies_behind_the_keyframes_surface_is_hidden_and_no_misfit() -> Non
     for by in (-0.3, 0.3):  # in front of the wall it contradicts it
         part = np.where(np.arange(64) < 32, z + by, z) * (z > 0)
         seen = replace(s, image=replace(s.image, z=ENGINE.upload(part))).term(s.truth, 1e-3)
-        counts.append((seen.count, seen.compared))
+        counts.append((seen.count, seen.sums.compared))
     (front, front_of), (behind, behind_of) = counts
     assert front < 0.6 * front_of and behind == behind_of and behind == pytest.approx(front, rel=0.02)
 
@@ -345,6 +346,8 @@ def test_observability_is_zero_where_a_motion_is_not_seen() -> None:
 
 def test_rotations_are_seen_by_the_scenes_depth() -> None:
     alike = BlockSums(np.diag([1.0, 1.0, 1.0, 4.0, 4.0, 4.0])[None, None] * 5, np.zeros((1, 1, 6)), 0.0, 0.0, 10)
-    np.testing.assert_allclose(seen_motions(alike, 2.0), 0.5 * np.eye(6))
-    assert weakest_motion(seen_motions(alike, 2.0)) == pytest.approx(0.5)
-    assert weakest_motion(seen_motions(BlockSums(0.0 * alike.H, alike.g, 0.0, 0.0, 0), 2.0)) == 0.0
+    unseen = BlockSums(0.0 * alike.H, alike.g, 0.0, 0.0, 0)
+    for sums, expected in ((alike, 0.5), (unseen, 0.0)):
+        model = Quadratic(0, np.zeros((24, 24)), np.zeros(24))
+        lin = Linearised(model, np.zeros((1, 6, 24)), 1.0, 1.0, 0.0, 1.0, 2.0, sums)
+        assert lin.observability == pytest.approx(expected)

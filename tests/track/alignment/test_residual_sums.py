@@ -24,11 +24,10 @@ from rsgen.geometry import se3
 from rsgen.geometry.so3 import hat
 from rsgen.geometry.spline import Spline
 from rstrack.alignment import block_sums as block_sums_module
-from rstrack.alignment import pixel_runs, residuals
-from rstrack.alignment.block_sums import BlockSums, Contribution, Layout, Scaling, block_counts
+from rstrack.alignment import residuals
+from rstrack.alignment.block_sums import BlockSums, Contribution, Pixels, Scaling, block_counts
 from rstrack.alignment.normal_equations import Slopes, chain
-from rstrack.alignment.pixel_runs import Pixels
-from rstrack.alignment.student_t import LEAST_CURVATURE, NU, weight
+from rstrack.alignment.weights import LEAST_CURVATURE, NU, weight
 from rstrack.images import line_poses as lines
 from rstrack.images.line_poses import IDENTITY_FROM_BASE, to_base_table
 from rstrack.images.pyramid import DepthImage
@@ -304,7 +303,7 @@ def test_full_blocks_of_the_worst_pixels_do_not_overflow(s: float, length: float
 def test_runs_of_pixels_add_up_to_what_pixels_do(
     monkeypatch: pytest.MonkeyPatch, width: int, height: int, stride: int, down: bool, run: int
 ) -> None:
-    monkeypatch.setattr(pixel_runs, "_run", lambda *_: run)
+    monkeypatch.setattr(block_sums_module, "_run", lambda *_: run)
     rng = np.random.default_rng(width + run)
     y, x = np.mgrid[:height:stride, :width:stride]
     # Runs leave blocks at every other step here, stay long there, and some pixels belong to none.
@@ -321,7 +320,7 @@ def test_runs_of_pixels_add_up_to_what_pixels_do(
         dr.scatter_add(seen, ENGINE.Int(1), pixels.y * width + pixels.x, pixels.meant & (pixels.index < len(seen)))
         return Contribution(slot, tuple(dr.select(compared, v, 0) for v in (a, b)), compared)
 
-    got = pixel_runs.summed(ENGINE, (width, height, stride), Layout(12, 2), at, down, False)
+    got = block_sums_module.summed(ENGINE, (width, height, stride), (12, 2), at, down, False)
     assert np.array_equal(got.numpy().reshape(6, 2), want)
     assert np.array_equal(seen.numpy().reshape(height, width)[::stride, ::stride], np.ones_like(x))
     assert seen.numpy().sum() == x.size

@@ -20,7 +20,7 @@ from rsgen.device.projection import project_rolling
 from rsgen.geometry import se3
 from rstrack.alignment import residuals
 from rstrack.alignment.linearise import Linearised
-from rstrack.alignment.student_t import LEAST_CURVATURE, NU, scale_step, weight
+from rstrack.alignment.weights import LEAST_CURVATURE, NU, scale_step, weight
 from rstrack.images import line_poses as lines
 from rstrack.images.blur import blur_length, blur_weight
 
