@@ -11,8 +11,8 @@ import trimesh
 
 from rsgen.array_types import BoolArray, FloatArray, IntArray
 from rsgen.formats.meshes.mesh_visual import Part
+from rsgen.formats.polygons import triangulate
 from rsgen.formats.scenes.content import Notes
-from rsgen.formats.scenes.triangulate import triangulate
 from rsgen.formats.scenes.usd_material import Look
 from rsgen.render.material import Material
 

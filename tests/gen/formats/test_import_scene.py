@@ -14,9 +14,9 @@ from usd_scenes import albedo, imported, triangles
 from rsgen import srgb
 from rsgen.cli.main import main
 from rsgen.errors import UserError
+from rsgen.formats.polygons import triangulate
 from rsgen.formats.scenes import blend, usd_stage
 from rsgen.formats.scenes.folder import write_folder, write_scene
-from rsgen.formats.scenes.triangulate import triangulate
 from rsgen.render.material import Material, Texture, bsdf
 from rsgen.render.scene import load_scene
 

@@ -13,7 +13,8 @@ from rendering import mi
 from scene_files import fails, hits, write_scene
 from trimesh.transformations import random_rotation_matrix
 
-from rsgen.formats.mitsuba_xml.mesh_files import is_convex, triangulated, with_triangles
+from rsgen.formats.mitsuba_xml.mesh_files import with_triangles
+from rsgen.formats.polygons import is_convex, triangulated
 from rsgen.render.meshes import surface
 from rsgen.render.scene import content_hash, load_scene
 
