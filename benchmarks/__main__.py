@@ -10,12 +10,13 @@ from typing import Annotated
 
 import numpy as np
 
-from benchmarks.compare import compare, tolerances
+from benchmarks.compare import compare
+from benchmarks.inference import tolerances
 from rsgen.console.command_line import Commands, Parser, Quiet, run_program
 from rsgen.console.progress import Progress
 from rsgen.console.scheduler import Scheduler, open_workers
-from rstrack.bench.definitions import Cell
-from rstrack.bench.record import Record, read_records, write_record, write_records
+from rstrack.bench.cells import Cell
+from rstrack.bench.record import CellRecord, read_records, write_record, write_records
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results"
@@ -81,7 +82,7 @@ def run_tier(tier: str, choice: Choice, scheduler: str | None, quiet: bool) -> i
     """Run, compare, keep; returns the exit status. Raises UserError."""
     from benchmarks.measures import MEASURES
     from rsgen.console.progress import ProgressDisplay
-    from rstrack.bench.definitions import load_benchmark
+    from rstrack.bench.cells import load_benchmark
     from rstrack.bench.runner import RECORD, Outcome, run_cells
     from rstrack.bench.sequences import Sources
 
@@ -89,7 +90,7 @@ def run_tier(tier: str, choice: Choice, scheduler: str | None, quiet: bool) -> i
     before = None if choice.against is None else read_records(choice.against)
     sources = Sources(None if choice.data is None else choice.data.resolve(), choice.cache, scheduler)
 
-    def done(record: Record) -> None:
+    def done(record: CellRecord) -> None:
         if record.error is not None and not quiet:
             print(f"bench: {record.cell}: {'skipped' if record.skipped else 'FAILED'}: {record.error}", file=sys.stderr)
 
@@ -159,13 +160,13 @@ def _within(progress: Progress, begin: float, end: float) -> Progress:
     return show
 
 
-def known(tier: str) -> dict[str, Record]:
+def known(tier: str) -> dict[str, CellRecord]:
     """The tier's committed records."""
     target = RESULTS / f"{tier}.json"
     return read_records(target) if target.is_file() else {}
 
 
-def accept(tier: str, records: Mapping[str, Record], is_part: bool) -> str:
+def accept(tier: str, records: Mapping[str, CellRecord], is_part: bool) -> str:
     """Write the records as the committed ones; a part of a tier replaces its own. Returns what to say."""
     target, kept = RESULTS / f"{tier}.json", known(tier) if is_part else {}
     good = {name: record for name, record in records.items() if record.error is None}

@@ -8,15 +8,15 @@ Seeds, and with them the noise, are the same in both, so that unchanged code giv
 alike in all runs are no comparison at all. The others are tested one-sidedly, and over all of these tests together
 there is a false alarm in at most one comparison of twenty (Holm 1979). The tests:
 
-- Figures with three runs or so: t-test of the means with a moderated variance (`benchmarks.scatter`), errors and ratios
-  in logarithms. It is not paired: a changed program's errors under the same noise may be alike, or may not, and where
-  they are, the test says less than it could. Of what has a nominal value, the distance of the mean from it.
+- Figures with three runs or so: t-test of the means with a moderated variance (`benchmarks.inference`), errors and
+  ratios in logarithms. It is not paired: a changed program's errors under the same noise may be alike, or may not, and
+  where they are, the test says less than it could. Of what has a nominal value, the distance of the mean from it.
 - The same tests together, for each figure of each method over all cells (Stouffer 1949): what makes everything a little
   worse is seen there, long before it is in any one cell. Half of the false alarms are theirs.
 - Ten runs and more, as of faults, one a seed: exact signed-rank test (Wilcoxon 1945) of the runs' differences, since
   lost frames are mostly none and sometimes hundreds, of which no mean knows anything. Counts by their differences.
 - Counts of fewer runs: exact test of two binomial shares of the frames (Fisher), without frames of two Poisson counts.
-- Silently wrong frames, and others that `tables.figures` has as outright: the first of them, where there was none.
+- Silently wrong frames, and others that `rstrack.bench.figures` has as outright: the first, where there was none.
   Where there were some, as of methods that take a rolling shutter for a global one, they are counts like others.
 - A cell that failed, or has no error in a run or in all of them where there was one: worse.
 
@@ -36,14 +36,19 @@ from operator import attrgetter
 
 from scipy import special
 
-from benchmarks.comparison import SIGNIFICANCE, Change, Comparison, times
-from benchmarks.exact import fisher_p, holm, poisson_p, signed_rank_p, stouffer_p
-from benchmarks.scatter import Prior, priors, spread_of, tolerances
-from rstrack.bench.record import Record
-from rstrack.bench.tables.cells import is_others
-from rstrack.bench.tables.figures import Figure, figure_of
-
-__all__ = ["Change", "Comparison", "compare", "tolerances"]
+from benchmarks.comparison import SIGNIFICANCE, FigureChange, RecordComparison, times
+from benchmarks.inference import (
+    Prior,
+    fisher_p,
+    holm,
+    poisson_p,
+    priors,
+    signed_rank_p,
+    spread_of,
+    stouffer_p,
+)
+from rstrack.bench.figures import FigureInfo, figure_of
+from rstrack.bench.record import CellRecord
 
 PAIRED_FROM = 10
 """Runs from which these are compared one by one: fewer cannot be told from chance by ranks (2⁻¹⁰ at the least)."""
@@ -52,7 +57,7 @@ _DIGITS = 6
 
 @dataclass(frozen=True)
 class _Test:
-    change: Change
+    change: FigureChange
     p_worse: float
     p_better: float
     is_of_means: bool = False
@@ -62,17 +67,17 @@ class _Test:
 class _Judged:
     """Changes so far; what tests say of theirs is known once all are there."""
 
-    worse: list[Change] = field(default_factory=list)
-    better: list[Change] = field(default_factory=list)
-    unknown: list[Change] = field(default_factory=list)
+    worse: list[FigureChange] = field(default_factory=list)
+    better: list[FigureChange] = field(default_factory=list)
+    unknown: list[FigureChange] = field(default_factory=list)
     tests: list[_Test] = field(default_factory=list)
 
 
-def compare(old: Mapping[str, Record], new: Mapping[str, Record]) -> Comparison:
-    """Compare all cells that both have. `Comparison.worse` is empty where nothing got worse beyond chance."""
+def compare(old: Mapping[str, CellRecord], new: Mapping[str, CellRecord]) -> RecordComparison:
+    """Compare all cells that both have. `RecordComparison.worse` is empty where nothing got worse beyond chance."""
     usual = priors([old, new])
     judged, cells = _Judged(), defaultdict[str, list[str]](list)
-    pairs: list[tuple[Record, Record]] = []
+    pairs: list[tuple[CellRecord, CellRecord]] = []
     same = 0
     for name in dict.fromkeys((*old, *new)):
         before, after = old.get(name), new.get(name)
@@ -81,11 +86,11 @@ def compare(old: Mapping[str, Record], new: Mapping[str, Record]) -> Comparison:
             cells[fate].append(name)
         if before is None or after is None:
             continue
-        if fate == _FAILED and before.error is None and before.runs and not is_others(after):
-            judged.worse.append(Change(name, why=f"failed: {after.error}"))
+        if fate == _FAILED and before.error is None and before.runs and not after.is_others:
+            judged.worse.append(FigureChange(name, why=f"failed: {after.error}"))
         if not fate:
             pairs.append(_shared(before, after))
-            if not is_others(after):
+            if not after.is_others:
                 same += not _judge(*pairs[-1], usual, judged)
     together = _together(judged.tests)
     tests = [*together, *judged.tests]
@@ -97,10 +102,10 @@ def compare(old: Mapping[str, Record], new: Mapping[str, Record]) -> Comparison:
         ]
         for p in (attrgetter("p_worse"), attrgetter("p_better"))
     )
-    return Comparison(
+    return RecordComparison(
         (*judged.worse, *worse), (*judged.better, *better), tuple(judged.unknown),
         {what: tuple(cells[what]) for what in _FATES if cells[what]}, tuple(times(pairs)), len(tests), same,
-        sum(not is_others(after) for _, after in pairs),
+        sum(not after.is_others for _, after in pairs),
     )  # fmt: skip
 
 
@@ -110,7 +115,7 @@ _FAILED, _OTHERWISE = "failed", "defined otherwise now, not compared"
 _FATES = (_FAILED, "not run", "skipped", "not finished", _OTHERWISE, "new", "had failed before")
 
 
-def _fate(before: Record | None, after: Record | None) -> str:
+def _fate(before: CellRecord | None, after: CellRecord | None) -> str:
     """Why two records cannot be compared; empty if they can."""
     if after is None:
         return "not run"
@@ -126,7 +131,7 @@ def _fate(before: Record | None, after: Record | None) -> str:
     return _OTHERWISE if definitions[0] != definitions[1] or not {*before.seeds} & {*after.seeds} else ""
 
 
-def _judge(one: Record, other: Record, usual: Mapping[str, Prior], judged: _Judged) -> bool:
+def _judge(one: CellRecord, other: CellRecord, usual: Mapping[str, Prior], judged: _Judged) -> bool:
     """Add what changed between two records of the same runs to `judged`; whether anything did."""
     names = [n for n in _names(one) if figure_of(n).is_judged and one.values(n) != other.values(n)]
     for name in names:
@@ -135,24 +140,24 @@ def _judge(one: Record, other: Record, usual: Mapping[str, Prior], judged: _Judg
         is_gone = had > 0 and (missing == len(other.runs) or (missing > 0 and had == len(one.runs)))
         if is_gone and figure_of(name).scale != "count":
             why = f"missing in {missing} of its runs"
-            judged.worse.append(Change(one.cell, name, _shown(one, name), _shown(other, name), why=why))
+            judged.worse.append(FigureChange(one.cell, name, _shown(one, name), _shown(other, name), why=why))
         elif figure_of(name).outright and one.total(name) == 0.0 < other.total(name):
             why = "there was none"
-            judged.worse.append(Change(one.cell, name, 0.0, other.total(name), why=why))
+            judged.worse.append(FigureChange(one.cell, name, 0.0, other.total(name), why=why))
         else:
             test = _test(one, other, name, usual.get(name))
             if test is None:
-                judged.unknown.append(Change(one.cell, name, _shown(one, name), _shown(other, name)))
+                judged.unknown.append(FigureChange(one.cell, name, _shown(one, name), _shown(other, name)))
             else:
                 judged.tests.append(test)
     return bool(names)
 
 
-def _shared(before: Record, after: Record) -> tuple[Record, Record]:
+def _shared(before: CellRecord, after: CellRecord) -> tuple[CellRecord, CellRecord]:
     """Both with the runs of the seeds that both have, to the digits that files keep."""
     seeds = [seed for seed in before.seeds if seed in after.seeds]
 
-    def only(record: Record) -> Record:
+    def only(record: CellRecord) -> CellRecord:
         runs = dict(zip(record.seeds, record.runs, strict=True))
         rounded = ({name: _rounded(value) for name, value in runs[seed].items()} for seed in seeds)
         return dataclasses.replace(record, seeds=tuple(seeds), runs=tuple(rounded))
@@ -164,19 +169,19 @@ def _rounded(value: float | None) -> float | None:
     return None if value is None or not math.isfinite(value) else float(f"{value:.{_DIGITS}g}")
 
 
-def _names(record: Record) -> list[str]:
+def _names(record: CellRecord) -> list[str]:
     return list(dict.fromkeys(name for run in record.runs for name in run))
 
 
-def _shown(record: Record, name: str) -> float | None:
+def _shown(record: CellRecord, name: str) -> float | None:
     """A count's sum, or a figure's mean."""
     return record.total(name) if figure_of(name).scale == "count" else record.figures.get(name)
 
 
-def _test(one: Record, other: Record, name: str, usual: Prior | None) -> _Test | None:
+def _test(one: CellRecord, other: CellRecord, name: str, usual: Prior | None) -> _Test | None:
     """Old against new of one figure; None: there is no scatter to compare the difference with."""
     figure = figure_of(name)
-    change = Change(one.cell, name, _shown(one, name), _shown(other, name))
+    change = FigureChange(one.cell, name, _shown(one, name), _shown(other, name))
     pairs = [(a.get(name), b.get(name)) for a, b in zip(one.runs, other.runs, strict=True)]
     both = [(a, b) for a, b in pairs if a is not None and b is not None]
     if len(both) >= PAIRED_FROM:
@@ -187,13 +192,13 @@ def _test(one: Record, other: Record, name: str, usual: Prior | None) -> _Test |
     return _t_test(change, one, other, usual)
 
 
-def _cost(figure: Figure, value: float) -> float:
+def _cost(figure: FigureInfo, value: float) -> float:
     """One run's badness, of ranks' use only: what has no logarithm is below all that have one."""
     scaled = figure.on_scale(value)
     return figure.badness([-1e3 if scaled is None else scaled])
 
 
-def _t_test(change: Change, one: Record, other: Record, usual: Prior | None) -> _Test | None:
+def _t_test(change: FigureChange, one: CellRecord, other: CellRecord, usual: Prior | None) -> _Test | None:
     figure = figure_of(change.figure)
     values = [
         [x for value in record.values(change.figure) if (x := figure.on_scale(value)) is not None]
@@ -214,7 +219,7 @@ def _t_test(change: Change, one: Record, other: Record, usual: Prior | None) -> 
     return _Test(change, float(special.stdtr(dof, -t)), float(special.stdtr(dof, t)), is_of_means=True)
 
 
-def _count_test(change: Change, one: Record, other: Record) -> _Test:
+def _count_test(change: FigureChange, one: CellRecord, other: CellRecord) -> _Test:
     sign = 1 if figure_of(change.figure).better == "less" else -1
     counts = [round(record.total(change.figure)) for record in (one, other)]
     frames = [round(record.total("frames")) for record in (one, other)]
@@ -238,12 +243,12 @@ def _together(tests: Sequence[_Test]) -> list[_Test]:
     for (cell, name), of in families.items():
         if len(of) > 1:
             old, new = (_mean(figure_of(name), [getattr(test.change, when) for test in of]) for when in ("old", "new"))
-            change = Change(cell, name, old, new, why=f"mean of {len(of)} cells")
+            change = FigureChange(cell, name, old, new, why=f"mean of {len(of)} cells")
             out.append(_Test(change, stouffer_p([t.p_worse for t in of]), stouffer_p([t.p_better for t in of])))
     return out
 
 
-def _mean(figure: Figure, values: Sequence[float]) -> float | None:
+def _mean(figure: FigureInfo, values: Sequence[float]) -> float | None:
     """On the figure's scale."""
     scaled = [x for value in values if (x := figure.on_scale(value)) is not None]
     mean = math.fsum(scaled) / len(scaled) if scaled else math.nan

@@ -10,15 +10,15 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rsgen.console.tables import significant
-from rstrack.bench.record import Record
-from rstrack.bench.tables.figures import figure_of
+from rstrack.bench.figures import figure_of
+from rstrack.bench.record import CellRecord
 
 SIGNIFICANCE = 0.05
 """Chance of any false alarm over all tests of a comparison."""
 
 
 @dataclass(frozen=True)
-class Change:
+class FigureChange:
     """One figure of a cell: means, sums of counts. p: chance of as much without a change; why: other reasons."""
 
     cell: str
@@ -43,14 +43,14 @@ class Change:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class RecordComparison:
     """worse, better: beyond chance. unknown: changed, but what chance does there was never measured. cells: names by
     what became of them, where there is nothing to compare. times: lines. tests: how many; same: cells all alike.
     """
 
-    worse: tuple[Change, ...] = ()
-    better: tuple[Change, ...] = ()
-    unknown: tuple[Change, ...] = ()
+    worse: tuple[FigureChange, ...] = ()
+    better: tuple[FigureChange, ...] = ()
+    unknown: tuple[FigureChange, ...] = ()
     cells: dict[str, tuple[str, ...]] = field(default_factory=dict)
     times: tuple[str, ...] = ()
     tests: int = 0
@@ -75,7 +75,7 @@ class Comparison:
         return "\n".join(lines)
 
 
-def times(pairs: Sequence[tuple[Record, Record]]) -> list[str]:
+def times(pairs: Sequence[tuple[CellRecord, CellRecord]]) -> list[str]:
     """A line for each kind of time: its change over all cells, and on which machines."""
     factors: dict[str, list[float]] = defaultdict(list)
     for one, other in pairs:

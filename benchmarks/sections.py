@@ -7,20 +7,13 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from statistics import geometric_mean
 
-from benchmarks.beaten import beaten, beaten_table, peer_of, sentences
-from benchmarks.cliff import FAMILY
+from benchmarks.verdicts import FAMILY, beaten, beaten_table, peer_of, sentences
 from rsgen.console.tables import NOTHING, Entry, Table, significant
-from rstrack.bench.record import Record
-from rstrack.bench.tables.cells import (
-    group_of,
-    is_change,
-    is_others,
+from rstrack.bench.record import (
+    CellRecord,
     methods_in_order,
-    options_of,
-    program_of,
-    sequence_of,
 )
-from rstrack.bench.tables.shown import (
+from rstrack.bench.tables import (
     ERRORS,
     Average,
     Records,
@@ -77,7 +70,7 @@ def methods(full: Records) -> list[str]:
 def per_sequence(full: Records) -> list[str]:
     """ATE of every method, with the fusion that it has by default, on every sequence of these groups."""
     records = [record for group in PAPERS_GROUPS for record in of_group(full, group)]
-    records = [record for record in records if not {"fuse", "no-fuse"} & set(options_of(record))]
+    records = [record for record in records if not {"fuse", "no-fuse"} & set(record.options)]
     return _section("ATE by sequence, mm", by_sequence(records), records)
 
 
@@ -94,7 +87,7 @@ def real(full: Records) -> list[str]:
     clocks = [
         f"{record.case} {significant(record.figures['truth_offset_ms'])}"
         for record in records
-        if record.method == "rs-pg" and "truth_offset_ms" in record.figures and not is_change(record)
+        if record.method == "rs-pg" and "truth_offset_ms" in record.figures and not record.is_change
     ]
     about = f" Offsets with `rs-pg`, ms: {', '.join(clocks)}." if clocks else ""
     told = f"The truth has a clock of its own, which is fitted for each track.{about}"
@@ -105,13 +98,13 @@ def real(full: Records) -> list[str]:
 def imu(full: Records) -> list[str]:
     """With an IMU and without: averages of groups, and the cases of no group above."""
     tracks = [record for record in of_measure(full, "track") if _is_close(record)]
-    return _beside("With an IMU", tracks, lambda record: program_of(record) in _IMU)
+    return _beside("With an IMU", tracks, lambda record: record.program in _IMU)
 
 
 def loops(full: Records) -> list[str]:
     """With loops closed and without, and how true loops are."""
     tracks = of_measure(full, "track")
-    closing = {record.method: program_of(record) for record in tracks if "loops" in options_of(record)}
+    closing = {record.method: record.program for record in tracks if "loops" in record.options}
     shown = [record for record in tracks if record.method in {*closing, *closing.values()}]
     lines = _beside("Loops closed, and not", shown, lambda record: record.method in closing)
     found = of_measure(full, "loops")
@@ -142,14 +135,14 @@ def faults(full: Records) -> list[str]:
 
 def changes(full: Records) -> list[str]:
     """What may be wrong with a recording, beside the same as it is, by the method that most of it was asked of."""
-    tracks = [record for record in of_measure(full, "track") if group_of(record) != "real"]
-    asked = Counter(record.method for record in tracks if is_change(record)).most_common(1)
+    tracks = [record for record in of_measure(full, "track") if record.group != "real"]
+    asked = Counter(record.method for record in tracks if record.is_change).most_common(1)
     tracks = [record for record in tracks if asked and record.method == asked[0][0]]
-    changed = [record for record in tracks if is_change(record)]
-    bases = {sequence_of(record) for record in changed}
+    changed = [record for record in tracks if record.is_change]
+    bases = {record.sequence for record in changed}
     records = [record for record in tracks if record.case in bases] + changed
-    places = list(dict.fromkeys(map(sequence_of, records)))
-    records.sort(key=lambda record: places.index(sequence_of(record)))
+    places = list(dict.fromkeys(record.sequence for record in records))
+    records.sort(key=lambda record: places.index(record.sequence))
     return _section("What may be wrong: ATE mm · mm/s · deg/s", by_case(records, triples=True), records)
 
 
@@ -163,7 +156,7 @@ def others(full: Records) -> list[str]:
     """Sequences of no group above."""
     shown = {*PAPERS_GROUPS, "real", "", FAMILY}
     tracks = of_measure(full, "track")
-    records = [record for record in tracks if group_of(record) not in shown and not is_change(record)]
+    records = [record for record in tracks if record.group not in shown and not record.is_change]
     return _section("Other sequences: ATE, mm", by_case(records), records)
 
 
@@ -203,10 +196,10 @@ def not_the_best(full: Records) -> list[str]:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _averages(records: Sequence[Record], shown: Sequence[str]) -> Table:
+def _averages(records: Sequence[CellRecord], shown: Sequence[str]) -> Table:
     """Of each method: errors, the paper's, counts, and how true its covariances are."""
     found, names = averages(records), dict(zip(_ERRORS, ERRORS, strict=True))
-    ours = {record.method: program_of(record) for record in records if not is_others(record)}
+    ours = {record.method: record.program for record in records if not record.is_others}
 
     def value(method: str, column: str) -> float | None:
         return found[method].figures.get(names.get(column, "")) if method in found else None
@@ -226,7 +219,7 @@ def _averages(records: Sequence[Record], shown: Sequence[str]) -> Table:
     return pivot("method", shown, (*_ERRORS, "the paper", "lost", "silent", "NEES/6", "in 90 %"), entry, value)
 
 
-def _refined(records: Sequence[Record]) -> list[str]:
+def _refined(records: Sequence[CellRecord]) -> list[str]:
     """What refining runs came to, in a sentence."""
     changed = [record for record in records if not record.figures.get("given_back")]
     ratios = {what: [r.figures[name] for r in changed if name in r.figures] for what, name in _REFINED.items()}
@@ -240,11 +233,11 @@ def _refined(records: Sequence[Record]) -> list[str]:
     return [text, ""] if parts else []
 
 
-def _beside(title: str, tracks: Sequence[Record], chosen: Callable[[Record], bool]) -> list[str]:
+def _beside(title: str, tracks: Sequence[CellRecord], chosen: Callable[[CellRecord], bool]) -> list[str]:
     """Averages of groups of some cases, over those that the chosen methods ran on; `others` has single ones."""
     means: dict[tuple[str, str], Average] = {}
-    for group in dict.fromkeys(group_of(record) for record in tracks if not is_change(record)):
-        cases = {r.case for r in tracks if group_of(r) == group and chosen(r) and not is_change(r)}
+    for group in dict.fromkeys(record.group for record in tracks if not record.is_change):
+        cases = {r.case for r in tracks if r.group == group and chosen(r) and not r.is_change}
         if group not in (*PAPERS_GROUPS, "real") and len(cases) < 3:
             continue
         found = averages([record for record in tracks if record.case in cases])
@@ -257,10 +250,10 @@ def _beside(title: str, tracks: Sequence[Record], chosen: Callable[[Record], boo
     return _section(f"{title}: ATE mm · mm/s · deg/s", table, tracks if means else ())
 
 
-def _is_close(record: Record) -> bool:
+def _is_close(record: CellRecord) -> bool:
     """Whether it is with an IMU, or the same without."""
     plain = [program.removesuffix("i") for program in _IMU]
-    return not is_others(record) and program_of(record) in (*_IMU, *plain) and "fuse" not in options_of(record)
+    return not record.is_others and record.program in (*_IMU, *plain) and "fuse" not in record.options
 
 
 def _fault_entries(runs: Sequence[dict[str, float | None]]) -> list[Entry]:
@@ -276,7 +269,7 @@ def _fault_entries(runs: Sequence[dict[str, float | None]]) -> list[Entry]:
 
 def _kinds() -> list[str]:
     try:
-        return list(import_module("benchmarks.faults.faults").KINDS)
+        return list(import_module("benchmarks.measures.injected").KINDS)
     except (ImportError, AttributeError):
         return []
 
@@ -287,6 +280,6 @@ def _kind(kind: float | None, names: Sequence[str]) -> str:
     return names[int(kind)] if int(kind) < len(names) else f"kind {kind:g}"
 
 
-def _section(title: str, table: Table, records: Sequence[Record], *told: str) -> list[str]:
+def _section(title: str, table: Table, records: Sequence[CellRecord], *told: str) -> list[str]:
     """Nothing where there are no records."""
     return [f"## {title}", "", *told, table.markdown(), ""] if records else []

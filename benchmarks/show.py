@@ -6,30 +6,34 @@ python -m benchmarks.show --check      # 1 where the texts differ from what the 
 
 from __future__ import annotations
 
+import re
 import sys
+from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks import sections
-from benchmarks.beaten import sentences
-from benchmarks.cliff import cliff
-from benchmarks.pictures import draw_readout
+from benchmarks.verdicts import cliff, sentences
 from rsgen.console.tables import Entry, Table
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, read_text
-from rstrack.bench.record import read_records
-from rstrack.bench.tables.cells import is_others, methods_in_order, program_of
-from rstrack.bench.tables.files import failures, provenance
-from rstrack.bench.tables.shown import (
+from rstrack.bench.experiments.readout_results import errors, readout_chart
+from rstrack.bench.record import CellRecord, methods_in_order, read_records
+from rstrack.bench.tables import (
     Records,
     averages,
     closes_loops,
+    failures,
     is_default,
     of_group,
+    of_measure,
     paper_triple,
+    provenance,
     sequences_of,
     triple,
 )
+from rstrack.charts.chart import Chart
+from rstrack.charts.to_file import write_charts
 
 ROOT = Path(__file__).parents[1]
 GATE, FULL = (ROOT / "benchmarks/results" / f"{tier}.json" for tier in ("gate", "full"))
@@ -95,12 +99,12 @@ def readme_block(gate: Records, full: Records) -> str:
     rows = []
     for method in methods_in_order(shown):
         record = next(record for record in shown if record.method == method)
-        cells: list[Entry | str] = [_what(method, program_of(record), closes_loops(record))]
+        cells: list[Entry | str] = [_what(method, record.program, closes_loops(record))]
         for name, records in groups.items():
             average = means[name].get(method)
             cells.append(Entry("-" if average is None else triple(average.figures, average.mark)))
             if name != "real":
-                is_papers = is_default(record) and not is_others(record)
+                is_papers = is_default(record) and not record.is_others
                 cells.append(paper_triple(sequences_of(records), method) if is_papers else "")
         rows.append((method, *cells))
     head = ("method", "what it does", "hand-held", "the paper", "living room", "the paper", "real recordings")
@@ -178,3 +182,26 @@ def _provenance(tier: str, records: Records) -> list[str]:
 
 if __name__ == "__main__":
     sys.exit(main())
+
+
+_CASE = re.compile(r"readout-(.+)-(\d+(?:\.\d+)?)ms")
+
+
+def readout_charts(full: Records) -> list[Chart]:
+    """ATE over readout, one chart a motion, of cells track/readout-MOTION-Nms/METHOD."""
+    motions: dict[str, dict[str, dict[float, CellRecord]]] = defaultdict(lambda: defaultdict(dict))
+    records = of_measure(full, "track")
+    order = methods_in_order(records)
+    for record in sorted(records, key=lambda record: order.index(record.method)):
+        named = _CASE.fullmatch(record.case)
+        if named and errors(record):
+            motions[named[1]][record.method][1e-3 * float(named[2])] = record
+    return [readout_chart(motion, methods) for motion, methods in motions.items()]
+
+
+def draw_readout(full: Records, path: Path) -> bool:
+    """Write the picture, the same bytes for the same records and versions; whether there is anything to draw."""
+    charts = readout_charts(full)
+    if charts:
+        write_charts(charts, path, "", columns=len(charts), one_legend=True)
+    return bool(charts)

@@ -21,7 +21,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
-from rstrack.peers.command import run_command
+from rstrack.peers.peer import run_command
 
 EXAMPLES = Path(__file__).parents[1] / "docs/examples"
 

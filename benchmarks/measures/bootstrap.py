@@ -10,10 +10,10 @@ from pydantic import Field
 
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
+from rstrack.bench.definitions import StrictModel
 from rstrack.bench.measures.track import WRONG_M
 from rstrack.bench.record import Figures
-from rstrack.bench.settings import Settings, settings_of
-from rstrack.bench.task import Task
+from rstrack.bench.task import Task, settings_of
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate
 from rstrack.metrics.association import Truth, compare, truth_of
@@ -24,7 +24,7 @@ _LIMITS_MM = (1, 5)
 _MIN_POSES = 3
 
 
-class BootstrapSettings(Settings):
+class BootstrapSettings(StrictModel):
     """How many starts, and frames of each."""
 
     starts: int = Field(default=50, ge=1)

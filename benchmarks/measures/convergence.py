@@ -17,9 +17,9 @@ from rsgen.geometry.spline import Spline
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.observation import observe
 from rstrack.alignment.spline_state import SplineState
+from rstrack.bench.definitions import StrictModel
 from rstrack.bench.record import Figures
-from rstrack.bench.settings import Settings, settings_of
-from rstrack.bench.task import Task
+from rstrack.bench.task import Task, settings_of
 from rstrack.data.dataset import Dataset
 from rstrack.data.rig import Frame, Rig
 from rstrack.images.device_frame import DeviceFrame, DeviceRig
@@ -40,14 +40,14 @@ _GAPS = range(1, 11)
 _END_KNOTS = 6
 
 
-class ConvergenceSettings(Settings):
+class ConvergenceSettings(StrictModel):
     """How many keyframes with a frame."""
 
     pairs: int = Field(default=50, ge=1)
 
 
 @dataclass(frozen=True)
-class Pair:
+class FramePair:
     """Frames (their numbers), and the unit vectors (3,) along which, and about which, the later one is moved."""
 
     keyframe: int
@@ -57,7 +57,7 @@ class Pair:
 
 
 @dataclass(frozen=True)
-class Trial:
+class AlignmentTrial:
     """Where a moved frame ended: errors at mid readout. believed: the tracker would have gone on with it."""
 
     factor: float
@@ -96,13 +96,13 @@ def convergence_cell(task: Task, progress: Progress) -> Figures:
 
 
 def run_trials(
-    dataset: Dataset, truth: Spline, options: Options, pairs: Sequence[Pair], progress: Progress
-) -> tuple[list[Trial], float]:
+    dataset: Dataset, truth: Spline, options: Options, pairs: Sequence[FramePair], progress: Progress
+) -> tuple[list[AlignmentTrial], float]:
     """All pairs from all distances; and the largest error (m) of the spline that stands for the truth."""
     aligner = Aligner(dataset.rig, options)
     t0 = _span(dataset, 0)[0] - options.knot_phase * options.knots_s()
     spline = resampled(truth, t0, options.knots_s())
-    trials: list[Trial] = []
+    trials: list[AlignmentTrial] = []
     off_m = 0.0
     for done, pair in enumerate(pairs, 1):
         ref = aligner.keyframe(pair.keyframe, dataset.frame(pair.keyframe), truth)
@@ -115,13 +115,13 @@ def run_trials(
             steps, believed = aligner.align(new, ref, state)
             T = state.spline.pose(t)
             error = float(np.linalg.norm(T[:3, 3] - T_true[:3, 3])), float(angles_deg(T_true[None], T[None])[0])
-            trials.append(Trial(factor, *error, steps, believed))
+            trials.append(AlignmentTrial(factor, *error, steps, believed))
         found = sum(trial.converged for trial in trials if trial.factor == 1.0)
         progress("aligning", done / len(pairs), f"{found} of {done} converged")
     return trials, off_m
 
 
-def figures_of(trials: Sequence[Trial]) -> Figures:
+def figures_of(trials: Sequence[AlignmentTrial]) -> Figures:
     """By factor; wrong_unnoticed: trials that have not converged, with which the tracker would have gone on."""
     figures: Figures = {}
     for factor in dict.fromkeys(trial.factor for trial in trials):
@@ -138,7 +138,7 @@ def figures_of(trials: Sequence[Trial]) -> Figures:
 
 def choose_pairs(
     dataset: Dataset, frames: range, truth: Spline, options: Options, count: int, seed: int
-) -> list[Pair]:  # fmt: skip
+) -> list[FramePair]:  # fmt: skip
     """Random pairs of `frames` one to ten apart. Raises UserError if there are none."""
     rng = np.random.default_rng(seed)
     margin = _END_KNOTS * options.knots_s()
@@ -161,7 +161,7 @@ def choose_pairs(
         gap = int(rng.choice(gaps))
         k = int(rng.choice(starts[gap]))
         direction, axis = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
-        pairs.append(Pair(k, k + gap, direction, axis))
+        pairs.append(FramePair(k, k + gap, direction, axis))
     return pairs
 
 
@@ -181,7 +181,7 @@ def resampled(truth: Spline, t0: float, dt: float) -> Spline:
     return Spline(points, t0, dt)
 
 
-def moved_state(spline: Spline, new: DeviceFrame, pair: Pair, factor: float) -> SplineState:
+def moved_state(spline: Spline, new: DeviceFrame, pair: FramePair, factor: float) -> SplineState:
     """The spline up to a frame, whose control points are all moved so that its camera has turned and shifted.
 
     Pose at mid readout: T_world_cam D with D = (rotation about pair.axis, shift along pair.direction).

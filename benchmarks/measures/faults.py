@@ -13,12 +13,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from benchmarks.faults.faults import KINDS, Fault, random_fault
+from benchmarks.measures.injected import KINDS, InjectedFault, random_fault
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rstrack.bench.changes.edits import reordered
+from rstrack.bench.changes import reordered
 from rstrack.bench.measures.track import WRONG_DEG, WRONG_M
 from rstrack.bench.record import Figures
 from rstrack.bench.task import Task
@@ -47,7 +47,7 @@ def fault_cell(task: Task, progress: Progress) -> Figures:
     return judged(random_fault(cut, task.seed, kind), task.options)
 
 
-def judged(fault: Fault, options: Options) -> Figures:
+def judged(fault: InjectedFault, options: Options) -> Figures:
     """Track a recording with a fault and compare every pose with the truth, when it is given and in the end.
 
     silent: frames given though wrong; silent_fault: whether there is any (0 or 1). lost: of all `frames`. worst_mm,

@@ -20,11 +20,10 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.adjustment.loops import Loop, LoopSearch
-from rstrack.bench.changes.edits import with_color, with_depth
-from rstrack.bench.definitions import SequenceEntry
+from rstrack.bench.changes import with_color, with_depth
+from rstrack.bench.definitions import SequenceEntry, StrictModel
 from rstrack.bench.record import Figures
-from rstrack.bench.settings import Settings, settings_of
-from rstrack.bench.task import Task
+from rstrack.bench.task import Task, settings_of
 from rstrack.data.dataset import Dataset
 from rstrack.options import Options
 from rstrack.tracking.any_tracker import make_tracker
@@ -39,7 +38,7 @@ _FALSE = np.array([0.02, np.radians(2.0)])
 _ANYWHERE = np.array([1e3, 10.0])
 
 
-class LoopsSettings(Settings):
+class LoopsSettings(StrictModel):
     """alike: pairs of different places that look alike to try. other: try those with another room.
 
     That is another sequence, defined as they are in `sequences`, or the same one with left and right exchanged.
@@ -71,7 +70,7 @@ def loops_cell(task: Task, progress: Progress) -> Figures:
     if other is None:
         tried, accepted = _look_alikes(search, truth, times, settings.alike, progress)
     else:
-        there = _tracked(other, task.options, range(len(other))[task.cell.piece], progress)
+        there = _tracked(other, task.options, range(len(other))[task.cell.frames], progress)
         tried, accepted = _across(search, there, settings.alike, progress)
     return {
         "keyframes": len(times), "loops": len(loops), **_accuracy(loops, truth, times),

@@ -38,7 +38,7 @@ _GREY = 0.5  # in the place of metals and glass, which have no diffuse lobe
 
 
 @dataclass(frozen=True)
-class CameraPath:
+class ExposurePath:
     """One picture's camera path: T_world_cam (n, 4, 4), evenly spaced in time from the opening to the closing.
 
     line_share: each line's exposure as a share of that time; None for a still, whose path has one pose.
@@ -48,18 +48,18 @@ class CameraPath:
     line_share: float | None
 
 
-def exposure(T_world_cam: Any, shutter: Shutter, stamp: float) -> CameraPath:
+def exposure(T_world_cam: Any, shutter: Shutter, stamp: float) -> ExposurePath:
     """The exposure of a frame stamped `stamp` (s): T_world_cam maps times (n,) s to (n, 4, 4), e.g. `Spline.pose`.
 
     Raises UserError for another scan than top-bottom, which is the only one that Blender knows.
     """
     span = shutter.readout_s + shutter.exposure_s
     if span == 0:
-        return CameraPath(np.asarray(T_world_cam(np.array([stamp])), float), None)
+        return ExposurePath(np.asarray(T_world_cam(np.array([stamp])), float), None)
     if shutter.scan != "top-bottom":
         raise UserError(f"scan '{shutter.scan}': Blender's rolling shutter runs from top to bottom only")
     times = stamp - shutter.exposure_s + span * np.linspace(0, 1, _POSES)
-    return CameraPath(np.asarray(T_world_cam(times), float), shutter.exposure_s / span)
+    return ExposurePath(np.asarray(T_world_cam(times), float), shutter.exposure_s / span)
 
 
 def check_installed() -> None:
@@ -71,7 +71,7 @@ def check_installed() -> None:
 class BlenderRenderer(AbstractContextManager["BlenderRenderer"]):
     """Blender in a child process that keeps the scene between pictures; close it, or use it as a context."""
 
-    def __init__(self, scene: Any, camera: Camera, exposures: Sequence[CameraPath], spp: int, max_depth: int) -> None:
+    def __init__(self, scene: Any, camera: Camera, exposures: Sequence[ExposurePath], spp: int, max_depth: int) -> None:
         """Start Blender and give it the scene. max_depth: of paths, as Mitsuba's `path` counts it.
 
         Raises UserError if Blender is missing or fails, or if the camera or scene is beyond it.

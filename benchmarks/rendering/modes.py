@@ -25,7 +25,7 @@ from rsgen.errors import UserError
 from rsgen.geometry.shutter import Shutter
 from rsgen.produce.frame_source import mirrored_samples
 from rsgen.produce.ground_truth import load_motion
-from rstrack.bench.memory import peak_mb
+from rstrack.bench.machine import peak_mb
 
 MODES = ("still", "rs-blur", "path", "rows", "averaged")
 BLENDER_MODES = ("blender-still", "blender")

@@ -8,36 +8,35 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import platform
-import subprocess
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
-from datetime import UTC, datetime
-from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, read_text
+from rstrack.bench.definitions import OTHERS
 from rstrack.data.estimate import plain
+from rstrack.options import METHODS
 
 Figures = dict[str, float | None]
 """Of one run, flat; units are in the names (ate_mm, median_ms, psnr_db, lost); None: could not be had."""
 
 _DIGITS = 6
+_ORDER = ("rs-pg", "rs-g", "rs-p", "rs-pgi", "rs-gi", "gs-pg", "gs-g", "gs-p", "baseline")
+# A track with poses for fewer of the frames says little of its error: it counts as lost.
+_LEAST_COVERAGE = 0.5
 
 
 @dataclass(frozen=True)
-class Record:
+class CellRecord:
     """One cell's outcome.
 
     cell: MEASURE/CASE/METHOD. key: what the runs depend on. seeds, runs: one run of figures for each seed that is done;
     complete: all of them are. settings: case, method and measure as they were defined. machine: CPU, cores, load before
     the first run. error: why there is nothing; skipped: whether that is no fault (a recording or a package is absent).
     scatter: by figure, what chance is measured to do to one run of this cell: a standard deviation (of logarithms,
-    where `tables.figures` compares in these) and its degrees of freedom; set when the records are accepted.
+    where `rstrack.bench.figures` compares in these) and its degrees of freedom; set when the records are accepted.
     """
 
     cell: str
@@ -71,6 +70,42 @@ class Record:
         return self.cell.split("/")[2]
 
     @property
+    def program(self) -> str:
+        """The method or peer that ran, by its own name."""
+        return str(self._part("method").get("method") or self.method)
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Of our method, those that are not at their defaults."""
+        return dict(self._part("method").get("options", {}))
+
+    @property
+    def is_others(self) -> bool:
+        """Whether it measures other people's tracker: a peer, a command, or results in a folder."""
+        entry = self._part("method")
+        return bool(entry.get("command") or entry.get("results")) or self.program in OTHERS
+
+    @property
+    def sequence(self) -> str:
+        """The sequence that the case is a part of."""
+        return str(self._part("case").get("sequence", self.case))
+
+    @property
+    def group(self) -> str:
+        """Cases that are averaged together; empty: none."""
+        return str(self.settings.get("group") or "")
+
+    @property
+    def is_change(self) -> bool:
+        """Whether something was done to a sequence: its case is named SEQUENCE-CHANGE, or of the group `changes`."""
+        return self.group == "changes" or self.case.startswith(f"{self.sequence}-")
+
+    @property
+    def folder(self) -> Path:
+        """Of its run, relative to that of the results."""
+        return Path("cells", self.cell)
+
+    @property
     def figures(self) -> dict[str, float]:
         """The mean of every figure over the runs that have it."""
         names = dict.fromkeys(name for run in self.runs for name in run)
@@ -85,64 +120,58 @@ class Record:
         """A count's sum over the runs."""
         return math.fsum(self.values(name))
 
+    @property
+    def is_done(self) -> bool:
+        """Whether there are figures."""
+        return self.error is None and bool(self.runs)
 
-def machine() -> dict[str, Any]:
-    """What figures are taken on, and how busy it is (load: average of the last minute)."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return {
-        "cpu": models[0] if models else platform.processor() or platform.machine(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
-        "system": platform.system(),
-        "python": platform.python_version(),
-    }
+    @property
+    def is_good(self) -> bool:
+        """Whether it has run and kept the track."""
+        return self.error is None and counts(self.figures)
 
+    @property
+    def truth_offset_s(self) -> float | None:
+        """The offset of the truth's clock that the errors are for, s; None for clocks as they are."""
+        offset_ms = self.figures.get("truth_offset_ms")
+        return None if offset_ms is None else 1e-3 * offset_ms
 
-def stamped(record: Mapping[str, Any]) -> dict[str, Any]:
-    """Version, commit, date and machine, now."""
-    return dict(record) | {
-        "version": package_version(), "commit": commit(), "date": f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
-        "machine": machine(),
-    }  # fmt: skip
+    def _part(self, name: str) -> dict[str, Any]:
+        """What the settings have of case or method."""
+        found = self.settings.get(name)
+        return found if isinstance(found, dict) else {}
 
 
-def package_version() -> str:
-    """Of this project."""
-    return version("rolling-shutter-rgbd")
+def counts(figures: Mapping[str, float | None]) -> bool:
+    """Whether a run's errors mean something: at least half of the frames have a pose."""
+    frames, lost = figures.get("frames") or 0.0, figures.get("lost") or 0.0
+    return figures.get("ate_mm") is not None and lost <= (1.0 - _LEAST_COVERAGE) * frames
 
 
-def versions_behind(version: str) -> int:
-    """Minor versions by which another one of this project is older; many where the major one is another."""
-    then, now = (tuple(int(part) for part in text.split(".")[:2]) for text in (version, package_version()))
-    return now[1] - then[1] if then[0] == now[0] else 999
+def figure(record: CellRecord | None, name: str) -> float | None:
+    """A figure of a record; None where it failed, the track is lost or lacks it."""
+    return record.figures.get(name) if record is not None and record.is_good else None
 
 
-@cache
-def commit() -> str | None:
-    """Of the checkout that this code is in, with a + where files have changed since; None outside of one."""
-    here = Path(__file__).parent
-    try:
-        told = subprocess.run(
-            ["git", "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"],
-            cwd=here, capture_output=True, text=True, check=False, timeout=10,
-        )  # fmt: skip
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return told.stdout.strip() or None
+def methods_in_order(records: Iterable[CellRecord]) -> list[str]:
+    """Names of methods: ours first, variants after what they are variants of, then other people's."""
+
+    def rank(record: CellRecord) -> tuple[bool, int, bool, str]:
+        known = OTHERS if record.is_others else (*_ORDER, *METHODS)
+        place = known.index(record.program) if record.program in known else len(known)
+        return record.is_others, place, record.method != record.program, record.method
+
+    return list(dict.fromkeys(record.method for record in sorted(records, key=rank)))
 
 
-def write_records(path: Path, records: Iterable[Record]) -> None:
+def write_records(path: Path, records: Iterable[CellRecord]) -> None:
     """All records into one file, a line a cell, in the order of their names. Raises UserError."""
     lines = [json.dumps(_short(record)) for record in sorted(records, key=lambda record: record.cell)]
     path.parent.mkdir(parents=True, exist_ok=True)
     atomic_write(path, ("[\n" + ",\n".join(lines) + "\n]\n").encode())
 
 
-def read_records(path: Path) -> dict[str, Record]:
+def read_records(path: Path) -> dict[str, CellRecord]:
     """The records of a file by their cells' names. Raises UserError: it is missing, or is not one of these files."""
     try:
         return {data["cell"]: _record(data) for data in json.loads(read_text(path))}
@@ -150,13 +179,13 @@ def read_records(path: Path) -> dict[str, Record]:
         raise UserError(f"{path}: is no file of benchmark records ({error}): write it with --accept") from None
 
 
-def write_record(path: Path, record: Record) -> None:
+def write_record(path: Path, record: CellRecord) -> None:
     """One record. Raises UserError."""
     path.parent.mkdir(parents=True, exist_ok=True)
     atomic_write(path, (json.dumps(_short(record), indent=1) + "\n").encode())
 
 
-def read_record(path: Path) -> Record | None:
+def read_record(path: Path) -> CellRecord | None:
     """One record; None if there is none that can be read."""
     try:
         return _record(json.loads(read_text(path)))
@@ -164,12 +193,12 @@ def read_record(path: Path) -> Record | None:
         return None
 
 
-def _record(data: Mapping[str, Any]) -> Record:
+def _record(data: Mapping[str, Any]) -> CellRecord:
     scatter = {name: (float(sd), float(dof)) for name, (sd, dof) in data.get("scatter", {}).items()}
-    return Record(**{**data, "seeds": tuple(data["seeds"]), "runs": tuple(data["runs"]), "scatter": scatter})
+    return CellRecord(**{**data, "seeds": tuple(data["seeds"]), "runs": tuple(data["runs"]), "scatter": scatter})
 
 
-def _short(record: Record) -> dict[str, Any]:
+def _short(record: CellRecord) -> dict[str, Any]:
     """Plain data, figures to six digits: more is not measured."""
 
     def short(value: float | None) -> float | None:

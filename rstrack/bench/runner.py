@@ -22,9 +22,9 @@ from rsgen.console.progress import Progress, no_progress
 from rsgen.console.scheduler import InProcess, Workers
 from rsgen.device.backend import select
 from rsgen.errors import UserError
-from rstrack.bench.definitions import Benchmark, Cell
-from rstrack.bench.memory import peak_mb, reset_peak
-from rstrack.bench.record import Record, package_version, read_record, stamped, versions_behind, write_record
+from rstrack.bench.cells import Benchmark, Cell
+from rstrack.bench.machine import package_version, peak_mb, reset_peak, stamped, versions_behind
+from rstrack.bench.record import CellRecord, read_record, write_record
 from rstrack.bench.sequences import Absent, Sources
 from rstrack.bench.task import MEASURES, Task, measure_named
 from rstrack.data.estimate import TRAJECTORY
@@ -46,7 +46,7 @@ _DESCRIPTIONS = (
 class Outcome:
     """Records by their cells' names, of those that are done; interrupted: some are missing."""
 
-    records: dict[str, Record]
+    records: dict[str, CellRecord]
     interrupted: bool = False
 
 
@@ -66,7 +66,7 @@ class Job:
 
 def run_cells(
     benchmark: Benchmark, out: Path, sources: Sources, workers: Workers | None = None, progress: Progress = no_progress,
-    measures: Mapping[str, str] | None = None, done: Callable[[Record], None] | None = None,
+    measures: Mapping[str, str] | None = None, done: Callable[[CellRecord], None] | None = None,
     expected_s: Mapping[str, float] | None = None,
 ) -> Outcome:  # fmt: skip
     """Run what `out` does not hold yet, in this process or by `workers`; Ctrl-C ends it with what is finished.
@@ -88,7 +88,7 @@ def run_cells(
         for cell in benchmark.cells
         for where in [known[cell.measure]]
     ]  # fmt: skip
-    records: dict[str, Record] = {}
+    records: dict[str, CellRecord] = {}
     known_s = dict(expected_s or {})
     usual_s = sorted(known_s.values())[len(known_s) // 2] if known_s else 1.0
     weight = {job.cell.name: known_s.get(job.cell.name, usual_s) for job in jobs}
@@ -129,7 +129,7 @@ def run_cells(
     return Outcome(_ordered(jobs, records))
 
 
-def run_cell(job: Job, progress: Progress = no_progress) -> Record:
+def run_cell(job: Job, progress: Progress = no_progress) -> CellRecord:
     """Run the seeds of a cell that its record does not hold yet; the record is written after each.
 
     What is missing or cannot be read is the record's error: such a cell is tried again the next time. Raises
@@ -139,7 +139,7 @@ def run_cell(job: Job, progress: Progress = no_progress) -> Record:
     key = _key(job)
     record = _kept(job, key)
     if record is None:
-        record = Record(**stamped({"cell": cell.name, "key": key, "settings": cell.as_dict()}))
+        record = CellRecord(**stamped({"cell": cell.name, "key": key, "settings": cell.as_dict()}))
     if record.complete:
         return record
     try:
@@ -212,7 +212,7 @@ def _key(job: Job, root: Path | None = None) -> str:
     return hashlib.sha256(json.dumps(depends, sort_keys=True, default=str).encode()).hexdigest()
 
 
-def _kept(job: Job, key: str) -> Record | None:
+def _kept(job: Job, key: str) -> CellRecord | None:
     """What there is of the seeds that are asked for; None: nothing, or of other inputs."""
     there = read_record(job.out / RECORD)
     if there is None or there.error is not None or there.key != key:
@@ -255,5 +255,5 @@ def _file_digest(path: Path) -> str | None:
         return None
 
 
-def _ordered(jobs: list[Job], records: Mapping[str, Record]) -> dict[str, Record]:
+def _ordered(jobs: list[Job], records: Mapping[str, CellRecord]) -> dict[str, CellRecord]:
     return {job.cell.name: records[job.cell.name] for job in jobs if job.cell.name in records}

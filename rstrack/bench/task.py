@@ -16,9 +16,13 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 from rsgen.console.progress import Progress
+from rsgen.errors import UserError, first_problem
+from rstrack.bench.cells import Cell
 from rstrack.bench.changes import changed
-from rstrack.bench.definitions import Cell
+from rstrack.bench.definitions import Model
 from rstrack.bench.record import Figures
 from rstrack.bench.sequences import Sources
 from rstrack.data.dataset import Dataset, open_dataset
@@ -85,7 +89,7 @@ class Task:
     @property
     def frames(self) -> range:
         """Those of the dataset that are the case's."""
-        return range(len(self.dataset))[self.cell.piece]
+        return range(len(self.dataset))[self.cell.frames]
 
 
 def measure_named(where: str) -> Measure:
@@ -93,3 +97,11 @@ def measure_named(where: str) -> Measure:
     module, _, function = where.partition(":")
     found: Measure = getattr(import_module(module), function)
     return found
+
+
+def settings_of(task: Task, model: type[Model]) -> Model:
+    """The task's settings as the measure has them. Raises UserError naming cell and setting."""
+    try:
+        return model.model_validate(dict(task.settings))
+    except ValidationError as error:
+        raise UserError(f"{task.cell.name}: settings: {first_problem(error)}") from None

@@ -1,4 +1,7 @@
-"""What a figure shows, apart from how it is drawn: lines, ticks and bars in a plane, or camera paths in space."""
+"""What a figure shows, apart from how it is drawn: lines, ticks and bars, camera paths in space, and a calibration.
+
+A chart has a title, and a note with what the reader has to know.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rsgen.geometry.so3 import FloatArray
+from rsgen.array_types import FloatArray
 
 # Seen on white and on black.
 TRUE_COLOR, LOST_COLOR = "#8a919e", "#d1432f"
@@ -25,7 +28,7 @@ _ROOM = 0.35
 
 
 @dataclass(frozen=True)
-class Line:
+class Curve:
     """Values y (n,) over x (n,), NaN where there is none. has_points: few values were measured, and each is marked.
 
     low, high (n,): ends of the values' intervals, where these are known.
@@ -70,7 +73,7 @@ class Chart:
     title: str
     unit: str
     x_label: str = ""
-    lines: tuple[Line, ...] = ()
+    lines: tuple[Curve, ...] = ()
     ticks: tuple[Ticks, ...] = ()
     bars: tuple[Bars, ...] = ()
     groups: tuple[str, ...] = ()
@@ -111,11 +114,6 @@ class PathChart:
     note: str = ""
 
     @property
-    def heading(self) -> str:
-        """As a `Chart` has one."""
-        return self.title
-
-    @property
     def axes(self) -> tuple[tuple[int, int], ...]:
         """World axes, each with its sign, that are x, y and z of the plot; see `upright_axes`."""
         return upright_axes(self.paths[-1].T_world_cam)
@@ -142,11 +140,68 @@ class PathChart:
         return [(float(m - 0.53 * s), float(m + 0.53 * s)) for m, s in zip(middle, size, strict=True)]
 
 
+@dataclass(frozen=True)
+class MovedValue:
+    """How far a value moved from its start, and twice its σ, NaN where undetermined; both in the chart's unit."""
+
+    label: str
+    change: float
+    two_sigma: float
+    hover: str
+
+    @property
+    def is_found(self) -> bool:
+        """Whether the recording tells it."""
+        return bool(np.isfinite(self.two_sigma))
+
+
+@dataclass(frozen=True)
+class ChangeChart:
+    """For each unit an axis of its own, with a row for each of its values."""
+
+    title: str
+    by_unit: tuple[tuple[str, tuple[MovedValue, ...]], ...]
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class StripChart:
+    """Rows of cells over time, the darker the larger their parts (r, s), and curves below along the same time.
+
+    spans (s, 2): from when to when a column is, s. curves: each has an axis of its own, of this unit.
+    """
+
+    title: str
+    names: tuple[str, ...]
+    spans: FloatArray
+    parts: FloatArray
+    curves: tuple[tuple[str, Curve], ...]
+    x_label: str
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class LensChart:
+    """Points of an image at (n, 2), how far the lens has moved them (n, 2), drawn `magnified` times as far, and their
+    2 σ (n,); px."""
+
+    title: str
+    at: FloatArray
+    moved: FloatArray
+    two_sigma: FloatArray
+    magnified: float
+    note: str = ""
+
+
+AnyChart = Chart | PathChart | ChangeChart | StripChart | LensChart
+"""Everything that the page shows; files are drawn of `Chart` and `PathChart`."""
+
+
 def method_colors(methods: Iterable[str]) -> dict[str, str]:
     """A colour for each method, always the same for ours."""
     names = list(methods)
     # The setting of a method that 'rstrack bench' shows in its place.
-    fused = {name: _METHOD_COLORS[plain] for name in names if (plain := name.removesuffix(" --fuse")) in _METHOD_COLORS}
+    fused = {name: _METHOD_COLORS[plain] for name in names if (plain := name.removesuffix("-fuse")) in _METHOD_COLORS}
     others = [name for name in names if name not in fused]
     return _METHOD_COLORS | fused | {name: _OTHER_COLORS[k % len(_OTHER_COLORS)] for k, name in enumerate(others)}
 

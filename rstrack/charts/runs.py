@@ -20,7 +20,7 @@ from rstrack.charts.chart import (
     TRUE_COLOR,
     CameraPath,
     Chart,
-    Line,
+    Curve,
     PathChart,
     Ticks,
     method_colors,
@@ -100,7 +100,7 @@ def compared_errors(runs: Mapping[str, Tracked]) -> Chart:
     """Position errors of runs on one sequence, by name."""
     colors, begin = method_colors(runs), _begin(runs)
     lines = tuple(
-        Line(name, colors[name], run.estimate.stamps[run.found.index] - begin, 1e3 * run.found.position_errors_m)
+        Curve(name, colors[name], run.estimate.stamps[run.found.index] - begin, 1e3 * run.found.position_errors_m)
         for name, run in runs.items()
         if run.found is not None
     )
@@ -114,7 +114,7 @@ def inlier_charts(tracked: Tracked) -> tuple[Chart, ...]:
         return ()
     t = np.array([float(frame["stamp"]) for frame in frames]) - tracked.begin_s
     lines = tuple(
-        Line(name, color, t, values)
+        Curve(name, color, t, values)
         for key, color, name in (("inliers_depth", BLUE, "depth"), ("inliers_color", ORANGE, "colour"))
         if np.isfinite(values := 100.0 * np.array([_number(frame.get(key)) for frame in frames])).any()
     )
@@ -138,7 +138,7 @@ def time_charts(tracked: Tracked) -> tuple[Chart, ...]:
     # The first frames compile kernels, which would flatten all others.
     top = 1.5 * float(np.nanpercentile(times, 99)) if np.isfinite(times).any() else 1.0
     note = "The first frames compile kernels and may lie above."
-    line = Line("time", BLUE, t, times)
+    line = Curve("time", BLUE, t, times)
     return (Chart("Time to track a frame", "ms", _TIME, (line,), y_max=top, note=note),)
 
 
@@ -152,8 +152,8 @@ def _begin(runs: Mapping[str, Tracked]) -> float:
 
 def _with_rms(title: str, unit: str, t: FloatArray, values: FloatArray, color: str, note: str = "") -> Chart:
     rms = float(np.sqrt(np.mean(np.square(values))))
-    level = Line(f"RMS {significant(rms)}", TRUE_COLOR, t[[0, -1]], np.array([rms, rms]), is_dashed=True)
-    return Chart(title, unit, _TIME, (Line(title.split()[0].lower(), color, t, values), level), note=note)
+    level = Curve(f"RMS {significant(rms)}", TRUE_COLOR, t[[0, -1]], np.array([rms, rms]), is_dashed=True)
+    return Chart(title, unit, _TIME, (Curve(title.split()[0].lower(), color, t, values), level), note=note)
 
 
 def _summary(tracked: Tracked) -> str:

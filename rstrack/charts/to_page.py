@@ -2,36 +2,58 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from rsgen.geometry.so3 import FloatArray
-from rstrack.charts.calibration import ChangeChart, LensChart, StripChart
-from rstrack.charts.calibration_to_page import change_figure, lens_figure, strip_figure
-from rstrack.charts.chart import CameraPath, Chart, Line, PathChart, broken
+from rsgen.array_types import FloatArray
+from rstrack.charts.chart import (
+    COLORS,
+    TRUE_COLOR,
+    AnyChart,
+    CameraPath,
+    ChangeChart,
+    Chart,
+    Curve,
+    LensChart,
+    MovedValue,
+    PathChart,
+    StripChart,
+    broken,
+)
 
-Figure = dict[str, Any]
-"""{"data": [trace, ...], "layout": {...}}; the page's script adds the colours of its theme."""
+PlotlyFigure = dict[str, Any]
+"""{"data": [trace, ...], "layout": {...}}, with "height" (px) where it goes by the number of rows.
+
+The page's script adds the colours of its theme.
+"""
 
 # Where the eye is, as a direction.
 _EYE = (-0.5, -0.72, 0.48)
 _LEGEND: dict[str, Any] = {"orientation": "h", "x": 0, "y": 1.02, "yanchor": "bottom"}
 _LEGEND_3D: dict[str, Any] = {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "top"}
+# Heights of a calibration's charts, px: of a row, of an axis with its title below rows, of a curve and what is above
+# it, of the margins, and of a lens.
+_ROW, _AXIS, _CURVE, _GAP, _TOP, _BOTTOM, _LENS = 36, 52, 92, 20, 12, 50, 460
+# Seen on white and on black, and text of the page's colour on it.
+_STRIP_COLORS = [[0.0, "rgba(42,127,201,0.05)"], [1.0, "rgba(42,127,201,0.75)"]]
+# Characters after which a row's name goes on in a second line.
+_LONG = 18
 
 
-def figure_of(chart: Chart | PathChart | ChangeChart | StripChart | LensChart, points: int) -> Figure:
+def figure_of(chart: AnyChart, points: int) -> PlotlyFigure:
     """points: at most so many of each line and path."""
+    if isinstance(chart, Chart):
+        return _chart(chart, points)
+    if isinstance(chart, PathChart):
+        return _paths(chart, points)
     if isinstance(chart, ChangeChart):
-        return change_figure(chart)
-    if isinstance(chart, StripChart):
-        return strip_figure(chart)
-    if isinstance(chart, LensChart):
-        return lens_figure(chart)
-    return _paths(chart, points) if isinstance(chart, PathChart) else _chart(chart, points)
+        return _changes(chart)
+    return _strips(chart) if isinstance(chart, StripChart) else _lens(chart)
 
 
-def _chart(chart: Chart, points: int) -> Figure:
+def _chart(chart: Chart, points: int) -> PlotlyFigure:
     data = [_line(line, points) for line in chart.lines]
     for ticks in chart.ticks:
         marker = {"color": ticks.color, "symbol": "line-ns", "size": 9, "line": {"width": 1.5, "color": ticks.color}}
@@ -68,7 +90,7 @@ def _chart(chart: Chart, points: int) -> Figure:
     return {"data": data, "layout": layout}
 
 
-def _line(line: Line, points: int) -> dict[str, Any]:
+def _line(line: Curve, points: int) -> dict[str, Any]:
     dash, hover = "dash" if line.is_dashed else "solid", f"%{{y:.4g}}<extra>{line.name}</extra>"
     style: dict[str, Any] = {"line": {"color": line.color, "width": 1.4, "dash": dash}, "hovertemplate": hover}
     if line.has_points:
@@ -86,7 +108,7 @@ def _scatter(name: str, x: Any, y: Any, **style: Any) -> dict[str, Any]:
     return {"type": "scatter", "name": name, "x": list(x), "y": list(y), **style}
 
 
-def _paths(chart: PathChart, points: int) -> Figure:
+def _paths(chart: PathChart, points: int) -> PlotlyFigure:
     ranges = chart.ranges
     size = np.array([high - low for low, high in ranges])
     size *= 1.3 / size.max()
@@ -140,3 +162,138 @@ def _short(values: FloatArray, digits: int | None = None) -> list[float | None]:
     """Numbers for the page, NaN as None: to tenths of a millimetre or millisecond, or to so many significant digits."""
     short = (round(v, 4) if digits is None else float(f"{v:.{digits}g}") for v in np.asarray(values, float).tolist())
     return [v if np.isfinite(v) else None for v in short]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# of a calibration
+
+
+def _lens(chart: LensChart) -> PlotlyFigure:
+    """A line from each point to where it has moved, and a dot at its beginning with the colour of its 2 σ."""
+    ends = chart.at + chart.magnified * chart.moved
+    between = np.full(len(chart.at), np.nan)
+    x, y = (_short(np.stack([chart.at[:, k], ends[:, k], between], axis=1).ravel(), 5) for k in (0, 1))
+    style = {"line": {"color": TRUE_COLOR, "width": 1.6}, "hoverinfo": "skip", "showlegend": False}
+    length = np.linalg.norm(chart.moved, axis=1)
+    marker = {
+        "size": 7, "color": _short(chart.two_sigma, 5), "colorscale": "Viridis", "cmin": 0.0,
+        "colorbar": {"title": {"text": "2 σ, px"}, "thickness": 12},
+    }  # fmt: skip
+    dots = _scatter(
+        "", *(_short(chart.at[:, k], 5) for k in (0, 1)), mode="markers", showlegend=False, marker=marker,
+        text=[f"{a:.2f} ± {b:.2f} px" for a, b in zip(length, chart.two_sigma, strict=True)],
+        hovertemplate="(%{x:.0f}, %{y:.0f}): moved by %{text}<extra></extra>",
+    )  # fmt: skip
+    axis = {"zeroline": False, "fixedrange": True}
+    layout = _layout(_AXIS) | {
+        "xaxis": axis | {"title": {"text": "x, px"}, "constrain": "domain"},
+        "yaxis": axis | {"title": {"text": "y, px"}, "autorange": "reversed", "scaleanchor": "x", "automargin": True},
+    }  # fmt: skip
+    return {"data": [_scatter("", x, y, mode="lines", **style), dots], "layout": layout, "height": _LENS}
+
+
+def _changes(chart: ChangeChart) -> PlotlyFigure:
+    """A dot with whiskers for each value, around the line of no change; an axis for each unit."""
+    height = _TOP + sum(_ROW * len(rows) + _AXIS for _, rows in chart.by_unit)
+    inner = height - _TOP - _AXIS
+    data: list[dict[str, Any]] = []
+    layout, top = _layout(_AXIS), 0
+    for n, (unit, rows) in enumerate(chart.by_unit):
+        found = [row for row in rows if row.is_found]
+        of_axis = {"xaxis": _axis("x", n), "yaxis": _axis("y", n)}
+        undetermined = [row for row in rows if not row.is_found]
+        data += [_dots(some, is_found) | of_axis for some, is_found in ((found, True), (undetermined, False)) if some]
+        bottom = top + _ROW * len(rows)
+        reach = 1.15 * max((abs(row.change) + row.two_sigma for row in found), default=0.0) or 1.0
+        layout[_axis("xaxis", n)] = {
+            "title": {"text": f"change, {unit}", "standoff": 4}, "anchor": _axis("y", n), "range": [-reach, reach],
+            "zeroline": True, "zerolinewidth": 2, "zerolinecolor": TRUE_COLOR, "nticks": 7, "fixedrange": True,
+            "showticklabels": bool(found),
+        }  # fmt: skip
+        layout[_axis("yaxis", n)] = _names(1.0 - bottom / inner, 1.0 - top / inner) | {
+            "anchor": _axis("x", n), "range": [len(rows) - 0.5, -0.5], "categoryorder": "array",
+            "categoryarray": [_two_lines(row.label) for row in rows],
+        }  # fmt: skip
+        top = bottom + _AXIS
+    return {"data": data, "layout": layout, "height": height}
+
+
+def _dots(rows: Sequence[MovedValue], is_found: bool) -> dict[str, Any]:
+    """Dots with whiskers; hollow and without any where nothing was found."""
+    color = COLORS[0] if is_found else TRUE_COLOR
+    x, two_sigma = (_short(np.array([getattr(row, name) for row in rows]), 5) for name in ("change", "two_sigma"))
+    dots = _scatter(
+        "", x, [_two_lines(row.label) for row in rows], mode="markers", showlegend=False,
+        text=[row.hover for row in rows], hovertemplate="%{y}: %{text}<extra></extra>",
+        marker={"size": 9, "color": color, "symbol": "circle" if is_found else "circle-open"},
+    )  # fmt: skip
+    whiskers = {"type": "data", "array": two_sigma, "thickness": 1.6, "width": 5, "color": color}
+    return dots | ({"error_x": whiskers} if is_found else {})
+
+
+def _strips(chart: StripChart) -> PlotlyFigure:
+    """Cells above, curves below, all over one time."""
+    height = _TOP + len(chart.names) * _ROW + len(chart.curves) * (_CURVE + _GAP) + _BOTTOM
+    inner = height - _TOP - _BOTTOM
+    layout, bottom = _layout(_BOTTOM), 1.0 - _ROW * len(chart.names) / inner
+    data: list[dict[str, Any]] = [_cells(chart)] if chart.names else []
+    layout["yaxis"] = _names(bottom, 1.0) | {"autorange": "reversed", "showgrid": False}
+    for n, (unit, line) in enumerate(chart.curves, 1):
+        top = bottom - _GAP / inner
+        bottom = top - _CURVE / inner
+        style = {"line": {"color": line.color, "width": 1.4}, "yaxis": _axis("y", n)}
+        hover = f"%{{y:.3g}} {unit} at %{{x:.2f}} s<extra></extra>"
+        x, y = _short(line.x, 5), _short(line.y, 5)
+        data.append(_scatter(line.name, x, y, mode="lines", hovertemplate=hover, **style))
+        layout[_axis("yaxis", n)] = {
+            "domain": [max(0.0, bottom), top], "anchor": "x", "rangemode": "tozero", "zeroline": False, "nticks": 4,
+            "title": {"text": f"{line.name},<br>{unit}", "standoff": 6}, "automargin": True, "fixedrange": True,
+        }  # fmt: skip
+    times = np.concatenate([chart.spans.ravel(), *(line.x[np.isfinite(line.x)] for _, line in chart.curves)])
+    layout["xaxis"] = {
+        "title": {"text": chart.x_label}, "zeroline": False, "anchor": _axis("y", len(chart.curves)),
+        "range": [float(times.min(initial=0.0)), float(times.max(initial=1.0))],
+    }  # fmt: skip
+    return {"data": data, "layout": layout | {"showlegend": False}, "height": height}
+
+
+def _cells(chart: StripChart) -> dict[str, Any]:
+    """A heat map whose columns are the windows and the gaps between them, which hold nothing."""
+    edges: list[float] = [float(chart.spans[0, 0])]
+    columns: list[int | None] = []
+    for k, (begin, end) in enumerate(chart.spans.tolist()):
+        if begin > edges[-1]:
+            edges.append(begin)
+            columns.append(None)
+        edges.append(end)
+        columns.append(k)
+    parts = [_short(np.array([np.nan if k is None else row[k] for k in columns]), 5) for row in 100.0 * chart.parts]
+    return {
+        "type": "heatmap", "x": edges, "y": [_two_lines(name) for name in chart.names], "z": parts, "zmin": 0.0,
+        "zmax": float(max(1.0, 100.0 * chart.parts.max(initial=0.0))), "colorscale": _STRIP_COLORS, "showscale": False,
+        "texttemplate": "%{z:.0f}", "xgap": 1, "ygap": 3, "hoverongaps": False, "yaxis": "y", "xaxis": "x",
+        "hovertemplate": "%{y}: %{z:.1f} % told at %{x:.1f} s<extra></extra>",
+    }  # fmt: skip
+
+
+def _layout(bottom: int) -> dict[str, Any]:
+    margin = {"l": 10, "r": 14, "t": _TOP, "b": bottom}
+    return {"margin": margin, "hovermode": "closest", "uirevision": "keep"}
+
+
+def _names(low: float, high: float) -> dict[str, Any]:
+    """An axis of names, beside which there is room for them."""
+    return {
+        "domain": [max(0.0, low), min(1.0, high)], "type": "category", "automargin": True, "fixedrange": True,
+        "ticks": "", "zeroline": False,
+    }  # fmt: skip
+
+
+def _axis(name: str, n: int) -> str:
+    """The n-th axis as Plotly calls it: x, x2, x3."""
+    return name if n == 0 else f"{name}{n + 1}"
+
+
+def _two_lines(name: str) -> str:
+    head, comma, rest = name.partition(", ")
+    return f"{head},<br>{rest}" if comma and len(name) > _LONG else name

@@ -24,7 +24,7 @@ from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate
 from rstrack.data.image_files import prefetched
 from rstrack.options import CLOUD_PEERS, Options
-from rstrack.peers.record import run_info
+from rstrack.peers.peer import run_info
 
 # Pixels of a depth image are thinned out to about so many.
 _POINTS = 40_000

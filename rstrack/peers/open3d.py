@@ -23,7 +23,7 @@ from rstrack.data.estimate import Estimate
 from rstrack.data.image_files import prefetched
 from rstrack.data.registration import RegisteredImage, Registrar, registered_image
 from rstrack.options import PEERS, Options
-from rstrack.peers.record import run_info
+from rstrack.peers.peer import run_info
 
 _KEYFRAME = "-keyframe"
 # Part of the pixels that must have found a partner, and frames in a row without, after which the reference is given up.

@@ -12,16 +12,15 @@ from pathlib import Path
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, write_error
-from rstrack.bench.methods.results import RESULTS
-from rstrack.bench.stress.results import STRESS
+from rstrack.bench.experiments.blur import STRESS
+from rstrack.bench.experiments.method_results import RESULTS
 from rstrack.calibration.findings.record import read_record
 from rstrack.data.estimate import TRAJECTORY
 from rstrack.metrics.clock import TruthOffset
-from rstrack.report.bench import bench_page
+from rstrack.report.bench import bench_page, stress_page
 from rstrack.report.calibration import calibration_page
 from rstrack.report.page import Page, render
 from rstrack.report.run import run_page
-from rstrack.report.stress import stress_page
 
 REPORT = "report.html"
 

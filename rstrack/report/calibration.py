@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
+import numpy as np
+
 from rsgen.console.tables import Entry, Table, fixed, significant
-from rstrack.calibration.findings.record import Change, Parameter, Record
-from rstrack.charts.calibration import change_chart, lens_charts, strip_chart
-from rstrack.report.page import Block, Card, CardRow, Note, Page, Plot, Section, TextFile
+from rstrack.calibration.findings.record import Change, LensMap, Parameter, Record
+from rstrack.charts.chart import COLORS, ChangeChart, Curve, LensChart, MovedValue, StripChart, broken
+from rstrack.report.page import Block, Card, CardRow, Note, Page, PageSection, Plot, TextFile
 
 _BEFORE = (
     "Scales of the residuals (Student's, medians over a few stretches; those before to some percent). Before: with the "
@@ -29,20 +31,20 @@ def calibration_page(record: Record) -> Page:
         subtitle=f"from {count} stretches of the recording, {frames} frames in all, in {record.seconds:.0f} s",
         cards=(CardRow(calibration_cards(record)),),
         sections=(
-            Section("values", "Values", _values(record)),
-            *((Section("undetermined", "Undetermined", _undetermined(record)),) if record.undetermined else ()),
-            Section("residuals", "Residuals", _residuals(record)),
-            Section("where", "Where it was told", _where(record)),
-            Section("camera", "Camera file", _camera_file(record)),
+            PageSection("values", "Values", _values(record)),
+            *((PageSection("undetermined", "Undetermined", _undetermined(record)),) if record.undetermined else ()),
+            PageSection("residuals", "Residuals", _residuals(record)),
+            PageSection("where", "Where it was told", _where(record)),
+            PageSection("camera", "Camera file", _camera_file(record)),
         ),
         warnings=calibration_warnings(record),
     )  # fmt: skip
 
 
-def calibration_section(record: Record) -> Section:
+def calibration_section(record: Record) -> PageSection:
     """All of it but the warnings as one part of a run's page."""
     blocks = (*_values(record), *_undetermined(record), *_residuals(record), *_where(record), *_camera_file(record))
-    return Section("calibration", "Calibration", blocks)
+    return PageSection("calibration", "Calibration", blocks)
 
 
 def calibration_cards(record: Record) -> tuple[Card, ...]:
@@ -159,3 +161,61 @@ def _camera_file(record: Record) -> tuple[Block, ...]:
         Note("Not converged: do not use this file.", is_warning=True),)  # fmt: skip
     return *warning, TextFile("camera.yaml", record.camera_file), Note(
         "rstrack track RECORDING --camera camera.yaml --out RUN tracks with it.")  # fmt: skip
+
+
+def lens_charts(record: Record) -> tuple[LensChart, ...]:
+    """Where each lens that was looked for puts points, against what it began with."""
+    return tuple(_lens_chart(name, lens) for name, lens in record.lens_maps.items() if lens.at_px)
+
+
+def _lens_chart(name: str, lens: LensMap) -> LensChart:
+    at, moved = np.array(lens.at_px), np.array(lens.moved_px)
+    longest = float(np.linalg.norm(moved, axis=1).max())
+    spacing = float(np.diff(np.unique(at[:, 0])).min(initial=np.inf))
+    magnified = spacing / longest if np.isfinite(spacing) and longest > 0.0 else 1.0
+    note = (
+        f"From where the lens before had a point of the scene, a dot, to where the new one has it: {longest:.2g} px at "
+        f"most, drawn {magnified:.2g} times as long. Colour: 2 σ of that place."
+    )
+    return LensChart(f"The {name} camera's lens", at, moved, 2.0 * np.array(lens.sigma_px)[:, 0], magnified, note)
+
+
+def change_chart(record: Record) -> ChangeChart:
+    """Values against what they were before."""
+    by_unit: dict[str, list[MovedValue]] = {}
+    for p in record.parameters.values():
+        by_unit.setdefault(p.shown.unit, []).append(_moved(p))
+    note = (
+        "Zero is where a value began; whiskers are 2 σ, often narrower than the dot. Hollow: undetermined, it has "
+        "stayed where it was."
+    )
+    return ChangeChart("How far values moved from their starts", tuple((u, tuple(m)) for u, m in by_unit.items()), note)
+
+
+def strip_chart(record: Record) -> StripChart:
+    """Which stretches of the recording tell each value, and how the camera moved there."""
+    found = [p for p in record.parameters.values() if p.is_found]
+    parts = np.array([p.told_by_stretch for p in found]).reshape(len(found), len(record.stretches))
+    t, speed, turning = broken(
+        *(np.array(values) for values in (record.pace.time_s, record.pace.m_s, record.pace.rad_s))
+    )
+    curves = (
+        ("m/s", Curve("speed", COLORS[0], t, speed)), ("deg/s", Curve("turning", COLORS[1], t, np.degrees(turning))),
+    )  # fmt: skip
+    note = (
+        "Each row is one value: the part of what is known of it that a stretch tells, in percent, all other values "
+        "known. Between the stretches nothing was used. Below, how fast the camera moves and turns, by the first rough "
+        "track; it is broken where that was lost."
+    )
+    return StripChart(
+        "Where in the recording values are told", tuple(p.shown.label for p in found),
+        np.array(record.stretch_times_s).reshape(-1, 2), parts, curves, "time since the first frame, s", note,
+    )  # fmt: skip
+
+
+def _moved(p: Parameter) -> MovedValue:
+    shown, factor = p.shown, p.shown.factor
+    if p.sigma is None:
+        return MovedValue(shown.label, 0.0, float("nan"), f"undetermined, kept at {factor * p.value:.4g} {shown.unit}")
+    hover = f"{factor * p.value:.4g} ± {2.0 * factor * p.sigma:.2g} {shown.unit}, from {factor * p.start:.4g}"
+    return MovedValue(shown.label, factor * (p.value - p.start), 2.0 * factor * p.sigma, hover)

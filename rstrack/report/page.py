@@ -1,6 +1,6 @@
 """The page: what it is made of, and how that becomes one HTML file that loads nothing.
 
-html = render(Page("lr_kt2", "tracked with rs-pg", cards, facts, (Section("errors", "Errors", blocks),)))
+html = render(Page("lr_kt2", "tracked with rs-pg", cards, facts, (PageSection("errors", "Errors", blocks),)))
 """
 
 from __future__ import annotations
@@ -12,10 +12,8 @@ from importlib.resources import files
 from typing import Any, Literal
 
 from rsgen.console.tables import Table
-from rstrack.charts.calibration import ChangeChart, LensChart, StripChart
-from rstrack.charts.calibration_to_page import LENS_HEIGHT, change_height, strip_height
-from rstrack.charts.chart import Chart, PathChart
-from rstrack.charts.to_page import Figure, figure_of
+from rstrack.charts.chart import AnyChart, Chart, PathChart
+from rstrack.charts.to_page import PlotlyFigure, figure_of
 from rstrack.data.estimate import plain
 
 
@@ -44,7 +42,7 @@ class CardRow:
 class Plot:
     """A chart of at most so many points a line. Paths are drawn from above where the browser has no WebGL."""
 
-    chart: Chart | PathChart | ChangeChart | StripChart | LensChart
+    chart: AnyChart
     points: int = 1500
     block: Literal["plot"] = "plot"
 
@@ -54,17 +52,13 @@ class Plot:
         return isinstance(self.chart, PathChart)
 
     @property
-    def height(self) -> int | None:
-        """In px where it goes by the number of rows."""
-        if isinstance(self.chart, ChangeChart):
-            return change_height(self.chart)
-        if isinstance(self.chart, LensChart):
-            return LENS_HEIGHT
-        return strip_height(self.chart) if isinstance(self.chart, StripChart) else None
+    def heading(self) -> str:
+        """Its title, with the unit of a chart that has one."""
+        return self.chart.heading if isinstance(self.chart, Chart) else self.chart.title
 
 
 @dataclass(frozen=True)
-class Picture:
+class PageImage:
     """uri: an image as a data URI. alt: what it shows, in words."""
 
     uri: str
@@ -73,10 +67,10 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Pictures:
+class ImageRow:
     """Pictures side by side."""
 
-    items: tuple[Picture, ...]
+    items: tuple[PageImage, ...]
     block: Literal["pictures"] = "pictures"
 
 
@@ -85,8 +79,8 @@ class Slider:
     """Two pictures of one size on top of each other; a slider uncovers the one below."""
 
     title: str
-    before: Picture
-    after: Picture
+    before: PageImage
+    after: PageImage
     note: str = ""
     block: Literal["slider"] = "slider"
 
@@ -114,7 +108,7 @@ class TextFile:
         return "data:text/plain;base64," + base64.b64encode(self.text.encode()).decode("ascii")
 
 
-Block = Table | Plot | Pictures | Slider | Note | TextFile
+Block = Table | Plot | ImageRow | Slider | Note | TextFile
 
 
 @dataclass(frozen=True)
@@ -127,7 +121,7 @@ class Chooser:
 
 
 @dataclass(frozen=True)
-class Section:
+class PageSection:
     """A part of the page; key: its anchor."""
 
     key: str
@@ -142,7 +136,7 @@ class Page:
     title: str
     subtitle: str
     cards: tuple[CardRow, ...]
-    sections: tuple[Section, ...]
+    sections: tuple[PageSection, ...]
     facts: tuple[tuple[str, str], ...] = ()
     warnings: tuple[str, ...] = ()
     made_with: str = ""
@@ -154,11 +148,12 @@ def render(page: Page) -> str:
     from markupsafe import Markup
     from plotly.offline import get_plotlyjs  # type: ignore[import-untyped]
 
-    figures: list[Figure] = []
+    figures: list[PlotlyFigure] = []
 
-    def add_figure(plot: Plot) -> int:
+    def add_figure(plot: Plot) -> tuple[int, int | None]:
+        """Its number, and its height in px where that goes by its rows."""
         figures.append(figure_of(plot.chart, plot.points))
-        return len(figures) - 1
+        return len(figures) - 1, figures[-1].pop("height", None)
 
     here = files("rstrack.report")
     environment = Environment(

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import base64
 from pathlib import Path
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.files import read_bytes
+from rsgen.geometry import se3
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter, project_rolling
 from rsgen.geometry.spline import Spline
-from rstrack.bench.methods.mesh_pictures import MeshPicture
+from rstrack.bench.experiments.pictures import MeshPicture
 from rstrack.data.dataset import Dataset
+from rstrack.data.rig import Image, Rig
 from rstrack.metrics.tracked import Tracked
-from rstrack.report.images import colored_depth, jpeg_uri, rectified
-from rstrack.report.page import Block, Note, Picture, Pictures, Slider
+from rstrack.report.page import Block, ImageRow, Note, PageImage, Slider
 
 # Of maps to be compared with a slider: more than of photographs, for the differences are small.
 _SLIDER_WIDTH = 720
@@ -30,7 +35,7 @@ def frame_panels(tracked: Tracked, dataset: Dataset, width: int = 640) -> tuple[
     depth, low, high = colored_depth(frame.depth.pixels)
     at = f"frame {k or 0}"
     items = [
-        Picture(
+        PageImage(
             jpeg_uri(image.pixels, width),
             f"Colour, {at}, {image.stamp - tracked.begin_s:.3f} s",
             f"colour image of {at}",
@@ -39,7 +44,7 @@ def frame_panels(tracked: Tracked, dataset: Dataset, width: int = 640) -> tuple[
     ]
     t = frame.depth.stamp - tracked.begin_s
     caption = f"Depth, {at}, {t:.3f} s: {low:.2f} m (dark) to {high:.2f} m (bright); grey: not measured"
-    return (Pictures((*items, Picture(jpeg_uri(depth, width), caption, f"depth image of {at}"))),)
+    return (ImageRow((*items, PageImage(jpeg_uri(depth, width), caption, f"depth image of {at}"))),)
 
 
 def shutter_sliders(tracked: Tracked, dataset: Dataset, width: int = 640) -> tuple[Block, ...]:
@@ -64,8 +69,8 @@ def shutter_sliders(tracked: Tracked, dataset: Dataset, width: int = 640) -> tup
         blocks.append(
             Slider(
                 f"Rolling against global shutter, {at}",
-                Picture(jpeg_uri(rolling, width), "rolling shutter", f"{at} with a rolling shutter"),
-                Picture(jpeg_uri(sequence.truth(twin, i), width), "global shutter", f"{at} with a global shutter"),
+                PageImage(jpeg_uri(rolling, width), "rolling shutter", f"{at} with a rolling shutter"),
+                PageImage(jpeg_uri(sequence.truth(twin, i), width), "global shutter", f"{at} with a global shutter"),
                 f"Right: the exact twin of the renderer, all lines at the time of the {_TWINS[twin]} one. {kind}",
             )
         )
@@ -81,8 +86,8 @@ def shutter_sliders(tracked: Tracked, dataset: Dataset, width: int = 640) -> tup
         blocks.append(
             Slider(
                 f"As recorded, and rectified with the estimated motion, {at}",
-                Picture(jpeg_uri(color.pixels, width), "as recorded", f"{at} as recorded"),
-                Picture(
+                PageImage(jpeg_uri(color.pixels, width), "as recorded", f"{at} as recorded"),
+                PageImage(
                     jpeg_uri(rectified(dataset.rig, spline, image.depth, color), width), "rectified", f"{at} rectified"
                 ),
                 "Right: the same image as a global shutter at the middle line's time would show it, from the estimated "
@@ -104,7 +109,7 @@ def map_pictures(picture: MeshPicture, width: int) -> tuple[Block, ...]:
     if any(panel.shape[:2] != (h, w) for panel in panels):
         raise UserError(f"{picture.path}: is not of the size that was drawn: delete it and run 'rstrack bench' again")
     named = list(zip(panels, picture.labels, strict=True))
-    blocks: list[Block] = [Pictures(tuple(_map(panel, label, width) for panel, label in named))]
+    blocks: list[Block] = [ImageRow(tuple(_map(panel, label, width) for panel, label in named))]
     first, *others = [_map(panel, label, _SLIDER_WIDTH) for panel, label in named]
     for method, other in zip(picture.methods[1:], others, strict=True):
         blocks.append(Slider(f"Map with {method} against {picture.methods[0]}", other, first))
@@ -114,8 +119,8 @@ def map_pictures(picture: MeshPicture, width: int) -> tuple[Block, ...]:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _map(panel: npt.NDArray[np.uint8], label: str, width: int) -> Picture:
-    return Picture(jpeg_uri(panel, width), label, f"map from above, {label}")
+def _map(panel: npt.NDArray[np.uint8], label: str, width: int) -> PageImage:
+    return PageImage(jpeg_uri(panel, width), label, f"map from above, {label}")
 
 
 def _read_jpeg(path: Path) -> npt.NDArray[np.uint8]:
@@ -161,3 +166,81 @@ def _fastest(dataset: Dataset, among: npt.NDArray[np.int64], motion: Spline | No
     velocity = motion.velocity(middle)
     shift = np.linalg.norm(velocity[:, :3], axis=1) / 2.0 + np.linalg.norm(velocity[:, 3:], axis=1)
     return int(among[np.argmax(shift)])
+
+
+_JPEG_QUALITY = 85
+# Where nothing was measured.
+_NOTHING = 128
+# Pixels between the samples of a coarser depth image, which are filled from their neighbours.
+_FILL_ROUNDS = 3
+
+
+def jpeg_uri(image: npt.NDArray[np.uint8], width: int = 640) -> str:
+    """An RGB image (h, w, 3) as a data URI, made smaller if it is wider than `width` pixels."""
+    if image.shape[1] > width:
+        height = round(image.shape[0] * width / image.shape[1])
+        image = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    ok, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    if not ok:
+        raise ValueError("cv2 could not encode a JPEG")
+    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
+
+
+def colored_depth(z: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.uint8], float, float]:
+    """Planar z (h, w) in m as RGB (h, w, 3), grey where it is 0; and the depths in m of dark and bright."""
+    seen = z > 0.0
+    low, high = (float(v) for v in np.percentile(z[seen], [1.0, 99.0])) if seen.any() else (0.0, 1.0)
+    scaled = np.clip((z - low) / max(high - low, 1e-6), 0.0, 1.0)
+    image = cv2.applyColorMap(np.rint(255.0 * scaled).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
+    return np.where(seen[..., None], cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8(_NOTHING)), low, high
+
+
+def rectified(rig: Rig, spline: Spline, depth: Image, color: Image) -> npt.NDArray[np.uint8]:
+    """The colour image (h, w, 3) as a global shutter at its middle line's time would have taken it; grey where unknown.
+
+    spline: T_world_depth(t), which must cover both readouts. The measured depth, each point moved by its own line's
+    pose, is seen from the middle line's pose; each pixel's point is then looked up in the rolling-shutter image, where
+    equation (3) of the paper says that it is.
+    """
+    camera, shutter = rig.color_camera, rig.color_shutter
+    middle = shutter.line_mid_time(color.stamp, (shutter.line_count(camera) - 1) / 2, camera)
+    T_world_color = spline.pose(middle) @ se3.inverse(rig.T_color_depth)
+    p_world = _points(rig.depth_camera, rig.depth_shutter, spline, depth)
+    z = _seen(camera, se3.transform(se3.inverse(T_world_color), p_world))
+    known = z > 0.0
+    there = se3.transform(T_world_color, camera.backproject(camera.pixel_grid()[known], z[known]))
+    uv = np.full((*z.shape, 2), -10.0, np.float32)
+    found, _, valid = project_rolling(spline, rig.T_color_depth, camera, shutter, color.stamp, there, iterations=4)
+    uv[known] = np.where(valid[:, None], found, -10.0)
+    grey = (_NOTHING, _NOTHING, _NOTHING)
+    image = cv2.remap(
+        color.pixels, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=grey
+    )
+    # At the border the interpolation mixes the picture with what lies outside.
+    image[(uv < 0.0).any(axis=-1)] = _NOTHING
+    return np.asarray(image, np.uint8)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _points(camera: Camera, shutter: Shutter, spline: Spline, depth: Image) -> FloatArray:
+    """Points (n, 3) in the world that a depth image measures, each from its own line's pose."""
+    seen = (depth.pixels > 0.0) & np.isfinite(depth.pixels)
+    uv = camera.pixel_grid()[seen]
+    lines = np.arange(shutter.line_count(camera))
+    T_world_depth = spline.pose(shutter.line_mid_time(depth.stamp, lines, camera))
+    line = np.rint(shutter.line_of_pixel(uv, camera)).astype(np.int64)
+    return se3.transform(T_world_depth[line], camera.backproject(uv, depth.pixels[seen]))
+
+
+def _seen(camera: Camera, p_cam: FloatArray) -> npt.NDArray[np.float64]:
+    """Planar z (h, w) of the nearest of the points (n, 3) in each pixel, small holes filled with the nearest beside."""
+    uv, _ = camera.project(p_cam)
+    inside = camera.contains(uv)
+    x, y = np.rint(uv[inside]).astype(np.int64).T
+    inverse = np.zeros((camera.height, camera.width))
+    np.maximum.at(inverse, (y, x), 1.0 / p_cam[inside, 2])
+    for _ in range(_FILL_ROUNDS):
+        inverse = np.where(inverse > 0.0, inverse, cv2.dilate(inverse, np.ones((3, 3), np.uint8)))
+    return np.where(inverse > 0.0, 1.0 / np.where(inverse > 0.0, inverse, 1.0), 0.0)

@@ -17,7 +17,7 @@ from rstrack.metrics.evaluate import Metrics
 from rstrack.metrics.run_evaluate import Evaluation, evaluate_clocks
 from rstrack.metrics.tracked import Tracked, load_run
 from rstrack.report.calibration import calibration_section, calibration_warnings
-from rstrack.report.page import Card, CardRow, Note, Page, Plot, Section
+from rstrack.report.page import Card, CardRow, Note, Page, PageSection, Plot
 from rstrack.report.pictures import frame_panels, shutter_sliders
 
 _AS_STORED = "table, path and curves go by the truth's clock as stored; --truth-offset auto: by the fitted one"
@@ -35,26 +35,26 @@ def run_page(
         raise UserError(f"{run}: there is no truth whose clock could be moved: name its --sequence, or leave "
                         "--truth-offset out")  # fmt: skip
     info = tracked.estimate.info
-    sections: list[Section] = []
+    sections: list[PageSection] = []
     evaluation = None
     if tracked.truth is not None and (tracked.found is not None or truth_offset is not None):
         evaluation = evaluate_clocks(tracked.truth, tracked.estimate, truth_offset)
         metrics = evaluation.chosen
         lines = (*evaluation.clocks, *([_AS_STORED] if evaluation.hint else []), *metrics.notes)
         notes = (Note(f"{line[0].upper()}{line[1:]}.") for line in lines)
-        sections.append(Section("errors", "Errors", (metrics.table(), *notes)))
+        sections.append(PageSection("errors", "Errors", (metrics.table(), *notes)))
         if evaluation.asked:
             tracked = load_run(run, dataset=tracked.dataset, truth_offset=evaluation.offset_s)
-    sections.append(Section("path", "Path", (Plot(path_chart({"estimated": tracked})),)))
+    sections.append(PageSection("path", "Path", (Plot(path_chart({"estimated": tracked})),)))
     if evaluation is not None:
-        sections.append(Section("time", "Errors over time", plots(error_charts(tracked))))
+        sections.append(PageSection("time", "Errors over time", plots(error_charts(tracked))))
     if charts := (*inlier_charts(tracked), *time_charts(tracked)):
-        sections.append(Section("tracker", "What the tracker said", plots(charts)))
+        sections.append(PageSection("tracker", "What the tracker said", plots(charts)))
     warnings = list(tracked.notes)
     if tracked.dataset is not None:
         try:
             blocks = (*frame_panels(tracked, tracked.dataset), *shutter_sliders(tracked, tracked.dataset))
-            sections.append(Section("images", "Images", blocks))
+            sections.append(PageSection("images", "Images", blocks))
         except UserError as error:
             warnings.append(f"Images are left out: {error}.")
     if (run / CALIBRATION).is_file():

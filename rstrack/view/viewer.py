@@ -9,7 +9,6 @@ times a second, so that the tracker hardly waits.
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -19,13 +18,15 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from rsgen.array_types import ByteArray, FloatArray
+from rsgen.array_types import ByteArray, Float32Array, FloatArray
+from rsgen.console.rerun import recording_file, rerun
 from rsgen.errors import UserError
-from rsgen.files import whole_file, write_error
+from rsgen.files import write_error
 from rsgen.geometry import se3
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rstrack.data.rig import Frame, Image, Rig
-from rstrack.view.residuals import depth_residuals, world_points
 
 if TYPE_CHECKING:
     from rstrack.tracking.any_tracker import AnyTracker
@@ -51,8 +52,8 @@ def open_view(file: Path | None, rig: Rig, name: str) -> Iterator[Viewer]:
 
     Raises UserError: rerun is not installed, no window can be opened, the file has another suffix or is there already.
     """
-    rr = _rerun()
     if file is None:
+        rr = rerun("--view")
         recording = rr.RecordingStream("rstrack", recording_id=None)
         try:
             recording.spawn()
@@ -61,29 +62,12 @@ def open_view(file: Path | None, rig: Rig, name: str) -> Iterator[Viewer]:
         yield Viewer(rr, recording, rig)
         recording.flush()
         return
-    if file.suffix != ".rrd":
-        raise UserError(f"--view {file}: a rerun recording is named .rrd")
-    if file.exists():
-        raise UserError(f"--view {file}: is there already: choose another name or delete it")
-    recording = rr.RecordingStream("rstrack", recording_id=name)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise write_error(file, error) from None
-    with whole_file(file) as temporary:
-        try:
-            recording.save(temporary)
-            yield Viewer(rr, recording, rig)
-            recording.flush()
-        finally:
-            recording.disconnect()
-
-
-def _rerun() -> Any:
-    try:
-        return importlib.import_module("rerun")
-    except ImportError:
-        raise UserError("--view: rerun is not installed: pip install 'rolling-shutter-rgbd[rerun]'") from None
+    with recording_file(file, "rstrack", name, "--view") as (rr, recording):
+        yield Viewer(rr, recording, rig)
 
 
 @dataclass
@@ -215,3 +199,58 @@ def _diverging(x: FloatArray) -> ByteArray:
     x = np.clip(x, -1.0, 1.0)
     rgb = np.stack([1.0 + np.minimum(x, 0.0), 1.0 - np.abs(x), 1.0 - np.maximum(x, 0.0)], axis=-1)
     return np.where(np.isnan(x)[..., None], 40, 255.0 * np.nan_to_num(rgb)).astype(np.uint8)
+
+
+_ROW_ITERATIONS = 3
+# Neighbours whose depths differ by more than this part are on two sides of an edge.
+_EDGE = 0.1
+
+
+def world_points(spline: Spline, camera: Camera, shutter: Shutter, image: Image, stride: int) -> FloatArray:
+    """p_world (h', w', 3) of every stride-th pixel of a depth image, each at its line's pose; NaN without depth.
+
+    spline: T_world_depth(t). Raises UserError where the spline does not cover the image.
+    """
+    uv = camera.pixel_grid()[::stride, ::stride]
+    z = image.pixels[::stride, ::stride].astype(np.float64)
+    p_cam = camera.backproject(uv, np.where(z > 0.0, z, np.nan))
+    lines, of = np.unique(shutter.line_of_pixel(uv, camera), return_inverse=True)
+    T = spline.pose(shutter.line_mid_time(image.stamp, lines, camera))
+    return np.asarray(se3.transform(T[of.reshape(p_cam.shape[:-1])], p_cam))
+
+
+def depth_residuals(
+    spline: Spline, camera: Camera, shutter: Shutter, p_world: FloatArray, other: Image
+) -> FloatArray:  # fmt: skip
+    """Depth that another image has where it sees p_world (..., 3), less the depth that the points have there, in m.
+
+    NaN: not seen, or without depth there. spline: T_world_depth(t), of both images. Which line sees a point is found by
+    looking from the line that would have seen it from the line before, which here settles within a hundredth of a line.
+    Raises UserError where the spline does not cover the other image.
+    """
+    points = p_world.reshape(-1, 3)
+    last = shutter.line_count(camera) - 1
+    times = shutter.line_mid_time(other.stamp, np.arange(last + 1), camera)
+    T_cam_world = se3.inverse(spline.pose(times))
+    line = np.full(len(points), last // 2)
+    for _ in range(_ROW_ITERATIONS):
+        p_cam = se3.transform(T_cam_world[line], points)
+        uv, valid = camera.project(p_cam)
+        wanted = np.where(valid, shutter.line_of_pixel(uv, camera), 0.0)
+        line = np.clip(np.rint(wanted), 0, last).astype(int)
+    residuals = np.where(valid, _between(other.pixels, uv), np.nan) - p_cam[:, 2]
+    return np.asarray(residuals.reshape(p_world.shape[:-1]))
+
+
+def _between(z: Float32Array, uv: FloatArray) -> FloatArray:
+    """Depth (n,) between the four pixels about uv (n, 2), as of a plane: linear in 1 / z. NaN beside edges and gaps."""
+    height, width = z.shape
+    inside = np.asarray(((uv >= 0.0) & (uv <= (width - 1, height - 1))).all(axis=-1))
+    at = np.where(inside[:, None], uv, 0.0)
+    u, v = (np.minimum(np.floor(at[:, i]).astype(int), n - 2) for i, n in enumerate((width, height)))
+    near = np.stack([z[v + j, u + i] for j in (0, 1) for i in (0, 1)]).astype(np.float64)
+    a, b = at[:, 0] - u, at[:, 1] - v
+    weights = np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b])
+    smooth = inside & (near.min(axis=0) > 0.0) & (np.ptp(near, axis=0) < _EDGE * near.max(axis=0))
+    inverse = (weights / np.where(smooth, near, 1.0)).sum(axis=0)
+    return np.where(smooth, 1.0 / inverse, np.nan)

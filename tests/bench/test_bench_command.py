@@ -38,11 +38,11 @@ import rstrack.bench.measures.track
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.sequence.format import pose_rows
-from rstrack.bench.methods.plots import draw_sequence
-from rstrack.bench.methods.results import read_results
-from rstrack.bench.methods.tables import results_text
-from rstrack.bench.record import Record, read_record
-from rstrack.bench.tables.cells import truth_offset_s
+from rstrack.bench.experiments.method_results import read_results
+from rstrack.bench.experiments.method_tables import method_tables, notes
+from rstrack.bench.experiments.pictures import draw_sequence
+from rstrack.bench.record import CellRecord, read_record
+from rstrack.bench.tables import tables_text
 from rstrack.data.estimate import read_estimate
 from rstrack.metrics.run_evaluate import run_evaluate
 from rstrack.options import Options
@@ -154,19 +154,19 @@ def test_another_clock_of_the_truth(place: Path) -> None:
     (root / "sequence.yaml").unlink()
     how: dict[str, Any] = {"sequences": ["robot_t1"], "methods": ["rs-g"], "options": Options(fuse=True)}
     (before,) = run(plan(**how)).records.values()
-    assert truth_offset_s(before) is None
+    assert before.truth_offset_s is None
     found = results(plan(**how, truth_offset=0.012))
     (after,) = found.records
     asked = run_evaluate(root, place / "bench/cells" / after.cell, truth_offset=0.012)
-    assert truth_offset_s(after) == 0.012
+    assert after.truth_offset_s == 0.012
     assert after.figures["ate_mm"] == pytest.approx(1e3 * asked.chosen.ate_rmse_m, rel=1e-6)
     assert after.figures["ate_mm"] < 0.3 * before.figures["ate_mm"]
-    assert "0.012 s after the stamps" in results_text(found)
+    assert "0.012 s after the stamps" in tables_text(method_tables(found), notes(found))
     # A second of poses has too few pairs one second apart to find it: clocks as they are, and that is said.
     sought = results(plan(**how, truth_offset="auto"))
     assert sought.records[0].figures["ate_mm"] == pytest.approx(before.figures["ate_mm"], rel=1e-6)
-    assert truth_offset_s(sought.records[0]) is None
-    assert "no offset of the truth's clock was found" in results_text(sought)
+    assert sought.records[0].truth_offset_s is None
+    assert "no offset of the truth's clock was found" in tables_text(method_tables(sought), notes(sought))
 
 
 def test_an_interrupt_keeps_what_is_finished(
@@ -215,7 +215,7 @@ def test_the_scheduler(place: Path) -> None:
 def test_workers_have_to_share_the_folder(place: Path) -> None:
     class Far:
         def apply(self, function: Any, jobs: Sequence[Any], progress: Any) -> Iterator[tuple[int, Any]]:
-            yield 0, Record(jobs[0].cell.name, "", {}, (0,), ({},), True)
+            yield 0, CellRecord(jobs[0].cell.name, "", {}, (0,), ({},), True)
 
     shutil.rmtree("bench")
     with pytest.raises(UserError, match=r"gs-g: a worker has written it, but not here"):
@@ -294,7 +294,11 @@ def test_lost_frames_are_marked_and_lost_tracks_do_not_count(
     found = results(made)
     record = found.record("robot_t1", "mine")
     assert record is not None and record.figures["lost"] == lost and record.error is None
-    (line,) = [line for line in results_text(found).split("\n\n")[0].splitlines() if line.startswith("mine")]
+    (line,) = [
+        line
+        for line in tables_text(method_tables(found), notes(found)).split("\n\n")[0].splitlines()
+        if line.startswith("mine")
+    ]
     assert word in line.split()[1]
     assert found.averaged("hand-held") == ("robot_t1",) and found.average("hand-held", "rs-g").figures
     assert ("ate_mm" not in found.average("hand-held", "mine").figures) == (word == "lost")

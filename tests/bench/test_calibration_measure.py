@@ -12,7 +12,14 @@ import synthetic
 from bench_task import make_task
 
 from benchmarks.measures import calibration
-from benchmarks.measures.calibration import UNIT_M, Trial, calibration_cell, figures_of, told_wrong, true_dataset
+from benchmarks.measures.calibration import (
+    UNIT_M,
+    CalibrationTrial,
+    calibration_cell,
+    figures_of,
+    told_wrong,
+    true_dataset,
+)
 from rsgen.config.config import Config
 from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
@@ -46,15 +53,16 @@ def test_a_wrong_camera_is_off_by_that_much_in_all_values_at_once(tiny: Dataset)
     np.testing.assert_array_equal(same.color_stamps, tiny.color_stamps)
 
 
-def trial(factor: float, error: float, sigma: float, **more: Any) -> Trial:
-    return Trial(factor, np.full(POSES, error), np.full(POSES, sigma), **({"converged": True} | more))
+def trial(factor: float, error: float, sigma: float, **more: Any) -> CalibrationTrial:
+    return CalibrationTrial(factor, np.full(POSES, error), np.full(POSES, sigma), **({"converged": True} | more))
 
 
 def test_what_becomes_of_trials_is_counted() -> None:
     nothing = np.full(POSES, np.nan)
     found = figures_of([
         trial(1.0, 1e-4, 1e-4, seconds=2.0), trial(1.0, -3e-4, 1e-4), trial(1.0, 5e-4, 1e-4),
-        trial(1.0, 9.0, 1.0, converged=False, seconds=2.0), Trial(4.0, nothing, nothing, refused="frames only"),
+        trial(1.0, 9.0, 1.0, converged=False, seconds=2.0),
+        CalibrationTrial(4.0, nothing, nothing, refused="frames only"),
     ])  # fmt: skip
     names = "found_pct", "not_converged", "refused", "wrong_unnoticed"
     assert [found[f"{name}_1x"] for name in names] == [50.0, 1, 0, 1]

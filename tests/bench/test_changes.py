@@ -12,8 +12,7 @@ from changed_frames import colors, depths, true_positions
 
 from rsgen.errors import UserError
 from rsgen.geometry.shutter import Scan
-from rstrack.bench.changes.edits import reduced, reordered, with_color, with_depth, with_stamps
-from rstrack.bench.changes.named import (
+from rstrack.bench.changes import (
     CHANGES,
     camera_told,
     changed,
@@ -25,7 +24,12 @@ from rstrack.bench.changes.named import (
     gained,
     jittered,
     readout_told,
+    reduced,
+    reordered,
     swinging_gain,
+    with_color,
+    with_depth,
+    with_stamps,
 )
 from rstrack.data.camera_file import usual
 from rstrack.data.dataset import Dataset, open_dataset

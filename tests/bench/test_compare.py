@@ -15,26 +15,27 @@ from scipy import stats
 
 from benchmarks.compare import compare
 from benchmarks.comparison import SIGNIFICANCE
-from benchmarks.exact import fisher_p, poisson_p, signed_rank_p, stouffer_p
-from benchmarks.scatter import Spread, fit_prior, tolerances
-from rstrack.bench.record import Record, read_records, write_records
-from rstrack.bench.tables.figures import FIGURES, figure_of, heading
+from benchmarks.inference import RunSpread, fisher_p, fit_prior, poisson_p, signed_rank_p, stouffer_p, tolerances
+from rstrack.bench.figures import FIGURES, figure_of, heading
+from rstrack.bench.record import CellRecord, read_records, write_records
 
 
-def record(case: str, *runs: Mapping[str, Any], method: str = "rs-pg", measure: str = "track", **fields: Any) -> Record:
+def record(
+    case: str, *runs: Mapping[str, Any], method: str = "rs-pg", measure: str = "track", **fields: Any
+) -> CellRecord:
     settings = {"case": {"sequence": case}, "method": {}, "settings": {}, "group": ""}
-    base = Record(
+    base = CellRecord(
         f"{measure}/{case}/{method}", "key", settings, tuple(range(len(runs))), tuple(dict(run) for run in runs),
         complete=True, machine={"cpu": "A", "load": 0.1},
     )  # fmt: skip
     return dataclasses.replace(base, **fields)
 
 
-def by_cell(*records: Record) -> dict[str, Record]:
+def by_cell(*records: CellRecord) -> dict[str, CellRecord]:
     return {r.cell: r for r in records}
 
 
-def drawn(rng: np.random.Generator, sigmas: np.ndarray, shift: dict[int, float] | None = None) -> dict[str, Record]:
+def drawn(rng: np.random.Generator, sigmas: np.ndarray, shift: dict[int, float] | None = None) -> dict[str, CellRecord]:
     """Cells of three runs: errors that scatter by each cell's sigma in logarithms, some shifted by a factor."""
     out = []
     for k, sigma in enumerate(sigmas):
@@ -85,7 +86,7 @@ def test_the_usual_variance_is_found_again() -> None:
     rng = np.random.default_rng(3)
     d0, s0 = 8.0, 0.03
     variances = s0**2 * d0 / rng.chisquare(d0, 4000)
-    prior = fit_prior([Spread(float(v * rng.chisquare(4)), 4.0) for v in variances])
+    prior = fit_prior([RunSpread(float(v * rng.chisquare(4)), 4.0) for v in variances])
     assert prior is not None
     assert prior.variance == pytest.approx(s0**2, rel=0.05)
     assert prior.dof == pytest.approx(d0, rel=0.2)
@@ -112,7 +113,7 @@ def test_exact_tests_are_those_of_scipy_and_of_counting() -> None:
 NOISE = (0.97, 1.0, 1.03)
 
 
-def cells(name: str, values: list[float], **more: Any) -> dict[str, Record]:
+def cells(name: str, values: list[float], **more: Any) -> dict[str, CellRecord]:
     """One cell with these values, among twenty that scatter by three per cent."""
     fill = [record(f"other{k}", *({name: (1 + k) * f} for f in NOISE)) for k in range(20)]
     return by_cell(record("it", *({name: v} | more for v in values)), *fill)
@@ -165,7 +166,7 @@ def test_means_are_judged_by_scatter(name: str, old: list[float], new: list[floa
     ],
 )
 def test_linear_scales(name: str, old: list[float], new: list[float], is_worse: bool) -> None:
-    def with_others(values: list[float]) -> dict[str, Record]:
+    def with_others(values: list[float]) -> dict[str, CellRecord]:
         fill = [record(f"other{k}", *({name: 0.9 + d} for d in (-0.05, 0.0, 0.05))) for k in range(9)]
         return by_cell(record("it", *({name: v} for v in values)), *fill)
 
@@ -179,7 +180,7 @@ def test_one_more_silently_wrong_frame_is_worse() -> None:
 
 
 def test_lost_frames_are_shares_of_frames() -> None:
-    def lost(count: float) -> dict[str, Record]:
+    def lost(count: float) -> dict[str, CellRecord]:
         return by_cell(record("it", *({"lost": count, "frames": 200.0} for _ in range(3))))
 
     assert not compare(lost(0), lost(1)).worse
@@ -193,7 +194,7 @@ def test_faults_are_compared_one_by_one() -> None:
     rng = np.random.default_rng(4)
     base = rng.integers(0, 60, 90).astype(float)
 
-    def faults(lost: np.ndarray, found: np.ndarray) -> dict[str, Record]:
+    def faults(lost: np.ndarray, found: np.ndarray) -> dict[str, CellRecord]:
         runs = [{"lost": float(a), "found_in_5": float(b), "frames": 90.0} for a, b in zip(lost, found, strict=True)]
         return by_cell(record("it", *runs, measure="faults"))
 

@@ -15,7 +15,7 @@ from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.bench.changes.edits import with_color, with_depth
+from rstrack.bench.changes import with_color, with_depth
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.options import Options
 
@@ -61,7 +61,7 @@ def test_a_frame_is_moved_by_the_given_length_and_angle_as_a_whole(dataset: Data
     spline = conv.resampled(truth_of(dataset), -0.1, 0.03)
     aligner = conv.Aligner(dataset.rig, OPTIONS)
     new = aligner.prepare(9, dataset.frame(9))
-    pair = conv.Pair(7, 9, np.array([0.6, 0.0, 0.8]), np.array([0.0, 1.0, 0.0]))
+    pair = conv.FramePair(7, 9, np.array([0.6, 0.0, 0.8]), np.array([0.0, 1.0, 0.0]))
     state = conv.moved_state(spline, new, pair, factor)
     t = new.depth.exposure.mid_time
     D = se3.inverse(spline.pose(t)) @ state.spline.pose(t)

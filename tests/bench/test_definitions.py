@@ -10,8 +10,9 @@ import pytest
 import yaml
 
 from rsgen.errors import UserError
+from rstrack.bench.cells import Cell, frames_of, load_benchmark
 from rstrack.bench.changes import CHANGES
-from rstrack.bench.definitions import CaseEntry, Cell, MethodEntry, SequenceEntry, frames_of, load_benchmark
+from rstrack.bench.definitions import CaseEntry, MethodEntry, SequenceEntry
 
 BASE: dict[str, Any] = {
     "sequences": {"demo": {"config": "demo", "group": "all"}, "desk": {"path": "tum/desk"}},
@@ -40,7 +41,7 @@ def test_cells_are_all_methods_on_all_cases(tmp_path: Path) -> None:
     cells = {cell.name: cell for cell in load_benchmark([write(tmp_path)]).cells}
     assert list(cells) == [f"track/{case}/{m}" for case in ("demo", "demo-dark") for m in ("rs-pg", "slow", "kiss-icp")]
     slow, peer = cells["track/demo-dark/slow"], cells["track/demo/kiss-icp"]
-    assert (slow.seeds, slow.piece, slow.group) == ((0, 1), slice(5, 20), "all")
+    assert (slow.seeds, slow.frames, slow.group) == ((0, 1), slice(5, 20), "all")
     assert (slow.program, slow.is_ours) == ("rs-pg", True)
     assert (slow.options.method, slow.options.knot_spacing_s) == ("rs-pg", 0.05)
     assert (peer.program, peer.is_ours) == ("kiss-icp", False)
@@ -68,7 +69,7 @@ def test_later_files_are_on_top_and_files_are_beside_what_names_them(tmp_path: P
 def test_a_family_is_every_perturbation_of_every_piece(tmp_path: Path) -> None:
     cells = [{"cases": ["cliff-*"], "methods": ["rs-pg"]}]
     made = load_benchmark([write(tmp_path, families={"cliff": FAMILY}, cells=cells)]).cells
-    assert [(cell.case, cell.piece) for cell in made] == [
+    assert [(cell.case, cell.frames) for cell in made] == [
         ("cliff-demo-dark-as_told-from_0", slice(0, None)),
         ("cliff-demo-dark-as_told-from_7", slice(7, 20)),
         ("cliff-demo-dark-wide-from_0", slice(0, None)),

@@ -18,15 +18,15 @@ from rsgen.config.config import load_config
 from rsgen.console.configs import config_file
 from rsgen.errors import UserError
 from rsgen.geometry import se3
+from rstrack.bench import paper
 from rstrack.bench.definitions import OTHERS
-from rstrack.bench.methods.config import load_evaluation
-from rstrack.bench.methods.tables import results_text
-from rstrack.bench.record import read_record
-from rstrack.bench.tables import paper
-from rstrack.bench.tables.cells import counts
+from rstrack.bench.experiments.method_tables import method_tables, notes
+from rstrack.bench.experiments.methods import load_methods
+from rstrack.bench.record import counts, read_record
+from rstrack.bench.tables import tables_text
 from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.options import CLOUD_PEERS, METHODS, PEERS, SLAM_PEERS, Options
-from rstrack.peers.command import run_command
+from rstrack.peers.peer import run_command
 
 ROOT = Path(__file__).parents[2]
 
@@ -58,10 +58,10 @@ def test_one_setting_that_is_asked_for_is_that_of_a_cell_of_its_own(place: Path)
 
 def test_quick_is_a_subset_and_words_beat_it(place: Path) -> None:
     cells = plan(quick=True).benchmark.cells
-    assert [(c.case, c.method, c.piece) for c in cells] == [("lr_kt2", m, slice(0, 12)) for m in VARIANTS[2:]]
+    assert [(c.case, c.method, c.frames) for c in cells] == [("lr_kt2", m, slice(0, 12)) for m in VARIANTS[2:]]
     cells = plan(quick=True, methods=["gs-pg", "rs-g"], frames=slice(3, 9)).benchmark.cells
     names = ("gs-pg", "gs-pg-fuse", "rs-g", "rs-g-no-fuse")
-    assert [(c.case, c.method, c.piece) for c in cells] == [("lr_kt2", m, slice(3, 9)) for m in names]
+    assert [(c.case, c.method, c.frames) for c in cells] == [("lr_kt2", m, slice(3, 9)) for m in names]
     assert [(c.options.method, c.options.fuse) for c in cells[:2]] == [("gs-pg", False), ("gs-pg", True)]
 
 
@@ -106,7 +106,7 @@ def test_a_track_that_never_began_is_a_finished_cell(place: Path, monkeypatch: p
     found = results(made)
     (record,) = found.records
     assert record.error is None and not counts(record.figures) and record.figures["lost"] == 12
-    assert "ate_mm" not in record.figures and "lost (fewer than half" in results_text(found)
+    assert "ate_mm" not in record.figures and "lost (fewer than half" in tables_text(method_tables(found), notes(found))
 
 
 def test_an_unreadable_image_is_not_kept_as_a_result(place: Path) -> None:
@@ -216,7 +216,7 @@ def test_wrong_configs(place: Path, change: dict[str, Any], parts: list[str]) ->
     data = yaml.safe_load(Path("bench.yaml").read_text()) | change
     Path("wrong.yaml").write_text(yaml.safe_dump(data))
     with pytest.raises(UserError) as caught:
-        load_evaluation(Path("wrong.yaml"))
+        load_methods(Path("wrong.yaml"))
     assert all(part in str(caught.value) for part in ("wrong.yaml", *parts)), caught.value
 
 
@@ -229,7 +229,7 @@ def test_quick_needs_its_section(place: Path) -> None:
 
 
 def test_the_projects_own_config() -> None:
-    config = load_evaluation(ROOT / "configs/evaluation.yaml")
+    config = load_methods(ROOT / "configs/evaluation.yaml")
     assert {(name, method) for name in config.sequences for method in config.methods} == set(paper.FIGURES)
     assert all(load_config(config_file(str(s.config))).name == name for name, s in config.sequences.items())
     assert {s.group for s in config.sequences.values()} == {"hand-held", "living room"} and config.quick is not None

@@ -13,19 +13,18 @@ import synthetic
 from changed_frames import colors, depths, true_positions
 from scipy.optimize import least_squares
 
-from benchmarks.faults import faults
-from benchmarks.faults.faults import Fault
-from benchmarks.faults.passing import passed_by
-from benchmarks.faults.vibration import vibrating
 from benchmarks.measures import MEASURES
 from benchmarks.measures import faults as measure
+from benchmarks.measures import injected as faults
 from benchmarks.measures.faults import judged, mean_pose
+from benchmarks.measures.injected import InjectedFault, vibrating
+from benchmarks.measures.passing import passed_by
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3, so3
 from rsgen.sequence.trajectory import Trajectory
-from rstrack.bench.changes.edits import reordered, with_depth
-from rstrack.bench.definitions import Benchmark, load_benchmark
+from rstrack.bench.cells import Benchmark, load_benchmark
+from rstrack.bench.changes import reordered, with_depth
 from rstrack.bench.runner import run_cells
 from rstrack.bench.sequences import Sources
 from rstrack.data.dataset import Dataset, open_dataset
@@ -282,7 +281,7 @@ def outcome(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> Any:
         nothing = dict.fromkeys(range(FRAMES))
         monkeypatch.setattr(measure, "make_tracker", lambda *_, **__: Told(truth, off, **told))
         monkeypatch.setattr(segments, "make_tracker", lambda *_, **__: Told(truth, nothing, **told))
-        return SimpleNamespace(**judged(Fault("covered", dataset, first, last), Options()))
+        return SimpleNamespace(**judged(InjectedFault("covered", dataset, first, last), Options()))
 
     return make
 
@@ -355,9 +354,9 @@ cells: [{{cases: [piece], methods: [{method}], measure: faults, seeds: {seeds}}}
 def test_each_seed_is_a_fault_of_the_next_kind(
     dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made: list[Fault] = []
+    made: list[InjectedFault] = []
 
-    def watched(fault: Fault, options: Options) -> dict[str, float]:
+    def watched(fault: InjectedFault, options: Options) -> dict[str, float]:
         assert options.method == "rs-g"
         made.append(fault)
         return {"silent": 0, "kind": len(made) - 1}

@@ -12,8 +12,8 @@ import pytest
 import synthetic
 from bench_task import make_task
 
-from benchmarks.measures import lens
-from benchmarks.measures.lens import crossed_cell, lens_cell
+from benchmarks.measures import calibration as lens
+from benchmarks.measures.calibration import crossed_cell, lens_cell
 from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
 from rstrack.bench.task import Task

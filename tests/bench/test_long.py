@@ -8,8 +8,8 @@ import pytest
 import synthetic
 from bench_task import make_task
 
-from benchmarks.measures import long
-from benchmarks.measures.long import Block, figures_of, long_cell
+from benchmarks.measures import runs as long
+from benchmarks.measures.runs import FrameBlock, figures_of, long_cell
 from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
 
@@ -30,7 +30,7 @@ def test_frames_are_fed_over_and_over_and_counted_in_blocks(tmp_path: Path, monk
 
 
 def test_the_last_block_is_compared_with_the_second() -> None:
-    blocks = [Block(ms, ms + 1, k, k, 100.0 + k) for k, ms in enumerate((90.0, 20.0, 25.0, 22.0))]
+    blocks = [FrameBlock(ms, ms + 1, k, k, 100.0 + k) for k, ms in enumerate((90.0, 20.0, 25.0, 22.0))]
     found = figures_of(blocks)
     assert found["ratio"] == pytest.approx(1.1) and found["frames"] == 4000 and found["growth_mb"] == 2.0
     assert found["median_first_ms"] == 90.0 and found["mean_last_ms"] == 23.0 and found["median_worst_ms"] == 25.0

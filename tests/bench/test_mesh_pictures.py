@@ -19,11 +19,11 @@ import trimesh
 import yaml
 from bench_evaluation import made_up_record, main
 
-import rstrack.bench.methods.mesh_pictures as mesh_pictures
-from rstrack.bench.methods.config import SequenceInfo
-from rstrack.bench.methods.mesh_pictures import draw_meshes, make_mesh, read_picture
-from rstrack.bench.methods.results import Results
-from rstrack.bench.methods.tables import write_results
+import rstrack.bench.experiments.pictures as mesh_pictures
+from rstrack.bench.experiments.method_results import Results
+from rstrack.bench.experiments.method_tables import write_results
+from rstrack.bench.experiments.methods import SequenceInfo
+from rstrack.bench.experiments.pictures import draw_meshes, make_mesh, read_picture
 from rstrack.bench.record import write_record
 from rstrack.bench.runner import Outcome
 from rstrack.data.estimate import write_estimate
@@ -232,8 +232,8 @@ def test_the_command(
 ) -> None:
     results, called = of(place), []
     outcome = Outcome({record.cell: record for record in results.records})
-    monkeypatch.setattr("rstrack.bench.runner.run_cells", lambda *_: outcome)
-    monkeypatch.setattr("rstrack.bench.methods.plots.draw_plots", lambda *_: [])
+    monkeypatch.setattr("rstrack.bench.experiments.run.run_cells", lambda *_: outcome)
+    monkeypatch.setattr("rstrack.bench.experiments.pictures.draw_plots", lambda *_: [])
 
     def draw(given: Results, out: Path, progress: Any, warn: Any) -> list[Path]:
         called.append((given.records, out))

@@ -17,11 +17,12 @@ from scipy import stats
 
 import rstrack.bench.measures.track
 from rsgen.config.config import load_config
+from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
-from rstrack.bench.readout.config import SweepConfig, installed, load_sweep_config, narrow, sweep_benchmark
-from rstrack.bench.readout.results import (
+from rstrack.bench.experiments.readout import SweepConfig, installed, load_sweep, narrow, sweep_benchmark
+from rstrack.bench.experiments.readout_results import (
+    ReadoutExperiment,
     Sweep,
-    draw_sweep,
     errors,
     growth,
     log_interval,
@@ -29,8 +30,8 @@ from rstrack.bench.readout.results import (
     sweep_tables,
     write_sweep,
 )
-from rstrack.bench.record import Record, read_records
-from rstrack.bench.runner import run_cells
+from rstrack.bench.record import CellRecord, read_records
+from rstrack.bench.runner import Outcome, run_cells
 from rstrack.bench.sequences import Sources
 from rstrack.cli.main import main
 from rstrack.options import Options
@@ -40,7 +41,7 @@ SWEEP = ROOT / "configs/readout_sweep.yaml"
 
 
 def test_the_sweep_that_ships_is_the_one_asked_for() -> None:
-    config = load_sweep_config(SWEEP)
+    config = load_sweep(SWEEP)
     assert config.readouts_s == (0.0, 0.007, 0.014, 0.021, 0.028) and config.exposures_s == (0.0, 0.01)
     cells = sweep_benchmark(config, config.methods).cells
     assert len(config.motions) == 3 and len({cell.name for cell in cells}) == len(cells) == 30 * 10
@@ -49,7 +50,7 @@ def test_the_sweep_that_ships_is_the_one_asked_for() -> None:
 
 @pytest.mark.parametrize("motion", ["demo", "table1"])
 def test_rsgen_reads_what_it_is_told_of_a_case(motion: str) -> None:
-    config = narrow(load_sweep_config(SWEEP), motions=[motion], width=160, frames=20)
+    config = narrow(load_sweep(SWEEP), motions=[motion], width=160, frames=20)
     config = narrow(config, readouts_s=(0.014,), exposures_s=(0.010,))
     (cell,) = sweep_benchmark(config, ["rs-pg"], Options(fuse=False)).cells
     assert (cell.name, cell.options.fuse) == (f"track/{motion}_160px_readout_14ms_exposure_10ms/rs-pg-no-fuse", False)
@@ -112,9 +113,7 @@ def test_options_of_a_sweep_are_for_sweeps(capsys: pytest.CaptureFixture[str]) -
 
 def test_noise_is_of_the_seed_and_more_seeds_are_added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Rendered once, by a stand-in; tracked once for each seed, with that seed's noise."""
-    config = narrow(
-        load_sweep_config(SWEEP), motions=["demo"], readouts_s=(0.02,), exposures_s=(0.0,), seeds=2, frames=12
-    )
+    config = narrow(load_sweep(SWEEP), motions=["demo"], readouts_s=(0.02,), exposures_s=(0.0,), seeds=2, frames=12)
     made: list[Sequence[str]] = []
     seeds: list[int] = []
 
@@ -169,7 +168,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
 
 
 def test_what_is_not_installed_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rstrack.bench.readout.config.find_spec", lambda name: None)
+    monkeypatch.setattr("rstrack.bench.experiments.readout.find_spec", lambda name: None)
     assert installed(["rs-pg", "kiss-icp"]) == (("rs-pg",), ("kiss-icp",))
     with pytest.raises(UserError, match="none of kiss-icp, open3d-icp is installed"):
         installed(["kiss-icp", "open3d-icp"])
@@ -193,7 +192,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
 
 def result() -> Sweep:
     """Two readouts and two methods, three seeds; gs-pg loses one of them, and all at the second readout of 'b'."""
-    config = narrow(load_sweep_config(SWEEP), readouts_s=(0.028, 0.0), exposures_s=(0.0,), motions=["demo", "table1"])
+    config = narrow(load_sweep(SWEEP), readouts_s=(0.028, 0.0), exposures_s=(0.0,), motions=["demo", "table1"])
     ate = {("rs-pg", 0.0): 1.0, ("rs-pg", 0.028): 1.2, ("gs-pg", 0.0): 1.0, ("gs-pg", 0.028): 8.0}
     records = []
     for cell in sweep_benchmark(config, ["gs-pg", "rs-pg"]).cells:
@@ -203,7 +202,7 @@ def result() -> Sweep:
             is_lost = cell.method == "gs-pg" and (seed == 2 or (cell.group, readout) == ("table1", 0.028))
             found = {"ate_mm": ate[cell.method, readout] * 1.1 ** (seed - 1), "lost": 0}
             runs.append({"frames": 60, "lost": 60} if is_lost else {"frames": 60, **found})
-        records.append(Record(cell.name, "", cell.as_dict(), (0, 1, 2), tuple(runs), True))
+        records.append(CellRecord(cell.name, "", cell.as_dict(), (0, 1, 2), tuple(runs), True))
     return Sweep(config, tuple(records), ("orb-slam3",))
 
 
@@ -237,5 +236,7 @@ def test_the_picture_has_a_line_with_its_interval_for_each_method(tmp_path: Path
     np.testing.assert_allclose(ours.x, [0.0, 28.0])
     np.testing.assert_allclose(ours.y, [1.0, 1.2], rtol=1e-6)
     assert ours.low is not None and ours.high is not None and (ours.low < ours.y).all() and (ours.y < ours.high).all()
-    draw_sweep(result(), tmp_path / "readout.png")
-    assert (tmp_path / "readout.png").stat().st_size > 5000
+    sweep = result()
+    outcome = Outcome({record.cell: record for record in sweep.records})
+    ReadoutExperiment(sweep.config, Options()).draw(outcome, tmp_path, no_progress, pytest.fail)
+    assert (tmp_path / "plots/readout.png").stat().st_size > 5000

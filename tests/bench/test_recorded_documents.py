@@ -8,14 +8,15 @@ from pathlib import Path
 import pytest
 
 from benchmarks.show import FULL, GATE, README, RESULTS, documents
-from rstrack.bench.record import Record, read_records, versions_behind
+from rstrack.bench.machine import versions_behind
+from rstrack.bench.record import CellRecord, read_records
 from rstrack.bench.runner import OLDEST
 
 ROOT = Path(__file__).parents[2]
 NOTEBOOK = sorted((ROOT / "docs/notebook").glob("*.md"))
 
 
-def records(path: Path) -> dict[str, Record]:
+def records(path: Path) -> dict[str, CellRecord]:
     if not path.is_file():
         pytest.skip(f"{path.relative_to(ROOT)} is not there yet: './run.sh bench {path.stem} --accept' writes it")
     return read_records(path)

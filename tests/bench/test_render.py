@@ -33,8 +33,8 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.images import ColorRenderer
 from rsgen.render.scene import load_scene
-from rstrack.bench.definitions import load_benchmark
-from rstrack.bench.record import Record
+from rstrack.bench.cells import load_benchmark
+from rstrack.bench.record import CellRecord
 from rstrack.bench.runner import run_cells
 from rstrack.bench.sequences import Sources
 
@@ -148,7 +148,7 @@ def test_only_the_modes_asked_for_are_timed_and_none_is_an_error(
 
 def measured(
     folder: Path, measure: str, settings: str, method: str = "rsgen", set: str = "light.bounces: 0", frames: int = 6
-) -> Record:
+) -> CellRecord:
     text = f"""
 sequences: {{tiny: {{config: {tiny.write_config(folder, frames)}, set: {{{set}}}, frames: "0:2"}}}}
 cells: [{{cases: [tiny], methods: [{method}], measure: {measure}, settings: {settings}}}]
@@ -198,7 +198,7 @@ def test_frames_are_timed_by_a_process_of_its_own(tmp_path: Path) -> None:
 def test_what_cannot_be_measured(
     measure: str, settings: str, how: dict[str, Any], part: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("benchmarks.measures.render.find_spec", lambda _: None)
+    monkeypatch.setattr("benchmarks.measures.renderer.find_spec", lambda _: None)
     if how.get("method"):
         monkeypatch.setattr(Sources, "folder", lambda *_: tmp_path)
     record = measured(tmp_path, measure, settings, **how)
@@ -206,7 +206,7 @@ def test_what_cannot_be_measured(
 
 
 def test_a_process_that_dies_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("benchmarks.rendering.run.sys.executable", "/bin/false")
+    monkeypatch.setattr("benchmarks.measures.renderer.sys.executable", "/bin/false")
     record = measured(tmp_path, "render", "{modes: [still]}")
     assert record.error == "the renderer's process ended: no message"
 

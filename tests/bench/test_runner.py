@@ -13,10 +13,11 @@ import synthetic
 import yaml
 
 from rsgen.errors import UserError
-from rstrack.bench import record as bench_record
-from rstrack.bench import runner
-from rstrack.bench.definitions import Benchmark, CaseEntry, Cell, MethodEntry, NoiseEntry, SequenceEntry
-from rstrack.bench.record import Record, read_record, read_records, versions_behind, write_records
+from rstrack.bench import machine, runner
+from rstrack.bench.cells import Benchmark, Cell
+from rstrack.bench.definitions import CaseEntry, MethodEntry, NoiseEntry, SequenceEntry
+from rstrack.bench.machine import versions_behind
+from rstrack.bench.record import CellRecord, read_record, read_records, write_records
 from rstrack.bench.runner import Outcome, run_cells
 from rstrack.bench.sequences import Absent, Sources
 from rstrack.bench.task import Task
@@ -56,7 +57,7 @@ def run(data: Path, *cells: Cell, every: str = "version", **how: Any) -> Outcome
     return run_cells(Benchmark(cells, every), data.parent / "out", Sources(data), measures=MEASURES, **how)
 
 
-def record(outcome: Outcome) -> Record:
+def record(outcome: Outcome) -> CellRecord:
     (found,) = outcome.records.values()
     return found
 
@@ -136,7 +137,7 @@ def test_what_takes_hours_stands_for_three_minor_versions(
 
 
 def test_versions_are_counted_by_their_second_number(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench_record, "package_version", lambda: "0.27.1")
+    monkeypatch.setattr(machine, "package_version", lambda: "0.27.1")
     assert [versions_behind(v) for v in ("0.27.0", "0.25.3", "0.28.0")] == [0, 2, -1]
     assert versions_behind("1.27.0") > 2
 
@@ -209,7 +210,7 @@ def test_sequences_are_rendered_before_workers_begin(data: Path, tmp_path: Path)
 def test_workers_have_to_share_the_folder(data: Path) -> None:
     class Far:
         def apply(self, function: Any, jobs: Sequence[Any], progress: Any) -> Iterator[tuple[int, Any]]:
-            yield 0, Record(jobs[0].cell.name, "", {}, (0,), ({},), True)
+            yield 0, CellRecord(jobs[0].cell.name, "", {}, (0,), ({},), True)
 
     with pytest.raises(UserError, match=r"rs-g: a worker has written it, but not here"):
         run(data, cell(), workers=Far())

@@ -11,13 +11,12 @@ from typing import Any
 import pytest
 
 from benchmarks import show
-from benchmarks.beaten import beaten, sentences
-from benchmarks.pictures import draw_readout, readout_charts
-from benchmarks.scatter import tolerances
+from benchmarks.inference import tolerances
 from benchmarks.sections import PAPERS_GROUPS
-from benchmarks.show import BEGIN, END, readme_block, results_markdown, with_block
+from benchmarks.show import BEGIN, END, draw_readout, readme_block, readout_charts, results_markdown, with_block
+from benchmarks.verdicts import beaten, sentences
 from rsgen.errors import UserError
-from rstrack.bench.record import Record, read_records, write_records
+from rstrack.bench.record import CellRecord, read_records, write_records
 
 HAND_HELD = ("robot_t1", "robot_t2", "robot_r1", "robot_r2", "table1", "table2")
 LIVING_ROOM = ("lr_kt0", "lr_kt1", "lr_kt2", "lr_kt3")
@@ -27,10 +26,10 @@ ERRORS = {"rs-pg": 0.5, "rs-g": 0.9, "gs-pg": 12.0, "baseline": 20.0, "open3d-ic
 def cell(
     case: str, method: str, *runs: Mapping[str, Any], measure: str = "track", group: str = "", sequence: str = "",
     options: dict[str, Any] | None = None, settings: dict[str, Any] | None = None,
-) -> Record:  # fmt: skip
+) -> CellRecord:  # fmt: skip
     entry = {"method": method.partition("_")[0], "options": options} if options else {}
     defined = {"case": {"sequence": sequence or case}, "method": entry, "settings": settings or {}, "group": group}
-    return Record(
+    return CellRecord(
         f"{measure}/{case}/{method}", "key", defined, tuple(range(len(runs))), tuple(dict(run) for run in runs),
         complete=True, version="0.25.0", commit="abc", date="2026-11-26T04:00:00Z",
         machine={"cpu": "A processor", "cores": 2, "load": 0.2},
@@ -42,12 +41,12 @@ def errors(ate_mm: float, **more: Any) -> dict[str, Any]:
     return figures | {"drift_deg_s": 0.02 * ate_mm, "nees": 1.2, "coverage_90": 0.88, "peak_mb": 600.0} | more
 
 
-def by_cell(*records: Record) -> dict[str, Record]:
+def by_cell(*records: CellRecord) -> dict[str, CellRecord]:
     return {record.cell: record for record in records}
 
 
 @pytest.fixture
-def full() -> dict[str, Record]:
+def full() -> dict[str, CellRecord]:
     made = []
     for sequences, group in ((HAND_HELD, "hand-held"), (LIVING_ROOM, "living room"), (("fr1_rpy",), "real")):
         for k, sequence in enumerate(sequences):
@@ -76,7 +75,7 @@ def full() -> dict[str, Record]:
 
 
 @pytest.fixture
-def gate() -> dict[str, Record]:
+def gate() -> dict[str, CellRecord]:
     runs = (errors(0.5), errors(0.52), errors(0.48))
     return tolerances(by_cell(*(cell(f"{name}-320", "rs-pg", *runs, group="hand-held 320") for name in HAND_HELD)))
 
@@ -89,7 +88,7 @@ def row(text: str, name: str) -> str:
     return next(line for line in text.splitlines() if line.startswith(f"| `{name}` |"))
 
 
-def test_results_have_every_section_and_are_short(gate: dict[str, Record], full: dict[str, Record]) -> None:
+def test_results_have_every_section_and_are_short(gate: dict[str, CellRecord], full: dict[str, CellRecord]) -> None:
     text = results_markdown(gate, full)
     assert len(text.splitlines()) <= 250
     methods = section(text, "Methods")
@@ -111,8 +110,8 @@ def test_results_have_every_section_and_are_short(gate: dict[str, Record], full:
     assert all(len(line.split("|")) > 2 for line in text.splitlines() if line.startswith("|"))
 
 
-def test_the_cliff_test_has_a_row_for_each_sequence_the_worst_first(gate: dict[str, Record]) -> None:
-    def told(sequence: str, *figures: dict[str, Any]) -> list[Record]:
+def test_the_cliff_test_has_a_row_for_each_sequence_the_worst_first(gate: dict[str, CellRecord]) -> None:
+    def told(sequence: str, *figures: dict[str, Any]) -> list[CellRecord]:
         names = (f"cliff-{sequence}-as_told-from_{k}" for k in range(len(figures)))
         return [cell(n, "rs-pg", f, sequence=sequence, group="cliff") for n, f in zip(names, figures, strict=True)]
 
@@ -145,14 +144,14 @@ def test_what_is_not_measured_is_left_out() -> None:
     assert "| `rs-pg` |" in results_markdown({}, only)
 
 
-def test_all_rows_of_a_table_are_as_long(gate: dict[str, Record], full: dict[str, Record]) -> None:
+def test_all_rows_of_a_table_are_as_long(gate: dict[str, CellRecord], full: dict[str, CellRecord]) -> None:
     lines = (results_markdown(gate, full) + readme_block({}, full)).splitlines()
     for above, line in itertools.pairwise(lines):
         if above.startswith("|") and line.startswith("|"):
             assert above.count("|") == line.count("|"), line
 
 
-def test_where_ours_is_not_the_best(full: dict[str, Record]) -> None:
+def test_where_ours_is_not_the_best(full: dict[str, CellRecord]) -> None:
     assert not beaten(full)  # at readout 0 Open3D is as good, not better
     assert "has the least errors" in sentences(full)
     worse = full | by_cell(
@@ -169,13 +168,13 @@ def test_where_ours_is_not_the_best(full: dict[str, Record]) -> None:
     assert "| `table1` | 30.0 > 11.0 (the paper) |  |  |" in results_markdown({}, worse)
 
 
-def test_losing_the_track_is_being_beaten(full: dict[str, Record]) -> None:
+def test_losing_the_track_is_being_beaten(full: dict[str, CellRecord]) -> None:
     gone = full | by_cell(cell("fr1_rpy", "rs-pg", {"frames": 100, "lost": 100, "silent": 0}, group="real"))
     assert {each.figure for each in beaten(gone)} == {"ate_mm", "drift_mm_s", "drift_deg_s"}
     assert beaten(gone)[0].text().startswith("lost > 15.0 (open3d-icp-keyframe")
 
 
-def test_the_readmes_block(full: dict[str, Record]) -> None:
+def test_the_readmes_block(full: dict[str, CellRecord]) -> None:
     text = readme_block({}, full)
     ours = row(text, "rs-pg")
     assert "rolling shutter, depth and colour" in ours and "13.2 · 5.28 · 0.122" in ours and "0.500 · 0.300" in ours
@@ -184,7 +183,7 @@ def test_the_readmes_block(full: dict[str, Record]) -> None:
     assert "version 0.25.0" in text and "In 1 of 1 timings" in text
 
 
-def test_the_block_is_put_between_its_markers(full: dict[str, Record]) -> None:
+def test_the_block_is_put_between_its_markers(full: dict[str, CellRecord]) -> None:
     readme = f"# Title\n\n{BEGIN}\nold\n{END}\n\nrest\n"
     new = with_block(readme, readme_block({}, full))
     assert new.startswith("# Title\n") and new.endswith(f"{END}\n\nrest\n") and "\nold" not in new
@@ -194,7 +193,7 @@ def test_the_block_is_put_between_its_markers(full: dict[str, Record]) -> None:
 
 
 def test_the_command_writes_and_checks(
-    tmp_path: Path, gate: dict[str, Record], full: dict[str, Record], monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, gate: dict[str, CellRecord], full: dict[str, CellRecord], monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     monkeypatch.setattr(show, "ROOT", tmp_path)
@@ -218,7 +217,7 @@ def test_the_command_writes_and_checks(
     assert show.main(["--what"]) == 2
 
 
-def test_the_readouts_picture(full: dict[str, Record], tmp_path: Path) -> None:
+def test_the_readouts_picture(full: dict[str, CellRecord], tmp_path: Path) -> None:
     (chart,) = readout_charts(full)
     assert chart.title.startswith("demo") and [line.name for line in chart.lines] == ["rs-pg", "open3d-icp-keyframe"]
     line = chart.lines[1]
@@ -228,7 +227,7 @@ def test_the_readouts_picture(full: dict[str, Record], tmp_path: Path) -> None:
     assert not draw_readout({}, tmp_path / "none.png") and not (tmp_path / "none.png").exists()
 
 
-def test_numbers_in_names_are_in_their_order(full: dict[str, Record], gate: dict[str, Record]) -> None:
+def test_numbers_in_names_are_in_their_order(full: dict[str, CellRecord], gate: dict[str, CellRecord]) -> None:
     changes = section(results_markdown(gate, full), "What may be wrong")
     assert changes.index("demo-late_9ms") < changes.index("demo-late_10ms")
     shuffled = dict(sorted(full.items(), reverse=True))

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.__main__ import HERE, main, parts
-from rstrack.bench.definitions import load_benchmark
+from rstrack.bench.cells import load_benchmark
 from rstrack.bench.record import read_records
 
 

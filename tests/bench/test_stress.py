@@ -25,13 +25,20 @@ from rsgen.produce.writer import SequenceWriter
 from rsgen.sequence.format import stream_stamps
 from rsgen.sequence.trajectory import read_trajectory
 from rsgen.srgb import encode
+from rstrack.bench.experiments.blur import (
+    PATHS,
+    StressOptions,
+    StressResult,
+    case_name,
+    read_stress,
+    stress_benchmark,
+    stress_result,
+)
+from rstrack.bench.experiments.blur_results import draw_stress, write_stress
 from rstrack.bench.measures import blur
-from rstrack.bench.record import Record
+from rstrack.bench.record import CellRecord
 from rstrack.bench.runner import run_cells
 from rstrack.bench.sequences import Sources
-from rstrack.bench.stress.cases import StressOptions, case_name, stress_benchmark
-from rstrack.bench.stress.charts import write_stress
-from rstrack.bench.stress.results import PATHS, StressResult, read_stress, stress_result
 from rstrack.cli.main import main
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import Estimate
@@ -124,13 +131,13 @@ def told_truth(dataset: Any, options: Any, out: Path, *_: Any) -> Any:
     return SimpleNamespace(estimate=estimate, end="done", unreadable=())
 
 
-def run_stress(config: Path, out: Path, options: StressOptions) -> tuple[Record, ...]:
+def run_stress(config: Path, out: Path, options: StressOptions) -> tuple[CellRecord, ...]:
     sources = Sources(cache=out, render=render)
     return tuple(run_cells(stress_benchmark(config, sources, options), out, sources).records.values())
 
 
 @pytest.fixture(scope="module")
-def records(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[Record, ...]]:
+def records(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[CellRecord, ...]]:
     out = tmp_path_factory.mktemp("stress")
     config = write_config(out / "tiny.yaml")
     options = StressOptions(exposures_s=(0.0, 0.02), speeds=(), sigmas_px=(1.0, 2.0), frames=FRAMES)
@@ -140,7 +147,7 @@ def records(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[Recor
 
 
 @pytest.fixture(scope="module")
-def stressed(records: tuple[Path, tuple[Record, ...]]) -> tuple[Path, StressResult]:
+def stressed(records: tuple[Path, tuple[CellRecord, ...]]) -> tuple[Path, StressResult]:
     return records[0], stress_result(records[1])
 
 
@@ -202,9 +209,10 @@ def test_exposures_differ_in_blur_only(stressed: tuple[Path, StressResult]) -> N
     assert not np.array_equal(sharp.images.color(5), blurred.images.color(5))
 
 
-def test_what_is_written_can_be_read_again(records: tuple[Path, tuple[Record, ...]]) -> None:
+def test_what_is_written_can_be_read_again(records: tuple[Path, tuple[CellRecord, ...]]) -> None:
     out, found = records
     report, text = write_stress(found, out)
+    draw_stress(report, out)
     names = ("stress.txt", "stress.md", "stress.csv", "stress.json", "stress.png", "panels.png")
     assert all((out / name).stat().st_size > 0 for name in names)
     read = read_stress(out)

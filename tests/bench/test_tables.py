@@ -13,18 +13,18 @@ from matplotlib.figure import Figure
 
 import rsgen.figures
 from rsgen.console.tables import csv_text
-from rstrack.bench.methods.config import SequenceInfo
-from rstrack.bench.methods.plots import ate_chart
-from rstrack.bench.methods.results import Results, better_pct, read_results
-from rstrack.bench.methods.tables import csv_rows, method_tables, notes, results_text, write_results
-from rstrack.bench.record import Record
-from rstrack.bench.tables import paper
-from rstrack.bench.tables.files import tables_markdown
+from rstrack.bench import paper
+from rstrack.bench.experiments.method_results import Results, better_pct, read_results
+from rstrack.bench.experiments.method_tables import csv_rows, method_tables, notes, write_results
+from rstrack.bench.experiments.methods import SequenceInfo
+from rstrack.bench.experiments.pictures import ate_chart
+from rstrack.bench.record import CellRecord
+from rstrack.bench.tables import tables_markdown, tables_text
 from rstrack.charts.to_file import write_charts
 from rstrack.charts.to_page import figure_of
 
 
-def cell(sequence: str, method: str, ate_m: float, lost: int = 0, error: str | None = None) -> Record:
+def cell(sequence: str, method: str, ate_m: float, lost: int = 0, error: str | None = None) -> CellRecord:
     figures = {"ate_mm": 1e3 * ate_m, "drift_mm_s": 2e3 * ate_m, "drift_deg_s": 100 * ate_m}
     return made_up_record(sequence, method, error, frames=100, lost=lost, total_s=5.0, **figures)
 
@@ -71,7 +71,7 @@ def test_the_better_setting_is_shown_and_the_other_one_kept() -> None:
     assert results.averaged("one") == ("a", "b", "c") and not results.average("one", "gs-g-fuse").figures
     (row,) = [r for r in csv_rows(results) if (r["group"], r["sequence"], r["method"]) == ("one", "average", "rs-g")]
     assert row["better_ate_mm_pct"] == pytest.approx(100 * (1 - 0.001 / 0.011))
-    lines = [line.split() for line in results_text(results).split("\n\n")[3].splitlines()]
+    lines = [line.split() for line in tables_text(method_tables(results), notes(results)).split("\n\n")[3].splitlines()]
     assert lines[2:] == [
         ["baseline", "50.0", "50.0"], ["paper:", "Baseline", "12.9", "12.9"],
         ["gs-g", "20.0", "20.0", "60", "%"], ["paper:", "Spline", "GS", "G", "16.9", "16.9", "-31", "%"],
@@ -85,7 +85,7 @@ def test_the_better_setting_is_shown_and_the_other_one_kept() -> None:
 
 
 def test_text_by_hand() -> None:
-    blocks = results_text(made_up()).split("\n\n")
+    blocks = tables_text(method_tables(made_up()), notes(made_up())).split("\n\n")
     lines = [line.split() for line in blocks[0].splitlines()]
     assert lines == [
         ["one,", "ATE,", "mm"],
@@ -131,7 +131,10 @@ def test_markdown_and_csv_by_hand() -> None:
 def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     text = write_results(made_up(), tmp_path)
     found = read_results(tmp_path / "results.json")
-    assert found == made_up() and results_text(found) == text == (tmp_path / "results.txt").read_text()[:-1]
+    assert (
+        found == made_up()
+        and tables_text(method_tables(found), notes(found)) == text == (tmp_path / "results.txt").read_text()[:-1]
+    )
 
 
 def test_the_papers_averages_are_those_of_its_rows() -> None:

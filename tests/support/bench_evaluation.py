@@ -14,9 +14,9 @@ import yaml
 from rsgen.console.command_line import Commands, Parser, run_program
 from rsgen.geometry import se3
 from rsgen.sequence.format import pose_rows
-from rstrack.bench.methods.config import Plan, load_evaluation, make_plan
-from rstrack.bench.methods.results import Results
-from rstrack.bench.record import Record
+from rstrack.bench.experiments.method_results import Results
+from rstrack.bench.experiments.methods import Plan, load_methods, make_plan
+from rstrack.bench.record import CellRecord
 from rstrack.bench.runner import RECORD, Outcome, run_cells
 from rstrack.bench.sequences import Sources
 from rstrack.cli.benchmark import bench
@@ -54,7 +54,7 @@ def make_data(folder: Path) -> None:
 
 def plan(**how: Any) -> Plan:
     """Of the working directory."""
-    return make_plan(load_evaluation(Path("bench.yaml")), Path("data"), **how)
+    return make_plan(load_methods(Path("bench.yaml")), Path("data"), **how)
 
 
 def run(made: Plan, *more: Any) -> Outcome:
@@ -73,10 +73,12 @@ def record_file(sequence: str, method: str) -> Path:
     return Path("bench/cells/track", sequence, method, RECORD)
 
 
-def made_up_record(case: str, method: str, error: str | None = None, measure: str = "track", **figures: Any) -> Record:
+def made_up_record(
+    case: str, method: str, error: str | None = None, measure: str = "track", **figures: Any
+) -> CellRecord:
     """One that was never run."""
     about = {"group": "", "case": {}}
-    return Record(
+    return CellRecord(
         f"{measure}/{case}/{method}", "k", about, (0,), () if error else (figures,), not error, error,
         version="1.2.3", machine={"cpu": "abacus", "cores": 2, "system": "Linux"},
     )  # fmt: skip

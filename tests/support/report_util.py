@@ -23,13 +23,13 @@ from rsgen.geometry import se3
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.format import pose_rows
+from rstrack.bench.experiments.blur import StressResult
+from rstrack.bench.experiments.blur_results import write_stress
+from rstrack.bench.experiments.method_results import Results
+from rstrack.bench.experiments.method_tables import write_results
+from rstrack.bench.experiments.methods import SequenceInfo
 from rstrack.bench.measures.blur import PANELS, Panels
-from rstrack.bench.methods.config import SequenceInfo
-from rstrack.bench.methods.results import Results
-from rstrack.bench.methods.tables import write_results
-from rstrack.bench.record import Record
-from rstrack.bench.stress.charts import write_stress
-from rstrack.bench.stress.results import StressResult
+from rstrack.bench.record import CellRecord
 from rstrack.calibration.findings.record import CALIBRATION
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import write_estimate
@@ -204,7 +204,7 @@ def make_bench(root: Path, sequence: Path, twin: Path) -> Results:
 
 def stress_record(
     case: str, speed: float, exposure_s: float, variant: str, figures: dict[str, Any], measure: str = "track"
-) -> Record:
+) -> CellRecord:
     """One of a stress test."""
     record = made_up_record(case, f"rs-pg-{variant.replace(' ', '_').replace(',', '')}", measure=measure, **figures)
     about = {"sequence": case, "motion": NASTY, "speed": speed, "exposure_s": exposure_s, "variant": variant}

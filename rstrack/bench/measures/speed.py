@@ -18,10 +18,10 @@ from pydantic import Field
 
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
+from rstrack.bench.definitions import StrictModel
 from rstrack.bench.record import Figures
 from rstrack.bench.sequences import Absent
-from rstrack.bench.settings import Settings, settings_of
-from rstrack.bench.task import Task
+from rstrack.bench.task import Task, settings_of
 from rstrack.data.registration import Registrar, registered_image
 from rstrack.options import PEERS, Peer
 from rstrack.peers.open3d import PeerTracker
@@ -33,7 +33,7 @@ _WARM_UP = 20
 _TURN = 10
 
 
-class SpeedSettings(Settings):
+class SpeedSettings(StrictModel):
     """What else is timed."""
 
     peer: Peer | None = Field(default=None, description="Open3D's odometry, in turns with the cell's method")

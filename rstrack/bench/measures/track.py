@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
-from rstrack.bench.definitions import Cell
+from rstrack.bench.cells import Cell
 from rstrack.bench.record import Figures
 from rstrack.bench.sequences import Absent
 from rstrack.bench.task import Task
@@ -24,7 +24,7 @@ from rstrack.metrics.evaluate import Metrics
 from rstrack.metrics.run_evaluate import evaluate_clocks, evaluate_extrinsics
 from rstrack.metrics.truth_noise import TruthNoise
 from rstrack.options import CLOUD_PEERS, SLAM_PEERS
-from rstrack.peers.command import run_command
+from rstrack.peers.peer import run_command
 from rstrack.tracking.runs.run import track
 
 WRONG_M, WRONG_DEG = 0.020, 2.0
@@ -127,7 +127,7 @@ def results_path(cell: Cell) -> Path:
 
 
 def _tracked(task: Task, progress: Progress) -> tuple[Estimate, Figures]:
-    result = track(task.dataset, task.options, task.out, task.cell.piece, task.noise, progress)
+    result = track(task.dataset, task.options, task.out, task.cell.frames, task.noise, progress)
     if result.end == "interrupted":
         raise KeyboardInterrupt
     if result.unreadable:

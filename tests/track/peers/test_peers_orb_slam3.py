@@ -14,9 +14,15 @@ import pytest
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rstrack.peers import orb_slam3
-from rstrack.peers.orb_slam3 import settings_text
+from rstrack.peers.orb_slam3 import (
+    BYTES,
+    Vocabulary,
+    orb_descriptors,
+    settings_text,
+    train_vocabulary,
+    write_vocabulary,
+)
 from rstrack.peers.orb_slam3_worker import work
-from rstrack.peers.orb_vocabulary import BYTES, Vocabulary, orb_descriptors, train_vocabulary, write_vocabulary
 
 
 def clustered(rng: np.random.Generator, clusters: int = 12, each: int = 40) -> list[np.ndarray]:

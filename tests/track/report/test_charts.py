@@ -19,7 +19,7 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.trajectory import Trajectory
-from rstrack.charts.chart import Chart, Line, PathChart, Ticks
+from rstrack.charts.chart import Chart, Curve, PathChart, Ticks
 from rstrack.charts.runs import compared_errors, error_charts, inlier_charts, path_chart, run_plot
 from rstrack.charts.to_file import write_charts
 from rstrack.charts.to_page import figure_of
@@ -205,7 +205,7 @@ def test_time_is_counted_from_the_first_frame_by_both_drawers(
 
 def test_a_line_of_many_points_is_thinned_on_the_page() -> None:
     t = np.arange(10_000) / 100.0
-    chart = Chart("a", "mm", lines=(Line("b", "#000000", t, np.sin(t)),), ticks=(Ticks("c", "#000000", t[:3]),))
+    chart = Chart("a", "mm", lines=(Curve("b", "#000000", t, np.sin(t)),), ticks=(Ticks("c", "#000000", t[:3]),))
     line, ticks = figure_of(chart, 50)["data"]
     assert len(line["x"]) == 50 and line["x"][0] == 0.0 and line["x"][-1] == pytest.approx(99.99)
     assert ticks["y"] == [pytest.approx(-0.06, rel=1e-3)] * 3

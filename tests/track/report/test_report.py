@@ -34,8 +34,8 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rstrack.bench.methods.results import read_results
-from rstrack.bench.tables import paper
+from rstrack.bench import paper
+from rstrack.bench.experiments.method_results import read_results
 from rstrack.charts.chart import CameraPath, PathChart, upright_axes
 from rstrack.cli.results import report as report_command
 from rstrack.data.dataset import open_dataset
@@ -45,8 +45,8 @@ from rstrack.metrics.association import compare, truth_of
 from rstrack.metrics.evaluate import Metrics, drift, evaluate
 from rstrack.metrics.run_evaluate import run_evaluate
 from rstrack.report.build import write_report
-from rstrack.report.images import rectified
-from rstrack.report.page import Note, Page, Section, render
+from rstrack.report.page import Note, Page, PageSection, render
+from rstrack.report.pictures import rectified
 
 
 @pytest.fixture(scope="module")
@@ -232,7 +232,7 @@ def test_without_a_twin_the_page_says_how_to_get_one(sequence: Path, tmp_path: P
 
 
 def test_names_cannot_break_the_page() -> None:
-    html = render(Page(NASTY, NASTY, (), (Section("a", NASTY, (Note(NASTY),)),)))
+    html = render(Page(NASTY, NASTY, (), (PageSection("a", NASTY, (Note(NASTY),)),)))
     assert html.count("<b>") == 0 and html.count("</script>") == 3
     page = Parsed()
     page.feed(html)

@@ -13,9 +13,9 @@ from report_util import NASTY, Parsed, calibration, make_run, make_sequence, par
 
 from rsgen.errors import UserError
 from rstrack.calibration.findings.record import CALIBRATION, read_record
-from rstrack.charts.calibration import strip_chart
 from rstrack.cli.main import main
 from rstrack.report.build import write_report
+from rstrack.report.calibration import strip_chart
 
 
 def page(folder: Path, data: dict[str, Any]) -> Parsed:

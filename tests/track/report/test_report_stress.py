@@ -15,7 +15,7 @@ from report_util import NASTY, Parsed, make_stress, parse, picture
 
 from rsgen.console.command_line import Commands, run_program
 from rsgen.errors import UserError
-from rstrack.bench.stress.results import StressResult, read_stress
+from rstrack.bench.experiments.blur import StressResult, read_stress
 from rstrack.cli.results import report as report_command
 from rstrack.report.build import write_report
 

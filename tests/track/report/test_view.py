@@ -16,8 +16,7 @@ from rsgen.geometry.shutter import Scan, project_rolling
 from rstrack.cli.main import main
 from rstrack.data.dataset import open_dataset
 from rstrack.data.rig import Image
-from rstrack.view.residuals import depth_residuals, world_points
-from rstrack.view.viewer import Viewer, open_view
+from rstrack.view.viewer import Viewer, depth_residuals, open_view, world_points
 
 
 @pytest.mark.parametrize("scan", ["top-bottom", "bottom-top", "right-left"])

@@ -6,7 +6,6 @@ the pose in the middle of their readout.
 
 from __future__ import annotations
 
-import importlib
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +13,9 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
+from rsgen.console.rerun import recording_file
 from rsgen.errors import UserError
-from rsgen.files import read_bytes, whole_file
+from rsgen.files import read_bytes
 from rsgen.formats.export.folder import image_streams
 from rsgen.geometry import se3
 from rsgen.sequence.format import ground_truth
@@ -33,30 +33,10 @@ def export_rerun(sequence: Sequence, out: Path, progress: Progress = no_progress
     Raises UserError if rerun-sdk is not installed, if `out` is there already or not named .rrd, or a file of the
     sequence cannot be read.
     """
-    rr = _rerun()
     out = Path(out)
-    if out.suffix != ".rrd":
-        raise UserError(f"{out}: a rerun recording is named .rrd: choose another --out")
-    if out.exists():
-        raise UserError(f"{out}: is there already: choose another --out or delete it")
-    if not out.parent.is_dir():
-        raise UserError(f"{out.parent}: no such folder: make it or choose another --out")
-    recording = rr.RecordingStream("rsgen", recording_id=sequence.name)
-    with whole_file(out) as temporary:
-        try:
-            recording.save(temporary)
-            _log(rr, recording, sequence, progress)
-            recording.flush()
-        finally:
-            recording.disconnect()
+    with recording_file(out, "rsgen", sequence.name, "--out") as (rr, recording):
+        _log(rr, recording, sequence, progress)
     return f"{out}: {out.stat().st_size / 1e6:.1f} MB, open it with 'rerun {out.name}'"
-
-
-def _rerun() -> Any:
-    try:
-        return importlib.import_module("rerun")
-    except ImportError:
-        raise UserError("rerun is not installed: pip install rerun-sdk") from None
 
 
 def _log(rr: Any, recording: Any, sequence: Sequence, progress: Progress) -> None:

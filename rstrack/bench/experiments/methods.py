@@ -1,0 +1,234 @@
+"""Every method on every sequence: the YAML file that lists them, and which cells of it are asked for.
+
+plan = make_plan(load_methods(Path("configs/evaluation.yaml")), Path("out"), quick=True)
+outcome = run_cells(plan.benchmark, Path("out/bench"), Sources(Path("out")))
+
+Methods of ours run with the depth of later frames fused into keyframes and without. The paper fuses with every method,
+and so does ours with rolling ones; taken for a global shutter's, rows that are averaged do not fit together, which
+helps where images are noisy and harms where they are not. So either may be better.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field, model_validator
+
+from rsgen.errors import UserError
+from rstrack.bench.cells import Benchmark, Cell
+from rstrack.bench.definitions import (
+    OTHERS,
+    CaseEntry,
+    MethodEntry,
+    Name,
+    SequenceEntry,
+    StrictModel,
+    beside,
+    validated,
+)
+from rstrack.data.dataset import Dataset, open_dataset
+from rstrack.metrics.association import truth_of
+from rstrack.metrics.clock import TruthOffset
+from rstrack.options import METHODS, PEERS, Options
+
+MAPPED = ("rs-pg", "gs-pg", "baseline")
+"""The methods whose maps are compared: ours, the same without its model of the shutter, and the usual way."""
+
+
+class Quick(StrictModel):
+    """What --quick leaves of it."""
+
+    sequences: tuple[Name, ...] = Field(min_length=1, description="names of sequences")
+    methods: tuple[Name, ...] = Field(min_length=1, description="names of methods")
+    frames: int = Field(ge=10, description="frames of each sequence, from the first one on")
+
+
+class MethodsConfig(StrictModel):
+    """The whole evaluation. Sequences lie in --data, in folders of their `path`, or of their name if they have none."""
+
+    sequences: dict[Name, SequenceEntry] = Field(min_length=1, description="what is tracked")
+    methods: tuple[Name, ...] = Field(min_length=1, description="what tracks it, in the order of the tables")
+    quick: Quick | None = Field(default=None, description="a subset that runs in minutes")
+
+    @model_validator(mode="after")
+    def _names_are_consistent(self) -> MethodsConfig:
+        twice = [name for name, count in Counter(self.methods).items() if count > 1]
+        if twice:
+            raise ValueError(f"methods: '{twice[0]}' is there twice")
+        unknown = [name for name in (self.quick.sequences if self.quick else ()) if name not in self.sequences]
+        if unknown:
+            raise ValueError(f"quick.sequences: '{unknown[0]}' is not among the sequences")
+        return self
+
+
+@dataclass(frozen=True)
+class SequenceInfo:
+    """A sequence as it is run; frames: how many of it are used."""
+
+    name: str
+    group: str
+    path: Path
+    frames: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All cells, sequence by sequence; methods: variants (`variants`), peers and other trackers."""
+
+    benchmark: Benchmark
+    sequences: tuple[SequenceInfo, ...]
+    methods: tuple[str, ...]
+
+
+def load_methods(path: Path) -> MethodsConfig:
+    """Read and validate a file such as configs/evaluation.yaml. Raises UserError naming the file and the entry."""
+    config = validated(MethodsConfig, path, "configs/evaluation.yaml")
+    return config.model_copy(update={"sequences": beside(config.sequences, path.parent)})
+
+
+def make_plan(
+    config: MethodsConfig, data: Path, options: Options | None = None, *, quick: bool = False,
+    frames: slice | None = None, sequences: Sequence[str] = (), methods: Sequence[str] = (), peers: bool = False,
+    added: Mapping[str, Path] | None = None, commands: Mapping[str, str] | None = None,
+    truth_offset: TruthOffset | None = None, measure: str = "track",
+) -> Plan:  # fmt: skip
+    """Look the sequences up in the folder `data` and list the cells; what is given beats what `quick` says.
+
+    sequences, methods: names, none: all of the config; methods may name ours and all peers. peers: all of these too,
+    or those that can be timed.
+    Each of our methods is run with and without fusion, unless options.fuse says which or it is not errors that are
+    measured. added: results of other trackers by name, each a folder with SEQUENCE.txt (TUM) or SEQUENCE/ (a run
+    folder). commands: other trackers by name, see `rstrack.peers.peer`. truth_offset: of the truth's clock. Raises
+    UserError, one line: names that there are not; sequences that are missing or not whole, with how to make them.
+    """
+    options, added, commands = options or Options(), added or {}, commands or {}
+    subset = config.quick if quick else None
+    if quick and subset is None:
+        raise UserError("--quick: the config has no section 'quick'")
+    for name in sequences:
+        if name not in config.sequences:
+            raise UserError(f"--sequence {name}: the config has no such sequence: it has {', '.join(config.sequences)}")
+    asked = sequences or (subset.sequences if subset else tuple(config.sequences))
+    entries = {name: entry for name, entry in config.sequences.items() if name in asked}
+    more = (OTHERS if measure == "track" else PEERS) if peers else ()
+    chosen = chosen_methods(methods or (subset.methods if subset else config.methods), more)
+    for option, name in (*(("--add", name) for name in added), *(("--peer-command", name) for name in commands)):
+        if name in (*chosen, *METHODS, *OTHERS) or (option == "--peer-command" and name in added):
+            raise UserError(f"{option} {name}=...: there is a method of that name: choose another name")
+    frames = frames or slice(0, subset.frames if subset else None)
+    missing = [name for name, entry in entries.items() if not (data / _folder(name, entry)).is_dir()]
+    if missing:
+        how = "; ".join(_render_command(name, entries[name], data, frames) for name in missing)
+        raise UserError(f"{data}: has no {', '.join(missing)}: leave them out with --sequence, or make them: {how}")
+    of_each = {name: variants(name, options.fuse) for name in chosen}
+    names = [v for found in of_each.values() for v in (found if measure == "track" else found[:1])]
+    run = {name: method_entry(name, options) for name in names}
+    run |= {name: MethodEntry(results=folder) for name, folder in added.items()}
+    run |= {name: MethodEntry(command=command) for name, command in commands.items()}
+    infos, cells = [], []
+    for name, entry in entries.items():
+        dataset = open_dataset(data / _folder(name, entry))
+        if truth_of(dataset) is None:
+            raise UserError(f"{dataset.root}: has no ground truth to compare with: leave it out with --sequence")
+        kept = _kept(dataset, _render_command(name, entry, data, frames), frames)
+        infos.append(SequenceInfo(name, entry.group, dataset.root.resolve(), len(kept)))
+        piece = None if len(kept) == len(dataset) else f"{kept.start}:{kept.stop}"
+        case = CaseEntry(sequence=name, frames=piece, truth_offset=truth_offset)
+        sequence = SequenceEntry(path=_folder(name, entry), group=entry.group)
+        cells += [Cell(measure, name, method, (0,), case, sequence, how, {}) for method, how in run.items()]
+    return Plan(Benchmark(tuple(cells)), tuple(infos), tuple(run))
+
+
+def chosen_methods(methods: Sequence[str], more: Sequence[str]) -> list[str]:
+    """The methods, each once, and more behind them. Raises UserError for one that there is not."""
+    chosen = list(dict.fromkeys(methods))
+    for method in chosen:
+        if method not in (*METHODS, *OTHERS):
+            raise UserError(f"no method '{method}': choose from {', '.join((*METHODS, *OTHERS))}")
+    return chosen + [peer for peer in more if peer not in chosen]
+
+
+def method_entry(name: str, options: Options) -> MethodEntry:
+    """The entry of a variant, or of a peer, which has no options."""
+    if method_of(name) not in METHODS:
+        return MethodEntry()
+    return MethodEntry(method=method_of(name), options=given_options(options) | {"fuse": fuses(name)})
+
+
+def given_options(options: Options) -> dict[str, Any]:
+    """Those that are not at their defaults, without the method."""
+    usual = dataclasses.asdict(Options())
+    return {k: v for k, v in dataclasses.asdict(options).items() if k != "method" and v != usual[k]}
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _folder(name: str, entry: SequenceEntry) -> Path:
+    return entry.path or Path(name)
+
+
+def _render_command(name: str, entry: SequenceEntry, data: Path, frames: slice) -> str:
+    few = "" if frames.stop is None else f" --frames {frames.start or 0}:{frames.stop}"
+    return f"rsgen render {entry.config or '...'} --out {data / _folder(name, entry)}{few}"
+
+
+def _kept(dataset: Dataset, command: str, frames: slice) -> range:
+    """The frames that are run. Raises UserError: there are none, or fewer than are wanted have been rendered."""
+    chosen = range(len(dataset))[frames]
+    if dataset.sequence is not None and (frames.stop is None or frames.stop > len(dataset)):
+        there, in_all = min((len(s.paths), s.frames) for s in dataset.sequence.streams.values())
+        if there < in_all:
+            raise UserError(
+                f"{dataset.root}: {there} of {in_all} frames are rendered: finish it with '{command}', leave it out "
+                f"with --sequence, or track what there is with --frames 0:{there}"
+            )
+    if not len(chosen):
+        raise UserError(f"{dataset.root}: has no frame {frames.start}: its frames are 0 to {len(dataset) - 1}")
+    return chosen
+
+
+_FUSE, _NO_FUSE = "-fuse", "-no-fuse"
+
+
+def variants(method: str, fuse: bool | None) -> tuple[str, ...]:
+    """Names of what is run of a method, its usual setting first; fuse: the only one that is asked for, None: both.
+
+    The usual setting has the method's own name: fused where the rolling shutter is modelled, else not. Peers and
+    added trackers have one variant.
+    """
+    if method not in METHODS:
+        return (method,)
+    names = (method, method + (_NO_FUSE if _is_rolling(method) else _FUSE))
+    return tuple(name for name in names if fuse is None or fuses(name) == fuse)
+
+
+def method_of(name: str) -> str:
+    """The method of a variant."""
+    return name.removesuffix(_NO_FUSE).removesuffix(_FUSE)
+
+
+def fuses(name: str) -> bool | None:
+    """`Options.fuse` of a variant; None: not one of our methods."""
+    if method_of(name) not in METHODS:
+        return None
+    return not name.endswith(_NO_FUSE) and (name.endswith(_FUSE) or _is_rolling(name))
+
+
+def row_of(name: str) -> str:
+    """The line of the tables that a variant competes for.
+
+    Methods that take the rolling shutter for a global one have one for both settings, the better of which is shown, as
+    the paper's may have been. A rolling one without fusion has its own, to tell what the shutter does from what fusion
+    does.
+    """
+    return name if _is_rolling(name) else method_of(name)
+
+
+def _is_rolling(name: str) -> bool:
+    return name.startswith("rs-")

@@ -1,1 +1,0 @@
-"""`rstrack bench`: every method on every sequence, beside the paper's figures."""

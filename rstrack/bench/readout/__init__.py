@@ -1,1 +1,0 @@
-"""The readout sweep: what each tracker's error comes to as the shutter gets slower."""

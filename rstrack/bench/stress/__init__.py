@@ -1,1 +1,0 @@
-"""`rstrack bench stress`: what blur does, and what blur-aware weights gain."""
