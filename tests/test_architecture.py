@@ -19,8 +19,8 @@ TRACKER = sorted((ROOT / "rstrack").rglob("*.py"))
 BENCHMARKS = sorted((ROOT / "benchmarks").rglob("*.py"))
 # What rstrack builds on; the rest of rsgen renders, or is about rendering.
 SHARED = (
-    "array_types", "console", "device", "errors", "figures", "files", "geometry", "inputs", "limits", "sequence",
-    "srgb",
+    "array_types", "console", "device", "errors", "figures", "files", "geometry", "image_codecs", "inputs", "limits",
+    "sequence", "srgb",
 )  # fmt: skip
 ENGINES = ("mitsuba", "drjit")
 WITHOUT_ENGINE = (

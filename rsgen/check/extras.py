@@ -11,13 +11,11 @@ import numpy as np
 
 from rsgen.errors import UserError
 from rsgen.files import is_temporary, read_text, read_yaml
-from rsgen.sensors.imu import imu_csv
-from rsgen.sensors.imu_truth import IMU_TRUTH_CSV, IMU_TRUTH_YAML, imu_truth_csv
+from rsgen.sensors.imu import IMU_TRUTH_CSV, IMU_TRUTH_YAML, imu_csv, imu_truth_csv
 from rsgen.sequence.camera_yaml import TRUE_CAMERAS
 from rsgen.sequence.format import STREAMS, color_truth_path, ground_truth, pose_lines
-from rsgen.sequence.object_files import poses_file
 from rsgen.sequence.reader import Sequence
-from rsgen.sequence.target_corners import TARGET_CORNERS, target_corners_text
+from rsgen.sequence.truth_files import TARGET_CORNERS, poses_file, target_corners_text
 from rsgen.truth.settings import sequence_imu, sequence_target
 
 

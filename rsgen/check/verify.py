@@ -24,7 +24,7 @@ from rsgen.errors import UserError
 from rsgen.files import is_temporary, read_text
 from rsgen.geometry import se3
 from rsgen.produce.identity import fingerprint
-from rsgen.sensors.mocap import reported_poses
+from rsgen.sensors.reports import reported_poses
 from rsgen.sequence.format import (
     FOLDERS,
     STAMP_TOLERANCE_S,

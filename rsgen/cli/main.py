@@ -176,8 +176,7 @@ def stats(
 ) -> int:
     """Print length, mean speeds and accelerations of the configs' motions, a line a config, beside the paper's."""
     from rsgen.config.config import load_config
-    from rsgen.motion.statistics import motion_statistics
-    from rsgen.motion.table import stats_table
+    from rsgen.motion.statistics import motion_statistics, stats_table
     from rsgen.produce.ground_truth import load_motion
 
     rows = []

@@ -3,7 +3,7 @@
 Camera frame: x right, y down, z forward. Pixel centres at integer coordinates. Normalised coordinates are (x/z, y/z).
 Distortion as in OpenCV: `radtan` k1 k2 p1 p2 [k3] (Brown-Conrady), `rational` k1 k2 p1 p2 k3 k4 k5 k6, in which the
 radial part is divided by 1 + k4 r² + k5 r⁴ + k6 r⁶, `fisheye` k1 k2 k3 k4 (Kannala-Brandt);
-`double_sphere` xi alpha as in Kalibr and Basalt (`rsgen.geometry.double_sphere`).
+`double_sphere` xi alpha as in Kalibr and Basalt.
 
 Distortions are polynomials, or quotients of them, that may fold back at some radius, beyond which one pixel would see
 two directions. A camera here is defined only inside a disc around the optical axis on which the distortion provably is
@@ -13,18 +13,16 @@ one to one; what lies outside is reported as not visible instead of being projec
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
-from numpy.polynomial import Polynomial
 
 from rsgen.array_types import BoolArray, FloatArray
 from rsgen.errors import UserError
-from rsgen.geometry import double_sphere
+from rsgen.geometry import distortion as lens
 
 Model = Literal["pinhole", "radtan", "rational", "fisheye", "double_sphere"]
 
@@ -82,7 +80,7 @@ class Camera:
             raise UserError(
                 f"camera: {self.model} takes {counts} finite distortion coefficients, not {self.distortion}"
             )
-        if self.model == "double_sphere" and not double_sphere.is_lens(*self.distortion):
+        if self.model == "double_sphere" and not lens.is_double_sphere(*self.distortion):
             raise UserError(f"camera: double_sphere takes xi in (-1, 1] and alpha in [0, 1], not {self.distortion}")
 
     @property
@@ -96,20 +94,20 @@ class Camera:
         if self.model == "pinhole":
             return math.inf
         if self.model == "fisheye":
-            theta = math.sqrt(_first_root(_odd_slope(self.distortion)))
+            theta = math.sqrt(lens.first_root(lens.odd_slope(self.distortion)))
             return math.tan(min(theta, math.atan(_MAX_RADIUS)))
         if self.model == "double_sphere":
-            return min(double_sphere.max_radius(*self._sphere), _MAX_RADIUS)
+            return min(lens.double_sphere_radius(*self._sphere), _MAX_RADIUS)
         k1, k2, p1, p2, k3 = self._brown
         # The Jacobian is symmetric; its radial part has the eigenvalues d and (r d)', the tangential part none below
         # -6 |p| r. Where both sums are positive it is positive definite, and on a disc, being convex, that makes the
         # map one to one.
         tangential = 6.0 * math.hypot(p1, p2)
         if self.model == "rational":
-            return min(_rational_radius((k1, k2, k3), self.distortion[5:], tangential), _MAX_RADIUS)
+            return min(lens.rational_radius((k1, k2, k3), self.distortion[5:], tangential), _MAX_RADIUS)
         across = [1.0, -tangential, k1, 0.0, k2, 0.0, k3]
         along = [1.0, -tangential, 3.0 * k1, 0.0, 5.0 * k2, 0.0, 7.0 * k3]
-        return min(_first_root(across), _first_root(along), _MAX_RADIUS)
+        return min(lens.first_root(across), lens.first_root(along), _MAX_RADIUS)
 
     def project(self, p_cam: npt.ArrayLike) -> tuple[FloatArray, BoolArray]:
         """Pixels uv (..., 2) of points (..., 3) in metres, and whether they are defined (...,).
@@ -178,7 +176,7 @@ class Camera:
         if self.model == "fisheye":
             return xy * self._fisheye_scale(r2)[0][..., None]
         if self.model == "double_sphere":
-            return xy * double_sphere.scale(*self._sphere, r2)[0][..., None]
+            return xy * lens.double_sphere_scale(*self._sphere, r2)[0][..., None]
         _, _, p1, p2, _ = self._brown
         d = self._radial_scale(r2)[0]
         return np.stack(
@@ -193,7 +191,7 @@ class Camera:
         x, y = xy[..., 0], xy[..., 1]
         r2 = x * x + y * y
         if self.model in ("fisheye", "double_sphere"):
-            s, g = self._fisheye_scale(r2) if self.model == "fisheye" else double_sphere.scale(*self._sphere, r2)
+            s, g = self._fisheye_scale(r2) if self.model == "fisheye" else lens.double_sphere_scale(*self._sphere, r2)
             return _symmetric(s + g * x * x, g * x * y, s + g * y * y)
         _, _, p1, p2, _ = self._brown
         s, g = self._radial_scale(r2)
@@ -220,8 +218,8 @@ class Camera:
         r = np.sqrt(r2)
         theta = np.arctan(r)
         safe_r2 = np.where(r2 > 0.0, r2, 1.0)
-        s = np.where(r2 > 0.0, _odd(self.distortion, theta) / np.sqrt(safe_r2), 1.0)
-        slope = _horner(_odd_slope(self.distortion), theta * theta)
+        s = np.where(r2 > 0.0, lens.odd(self.distortion, theta) / np.sqrt(safe_r2), 1.0)
+        slope = lens.horner(lens.odd_slope(self.distortion), theta * theta)
         # g only ever multiplies products of x and y, so what cancels here for small r does no harm.
         return s, np.where(r2 > 0.0, (slope / (1.0 + r2) - s) / safe_r2, 0.0)
 
@@ -229,12 +227,12 @@ class Camera:
         if self.model == "pinhole":
             return distorted
         if self.model == "double_sphere":
-            xy = double_sphere.undistort(*self._sphere, distorted)
+            xy = lens.undistort_double_sphere(*self._sphere, distorted)
             return np.where((np.hypot(xy[..., 0], xy[..., 1]) < self.max_radius)[..., None], xy, np.nan)
         radius = np.hypot(distorted[..., 0], distorted[..., 1])
         unit = distorted / np.where(radius > 0.0, radius, 1.0)[..., None]
         if self.model == "fisheye":
-            theta = _invert_odd(self.distortion, radius, math.atan(self.max_radius))
+            theta = lens.invert_odd(self.distortion, radius, math.atan(self.max_radius))
             return unit * np.tan(theta)[..., None]
         if self.model == "rational":
             reach = math.atan((1.0 - 1e-9) * self.max_radius)
@@ -242,7 +240,7 @@ class Camera:
             start = np.interp(radius, radii * self._radial_scale(radii * radii)[0], radii)
             return self._newton(unit * start[..., None], distorted)
         k1, k2, p1, p2, k3 = self._brown
-        without_tangential = _invert_odd((k1, k2, k3), radius, self.max_radius)
+        without_tangential = lens.invert_odd((k1, k2, k3), radius, self.max_radius)
         if p1 == p2 == 0.0:
             return unit * without_tangential[..., None]
         start = np.where(np.isnan(without_tangential), 0.5 * min(self.max_radius, 1.0), without_tangential)
@@ -277,64 +275,3 @@ class Camera:
 
 def _symmetric(xx: FloatArray, xy: FloatArray, yy: FloatArray) -> FloatArray:
     return np.stack([np.stack([xx, xy], axis=-1), np.stack([xy, yy], axis=-1)], axis=-2)
-
-
-def _horner(coefficients: Sequence[float], x: FloatArray) -> FloatArray:
-    """Polynomial with the constant term first."""
-    value = np.full_like(x, coefficients[-1])
-    for k in reversed(coefficients[:-1]):
-        value = value * x + k
-    return np.asarray(value)
-
-
-def _odd(ks: Sequence[float], x: FloatArray) -> FloatArray:
-    """x (1 + k1 x² + k2 x⁴ + ...)."""
-    return np.asarray(x * _horner((1.0, *ks), x * x))
-
-
-def _odd_slope(ks: Sequence[float]) -> list[float]:
-    """Coefficients, in x² and with the constant term first, of the derivative of `_odd`."""
-    return [1.0, *((2 * i + 3) * k for i, k in enumerate(ks))]
-
-
-def _rational_radius(above: Sequence[float], below: Sequence[float], tangential: float) -> float:
-    """As `Camera.max_radius` of N / D, D positive: the conditions of radtan, times D and D².
-
-    above, below (3,): coefficients of r², r⁴, r⁶ of N and of D.
-    """
-    N, D = (Polynomial([1.0, 0.0, k[0], 0.0, k[1], 0.0, k[2]]) for k in (above, below))
-    r = Polynomial([0.0, 1.0])
-    across = N - tangential * r * D
-    along = N * D + r * (N.deriv() * D - N * D.deriv()) - tangential * r * D * D
-    return min(_first_root(p.coef.tolist()) for p in (D, across, along))
-
-
-def _first_root(coefficients: Sequence[float]) -> float:
-    """Smallest positive root of a polynomial that starts at 1 (constant term first), infinite if it has none."""
-    # Solved for 1/x: its leading coefficient is the 1, so that a vanishing last coefficient does no harm.
-    inverses = np.roots(coefficients)
-    # A root where the polynomial only touches zero comes out as a nearly real pair.
-    real = inverses.real[(np.abs(inverses.imag) < 1e-7 * np.abs(inverses)) & (inverses.real > 1e-100)]
-    return 1.0 / float(real.max()) if real.size else math.inf
-
-
-def _invert_odd(ks: Sequence[float], target: FloatArray, upper: float) -> FloatArray:
-    """x in [0, upper] with _odd(ks, x) = target ≥ 0, NaN where there is none; _odd must increase on [0, upper].
-
-    Newton's method, bisecting where a step would leave the bracket.
-    """
-    reachable = target <= _odd(ks, np.array(upper))
-    goal = np.where(reachable, target, 0.0)
-    slope = _odd_slope(ks)
-    low, high = np.zeros_like(goal), np.full_like(goal, upper)
-    x = np.minimum(goal, high)
-    for _ in range(80):
-        error = _odd(ks, x) - goal
-        if not (np.abs(error) > 4e-16 * (1.0 + goal)).any():
-            break
-        low, high = np.where(error < 0.0, x, low), np.where(error > 0.0, x, high)
-        rate = _horner(slope, x * x)
-        newton = x - error / np.where(rate > 0.0, rate, np.inf)
-        strays = (newton < low) | (newton > high) | (rate <= 0.0)
-        x = np.where(error == 0.0, x, np.where(strays, 0.5 * (low + high), newton))
-    return np.where(reachable, x, np.nan)

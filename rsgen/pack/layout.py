@@ -13,7 +13,7 @@ import numpy as np
 
 from rsgen.array_types import BoolArray, ByteArray, Float32Array, FloatArray
 from rsgen.config.sections import GlobalTime
-from rsgen.files import encode_png
+from rsgen.image_codecs import encode_png
 from rsgen.pack.draw import Drawn, Layout
 
 TIMES: tuple[GlobalTime, ...] = ("first", "middle")

@@ -26,7 +26,7 @@ from rsgen.geometry.spline import Spline
 from rsgen.produce.frame_source import ColorShot, DepthShot, FrameSource, scene_hash
 from rsgen.produce.moving import mesh_hashes
 from rsgen.produce.writer import SequenceWriter
-from rsgen.sensors.adaptation import Setting
+from rsgen.sensors.color import Setting
 from rsgen.sequence.format import StreamName
 
 # Written frames that may wait for the disk: bounds memory and how much a kill can lose.

@@ -22,15 +22,11 @@ from rsgen.geometry.spline import Spline
 from rsgen.produce.ground_truth import lines_of_sight
 from rsgen.produce.identity import fingerprint
 from rsgen.produce.moving import lit_objects, load_meshes
-from rsgen.sensors.adaptation import Meter, Reading, Setting, reading
-from rsgen.sensors.color import apply_color_noise, apply_setting
-from rsgen.sensors.depth import apply_depth_noise
-from rsgen.sensors.depth_errors import mixed_depth, with_fixed_errors
-from rsgen.sensors.registration import register_depth
-from rsgen.sensors.response import to_srgb8
+from rsgen.sensors.color import Meter, Reading, Setting, apply_color_noise, apply_setting, reading, to_srgb8
+from rsgen.sensors.depth import apply_depth_noise, mixed_depth, register_depth, with_fixed_errors
 from rsgen.sensors.seed import noise_generator
 from rsgen.sequence.format import CLEAN_COLOR
-from rsgen.sequence.frame_table import FrameTable
+from rsgen.sequence.truth_files import FrameTable
 
 # Light meters of cameras see no more than this of a picture.
 _METER_WIDTH, _METER_SPP = 64, 4

@@ -27,9 +27,9 @@ from rsgen.produce.moving import (
     object_mesh_ply,
 )
 from rsgen.produce.writer import SequenceWriter
-from rsgen.sensors.adaptation import Reading, Setting, adapt
+from rsgen.sensors.color import Reading, Setting, adapt
 from rsgen.sequence.format import STREAMS, stream_stamps
-from rsgen.sequence.object_files import mesh_file
+from rsgen.sequence.truth_files import mesh_file
 
 log = logging.getLogger("rsgen")
 

@@ -12,8 +12,7 @@ from rsgen.config.config import Config, TrajectoryConfig
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.motion.fit import FitResult, fit_spline
-from rsgen.motion.make import make_motion
-from rsgen.motion.tremor import with_tremor
+from rsgen.motion.make import make_motion, with_tremor
 from rsgen.produce.moving import object_splines
 from rsgen.sequence.trajectory import Trajectory, read_trajectory
 

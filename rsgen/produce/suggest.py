@@ -24,9 +24,8 @@ from rsgen.files import encode_yaml
 from rsgen.geometry.spline import Spline
 from rsgen.motion.clearance import clearance, plan_tour
 from rsgen.motion.floor_plan import HIGHEST_M, Cast, FloorPlan, find_floors, floor_plan, share_without_floor
-from rsgen.motion.gaze import choose_targets, seen_from
 from rsgen.motion.make import least_turning
-from rsgen.motion.walk import free_region, ring, walk_inside
+from rsgen.motion.walk import choose_targets, free_region, ring, seen_from, walk_inside
 from rsgen.produce.exposure import suggested_gain
 from rsgen.produce.generate import scene_triangles
 from rsgen.produce.ground_truth import load_motion

@@ -11,9 +11,8 @@ from rsgen.array_types import FloatArray
 from rsgen.config.config import Config
 from rsgen.geometry.spline import Spline
 from rsgen.motion.floor_plan import FloorPlan
-from rsgen.motion.gaze import Seen
 from rsgen.motion.statistics import motion_statistics
-from rsgen.motion.walk import free_region
+from rsgen.motion.walk import Seen, free_region
 
 REACH_M = 1.0  # so near a surface's distance is told
 _LARGEST_THING_M = 50.0

@@ -16,25 +16,23 @@ from rsgen.config.config import Config, StreamConfig
 from rsgen.config.faults import StreamFaults
 from rsgen.config.imu import ImuConfig
 from rsgen.errors import UserError
-from rsgen.files import (
-    atomic_write,
-    encode_exr,
-    encode_npy,
-    encode_npz,
-    encode_png,
-    encode_yaml,
-    remove_stale_temporaries,
-    write_error,
-)
+from rsgen.files import atomic_write, encode_yaml, remove_stale_temporaries, write_error
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
+from rsgen.image_codecs import encode_exr, encode_npy, encode_npz, encode_png
 from rsgen.produce.identity import color_truth, describe, refuse_foreign_folder, true_cameras
-from rsgen.sensors.adaptation import Setting
-from rsgen.sensors.driver import color_clock, deliver
-from rsgen.sensors.imu import sample_clock, simulate_imu, write_imu_csv
-from rsgen.sensors.imu_truth import IMU_TRUTH_CSV, IMU_TRUTH_YAML, imu_truth_csv, imu_truth_yaml
-from rsgen.sensors.mocap import reported_poses
+from rsgen.sensors.color import Setting
+from rsgen.sensors.imu import (
+    IMU_TRUTH_CSV,
+    IMU_TRUTH_YAML,
+    imu_truth_csv,
+    imu_truth_yaml,
+    sample_clock,
+    simulate_imu,
+    write_imu_csv,
+)
+from rsgen.sensors.reports import color_clock, deliver, reported_poses
 from rsgen.sequence.camera_yaml import TRUE_CAMERAS, camera_yaml
 from rsgen.sequence.format import (
     DEPTH_OBJECT_IDS,
@@ -55,9 +53,7 @@ from rsgen.sequence.format import (
     pose_lines,
     round_stamps,
 )
-from rsgen.sequence.frame_table import FrameTable
-from rsgen.sequence.object_files import poses_file, spline_file
-from rsgen.sequence.target_corners import TARGET_CORNERS, target_corners_text
+from rsgen.sequence.truth_files import TARGET_CORNERS, FrameTable, poses_file, spline_file, target_corners_text
 
 _SPLINE_TOLERANCE = 1e-9
 

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 
 from rsgen.array_types import ByteArray, FloatArray, IntArray
-from rsgen.files import encode_png
 from rsgen.geometry import se3
 from rsgen.geometry.aprilgrid import AprilGrid
+from rsgen.image_codecs import encode_png
 from rsgen.render.meshes import ply_bytes
 
 BOARD_ID = "rsgen_target"  # of its shape in a scene

@@ -16,10 +16,11 @@ import numpy.typing as npt
 
 from rsgen.array_types import ByteArray, Float32Array, FloatArray, IntArray
 from rsgen.errors import UserError
-from rsgen.files import listed_file, read_exr, read_npy, read_png, read_text
+from rsgen.files import listed_file, read_text
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
+from rsgen.image_codecs import read_exr, read_npy, read_png
 from rsgen.limits import rigid
 from rsgen.sequence.camera_yaml import TRUE_CAMERAS, read_true_cameras
 from rsgen.sequence.format import (
@@ -40,8 +41,7 @@ from rsgen.sequence.format import (
     poses_of_rows,
     read_sequence_yaml,
 )
-from rsgen.sequence.frame_table import FrameTable, read_frame_table
-from rsgen.sequence.object_files import SequenceObject, read_objects
+from rsgen.sequence.truth_files import FrameTable, SequenceObject, read_frame_table, read_objects
 
 _LONGEST_S = 1e6  # as long as stamps may grow
 

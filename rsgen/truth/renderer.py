@@ -40,7 +40,7 @@ from rsgen.geometry.shutter import Shutter
 from rsgen.render.images import ColorRenderer
 from rsgen.render.moving_objects import MovingObjects, ObjectsInFrame
 from rsgen.render.sensor import RollingShutterSensor
-from rsgen.sensors.response import to_srgb8
+from rsgen.sensors.color import to_srgb8
 from rsgen.sequence.format import OBJECT_IDS
 
 # Rays that ask whether a point is seen end this much short of it, as a fraction of their length: 0.1 mm at 1 m.

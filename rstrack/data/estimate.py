@@ -16,8 +16,9 @@ import numpy.typing as npt
 
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
-from rsgen.files import atomic_write, encode_npz, read_text, write_error
+from rsgen.files import atomic_write, read_text, write_error
 from rsgen.geometry.spline import Spline
+from rsgen.image_codecs import encode_npz
 from rsgen.sequence.format import pose_rows
 from rsgen.sequence.trajectory import read_trajectory
 from rstrack.data.moving_masks import MOVING, MovingMasks

@@ -17,8 +17,9 @@ import numpy.typing as npt
 
 from rsgen.array_types import ByteArray, Float32Array
 from rsgen.errors import UserError
-from rsgen.files import png_fault, read_bytes
+from rsgen.files import read_bytes
 from rsgen.geometry.camera import Camera
+from rsgen.image_codecs import png_fault
 from rsgen.inputs import MOST_PIXELS, image_size
 from rstrack.data.rig import Frame, Image, Rig
 

@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rsgen.errors import UserError
-from rsgen.files import atomic_write, encode_npz
+from rsgen.files import atomic_write
+from rsgen.image_codecs import encode_npz
 from rsgen.inputs import MOST_PIXELS, read_arrays
 
 MOVING = "moving.npz"

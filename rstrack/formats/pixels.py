@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from rsgen.array_types import ByteArray
 from rsgen.errors import UserError
-from rsgen.files import encode_png, png_fault
 from rsgen.geometry.camera import Camera
+from rsgen.image_codecs import encode_png, png_fault
 from rsgen.inputs import MOST_PIXELS, image_size
 from rstrack.formats.recording import FLOAT_DEPTH_SCALE
 

@@ -14,8 +14,8 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
-from rsgen.files import encode_png
 from rsgen.geometry.camera import Camera
+from rsgen.image_codecs import encode_png
 from rstrack.formats.pixels import compressed_color, header_size, units_of_metres
 from rstrack.formats.recording import (
     ARKIT_TRUTH,

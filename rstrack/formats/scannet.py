@@ -17,9 +17,9 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
-from rsgen.files import encode_png
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
+from rsgen.image_codecs import encode_png
 from rstrack.formats.pixels import compressed_color
 from rstrack.formats.recording import Item, ReadOptions, RecordedImage, RecordedPose, Recording, StreamCamera, camera_of
 

@@ -18,8 +18,9 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
-from rsgen.files import encode_png, listed_file, png_fault, read_bytes, read_text
+from rsgen.files import listed_file, read_bytes, read_text
 from rsgen.geometry.camera import Camera
+from rsgen.image_codecs import encode_png, png_fault
 from rstrack.formats.pixels import check_size, decode, header_size
 from rstrack.formats.recording import (
     ARKIT_TRUTH,

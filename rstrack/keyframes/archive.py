@@ -14,7 +14,8 @@ import numpy.typing as npt
 
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
-from rsgen.files import atomic_write, encode_npz, write_error
+from rsgen.files import atomic_write, write_error
+from rsgen.image_codecs import encode_npz
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker

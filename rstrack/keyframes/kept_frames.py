@@ -9,7 +9,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from rsgen.errors import UserError
-from rsgen.files import atomic_write, encode_npz
+from rsgen.files import atomic_write
+from rsgen.image_codecs import encode_npz
 from rstrack.data.rig import Frame, Image
 from rstrack.keyframes.archive import temporary_folder
 

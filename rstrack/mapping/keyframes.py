@@ -11,7 +11,8 @@ import numpy as np
 
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
-from rsgen.files import atomic_write, encode_png, encode_yaml, write_error
+from rsgen.files import atomic_write, encode_yaml, write_error
+from rsgen.image_codecs import encode_png
 from rsgen.sequence.format import DEPTH_SCALE, frame_name, pose_rows
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import TRAJECTORY, Estimate

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from rsgen.files import encode_npz
+from rsgen.image_codecs import encode_npz
 
 
 def lines_of(path: Path) -> list[str]:

@@ -29,7 +29,7 @@ from hostile_cases import (
 )
 
 import rsgen.cli.main
-from rsgen.files import encode_png
+from rsgen.image_codecs import encode_png
 from rstrack.data.imu.recording import find_imu
 
 

@@ -23,7 +23,7 @@ from hostile_cases import (
     text_edited,
 )
 
-from rsgen.files import encode_png
+from rsgen.image_codecs import encode_png
 
 
 def phones(folder: Path) -> Iterator[Case]:

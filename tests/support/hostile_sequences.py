@@ -25,7 +25,7 @@ from hostile_cases import (
 )
 
 from rsgen.config.config import load_config
-from rsgen.files import encode_exr, encode_npy, encode_npz
+from rsgen.image_codecs import encode_exr, encode_npy, encode_npz
 from rsgen.sequence.reader import read_sequence
 from rsgen.sequence.trajectory import read_trajectory
 from rstrack.data.estimate import read_estimate, write_estimate

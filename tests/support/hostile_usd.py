@@ -10,8 +10,8 @@ import hostile
 import numpy as np
 from hostile_cases import Base, Case, of_8_gb, piped, replaced_by, text_edited
 
-from rsgen.files import encode_png
 from rsgen.formats.scenes.import_scene import import_scene
+from rsgen.image_codecs import encode_png
 
 
 def usd(folder: Path) -> Iterator[Case]:

@@ -24,8 +24,8 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
-from rsgen.files import encode_png
 from rsgen.geometry import se3
+from rsgen.image_codecs import encode_png
 
 COLOR_SIZE, DEPTH_SIZE = (40, 30), (32, 24)
 COLOR_K, DEPTH_K = (31.0, 31.5, 19.25, 14.75), (25.0, 24.5, 15.75, 11.5)

@@ -18,10 +18,10 @@ import yaml
 from bench_evaluation import made_up_record
 
 from rsgen.config.sections import TruthConfig
-from rsgen.files import encode_png
 from rsgen.geometry import se3
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
+from rsgen.image_codecs import encode_png
 from rsgen.sequence.format import pose_rows
 from rstrack.bench.experiments.blur import StressResult
 from rstrack.bench.experiments.blur_results import write_stress

@@ -15,7 +15,8 @@ import numpy as np
 from rsgen import srgb
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
-from rsgen.files import encode_exr, encode_png, write_error
+from rsgen.files import write_error
+from rsgen.image_codecs import encode_exr, encode_png
 
 NAME = "scene.xml"
 

@@ -16,8 +16,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError, first_problem
-from rsgen.files import atomic_write, encode_png, read_png, read_text
+from rsgen.files import atomic_write, read_text
 from rsgen.geometry.spline import Spline
+from rsgen.image_codecs import encode_png, read_png
 from rstrack.bench.measures.track import accuracy, estimated
 from rstrack.bench.record import Figures
 from rstrack.bench.task import Task

@@ -14,9 +14,10 @@ import yaml
 
 from rsgen.check.reprojection import reproject_depth
 from rsgen.check.verify import Verification, verify_sequence
-from rsgen.files import encode_exr, encode_npy, encode_png, encode_yaml, read_exr
+from rsgen.files import encode_yaml
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
+from rsgen.image_codecs import encode_exr, encode_npy, encode_png, read_exr
 from rsgen.produce.writer import quantise
 from rsgen.sequence.reader import read_sequence
 

@@ -125,7 +125,7 @@ def test_no_imu_is_no_imu(meta: dict[str, Any], sequence: Sequence) -> None:
 def test_the_sequences_imu_is_over_its_spline(sequence: Sequence) -> None:
     found = sequence_imu(sequence)
     assert found is not None
-    config, samples = found
+    config, samples, _ = found
     assert config.rate_hz == 100.0
     assert samples.t[0] == sequence.spline.t_begin and samples.t[-1] > sequence.spline.t_end - 0.0101
     gyro, force = exact_imu(sequence.spline, T_IMU_DEPTH, config.gravity, samples.t)

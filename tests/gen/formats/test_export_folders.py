@@ -22,7 +22,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
-from rsgen.sensors.registration import register_depth
+from rsgen.sensors.depth import register_depth
 from rsgen.sequence.format import STREAMS
 from rsgen.sequence.reader import Sequence, read_sequence
 from rsgen.sequence.trajectory import read_trajectory

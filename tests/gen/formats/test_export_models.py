@@ -15,7 +15,6 @@ import trimesh
 from scipy.spatial.transform import Rotation, Slerp
 
 from rsgen.errors import UserError
-from rsgen.files import read_png
 from rsgen.formats.export.poses.approximation import Loss, sightings
 from rsgen.formats.export.reconstruction.aligned import NOTHING
 from rsgen.formats.export.reconstruction.colmap import camera_line, export_colmap
@@ -23,8 +22,9 @@ from rsgen.formats.export.reconstruction.nerfstudio import export_nerfstudio, ng
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter
+from rsgen.image_codecs import read_png
 from rsgen.produce.writer import quantise
-from rsgen.sensors.registration import register_depth
+from rsgen.sensors.depth import register_depth
 from rsgen.sequence.format import poses_of_rows
 from rsgen.sequence.reader import Sequence, read_sequence
 
@@ -357,7 +357,7 @@ def test_every_line_s_pose_follows_from_the_two_files_beside(
 
 def test_an_automatic_camera_s_exposures_count(sequence: Sequence, tmp_path: Path) -> None:
     """The middle of a longer exposure lies earlier; stamps are its end."""
-    from rsgen.sequence.frame_table import FrameTable
+    from rsgen.sequence.truth_files import FrameTable
 
     color = sequence.streams["color"]
     n, ones = np.arange(6), np.ones(6)

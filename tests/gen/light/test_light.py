@@ -35,7 +35,7 @@ from rsgen.light.surface_points import SurfacePoints
 from rsgen.render.baked import BakedIntegrator
 from rsgen.render.images import ColorRenderer
 from rsgen.render.irradiance import make_field, make_lattice
-from rsgen.sensors.response import to_srgb8
+from rsgen.sensors.color import to_srgb8
 
 
 def agree(got: np.ndarray, expected: np.ndarray) -> None:

@@ -12,9 +12,9 @@ from rendering import constant_twist, dr, mi
 from scipy.integrate import quad
 
 from rsgen.device.arrays import vectors
-from rsgen.files import encode_exr
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
+from rsgen.image_codecs import encode_exr
 from rsgen.light.quality import estimated_quality
 from rsgen.light.sampling import in_channels
 from rsgen.render.baked import BakedIntegrator

@@ -16,11 +16,9 @@ from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
 from rsgen.motion.clearance import check_clearance, clearance, nearest_surface, plan_tour
 from rsgen.motion.fit import fit_spline
-from rsgen.motion.make import make_motion
+from rsgen.motion.make import band_noise, make_motion
 from rsgen.motion.paths import TourCurve, look_at, make_path, travel, window
-from rsgen.motion.shake import band_noise
-from rsgen.motion.statistics import motion_statistics
-from rsgen.motion.table import TABLE_1, stats_table
+from rsgen.motion.statistics import TABLE_1, motion_statistics, stats_table
 from rsgen.sequence.trajectory import Trajectory
 
 STILL: dict[str, Any] = {"shake_position_m": 0.0, "shake_rotation_deg": 0.0}

@@ -16,8 +16,7 @@ from rsgen.config.motion import MotionConfig
 from rsgen.motion.clearance import nearest_surface
 from rsgen.motion.fit import FitResult, fit_spline
 from rsgen.motion.make import make_motion
-from rsgen.motion.statistics import motion_statistics
-from rsgen.motion.table import TABLE_1
+from rsgen.motion.statistics import TABLE_1, motion_statistics
 from rsgen.sequence.trajectory import Trajectory
 from scenes.living_room import build
 

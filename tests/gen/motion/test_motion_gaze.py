@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from rsgen.motion.gaze import choose_targets, seen_from
+from rsgen.motion.walk import choose_targets, seen_from
 
 
 def test_a_view_of_one_plane_is_flat_and_one_of_a_corner_is_not() -> None:

@@ -16,7 +16,7 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.motion.fit import fit_spline
-from rsgen.motion.tremor import with_tremor
+from rsgen.motion.make import with_tremor
 from rsgen.produce.ground_truth import load_motion
 
 ROOT = Path(__file__).parents[3]

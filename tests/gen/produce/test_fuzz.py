@@ -20,7 +20,7 @@ import rsgen.cli.main
 import rsgen.produce.generate
 import rstrack.cli.main
 from rsgen.config.config import describe_fields
-from rsgen.files import encode_exr, encode_npy, encode_npz, encode_png
+from rsgen.image_codecs import encode_exr, encode_npy, encode_npz, encode_png
 from rsgen.sequence.reader import read_sequence
 from rstrack.data.estimate import write_estimate
 

@@ -20,8 +20,8 @@ from rsgen.console.configs import config_file
 from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
 from rsgen.motion.clearance import check_clearance
-from rsgen.motion.gaze import seen_from
 from rsgen.motion.statistics import motion_statistics
+from rsgen.motion.walk import seen_from
 from rsgen.produce.ground_truth import Motion, load_motion
 from rsgen.produce.suggest import Suggestion, Wish, suggest_tour
 from rsgen.produce.units import doubt, likely_unit

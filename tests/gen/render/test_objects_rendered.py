@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from rsgen.check.verify import verify_sequence
 from rsgen.cli.main import main
 from rsgen.config.config import load_config
-from rsgen.files import encode_exr, read_exr
 from rsgen.geometry.shutter import Shutter
+from rsgen.image_codecs import encode_exr, read_exr
 from rsgen.light.probes import gathered_light
 from rsgen.produce.frame_source import FrameSource
 from rsgen.produce.ground_truth import load_motion

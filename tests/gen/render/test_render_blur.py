@@ -21,7 +21,7 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.produce import frame_source
 from rsgen.render.images import ColorRenderer
-from rsgen.sensors.response import to_srgb8
+from rsgen.sensors.color import to_srgb8
 from rsgen.truth.renderer import TruthRenderer
 
 CAMERA = Camera(tiny.WIDTH, tiny.HEIGHT, 36.0, 36.0, 23.5, 17.5)

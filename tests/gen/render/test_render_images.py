@@ -25,7 +25,7 @@ from rsgen.produce import generate
 from rsgen.render import images as render
 from rsgen.render.images import ColorRenderer, DepthRenderer
 from rsgen.render.scene import load_scene
-from rsgen.sensors.response import to_srgb8
+from rsgen.sensors.color import to_srgb8
 
 
 @pytest.fixture(scope="module")

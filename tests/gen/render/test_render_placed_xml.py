@@ -10,10 +10,10 @@ from rendering import dr, mi
 from scene_files import write_scene
 
 from rsgen.errors import UserError
-from rsgen.files import encode_exr
 from rsgen.geometry.aprilgrid import AprilGrid
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
+from rsgen.image_codecs import encode_exr
 from rsgen.render import placement
 from rsgen.render.board import Board
 from rsgen.render.images import ColorRenderer, DepthRenderer

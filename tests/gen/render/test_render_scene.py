@@ -14,7 +14,7 @@ from rendering import mi
 from scene_files import ANY_POSE, EVEN_POSE, MIRRORED, SHAPES, fails, hits, rays_at, shape_xml, write_scene
 
 from rsgen.errors import UserError
-from rsgen.files import encode_exr
+from rsgen.image_codecs import encode_exr
 from rsgen.render.meshes import mesh_arrays, surface
 from rsgen.render.scene import content_hash, ensure_built, load_scene
 

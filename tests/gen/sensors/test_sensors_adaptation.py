@@ -19,8 +19,7 @@ from rsgen.produce.distribute import RenderJob, SequenceRecipe, engine_versions,
 from rsgen.produce.frame_source import setting_of
 from rsgen.produce.generate import input_hashes, sequence_stamps
 from rsgen.produce.ground_truth import load_motion
-from rsgen.sensors.adaptation import Reading, Setting, adapt, reading
-from rsgen.sensors.color import apply_color_noise, apply_setting
+from rsgen.sensors.color import Reading, Setting, adapt, apply_color_noise, apply_setting, reading
 from rsgen.sequence.reader import read_sequence
 
 REFERENCE = Setting(0.010, 2.0)

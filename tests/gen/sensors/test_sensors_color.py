@@ -12,7 +12,7 @@ from scipy import stats
 from rsgen import srgb
 from rsgen.config.cameras import ColorNoiseConfig
 from rsgen.sensors import color
-from rsgen.sensors.response import power_law, quantise8, s_curve, to_srgb8
+from rsgen.sensors.color import power_law, quantise8, s_curve, to_srgb8
 from rsgen.sensors.seed import noise_generator
 
 assert mi

@@ -17,7 +17,7 @@ from rsgen.config.config import load_config
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.produce.frame_source import FrameSource
-from rsgen.sensors.depth_errors import disparity_error, mixed_depth, with_fixed_errors
+from rsgen.sensors.depth import disparity_error, mixed_depth, with_fixed_errors
 from rsgen.sequence.reader import read_sequence
 from rsgen.sequence.trajectory import read_trajectory
 

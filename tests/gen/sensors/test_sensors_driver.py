@@ -12,8 +12,8 @@ from pydantic import ValidationError
 from rsgen.check.verify import verify_sequence
 from rsgen.cli.main import main
 from rsgen.config.faults import StreamFaults
-from rsgen.files import read_png
-from rsgen.sensors.driver import deliver
+from rsgen.image_codecs import read_png
+from rsgen.sensors.reports import deliver
 from rsgen.sequence.reader import read_sequence
 
 STAMPS = 2.0 + np.arange(3000) / 30.0

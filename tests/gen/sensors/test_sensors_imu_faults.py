@@ -18,8 +18,8 @@ from rsgen.config.faults import FaultsConfig, ImuFaults, StreamFaults
 from rsgen.config.imu import ImuConfig
 from rsgen.config.presets import _IMU_FAULTS, _IMU_PRESETS
 from rsgen.geometry import se3
-from rsgen.sensors.driver import deliver
 from rsgen.sensors.imu import exact_imu, imu_csv, simulate_imu
+from rsgen.sensors.reports import deliver
 from rstrack.data.dataset import open_dataset
 
 SPLINE = hand_held(20.0)

@@ -15,7 +15,7 @@ from rsgen.config.sections import MocapConfig
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rsgen.sensors.mocap import T_camera_body, reported_poses
+from rsgen.sensors.reports import T_camera_body, reported_poses
 from rsgen.sequence.format import poses_of_rows
 
 SPLINE = Spline(se3.exp(np.cumsum(np.full((170, 6), 0.01), axis=0)), -0.05, 0.05)

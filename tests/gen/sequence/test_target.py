@@ -23,7 +23,7 @@ from rsgen.produce.frame_source import load_scene, scene_hash, surfaces_hash
 from rsgen.render.board import Board, drawing, surface
 from rsgen.render.meshes import mesh_arrays
 from rsgen.sequence.reader import Sequence, read_sequence
-from rsgen.sequence.target_corners import TARGET_CORNERS
+from rsgen.sequence.truth_files import TARGET_CORNERS
 
 # The tiny room's y points down: the board stands upright in it and looks at the camera.
 T_WORLD_TARGET = [[1, 0, 0, -0.49], [0, -1, 0, 0.36], [0, 0, -1, 0.7], [0, 0, 0, 1]]

@@ -16,7 +16,7 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.images import ColorRenderer
 from rsgen.render.scene import load_scene
-from rsgen.sensors.response import to_srgb8
+from rsgen.sensors.color import to_srgb8
 from rsgen.truth.renderer import TruthRenderer
 
 

@@ -13,10 +13,10 @@ import synthetic
 import yaml
 
 from rsgen.errors import UserError
-from rsgen.files import encode_png
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
+from rsgen.image_codecs import encode_png
 from rsgen.sequence.format import pose_rows
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import Estimate

@@ -13,7 +13,7 @@ import recordings
 from import_command import CONTENT, imported, refused
 from recordings import COLOR, COLOR_SIZE, COUNT, DEPTH, FRAME, Talker
 
-from rsgen.files import encode_png
+from rsgen.image_codecs import encode_png
 
 
 @pytest.fixture

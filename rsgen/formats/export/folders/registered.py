@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from rsgen.console.progress import Progress, no_progress
-from rsgen.files import atomic_write, encode_png, encode_yaml
+from rsgen.files import atomic_write, encode_yaml
 from rsgen.formats.export.folder import make_folders, new_folder, place_images
+from rsgen.image_codecs import encode_png
 from rsgen.produce.writer import quantise
-from rsgen.sensors.mocap import reported_poses
-from rsgen.sensors.registration import register_depth
+from rsgen.sensors.depth import register_depth
+from rsgen.sensors.reports import reported_poses
 from rsgen.sequence.camera_yaml import Cameras, ColorClock, camera_yaml
 from rsgen.sequence.format import associate, ground_truth, pose_lines
 from rsgen.sequence.reader import Sequence

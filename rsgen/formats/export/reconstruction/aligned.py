@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from rsgen.console.progress import Progress
-from rsgen.files import atomic_write, encode_png
+from rsgen.files import atomic_write
 from rsgen.formats.export.folder import place_images
+from rsgen.image_codecs import encode_png
 from rsgen.produce.writer import quantise
-from rsgen.sensors.registration import register_depth
+from rsgen.sensors.depth import register_depth
 from rsgen.sequence.reader import Sequence
 
 NOTHING = "nothing.png"

@@ -1,16 +1,20 @@
-"""A driver's listing of a stream: stamps of arrival on a computer's clock, images lost, images delivered twice."""
+"""What a recording reports beside its images: a driver's stamps, losses and repetitions; a motion capture's poses."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from rsgen.array_types import BoolArray, FloatArray, IntArray
 from rsgen.config.faults import StreamFaults
-from rsgen.sensors.seed import driver_generator
+from rsgen.config.sections import MocapConfig
+from rsgen.geometry import se3, so3
+from rsgen.geometry.spline import Spline
+from rsgen.sensors.seed import driver_generator, mocap_generator
 from rsgen.sequence.camera_yaml import ColorClock
-from rsgen.sequence.format import StreamName, round_stamps
+from rsgen.sequence.format import StreamName, pose_rows, round_stamps
 
 # Listings must rise; two images that arrive at once are stamped this far apart where no grid keeps them apart.
 _LEAST_STEP_S = 1e-6
@@ -75,3 +79,28 @@ def color_clock(
     t = color_first + (middle - color.offset_s - color_first) / color_rate
     as_depth = depth_first + depth_rate * (t - depth_first) + depth.offset_s
     return ColorClock(as_depth - middle, 1e6 * (depth_rate / color_rate - 1.0), is_exact=False)
+
+
+def T_camera_body(config: MocapConfig) -> FloatArray:
+    """Coordinates of the reported body to the camera's (4, 4)."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = so3.exp(np.deg2rad(config.rotation_deg)), config.translation_m
+    return T
+
+
+def reported_poses(spline: Spline, config: MocapConfig, seed: int, T_cam_depth: FloatArray | None = None) -> FloatArray:
+    """Rows (n, 8), as of groundtruth.txt: listed stamp, s, and T_world_body = T_world_cam T_camera_body exp(noise).
+
+    spline: T_world_depth(t). T_cam_depth: of the camera that is meant, where it is not depth's. Poses are taken at all
+    multiples of 1 / rate_hz within the spline; `seed` decides their noise.
+    """
+    first = math.ceil(spline.t_begin * config.rate_hz)
+    last = math.floor(spline.t_end * config.rate_hz)
+    t = np.clip(np.arange(first, last + 1) / config.rate_hz, spline.t_begin, spline.t_end)
+    T = spline.pose(t)
+    if T_cam_depth is not None:
+        T = T @ se3.inverse(T_cam_depth)
+    sigma = np.repeat([config.position_sigma_m, math.radians(config.rotation_sigma_deg)], 3)
+    noise = sigma * mocap_generator(seed).standard_normal((len(t), 6))
+    T = T @ T_camera_body(config) @ se3.exp(noise)
+    return np.column_stack([round_stamps(t + config.offset_s), pose_rows(T)])
