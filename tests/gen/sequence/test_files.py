@@ -15,7 +15,8 @@ import OpenEXR
 import pytest
 import yaml
 
-from rsgen import files, image_codecs
+from rsgen import files
+from rsgen import image_codecs as codecs
 from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
 
@@ -27,10 +28,10 @@ ROWS = RNG.random((3, 24, 7))
 
 # name, bytes, reader
 KINDS: list[tuple[str, bytes, Callable[[Path], np.ndarray], np.ndarray]] = [
-    ("rgb.png", image_codecs.encode_png(RGB), lambda p: image_codecs.read_png(p, RGB.shape, np.uint8), RGB),
-    ("depth.png", image_codecs.encode_png(UNITS), lambda p: image_codecs.read_png(p, UNITS.shape, np.uint16), UNITS),
-    ("z.exr", image_codecs.encode_exr(Z), lambda p: image_codecs.read_exr(p, Z.shape), Z),
-    ("rows.npy", image_codecs.encode_npy(ROWS), lambda p: image_codecs.read_npy(p, ROWS.shape), ROWS),
+    ("rgb.png", codecs.encode_png(RGB), lambda p: codecs.read_png(p, RGB.shape, np.uint8), RGB),
+    ("depth.png", codecs.encode_png(UNITS), lambda p: codecs.read_png(p, UNITS.shape, np.uint16), UNITS),
+    ("z.exr", codecs.encode_exr(Z), lambda p: codecs.read_exr(p, Z.shape), Z),
+    ("rows.npy", codecs.encode_npy(ROWS), lambda p: codecs.read_npy(p, ROWS.shape), ROWS),
 ]
 
 
@@ -86,14 +87,14 @@ def test_a_flipped_bit_never_gives_a_wrong_image(
 
 
 def test_a_file_of_another_size_or_type_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "a.png").write_bytes(image_codecs.encode_png(UNITS))
-    (tmp_path / "a.exr").write_bytes(image_codecs.encode_exr(Z))
-    (tmp_path / "a.npy").write_bytes(image_codecs.encode_npy(ROWS.astype(np.float32)))
+    (tmp_path / "a.png").write_bytes(codecs.encode_png(UNITS))
+    (tmp_path / "a.exr").write_bytes(codecs.encode_exr(Z))
+    (tmp_path / "a.npy").write_bytes(codecs.encode_npy(ROWS.astype(np.float32)))
     for read in (
-        lambda: image_codecs.read_png(tmp_path / "a.png", (24, 32, 3), np.uint8),
-        lambda: image_codecs.read_png(tmp_path / "a.png", (32, 24), np.uint16),
-        lambda: image_codecs.read_exr(tmp_path / "a.exr", (12, 32)),
-        lambda: image_codecs.read_npy(tmp_path / "a.npy", ROWS.shape),
+        lambda: codecs.read_png(tmp_path / "a.png", (24, 32, 3), np.uint8),
+        lambda: codecs.read_png(tmp_path / "a.png", (32, 24), np.uint16),
+        lambda: codecs.read_exr(tmp_path / "a.exr", (12, 32)),
+        lambda: codecs.read_npy(tmp_path / "a.npy", ROWS.shape),
     ):
         with pytest.raises(UserError, match=r"sequence\.yaml asks for") as error:
             read()
@@ -120,11 +121,11 @@ def test_yaml_may_be_nested_as_deep_as_it_likes(tmp_path: Path) -> None:
 
 
 def test_other_programs_read_the_images(tmp_path: Path) -> None:
-    files.atomic_write(tmp_path / "a.png", image_codecs.encode_png(RGB))
+    files.atomic_write(tmp_path / "a.png", codecs.encode_png(RGB))
     image = cv2.imread(str(tmp_path / "a.png"))
     assert image is not None
     np.testing.assert_array_equal(image[..., ::-1], RGB)
-    files.atomic_write(tmp_path / "a.exr", image_codecs.encode_exr(Z))
+    files.atomic_write(tmp_path / "a.exr", codecs.encode_exr(Z))
     with OpenEXR.File(str(tmp_path / "a.exr")) as file:
         np.testing.assert_array_equal(file.channels()["Z"].pixels, Z)
 
@@ -132,17 +133,17 @@ def test_other_programs_read_the_images(tmp_path: Path) -> None:
 def test_an_exr_of_another_program_is_read(tmp_path: Path) -> None:
     with OpenEXR.File({"compression": OpenEXR.PIZ_COMPRESSION, "type": OpenEXR.scanlineimage}, {"Z": Z}) as file:
         file.write(str(tmp_path / "a.exr"))
-    np.testing.assert_array_equal(image_codecs.read_exr(tmp_path / "a.exr", Z.shape), Z)
+    np.testing.assert_array_equal(codecs.read_exr(tmp_path / "a.exr", Z.shape), Z)
 
 
 def test_the_same_data_gives_the_same_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
     arrays = {"control_points": np.tile(np.eye(4), (5, 1, 1)), "t0": np.array(0.5), "dt": np.array(0.05)}
-    first = image_codecs.encode_npz(arrays), image_codecs.encode_exr(Z), image_codecs.encode_png(RGB)
+    first = codecs.encode_npz(arrays), codecs.encode_exr(Z), codecs.encode_png(RGB)
     monkeypatch.setattr("time.time", lambda: 2e9)
     assert (
-        image_codecs.encode_npz(arrays),
-        image_codecs.encode_exr(Z.copy()),
-        image_codecs.encode_png(RGB.copy()),
+        codecs.encode_npz(arrays),
+        codecs.encode_exr(Z.copy()),
+        codecs.encode_png(RGB.copy()),
     ) == first
 
 
@@ -151,12 +152,12 @@ def test_npz_is_what_spline_loads(tmp_path: Path) -> None:
     points[:, 0, 3] = RNG.random(5)
     files.atomic_write(
         tmp_path / "s.npz",
-        image_codecs.encode_npz({"control_points": points, "t0": np.array(0.1), "dt": np.array(0.05)}),
+        codecs.encode_npz({"control_points": points, "t0": np.array(0.1), "dt": np.array(0.05)}),
     )
     spline = Spline.load(tmp_path / "s.npz")
     np.testing.assert_array_equal(spline.control_points, points)
     assert (spline.t0, spline.dt) == (0.1, 0.05)
-    with np.load(io.BytesIO(image_codecs.encode_npz({"a": points}))) as data:
+    with np.load(io.BytesIO(codecs.encode_npz({"a": points}))) as data:
         np.testing.assert_array_equal(data["a"], points)
 
 
@@ -228,9 +229,9 @@ def test_yaml_floats_survive_and_errors_name_the_line(tmp_path: Path) -> None:
 
 def test_wrong_arrays_are_not_encoded() -> None:
     for encode, image in (
-        (image_codecs.encode_png, Z),
-        (image_codecs.encode_png, RGB[..., :2]),
-        (image_codecs.encode_exr, Z.astype(float)),
+        (codecs.encode_png, Z),
+        (codecs.encode_png, RGB[..., :2]),
+        (codecs.encode_exr, Z.astype(float)),
     ):
         with pytest.raises(ValueError, match="written from"):
             encode(image)
