@@ -20,7 +20,7 @@ from rsgen.array_types import FloatArray, IntArray
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.adjustment.band import Band
-from rstrack.adjustment.unit import Found, Sums, Unit, UnitState
+from rstrack.adjustment.imu import Equations, ImuResult, ImuState, ImuTerm
 from rstrack.alignment.priors import ACCELERATION, acceleration_sigmas
 
 # Information that holds the first control point, in m⁻² and rad⁻²: the gauge.
@@ -64,7 +64,7 @@ class State:
 
     spline: Spline
     keyframes: dict[int, FloatArray]
-    unit: UnitState | None = None
+    imu: ImuState | None = None
 
     def errors(self, sightings: Sequence[Sighting]) -> FloatArray:
         """Twists (n, 6) from where sightings put the camera to where it is, in the camera's axes."""
@@ -72,23 +72,23 @@ class State:
         T = se3.inverse(keyframes) @ self.spline.pose(np.array([s.t for s in sightings]))
         return se3.log(se3.inverse(np.array([s.T_ref_cam for s in sightings])) @ T)
 
-    def moved(self, points: FloatArray, keyframes: FloatArray, unit: FloatArray | None = None) -> State:
+    def moved(self, points: FloatArray, keyframes: FloatArray, imu: FloatArray | None = None) -> State:
         """With left increments of the control points (n, 6) and of the keyframes (m, 6), in their order, and a step of
-        the unit's own blocks (k, 6)."""
+        the IMU's own blocks (k, 6)."""
         T = se3.orthonormalise(se3.exp(points) @ self.spline.control_points)
         spline = Spline(T, self.spline.t0, self.spline.dt)
         steps = se3.exp(keyframes)
         return State(
             spline,
             {k: se3.orthonormalise(steps[n] @ K) for n, (k, K) in enumerate(self.keyframes.items())},
-            self.unit if self.unit is None or unit is None else self.unit.moved(unit),
+            self.imu if self.imu is None or imu is None else self.imu.moved(imu),
         )
 
     def placed(self, T: FloatArray) -> State:
         """All of it moved by T (4, 4) in the world."""
         spline = Spline(se3.orthonormalise(T @ self.spline.control_points), self.spline.t0, self.spline.dt)
-        unit = None if self.unit is None else self.unit.turned(T[:3, :3])
-        return State(spline, {k: se3.orthonormalise(T @ K) for k, K in self.keyframes.items()}, unit)
+        imu = None if self.imu is None else self.imu.turned(T[:3, :3])
+        return State(spline, {k: se3.orthonormalise(T @ K) for k, K in self.keyframes.items()}, imu)
 
 
 @dataclass(frozen=True)
@@ -96,14 +96,14 @@ class Graph:
     """What is known.
 
     at: the state around which the models of `seen` were made. keeps_motion: accelerations are to stay what they are
-    there; else to be small. unit: an IMU's readings, of which a state has a `UnitState` then.
+    there; else to be small. imu: an IMU's readings, of which a state has a `ImuState` then.
     """
 
     at: State
     seen: Sequence[Seen]
     sightings: Sequence[Sighting]
     keeps_motion: bool = True
-    unit: Unit | None = None
+    imu: ImuTerm | None = None
 
     def weakened(self, spread: float) -> Graph:
         """With what frames and sightings say taken as so many times as uncertain (σ)."""
@@ -118,14 +118,14 @@ class Graph:
         points, keyframes = len(state.spline.control_points), len(state.keyframes)
         return state.moved(x[:points], x[points : points + keyframes], x[points + keyframes :]), x
 
-    def found(self, state: State) -> Found | None:
-        """What is known there of the unit, if there is one."""
-        if self.unit is None or state.unit is None:
+    def found(self, state: State) -> ImuResult | None:
+        """What is known there of the IMU, if there is one."""
+        if self.imu is None or state.imu is None:
             return None
-        return Found.of(state.unit, self.unit.recording.T_imu_depth, self._system(state, None).covariance())
+        return ImuResult.of(state.imu, self.imu.recording.T_imu_depth, self._system(state, None).covariance())
 
     def _system(self, state: State, weights: FloatArray | None) -> _System:
-        others = 0 if self.unit is None or state.unit is None else len(state.unit)
+        others = 0 if self.imu is None or state.imu is None else len(state.imu)
         system = _System(len(state.spline.control_points), list(state.keyframes), others)
         moved_points = state.spline.control_points @ se3.inverse(self.at.spline.control_points)
         for seen in self.seen:
@@ -133,9 +133,9 @@ class Graph:
         if self.sightings:
             system.add_sightings(self.sightings, state, np.ones(len(self.sightings)) if weights is None else weights)
         accelerations = ACCELERATION
-        if self.unit is not None and state.unit is not None:
-            accelerations = self.unit.accelerations
-            for sums in (*self.unit.known(state.unit, state.spline.dt), *self.unit.said(state.spline, state.unit)):
+        if self.imu is not None and state.imu is not None:
+            accelerations = self.imu.accelerations
+            for sums in (*self.imu.known(state.imu, state.spline.dt), *self.imu.equations(state.spline, state.imu)):
                 system.add(sums)
         before = self.at.spline.increments if self.keeps_motion else np.zeros_like(state.spline.increments)
         system.add_smoothness(state.spline, before, accelerations)
@@ -157,8 +157,8 @@ class _System:
         self._number = {k: self.points + n for n, k in enumerate(self.keyframes)}
         self.g = np.zeros((self.points + len(self.keyframes) + self.others, 6))
 
-    def add(self, sums: Sums) -> None:
-        """Sums of any blocks, of which numbers below zero count from the end."""
+    def add(self, sums: Equations) -> None:
+        """Equations of any blocks, of which numbers below zero count from the end."""
         numbers = sums.numbers % len(self.g)
         n, k = numbers.shape
         np.add.at(self.g, numbers, sums.g.reshape(n, k, 6))

@@ -19,7 +19,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.adjustment.band import Band
 from rstrack.adjustment.graph import Graph, Seen, State
-from rstrack.adjustment.unit import Found, Unit, UnitState
+from rstrack.adjustment.imu import ImuResult, ImuState, ImuTerm
 from rstrack.alignment import brightness
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.normal_equations import Quadratic
@@ -81,7 +81,7 @@ class Refiner:
 
     frames, times: numbers of the frames whose poses the spline knows, and their mid readouts (n,) s. begin: when (s)
     the camera stays where it was. load: frames by their numbers, on the device. usual: scales of residuals to begin
-    with. unit: an IMU beside the camera; found: what has been learnt of it.
+    with. imu: an IMU beside the camera; found: what has been learnt of it.
     """
 
     terms: Terms
@@ -92,8 +92,8 @@ class Refiner:
     begin: float
     load: Callable[[Sequence[int]], Iterator[DeviceFrame]]
     usual: Usual
-    unit: Unit | None = None
-    found: Found | None = None
+    imu: ImuTerm | None = None
+    found: ImuResult | None = None
     _inflations: tuple[float, float] = field(default=(1.0, 1.0))
     _sharing: float = 1.0
     # Gain and offset of the last colour image against each keyframe.
@@ -131,7 +131,7 @@ class Refiner:
                     against.setdefault(k, _Against()).add(self._model(o, state, frame).scaled(weight))
                     kept.append(_Figures.of(o))
             told(0.5 + 0.5 * (n + 1) / len(self.frames), f"{pairs} pairs")
-        at = State(spline, {k: keyframes[k].T_world_base for k in sorted(against)}, self._unit_state(spline))
+        at = State(spline, {k: keyframes[k].T_world_base for k in sorted(against)}, self._imu_state(spline))
         seen = [against[k].seen(k) for k in at.keyframes]
         moved = self._solved(at, seen).spline
         shift = np.linalg.norm((moved.pose(self.times) - spline.pose(self.times))[:, :3, 3], axis=1)
@@ -143,8 +143,8 @@ class Refiner:
 
         Beside an IMU readings are linearised until nothing moves: they bend sooner than images do.
         """
-        graph = Graph(at, seen, (), keeps_motion=False, unit=self.unit)
-        if self.unit is None:
+        graph = Graph(at, seen, (), keeps_motion=False, imu=self.imu)
+        if self.imu is None:
             return self._placed(graph.step(at)[0], at)
         graph, state = graph.weakened(np.sqrt(ALIKE)), at
         for _ in range(_STEPS):
@@ -153,14 +153,14 @@ class Refiner:
                 break
         state = self._placed(state, at)
         self.found = graph.found(state)
-        if state.unit is not None:
-            self.unit = self.unit.learnt(state.spline, state.unit)
+        if state.imu is not None:
+            self.imu = self.imu.learnt(state.spline, state.imu)
         return state
 
-    def _unit_state(self, spline: Spline) -> UnitState | None:
-        if self.unit is None:
+    def _imu_state(self, spline: Spline) -> ImuState | None:
+        if self.imu is None:
             return None
-        return self.unit.start(spline) if self.found is None else self.found.state
+        return self.imu.start(spline) if self.found is None else self.found.state
 
     def _placed(self, state: State, before: State) -> State:
         """With the camera where it was in the beginning."""

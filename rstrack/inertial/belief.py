@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 
 from rsgen.array_types import FloatArray
 from rsgen.geometry.so3 import hat
+from rstrack.data.imu.description import ImuNoise
 
 SIZE = 12
 """Gyroscope's bias (rad/s), accelerometer's bias, gravity in the world (both m/s²), and the turn φ (rad, in the unit's
@@ -28,6 +30,13 @@ WARMS = 2e-5, 5e-4
 # σ of the gyroscope's bias (rad/s), and of the force (m/s²) that gravity and the accelerometer's bias make together in
 # an attitude, below which the unit is of use; and of gravity's direction, degrees, below which that is determined.
 _KNOWN_GYRO, _KNOWN_FORCE, _KNOWN_DEG = 5e-3, 0.15, 0.3
+
+
+def bias_walk(noise: ImuNoise, seconds: npt.ArrayLike) -> FloatArray:
+    """σ (..., 6) of how far the biases, gyroscope first, walk in times (...) in s."""
+    s = np.asarray(seconds, dtype=np.float64)[..., None]
+    walk = np.repeat([noise.gyro_walk, noise.accel_walk], 3)
+    return np.asarray(np.hypot(walk * np.sqrt(s), np.repeat(WARMS, 3) * s))
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from rsgen.array_types import FloatArray, IntArray
-from rsgen.geometry import se3, so3
-from rsgen.geometry.so3 import cross, hat
+from rsgen.geometry import so3
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.normal_equations import Quadratic
 from rstrack.data.imu.recording import ImuRecording
-from rstrack.inertial.belief import ACCEL, GRAVITY, GYRO, SIZE, TURN, Belief
-from rstrack.inertial.derivatives import motion
+from rstrack.inertial.belief import GRAVITY, SIZE, TURN, Belief
+from rstrack.inertial.factor import ImuFactor, motion
 from rstrack.inertial.wild import wild
 
 # Readings within this part of the range's end are saturated, or may be.
@@ -108,27 +107,17 @@ class Rows:
     @classmethod
     def of(cls, spline: Spline, samples: Samples, T_imu_depth: FloatArray, belief: FloatArray) -> Rows:
         """Around a spline and a belief's numbers (12,). All samples' times must be within the spline."""
-        at, turn = motion(spline, samples.t), belief[TURN]
+        turn = belief[TURN]
         a, b, c = so3.exp_coefficients(so3.squared_norm(turn))
         T_imu_depth = np.concatenate([so3.polynomial(turn, a, b) @ T_imu_depth[:3], T_imu_depth[3:]])
-        Ad, n = se3.adjoint(T_imu_depth), len(samples)
-        twist, rate = at.twist @ Ad.T, at.rate @ Ad.T
-        by_twist, by_rate = Ad @ at.by_twist, Ad @ at.by_rate
-        v, omega = twist[:, :3], twist[:, 3:]
-        R_imu_world = T_imu_depth[:3, :3] @ np.swapaxes(at.rotation, 1, 2)
-        g = belief[GRAVITY]
-        felt, across = rate[:, :3] + cross(omega, v) - R_imu_world @ g, hat(omega)
-        J = np.zeros((n, 6, 24 + SIZE))
-        J[:, :3, :24] = by_twist[:, 3:]
-        J[:, 3:, :24] = by_rate[:, :3] + across @ by_twist[:, :3] - hat(v) @ by_twist[:, 3:]
-        # R ← exp(φ) R turns Rᵀ g by Rᵀ g^ φ.
-        J[:, 3:, :24] -= (R_imu_world @ hat(g)) @ at.by_turn
-        J[:, :3, 24:27] = J[:, 3:, 27:30] = np.eye(3)
-        J[:, 3:, 30:33] = -R_imu_world
+        at = ImuFactor(motion(spline, samples.t), T_imu_depth, belief[GRAVITY])
+        J = np.zeros((len(samples), 6, 24 + SIZE))
+        J[:, :, :24] = at.by_motion
+        J[:, :, 24:30] = np.eye(6)
+        J[:, :, 30:33] = at.by_gravity
         # exp(φ + δ) = exp(Jl(φ) δ) exp(φ).
-        J[:, :, 33:] = -np.concatenate([across, hat(felt)], axis=1) @ so3.polynomial(turn, b, c)
-        told = np.concatenate([omega + belief[GYRO], felt + belief[ACCEL]], axis=1)
-        return cls(samples, told - samples.values, J, at.first)
+        J[:, :, 33:] = at.by_rotation @ so3.polynomial(turn, b, c)
+        return cls(samples, at.readings + belief[:6] - samples.values, J, at.motion.first)
 
     def until(self, end: float) -> Rows:
         """Those of samples before a time, s."""

@@ -34,3 +34,14 @@ def random_spline(seed: int, points: int = 9, angle: float = 0.6, distance: floa
     for step in random_twists(rng, (points - 1,), angle, distance):
         T.append(T[-1] @ se3.exp(step))
     return Spline(np.stack(T), t0=0.3, dt=dt)
+
+
+def swung(seconds: float = 12.0) -> Spline:
+    """A camera that is carried to and fro, and tilted, as a hand does."""
+    t = np.arange(round(seconds / 0.05) + 3) * 0.05
+    twist = np.zeros((len(t), 6))
+    for i, (size, hertz) in enumerate(
+        zip((0.2, 0.1, 0.2, 0.4, 0.5, 0.3), (0.3, 0.5, 0.4, 0.45, 0.35, 0.6), strict=True)
+    ):
+        twist[:, i] = size * np.sin(2 * np.pi * hertz * t + i)
+    return Spline(se3.exp(twist), 0.0, 0.05)

@@ -10,8 +10,8 @@ import numpy as np
 from rsgen.array_types import BoolArray, FloatArray
 from rsgen.geometry import so3
 from rsgen.geometry.so3 import hat
-from rstrack.calibration.imu.solve import Solution
-from rstrack.calibration.imu.unit import COUNT, DRIFT, LEVER, OFFSET, ROTATION, SCALE
+from rstrack.calibration.imu.model import COUNT, DRIFT, LEVER, OFFSET, ROTATION, SCALE
+from rstrack.calibration.imu.solve import ImuSolution
 from rstrack.data.imu.description import ImuDescription, ImuNoise, imu_yaml
 
 # σ above which a value is of no use: rad, m, s, s/s, parts, rad.
@@ -22,10 +22,10 @@ _GROUPS = (("rotation", ROTATION), ("translation", LEVER), ("clock offset", OFFS
 
 @dataclass(frozen=True)
 class ImuCalibration:
-    """A solution, and what it was found from. said: what stood in the IMU's file; samples, seconds: what was used."""
+    """A solution, and what it was found from. stated: what stood in the IMU's file; samples, seconds: what was used."""
 
-    solution: Solution
-    said: ImuDescription
+    solution: ImuSolution
+    stated: ImuDescription
     noise: ImuNoise
     samples: int
     seconds: float
@@ -34,18 +34,18 @@ class ImuCalibration:
     @property
     def T_imu_depth(self) -> FloatArray:
         """(4, 4): p_imu from p_depth."""
-        return self.solution.unit.T_imu_depth
+        return self.solution.imu.T_imu_depth
 
     @property
     def sigmas(self) -> FloatArray:
-        """σ (13,) in the order of `rstrack.calibration.imu.unit.NAMES`."""
+        """σ (13,) in the order of `rstrack.calibration.imu.model.NAMES`."""
         return np.sqrt(np.diag(self.solution.covariance)[:COUNT])
 
     @property
     def translation_sigma(self) -> FloatArray:
         """σ (3,) of T_imu_depth's translation, m: of −R l."""
-        unit = self.solution.unit
-        J = np.hstack([hat(unit.R @ unit.lever), -unit.R])
+        imu = self.solution.imu
+        J = np.hstack([hat(imu.R @ imu.lever), -imu.R])
         return np.sqrt(np.diag(J @ self.solution.covariance[:6, :6] @ J.T))
 
     @property
@@ -56,25 +56,25 @@ class ImuCalibration:
     @property
     def offset_s(self) -> float:
         """Seconds to be added to the stamps as they stand in the file, in the images' middle."""
-        unit = self.solution.unit
-        return self.said.offset_s + unit.offset_s + unit.drift * self.said.offset_s
+        imu = self.solution.imu
+        return self.stated.offset_s + imu.offset_s + imu.drift * self.stated.offset_s
 
     @property
     def drift(self) -> float:
         """By which that grows, s/s."""
-        unit = self.solution.unit
-        return self.said.drift + unit.drift + self.said.drift * unit.drift
+        imu = self.solution.imu
+        return self.stated.drift + imu.drift + self.stated.drift * imu.drift
 
     @property
     def gyro_matrix(self) -> FloatArray:
         """(3, 3): takes the true rate to the measured one."""
-        before = np.eye(3) if self.said.gyro_matrix is None else self.said.gyro_matrix
-        return before @ np.diag(1.0 + self.solution.unit.scale)
+        before = np.eye(3) if self.stated.gyro_matrix is None else self.stated.gyro_matrix
+        return before @ np.diag(1.0 + self.solution.imu.scale)
 
     def text(self) -> str:
         """For the screen, with twice the standard errors."""
-        unit, s = self.solution.unit, self.sigmas
-        turn, shift = np.degrees(so3.log(unit.R)), 1e3 * self.T_imu_depth[:3, 3]
+        imu, s = self.solution.imu, self.sigmas
+        turn, shift = np.degrees(so3.log(imu.R)), 1e3 * self.T_imu_depth[:3, 3]
         biases, bias_s = self._biases()
         rows = [
             ("", f"{self.samples} samples over {self.seconds:.1f} s"),
@@ -97,7 +97,7 @@ class ImuCalibration:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain types, σ beside every value."""
-        unit, s, sizes = self.solution.unit, self.sigmas, self.solution.sizes
+        imu, s, sizes = self.solution.imu, self.sigmas, self.solution.sizes
         biases, bias_s = self._biases()
         return {
             "T_imu_depth": self.T_imu_depth.tolist(),
@@ -109,8 +109,8 @@ class ImuCalibration:
             "drift_sigma_ppm": 1e6 * float(s[DRIFT]),
             "gyroscope_matrix": self.gyro_matrix.tolist(),
             "gyroscope_scale_sigma": s[SCALE].tolist(),
-            "gravity_in_track": unit.gravity.tolist(),
-            "bias_times_s": unit.bias_times.tolist(),
+            "gravity_in_track": imu.gravity.tolist(),
+            "bias_times_s": imu.bias_times.tolist(),
             "gyroscope_bias": biases[:, :3].tolist(),
             "gyroscope_bias_sigma": bias_s[:, :3].tolist(),
             "accelerometer_bias": biases[:, 3:].tolist(),
@@ -130,15 +130,16 @@ class ImuCalibration:
             f"offset_s: {self.offset_s:.9f}  # ± {self.sigmas[OFFSET]:.2g}",
             f"drift_ppm: {1e6 * self.drift:.4f}  # ± {1e6 * self.sigmas[DRIFT]:.2g}",
         ]
-        for name, matrix in (("gyroscope_matrix", self.gyro_matrix), ("accelerometer_matrix", self.said.accel_matrix)):
+        stated = self.stated
+        for name, matrix in (("gyroscope_matrix", self.gyro_matrix), ("accelerometer_matrix", stated.accel_matrix)):
             if matrix is not None:
                 rows = ", ".join(f"[{', '.join(f'{x:.7g}' for x in row)}]" for row in matrix)
                 lines.append(f"{name}: [{rows}]")
-        return "\n".join([*lines, f"gravity: {self.said.gravity:.7g}", ""])
+        return "\n".join([*lines, f"gravity: {stated.gravity:.7g}", ""])
 
     def _biases(self) -> tuple[FloatArray, FloatArray]:
-        unit = self.solution.unit
-        return unit.biases, np.sqrt(np.diag(self.solution.covariance)[COUNT:]).reshape(unit.biases.shape)
+        imu = self.solution.imu
+        return imu.biases, np.sqrt(np.diag(self.solution.covariance)[COUNT:]).reshape(imu.biases.shape)
 
     def _undetermined_names(self) -> list[str]:
         return [name for name, part in _GROUPS if np.any(self.undetermined[part])]

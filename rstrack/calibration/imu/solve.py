@@ -1,6 +1,6 @@
-"""The joint solution: the unit, and the track's own errors, which would otherwise pass for accelerations.
+"""The joint solution: the IMU, and the track's own errors, which would otherwise pass for accelerations.
 
-Unknown beside the unit are the track's corrections x (see `tracked`), and its drift: world rotation and shift, a line
+Unknown beside the IMU are the track's corrections x (see `model`), and its drift: world rotation and shift, a line
 between values a second apart, which walk. Of the track its poses at the frames are taken for measured, with white
 errors about that drift. How large errors are is found on the way: of poses and of the drift's steps by their residuals,
 of both sensors likewise, but never below what is stated. Samples count robustly (Huber).
@@ -12,15 +12,25 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
 from scipy.linalg import cho_solve, cho_solve_banded, cholesky_banded
 
-from rsgen.array_types import FloatArray
+from rsgen.array_types import BoolArray, FloatArray
 from rsgen.errors import UserError
-from rstrack.calibration.imu.normal import Data, Sizes, known, samples, tracked_poses
-from rstrack.calibration.imu.tracked import corrections, motion_at
-from rstrack.calibration.imu.unit import COUNT, Unit, at_stamps, hats, readings, unit_size
+from rstrack.calibration.imu.model import COUNT, CorrectedTrack, Corrections, ImuUnknowns, Prediction, hats
+from rstrack.data.imu.description import ImuNoise
+from rstrack.inertial.belief import bias_walk
 
+_BAND = 24  # of four control points of six
+_HUBER = 2.5
+# Held so where nothing tells them, σ: corrections (rad, m); of the IMU's NAMES rad, m, s, s/s, parts, rad; biases.
+_FREE = (0.02, 0.05)
+_PRIOR = np.array([*(1.0,) * 3, *(0.5,) * 3, 0.2, 5e-4, *(0.05,) * 3, *(1.0,) * 2])
+_BIAS = np.array([*(0.3,) * 3, *(1.0,) * 3])
+# The drift begins with nothing: what is constant in it, gravity takes.
+_PINNED = (1e-6, 1e-6)
 _MOST, _SETTLED, _SAME = 30, 0.05, 0.05
+# Seconds between values of the drift.
 _SLOW_S = 1.0
 # Where errors' sizes begin: of poses (rad, m), and of the drift's steps a second; and what they never fall below.
 _POSES, _STEPS = (3e-4, 5e-4), (3e-4, 5e-4)
@@ -31,29 +41,84 @@ _TELLS_LITTLE = "IMU: the recording tells too little of it: record 20 s with tur
 
 
 @dataclass(frozen=True)
-class Solution:
-    """unit with the covariance (13 + 6 m, 13 + 6 m) of a step of it; x (k, 6): the track's corrections; sizes found."""
+class Data:
+    """What is given. stamps (n,), readings (n, 6) = [gyro; accel] and which of them count (n, 6); frame_times (k,):
+    when the track's poses hold, s; noise and rate_hz as stated."""
 
-    unit: Unit
+    track: CorrectedTrack
+    stamps: FloatArray
+    readings: FloatArray
+    counts: BoolArray
+    frame_times: FloatArray
+    noise: ImuNoise
+    rate_hz: float
+
+    @property
+    def stated_sigmas(self) -> tuple[float, float]:
+        """Of a sample of either sensor, rad/s and m/s²."""
+        root = float(np.sqrt(self.rate_hz))
+        return self.noise.gyro_density * root, self.noise.accel_density * root
+
+
+@dataclass(frozen=True)
+class ErrorSizes:
+    """Standard deviations: of samples (rad/s, m/s²), of the track's poses and its drift's steps a second (rad, m)."""
+
+    gyro: float
+    accel: float
+    poses: tuple[float, float]
+    steps: tuple[float, float]
+
+    def like(self, other: ErrorSizes, part: float) -> bool:
+        """Whether all are the other's, to a part."""
+        mine, theirs = ((s.gyro, s.accel, *s.poses, *s.steps) for s in (self, other))
+        return all(abs(np.log(a / b)) < part for a, b in zip(mine, theirs, strict=True))
+
+
+@dataclass(frozen=True)
+class Normal:
+    """band (24, 6 k), lower, and a (6 k,): of the corrections; D (q, q), b (q,): of the IMU, then of the
+    drift; C (6 k, q)."""
+
+    band: FloatArray
+    a: FloatArray
+    C: FloatArray
+    D: FloatArray
+    b: FloatArray
+
+    def plus(self, other: Normal) -> Normal:
+        """Both together: this one has no drift yet."""
+        size, more = len(self.b), len(other.b) - len(self.b)
+        D, b, C = other.D.copy(), other.b.copy(), other.C + np.pad(self.C, ((0, 0), (0, more)))
+        D[:size, :size] += self.D
+        b[:size] += self.b
+        return Normal(self.band + other.band, self.a + other.a, C, D, b)
+
+
+@dataclass(frozen=True)
+class ImuSolution:
+    """imu, and the covariance (13 + 6 m, 13 + 6 m) of a step of it; x (k, 6): the track's corrections; sizes found."""
+
+    imu: ImuUnknowns
     covariance: FloatArray
     x: FloatArray
-    sizes: Sizes
+    sizes: ErrorSizes
     iterations: int
 
 
-def solve(data: Data, unit: Unit, done: Callable[[int], None] = lambda _: None) -> Solution:
+def solve(data: Data, imu: ImuUnknowns, done: Callable[[int], None] = lambda _: None) -> ImuSolution:
     """From a start on. done: told of each step. Raises UserError: it does not settle, or too little is told."""
     x = np.zeros((data.track.count, 6))
-    at_frames = motion_at(data.track, data.frame_times)
+    R_frames = data.track.spline.pose(data.frame_times)[:, :3, :3]
+    at_frames = data.track.corrections(data.frame_times)
     slow_times = np.arange(data.frame_times[0], data.frame_times[-1] + _SLOW_S, _SLOW_S)
     slow, weights = np.zeros((len(slow_times), 6)), hats(slow_times, data.frame_times)
-    root, size = np.sqrt(data.rate_hz), unit_size(unit)
-    sizes = Sizes(data.noise.gyro_density * root, data.noise.accel_density * root, _POSES, _STEPS)
+    sizes, size = ErrorSizes(*data.stated_sigmas, _POSES, _STEPS), imu.size
     for iteration in range(1, _MOST + 1):
         done(iteration)
-        normal = samples(data, unit, x, sizes)
-        normal = normal.plus(tracked_poses(at_frames, x, slow, weights, sizes, size))
-        D, b = known(unit, slow, slow_times, sizes, data.noise)
+        normal = _samples(data, imu, x, sizes)
+        normal = normal.plus(_tracked_poses(at_frames, R_frames, x, slow, weights, sizes, size))
+        D, b = _known(imu, slow, slow_times, sizes, data.noise)
         D[:, :] += normal.D
         b += normal.b
         try:
@@ -64,18 +129,93 @@ def solve(data: Data, unit: Unit, done: Callable[[int], None] = lambda _: None) 
             raise UserError(_TELLS_LITTLE) from None
         step = cho_solve((lower, True), b - normal.C.T @ inner[:, -1])
         covariance = np.asarray(cho_solve((lower, True), np.eye(len(D))[:, :size]))[:size]
-        unit = unit.moved(step[:size])
+        imu = imu.moved(step[:size])
         x = x + (inner[:, -1] - inner[:, :-1] @ step).reshape(x.shape)
         slow = slow + step[size:].reshape(-1, 6)
         before = sizes
-        about = corrections(at_frames, x)[0] - _drift(at_frames.R, weights @ slow)
-        sizes = _measured(data, unit, x, about, np.diff(slow, axis=0), sizes)
+        about = at_frames.values(x)[0] - _drift(R_frames, weights @ slow)
+        sizes = _measured(data, imu, x, about, np.diff(slow, axis=0), sizes)
         moved = np.abs(step[:COUNT]) / np.sqrt(np.diag(covariance)[:COUNT])
         if not np.isfinite(moved).all():
             break
         if iteration > 3 and moved.max() < _SETTLED and sizes.like(before, _SAME):
-            return Solution(unit, covariance, x, sizes, iteration)
+            return ImuSolution(imu, covariance, x, sizes, iteration)
     raise UserError(f"{_TELLS_LITTLE} (no solution after {_MOST} steps)")
+
+
+def _samples(data: Data, imu: ImuUnknowns, x: FloatArray, sizes: ErrorSizes) -> Normal:
+    """Of both sensors' samples, weighted by their residuals. Raises UserError: taken outside the track."""
+    at = Prediction(data.track, imu, x, data.stamps)
+    sigma = np.repeat([sizes.gyro, sizes.accel], 3)
+    r = (data.readings - at.readings) / sigma
+    weight = np.sqrt(np.minimum(1.0, _HUBER / np.maximum(np.abs(r), 1e-12))) * data.counts
+    scaled = (weight / sigma)[..., None]
+    J = at.corrections.spread(at.by_corrections * scaled, len(x))
+    B, r = (at.by_imu * scaled).reshape(-1, imu.size), (r * weight).ravel()
+    return Normal(_banded(J.T @ J, x.size), J.T @ r, J.T @ B, B.T @ B, B.T @ r)
+
+
+def _tracked_poses(
+    at_frames: Corrections, R_frames: FloatArray, x: FloatArray, slow: FloatArray, weights: FloatArray,
+    sizes: ErrorSizes, size: int,
+) -> Normal:  # fmt: skip
+    """Of the track's poses about its drift, and of corrections that nothing tells.
+
+    R_frames (frames, 3, 3): R_world_depth. slow (m, 6): the drift; weights (frames, m): of its values at the frames;
+    size: of the IMU's step.
+    """
+    frames, scale = len(R_frames), np.repeat(1.0 / np.array(sizes.poses), 3)
+    into = np.zeros((frames, 6, 6))  # a drift in the world's axes as corrections
+    into[:, :3, :3], into[:, 3:, 3:] = np.swapaxes(R_frames, 1, 2), np.eye(3)
+    r = -((at_frames.values(x)[0] - _drift(R_frames, weights @ slow)) * scale).ravel()
+    dense = -weights[:, None, :, None] * into[:, :, None, :] * scale[:, None, None]
+    B = np.pad(dense.reshape(6 * frames, -1), ((0, 0), (size, 0)))
+    J = at_frames.spread(np.tile(np.eye(6, 18) * scale[:, None], (frames, 1, 1)), len(x))
+    free = np.tile(np.repeat(1.0 / np.square(_FREE), 3), len(x))
+    band = _banded(J.T @ J, x.size)
+    band[0] += free
+    return Normal(band, J.T @ r - free * x.ravel(), J.T @ B, B.T @ B, B.T @ r)
+
+
+def _known(
+    imu: ImuUnknowns, slow: FloatArray, slow_times: FloatArray, sizes: ErrorSizes, noise: ImuNoise
+) -> tuple[FloatArray, FloatArray]:
+    """Information (q, q) and its gradient (q,) on IMU and drift: priors, walks of biases, steps of the drift."""
+    size, q = imu.size, imu.size + slow.size
+    D, b = np.zeros((q, q)), np.zeros(q)
+    D[np.arange(COUNT), np.arange(COUNT)] = _PRIOR**-2.0
+    _walking(D, b, COUNT, imu.biases, bias_walk(noise, np.diff(imu.bias_times)))
+    at = np.arange(COUNT, size)
+    D[at, at] += np.tile(_BIAS**-2.0, len(imu.biases))
+    b[at] -= (imu.biases * _BIAS**-2.0).ravel()
+    _walking(D, b, size, slow, np.repeat(sizes.steps, 3) * np.sqrt(np.diff(slow_times)[:, None]))
+    first, pinned = np.arange(size, size + 6), np.repeat(_PINNED, 3) ** -2.0
+    D[first, first] += pinned
+    b[first] -= slow[0] * pinned
+    return D, b
+
+
+def _walking(D: FloatArray, b: FloatArray, first: int, values: FloatArray, sigma: FloatArray) -> None:
+    """Adds steps' information: values (m, 6) from unknown `first` on, whose steps have sigma (m − 1, 6)."""
+    before = first + np.arange(values.size - 6)
+    w, step = sigma.ravel() ** -2.0, np.diff(values, axis=0).ravel()
+    for i, j, sign in (
+        (before, before, 1.0),
+        (before + 6, before + 6, 1.0),
+        (before, before + 6, -1.0),
+        (before + 6, before, -1.0),
+    ):
+        D[i, j] += sign * w
+    b[before] += w * step
+    b[before + 6] -= w * step
+
+
+def _banded(H: sparse.csr_array, count: int) -> FloatArray:
+    """The lower band (24, count) of a symmetric matrix."""
+    band = np.zeros((_BAND, count))
+    for k in range(_BAND):
+        band[k, : count - k] = H.diagonal(-k)
+    return band
 
 
 def _drift(R_world_depth: FloatArray, slow: FloatArray) -> FloatArray:
@@ -84,19 +224,15 @@ def _drift(R_world_depth: FloatArray, slow: FloatArray) -> FloatArray:
 
 
 def _measured(
-    data: Data, unit: Unit, x: FloatArray, about: FloatArray, steps: FloatArray, before: Sizes
-) -> Sizes:  # fmt: skip
+    data: Data, imu: ImuUnknowns, x: FloatArray, about: FloatArray, steps: FloatArray, before: ErrorSizes
+) -> ErrorSizes:
     """Errors' sizes by what is left: robustly of samples, where many are."""
-    found = readings(unit, *at_stamps(data.track, unit, x, data.stamps))
-    root = np.sqrt(data.rate_hz)
+    left = np.abs(data.readings - Prediction(data.track, imu, x, data.stamps).readings)
     gyro, accel = (
-        max(stated * root, 1.4826 * float(np.median(np.abs((seen - guess)[counts]))))
-        for stated, seen, guess, counts in (
-            (data.noise.gyro_density, data.gyro, found[0], data.gyro_counts),
-            (data.noise.accel_density, data.accel, found[1], data.accel_counts),
-        )
+        max(stated, 1.4826 * float(np.median(left[:, part][data.counts[:, part]])))
+        for stated, part in zip(data.stated_sigmas, (slice(3), slice(3, 6)), strict=True)
     )
-    return Sizes(gyro, accel, _rms(about * _alike(about), before.poses), _rms(steps, before.steps))
+    return ErrorSizes(gyro, accel, _rms(about * _alike(about), before.poses), _rms(steps, before.steps))
 
 
 def _alike(about: FloatArray) -> float:

@@ -35,8 +35,8 @@ from rstrack.options import Options
 from rstrack.tracking.runs.record import Noise
 
 if TYPE_CHECKING:
+    from rstrack.adjustment.imu import ImuTerm
     from rstrack.adjustment.refine import Refiner, Round, Usual
-    from rstrack.adjustment.unit import Unit
     from rstrack.images.device_frame import DeviceFrame
 
 Kind = TypeVar("Kind", Options, Noise)
@@ -127,10 +127,10 @@ def refine_run(
         info["dataset"] = recorded | {"camera": dataset.cameras}
     poses = estimate.T_world_depth if kept else se3.orthonormalise(moved @ estimate.T_world_depth)
     imu = _NOT_LOOKED_AT if options.inertial else ""
-    if refiner.unit is not None and refiner.found is not None and not kept:
-        believed = imu_record.believed(refiner.found.belief, refiner.unit.sigma)
+    if refiner.imu is not None and refiner.found is not None and not kept:
+        believed = imu_record.believed(refiner.found.belief, refiner.imu.sigma)
         info["imu"] = (estimate.info.get("imu") or {}) | believed | refiner.found.as_dict()
-        imu = f"{imu_record.refined_text(believed)}, {refiner.found.text(refiner.unit.recording.T_imu_depth)}"
+        imu = f"{imu_record.refined_text(believed)}, {refiner.found.text(refiner.imu.recording.T_imu_depth)}"
     result = Estimate(estimate.stamps, poses, spline, info, estimate.moving)
     truth = truth_of(dataset)
     before, after = (evaluated(truth, each) for each in (estimate, result))
@@ -237,17 +237,17 @@ def _refiner(dataset: Dataset, estimate: Estimate, options: Options, noise: Nois
     return Refiner(terms, maker, options, numbers, times, begin, load, _usual(estimate.info), unit)
 
 
-def _unit(dataset: Dataset, estimate: Estimate, options: Options) -> Unit | None:
+def _unit(dataset: Dataset, estimate: Estimate, options: Options) -> ImuTerm | None:
     """The IMU of a run that used one, as far as its spline is known. None without a gyroscope: as when tracking, an
     accelerometer alone is to change nothing."""
-    from rstrack.adjustment.unit import Unit
+    from rstrack.adjustment.imu import ImuTerm
 
     if not options.inertial or estimate.spline is None:
         return None
     if dataset.imu is None:
         raise UserError(f"{dataset.root}: has no IMU, which method {options.method} of the run needs")
     valid = estimate.info.get("spline_valid") or [[estimate.spline.t_begin, estimate.spline.t_end]]
-    return Unit.of(dataset.imu, estimate.spline, np.array(valid, np.float64).reshape(-1, 2))
+    return ImuTerm.of(dataset.imu, estimate.spline, np.array(valid, np.float64).reshape(-1, 2))
 
 
 def _known_frames(dataset: Dataset, estimate: Estimate) -> list[int]:

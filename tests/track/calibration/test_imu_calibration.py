@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_imu_input import swung
 from tum_recording import make_tum
-from util import random_spline
+from util import random_spline, swung
 
 from rsgen.config.faults import ImuFaults
 from rsgen.config.imu import ImuConfig
@@ -17,26 +16,23 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3, so3
 from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import exact_imu, imu_csv, simulate_imu
-from rstrack.calibration.imu.result import ImuCalibration
-from rstrack.calibration.imu.run import Followed, calibrate_imu
-from rstrack.calibration.imu.tracked import Track, corrected, corrections, motion_at, spread
-from rstrack.calibration.imu.unit import (
-    COUNT,
+from rstrack.calibration.imu.model import (
     DRIFT,
     LEVER,
     OFFSET,
     ROTATION,
     SCALE,
-    Unit,
-    at_stamps,
-    by_corrections,
-    by_time,
-    by_unit,
+    CorrectedTrack,
+    ImuUnknowns,
+    Prediction,
     hats,
-    readings,
 )
+from rstrack.calibration.imu.result import ImuCalibration
+from rstrack.calibration.imu.run import Followed, begin, calibrate_imu
+from rstrack.calibration.imu.solve import _alike
 from rstrack.cli.main import main
 from rstrack.data.dataset import Dataset, open_dataset
+from rstrack.inertial.factor import BodyMotion
 
 SCALES = np.array([1.01, 0.995, 1.004])
 CONFIG = ImuConfig.model_validate({"preset": "phone", "gyroscope_matrix": np.diag(SCALES).tolist()})
@@ -46,9 +42,9 @@ TRUE = swung(SECONDS)
 SAMPLES = simulate_imu(TRUE, CONFIG, 0.0, SECONDS, 1, FAULTS)
 
 
-def unit_of(spline: Spline, rng: np.random.Generator) -> Unit:
+def unknowns_of(spline: Spline, rng: np.random.Generator) -> ImuUnknowns:
     T = se3.exp(0.5 * rng.normal(size=6))
-    return Unit(
+    return ImuUnknowns(
         T[:3, :3], 0.1 * rng.normal(size=3), 0.003, 1e-3, 0.02 * rng.normal(size=3), np.array([0.3, -9.7, 1.0]),
         np.linspace(spline.t_begin, spline.t_end, 3), 0.1 * rng.normal(size=(3, 6)), spline.t_begin + 0.2,
     )  # fmt: skip
@@ -57,63 +53,66 @@ def unit_of(spline: Spline, rng: np.random.Generator) -> Unit:
 @pytest.mark.parametrize("parts", [1, 3])
 def test_derivatives_are_those_of_differences(parts: int) -> None:
     rng, spline = np.random.default_rng(parts), random_spline(3, points=10, angle=0.3)
-    track = Track(spline, parts)
-    unit, x = unit_of(spline, rng), np.zeros((track.count, 6))
+    track = CorrectedTrack(spline, parts)
+    imu, x = unknowns_of(spline, rng), np.zeros((track.count, 6))
     stamps = np.linspace(spline.t_begin + 0.02, spline.t_end - 0.02, 23)
 
-    def read(unit: Unit, x: np.ndarray) -> np.ndarray:
-        return np.stack(readings(unit, *at_stamps(track, unit, x, stamps)))
+    def read(imu: ImuUnknowns, x: np.ndarray) -> np.ndarray:
+        return Prediction(track, imu, x, stamps).readings
 
-    motion, t = at_stamps(track, unit, x, stamps)
-    change = by_time(track, unit, x, stamps)
-    J = by_unit(unit, motion, t, change, stamps)
-    for i in range(COUNT + unit.biases.size):
-        step = np.zeros(COUNT + unit.biases.size)
-        step[i] = 1e-4 if i == OFFSET else 1e-5  # of times as by_time does: jerks jump at knots
-        found = (read(unit.moved(step), x) - read(unit.moved(-step), x)) / (2 * step[i])
-        if i != DRIFT:
-            np.testing.assert_allclose(J[..., i], found, atol=1e-5 * np.abs(found).max() + 1e-9)
-    np.testing.assert_allclose(J[..., DRIFT], J[..., OFFSET] * (stamps - unit.middle)[:, None])
-    by_x = [spread(motion, blocks, track.count).toarray() for blocks in by_corrections(unit, motion)]
+    at = Prediction(track, imu, x, stamps)
+    for i in range(imu.size):
+        step = np.zeros(imu.size)
+        step[i] = 1e-6 if i == OFFSET else 1e-5
+        found = (read(imu.moved(step), x) - read(imu.moved(-step), x)) / (2 * step[i])
+        # The clock is the gyroscope's to tell.
+        told = slice(None, 3 if i in (OFFSET, DRIFT) else None)
+        close = 1e-5 * np.abs(found[:, told]).max() + 1e-9
+        np.testing.assert_allclose(at.by_imu[:, told, i], found[:, told], atol=close)
+    assert not at.by_imu[:, 3:, [OFFSET, DRIFT]].any()
+    by_x = at.corrections.spread(at.by_corrections, track.count).toarray().reshape(len(stamps), 6, -1)
     for k in range(0, track.count, 3):
         for c in range(6):
             step = np.zeros_like(x)
             step[k, c] = 1e-6
-            found = (read(unit, step) - read(unit, -step)) / 2e-6
-            for sensor in range(2):
-                close = 1e-5 * np.abs(found[sensor]).max() + 1e-9
-                np.testing.assert_allclose(by_x[sensor][:, 6 * k + c], found[sensor].ravel(), atol=close)
+            found = (read(imu, step) - read(imu, -step)) / 2e-6
+            for part in (slice(3), slice(3, 6)):
+                close = 1e-5 * np.abs(found[:, part]).max() + 1e-9
+                np.testing.assert_allclose(by_x[:, part, 6 * k + c], found[:, part], atol=close)
 
 
 def test_readings_are_those_of_the_generator() -> None:
     spline = random_spline(5, points=12, angle=0.3)
-    unit = unit_of(spline, np.random.default_rng(1))
-    t = np.linspace(spline.t_begin, spline.t_end, 50)
-    gyro, accel = exact_imu(spline, unit.T_imu_depth, unit.gravity, t)
-    bias = hats(unit.bias_times, t) @ unit.biases
-    found = readings(unit, motion_at(Track(spline), t), t)
-    np.testing.assert_allclose(found[0], (1.0 + unit.scale) * gyro + bias[:, :3], atol=1e-10)
-    np.testing.assert_allclose(found[1], accel + bias[:, 3:], atol=1e-9)
+    imu = replace(unknowns_of(spline, np.random.default_rng(1)), offset_s=0.0, drift=0.0)
+    t, track = np.linspace(spline.t_begin, spline.t_end, 50), CorrectedTrack(spline)
+    gyro, accel = exact_imu(spline, imu.T_imu_depth, imu.gravity, t)
+    bias = hats(imu.bias_times, t) @ imu.biases
+    found = Prediction(track, imu, np.zeros((track.count, 6)), t).readings
+    np.testing.assert_allclose(found[:, :3], (1.0 + imu.scale) * gyro + bias[:, :3], atol=1e-10)
+    np.testing.assert_allclose(found[:, 3:], accel + bias[:, 3:], atol=1e-9)
 
 
 def test_a_corrected_motion_is_that_of_the_corrected_poses() -> None:
     """Finite differences of R exp(φ), p + δ."""
     spline, rng = random_spline(7, points=9, angle=0.3), np.random.default_rng(0)
-    track = Track(spline, 2)
+    track = CorrectedTrack(spline, 2)
     x, h = 1e-4 * rng.normal(size=(track.count, 6)), 1e-4
-    t = spline.t_begin + 0.0125 + 0.025 * np.arange(11)  # amid the pieces, where all is smooth
+    t = spline.t_begin + 0.0125 + 0.025 * np.arange(11)  # amid the knots, where all is smooth
 
     def poses(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        T, value = spline.pose(t), corrections(motion_at(track, t), x)[0]
+        T, value = spline.pose(t), track.corrections(t).values(x)[0]
         return T[:, :3, :3] @ so3.exp(value[:, :3]), T[:, :3, 3] + value[:, 3:]
 
-    (early, p0), (now, p1), (late, p2) = (poses(t + k * h) for k in (-1, 0, 1))
-    motion = corrected(motion_at(track, t), x)
-    np.testing.assert_allclose(motion.R, now, atol=1e-12)
-    np.testing.assert_allclose(motion.rate, so3.log(np.swapaxes(early, 1, 2) @ late) / (2 * h), rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(motion.acceleration, (p2 - 2 * p1 + p0) / h**2, rtol=1e-4, atol=1e-3)
-    after, before = (corrected(motion_at(track, t + k * h), x).rate for k in (1, -1))
-    np.testing.assert_allclose(motion.rate_change, (after - before) / (2 * h), rtol=1e-3, atol=2e-3)
+    def motion(t: np.ndarray) -> BodyMotion:
+        return track.motion(t, track.corrections(t), x)
+
+    (early, p0), (now, _), (late, p2) = (poses(t + k * h) for k in (-1, 0, 1))
+    at, (before, after) = motion(t), (motion(t + k * h).twist for k in (-1, 1))
+    np.testing.assert_allclose(at.rotation, now, atol=1e-12)
+    v = ((p2 - p0)[:, None] @ now)[:, 0] / (2 * h)
+    turns = so3.log(np.swapaxes(early, 1, 2) @ late) / (2 * h)
+    np.testing.assert_allclose(at.twist, np.concatenate([v, turns], axis=1), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(at.rate, (after - before) / (2 * h), rtol=1e-3, atol=2e-3)
 
 
 def tracked(noise: float, seed: int = 0, dt: float = 0.025) -> Followed:
@@ -159,10 +158,10 @@ def test_place_clock_and_scale_are_found_within_their_errors(found: ImuCalibrati
     assert abs(found.drift + 80e-6) < 5.0 * sigmas[DRIFT] < 1e-4
     assert (np.abs(np.diag(found.gyro_matrix) - SCALES) < 5.0 * sigmas[SCALE]).all() and sigmas[SCALE].max() < 1e-3
     assert not found.undetermined.any() and (sigmas[LEVER] > 1e-5).all()
-    unit = found.solution.unit
-    at = np.searchsorted(SAMPLES.t, unit.bias_times[1:-1])
-    assert np.abs(unit.biases[1:-1, :3] - SAMPLES.gyro_bias[at]).max() < 5e-4
-    assert np.abs(unit.biases[1:-1, 3:] - SAMPLES.accel_bias[at]).max() < 1e-2
+    imu = found.solution.imu
+    at = np.searchsorted(SAMPLES.t, imu.bias_times[1:-1])
+    assert np.abs(imu.biases[1:-1, :3] - SAMPLES.gyro_bias[at]).max() < 5e-4
+    assert np.abs(imu.biases[1:-1, 3:] - SAMPLES.accel_bias[at]).max() < 1e-2
 
 
 def test_what_was_written_brings_the_samples_to_the_images_clock(found: ImuCalibration, dataset: Dataset) -> None:
@@ -174,10 +173,10 @@ def test_what_was_written_brings_the_samples_to_the_images_clock(found: ImuCalib
     assert imu is not None and imu.gyro is not None
     np.testing.assert_allclose(imu.t, SAMPLES.t, atol=1.5e-4)
     np.testing.assert_allclose(imu.T_imu_depth, found.T_imu_depth, atol=1e-8)
-    np.testing.assert_allclose(imu.gyro * (1.0 + found.solution.unit.scale), SAMPLES.gyro, atol=1e-6)
+    np.testing.assert_allclose(imu.gyro * (1.0 + found.solution.imu.scale), SAMPLES.gyro, atol=1e-6)
     # What is found from there on is told on top of that: the file of the whole is the same.
     assert right.imu_files is not None and right.imu_files.description().offset_s == pytest.approx(found.offset_s)
-    rest = replace(found, said=right.imu_files.description())
+    rest = replace(found, stated=right.imu_files.description())
     assert rest.offset_s == pytest.approx(2 * found.offset_s, abs=1e-5)
     np.testing.assert_allclose(rest.gyro_matrix, found.gyro_matrix @ found.gyro_matrix, atol=1e-6)
     assert "±" in found.text() and found.as_dict()["undetermined"] == []
@@ -208,8 +207,6 @@ def test_what_tells_nothing_is_one_line(dataset: Dataset, tmp_path: Path) -> Non
 
 
 def test_turning_about_one_axis_tells_no_axes() -> None:
-    from rstrack.calibration.imu.start import begin
-
     t = np.arange(200) * 0.05
     twist = np.zeros((len(t), 6))
     twist[:, 4] = np.sin(2.0 * t)
@@ -217,7 +214,7 @@ def test_turning_about_one_axis_tells_no_axes() -> None:
     samples = simulate_imu(spline, CONFIG, 0.0, spline.t_end, 0, FAULTS)
     given = samples.stamps, samples.gyro, samples.accel, 9.80665, np.array([0.0, 9.0]), 4.0
     with pytest.raises(UserError, match="one axis only"):
-        begin(Track(spline), (0.0, 9.0), *given)
+        begin(spline, (0.0, 9.0), *given)
 
 
 def test_the_command(dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -232,8 +229,6 @@ def test_the_command(dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFix
 
 def test_errors_that_are_alike_count_for_more() -> None:
     """An autoregression of φ has in sums (1 + φ) / (1 − φ) times the variance of white noise."""
-    from rstrack.calibration.imu.solve import _alike
-
     rng = np.random.default_rng(0)
     white = rng.normal(size=(20000, 6))
     assert _alike(white) == pytest.approx(1.0, abs=0.05)

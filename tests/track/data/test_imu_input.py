@@ -10,11 +10,11 @@ import pytest
 import yaml
 from synthetic import make_config, make_sequence
 from tum_recording import STAMPS, make_tum
+from util import swung
 
 from rsgen.config.imu import ImuConfig
 from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import ImuSamples, imu_csv, simulate_imu
 from rstrack.cli.main import main
 from rstrack.data.dataset import open_dataset
@@ -26,17 +26,6 @@ CONFIG = ImuConfig(
 )
 EPOCH_S = 1305031100
 YAML = {"T_imu_depth": T_IMU_DEPTH.tolist()}
-
-
-def swung(seconds: float = 12.0) -> Spline:
-    """A camera that is carried to and fro, and tilted, as a hand does."""
-    t = np.arange(round(seconds / 0.05) + 3) * 0.05
-    twist = np.zeros((len(t), 6))
-    for i, (size, hertz) in enumerate(
-        zip((0.2, 0.1, 0.2, 0.4, 0.5, 0.3), (0.3, 0.5, 0.4, 0.45, 0.35, 0.6), strict=True)
-    ):
-        twist[:, i] = size * np.sin(2 * np.pi * hertz * t + i)
-    return Spline(se3.exp(twist), 0.0, 0.05)
 
 
 SAMPLES = simulate_imu(swung(), CONFIG, 0.0, 12.0, seed=3)

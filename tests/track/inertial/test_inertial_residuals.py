@@ -13,7 +13,7 @@ from rsgen.sensors.imu import exact_imu
 from rstrack.data.imu.description import ImuNoise
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.inertial.belief import SIZE, Belief
-from rstrack.inertial.derivatives import motion
+from rstrack.inertial.factor import motion
 from rstrack.inertial.residuals import Rows, Samples
 
 T_IMU_DEPTH = se3.exp([0.03, -0.02, 0.05, 0.3, -1.2, 0.7])

@@ -1,10 +1,9 @@
 """An IMU's readings over a whole recording, for the graph: residuals at their own stamps, and what is not known of it.
 
-    gyro = (1 + s_g) ω + b_g,   accel = (1 + s_a) (v̇ + ω × v − R_imu_world g) + b_a,   ω, v̇, v at the unit
-
-Biases b are linear between knots about a second apart and walk from one to the next; gravity g is one vector in the
-spline's world; T_imu_depth and the scales s are nearly what is told. In the graph's blocks of six numbers there are,
-last of all: T_imu_depth's left increment, the scales, the knots, and gravity, three numbers of which say nothing.
+By `rstrack.inertial.factor`. Biases are linear between knots about a second apart and walk from one to the next;
+gravity is one vector in the spline's world; T_imu_depth and the scales are nearly what is stated. In the graph's blocks
+of six numbers there are, last of all: T_imu_depth's left increment, the scales, the knots, and gravity, three numbers
+of which say nothing.
 """
 
 from __future__ import annotations
@@ -17,25 +16,25 @@ import numpy as np
 
 from rsgen.array_types import FloatArray, IntArray
 from rsgen.geometry import se3, so3
-from rsgen.geometry.so3 import hat
 from rsgen.geometry.spline import Spline
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.inertial.band import Band
-from rstrack.inertial.belief import GRAVITY, SIZE, STRENGTH, TURN, WARMS, Belief
-from rstrack.inertial.residuals import Rows, Samples
+from rstrack.inertial.belief import STRENGTH, Belief, bias_walk
+from rstrack.inertial.factor import ImuFactor, motion
+from rstrack.inertial.residuals import Samples
 
 # About how far apart the biases' knots are, s.
 _KNOT_S = 1.0
 # Blocks of six that a sample depends on: control points, T_imu_depth, scales, knots of the biases and gravity.
 _BLOCKS = 4 + 1 + 1 + 2 + 1
-# σ of what is told: of T_imu_depth (m, rad), and of scales, which data sheets of cheap units state to a hundredth.
+# σ of what is stated: of T_imu_depth (m, rad), and of scales, which data sheets of cheap units state to a hundredth.
 _PLACE, _SCALE = np.repeat([5e-3, 1e-2], 3), 5e-3
 # Samples linearised at once: intermediate matrices then stay small.
 _AT_ONCE = 4096
 
 
 @dataclass(frozen=True)
-class Sums:
+class Equations:
     """Normal equations of n parts: numbers (n, k) of the blocks of six each depends on, H (n, 6 k, 6 k), g (n, 6 k)."""
 
     numbers: IntArray
@@ -44,8 +43,8 @@ class Sums:
 
 
 @dataclass(frozen=True)
-class UnitState:
-    """What is believed of a unit. biases (m, 6) = [gyroscope rad/s; accelerometer m/s²] at its knots; gravity (3,) in
+class ImuState:
+    """Values of an IMU. biases (m, 6) = [gyroscope rad/s; accelerometer m/s²] at its knots; gravity (3,) in
     the world, m/s²; T_imu_depth (4, 4); scales (6,) of gyroscope and accelerometer, parts."""
 
     biases: FloatArray
@@ -57,28 +56,28 @@ class UnitState:
         """Blocks of six."""
         return len(self.biases) + 3
 
-    def moved(self, step: FloatArray) -> UnitState:
+    def moved(self, step: FloatArray) -> ImuState:
         """After a step (m + 3, 6)."""
         T = se3.orthonormalise(se3.exp(step[0]) @ self.T_imu_depth)
-        return UnitState(self.biases + step[2:-1], self.gravity + step[-1, :3], T, self.scales + step[1])
+        return ImuState(self.biases + step[2:-1], self.gravity + step[-1, :3], T, self.scales + step[1])
 
-    def turned(self, R: FloatArray) -> UnitState:
+    def turned(self, R: FloatArray) -> ImuState:
         """In a world that is turned by R (3, 3)."""
         return replace(self, gravity=R @ self.gravity)
 
 
 @dataclass(frozen=True)
-class Found:
-    """What a recording tells of a unit: its state, with a belief of the biases in the end, of gravity and of the turn;
+class ImuResult:
+    """What a recording tells of an IMU: its state, with a belief of the biases in the end, of gravity and of the turn;
     and sigmas (12,) of T_imu_depth's left increment (m, rad) and of the scales."""
 
-    state: UnitState
+    state: ImuState
     belief: Belief
     sigmas: FloatArray
 
     @classmethod
-    def of(cls, state: UnitState, T_imu_depth: FloatArray, inverse: Callable[[IntArray], FloatArray]) -> Found:
-        """T_imu_depth (4, 4): as it was told. inverse: the covariance of unknowns, whose numbers count from the end,
+    def of(cls, state: ImuState, T_imu_depth: FloatArray, inverse: Callable[[IntArray], FloatArray]) -> ImuResult:
+        """T_imu_depth (4, 4): as it was stated. inverse: the covariance of unknowns, whose numbers count from the end,
         below 0."""
         own = np.arange(12) - 6 * len(state)
         last = inverse(np.concatenate([np.arange(-12, -3), own[3:6]]))
@@ -97,7 +96,7 @@ class Found:
         }
 
     def text(self, T_imu_depth: FloatArray) -> str:
-        """How far it is from where it was told (4, 4) to be."""
+        """How far it is from where it was stated (4, 4) to be."""
         off = np.linalg.norm(se3.log(self.state.T_imu_depth @ se3.inverse(T_imu_depth)).reshape(2, 3), axis=1)
         sigma = self.sigmas[:6].reshape(2, 3).max(axis=1)
         return (
@@ -107,7 +106,7 @@ class Found:
 
 
 @dataclass(frozen=True)
-class Unit:
+class ImuTerm:
     """What is given. samples: those that count, at times the spline knows. sigma (2,): of a gyroscope's reading (rad/s)
     and of an accelerometer's (m/s²) about the spline; noise (2,): what they are at least. accelerations (6,): σ for the
     motion prior, m/s² and rad/s². segment, per: the segment at which the first knot of the biases is, and segments from
@@ -123,7 +122,7 @@ class Unit:
     per: int
 
     @classmethod
-    def of(cls, recording: ImuRecording, spline: Spline, valid: FloatArray) -> Unit | None:
+    def of(cls, recording: ImuRecording, spline: Spline, valid: FloatArray) -> ImuTerm | None:
         """Of the samples within valid (k, 2), s: where the spline is an estimate; None without any, or a gyroscope."""
         samples = Samples.of(recording)
         begin, end = np.maximum(valid[:, 0], spline.t_begin), np.minimum(valid[:, 1], spline.t_end)
@@ -137,17 +136,17 @@ class Unit:
         per = max(1, round(_KNOT_S / spline.dt))
         return cls(recording, samples, noise, sigma, band.allowed, int(spline.locate(samples.t[0])[0]), per)
 
-    def start(self, spline: Spline) -> UnitState:
+    def start(self, spline: Spline) -> ImuState:
         """No biases, and gravity along what the mean force would be if it were nothing else."""
         last = int(spline.locate(self.samples.t[-1])[0])
         R = spline.pose(self.samples.t)[:, :3, :3] @ self.recording.T_imu_depth[:3, :3].T
         up = (R @ self.samples.values[:, 3:, None])[..., 0].sum(axis=0)
         gravity = -self.recording.gravity * up / max(1e-9, float(np.linalg.norm(up)))
         biases = np.zeros(((last - self.segment) // self.per + 2, 6))
-        return UnitState(biases, gravity, self.recording.T_imu_depth)
+        return ImuState(biases, gravity, self.recording.T_imu_depth)
 
-    def said(self, spline: Spline, state: UnitState) -> Iterator[Sums]:
-        """All samples' normal equations, a part for each segment; the unit's own blocks count from the end, below 0."""
+    def equations(self, spline: Spline, state: ImuState) -> Iterator[Equations]:
+        """All samples' normal equations, a part for each segment; the IMU's own blocks count from the end, below 0."""
         own = np.array([-len(state), 1 - len(state)])
         for r, J, first, knot in self._rows(spline, state):
             starts = np.flatnonzero(np.diff(first, prepend=-1))
@@ -160,19 +159,21 @@ class Unit:
             points, knots = first[starts, None] + np.arange(4), knot[starts, None] + np.arange(2, 4) - len(state)
             each = np.ones((len(starts), 1), dtype=int)
             numbers = np.concatenate([points, each * own, knots, -each], axis=1)
-            yield Sums(numbers, total[:, :-1, :-1], total[:, :-1, -1])
+            yield Equations(numbers, total[:, :-1, :-1], total[:, :-1, -1])
 
-    def known(self, state: UnitState, dt: float) -> Iterator[Sums]:
+    def known(self, state: ImuState, dt: float) -> Iterator[Equations]:
         """What is known beforehand: how biases walk and how large they are, how strong gravity is."""
         m, size = len(state.biases), float(np.linalg.norm(state.gravity))
-        walk, place, scale = self._walk(dt) ** -2.0, _PLACE**-2.0, np.full(6, _SCALE**-2.0)
+        walk = bias_walk(self.recording.noise, self.per * dt) ** -2.0
+        place, scale = _PLACE**-2.0, np.full(6, _SCALE**-2.0)
         loose = np.diag(Belief.initial(state.gravity).information)[:6]
         along = np.append(state.gravity / size, np.zeros(3))
         off = se3.log(state.T_imu_depth @ se3.inverse(self.recording.T_imu_depth))
         J = se3.left_jacobian_inv(off)
         step = np.diff(state.biases, axis=0) * walk
         between = np.broadcast_to(np.kron([[1.0, -1.0], [-1.0, 1.0]], np.diag(walk)), (m - 1, 12, 12))
-        yield Sums(np.arange(m - 1)[:, None] + np.arange(2) - m - 1, between, np.concatenate([-step, step], axis=1))
+        numbers = np.arange(m - 1)[:, None] + np.arange(2) - m - 1
+        yield Equations(numbers, between, np.concatenate([-step, step], axis=1))
         for number, H, g in (
             (0, J.T @ (place[:, None] * J), J.T @ (place * off)),
             (1, np.diag(scale), scale * state.scales),
@@ -180,9 +181,9 @@ class Unit:
             (m + 2, np.outer(along, along) / STRENGTH**2, along * (size - self.recording.gravity) / STRENGTH**2),
             (m + 2, np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]), np.zeros(6)),
         ):
-            yield Sums(np.array([[number - len(state)]]), H[None], g[None])
+            yield Equations(np.array([[number - len(state)]]), H[None], g[None])
 
-    def learnt(self, spline: Spline, state: UnitState) -> Unit:
+    def learnt(self, spline: Spline, state: ImuState) -> ImuTerm:
         """With σ as readings scatter about a spline, of whose noise that follows a part."""
         squares = np.zeros(2)
         for r, *_ in self._rows(spline, state):
@@ -192,18 +193,9 @@ class Unit:
         sigma = np.sqrt(squares / np.maximum(1.0, number) + followed)
         return replace(self, sigma=np.where(number > 0.0, np.maximum(self.noise, sigma), self.sigma))
 
-    def _walk(self, dt: float) -> FloatArray:
-        """σ (6,) of the biases' steps from knot to knot."""
-        noise, seconds = self.recording.noise, self.per * dt
-        walk = np.array([noise.gyro_walk, noise.accel_walk]) * np.sqrt(seconds)
-        return np.repeat(np.hypot(walk, np.array(WARMS) * seconds), 3)
-
-    def _rows(self, spline: Spline, state: UnitState) -> Iterator[tuple[FloatArray, FloatArray, IntArray, IntArray]]:
+    def _rows(self, spline: Spline, state: ImuState) -> Iterator[tuple[FloatArray, FloatArray, IntArray, IntArray]]:
         """Residuals (n, 6) and their derivatives (n, 6, 54), in σ, the first control point and knot (n,) of each: of
         whole segments, some at once."""
-        numbers = np.zeros(SIZE)
-        numbers[GRAVITY] = state.gravity
-        R_imu_depth = state.T_imu_depth[:3, :3]
         segment, u = spline.locate(self.samples.t)
         begin = 0
         while begin < len(segment):
@@ -213,22 +205,19 @@ class Unit:
                 end = end if end > begin else int(np.searchsorted(segment, segment[begin], side="right"))
             part = slice(begin, end)
             samples = Samples(self.samples.t[part], self.samples.values[part], self.samples.counts[part])
-            rows = Rows.of(spline, samples, state.T_imu_depth, numbers)
-            felt, scale = rows.r + samples.values, 1.0 + state.scales
-            omega, turning = felt[:, :3], spline.acceleration(samples.t)[:, 3:] @ R_imu_depth.T
+            at = ImuFactor(motion(spline, samples.t), state.T_imu_depth, state.gravity)
+            scale = 1.0 + state.scales
             knot, rest = np.divmod(segment[part] - self.segment, self.per)
             late = ((rest + u[part]) / self.per)[:, None]
-            r = scale * felt + (1.0 - late) * state.biases[knot] + late * state.biases[knot + 1] - samples.values
-            J = np.zeros((len(r), 6, 6 * _BLOCKS))
-            by_belief = rows.J[:, :, 24:]
-            J[:, :, :24], J[:, :, 48:51] = rows.J[:, :, :24], by_belief[:, :, GRAVITY]
-            # A unit that is elsewhere by −ρ in its axes, and turned by φ.
-            J[:, 3:, 24:27] = -(hat(turning) + hat(omega) @ hat(omega))
-            J[:, :, 27:30] = by_belief[:, :, TURN]
+            bias = (1.0 - late) * state.biases[knot] + late * state.biases[knot + 1]
+            J = np.zeros((len(late), 6, 6 * _BLOCKS))
+            J[:, :, :24], J[:, :, 48:51] = at.by_motion, at.by_gravity
+            J[:, :, 24:27], J[:, :, 27:30] = at.by_translation, at.by_rotation
             J *= scale[:, None]
-            J[:, :, 30:36] = felt[..., None] * np.eye(6)
+            J[:, :, 30:36] = at.readings[..., None] * np.eye(6)
             J[:, :, 36:42] = (1.0 - late)[..., None] * np.eye(6)
             J[:, :, 42:48] = late[..., None] * np.eye(6)
             root = samples.counts / np.repeat(self.sigma, 3)
-            yield root * r, root[..., None] * J, rows.first, knot
+            r = scale * at.readings + bias - samples.values
+            yield root * r, root[..., None] * J, at.motion.first, knot
             begin = end

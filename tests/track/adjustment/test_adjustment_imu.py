@@ -12,9 +12,9 @@ from rsgen.array_types import FloatArray
 from rsgen.geometry import se3, so3
 from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import exact_imu
-from rstrack.adjustment import unit as unit_module
+from rstrack.adjustment import imu as imu_module
 from rstrack.adjustment.graph import Graph, Sighting, State
-from rstrack.adjustment.unit import Sums, Unit, UnitState
+from rstrack.adjustment.imu import Equations, ImuState, ImuTerm
 from rstrack.data.imu.description import ImuNoise
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.inertial.belief import STRENGTH, WARMS
@@ -33,7 +33,7 @@ def moving(seed: int, count: int = POINTS) -> Spline:
     return Spline(np.array(points), 0.0, DT)
 
 
-def unit_on(spline: Spline, told: UnitState, seed: int, gap: tuple[float, float] = (1.0, 1.0)) -> Unit:
+def unit_on(spline: Spline, told: ImuState, seed: int, gap: tuple[float, float] = (1.0, 1.0)) -> ImuTerm:
     """A unit that reads what the spline says, with noise; but in a gap, s, and one reading that is none."""
     t = np.arange(spline.t_begin + 1e-3, spline.t_end, 0.005)
     t = t[(t < gap[0]) | (t >= gap[1])]
@@ -42,26 +42,26 @@ def unit_on(spline: Spline, told: UnitState, seed: int, gap: tuple[float, float]
     read += np.random.default_rng(seed).normal(0.0, np.repeat([2e-3, 2e-2], 3), read.shape)
     read[4, 1] = np.nan
     recording = ImuRecording(t, read[:, :3], read[:, 3:], NOISE, T_IMU_DEPTH, 200.0, float(np.linalg.norm(GRAVITY)))
-    unit = Unit.of(recording, spline, np.array([[-1.0, 9.0]]))
+    unit = ImuTerm.of(recording, spline, np.array([[-1.0, 9.0]]))
     assert unit is not None
     return replace(unit, sigma=np.array([2e-3, 2e-2]), per=PER)
 
 
-def bias_at(spline: Spline, told: UnitState, t: FloatArray) -> FloatArray:
+def bias_at(spline: Spline, told: ImuState, t: FloatArray) -> FloatArray:
     knots = spline.t_begin + DT * PER * np.arange(len(told.biases))
     return np.stack([np.interp(t, knots, axis) for axis in told.biases.T], axis=1)
 
 
-def true_state(seed: int, knots: int = KNOTS, walks: float = 5.0) -> UnitState:
+def true_state(seed: int, knots: int = KNOTS, walks: float = 5.0) -> ImuState:
     """Biases that walk so many times as far as they should; the unit sits elsewhere than is told, by half a σ or so."""
     rng = np.random.default_rng(seed)
     steps = rng.normal(0.0, walks * (DT * PER) ** 0.5 * np.repeat([1e-3, 1e-2], 3), (knots, 6))
     biases = rng.normal(0.0, np.repeat([0.02, 0.1], 3)) + np.cumsum(steps, axis=0)
-    off = rng.normal(0.0, unit_module._PLACE)
-    return UnitState(biases, GRAVITY, se3.exp(off) @ T_IMU_DEPTH, rng.normal(0.0, unit_module._SCALE, 6))
+    off = rng.normal(0.0, imu_module._PLACE)
+    return ImuState(biases, GRAVITY, se3.exp(off) @ T_IMU_DEPTH, rng.normal(0.0, imu_module._SCALE, 6))
 
 
-def whitened(unit: Unit, spline: Spline, told: UnitState) -> FloatArray:
+def whitened(unit: ImuTerm, spline: Spline, told: ImuState) -> FloatArray:
     """Residuals in σ, from the generator's sensor."""
     gyro, force = exact_imu(spline, told.T_imu_depth, told.gravity, unit.samples.t)
     felt = (1.0 + told.scales) * np.concatenate([gyro, force], axis=1)
@@ -69,11 +69,11 @@ def whitened(unit: Unit, spline: Spline, told: UnitState) -> FloatArray:
     return (r * unit.samples.counts / np.repeat(unit.sigma, 3)).ravel()
 
 
-def summed(unit: Unit, spline: Spline, told: UnitState) -> tuple[FloatArray, FloatArray]:
+def summed(unit: ImuTerm, spline: Spline, told: ImuState) -> tuple[FloatArray, FloatArray]:
     """H and g over control points and the unit's own blocks, the last three of which are nothing's."""
     size = POINTS + len(told)
     H, g = np.zeros((size, 6, size, 6)), np.zeros((size, 6))
-    parts: list[Sums] = list(unit.said(spline, told))
+    parts: list[Equations] = list(unit.equations(spline, told))
     for sums in parts:
         for numbers, block, gradient in zip(sums.numbers, sums.H, sums.g, strict=True):
             k = len(numbers)
@@ -94,8 +94,8 @@ def test_sums_are_those_of_finite_differences(monkeypatch: pytest.MonkeyPatch) -
             x = np.zeros((POINTS + len(told), 6))
             x.flat[i] = side
             state = State(spline, {}, told).moved(x[:POINTS], np.zeros((0, 6)), x[POINTS:])
-            assert state.unit is not None
-            ends.append(whitened(unit, state.spline, state.unit))
+            assert state.imu is not None
+            ends.append(whitened(unit, state.spline, state.imu))
         columns.append((ends[1] - ends[0]) / (2.0 * step))
     J, r = np.stack(columns, axis=1), whitened(unit, spline, told)
     H, g = summed(unit, spline, told)
@@ -103,7 +103,7 @@ def test_sums_are_those_of_finite_differences(monkeypatch: pytest.MonkeyPatch) -
     np.testing.assert_allclose(g, J.T @ r, atol=1e-6 * np.abs(g).max())
     assert not H[:, -3:].any() and (np.diag(H)[:-3] > 0.0).all()
     # A few at a time are the same.
-    monkeypatch.setattr(unit_module, "_AT_ONCE", 7)
+    monkeypatch.setattr(imu_module, "_AT_ONCE", 7)
     few_H, few_g = summed(unit, spline, told)
     np.testing.assert_allclose(few_H, H, rtol=1e-12, atol=1e-12 * np.abs(H).max())
     np.testing.assert_allclose(few_g, g, rtol=1e-12, atol=1e-12 * np.abs(g).max())
@@ -123,16 +123,16 @@ def test_what_is_believed_is_as_far_off_as_it_says() -> None:
         unit = unit_on(truth, told, seed)
         state = State(truth, {5: np.eye(4)}, unit.start(truth))
         sightings = sightings_of(truth, np.random.default_rng(seed), 3e-4, 20)
-        graph = Graph(state, (), sightings, keeps_motion=False, unit=unit)
+        graph = Graph(state, (), sightings, keeps_motion=False, imu=unit)
         for _ in range(4):
             state, _ = graph.step(state)
         found = graph.found(state)
-        assert found is not None and state.unit is not None
+        assert found is not None and state.imu is not None
         off = [se3.log(found.state.T_imu_depth @ se3.inverse(told.T_imu_depth)), found.state.scales - told.scales]
         turn = so3.log(told.T_imu_depth[:3, :3] @ unit.recording.T_imu_depth[:3, :3].T)
         believed = found.belief.mean - np.concatenate([told.biases[-1], told.gravity, turn])
         scores.append([*(believed / found.belief.sigmas), *(np.concatenate(off) / found.sigmas)])
-        sigmas.append(unit.learnt(state.spline, state.unit).sigma)
+        sigmas.append(unit.learnt(state.spline, state.imu).sigma)
     squares = np.square(scores).mean(axis=0)
     assert 0.6 < squares[:3].mean() < 1.5 and 0.6 < squares[9:].mean() < 1.5
     assert 0.2 < squares[3:9].mean() < 1.5  # the prior of biases is wider than these are
@@ -143,13 +143,13 @@ def test_what_is_believed_is_as_far_off_as_it_says() -> None:
 def test_readings_count_where_the_track_is_known() -> None:
     truth = moving(1)
     recording = unit_on(truth, true_state(2), 3).recording
-    unit = Unit.of(recording, truth, np.array([[-1.0, 0.03], [0.08, 0.1]]))
+    unit = ImuTerm.of(recording, truth, np.array([[-1.0, 0.03], [0.08, 0.1]]))
     assert unit is not None
     t = recording.t
     np.testing.assert_array_equal(unit.samples.t, t[(t < 0.03) | ((t >= 0.08) & (t < 0.1))])
-    assert Unit.of(recording, truth, np.array([[5.0, 6.0]])) is None
+    assert ImuTerm.of(recording, truth, np.array([[5.0, 6.0]])) is None
     # An accelerometer alone is to change nothing, as when tracking.
-    assert Unit.of(replace(recording, gyro=None), truth, np.array([[-1.0, 9.0]])) is None
+    assert ImuTerm.of(replace(recording, gyro=None), truth, np.array([[-1.0, 9.0]])) is None
 
 
 def test_steps_end_where_least_squares_do() -> None:
@@ -163,8 +163,8 @@ def test_steps_end_where_least_squares_do() -> None:
         sightings.append(Sighting(5, float(t), T, 1e5 * root @ root.T))
     begin = Spline(se3.exp(rng.normal(0.0, 2e-3, (POINTS, 6))) @ truth.control_points, 0.0, DT)
     at = State(begin, {5: np.eye(4)}, unit.start(begin))
-    assert at.unit is not None and len(at.unit) == KNOTS + 3
-    graph = Graph(at, (), sightings, keeps_motion=False, unit=unit)
+    assert at.imu is not None and len(at.imu) == KNOTS + 3
+    graph = Graph(at, (), sightings, keeps_motion=False, imu=unit)
     found = at
     for _ in range(12):
         found, x = graph.step(found)
@@ -178,8 +178,8 @@ def test_steps_end_where_least_squares_do() -> None:
 
     def residuals(x: FloatArray) -> FloatArray:
         state = moved(x)
-        assert state.unit is not None
-        out = [whitened(unit, state.spline, state.unit)]
+        assert state.imu is not None
+        out = [whitened(unit, state.spline, state.imu)]
         for s in sightings:
             T = se3.inverse(state.keyframes[s.keyframe]) @ state.spline.pose(s.t)
             out.append(np.linalg.cholesky(s.information).T @ se3.log(se3.inverse(s.T_ref_cam) @ T))
@@ -191,11 +191,11 @@ def test_steps_end_where_least_squares_do() -> None:
         out.append(1e7 * x[:6])  # the gauge
         seconds = DT * PER
         walk = np.hypot([1e-3 * seconds**0.5, 1e-2 * seconds**0.5], np.array(WARMS) * seconds)
-        out.append((np.diff(state.unit.biases, axis=0) / np.repeat(walk, 3)).ravel())
-        out.append(state.unit.biases[0] / np.repeat([0.1, 0.6], 3))
-        out.append(np.atleast_1d((np.linalg.norm(state.unit.gravity) - np.linalg.norm(GRAVITY)) / STRENGTH))
-        out.append(se3.log(state.unit.T_imu_depth @ se3.inverse(T_IMU_DEPTH)) / unit_module._PLACE)
-        out.append(state.unit.scales / unit_module._SCALE)
+        out.append((np.diff(state.imu.biases, axis=0) / np.repeat(walk, 3)).ravel())
+        out.append(state.imu.biases[0] / np.repeat([0.1, 0.6], 3))
+        out.append(np.atleast_1d((np.linalg.norm(state.imu.gravity) - np.linalg.norm(GRAVITY)) / STRENGTH))
+        out.append(se3.log(state.imu.T_imu_depth @ se3.inverse(T_IMU_DEPTH)) / imu_module._PLACE)
+        out.append(state.imu.scales / imu_module._SCALE)
         out.append(x[-3:])  # what says nothing
         return np.concatenate(out)
 
@@ -203,8 +203,8 @@ def test_steps_end_where_least_squares_do() -> None:
     best = least_squares(residuals, np.zeros(size), x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12)
     expected = moved(best.x)
     np.testing.assert_allclose(found.spline.control_points, expected.spline.control_points, atol=1e-7)
-    assert found.unit is not None and expected.unit is not None
-    np.testing.assert_allclose(found.unit.biases, expected.unit.biases, atol=1e-6)
-    np.testing.assert_allclose(found.unit.gravity, expected.unit.gravity, atol=1e-5)
-    np.testing.assert_allclose(found.unit.T_imu_depth, expected.unit.T_imu_depth, atol=1e-6)
-    np.testing.assert_allclose(found.unit.scales, expected.unit.scales, atol=1e-6)
+    assert found.imu is not None and expected.imu is not None
+    np.testing.assert_allclose(found.imu.biases, expected.imu.biases, atol=1e-6)
+    np.testing.assert_allclose(found.imu.gravity, expected.imu.gravity, atol=1e-5)
+    np.testing.assert_allclose(found.imu.T_imu_depth, expected.imu.T_imu_depth, atol=1e-6)
+    np.testing.assert_allclose(found.imu.scales, expected.imu.scales, atol=1e-6)

@@ -1,0 +1,167 @@
+"""The IMU factor: what a gyroscope and an accelerometer read on a motion, and the derivatives by all unknowns.
+
+    gyro = (1 + s_g) ω + b_g,   accel = (1 + s_a) f + b_a,   f = v̇ + ω × v − R_imu_world g,   of ω, v, v̇ at the IMU
+
+`BodyMotion` is the motion of the body (the depth camera) with derivatives by some unknowns of its own, `motion` that of
+a spline. `ImuFactor` takes it to the IMU by the adjoint of T_imu_depth, lever arm included. Tracking, refinement and
+calibration take from it the columns of what they estimate, and add biases and scales, which are linear.
+Left increments T ← exp(δ) T throughout, as for the images (DESIGN section 4).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from rsgen.array_types import FloatArray, IntArray
+from rsgen.geometry import se3
+from rsgen.geometry.so3 import cross, hat, powers
+from rsgen.geometry.spline import Spline
+
+# b_1..b_3 as polynomials in u, and their derivatives by u: see `rsgen.geometry.spline`.
+_BASIS = np.array([[5.0, 3.0, -3.0, 1.0], [1.0, 3.0, 3.0, -2.0], [0.0, 0.0, 0.0, 1.0]]).T / 6.0
+BY_U = np.diag([1.0, 2.0, 3.0], 1)
+"""Derives polynomials in u, constant term first."""
+_BASES = _BASIS, BY_U @ _BASIS, BY_U @ BY_U @ _BASIS
+
+
+@dataclass(frozen=True)
+class BodyMotion:
+    """At n times: first (n,), the first of the four control points; rotation (n, 3, 3), body to world.
+
+    twist (n, 6) = [v; ω] and rate (n, 6) = [v̇; ω̇] in body coordinates (m/s, rad/s). Their derivatives by m unknowns,
+    for a spline the left increments of the four control points (m = 24): by_twist, by_rate (n, 6, m); by_turn (n, 3, m)
+    of the pose's left rotation.
+    """
+
+    first: IntArray
+    rotation: FloatArray
+    twist: FloatArray
+    rate: FloatArray
+    by_twist: FloatArray
+    by_rate: FloatArray
+    by_turn: FloatArray
+
+
+@dataclass(frozen=True)
+class ImuFactor:
+    """n ideal samples of an IMU on a motion; gravity (3,): g in the world, m/s². All derivatives are of `readings`."""
+
+    motion: BodyMotion
+    T_imu_depth: FloatArray
+    gravity: FloatArray
+
+    @cached_property
+    def readings(self) -> FloatArray:
+        """(n, 6) = [ω; f] in the IMU's axes, rad/s and m/s², without biases and scales."""
+        v, omega = self._twist[:, :3], self._twist[:, 3:]
+        force = self._rate[:, :3] + cross(omega, v) - self._R_imu_world @ self.gravity
+        return np.concatenate([omega, force], axis=1)
+
+    @cached_property
+    def by_motion(self) -> FloatArray:
+        """(n, 6, m): by the unknowns of the motion."""
+        Ad, v = se3.adjoint(self.T_imu_depth), self._twist[:, :3]
+        by_twist, by_rate = Ad @ self.motion.by_twist, Ad @ self.motion.by_rate
+        J = np.empty_like(by_twist)
+        J[:, :3] = by_twist[:, 3:]
+        J[:, 3:] = by_rate[:, :3] + self._across @ by_twist[:, :3] - hat(v) @ by_twist[:, 3:]
+        # R ← exp(φ) R turns Rᵀ g by Rᵀ g^ φ.
+        J[:, 3:] -= (self._R_imu_world @ hat(self.gravity)) @ self.motion.by_turn
+        return J
+
+    @cached_property
+    def by_gravity(self) -> FloatArray:
+        """(n, 6, 3)."""
+        return np.concatenate([np.zeros_like(self._R_imu_world), -self._R_imu_world], axis=1)
+
+    @cached_property
+    def by_rotation(self) -> FloatArray:
+        """(n, 6, 3): by T_imu_depth ← exp([0; φ]) T_imu_depth."""
+        return -np.concatenate([self._across, hat(self.readings[:, 3:])], axis=1)
+
+    @cached_property
+    def by_translation(self) -> FloatArray:
+        """(n, 6, 3): by T_imu_depth ← exp([ρ; 0]) T_imu_depth, an IMU that is elsewhere by −ρ in its axes."""
+        swing = -(hat(self._rate[:, 3:]) + self._across @ self._across)
+        return np.concatenate([np.zeros_like(swing), swing], axis=1)
+
+    @property
+    def gyro_by_time(self) -> FloatArray:
+        """(n, 3): of the gyroscope, by the time of the samples. The accelerometer has none that a cubic spline tells:
+        its acceleration bends at the knots."""
+        return self._rate[:, 3:]
+
+    @cached_property
+    def _twist(self) -> FloatArray:
+        return self.motion.twist @ se3.adjoint(self.T_imu_depth).T
+
+    @cached_property
+    def _rate(self) -> FloatArray:
+        return self.motion.rate @ se3.adjoint(self.T_imu_depth).T
+
+    @cached_property
+    def _across(self) -> FloatArray:
+        return hat(self._twist[:, 3:])
+
+    @cached_property
+    def _R_imu_world(self) -> FloatArray:
+        return self.T_imu_depth[:3, :3] @ np.swapaxes(self.motion.rotation, 1, 2)
+
+
+def motion(spline: Spline, t: FloatArray) -> BodyMotion:
+    """Of a spline at times t (n,) s within it. Raises UserError outside.
+
+    With y = Ad(A_j⁻¹) w_{j−1} and x = Ad(A_j⁻¹) ẇ_{j−1}, both of which Ω_j turns by ad(·) b_j Jr(b_j Ω_j):
+    dw_j = Ad(A_j⁻¹) dw_{j−1} + (b_j ad(y) Jr + ḃ_j) dΩ_j,
+    dẇ_j = Ad(A_j⁻¹) dẇ_{j−1} + (b_j ad(x) Jr + ḃ_j ad(w_j) + b̈_j) dΩ_j − ḃ_j ad(Ω_j) dw_j.
+    The pose's right increment likewise: e_j = Ad(A_j⁻¹) e_{j−1} + b_j Jr dΩ_j, from e_0 = Ad(T_0⁻¹) δ_0.
+    """
+    segment, u = spline.locate(t)
+    held, n = segment - spline.first, len(u)
+    p = powers(u, 4)
+    b, db, ddb = (p @ basis / spline.dt**k for k, basis in enumerate(_BASES))
+    three = held[:, None] + np.arange(3)
+    omega = spline.increments[three]
+    parts = b[..., None] * omega
+    A, ad = se3.exp(parts), se3.ad(omega)
+    turned = b[..., None, None] * se3.right_jacobian(parts)
+    back = se3.adjoint(se3.inverse(A))
+    T = spline.control_points[held]
+    state = np.zeros((n, 6, 2))  # w and ẇ
+    by = np.zeros((n, 6, 60))  # of w and ẇ by Ω_1..Ω_3, of e by those and by δ_0
+    by[:, :, 54:] = se3.adjoint(se3.inverse(T))
+    one = np.eye(6)
+    for j in range(3):
+        bj, bbj = db[:, j, None, None], ddb[:, j, None, None]
+        state, by = back[:, j] @ state, back[:, j] @ by
+        pushed = bj[..., 0] * omega[:, j]
+        # Of y, x and w_j = y + ḃ_j Ω_j at once: a call costs more than the numbers.
+        ad_y, ad_x, ad_w = se3.ad(np.stack([state[..., 0], state[..., 1], state[..., 0] + pushed]))
+        state[..., 0] += pushed
+        state[..., 1] += ((bj * ad_w + bbj * one) @ omega[:, j, :, None])[..., 0]
+        own = 6 * j
+        by[:, :, own : own + 6] += ad_y @ turned[:, j] + bj * one
+        by[:, :, 18:36] -= bj * (ad[:, j] @ by[:, :, :18])
+        by[:, :, 18 + own : 24 + own] += ad_x @ turned[:, j] + bj * ad_w + bbj * one
+        by[:, :, 36 + own : 42 + own] += turned[:, j]
+        T = T @ A[:, j]
+    R = T[:, :3, :3]
+    by[:, 3:, 36:] = R @ by[:, 3:, 36:]
+    # Twist, rate and turn, one below the other: a call costs more than the numbers.
+    rows = np.concatenate([by[:, :, :18], by[:, :, 18:36], by[:, 3:, 36:54]], axis=1)
+    points = _by_points(rows, spline.left_gains[three])
+    points[:, 12:, :6] += by[:, 3:, 54:]
+    return BodyMotion(segment, R, state[..., 0], state[..., 1], points[:, :6], points[:, 6:12], points[:, 12:])
+
+
+def _by_points(by_increments: FloatArray, gains: FloatArray) -> FloatArray:
+    """From Ω_1..Ω_3 (n, k, 18) to the four control points (n, k, 24): dΩ_j = G_j (δ_j − δ_{j−1})."""
+    out = np.zeros((*by_increments.shape[:2], 24))
+    for j in range(3):
+        part = by_increments[:, :, 6 * j : 6 * j + 6] @ gains[:, j]
+        out[:, :, 6 * j : 6 * j + 6] -= part
+        out[:, :, 6 * j + 6 : 6 * j + 12] += part
+    return out
