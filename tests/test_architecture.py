@@ -29,10 +29,10 @@ WITHOUT_ENGINE = (
     "rsgen.sequence.trajectory", "rsgen.motion.fit", "rsgen.motion.fit_summary", "rsgen.device.backend",
     "rsgen.console.scheduler", "rsgen.produce.distribute", "rsgen.produce.generate", "rsgen.produce.frame_source",
     "rsgen.pictures.frames", "rsgen.cli.main", "rsgen.motion.make", "rsgen.sensors.color", "rsgen.sensors.depth",
-    "rsgen.sensors.imu", "rsgen.config.sections", "rsgen.formats.export.folders.kalibr",
-    "rsgen.formats.export.folders.euroc", "rsgen.formats.export.folders.registered",
-    "rsgen.formats.export.viewing.video", "rsgen.formats.export.bags.ros",
-    "rsgen.formats.export.reconstruction.colmap", "rsgen.formats.export.reconstruction.nerfstudio",
+    "rsgen.sensors.imu", "rsgen.config.sections", "rsgen.formats.export.kalibr",
+    "rsgen.formats.export.euroc", "rsgen.formats.export.registered",
+    "rsgen.formats.export.video", "rsgen.formats.export.ros",
+    "rsgen.formats.export.colmap", "rsgen.formats.export.nerfstudio",
 )  # fmt: skip
 CONFIGS = sorted(path for path in (ROOT / "configs").glob("*.yaml") if path.stem not in ("evaluation", "readout_sweep"))
 

@@ -10,8 +10,9 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from itertools import groupby
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 from rsgen.cli.pack import pack
 from rsgen.cli.pictures import SequenceFolder, compare, picture, preview
@@ -20,10 +21,8 @@ from rsgen.console.command_line import Commands, Frames, Json, Parser, Quiet, pr
 from rsgen.console.configs import ConfigFile, config_file, configs_text
 from rsgen.console.scheduler import Scheduler, open_workers
 from rsgen.errors import UserError
+from rsgen.formats import EXPORTS, IMPORTS, exporter
 
-Export = Literal[
-    "kalibr", "euroc", "registered", "ros1", "ros2", "mcap", "colmap", "nerfstudio", "ncore", "video", "rerun"
-]  # fmt: skip
 Storage = Literal["sqlite3", "mcap"]
 _DESCRIPTION = """\
 rsgen makes rolling-shutter RGB-D benchmark sequences with exact continuous-time ground truth.
@@ -230,7 +229,7 @@ def suggest(
 
 
 def import_scene(
-    file: Annotated[Path, "USD (.usd .usda .usdc .usdz), Blender (.blend) or mesh file (.glb .gltf .obj .ply .stl)"],
+    file: Annotated[Path, f"file of USD, Blender or meshes: {' '.join(IMPORTS)}"],
     out: Annotated[Path, "folder of the scene"],
     *,
     force: Annotated[bool, "replace the folder if it is there"] = False,
@@ -270,16 +269,19 @@ def verify(
     return 0 if found.ok else 1
 
 
+def _export_name(word: str) -> str:
+    if word not in EXPORTS:
+        raise argparse.ArgumentTypeError(f"invalid choice: '{word}' (choose from {', '.join(EXPORTS)})")
+    return word
+
+
+def _export_help() -> str:
+    by_help = groupby(EXPORTS, lambda name: EXPORTS[name][2])
+    return "; ".join(f"{', '.join(names)}: {text}" for text, names in by_help)
+
+
 def export(
-    to: Annotated[
-        Export,
-        "kalibr: camchain.yaml with line_delay, imu.yaml, with a target also target.yaml and images; euroc: mav0/ "
-        "(ASL); registered: TUM folder with depth warped into the colour camera, its rows' times lost; ros1, ros2, "
-        "mcap: a bag with images, IMU, tf and the lines' times; colmap: text model and images; nerfstudio: "
-        "transforms.json with poses and velocities for rolling-shutter splatting; ncore: NVIDIA's format, "
-        "poses for every line; video: global beside rolling shutter (.mp4); rerun: .rrd recording",
-        "|".join(get_args(Export)),
-    ],
+    to: Annotated[str, _export_help(), "|".join(EXPORTS), _export_name],
     sequence: SequenceFolder,
     *,
     out: Annotated[Path | None, "where to (default: within the sequence's folder)", "PATH"] = None,
@@ -290,10 +292,14 @@ def export(
 ) -> int:
     """Write a sequence in the layout of other tools."""
     from rsgen.console.progress import ProgressDisplay
-    from rsgen.formats.export.all import export as write
+    from rsgen.formats.export.folder import ExportOptions
+    from rsgen.sequence.reader import read_sequence
 
+    options = ExportOptions(to, copy, scene, storage)
     with ProgressDisplay(quiet) as progress:
-        done = write(to, sequence, out, copy, scene, storage, progress)
+        recorded = read_sequence(sequence)
+        place = sequence / EXPORTS[to][1].format(recorded.name)
+        done = exporter(to)(recorded, out or place, options, progress)
     print(done)
     return 0
 

@@ -1,4 +1,4 @@
-"""What the exports share: a fresh folder, linked images, and a camera in other tools' terms."""
+"""What the exports share: options, a fresh folder or file, linked images, aligned depth, lens coefficients."""
 
 from __future__ import annotations
 
@@ -7,20 +7,59 @@ import os
 from collections.abc import Sequence as Items
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
+
+import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, read_bytes, write_error
 from rsgen.geometry.camera import Camera
-from rsgen.geometry.shutter import Shutter
+from rsgen.image_codecs import encode_png
+from rsgen.produce.writer import quantise
+from rsgen.sensors.depth import register_depth
 from rsgen.sequence.reader import Sequence, Stream
 
+Storage = Literal["sqlite3", "mcap"]
 EPOCH_S = 1_000_000_000
 """Added to stamps that are file names: all have 19 digits then, as EuRoC's have, and sort by time."""
 
 # What a hard link fails with where a copy would do: another disk, a file system without links, too many of them.
 _NO_LINK = (errno.EXDEV, errno.EPERM, errno.ENOTSUP, errno.EMLINK, errno.EACCES, errno.ENOSYS)
+
+
+NO_DEPTH = "nothing.png"
+"""All zeros: for colour images that no depth image was taken with."""
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """What a user may choose; an export ignores what does not concern it.
+
+    name: of the export, for a module that handles several. copy: images, rather than linking them. scene: for the
+    video, which renders again. storage: of a ROS 2 bag.
+    """
+
+    name: str = ""
+    copy: bool = False
+    scene: Path | None = None
+    storage: Storage = "sqlite3"
+
+
+DEFAULTS = ExportOptions()
+
+
+def new_file(out: Path, what: str, suffixes: Items[str]) -> Path:
+    """The path `out` of `what`, to be written. Raises UserError if it is there, named otherwise, or has no folder."""
+    out = Path(out)
+    if suffixes and out.suffix.lower() not in suffixes:
+        raise UserError(f"{out}: {what} is named {' or '.join(suffixes)}: choose another --out")
+    if out.exists():
+        raise UserError(f"{out}: is there already: choose another --out or delete it")
+    if not out.parent.is_dir():
+        raise UserError(f"{out.parent}: no such folder: make it or choose another --out")
+    return out
 
 
 def new_folder(out: Path) -> Path:
@@ -80,27 +119,6 @@ def image_streams(sequence: Sequence) -> tuple[tuple[Stream, FloatArray], tuple[
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class RowClock:
-    """When image row v is exposed: mid-exposure at stamp + first_s + v · delay_s; delay_s < 0 from bottom to top."""
-
-    first_s: float
-    delay_s: float
-
-
-def row_clock(name: str, camera: Camera, shutter: Shutter) -> RowClock:
-    """The rows' times of a camera called `name`. Raises UserError for one that is read column by column."""
-    if shutter.readout_s == 0.0:
-        return RowClock(-0.5 * shutter.exposure_s, 0.0)
-    if not shutter.by_rows:
-        raise UserError(
-            f"{name}: scan {shutter.scan} reads columns, but a line_delay belongs to rows: render with top-bottom"
-        )
-    rows = [[0.0, 0.0], [0.0, 1.0]]
-    first, second = shutter.line_mid_time(0.0, shutter.line_of_pixel(rows, camera), camera)
-    return RowClock(float(first), float(second - first))
-
-
 def four_coefficients(name: str, camera: Camera) -> list[float]:
     """Distortion as the four numbers that Kalibr and EuRoC have; zeros (of radtan) for a pinhole. Raises UserError."""
     if camera.model == "pinhole":
@@ -114,3 +132,38 @@ def four_coefficients(name: str, camera: Camera) -> list[float]:
             f"render with k{number} = 0 or use a fisheye model"
         )
     return list(camera.distortion[:4])
+
+
+def aligned_depth(
+    sequence: Sequence, folder: Path, copy: bool, progress: Progress, share: tuple[float, float]
+) -> list[str]:
+    """Write depth images into `folder`, 16-bit in the sequence's units; returns the file name for each colour image.
+
+    Of each colour image the depth image that is nearest in time, within half a period of the slower stream. Links (or
+    copies with `copy`) where depth has the colour camera's pixels: registered, or one camera for both; else warped by
+    geometry alone, as `export registered` does. share: of the whole export's progress. Raises UserError.
+    """
+    color, depth = sequence.streams["color"], sequence.streams["depth"]
+    nearest = np.abs(depth.stamps - color.stamps[:, None]).argmin(axis=1)
+    apart = np.abs(depth.stamps[nearest] - color.stamps)
+    paired = apart <= 0.5 / min(color.rate_hz, depth.rate_hz)
+    used = np.unique(nearest[paired])
+    sources = [depth.paths[i] for i in used]
+    if has_color_pixels(sequence):
+        place_images(sources, [folder / path.name for path in sources], copy, progress, share)
+    else:
+        rays = depth.camera.unproject(depth.camera.pixel_grid())
+        for count, i in enumerate(used, 1):
+            z = register_depth(rays, sequence.depth(int(i)), color.camera, sequence.T_color_depth)
+            atomic_write(folder / depth.paths[i].name, encode_png(quantise(z, depth.depth_scale)))
+            progress("export", share[0] + (share[1] - share[0]) * count / len(used), depth.paths[i].name)
+    if not paired.all():
+        atomic_write(folder / NO_DEPTH, encode_png(np.zeros((color.camera.height, color.camera.width), np.uint16)))
+    return [depth.paths[i].name if found else NO_DEPTH for i, found in zip(nearest, paired, strict=True)]
+
+
+def has_color_pixels(sequence: Sequence) -> bool:
+    """Whether the images in depth/ are in the colour camera's pixels."""
+    color, depth = sequence.streams["color"], sequence.streams["depth"]
+    one_camera = color.camera == depth.camera and bool((sequence.T_color_depth == np.eye(4)).all())
+    return depth.registered or one_camera

@@ -7,13 +7,19 @@ inside it meet its surfaces from behind.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rsgen.array_types import BoolArray, FloatArray, IntArray
+from rsgen.config.sections import SceneLight
 from rsgen.device.arrays import aligned
+from rsgen.errors import UserError
+from rsgen.formats.meshes.parts import Part
+from rsgen.render.meshes import joined_triangles, ply_bytes
 
 SKY = 0.8  # radiance
 _IRRADIANCE = 2.5  # of lamps on a floor, were all their light to reach it: about what the sky gives in the open
@@ -86,3 +92,29 @@ class Probe:
 
         distance, normal = cast_rays(self._scene, origins, directions)
         return distance, np.isfinite(distance) & (np.einsum("ij,ij->i", normal, directions) < 0)
+
+
+def light_shapes(mi: Any, path: Path, parts: Sequence[Part], light: SceneLight, folder: Path) -> dict[str, Any]:
+    """Entries of a scene dictionary for the light that parts get, whose lamps' meshes go into `folder`.
+
+    Raises UserError if lamps are asked for where there is no ceiling.
+    """
+    if light == "none":
+        return {}
+    probe = Probe(mi, *joined_triangles([part.vertices for part in parts], [part.faces for part in parts]))
+    is_room = light == "ceiling" or (light == "auto" and probe.encloses())
+    lamps = probe.lamps() if is_room else None
+    if lamps is None and light == "ceiling":
+        raise UserError(f"scene {path}: has no ceiling over its middle to put lamps under: set scene.light to sky")
+    if lamps is None:
+        return {"sky": {"type": "constant", "radiance": {"type": "rgb", "value": SKY}}}
+    shapes: dict[str, Any] = {}
+    for number, corners in enumerate(lamps.corners):
+        file = folder / f"lamp{number}.ply"
+        file.write_bytes(ply_bytes(corners, np.array([[0, 1, 2], [0, 2, 3]])))
+        radiance = {"type": "rgb", "value": lamps.radiance}
+        shapes[f"lamp{number:05}"] = {
+            "type": "ply", "filename": str(file), "face_normals": True, "bsdf": {"type": "diffuse"},
+            "emitter": {"type": "area", "radiance": radiance},
+        }  # fmt: skip
+    return shapes

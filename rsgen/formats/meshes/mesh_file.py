@@ -18,25 +18,26 @@ import numpy as np
 import trimesh
 from PIL import Image
 
+from rsgen import srgb
 from rsgen.array_types import FloatArray
-from rsgen.config.sections import SceneLight
 from rsgen.errors import UserError
 from rsgen.formats.meshes import gltf
-from rsgen.formats.meshes.cutout import Mask, cut_away
-from rsgen.formats.meshes.default_light import SKY, Probe
-from rsgen.formats.meshes.mesh_visual import Looks, Part, joined
+from rsgen.formats.meshes.default_light import light_shapes
+from rsgen.formats.meshes.parts import Part, finished, placed
 from rsgen.inputs import check_input
-from rsgen.limits import MOST_M
 from rsgen.render.file_names import located
-from rsgen.render.material import bsdf, emitter
-from rsgen.render.meshes import joined_triangles, ply_bytes
+from rsgen.render.material import Material, Texture, bsdf, emitter
+from rsgen.render.meshes import ply_bytes
 from rsgen.render.placement import SceneOptions, world_from_file
 
 log = logging.getLogger("rsgen")
 
 # Raise when files are read in another way, so that light baked for the older one is not taken for the new one's.
 _READING = 1
-_USUAL_M = (0.02, 300.0)  # sizes outside are rather wrong units
+_GREY = Material()
+_WHITE = Material(color=np.ones(3))
+_BLENDED = 0.5  # cover from which a blended surface counts as there
+_RENDERED = {"KHR_materials_unlit", "KHR_materials_emissive_strength", "KHR_materials_pbrSpecularGlossiness"}
 
 
 def read_parts(path: Path, options: SceneOptions) -> list[Part]:
@@ -67,30 +68,6 @@ def read_parts(path: Path, options: SceneOptions) -> list[Part]:
     return finished(path, parts)
 
 
-def placed(path: Path, name: str, part: Part, T_world_part: FloatArray) -> Part:
-    """A part of `path`, called `name` there, moved into the world by any affine map. Raises UserError."""
-    if not (np.isfinite(part.vertices).all() and np.isfinite(T_world_part).all()):
-        raise UserError(f"scene {path}: '{name}' has vertices that are not finite: mend it and export it again")
-    return _moved(part, T_world_part)
-
-
-def finished(path: Path, parts: Sequence[Part]) -> list[Part]:
-    """Parts in the world, those alike as one, without triangles of no area and what masks hide. Raises UserError."""
-    left, dropped = [], 0
-    for part in parts:
-        part, without_area = _solid(part)
-        dropped += without_area
-        if len(part.faces):
-            left.append(_cut(part))
-    if dropped:
-        log.info("scene %s: %d triangles without area left out", path, dropped)
-    left = _merged([part for part in left if len(part.faces)])
-    if not left:
-        raise UserError(f"scene {path}: holds no triangles that could be seen: export a mesh, with faces of some area")
-    _check_size(path, left)
-    return left
-
-
 def scene_dict(mi: Any, path: Path, scratch: Path, options: SceneOptions) -> dict[str, Any]:
     """Scene dictionary of a mesh file and of the light that it gets; files go into `scratch`."""
     parts = read_parts(path, options)
@@ -111,32 +88,6 @@ def part_shapes(mi: Any, parts: Sequence[Part], folder: Path) -> dict[str, Any]:
         if (light := emitter(mi, part.material)) is not None:
             shape["emitter"] = light
         shapes[f"part{number:05}"] = shape
-    return shapes
-
-
-def light_shapes(mi: Any, path: Path, parts: Sequence[Part], light: SceneLight, folder: Path) -> dict[str, Any]:
-    """Entries of a scene dictionary for the light that parts get, whose lamps' meshes go into `folder`.
-
-    Raises UserError if lamps are asked for where there is no ceiling.
-    """
-    if light == "none":
-        return {}
-    probe = Probe(mi, *joined_triangles([part.vertices for part in parts], [part.faces for part in parts]))
-    is_room = light == "ceiling" or (light == "auto" and probe.encloses())
-    lamps = probe.lamps() if is_room else None
-    if lamps is None and light == "ceiling":
-        raise UserError(f"scene {path}: has no ceiling over its middle to put lamps under: set scene.light to sky")
-    if lamps is None:
-        return {"sky": {"type": "constant", "radiance": {"type": "rgb", "value": SKY}}}
-    shapes: dict[str, Any] = {}
-    for number, corners in enumerate(lamps.corners):
-        file = folder / f"lamp{number}.ply"
-        file.write_bytes(ply_bytes(corners, np.array([[0, 1, 2], [0, 2, 3]])))
-        radiance = {"type": "rgb", "value": lamps.radiance}
-        shapes[f"lamp{number:05}"] = {
-            "type": "ply", "filename": str(file), "face_normals": True, "bsdf": {"type": "diffuse"},
-            "emitter": {"type": "area", "radiance": radiance},
-        }  # fmt: skip
     return shapes
 
 
@@ -190,68 +141,145 @@ def _refuse_unreadable_texture(path: Path, name: str, data: bytes) -> None:
         raise UserError(f"scene {path}: texture '{name}' cannot be read: make it a PNG or a JPEG") from None
 
 
-def _moved(part: Part, T: FloatArray) -> Part:
-    A = T[:3, :3]
-    normals, faces = part.normals, part.faces
-    if normals is not None:
-        # The cofactors: what the inverse's transpose is but for its length, and defined where there is no inverse.
-        cofactors = np.stack([np.cross(A[1], A[2]), np.cross(A[2], A[0]), np.cross(A[0], A[1])])
-        normals = normals @ cofactors.T * np.sign(np.linalg.det(A))
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        normals = normals / length if np.isfinite(length).all() and length.all() else None
-    if np.linalg.det(A) < 0:
-        faces = faces[:, ::-1]
-    return replace(part, vertices=part.vertices @ A.T + T[:3, 3], normals=normals, faces=faces)
+class Looks:
+    """Parts of one file as trimesh's meshes say they look; each material is made once."""
+
+    def __init__(self, path: Path, header: dict[str, Any] | None) -> None:
+        """header: glTF's JSON, as `gltf.for_trimesh` left it; None for other files."""
+        self._path, self._header = path, header
+        # By identity, and with what they were made of, so that no number is used again.
+        self._made: dict[tuple[int, bool], tuple[Any, Material]] = {}
+        self._pixels: dict[int, tuple[Any, Any]] = {}
+        if header is not None:
+            self._warn_of_extensions(header)
+
+    def part(self, mesh: Any, name: str) -> Part:
+        """The mesh, called `name`, in its own frame. Raises UserError."""
+        vertices, faces = np.array(mesh.vertices, float), np.array(mesh.faces, np.int64)
+        if faces.min() < 0 or faces.max() >= len(vertices):
+            raise UserError(f"scene {self._path}: '{name}' has faces without vertices: export it again")
+        part, visual = Part(vertices, faces, _GREY, given_normals(mesh)), mesh.visual
+        if not isinstance(visual, trimesh.visual.TextureVisuals):
+            if visual.kind == "vertex":
+                return replace(part, material=_WHITE, vertex_colors=from_srgb(visual.vertex_colors))
+            if visual.kind == "face":
+                return replace(part, material=_WHITE, face_colors=from_srgb(visual.face_colors))
+            return part
+        if visual.uv is not None and len(visual.uv) == len(vertices):
+            # trimesh's v runs up. Mitsuba's runs down, as glTF's does.
+            uv = np.nan_to_num(np.array(visual.uv, float)[:, :2] * [1, -1] + [0, 1])
+            part = replace(part, uv=np.clip(uv, -1e5, 1e5))
+        part = replace(part, material=self._material(visual.material, part.uv is not None))
+        return self._with_factors(part, visual.vertex_attributes.get("color"), name)
+
+    def _with_factors(self, part: Part, factors: Any, name: str) -> Part:
+        """A part with glTF's vertex colours, which are linear, and factors on the material's."""
+        if factors is None or len(factors) != len(part.vertices):
+            return part
+        values = np.array(factors, float)[:, :3] / (np.iinfo(factors.dtype).max if factors.dtype.kind == "u" else 1.0)
+        if not np.isfinite(values).all():
+            raise UserError(f"scene {self._path}: '{name}' has colours that are not finite: export it again")
+        # A primitive without a material is grey only where it has no colours either.
+        material = _WHITE if part.material is _GREY else part.material
+        if material.color_texture is not None:
+            if np.ptp(values, axis=0).any():
+                log.warning("scene %s: vertex colours of '%s' left out: it has a texture", self._path, name)
+                return part
+            factor = material.color * values[0]
+            return part if (values[0] == 1).all() else replace(part, material=replace(material, color=factor))
+        return replace(part, material=material, vertex_colors=np.clip(values * material.color, 0, 1))
+
+    def _material(self, material: Any, with_uv: bool) -> Material:
+        key = id(material), with_uv
+        if key not in self._made:
+            simple = isinstance(material, trimesh.visual.material.SimpleMaterial)
+            made = self._simple(material) if simple else self._pbr(material)
+            if not with_uv and made is not _GREY:
+                none: dict[str, Any] = dict.fromkeys(
+                    f"{name}_texture" for name in ("color", "metal", "normal", "emission")
+                )
+                made = replace(made, **none)
+            self._made[key] = material, made
+        return self._made[key][1]
+
+    def _simple(self, material: Any) -> Material:
+        """Of an OBJ or a PLY. A texture takes the place of the colour, as most programs that write both mean it."""
+        own = material.kwargs
+        glow = own.get("ke", ())
+        emission = np.array([float(x) for x in glow[:3]]) if len(glow) >= 3 else np.zeros(3)
+        # An image without a format is no file's, but trimesh's own dark grey for coordinates without a texture.
+        if material.image is not None and material.image.format is not None:
+            return Material(np.ones(3), self._texture(material.image, {}), emission=emission)
+        if np.size(own.get("kd")) == 3:
+            return Material(np.array(own["kd"], float), emission=emission)
+        return Material(emission=emission) if emission.any() else _GREY
+
+    def _pbr(self, material: Any) -> Material:
+        json = {} if self._header is None else gltf.material_of(self._header, material.name)
+        if json is None:
+            return _GREY
+        extensions = json.get("extensions", {})
+        factors = {} if "KHR_materials_pbrSpecularGlossiness" in extensions else json.get("pbrMetallicRoughness", {})
+        if "baseColorFactor" in factors:
+            color = np.array(factors["baseColorFactor"], float)
+        elif material.baseColorFactor is not None:
+            color = np.array(material.baseColorFactor, float) / 255
+        else:
+            color = np.ones(4)
+        unlit = "KHR_materials_unlit" in extensions
+        metallic, roughness = (
+            1.0 if f is None else float(f) for f in (material.metallicFactor, material.roughnessFactor)
+        )
+        glow = np.zeros(3) if material.emissiveFactor is None else np.array(material.emissiveFactor, float)
+        strength = extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
+        cutoff = {"MASK": 0.5 if material.alphaCutoff is None else float(material.alphaCutoff), "BLEND": _BLENDED}
+        normal = json.get("normalTexture", {})
+        return Material(
+            color=color[:3],
+            color_texture=self._texture(material.baseColorTexture, factors.get("baseColorTexture", {})),
+            opacity=float(color[3]),
+            cutoff=cutoff.get(str(material.alphaMode)),
+            metallic=0.0 if unlit else metallic,
+            roughness=1.0 if unlit else roughness,
+            metal_texture=None if unlit else self._texture(
+                material.metallicRoughnessTexture, factors.get("metallicRoughnessTexture", {})
+            ),
+            normal_texture=self._texture(material.normalTexture, normal),
+            normal_scale=float(normal.get("scale", 1.0)),
+            emission=glow * float(strength),
+            emission_texture=self._texture(material.emissiveTexture, json.get("emissiveTexture", {})),
+        )  # fmt: skip
+
+    def _texture(self, image: Any, info: dict[str, Any]) -> Texture | None:
+        """A texture of trimesh's image, as glTF's textureInfo says that it is looked up."""
+        if image is None:
+            if info:
+                raise UserError(f"scene {self._path}: a texture of it cannot be read: make it a PNG or a JPEG")
+            return None
+        if id(image) not in self._pixels:
+            try:
+                self._pixels[id(image)] = image, np.asarray(image.convert("RGBA"))
+            except (OSError, ValueError, SyntaxError):  # what Pillow raises on damaged images
+                raise UserError(f"scene {self._path}: a texture of it is damaged: export it again") from None
+        pixels = self._pixels[id(image)][1]
+        return Texture(pixels) if self._header is None else Texture(pixels, *gltf.sampling(self._header, info))
+
+    def _warn_of_extensions(self, header: dict[str, Any]) -> None:
+        used = {name for material in header.get("materials", []) for name in material.get("extensions", {})}
+        if left := sorted(used - _RENDERED):
+            log.warning("scene %s: rendered without %s", self._path, ", ".join(left))
 
 
-def _solid(part: Part) -> tuple[Part, int]:
-    """The part without triangles of no area, as float32 has them, and how many those were."""
-    a, b, c = (part.vertices[part.faces[:, k]].astype(np.float32).astype(float) for k in range(3))
-    edges = np.stack([b - a, c - b, a - c])
-    longest = (edges**2).sum(axis=2).max(axis=0)
-    keep = np.linalg.norm(np.cross(edges[0], edges[1]), axis=1) > 1e-7 * longest
-    colors = None if part.face_colors is None else part.face_colors[keep]
-    return replace(part, faces=part.faces[keep], face_colors=colors), int((~keep).sum())
+def given_normals(mesh: Any) -> FloatArray | None:
+    """The file's own vertex normals; trimesh would make some up, smooth over every edge."""
+    if "vertex_normals" not in mesh._cache.cache:
+        return None
+    normals = np.array(mesh.vertex_normals, float)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    usable = normals.shape == mesh.vertices.shape and np.isfinite(length).all() and length.all()
+    return normals / length if usable else None
 
 
-def _cut(part: Part) -> Part:
-    """What a mask leaves of a part."""
-    material = part.material
-    if material.cutoff is None:
-        return part
-    texture = material.color_texture
-    if texture is None or part.uv is None:
-        return part if material.opacity >= material.cutoff else replace(part, faces=part.faces[:0])
-    alpha = texture.pixels[..., 3] / 255 * material.opacity
-    if texture.wrap == "mirror":
-        alpha = np.block([[alpha, alpha[:, ::-1]], [alpha[::-1], alpha[::-1, ::-1]]])
-    uv = part.uv @ texture.transform[:, :2].T + texture.transform[:, 2]
-    xy = uv * texture.pixels.shape[1::-1] - 0.5
-    carried = [part.vertices, part.uv] + [v for v in (part.normals, part.vertex_colors) if v is not None]
-    mask = Mask(alpha, material.cutoff, texture.wrap != "clamp")
-    rows, faces, source = cut_away(np.concatenate(carried, axis=1), part.faces, xy, mask)
-    columns = np.split(rows, np.cumsum([v.shape[1] for v in carried])[:-1], axis=1)
-    normals = None if part.normals is None else columns[2]
-    colors = None if part.vertex_colors is None else columns[-1]
-    of_faces = None if part.face_colors is None else part.face_colors[source]
-    return _solid(Part(columns[0], faces, material, normals, columns[1], colors, of_faces))[0]
-
-
-def _merged(parts: list[Part]) -> list[Part]:
-    """Parts of the same material as one: light is baked, and kernels are compiled, shape by shape."""
-    alike: dict[tuple[Any, ...], list[Part]] = {}
-    for part in parts:
-        carries = (part.normals, part.uv, part.vertex_colors, part.face_colors)
-        alike.setdefault((id(part.material), *(v is not None for v in carries)), []).append(part)
-    return [joined(same) for same in alike.values()]
-
-
-def _check_size(path: Path, parts: list[Part]) -> None:
-    corners = np.concatenate(
-        [[p.vertices[p.faces].min(axis=(0, 1)), p.vertices[p.faces].max(axis=(0, 1))] for p in parts]
-    )
-    size = float(np.ptp(corners, axis=0).max())
-    if not np.abs(corners).max() <= MOST_M:
-        raise UserError(f"scene {path}: reaches beyond {MOST_M:g} m: set scene.scale to metres per unit of the file")
-    if not _USUAL_M[0] <= size <= _USUAL_M[1]:
-        log.warning("scene %s: is %.3g m across: is scene.scale right, metres per unit of the file?", path, size)
+def from_srgb(colors: Any) -> FloatArray:
+    """Linear colours (n, 3) of trimesh's, bytes in sRGB as PLY and OBJ have them by custom."""
+    return srgb.decode(np.array(colors, float)[:, :3] / 255)

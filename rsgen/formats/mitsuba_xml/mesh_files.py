@@ -18,7 +18,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from rsgen.array_types import FloatArray, IntArray
-from rsgen.formats.meshes.mesh_visual import from_srgb, given_normals
+from rsgen.formats.meshes.mesh_file import from_srgb, given_normals
 from rsgen.formats.polygons import is_convex, triangulated
 from rsgen.render.meshes import joined_triangles, ply_bytes
 

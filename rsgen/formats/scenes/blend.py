@@ -21,8 +21,6 @@ from rsgen.formats.meshes.mesh_file import read_parts
 from rsgen.formats.scenes.content import Content, Lamp
 from rsgen.render.placement import SceneOptions, world_from_file
 
-BLEND = ".blend"
-
 _INSTALL = "install it with: pip install 'rolling-shutter-rgbd[blender]' (Python 3.11)"
 _LONGEST_S = 1800
 # Blender's z is up, in GLB y is: (x, y, z) becomes (x, z, -y).
@@ -37,7 +35,7 @@ def check_installed() -> None:
         raise UserError(f".blend files need Blender's Python module bpy, which is not installed: {_INSTALL}")
 
 
-def read_blend(path: Path, scale: float | None, up: Any) -> Content:
+def read_content(path: Path, scale: float | None, up: Any) -> Content:
     """All of a Blender file that its render shows. scale: metres per unit; None: the file's own. up: of the file, y
     standing for Blender's z; None: that.
 

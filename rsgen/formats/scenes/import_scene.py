@@ -10,16 +10,12 @@ import numpy as np
 from rsgen.config.sections import Up
 from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
+from rsgen.formats import IMPORTS, scene_importer
 from rsgen.formats.meshes.mesh_file import finished, light_shapes, part_shapes, read_parts
-from rsgen.formats.scenes import usd_stage
-from rsgen.formats.scenes.blend import BLEND, read_blend
-from rsgen.formats.scenes.content import Content
+from rsgen.formats.scenes.content import Content, lamp_shapes
 from rsgen.formats.scenes.folder import NAME, write_folder, write_scene
-from rsgen.formats.scenes.lamps import lamp_shapes
 from rsgen.inputs import check_input
 from rsgen.render.placement import SceneOptions
-
-MESH_FILES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 
 
 @dataclass(frozen=True)
@@ -41,26 +37,18 @@ def import_scene(
     where the package that reads them is missing, and for folders that cannot be written; nothing is written then.
     """
     suffix = file.suffix.lower()
-    if suffix not in (*usd_stage.SUFFIXES, BLEND, *MESH_FILES):
-        kinds = " ".join((*usd_stage.SUFFIXES, BLEND, *MESH_FILES))
-        hint = ": name it in scene.file as it is" if suffix == ".xml" else f": of these kinds are read: {kinds}"
+    if suffix not in IMPORTS:
+        kinds = ": of these kinds are read: " + " ".join(IMPORTS)
+        hint = ": name it in scene.file as it is" if suffix == ".xml" else kinds
         raise UserError(f"scene {file}: is no file to import{hint}")
     if not file.is_file():
         raise UserError(f"scene {file}: no such file")
-    if not _is_mapped(file):
-        check_input(file)
     found, notes = write_folder(out, force, lambda folder: _fill(file, folder, scale, up))
     return Imported(out / NAME, found, notes)
 
 
-def _is_mapped(file: Path) -> bool:
-    """Whether no reader takes the whole file into memory: binary USD, and .blend, which Blender reads."""
-    with file.open("rb") as opened:
-        return file.suffix.lower() in (".usdz", BLEND) or opened.read(8) == b"PXR-USDC"
-
-
 def _fill(file: Path, folder: Path, scale: float | None, up: Up | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    content = _content(file, scale, up)
+    content: Content = scene_importer(file.suffix).read_content(file, scale, up)
     mi = mitsuba()
     parts = finished(file, content.parts)
     lights, remarks = lamp_shapes(content.lamps, folder)
@@ -81,11 +69,8 @@ def _fill(file: Path, folder: Path, scale: float | None, up: Up | None) -> tuple
     return found, tuple(notes)
 
 
-def _content(file: Path, scale: float | None, up: Up | None) -> Content:
-    suffix = file.suffix.lower()
-    if suffix in usd_stage.SUFFIXES:
-        return usd_stage.read_usd(file, scale, up)
-    if suffix == BLEND:
-        return read_blend(file, scale, up)
-    parts = read_parts(file, SceneOptions(scale or 1.0, up or "y"))
+def read_content(path: Path, scale: float | None, up: Up | None) -> Content:
+    """The parts of a mesh file. Raises UserError."""
+    check_input(path)
+    parts = read_parts(path, SceneOptions(scale or 1.0, up or "y"))
     return Content(parts, [], ["scene.file of a config takes a mesh file as it is, too"])

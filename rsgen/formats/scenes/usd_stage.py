@@ -15,15 +15,13 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
-from rsgen.formats.meshes.mesh_file import placed
-from rsgen.formats.meshes.mesh_visual import Part
+from rsgen.formats.meshes.parts import Part, placed
 from rsgen.formats.scenes import usd_light
 from rsgen.formats.scenes.content import MOST_TRIANGLES, Content, Lamp, Notes
 from rsgen.formats.scenes.usd_material import UNBOUND, Looks
 from rsgen.formats.scenes.usd_mesh import SOLIDS, mesh_surface, parts, smooth_normals, solid
+from rsgen.inputs import check_input
 from rsgen.render.placement import SceneOptions, world_from_file
-
-SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 
 _INSTALL = "install it with: pip install 'rolling-shutter-rgbd[usd]'"
 _HIDDEN = ("proxy", "guide")
@@ -37,7 +35,7 @@ def check_installed() -> None:
         raise UserError(f"USD files need the package usd-core, which is not installed: {_INSTALL}")
 
 
-def read_usd(path: Path, scale: float | None, up: str | None) -> Content:
+def read_content(path: Path, scale: float | None, up: str | None) -> Content:
     """All of the stage at `path`. scale: metres per unit, up: axis of the file; None: what it says of itself.
 
     Raises UserError for a file that is no USD, is damaged or holds no surface.
@@ -45,6 +43,8 @@ def read_usd(path: Path, scale: float | None, up: str | None) -> Content:
     check_installed()
     from pxr import Tf, Usd, UsdGeom, UsdUtils
 
+    if not _is_mapped(path):
+        check_input(path)
     _check_nesting(path)
     notes = Notes()
     messages = UsdUtils.CoalescingDiagnosticDelegate()  # else they would be printed
@@ -262,6 +262,12 @@ def _normals(prim: Any, mesh: Any, time: Any, surface: Any) -> FloatArray | None
     if at is None or length is None or not (np.isfinite(length).all() and length.all()):
         return None
     return np.asarray(at / length)
+
+
+def _is_mapped(path: Path) -> bool:
+    """Whether USD does not take the whole file into memory: it is binary or a package."""
+    with path.open("rb") as file:
+        return path.suffix.lower() == ".usdz" or file.read(8) == b"PXR-USDC"
 
 
 def _check_nesting(path: Path) -> None:

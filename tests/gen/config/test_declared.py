@@ -17,9 +17,9 @@ from rsgen.check.verify import verify_sequence
 from rsgen.cli.main import main
 from rsgen.config.config import Config, load_config
 from rsgen.errors import UserError
-from rsgen.formats.export.folders.euroc import export_euroc
-from rsgen.formats.export.folders.kalibr import export_kalibr
-from rsgen.formats.export.folders.registered import export_registered
+from rsgen.formats.export.euroc import export_euroc
+from rsgen.formats.export.kalibr import export_kalibr
+from rsgen.formats.export.registered import export_registered
 from rsgen.geometry import se3
 from rsgen.sequence.camera_yaml import TRUE_CAMERAS
 from rsgen.sequence.reader import read_sequence, sequence_info

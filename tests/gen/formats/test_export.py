@@ -19,10 +19,10 @@ from rsgen.config.config import Config
 from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
 from rsgen.formats.export import folder
+from rsgen.formats.export.euroc import export_euroc
 from rsgen.formats.export.folder import place_images
-from rsgen.formats.export.folders.euroc import export_euroc
-from rsgen.formats.export.folders.kalibr import export_kalibr
-from rsgen.formats.export.folders.registered import export_registered
+from rsgen.formats.export.kalibr import export_kalibr
+from rsgen.formats.export.registered import export_registered
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.sensors.imu import exact_imu
@@ -146,10 +146,7 @@ def test_the_exported_imu_is_that_of_the_sequences_own_file(tmp_path: Path) -> N
 
 
 def test_the_exports_load_no_engine() -> None:
-    names = [
-        f"rsgen.formats.export.{name}"
-        for name in ("folders.kalibr", "folders.euroc", "folders.registered", "viewing.video", "viewing.rerun")
-    ]
+    names = [f"rsgen.formats.export.{name}" for name in ("kalibr", "euroc", "registered", "video", "rerun")]
     modules = ", ".join(["sys", "rsgen.sensors.imu", *names])
     code = f"import {modules}; print(*({{'mitsuba', 'drjit', 'rerun'}} & set(sys.modules)))"
     root = Path(__file__).parents[3]

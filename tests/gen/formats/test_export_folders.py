@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 from shutter_reference import line_window
 
 from rsgen.errors import UserError
-from rsgen.formats.export.folder import row_clock
-from rsgen.formats.export.folders.euroc import export_euroc
-from rsgen.formats.export.folders.kalibr import export_kalibr
-from rsgen.formats.export.folders.registered import export_registered
+from rsgen.formats.export.euroc import export_euroc
+from rsgen.formats.export.folder import ExportOptions
+from rsgen.formats.export.kalibr import export_kalibr, row_clock
+from rsgen.formats.export.registered import export_registered
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter
@@ -191,7 +191,9 @@ def test_eurocs_sensors_stand_where_they_are(sequence: Sequence, mav0: Path) -> 
 
 def test_euroc_without_an_imu_and_with_copies(plain: Sequence, tmp_path: Path) -> None:
     stages: list[float] = []
-    message = export_euroc(plain, tmp_path, copy=True, progress=lambda stage, done, note: stages.append(done))
+    message = export_euroc(
+        plain, tmp_path, ExportOptions(copy=True), progress=lambda stage, done, note: stages.append(done)
+    )
     assert "no IMU" in message and stages == sorted(stages) and stages[-1] == 1.0
     assert not (tmp_path / "mav0/imu0").exists()
     trajectory = file_interface.read_euroc_csv_trajectory(str(tmp_path / "mav0/state_groundtruth_estimate0/data.csv"))

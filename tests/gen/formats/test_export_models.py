@@ -15,10 +15,10 @@ import trimesh
 from scipy.spatial.transform import Rotation, Slerp
 
 from rsgen.errors import UserError
-from rsgen.formats.export.poses.approximation import Loss, sightings
-from rsgen.formats.export.reconstruction.aligned import NOTHING
-from rsgen.formats.export.reconstruction.colmap import camera_line, export_colmap
-from rsgen.formats.export.reconstruction.nerfstudio import export_nerfstudio, ngp_rolling_shutter
+from rsgen.formats.export.colmap import camera_line, export_colmap
+from rsgen.formats.export.folder import NO_DEPTH, ExportOptions
+from rsgen.formats.export.nerfstudio import export_nerfstudio, ngp_rolling_shutter
+from rsgen.formats.export.poses import Loss, sightings
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter
@@ -329,7 +329,7 @@ def test_depth_in_the_colour_camera_s_pixels_is_linked_and_its_absence_is_zeros(
     assert data["shutter_type"] == "ROLLING_BOTTOM_TO_TOP" and "rolling_shutter_time" not in data
     assert not any("camera_linear_velocity" in frame for frame in data["frames"])
     first, last = data["frames"][0]["depth_file_path"], data["frames"][3]["depth_file_path"]
-    assert first == f"depth/{NOTHING}" and not read_png(tmp_path / "out" / first, (48, 64), np.uint16).any()
+    assert first == f"depth/{NO_DEPTH}" and not read_png(tmp_path / "out" / first, (48, 64), np.uint16).any()
     assert last == "depth/000000.png" and (tmp_path / "out" / last).samefile(depth.paths[0])
     # The start is what is read first, at the bottom.
     for name, row in (("_start", 47.0), ("_end", 0.0)):
@@ -375,7 +375,7 @@ def test_a_folder_in_use_is_refused_and_images_can_be_copies(sequence: Sequence,
     for write in (export_colmap, export_nerfstudio):
         with pytest.raises(UserError, match="is not empty"):
             write(sequence, colmap)
-    export_colmap(sequence, tmp_path / "copy", copy=True)
+    export_colmap(sequence, tmp_path / "copy", ExportOptions(copy=True))
     file = sequence.streams["color"].paths[0]
     assert not (tmp_path / "copy/images" / file.name).samefile(file)
     assert (colmap / "images" / file.name).samefile(file)

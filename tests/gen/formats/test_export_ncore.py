@@ -11,10 +11,10 @@ import pytest
 import synthetic
 
 from rsgen.errors import UserError
+from rsgen.formats.export import poses
 from rsgen.formats.export.folder import EPOCH_S
-from rsgen.formats.export.poses import approximation
-from rsgen.formats.export.poses.approximation import Sightings, sightings
-from rsgen.formats.export.reconstruction.ncore import ENDS, export_ncore, frame_times_us
+from rsgen.formats.export.ncore import ENDS, export_ncore, frame_times_us
+from rsgen.formats.export.poses import Sightings, sightings
 from rsgen.sequence.reader import Sequence, read_sequence
 
 LENSES: dict[str, list[float]] = {
@@ -55,7 +55,7 @@ def test_every_line_is_where_the_library_looks_for_it(
     np.testing.assert_array_equal(units, sequence.depth_units(1))
 
     # Scene points, at the time that the library gives the line on which each is seen.
-    monkeypatch.setattr(approximation, "_COLUMNS", 64)
+    monkeypatch.setattr(poses, "_COLUMNS", 64)
     seen, times = sightings(sequence), camera.frames_timestamps_us.astype(float)
     line = color.shutter.line_of_pixel(seen.uv, color.camera)
     # Half of the first line's pixels, and of the last's, are beyond their middle: no image is taken then.

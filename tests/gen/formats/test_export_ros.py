@@ -16,9 +16,9 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation, Slerp
 
 from rsgen.errors import UserError
-from rsgen.formats.export.bags import bag
-from rsgen.formats.export.bags.bag import Kind, Storage
-from rsgen.formats.export.bags.ros import export_ros, loss_of_tf
+from rsgen.formats.export import bag
+from rsgen.formats.export.folder import ExportOptions, Storage
+from rsgen.formats.export.ros import export_ros, loss_of_tf
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.spline import Spline
@@ -26,7 +26,7 @@ from rsgen.sequence.format import ground_truth, poses_of_rows
 from rsgen.sequence.reader import Sequence, read_sequence
 from rsgen.truth.settings import sequence_imu
 
-KINDS: list[tuple[Kind, Storage, str]] = [
+KINDS: list[tuple[str, Storage, str]] = [
     ("ros1", "sqlite3", "a.bag"),
     ("ros2", "sqlite3", "a"),
     ("ros2", "mcap", "a"),
@@ -57,7 +57,7 @@ def read(path: Path) -> Messages:
 def messages(request: pytest.FixtureRequest, sequence: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Messages:
     kind, storage, name = request.param
     out = tmp_path_factory.mktemp("bag") / name
-    said = export_ros(sequence, out, kind, storage)
+    said = export_ros(sequence, out, ExportOptions(kind, storage=storage))
     assert "6 colour and 6 depth images, IMU" in said and "px at most" in said
     assert [path.name for path in out.parent.iterdir()] == [name]
     return read(out)
@@ -177,10 +177,10 @@ def test_the_imu_is_the_sequence_s_from_time_0_on(sequence: Sequence, messages: 
 
 def test_latched_topics_say_so(sequence: Sequence, tmp_path: Path) -> None:
     latched = {"/tf_static", "/camera/rolling_shutter", "/ground_truth/spline"}
-    export_ros(sequence, tmp_path / "a.bag", "ros1")
+    export_ros(sequence, tmp_path / "a.bag", ExportOptions("ros1"))
     with AnyReader([tmp_path / "a.bag"]) as reader:
         assert {c.topic for c in reader.connections if c.ext.latching} == latched  # type: ignore[union-attr]
-    export_ros(sequence, tmp_path / "a", "ros2")
+    export_ros(sequence, tmp_path / "a", ExportOptions("ros2"))
     with AnyReader([tmp_path / "a"]) as reader:
         qos = {c.topic: c.ext.offered_qos_profiles for c in reader.connections}  # type: ignore[union-attr]
     assert {topic for topic, profiles in qos.items() if profiles} == latched
@@ -190,7 +190,7 @@ def test_latched_topics_say_so(sequence: Sequence, tmp_path: Path) -> None:
 def test_mcaps_own_reader_decodes_the_file(sequence: Sequence, tmp_path: Path) -> None:
     reader = pytest.importorskip("mcap.reader")
     decoder = pytest.importorskip("mcap_ros2.decoder")
-    export_ros(sequence, tmp_path / "a.mcap", "mcap")
+    export_ros(sequence, tmp_path / "a.mcap", ExportOptions("mcap"))
     with (tmp_path / "a.mcap").open("rb") as file:
         opened = reader.make_reader(file, decoder_factories=[decoder.DecoderFactory()])
         images = [m for _, _, _, m in opened.iter_decoded_messages(topics=["/camera/color/image_raw"])]
@@ -201,7 +201,7 @@ def test_mcaps_own_reader_decodes_the_file(sequence: Sequence, tmp_path: Path) -
 def test_registered_depth_and_millimetres(sequence: Sequence, tmp_path: Path) -> None:
     depth = replace(sequence.streams["depth"], registered=True, depth_scale=1000.0)
     warped = replace(sequence, streams={**sequence.streams, "depth": depth}, meta={})
-    assert "no IMU" in export_ros(warped, tmp_path / "a.bag", "ros1")
+    assert "no IMU" in export_ros(warped, tmp_path / "a.bag", ExportOptions("ros1"))
     found = read(tmp_path / "a.bag")
     assert "/camera/imu" not in found and not any("camera/depth" in topic for topic in found)
     image = found["/camera/aligned_depth_to_color/image_raw"][2][1]
@@ -220,18 +220,20 @@ def test_a_rational_lens_keeps_its_coefficients_and_a_double_sphere_is_refused(
         return replace(sequence, streams={**sequence.streams, "color": color})
 
     eight = (0.3, 0.1, 0.004, -0.003, 0.02, 0.5, 0.1, 0.01)
-    export_ros(lens("rational", eight), tmp_path / "a.bag", "ros1")
+    export_ros(lens("rational", eight), tmp_path / "a.bag", ExportOptions("ros1"))
     info = read(tmp_path / "a.bag")["/camera/color/camera_info"][0][1]
     assert info.distortion_model == "rational_polynomial" and tuple(info.D) == eight
     with pytest.raises(UserError, match="has no double_sphere lens"):
-        export_ros(lens("double_sphere", (-0.2, 0.6)), tmp_path / "b.bag", "ros1")
+        export_ros(lens("double_sphere", (-0.2, 0.6)), tmp_path / "b.bag", ExportOptions("ros1"))
     assert [path.name for path in tmp_path.iterdir()] == ["a.bag"]
 
 
 def test_a_fisheye_is_equidistant(sequence: Sequence, tmp_path: Path) -> None:
     camera = Camera(64, 48, 40, 41, 31.5, 23.5, "fisheye", (0.1, 0.02, 0.0, 0.001))
     color = replace(sequence.streams["color"], camera=camera)
-    export_ros(replace(sequence, streams={**sequence.streams, "color": color}), tmp_path / "a.mcap", "mcap")
+    export_ros(
+        replace(sequence, streams={**sequence.streams, "color": color}), tmp_path / "a.mcap", ExportOptions("mcap")
+    )
     info = read(tmp_path / "a.mcap")["/camera/color/camera_info"][0][1]
     assert info.distortion_model == "equidistant" and info.d.tolist() == [0.1, 0.02, 0.0, 0.001]
     assert info.k.tolist() == [40, 0, 31.5, 0, 41, 23.5, 0, 0, 1] and info.p.tolist()[:8:5] == [40, 41]
@@ -252,21 +254,25 @@ def test_the_loss_of_tf_grows_with_its_spacing(sequence: Sequence) -> None:
         ("ros1", "no/a.bag", "no such folder"),
     ],
 )
-def test_where_a_bag_cannot_be(sequence: Sequence, tmp_path: Path, kind: Kind, name: str, said: str) -> None:
+def test_where_a_bag_cannot_be(sequence: Sequence, tmp_path: Path, kind: str, name: str, said: str) -> None:
     (tmp_path / "there").mkdir()
     with pytest.raises(UserError, match=said):
-        export_ros(sequence, tmp_path / name, kind)
+        export_ros(sequence, tmp_path / name, ExportOptions(kind))
     assert [path.name for path in tmp_path.iterdir()] == ["there"]
 
 
 @pytest.mark.parametrize(("kind", "storage", "name"), KINDS, ids="-".join)
 def test_nothing_is_left_of_a_bag_that_could_not_be_finished(
-    sequence: Sequence, tmp_path: Path, kind: Kind, storage: Storage, name: str
+    sequence: Sequence, tmp_path: Path, kind: str, storage: Storage, name: str
 ) -> None:
     whole = sequence.streams["color"]
     absent = replace(whole, paths=(*whole.paths[:5], whole.paths[5].with_name("999999.png")))
     with pytest.raises(UserError, match="999999"):
-        export_ros(replace(sequence, streams={**sequence.streams, "color": absent}), tmp_path / name, kind, storage)
+        export_ros(
+            replace(sequence, streams={**sequence.streams, "color": absent}),
+            tmp_path / name,
+            ExportOptions(kind, storage=storage),
+        )
     assert not list(tmp_path.iterdir())
 
 
@@ -276,19 +282,21 @@ def test_a_full_disk_is_one_line(sequence: Sequence, tmp_path: Path, monkeypatch
 
     monkeypatch.setattr("rosbags.rosbag1.Writer.write", full)
     with pytest.raises(UserError, match="No space left"):
-        export_ros(sequence, tmp_path / "a.bag", "ros1")
+        export_ros(sequence, tmp_path / "a.bag", ExportOptions("ros1"))
     assert not list(tmp_path.iterdir())
 
 
 def test_without_rosbags_and_before_time_0(sequence: Sequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     early = replace(sequence.streams["color"], listed=sequence.streams["color"].listed - 0.01)
     with pytest.raises(UserError, match="cannot be negative"):
-        export_ros(replace(sequence, streams={**sequence.streams, "color": early}), tmp_path / "a.bag", "ros1")
+        export_ros(
+            replace(sequence, streams={**sequence.streams, "color": early}), tmp_path / "a.bag", ExportOptions("ros1")
+        )
 
     def absent(name: str) -> None:
         raise ImportError(name)
 
     monkeypatch.setattr(bag.importlib, "import_module", absent)
     with pytest.raises(UserError, match="pip install rosbags"):
-        export_ros(sequence, tmp_path / "a.bag", "ros1")
+        export_ros(sequence, tmp_path / "a.bag", ExportOptions("ros1"))
     assert not list(tmp_path.iterdir())

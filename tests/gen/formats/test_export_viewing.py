@@ -13,8 +13,8 @@ import pytest
 from exported import IMU, make_plain, with_imu
 
 from rsgen.errors import UserError
-from rsgen.formats.export.viewing.rerun import export_rerun
-from rsgen.formats.export.viewing.video import write_video
+from rsgen.formats.export.rerun import export_rerun
+from rsgen.formats.export.video import write_video
 from rsgen.sequence.reader import Sequence
 from rsgen.truth.settings import sequence_imu
 

@@ -148,7 +148,7 @@ def test_kalibrs_files(folder: Path, tmp_path: Path) -> None:
 
 
 def test_rsgens_own_export_for_kalibr_is_read(tmp_path: Path) -> None:
-    from rsgen.formats.export.folders.kalibr import export_kalibr
+    from rsgen.formats.export.kalibr import export_kalibr
     from rsgen.sequence.reader import read_sequence
 
     root = sequence(tmp_path / "seq", CONFIG)

@@ -13,7 +13,7 @@ import yaml
 from rsgen.config.faults import FaultsConfig, ImuFaults
 from rsgen.config.imu import ImuConfig
 from rsgen.errors import UserError
-from rsgen.formats.export.folders.kalibr import export_kalibr
+from rsgen.formats.export.kalibr import export_kalibr
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.sequence.reader import Sequence, read_sequence

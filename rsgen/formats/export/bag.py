@@ -16,19 +16,18 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.files import write_error
+from rsgen.formats.export.folder import ExportOptions, new_file
 from rsgen.geometry.camera import Camera
 
-Kind = Literal["ros1", "ros2", "mcap"]
-Storage = Literal["sqlite3", "mcap"]
-_SUFFIX = {"ros1": ".bag", "ros2": "", "mcap": ".mcap"}
+_SUFFIXES: dict[str, tuple[str, ...]] = {"ros1": (".bag",), "ros2": (), "mcap": (".mcap",)}
 TF = "tf2_msgs/msg/TFMessage"  # which rosbags does not know of ROS 1
 _BAG_VERSION: Literal[8] = 8  # of ROS 2 Iron; the next writes QoS in a way that older ones cannot read
-# Axes of ROS's vectors, in the order of ours.
 # ROS's names of lens models, and how many coefficients each has.
 _MODELS = {
     "pinhole": ("plumb_bob", 5), "radtan": ("plumb_bob", 5), "rational": ("rational_polynomial", 8),
     "fisheye": ("equidistant", 4),
 }  # fmt: skip
+# Axes of ROS's vectors, in the order of ours.
 _AXES = {"Vector3": "xyz", "Point": "xyz", "Quaternion": "xyzw"}
 
 
@@ -36,10 +35,10 @@ _AXES = {"Vector3": "xyz", "Point": "xyz", "Quaternion": "xyzw"}
 class Bag:
     """An open bag: `add` makes a topic and returns what writes to it; the rest makes parts of messages.
 
-    images: written so far, for the progress.
+    kind: ros1, ros2 or mcap; images: written so far, for the progress.
     """
 
-    kind: Kind
+    kind: str
     writer: Any
     store: Any
     images: int = 0
@@ -100,20 +99,15 @@ class Bag:
 
 
 @contextmanager
-def new_bag(out: Path, kind: Kind, storage: Storage, first_s: float) -> Iterator[Bag]:
+def new_bag(out: Path, options: ExportOptions, first_s: float) -> Iterator[Bag]:
     """A bag that is at `out` once this ends without an error, and not before.
 
     first_s: the earliest stamp. Raises UserError if rosbags is not installed, `out` is there already or has another
     suffix, a stamp is negative, or the disk refuses.
     """
     typesys, one, two = _rosbags()
-    suffix = _SUFFIX[kind]
-    if suffix and out.suffix != suffix:
-        raise UserError(f"{out}: a bag of this kind is named {suffix}: choose another --out")
-    if out.exists():
-        raise UserError(f"{out}: is there already: choose another --out or delete it")
-    if not out.parent.is_dir():
-        raise UserError(f"{out.parent}: no such folder: make it or choose another --out")
+    kind = options.name
+    new_file(out, "a bag of this kind", _SUFFIXES[kind])
     if first_s < 0:
         raise UserError(
             f"{out}: ROS's stamps cannot be negative, but an image has {first_s:.9f} s: render with a later one"
@@ -127,7 +121,7 @@ def new_bag(out: Path, kind: Kind, storage: Storage, first_s: float) -> Iterator
             store, writer = typesys.get_typestore(typesys.Stores.ROS1_NOETIC), one.Writer(made)
             store.register(typesys.get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF))
         else:
-            plugin = two.StoragePlugin.MCAP if kind == "mcap" or storage == "mcap" else two.StoragePlugin.SQLITE3
+            plugin = two.StoragePlugin.MCAP if "mcap" in (kind, options.storage) else two.StoragePlugin.SQLITE3
             store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
             writer = two.Writer(made, version=_BAG_VERSION, storage_plugin=plugin)
         with writer:

@@ -20,34 +20,31 @@ from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import read_bytes, write_error
-from rsgen.formats.export.folder import EPOCH_S, image_streams, new_folder
-from rsgen.formats.export.poses.approximation import (
+from rsgen.formats.export.folder import DEFAULTS, EPOCH_S, ExportOptions, image_streams, new_folder
+from rsgen.formats.export.poses import (
+    PIXEL_SHIFT,
     Loss,
     between,
     blur_centres,
     loss_of_poses,
+    loss_words,
     poses_of_line,
+    shutter_facts,
+    shutter_type,
     sightings,
-)
-from rsgen.formats.export.poses.shutter_facts import loss_words, shutter_facts
-from rsgen.formats.export.reconstruction.colmap import PIXEL_SHIFT
+)  # fmt: skip
 from rsgen.geometry import se3
-from rsgen.geometry.shutter import Shutter
 from rsgen.sequence.reader import Sequence, Stream
 
 INSTALL = "pip install 'rolling-shutter-rgbd[ncore]'"
 ENDS, DENSE = "start and end pose of an image", "the pose of each line"
 _STEP_US = 500  # a hand turns by nothing that is not straight meanwhile: 0.001 px
-_SCANS = {
-    "top-bottom": "ROLLING_TOP_TO_BOTTOM",
-    "bottom-top": "ROLLING_BOTTOM_TO_TOP",
-    "left-right": "ROLLING_LEFT_TO_RIGHT",
-    "right-left": "ROLLING_RIGHT_TO_LEFT",
-}
 Times = npt.NDArray[np.uint64]
 
 
-def export_ncore(sequence: Sequence, out: Path, progress: Progress = no_progress) -> str:
+def export_ncore(
+    sequence: Sequence, out: Path, options: ExportOptions = DEFAULTS, progress: Progress = no_progress
+) -> str:
     """Write the new folder `out`; returns one line. Cameras and poses are the true ones.
 
     Raises UserError if nvidia-ncore is not installed, it has no such lens, `out` is not empty, or a file cannot be read
@@ -120,7 +117,7 @@ def _model(data: Any, stream: Stream) -> Any:
     camera = stream.camera
     common = {
         "resolution": np.array([camera.width, camera.height], np.uint64),
-        "shutter_type": data.ShutterType[_shutter_name(stream.shutter)],
+        "shutter_type": data.ShutterType[shutter_type(stream.shutter)],
         "external_distortion_parameters": None,
         "principal_point": np.array([camera.cx + PIXEL_SHIFT, camera.cy + PIXEL_SHIFT], np.float32),
         "focal_length": np.array([camera.fx, camera.fy], np.float32),
@@ -139,10 +136,6 @@ def _model(data: Any, stream: Stream) -> Any:
         tangential_coeffs=np.array([p1, p2], np.float32),
         thin_prism_coeffs=np.zeros(4, np.float32),
     )
-
-
-def _shutter_name(shutter: Shutter) -> str:
-    return _SCANS[shutter.scan] if shutter.readout_s else "GLOBAL"
 
 
 def _losses(sequence: Sequence) -> dict[str, Loss]:

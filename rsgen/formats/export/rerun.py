@@ -16,7 +16,7 @@ from rsgen.console.progress import Progress, no_progress
 from rsgen.console.rerun import recording_file
 from rsgen.errors import UserError
 from rsgen.files import read_bytes
-from rsgen.formats.export.folder import image_streams
+from rsgen.formats.export.folder import DEFAULTS, ExportOptions, image_streams
 from rsgen.geometry import se3
 from rsgen.sequence.format import ground_truth
 from rsgen.sequence.reader import Sequence, Stream
@@ -27,7 +27,9 @@ _UP = {(0, 1): "X_DOWN", (0, -1): "X_UP", (1, 1): "Y_DOWN", (1, -1): "Y_UP", (2,
 _PATH_COLOR, _SCENE_COLOR = [230, 120, 30], [190, 190, 190]
 
 
-def export_rerun(sequence: Sequence, out: Path, progress: Progress = no_progress) -> str:
+def export_rerun(
+    sequence: Sequence, out: Path, options: ExportOptions = DEFAULTS, progress: Progress = no_progress
+) -> str:
     """Write the recording `out` (.rrd), whole or not at all; returns one line. Timeline "time": the sequence's seconds.
 
     Raises UserError if rerun-sdk is not installed, if `out` is there already or not named .rrd, or a file of the
@@ -35,7 +37,7 @@ def export_rerun(sequence: Sequence, out: Path, progress: Progress = no_progress
     """
     out = Path(out)
     with recording_file(out, "rsgen", sequence.name, "--out") as (rr, recording):
-        _log(rr, recording, sequence, progress)
+        _log(rr, recording, sequence.as_taken, progress)
     return f"{out}: {out.stat().st_size / 1e6:.1f} MB, open it with 'rerun {out.name}'"
 
 

@@ -12,11 +12,38 @@ from rsgen.array_types import ByteArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import whole_file
+from rsgen.formats.export.folder import DEFAULTS, ExportOptions, new_file
+from rsgen.sequence.reader import Sequence
 
 # Encoders that OpenCV's own wheels bring along.
 _CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
 _GAP = 4  # black columns between the two images
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
+
+
+def export_video(
+    sequence: Sequence, out: Path, options: ExportOptions = DEFAULTS, progress: Progress = no_progress
+) -> str:
+    """Write the video `out`: the sequence rendered with a global shutter, beside its own images. Raises UserError.
+
+    options.scene: the scene's file, if it has moved since the sequence was rendered.
+    """
+    from rsgen.pictures.frames import config_of
+    from rsgen.produce.frame_source import FrameSource, setting_of
+
+    sequence = sequence.as_taken
+    stream = sequence.streams["color"]
+    config = config_of(sequence.root, sequence.meta, options.scene)
+    source = FrameSource(config, progress, global_shutter=True, objects=[thing.spline for thing in sequence.objects])
+    # All lines at the middle line's time.
+    middle = 0.5 * (stream.line_count - 1) * stream.shutter.line_delay(stream.camera)
+    frames = range(len(stream.paths))
+    left = (
+        source.color(sequence.spline, stamp + middle, int(k), setting_of(config, stream.table, i))
+        for i, (stamp, k) in enumerate(zip(stream.stamps, stream.indices, strict=True))
+    )
+    right = (sequence.color(k) for k in frames)
+    return write_video(out, left, right, stream.rate_hz, count=len(frames), progress=progress)
 
 
 def write_video(
@@ -34,13 +61,7 @@ def write_video(
     number of frames, for the progress. The file is there whole or not at all. Raises UserError if it is there already,
     has another suffix, or cannot be written; ValueError for images of different sizes and unequal runs.
     """
-    path = Path(path)
-    if path.suffix.lower() not in _CODECS:
-        raise UserError(f"{path}: a video is written as {' or '.join(_CODECS)}: choose another --out")
-    if path.exists():
-        raise UserError(f"{path}: is there already: choose another --out or delete it")
-    if not path.parent.is_dir():
-        raise UserError(f"{path.parent}: no such folder: make it or choose another --out")
+    path = new_file(path, "a video", tuple(_CODECS))
     with whole_file(path) as temporary:
         written = _write(temporary, path, zip(frames_left, frames_right, strict=True), fps, labels, count, progress)
     return f"{path}: {written} frames at {fps:g} Hz, {labels[0]} left and {labels[1]} right"

@@ -23,10 +23,9 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
-from rsgen.formats.export.bags.bag import TF, Bag, Kind, Storage, new_bag
-from rsgen.formats.export.folder import image_streams
-from rsgen.formats.export.poses.approximation import Loss, between, loss_of_poses, sightings
-from rsgen.formats.export.poses.shutter_facts import loss_words, shutter_facts
+from rsgen.formats.export.bag import TF, Bag, new_bag
+from rsgen.formats.export.folder import ExportOptions, image_streams
+from rsgen.formats.export.poses import Loss, between, loss_of_poses, loss_words, shutter_facts, sightings
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import nanoseconds
@@ -49,10 +48,10 @@ _LOSS = "tf, interpolated"
 Message = tuple[int, Callable[[], None]]
 
 
-def export_ros(
-    sequence: Sequence, out: Path, kind: Kind, storage: Storage = "sqlite3", progress: Progress = no_progress
-) -> str:
-    """Write the bag `out`, whole or not at all; returns one line. ros1: a .bag; ros2: a folder; mcap: a file.
+def export_ros(sequence: Sequence, out: Path, options: ExportOptions, progress: Progress = no_progress) -> str:
+    """Write the bag `out`, whole or not at all; returns one line.
+
+    options.name: ros1 for a .bag, ros2 for a folder, mcap for a file; options.storage: sqlite3 or mcap, of ros2.
 
     Cameras are those that the sequence declares, poses are true. ROS has no times before 0: what the IMU and the truth
     have before is left out of their topics, not out of the spline. Raises UserError if rosbags is not installed, `out`
@@ -63,7 +62,7 @@ def export_ros(
     truth = ground_truth(sequence.spline, color[0].stamps, depth[0].stamps)
     losses = {_LOSS: loss_of_tf(sequence, truth)}
     facts = shutter_facts(sequence, losses) | {"poses": "T_world_depth of tf and pose, T_depth_color of tf_static"}
-    with new_bag(out, kind, storage, min(color[0].listed[0], depth[0].listed[0])) as bag:
+    with new_bag(out, options, min(color[0].listed[0], depth[0].listed[0])) as bag:
         start = max(0, min(nanoseconds([color[0].listed[0], depth[0].listed[0], truth[0, 0]])))
         statics = [(COLOR_FRAME, se3.inverse(sequence.T_color_depth))]
         if imu:

@@ -23,40 +23,47 @@ from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write
-from rsgen.formats.export.folder import make_folders, new_folder, place_images
-from rsgen.formats.export.poses.approximation import (
+from rsgen.formats.export.folder import (
+    DEFAULTS,
+    ExportOptions,
+    aligned_depth,
+    make_folders,
+    new_folder,
+    place_images,
+)  # fmt: skip
+from rsgen.formats.export.poses import (
+    ONE_POSE,
+    PIXEL_SHIFT,
     Loss,
+    SurfacePoints,
     between,
     blur_centres,
     exposures,
     loss_of_image_velocity,
     loss_of_poses,
+    loss_words,
+    middle_line,
     poses_of_line,
+    shutter_type,
     sightings,
-)
-from rsgen.formats.export.poses.shutter_facts import loss_words
-from rsgen.formats.export.poses.surface_points import SurfacePoints, surface_points
-from rsgen.formats.export.reconstruction.aligned import aligned_depth
-from rsgen.formats.export.reconstruction.colmap import ONE_POSE, PIXEL_SHIFT, middle_line, write_shutter_files
+    surface_points,
+    write_shutter_files,
+)  # fmt: skip
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.sequence.reader import Sequence
 
 GSPLAT, NGP, VELOCITY = "start and end pose in gsplat", "in instant-ngp", "constant velocity in 3dgs-deblur"
-_TYPES = {
-    "top-bottom": "ROLLING_TOP_TO_BOTTOM",
-    "bottom-top": "ROLLING_BOTTOM_TO_TOP",
-    "left-right": "ROLLING_LEFT_TO_RIGHT",
-    "right-left": "ROLLING_RIGHT_TO_LEFT",
-}
 _MODELS = {"pinhole": "PINHOLE", "radtan": "OPENCV", "fisheye": "OPENCV_FISHEYE"}
 _NAMES = {"pinhole": (), "radtan": ("k1", "k2", "p1", "p2", "k3"), "fisheye": ("k1", "k2", "k3", "k4")}
 _GL = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera axes in ours, and back
 
 
-def export_nerfstudio(sequence: Sequence, out: Path, copy: bool = False, progress: Progress = no_progress) -> str:
-    """Write the new folder `out`; returns one line. Images are hard links where the disk allows, or copies with `copy`.
+def export_nerfstudio(
+    sequence: Sequence, out: Path, options: ExportOptions = DEFAULTS, progress: Progress = no_progress
+) -> str:
+    """Write the new folder `out`; returns one line. Images are hard links, or copies with options.copy.
 
     images/, depth/ (aligned to colour, in the sequence's units; warped where the sequence's is not), points3D.ply,
     transforms.json, and rolling_shutter.json and spline.npz with every line's time and pose. Cameras and poses are the
@@ -72,8 +79,8 @@ def export_nerfstudio(sequence: Sequence, out: Path, copy: bool = False, progres
 
     new_folder(out)
     make_folders(out / "images", out / "depth")
-    place_images(color.paths, [out / "images" / path.name for path in color.paths], copy, progress, (0.5, 0.6))
-    depths = aligned_depth(sequence, out / "depth", copy, progress, (0.6, 1.0))
+    place_images(color.paths, [out / "images" / path.name for path in color.paths], options.copy, progress, (0.5, 0.6))
+    depths = aligned_depth(sequence, out / "depth", options.copy, progress, (0.6, 1.0))
     write_shutter_files(sequence, out, losses)
     atomic_write(out / "points3D.ply", _ply(points))
     atomic_write(out / "transforms.json", json.dumps(_transforms(sequence, depths), indent=1).encode())
@@ -129,7 +136,7 @@ def _transforms(sequence: Sequence, depths: list[str]) -> dict[str, Any]:
         "ply_file_path": "points3D.ply",
         "depth_unit_scale_factor": 1.0 / sequence.streams["depth"].depth_scale,
         "rolling_shutter": ngp_rolling_shutter(camera, shutter),
-        "shutter_type": _TYPES[shutter.scan] if shutter.readout_s else "GLOBAL",
+        "shutter_type": shutter_type(shutter),
         "exposure_time": float(exposures(color).mean()),
     }
     if speaks:

@@ -6,16 +6,28 @@ Names and checks after Kalibr's `kalibr_common/ConfigReader.py`; formats: its wi
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rsgen.array_types import FloatArray
 from rsgen.config.imu import ImuConfig
 from rsgen.console.progress import Progress, no_progress
+from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_yaml
-from rsgen.formats.export.folder import EPOCH_S, four_coefficients, make_folders, new_folder, place_images, row_clock
+from rsgen.formats.export.folder import (
+    DEFAULTS,
+    EPOCH_S,
+    ExportOptions,
+    four_coefficients,
+    make_folders,
+    new_folder,
+    place_images,
+)
 from rsgen.geometry import se3
 from rsgen.geometry.aprilgrid import AprilGrid
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter
 from rsgen.sensors.imu import nanoseconds, write_imu_csv
 from rsgen.sequence.reader import Sequence, Stream
 from rsgen.truth.settings import SequenceImu, sequence_imu, sequence_target
@@ -24,11 +36,13 @@ COLOR_TOPIC, DEPTH_TOPIC, IMU_TOPIC = "/cam0/image_raw", "/cam1/image_raw", "/im
 _MODELS = {"pinhole": "radtan", "radtan": "radtan", "rational": "radtan", "fisheye": "equidistant"}
 
 
-def export_kalibr(sequence: Sequence, out: Path, copy: bool = False, progress: Progress = no_progress) -> str:
+def export_kalibr(
+    sequence: Sequence, out: Path, options: ExportOptions = DEFAULTS, progress: Progress = no_progress
+) -> str:
     """Write camchain.yaml, and imu.yaml where the sequence has an IMU, into the new folder `out`; returns one line.
 
-    Where a target is in the scene, also target.yaml, colour's images as cam0/STAMP.png (hard links where the disk
-    allows, or copies with `copy`) and imu0.csv, their stamps EPOCH_S later.
+    Where a target is in the scene, also target.yaml, colour's images as cam0/STAMP.png and imu0.csv, their stamps
+    EPOCH_S later. Images are hard links, or copies with options.copy.
     cam0 is the colour camera, cam1 the depth camera. line_delay: s from one row to the next (negative from bottom to
     top). timeshift_cam_imu takes a stamp to row 0's mid-exposure (t_imu = t_cam + shift): row v is exposed at
     stamp + timeshift_cam_imu + v · line_delay. Raises UserError for what Kalibr has no words for (k3, columns read one
@@ -49,7 +63,7 @@ def export_kalibr(sequence: Sequence, out: Path, copy: bool = False, progress: P
         color = sequence.streams["color"]
         make_folders(out / "cam0")
         targets = [out / "cam0" / f"{ns}.png" for ns in nanoseconds(color.listed, EPOCH_S)]
-        place_images(color.paths, targets, copy, progress)
+        place_images(color.paths, targets, options.copy, progress)
         written += ["target.yaml", f"cam0/ with {len(targets)} images"]
         if imu:
             write_imu_csv(out / "imu0.csv", imu[1], EPOCH_S)
@@ -118,6 +132,27 @@ def _camera(stream: Stream, topic: str) -> dict[str, Any]:
         "rostopic": topic,
         "line_delay": row_clock(stream.name, camera, stream.shutter).delay_s,
     }
+
+
+@dataclass(frozen=True)
+class RowClock:
+    """When image row v is exposed: mid-exposure at stamp + first_s + v · delay_s; delay_s < 0 from bottom to top."""
+
+    first_s: float
+    delay_s: float
+
+
+def row_clock(name: str, camera: Camera, shutter: Shutter) -> RowClock:
+    """The rows' times of a camera called `name`. Raises UserError for one that is read column by column."""
+    if shutter.readout_s == 0.0:
+        return RowClock(-0.5 * shutter.exposure_s, 0.0)
+    if not shutter.by_rows:
+        raise UserError(
+            f"{name}: scan {shutter.scan} reads columns, but a line_delay belongs to rows: render with top-bottom"
+        )
+    rows = [[0.0, 0.0], [0.0, 1.0]]
+    first, second = shutter.line_mid_time(0.0, shutter.line_of_pixel(rows, camera), camera)
+    return RowClock(float(first), float(second - first))
 
 
 def _matrix(T: FloatArray) -> list[list[float]]:

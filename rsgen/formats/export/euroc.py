@@ -24,7 +24,9 @@ from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_yaml
 from rsgen.formats.export.folder import (
+    DEFAULTS,
     EPOCH_S,
+    ExportOptions,
     four_coefficients,
     image_streams,
     make_folders,
@@ -50,9 +52,13 @@ _TRUTH_HEADER = (
 
 
 def export_euroc(
-    sequence: Sequence, out: Path, copy: bool = False, epoch_s: int = EPOCH_S, progress: Progress = no_progress
+    sequence: Sequence,
+    out: Path,
+    options: ExportOptions = DEFAULTS,
+    progress: Progress = no_progress,
+    epoch_s: int = EPOCH_S,
 ) -> str:
-    """Write `out`/mav0; returns one line. Images are hard links where the disk allows, or copies with `copy`.
+    """Write `out`/mav0; returns one line. Images are hard links, or copies with options.copy.
 
     epoch_s: whole seconds added to all stamps. Raises UserError if `out`/mav0 is there and not empty, if a stamp is
     negative, if a stream's distortion does not fit EuRoC's four coefficients, or if the disk refuses.
@@ -84,7 +90,7 @@ def export_euroc(
         atomic_write(root / name / "data.csv", "\n".join(["#timestamp [ns],filename", *rows, ""]).encode())
         atomic_write(root / name / "sensor.yaml", encode_yaml(described[name]))
         targets = [root / name / "data" / file for file in files]
-        place_images(stream.paths, targets, copy, progress, (0.5 * k, 0.5 * (k + 1)))
+        place_images(stream.paths, targets, options.copy, progress, (0.5 * k, 0.5 * (k + 1)))
     counts = f"{len(stamps['cam0'])} colour and {len(stamps['depth0'])} depth images"
     return f"{root}: {counts}, {f'{len(times)} IMU samples' if imu else 'no IMU'}, stamps + {epoch_s} s"
 

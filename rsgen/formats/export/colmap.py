@@ -7,7 +7,6 @@ https://colmap.github.io/format.html
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -15,23 +14,30 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
-from rsgen.files import atomic_write, read_bytes
-from rsgen.formats.export.folder import make_folders, new_folder, place_images
-from rsgen.formats.export.poses.approximation import Loss, loss_of_poses, poses_of_line, sightings
-from rsgen.formats.export.poses.shutter_facts import loss_words, shutter_facts
-from rsgen.formats.export.poses.surface_points import SurfacePoints, surface_points
+from rsgen.files import atomic_write
+from rsgen.formats.export.folder import DEFAULTS, ExportOptions, make_folders, new_folder, place_images
+from rsgen.formats.export.poses import (
+    ONE_POSE,
+    PIXEL_SHIFT,
+    SurfacePoints,
+    loss_of_poses,
+    loss_words,
+    middle_line,
+    poses_of_line,
+    sightings,
+    surface_points,
+    write_shutter_files,
+)  # fmt: skip
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.sequence.format import pose_rows
 from rsgen.sequence.reader import Sequence
 
-PIXEL_SHIFT = 0.5
-"""What COLMAP's and nerfstudio's pixel coordinates are larger by: their pixel centres are at halves."""
-ONE_POSE = "one pose an image"
 
-
-def export_colmap(sequence: Sequence, out: Path, copy: bool = False, progress: Progress = no_progress) -> str:
-    """Write the new folder `out`; returns one line. Images are hard links where the disk allows, or copies with `copy`.
+def export_colmap(
+    sequence: Sequence, out: Path, options: ExportOptions = DEFAULTS, progress: Progress = no_progress
+) -> str:
+    """Write the new folder `out`; returns one line. Images are hard links, or copies with options.copy.
 
     Cameras and poses are the true ones. Points are exact, their observations where the rolling shutter shows them, so
     that a point's ERROR is what one pose an image loses. rolling_shutter.json and spline.npz have the lines' times and
@@ -41,14 +47,15 @@ def export_colmap(sequence: Sequence, out: Path, copy: bool = False, progress: P
     color = sequence.streams["color"]
     cameras = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", f"1 {camera_line(color.camera)}"]
     T_world_color = poses_of_line(sequence, middle_line(sequence))
-    losses = {ONE_POSE: loss_of_one_pose(sequence, T_world_color)}
+    seen = sightings(sequence)
+    losses = {ONE_POSE: loss_of_poses(color.camera, seen, T_world_color[seen.image])}
     points = surface_points(sequence, progress, (0.0, 0.8))
     names = [path.name for path in color.paths]
 
     new_folder(out)
     model = out / "sparse" / "0"
     make_folders(out / "images", model)
-    place_images(color.paths, [out / "images" / name for name in names], copy, progress, (0.8, 1.0))
+    place_images(color.paths, [out / "images" / name for name in names], options.copy, progress, (0.8, 1.0))
     write_shutter_files(sequence, out, losses)
     files = {
         "cameras.txt": cameras,
@@ -58,23 +65,6 @@ def export_colmap(sequence: Sequence, out: Path, copy: bool = False, progress: P
     for name, lines in files.items():
         atomic_write(model / name, "".join(f"{line}\n" for line in lines).encode())
     return f"{out}: {len(names)} images, {len(points.p_world)} points; {loss_words(losses)}"
-
-
-def middle_line(sequence: Sequence) -> float:
-    """The line half way between the first and the last of a colour image."""
-    return 0.5 * (sequence.streams["color"].line_count - 1)
-
-
-def loss_of_one_pose(sequence: Sequence, T_world_color: FloatArray) -> Loss:
-    """What poses T_world_color (n, 4, 4) of the n colour images lose if they are taken for those of all lines."""
-    seen = sightings(sequence)
-    return loss_of_poses(sequence.streams["color"].camera, seen, T_world_color[seen.image])
-
-
-def write_shutter_files(sequence: Sequence, out: Path, losses: dict[str, Loss]) -> None:
-    """Write rolling_shutter.json and spline.npz, from which every line's pose follows. Raises UserError."""
-    atomic_write(out / "rolling_shutter.json", json.dumps(shutter_facts(sequence, losses), indent=1).encode())
-    atomic_write(out / "spline.npz", read_bytes(sequence.root / "spline.npz"))
 
 
 def camera_line(camera: Camera) -> str:

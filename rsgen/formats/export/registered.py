@@ -12,7 +12,7 @@ from typing import Any
 
 from rsgen.console.progress import Progress, no_progress
 from rsgen.files import atomic_write, encode_yaml
-from rsgen.formats.export.folder import make_folders, new_folder, place_images
+from rsgen.formats.export.folder import DEFAULTS, ExportOptions, make_folders, new_folder, place_images
 from rsgen.image_codecs import encode_png
 from rsgen.produce.writer import quantise
 from rsgen.sensors.depth import register_depth
@@ -25,25 +25,29 @@ from rsgen.truth.settings import sequence_mocap
 _MARK = "registered to the colour camera"
 
 
-def export_registered(sequence: Sequence, out: Path, copy: bool = False, progress: Progress = no_progress) -> str:
+def export_registered(
+    sequence: Sequence, out: Path, options: ExportOptions = DEFAULTS, progress: Progress = no_progress
+) -> str:
     """Write the new folder `out` in TUM's layout with registered depth; returns one line.
 
-    rgb/ holds hard links where the disk allows, or copies with `copy`. camera.yaml (as rstrack reads it) says that
-    depth has the colour camera, and which camera with which shutter it was warped from; groundtruth.txt holds poses of
-    the colour camera at true times, or what the sequence's motion capture reports of it. Stamps are the sequence's
-    listed ones; depth that is registered already is linked like colour. Warped, and said in camera.yaml, is what the
-    sequence declares; the poses are the true colour camera's. Raises UserError if `out` is not empty, or an
-    image cannot be read.
+    rgb/ holds hard links, or copies with options.copy. camera.yaml (as rstrack reads it) states that depth has the
+    colour camera, and which camera with which shutter it was warped from. groundtruth.txt holds poses of the colour
+    camera at true times, or what the sequence's motion capture reports of it. Stamps are the sequence's listed ones;
+    depth that is registered already is linked like colour. Warped, and stated in camera.yaml, is what the sequence
+    declares; the poses are the true colour camera's. Raises UserError if `out` is not empty, or an image cannot be
+    read.
     """
     color, depth = sequence.streams["color"], sequence.streams["depth"]
     sequence.depth(0)  # of the size that sequence.yaml says, or all below would take memory for another one
     new_folder(out)
     make_folders(out / "rgb", out / "depth")
-    place_images(color.paths, [out / "rgb" / path.name for path in color.paths], copy, progress, (0.0, 0.1))
+    place_images(color.paths, [out / "rgb" / path.name for path in color.paths], options.copy, progress, (0.0, 0.1))
     rays = depth.camera.unproject(depth.camera.pixel_grid())
     filled = 0.0
     if depth.registered:
-        place_images(depth.paths, [out / "depth" / path.name for path in depth.paths], copy, progress, (0.1, 0.2))
+        place_images(
+            depth.paths, [out / "depth" / path.name for path in depth.paths], options.copy, progress, (0.1, 0.2)
+        )
     for k, path in enumerate(depth.paths):
         z = sequence.depth(k)
         if not depth.registered:

@@ -1,1 +1,0 @@
-"""Layouts of calibration and odometry: Kalibr, EuRoC/ASL, and registered TUM folders."""

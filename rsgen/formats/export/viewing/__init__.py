@@ -1,1 +1,0 @@
-"""To look at: a video of both shutters, and a rerun recording."""

@@ -1,0 +1,248 @@
+"""Parts of a scene file: triangles of one material, moved into the world, without what has no area or is transparent.
+
+Depth, truth and baked light know triangles only, so what an alpha mask hides is cut out of the triangles.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rsgen.array_types import BoolArray, FloatArray, IntArray
+from rsgen.errors import UserError
+from rsgen.limits import MOST_M
+from rsgen.render.material import Material
+
+log = logging.getLogger("rsgen")
+
+_USUAL_M = (0.02, 300.0)  # sizes outside are rather wrong units
+_FINE_TEXELS = 2.0  # triangles this small are cut along a straight line
+_MOST = 400_000  # triangles of one part; beyond, the outline gets coarser
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Triangles of one material in the world frame, m: vertices (n, 3), faces (m, 3).
+
+    normals (n, 3) unit, None: flat; uv (n, 2), v down; colors: linear, (n, 3) of vertices or (m, 3) of faces.
+    """
+
+    vertices: FloatArray
+    faces: IntArray
+    material: Material
+    normals: FloatArray | None = None
+    uv: FloatArray | None = None
+    vertex_colors: FloatArray | None = None
+    face_colors: FloatArray | None = None
+
+
+def joined(parts: Sequence[Part]) -> Part:
+    """One part of several that have one material and carry the same."""
+    first = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = np.concatenate([part.faces + k for part, k in zip(parts, first[:-1], strict=True)])
+    columns = [
+        None if getattr(parts[0], name) is None else np.concatenate([getattr(part, name) for part in parts])
+        for name in ("normals", "uv", "vertex_colors", "face_colors")
+    ]
+    return Part(np.concatenate([part.vertices for part in parts]), faces, parts[0].material, *columns)
+
+
+def placed(path: Path, name: str, part: Part, T_world_part: FloatArray) -> Part:
+    """A part of `path`, called `name` there, moved into the world by any affine map. Raises UserError."""
+    if not (np.isfinite(part.vertices).all() and np.isfinite(T_world_part).all()):
+        raise UserError(f"scene {path}: '{name}' has vertices that are not finite: mend it and export it again")
+    return _moved(part, T_world_part)
+
+
+def finished(path: Path, parts: Sequence[Part]) -> list[Part]:
+    """Parts in the world, those alike as one, without triangles of no area and what masks hide. Raises UserError."""
+    left, dropped = [], 0
+    for part in parts:
+        part, without_area = _solid(part)
+        dropped += without_area
+        if len(part.faces):
+            left.append(_cut(part))
+    if dropped:
+        log.info("scene %s: %d triangles without area left out", path, dropped)
+    left = _merged([part for part in left if len(part.faces)])
+    if not left:
+        raise UserError(f"scene {path}: holds no triangles that could be seen: export a mesh, with faces of some area")
+    _check_size(path, left)
+    return left
+
+
+def _moved(part: Part, T: FloatArray) -> Part:
+    A = T[:3, :3]
+    normals, faces = part.normals, part.faces
+    if normals is not None:
+        # The cofactors: what the inverse's transpose is but for its length, and defined where there is no inverse.
+        cofactors = np.stack([np.cross(A[1], A[2]), np.cross(A[2], A[0]), np.cross(A[0], A[1])])
+        normals = normals @ cofactors.T * np.sign(np.linalg.det(A))
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        normals = normals / length if np.isfinite(length).all() and length.all() else None
+    if np.linalg.det(A) < 0:
+        faces = faces[:, ::-1]
+    return replace(part, vertices=part.vertices @ A.T + T[:3, 3], normals=normals, faces=faces)
+
+
+def _solid(part: Part) -> tuple[Part, int]:
+    """The part without triangles of no area, as float32 has them, and how many those were."""
+    a, b, c = (part.vertices[part.faces[:, k]].astype(np.float32).astype(float) for k in range(3))
+    edges = np.stack([b - a, c - b, a - c])
+    longest = (edges**2).sum(axis=2).max(axis=0)
+    keep = np.linalg.norm(np.cross(edges[0], edges[1]), axis=1) > 1e-7 * longest
+    colors = None if part.face_colors is None else part.face_colors[keep]
+    return replace(part, faces=part.faces[keep], face_colors=colors), int((~keep).sum())
+
+
+def _cut(part: Part) -> Part:
+    """What a mask leaves of a part."""
+    material = part.material
+    if material.cutoff is None:
+        return part
+    texture = material.color_texture
+    if texture is None or part.uv is None:
+        return part if material.opacity >= material.cutoff else replace(part, faces=part.faces[:0])
+    alpha = texture.pixels[..., 3] / 255 * material.opacity
+    if texture.wrap == "mirror":
+        alpha = np.block([[alpha, alpha[:, ::-1]], [alpha[::-1], alpha[::-1, ::-1]]])
+    uv = part.uv @ texture.transform[:, :2].T + texture.transform[:, 2]
+    xy = uv * texture.pixels.shape[1::-1] - 0.5
+    carried = [part.vertices, part.uv] + [v for v in (part.normals, part.vertex_colors) if v is not None]
+    mask = Mask(alpha, material.cutoff, texture.wrap != "clamp")
+    rows, faces, source = cut_away(np.concatenate(carried, axis=1), part.faces, xy, mask)
+    columns = np.split(rows, np.cumsum([v.shape[1] for v in carried])[:-1], axis=1)
+    normals = None if part.normals is None else columns[2]
+    colors = None if part.vertex_colors is None else columns[-1]
+    of_faces = None if part.face_colors is None else part.face_colors[source]
+    return _solid(Part(columns[0], faces, material, normals, columns[1], colors, of_faces))[0]
+
+
+def _merged(parts: list[Part]) -> list[Part]:
+    """Parts of the same material as one: light is baked, and kernels are compiled, shape by shape."""
+    alike: dict[tuple[Any, ...], list[Part]] = {}
+    for part in parts:
+        carries = (part.normals, part.uv, part.vertex_colors, part.face_colors)
+        alike.setdefault((id(part.material), *(v is not None for v in carries)), []).append(part)
+    return [joined(same) for same in alike.values()]
+
+
+def _check_size(path: Path, parts: list[Part]) -> None:
+    corners = np.concatenate(
+        [[p.vertices[p.faces].min(axis=(0, 1)), p.vertices[p.faces].max(axis=(0, 1))] for p in parts]
+    )
+    size = float(np.ptp(corners, axis=0).max())
+    if not np.abs(corners).max() <= MOST_M:
+        raise UserError(f"scene {path}: reaches beyond {MOST_M:g} m: set scene.scale to metres per unit of the file")
+    if not _USUAL_M[0] <= size <= _USUAL_M[1]:
+        log.warning("scene %s: is %.3g m across: is scene.scale right, metres per unit of the file?", path, size)
+
+
+@dataclass(frozen=True)
+class Mask:
+    """Where a surface is: alpha (h, w) in [0, 1], there at `cutoff` and above, repeated or else held at its rim."""
+
+    alpha: FloatArray
+    cutoff: float
+    repeat: bool
+
+    def at(self, xy: FloatArray) -> FloatArray:
+        """Bilinear alpha (...,) less the cutoff at texel positions (..., 2), texel centres integer, row 0 on top."""
+        h, w = self.alpha.shape
+        low = np.floor(xy).astype(np.int64)
+        fx, fy = (xy[..., k] - low[..., k] for k in (0, 1))
+        columns, rows = ([self._inside(low[..., k] + step, size) for step in (0, 1)] for k, size in ((0, w), (1, h)))
+        top = self.alpha[rows[0], columns[0]] * (1 - fx) + self.alpha[rows[0], columns[1]] * fx
+        bottom = self.alpha[rows[1], columns[0]] * (1 - fx) + self.alpha[rows[1], columns[1]] * fx
+        return top * (1 - fy) + bottom * fy - self.cutoff
+
+    def _inside(self, index: IntArray, size: int) -> IntArray:
+        return index % size if self.repeat else np.clip(index, 0, size - 1)
+
+
+def cut_away(rows: FloatArray, faces: IntArray, xy: FloatArray, mask: Mask) -> tuple[FloatArray, IntArray, IntArray]:
+    """What is left of triangles where `mask` is there.
+
+    rows: (n, k), whatever vertices carry, interpolated linearly; faces (m, 3); xy (n, 2): texel position of each
+    vertex. Returns new rows, faces and, per new face, the number of the old one.
+    """
+    solid = mask.alpha >= mask.cutoff
+    if solid.all():
+        return rows, faces, np.arange(len(faces))
+    table = _counts(solid)
+    corners = np.concatenate([rows, xy], axis=1)[faces]
+    source = np.arange(len(faces))
+    kept, kept_source = [], []
+    while len(corners):
+        there, nowhere = _uniform(corners[..., -2:], table, mask)
+        kept.append(corners[there])
+        kept_source.append(source[there])
+        mixed = ~there & ~nowhere
+        corners, source = corners[mixed], source[mixed]
+        edge = np.linalg.norm(corners[..., -2:] - np.roll(corners[..., -2:], 1, axis=1), axis=-1).max(axis=1)
+        fine = edge <= _FINE_TEXELS
+        if sum(map(len, kept)) + 4 * len(corners) > _MOST:
+            fine[:] = True
+        clipped, of = _clip(corners[fine], mask.at(corners[fine][..., -2:]))
+        kept.append(clipped)
+        kept_source.append(source[fine][of])
+        corners, source = _quartered(corners[~fine]), np.repeat(source[~fine], 4)
+    left = np.concatenate(kept)
+    return (
+        left[..., :-2].reshape(-1, rows.shape[1]),
+        np.arange(3 * len(left)).reshape(-1, 3),
+        np.concatenate(kept_source),
+    )
+
+
+def _counts(solid: BoolArray) -> NDArray[np.int64]:
+    """Summed-area table (2h + 1, 2w + 1) of two by two copies, so that no box of at most a copy's size wraps around."""
+    table = np.zeros((2 * solid.shape[0] + 1, 2 * solid.shape[1] + 1), np.int64)
+    table[1:, 1:] = np.tile(solid, (2, 2)).cumsum(axis=0, dtype=np.int64).cumsum(axis=1)
+    return table
+
+
+def _uniform(xy: FloatArray, table: NDArray[np.int64], mask: Mask) -> tuple[BoolArray, BoolArray]:
+    """Whether the mask is there, and whether it is nowhere, in all texels around triangles (m, 3, 2)."""
+    size = np.array(mask.alpha.shape[::-1])
+    low, high = np.floor(xy.min(axis=1)).astype(np.int64), np.ceil(xy.max(axis=1)).astype(np.int64)
+    if mask.repeat:
+        span = np.minimum(high - low + 1, size)
+        low = low % size
+    else:
+        low = np.clip(low, 0, size - 1)
+        span = np.clip(high, 0, size - 1) - low + 1
+    (x0, y0), (x1, y1) = low.T, (low + span).T
+    count = table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0]
+    return count == span.prod(axis=1), count == 0
+
+
+def _quartered(corners: FloatArray) -> FloatArray:
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+    parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+    return np.stack([np.stack(part, axis=1) for part in parts], axis=1).reshape(-1, 3, corners.shape[-1])
+
+
+def _clip(corners: FloatArray, level: FloatArray) -> tuple[FloatArray, IntArray]:
+    """The parts of triangles (m, 3, k) where a value, given at their corners (m, 3), is not negative; and of which."""
+    inside = level >= 0
+    count = inside.sum(axis=1)
+    out, of = [corners[count == 3]], [np.flatnonzero(count == 3)]
+    for ends in (1, 2):  # the odd corner first: the one inside, or the one outside
+        which = np.flatnonzero(count == ends)
+        odd = np.argmax(inside[which] == (ends == 1), axis=1)
+        order = (odd[:, None] + np.arange(3)) % 3
+        p = np.take_along_axis(corners[which], order[..., None], axis=1)
+        s = np.take_along_axis(level[which], order, axis=1)
+        q, r = (p[:, 0] + (s[:, 0] / (s[:, 0] - s[:, k]))[:, None] * (p[:, k] - p[:, 0]) for k in (1, 2))
+        pieces = [(p[:, 0], q, r)] if ends == 1 else [(q, p[:, 1], p[:, 2]), (q, p[:, 2], r)]
+        out += [np.stack(piece, axis=1) for piece in pieces]
+        of += [which] * len(pieces)
+    return np.concatenate(out), np.concatenate(of)
