@@ -19,10 +19,10 @@ from rstrack.bench.definitions import SequenceEntry, StrictModel
 from rstrack.bench.measures.track import track_cell
 from rstrack.bench.record import Figures
 from rstrack.bench.task import Task, settings_of
-from rstrack.calibration.findings.lens_pixels import displacement_px, rms
-from rstrack.calibration.findings.result import Calibration
+from rstrack.calibration.figures import displacement_px, rms
+from rstrack.calibration.parameters import COLOR_LENS, DRIFT, EXTRINSICS, NAMES, POSES, Parameters
+from rstrack.calibration.result import Calibration
 from rstrack.calibration.run import calibrate, parameters_of
-from rstrack.calibration.unknowns.parameters import COLOR_LENS, DRIFT, EXTRINSICS, NAMES, POSES, Parameters
 from rstrack.data.camera_file import usual
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.image_files import NoisyImages

@@ -20,28 +20,25 @@ from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan
 from rsgen.geometry.spline import Spline
-from rstrack.calibration.findings.motion import motion_of
-from rstrack.calibration.findings.pace import pace_of
-from rstrack.calibration.findings.residuals import residuals_at, residuals_now, some_of
-from rstrack.calibration.findings.result import Calibration
-from rstrack.calibration.first_track import Track, first_track
-from rstrack.calibration.pairs.load import load_stretch, pair_terms
-from rstrack.calibration.pairs.stretch import Stretch
-from rstrack.calibration.pairs.terms import PairTerms
+from rstrack.calibration.devices import Device, device_notes
+from rstrack.calibration.figures import motion_of, pace_of, residuals_at, residuals_now, some_of
+from rstrack.calibration.pairs.terms import PairTerms, pair_terms
 from rstrack.calibration.pairs.trust import trust_in
-from rstrack.calibration.solve import solve
-from rstrack.calibration.stages import Stage, in_stages, progress_watch
-from rstrack.calibration.unknowns.devices import Device, device_notes
-from rstrack.calibration.unknowns.known import Known
-from rstrack.calibration.unknowns.parameters import (
+from rstrack.calibration.pairs.window import Stretch
+from rstrack.calibration.parameters import (
     COLOR_LENS,
     DEPTH_LENS,
     DRIFT,
     GROUPS,
     LENSES,
+    Known,
     Parameters,
     free_of,
 )
+from rstrack.calibration.result import Calibration
+from rstrack.calibration.solve import solve
+from rstrack.calibration.stages import Stage, in_stages, progress_watch
+from rstrack.calibration.start import Track, first_track, load_stretch
 from rstrack.data.dataset import Dataset
 from rstrack.options import Options
 

@@ -12,9 +12,9 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
-from rstrack.calibration.findings.result import Calibration
+from rstrack.calibration.parameters import COUNT, DRIFT, NAMES
+from rstrack.calibration.result import Calibration
 from rstrack.calibration.solve import Solution, posterior
-from rstrack.calibration.unknowns.parameters import COUNT, DRIFT, NAMES
 from rstrack.data.dataset import Dataset
 
 # Colour's clock: each recording's own.

@@ -10,10 +10,9 @@ from scipy import stats
 
 from rsgen.array_types import BoolArray, FloatArray
 from rstrack.alignment.normal_equations import AndersonMixing
-from rstrack.calibration.pairs.stretch import Stretch
 from rstrack.calibration.pairs.terms import PairTerms
-from rstrack.calibration.unknowns.known import Known
-from rstrack.calibration.unknowns.parameters import COUNT, DEPTH, DRIFT, PRIOR, USEFUL, Parameters
+from rstrack.calibration.pairs.window import Stretch
+from rstrack.calibration.parameters import COUNT, DEPTH, DRIFT, PRIOR, USEFUL, Known, Parameters
 
 # Steps at most on a level, and the part of the standard errors, as the stretches' scatter shows them, that ends it.
 _MOST_STEPS, _SMALL = 15, 0.1

@@ -16,11 +16,10 @@ import numpy as np
 
 from rsgen.array_types import BoolArray
 from rsgen.console.progress import Progress
-from rstrack.calibration.pairs.stretch import Stretch
 from rstrack.calibration.pairs.terms import PairTerms
+from rstrack.calibration.pairs.window import Stretch
+from rstrack.calibration.parameters import BY_COLOR, COLOR_LENS, COUNT, DRIFT, LENSES, Known, Parameters
 from rstrack.calibration.solve import Solution, Watch, joined, solve
-from rstrack.calibration.unknowns.known import Known
-from rstrack.calibration.unknowns.parameters import BY_COLOR, COLOR_LENS, COUNT, DRIFT, LENSES, Parameters
 
 # Levels of the pyramid.
 _FINE = (0,)

@@ -97,7 +97,7 @@ def import_(
 ) -> int:
     """Turn a recording of another format into a folder that can be tracked: images, stamps, cameras, truth, IMU."""
     from rsgen.console.progress import ProgressDisplay
-    from rstrack.calibration.unknowns.devices import device_named
+    from rstrack.calibration.devices import device_named
     from rstrack.formats import open_recording
     from rstrack.formats.folder import check_place, write_folder
     from rstrack.formats.recording import ReadOptions

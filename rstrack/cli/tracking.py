@@ -57,9 +57,9 @@ def track(
     """
     from rsgen.console.progress import ProgressDisplay
     from rsgen.files import atomic_write
-    from rstrack.calibration.findings.record import CALIBRATION, write_record
+    from rstrack.calibration.devices import device_named
+    from rstrack.calibration.record import CALIBRATION, write_record
     from rstrack.calibration.run import calibrate as run_calibration
-    from rstrack.calibration.unknowns.devices import device_named
     from rstrack.data.dataset import open_dataset
     from rstrack.data.rig import UNDISTORTED_K1
     from rstrack.tracking.runs import run
@@ -150,10 +150,10 @@ def calibrate(
     """A recording's cameras from the recording alone: lenses, readouts, clocks and extrinsics, with their errors."""
     from rsgen.console.progress import ProgressDisplay
     from rsgen.files import atomic_write
-    from rstrack.calibration.findings.record import record_of
+    from rstrack.calibration.devices import device_named
+    from rstrack.calibration.record import record_of
     from rstrack.calibration.run import calibrate as calibrate_cameras
     from rstrack.calibration.several import check_alike, together
-    from rstrack.calibration.unknowns.devices import device_named
     from rstrack.data.dataset import open_dataset
     from rstrack.data.image_files import NoisyImages
     from rstrack.report.build import write_page

@@ -14,7 +14,7 @@ from rsgen.errors import UserError
 from rsgen.files import atomic_write, write_error
 from rstrack.bench.experiments.blur import STRESS
 from rstrack.bench.experiments.method_results import RESULTS
-from rstrack.calibration.findings.record import read_record
+from rstrack.calibration.record import read_record
 from rstrack.data.estimate import TRAJECTORY
 from rstrack.metrics.clock import TruthOffset
 from rstrack.report.bench import bench_page, stress_page

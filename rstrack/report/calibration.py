@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from rsgen.console.tables import Entry, Table, fixed, significant
-from rstrack.calibration.findings.record import Change, LensMap, Parameter, Record
+from rstrack.calibration.record import Change, LensMap, Parameter, Record
 from rstrack.charts.chart import COLORS, ChangeChart, Curve, LensChart, MovedValue, StripChart, broken
 from rstrack.report.page import Block, Card, CardRow, Note, Page, PageSection, Plot, TextFile
 

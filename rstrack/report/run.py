@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rsgen.errors import UserError
-from rstrack.calibration.findings.record import CALIBRATION, read_record
+from rstrack.calibration.record import CALIBRATION, read_record
 from rstrack.charts.chart import Chart, PathChart
 from rstrack.charts.runs import error_charts, inlier_charts, path_chart, time_charts
 from rstrack.metrics.clock import TruthOffset

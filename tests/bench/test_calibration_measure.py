@@ -23,8 +23,8 @@ from benchmarks.measures.calibration import (
 from rsgen.config.config import Config
 from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
+from rstrack.calibration.parameters import COUNT, DRIFT, EXTRINSICS, POSES
 from rstrack.calibration.run import parameters_of
-from rstrack.calibration.unknowns.parameters import COUNT, DRIFT, EXTRINSICS, POSES
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.image_files import NoisyImages
 

@@ -17,8 +17,8 @@ from benchmarks.measures.calibration import crossed_cell, lens_cell
 from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
 from rstrack.bench.task import Task
+from rstrack.calibration.parameters import COUNT
 from rstrack.calibration.run import parameters_of
-from rstrack.calibration.unknowns.parameters import COUNT
 from rstrack.data.dataset import Dataset
 
 CAMERA = "color: {width: 32, height: 24, intrinsics: [24, 24, 15.5, 11.5], readout_s: 0.02}\n"

@@ -30,7 +30,7 @@ from rstrack.bench.experiments.method_tables import write_results
 from rstrack.bench.experiments.methods import SequenceInfo
 from rstrack.bench.measures.blur import PANELS, Panels
 from rstrack.bench.record import CellRecord
-from rstrack.calibration.findings.record import CALIBRATION
+from rstrack.calibration.record import CALIBRATION
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import write_estimate
 from rstrack.metrics.run_evaluate import run_evaluate

@@ -13,8 +13,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
-from rstrack.calibration.findings.pace import Pace
-from rstrack.calibration.findings.residuals import Residuals
+from rstrack.calibration.figures import Pace, Residuals
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.image_files import ImageReader
 from rstrack.data.rig import DepthError

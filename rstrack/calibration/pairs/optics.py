@@ -15,7 +15,7 @@ from rsgen.device.lens import Lens
 from rsgen.device.projection import Projection, Vector
 from rsgen.geometry.camera import Camera
 from rstrack.alignment.block_sums import BlockSums, ColumnSums
-from rstrack.calibration.unknowns.parameters import DEPTH, LENS, NAMES
+from rstrack.calibration.parameters import DEPTH, LENS, NAMES
 from rstrack.data.rig import DepthError
 
 # Coefficients of distortion at most.

@@ -9,16 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from rsgen.array_types import FloatArray
+from rsgen.array_types import BoolArray, FloatArray
 from rsgen.device.arrays import Engine, Kernels
 from rsgen.device.lens import Lens
 from rsgen.geometry.camera import Camera
 from rstrack.alignment.block_sums import BlockSums, Scaling, block_counts
+from rstrack.calibration.pairs.images import Surface, pair_lens
 from rstrack.calibration.pairs.kernels import ColorPairInput, DepthPairInput, color_pair_kernel, depth_pair_kernel
 from rstrack.calibration.pairs.optics import Asked, Optics, camera_table, error_table, in_units, units
-from rstrack.calibration.pairs.surfaces import Surface
-from rstrack.calibration.unknowns.parameters import Parameters, changed
-from rstrack.data.rig import DepthError
+from rstrack.calibration.parameters import COLOR_LENS, COUNT, DEPTH, DEPTH_ERROR, DEPTH_LENS, LENS, Parameters, changed
+from rstrack.data.dataset import Dataset
+from rstrack.data.rig import NO_DEPTH_ERROR, DepthError
 from rstrack.images.line_poses import Exposure
 from rstrack.images.pyramid import camera_rays
 
@@ -127,3 +128,18 @@ class PairTerms:
         pixels = -(-camera.width // stride) * -(-camera.height // stride)
         blocks = block_counts(lens, lens)[0]
         return Scaling(median_depth, bound, min(pixels, -(-_CROWDED * pixels // blocks)))
+
+
+def pair_terms(e: Engine, dataset: Dataset, free: BoolArray | None = None) -> PairTerms:
+    """The kernels of a dataset's rig, with columns for those lens and depth unknowns (31,) that are free."""
+    rig = dataset.rig
+    depth, color = pair_lens(rig.depth_camera, rig.depth_shutter), pair_lens(rig.color_camera, rig.color_shutter)
+    return PairTerms(e, depth, color, _asked(dataset, np.zeros(COUNT, bool) if free is None else free))
+
+
+def _asked(dataset: Dataset, free: BoolArray) -> Asked:
+    one = dataset.rig.is_registered
+    color = tuple(name for name, asked in zip(LENS, free[COLOR_LENS], strict=True) if asked)
+    depth = color if one else tuple(name for name, asked in zip(LENS, free[DEPTH_LENS], strict=True) if asked)
+    depth += tuple(name for name, asked in zip(DEPTH, free[DEPTH_ERROR], strict=True) if asked)
+    return Asked(depth, color, bool(free[DEPTH_ERROR].any()) or dataset.depth_error != NO_DEPTH_ERROR, one)

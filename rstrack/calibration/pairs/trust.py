@@ -19,13 +19,12 @@ from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rstrack.alignment.block_sums import Pixels, Scaling, every
 from rstrack.alignment.brightness import SAME
-from rstrack.calibration.pairs.images import Lines, lines_of
+from rstrack.calibration.pairs.images import Lines, Surface, lines_of
 from rstrack.calibration.pairs.kernels import color_residual, depth_residual
 from rstrack.calibration.pairs.optics import turn
-from rstrack.calibration.pairs.stretch import Stretch, View
-from rstrack.calibration.pairs.surfaces import Surface
 from rstrack.calibration.pairs.terms import FLOOR_DEPTH, GATE_INTENSITY, GATE_SIGMAS, PairTerms
-from rstrack.calibration.unknowns.parameters import Parameters
+from rstrack.calibration.pairs.window import Stretch, View
+from rstrack.calibration.parameters import Parameters
 
 
 def trust_in(stretch: Stretch, terms: PairTerms, p: Parameters) -> float:

@@ -20,16 +20,17 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.calibration import run as calibration_run
 from rstrack.calibration import solve as calibration_solve
-from rstrack.calibration.pairs import stretch
-from rstrack.calibration.pairs.load import load_stretch, pair_terms
+from rstrack.calibration.pairs import window
+from rstrack.calibration.pairs.terms import pair_terms
 from rstrack.calibration.pairs.trust import trust_in
-from rstrack.calibration.run import calibrate, parameters_of
-from rstrack.calibration.unknowns.parameters import (
+from rstrack.calibration.parameters import (
     COUNT,
     DRIFT,
     LENSES,
     USEFUL,
 )
+from rstrack.calibration.run import calibrate, parameters_of
+from rstrack.calibration.start import load_stretch
 from rstrack.cli.main import main
 from rstrack.data.dataset import Dataset
 from rstrack.data.image_files import NoisyImages, with_noise
@@ -40,7 +41,7 @@ from rstrack.options import Options
 @pytest.fixture(autouse=True)
 def few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
     """A quarter of the pairs of frames, and one coarse level: what all find stands beside the derivatives."""
-    monkeypatch.setattr(stretch, "_APART", (5,))
+    monkeypatch.setattr(window, "_APART", (5,))
     monkeypatch.setattr(calibration_run, "_COARSE", (1,))
 
 

@@ -12,13 +12,9 @@ import pytest
 from shaken_recording import FRAMES, OPTIONS, PACE, RATE_HZ, READOUT_S, RESIDUALS, SHORT, recording, shaking, told
 
 from rstrack.calibration import run as calibration_run
-from rstrack.calibration.findings.record import read_record
-from rstrack.calibration.findings.result import Calibration
-from rstrack.calibration.pairs import stretch
-from rstrack.calibration.run import calibrate, parameters_of
-from rstrack.calibration.solve import Solution
-from rstrack.calibration.unknowns.devices import Device, Stream
-from rstrack.calibration.unknowns.parameters import (
+from rstrack.calibration.devices import Device, Stream
+from rstrack.calibration.pairs import window
+from rstrack.calibration.parameters import (
     COUNT,
     DEPTH_ERROR,
     DEPTH_LENS,
@@ -26,6 +22,10 @@ from rstrack.calibration.unknowns.parameters import (
     PRIOR,
     changed,
 )
+from rstrack.calibration.record import read_record
+from rstrack.calibration.result import Calibration
+from rstrack.calibration.run import calibrate, parameters_of
+from rstrack.calibration.solve import Solution
 from rstrack.cli.main import main
 from rstrack.data.camera_file import read_rig
 from rstrack.data.dataset import Dataset, open_dataset
@@ -36,7 +36,7 @@ from rstrack.data.timing import Timing, stream_timing
 @pytest.fixture(autouse=True)
 def few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
     """A quarter of the pairs of frames, and one coarse level: what all find stands beside the derivatives."""
-    monkeypatch.setattr(stretch, "_APART", (5,))
+    monkeypatch.setattr(window, "_APART", (5,))
     monkeypatch.setattr(calibration_run, "_COARSE", (1,))
 
 

@@ -18,24 +18,25 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera, Model
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
-from rstrack.calibration.findings.residuals import extrapolated, residuals_at, residuals_now
-from rstrack.calibration.pairs import stretch as pairs_stretch
+from rstrack.calibration.figures import extrapolated, residuals_at, residuals_now
+from rstrack.calibration.pairs import window as pairs_window
 from rstrack.calibration.pairs.images import Taken, lines_of
-from rstrack.calibration.pairs.load import like, load_stretch, pair_terms
 from rstrack.calibration.pairs.optics import camera_table, moves, traced
-from rstrack.calibration.run import calibrate, parameters_of
-from rstrack.calibration.solve import Solution, solve
-from rstrack.calibration.unknowns.known import Known
-from rstrack.calibration.unknowns.parameters import (
+from rstrack.calibration.pairs.terms import pair_terms
+from rstrack.calibration.parameters import (
     COUNT,
     DRIFT,
     LENS,
     NAMES,
     POSES,
+    Known,
     Parameters,
     changed,
     free_of,
 )
+from rstrack.calibration.run import calibrate, parameters_of
+from rstrack.calibration.solve import Solution, solve
+from rstrack.calibration.start import like, load_stretch
 from rstrack.data.dataset import Dataset
 from rstrack.data.image_files import NoisyImages
 from rstrack.data.rig import DepthError
@@ -77,7 +78,7 @@ def test_lines_move_with_every_parameter_and_control_point_as_finite_differences
 def test_the_gradient_changes_along_every_parameter_as_the_normal_equations_say(
     shaken: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pairs_stretch, "_APART", (4,))
+    monkeypatch.setattr(pairs_window, "_APART", (4,))
     lensed = bent(shaken)
     terms, p = pair_terms(engine("llvm"), lensed, np.ones(COUNT, bool)), parameters_of(lensed)
     assert shaken.truth is not None
@@ -98,7 +99,7 @@ def test_the_gradient_changes_along_every_parameter_as_the_normal_equations_say(
 
 
 def test_scipy_finds_the_same_offset_by_the_cost_alone(shaken: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pairs_stretch, "_APART", (5,))
+    monkeypatch.setattr(pairs_window, "_APART", (5,))
     terms, p = pair_terms(engine("llvm"), shaken), parameters_of(shaken)
     assert shaken.truth is not None
     stretches = [load_stretch(terms, shaken, range(4, 20), shaken.truth, p, OPTIONS)]

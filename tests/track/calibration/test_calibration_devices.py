@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from rsgen.errors import UserError
+from rstrack.calibration.devices import DEVICES, Device, Stream, device_named, device_notes
+from rstrack.calibration.parameters import COUNT, Known, Parameters, free_of
 from rstrack.calibration.solve import Solution
-from rstrack.calibration.unknowns.devices import DEVICES, Device, Stream, device_named, device_notes
-from rstrack.calibration.unknowns.known import Known
-from rstrack.calibration.unknowns.parameters import COUNT, Parameters, free_of
 from rstrack.cli.main import main
 
 RECORDINGS = Path(__file__).parents[3] / "docs/recordings.md"

@@ -12,10 +12,10 @@ import pytest
 
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
-from rstrack.calibration.findings.result import Calibration
+from rstrack.calibration.parameters import COUNT, NAMES, Parameters
+from rstrack.calibration.result import Calibration
 from rstrack.calibration.several import check_alike, together
 from rstrack.calibration.solve import Solution
-from rstrack.calibration.unknowns.parameters import COUNT, NAMES, Parameters
 
 START = Parameters(0.03, 0.03, 0.0, 0.0, np.eye(4))
 AT = [NAMES.index(name) for name in ("color.readout_s", "color.offset_s", "color.fx", "color.cx")]

@@ -12,11 +12,11 @@ from shaken_recording import OPTIONS, READOUT_S, SHORT
 
 from rsgen.array_types import ByteArray, Float32Array
 from rstrack.calibration import run as calibration_run
-from rstrack.calibration.pairs import stretch
-from rstrack.calibration.pairs.stretch import overcounted
+from rstrack.calibration.pairs import window
+from rstrack.calibration.pairs.window import overcounted
+from rstrack.calibration.parameters import BY_COLOR, COUNT, NAMES, Parameters
 from rstrack.calibration.run import calibrate
 from rstrack.calibration.solve import Solution, joined
-from rstrack.calibration.unknowns.parameters import BY_COLOR, COUNT, NAMES, Parameters
 from rstrack.data.dataset import Dataset
 from rstrack.data.image_files import ImageReader
 from rstrack.data.rig import DEFAULT_SIGMA
@@ -43,7 +43,7 @@ class UnevenDepth:
 
 @pytest.fixture(autouse=True)
 def few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stretch, "_APART", (5,))
+    monkeypatch.setattr(window, "_APART", (5,))
     monkeypatch.setattr(calibration_run, "_COARSE", (1,))
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
-from rstrack.calibration.findings.lens_pixels import displacement_px, lens_map, rms, sigma_px
-from rstrack.calibration.unknowns.parameters import LENS, changed
+from rstrack.calibration.figures import displacement_px, lens_map, rms, sigma_px
+from rstrack.calibration.parameters import LENS, changed
 
 BENT = Camera(640, 480, 525.0, 524.0, 318.0, 241.0, "radtan", (0.1, -0.2, 1e-3, -2e-3, 0.0))
 

@@ -12,7 +12,7 @@ import pytest
 from report_util import NASTY, Parsed, calibration, make_run, make_sequence, parse, write_calibration
 
 from rsgen.errors import UserError
-from rstrack.calibration.findings.record import CALIBRATION, read_record
+from rstrack.calibration.record import CALIBRATION, read_record
 from rstrack.cli.main import main
 from rstrack.report.build import write_report
 from rstrack.report.calibration import strip_chart

@@ -13,8 +13,7 @@ from typing import Literal
 import numpy as np
 
 from rsgen.errors import UserError
-from rstrack.calibration.unknowns.known import Known
-from rstrack.calibration.unknowns.parameters import COUNT, NAMES, Parameters
+from rstrack.calibration.parameters import COUNT, NAMES, Known, Parameters
 
 # σ of the readout of a shutter that is published to be global, s.
 _GLOBAL_SIGMA_S = 1e-4

@@ -13,12 +13,8 @@ from rsgen.array_types import BoolArray, FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter
-from rstrack.calibration.findings.lens_pixels import displacement_px, lens_map, rms, sigma_px
-from rstrack.calibration.findings.motion import Motion
-from rstrack.calibration.findings.pace import Pace, since_begin
-from rstrack.calibration.findings.residuals import Residuals
-from rstrack.calibration.solve import Solution
-from rstrack.calibration.unknowns.parameters import (
+from rstrack.calibration.figures import Motion, Pace, Residuals, displacement_px, lens_map, rms, sigma_px, since_begin
+from rstrack.calibration.parameters import (
     COLOR_LENS,
     COUNT,
     DEPTH,
@@ -32,6 +28,7 @@ from rstrack.calibration.unknowns.parameters import (
     Parameters,
     changed,
 )
+from rstrack.calibration.solve import Solution
 from rstrack.data.camera_file import usual
 from rstrack.data.dataset import Dataset
 

@@ -15,11 +15,10 @@ from rstrack.alignment.block_sums import BlockSums
 from rstrack.alignment.brightness import SAME
 from rstrack.alignment.priors import ACCELERATION, acceleration_prior, pose_constraint
 from rstrack.alignment.weights import scale_step
-from rstrack.calibration.pairs.images import Lines, Taken, lines_of
+from rstrack.calibration.pairs.images import Lines, Surface, Taken, lines_of
 from rstrack.calibration.pairs.optics import Optics
-from rstrack.calibration.pairs.surfaces import Surface
 from rstrack.calibration.pairs.terms import FLOOR_DEPTH, FLOOR_INTENSITY, PairTerms
-from rstrack.calibration.unknowns.parameters import COUNT, POSES, Parameters
+from rstrack.calibration.parameters import COUNT, POSES, Parameters
 
 # σ of accelerations (m/s², rad/s²), looser than the tracker's; the ends, which few lines touch, are held more tightly.
 _ACCELERATION = 3.0 * ACCELERATION

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from rsgen.errors import UserError, first_problem
 from rsgen.files import atomic_write, read_text
-from rstrack.calibration.findings.result import Calibration
+from rstrack.calibration.result import Calibration
 
 CALIBRATION = "calibration.json"
 

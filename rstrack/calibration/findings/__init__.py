@@ -1,1 +1,0 @@
-"""What is said of a calibration: values and errors, residuals, pace, records."""

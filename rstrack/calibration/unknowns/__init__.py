@@ -1,1 +1,0 @@
-"""What is unknown, and what is known of it beforehand."""
