@@ -12,6 +12,8 @@ import numpy as np
 
 from benchmarks.compare import compare
 from benchmarks.inference import tolerances
+from benchmarks.size import CELL as SIZE
+from benchmarks.size import size_record
 from rsgen.console.command_line import Commands, Parser, Quiet, run_program
 from rsgen.console.progress import Progress
 from rsgen.console.scheduler import Scheduler, open_workers
@@ -26,13 +28,13 @@ TIERS = ("smoke", "gate", "full")
 SPEED = "speed"
 
 _DESCRIPTION = """\
-Runs what the project claims and compares it with the last time.
+Measures the project and compares the figures with those of the last time.
 
-  ./run.sh bench smoke                                        that every measure runs: minutes, part of the tests
-  ./run.sh bench gate --data DIR                              what guards every change: at most 25 minutes
-  ./run.sh bench gate --against benchmarks/results/gate.json  says what changed beyond chance; 1 if anything is worse
-  ./run.sh bench full --only 'track/table1/*'                 everything, or some of it: hours, resumable
-  ./run.sh bench gate --accept                                keeps the records as the committed ones
+  ./run.sh bench smoke                                        check that every measure runs; minutes, part of the tests
+  ./run.sh bench gate --data DIR                              run before every change is accepted; at most 25 minutes
+  ./run.sh bench gate --against benchmarks/results/gate.json  compare; exit status 1 if a figure is worse beyond chance
+  ./run.sh bench gate --accept                                store the records as the committed ones
+  ./run.sh bench full --only 'track/table1/*'                 run everything, or a part; hours, resumable
 """
 _STATUS = "exit status: 0 done, 1 something is worse or failed, 2 wrong input, 130 interrupted (run it again to go on)"
 
@@ -51,30 +53,30 @@ def _parser() -> Parser:
 
 @dataclass(frozen=True)
 class Choice:
-    """What of a tier is run, where, and what becomes of it."""
+    """What of a tier is run, where, and what is done with the records."""
 
-    only: Annotated[tuple[str, ...] | None, "cells whose names (MEASURE/CASE/METHOD) match, * allowed", "GLOB"] = None
-    data: Annotated[Path | None, "folder of recordings; what needs one is skipped where it is absent", "DIR"] = None
-    cache: Annotated[Path | None, "where rendered sequences are kept (default: in ~/.cache)", "DIR"] = None
-    out: Annotated[Path | None, "where cells are kept while they are made (default: out/bench/TIER)", "DIR"] = None
+    only: Annotated[
+        tuple[str, ...] | None, "run only cells whose names (MEASURE/CASE/METHOD) match; * is allowed", "GLOB"
+    ] = None
+    data: Annotated[Path | None, "folder of recordings; cells whose recording is missing are skipped", "DIR"] = None
+    cache: Annotated[Path | None, "folder for rendered sequences (default: in ~/.cache)", "DIR"] = None
+    out: Annotated[Path | None, "folder for finished cells (default: out/bench/TIER)", "DIR"] = None
     against: Annotated[Path | None, "records to compare with", "FILE"] = None
-    accept: Annotated[bool, "keep the records as benchmarks/results/TIER.json: the commit that does it says why"] = (
-        False
-    )
+    accept: Annotated[bool, "store the records as benchmarks/results/TIER.json; say why in the commit"] = False
 
 
 def smoke(choice: Choice, *, scheduler: Scheduler = None, quiet: Quiet = False) -> int:
-    """That every measure runs: minutes."""
+    """Check that every measure runs: minutes."""
     return run_tier("smoke", choice, scheduler, quiet)
 
 
 def gate(choice: Choice, *, scheduler: Scheduler = None, quiet: Quiet = False) -> int:
-    """What guards every change: at most 25 minutes on two cores."""
+    """Run what guards every change: at most 25 minutes on two cores."""
     return run_tier("gate", choice, scheduler or "local", quiet)
 
 
 def full(choice: Choice, *, scheduler: Scheduler = None, quiet: Quiet = False) -> int:
-    """Everything at full size: hours."""
+    """Run everything at full size: hours."""
     return run_tier("full", choice, scheduler, quiet)
 
 
@@ -115,9 +117,11 @@ def run_tier(tier: str, choice: Choice, scheduler: str | None, quiet: bool) -> i
             if part.interrupted:
                 break
     records = {cell.name: outcome.records[cell.name] for cell in benchmark.cells if cell.name in outcome.records}
+    if tier == "gate" and not choice.only:
+        records[SIZE] = size_record(HERE.parent)
     failed = [record.cell for record in records.values() if record.error is not None and not record.skipped]
     skipped = sum(record.skipped for record in records.values())
-    print(f"{tier}: {len(records)} of {len(benchmark.cells)} cells, {skipped} skipped, {len(failed)} failed")
+    print(f"{tier}: {len(outcome.records)} of {len(benchmark.cells)} cells, {skipped} skipped, {len(failed)} failed")
     if before is not None and not outcome.interrupted:
         chosen = {cell.name for cell in benchmark.cells}
         comparison = compare({name: r for name, r in before.items() if name in chosen or not choice.only}, records)

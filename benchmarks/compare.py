@@ -21,7 +21,7 @@ there is a false alarm in at most one comparison of twenty (Holm 1979). The test
 - A cell that failed, or has no error in a run or in all of them where there was one: worse.
 
 Milliseconds are never judged, since machines differ, and one machine from one day to the next: the ratio of median
-times in one run is. Other people's trackers are shown, and not judged.
+times in one run is. Other people's trackers and the size of the product are shown, and not judged.
 """
 
 from __future__ import annotations
@@ -47,6 +47,8 @@ from benchmarks.inference import (
     spread_of,
     stouffer_p,
 )
+from benchmarks.size import CELL as SIZE
+from benchmarks.size import size_changes
 from rstrack.bench.figures import FigureInfo, figure_of
 from rstrack.bench.record import CellRecord
 
@@ -79,7 +81,7 @@ def compare(old: Mapping[str, CellRecord], new: Mapping[str, CellRecord]) -> Rec
     judged, cells = _Judged(), defaultdict[str, list[str]](list)
     pairs: list[tuple[CellRecord, CellRecord]] = []
     same = 0
-    for name in dict.fromkeys((*old, *new)):
+    for name in dict.fromkeys(name for name in (*old, *new) if name != SIZE):
         before, after = old.get(name), new.get(name)
         fate = _fate(before, after)
         if fate:
@@ -105,7 +107,7 @@ def compare(old: Mapping[str, CellRecord], new: Mapping[str, CellRecord]) -> Rec
     return RecordComparison(
         (*judged.worse, *worse), (*judged.better, *better), tuple(judged.unknown),
         {what: tuple(cells[what]) for what in _FATES if cells[what]}, tuple(times(pairs)), len(tests), same,
-        sum(not after.is_others for _, after in pairs),
+        sum(not after.is_others for _, after in pairs), size_changes(old, new),
     )  # fmt: skip
 
 

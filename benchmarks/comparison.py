@@ -45,7 +45,7 @@ class FigureChange:
 @dataclass(frozen=True)
 class RecordComparison:
     """worse, better: beyond chance. unknown: changed, but what chance does there was never measured. cells: names by
-    what became of them, where there is nothing to compare. times: lines. tests: how many; same: cells all alike.
+    what became of them, where there is nothing to compare. times, size: lines. tests: how many; same: cells all alike.
     """
 
     worse: tuple[FigureChange, ...] = ()
@@ -56,6 +56,7 @@ class RecordComparison:
     tests: int = 0
     same: int = 0
     compared: int = 0
+    size: tuple[str, ...] = ()
 
     def text(self) -> str:
         """For the screen: worse first, then better, then what was not compared."""
@@ -66,7 +67,7 @@ class RecordComparison:
             lines.append("changed, and not judged: how chance scatters these is not known")
             lines += [f"  {change.text()}" for change in self.unknown]
         lines += [f"{what}: {', '.join(names)}" for what, names in self.cells.items()]
-        lines += self.times
+        lines += [*self.times, *self.size]
         verdict = "nothing got worse" if not self.worse else f"{len(self.worse)} figures got worse"
         lines.append(
             f"{verdict}: {self.compared} cells compared, {self.same} of them alike in every run; {self.tests} tests, "

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from statistics import geometric_mean
 
+from benchmarks.size import size_table
 from benchmarks.verdicts import FAMILY, beaten, beaten_table, peer_of, sentences
 from rsgen.console.tables import NOTHING, Entry, Table, significant
 from rstrack.bench.record import (
@@ -183,6 +184,12 @@ def measured(title: str, *measures: str) -> Callable[[Records], list[str]]:
         return _section(title, measured_table(records, _COLUMNS[measures[0]]), records)
 
     return section
+
+
+def size(records: Records) -> list[str]:
+    """How large the product is, by wing."""
+    found = of_measure(records, "size")
+    return _section("Size of the product", size_table(found[0]), found) if found else []
 
 
 def not_the_best(full: Records) -> list[str]:

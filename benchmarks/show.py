@@ -81,6 +81,7 @@ def results_markdown(gate: Records, full: Records) -> str:
         sections.measured("Convergence and start", "convergence", "bootstrap"),
         sections.measured("Light and rendering", "light", "render"),
         sections.measured("Long runs", "long"),
+        sections.size,
     )  # fmt: skip
     tiers = [*_provenance("Full tier", full), *_provenance("Gate", gate)]
     missing = [*failures(full.values()), *failures(gate.values())]

@@ -126,6 +126,10 @@ FIGURES: tuple[FigureInfo, ...] = (
     FigureInfo("not_converged_*", "", "", "less", "count"),
     FigureInfo("refused_*", "", "", "unjudged", "count"),
     FigureInfo("lost_last", "lost of the last", "frames", "less", "count"),
+    # Of the product itself.
+    FigureInfo("lines*", "lines", "", "unjudged", "count"),
+    FigureInfo("modules*", "modules", "", "unjudged", "count"),
+    FigureInfo("constants*", "constants", "", "unjudged", "count"),
     # All other errors, at multiples of a distance too (median_error_mm_2x).
     FigureInfo("*_mm", "", "mm", "less", "log"),
     FigureInfo("*_deg", "", "deg", "less", "log"),

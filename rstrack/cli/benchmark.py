@@ -48,12 +48,12 @@ def _named(text: str) -> tuple[str, str]:
 
 @dataclass(frozen=True)
 class Narrowed:
-    """What a readout sweep or a stress test is narrowed down to; None: what it is by itself."""
+    """Limits of a readout sweep or a stress test; None: as its config has it."""
 
-    width: Annotated[int | None, "of all images, px: small ones are rendered and tracked sooner", "PX"] = None
-    readout: Annotated[tuple[float, ...] | None, "only these readouts, s", "S"] = None
-    exposure: Annotated[tuple[float, ...] | None, "only these exposures, s", "S"] = None
-    seeds: Annotated[int | None, "runs of each, with other noise every time", "N"] = None
+    width: Annotated[int | None, "width of all images, px; small images are rendered and tracked faster", "PX"] = None
+    readout: Annotated[tuple[float, ...] | None, "run only these readout times, s", "S"] = None
+    exposure: Annotated[tuple[float, ...] | None, "run only these exposure times, s", "S"] = None
+    seeds: Annotated[int | None, "number of runs of each cell, each with different noise", "N"] = None
 
 
 def bench(
@@ -61,46 +61,46 @@ def bench(
     narrowed: Narrowed,
     config: ConfigFile = Path("evaluation"),
     *,
-    data: Annotated[Path, "folder of the sequences' folders", "DIR"] = Path("out"),
+    data: Annotated[Path, "folder that holds the sequences", "DIR"] = Path("out"),
     out: Annotated[
         Path | None,
-        "for runs, tables, plots; finished cells there are kept (default: out/bench, or out/bench_quick, "
-        "out/readout_sweep, out/stress)",
+        "folder for runs, tables and plots; finished cells in it are reused (default: out/bench, out/bench_quick, "
+        "out/readout_sweep or out/stress)",
         "DIR",
     ] = None,
-    quick: Annotated[bool, "the config's short version"] = False,
+    quick: Annotated[bool, "run the short version that the config defines"] = False,
     frames: Frames = None,
-    sequence: Annotated[tuple[str, ...] | None, "only these", "NAME"] = None,
-    method: Annotated[tuple[str, ...] | None, "only these", "NAME"] = None,
-    peers: Annotated[bool, "Open3D's odometry, KISS-ICP, small_gicp and ORB-SLAM3 too"] = False,
+    sequence: Annotated[tuple[str, ...] | None, "run only these sequences", "NAME"] = None,
+    method: Annotated[tuple[str, ...] | None, "run only these methods", "NAME"] = None,
+    peers: Annotated[bool, "also run Open3D's odometry, KISS-ICP, small_gicp and ORB-SLAM3"] = False,
     add: Annotated[
         list[tuple[str, Path]] | None,
-        "a tracker of your own: DIR holds SEQUENCE.txt (TUM), or SEQUENCE/ (a run folder), for each sequence",
+        "add results of another tracker: DIR holds SEQUENCE.txt (TUM) or SEQUENCE/ (a run folder) for each sequence",
         "NAME=DIR",
         _added,
     ] = None,
     peer_command: Annotated[
         list[tuple[str, str]] | None,
-        "a tracker of your own, run on each sequence: mine='mytracker {sequence} {out}' reads the folder {sequence} "
-        "and writes the TUM file {out}",
+        "run another tracker on each sequence: mine='mytracker {sequence} {out}' reads the folder {sequence} and "
+        "writes the TUM file {out}",
         "NAME=COMMAND",
         _command,
     ] = None,
     truth_offset: TruthOffset = None,
     meshes: Annotated[
-        bool | None, "pictures of maps made with the trajectories, one a sequence (default: yes, but with --quick no)"
+        bool | None, "draw a picture of the maps of each sequence (default: yes, with --quick no)"
     ] = None,
-    speed: Annotated[bool, "instead of errors, how long a frame takes with each method"] = False,
+    speed: Annotated[bool, "measure the time of a frame with each method instead of errors"] = False,
     scheduler: Scheduler = None,
     quiet: Quiet = False,
 ) -> int:
-    """Run tracking methods on sequences and compare them with the truth and the paper: tables and plots.
+    """Run tracking methods on sequences and compare them with the truth and with the paper; writes tables and plots.
 
-    CONFIG says what is run. evaluation, the default: every method on every sequence of the paper. Each of our methods
-    runs with fused keyframes and without, unless --fuse or --no-fuse says which; the tables show the better of the two
-    for baseline and gs-*, and both for rs-*. readout_sweep: error against readout time; --sequence names motions.
-    stress: one motion at several exposures and speeds, with constant and with blur-aware weights. These two render the
-    sequences that are missing. Finished cells are kept: the same command goes on where it ended.
+    The config says what is run. 'evaluation' (default) runs every method on every sequence of the paper. Each of our
+    methods runs with fused keyframes and without, unless --fuse or --no-fuse chooses; the tables show the better one
+    for baseline and gs-*, and both for rs-*. 'readout_sweep' measures the error against the readout time; --sequence
+    names its motions. 'stress' runs one motion at several exposures and speeds, with constant and with blur-aware
+    weights. The last two render missing sequences. Finished cells are stored: the same command resumes.
     """
     from rsgen.files import read_yaml
     from rstrack.bench.experiments.run import run_experiment
