@@ -64,26 +64,26 @@ def export_euroc(
     negative, if a stream's distortion does not fit EuRoC's four coefficients, or if the disk refuses.
     """
     imu = sequence_imu(sequence)
-    T_depth_body = imu[0].T_depth_imu() if imu else np.eye(4)
+    T_depth_body = imu.config.T_depth_imu() if imu else np.eye(4)
     root = Path(out) / "mav0"
     streams = zip(("cam0", "depth0"), image_streams(sequence), strict=True)
     sensors = {name: (stream, se3.inverse(T @ T_depth_body)) for name, (stream, T) in streams}
     described = {name: _camera_yaml(stream, T_BS) for name, (stream, T_BS) in sensors.items()}
     stamps = {name: nanoseconds(stream.listed, epoch_s) for name, (stream, _) in sensors.items()}
-    times = imu[1].t if imu else ground_truth(sequence.spline)[:, 0]
+    times = imu.samples.t if imu else ground_truth(sequence.spline)[:, 0]
     if min(*(ns[0] for ns in stamps.values()), nanoseconds(times[:1], epoch_s)[0]) < 0:
         raise UserError(f"{out}: EuRoC's stamps cannot be negative: give an epoch of a second or more")
 
     new_folder(root)
     make_folders(*(root / name / "data" for name in sensors), root / _TRUTH)
-    atomic_write(root / "body.yaml", encode_yaml(_body_yaml(sequence, imu[0] if imu else None, epoch_s)))
-    truth = truth_csv(sequence, times, T_depth_body, imu[1] if imu else None, epoch_s)
+    atomic_write(root / "body.yaml", encode_yaml(_body_yaml(sequence, imu.config if imu else None, epoch_s)))
+    truth = truth_csv(sequence, times, T_depth_body, imu.samples if imu else None, epoch_s)
     atomic_write(root / _TRUTH / "data.csv", truth)
     atomic_write(root / _TRUTH / "sensor.yaml", encode_yaml(_truth_yaml()))
     if imu:
         make_folders(root / "imu0")
-        write_imu_csv(root / "imu0" / "data.csv", imu[1], epoch_s)
-        atomic_write(root / "imu0" / "sensor.yaml", encode_yaml(_imu_yaml(imu[0])))
+        write_imu_csv(root / "imu0" / "data.csv", imu.samples, epoch_s)
+        atomic_write(root / "imu0" / "sensor.yaml", encode_yaml(_imu_yaml(imu.config)))
     for k, (name, (stream, _)) in enumerate(sensors.items()):
         files = [f"{ns}.png" for ns in stamps[name]]
         rows = [f"{ns},{file}" for ns, file in zip(stamps[name], files, strict=True)]

@@ -54,9 +54,9 @@ def export_kalibr(
     atomic_write(out / "camchain.yaml", encode_yaml(chain))
     written, note = ["camchain.yaml"], "" if imu else " (the sequence has no IMU)"
     if imu:
-        atomic_write(out / "imu.yaml", encode_yaml(imu_yaml(imu[0])))
+        atomic_write(out / "imu.yaml", encode_yaml(imu_yaml(imu.config)))
         written.append("imu.yaml")
-        zero = [name for name in _DENSITIES if getattr(imu[0], name) == 0.0]
+        zero = [name for name in _DENSITIES if getattr(imu.config, name) == 0.0]
         note = f"; Kalibr itself refuses a {zero[0]} of 0" if zero else ""
     if target:
         atomic_write(out / "target.yaml", encode_yaml(target_yaml(target.grid)))
@@ -66,7 +66,7 @@ def export_kalibr(
         place_images(color.paths, targets, options.copy, progress)
         written += ["target.yaml", f"cam0/ with {len(targets)} images"]
         if imu:
-            write_imu_csv(out / "imu0.csv", imu[1], EPOCH_S)
+            write_imu_csv(out / "imu0.csv", imu.samples, EPOCH_S)
             written.append("imu0.csv")
     progress("export", 1.0, written[-1])
     return f"{out}: {', '.join(written)}{note}"

@@ -43,7 +43,7 @@ def export_rerun(
 
 def _log(rr: Any, recording: Any, sequence: Sequence, progress: Progress) -> None:
     imu = sequence_imu(sequence)
-    gravity = np.array(imu[0].gravity) if imu else np.zeros(3)
+    gravity = np.array(imu.config.gravity) if imu else np.zeros(3)
     axis = int(np.argmax(np.abs(gravity)))
     up = _UP[axis, int(np.sign(gravity[axis]))] if gravity.any() else "Y_UP"
     recording.log("world", getattr(rr.ViewCoordinates, f"RIGHT_HAND_{up}"), static=True)
@@ -54,8 +54,8 @@ def _log(rr: Any, recording: Any, sequence: Sequence, progress: Progress) -> Non
         if imu:
             names = [f"{axis} {channels}" for axis in "xyz"]
             recording.log(f"imu/{name}", rr.SeriesLines(names=names), static=True)
-            times = [rr.TimeColumn(TIMELINE, duration=imu[1].t)]
-            recording.send_columns(f"imu/{name}", times, rr.Scalars.columns(scalars=getattr(imu[1], name)))
+            times = [rr.TimeColumn(TIMELINE, duration=imu.samples.t)]
+            recording.send_columns(f"imu/{name}", times, rr.Scalars.columns(scalars=getattr(imu.samples, name)))
 
     color, depth = image_streams(sequence)
     count = len(color[0].paths) + len(depth[0].paths)

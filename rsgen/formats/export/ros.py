@@ -31,7 +31,7 @@ from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import nanoseconds
 from rsgen.sequence.format import ground_truth, pose_rows, poses_of_rows
 from rsgen.sequence.reader import Sequence, Stream
-from rsgen.truth.settings import sequence_imu
+from rsgen.truth.settings import SequenceImu, sequence_imu
 
 COLOR_FRAME, DEPTH_FRAME, IMU_FRAME = (
     "camera_color_optical_frame",
@@ -66,7 +66,7 @@ def export_ros(sequence: Sequence, out: Path, options: ExportOptions, progress: 
         start = max(0, min(nanoseconds([color[0].listed[0], depth[0].listed[0], truth[0, 0]])))
         statics = [(COLOR_FRAME, se3.inverse(sequence.T_color_depth))]
         if imu:
-            statics.append((IMU_FRAME, imu[0].T_depth_imu()))
+            statics.append((IMU_FRAME, imu.config.T_depth_imu()))
         _write_latched(bag, start, statics, facts, sequence.spline)
         sources = [_poses(bag, truth), *(_images(bag, sequence, stream) for stream in (color[0], depth[0]))]
         if imu:
@@ -168,9 +168,9 @@ def _depth(sequence: Sequence, k: int) -> tuple[np.ndarray, str]:
     return np.where(units > 0, units / scale, np.nan).astype("<f4"), "32FC1"
 
 
-def _imu(bag: Bag, imu: Any) -> Iterator[Message]:
+def _imu(bag: Bag, imu: SequenceImu) -> Iterator[Message]:
     """Readings from time 0 on, with covariances of the white noise and no orientation."""
-    config, samples = imu
+    config, samples = imu.config, imu.samples
     write = bag.add(IMU_TOPIC, "sensor_msgs/msg/Imu")
     gyro, accel = (
         (np.eye(3) * density**2 * config.rate_hz).ravel()

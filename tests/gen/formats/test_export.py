@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,7 @@ import pytest
 import synthetic
 from exported import EPOCH_NS, IMU, T_IMU_DEPTH, load, make_plain, with_color, with_imu
 
+from rsgen import formats
 from rsgen.config.config import Config
 from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
@@ -26,6 +29,7 @@ from rsgen.formats.export.registered import export_registered
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.sensors.imu import exact_imu
+from rsgen.sequence.format import pose_rows
 from rsgen.sequence.reader import Sequence, read_sequence
 from rsgen.truth.settings import sequence_imu
 
@@ -154,3 +158,25 @@ def test_the_exports_load_no_engine() -> None:
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == ""
     assert all(importlib.util.find_spec(name) for name in names)
+
+
+def test_the_export_of_the_document_is_one_module_and_one_line(
+    plain: Sequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """docs/adding-a-format.md: its module runs by its line in the registry."""
+    text = (Path(__file__).parents[3] / "docs/adding-a-format.md").read_text()
+    code, line = re.findall(r"^```python\n(.*?)^```$", text, flags=re.M | re.S)
+    module = ModuleType("rsgen.formats.export.poses_csv")
+    exec(code, module.__dict__)
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setattr(formats, "EXPORTS", dict(formats.EXPORTS))
+    exec(line, formats.__dict__)
+    out = plain.root / f"{plain.name}.csv"
+    told = formats.exporter("poses_csv")(plain, plain.root / formats.EXPORTS["poses_csv"][1].format(plain.name))
+    assert told == f"{out}: {sum(len(stream.paths) for stream in plain.streams.values())} poses"
+    rows = out.read_text().splitlines()[1:]
+    depth = plain.streams["depth"]
+    times = depth.shutter.line_mid_time(depth.stamps, 0.5 * (depth.line_count - 1), depth.camera)
+    expected = pose_rows(plain.spline.pose(times))
+    written = np.array([row.split(",")[3:] for row in rows if row.startswith("depth,")], float)
+    np.testing.assert_allclose(written, expected, atol=1e-9)

@@ -161,7 +161,7 @@ def test_tf_leads_from_the_world_to_the_camera(sequence: Sequence, messages: Mes
 def test_the_imu_is_the_sequence_s_from_time_0_on(sequence: Sequence, messages: Messages) -> None:
     found = sequence_imu(sequence)
     assert found is not None
-    config, samples = found
+    config, samples, _ = found
     later = samples.t >= 0
     assert 0 < later.sum() < len(later)
     read = messages["/camera/imu"]
