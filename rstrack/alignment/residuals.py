@@ -28,8 +28,17 @@ from rsgen.device.projection import TO_BASE, RollingProjection, Vector, gather, 
 from rsgen.geometry.camera import Camera
 from rstrack.alignment.block_sums import Contribution, Pixels, block_slot, contribution, sizes, summed
 from rstrack.alignment.brightness import MID_GREY
-from rstrack.images.blur import blur_length, blur_weight
-from rstrack.images.sampling import EDGE, NEAREST, grid, level_size, nearest, surface, value_and_slope
+from rstrack.images.sampling import (
+    EDGE,
+    NEAREST,
+    blur_length,
+    blur_weight,
+    grid,
+    level_size,
+    nearest,
+    surface,
+    value_and_slope,
+)
 
 WHOLE = 3
 """Unknowns of a depth image as a whole: offset and two tilts of its inverse depth."""

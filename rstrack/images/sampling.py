@@ -1,4 +1,4 @@
-"""Reading images on the device: grids of pixels, bilinear and nearest values, surfaces of inverse depth."""
+"""Reading images on the device: pixel grids, bilinear and nearest values, surfaces of inverse depth; motion blur."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 import drjit as dr
 
 from rsgen.device.arrays import Engine
+from rsgen.device.lens import Lens
 from rsgen.geometry.camera import Camera
 
 # Relative spread of inverse depth within 2×2 pixels from which on they lie on both sides of an edge.
@@ -93,3 +94,18 @@ def surface(e: Engine, camera: Camera, rho: Any, x: Any, y: Any, active: Any) ->
 def level_size(size: int, level: int) -> int:
     """Width or height of a pyramid level: halved and rounded up, as cv2.pyrDown does."""
     return -(-size // 2**level)
+
+
+def blur_weight(length_px: Any, inv_sigma2: Any) -> Any:
+    """Equation (13), w = exp(−‖x_t − x_{t−t_e}‖ / σ²), on the device.
+
+    length_px: how far the point moves in the image while its line is exposed. inv_sigma2: 1/σ², σ in pixels; 0 counts
+    all alike.
+    """
+    return dr.exp(-inv_sigma2 * length_px)
+
+
+def blur_length(lens: Lens, pixel_speed: tuple[Any, Any]) -> Any:
+    """‖x_t − x_{t−t_e}‖ in pixels of points that move by pixel_speed (px) per line delay (`project_rolling`)."""
+    u, v = pixel_speed
+    return dr.sqrt(u * u + v * v) * (lens.shutter.exposure_s / lens.shutter.line_delay(lens.camera))

@@ -14,8 +14,7 @@ from rsgen.device.arrays import Engine, Kernels
 from rsgen.device.lens import Lens
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.images.device_frame import DeviceRig, Timer, untimed
-from rstrack.images.left_out import MARGIN, thumbnail_without
+from rstrack.images.device_frame import MARGIN, DeviceRig, Timer, thumbnail_without, untimed
 from rstrack.images.line_poses import from_base_table, to_base_table
 from rstrack.images.pyramid import ColorImage, DepthImage, thumbnail
 from rstrack.images.sampling import EDGE

@@ -27,10 +27,9 @@ from rsgen.device.lens import Lens
 from rsgen.device.projection import RollingProjection, cross, gather, move, project, project_rolling
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.images.blur import blur_weight
 from rstrack.images.line_poses import Exposure, from_base_table, line_twists
 from rstrack.images.pyramid import DepthImage
-from rstrack.images.sampling import EDGE, bilinear, grid
+from rstrack.images.sampling import EDGE, bilinear, blur_weight, grid
 from rstrack.keyframes.keyframe import Reference
 
 SIGMA_PX = 1.0

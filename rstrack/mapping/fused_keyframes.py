@@ -66,8 +66,7 @@ def fused_keyframes(
     options = replace(options, method="rs-pg" if options.rolling else "gs-pg")
     e = engine(options.backend)
     # After the engine: it chooses the libLLVM that Dr.Jit loads.
-    from rstrack.images.device_frame import DeviceRig
-    from rstrack.images.left_out import frame_without
+    from rstrack.images.device_frame import DeviceRig, frame_without
     from rstrack.keyframes.maker import KeyframeMaker
     from rstrack.mapping.color_fusion import SIGMA_PX, ColorFusion, FusedColor, linear_image
 

@@ -23,7 +23,7 @@ from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.data.image_files import prefetched
 from rstrack.data.rig import Frame, Rig
-from rstrack.images.left_out import MARGIN
+from rstrack.images.device_frame import MARGIN
 from rstrack.images.line_poses import Exposure, from_base_table, to_base_table
 from rstrack.images.pyramid import camera_rays, depth_image, lens_sees
 from rstrack.keyframes.keyframe import rectified_lens

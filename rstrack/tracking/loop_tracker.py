@@ -30,8 +30,7 @@ from rstrack.adjustment.moves import Moves
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.rig import Frame, Rig
 from rstrack.images.device_frame import Timer, untimed
-from rstrack.keyframes.archive import Archive
-from rstrack.keyframes.kept_frames import KeptFrames
+from rstrack.keyframes.archive import Archive, StoredFrames
 from rstrack.options import Options
 from rstrack.tracking.frame_report import FrameReport
 from rstrack.tracking.loop_closing import Closing, graph_of, search_of
@@ -64,7 +63,7 @@ class LoopTracker:
         """
         self.rig, self._load = rig, load
         self._tracker = Tracker(rig, options, timer, imu)
-        self._frames = KeptFrames(1e9 * self.options.memory_gb)
+        self._frames = StoredFrames(1e9 * self.options.memory_gb)
         self._held: deque[tuple[int, Frame]] = deque()
         self._moves = Moves()
         # By what each keyframe was moved, and the one that frames are aligned to now.

@@ -22,8 +22,7 @@ from rstrack.alignment.linearise import Terms
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.moving_masks import MovingMasks
 from rstrack.data.rig import Frame, Rig
-from rstrack.images.device_frame import DeviceFrame, Timer, untimed
-from rstrack.images.left_out import frame_without
+from rstrack.images.device_frame import DeviceFrame, Timer, frame_without, untimed
 from rstrack.inertial.inertia import Inertia
 from rstrack.keyframes.archive import Archive
 from rstrack.options import Options

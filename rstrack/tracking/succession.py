@@ -13,8 +13,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.brightness import factor_and_offset, relative
 from rstrack.alignment.observation import Observation
-from rstrack.images.device_frame import DeviceFrame
-from rstrack.images.left_out import Mask
+from rstrack.images.device_frame import DeviceFrame, Mask
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.keyframes.store import KeyframeStore

@@ -10,7 +10,7 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
-from rstrack.images.left_out import Mask
+from rstrack.images.device_frame import Mask
 from rstrack.images.sampling import EDGE
 from rstrack.keyframes.keyframe import Image, surface_slopes
 

@@ -17,7 +17,7 @@ from rstrack.alignment.free_space import Free, FreeSpace, Seen, grid_of
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.spline_state import SplineState
 from rstrack.alignment.weights import START_DEPTH
-from rstrack.images.left_out import full_size, without_pixels
+from rstrack.images.device_frame import full_size, without_pixels
 from rstrack.images.pyramid import DepthImage
 from rstrack.keyframes.keyframe import Reference, strides
 from rstrack.tracking.moving.regions import Mask, anything, moving, moving_with, untold

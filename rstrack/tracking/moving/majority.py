@@ -19,8 +19,7 @@ from rsgen.array_types import FloatArray
 from rsgen.device.arrays import Engine
 from rsgen.geometry import se3
 from rstrack.alignment.free_space import grid_shape
-from rstrack.images.device_frame import DeviceFrame
-from rstrack.images.left_out import Mask
+from rstrack.images.device_frame import DeviceFrame, Mask
 from rstrack.images.pyramid import ColorImage
 from rstrack.keyframes.keyframe import Image, on_one_surface
 from rstrack.tracking.moving.depth_majority import apart, averaged, goes_elsewhere

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from rstrack.alignment.free_space import Free, Grid, Seen
-from rstrack.images.left_out import Mask
+from rstrack.images.device_frame import Mask
 from rstrack.images.sampling import EDGE
 
 # How far before what was seen (m, part of the depth, σ of depth there) a pixel has to stand to be in free space.

@@ -85,7 +85,7 @@ class Checkpoint:
     def begin(self) -> Done:
         """Take away what an earlier run has left; keyframes' files are here from now on."""
         shutil.rmtree(self.root, ignore_errors=True)
-        self.tracker.archive.put_in(self.root)
+        self.tracker.archive.images.put_in(self.root)
         return Done()
 
     def save_when_due(self, done: Done) -> None:
@@ -108,7 +108,7 @@ class Checkpoint:
             self.root.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise write_error(self.root, error) from None
-        self.tracker.archive.write()
+        self.tracker.archive.images.write()
         stream = io.BytesIO()
         _Writer(stream, self.tracker).dump({"key": dict(self.key), "done": done, "tracker": self.tracker.state})
         data = stream.getvalue()
@@ -143,7 +143,7 @@ class Checkpoint:
                     "track without --resume"
                 )
         self.tracker.state = state
-        self.tracker.archive.put_in(self.root)
+        self.tracker.archive.images.put_in(self.root)
         return done
 
     def remove(self) -> None:

@@ -208,8 +208,7 @@ def _refiner(dataset: Dataset, estimate: Estimate, options: Options, noise: Nois
     # After the engine: it chooses the libLLVM that Dr.Jit loads.
     from rstrack.adjustment.refine import Refiner
     from rstrack.alignment.linearise import Terms
-    from rstrack.images.device_frame import DeviceRig
-    from rstrack.images.left_out import frame_without
+    from rstrack.images.device_frame import DeviceRig, frame_without
     from rstrack.keyframes.maker import KeyframeMaker
 
     device = DeviceRig(dataset.rig, options)

@@ -22,7 +22,7 @@ from rstrack.alignment import residuals
 from rstrack.alignment.linearise import Linearised
 from rstrack.alignment.weights import LEAST_CURVATURE, NU, scale_step, weight
 from rstrack.images import line_poses as lines
-from rstrack.images.blur import blur_length, blur_weight
+from rstrack.images.sampling import blur_length, blur_weight
 
 
 @pytest.fixture(autouse=True)

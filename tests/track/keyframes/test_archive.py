@@ -58,14 +58,14 @@ def test_what_does_not_fit_goes_to_files_and_comes_back_the_same(
     for archive in (all_of_them, few):
         for ref in refs:
             archive.add(ref)
-    assert (all_of_them.spilled, few.spilled) == (0, 2) and len(few) == 4
+    assert (all_of_them.images.spilled, few.images.spilled) == (0, 2) and len(few) == 4
     files = sorted(tmp_path.glob("*/*.npz"))
     assert [file.name for file in files] == ["keyframe-00000000-00000001.npz", "keyframe-00000001-00000002.npz"]
     for ref in refs:
         assert same(few.get(ref.index), all_of_them.get(ref.index))
     # Used again and put back: its file is old, and it is the newest.
     few.add(replace(few.get(0), stamp=9.0))
-    assert few.get(0).stamp == 9.0 and few.spilled == 2 and not files[0].exists()
+    assert few.get(0).stamp == 9.0 and few.images.spilled == 2 and not files[0].exists()
     del few, archive
     assert not list(tmp_path.iterdir())
 
@@ -98,7 +98,7 @@ def test_a_tracker_with_hardly_any_memory_finds_the_same() -> None:
         for frame in frames():
             tracker.feed(frame)
         found.append(tracker)
-    assert found[0].keyframes > 2 and found[1].archive.spilled > 0 == found[0].archive.spilled
+    assert found[0].keyframes > 2 and found[1].archive.images.spilled > 0 == found[0].archive.images.spilled
     for a, b in zip(found[0].trajectory, found[1].trajectory, strict=True):
         np.testing.assert_array_equal(a, b)
 

@@ -17,7 +17,7 @@ from rstrack.data.rig import Frame, Image, Rig
 from rstrack.images.device_frame import DeviceRig
 from rstrack.keyframes.keyframe import strides
 from rstrack.keyframes.maker import KeyframeMaker
-from rstrack.keyframes.surface_model import SurfaceModel
+from rstrack.keyframes.store import SurfaceModel
 from rstrack.options import Options, Source
 from rstrack.tracking.spline_tracker import Tracker
 

@@ -19,7 +19,7 @@ from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import read_estimate
 from rstrack.data.image_files import with_noise
 from rstrack.data.rig import Frame, Image
-from rstrack.keyframes.kept_frames import KeptFrames
+from rstrack.keyframes.archive import StoredFrames
 from rstrack.tracking import loop_tracker
 from rstrack.tracking.any_tracker import make_tracker
 from rstrack.tracking.loop_tracker import LoopTracker
@@ -172,7 +172,7 @@ def test_moves_of_control_points() -> None:
     np.testing.assert_allclose(moves.poses(before, t, T_pose), expected, atol=1e-12)
 
 
-def test_kept_frames_come_back_from_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stored_frames_come_back_from_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr("tempfile.tempdir", None)
     rng = np.random.default_rng(1)
@@ -182,7 +182,7 @@ def test_kept_frames_come_back_from_files(tmp_path: Path, monkeypatch: pytest.Mo
         return Frame(Image(stamp, depth), (Image(stamp + 0.01, rgb),))
 
     made = {k: frame(0.1 * k) for k in (2, 5, 9)}
-    kept = KeptFrames(made[2].depth.pixels.nbytes + made[2].colors[0].pixels.nbytes)
+    kept = StoredFrames(made[2].depth.pixels.nbytes + made[2].colors[0].pixels.nbytes)
     for k, each in made.items():
         kept.add(k, each)
     assert len(list(tmp_path.rglob("*.npz"))) == 2
@@ -191,8 +191,8 @@ def test_kept_frames_come_back_from_files(tmp_path: Path, monkeypatch: pytest.Mo
         assert back.depth.stamp == each.depth.stamp and back.colors[0].stamp == each.colors[0].stamp
         np.testing.assert_array_equal(back.depth.pixels, each.depth.pixels)
         np.testing.assert_array_equal(back.colors[0].pixels, each.colors[0].pixels)
-    with pytest.raises(UserError, match="frame 3: its images were not kept"):
+    with pytest.raises(UserError, match="frame 3: its images were not stored"):
         kept.get(3)
-    next(tmp_path.rglob("*2.npz")).unlink()
+    next(tmp_path.rglob("frame-00000002-*.npz")).unlink()
     with pytest.raises(UserError, match="cannot be read again"):
         kept.get(2)

@@ -28,8 +28,7 @@ from rstrack.alignment.free_space import FreeSpace, Seen, grid_of
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.images import line_poses as lines
-from rstrack.images.device_frame import DeviceRig, untimed
-from rstrack.images.left_out import Mask, without_pixels
+from rstrack.images.device_frame import DeviceRig, Mask, untimed, without_pixels
 from rstrack.options import Options
 from rstrack.tracking.moving.majority import not_with_most
 from rstrack.tracking.moving.regions import moving, moving_with
