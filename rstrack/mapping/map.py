@@ -6,16 +6,19 @@ write_ply(Path("mesh.ply"), result.surface)
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import drjit as dr
 import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
-from rsgen.device.arrays import Engine, Kernels, engine
+from rsgen.device.arrays import Engine, Kernels, engine, recorded
 from rsgen.device.lens import Lens
+from rsgen.device.projection import project_rolling
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.shutter import Shutter
@@ -26,12 +29,12 @@ from rstrack.data.rig import Frame, Rig
 from rstrack.images.device_frame import MARGIN
 from rstrack.images.line_poses import Exposure, from_base_table, to_base_table
 from rstrack.images.pyramid import camera_rays, depth_image, lens_sees
+from rstrack.images.sampling import bilinear, grid
 from rstrack.keyframes.keyframe import rectified_lens
 from rstrack.keyframes.rectification import rectify_kernel
 from rstrack.metrics.association import compare, truth_of
 from rstrack.options import MapOptions
-from rstrack.volume.kernels import lookup_kernel
-from rstrack.volume.mesh import Surface, extract_surface, write_ply
+from rstrack.volume.mesh import TriangleSurface, extract_surface, write_ply
 from rstrack.volume.volume import Volume
 
 # Seconds from the nearest estimated pose beyond which a frame is left out: its pose would be a guess.
@@ -42,7 +45,7 @@ _POSE_WITHIN_S = 0.1
 class Reconstruction:
     """A surface and how it came about. frames: integrated; without_pose: frames left out."""
 
-    surface: Surface
+    surface: TriangleSurface
     frames: int
     without_pose: int
     shutter: Literal["rs", "gs"]
@@ -121,7 +124,7 @@ class FrameMapper:
             T = self._rig.T_color_depth @ se3.inverse(self._pose(exposure.mid_time)) @ T_estimate_base
             from_base = np.concatenate([T[:3, :3].ravel(), T[:3, 3], np.zeros(6)])
         planes = [e.upload(plane / np.float32(255.0)) for plane in np.moveaxis(frame.colors[best].pixels, -1, 0)]
-        out: list[Any] = self._kernel(lookup_kernel, self._color_lens, self.base)(rho, *planes, e.upload(from_base))
+        out: list[Any] = self._kernel(_lookup_kernel, self._color_lens, self.base)(rho, *planes, e.upload(from_base))
         return out
 
     def _pose(self, t: float) -> FloatArray:
@@ -151,6 +154,30 @@ class FrameMapper:
             (rig.color_camera, rig.color_shutter) if stream == "color" else (rig.depth_camera, rig.depth_shutter)
         )
         return 0.5 * (shutter.line_count(camera) - 1) * shutter.line_delay(camera)
+
+
+def _lookup_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
+    """Kernel (inverse_depth, red, green, blue, from_base) → [red, green, blue, 1 where seen], equation (3).
+
+    Colours of a rectified depth image's points (`base`, a global-shutter pinhole) in a colour image of `lens`.
+    """
+    camera = lens.camera
+
+    @recorded
+    def kernel(rho: Any, red: Any, green: Any, blue: Any, from_base: Any) -> Any:
+        _, px, py = grid(e, base.camera.width, base.camera.height, 1)
+        active = rho > 0.0
+        z = dr.rcp(dr.select(active, rho, 1.0))
+        p = (e.Float(px) - base.camera.cx) / base.camera.fx * z, (e.Float(py) - base.camera.cy) / base.camera.fy * z, z
+        seen = project_rolling(lens, from_base, p, e.UInt, e.Int)
+        out = []
+        inside = active & seen.valid
+        for plane in (red, green, blue):
+            a, b, c, d, fx, fy, inside = bilinear(e, plane, camera.width, camera.height, seen.x, seen.y, inside)
+            out.append(dr.lerp(dr.lerp(a, b, fx), dr.lerp(c, d, fx), fy))
+        return [*(dr.select(inside, value, 0.0) for value in out), dr.select(inside, e.Float(1.0), 0.0)]
+
+    return kernel
 
 
 def reconstruct(

@@ -16,8 +16,8 @@ import drjit as dr
 
 from rsgen.device.arrays import Engine, recorded
 from rsgen.device.lens import Lens
-from rsgen.device.projection import Vector, gather, move, project, project_rolling
-from rstrack.images.sampling import EDGE, bilinear, grid, nearest, surface
+from rsgen.device.projection import Vector, gather, move, project
+from rstrack.images.sampling import EDGE, grid, nearest, surface
 
 BLOCK = 8
 POINTS = BLOCK**3
@@ -220,30 +220,6 @@ def raycast_kernel(e: Engine, lens: Lens, voxel_m: float, truncation_m: float, c
         if not colored:
             return rho, []
         return rho, _color(e, directory, sums, limits, at(t1), known)
-
-    return kernel
-
-
-def lookup_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
-    """Kernel (inverse_depth, red, green, blue, from_base) → [red, green, blue, 1 where seen], equation (3).
-
-    Colours of a rectified depth image's points (`base`, a global-shutter pinhole) in a colour image of `lens`.
-    """
-    camera = lens.camera
-
-    @recorded
-    def kernel(rho: Any, red: Any, green: Any, blue: Any, from_base: Any) -> Any:
-        _, px, py = grid(e, base.camera.width, base.camera.height, 1)
-        active = rho > 0.0
-        z = dr.rcp(dr.select(active, rho, 1.0))
-        p = (e.Float(px) - base.camera.cx) / base.camera.fx * z, (e.Float(py) - base.camera.cy) / base.camera.fy * z, z
-        seen = project_rolling(lens, from_base, p, e.UInt, e.Int)
-        out = []
-        inside = active & seen.valid
-        for plane in (red, green, blue):
-            a, b, c, d, fx, fy, inside = bilinear(e, plane, camera.width, camera.height, seen.x, seen.y, inside)
-            out.append(dr.lerp(dr.lerp(a, b, fx), dr.lerp(c, d, fx), fy))
-        return [*(dr.select(inside, value, 0.0) for value in out), dr.select(inside, e.Float(1.0), 0.0)]
 
     return kernel
 

@@ -27,7 +27,7 @@ _CELL_BITS = 14
 
 
 @dataclass(frozen=True)
-class Surface:
+class TriangleSurface:
     """Triangles: vertices (n, 3) in m, faces (m, 3), counter-clockwise as the camera saw them, colors (n, 3) uint8."""
 
     vertices: FloatArray
@@ -35,7 +35,7 @@ class Surface:
     colors: npt.NDArray[np.uint8] | None
 
 
-def extract_surface(blocks: Blocks, voxel_m: float, least_weight: float = 1e-3) -> Surface:
+def extract_surface(blocks: Blocks, voxel_m: float, least_weight: float = 1e-3) -> TriangleSurface:
     """Triangles where the distance is zero, between lattice points of at least this weight.
 
     Marching cubes after Lewiner et al. (Journal of Graphics Tools 8(2), 2003), scikit-image's. Raises UserError if
@@ -59,10 +59,10 @@ def extract_surface(blocks: Blocks, voxel_m: float, least_weight: float = 1e-3) 
     _, first, same = np.unique(_packed(keys), return_index=True, return_inverse=True)
     mesh = same.reshape(-1)[mesh]
     whole = (mesh[:, 0] != mesh[:, 1]) & (mesh[:, 1] != mesh[:, 2]) & (mesh[:, 2] != mesh[:, 0])
-    return Surface(lattice[first] * voxel_m, mesh[whole], np.concatenate(colors)[first] if colors else None)
+    return TriangleSurface(lattice[first] * voxel_m, mesh[whole], np.concatenate(colors)[first] if colors else None)
 
 
-def write_ply(path: Path, surface: Surface, comment: str = "", cloud: bool = False) -> None:
+def write_ply(path: Path, surface: TriangleSurface, comment: str = "", cloud: bool = False) -> None:
     """Write a binary PLY, a mesh or only its vertices, whole or not at all. Raises UserError."""
     import trimesh
 

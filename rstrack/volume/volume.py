@@ -23,7 +23,7 @@ from rsgen.device.arrays import Engine, Kernels
 from rsgen.device.lens import Lens
 from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rstrack.volume.directory import Directory
+from rstrack.volume.blocks import BlockDirectory, BlockValues, unsigned
 from rstrack.volume.kernels import (
     BLOCK,
     POINTS,
@@ -32,7 +32,6 @@ from rstrack.volume.kernels import (
     scale_kernel,
     sight_kernel,
 )
-from rstrack.volume.values import Values, unsigned
 
 TRUNCATION = 4.0
 """Voxels to both sides of a surface within which distances are kept."""
@@ -76,8 +75,8 @@ class Volume:
             raise UserError(f"truncation {truncation!r} must be between 2 and 8 voxels: blocks are 8 voxels wide")
         self.e, self.voxel_m, self.truncation_m = e, float(voxel_m), truncation * float(voxel_m)
         self._colored = color
-        self._directory, self._table = Directory(), e.Int()
-        self._values = Values(e, 6 if color else 2, most_bytes)
+        self._directory, self._table = BlockDirectory(), e.Int()
+        self._values = BlockValues(e, 6 if color else 2, most_bytes)
         self._farthest_m = 0.0
         self._kernel = Kernels(e)
 
@@ -235,7 +234,7 @@ class Volume:
         return self.e.upload(pose), self.e.upload(box)
 
     def _move(self, low: IntArray, high: IntArray, alone: bool = False) -> bool:
-        """The window to where it holds a box, see `Directory.move`: its blocks come in, others go if room is short."""
+        """Move the window (`BlockDirectory.move`): its blocks come in, others go if room is short."""
         directory = self._directory
         if not directory.move(low, high, alone):
             return False

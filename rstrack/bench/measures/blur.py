@@ -24,7 +24,7 @@ from rstrack.bench.record import Figures
 from rstrack.bench.task import Task
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate
-from rstrack.mapping.fused_keyframes import FusedKeyframe, Sigma, depth_errors, fused_keyframes
+from rstrack.mapping.keyframes import BlurSigma, FusedKeyframe, depth_errors, fused_keyframes
 from rstrack.metrics.images import gradient_energy, psnr_db, ssim
 from rstrack.options import Options
 
@@ -125,7 +125,7 @@ def _sharp_view(truth: Dataset, done: FusedKeyframe) -> Any:
 
 def _color(keyframes: Sequence[FusedKeyframe], truth: Dataset, poses: str) -> Figures:
     """Means over the keyframes by the weights. gradient: its energy over that of the sharp view."""
-    sums: dict[Sigma, list[tuple[float, float, float]]] = {}
+    sums: dict[BlurSigma, list[tuple[float, float, float]]] = {}
     for done in keyframes:
         sharp = _sharp_view(truth, done)
         known = np.logical_and.reduce([weight > 0 for _, weight in done.colors.values()])

@@ -14,7 +14,7 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rstrack.keyframes.keyframe import rectified_lens
-from rstrack.volume.away import Away
+from rstrack.volume.blocks import FarBlocks
 from rstrack.volume.kernels import BLOCK, scale_kernel
 from rstrack.volume.mesh import extract_surface, write_ply
 from rstrack.volume.volume import Blocks, Volume
@@ -137,7 +137,7 @@ def test_memory_is_spent_on_the_surface_only() -> None:
 def test_a_volume_grows_beyond_its_first_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     T = POSES[0]
     kept, _ = filled().raycast(T, LENS)
-    monkeypatch.setattr("rstrack.volume.values._FIRST_BLOCKS", 16)
+    monkeypatch.setattr("rstrack.volume.blocks._FIRST_BLOCKS", 16)
     volume = filled()
     far = np.eye(4)
     far[:3, 3] = 5.0, -3.0, 0.0  # the directory grows too
@@ -158,9 +158,9 @@ def far_apart(n: int) -> list[np.ndarray]:
 
 @pytest.fixture
 def small_window(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rstrack.volume.directory.MOST_ENTRIES", 60_000)
+    monkeypatch.setattr("rstrack.volume.blocks.MOST_ENTRIES", 60_000)
     monkeypatch.setattr("rstrack.volume.volume._AT_ONCE", 50)
-    monkeypatch.setattr("rstrack.volume.values._FIRST_BLOCKS", 16)
+    monkeypatch.setattr("rstrack.volume.blocks._FIRST_BLOCKS", 16)
 
 
 @pytest.mark.parametrize("color", [False, True])
@@ -187,7 +187,7 @@ def test_what_is_far_away_goes_to_a_file_and_comes_back_to_the_bit(
 
     far, far_seen = made(2e6 if color else 0.7e6)
     assert far.blocks_away > 0.5 * far.blocks
-    monkeypatch.setattr("rstrack.volume.directory.MOST_ENTRIES", 2**24)
+    monkeypatch.setattr("rstrack.volume.blocks.MOST_ENTRIES", 2**24)
     away = 0
     whole, whole_seen = made(np.inf)
     assert away == 0 and far.bytes < 0.3 * whole.bytes
@@ -223,18 +223,18 @@ def test_a_volume_is_as_good_far_from_the_origin(away_m: float) -> None:
 
 
 def test_what_is_away_goes_into_a_checkpoint_as_it_is_then() -> None:
-    away, rng = Away(5), np.random.default_rng(1)
+    away, rng = FarBlocks(5), np.random.default_rng(1)
     first, second = rng.normal(size=(2, 3, 5)).astype(np.float32)
     away.put(np.array([7, 2, 9]), first)
     away.put(np.array([9]), second[:1])
     written = pickle.dumps(away)
     away.put(np.array([7, 2, 9, 4]), np.zeros((4, 5), np.float32))
     np.testing.assert_array_equal(pickle.loads(written).get(np.array([9, 7, 2])), [second[0], first[0], first[1]])
-    assert len(pickle.loads(pickle.dumps(Away(5)))) == 0
+    assert len(pickle.loads(pickle.dumps(FarBlocks(5)))) == 0
 
 
 def test_a_full_disk_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch, small_window: None) -> None:
-    monkeypatch.setattr("rstrack.volume.away.os.pwrite", lambda *_: 0)
+    monkeypatch.setattr("rstrack.volume.blocks.os.pwrite", lambda *_: 0)
     volume = Volume(ENGINE, 0.02, most_bytes=1e5)
     with pytest.raises(UserError, match="No space left"):
         for T in far_apart(20):
