@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from rsgen.console.command_line import number
-from rstrack.metrics import truth_noise
+from rstrack.metrics import consistency
 
 SequenceFolder = Annotated[Path, "rsgen sequence, TUM RGB-D, ICL-NUIM or 7-Scenes folder"]
 CameraFile = Annotated[Path | None, "camera file to go by instead of what the folder tells of its cameras", "FILE"]
@@ -45,10 +45,10 @@ TruthExtrinsics = Annotated[
     "auto",
 ]
 TruthNoise = Annotated[
-    truth_noise.TruthNoise | None,
+    consistency.TruthNoise | None,
     "how far off the truth itself is: standard deviations of its motions over one second, mm and degrees along and "
     "about each axis, growing as the root of the time; NEES and intervals count them too (default: it is exact)",
     "MM,DEG",
-    truth_noise.TruthNoise.parse,
+    consistency.TruthNoise.parse,
 ]
 Run = Annotated[Path, "folder that 'rstrack track' wrote, or a TUM file"]

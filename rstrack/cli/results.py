@@ -71,7 +71,7 @@ def export(
     out: Annotated[Path, "file to write", "FILE"],
 ) -> int:
     """Write what a run knows of itself for other tools."""
-    from rstrack.metrics.covariance_file import write_covariances
+    from rstrack.metrics.consistency import write_covariances
 
     print(f"{out}: {write_covariances(run, out)} poses written")
     return 0

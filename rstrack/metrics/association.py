@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from rsgen.array_types import FloatArray, IntArray
 from rsgen.errors import UserError
@@ -17,7 +17,7 @@ from rsgen.geometry.spline import Spline
 from rsgen.sequence.format import STAMP_TOLERANCE_S, associate
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.estimate import Estimate
-from rstrack.metrics.truth_noise import TruthNoise
+from rstrack.metrics.consistency import TruthNoise
 
 if TYPE_CHECKING:
     from rstrack.data.dataset import Dataset
@@ -112,7 +112,7 @@ def compare(truth: Truth, estimate: Estimate) -> Comparison:
 def align(T_world_true: FloatArray, T_world_est: FloatArray) -> tuple[FloatArray, bool]:
     """T_true_est (4, 4) that moves estimated positions closest to the true ones, and whether they determine it.
 
-    Poses (k, 4, 4). Least squares without scale, closed form: Umeyama, PAMI 13(4), 1991 (Horn's method by SVD). Where
+    Poses (k, 4, 4). Least squares without scale, closed form: Umeyama, PAMI 13(4), 1991 (SciPy's). Where
     positions lie on a line or in one point, the rotation that they leave open is that which brings the orientations
     closest (chordal distance), so that rotation errors mean something there too.
     """
@@ -120,18 +120,19 @@ def align(T_world_true: FloatArray, T_world_est: FloatArray) -> tuple[FloatArray
     mean_true, mean_est = p_true.mean(axis=0), p_est.mean(axis=0)
     U, s, Vt = np.linalg.svd((p_true - mean_true).T @ (p_est - mean_est) / len(p_true))
     is_determined = bool(s[1] > _LINE * s[0] and s[0] > _POINT)
-    M = np.einsum("nij,nkj->ik", T_world_true[:, :3, :3], T_world_est[:, :3, :3])
-    if s[0] <= _POINT:
-        U, _, Vt = np.linalg.svd(M)
-    R_signs = np.diag([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
-    R = U @ R_signs @ Vt
-    if s[0] > _POINT and not is_determined:
-        # R turns one line onto the other; left is the spin about it, by the angle that maximises tr(Rᵀ M).
-        m = U.T @ M @ (R_signs @ Vt).T
-        angle = math.atan2(m[2, 1] - m[1, 2], m[1, 1] + m[2, 2])
-        R = U @ so3.exp([angle, 0.0, 0.0]) @ R_signs @ Vt
+    if is_determined:
+        turn, _ = Rotation.align_vectors(p_true - mean_true, p_est - mean_est)
+    else:
+        axes_true, axes_est = (np.swapaxes(T[:, :3, :3], 1, 2).reshape(-1, 3) for T in (T_world_true, T_world_est))
+        weights = np.ones(len(axes_true))
+        if s[0] > _POINT:
+            # One line onto the other exactly; the axes decide the spin about it.
+            axes_true, axes_est = np.vstack([U[:, 0], axes_true]), np.vstack([Vt[0], axes_est])
+            weights = np.append(np.inf, weights)
+        turn, _ = Rotation.align_vectors(axes_true, axes_est, weights)
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, mean_true - R @ mean_est
+    T[:3, :3] = R = turn.as_matrix()
+    T[:3, 3] = mean_true - R @ mean_est
     return T, is_determined
 
 
@@ -162,11 +163,7 @@ def true_poses(motion: Spline | Trajectory, stamps: FloatArray, interpolate: boo
         return np.empty(0, np.int64), np.empty((0, 4, 4))
     near = np.abs(motion.stamps[nearest(motion.stamps, stamps)] - stamps) <= ASSOCIATE_WITHIN_S
     index = np.flatnonzero(near & (stamps >= motion.stamps[0]) & (stamps <= motion.stamps[-1]))
-    before = np.clip(np.searchsorted(motion.stamps, stamps[index], side="right") - 1, 0, len(motion) - 2)
-    T = motion.T_world_cam[before]
-    step = se3.log(se3.inverse(T) @ motion.T_world_cam[before + 1])
-    u = (stamps[index] - motion.stamps[before]) / (motion.stamps[before + 1] - motion.stamps[before])
-    return index, T @ se3.exp(u[:, None] * step)
+    return index, se3.interpolated(motion.stamps, motion.T_world_cam, stamps[index])
 
 
 def _span(motion: Spline | Trajectory) -> tuple[float, float]:

@@ -1,24 +1,30 @@
 """Whether an estimate's covariances are as large as its errors are, over motions of a tenth of a second to five.
 
+And the file of poses and covariances that smfeval scores.
+
 C = motion_covariance(estimate.T_world_depth, covariances(estimate), i, j)
 horizon = horizon_of(1.0, motion_errors(T_true, estimate.T_world_depth, i, j), C)
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import chdtri
 
-from rsgen.array_types import FloatArray
+from rsgen.array_types import FloatArray, IntArray
 from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
+from rsgen.files import atomic_write
 from rsgen.geometry import se3
-from rstrack.data.estimate import INFO, Estimate
+from rsgen.sequence.format import pose_rows
+from rstrack.data.estimate import INFO, Estimate, read_estimate
 
 HORIZONS_S = (0.1, 1.0, 5.0)
 AXES = ("x", "y", "z", "rx", "ry", "rz")
@@ -27,6 +33,22 @@ LEVELS = (50, 90, 99)
 
 # Part of the drift that rounding may be.
 _ROUNDING = 1e-9
+
+# The truth is T_world_depth exp(ξ), ξ = [m; rad] in the depth camera's frame, and the world is whatever fits best.
+_HEADER = """\
+#%FORMAT SQUARE/0.3
+#%REPRESENTATION gaussian_se3
+#%POSE_FRAME world
+#%BODY_FRAME depth
+#%GAUGE se3
+#%TIMESTAMP_UNIT seconds
+#%ALGORITHM rstrack
+#%ALGORITHM_VERSION {version}
+#%TANGENT_CONVENTION right_perturbation
+#%TANGENT_ORDER translation_rotation
+#%ROTATION_PARAM axis_angle
+# stamp tx ty tz qx qy qz qw c11 c21 c22 c31 c32 c33 c41 ... c66
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,6 +178,67 @@ def consistency_table(horizons: Sequence[Horizon]) -> Table:
     rows += [row(f"{h.seconds:g} s, {a}", "", "", h.axes[a]) for h in horizons if h.seconds == 1.0 for a in AXES]
     head = ("motions over", "pairs", "NEES/6", *(f"in {level} %" for level in LEVELS))
     return Table(head, tuple(rows), "NEES, and per cent of the truths within the covariances' regions")
+
+
+@dataclass(frozen=True)
+class TruthNoise:
+    """Errors of the truth's own motions over one second: σ along and about each of the camera's axes, mm and degrees.
+
+    Motion capture errs by millimetres within a second. σ grows as the square root of the time.
+    """
+
+    translation_mm: float
+    rotation_deg: float
+
+    @classmethod
+    def parse(cls, text: str) -> TruthNoise:
+        """The noise that 'MM,DEG' names. Raises UserError."""
+        try:
+            mm, deg = (float(word) for word in text.split(","))
+        except ValueError:
+            mm = deg = math.nan
+        if not (0.0 <= mm < math.inf and 0.0 <= deg < math.inf):
+            raise UserError(f"--truth-noise {text}: expected MM,DEG, two numbers of at least 0, for example 2,0.25")
+        return cls(mm, deg)
+
+    def covariance(self, seconds: FloatArray) -> FloatArray:
+        """Covariances (k, 6, 6), [m; rad], of the truth's motions over so many seconds (k,)."""
+        sigma = np.repeat([1e-3 * self.translation_mm, np.radians(self.rotation_deg)], 3)
+        return np.asarray(seconds[:, None, None] * np.diag(sigma**2))
+
+
+def write_covariances(run: Path, out: Path) -> int:
+    """Write the poses of a run whose covariances are known; returns their number. Raises UserError: there are none."""
+    estimate = read_estimate(run)
+    known = covariances(estimate)
+    index = np.flatnonzero(np.isfinite(known.pose).all(axis=(1, 2)))
+    if not len(index):
+        raise UserError(f"{run}: has no covariances of poses: give a run of one of the rs or gs methods")
+    atomic_write(out, covariance_text(estimate, known, index).encode())
+    return len(index)
+
+
+def covariance_text(estimate: Estimate, known: Covariances, index: IntArray) -> str:
+    """The file for the poses `index` (k,): stamp, pose, and the lower triangle of the covariance row by row."""
+    T = estimate.T_world_depth[index]
+    lower = against_first(T, known.at(index))[:, *np.tril_indices(6)]
+    lines = [
+        f"{stamp:.9f} " + " ".join(f"{v:.12f}" for v in row) + " " + " ".join(f"{v:.9g}" for v in entries)
+        for stamp, row, entries in zip(estimate.stamps[index], pose_rows(T), lower, strict=True)
+    ]
+    version = (estimate.info.get("versions") or {}).get("rstrack", "unknown")
+    return _HEADER.format(version=version) + "\n".join(lines) + "\n"
+
+
+def against_first(T_world_depth: FloatArray, known: Covariances) -> FloatArray:
+    """Covariances (n, 6, 6) of poses (n, 4, 4) against the first of them, increments [m; rad] on their right.
+
+    Errors of the calibration count as far as they change a pose otherwise than the first one.
+    """
+    from_world, Ad = (se3.adjoint(se3.inverse(T_world_depth) @ T) for T in (np.eye(4), T_world_depth[0]))
+    common = known.common - Ad @ known.common[0]
+    drift = turned(from_world, known.drift_world)
+    return np.asarray(known.pose + drift + common @ np.swapaxes(common, 1, 2))
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -31,13 +31,13 @@ from rstrack.metrics.association import (
 from rstrack.metrics.consistency import (
     HORIZONS_S,
     Horizon,
+    TruthNoise,
     consistency_table,
     covariances,
     horizon_of,
     motion_covariance,
     motion_errors,
 )
-from rstrack.metrics.truth_noise import TruthNoise
 
 _PAIR_WITHIN_S = 0.1
 # Stamps rounded to TUM's four digits still are one second apart.
@@ -137,7 +137,7 @@ class Metrics:
 
 
 @dataclass(frozen=True)
-class Drift:
+class RelativeErrors:
     """Relative pose errors over one second, from each of the times (k,) s on: m (k,) and degrees (k,)."""
 
     stamps: FloatArray
@@ -234,12 +234,12 @@ def pairs_apart(stamps: FloatArray, seconds: float) -> tuple[IntArray, IntArray]
     return np.flatnonzero(keep), j[keep]
 
 
-def drift(estimate: Estimate, found: Comparison) -> Drift:
+def drift(estimate: Estimate, found: Comparison) -> RelativeErrors:
     """The relative pose errors whose RMS `evaluate` gives, with the time at which each second begins."""
     i, j = _pairs(estimate, found, 1.0)
     true_step = se3.inverse(found.T_world_true[i]) @ found.T_world_true[j]
     est_step = se3.inverse(found.T_world_est[i]) @ found.T_world_est[j]
-    return Drift(estimate.stamps[found.index[i]], *_pose_errors(true_step, est_step))
+    return RelativeErrors(estimate.stamps[found.index[i]], *_pose_errors(true_step, est_step))
 
 
 def _pairs(estimate: Estimate, found: Comparison, seconds: float) -> tuple[IntArray, IntArray]:

@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
@@ -138,8 +139,7 @@ def _refuse_few_turns(body: FloatArray) -> None:
 def _closed_form(body: FloatArray, camera: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Rotation (3, 3) and translation (3,) of X in A X = X B, motions A and B (n, 4, 4) of body and camera."""
     # R_X turns the camera's axes of rotation onto the body's.
-    U, _, Vt = np.linalg.svd(so3.log(body[:, :3, :3]).T @ so3.log(camera[:, :3, :3]))
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    R = Rotation.align_vectors(so3.log(body[:, :3, :3]), so3.log(camera[:, :3, :3]))[0].as_matrix()
     A = (body[:, :3, :3] - np.eye(3)).reshape(-1, 3)
     b = (camera[:, :3, 3] @ R.T - body[:, :3, 3]).ravel()
     return R, np.asarray(np.linalg.lstsq(A, b, rcond=None)[0])

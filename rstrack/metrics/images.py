@@ -7,30 +7,30 @@ import math
 import cv2
 import numpy as np
 import numpy.typing as npt
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from rsgen.array_types import BoolArray, ByteArray
 
-# Wang, Bovik, Sheikh, Simoncelli, IEEE TIP 13(4), 2004: window of 11 px with σ = 1.5 px, constants for 8 bit.
-_WINDOW, _SIGMA = (11, 11), 1.5
-_C1, _C2 = (0.01 * 255.0) ** 2, (0.03 * 255.0) ** 2
+_WINDOW = 11
 
 
 def psnr_db(image: ByteArray, truth: ByteArray, known: BoolArray) -> float:
     """Peak signal-to-noise ratio in dB of sRGB code values (h, w, 3) over the known pixels (h, w); inf if equal."""
-    error = image[known].astype(np.float64) - truth[known]
-    mean = float(np.mean(error**2)) if error.size else math.nan
-    return math.inf if mean == 0.0 else 10.0 * math.log10(255.0**2 / mean)
+    if not known.any() or (image[known] == truth[known]).all():
+        return math.inf if known.any() else math.nan
+    return float(peak_signal_noise_ratio(truth[known], image[known]))
 
 
 def ssim(image: ByteArray, truth: ByteArray, known: BoolArray) -> float:
-    """Mean structural similarity of the grey images over pixels whose whole window is known; NaN if there are none."""
-    a, b = _grey(image), _grey(truth)
-    mean_a, mean_b = _blur(a), _blur(b)
-    var_a, var_b = _blur(a * a) - mean_a**2, _blur(b * b) - mean_b**2
-    covariance = _blur(a * b) - mean_a * mean_b
-    likeness = (2.0 * mean_a * mean_b + _C1) * (2.0 * covariance + _C2)
-    likeness /= (mean_a**2 + mean_b**2 + _C1) * (var_a + var_b + _C2)
-    return _mean(likeness, _eroded(known, _WINDOW[0] // 2))
+    """Mean structural similarity of the grey images over pixels whose whole window is known; NaN if there are none.
+
+    Wang, Bovik, Sheikh, Simoncelli, IEEE TIP 13(4), 2004: window of 11 px with σ = 1.5 px, constants for 8 bit.
+    """
+    _, likeness = structural_similarity(
+        _grey(image), _grey(truth), gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=255.0,
+        full=True,
+    )  # fmt: skip
+    return _mean(likeness, _eroded(known, _WINDOW // 2))
 
 
 def gradient_energy(image: ByteArray, known: BoolArray) -> float:
@@ -44,10 +44,6 @@ def gradient_energy(image: ByteArray, known: BoolArray) -> float:
 
 def _grey(image: ByteArray) -> npt.NDArray[np.float64]:
     return np.asarray(image.astype(np.float64) @ (0.299, 0.587, 0.114))
-
-
-def _blur(image: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    return np.asarray(cv2.GaussianBlur(image, _WINDOW, _SIGMA))
 
 
 def _eroded(known: BoolArray, reach: int) -> BoolArray:

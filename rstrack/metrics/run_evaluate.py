@@ -20,13 +20,13 @@ from rstrack.data.dataset import open_tracked
 from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.metrics.association import Truth, truth_of
 from rstrack.metrics.clock import ClockFit, TruthOffset, fit_clock, shifted
+from rstrack.metrics.consistency import TruthNoise
 from rstrack.metrics.evaluate import Metrics, evaluate
 from rstrack.metrics.extrinsics import ExtrinsicsFit, TruthExtrinsics, fit_extrinsics, mounted
-from rstrack.metrics.truth_noise import TruthNoise
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class RunEvaluation:
     """Errors with the clocks as they are, and with the truth `offset_s` after the stamps.
 
     moved: errors there; None with offset_s where nothing was asked and nothing was found. fit: how the offset was
@@ -117,7 +117,7 @@ class Evaluation:
         return f"the truth {size}{spread} ms {side} the stamps"
 
 
-def evaluated(truth: Truth | None, estimate: Estimate) -> Evaluation | None:
+def evaluated(truth: Truth | None, estimate: Estimate) -> RunEvaluation | None:
     """`evaluate_clocks`; None without a truth, and where fewer than three poses have a true counterpart."""
     try:
         return None if truth is None else evaluate_clocks(truth, estimate)
@@ -125,7 +125,7 @@ def evaluated(truth: Truth | None, estimate: Estimate) -> Evaluation | None:
         return None
 
 
-def evaluate_clocks(truth: Truth, estimate: Estimate, offset: TruthOffset | None = None) -> Evaluation:
+def evaluate_clocks(truth: Truth, estimate: Estimate, offset: TruthOffset | None = None) -> RunEvaluation:
     """Evaluate with the clocks as they are, and with an offset: given, found, or None.
 
     None: a truth of poses, which may have a clock of its own, is tried with the best offset, and the result kept if it
@@ -136,14 +136,14 @@ def evaluate_clocks(truth: Truth, estimate: Estimate, offset: TruthOffset | None
     if offset is None:
         fit = None if isinstance(truth.motion, Spline) else _fit_or_none(truth, estimate)
         if fit is None or not fit.is_clear:
-            return Evaluation(metrics)
-        return Evaluation(metrics, fit.offset_s, evaluate(shifted(truth, fit.offset_s), estimate), fit)
+            return RunEvaluation(metrics)
+        return RunEvaluation(metrics, fit.offset_s, evaluate(shifted(truth, fit.offset_s), estimate), fit)
     fit = fit_clock(truth, estimate) if offset == "auto" else None
     tau = float(offset) if fit is None else fit.offset_s
-    return Evaluation(metrics, tau, evaluate(shifted(truth, tau), estimate), fit, asked=True)
+    return RunEvaluation(metrics, tau, evaluate(shifted(truth, tau), estimate), fit, asked=True)
 
 
-def evaluate_extrinsics(truth: Truth, estimate: Estimate, offset: TruthOffset | None = None) -> Evaluation:
+def evaluate_extrinsics(truth: Truth, estimate: Estimate, offset: TruthOffset | None = None) -> RunEvaluation:
     """As `evaluate_clocks`, and with the truth's extrinsics, found at the offset that was asked for. Raises UserError.
 
     They change the clock by less than its standard deviation: it is not fitted again.
@@ -165,7 +165,7 @@ def aligned_clock(truth: Truth, estimate: Estimate, offset: TruthOffset | None) 
 def run_evaluate(
     truth_path: Path, estimate_path: Path, camera_file: Path | None = None, truth_offset: TruthOffset | None = None,
     truth_extrinsics: TruthExtrinsics | None = None, truth_noise: TruthNoise | None = None,
-) -> Evaluation:  # fmt: skip
+) -> RunEvaluation:  # fmt: skip
     """Evaluate a run folder or TUM file against the truth of a sequence folder, or against another TUM file.
 
     Arguments as in `read_estimate`, `rstrack.data.dataset.open_tracked`, `evaluate_clocks`, `evaluate_extrinsics` and

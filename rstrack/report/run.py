@@ -14,7 +14,7 @@ from rstrack.charts.chart import Chart, PathChart
 from rstrack.charts.runs import error_charts, inlier_charts, path_chart, time_charts
 from rstrack.metrics.clock import TruthOffset
 from rstrack.metrics.evaluate import Metrics
-from rstrack.metrics.run_evaluate import Evaluation, evaluate_clocks
+from rstrack.metrics.run_evaluate import RunEvaluation, evaluate_clocks
 from rstrack.metrics.tracked import Tracked, load_run
 from rstrack.report.calibration import calibration_section, calibration_warnings
 from rstrack.report.page import Card, CardRow, Note, Page, PageSection, Plot
@@ -90,7 +90,7 @@ def number(value: float | None, scale: float = 1.0) -> str:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _cards(tracked: Tracked, evaluation: Evaluation | None) -> tuple[CardRow, ...]:
+def _cards(tracked: Tracked, evaluation: RunEvaluation | None) -> tuple[CardRow, ...]:
     """A row of errors for each of the truth's clocks where there are two, and what else there is to say."""
     info = tracked.estimate.info
     frames, lost = len(tracked.frames), info.get("lost")

@@ -19,10 +19,9 @@ from rstrack.bench.task import Task
 from rstrack.data.estimate import Estimate, read_estimate, write_estimate
 from rstrack.metrics.association import ASSOCIATE_WITHIN_S, Truth, angles_deg, compare, truth_of
 from rstrack.metrics.clock import shifted
-from rstrack.metrics.consistency import LEVELS
+from rstrack.metrics.consistency import LEVELS, TruthNoise
 from rstrack.metrics.evaluate import Metrics
 from rstrack.metrics.run_evaluate import evaluate_clocks, evaluate_extrinsics
-from rstrack.metrics.truth_noise import TruthNoise
 from rstrack.options import CLOUD_PEERS, SLAM_PEERS
 from rstrack.peers.peer import run_command
 from rstrack.tracking.runs.run import track

@@ -29,7 +29,7 @@ from rstrack.inertial import record as imu_record
 from rstrack.metrics.association import truth_of
 from rstrack.metrics.consistency import HORIZONS_S, covariances, motion_covariance, motion_errors, step_nees
 from rstrack.metrics.evaluate import pairs_apart
-from rstrack.metrics.run_evaluate import Evaluation, evaluated
+from rstrack.metrics.run_evaluate import RunEvaluation, evaluated
 from rstrack.metrics.tracked import load_run
 from rstrack.options import Options
 from rstrack.tracking.runs.record import Noise
@@ -62,8 +62,8 @@ class Refined:
 
     estimate: Estimate
     rounds: list[dict[str, Any]]
-    before: Evaluation | None
-    after: Evaluation | None
+    before: RunEvaluation | None
+    after: RunEvaluation | None
     seconds: float
     imu: str = ""
     kept: str = ""

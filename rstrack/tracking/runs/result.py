@@ -10,7 +10,7 @@ from typing import Any, Literal
 from rstrack.data.estimate import Estimate
 from rstrack.data.timing import Timing
 from rstrack.metrics.evaluate import Metrics
-from rstrack.metrics.run_evaluate import Evaluation
+from rstrack.metrics.run_evaluate import RunEvaluation
 
 End = Literal["done", "interrupted", "broke down"]
 
@@ -28,7 +28,7 @@ class Result:
     """
 
     estimate: Estimate
-    evaluation: Evaluation | None
+    evaluation: RunEvaluation | None
     end: End
     error: str
     lost: int

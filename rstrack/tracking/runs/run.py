@@ -28,7 +28,7 @@ from rstrack.data.image_files import prefetched, with_noise
 from rstrack.data.rig import Frame
 from rstrack.inertial import record as imu_record
 from rstrack.metrics.association import Truth, compare, truth_of
-from rstrack.metrics.run_evaluate import Evaluation, evaluated
+from rstrack.metrics.run_evaluate import RunEvaluation, evaluated
 from rstrack.options import Options
 from rstrack.tracking.any_tracker import AnyTracker, make_tracker
 from rstrack.tracking.first_look.looked_at import looked_at
@@ -270,7 +270,7 @@ def _upright(estimate: Estimate) -> Estimate:
     return Estimate(estimate.stamps, T_upright_world @ estimate.T_world_depth, spline, estimate.info)
 
 
-def _loops_text(closing: Closing, online: Estimate, estimate: Estimate, before: Evaluation | None) -> str:
+def _loops_text(closing: Closing, online: Estimate, estimate: Estimate, before: RunEvaluation | None) -> str:
     moved = np.linalg.norm((estimate.T_world_depth - online.T_world_depth)[:, :3, 3], axis=1)
     was = "" if before is None else f", ATE before {1e3 * before.metrics.ate_rmse_m:.3f} mm"
     return closing.text(float(moved.max(initial=0.0))) + was

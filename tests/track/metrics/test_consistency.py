@@ -17,9 +17,8 @@ from rsgen.sequence.trajectory import Trajectory
 from rstrack.cli.main import main
 from rstrack.data.estimate import Estimate, write_estimate
 from rstrack.metrics.association import Truth
-from rstrack.metrics.consistency import Covariances, motion_covariance, motion_errors
+from rstrack.metrics.consistency import Covariances, TruthNoise, motion_covariance, motion_errors
 from rstrack.metrics.evaluate import Metrics, evaluate
-from rstrack.metrics.truth_noise import TruthNoise
 
 SIGMAS = np.array([1e-3, 2e-3, 3e-3, 1e-3, 5e-4, 2e-3])
 
