@@ -27,6 +27,7 @@ from rsgen.files import read_bytes
 from rsgen.geometry.camera import Camera
 from rsgen.limits import MOST_M
 from rsgen.motion.paths import look_at
+from rsgen.render.meshes import ply_bytes, vertex_normals
 from rsgen.sensors.color import to_srgb8
 
 Point = tuple[float, float, float]
@@ -35,6 +36,7 @@ SUFFIXES = (".png", ".jpg", ".svg", ".pdf")
 MAX_SIZE_PX = 8192
 MAX_MESHES = 8
 
+_UP = (0.0, 1.0, 0.0)
 _FIELD_OF_VIEW = math.radians(45)  # vertical
 _ABOVE = math.radians(55)  # elevation of the view from above
 _TRIM_PERCENT = 0.1  # of the vertices on each side need not fit into the picture: strays
@@ -62,9 +64,8 @@ class ColoredMesh:
 
     def facing(self, eye: FloatArray) -> ColoredMesh:
         """Only the triangles whose front (counter-clockwise) is turned to `eye` (3,), m, world."""
-        corners = self.vertices[self.faces]
-        to_eye = eye.astype(np.float32) - corners[:, 0]
-        front = np.einsum("ij,ij->i", _face_normals(corners), to_eye) > 0
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        front = np.einsum("ij,ij->i", np.cross(b - a, c - a), eye.astype(np.float32) - a) > 0
         return ColoredMesh(self.vertices, self.faces[front], self.normals, self.colors)
 
 
@@ -77,16 +78,10 @@ class PinholeView:
 
 
 def picture_meshes(
-    paths: Sequence[Path],
-    out: Path,
-    labels: Sequence[str] | None = None,
-    eye: Point | None = None,
-    target: Point | None = None,
-    width: int = 800,
-    height: int = 600,
-    grey: bool = False,
+    paths: Sequence[Path], out: Path, labels: Sequence[str] | None = None, eye: Point | None = None,
+    target: Point | None = None, width: int = 800, height: int = 600, grey: bool = False,
     progress: Progress = no_progress,
-) -> Path:
+) -> Path:  # fmt: skip
     """Draw each mesh of `paths`, all from the same place, write them side by side into `out` and return that.
 
     eye, target: camera centre and the point in the middle of the image, m, world; without an eye the view is from above
@@ -147,7 +142,7 @@ def read_mesh(path: Path) -> ColoredMesh:
     colors = np.full((len(used), 3), _GREY, np.float32)
     if mesh.visual.kind == "vertex":
         colors = srgb.decode(np.asarray(mesh.visual.vertex_colors)[used, :3] / 255).astype(np.float32)
-    return ColoredMesh(vertices[used], faces, _vertex_normals(vertices[used], faces), colors)
+    return ColoredMesh(vertices[used], faces, vertex_normals(vertices[used], faces, _UP).astype(np.float32), colors)
 
 
 def frame_meshes(
@@ -188,7 +183,6 @@ def render_mesh(mesh: ColoredMesh, view: PinholeView, reach: float) -> ByteArray
     reach: m, within which a surface darkens its neighbours.
     """
     from rsgen.device.backend import mitsuba
-    from rsgen.render.meshes import ply_bytes
 
     mi = mitsuba()
     with tempfile.TemporaryDirectory(prefix="rsgen-mesh-") as folder:
@@ -203,9 +197,6 @@ def render_mesh(mesh: ColoredMesh, view: PinholeView, reach: float) -> ByteArray
         total += _launch(scene, colors, view, reach, first, min(per_launch, _SAMPLES - first))
     linear = (total / _SAMPLES).astype(np.float32).reshape(view.camera.height, view.camera.width, 3)
     return to_srgb8(linear)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
 
 
 def _launch(scene: Any, colors: Any, view: PinholeView, reach: float, first: int, count: int) -> FloatArray:
@@ -251,13 +242,9 @@ def _launch(scene: Any, colors: Any, view: PinholeView, reach: float, first: int
 
 
 def _check(
-    paths: Sequence[Path],
-    out: Path,
-    labels: Sequence[str],
-    eye: Point | None,
-    target: Point | None,
+    paths: Sequence[Path], out: Path, labels: Sequence[str], eye: Point | None, target: Point | None,
     size: tuple[int, int],
-) -> None:
+) -> None:  # fmt: skip
     """Raise UserError for what can be refused before anything is read."""
     if not 1 <= len(paths) <= MAX_MESHES:
         raise UserError(f"{len(paths)} meshes: give 1 to {MAX_MESHES}")
@@ -287,18 +274,3 @@ def _side_by_side(images: Sequence[ByteArray], labels: Sequence[str]) -> Any:
         figure.text((left + width / 2) / total[0], 1 - _TITLE_PX / 2 / total[1], label, ha="center", va="center",
                     fontsize=9, parse_math=False)  # fmt: skip
     return figure
-
-
-def _face_normals(corners: Float32Array) -> Float32Array:
-    """Normals (m, 3) of triangles (m, 3, 3), counter-clockwise seen from their front, as long as twice their area."""
-    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-
-
-def _vertex_normals(vertices: Float32Array, faces: IntArray) -> Float32Array:
-    """Unit normals (n, 3), the mean of the neighbouring triangles' by area; +y where they cancel."""
-    normal = _face_normals(vertices[faces])
-    corner = faces.ravel()
-    sums = [np.bincount(corner, np.repeat(normal[:, k], 3), len(vertices)) for k in range(3)]
-    total = np.stack(sums, axis=1)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.where(length > 0, total / np.where(length > 0, length, 1), (0.0, 1.0, 0.0)).astype(np.float32)

@@ -148,17 +148,17 @@ def suggest_tour(
     camera, no floor, or no scene, and if it is a room in another unit than metres.
     """
     mitsuba()
+    from rsgen.render.meshes import coarser, inhabited_box
     from rsgen.render.placement import AS_IT_IS, SceneOptions, camera_up
     from rsgen.render.rays import cast_rays
     from rsgen.render.scene import load_scene
-    from rsgen.render.terrain import coarser, inhabited
 
     placed = {key: value for key, value in (("scale", scale), ("up", up)) if value != getattr(AS_IT_IS, key)}
     if not 1e-9 <= scale <= 1e9:  # as scene.scale
         raise UserError(f"--scale {scale:g}: must lie in 1e-09 to 1e+09")
     loaded = load_scene(file, options=SceneOptions(scale, up))
     triangles = scene_triangles(loaded)
-    fineness = 1.0 / coarser(triangles, inhabited([shape for shape in loaded.shapes() if shape.is_mesh()]))
+    fineness = 1.0 / coarser(triangles, inhabited_box([shape for shape in loaded.shapes() if shape.is_mesh()]))
     own = camera_up(file) if file.suffix.lower() == ".xml" else None
     hint = "" if own in (None, up) else f"its own camera has {own} up: --up {own}"
     scene = _Scene(file, triangles, fineness, partial(cast_rays, loaded), placed, hint)

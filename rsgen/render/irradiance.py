@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from rsgen.array_types import Float32Array, IntArray
 from rsgen.device.arrays import aligned, vectors
 from rsgen.errors import UserError
-from rsgen.render.meshes import mesh_arrays
-from rsgen.render.terrain import coarser, inhabited
+from rsgen.render.meshes import coarser, inhabited_box, mesh_arrays
 
 REACH_LEVELS = 31  # how far a sample counts towards a neighbour: level / 30 of the way
 FREE = REACH_LEVELS  # and this, beyond the neighbour: nothing stands between
@@ -67,7 +66,7 @@ def make_lattice(scene: Any, spacing: float) -> Lattice:
     shape_first = np.full(max(ids) + 1, -1, np.int32)
     lacquered = np.zeros(len(shape_first), bool)
     sides, apexes, faces_before = [], [], 0
-    box = inhabited(shapes)
+    box = inhabited_box(shapes)
     for shape, number in zip(shapes, ids, strict=True):
         vertices, faces = mesh_arrays(shape)
         corners = vertices[faces].astype(np.float64)

@@ -1,7 +1,9 @@
-"""Triangle meshes: as arrays and PLY files, and repaired as they are loaded.
+"""Triangle meshes: as arrays and PLY files, repaired as they are loaded, and terrain in parts.
 
 A triangle without area or a vertex normal without direction would put NaN into the baked light, and from there into
-images.
+images. A ground to the horizon must not take the samples that its house needs: meshes larger than a building are taken
+for terrain, and what lies between the others for where one may be. Terrain's triangles are cut into parts, smaller the
+nearer they are, and light on it is the coarser the farther it is.
 """
 
 from __future__ import annotations
@@ -14,13 +16,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsgen.array_types import Float32Array
+from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.device.arrays import aligned
 from rsgen.errors import UserError
 
 log = logging.getLogger("rsgen")
 
+_UP = (0.0, 0.0, 1.0)
 _FLAT = 1e-7  # twice a triangle's area over its longest edge squared: below lies what float32 makes of a line
+_BUILDING_M = 60.0
+_NEAR_M = 2.0  # so far beside where one may be, light is as fine as there
+_EDGE_M = 10.0  # longest edge of terrain there
+_SPLIT = ("vertex_positions", "vertex_normals", "vertex_texcoords", "faces")
 
 
 def ply_bytes(
@@ -73,9 +80,8 @@ def surface(scene: Any) -> tuple[Float32Array, NDArray[np.uint32]]:
 
 def mesh_arrays(shape: Any) -> tuple[Float32Array, NDArray[np.uint32]]:
     """Vertices (n, 3) float32 in the world frame and faces (m, 3) uint32 of one Mitsuba mesh."""
-    v = np.asarray(shape.vertex_positions_buffer(), np.float32).reshape(-1, 3)
-    f = np.asarray(shape.faces_buffer(), np.uint32).reshape(-1, 3)
-    return v, f
+    vertices, faces = shape.vertex_positions_buffer(), shape.faces_buffer()
+    return np.asarray(vertices, np.float32).reshape(-1, 3), np.asarray(faces, np.uint32).reshape(-1, 3)
 
 
 def repair_meshes(mi: Any, scene: Any, path: Path) -> Any:
@@ -88,8 +94,7 @@ def repair_meshes(mi: Any, scene: Any, path: Path) -> Any:
     for number, shape in enumerate(scene.shapes()):
         if not shape.is_mesh():
             continue
-        vertices = np.asarray(shape.vertex_positions_buffer(), np.float32).reshape(-1, 3)
-        faces = np.asarray(shape.faces_buffer(), np.uint32).reshape(-1, 3)
+        vertices, faces = mesh_arrays(shape)
         what = f"scene {path}: mesh '{shape.id() or number}'"
         if faces.size and faces.max() >= len(vertices):
             raise UserError(f"{what} names vertex {faces.max()} of {len(vertices)}: export it anew")
@@ -147,18 +152,100 @@ def _repair(mi: Any, shape: Any, vertices: Float32Array, faces: NDArray, keep: N
             parameters["vertex_normals"] = mi.Float(aligned(normals))  # else made anew, from the triangles
         log.debug("mesh '%s': %d triangles without area dropped", shape.id(), np.count_nonzero(~keep))
     if useless.any():
-        repaired = np.where(useless[:, None], _vertex_normals(vertices, faces[keep]), normals)
+        repaired = np.where(useless[:, None], vertex_normals(vertices, faces[keep], _UP), normals)
         parameters["vertex_normals"] = mi.Float(aligned(repaired))
         log.debug("mesh '%s': %d vertex normals without direction replaced", shape.id(), np.count_nonzero(useless))
     parameters.update()
     return True
 
 
-def _vertex_normals(vertices: Float32Array, faces: NDArray) -> NDArray[np.float64]:
-    """(n, 3) unit normals, weighted by area; those of vertices that no face has, or whose faces cancel, point up."""
+def vertex_normals(vertices: Float32Array, faces: NDArray, otherwise: tuple[float, float, float]) -> FloatArray:
+    """Unit normals (n, 3), the mean of the faces' by area; `otherwise` where no face is, or where they cancel."""
     a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
     normal = np.repeat(np.cross(b - a, c - a), 3, axis=0)
     total = np.stack([np.bincount(faces.ravel(), normal[:, k], len(vertices)) for k in range(3)], axis=-1)
     length = np.linalg.norm(total, axis=-1, keepdims=True)
-    up = np.array([0.0, 0.0, 1.0])
-    return np.where(length > 0, total / np.where(length > 0, length, 1), up)
+    return np.where(length > 0, total / np.where(length > 0, length, 1), otherwise)
+
+
+log = logging.getLogger("rsgen")
+
+
+def inhabited_box(shapes: Sequence[Any]) -> FloatArray:
+    """Least and largest corner (2, 3), world, m, of all meshes that are no terrain; of all if there is nothing else."""
+    every = [_vertices(shape) for shape in shapes]
+    others = [v for v in every if _across(v) <= _BUILDING_M]
+    boxes = np.array([[v.min(axis=0), v.max(axis=0)] for v in others or every])
+    return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
+
+
+def coarser(corners: FloatArray, box: FloatArray) -> FloatArray:
+    """How many times coarser than asked for light is on triangles (n, 3, 3) away from the `inhabited_box`."""
+    return np.maximum(_distance(corners, box) / _NEAR_M, 1.0)
+
+
+def split_terrain(mi: Any, scene: Any) -> Any:
+    """The scene with the triangles of its terrain in parts, if it has any; meshes are changed in place."""
+    shapes = [shape for shape in scene.shapes() if shape.is_mesh()]
+    terrain = [_across(_vertices(shape)) > _BUILDING_M for shape in shapes]
+    if all(terrain):
+        return scene  # with nothing that it is around
+    box, changed = inhabited_box(shapes), False
+    for shape, is_terrain in zip(shapes, terrain, strict=True):
+        if not is_terrain or shape.is_emitter():
+            continue
+        parameters = mi.traverse(shape)
+        if any(key.startswith(("vertex_", "face_")) and key not in _SPLIT for key in parameters.keys()):  # noqa: SIM118
+            continue  # colours of its own
+        widths = {"vertex_positions": 3}
+        if shape.has_vertex_normals():
+            widths["vertex_normals"] = 3
+        if shape.has_vertex_texcoords():
+            widths["vertex_texcoords"] = 2
+        columns = [np.asarray(parameters[name], np.float64).reshape(-1, width) for name, width in widths.items()]
+        before = np.asarray(parameters["faces"]).reshape(-1, 3).astype(np.int64)
+        faces, table = split_triangles(before, np.hstack(columns), box)
+        if len(faces) == len(before):
+            continue
+        for name, values in zip(widths, np.split(table, np.cumsum([*widths.values()])[:-1], axis=1), strict=True):
+            parameters[name] = mi.Float(aligned(values))
+        parameters["faces"] = mi.UInt32(aligned(faces, np.uint32))
+        parameters.update()
+        log.debug("mesh '%s': %d triangles of terrain made %d", shape.id(), len(before), len(faces))
+        changed = True
+    return rebuilt(mi, scene) if changed else scene
+
+
+def split_triangles(faces: IntArray, table: FloatArray, box: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Triangles (m, 3) over vertices (n, 3 + k), position first, halved until no edge is too long for where it is.
+
+    box: where one may be. There that is 10 m, farther away as much as the distance.
+    """
+    while True:
+        corners = table[:, :3][faces]
+        edges = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)  # edge k: from corner k to the next
+        long = edges.max(axis=1) > np.maximum(_EDGE_M, _distance(corners, box))
+        if not long.any():
+            return faces, table
+        rows = np.flatnonzero(long)
+        k = edges[rows].argmax(axis=1)
+        a, b, c = (faces[rows, (k + turn) % 3] for turn in range(3))
+        ends, which = np.unique(np.sort(np.stack([a, b], axis=1), axis=1), axis=0, return_inverse=True)
+        middle = len(table) + which.ravel()
+        table = np.concatenate([table, table[ends].mean(axis=1)])
+        halves = np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)
+        faces = np.concatenate([faces[~long], *halves])
+
+
+def _distance(corners: FloatArray, box: FloatArray) -> FloatArray:
+    """Of the boxes about triangles (n, 3, 3) from `box`, m (n,)."""
+    away = np.maximum(np.maximum(box[0] - corners.max(axis=1), corners.min(axis=1) - box[1]), 0.0)
+    return np.asarray(np.linalg.norm(away, axis=1))
+
+
+def _across(vertices: FloatArray) -> float:
+    return float(np.linalg.norm(np.ptp(vertices, axis=0)))
+
+
+def _vertices(shape: Any) -> FloatArray:
+    return mesh_arrays(shape)[0].astype(np.float64)

@@ -23,11 +23,18 @@ from rsgen.errors import UserError
 from rsgen.formats import scene_reader, xml_helper
 from rsgen.inputs import check_input
 from rsgen.render.board import BOARD_ID, Board, board_xml
-from rsgen.render.file_names import tell_renamed
-from rsgen.render.meshes import repair_meshes
+from rsgen.render.meshes import repair_meshes, split_terrain
 from rsgen.render.placement import AS_IT_IS, SceneOptions, place, place_lamps
-from rsgen.render.terrain import split_terrain
-from rsgen.render.xml_scene import Parsed, check_files, explained, messages_to_log, parse, prepare, unknown_properties
+from rsgen.render.xml_scene import (
+    Parsed,
+    check_files,
+    explained,
+    log_renamed,
+    messages_to_log,
+    parse,
+    prepare,
+    unknown_properties,
+)
 from rsgen.render.xml_shapes import ANALYTIC, tessellated, turn_mirrored
 
 log = logging.getLogger("rsgen")
@@ -133,7 +140,7 @@ def _load_xml(
     config.merge_meshes = False
     parsed = parse(mi, config, path, scratch, None if board is None else board_xml(board, scratch))
     changes = parsed.changes
-    tell_renamed(path, parsed.renamed)
+    log_renamed(path, parsed.renamed)
     resolver = mi.file_resolver()
     resolver.prepend(str(path.resolve().parent))
     try:

@@ -1,14 +1,16 @@
 """A scene file parsed by Mitsuba and made ready for it: old files upgraded, instances flattened, broken parts named.
 
-Also where Mitsuba's own messages go meanwhile: to the logger, never onto the screen.
+Files that it names are found as Windows finds them: in whatever case, with backslashes between folders. Mitsuba's own
+messages go to the logger meanwhile, never onto the screen.
 """
 
 from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,15 +21,14 @@ import numpy as np
 from rsgen.errors import UserError
 from rsgen.formats import xml_helper
 from rsgen.inputs import MOST_BYTES, MOST_PIXELS, image_size
-from rsgen.render.file_names import mend_names
 from rsgen.render.xml_shapes import children, flatten
 
 log = logging.getLogger("rsgen")
 
+_MOST_LISTED = 3
 # Where a JPEG with a preview in front of it has told its size.
 _HEADER_BYTES = 1 << 20
 _UNKNOWN = re.compile(r'(\w+) plugin of type "(\w+)":|- \w+ "(\w+)"')
-
 _FAILED = re.compile(r'At (.*?\(line \d+, col \d+\)): failed to instantiate (\w+) plugin of type "(\w+)": (.*)')
 
 
@@ -62,7 +63,7 @@ def parse(mi: Any, config: Any, path: Path, scratch: Path, shape: str | None = N
         file = whole
     state = mi.parser.parse_file(config, str(file))
     renamed = {} if changes is None else changes.renamed
-    return Parsed(state, changes, renamed | mend_names(state, path.parent))
+    return Parsed(state, changes, renamed | repair_names(state, path.parent))
 
 
 def older_version(path: Path) -> str | None:
@@ -196,3 +197,56 @@ def unknown_properties(messages: list[str]) -> list[str]:
             else:
                 found.append(f"{match[3]} of {plugin}")
     return sorted(found)
+
+
+def located(folder: Path, name: str) -> Path | None:
+    """The file or folder `name` in `folder`: by that very name, else by the only one that it is but for its case.
+
+    Backslashes part folders where there is no such name. None if there is nothing, or more than one could be meant.
+    """
+    plain = name.replace("\\", "/")
+    for exact in (folder / name, folder / plain):
+        if exact.exists():
+            return exact
+    if not plain or Path(plain).is_absolute():
+        return None
+    found = [folder]
+    for part in Path(plain).parts:
+        found = [here for place in found for here in _alike(place, part)]
+    return found[0] if len(found) == 1 else None
+
+
+def repair_names(state: Any, folder: Path) -> dict[str, str]:
+    """Rename files that a parsed scene names otherwise than they are called, in place; returns their names by those.
+
+    folder: of the scene's file, which names are relative to. Names of no file stay as they are.
+    """
+    renamed: dict[str, str] = {}
+    for node in state.nodes:
+        if "filename" not in node.props:
+            continue
+        name = str(node.props["filename"])
+        file = None if (folder / name).exists() else located(folder, name)
+        if file is not None:
+            renamed[name] = node.props["filename"] = os.path.relpath(file, folder)
+    return renamed
+
+
+def log_renamed(path: Path, renamed: Mapping[str, str]) -> None:
+    """Log in a line which files of the scene `path` were found under other names than its own, if any."""
+    pairs = [f"'{name}' is '{file}'" for name, file in sorted(renamed.items())]
+    if pairs:
+        more = f" and {len(pairs) - _MOST_LISTED} more" if len(pairs) > _MOST_LISTED else ""
+        log.warning(
+            "scene %s: found files by names that differ in case or slashes: %s%s",
+            path, ", ".join(pairs[:_MOST_LISTED]), more,
+        )  # fmt: skip
+
+
+def _alike(folder: Path, name: str) -> list[Path]:
+    if name == "..":
+        return [folder / name]
+    try:
+        return [other for other in folder.iterdir() if other.name.casefold() == name.casefold()]
+    except OSError:
+        return []

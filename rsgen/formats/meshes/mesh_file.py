@@ -25,10 +25,10 @@ from rsgen.formats.meshes import gltf
 from rsgen.formats.meshes.default_light import light_shapes
 from rsgen.formats.meshes.parts import Part, finished, placed
 from rsgen.inputs import check_input
-from rsgen.render.file_names import located
 from rsgen.render.material import Material, Texture, bsdf, emitter
 from rsgen.render.meshes import ply_bytes
 from rsgen.render.placement import SceneOptions, world_from_file
+from rsgen.render.xml_scene import located
 
 log = logging.getLogger("rsgen")
 

@@ -21,7 +21,7 @@ import numpy as np
 from rsgen.errors import UserError
 from rsgen.formats.mitsuba_xml.colors import FACTOR, numbers
 from rsgen.formats.mitsuba_xml.plugins import Changes, Exists, Upgrade
-from rsgen.render.file_names import located
+from rsgen.render.xml_scene import located
 
 METHOD = b"old-xml/2"
 """Raise when old files come out differently: their baked light is kept under it."""

@@ -10,9 +10,8 @@ from lit import scene_of
 from rsgen.array_types import FloatArray
 from rsgen.device.arrays import rows_of
 from rsgen.render.irradiance import make_lattice
-from rsgen.render.meshes import mesh_arrays
+from rsgen.render.meshes import coarser, inhabited_box, mesh_arrays, split_triangles
 from rsgen.render.rays import rays_from
-from rsgen.render.terrain import coarser, inhabited, pieces
 
 HOUSE = """<shape type="cube"><transform name="to_world"><scale x="3" y="2" z="1.5"/><translate z="1.4"/></transform>
     <bsdf type="diffuse"/></shape>"""
@@ -28,7 +27,7 @@ def area(corners: FloatArray) -> FloatArray:
 def test_land_is_cut_into_pieces_that_are_small_where_one_may_be(tmp_path: Path) -> None:
     scene = scene_of(tmp_path, HOUSE, GROUND)
     shapes = [shape for shape in scene.shapes() if shape.is_mesh()]
-    np.testing.assert_allclose(inhabited(shapes), BOX, atol=1e-5)
+    np.testing.assert_allclose(inhabited_box(shapes), BOX, atol=1e-5)
     (vertices, faces) = next(mesh_arrays(s) for s in shapes if len(mesh_arrays(s)[1]) > 12)
     corners = vertices[faces].astype(float)
     assert abs(area(corners).sum() / 160000.0 - 1) < 1e-5
@@ -64,4 +63,4 @@ def test_a_lamp_and_small_things_stay_as_they_are(tmp_path: Path) -> None:
     scene = scene_of(tmp_path, HOUSE, sky)
     assert sorted(len(mesh_arrays(shape)[1]) for shape in scene.shapes()) == [2, 12]
     faces, table = np.array([[0, 1, 2]]), np.array([[0.0, 0, 0], [9, 0, 0], [0, 2, 0]])
-    assert pieces(faces, table, BOX)[0] is faces
+    assert split_triangles(faces, table, BOX)[0] is faces

@@ -17,6 +17,7 @@ from test_scene_living_room import digest, read_ply
 
 from rsgen.errors import UserError
 from rsgen.render.scene import content_hash, ensure_built, load_scene
+from scenes.kit.pieces import Piece
 from scenes.kit.shapes import merge
 from scenes.living_room import layout, table
 from scenes.living_room.room import FLOOR, RIGHT
@@ -39,7 +40,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return table.build(folder)
 
 
-def vertices(thing: table.Thing) -> np.ndarray:
+def vertices(thing: Piece) -> np.ndarray:
     """(n, 3) of all its parts."""
     return np.concatenate([mesh.v for _, mesh in thing.parts])
 
