@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from importlib import import_module
 from statistics import geometric_mean
 
+from benchmarks.measures.injected import KINDS
 from benchmarks.size import size_table
 from benchmarks.verdicts import FAMILY, beaten, beaten_table, peer_of, sentences
 from rsgen.console.tables import NOTHING, Entry, Table, significant
 from rstrack.bench.record import (
     CellRecord,
+    Figures,
     methods_in_order,
 )
 from rstrack.bench.tables import (
@@ -119,13 +120,14 @@ def faults(full: Records) -> list[str]:
     """Injected faults, those of a kind together."""
     lines = ["## Faults", ""]
     records = of_measure(full, "faults")
-    names = _kinds()
     for method in methods_in_order(records):
         runs = [run for record in records if record.method == method for run in record.runs]
-        kinds = list(dict.fromkeys(run.get("kind") for run in runs))
+        by_kind: dict[float | None, list[Figures]] = {}
+        for run in runs:
+            by_kind.setdefault(run.get("kind"), []).append(run)
         rows: list[tuple[Entry | str, ...]] = [
-            (_kind(kind, names), *_fault_entries([run for run in runs if run.get("kind") == kind]))
-            for kind in sorted(kinds, key=lambda kind: -1.0 if kind is None else float(kind))
+            ("any" if kind is None else list(KINDS)[int(kind)], *_fault_entries(by_kind[kind]))
+            for kind in sorted(by_kind, key=lambda kind: -1.0 if kind is None else kind)
         ]
         rows.append(("all", *_fault_entries(runs)))
         head = ("kind", "faults", "silently wrong", "frames of these", "lost frames", "found in 5", "worst, mm")
@@ -272,19 +274,6 @@ def _fault_entries(runs: Sequence[dict[str, float | None]]) -> list[Entry]:
     texts = [str(len(runs)), f"{sum(wrong):.0f}", f"{sum(values('silent')):.0f}", f"{sum(values('lost')):.0f}"]
     texts += [f"{sum(found):.0f} of {len(found)}" if found else NOTHING, significant(max(worst, default=None))]
     return [Entry(text) for text in texts]
-
-
-def _kinds() -> list[str]:
-    try:
-        return list(import_module("benchmarks.measures.injected").KINDS)
-    except (ImportError, AttributeError):
-        return []
-
-
-def _kind(kind: float | None, names: Sequence[str]) -> str:
-    if kind is None:
-        return "any"
-    return names[int(kind)] if int(kind) < len(names) else f"kind {kind:g}"
 
 
 def _section(title: str, table: Table, records: Sequence[CellRecord], *told: str) -> list[str]:

@@ -12,7 +12,6 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,7 +21,6 @@ from rsgen.console.progress import Progress
 from rsgen.errors import UserError
 from rstrack.bench.definitions import StrictModel
 from rstrack.bench.record import Figures
-from rstrack.bench.sequences import Absent
 from rstrack.bench.task import Task, settings_of
 
 _ROOT = Path(__file__).parents[2]
@@ -47,7 +45,7 @@ def rendered(task: Task, what: str, settings: Mapping[str, Any], progress: Progr
     with (
         tempfile.TemporaryFile("w+") as log,
         subprocess.Popen(
-            [sys.executable, "-m", "benchmarks.rendering.worker", json.dumps(job)],
+            [sys.executable, "-m", "benchmarks.measures.render_worker", json.dumps(job)],
             stdout=subprocess.PIPE, stderr=log, text=True, env=os.environ | {"PYTHONPATH": path},
         ) as process,
     ):  # fmt: skip
@@ -89,11 +87,11 @@ def light_cell(task: Task, progress: Progress) -> Figures:
     return rendered(task, "light", settings | {"seed": task.seed, "picture": str(task.out / "light.png")}, progress)
 
 
-ModeName = Literal["still", "rs-blur", "path", "rows", "averaged", "blender-still", "blender"]
+ModeName = Literal["still", "rs-blur", "path", "rows", "averaged"]
 
 
 class RenderSettings(StrictModel):
-    """What is timed; modes of Blender need the package bpy and take long."""
+    """What is timed."""
 
     modes: tuple[ModeName, ...] = Field(default=("still", "rs-blur", "path", "rows", "averaged"), min_length=1)
     frames: int = Field(default=5, ge=1, description="timed frames, each in all modes")
@@ -103,10 +101,8 @@ class RenderSettings(StrictModel):
 def render_cell(task: Task, progress: Progress) -> Figures:
     """Time the modes on the sequence's config, whose method is `rsgen`, with 28 ms of readout and 20 ms of blur.
 
-    Figures: see `benchmarks.rendering.modes.figures_of`; those of a mode that failed are missing. Raises UserError, and
-    Absent.
+    Figures: see `benchmarks.measures.render_worker.figures_of`; those of a mode that failed are missing. Raises
+    UserError, and Absent.
     """
     settings = settings_of(task, RenderSettings)
-    if {"blender", "blender-still"} & set(settings.modes) and find_spec("bpy") is None:
-        raise Absent("Blender's Python module bpy is not installed: pip install 'bpy==4.2.*' (Python 3.11)")
     return rendered(task, "render", settings.model_dump(), progress)

@@ -1,9 +1,10 @@
-"""Datasets with something changed: pure functions from a dataset to one that says or shows something else.
+"""Recordings with something changed, in their images, stamps or cameras, as the cases of benchmarks have it.
 
-dataset = with_color(dataset, lambda k, pixels: gained(pixels, 0.92))
+dataset = changed(dataset, "darkened", seed=0, arguments={"factor": 0.5})
 dataset = reordered(dataset, shown=range(0, len(dataset), 2), stamps=dataset.stamps[::2])
 
-Images are changed when they are read. What is random depends on a seed and on the image's number alone.
+All are pure functions of a dataset. Images are changed when they are read. What is random depends on a seed and on the
+image's number alone.
 """
 
 from __future__ import annotations
@@ -31,14 +32,14 @@ DepthChange = Callable[[int, Float32Array], Float32Array]
 
 
 @dataclass(frozen=True)
-class _Changed:
-    """Images of another reader: its k-th is the source's shown_*[k]-th, after a change that is told k."""
+class _ChangedImages:
+    """Images of another reader: its k-th is the source's shown_*[k]-th, after a change that is given k."""
 
     source: ImageReader
-    change_color: ColorChange
-    change_depth: DepthChange
-    shown_color: tuple[int, ...]
-    shown_depth: tuple[int, ...]
+    shown_color: Sequence[int]
+    shown_depth: Sequence[int]
+    change_color: ColorChange = lambda _, pixels: pixels
+    change_depth: DepthChange = lambda _, z: z
 
     def color(self, k: int) -> ByteArray:
         return self.change_color(k, self.source.color(self.shown_color[k]))
@@ -47,22 +48,14 @@ class _Changed:
         return self.change_depth(k, self.source.depth(self.shown_depth[k]))
 
 
-def _same_color(_: int, pixels: ByteArray) -> ByteArray:
-    return pixels
-
-
-def _same_depth(_: int, z: Float32Array) -> Float32Array:
-    return z
-
-
 def with_color(dataset: Dataset, change: ColorChange) -> Dataset:
     """With every colour image k (h, w, 3) replaced by change(k, pixels)."""
-    return _with_images(dataset, change_color=change)
+    return replace(dataset, images=replace(_all_images(dataset), change_color=change))
 
 
 def with_depth(dataset: Dataset, change: DepthChange) -> Dataset:
     """With every depth image k (h, w), metres, replaced by change(k, z)."""
-    return _with_images(dataset, change_depth=change)
+    return replace(dataset, images=replace(_all_images(dataset), change_depth=change))
 
 
 def with_stamps(dataset: Dataset, depth: FloatArray, color: FloatArray) -> Dataset:
@@ -75,14 +68,6 @@ def with_stamps(dataset: Dataset, depth: FloatArray, color: FloatArray) -> Datas
         raise UserError(f"{dataset.name}: its stamps are closer than they would be moved: they must increase")
     moved = _with_truth(dataset, dataset.stamps, depth)
     return replace(moved, stamps=depth, color_stamps=color, groups=group_colors(depth, color))
-
-
-def with_shutter(dataset: Dataset, depth: Callable[[float], float], color: Callable[[float], float]) -> Dataset:
-    """Readouts, s, said to be others. Raises UserError for one below zero."""
-    rig = dataset.rig
-    depth_shutter = replace(rig.depth_shutter, readout_s=depth(rig.depth_shutter.readout_s))
-    color_shutter = replace(rig.color_shutter, readout_s=color(rig.color_shutter.readout_s))
-    return replace(dataset, rig=replace(rig, depth_shutter=depth_shutter, color_shutter=color_shutter))
 
 
 def reordered(
@@ -102,7 +87,7 @@ def reordered(
         groups.append(tuple(range(len(chosen), len(chosen) + len(group))))
         chosen += list(group)
         color_stamps += [stamp + dataset.color_stamps[i] - dataset.stamps[source] for i in group]
-    images = _Changed(dataset.images, _same_color, _same_depth, tuple(chosen), tuple(shown))
+    images = _ChangedImages(dataset.images, tuple(chosen), tuple(shown))
     moved = _with_truth(dataset, dataset.stamps[np.asarray(shown, int)], stamps)
     return replace(
         moved,
@@ -139,15 +124,8 @@ def reduced(dataset: Dataset, factor: int) -> Dataset:
     return replace(changed, rig=small, stamps=stamps, color_stamps=color_stamps)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-
-
-def _with_images(
-    dataset: Dataset, change_color: ColorChange = _same_color, change_depth: DepthChange = _same_depth
-) -> Dataset:
-    everything = tuple(range(len(dataset.color_stamps))), tuple(range(len(dataset.stamps)))
-    images = _Changed(dataset.images, change_color, change_depth, *everything)
-    return replace(dataset, images=images)
+def _all_images(dataset: Dataset) -> _ChangedImages:
+    return _ChangedImages(dataset.images, range(len(dataset.color_stamps)), range(len(dataset.stamps)))
 
 
 def _with_truth(dataset: Dataset, taken: FloatArray, stamps: FloatArray) -> Dataset:
@@ -208,28 +186,30 @@ def jittered(dataset: Dataset, rms_s: float, seed: int) -> Dataset:
 
 
 def readout_told(dataset: Dataset, shift_s: float = 0.0, factor: float = 1.0) -> Dataset:
-    """Readouts of both streams told wrongly: a shutter that is global stays so, none goes below zero."""
+    """Readouts of both streams stated wrongly: a shutter that is global stays so, none goes below zero."""
 
-    def told(readout_s: float) -> float:
-        return max(0.0, factor * readout_s + shift_s) if readout_s > 0.0 else 0.0
+    def stated(shutter: Shutter) -> Shutter:
+        readout_s = shutter.readout_s
+        return replace(shutter, readout_s=max(0.0, factor * readout_s + shift_s) if readout_s > 0.0 else 0.0)
 
-    return with_shutter(dataset, told, told)
+    rig = dataset.rig
+    depth, color = stated(rig.depth_shutter), stated(rig.color_shutter)
+    return replace(dataset, rig=replace(rig, depth_shutter=depth, color_shutter=color))
 
 
 def camera_told(
     dataset: Dataset, *, focal: float = 1.0, cx_px: float = 0.0, cy_px: float = 0.0, readout_ms: float = 0.0,
     rotation_deg: float = 0.0, undistorted: bool = False, color_ms: float = 0.0,
 ) -> Dataset:  # fmt: skip
-    """What the camera file says of both cameras is wrong by that much, and may be, as far as its user knows.
+    """What the camera file states of both cameras is wrong by that much, and may be, as far as its user knows.
 
-    focal: factor of focal lengths. cx_px, cy_px: added to principal points. readout_ms: added to readouts, as
-    `readout_told` does. rotation_deg: the colour camera is told turned about its own y axis. undistorted: no lens
-    distortion is told. color_ms: added to colour stamps. Raises UserError: a registered recording, whose two cameras
-    are one, told turned; colour told late where its offset is looked for, which would undo it; a focal length that is
-    not positive.
+    focal: factor of focal lengths. cx_px, cy_px: added to principal points. readout_ms: as of `readout_told`.
+    rotation_deg: of the colour camera about its own y axis. undistorted: without lens distortion. color_ms: added to
+    colour stamps. Raises UserError: a registered recording, whose two cameras are one, is turned; colour's offset is
+    looked for, which would undo a later one; a focal length that is not positive.
     """
 
-    def told(camera: Camera) -> Camera:
+    def stated(camera: Camera) -> Camera:
         moved = replace(camera, fx=focal * camera.fx, fy=focal * camera.fy, cx=camera.cx + cx_px, cy=camera.cy + cy_px)
         return replace(moved, model="pinhole", distortion=()) if undistorted else moved
 
@@ -238,9 +218,9 @@ def camera_told(
         raise UserError(f"{dataset.name}: depth is registered: no rotation between its cameras could be told wrongly")
     if color_ms and dataset.timing is not None and dataset.timing.wants_color_offset:
         raise UserError(f"{dataset.name}: colour's offset is looked for: name one in a camera file to tell it wrongly")
-    T_told_color = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, np.radians(rotation_deg), 0.0]))
-    cameras = replace(rig, depth_camera=told(rig.depth_camera), color_camera=told(rig.color_camera))
-    T_color_depth = T_told_color @ rig.T_color_depth if rotation_deg else rig.T_color_depth
+    T_stated_color = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, np.radians(rotation_deg), 0.0]))
+    cameras = replace(rig, depth_camera=stated(rig.depth_camera), color_camera=stated(rig.color_camera))
+    T_color_depth = T_stated_color @ rig.T_color_depth if rotation_deg else rig.T_color_depth
     # A rendering's lenses count as exact, whatever its depth camera has wrong.
     sigma = usual(cameras.color_camera) if rig.sigma.focal == 0.0 else rig.sigma
     cameras = replace(cameras, T_color_depth=T_color_depth, sigma=sigma)

@@ -35,7 +35,7 @@ RECORD = "record.json"
 OLDEST = 2
 """Minor versions that what takes hours may be behind."""
 # Parts of both packages that show things, or read and write for other programs: figures do not depend on them.
-_SHOWING = ("bench", "charts", "cli", "export", "importing", "pack", "pictures", "report", "share", "view")
+_SHOWING = ("bench", "charts", "cli", "formats", "pack", "pictures", "report", "share", "view")
 # What describes a sequence, rsgen's or TUM's; the images themselves are not read for the key.
 _DESCRIPTIONS = (
     "sequence.yaml", "rgb.txt", "depth.txt", "associations.txt", "groundtruth.txt", "camera.yaml", "calibration.yaml"
@@ -90,12 +90,12 @@ def run_cells(
     ]  # fmt: skip
     records: dict[str, CellRecord] = {}
     known_s = dict(expected_s or {})
-    usual_s = sorted(known_s.values())[len(known_s) // 2] if known_s else 1.0
-    weight = {job.cell.name: known_s.get(job.cell.name, usual_s) for job in jobs}
+    median_s = sorted(known_s.values())[len(known_s) // 2] if known_s else 1.0
+    weight = {job.cell.name: known_s.get(job.cell.name, median_s) for job in jobs}
     running: dict[str, float] = {}
     todo = []
     for job in jobs:
-        there = _kept(job, _key(job))
+        there = _stored(job, _key(job))
         if there is not None and there.complete:
             records[job.cell.name] = there
         else:
@@ -137,7 +137,7 @@ def run_cell(job: Job, progress: Progress = no_progress) -> CellRecord:
     """
     cell, file = job.cell, job.out / RECORD
     key = _key(job)
-    record = _kept(job, key)
+    record = _stored(job, key)
     if record is None:
         record = CellRecord(**stamped({"cell": cell.name, "key": key, "settings": cell.as_dict()}))
     if record.complete:
@@ -212,7 +212,7 @@ def _key(job: Job, root: Path | None = None) -> str:
     return hashlib.sha256(json.dumps(depends, sort_keys=True, default=str).encode()).hexdigest()
 
 
-def _kept(job: Job, key: str) -> CellRecord | None:
+def _stored(job: Job, key: str) -> CellRecord | None:
     """What there is of the seeds that are asked for; None: nothing, or of other inputs."""
     there = read_record(job.out / RECORD)
     if there is None or there.error is not None or there.key != key:
@@ -233,18 +233,14 @@ def _render(jobs: list[Job], progress: Progress) -> None:
 
 def _made_of(job: Job, root: Path | None) -> str:
     """Of the sequence in `root`: empty where it is still to be rendered. Of the renderer's cells: what it renders."""
-    entry = job.cell.sequence
-    try:
-        if job.cell.renders:
+    entry, name = job.cell.sequence, job.cell.case_entry.sequence
+    if job.cell.renders:
+        try:
             return job.sources.recipe(entry)
-        there = dataclasses.replace(job.sources, render=_not_now)
-        return sequence_digest(root or there.folder(entry, job.cell.case_entry.sequence))
-    except UserError:
-        return ""
-
-
-def _not_now(_: object) -> None:
-    raise UserError("the sequence is to be rendered")
+        except UserError:
+            return ""
+    folder = root or job.sources.found(entry, name)
+    return "" if folder is None else sequence_digest(folder)
 
 
 def _file_digest(path: Path) -> str | None:

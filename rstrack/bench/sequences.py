@@ -64,13 +64,12 @@ class Sources:
             atomic_write(note, recipe.encode())
         return folder
 
-    def has(self, entry: SequenceEntry, name: str) -> bool:
-        """Whether a sequence is there, whole."""
+    def found(self, entry: SequenceEntry, name: str) -> Path | None:
+        """The folder of a sequence that is there whole, else None: nothing is rendered."""
         try:
-            dataclasses.replace(self, render=_not_now).folder(entry, name)
+            return dataclasses.replace(self, render=_not_now).folder(entry, name)
         except UserError:
-            return False
-        return True
+            return None
 
     def words(self, entry: SequenceEntry) -> list[str]:
         """What `rsgen` is called with, but for --out. Raises UserError, and Absent."""
@@ -140,10 +139,12 @@ def scaled(path: Path, config: Mapping[str, Any], width: int) -> dict[str, Any]:
 def run_rsgen(words: Sequence[str]) -> None:
     """Run `rsgen` with these arguments in a process of its own. Raises UserError if it fails."""
     # The tracker's process must not load the renderer.
-    done = subprocess.run([sys.executable, "-m", "rsgen", *words], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-m", "rsgen", *words], capture_output=True, text=True, errors="replace", check=False
+    )
     if done.returncode:
         told = (done.stderr.strip() or done.stdout.strip() or f"exit status {done.returncode}").splitlines()
-        raise UserError(f"rsgen {' '.join(words[:2])} failed: {told[-1]}")
+        raise UserError(f"rsgen {' '.join(words[:2])} failed: {told[-1].removeprefix('rsgen: ')}")
 
 
 def _not_now(_: object) -> None:

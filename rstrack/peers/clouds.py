@@ -22,9 +22,8 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate
-from rstrack.data.image_files import prefetched
 from rstrack.options import CLOUD_PEERS, Options
-from rstrack.peers.peer import run_info
+from rstrack.peers.peer import chosen_frames, run_info, timed_frames
 
 # Pixels of a depth image are thinned out to about so many.
 _POINTS = 40_000
@@ -116,25 +115,19 @@ def run_cloud_peer(
 
     Raises UserError: unknown name, the peer is not installed, no such frames, an image cannot be read or holds nothing.
     """
-    chosen = range(len(dataset))[frames]
-    if not len(chosen):
-        raise UserError(f"{dataset.root}: has no frame {frames.start}: its frames are 0 to {len(dataset) - 1}")
-    tracker = _tracker(name)
-    cloud = cloud_of(dataset)
-    poses, seconds = [], []
-    begin = time.perf_counter()
-    for k, (points, line) in zip(chosen, prefetched(cloud, chosen, 2), strict=True):
-        if len(points) < 100:
+    chosen, tracker = chosen_frames(dataset, frames), _tracker(name)
+    poses: list[FloatArray] = []
+
+    def feed(k: int, cloud: tuple[FloatArray, FloatArray]) -> None:
+        if len(cloud[0]) < 100:
             raise UserError(f"{dataset.root}: depth frame {k} holds next to nothing, of which {name} makes no pose")
-        start = time.perf_counter()
-        poses.append(tracker.register(points, line))
-        seconds.append(time.perf_counter() - start)
-        rate = len(seconds) / (time.perf_counter() - begin)
-        progress("tracking", len(seconds) / len(chosen), f"{rate:.1f} frames/s, {name}")
+        poses.append(tracker.register(*cloud))
+
+    begin = time.perf_counter()
+    seconds = timed_frames(name, chosen, cloud_of(dataset), feed, progress)
     stamps = dataset.stamps[chosen]
     T_world_depth = se3.interpolated(stamps + _last_line(dataset), np.array(poses), stamps)
-    total_s = time.perf_counter() - begin
-    info = run_info(name, {_PACKAGES[name]: version(_PACKAGES[name])}, "on the CPU", dataset, chosen, total_s, seconds)
+    info = run_info(name, {_PACKAGES[name]: version(_PACKAGES[name])}, "on the CPU", dataset, chosen, begin, seconds)
     info |= {"settings": tracker.settings, "keyframes": 0, "lost": 0}
     return Estimate(stamps, se3.orthonormalise(T_world_depth), info=info)
 

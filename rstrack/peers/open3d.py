@@ -20,10 +20,9 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate
-from rstrack.data.image_files import prefetched
 from rstrack.data.registration import RegisteredImage, Registrar, registered_image
 from rstrack.options import PEERS, Options
-from rstrack.peers.peer import run_info
+from rstrack.peers.peer import chosen_frames, mid_readout_s, run_info, timed_frames
 
 _KEYFRAME = "-keyframe"
 # Part of the pixels that must have found a partner, and frames in a row without, after which the reference is given up.
@@ -55,11 +54,11 @@ class PeerTracker:
     Raises UserError: unknown name, or Open3D cannot be loaded.
     """
 
-    def __init__(self, name: str, camera: Camera, options: Options | None = None) -> None:
+    def __init__(self, name: str, camera: Camera) -> None:
         if name not in PEERS:
             raise UserError(f"unknown peer '{name}': choose {', '.join(PEERS)}")
         self._o3d = open3d()
-        self.options = options or Options()
+        self.options = Options()
         self._to_keyframe = name.endswith(_KEYFRAME)
         self._method = getattr(self._o3d.t.pipelines.odometry.Method, "PointToPlane" if "icp" in name else "Hybrid")
         self._intrinsics = self._tensor(camera.K)
@@ -146,27 +145,18 @@ def run_peer(name: str, dataset: Dataset, frames: slice = slice(None), progress:
 
     Raises UserError: unknown name, Open3D cannot be loaded, no such frames, an image cannot be read, all were lost.
     """
-    chosen = range(len(dataset))[frames]
-    if not len(chosen):
-        raise UserError(f"{dataset.root}: has no frame {frames.start}: its frames are 0 to {len(dataset) - 1}")
-    registrar = Registrar(dataset.rig)
+    chosen, registrar = chosen_frames(dataset, frames), Registrar(dataset.rig)
     tracker = PeerTracker(name, registrar.camera)
-    seconds: list[float] = []
     begin = time.perf_counter()
-    images = prefetched(lambda k: registered_image(dataset, registrar, k), chosen, 2)
-    for k, image in zip(chosen, images, strict=True):
-        start = time.perf_counter()
-        tracker.feed(float(dataset.stamps[k]), image)
-        seconds.append(time.perf_counter() - start)
-        rate = len(seconds) / (time.perf_counter() - begin)
-        progress("tracking", len(seconds) / len(chosen), f"{rate:.1f} frames/s, {name}")
+    seconds = timed_frames(
+        name, chosen, lambda k: registered_image(dataset, registrar, k),
+        lambda k, image: tracker.feed(float(dataset.stamps[k]), image), progress,
+    )  # fmt: skip
     if not tracker.poses:
         raise UserError(f"{dataset.root}: {name} found no pose: the depth images hold next to nothing")
     stamps = np.array(tracker.stamps)
-    T_world_depth = se3.interpolated(stamps + _mid_readout(dataset), np.array(tracker.poses), stamps)
-    info = run_info(
-        name, {"open3d": version("open3d")}, "Open3D on the CPU", dataset, chosen, time.perf_counter() - begin, seconds
-    )
+    T_world_depth = se3.interpolated(stamps + mid_readout_s(dataset), np.array(tracker.poses), stamps)
+    info = run_info(name, {"open3d": version("open3d")}, "Open3D on the CPU", dataset, chosen, begin, seconds)
     frames_told = [
         {
             "stamp": r.stamp, "lost": r.lost, "keyframe": r.keyframe and _KEYFRAME in name,
@@ -191,9 +181,3 @@ def open3d() -> Any:
         first = str(error).splitlines()[0]
         raise UserError(f"Open3D does not load ({first}): on Debian or Ubuntu, apt-get install {needed}") from None
     return module
-
-
-def _mid_readout(dataset: Dataset) -> float:
-    """Seconds from a depth frame's stamp to the middle of its readout."""
-    camera, shutter = dataset.rig.depth_camera, dataset.rig.depth_shutter
-    return float(shutter.line_mid_time(0.0, 0.5 * (shutter.line_count(camera) - 1), camera))

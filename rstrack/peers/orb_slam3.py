@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 import os
-import subprocess
 import sys
 import time
 from collections.abc import Iterable
@@ -37,7 +36,7 @@ from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.data.image_files import prefetched
 from rstrack.data.registration import RegisteredImage, Registrar, registered_image
 from rstrack.options import Options
-from rstrack.peers.peer import run_info
+from rstrack.peers.peer import chosen_frames, mid_readout_s, run_info, run_logged
 
 NAME = "orb-slam3"
 VOCABULARY = "RSTRACK_ORB_VOCABULARY"
@@ -57,9 +56,7 @@ def run_orb_slam3(
     readout, and interpolated to the stamp. seed: of the vocabulary. Raises UserError: it is not installed, no such
     frames, an image cannot be read, its process fails, nothing was tracked.
     """
-    chosen = range(len(dataset))[frames]
-    if not len(chosen):
-        raise UserError(f"{dataset.root}: has no frame {frames.start}: its frames are 0 to {len(dataset) - 1}")
+    chosen = chosen_frames(dataset, frames)
     if find_spec("pyorbslam3") is None:
         raise UserError("the peer needs pyorbslam3 (GPL): pip install 'pyorbslam3>=0.1.1,<0.2'")
     registrar = Registrar(dataset.rig)
@@ -68,22 +65,22 @@ def run_orb_slam3(
         folder = Path(name)
         images = prefetched(lambda k: registered_image(dataset, registrar, k), chosen, 2)
         _write_frames(folder, dataset, chosen, images, seed)
-        (folder / "settings.yaml").write_text(settings_text(registrar.camera, _rate(dataset, chosen)))
+        rate_hz = 1.0 / (dataset.interval_s(chosen) or 1.0 / 30.0)
+        (folder / "settings.yaml").write_text(settings_text(registrar.camera, rate_hz))
         progress("tracking", 0.0, f"{NAME} runs")
-        _run_worker(folder, dataset)
+        failure = run_logged([sys.executable, "-m", _WORKER, str(folder)], folder / "log.txt")
+        if failure or not (folder / "frames.npz").is_file():
+            raise UserError(f"{dataset.root}: {NAME} {failure or 'wrote no times of its frames'}")
         with np.load(folder / "frames.npz") as told:
             ms, tracked = told["ms"], told["tracked"]
         if not (folder / "final.txt").is_file():
             raise UserError(f"{dataset.root}: {NAME} tracked no frame: too few features in the images")
         found = read_estimate(folder / "final.txt")
-    camera, shutter = dataset.rig.depth_camera, dataset.rig.depth_shutter
-    middle = float(shutter.line_mid_time(0.0, 0.5 * (shutter.line_count(camera) - 1), camera))
     nearest = np.abs(dataset.stamps[chosen][None] - found.stamps[:, None]).argmin(axis=1)
     # Its file has microseconds only.
     stamps, first = np.unique(dataset.stamps[chosen][nearest], return_index=True)
-    T_world_depth = se3.interpolated(stamps + middle, found.T_world_depth[first], stamps)
-    total_s = time.perf_counter() - begin
-    info = run_info(NAME, {"pyorbslam3": version("pyorbslam3")}, "on the CPU", dataset, chosen, total_s, 1e-3 * ms)
+    T_world_depth = se3.interpolated(stamps + mid_readout_s(dataset), found.T_world_depth[first], stamps)
+    info = run_info(NAME, {"pyorbslam3": version("pyorbslam3")}, "on the CPU", dataset, chosen, begin, 1e-3 * ms)
     info |= {"settings": SETTINGS, "keyframes": 0, "lost": int((~tracked).sum())}
     return Estimate(stamps, se3.orthonormalise(T_world_depth), info=info)
 
@@ -125,22 +122,6 @@ def _write_frames(folder: Path, dataset: Dataset, chosen: range, images: Iterabl
         raise UserError(f"{dataset.root}: {NAME} finds no feature in the images")
     else:
         write_vocabulary(folder / "vocabulary.txt", train_vocabulary(learnt_from, seed=seed))
-
-
-def _rate(dataset: Dataset, chosen: range) -> float:
-    return 1.0 / (dataset.interval_s(chosen) or 1.0 / 30.0)
-
-
-def _run_worker(folder: Path, dataset: Dataset) -> None:
-    """Raises UserError with the last line it said, if it fails."""
-    log = folder / "log.txt"
-    with log.open("wb") as file:
-        words = [sys.executable, "-m", _WORKER, str(folder)]
-        status = subprocess.run(words, stdout=file, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL)
-    if status.returncode or not (folder / "frames.npz").is_file():
-        lines = log.read_text(errors="replace").split("\n")
-        last = next((line.strip() for line in reversed(lines) if line.strip()), "it said nothing")
-        raise UserError(f"{dataset.root}: {NAME} ended with status {status.returncode}: {last[:200]}")
 
 
 BYTES = 32

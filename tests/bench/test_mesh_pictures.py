@@ -45,7 +45,7 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for method in METHODS:
         run = folder / "bench/cells/track/a" / method
         write_estimate(run, stamps, spline.pose(stamps), None if method == "baseline" else spline, {"method": method})
-    draw_meshes(of(folder), folder / "bench")
+    draw_meshes(of(folder), folder / "bench", warn=pytest.fail)
     return folder
 
 
@@ -143,15 +143,15 @@ def test_a_long_sequence_is_thinned(place: Path, monkeypatch: pytest.MonkeyPatch
 
 def test_what_is_there_is_kept_and_what_changed_is_made_again(place: Path, calls: list[str]) -> None:
     out = place / "bench"
-    assert draw_meshes(of(place), out) == [out / "plots/meshes_a.jpg"]
+    assert draw_meshes(of(place), out, warn=pytest.fail) == [out / "plots/meshes_a.jpg"]
     assert calls == []
-    assert draw_meshes(of(place, key="another"), out) and calls == ["baseline", "picture"]
+    assert draw_meshes(of(place, key="another"), out, warn=pytest.fail) and calls == ["baseline", "picture"]
     calls.clear()
     (out / "plots/meshes_a.jpg").unlink()
-    draw_meshes(of(place, key="another"), out)
+    draw_meshes(of(place, key="another"), out, warn=pytest.fail)
     assert calls == ["picture"] and (out / "plots/meshes_a.jpg").is_file()
     calls.clear()
-    draw_meshes(of(place, key="another"), out, ("baseline",))
+    draw_meshes(of(place, key="another"), out, ("baseline",), warn=pytest.fail)
     assert calls == ["picture"], "of fewer meshes"
 
 
@@ -165,9 +165,9 @@ def test_an_interrupt_leaves_nothing_half_made(place: Path, calls: list[str], mo
 
         broken.setattr(mesh_pictures, "run_map", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            draw_meshes(of(place, key="another"), out)
+            draw_meshes(of(place, key="another"), out, warn=pytest.fail)
     # Back to the inputs of the mesh that is no longer there.
-    draw_meshes(of(place), out)
+    draw_meshes(of(place), out, warn=pytest.fail)
     assert calls == ["baseline"] and np.median(distance_to_box(place, "baseline")) > 0.0
 
 
@@ -186,12 +186,13 @@ def test_what_fails_is_said_and_the_others_are_drawn(
     (out / "plots/meshes_a.jpg").unlink()
     monkeypatch.setattr(subprocess, "run", RUN)
     assert draw_meshes(of(place), out, ("rs-pg",), warn=said.append) == []
-    assert len(said) == 1 and "no picture of the meshes of a: rsgen picture: " in said[0] and "mesh.ply" in said[0]
+    (told,) = said
+    assert "no picture of the meshes of a: rsgen picture --quiet failed: " in told and "mesh.ply" in told
 
 
 def test_lost_tracks_are_not_shown(place: Path, calls: list[str]) -> None:
     lost = {"ate_mm": 1.0, "frames": FRAMES, "lost": FRAMES - 1}
-    draw_meshes(of(place, runs=(lost,)), place / "bench")
+    draw_meshes(of(place, runs=(lost,)), place / "bench", warn=pytest.fail)
     found = read_picture(place / "bench", "a")
     assert found is not None and found.methods == ("rs-pg",) and calls == ["picture"]
 

@@ -1,21 +1,17 @@
-"""Other ways to the same picture show the same, times are counted right, and Blender agrees with us; light measured."""
+"""Other ways to the same picture show the same, and times are counted right; light is measured."""
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import tiny
-from rendering import CAMERA, constant_twist, emission_integrator, mi, room_xml
+from rendering import CAMERA, constant_twist, emission_integrator, room_xml
 
 from benchmarks.measures import MEASURES
-from benchmarks.rendering.blender import BlenderRenderer, check_installed, export_scene, exposure
-from benchmarks.rendering.modes import (
-    BLENDER_MODES,
+from benchmarks.measures.render_worker import (
     MODES,
     Mode,
     ModeTimes,
@@ -29,7 +25,6 @@ from benchmarks.rendering.modes import (
 )
 from rsgen.config.config import load_config
 from rsgen.errors import UserError
-from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.images import ColorRenderer
 from rsgen.render.scene import load_scene
@@ -40,7 +35,6 @@ from rstrack.bench.sequences import Sources
 
 MOTION = constant_twist((0.5, 0.2, 0.0, 0.4, 3.0, 2.0))
 STAMP = 0.05
-needs_blender = pytest.mark.skipif(find_spec("bpy") is None, reason="needs Blender: pip install 'bpy==4.2.*'")
 
 
 def rms(a: np.ndarray, b: np.ndarray) -> float:
@@ -50,11 +44,6 @@ def rms(a: np.ndarray, b: np.ndarray) -> float:
 @pytest.fixture(scope="module")
 def glowing(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return load_scene(room_xml(tmp_path_factory.mktemp("glowing")))
-
-
-@pytest.fixture(scope="module")
-def lit(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    return load_scene(tiny.write_scene(tmp_path_factory.mktemp("lit")))
 
 
 def picture(scene: Any, shutter: Shutter, spp: int = 64) -> np.ndarray:
@@ -92,9 +81,9 @@ def test_ratios_are_of_the_same_round_or_else_of_the_same_frame() -> None:
 
 
 def test_times_are_medians_and_samples_are_counted() -> None:
-    found = figures_of(times(still=[[0.1, 0.3]], blender_still=[[0.5]]))
+    found = figures_of(times(still=[[0.1, 0.3]], path=[[0.5]]))
     assert found["still_s"] == pytest.approx(0.2) and found["still_msamples_s"] == pytest.approx(0.2)
-    assert found["blender_still_s"] == 0.5 and found["blender_still_ratio"] == pytest.approx(2.5)
+    assert found["path_s"] == 0.5 and found["path_ratio"] == pytest.approx(2.5)
 
 
 def test_modes_take_turns_and_a_broken_one_does_not_stop_the_others() -> None:
@@ -138,7 +127,7 @@ def test_only_the_modes_asked_for_are_timed_and_none_is_an_error(
     config = load_config(tiny.write_config(tmp_path))
     settings = {"frames": 1, "spp": 1, "modes": ["still"]}
     assert set(render_figures(config, settings, lambda *_: None)) == {"still_s", "still_msamples_s", "peak_mb"}
-    monkeypatch.setattr("benchmarks.rendering.modes._measure", lambda *_: ({}, {"still": "gone"}))
+    monkeypatch.setattr("benchmarks.measures.render_worker._measure", lambda *_: ({}, {"still": "gone"}))
     with pytest.raises(UserError, match="still: gone"):
         render_figures(config, settings, lambda *_: None)
 
@@ -192,111 +181,18 @@ def test_frames_are_timed_by_a_process_of_its_own(tmp_path: Path) -> None:
         ("light", "{}", {"method": "rs-g"}, "its method is rsgen"),
         ("light", "{}", {"set": "light.mode: path"}, "light.mode"),
         ("render", "{modes: [still]}", {"set": "color.sp: 1"}, "color.sp"),
-        ("render", "{modes: [blender]}", {}, "bpy is not installed"),
     ],
 )
 def test_what_cannot_be_measured(
     measure: str, settings: str, how: dict[str, Any], part: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("benchmarks.measures.renderer.find_spec", lambda _: None)
     if how.get("method"):
         monkeypatch.setattr(Sources, "folder", lambda *_: tmp_path)
     record = measured(tmp_path, measure, settings, **how)
-    assert part in (record.error or "") and record.skipped == ("bpy" in part)
+    assert part in (record.error or "") and not record.skipped
 
 
 def test_a_process_that_dies_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("benchmarks.measures.renderer.sys.executable", "/bin/false")
     record = measured(tmp_path, "render", "{modes: [still]}")
     assert record.error == "the renderer's process ended: no message"
-
-
-# --- Blender ---------------------------------------------------------------------------------------------------------
-
-
-def test_the_scene_that_blender_gets_has_our_triangles_and_colours(lit: Any) -> None:
-    arrays, names, sky = export_scene(lit)
-    assert len(names) == 3 and sky == [0, 0, 0]
-    corners = arrays["vertices_1"][arrays["faces_1"]]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    assert 0.5 * np.linalg.norm(cross, axis=1).sum() == pytest.approx(np.pi, rel=2e-3)  # a ball of radius 0.5 m
-    np.testing.assert_allclose(arrays["colour_1"], [0.7, 0.3, 0.2], atol=1e-6)
-    np.testing.assert_allclose(arrays["radiance_2"], 4.0)
-    pattern = np.random.default_rng(3).integers(60, 230, (8, 8, 3), dtype=np.uint8)[..., ::-1] / 255
-    linear = ((pattern + 0.055) / 1.055) ** 2.4
-    texels = arrays["colour_0"].astype(float)
-    assert min(np.abs(texels - linear).max(), np.abs(texels[::-1] - linear).max()) < 2e-3
-
-
-def test_light_that_blender_does_not_get_is_refused(tmp_path: Path) -> None:
-    tiny.write_scene(tmp_path)
-    cv2.imwrite(str(tmp_path / "sky.png"), np.full((4, 8, 3), 200, np.uint8))
-    text = (tmp_path / "scene.xml").read_text()
-    sky = '<emitter type="envmap"><string name="filename" value="sky.png"/></emitter></scene>'
-    (tmp_path / "scene.xml").write_text(text.replace("</scene>", sky))
-    with pytest.raises(UserError, match="area lamps"):
-        export_scene(load_scene(tmp_path / "scene.xml"))
-
-
-def test_the_uniform_sky_is_handed_over(tmp_path: Path) -> None:
-    tiny.write_scene(tmp_path)
-    text = (tmp_path / "scene.xml").read_text()
-    sky = '<emitter type="constant"><rgb name="radiance" value="0.1, 0.2, 0.4"/></emitter></scene>'
-    (tmp_path / "scene.xml").write_text(text.replace("</scene>", sky))
-    assert export_scene(load_scene(tmp_path / "scene.xml"))[2] == pytest.approx([0.1, 0.2, 0.4])
-
-
-def test_an_exposure_spans_from_the_first_lines_opening_to_the_last_ones_closing() -> None:
-    got = exposure(MOTION, Shutter(0.03, 0.01), 1.0)
-    np.testing.assert_allclose(got.T_world_cam[[0, -1]], MOTION(np.array([0.99, 1.03])))
-    assert got.line_share == pytest.approx(0.25)
-    still = exposure(MOTION, Shutter(), 1.0)
-    assert still.line_share is None and len(still.T_world_cam) == 1
-    with pytest.raises(UserError, match="left-right"):
-        exposure(MOTION, Shutter(0.03, scan="left-right"), 1.0)
-
-
-def test_a_missing_blender_is_one_line_before_any_work(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("benchmarks.rendering.blender.find_spec", lambda _: None)
-    with pytest.raises(UserError, match="pip install") as caught:
-        check_installed()
-    assert "\n" not in str(caught.value)
-    config = load_config(tiny.write_config(tmp_path)).model_copy(update={"scene": None})
-    with pytest.raises(UserError, match="bpy is not installed"):
-        time_modes(config, 1, 1, [*MODES, *BLENDER_MODES], lambda *_: None)
-
-
-@needs_blender
-def test_blender_renders_the_same_still_and_the_same_rolling_shutter(lit: Any) -> None:
-    camera = Camera(32, 24, 24.0, 27.0, 17.3, 10.2)
-    shutters = [Shutter(), Shutter(0.05), Shutter(0.05, 0.03), Shutter(0, 0.03)]
-    path = mi.load_dict({"type": "path", "max_depth": 3})
-    ours = [ColorRenderer(lit, path, camera, s, 64).render(MOTION, STAMP, 3) for s in shutters]
-    exposures = [exposure(MOTION, s, STAMP) for s in shutters]
-    with BlenderRenderer(lit, camera, exposures, spp=64, max_depth=3) as blender:
-        # Blender keeps the scene: the order must not matter.
-        theirs = {k: blender.render(k) for k in (0, 2, 1, 3)}
-        assert blender.time(1) > 0
-    tone = [np.clip(image, 0, 1) ** (1 / 2.2) for image in ours]
-    for k in range(4):
-        distances = [rms(np.clip(theirs[k], 0, 1) ** (1 / 2.2), image) for image in tone]
-        assert distances[k] < 0.013, (k, distances)
-        assert min(d for other, d in enumerate(distances) if other != k) > 1.7 * distances[k], (k, distances)
-
-
-@needs_blender
-def test_a_blender_that_dies_is_one_line(lit: Any) -> None:
-    still = [exposure(MOTION, Shutter(), STAMP)]
-    with BlenderRenderer(lit, Camera(8, 8, 8.0, 8.0, 3.5, 3.5), still, spp=1, max_depth=2) as blender:
-        assert blender._process is not None
-        blender._process.kill()
-        with pytest.raises(UserError, match="Blender ended with status -9") as caught:
-            blender.time(0)
-    assert "\n" not in str(caught.value)
-
-
-def test_a_lens_with_distortion_is_refused(lit: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("benchmarks.rendering.blender.find_spec", lambda _: object())
-    camera = Camera(8, 8, 8.0, 8.0, 3.5, 3.5, "radtan", (0.1, 0, 0, 0))
-    with pytest.raises(UserError, match="without distortion"):
-        BlenderRenderer(lit, camera, [], spp=1, max_depth=2)

@@ -64,14 +64,14 @@ def test_rendering_happens_once_and_again_when_something_changes(tmp_path: Path,
 def test_what_is_not_whole_is_finished(tmp_path: Path, config: Path) -> None:
     render = Renderer()
     sources = Sources(cache=tmp_path, render=render)
-    assert not sources.has(entry(config), "tiny") and render.called == []
+    assert not sources.found(entry(config), "tiny") and render.called == []
     folder = sources.folder(entry(config), "tiny")
-    assert sources.has(entry(config), "tiny")
+    assert sources.found(entry(config), "tiny")
     for count, stream in enumerate(("rgb", "depth"), 2):
         sorted((folder / stream).glob("*.png"))[-1].unlink()
-        assert not sources.has(entry(config), "tiny")
+        assert not sources.found(entry(config), "tiny")
         assert sources.folder(entry(config), "tiny") == folder and len(render.called) == count
-        assert sources.has(entry(config), "tiny")
+        assert sources.found(entry(config), "tiny")
 
 
 def test_a_camera_may_drop_frames(tmp_path: Path, config: Path) -> None:
@@ -81,7 +81,7 @@ def test_a_camera_may_drop_frames(tmp_path: Path, config: Path) -> None:
     folder = sources.folder(entry(config), "tiny")
     listing = folder / "depth.txt"
     listing.write_text("".join(listing.read_text().splitlines(keepends=True)[:-1]))
-    assert sources.has(entry(config), "tiny") and len(render.called) == 1
+    assert sources.found(entry(config), "tiny") and len(render.called) == 1
 
 
 def test_an_interrupted_render_is_not_taken_for_a_whole_one(tmp_path: Path, config: Path) -> None:
@@ -90,7 +90,7 @@ def test_an_interrupted_render_is_not_taken_for_a_whole_one(tmp_path: Path, conf
 
     with pytest.raises(KeyboardInterrupt):
         Sources(cache=tmp_path, render=broken).folder(entry(config), "tiny")
-    assert not Sources(cache=tmp_path).has(entry(config), "tiny")
+    assert not Sources(cache=tmp_path).found(entry(config), "tiny")
 
 
 def test_recordings_lie_in_the_folder_of_data(tmp_path: Path, config: Path) -> None:

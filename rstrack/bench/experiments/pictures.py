@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +17,7 @@ from rstrack.bench.experiments.method_results import Results
 from rstrack.bench.experiments.methods import MAPPED, SequenceInfo, method_of
 from rstrack.bench.record import CellRecord, figure, read_record
 from rstrack.bench.runner import RECORD
+from rstrack.bench.sequences import run_rsgen
 from rstrack.charts.chart import Bars, Chart, method_colors, numbers
 from rstrack.charts.runs import compared_errors, path_chart
 from rstrack.charts.to_file import write_charts
@@ -112,13 +110,9 @@ class MeshPicture:
     labels: tuple[str, ...]
 
 
-def _say(text: str) -> None:
-    print(f"rstrack: {text}", file=sys.stderr)
-
-
 def draw_meshes(
-    results: Results, out: Path, methods: Sequence[str] = MAPPED, progress: Progress = no_progress,
-    warn: Callable[[str], None] = _say,
+    results: Results, out: Path, methods: Sequence[str] = MAPPED, *, progress: Progress = no_progress,
+    warn: Callable[[str], None],
 ) -> list[Path]:  # fmt: skip
     """Write mesh.ply into the cells' folders, plots/meshes_SEQUENCE.jpg into `out`; returns the pictures.
 
@@ -132,9 +126,9 @@ def draw_meshes(
     for sequence, records in rows:
         made: list[dict[str, Any]] = []
         for record in records:
-            report = partial(_report, progress, done, steps, f"{record.case} {record.method}")
+            about = f"{record.case} {record.method}"
             try:
-                mesh = make_mesh(sequence, record, out, report)
+                mesh = make_mesh(sequence, record, out, _part_of(progress, done, steps, about))
                 made.append({"cell": record.cell, "method": record.method, "label": _label(record), "mesh": mesh})
             except UserError as error:
                 warn(f"no mesh of {record.method} on {record.case}: {error}")
@@ -194,8 +188,9 @@ def read_picture(out: Path, sequence: str) -> MeshPicture | None:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _report(progress: Progress, done: int, steps: int, name: str, fraction: float, note: str) -> None:
-    progress("meshes", (done + fraction) / steps, f"{name}, {note}")
+def _part_of(progress: Progress, done: int, steps: int, name: str) -> Callable[[float, str], None]:
+    """Shows one step's fraction and note as those of all steps."""
+    return lambda fraction, note: progress("meshes", (done + fraction) / steps, f"{name}, {note}")
 
 
 def _records(results: Results, sequence: SequenceInfo, methods: Sequence[str]) -> list[CellRecord]:
@@ -222,14 +217,9 @@ def _draw(sequence: str, parts: list[dict[str, Any]], out: Path) -> Path:
         return path
     _remove(about)
     # Mitsuba draws, which the tracker's process never loads.
-    command = [sys.executable, "-m", "rsgen", "picture", "--quiet", f"--out={path.resolve()}"]
-    command += [f"--width={_PANEL_PX[0]}", f"--height={_PANEL_PX[1]}"]
-    command += [f"--label={part['label']}" for part in parts]
-    command += [str((out / "cells" / part["cell"] / MESH).resolve()) for part in parts]
-    done = subprocess.run(command, capture_output=True, text=True, errors="replace")
-    if done.returncode != 0:
-        said = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
-        raise UserError(f"rsgen picture: {said[-1].removeprefix('rsgen: ')}")
+    words = ["picture", "--quiet", f"--out={path.resolve()}", f"--width={_PANEL_PX[0]}", f"--height={_PANEL_PX[1]}"]
+    words += [f"--label={part['label']}" for part in parts]
+    run_rsgen([*words, *(str((out / "cells" / part["cell"] / MESH).resolve()) for part in parts)])
     atomic_write(about, _json(pictured))
     return path
 

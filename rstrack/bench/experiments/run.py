@@ -65,7 +65,7 @@ def run_experiment(experiment: Experiment, out: Path, sources: Sources, quiet: b
 def _announce(benchmark: Benchmark, sources: Sources) -> None:
     """Say how much is to be rendered before anything is tracked."""
     entries = {c.case_entry.sequence: c.sequence for c in benchmark.cells if c.sequence.config is not None}
-    missing = [name for name, entry in entries.items() if not sources.has(entry, name)]
+    missing = [name for name, entry in entries.items() if sources.found(entry, name) is None]
     if missing:
         print(
             f"rstrack: {len(missing)} of {len(entries)} sequences are to be rendered first, minutes each, and more "

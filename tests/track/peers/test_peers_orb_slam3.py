@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
+import sys
 from importlib.util import find_spec
 from pathlib import Path
 from typing import ClassVar
@@ -23,6 +23,7 @@ from rstrack.peers.orb_slam3 import (
     write_vocabulary,
 )
 from rstrack.peers.orb_slam3_worker import work
+from rstrack.peers.peer import run_logged
 
 
 def clustered(rng: np.random.Generator, clusters: int = 12, each: int = 40) -> list[np.ndarray]:
@@ -154,15 +155,11 @@ def test_the_worker_feeds_frames_in_order_and_at_their_pace(tmp_path: Path) -> N
         assert told["tracked"].tolist() == [False, True, True] and len(told["ms"]) == 3
 
 
-def test_a_process_that_dies_is_an_error_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def died(words: list[str], stdout: object, **how: object) -> subprocess.CompletedProcess[bytes]:
-        stdout.write(b"loading\nwhat(): bad vocabulary\n")  # type: ignore[attr-defined]
-        return subprocess.CompletedProcess(words, -6)
-
-    monkeypatch.setattr(orb_slam3.subprocess, "run", died)
-    dataset = type("Dataset", (), {"root": Path("seq")})()
-    with pytest.raises(UserError, match=r"seq: orb-slam3 ended with status -6: what\(\): bad vocabulary"):
-        orb_slam3._run_worker(tmp_path, dataset)
+def test_a_process_that_dies_is_told_in_one_line(tmp_path: Path) -> None:
+    dies = "import os; print('loading'); print('what(): bad vocabulary', flush=True); print(); os.abort()"
+    failure = run_logged([sys.executable, "-c", dies], tmp_path / "log.txt")
+    assert failure == "ended with status -6: what(): bad vocabulary"
+    assert run_logged(["true"], tmp_path / "log.txt") == ""
 
 
 @pytest.mark.skipif(find_spec("pyorbslam3") is not None, reason="pyorbslam3 is installed")

@@ -1,41 +1,86 @@
-"""What a colour frame costs in each mode, and the ratios, all measured in one run on the same frames.
+"""The process that renders for the measures `light` and `render`, started by `benchmarks.measures.renderer`.
 
-times, failed = time_modes(config, frames=5, spp=64, modes=MODES, progress=progress)
-print(figures_of(times))          # {"still_s": ..., "rs_blur_s": ..., "rs_blur_ratio": ...}
+python -m benchmarks.measures.render_worker JOB
 
-Beside the generator's own modes stand other ways to the same picture: a render for each line, many sharp renders
-averaged, and Blender.
+JOB, JSON, states what is to be measured, of which config, with which settings. Lines of JSON on standard output answer:
+[stage, fraction, note] of progress, at last an object with `figures`, or with `error`. What libraries print goes to
+standard error.
+
+The measure `render` has what a colour frame costs in each mode, and the ratios, all measured in one run on the same
+frames. Beside the generator's own modes stand other ways to the same picture: a render for each row, and many sharp
+renders averaged.
 """
 
 from __future__ import annotations
 
+import json
+import os
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from rsgen.array_types import Float32Array, FloatArray
-from rsgen.check.light import lit_scene, spread_times
-from rsgen.config.config import Config
+from rsgen.check.light import compare_light, lit_scene, spread_times, view_camera
+from rsgen.config.config import Config, load_config
 from rsgen.console.progress import Progress
+from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
 from rsgen.geometry.shutter import Shutter
-from rsgen.produce.frame_source import mirrored_samples
-from rsgen.produce.ground_truth import load_motion
-from rstrack.bench.machine import peak_mb
+from rsgen.produce.frame_source import load_scene, mirrored_samples, surfaces_hash
+from rsgen.produce.ground_truth import lines_of_sight, load_motion
+from rstrack.bench.machine import peak_mb, reset_peak
+
+
+def light_figures(config: Config, settings: Mapping[str, Any], progress: Progress) -> dict[str, float]:
+    """The figures of the measure `light`, with its settings, `seed` of what is rendered and `picture`, a file to write.
+
+    bake_mb: most memory of this process until the light is there. Raises UserError.
+    """
+    if config.light.mode != "baked":
+        raise UserError("light.mode is 'path': what is measured is baked light")
+    view_camera(config, settings["width"])  # a wrong width would else be told after the bake
+    mi = mitsuba(config.backend)
+    from rsgen.light.cache import baked_field
+    from rsgen.light.lamps import straight_through_bulbs
+    from rsgen.light.quality import estimated_quality
+    from rsgen.render.baked import BakedIntegrator
+
+    scene = load_scene(config)
+    reset_peak()
+    begin = time.perf_counter()
+    with TemporaryDirectory(prefix="rsgen-light-") as folder:
+        field = baked_field(scene, surfaces_hash(config), config.light, Path(folder), progress)
+    figures = {"bake_s": time.perf_counter() - begin, "bake_mb": peak_mb()}
+    with straight_through_bulbs(scene):
+        estimate = estimated_quality(scene, field, config.light.texel_m, *lines_of_sight(config))
+    views = compare_light(
+        config, settings["views"], settings["spp"], settings["width"], Path(settings["picture"]), progress,
+        lit=(scene, BakedIntegrator(field), mi), seed=settings["seed"],
+    )  # fmt: skip
+    psnr = [view.psnr_db for view in views]
+    return {
+        "psnr_db": float(np.mean(psnr)),
+        "psnr_least_db": min(psnr),
+        "surely_least_db": min(view.surely_db for view in views),
+        "bias_pct": float(np.mean([view.bias_pct for view in views])),
+        **figures,
+        "estimate_db": estimate.psnr_db,
+        "estimate_least_db": estimate.at_least_db,
+        "peak_mb": peak_mb(),
+    }
+
 
 MODES = ("still", "rs-blur", "path", "rows", "averaged")
-BLENDER_MODES = ("blender-still", "blender")
 BLUR_S, READOUT_S = 0.020, 0.028
 AVERAGED = 64  # sharp renders in the place of a blurred one
 # Modes that are divided by others than the still.
-_RATIOS = (
-    ("path", "rs-blur"), ("rows", "rs-blur"), ("averaged", "rs-blur"), ("blender", "rs-blur"), ("blender", "path"),
-    ("blender", "blender-still"),
-)  # fmt: skip
+_RATIOS = (("path", "rs-blur"), ("rows", "rs-blur"), ("averaged", "rs-blur"))
 _ROWS = 32  # rows measured of mode 'rows'; the others cost the same
 _PATH_SHARE = 4  # path tracing is slow and its time proportional to its samples: a quarter of them is measured
 _ROUNDS = 4  # of the modes that are compared most closely, after one to warm up: what ran before leaves caches cold
@@ -62,15 +107,11 @@ class ModeTimes:
 def time_modes(
     config: Config, frames: int, spp: int, modes: Sequence[str], progress: Progress
 ) -> tuple[dict[str, ModeTimes], dict[str, str]]:
-    """Time the modes, names of MODES and BLENDER_MODES, on `frames` frames spread over the config's trajectory.
+    """Time the modes, names of MODES, on `frames` frames spread over the config's trajectory.
 
     All modes render each frame before the next frame's turn comes; a frame before the first compiles kernels. spp:
     samples per pixel. Returns the times by mode, and why a mode failed, by mode. Raises UserError.
     """
-    if set(modes) & set(BLENDER_MODES):
-        from benchmarks.rendering.blender import check_installed
-
-        check_installed()
     # Fitted for the shutter that is timed here, so that its lines find a pose in the shortest trajectory.
     timed = config.color.model_copy(update={"readout_s": READOUT_S, "exposure_s": BLUR_S})
     motion = load_motion(config.model_copy(update={"color": timed}))
@@ -78,14 +119,8 @@ def time_modes(
     baked.glossy_spp = mirrored_samples(config.light, spp)
     stamps = spread_times(motion, frames + 1)
     camera = config.color.camera
-    with ExitStack() as stack:
-        chosen = [m for m in _our_modes(config, scene, baked, mi, motion.spline.pose, spp) if m.name in modes]
-        names = [name for name in BLENDER_MODES if name in modes]
-        if names:
-            progress("starting Blender", 0.0, "handing the scene over")
-            chosen += _blender_modes(config, scene, motion.spline.pose, stamps, spp, names, stack)
-            progress("starting Blender", 1.0, "ready")
-        seconds, failed = _measure(chosen, stamps, progress)
+    chosen = [m for m in _modes(config, scene, baked, mi, motion.spline.pose, spp) if m.name in modes]
+    seconds, failed = _measure(chosen, stamps, progress)
     pixels = camera.width * camera.height
     times = {
         m.name: ModeTimes(np.array(seconds[m.name]), 1e-6 * pixels * m.spp) for m in chosen if m.name not in failed
@@ -158,7 +193,7 @@ def render_averaged(renderer: Any, pose: Any, stamp: float, exposure_s: float, c
     return np.mean([renderer.render(pose, float(t), k) for k, t in enumerate(times)], axis=0)
 
 
-def _our_modes(config: Config, scene: Any, baked: Any, mi: Any, pose: Any, spp: int) -> list[Mode]:
+def _modes(config: Config, scene: Any, baked: Any, mi: Any, pose: Any, spp: int) -> list[Mode]:
     from rsgen.render.images import ColorRenderer
 
     camera, still, moving = config.color.camera, Shutter(), Shutter(READOUT_S, BLUR_S)
@@ -178,22 +213,6 @@ def _our_modes(config: Config, scene: Any, baked: Any, mi: Any, pose: Any, spp: 
         Mode("rows", spp, lambda _, t: _time(render_rows, by_row, pose, t, delay, rows) * h / n),
         Mode("averaged", each * AVERAGED, lambda _, t: _time(render_averaged, sharp, pose, t, BLUR_S, AVERAGED)),
     ]
-
-
-def _blender_modes(
-    config: Config, scene: Any, pose: Any, stamps: FloatArray, spp: int, names: Sequence[str], stack: ExitStack
-) -> list[Mode]:
-    """Blender's modes; the process lives as long as the stack. Frame k's exposure in mode i is number k · modes + i."""
-    from benchmarks.rendering.blender import BlenderRenderer, exposure
-
-    shutters = {"blender-still": Shutter(), "blender": Shutter(READOUT_S, BLUR_S)}
-    exposures = [exposure(pose, shutters[name], float(t)) for t in stamps for name in names]
-    blender = stack.enter_context(BlenderRenderer(scene, config.color.camera, exposures, spp, config.light.max_depth))
-
-    def mode(i: int, name: str) -> Mode:
-        return Mode(name, spp, lambda k, _: blender.time(k * len(names) + i))
-
-    return [mode(i, name) for i, name in enumerate(names)]
 
 
 def _measure(
@@ -231,3 +250,25 @@ def _ratio(a: FloatArray, b: FloatArray) -> float:
     """Median over pairs of the same frame: round by round where both have as many, else the frames' medians."""
     pairs = a / b if a.shape == b.shape else np.median(a, axis=1) / np.median(b, axis=1)
     return float(np.median(pairs))
+
+
+def main(job: dict[str, Any]) -> None:
+    """Measure and answer."""
+    answers = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)
+
+    def tell(*progress: object) -> None:
+        print(json.dumps(progress), file=answers)
+
+    figures_of = {"light": light_figures, "render": render_figures}[job["what"]]
+    answer: dict[str, Any]
+    try:
+        config = load_config(Path(job["config"]), job["fields"])
+        answer = {"figures": figures_of(config, job["settings"], tell)}
+    except UserError as error:
+        answer = {"error": str(error)}
+    print(json.dumps(answer), file=answers)
+
+
+if __name__ == "__main__":
+    main(json.loads(sys.argv[1]))

@@ -1,1 +1,0 @@
-"""What is measured of the renderer, in processes of its own: see `benchmarks.rendering.worker`."""
