@@ -21,8 +21,15 @@ from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_yaml, read_yaml, write_error
 from rsgen.geometry.spline import Spline
 from rsgen.pack.draw import Drawn, PackOptions, draw_sequence
-from rsgen.pack.layout import mark_file, pair_files
-from rsgen.pack.sequence import Stage, gyro_samples, load_stage, mean_twist, render_pairs
+from rsgen.pack.pairs import (
+    LoadedScene,
+    gyro_samples,
+    load_scene_and_light,
+    mark_file,
+    mean_twist,
+    pair_files,
+    render_pairs,
+)  # fmt: skip
 from rsgen.produce.distribute import engine_versions
 from rsgen.produce.generate import input_hashes
 from rsgen.produce.ground_truth import load_motion
@@ -94,19 +101,19 @@ def make_pack(
 
 def make_sequence(job: PackJob, progress: Progress) -> None:
     """Render one sequence into its folder, which is there when all of it is. Raises UserError."""
-    stage = _stage(job, progress)
+    loaded = _loaded_scene(job, progress)
     temporary = job.folder.with_name(f".{job.folder.name}.{os.getpid()}.tmp")
     try:
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir(parents=True)
-        for k, pair in enumerate(render_pairs(stage, job.drawn, job.options.length, job.options.depth)):
+        for k, pair in enumerate(render_pairs(loaded, job.drawn, job.options.length, job.options.depth)):
             for name, data in pair_files(job.options.layout, k, pair).items():
                 (temporary / name).write_bytes(data)
-        twist = mean_twist(stage, job.drawn, job.options.length)
+        twist = mean_twist(loaded, job.drawn, job.options.length)
         name, text = mark_file(job.options.layout, job.drawn, twist, job.config.color.rate_hz)
-        samples = gyro_samples(stage, job.drawn, job.options.length)
+        samples = gyro_samples(loaded, job.drawn, job.options.length)
         (temporary / GYRO).write_bytes(imu_csv(samples).encode())
-        (temporary / DRAWN).write_text(json.dumps(_about(job, stage), indent=1) + "\n")
+        (temporary / DRAWN).write_text(json.dumps(_about(job, loaded), indent=1) + "\n")
         (temporary / name).write_bytes(text)
         os.replace(temporary, job.folder)  # noqa: PTH105 - one name for tests to break
     except OSError as error:
@@ -158,21 +165,21 @@ def _for_other_processes(config: Config, versions: dict[str, str]) -> Config:
 
 
 # Scene and light that this process rendered last, by what they were made from.
-_loaded: dict[str, Stage] = {}
+_loaded: dict[str, LoadedScene] = {}
 
 
-def _stage(job: PackJob, progress: Progress) -> Stage:
+def _loaded_scene(job: PackJob, progress: Progress) -> LoadedScene:
     if job.key not in _loaded:
         _loaded.clear()
-        _loaded[job.key] = load_stage(job.config, job.spline, progress)
+        _loaded[job.key] = load_scene_and_light(job.config, job.spline, progress)
     return _loaded[job.key]
 
 
-def _about(job: PackJob, stage: Stage) -> dict[str, Any]:
+def _about(job: PackJob, loaded: LoadedScene) -> dict[str, Any]:
     """What was drawn, and the camera; times count from the first frame's stamp."""
-    color, drawn = stage.config.color, job.drawn
+    color, drawn = loaded.config.color, job.drawn
     return {
-        "config": stage.config.name, **dataclasses.asdict(drawn), "frames": job.options.length,
+        "config": loaded.config.name, **dataclasses.asdict(drawn), "frames": job.options.length,
         "rate_hz": color.rate_hz, "size": [color.width, color.height], "intrinsics": list(color.intrinsics),
         "model": color.model, "distortion": list(color.distortion), "scan": color.scan,
     }  # fmt: skip

@@ -133,10 +133,7 @@ def _transform(bag: Bag, ns: int, parent: str, child: str, pose: FloatArray) -> 
     turned = {"translation": bag.vector("Vector3", row[:3]), "rotation": bag.vector("Quaternion", row[3:])}
     transform = bag.message("geometry_msgs/msg/Transform", **turned)
     return bag.message(
-        "geometry_msgs/msg/TransformStamped",
-        header=bag.header(ns, parent),
-        child_frame_id=child,
-        transform=transform,
+        "geometry_msgs/msg/TransformStamped", header=bag.header(ns, parent), child_frame_id=child, transform=transform
     )
 
 

@@ -17,7 +17,7 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3, so3
 from rsgen.geometry.spline import Spline
 from rsgen.pack.draw import Drawn, PackOptions, camera_spline, draw_sequence
-from rsgen.pack.layout import flo_bytes, mark_file, pdepth_text
+from rsgen.pack.pairs import flo_bytes, mark_file, pdepth_text
 
 SPAN = [(2.0, 12.0), (0.0, 1.0)]
 
