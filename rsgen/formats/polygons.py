@@ -13,8 +13,8 @@ _STRAIGHT = 1e-9  # of a polygon's area: corners that turn less go straight on
 def triangulate(points: FloatArray, vertex: IntArray, counts: IntArray, kept: BoolArray) -> tuple[IntArray, IntArray]:
     """Triangles of polygons, in the polygons' order.
 
-    points (n, 3); vertex (k,): point of each corner, polygon after polygon; counts (m,): corners of each; kept (m,).
-    Returns corners (t, 3), numbers into `vertex`, and the polygon (t,) of each triangle.
+    points (n, 3); vertex (k,): point of each corner, polygon after polygon; counts (m,): corners of each; kept (m,):
+    which are wanted. Returns corners (t, 3), numbers into `vertex`, and the polygon (t,) of each triangle.
     """
     first = np.cumsum(counts) - counts
     out, of = [], []

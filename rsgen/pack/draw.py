@@ -1,4 +1,4 @@
-"""What is drawn at random for each sequence of a pack: scene, stretch of the motion, speed, view, readout, exposure.
+"""What is drawn at random for each sequence of a pack: scene, window of the motion, speed, view, readout, exposure.
 
 drawn = draw_sequence(PackOptions(count=1000, seed=3), 17, spans, rate_hz=30.0)
 """
@@ -22,7 +22,7 @@ LAYOUTS: tuple[str, ...] = get_args(Layout)
 _DEFAULTS = {"readout": (0.010, 0.030), "exposure": (0.0, 0.0), "speed": (0.7, 3.0)}
 # Pitch and roll are drawn from this part of the angle that yaw is.
 _TILT = 1 / 3
-# A stretch may take up this part of the motion at most: the rest is where it may begin.
+# A window may take up this part of the motion at most: the rest is where it may begin.
 _MOST_OF_MOTION = 0.9
 
 
@@ -95,7 +95,7 @@ def draw_sequence(
 ) -> Drawn:
     """Sequence `index` of a pack, which depends on nothing but these arguments.
 
-    spans: first and last time (s) of each config's motion. rates_hz: of its colour camera. Where a stretch would be
+    spans: first and last time (s) of each config's motion. rates_hz: of its colour camera. Where a window would be
     longer than the motion, it is slower. Raises UserError: a motion too short even so, or a readout longer than the
     time between frames.
     """

@@ -54,7 +54,7 @@ class PackJob:
 
 
 @dataclass(frozen=True)
-class Made:
+class PackSummary:
     """What `out` holds now: sequences, pairs in them, and how many sequences were made in this run."""
 
     out: Path
@@ -65,7 +65,7 @@ class Made:
 
 def make_pack(
     configs: Sequence[Config], options: PackOptions, seed: int, out: Path, workers: Workers, progress: Progress
-) -> Made:
+) -> PackSummary:
     """Render the sequences that `out` lacks. A pack may be continued with a larger count, by nothing else.
 
     Raises UserError: a config that a pack cannot be made of, a folder that holds something else or cannot be written.
@@ -96,7 +96,7 @@ def make_pack(
             if not part[k].folder.is_dir():
                 raise UserError(f"{part[k].folder}: a worker has written it, but not here: choose an --out all share")
             progress("sequences", done / len(jobs), f"{done * options.length} of {len(jobs) * options.length} pairs")
-    return Made(out, options.sequences, options.sequences * options.length, done)
+    return PackSummary(out, options.sequences, options.sequences * options.length, done)
 
 
 def make_sequence(job: PackJob, progress: Progress) -> None:

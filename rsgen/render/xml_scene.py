@@ -26,7 +26,7 @@ from rsgen.render.xml_shapes import children, flatten
 log = logging.getLogger("rsgen")
 
 _MOST_LISTED = 3
-# Where a JPEG with a preview in front of it has told its size.
+# In these a JPEG with a preview in front of it has stated its size.
 _HEADER_BYTES = 1 << 20
 _UNKNOWN = re.compile(r'(\w+) plugin of type "(\w+)":|- \w+ "(\w+)"')
 _FAILED = re.compile(r'At (.*?\(line \d+, col \d+\)): failed to instantiate (\w+) plugin of type "(\w+)": (.*)')
@@ -142,11 +142,11 @@ def check_files(mi: Any, state: Any, path: Path) -> None:
 @contextlib.contextmanager
 def messages_to_log(mi: Any) -> Iterator[list[str]]:
     """While open, what Mitsuba would print goes to the logger at debug level, and into the list that this yields."""
-    seen: list[str] = []
+    messages: list[str] = []
 
     class ToLog(mi.Appender):
         def append(self, level: Any, text: str) -> None:
-            seen.append(text)
+            messages.append(text)
             log.debug("mitsuba: %s", text)
 
         def log_progress(self, *_: Any) -> None:
@@ -157,7 +157,7 @@ def messages_to_log(mi: Any) -> Iterator[list[str]]:
     logger.clear_appenders()
     logger.add_appender(ToLog())
     try:
-        yield seen
+        yield messages
     finally:
         logger.clear_appenders()
         for appender in before:
@@ -165,7 +165,7 @@ def messages_to_log(mi: Any) -> Iterator[list[str]]:
 
 
 def explained(mi: Any, state: Any, error: str) -> str:
-    """Mitsuba's message about an object that it could not make, in one line: which one, why, and how to mend it."""
+    """Mitsuba's message about an object that it could not make, in one line: which one, why, and what to do."""
     text = " ".join(error.split())
     found = _FAILED.search(text)
     if found is None:

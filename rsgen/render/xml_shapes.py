@@ -105,7 +105,7 @@ def _copy(mi: Any, state: Any, index: int, pose: Any) -> int:
 
 
 def pose_of(props: Any) -> FloatArray:
-    """`to_world` (4, 4) of an object's properties; the identity if they say none."""
+    """`to_world` (4, 4) of an object's properties; the identity if they have none."""
     return np.asarray(props["to_world"].matrix, float).reshape(4, 4) if "to_world" in props else np.eye(4)
 
 

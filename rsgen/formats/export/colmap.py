@@ -23,8 +23,8 @@ from rsgen.formats.export.poses import (
     loss_of_poses,
     loss_words,
     middle_line,
+    observations,
     poses_of_line,
-    sightings,
     surface_points,
     write_shutter_files,
 )  # fmt: skip
@@ -47,8 +47,8 @@ def export_colmap(
     color = sequence.streams["color"]
     cameras = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", f"1 {camera_line(color.camera)}"]
     T_world_color = poses_of_line(sequence, middle_line(sequence))
-    seen = sightings(sequence)
-    losses = {ONE_POSE: loss_of_poses(color.camera, seen, T_world_color[seen.image])}
+    observed = observations(sequence)
+    losses = {ONE_POSE: loss_of_poses(color.camera, observed, T_world_color[observed.image])}
     points = surface_points(sequence, progress, (0.0, 0.8))
     names = [path.name for path in color.paths]
 
@@ -86,9 +86,9 @@ def _images(T_world_color: FloatArray, names: list[str], points: SurfacePoints) 
     lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", "# POINTS2D[] as X Y POINT3D_ID"]
     rows = pose_rows(se3.inverse(T_world_color))[:, [6, 3, 4, 5, 0, 1, 2]]
     for k, (row, name) in enumerate(zip(rows, names, strict=True)):
-        observations = np.column_stack([points.uv[k] + PIXEL_SHIFT, points.shown[k] + 1]).tolist()
+        image_rows = np.column_stack([points.uv[k] + PIXEL_SHIFT, points.shown[k] + 1]).tolist()
         lines.append(f"{k + 1} {' '.join(f'{value:.15g}' for value in row)} 1 {name}")
-        lines.append(" ".join(f"{x:.6f} {y:.6f} {number:.0f}" for x, y, number in observations))
+        lines.append(" ".join(f"{x:.6f} {y:.6f} {number:.0f}" for x, y, number in image_rows))
     return lines
 
 

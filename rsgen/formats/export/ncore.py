@@ -28,10 +28,10 @@ from rsgen.formats.export.poses import (
     blur_centres,
     loss_of_poses,
     loss_words,
+    observations,
     poses_of_line,
     shutter_facts,
     shutter_type,
-    sightings,
 )  # fmt: skip
 from rsgen.geometry import se3
 from rsgen.sequence.reader import Sequence, Stream
@@ -140,15 +140,15 @@ def _model(data: Any, stream: Stream) -> Any:
 
 def _losses(sequence: Sequence) -> dict[str, Loss]:
     """Of the two poses of an image, which NCore's camera models take, and of poses looked up for each line."""
-    color, seen = sequence.streams["color"], sightings(sequence)
-    start, end = (poses_of_line(sequence, line)[seen.image] for line in (0.0, color.line_count - 1.0))
-    stamps = color.shutter.line_mid_time(blur_centres(color)[seen.image], 0.0, color.camera)
+    color, observed = sequence.streams["color"], observations(sequence)
+    start, end = (poses_of_line(sequence, line)[observed.image] for line in (0.0, color.line_count - 1.0))
+    stamps = color.shutter.line_mid_time(blur_centres(color)[observed.image], 0.0, color.camera)
     length = color.shutter.line_delay(color.camera) * (color.line_count - 1)
-    part = (seen.t - stamps) / length if length > 0.0 else np.zeros_like(seen.t)
+    part = (observed.t - stamps) / length if length > 0.0 else np.zeros_like(observed.t)
     ends = se3.inverse(between(se3.inverse(start), se3.inverse(end), part))
     step, T_rig_color = 1e-6 * _STEP_US, se3.inverse(sequence.T_color_depth)
-    before = np.floor(seen.t / step) * step
+    before = np.floor(observed.t / step) * step
     held = np.clip([before, before + step], sequence.spline.t_begin, sequence.spline.t_end)
     T_before, T_after = (sequence.spline.pose(t) for t in held)
-    dense = between(T_before, T_after, (seen.t - held[0]) / (held[1] - held[0])) @ T_rig_color
-    return {ENDS: loss_of_poses(color.camera, seen, ends), DENSE: loss_of_poses(color.camera, seen, dense)}
+    dense = between(T_before, T_after, (observed.t - held[0]) / (held[1] - held[0])) @ T_rig_color
+    return {ENDS: loss_of_poses(color.camera, observed, ends), DENSE: loss_of_poses(color.camera, observed, dense)}

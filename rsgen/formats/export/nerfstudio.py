@@ -43,9 +43,9 @@ from rsgen.formats.export.poses import (
     loss_of_poses,
     loss_words,
     middle_line,
+    observations,
     poses_of_line,
     shutter_type,
-    sightings,
     surface_points,
     write_shutter_files,
 )  # fmt: skip
@@ -156,20 +156,22 @@ def _twists(sequence: Sequence) -> FloatArray:
 
 
 def _losses(sequence: Sequence) -> dict[str, Loss]:
-    color, seen = sequence.streams["color"], sightings(sequence)
-    middle = poses_of_line(sequence, middle_line(sequence))[seen.image]
-    losses = {ONE_POSE: loss_of_poses(color.camera, seen, middle)}
-    dt = seen.t - color.shutter.line_mid_time(blur_centres(color)[seen.image], middle_line(sequence), color.camera)
+    color, observed = sequence.streams["color"], observations(sequence)
+    middle = poses_of_line(sequence, middle_line(sequence))[observed.image]
+    losses = {ONE_POSE: loss_of_poses(color.camera, observed, middle)}
+    dt = observed.t - color.shutter.line_mid_time(
+        blur_centres(color)[observed.image], middle_line(sequence), color.camera
+    )
     length = color.shutter.line_delay(color.camera) * (color.line_count - 1)
     if length > 0.0:
         part = 0.5 + dt / length
-        start, end = (poses_of_line(sequence, line)[seen.image] for line in (0.0, color.line_count - 1.0))
+        start, end = (poses_of_line(sequence, line)[observed.image] for line in (0.0, color.line_count - 1.0))
         T_color_world = between(se3.inverse(start), se3.inverse(end), part)
-        losses[GSPLAT] = loss_of_poses(color.camera, seen, se3.inverse(T_color_world))
-        losses[NGP] = loss_of_poses(color.camera, seen, between(start, end, part))
+        losses[GSPLAT] = loss_of_poses(color.camera, observed, se3.inverse(T_color_world))
+        losses[NGP] = loss_of_poses(color.camera, observed, between(start, end, part))
     if _is_downward(color.shutter):
-        twist = _twists(sequence)[seen.image]
-        losses[VELOCITY] = loss_of_image_velocity(color.camera, seen, middle, twist, dt)
+        twist = _twists(sequence)[observed.image]
+        losses[VELOCITY] = loss_of_image_velocity(color.camera, observed, middle, twist, dt)
     return losses
 
 

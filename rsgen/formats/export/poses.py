@@ -38,7 +38,7 @@ _FRAMES, _ROWS, _COLUMNS = 12, 120, 12  # at most as many of each are looked at
 
 @dataclass(frozen=True)
 class Loss:
-    """Distances in pixels between where a scene point is seen and where an approximation has it; NaN of no points."""
+    """Distances in pixels between scene points as images show them and as an approximation has them; NaN of none."""
 
     median_px: float
     max_px: float
@@ -53,7 +53,7 @@ class Loss:
 
 
 @dataclass(frozen=True)
-class Sightings:
+class Observations:
     """n scene points as colour images show them: p_world (n, 3) m, uv (n, 2) px, t (n,) s of the line, image (n,)."""
 
     p_world: FloatArray
@@ -96,14 +96,14 @@ def exact_points(sequence: Sequence, k: int, uv: IntArray) -> tuple[FloatArray, 
     """
     depth = sequence.streams["depth"]
     z = sequence.truth_depth(k)[uv[:, 1], uv[:, 0]]
-    seen = np.flatnonzero(z > 0)
-    line = depth.shutter.line_of_pixel(uv[seen], depth.camera)
+    measured = np.flatnonzero(z > 0)
+    line = depth.shutter.line_of_pixel(uv[measured], depth.camera)
     T_world_depth = sequence.spline.pose(depth.shutter.line_mid_time(blur_centres(depth)[k], line, depth.camera))
-    return se3.transform(T_world_depth, depth.camera.backproject(uv[seen], z[seen])), seen
+    return se3.transform(T_world_depth, depth.camera.backproject(uv[measured], z[measured])), measured
 
 
-def sightings(sequence: Sequence) -> Sightings:
-    """Scene points on lines all over some of the colour images, evenly spread over the sequence. Raises UserError.
+def observations(sequence: Sequence) -> Observations:
+    """Scene points on rows all over some of the colour images, evenly spread over the sequence. Raises UserError.
 
     sequence: with the cameras that took it.
     """
@@ -123,28 +123,28 @@ def sightings(sequence: Sequence) -> Sightings:
             sequence.spline, sequence.T_color_depth, color.camera, color.shutter, stamp, p_world
         )
         found.append((p_world[valid], uv[valid], t[valid], np.full(valid.sum(), k)))
-    return Sightings(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+    return Observations(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 
-def loss_of_poses(camera: Camera, seen: Sightings, T_world_color: FloatArray) -> Loss:
-    """Of an approximation that has the poses T_world_color (n, 4, 4) for the lines of the sightings."""
-    uv, _ = camera.project(se3.transform(se3.inverse(T_world_color), seen.p_world))
-    return _loss(uv - seen.uv)
+def loss_of_poses(camera: Camera, observed: Observations, T_world_color: FloatArray) -> Loss:
+    """Of an approximation that has the poses T_world_color (n, 4, 4) for the lines of the observations."""
+    uv, _ = camera.project(se3.transform(se3.inverse(T_world_color), observed.p_world))
+    return _loss(uv - observed.uv)
 
 
 def loss_of_image_velocity(
-    camera: Camera, seen: Sightings, T_world_color: FloatArray, twist: FloatArray, dt: FloatArray
+    camera: Camera, observed: Observations, T_world_color: FloatArray, twist: FloatArray, dt: FloatArray
 ) -> Loss:
     """Of points that move straight on through the image, as 3dgs-deblur moves its Gaussians.
 
     T_world_color (n, 4, 4), twist (n, 6): pose and velocity [v; ω] of the camera in its own frame, m/s and rad/s, of
-    the image that each sighting is in; dt (n,): time from that pose to the sighting's line, s.
+    the image that each observation is in; dt (n,): time from that pose to the observation's line, s.
     """
-    p_color = se3.transform(se3.inverse(T_world_color), seen.p_world)
+    p_color = se3.transform(se3.inverse(T_world_color), observed.p_world)
     uv, _ = camera.project(p_color)
     p_dot = -(twist[:, :3] + so3.cross(twist[:, 3:], p_color))
     moved = np.einsum("nij,nj->ni", camera.project_jacobian(p_color), p_dot) * dt[:, None]
-    return _loss(uv + moved - seen.uv)
+    return _loss(uv + moved - observed.uv)
 
 
 def between(T_start: FloatArray, T_end: FloatArray, s: FloatArray) -> FloatArray:
@@ -242,17 +242,17 @@ class SurfacePoints:
 
 
 def surface_points(sequence: Sequence, progress: Progress, share: tuple[float, float]) -> SurfacePoints:
-    """Points from the exact depth of some depth images, each seen by one colour image or more. Raises UserError.
+    """Points from the exact depth of some depth images, each in one colour image or more. Raises UserError.
 
-    Visible is what the depth image that is nearest in time shows at the depth that the point has; colours are those of
-    the first image that shows it. sequence: with the cameras that took it. share: of the whole export's progress.
+    A point is visible if the depth image that is nearest in time shows it at its depth. Its colour is that of the first
+    image that shows it. sequence: with the cameras that took it. share: of the whole export's progress.
     """
     color = sequence.streams["color"]
     p_world = _seeds(sequence)
     shown, uvs = [], []
     colors, colored = np.zeros((len(p_world), 3), np.uint8), np.zeros(len(p_world), bool)
     for k, stamp in enumerate(blur_centres(color)):
-        near = _seen_by_depth(
+        near = _visible_in_depth(
             sequence, int(np.abs(sequence.streams["depth"].stamps - color.stamps[k]).argmin()), p_world
         )
         uv, _, valid = project_rolling(
@@ -284,7 +284,7 @@ def _seeds(sequence: Sequence) -> FloatArray:
     return np.concatenate([exact_points(sequence, int(k), grid)[0] for k in frames])
 
 
-def _seen_by_depth(sequence: Sequence, k: int, p_world: FloatArray) -> IntArray:
+def _visible_in_depth(sequence: Sequence, k: int, p_world: FloatArray) -> IntArray:
     """Numbers (s,) of the points (m, 3) that lie on the surface that depth image k shows."""
     depth = sequence.streams["depth"]
     uv, t, valid = project_rolling(

@@ -1,7 +1,7 @@
 """Registered depth, as drivers deliver it: warped into the colour camera by geometry alone, motion ignored.
 
 Writes a plain TUM RGB-D folder. A row of a registered image mixes pixels of neighbouring depth rows; where the cameras
-lie beside each other their order hardly changes, and camera.yaml says whose lines' times they have.
+lie beside each other their order hardly changes, and camera.yaml states whose rows' times they have.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def export_registered(
     read.
     """
     color, depth = sequence.streams["color"], sequence.streams["depth"]
-    sequence.depth(0)  # of the size that sequence.yaml says, or all below would take memory for another one
+    sequence.depth(0)  # checks its size, before memory is taken for that of sequence.yaml
     new_folder(out)
     make_folders(out / "rgb", out / "depth")
     place_images(color.paths, [out / "rgb" / path.name for path in color.paths], options.copy, progress, (0.0, 0.1))

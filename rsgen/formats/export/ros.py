@@ -25,7 +25,7 @@ from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.formats.export.bag import TF, Bag, new_bag
 from rsgen.formats.export.folder import ExportOptions, image_streams
-from rsgen.formats.export.poses import Loss, between, loss_of_poses, loss_words, shutter_facts, sightings
+from rsgen.formats.export.poses import Loss, between, loss_of_poses, loss_words, observations, shutter_facts
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import nanoseconds
@@ -84,12 +84,12 @@ def export_ros(sequence: Sequence, out: Path, options: ExportOptions, progress: 
 def loss_of_tf(sequence: Sequence, truth: FloatArray) -> Loss:
     """What tf's interpolation between the poses `truth` (n, 8) loses for the lines of colour images."""
     true = sequence.as_taken
-    seen = sightings(true)
+    observed = observations(true)
     T = poses_of_rows(truth[:, 1:])
-    i = np.clip(np.searchsorted(truth[:, 0], seen.t, side="right") - 1, 0, len(truth) - 2)
-    part = (seen.t - truth[i, 0]) / (truth[i + 1, 0] - truth[i, 0])
+    i = np.clip(np.searchsorted(truth[:, 0], observed.t, side="right") - 1, 0, len(truth) - 2)
+    part = (observed.t - truth[i, 0]) / (truth[i + 1, 0] - truth[i, 0])
     T_world_color = between(T[i], T[i + 1], part) @ se3.inverse(true.T_color_depth)
-    return loss_of_poses(true.streams["color"].camera, seen, T_world_color)
+    return loss_of_poses(true.streams["color"].camera, observed, T_world_color)
 
 
 def spline_facts(spline: Spline) -> dict[str, Any]:

@@ -35,7 +35,7 @@ def export_video(
     stream = sequence.streams["color"]
     config = config_of(sequence.root, sequence.meta, options.scene)
     source = FrameSource(config, progress, global_shutter=True, objects=[thing.spline for thing in sequence.objects])
-    # All lines at the middle line's time.
+    # All rows at the middle row's time.
     middle = 0.5 * (stream.line_count - 1) * stream.shutter.line_delay(stream.camera)
     frames = range(len(stream.paths))
     left = (
@@ -114,10 +114,12 @@ def _write(
             writer.release()
     if not written:
         raise UserError(f"{path}: there is no frame to show: choose other --frames")
-    # The encoder does not say so when the disk is full.
+    # The encoder does not report a full disk.
     reader = cv2.VideoCapture(str(temporary))
-    kept = int(reader.get(cv2.CAP_PROP_FRAME_COUNT))
+    stored = int(reader.get(cv2.CAP_PROP_FRAME_COUNT))
     reader.release()
-    if kept != written:
-        raise UserError(f"{path}: only {kept} of {written} frames could be written: free space or choose another --out")
+    if stored != written:
+        raise UserError(
+            f"{path}: only {stored} of {written} frames could be written: free space or choose another --out"
+        )
     return written

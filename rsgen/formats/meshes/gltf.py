@@ -1,4 +1,4 @@
-"""What a glTF file's JSON says that trimesh leaves out, and the file as trimesh reads it best.
+"""What trimesh leaves out of a glTF file's JSON, and the file as trimesh reads it best.
 
 trimesh keeps images and factors, but no samplers, texture transforms, second texture coordinates or extensions, and
 rounds factors and colours to 8 bits. So the JSON is read here, and materials are numbered in it on the way in.

@@ -58,13 +58,13 @@ def read_parts(path: Path, options: SceneOptions) -> list[Part]:
             files[libraries[0]] = b"\n".join(files[name] for name in libraries)  # trimesh reads the first only
     loaded = trimesh.load_scene(io.BytesIO(data), file_type=path.suffix[1:].lower(), resolver=files, process=False)
     T_world_file = world_from_file(options)
-    looks = Looks(path, header)
+    reader = PartReader(path, header)
     parts = []
     for node in loaded.graph.nodes_geometry:  # in the file's order; never sort by name, some are random
         T_file_part, name = loaded.graph[node]
         mesh = loaded.geometry[name]
         if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
-            parts.append(placed(path, name, looks.part(mesh, name), T_world_file @ T_file_part))
+            parts.append(placed(path, name, reader.part(mesh, name), T_world_file @ T_file_part))
     return finished(path, parts)
 
 
@@ -141,8 +141,8 @@ def _refuse_unreadable_texture(path: Path, name: str, data: bytes) -> None:
         raise UserError(f"scene {path}: texture '{name}' cannot be read: make it a PNG or a JPEG") from None
 
 
-class Looks:
-    """Parts of one file as trimesh's meshes say they look; each material is made once."""
+class PartReader:
+    """Parts of one file from trimesh's meshes; each material is made once."""
 
     def __init__(self, path: Path, header: dict[str, Any] | None) -> None:
         """header: glTF's JSON, as `gltf.for_trimesh` left it; None for other files."""
@@ -251,7 +251,7 @@ class Looks:
         )  # fmt: skip
 
     def _texture(self, image: Any, info: dict[str, Any]) -> Texture | None:
-        """A texture of trimesh's image, as glTF's textureInfo says that it is looked up."""
+        """A texture of trimesh's image, looked up as glTF's textureInfo states."""
         if image is None:
             if info:
                 raise UserError(f"scene {self._path}: a texture of it cannot be read: make it a PNG or a JPEG")

@@ -178,26 +178,26 @@ def cut_away(rows: FloatArray, faces: IntArray, xy: FloatArray, mask: Mask) -> t
     table = _counts(solid)
     corners = np.concatenate([rows, xy], axis=1)[faces]
     source = np.arange(len(faces))
-    kept, kept_source = [], []
+    left, left_source = [], []
     while len(corners):
         there, nowhere = _uniform(corners[..., -2:], table, mask)
-        kept.append(corners[there])
-        kept_source.append(source[there])
+        left.append(corners[there])
+        left_source.append(source[there])
         mixed = ~there & ~nowhere
         corners, source = corners[mixed], source[mixed]
         edge = np.linalg.norm(corners[..., -2:] - np.roll(corners[..., -2:], 1, axis=1), axis=-1).max(axis=1)
         fine = edge <= _FINE_TEXELS
-        if sum(map(len, kept)) + 4 * len(corners) > _MOST:
+        if sum(map(len, left)) + 4 * len(corners) > _MOST:
             fine[:] = True
         clipped, of = _clip(corners[fine], mask.at(corners[fine][..., -2:]))
-        kept.append(clipped)
-        kept_source.append(source[fine][of])
+        left.append(clipped)
+        left_source.append(source[fine][of])
         corners, source = _quartered(corners[~fine]), np.repeat(source[~fine], 4)
-    left = np.concatenate(kept)
+    whole = np.concatenate(left)
     return (
-        left[..., :-2].reshape(-1, rows.shape[1]),
-        np.arange(3 * len(left)).reshape(-1, 3),
-        np.concatenate(kept_source),
+        whole[..., :-2].reshape(-1, rows.shape[1]),
+        np.arange(3 * len(whole)).reshape(-1, 3),
+        np.concatenate(left_source),
     )
 
 
@@ -242,7 +242,7 @@ def _clip(corners: FloatArray, level: FloatArray) -> tuple[FloatArray, IntArray]
         p = np.take_along_axis(corners[which], order[..., None], axis=1)
         s = np.take_along_axis(level[which], order, axis=1)
         q, r = (p[:, 0] + (s[:, 0] / (s[:, 0] - s[:, k]))[:, None] * (p[:, k] - p[:, 0]) for k in (1, 2))
-        pieces = [(p[:, 0], q, r)] if ends == 1 else [(q, p[:, 1], p[:, 2]), (q, p[:, 2], r)]
-        out += [np.stack(piece, axis=1) for piece in pieces]
-        of += [which] * len(pieces)
+        new = [(p[:, 0], q, r)] if ends == 1 else [(q, p[:, 1], p[:, 2]), (q, p[:, 2], r)]
+        out += [np.stack(triangle, axis=1) for triangle in new]
+        of += [which] * len(new)
     return np.concatenate(out), np.concatenate(of)

@@ -118,14 +118,14 @@ class Factors:
 
     def __init__(self, root: Element) -> None:
         self._named = {e.get("id", ""): deepcopy(e) for e in root.iter("texture") if e.get("id")}
-        self.kept: list[Element] = []
+        self.originals: list[Element] = []
         """Textures as they were of which there is a product now: others may name them."""
 
     def times(self, e: Element, factor: Sequence[float]) -> Element | None:
         """A copy of a colour, a texture or a reference to one, times a factor (3); None if there is no way."""
         e = deepcopy(e)
         if e.get("id") is not None and e.tag == "texture":
-            self.kept.append(renamed(deepcopy(e), None))
+            self.originals.append(renamed(deepcopy(e), None))
             del e.attrib["id"]
         if e.tag in _COLOR_TAGS:
             return _color_times(as_rgb(e), factor)
@@ -212,7 +212,7 @@ def _color_times(color: Element, factor: Sequence[float]) -> Element | None:
 TWO_LOBES = ("phong", "ward")
 
 _LOBE_COLORS = {"diffuse": "reflectance", "conductor": "specular_reflectance", "roughconductor": "specular_reflectance"}
-_MATTE, _MIRRORED = "0.5", "0.2"  # reflectances, where a file says nothing
+_MATTE, _MIRRORED = "0.5", "0.2"  # reflectances, where a file has none
 _EXPONENT, _ALPHA = "30", "0.1"
 _MOST = 0.99  # of both together, to which Mitsuba 0.x brought those that would make light
 
@@ -274,7 +274,7 @@ def _lobe(plugin: str, name: str, color: Element) -> Element:
 
 
 def _metal(e: Element, color: Element) -> Element:
-    """A mirror of that colour, as rough as the lobe of `e`: of a texture, as rough as that is if nothing is said."""
+    """A mirror of that colour, as rough as the lobe of `e`; of the default roughness where `e` has a texture for it."""
     metal = _lobe("roughconductor", "specular_reflectance", color)
     SubElement(metal, "string", name="material", value="none")
     if e.get("type") == "phong":

@@ -23,7 +23,7 @@ from rsgen.formats.polygons import is_convex, triangulated
 from rsgen.render.meshes import joined_triangles, ply_bytes
 
 _OBJ_METHOD = b"obj-polygons/2"
-"""Raise when files come out differently: light baked on their surfaces is kept under it."""
+"""Raise when files come out differently: light baked on their surfaces is stored under it."""
 
 _POLYGON = re.compile(rb"(?:^|(?<=\n))[ \t]*f((?:[ \t]+\S+){5,})[ \t]*\r?(?=\n|$)")
 _VERTEX = re.compile(rb"(?:^|(?<=\n))[ \t]*v[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)")
@@ -47,18 +47,18 @@ def with_triangles(data: bytes) -> bytes | None:
     for found in _VERTEX.finditer(data):
         places.append(found.start())
         vertices.append(found.groups())
-    pieces, end, needed = [], 0, False
+    text, end, needed = [], 0, False
     try:
         positions = np.array(vertices).astype(float).reshape(-1, 3)
         for polygon in polygons:
             words = polygon[1].split()
             corners = positions[_indices(words, int(np.searchsorted(places, polygon.start())), len(positions))]
             needed |= len(polygon[0]) > _MOST_CHARACTERS or not is_convex(corners)
-            pieces += [data[end : polygon.start()], _face_lines(words, corners)]
+            text += [data[end : polygon.start()], _face_lines(words, corners)]
             end = polygon.end()
     except (ValueError, IndexError):
         return None
-    return b"".join([*pieces, data[end:]]) if needed else None
+    return b"".join([*text, data[end:]]) if needed else None
 
 
 def _indices(words: list[bytes], before: int, count: int) -> list[int]:
@@ -90,7 +90,7 @@ def read_polygons(mi: Any, state: Any, scratch: Path) -> None:
         name = str(node.props["filename"])
         if name not in made:
             text = with_triangles(Path(str(mi.file_resolver().resolve(name))).read_bytes())
-            made[name] = None if text is None else _kept(text, scratch, f"triangles{len(made)}.obj")
+            made[name] = None if text is None else _stored(text, scratch, f"triangles{len(made)}.obj")
         node.props["filename"] = made[name] or name
 
 
@@ -105,7 +105,7 @@ def read_refused(mi: Any, state: Any, path: Path, scratch: Path) -> bool:
         plugin = node.props.plugin_name()
         mesh = None if _takes(mi, plugin, file) else _read(file, plugin)
         if mesh is not None:
-            node.props = _as_ply(mi, node.props, _kept(mesh, scratch, f"read{number}.ply"))
+            node.props = _as_ply(mi, node.props, _stored(mesh, scratch, f"read{number}.ply"))
             names.append(name)
     if names:
         more = f" and {len(names) - 3} more" if len(names) > 3 else ""
@@ -113,7 +113,7 @@ def read_refused(mi: Any, state: Any, path: Path, scratch: Path) -> bool:
     return bool(names)
 
 
-def _kept(data: bytes, folder: Path, name: str) -> str:
+def _stored(data: bytes, folder: Path, name: str) -> str:
     (folder / name).write_bytes(data)
     return str(folder / name)
 
@@ -133,7 +133,7 @@ def _as_ply(mi: Any, props: Any, file: str) -> Any:
     for key in props.keys():  # noqa: SIM118 (Mitsuba's Properties is no dict)
         out[key] = props[key]
     out["filename"] = file
-    if props.plugin_name() == "obj":  # whose v runs the other way if nothing is said
+    if props.plugin_name() == "obj":  # whose v runs the other way by default
         out["flip_tex_coords"] = props.get("flip_tex_coords", True)
     return out
 
@@ -145,7 +145,7 @@ def _read(file: Path, plugin: str) -> bytes | None:
         vertices, faces, *more = _of_ply(meshes[0].metadata["_ply_raw"]) if plugin == "ply" else _of_obj(meshes)
         if not len(faces) or faces.min() < 0 or faces.max() >= len(vertices) or not np.isfinite(vertices).all():
             return None
-        with np.errstate(invalid="ignore"):  # normals without direction are mended later
+        with np.errstate(invalid="ignore"):  # normals without direction are repaired later
             return ply_bytes(vertices, faces, *more)
     except Exception:  # of whatever kind trimesh's parsers raise
         return None

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement
 
+from rsgen.formats.mitsuba_xml import Changes
 from rsgen.formats.mitsuba_xml import colors as old
 
 _OBJECTS = ("scene", "shape", "bsdf", "texture", "emitter")
@@ -21,35 +19,6 @@ _ATTRIBUTES = frozenset(
 _RENAMED = {"bump": "bumpmap", "ldrtexture": "bitmap", "exrtexture": "bitmap", "lambertian": "diffuse"}
 Exists = Callable[[str, str], bool]
 """Whether Mitsuba 3 has a plugin: its kind, as a tag ("shape", "bsdf", "texture", "emitter"), and its name."""
-
-
-@dataclass
-class Changes:
-    """What an upgrade dropped and replaced, with counts; what rsgen never uses; the files that it included, and which
-    of the files that it names were found under another name.
-    """
-
-    version: str
-    dropped: Counter[str] = field(default_factory=Counter)
-    replaced: Counter[str] = field(default_factory=Counter)
-    not_used: Counter[str] = field(default_factory=Counter)
-    files: list[Path] = field(default_factory=list)
-    renamed: dict[str, str] = field(default_factory=dict)
-
-    def summary(self) -> str:
-        """'upgraded from Mitsuba 0.6; dropped: ...; replaced: ...; not used: ...', counted."""
-        lists = {"dropped": self.dropped, "replaced": self.replaced, "not used": self.not_used}
-        said = [f"{word}: {_listed(counts)}" for word, counts in lists.items() if counts]
-        return "; ".join([f"upgraded from Mitsuba {self.version}", *said])
-
-    @property
-    def lossy(self) -> bool:
-        """Whether images show the difference."""
-        return bool(self.dropped or self.replaced)
-
-
-def _listed(counts: Counter[str]) -> str:
-    return ", ".join(f"{count} x {what}" if count > 1 else what for what, count in counts.items())
 
 
 class Upgrade:
@@ -68,9 +37,9 @@ class Upgrade:
         self._names(root)
         self._factors = old.Factors(root)
         self._children(root)
-        for kept in self._factors.kept:  # they may become more on the way
-            if all(element.get("id") != kept.get("id") or element.tag == "ref" for element in root.iter()):
-                root.append(self._texture(kept))
+        for texture in self._factors.originals:  # they may become more on the way
+            if all(element.get("id") != texture.get("id") or element.tag == "ref" for element in root.iter()):
+                root.append(self._texture(texture))
                 self._children(root[-1])
         root.set("version", "3.0.0")
         present = {element.get("id") for element in root.iter() if element.tag != "ref"}
@@ -103,7 +72,7 @@ class Upgrade:
             self._names(child)
 
     def _children(self, parent: Element) -> None:
-        kept = []
+        left = []
         last = {child.get("name"): child for child in parent if child.tag in _VALUES and child.tag != "ref"}
         for child in list(parent):
             name = child.get("name")
@@ -114,12 +83,12 @@ class Upgrade:
             if new is None:
                 self._leave_out(child)
                 continue
-            kept.append(new)
+            left.append(new)
             if parent.tag == "bsdf" and new.tag == "rgb" and self._version < (2, 0):
                 self._bounded(new)
             if new.tag in _OBJECTS:
                 self._children(new)
-        parent[:] = kept
+        parent[:] = left
 
     def _bounded(self, color: Element) -> None:
         """What would reflect more than there is, is darkened, as Mitsuba 0.x did."""
@@ -242,11 +211,8 @@ class Upgrade:
     def _scale(self, e: Element) -> Element:
         """What it scales, times its factor."""
         factor, inner = old.factor_of(e), old.scaled_by(e)
-        if (
-            inner.tag == "texture"
-            and not self._exists("texture", inner.get("type", ""))
-            and inner.get("type") != "scale"
-        ):
+        plugin = inner.get("type", "")
+        if inner.tag == "texture" and plugin != "scale" and not self._exists("texture", plugin):
             inner = self._texture(inner)
         product = self._factors.times(inner, factor)
         if product is None:
@@ -296,7 +262,7 @@ class Upgrade:
         return e
 
     def _mixture(self, e: Element) -> Element:
-        """Blends of two; what weights below 1 in all would absorb is lost."""
+        """Blends of two. What weights of less than 1 in all would absorb is lost."""
         weights = old.numbers(old.take(e, "weights", ""))
         keeps_energy = old.take(e, "ensure_energy_conservation", "true") == "true"
         parts = [child for child in e if child.tag in ("bsdf", "ref")]

@@ -19,12 +19,13 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from rsgen.errors import UserError
+from rsgen.formats.mitsuba_xml import Changes
 from rsgen.formats.mitsuba_xml.colors import FACTOR, numbers
-from rsgen.formats.mitsuba_xml.plugins import Changes, Exists, Upgrade
+from rsgen.formats.mitsuba_xml.plugins import Exists, Upgrade
 from rsgen.render.xml_scene import located
 
 METHOD = b"old-xml/2"
-"""Raise when old files come out differently: their baked light is kept under it."""
+"""Raise when old files come out differently: their baked light is stored under it."""
 
 _DEEPEST = 15  # includes, as in Mitsuba
 

@@ -1,4 +1,4 @@
-"""Read a Blender file: Blender itself, as PyPI's `bpy` in a process of its own, writes it as GLB and tells its lights.
+"""Read a Blender file: Blender itself, as PyPI's `bpy` in a process of its own, writes it as GLB and lists its lights.
 
 What is rendered there is read, with modifiers applied, at the file's current frame; its scripts are not run.
 """
@@ -9,7 +9,6 @@ import json
 import subprocess
 import sys
 import tempfile
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -18,21 +17,14 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.formats.meshes.mesh_file import read_parts
-from rsgen.formats.scenes.content import Content, Lamp
+from rsgen.formats.scenes.content import Content, Lamp, check_installed
 from rsgen.render.placement import SceneOptions, world_from_file
 
-_INSTALL = "install it with: pip install 'rolling-shutter-rgbd[blender]' (Python 3.11)"
 _LONGEST_S = 1800
 # Blender's z is up, in GLB y is: (x, y, z) becomes (x, z, -y).
 _T_GLB_BLENDER = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 # The middle of Blender's sky pictures is its x axis, of Mitsuba's its z; both are seen from inside.
 _T_BLENDER_SKY = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
-
-
-def check_installed() -> None:
-    """Raises UserError if there is no Blender for this Python."""
-    if find_spec("bpy") is None:
-        raise UserError(f".blend files need Blender's Python module bpy, which is not installed: {_INSTALL}")
 
 
 def read_content(path: Path, scale: float | None, up: Any) -> Content:
@@ -41,32 +33,34 @@ def read_content(path: Path, scale: float | None, up: Any) -> Content:
 
     Raises UserError if Blender is missing or cannot read the file, or if nothing in it can be rendered.
     """
-    check_installed()
+    check_installed(
+        "bpy", ".blend files need Blender's Python module bpy", "rolling-shutter-rgbd[blender]", " (Python 3.11)"
+    )
     with tempfile.TemporaryDirectory(prefix="rsgen-blend-") as scratch:
         folder = Path(scratch)
         _run(path, folder)
-        told = json.loads((folder / "told.json").read_text(encoding="utf-8"))
+        found = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
         if not (folder / "scene.glb").is_file():
             raise UserError(f"scene {path}: holds no surface that its render shows: add a mesh, or unhide one")
-        options = SceneOptions(scale or float(told["metres_per_unit"]), up or "y")
+        options = SceneOptions(scale or float(found["metres_per_unit"]), up or "y")
         try:
             parts = read_parts(folder / "scene.glb", options)
         except UserError as error:
             raise UserError(str(error).replace(str(folder / "scene.glb"), str(path))) from None
         T_world_blender = world_from_file(options) @ _T_GLB_BLENDER
-        lamps = [lamp_of(entry, T_world_blender, folder) for entry in told["lights"]]
-    return Content(parts, lamps, told["notes"])
+        lamps = [lamp_of(entry, T_world_blender, folder) for entry in found["lights"]]
+    return Content(parts, lamps, found["notes"])
 
 
 def lamp_of(entry: dict[str, Any], T_world_blender: FloatArray, folder: Path) -> Lamp:
-    """The lamp of a light as the worker tells it.
+    """The lamp of a light as the worker lists it.
 
     Of P W, a point or a spot has the intensity P / 4π, a surface of area A the radiance P / πA; a sun's irradiance is
     its strength: so Cycles 4.2 renders them (docs/notebook/scenes.md). T_world_blender (4, 4): to the
     world, m; lengths of the entry are Blender's units.
     """
     T = T_world_blender @ np.array(entry["T_blender_light"], float)
-    unit = abs(np.linalg.det(T_world_blender[:3, :3])) ** (1 / 3)
+    metres = abs(np.linalg.det(T_world_blender[:3, :3])) ** (1 / 3)
     value = np.array(entry["value"], float)
     T_rigid = T.copy()
     length = np.linalg.norm(T[:3, :3], axis=0)
@@ -83,9 +77,9 @@ def lamp_of(entry: dict[str, Any], T_world_blender: FloatArray, folder: Path) ->
     if kind in ("point", "spot"):
         # Watts of a scene in other units are watts of that unit: its picture stays what it is.
         cone = float(entry.get("cone_deg", 45.0))
-        return Lamp(kind, value * unit**2 / (4 * np.pi), T_rigid, (cone, cone * (1 - float(entry.get("blend", 0.0)))))
+        return Lamp(kind, value * metres**2 / (4 * np.pi), T_rigid, (cone, cone * (1 - float(entry.get("blend", 0.0)))))
     half = np.array(entry["size"], float) / 2
-    across = length[:2] / unit * half
+    across = length[:2] / metres * half
     area = float(across.prod()) * (np.pi if kind == "disk" else 4.0)
     return Lamp(kind, value / (np.pi * area), T @ np.diag([*half, 1.0, 1.0]))
 
@@ -97,11 +91,11 @@ def _run(path: Path, folder: Path) -> None:
             done = subprocess.run(words, stdin=subprocess.DEVNULL, stdout=log, stderr=log, timeout=_LONGEST_S)
         except subprocess.TimeoutExpired:
             raise UserError(f"scene {path}: Blender did not end within {_LONGEST_S} s: export it as GLB") from None
-        if done.returncode == 0 and (folder / "told.json").is_file():
+        if done.returncode == 0 and (folder / "scene.json").is_file():
             return
         log.seek(0)
-        said = [line.strip() for line in log.read().splitlines() if line.strip()]
+        output = [line.strip() for line in log.read().splitlines() if line.strip()]
     raise UserError(
-        f"scene {path}: Blender cannot read it ({said[-1][:200] if said else f'status {done.returncode}'}): "
+        f"scene {path}: Blender cannot read it ({output[-1][:200] if output else f'status {done.returncode}'}): "
         "save it again with the version of bpy, or export it as GLB"
     )

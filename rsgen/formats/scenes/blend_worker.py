@@ -1,6 +1,6 @@
 """The child process that opens a Blender file: `python -m rsgen.formats.scenes.blend_worker FILE FOLDER` (see `blend`).
 
-Writes FOLDER/scene.glb, told.json (lights, notes, metres_per_unit) and the sky's picture. Changes nothing else.
+Writes FOLDER/scene.glb, scene.json (lights, notes, metres_per_unit) and the sky's picture. Changes nothing else.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ def main(file: Path, folder: Path) -> None:
         _made_plain(material, notes)
     if any(o.type in _SURFACES or o.instance_type == "COLLECTION" for o in shown):
         _export(bpy, folder / "scene.glb")
-    told = {"lights": lights, "notes": notes, "metres_per_unit": scene.unit_settings.scale_length}
-    (folder / "told.json").write_text(json.dumps(told), encoding="utf-8")
+    found = {"lights": lights, "notes": notes, "metres_per_unit": scene.unit_settings.scale_length}
+    (folder / "scene.json").write_text(json.dumps(found), encoding="utf-8")
 
 
 def _export(bpy: Any, file: Path) -> None:

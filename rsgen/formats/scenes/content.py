@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from rsgen.array_types import FloatArray
+from rsgen.errors import UserError
 from rsgen.formats.meshes.parts import Part
 
 MOST_TRIANGLES = 30_000_000
@@ -38,11 +40,17 @@ class Lamp:
 
 @dataclass(frozen=True, eq=False)
 class Content:
-    """All of a scene that can be rendered; `notes` say in one line each what cannot, or is another way."""
+    """All of a scene that can be rendered; `notes` list in one line each what cannot, or is changed."""
 
     parts: Sequence[Part]
     lamps: Sequence[Lamp]
     notes: Sequence[str]
+
+
+def check_installed(module: str, need: str, extra: str, note: str = "") -> None:
+    """Raises UserError, beginning with the need, if there is no such module: what to install, and a note on that."""
+    if find_spec(module) is None:
+        raise UserError(f"{need}, which is not installed: install it with: pip install '{extra}'{note}")
 
 
 class Notes:

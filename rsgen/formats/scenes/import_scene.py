@@ -33,7 +33,7 @@ def import_scene(
     """Write `file` as a Mitsuba scene, with its meshes and textures, into the new folder `out`.
 
     force: replace a folder that is there. scale: metres per unit of the file, up: its axis that is up; None: what it
-    says of itself, metres and y for mesh files. Raises UserError for files that cannot be read or hold no surface,
+    states, metres and y for mesh files. Raises UserError for files that cannot be read or hold no surface,
     where the package that reads them is missing, and for folders that cannot be written; nothing is written then.
     """
     suffix = file.suffix.lower()

@@ -11,7 +11,7 @@ import numpy as np
 from rsgen.array_types import Float32Array, FloatArray
 from rsgen.formats.scenes.content import Notes
 from rsgen.formats.scenes.usd_texture import (
-    Picture,
+    UsdImage,
     asset_bytes,
     decoded,
     same_size,
@@ -41,7 +41,7 @@ _CHANNELS = {"r": 0, "g": 1, "b": 2, "a": 3}
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class BoundMaterial:
     """A material, the primvars by which it is looked up and coloured, if any, and whether it is one of the file."""
 
     material: Material
@@ -50,29 +50,29 @@ class Look:
     bound: bool = True
 
 
-UNBOUND = Look(Material(), None, COLORS, bound=False)
+UNBOUND = BoundMaterial(Material(), None, COLORS, bound=False)
 
 
-class Looks:
+class Materials:
     """Materials of a stage at one time; each is made once."""
 
     def __init__(self, time: Any, notes: Notes) -> None:
         """time: a Usd.TimeCode. notes: takes what has no place here."""
         self._time, self._notes = time, notes
-        self._made: dict[str, Look] = {}
+        self._made: dict[str, BoundMaterial] = {}
         self._equal: dict[bytes, Material] = {}
         self._images: dict[tuple[str, str], Float32Array | None] = {}
 
-    def look(self, material: Any) -> Look:
-        """The look of a bound UsdShade.Material; UNBOUND for none."""
+    def bound(self, material: Any) -> BoundMaterial:
+        """What a bound UsdShade.Material is here; UNBOUND for none."""
         if not material:
             return UNBOUND
         path = str(material.GetPath())
         if path not in self._made:
-            self._made[path] = self._look(material, path)
+            self._made[path] = self._bound(material, path)
         return self._made[path]
 
-    def _look(self, material: Any, path: str) -> Look:
+    def _bound(self, material: Any, path: str) -> BoundMaterial:
         shader = _surface(material)
         if not shader:
             self._notes.add("material without a surface that is read here, rendered grey", path)
@@ -85,28 +85,28 @@ class Looks:
             given = shader.GetInput(name)
             if given and (given.HasConnectedSource() or given.Get(self._time)):
                 self._notes.add(f"rendered without {name}", path)
-        pictures = [v for v in inputs.values() if isinstance(v, _Channel)]
-        coordinates = next((p.picture.coordinates for p in pictures), COORDINATES)
-        if any(p.picture.coordinates != coordinates for p in pictures):
+        images = [v for v in inputs.values() if isinstance(v, _Channel)]
+        coordinates = next((p.image.coordinates for p in images), COORDINATES)
+        if any(p.image.coordinates != coordinates for p in images):
             self._notes.add("all textures looked up by the coordinates of the first", path)
         color = inputs["color"]
         made = self._color(inputs, Material(color=_constant(color, 3, 0.18)))
         made = self._metal(inputs, made)
         if isinstance(emission := inputs["emission"], _Channel):
-            made = replace(made, emission=np.ones(3), emission_texture=emission.texture(emission.picture.color))
+            made = replace(made, emission=np.ones(3), emission_texture=emission.texture(emission.image.color))
         elif emission is not None:
             made = replace(made, emission=_constant(emission, 3, 0.0))
         if isinstance(normal := inputs["normal"], _Channel):
-            bytes_ = normal.picture.bytes_of((normal.picture.values + 1) / 2)
+            bytes_ = normal.image.bytes_of((normal.image.values + 1) / 2)
             made = replace(made, normal_texture=normal.texture(bytes_))
         # Copies of a material are one: shapes are joined by their materials.
         made = self._equal.setdefault(_fingerprint(made), made)
-        return Look(made, coordinates, color if isinstance(color, str) else None)
+        return BoundMaterial(made, coordinates, color if isinstance(color, str) else None)
 
     def _color(self, inputs: dict[str, Any], made: Material) -> Material:
         color, opacity = inputs["color"], inputs["opacity"]
         if isinstance(color, _Channel):
-            made = replace(made, color=np.ones(3), color_texture=color.texture(color.picture.color))
+            made = replace(made, color=np.ones(3), color_texture=color.texture(color.image.color))
         threshold = float(_constant(inputs["threshold"], 1, 0.0)[0])
         cutoff = threshold if threshold > 0 else _THERE
         if not isinstance(opacity, _Channel):
@@ -116,7 +116,7 @@ class Looks:
             pixels, base = np.full((1, 1, 4), 255, np.uint8), opacity
         else:
             pixels, base = made.color_texture.pixels, color
-        channels = same_size([*np.moveaxis(pixels, -1, 0)[:3], opacity.picture.bytes_of(opacity.values)])
+        channels = same_size([*np.moveaxis(pixels, -1, 0)[:3], opacity.image.bytes_of(opacity.values)])
         return replace(made, color_texture=base.texture(np.stack(channels, -1).astype(np.uint8)), cutoff=cutoff)
 
     def _metal(self, inputs: dict[str, Any], made: Material) -> Material:
@@ -127,9 +127,7 @@ class Looks:
         )  # fmt: skip
         if texture is None:
             return made
-        g, b = (
-            v.picture.bytes_of(v.values) if isinstance(v, _Channel) else np.full((1, 1), 255) for v in (rough, metal)
-        )
+        g, b = (v.image.bytes_of(v.values) if isinstance(v, _Channel) else np.full((1, 1), 255) for v in (rough, metal))
         g, b = same_size([g, b])
         pixels = np.stack([np.zeros_like(g), g, b, np.full_like(g, 255)], axis=-1).astype(np.uint8)
         made = replace(made, metal_texture=texture.texture(pixels))
@@ -137,7 +135,7 @@ class Looks:
         return replace(made, metallic=1.0) if isinstance(metal, _Channel) else made
 
     def _input(self, shader: Any, key: str) -> Any:
-        """None, a constant, a `_Channel` of a picture, or the name of the primvar that it takes."""
+        """None, a constant, a `_Channel` of an image, or the name of the primvar that it takes."""
         from pxr import UsdShade
 
         given = next((i for name in _NAMES[key] if (i := shader.GetInput(name))), None)
@@ -178,12 +176,12 @@ class Looks:
         scale, bias = (_four(None if node is None else _value(node.GetInput(n), self._time), d)
                        for n, d in (("scale", 1.0), ("bias", 0.0)))  # fmt: skip
         if is_normal and (scale == 1).all() and not bias.any():
-            scale, bias = np.full(4, 2.0), np.full(4, -1.0)  # what is meant, though not said
+            scale, bias = np.full(4, 2.0), np.full(4, -1.0)  # what is meant, though not stated
         if (scale != 1).any() or bias.any():
             values = (values * scale + bias).astype(np.float32)
         where, transform = self._lookup(None if node is None else node.GetInput("st"))
         wrap = wrap_of(*(None if node is None else _value(node.GetInput(n), self._time) for n in ("wrapS", "wrapT")))
-        return _Channel(Picture(values, wrap, transform, where), output)
+        return _Channel(UsdImage(values, wrap, transform, where), output)
 
     def _image(self, source: Any, asset: Any, space: str) -> Float32Array | None:
         key = str(asset.resolvedPath) or asset.path, space
@@ -217,18 +215,18 @@ class Looks:
 
 @dataclass(frozen=True, eq=False)
 class _Channel:
-    """A picture and which of its outputs is taken."""
+    """An image and which of its outputs is taken."""
 
-    picture: Picture
+    image: UsdImage
     output: str
 
     @property
     def values(self) -> Float32Array:
         """(h, w) of the output that is one number."""
-        return self.picture.values[..., _CHANNELS.get(self.output, 0)]
+        return self.image.values[..., _CHANNELS.get(self.output, 0)]
 
     def texture(self, pixels: Any) -> Texture:
-        return Texture(pixels, self.picture.wrap, False, self.picture.transform)
+        return Texture(pixels, self.image.wrap, False, self.image.transform)
 
 
 def _fingerprint(material: Material) -> bytes:

@@ -13,10 +13,13 @@ from rsgen.array_types import BoolArray, FloatArray, IntArray
 from rsgen.formats.meshes.parts import Part
 from rsgen.formats.polygons import triangulate
 from rsgen.formats.scenes.content import Notes
-from rsgen.formats.scenes.usd_material import Look
+from rsgen.formats.scenes.usd_material import BoundMaterial
 from rsgen.render.material import Material
 
 SOLIDS = ("Cube", "Sphere", "Cylinder", "Cone", "Capsule", "Plane")
+
+Primvar = Callable[[str], tuple[FloatArray, str] | None]
+"""Values (k, ...) of a primvar by its name, with the kind of its interpolation; None if there is none."""
 
 _CREASE = np.cos(np.radians(50))  # an edge whose corner leans less from its vertex is a smooth one
 _SECTIONS = 48
@@ -27,7 +30,7 @@ _PLANE_AXES = _AXES | {"X": [[0, 0, 1], [0, 1, 0], [-1, 0, 0]], "Y": [[1, 0, 0],
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class PrimTriangles:
     """Triangles in a prim's own frame: points (n, 3); corners (m, 3) into face-vertices, whose point and face follow.
 
     vertex (k,): point of each face-vertex; face (m,): polygon of each triangle.
@@ -56,7 +59,7 @@ class Surface:
         return values[self.corners if interpolation == "faceVarying" else self.triangles]
 
 
-def mesh_surface(mesh: Any, time: Any, notes: Notes, name: str) -> Surface | None:
+def mesh_triangles(mesh: Any, time: Any, notes: Notes, name: str) -> PrimTriangles | None:
     """Triangles of a UsdGeom.Mesh; None if it has none, or names points that it has not."""
     points = _array(mesh.GetPointsAttr().Get(time), (0, 3))
     counts = _array(mesh.GetFaceVertexCountsAttr().Get(time), (0,)).astype(np.int64)
@@ -69,16 +72,16 @@ def mesh_surface(mesh: Any, time: Any, notes: Notes, name: str) -> Surface | Non
     if not np.isfinite(points[vertex]).all():
         notes.add("left out, it has vertices that are not finite", name)
         return None
-    kept = np.ones(len(counts), bool)
+    filled = np.ones(len(counts), bool)
     holes = _array(mesh.GetHoleIndicesAttr().Get(time), (0,)).astype(np.int64)
-    kept[holes[(holes >= 0) & (holes < len(counts))]] = False
-    corners, face = triangulate(points, vertex, counts, kept)
+    filled[holes[(holes >= 0) & (holes < len(counts))]] = False
+    corners, face = triangulate(points, vertex, counts, filled)
     if mesh.GetOrientationAttr().Get(time) == "leftHanded":
         corners = corners[:, ::-1]
-    return Surface(points, vertex, corners, face, len(counts)) if len(corners) else None
+    return PrimTriangles(points, vertex, corners, face, len(counts)) if len(corners) else None
 
 
-def solid(prim: Any, geom: Any, time: Any) -> tuple[Surface, FloatArray]:
+def solid(prim: Any, geom: Any, time: Any) -> tuple[PrimTriangles, FloatArray]:
     """Triangles of a UsdGeom solid, and normals (m, 3, 3) at their corners."""
     kind = prim.GetTypeName()
     own = getattr(geom, kind)(prim)
@@ -106,11 +109,13 @@ def solid(prim: Any, geom: Any, time: Any) -> tuple[Surface, FloatArray]:
             mesh = trimesh.creation.capsule(number("Height"), number("Radius"), (_SECTIONS // 2, _SECTIONS))
             mesh.apply_translation([0, 0, -mesh.bounds.mean(axis=0)[2]])
     points, faces = np.array(mesh.vertices) @ turn.T, np.array(mesh.faces, np.int64)
-    surface = Surface(points, faces.ravel(), np.arange(faces.size).reshape(-1, 3), np.arange(len(faces)), len(faces))
+    surface = PrimTriangles(
+        points, faces.ravel(), np.arange(faces.size).reshape(-1, 3), np.arange(len(faces)), len(faces)
+    )
     return surface, smooth_normals(surface)
 
 
-def smooth_normals(surface: Surface) -> FloatArray:
+def smooth_normals(surface: PrimTriangles) -> FloatArray:
     """Unit normals (m, 3, 3) at the corners: smooth over a vertex unless the corner's triangle leans far from it."""
     a, b, c = (surface.points[surface.triangles[:, k]] for k in range(3))
     flat = np.cross(b - a, c - a)
@@ -122,31 +127,30 @@ def smooth_normals(surface: Surface) -> FloatArray:
 
 
 def parts(
-    surface: Surface, chosen: BoolArray, look: Look, normals: FloatArray | None,
-    primvar: Callable[[str], tuple[FloatArray, str] | None], notes: Notes, name: str,
+    surface: PrimTriangles, chosen: BoolArray, bound: BoundMaterial, normals: FloatArray | None, primvar: Primvar,
+    notes: Notes, name: str,
 ) -> Part | None:  # fmt: skip
     """The part of the chosen triangles (m,) of a surface.
 
-    normals (m, 3, 3) at corners, None: flat. primvar: values (k, ...) of a primvar by its name, with the kind of its
-    interpolation. None if nothing is chosen.
+    normals (m, 3, 3) at corners, None: flat. None if nothing is chosen.
     """
     if not chosen.any():
         return None
     columns: dict[str, FloatArray] = {}
     if normals is not None:
         columns["normals"] = normals[chosen]
-    uv = _corners(surface, primvar, look.coordinates, 2, notes, name) if look.coordinates else None
+    uv = _corners(surface, primvar, bound.coordinates, 2, notes, name) if bound.coordinates else None
     if uv is not None:
         columns["uv"] = np.clip(np.nan_to_num(uv[chosen] * [1, -1] + [0, 1]), -1e5, 1e5)  # USD's v runs up
-    colors = _corners(surface, primvar, look.colors, 3, notes, name) if look.colors else None
+    colors = _corners(surface, primvar, bound.colors, 3, notes, name) if bound.colors else None
     if colors is not None:
         columns["vertex_colors"] = np.clip(np.nan_to_num(colors[chosen]), 0, 1)
-    material = look.material
-    if colors is not None and not look.bound:
+    material = bound.material
+    if colors is not None and not bound.bound:
         material = _WHITE
     textures = [f"{k}_texture" for k in ("color", "metal", "normal", "emission")]
     if uv is None and any(getattr(material, texture) is not None for texture in textures):
-        notes.add(f"rendered without its textures, it has no coordinates '{look.coordinates}'", name)
+        notes.add(f"rendered without its textures, it has no coordinates '{bound.coordinates}'", name)
         none: dict[str, Any] = dict.fromkeys(textures)
         material = replace(material, **none)
     corners = surface.corners[chosen]
@@ -162,9 +166,8 @@ def parts(
 
 
 def _corners(
-    surface: Surface, primvar: Callable[[str], tuple[FloatArray, str] | None], name: str, width: int, notes: Notes,
-    of: str,
-) -> FloatArray | None:  # fmt: skip
+    surface: PrimTriangles, primvar: Primvar, name: str, width: int, notes: Notes, of: str
+) -> FloatArray | None:
     found = primvar(name)
     if found is None:
         return None

@@ -5,9 +5,7 @@ References and payloads are followed as files, on this machine only; variants ar
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from importlib.util import find_spec
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,30 +15,23 @@ from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.formats.meshes.parts import Part, placed
 from rsgen.formats.scenes import usd_light
-from rsgen.formats.scenes.content import MOST_TRIANGLES, Content, Lamp, Notes
-from rsgen.formats.scenes.usd_material import UNBOUND, Looks
-from rsgen.formats.scenes.usd_mesh import SOLIDS, mesh_surface, parts, smooth_normals, solid
+from rsgen.formats.scenes.content import MOST_TRIANGLES, Content, Lamp, Notes, check_installed
+from rsgen.formats.scenes.usd_material import UNBOUND, Materials
+from rsgen.formats.scenes.usd_mesh import SOLIDS, Primvar, mesh_triangles, parts, smooth_normals, solid
 from rsgen.inputs import check_input
 from rsgen.render.placement import SceneOptions, world_from_file
 
-_INSTALL = "install it with: pip install 'rolling-shutter-rgbd[usd]'"
 _HIDDEN = ("proxy", "guide")
 _DEEPEST = 200  # prims within prims: beyond, instancers hold themselves
 _TEXT, _MOST_NESTED = b"#usda", 1000  # brackets within brackets: many more overflow the stack of the parser
 
 
-def check_installed() -> None:
-    """Raises UserError if there is no USD for this Python."""
-    if find_spec("pxr") is None:
-        raise UserError(f"USD files need the package usd-core, which is not installed: {_INSTALL}")
-
-
 def read_content(path: Path, scale: float | None, up: str | None) -> Content:
-    """All of the stage at `path`. scale: metres per unit, up: axis of the file; None: what it says of itself.
+    """All of the stage at `path`. scale: metres per unit, up: axis of the file; None: what it states.
 
     Raises UserError for a file that is no USD, is damaged or holds no surface.
     """
-    check_installed()
+    check_installed("pxr", "USD files need the package usd-core", "rolling-shutter-rgbd[usd]")
     from pxr import Tf, Usd, UsdGeom, UsdUtils
 
     if not _is_mapped(path):
@@ -59,14 +50,15 @@ def read_content(path: Path, scale: float | None, up: str | None) -> Content:
             time = Usd.TimeCode(stage.GetStartTimeCode())
         _bake_skins(stage, time)
         walk = _Walk(path, time, T_world_stage, own_up == "z", notes)
-        walk.children(stage.GetPseudoRoot(), _Place(np.eye(4)))
+        walk.children(stage.GetPseudoRoot(), np.eye(4), 0)
         for error in stage.GetCompositionErrors():
             missing = str(error).rpartition("Could not open asset @")[2].partition("@")
             text = Path(missing[0]).name if missing[1] else " ".join(str(error).split())[:150]
             kind = " (usd-core reads no MaterialX)" if text.endswith(".mtlx") else ""
             notes.add(f"part of the scene missing{kind}", text)
         if not walk.parts:
-            raise UserError(f"scene {path}: holds no surface{_also(notes)}: export it with meshes")
+            found = f" ({notes.lines()[0]})" if notes.lines() else ""
+            raise UserError(f"scene {path}: holds no surface{found}: export it with meshes")
     except Tf.ErrorException as error:
         raise UserError(
             f"scene {path}: cannot be read ({_reason(error).replace(str(path), path.name)}): export it again"
@@ -77,15 +69,6 @@ def read_content(path: Path, scale: float | None, up: str | None) -> Content:
     return Content(walk.parts, walk.lamps, notes.lines())
 
 
-@dataclass(frozen=True, eq=False)
-class _Place:
-    """Where the walk is: T_stage_parent (4, 4), how deep, what instancer it came through, and the purpose it is in."""
-
-    T_stage_parent: FloatArray
-    depth: int = 0
-    hidden: bool = False
-
-
 class _Walk:
     """Gathers parts and lamps of a stage."""
 
@@ -93,28 +76,28 @@ class _Walk:
         self.parts: list[Part] = []
         self.lamps: list[Lamp] = []
         self._path, self._time, self._T_world_stage, self._z_up, self._notes = path, time, T_world_stage, z_up, notes
-        self._looks = Looks(time, notes)
+        self._materials = Materials(time, notes)
         self._made: dict[tuple[str, str], list[Part]] = {}
         self._triangles = 0
 
-    def children(self, prim: Any, place: _Place) -> None:
-        """What is below a prim. place: T_stage_parent is the prim's own."""
+    def children(self, prim: Any, T_stage_prim: FloatArray, depth: int) -> None:
+        """What is below a prim."""
         from pxr import Usd
 
         wanted = Usd.PrimIsActive & Usd.PrimIsDefined & Usd.PrimIsLoaded
         if not prim.IsAbstract():  # prototypes of an instancer may be, with all below them
             wanted = Usd.PrimDefaultPredicate
         for child in prim.GetFilteredChildren(Usd.TraverseInstanceProxies(wanted)):
-            self.visit(child, place)
+            self.visit(child, T_stage_prim, depth)
 
-    def visit(self, prim: Any, place: _Place) -> None:
-        """A prim and all below it."""
+    def visit(self, prim: Any, T_stage_parent: FloatArray, depth: int) -> None:
+        """A prim and all below it. depth: of prims and instancers that it lies in."""
         from pxr import UsdGeom
 
         kind, name = str(prim.GetTypeName()), str(prim.GetPath())
-        if place.depth > _DEEPEST:
+        if depth > _DEEPEST:
             raise UserError(f"scene {self._path}: '{name}' lies too deep: an instancer may hold itself")
-        T_stage_prim = place.T_stage_parent
+        T_stage_prim = T_stage_parent
         if prim.IsA(UsdGeom.Imageable):
             if UsdGeom.Imageable(prim).GetVisibilityAttr().Get(self._time) == UsdGeom.Tokens.invisible:
                 self._notes.add("invisible, left out", name)
@@ -128,9 +111,8 @@ class _Walk:
             T_stage_prim = T_parent_prim if own.GetResetXformStack() else T_stage_prim @ T_parent_prim
             if own.TransformMightBeTimeVarying():
                 self._notes.add(f"moves: taken as it is at time {self._time.GetValue():g}", name)
-        below = _Place(T_stage_prim, place.depth + 1)
         if kind == "PointInstancer":
-            self._instances(prim, name, below)
+            self._instances(prim, name, T_stage_prim, depth + 1)
             return
         if kind == "Mesh" or kind in SOLIDS:
             self._mesh(prim, kind, name, T_stage_prim)
@@ -145,9 +127,9 @@ class _Walk:
             self._notes.add(f"{kind} left out", name)
         elif kind == "SkelRoot" and prim.IsInstanceProxy():
             self._notes.add("skinned meshes of an instance in the pose that they were bound in", name)
-        self.children(prim, below)
+        self.children(prim, T_stage_prim, depth + 1)
 
-    def _instances(self, prim: Any, name: str, place: _Place) -> None:
+    def _instances(self, prim: Any, name: str, T_stage_prim: FloatArray, depth: int) -> None:
         from pxr import UsdGeom
 
         instancer, time = UsdGeom.PointInstancer(prim), self._time
@@ -168,7 +150,7 @@ class _Walk:
         for k, T_instancer_instance, there in zip(which, transforms, mask, strict=True):
             prototype = prim.GetStage().GetPrimAtPath(targets[k])
             if there and prototype:
-                self.visit(prototype, _Place(place.T_stage_parent @ T_instancer_instance, place.depth + 1))
+                self.visit(prototype, T_stage_prim @ T_instancer_instance, depth + 1)
 
     def _mesh(self, prim: Any, kind: str, name: str, T_stage_prim: FloatArray) -> None:
         from pxr import UsdShade
@@ -191,7 +173,7 @@ class _Walk:
         time, notes = self._time, self._notes
         if kind == "Mesh":
             mesh = UsdGeom.Mesh(prim)
-            surface = mesh_surface(mesh, time, notes, name)
+            surface = mesh_triangles(mesh, time, notes, name)
             if surface is None:
                 return
             if mesh.GetPointsAttr().ValueMightBeTimeVarying():
@@ -208,13 +190,13 @@ class _Walk:
             own = UsdShade.MaterialBindingAPI(subset.GetPrim()).ComputeBoundMaterial(UsdShade.Tokens.preview)[0]
             chosen = np.isin(surface.face, np.array(subset.GetIndicesAttr().Get(time) or [], np.int64)) & rest
             rest &= ~chosen
-            part = parts(surface, chosen, self._looks.look(own or material), normals, find, notes, name)
+            part = parts(surface, chosen, self._materials.bound(own or material), normals, find, notes, name)
             if part is not None:
                 yield part
-        look = self._looks.look(material)
-        if look is UNBOUND and find(UNBOUND.colors or "") is None:
+        bound = self._materials.bound(material)
+        if bound is UNBOUND and find(UNBOUND.colors or "") is None:
             notes.add("neither material nor colour, rendered grey", name)
-        part = parts(surface, rest, look, normals, find, notes, name)
+        part = parts(surface, rest, bound, normals, find, notes, name)
         if part is not None:
             yield part
 
@@ -232,7 +214,7 @@ def _bake_skins(stage: Any, time: Any) -> None:
         UsdSkel.BakeSkinning(root, Gf.Interval(at, at))
 
 
-def _primvars(prim: Any, time: Any) -> Callable[[str], tuple[FloatArray, str] | None]:
+def _primvars(prim: Any, time: Any) -> Primvar:
     from pxr import UsdGeom
 
     api = UsdGeom.PrimvarsAPI(prim)
@@ -282,13 +264,8 @@ def _check_nesting(path: Path) -> None:
         raise UserError(f"scene {path}: nests more than {_MOST_NESTED} deep: it is damaged")
 
 
-def _also(notes: Notes) -> str:
-    lines = notes.lines()
-    return f" ({lines[0]})" if lines else ""
-
-
 def _reason(error: Exception) -> str:
-    """What the first of USD's errors says, which names the line."""
+    """The first of USD's errors, which names the line."""
     try:
         first = " ".join(str(error.args[0] if error.args else error).split())
     except UnicodeDecodeError:  # it quotes a line of bytes that are no text

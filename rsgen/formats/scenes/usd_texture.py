@@ -21,7 +21,7 @@ _EXR_MAGIC = b"\x76\x2f\x31\x01"
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class UsdImage:
     """An image as a UsdUVTexture node gives it: values (h, w, 4) in [0, 1] linear, row 0 on top, v running down.
 
     wrap, transform (2, 3): as `Texture` has them. coordinates: the primvar that it is looked up by.
@@ -105,7 +105,7 @@ def _exr(data: bytes) -> Float32Array | None:
 
 
 def wrap_of(*modes: Any) -> str:
-    """How a texture goes on outside, of USD's words for it in either direction; the first that says anything."""
+    """How a texture goes on outside: the first of USD's words, of either direction, that is known here."""
     return next((_WRAP[str(mode)] for mode in modes if str(mode) in _WRAP), "repeat")
 
 
@@ -120,7 +120,7 @@ def transform_of(rotation_deg: float, scale: FloatArray, translation: FloatArray
     return np.asarray((flip @ up @ flip)[:2])
 
 
-def same_size(pictures: list[Any]) -> list[Any]:
+def same_size(images: list[Any]) -> list[Any]:
     """Channels (h, w), enlarged to the largest by repeating texels; (1, 1) are constants."""
-    h, w = (max(p.shape[axis] for p in pictures) for axis in (0, 1))
-    return [p[np.arange(h) * p.shape[0] // h][:, np.arange(w) * p.shape[1] // w] for p in pictures]
+    h, w = (max(p.shape[axis] for p in images) for axis in (0, 1))
+    return [p[np.arange(h) * p.shape[0] // h][:, np.arange(w) * p.shape[1] // w] for p in images]

@@ -18,7 +18,7 @@ from rsgen.errors import UserError
 from rsgen.formats.export.colmap import camera_line, export_colmap
 from rsgen.formats.export.folder import NO_DEPTH, ExportOptions
 from rsgen.formats.export.nerfstudio import export_nerfstudio, ngp_rolling_shutter
-from rsgen.formats.export.poses import Loss, sightings
+from rsgen.formats.export.poses import Loss, observations
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter
@@ -275,7 +275,7 @@ def test_the_velocities_move_points_as_3dgs_deblur_moves_them(
     sequence: Sequence, nerf: Path, meta: dict[str, Any]
 ) -> None:
     """Axes flipped, t = rolling_shutter_time (y / height − 1/2), y = row + 1/2, straight in the image."""
-    seen, camera = sightings(sequence), sequence.streams["color"].camera
+    seen, camera = observations(sequence), sequence.streams["color"].camera
     pinhole = replace(camera, model="pinhole", distortion=())
     errors = []
     for k, frame in enumerate(meta["frames"]):

@@ -14,7 +14,7 @@ from rsgen.errors import UserError
 from rsgen.formats.export import poses
 from rsgen.formats.export.folder import EPOCH_S
 from rsgen.formats.export.ncore import ENDS, export_ncore, frame_times_us
-from rsgen.formats.export.poses import Sightings, sightings
+from rsgen.formats.export.poses import Observations, observations
 from rsgen.sequence.reader import Sequence, read_sequence
 
 LENSES: dict[str, list[float]] = {
@@ -56,11 +56,11 @@ def test_every_line_is_where_the_library_looks_for_it(
 
     # Scene points, at the time that the library gives the line on which each is seen.
     monkeypatch.setattr(poses, "_COLUMNS", 64)
-    seen, times = sightings(sequence), camera.frames_timestamps_us.astype(float)
+    seen, times = observations(sequence), camera.frames_timestamps_us.astype(float)
     line = color.shutter.line_of_pixel(seen.uv, color.camera)
     # Half of the first line's pixels, and of the last's, are beyond their middle: no image is taken then.
     kept = (line >= 0) & (line <= color.line_count - 1)
-    seen = Sightings(seen.p_world[kept], seen.uv[kept], seen.t[kept], seen.image[kept])
+    seen = Observations(seen.p_world[kept], seen.uv[kept], seen.t[kept], seen.image[kept])
     line = line[kept]
     part = line / (color.line_count - 1)
     at = np.rint(times[seen.image, 0] * (1 - part) + times[seen.image, 1] * part).astype(np.uint64)

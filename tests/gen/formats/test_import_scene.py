@@ -15,7 +15,7 @@ from rsgen import srgb
 from rsgen.cli.main import main
 from rsgen.errors import UserError
 from rsgen.formats.polygons import triangulate
-from rsgen.formats.scenes import blend, usd_stage
+from rsgen.formats.scenes import content
 from rsgen.formats.scenes.folder import write_folder, write_scene
 from rsgen.render.material import Material, Texture, bsdf
 from rsgen.render.scene import load_scene
@@ -126,8 +126,7 @@ def test_what_is_missing_is_said_in_one_line(
     (tmp_path / "a.usda").write_text("#usda 1.0\n")
     (tmp_path / "a.blend").write_bytes(b"BLENDER")
     (tmp_path / "a.txt").write_text("")
-    for module in (usd_stage, blend):
-        monkeypatch.setattr(module, "find_spec", lambda name: None)
+    monkeypatch.setattr(content, "find_spec", lambda name: None)
     for name, text in [
         ("a.usda", "need the package usd-core, which is not installed: install it with: pip install"),
         ("a.blend", "need Blender's Python module bpy, which is not installed: install it with: pip install"),

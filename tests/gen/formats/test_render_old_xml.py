@@ -13,7 +13,7 @@ import trimesh
 from rendering import dr, mi
 
 from rsgen.errors import UserError
-from rsgen.formats.mitsuba_xml.plugins import Changes
+from rsgen.formats.mitsuba_xml import Changes
 from rsgen.formats.mitsuba_xml.upgrade import upgrade
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
