@@ -21,7 +21,7 @@ from rstrack.bench.record import Figures
 from rstrack.bench.task import Task, settings_of
 from rstrack.calibration.figures import displacement_px, rms
 from rstrack.calibration.parameters import COLOR_LENS, DRIFT, EXTRINSICS, NAMES, POSES, Parameters
-from rstrack.calibration.result import Calibration
+from rstrack.calibration.result import CameraCalibration
 from rstrack.calibration.run import calibrate, parameters_of
 from rstrack.data.camera_file import usual
 from rstrack.data.dataset import Dataset, open_dataset
@@ -259,7 +259,7 @@ def _wrong(camera: Camera, rng: np.random.Generator) -> Camera:
     )  # fmt: skip
 
 
-def _errors_over_sigma(found: Calibration, true: Camera, task: Task) -> list[float]:
+def _errors_over_sigma(found: CameraCalibration, true: Camera, task: Task) -> list[float]:
     """Of the lens, the readouts and, unless a driver's stamps hide it, colour's clock, of those that are told."""
     lens, truth = found.calibrated().rig.color_camera, parameters_of(task.dataset)
     bent = (*true.distortion, *(0.0,) * 5)[:5]

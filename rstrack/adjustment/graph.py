@@ -1,10 +1,10 @@
 """Control points and keyframes, what ties them to each other, and the sparse system that moves all of them at once.
 
 Unknowns are left increments in the world: T_i ← exp(δ_i) T_i of control points, K_j ← exp(ξ_j) K_j of keyframes. What a
-frame says of the control points against a keyframe (`Seen`) is a quadratic model whose Hessian the tracker has made
-anyway. All control points and the keyframe moved as one body change nothing, so that x_i = log(E⁻¹ D_i) takes the place
-of δ_i in it, where D_i and E are by what control point and keyframe have been moved (left, in the world) since the
-model was made.
+frame says of the control points against a keyframe (`KeyframeModel`) is a quadratic model whose Hessian the tracker has
+made anyway. All control points and the keyframe moved as one body change nothing, so that x_i = log(E⁻¹ D_i) takes the
+place of δ_i in it, where D_i and E are by what control point and keyframe have been moved (left, in the world) since
+the model was made.
 """
 
 from __future__ import annotations
@@ -19,30 +19,12 @@ from scipy.sparse.linalg import splu
 from rsgen.array_types import FloatArray, IntArray
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.adjustment.band import Band
+from rstrack.adjustment.chain import KeyframeModel
 from rstrack.adjustment.imu import Equations, ImuResult, ImuState, ImuTerm
 from rstrack.alignment.priors import ACCELERATION, acceleration_sigmas
 
 # Information that holds the first control point, in m⁻² and rad⁻²: the gauge.
 _HELD = 1e14
-
-
-@dataclass(frozen=True)
-class Seen:
-    """What frames say of control points against a keyframe; None: against others of them, by the model itself.
-
-    gradient (n, 6): of what they say, of the band's control points, where the models were made; None: zero, as
-    after the tracker's own steps.
-    """
-
-    keyframe: int | None
-    band: Band
-    gradient: FloatArray | None = None
-
-    def weakened(self, spread: float) -> Seen:
-        """Taken as so many times as uncertain (σ)."""
-        gradient = None if self.gradient is None else self.gradient / spread**2
-        return Seen(self.keyframe, Band(self.band.first, self.band.blocks / spread**2), gradient)
 
 
 @dataclass(frozen=True)
@@ -60,7 +42,7 @@ class Sighting:
 
 @dataclass(frozen=True)
 class State:
-    """A spline T_world_cam(t) and keyframes' T_world_base (4, 4) by their numbers; what is believed of an IMU."""
+    """A spline T_world_cam(t) and keyframes' T_world_base (4, 4) by their numbers; the estimate of an IMU."""
 
     spline: Spline
     keyframes: dict[int, FloatArray]
@@ -100,7 +82,7 @@ class Graph:
     """
 
     at: State
-    seen: Sequence[Seen]
+    seen: Sequence[KeyframeModel]
     sightings: Sequence[Sighting]
     keeps_motion: bool = True
     imu: ImuTerm | None = None
@@ -167,7 +149,7 @@ class _System:
             for b in range(a, k):
                 self._put(numbers[:, a], numbers[:, b], H[:, a, :, b])
 
-    def add_seen(self, seen: Seen, state: State, at: State, moved_points: FloatArray) -> None:
+    def add_seen(self, seen: KeyframeModel, state: State, at: State, moved_points: FloatArray) -> None:
         """A keyframe's frames."""
         band = seen.band
         n = min(len(band), self.points - band.first)

@@ -18,10 +18,10 @@ from rsgen.array_types import FloatArray, IntArray
 from rsgen.geometry import se3, so3
 from rsgen.geometry.spline import Spline
 from rstrack.data.imu.recording import ImuRecording
-from rstrack.inertial.band import Band
-from rstrack.inertial.belief import STRENGTH, Belief, bias_walk
+from rstrack.inertial.band import MotionBand
+from rstrack.inertial.estimate import STRENGTH, ImuEstimate, bias_walk
 from rstrack.inertial.factor import ImuFactor, motion
-from rstrack.inertial.residuals import Samples
+from rstrack.inertial.residuals import ImuReadings
 
 # About how far apart the biases' knots are, s.
 _KNOT_S = 1.0
@@ -68,11 +68,11 @@ class ImuState:
 
 @dataclass(frozen=True)
 class ImuResult:
-    """What a recording tells of an IMU: its state, with a belief of the biases in the end, of gravity and of the turn;
-    and sigmas (12,) of T_imu_depth's left increment (m, rad) and of the scales."""
+    """What was estimated of an IMU. estimate: of the biases in the end, of gravity and of the turn; sigmas (12,): of
+    T_imu_depth's left increment (m, rad) and of the scales."""
 
     state: ImuState
-    belief: Belief
+    estimate: ImuEstimate
     sigmas: FloatArray
 
     @classmethod
@@ -83,8 +83,8 @@ class ImuResult:
         last = inverse(np.concatenate([np.arange(-12, -3), own[3:6]]))
         turn = so3.log(state.T_imu_depth[:3, :3] @ T_imu_depth[:3, :3].T)
         numbers = np.concatenate([state.biases[-1], state.gravity, turn])
-        belief = Belief(numbers, np.asarray(np.linalg.inv(0.5 * (last + last.T))))
-        return cls(state, belief, np.sqrt(np.diag(inverse(own))))
+        estimate = ImuEstimate(numbers, np.asarray(np.linalg.inv(0.5 * (last + last.T))))
+        return cls(state, estimate, np.sqrt(np.diag(inverse(own))))
 
     def as_dict(self) -> dict[str, Any]:
         """T_imu_depth and scales, for run.json."""
@@ -114,7 +114,7 @@ class ImuTerm:
     """
 
     recording: ImuRecording
-    samples: Samples
+    samples: ImuReadings
     noise: FloatArray
     sigma: FloatArray
     accelerations: FloatArray
@@ -124,13 +124,13 @@ class ImuTerm:
     @classmethod
     def of(cls, recording: ImuRecording, spline: Spline, valid: FloatArray) -> ImuTerm | None:
         """Of the samples within valid (k, 2), s: where the spline is an estimate; None without any, or a gyroscope."""
-        samples = Samples.of(recording)
+        samples = ImuReadings.of(recording)
         begin, end = np.maximum(valid[:, 0], spline.t_begin), np.minimum(valid[:, 1], spline.t_end)
         inside = ((samples.t[:, None] >= begin) & (samples.t[:, None] < end)).any(axis=1)
         if recording.gyro is None or not inside.any():
             return None
-        samples = Samples(samples.t[inside], samples.values[inside], samples.counts[inside])
-        band, root = Band.of(recording), np.sqrt(recording.rate_hz)
+        samples = ImuReadings(samples.t[inside], samples.values[inside], samples.counts[inside])
+        band, root = MotionBand.of(recording), np.sqrt(recording.rate_hz)
         noise = np.array([recording.noise.gyro_density, recording.noise.accel_density]) * root
         sigma = np.hypot(noise, band.scatter(spline.dt))
         per = max(1, round(_KNOT_S / spline.dt))
@@ -166,7 +166,7 @@ class ImuTerm:
         m, size = len(state.biases), float(np.linalg.norm(state.gravity))
         walk = bias_walk(self.recording.noise, self.per * dt) ** -2.0
         place, scale = _PLACE**-2.0, np.full(6, _SCALE**-2.0)
-        loose = np.diag(Belief.initial(state.gravity).information)[:6]
+        loose = np.diag(ImuEstimate.initial(state.gravity).information)[:6]
         along = np.append(state.gravity / size, np.zeros(3))
         off = se3.log(state.T_imu_depth @ se3.inverse(self.recording.T_imu_depth))
         J = se3.left_jacobian_inv(off)
@@ -204,7 +204,7 @@ class ImuTerm:
                 end = int(np.searchsorted(segment, segment[begin + _AT_ONCE]))
                 end = end if end > begin else int(np.searchsorted(segment, segment[begin], side="right"))
             part = slice(begin, end)
-            samples = Samples(self.samples.t[part], self.samples.values[part], self.samples.counts[part])
+            samples = ImuReadings(self.samples.t[part], self.samples.values[part], self.samples.counts[part])
             at = ImuFactor(motion(spline, samples.t), state.T_imu_depth, state.gravity)
             scale = 1.0 + state.scales
             knot, rest = np.divmod(segment[part] - self.segment, self.per)

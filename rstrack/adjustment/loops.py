@@ -1,4 +1,4 @@
-"""Places that a track has come back to: looked for among its keyframes, aligned both ways, and believed only then."""
+"""Places that a track has come back to: looked for among its keyframes, aligned both ways, and used only then."""
 
 from __future__ import annotations
 

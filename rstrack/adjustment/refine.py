@@ -17,8 +17,8 @@ from rsgen.array_types import FloatArray, IntArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.adjustment.band import Band
-from rstrack.adjustment.graph import Graph, Seen, State
+from rstrack.adjustment.chain import BandedHessian, KeyframeModel
+from rstrack.adjustment.graph import Graph, State
 from rstrack.adjustment.imu import ImuResult, ImuState, ImuTerm
 from rstrack.alignment import brightness
 from rstrack.alignment.linearise import Terms
@@ -26,7 +26,7 @@ from rstrack.alignment.normal_equations import Quadratic
 from rstrack.alignment.observation import Observation, observe
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.device_frame import DeviceFrame
-from rstrack.inertial.belief import ALIKE
+from rstrack.inertial.estimate import ALIKE
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.options import Options
@@ -58,7 +58,7 @@ Near = list[tuple[int, float]]
 
 
 @dataclass(frozen=True)
-class Usual:
+class TypicalScales:
     """Scales of residuals that a track has: of depth at one metre (m), and of intensity; NaN where there is none."""
 
     depth: float
@@ -72,7 +72,7 @@ class Round:
     moved_m: float
     keyframes: int
     pairs: int
-    usual: Usual
+    usual: TypicalScales
 
 
 @dataclass
@@ -91,7 +91,7 @@ class Refiner:
     times: FloatArray
     begin: float
     load: Callable[[Sequence[int]], Iterator[DeviceFrame]]
-    usual: Usual
+    usual: TypicalScales
     imu: ImuTerm | None = None
     found: ImuResult | None = None
     _inflations: tuple[float, float] = field(default=(1.0, 1.0))
@@ -138,7 +138,7 @@ class Refiner:
         self._learn(kept)
         return moved, Round(float(shift.max()), len(seen), pairs, self.usual)
 
-    def _solved(self, at: State, seen: Sequence[Seen]) -> State:
+    def _solved(self, at: State, seen: Sequence[KeyframeModel]) -> State:
         """Where control points and keyframes belong.
 
         Beside an IMU readings are linearised until nothing moves: they bend sooner than images do.
@@ -232,7 +232,7 @@ class Refiner:
 
     def _learn(self, kept: list[_Figures]) -> None:
         depth, color = ([f for f in kept if f.is_depth is is_depth] for is_depth in (True, False))
-        self.usual = Usual(
+        self.usual = TypicalScales(
             _median([f.sigma for f in depth], self.usual.depth), _median([f.sigma for f in color], self.usual.intensity)
         )
         one, other = (max(1.0, _median([f.inflation for f in some], 1.0)) for some in (depth, color))
@@ -243,7 +243,7 @@ class Refiner:
 class _Against:
     """What frames say against one keyframe."""
 
-    band: Band = field(default_factory=Band)
+    band: BandedHessian = field(default_factory=BandedHessian)
     models: list[tuple[int, FloatArray]] = field(default_factory=list)
 
     def add(self, model: Quadratic) -> None:
@@ -251,12 +251,12 @@ class _Against:
         self.band.add(model)
         self.models.append((model.first, model.g.reshape(-1, 6)))
 
-    def seen(self, keyframe: int) -> Seen:
+    def seen(self, keyframe: int) -> KeyframeModel:
         """All of it."""
         gradient = np.zeros((len(self.band), 6))
         for first, g in self.models:
             gradient[first - self.band.first :][: len(g)] += g
-        return Seen(keyframe, self.band, gradient)
+        return KeyframeModel(keyframe, self.band, gradient)
 
 
 def doubted(model: Quadratic, to_world: FloatArray, information: FloatArray) -> Quadratic:

@@ -74,6 +74,12 @@ def _line_jacobian(spline: Spline, T_world_base: bytes, times: bytes, first: int
     prepare_jacobians(spline, [np.frombuffer(times)])
     at, J = _jacobians[spline][times]
     J = se3.adjoint(se3.inverse(np.frombuffer(T_world_base).reshape(4, 4))) @ J
+    return by_points(at, J, first, count)
+
+
+def by_points(at: IntArray, J: FloatArray, first: int, count: int) -> FloatArray:
+    """Derivatives (n, 6, 6 count) by control points first..first+count of what four of them move, from `at` (n,) on, by
+    J (n, 4, 6, 6)."""
     out = np.zeros((len(at), 6, count, 6))
     rows = np.arange(len(at))
     for i in range(4):

@@ -24,7 +24,7 @@ _ADDS_LITTLE = 0.7
 
 
 @dataclass(frozen=True)
-class Stream:
+class PublishedShutter:
     """What is published of one stream's shutter.
 
     readout_s: from the first line to one past the last, and its σ; None where none was found. kind: whose word that is.
@@ -52,8 +52,8 @@ class Device:
 
     name: str
     title: str
-    depth: Stream
-    color: Stream
+    depth: PublishedShutter
+    color: PublishedShutter
 
     def known(self, start: Parameters) -> Known:
         """What is known of both readouts; all else, and what was not found, begins where `start` does."""
@@ -89,12 +89,12 @@ def device_notes(device: Device, before: Known, used: Known, sigmas: Iterable[fl
     return tuple(notes)
 
 
-def _global(kind: str, source: str) -> Stream:
-    return Stream("global", kind, source, 0.0, _GLOBAL_SIGMA_S)
+def _global(kind: str, source: str) -> PublishedShutter:
+    return PublishedShutter("global", kind, source, 0.0, _GLOBAL_SIGMA_S)
 
 
 def _zed2(title: str, lines: int, line_s: float) -> Device:
-    stream = Stream(
+    stream = PublishedShutter(
         "rolling", "maker's support, times of a line",
         "https://support.stereolabs.com/hc/en-us/articles/1500008922521-What-is-the-readout-time-of-the-ZED-2-camera-",
         lines * line_s, _LINE_TIME_SIGMA_S,
@@ -111,11 +111,11 @@ _GEMINI_305 = "https://wiki.seeedstudio.com/orbbec_gemini305/"
 DEVICES = (
     Device(
         "azure-kinect", "Azure Kinect",
-        Stream(
+        PublishedShutter(
             "unknown", "time of flight, says its maker",
             "https://learn.microsoft.com/sk-sk/azure/kinect-dk/hardware-specification",
         ),
-        Stream(
+        PublishedShutter(
             "rolling", "the maker's specification, in others' words",
             "https://ivanatilca.com/2019/08/17/azure-kinect-hardware-specifications-in-detail",
         ),
@@ -126,12 +126,12 @@ DEVICES = (
     ),
     Device(
         "kinect-v1", "Kinect of 2010, 640×480, 30 Hz",
-        Stream("rolling", "measured by this project on one of them", _KINECT_V1, 0.0339, 2e-3),
-        Stream("rolling", "measured by this project on one of them", _KINECT_V1, 0.0263, 2e-3),
+        PublishedShutter("rolling", "measured by this project on one of them", _KINECT_V1, 0.0339, 2e-3),
+        PublishedShutter("rolling", "measured by this project on one of them", _KINECT_V1, 0.0263, 2e-3),
     ),
     Device(
         "oak-d-s2", "Luxonis OAK-D S2", _global("maker's documentation", _OAK),
-        Stream("rolling", "maker's documentation", _OAK),
+        PublishedShutter("rolling", "maker's documentation", _OAK),
     ),
     Device(
         "realsense-d405", "RealSense D405", _global(_SUPPORT, f"{_REALSENSE}/librealsense/issues/14253"),
@@ -139,12 +139,12 @@ DEVICES = (
     ),
     Device(
         "realsense-d415", "RealSense D415",
-        Stream("rolling", "a user, of the maker's support", f"{_REALSENSE}/librealsense/issues/12716"),
-        Stream("rolling", _SUPPORT, f"{_REALSENSE}/librealsense/issues/13794"),
+        PublishedShutter("rolling", "a user, of the maker's support", f"{_REALSENSE}/librealsense/issues/12716"),
+        PublishedShutter("rolling", _SUPPORT, f"{_REALSENSE}/librealsense/issues/13794"),
     ),
     Device(
         "realsense-d435", "RealSense D435, D435i", _global(_SUPPORT, f"{_REALSENSE}/librealsense/issues/13285"),
-        Stream("rolling", _SUPPORT, f"{_REALSENSE}/librealsense/issues/13285"),
+        PublishedShutter("rolling", _SUPPORT, f"{_REALSENSE}/librealsense/issues/13285"),
     ),
     Device(
         "realsense-d455", "RealSense D455", _global(_SUPPORT, f"{_REALSENSE}/realsense-ros/issues/3451"),

@@ -10,14 +10,15 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.spline import Spline
-from rstrack.calibration.pairs.terms import FLOOR_DEPTH, FLOOR_INTENSITY, PairTerms
-from rstrack.calibration.pairs.window import Stretch
+from rstrack.alignment.weights import FLOOR_DEPTH, FLOOR_INTENSITY
+from rstrack.calibration.pairs.terms import PairTerms
+from rstrack.calibration.pairs.window import RecordingWindow
 from rstrack.calibration.parameters import LENS, Parameters, changed
 from rstrack.data.dataset import Dataset
 
 
 @dataclass(frozen=True)
-class Motion:
+class MeanMotion:
     """Mean speeds in the stretches that were used, m/s and rad/s, and the changes of the latter, rad/s²."""
 
     speed: float
@@ -32,12 +33,12 @@ class Motion:
         )
 
 
-def motion_of(dataset: Dataset, parts: Sequence[range], track: Spline) -> Motion:
+def motion_of(dataset: Dataset, parts: Sequence[range], track: Spline) -> MeanMotion:
     """Of the stretches of frames that were used, by the track."""
     stamps = np.concatenate([dataset.stamps[part.start : part.stop] for part in parts])
     v, a = track.velocity(stamps), track.acceleration(stamps)
     means = [float(np.linalg.norm(x, axis=1).mean()) for x in (v[:, :3], v[:, 3:], a[:, 3:])]
-    return Motion(*means)
+    return MeanMotion(*means)
 
 
 # Instants at most.
@@ -81,24 +82,24 @@ _MOST_MORE = 2.0
 
 
 @dataclass(frozen=True)
-class Residuals:
+class ResidualScales:
     """Student's scales of the residuals, medians over stretches: depth in m, intensity of 0 to 1."""
 
     depth_m: float
     intensity: float
 
 
-def some_of(stretches: Sequence[Stretch]) -> Sequence[Stretch]:
+def some_of(stretches: Sequence[RecordingWindow]) -> Sequence[RecordingWindow]:
     """A few, all over the recording: those whose residuals are looked at."""
     return stretches[:: -(-len(stretches) // _FEW)]
 
 
-def residuals_now(stretches: Sequence[Stretch]) -> Residuals:
+def residuals_now(stretches: Sequence[RecordingWindow]) -> ResidualScales:
     """Those by which the stretches weight their pixels."""
     return _medians(np.array([stretch.sigma for stretch in stretches]))
 
 
-def residuals_at(stretches: Sequence[Stretch], terms: PairTerms, p: Parameters) -> Residuals:
+def residuals_at(stretches: Sequence[RecordingWindow], terms: PairTerms, p: Parameters) -> ResidualScales:
     """Along the stretches' splines as they are, with values `p`, on the pyramid's finest level.
 
     Evaluated on copies: the stretches keep their scales and their brightness.
@@ -116,12 +117,12 @@ def extrapolated(scales: FloatArray) -> FloatArray:
     return np.asarray(scales[-1] + last * ratio / (1.0 - ratio))
 
 
-def _medians(scales: FloatArray) -> Residuals:
+def _medians(scales: FloatArray) -> ResidualScales:
     depth_m, intensity = np.median(scales, axis=0)
-    return Residuals(float(depth_m), float(intensity))
+    return ResidualScales(float(depth_m), float(intensity))
 
 
-def _scales(stretch: Stretch, terms: PairTerms, p: Parameters) -> FloatArray:
+def _scales(stretch: RecordingWindow, terms: PairTerms, p: Parameters) -> FloatArray:
     """Those of depth and intensity (rounds, 2) after each step."""
     scales = []
     for _ in range(_ROUNDS):

@@ -1,4 +1,4 @@
-"""calibration.json, read back: what `Calibration.as_dict` says and `rstrack report` shows."""
+"""calibration.json, read back: what `CameraCalibration.as_dict` says and `rstrack report` shows."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from rsgen.errors import UserError, first_problem
 from rsgen.files import atomic_write, read_text
-from rstrack.calibration.result import Calibration
+from rstrack.calibration.result import CameraCalibration
 
 CALIBRATION = "calibration.json"
 
@@ -55,7 +55,7 @@ class Change(_Stored):
     after: _Positive
 
 
-class BothResiduals(_Stored):
+class StoredResiduals(_Stored):
     """Scales with the values and the track before and after: m, and intensity of 0 to 1."""
 
     depth_m: Change
@@ -84,14 +84,14 @@ class LensMap(_Stored):
         return self
 
 
-class Record(_Stored):
+class CalibrationRecord(_Stored):
     """A calibration; `parameters` by name, in the order in which they are shown."""
 
     dataset: str
     parameters: dict[str, Parameter]
     stretches: tuple[tuple[int, int], ...]
     stretch_times_s: tuple[tuple[_Finite, _Finite], ...]
-    residuals: BothResiduals
+    residuals: StoredResiduals
     pace: StoredPace
     finished: bool
     converged: bool
@@ -102,7 +102,7 @@ class Record(_Stored):
     camera_file: str
 
     @model_validator(mode="after")
-    def _fits(self) -> Record:
+    def _fits(self) -> CalibrationRecord:
         count = len(self.stretches)
         if len(self.stretch_times_s) != count or any(len(p.told_by_stretch) != count for p in self.parameters.values()):
             raise ValueError(f"there are {count} stretches, and as many times and parts of every parameter must be")
@@ -116,19 +116,19 @@ class Record(_Stored):
         return {name: each for name, each in self.parameters.items() if not each.is_found}
 
 
-def record_of(found: Calibration) -> Record:
+def record_of(found: CameraCalibration) -> CalibrationRecord:
     """The record of a calibration that has just been made."""
-    return Record.model_validate(found.as_dict())
+    return CalibrationRecord.model_validate(found.as_dict())
 
 
-def write_record(found: Calibration, path: Path) -> None:
+def write_record(found: CameraCalibration, path: Path) -> None:
     """Write calibration.json. Raises UserError."""
     atomic_write(path, (json.dumps(found.as_dict(), indent=2) + "\n").encode())
 
 
-def read_record(path: Path) -> Record:
+def read_record(path: Path) -> CalibrationRecord:
     """What `write_record` or `rstrack calibrate --json` wrote. Raises UserError naming the first wrong field."""
     try:
-        return Record.model_validate_json(read_text(path))
+        return CalibrationRecord.model_validate_json(read_text(path))
     except ValidationError as error:
         raise UserError(f"{path}: {first_problem(error)}: run 'rstrack calibrate --json' again") from None

@@ -13,7 +13,16 @@ from rsgen.array_types import BoolArray, FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter
-from rstrack.calibration.figures import Motion, Pace, Residuals, displacement_px, lens_map, rms, sigma_px, since_begin
+from rstrack.calibration.figures import (
+    MeanMotion,
+    Pace,
+    ResidualScales,
+    displacement_px,
+    lens_map,
+    rms,
+    sigma_px,
+    since_begin,
+)
 from rstrack.calibration.parameters import (
     COLOR_LENS,
     COUNT,
@@ -58,7 +67,7 @@ _NEEDS = (
 
 
 @dataclass(frozen=True)
-class Calibration:
+class CameraCalibration:
     """start: the values before; asked (31,): which might change; parts: the stretches of frames that told.
 
     residuals: of a few stretches, with the values before along the first track, and with those found. pace: by the
@@ -73,9 +82,9 @@ class Calibration:
     solution: Solution
     asked: BoolArray
     parts: tuple[range, ...]
-    motion: Motion
+    motion: MeanMotion
     seconds: float
-    residuals: tuple[Residuals, Residuals]
+    residuals: tuple[ResidualScales, ResidualScales]
     pace: Pace
     device_notes: tuple[str, ...] = ()
     kept_lens: bool = False

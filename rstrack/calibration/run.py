@@ -24,7 +24,7 @@ from rstrack.calibration.devices import Device, device_notes
 from rstrack.calibration.figures import motion_of, pace_of, residuals_at, residuals_now, some_of
 from rstrack.calibration.pairs.terms import PairTerms, pair_terms
 from rstrack.calibration.pairs.trust import trust_in
-from rstrack.calibration.pairs.window import Stretch
+from rstrack.calibration.pairs.window import RecordingWindow
 from rstrack.calibration.parameters import (
     COLOR_LENS,
     DEPTH_LENS,
@@ -35,10 +35,10 @@ from rstrack.calibration.parameters import (
     Parameters,
     free_of,
 )
-from rstrack.calibration.result import Calibration
+from rstrack.calibration.result import CameraCalibration
 from rstrack.calibration.solve import solve
-from rstrack.calibration.stages import Stage, in_stages, progress_watch
-from rstrack.calibration.start import Track, first_track, load_stretch
+from rstrack.calibration.stages import StageResult, in_stages, progress_watch
+from rstrack.calibration.start import RoughTrack, first_track, load_window
 from rstrack.data.dataset import Dataset
 from rstrack.options import Options
 
@@ -62,7 +62,7 @@ _COEFFICIENTS = 5
 def calibrate(
     dataset: Dataset, groups: Sequence[str] | None = None, frames: slice = slice(None), options: Options | None = None,
     progress: Progress = no_progress, device: Device | None = None,
-) -> Calibration:  # fmt: skip
+) -> CameraCalibration:  # fmt: skip
     """Readouts, colour's clock, extrinsics, lenses and depth of a dataset, from the values of its cameras on.
 
     groups: of GROUPS, what may change; by default the first three, but where depth is registered to colour the lens in
@@ -96,12 +96,12 @@ def calibrate(
     rough = [replace(each, is_rough=True) for each in stretches]
     coarse = solve(rough, terms, start, free, _COARSE, progress_watch(progress, 0.15), known)
     stretches = [replace(each, is_rough=False) for each in rough]
-    stage = Stage(stretches, coarse, True, False)
+    stage = StageResult(stretches, coarse, True, False)
     if coarse.finished:
         kept = _trusted(dataset, stretches, terms, coarse.values)
         parts, stretches = [parts[k] for k in kept], [stretches[k] for k in kept]
 
-        def staged(known: Known, p: Parameters) -> Stage:
+        def staged(known: Known, p: Parameters) -> StageResult:
             def terms_of(free: BoolArray) -> PairTerms:
                 return pair_terms(engine(options.backend), dataset, free)
 
@@ -121,13 +121,15 @@ def calibrate(
     notes = device_notes(device, before, known, solution.sigmas) if device else ()
     pace = pace_of(dataset, track.frames(dataset, chosen), track.spline)
     both, seconds = (residuals, residuals_now(some_of(stage.stretches))), time.perf_counter() - begun
-    return Calibration(dataset, start, solution, free, tuple(parts), motion, seconds, both, pace, notes, kept_lens)
+    return CameraCalibration(
+        dataset, start, solution, free, tuple(parts), motion, seconds, both, pace, notes, kept_lens
+    )
 
 
 def _loaded(
     dataset: Dataset, terms: PairTerms, parts: Sequence[range], track: Spline, start: Parameters, options: Options,
     progress: Progress,
-) -> list[Stretch]:  # fmt: skip
+) -> list[RecordingWindow]:  # fmt: skip
     """Knots of every other stretch lie half a spacing later.
 
     No spline follows a hand quite, and what it leaves passes for other clocks: one way for these knots, another way for
@@ -137,12 +139,12 @@ def _loaded(
     for n, part in enumerate(parts):
         progress("calibrating", 0.15 * n / len(parts), "reading images")
         phase = replace(options, knot_phase=(options.knot_phase + 0.5 * (n % 2)) % 1.0)
-        stretches.append(load_stretch(terms, base, part, track, start, phase))
+        stretches.append(load_window(terms, base, part, track, start, phase))
     return stretches
 
 
 def _oriented(
-    dataset: Dataset, stretches: Sequence[Stretch], start: Parameters, options: Options, progress: Progress
+    dataset: Dataset, stretches: Sequence[RecordingWindow], start: Parameters, options: Options, progress: Progress
 ) -> Dataset:
     """The dataset with images that are read by rows or by columns, whichever fits better after some steps.
 
@@ -187,7 +189,7 @@ def _bent(dataset: Dataset) -> Dataset:
     return replace(dataset, rig=replace(rig, depth_camera=bent(rig.depth_camera), color_camera=bent(rig.color_camera)))
 
 
-def _trusted(dataset: Dataset, stretches: Sequence[Stretch], terms: PairTerms, p: Parameters) -> list[int]:
+def _trusted(dataset: Dataset, stretches: Sequence[RecordingWindow], terms: PairTerms, p: Parameters) -> list[int]:
     """Those stretches (counted from 0) of whose motion more is known than noise makes up. Raises UserError: too few."""
     kept = [k for k, stretch in enumerate(stretches) if trust_in(stretch, terms, p) > _TRUST]
     if len(kept) < _FEWEST:
@@ -198,7 +200,7 @@ def _trusted(dataset: Dataset, stretches: Sequence[Stretch], terms: PairTerms, p
     return kept
 
 
-def _stretches(dataset: Dataset, chosen: range, track: Track) -> list[range]:
+def _stretches(dataset: Dataset, chosen: range, track: RoughTrack) -> list[range]:
     """Frames in a row that were followed, with colour images; of many those that move most."""
     runs = track.frames(dataset, chosen)
     total = sum(len(run) for run in runs)

@@ -13,7 +13,7 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rstrack.calibration.parameters import COUNT, DRIFT, NAMES
-from rstrack.calibration.result import Calibration
+from rstrack.calibration.result import CameraCalibration
 from rstrack.calibration.solve import Solution, posterior
 from rstrack.data.dataset import Dataset
 
@@ -36,7 +36,7 @@ def check_alike(datasets: Sequence[Dataset]) -> None:
         raise UserError(f"{', '.join(names)}: recordings of one name, by which their clocks are told: rename them")
 
 
-def together(found: Sequence[Calibration]) -> Calibration:
+def together(found: Sequence[CameraCalibration]) -> CameraCalibration:
     """What recordings say together of one camera, each calibrated by itself from the same camera file.
 
     Their stretches' normal equations stand side by side, each recording's clock eliminated, and are solved once more,
@@ -95,7 +95,7 @@ def _without_clock(solution: Solution) -> tuple[FloatArray, FloatArray, FloatArr
     return project @ A @ project.T, b @ project.T, K
 
 
-def _clock(found: Calibration, moved: FloatArray, K: FloatArray) -> tuple[float, float]:
+def _clock(found: CameraCalibration, moved: FloatArray, K: FloatArray) -> tuple[float, float]:
     """Offset (s) and drift of a recording's colour for a camera that has moved by so much (31,) from its own."""
     step = np.zeros(COUNT)
     step[_CLOCK] = -K @ moved

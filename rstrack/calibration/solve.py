@@ -9,9 +9,9 @@ import numpy as np
 from scipy import stats
 
 from rsgen.array_types import BoolArray, FloatArray
-from rstrack.alignment.normal_equations import AndersonMixing
+from rstrack.alignment.normal_equations import AndersonMixing, Eliminated
 from rstrack.calibration.pairs.terms import PairTerms
-from rstrack.calibration.pairs.window import Stretch
+from rstrack.calibration.pairs.window import RecordingWindow
 from rstrack.calibration.parameters import COUNT, DEPTH, DRIFT, PRIOR, USEFUL, Known, Parameters
 
 # Steps at most on a level, and the part of the standard errors, as the stretches' scatter shows them, that ends it.
@@ -128,14 +128,15 @@ class Solution:
 
 
 def solve(
-    stretches: Sequence[Stretch], terms: PairTerms, start: Parameters, free: BoolArray, levels: Sequence[int],
+    stretches: Sequence[RecordingWindow], terms: PairTerms, start: Parameters, free: BoolArray, levels: Sequence[int],
     watch: Watch = lambda *_: None, known: Known | None = None, steps: int = _MOST_STEPS, depth_counts: float = 1.0,
 ) -> Solution:  # fmt: skip
-    """Parameters and all control points jointly, coarse to fine; the stretches' splines are moved.
+    """Parameters and all control points jointly, coarse to fine; the windows' splines are moved.
 
     free (31,): which parameters may change; the others stay at `start`, to which weak ones are held by PRIOR, and to
-    what is `known` as firmly as that is. depth_counts: see `Stretch.sums`. Where `watch` raises KeyboardInterrupt, what
-    has been found so far is returned, `finished` False. Raises numpy.linalg.LinAlgError where images say nothing.
+    what is `known` as firmly as that is. depth_counts: see `RecordingWindow.sums`. Where `watch` raises
+    KeyboardInterrupt, what has been found so far is returned, `finished` False. Raises numpy.linalg.LinAlgError where
+    images say nothing.
     """
     known = known or Known.nothing(start)
     p, acceleration, finished, step = start, AndersonMixing(), True, np.zeros(COUNT)
@@ -148,21 +149,21 @@ def solve(
             for n in range(steps):
                 watch(level, n, p)
                 sums = [stretch.sums(terms, p, level, depth_counts) for stretch in stretches]
-                step, sigmas = _step([one.reduced() for one in sums], p, start, known, free, acceleration)
+                step, sigmas = _step([one.reduced for one in sums], p, start, known, free, acceleration)
                 for stretch, one in zip(stretches, sums, strict=True):
                     stretch.move(one.points_step(step))
                 p = p.moved(step)
                 if (np.abs(step[free]) <= _SMALL * sigmas).all():
                     break
         sums = [stretch.sums(terms, p, levels[-1], depth_counts) for stretch in stretches]
-        last, _ = _step([one.reduced() for one in sums], p, start, known, free)
+        last, _ = _step([one.reduced for one in sums], p, start, known, free)
         for stretch, one in zip(stretches, sums, strict=True):
             stretch.move(one.points_step(last))
         p = p.moved(last)
     except KeyboardInterrupt:
         finished = False
     sums = [stretch.sums(terms, p, levels[-1], depth_counts) for stretch in stretches]
-    reduced = [one.reduced() for one in sums]
+    reduced = [one.reduced for one in sums]
     A, b = _of_free(reduced, free)
     depth, intensity = np.median([stretch.sigma for stretch in stretches], axis=0)
     pixels = max(1, sum(one.pixels for one in sums))
@@ -190,7 +191,7 @@ def joined(first: Solution, then: Solution) -> Solution:
     return replace(then, free=free, A=A[0] + A[1], b=b[0] + b[1], last_step=last_step)
 
 
-def _blind(stretches: Sequence[Stretch], terms: PairTerms) -> FloatArray:
+def _blind(stretches: Sequence[RecordingWindow], terms: PairTerms) -> FloatArray:
     """σ (31,) of what no disagreement shows.
 
     Of the extrinsics, so many pixels as an angle and as a shift; of the drift, so many seconds from the middle to an
@@ -206,7 +207,7 @@ def _blind(stretches: Sequence[Stretch], terms: PairTerms) -> FloatArray:
 
 
 def _step(
-    reduced: Sequence[tuple[FloatArray, FloatArray]], p: Parameters, start: Parameters, known: Known, free: BoolArray,
+    reduced: Sequence[Eliminated], p: Parameters, start: Parameters, known: Known, free: BoolArray,
     acceleration: AndersonMixing | None = None,
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     """The step (31,) of the parameters, and the standard errors of the free ones.
@@ -228,9 +229,9 @@ def _step(
     return step, np.sqrt(np.diag(C))
 
 
-def _of_free(reduced: Sequence[tuple[FloatArray, FloatArray]], free: BoolArray) -> tuple[FloatArray, FloatArray]:
+def _of_free(reduced: Sequence[Eliminated], free: BoolArray) -> tuple[FloatArray, FloatArray]:
     """A (s, n, n) and b (s, n) of the free parameters alone."""
-    return np.array([A[np.ix_(free, free)] for A, _ in reduced]), np.array([b[free] for _, b in reduced])
+    return np.array([one.H[np.ix_(free, free)] for one in reduced]), np.array([one.g[free] for one in reduced])
 
 
 def posterior(A: FloatArray, b: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray, float]:

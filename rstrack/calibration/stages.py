@@ -17,7 +17,7 @@ import numpy as np
 from rsgen.array_types import BoolArray
 from rsgen.console.progress import Progress
 from rstrack.calibration.pairs.terms import PairTerms
-from rstrack.calibration.pairs.window import Stretch
+from rstrack.calibration.pairs.window import RecordingWindow
 from rstrack.calibration.parameters import BY_COLOR, COLOR_LENS, COUNT, DRIFT, LENSES, Known, Parameters
 from rstrack.calibration.solve import Solution, Watch, joined, solve
 
@@ -37,19 +37,19 @@ _FEW_STEPS = 4
 
 
 @dataclass(frozen=True)
-class Stage:
+class StageResult:
     """What is found so far. drifts: colour's clock may drift; kept_lens: another explains no more than the file's."""
 
-    stretches: Sequence[Stretch]
+    stretches: Sequence[RecordingWindow]
     solution: Solution
     drifts: bool
     kept_lens: bool
 
 
 def in_stages(
-    stretches: Sequence[Stretch], terms_of: Callable[[BoolArray], PairTerms], known: Known, p: Parameters,
+    stretches: Sequence[RecordingWindow], terms_of: Callable[[BoolArray], PairTerms], known: Known, p: Parameters,
     free: BoolArray, is_exact: bool, progress: Progress,
-) -> Stage:  # fmt: skip
+) -> StageResult:  # fmt: skip
     """From values `p` on, with all that may change (31,).
 
     terms_of: kernels with columns for so many of the unknowns. is_exact: depth is, and all is found at once.
@@ -58,9 +58,9 @@ def in_stages(
     if is_exact or not free[COLOR_LENS].any():
         solution, drifts = _solved(stretches, terms, known, p, free, _NONE, progress)
         if not solution.finished or not solution.free[LENSES].any():
-            return Stage(stretches, solution, drifts, False)
+            return StageResult(stretches, solution, drifts, False)
         stretches, solution, kept_lens = _paid(stretches, terms, known, solution, _NONE, progress)
-        return Stage(stretches, solution, drifts, kept_lens)
+        return StageResult(stretches, solution, drifts, kept_lens)
     watch = progress_watch(progress, 0.3)
     lens = solve(stretches, terms, p, free & BY_COLOR, _FINE, watch, known, _FEW_STEPS, _HARDLY)
     counts = 1.0 / max(1.0, lens.depth_overcounts)
@@ -68,10 +68,10 @@ def in_stages(
         lens, _ = _solved(stretches, terms, known, lens.values, free & BY_COLOR, ~BY_COLOR, progress, counts)
     stretches, lens, kept_lens = _paid(stretches, terms, known, lens, ~LENSES, progress, counts)
     if not lens.finished:
-        return Stage(stretches, lens, True, kept_lens)
+        return StageResult(stretches, lens, True, kept_lens)
     held, rest = (_NONE, free & ~LENSES) if kept_lens else (lens.free, free & ~BY_COLOR)
     solution, drifts = _solved(stretches, terms_of(rest), known, lens.values, rest, held, progress)
-    return Stage(stretches, solution if kept_lens else joined(lens, solution), drifts, kept_lens)
+    return StageResult(stretches, solution if kept_lens else joined(lens, solution), drifts, kept_lens)
 
 
 def progress_watch(progress: Progress, begin: float) -> Watch:
@@ -91,8 +91,8 @@ def progress_watch(progress: Progress, begin: float) -> Watch:
 
 
 def _solved(
-    stretches: Sequence[Stretch], terms: PairTerms, known: Known, p: Parameters, free: BoolArray, held: BoolArray,
-    progress: Progress, depth_counts: float = 1.0,
+    stretches: Sequence[RecordingWindow], terms: PairTerms, known: Known, p: Parameters, free: BoolArray,
+    held: BoolArray, progress: Progress, depth_counts: float = 1.0,
 ) -> tuple[Solution, bool]:  # fmt: skip
     """With all that may change, those `held` (31,) at `p`, then without what the recording does not tell.
 
@@ -116,9 +116,9 @@ def _solved(
 
 
 def _paid(
-    stretches: Sequence[Stretch], terms: PairTerms, known: Known, solution: Solution, held: BoolArray,
+    stretches: Sequence[RecordingWindow], terms: PairTerms, known: Known, solution: Solution, held: BoolArray,
     progress: Progress, depth_counts: float = 1.0,
-) -> tuple[Sequence[Stretch], Solution, bool]:  # fmt: skip
+) -> tuple[Sequence[RecordingWindow], Solution, bool]:  # fmt: skip
     """The solution with the lens that was found, or that with the file's where another does not pay, and which.
 
     It pays if chance makes the images so much more likely in one of a thousand recordings at most. How likely the

@@ -12,9 +12,9 @@ from rsgen.console.progress import Progress
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.calibration.pairs.images import Taken, averaged, intensity_bound, span, surface_of
+from rstrack.calibration.pairs.images import ImageTiming, averaged, intensity_bound, span, surface_of
 from rstrack.calibration.pairs.terms import PairTerms
-from rstrack.calibration.pairs.window import Stretch, View
+from rstrack.calibration.pairs.window import RecordingWindow, WindowFrame
 from rstrack.calibration.parameters import Parameters
 from rstrack.data.dataset import Dataset
 from rstrack.images.line_poses import Exposure
@@ -32,7 +32,7 @@ _GAP = 2.5
 
 
 @dataclass(frozen=True)
-class Track:
+class RoughTrack:
     """A rough T_world_depth(t), and the times (begin, end) in s within which it was followed."""
 
     spline: Spline
@@ -61,7 +61,7 @@ class Track:
         return runs
 
 
-def first_track(dataset: Dataset, chosen: range, options: Options, progress: Progress) -> Track:
+def first_track(dataset: Dataset, chosen: range, options: Options, progress: Progress) -> RoughTrack:
     """Of the frames of a dataset. Raises UserError: nothing can be followed."""
     whole, best = dataset.stamps[chosen[-1]] - dataset.stamps[chosen[0]], None
     for method in _METHODS:
@@ -75,10 +75,10 @@ def first_track(dataset: Dataset, chosen: range, options: Options, progress: Pro
     return best
 
 
-def _tracked(dataset: Dataset, chosen: range, options: Options, progress: Progress) -> Track | None:
+def _tracked(dataset: Dataset, chosen: range, options: Options, progress: Progress) -> RoughTrack | None:
     tracker = rough_track(dataset, chosen, options, lambda done: progress(f"first track ({options.method})", done, ""))
     if tracker.spline is not None and tracker.spline_valid:
-        return Track(tracker.spline, tuple(tracker.spline_valid))
+        return RoughTrack(tracker.spline, tuple(tracker.spline_valid))
     stamps, poses = tracker.trajectory
     if len(stamps) < 2:
         return None
@@ -89,7 +89,7 @@ def _tracked(dataset: Dataset, chosen: range, options: Options, progress: Progre
     knots = np.asarray(t0 + (np.arange(int((stamps[-1] - t0) / dt) + 5) - 1) * dt, np.float64)
     breaks = np.flatnonzero(np.diff(stamps) > _GAP * period) + 1
     spans = tuple((float(part[0]), float(part[-1])) for part in np.split(stamps, breaks))
-    return Track(through(se3.interpolated(stamps, poses, knots), t0, dt), spans)
+    return RoughTrack(through(se3.interpolated(stamps, poses, knots), t0, dt), spans)
 
 
 # Seconds before the first and after the last line for which a stretch has spline: times move while they are estimated.
@@ -100,9 +100,9 @@ _BASELINE_M = 0.01
 _ROUNDS = 6
 
 
-def load_stretch(
+def load_window(
     terms: PairTerms, dataset: Dataset, frames: Sequence[int], track: Spline, p: Parameters, options: Options
-) -> Stretch:
+) -> RecordingWindow:
     """Frames of a dataset, with a spline like that of the track but with knots as the options want them.
 
     Raises UserError: an image that cannot be read.
@@ -112,7 +112,7 @@ def load_stretch(
     knot_s = options.knots_s()
     t0 = begin - _MARGIN_S - options.knot_phase * knot_s
     count = int(np.ceil((end + _MARGIN_S - t0) / knot_s)) + 3
-    return Stretch(views, like(track, t0, knot_s, count))
+    return RecordingWindow(views, like(track, t0, knot_s, count))
 
 
 def like(track: Spline, t0: float, dt: float, count: int) -> Spline:
@@ -137,18 +137,18 @@ def through(poses: FloatArray, t0: float, dt: float) -> Spline:
     return Spline(points, t0, dt)
 
 
-def _view(terms: PairTerms, dataset: Dataset, k: int, max_depth: float) -> View:
+def _view(terms: PairTerms, dataset: Dataset, k: int, max_depth: float) -> WindowFrame:
     e, rig = terms.e, dataset.rig
     z = dataset.images.depth(k)
     rho = averaged(np.divide(np.float32(1.0), z, out=np.zeros_like(z), where=(z > 0.0) & (z < max_depth)))
     z = np.divide(np.float32(1.0), rho, out=np.zeros_like(z), where=rho > 0.0)
-    depth = Taken(terms.depth, float(dataset.stamps[k]), rig.depth_shutter.exposure_s, True)
+    depth = ImageTiming(terms.depth, float(dataset.stamps[k]), rig.depth_shutter.exposure_s, True)
     camera, baseline = rig.depth_camera, _BASELINE_M + float(np.linalg.norm(rig.T_color_depth[:3, 3]))
-    view = View(depth, e.upload(z), surface_of(e, rho, camera.fx, camera.fy, baseline))
+    view = WindowFrame(depth, e.upload(z), surface_of(e, rho, camera.fx, camera.fy, baseline))
     if dataset.groups[k]:
         i = dataset.groups[k][0]
         color = dataset.images.color(i)
-        view.color = Taken(terms.color, float(dataset.color_stamps[i]), rig.color_shutter.exposure_s, False)
+        view.color = ImageTiming(terms.color, float(dataset.color_stamps[i]), rig.color_shutter.exposure_s, False)
         view.levels = color_image(e, Exposure(terms.color, 0.0, np.eye(4)), color).levels
         view.bound = intensity_bound(intensity(color), rig.color_camera.fx, view.surface.median_depth)
     return view

@@ -16,7 +16,7 @@ from scipy.signal import welch
 from rsgen.array_types import FloatArray
 from rstrack.alignment.priors import ACCELERATION
 from rstrack.data.imu.recording import ImuRecording
-from rstrack.inertial.wild import wild
+from rstrack.inertial.residuals import outliers
 from rstrack.options import Options
 
 # Spacings to choose from, s. No wider than without an IMU: a keyframe is made of a frame whose control points move no
@@ -42,7 +42,7 @@ def missed(x: FloatArray, degree: int) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class Band:
+class MotionBand:
     """hertz (n,) and, of all three axes together, what motion adds to the noise: rate (n,) (rad/s)²/Hz and force (n,)
     (m/s²)²/Hz. Gravity that turns with the camera is in it, little where knots matter."""
 
@@ -51,7 +51,7 @@ class Band:
     force: FloatArray
 
     @classmethod
-    def of(cls, recording: ImuRecording) -> Band:
+    def of(cls, recording: ImuRecording) -> MotionBand:
         """Of a whole recording, in the mean over it; None of a gyroscope that is not there."""
         t = np.arange(recording.t[0], recording.t[-1], 1.0 / recording.rate_hz)
         noise = recording.noise
@@ -102,7 +102,7 @@ def with_knots(options: Options, recording: ImuRecording | None, focal: float) -
     else is asked for; an accelerometer alone does not tell enough between images to have them otherwise."""
     if options.knot_spacing_s is not None or not options.inertial or recording is None or recording.gyro is None:
         return options
-    return replace(options, knot_spacing_s=Band.of(recording).knots_s(focal, recording.rate_hz))
+    return replace(options, knot_spacing_s=MotionBand.of(recording).knots_s(focal, recording.rate_hz))
 
 
 def _spectrum(
@@ -112,7 +112,7 @@ def _spectrum(
 
     t: even times to take it at. density: of the noise.
     """
-    told = (np.isfinite(values) & ~wild(values, density * np.sqrt(rate_hz))).all(axis=1)
+    told = (np.isfinite(values) & ~outliers(values, density * np.sqrt(rate_hz))).all(axis=1)
     even: FloatArray = np.stack([np.interp(t, at[told], axis[told]) for axis in values.T])
     length = min(len(t), max(8, round(_STRETCH_S * rate_hz)))
     # The stubs have 'literal' where SciPy has 'linear'.

@@ -12,11 +12,10 @@ from rstrack.alignment.normal_equations import Quadratic
 from rstrack.alignment.priors import ACCELERATION, acceleration_prior
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.imu.recording import ImuRecording
-from rstrack.inertial.band import Band
-from rstrack.inertial.belief import GRAVITY, GYRO, SIZE, Belief
-from rstrack.inertial.kept import Kept
-from rstrack.inertial.residuals import Rows, Samples
-from rstrack.inertial.smoother import Smoother
+from rstrack.inertial.band import MotionBand
+from rstrack.inertial.estimate import GRAVITY, GYRO, SIZE, ImuEstimate
+from rstrack.inertial.residuals import ImuReadings, ImuResiduals
+from rstrack.inertial.smoother import ReusedPrior, Smoother
 
 # σ of the mean acceleration of a track's first moments, m/s².
 _MEAN_ACCELERATION = 1.0
@@ -36,7 +35,7 @@ _GIVEN = "recording", "samples", "common", "_band"
 
 
 class Inertia:
-    """recording: of the unit. belief: of its biases, gravity and turn as far as is known.
+    """recording: of the unit. estimate: of its biases, gravity and turn as far as is known.
 
     common (6,): standard deviation of accelerations for the motion prior, m/s² and rad/s².
     sigma (2,): of a gyroscope's reading against the spline (rad/s), and of an accelerometer's (m/s²): never less than
@@ -45,22 +44,22 @@ class Inertia:
     """
 
     def __init__(self, recording: ImuRecording) -> None:
-        self.recording, self.samples = recording, Samples.of(recording)
+        self.recording, self.samples = recording, ImuReadings.of(recording)
         self.usable_s = self.determined_s = float("nan")
         noise, root = recording.noise, np.sqrt(recording.rate_hz)
         self._noise = np.array([noise.gyro_density, noise.accel_density]) * root
         walks = np.repeat([noise.gyro_walk, noise.accel_walk, _DRIFT, 0.0], 3)
         self._walk = walks**2
-        self._band, self._dt = Band.of(recording), 0.0
+        self._band, self._dt = MotionBand.of(recording), 0.0
         self.common = self._band.allowed if self.tells else ACCELERATION
         self.sigma, self._told = self._noise, np.zeros(2)
         self._smoother: Smoother | None = None
         self._until, self._next, self._tripled = -np.inf, -np.inf, 0
-        self.belief = Belief.initial(np.array([0.0, recording.gravity, 0.0]))
+        self.estimate = ImuEstimate.initial(np.array([0.0, recording.gravity, 0.0]))
         self._leaves_open = False
         # The rows `ahead` has linearised last: of a state, whose control points from a first one on had received so
         # much by then.
-        self._ahead: tuple[SplineState, int, FloatArray, Rows] | None = None
+        self._ahead: tuple[SplineState, int, FloatArray, ImuResiduals] | None = None
 
     @property
     def state(self) -> dict[str, object]:
@@ -86,10 +85,13 @@ class Inertia:
         """The world is another one from now on; biases and turn stay what they are."""
         if self._smoother is None:
             return
-        start, own = Belief.initial(np.array([0.0, self.recording.gravity, 0.0])), np.delete(np.arange(SIZE), GRAVITY)
-        start.information[np.ix_(own, own)] = np.linalg.inv(self.belief.covariance[np.ix_(own, own)])
-        start.mean[own] = self.belief.mean[own]
-        self.belief, self._smoother = start, None
+        start, own = (
+            ImuEstimate.initial(np.array([0.0, self.recording.gravity, 0.0])),
+            np.delete(np.arange(SIZE), GRAVITY),
+        )
+        start.information[np.ix_(own, own)] = np.linalg.inv(self.estimate.covariance[np.ix_(own, own)])
+        start.mean[own] = self.estimate.mean[own]
+        self.estimate, self._smoother = start, None
         self.usable_s = self.determined_s = float("nan")
         self._until = self._next = -np.inf
 
@@ -115,27 +117,26 @@ class Inertia:
         """σ (6,) of accelerations over so many seconds in an attitude (3, 3), m/s² and rad/s², with what it says, and
         of the mean angular rate, rad/s."""
         gyro, accel = self.sigma**2 / max(1.0, seconds * self.recording.rate_hz)
-        gyro += float(np.diag(self.belief.covariance)[GYRO].max())
-        accel += self.belief.force_variance(R_imu_world)
+        gyro += float(np.diag(self.estimate.covariance)[GYRO].max())
+        accel += self.estimate.force_variance(R_imu_world)
         return np.repeat(np.sqrt([accel, (2.0 / seconds) ** 2 * gyro]), 3), float(np.sqrt(gyro))
 
     # -- what it says of the spline ---------------------------------------------------------------------------------
 
-    def prior(self, state: SplineState, piece: int, first: int) -> Kept:
+    def prior(self, state: SplineState, piece: int, first: int) -> ReusedPrior:
         """All samples that depend on control points from `first` on, of the piece of the spline that begins at control
         point `piece`, while it moves with `state`; biases and gravity as far as they are known."""
         spline = state.spline
         self._expect(spline.dt)
         begin = max(spline.t0 + max(piece, first - 3) * spline.dt, spline.t_begin)
         samples = self.samples.between(begin, spline.t_end)
-        belief = self.belief
+        estimate = self.estimate
         if not self.is_usable:
-            # A belief that is still wrong would draw the spline, and find itself confirmed: as good as none, so that it
-            # says how the motion changes. Only that a hand accelerates little in the mean holds where images tell
-            # little.
-            belief = Belief.initial(self._guessed(spline, samples))
-            belief.information[GRAVITY, GRAVITY] = np.eye(3) / _MEAN_ACCELERATION**2
-        numbers = belief.mean
+            # An estimate that is still wrong would draw the spline and confirm itself. Readings then only say how the
+            # motion changes, and a hand accelerates little in the mean where images leave that open.
+            estimate = ImuEstimate.initial(self._guessed(spline, samples))
+            estimate.information[GRAVITY, GRAVITY] = np.eye(3) / _MEAN_ACCELERATION**2
+        numbers = estimate.mean
 
         def around() -> tuple[Quadratic, float]:
             nonlocal numbers
@@ -143,13 +144,13 @@ class Inertia:
                 joint, _ = self._rows(state, samples, numbers).summed(self.sigma)
                 if joint is None:
                     return Quadratic(state.end - 1, np.zeros((6, 6)), np.zeros(6)), 0.0
-                model, cost, best = joint.without_belief(belief, numbers)
+                model, cost, best = joint.without_imu(estimate, numbers)
                 if np.abs(best - numbers)[GRAVITY].max() < _SAME_GRAVITY:
                     break
                 numbers = best
             return model, cost
 
-        return Kept(state, first, around)
+        return ReusedPrior(state, first, around)
 
     def held(self, piece: int) -> int | None:
         """First control point of what is known of the newest ones, where the unit is of use and has seen enough of the
@@ -166,7 +167,7 @@ class Inertia:
             return None
         return smoother.first
 
-    def ahead(self, state: SplineState) -> Kept:
+    def ahead(self, state: SplineState) -> ReusedPrior:
         """What all images and samples so far say of the control points that are `held`, and the samples since of those
         that came anew, while they move with `state`."""
         smoother = self._smoother
@@ -176,17 +177,17 @@ class Inertia:
         def around() -> tuple[Quadratic, float]:
             both = smoother.copy()
             cost = both.reach(state, both.first, state.end)
-            rows = self._rows(state, samples, self.belief.mean)
+            rows = self._rows(state, samples, self.estimate.mean)
             self._ahead = state, both.first, both.at, rows
             joint, _ = rows.summed(self.sigma)
             if joint is not None:
                 both.add(joint)
                 cost += joint.cost
             cost += self._regular(both, state.spline)
-            model, gained = both.without_belief(self.recording.gravity)
+            model, gained = both.without_imu(self.recording.gravity)
             return model, cost - gained
 
-        return Kept(state, smoother.first, around)
+        return ReusedPrior(state, smoother.first, around)
 
     # -- what the track says of it ----------------------------------------------------------------------------------
 
@@ -222,22 +223,22 @@ class Inertia:
             smoother.diffuse(self._walk * max(1e-6, float(self._until - begin)))
         keep = state.segment(self._until) if joint is not None else smoother.first
         smoother.forget(max(keep, state.first))
-        before = self.belief.mean
-        self._believe(smoother)
+        before = self.estimate.mean
+        self._update(smoother)
         if joint is not None and self.tells:
-            self._learn_sigma(scatter.after(self.belief.mean - before), fresh.counts, state.dt)
+            self._learn_sigma(scatter.after(self.estimate.mean - before), fresh.counts, state.dt)
         if not self.is_usable:
             T, twist = state.spline.pose_and_velocity(self._until)
             R_imu_depth = self.recording.T_imu_depth[:3, :3]
-            usable = self.belief.is_usable(R_imu_depth @ T[:3, :3].T, R_imu_depth @ twist[3:])
+            usable = self.estimate.is_usable(R_imu_depth @ T[:3, :3].T, R_imu_depth @ twist[3:])
             self.usable_s = end if usable else self.usable_s
-        if not np.isfinite(self.determined_s) and self.belief.is_determined:
+        if not np.isfinite(self.determined_s) and self.estimate.is_determined:
             self.determined_s = end
 
-    def _rows(self, state: SplineState, samples: Samples, numbers: FloatArray) -> Rows:
-        return Rows.of(state.spline, samples, self.recording.T_imu_depth, numbers)
+    def _rows(self, state: SplineState, samples: ImuReadings, numbers: FloatArray) -> ImuResiduals:
+        return ImuResiduals.of(state.spline, samples, self.recording.T_imu_depth, numbers)
 
-    def _rows_known(self, state: SplineState, fresh: Samples) -> Rows:
+    def _rows_known(self, state: SplineState, fresh: ImuReadings) -> ImuResiduals:
         """Of fresh samples, those until now: from when the frame was solved for, if that was hardly elsewhere."""
         known, self._ahead = self._ahead, None
         if known is not None and known[0] is state:
@@ -248,7 +249,7 @@ class Inertia:
                 moved = state.received(first, first + count) - at[:count]
                 if np.abs(moved).max() < _SAME:
                     return rows.moved(first, moved)
-        return self._rows(state, fresh, self.belief.mean)
+        return self._rows(state, fresh, self.estimate.mean)
 
     def _started(self, state: SplineState, piece: int) -> Smoother | None:
         """A smoother that knows nothing; gravity is guessed from the first samples, so that turns are about right."""
@@ -257,10 +258,10 @@ class Inertia:
         fresh = self.samples.between(begin, spline.t_end)
         if not len(fresh):
             return None
-        self.belief.mean[GRAVITY] = self._guessed(spline, fresh)
-        return Smoother.start(self.belief)
+        self.estimate.mean[GRAVITY] = self._guessed(spline, fresh)
+        return Smoother.start(self.estimate)
 
-    def _guessed(self, spline: Spline, samples: Samples) -> FloatArray:
+    def _guessed(self, spline: Spline, samples: ImuReadings) -> FloatArray:
         """Gravity in the world (3,), m/s², if the samples' mean force were nothing else."""
         R = spline.pose(samples.t)[:, :3, :3] @ self.recording.T_imu_depth[:3, :3].T
         up = (R @ samples.values[:, 3:, None])[..., 0].sum(axis=0)
@@ -276,10 +277,10 @@ class Inertia:
         smoother.add(model)
         return cost
 
-    def _believe(self, smoother: Smoother) -> None:
+    def _update(self, smoother: Smoother) -> None:
         free = smoother.marginal()
-        self.belief = free.of_strength(self.recording.gravity)
-        smoother.around(self.belief.mean)
+        self.estimate = free.of_strength(self.recording.gravity)
+        smoother.around(self.estimate.mean)
 
     def _expect(self, dt: float) -> None:
         """Readings to scatter about a spline with knots dt s apart as their noise and what it cannot follow make them.

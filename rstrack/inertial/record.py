@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from rsgen.array_types import FloatArray
 from rsgen.geometry import so3
 from rsgen.geometry.spline import Spline
-from rstrack.inertial.belief import ACCEL, GRAVITY, GYRO, TURN, Belief
+from rstrack.inertial.estimate import ACCEL, GRAVITY, GYRO, TURN, ImuEstimate
 from rstrack.inertial.inertia import Inertia
 
 # χ² of three numbers that chance exceeds once in 10⁵, and a turn, rad, that is worth saying.
@@ -18,34 +18,34 @@ _BEYOND, _WORTH_SAYING = float(chi2.isf(1e-5, 3)), np.radians(0.1)
 
 
 def record(inertia: Inertia) -> dict[str, Any]:
-    """What is believed at the end, and when it was known (s)."""
+    """The estimate at the end, and when it was known (s)."""
     known = {"usable_s": _known(inertia.usable_s), "gravity_determined_s": _known(inertia.determined_s)}
-    return known | believed(inertia.belief, inertia.sigma)
+    return known | estimate_dict(inertia.estimate, inertia.sigma)
 
 
-def believed(belief: Belief, sigma: FloatArray) -> dict[str, Any]:
+def estimate_dict(estimate: ImuEstimate, sigma: FloatArray) -> dict[str, Any]:
     """Gravity in the run's world (m/s²) and the biases (rad/s, m/s²), each with σ; sigma (2,): of readings."""
-    sigmas = belief.sigmas
+    sigmas = estimate.sigmas
     return {
-        "gravity": belief.mean[GRAVITY].tolist(),
-        "gravity_sigma_deg": belief.direction_deg,
-        "gyro_bias": belief.mean[GYRO].tolist(),
+        "gravity": estimate.mean[GRAVITY].tolist(),
+        "gravity_sigma_deg": estimate.direction_deg,
+        "gyro_bias": estimate.mean[GYRO].tolist(),
         "gyro_bias_sigma": sigmas[GYRO].tolist(),
-        "accel_bias": belief.mean[ACCEL].tolist(),
+        "accel_bias": estimate.mean[ACCEL].tolist(),
         "accel_bias_sigma": sigmas[ACCEL].tolist(),
-        "T_imu_depth_turn": belief.mean[TURN].tolist(),
+        "T_imu_depth_turn": estimate.mean[TURN].tolist(),
         "T_imu_depth_turn_sigma": sigmas[TURN].tolist(),
-        "T_imu_depth_is_contradicted": is_contradicted(belief),
+        "T_imu_depth_is_contradicted": is_contradicted(estimate),
         "gyro_residual": float(sigma[0]),
         "accel_residual": float(sigma[1]),
     }
 
 
-def is_contradicted(belief: Belief) -> bool:
+def is_contradicted(estimate: ImuEstimate) -> bool:
     """Whether readings and images say beyond chance that the unit is turned from where T_imu_depth has it, and by
     more than what draws images by a thousandth of the motion passes for."""
-    turn = belief.mean[TURN]
-    beyond = float(turn @ np.linalg.solve(belief.covariance[TURN, TURN], turn))
+    turn = estimate.mean[TURN]
+    beyond = float(turn @ np.linalg.solve(estimate.covariance[TURN, TURN], turn))
     return beyond > _BEYOND and bool(np.linalg.norm(turn) > _WORTH_SAYING)
 
 
@@ -60,7 +60,7 @@ def text(found: dict[str, Any], begin: float, bridged: int) -> str:
 
 
 def refined_text(found: dict[str, Any]) -> str:
-    """One line of `believed`, of a whole recording."""
+    """One line of `estimate_dict`, of a whole recording."""
     return _summary(found, "")
 
 

@@ -1,8 +1,7 @@
 """Residuals of gyroscope and accelerometer at their own stamps, by the spline's control points, biases and gravity.
 
-r = [ω_imu + b_g − gyro; a_imu − R_imu_world g + b_a − accel], with twist and rate taken to the unit by the adjoint of
-exp([0; φ]) T_imu_depth, lever arm included: a_imu = v̇ + ω × v there (DESIGN section 4). φ, a belief's turn, turns the
-unit where it sits.
+r = [ω_imu + b_g − gyro; f + b_a − accel] by `rstrack.inertial.factor`, of an IMU at exp([0; φ]) T_imu_depth: φ, an
+estimate's turn, turns it where it sits.
 """
 
 from __future__ import annotations
@@ -11,21 +10,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rsgen.array_types import FloatArray, IntArray
+from rsgen.array_types import BoolArray, FloatArray, IntArray
 from rsgen.geometry import so3
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.normal_equations import Quadratic
 from rstrack.data.imu.recording import ImuRecording
-from rstrack.inertial.belief import GRAVITY, SIZE, TURN, Belief
+from rstrack.inertial.estimate import GRAVITY, SIZE, TURN, ImuEstimate
 from rstrack.inertial.factor import ImuFactor, motion
-from rstrack.inertial.wild import wild
 
 # Readings within this part of the range's end are saturated, or may be.
 _SATURATED = 0.995
 
 
 @dataclass(frozen=True)
-class Samples:
+class ImuReadings:
     """n of a unit's samples: t (n,) s, values (n, 6) = [gyro; accel], counts (n, 6): whether a reading does."""
 
     t: FloatArray
@@ -33,8 +31,8 @@ class Samples:
     counts: FloatArray
 
     @classmethod
-    def of(cls, imu: ImuRecording) -> Samples:
-        """All of a recording; saturated readings, single wild ones, and those that are not numbers do not count."""
+    def of(cls, imu: ImuRecording) -> ImuReadings:
+        """All of a recording; saturated readings, outliers, and those that are not numbers do not count."""
         gyro = np.full_like(imu.accel, np.nan) if imu.gyro is None else imu.gyro
         values = np.concatenate([gyro, imu.accel], axis=1)
         limits = [np.inf if r is None else _SATURATED * r for r in (imu.noise.gyro_range, imu.noise.accel_range)]
@@ -42,21 +40,21 @@ class Samples:
         parts = (gyro, imu.noise.gyro_density * root), (imu.accel, imu.noise.accel_density * root)
         with np.errstate(invalid="ignore"):
             counts = np.isfinite(values) & (np.abs(values) < np.repeat(limits, 3))
-            counts &= ~np.concatenate([wild(part, sigma) for part, sigma in parts], axis=1)
+            counts &= ~np.concatenate([outliers(part, sigma) for part, sigma in parts], axis=1)
         return cls(np.asarray(imu.t, dtype=np.float64), np.where(counts, values, 0.0), counts.astype(np.float64))
 
-    def between(self, begin: float, end: float) -> Samples:
+    def between(self, begin: float, end: float) -> ImuReadings:
         """Those of begin ≤ t < end."""
         part = slice(*np.searchsorted(self.t, [begin, end]))
-        return Samples(self.t[part], self.values[part], self.counts[part])
+        return ImuReadings(self.t[part], self.values[part], self.counts[part])
 
     def __len__(self) -> int:
         return len(self.t)
 
 
 @dataclass(frozen=True)
-class Joint:
-    """½ xᵀ H x + gᵀ x over control points from `first` on and, last, the numbers of a `Belief`; cost: at x = 0."""
+class ImuQuadratic:
+    """½ xᵀ H x + gᵀ x over control points from `first` on and, last, the numbers of a `ImuEstimate`; cost: at x = 0."""
 
     first: int
     H: FloatArray
@@ -68,70 +66,77 @@ class Joint:
         """Control points."""
         return (len(self.g) - SIZE) // 6
 
-    def without_belief(self, belief: Belief, at: FloatArray) -> tuple[Quadratic, float, FloatArray]:
-        """Over the control points alone, a belief's numbers, here around `at` (12,), being best at every step and known
-        beforehand as `belief` says; the cost, and the best ones (12,) where no control point moves."""
-        z = slice(6 * self.count, None)
-        c = slice(0, 6 * self.count)
-        off = at - belief.mean
-        gradient = self.g[z] + belief.information @ off
-        solved = np.linalg.solve(self.H[z, z] + belief.information, np.column_stack([self.H[z, c], gradient]))
-        H = self.H[c, c] - self.H[c, z] @ solved[:, :-1]
-        g = self.g[c] - self.H[c, z] @ solved[:, -1]
-        cost = self.cost + 0.5 * float(off @ belief.information @ off) - 0.5 * float(gradient @ solved[:, -1])
-        return Quadratic(self.first, 0.5 * (H + H.T), g), cost, at - solved[:, -1]
+    def without_imu(self, estimate: ImuEstimate, at: FloatArray) -> tuple[Quadratic, float, FloatArray]:
+        """Over the control points alone, the IMU's numbers, here around `at` (12,), being best at every step and known
+        beforehand as `estimate` says; the cost, and the best ones (12,) where no control point moves."""
+        off = at - estimate.mean
+        gradient = self.g[6 * self.count :] + estimate.information @ off
+        model, step = without_tail(self.first, self.H, self.g, estimate.information, gradient)
+        cost = self.cost + 0.5 * float(off @ estimate.information @ off) - 0.5 * float(gradient @ step)
+        return model, cost, at - step
+
+
+def without_tail(
+    first: int, H: FloatArray, g: FloatArray, information: FloatArray, gradient: FloatArray
+) -> tuple[Quadratic, FloatArray]:  # fmt: skip
+    """H, g without the IMU's numbers, the last ones, of which there is more information (12, 12); and what these are
+    smaller by where they are best (12,). gradient (12,): by them, of all together."""
+    z, c = slice(len(g) - SIZE, None), slice(0, len(g) - SIZE)
+    solved = np.linalg.solve(H[z, z] + information, np.column_stack([H[z, c], gradient]))
+    rest = H[c, c] - H[c, z] @ solved[:, :-1]
+    return Quadratic(first, 0.5 * (rest + rest.T), g[c] - H[c, z] @ solved[:, -1]), np.asarray(solved[:, -1])
 
 
 @dataclass(frozen=True)
 class Scatter:
-    """Residuals r (n, 6), and by_belief (n, 6, 12) what a belief's numbers do to them."""
+    """Residuals r (n, 6), and by_imu (n, 6, 12) what an estimate's numbers do to them."""
 
     r: FloatArray
-    by_belief: FloatArray
+    by_imu: FloatArray
 
     def after(self, change: FloatArray) -> FloatArray:
         """(n, 6), where these have changed by (12,), to first order in the turn."""
-        return self.r + self.by_belief @ change
+        return self.r + self.by_imu @ change
 
 
 @dataclass(frozen=True)
-class Rows:
+class ImuResiduals:
     """Residuals of n samples, linearised: r (n, 6), J (n, 6, 36) their derivatives by the four control points and by a
-    belief's numbers, first (n,) the first of these control points."""
+    estimate's numbers, first (n,) the first of these control points."""
 
-    samples: Samples
+    samples: ImuReadings
     r: FloatArray
     J: FloatArray
     first: IntArray
 
     @classmethod
-    def of(cls, spline: Spline, samples: Samples, T_imu_depth: FloatArray, belief: FloatArray) -> Rows:
-        """Around a spline and a belief's numbers (12,). All samples' times must be within the spline."""
-        turn = belief[TURN]
+    def of(cls, spline: Spline, samples: ImuReadings, T_imu_depth: FloatArray, estimate: FloatArray) -> ImuResiduals:
+        """Around a spline and an estimate's numbers (12,). All samples' times must be within the spline."""
+        turn = estimate[TURN]
         a, b, c = so3.exp_coefficients(so3.squared_norm(turn))
         T_imu_depth = np.concatenate([so3.polynomial(turn, a, b) @ T_imu_depth[:3], T_imu_depth[3:]])
-        at = ImuFactor(motion(spline, samples.t), T_imu_depth, belief[GRAVITY])
+        at = ImuFactor(motion(spline, samples.t), T_imu_depth, estimate[GRAVITY])
         J = np.zeros((len(samples), 6, 24 + SIZE))
         J[:, :, :24] = at.by_motion
         J[:, :, 24:30] = np.eye(6)
         J[:, :, 30:33] = at.by_gravity
         # exp(φ + δ) = exp(Jl(φ) δ) exp(φ).
         J[:, :, 33:] = at.by_rotation @ so3.polynomial(turn, b, c)
-        return cls(samples, at.readings + belief[:6] - samples.values, J, at.motion.first)
+        return cls(samples, at.readings + estimate[:6] - samples.values, J, at.motion.first)
 
-    def until(self, end: float) -> Rows:
+    def until(self, end: float) -> ImuResiduals:
         """Those of samples before a time, s."""
         n = int(np.searchsorted(self.samples.t, end))
         samples = self.samples.between(-np.inf, end)
-        return Rows(samples, self.r[:n], self.J[:n], self.first[:n])
+        return ImuResiduals(samples, self.r[:n], self.J[:n], self.first[:n])
 
-    def moved(self, first: int, increments: FloatArray) -> Rows:
+    def moved(self, first: int, increments: FloatArray) -> ImuResiduals:
         """Where control points from number `first` on have moved by increments (k, 6)."""
         step = increments[self.first[:, None] - first + np.arange(4)].reshape(len(self.r), 24, 1)
-        return Rows(self.samples, self.r + (self.J[:, :, :24] @ step)[..., 0], self.J, self.first)
+        return ImuResiduals(self.samples, self.r + (self.J[:, :, :24] @ step)[..., 0], self.J, self.first)
 
-    def summed(self, sigma: FloatArray) -> tuple[Joint | None, Scatter]:
-        """Their normal equations, and how they scatter about the spline and a belief's numbers.
+    def summed(self, sigma: FloatArray) -> tuple[ImuQuadratic | None, Scatter]:
+        """Their normal equations, and how they scatter about the spline and an estimate's numbers.
 
         sigma (2,): of a gyroscope's reading (rad/s), of an accelerometer's (m/s²). None without samples.
         """
@@ -151,4 +156,21 @@ class Rows:
             for to, own in ((slice(low, low + 24), slice(0, 24)), (tail, slice(24, None))):
                 total[to, tail] += squares[own, 24:]
                 total[to, low : low + 24] += squares[own, :24]
-        return Joint(first, total[:-1, :-1], total[:-1, -1], 0.5 * float(total[-1, -1])), scatter
+        return ImuQuadratic(first, total[:-1, :-1], total[:-1, -1], 0.5 * float(total[-1, -1])), scatter
+
+
+# An outlier stands out from between its neighbours by so many σ of the noise, and so many times as far as the four
+# around it differ: motion that sudden would show in these, too. A bus that drops a bit leaves such readings.
+_SIGMAS, _TIMES = 20.0, 3.0
+
+
+def outliers(values: FloatArray, sigma: float) -> BoolArray:
+    """Which readings (n, 3), even ones, of noise sigma are. The first and the last two are not looked at, nor what is
+    beside no number."""
+    found = np.zeros(values.shape, dtype=bool)
+    if len(values) < 5:
+        return found
+    a, b, x, c, d = (values[i : len(values) - 4 + i] for i in range(5))
+    usual = np.abs(b - a) + np.abs(c - b) + np.abs(d - c)
+    found[2:-2] = np.abs(x - 0.5 * (b + c)) > _SIGMAS * sigma + _TIMES * usual
+    return found

@@ -1,4 +1,4 @@
-"""A fixed-lag smoother over the newest control points and a belief: what all images and samples so far say.
+"""A fixed-lag smoother over the newest control points and an IMU's estimate: what all images and samples so far say.
 
 Each image's normal equations and each sample are added once. Control points that nothing new depends on are
 marginalised, not fixed: a spline held where it was estimated would make biases look far better known than they are.
@@ -6,15 +6,17 @@ marginalised, not fixed: a spline held where it was estimated would make biases 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from rsgen.array_types import FloatArray
+from rsgen.geometry.spline import Spline
 from rstrack.alignment.normal_equations import Quadratic
 from rstrack.alignment.spline_state import SplineState
-from rstrack.inertial.belief import GRAVITY, SIZE, STRENGTH, Belief
-from rstrack.inertial.residuals import Joint
+from rstrack.inertial.estimate import GRAVITY, SIZE, STRENGTH, ImuEstimate
+from rstrack.inertial.residuals import ImuQuadratic, without_tail
 
 # Information of a control point that nothing tells (σ 100 m, rad): systems are never singular.
 _NOTHING = 1e-4
@@ -22,19 +24,19 @@ _NOTHING = 1e-4
 
 @dataclass
 class Smoother:
-    """½ xᵀ H x + gᵀ x over control points `first`... and a belief's numbers, as increments since the control points had
-    received `at` (k, 6) and around `belief` (12,)."""
+    """½ xᵀ H x + gᵀ x over control points `first`... and the IMU's numbers, as increments since the control points had
+    received `at` (k, 6) and around `estimate` (12,)."""
 
     first: int
     H: FloatArray
     g: FloatArray
     at: FloatArray
-    belief: FloatArray
+    estimate: FloatArray
 
     @classmethod
-    def start(cls, belief: Belief) -> Smoother:
+    def start(cls, estimate: ImuEstimate) -> Smoother:
         """Without any control points."""
-        return cls(0, belief.information.copy(), np.zeros(SIZE), np.zeros((0, 6)), belief.mean)
+        return cls(0, estimate.information.copy(), np.zeros(SIZE), np.zeros((0, 6)), estimate.mean)
 
     @property
     def last(self) -> int:
@@ -67,29 +69,25 @@ class Smoother:
 
     def copy(self) -> Smoother:
         """One to which can be added without adding to this one."""
-        return Smoother(self.first, self.H.copy(), self.g.copy(), self.at, self.belief)
+        return Smoother(self.first, self.H.copy(), self.g.copy(), self.at, self.estimate)
 
-    def without_belief(self, strength: float) -> tuple[Quadratic, float]:
-        """Over the control points alone, the belief, gravity of a known strength (m/s²), being best at every step; and
-        how much less that costs here than what is believed."""
-        z, c = slice(len(self.g) - SIZE, None), slice(0, len(self.g) - SIZE)
-        u, size = np.zeros(SIZE), float(np.linalg.norm(self.belief[GRAVITY]))
-        u[GRAVITY] = self.belief[GRAVITY] / max(1e-9, size)
-        gradient = self.g[z] + u * (size - strength) / STRENGTH**2
-        information = self.H[z, z] + np.outer(u, u) / STRENGTH**2
-        solved = np.linalg.solve(information, np.column_stack([self.H[z, c], gradient]))
-        H = self.H[c, c] - self.H[c, z] @ solved[:, :-1]
-        g = self.g[c] - self.H[c, z] @ solved[:, -1]
-        return Quadratic(self.first, 0.5 * (H + H.T), g), 0.5 * float(gradient @ solved[:, -1])
+    def without_imu(self, strength: float) -> tuple[Quadratic, float]:
+        """Over the control points alone, the IMU's numbers, gravity of a known strength (m/s²), being best at every
+        step; and how much less that costs here than the estimate does."""
+        u, size = np.zeros(SIZE), float(np.linalg.norm(self.estimate[GRAVITY]))
+        u[GRAVITY] = self.estimate[GRAVITY] / max(1e-9, size)
+        gradient = self.g[-SIZE:] + u * (size - strength) / STRENGTH**2
+        model, step = without_tail(self.first, self.H, self.g, np.outer(u, u) / STRENGTH**2, gradient)
+        return model, 0.5 * float(gradient @ step)
 
-    def around(self, belief: FloatArray) -> None:
-        """Be around another belief (12,)."""
-        self.g = self.g + self.H[:, -SIZE:] @ (belief - self.belief)
-        self.belief = belief.copy()
+    def around(self, estimate: FloatArray) -> None:
+        """Be around another estimate (12,)."""
+        self.g = self.g + self.H[:, -SIZE:] @ (estimate - self.estimate)
+        self.estimate = estimate.copy()
 
-    def add(self, model: Quadratic | Joint) -> None:
-        """What is around the same state (and belief). Control points before the first are taken to be fixed."""
-        tail = SIZE if isinstance(model, Joint) else 0
+    def add(self, model: Quadratic | ImuQuadratic) -> None:
+        """What is around the same state (and estimate). Control points before the first are taken to be fixed."""
+        tail = SIZE if isinstance(model, ImuQuadratic) else 0
         count = (len(model.g) - tail) // 6
         low, high = max(model.first, self.first), min(model.first + count, self.last)
         if low >= high:
@@ -105,7 +103,7 @@ class Smoother:
                 self.H[to, to_other] += model.H[own, own_other]
 
     def diffuse(self, variance: FloatArray) -> None:
-        """The belief's numbers walk on: variances (12,) of their steps."""
+        """The estimate's numbers walk on: variances (12,) of their steps."""
         walks = np.flatnonzero(variance > 0.0)
         ways = np.zeros((len(self.g), len(walks)))
         ways[len(self.g) - SIZE + walks, np.arange(len(walks))] = 1.0
@@ -119,7 +117,7 @@ class Smoother:
         """
         sizes, axes = np.linalg.eigh(covariance)
         covariance = (axes * np.maximum(0.0, sizes)) @ axes.T
-        x, y, z = self.belief[GRAVITY]
+        x, y, z = self.estimate[GRAVITY]
         ways = np.concatenate([np.tile(np.eye(6), (len(self.at), 1)), np.zeros((SIZE, 6))])
         ways[6 * len(self.at) :][GRAVITY, 3:] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]  # φ × g
         self._loosen(ways, covariance)
@@ -144,8 +142,40 @@ class Smoother:
         self.H, self.at = 0.5 * (H + H.T), self.at[count // 6 :]
         self.first += count // 6
 
-    def marginal(self) -> Belief:
-        """What is believed."""
-        only = Smoother(self.first, self.H, self.g, self.at, self.belief)
+    def marginal(self) -> ImuEstimate:
+        """The estimate."""
+        only = Smoother(self.first, self.H, self.g, self.at, self.estimate)
         only.forget(self.last)
-        return Belief(self.belief - np.linalg.solve(only.H, only.g), only.H)
+        return ImuEstimate(self.estimate - np.linalg.solve(only.H, only.g), only.H)
+
+
+# Increments of control points (m, rad) that leave the samples' derivatives as they were.
+_SAME = 1e-2
+
+
+class ReusedPrior:
+    """A `rstrack.alignment.priors.Prior` of an IMU, around a state.
+
+    summed: its model around the state as it is now, and the cost there. first, end: the control points that it depends
+    on, and how many there were of all.
+    """
+
+    def __init__(self, state: SplineState, first: int, summed: Callable[[], tuple[Quadratic, float]]) -> None:
+        self.state, self.first, self.end = state, first, state.end
+        self._summed = summed
+        self._known: tuple[Quadratic, float] | None = None
+        self._at: FloatArray = np.zeros((0, 6))
+
+    def __call__(self, spline: Spline) -> tuple[Quadratic, float]:
+        if self._known is not None:
+            model, cost = self._known
+            moved = self.state.received(model.first, model.last) - self._at
+            if np.abs(moved).max() < _SAME:
+                step = moved.ravel()
+                turned = model.H @ step
+                there = Quadratic(model.first, model.H, model.g + turned)
+                return there, cost + float(step @ (model.g + 0.5 * turned))
+        self._known = self._summed()
+        model, _ = self._known
+        self._at = self.state.received(model.first, model.last)
+        return self._known

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from rsgen.console.tables import Entry, Table, fixed, significant
-from rstrack.calibration.record import Change, LensMap, Parameter, Record
+from rstrack.calibration.record import CalibrationRecord, Change, LensMap, Parameter
 from rstrack.charts.chart import COLORS, ChangeChart, Curve, LensChart, MovedValue, StripChart, broken
 from rstrack.report.page import Block, Card, CardRow, Note, Page, PageSection, Plot, TextFile
 
@@ -23,7 +23,7 @@ _SIGMA = (
 )
 
 
-def calibration_page(record: Record) -> Page:
+def calibration_page(record: CalibrationRecord) -> Page:
     """A page of its own."""
     count, frames = len(record.stretches), sum(end - begin for begin, end in record.stretches)
     return Page(
@@ -41,13 +41,13 @@ def calibration_page(record: Record) -> Page:
     )  # fmt: skip
 
 
-def calibration_section(record: Record) -> PageSection:
+def calibration_section(record: CalibrationRecord) -> PageSection:
     """All of it but the warnings as one part of a run's page."""
     blocks = (*_values(record), *_undetermined(record), *_residuals(record), *_where(record), *_camera_file(record))
     return PageSection("calibration", "Calibration", blocks)
 
 
-def calibration_cards(record: Record) -> tuple[Card, ...]:
+def calibration_cards(record: CalibrationRecord) -> tuple[Card, ...]:
     """Whether it converged, what was found, and by how much residuals fell."""
     found, asked = len(record.parameters) - len(record.undetermined), len(record.parameters)
     depth, intensity = record.residuals.depth_m, record.residuals.intensity
@@ -60,7 +60,7 @@ def calibration_cards(record: Record) -> tuple[Card, ...]:
     )  # fmt: skip
 
 
-def calibration_warnings(record: Record) -> tuple[str, ...]:
+def calibration_warnings(record: CalibrationRecord) -> tuple[str, ...]:
     """What must not be overlooked."""
     warnings = []
     if not record.finished:
@@ -76,7 +76,7 @@ def calibration_warnings(record: Record) -> tuple[str, ...]:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _verdict(record: Record) -> Card:
+def _verdict(record: CalibrationRecord) -> Card:
     if not record.finished:
         return Card("Interrupted", "before it had converged", "best values so far", "bad")
     if not record.converged:
@@ -98,7 +98,7 @@ def _names(parameters: Iterable[Parameter]) -> str:
     return "; ".join(f"{head} ({', '.join(rest)})" if rest != [""] else head for head, rest in by_head.items())
 
 
-def _values(record: Record) -> tuple[Block, ...]:
+def _values(record: CalibrationRecord) -> tuple[Block, ...]:
     if not record.parameters:
         return (Note("Nothing was asked for."),)
     head = ("value", "found", "± 2 σ", "began at", "change", "unit")
@@ -124,7 +124,7 @@ def _digits(error: float) -> int:
     return min(6, max(0, 1 - math.floor(math.log10(error)))) if error > 0.0 else 3
 
 
-def _undetermined(record: Record) -> tuple[Block, ...]:
+def _undetermined(record: CalibrationRecord) -> tuple[Block, ...]:
     if not record.undetermined:
         return ()
     rows = tuple(
@@ -141,7 +141,7 @@ def _undetermined(record: Record) -> tuple[Block, ...]:
     return Table(head, rows, "Not told by this recording", words=(0, 3)), seen
 
 
-def _residuals(record: Record) -> tuple[Block, ...]:
+def _residuals(record: CalibrationRecord) -> tuple[Block, ...]:
     depth, intensity = record.residuals.depth_m, record.residuals.intensity
     rows = (_fall("depth, mm", depth, 1e3), _fall("intensity, % of white", intensity, 1e2))
     return Table(("residual", "before", "after", "change"), rows, "Residuals before and after"), Note(_BEFORE)
@@ -152,18 +152,18 @@ def _fall(name: str, change: Change, factor: float) -> tuple[str, ...]:
     return name, significant(change.before, 3, factor), significant(change.after, 3, factor), f"{part:+.0f} %"
 
 
-def _where(record: Record) -> tuple[Block, ...]:
+def _where(record: CalibrationRecord) -> tuple[Block, ...]:
     return (Plot(strip_chart(record)),) if record.stretches else ()
 
 
-def _camera_file(record: Record) -> tuple[Block, ...]:
+def _camera_file(record: CalibrationRecord) -> tuple[Block, ...]:
     warning = () if record.finished and record.converged else (
         Note("Not converged: do not use this file.", is_warning=True),)  # fmt: skip
     return *warning, TextFile("camera.yaml", record.camera_file), Note(
         "rstrack track RECORDING --camera camera.yaml --out RUN tracks with it.")  # fmt: skip
 
 
-def lens_charts(record: Record) -> tuple[LensChart, ...]:
+def lens_charts(record: CalibrationRecord) -> tuple[LensChart, ...]:
     """Where each lens that was looked for puts points, against what it began with."""
     return tuple(_lens_chart(name, lens) for name, lens in record.lens_maps.items() if lens.at_px)
 
@@ -180,7 +180,7 @@ def _lens_chart(name: str, lens: LensMap) -> LensChart:
     return LensChart(f"The {name} camera's lens", at, moved, 2.0 * np.array(lens.sigma_px)[:, 0], magnified, note)
 
 
-def change_chart(record: Record) -> ChangeChart:
+def change_chart(record: CalibrationRecord) -> ChangeChart:
     """Values against what they were before."""
     by_unit: dict[str, list[MovedValue]] = {}
     for p in record.parameters.values():
@@ -192,7 +192,7 @@ def change_chart(record: Record) -> ChangeChart:
     return ChangeChart("How far values moved from their starts", tuple((u, tuple(m)) for u, m in by_unit.items()), note)
 
 
-def strip_chart(record: Record) -> StripChart:
+def strip_chart(record: CalibrationRecord) -> StripChart:
     """Which stretches of the recording tell each value, and how the camera moved there."""
     found = [p for p in record.parameters.values() if p.is_found]
     parts = np.array([p.told_by_stretch for p in found]).reshape(len(found), len(record.stretches))

@@ -19,10 +19,9 @@ from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.adjustment.closing import Closed, closed
+from rstrack.adjustment.closing import Closed, Moves, closed
 from rstrack.adjustment.graph import Graph, Sighting, State
 from rstrack.adjustment.loops import Loop, LoopSearch
-from rstrack.adjustment.moves import Moves
 from rstrack.adjustment.rigid import Judge
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Solved

@@ -24,9 +24,8 @@ from rsgen.device.arrays import Engine
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.adjustment.closing import Closed, closed
+from rstrack.adjustment.closing import Closed, Moves, closed
 from rstrack.adjustment.loops import Loop, LoopSearch
-from rstrack.adjustment.moves import Moves
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.rig import Frame, Rig
 from rstrack.images.device_frame import Timer, untimed

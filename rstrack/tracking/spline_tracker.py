@@ -17,7 +17,7 @@ from rsgen.array_types import FloatArray
 from rsgen.device.arrays import Engine
 from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
-from rstrack.adjustment.graph import Seen
+from rstrack.adjustment.chain import KeyframeModel
 from rstrack.alignment.linearise import Terms
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.moving_masks import MovingMasks
@@ -147,7 +147,7 @@ class Tracker:
         return self._track.keyframes.archive
 
     @property
-    def seen(self) -> list[Seen]:
+    def seen(self) -> list[KeyframeModel]:
         """What its frames said of the spline's control points."""
         return self._track.chain.seen
 

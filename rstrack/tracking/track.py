@@ -24,7 +24,7 @@ from rstrack.data.rig import Frame, Rig
 from rstrack.images.device_frame import DeviceFrame, DeviceRig, Timer
 from rstrack.images.pyramid import DepthImage
 from rstrack.inertial.band import with_knots
-from rstrack.inertial.belief import ALIKE
+from rstrack.inertial.estimate import ALIKE
 from rstrack.inertial.inertia import Inertia
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker

@@ -25,7 +25,7 @@ from rstrack.alignment.priors import (
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.inertial.inertia import Inertia
-from rstrack.inertial.kept import Kept
+from rstrack.inertial.smoother import ReusedPrior
 from rstrack.keyframes.keyframe import Reference
 
 # Metres and radians within which the reference's pose is held while its own control points are free.
@@ -56,7 +56,7 @@ class Window:
         self.state, self.piece = state, piece
         self.first_free = piece
         self.active: list[Observation] = []
-        self._led: Kept | None = None
+        self._led: ReusedPrior | None = None
         self._is_held = False
 
     @classmethod
@@ -152,7 +152,7 @@ class Window:
         """
         free = self.first_free, self.state.end
         priors = self._priors(free)
-        bandwidth = 6 * (free[1] - free[0]) if coupled or isinstance(priors[-1], Kept) else 24
+        bandwidth = 6 * (free[1] - free[0]) if coupled or isinstance(priors[-1], ReusedPrior) else 24
         priors += [] if gauge is None else [_pose_prior(gauge)]
         if self.piece > 0 and self.first_free == self.piece:
             priors.append(self._velocity_prior(free))

@@ -162,7 +162,7 @@ class Corrections:
         return sparse.csr_array((values.ravel(), columns.ravel(), ends), shape=(m * n, 6 * count))
 
 
-class Prediction:
+class ImuPrediction:
     """What an IMU with such values reads at stamps (n,), s, on a track with corrections x (k, 6), and the derivatives.
 
     Raises UserError: taken outside the track.

@@ -18,7 +18,7 @@ from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
 from rstrack.calibration.imu.model import CorrectedTrack, ImuUnknowns
 from rstrack.calibration.imu.result import ImuCalibration
-from rstrack.calibration.imu.solve import Data, solve
+from rstrack.calibration.imu.solve import ImuData, solve
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import read_estimate
 from rstrack.options import Options
@@ -94,7 +94,7 @@ def calibrate_imu(dataset: Dataset, followed: Followed, progress: Progress = no_
     frame_times = frame_times[(frame_times > first) & (frame_times < last)]
     noise, readings = imu.noise, np.concatenate([imu.gyro, imu.accel], axis=1)[inside]
     limits = [np.inf if limit is None else _SATURATED * limit for limit in (noise.gyro_range, noise.accel_range)]
-    data = Data(
+    data = ImuData(
         CorrectedTrack(followed.spline, min(max(parts, 1), _MOST_PARTS)), imu.t[inside], readings,
         np.abs(readings) < np.repeat(limits, 3), frame_times, noise, imu.rate_hz,
     )  # fmt: skip

@@ -3,7 +3,7 @@
 Unknown beside the IMU are the track's corrections x (see `model`), and its drift: world rotation and shift, a line
 between values a second apart, which walk. Of the track its poses at the frames are taken for measured, with white
 errors about that drift. How large errors are is found on the way: of poses and of the drift's steps by their residuals,
-of both sensors likewise, but never below what is stated. Samples count robustly (Huber).
+of both sensors likewise, but never below what is stated. ImuReadings count robustly (Huber).
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from scipy.linalg import cho_solve, cho_solve_banded, cholesky_banded
 
 from rsgen.array_types import BoolArray, FloatArray
 from rsgen.errors import UserError
-from rstrack.calibration.imu.model import COUNT, CorrectedTrack, Corrections, ImuUnknowns, Prediction, hats
+from rstrack.calibration.imu.model import COUNT, CorrectedTrack, Corrections, ImuPrediction, ImuUnknowns, hats
 from rstrack.data.imu.description import ImuNoise
-from rstrack.inertial.belief import bias_walk
+from rstrack.inertial.estimate import bias_walk
 
 _BAND = 24  # of four control points of six
 _HUBER = 2.5
@@ -41,7 +41,7 @@ _TELLS_LITTLE = "IMU: the recording tells too little of it: record 20 s with tur
 
 
 @dataclass(frozen=True)
-class Data:
+class ImuData:
     """What is given. stamps (n,), readings (n, 6) = [gyro; accel] and which of them count (n, 6); frame_times (k,):
     when the track's poses hold, s; noise and rate_hz as stated."""
 
@@ -76,7 +76,7 @@ class ErrorSizes:
 
 
 @dataclass(frozen=True)
-class Normal:
+class BorderedSystem:
     """band (24, 6 k), lower, and a (6 k,): of the corrections; D (q, q), b (q,): of the IMU, then of the
     drift; C (6 k, q)."""
 
@@ -86,13 +86,13 @@ class Normal:
     D: FloatArray
     b: FloatArray
 
-    def plus(self, other: Normal) -> Normal:
+    def plus(self, other: BorderedSystem) -> BorderedSystem:
         """Both together: this one has no drift yet."""
         size, more = len(self.b), len(other.b) - len(self.b)
         D, b, C = other.D.copy(), other.b.copy(), other.C + np.pad(self.C, ((0, 0), (0, more)))
         D[:size, :size] += self.D
         b[:size] += self.b
-        return Normal(self.band + other.band, self.a + other.a, C, D, b)
+        return BorderedSystem(self.band + other.band, self.a + other.a, C, D, b)
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class ImuSolution:
     iterations: int
 
 
-def solve(data: Data, imu: ImuUnknowns, done: Callable[[int], None] = lambda _: None) -> ImuSolution:
+def solve(data: ImuData, imu: ImuUnknowns, done: Callable[[int], None] = lambda _: None) -> ImuSolution:
     """From a start on. done: told of each step. Raises UserError: it does not settle, or too little is told."""
     x = np.zeros((data.track.count, 6))
     R_frames = data.track.spline.pose(data.frame_times)[:, :3, :3]
@@ -143,22 +143,22 @@ def solve(data: Data, imu: ImuUnknowns, done: Callable[[int], None] = lambda _: 
     raise UserError(f"{_TELLS_LITTLE} (no solution after {_MOST} steps)")
 
 
-def _samples(data: Data, imu: ImuUnknowns, x: FloatArray, sizes: ErrorSizes) -> Normal:
+def _samples(data: ImuData, imu: ImuUnknowns, x: FloatArray, sizes: ErrorSizes) -> BorderedSystem:
     """Of both sensors' samples, weighted by their residuals. Raises UserError: taken outside the track."""
-    at = Prediction(data.track, imu, x, data.stamps)
+    at = ImuPrediction(data.track, imu, x, data.stamps)
     sigma = np.repeat([sizes.gyro, sizes.accel], 3)
     r = (data.readings - at.readings) / sigma
     weight = np.sqrt(np.minimum(1.0, _HUBER / np.maximum(np.abs(r), 1e-12))) * data.counts
     scaled = (weight / sigma)[..., None]
     J = at.corrections.spread(at.by_corrections * scaled, len(x))
     B, r = (at.by_imu * scaled).reshape(-1, imu.size), (r * weight).ravel()
-    return Normal(_banded(J.T @ J, x.size), J.T @ r, J.T @ B, B.T @ B, B.T @ r)
+    return BorderedSystem(_banded(J.T @ J, x.size), J.T @ r, J.T @ B, B.T @ B, B.T @ r)
 
 
 def _tracked_poses(
     at_frames: Corrections, R_frames: FloatArray, x: FloatArray, slow: FloatArray, weights: FloatArray,
     sizes: ErrorSizes, size: int,
-) -> Normal:  # fmt: skip
+) -> BorderedSystem:  # fmt: skip
     """Of the track's poses about its drift, and of corrections that nothing tells.
 
     R_frames (frames, 3, 3): R_world_depth. slow (m, 6): the drift; weights (frames, m): of its values at the frames;
@@ -174,7 +174,7 @@ def _tracked_poses(
     free = np.tile(np.repeat(1.0 / np.square(_FREE), 3), len(x))
     band = _banded(J.T @ J, x.size)
     band[0] += free
-    return Normal(band, J.T @ r - free * x.ravel(), J.T @ B, B.T @ B, B.T @ r)
+    return BorderedSystem(band, J.T @ r - free * x.ravel(), J.T @ B, B.T @ B, B.T @ r)
 
 
 def _known(
@@ -224,10 +224,10 @@ def _drift(R_world_depth: FloatArray, slow: FloatArray) -> FloatArray:
 
 
 def _measured(
-    data: Data, imu: ImuUnknowns, x: FloatArray, about: FloatArray, steps: FloatArray, before: ErrorSizes
+    data: ImuData, imu: ImuUnknowns, x: FloatArray, about: FloatArray, steps: FloatArray, before: ErrorSizes
 ) -> ErrorSizes:
     """Errors' sizes by what is left: robustly of samples, where many are."""
-    left = np.abs(data.readings - Prediction(data.track, imu, x, data.stamps).readings)
+    left = np.abs(data.readings - ImuPrediction(data.track, imu, x, data.stamps).readings)
     gyro, accel = (
         max(stated, 1.4826 * float(np.median(left[:, part][data.counts[:, part]])))
         for stated, part in zip(data.stated_sigmas, (slice(3), slice(3, 6)), strict=True)

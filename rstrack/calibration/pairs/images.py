@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rsgen.array_types import FloatArray, IntArray
+from rsgen.array_types import FloatArray
 from rsgen.device.arrays import Engine
 from rsgen.device.lens import Lens
 from rsgen.geometry import se3
@@ -20,6 +20,7 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import block_counts
+from rstrack.alignment.normal_equations import by_points
 from rstrack.calibration.parameters import DRIFT, EXTRINSICS, POSES, Parameters
 from rstrack.images.line_poses import rows_of
 from rstrack.images.sampling import EDGE
@@ -32,7 +33,7 @@ def pair_lens(camera: Camera, shutter: Shutter) -> Lens:
 
 
 @dataclass(frozen=True)
-class Taken:
+class ImageTiming:
     """When an image was taken. lens: see `pair_lens`. stamp: s, as the dataset has it; exposure_s: of a line."""
 
     lens: Lens
@@ -58,7 +59,7 @@ class Taken:
 
 
 @dataclass(frozen=True)
-class Lines:
+class LinePoses:
     """The lines of an image for some spline and parameters.
 
     T_world_cam (lines, 4, 4); twist (lines, 6): the camera's own per line delay. Derivatives of the twist, in the
@@ -81,7 +82,7 @@ class Lines:
         return np.concatenate([rows_of(se3.inverse(T_base_world @ self.T_world_cam)), self.twist], axis=1)
 
 
-def lines_of(images: Sequence[Taken], spline: Spline, p: Parameters) -> list[Lines]:
+def lines_of(images: Sequence[ImageTiming], spline: Spline, p: Parameters) -> list[LinePoses]:
     """Where the lines of images were, which one camera took, and what that depends on.
 
     A line's time is begin + readout l / lines: a later one moves its pose by its velocity. Extrinsics move the colour
@@ -96,7 +97,8 @@ def lines_of(images: Sequence[Taken], spline: Spline, p: Parameters) -> list[Lin
     blocks, _, per, _ = block_counts(lens, lens)
     start = np.arange(blocks) * per
     middle = 0.5 * (start + np.minimum(start + per, count) - 1) / count
-    t = _within(spline, first + readout * np.concatenate([np.arange(count) / count, middle]))
+    # Times that a step too far has led out of the spline are brought back: the next one leads back.
+    t = np.clip(first + readout * np.concatenate([np.arange(count) / count, middle]), spline.t_begin, spline.t_end)
     T_world_body, velocity = spline.pose_and_velocity(t)
     T_cam_body = np.eye(4) if is_depth else p.T_color_depth
     T_world_cam = T_world_body[:, :count] @ se3.inverse(T_cam_body)
@@ -114,26 +116,15 @@ def lines_of(images: Sequence[Taken], spline: Spline, p: Parameters) -> list[Lin
         by_parameters[..., DRIFT] = w_world * since[:, None, None]
         by_parameters[..., EXTRINSICS] = -Ad @ se3.adjoint(se3.inverse(T_cam_body))
     points, J = spline.pose_jacobian(t[:, count:])
-    moved = [_by_points(points[k], J[k]) for k in range(len(images))]
-    return [Lines(T_world_cam[k], twist[k], *moved[k], by_parameters[k]) for k in range(len(images))]
+    found = []
+    for k, at in enumerate(points):
+        begin, several = int(at.min()), int(np.ptp(at)) + 4
+        moved = by_points(at, J[k], begin, several)
+        found.append(LinePoses(T_world_cam[k], twist[k], begin, moved, by_parameters[k]))
+    return found
 
 
-def _by_points(points: IntArray, J: FloatArray) -> tuple[int, FloatArray]:
-    """Of blocks that four control points move, from `points` (blocks,) on, by J (blocks, 4, 6, 6): the first of all
-    these points, and the derivatives (blocks, 6, 6k) by it and those that follow."""
-    first, rows = int(points.min()), np.arange(len(points))
-    out = np.zeros((len(points), 6, int(points.max()) - first + 4, 6))
-    for i in range(4):
-        out[rows, :, points - first + i] = J[:, i]
-    return first, out.reshape(len(points), 6, -1)
-
-
-def _within(spline: Spline, t: FloatArray) -> FloatArray:
-    """Times that a step too far has led out of the spline are brought back: the next one leads back."""
-    return np.clip(t, spline.t_begin, spline.t_end)
-
-
-def span(images: Sequence[Taken], p: Parameters) -> tuple[float, float]:
+def span(images: Sequence[ImageTiming], p: Parameters) -> tuple[float, float]:
     """Times (s) within which the lines of all images lie."""
     spans = [image.span(p) for image in images]
     return min(begin for begin, _ in spans), max(end for _, end in spans)
@@ -148,7 +139,7 @@ Float32Image = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class Surface:
+class DepthSurface:
     """A depth image that others are compared with, on the device: inverse depth (1/m, 0 missing) averaged over a
     window, its slopes by normalised coordinates, how far averaging may have moved it (m), and z (m) of what the colour
     camera can see of it, else 0. median_depth, bound: see `Scaling`.
@@ -163,7 +154,7 @@ class Surface:
     bound: float
 
 
-def surface_of(e: Engine, rho: Float32Image, fx: float, fy: float, baseline_m: float = 0.0) -> Surface:
+def surface_of(e: Engine, rho: Float32Image, fx: float, fy: float, baseline_m: float = 0.0) -> DepthSurface:
     """Of `averaged` inverse depth (h, w).
 
     baseline_m: at most so far is the colour camera away, from where nearer things hide some of what is seen.
@@ -178,7 +169,7 @@ def surface_of(e: Engine, rho: Float32Image, fx: float, fy: float, baseline_m: f
     nearest = np.asarray(cv2.dilate(rho, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)))
     shown = np.where((z > 0) & (nearest < np.float32(1.0 + _HIDES) * rho), z, np.float32(0.0))
     on_device = e.upload(rho), e.upload(slope_x), e.upload(slope_y), e.upload(roughness), e.upload(shown)
-    return Surface(*on_device, *depth_scaling(rho))
+    return DepthSurface(*on_device, *depth_scaling(rho))
 
 
 def averaged(rho: Float32Image) -> Float32Image:

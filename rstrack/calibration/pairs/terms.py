@@ -14,7 +14,8 @@ from rsgen.device.arrays import Engine, Kernels
 from rsgen.device.lens import Lens
 from rsgen.geometry.camera import Camera
 from rstrack.alignment.block_sums import BlockSums, Scaling, block_counts
-from rstrack.calibration.pairs.images import Surface, pair_lens
+from rstrack.alignment.weights import FLOOR_DEPTH, GATE_INTENSITY, GATE_SIGMAS
+from rstrack.calibration.pairs.images import DepthSurface, pair_lens
 from rstrack.calibration.pairs.kernels import ColorPairInput, DepthPairInput, color_pair_kernel, depth_pair_kernel
 from rstrack.calibration.pairs.optics import Asked, Optics, camera_table, error_table, in_units, units
 from rstrack.calibration.parameters import COLOR_LENS, COUNT, DEPTH, DEPTH_ERROR, DEPTH_LENS, LENS, Parameters, changed
@@ -23,9 +24,6 @@ from rstrack.data.rig import NO_DEPTH_ERROR, DepthError
 from rstrack.images.line_poses import Exposure
 from rstrack.images.pyramid import camera_rays
 
-# Gates: residuals beyond are outliers for certain, in σ (depth) and intensity; and smallest credible σ (m, intensity).
-GATE_SIGMAS, GATE_INTENSITY = 5.0, 0.3
-FLOOR_DEPTH, FLOOR_INTENSITY = 2e-4, 1.0 / 255.0
 # Part of σ by which the averaging may have bent a pixel's surface.
 _SMOOTH = 0.25
 # Points of a depth image that are compared, about: what a calibration does not know is far more than their noise.
@@ -65,7 +63,13 @@ class PairTerms:
         return changed(self.depth.camera, depth), changed(self.color.camera, p.color_lens)
 
     def by_depth(
-        self, z: Any, surface: Surface, to_base: FloatArray, ref_from_base: FloatArray, optics: Optics, sigma: float
+        self,
+        z: Any,
+        surface: DepthSurface,
+        to_base: FloatArray,
+        ref_from_base: FloatArray,
+        optics: Optics,
+        sigma: float,
     ) -> Callable[[], BlockSums]:
         """A depth image's z against a surface; σ in m. The device works until what this returns is called."""
         asked, stride, bound = self.asked, self.stride, surface.bound
@@ -77,7 +81,7 @@ class PairTerms:
         return lambda: in_units(scaling.unpack(raw.numpy(), current, reference, len(unit)), unit)
 
     def by_color(
-        self, images: tuple[Any, Any], surface: Surface, to_base: FloatArray, from_base: FloatArray,
+        self, images: tuple[Any, Any], surface: DepthSurface, to_base: FloatArray, from_base: FloatArray,
         ref_from_base: FloatArray, optics: Optics, bound: float, brightness: FloatArray, sigma: float, level: int,
     ) -> Callable[[], BlockSums]:  # fmt: skip
         """A colour image against the reference's, both given as intensities of a level.
@@ -94,8 +98,8 @@ class PairTerms:
         return lambda: in_units(scaling.unpack(raw.numpy(), current, reference, len(unit)), unit)
 
     def depth_input(
-        self, z: Any, surface: Surface, to_base: FloatArray, ref_from_base: FloatArray, optics: Optics, sigma: float,
-        scaling: Scaling,
+        self, z: Any, surface: DepthSurface, to_base: FloatArray, ref_from_base: FloatArray, optics: Optics,
+        sigma: float, scaling: Scaling,
     ) -> DepthPairInput:  # fmt: skip
         """What the depth kernel takes; see `by_depth`."""
         gate = max(GATE_SIGMAS * sigma, 10.0 * FLOOR_DEPTH)
@@ -107,7 +111,7 @@ class PairTerms:
         return DepthPairInput(z, optics.rays_x, optics.rays_y, to, *ref, of, *own)
 
     def color_input(
-        self, images: tuple[Any, Any], surface: Surface, lines: tuple[FloatArray, FloatArray, FloatArray],
+        self, images: tuple[Any, Any], surface: DepthSurface, lines: tuple[FloatArray, FloatArray, FloatArray],
         optics: Optics, brightness: FloatArray, sigma: float, scaling: Scaling,
     ) -> ColorPairInput:  # fmt: skip
         """What the colour kernel takes; see `by_color`. lines: to_base, from_base, ref_from_base."""

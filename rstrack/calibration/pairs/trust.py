@@ -19,15 +19,16 @@ from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rstrack.alignment.block_sums import Pixels, Scaling, every
 from rstrack.alignment.brightness import SAME
-from rstrack.calibration.pairs.images import Lines, Surface, lines_of
+from rstrack.alignment.weights import FLOOR_DEPTH, GATE_INTENSITY, GATE_SIGMAS
+from rstrack.calibration.pairs.images import DepthSurface, LinePoses, lines_of
 from rstrack.calibration.pairs.kernels import color_residual, depth_residual
 from rstrack.calibration.pairs.optics import turn
-from rstrack.calibration.pairs.terms import FLOOR_DEPTH, GATE_INTENSITY, GATE_SIGMAS, PairTerms
-from rstrack.calibration.pairs.window import Stretch, View
+from rstrack.calibration.pairs.terms import PairTerms
+from rstrack.calibration.pairs.window import RecordingWindow, WindowFrame
 from rstrack.calibration.parameters import Parameters
 
 
-def trust_in(stretch: Stretch, terms: PairTerms, p: Parameters) -> float:
+def trust_in(stretch: RecordingWindow, terms: PairTerms, p: Parameters) -> float:
     """Part of the information about the stretch's motion, in the direction of which least of it is real, that is real.
 
     1 where images are free of noise, 0 or less where there is nothing but noise in some direction. Of the frame in the
@@ -53,8 +54,8 @@ def trust_in(stretch: Stretch, terms: PairTerms, p: Parameters) -> float:
 
 
 def _by_depth(
-    terms: PairTerms, current: View, ref: View, lines: Sequence[Lines], T_base_world: FloatArray, p: Parameters,
-    sigma: float,
+    terms: PairTerms, current: WindowFrame, ref: WindowFrame, lines: Sequence[LinePoses], T_base_world: FloatArray,
+    p: Parameters, sigma: float,
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     """Derivatives (n, 6) of depth's residuals over σ by a twist, with the slopes of either image.
 
@@ -73,7 +74,7 @@ def _by_depth(
 
 
 def _by_color(
-    terms: PairTerms, current: View, ref: View, lines: Sequence[Lines], T_base_world: FloatArray,
+    terms: PairTerms, current: WindowFrame, ref: WindowFrame, lines: Sequence[LinePoses], T_base_world: FloatArray,
     p: Parameters, sigma: float,
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     """The same of colour's, of the reference's points; lines: of its depth image, of the current colour image, of its
@@ -90,7 +91,7 @@ def _pixels(terms: PairTerms) -> Pixels:
     return every(terms.e, camera.width, camera.height, terms.stride)
 
 
-def _scaling(surface: Surface) -> Scaling:
+def _scaling(surface: DepthSurface) -> Scaling:
     """Of sums that are not made."""
     return Scaling(surface.median_depth, 1.0, 1)
 

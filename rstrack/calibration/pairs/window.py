@@ -1,9 +1,10 @@
-"""One stretch of a recording: its own piece of spline, and what its images say of that and of the parameters."""
+"""A window of a recording: a spline of its own, and what its images say of that and of the parameters."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -13,42 +14,41 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import BlockSums
 from rstrack.alignment.brightness import SAME
-from rstrack.alignment.priors import ACCELERATION, acceleration_prior, pose_constraint
-from rstrack.alignment.weights import scale_step
-from rstrack.calibration.pairs.images import Lines, Surface, Taken, lines_of
+from rstrack.alignment.normal_equations import Eliminated, eliminate
+from rstrack.alignment.priors import ACCELERATION, acceleration_prior, acceleration_sigmas, pose_constraint
+from rstrack.alignment.weights import FLOOR_DEPTH, FLOOR_INTENSITY, START_DEPTH, START_INTENSITY, scale_step
+from rstrack.calibration.pairs.images import DepthSurface, ImageTiming, LinePoses, lines_of
 from rstrack.calibration.pairs.optics import Optics
-from rstrack.calibration.pairs.terms import FLOOR_DEPTH, FLOOR_INTENSITY, PairTerms
+from rstrack.calibration.pairs.terms import PairTerms
 from rstrack.calibration.parameters import COUNT, POSES, Parameters
 
-# σ of accelerations (m/s², rad/s²), looser than the tracker's; the ends, which few lines touch, are held more tightly.
+# σ of accelerations (m/s², rad/s²), looser than the tracker's.
 _ACCELERATION = 3.0 * ACCELERATION
-_ENDS, _END_FACTOR = 2, 0.1
 _GAUGE = np.full(6, 1e-6)
 # Frames between those that are compared: near ones tell the clocks, far ones the extrinsics.
 _APART = (1, 4, 9, 16)
-# σ at the start, m and intensity, and of gain and offset of an image against another.
-START_DEPTH, START_INTENSITY = 5e-3, 0.03
-_BRIGHTNESS = np.array([0.3, 0.15])
+# σ of gain and offset of an image against another, and the least and the most that they become.
+_BRIGHTNESS, _BRIGHTNESS_BOUNDS = np.array([0.3, 0.15]), (-0.7, 2.0)
 
 
 @dataclass
-class View:
+class WindowFrame:
     """A frame on the device: its depth, as z (m) and as a surface, and the colour image that goes with it, if any.
 
     levels: intensities of the pyramid's levels, NaN where they tell nothing. bound: see `intensity_bound`.
     """
 
-    depth: Taken
+    depth: ImageTiming
     z: object
-    surface: Surface
-    color: Taken | None = None
+    surface: DepthSurface
+    color: ImageTiming | None = None
     levels: tuple[object, ...] = ()
     bound: float = 1.0
 
 
 @dataclass(frozen=True)
-class Sums:
-    """What a stretch says at some spline and parameters, as least squares: H, g over [control points, parameters].
+class WindowSums:
+    """What a window says at some spline and parameters, as least squares: H, g over [control points, parameters].
 
     cost: negative log-likelihood but for its constant; pixels: that were compared. depth_overcounts: see `overcounted`;
     1 where all of depth's pixels count.
@@ -60,30 +60,27 @@ class Sums:
     pixels: int
     depth_overcounts: float = 1.0
 
-    def reduced(self) -> tuple[FloatArray, FloatArray]:
-        """A (31, 31) and b (31,) of the parameters alone: the control points are what the images then make of them."""
+    @cached_property
+    def reduced(self) -> Eliminated:
+        """Of the parameters (31,) alone: the control points are what the images then make of them."""
         x = len(self.g) - COUNT
-        solved = np.linalg.solve(self.H[:x, :x], np.column_stack([self.H[:x, x:], self.g[:x]]))
-        A = self.H[x:, x:] - self.H[x:, :x] @ solved[:, :COUNT]
-        b = self.g[x:] - self.H[x:, :x] @ solved[:, COUNT]
-        return np.asarray(0.5 * (A + A.T)), b
+        nothing = np.full(x, np.inf), np.zeros(x)
+        return eliminate(self.H[x:, x:], self.g[x:], self.H[x:, :x], self.H[:x, :x], self.g[:x], *nothing)
 
     def points_step(self, step: FloatArray) -> FloatArray:
         """Increments (k, 6) of the control points that go with a step (31,) of the parameters."""
-        x = len(self.g) - COUNT
-        moved = np.linalg.solve(self.H[:x, :x], self.g[:x] + self.H[:x, x:] @ step)
-        return np.asarray(-moved.reshape(-1, 6))
+        return (self.reduced.step + self.reduced.follow @ step).reshape(-1, 6)
 
 
 @dataclass
-class Stretch:
+class RecordingWindow:
     """Views in order of time, and the spline T_world_depth(t) that covers them all.
 
     sigma: of depth (m) and of intensity. brightness: gain and offset of each pair (view, reference). is_rough: every
     second distance between views is enough.
     """
 
-    views: list[View]
+    views: list[WindowFrame]
     spline: Spline
     sigma: tuple[float, float] = (START_DEPTH, START_INTENSITY)
     brightness: dict[tuple[int, int], FloatArray] = field(default_factory=dict)
@@ -94,7 +91,7 @@ class Stretch:
         """Whether nothing says yet how large its errors are."""
         return self.sigma == (START_DEPTH, START_INTENSITY)
 
-    def sums(self, terms: PairTerms, p: Parameters, level: int, depth_counts: float = 1.0) -> Sums:
+    def sums(self, terms: PairTerms, p: Parameters, level: int, depth_counts: float = 1.0) -> WindowSums:
         """Around the current spline; re-estimates σ and brightness on the way.
 
         depth_counts: part of depth's pixels that count, as the others only repeat them.
@@ -125,12 +122,12 @@ class Stretch:
         floors = FLOOR_DEPTH, FLOOR_INTENSITY
         found = [scale_step(self.sigma[k], weighted[k], int(counted[k]), floors[k]) for k in range(2)]
         self.sigma = found[0], found[1]
-        return Sums(H, g, cost, int(counted.sum()), overcounted(*by_depth, H) if depth_counts < 1.0 else 1.0)
+        return WindowSums(H, g, cost, int(counted.sum()), overcounted(*by_depth, H) if depth_counts < 1.0 else 1.0)
 
-    def read_by(self, terms: PairTerms) -> Stretch:
+    def read_by(self, terms: PairTerms) -> RecordingWindow:
         """The same images and spline, to be changed by themselves, if cameras read their lines as those of `terms`."""
 
-        def taken(one: Taken) -> Taken:
+        def taken(one: ImageTiming) -> ImageTiming:
             return replace(one, lens=terms.depth if one.is_depth else terms.color)
 
         views = [replace(v, depth=taken(v.depth), color=v.color and taken(v.color)) for v in self.views]
@@ -142,9 +139,9 @@ class Stretch:
         self.spline = Spline(points, self.spline.t0, self.spline.dt)
 
     def _pairs(
-        self, terms: PairTerms, optics: Optics, p: Parameters, level: int, depths: Sequence[Lines],
-        colors: Sequence[Lines | None],
-    ) -> Iterator[tuple[int, tuple[int, int], BlockSums, Lines, Lines, FloatArray]]:  # fmt: skip
+        self, terms: PairTerms, optics: Optics, p: Parameters, level: int, depths: Sequence[LinePoses],
+        colors: Sequence[LinePoses | None],
+    ) -> Iterator[tuple[int, tuple[int, int], BlockSums, LinePoses, LinePoses, FloatArray]]:  # fmt: skip
         """Kind (0 depth, 1 colour), pair, sums, lines of the current image and the reference's, T_base_world."""
         waiting = []
         for r, others in enumerate(partners(len(self.views), _APART[::2] if self.is_rough else _APART)):
@@ -174,17 +171,14 @@ class Stretch:
     def _without_brightness(self, pair: tuple[int, int], H: FloatArray, g: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The system (m + 2, m + 2) without the last two unknowns, this pair's gain and offset: they take their next
         values."""
-        at, prior = self.brightness.get(pair, SAME), 1.0 / _BRIGHTNESS**2
-        own, own_g, coupling = H[-2:, -2:] + np.diag(prior), g[-2:] + prior * at, H[:-2, -2:]
-        solved = np.linalg.solve(own, np.column_stack([own_g, coupling.T]))
-        self.brightness[pair] = np.clip(at - solved[:, 0], -0.7, 2.0)
-        return H[:-2, :-2] - coupling @ solved[:, 1:], g[:-2] - coupling @ solved[:, 0]
+        at = self.brightness.get(pair, SAME)
+        found = eliminate(H[:-2, :-2], g[:-2], H[:-2, -2:], H[-2:, -2:], g[-2:], _BRIGHTNESS, at)
+        self.brightness[pair] = np.clip(at + found.step, *_BRIGHTNESS_BOUNDS)
+        return found.H, found.g
 
     def _add_priors(self, H: FloatArray, g: FloatArray, p: Parameters) -> None:
         count = len(self.spline.control_points)
-        sigma = np.repeat(_ACCELERATION[None] * self.spline.dt**2, count - 2, axis=0)
-        sigma[:_ENDS] *= _END_FACTOR
-        sigma[-_ENDS:] *= _END_FACTOR
+        sigma = acceleration_sigmas(_ACCELERATION, self.spline.dt, count - 2)
         t = self.views[len(self.views) // 2].depth.mid_time(p)
         for model, _ in (
             acceleration_prior(self.spline, 0, count, sigma),
@@ -196,7 +190,7 @@ class Stretch:
 
 
 def overcounted(H: FloatArray, g: FloatArray, told: FloatArray) -> float:
-    """How many times too much a term counts by its H and g (see `Sums`), around control points known from elsewhere.
+    """How many times too much a term counts by its H and g (see `WindowSums`), around control points known otherwise.
 
     gᵀ H⁺ g is in the mean the rank of H times that, and what these points are off by: tr(H C), C their covariance by
     what is `told` of them (like H). All of the control points alone. 1 where its pixels are independent.
@@ -223,7 +217,7 @@ def partners(count: int, distances: Sequence[int]) -> list[list[int]]:
 
 
 def _system(
-    sums: BlockSums, current: Lines, reference: Lines, T_base_world: FloatArray, sigma: float
+    sums: BlockSums, current: LinePoses, reference: LinePoses, T_base_world: FloatArray, sigma: float
 ) -> tuple[FloatArray, FloatArray]:
     """A pair's H and g by control points of the current image, of the reference, the parameters that move poses, those
     of lenses and depth that are asked for, and gain and offset, if any."""
@@ -239,7 +233,7 @@ def _system(
 
 
 def _slopes(
-    sums: BlockSums, current: Lines, reference: Lines, T_base_world: FloatArray
+    sums: BlockSums, current: LinePoses, reference: LinePoses, T_base_world: FloatArray
 ) -> tuple[FloatArray, tuple[npt.NDArray[np.intp], ...]]:
     """Derivatives (n, 6, m) of the relative twists of those pairs of blocks that have pixels, and these pairs.
 
@@ -253,7 +247,7 @@ def _slopes(
 
 
 def _add(
-    H: FloatArray, g: FloatArray, own: FloatArray, own_g: FloatArray, current: Lines, reference: Lines,
+    H: FloatArray, g: FloatArray, own: FloatArray, own_g: FloatArray, current: LinePoses, reference: LinePoses,
     asked: Sequence[int],
 ) -> None:  # fmt: skip
     """Add a pair's system, in the columns of `_system`, to that of all unknowns; asked: places of the last ones."""

@@ -36,7 +36,7 @@ from rstrack.tracking.runs.record import Noise
 
 if TYPE_CHECKING:
     from rstrack.adjustment.imu import ImuTerm
-    from rstrack.adjustment.refine import Refiner, Round, Usual
+    from rstrack.adjustment.refine import Refiner, Round, TypicalScales
     from rstrack.images.device_frame import DeviceFrame
 
 Kind = TypeVar("Kind", Options, Noise)
@@ -128,9 +128,9 @@ def refine_run(
     poses = estimate.T_world_depth if kept else se3.orthonormalise(moved @ estimate.T_world_depth)
     imu = _NOT_LOOKED_AT if options.inertial else ""
     if refiner.imu is not None and refiner.found is not None and not kept:
-        believed = imu_record.believed(refiner.found.belief, refiner.imu.sigma)
-        info["imu"] = (estimate.info.get("imu") or {}) | believed | refiner.found.as_dict()
-        imu = f"{imu_record.refined_text(believed)}, {refiner.found.text(refiner.imu.recording.T_imu_depth)}"
+        imu_estimate = imu_record.estimate_dict(refiner.found.estimate, refiner.imu.sigma)
+        info["imu"] = (estimate.info.get("imu") or {}) | imu_estimate | refiner.found.as_dict()
+        imu = f"{imu_record.refined_text(imu_estimate)}, {refiner.found.text(refiner.imu.recording.T_imu_depth)}"
     result = Estimate(estimate.stamps, poses, spline, info, estimate.moving)
     truth = truth_of(dataset)
     before, after = (evaluated(truth, each) for each in (estimate, result))
@@ -270,16 +270,16 @@ def _is_covered(estimate: Estimate, stamp: float, span_s: float) -> bool:
     return bool(estimate.spline_covers([first, 0.5 * (first + last), last]).all())
 
 
-def _usual(info: dict[str, Any]) -> Usual:
+def _usual(info: dict[str, Any]) -> TypicalScales:
     """Scales of residuals as the run had them, of depth as if it were at one metre."""
-    from rstrack.adjustment.refine import Usual
+    from rstrack.adjustment.refine import TypicalScales
 
     frames = [f for f in info.get("frames", ()) if isinstance(f, dict)]
     of = {
         name: [f[name] for f in frames if isinstance(f.get(name), float)]
         for name in ("sigma_depth_m", "sigma_intensity")
     }
-    return Usual(
+    return TypicalScales(
         float(np.median(of["sigma_depth_m"])) / _TYPICAL_M**2 if of["sigma_depth_m"] else _USUAL_DEPTH,
         float(np.median(of["sigma_intensity"])) if of["sigma_intensity"] else _USUAL_INTENSITY,
     )

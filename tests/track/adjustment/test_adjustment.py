@@ -13,9 +13,9 @@ from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.adjustment import graph as graph_module
-from rstrack.adjustment.band import Band
+from rstrack.adjustment.chain import BandedHessian, KeyframeModel
 from rstrack.adjustment.closing import closed
-from rstrack.adjustment.graph import Graph, Seen, Sighting, State
+from rstrack.adjustment.graph import Graph, Sighting, State
 from rstrack.adjustment.loops import Loop
 from rstrack.alignment.normal_equations import Quadratic, assemble
 from rstrack.alignment.priors import ACCELERATION
@@ -26,14 +26,14 @@ def quadratic(rng: np.random.Generator, first: int, size: int, strength: float =
     return Quadratic(first, strength * (A @ A.T), np.zeros(6 * size))
 
 
-def summed(models: list[Quadratic]) -> Band:
-    band = Band()
+def summed(models: list[Quadratic]) -> BandedHessian:
+    band = BandedHessian()
     for model in models:
         band.add(model)
     return band
 
 
-def dense(band: Band, count: int) -> FloatArray:
+def dense(band: BandedHessian, count: int) -> FloatArray:
     """H (6n, 6n) of a band over control points 0 to n − 1."""
     H = np.zeros((count, 6, count, 6))
     for i in range(min(len(band), count - band.first)):
@@ -96,7 +96,7 @@ def test_steps_end_where_least_squares_do() -> None:
         sightings.append(Sighting(k, mid + after, T_ref_cam, 1e6 * A @ A.T))
     # One keyframe's frames were not where they wanted to be when their models were made.
     gradients = {4: 1e3 * rng.normal(size=(5, 6)), 9: np.zeros((6, 6))}
-    seen = [Seen(4, summed([models[4]]), gradients[4]), Seen(9, summed([models[9]]))]
+    seen = [KeyframeModel(4, summed([models[4]]), gradients[4]), KeyframeModel(9, summed([models[9]]))]
     graph = Graph(at, seen, sightings)
 
     def residuals(x: FloatArray) -> FloatArray:
@@ -143,7 +143,7 @@ def test_nothing_moves_where_nothing_pulls() -> None:
     at = State(spline, {0: spline.pose(spline.t_begin)})
     model = quadratic(rng, 0, 9)
     still = Quadratic(0, model.H, np.zeros(54))
-    graph = Graph(at, [Seen(0, summed([still]))], [])
+    graph = Graph(at, [KeyframeModel(0, summed([still]))], [])
     _, x = graph.step(at)
     assert np.abs(x).max() < 1e-12
     # Nor does what is moved as one body, which changes nothing.
@@ -160,7 +160,7 @@ def test_frames_among_themselves_move_as_one_body() -> None:
     together = np.tile(np.eye(6), (9, 1))
     free = np.eye(54) - together @ np.linalg.pinv(together)
     model = quadratic(rng, 0, 9, 1e6)
-    graph = Graph(at, [Seen(None, summed([Quadratic(0, free @ model.H @ free, np.zeros(54))]))], [])
+    graph = Graph(at, [KeyframeModel(None, summed([Quadratic(0, free @ model.H @ free, np.zeros(54))]))], [])
     bent = moved_state(rng, at, 1e-4).placed(se3.exp(np.array([0.3, -0.2, 0.5, 0.4, 0.1, -0.6])))
     for _ in range(5):
         bent, x = graph.step(bent)
@@ -193,14 +193,14 @@ def drifted_track(rng: np.random.Generator) -> tuple[Graph, State, list[Loop]]:
     information = np.diag(np.repeat([1e-3, 4e-4], 3) ** -2.0)
     seen, ties = [], []
     for k in times:
-        band = Band()
+        band = BandedHessian()
         for i in range(k, k + 9):
             local = np.tile(se3.adjoint(se3.inverse(spline.pose(times[k]))), (1, 4))
             J = np.zeros((24, 24))
             for n in range(4):
                 J[6 * n : 6 * n + 6, 6 * n : 6 * n + 6] = local[:, :6]
             band.add(Quadratic(i, J.T @ np.kron(np.eye(4), information) @ J, np.zeros(24)))
-        seen.append(Seen(k, band))
+        seen.append(KeyframeModel(k, band))
         ties.append(Sighting(k, times[k], np.eye(4), 100.0 * information))
     loops = []
     round_ = count // 3
@@ -247,7 +247,9 @@ def test_loops_take_the_drift_away_and_a_false_one_is_refused() -> None:
 
 def too_sure(graph: Graph, times: float) -> Graph:
     """Frames that think they know so many times better than they do."""
-    seen = [Seen(each.keyframe, Band(each.band.first, each.band.blocks * times**2)) for each in graph.seen]
+    seen = [
+        KeyframeModel(each.keyframe, BandedHessian(each.band.first, each.band.blocks * times**2)) for each in graph.seen
+    ]
     ties = [replace(each, information=each.information * times**2) for each in graph.sightings]
     return Graph(graph.at, seen, ties)
 

@@ -17,7 +17,7 @@ from rstrack.adjustment.graph import Graph, Sighting, State
 from rstrack.adjustment.imu import Equations, ImuState, ImuTerm
 from rstrack.data.imu.description import ImuNoise
 from rstrack.data.imu.recording import ImuRecording
-from rstrack.inertial.belief import STRENGTH, WARMS
+from rstrack.inertial.estimate import STRENGTH, WARMS
 
 T_IMU_DEPTH = se3.exp([0.03, -0.02, 0.05, 0.3, -1.2, 0.7])
 GRAVITY = np.array([1.0, -9.0, 3.5])
@@ -130,8 +130,8 @@ def test_what_is_believed_is_as_far_off_as_it_says() -> None:
         assert found is not None and state.imu is not None
         off = [se3.log(found.state.T_imu_depth @ se3.inverse(told.T_imu_depth)), found.state.scales - told.scales]
         turn = so3.log(told.T_imu_depth[:3, :3] @ unit.recording.T_imu_depth[:3, :3].T)
-        believed = found.belief.mean - np.concatenate([told.biases[-1], told.gravity, turn])
-        scores.append([*(believed / found.belief.sigmas), *(np.concatenate(off) / found.sigmas)])
+        estimated = found.estimate.mean - np.concatenate([told.biases[-1], told.gravity, turn])
+        scores.append([*(estimated / found.estimate.sigmas), *(np.concatenate(off) / found.sigmas)])
         sigmas.append(unit.learnt(state.spline, state.imu).sigma)
     squares = np.square(scores).mean(axis=0)
     assert 0.6 < squares[:3].mean() < 1.5 and 0.6 < squares[9:].mean() < 1.5

@@ -30,7 +30,7 @@ from rstrack.calibration.parameters import (
     USEFUL,
 )
 from rstrack.calibration.run import calibrate, parameters_of
-from rstrack.calibration.start import load_stretch
+from rstrack.calibration.start import load_window
 from rstrack.cli.main import main
 from rstrack.data.dataset import Dataset
 from rstrack.data.image_files import NoisyImages, with_noise
@@ -112,7 +112,7 @@ def test_a_bare_wall_is_told_from_a_room(shaken: Dataset, tmp_path: Path, monkey
         noisy = replace(dataset, images=NoisyImages(dataset.images, 1.2e-3, 0.01, 1))
         terms, p = pair_terms(engine("llvm"), noisy), parameters_of(noisy)
         assert dataset.truth is not None
-        part = load_stretch(terms, noisy, range(10, 24), dataset.truth, p, OPTIONS)
+        part = load_window(terms, noisy, range(10, 24), dataset.truth, p, OPTIONS)
         for _ in range(3):
             part.sums(terms, p, 0)
         trusts.append(trust_in(part, terms, p))
@@ -136,7 +136,7 @@ def test_a_drift_is_found_or_else_held(shaken: Dataset, monkeypatch: pytest.Monk
 
 def test_knots_of_every_other_stretch_lie_half_a_spacing_later(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever phase is asked for: what a spline cannot follow then averages out of the clocks."""
-    monkeypatch.setattr(calibration_run, "load_stretch", lambda *given: given[-1].knot_phase)
+    monkeypatch.setattr(calibration_run, "load_window", lambda *given: given[-1].knot_phase)
     dataset: Any = SimpleNamespace(with_color_offset=lambda *_, **__: None)
     for asked in (0.0, 0.5, 0.8):
         given: list[Any] = [dataset, None, [range(30)] * 4, None, None, Options(knot_phase=asked)]

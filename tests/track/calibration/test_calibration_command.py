@@ -12,7 +12,7 @@ import pytest
 from shaken_recording import FRAMES, OPTIONS, PACE, RATE_HZ, READOUT_S, RESIDUALS, SHORT, recording, shaking, told
 
 from rstrack.calibration import run as calibration_run
-from rstrack.calibration.devices import Device, Stream
+from rstrack.calibration.devices import Device, PublishedShutter
 from rstrack.calibration.pairs import window
 from rstrack.calibration.parameters import (
     COUNT,
@@ -23,7 +23,7 @@ from rstrack.calibration.parameters import (
     changed,
 )
 from rstrack.calibration.record import read_record
-from rstrack.calibration.result import Calibration
+from rstrack.calibration.result import CameraCalibration
 from rstrack.calibration.run import calibrate, parameters_of
 from rstrack.calibration.solve import Solution
 from rstrack.cli.main import main
@@ -92,7 +92,7 @@ def test_the_camera_file_says_what_was_found(shaken: Dataset, tmp_path: Path) ->
     A = np.array([np.diag(1.0 / (1e-3 * PRIOR[free]) ** 2)] * 3)
     solution = Solution(found, free, A, np.zeros((3, COUNT - 1)), 0.0, 1e-3, 1e-2)
     motion = calibration_run.motion_of(shaken, [range(30)], shaking())
-    made = Calibration(shaken, start, solution, np.ones(COUNT, bool), (range(30),), motion, 1.0, RESIDUALS, PACE)
+    made = CameraCalibration(shaken, start, solution, np.ones(COUNT, bool), (range(30),), motion, 1.0, RESIDUALS, PACE)
     (tmp_path / "camera.yaml").write_text(made.camera_file())
     again = open_dataset(shaken.root, tmp_path / "camera.yaml")
     expected = made.calibrated()
@@ -128,11 +128,11 @@ def test_the_camera_file_says_what_was_found(shaken: Dataset, tmp_path: Path) ->
 def test_ctrl_c_while_calibrating_ends_track_too(
     shaken: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupted(dataset: Dataset, *_: object) -> Calibration:
+    def interrupted(dataset: Dataset, *_: object) -> CameraCalibration:
         start = parameters_of(dataset)
         nothing = Solution(start, np.zeros(COUNT, bool), np.zeros((3, 0, 0)), np.zeros((3, 0)), 0, 1, 1, finished=False)
         motion = calibration_run.motion_of(dataset, [range(30)], shaking())
-        return Calibration(dataset, start, nothing, nothing.free, (range(30),), motion, 1.0, RESIDUALS, PACE)
+        return CameraCalibration(dataset, start, nothing, nothing.free, (range(30),), motion, 1.0, RESIDUALS, PACE)
 
     monkeypatch.setattr(calibration_run, "calibrate", interrupted)
     assert main(["track", str(shaken.root), "--calibrate", "--out", str(tmp_path / "run"), "--quiet"]) == 130
@@ -142,9 +142,9 @@ def test_ctrl_c_while_calibrating_ends_track_too(
 def test_a_sequence_is_calibrated_and_tracked_by_command(
     shaken: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found: list[Calibration] = []
+    found: list[CameraCalibration] = []
 
-    def once(*given: Any, **named: Any) -> Calibration:
+    def once(*given: Any, **named: Any) -> CameraCalibration:
         if not found:
             found.append(calibrate(*given, **named))
         return found[0]
@@ -190,7 +190,7 @@ def test_a_sequence_is_calibrated_and_tracked_by_command(
 def test_a_device_that_the_recording_contradicts_is_left_out(shaken: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(calibration_run, "_COARSE", (1,))
     wrong = told(shaken, 0.01, 0.0, np.zeros(6))
-    stream = Stream("global", "made up", "https://example.org", 0.0, 1e-4)
+    stream = PublishedShutter("global", "made up", "https://example.org", 0.0, 1e-4)
     device = Device("made-up", "Made up", stream, stream)
     found = calibrate(wrong, ("readout",), SHORT, OPTIONS, device=device)
     assert found.text().count("this recording contradicts the device's") == 2 and found.start.depth_readout_s == 0.0

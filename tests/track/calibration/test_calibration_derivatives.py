@@ -20,7 +20,7 @@ from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
 from rstrack.calibration.figures import extrapolated, residuals_at, residuals_now
 from rstrack.calibration.pairs import window as pairs_window
-from rstrack.calibration.pairs.images import Taken, lines_of
+from rstrack.calibration.pairs.images import ImageTiming, lines_of
 from rstrack.calibration.pairs.optics import camera_table, moves, traced
 from rstrack.calibration.pairs.terms import pair_terms
 from rstrack.calibration.parameters import (
@@ -36,7 +36,7 @@ from rstrack.calibration.parameters import (
 )
 from rstrack.calibration.run import calibrate, parameters_of
 from rstrack.calibration.solve import Solution, solve
-from rstrack.calibration.start import like, load_stretch
+from rstrack.calibration.start import like, load_window
 from rstrack.data.dataset import Dataset
 from rstrack.data.image_files import NoisyImages
 from rstrack.data.rig import DepthError
@@ -48,7 +48,7 @@ def test_lines_move_with_every_parameter_and_control_point_as_finite_differences
     is_depth: bool, scan: Scan
 ) -> None:
     camera = synthetic.make_config(width=16, height=12).color.camera
-    taken = Taken(Lens(camera, Shutter(1.0, 0.0, scan)), 0.4, 0.006, is_depth)
+    taken = ImageTiming(Lens(camera, Shutter(1.0, 0.0, scan)), 0.4, 0.006, is_depth)
     p = Parameters(0.017, 0.021, 0.004, 2e-4, synthetic.T_COLOR_DEPTH, epoch_s=0.1)
     spline = shaking()
     (lines,) = lines_of([taken], spline, p)
@@ -82,7 +82,7 @@ def test_the_gradient_changes_along_every_parameter_as_the_normal_equations_say(
     lensed = bent(shaken)
     terms, p = pair_terms(engine("llvm"), lensed, np.ones(COUNT, bool)), parameters_of(lensed)
     assert shaken.truth is not None
-    stretch = load_stretch(terms, lensed, range(4, 15), shaken.truth, p, OPTIONS)
+    stretch = load_window(terms, lensed, range(4, 15), shaken.truth, p, OPTIONS)
     for _ in range(4):
         stretch.sums(terms, p, 0)
     sigma = stretch.sigma
@@ -102,7 +102,7 @@ def test_scipy_finds_the_same_offset_by_the_cost_alone(shaken: Dataset, monkeypa
     monkeypatch.setattr(pairs_window, "_APART", (5,))
     terms, p = pair_terms(engine("llvm"), shaken), parameters_of(shaken)
     assert shaken.truth is not None
-    stretches = [load_stretch(terms, shaken, range(4, 20), shaken.truth, p, OPTIONS)]
+    stretches = [load_window(terms, shaken, range(4, 20), shaken.truth, p, OPTIONS)]
     ours = solve(stretches, terms, p, np.arange(COUNT) == 2, (0,))
     sigma = stretches[0].sigma
 
@@ -194,7 +194,7 @@ def test_looking_at_residuals_leaves_stretches_as_they_are(shaken: Dataset) -> N
     noisy = replace(shaken, images=NoisyImages(shaken.images, 2e-3, 0.02, 7))
     terms, p = pair_terms(engine("llvm"), noisy), parameters_of(noisy)
     assert noisy.truth is not None
-    seen, other = (load_stretch(terms, noisy, range(4, 20), noisy.truth, p, OPTIONS) for _ in range(2))
+    seen, other = (load_window(terms, noisy, range(4, 20), noisy.truth, p, OPTIONS) for _ in range(2))
     before = seen.sigma, dict(seen.brightness), seen.spline.control_points.copy()
     found = residuals_at([seen], terms, p)
     assert (seen.sigma, seen.brightness) == before[:2]
@@ -256,7 +256,7 @@ def test_known_values_draw_a_solution_by_as_much_as_they_weigh(shaken: Dataset) 
     terms, start, free = pair_terms(engine("llvm"), shaken), parameters_of(shaken), free_of(("readout",))
     off = replace(start, color_readout_s=start.color_readout_s + 5e-4)
     assert shaken.truth is not None
-    stretches = [load_stretch(terms, shaken, range(4, 20), shaken.truth, start, OPTIONS)]
+    stretches = [load_window(terms, shaken, range(4, 20), shaken.truth, start, OPTIONS)]
     errors = []
     for sigma_s in (np.inf, 1.0, 1e-7):
         known = Known(off, np.where(np.arange(COUNT) == 1, sigma_s, np.inf))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rsgen.errors import UserError
-from rstrack.calibration.devices import DEVICES, Device, Stream, device_named, device_notes
+from rstrack.calibration.devices import DEVICES, Device, PublishedShutter, device_named, device_notes
 from rstrack.calibration.parameters import COUNT, Known, Parameters, free_of
 from rstrack.calibration.solve import Solution
 from rstrack.cli.main import main
@@ -20,7 +20,7 @@ FILE = Parameters(0.005, 0.007, 1e-3, 0.0, np.eye(4))
 READOUTS = free_of(("readout",))
 
 
-def link(stream: Stream) -> str:
+def link(stream: PublishedShutter) -> str:
     return f"[{stream.kind}]({stream.source})"
 
 

@@ -13,7 +13,7 @@ import pytest
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rstrack.calibration.parameters import COUNT, NAMES, Parameters
-from rstrack.calibration.result import Calibration
+from rstrack.calibration.result import CameraCalibration
 from rstrack.calibration.several import check_alike, together
 from rstrack.calibration.solve import Solution
 
@@ -22,7 +22,9 @@ AT = [NAMES.index(name) for name in ("color.readout_s", "color.offset_s", "color
 READOUT, OFFSET, FX, CX = AT
 
 
-def calibrated(name: str, true: np.ndarray, own: np.ndarray, sure: np.ndarray, rng: np.random.Generator) -> Calibration:
+def calibrated(
+    name: str, true: np.ndarray, own: np.ndarray, sure: np.ndarray, rng: np.random.Generator
+) -> CameraCalibration:
     """A recording whose eight stretches bear out `true` (31,), though it has ended at `own`."""
     free = np.isin(np.arange(COUNT), AT)
     root = rng.standard_normal((8, 4, 4)) * sure[:, None]
@@ -32,7 +34,7 @@ def calibrated(name: str, true: np.ndarray, own: np.ndarray, sure: np.ndarray, r
     shutter = SimpleNamespace(scan="top-bottom")
     dataset: Any = SimpleNamespace(name=name, rig=SimpleNamespace(color_shutter=shutter))
     unused: Any = None
-    return Calibration(dataset, START, solution, free, (range(30),), unused, 1.0, unused, unused)
+    return CameraCalibration(dataset, START, solution, free, (range(30),), unused, 1.0, unused, unused)
 
 
 def test_recordings_tell_what_the_others_do_not_and_keep_their_clocks() -> None:

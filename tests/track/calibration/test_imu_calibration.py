@@ -23,8 +23,8 @@ from rstrack.calibration.imu.model import (
     ROTATION,
     SCALE,
     CorrectedTrack,
+    ImuPrediction,
     ImuUnknowns,
-    Prediction,
     hats,
 )
 from rstrack.calibration.imu.result import ImuCalibration
@@ -58,9 +58,9 @@ def test_derivatives_are_those_of_differences(parts: int) -> None:
     stamps = np.linspace(spline.t_begin + 0.02, spline.t_end - 0.02, 23)
 
     def read(imu: ImuUnknowns, x: np.ndarray) -> np.ndarray:
-        return Prediction(track, imu, x, stamps).readings
+        return ImuPrediction(track, imu, x, stamps).readings
 
-    at = Prediction(track, imu, x, stamps)
+    at = ImuPrediction(track, imu, x, stamps)
     for i in range(imu.size):
         step = np.zeros(imu.size)
         step[i] = 1e-6 if i == OFFSET else 1e-5
@@ -87,7 +87,7 @@ def test_readings_are_those_of_the_generator() -> None:
     t, track = np.linspace(spline.t_begin, spline.t_end, 50), CorrectedTrack(spline)
     gyro, accel = exact_imu(spline, imu.T_imu_depth, imu.gravity, t)
     bias = hats(imu.bias_times, t) @ imu.biases
-    found = Prediction(track, imu, np.zeros((track.count, 6)), t).readings
+    found = ImuPrediction(track, imu, np.zeros((track.count, 6)), t).readings
     np.testing.assert_allclose(found[:, :3], (1.0 + imu.scale) * gyro + bias[:, :3], atol=1e-10)
     np.testing.assert_allclose(found[:, 3:], accel + bias[:, 3:], atol=1e-9)
 

@@ -17,9 +17,9 @@ from rsgen.sensors.imu import simulate_imu
 from rstrack.data.imu.description import ImuNoise
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.rig import Rig
-from rstrack.inertial.band import Band, missed, with_knots
+from rstrack.inertial.band import MotionBand, missed, with_knots
 from rstrack.inertial.inertia import Inertia
-from rstrack.inertial.residuals import Samples
+from rstrack.inertial.residuals import ImuReadings
 from rstrack.options import Options
 from rstrack.tracking.spline_tracker import Tracker
 
@@ -56,7 +56,7 @@ def test_what_a_spline_misses_of_a_wave_is_what_least_squares_leaves(degree: int
 
 def test_what_is_missed_of_a_swing_follows_from_the_readings() -> None:
     size, hertz = np.repeat([3e-4, 1e-3], 3), 23.0
-    band = Band.of(recording(swinging(size, hertz), gravity=0.0))
+    band = MotionBand.of(recording(swinging(size, hertz), gravity=0.0))
     rms = size * np.sqrt(3 / 2)
     for dt in (0.0125, 0.025, 0.05):
         share = np.sqrt(missed(np.array([hertz * dt]), 3)[0])
@@ -82,9 +82,9 @@ def test_knots_are_as_dense_as_the_motion_needs() -> None:
     ]
     for size, hertz, expected in cases:
         read = recording(swinging(size, hertz))
-        assert Band.of(read).knots_s(FOCAL, read.rate_hz) in expected
+        assert MotionBand.of(read).knots_s(FOCAL, read.rate_hz) in expected
     # As the lens sees it: what is far below a pixel needs no knots.
-    few = Band.of(recording(swinging(vibrating, 25.0))).knots_s(FOCAL / 100, 200.0)
+    few = MotionBand.of(recording(swinging(vibrating, 25.0))).knots_s(FOCAL / 100, 200.0)
     assert few > 0.0125
 
 
@@ -92,7 +92,7 @@ def test_the_tracker_has_such_knots_unless_told_otherwise() -> None:
     read = recording(swinging(np.repeat([3e-4, 1e-3], 3), 25.0, 3.0))
     rig = Rig(*(Camera(80, 60, 60.0, 60.0, 39.5, 29.5), Shutter(readout_s=0.028)) * 2, np.eye(4))
     chosen = Tracker(rig, Options(method="rs-gi", backend="llvm"), imu=read).options.knot_spacing_s
-    assert chosen == Band.of(read).knots_s(60.0, 200.0) < 0.025
+    assert chosen == MotionBand.of(read).knots_s(60.0, 200.0) < 0.025
     asked = Options(method="rs-gi", knot_spacing_s=0.03)
     assert with_knots(asked, read, 60.0) == asked
     plain = Options(method="rs-g")
@@ -111,13 +111,13 @@ def test_the_prior_lets_through_what_the_readings_say_of_accelerations() -> None
 def test_single_wild_readings_do_not_count_and_do_not_make_knots_denser() -> None:
     truth = swinging(np.repeat([1e-3, 5e-3], 3), 20.0)
     read = recording(truth)
-    assert read.gyro is not None and Samples.of(read).counts.all()
+    assert read.gyro is not None and ImuReadings.of(read).counts.all()
     rng = np.random.default_rng(3)
     at = 5 + 25 * np.arange(60), rng.integers(0, 6, 60)
     values = np.concatenate([read.gyro, read.accel], axis=1)
     values[at] += rng.choice([-1.0, 1.0], 60) * np.where(at[1] < 3, 8.0, 160.0)
     broken = ImuRecording(read.t, values[:, :3], values[:, 3:], NOISE, np.eye(4), 200.0)
     np.testing.assert_array_equal(
-        np.argwhere(Samples.of(broken).counts == 0.0), np.argwhere(values != np.hstack([read.gyro, read.accel]))
+        np.argwhere(ImuReadings.of(broken).counts == 0.0), np.argwhere(values != np.hstack([read.gyro, read.accel]))
     )
-    np.testing.assert_allclose(Band.of(broken).scatter(0.025), Band.of(read).scatter(0.025), rtol=0.05)
+    np.testing.assert_allclose(MotionBand.of(broken).scatter(0.025), MotionBand.of(read).scatter(0.025), rtol=0.05)

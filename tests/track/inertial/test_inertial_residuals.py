@@ -12,9 +12,9 @@ from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import exact_imu
 from rstrack.data.imu.description import ImuNoise
 from rstrack.data.imu.recording import ImuRecording
-from rstrack.inertial.belief import SIZE, Belief
+from rstrack.inertial.estimate import SIZE, ImuEstimate
 from rstrack.inertial.factor import motion
-from rstrack.inertial.residuals import Rows, Samples
+from rstrack.inertial.residuals import ImuReadings, ImuResiduals
 
 T_IMU_DEPTH = se3.exp([0.03, -0.02, 0.05, 0.3, -1.2, 0.7])
 GRAVITY = np.array([1.0, -9.0, 3.5])
@@ -61,20 +61,23 @@ def test_motion_is_the_splines() -> None:
 def test_residuals_vanish_at_the_truth() -> None:
     spline = wild_spline()
     imu = recording(spline, np.linspace(spline.t_begin, spline.t_end, 40))
-    r = Rows.of(spline, Samples.of(imu), T_IMU_DEPTH, np.concatenate([BIAS, GRAVITY, TURN])).r
+    r = ImuResiduals.of(spline, ImuReadings.of(imu), T_IMU_DEPTH, np.concatenate([BIAS, GRAVITY, TURN])).r
     assert np.abs(r).max() < 1e-11
 
 
 def test_derivatives_by_control_points_are_finite_differences() -> None:
     spline = wild_spline(3)
     t = np.linspace(spline.t_begin, spline.t_end, 13)
-    samples, belief = Samples.of(recording(wild_spline(4), t)), np.concatenate([BIAS, GRAVITY, TURN])
-    rows = Rows.of(spline, samples, T_IMU_DEPTH, belief)
+    samples, estimate = ImuReadings.of(recording(wild_spline(4), t)), np.concatenate([BIAS, GRAVITY, TURN])
+    rows = ImuResiduals.of(spline, samples, T_IMU_DEPTH, estimate)
     J, first = rows.J, rows.first
     step, worst = 1e-5, np.zeros(2)
     for number in range(len(spline.control_points)):
         for axis in range(6):
-            ends = [Rows.of(moved(spline, number, axis, s * step), samples, T_IMU_DEPTH, belief).r for s in (-1, 1)]
+            ends = [
+                ImuResiduals.of(moved(spline, number, axis, s * step), samples, T_IMU_DEPTH, estimate).r
+                for s in (-1, 1)
+            ]
             told = np.zeros((len(t), 6))
             for k in np.flatnonzero((first <= number) & (number < first + 4)):
                 told[k] = J[k, :, 6 * (number - first[k]) + axis]
@@ -86,25 +89,25 @@ def test_derivatives_by_control_points_are_finite_differences() -> None:
 
 def test_derivatives_by_a_belief_are_finite_differences() -> None:
     spline = wild_spline(3)
-    samples = Samples.of(recording(spline, np.linspace(spline.t_begin, spline.t_end, 13)))
-    belief = np.concatenate([BIAS, GRAVITY, TURN])
-    J = Rows.of(spline, samples, T_IMU_DEPTH, belief).J
+    samples = ImuReadings.of(recording(spline, np.linspace(spline.t_begin, spline.t_end, 13)))
+    estimate = np.concatenate([BIAS, GRAVITY, TURN])
+    J = ImuResiduals.of(spline, samples, T_IMU_DEPTH, estimate).J
     for i, e in enumerate(np.eye(SIZE)):
         step = 1.0 if i < 9 else 1e-4  # all but the turn are linear
-        ends = [Rows.of(spline, samples, T_IMU_DEPTH, belief + s * step * e).r for s in (-0.5, 0.5)]
+        ends = [ImuResiduals.of(spline, samples, T_IMU_DEPTH, estimate + s * step * e).r for s in (-0.5, 0.5)]
         np.testing.assert_allclose((ends[1] - ends[0]) / step, J[:, :, 24 + i], atol=1e-9 if i < 9 else 1e-7)
 
 
 def test_sums_are_the_dense_least_squares() -> None:
     spline = wild_spline(3)
-    samples = Samples.of(recording(wild_spline(4), np.linspace(spline.t_begin + 0.06, spline.t_end, 50)))
-    belief, sigma = Belief.initial(GRAVITY), np.array([0.01, 0.2])
-    rows = Rows.of(spline, samples, T_IMU_DEPTH, belief.mean)
+    samples = ImuReadings.of(recording(wild_spline(4), np.linspace(spline.t_begin + 0.06, spline.t_end, 50)))
+    estimate, sigma = ImuEstimate.initial(GRAVITY), np.array([0.01, 0.2])
+    rows = ImuResiduals.of(spline, samples, T_IMU_DEPTH, estimate.mean)
     joint, scatter = rows.summed(sigma)
     assert joint is not None and joint.first == 1 and joint.count == len(spline.control_points) - 1
     r, J, first = rows.r, rows.J, rows.first
     change = np.random.default_rng(5).normal(0.0, 0.1, SIZE) * (np.arange(SIZE) < 9)
-    expected = Rows.of(spline, samples, T_IMU_DEPTH, belief.mean + change).r
+    expected = ImuResiduals.of(spline, samples, T_IMU_DEPTH, estimate.mean + change).r
     np.testing.assert_allclose(scatter.after(change), expected, atol=1e-9)
     dense = np.zeros((len(r), 6, 6 * joint.count + SIZE))
     for k, at in enumerate(first - 1):
@@ -118,14 +121,14 @@ def test_sums_are_the_dense_least_squares() -> None:
 
 def test_belief_is_eliminated_as_if_it_were_solved_for() -> None:
     spline = wild_spline(3)
-    samples = Samples.of(recording(wild_spline(4), np.linspace(spline.t_begin, spline.t_end, 50)))
-    rng, belief = np.random.default_rng(0), Belief.initial(GRAVITY)
-    at = belief.mean + rng.normal(0.0, 0.1, SIZE)
-    joint, _ = Rows.of(spline, samples, T_IMU_DEPTH, at).summed(np.array([0.01, 0.2]))
+    samples = ImuReadings.of(recording(wild_spline(4), np.linspace(spline.t_begin, spline.t_end, 50)))
+    rng, estimate = np.random.default_rng(0), ImuEstimate.initial(GRAVITY)
+    at = estimate.mean + rng.normal(0.0, 0.1, SIZE)
+    joint, _ = ImuResiduals.of(spline, samples, T_IMU_DEPTH, at).summed(np.array([0.01, 0.2]))
     assert joint is not None
-    model, cost, nine = joint.without_belief(belief, at)
-    H, g, known = joint.H, joint.g, belief.information
-    c, z, off = slice(0, -SIZE), slice(-SIZE, None), at - belief.mean
+    model, cost, nine = joint.without_imu(estimate, at)
+    H, g, known = joint.H, joint.g, estimate.information
+    c, z, off = slice(0, -SIZE), slice(-SIZE, None), at - estimate.mean
     for step in (rng.normal(0.0, 1e-3, len(model.g)), np.zeros(len(model.g))):
         best = -np.linalg.solve(H[z, z] + known, g[z] + known @ off + H[z, c] @ step)
         whole = np.concatenate([step, best])
@@ -139,17 +142,17 @@ def test_saturated_and_missing_readings_do_not_count() -> None:
     noise = ImuNoise(1e-4, 1e-5, 1e-3, 1e-4, gyro_range=4.0, accel_range=20.0)
     gyro = np.array([[4.0, 3.9, -4.0], [np.nan, 0.0, 0.0]])
     accel = np.array([[0.0, -20.0, 19.0], [np.inf, 0.0, 0.0]])
-    samples = Samples.of(ImuRecording(t, gyro, accel, noise, np.eye(4), 10.0))
+    samples = ImuReadings.of(ImuRecording(t, gyro, accel, noise, np.eye(4), 10.0))
     np.testing.assert_array_equal(samples.counts, [[0, 1, 0, 1, 0, 1], [0, 1, 1, 0, 1, 1]])
     assert np.isfinite(samples.values).all()
-    without = Samples.of(ImuRecording(t, None, accel[:1].repeat(2, 0), noise, np.eye(4), 10.0))
+    without = ImuReadings.of(ImuRecording(t, None, accel[:1].repeat(2, 0), noise, np.eye(4), 10.0))
     assert not without.counts[:, :3].any() and without.counts[:, 3:].any()
 
 
 def test_gravity_of_a_known_strength_is_on_its_sphere() -> None:
-    start = Belief.initial(np.array([0.0, -9.0, 0.0]))
+    start = ImuEstimate.initial(np.array([0.0, -9.0, 0.0]))
     more = np.repeat([0.0, 0.0, 4.0, 0.0], 3)
-    told = Belief(np.concatenate([BIAS, [3.0, -9.0, 4.0], TURN]), start.information + np.diag(more))
+    told = ImuEstimate(np.concatenate([BIAS, [3.0, -9.0, 4.0], TURN]), start.information + np.diag(more))
     found = told.of_strength(9.80665)
     assert np.linalg.norm(found.mean[6:9]) == pytest.approx(9.80665, abs=2e-3)
     # All directions were known alike: the nearest point of the sphere is the best.
@@ -160,13 +163,13 @@ def test_rows_are_moved_as_if_they_were_linearised_anew() -> None:
     """To second order: steps half as long are off by a quarter."""
     spline = wild_spline(3)
     imu = recording(spline, np.linspace(spline.t_begin, spline.t_end, 40))
-    belief = np.concatenate([BIAS, GRAVITY, TURN])
-    rows = Rows.of(spline, Samples.of(imu), T_IMU_DEPTH, belief)
+    estimate = np.concatenate([BIAS, GRAVITY, TURN])
+    rows = ImuResiduals.of(spline, ImuReadings.of(imu), T_IMU_DEPTH, estimate)
     step = np.random.default_rng(4).normal(0.0, 1e-3, (len(spline.control_points), 6))
     off = []
     for part in (1.0, 0.5):
         T = se3.exp(part * step) @ spline.control_points
-        expected = Rows.of(Spline(T, spline.t0, spline.dt), rows.samples, T_IMU_DEPTH, belief)
+        expected = ImuResiduals.of(Spline(T, spline.t0, spline.dt), rows.samples, T_IMU_DEPTH, estimate)
         off.append(np.abs(rows.moved(0, part * step).r - expected.r).max())
     assert 0.0 < off[1] < 0.27 * off[0] < 0.05 * np.abs(expected.r - rows.r).max()
     early = rows.until(float(imu.t[7]))

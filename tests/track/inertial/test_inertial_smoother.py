@@ -17,13 +17,12 @@ from rstrack.alignment.priors import pose_constraint
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.imu.description import ImuNoise
 from rstrack.data.imu.recording import ImuRecording
-from rstrack.inertial.belief import SIZE, TURN, TURNED, Belief
-from rstrack.inertial.belief import STRENGTH as STRENGTH_SIGMA
+from rstrack.inertial.estimate import SIZE, TURN, TURNED, ImuEstimate
+from rstrack.inertial.estimate import STRENGTH as STRENGTH_SIGMA
 from rstrack.inertial.inertia import Inertia
-from rstrack.inertial.kept import Kept
 from rstrack.inertial.record import is_contradicted, record, text
-from rstrack.inertial.residuals import Rows, Samples
-from rstrack.inertial.smoother import Smoother
+from rstrack.inertial.residuals import ImuReadings, ImuResiduals
+from rstrack.inertial.smoother import ReusedPrior, Smoother
 
 GRAVITY = np.array([2.0, -8.6, 4.262])
 STRENGTH = float(np.linalg.norm(GRAVITY))
@@ -71,45 +70,45 @@ def test_a_small_problem_is_solved_as_by_scipy() -> None:
     truth = hand_held(0.05, 1)
     imu, poses = recording(truth, 2), seen_poses(truth, np.random.default_rng(3), 0.01)
     times, T_seen = np.array([t for t, _ in poses]), np.array([T for _, T in poses])
-    samples, sigma = Samples.of(imu), np.array([2e-3, 0.03])
-    start = Belief.initial(GRAVITY + np.array([0.5, -0.3, 0.4]))
+    samples, sigma = ImuReadings.of(imu), np.array([2e-3, 0.03])
+    start = ImuEstimate.initial(GRAVITY + np.array([0.5, -0.3, 0.4]))
     first = Spline(se3.exp(np.random.default_rng(4).normal(0.0, 2e-3, (len(truth.control_points), 6)))
                    @ truth.control_points, truth.t0, truth.dt)  # fmt: skip
     count = len(first.control_points)
 
     def cost(x: FloatArray) -> FloatArray:
         moved = Spline(se3.exp(x[:-SIZE].reshape(-1, 6)) @ first.control_points, first.t0, first.dt)
-        belief = start.mean + x[-SIZE:]
-        gyro, force = exact_imu(moved, turned(imu.T_imu_depth, belief[9:]), belief[6:9], samples.t)
-        r = np.concatenate([gyro, force], axis=1) + belief[:6] - samples.values
+        estimate = start.mean + x[-SIZE:]
+        gyro, force = exact_imu(moved, turned(imu.T_imu_depth, estimate[9:]), estimate[6:9], samples.t)
+        r = np.concatenate([gyro, force], axis=1) + estimate[:6] - samples.values
         seen = se3.log(moved.pose(times) @ se3.inverse(T_seen)) / POSE_SIGMA
-        known = (belief - start.mean) * np.sqrt(np.diag(start.information))
+        known = (estimate - start.mean) * np.sqrt(np.diag(start.information))
         return np.concatenate([(r / np.repeat(sigma, 3)).ravel(), seen.ravel(), known])
 
     expected = least_squares(cost, np.zeros(6 * count + SIZE), x_scale="jac", method="trf", xtol=1e-14, ftol=1e-14)
-    state, belief = SplineState(first), start.mean.copy()
+    state, estimate = SplineState(first), start.mean.copy()
     for _ in range(5):
         smoother = Smoother.start(start)
-        smoother.around(belief)
+        smoother.around(estimate)
         smoother.reach(state, 0, count)
         for t, T in poses:
             smoother.add(pose_constraint(state.spline, t, T, POSE_SIGMA)[0])
-        joint, _ = Rows.of(state.spline, samples, imu.T_imu_depth, belief).summed(sigma)
+        joint, _ = ImuResiduals.of(state.spline, samples, imu.T_imu_depth, estimate).summed(sigma)
         assert joint is not None
         smoother.add(joint)
         step = -np.linalg.solve(smoother.H, smoother.g)
-        np.testing.assert_allclose(smoother.marginal().mean, belief + step[-SIZE:], atol=1e-8)
+        np.testing.assert_allclose(smoother.marginal().mean, estimate + step[-SIZE:], atol=1e-8)
         state.apply(0, step[:-SIZE].reshape(-1, 6))
-        belief = belief + step[-SIZE:]
+        estimate = estimate + step[-SIZE:]
     best = Spline(se3.exp(expected.x[:-SIZE].reshape(-1, 6)) @ first.control_points, first.t0, first.dt)
-    np.testing.assert_allclose(belief, start.mean + expected.x[-SIZE:], atol=1e-5)
+    np.testing.assert_allclose(estimate, start.mean + expected.x[-SIZE:], atol=1e-5)
     t = np.linspace(best.t_begin, best.t_end, 20)
     np.testing.assert_allclose(state.spline.pose(t), best.pose(t), atol=1e-7)
 
 
 def filled(seed: int = 0) -> Smoother:
     rng = np.random.default_rng(seed)
-    smoother = Smoother.start(Belief.initial(GRAVITY))
+    smoother = Smoother.start(ImuEstimate.initial(GRAVITY))
     smoother.reach(SplineState.still(0.0, DT, np.eye(4), 6), 0, 6)
     size = 36 + SIZE
     root = rng.normal(0.0, 1.0, (2 * size, size))
@@ -137,7 +136,7 @@ def test_walks_and_shifts_add_to_covariances_and_leave_means() -> None:
     smoother.shift(root @ root.T)
     ways = np.concatenate([np.tile(np.eye(6), (6, 1)), np.zeros((SIZE, 6))])
     for i, axis in enumerate(np.eye(3)):
-        ways[42:45, 3 + i] = np.cross(axis, smoother.belief[6:9])
+        ways[42:45, 3 + i] = np.cross(axis, smoother.estimate[6:9])
     expected = before + np.diag(np.concatenate([np.zeros(36), variance])) + ways @ root @ root.T @ ways.T
     np.testing.assert_allclose(np.linalg.inv(smoother.H), expected, rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(-np.linalg.solve(smoother.H, smoother.g), mean, atol=1e-8)
@@ -154,13 +153,13 @@ def test_a_shift_less_than_nothing_takes_nothing_away() -> None:
 
 
 def test_without_biases_and_gravity_the_rest_is_as_if_these_were_best() -> None:
-    """Against SciPy's minimum over all of the belief, gravity's strength a measurement, at several places."""
+    """Against SciPy's minimum over all of the estimate, gravity's strength a measurement, at several places."""
     smoother = filled(6)
-    model, gained = smoother.without_belief(STRENGTH)
-    u = np.concatenate([np.zeros(6), smoother.belief[6:9] / STRENGTH, np.zeros(3)])
+    model, gained = smoother.without_imu(STRENGTH)
+    u = np.concatenate([np.zeros(6), smoother.estimate[6:9] / STRENGTH, np.zeros(3)])
 
     def cost(x: FloatArray) -> float:
-        off = (u @ (smoother.belief + x[-SIZE:]) - STRENGTH) / STRENGTH_SIGMA
+        off = (u @ (smoother.estimate + x[-SIZE:]) - STRENGTH) / STRENGTH_SIGMA
         return float(0.5 * x @ smoother.H @ x + smoother.g @ x + 0.5 * off**2)
 
     assert (model.first, model.last) == (0, 6)
@@ -211,8 +210,8 @@ def test_biases_gravity_and_turn_are_found_to_what_their_sigmas_say() -> None:
     for seed in range(50):
         turn = np.random.default_rng(100 + seed).normal(0.0, TURNED, 3)
         inertia, _ = learnt(seed, 0.8, 0.1, turn)
-        off = inertia.belief.mean - np.concatenate([BIAS, GRAVITY, turn])
-        scores.append(off / inertia.belief.sigmas)
+        off = inertia.estimate.mean - np.concatenate([BIAS, GRAVITY, turn])
+        scores.append(off / inertia.estimate.sigmas)
     assert (np.abs(scores) < 3.0).mean() > 0.98
     np.testing.assert_allclose(np.sqrt(np.mean(np.square(scores)[:, :3])), 1.0, atol=0.2)
     assert 0.3 < np.sqrt(np.mean(np.square(scores)[:, 3:9])) < 1.2  # the prior of biases is wider than these are
@@ -223,23 +222,23 @@ def test_a_place_that_readings_contradict_is_said() -> None:
     """0.3° of turn are found, and said to be; without any nothing is."""
     turn = np.radians([0.2, -0.2, 0.1])
     (off, _), (right, _) = learnt(3, 2.0, turn=turn), learnt(3, 2.0)
-    assert is_contradicted(off.belief) and not is_contradicted(right.belief)
-    assert np.linalg.norm(off.belief.mean[TURN] - turn) < np.radians(0.1)
+    assert is_contradicted(off.estimate) and not is_contradicted(right.estimate)
+    assert np.linalg.norm(off.estimate.mean[TURN] - turn) < np.radians(0.1)
     said, plain = (text(record(inertia), 0.0, 0) for inertia in (off, right))
-    degrees = np.degrees(np.linalg.norm(off.belief.mean[TURN]))
+    degrees = np.degrees(np.linalg.norm(off.estimate.mean[TURN]))
     assert f"turned by {degrees:.2f}°" in said and "rstrack calibrate SEQ --free imu" in said and "turned" not in plain
 
 
 def test_a_second_look_knows_gravity_and_says_when() -> None:
     inertia, truth = learnt(3, 5.0, 0.1)
-    angle = np.degrees(np.arccos(min(1.0, inertia.belief.direction @ GRAVITY / STRENGTH)))
-    assert angle < 0.2 and inertia.belief.direction_deg < 0.3
+    angle = np.degrees(np.arccos(min(1.0, inertia.estimate.direction @ GRAVITY / STRENGTH)))
+    assert angle < 0.2 and inertia.estimate.direction_deg < 0.3
     assert 0.1 < inertia.usable_s < 1.0 < inertia.determined_s < 4.5 < truth.t_end
     # The spline can follow all that there is: readings scatter by their noise.
     np.testing.assert_allclose(inertia.sigma, [7e-5 * 200**0.5, 1e-3 * 200**0.5], rtol=0.5)
 
 
-def ahead_of(inertia: Inertia, state: SplineState) -> tuple[Kept, FloatArray]:
+def ahead_of(inertia: Inertia, state: SplineState) -> tuple[ReusedPrior, FloatArray]:
     """What is known ahead, and what of the control points after its first its minimum adds (k, 6)."""
     known = inertia.ahead(state)
     model, _ = known(state.spline)
@@ -299,15 +298,15 @@ def test_nothing_is_held_where_images_leave_a_way_open() -> None:
 
 def test_another_world_has_its_own_gravity_and_the_same_biases() -> None:
     inertia, _ = learnt(3, 1.2)
-    own, before = [*range(6), *range(9, 12)], inertia.belief
+    own, before = [*range(6), *range(9, 12)], inertia.estimate
     inertia.begin_world()
-    np.testing.assert_allclose(inertia.belief.sigmas[own], before.sigmas[own], rtol=1e-9)
-    np.testing.assert_array_equal(inertia.belief.mean[own], before.mean[own])
-    assert not inertia.is_usable and inertia.belief.direction_deg > 45.0
+    np.testing.assert_allclose(inertia.estimate.sigmas[own], before.sigmas[own], rtol=1e-9)
+    np.testing.assert_array_equal(inertia.estimate.mean[own], before.mean[own])
+    assert not inertia.is_usable and inertia.estimate.direction_deg > 45.0
 
 
 def test_what_comes_before_the_first_control_point_is_taken_for_fixed() -> None:
-    smoother = Smoother.start(Belief.initial(GRAVITY))
+    smoother = Smoother.start(ImuEstimate.initial(GRAVITY))
     smoother.reach(SplineState.still(0.0, DT, np.eye(4), 8), 3, 6)
     model = Quadratic(1, np.arange(1.0, 24 * 24 + 1).reshape(24, 24), np.arange(24.0))
     smoother.add(model)

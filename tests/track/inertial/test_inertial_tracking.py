@@ -23,7 +23,7 @@ from rstrack.data.estimate import read_estimate
 from rstrack.data.imu.description import ImuNoise
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.rig import Frame, Image, Rig
-from rstrack.inertial.band import Band
+from rstrack.inertial.band import MotionBand
 from rstrack.inertial.record import upright
 from rstrack.options import Options
 from rstrack.tracking.runs import checkpoint
@@ -101,7 +101,7 @@ def test_what_vibrates_is_followed_by_knots_as_dense_as_its_unit_asks_for() -> N
     assert dt is not None and dt < 0.01
     assert error < 0.03 and turned_off(truth, 0.025)[0] > 5.0 * error
     # What it cannot follow is told beforehand, and does not grow because images count for more where it is large.
-    assert tracker.inertia is not None and tracker.inertia.sigma[0] < 3.0 * Band.of(imu_of(truth)).scatter(dt)[0]
+    assert tracker.inertia is not None and tracker.inertia.sigma[0] < 3.0 * MotionBand.of(imu_of(truth)).scatter(dt)[0]
 
 
 def test_a_method_without_imu_takes_no_notice_of_one_and_one_with_needs_it() -> None:
@@ -159,7 +159,7 @@ def test_a_run_says_what_it_found_and_resumes_to_the_same_bits(tmp_path: Path, m
         assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "cut" / name).read_bytes()
     info = json.loads((tmp_path / "cut" / "run.json").read_text())
     told = info["imu"]
-    # Where it was described is said, and believed of the run from then on.
+    # Where it was described is said, and used of the run from then on.
     assert info["dataset"]["imu_file"] == str((dataset.root / "imu.yaml").resolve())
     files = open_dataset(dataset.root).as_seen_by(info).imu_files
     assert files is not None and files.given == (dataset.root / "imu.yaml").resolve()

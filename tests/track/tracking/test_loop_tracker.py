@@ -14,7 +14,7 @@ from loop_room import to_and_fro as true_path
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.adjustment.moves import Moves
+from rstrack.adjustment.closing import Moves
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import read_estimate
 from rstrack.data.image_files import with_noise

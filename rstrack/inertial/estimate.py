@@ -1,4 +1,4 @@
-"""What is believed of a unit's biases, of gravity and of how it is turned: twelve numbers, normally distributed."""
+"""The estimate of an IMU's biases, of gravity and of its turn: twelve normally distributed numbers."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ def bias_walk(noise: ImuNoise, seconds: npt.ArrayLike) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class Belief:
+class ImuEstimate:
     """mean (12,): gyroscope's bias, accelerometer's bias, gravity in the world, turn. information (12, 12): of it."""
 
     mean: FloatArray
     information: FloatArray
 
     @classmethod
-    def initial(cls, gravity: FloatArray) -> Belief:
+    def initial(cls, gravity: FloatArray) -> ImuEstimate:
         """Before anything is known; gravity (3,) a guess in the world, whose strength alone counts."""
         sigma = np.repeat([_GYRO_BIAS, _ACCEL_BIAS, 3.0 * float(np.linalg.norm(gravity)), TURNED], 3)
         mean = np.concatenate([np.zeros(6), np.asarray(gravity, dtype=np.float64), np.zeros(3)])
@@ -96,7 +96,7 @@ class Belief:
         """Of what the gyroscope's bias and the turn make together at a rate (3,), rad/s, in the worst direction."""
         return self._worst(np.concatenate([np.eye(3), np.zeros((3, 6)), -hat(rate)], axis=1))
 
-    def of_strength(self, strength: float) -> Belief:
+    def of_strength(self, strength: float) -> ImuEstimate:
         """With gravity on the sphere of a known strength, m/s²: |g| is a measurement, taken where it is in the end."""
         mean, u = self.mean, np.zeros(SIZE)
         for _ in range(3):
@@ -105,7 +105,7 @@ class Belief:
             along = self.covariance @ u
             mean = self.mean + along * ((strength - u @ self.mean) / (STRENGTH**2 + u @ along))
         information = self.information + np.outer(u, u) / STRENGTH**2
-        return Belief(mean, 0.5 * (information + information.T))
+        return ImuEstimate(mean, 0.5 * (information + information.T))
 
     def _worst(self, J: FloatArray) -> float:
         return float(np.linalg.eigvalsh(J @ self.covariance @ J.T)[-1])
