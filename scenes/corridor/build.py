@@ -60,16 +60,9 @@ def build(out: Path, seed: int = 0) -> Path:
     """
     pieces, lamps = contents(seed)
     sky = float(draw(seed, "sky").uniform(0.6, 1.1))
-    return write_room(
-        out,
-        Room(
-            surfaces(pieces),
-            materials(seed),
-            lamps,
-            view=((9.5, 1.6, 0.2), (14.5, 1.2, -0.2)),
-            pictures={"town": town((768, 640), 920 + seed, SKY * sky, GROUND * sky)},
-        ),
-    )
+    view = (9.5, 1.6, 0.2), (14.5, 1.2, -0.2)
+    shown = {"town": town((768, 640), 920 + seed, SKY * sky, GROUND * sky)}
+    return write_room(out, Room(surfaces(pieces), materials(seed), lamps, view, shown))
 
 
 if __name__ == "__main__":

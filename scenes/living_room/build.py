@@ -24,8 +24,8 @@ if str(_ROOT) not in sys.path:  # so that it also runs as a script from anywhere
     sys.path.insert(0, str(_ROOT))
 
 from scenes.kit import room_files  # noqa: E402
+from scenes.kit.pieces import Piece, surfaces  # noqa: E402
 from scenes.kit.room_files import AreaLamp, Room, command, write_room  # noqa: E402
-from scenes.kit.shapes import Mesh, Parts  # noqa: E402
 from scenes.living_room import layout, pictures, room  # noqa: E402
 from scenes.living_room.materials import MATERIALS  # noqa: E402
 
@@ -35,37 +35,30 @@ SKY, GROUND = 2.2, 0.62  # radiance behind the window
 SPOT_COLOUR = np.array([1.05, 0.98, 0.86])
 
 
-def parts() -> tuple[Parts, list[Mesh], list[tuple[Mesh, float]]]:
-    """Everything in the room: surfaces by material, glowing lamp shades, luminous discs with their radiance."""
+def contents() -> tuple[list[Piece], list[AreaLamp]]:
+    """Everything in the room: the shell and pieces, and what shines."""
     furniture, shades = layout.furnishing()
     housings, discs = room.spots()
-    return [*room.architecture(), *housings, *furniture], shades, discs
-
-
-def build(out: Path) -> Path:
-    """Write the scene into the folder `out` (made if need be) and return the path of its scene.xml, written last.
-
-    Raises OSError if the folder cannot be written.
-    """
-    surfaces, shades, discs = parts()
-    shade, spot = room_files.radiance(SHADE_RADIANCE), SPOT_COLOUR
+    pieces = [Piece("shell", room.architecture()), Piece("spots", housings), Piece("furniture", furniture)]
+    shade = room_files.radiance(SHADE_RADIANCE)
     lamps = [AreaLamp(f"lamp_shade_{i}", "shade", mesh, shade) for i, mesh in enumerate(shades)]
     lamps += [
-        AreaLamp(f"spot_{i}", "black", mesh, room_files.radiance(tuple(power * spot)))
+        AreaLamp(f"spot_{i}", "black", mesh, room_files.radiance(tuple(power * SPOT_COLOUR)))
         for i, (mesh, power) in enumerate(discs)
     ]
     garden = room_files.radiance_map("textures/garden.pfm")
-    lamps.append(AreaLamp("window_pane", "black", room.pane(), garden, atlas=True))
-    return write_room(
-        out,
-        Room(
-            surfaces,
-            MATERIALS,
-            lamps,
-            view=((-1.6, 1.55, 1.9), (0.7, 0.75, -0.9)),
-            pictures={"garden": pictures.garden((512, 512), 901, SKY, GROUND)},
-        ),
-    )
+    return pieces, [*lamps, AreaLamp("window_pane", "black", room.pane(), garden, atlas=True)]
+
+
+def build(out: Path) -> Path:
+    """Write the living room into the folder `out` and return the path of its scene.xml, written last.
+
+    Raises OSError if the folder cannot be written.
+    """
+    pieces, lamps = contents()
+    view = (-1.6, 1.55, 1.9), (0.7, 0.75, -0.9)
+    garden = pictures.garden((512, 512), 901, SKY, GROUND)
+    return write_room(out, Room(surfaces(pieces), MATERIALS, lamps, view, {"garden": garden}))
 
 
 if __name__ == "__main__":

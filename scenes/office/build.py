@@ -67,19 +67,12 @@ def build(out: Path, seed: int = 0) -> Path:
     """
     pieces, lamps = contents(seed)
     sky = float(draw(seed, "sky").uniform(0.6, 1.1))
-    return write_room(
-        out,
-        Room(
-            surfaces(pieces),
-            materials(seed),
-            lamps,
-            view=((-3.2, 1.6, -2.5), (0.4, 0.8, 0.9)),
-            pictures={
-                "screens": SCREEN_RADIANCE * pictures.screens((640, 2048), 900 + seed),
-                "town": town((512, 768), 910 + seed, SKY * sky, GROUND * sky),
-            },
-        ),
-    )
+    view = (-3.2, 1.6, -2.5), (0.4, 0.8, 0.9)
+    shown = {
+        "screens": SCREEN_RADIANCE * pictures.screens((640, 2048), 900 + seed),
+        "town": town((512, 768), 910 + seed, SKY * sky, GROUND * sky),
+    }
+    return write_room(out, Room(surfaces(pieces), materials(seed), lamps, view, shown))
 
 
 if __name__ == "__main__":

@@ -43,8 +43,9 @@ def fitted(name: str) -> FitResult:
 @cache
 def room() -> np.ndarray:
     """(m, 3, 3) triangles of the living room."""
-    parts, shades, _ = build.parts()
-    return np.concatenate([mesh.v[mesh.f] for mesh in (*(mesh for _, mesh in parts), *shades)])
+    pieces, lamps = build.contents()
+    meshes = [*(mesh for piece in pieces for _, mesh in piece.parts), *(lamp.mesh for lamp in lamps)]
+    return np.concatenate([mesh.v[mesh.f] for mesh in meshes])
 
 
 @pytest.mark.parametrize("name", TABLE_1)

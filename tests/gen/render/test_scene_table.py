@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
+import struct
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
@@ -13,7 +15,6 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial import ConvexHull
-from test_scene_living_room import digest, read_ply
 
 from rsgen.errors import UserError
 from rsgen.render.scene import content_hash, ensure_built, load_scene
@@ -30,6 +31,26 @@ STUB = (
 FURNITURE = layout.furnishing()[0]
 THINGS = {thing.name: thing for thing in table.things()}
 Prism = tuple[np.ndarray, float, float]  # outline (n, 2) of x, z, counter-clockwise; lowest and highest y
+
+
+def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 8) float64 and faces (m, 3) of our binary PLY, read from its header and not by our writer."""
+    head, body = path.read_bytes().split(b"end_header\n", 1)
+    counts = {line.split()[1]: int(line.split()[2]) for line in head.splitlines() if line.startswith(b"element")}
+    names = [line.split()[-1] for line in head.splitlines() if line.startswith(b"property float")]
+    assert names == [b"x", b"y", b"z", b"nx", b"ny", b"nz", b"u", b"v"]
+    n, m = counts[b"vertex"], counts[b"face"]
+    assert len(body) == n * struct.calcsize("<8f") + m * struct.calcsize("<B3i")
+    v = np.frombuffer(body, "<f4", 8 * n).reshape(n, 8).astype(float)
+    f = np.frombuffer(body, np.dtype([("n", "u1"), ("i", "<i4", 3)]), m, offset=32 * n)
+    assert (f["n"] == 3).all()
+    return v, f["i"].astype(int)
+
+
+def digest(folder: Path) -> dict[str, str]:
+    """SHA-256 of every file below `folder`."""
+    files = sorted(p for p in folder.rglob("*") if p.is_file())
+    return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
 
 
 @pytest.fixture(scope="module")
