@@ -10,7 +10,7 @@ there is a false alarm in at most one comparison of twenty (Holm 1979). The test
 
 - Figures with three runs or so: t-test of the means with a moderated variance (`benchmarks.inference`), errors and
   ratios in logarithms. It is not paired: a changed program's errors under the same noise may be alike, or may not, and
-  where they are, the test says less than it could. Of what has a nominal value, the distance of the mean from it.
+  where they are, the test is weaker than it could be. Of what has a nominal value, the distance of the mean from it.
 - The same tests together, for each figure of each method over all cells (Stouffer 1949): what makes everything a little
   worse is seen there, long before it is in any one cell. Half of the false alarms are theirs.
 - Ten runs and more, as of faults, one a seed: exact signed-rank test (Wilcoxon 1945) of the runs' differences, since
@@ -77,7 +77,7 @@ class _Judged:
 
 def compare(old: Mapping[str, CellRecord], new: Mapping[str, CellRecord]) -> RecordComparison:
     """Compare all cells that both have. `RecordComparison.worse` is empty where nothing got worse beyond chance."""
-    usual = priors([old, new])
+    known = priors([old, new])
     judged, cells = _Judged(), defaultdict[str, list[str]](list)
     pairs: list[tuple[CellRecord, CellRecord]] = []
     same = 0
@@ -93,7 +93,7 @@ def compare(old: Mapping[str, CellRecord], new: Mapping[str, CellRecord]) -> Rec
         if not fate:
             pairs.append(_shared(before, after))
             if not after.is_others:
-                same += not _judge(*pairs[-1], usual, judged)
+                same += not _judge(*pairs[-1], known, judged)
     together = _together(judged.tests)
     tests = [*together, *judged.tests]
     worse, better = (
@@ -133,7 +133,7 @@ def _fate(before: CellRecord | None, after: CellRecord | None) -> str:
     return _OTHERWISE if definitions[0] != definitions[1] or not {*before.seeds} & {*after.seeds} else ""
 
 
-def _judge(one: CellRecord, other: CellRecord, usual: Mapping[str, Prior], judged: _Judged) -> bool:
+def _judge(one: CellRecord, other: CellRecord, known: Mapping[str, Prior], judged: _Judged) -> bool:
     """Add what changed between two records of the same runs to `judged`; whether anything did."""
     names = [n for n in _names(one) if figure_of(n).is_judged and one.values(n) != other.values(n)]
     for name in names:
@@ -147,7 +147,7 @@ def _judge(one: CellRecord, other: CellRecord, usual: Mapping[str, Prior], judge
             why = "there was none"
             judged.worse.append(FigureChange(one.cell, name, 0.0, other.total(name), why=why))
         else:
-            test = _test(one, other, name, usual.get(name))
+            test = _test(one, other, name, known.get(name))
             if test is None:
                 judged.unknown.append(FigureChange(one.cell, name, _shown(one, name), _shown(other, name)))
             else:
@@ -180,7 +180,7 @@ def _shown(record: CellRecord, name: str) -> float | None:
     return record.total(name) if figure_of(name).scale == "count" else record.figures.get(name)
 
 
-def _test(one: CellRecord, other: CellRecord, name: str, usual: Prior | None) -> _Test | None:
+def _test(one: CellRecord, other: CellRecord, name: str, prior: Prior | None) -> _Test | None:
     """Old against new of one figure; None: there is no scatter to compare the difference with."""
     figure = figure_of(name)
     change = FigureChange(one.cell, name, _shown(one, name), _shown(other, name))
@@ -191,7 +191,7 @@ def _test(one: CellRecord, other: CellRecord, name: str, usual: Prior | None) ->
         return _Test(change, signed_rank_p(differences), signed_rank_p([-d for d in differences]))
     if figure.scale == "count":
         return _count_test(change, one, other)
-    return _t_test(change, one, other, usual)
+    return _t_test(change, one, other, prior)
 
 
 def _cost(figure: FigureInfo, value: float) -> float:
@@ -200,7 +200,7 @@ def _cost(figure: FigureInfo, value: float) -> float:
     return figure.badness([-1e3 if scaled is None else scaled])
 
 
-def _t_test(change: FigureChange, one: CellRecord, other: CellRecord, usual: Prior | None) -> _Test | None:
+def _t_test(change: FigureChange, one: CellRecord, other: CellRecord, prior: Prior | None) -> _Test | None:
     figure = figure_of(change.figure)
     values = [
         [x for value in record.values(change.figure) if (x := figure.on_scale(value)) is not None]
@@ -209,9 +209,9 @@ def _t_test(change: FigureChange, one: CellRecord, other: CellRecord, usual: Pri
     if not all(values):
         return None
     own = [spread_of(figure, record.values(change.figure)) for record in (one, other)]
-    variance, dof = (0.0, 0.0) if usual is None else usual.with_own(own[0] + own[1])
+    variance, dof = (0.0, 0.0) if prior is None else prior.with_own(own[0] + own[1])
     sd, kept = one.scatter.get(change.figure, (0.0, 0.0))
-    if kept > (0.0 if usual is None else usual.pooled):
+    if kept > (0.0 if prior is None else prior.pooled):
         # Measured on more cells, when the old ones were accepted, than are here; their own runs are in it.
         variance, dof = Prior(sd**2, kept, kept + own[1].dof).with_own(own[1])
     if variance <= 0.0 or dof <= 0.0:

@@ -94,5 +94,5 @@ def times(pairs: Sequence[tuple[CellRecord, CellRecord]]) -> list[str]:
         return []
     machines = [sorted({str(pair[k].machine.get("cpu", "?")) for pair in pairs}) for k in (0, 1)]
     loads = [max((float(pair[k].machine.get("load") or 0.0) for pair in pairs), default=0.0) for k in (0, 1)]
-    told = " -> ".join(f"{', '.join(m)}, load up to {load:g}" for m, load in zip(machines, loads, strict=True))
-    return [f"times, shown and not judged ({told}):", *lines]
+    where = " -> ".join(f"{', '.join(m)}, load up to {load:g}" for m, load in zip(machines, loads, strict=True))
+    return [f"times, shown and not judged ({where}):", *lines]

@@ -1,8 +1,9 @@
-"""How much chance scatters figures, measured: each cell's own variance, moderated by that of all cells.
+"""Statistics of comparisons: how much chance scatters figures, and exact one-sided tests.
 
-With three runs a cell's own variance is off by a factor of two and more. All cells' variances of a figure tell what is
-usual (s0²), and how alike they are (d0 degrees of freedom), by the method of moments of Smyth (2004), *Linear models
-and empirical Bayes methods*, section 6.2; the two are then weighed by their degrees of freedom (there equation 1).
+The scatter is measured: each cell's own variance, moderated by that of all cells. With three runs a cell's own variance
+is off by a factor of two and more. All cells' variances of a figure give the common one (s0²), and how alike they are
+(d0 degrees of freedom), by the method of moments of Smyth (2004), *Linear models and empirical Bayes methods*, section
+6.2; the two are then weighed by their degrees of freedom (there equation 1).
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class RunSpread:
 
 @dataclass(frozen=True)
 class Prior:
-    """What is usual: a variance, and how many degrees of freedom it is worth; pooled: those it was measured with."""
+    """The variance that cells have in common, its worth in degrees of freedom; pooled: those it was measured with."""
 
     variance: float
     dof: float
@@ -44,8 +45,8 @@ class Prior:
     def with_own(self, own: RunSpread) -> tuple[float, float]:
         """Variance and degrees of freedom of a cell with a spread of its own.
 
-        They are never more than all cells have together: what is usual is not known better than that (as limma has
-        it). A spread of exactly zero says that chance plays no part in this cell's runs, and counts as none.
+        They are never more than all cells have together: the common variance is not known better (as limma has it).
+        A spread of exactly zero means that chance plays no part in this cell's runs, and counts as none.
         """
         if own.squares <= 0.0:
             return self.variance, min(self.dof, self.pooled)
@@ -104,14 +105,14 @@ def scattered(record: CellRecord) -> list[str]:
 
 def tolerances(records: Mapping[str, CellRecord]) -> dict[str, CellRecord]:
     """The records with each one's scatter, as measured over all of them, to be kept with them when accepted."""
-    usual = priors([records])
+    known = priors([records])
     out = {}
     for cell, record in records.items():
         scatter = {}
         for name in scattered(record) if record.error is None and not record.is_others else []:
-            if name in usual:
-                variance, dof = usual[name].with_own(spread_of(figure_of(name), record.values(name)))
-                if dof <= 0.0:  # one cell alone says nothing of the others
+            if name in known:
+                variance, dof = known[name].with_own(spread_of(figure_of(name), record.values(name)))
+                if dof <= 0.0:  # one cell alone shows nothing of the others
                     continue
                 scatter[name] = (float(f"{math.sqrt(variance):.6g}"), float(f"{dof:.6g}"))
         out[cell] = dataclasses.replace(record, scatter=scatter)

@@ -92,9 +92,9 @@ def real(full: Records) -> list[str]:
         if record.method == "rs-pg" and "truth_offset_ms" in record.figures and not record.is_change
     ]
     about = f" Offsets with `rs-pg`, ms: {', '.join(clocks)}." if clocks else ""
-    told = f"The truth has a clock of its own, which is fitted for each track.{about}"
+    clock = f"The truth has a clock of its own, which is fitted for each track.{about}"
     table = Table((*table.head, "lost", "silently wrong"), tuple(rows))
-    return _section("Real recordings: ATE mm · mm/s · deg/s", table, records, told, "")
+    return _section("Real recordings: ATE mm · mm/s · deg/s", table, records, clock, "")
 
 
 def imu(full: Records) -> list[str]:
@@ -221,9 +221,9 @@ def _averages(records: Sequence[CellRecord], shown: Sequence[str]) -> Table:
         if column in names:
             return Entry(significant(value(method, column)), mark=found[method].mark if column == _ERRORS[0] else "")
         average = found[method]
-        told = {"NEES/6": significant(average.figures.get("nees")), "lost": str(average.lost)}
-        told["in 90 %"] = significant(average.figures.get("coverage_90"), 2)
-        return Entry(told.get(column, NOTHING if average.silent is None else str(average.silent)))
+        texts = {"NEES/6": significant(average.figures.get("nees")), "lost": str(average.lost)}
+        texts["in 90 %"] = significant(average.figures.get("coverage_90"), 2)
+        return Entry(texts.get(column, NOTHING if average.silent is None else str(average.silent)))
 
     return pivot("method", shown, (*_ERRORS, "the paper", "lost", "silent", "NEES/6", "in 90 %"), entry, value)
 
@@ -276,6 +276,6 @@ def _fault_entries(runs: Sequence[dict[str, float | None]]) -> list[Entry]:
     return [Entry(text) for text in texts]
 
 
-def _section(title: str, table: Table, records: Sequence[CellRecord], *told: str) -> list[str]:
+def _section(title: str, table: Table, records: Sequence[CellRecord], *lines: str) -> list[str]:
     """Nothing where there are no records."""
-    return [f"## {title}", "", *told, table.markdown(), ""] if records else []
+    return [f"## {title}", "", *lines, table.markdown(), ""] if records else []

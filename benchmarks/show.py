@@ -50,6 +50,7 @@ _WORDS = f"""\
 ATE and drift over a second are RMSE, means over seeds; counts are sums. † frames were lost; silent: frames given, not \
 lost, though 20 mm or 2° off. NEES/6 is 1 where errors are as large as covariances say, and 90 % should lie in 90 %. \
 {_PAPERS}"""
+_CASE = re.compile(r"readout-(.+)-(\d+(?:\.\d+)?)ms")
 _WHAT = {
     "rs-pg": "rolling shutter, depth and colour",
     "rs-g": "rolling shutter, depth",
@@ -76,7 +77,7 @@ def results_markdown(gate: Records, full: Records) -> str:
         sections.methods, sections.per_sequence, sections.real, sections.not_the_best, sections.imu, sections.loops,
         sections.faults, sections.changes, cliff, sections.readout, sections.speed, sections.memory,
         sections.measured("Calibration", "calibration"),
-        sections.measured("Lenses told wrong, found: RMS over the image", "lens"),
+        sections.measured("Wrong lenses, calibrated: RMS over the image", "lens"),
         sections.measured("With the camera found on another recording", "crossed"),
         sections.measured("Convergence and start", "convergence", "bootstrap"),
         sections.measured("Light and rendering", "light", "render"),
@@ -110,16 +111,17 @@ def readme_block(gate: Records, full: Records) -> str:
         rows.append((method, *cells))
     head = ("method", "what it does", "hand-held", "the paper", "living room", "the paper", "real recordings")
     table = Table(head, tuple(rows), words=(0, 1)).markdown() if rows else "-"
-    told = {name: ", ".join(sequences_of(records)) or "nothing yet" for name, records in groups.items()}
+    listed = {name: ", ".join(sequences_of(records)) or "nothing yet" for name, records in groups.items()}
     loops = sorted({record.method for record in shown if closes_loops(record)})
     but = f", and closed in the end in {' and '.join(f'`{method}`' for method in loops)}" if loops else ""
     words = sentences({**gate, **full})
     return "\n".join([
-        f"Averages over sequences: hand-held (blurred, noisy, unregistered: {told['hand-held']}),",
-        f"living room (noise-free: {told['living room']}), real recordings ({told['real']}, the truth's clock fitted).",
+        f"Averages over sequences: hand-held (blurred, noisy, unregistered: {listed['hand-held']}),",
+        f"living room (noise-free: {listed['living room']}),",
+        f"real recordings ({listed['real']}, the truth's clock fitted).",
         "Cells are ATE in mm · drift in mm/s · drift in degrees/s, all RMSE. † frames were lost; (n of m) has so many.",
         "", table, "", _PAPERS,
-        f"Settings are defaults; loops are off{but}. `rstrack track` closes them in the end unless told otherwise.",
+        f"Settings are defaults; loops are off{but}. `rstrack track` closes them in the end by default.",
         *_provenance("Measured", full or gate), *([words] if words else []),
         "Every sequence, recording and measure is in [docs/results.md](docs/results.md).",
     ])  # fmt: skip
@@ -140,6 +142,26 @@ def documents(gate: Records, full: Records) -> dict[Path, str]:
         RESULTS: results_markdown(gate, full),
         README: with_block(read_text(README), readme_block(gate, full)),
     }
+
+
+def readout_charts(full: Records) -> list[Chart]:
+    """ATE over readout, one chart a motion, of cells track/readout-MOTION-Nms/METHOD."""
+    motions: dict[str, dict[str, dict[float, CellRecord]]] = defaultdict(lambda: defaultdict(dict))
+    records = of_measure(full, "track")
+    order = methods_in_order(records)
+    for record in sorted(records, key=lambda record: order.index(record.method)):
+        named = _CASE.fullmatch(record.case)
+        if named and errors(record):
+            motions[named[1]][record.method][1e-3 * float(named[2])] = record
+    return [readout_chart(motion, methods) for motion, methods in motions.items()]
+
+
+def draw_readout(full: Records, path: Path) -> bool:
+    """Write the picture, the same bytes for the same records and versions; whether there is anything to draw."""
+    charts = readout_charts(full)
+    if charts:
+        write_charts(charts, path, "", columns=len(charts), one_legend=True)
+    return bool(charts)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -173,8 +195,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _what(method: str, program: str, with_loops: bool) -> str:
     """What a row's method does, in a few words."""
-    said = _WHAT.get(program, "")
-    return f"{said}, loops closed" if with_loops and method != program else said
+    what = _WHAT.get(program, "")
+    return f"{what}, loops closed" if with_loops and method != program else what
 
 
 def _provenance(tier: str, records: Records) -> list[str]:
@@ -183,26 +205,3 @@ def _provenance(tier: str, records: Records) -> list[str]:
 
 if __name__ == "__main__":
     sys.exit(main())
-
-
-_CASE = re.compile(r"readout-(.+)-(\d+(?:\.\d+)?)ms")
-
-
-def readout_charts(full: Records) -> list[Chart]:
-    """ATE over readout, one chart a motion, of cells track/readout-MOTION-Nms/METHOD."""
-    motions: dict[str, dict[str, dict[float, CellRecord]]] = defaultdict(lambda: defaultdict(dict))
-    records = of_measure(full, "track")
-    order = methods_in_order(records)
-    for record in sorted(records, key=lambda record: order.index(record.method)):
-        named = _CASE.fullmatch(record.case)
-        if named and errors(record):
-            motions[named[1]][record.method][1e-3 * float(named[2])] = record
-    return [readout_chart(motion, methods) for motion, methods in motions.items()]
-
-
-def draw_readout(full: Records, path: Path) -> bool:
-    """Write the picture, the same bytes for the same records and versions; whether there is anything to draw."""
-    charts = readout_charts(full)
-    if charts:
-        write_charts(charts, path, "", columns=len(charts), one_legend=True)
-    return bool(charts)

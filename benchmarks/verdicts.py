@@ -122,7 +122,7 @@ FAMILY = "cliff"
 """The family's name in the definitions, and so the group of its cells."""
 _LEAST_TRACKED = 0.99
 _MEDIANS, _MORE_MM = 2.5, 5.0
-_TOLD = """\
+_ABOUT = """\
 {methods} with one thing of the camera file a little wrong, begun at several frames: the least share of frames with a
 pose, how many cells have less than 99 %, their median ATE, and how many are far off: more than 2.5 medians + 5 mm, or
 most frames lost."""
@@ -165,5 +165,5 @@ def cliff(records: Records) -> list[str]:
         texts = (f"{fall.cells}", f"{100.0 * fall.least:.1f}", f"{fall.untracked}", significant(fall.median_mm))
         rows.append((fall.sequence, *map(Entry, texts), Entry(f"{fall.off}")))
     head = ("sequence", "cells", "tracked at worst, %", "cells below 99 %", "median ATE, mm", "cells far off")
-    told = _TOLD.format(methods=", ".join(f"`{method}`" for method in methods_in_order(cells)))
-    return ["## The cliff test", "", told, "", Table(head, tuple(rows)).markdown(), ""]
+    about = _ABOUT.format(methods=", ".join(f"`{method}`" for method in methods_in_order(cells)))
+    return ["## The cliff test", "", about, "", Table(head, tuple(rows)).markdown(), ""]

@@ -1,4 +1,8 @@
-"""The measure `calibration`: how far off cameras may be and still be found, and whether errors are as large as said."""
+"""Measures of calibrations, with errors over their σ.
+
+`calibration`: how far off cameras may be and still be found. `lens`: wrong lenses of a rendering. `crossed`: a track
+with the camera that was found on another recording.
+"""
 
 from __future__ import annotations
 
@@ -27,9 +31,9 @@ from rstrack.data.camera_file import usual
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.image_files import NoisyImages
 
-# What cameras are told wrong by, and multiples of it: readouts by half, colour's clock in s, extrinsics.
+# How wrong cameras are stated, and multiples of it: readouts by half, colour's clock in s, extrinsics.
 UNIT_READOUT, UNIT_OFFSET_S, UNIT_M, UNIT_RAD = 0.5, 0.015, 5e-3, float(np.radians(0.5))
-# σ beyond which a value is wrong, whatever is said of it; and up to which its interval of two σ holds 95 %.
+# σ beyond which a value is wrong, whatever is reported of it; and up to which its interval of two σ holds 95 %.
 _WRONG, _WITHIN = 4.0, 2.0
 _DEG = 180.0 / np.pi
 # The unknowns that move poses, as figures name them: unit and how many of it are in the SI unit.
@@ -50,7 +54,7 @@ class CalibrationSettings(StrictModel):
 @dataclass(frozen=True)
 class CalibrationTrial:
     """One start. errors, sigmas (10,): of the unknowns that move poses, against the true cameras', in SI units; NaN
-    where not told. refused: the line that it ended with.
+    where not determined. refused: the line that it ended with.
     """
 
     factor: float
@@ -62,20 +66,20 @@ class CalibrationTrial:
 
     @property
     def is_wrong(self) -> bool:
-        """Whether a value that is said to be found is not."""
+        """Whether a value that is reported as found is not."""
         return self.converged and bool((np.abs(self.errors) > _WRONG * self.sigmas).any())
 
     @property
     def is_found(self) -> bool:
-        """Whether it is where it says to be."""
+        """Whether it is found within its error."""
         return self.converged and not self.is_wrong
 
 
 def calibration_cell(task: Task, progress: Progress) -> Figures:
-    """Calibrate the case from cameras that are told ever more wrongly, all values at once, each way round at random.
+    """Calibrate the case from cameras that are stated ever more wrongly, all values at once, each way round at random.
 
     The sequence's cameras are taken for the truth; of one that declares others, those in truth/cameras.yaml. The case's
-    noise is another for each start. A readout is never told below 0. Raises UserError: factors below 0.
+    noise is another for each start. A readout is never stated below 0. Raises UserError: factors below 0.
     """
     settings = settings_of(task, CalibrationSettings)
     if min(settings.factors) < 0.0:
@@ -90,8 +94,8 @@ def calibration_cell(task: Task, progress: Progress) -> Figures:
             if noise.sigma_depth or noise.sigma_intensity:
                 seed = task.seed * settings.starts + k
                 images = NoisyImages(images, noise.sigma_depth, noise.sigma_intensity, seed)
-            told = told_wrong(replace(dataset, images=images), truth, factor, unit)
-            trials.append(_trial(task, told, truth, factor))
+            wrong = stated_wrong(replace(dataset, images=images), truth, factor, unit)
+            trials.append(_trial(task, wrong, truth, factor))
             found = sum(trial.is_found for trial in trials)
             done = len(trials) / (len(units) * len(settings.factors))
             progress("calibrating", done, f"{found} of {len(trials)} found")
@@ -100,13 +104,13 @@ def calibration_cell(task: Task, progress: Progress) -> Figures:
 
 def true_dataset(task: Task) -> Dataset:
     """The task's dataset with its true cameras, where its own are claims. Raises UserError."""
-    entry, told = task.cell.case_entry, task.root / TRUE_CAMERAS
-    if entry.camera is None and told.exists():
-        task = replace(task, cell=replace(task.cell, case_entry=entry.model_copy(update={"camera": told})))
+    entry, true = task.cell.case_entry, task.root / TRUE_CAMERAS
+    if entry.camera is None and true.exists():
+        task = replace(task, cell=replace(task.cell, case_entry=entry.model_copy(update={"camera": true})))
     return task.dataset
 
 
-def told_wrong(dataset: Dataset, truth: Parameters, factor: float, unit: Sequence[float]) -> Dataset:
+def stated_wrong(dataset: Dataset, truth: Parameters, factor: float, unit: Sequence[float]) -> Dataset:
     """The dataset with cameras that are off by `factor` units along `unit` (9,): clocks (±1), shift and turn."""
     scales = [UNIT_READOUT * truth.depth_readout_s, UNIT_READOUT * truth.color_readout_s, UNIT_OFFSET_S]
     step = np.zeros(len(NAMES))
@@ -168,9 +172,9 @@ def _directions(rng: np.random.Generator) -> list[float]:
     return flat
 
 
-def _trial(task: Task, told: Dataset, truth: Parameters, factor: float) -> CalibrationTrial:
+def _trial(task: Task, stated: Dataset, truth: Parameters, factor: float) -> CalibrationTrial:
     try:
-        found = calibrate(told, frames=task.cell.frames, options=task.options)
+        found = calibrate(stated, frames=task.cell.frames, options=task.options)
     except UserError as error:
         return CalibrationTrial(factor, np.full(POSES, np.nan), np.full(POSES, np.nan), refused=str(error))
     if not found.solution.finished:
@@ -181,7 +185,7 @@ def _trial(task: Task, told: Dataset, truth: Parameters, factor: float) -> Calib
     return CalibrationTrial(factor, errors, sigmas, found.solution.is_settled, seconds=found.seconds)
 
 
-# How far lenses are told wrong: parts, px of 640, and σ of distortion as OpenCV counts it.
+# How wrong lenses are stated: parts, px of 640, and σ of distortion as OpenCV counts it.
 _FOCAL, _CENTER_PX, _DISTORTION = 0.03, 15.0, (0.06, 0.06, 0.002, 0.002, 0.06)
 _WITHIN = 2.0
 
@@ -213,7 +217,7 @@ def crossed_cell(task: Task, progress: Progress) -> Figures:
 
 
 def lens_cell(task: Task, progress: Progress) -> Figures:
-    """Find a lens that is told wrong by 3 %, 15 of 640 px and distortion, and readouts that are told to be none.
+    """Find a lens that is stated wrong by 3 %, 15 of 640 px and distortion, and readouts that are stated as none.
 
     Of a rendering whose depth is registered to colour. Raises UserError: its depth is not.
     """
@@ -229,9 +233,9 @@ def lens_cell(task: Task, progress: Progress) -> Figures:
         progress("lenses", k / count, "")
         wrong = _wrong(rig.color_camera, rng)
         before.append(rms(displacement_px(rig.color_camera, wrong)))
-        told = replace(rig, depth_camera=wrong, color_camera=wrong, sigma=usual(wrong))
+        stated = replace(rig, depth_camera=wrong, color_camera=wrong, sigma=usual(wrong))
         depth, color = (replace(shutter, readout_s=0.0) for shutter in (rig.depth_shutter, rig.color_shutter))
-        dataset = task.noisy.seen_with(replace(told, depth_shutter=depth, color_shutter=color))
+        dataset = task.noisy.seen_with(replace(stated, depth_shutter=depth, color_shutter=color))
         found = calibrate(dataset, frames=task.cell.frames, options=task.options)
         if not found.solution.finished:
             raise KeyboardInterrupt
@@ -260,7 +264,7 @@ def _wrong(camera: Camera, rng: np.random.Generator) -> Camera:
 
 
 def _errors_over_sigma(found: CameraCalibration, true: Camera, task: Task) -> list[float]:
-    """Of the lens, the readouts and, unless a driver's stamps hide it, colour's clock, of those that are told."""
+    """Of the lens, the readouts and, unless a driver's stamps hide it, colour's clock, of those that are determined."""
     lens, truth = found.calibrated().rig.color_camera, parameters_of(task.dataset)
     bent = (*true.distortion, *(0.0,) * 5)[:5]
     errors = [

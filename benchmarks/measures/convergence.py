@@ -30,7 +30,7 @@ from rstrack.options import Options
 from rstrack.tracking.judgement.lost_track import lost
 from rstrack.tracking.window import Window
 
-# What a frame is moved by, in metres and degrees, and multiples of it; 0 tells how good the truth itself is as a start.
+# What a frame is moved by, in metres and degrees, and multiples of it; 0 shows how good the truth itself is as a start.
 UNIT_M, UNIT_DEG = 0.02, 1.0
 FACTORS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 # Errors within which a frame has converged.
@@ -58,13 +58,13 @@ class FramePair:
 
 @dataclass(frozen=True)
 class AlignmentTrial:
-    """Where a moved frame ended: errors at mid readout. believed: the tracker would have gone on with it."""
+    """Where a moved frame ended: errors at mid readout. accepted: the tracker would have gone on with it."""
 
     factor: float
     error_m: float
     error_deg: float
     steps: int
-    believed: bool
+    accepted: bool
 
     @property
     def converged(self) -> bool:
@@ -112,10 +112,10 @@ def run_trials(
         off_m = max(off_m, float(np.linalg.norm(spline.pose(t)[:3, 3] - T_true[:3, 3])))
         for factor in FACTORS:
             state = moved_state(spline, new, pair, factor)
-            steps, believed = aligner.align(new, ref, state)
+            steps, accepted = aligner.align(new, ref, state)
             T = state.spline.pose(t)
             error = float(np.linalg.norm(T[:3, 3] - T_true[:3, 3])), float(angles_deg(T_true[None], T[None])[0])
-            trials.append(AlignmentTrial(factor, *error, steps, believed))
+            trials.append(AlignmentTrial(factor, *error, steps, accepted))
         found = sum(trial.converged for trial in trials if trial.factor == 1.0)
         progress("aligning", done / len(pairs), f"{found} of {done} converged")
     return trials, off_m
@@ -128,7 +128,7 @@ def figures_of(trials: Sequence[AlignmentTrial]) -> Figures:
         these = [trial for trial in trials if trial.factor == factor]
         figures |= {
             f"converged_pct_{factor:g}x": 100.0 * float(np.mean([trial.converged for trial in these])),
-            f"wrong_unnoticed_{factor:g}x": sum(trial.believed and not trial.converged for trial in these),
+            f"wrong_unnoticed_{factor:g}x": sum(trial.accepted and not trial.converged for trial in these),
             f"median_error_mm_{factor:g}x": 1e3 * float(np.median([trial.error_m for trial in these])),
             f"median_error_deg_{factor:g}x": float(np.median([trial.error_deg for trial in these])),
             f"median_steps_{factor:g}x": float(np.median([trial.steps for trial in these])),

@@ -1,4 +1,4 @@
-"""The measure `faults`: one injected fault a run, and what the tracker says and does about it.
+"""The measure `faults`: one injected fault a run, and what the tracker reports and does about it.
 
 Kinds take turns: the run of seed n has the kind n modulo their number. A pose is wrong silently where it is given, not
 lost, though it is more than 20 mm or 2° off: at once or in the end. The estimate's world is aligned to the truth's by
@@ -54,7 +54,7 @@ def judged(fault: InjectedFault, options: Options) -> Figures:
     worst_deg: of the frames given from the fault on. place_known: some frame was lost until the fault's end, and the
     frame there is where a keyframe is; found_in_5: then, whether one of the five frames from there on is right.
     moved_mm: largest change of a position ten frames after it was first given; rewritten_mm: largest change of any
-    position when a new piece of the track began. lost_ms, tracked_ms: median time of such frames. kind: its number in
+    position when a new segment of the track began. lost_ms, tracked_ms: median time of such frames. kind: its number in
     `KINDS`.
     """
     dataset, first, last = fault.dataset, fault.first, fault.last
@@ -127,13 +127,13 @@ def _watch(dataset: Dataset, options: Options) -> _Watched:
     seen = _Watched()
     settled: dict[int, FloatArray] = {}
     for k, frame in enumerate(dataset.frames()):
-        begin, pieces = time.perf_counter(), len(tracker.spline_valid)
+        begin, segments_before = time.perf_counter(), len(tracker.spline_valid)
         tracker.feed(frame)
         seen.seconds.append(time.perf_counter() - begin)
         segments.feed(frame, tracker.reports)
         now = _poses(dataset, *tracker.trajectory)
         seen.at_once.append(now.get(k))
-        if len(tracker.spline_valid) > pieces:
+        if len(tracker.spline_valid) > segments_before:
             seen.rewritten_m = max(seen.rewritten_m, _largest_move(seen.final, now))
         seen.final = now
         if k >= _CONVERGED and k - _CONVERGED in now:

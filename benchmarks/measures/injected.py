@@ -4,7 +4,7 @@ fault = random_fault(dataset, seed=17)
 track(fault.dataset, options, out)         # frames fault.first to fault.last - 1 were touched
 
 All are pure functions of dataset and seed. The truth of a frame is where its depth image was really taken, whatever is
-shown in it: `Dataset.truth_poses` says it at every stamp.
+shown in it: `Dataset.truth_poses` has it at every stamp.
 """
 
 from __future__ import annotations

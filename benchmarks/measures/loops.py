@@ -51,7 +51,7 @@ class LoopsSettings(StrictModel):
 def loops_cell(task: Task, progress: Progress) -> Figures:
     """Track the case, look for loops, then try look-alikes, its own or another recording's.
 
-    median_mm, median_mrad, worst_mm: errors of what each frame says of the other keyframe, against the truth. nees:
+    median_mm, median_mrad, worst_mm: errors of each frame's pose in the other keyframe, against the truth. nees:
     squared errors over the covariances, over six (1: as large as they say), median. false: loops further off than 20 mm
     or 2 degrees. alike: pairs of different places that were tried, those that look most alike; accepted: of these,
     taken for one. Raises UserError: no true spline, no frame, a method without a spline, another recording by other

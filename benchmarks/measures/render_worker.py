@@ -44,7 +44,7 @@ def light_figures(config: Config, settings: Mapping[str, Any], progress: Progres
     """
     if config.light.mode != "baked":
         raise UserError("light.mode is 'path': what is measured is baked light")
-    view_camera(config, settings["width"])  # a wrong width would else be told after the bake
+    view_camera(config, settings["width"])  # a wrong width would else be reported after the bake
     mi = mitsuba(config.backend)
     from rsgen.light.cache import baked_field
     from rsgen.light.lamps import straight_through_bulbs
@@ -155,7 +155,7 @@ def render_figures(config: Config, settings: Mapping[str, Any], progress: Progre
 
 
 def row_renderer(scene: Any, integrator: Any, camera: Any, spp: int) -> Any:
-    """A ColorRenderer of single rows: `sensor.row` says which row of `camera` comes next."""
+    """A ColorRenderer of single rows: `sensor.row` is the row of `camera` that comes next."""
     import mitsuba as mi
 
     from rsgen.render.images import ColorRenderer

@@ -63,8 +63,8 @@ def rendered(task: Task, what: str, settings: Mapping[str, Any], progress: Progr
         finally:
             process.kill()
         log.seek(0)
-        said = log.read().strip().splitlines()
-        raise UserError(f"the renderer's process ended: {said[-1] if said else 'no message'}")
+        lines = log.read().strip().splitlines()
+        raise UserError(f"the renderer's process ended: {lines[-1] if lines else 'no message'}")
 
 
 class LightSettings(StrictModel):
@@ -80,7 +80,7 @@ def light_cell(task: Task, progress: Progress) -> Figures:
 
     psnr_db: mean over views, noise taken out; psnr_least_db: of the worst; surely_least_db: what that is at least, two
     standard errors. bias_pct: by how much brighter baked pictures are. bake_s, bake_mb: time and most memory.
-    estimate_db, estimate_least_db: what a bake says of itself. Keeps light.png. Raises UserError, and Absent.
+    estimate_db, estimate_least_db: what a bake estimates of itself. Keeps light.png. Raises UserError, and Absent.
     """
     settings = settings_of(task, LightSettings).model_dump()
     task.out.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,8 @@
-"""The measure `long`: whether a frame costs the same however many there have been, a case fed over and over."""
+"""Measures of whole runs.
+
+`long`: whether a frame costs the same however many there have been, a case fed over and over. `refined`: what `rstrack
+refine` makes of a run.
+"""
 
 from __future__ import annotations
 

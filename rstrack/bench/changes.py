@@ -59,7 +59,7 @@ def with_depth(dataset: Dataset, change: DepthChange) -> Dataset:
 
 
 def with_stamps(dataset: Dataset, depth: FloatArray, color: FloatArray) -> Dataset:
-    """The same images said to be of other times (n,) and (m,) in s, grouped by these.
+    """The same images, stated to be of other times (n,) and (m,) in s, grouped by these.
 
     The truth stays that of the images: poses are compared by frame, so that what is measured is the track, not that the
     camera was elsewhere at the wrong time. Raises UserError if stamps do not increase.
@@ -215,7 +215,7 @@ def camera_told(
 
     rig = dataset.rig
     if rotation_deg and rig.is_registered:
-        raise UserError(f"{dataset.name}: depth is registered: no rotation between its cameras could be told wrongly")
+        raise UserError(f"{dataset.name}: depth is registered: no rotation between its cameras could be stated wrongly")
     if color_ms and dataset.timing is not None and dataset.timing.wants_color_offset:
         raise UserError(f"{dataset.name}: colour's offset is looked for: name one in a camera file to tell it wrongly")
     T_stated_color = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, np.radians(rotation_deg), 0.0]))

@@ -72,7 +72,7 @@ class CaseEntry(StrictModel):
     frames: Frames | None = Field(default=None, description="A:B, which are tracked; default: all")
     changes: Changes = Field(default=(), description="of `rstrack.bench.changes`")
     noise: NoiseEntry = Field(default=NoiseEntry(), description="added to the images")
-    camera: Path | None = Field(default=None, description="camera file to use, relative to the file that says so")
+    camera: Path | None = Field(default=None, description="camera file to use, relative to this file")
     truth_offset: TruthOffset | None = Field(default=None, description="of the truth's clock: seconds, or auto")
     truth_extrinsics: TruthExtrinsics | None = Field(
         default=None, description="auto: NEES and coverage with those of the truth fitted; all other errors without"

@@ -3,7 +3,7 @@
 figure = figure_of("ate_mm")
 print(figure.title, figure.unit, figure.better)         # ATE mm less
 
-This table is the one place where that is said. A name that it does not have is shown, and never judged.
+This table is the one place for that. A name that it does not have is shown, and never judged.
 """
 
 from __future__ import annotations
@@ -84,8 +84,8 @@ FIGURES: tuple[FigureInfo, ...] = (
     FigureInfo("false*", "false", "loops", "less", "count", outright=True),
     FigureInfo("accepted", "look-alikes taken for one", "pairs", "less", "count", outright=True),
     FigureInfo("median_mrad", "median", "mrad", "less", "log"),
-    # `lens`: what it was told wrong by, and what is left of that.
-    FigureInfo("before_px", "told wrong by", "px", "unjudged", "log"),
+    # `lens`: how wrong the stated lens was, and how wrong the found one is.
+    FigureInfo("before_px", "wrong by", "px", "unjudged", "log"),
     FigureInfo("after_px*", "left", "px", "less", "log"),
     # Times of the machine, and ratios of times of one run, of which a machine's speed falls out. What else runs on it
     # for some minutes does not: repetitions in a row share that, and do not show how means and tails scatter.

@@ -71,7 +71,7 @@ def run_cells(
 ) -> Outcome:  # fmt: skip
     """Run what `out` does not hold yet, in this process or by `workers`; Ctrl-C ends it with what is finished.
 
-    measures: where more of them are found (`rstrack.bench.task`). done: told of each record. expected_s: what cells
+    measures: where more of them are found (`rstrack.bench.task`). done: called with each record. expected_s: what cells
     took before, by name, for the time that is left. Raises UserError: a measure that there is not, a folder that cannot
     be written or is not shared with the workers.
     """

@@ -98,8 +98,8 @@ class Sources:
         # A room of ours is made by scripts beside it, and is not there before.
         files += sorted(scene.parent.glob("*.py")) or [scene]
         hashes = {file.name: hashlib.sha256(read_bytes(file)).hexdigest() for file in files if file.is_file()}
-        says = entry.model_dump(mode="json", exclude_defaults=True, exclude={"group"}) | {"config": path.name}
-        return json.dumps({"sequence": says, "files": hashes}, indent=1, sort_keys=True) + "\n"
+        stated = entry.model_dump(mode="json", exclude_defaults=True, exclude={"group"}) | {"config": path.name}
+        return json.dumps({"sequence": stated, "files": hashes}, indent=1, sort_keys=True) + "\n"
 
     def _recording(self, path: Path) -> Path:
         if self.data is None:
@@ -117,7 +117,7 @@ def default_cache() -> Path:
 def scaled(path: Path, config: Mapping[str, Any], width: int) -> dict[str, Any]:
     """Fields of a config that make its images so wide, the same view in fewer or more pixels.
 
-    Pixel centres are at whole numbers. Raises UserError: the config (of the file `path`) says no size.
+    Pixel centres are at whole numbers. Raises UserError: the config (of the file `path`) has no size.
     """
     out: dict[str, Any] = {}
     for stream in _STREAMS:
@@ -143,8 +143,8 @@ def run_rsgen(words: Sequence[str]) -> None:
         [sys.executable, "-m", "rsgen", *words], capture_output=True, text=True, errors="replace", check=False
     )
     if done.returncode:
-        told = (done.stderr.strip() or done.stdout.strip() or f"exit status {done.returncode}").splitlines()
-        raise UserError(f"rsgen {' '.join(words[:2])} failed: {told[-1].removeprefix('rsgen: ')}")
+        lines = (done.stderr.strip() or done.stdout.strip() or f"exit status {done.returncode}").splitlines()
+        raise UserError(f"rsgen {' '.join(words[:2])} failed: {lines[-1].removeprefix('rsgen: ')}")
 
 
 def _not_now(_: object) -> None:

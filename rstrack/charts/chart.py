@@ -21,7 +21,7 @@ _METHOD_COLORS = {
 }  # fmt: skip
 _OTHER_COLORS = ("#1f9e77", "#66c29a", "#c9579b", "#8fae2b", "#5c8a8a", "#b06a6a")
 
-# A line is broken where poses are missing for so many times the usual step.
+# A line is broken where poses are missing for so many times the median step.
 _GAP_STEPS = 3.0
 # A path may leave the true one's box by this part of the box's size before it is cut off.
 _ROOM = 0.35
@@ -151,7 +151,7 @@ class MovedValue:
 
     @property
     def is_found(self) -> bool:
-        """Whether the recording tells it."""
+        """Whether the recording determines it."""
         return bool(np.isfinite(self.two_sigma))
 
 
@@ -214,7 +214,7 @@ def numbers(values: Sequence[float | None], scale: float = 1.0) -> FloatArray:
 def upright_axes(T_world_cam: FloatArray) -> tuple[tuple[int, int], ...]:
     """World axes, each with its sign, to draw as x, y and z of a plot whose z points up: a right-handed system.
 
-    Up is the world axis that the camera's −y is nearest to in the mean: nothing else tells which way is up.
+    Up is the world axis that the camera's −y is nearest to in the mean: nothing else shows which way is up.
     """
     up = -T_world_cam[:, :3, 1].mean(axis=0)
     k = int(np.argmax(np.abs(up)))

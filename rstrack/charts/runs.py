@@ -1,4 +1,4 @@
-"""Charts of runs: paths, errors over time, and what the tracker said of its frames.
+"""Charts of runs: paths, errors over time, and what the tracker reported of its frames.
 
 run_plot(Path("out/lr_kt2"), Path("runs/lr_kt2"), Path("run.png"))
 """
@@ -41,7 +41,7 @@ def run_plot(
     """Draw a run folder or TUM file into a png, pdf or svg file, against the truth where there is a sequence with one.
 
     Always: the path seen from above. With a truth: the true path too, and errors after alignment. With frames in
-    run.json: inliers, keyframes and lost frames. The label of time tells the first frame's stamp. Arguments
+    run.json: inliers, keyframes and lost frames. The label of time has the first frame's stamp. Arguments
     as in `load_run`. Raises UserError.
     """
     tracked = load_run(run, seq_path, camera_file, truth_offset=truth_offset)

@@ -148,7 +148,7 @@ def _path(path: CameraPath, p_plot: FloatArray, points: int) -> dict[str, Any]:
     return {
         "type": "scatter3d", "mode": "lines", "name": path.name, "x": x, "y": y, "z": z, "line": line, "text": text,
         "hovertemplate": f"%{{text}}<extra>{path.name}</extra>", "opacity": 0.45 if path.is_true else 1.0,
-        # A legend cannot show a line of many colours; the bar of colours says what it is.
+        # A legend cannot show a line of many colours; the bar of colours explains it.
         "showlegend": path.error_mm is None,
     }  # fmt: skip
 
@@ -272,7 +272,7 @@ def _cells(chart: StripChart) -> dict[str, Any]:
         "type": "heatmap", "x": edges, "y": [_two_lines(name) for name in chart.names], "z": parts, "zmin": 0.0,
         "zmax": float(max(1.0, 100.0 * chart.parts.max(initial=0.0))), "colorscale": _STRIP_COLORS, "showscale": False,
         "texttemplate": "%{z:.0f}", "xgap": 1, "ygap": 3, "hoverongaps": False, "yaxis": "y", "xaxis": "x",
-        "hovertemplate": "%{y}: %{z:.1f} % told at %{x:.1f} s<extra></extra>",
+        "hovertemplate": "%{y}: %{z:.1f} % at %{x:.1f} s<extra></extra>",
     }  # fmt: skip
 
 

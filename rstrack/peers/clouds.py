@@ -44,7 +44,8 @@ class CloudTracker(Protocol):
 class KissIcp:
     """KISS-ICP (Vizzo et al., RA-L 2023): point to point against a voxel map, deskewed to the end of each scan.
 
-    It takes a scan to last as long as the time between two, whatever it is told, and deskews shorter readouts too much.
+    It takes a scan to last as long as the time between two, whatever it is given: shorter readouts are deskewed too
+    much.
     """
 
     def __init__(self, max_depth: float) -> None:

@@ -32,7 +32,7 @@ _MOST_LOST = 5
 
 @dataclass(frozen=True)
 class PeerFrame:
-    """What a peer says about a frame. fitness: part of its pixels with a partner; inlier_rmse: of their residuals."""
+    """What a peer reports of a frame. fitness: part of its pixels with a partner; inlier_rmse: of their residuals."""
 
     stamp: float
     lost: bool

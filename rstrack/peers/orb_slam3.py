@@ -71,8 +71,8 @@ def run_orb_slam3(
         failure = run_logged([sys.executable, "-m", _WORKER, str(folder)], folder / "log.txt")
         if failure or not (folder / "frames.npz").is_file():
             raise UserError(f"{dataset.root}: {NAME} {failure or 'wrote no times of its frames'}")
-        with np.load(folder / "frames.npz") as told:
-            ms, tracked = told["ms"], told["tracked"]
+        with np.load(folder / "frames.npz") as times:
+            ms, tracked = times["ms"], times["tracked"]
         if not (folder / "final.txt").is_file():
             raise UserError(f"{dataset.root}: {NAME} tracked no frame: too few features in the images")
         found = read_estimate(folder / "final.txt")

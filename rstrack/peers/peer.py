@@ -75,7 +75,7 @@ def run_logged(words: Sequence[str], log: Path, folder: Path | None = None) -> s
     with log.open("wb") as file:
         done = subprocess.run(words, cwd=folder, stdout=file, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL)
     lines = [line.strip() for line in log.read_text(errors="replace").split("\n") if line.strip()]
-    last = lines[-1][:200] if lines else "it said nothing"
+    last = lines[-1][:200] if lines else "it printed nothing"
     return f"ended with status {done.returncode}: {last}" if done.returncode else ""
 
 

@@ -222,7 +222,7 @@ def _subtitle(result: StressResult) -> str:
 
 
 def _blur_cards(result: StressResult) -> CardRow:
-    """The sequence of the longest exposure at the usual speed."""
+    """The sequence of the longest exposure at the motion's own speed."""
     poses = next(poses for poses in PATHS if result.fused(poses))
     cell = min(result.fused(poses), key=lambda cell: (cell.speed != 1.0, -cell.exposure_s))
     sigmas, cards = [sigma for sigma in cell.sigmas_px if sigma is not None], []

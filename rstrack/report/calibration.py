@@ -1,4 +1,4 @@
-"""The report of a calibration: values with their errors, residuals, where it was told, and the camera file."""
+"""The report of a calibration: values with their errors, residuals, what determined them, and the camera file."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from rstrack.charts.chart import COLORS, ChangeChart, Curve, LensChart, MovedVal
 from rstrack.report.page import Block, Card, CardRow, Note, Page, PageSection, Plot, TextFile
 
 _BEFORE = (
-    "Scales of the residuals (Student's, medians over a few stretches; those before to some percent). Before: with the "
+    "Scales of the residuals (Student's, medians over a few windows; those before to some percent). Before: with the "
     "values that it began with, along the first rough track; so a part of what is gained is the track's, which is "
     "refined together with the values."
 )
 _SIGMA = (
-    "σ is measured from how far stretches of the recording disagree: of what is wrong and was not estimated, it knows "
+    "σ is measured from how far windows of the recording disagree: of what is wrong and was not estimated, it covers "
     "only a part."
 )
 
@@ -28,13 +28,13 @@ def calibration_page(record: CalibrationRecord) -> Page:
     count, frames = len(record.stretches), sum(end - begin for begin, end in record.stretches)
     return Page(
         title=f"{record.dataset}, calibrated",
-        subtitle=f"from {count} stretches of the recording, {frames} frames in all, in {record.seconds:.0f} s",
+        subtitle=f"from {count} windows of the recording, {frames} frames in all, in {record.seconds:.0f} s",
         cards=(CardRow(calibration_cards(record)),),
         sections=(
             PageSection("values", "Values", _values(record)),
             *((PageSection("undetermined", "Undetermined", _undetermined(record)),) if record.undetermined else ()),
             PageSection("residuals", "Residuals", _residuals(record)),
-            PageSection("where", "Where it was told", _where(record)),
+            PageSection("where", "Where values were found", _where(record)),
             PageSection("camera", "Camera file", _camera_file(record)),
         ),
         warnings=calibration_warnings(record),
@@ -69,7 +69,7 @@ def calibration_warnings(record: CalibrationRecord) -> tuple[str, ...]:
         warnings.append("Not converged: the last step still moved values by more than their error. Do not use them.")
     if record.undetermined:
         names = _names(record.undetermined.values())
-        warnings.append(f"This recording does not tell {names}: kept as given, see what is needed below.")
+        warnings.append(f"This recording does not determine {names}: kept as given, see what is needed below.")
     return tuple(warnings)
 
 
@@ -138,7 +138,7 @@ def _undetermined(record: CalibrationRecord) -> tuple[Block, ...]:
     if t.m_s:
         mean, turning = sum(t.m_s) / len(t.m_s), math.degrees(sum(t.rad_s) / len(t.rad_s))
         seen = Note(f"This recording moves at {mean:.2f} m/s and turns at {turning:.1f} deg/s in the mean.")
-    return Table(head, rows, "Not told by this recording", words=(0, 3)), seen
+    return Table(head, rows, "Not determined by this recording", words=(0, 3)), seen
 
 
 def _residuals(record: CalibrationRecord) -> tuple[Block, ...]:
@@ -193,7 +193,7 @@ def change_chart(record: CalibrationRecord) -> ChangeChart:
 
 
 def strip_chart(record: CalibrationRecord) -> StripChart:
-    """Which stretches of the recording tell each value, and how the camera moved there."""
+    """Which windows of the recording determine each value, and how the camera moved there."""
     found = [p for p in record.parameters.values() if p.is_found]
     parts = np.array([p.told_by_stretch for p in found]).reshape(len(found), len(record.stretches))
     t, speed, turning = broken(
@@ -203,12 +203,12 @@ def strip_chart(record: CalibrationRecord) -> StripChart:
         ("m/s", Curve("speed", COLORS[0], t, speed)), ("deg/s", Curve("turning", COLORS[1], t, np.degrees(turning))),
     )  # fmt: skip
     note = (
-        "Each row is one value: the part of what is known of it that a stretch tells, in percent, all other values "
-        "known. Between the stretches nothing was used. Below, how fast the camera moves and turns, by the first rough "
+        "Each row is one value: the part of what is known of it that a window adds, in percent, all other values "
+        "known. Between the windows nothing was used. Below, how fast the camera moves and turns, by the first rough "
         "track; it is broken where that was lost."
     )
     return StripChart(
-        "Where in the recording values are told", tuple(p.shown.label for p in found),
+        "Where in the recording values are determined", tuple(p.shown.label for p in found),
         np.array(record.stretch_times_s).reshape(-1, 2), parts, curves, "time since the first frame, s", note,
     )  # fmt: skip
 

@@ -21,7 +21,7 @@ from rstrack.data.estimate import plain
 class Card:
     """One number that a reader wants: its value with a unit, what it is, and what to compare it with.
 
-    verdict: whether it says that all is well, or not.
+    verdict: whether all is well, or not.
     """
 
     value: str

@@ -200,7 +200,7 @@ def rectified(rig: Rig, spline: Spline, depth: Image, color: Image) -> npt.NDArr
 
     spline: T_world_depth(t), which must cover both readouts. The measured depth, each point moved by its own line's
     pose, is seen from the middle line's pose; each pixel's point is then looked up in the rolling-shutter image, where
-    equation (3) of the paper says that it is.
+    equation (3) of the paper puts it.
     """
     camera, shutter = rig.color_camera, rig.color_shutter
     middle = shutter.line_mid_time(color.stamp, (shutter.line_count(camera) - 1) / 2, camera)

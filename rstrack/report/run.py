@@ -49,7 +49,7 @@ def run_page(
     if evaluation is not None:
         sections.append(PageSection("time", "Errors over time", plots(error_charts(tracked))))
     if charts := (*inlier_charts(tracked), *time_charts(tracked)):
-        sections.append(PageSection("tracker", "What the tracker said", plots(charts)))
+        sections.append(PageSection("tracker", "What the tracker reported", plots(charts)))
     warnings = list(tracked.notes)
     if tracked.dataset is not None:
         try:

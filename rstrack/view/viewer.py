@@ -3,7 +3,7 @@
 with open_view(Path("run.rrd"), dataset.rig, dataset.name) as viewer:
     track(dataset, options, out, watch=viewer.see)
 
-It looks at what the tracker says of itself and changes nothing. Images are shown at a part of their size, and a few
+It shows what the tracker reports and changes nothing. Images are shown at a part of their size, and a few
 times a second, so that the tracker hardly waits.
 """
 
@@ -98,7 +98,7 @@ class Viewer:
         log("world/camera/color", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]), static=True)
 
     def see(self, index: int, frame: Frame, report: FrameReport, tracker: AnyTracker) -> None:
-        """Frame number `index` has been fed, and this is what the tracker says of it."""
+        """Frame number `index` has been fed, and this is what the tracker reports of it."""
         rr, log = self.rr, self.recording.log
         self.recording.set_time(TIMELINE, duration=frame.depth.stamp)
         self._recent[index] = frame

@@ -17,7 +17,7 @@ from benchmarks.measures.calibration import (
     CalibrationTrial,
     calibration_cell,
     figures_of,
-    told_wrong,
+    stated_wrong,
     true_dataset,
 )
 from rsgen.config.config import Config
@@ -43,13 +43,13 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 def test_a_wrong_camera_is_off_by_that_much_in_all_values_at_once(tiny: Dataset) -> None:
     truth = parameters_of(tiny)
-    off = parameters_of(told_wrong(tiny, truth, 2.0, UNIT)).since(truth)
+    off = parameters_of(stated_wrong(tiny, truth, 2.0, UNIT)).since(truth)
     np.testing.assert_allclose(off[:3], [0.02, -0.02, 0.03], atol=1e-12)  # readouts by 2 x 50 %, one of them to 0
     assert off[DRIFT] == 0.0
     np.testing.assert_allclose(off[EXTRINSICS], [2 * UNIT_M, 0, 0, 0, 0, np.radians(1.0)], atol=1e-9)
-    further = parameters_of(told_wrong(tiny, truth, 4.0, UNIT))
+    further = parameters_of(stated_wrong(tiny, truth, 4.0, UNIT))
     assert (further.depth_readout_s, further.color_readout_s) == pytest.approx((0.06, 0.0))
-    same = told_wrong(tiny, truth, 0.0, UNIT)
+    same = stated_wrong(tiny, truth, 0.0, UNIT)
     np.testing.assert_array_equal(same.color_stamps, tiny.color_stamps)
 
 

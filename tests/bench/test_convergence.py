@@ -130,7 +130,7 @@ def test_the_prior_alone_does_not_bring_a_frame_back(dataset: Dataset) -> None:
     blind, truth = with_depth(grey, lambda _, z: np.zeros_like(z)), truth_of(dataset)
     pairs = conv.choose_pairs(blind, EVERY, truth, OPTIONS, 2, 0)
     trials, _ = conv.run_trials(blind, truth, OPTIONS, pairs, no_progress)
-    assert len(trials) == 2 * len(conv.FACTORS) and not any(t.converged or t.believed for t in trials if t.factor)
+    assert len(trials) == 2 * len(conv.FACTORS) and not any(t.converged or t.accepted for t in trials if t.factor)
 
 
 @pytest.mark.parametrize(

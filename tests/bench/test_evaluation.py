@@ -75,7 +75,7 @@ def test_quick_is_a_subset_and_words_beat_it(place: Path) -> None:
         ("nowhere/mytracker {sequence} {out}", "cannot run 'nowhere/mytracker'"),
         ("true {sequence} {out}", "wrote no .*command.txt"),
         ("cp {sequence}/rgb.txt {out}", "command.txt"),
-        ("false {sequence} {out}", "ended with status 1: it said nothing"),
+        ("false {sequence} {out}", "ended with status 1: it printed nothing"),
     ],
 )
 def test_commands_that_give_nothing(place: Path, command: str, message: str) -> None:

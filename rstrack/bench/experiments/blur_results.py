@@ -49,7 +49,7 @@ def stress_tables(result: StressResult) -> list[Table]:
 
 
 def stress_notes(result: StressResult) -> list[str]:
-    """What has to be said about them, one line each."""
+    """What a reader has to know about them, one line each."""
     about = f"blur stress test of {result.motion}: colour against the sharp view, means over keyframes"
     return [about, *result.failed, provenance(cell.record for cell in result.cells)]
 

@@ -106,34 +106,34 @@ def sequence_table(results: Results, group: str, name: str) -> Table:
 
 
 def notes(results: Results) -> list[str]:
-    """What has to be said about the figures, one line each: frames, losses, failures, averages, the machine."""
-    said = [_frames(results.sequences)]
+    """What a reader has to know about the figures, one line each: frames, losses, failures, averages, the machine."""
+    lines = [_frames(results.sequences)]
     done = [(r, r.figures) for r in results.records if r.error is None]
     some = [f"{_where(r)} {f['lost']:.0f}" for r, f in done if counts(f) and f["lost"]]
     if some:
-        said.append("† frames lost: " + ", ".join(some))
+        lines.append("† frames lost: " + ", ".join(some))
     lost = [
         f"{_where(r)} (poses for {f['frames'] - f['lost']:.0f} of {f['frames']:.0f})" for r, f in done if not counts(f)
     ]
     if lost:
-        said.append(f"lost (fewer than half of the frames have a pose): {', '.join(lost)}")
-    said += failures(results.records)
+        lines.append(f"lost (fewer than half of the frames have a pose): {', '.join(lost)}")
+    lines += failures(results.records)
     if len(results.records) < len(results.sequences) * len(results.methods):
-        said.append("not run yet (-): the same command goes on where this one ended")
+        lines.append("not run yet (-): the same command goes on where this one ended")
     for group in results.groups:
         names = results.averaged(group)
         if len(names) < len(results.names(group)):
             over = f"only over {', '.join(names)}: the others lack" if names else "none: each sequence lacks"
-            said.append(f"average of {group}: {over} figures of one of our methods at least")
-    said += _settings(results)
-    said += _clocks(results)
+            lines.append(f"average of {group}: {over} figures of one of our methods at least")
+    lines += _settings(results)
+    lines += _clocks(results)
     if any((s.name, row_of(name)) in paper.FIGURES for s in results.sequences for name in results.methods):
-        said.append(
+        lines.append(
             "lines 'paper:', or figures in brackets: Kerl, Stückler, Cremers, ICCV 2015, Tables 2 and 3, on their own "
             "recordings and renderings of such motions; rooms and images differ: compare the orders, not the digits"
         )
-    said.append("all figures are RMSE; drift is over one second; 'better by' compares averages with the baseline's")
-    return [*said, provenance(results.records)]
+    lines.append("all figures are RMSE; drift is over one second; 'better by' compares averages with the baseline's")
+    return [*lines, provenance(results.records)]
 
 
 @dataclass(frozen=True)
@@ -216,8 +216,8 @@ def _clocks(results: Results) -> list[str]:
         return []
     offset = asked[0][1]
     how = "the offset of least drift, for each cell" if offset == "auto" else f"looked up {offset:g} s after the stamps"
-    said = [f"the truth's clock: {how} (truth_offset_ms in results.csv)"]
+    lines = [f"the truth's clock: {how} (truth_offset_ms in results.csv)"]
     without = ", ".join(_where(r) for r, _ in asked if r.is_good and r.truth_offset_s is None)
     if without:
-        said.append(f"no offset of the truth's clock was found, errors are those of the clocks as they are: {without}")
-    return said
+        lines.append(f"no offset of the truth's clock was found, errors are those of the clocks as they are: {without}")
+    return lines

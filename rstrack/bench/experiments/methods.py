@@ -37,7 +37,7 @@ from rstrack.metrics.clock import TruthOffset
 from rstrack.options import METHODS, PEERS, Options
 
 MAPPED = ("rs-pg", "gs-pg", "baseline")
-"""The methods whose maps are compared: ours, the same without its model of the shutter, and the usual way."""
+"""The methods whose maps are compared: ours, the same without its model of the shutter, and the classical way."""
 
 
 class Quick(StrictModel):
@@ -97,11 +97,11 @@ def make_plan(
     added: Mapping[str, Path] | None = None, commands: Mapping[str, str] | None = None,
     truth_offset: TruthOffset | None = None, measure: str = "track",
 ) -> Plan:  # fmt: skip
-    """Look the sequences up in the folder `data` and list the cells; what is given beats what `quick` says.
+    """Look the sequences up in the folder `data` and list the cells; what is given beats what `quick` has.
 
     sequences, methods: names, none: all of the config; methods may name ours and all peers. peers: all of these too,
     or those that can be timed.
-    Each of our methods is run with and without fusion, unless options.fuse says which or it is not errors that are
+    Each of our methods is run with and without fusion, unless options.fuse chooses or it is not errors that are
     measured. added: results of other trackers by name, each a folder with SEQUENCE.txt (TUM) or SEQUENCE/ (a run
     folder). commands: other trackers by name, see `rstrack.peers.peer`. truth_offset: of the truth's clock. Raises
     UserError, one line: names that there are not; sequences that are missing or not whole, with how to make them.
@@ -137,8 +137,8 @@ def make_plan(
             raise UserError(f"{dataset.root}: has no ground truth to compare with: leave it out with --sequence")
         kept = _kept(dataset, _render_command(name, entry, data, frames), frames)
         infos.append(SequenceInfo(name, entry.group, dataset.root.resolve(), len(kept)))
-        piece = None if len(kept) == len(dataset) else f"{kept.start}:{kept.stop}"
-        case = CaseEntry(sequence=name, frames=piece, truth_offset=truth_offset)
+        part = None if len(kept) == len(dataset) else f"{kept.start}:{kept.stop}"
+        case = CaseEntry(sequence=name, frames=part, truth_offset=truth_offset)
         sequence = SequenceEntry(path=_folder(name, entry), group=entry.group)
         cells += [Cell(measure, name, method, (0,), case, sequence, how, {}) for method, how in run.items()]
     return Plan(Benchmark(tuple(cells)), tuple(infos), tuple(run))
@@ -162,8 +162,8 @@ def method_entry(name: str, options: Options) -> MethodEntry:
 
 def given_options(options: Options) -> dict[str, Any]:
     """Those that are not at their defaults, without the method."""
-    usual = dataclasses.asdict(Options())
-    return {k: v for k, v in dataclasses.asdict(options).items() if k != "method" and v != usual[k]}
+    defaults = dataclasses.asdict(Options())
+    return {k: v for k, v in dataclasses.asdict(options).items() if k != "method" and v != defaults[k]}
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -197,9 +197,9 @@ _FUSE, _NO_FUSE = "-fuse", "-no-fuse"
 
 
 def variants(method: str, fuse: bool | None) -> tuple[str, ...]:
-    """Names of what is run of a method, its usual setting first; fuse: the only one that is asked for, None: both.
+    """Names of what is run of a method, its default setting first; fuse: the only one that is asked for, None: both.
 
-    The usual setting has the method's own name: fused where the rolling shutter is modelled, else not. Peers and
+    The default setting has the method's own name: fused where the rolling shutter is modelled, else not. Peers and
     added trackers have one variant.
     """
     if method not in METHODS:

@@ -30,7 +30,7 @@ from rstrack.options import MapOptions
 def draw_plots(results: Results, out: Path, progress: Progress, warn: Callable[[str], None]) -> list[Path]:
     """Write plots/ate.png and plots/SEQUENCE.png into `out`; returns what was written.
 
-    Runs that cannot be read are left out and said to `warn`, a line each. Raises UserError.
+    Runs that cannot be read are left out, a line each to `warn`. Raises UserError.
     """
     count = 1 + len(results.sequences)
     written = [out / "plots" / "ate.png"]
@@ -118,7 +118,7 @@ def draw_meshes(
 
     out: the folder with the results' cells. methods: those of them that kept the track are shown, in this order, each
     with the setting that the tables show. Meshes of the same cells, and pictures of the same meshes, are kept. What
-    fails is left out and said to `warn` in one line. Raises KeyboardInterrupt; the same call goes on after that.
+    fails is left out, with one line to `warn`. Raises KeyboardInterrupt; the same call goes on after that.
     """
     rows = [(sequence, _records(results, sequence, methods)) for sequence in results.sequences]
     rows = [(sequence, records) for sequence, records in rows if records]

@@ -85,7 +85,7 @@ def load_sweep(path: Path) -> SweepConfig:
 def narrow(
     config: SweepConfig, *, motions: Sequence[str] = (), seeds: int | None = None, **given: Any
 ) -> SweepConfig:  # fmt: skip
-    """The sweep with what is given in place of what its file says: motions by name, seeds, and fields by theirs.
+    """The sweep with what is given in place of what its file has: motions by name, seeds, and fields by theirs.
 
     Raises UserError: a value or name that is none.
     """
@@ -113,7 +113,7 @@ def installed(methods: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]
 
 
 def sweep_benchmark(config: SweepConfig, methods: Sequence[str], options: Options | None = None) -> Benchmark:
-    """The cells, motion by motion; our methods in their usual setting, unless options.fuse says which.
+    """The cells, motion by motion; our methods in their default setting, unless options.fuse chooses.
 
     Raises UserError: a motion's config cannot be read, or does not say what the sweep changes.
     """

@@ -129,7 +129,7 @@ def sweep_tables(sweep: Sweep) -> list[Table]:
 
 
 def sweep_notes(sweep: Sweep) -> list[str]:
-    """What has to be said about the figures, one line each."""
+    """What a reader has to know about the figures, one line each."""
     noise = sweep.config.noise
     frames = sorted({int(value) for r in sweep.records for value in r.values("frames")}) or [0]
     over = f"{frames[0]} frames" if len(frames) == 1 else f"{frames[0]} to {frames[-1]} frames"

@@ -34,7 +34,7 @@ class Experiment(Protocol):
         """Write tables and records into `out`. Raises UserError."""
 
     def draw(self, outcome: Outcome, out: Path, progress: Progress, warn: Callable[[str], None]) -> None:
-        """Draw the pictures of finished cells into `out`; what fails alone is said to `warn`. Raises UserError."""
+        """Draw the pictures of finished cells into `out`; one line to `warn` where one fails. Raises UserError."""
 
 
 def run_experiment(experiment: Experiment, out: Path, sources: Sources, quiet: bool) -> int:

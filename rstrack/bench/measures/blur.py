@@ -1,7 +1,7 @@
 """The measure `blur`: what `track` measures, and how good keyframes are that are fused with blur-aware weights.
 
 Figures are named by the path that frames are fused along ('true' or 'estimated'), those of colour also by the weights:
-psnr_db_true_sigma1, psnr_db_estimated_constant. The setting `sigmas_px` says which σ of equation (13) are tried.
+psnr_db_true_sigma1, psnr_db_estimated_constant. The setting `sigmas_px` has the σ of equation (13) that are tried.
 """
 
 from __future__ import annotations

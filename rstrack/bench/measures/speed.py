@@ -75,7 +75,7 @@ def speed_cell(task: Task, progress: Progress) -> Figures:
     if len(frames) < 2:
         raise UserError(f"{task.dataset.root}: speed needs at least 2 frames")
     warm_up = min(_WARM_UP, len(frames) // 2)
-    # The peer first: what is missing is said at once.
+    # The peer first: a missing one is reported at once.
     timed = [] if settings.peer is None else [_peer(task, settings.peer)]
     timed.insert(0, _method(task))
     for first in range(0, len(frames), _TURN):

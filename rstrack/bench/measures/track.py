@@ -58,7 +58,7 @@ def estimated(task: Task, progress: Progress) -> tuple[Estimate, Figures]:
 def accuracy(task: Task, estimate: Estimate) -> Figures:
     """Errors over the case's frames; those of too few poses are missing, and then all frames are lost.
 
-    The truth's own errors and extrinsics, where the case tells of them, count in NEES and coverage only.
+    The truth's own errors and extrinsics, where the case states them, count in NEES and coverage only.
     """
     chosen, case = task.frames, task.cell.case_entry
     frames = len(chosen)

@@ -35,7 +35,7 @@ def test_values_stand_beside_their_starts_in_units_that_are_read(tmp_path: Path)
     assert [trace["x"] for trace in change["data"]] == [[27.957, -0.5], [0.0], [-0.14]]
     assert change["data"][0]["error_x"]["array"][0] == pytest.approx(0.044)
     assert change["data"][1]["y"] == ["colour drift"] and "error_x" not in change["data"][1]
-    # Two stretches, seen from 1 to 2 s and from 3 to 5 s: what lies between is empty.
+    # Two windows, seen from 1 to 2 s and from 3 to 5 s: what lies between is empty.
     cells = strips["data"][0]
     assert cells["x"] == [1.0, 2.0, 3.0, 5.0]
     assert cells["z"][0] == [25.0, None, 75.0] and len(cells["z"]) == 3
@@ -91,13 +91,13 @@ def test_whether_it_converged_is_said_at_the_top(tmp_path: Path, changed: Any, s
 
 def test_what_is_undetermined_is_named_with_what_it_needs(tmp_path: Path) -> None:
     shown = page(tmp_path, calibration())
-    assert "This recording does not tell colour drift" in shown.text and "3 of 4" in shown.text
+    assert "This recording does not determine colour drift" in shown.text and "3 of 4" in shown.text
     assert shown.row("colour drift") == ["colour drift", "undetermined", "–", "0", "kept", "ms"]
     needs = [row for row in shown.rows if row[0] == "colour drift"][1]
     assert needs[-1] == "motion that changes" and needs[2] == "2.0 ms"
     data = calibration()
     del data["parameters"]["color.drift"]
-    assert "does not tell" not in page(tmp_path, data).text
+    assert "does not determine" not in page(tmp_path, data).text
     for name in data["parameters"]:
         data["parameters"][name] |= {"sigma": None, "state": "undetermined", "told_by_stretch": [0.0, 0.0]}
     shown = page(tmp_path, data)
