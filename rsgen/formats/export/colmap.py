@@ -15,19 +15,8 @@ from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write
+from rsgen.formats.export import poses
 from rsgen.formats.export.folder import DEFAULTS, ExportOptions, make_folders, new_folder, place_images
-from rsgen.formats.export.poses import (
-    ONE_POSE,
-    PIXEL_SHIFT,
-    SurfacePoints,
-    loss_of_poses,
-    loss_words,
-    middle_line,
-    observations,
-    poses_of_line,
-    surface_points,
-    write_shutter_files,
-)  # fmt: skip
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.sequence.format import pose_rows
@@ -46,17 +35,17 @@ def export_colmap(
     sequence = sequence.as_taken
     color = sequence.streams["color"]
     cameras = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", f"1 {camera_line(color.camera)}"]
-    T_world_color = poses_of_line(sequence, middle_line(sequence))
-    observed = observations(sequence)
-    losses = {ONE_POSE: loss_of_poses(color.camera, observed, T_world_color[observed.image])}
-    points = surface_points(sequence, progress, (0.0, 0.8))
+    T_world_color = poses.at_line(sequence, poses.middle_line(sequence))
+    observed = poses.observations(sequence)
+    losses = {poses.ONE_POSE: poses.loss_of_poses(color.camera, observed, T_world_color[observed.image])}
+    points = poses.surface_points(sequence, progress, (0.0, 0.8))
     names = [path.name for path in color.paths]
 
     new_folder(out)
     model = out / "sparse" / "0"
     make_folders(out / "images", model)
     place_images(color.paths, [out / "images" / name for name in names], options.copy, progress, (0.8, 1.0))
-    write_shutter_files(sequence, out, losses)
+    poses.write_shutter_files(sequence, out, losses)
     files = {
         "cameras.txt": cameras,
         "images.txt": _images(T_world_color, names, points),
@@ -64,7 +53,7 @@ def export_colmap(
     }
     for name, lines in files.items():
         atomic_write(model / name, "".join(f"{line}\n" for line in lines).encode())
-    return f"{out}: {len(names)} images, {len(points.p_world)} points; {loss_words(losses)}"
+    return f"{out}: {len(names)} images, {len(points.p_world)} points; {poses.loss_words(losses)}"
 
 
 def camera_line(camera: Camera) -> str:
@@ -78,21 +67,21 @@ def camera_line(camera: Camera) -> str:
         model, distortion = "FULL_OPENCV", (*distortion, 0.0, 0.0, 0.0)[:8]
     elif camera.model in ("radtan", "rational"):
         model, distortion = "OPENCV", distortion[:4]
-    params = (camera.fx, camera.fy, camera.cx + PIXEL_SHIFT, camera.cy + PIXEL_SHIFT, *distortion)
+    params = (camera.fx, camera.fy, camera.cx + poses.PIXEL_SHIFT, camera.cy + poses.PIXEL_SHIFT, *distortion)
     return " ".join([model, f"{camera.width} {camera.height}", *(repr(float(value)) for value in params)])
 
 
-def _images(T_world_color: FloatArray, names: list[str], points: SurfacePoints) -> list[str]:
+def _images(T_world_color: FloatArray, names: list[str], points: poses.SurfacePoints) -> list[str]:
     lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", "# POINTS2D[] as X Y POINT3D_ID"]
     rows = pose_rows(se3.inverse(T_world_color))[:, [6, 3, 4, 5, 0, 1, 2]]
     for k, (row, name) in enumerate(zip(rows, names, strict=True)):
-        image_rows = np.column_stack([points.uv[k] + PIXEL_SHIFT, points.shown[k] + 1]).tolist()
+        image_rows = np.column_stack([points.uv[k] + poses.PIXEL_SHIFT, points.shown[k] + 1]).tolist()
         lines.append(f"{k + 1} {' '.join(f'{value:.15g}' for value in row)} 1 {name}")
         lines.append(" ".join(f"{x:.6f} {y:.6f} {number:.0f}" for x, y, number in image_rows))
     return lines
 
 
-def _points(T_world_color: FloatArray, camera: Camera, points: SurfacePoints) -> list[str]:
+def _points(T_world_color: FloatArray, camera: Camera, points: poses.SurfacePoints) -> list[str]:
     """With ERROR: the mean distance between observations and what the images' poses make of the point."""
     which = np.concatenate(points.shown)
     image = np.repeat(np.arange(len(points.shown)), [len(shown) for shown in points.shown])

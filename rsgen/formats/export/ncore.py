@@ -20,19 +20,8 @@ from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import read_bytes, write_error
+from rsgen.formats.export import poses
 from rsgen.formats.export.folder import DEFAULTS, EPOCH_S, ExportOptions, image_streams, new_folder
-from rsgen.formats.export.poses import (
-    PIXEL_SHIFT,
-    Loss,
-    between,
-    blur_centres,
-    loss_of_poses,
-    loss_words,
-    observations,
-    poses_of_line,
-    shutter_facts,
-    shutter_type,
-)  # fmt: skip
 from rsgen.geometry import se3
 from rsgen.sequence.reader import Sequence, Stream
 
@@ -61,18 +50,18 @@ def export_ncore(
     losses = _losses(sequence)
 
     new_folder(out)
-    facts = shutter_facts(sequence, losses) | {"epoch_s": EPOCH_S}
+    facts = poses.shutter_facts(sequence, losses) | {"epoch_s": EPOCH_S}
     try:
         interval = importlib.import_module("ncore.impl.common.transformations").HalfClosedInterval(first, last + 1)
         writer = v4.SequenceComponentGroupsWriter(out, sequence.name, sequence.name, interval, facts)
         # Its loader looks for these four by this name, masks and boxes too, of which there are none.
         kinds = v4.PosesComponent, v4.IntrinsicsComponent, v4.MasksComponent, v4.CuboidsComponent
-        poses, intrinsics, masks, boxes = (writer.register_component_writer(kind.Writer, "default") for kind in kinds)
+        rig, intrinsics, masks, boxes = (writer.register_component_writer(kind.Writer, "default") for kind in kinds)
         boxes.store_observations([])
-        poses.store_dynamic_pose("rig", "world", _with_exact_row(T_world_rig), times)
+        rig.store_dynamic_pose("rig", "world", _with_exact_row(T_world_rig), times)
         count, done = sum(len(stream.paths) for stream, _ in streams.values()), 0
         for name, (stream, T_cam_rig) in streams.items():
-            poses.store_static_pose(name, "rig", _with_exact_row(se3.inverse(T_cam_rig)))
+            rig.store_static_pose(name, "rig", _with_exact_row(se3.inverse(T_cam_rig)))
             intrinsics.store_camera_intrinsics(name, models[name])
             masks.store_camera_masks(name, {})
             about = {"depth_units_per_metre": stream.depth_scale} if stream.depth_scale else {}
@@ -88,13 +77,13 @@ def export_ncore(
             raise write_error(out, error) from None
         raise
     counts = f"{len(streams['color'][0].paths)} colour and {len(streams['depth'][0].paths)} depth images"
-    return f"{path}: {counts}, stamps + {EPOCH_S} s; {loss_words(losses)}"
+    return f"{path}: {counts}, stamps + {EPOCH_S} s; {poses.loss_words(losses)}"
 
 
 def frame_times_us(stream: Stream) -> Times:
     """(n, 2): mid-exposure of the first line that is read and of the last of each image, microseconds."""
     lines = np.array([0.0, stream.line_count - 1.0])
-    times = stream.shutter.line_mid_time(blur_centres(stream)[:, None], lines, stream.camera)
+    times = stream.shutter.line_mid_time(poses.blur_centres(stream)[:, None], lines, stream.camera)
     return np.rint(1e6 * (times + EPOCH_S)).astype(np.uint64)
 
 
@@ -117,9 +106,9 @@ def _model(data: Any, stream: Stream) -> Any:
     camera = stream.camera
     common = {
         "resolution": np.array([camera.width, camera.height], np.uint64),
-        "shutter_type": data.ShutterType[shutter_type(stream.shutter)],
+        "shutter_type": data.ShutterType[poses.shutter_type(stream.shutter)],
         "external_distortion_parameters": None,
-        "principal_point": np.array([camera.cx + PIXEL_SHIFT, camera.cy + PIXEL_SHIFT], np.float32),
+        "principal_point": np.array([camera.cx + poses.PIXEL_SHIFT, camera.cy + poses.PIXEL_SHIFT], np.float32),
         "focal_length": np.array([camera.fx, camera.fy], np.float32),
     }
     if camera.model == "fisheye":
@@ -138,17 +127,20 @@ def _model(data: Any, stream: Stream) -> Any:
     )
 
 
-def _losses(sequence: Sequence) -> dict[str, Loss]:
+def _losses(sequence: Sequence) -> dict[str, poses.Loss]:
     """Of the two poses of an image, which NCore's camera models take, and of poses looked up for each line."""
-    color, observed = sequence.streams["color"], observations(sequence)
-    start, end = (poses_of_line(sequence, line)[observed.image] for line in (0.0, color.line_count - 1.0))
-    stamps = color.shutter.line_mid_time(blur_centres(color)[observed.image], 0.0, color.camera)
+    color, observed = sequence.streams["color"], poses.observations(sequence)
+    start, end = (poses.at_line(sequence, line)[observed.image] for line in (0.0, color.line_count - 1.0))
+    stamps = color.shutter.line_mid_time(poses.blur_centres(color)[observed.image], 0.0, color.camera)
     length = color.shutter.line_delay(color.camera) * (color.line_count - 1)
     part = (observed.t - stamps) / length if length > 0.0 else np.zeros_like(observed.t)
-    ends = se3.inverse(between(se3.inverse(start), se3.inverse(end), part))
+    ends = se3.inverse(poses.between(se3.inverse(start), se3.inverse(end), part))
     step, T_rig_color = 1e-6 * _STEP_US, se3.inverse(sequence.T_color_depth)
     before = np.floor(observed.t / step) * step
     held = np.clip([before, before + step], sequence.spline.t_begin, sequence.spline.t_end)
     T_before, T_after = (sequence.spline.pose(t) for t in held)
-    dense = between(T_before, T_after, (observed.t - held[0]) / (held[1] - held[0])) @ T_rig_color
-    return {ENDS: loss_of_poses(color.camera, observed, ends), DENSE: loss_of_poses(color.camera, observed, dense)}
+    dense = poses.between(T_before, T_after, (observed.t - held[0]) / (held[1] - held[0])) @ T_rig_color
+    return {
+        ENDS: poses.loss_of_poses(color.camera, observed, ends),
+        DENSE: poses.loss_of_poses(color.camera, observed, dense),
+    }

@@ -23,6 +23,7 @@ from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write
+from rsgen.formats.export import poses
 from rsgen.formats.export.folder import (
     DEFAULTS,
     ExportOptions,
@@ -30,24 +31,6 @@ from rsgen.formats.export.folder import (
     make_folders,
     new_folder,
     place_images,
-)  # fmt: skip
-from rsgen.formats.export.poses import (
-    ONE_POSE,
-    PIXEL_SHIFT,
-    Loss,
-    SurfacePoints,
-    between,
-    blur_centres,
-    exposures,
-    loss_of_image_velocity,
-    loss_of_poses,
-    loss_words,
-    middle_line,
-    observations,
-    poses_of_line,
-    shutter_type,
-    surface_points,
-    write_shutter_files,
 )  # fmt: skip
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
@@ -74,19 +57,19 @@ def export_nerfstudio(
     color = sequence.streams["color"]
     if color.camera.model not in _MODELS:
         raise UserError(f"nerfstudio has no {color.camera.model} lens: render with radtan or fisheye")
-    points = surface_points(sequence, progress, (0.0, 0.5))
+    points = poses.surface_points(sequence, progress, (0.0, 0.5))
     losses = _losses(sequence)
 
     new_folder(out)
     make_folders(out / "images", out / "depth")
     place_images(color.paths, [out / "images" / path.name for path in color.paths], options.copy, progress, (0.5, 0.6))
     depths = aligned_depth(sequence, out / "depth", options.copy, progress, (0.6, 1.0))
-    write_shutter_files(sequence, out, losses)
+    poses.write_shutter_files(sequence, out, losses)
     atomic_write(out / "points3D.ply", _ply(points))
     atomic_write(out / "transforms.json", json.dumps(_transforms(sequence, depths), indent=1).encode())
     note = "" if VELOCITY in losses else f" (no velocities: 3dgs-deblur does not know the scan {color.shutter.scan})"
     counts = f"{len(color.paths)} images with depth, {len(points.p_world)} points"
-    return f"{out}: {counts}; {loss_words(losses)}{note}"
+    return f"{out}: {counts}; {poses.loss_words(losses)}{note}"
 
 
 def ngp_rolling_shutter(camera: Camera, shutter: Shutter) -> list[float]:
@@ -106,8 +89,8 @@ def ngp_rolling_shutter(camera: Camera, shutter: Shutter) -> list[float]:
 def _transforms(sequence: Sequence, depths: list[str]) -> dict[str, Any]:
     color = sequence.streams["color"]
     camera, shutter = color.camera, color.shutter
-    ends = {"": middle_line(sequence), "_start": 0.0, "_end": color.line_count - 1.0}
-    poses = {f"transform_matrix{name}": poses_of_line(sequence, line) @ _GL for name, line in ends.items()}
+    ends = {"": poses.middle_line(sequence), "_start": 0.0, "_end": color.line_count - 1.0}
+    matrices = {f"transform_matrix{name}": poses.at_line(sequence, line) @ _GL for name, line in ends.items()}
     twist = _twists(sequence) * np.tile(np.diag(_GL)[:3], 2)
     speaks = _is_downward(shutter)
     frames = []
@@ -116,9 +99,9 @@ def _transforms(sequence: Sequence, depths: list[str]) -> dict[str, Any]:
             "file_path": f"images/{path.name}",
             "depth_file_path": f"depth/{depths[k]}",
             "time": float(color.stamps[k]),
-            "exposure_s": float(exposures(color)[k]),
+            "exposure_s": float(poses.exposures(color)[k]),
         }
-        frame |= {name: T[k].tolist() for name, T in poses.items()}
+        frame |= {name: T[k].tolist() for name, T in matrices.items()}
         if speaks:
             frame |= {"camera_linear_velocity": twist[k, :3].tolist(), "camera_angular_velocity": twist[k, 3:].tolist()}
         frames.append(frame)
@@ -129,15 +112,15 @@ def _transforms(sequence: Sequence, depths: list[str]) -> dict[str, Any]:
         "h": camera.height,
         "fl_x": camera.fx,
         "fl_y": camera.fy,
-        "cx": camera.cx + PIXEL_SHIFT,
-        "cy": camera.cy + PIXEL_SHIFT,
+        "cx": camera.cx + poses.PIXEL_SHIFT,
+        "cy": camera.cy + poses.PIXEL_SHIFT,
         **dict(distortion),
         "is_fisheye": camera.model == "fisheye",
         "ply_file_path": "points3D.ply",
         "depth_unit_scale_factor": 1.0 / sequence.streams["depth"].depth_scale,
         "rolling_shutter": ngp_rolling_shutter(camera, shutter),
-        "shutter_type": shutter_type(shutter),
-        "exposure_time": float(exposures(color).mean()),
+        "shutter_type": poses.shutter_type(shutter),
+        "exposure_time": float(poses.exposures(color).mean()),
     }
     if speaks:
         data["rolling_shutter_time"] = shutter.readout_s
@@ -151,31 +134,31 @@ def _is_downward(shutter: Shutter) -> bool:
 def _twists(sequence: Sequence) -> FloatArray:
     """Velocities (n, 6) of the colour camera at every image's middle line, in its own frame: m/s, then rad/s."""
     color = sequence.streams["color"]
-    times = color.shutter.line_mid_time(blur_centres(color), middle_line(sequence), color.camera)
+    times = color.shutter.line_mid_time(poses.blur_centres(color), poses.middle_line(sequence), color.camera)
     return np.asarray(sequence.spline.velocity(times) @ se3.adjoint(sequence.T_color_depth).T)
 
 
-def _losses(sequence: Sequence) -> dict[str, Loss]:
-    color, observed = sequence.streams["color"], observations(sequence)
-    middle = poses_of_line(sequence, middle_line(sequence))[observed.image]
-    losses = {ONE_POSE: loss_of_poses(color.camera, observed, middle)}
+def _losses(sequence: Sequence) -> dict[str, poses.Loss]:
+    color, observed = sequence.streams["color"], poses.observations(sequence)
+    middle = poses.at_line(sequence, poses.middle_line(sequence))[observed.image]
+    losses = {poses.ONE_POSE: poses.loss_of_poses(color.camera, observed, middle)}
     dt = observed.t - color.shutter.line_mid_time(
-        blur_centres(color)[observed.image], middle_line(sequence), color.camera
+        poses.blur_centres(color)[observed.image], poses.middle_line(sequence), color.camera
     )
     length = color.shutter.line_delay(color.camera) * (color.line_count - 1)
     if length > 0.0:
         part = 0.5 + dt / length
-        start, end = (poses_of_line(sequence, line)[observed.image] for line in (0.0, color.line_count - 1.0))
-        T_color_world = between(se3.inverse(start), se3.inverse(end), part)
-        losses[GSPLAT] = loss_of_poses(color.camera, observed, se3.inverse(T_color_world))
-        losses[NGP] = loss_of_poses(color.camera, observed, between(start, end, part))
+        start, end = (poses.at_line(sequence, line)[observed.image] for line in (0.0, color.line_count - 1.0))
+        T_color_world = poses.between(se3.inverse(start), se3.inverse(end), part)
+        losses[GSPLAT] = poses.loss_of_poses(color.camera, observed, se3.inverse(T_color_world))
+        losses[NGP] = poses.loss_of_poses(color.camera, observed, poses.between(start, end, part))
     if _is_downward(color.shutter):
         twist = _twists(sequence)[observed.image]
-        losses[VELOCITY] = loss_of_image_velocity(color.camera, observed, middle, twist, dt)
+        losses[VELOCITY] = poses.loss_of_image_velocity(color.camera, observed, middle, twist, dt)
     return losses
 
 
-def _ply(points: SurfacePoints) -> bytes:
+def _ply(points: poses.SurfacePoints) -> bytes:
     """A cloud with colours, as nerfstudio's `ply_file_path` has it."""
     kinds = [(axis, "<f4") for axis in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
     table = np.zeros(len(points.p_world), kinds)

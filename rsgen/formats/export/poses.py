@@ -77,7 +77,7 @@ def exposures(stream: Stream) -> FloatArray:
     return np.full(len(stream.paths), stream.shutter.exposure_s) if stream.table is None else stream.table.exposure_s
 
 
-def poses_of_line(sequence: Sequence, line: float) -> FloatArray:
+def at_line(sequence: Sequence, line: float) -> FloatArray:
     """T_world_color (n, 4, 4) of every colour image at the mid-exposure of `line`, 0 the first that is read."""
     color = sequence.streams["color"]
     times = color.shutter.line_mid_time(blur_centres(color), line, color.camera)

@@ -33,11 +33,7 @@ from rsgen.sequence.format import ground_truth, pose_rows, poses_of_rows
 from rsgen.sequence.reader import Sequence, Stream
 from rsgen.truth.settings import SequenceImu, sequence_imu
 
-COLOR_FRAME, DEPTH_FRAME, IMU_FRAME = (
-    "camera_color_optical_frame",
-    "camera_depth_optical_frame",
-    "camera_imu_optical_frame",
-)
+COLOR_FRAME, DEPTH_FRAME, IMU_FRAME = (f"camera_{name}_optical_frame" for name in ("color", "depth", "imu"))
 WORLD_FRAME = "world"
 COLOR_TOPIC, DEPTH_TOPIC = "/camera/color/image_raw", "/camera/depth/image_rect_raw"
 ALIGNED_TOPIC = "/camera/aligned_depth_to_color/image_raw"

@@ -84,13 +84,10 @@ def lamp_shapes(lamps: Sequence[Lamp], folder: Path) -> tuple[dict[str, Any], li
     skies = [lamp for lamp in lamps if lamp.kind == "sky"]
     # Mitsuba takes one; uniform ones add up where there is no picture.
     pictured = [lamp for lamp in skies if lamp.picture is not None]
-    remarks = [] if len(skies) == max(len(pictured[:1]), 1 if skies and not pictured else 0) else [
-        f"of {len(skies)} skies {'one with a picture' if pictured else 'the sum'} is taken"
-    ]  # fmt: skip
-    shapes: dict[str, Any] = {}
+    taken = "one with a picture" if pictured else "the sum"
+    remarks = [f"of {len(skies)} skies {taken} is taken"] if len(skies) > 1 else []
     others = [lamp for lamp in lamps if lamp.kind != "sky"]
-    for number, lamp in enumerate(others):
-        shapes[f"light{number:05}"] = _entry(lamp)
+    shapes = {f"light{number:05}": _entry(lamp) for number, lamp in enumerate(others)}
     if pictured:
         shapes["sky"] = _environment(pictured[0], folder)
     elif skies:
@@ -114,10 +111,8 @@ def _entry(lamp: Lamp) -> dict[str, Any]:
         place[:3, 3] = T[:3, 3]
         return {"type": "point", "to_world": place, "intensity": _rgb(lamp.value)}
     cutoff, beam = lamp.cone_deg
-    return {
-        "type": "spot", "to_world": T @ _TURN, "intensity": _rgb(lamp.value),
-        "cutoff_angle": cutoff, "beam_width": min(beam, 0.999 * cutoff),
-    }  # fmt: skip
+    cone = {"cutoff_angle": cutoff, "beam_width": min(beam, 0.999 * cutoff)}
+    return {"type": "spot", "to_world": T @ _TURN, "intensity": _rgb(lamp.value), **cone}
 
 
 def _environment(lamp: Lamp, folder: Path) -> dict[str, Any]:

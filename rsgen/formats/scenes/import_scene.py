@@ -1,19 +1,28 @@
-"""Make a scene folder of a file of another program."""
+"""Make a scene folder of a file of another program: scene.xml with its meshes and pictures, whole or not at all."""
 
 from __future__ import annotations
 
+import hashlib
+import os
+import shutil
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeVar
+from xml.etree import ElementTree
 
 import numpy as np
 
+from rsgen import srgb
+from rsgen.array_types import FloatArray
 from rsgen.config.sections import Up
 from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
+from rsgen.files import write_error
 from rsgen.formats import IMPORTS, scene_importer
 from rsgen.formats.meshes.mesh_file import finished, light_shapes, part_shapes, read_parts
 from rsgen.formats.scenes.content import Content, lamp_shapes
-from rsgen.formats.scenes.folder import NAME, write_folder, write_scene
+from rsgen.image_codecs import encode_exr, encode_png
 from rsgen.inputs import check_input
 from rsgen.render.placement import SceneOptions
 
@@ -74,3 +83,118 @@ def read_content(path: Path, scale: float | None, up: Up | None) -> Content:
     check_input(path)
     parts = read_parts(path, SceneOptions(scale or 1.0, up or "y"))
     return Content(parts, [], ["scene.file of a config takes a mesh file as it is, too"])
+
+
+NAME = "scene.xml"
+
+Made = TypeVar("Made")
+
+_TAGS = {
+    "bsdf": ("diffuse", "roughplastic", "roughconductor", "blendbsdf", "normalmap", "twosided"),
+    "texture": ("bitmap", "mesh_attribute", "uniform"),
+    "emitter": ("area", "constant", "envmap", "point", "spot", "directional"),
+    "shape": ("ply", "rectangle", "disk", "sphere"),
+}  # fmt: skip
+_TAG_OF = {kind: tag for tag, kinds in _TAGS.items() for kind in kinds}
+_BYTE_STEP = 2e-5  # linear; a picture whose values are this near to bytes in sRGB is written as those
+
+
+def write_folder(out: Path, force: bool, fill: Callable[[Path], Made]) -> Made:
+    """Make the folder `out` by `fill`, which is given an empty one and whose result is returned. Raises UserError.
+
+    One that is there is refused, or with force replaced once the new one is whole.
+    """
+    if out.exists() and not force:
+        raise UserError(f"{out}: is there already: choose another folder, or replace it with --force")
+    if out.exists() and not (out / NAME).is_file() and (not out.is_dir() or any(out.iterdir())):
+        raise UserError(f"{out}: is no folder of import-scene ({NAME} is not in it): delete it yourself")
+    new, old = (out.with_name(f".{out.name}.{os.getpid()}.{word}") for word in ("new", "old"))
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        new.mkdir()
+        try:
+            made = fill(new)
+            if out.exists():
+                out.rename(old)
+            new.rename(out)
+        finally:
+            shutil.rmtree(new, ignore_errors=True)
+            shutil.rmtree(old, ignore_errors=True)
+    except OSError as error:
+        raise write_error(out, error) from None
+    return made
+
+
+def write_scene(scene: dict[str, Any], comments: Sequence[str], folder: Path) -> None:
+    """scene.xml of a scene dictionary in `folder`, where its meshes are; pictures go into `folder`/textures.
+
+    comments: lines at its top.
+    """
+    root = ElementTree.Element("scene", version="3.0.0")
+    for name, value in scene.items():
+        if name != "type":
+            _element(root, name, value, folder)
+    ElementTree.indent(root)
+    text = "".join(f"<!-- {line.replace('--', '- -')} -->\n" for line in comments)
+    (folder / NAME).write_text(f"{text}{ElementTree.tostring(root, encoding='unicode')}\n", encoding="utf-8")
+
+
+def _element(parent: ElementTree.Element, name: str, value: Any, folder: Path) -> None:
+    if isinstance(value, dict) and value["type"] == "rgb":
+        rgb = value["value"]
+        rgb = [rgb] if isinstance(rgb, int | float) else rgb
+        ElementTree.SubElement(parent, "rgb", name=name, value=" ".join(f"{x:.9g}" for x in rgb))
+    elif isinstance(value, dict) and value["type"] == "bitmap":
+        _picture(parent, name, value, folder)
+    elif isinstance(value, dict):
+        tag = _TAG_OF[value["type"]]
+        own = ElementTree.SubElement(parent, tag, {"type": value["type"], "id" if tag == "shape" else "name": name})
+        for key, inner in value.items():
+            if key != "type":
+                _element(own, key, inner, folder)
+    elif isinstance(value, bool):
+        ElementTree.SubElement(parent, "boolean", name=name, value=str(value).lower())
+    elif isinstance(value, int | float):
+        ElementTree.SubElement(parent, "float", name=name, value=f"{value:.9g}")
+    elif isinstance(value, str):
+        is_file = name == "filename"
+        text = Path(value).relative_to(folder).as_posix() if is_file and Path(value).is_absolute() else value
+        ElementTree.SubElement(parent, "string", name=name, value=text)
+    else:
+        _matrix(parent, name, np.asarray(value, float))
+
+
+def _matrix(parent: ElementTree.Element, name: str, T: FloatArray) -> None:
+    own = ElementTree.SubElement(parent, "transform", name=name)
+    ElementTree.SubElement(own, "matrix", value=" ".join(f"{x:.9g}" for x in T.ravel()))
+
+
+def _picture(parent: ElementTree.Element, name: str, bitmap: dict[str, Any], folder: Path) -> None:
+    """A bitmap's picture as a PNG where that keeps its values, else as an EXR."""
+    values = np.atleast_3d(np.array(bitmap["bitmap"], np.float32))
+    encoded = srgb.encode(np.clip(values, 0, 1).astype(np.float64))
+    in_bytes = np.round(encoded * 255).astype(np.uint8)
+    as_bytes = values.shape[2] == 3 and np.abs(srgb.decode(in_bytes / 255) - values).max() < _BYTE_STEP
+    digest = hashlib.sha256(repr(values.shape).encode() + values.tobytes()).hexdigest()[:16]
+    file = folder / "textures" / f"{digest}.{'png' if as_bytes else 'exr'}"
+    file.parent.mkdir(exist_ok=True)
+    if not file.exists():
+        if as_bytes:
+            file.write_bytes(encode_png(in_bytes))
+        else:
+            # Not by Mitsuba, whose writer waits for itself for ever where Dr.Jit has one thread.
+            file.write_bytes(encode_exr(values, ("Y",) if values.shape[2] == 1 else ("R", "G", "B")))
+    own = ElementTree.SubElement(parent, "texture", type="bitmap", name=name)
+    ElementTree.SubElement(own, "string", name="filename", value=file.relative_to(folder).as_posix())
+    ElementTree.SubElement(own, "boolean", name="raw", value=str(not as_bytes).lower())
+    for key in ("format", "wrap_mode", "filter_type"):
+        ElementTree.SubElement(own, "string", name=key, value=bitmap[key])
+    _matrix(own, "to_uv", _to_uv(bitmap["to_uv"]))
+
+
+def _to_uv(transform: Any) -> FloatArray:
+    """A transform of coordinates (3, 3) as Mitsuba's XML takes it, (4, 4), whose translation is in its last column."""
+    flat = np.asarray(transform.matrix, float).reshape(3, 3)
+    out = np.eye(4)
+    out[:2, :2], out[:2, 3] = flat[:2, :2], flat[:2, 2]
+    return out

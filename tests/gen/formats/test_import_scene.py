@@ -16,7 +16,7 @@ from rsgen.cli.main import main
 from rsgen.errors import UserError
 from rsgen.formats.polygons import triangulate
 from rsgen.formats.scenes import content
-from rsgen.formats.scenes.folder import write_folder, write_scene
+from rsgen.formats.scenes.import_scene import write_folder, write_scene
 from rsgen.render.material import Material, Texture, bsdf
 from rsgen.render.scene import load_scene
 
