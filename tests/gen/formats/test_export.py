@@ -1,10 +1,8 @@
-"""What the exports share: folders left alone, what others have no words for, the IMU, and no engine loaded."""
+"""What the exports share: folders left alone, what others have no words for, the IMU, the example of the docs."""
 
 from __future__ import annotations
 
-import importlib.util
 import re
-import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -147,17 +145,6 @@ def test_the_exported_imu_is_that_of_the_sequences_own_file(tmp_path: Path) -> N
     for a, b in zip(own[1:], exported[1:], strict=True):
         (ns_a, readings_a), (ns_b, readings_b) = (line.split(",", 1) for line in (a, b))
         assert int(ns_a) + EPOCH_NS == int(ns_b) and readings_a == readings_b
-
-
-def test_the_exports_load_no_engine() -> None:
-    names = [f"rsgen.formats.export.{name}" for name in ("kalibr", "euroc", "registered", "video", "rerun")]
-    modules = ", ".join(["sys", "rsgen.sensors.imu", *names])
-    code = f"import {modules}; print(*({{'mitsuba', 'drjit', 'rerun'}} & set(sys.modules)))"
-    root = Path(__file__).parents[3]
-    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.strip() == ""
-    assert all(importlib.util.find_spec(name) for name in names)
 
 
 def test_the_export_of_the_document_is_one_module_and_one_line(

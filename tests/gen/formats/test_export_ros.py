@@ -101,9 +101,6 @@ def test_images_and_stamps_come_back_bit_for_bit(sequence: Sequence, messages: M
         units = sequence.depth_units(k)
         np.testing.assert_array_equal(np.isnan(z), units == 0)
         np.testing.assert_array_equal(np.rint(np.nan_to_num(z) * 5000.0), units)
-
-
-def test_messages_are_in_the_order_of_time(messages: Messages) -> None:
     assert all(ns == sorted(ns) for ns in ([t for t, _ in found] for found in messages.values()))
     assert min(ns for found in messages.values() for ns, _ in found) == 0
 
@@ -211,32 +208,31 @@ def test_registered_depth_and_millimetres(sequence: Sequence, tmp_path: Path) ->
     assert "registered" in facts(found)["streams"]["depth"]
 
 
-def test_a_rational_lens_keeps_its_coefficients_and_a_double_sphere_is_refused(
-    sequence: Sequence, tmp_path: Path
+def with_lens(sequence: Sequence, model: Any, distortion: tuple[float, ...]) -> Sequence:
+    color = replace(sequence.streams["color"], camera=Camera(64, 48, 40, 41, 31.5, 23.5, model, distortion))
+    return replace(sequence, streams={**sequence.streams, "color": color})
+
+
+@pytest.mark.parametrize(
+    ("model", "theirs", "distortion"),
+    [
+        ("rational", "rational_polynomial", (0.3, 0.1, 0.004, -0.003, 0.02, 0.5, 0.1, 0.01)),
+        ("fisheye", "equidistant", (0.1, 0.02, 0.0, 0.001)),
+    ],
+)
+def test_lenses_that_ros_has_keep_their_coefficients(
+    sequence: Sequence, tmp_path: Path, model: str, theirs: str, distortion: tuple[float, ...]
 ) -> None:
-    def lens(model: Any, distortion: tuple[float, ...]) -> Sequence:
-        camera = Camera(64, 48, 40, 41, 31.5, 23.5, model, distortion)
-        color = replace(sequence.streams["color"], camera=camera)
-        return replace(sequence, streams={**sequence.streams, "color": color})
-
-    eight = (0.3, 0.1, 0.004, -0.003, 0.02, 0.5, 0.1, 0.01)
-    export_ros(lens("rational", eight), tmp_path / "a.bag", ExportOptions("ros1"))
-    info = read(tmp_path / "a.bag")["/camera/color/camera_info"][0][1]
-    assert info.distortion_model == "rational_polynomial" and tuple(info.D) == eight
-    with pytest.raises(UserError, match="has no double_sphere lens"):
-        export_ros(lens("double_sphere", (-0.2, 0.6)), tmp_path / "b.bag", ExportOptions("ros1"))
-    assert [path.name for path in tmp_path.iterdir()] == ["a.bag"]
-
-
-def test_a_fisheye_is_equidistant(sequence: Sequence, tmp_path: Path) -> None:
-    camera = Camera(64, 48, 40, 41, 31.5, 23.5, "fisheye", (0.1, 0.02, 0.0, 0.001))
-    color = replace(sequence.streams["color"], camera=camera)
-    export_ros(
-        replace(sequence, streams={**sequence.streams, "color": color}), tmp_path / "a.mcap", ExportOptions("mcap")
-    )
+    export_ros(with_lens(sequence, model, distortion), tmp_path / "a.mcap", ExportOptions("mcap"))
     info = read(tmp_path / "a.mcap")["/camera/color/camera_info"][0][1]
-    assert info.distortion_model == "equidistant" and info.d.tolist() == [0.1, 0.02, 0.0, 0.001]
+    assert (info.distortion_model, tuple(info.d)) == (theirs, distortion)
     assert info.k.tolist() == [40, 0, 31.5, 0, 41, 23.5, 0, 0, 1] and info.p.tolist()[:8:5] == [40, 41]
+
+
+def test_a_lens_that_ros_has_not_is_refused(sequence: Sequence, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="has no double_sphere lens"):
+        export_ros(with_lens(sequence, "double_sphere", (-0.2, 0.6)), tmp_path / "b.bag", ExportOptions("ros1"))
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_loss_of_tf_grows_with_its_spacing(sequence: Sequence) -> None:

@@ -21,38 +21,18 @@ from rsgen.render.material import Material, Texture, bsdf
 from rsgen.render.scene import load_scene
 
 
-def test_polygons_of_any_shape_keep_their_area() -> None:
-    """Against the shoelace formula: convex ones, stars, and an L whose first corner is its inner one."""
-    rng = np.random.default_rng(3)
-    points, counts, expected = [], [], []
-    for n in (3, 4, 5, 6, 8, 12, 4):
-        angle = np.sort(rng.uniform(0, 2 * np.pi, n)) if n != 4 else np.radians([0, 80, 100, 270])
-        radius = np.where(np.arange(n) % 2, 0.3, 1.0) if n in (8, 12) else np.ones(n)
-        if len(counts) == 6:
-            radius[1] = 0.05  # an arrow head
-        if n in (8, 12):
-            angle = np.arange(n) * 2 * np.pi / n
-        flat = np.roll(radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)]), n // 2 + 1, axis=0)
-        x, y = flat.T
-        expected.append(abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2)
-        tilt = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-        points.append(np.column_stack([flat, np.zeros(n)]) @ tilt.T)
-        counts.append(n)
-    flat_L = np.array([[1, 1], [1, 2], [0, 2], [0, 0], [2, 0], [2, 1.0]])
-    points.append(np.column_stack([flat_L, np.ones(6)]))
-    counts.append(6)
-    expected.append(3.0)
-    p = np.concatenate(points)
-    kept = np.ones(len(counts), bool)
-    kept[2] = False  # a hole
-    corners, polygon = triangulate(p, np.arange(len(p)), np.array(counts), kept)
-    areas = (
-        np.linalg.norm(np.cross(p[corners[:, 1]] - p[corners[:, 0]], p[corners[:, 2]] - p[corners[:, 0]]), axis=1) / 2
-    )
-    np.testing.assert_allclose(
-        np.bincount(polygon, areas, len(counts)), np.where(kept, expected, 0), rtol=1e-9, atol=1e-12
-    )
-    assert (np.diff(polygon) >= 0).all()
+def test_polygons_of_a_mesh_keep_their_area_and_order_and_holes_are_left_out() -> None:
+    """A triangle, an L whose first corner is its inner one, a hole, and an arrow head."""
+    L = [[1, 1], [1, 2], [0, 2], [0, 0], [2, 0], [2, 1]]
+    polygons = [[[0, 0], [4, 0], [0, 1]], L, [[0, 0], [1, 0], [1, 1], [0, 1]], [[0, 0], [4, 0], [2, 1], [2, 4]]]
+    flat = np.concatenate(polygons)
+    turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+    points = np.pad(flat, ((0, 0), (0, 1))) @ turn
+    corners, polygon = triangulate(points, np.arange(len(flat)), np.array([3, 6, 4, 4]), np.array([1, 1, 0, 1], bool))
+    a, b, c = (points[corners[:, k]] for k in range(3))
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    np.testing.assert_allclose(np.bincount(polygon, areas), [2, 3, 0, 5], atol=1e-12)
+    assert polygon.tolist() == [0, 1, 1, 1, 1, 3, 3]
 
 
 def test_a_mesh_file_becomes_the_scene_that_it_is_by_itself(tmp_path: Path) -> None:
