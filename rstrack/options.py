@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal, get_args
 
 import numpy as np
@@ -36,6 +36,10 @@ LOOPS: tuple[str, ...] = get_args(Loops)
 _KNOTS_S, _SLOW_S, _KNOTS_PER_FRAME, _SLOWEST_S = 0.025, 0.04, 0.75, 0.3
 
 
+# Of fields that are no options on the command line: nobody has had to touch them there.
+_IN_PYTHON = {"command_line": False}
+
+
 @dataclass(frozen=True)
 class Options:
     """What can be chosen for a tracker; each field's text is also the help of the option of its name."""
@@ -51,13 +55,17 @@ class Options:
         "where these come more slowly than 25 a second; beside an IMU as dense as what it reads needs); with gs that "
         "of the frames if it is more, since each gives one pose only",
     ] = None
-    knot_phase: Annotated[float, "the first knot lies this part of the spacing before the first line"] = 0.5
+    knot_phase: Annotated[float, "the first knot lies this part of the spacing before the first line"] = field(
+        default=0.5, metadata=_IN_PYTHON
+    )
     backend: Annotated[Backend, "where kernels run"] = "auto"
     keyframe_overlap: Annotated[
         float, "new keyframe once less than this part of the depth points that the current one saw at first is seen"
-    ] = 0.65
-    keyframe_distance: Annotated[float, "new keyframe after this distance, m"] = 0.3
-    keyframe_angle_deg: Annotated[float, "new keyframe after this rotation, degrees"] = 20.0
+    ] = field(default=0.65, metadata=_IN_PYTHON)
+    keyframe_distance: Annotated[float, "new keyframe after this distance, m"] = field(default=0.3, metadata=_IN_PYTHON)
+    keyframe_angle_deg: Annotated[float, "new keyframe after this rotation, degrees"] = field(
+        default=20.0, metadata=_IN_PYTHON
+    )
     keyframe_strategy: Annotated[
         Strategy,
         "which frame that is (paper, section 3.5): the last that has converged, rectified at once, or the newest, "
@@ -73,7 +81,9 @@ class Options:
         "leave out what moves by itself, as far as it stands where a keyframe saw through, or the other way round (not "
         "for the baseline, nor where a rolling shutter is taken for a global one)",
     ] = True
-    bootstrap_frames: Annotated[int, "frames that are aligned jointly at the start"] = 6
+    bootstrap_frames: Annotated[int, "frames that are aligned jointly at the start"] = field(
+        default=6, metadata=_IN_PYTHON
+    )
     max_depth: Annotated[float, "depth beyond this counts as missing, m"] = 12.0
     blur_sigma_px: Annotated[
         float, "colour that motion blurs counts less, by exp(-length / this squared), equation (13), px; 0: all alike"
@@ -84,7 +94,7 @@ class Options:
         "distance volume of all frames, and the oldest keyframe in view: less drift where the camera comes back; not "
         "for the baseline",
     ] = "keyframe"
-    voxel_m: Annotated[float, "voxels of that volume, m"] = 0.01
+    voxel_m: Annotated[float, "voxels of that volume, m"] = field(default=0.01, metadata=_IN_PYTHON)
     loops: Annotated[
         Loops | None,
         "places that the camera has come back to are looked for, and the whole spline is corrected: end when the "

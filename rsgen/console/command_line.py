@@ -71,7 +71,8 @@ class Commands:
         A parameter is `Annotated[type, help, *more]`, an option if it is keyword-only. more: a converter of words, a
         metavar, or another name of the option ("--voxel"). Of int (count) and float (number) those below convert; list
         takes the option repeatedly, tuple with several words. A parameter whose type is a dataclass of such fields gets
-        an option for each that the command has not itself; **fields gets what else is added to the parser, if given.
+        an option for each that the command has not itself, but for fields whose metadata has command_line False, which
+        are for Python alone; **fields gets what else is added to the parser, if given.
         example: what may follow the command's name; note: a last line of help.
         """
         name = run.__name__.strip("_").replace("_", "-")
@@ -93,7 +94,10 @@ class Commands:
             within = command.add_argument_group(f"the {group}")
             meant = get_type_hints(declared, include_extras=True)
             for field in fields:
-                _add(within, field.name, meant[field.name], field.default)
+                if field.metadata.get("command_line", True):
+                    _add(within, field.name, meant[field.name], field.default)
+                else:
+                    _refuse(within, field.name, declared.__name__, field.default)
 
         def call(given: dict[str, Any]) -> int:
             made = {group: groups[group](**{n: given.pop(n) for n in names}) for group, names in own.items()}
@@ -133,6 +137,17 @@ def _add(to: Any, name: str, hint: Any, default: Any, kind: Any = inspect.Parame
         how |= {"action": "append"} if many is list else {"action": "extend", "nargs": "+"}
     flag = "--" + name.strip("_").replace("_", "-")
     to.add_argument(flag, *names, dest=name, required=required, **how)
+
+
+def _refuse(to: Any, name: str, declared: str, default: Any) -> None:
+    """A field of the dataclass `declared` that has no option: whoever gives one is told where it is."""
+
+    class Refusal(argparse.Action):
+        def __call__(self, _: object, __: object, ___: object, option: str | None = None) -> NoReturn:
+            raise UserError(f"{option}: is for Python alone, {declared}({name}=...): leave it out here")
+
+    flag = "--" + name.replace("_", "-")
+    to.add_argument(flag, dest=name, default=default, action=Refusal, nargs="?", help=argparse.SUPPRESS)
 
 
 class _YesNo(argparse.BooleanOptionalAction):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
+from functools import partial
 from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -62,7 +63,10 @@ def track(
     from rstrack.calibration.run import calibrate as run_calibration
     from rstrack.data.dataset import open_dataset
     from rstrack.data.rig import UNDISTORTED_K1
+    from rstrack.metrics.association import truth_of
+    from rstrack.metrics.run_evaluate import add_errors, error_note
     from rstrack.tracking.runs import run
+    from rstrack.tracking.runs.record import Noise
 
     if device is not None and not calibrate:
         raise UserError(f"--device {device}: is for --calibrate, which is not given")
@@ -70,18 +74,22 @@ def track(
         raise UserError("--resume --calibrate: 'rstrack calibrate --out camera.yaml' first, and track with --camera")
     tracker = replace(tracker, loops=tracker.loops or "end")
     known = None if device is None else device_named(device)
-    noise = run.Noise(noise_depth, noise_intensity, seed)
+    noise, chosen = Noise(noise_depth, noise_intensity, seed), frames or slice(None)
     dataset = open_dataset(sequence, camera, imu)
     with ProgressDisplay(quiet) as progress:
         found = None
         if calibrate:
-            found = run_calibration(dataset, None, frames or slice(None), tracker, progress, known)
+            found = run_calibration(dataset, None, chosen, tracker, progress, known)
             if not found.solution.finished:
                 raise KeyboardInterrupt
             dataset = found.calibrated()
+        truth = truth_of(dataset)
+        if truth is not None:
+            truth = replace(truth, frame_stamps=dataset.stamps[chosen])
+        note = partial(error_note, truth)
         with _viewed(view, dataset) as viewer:
             watch = None if viewer is None else viewer.see
-            result = run.track(dataset, tracker, out, frames or slice(None), noise, progress, resume, watch, gravity)
+            result = run.track(dataset, tracker, out, chosen, noise, progress, resume, watch, gravity, note)
             if viewer is not None:
                 viewer.corrected(result.estimate.T_world_depth)
     (out / CALIBRATION).unlink(missing_ok=True)  # of an earlier run in this folder
@@ -89,7 +97,8 @@ def track(
         atomic_write(out / "camera.yaml", found.camera_file().encode())
         write_record(found, out / CALIBRATION)
         print(found.text())
-    print(result.text())
+    errors = add_errors(out, truth, result.estimate, result.online)
+    print("\n".join(text for text in (result.text(), errors) if text))
     if found is None and dataset.rig.sigma.k1 >= UNDISTORTED_K1:
         print(
             "the camera file has no distortion, which hardly any camera is without: --calibrate finds lens, clocks and "

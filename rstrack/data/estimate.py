@@ -115,6 +115,11 @@ def write_estimate(
     _write_run(folder, estimate, TRAJECTORY, SPLINE)
     if online is not None:
         _write_run(folder, online, ONLINE_TRAJECTORY, ONLINE_SPLINE)
+    write_info(folder, info)
+
+
+def write_info(folder: Path, info: dict[str, Any]) -> None:
+    """A run folder's run.json; what is not finite becomes null. Raises UserError."""
     atomic_write(folder / INFO, (json.dumps(plain(info), indent=1, allow_nan=False) + "\n").encode())
 
 

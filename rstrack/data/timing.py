@@ -6,7 +6,7 @@
 
 Arrival times say little of how long each stream took to arrive, so colour may be stamped early or late against depth
 by tens of milliseconds: `color.offset_s` is added to its stamps. Where it is auto, it is looked for if stamps are
-arrival times (`rstrack.tracking.first_look.color_offset`), and 0 otherwise.
+arrival times (`rstrack.tracking.first_look.color_clock`), and 0 otherwise.
 """
 
 from __future__ import annotations

@@ -13,12 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.trajectory import read_trajectory
 from rstrack.data.dataset import open_tracked
-from rstrack.data.estimate import Estimate, read_estimate
-from rstrack.metrics.association import Truth, truth_of
+from rstrack.data.estimate import Estimate, read_estimate, write_info
+from rstrack.metrics.association import Truth, compare, truth_of
 from rstrack.metrics.clock import ClockFit, TruthOffset, fit_clock, shifted
 from rstrack.metrics.consistency import TruthNoise
 from rstrack.metrics.evaluate import Metrics, evaluate
@@ -115,6 +116,32 @@ class RunEvaluation:
         size, side = f"{abs(1e3 * self.offset_s):.1f}", "after" if self.offset_s > 0 else "before"
         spread = f" ± {1e3 * self.fit.sigma_s:.1f}" if self.fit else ""
         return f"the truth {size}{spread} ms {side} the stamps"
+
+
+def error_note(truth: Truth | None, stamps: FloatArray, T_world_depth: FloatArray) -> str:
+    """The error of poses (n, 4, 4) at stamps (n,) so far, for a progress line; empty if it cannot be told."""
+    try:
+        errors = None if truth is None else compare(truth, Estimate(stamps, T_world_depth)).position_errors_m
+    except UserError:
+        return ""  # fewer than three poses
+    return "" if errors is None else f", ATE {1e3 * np.sqrt(np.mean(errors**2)):.2f} mm"
+
+
+def add_errors(run: Path, truth: Truth | None, estimate: Estimate, online: Estimate | None = None) -> str:
+    """Add the errors of a run that has just been written to its run.json; in words, empty without a truth.
+
+    online: the track before it was corrected. Raises UserError.
+    """
+    evaluation, before = evaluated(truth, estimate), None if online is None else evaluated(truth, online)
+    errors: dict[str, Any] = {
+        "metrics": None if evaluation is None else evaluation.metrics.as_dict(),
+        "truth_offset": None if evaluation is None else evaluation.truth_offset,
+    }
+    if online is not None:
+        errors["metrics_online"] = None if before is None else before.metrics.as_dict()
+    write_info(run, estimate.info | errors)
+    lines = [] if before is None else [f"ATE before loops were closed: {1e3 * before.metrics.ate_rmse_m:.3f} mm"]
+    return "\n".join(lines if evaluation is None else [*lines, "", evaluation.text()])
 
 
 def evaluated(truth: Truth | None, estimate: Estimate) -> RunEvaluation | None:

@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING, Protocol
 from rsgen.array_types import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.data.imu.recording import ImuRecording
+from rstrack.data.moving_masks import MovingMasks
 from rstrack.data.rig import Frame, Rig
 from rstrack.inertial.band import with_knots
 from rstrack.options import Options
 
 if TYPE_CHECKING:
     from rstrack.images.device_frame import Timer
+    from rstrack.inertial.inertia import Inertia
     from rstrack.tracking.frame_report import FrameReport
 
 
@@ -27,6 +29,10 @@ class AnyTracker(Protocol):
     @property
     def options(self) -> Options:
         """With all that depends on the rig."""
+
+    @property
+    def uncorrected(self) -> FrameTracker:
+        """What tracks frame by frame, before loops are closed: often the same."""
 
     @property
     def keyframes(self) -> int:
@@ -50,6 +56,22 @@ class AnyTracker(Protocol):
 
     def feed(self, frame: Frame) -> FrameReport:
         """Track one frame."""
+
+
+class FrameTracker(AnyTracker, Protocol):
+    """A tracker that closes no loops."""
+
+    @property
+    def inertia(self) -> Inertia | None:
+        """What has been found of an IMU, where the method uses one."""
+
+    @property
+    def color_late(self) -> tuple[float, float]:
+        """Seconds that colour was found to be later than its stamps, and σ of that; 0 where it is not estimated."""
+
+    @property
+    def left_out(self) -> MovingMasks:
+        """Pixels of frames, by their numbers, that were left out since they move by themselves."""
 
 
 def make_tracker(
@@ -81,7 +103,7 @@ def make_tracker(
 
     if options.loops == "online":
         return LoopTracker(rig, options, timer, load, imu)
-    made, first = Tracker(rig, options, timer, imu), after.uncorrected if isinstance(after, LoopTracker) else after
+    made, first = Tracker(rig, options, timer, imu), None if after is None else after.uncorrected
     if isinstance(first, Tracker):
         made.learn_cameras(first)
     return made

@@ -12,8 +12,7 @@ from rstrack.alignment.observation import Observation
 from rstrack.alignment.score import Scores, scores
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference
-from rstrack.tracking.frame_report import FrameReport
-from rstrack.tracking.judgement.fault import Fault
+from rstrack.tracking.frame_report import Fault, FrameReport
 from rstrack.tracking.judgement.innovation import disagreement
 from rstrack.tracking.judgement.lost_track import lost
 from rstrack.tracking.moving.leave_out import LeftOut, left_out_with, without

@@ -29,7 +29,7 @@ from rstrack.alignment.spline_state import SplineState
 from rstrack.data.rig import Frame
 from rstrack.keyframes.archive import Archive
 from rstrack.keyframes.keyframe import Reference
-from rstrack.tracking.judgement.systematic import SYSTEMATIC_PX
+from rstrack.tracking.judgement.uncertainty import SYSTEMATIC_PX
 from rstrack.tracking.matching import judge_alone
 from rstrack.tracking.spline_tracker import Tracker
 

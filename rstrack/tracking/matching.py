@@ -13,8 +13,8 @@ from rstrack.alignment.spline_state import SplineState
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.images.pyramid import DepthImage
 from rstrack.keyframes.keyframe import Reference
-from rstrack.tracking.judgement.common import Common
-from rstrack.tracking.judgement.fault import Fault
+from rstrack.tracking.frame_report import Fault
+from rstrack.tracking.judgement.calibration_errors import Common
 from rstrack.tracking.judgement.innovation import Innovation, Prediction, disagreement, doubt, learnt, weighed
 from rstrack.tracking.judgement.lost_track import UsualScales, implausible, is_hopeless, is_settled, lost, misfits
 from rstrack.tracking.judgement.pose_covariances import PoseCovariances

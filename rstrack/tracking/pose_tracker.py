@@ -22,13 +22,13 @@ from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Solved
 from rstrack.alignment.score import scores
 from rstrack.alignment.spline_state import SplineState
+from rstrack.data.moving_masks import MovingMasks
 from rstrack.data.rig import Frame, Rig
 from rstrack.images.device_frame import DeviceFrame, DeviceRig, Timer, untimed
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.options import Options
-from rstrack.tracking.frame_report import FrameReport, frame_report
-from rstrack.tracking.judgement.fault import Fault
+from rstrack.tracking.frame_report import Fault, FrameReport, frame_report
 from rstrack.tracking.judgement.lost_track import lost
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.window import LEVELS
@@ -46,6 +46,8 @@ class BaselineTracker:
 
     spline = None
     spline_valid: tuple[tuple[float, float], ...] = ()
+    inertia = None
+    color_late = 0.0, 0.0
 
     def __init__(self, rig: Rig, options: Options | None = None, timer: Timer = untimed) -> None:
         self.rig = rig
@@ -64,6 +66,12 @@ class BaselineTracker:
         self._last: list[tuple[float, FloatArray]] = []
         self.reports: list[FrameReport] = []
         self.keyframes = 0
+        self.left_out = MovingMasks()
+
+    @property
+    def uncorrected(self) -> BaselineTracker:
+        """Itself: it closes no loops."""
+        return self
 
     @property
     def reference(self) -> int | None:

@@ -1,9 +1,9 @@
-"""Find a lost frame: where the track ended, or at any keyframe ever made that looks like it, and make sure of it."""
+"""Find lost frames: at any keyframe that looks like them, or led by an IMU over frames that show nothing."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -13,11 +13,52 @@ from rstrack.alignment import brightness
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes import coarse_search
 from rstrack.keyframes.keyframe import Reference
-from rstrack.tracking.judgement.fault import Fault
+from rstrack.tracking.frame_report import Fault
 from rstrack.tracking.judgement.lost_track import implausible
 from rstrack.tracking.matching import Match, Verdict, judge_unpredicted, match
 from rstrack.tracking.track import Track
 from rstrack.tracking.window import LEVELS, Window
+
+# Seconds for which an IMU alone leads: in two a phone's is off by some centimetres, from where images are not aligned.
+_LONGEST_S = 2.0
+# Frames in a row that show something, but not where the IMU leads: then it is no blackout.
+_MOST_ODD = 6
+
+
+@dataclass
+class Bridge:
+    """over: frames since the last one that was found. odd: how many of them were not dark."""
+
+    over: list[DeviceFrame] = field(default_factory=list)
+    odd: int = 0
+
+    def leads(self, track: Track, new: DeviceFrame) -> bool:
+        """Whether the motion since the last frame that was found is told well enough to look for a new one there."""
+        window, end = track.window, track.found.end
+        return (
+            window is not None
+            and new.last_time - end < _LONGEST_S
+            and self.odd < _MOST_ODD
+            and window.is_led(end, new.last_time)
+        )
+
+    def put(self, track: Track, new: DeviceFrame) -> None:
+        """A frame that was not found: lost, until one after it is."""
+        self.over.append(new)
+        self.odd += not track.succession.is_unfit(new)
+
+    def close(self, track: Track) -> None:
+        """A frame beyond was found, on the same piece of the spline: those before have poses, too."""
+        for frame in self.over:
+            track.found.add(frame)
+            report = track.reports[frame.index]
+            track.reports[frame.index] = replace(report, lost=False, bridged=True)
+        self.forget()
+
+    def forget(self) -> None:
+        """The track begins anew: what was lost stays so."""
+        self.over, self.odd = [], 0
+
 
 # Keyframes at which a lost frame is looked for, at once.
 _PLACES = 3

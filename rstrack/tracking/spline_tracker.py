@@ -27,13 +27,11 @@ from rstrack.inertial.inertia import Inertia
 from rstrack.keyframes.archive import Archive
 from rstrack.options import Options
 from rstrack.tracking.bootstrap import bootstrap, fit_knots, start
-from rstrack.tracking.bridging import Bridge
-from rstrack.tracking.frame_report import FrameReport
-from rstrack.tracking.judgement.fault import Fault
+from rstrack.tracking.frame_report import Fault, FrameReport
 from rstrack.tracking.judgement.lost_track import UsualScales
 from rstrack.tracking.judgement.pose_covariances import PoseCovariances
 from rstrack.tracking.matching import Match, Verdict, judge_predicted, match
-from rstrack.tracking.relocalise import Relocaliser
+from rstrack.tracking.relocalise import Bridge, Relocaliser
 from rstrack.tracking.track import Track
 from rstrack.tracking.window import LEVELS, TRACKING_LEVELS, Window
 
@@ -104,6 +102,16 @@ class Tracker:
     def spline_valid(self) -> list[tuple[float, float]]:
         """Times (begin, end) in s within which the spline is an estimate."""
         return self._track.found.valid
+
+    @property
+    def uncorrected(self) -> Tracker:
+        """Itself: it closes no loops while tracking."""
+        return self
+
+    @property
+    def color_late(self) -> tuple[float, float]:
+        """Seconds that colour was found to be later than its stamps, and σ of that; (0, 0) where the file is exact."""
+        return self._track.covariances.color_late
 
     @property
     def keyframes(self) -> int:

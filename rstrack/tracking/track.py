@@ -30,16 +30,13 @@ from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.keyframes.store import KeyframeStore
 from rstrack.options import Options
-from rstrack.tracking.found_poses import FoundPoses
-from rstrack.tracking.frame_report import FrameReport, frame_report
-from rstrack.tracking.gains import Gains
+from rstrack.tracking.frame_report import Fault, FrameReport, frame_report
 from rstrack.tracking.judgement.consider import Calibration
-from rstrack.tracking.judgement.fault import Fault
 from rstrack.tracking.judgement.lost_track import UsualScales
 from rstrack.tracking.judgement.pose_covariances import PoseCovariances
 from rstrack.tracking.moving.leave_out import LeftOut, leave_out
-from rstrack.tracking.succession import Succession
-from rstrack.tracking.window import Window
+from rstrack.tracking.succession import Gains, Succession
+from rstrack.tracking.window import FoundPoses, Window
 
 # What a track of the same rig and options would make in the same way.
 _MADE_ANEW = "rig", "options", "device", "terms", "maker", "space"

@@ -9,6 +9,8 @@ from loop_room import NOISE, OPTIONS, make_dataset
 from shaken_recording import FRAMES, recording, shaking
 
 from rstrack.data.dataset import Dataset
+from rstrack.metrics.association import truth_of
+from rstrack.metrics.run_evaluate import add_errors
 from rstrack.tracking.runs.run import track
 
 
@@ -30,4 +32,5 @@ def closed_at_end(to_and_fro: Dataset, tmp_path_factory: pytest.TempPathFactory)
     out = tmp_path_factory.mktemp("loops-run") / "run"
     result = track(to_and_fro, OPTIONS, out, noise=NOISE)
     assert result.lost == 0 and "closed" in result.loops
+    assert add_errors(out, truth_of(to_and_fro), result.estimate, result.online).startswith("ATE before loops")
     return out

@@ -26,10 +26,8 @@ from rsgen.geometry.spline import Spline
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.score import steady
 from rstrack.alignment.spline_state import SplineState
-from rstrack.tracking.judgement.calibration_errors import CalibrationErrors
-from rstrack.tracking.judgement.common import Considered
-from rstrack.tracking.judgement.systematic import SYSTEMATIC_PX, Systematic, of_pixels
-from rstrack.tracking.judgement.uncertainty import Uncertainty
+from rstrack.tracking.judgement.calibration_errors import CalibrationErrors, Considered
+from rstrack.tracking.judgement.uncertainty import SYSTEMATIC_PX, Systematic, Uncertainty, of_pixels
 
 # What an innovation of 12 numbers, over its covariance, exceeds by chance once in a thousand times.
 _LIMIT = float(chdtri(12, 1e-3))

@@ -12,7 +12,7 @@ from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Solved
-from rstrack.tracking.judgement.fault import Fault
+from rstrack.tracking.frame_report import Fault
 
 # A term has to see this share of the reference's pixels to say anything.
 _LEAST_SHARE = 0.08

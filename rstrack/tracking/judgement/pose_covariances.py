@@ -16,7 +16,7 @@ from rstrack.alignment.spline_state import SplineState
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.frame_report import FrameReport
-from rstrack.tracking.judgement.common import Common, Considered
+from rstrack.tracking.judgement.calibration_errors import Common, Considered
 from rstrack.tracking.judgement.consider import CLOCK, Calibration
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 

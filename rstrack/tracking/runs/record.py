@@ -1,20 +1,28 @@
-"""How far a run is, and what run.json says of it: its settings, its times, and a line for every frame."""
+"""How far a run is, what run.json holds of it, and the few lines that it ends with."""
 
 from __future__ import annotations
 
 import dataclasses
 import os
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from rsgen.array_types import FloatArray
 from rstrack.data.dataset import Dataset
+from rstrack.data.estimate import Estimate
+from rstrack.data.timing import Timing
 from rstrack.options import Options
 from rstrack.tracking.frame_report import FrameReport
+
+End = Literal["done", "interrupted", "broke down"]
+
+# Observability (see FrameReport) below which a motion is held by the prior rather than by depth.
+_WEAK = 5e-4
 
 
 @dataclass(frozen=True)
@@ -62,11 +70,10 @@ def settings(dataset: Dataset, chosen: range, options: Options, noise: Noise) ->
     }  # fmt: skip
 
 
-def timings(total_s: float, seconds: Sequence[float]) -> dict[str, Any]:
-    """Of the tracker alone, but for the total; the first frames compile kernels."""
+def timings(seconds: Sequence[float]) -> dict[str, Any]:
+    """Of the tracker alone; the first frames compile kernels."""
     ms = 1e3 * np.array(seconds)
     return {
-        "total_s": total_s,
         "median_ms": float(np.median(ms)),
         "mean_ms": float(ms.mean()),
         "p95_ms": float(np.percentile(ms, 95)),
@@ -102,3 +109,64 @@ def diagnostics(
 def _upper(covariance: FloatArray | None, spread: float) -> FloatArray | None:
     """The upper triangle (21,) of a covariance (6, 6), row by row."""
     return None if covariance is None else spread**2 * covariance[np.triu_indices(6)]
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a run came to.
+
+    online: the track before loops were closed, None where none were. end: why it stopped; `error` says where the
+    tracker broke down. lost: number of frames. unreadable: what was wrong with each image that was left out; where that
+    was a depth image, its frame was. timing: of recordings, how stamps came about. loops, imu, segments: a line each.
+    """
+
+    estimate: Estimate
+    online: Estimate | None
+    end: End
+    error: str
+    lost: int
+    unreadable: tuple[str, ...] = ()
+    timing: Timing | None = None
+    loops: str = ""
+    imu: str = ""
+    segments: str = ""
+
+    def text(self) -> str:
+        """A summary of a few lines."""
+        info, times = self.estimate.info, self.estimate.info["timings"]
+        done, asked = len(info["frames"]), info["dataset"]["frames"][1] - info["dataset"]["frames"][0]
+        part = f"{done} frames" if done == asked else f"{done} of {asked} frames"
+        lost = f"{self.lost} lost" if self.lost else "none lost"
+        rate = done / times["total_s"]
+        lines = [
+            f"{info['method']} on {info['dataset']['name']}: {part}, {keyframes_text(info['keyframes'])}, {lost}",
+            f"{times['total_s']:.1f} s, {rate:.1f} frames/s on {info['backend']}; a frame takes "
+            f"{times['median_ms']:.1f} ms (median), {times['mean_ms']:.1f} (mean), {times['p95_ms']:.1f} (95 %)",
+        ]
+        lines += [why] if (why := _faults_text(info["frames"])) else []
+        lines += [line for line in (self.segments, self.loops, self.imu) if line]
+        weak = sum(not f["lost"] and 0.0 < f["observability"] < _WEAK for f in info["frames"])
+        if weak and info["method"] in ("rs-g", "gs-g", "baseline"):
+            lines.append(f"in {weak} of {done} frames the geometry hardly fixes all six degrees of freedom (a wall?)")
+        if self.unreadable:
+            images = "1 image" if len(self.unreadable) == 1 else f"{len(self.unreadable)} images"
+            lines.append(f"left out: {images} that cannot be read, first {self.unreadable[0]}")
+        if info.get("checkpoint_error"):
+            lines.append(f"cannot be resumed: {info['checkpoint_error']}")
+        lines += [f"assumed: {note}" for note in info["dataset"].get("notes", ())]
+        lines += [] if self.timing is None else self.timing.lines()
+        if late := info.get("color_late"):
+            seconds, sigma_s = (1e3 * late[name] for name in ("seconds", "sigma_s"))
+            lines.append(f"colour: found to be {seconds:+.1f} ± {sigma_s:.1f} ms later than that while tracking")
+        return "\n".join(lines)
+
+
+def _faults_text(frames: Sequence[dict[str, Any]]) -> str:
+    """Why frames were lost, most frequent reason first."""
+    faults = Counter(f["fault"] for f in frames if f["lost"])
+    return "lost because: " + "; ".join(f"{why} ({count})" for why, count in faults.most_common()) if faults else ""
+
+
+def keyframes_text(count: int) -> str:
+    """So many keyframes, in words."""
+    return f"{count} keyframe" + ("" if count == 1 else "s")

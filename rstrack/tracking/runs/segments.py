@@ -91,9 +91,9 @@ class Segments:
     _next: int = 0
 
     @property
-    def is_open(self) -> bool:
-        """Whether the camera is in one now."""
-        return self._tracker is not None
+    def begun(self) -> bool:
+        """Whether the camera has been in one, or is now."""
+        return bool(self.found) or self._tracker is not None
 
     def feed(self, frame: Frame, reports: Sequence[FrameReport]) -> None:
         """The newest frame, and the first track's reports of all frames. Raises UserError as `Tracker.feed`."""

@@ -24,6 +24,8 @@ from rstrack.cli.main import main
 from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.data.imu.description import PHONE
 from rstrack.data.imu.recording import ImuRecording, ReadImu
+from rstrack.metrics.association import truth_of
+from rstrack.metrics.run_evaluate import add_errors
 from rstrack.metrics.tracked import load_run
 from rstrack.options import Options
 from rstrack.report.build import write_report
@@ -43,6 +45,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     dataset = make_dataset(folder / "seq").with_color_falloff(1e-5)
     result = track(dataset, OPTIONS, folder / "run", noise=Noise(1.2e-3, 0.01, 1))
     assert result.lost == 0
+    add_errors(folder / "run", truth_of(dataset), result.estimate)
     return folder / "run"
 
 

@@ -16,8 +16,7 @@ from rstrack_command import FRAMES, make_seq, read_info, refused, run
 import rsgen.console.progress
 from rstrack.data.estimate import read_estimate
 from rstrack.data.rig import Frame
-from rstrack.tracking.frame_report import FrameReport
-from rstrack.tracking.judgement.fault import Fault
+from rstrack.tracking.frame_report import Fault, FrameReport
 from rstrack.tracking.spline_tracker import Tracker
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
@@ -14,8 +15,11 @@ import synthetic
 from rsgen.errors import UserError
 from rsgen.geometry.shutter import Scan, project_rolling
 from rstrack.cli.main import main
-from rstrack.data.dataset import open_dataset
+from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.rig import Image
+from rstrack.options import Options
+from rstrack.tracking.runs import run
+from rstrack.tracking.runs.record import Result
 from rstrack.view.viewer import Viewer, depth_residuals, open_view, world_points
 
 
@@ -77,10 +81,16 @@ def rerun(monkeypatch: pytest.MonkeyPatch) -> Rerun:
     return module
 
 
-def test_a_run_is_watched_and_stays_the_same_to_the_bit(tmp_path: Path, rerun: Rerun) -> None:
+def test_a_run_is_watched_and_stays_the_same_to_the_bit(
+    tmp_path: Path, rerun: Rerun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def often(dataset: Dataset, options: Options, *rest: Any) -> Result:
+        return tracked(dataset, replace(options, bootstrap_frames=3, keyframe_distance=0.05), *rest)
+
+    tracked = run.track
+    monkeypatch.setattr(run, "track", often)
     root = synthetic.make_sequence(tmp_path / "seq", synthetic.make_config(width=80, height=60), frames=14)
-    arguments = ["track", str(root), "--backend", "llvm", "--bootstrap-frames", "3", "--quiet"]
-    arguments += ["--keyframe-distance", "0.05"]
+    arguments = ["track", str(root), "--backend", "llvm", "--quiet"]
     view = tmp_path / "views/run.rrd"
     # Whether a frame of so small images is lost hangs on the machine's rounding; that both are alike does not.
     status = main([*arguments, "--out", str(tmp_path / "plain")])
@@ -104,7 +114,7 @@ def test_a_view_that_breaks_down_leaves_what_was_tracked(
 
     root = synthetic.make_sequence(tmp_path / "seq", synthetic.make_config(width=80, height=60), frames=5)
     monkeypatch.setattr(Viewer, "see", broken)
-    arguments = ["track", str(root), "--backend", "llvm", "--bootstrap-frames", "3", "--quiet"]
+    arguments = ["track", str(root), "--backend", "llvm", "--quiet"]
     assert main([*arguments, "--out", str(tmp_path / "run"), "--view", str(tmp_path / "run.rrd")]) == 1
     assert "--view broke down at frame 4: no room" in capsys.readouterr().err
     assert len((tmp_path / "run/trajectory.txt").read_text().splitlines()) >= 5
@@ -150,7 +160,7 @@ def test_rerun_reads_back_what_was_seen(tmp_path: Path) -> None:
     pytest.importorskip("rerun")
     chunks = pytest.importorskip("rerun.chunk")
     root = synthetic.make_sequence(tmp_path / "seq", synthetic.make_config(width=80, height=60), frames=14)
-    arguments = ["track", str(root), "--backend", "llvm", "--bootstrap-frames", "3", "--quiet"]
+    arguments = ["track", str(root), "--backend", "llvm", "--quiet"]
     assert main([*arguments, "--out", str(tmp_path / "run"), "--view", str(tmp_path / "run.rrd")]) == 0
     rows: dict[str, int] = {}
     for chunk in chunks.RrdReader(tmp_path / "run.rrd").stream():

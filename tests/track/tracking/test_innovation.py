@@ -15,7 +15,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.tracking.judgement import innovation as module
 from rstrack.tracking.judgement.calibration_errors import CalibrationErrors
 from rstrack.tracking.judgement.innovation import Prediction, disagreement, doubt, learnt, weighed
-from rstrack.tracking.judgement.systematic import Systematic
+from rstrack.tracking.judgement.uncertainty import Systematic
 
 HALF = 0.015
 LIMIT = float(chi2.ppf(0.999, 12))

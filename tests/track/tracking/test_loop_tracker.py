@@ -20,6 +20,9 @@ from rstrack.data.estimate import read_estimate
 from rstrack.data.image_files import with_noise
 from rstrack.data.rig import Frame, Image
 from rstrack.keyframes.archive import StoredFrames
+from rstrack.metrics.association import truth_of
+from rstrack.metrics.evaluate import evaluate
+from rstrack.metrics.run_evaluate import add_errors
 from rstrack.tracking import loop_tracker
 from rstrack.tracking.any_tracker import make_tracker
 from rstrack.tracking.loop_tracker import LoopTracker
@@ -39,6 +42,7 @@ def run(to_and_fro: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("online-run") / "run"
     result = track(to_and_fro, ONLINE, out, noise=NOISE)
     assert result.lost == 0 and "closed" in result.loops
+    add_errors(out, truth_of(to_and_fro), result.estimate, result.online)
     return out
 
 
@@ -117,8 +121,9 @@ def test_what_was_closed_before_ctrl_c_is_kept(
     monkeypatch.setattr(LoopTracker, "finished", interrupted)
     result = track(dataset, ONLINE, tmp_path / "run", noise=NOISE)
     assert result.end == "interrupted" and "closed" in result.loops
-    info = json.loads((tmp_path / "run" / "run.json").read_text())
-    assert info["metrics"]["ate_rmse_m"] < 0.9 * info["metrics_online"]["ate_rmse_m"]
+    truth = truth_of(dataset)
+    assert result.online is not None and truth is not None
+    assert evaluate(truth, result.estimate).ate_rmse_m < 0.9 * evaluate(truth, result.online).ate_rmse_m
 
 
 def test_an_image_that_is_gone_costs_its_loops_only(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from rsgen.geometry import se3
 from rstrack.alignment.optimizer import Solved
-from rstrack.tracking.judgement.fault import Fault
+from rstrack.tracking.frame_report import Fault
 from rstrack.tracking.judgement.lost_track import UsualScales, implausible, is_hopeless, is_settled, lost, misfits
 
 NOTHING, UNSETTLED = Fault.NOTHING_SEEN, Fault.UNSETTLED

@@ -30,8 +30,8 @@ from rstrack.data.rig import Frame, Image, Rig
 from rstrack.images import line_poses as lines
 from rstrack.images.device_frame import DeviceRig, Mask, untimed, without_pixels
 from rstrack.options import Options
+from rstrack.tracking.moving.leave_out import moving, moving_with
 from rstrack.tracking.moving.majority import not_with_most
-from rstrack.tracking.moving.regions import moving, moving_with
 from rstrack.tracking.track import Track
 
 REF_STAMP, STAMP = 0.43, 0.465

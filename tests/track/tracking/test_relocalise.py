@@ -15,7 +15,7 @@ from rstrack.alignment.optimizer import Solved
 from rstrack.alignment.score import Scores
 from rstrack.images.pyramid import DepthImage
 from rstrack.tracking import matching
-from rstrack.tracking.judgement.fault import Fault
+from rstrack.tracking.frame_report import Fault
 from rstrack.tracking.judgement.lost_track import UsualScales
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.matching import Match, judge_unpredicted, without_misfits

@@ -13,8 +13,7 @@ from rsgen.geometry import se3
 from rsgen.sequence.trajectory import read_trajectory
 from rstrack.data.estimate import SEGMENTS, Estimate
 from rstrack.data.rig import Frame
-from rstrack.tracking.frame_report import FrameReport, frame_report
-from rstrack.tracking.judgement.fault import Fault
+from rstrack.tracking.frame_report import Fault, FrameReport, frame_report
 from rstrack.tracking.runs.segments import Segment, Segments
 
 

@@ -17,7 +17,7 @@ from rsgen.geometry.shutter import Shutter
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.options import Method, Options
 from rstrack.tracking import bootstrap
-from rstrack.tracking.judgement.fault import Fault
+from rstrack.tracking.frame_report import Fault
 from rstrack.tracking.spline_tracker import Tracker
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 79.5, 59.5)

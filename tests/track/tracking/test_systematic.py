@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from rstrack.tracking.judgement import systematic
-from rstrack.tracking.judgement.systematic import SYSTEMATIC_PX, Systematic, of_pixels
+from rstrack.tracking.judgement import uncertainty
+from rstrack.tracking.judgement.uncertainty import SYSTEMATIC_PX, Systematic, of_pixels
 
 FOCAL, DEPTH = 500.0, 2.0
 
@@ -45,6 +45,6 @@ def test_it_is_never_more_than_where_nothing_is_known() -> None:
 def test_likelihoods_are_those_of_normal_distances() -> None:
     rng = np.random.default_rng(4)
     spread, off = rng.uniform(1e-6, 1e-4, 6), rng.normal(size=6) * 1e-2
-    found = systematic._likelihoods(off**2, spread)
-    true = [scipy.stats.norm.logpdf(off, scale=np.sqrt(spread + 2.0 * sigma**2)).sum() for sigma in systematic._GRID]
+    found = uncertainty._likelihoods(off**2, spread)
+    true = [scipy.stats.norm.logpdf(off, scale=np.sqrt(spread + 2.0 * sigma**2)).sum() for sigma in uncertainty._GRID]
     np.testing.assert_allclose(np.diff(found), np.diff(true), rtol=1e-9)

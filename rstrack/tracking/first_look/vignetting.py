@@ -1,6 +1,6 @@
 """How much darker colour images are towards their corners (vignetting): from the recording itself.
 
-found = estimate_color_falloff(dataset, GeometricTracks(dataset, range(len(dataset)), Options(), no_progress))
+found = estimate_vignetting(dataset, GeometricTracks(dataset, range(len(dataset)), Options(), no_progress))
 dataset = dataset.with_color_falloff(found.falloff, found.text())
 
 It stays where it is while the scene passes by, which draws every alignment of colours towards no motion at all. A point
@@ -25,14 +25,7 @@ from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rstrack.data.dataset import Dataset
 from rstrack.images.pyramid import corner_distance2
-from rstrack.tracking.first_look.color_pairs import (
-    GeometricTrack,
-    image_of,
-    looked_up,
-    pairs_in,
-    points_of,
-    rests,
-)
+from rstrack.tracking.first_look.rough_track import GeometricTrack, image_of, looked_up, pairs_in, points_of, rests
 
 # The fewest points that a pair of images may share, and pairs.
 _FEWEST_POINTS, _FEWEST_PAIRS = 400, 6
@@ -45,7 +38,7 @@ _ROUNDS, _REWEIGHTED = 5, 4
 
 
 @dataclass(frozen=True)
-class ColorFalloff:
+class Vignetting:
     """falloff: f, not below 0. sigma: its standard error. pairs: of images compared, 0 where only the prior tells."""
 
     falloff: float
@@ -70,9 +63,9 @@ class _Pair:
     distance2: tuple[FloatArray, FloatArray]
 
 
-def estimate_color_falloff(
+def estimate_vignetting(
     dataset: Dataset, tracks: Iterable[GeometricTrack | None], progress: Progress = no_progress
-) -> ColorFalloff:
+) -> Vignetting:
     """The falloff of a dataset's colour images, from the part that moves most of those where enough pairs overlap.
 
     Raises UserError: an image that cannot be read.
@@ -83,8 +76,8 @@ def estimate_color_falloff(
             measured, sigma = _solved(pairs)
             information, prior = sigma**-2, _PRIOR_SIGMA**-2
             mean = (information * measured + prior * _PRIOR) / (information + prior)
-            return ColorFalloff(max(mean, 0.0), (information + prior) ** -0.5, len(pairs))
-    return ColorFalloff(_PRIOR, _PRIOR_SIGMA, 0)
+            return Vignetting(max(mean, 0.0), (information + prior) ** -0.5, len(pairs))
+    return Vignetting(_PRIOR, _PRIOR_SIGMA, 0)
 
 
 def _compared(dataset: Dataset, track: GeometricTrack, progress: Progress) -> list[_Pair]:

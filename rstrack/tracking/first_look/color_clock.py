@@ -23,13 +23,7 @@ from rsgen.console.progress import Progress, no_progress
 from rsgen.geometry.spline import Spline
 from rstrack.data.dataset import Dataset
 from rstrack.data.rig import UNFOUND_OFFSET_S
-from rstrack.tracking.first_look.color_pairs import (
-    GeometricTrack,
-    image_of,
-    looked_up,
-    pairs_in,
-    points_of,
-)
+from rstrack.tracking.first_look.rough_track import GeometricTrack, image_of, looked_up, pairs_in, points_of
 
 # For the progress bar.
 _STAGE = "colour's clock"

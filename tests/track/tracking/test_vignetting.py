@@ -17,9 +17,9 @@ from rstrack.data.estimate import read_estimate
 from rstrack.images.device_frame import DeviceRig
 from rstrack.images.pyramid import corner_distance2
 from rstrack.options import Options
-from rstrack.tracking.first_look import color_falloff, color_pairs
-from rstrack.tracking.first_look.color_falloff import ColorFalloff, estimate_color_falloff
-from rstrack.tracking.first_look.color_pairs import GeometricTrack, GeometricTracks
+from rstrack.tracking.first_look import rough_track, vignetting
+from rstrack.tracking.first_look.rough_track import GeometricTrack, GeometricTracks
+from rstrack.tracking.first_look.vignetting import Vignetting, estimate_vignetting
 from rstrack.tracking.runs.run import track
 
 RPY = Path(__file__).resolve().parents[4] / "shared/data/tum_fr1_rpy"
@@ -29,7 +29,7 @@ needs_rpy = pytest.mark.skipif(not RPY.is_dir(), reason="../shared/data/tum_fr1_
 @pytest.fixture(autouse=True)
 def few_points(monkeypatch: pytest.MonkeyPatch) -> None:
     """A quarter of the points of images as small as these, in a third of the time."""
-    monkeypatch.setattr(color_pairs, "_ACROSS", 80)
+    monkeypatch.setattr(rough_track, "_ACROSS", 80)
 
 
 class Darkened:
@@ -57,37 +57,37 @@ def test_what_the_corners_lose_is_found_whatever_the_gain(
 ) -> None:
     """As little as the prior draws an estimate whose σ is a third of it, and not at all without the systematic part."""
     dark = replace(shaken, images=Darkened(shaken, corner))
-    found = estimate_color_falloff(dark, true_path(shaken))
+    found = estimate_vignetting(dark, true_path(shaken))
     assert found.falloff == pytest.approx(0.9 * corner + 0.1 * 0.15, abs=5e-3) and 0.04 < found.sigma < 0.055
     assert found.pairs > 10 and "% darker" in found.text() and "pairs of images" in found.text()
-    monkeypatch.setattr(color_falloff, "_SYSTEMATIC", 1e-3)
-    found = estimate_color_falloff(dark, true_path(shaken))
+    monkeypatch.setattr(vignetting, "_SYSTEMATIC", 1e-3)
+    found = estimate_vignetting(dark, true_path(shaken))
     assert found.falloff == pytest.approx(corner, abs=4e-3) and found.sigma < 5e-3
 
 
 def test_the_law_of_a_lens_is_near_enough(shaken: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     """cos⁴ of a quarter of the light, seen through a gamma of 2.2."""
     corner = 0.75**-0.5 - 1.0
-    monkeypatch.setattr(color_falloff, "_SYSTEMATIC", 1e-3)
-    found = estimate_color_falloff(replace(shaken, images=Darkened(shaken, corner, 2.0 / 2.2)), true_path(shaken))
+    monkeypatch.setattr(vignetting, "_SYSTEMATIC", 1e-3)
+    found = estimate_vignetting(replace(shaken, images=Darkened(shaken, corner, 2.0 / 2.2)), true_path(shaken))
     d2 = corner_distance2(160, 120)
     np.testing.assert_allclose((1.0 + found.falloff * d2) * (1.0 + corner * d2) ** (-2.0 / 2.2), 1.0, atol=0.01)
 
 
 def test_even_images_stay_about_as_they_are(shaken: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = estimate_color_falloff(shaken, true_path(shaken))
+    found = estimate_vignetting(shaken, true_path(shaken))
     assert 0.0 <= found.falloff < 0.02 and found.sigma < 0.055
-    monkeypatch.setattr(color_falloff, "_SYSTEMATIC", 1e-3)
+    monkeypatch.setattr(vignetting, "_SYSTEMATIC", 1e-3)
     brighter = replace(shaken, images=Darkened(shaken, -0.1))
-    assert estimate_color_falloff(brighter, true_path(shaken)).falloff == 0.0, "no lens does that"
+    assert estimate_vignetting(brighter, true_path(shaken)).falloff == 0.0, "no lens does that"
 
 
 def test_what_no_motion_shows_is_taken_from_what_lenses_do(shaken: Dataset) -> None:
     dark = replace(shaken, images=Darkened(shaken, 0.3))
     for tracks in ([None], true_path(shaken, range(5))):
-        found = estimate_color_falloff(dark, tracks)
-        assert found == ColorFalloff(0.15, 0.15, 0) and "as lenses do" in found.text()
-    assert estimate_color_falloff(dark, [None, *true_path(shaken)]).falloff == pytest.approx(0.285, abs=5e-3)
+        found = estimate_vignetting(dark, tracks)
+        assert found == Vignetting(0.15, 0.15, 0) and "as lenses do" in found.text()
+    assert estimate_vignetting(dark, [None, *true_path(shaken)]).falloff == pytest.approx(0.285, abs=5e-3)
 
 
 class Covered:
@@ -105,11 +105,11 @@ class Covered:
 def test_points_that_depth_does_not_show_where_they_were_do_not_count(shaken: Dataset) -> None:
     """Regression: beside things that move the corners were found to be 16 % brighter where they were darker."""
     assert shaken.truth is not None
-    p_world, covered = color_pairs.points_of(shaken, shaken.truth, 0), replace(shaken, images=Covered(shaken))
-    still = color_pairs.rests(shaken, shaken.truth, p_world, 0)
-    hidden = color_pairs.rests(covered, shaken.truth, p_world, 0)
+    p_world, covered = rough_track.points_of(shaken, shaken.truth, 0), replace(shaken, images=Covered(shaken))
+    still = rough_track.rests(shaken, shaken.truth, p_world, 0)
+    hidden = rough_track.rests(covered, shaken.truth, p_world, 0)
     assert still.mean() > 0.97 and not (hidden & ~still).any() and 0.4 < hidden.mean() < 0.6
-    later = color_pairs.rests(shaken, shaken.truth, p_world, 6)
+    later = rough_track.rests(shaken, shaken.truth, p_world, 6)
     assert 0.5 < later.mean() < 1.0
 
 
@@ -120,7 +120,7 @@ def test_a_kinect_darkens(tmp_path: Path) -> None:
         "color: {width: 640, height: 480, intrinsics: [525, 525, 319.5, 239.5], readout_s: 0.03, offset_s: 0.018}"
     )
     dataset = open_dataset(RPY, tmp_path / "camera.yaml")
-    found = estimate_color_falloff(dataset, GeometricTracks(dataset, range(60, 160), Options(), no_progress))
+    found = estimate_vignetting(dataset, GeometricTracks(dataset, range(60, 160), Options(), no_progress))
     assert found.falloff == pytest.approx(0.097, abs=0.02) and found.sigma < 0.055
 
 
@@ -140,11 +140,11 @@ def test_a_run_finds_it_unless_the_camera_file_says_it_or_it_was_rendered_withou
 ) -> None:
     asked: list[Dataset] = []
 
-    def estimate(seen: Dataset, *_: object) -> ColorFalloff:
+    def estimate(seen: Dataset, *_: object) -> Vignetting:
         asked.append(seen)
-        return ColorFalloff(0.25, 0.002, 20)
+        return Vignetting(0.25, 0.002, 20)
 
-    monkeypatch.setattr(color_falloff, "estimate_color_falloff", estimate)
+    monkeypatch.setattr(vignetting, "estimate_vignetting", estimate)
     assert shaken.rig.color_falloff == 0.0
     recorded = replace(shaken, rig=replace(shaken.rig, color_falloff=None))
     track(recorded, Options(backend="llvm", loops="off"), tmp_path / "run", slice(0, 8))

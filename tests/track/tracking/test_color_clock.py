@@ -20,10 +20,9 @@ from rstrack.data.dataset import Dataset, group_colors, open_dataset
 from rstrack.data.estimate import read_estimate
 from rstrack.data.timing import Timing, stream_timing
 from rstrack.options import Options
-from rstrack.tracking.first_look import color_offset, color_pairs
-from rstrack.tracking.first_look.color_offset import ColorOffset, estimate_color_offset
-from rstrack.tracking.first_look.color_pairs import GeometricTrack, GeometricTracks
-from rstrack.tracking.first_look.looked_at import looked_at
+from rstrack.tracking.first_look import color_clock, looked_at, rough_track
+from rstrack.tracking.first_look.color_clock import ColorOffset, estimate_color_offset
+from rstrack.tracking.first_look.rough_track import GeometricTrack, GeometricTracks
 from rstrack.tracking.runs.run import track
 
 WRONG_S = 0.0173
@@ -34,8 +33,8 @@ needs_rpy = pytest.mark.skipif(not RPY.is_dir(), reason="../shared/data/tum_fr1_
 @pytest.fixture(autouse=True)
 def few_points(monkeypatch: pytest.MonkeyPatch) -> None:
     """A quarter of the points of images as small as these, in a third of the time."""
-    monkeypatch.setattr(color_pairs, "_ACROSS", 80)
-    monkeypatch.setattr(color_offset, "_FEWEST", 100)
+    monkeypatch.setattr(rough_track, "_ACROSS", 80)
+    monkeypatch.setattr(color_clock, "_FEWEST", 100)
 
 
 def shaking() -> Spline:
@@ -107,7 +106,7 @@ def test_a_clock_is_looked_for_by_depth_alone_along_a_track_that_is_made_once(
         done(1.0)
         return SimpleNamespace(spline_valid=(), spline=None)
 
-    monkeypatch.setattr(color_pairs, "rough_track", lost)
+    monkeypatch.setattr(rough_track, "rough_track", lost)
     tracks = GeometricTracks(shaken, range(9), Options(), no_progress)
     assert list(tracks) == list(tracks) == [None] and asked == [(range(9), "rs-g")]
 
@@ -134,20 +133,20 @@ def test_what_the_motion_does_not_tell_is_left_open(shaken: Dataset) -> None:
 
 
 def test_where_one_part_does_not_tell_others_are_asked(shaken: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(color_pairs, "_TRACKED", 8)
+    monkeypatch.setattr(rough_track, "_TRACKED", 8)
     asked: list[range] = []
 
     def lost(_: Dataset, part: range, *__: object) -> object:
         asked.append(part)
         return SimpleNamespace(spline_valid=(), spline=None)
 
-    monkeypatch.setattr(color_pairs, "rough_track", lost)
+    monkeypatch.setattr(rough_track, "rough_track", lost)
     tracks = GeometricTracks(shaken, range(len(shaken)), Options(), no_progress)
     found = estimate_color_offset(replace(shaken, images=Brightness(shaken)), (*tracks, *along(shaken.truth)))
     assert not found.reason and abs(found.offset_s) < 1e-3
     assert not set(asked[0]) & set(asked[1]) and {len(part) for part in asked} == {8}
     asked.clear()
-    monkeypatch.setattr(color_pairs, "_shift", lambda _, part: 0.012 if 20 in part else 1e-4 * part[0])
+    monkeypatch.setattr(rough_track, "_shift", lambda _, part: 0.012 if 20 in part else 1e-4 * part[0])
     tracks = GeometricTracks(shaken, range(len(shaken)), Options(), no_progress)
     assert estimate_color_offset(shaken, tracks).reason, "none of three told"
     assert len(asked) == 3 and 20 in asked[0] and asked[1][0] > asked[2][0]
@@ -184,7 +183,7 @@ def test_the_tracker_is_told_how_well_the_clock_is_known(
     depth, color = (stream_timing("any", shaken.stamps + late, "auto", 0.0) for late in late_s)
     unknown = replace(shaken, timing=Timing(depth, color, None))
     assert unknown.rig.sigma.is_exact
-    monkeypatch.setattr(color_offset, "estimate_color_offset", lambda *_: found)
+    monkeypatch.setattr(color_clock, "estimate_color_offset", lambda *_: found)
     seen = looked_at(unknown, range(30), Options(method="rs-pg"), no_progress)
     assert seen.rig.sigma.offset_s == pytest.approx(sigma_s, rel=1e-3) and seen.rig.sigma.focal == 0.0
     assert looked_at(unknown, range(30), Options(method="rs-g"), no_progress) is unknown
@@ -192,7 +191,7 @@ def test_the_tracker_is_told_how_well_the_clock_is_known(
 
 def test_the_part_whose_pairs_differ_least_tells(shaken: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     by_part = iter([ColorOffset(0.0, np.inf, 0, "no"), ColorOffset(0.02, 3e-3, 9), ColorOffset(0.01, 1e-3, 9)])
-    monkeypatch.setattr(color_offset, "_estimate", lambda *_: next(by_part))
+    monkeypatch.setattr(color_clock, "_estimate", lambda *_: next(by_part))
     assert estimate_color_offset(shaken, 4 * along(shaken.truth)) == ColorOffset(0.01, 1e-3, 9)
     assert next(by_part, None) is None, "the fourth part is not asked"
 
@@ -222,7 +221,7 @@ def test_a_run_says_and_holds_the_clocks(shaken: Dataset, tmp_path: Path, monkey
     camera = "{width: 160, height: 120, intrinsics: [120.0, 120.0, 79.5, 59.5], readout_s: 0.028}"
     (root / "camera.yaml").write_text(f"color: {camera}\ndepth: {camera}\n")
     found = ColorOffset(0.0171, 0.001, 12)
-    monkeypatch.setattr(color_offset, "estimate_color_offset", lambda *_: found)
+    monkeypatch.setattr(color_clock, "estimate_color_offset", lambda *_: found)
     result = track(open_dataset(root), Options(method="rs-pg"), tmp_path / "run", slice(0, 4))
     info = read_estimate(tmp_path / "run").info
     assert info["clocks"]["color_offset_s"] == 0.0171 and info["clocks"]["depth"]["verdict"] == "jittered"
