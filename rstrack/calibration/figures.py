@@ -19,7 +19,7 @@ from rstrack.data.dataset import Dataset
 
 @dataclass(frozen=True)
 class MeanMotion:
-    """Mean speeds in the stretches that were used, m/s and rad/s, and the changes of the latter, rad/s²."""
+    """Mean speeds in the windows that were used, m/s and rad/s, and the changes of the latter, rad/s²."""
 
     speed: float
     rotation: float
@@ -34,7 +34,7 @@ class MeanMotion:
 
 
 def motion_of(dataset: Dataset, parts: Sequence[range], track: Spline) -> MeanMotion:
-    """Of the stretches of frames that were used, by the track."""
+    """Of the windows of frames that were used, by the track."""
     stamps = np.concatenate([dataset.stamps[part.start : part.stop] for part in parts])
     v, a = track.velocity(stamps), track.acceleration(stamps)
     means = [float(np.linalg.norm(x, axis=1).mean()) for x in (v[:, :3], v[:, 3:], a[:, 3:])]
@@ -73,7 +73,7 @@ def since_begin(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> FloatAr
     return np.asarray(dataset.stamps[np.asarray(frames)] - dataset.stamps[0])
 
 
-# Stretches at most: an evaluation takes as long as a step of the solution.
+# Windows at most: an evaluation takes as long as a step of the solution.
 _FEW = 3
 # Fixed-point steps that are taken: what is missing then, a tenth or so, is extrapolated, to some percent.
 _ROUNDS = 3
@@ -83,28 +83,28 @@ _MOST_MORE = 2.0
 
 @dataclass(frozen=True)
 class ResidualScales:
-    """Student's scales of the residuals, medians over stretches: depth in m, intensity of 0 to 1."""
+    """Student's scales of the residuals, medians over windows: depth in m, intensity of 0 to 1."""
 
     depth_m: float
     intensity: float
 
 
-def some_of(stretches: Sequence[RecordingWindow]) -> Sequence[RecordingWindow]:
+def some_of(windows: Sequence[RecordingWindow]) -> Sequence[RecordingWindow]:
     """A few, all over the recording: those whose residuals are looked at."""
-    return stretches[:: -(-len(stretches) // _FEW)]
+    return windows[:: -(-len(windows) // _FEW)]
 
 
-def residuals_now(stretches: Sequence[RecordingWindow]) -> ResidualScales:
-    """Those by which the stretches weight their pixels."""
-    return _medians(np.array([stretch.sigma for stretch in stretches]))
+def residuals_now(windows: Sequence[RecordingWindow]) -> ResidualScales:
+    """Those by which the windows weight their pixels."""
+    return _medians(np.array([window.sigma for window in windows]))
 
 
-def residuals_at(stretches: Sequence[RecordingWindow], terms: PairTerms, p: Parameters) -> ResidualScales:
-    """Along the stretches' splines as they are, with values `p`, on the pyramid's finest level.
+def residuals_at(windows: Sequence[RecordingWindow], terms: PairTerms, p: Parameters) -> ResidualScales:
+    """Along the windows' splines as they are, with values `p`, on the pyramid's finest level.
 
-    Evaluated on copies: the stretches keep their scales and their brightness.
+    Evaluated on copies: the windows keep their scales and their brightness.
     """
-    scales = np.array([_scales(replace(each, brightness=dict(each.brightness)), terms, p) for each in stretches])
+    scales = np.array([_scales(replace(each, brightness=dict(each.brightness)), terms, p) for each in windows])
     return _medians(np.maximum(extrapolated(np.moveaxis(scales, 1, 0)), (FLOOR_DEPTH, FLOOR_INTENSITY)))
 
 
@@ -122,12 +122,12 @@ def _medians(scales: FloatArray) -> ResidualScales:
     return ResidualScales(float(depth_m), float(intensity))
 
 
-def _scales(stretch: RecordingWindow, terms: PairTerms, p: Parameters) -> FloatArray:
+def _scales(window: RecordingWindow, terms: PairTerms, p: Parameters) -> FloatArray:
     """Those of depth and intensity (rounds, 2) after each step."""
     scales = []
     for _ in range(_ROUNDS):
-        stretch.sums(terms, p, 0)
-        scales.append(stretch.sigma)
+        window.sums(terms, p, 0)
+        scales.append(window.sigma)
     return np.array(scales)
 
 

@@ -68,6 +68,26 @@ USEFUL = np.array([
     2e-3, 2e-3, 2e-3, 5e-5, *(5e-3,) * 3, *np.radians((0.3,) * 3),
     *(0.01, 0.01, 0.01, 0.01, 0.05, 0.2, 5e-3, 5e-3, 0.5) * 2, 0.01, 5e-3, 5e-3,
 ])  # fmt: skip
+SHOWN = (
+    ("depth readout", "ms", 1e3), ("colour readout", "ms", 1e3), ("colour offset", "ms", 1e3),
+    ("colour drift", "ppm", 1e6), *((f"colour from depth, {axis}", "mm", 1e3) for axis in "xyz"),
+    *((f"colour from depth, about {axis}", "deg", float(np.degrees(1.0))) for axis in "xyz"),
+    *(
+        (f"{camera} {name}", *(("px", 1.0) if name[0] in "fc" else ("1e-3", 1e3)))
+        for camera in ("depth", "colour") for name in LENS
+    ),
+    ("depth offset", "mm", 1e3), ("depth inverse offset", "1/km", 1e3), ("depth radial", "1/km", 1e3),
+)  # fmt: skip
+"""Name on the screen, unit and factor of each unknown."""
+NEEDS = (
+    "turning and shaking in front of surfaces that lie at many angles", "turning and shaking in front of texture",
+    "motion that changes", "some ten seconds of motion that changes",
+    *(("turning about two axes in front of near and far texture",) * 3), *(("turning about two axes",) * 3),
+    *(("turning about all axes, so that all of the image sees shapes",) * len(LENS)),
+    *(("turning about all axes, so that all of the image sees texture",) * len(LENS)),
+    *(("surfaces near and far, seen from near and far",) * 3),
+)  # fmt: skip
+"""What a recording needs to tell it."""
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from json import dumps
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,8 @@ import numpy as np
 from rsgen.array_types import BoolArray, FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
-from rsgen.geometry.shutter import Scan, Shutter
+from rsgen.geometry.shutter import Scan
+from rstrack.calibration.camera_file import camera_file_of
 from rstrack.calibration.figures import (
     MeanMotion,
     Pace,
@@ -26,13 +26,13 @@ from rstrack.calibration.figures import (
 from rstrack.calibration.parameters import (
     COLOR_LENS,
     COUNT,
-    DEPTH,
     DEPTH_ERROR,
     DEPTH_LENS,
-    DRIFT,
     EXTRINSICS,
     LENS,
     NAMES,
+    NEEDS,
+    SHOWN,
     USEFUL,
     Parameters,
     changed,
@@ -44,33 +44,13 @@ from rstrack.data.dataset import Dataset
 _OPPOSITE: dict[str, Scan] = {
     "top-bottom": "bottom-top", "bottom-top": "top-bottom", "left-right": "right-left", "right-left": "left-right",
 }  # fmt: skip
-# Name on the screen, unit and factor of each unknown.
-_SHOWN = (
-    ("depth readout", "ms", 1e3), ("colour readout", "ms", 1e3), ("colour offset", "ms", 1e3),
-    ("colour drift", "ppm", 1e6), *((f"colour from depth, {axis}", "mm", 1e3) for axis in "xyz"),
-    *((f"colour from depth, about {axis}", "deg", float(np.degrees(1.0))) for axis in "xyz"),
-    *(
-        (f"{camera} {name}", *(("px", 1.0) if name[0] in "fc" else ("1e-3", 1e3)))
-        for camera in ("depth", "colour") for name in LENS
-    ),
-    ("depth offset", "mm", 1e3), ("depth inverse offset", "1/km", 1e3), ("depth radial", "1/km", 1e3),
-)  # fmt: skip
-# What each needs to be told.
-_NEEDS = (
-    "turning and shaking in front of surfaces that lie at many angles", "turning and shaking in front of texture",
-    "motion that changes", "some ten seconds of motion that changes",
-    *(("turning about two axes in front of near and far texture",) * 3), *(("turning about two axes",) * 3),
-    *(("turning about all axes, so that all of the image sees shapes",) * len(LENS)),
-    *(("turning about all axes, so that all of the image sees texture",) * len(LENS)),
-    *(("surfaces near and far, seen from near and far",) * 3),
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class CameraCalibration:
-    """start: the values before; asked (31,): which might change; parts: the stretches of frames that told.
+    """start: the values before; asked (31,): which might change; parts: the windows of frames that told.
 
-    residuals: of a few stretches, with the values before along the first track, and with those found. pace: by the
+    residuals: of a few windows, with the values before along the first track, and with those found. pace: by the
     first track.
     device_notes: what became of what is published of the device, if one was named. kept_lens: another was asked for,
     but explains the images no better than the file's. clocks: of several recordings together, by their folders' names,
@@ -107,9 +87,9 @@ class CameraCalibration:
 
     def calibrated(self) -> Dataset:
         """The dataset with these cameras."""
-        found, rig = self._upright(), self.dataset.rig
-        scans = self._scans()
-        depth, color = self._cameras()
+        found, rig = self.upright(), self.dataset.rig
+        scans = self.scans()
+        depth, color = self.cameras()
         rig = replace(
             rig,
             depth_camera=depth,
@@ -117,29 +97,29 @@ class CameraCalibration:
             depth_shutter=replace(rig.depth_shutter, readout_s=found.depth_readout_s, scan=scans[0]),
             color_shutter=replace(rig.color_shutter, readout_s=found.color_readout_s, scan=scans[1]),
             T_color_depth=found.T_color_depth,
-            sigma=usual(color, self._stated()),
+            sigma=usual(color, self.stated_sigmas()),
         )
         found_dataset = replace(self.dataset, rig=rig, depth_error=found.error)
         return found_dataset.with_color_offset(found.color_offset_s, drift=found.color_drift)
 
     def text(self) -> str:
         """A table of the values with their σ, what could not be told and why, and what comes with it."""
-        sigmas, absolute, before = self._absolute_sigmas, self._absolute(self.values), self._absolute(self.start)
+        sigmas, absolute, before = self.absolute_sigmas, self._absolute(self.values), self._absolute(self.start)
         lines = [f"{'':<28}{'found':>10}   {'2 sigma':>9}   {'from':>10}"]
-        for i, (name, unit, factor) in enumerate(_SHOWN):
+        for i, (name, unit, factor) in enumerate(SHOWN):
             if not self.asked[i]:
                 continue
             if self.undetermined[i]:
-                lines.append(f"{name:<28}{factor * absolute[i]:>10.3f}   undetermined: needs {_NEEDS[i]}")
+                lines.append(f"{name:<28}{factor * absolute[i]:>10.3f}   undetermined: needs {NEEDS[i]}")
             else:
                 found = f"{factor * absolute[i]:>10.3f} ± {2.0 * factor * sigmas[i]:>9.3f}"
                 lines.append(f"{name:<28}{found}   {factor * before[i]:>10.3f} {unit}")
         if self.undetermined.any():
             lines.append(self.motion.text())
         lines += [f"{name} lens: {text}" for name, text in self._lenses_px().items()]
-        lines += self._notes()
+        lines += self.notes()
         lines.append(
-            f"from {len(self.parts)} stretches of {len(self.parts[0])} frames in {self.seconds:.0f} s; residuals "
+            f"from {len(self.parts)} windows of {len(self.parts[0])} frames in {self.seconds:.0f} s; residuals "
             f"{1e3 * self.solution.sigma_depth_m:.2f} mm and {self.solution.sigma_intensity:.4f} of intensity"
         )
         return "\n".join(lines)
@@ -154,7 +134,7 @@ class CameraCalibration:
 
     def _lenses(self) -> Iterator[tuple[str, Camera, Camera, FloatArray]]:
         """Of those that were asked for the name, the lens before and after, and its covariance (8, 8)."""
-        before, after = self._changed(self.start), self._cameras()
+        before, after = self._changed(self.start), self.cameras()
         for name, at, old, new in zip(("depth", "colour"), (DEPTH_LENS, COLOR_LENS), before, after, strict=True):
             if self.asked[at].any():
                 yield name, old, new, self.solution.covariance[at, at]
@@ -165,7 +145,7 @@ class CameraCalibration:
         shown: how a value is called on the screen, its unit there, and the factor from the SI unit to that.
         useful_sigma: a σ above it makes a value undetermined.
         """
-        sigmas, solution, (before, after) = self._absolute_sigmas, self.solution, self.residuals
+        sigmas, solution, (before, after) = self.absolute_sigmas, self.solution, self.residuals
         absolute, start = self._absolute(self.values), self._absolute(self.start)
         shares, useful = solution.shares, USEFUL * self._units
         ends = [(part.start, part.stop - 1) for part in self.parts]
@@ -177,8 +157,8 @@ class CameraCalibration:
                     "sigma": None if np.isnan(sigmas[i]) else float(sigmas[i]),
                     "state": "undetermined" if self.undetermined[i] else "found",
                     "told_by_stretch": np.round(shares[:, i], 4).tolist(),
-                    "shown": dict(zip(("label", "unit", "factor"), _SHOWN[i], strict=True)),
-                    "useful_sigma": float(useful[i]), "needs": _NEEDS[i],
+                    "shown": dict(zip(("label", "unit", "factor"), SHOWN[i], strict=True)),
+                    "useful_sigma": float(useful[i]), "needs": NEEDS[i],
                 }
                 for i, name in enumerate(NAMES) if self.asked[i]
             },
@@ -195,51 +175,15 @@ class CameraCalibration:
             "finished": solution.finished, "converged": solution.is_settled, "seconds": self.seconds,
             "lenses_px": self._lenses_px(),
             "lens_maps": {name: lens_map(old, new, C) for name, old, new, C in self._lenses()},
-            "notes": self._notes(), "device": list(self.device_notes),
+            "notes": self.notes(), "device": list(self.device_notes),
             "camera_file": self.camera_file(),
         }  # fmt: skip
 
-    def camera_file(self) -> str:
-        """A camera.yaml that `rstrack track` takes, with 2 σ beside each value."""
-        rig, found, scans = self.dataset.rig, self._upright(), self._scans()
-        beside = self._beside()
-        recordings = " ".join(self.clocks or (self.dataset.name,))
-        names = [f"# rstrack calibrate {recordings}, {len(self.parts)} stretches; ± is 2 sigma"]
-        names += [f"# {note}" for note in self._notes()]
-        drift = f"\n  drift_ppm: {1e6 * found.color_drift:.3f}{beside[DRIFT]}"
-        depth_camera, color_camera = self._cameras()
-        color = _stream("color", color_camera, rig.color_shutter, found.color_readout_s, scans[1], beside[COLOR_LENS])
-        color += beside[1]
-        timing, clocks, color_clock = self.dataset.timing, [], ""
-        if self.clocks or (timing is not None and timing.is_jittered):
-            # Of stamps that are arrival times: every recording has another.
-            own = {self.dataset.name: (found.color_offset_s, found.color_drift)}
-            clocks = ["clocks:", *(self._clock(name, *clock) for name, clock in (self.clocks or own).items())]
-            clocks[-1] += beside[2]
-        else:
-            color_clock = f"\n  offset_s: {found.color_offset_s - self.dataset.depth_offset_s:.7f}{beside[2]}"
-            color_clock += drift if found.color_drift else ""
-        depth = _stream("depth", depth_camera, rig.depth_shutter, found.depth_readout_s, scans[0], beside[DEPTH_LENS])
-        depth += beside[0]
-        rows = ["  - [" + ", ".join(f"{x:.12g}" for x in row) + "]" for row in found.T_color_depth]
-        shown = [f"{_SHOWN[i][0].split(', ')[1]}{beside[i][3:]}" for i in range(COUNT)[EXTRINSICS]]
-        mode = "auto" if timing is None else timing.mode
-        return "\n".join([
-            *names, *(() if mode == "auto" else (f"stamps: {mode}",)), *clocks, color + color_clock,
-            depth + f"\n  depth_scale: {self.dataset.depth_scale:g}" + self._error_entry(),
-            "T_color_depth:" + ("  # " + ", ".join(shown) if self.asked[EXTRINSICS].any() else ""), *rows,
-            "sigma: {" + ", ".join(f"{name}: {sigma:.3g}" for name, sigma in self._stated().items()) + "}", "",
-        ])  # fmt: skip
-
-    def _clock(self, name: str, offset_s: float, drift: float) -> str:
-        more = f", drift_ppm: {1e6 * drift:.3f}" if drift else ""
-        return f"  {dumps(name)}: {{offset_s: {offset_s - self.dataset.depth_offset_s:.7f}{more}}}"
-
-    def _stated(self) -> dict[str, float]:
+    def stated_sigmas(self) -> dict[str, float]:
         """σ of what was found, as a camera file has them: of each kind the largest, lenses' by the colour camera's."""
         lens = [f"color.{name}" for name in LENS]
         kinds = {
-            "focal": (lens[:2], 1.0), "aspect": (lens[:2], 1.0), "center_px": (lens[2:4], self._cameras()[1].fx),
+            "focal": (lens[:2], 1.0), "aspect": (lens[:2], 1.0), "center_px": (lens[2:4], self.cameras()[1].fx),
             "k1": (lens[4:5], 1.0), "translation_m": (NAMES[EXTRINSICS][:3], 1.0),
             "rotation_deg": (NAMES[EXTRINSICS][3:], float(np.degrees(1.0))),
             "readout_s": (NAMES[:2], 1.0), "offset_s": (NAMES[2:3], 1.0),
@@ -255,29 +199,11 @@ class CameraCalibration:
             found["depth_image"] = 0.0
         return found
 
-    def _error_entry(self) -> str:
-        """The depth camera's error in the camera file, if there is any."""
-        error, at = self.values.depth_error, range(COUNT)[DEPTH_ERROR]
-        if not error.any():
-            return ""
-        beside = self._beside()
-        return "\n  error:" + "".join(
-            f"\n    {name}: {error[k]:.7g}{beside[i]}" for k, (name, i) in enumerate(zip(DEPTH, at, strict=True))
-        )
+    def camera_file(self) -> str:
+        """A camera.yaml that `rstrack track` takes, with 2 σ beside each value."""
+        return camera_file_of(self)
 
-    def _beside(self) -> list[str]:
-        """For each of the unknowns the comment beside its value in the camera file."""
-
-        def comment(i: int) -> str:
-            _, unit, factor = _SHOWN[i]
-            if self.undetermined[i]:
-                return "  # undetermined, kept"
-            return f"  # ± {2.0 * factor * sigmas[i]:.3g} {unit}" if self.asked[i] else ""
-
-        sigmas = self._absolute_sigmas
-        return [comment(i) for i in range(COUNT)]
-
-    def _cameras(self) -> tuple[Camera, Camera]:
+    def cameras(self) -> tuple[Camera, Camera]:
         """Depth camera and colour camera, as found."""
         return self._changed(self.values)
 
@@ -294,7 +220,7 @@ class CameraCalibration:
         return np.concatenate([clocks, T[:3, 3], se3.log(T)[3:], *lenses, p.depth_error])
 
     @property
-    def _absolute_sigmas(self) -> FloatArray:
+    def absolute_sigmas(self) -> FloatArray:
         """Their standard errors (31,)."""
         return self.sigmas * self._units
 
@@ -306,14 +232,14 @@ class CameraCalibration:
             units[lens][:4] = camera.fx, camera.fy, camera.fx, camera.fy
         return units
 
-    def _scans(self) -> tuple[Scan, Scan]:
+    def scans(self) -> tuple[Scan, Scan]:
         """Of depth and colour; the opposite of what was assumed where the readout turned out negative."""
         rig, p = self.dataset.rig, self.values
         pairs = (rig.depth_shutter, p.depth_readout_s), (rig.color_shutter, p.color_readout_s)
         depth, color = (_OPPOSITE[s.scan] if readout < 0.0 else s.scan for s, readout in pairs)
         return depth, color
 
-    def _upright(self) -> Parameters:
+    def upright(self) -> Parameters:
         """The values for `_scans`: stamps belong to the line that is read first."""
         p, rig = self.values, self.dataset.rig
         last = [1.0 - 1.0 / s.line_count(c) for s, c in ((rig.depth_shutter, rig.depth_camera),
@@ -324,11 +250,11 @@ class CameraCalibration:
             color_offset_s=p.color_offset_s + late,
         )  # fmt: skip
 
-    def _notes(self) -> list[str]:
+    def notes(self) -> list[str]:
         """What a user should know of the clocks and the directions."""
         notes = list(self.device_notes)
         for name, scan, before, readout, sigma in zip(
-            ("depth", "colour"), self._scans(), (self.dataset.rig.depth_shutter, self.dataset.rig.color_shutter),
+            ("depth", "colour"), self.scans(), (self.dataset.rig.depth_shutter, self.dataset.rig.color_shutter),
             (self.values.depth_readout_s, self.values.color_readout_s), self.sigmas[:2], strict=True,
         ):  # fmt: skip
             if scan != before.scan:
@@ -357,27 +283,3 @@ def _lens(camera: Camera) -> FloatArray:
     """LENS (9,) of a camera."""
     bent = (*camera.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5] if camera.model == "radtan" else (0.0,) * 5
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *bent])
-
-
-def _stream(name: str, camera: Camera, shutter: Shutter, readout_s: float, scan: Scan, beside: Sequence[str]) -> str:
-    """beside: comments of LENS."""
-    K = ", ".join(f"{x:.10g}" for x in (camera.fx, camera.fy, camera.cx, camera.cy))
-    lines = [
-        f"{name}:",
-        f"  width: {camera.width}",
-        f"  height: {camera.height}",
-        f"  intrinsics: [{K}]{_joined(beside[:4])}",
-    ]
-    if camera.model != "pinhole":
-        lines += [
-            f"  model: {camera.model}",
-            f"  distortion: [{', '.join(f'{x:.10g}' for x in camera.distortion)}]{_joined(beside[4:])}",
-        ]
-    lines += [f"  exposure_s: {shutter.exposure_s:g}", f"  scan: {scan}", f"  readout_s: {readout_s:.7f}"]
-    return "\n".join(lines)
-
-
-def _joined(comments: Sequence[str]) -> str:
-    """The comments beside several values of a line as one."""
-    said = [comment.removeprefix("  # ") for comment in comments]
-    return f"  # {'; '.join(said)}" if all(said) and said else ""

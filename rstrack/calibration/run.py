@@ -42,17 +42,17 @@ from rstrack.calibration.start import RoughTrack, first_track, load_window
 from rstrack.data.dataset import Dataset
 from rstrack.options import Options
 
-# Frames of a stretch, the fewest that one may have, and how many stretches there are at least and at most.
+# Frames of a window, the fewest that one may have, and how many windows there are at least and at most.
 _FRAMES, _FEWEST_FRAMES, _FEWEST, _MOST = 30, 14, 3, 12
 # Seconds over which colour's clock must be seen for its drift to be asked for.
 _DRIFT_S = 4.0
-# Stretches that short recordings are cut into.
+# Windows that short recordings are cut into.
 _SEVERAL = 6
 # Levels of the pyramid that it begins on.
 _COARSE = (2,)
 # See `trust_in`: 0.83 to 0.99 where there is something to see, with a Kinect's noise too, below 0.3 on bare walls.
 _TRUST = 0.5
-# Ways in which images may be read, stretches with which they are tried, and steps at most.
+# Ways in which images may be read, windows with which they are tried, and steps at most.
 _AXES: tuple[Scan, ...] = ("top-bottom", "left-right")
 _TRIED, _TRIED_STEPS = 2, 5
 # Unknowns of a lens that are its distortion, of radial-tangential ones.
@@ -83,30 +83,30 @@ def calibrate(
     before = device.known(parameters_of(dataset)) if device else Known.nothing(parameters_of(dataset))
     start = before.values
     track = first_track(dataset, chosen, options, progress)
-    parts = _stretches(dataset, chosen, track)
+    parts = _windows(dataset, chosen, track)
     free = _free(dataset, groups, parts)
     terms = pair_terms(engine(options.backend), dataset, free)
-    stretches = _loaded(dataset, terms, parts, track.spline, start, options, progress)
+    windows = _loaded(dataset, terms, parts, track.spline, start, options, progress)
     if not dataset.scan_named and "readout" in groups:
-        dataset = _oriented(dataset, stretches, start, options, progress)
+        dataset = _oriented(dataset, windows, start, options, progress)
         terms = pair_terms(engine(options.backend), dataset, free)
-        stretches = [each.read_by(terms) for each in stretches]
-    residuals = residuals_at(some_of(stretches), terms, start)
+        windows = [each.read_by(terms) for each in windows]
+    residuals = residuals_at(some_of(windows), terms, start)
     known = before.with_lenses() if "intrinsics" in groups else before
-    rough = [replace(each, is_rough=True) for each in stretches]
+    rough = [replace(each, is_rough=True) for each in windows]
     coarse = solve(rough, terms, start, free, _COARSE, progress_watch(progress, 0.15), known)
-    stretches = [replace(each, is_rough=False) for each in rough]
-    stage = StageResult(stretches, coarse, True, False)
+    windows = [replace(each, is_rough=False) for each in rough]
+    stage = StageResult(windows, coarse, True, False)
     if coarse.finished:
-        kept = _trusted(dataset, stretches, terms, coarse.values)
-        parts, stretches = [parts[k] for k in kept], [stretches[k] for k in kept]
+        kept = _trusted(dataset, windows, terms, coarse.values)
+        parts, windows = [parts[k] for k in kept], [windows[k] for k in kept]
 
         def staged(known: Known, p: Parameters) -> StageResult:
             def terms_of(free: BoolArray) -> PairTerms:
                 return pair_terms(engine(options.backend), dataset, free)
 
             is_exact = not dataset.rig.sigma.depth_inverse_offset
-            return in_stages(stretches, terms_of, known, p, free, is_exact, progress)
+            return in_stages(windows, terms_of, known, p, free, is_exact, progress)
 
         stage = staged(known, coarse.values)
         contradicted = before.contradicted(stage.solution.values, stage.solution.sigmas)
@@ -120,7 +120,7 @@ def calibrate(
     motion = motion_of(dataset, parts, track.spline)
     notes = device_notes(device, before, known, solution.sigmas) if device else ()
     pace = pace_of(dataset, track.frames(dataset, chosen), track.spline)
-    both, seconds = (residuals, residuals_now(some_of(stage.stretches))), time.perf_counter() - begun
+    both, seconds = (residuals, residuals_now(some_of(stage.windows))), time.perf_counter() - begun
     return CameraCalibration(
         dataset, start, solution, free, tuple(parts), motion, seconds, both, pace, notes, kept_lens
     )
@@ -130,27 +130,27 @@ def _loaded(
     dataset: Dataset, terms: PairTerms, parts: Sequence[range], track: Spline, start: Parameters, options: Options,
     progress: Progress,
 ) -> list[RecordingWindow]:  # fmt: skip
-    """Knots of every other stretch lie half a spacing later.
+    """Knots of every other window lie half a spacing later.
 
     No spline follows a hand quite, and what it leaves passes for other clocks: one way for these knots, another way for
-    those. So it averages out, and the stretches' scatter has it.
+    those. So it averages out, and the windows' scatter has it.
     """
-    base, stretches = dataset.with_color_offset(0.0, drift=0.0), []
+    base, windows = dataset.with_color_offset(0.0, drift=0.0), []
     for n, part in enumerate(parts):
         progress("calibrating", 0.15 * n / len(parts), "reading images")
         phase = replace(options, knot_phase=(options.knot_phase + 0.5 * (n % 2)) % 1.0)
-        stretches.append(load_window(terms, base, part, track, start, phase))
-    return stretches
+        windows.append(load_window(terms, base, part, track, start, phase))
+    return windows
 
 
 def _oriented(
-    dataset: Dataset, stretches: Sequence[RecordingWindow], start: Parameters, options: Options, progress: Progress
+    dataset: Dataset, windows: Sequence[RecordingWindow], start: Parameters, options: Options, progress: Progress
 ) -> Dataset:
     """The dataset with images that are read by rows or by columns, whichever fits better after some steps.
 
     Which of the two ways round is told by the readout's sign.
     """
-    few = [replace(each, is_rough=True) for each in stretches[:: -(-len(stretches) // _TRIED)]]
+    few = [replace(each, is_rough=True) for each in windows[:: -(-len(windows) // _TRIED)]]
     free, found = free_of(("readout", "offset")), []
     free[DRIFT] = False
     for count, scan in enumerate(_AXES):
@@ -189,18 +189,18 @@ def _bent(dataset: Dataset) -> Dataset:
     return replace(dataset, rig=replace(rig, depth_camera=bent(rig.depth_camera), color_camera=bent(rig.color_camera)))
 
 
-def _trusted(dataset: Dataset, stretches: Sequence[RecordingWindow], terms: PairTerms, p: Parameters) -> list[int]:
-    """Those stretches (counted from 0) of whose motion more is known than noise makes up. Raises UserError: too few."""
-    kept = [k for k, stretch in enumerate(stretches) if trust_in(stretch, terms, p) > _TRUST]
+def _trusted(dataset: Dataset, windows: Sequence[RecordingWindow], terms: PairTerms, p: Parameters) -> list[int]:
+    """Those windows (counted from 0) of whose motion more is known than noise makes up. Raises UserError: too few."""
+    kept = [k for k, window in enumerate(windows) if trust_in(window, terms, p) > _TRUST]
     if len(kept) < _FEWEST:
         raise UserError(
-            f"{dataset.root}: in {len(stretches) - len(kept)} of {len(stretches)} stretches what seems to be known of "
+            f"{dataset.root}: in {len(windows) - len(kept)} of {len(windows)} windows what seems to be known of "
             "the motion is noise: choose --frames with more shape and print, or a --camera that is less far off"
         )
     return kept
 
 
-def _stretches(dataset: Dataset, chosen: range, track: RoughTrack) -> list[range]:
+def _windows(dataset: Dataset, chosen: range, track: RoughTrack) -> list[range]:
     """Frames in a row that were followed, with colour images; of many those that move most."""
     runs = track.frames(dataset, chosen)
     total = sum(len(run) for run in runs)

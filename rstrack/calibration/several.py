@@ -19,7 +19,7 @@ from rstrack.data.dataset import Dataset
 
 # Colour's clock: each recording's own.
 _CLOCK = np.isin(np.arange(COUNT), [NAMES.index("color.offset_s"), DRIFT])
-# Times that the scatter of the stretches is taken anew.
+# Times that the scatter of the windows is taken anew.
 _ROUNDS = 3
 
 
@@ -39,7 +39,7 @@ def check_alike(datasets: Sequence[Dataset]) -> None:
 def together(found: Sequence[CameraCalibration]) -> CameraCalibration:
     """What recordings say together of one camera, each calibrated by itself from the same camera file.
 
-    Their stretches' normal equations stand side by side, each recording's clock eliminated, and are solved once more,
+    Their windows' normal equations stand side by side, each recording's clock eliminated, and are solved once more,
     with the same prior: what one recording does not tell another may. Recordings have clocks of their own still, at the
     camera that all have found. Raises UserError: it was read by rows here and by columns there.
     """
@@ -82,7 +82,7 @@ def _camera(step: FloatArray) -> FloatArray:
 
 
 def _without_clock(solution: Solution) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A (s, 31, 31) and b (s, 31) of the stretches with the recording's clock where it is best for any camera, and K
+    """A (s, 31, 31) and b (s, 31) of the windows with the recording's clock where it is best for any camera, and K
     (2, 31): by how much the clock then moves, −K x, with the camera."""
     of = solution.free
     A, b = np.zeros((len(solution.b), COUNT, COUNT)), np.zeros((len(solution.b), COUNT))

@@ -1,4 +1,4 @@
-"""The joint solution: parameters that all stretches share, control points of each its own, and how sure that is."""
+"""The joint solution: parameters that all windows share, control points of each its own, and how sure that is."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from rstrack.calibration.pairs.terms import PairTerms
 from rstrack.calibration.pairs.window import RecordingWindow
 from rstrack.calibration.parameters import COUNT, DEPTH, DRIFT, PRIOR, USEFUL, Known, Parameters
 
-# Steps at most on a level, and the part of the standard errors, as the stretches' scatter shows them, that ends it.
+# Steps at most on a level, and the part of the standard errors, as the windows' scatter shows them, that ends it.
 _MOST_STEPS, _SMALL = 15, 0.1
-# Stretches that what is known of all unknowns together counts for, beside the scatter of one.
+# Windows that what is known of all unknowns together counts for, beside the scatter of one.
 _POOLED = 4.0
 # Systematic error of the colour camera's pose, px, σ: interpolation, spline, surfaces. Seen on renderings.
 _BLIND_PX = 0.08
@@ -27,7 +27,7 @@ _BLIND_S = 3e-5
 # were seen above a thousandth.
 _MOVES = np.full(COUNT, 0.0015)
 _MOVES[:DRIFT] = 0.0075
-# Times that the scales of a stretch's errors are estimated before its first step.
+# Times that the scales of a window's errors are estimated before its first step.
 _ROUNDS = 3
 
 Watch = Callable[[int, int, Parameters], None]
@@ -36,11 +36,11 @@ Watch = Callable[[int, int, Parameters], None]
 
 @dataclass(frozen=True)
 class Solution:
-    """values; normal equations of the free parameters at them: A (s, n, n), b (s, n) of the s stretches, free (31,).
+    """values; normal equations of the free parameters at them: A (s, n, n), b (s, n) of the s windows, free (31,).
 
     cost: negative log-likelihood a pixel. sigma_depth_m, sigma_intensity: of the residuals, medians. last_step (31,):
     the last one that was taken. blind (31,): σ of what no scatter shows. finished: nobody interrupted it. known
-    (31, 31): `Known.information`. pixels: that were compared. depth_overcounts: mean over the stretches, see `Sums`.
+    (31, 31): `Known.information`. pixels: that were compared. depth_overcounts: mean over the windows, see `Sums`.
     """
 
     values: Parameters
@@ -64,7 +64,7 @@ class Solution:
 
     @property
     def sigmas(self) -> FloatArray:
-        """Standard errors (31,) as the scatter of the stretches shows them; 0 of what is not free.
+        """Standard errors (31,) as the scatter of the windows shows them; 0 of what is not free.
 
         Student's factor, for there are few of these, makes two σ hold 95 %.
         """
@@ -120,7 +120,7 @@ class Solution:
 
     @property
     def shares(self) -> FloatArray:
-        """Part (s, 31) of what is known of each parameter that each stretch tells, all others known."""
+        """Part (s, 31) of what is known of each parameter that each window tells, all others known."""
         own = np.einsum("snn->sn", self.A)
         shares = np.zeros((len(own), COUNT))
         shares[:, self.free] = own / np.maximum(own.sum(axis=0), 1e-300)
@@ -128,7 +128,7 @@ class Solution:
 
 
 def solve(
-    stretches: Sequence[RecordingWindow], terms: PairTerms, start: Parameters, free: BoolArray, levels: Sequence[int],
+    windows: Sequence[RecordingWindow], terms: PairTerms, start: Parameters, free: BoolArray, levels: Sequence[int],
     watch: Watch = lambda *_: None, known: Known | None = None, steps: int = _MOST_STEPS, depth_counts: float = 1.0,
 ) -> Solution:  # fmt: skip
     """Parameters and all control points jointly, coarse to fine; the windows' splines are moved.
@@ -141,34 +141,34 @@ def solve(
     known = known or Known.nothing(start)
     p, acceleration, finished, step = start, AndersonMixing(), True, np.zeros(COUNT)
     try:
-        for stretch in stretches:
-            for _ in range(_ROUNDS if stretch.is_new else 0):
-                stretch.sums(terms, p, levels[0], depth_counts)
+        for window in windows:
+            for _ in range(_ROUNDS if window.is_new else 0):
+                window.sums(terms, p, levels[0], depth_counts)
         for level in levels:
             acceleration.reset()
             for n in range(steps):
                 watch(level, n, p)
-                sums = [stretch.sums(terms, p, level, depth_counts) for stretch in stretches]
+                sums = [window.sums(terms, p, level, depth_counts) for window in windows]
                 step, sigmas = _step([one.reduced for one in sums], p, start, known, free, acceleration)
-                for stretch, one in zip(stretches, sums, strict=True):
-                    stretch.move(one.points_step(step))
+                for window, one in zip(windows, sums, strict=True):
+                    window.move(one.points_step(step))
                 p = p.moved(step)
                 if (np.abs(step[free]) <= _SMALL * sigmas).all():
                     break
-        sums = [stretch.sums(terms, p, levels[-1], depth_counts) for stretch in stretches]
+        sums = [window.sums(terms, p, levels[-1], depth_counts) for window in windows]
         last, _ = _step([one.reduced for one in sums], p, start, known, free)
-        for stretch, one in zip(stretches, sums, strict=True):
-            stretch.move(one.points_step(last))
+        for window, one in zip(windows, sums, strict=True):
+            window.move(one.points_step(last))
         p = p.moved(last)
     except KeyboardInterrupt:
         finished = False
-    sums = [stretch.sums(terms, p, levels[-1], depth_counts) for stretch in stretches]
+    sums = [window.sums(terms, p, levels[-1], depth_counts) for window in windows]
     reduced = [one.reduced for one in sums]
     A, b = _of_free(reduced, free)
-    depth, intensity = np.median([stretch.sigma for stretch in stretches], axis=0)
+    depth, intensity = np.median([window.sigma for window in windows], axis=0)
     pixels = max(1, sum(one.pixels for one in sums))
     cost = sum(one.cost for one in sums) / pixels
-    blind = _blind(stretches, terms)
+    blind = _blind(windows, terms)
     return Solution(
         p, free, A, b, cost, float(depth), float(intensity), step, blind, finished, known.information, pixels,
         float(np.mean([one.depth_overcounts for one in sums])),
@@ -191,15 +191,15 @@ def joined(first: Solution, then: Solution) -> Solution:
     return replace(then, free=free, A=A[0] + A[1], b=b[0] + b[1], last_step=last_step)
 
 
-def _blind(stretches: Sequence[RecordingWindow], terms: PairTerms) -> FloatArray:
+def _blind(windows: Sequence[RecordingWindow], terms: PairTerms) -> FloatArray:
     """σ (31,) of what no disagreement shows.
 
     Of the extrinsics, so many pixels as an angle and as a shift; of the drift, so many seconds from the middle to an
     end.
     """
     turn = _BLIND_PX / terms.color.camera.fx
-    depth = float(np.median([view.surface.median_depth for stretch in stretches for view in stretch.views]))
-    stamps = [view.depth.stamp for stretch in stretches for view in stretch.views]
+    depth = float(np.median([view.surface.median_depth for window in windows for view in window.views]))
+    stamps = [view.depth.stamp for window in windows for view in window.views]
     drift = _BLIND_S / max(0.5 * (max(stamps) - min(stamps)), 1e-3)
     lens = turn * np.array([1.0, 1.0, 1.0, 1.0, 4.0, 8.0, 1.0, 1.0, 16.0])
     poses = np.zeros(3), [drift], np.full(3, turn * depth), np.full(3, turn)
@@ -235,13 +235,13 @@ def _of_free(reduced: Sequence[Eliminated], free: BoolArray) -> tuple[FloatArray
 
 
 def posterior(A: FloatArray, b: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Covariance (n, n) of parameters by stretches' A (s, n, n) and b (s, n) and a prior's information (n, n); what
+    """Covariance (n, n) of parameters by windows' A (s, n, n) and b (s, n) and a prior's information (n, n); what
     the gradient counts for beside the prior's (n, n): A N⁻¹, N the covariance of the gradient; and how many times too
     large A is in the mean.
 
-    At the solution the stretches' gradients add up to nothing; how far each is from nothing shows N (the "sandwich" of
-    White, Econometrica 1980, by clusters, of which a stretch is one). A says far too little: a frame counts in several
-    pairs, pixels are not independent, and what no model has is in all of them. The scatter of few stretches is shrunk
+    At the solution the windows' gradients add up to nothing; how far each is from nothing shows N (the "sandwich" of
+    White, Econometrica 1980, by clusters, of which a window is one). A says far too little: a frame counts in several
+    pairs, pixels are not independent, and what no model has is in all of them. The scatter of few windows is shrunk
     towards A times what the two differ by in the mean over parameters.
     """
     told, dof = A.sum(axis=0), max(1.0, len(b) - 1.0)

@@ -40,14 +40,14 @@ _FEW_STEPS = 4
 class StageResult:
     """What is found so far. drifts: colour's clock may drift; kept_lens: another explains no more than the file's."""
 
-    stretches: Sequence[RecordingWindow]
+    windows: Sequence[RecordingWindow]
     solution: Solution
     drifts: bool
     kept_lens: bool
 
 
 def in_stages(
-    stretches: Sequence[RecordingWindow], terms_of: Callable[[BoolArray], PairTerms], known: Known, p: Parameters,
+    windows: Sequence[RecordingWindow], terms_of: Callable[[BoolArray], PairTerms], known: Known, p: Parameters,
     free: BoolArray, is_exact: bool, progress: Progress,
 ) -> StageResult:  # fmt: skip
     """From values `p` on, with all that may change (31,).
@@ -56,22 +56,22 @@ def in_stages(
     """
     terms = terms_of(free)
     if is_exact or not free[COLOR_LENS].any():
-        solution, drifts = _solved(stretches, terms, known, p, free, _NONE, progress)
+        solution, drifts = _solved(windows, terms, known, p, free, _NONE, progress)
         if not solution.finished or not solution.free[LENSES].any():
-            return StageResult(stretches, solution, drifts, False)
-        stretches, solution, kept_lens = _paid(stretches, terms, known, solution, _NONE, progress)
-        return StageResult(stretches, solution, drifts, kept_lens)
+            return StageResult(windows, solution, drifts, False)
+        windows, solution, kept_lens = _paid(windows, terms, known, solution, _NONE, progress)
+        return StageResult(windows, solution, drifts, kept_lens)
     watch = progress_watch(progress, 0.3)
-    lens = solve(stretches, terms, p, free & BY_COLOR, _FINE, watch, known, _FEW_STEPS, _HARDLY)
+    lens = solve(windows, terms, p, free & BY_COLOR, _FINE, watch, known, _FEW_STEPS, _HARDLY)
     counts = 1.0 / max(1.0, lens.depth_overcounts)
     if lens.finished:
-        lens, _ = _solved(stretches, terms, known, lens.values, free & BY_COLOR, ~BY_COLOR, progress, counts)
-    stretches, lens, kept_lens = _paid(stretches, terms, known, lens, ~LENSES, progress, counts)
+        lens, _ = _solved(windows, terms, known, lens.values, free & BY_COLOR, ~BY_COLOR, progress, counts)
+    windows, lens, kept_lens = _paid(windows, terms, known, lens, ~LENSES, progress, counts)
     if not lens.finished:
-        return StageResult(stretches, lens, True, kept_lens)
+        return StageResult(windows, lens, True, kept_lens)
     held, rest = (_NONE, free & ~LENSES) if kept_lens else (lens.free, free & ~BY_COLOR)
-    solution, drifts = _solved(stretches, terms_of(rest), known, lens.values, rest, held, progress)
-    return StageResult(stretches, solution if kept_lens else joined(lens, solution), drifts, kept_lens)
+    solution, drifts = _solved(windows, terms_of(rest), known, lens.values, rest, held, progress)
+    return StageResult(windows, solution if kept_lens else joined(lens, solution), drifts, kept_lens)
 
 
 def progress_watch(progress: Progress, begin: float) -> Watch:
@@ -91,7 +91,7 @@ def progress_watch(progress: Progress, begin: float) -> Watch:
 
 
 def _solved(
-    stretches: Sequence[RecordingWindow], terms: PairTerms, known: Known, p: Parameters, free: BoolArray,
+    windows: Sequence[RecordingWindow], terms: PairTerms, known: Known, p: Parameters, free: BoolArray,
     held: BoolArray, progress: Progress, depth_counts: float = 1.0,
 ) -> tuple[Solution, bool]:  # fmt: skip
     """With all that may change, those `held` (31,) at `p`, then without what the recording does not tell.
@@ -102,7 +102,7 @@ def _solved(
     file, drifts, watch = known.values, True, progress_watch(progress, 0.5)
     while True:
         start = file.moved(np.where(free | held, p.since(file), 0.0))
-        solution = solve(stretches, terms, start, free, _FINE, watch, known, depth_counts=depth_counts)
+        solution = solve(windows, terms, start, free, _FINE, watch, known, depth_counts=depth_counts)
         unsure, p = solution.unsure, solution.values
         if not solution.finished:
             return solution, drifts
@@ -116,7 +116,7 @@ def _solved(
 
 
 def _paid(
-    stretches: Sequence[RecordingWindow], terms: PairTerms, known: Known, solution: Solution, held: BoolArray,
+    windows: Sequence[RecordingWindow], terms: PairTerms, known: Known, solution: Solution, held: BoolArray,
     progress: Progress, depth_counts: float = 1.0,
 ) -> tuple[Sequence[RecordingWindow], Solution, bool]:  # fmt: skip
     """The solution with the lens that was found, or that with the file's where another does not pay, and which.
@@ -126,13 +126,13 @@ def _paid(
     """
     plainly = solution.chance(solution.gain_over(known.values, LENSES), LENSES) < _CHANCE**2
     if plainly or not solution.finished:
-        return stretches, solution, False
+        return windows, solution, False
     without = solution.free & ~LENSES
-    plain = [replace(each, brightness=dict(each.brightness)) for each in stretches]
+    plain = [replace(each, brightness=dict(each.brightness)) for each in windows]
     start = known.values.moved(np.where(without | held, solution.values.since(known.values), 0.0))
     watch = progress_watch(progress, 0.8)
     other = solve(plain, terms, start, without, _FINE, watch, known, depth_counts=depth_counts)
     gain = (other.cost - solution.cost) * solution.pixels
     if not other.finished or solution.chance(gain, LENSES) < _CHANCE:
-        return stretches, replace(solution, finished=other.finished), False
+        return windows, replace(solution, finished=other.finished), False
     return plain, other, True

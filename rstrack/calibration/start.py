@@ -92,7 +92,7 @@ def _tracked(dataset: Dataset, chosen: range, options: Options, progress: Progre
     return RoughTrack(through(se3.interpolated(stamps, poses, knots), t0, dt), spans)
 
 
-# Seconds before the first and after the last line for which a stretch has spline: times move while they are estimated.
+# Seconds before the first and after the last line for which a window has spline: times move while they are estimated.
 _MARGIN_S = 0.08
 # What the colour camera may be further away than the file says, m.
 _BASELINE_M = 0.01

@@ -1,1 +1,1 @@
-"""What is compared: pairs of images with their own lines, and stretches of them."""
+"""What is compared: pairs of images with their own lines, and windows of them."""

@@ -28,20 +28,20 @@ from rstrack.calibration.pairs.window import RecordingWindow, WindowFrame
 from rstrack.calibration.parameters import Parameters
 
 
-def trust_in(stretch: RecordingWindow, terms: PairTerms, p: Parameters) -> float:
-    """Part of the information about the stretch's motion, in the direction of which least of it is real, that is real.
+def trust_in(window: RecordingWindow, terms: PairTerms, p: Parameters) -> float:
+    """Part of the information about the window's motion, in the direction of which least of it is real, that is real.
 
     1 where images are free of noise, 0 or less where there is nothing but noise in some direction. Of the frame in the
     middle against the next one, at the values that were found.
     """
-    k = len(stretch.views) // 2
-    ref, current = stretch.views[k - 1], stretch.views[k]
-    T_base_world = se3.inverse(stretch.spline.pose(ref.depth.mid_time(p)))
-    depths = lines_of([view.depth for view in (ref, current)], stretch.spline, p)
-    pairs = [_by_depth(terms, current, ref, (depths[1], depths[0]), T_base_world, p, stretch.sigma[0])]
+    k = len(window.views) // 2
+    ref, current = window.views[k - 1], window.views[k]
+    T_base_world = se3.inverse(window.spline.pose(ref.depth.mid_time(p)))
+    depths = lines_of([view.depth for view in (ref, current)], window.spline, p)
+    pairs = [_by_depth(terms, current, ref, (depths[1], depths[0]), T_base_world, p, window.sigma[0])]
     if ref.color is not None and current.color is not None:
-        lines = depths[0], *lines_of([current.color, ref.color], stretch.spline, p)
-        pairs.append(_by_color(terms, current, ref, lines, T_base_world, p, stretch.sigma[1]))
+        lines = depths[0], *lines_of([current.color, ref.color], window.spline, p)
+        pairs.append(_by_color(terms, current, ref, lines, T_base_world, p, window.sigma[1]))
     lever = ref.surface.median_depth
     common, single = np.zeros((6, 6)), np.zeros((6, 6))
     for a, b in pairs:

@@ -118,7 +118,7 @@ def test_a_bare_wall_is_told_from_a_room(shaken: Dataset, tmp_path: Path, monkey
         trusts.append(trust_in(part, terms, p))
     assert trusts[0] > 0.8 and trusts[1] < 0.3
     monkeypatch.setattr(calibration_run, "trust_in", lambda *_: 0.1)
-    with pytest.raises(UserError, match="3 of 3 stretches what seems to be known of the motion is noise"):
+    with pytest.raises(UserError, match="3 of 3 windows what seems to be known of the motion is noise"):
         calibrate(shaken, ("readout",), SHORT, OPTIONS)
 
 
@@ -134,7 +134,7 @@ def test_a_drift_is_found_or_else_held(shaken: Dataset, monkeypatch: pytest.Monk
     assert ("colour drift" in found.text()) == (drift > 0.0)
 
 
-def test_knots_of_every_other_stretch_lie_half_a_spacing_later(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_knots_of_every_other_window_lie_half_a_spacing_later(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever phase is asked for: what a spline cannot follow then averages out of the clocks."""
     monkeypatch.setattr(calibration_run, "load_window", lambda *given: given[-1].knot_phase)
     dataset: Any = SimpleNamespace(with_color_offset=lambda *_, **__: None)

@@ -82,18 +82,18 @@ def test_the_gradient_changes_along_every_parameter_as_the_normal_equations_say(
     lensed = bent(shaken)
     terms, p = pair_terms(engine("llvm"), lensed, np.ones(COUNT, bool)), parameters_of(lensed)
     assert shaken.truth is not None
-    stretch = load_window(terms, lensed, range(4, 15), shaken.truth, p, OPTIONS)
+    window = load_window(terms, lensed, range(4, 15), shaken.truth, p, OPTIONS)
     for _ in range(4):
-        stretch.sums(terms, p, 0)
-    sigma = stretch.sigma
-    at = stretch.sums(terms, p, 0)
+        window.sums(terms, p, 0)
+    sigma = window.sigma
+    at = window.sums(terms, p, 0)
     for i in (*range(DRIFT), *range(DRIFT + 1, COUNT)):
         step = np.zeros(COUNT)
         step[i] = 3.0 / np.sqrt(at.H[-COUNT + i, -COUNT + i])
         ends = []
         for sign in (1.0, -1.0):
-            stretch.sigma, stretch.brightness = sigma, dict.fromkeys(stretch.brightness, np.zeros(2))
-            ends.append(stretch.sums(terms, p.moved(sign * step), 0))
+            window.sigma, window.brightness = sigma, dict.fromkeys(window.brightness, np.zeros(2))
+            ends.append(window.sums(terms, p.moved(sign * step), 0))
         bend = (ends[0].g - ends[1].g)[-COUNT + i] / (2.0 * step[i])
         assert bend == pytest.approx(at.H[-COUNT + i, -COUNT + i], rel=0.25), NAMES[i]
 
@@ -102,14 +102,14 @@ def test_scipy_finds_the_same_offset_by_the_cost_alone(shaken: Dataset, monkeypa
     monkeypatch.setattr(pairs_window, "_APART", (5,))
     terms, p = pair_terms(engine("llvm"), shaken), parameters_of(shaken)
     assert shaken.truth is not None
-    stretches = [load_window(terms, shaken, range(4, 20), shaken.truth, p, OPTIONS)]
-    ours = solve(stretches, terms, p, np.arange(COUNT) == 2, (0,))
-    sigma = stretches[0].sigma
+    windows = [load_window(terms, shaken, range(4, 20), shaken.truth, p, OPTIONS)]
+    ours = solve(windows, terms, p, np.arange(COUNT) == 2, (0,))
+    sigma = windows[0].sigma
 
     def cost(offset_ms: float) -> float:
-        stretches[0].sigma = sigma
+        windows[0].sigma = sigma
         tried = replace(p, color_offset_s=1e-3 * offset_ms)
-        return solve(stretches, terms, tried, np.zeros(COUNT, bool), (0,)).cost
+        return solve(windows, terms, tried, np.zeros(COUNT, bool), (0,)).cost
 
     found = scipy.optimize.minimize_scalar(cost, bounds=(-0.4, 0.4), method="bounded", options={"xatol": 2e-3})
     assert 1e-3 * found.x == pytest.approx(ours.values.color_offset_s, abs=2.5e-5)
@@ -190,7 +190,7 @@ def test_too_little_to_go_by_is_said_in_one_line(shaken: Dataset) -> None:
         calibrate(blind, options=OPTIONS)
 
 
-def test_looking_at_residuals_leaves_stretches_as_they_are(shaken: Dataset) -> None:
+def test_looking_at_residuals_leaves_windows_as_they_are(shaken: Dataset) -> None:
     noisy = replace(shaken, images=NoisyImages(shaken.images, 2e-3, 0.02, 7))
     terms, p = pair_terms(engine("llvm"), noisy), parameters_of(noisy)
     assert noisy.truth is not None
@@ -256,11 +256,11 @@ def test_known_values_draw_a_solution_by_as_much_as_they_weigh(shaken: Dataset) 
     terms, start, free = pair_terms(engine("llvm"), shaken), parameters_of(shaken), free_of(("readout",))
     off = replace(start, color_readout_s=start.color_readout_s + 5e-4)
     assert shaken.truth is not None
-    stretches = [load_window(terms, shaken, range(4, 20), shaken.truth, start, OPTIONS)]
+    windows = [load_window(terms, shaken, range(4, 20), shaken.truth, start, OPTIONS)]
     errors = []
     for sigma_s in (np.inf, 1.0, 1e-7):
         known = Known(off, np.where(np.arange(COUNT) == 1, sigma_s, np.inf))
-        found = solve(stretches, terms, off, free, (0,), known=known)
+        found = solve(windows, terms, off, free, (0,), known=known)
         errors.append(found.values.color_readout_s - off.color_readout_s)
     assert errors[0] == pytest.approx(-5e-4, abs=1.5e-4) and errors[1] == pytest.approx(errors[0], abs=1e-5)
     assert abs(errors[2]) < 1e-6 and found.sigmas[1] == pytest.approx(1e-7, rel=0.1)

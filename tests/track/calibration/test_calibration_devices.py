@@ -68,7 +68,7 @@ def test_an_unknown_device_is_refused_with_all_names(capsys: pytest.CaptureFixtu
 
 
 def solution(told_s: tuple[float, float], known_s: tuple[float, float], seed: int = 3) -> Solution:
-    """Twelve stretches that tell readouts to within σ `told_s` (s), 5 times as badly as their normal equations say."""
+    """Twelve windows that tell readouts to within σ `told_s` (s), 5 times as badly as their normal equations say."""
     rng = np.random.default_rng(seed)
     A = np.array([np.diag(25.0 / np.square(told_s) / 12.0)] * 12)
     b = 5.0 * rng.standard_normal((12, 2)) * np.sqrt(np.einsum("snn->sn", A))

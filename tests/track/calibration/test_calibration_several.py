@@ -25,7 +25,7 @@ READOUT, OFFSET, FX, CX = AT
 def calibrated(
     name: str, true: np.ndarray, own: np.ndarray, sure: np.ndarray, rng: np.random.Generator
 ) -> CameraCalibration:
-    """A recording whose eight stretches bear out `true` (31,), though it has ended at `own`."""
+    """A recording whose eight windows bear out `true` (31,), though it has ended at `own`."""
     free = np.isin(np.arange(COUNT), AT)
     root = rng.standard_normal((8, 4, 4)) * sure[:, None]
     A = root @ root.swapaxes(1, 2)
