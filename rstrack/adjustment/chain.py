@@ -1,4 +1,4 @@
-"""What a track's frames say of its control points, kept small for when the whole spline is adjusted."""
+"""Normal equations of a track's frames, summed by keyframes and stored small until the whole spline is adjusted."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class BandedHessian:
             self.blocks[max(0, kept - d) :, d] = 0.0
 
     def packed(self) -> BandedHessian:
-        """The same with room for no more, in half the bytes: to be kept."""
+        """The same with room for no more, in half the bytes: to be stored."""
         used = np.flatnonzero(np.abs(self.blocks).sum(axis=(1, 2, 3)))
         begin, end = (int(used[0]), int(used[-1]) + 1) if len(used) else (0, 0)
         end = min(len(self), end + self.blocks.shape[1] - 1)
@@ -72,9 +72,9 @@ class BandedHessian:
 
 @dataclass(frozen=True)
 class KeyframeModel:
-    """What frames say of control points against a keyframe; None: against others of them, by the model itself.
+    """Frames' quadratic model of control points against a keyframe; None: against each other.
 
-    gradient (n, 6): of what they say, of the band's control points, where the models were made; None: zero, as
+    gradient (n, 6): of the band's control points, where the models were made; None: zero, as
     after the tracker's own steps.
     """
 

@@ -22,7 +22,7 @@ _NARROWER, _MOST_STEPS = 4.0, 40
 _SMALL = 1e-7
 # Weight below which a loop has been refused by the others.
 _REFUSED = 0.1
-# By what the track's own errors may be larger than it thinks, where loops say so: widened until no more than this part
+# By what the track's own errors may be larger than estimated, where loops show it: widened until no more than this part
 # of them is refused. So many must agree: a few may as well be false. The second, for where only some are refused: a
 # track that may bend much more goes with false ones too (tested).
 _MOST_SPREADS, _SOME_SPREADS = (2.0, 4.0, 8.0, 16.0), (2.0, 4.0)
@@ -33,7 +33,7 @@ _REFUSED_SHARE, _AGREEING = 0.25, 4
 class Closed:
     """The state with its loops closed. refused (n,): loops that do not go with the others, and count for nothing.
 
-    spread: by what the track's own errors were taken to be larger than it thinks.
+    spread: by what the track's own errors were taken to be larger than estimated.
     """
 
     state: State
@@ -50,7 +50,7 @@ def closed(graph: Graph, loops: Sequence[Loop], begin: float, progress: Progress
     """Close loops of the track that a graph describes; the camera stays where it was at time `begin` (s).
 
     A loop that contradicts the others and the track is left out. Where that were more than a few, though they go with
-    each other, it is the track that is wrong by more than it thinks: of cameras that are not quite as told, frame after
+    each other, it is the track that is wrong by more than estimated: with a slightly wrong camera file, frame after
     frame errs alike, and one blurred stretch may bend all that follows, which no single frame shows. Raises
     numpy.linalg.LinAlgError where the system has no solution.
     """

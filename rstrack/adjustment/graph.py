@@ -88,7 +88,7 @@ class Graph:
     imu: ImuTerm | None = None
 
     def weakened(self, spread: float) -> Graph:
-        """With what frames and sightings say taken as so many times as uncertain (σ)."""
+        """With frames and sightings so many times as uncertain (σ)."""
         seen = [each.weakened(spread) for each in self.seen]
         sightings = [replace(each, information=each.information / spread**2) for each in self.sightings]
         return replace(self, seen=seen, sightings=sightings)

@@ -3,7 +3,7 @@
 By `rstrack.inertial.factor`. Biases are linear between knots about a second apart and walk from one to the next;
 gravity is one vector in the spline's world; T_imu_depth and the scales are nearly what is stated. In the graph's blocks
 of six numbers there are, last of all: T_imu_depth's left increment, the scales, the knots, and gravity, three numbers
-of which say nothing.
+of which are unused.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from rstrack.inertial.residuals import ImuReadings
 _KNOT_S = 1.0
 # Blocks of six that a sample depends on: control points, T_imu_depth, scales, knots of the biases and gravity.
 _BLOCKS = 4 + 1 + 1 + 2 + 1
-# σ of what is stated: of T_imu_depth (m, rad), and of scales, which data sheets of cheap units state to a hundredth.
+# σ of what is stated: of T_imu_depth (m, rad), and of scales, which data sheets of cheap IMUs state to a hundredth.
 _PLACE, _SCALE = np.repeat([5e-3, 1e-2], 3), 5e-3
 # Samples linearised at once: intermediate matrices then stay small.
 _AT_ONCE = 4096
@@ -107,7 +107,7 @@ class ImuResult:
 
 @dataclass(frozen=True)
 class ImuTerm:
-    """What is given. samples: those that count, at times the spline knows. sigma (2,): of a gyroscope's reading (rad/s)
+    """What is given. samples: those that count, within the spline. sigma (2,): of a gyroscope's reading (rad/s)
     and of an accelerometer's (m/s²) about the spline; noise (2,): what they are at least. accelerations (6,): σ for the
     motion prior, m/s² and rad/s². segment, per: the segment at which the first knot of the biases is, and segments from
     knot to knot.

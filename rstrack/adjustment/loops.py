@@ -48,7 +48,7 @@ _ANYWHERE: tuple[int, ...] = (2, 1, 0)
 
 @dataclass(frozen=True)
 class Loop:
-    """Keyframes `early` and `late` (their frames' numbers) that see one place, and what each frame says of the other.
+    """Keyframes `early` and `late` (their frames' numbers) that see one place, each frame aligned to the other.
 
     disagreement: m and rad between the two ways.
     """
@@ -219,12 +219,12 @@ class LoopSearch:
             self._refuse("the two ways of aligning it differ")
             return None
         between = _sizes(there.T_ref_cam @ back.T_ref_cam)
-        # What the two differ by tells more of their errors than either's noise.
+        # Their difference shows more of their errors than either's noise.
         off = se3.log(there.T_ref_cam @ back.T_ref_cam)
         Ad = se3.adjoint(there.T_ref_cam)
         spread = Ad @ self._covariance(there) @ Ad.T + self._covariance(back)
         excess = max(1.0, float(off @ np.linalg.solve(spread, off)) / 6.0)
-        # They share their images: together they tell as much as one.
+        # They share their images: together they count as one.
         one, other = (
             Sighting(
                 at,

@@ -79,7 +79,7 @@ class Round:
 class Refiner:
     """Refines the spline of a recording.
 
-    frames, times: numbers of the frames whose poses the spline knows, and their mid readouts (n,) s. begin: when (s)
+    frames, times: numbers of the frames within the spline, and their mid readouts (n,) s. begin: when (s)
     the camera stays where it was. load: frames by their numbers, on the device. usual: scales of residuals to begin
     with. imu: an IMU beside the camera; found: what has been learnt of it.
     """
@@ -189,7 +189,7 @@ class Refiner:
         return done
 
     def _linearised(self, frame: DeviceFrame, ref: Reference, state: SplineState) -> list[Observation]:
-        """What a frame's images say against a keyframe, as far as they fit."""
+        """A frame's images against a keyframe, those that fit."""
         good = []
         expected = self._brightness.get(ref.index)
         if expected is None:
@@ -241,7 +241,7 @@ class Refiner:
 
 @dataclass
 class _Against:
-    """What frames say against one keyframe."""
+    """Models of frames against one keyframe."""
 
     band: BandedHessian = field(default_factory=BandedHessian)
     models: list[tuple[int, FloatArray]] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""The camera.yaml of a calibration, as `rstrack track --camera` takes it: what was found, with 2 σ beside each value."""
+"""The camera.yaml of a calibration for `rstrack track --camera`: what was found, with 2 σ beside each value."""
 
 from __future__ import annotations
 

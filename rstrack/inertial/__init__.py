@@ -1,1 +1,1 @@
-"""An inertial measurement unit in the same spline: residuals, biases and gravity, prediction and bridging."""
+"""An IMU in the same spline: residuals, biases and gravity, prediction and bridging."""

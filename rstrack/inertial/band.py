@@ -1,4 +1,4 @@
-"""How dense knots have to be for a motion, told by the band of an IMU's readings before anything is tracked.
+"""How dense knots have to be for a motion, by the spectrum of an IMU's readings before anything is tracked.
 
 A uniform spline of degree n with knots Δt apart misses of a wave of f Hz, at best and in the mean over its phases, the
 part 1 − sinc²ⁿ⁺²(f Δt) / Σ_k sinc²ⁿ⁺²(f Δt + k) of its power (Blu and Unser, Quantitative Fourier Analysis of
@@ -22,12 +22,12 @@ from rstrack.options import Options
 # Spacings to choose from, s. No wider than without an IMU: a keyframe is made of a frame whose control points move no
 # more, which the camera leaves the further behind the wider they are apart.
 _SPACINGS_S = 0.025, 1 / 60, 0.0125, 1 / 120, 0.00625, 0.005
-# Samples a knot, at least: with fewer the readings do not tell where control points are.
+# Samples a knot, at least: fewer readings do not determine the control points.
 _SAMPLES = 1.2
 # Root mean square by which lines of the depth image may be off their best spline, of what is 1 m away, px.
 _MOST_PX = 0.005
-# Accelerations that the motion prior allows for, over what the readings are in the mean: the prior must not hold what
-# they tell, nor what they tell be taken for scatter because the prior held it.
+# Accelerations that the motion prior allows for, over the mean of the readings: a tighter one would work against them,
+# and take for scatter what it suppressed.
 _RARE = 3.0
 # Seconds whose spectrum is taken at once.
 _STRETCH_S = 1.0
@@ -88,8 +88,8 @@ class MotionBand:
         return np.maximum(ACCELERATION, _RARE * self.accelerations)
 
     def knots_s(self, focal: float, rate_hz: float) -> float:
-        """The widest spacing (s) that misses less of the motion than lines of a camera with a focal length (px) tell,
-        and the densest that readings at rate_hz determine where none does."""
+        """The widest spacing (s) that misses less of the motion than a camera with a focal length (px) shows, and the
+        densest that readings at rate_hz determine where none does."""
         usable = [dt for dt in _SPACINGS_S if dt * rate_hz >= _SAMPLES] or [_SPACINGS_S[0]]
         return next((dt for dt in usable if focal * np.hypot(*self.missed_motion(dt)) < _MOST_PX), usable[-1])
 
@@ -98,8 +98,8 @@ class MotionBand:
 
 
 def with_knots(options: Options, recording: ImuRecording | None, focal: float) -> Options:
-    """Options with knots as dense as a unit's motion needs them for a camera with a focal length (px), where nothing
-    else is asked for; an accelerometer alone does not tell enough between images to have them otherwise."""
+    """Options with knots as dense as an IMU's motion needs them for a camera with a focal length (px), unless a spacing
+    is asked for; an accelerometer alone does not determine the motion between images."""
     if options.knot_spacing_s is not None or not options.inertial or recording is None or recording.gyro is None:
         return options
     return replace(options, knot_spacing_s=MotionBand.of(recording).knots_s(focal, recording.rate_hz))

@@ -13,22 +13,22 @@ from rsgen.geometry.so3 import hat
 from rstrack.data.imu.description import ImuNoise
 
 SIZE = 12
-"""Gyroscope's bias (rad/s), accelerometer's bias, gravity in the world (both m/s²), and the turn φ (rad, in the unit's
-axes) from where T_imu_depth has the unit: its axes are those of exp(φ) R_imu_depth."""
+"""Gyroscope's bias (rad/s), accelerometer's bias, gravity in the world (both m/s²), and the IMU's turn φ (rad, in its
+axes): R_imu_depth is exp(φ) times that of T_imu_depth."""
 GYRO, ACCEL, GRAVITY, TURN = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 TURNED = 5e-3
 """σ of that turn beforehand, rad: drawings and hands are right to some tenths of a degree."""
-# σ of biases before anything is known: rad/s and m/s², as sheets of cheap units have them.
+# σ of biases before anything is known: rad/s and m/s², as data sheets of cheap IMUs have them.
 _GYRO_BIAS, _ACCEL_BIAS = 0.1, 0.6
 STRENGTH = 0.03
-"""How well gravity's strength is known, m/s²: over the earth, and of a unit's scale."""
+"""How well gravity's strength is known, m/s²: over the earth, and of an IMU's scale."""
 ALIKE = 8.0
-"""Images in a row that are off alike: what interpolation, what shines and the keyframe's own noise do to them changes
-slowly. So many tell how the camera has moved, beside an IMU's readings, as one would by its scatter."""
+"""Images in a row whose errors are alike, since those of interpolation, of reflections and of the keyframe change
+slowly. Beside an IMU's readings so many of them inform about the motion as one would by its scatter."""
 WARMS = 2e-5, 5e-4
-"""What a bias may do beside its walk while a unit warms up: in a second, rad/s and m/s²."""
+"""What a bias may do beside its walk while an IMU warms up: in a second, rad/s and m/s²."""
 # σ of the gyroscope's bias (rad/s), and of the force (m/s²) that gravity and the accelerometer's bias make together in
-# an attitude, below which the unit is of use; and of gravity's direction, degrees, below which that is determined.
+# an attitude, below which the IMU is usable; and of gravity's direction, degrees, below which that is determined.
 _KNOWN_GYRO, _KNOWN_FORCE, _KNOWN_DEG = 5e-3, 0.15, 0.3
 
 
@@ -82,7 +82,7 @@ class ImuEstimate:
         return self.direction_deg < _KNOWN_DEG
 
     def is_usable(self, R_imu_world: FloatArray, rate: FloatArray) -> bool:
-        """Whether readings in an attitude (3, 3), and at a rate (3,) of the unit in rad/s, tell accelerations to
+        """Whether readings in an attitude (3, 3), and at a rate (3,) of the IMU in rad/s, determine accelerations to
         0.15 m/s², and rates to 0.3 °/s."""
         return self.force_variance(R_imu_world) < _KNOWN_FORCE**2 and self.rate_variance(rate) < _KNOWN_GYRO**2
 

@@ -90,8 +90,8 @@ class ImuFactor:
 
     @property
     def gyro_by_time(self) -> FloatArray:
-        """(n, 3): of the gyroscope, by the time of the samples. The accelerometer has none that a cubic spline tells:
-        its acceleration bends at the knots."""
+        """(n, 3): of the gyroscope, by the time of the samples. A cubic spline has none for the accelerometer: its
+        acceleration bends at the knots."""
         return self._rate[:, 3:]
 
     @cached_property

@@ -1,4 +1,4 @@
-"""A unit's recording beside a track: what it says of the spline, and what the track says of biases and gravity."""
+"""An IMU's recording beside a track: its readings constrain the spline, and the track determines biases and gravity."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from rstrack.inertial.smoother import ReusedPrior, Smoother
 
 # σ of the mean acceleration of a track's first moments, m/s².
 _MEAN_ACCELERATION = 1.0
-# Samples that tell how readings scatter about the spline, and that the scatter which is expected counts as.
+# Samples that estimate how readings scatter about the spline, and as how many the expected scatter counts.
 _MEMORY, _EXPECTED = 100.0, 10.0
-# Gravity in the world turns as the track drifts, beside what keyframes' covariances say: m/s² per √s.
+# Gravity in the world turns as the track drifts, beside keyframes' covariances: m/s² per √s.
 _DRIFT = 5e-4
 # Increments of control points (m, rad) that leave the rows of a frame's samples as they were linearised before it.
 _SAME = 1e-3
-# What images tell a pose by, σ in m and rad, where they leave a way open: there interpolation seems to tell something.
+# σ of a pose (m, rad) by images that leave a direction open: interpolation alone seems to constrain it so.
 _OPEN = np.repeat([1e-2, 5e-3], 3)
-# Change of gravity (m/s²) that calls for new derivatives: turns of the spline and changes of gravity are told by their
-# product, which at the start, when gravity is a guess, no derivative knows.
+# Change of gravity (m/s²) that calls for new derivatives: readings depend on the product of the spline's turns and
+# gravity, which no derivative has at the start, when gravity is a guess.
 _SAME_GRAVITY = 0.1
 # What follows from the recording alone.
 _GIVEN = "recording", "samples", "common", "_band"
 
 
 class Inertia:
-    """recording: of the unit. estimate: of its biases, gravity and turn as far as is known.
+    """recording: of the IMU. estimate: of its biases, gravity and turn so far.
 
     common (6,): standard deviation of accelerations for the motion prior, m/s² and rad/s².
     sigma (2,): of a gyroscope's reading against the spline (rad/s), and of an accelerometer's (m/s²): never less than
-    their noise, and as much as the spline cannot follow. usable_s: time (s) from which on the unit is of use;
+    their noise, and as much as the spline cannot follow. usable_s: time (s) from which on the IMU is usable;
     determined_s: at which gravity's direction was first known; NaN before.
     """
 
@@ -51,7 +51,7 @@ class Inertia:
         walks = np.repeat([noise.gyro_walk, noise.accel_walk, _DRIFT, 0.0], 3)
         self._walk = walks**2
         self._band, self._dt = MotionBand.of(recording), 0.0
-        self.common = self._band.allowed if self.tells else ACCELERATION
+        self.common = self._band.allowed if self.is_informative else ACCELERATION
         self.sigma, self._told = self._noise, np.zeros(2)
         self._smoother: Smoother | None = None
         self._until, self._next, self._tripled = -np.inf, -np.inf, 0
@@ -76,9 +76,9 @@ class Inertia:
         return bool(np.isfinite(self.usable_s))
 
     @property
-    def tells(self) -> bool:
-        """Whether it says something of a motion: of how it changes at once, while biases and gravity are still unknown;
-        without a gyroscope once it is of use."""
+    def is_informative(self) -> bool:
+        """Whether it constrains the motion: with a gyroscope at once, while biases and gravity are still unknown;
+        without one when it is usable."""
         return self.is_usable or self.recording.gyro is not None
 
     def begin_world(self) -> None:
@@ -95,15 +95,15 @@ class Inertia:
         self.usable_s = self.determined_s = float("nan")
         self._until = self._next = -np.inf
 
-    def begin_piece(self) -> None:
+    def begin_segment(self) -> None:
         """The spline goes on elsewhere, with control points that have nothing to do with those before."""
         if self._smoother is not None:
             self._smoother.forget(self._smoother.last)
         self._until = self._next = -np.inf
 
     def shift(self, covariance: FloatArray) -> None:
-        """Images tell the pose against another keyframe from now on, which lies in the world up to a left increment
-        with covariance (6, 6): that is no motion."""
+        """Images are aligned to another keyframe from now on, known in the world up to a left increment with covariance
+        (6, 6): that is no motion."""
         if self._smoother is not None:
             self._smoother.shift(covariance)
 
@@ -113,22 +113,22 @@ class Inertia:
         longest = max(3.0 / self.recording.rate_hz, 0.02)
         return bool(np.diff(np.concatenate([[begin], t, [end]])).max() <= longest)
 
-    def told(self, seconds: float, R_imu_world: FloatArray) -> tuple[FloatArray, float]:
-        """σ (6,) of accelerations over so many seconds in an attitude (3, 3), m/s² and rad/s², with what it says, and
-        of the mean angular rate, rad/s."""
+    def sigmas_over(self, seconds: float, R_imu_world: FloatArray) -> tuple[FloatArray, float]:
+        """σ (6,) of accelerations over so many seconds in an attitude (3, 3), m/s² and rad/s², given the readings,
+        and of the mean angular rate, rad/s."""
         gyro, accel = self.sigma**2 / max(1.0, seconds * self.recording.rate_hz)
         gyro += float(np.diag(self.estimate.covariance)[GYRO].max())
         accel += self.estimate.force_variance(R_imu_world)
         return np.repeat(np.sqrt([accel, (2.0 / seconds) ** 2 * gyro]), 3), float(np.sqrt(gyro))
 
-    # -- what it says of the spline ---------------------------------------------------------------------------------
+    # -- readings constrain the spline ------------------------------------------------------------------------------
 
-    def prior(self, state: SplineState, piece: int, first: int) -> ReusedPrior:
-        """All samples that depend on control points from `first` on, of the piece of the spline that begins at control
-        point `piece`, while it moves with `state`; biases and gravity as far as they are known."""
+    def prior(self, state: SplineState, segment: int, first: int) -> ReusedPrior:
+        """All samples that depend on control points from `first` on, of the segment of the spline that begins at control
+        point `segment`, while it moves with `state`; biases and gravity as far as they are known."""
         spline = state.spline
         self._expect(spline.dt)
-        begin = max(spline.t0 + max(piece, first - 3) * spline.dt, spline.t_begin)
+        begin = max(spline.t0 + max(segment, first - 3) * spline.dt, spline.t_begin)
         samples = self.samples.between(begin, spline.t_end)
         estimate = self.estimate
         if not self.is_usable:
@@ -152,24 +152,24 @@ class Inertia:
 
         return ReusedPrior(state, first, around)
 
-    def held(self, piece: int) -> int | None:
-        """First control point of what is known of the newest ones, where the unit is of use and has seen enough of the
-        piece of the spline that begins at control point `piece`. None where images left a way open: fixed control
-        points let the spline slide there by what readings leave open in a frame, a smoother by all that they do."""
+    def held(self, segment: int) -> int | None:
+        """First control point that the smoother has, where the IMU is usable and has seen enough of the segment of the
+        spline that begins at control point `segment`. None where images left a direction open: fixed control points
+        let the spline slide there by what readings leave open in a frame, a smoother by all that they do."""
         smoother = self._smoother
         if (
             smoother is None
             or self._leaves_open
             or not self.is_usable
             or len(smoother.at) < 4
-            or smoother.first < piece
+            or smoother.first < segment
         ):
             return None
         return smoother.first
 
     def ahead(self, state: SplineState) -> ReusedPrior:
-        """What all images and samples so far say of the control points that are `held`, and the samples since of those
-        that came anew, while they move with `state`."""
+        """All images and samples so far, on the control points that are `held`, and the samples since on those that
+        came anew, while they move with `state`."""
         smoother = self._smoother
         assert smoother is not None
         samples = self.samples.between(self._until, state.spline.t_end)
@@ -189,10 +189,10 @@ class Inertia:
 
         return ReusedPrior(state, smoother.first, around)
 
-    # -- what the track says of it ----------------------------------------------------------------------------------
+    # -- the track determines biases and gravity --------------------------------------------------------------------
 
-    def learn(self, state: SplineState, piece: int, models: Sequence[Quadratic], end: float) -> None:
-        """From a frame whose lines end at time `end` (s), which has been found: `models` is what its images say.
+    def learn(self, state: SplineState, segment: int, models: Sequence[Quadratic], end: float) -> None:
+        """From a frame whose lines end at time `end` (s), which has been found: `models` are of its images.
 
         Samples count up to the end of the frame before; the newest control points still move.
         """
@@ -200,10 +200,10 @@ class Inertia:
             return
         self._expect(state.dt)
         low, high = min(m.first for m in models), max(m.last for m in models)
-        begin = max(self._until, state.spline.t0 + piece * state.dt, state.spline.t_begin)
+        begin = max(self._until, state.spline.t0 + segment * state.dt, state.spline.t_begin)
         self._until, self._next = max(begin, self._next), end
         fresh = self.samples.between(begin, self._until)
-        smoother = self._smoother or self._started(state, piece)
+        smoother = self._smoother or self._started(state, segment)
         if smoother is None:
             return
         self._smoother = smoother
@@ -225,7 +225,7 @@ class Inertia:
         smoother.forget(max(keep, state.first))
         before = self.estimate.mean
         self._update(smoother)
-        if joint is not None and self.tells:
+        if joint is not None and self.is_informative:
             self._learn_sigma(scatter.after(self.estimate.mean - before), fresh.counts, state.dt)
         if not self.is_usable:
             T, twist = state.spline.pose_and_velocity(self._until)
@@ -251,10 +251,10 @@ class Inertia:
                     return rows.moved(first, moved)
         return self._rows(state, fresh, self.estimate.mean)
 
-    def _started(self, state: SplineState, piece: int) -> Smoother | None:
-        """A smoother that knows nothing; gravity is guessed from the first samples, so that turns are about right."""
+    def _started(self, state: SplineState, segment: int) -> Smoother | None:
+        """An empty smoother; gravity is guessed from the first samples, so that turns are about right."""
         spline = state.spline
-        begin = max(spline.t0 + piece * spline.dt, spline.t_begin)
+        begin = max(spline.t0 + segment * spline.dt, spline.t_begin)
         fresh = self.samples.between(begin, spline.t_end)
         if not len(fresh):
             return None
@@ -285,7 +285,7 @@ class Inertia:
     def _expect(self, dt: float) -> None:
         """Readings to scatter about a spline with knots dt s apart as their noise and what it cannot follow make them.
 
-        Learnt alone, from a start that says little, σ would stay as large as that start makes the scatter.
+        Learnt alone, from a weak start, σ would stay as large as that start makes the scatter.
         """
         if dt != self._dt:
             self._dt, self.sigma = dt, np.hypot(self._noise, self._band.scatter(dt))

@@ -1,4 +1,4 @@
-"""What a run says of an IMU at its end, in run.json and in a line on the screen; and a world that stands upright."""
+"""A run's estimate of its IMU, for run.json and in a line on the screen; and a world that stands upright."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def estimate_dict(estimate: ImuEstimate, sigma: FloatArray) -> dict[str, Any]:
 
 
 def is_contradicted(estimate: ImuEstimate) -> bool:
-    """Whether readings and images say beyond chance that the unit is turned from where T_imu_depth has it, and by
-    more than what draws images by a thousandth of the motion passes for."""
+    """Whether the IMU is turned from where T_imu_depth has it, beyond chance and by more than a bias of the images by a
+    thousandth of the motion explains."""
     turn = estimate.mean[TURN]
     beyond = float(turn @ np.linalg.solve(estimate.covariance[TURN, TURN], turn))
     return beyond > _BEYOND and bool(np.linalg.norm(turn) > _WORTH_SAYING)

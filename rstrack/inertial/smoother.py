@@ -1,4 +1,4 @@
-"""A fixed-lag smoother over the newest control points and an IMU's estimate: what all images and samples so far say.
+"""A fixed-lag smoother over the newest control points and an IMU's numbers, from all images and samples so far.
 
 Each image's normal equations and each sample are added once. Control points that nothing new depends on are
 marginalised, not fixed: a spline held where it was estimated would make biases look far better known than they are.
@@ -18,7 +18,7 @@ from rstrack.alignment.spline_state import SplineState
 from rstrack.inertial.estimate import GRAVITY, SIZE, STRENGTH, ImuEstimate
 from rstrack.inertial.residuals import ImuQuadratic, without_tail
 
-# Information of a control point that nothing tells (σ 100 m, rad): systems are never singular.
+# Information of a control point that nothing observes (σ 100 m, rad): systems are never singular.
 _NOTHING = 1e-4
 
 

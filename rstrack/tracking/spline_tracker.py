@@ -311,7 +311,7 @@ class Tracker:
         self._relocaliser.forget()
         self._bridge.forget()
         if track.inertia is not None:
-            track.inertia.begin_piece()
+            track.inertia.begin_segment()
             track.learn_inertia(found.fresh, found.window, excess, new.last_time)
         track.age = 1
         track.placed(new, found.fresh, joined=False)

@@ -180,7 +180,7 @@ class Track:
         rad/s: an IMU tells most. R_world_depth (3, 3): about how the camera is turned."""
         if self.inertia is None or seconds <= 0.0 or not window.is_led(self.found.end, self.found.end + seconds):
             return ACCELERATION, np.inf
-        told, rate = self.inertia.told(seconds, self.inertia.recording.T_imu_depth[:3, :3] @ R_world_depth.T)
+        told, rate = self.inertia.sigmas_over(seconds, self.inertia.recording.T_imu_depth[:3, :3] @ R_world_depth.T)
         return np.minimum(ACCELERATION, told), rate
 
     def _shift_inertia(self, fresh: Sequence[Observation]) -> None:

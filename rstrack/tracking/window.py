@@ -193,7 +193,7 @@ class Window:
     def _inertial(self, free: tuple[int, int]) -> list[Prior]:
         """What an IMU says, where it tells the newest control points."""
         last, inertia = self.state.spline.t_end, self._inertia
-        if inertia is None or not inertia.tells or not inertia.covers(last - _NEWEST_S, last):
+        if inertia is None or not inertia.is_informative or not inertia.covers(last - _NEWEST_S, last):
             return []
         known = self._led
         if known is None or known.state is not self.state or known.first > free[0] or known.end != self.state.end:
@@ -202,7 +202,11 @@ class Window:
 
     def _tells_from(self, begin: float) -> bool:
         """Whether an IMU says how the motion changes in a piece's first control points, that begins at a time (s)."""
-        return self._inertia is not None and self._inertia.tells and self._inertia.covers(begin, begin + _NEWEST_S)
+        return (
+            self._inertia is not None
+            and self._inertia.is_informative
+            and self._inertia.covers(begin, begin + _NEWEST_S)
+        )
 
     def _velocity_prior(self, free: tuple[int, int]) -> Prior:
         """What is known of the motion of a piece that has just begun."""

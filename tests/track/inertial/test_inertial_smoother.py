@@ -286,7 +286,7 @@ def test_nothing_is_held_before_the_unit_is_of_use_or_of_another_piece() -> None
     inertia = learnt_until(truth, 5, 0.5)
     held = inertia.held(0)
     assert held is not None and held > 10 and inertia.held(held + 1) is None
-    inertia.begin_piece()
+    inertia.begin_segment()
     assert inertia.held(0) is None
 
 
