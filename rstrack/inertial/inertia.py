@@ -124,8 +124,8 @@ class Inertia:
     # -- readings constrain the spline ------------------------------------------------------------------------------
 
     def prior(self, state: SplineState, segment: int, first: int) -> ReusedPrior:
-        """All samples that depend on control points from `first` on, of the segment of the spline that begins at control
-        point `segment`, while it moves with `state`; biases and gravity as far as they are known."""
+        """All samples on control points from `first` on, of the segment of the spline that begins at control point
+        `segment`, while it moves with `state`; biases and gravity as far as they are known."""
         spline = state.spline
         self._expect(spline.dt)
         begin = max(spline.t0 + max(segment, first - 3) * spline.dt, spline.t_begin)
