@@ -52,13 +52,17 @@ def constants(text: str) -> int:
 
 
 def size_table(record: CellRecord) -> Table:
-    """A row for each wing, and one for all."""
-    wings = [name.partition("_")[2] for name in record.figures if name.startswith(f"{WHAT[0]}_")]
-    rows: list[tuple[Entry | str, ...]] = [
-        (wing or "all", *(f"{record.figures[f'{what}_{wing}'.rstrip('_')]:.0f}" for what in WHAT))
-        for wing in (*wings, "")
-    ]
-    return Table(("wing", *WHAT), tuple(rows))
+    """A row for each package, with its wings beside it, and one for all."""
+    figures = record.figures
+    wings = [name.partition("_")[2] for name in figures if name.startswith(f"{WHAT[0]}_")]
+    rows: list[tuple[Entry | str, ...]] = []
+    for package in PACKAGES:
+        own = [wing for wing in wings if wing.partition(".")[0] == package]
+        parts = [f"{wing.partition('.')[2] or 'itself'} {figures[f'{WHAT[0]}_{wing}']:.0f}" for wing in own]
+        sums = [sum(figures[f"{what}_{wing}"] for wing in own) for what in WHAT]
+        rows.append((package, *(f"{count:.0f}" for count in sums), ", ".join(parts)))
+    rows.append(("all", *(f"{figures[what]:.0f}" for what in WHAT), ""))
+    return Table(("package", *WHAT, "lines of each wing"), tuple(rows), words=(0, len(WHAT) + 1))
 
 
 def size_changes(old: Mapping[str, CellRecord], new: Mapping[str, CellRecord]) -> tuple[str, ...]:

@@ -97,10 +97,7 @@ def _poses(motion: Spline | Trajectory, times: FloatArray) -> FloatArray:
         raise UserError(f"a thing that passes needs true poses from {times.min():.3f} to {times.max():.3f} s")
     if isinstance(motion, Spline):
         return motion.pose(times)
-    before = np.clip(np.searchsorted(motion.stamps, times, side="right") - 1, 0, len(motion) - 2)
-    T, after = motion.T_world_cam[before], motion.T_world_cam[before + 1]
-    u = (times - motion.stamps[before]) / (motion.stamps[before + 1] - motion.stamps[before])
-    return np.asarray(T @ se3.exp(u[:, None] * se3.log(se3.inverse(T) @ after)))
+    return se3.interpolated(motion.stamps, motion.T_world_cam, times)
 
 
 def _is_hidden(z: Float32Array, camera: Camera, p: FloatArray) -> npt.NDArray[np.bool_]:

@@ -14,13 +14,14 @@ from rsgen.errors import UserError
 from rsgen.files import read_bytes
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
-from rsgen.geometry.shutter import Shutter, project_rolling
+from rsgen.geometry.shutter import project_rolling
 from rsgen.geometry.spline import Spline
 from rstrack.bench.experiments.pictures import MeshPicture
 from rstrack.data.dataset import Dataset
 from rstrack.data.rig import Image, Rig
 from rstrack.metrics.tracked import Tracked
 from rstrack.report.page import Block, ImageRow, Note, PageImage, Slider
+from rstrack.view.viewer import jpeg, world_points
 
 # Of maps to be compared with a slider: more than of photographs, for the differences are small.
 _SLIDER_WIDTH = 720
@@ -168,22 +169,15 @@ def _fastest(dataset: Dataset, among: npt.NDArray[np.int64], motion: Spline | No
     return int(among[np.argmax(shift)])
 
 
-_JPEG_QUALITY = 85
 # Where nothing was measured.
 _NOTHING = 128
 # Pixels between the samples of a coarser depth image, which are filled from their neighbours.
-_FILL_ROUNDS = 3
+_FILL_STEPS = 3
 
 
 def jpeg_uri(image: npt.NDArray[np.uint8], width: int = 640) -> str:
     """An RGB image (h, w, 3) as a data URI, made smaller if it is wider than `width` pixels."""
-    if image.shape[1] > width:
-        height = round(image.shape[0] * width / image.shape[1])
-        image = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
-    ok, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    if not ok:
-        raise ValueError("cv2 could not encode a JPEG")
-    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
+    return "data:image/jpeg;base64," + base64.b64encode(jpeg(image, width)).decode("ascii")
 
 
 def colored_depth(z: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.uint8], float, float]:
@@ -205,8 +199,9 @@ def rectified(rig: Rig, spline: Spline, depth: Image, color: Image) -> npt.NDArr
     camera, shutter = rig.color_camera, rig.color_shutter
     middle = shutter.line_mid_time(color.stamp, (shutter.line_count(camera) - 1) / 2, camera)
     T_world_color = spline.pose(middle) @ se3.inverse(rig.T_color_depth)
-    p_world = _points(rig.depth_camera, rig.depth_shutter, spline, depth)
-    z = _seen(camera, se3.transform(se3.inverse(T_world_color), p_world))
+    p_world = world_points(spline, rig.depth_camera, rig.depth_shutter, depth, 1)
+    p_world = p_world[np.isfinite(p_world).all(axis=-1)]
+    z = _nearest_z(camera, se3.transform(se3.inverse(T_world_color), p_world))
     known = z > 0.0
     there = se3.transform(T_world_color, camera.backproject(camera.pixel_grid()[known], z[known]))
     uv = np.full((*z.shape, 2), -10.0, np.float32)
@@ -224,23 +219,13 @@ def rectified(rig: Rig, spline: Spline, depth: Image, color: Image) -> npt.NDArr
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _points(camera: Camera, shutter: Shutter, spline: Spline, depth: Image) -> FloatArray:
-    """Points (n, 3) in the world that a depth image measures, each from its own line's pose."""
-    seen = (depth.pixels > 0.0) & np.isfinite(depth.pixels)
-    uv = camera.pixel_grid()[seen]
-    lines = np.arange(shutter.line_count(camera))
-    T_world_depth = spline.pose(shutter.line_mid_time(depth.stamp, lines, camera))
-    line = np.rint(shutter.line_of_pixel(uv, camera)).astype(np.int64)
-    return se3.transform(T_world_depth[line], camera.backproject(uv, depth.pixels[seen]))
-
-
-def _seen(camera: Camera, p_cam: FloatArray) -> npt.NDArray[np.float64]:
+def _nearest_z(camera: Camera, p_cam: FloatArray) -> npt.NDArray[np.float64]:
     """Planar z (h, w) of the nearest of the points (n, 3) in each pixel, small holes filled with the nearest beside."""
     uv, _ = camera.project(p_cam)
     inside = camera.contains(uv)
     x, y = np.rint(uv[inside]).astype(np.int64).T
     inverse = np.zeros((camera.height, camera.width))
     np.maximum.at(inverse, (y, x), 1.0 / p_cam[inside, 2])
-    for _ in range(_FILL_ROUNDS):
+    for _ in range(_FILL_STEPS):
         inverse = np.where(inverse > 0.0, inverse, cv2.dilate(inverse, np.ones((3, 3), np.uint8)))
     return np.where(inverse > 0.0, 1.0 / np.where(inverse > 0.0, inverse, 1.0), 0.0)

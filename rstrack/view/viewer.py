@@ -132,7 +132,7 @@ class Viewer:
     def _show(self, frame: Frame) -> None:
         rr, log = self.rr, self.recording.log
         if frame.colors:
-            picture = rr.EncodedImage(contents=_jpeg(frame.colors[0].pixels), media_type="image/jpeg")
+            picture = rr.EncodedImage(contents=jpeg(frame.colors[0].pixels, _WIDTH), media_type="image/jpeg")
             log("world/camera/color/image", picture)
         stride = -(-frame.depth.pixels.shape[1] // _WIDTH)
         z = _millimetres(frame.depth.pixels[::stride, ::stride])
@@ -184,10 +184,12 @@ class Viewer:
         self.recording.log("residuals/depth", self.rr.Image(_diverging(off / (_SIGMAS * sigma_m))))
 
 
-def _jpeg(rgb: ByteArray) -> bytes:
-    share = min(1.0, _WIDTH / rgb.shape[1])
-    small = cv2.resize(rgb, None, fx=share, fy=share, interpolation=cv2.INTER_AREA) if share < 1.0 else rgb
-    return bytes(cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 85])[1])
+def jpeg(rgb: ByteArray, width: int) -> bytes:
+    """An RGB image (h, w, 3), made smaller if it is wider than `width` pixels."""
+    if rgb.shape[1] > width:
+        height = round(rgb.shape[0] * width / rgb.shape[1])
+        rgb = np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    return bytes(cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 85])[1])
 
 
 def _millimetres(z: FloatArray) -> Any:

@@ -35,13 +35,12 @@ from matplotlib.figure import Figure
 
 import rsgen.figures
 import rstrack.bench.measures.track
-from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.sequence.format import pose_rows
 from rstrack.bench.experiments.method_results import read_results
 from rstrack.bench.experiments.method_tables import method_tables, notes
 from rstrack.bench.experiments.pictures import draw_sequence
-from rstrack.bench.record import CellRecord, read_record
+from rstrack.bench.record import read_record
 from rstrack.bench.tables import tables_text
 from rstrack.data.estimate import read_estimate
 from rstrack.metrics.run_evaluate import run_evaluate
@@ -210,16 +209,6 @@ def test_the_scheduler(place: Path) -> None:
     words = "--sequence lr_kt2 --method gs-g --no-fuse --frames 0:12 --no-meshes --scheduler local:1"
     assert main(f"bench bench.yaml --data data --out bench --quiet {words}") == 0
     assert read_record(record_file("lr_kt2", "gs-g")) is not None
-
-
-def test_workers_have_to_share_the_folder(place: Path) -> None:
-    class Far:
-        def apply(self, function: Any, jobs: Sequence[Any], progress: Any) -> Iterator[tuple[int, Any]]:
-            yield 0, CellRecord(jobs[0].cell.name, "", {}, (0,), ({},), True)
-
-    shutil.rmtree("bench")
-    with pytest.raises(UserError, match=r"gs-g: a worker has written it, but not here"):
-        run(plan(), Far())
 
 
 def test_speed_in_place_of_errors(

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from rsgen.errors import UserError
-from rstrack.bench.cells import Cell, frames_of, load_benchmark
+from rstrack.bench.cells import Cell, load_benchmark
 from rstrack.bench.changes import CHANGES
 from rstrack.bench.definitions import CaseEntry, MethodEntry, SequenceEntry
 
@@ -187,10 +187,3 @@ def test_unknown_options_are_said_in_one_line() -> None:
     cell = Cell("track", "a", "mine", (0,), CaseEntry(sequence="a"), SequenceEntry(path=Path("a")), how, {})
     with pytest.raises(UserError, match=r"^method mine: .*'speed'$"):
         _ = cell.options
-
-
-@pytest.mark.parametrize(
-    ("text", "found"), [(None, slice(None)), ("3:9", slice(3, 9)), (":9", slice(None, 9)), ("3:", slice(3, None))]
-)
-def test_frames(text: str | None, found: slice) -> None:
-    assert frames_of(text) == found

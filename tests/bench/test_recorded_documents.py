@@ -35,7 +35,7 @@ def test_documents_say_what_the_records_say(path: Path) -> None:
 
 def test_the_results_are_short() -> None:
     records(GATE)
-    assert len(RESULTS.read_text().splitlines()) <= 250
+    assert len(RESULTS.read_text().splitlines()) <= 260
 
 
 def test_the_gate_is_of_this_version() -> None:

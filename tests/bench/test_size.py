@@ -41,7 +41,7 @@ def test_growth_is_shown_and_never_worse(tmp_path: Path) -> None:
         not compare({CELL: old}, {CELL: dataclasses.replace(new, runs=old.runs)}).size
         and not compare({}, {CELL: new}).size
     )
-    assert "| `rsgen.light` | 1003 | 3 | 1001 |" in results_markdown({CELL: new}, {})
+    assert "| `rsgen` | 1004 | 4 | 1002 | itself 1, light 1003 |" in results_markdown({CELL: new}, {})
 
 
 @pytest.mark.parametrize("what", WHAT)
