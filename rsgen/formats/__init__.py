@@ -9,20 +9,14 @@ from typing import Any
 _BAG = "a bag with images, IMU, tf and the lines' times"
 # Exports: module with a function export_MODULE, place within the sequence's folder ({} is its name), help.
 EXPORTS = {
-    "kalibr": (
-        *("kalibr", "kalibr"), "camchain.yaml with line_delay, imu.yaml, with a target also target.yaml and images",
-    ),
+    "kalibr": ("kalibr", "kalibr", "camchain.yaml with line_delay, imu.yaml, of a target also target.yaml and images"),
     "euroc": ("euroc", "", "mav0/ (ASL)"),
-    "registered": (
-        *("registered", "registered"), "TUM folder with depth warped into the colour camera, its rows' times lost",
-    ),
+    "registered": ("registered", "registered", "TUM folder, depth warped into the colour camera, its rows' times lost"),
     "ros1": ("ros", "{}.bag", _BAG),
     "ros2": ("ros", "ros2", _BAG),
     "mcap": ("ros", "{}.mcap", _BAG),
     "colmap": ("colmap", "colmap", "text model and images"),
-    "nerfstudio": (
-        *("nerfstudio", "nerfstudio"), "transforms.json with poses and velocities for rolling-shutter splatting",
-    ),
+    "nerfstudio": ("nerfstudio", "nerfstudio", "transforms.json, poses and velocities for rolling-shutter splatting"),
     "ncore": ("ncore", "ncore", "NVIDIA's format, poses for every line"),
     "video": ("video", "shutter.mp4", "global beside rolling shutter (.mp4)"),
     "rerun": ("rerun", "{}.rrd", ".rrd recording"),

@@ -121,7 +121,7 @@ def rebuilt(mi: Any, scene: Any, left_out: Collection[int] = ()) -> Any:
     return mi.load_dict({"type": "scene", **shapes, **lamps}, optimize=False)
 
 
-def has_area(vertices: Float32Array, faces: NDArray[np.uint32]) -> NDArray[np.bool_]:
+def has_area(vertices: Float32Array, faces: NDArray) -> NDArray[np.bool_]:
     """(m,) whether each of the faces (m, 3) over vertices (n, 3) has an area, to the precision of float32."""
     a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
     edges = b - a, c - b, a - c

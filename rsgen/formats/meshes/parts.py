@@ -18,6 +18,7 @@ from rsgen.array_types import BoolArray, FloatArray, IntArray
 from rsgen.errors import UserError
 from rsgen.limits import MOST_M
 from rsgen.render.material import Material
+from rsgen.render.meshes import has_area
 
 log = logging.getLogger("rsgen")
 
@@ -93,10 +94,7 @@ def _moved(part: Part, T: FloatArray) -> Part:
 
 def _solid(part: Part) -> tuple[Part, int]:
     """The part without triangles of no area, as float32 has them, and how many those were."""
-    a, b, c = (part.vertices[part.faces[:, k]].astype(np.float32).astype(float) for k in range(3))
-    edges = np.stack([b - a, c - b, a - c])
-    longest = (edges**2).sum(axis=2).max(axis=0)
-    keep = np.linalg.norm(np.cross(edges[0], edges[1]), axis=1) > 1e-7 * longest
+    keep = has_area(part.vertices.astype(np.float32), part.faces)
     colors = None if part.face_colors is None else part.face_colors[keep]
     return replace(part, faces=part.faces[keep], face_colors=colors), int((~keep).sum())
 

@@ -163,25 +163,26 @@ class Materials:
 
         source = next(iter(UsdShade.Utils.GetValueProducingAttributes(file)), file.GetAttr())
         asset = source.Get(self._time)
-        space = source.GetColorSpace() if node is None else _value(node.GetInput("sourceColorSpace"), self._time)
-        space = str(space) if str(space) in ("raw", "sRGB") else "auto"
+
+        def given(name: str) -> Any:
+            return None if node is None else _value(node.GetInput(name), self._time)
+
+        space = str(source.GetColorSpace() if node is None else given("sourceColorSpace"))
+        space = space if space in ("raw", "sRGB") else "auto"
         values = None if asset is None else self._image(source, asset, space)
         if values is None:
             name = "of no name" if asset is None else asset.path
             self._notes.add("texture missing or unreadable, a constant in its place", f"{name} of {path}")
-            fallback = None if node is None else _value(node.GetInput("fallback"), self._time)
-            return None if fallback is None else fallback
+            return given("fallback")
         if asset is not None and "<UDIM>" in asset.path:
             self._notes.add("of a texture in tiles only the first is taken", asset.path)
-        scale, bias = (_four(None if node is None else _value(node.GetInput(n), self._time), d)
-                       for n, d in (("scale", 1.0), ("bias", 0.0)))  # fmt: skip
+        scale, bias = _four(given("scale"), 1.0), _four(given("bias"), 0.0)
         if is_normal and (scale == 1).all() and not bias.any():
             scale, bias = np.full(4, 2.0), np.full(4, -1.0)  # what is meant, though not stated
         if (scale != 1).any() or bias.any():
             values = (values * scale + bias).astype(np.float32)
         where, transform = self._lookup(None if node is None else node.GetInput("st"))
-        wrap = wrap_of(*(None if node is None else _value(node.GetInput(n), self._time) for n in ("wrapS", "wrapT")))
-        return _Channel(UsdImage(values, wrap, transform, where), output)
+        return _Channel(UsdImage(values, wrap_of(given("wrapS"), given("wrapT")), transform, where), output)
 
     def _image(self, source: Any, asset: Any, space: str) -> Float32Array | None:
         key = str(asset.resolvedPath) or asset.path, space
@@ -203,11 +204,10 @@ class Materials:
             if (var := node.GetInput("varname")) or "PrimvarReader" in _identifier(node):
                 name = str(_value(var, self._time) or COORDINATES)
                 break
-            own = [_value(node.GetInput(k), self._time) for k in ("rotation", "scale", "translation")]
-            values: list[Any] = [
-                d if v is None else v for v, d in zip(own, (0.0, (1.0, 1.0), (0.0, 0.0)), strict=True)
-            ]  # fmt: skip
-            step = transform_of(float(values[0]), np.array(values[1], float), np.array(values[2], float))
+            own = {k: _value(node.GetInput(k), self._time) for k in ("rotation", "scale", "translation")}
+            scale = np.ones(2) if own["scale"] is None else np.array(own["scale"], float)
+            move = np.zeros(2) if own["translation"] is None else np.array(own["translation"], float)
+            step = transform_of(float(own["rotation"] or 0.0), scale, move)
             transform = transform @ np.vstack([step, [0, 0, 1]])
             given = node.GetInput("in")
         return name, transform[:2]
