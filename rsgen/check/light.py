@@ -1,4 +1,4 @@
-"""How right the baked light is, against path tracing; and what all measurements of the renderer start from."""
+"""The error of baked light against path tracing; and what all measurements of the renderer start from."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from rsgen.produce.ground_truth import Motion, load_motion
 PSNR_FLOOR_DB = 36.0
 _REFERENCE_DEPTH = 64  # path length of the reference; Russian roulette ends most paths long before
 _REFERENCE_PASS = 64  # samples per pixel of one pass, for progress
-_LEAST_ERROR = 1e-6  # squared: less than that cannot be told from none
+_LEAST_ERROR = 1e-6  # squared: less than that cannot be distinguished from none
 _SURE = 2.0  # standard errors
 _SEEDS = 1_000_000  # of one run's samples
 _BAKED_SPP = 256  # samples of the baked picture: what is compared is its light, not its noise
@@ -64,7 +64,7 @@ def compare_light(
 
     Noise is taken out, both pictures': the squared error is the product of two errors, of different samples throughout.
     So is what sRGB's bend makes of the reference's noise (see `_encoded`).
-    How much of it that leaves unsure is told from its scatter over pixels.
+    The uncertainty that this leaves is estimated from the scatter over pixels.
     Writes baked, path-traced and eight times their difference as one picture if a path is given. lit: what `lit_scene`
     returns, if it is at hand. seed: of all samples. Raises UserError.
     """

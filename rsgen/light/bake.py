@@ -1,17 +1,16 @@
-"""Bake a scene's diffuse irradiance: direct light by emitter sampling, indirect by gathering over bounces.
+"""Bake a scene's diffuse irradiance: direct light by emitter sampling, indirect light by gathering over bounces.
 
-1. Every lattice point of `irradiance.Lattice` (both sides of each triangle; points that coincide are one) gets direct
-   light from each lamp with a stratified set of samples, from the sky and off mirrors as `sky` has it, and off lacquer
-   and brushed metal as `caustics` has it.
-   Where a mesh is finer than the texel, a thinned set of points is computed and the others are interpolated.
-2. Indirect light varies slowly, so it is gathered at a still thinner set, a few texels apart, by cosine-distributed
-   rays that look the previous bounce up where they hit, and interpolated in position and normal.
-3. Points that never get any light (buried in another object) are marked as not alive, and how far others count where
-   something stands on their surface (`barriers`).
+1. Every point of `irradiance.Lattice` gets direct light: from each lamp (`lamps`), from the sky and off mirrors
+   (`sky`), and off lacquer and brushed metal (`caustics`). Both sides of each triangle have points; points that
+   coincide are one. Where a mesh is finer than the texel, a thinned set of points is computed and the others are
+   interpolated.
+2. Indirect light varies slowly, so it is gathered at a still thinner set, a few texels apart (`indirect`).
+3. Points that no light reaches (buried in another object) are marked as not alive. Where something stands on a surface,
+   `barriers` limits how far its points count.
 
-How many samples a point gets depends on what their scatter would show as (`sampling`); what is left is smoothed where
-it hides any difference (`interpolation`). All randomness is a fixed low-discrepancy sequence rotated by a hash of the
-point's number: a scene bakes to the same bytes each time on one backend.
+A point gets as many samples as the visible error of their scatter needs (`sampling`). The scatter that is left is
+smoothed where it hides any difference (`interpolation`). All randomness is a fixed low-discrepancy sequence rotated by
+a hash of the point's number: a scene bakes to the same bytes each time on one backend.
 """
 
 from __future__ import annotations
@@ -93,7 +92,7 @@ def _direct(
     area (n,): of the surface that each stands for, m². Raises UserError if there are none.
     """
     scene, points, follow = surfaces.scene, surfaces.points, surfaces.follow
-    # A first look at some of the points tells how bright it is about, which is what scatter is compared with.
+    # A first look at some of the points estimates how bright the scene is, which scatter is compared with.
     looked_at, stands_for = thin(points, _FIRST_LOOK_TEXELS * light.texel_m, fine)
     report = _reporter(progress, 0.03, 0.04, "a first look at the light")
     grey = first_look(scene, points, fine[looked_at], follow, report).mean(axis=1)[stands_for]

@@ -1,10 +1,10 @@
-"""What stands on a surface and parts it: a floor under a wall, a board or a box is two pieces, each with its own light.
+"""Barriers on a surface: a floor under a wall, a board or a box is two pieces of surface, each with its own light.
 
-Light must not be mixed across: outside of a wall the sky shines on the floor, a texel from the room. Between every two
-neighbours of a triangle's grid a ray runs just above the surface. Where something is in its way, each of the two counts
-as far as that alone (`Barriers.reach`, for the lookup), and pieces of surface that are joined nowhere nearby are kept
-apart while light is smoothed and interpolated (`Barriers.piece`). What has something right above it, as a desk has
-under a sheet of paper, is seen by nobody and counts for nothing beside it.
+Light must not be mixed across a barrier: outside a wall the sky shines on the floor, one texel away from the room. A
+ray runs just above the surface between every two neighbours of a triangle's grid. Where something blocks it, each of
+the two counts only up to the obstacle (`Barriers.reach`, for the lookup). Pieces of surface that are joined nowhere
+nearby are kept apart while light is smoothed and interpolated (`Barriers.piece`). A point right below something, such
+as a desk under a sheet of paper, is not visible and does not count for its neighbours.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A scene's baked light: from the cache if it was baked with the same inputs before, else baked now and kept."""
+"""A scene's baked light: from the cache if it was baked with the same inputs before, else baked now and stored."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def baked_field(
 ) -> IrradianceField:  # fmt: skip
     """The scene's irradiance: from `cache` (a folder) if it was baked with the same inputs before, else baked now.
 
-    view: eyes and directions (n, 3) of rays along which it will be seen; with them, how right a new bake is is logged.
+    view: eyes and directions (n, 3) of rays along which it will be seen; with them, a new bake's quality is logged.
     """
     lattice = make_lattice(scene, light.texel_m)
     key = cache_key(scene_hash, light)
@@ -71,7 +71,7 @@ def cache_key(scene_hash: str, light: LightConfig) -> str:
 
 
 def cache_folder(scene_file: Path) -> Path:
-    """Where a scene's bakes are kept: beside the scene if that is writable, else in the user's cache."""
+    """Where a scene's bakes are stored: beside the scene if that is writable, else in the user's cache."""
     if os.access(scene_file.parent, os.W_OK):
         return scene_file.parent / ".rsgen-cache"
     return user_cache()

@@ -1,7 +1,7 @@
-"""Light that lacquer and brushed metal throw: from lit places on them along their lobes to where it lands.
+"""Caustics of lacquer and brushed metal: photons from lit places on them along their lobes to where they land.
 
-Looked for from where it lands, the sun in a varnished table is found by one ray in a thousand; from the table it is
-where it goes (photon mapping: Jensen 1996). What lands is averaged over decimetres, which is what there is little of.
+A ray from where the light lands finds the sun in a varnished table one time in a thousand, so light is followed from
+the table instead (photon mapping: Jensen 1996). Photons are averaged over decimetres: they are few.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from rsgen.render.irradiance import at_triangles, registry_id
 from rsgen.render.meshes import mesh_arrays
 
 # Where photons land, the normals of the sides they land on, (n, 3) each, and what each brings, W: (n, CHANNELS).
-Landed = tuple[NDArray, NDArray, NDArray]
+Photons = tuple[NDArray, NDArray, NDArray]
 
 _A_SAMPLE, _MOST, _BATCH = 1 << 15, 1 << 21, 1 << 18  # photons: for each of a point's samples, in all, at a time
 _TURNS = 4  # surfaces that a photon is followed over
@@ -107,7 +107,7 @@ def gathered_caustics(scene: Any, points: SurfacePoints, which: IntArray, sample
     return draw(np.arange(len(which)), 0, samples, lambda _: None) / np.float32(samples / 2)
 
 
-def _photons(scene: Any, shapes: list[Any], photons: int, follow: bool) -> Iterator[Landed]:
+def _photons(scene: Any, shapes: list[Any], photons: int, follow: bool) -> Iterator[Photons]:
     """Yields what lands of so many photons that start from lit places on `shapes`, a batch and a turn at a time."""
     meshes = [mesh_arrays(shape) for shape in shapes]
     corners = np.concatenate([vertices[faces].astype(np.float64) for vertices, faces in meshes])
@@ -124,7 +124,7 @@ def _photons(scene: Any, shapes: list[Any], photons: int, follow: bool) -> Itera
         yield from _thrown(scene, at_triangles(of[at], face[at], uv)[1], number, growing[-1] / photons, follow)
 
 
-def _thrown(scene: Any, si: Any, which: IntArray, area: float, follow: bool) -> Iterator[Landed]:
+def _thrown(scene: Any, si: Any, which: IntArray, area: float, follow: bool) -> Iterator[Photons]:
     """What the photons `which` from places on lacquer bring, each of which has `area`, surface after surface."""
     specular = mi.BSDFContext()
     specular.type_mask = SPECULAR

@@ -136,7 +136,7 @@ def near_lamps(scene: Any, position: Float32Array) -> IntArray:
 
 
 def _kinds(scene: Any) -> list[tuple[Any, int, bool]]:
-    """What is sampled by itself: (emitter or None for any, number of its random numbers, one sample tells all)."""
+    """What is sampled by itself: (emitter, None for any; number of its random numbers; whether one sample is exact)."""
     lamps = lamps_of(scene)
     if len(lamps) > MANY_EMITTERS:
         return [(None, 0, False)]

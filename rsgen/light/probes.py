@@ -1,8 +1,8 @@
-"""The light that arrives at places in the air, as irradiance by direction: what things that move are lit by.
+"""Light probes: the light that arrives at places in the air, as irradiance by direction, which lights moving objects.
 
-Lamps and sky by light samples, as far as nothing static stands in between; light off surfaces, baked as it is, and what
-comes through panes and off mirrors by rays spread evenly over all directions. All places use the same directions, so
-that what scatter is left does not flicker along a path.
+Lamps and the sky are sampled, with the shadows of what is static. Baked light off surfaces, and what comes through
+panes and off mirrors, is found by rays spread evenly over all directions. All places use the same directions, so that
+the scatter that is left does not flicker along a path.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _PLACES = 256  # at once
 
 
 def gathered_light(scene: Any, field: IrradianceField, p_world: FloatArray) -> FloatArray:
-    """Coefficients (n, 9, 3) of irradiance by the direction faced (see `object_light`) at places (n, 3), world, m."""
+    """Coefficients (n, 9, 3) of irradiance by the direction faced (see `moving_objects`) at places (n, 3), world, m."""
     follow = passes_light_on(scene)
     parts = [_gathered(scene, field, p_world[k : k + _PLACES], follow) for k in range(0, len(p_world), _PLACES)]
     return irradiance_coefficients(np.concatenate(parts))

@@ -1,4 +1,4 @@
-"""How right baked light is where cameras look: against light computed for the very places that they see.
+"""The error of baked light where cameras look, against light computed for the very places that they see.
 
 Places lie anywhere between the samples, so that what the texel blurs counts as well as what scatters. What light a
 bounce finds on other surfaces is taken as baked.

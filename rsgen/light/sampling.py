@@ -97,7 +97,7 @@ def chunks(
         report(min(1.0, (begin + len(part)) / len(which)))
 
 
-# Sums (2, n, 4) over two halves of the samples `begin` to `begin + count` at some points, which it is told.
+# Of (which points, begin, count, progress): sums (2, n, 4) over two halves of their samples `begin` to `begin + count`.
 Sampler = Callable[[IntArray, int, int, Callable[[float], None]], Float32Array]
 
 GREY_SLOPE = 0.21  # of sRGB at its middle, by the logarithm of light

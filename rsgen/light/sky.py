@@ -1,8 +1,8 @@
 """Light from the sky, and lamps' light that comes off mirrors or through thick glass, on points of surfaces.
 
-In a room a sky is seen through a window only: most directions that are drawn from the whole of it end at a wall. So a
-first look learns where light comes from in each part of the scene, as a histogram over directions, and half of the
-directions are drawn from that: path guiding (Müller, Gross, Novák, CGF 2017), with cells and bins of one size.
+A room sees the sky through windows only: most directions sampled from the whole sky end at a wall. So a first pass
+learns where light comes from in each part of the scene, as a histogram over directions, and half of the directions are
+sampled from that: path guiding (Müller, Gross, Novák, CGF 2017), with cells and bins of one size.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ def first_scatterer(scene, ray, pick, follow, active):
     pi = scene.ray_intersect_preliminary(ray, coherent=False, active=going)
     if dr.hint(follow, mode="scalar"):
         while going:
-            # Most of what is met is matte: told by its flags, before the costly description of the place.
+            # Most of what is met is matte: flags show that without the costly description of the place.
             kind = pi.shape.bsdf().flags()
             going &= pi.is_valid() & (passed < _MOST) & ((kind & _STRAIGHT) != 0)
             si = pi.compute_surface_interaction(ray, mi.RayFlags.All, going)
@@ -82,7 +82,7 @@ def first_scatterer(scene, ray, pick, follow, active):
 
 @dr.syntax
 def surface_radiance(scene, field, ray, number, i, pick, follow, active):
-    """Radiance times π (Color3f) that matte surfaces send along a ray, lit as `field` says.
+    """Radiance times π (Color3f) that matte surfaces send along a ray, lit as `field` states.
 
     With `follow` by way of whatever mirrors or lets through, which of a surface's lobes by lot; without, the first
     surface counts as matte altogether, as the last one does after many. number, i: of the place and of its ray, for

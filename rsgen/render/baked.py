@@ -142,7 +142,7 @@ def trace_baked(scene, field, sampler, ray, bounces, active, first_lobe, first_l
         wo.z *= dr.sign(si.wi.z)
         lobe = bsdf.eval(diffuse, si, wo, active & ~last) / dr.maximum(dr.abs(wo.z), 1e-6)
         once, albedo = bsdf.sample(everything, si, sampler.next_1d(active), sampler.next_2d(active), active & last)
-        # Of rough metal seen from behind Mitsuba says that it sends nothing along no direction.
+        # Of rough metal seen from behind Mitsuba samples no direction, with weight 0.
         further = active & last & ~beyond & ((once.sampled_type & _SPECULAR) != 0) & (dr.max(albedo) > 0)
         irradiance = field.lookup(pi, si, -ray.d, active)
         counts = active & ~further & ((depth > 0) | matte_too)

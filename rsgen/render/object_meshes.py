@@ -1,4 +1,4 @@
-"""Meshes of the things that move by themselves: each a Mitsuba scene of its own, in its own frame, without light."""
+"""Meshes of moving objects: each a Mitsuba scene of its own, in its own frame, without light."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ normals: of the triangle at p, in the camera frame of the line's mid-exposure, t
 
 color_depth: planar z of p, m; 0 at infinity.
 
-object_ids: which of the things that move p is on, 0 for none; p then moves with it, in all of the above.
+object_ids: which of the moving objects p is on, 0 for none; p then moves with it, in all of the above.
 """
 
 from __future__ import annotations
@@ -255,5 +255,5 @@ def global_instant(camera: Camera, shutter: Shutter, stamp: float, time: GlobalT
 
 
 def _seed(seed: int, image: int) -> int:
-    # Of its own for each image and apart from the frame's: a twin's noise tells nothing about the frame's.
+    # Of its own for each image and apart from the frame's: a twin's noise is independent of the frame's.
     return int(np.random.SeedSequence([seed, 1 + image]).generate_state(1)[0])
