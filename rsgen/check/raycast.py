@@ -1,6 +1,6 @@
 """Depth of a sequence against an independent ray caster: trimesh with Embree on scene.ply, float64 rows' poses.
 
-What moves by itself is cast in its own frame, with each ray moved to where the thing is at its line's time.
+What moves by itself is cast in its own frame, with each ray moved to where the object is at its line's time.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ _TARGET_PIXELS = 3000  # small images are sampled more densely than every fourth
 
 @dataclass(frozen=True, eq=False)
 class RelativeMotion:
-    """T_object_body(t) of a body and a thing along splines; `project_rolling` takes it in the place of a spline."""
+    """T_object_body(t) of a body and an object along splines; `project_rolling` takes it in the place of a spline."""
 
     body: Spline
     thing: Spline
@@ -56,7 +56,7 @@ class RelativeMotion:
         return np.asarray(se3.inverse(self.thing.pose(t)) @ self.body.pose(t))
 
     def pose_and_velocity(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """`pose`, and the body's twist (..., 6) against the thing in the body's frame, m/s and rad/s."""
+        """`pose`, and the body's twist (..., 6) against the object in the body's frame, m/s and rad/s."""
         T_world_body, w_body = self.body.pose_and_velocity(t)
         T_world_object, w_object = self.thing.pose_and_velocity(t)
         T_object_body = se3.inverse(T_world_object) @ T_world_body
@@ -90,7 +90,7 @@ def check_reprojection(sequence: Sequence, pairs: int) -> tuple[bool, str]:
             return False, f"{frame}: only {len(size)} pixels agree on a surface, {result.occluded} are hidden"
         median, share = float(np.median(size)), float((size <= INLIER_M).mean())
         ok &= median <= MEDIAN_TOLERANCE_M and share >= INLIER_SHARE
-        for which in np.unique(result.number[result.number > 0]):  # nor a thing that moves another way
+        for which in np.unique(result.number[result.number > 0]):  # nor an object that moves another way
             part = size[result.number == which]
             if len(part) >= MINIMUM_PIXELS and not np.median(part) <= INLIER_M:
                 name = sequence.objects[which - 1].name
@@ -140,7 +140,7 @@ def reproject_depth(sequence: Sequence, k: int, next_k: int) -> Reprojection:
 
     Pixels of frame k go to the world with their own line's pose and into the other frame with the rolling-shutter
     projection (3); the planar z predicted there is compared with the observed one, interpolated bilinearly in inverse
-    depth. What is on a thing that moves by itself goes with it. Left out: places where that is not good to 0.5 mm
+    depth. What is on a moving object goes with it. Left out: places where that is not good to 0.5 mm
     (edges), and points hidden by a nearer surface.
     Raises UserError for unreadable files.
     """
@@ -174,7 +174,7 @@ def reproject_depth(sequence: Sequence, k: int, next_k: int) -> Reprojection:
 def depth_points(sequence: Sequence, k: int) -> FloatArray:
     """Points (n, 3) in the world that every fourth pixel of exact depth k shows, each from its own line's pose.
 
-    Without those on things that move by themselves. Raises UserError for unreadable files.
+    Without those on moving objects. Raises UserError for unreadable files.
     """
     seen = _depth_pixels(sequence, k)
     return seen.p_world[seen.number == 0]

@@ -32,7 +32,7 @@ class ColorRenderer:
     def __init__(self, scene: Any, integrator: Any, camera: Camera, shutter: Shutter, spp: int) -> None:
         """`integrator`: any Mitsuba sampling integrator, e.g. `path` or `rsgen.render.baked.BakedIntegrator`.
 
-        Only the latter shows things that move, its `objects`.
+        Only the latter shows moving objects, its `objects`.
         """
         self._scene = scene
         self._integrator = integrator
@@ -128,7 +128,7 @@ class DepthRenderer:
         return self.cast(T_world_cam, stamp)[0]
 
     def cast(self, T_world_cam: PoseFunction, stamp: float) -> tuple[Float32Array, Float32Array | None]:
-        """`render`'s z, and which of the things that move each pixel shows (h, w): 0 none, k + 1 the k-th.
+        """`render`'s z, and which of the moving objects each pixel shows (h, w): 0 none, k + 1 the k-th.
 
         None where nothing moves.
         """

@@ -84,7 +84,7 @@ class ObjectLight:
 
 @dataclass(frozen=True, eq=False)
 class MovingObject:
-    """A thing: its mesh, T_world_object(t), and what lights it; None where it is only met, not seen."""
+    """An object: its mesh, T_world_object(t), and what lights it; None where it is only met, not seen."""
 
     mesh: ObjectMesh
     spline: Spline
@@ -93,7 +93,7 @@ class MovingObject:
 
 @dataclass(frozen=True)
 class Meeting:
-    """What rays meet first among things: which (UInt32; 0 none, k + 1 the k-th), at what distance, and each one's hit.
+    """What rays meet first among objects: which (UInt32; 0 none, k + 1 the k-th), at what distance, and each one's hit.
 
     t: of the rays' own length, no more than what was given. hits: each with the ray in its frame, and its pose.
     """
@@ -104,7 +104,7 @@ class Meeting:
 
 
 class ObjectsInFrame:
-    """All things over one frame of one camera. No dataclass, which Dr.Jit's loops would take apart as their state."""
+    """All objects over one frame of one camera. No dataclass, which Dr.Jit's loops would take apart as their state."""
 
     def __init__(
         self, objects: Sequence[MovingObject], camera: Camera, shutter: Shutter, stamp: float,
@@ -112,13 +112,13 @@ class ObjectsInFrame:
     ) -> None:  # fmt: skip
         """Of the frame at `stamp` (s). reference (3,): what `carried` counts positions from; default: the origin.
 
-        Raises UserError if a thing's spline does not cover the frame.
+        Raises UserError if an object's spline does not cover the frame.
         """
         self._objects, self._exposure_s = objects, shutter.exposure_s
         self._span = shutter.exposure_s + shutter.readout_s
         of, own = PoseTable.of, [o.spline.pose for o in objects]
         self._poses = [of(mi.Vector4f, camera, shutter, pose, stamp) for pose in own]
-        # One table of all, for points that know their thing: first of what stays, then of each thing.
+        # One table of all, for points that know their object: first of what stays, then of each object.
         still = np.tile(np.eye(4), (1, 1, 1))
         still[:, :3, 3] = 0.0 if reference is None else reference
         self._carried = of(mi.Vector4f, camera, shutter, lambda t: still, stamp, reference).followed_by(
@@ -151,7 +151,7 @@ class ObjectsInFrame:
         return Meeting(number, t, tuple(hits))
 
     def hide(self, ray: Any, active: Any) -> Any:
-        """Whether a thing stands in the way of rays, which end at their `maxt`."""
+        """Whether an object stands in the way of rays, which end at their `maxt`."""
         hidden = mi.Bool(False)
         for thing, poses in zip(self._objects, self._poses, strict=True):
             own, near = _own_ray(thing, poses.at(ray.time + self._exposure_s), ray, ray.maxt)
@@ -186,7 +186,7 @@ class ObjectsInFrame:
         return total
 
     def normal(self, meeting: Meeting) -> Any:
-        """Unit normals (Normal3f) of the triangles that rays meet, in the things' own frames, towards the rays."""
+        """Unit normals (Normal3f) of the triangles that rays meet, in the objects' own frames, towards the rays."""
         normal = mi.Normal3f(0)
         for k, (hit, own, _) in enumerate(meeting.hits):
             here = meeting.number == k + 1
@@ -195,7 +195,7 @@ class ObjectsInFrame:
         return normal
 
     def place(self, meeting: Meeting) -> Any:
-        """Points (Point3f) that rays meet, in the things' own frames; 0 where that is nothing."""
+        """Points (Point3f) that rays meet, in the objects' own frames; 0 where that is nothing."""
         place = mi.Point3f(0)
         for k, (_, own, _) in enumerate(meeting.hits):
             place = dr.select(meeting.number == k + 1, own(meeting.t), place)
@@ -204,7 +204,7 @@ class ObjectsInFrame:
     def carried(self, number: Any, t: Any, p: Any, normal: Any) -> tuple[Any, Any]:
         """Points and normals at t seconds after the first line's shutter opened, from the reference, world axes.
 
-        Given in the frame of the thing `number` - 1; where number is 0 they stay what they are.
+        Given in the frame of the object `number` - 1; where number is 0 they stay what they are.
         """
         rows = self._carried.at(t, beyond=True, number=number)
         moved = mi.Point3f(*(a + row.w for a, row in zip(_rotated(rows, p), rows, strict=True)))
@@ -224,7 +224,7 @@ class ObjectsInFrame:
 
 
 class MovingObjects:
-    """The things of a sequence; what renders them points them at each frame, as `RollingShutterSensor` is."""
+    """The objects of a sequence; what renders them points them at each frame, as `RollingShutterSensor` is."""
 
     def __init__(self, objects: Sequence[MovingObject]) -> None:
         self.objects = tuple(objects)
@@ -237,7 +237,7 @@ class MovingObjects:
 
 
 class ShadedField:
-    """A scene's irradiance without what the things around take of it; stands in for `IrradianceField`."""
+    """A scene's irradiance without what the objects around take of it; stands in for `IrradianceField`."""
 
     def __init__(self, field: Any, objects: MovingObjects) -> None:
         self._field, self._objects = field, objects
@@ -250,7 +250,7 @@ class ShadedField:
 
 
 def _own_ray(thing: MovingObject, rows: Rows, ray: Any, most: Any) -> tuple[Any, Any]:
-    """Rays in the thing's own frame, and whether they come near it within `most`."""
+    """Rays in the object's own frame, and whether they come near it within `most`."""
     o = mi.Point3f(*_rotated_back(rows, ray.o - _origin(rows)))
     d = mi.Vector3f(*_rotated_back(rows, ray.d))
     to_middle = mi.Point3f(*thing.mesh.middle.tolist()) - o

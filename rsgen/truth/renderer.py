@@ -56,7 +56,7 @@ class TruthRenderer:
     ) -> None:
         """`scene` and `integrator` as for `ColorRenderer`; `color` is the stream that the images belong to.
 
-        objects: things that move, whose masks then are made too.
+        objects: moving objects, whose masks then are made too.
         """
         self._scene, self._truth = scene, truth
         self._camera, self._shutter = color.camera, color.shutter
@@ -73,11 +73,11 @@ class TruthRenderer:
     ) -> dict[str, NDArray[Any]]:  # fmt: skip
         """Every image of `TruthConfig.images` of the frame at `stamp` (s): uint8 sRGB (h, w, 3), or float32 (h, w, n).
 
-        With `object_ids` if things move. n is the number of the image's EXR channels; with one channel the image is
-        (h, w). `T_world_cam` takes times (n,) s to poses (n, 4, 4) of the colour camera; UserError if it ends before a
-        frame's last line. `next_stamp` is the next frame's stamp, None after the last frame: then flow_next is 0 and
-        nowhere valid. `seed` decides the random numbers of the frame's twins. exposure_s: of this frame and the next,
-        where they are others than the stream's. brightness: factor on the light of the 8-bit images.
+        With `object_ids` if there are moving objects. n is the number of the image's EXR channels; with one channel the
+        image is (h, w). `T_world_cam` takes times (n,) s to poses (n, 4, 4) of the colour camera; UserError if it ends
+        before a frame's last line. `next_stamp` is the next frame's stamp, None after the last frame: then flow_next is
+        0 and nowhere valid. `seed` decides the random numbers of the frame's twins. exposure_s: of this frame and the
+        next, where they are others than the stream's. brightness: factor on the light of the 8-bit images.
         """
         if exposure_s is not None:
             shutters = [replace(self._shutter, exposure_s=each) for each in exposure_s]
@@ -225,7 +225,7 @@ def _moving(
 
 
 def _carrying(camera: MovingCamera, things: ObjectsInFrame | None, hits: _PixelHits) -> MovingCamera:
-    """The camera of a frame over which the points hit move with the things that they are on."""
+    """The camera of a frame over which the points hit move with the objects that they are on."""
     if things is None:
         return camera
     return replace(camera, carry=lambda t, p: tuple(things.carried(hits.number, t, mi.Point3f(p), mi.Normal3f(0))[0]))
@@ -235,7 +235,7 @@ def _carrying(camera: MovingCamera, things: ObjectsInFrame | None, hits: _PixelH
 class _PixelHits:
     """Per pixel, on the device: what its ray meets. Positions relative to the reference, m, world axes.
 
-    Those on things that move, and the normals there, are in the things' own frames.
+    Those on moving objects, and the normals there, are in the objects' own frames.
     """
 
     uv: Any  # the pixel itself
@@ -245,7 +245,7 @@ class _PixelHits:
     normal: Any  # world axes, towards the camera, 0 at infinity
     n_cam: Any
     z: Any
-    number: Any = 0  # of the thing, 0 for none
+    number: Any = 0  # of the object, 0 for none
 
 
 def global_instant(camera: Camera, shutter: Shutter, stamp: float, time: GlobalTime) -> float:
