@@ -75,13 +75,16 @@ def test_no_engine_is_loaded_where_nothing_is_rendered() -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_help_and_info_load_no_engine() -> None:
+def test_help_and_info_load_no_engine_and_no_format() -> None:
+    guests = (*ENGINES, "trimesh", "rosbags", "pxr", "rsgen.formats.")
     code = (
-        "import sys\nfrom rsgen.cli.main import main\nfor words in (['render', '--help'], ['info', 'nowhere']):\n"
+        "import sys\nfrom rsgen.cli.main import main\n"
+        "for words in (['render', '--help'], ['export', '--help'], ['info', 'nowhere']):\n"
         "    try:\n        main(words)\n    except SystemExit:\n        pass\n"
-        f"sys.exit(bool({set(ENGINES)!r} & set(sys.modules)))"
+        f"sys.exit(', '.join(name for name in sys.modules if name.startswith({guests!r})) or 0)"
     )
-    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True).returncode == 0
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_the_tracker_loads_no_renderer() -> None:
