@@ -14,7 +14,7 @@ from pathlib import Path
 
 from benchmarks import sections
 from benchmarks.verdicts import cliff, sentences
-from rsgen.console.tables import Entry, Table
+from rsgen.console.tables import Entry, Table, significant
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, read_text
 from rstrack.bench.experiments.readout_results import errors, readout_chart
@@ -39,7 +39,7 @@ ROOT = Path(__file__).parents[1]
 GATE, FULL = (ROOT / "benchmarks/results" / f"{tier}.json" for tier in ("gate", "full"))
 RESULTS, README, READOUT = ROOT / "docs/results.md", ROOT / "README.md", ROOT / "docs/readout.png"
 BEGIN, END = "<!-- results:begin (python -m benchmarks.show writes this) -->", "<!-- results:end -->"
-_BEGIN = "<!-- results:begin"
+HEADLINE = ("<!-- headline:begin -->", "<!-- headline:end -->")
 _ABOUT = """\
 Written by `python -m benchmarks.show` from the records in `benchmarks/results`: change nothing here. How to measure it
 again is in [its README](../benchmarks/README.md), what was learnt on the way in [the notebook](notebook/README.md)."""
@@ -68,6 +68,13 @@ _WHAT = {
     "kiss-icp": "lidar odometry",
     "small-gicp": "lidar odometry",
     "orb-slam3": "SLAM with loops, depth and colour",
+}
+# What a newcomer compares first.
+_HEADLINE = {
+    "rs-pg": "`rs-pg`",
+    "gs-pg": "the same with a global shutter",
+    "orb-slam3": "ORB-SLAM3",
+    "open3d-icp-keyframe": "Open3D's point-to-plane ICP",
 }
 
 
@@ -127,20 +134,32 @@ def readme_block(gate: Records, full: Records) -> str:
     ])  # fmt: skip
 
 
-def with_block(readme: str, block: str) -> str:
-    """The README with another block between its markers. Raises UserError: it has none."""
-    head, begin, rest = readme.partition(_BEGIN)
-    _, end, tail = rest.partition(END)
-    if not begin or not end:
-        raise UserError(f"README.md: has no lines '{BEGIN}' and '{END}': put them around the results")
-    return f"{head}{BEGIN}\n{block.strip()}\n{END}{tail}"
+def headline(full: Records) -> str:
+    """The README's first figures: errors on real recordings, ours and others', the same averages as in its table."""
+    real = of_group(full, "real")
+    means = averages(real)
+    errors = {method: means[method].figures["ate_mm"] for method in _HEADLINE if method in means}
+    listed = [f"{_HEADLINE[method]} {significant(error)} mm" for method, error in errors.items()]
+    if not listed:
+        return "-"
+    what = f"{', '.join(sequences_of(real))}; a guessed camera file, the truth's clock fitted"
+    return f"On real recordings ({what}) the ATE is {', '.join(listed)}: [all results](docs/results.md)."
+
+
+def with_block(readme: str, block: str, begin: str = BEGIN, end: str = END) -> str:
+    """The README with another block between two markers. Raises UserError: it has none."""
+    head, found, rest = readme.partition(begin.partition(" (")[0])
+    _, last, tail = rest.partition(end)
+    if not found or not last:
+        raise UserError(f"README.md: has no lines '{begin}' and '{end}': put them around the results")
+    return f"{head}{begin}\n{block.strip()}\n{end}{tail}"
 
 
 def documents(gate: Records, full: Records) -> dict[Path, str]:
     """Every text that shows records, as it should be. Raises UserError."""
     return {
         RESULTS: results_markdown(gate, full),
-        README: with_block(read_text(README), readme_block(gate, full)),
+        README: with_block(with_block(read_text(README), readme_block(gate, full)), headline(full), *HEADLINE),
     }
 
 

@@ -13,7 +13,17 @@ import pytest
 from benchmarks import show
 from benchmarks.inference import tolerances
 from benchmarks.sections import PAPERS_GROUPS
-from benchmarks.show import BEGIN, END, draw_readout, readme_block, readout_charts, results_markdown, with_block
+from benchmarks.show import (
+    BEGIN,
+    END,
+    HEADLINE,
+    draw_readout,
+    headline,
+    readme_block,
+    readout_charts,
+    results_markdown,
+    with_block,
+)
 from benchmarks.verdicts import beaten, sentences
 from rsgen.errors import UserError
 from rstrack.bench.record import CellRecord, read_records, write_records
@@ -192,6 +202,14 @@ def test_the_block_is_put_between_its_markers(full: dict[str, CellRecord]) -> No
         with_block("# Title\n", "")
 
 
+def test_the_headline_has_the_averages_of_real_recordings(full: dict[str, CellRecord]) -> None:
+    text = headline(full)
+    assert "fr1_rpy" in text and "`rs-pg` 0.500 mm" in text and "ORB-SLAM3 18.0 mm" in text
+    readme = f"a\n{HEADLINE[0]}\nold\n{HEADLINE[1]}\nb\n"
+    assert with_block(readme, text, *HEADLINE) == readme.replace("old", text)
+    assert headline({}) == "-"
+
+
 def test_the_command_writes_and_checks(
     tmp_path: Path, gate: dict[str, CellRecord], full: dict[str, CellRecord], monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -207,7 +225,7 @@ def test_the_command_writes_and_checks(
     assert read_records(tmp_path / "gate.json")["track/table1-320/rs-pg"].scatter["ate_mm"][0] == pytest.approx(
         0.04, 0.1
     )
-    (tmp_path / "README.md").write_text(f"{BEGIN}\n{END}\n")
+    (tmp_path / "README.md").write_text("\n".join((*HEADLINE, BEGIN, END, "")))
     assert show.main(["--check"]) == 1
     assert "results.md" in capsys.readouterr().out
     assert show.main([]) == 0
