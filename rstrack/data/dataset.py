@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +21,13 @@ from rsgen.array_types import Float32Array, FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.format import DEPTH_SCALE, StreamName
-from rsgen.sequence.reader import Sequence, read_sequence
+from rsgen.sequence.reader import Sequence
 from rsgen.sequence.trajectory import Trajectory
-from rstrack.data.camera_file import RigFile, camera_content, read_rig, run_cameras
+from rstrack.data.camera_file import RigFile, camera_content, run_cameras
 from rstrack.data.estimate import INFO
 from rstrack.data.image_files import ImageReader, prefetched
 from rstrack.data.imu.recording import ImuFiles, ImuRecording, ReadImu, find_imu
-from rstrack.data.layouts.generated import as_recorded, is_exact, sigma_of, with_depth_scale
-from rstrack.data.layouts.seven_scenes import is_seven_scenes, read_seven_scenes
-from rstrack.data.layouts.tum_folder import TumFolder, read_tum_folder
+from rstrack.data.layouts import LAYOUTS, layout_of
 from rstrack.data.rig import NO_DEPTH_ERROR, DepthError, Frame, Image, Rig
 from rstrack.data.timing import Timing, stream_timing
 
@@ -223,24 +222,19 @@ class Dataset:
 def open_dataset(path: Path, camera_file: Path | None = None, imu_file: Path | None = None) -> Dataset:
     """Read the description and listings of a folder; images are read when asked for.
 
-    path: a sequence that rsgen wrote (it has a sequence.yaml, which holds the cameras), or a TUM RGB-D or ICL-NUIM
-      folder: rgb.txt and depth.txt, or associations.txt; see `rstrack.data.layouts.tum_folder`; or one in the layout of
-      7-Scenes: frame-000000.depth.png and so on; see `rstrack.data.layouts.seven_scenes`.
-    camera_file: the cameras, instead of those that a sequence.yaml, or a camera.yaml or calibration.yaml in the folder,
-      tells; see `rstrack.data.camera_file`.
+    path: a folder of one of the layouts in `rstrack.data.layouts`.
+    camera_file: the cameras, instead of those of a sequence.yaml, camera.yaml or calibration.yaml in the folder;
+      see `rstrack.data.camera_file`.
     imu_file: what describes the IMU, see `rstrack.data.imu.description`; without it the IMU is read when asked for.
     Raises UserError, one line: what is missing or wrong, where, and how to mend it.
     """
     root = Path(path)
     if not root.is_dir():
-        raise UserError(f"{root}: no such folder: give an rsgen sequence or a TUM RGB-D, ICL-NUIM or 7-Scenes folder")
-    if not (root / "sequence.yaml").exists():
-        read = read_seven_scenes if is_seven_scenes(root) else read_tum_folder
-        found = replace(_of_tum(root, read(root, camera_file)), imu_files=find_imu(root, imu_file))
-    else:
-        sequence = read_sequence(root)
-        found = replace(_of_generated(root, sequence), imu_files=find_imu(root, imu_file, sequence.meta))
-        found = found if camera_file is None else _seen_as(found, camera_file)
+        raise UserError(f"{root}: no such folder: give {' or '.join(LAYOUTS)}")
+    layout: Any = import_module(layout_of(root))
+    found: Dataset = layout.read(root, camera_file)
+    meta = found.images.meta if isinstance(found.images, Sequence) else None
+    found = replace(found, imu_files=find_imu(root, imu_file, meta))
     if imu_file is not None:
         _ = found.read_imu  # what was named has to be right
     return found
@@ -254,81 +248,6 @@ def open_tracked(path: Path, run: Path, info: dict[str, Any], camera_file: Path 
     """
     recorded = None if run_cameras(info) is None else run / INFO
     return open_dataset(path, camera_file or recorded).as_seen_by(info)
-
-
-def _seen_as(dataset: Dataset, camera_file: Path) -> Dataset:
-    """A generated sequence with other cameras than it was taken with. Raises UserError: not of its images' size."""
-    sizes = [(c.width, c.height) for c in (dataset.rig.color_camera, dataset.rig.depth_camera)]
-    file = read_rig(camera_file, *sizes).of(dataset.name)
-    found = [(c.width, c.height) for c in (file.rig.color_camera, file.rig.depth_camera)]
-    if found != sizes:
-        shown = [" and ".join(f"{w}x{h}" for w, h in pair) for pair in (found, sizes)]
-        raise UserError(f"{camera_file}: cameras (colour and depth) of {shown[0]} pixels, but images are {shown[1]}")
-    seen = replace(
-        dataset.seen_with(file.rig), notes=(*dataset.notes, *file.notes), scan_named=file.scan_named,
-        depth_error=file.depth_error,
-    )  # fmt: skip
-    if file.scale_named and isinstance(dataset.images, Sequence):
-        scaled = with_depth_scale(dataset.images, file.depth_scale)
-        seen = replace(seen, images=scaled, depth_scale=file.depth_scale)
-    if file.color_offset_s is None:
-        return replace(seen, color_drift=file.color_drift)
-    return seen.with_color_offset(file.color_offset_s, drift=file.color_drift)
-
-
-def _of_generated(root: Path, sequence: Sequence) -> Dataset:
-    """A sequence of rsgen. Raises UserError."""
-    if not is_exact(sequence):
-        return _of_recorded(root, sequence)
-    color, depth = sequence.streams["color"], sequence.streams["depth"]
-    noise = sequence.meta.get("noise")
-    color_noise = noise.get("color") if isinstance(noise, dict) else None
-    # What is rendered without a camera's noise has no corners that are darker: they need not be looked at.
-    falloff = 0.0 if color_noise in (None, "none") else None
-    rig = Rig(
-        depth.camera, depth.shutter, color.camera, color.shutter, sequence.T_color_depth, falloff, sigma_of(sequence)
-    )
-    groups = group_colors(depth.stamps, color.stamps)
-    stamps = (depth.stamps, color.stamps)
-    return Dataset(
-        sequence.name, root, rig, *stamps, groups, sequence, truth=sequence.spline, sequence=sequence,
-        depth_scale=depth.depth_scale,
-    )  # fmt: skip
-
-
-def _of_recorded(root: Path, sequence: Sequence) -> Dataset:
-    """A sequence with a driver's stamps or registered depth. Raises UserError."""
-    try:
-        found = as_recorded(sequence)
-    except UserError as error:
-        raise UserError(f"{root}: {error}") from None
-    stamps, color_stamps = found.timing.depth.used, found.timing.color.used
-    groups = group_colors(stamps, color_stamps)
-    return Dataset(
-        sequence.name, root, found.rig, stamps, color_stamps, groups, sequence, truth_poses=found.truth_poses,
-        timing=found.timing, depth_scale=sequence.streams["depth"].depth_scale,
-    )  # fmt: skip
-
-
-def _of_tum(root: Path, tum: TumFolder) -> Dataset:
-    """A recording with its stamps as its camera file wants them. Raises UserError."""
-    name = root.resolve().name
-    file = tum.file.of(name)
-    try:
-        depth = stream_timing("depth", tum.depth_stamps, file.stamps, file.depth_offset_s)
-        color = stream_timing("colour", tum.color_stamps, file.stamps, 0.0)
-    except UserError as error:
-        raise UserError(f"{root}: {error}") from None
-    if tum.depth_numbers is not None:
-        depth = replace(depth, listed=tum.depth_numbers)
-    timing = Timing(depth, color, file.color_offset_s, file.notes)
-    dataset = Dataset(
-        name, root, file.rig, depth.used, color.used, (), tum.images, truth_poses=tum.truth_poses,
-        notes=tum.notes, timing=timing, scan_named=file.scan_named, depth_scale=file.depth_scale,
-        depth_offset_s=file.depth_offset_s, depth_error=file.depth_error,
-    )  # fmt: skip
-    found = dataset.with_color_offset(file.color_offset_s or 0.0, drift=file.color_drift)
-    return replace(found, timing=timing)
 
 
 def group_colors(depth_stamps: npt.ArrayLike, color_stamps: npt.ArrayLike) -> tuple[tuple[int, ...], ...]:

@@ -9,7 +9,7 @@ Nothing there tells times, cameras or shutters. Frames are taken to be 1/30 s ap
 left out is a gap. An image that is the one before again is left out, and a number at which both cameras have nothing
 new takes no time: recorders that were faster than the camera wrote those (91 of the 1000 frames of one of 7-Scenes').
 Without a camera file depth has the intrinsics that the data set's authors recommend, colour and the pose between them
-are a Kinect's as those who use the data set have it, and shutters are global. What is assumed is in `TumFolder.notes`.
+are a Kinect's as those who use the data set have it, and shutters are global. What is assumed is in `Dataset.notes`.
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.camera_file import RigFile, read_rig
+from rstrack.data.dataset import Dataset
 from rstrack.data.image_files import ImageFiles, decode_color, decode_depth, first_size, repeated
-from rstrack.data.layouts.tum_folder import TumFolder, find_camera_file, repeats_note
+from rstrack.data.layouts.recorded import RecordedFolder, find_camera_file, repeats_note
 from rstrack.data.rig import DEFAULT_SIGMA, Rig
 
 IntArray = npt.NDArray[np.int64]
@@ -50,14 +51,14 @@ _UNITS_PER_M, _MISSING = 1000.0, 65535
 _SKEW = 1e-2
 
 
-def is_seven_scenes(root: Path) -> bool:
+def matches(root: Path) -> bool:
     """Whether a folder has this layout, and no listings, which would say more."""
     if (root / "depth.txt").exists() or (root / "rgb.txt").exists():
         return False
     return any(_NAME.fullmatch(path.name) for path in root.glob("frame-*"))
 
 
-def read_seven_scenes(root: Path, camera_file: Path | None) -> TumFolder:
+def read(root: Path, camera_file: Path | None) -> Dataset:
     """Read names, poses and cameras; images are decoded when asked for.
 
     camera_file: default camera.yaml, else calibration.yaml in the folder. Poses are taken for the depth camera's, which
@@ -81,7 +82,7 @@ def read_seven_scenes(root: Path, camera_file: Path | None) -> TumFolder:
     if without:
         notes = (*notes, f"{without} of {len(poses)} pose files hold no finite pose: there is no truth at these frames")
     stamps = _stamps(list(depth), idle), _stamps(list(color), idle)
-    return TumFolder(file, *stamps, images, truth, notes, _stamps(list(depth)))
+    return RecordedFolder(file, *stamps, images, truth, notes, _stamps(list(depth))).dataset(root)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -18,50 +18,37 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.files import listed_file, read_text
 from rsgen.sequence.trajectory import ICL_RATE_HZ, Trajectory, read_trajectory
 from rstrack.data.camera_file import EXAMPLE, RigFile, read_rig
+from rstrack.data.dataset import Dataset
 from rstrack.data.image_files import (
     ImageFiles,
-    ImageReader,
     decode_color,
     decode_depth,
     decode_image,
     first_size,
     repeated,
 )
+from rstrack.data.layouts.recorded import CAMERA_FILES, RecordedFolder, find_camera_file, repeats_note
 from rstrack.data.own_intrinsics import OwnIntrinsics, SharedImages, read_own_intrinsics
 from rstrack.data.rig import Rig
 
 _ASSOCIATIONS = ("associations.txt", "associate.txt", "association.txt")
-_CAMERA_FILES = ("camera.yaml", "calibration.yaml", "camchain-imucam.yaml", "camchain.yaml")
 ESTIMATED = "# estimated, not measured: "
 """Begins the first line of a groundtruth.txt whose poses are another estimate from the same images."""
 _MAX_STAMP_S = 1e11  # the year 5138; today in milliseconds, microseconds or nanoseconds is beyond
 
 
-@dataclass(frozen=True)
-class TumFolder:
-    """What is found in a folder. Stamps as listed (n,) and (m,) in seconds, increasing; truth_poses are T_world_depth.
-
-    file: the camera file's content. notes: what had to be assumed, each in one line. depth_numbers: of frames that are
-    numbered, the seconds (n,) that their numbers alone would tell.
-    """
-
-    file: RigFile
-    depth_stamps: FloatArray
-    color_stamps: FloatArray
-    images: ImageReader
-    truth_poses: Trajectory | None
-    notes: tuple[str, ...] = ()
-    depth_numbers: FloatArray | None = None
+def matches(root: Path) -> bool:
+    """Whether a folder has listings."""
+    return any((root / name).exists() for name in ("rgb.txt", "depth.txt", *_ASSOCIATIONS))
 
 
-def read_tum_folder(root: Path, camera_file: Path | None) -> TumFolder:
+def read(root: Path, camera_file: Path | None) -> Dataset:
     """Read cameras, listings and ground truth; images are decoded when asked for, but all have to be there.
 
     camera_file: default camera.yaml, calibration.yaml or Kalibr's camchain-imucam.yaml or camchain.yaml in the folder.
@@ -79,7 +66,7 @@ def read_tum_folder(root: Path, camera_file: Path | None) -> TumFolder:
     own_depth = read_own_intrinsics(root, "depth", stamps[0], file.rig.depth_camera)
     images = files if own_color is own_depth is None else SharedImages(files, own_color, own_depth)
     notes = (*depth_note, *color_note, *_own_notes(own_color, own_depth), *_truth_note(root))
-    return TumFolder(file, *stamps, images, _truth(root, file.rig), notes)
+    return RecordedFolder(file, *stamps, images, _truth(root, file.rig), notes).dataset(root)
 
 
 # --- listings --------------------------------------------------------------------------------------------------------
@@ -178,24 +165,11 @@ def _own_notes(*each: OwnIntrinsics | None) -> tuple[str, ...]:
     )
 
 
-def repeats_note(name: str, again: npt.NDArray[np.bool_]) -> str:
-    """For the screen. again (n,): which images of a stream are the one before again."""
-    return (
-        f"{np.count_nonzero(again)} of {len(again)} {name} images are the one before again, byte for byte: they were "
-        "not taken anew, and are left out"
-    )
-
-
 def _listings(root: Path) -> tuple[_Listing, _Listing]:
     """Depth and colour images that the folder lists. Raises UserError."""
     depth_file, color_file = root / "depth.txt", root / "rgb.txt"
     associations = next((root / name for name in _ASSOCIATIONS if (root / name).exists()), None)
     if associations is None or (depth_file.exists() and color_file.exists()):
-        if not (depth_file.exists() or color_file.exists()):
-            raise UserError(
-                f"{root}: neither an rsgen sequence (sequence.yaml) nor a TUM or ICL-NUIM folder "
-                f"(rgb.txt and depth.txt, or {_ASSOCIATIONS[0]})"
-            )
         return (
             _Listing(root, depth_file, tuple(entry for (entry,) in _entries(depth_file, 1))),
             _Listing(root, color_file, tuple(entry for (entry,) in _entries(color_file, 1))),
@@ -231,18 +205,11 @@ def _is_depth_first(left: _Listing, right: _Listing) -> bool:
 # --- cameras and truth -----------------------------------------------------------------------------------------------
 
 
-def find_camera_file(root: Path, camera_file: Path | None) -> Path | None:
-    """The given one, else that in the folder, None without any."""
-    if camera_file is not None:
-        return camera_file
-    return next((root / name for name in _CAMERA_FILES if (root / name).exists()), None)
-
-
 def _rig_file(root: Path, camera_file: Path | None, color: Sequence[Path], depth: Sequence[Path]) -> RigFile:
     file = find_camera_file(root, camera_file)
     if file is None:
         raise UserError(
-            f"{root}: nothing tells the cameras: write {root / _CAMERA_FILES[0]} (or give a camera file) with "
+            f"{root}: nothing tells the cameras: write {root / CAMERA_FILES[0]} (or give a camera file) with "
             f"'{EXAMPLE}' and, unless depth is registered to colour, 'depth: {{...}}' likewise"
         )
     return read_rig(file, first_size(color, decode_color), first_size(depth, decode_depth))

@@ -66,7 +66,7 @@ def outside(root: Path) -> None:
 
 
 FAULTS: dict[str, tuple[Fault, str]] = {
-    "no listings": (remove("rgb.txt", "depth.txt"), "neither an rsgen sequence"),
+    "no listings": (remove("rgb.txt", "depth.txt"), "nothing that can be tracked: give an rsgen sequence"),
     "no colour listing": (remove("rgb.txt"), r"rgb\.txt: cannot be read"),
     "empty listing": (listing("depth.txt", ""), r"depth\.txt: is empty"),
     "comments only": (listing("depth.txt", "# nothing", ""), r"depth\.txt: lists no image"),

@@ -157,7 +157,7 @@ def link_out(root: Path) -> None:
 FAULTS: dict[str, tuple[Fault, str]] = {
     "no depth": (unlink("*.depth.png"), "has no depth image"),
     "no colour": (unlink("*.color.png"), "has no colour image"),
-    "nothing": (unlink("*"), "neither an rsgen sequence"),
+    "nothing": (unlink("*"), "nothing that can be tracked: give an rsgen sequence"),
     "no camera, odd size": (unlink("camera.yaml"), "images are 32x24 and 32x24, and nothing tells the cameras"),
     "two colours": (lambda r: cv2.imwrite(str(r / "frame-000001.color.jpg"), pixels(1)), "frame 1 has .* already"),
     "link out": (link_out, "path 'frame-000001.depth.png' leaves"),
