@@ -27,9 +27,9 @@ from rstrack.calibration.figures import displacement_px, rms
 from rstrack.calibration.parameters import COLOR_LENS, DRIFT, EXTRINSICS, NAMES, POSES, Parameters
 from rstrack.calibration.result import CameraCalibration
 from rstrack.calibration.run import calibrate, parameters_of
-from rstrack.data.camera_file import usual
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.image_files import NoisyImages
+from rstrack.data.rig import sigma_of_file
 
 # How wrong cameras are stated, and multiples of it: readouts by half, colour's clock in s, extrinsics.
 UNIT_READOUT, UNIT_OFFSET_S, UNIT_M, UNIT_RAD = 0.5, 0.015, 5e-3, float(np.radians(0.5))
@@ -233,7 +233,7 @@ def lens_cell(task: Task, progress: Progress) -> Figures:
         progress("lenses", k / count, "")
         wrong = _wrong(rig.color_camera, rng)
         before.append(rms(displacement_px(rig.color_camera, wrong)))
-        stated = replace(rig, depth_camera=wrong, color_camera=wrong, sigma=usual(wrong))
+        stated = replace(rig, depth_camera=wrong, color_camera=wrong, sigma=sigma_of_file(wrong))
         depth, color = (replace(shutter, readout_s=0.0) for shutter in (rig.depth_shutter, rig.color_shutter))
         dataset = task.noisy.seen_with(replace(stated, depth_shutter=depth, color_shutter=color))
         found = calibrate(dataset, frames=task.cell.frames, options=task.options)

@@ -22,9 +22,8 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.sequence.trajectory import Trajectory
-from rstrack.data.camera_file import usual
 from rstrack.data.dataset import Dataset, ImageReader, group_colors
-from rstrack.data.rig import Rig
+from rstrack.data.rig import Rig, sigma_of_file
 from rstrack.metrics.association import true_poses, truth_of
 
 ColorChange = Callable[[int, ByteArray], ByteArray]
@@ -222,7 +221,7 @@ def camera_told(
     cameras = replace(rig, depth_camera=stated(rig.depth_camera), color_camera=stated(rig.color_camera))
     T_color_depth = T_stated_color @ rig.T_color_depth if rotation_deg else rig.T_color_depth
     # A rendering's lenses count as exact, whatever its depth camera has wrong.
-    sigma = usual(cameras.color_camera) if rig.sigma.focal == 0.0 else rig.sigma
+    sigma = sigma_of_file(cameras.color_camera) if rig.sigma.focal == 0.0 else rig.sigma
     cameras = replace(cameras, T_color_depth=T_color_depth, sigma=sigma)
     made = readout_told(replace(dataset, rig=cameras), shift_s=1e-3 * readout_ms)
     return color_late(made, 1e-3 * color_ms) if color_ms else made

@@ -38,8 +38,8 @@ from rstrack.calibration.parameters import (
     changed,
 )
 from rstrack.calibration.solve import Solution
-from rstrack.data.camera_file import usual
 from rstrack.data.dataset import Dataset
+from rstrack.data.rig import sigma_of_file
 
 _OPPOSITE: dict[str, Scan] = {
     "top-bottom": "bottom-top", "bottom-top": "top-bottom", "left-right": "right-left", "right-left": "left-right",
@@ -97,7 +97,7 @@ class CameraCalibration:
             depth_shutter=replace(rig.depth_shutter, readout_s=found.depth_readout_s, scan=scans[0]),
             color_shutter=replace(rig.color_shutter, readout_s=found.color_readout_s, scan=scans[1]),
             T_color_depth=found.T_color_depth,
-            sigma=usual(color, self.stated_sigmas()),
+            sigma=sigma_of_file(color, self.stated_sigmas()),
         )
         found_dataset = replace(self.dataset, rig=rig, depth_error=found.error)
         return found_dataset.with_color_offset(found.color_offset_s, drift=found.color_drift)

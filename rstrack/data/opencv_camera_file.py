@@ -25,16 +25,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import yaml
 
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
-from rsgen.geometry import se3
-from rsgen.geometry.camera import Camera, Model
-from rsgen.geometry.shutter import Shutter
-from rsgen.limits import rigid
-from rstrack.data.rig import Rig
 
 _STREAMS = {"color": ("color", "rgb"), "depth": ("depth",)}
 _OTHER = {"color": "depth", "depth": "color"}
@@ -42,7 +36,6 @@ _MATRIX = ("camera_matrix", "k", "intrinsics")
 _SCALARS = ("fx", "fy", "cx", "cy")
 _DISTORTION = ("distortion", "distortion_coefficients", "dist_coeffs", "d")
 _EXTRINSIC = ("t_color_depth", "t_rgb_depth", "extrinsics", "extrinsic")
-_ROTATION_TOLERANCE = 1e-3  # what printing a matrix to three or four digits loses
 
 Values = dict[str, Any]
 Size = tuple[int, int]
@@ -70,42 +63,19 @@ def is_opencv(text: str) -> bool:
     return text.lstrip().startswith("%YAML") or "!!opencv-" in text
 
 
-def read_opencv_rig(path: Path, text: str, color_size: Size, depth_size: Size) -> tuple[Rig, float | None]:
-    """The cameras and the depth images' units per metre (None: not told).
+def opencv_content(path: Path, text: str, color_size: Size, depth_size: Size) -> dict[str, Any]:
+    """What a camera.yaml with the same cameras has.
 
-    path: for messages. text: what is in it. Sizes are (width, height) in pixels, for where the file tells none.
+    path: for messages. text: what is in it. Sizes are (width, height) in pixels, for where the file has none.
     Raises UserError that lists the keys that are there.
     """
     keys = _Keys(path, _parse(path, text))
-    color_camera, depth_camera = keys.camera("color", color_size), keys.camera("depth", depth_size)
-    color_shutter, depth_shutter = keys.shutter("color"), keys.shutter("depth")
-    T_color_depth = keys.first(_EXTRINSIC)
-    try:
-        T = extrinsic(np.eye(4) if T_color_depth is None else T_color_depth, "T_color_depth")
-    except UserError as error:
-        raise UserError(f"{path}: {error}") from None
-    scale = keys.first(("depth_scale",))
-    if scale is not None and not (np.ndim(scale) == 0 and 1.0 <= _number(scale) < math.inf):
-        raise UserError(f"{path}: depth_scale {scale!r} is not a number of units per metre, such as 5000")
-    rig = Rig(depth_camera, depth_shutter, color_camera, color_shutter, T)
-    return rig, None if scale is None else _number(scale)
-
-
-def extrinsic(T: npt.ArrayLike, name: str) -> FloatArray:
-    """T (4, 4), its rotation made orthonormal to the last digit. Raises UserError if it is not a rigid transform."""
-    try:
-        return se3.orthonormalise(rigid(T, _ROTATION_TOLERANCE))
-    except ValueError as error:
-        raise UserError(f"{name}: {error}") from None
-
-
-def check_fy(fy: float, where: str) -> None:
-    """Raises UserError for ICL-NUIM's published focal length."""
-    if fy < 0:
-        raise UserError(
-            f"{where}: fy = {fy:g} belongs to ICL-NUIM's y-up camera: write {-fy:g}; "
-            "the images stay as they are and its .gt.freiburg file is converted when it is read"
-        )
+    content: dict[str, Any] = {"color": keys.stream("color", color_size), "depth": keys.stream("depth", depth_size)}
+    if (scale := keys.first(("depth_scale",))) is not None:
+        content["depth"]["depth_scale"] = scale
+    if (T := keys.first(_EXTRINSIC)) is not None:
+        content["T_color_depth"] = np.asarray(T).tolist()
+    return content
 
 
 @dataclass(frozen=True)
@@ -125,48 +95,41 @@ class _Keys:
         there = ", ".join(self.values)[:400] or "none"
         return UserError(f"{self.path}: {message}; keys that are there: {there}")
 
-    def camera(self, stream: str, size: Size) -> Camera:
+    def stream(self, stream: str, size: Size) -> dict[str, Any]:
+        """Camera and shutter of a stream. Raises UserError."""
         intrinsics = self._intrinsics(stream) or self._intrinsics(_OTHER[stream])
         if intrinsics is None:
             raise self.fail(f"no camera matrix for {stream}: add '{stream}_intrinsics: [fx, fy, cx, cy]'")
         width, height = (
-            default if (told := self.first((name, f"image_{name}"), stream)) is None else told
+            default if (stated := self.first((name, f"image_{name}"), stream)) is None else stated
             for name, default in zip(("width", "height"), size, strict=True)
         )
-        told = self.first(_DISTORTION, stream)
-        distortion = _flat([] if told is None else told)
+        stated = self.first(_DISTORTION, stream)
+        distortion = _flat([] if stated is None else stated)
         if len(distortion) > 5 and not any(distortion[5:]):
             distortion = distortion[:5]  # OpenCV's longer models with their further terms at zero
-        model: Model = "radtan" if any(distortion) else "pinhole"
-        coefficients = tuple(distortion) if model == "radtan" else ()
-        check_fy(intrinsics[1], f"{self.path}: {stream} camera matrix")
-        try:
-            return Camera(_whole(width), _whole(height), *intrinsics, model, coefficients)
-        except UserError as error:
-            raise UserError(f"{self.path}: {stream} {error}") from None
-
-    def shutter(self, stream: str) -> Shutter:
+        lens = {"model": "radtan", "distortion": distortion} if any(distortion) else {}
         readout = self._seconds(stream, ("readout", "rolling_shutter_readout"))
         if readout is None:
             raise self.fail(
                 f"no readout time for {stream}: add 'readout_s: 0.028' (seconds; 0 for a global shutter), "
                 "or give a camera file"
             )
-        try:
-            return Shutter(readout, self._seconds(stream, ("exposure",)) or 0.0)
-        except UserError as error:
-            raise UserError(f"{self.path}: {stream} {error}") from None
+        return {
+            "width": width, "height": height, "intrinsics": intrinsics, "readout_s": readout,
+            "exposure_s": self._seconds(stream, ("exposure",)) or 0.0, "scan": "top-bottom", **lens,
+        }  # fmt: skip
 
     def _intrinsics(self, stream: str) -> tuple[float, float, float, float] | None:
-        told = self.first(_MATRIX, stream)
-        if told is None:
-            told = [self.first((name,), stream) for name in _SCALARS]
-            if any(value is None for value in told):
+        stated = self.first(_MATRIX, stream)
+        if stated is None:
+            stated = [self.first((name,), stream) for name in _SCALARS]
+            if any(value is None for value in stated):
                 return None
-        numbers = _flat(told)
+        numbers = _flat(stated)
         if len(numbers) == 9 and numbers[1:2] + numbers[3:4] + numbers[6:] == [0, 0, 0, 0, 1]:
             numbers = [numbers[i] for i in (0, 4, 2, 5)]
-        if len(numbers) != 4 or np.shape(told) == (2, 2):
+        if len(numbers) != 4 or np.shape(stated) == (2, 2):
             raise self.fail(f"the camera matrix of {stream} is neither [fx 0 cx; 0 fy cy; 0 0 1] nor [fx, fy, cx, cy]")
         fx, fy, cx, cy = numbers
         return fx, fy, cx, cy
@@ -219,8 +182,3 @@ def _flat(value: Any) -> list[float]:
 def _number(value: Any) -> float:
     numbers = _flat(value)
     return numbers[0] if len(numbers) == 1 else math.nan
-
-
-def _whole(value: Any) -> int:
-    number = _number(value)
-    return int(number) if math.isfinite(number) and number == int(number) else 0

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from typing import Any
 
@@ -74,6 +75,14 @@ UNFOUND_OFFSET_S = 0.015
 
 UNDISTORTED_K1 = 0.1
 """σ of k1 where a real lens is said to have no distortion, as it hardly ever is."""
+
+
+def sigma_of_file(camera: Camera, stated: Mapping[str, float] | None = None) -> CalibrationSigma:
+    """How far a camera file may be wrong that states these σ, by the names that it has for them. camera: colour's."""
+    found = dict(stated or {})
+    if "center_px" in found:
+        found["center"] = found.pop("center_px") / camera.fx
+    return replace(DEFAULT_SIGMA if any(camera.distortion) else replace(DEFAULT_SIGMA, k1=UNDISTORTED_K1), **found)
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,8 @@ from rstrack.bench.changes import (
     with_depth,
     with_stamps,
 )
-from rstrack.data.camera_file import usual
 from rstrack.data.dataset import Dataset, open_dataset
+from rstrack.data.rig import sigma_of_file
 from rstrack.data.timing import Timing, stream_timing
 
 FRAMES = 30
@@ -177,7 +177,9 @@ def test_changes_by_name_and_what_is_wrong_with_them(dataset: Dataset) -> None:
 
 def test_a_wrong_camera_file(dataset: Dataset) -> None:
     rig = dataset.rig
-    assert rig.sigma.is_exact and camera_told(dataset).rig == dataclasses.replace(rig, sigma=usual(rig.color_camera))
+    assert rig.sigma.is_exact and camera_told(dataset).rig == dataclasses.replace(
+        rig, sigma=sigma_of_file(rig.color_camera)
+    )
     made = camera_told(dataset, focal=1.02, cx_px=1.5, cy_px=-2.0, readout_ms=-3.0, rotation_deg=0.5)
     for before, after in ((rig.depth_camera, made.rig.depth_camera), (rig.color_camera, made.rig.color_camera)):
         assert (after.fx, after.fy) == pytest.approx((1.02 * before.fx, 1.02 * before.fy))

@@ -18,10 +18,10 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.sequence.reader import Sequence, read_sequence
 from rsgen.sequence.trajectory import Trajectory
-from rstrack.data.camera_file import read_rig, usual
+from rstrack.data.camera_file import read_rig
 from rstrack.data.dataset import Dataset, group_colors
 from rstrack.data.registration import DepthSensor, registered_shutter
-from rstrack.data.rig import DEFAULT_SIGMA, EXACT_SIGMA, CalibrationSigma, Rig
+from rstrack.data.rig import DEFAULT_SIGMA, EXACT_SIGMA, CalibrationSigma, Rig, sigma_of_file
 from rstrack.data.timing import StampsMode, Timing, stream_timing
 
 
@@ -71,7 +71,7 @@ def sigma_of(sequence: Sequence) -> CalibrationSigma:
     A depth camera with fixed errors of its own has them though its lens is told: as usual, since a user of such a
     camera knows no more.
     """
-    sigma = usual(sequence.streams["color"].camera) if sequence.meta.get("declared") else EXACT_SIGMA
+    sigma = sigma_of_file(sequence.streams["color"].camera) if sequence.meta.get("declared") else EXACT_SIGMA
     noise: Any = sequence.meta
     for name in ("config", "depth", "noise"):
         noise = noise.get(name) if isinstance(noise, dict) else None

@@ -23,8 +23,8 @@ from rsgen.formats.export.registered import export_registered
 from rsgen.geometry import se3
 from rsgen.sequence.camera_yaml import TRUE_CAMERAS
 from rsgen.sequence.reader import read_sequence, sequence_info
-from rstrack.data.camera_file import usual
 from rstrack.data.dataset import open_dataset
+from rstrack.data.rig import sigma_of_file
 from rstrack.metrics.association import truth_of
 
 T_WRONG = se3.exp(np.array([0.02, 0.0, -0.01, 0.0, 0.03, 0.0])) @ synthetic.T_COLOR_DEPTH
@@ -90,7 +90,7 @@ def test_a_tracker_gets_what_is_declared_and_the_truth_with_the_true_camera_file
     honest, wrong = (open_dataset(root) for root in pair)
     assert wrong.rig.color_shutter.readout_s == 0.010 and wrong.rig.depth_shutter.readout_s == 0.020
     np.testing.assert_array_equal(wrong.rig.T_color_depth, T_WRONG)
-    assert honest.rig.sigma.is_exact and wrong.rig.sigma == usual(wrong.rig.color_camera)
+    assert honest.rig.sigma.is_exact and wrong.rig.sigma == sigma_of_file(wrong.rig.color_camera)
     mended = open_dataset(pair[1], pair[1] / TRUE_CAMERAS)
     assert mended.rig.color_camera == honest.rig.color_camera and mended.rig.depth_camera == honest.rig.depth_camera
     assert mended.rig.color_shutter == honest.rig.color_shutter

@@ -146,7 +146,7 @@ def test_a_run_json_opens_the_folder_as_the_run_saw_it(tmp_path: Path) -> None:
         del info["dataset"]["camera"]
         assert open_tracked(root, run, info).rig.color_shutter.readout_s == 0.001
     write_estimate(run, STAMPS, np.tile(np.eye(4), (4, 1, 1)), None, info)
-    with pytest.raises(UserError, match=r"run\.json: tells no cameras"):
+    with pytest.raises(UserError, match=r"run\.json: states no cameras"):
         open_dataset(root, run / "run.json")
     write_estimate(
         run, STAMPS, np.tile(np.eye(4), (4, 1, 1)), None, {"dataset": {"camera": {"color": COLOR | {"x": 1}}}}
