@@ -1,6 +1,6 @@
 """Reads every hostile file in a process of its own, whose memory is bounded, and says what came of each, as JSON lines.
 
-python hostile_worker.py FOLDER GROUP...     with tests/support on the path; see tests/test_hostile_files.py
+python hostile_worker.py FOLDER quick|all GROUP...     with tests/support on the path; see tests/test_hostile_files.py
 """
 
 from __future__ import annotations
@@ -79,15 +79,21 @@ def _run(case: hostile_cases.Case, folder: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def main(folder: Path, groups: list[str]) -> None:
+# Of damages that may be harmless, a quick run has every so manieth; what has to be refused it has all.
+_EVERY = 8
+
+
+def main(folder: Path, is_quick: bool, groups: list[str]) -> None:
     warnings.simplefilter("error")
     hostile_cases.prepare()
     resource.setrlimit(resource.RLIMIT_AS, (_MOST_ADDRESSES, _MOST_ADDRESSES))
     with contextlib.redirect_stdout(sys.stderr):
         cases = [case for group in groups for case in GROUPS[group](folder / group)]
-    for case in cases:
+    for k, case in enumerate(cases):
+        if is_quick and k % _EVERY and not (case.must_refuse or case.name.endswith("as it is")):
+            continue
         print(json.dumps(_run(case, folder / "one")), flush=True)
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), sys.argv[2:])
+    main(Path(sys.argv[1]), sys.argv[2] == "quick", sys.argv[3:])

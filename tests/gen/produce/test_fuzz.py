@@ -15,6 +15,7 @@ import synthetic
 import tiny
 import yaml
 from fuzzing import ConfigVariant
+from nightly import QUICK_OR_ALL, sampled
 
 import rsgen.cli.main
 import rsgen.produce.generate
@@ -103,19 +104,21 @@ def test_what_the_variants_are_made_of_is_accepted(
     assert check(ConfigVariant("whole", fuzzing.yaml_bytes(fuzzing.base_config(motion)), "", False))
 
 
-@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("field", sampled(FIELDS, 8))
 def test_a_field_takes_no_odd_values(field: str, check: Callable[[ConfigVariant], bool]) -> None:
     for variant in fuzzing.config_variants(field, SEED, extremes=1):
         check(variant)
 
 
-def test_odd_sections_and_contradictions_are_refused(check: Callable[[ConfigVariant], bool]) -> None:
-    for variant in fuzzing.structure_variants():
+@pytest.mark.parametrize("is_quick", QUICK_OR_ALL)
+def test_odd_sections_and_contradictions_are_refused(is_quick: bool, check: Callable[[ConfigVariant], bool]) -> None:
+    for variant in list(fuzzing.structure_variants())[:: 4 if is_quick else 1]:
         check(variant)
 
 
-def test_garbage_is_no_config(check: Callable[[ConfigVariant], bool]) -> None:
-    for variant in fuzzing.garbage_variants(SEED, edits=24):
+@pytest.mark.parametrize("is_quick", QUICK_OR_ALL)
+def test_garbage_is_no_config(is_quick: bool, check: Callable[[ConfigVariant], bool]) -> None:
+    for variant in fuzzing.garbage_variants(SEED, edits=4 if is_quick else 24):
         check(variant)
 
 
@@ -194,7 +197,7 @@ def test_whole_sequences_pass(use: Callable[[str], tuple[int, str]], sequence: P
     assert status == 0, text
 
 
-@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("name", sampled(FILES, 4))
 def test_a_damaged_file_is_named_by_all_that_read_it(
     name: str, sequence: Path, use: Callable[[str], tuple[int, str]]
 ) -> None:
@@ -221,7 +224,10 @@ def test_a_damaged_file_is_named_by_all_that_read_it(
                 assert (status == 1 and Path(name).name in text) or way in vague, (way, text)
 
 
-def test_whole_files_of_another_kind_or_size_are_named(sequence: Path, use: Callable[[str], tuple[int, str]]) -> None:
+@pytest.mark.parametrize("is_quick", QUICK_OR_ALL)
+def test_whole_files_of_another_kind_or_size_are_named(
+    is_quick: bool, sequence: Path, use: Callable[[str], tuple[int, str]]
+) -> None:
     small, rows = np.zeros((9, 12), np.float32), np.zeros((4, 36, 7))
     points = read_sequence(sequence).spline.control_points
     cases: list[tuple[str, bytes]] = [
@@ -254,7 +260,7 @@ def test_whole_files_of_another_kind_or_size_are_named(sequence: Path, use: Call
     for t0, dt in ((np.nan, 0.05), (1e300, 0.05), (0.0, 1e300), (0.0, 1e-300), (0.0, -1.0), (1e18, 0.05)):
         arrays = {"control_points": points, "t0": np.array(t0), "dt": np.array(dt)}
         cases.append(("spline.npz", encode_npz(arrays)))
-    for k, (name, data) in enumerate(cases):
+    for k, (name, data) in list(enumerate(cases))[:: 4 if is_quick else 1]:
         with fuzzing.replaced(sequence / name, data):
             status, text = verify(use)
             assert status == 1 and ("FAIL" in text), (k, text)
@@ -280,7 +286,7 @@ LISTINGS = [
 ]
 
 
-@pytest.mark.parametrize("case", range(len(LISTINGS)))
+@pytest.mark.parametrize("case", sampled(range(len(LISTINGS)), 3))
 def test_an_odd_line_in_a_listing_is_named(case: int, sequence: Path, use: Callable[[str], tuple[int, str]]) -> None:
     name, old, new = LISTINGS[case]
     data = (sequence / name).read_bytes()
@@ -316,7 +322,7 @@ ODD = (
 )
 
 
-@pytest.mark.parametrize(("entry", "count"), list(entries()))
+@pytest.mark.parametrize(("entry", "count"), sampled(entries(), 8))
 def test_no_entry_of_sequence_yaml_is_taken_on_trust(
     entry: str, count: int, sequence: Path, use: Callable[[str], tuple[int, str]]
 ) -> None:
