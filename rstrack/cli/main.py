@@ -112,7 +112,7 @@ def import_(
     if written.unknown:
         named = f" --device {device}" if device else ""
         print(
-            f"nothing tells the readout of {' and '.join(written.unknown)}: "
+            f"nothing states the readout of {' and '.join(written.unknown)}: "
             f"rstrack calibrate {out} --out {out / 'camera.yaml'}{named}"
         )
     print(f"{out}: ready (rstrack track {out} --out RUN)")

@@ -7,7 +7,7 @@ from rsgen.console.command_line import number
 from rstrack.metrics import consistency
 
 SequenceFolder = Annotated[Path, "rsgen sequence, TUM RGB-D, ICL-NUIM or 7-Scenes folder"]
-CameraFile = Annotated[Path | None, "camera file to go by instead of what the folder tells of its cameras", "FILE"]
+CameraFile = Annotated[Path | None, "camera file to use in place of the cameras that the folder states", "FILE"]
 ImuFile = Annotated[
     Path | None,
     "imu.yaml as Kalibr has it, of the IMU whose samples the folder has: densities, T_imu_depth or T_cam_imu, offset_s",
@@ -51,4 +51,4 @@ TruthNoise = Annotated[
     "MM,DEG",
     consistency.TruthNoise.parse,
 ]
-Run = Annotated[Path, "folder that 'rstrack track' wrote, or a TUM file"]
+RunFolder = Annotated[Path, "folder that 'rstrack track' wrote, or a TUM file"]

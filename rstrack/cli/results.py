@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from rsgen.console.command_line import Json, Quiet, print_figures
-from rstrack.cli.options import CameraFile, Run, SequenceFolder, TruthExtrinsics, TruthNoise, TruthOffset
+from rstrack.cli.options import CameraFile, RunFolder, SequenceFolder, TruthExtrinsics, TruthNoise, TruthOffset
 from rstrack.options import MapOptions
 
 
 def evaluate(
     sequence: Annotated[Path, "rsgen sequence, TUM RGB-D, ICL-NUIM or 7-Scenes folder; or a TUM file of true poses"],
-    run: Run,
+    run: RunFolder,
     *,
     camera: CameraFile = None,
     truth_offset: TruthOffset = None,
@@ -45,7 +45,7 @@ def evaluate(
 
 def plot(
     sequence: SequenceFolder,
-    run: Run,
+    run: RunFolder,
     *,
     camera: CameraFile = None,
     truth_offset: TruthOffset = None,
@@ -103,7 +103,7 @@ def report(
 
 def map_(
     sequence: SequenceFolder,
-    run: Run,
+    run: RunFolder,
     map: MapOptions,
     *,
     camera: CameraFile = None,
@@ -138,7 +138,7 @@ def map_eval(
 
 def keyframes(
     sequence: SequenceFolder,
-    run: Run,
+    run: RunFolder,
     *,
     camera: CameraFile = None,
     out: Annotated[Path, "folder to write", "DIR"],

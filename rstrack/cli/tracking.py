@@ -42,7 +42,7 @@ def track(
     ] = False,
     device: DeviceName = None,
     gravity: Annotated[
-        bool, "write the trajectory in a world whose z axis points up, as an IMU tells (rs-pgi, rs-gi)"
+        bool, "write the trajectory in a world whose z axis points up, as an IMU measures it (rs-pgi, rs-gi)"
     ] = False,
     resume: Annotated[
         bool, "go on with a run of the same settings in DIR that was stopped or killed, to the same bits"
@@ -124,7 +124,8 @@ def _viewed(view: Path | None, dataset: Dataset) -> AbstractContextManager[Viewe
 
 
 CALIBRATE_STATUS = (
-    "exit status: 0 done, 1 some values are not told by the recording, or not converged, 2 wrong input, 130 interrupted"
+    "exit status: 0 done, 1 not converged, or the recording does not determine some values, 2 wrong input, "
+    "130 interrupted"
 )
 
 
@@ -243,7 +244,7 @@ def refine(
     camera: CameraFile = None,
     imu: ImuFile = None,
     out: Annotated[Path, "folder for the refined run, made if need be", "DIR"],
-    rounds: Annotated[int, "rounds at most; fewer where nothing moves any more", "N"] = 3,
+    rounds: Annotated[int, "passes at most; fewer where nothing moves any more", "N"] = 3,
     quiet: Quiet = False,
 ) -> int:
     """Align every frame of a run to all keyframes that see it, at once, beside its IMU: writes a run folder with the

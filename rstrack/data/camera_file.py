@@ -11,7 +11,7 @@ configs. T_color_depth (4x4) is the identity where it is left out. color.offset_
 auto: see `rstrack.data.timing`. color.drift_ppm: millionths by which that grows over the recording, in whose middle it
 holds. `rstrack calibrate` finds both and writes such a file. clocks: {NAME: {offset_s: 0.02, drift_ppm: 3}} of the
 recording in a folder of that name alone. color.falloff: see `Rig`; auto: `track` finds it. stamps: see there, too.
-sigma: {focal: 0.01, center_px: 3, ...}: how far this may be wrong, see `CalibrationSigma`; the rest is as usual.
+sigma: {focal: 0.01, center_px: 3, ...}: how far this may be wrong, see `CalibrationSigma`; the rest is by default.
 depth.registered: warped into the colour camera, see `rstrack.data.registration`. depth.offset_s: seconds added to
 depth's stamps. calibration.yaml: see `rstrack.data.opencv_camera_file`; Kalibr's camchain.yaml: see
 `rstrack.data.kalibr_camera_file`. A run.json holds the cameras of its run in the same form (`camera_content`).
@@ -202,7 +202,7 @@ def read_rig(path: Path, color_size: Size, depth_size: Size) -> RigFile:
 
 
 def run_cameras(info: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The cameras of a run whose run.json holds `info`, as a camera.yaml has them; None where it does not tell."""
+    """The cameras of a run whose run.json holds `info`, as a camera.yaml has them; None where it has none."""
     dataset = info.get("dataset")
     cameras = dataset.get("camera") if isinstance(dataset, dict) else None
     return cameras if isinstance(cameras, dict) else None

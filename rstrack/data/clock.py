@@ -24,7 +24,7 @@ from scipy.sparse.linalg import spsolve
 
 from rsgen.array_types import FloatArray
 
-__all__ = ["Clock", "RunningClock", "drift_ppm", "estimate_clock", "regular", "straightened"]
+__all__ = ["RunningClock", "StampClock", "drift_ppm", "estimate_clock", "regular", "straightened"]
 
 Verdict = Literal["regular", "jittered", "irregular", "too short"]
 IntArray = npt.NDArray[np.int64]
@@ -50,8 +50,8 @@ _PASSES, _SETTLED_S = 30, 1e-6
 
 
 @dataclass(frozen=True)
-class Clock:
-    """What a stream's stamps tell of its clock.
+class StampClock:
+    """The clock behind a stream's stamps, as far as they show it.
 
     images: number of stamps. period_s: between images (0: too few stamps). first_s: straightened stamp of the first.
     jitter_rms_s, jitter_max_s: stamps against the straightened ones. dropped: periods without an image, pauses left
@@ -69,7 +69,7 @@ class Clock:
     verdict: Verdict
 
 
-def estimate_clock(stamps: npt.ArrayLike) -> Clock:
+def estimate_clock(stamps: npt.ArrayLike) -> StampClock:
     """The clock of stamps (n,) in seconds, not decreasing."""
     return straightened(stamps)[0]
 
@@ -80,7 +80,7 @@ def regular(stamps: npt.ArrayLike) -> FloatArray:
     return even if clock.verdict == "jittered" else np.asarray(stamps, np.float64)
 
 
-def drift_ppm(clock: Clock, other: Clock) -> float | None:
+def drift_ppm(clock: StampClock, other: StampClock) -> float | None:
     """Parts per million by which a clock runs fast against another stream's.
 
     Rates may be multiples of each other (15 and 30 Hz). None where they are not, within 1 %, or one is not known.
@@ -93,7 +93,7 @@ def drift_ppm(clock: Clock, other: Clock) -> float | None:
     return 1e6 * drift if abs(drift) < 0.01 else None
 
 
-def straightened(stamps: npt.ArrayLike) -> tuple[Clock, FloatArray]:
+def straightened(stamps: npt.ArrayLike) -> tuple[StampClock, FloatArray]:
     """The clock of stamps (n,) in seconds, not decreasing, and the stamps as it has them, whatever its verdict.
 
     Strictly increasing where `stamps` are; repeated images are a hundredth of a period apart.
@@ -102,8 +102,8 @@ def straightened(stamps: npt.ArrayLike) -> tuple[Clock, FloatArray]:
     steps = np.diff(t)
     if len(t) < _FEWEST or not (steps > 0).any():
         period = float(np.median(steps)) if len(steps) else 0.0
-        return Clock(len(t), period, float(t[0]) if len(t) else 0.0, 0.0, 0.0, 0, 0, "too short"), t
-    # Most steps are one period; where more than half are two, because images were dropped, the short ones tell.
+        return StampClock(len(t), period, float(t[0]) if len(t) else 0.0, 0.0, 0.0, 0, 0, "too short"), t
+    # Most steps are one period; where more than half are two, because images were dropped, the short ones decide.
     guesses = [np.median(steps[steps > 0]), np.quantile(steps[steps > 0], 0.1)]
     found = _with_period(t, float(guesses[0]))
     if found[0].verdict == "irregular":
@@ -112,7 +112,7 @@ def straightened(stamps: npt.ArrayLike) -> tuple[Clock, FloatArray]:
     return found
 
 
-def _with_period(t: FloatArray, guess: float) -> tuple[Clock, FloatArray]:
+def _with_period(t: FloatArray, guess: float) -> tuple[StampClock, FloatArray]:
     """The clock whose period is near `guess` seconds, and the stamps on it."""
     period = _refined(np.diff(t), guess)
     parts = np.split(np.arange(len(t)), np.flatnonzero(np.diff(t) > max(_PAUSE_S, 10.0 * period)) + 1)
@@ -133,11 +133,11 @@ def _with_period(t: FloatArray, guess: float) -> tuple[Clock, FloatArray]:
     error = t - even
     rms, most = float(np.sqrt(np.mean(error**2))), float(np.abs(error).max())
     # Of most stamps: a few that were held up by a busy computer do not make a clock irregular.
-    usual = float(np.sqrt(np.mean(np.sort(error**2)[: int(np.ceil(0.95 * len(t)))])))
+    typical = float(np.sqrt(np.mean(np.sort(error**2)[: int(np.ceil(0.95 * len(t)))])))
     verdict: Verdict = "regular" if rms <= _REGULAR_S else "jittered"
-    if not steady or usual > _IRREGULAR * period or repeated > 0.5 * len(t):
+    if not steady or typical > _IRREGULAR * period or repeated > 0.5 * len(t):
         verdict = "irregular"
-    return Clock(len(t), period, float(even[0]), rms, most, dropped, repeated, verdict), even
+    return StampClock(len(t), period, float(even[0]), rms, most, dropped, repeated, verdict), even
 
 
 def _refined(steps: FloatArray, guess: float) -> float:
@@ -199,10 +199,9 @@ def _on_clock(count: IntArray, t: FloatArray, again: npt.NDArray[np.bool_]) -> t
 
 def _basis(count: IntArray, duration_s: float) -> csr_array:
     """Functions (n, m) of the count: a line's for a recording of two minutes or less, then cubic B-splines."""
-    pieces = max(int(duration_s / _KNOTS_S), 1)
-    degree = 1 if pieces < 2 else 3
-    pieces = 1 if pieces < 2 else pieces
-    inner = np.linspace(count[0], count[-1], pieces + 1)
+    segments = max(int(duration_s / _KNOTS_S), 1)
+    degree = 1 if segments < 2 else 3
+    inner = np.linspace(count[0], count[-1], segments + 1)
     knots = np.concatenate([[inner[0]] * degree, inner, [inner[-1]] * degree])
     return csr_array(BSpline.design_matrix(count.astype(np.float64), knots, degree))
 
@@ -308,7 +307,7 @@ class RunningClock:
         return (y - slope * k) / n, slope
 
     def _shift(self, count: int, time: float) -> None:
-        """Count and time from an image `count` periods and `time` seconds later, and forget a little."""
+        """Count and time from an image `count` periods and `time` seconds later; older stamps weigh a little less."""
         n, k, kk, y, ky = self._sums
         moved = (n, k - count * n, kk - 2 * count * k + count**2 * n, y - time * n,
                  ky - time * k - count * y + count * time * n)  # fmt: skip

@@ -46,7 +46,7 @@ class Dataset:
     truth: T_world_depth(t), of exact rsgen sequences. truth_poses: T_world_depth, of others that have it.
     sequence: the rsgen sequence itself, where it is an exact one (`rstrack.data.layouts.generated`). notes: what had to
     be assumed when it was read. timing: of recordings, how their stamps came about. color_drift: seconds a second that
-    colour's offset grows by, see `with_color_offset`. scan_named: whether the cameras' description says which way
+    colour's offset grows by, see `with_color_offset`. scan_named: whether the cameras' description states which way
     images are read. depth_scale: units per metre of the depth images. depth_offset_s: what has been added to the stamps
     of registered depth, see `rstrack.data.camera_file`. images: as they are on disk; depth_error: of the depth in them.
     imu_files: where an IMU's samples are.
@@ -75,7 +75,7 @@ class Dataset:
         return len(self.stamps)
 
     def interval_s(self, frames: range) -> float | None:
-        """The usual time from one of these frames to the next, s; None of a single one."""
+        """The median time from one of these frames to the next, s; None of a single one."""
         return float(np.median(np.diff(self.stamps[frames]))) if len(frames) > 1 else None
 
     def frame(self, k: int, *, color: bool = True) -> Frame:
@@ -125,7 +125,7 @@ class Dataset:
     def imu(self) -> ImuRecording | None:
         """What an IMU recorded meanwhile, None without one; it is read when first asked for.
 
-        Raises UserError, one line: the file that is wrong, or that nothing tells where the IMU sits.
+        Raises UserError, one line: the file that is wrong, or that nothing states where the IMU sits.
         """
         return None if self.read_imu is None else self.read_imu.recording
 
@@ -147,7 +147,7 @@ class Dataset:
         """The same recording with `offset_s` added to the stamps that colour would have without any offset.
 
         note: for the screen, where the offset comes from. drift: what it grows by, s/s, if not as it did. sigma_s: how
-        far it may be wrong, if not as far as the rig says. Without a `timing` it is added to the stamps as they are.
+        far it may be wrong, if not as far as the rig states. Without a `timing` it is added to the stamps as they are.
         """
         drift = self.color_drift if drift is None else drift
         before = self.color_stamps if self.timing is None else self.timing.color.used
@@ -242,7 +242,7 @@ def open_dataset(path: Path, camera_file: Path | None = None, imu_file: Path | N
 
 def open_tracked(path: Path, run: Path, info: dict[str, Any], camera_file: Path | None = None) -> Dataset:
     """A folder as a run saw it, whose run.json holds `info`: by the camera file that is named, else by the run's own
-    cameras, else, of runs that do not tell them, by the folder's.
+    cameras, else, of runs that do not state them, by the folder's.
 
     Arguments as in `open_dataset`. Raises UserError.
     """

@@ -35,7 +35,7 @@ _AT_REST = 30
 class ImageFiles:
     """Decodes the images of a folder, and checks that they are as large as the cameras say.
 
-    depth_scale: units per metre. missing: a depth in units that says, as 0 does, that nothing was measured.
+    depth_scale: units per metre. missing: a depth in units that means, as 0 does, that nothing was measured.
     """
 
     rig: Rig
@@ -90,7 +90,7 @@ def _same_bytes(a: Path, b: Path) -> bool:
     try:
         return a.stat().st_size == b.stat().st_size and a.read_bytes() == b.read_bytes()
     except OSError:
-        return False  # said when it is decoded
+        return False  # reported when it is decoded
 
 
 def decode_image(path: Path) -> npt.NDArray[Any]:

@@ -1,4 +1,4 @@
-"""Kalibr's results, camchain.yaml or camchain-imucam.yaml, as a camera file and as what tells where the IMU sits.
+"""Kalibr's results, camchain.yaml or camchain-imucam.yaml, as a camera file and as the place of the IMU.
 
     cam0: {camera_model: pinhole, intrinsics: [fx, fy, cx, cy], distortion_model: radtan, distortion_coeffs: [...],
            resolution: [w, h], T_cam_imu: ..., timeshift_cam_imu: 0.002, line_delay: 5.8e-5}
@@ -60,8 +60,8 @@ class _Cam(BaseModel):
 class ChainCamera:
     """One camera of a chain.
 
-    has_readout: whether its readout is told. T_cam_imu (4, 4), and shift_s: t_imu - t_cam of the line that is read
-    first; None where they are not told.
+    has_readout: whether its readout is stated. T_cam_imu (4, 4), and shift_s: t_imu - t_cam of the line that is read
+    first; None where they are not stated.
     """
 
     camera: Camera
@@ -81,13 +81,13 @@ class Camchain:
 
     @property
     def color_offset_s(self) -> float | None:
-        """Seconds to add to colour's stamps for depth's clock; None where nothing tells both against the IMU."""
+        """Seconds to add to colour's stamps for depth's clock; None where not both are stated against the IMU."""
         shifts = self.color.shift_s, None if self.depth is None else self.depth.shift_s
         return None if shifts[0] is None or shifts[1] is None else shifts[0] - shifts[1]
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a chain does not tell."""
+        """What a chain does not state."""
         cameras = {"color": self.color} | ({} if self.depth is None else {"depth": self.depth})
         return tuple(
             f"the camchain has no line_delay of {name}: taken for a global shutter, rstrack calibrate finds its readout"
@@ -144,7 +144,7 @@ def _chain(path: Path, cams: dict[str, _Cam]) -> dict[str, FloatArray]:
             T_cam0_imu = _rigid(path, "cam0.T_cam_imu", first.T_cam_imu)
             T[name] = _rigid(path, f"{name}.T_cam_imu", cam.T_cam_imu) @ se3.inverse(T_cam0_imu)
         else:
-            raise UserError(f"{path}: {name}.T_cn_cnm1: is missing: nothing tells where the camera sits")
+            raise UserError(f"{path}: {name}.T_cn_cnm1: is missing: nothing states where the camera sits")
     return T
 
 

@@ -115,8 +115,8 @@ def read_own_intrinsics(root: Path, stream: StreamName, stamps: FloatArray, came
         raise UserError(f"{path}: focal lengths {table[:, 1].min():g} to {table[:, 1].max():g} are not of one camera")
     if (np.abs(np.array([camera.fx, camera.fy]) / shared[:2] - 1.0) > _MOST_APART).any():
         raise UserError(
-            f"{path}: is about a camera with fx {shared[0]:g}, not {camera.fx:g} as the camera file says: mend that, "
-            "or remove this file"
+            f"{path}: is about a camera with fx {shared[0]:g}, not {camera.fx:g} as the camera file states: correct "
+            "that, or remove this file"
         )
     own = np.column_stack([np.interp(stamps, table[:, 0], column) for column in table[:, 1:].T])
     return OwnIntrinsics(own, shared)

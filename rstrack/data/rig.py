@@ -30,7 +30,7 @@ counts it. T_color_depth ← exp(ε) T_color_depth. Depth's scale as a part, its
 
 @dataclass(frozen=True)
 class CalibrationSigma:
-    """Standard deviations of what a camera file says, of both cameras alike; 0: exact.
+    """Standard deviations of what a camera file states, of both cameras alike; 0: exact.
 
     focal: part of the focal lengths; aspect: part of fy beyond that; center: principal point, in focal lengths; k1:
     distortion; rotation_deg, translation_m: of T_color_depth, an axis; readout_s; offset_s: colour's clock;
@@ -68,13 +68,13 @@ EXACT_SIGMA = CalibrationSigma()
 """Of renderings, but for depth cameras with fixed errors."""
 
 DEFAULT_SIGMA = CalibrationSigma(0.01, 0.003, 0.01, 0.02, 0.3, 0.005, 0.003, 0.003, 0.01, 0.005, 0.001)
-"""Of a camera file that does not say: a judgement of what such files have wrong, not a measurement."""
+"""Of a camera file that states none: a judgement of what such files have wrong, not a measurement."""
 
 UNFOUND_OFFSET_S = 0.015
 """σ of colour's clock where it is looked for and not found: half a frame at 30 Hz, as cameras run that nothing ties."""
 
 UNDISTORTED_K1 = 0.1
-"""σ of k1 where a real lens is said to have no distortion, as it hardly ever is."""
+"""σ of k1 where a real lens is stated to have no distortion, as it hardly ever is."""
 
 
 def sigma_of_file(camera: Camera, stated: Mapping[str, float] | None = None) -> CalibrationSigma:

@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
-from rstrack.data.clock import Clock, drift_ppm, straightened
+from rstrack.data.clock import StampClock, drift_ppm, straightened
 
 StampsMode = Literal["auto", "raw", "regular"]
 
@@ -26,7 +26,7 @@ StampsMode = Literal["auto", "raw", "regular"]
 class StreamTiming:
     """One stream's stamps (n,) in seconds, as listed and as used, and its clock. is_even: used are the clock's."""
 
-    clock: Clock
+    clock: StampClock
     listed: FloatArray
     used: FloatArray
     is_even: bool
@@ -35,7 +35,7 @@ class StreamTiming:
         """E.g. "33.369 ms period, jitter 1.9 ms RMS straightened, 2 frames dropped"."""
         clock = self.clock
         if clock.verdict == "too short":
-            return "too few stamps to tell the clock, used as they are"
+            return "too few stamps to find the clock, used as they are"
         if clock.verdict == "irregular":
             used = "straightened all the same" if self.is_even else "used as they are"
             return f"stamps of no steady clock (about {1e3 * clock.period_s:.1f} ms apart), {used}"

@@ -1,8 +1,8 @@
 """Writes a recording as a folder in TUM's layout, with its cameras, and what else is known of it. Whole or not at all.
 
 rgb/000000.png depth/000000.png rgb.txt depth.txt camera.yaml     see docs/format.md
-groundtruth.txt   poses of the colour camera, where the recording has any; its first line says whose
-imu.csv           EuRoC's columns; imu.yaml where the recording says where the IMU sits, or how noisy it is
+groundtruth.txt   poses of the colour camera, where the recording has any; its first line states whose
+imu.csv           EuRoC's columns; imu.yaml where the recording states where the IMU sits, or how noisy it is
 intrinsics.csv    stamp [ns], fx, fy, cx, cy of each colour image, where they change; intrinsics_depth.csv: of each
                   depth image
 import.json       what was read of which file, and what was assumed

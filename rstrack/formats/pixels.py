@@ -126,7 +126,7 @@ def decode(where: str, data: bytes) -> npt.NDArray[Any]:
 
 
 def header_size(where: str, data: bytes) -> tuple[int, int]:
-    """(width, height) as an image's header says, without decoding it. Raises UserError."""
+    """(width, height) as an image's header states it, without decoding it. Raises UserError."""
     if (size := image_size(data)) is None:
         raise UserError(f"{where}: the image cannot be decoded")
     return size

@@ -115,7 +115,7 @@ def _member(path: Path, archive: zipfile.ZipFile, name: str) -> bytes:
     except Exception as error:
         raise UserError(f"{path}: {name} cannot be unpacked ({type(error).__name__}): export it again") from None
     if len(data) > _MOST_BYTES:
-        raise UserError(f"{path}: {name} unpacks to more than it says: the file is damaged")
+        raise UserError(f"{path}: {name} unpacks to more than it claims: the file is damaged")
     return data
 
 

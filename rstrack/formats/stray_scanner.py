@@ -128,7 +128,7 @@ class _Video:
         with path.open("rb") as file:
             if file.read(8)[4:] not in _FIRST_BOXES:
                 raise UserError(f"{path}: is no MP4 video: copy it again")
-        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # what is wrong is said here, in one line
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # what is wrong is reported here, in one line
         before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         try:
             self._capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)

@@ -32,7 +32,7 @@ class ImuNoise:
     """Densities as Kalibr states them (its wiki, "IMU Noise Model"), per axis.
 
     gyro_density rad/s/√Hz, gyro_walk rad/s²/√Hz, accel_density m/s²/√Hz, accel_walk m/s³/√Hz. gyro_range (rad/s) and
-    accel_range (m/s²): the largest readings of an axis, where the unit saturates; None: not known.
+    accel_range (m/s²): the largest readings of an axis, where the IMU saturates; None: not known.
     """
 
     gyro_density: float
@@ -65,7 +65,7 @@ Matrix3 = tuple[Vector3, Vector3, Vector3]
 
 @dataclass(frozen=True)
 class ImuDescription:
-    """Where it stands: source. None: not told there.
+    """What is known of an IMU. source: where it is stated. None: not stated there.
 
     T_imu_depth (4, 4); T_cam_imu (4, 4): IMU to colour camera, Kalibr's way to say the same. offset_s, drift: added to
     the IMU's stamps, see `ImuFiles`. gyro_matrix, accel_matrix (3, 3): take the true value to the measured one.
@@ -83,7 +83,7 @@ class ImuDescription:
     accel_matrix: FloatArray | None = None
 
     def extrinsics(self, T_color_depth: FloatArray) -> FloatArray | None:
-        """T_imu_depth (4, 4), None where it is not told. T_color_depth (4, 4): depth to colour camera."""
+        """T_imu_depth (4, 4), None where it is not stated. T_color_depth (4, 4): depth to colour camera."""
         if self.T_imu_depth is None and self.T_cam_imu is not None:
             return se3.inverse(self.T_cam_imu) @ T_color_depth
         return self.T_imu_depth
@@ -139,7 +139,7 @@ def _of_camchain(path: Path, data: dict[str, Any]) -> ImuDescription:
     chain = read_camchain(path, data)
     tracked = chain.depth or chain.color
     if tracked.T_cam_imu is None:
-        raise UserError(f"{path}: tells no T_cam_imu: give the camchain-imucam.yaml of kalibr_calibrate_imu_camera")
+        raise UserError(f"{path}: has no T_cam_imu: give the camchain-imucam.yaml of kalibr_calibrate_imu_camera")
     beside = path.with_name("imu.yaml")
     found = read_imu_yaml(beside) if beside.is_file() else ImuDescription(path.name)
     T_imu_depth = se3.inverse(tracked.T_cam_imu)
@@ -147,7 +147,7 @@ def _of_camchain(path: Path, data: dict[str, Any]) -> ImuDescription:
 
 
 def of_sequence(path: Path, meta: Mapping[str, Any]) -> ImuDescription | None:
-    """What a sequence.yaml, whose content is `meta`, says of its IMU, biases and true errors left out; None without.
+    """What a sequence.yaml, whose content is `meta`, states of its IMU, biases and true errors left out; None without.
 
     Raises UserError.
     """
@@ -196,7 +196,7 @@ def read_sensor_yaml(path: Path) -> ImuDescription:
 
 
 def imu_yaml(T_imu_depth: FloatArray | None, noise: ImuNoise | None) -> str:
-    """Text of an imu.yaml: what is known of a unit, as `read_imu_yaml` reads it. T_imu_depth (4, 4)."""
+    """Text of an imu.yaml: what is known of an IMU, as `read_imu_yaml` reads it. T_imu_depth (4, 4)."""
     lines = []
     if noise is not None:
         values = (noise.accel_density, noise.accel_walk, noise.gyro_density, noise.gyro_walk)
@@ -234,16 +234,16 @@ def read_asl_yaml(path: Path) -> dict[str, Any]:
 
 
 def _noise(path: Path, yaml: _ImuYaml) -> ImuNoise | None:
-    """None where nothing is said; all four or none. Raises UserError."""
-    said: dict[str, float | None] = {name: getattr(yaml, name) for name in DENSITIES}
-    missing = [name for name, value in said.items() if value is None]
-    if len(missing) == len(said):
+    """None where nothing is stated; all four or none. Raises UserError."""
+    stated: dict[str, float | None] = {name: getattr(yaml, name) for name in DENSITIES}
+    missing = [name for name, value in stated.items() if value is None]
+    if len(missing) == len(stated):
         ranges = yaml.gyroscope_range, yaml.accelerometer_range
         return None if ranges == (None, None) else replace(PHONE, gyro_range=ranges[0], accel_range=ranges[1])
     # An accelerometer has no gyroscope's noise.
     if missing and missing != list(DENSITIES[2:]):
         raise UserError(f"{path}: {missing[0]}: is missing: give all four densities, in Kalibr's units, or none")
-    accel, accel_walk, gyro, gyro_walk = (0.0 if value is None else value for value in said.values())
+    accel, accel_walk, gyro, gyro_walk = (0.0 if value is None else value for value in stated.values())
     if missing:
         gyro, gyro_walk = PHONE.gyro_density, PHONE.gyro_walk
     return ImuNoise(gyro, gyro_walk, accel, accel_walk, yaml.gyroscope_range, yaml.accelerometer_range)

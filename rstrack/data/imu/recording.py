@@ -23,12 +23,12 @@ from rstrack.data.imu.description import (
     read_imu_yaml,
     read_sensor_yaml,
 )
-from rstrack.data.imu.samples import Layout, Samples, check_times, check_units, read_samples, saturated
+from rstrack.data.imu.samples import ImuSamples, Layout, check_times, check_units, read_samples, saturated
 
 
 @dataclass(frozen=True)
 class ImuRecording:
-    """n samples of one unit fixed to the depth camera, in the order of time.
+    """n samples of one IMU fixed to the depth camera, in the order of time.
 
     t (n,): s, on the clock of the images' stamps as far as it is known. gyro (n, 3): angular rate, rad/s; None where
     there is no gyroscope. accel (n, 3): specific force a − g, m/s²: at rest it reads −g. Both in the IMU's frame, at
@@ -66,7 +66,7 @@ class ReadImu:
 
 @dataclass(frozen=True)
 class ImuFiles:
-    """Where an IMU's samples are, and where it says what is known of it. given: of --imu. meta: of a sequence.yaml.
+    """Where an IMU's samples are, and what describes it. given: of --imu. meta: of a sequence.yaml.
 
     Stamps t of the samples become t + offset_s + drift (t - middle), `middle` being that of the images.
     """
@@ -77,7 +77,7 @@ class ImuFiles:
     meta: dict[str, Any] | None = None
 
     def description(self) -> ImuDescription:
-        """What is known of the unit. Raises UserError."""
+        """What is known of the IMU. Raises UserError."""
         if self.given is not None:
             return read_imu_yaml(self.given)
         beside = self.samples.with_name(IMU_YAML)
@@ -85,8 +85,8 @@ class ImuFiles:
             return read_imu_yaml(beside)
         if (sensor := self.samples.with_name("sensor.yaml")).is_file():
             return read_sensor_yaml(sensor)
-        if self.meta is not None and (said := of_sequence(self.samples.with_name("sequence.yaml"), self.meta)):
-            return said
+        if self.meta is not None and (known := of_sequence(self.samples.with_name("sequence.yaml"), self.meta)):
+            return known
         return ImuDescription("nothing")
 
     def read(
@@ -94,25 +94,25 @@ class ImuFiles:
     ) -> ReadImu:
         """Samples on the images' clock. stamps (n,): the images', s; middle: where the clock's offset holds, s.
 
-        T_color_depth (4, 4): of the cameras. T_imu_depth (4, 4): to be taken where nothing tells it. Raises UserError,
+        T_color_depth (4, 4): of the cameras. T_imu_depth (4, 4): to be taken where it is not stated. Raises UserError,
         one line: what is wrong with which file, and the likely cure.
         """
-        samples, said = read_samples(self.samples, self.layout), self.description()
-        notes = list(check_times(samples, stamps, said.offset_s))
-        samples = replace(samples, gyro=_undone(samples.gyro, said.gyro_matrix),
-                          accel=samples.accel @ _inverse(said.accel_matrix).T)  # fmt: skip
-        check_units(samples, said.gravity)
-        T = said.extrinsics(T_color_depth)
+        samples, known = read_samples(self.samples, self.layout), self.description()
+        notes = list(check_times(samples, stamps, known.offset_s))
+        samples = replace(samples, gyro=_undone(samples.gyro, known.gyro_matrix),
+                          accel=samples.accel @ _inverse(known.accel_matrix).T)  # fmt: skip
+        check_units(samples, known.gravity)
+        T = known.extrinsics(T_color_depth)
         if T is None and self.layout == "tum":
             T = _T_KINECT
             notes.append("accelerometer.txt: axes taken as a Kinect's, at the camera: imu.yaml may say T_imu_depth")
         T = T_imu_depth if T is None else T
         if T is None:
             raise UserError(
-                f"{self.samples}: nothing tells where the IMU sits: write {self.samples.with_name(IMU_YAML)} (or give "
+                f"{self.samples}: nothing states where the IMU sits: write {self.samples.with_name(IMU_YAML)} (or give "
                 f"--imu FILE) with '{EXAMPLE}', or find it: rstrack calibrate --free imu"
             )
-        noise = said.noise
+        noise = known.noise
         if noise is None:
             noise = PHONE
             notes.append(f"{self.samples.name}: its noise is not stated: taken as a phone's (imu.yaml may say it)")
@@ -120,9 +120,9 @@ class ImuFiles:
                                     ("accelerometer", samples.accel, noise.accel_range)):  # fmt: skip
             if values is not None and (count := saturated(values, limit)):
                 notes.append(f"{self.samples.name}: the {name} is at its range in {count} samples")
-        rate, note = _rate(samples, said)
-        t = samples.t + said.offset_s + said.drift * (samples.t - middle)
-        recording = ImuRecording(t, samples.gyro, samples.accel, noise, T, rate, said.gravity)
+        rate, note = _rate(samples, known)
+        t = samples.t + known.offset_s + known.drift * (samples.t - middle)
+        recording = ImuRecording(t, samples.gyro, samples.accel, noise, T, rate, known.gravity)
         return ReadImu(recording, (*notes, *note))
 
 
@@ -141,16 +141,16 @@ def find_imu(root: Path, given: Path | None = None, meta: dict[str, Any] | None 
     return None
 
 
-def _rate(samples: Samples, said: ImuDescription) -> tuple[float, tuple[str, ...]]:
+def _rate(samples: ImuSamples, known: ImuDescription) -> tuple[float, tuple[str, ...]]:
     """Samples a second, and what there is to say where the description has another number."""
     steps = np.diff(samples.t)
     counted = float(np.rint(steps / np.median(steps)).sum() / (samples.t[-1] - samples.t[0]))
-    if said.rate_hz is None:
+    if known.rate_hz is None:
         return counted, ()
-    if abs(counted / said.rate_hz - 1.0) <= _SAME_RATE:
-        return said.rate_hz, ()
+    if abs(counted / known.rate_hz - 1.0) <= _SAME_RATE:
+        return known.rate_hz, ()
     return counted, (
-        f"{samples.path.name}: {counted:.4g} samples a second, not {said.rate_hz:g} as {said.source} says",
+        f"{samples.path.name}: {counted:.4g} samples a second, not {known.rate_hz:g} as {known.source} states",
     )
 
 

@@ -29,7 +29,7 @@ _SHOWN = 60
 
 
 @dataclass(frozen=True)
-class Samples:
+class ImuSamples:
     """n samples as they stand in a file: t (n,) s, gyro (n, 3) or None, accel (n, 3). numbers (n,): their lines.
 
     stamp_unit_s: seconds of one of the file's stamps.
@@ -47,7 +47,7 @@ class Samples:
         return f"{self.path} line {self.numbers[k]}"
 
 
-def read_samples(path: Path, layout: Layout) -> Samples:
+def read_samples(path: Path, layout: Layout) -> ImuSamples:
     """All samples, which are finite and come in the order of time.
 
     Lines that begin with '#' are comments, and a first one of letters. Raises UserError, one line, naming the line.
@@ -72,7 +72,7 @@ def read_samples(path: Path, layout: Layout) -> Samples:
     unit = _UNITS[layout]
     t = table[:, 0] / round(1.0 / unit)  # a division is rounded once; 1e-9 is no float
     gyro = table[:, 1:4] if layout == "euroc" else None
-    samples = Samples(path, t, gyro, table[:, -3:], np.array(numbers), unit)
+    samples = ImuSamples(path, t, gyro, table[:, -3:], np.array(numbers), unit)
     _check_order(samples)
     return samples
 
@@ -99,7 +99,7 @@ def _row(line: str, layout: Layout) -> int | None:
         return None
 
 
-def _check_order(samples: Samples) -> None:
+def _check_order(samples: ImuSamples) -> None:
     step = np.diff(samples.t)
     wrong = np.flatnonzero(step <= 0.0) + 1
     if not len(wrong):
@@ -117,8 +117,8 @@ def _check_order(samples: Samples) -> None:
 
 
 LOWEST_HZ, LOW_HZ = 25.0, 90.0
-"""Rates below which an IMU says nothing that a camera of 30 Hz does not, and below which that is said."""
-# Steps longer than so many usual ones are gaps.
+"""Rates below which an IMU adds nothing to a camera of 30 Hz, and below which a note is given."""
+# Steps longer than so many median ones are gaps.
 _GAP = 1.75
 # Part of g within which the median specific force lies (2.4 where fast, and shaken); of the factor between units.
 _NEAR_G, _NEAR_UNIT = (0.6, 10.0), (0.75, 1.3)
@@ -129,11 +129,11 @@ _STAMP_UNITS = (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6), ("ns", 1e-9))
 _WILD_RAD_S = 8.0
 # Seconds over which gravity's turning is compared, and how far the fit may be from the unit.
 _TURN_S, _LIKE = 0.2, (0.6, 1.5)
-# The turning must be told this much better than by chance.
+# The turning must be this much clearer than chance.
 _SURE = 6.0
 
 
-def check_units(samples: Samples, gravity: float) -> None:
+def check_units(samples: ImuSamples, gravity: float) -> None:
     """Raises UserError where the accelerometer or the gyroscope has another unit than m/s² and rad/s.
 
     gravity: m/s²; where there is none, only absurd rates show.
@@ -160,8 +160,7 @@ def check_units(samples: Samples, gravity: float) -> None:
         name, unit = other
         raise UserError(
             f"{samples.path}: gyroscope in {name}, not in rad/s (gravity turns {1 / unit:.0f} times less than it "
-            "says): "
-            f"multiply by {unit:.6g}"
+            f"states): multiply by {unit:.6g}"
         )
     if rms > _WILD_RAD_S:
         raise UserError(
@@ -170,7 +169,7 @@ def check_units(samples: Samples, gravity: float) -> None:
         )
 
 
-def check_times(samples: Samples, stamps: FloatArray, offset_s: float) -> tuple[str, ...]:
+def check_times(samples: ImuSamples, stamps: FloatArray, offset_s: float) -> tuple[str, ...]:
     """What there is to say of gaps, rate and reach, a line each. stamps (n,): the images', s; offset_s is added to t.
 
     Raises UserError: no sample at the images' times, or too low a rate.
@@ -209,7 +208,7 @@ def saturated(values: FloatArray, limit: float | None) -> int:
     return 0 if limit is None else int((np.abs(values) >= 0.999 * limit).any(axis=1).sum())
 
 
-def _apart(samples: Samples, first: float, last: float, offset_s: float) -> str:
+def _apart(samples: ImuSamples, first: float, last: float, offset_s: float) -> str:
     """Why no sample lies at the images' times."""
     stored = samples.t / samples.stamp_unit_s
     expected = dict((unit, name) for name, unit in _STAMP_UNITS)[samples.stamp_unit_s]
@@ -231,8 +230,8 @@ def _apart(samples: Samples, first: float, last: float, offset_s: float) -> str:
     )
 
 
-def _turning_unit(samples: Samples, gyro: FloatArray) -> tuple[str, float] | None:
-    """The gyroscope's unit, by name and in rad/s, if gravity's turning says that it is not rad/s."""
+def _turning_unit(samples: ImuSamples, gyro: FloatArray) -> tuple[str, float] | None:
+    """The gyroscope's unit, by name and in rad/s, if gravity's turning shows that it is not rad/s."""
     t, f = samples.t, samples.accel
     step = np.clip(np.diff(t), 0.0, 0.1)
     turned = np.cross(gyro, f)

@@ -1,7 +1,7 @@
 """Sequences of rsgen as a tracker gets them: exact, or as what a driver and a registration leave of them.
 
 Where a sequence's listed stamps are a driver's, or its depth is registered, it is a recording like any other: cameras
-as sequence.yaml tells them, stamps that are arrival times (`rstrack.data.timing`), colour's offset not known.
+as sequence.yaml states them, stamps that are arrival times (`rstrack.data.timing`), colour's offset not known.
 Its truth is the pose of each depth frame when it was taken, under the stamp at which it is tracked. Cameras that are
 declared wrong on purpose are given as they are declared; the truth is that of the cameras that took the images.
 """
@@ -66,10 +66,10 @@ def _is_exact(sequence: Sequence) -> bool:
 
 
 def sigma_of(sequence: Sequence) -> CalibrationSigma:
-    """How far the cameras that sequence.yaml tells may be wrong: not at all, unless they are declared so on purpose.
+    """How far the cameras of sequence.yaml may be wrong: not at all, unless they are declared so on purpose.
 
-    A depth camera with fixed errors of its own has them though its lens is told: as usual, since a user of such a
-    camera knows no more.
+    A depth camera with fixed errors of its own has them though its lens is stated: the σ are the default ones, since a
+    user of such a camera knows no more.
     """
     sigma = sigma_of_file(sequence.streams["color"].camera) if sequence.meta.get("declared") else EXACT_SIGMA
     noise: Any = sequence.meta

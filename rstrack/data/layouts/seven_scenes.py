@@ -3,9 +3,9 @@
     frame-000000.color.png    8-bit colour, or .jpg
     frame-000000.depth.png    16-bit grey, millimetres; 0 and 65535: nothing measured
     frame-000000.pose.txt     optional: T_world_camera, 4x4; what is not finite is no pose
-    camera.yaml               optional: see `camera_file`; depth is in millimetres whatever it says
+    camera.yaml               optional: see `camera_file`; depth is in millimetres whatever that states
 
-Nothing there tells times, cameras or shutters. Frames are taken to be 1/30 s apart by their numbers, so that a number
+Times, cameras and shutters are not stated there. Frames are taken to be 1/30 s apart by their numbers, so that a number
 left out is a gap. An image that is the one before again is left out, and a number at which both cameras have nothing
 new takes no time: recorders that were faster than the camera wrote those (91 of the 1000 frames of one of 7-Scenes').
 Without a camera file depth has the intrinsics that the data set's authors recommend, colour and the pose between them
@@ -136,7 +136,7 @@ def _cameras(
         return read_rig(file, *sizes), ()
     if sizes != (_SIZE, _SIZE):
         shown = " and ".join("x".join(map(str, size)) for size in sizes)
-        raise UserError(f"{root}: images are {shown}, and nothing tells the cameras: write {root / 'camera.yaml'}")
+        raise UserError(f"{root}: images are {shown}, and nothing states the cameras: write {root / 'camera.yaml'}")
     note = (
         f"the cameras are taken for 7-Scenes', global shutters, depth with fx {_DEPTH[0]:g}, colour with fx "
         f"{_COLOR[0]:g} and not registered: write {root / 'camera.yaml'} if you know them"

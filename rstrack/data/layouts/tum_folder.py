@@ -6,7 +6,7 @@
     groundtruth.txt       optional: poses of the colour camera; ICL-NUIM's NAME.gt.freiburg also
 
 Stamps without any decimal point are frame numbers at 30 Hz, as in ICL-NUIM. Colour images are 8-bit PNG or JPEG, depth
-images 16-bit grey PNG. One that is the one before again is left out: it was not taken when its stamp says.
+images 16-bit grey PNG. One that is the one before again is left out: it was not taken at its stamp.
 """
 
 from __future__ import annotations
@@ -209,7 +209,7 @@ def _rig_file(root: Path, camera_file: Path | None, color: Sequence[Path], depth
     file = find_camera_file(root, camera_file)
     if file is None:
         raise UserError(
-            f"{root}: nothing tells the cameras: write {root / CAMERA_FILES[0]} (or give a camera file) with "
+            f"{root}: nothing states the cameras: write {root / CAMERA_FILES[0]} (or give a camera file) with "
             f"'{EXAMPLE}' and, unless depth is registered to colour, 'depth: {{...}}' likewise"
         )
     return read_rig(file, first_size(color, decode_color), first_size(depth, decode_depth))
@@ -226,7 +226,7 @@ def _truth(root: Path, rig: Rig) -> Trajectory | None:
 
 
 def _truth_note(root: Path) -> tuple[str, ...]:
-    """What there is to say of a truth that says itself that it is none."""
+    """A note on a truth that is itself an estimate, by its first line."""
     file = root / "groundtruth.txt"
     if not file.is_file():
         return ()

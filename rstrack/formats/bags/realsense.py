@@ -1,7 +1,7 @@
 """What librealsense records, from a program or its viewer: a ROS 1 bag, or since 2.57 a ROS 2 recording in SQLite.
 
     /device_0/sensor_0/Depth_0/image/data            sensor_msgs/Image, mono16; then the unit of depth in m, float32,
-                                                     which the definition in the bag does not tell of
+                                                     which the definition in the bag does not have
     /device_0/sensor_0/Depth_0/info/camera_info      distortion by librealsense's names
     /device_0/sensor_0/Depth_0/tf/1                  geometry_msgs/Transform: p_stream from p_reference, by its number
     /device_0/sensor_1/Color_0/...                   likewise; /device_0/sensor_2/Gyro_0/imu/data, Accel_0

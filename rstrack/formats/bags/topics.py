@@ -73,7 +73,7 @@ def find_info(bag: BagReader, image: str, named: str | None, option: str) -> str
         if f"{place}/camera_info" in known:
             return f"{place}/camera_info"
     raise UserError(
-        f"{bag.path}: nothing tells the camera of {image}: name its camera_info with {option}; {_some(known)}"
+        f"{bag.path}: nothing states the camera of {image}: name its camera_info with {option}; {_some(known)}"
     )
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rstrack.data.clock import Clock, RunningClock, drift_ppm, estimate_clock, regular, straightened
+from rstrack.data.clock import RunningClock, StampClock, drift_ppm, estimate_clock, regular, straightened
 
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
 needs_rpy = pytest.mark.skipif(not (DATA / "tum_fr1_rpy").is_dir(), reason="../shared/data/tum_fr1_rpy is not here")
@@ -122,7 +122,7 @@ def test_half_the_rate_for_a_while_and_a_pause() -> None:
 
 
 def test_drift_against_another_clock() -> None:
-    def clock(period: float) -> Clock:
+    def clock(period: float) -> StampClock:
         return estimate_clock(true_times(300, period))
 
     depth = clock(1 / 30)

@@ -92,7 +92,7 @@ FAULTS: dict[str, tuple[Fault, str]] = {
     "small colour": (image(COLOR_0, color_pixels(0)[:, :-2]), rf"{COLOR_0}: is 30x24, but the camera is 32x24"),
     "8-bit depth": (image(DEPTH_0, color_pixels(0)[..., 0]), rf"{DEPTH_0}: is a 8-bit grey image"),
     "16-bit colour": (image(COLOR_0, depth_units(0)), rf"{COLOR_0}: is a 16-bit grey image"),
-    "no cameras": (remove("camera.yaml"), r"nothing tells the cameras: write .*camera\.yaml.*fx"),
+    "no cameras": (remove("camera.yaml"), r"nothing states the cameras: write .*camera\.yaml.*fx"),
     "broken yaml": (lambda root: (root / "camera.yaml").write_text("a: [\nb"), r"camera\.yaml: line 2 is not valid"),
     "empty camera": (lambda root: write_camera(root, {}), r"color: Field required; write e\.g\. 'color: \{width"),
     "unknown entry": (camera(redout_s=0.0), r"color\.redout_s: no such entry"),

@@ -225,7 +225,7 @@ def test_what_is_not_covered_and_saturated_is_said(folder: Path) -> None:
     read = open_dataset(folder).read_imu
     assert read is not None
     notes = "; ".join(read.notes)
-    assert "covers 66 %" in notes and "at its range" in notes and "not 100 as imu.yaml says" in notes
+    assert "covers 66 %" in notes and "at its range" in notes and "not 100 as imu.yaml states" in notes
     assert read.recording.rate_hz == pytest.approx(200.0)
 
 
@@ -333,14 +333,16 @@ def test_info_says_it_in_a_line(folder: Path, capsys: pytest.CaptureFixture[str]
 
 def test_units_are_right_for_every_shipped_motion_and_a_bad_sensor() -> None:
     """No false alarm where biases and noise are many times what units have."""
-    from rstrack.data.imu.samples import Samples, check_units
+    from rstrack.data.imu.samples import ImuSamples, check_units
 
     for seed in range(6):
         bad = CONFIG.model_copy(update={"gyroscope_noise_density": 5e-3, "accelerometer_noise_density": 2e-2,
                                         "gyroscope_bias": (0.2, -0.1, 0.1)})  # fmt: skip
         samples: ImuSamples = simulate_imu(swung(4.0 + seed), bad, 0.0, 4.0 + seed, seed)
         for factor in (1.0, 180.0 / np.pi):
-            table = Samples(Path("x"), samples.t, factor * samples.gyro, samples.accel, np.arange(len(samples.t)), 1e-9)
+            table = ImuSamples(
+                Path("x"), samples.t, factor * samples.gyro, samples.accel, np.arange(len(samples.t)), 1e-9
+            )
             if factor == 1.0:
                 check_units(table, 9.80665)
             else:

@@ -208,7 +208,7 @@ def test_the_table_goes_by_stamps(recordings: tuple[Path, Path], tmp_path: Path)
         ("9" * 400 + ",62,61,39,29\n", "line 1"),
         ("2,62,61,39,29\n1,62,61,39,29\n", "rising stamps"),
         ("1,62,61,39,29\n2,62,61,39,29\n3,20,20,39,29\n", "not of one camera"),
-        ("1,620,610,390,290\n", "not 62 as the camera file says"),
+        ("1,620,610,390,290\n", "not 62 as the camera file states"),
     ],
 )
 def test_a_wrong_table_is_one_line(recordings: tuple[Path, Path], tmp_path: Path, text: str, said: str) -> None:

@@ -158,7 +158,7 @@ FAULTS: dict[str, tuple[Fault, str]] = {
     "no depth": (unlink("*.depth.png"), "has no depth image"),
     "no colour": (unlink("*.color.png"), "has no colour image"),
     "nothing": (unlink("*"), "nothing that can be tracked: give an rsgen sequence"),
-    "no camera, odd size": (unlink("camera.yaml"), "images are 32x24 and 32x24, and nothing tells the cameras"),
+    "no camera, odd size": (unlink("camera.yaml"), "images are 32x24 and 32x24, and nothing states the cameras"),
     "two colours": (lambda r: cv2.imwrite(str(r / "frame-000001.color.jpg"), pixels(1)), "frame 1 has .* already"),
     "link out": (link_out, "path 'frame-000001.depth.png' leaves"),
     "short pose": (lambda r: (r / "frame-000003.pose.txt").write_text("1 2 3"), "000003.pose.txt: expected the 16"),

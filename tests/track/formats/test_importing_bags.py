@@ -164,7 +164,7 @@ def test_what_is_missing_in_a_bag_is_named_with_what_there_is(place: Path, capfd
     without = {
         "depth.bag": (DEPTH, ("no depth images", COLOR, "--depth")),
         "color.bag": (COLOR, ("no colour images", DEPTH, "--color")),
-        "info.bag": ("/camera/color/camera_info", ("nothing tells the camera", "/camera/depth/camera_info")),
+        "info.bag": ("/camera/color/camera_info", ("nothing states the camera", "/camera/depth/camera_info")),
     }
     for name, (topic, said) in without.items():
         recordings.write_spoken(place / name, talker, [entry for entry in spoken if entry[0] != topic])

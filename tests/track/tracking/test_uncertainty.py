@@ -55,7 +55,7 @@ def test_a_motion_that_no_image_shows_is_known_ever_less_until_it_is_unknown() -
     for _ in range(5):
         uncertainty = uncertainty.after(DT, H)
     assert uncertainty.is_known and uncertainty.held_by_motion < 0.05
-    wall = np.diag([0.0, 1e8, 1e8, 1e8, 1e8, 1e8])  # nothing tells how it moves along x
+    wall = np.diag([0.0, 1e8, 1e8, 1e8, 1e8, 1e8])  # nothing states how it moves along x
     sigmas = []
     while uncertainty.is_known:
         uncertainty = uncertainty.after(DT, wall)
