@@ -32,8 +32,7 @@ from rsgen.console.progress import Progress
 from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
 from rsgen.geometry.shutter import Shutter
-from rsgen.produce.frame_source import load_scene, mirrored_samples, surfaces_hash
-from rsgen.produce.ground_truth import lines_of_sight, load_motion
+from rsgen.produce.parts import lines_of_sight, load_motion, load_scene, mirrored_samples, surfaces_hash
 from rstrack.bench.machine import peak_mb, reset_peak
 
 

@@ -16,8 +16,8 @@ from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.produce.frame_source import load_scene, make_integrator, mirrored_samples, small_camera
-from rsgen.produce.ground_truth import Motion, load_motion
+from rsgen.produce.frame_source import small_camera
+from rsgen.produce.parts import TrueMotion, load_motion, load_scene, make_integrator, mirrored_samples
 
 PSNR_FLOOR_DB = 36.0
 _REFERENCE_DEPTH = 64  # path length of the reference; Russian roulette ends most paths long before
@@ -147,7 +147,7 @@ def view_camera(config: Config, width: int) -> Camera:
     return small_camera(camera, width)
 
 
-def spread_times(motion: Motion, count: int) -> FloatArray:
+def spread_times(motion: TrueMotion, count: int) -> FloatArray:
     """`count` instants spread over the recording, its very ends left out."""
     fraction = (np.arange(count) + 0.5) / count
     return motion.first_stamp + fraction * (motion.last_stamp - motion.first_stamp)

@@ -23,7 +23,7 @@ from rsgen.check.reprojection import check_reprojection, check_scene
 from rsgen.errors import UserError
 from rsgen.files import is_temporary, read_text
 from rsgen.geometry import se3
-from rsgen.produce.identity import fingerprint
+from rsgen.produce.records import fingerprint
 from rsgen.sensors.reports import reported_poses
 from rsgen.sequence.format import (
     FOLDERS,

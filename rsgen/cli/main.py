@@ -176,7 +176,7 @@ def stats(
     """Print length, mean speeds and accelerations of the configs' motions, a line a config, beside the paper's."""
     from rsgen.config.config import load_config
     from rsgen.motion.statistics import motion_statistics, stats_table
-    from rsgen.produce.ground_truth import load_motion
+    from rsgen.produce.parts import load_motion
 
     rows = []
     for file in configs:

@@ -35,6 +35,7 @@ from rsgen.sequence.format import STREAMS
 
 __all__ = ["Config", "StreamConfig", "describe_fields", "load_config", "validate_config"]
 
+Backend = Literal["auto", "llvm", "cuda"]
 # Fields that change how fast or where a sequence is made, never one byte of it.
 _NOT_CONTENT = {"backend", "faults"}
 # Sections that are left out where they are not set: sequences rendered before there were any stay the same.
@@ -75,7 +76,7 @@ class Config(Section):
     mocap: MocapConfig | None = None
     faults: FaultsConfig | None = None
     seed: int = Field(default=0, ge=0, lt=2**31, description="seed of every random number")
-    backend: Literal["auto", "llvm", "cuda"] = Field(default="auto", description="where Dr.Jit runs")
+    backend: Backend = Field(default="auto", description="where Dr.Jit runs")
 
     @model_validator(mode="after")
     def _has_one_motion(self) -> Config:

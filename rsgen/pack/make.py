@@ -30,10 +30,8 @@ from rsgen.pack.pairs import (
     pair_files,
     render_pairs,
 )  # fmt: skip
-from rsgen.produce.distribute import engine_versions
-from rsgen.produce.generate import input_hashes
-from rsgen.produce.ground_truth import load_motion
-from rsgen.produce.identity import fingerprint
+from rsgen.produce.parts import engine_versions, input_hashes, load_motion
+from rsgen.produce.records import fingerprint
 from rsgen.sensors.imu import imu_csv
 
 FORMAT = "rsgen-pack/1"
@@ -134,7 +132,7 @@ def _check(config: Config) -> None:
 
 
 def _identity(config: Config) -> dict[str, Any]:
-    return {"config": config.content(), "inputs": input_hashes(config), "versions": engine_versions(config)}
+    return {"config": config.content(), "inputs": input_hashes(config), "versions": engine_versions(config.backend)}
 
 
 def _open(out: Path, identities: Sequence[dict[str, Any]], options: PackOptions, seed: int) -> None:

@@ -23,7 +23,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.image_codecs import encode_png
 from rsgen.pack.draw import Drawn, Layout, camera_spline
-from rsgen.produce.frame_source import load_scene, make_integrator
+from rsgen.produce.parts import load_scene, make_integrator
 from rsgen.sensors.color import apply_color_noise
 from rsgen.sensors.imu import ImuSamples, exact_imu
 from rsgen.sensors.seed import noise_generator

@@ -17,8 +17,9 @@ from rsgen.config.config import Config, recorded_config
 from rsgen.console.progress import ProgressDisplay
 from rsgen.errors import UserError
 from rsgen.files import read_yaml
-from rsgen.produce.frame_source import FrameSource, scene_hash, setting_of
+from rsgen.produce.frame_source import setting_of
 from rsgen.produce.generate import ORIGIN
+from rsgen.produce.parts import open_frames, scene_hash
 from rsgen.sequence.reader import read_sequence
 
 if TYPE_CHECKING:
@@ -67,10 +68,10 @@ def compare_frame(path: Path, frame: int, out: Path | None, scene: Path | None) 
         log.warning("%s: the scene %s has changed since, so more than the shutter differs", path, config.scene.file)
     with ProgressDisplay() as progress:
         things = [thing.spline for thing in sequence.objects]
-        source = FrameSource(config, progress, global_shutter=True, objects=things)
+        source = open_frames(config, progress, global_shutter=True, objects=things)
     at = {stream.name: int(np.flatnonzero(stream.indices == frame)[0]) for stream in (color, depth)}
     middle = {s.name: float(s.stamps[at[s.name]]) + s.shutter.readout_s / 2 for s in (color, depth)}
-    setting = setting_of(config, color.table, at["color"])
+    setting = setting_of(config.color, color.table, at["color"])
     colors = source.color(sequence.spline, middle["color"], frame, setting), sequence.color(at["color"])
     depths = source.depth(sequence.spline, middle["depth"]), sequence.truth_depth(at["depth"])
     title = (

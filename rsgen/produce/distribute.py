@@ -1,4 +1,4 @@
-"""Render the images of an open sequence: in this process, or on workers, with the same bytes.
+"""Render the images of an open sequence on workers, with the same bytes as in this process.
 
 To workers go blocks of images to render, and encoded files come back. Only the process that the user started writes to
 the sequence's folder. Workers need the scene (and, to share the baked light, its cache) at the same path, nothing else
@@ -10,9 +10,7 @@ from __future__ import annotations
 import json
 import socket
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -23,58 +21,15 @@ from rsgen.console.scheduler import Workers
 from rsgen.errors import UserError
 from rsgen.files import atomic_write
 from rsgen.geometry.spline import Spline
-from rsgen.produce.frame_source import ColorShot, DepthShot, FrameSource, scene_hash
-from rsgen.produce.moving import mesh_hashes
+from rsgen.produce.frame_source import FrameSource
+from rsgen.produce.generate import render_shots
+from rsgen.produce.parts import engine_versions, mesh_hashes, open_frames, scene_hash
 from rsgen.produce.writer import SequenceWriter
 from rsgen.sensors.color import Setting
 from rsgen.sequence.format import StreamName
 
-# Written frames that may wait for the disk: bounds memory and how much a kill can lose.
-_WRITE_AHEAD = 4
 # Images a job makes: a few seconds of work and some megabytes of files.
 _BLOCK = 8
-
-
-def engine_versions(config: Config) -> dict[str, str]:
-    """Versions of the programs that decide a sequence's bytes, and the Dr.Jit variant that runs."""
-    from rsgen.device.backend import mitsuba
-
-    names = ("rolling-shutter-rgbd", "mitsuba", "drjit", "numpy", "scipy")
-    return {name: version(name) for name in names} | {"variant": mitsuba(config.backend).variant()}
-
-
-def render_shots(
-    writer: SequenceWriter, source: FrameSource, shots: Sequence[tuple[int, StreamName]], progress: Progress
-) -> None:
-    """Render images (frame, stream) in order and write them; noise and encoding go on beside. Raises UserError."""
-    # However this ends, leaving the pool waits for what has been rendered to be written.
-    with ThreadPoolExecutor(max_workers=2) as pool:
-        pending: list[Future[None]] = []
-        for done, (k, stream) in enumerate(shots, 1):
-            shown = writer.shows(stream, k)
-            stamp = float(writer.stamps(stream)[shown])
-            if stream == "color":
-                after = writer.next_color(k)
-                next_stamp = None if after is None else float(writer.stamps("color")[after])
-                settings = (None if frame is None else writer.setting(frame) for frame in (shown, after))
-                shot = source.expose_color(writer.spline, stamp, shown, next_stamp, *settings)
-                pending.append(pool.submit(_write_color, writer, source, k, shot))
-            else:
-                measured = source.expose_depth(writer.spline, stamp, shown)
-                pending.append(pool.submit(_write_depth, writer, source, k, measured))
-            while len(pending) > _WRITE_AHEAD:
-                pending.pop(0).result()
-            progress("frames", done / len(shots), f"frame {k}")
-        for write in pending:
-            write.result()
-
-
-def _write_color(writer: SequenceWriter, source: FrameSource, k: int, shot: ColorShot) -> None:
-    writer.write_color(k, *source.develop_color(shot))
-
-
-def _write_depth(writer: SequenceWriter, source: FrameSource, k: int, shot: DepthShot) -> None:
-    writer.write_depth(k, shot.z, source.develop_depth(shot), shot.ids)
 
 
 @dataclass(frozen=True)
@@ -172,7 +127,7 @@ def _source(plan: SequenceRecipe, progress: Progress) -> FrameSource:
         _loaded.clear()
         try:
             _check(plan)
-            _loaded[key] = FrameSource(plan.config, progress, objects=plan.objects)
+            _loaded[key] = open_frames(plan.config, progress, objects=plan.objects)
         except UserError as error:
             raise UserError(f"worker on {socket.gethostname()}: {error}") from None
     return _loaded[key]
@@ -180,7 +135,7 @@ def _source(plan: SequenceRecipe, progress: Progress) -> FrameSource:
 
 def _check(plan: SequenceRecipe) -> None:
     """Raises UserError if this process would render other bytes than the one that opened the sequence."""
-    mine = engine_versions(plan.config)
+    mine = engine_versions(plan.config.backend)
     for name, wanted in plan.versions.items():
         if mine.get(name) != wanted:
             raise UserError(
@@ -192,6 +147,6 @@ def _check(plan: SequenceRecipe) -> None:
         )
     if scene_hash(plan.config) != plan.inputs["scene"]:
         raise UserError(f"{plan.config.scene.file}: or a file of it is another one here: copy the scene again")
-    for name, found in mesh_hashes(plan.config).items():
+    for name, found in mesh_hashes(plan.config.objects, plan.config.backend).items():
         if found != plan.inputs[name]:
             raise UserError(f"{name}: its mesh is another one here: copy it again")

@@ -1,11 +1,11 @@
-"""Frames of a config on demand: rendered, then seen through the sensors' noise.
+"""Frames of both streams on demand: rendered, then seen through the sensors' noise.
 
 Exposing a frame uses the renderer and belongs into one thread; developing it is NumPy only and may run beside.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,15 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rsgen.array_types import BoolArray, ByteArray, Float32Array, FloatArray
-from rsgen.config.config import Config, LightConfig
-from rsgen.console.progress import Progress, no_progress
-from rsgen.errors import UserError
+from rsgen.config.cameras import ColorConfig, DepthConfig
+from rsgen.config.sections import TruthConfig
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
-from rsgen.produce.ground_truth import lines_of_sight
-from rsgen.produce.identity import fingerprint
-from rsgen.produce.moving import lit_objects, load_meshes
 from rsgen.sensors.color import Meter, Reading, Setting, apply_color_noise, apply_setting, reading, to_srgb8
 from rsgen.sensors.depth import apply_depth_noise, mixed_depth, register_depth, with_fixed_errors
 from rsgen.sensors.seed import noise_generator
@@ -30,7 +27,6 @@ from rsgen.sequence.truth_files import FrameTable
 
 # Light meters of cameras see no more than this of a picture.
 _METER_WIDTH, _METER_SPP = 64, 4
-_LEAST_MIRRORED = 4
 
 
 @dataclass(frozen=True)
@@ -62,46 +58,38 @@ class DepthShot:
 
 
 class FrameSource:
-    """Frames of a config's two streams, rendered on demand; with `global_shutter` all lines at once."""
+    """Frames of two streams, rendered on demand; `rsgen.produce.parts.open_frames` makes one of a config."""
 
     def __init__(
-        self,
-        config: Config,
-        progress: Progress = no_progress,
-        global_shutter: bool = False,
-        scene: Any = None,
-        objects: Sequence[Spline] = (),
-    ) -> None:
-        """Load the scene, unless it is given, and its light (baked now if no cache has it). Raises UserError.
+        self, scene: Any, integrator: Any, color: ColorConfig, depth: DepthConfig, T_color_depth: FloatArray,
+        truth: TruthConfig, seed: int, global_shutter: bool = False, has_objects: bool = False,
+    ) -> None:  # fmt: skip
+        """scene, integrator: as `load_scene` and `make_integrator` return them. seed: of all that is chance.
 
-        objects: T_world_object(t) of the config's, all of them.
+        global_shutter: all lines of a frame at once. has_objects: whether the integrator has some that move.
         """
-        from rsgen.device.backend import mitsuba
-
-        mi = mitsuba(config.backend)
         from rsgen.render import images as render
-
-        self._render = render
         from rsgen.sensors.shadow import Projector
         from rsgen.truth.renderer import TruthRenderer
 
-        self._config = config
-        self.scene = scene or load_scene(config)
-        self._integrator = integrator = make_integrator(mi, self.scene, config, progress, objects)
-        things = integrator.objects if objects else None
-        pick = render.global_shutter if global_shutter else lambda shutter: shutter
-        color, depth = config.color, config.depth
-        self._color = render.ColorRenderer(self.scene, integrator, color.camera, pick(color.shutter), color.spp)
-        self._depth = render.DepthRenderer(self.scene, depth.camera, pick(depth.shutter), things)
+        self._render, self.scene, self._integrator = render, scene, integrator
+        self._color_config, self._depth_config, self._seed = color, depth, seed
+        self._T_color_depth, self._T_depth_color = T_color_depth, se3.inverse(T_color_depth)
+        things = integrator.objects if has_objects else None
+
+        def pick(shutter: Shutter) -> Shutter:
+            return render.global_shutter(shutter) if global_shutter else shutter
+
+        self._color = render.ColorRenderer(scene, integrator, color.camera, pick(color.shutter), color.spp)
+        self._depth = render.DepthRenderer(scene, depth.camera, pick(depth.shutter), things)
         instant = replace(pick(depth.shutter), exposure_s=0.0)
-        self._instant = render.DepthRenderer(self.scene, depth.camera, instant, things)
+        self._instant = render.DepthRenderer(scene, depth.camera, instant, things)
         self._rays = depth.camera.unproject(depth.camera.pixel_grid()) if depth.registered else np.empty(0)
-        wanted = bool(config.truth.images) or things is not None
-        self._truth = TruthRenderer(self.scene, integrator, color, config.truth, things) if wanted else None
+        wanted = bool(truth.images) or things is not None
+        self._truth = TruthRenderer(scene, integrator, color, truth, things) if wanted else None
         lit = depth.noise.model == "kinect" and depth.noise.shadow
         pattern = depth.noise.projector_baseline_m, depth.noise.projector_width
-        self._projector = Projector(self.scene, self._depth.sensor, *pattern, things) if lit else None
-        self._T_depth_color = se3.inverse(np.asarray(config.T_color_depth, float))
+        self._projector = Projector(scene, self._depth.sensor, *pattern, things) if lit else None
 
     def expose_color(
         self, spline: Spline, stamp: float, frame: int, next_stamp: float | None = None,
@@ -118,18 +106,18 @@ class FrameSource:
         if setting is not None:
             exposures = setting.exposure_s, (next_setting or setting).exposure_s
             how = {"exposure_s": exposures, "brightness": setting.brightness}
-        truth = self._truth.render(self._pose(spline), stamp, next_stamp, self._seed(frame), **how)
+        truth = self._truth.render(self._pose(spline), stamp, next_stamp, self._frame_seed(frame), **how)
         return ColorShot(frame, linear, truth, setting)
 
     def develop_color(self, shot: ColorShot) -> tuple[ByteArray, dict[str, NDArray[Any]]]:
         """8-bit RGB (h, w, 3) that the camera reports, and the images of `color_truth`."""
-        color, truth = self._config.color, dict(shot.truth)
+        color, truth = self._color_config, dict(shot.truth)
         linear, noise = shot.linear * np.float32(color.exposure_gain), color.noise
         if shot.setting is not None:
             linear, noise = apply_setting(linear, noise, shot.setting)
         if noise.model != "none":
             truth[CLEAN_COLOR] = to_srgb8(linear)
-        rng = noise_generator(self._config.seed, "color", shot.frame)
+        rng = noise_generator(self._seed, "color", shot.frame)
         return apply_color_noise(linear, noise, rng), truth
 
     def expose_depth(self, spline: Spline, stamp: float, frame: int) -> DepthShot:
@@ -137,7 +125,7 @@ class FrameSource:
         z, ids = self._depth.cast(spline.pose, stamp)
         # The projector takes the depth sensor as it is now: exposed to this frame.
         shadow = None if self._projector is None else ~self._projector.lights(z, spline.pose, stamp)
-        depth = self._config.depth
+        depth = self._depth_config
         if depth.blur_samples == 1:
             return DepthShot(frame, z, shadow, ids=ids)
         share = (np.arange(depth.blur_samples) + 0.5) / depth.blur_samples
@@ -147,25 +135,25 @@ class FrameSource:
 
     def develop_depth(self, shot: DepthShot) -> Float32Array:
         """Planar z (h, w) in m that the camera reports, 0 where nothing; of colour's size where registered."""
-        depth, seed = self._config.depth, self._config.seed
+        depth, seed = self._depth_config, self._seed
         z = shot.z if shot.blurred is None else shot.blurred
         if depth.noise.model != "none":
             z = with_fixed_errors(z, depth.camera, depth.noise, seed)
         z = apply_depth_noise(z, depth.camera, depth.noise, noise_generator(seed, "depth", shot.frame), shot.shadow)
         if not depth.registered:
             return z
-        return register_depth(self._rays, z, self._config.color.camera, self._config.T_color_depth)
+        return register_depth(self._rays, z, self._color_config.camera, self._T_color_depth)
 
     def linear_color(self, spline: Spline, stamp: float, frame: int, exposure_s: float | None = None) -> Float32Array:
         """Linear RGB (h, w, 3) of the colour frame at `stamp` (s); seeded by the config's seed and `frame`.
 
         exposure_s: where it is another one than the stream's.
         """
-        return self._color.render(self._pose(spline), stamp, self._seed(frame), exposure_s)
+        return self._color.render(self._pose(spline), stamp, self._frame_seed(frame), exposure_s)
 
     def light_meter(self, spline: Spline, stamps: FloatArray) -> Meter:
         """What an automatic camera sees of the frames at `stamps` (n,), s: small and sharp pictures of them."""
-        color = self._config.color
+        color = self._color_config
         camera, shutter = small_camera(color.camera, _METER_WIDTH), replace(color.shutter, exposure_s=0.0)
         small = self._render.ColorRenderer(self.scene, self._integrator, camera, shutter, _METER_SPP)
         noiseless = color.noise.model_copy(update={"gain": 0.0, "bayer": "off"})
@@ -173,7 +161,9 @@ class FrameSource:
         def read(frame: int, setting: Setting) -> Reading:
             # A sharp picture at mid-exposure shows what the blurred one does in the mean.
             instant = float(stamps[frame]) - 0.5 * setting.exposure_s
-            linear = small.render(self._pose(spline), instant, self._seed(frame)) * np.float32(color.exposure_gain)
+            linear = small.render(self._pose(spline), instant, self._frame_seed(frame)) * np.float32(
+                color.exposure_gain
+            )
             seen = apply_color_noise(*apply_setting(linear, noiseless, setting), np.random.default_rng(0))
             return reading(seen, linear * np.float32(setting.brightness))
 
@@ -194,74 +184,13 @@ class FrameSource:
     def _pose(self, spline: Spline) -> Callable[[Any], FloatArray]:
         return lambda t: spline.pose(t) @ self._T_depth_color
 
-    def _seed(self, frame: int) -> int:
-        return int(np.random.SeedSequence([self._config.seed, frame]).generate_state(1)[0])
+    def _frame_seed(self, frame: int) -> int:
+        return int(np.random.SeedSequence([self._seed, frame]).generate_state(1)[0])
 
 
-def make_integrator(mi: Any, scene: Any, config: Config, progress: Progress, objects: Sequence[Spline] = ()) -> Any:
-    """Mitsuba integrator of the config's light: `path`, or `BakedIntegrator` over the scene's baked irradiance.
-
-    objects: T_world_object(t) of the config's objects; without any the scene alone is shown.
-    """
-    light = config.light
-    if light.mode == "path":
-        return mi.load_dict({"type": "path", "max_depth": light.max_depth})
-    from rsgen.light.cache import baked_field, cache_folder
-    from rsgen.render.baked import BakedIntegrator
-
-    try:
-        cache = cache_folder(config.scene.file)
-        field = baked_field(scene, surfaces_hash(config), light, cache, progress, lambda: lines_of_sight(config))
-    except UserError as error:
-        told = str(error)
-        raise UserError(told if told.startswith("scene ") else f"scene {config.scene.file}: {told}") from None
-    things = lit_objects(scene, field, load_meshes(config), objects) if objects else None
-    return BakedIntegrator(field, glossy_spp=mirrored_samples(light, config.color.spp), objects=things)
-
-
-def mirrored_samples(light: LightConfig, spp: int) -> int:
-    """Samples of what surfaces mirror, at most, of so many of a pixel."""
-    return light.glossy_spp or max(_LEAST_MIRRORED, spp // 4)
-
-
-def load_scene(config: Config) -> Any:
-    """The config's Mitsuba scene, with its target if it has one. Raises UserError."""
-    from rsgen.device.backend import mitsuba
-
-    mitsuba(config.backend)
-    from rsgen.render import scene
-    from rsgen.render.board import Board
-
-    target = config.target
-    board = None if target is None else Board(target.grid, np.array(target.T_world_target, float))
-    return scene.load_scene(config.scene.file, board, _mesh_options(config))
-
-
-def scene_hash(config: Config) -> str:
-    """Content hash of the config's scene with all its files. Raises UserError."""
-    from rsgen.device.backend import mitsuba
-
-    mitsuba(config.backend)
-    from rsgen.render.scene import content_hash
-
-    return content_hash(config.scene.file, _mesh_options(config))
-
-
-def _mesh_options(config: Config) -> Any:
-    from rsgen.render.placement import SceneOptions
-
-    return SceneOptions(config.scene.scale, config.scene.up, config.scene.light)
-
-
-def surfaces_hash(config: Config) -> str:
-    """Hash of all that is lit: the scene, and its target if it has one. Raises UserError."""
-    scene, target = scene_hash(config), config.target
-    return scene if target is None else fingerprint({"scene": scene, "target": target.model_dump(mode="json")})
-
-
-def setting_of(config: Config, table: FrameTable | None, k: int) -> Setting | None:
+def setting_of(color: ColorConfig, table: FrameTable | None, k: int) -> Setting | None:
     """How an automatic camera took the k-th image of its frame table; None where nothing is automatic."""
-    if table is None or not config.color.adapts:
+    if table is None or not color.adapts:
         return None
     red, green, blue = table.balance[k].tolist()
     return Setting(float(table.exposure_s[k]), float(table.gain[k]), float(table.brightness[k]), (red, green, blue))

@@ -2,45 +2,43 @@
 
 from __future__ import annotations
 
-import hashlib
-import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rsgen.array_types import FloatArray
+from rsgen.config.cameras import ColorConfig
 from rsgen.config.config import Config
 from rsgen.console.progress import Progress
 from rsgen.console.scheduler import Workers
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_yaml
 from rsgen.motion.clearance import check_clearance
-from rsgen.produce.distribute import engine_versions, render_blocks, render_shots
-from rsgen.produce.frame_source import FrameSource, load_scene, scene_hash
-from rsgen.produce.ground_truth import Motion, load_motion
-from rsgen.produce.moving import (
-    check_clear_of_camera,
+from rsgen.motion.object_paths import check_objects_clear
+from rsgen.produce.frame_source import ColorShot, DepthShot, FrameSource
+from rsgen.produce.parts import (
+    TrueMotion,
+    engine_versions,
+    input_hashes,
     load_meshes,
-    object_hashes,
-    object_mesh_ply,
+    load_motion,
+    load_scene,
+    open_frames,
+    sequence_stamps,
 )
 from rsgen.produce.writer import SequenceWriter
 from rsgen.sensors.color import Reading, Setting, adapt
-from rsgen.sequence.format import STREAMS, stream_stamps
+from rsgen.sequence.format import STREAMS, StreamName
 from rsgen.sequence.truth_files import mesh_file
-
-log = logging.getLogger("rsgen")
 
 # What a sequence folder remembers of the machine that rendered it, for commands that render again. Not part of the
 # format: a sequence is whole without it.
 ORIGIN = "origin.yaml"
-
-
-def sequence_stamps(config: Config, motion: Motion) -> dict[str, FloatArray]:
-    """Stamps (n,) in seconds of all frames of both streams."""
-    return {s: stream_stamps(motion.first_stamp, motion.last_stamp, getattr(config, s)) for s in STREAMS}
+# Written frames that may wait for the disk: bounds memory and how much a kill can lose.
+_WRITE_AHEAD = 4
 
 
 def render_sequence(
@@ -56,37 +54,33 @@ def render_sequence(
     stamps = sequence_stamps(config, motion)
     if frames.start is not None and frames.start >= (longest := max(map(len, stamps.values()))):
         raise UserError(f"--frames: the sequence has no frame {frames.start}, only 0 to {longest - 1}")
-    identity = engine_versions(config), input_hashes(config)
-    # In a new folder: a scene that does not load must not leave one behind that its mended self cannot continue.
-    scene = None
-    meshes = load_meshes(config) if motion.objects else ()
+    identity = engine_versions(config.backend), input_hashes(config)
+    meshes, scene = load_meshes(config.objects), None
+    # In a new folder: a scene that does not load must not leave one behind that its repaired self cannot continue.
     if not (out / "sequence.yaml").exists():
         scene = load_scene(config)
-        check_clear_of_camera(config, meshes, motion.objects, motion.spline, motion.first_stamp, motion.last_stamp)
-        least = config.trajectory.clearance_m if config.motion is None else config.motion.clearance_m
-        if least is not None:
-            check_clearance(motion.spline, scene_triangles(scene), least)
+        _check_ways(config, motion, meshes, scene)
     writer = SequenceWriter.open(
         out, config, motion.spline, stamps["color"], stamps["depth"], *identity, motion.objects
     )
     write_origin(out, config)
     source = None
     if config.color.adapts:
-        source = FrameSource(config, progress, scene=scene, objects=writer.objects)
-        writer = writer.adapted(automatic_settings(config, source, writer, progress))
-    todo = sorted(
-        [(k, stream) for stream in STREAMS for k in _chosen(writer.missing(stream), frames, len(stamps[stream]))],
-    )
+        source = open_frames(config, progress, scene=scene, objects=writer.objects)
+        writer = writer.adapted(automatic_settings(config.color, source, writer, progress))
+    todo = sorted((k, s) for s in STREAMS for k in _chosen(writer.missing(s), frames, len(stamps[s])))
     if not (out / "scene.ply").is_file():
         scene = scene or load_scene(config)
         write_scene_ply(scene, out / "scene.ply")
     for thing, mesh in zip(config.objects, meshes, strict=True):
-        atomic_write(out / mesh_file(thing.name), object_mesh_ply(mesh))
+        write_ply(mesh.vertices, mesh.faces, out / mesh_file(thing.name))
     try:
         if todo and workers is not None:
+            from rsgen.produce.distribute import render_blocks  # on workers `render_shots` renders, too
+
             render_blocks(writer, todo, *identity, workers, progress)
         elif todo:
-            source = source or FrameSource(config, progress, scene=scene, objects=writer.objects)
+            source = source or open_frames(config, progress, scene=scene, objects=writer.objects)
             render_shots(writer, source, todo, progress)
     except (KeyboardInterrupt, SystemExit):
         # A run that the user ends here leaves a readable, shorter sequence.
@@ -96,11 +90,45 @@ def render_sequence(
     return out
 
 
+def render_shots(
+    writer: SequenceWriter, source: FrameSource, shots: Sequence[tuple[int, StreamName]], progress: Progress
+) -> None:
+    """Render images (frame, stream) in order and write them; noise and encoding go on beside. Raises UserError."""
+    # However this ends, leaving the pool waits for what has been rendered to be written.
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        pending: list[Future[None]] = []
+        for done, (k, stream) in enumerate(shots, 1):
+            shown = writer.shows(stream, k)
+            stamp = float(writer.stamps(stream)[shown])
+            if stream == "color":
+                after = writer.next_color(k)
+                next_stamp = None if after is None else float(writer.stamps("color")[after])
+                settings = (None if frame is None else writer.setting(frame) for frame in (shown, after))
+                shot = source.expose_color(writer.spline, stamp, shown, next_stamp, *settings)
+                pending.append(pool.submit(_write_color, writer, source, k, shot))
+            else:
+                measured = source.expose_depth(writer.spline, stamp, shown)
+                pending.append(pool.submit(_write_depth, writer, source, k, measured))
+            while len(pending) > _WRITE_AHEAD:
+                pending.pop(0).result()
+            progress("frames", done / len(shots), f"frame {k}")
+        for write in pending:
+            write.result()
+
+
+def _write_color(writer: SequenceWriter, source: FrameSource, k: int, shot: ColorShot) -> None:
+    writer.write_color(k, *source.develop_color(shot))
+
+
+def _write_depth(writer: SequenceWriter, source: FrameSource, k: int, shot: DepthShot) -> None:
+    writer.write_depth(k, shot.z, source.develop_depth(shot), shot.ids)
+
+
 def automatic_settings(
-    config: Config, source: FrameSource, writer: SequenceWriter, progress: Progress
+    color: ColorConfig, source: FrameSource, writer: SequenceWriter, progress: Progress
 ) -> list[Setting]:
     """How the automatic camera takes all colour frames of its clock, also those that a driver loses."""
-    color, stamps = config.color, writer.stamps("color")
+    stamps = writer.stamps("color")
     gain = color.noise.gain if color.noise.model == "camera" and color.noise.gain > 0 else 1.0
     meter = source.light_meter(writer.spline, stamps)
 
@@ -110,6 +138,16 @@ def automatic_settings(
 
     reference = Setting(color.exposure_s, gain)
     return adapt(watched, len(stamps), reference, color.auto_exposure, color.auto_white_balance)
+
+
+def _check_ways(config: Config, motion: TrueMotion, meshes: Sequence[Any], scene: Any) -> None:
+    """Raises UserError if an object comes through a camera, or a camera too near to the scene."""
+    triangles, names = [mesh.vertices[mesh.faces] for mesh in meshes], [thing.name for thing in config.objects]
+    span, T_color_depth = (motion.first_stamp, motion.last_stamp), np.asarray(config.T_color_depth, float)
+    check_objects_clear(names, motion.objects, triangles, motion.spline, span, T_color_depth)
+    least = config.trajectory.clearance_m if config.motion is None else config.motion.clearance_m
+    if least is not None:
+        check_clearance(motion.spline, scene_triangles(scene), least)
 
 
 def _chosen(missing: Iterable[int], frames: slice, count: int) -> list[int]:
@@ -127,9 +165,16 @@ def scene_triangles(scene: Any) -> FloatArray:
 
 def write_scene_ply(scene: Any, path: Path) -> None:
     """All triangles of the scene, world frame, metres, as binary PLY. Raises UserError if it cannot be written."""
-    from rsgen.render.meshes import ply_bytes, surface
+    from rsgen.render.meshes import surface
 
     vertices, faces = surface(scene)
+    write_ply(vertices, faces, path)
+
+
+def write_ply(vertices: Any, faces: Any, path: Path) -> None:
+    """Triangles as binary PLY. Raises UserError if it cannot be written."""
+    from rsgen.render.meshes import ply_bytes
+
     atomic_write(path, ply_bytes(vertices, faces))
 
 
@@ -140,10 +185,3 @@ def write_origin(out: Path, config: Config) -> None:
         where["trajectory"] = str(config.trajectory.file.resolve())
     where |= {f"object {thing.name}": str(thing.mesh.resolve()) for thing in config.objects if thing.mesh is not None}
     atomic_write(out / ORIGIN, encode_yaml(where))
-
-
-def input_hashes(config: Config) -> dict[str, str]:
-    """Content hashes of the trajectory file, if there is one, and of the scene with all its files. Raises UserError."""
-    file = config.trajectory.file
-    trajectory = {} if file is None else {"trajectory": hashlib.sha256(file.read_bytes()).hexdigest()}
-    return trajectory | {"scene": scene_hash(config)} | object_hashes(config)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,24 +23,32 @@ from rsgen.errors import UserError
 from rsgen.files import encode_yaml
 from rsgen.geometry.spline import Spline
 from rsgen.motion.clearance import clearance, plan_tour
-from rsgen.motion.floor_plan import HIGHEST_M, Cast, FloorPlan, find_floors, floor_plan, share_without_floor
+from rsgen.motion.floor_plan import FloorPlan
 from rsgen.motion.make import least_turning
-from rsgen.motion.walk import choose_targets, free_region, ring, seen_from, walk_inside
-from rsgen.produce.exposure import suggested_gain
+from rsgen.motion.walk import choose_targets, ring, seen_from, walk_inside
 from rsgen.produce.generate import scene_triangles
-from rsgen.produce.ground_truth import load_motion
-from rsgen.produce.tour import REACH_M, Tour, motion_text, room_text, thing_text, view_times
-from rsgen.produce.units import doubt, likely_unit
+from rsgen.produce.parts import load_motion
+from rsgen.produce.tour import (
+    REACH_M,
+    Thing,
+    Tour,
+    TourScene,
+    doubt,
+    find_room,
+    find_thing,
+    motion_text,
+    room_text,
+    suggested_gain,
+    thing_text,
+    view_times,
+)
 
-_STOREYS = 6  # floors that are looked at, the largest first
-_LARGE = 0.3  # of the scene's ground, what walls enclose where the scene is a room
 _ATTEMPTS = 4
 _CALM = (0.08, 0.2, 1.0, 4.0)
 _BRISK_DEG_S = 35.0  # mean rotational speed of hand-held recordings: 15 to 40
 _SWAY_SHARE, _SWAY_DEG_S = 1.08, 1.5  # what the slow turning adds to that of the tour
 _SWAY_DEG = 20.0  # it turns to either side by so much at most where more is to be added: it is made faster instead
-_SMALLEST_M, _FARTHEST_M = 0.001, 9000.0
-_SKIN = 0.01  # of a scene's size: what lies so flat is its ground
+_FARTHEST_M = 9000.0
 _SLACK_M = 0.04
 _HAND: dict[str, Any] = {
     "sway": [0.7, 1.0, 0.7],
@@ -106,38 +114,6 @@ class Suggestion:
         return "".join(f"# {line}\n" for line in self.found).encode() + encode_yaml(data)
 
 
-@dataclass(frozen=True, eq=False)
-class _Scene:
-    """A scene file's triangles (m, 3, 3), world, m, and rays into it. fineness (m,): how finely light is baked on each,
-    of what is asked. placed: fields of its config but the file. hint: what may be the matter where no tour is found.
-    """
-
-    file: Path
-    triangles: FloatArray
-    fineness: FloatArray
-    cast: Cast
-    placed: Mapping[str, Any]
-    hint: str = ""
-
-    @property
-    def box(self) -> tuple[FloatArray, FloatArray]:
-        """Its least and largest corner (3,)."""
-        return self.triangles.min(axis=(0, 1)), self.triangles.max(axis=(0, 1))
-
-    def wrong(self, what: str) -> UserError:
-        """An error of one line that names the file."""
-        return UserError(f"scene {self.file}: {what}" + (f" ({self.hint})" if self.hint else ""))
-
-
-@dataclass(frozen=True, eq=False)
-class _Thing:
-    """Corners (3,) of the box of all but the ground, and the ground's height; world, m."""
-
-    low: FloatArray
-    high: FloatArray
-    ground_y: float
-
-
 def suggest_tour(
     file: Path, name: str | None, wish: Wish, scale: float = 1.0, up: Up = "y", like: Config | None = None
 ) -> Suggestion:
@@ -161,13 +137,13 @@ def suggest_tour(
     fineness = 1.0 / coarser(triangles, inhabited_box([shape for shape in loaded.shapes() if shape.is_mesh()]))
     own = camera_up(file) if file.suffix.lower() == ".xml" else None
     hint = "" if own in (None, up) else f"its own camera has {own} up: --up {own}"
-    scene = _Scene(file, triangles, fineness, partial(cast_rays, loaded), placed, hint)
+    scene = TourScene(file, triangles, fineness, partial(cast_rays, loaded), placed, hint)
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", file.stem) if name is None else name
-    aim = _room(scene, wish.clearance_m) or _thing(scene)
+    aim = find_room(scene, wish.clearance_m) or find_thing(scene)
     if (farthest := float(np.abs(scene.triangles).max())) > _FARTHEST_M:
         raise scene.wrong(f"reaches {farthest:.0f} m from the origin: scale it to metres, or move it to the origin")
     rng = np.random.default_rng(wish.seed)
-    best: Tour | None = None
+    best: tuple[Tour, Config] | None = None
     for _ in range(_ATTEMPTS):
         tours = _through(scene, aim, wish, rng) if isinstance(aim, FloorPlan) else [_round(scene, aim, wish, rng)]
         config = _config(scene, tours, name, wish, like)
@@ -175,66 +151,25 @@ def suggest_tour(
         least = clearance(spline, scene.triangles, max(REACH_M, wish.clearance_m))
         if least < wish.clearance_m:
             continue
-        tour = Tour(config, spline, least, seen_from(spline.pose(view_times(config)), scene.cast))
-        if best is None or tour.flat < best.flat:
-            best = tour
-        if best.flat <= _FLAT:
+        assert config.motion is not None
+        seconds = config.motion.duration_s
+        tour = Tour(spline, seconds, least, seen_from(spline.pose(view_times(seconds)), scene.cast))
+        if best is None or tour.flat < best[0].flat:
+            best = tour, config
+        if best[0].flat <= _FLAT:
             break
     if best is None:
         raise scene.wrong(f"no tour found that keeps {wish.clearance_m:g} m from all surfaces: reduce --clearance")
     where = room_text(aim, wish.clearance_m) if isinstance(aim, FloorPlan) else thing_text(aim.high - aim.low)
     if isinstance(aim, FloorPlan):
         where += doubt(aim.floor.gap_m, scale)
-    config, how = _exposed(loaded, best.config, best.spline)
-    found = (f"{file.name}: {where}", *((hint,) if hint else ()), *motion_text(best, wish.rotation_deg_s), *how)
+    tour, config = best
+    config, how = _exposed(loaded, config, tour.spline)
+    found = (f"{file.name}: {where}", *((hint,) if hint else ()), *motion_text(tour, wish.rotation_deg_s), *how)
     return Suggestion(config, found)
 
 
-def _room(scene: _Scene, clearance_m: float) -> FloorPlan | None:
-    """The plan of the floor with the largest room for a camera; None where the scene is no room. Raises UserError."""
-    low, high = scene.box
-    best, most = None, 0.0
-    for floor in find_floors(scene.cast, low, high)[:_STOREYS]:
-        if floor.area_m2 < most:
-            break  # the others are smaller yet
-        plan = floor_plan(scene.triangles, scene.cast, floor, clearance_m)
-        free = plan.area_m2(plan.largest(clearance_m))
-        if plan.inside.any() and (best is None or free > most):
-            best, most = plan, free
-    if best is None:
-        if share_without_floor(scene.cast, low, high) >= _LARGE:
-            raise scene.wrong("walls but no floor below them: add a floor, or say which axis is up (--up z)")
-        return None
-    height = float(high[1] - low[1])
-    if height > HIGHEST_M:
-        unit, scale = likely_unit(height)
-        scale *= scene.placed.get("scale", 1.0)
-        raise scene.wrong(
-            f"a room of {height:.0f} m from bottom to top is rather one in {unit}: --scale {scale:g}, or see --up"
-        )
-    if free_region(best, clearance_m) is not None:
-        return best
-    if not best.solid and best.inside.mean() >= _LARGE:
-        raise scene.wrong(
-            f"no room for a camera: no way between its walls at eye height keeps {clearance_m:g} m from all surfaces: "
-            "reduce --clearance, or see that the scene is in metres and y up"
-        )
-    return None
-
-
-def _thing(scene: _Scene) -> _Thing:
-    """All but the ground. Raises UserError if there is nothing else, or next to nothing."""
-    low, high = scene.box
-    size = float((high - low).max())
-    rest = scene.triangles[scene.triangles[..., 1].max(axis=1) > low[1] + _SKIN * size]
-    if not len(rest):
-        raise scene.wrong("holds nothing but a floor: add something to look at")
-    if size < _SMALLEST_M:
-        raise scene.wrong(f"all of it lies within {1000.0 * size:.2g} mm: scale it to metres")
-    return _Thing(rest.min(axis=(0, 1)), rest.max(axis=(0, 1)), float(low[1]))
-
-
-def _through(scene: _Scene, plan: FloorPlan, wish: Wish, rng: np.random.Generator) -> list[tuple[Waypoint, ...]]:
+def _through(scene: TourScene, plan: FloorPlan, wish: Wish, rng: np.random.Generator) -> list[tuple[Waypoint, ...]]:
     """Tours through a room along one walk, whose gaze is ever calmer."""
     p_world = walk_inside(plan, wish.seconds * wish.speed_m_s, wish.clearance_m, rng)
     if p_world is None:
@@ -245,7 +180,7 @@ def _through(scene: _Scene, plan: FloorPlan, wish: Wish, rng: np.random.Generato
     ]
 
 
-def _round(scene: _Scene, thing: _Thing, wish: Wish, rng: np.random.Generator) -> tuple[Waypoint, ...]:
+def _round(scene: TourScene, thing: Thing, wish: Wish, rng: np.random.Generator) -> tuple[Waypoint, ...]:
     """A tour round a thing, pushed off what else is there."""
     waypoints = _waypoints(*ring(thing.low, thing.high, thing.ground_y, rng))
     try:
@@ -270,7 +205,7 @@ def wish_like(config: Config, wish: Wish) -> Wish:
     return replace(wish, seconds=seconds, speed_m_s=motion.mean_speed_m_s, rotation_deg_s=turning)
 
 
-def _sections(scene: _Scene, like: Config | None) -> dict[str, Any]:
+def _sections(scene: TourScene, like: Config | None) -> dict[str, Any]:
     """What a config says beside its motion and scene: coarser light in a large one, and the cameras of another."""
     given = {} if like is None else like.model_dump(mode="json", include=set(_CAMERAS), exclude_unset=True)
     area = float((trimesh.triangles.area(scene.triangles) * scene.fineness**2).sum())
@@ -279,7 +214,9 @@ def _sections(scene: _Scene, like: Config | None) -> dict[str, Any]:
     return given
 
 
-def _config(scene: _Scene, tours: Sequence[tuple[Waypoint, ...]], name: str, wish: Wish, like: Config | None) -> Config:
+def _config(
+    scene: TourScene, tours: Sequence[tuple[Waypoint, ...]], name: str, wish: Wish, like: Config | None
+) -> Config:
     """The config of the first tour that turns no faster than people do, or than is wished, or of the last."""
     most = _BRISK_DEG_S if wish.rotation_deg_s is None else wish.rotation_deg_s
     sections = _sections(scene, like)

@@ -1,18 +1,25 @@
-"""A tour that has been found, in words: the room or the thing, how the camera moves, and what it sees."""
+"""A tour that has been found: in words, how to expose it, and the unit that its scene may be in."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from rsgen.array_types import FloatArray
-from rsgen.config.config import Config
+from rsgen.array_types import Float32Array, FloatArray
+from rsgen.device.pose_table import PoseFunction
+from rsgen.errors import UserError
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
-from rsgen.motion.floor_plan import FloorPlan
+from rsgen.motion.floor_plan import HIGHEST_M, Cast, FloorPlan, find_floors, floor_plan, share_without_floor
 from rsgen.motion.statistics import motion_statistics
 from rsgen.motion.walk import Seen, free_region
+from rsgen.produce.frame_source import small_camera
 
 REACH_M = 1.0  # so near a surface's distance is told
 _LARGEST_THING_M = 50.0
@@ -22,12 +29,94 @@ _AS_WISHED = 1.1
 _EMPTY = 0.3
 
 
+_STOREYS = 6  # floors that are looked at, the largest first
+_LARGE = 0.3  # of the scene's ground, what walls enclose where the scene is a room
+_SKIN = 0.01  # of a scene's size: what lies so flat is its ground
+_SMALLEST_M = 0.001
+
+
+@dataclass(frozen=True, eq=False)
+class TourScene:
+    """A scene file's triangles (m, 3, 3), world, m, and rays into it. fineness (m,): how finely light is baked on each,
+    of what is asked. placed: fields of its config but the file. hint: what may be the matter where no tour is found.
+    """
+
+    file: Path
+    triangles: FloatArray
+    fineness: FloatArray
+    cast: Cast
+    placed: Mapping[str, Any]
+    hint: str = ""
+
+    @property
+    def box(self) -> tuple[FloatArray, FloatArray]:
+        """Its least and largest corner (3,)."""
+        return self.triangles.min(axis=(0, 1)), self.triangles.max(axis=(0, 1))
+
+    def wrong(self, what: str) -> UserError:
+        """An error of one line that names the file."""
+        return UserError(f"scene {self.file}: {what}" + (f" ({self.hint})" if self.hint else ""))
+
+
+@dataclass(frozen=True, eq=False)
+class Thing:
+    """Corners (3,) of the box of all but the ground, and the ground's height; world, m."""
+
+    low: FloatArray
+    high: FloatArray
+    ground_y: float
+
+
+def find_room(scene: TourScene, clearance_m: float) -> FloorPlan | None:
+    """The plan of the floor with the largest room for a camera; None where the scene is no room. Raises UserError."""
+    low, high = scene.box
+    best, most = None, 0.0
+    for floor in find_floors(scene.cast, low, high)[:_STOREYS]:
+        if floor.area_m2 < most:
+            break  # the others are smaller yet
+        plan = floor_plan(scene.triangles, scene.cast, floor, clearance_m)
+        free = plan.area_m2(plan.largest(clearance_m))
+        if plan.inside.any() and (best is None or free > most):
+            best, most = plan, free
+    if best is None:
+        if share_without_floor(scene.cast, low, high) >= _LARGE:
+            raise scene.wrong("walls but no floor below them: add a floor, or say which axis is up (--up z)")
+        return None
+    height = float(high[1] - low[1])
+    if height > HIGHEST_M:
+        unit, scale = likely_unit(height)
+        scale *= scene.placed.get("scale", 1.0)
+        raise scene.wrong(
+            f"a room of {height:.0f} m from bottom to top is rather one in {unit}: --scale {scale:g}, or see --up"
+        )
+    if free_region(best, clearance_m) is not None:
+        return best
+    if not best.solid and best.inside.mean() >= _LARGE:
+        raise scene.wrong(
+            f"no room for a camera: no way between its walls at eye height keeps {clearance_m:g} m from all surfaces: "
+            "reduce --clearance, or see that the scene is in metres and y up"
+        )
+    return None
+
+
+def find_thing(scene: TourScene) -> Thing:
+    """All but the ground. Raises UserError if there is nothing else, or next to nothing."""
+    low, high = scene.box
+    size = float((high - low).max())
+    rest = scene.triangles[scene.triangles[..., 1].max(axis=1) > low[1] + _SKIN * size]
+    if not len(rest):
+        raise scene.wrong("holds nothing but a floor: add something to look at")
+    if size < _SMALLEST_M:
+        raise scene.wrong(f"all of it lies within {1000.0 * size:.2g} mm: scale it to metres")
+    return Thing(rest.min(axis=(0, 1)), rest.max(axis=(0, 1)), float(low[1]))
+
+
 @dataclass(frozen=True, eq=False)
 class Tour:
-    """A config, its spline, that one's least distance to surfaces in m, and what the camera sees along it."""
+    """A config's spline, how long it lasts, its least distance to surfaces in m, and what the camera sees along it."""
 
-    config: Config
     spline: Spline
+    seconds: float
     least: float
     seen: Seen
 
@@ -37,10 +126,9 @@ class Tour:
         return float(np.mean(self.seen.flat))
 
 
-def view_times(config: Config) -> FloatArray:
+def view_times(seconds: float) -> FloatArray:
     """Instants (n,) in s that views are looked at, over all of a made motion."""
-    assert config.motion is not None
-    return np.linspace(0.0, config.motion.duration_s, _VIEWS)
+    return np.linspace(0.0, seconds, _VIEWS)
 
 
 def room_text(plan: FloorPlan, clearance_m: float) -> str:
@@ -62,7 +150,7 @@ def thing_text(size: FloatArray) -> str:
 
 def motion_text(tour: Tour, rotation_deg_s: float | None) -> list[str]:
     """What the spline is like, and what its camera sees. rotation_deg_s: mean that was wished for, if any."""
-    stats = motion_statistics(tour.spline, 0.0, float(view_times(tour.config)[-1]))
+    stats = motion_statistics(tour.spline, 0.0, tour.seconds)
     distance, least = tour.seen.distance, tour.least
     near, far = _SEEN_M
     seen, nothing = np.mean((distance >= near) & (distance <= far)), np.mean(~np.isfinite(distance))
@@ -80,3 +168,65 @@ def motion_text(tour: Tour, rotation_deg_s: float | None) -> list[str]:
         flat = f"one plane fills {100 * tour.flat:.0f} % of the views"
         lines.append(f"{flat}: depth alone does not tell how the camera moves there")
     return lines
+
+
+_GLANCES, _WIDTH, _SPP, _DEPTH = 6, 48, 32, 16
+_BLOCK = 12  # pixels: noise of so few samples is averaged over blocks
+_GREY = 0.18  # what half of the blocks are to be brighter than
+_MOST, _WHITE = 0.7, 0.6  # of the blocks, that are not to be brighter than this: windows may, white walls not
+_ENOUGH = 2.0  # a factor that is not worth the while
+
+
+def suggested_gain(scene: Any, camera: Camera, T_world_cam: PoseFunction, until_s: float, gain: float) -> float | None:
+    """`color.exposure_gain` that makes the typical surface mid-grey, or less where it would make most of a picture's
+    bright part white: dark floors below white walls. None if `gain` does so within a factor of 2.
+
+    Path traced by `camera`, made small, at poses T_world_cam(t), at a few instants from 0 to `until_s`, in s. None too
+    where all is dark.
+    """
+    import mitsuba as mi
+
+    from rsgen.light.lamps import straight_through_bulbs
+    from rsgen.render.images import ColorRenderer
+
+    path = mi.load_dict({"type": "path", "max_depth": _DEPTH})
+    renderer = ColorRenderer(scene, path, small_camera(camera, _WIDTH), Shutter(), _SPP)
+    stamps = until_s * (np.arange(_GLANCES) + 0.5) / _GLANCES
+    with straight_through_bulbs(scene):
+        light = np.concatenate([_blocks(renderer.render(T_world_cam, float(t), k)) for k, t in enumerate(stamps)])
+    light = light[light > 0]
+    if not len(light):
+        return None
+    wanted = min(_GREY / float(np.median(light)), _WHITE / float(np.quantile(light, _MOST)))
+    if 1 / _ENOUGH <= wanted / gain <= _ENOUGH:
+        return None
+    return float(f"{wanted:.2g}")
+
+
+def _blocks(image: Float32Array) -> FloatArray:
+    """Mean light (n,), all channels, of whole blocks of an image (h, w, 3)."""
+    rows, columns = (size // _BLOCK for size in image.shape[:2])
+    whole = image[: rows * _BLOCK, : columns * _BLOCK].reshape(rows, _BLOCK, columns, _BLOCK, 3)
+    return np.asarray(whole.mean(axis=(1, 3, 4), dtype=np.float64)).ravel()
+
+
+_UNITS = {"centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254}
+_ROOM_M, _ROOMS_M = 2.5, (2.0, 6.0)
+
+
+def likely_unit(height: float) -> tuple[str, float]:
+    """The unit, and how many metres it has, in which a room of that height is as high as rooms are."""
+
+    def unlike(metres: float) -> tuple[float, float]:
+        low, high = _ROOMS_M
+        outside = max(math.log(low / metres), math.log(metres / high), 0.0)
+        return outside, abs(math.log(metres / _ROOM_M))
+
+    return min(_UNITS.items(), key=lambda unit: unlike(unit[1] * height))
+
+
+def doubt(height_m: float, scale: float) -> str:
+    """What to say of a room that high, taken at so many metres per unit: nothing if rooms are, or without a ceiling."""
+    if not _ROOMS_M[1] < height_m < math.inf:
+        return ""
+    return f"; if that is too high, --scale {scale * _ROOM_M / height_m:.2g} makes it {_ROOM_M:g} m"

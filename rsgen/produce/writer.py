@@ -14,38 +14,38 @@ import numpy.typing as npt
 from rsgen.array_types import BoolArray, ByteArray, Float32Array, FloatArray
 from rsgen.config.config import Config, StreamConfig
 from rsgen.config.faults import StreamFaults
-from rsgen.config.imu import ImuConfig
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_yaml, remove_stale_temporaries, write_error
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rsgen.image_codecs import encode_exr, encode_npy, encode_npz, encode_png
-from rsgen.produce.identity import color_truth, describe, refuse_foreign_folder, true_cameras
+from rsgen.produce.records import (
+    color_truth,
+    describe,
+    refuse_foreign_folder,
+    true_cameras,
+    write_ground_truth,
+    write_imu,
+    write_lines,
+    write_listings,
+)
 from rsgen.sensors.color import Setting
 from rsgen.sensors.imu import (
-    IMU_TRUTH_CSV,
-    IMU_TRUTH_YAML,
-    imu_truth_csv,
-    imu_truth_yaml,
     sample_clock,
-    simulate_imu,
-    write_imu_csv,
 )
-from rsgen.sensors.reports import color_clock, deliver, reported_poses
+from rsgen.sensors.reports import color_clock, deliver
 from rsgen.sequence.camera_yaml import TRUE_CAMERAS, camera_yaml
 from rsgen.sequence.format import (
     DEPTH_OBJECT_IDS,
     FOLDERS,
     FRAME_TABLES,
-    LISTINGS,
     OBJECT_CHANNELS,
     OBJECTS,
     ROWS,
     STREAMS,
     TRUTH_DEPTH,
     StreamName,
-    associate,
     color_truth_path,
     frame_name,
     ground_truth,
@@ -59,7 +59,7 @@ _SPLINE_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
-class _Stream:
+class _WrittenStream:
     """One stream; stamps (n,): true ones of all frames of its clock; table: what each of them shows, and when."""
 
     camera: Camera
@@ -72,7 +72,7 @@ class _Stream:
     @classmethod
     def of(
         cls, stream: StreamConfig, faults: StreamFaults | None, name: StreamName, stamps: npt.ArrayLike, seed: int
-    ) -> _Stream:
+    ) -> _WrittenStream:
         stamps = round_stamps(stamps)
         came = deliver(stamps, faults, seed, name)
         ones = np.ones(len(stamps))
@@ -102,8 +102,8 @@ class SequenceWriter:
     out: Path
     config: Config
     spline: Spline
-    color: _Stream
-    depth: _Stream
+    color: _WrittenStream
+    depth: _WrittenStream
     settings: tuple[Setting, ...] = ()
     objects: tuple[Spline, ...] = ()
 
@@ -132,8 +132,8 @@ class SequenceWriter:
         """
         out = Path(out)
         streams = {
-            "color": _Stream.of(config.color, config.injected.color, "color", stamps_color, config.seed),
-            "depth": _Stream.of(config.depth, config.injected.depth, "depth", stamps_depth, config.seed),
+            "color": _WrittenStream.of(config.color, config.injected.color, "color", stamps_color, config.seed),
+            "depth": _WrittenStream.of(config.depth, config.injected.depth, "depth", stamps_depth, config.seed),
         }
         for stream in streams.values():
             line_poses(spline, stream.camera, stream.shutter, stream.stamps[[0, -1]])
@@ -240,64 +240,37 @@ class SequenceWriter:
 
         Raises UserError if the disk refuses them.
         """
+        config, faults, out, spline = self.config, self.config.injected, self.out, self.spline
+        T_color_depth = np.array(config.T_color_depth, float)
+        T_image_depth = T_color_depth if config.depth.registered else None
         written = {s: [k for k in range(len(self.stamps(s))) if self._is_written(s, k)] for s in STREAMS}
         listed = {s: self._stream(s).table.listed_s for s in STREAMS}
-        entries = {s: [f"{listed[s][k]:.9f} {FOLDERS[s]}/{frame_name(k)}.png" for k in written[s]] for s in STREAMS}
-        for s in STREAMS:
-            header = [f"# {s} images of {self.config.name}", "# stamp path"]
-            _write_lines(self.out / LISTINGS[s], header + entries[s])
-        color, depth = (listed[s][written[s]] for s in STREAMS)
-        limit = 0.5 / min(self.config.color.rate_hz, self.config.depth.rate_hz)
-        pairs = [f"{entries['color'][i]} {entries['depth'][j]}" for i, j in associate(color, depth, limit)]
-        _write_lines(self.out / "associations.txt", pairs)
-        T_image_depth = np.array(self.config.T_color_depth, float) if self.config.depth.registered else None
-        camera = "T_world_depth" if T_image_depth is None else "T_world_color, depth being registered"
-        mocap = self.config.mocap
-        if mocap is None:
-            rows = ground_truth(self.spline, self.color.stamps, self.depth.stamps, T_cam_body=T_image_depth)
-        else:
-            rows = reported_poses(self.spline, mocap, self.config.seed, T_image_depth)
-            camera += ", as a motion capture reports it"
-        _write_lines(self.out / "groundtruth.txt", pose_lines(f"ground truth of {self.config.name}: {camera}", rows))
-        for thing, spline in zip(self.config.objects, self.objects, strict=True):
-            rows = ground_truth(spline, self.color.stamps, self.depth.stamps)
-            _write_lines(self.out / poses_file(thing.name), pose_lines(f"T_world_object of {thing.name}", rows))
+        write_listings(out, config.name, listed, written, 0.5 / min(config.color.rate_hz, config.depth.rate_hz))
+        stamps = {s: self.stamps(s) for s in STREAMS}
+        write_ground_truth(out, config.name, spline, stamps, T_image_depth, config.mocap, config.seed)
+        for thing, T_world_object in zip(config.objects, self.objects, strict=True):
+            rows = ground_truth(T_world_object, *stamps.values())
+            write_lines(out / poses_file(thing.name), pose_lines(f"T_world_object of {thing.name}", rows))
         for s in STREAMS:
             stream = self._stream(s)
-            T_cam_body = np.array(self.config.T_color_depth, float) if s == "color" else None
-            poses = stream.line_poses(self.spline, T_cam_body)
-            atomic_write(self.out / ROWS[s], encode_npy(poses))
+            atomic_write(out / ROWS[s], encode_npy(stream.line_poses(spline, T_color_depth if s == "color" else None)))
             if stream.writes_table:
                 table = stream.table.of(np.flatnonzero(stream.is_delivered))
-                atomic_write(self.out / FRAME_TABLES[s], table.text().encode())
-        if self.config.injected.declared is not None:
-            atomic_write(self.out / TRUE_CAMERAS, encode_yaml(self._true_cameras()))
-        if (target := self.config.target) is not None:
+                atomic_write(out / FRAME_TABLES[s], table.text().encode())
+        delivered = self.depth.table.listed_s[self.depth.is_delivered]
+        middle = float(delivered[len(delivered) // 2])
+        if faults.declared is not None:
+            firsts = float(self.color.stamps[0]), float(self.depth.stamps[0])
+            clock = color_clock(faults.color, faults.depth, *firsts, middle)
+            cameras = camera_yaml(true_cameras(config), clock, config.depth.registered)
+            atomic_write(out / TRUE_CAMERAS, encode_yaml(cameras))
+        if (target := config.target) is not None:
             text = target_corners_text(target.grid, np.array(target.T_world_target, float))
-            atomic_write(self.out / TARGET_CORNERS, text.encode())
-        if self.config.imu is not None:
-            spline, faults = self.spline, self.config.injected.imu
-            samples = simulate_imu(spline, self.config.imu, spline.t_begin, spline.t_end, self.config.seed, faults)
-            write_imu_csv(self.out / "imu.csv", samples)
-            if self.config.imu.has_truth(faults):
-                atomic_write(self.out / IMU_TRUTH_CSV, imu_truth_csv(samples).encode())
-                atomic_write(self.out / IMU_TRUTH_YAML, encode_yaml(self._true_imu(self.config.imu)))
+            atomic_write(out / TARGET_CORNERS, text.encode())
+        if config.imu is not None:
+            write_imu(out, spline, config.imu, faults.imu, config.seed, middle, T_image_depth)
 
-    def _true_cameras(self) -> dict[str, Any]:
-        """Content of truth/cameras.yaml."""
-        config, listed = self.config, self.depth.table.listed_s[self.depth.is_delivered]
-        times = (float(t) for t in (self.color.stamps[0], self.depth.stamps[0], listed[len(listed) // 2]))
-        clock = color_clock(config.injected.color, config.injected.depth, *times)
-        return camera_yaml(true_cameras(config), clock, config.depth.registered)
-
-    def _true_imu(self, imu: ImuConfig) -> dict[str, Any]:
-        """Content of truth/imu.yaml."""
-        start, _ = sample_clock(imu, self.spline.t_begin, self.spline.t_end)
-        listed = self.depth.table.listed_s[self.depth.is_delivered]
-        T_image_depth = np.array(self.config.T_color_depth, float) if self.config.depth.registered else np.eye(4)
-        return imu_truth_yaml(imu, self.config.injected.imu, start, float(listed[len(listed) // 2]), T_image_depth)
-
-    def _stream(self, stream: StreamName) -> _Stream:
+    def _stream(self, stream: StreamName) -> _WrittenStream:
         return self.color if stream == "color" else self.depth
 
     def _path(self, stream: StreamName, k: int) -> Path:
@@ -345,10 +318,6 @@ def _stored_spline(path: Path, spline: Spline) -> Spline:
     if not (same and np.abs(stored.control_points - spline.control_points).max() <= _SPLINE_TOLERANCE):
         raise UserError(f"{path}: holds another trajectory: choose another --out or delete the folder")
     return stored
-
-
-def _write_lines(path: Path, lines: list[str]) -> None:
-    atomic_write(path, "".join(f"{line}\n" for line in lines).encode())
 
 
 def _expect(image: np.ndarray, shape: tuple[int, ...], dtype: type[np.generic]) -> None:

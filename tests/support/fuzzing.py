@@ -20,7 +20,7 @@ import tiny
 import yaml
 
 from rsgen.config.config import Config, describe_fields
-from rsgen.produce.identity import color_truth
+from rsgen.produce.records import color_truth
 
 # No field takes any of these.
 NEVER: tuple[Any, ...] = (

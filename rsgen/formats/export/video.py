@@ -29,17 +29,18 @@ def export_video(
     options.scene: the scene's file, if it has moved since the sequence was rendered.
     """
     from rsgen.pictures.frames import config_of
-    from rsgen.produce.frame_source import FrameSource, setting_of
+    from rsgen.produce.frame_source import setting_of
+    from rsgen.produce.parts import open_frames
 
     sequence = sequence.as_taken
     stream = sequence.streams["color"]
     config = config_of(sequence.root, sequence.meta, options.scene)
-    source = FrameSource(config, progress, global_shutter=True, objects=[thing.spline for thing in sequence.objects])
+    source = open_frames(config, progress, global_shutter=True, objects=[thing.spline for thing in sequence.objects])
     # All rows at the middle row's time.
     middle = 0.5 * (stream.line_count - 1) * stream.shutter.line_delay(stream.camera)
     frames = range(len(stream.paths))
     left = (
-        source.color(sequence.spline, stamp + middle, int(k), setting_of(config, stream.table, i))
+        source.color(sequence.spline, stamp + middle, int(k), setting_of(config.color, stream.table, i))
         for i, (stamp, k) in enumerate(zip(stream.stamps, stream.indices, strict=True))
     )
     right = (sequence.color(k) for k in frames)

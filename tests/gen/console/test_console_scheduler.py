@@ -22,9 +22,9 @@ from rsgen.config.config import Config, load_config
 from rsgen.console import scheduler
 from rsgen.console.scheduler import DaskWorkers, InProcess, open_workers
 from rsgen.errors import UserError
-from rsgen.produce.distribute import RenderJob, SequenceRecipe, engine_versions, render_block
-from rsgen.produce.generate import input_hashes, render_sequence, sequence_stamps
-from rsgen.produce.ground_truth import load_motion
+from rsgen.produce.distribute import RenderJob, SequenceRecipe, render_block
+from rsgen.produce.generate import render_sequence
+from rsgen.produce.parts import engine_versions, input_hashes, load_motion, sequence_stamps
 from rsgen.sequence.reader import read_sequence
 
 FRAMES = 15  # 30 images, 4 blocks
@@ -175,7 +175,7 @@ def plan(config: Config) -> SequenceRecipe:
     motion = load_motion(config)
     stamps = sequence_stamps(config, motion)
     return SequenceRecipe(
-        config, motion.spline, stamps["color"], stamps["depth"], engine_versions(config), input_hashes(config)
+        config, motion.spline, stamps["color"], stamps["depth"], engine_versions(config.backend), input_hashes(config)
     )
 
 

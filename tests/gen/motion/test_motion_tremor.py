@@ -17,7 +17,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.motion.fit import fit_spline
 from rsgen.motion.make import with_tremor
-from rsgen.produce.ground_truth import load_motion
+from rsgen.produce.parts import load_motion
 
 ROOT = Path(__file__).parents[3]
 SECONDS = 8.0

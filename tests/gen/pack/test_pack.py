@@ -169,7 +169,7 @@ def test_masks_say_which_global_pixels_the_rolling_image_holds(packed: Path) -> 
 def test_the_gyroscope_reads_what_the_camera_turned(packed: Path, small_config: Path) -> None:
     about = json.loads((packed / "000000/sequence.json").read_text())
     table = np.loadtxt(packed / "000000/imu.csv", delimiter=",", comments="#")
-    from rsgen.produce.ground_truth import load_motion
+    from rsgen.produce.parts import load_motion
 
     config = load_config(small_config)
     fields = {name: about[name] for name in ("config", "readout_s", "exposure_s", "start_s", "speed", "seed")}
@@ -215,7 +215,7 @@ def test_depth_puts_points_where_the_flow_does(packed: Path, small_config: Path,
     assert extra == {"0000_rs.pdepth", "0001_rs.pdepth"}
     assert (folder / "0001_rs.png").read_bytes() == (packed / "000000/0001_rs.png").read_bytes()
 
-    from rsgen.produce.generate import load_motion
+    from rsgen.produce.parts import load_motion
 
     about, config = json.loads((folder / "sequence.json").read_text()), load_config(small_config)
     names = ("readout_s", "exposure_s", "start_s", "speed", "seed")

@@ -12,7 +12,7 @@ from rendering import constant_twist
 
 from rsgen.cli.main import main
 from rsgen.geometry.camera import Camera
-from rsgen.produce.exposure import suggested_gain
+from rsgen.produce.tour import suggested_gain
 
 CAMERA = Camera(640, 480, 480.0, 480.0, 319.5, 239.5)
 GLOWING = """<shape type="cube"><transform name="to_world"><scale value="2"/></transform>

@@ -22,9 +22,9 @@ from rsgen.geometry.spline import Spline
 from rsgen.motion.clearance import check_clearance
 from rsgen.motion.statistics import motion_statistics
 from rsgen.motion.walk import seen_from
-from rsgen.produce.ground_truth import Motion, load_motion
+from rsgen.produce.parts import TrueMotion, load_motion
 from rsgen.produce.suggest import Suggestion, Wish, suggest_tour
-from rsgen.produce.units import doubt, likely_unit
+from rsgen.produce.tour import doubt, likely_unit
 from rsgen.render.rays import cast_rays
 from rsgen.render.scene import load_scene
 from rsgen.sequence.trajectory import Trajectory
@@ -83,10 +83,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-_MOTIONS: dict[str, Motion] = {}
+_MOTIONS: dict[str, TrueMotion] = {}
 
 
-def motion_of(config: Config) -> Motion:
+def motion_of(config: Config) -> TrueMotion:
     """Of a config, fitted once: to look for a tour is to fit it already."""
     key = config.model_dump_json()
     if key not in _MOTIONS:

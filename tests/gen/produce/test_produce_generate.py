@@ -27,7 +27,7 @@ from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
 from rsgen.produce.frame_source import FrameSource
 from rsgen.produce.generate import render_sequence
-from rsgen.produce.ground_truth import load_motion
+from rsgen.produce.parts import load_motion, open_frames
 from rsgen.sequence.reader import read_sequence
 
 ROOT = Path(__file__).parents[3]
@@ -218,7 +218,7 @@ def test_frames_depend_neither_on_order_nor_on_threads(config: Path, whole: Path
     import drjit as dr
 
     loaded = load_config(config)
-    sequence, source = read_sequence(whole), FrameSource(loaded)
+    sequence, source = read_sequence(whole), open_frames(loaded)
     threads = dr.thread_count()
     try:
         for count in (1, threads):
@@ -235,7 +235,7 @@ def test_seeds_and_frames_have_noise_of_their_own(config: Path, whole: Path) -> 
     sequence = read_sequence(whole)
     stamp = float(sequence.streams["color"].stamps[0])
     linear = [
-        FrameSource(load_config(config, {"seed": seed})).linear_color(sequence.spline, stamp, frame)
+        open_frames(load_config(config, {"seed": seed})).linear_color(sequence.spline, stamp, frame)
         for seed, frame in (("0", 0), ("0", 1), ("1", 0))
     ]
     for a, b in ((0, 1), (0, 2), (1, 2)):
@@ -299,8 +299,8 @@ def test_variants_verify(folder: Path, tmp_path: Path, name: str) -> None:
 
 def test_baked_and_path_traced_pictures_look_alike(folder: Path, whole: Path) -> None:
     path = load_config(tiny.write_config(folder, FRAMES, "both", light={"mode": "path"}, color={"spp": 256}))
-    sequence, traced = read_sequence(whole), FrameSource(path).linear_color(load_motion(path).spline, 0.0, 0)
-    baked = FrameSource(load_config(folder / "tiny.yaml")).linear_color(sequence.spline, 0.0, 0)
+    sequence, traced = read_sequence(whole), open_frames(path).linear_color(load_motion(path).spline, 0.0, 0)
+    baked = open_frames(load_config(folder / "tiny.yaml")).linear_color(sequence.spline, 0.0, 0)
     assert np.abs(baked.mean() / traced.mean() - 1) < 0.2  # one bounce of nine, coarse
     assert np.corrcoef(baked.mean(-1).ravel(), traced.mean(-1).ravel())[0, 1] > 0.9
 

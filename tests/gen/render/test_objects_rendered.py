@@ -20,8 +20,7 @@ from rsgen.config.config import load_config
 from rsgen.geometry.shutter import Shutter
 from rsgen.image_codecs import encode_exr, read_exr
 from rsgen.light.probes import gathered_light
-from rsgen.produce.frame_source import FrameSource
-from rsgen.produce.ground_truth import load_motion
+from rsgen.produce.parts import load_motion, open_frames
 from rsgen.render.irradiance import IrradianceField, make_field, make_lattice
 from rsgen.render.moving_objects import MovingObject, ObjectsInFrame, covered, harmonics, irradiance_coefficients
 from rsgen.render.object_meshes import load_object
@@ -138,7 +137,7 @@ def test_verify_notices_wrong_masks_poses_and_motions(whole: Path, tmp_path: Pat
 def test_blur_is_the_mean_of_sharp_pictures_over_the_exposure(config: Path) -> None:
     loaded = load_config(config, {"color.spp": "64", "color.readout_s": "0.01"})
     made = load_motion(loaded)
-    color = FrameSource(loaded, objects=made.objects)._color
+    color = open_frames(loaded, objects=made.objects)._color
     rest = constant_twist(np.zeros(6), made.spline.pose(np.array([0.06]))[0])  # only the things blur
     got = color.render(rest, 0.06, 1)
     mean = np.mean([color.render(rest, 0.06 - 0.03 * (k + 0.5) / 12, k, 0.0) for k in range(12)], axis=0)

@@ -19,7 +19,7 @@ from rsgen.config.sections import TruthConfig
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter
-from rsgen.produce import frame_source
+from rsgen.produce import parts
 from rsgen.render.images import ColorRenderer
 from rsgen.sensors.color import to_srgb8
 from rsgen.truth.renderer import TruthRenderer
@@ -36,8 +36,8 @@ SCANS: tuple[Scan, Scan] = ("top-bottom", "left-right")
 def lit(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Any, Any]:
     """The tiny room with its baked light: scene, integrator, config."""
     config = load_config(tiny.write_config(tmp_path_factory.mktemp("tiny"), color={"exposure_s": EXPOSURE}))
-    scene = frame_source.load_scene(config)
-    return scene, frame_source.make_integrator(mi, scene, config, lambda *_: None), config
+    scene = parts.load_scene(config)
+    return scene, parts.make_integrator(mi, scene, config, lambda *_: None), config
 
 
 def frames(lit: Any, shutter: Shutter, spp: int, seeds: range, stamp: float = STAMP) -> np.ndarray:

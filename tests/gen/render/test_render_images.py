@@ -21,7 +21,7 @@ from trimesh.ray.ray_pyembree import RayMeshIntersector
 from rsgen.config.config import Config
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.produce import generate
+from rsgen.produce import parts
 from rsgen.render import images as render
 from rsgen.render.images import ColorRenderer, DepthRenderer
 from rsgen.render.scene import load_scene
@@ -211,7 +211,7 @@ def config_for(room: Path, **color: Any) -> Config:
 def test_frame_source_renders_both_streams_with_their_own_cameras(room: Path) -> None:
     config = config_for(room, exposure_s=0.01, exposure_gain=0.7)
     spline = synthetic.make_spline()
-    source = generate.FrameSource(config)
+    source = parts.open_frames(config)
     np.testing.assert_array_equal(
         source.depth(spline, STAMP),
         DepthRenderer(source.scene, config.depth.camera, config.depth.shutter).render(spline.pose, STAMP),
@@ -231,7 +231,7 @@ def test_frame_source_renders_both_streams_with_their_own_cameras(room: Path) ->
     np.testing.assert_array_equal(linear, frames[2])
     assert np.mean(frames[2] != frames[3]) > 0.9
     np.testing.assert_array_equal(source.color(spline, STAMP, 2), to_srgb8(linear, 0.7))
-    other_seed = generate.FrameSource(config.model_copy(update={"seed": 5})).linear_color(spline, STAMP, 2)
+    other_seed = parts.open_frames(config.model_copy(update={"seed": 5})).linear_color(spline, STAMP, 2)
     assert np.mean(other_seed != linear) > 0.9
 
 
@@ -244,6 +244,6 @@ def test_a_global_shutter_frame_source_is_that_of_a_config_without_readout(room:
         }
     )
     spline = synthetic.make_spline()
-    twin, plain = generate.FrameSource(config, global_shutter=True), generate.FrameSource(no_readout)
+    twin, plain = parts.open_frames(config, global_shutter=True), parts.open_frames(no_readout)
     np.testing.assert_array_equal(twin.depth(spline, STAMP), plain.depth(spline, STAMP))
     np.testing.assert_array_equal(twin.linear_color(spline, STAMP, 1), plain.linear_color(spline, STAMP, 1))

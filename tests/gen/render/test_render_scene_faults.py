@@ -18,7 +18,7 @@ from scene_files import fails, hits, rays_at, write_scene
 from rsgen.config.config import LightConfig, load_config
 from rsgen.errors import UserError
 from rsgen.light.bake import bake
-from rsgen.produce.frame_source import make_integrator
+from rsgen.produce.parts import make_integrator
 from rsgen.render import irradiance
 from rsgen.render.irradiance import lattice_area, lattice_barycentric, make_field, make_lattice
 from rsgen.render.meshes import ply_bytes, surface

@@ -15,10 +15,9 @@ from rsgen.config.cameras import AutoExposureConfig, AutoWhiteBalanceConfig, Col
 from rsgen.config.config import load_config
 from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
-from rsgen.produce.distribute import RenderJob, SequenceRecipe, engine_versions, render_block
+from rsgen.produce.distribute import RenderJob, SequenceRecipe, render_block
 from rsgen.produce.frame_source import setting_of
-from rsgen.produce.generate import input_hashes, sequence_stamps
-from rsgen.produce.ground_truth import load_motion
+from rsgen.produce.parts import engine_versions, input_hashes, load_motion, sequence_stamps
 from rsgen.sensors.color import Reading, Setting, adapt, apply_color_noise, apply_setting, reading
 from rsgen.sequence.reader import read_sequence
 
@@ -172,9 +171,9 @@ def test_a_worker_takes_frames_as_the_whole_did(config: Path, whole: Path) -> No
     motion = load_motion(loaded)
     stamps = sequence_stamps(loaded, motion)
     table = read_sequence(whole).streams["color"].table
-    settings = [setting_of(loaded, table, k) for k in range(12)]
+    settings = [setting_of(loaded.color, table, k) for k in range(12)]
     plan = SequenceRecipe(
-        loaded, motion.spline, stamps["color"], stamps["depth"], engine_versions(loaded), input_hashes(loaded),
+        loaded, motion.spline, stamps["color"], stamps["depth"], engine_versions(loaded.backend), input_hashes(loaded),
         tuple(s for s in settings if s is not None),
     )  # fmt: skip
     files = render_block(RenderJob(plan, ((10, "color"),)), no_progress)

@@ -16,7 +16,7 @@ from rsgen.config.cameras import DepthConfig, DepthNoiseConfig
 from rsgen.config.config import load_config
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
-from rsgen.produce.frame_source import FrameSource
+from rsgen.produce.parts import open_frames
 from rsgen.sensors.depth import disparity_error, mixed_depth, with_fixed_errors
 from rsgen.sequence.reader import read_sequence
 from rsgen.sequence.trajectory import read_trajectory
@@ -136,9 +136,9 @@ def test_it_is_what_the_colour_camera_sees(whole: Path) -> None:
 
 def test_blur_of_depth_is_that_of_its_exposure(config: Path, whole: Path) -> None:
     spline, stamp = read_sequence(whole).spline, 2 / 30
-    shot = FrameSource(load_config(config)).expose_depth(spline, stamp, 2)
+    shot = open_frames(load_config(config)).expose_depth(spline, stamp, 2)
     assert shot.blurred is not None
-    sharp = FrameSource(load_config(config, {"depth.exposure_s": "0", "depth.blur_samples": "1"}))
+    sharp = open_frames(load_config(config, {"depth.exposure_s": "0", "depth.blur_samples": "1"}))
     samples = [sharp.depth(spline, stamp - 0.02 + 0.004 * (k + 0.5)) for k in range(5)]
     np.testing.assert_allclose(samples[2], shot.z, rtol=1e-6)
     expected = 1 / np.mean([1 / z.astype(float) for z in samples], axis=0)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from rsgen.config.config import Config, StreamConfig
 from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
-from rsgen.produce.identity import fingerprint
+from rsgen.produce.records import fingerprint
 from rsgen.produce.writer import quantise
 from rsgen.sequence.format import FORMAT, associate, pose_rows, poses_of_rows, stream_stamps
 from rsgen.sequence.reader import read_sequence

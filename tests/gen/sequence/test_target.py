@@ -19,7 +19,7 @@ from rsgen.config.config import load_config
 from rsgen.errors import UserError
 from rsgen.geometry.aprilgrid import AprilGrid
 from rsgen.geometry.shutter import Shutter, project_rolling
-from rsgen.produce.frame_source import load_scene, scene_hash, surfaces_hash
+from rsgen.produce.parts import load_scene, scene_hash, surfaces_hash
 from rsgen.render.board import Board, drawing, surface
 from rsgen.render.meshes import mesh_arrays
 from rsgen.sequence.reader import Sequence, read_sequence

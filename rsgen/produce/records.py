@@ -1,4 +1,4 @@
-"""What tells one sequence from another: the text of sequence.yaml, its fingerprint, and whose a folder is."""
+"""What a sequence's folder holds beside its frames: whose it is, and the text files that go with the frames."""
 
 from __future__ import annotations
 
@@ -11,13 +11,39 @@ from typing import Any
 import numpy as np
 
 from rsgen.array_types import FloatArray
-from rsgen.config.config import Config, StreamConfig
-from rsgen.config.faults import moved_to
+from rsgen.config.cameras import StreamConfig
+from rsgen.config.config import Config
+from rsgen.config.faults import ImuFaults, moved_to
+from rsgen.config.imu import ImuConfig
+from rsgen.config.sections import MocapConfig
 from rsgen.errors import UserError
-from rsgen.files import is_temporary, read_yaml
+from rsgen.files import atomic_write, encode_yaml, is_temporary, read_yaml
 from rsgen.geometry.spline import Spline
+from rsgen.sensors.imu import (
+    IMU_TRUTH_CSV,
+    IMU_TRUTH_YAML,
+    imu_truth_csv,
+    imu_truth_yaml,
+    sample_clock,
+    simulate_imu,
+    write_imu_csv,
+)
+from rsgen.sensors.reports import reported_poses
 from rsgen.sequence.camera_yaml import Cameras
-from rsgen.sequence.format import CLEAN_COLOR, FORMAT, OBJECT_CHANNELS, OBJECT_IDS, STREAMS
+from rsgen.sequence.format import (
+    CLEAN_COLOR,
+    FOLDERS,
+    FORMAT,
+    LISTINGS,
+    OBJECT_CHANNELS,
+    OBJECT_IDS,
+    STREAMS,
+    StreamName,
+    associate,
+    frame_name,
+    ground_truth,
+    pose_lines,
+)
 
 
 def fingerprint(content: Mapping[str, Any]) -> str:
@@ -142,3 +168,52 @@ def _first_difference(old: Any, new: Any, name: str = "") -> tuple[str, Any, Any
 def _short(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 40 else f"{text[:37]}..."
+
+
+def write_listings(
+    out: Path, name: str, listed: Mapping[StreamName, FloatArray], written: Mapping[StreamName, list[int]],
+    limit_s: float,
+) -> None:  # fmt: skip
+    """rgb.txt, depth.txt, and the pairs at most limit_s apart. listed (n,): stamps, s; written: frames on disk."""
+    entries = {s: [f"{listed[s][k]:.9f} {FOLDERS[s]}/{frame_name(k)}.png" for k in written[s]] for s in STREAMS}
+    for s in STREAMS:
+        write_lines(out / LISTINGS[s], [f"# {s} images of {name}", "# stamp path", *entries[s]])
+    color, depth = (listed[s][written[s]] for s in STREAMS)
+    pairs = [f"{entries['color'][i]} {entries['depth'][j]}" for i, j in associate(color, depth, limit_s)]
+    write_lines(out / "associations.txt", pairs)
+
+
+def write_ground_truth(
+    out: Path, name: str, spline: Spline, stamps: Mapping[StreamName, FloatArray], T_image_depth: FloatArray | None,
+    mocap: MocapConfig | None, seed: int,
+) -> None:  # fmt: skip
+    """groundtruth.txt: exact poses, or what a motion capture reports of them.
+
+    T_image_depth (4, 4): of the colour camera, where depth is registered, whose poses they then are.
+    """
+    camera = "T_world_depth" if T_image_depth is None else "T_world_color, depth being registered"
+    if mocap is None:
+        rows = ground_truth(spline, stamps["color"], stamps["depth"], T_cam_body=T_image_depth)
+    else:
+        rows = reported_poses(spline, mocap, seed, T_image_depth)
+        camera += ", as a motion capture reports it"
+    write_lines(out / "groundtruth.txt", pose_lines(f"ground truth of {name}: {camera}", rows))
+
+
+def write_imu(
+    out: Path, spline: Spline, imu: ImuConfig, faults: ImuFaults | None, seed: int, middle: float,
+    T_image_depth: FloatArray | None,
+) -> None:  # fmt: skip
+    """imu.csv, and its truth where that is more than the spline's. middle: stamp of the middle depth image, s."""
+    samples = simulate_imu(spline, imu, spline.t_begin, spline.t_end, seed, faults)
+    write_imu_csv(out / "imu.csv", samples)
+    if imu.has_truth(faults):
+        start, _ = sample_clock(imu, spline.t_begin, spline.t_end)
+        T = np.eye(4) if T_image_depth is None else T_image_depth
+        atomic_write(out / IMU_TRUTH_CSV, imu_truth_csv(samples).encode())
+        atomic_write(out / IMU_TRUTH_YAML, encode_yaml(imu_truth_yaml(imu, faults, start, middle, T)))
+
+
+def write_lines(path: Path, lines: list[str]) -> None:
+    """A text file of these lines. Raises UserError if the disk refuses it."""
+    atomic_write(path, "".join(f"{line}\n" for line in lines).encode())

@@ -1,0 +1,261 @@
+"""The parts of a sequence, each made from its own sections of the config: motion, scene, objects, light and frames."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rsgen.array_types import FloatArray
+from rsgen.config.cameras import StreamConfig
+from rsgen.config.config import Backend, Config
+from rsgen.config.motion import ObjectConfig
+from rsgen.config.sections import LightConfig, SceneConfig, TrajectoryConfig
+from rsgen.console.progress import Progress, no_progress
+from rsgen.errors import UserError
+from rsgen.geometry import se3
+from rsgen.geometry.spline import Spline
+from rsgen.motion.fit import FitResult, fit_spline
+from rsgen.motion.make import make_motion, with_tremor
+from rsgen.motion.object_paths import object_spline
+from rsgen.produce.frame_source import FrameSource
+from rsgen.produce.records import fingerprint
+from rsgen.sequence.format import STREAMS, stream_stamps
+from rsgen.sequence.trajectory import Trajectory, read_trajectory
+
+log = logging.getLogger("rsgen")
+
+# About 12 days. Up to here a float64 tells 0.1 ns apart; in Unix time 0.24 us, half a percent of a line delay.
+_LARGEST_STAMP_S = 1e6
+_LOOKS = 64  # instants that lines of sight are taken at, and as many lines each
+_LIGHT_STEP_S = 0.1  # between the places along an object's path at which light is gathered
+_LEAST_MIRRORED = 4
+
+
+# --- motion
+
+
+@dataclass(frozen=True)
+class TrueMotion:
+    """The ground truth of a config: fitted spline of the body (depth camera), recorded stamps, and `fit`.
+
+    fit: of the recorded or made trajectory, before any tremor: what it missed. objects: T_world_object(t) of the
+    config's.
+    """
+
+    spline: Spline
+    fit: FitResult
+    first_stamp: float
+    last_stamp: float
+    objects: tuple[Spline, ...] = ()
+
+
+def load_motion(config: Config) -> TrueMotion:
+    """Read or make, place and fit the config's trajectory; the spline covers every line of every frame.
+
+    Stamps stay those of the file unless they are too large to time a line by (Unix time): then the first becomes 0.
+    Raises UserError naming the trajectory's file and line, or what a motion cannot meet.
+    """
+    settings = config.trajectory
+    trajectory = make_motion(config.motion, config.seed) if config.motion is not None else _recorded(settings)
+    if settings.T_world_file is not None:
+        trajectory = trajectory.moved(np.asarray(settings.T_world_file, float))
+    spacing, smoothing, recorded = settings.knot_spacing_s, settings.smoothing, None
+    if config.tremor is not None:
+        recorded = fit_spline(trajectory, dt=spacing, smoothing=smoothing)
+        trajectory, spacing = with_tremor(recorded.spline, config.tremor, config.seed, trajectory.stamps[[0, -1]])
+        smoothing = 0.0
+    before, after = _padding(config.color, config.depth)
+    fit = fit_spline(trajectory, dt=spacing, smoothing=smoothing, pad_begin_s=before, pad_end_s=after)
+    first, last = float(trajectory.stamps[0]), float(trajectory.stamps[-1])
+    objects = tuple(object_spline(thing, first, last, before, after) for thing in config.objects)
+    return TrueMotion(fit.spline, recorded or fit, first, last, objects)
+
+
+def sequence_stamps(config: Config, motion: TrueMotion) -> dict[str, FloatArray]:
+    """Stamps (n,) in seconds of all frames of both streams."""
+    return {s: stream_stamps(motion.first_stamp, motion.last_stamp, getattr(config, s)) for s in STREAMS}
+
+
+def _padding(*streams: StreamConfig) -> tuple[float, float]:
+    """Seconds before the first pose and after the last one in which lines of the streams are exposed."""
+    before = max(s.longest_exposure_s - min(s.offset_s, 0.0) for s in streams)
+    return before, max(s.readout_s for s in streams)
+
+
+def _recorded(settings: TrajectoryConfig) -> Trajectory:
+    assert settings.file is not None  # or there were a motion
+    trajectory = read_trajectory(settings.file, format=settings.format, icl_start=settings.icl_start)
+    if np.abs(trajectory.stamps).max() >= _LARGEST_STAMP_S:
+        log.info("%s: large stamps, so time counts from the first, %.9f s", settings.file, trajectory.stamps[0])
+        trajectory = trajectory.rebased()
+    return trajectory
+
+
+def lines_of_sight(config: Config) -> tuple[FloatArray, FloatArray]:
+    """What the config's colour camera looks along, at random over picture and recording. Raises UserError."""
+    motion = load_motion(config)
+    camera = config.color.camera
+    rng = np.random.default_rng(config.seed)
+    stamps = rng.uniform(motion.first_stamp, motion.last_stamp, _LOOKS)
+    T_world_color = motion.spline.pose(stamps) @ se3.inverse(np.asarray(config.T_color_depth, float))
+    pixels = rng.uniform(-0.5, (camera.width - 0.5, camera.height - 0.5), (_LOOKS, _LOOKS, 2))
+    ray = camera.unproject(pixels)
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    direction = np.einsum("nij,nkj->nki", T_world_color[:, :3, :3], ray)
+    seen = np.isfinite(direction).all(axis=-1)  # a lens may see nothing in its corners
+    eye = np.broadcast_to(T_world_color[:, None, :3, 3], direction.shape)
+    return eye[seen], direction[seen]
+
+
+# --- scene and objects
+
+
+def load_scene(config: Config) -> Any:
+    """The config's Mitsuba scene, with its target if it has one. Raises UserError."""
+    from rsgen.device.backend import mitsuba
+
+    mitsuba(config.backend)
+    from rsgen.render import scene
+    from rsgen.render.board import Board
+
+    target = config.target
+    board = None if target is None else Board(target.grid, np.array(target.T_world_target, float))
+    return scene.load_scene(config.scene.file, board, _options(config.scene))
+
+
+def scene_hash(config: Config) -> str:
+    """Content hash of the config's scene with all its files. Raises UserError."""
+    from rsgen.device.backend import mitsuba
+
+    mitsuba(config.backend)
+    from rsgen.render.scene import content_hash
+
+    return content_hash(config.scene.file, _options(config.scene))
+
+
+def _options(scene: SceneConfig) -> Any:
+    from rsgen.render.placement import SceneOptions
+
+    return SceneOptions(scene.scale, scene.up, scene.light)
+
+
+def surfaces_hash(config: Config) -> str:
+    """Hash of all that is lit: the scene, and its target if it has one. Raises UserError."""
+    scene, target = scene_hash(config), config.target
+    return scene if target is None else fingerprint({"scene": scene, "target": target.model_dump(mode="json")})
+
+
+def load_meshes(objects: Sequence[ObjectConfig]) -> tuple[Any, ...]:
+    """An `ObjectMesh` of each object. Raises UserError."""
+    from rsgen.render.object_meshes import load_object
+
+    return tuple(load_object(thing) for thing in objects)
+
+
+def mesh_hashes(objects: Sequence[ObjectConfig], backend: Backend) -> dict[str, str]:
+    """Content hashes of the objects' meshes, by names for sequence.yaml. Raises UserError."""
+    if not objects:
+        return {}
+    from rsgen.device.backend import mitsuba
+
+    mitsuba(backend)
+    from rsgen.render.object_meshes import object_hash
+
+    return {f"object {thing.name}": object_hash(thing) for thing in objects}
+
+
+def input_hashes(config: Config) -> dict[str, str]:
+    """Content hashes of all files that decide the sequence's bytes, by names for sequence.yaml. Raises UserError."""
+    hashes, file = {}, config.trajectory.file
+    if file is not None:
+        hashes["trajectory"] = hashlib.sha256(file.read_bytes()).hexdigest()
+    hashes |= {"scene": scene_hash(config)} | mesh_hashes(config.objects, config.backend)
+    for thing in config.objects:
+        if thing.motion.file is not None:
+            hashes[f"motion of {thing.name}"] = _file_hash(thing.motion.file, thing.name)
+    return hashes
+
+
+def _file_hash(path: Path, name: str) -> str:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise UserError(f"objects.{name}.motion: file {path}: cannot be read ({error.strerror})") from None
+
+
+def engine_versions(backend: Backend) -> dict[str, str]:
+    """Versions of the programs that decide a sequence's bytes, and the Dr.Jit variant that runs."""
+    from rsgen.device.backend import mitsuba
+
+    names = ("rolling-shutter-rgbd", "mitsuba", "drjit", "numpy", "scipy")
+    return {name: version(name) for name in names} | {"variant": mitsuba(backend).variant()}
+
+
+# --- light and frames
+
+
+def open_frames(
+    config: Config, progress: Progress = no_progress, global_shutter: bool = False, scene: Any = None,
+    objects: Sequence[Spline] = (),
+) -> FrameSource:  # fmt: skip
+    """Load the scene, unless it is given, and its light (baked now if no cache has it). Raises UserError.
+
+    global_shutter: all lines of a frame at once. objects: T_world_object(t) of the config's, all of them.
+    """
+    from rsgen.device.backend import mitsuba
+
+    mi = mitsuba(config.backend)
+    scene = scene or load_scene(config)
+    integrator = make_integrator(mi, scene, config, progress, objects)
+    T_color_depth = np.asarray(config.T_color_depth, float)
+    cameras = config.color, config.depth, T_color_depth
+    return FrameSource(scene, integrator, *cameras, config.truth, config.seed, global_shutter, bool(objects))
+
+
+def make_integrator(mi: Any, scene: Any, config: Config, progress: Progress, objects: Sequence[Spline] = ()) -> Any:
+    """Mitsuba integrator of the config's light: `path`, or `BakedIntegrator` over the scene's baked irradiance.
+
+    objects: T_world_object(t) of the config's objects; without any the scene alone is shown.
+    """
+    light = config.light
+    if light.mode == "path":
+        return mi.load_dict({"type": "path", "max_depth": light.max_depth})
+    from rsgen.light.cache import baked_field, cache_folder
+    from rsgen.render.baked import BakedIntegrator
+
+    try:
+        cache = cache_folder(config.scene.file)
+        field = baked_field(scene, surfaces_hash(config), light, cache, progress, lambda: lines_of_sight(config))
+    except UserError as error:
+        told = str(error)
+        raise UserError(told if told.startswith("scene ") else f"scene {config.scene.file}: {told}") from None
+    things = _lit_objects(scene, field, load_meshes(config.objects), objects) if objects else None
+    return BakedIntegrator(field, glossy_spp=mirrored_samples(light, config.color.spp), objects=things)
+
+
+def mirrored_samples(light: LightConfig, spp: int) -> int:
+    """Samples of what surfaces mirror, at most, of so many of a pixel."""
+    return light.glossy_spp or max(_LEAST_MIRRORED, spp // 4)
+
+
+def _lit_objects(scene: Any, field: Any, meshes: Sequence[Any], splines: Sequence[Spline]) -> Any:
+    """`MovingObjects` of meshes along splines in a scene whose baked irradiance is `field`."""
+    from rsgen.light.probes import gathered_light
+    from rsgen.render.moving_objects import MovingObject, MovingObjects, ObjectLight
+
+    things = []
+    for mesh, spline in zip(meshes, splines, strict=True):
+        count = max(2, math.ceil((spline.t_end - spline.t_begin) / _LIGHT_STEP_S) + 1)
+        t = np.linspace(spline.t_begin, spline.t_end, count)
+        middles = se3.transform(spline.pose(t), np.broadcast_to(mesh.middle, (count, 3)))
+        light = ObjectLight(gathered_light(scene, field, middles), spline.t_begin, float(t[1] - t[0]))
+        things.append(MovingObject(mesh, spline, light))
+    return MovingObjects(things)
