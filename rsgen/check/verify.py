@@ -35,7 +35,7 @@ from rsgen.sequence.format import (
     line_poses,
     pose_rows,
 )
-from rsgen.sequence.reader import Sequence, Stream, read_sequence
+from rsgen.sequence.reader import ImageStream, Sequence, read_sequence
 from rsgen.truth.settings import sequence_mocap
 
 # Rows' poses and groundtruth.txt come from the same spline: only the rounding of stamps (5e-10 s) and digits is left.
@@ -181,7 +181,7 @@ def _read_pairs(sequence: Sequence) -> int:
     return len(found)
 
 
-def _entry(sequence: Sequence, stream: Stream, k: int) -> tuple[str, str]:
+def _entry(sequence: Sequence, stream: ImageStream, k: int) -> tuple[str, str]:
     return f"{stream.listed[k]:.9f}", stream.paths[k].relative_to(sequence.root).as_posix()
 
 

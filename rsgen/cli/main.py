@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import cache
 from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from rsgen.cli.pack import pack
+from rsgen.cli.motion import fit, stats, suggest
 from rsgen.cli.pictures import SequenceFolder, compare, picture, preview
 from rsgen.config.sections import Up
 from rsgen.console.command_line import Commands, Frames, Json, Parser, Quiet, print_figures, run_program
@@ -22,6 +21,7 @@ from rsgen.console.configs import ConfigFile, config_file, configs_text
 from rsgen.console.scheduler import Scheduler, open_workers
 from rsgen.errors import UserError
 from rsgen.formats import EXPORTS, IMPORTS, exporter
+from rsgen.pack.draw import PackOptions
 
 Storage = Literal["sqlite3", "mcap"]
 _DESCRIPTION = """\
@@ -151,83 +151,6 @@ def render(
     return 0
 
 
-def fit(
-    file: Annotated[Path, "TUM, ICL-NUIM (.freiburg) or EuRoC trajectory"],
-    *,
-    dt: Annotated[float, "knot spacing, s", float] = 0.05,
-    smoothing: Annotated[float, "weight of the acceleration penalty", float] = 0.0,
-    format: Annotated[Literal["auto", "tum", "icl", "euroc"], "file format"] = "auto",
-    plot: Annotated[Path | None, "write residuals, speeds and accelerations as a picture", "PNG"] = None,
-    json: Json = False,
-) -> int:
-    """Fit a spline to a trajectory: residuals and motion statistics."""
-    from rsgen.motion.fit_summary import plot_fit, summarise_fit
-
-    summary = summarise_fit(file, dt, smoothing, format)
-    if plot is not None:
-        plot_fit(summary, plot)
-    print_figures(summary, json)
-    return 0
-
-
-def stats(
-    configs: Annotated[list[Path], "YAML files, or names that 'rsgen configs' lists", "config", config_file],
-) -> int:
-    """Print length, mean speeds and accelerations of the configs' motions, a line a config, beside the paper's."""
-    from rsgen.config.config import load_config
-    from rsgen.motion.statistics import motion_statistics, stats_table
-    from rsgen.produce.parts import load_motion
-
-    rows = []
-    for file in configs:
-        config = load_config(file)
-        made = load_motion(config)
-        rows.append((config.name, motion_statistics(made.spline, made.first_stamp, made.last_stamp)))
-    print(stats_table(rows))
-    return 0
-
-
-def suggest(
-    scene: Annotated[Path, "Mitsuba scene .xml, or a mesh file; metres, y up, or see --scale, --up"],
-    *,
-    out: Annotated[Path | None, "config to write (default: print it)", "YAML"] = None,
-    scale: Annotated[float, "metres per unit of the file: 0.01 for one in centimetres (default: 1)", float] = 1.0,
-    up: Annotated[Up, "axis of the file that is up (default: y)"] = "y",
-    seconds: Annotated[float | None, "length of the sequence, s (default: 20, or as --like)", float] = None,
-    speed: Annotated[float | None, "mean speed, m/s (default: 0.35, or as --like)", float] = None,
-    like: Annotated[
-        Path | None,
-        "a config, or its name: take over its length, speed, turning, cameras, noise, truth",
-        "CONFIG",
-        config_file,
-    ] = None,
-    clearance: Annotated[float, "least distance to the scene's surfaces, m", float] = 0.2,
-    seed: Annotated[int, "another seed, another tour (default: 0)", "N", int] = 0,
-    name: Annotated[str | None, "the sequence's name (default: the scene's)"] = None,
-) -> int:
-    """Propose a tour through a scene that has none: a config whose camera walks through the scene's largest room, or
-    round what it holds, looks at what is 1 to 3 m away, and keeps its distance. Edit it, or render it as it is. With
-    --like table1 it is the counterpart of table1 in this scene; --seed gives as many ways through it as are wanted.
-    """
-    from rsgen.config.config import load_config
-    from rsgen.files import atomic_write
-    from rsgen.produce.suggest import Wish, suggest_tour, wish_like
-
-    model = None if like is None else load_config(like)
-    wish = Wish(clearance_m=clearance, seed=seed)
-    wish = wish if model is None else wish_like(model, wish)
-    wish = wish if seconds is None else replace(wish, seconds=seconds)
-    wish = wish if speed is None else replace(wish, speed_m_s=speed)
-    suggested = suggest_tour(scene, name, wish, scale, up, model)
-    text = suggested.yaml((out or Path("here.yaml")).parent)
-    if out is None:
-        print(text.decode(), end="")
-        return 0
-    atomic_write(out, text)
-    print("\n".join([*suggested.found, f"{out}: written (rsgen render {out})"]))
-    return 0
-
-
 def import_scene(
     file: Annotated[Path, f"file of USD, Blender or meshes: {' '.join(IMPORTS)}"],
     out: Annotated[Path, "folder of the scene"],
@@ -249,7 +172,7 @@ def import_scene(
 
 def info(sequence: SequenceFolder) -> int:
     """Say what a sequence folder holds."""
-    from rsgen.sequence.reader import sequence_info
+    from rsgen.sequence.info import sequence_info
 
     print(sequence_info(sequence))
     return 0
@@ -323,3 +246,27 @@ def check_light(
         table, ok = check(chosen, views, spp, width, out, progress)
     print(table)
     return 0 if ok else 1
+
+
+def pack(
+    configs: Annotated[list[Path], "YAML files, or names that 'rsgen configs' lists", "config", config_file],
+    drawn: PackOptions,
+    *,
+    out: Annotated[Path, "folder; run the same command again to resume, or with a larger --count", "DIR"],
+    scheduler: Scheduler = None,
+    quiet: Quiet = False,
+    **fields: str,
+) -> int:
+    """Render pairs of rolling and global images to train on: short sequences along random stretches of the configs'
+    motions, at random speed, view, readout and exposure, with flow, masks and gyroscope. Another --seed, another
+    pack; rooms by other seeds ('rsgen scenes') make more scenes; --color.spp 8 --truth.spp 8 do where light is baked.
+    """
+    from rsgen.config.config import load_config
+    from rsgen.console.progress import ProgressDisplay
+    from rsgen.pack.make import make_pack
+
+    chosen = [load_config(config, fields) for config in configs]
+    with ProgressDisplay(quiet) as progress, open_workers(scheduler) as workers:
+        made = make_pack(chosen, drawn, chosen[0].seed, out, workers, progress)
+    print(f"{out}: {made.pairs} pairs in {made.sequences} sequences, {made.new} of them new")
+    return 0

@@ -14,7 +14,6 @@ from rsgen.config.motion import Waypoint
 from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
 from rsgen.motion.paths import TourCurve
-from rsgen.sequence.trajectory import Trajectory
 
 _STEP_S = 0.02
 _STEP_M = 0.02
@@ -57,15 +56,15 @@ def nearest_surface(points: FloatArray, triangles: FloatArray, reach_m: float) -
     return distance, nearest
 
 
-def clearance(motion: Spline | Trajectory, triangles: FloatArray, reach_m: float = 0.5) -> float:
+def clearance(motion: Spline, triangles: FloatArray, reach_m: float = 0.5) -> float:
     """Least distance in metres of the camera's path to the triangles (m, 3, 3), world frame; inf beyond reach_m.
 
-    A spline is sampled every 20 ms, a trajectory at its poses. (trimesh: mesh.triangles; arrays: vertices[faces].)
+    The spline is sampled every 20 ms. (trimesh: mesh.triangles; arrays: vertices[faces].)
     """
     return float(nearest_surface(_samples(motion)[1], triangles, reach_m)[0].min())
 
 
-def check_clearance(motion: Spline | Trajectory, triangles: FloatArray, clearance_m: float) -> None:
+def check_clearance(motion: Spline, triangles: FloatArray, clearance_m: float) -> None:
     """Raises UserError, naming time and place, if the camera comes closer than clearance_m to triangles (m, 3, 3)."""
     times, points = _samples(motion)
     distance, _ = nearest_surface(points, triangles, clearance_m)
@@ -161,9 +160,7 @@ def _vector(v: FloatArray) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _samples(motion: Spline | Trajectory) -> tuple[FloatArray, FloatArray]:
+def _samples(motion: Spline) -> tuple[FloatArray, FloatArray]:
     """Times (n,) and positions (n, 3)."""
-    if isinstance(motion, Trajectory):
-        return motion.stamps, motion.positions
     times = np.linspace(motion.t_begin, motion.t_end, max(2, round((motion.t_end - motion.t_begin) / _STEP_S)))
     return times, motion.pose(times)[:, :3, 3]

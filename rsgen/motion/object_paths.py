@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -150,8 +149,3 @@ def check_objects_clear(
                 raise UserError(
                     f"objects.{name}: comes through the camera at {when:.3f} s: move its path or the camera's"
                 )
-
-
-def file_of(thing: ObjectConfig) -> Path | None:
-    """The file of an object's motion, if it has one."""
-    return thing.motion.file

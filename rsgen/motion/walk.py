@@ -186,7 +186,7 @@ def choose_targets(p_world: FloatArray, cast: Cast, calm: float, rng: np.random.
 
 
 @dataclass(frozen=True)
-class Seen:
+class ViewContents:
     """What a grid of rays through the views of cameras meets: distances (n, rays) in m, inf for nothing, and flat (n,):
     whether a view holds next to nothing but one plane, along which and about whose normal depth tells of no motion.
     """
@@ -195,7 +195,7 @@ class Seen:
     flat: BoolArray
 
 
-def seen_from(T_world_cam: FloatArray, cast: Cast) -> Seen:
+def seen_from(T_world_cam: FloatArray, cast: Cast) -> ViewContents:
     """What cameras at poses (n, 4, 4) see."""
     x, y = np.meshgrid(np.tan(np.radians(_HALF_WIDTH_DEG)) * _GRID, np.tan(np.radians(_HALF_HEIGHT_DEG)) * _GRID)
     rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
@@ -212,7 +212,7 @@ def seen_from(T_world_cam: FloatArray, cast: Cast) -> Seen:
     off -= np.einsum("nck,nck->nc", p_world[:, few], normal[:, few])[..., None]
     there = np.isfinite(distance)
     on = there[:, None] & (np.abs(off) < _PLANE * np.where(there, distance, 0.0)[:, None]) & there[:, few, None]
-    return Seen(distance, on.mean(axis=2).max(axis=1) > _FLAT)
+    return ViewContents(distance, on.mean(axis=2).max(axis=1) > _FLAT)
 
 
 def _direction(azimuth: FloatArray, elevation: FloatArray) -> FloatArray:

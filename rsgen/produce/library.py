@@ -21,6 +21,7 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.config.config import load_config
+from rsgen.config.sections import LightConfig
 from rsgen.console.configs import configs_folder
 from rsgen.console.tables import Table
 from rsgen.errors import UserError
@@ -43,11 +44,6 @@ class ShippedScene:
     file: Path
     takes_seed: bool
     configs: tuple[Path, ...]
-
-    @property
-    def is_built(self) -> bool:
-        """Whether its file is there."""
-        return self.file.is_file()
 
     @property
     def how_to_vary(self) -> str:
@@ -220,13 +216,9 @@ def _built_text(contents: Contents | None) -> str:
         return "not built yet: it is when it is first rendered"
     lit, settings = contents.lit
     x, y, z = contents.size
-    light = (
-        "light baked"
-        if lit == settings
-        else "light not baked yet"
-        if not lit
-        else f"light baked for {lit} of {settings} settings"
-    )
+    light = f"light baked for {lit} of {settings} settings"
+    if lit in (0, settings):
+        light = "light baked" if lit == settings else "light not baked yet"
     return f"{x:.1f} x {y:.1f} x {z:.1f} m, {contents.triangles:,} triangles, {light}"
 
 
@@ -242,17 +234,16 @@ def _facts(scene: ShippedScene, contents: Contents | None) -> dict[str, Any]:
 
 def _contents(scene: ShippedScene) -> Contents | None:
     """What its file and the meshes that it names hold; None: it is not built. Raises UserError if it is damaged."""
-    if not scene.is_built:
+    if not scene.file.is_file():
         return None
     try:
         meshes, materials = _named(scene.file)
         counted = [_ply_box(mesh) for mesh in meshes]
     except (OSError, ET.ParseError, KeyError, ValueError, IndexError) as error:
         raise UserError(f"scene {scene.file}: is damaged ({error}): delete it, then it is built again") from None
-    low = np.min([box[1] for box in counted], axis=0)
-    high = np.max([box[2] for box in counted], axis=0)
-    x, y, z = (float(v) for v in high - low)
-    return Contents(sum(box[0] for box in counted), (x, y, z), tuple(sorted(materials)), _lit(scene))
+    triangles, low, high = zip(*counted, strict=True)
+    x, y, z = (float(v) for v in np.max(high, axis=0) - np.min(low, axis=0))
+    return Contents(sum(triangles), (x, y, z), tuple(sorted(materials)), _lit(scene))
 
 
 def _named(file: Path) -> tuple[list[Path], set[str]]:
@@ -287,7 +278,6 @@ def _ply_box(path: Path) -> tuple[int, FloatArray, FloatArray]:
 
 def _lit(scene: ShippedScene) -> tuple[int, int]:
     """How many of the settings of light with which its configs render it are baked, and of how many."""
-    from rsgen.config.config import LightConfig
     from rsgen.device.backend import mitsuba
 
     mitsuba()

@@ -5,19 +5,23 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from rsgen.array_types import FloatArray
+from rsgen.array_types import BoolArray, FloatArray
 from rsgen.config.cameras import StreamConfig
 from rsgen.config.config import Config
-from rsgen.config.faults import ImuFaults, moved_to
+from rsgen.config.faults import ImuFaults, StreamFaults, moved_to
 from rsgen.config.imu import ImuConfig
 from rsgen.config.sections import MocapConfig
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_yaml, is_temporary, read_yaml
+from rsgen.geometry.camera import Camera
+from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import (
     IMU_TRUTH_CSV,
@@ -28,7 +32,7 @@ from rsgen.sensors.imu import (
     simulate_imu,
     write_imu_csv,
 )
-from rsgen.sensors.reports import reported_poses
+from rsgen.sensors.reports import deliver, reported_poses
 from rsgen.sequence.camera_yaml import Cameras
 from rsgen.sequence.format import (
     CLEAN_COLOR,
@@ -42,8 +46,11 @@ from rsgen.sequence.format import (
     associate,
     frame_name,
     ground_truth,
+    line_poses,
     pose_lines,
+    round_stamps,
 )
+from rsgen.sequence.truth_files import FrameTable
 
 
 def fingerprint(content: Mapping[str, Any]) -> str:
@@ -168,6 +175,39 @@ def _first_difference(old: Any, new: Any, name: str = "") -> tuple[str, Any, Any
 def _short(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 40 else f"{text[:37]}..."
+
+
+@dataclass(frozen=True)
+class ListedStream:
+    """One stream that is written; stamps (n,): true ones of its clock; table: what each frame shows, and when."""
+
+    camera: Camera
+    shutter: Shutter
+    stamps: FloatArray
+    table: FrameTable
+    is_delivered: BoolArray
+    writes_table: bool
+
+    @classmethod
+    def of(
+        cls, stream: StreamConfig, faults: StreamFaults | None, name: StreamName, stamps: npt.ArrayLike, seed: int
+    ) -> ListedStream:
+        stamps = round_stamps(stamps)
+        came = deliver(stamps, faults, seed, name)
+        ones = np.ones(len(stamps))
+        table = FrameTable(
+            np.arange(len(stamps)), came.shows, stamps[came.shows], came.listed, stream.exposure_s * ones,
+            ones, ones, np.ones((len(stamps), 3)),
+        )  # fmt: skip
+        return cls(stream.camera, stream.shutter, stamps, table, came.is_delivered, stream.adapts or faults is not None)
+
+    def line_poses(self, spline: Spline, T_cam_body: FloatArray | None = None) -> FloatArray:
+        """Rows (frames, lines, 7), as in truth/rows_STREAM.npy. Raises UserError."""
+        table = self.table
+        return line_poses(
+            spline, self.camera, self.shutter, table.taken_s, T_cam_body,
+            table.exposure_s if self.writes_table else None,
+        )  # fmt: skip
 
 
 def write_listings(

@@ -18,7 +18,7 @@ from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rsgen.motion.floor_plan import HIGHEST_M, Cast, FloorPlan, find_floors, floor_plan, share_without_floor
 from rsgen.motion.statistics import motion_statistics
-from rsgen.motion.walk import Seen, free_region
+from rsgen.motion.walk import ViewContents, free_region
 from rsgen.produce.frame_source import small_camera
 
 REACH_M = 1.0  # so near a surface's distance is told
@@ -118,7 +118,7 @@ class Tour:
     spline: Spline
     seconds: float
     least: float
-    seen: Seen
+    seen: ViewContents
 
     @property
     def flat(self) -> float:

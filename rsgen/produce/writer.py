@@ -11,16 +11,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rsgen.array_types import BoolArray, ByteArray, Float32Array, FloatArray
-from rsgen.config.config import Config, StreamConfig
-from rsgen.config.faults import StreamFaults
+from rsgen.array_types import ByteArray, Float32Array, FloatArray
+from rsgen.config.config import Config
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_yaml, remove_stale_temporaries, write_error
-from rsgen.geometry.camera import Camera
-from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rsgen.image_codecs import encode_exr, encode_npy, encode_npz, encode_png
 from rsgen.produce.records import (
+    ListedStream,
     color_truth,
     describe,
     refuse_foreign_folder,
@@ -34,7 +32,7 @@ from rsgen.sensors.color import Setting
 from rsgen.sensors.imu import (
     sample_clock,
 )
-from rsgen.sensors.reports import color_clock, deliver
+from rsgen.sensors.reports import color_clock
 from rsgen.sequence.camera_yaml import TRUE_CAMERAS, camera_yaml
 from rsgen.sequence.format import (
     DEPTH_OBJECT_IDS,
@@ -51,44 +49,10 @@ from rsgen.sequence.format import (
     ground_truth,
     line_poses,
     pose_lines,
-    round_stamps,
 )
-from rsgen.sequence.truth_files import TARGET_CORNERS, FrameTable, poses_file, spline_file, target_corners_text
+from rsgen.sequence.truth_files import TARGET_CORNERS, poses_file, spline_file, target_corners_text
 
 _SPLINE_TOLERANCE = 1e-9
-
-
-@dataclass(frozen=True)
-class _WrittenStream:
-    """One stream; stamps (n,): true ones of all frames of its clock; table: what each of them shows, and when."""
-
-    camera: Camera
-    shutter: Shutter
-    stamps: FloatArray
-    table: FrameTable
-    is_delivered: BoolArray
-    writes_table: bool
-
-    @classmethod
-    def of(
-        cls, stream: StreamConfig, faults: StreamFaults | None, name: StreamName, stamps: npt.ArrayLike, seed: int
-    ) -> _WrittenStream:
-        stamps = round_stamps(stamps)
-        came = deliver(stamps, faults, seed, name)
-        ones = np.ones(len(stamps))
-        table = FrameTable(
-            np.arange(len(stamps)), came.shows, stamps[came.shows], came.listed, stream.exposure_s * ones,
-            ones, ones, np.ones((len(stamps), 3)),
-        )  # fmt: skip
-        return cls(stream.camera, stream.shutter, stamps, table, came.is_delivered, stream.adapts or faults is not None)
-
-    def line_poses(self, spline: Spline, T_cam_body: FloatArray | None = None) -> FloatArray:
-        """Rows (frames, lines, 7), as in truth/rows_STREAM.npy. Raises UserError."""
-        table = self.table
-        return line_poses(
-            spline, self.camera, self.shutter, table.taken_s, T_cam_body,
-            table.exposure_s if self.writes_table else None,
-        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -102,8 +66,8 @@ class SequenceWriter:
     out: Path
     config: Config
     spline: Spline
-    color: _WrittenStream
-    depth: _WrittenStream
+    color: ListedStream
+    depth: ListedStream
     settings: tuple[Setting, ...] = ()
     objects: tuple[Spline, ...] = ()
 
@@ -132,8 +96,8 @@ class SequenceWriter:
         """
         out = Path(out)
         streams = {
-            "color": _WrittenStream.of(config.color, config.injected.color, "color", stamps_color, config.seed),
-            "depth": _WrittenStream.of(config.depth, config.injected.depth, "depth", stamps_depth, config.seed),
+            "color": ListedStream.of(config.color, config.injected.color, "color", stamps_color, config.seed),
+            "depth": ListedStream.of(config.depth, config.injected.depth, "depth", stamps_depth, config.seed),
         }
         for stream in streams.values():
             line_poses(spline, stream.camera, stream.shutter, stream.stamps[[0, -1]])
@@ -270,7 +234,7 @@ class SequenceWriter:
         if config.imu is not None:
             write_imu(out, spline, config.imu, faults.imu, config.seed, middle, T_image_depth)
 
-    def _stream(self, stream: StreamName) -> _WrittenStream:
+    def _stream(self, stream: StreamName) -> ListedStream:
         return self.color if stream == "color" else self.depth
 
     def _path(self, stream: StreamName, k: int) -> Path:

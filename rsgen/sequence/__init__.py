@@ -1,5 +1,6 @@
 """A sequence on disk: format, strict reader and trajectory files. Reading loads no writer and no renderer."""
 
-from rsgen.sequence.reader import Sequence, Stream, read_sequence, sequence_info
+from rsgen.sequence.info import sequence_info
+from rsgen.sequence.reader import ImageStream, Sequence, read_sequence
 
-__all__ = ["Sequence", "Stream", "read_sequence", "sequence_info"]
+__all__ = ["ImageStream", "Sequence", "read_sequence", "sequence_info"]

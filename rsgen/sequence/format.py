@@ -104,7 +104,7 @@ class SequenceYaml(_Yaml):
     fingerprint: str  # the file's last entry: one that was cut off has none
 
 
-class Clock(Protocol):
+class FrameClock(Protocol):
     """Anything with a stream's rate and offset, such as `rsgen.config.config.StreamConfig`."""
 
     @property
@@ -122,7 +122,7 @@ class Line:
     path: str
 
 
-def stream_stamps(first: float, last: float, stream: Clock) -> FloatArray:
+def stream_stamps(first: float, last: float, stream: FrameClock) -> FloatArray:
     """Stamps (n,) of a stream over a recording from `first` to `last` seconds: first + offset + k / rate.
 
     They are rounded to the 9 decimals that listings hold, so that file and memory agree to the last bit. Raises

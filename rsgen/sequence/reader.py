@@ -1,4 +1,4 @@
-"""Sequence folders: read one, strictly, and describe it.
+"""Sequence folders: read one, strictly.
 
 sequence = read_sequence(Path("out/lr_kt2"))
 z, rows = sequence.depth(0), sequence.rows("depth")[0]     # metres (h, w); T_world_depth of each line (h, 7)
@@ -22,7 +22,7 @@ from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rsgen.image_codecs import read_exr, read_npy, read_png
 from rsgen.limits import rigid
-from rsgen.sequence.camera_yaml import TRUE_CAMERAS, read_true_cameras
+from rsgen.sequence.camera_yaml import read_true_cameras
 from rsgen.sequence.format import (
     DEPTH_OBJECT_IDS,
     FRAME_TABLES,
@@ -31,7 +31,6 @@ from rsgen.sequence.format import (
     OBJECT_IDS,
     ROWS,
     STAMP_TOLERANCE_S,
-    STREAMS,
     TRUTH_DEPTH,
     Line,
     StreamName,
@@ -47,7 +46,7 @@ _LONGEST_S = 1e6  # as long as stamps may grow
 
 
 @dataclass(frozen=True)
-class Stream:
+class ImageStream:
     """One camera's images: n of them are on disk, of `frames` in the whole sequence.
 
     stamps (n,) s, true ones; listed (n,): those of the listing, which a driver may have made; paths n files; indices
@@ -88,7 +87,7 @@ class Sequence:
 
     root: Path
     name: str
-    streams: dict[StreamName, Stream]
+    streams: dict[StreamName, ImageStream]
     T_color_depth: FloatArray
     spline: Spline
     meta: dict[str, Any]
@@ -110,7 +109,7 @@ class Sequence:
         if not self.meta.get("declared"):
             return self
         true = read_true_cameras(self.root)
-        streams: dict[StreamName, Stream] = {
+        streams: dict[StreamName, ImageStream] = {
             "color": replace(self.streams["color"], camera=true.color, shutter=true.color_shutter),
             "depth": replace(
                 self.streams["depth"], camera=true.depth, shutter=true.depth_shutter, depth_scale=true.depth_scale
@@ -212,7 +211,7 @@ def read_sequence(path: Path) -> Sequence:
         raise UserError(f"{root / 'sequence.yaml'}: T_color_depth: {error}") from None
     if description.streams.depth.depth_scale is None:
         raise UserError(f"{root / 'sequence.yaml'}: streams.depth.depth_scale is missing")
-    streams: dict[StreamName, Stream] = {
+    streams: dict[StreamName, ImageStream] = {
         "color": _read_stream(root, "color", description.streams.color),
         "depth": _read_stream(root, "depth", description.streams.depth),
     }
@@ -222,51 +221,7 @@ def read_sequence(path: Path) -> Sequence:
     return Sequence(root, description.name, streams, T_color_depth, spline, meta, objects)
 
 
-def sequence_info(path: Path) -> str:
-    """Text for `rsgen info`: what is in a sequence folder. Raises UserError."""
-    sequence = read_sequence(path)
-    knots = sequence.spline
-    rows = [("name", sequence.name)]
-    for name in STREAMS:
-        s = sequence.streams[name]
-        delay = s.shutter.line_delay(s.camera)
-        frames = f"{len(s.paths)} frames" if len(s.paths) == s.frames else f"{len(s.paths)} of {s.frames} frames"
-        span = f", {s.stamps[0]:.3f} to {s.stamps[-1]:.3f} s" if len(s.paths) else ""
-        scale = f", {s.depth_scale:g} units per metre" if s.depth_scale else ""
-        c = s.camera
-        rows += [
-            (name, f"{frames} at {s.rate_hz:g} Hz{span}"),
-            ("", f"{c.width}x{c.height} {c.model}, fx {c.fx:g} fy {c.fy:g} cx {c.cx:g} cy {c.cy:g}{scale}"),
-            ("", _shutter_text(s.shutter, delay)),
-        ]
-    last = max((s.stamps[-1] for s in sequence.streams.values() if len(s.stamps)), default=knots.t_begin)
-    first = min((s.stamps[0] for s in sequence.streams.values() if len(s.stamps)), default=knots.t_begin)
-    times = np.linspace(first, last, min(max(2, round((last - first) * 1000)), 1_000_000))
-    p_world = knots.pose(np.clip(times, knots.t_begin, knots.t_end))[:, :3, 3]
-    length = np.linalg.norm(np.diff(p_world, axis=0), axis=1).sum()
-    size = sum(file.stat().st_size for file in sequence.root.rglob("*") if file.is_file())
-    if sequence.meta.get("declared"):
-        rows.append(("declared", f"cameras are claims, not the truth, which {TRUE_CAMERAS} has"))
-    if sequence.objects:
-        rows.append(("objects", ", ".join(thing.name for thing in sequence.objects)))
-    rows += [
-        ("duration", f"{last - first:.3f} s"),
-        ("trajectory", f"{length:.3f} m, {len(knots.control_points)} control points every {knots.dt * 1000:g} ms"),
-        ("noise", str(sequence.meta.get("noise") or "none")),
-        ("on disk", f"{size / 1e6:.1f} MB"),
-    ]
-    return "\n".join(f"{label:<11} {text}" for label, text in rows)
-
-
-def _shutter_text(shutter: Shutter, delay: float) -> str:
-    if shutter.readout_s == 0:
-        readout = "global shutter"
-    else:
-        readout = f"readout {shutter.readout_s * 1000:g} ms {shutter.scan}, line delay {delay * 1e6:.3f} us"
-    return f"{readout}, exposure {shutter.exposure_s * 1000:g} ms"
-
-
-def _read_spline(path: Path, streams: dict[StreamName, Stream]) -> Spline:
+def _read_spline(path: Path, streams: dict[StreamName, ImageStream]) -> Spline:
     """The spline, which has to cover the frames and not much more: a huge knot spacing would take all memory."""
     spline = Spline.load(path)
     first = min(stream.stamps[0] for stream in streams.values())
@@ -281,7 +236,7 @@ def _read_spline(path: Path, streams: dict[StreamName, Stream]) -> Spline:
     return spline
 
 
-def _read_stream(root: Path, name: StreamName, yaml: StreamYaml) -> Stream:
+def _read_stream(root: Path, name: StreamName, yaml: StreamYaml) -> ImageStream:
     listing = root / LISTINGS[name]
     lines = parse_listing(listing, read_text(listing))
     if not lines:
@@ -306,7 +261,7 @@ def _read_stream(root: Path, name: StreamName, yaml: StreamYaml) -> Stream:
         raise UserError(f"{root / 'sequence.yaml'}: streams.{name}: {error}") from None
     scale = yaml.depth_scale if name == "depth" and yaml.depth_scale is not None else 0.0
     clock = (yaml.rate_hz, yaml.offset_s, scale, yaml.frames, yaml.first_stamp_s)
-    return Stream(name, camera, shutter, *clock, stamps, listed, paths, indices, yaml.registered, table)
+    return ImageStream(name, camera, shutter, *clock, stamps, listed, paths, indices, yaml.registered, table)
 
 
 def _table_of(root: Path, name: StreamName, indices: IntArray) -> FrameTable:

@@ -36,7 +36,7 @@ from rsgen.formats.export.folder import (
 from rsgen.geometry import se3
 from rsgen.sensors.imu import ImuSamples, nanoseconds, write_imu_csv
 from rsgen.sequence.format import ground_truth, pose_rows
-from rsgen.sequence.reader import Sequence, Stream
+from rsgen.sequence.reader import ImageStream, Sequence
 from rsgen.truth.settings import sequence_imu
 
 _MODELS = {"pinhole": "radial-tangential", "fisheye": "equidistant"} | dict.fromkeys(
@@ -116,7 +116,7 @@ def truth_csv(
     return "\n".join([_TRUTH_HEADER, *lines, ""]).encode()
 
 
-def _camera_yaml(stream: Stream, T_BS: FloatArray) -> dict[str, Any]:
+def _camera_yaml(stream: ImageStream, T_BS: FloatArray) -> dict[str, Any]:
     camera, shutter = stream.camera, stream.shutter
     coefficients = four_coefficients(stream.name, camera)
     data: dict[str, Any] = {

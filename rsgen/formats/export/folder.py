@@ -19,7 +19,7 @@ from rsgen.geometry.camera import Camera
 from rsgen.image_codecs import encode_png
 from rsgen.produce.writer import quantise
 from rsgen.sensors.depth import register_depth
-from rsgen.sequence.reader import Sequence, Stream
+from rsgen.sequence.reader import ImageStream, Sequence
 
 Storage = Literal["sqlite3", "mcap"]
 EPOCH_S = 1_000_000_000
@@ -108,7 +108,7 @@ def _linked(source: Path, target: Path) -> bool:
     return True
 
 
-def image_streams(sequence: Sequence) -> tuple[tuple[Stream, FloatArray], tuple[Stream, FloatArray]]:
+def image_streams(sequence: Sequence) -> tuple[tuple[ImageStream, FloatArray], tuple[ImageStream, FloatArray]]:
     """Colour and depth streams, each with the camera of its images and its T_cam_depth (4, 4).
 
     Registered depth has the colour camera and keeps the sensor's shutter, row for row.

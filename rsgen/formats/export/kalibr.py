@@ -29,7 +29,7 @@ from rsgen.geometry.aprilgrid import AprilGrid
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.sensors.imu import nanoseconds, write_imu_csv
-from rsgen.sequence.reader import Sequence, Stream
+from rsgen.sequence.reader import ImageStream, Sequence
 from rsgen.truth.settings import SequenceImu, sequence_imu, sequence_target
 
 COLOR_TOPIC, DEPTH_TOPIC, IMU_TOPIC = "/cam0/image_raw", "/cam1/image_raw", "/imu0"
@@ -116,7 +116,7 @@ _DENSITIES = (
 )
 
 
-def _camera(stream: Stream, topic: str) -> dict[str, Any]:
+def _camera(stream: ImageStream, topic: str) -> dict[str, Any]:
     camera = stream.camera
     pinhole = [camera.fx, camera.fy, camera.cx, camera.cy]
     if camera.model == "double_sphere":

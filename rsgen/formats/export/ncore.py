@@ -23,7 +23,7 @@ from rsgen.files import read_bytes, write_error
 from rsgen.formats.export import poses
 from rsgen.formats.export.folder import DEFAULTS, EPOCH_S, ExportOptions, image_streams, new_folder
 from rsgen.geometry import se3
-from rsgen.sequence.reader import Sequence, Stream
+from rsgen.sequence.reader import ImageStream, Sequence
 
 INSTALL = "pip install 'rolling-shutter-rgbd[ncore]'"
 ENDS, DENSE = "start and end pose of an image", "the pose of each line"
@@ -80,7 +80,7 @@ def export_ncore(
     return f"{path}: {counts}, stamps + {EPOCH_S} s; {poses.loss_words(losses)}"
 
 
-def frame_times_us(stream: Stream) -> Times:
+def frame_times_us(stream: ImageStream) -> Times:
     """(n, 2): mid-exposure of the first line that is read and of the last of each image, microseconds."""
     lines = np.array([0.0, stream.line_count - 1.0])
     times = stream.shutter.line_mid_time(poses.blur_centres(stream)[:, None], lines, stream.camera)
@@ -101,7 +101,7 @@ def _with_exact_row(T: FloatArray) -> FloatArray:
     return T
 
 
-def _model(data: Any, stream: Stream) -> Any:
+def _model(data: Any, stream: ImageStream) -> Any:
     """The stream's camera as one of NCore's; its pixel centres are at halves. Raises UserError: it has none such."""
     camera = stream.camera
     common = {

@@ -20,7 +20,7 @@ from rsgen.geometry import se3, so3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter, project_rolling
 from rsgen.sensors.imu import nanoseconds
-from rsgen.sequence.reader import Sequence, Stream
+from rsgen.sequence.reader import ImageStream, Sequence
 
 PIXEL_SHIFT = 0.5
 """What COLMAP's and nerfstudio's pixel coordinates are larger by: their pixel centres are at halves."""
@@ -62,7 +62,7 @@ class Observations:
     image: IntArray
 
 
-def blur_centres(stream: Stream) -> FloatArray:
+def blur_centres(stream: ImageStream) -> FloatArray:
     """Stamps (n,) in s for which `Shutter.line_mid_time` is the middle of each line's own exposure.
 
     They are the true stamps, but for an automatic camera, whose exposures are not the shutter's.
@@ -72,7 +72,7 @@ def blur_centres(stream: Stream) -> FloatArray:
     return stream.stamps - 0.5 * (stream.table.exposure_s - stream.shutter.exposure_s)
 
 
-def exposures(stream: Stream) -> FloatArray:
+def exposures(stream: ImageStream) -> FloatArray:
     """Exposure (n,) in s of each image."""
     return np.full(len(stream.paths), stream.shutter.exposure_s) if stream.table is None else stream.table.exposure_s
 
@@ -194,7 +194,7 @@ def write_shutter_files(sequence: Sequence, out: Path, losses: dict[str, Loss]) 
     atomic_write(out / "spline.npz", read_bytes(sequence.root / "spline.npz"))
 
 
-def _stream_facts(stream: Stream) -> dict[str, Any]:
+def _stream_facts(stream: ImageStream) -> dict[str, Any]:
     facts: dict[str, Any] = {
         "readout_s": stream.shutter.readout_s,
         "exposure_s": stream.shutter.exposure_s,

@@ -19,7 +19,7 @@ from rsgen.files import read_bytes
 from rsgen.formats.export.folder import DEFAULTS, ExportOptions, image_streams
 from rsgen.geometry import se3
 from rsgen.sequence.format import ground_truth
-from rsgen.sequence.reader import Sequence, Stream
+from rsgen.sequence.reader import ImageStream, Sequence
 from rsgen.truth.settings import sequence_imu
 
 TIMELINE = "time"
@@ -81,7 +81,7 @@ def _log(rr: Any, recording: Any, sequence: Sequence, progress: Progress) -> Non
             progress("export", (first + k + 1) / count, file.name)
 
 
-def _middle_poses(sequence: Sequence, stream: Stream, T_cam_depth: FloatArray) -> FloatArray:
+def _middle_poses(sequence: Sequence, stream: ImageStream, T_cam_depth: FloatArray) -> FloatArray:
     """T_world_cam (n, 4, 4) of the frames in the middle of their readout."""
     middle = 0.5 * (stream.line_count - 1)
     times = stream.shutter.line_mid_time(stream.stamps, middle, stream.camera)

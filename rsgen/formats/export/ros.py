@@ -30,7 +30,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import nanoseconds
 from rsgen.sequence.format import ground_truth, pose_rows, poses_of_rows
-from rsgen.sequence.reader import Sequence, Stream
+from rsgen.sequence.reader import ImageStream, Sequence
 from rsgen.truth.settings import SequenceImu, sequence_imu
 
 COLOR_FRAME, DEPTH_FRAME, IMU_FRAME = (f"camera_{name}_optical_frame" for name in ("color", "depth", "imu"))
@@ -133,7 +133,7 @@ def _transform(bag: Bag, ns: int, parent: str, child: str, pose: FloatArray) -> 
     )
 
 
-def _images(bag: Bag, sequence: Sequence, stream: Stream) -> Iterator[Message]:
+def _images(bag: Bag, sequence: Sequence, stream: ImageStream) -> Iterator[Message]:
     topic = COLOR_TOPIC if stream.name == "color" else ALIGNED_TOPIC if stream.registered else DEPTH_TOPIC
     frame = DEPTH_FRAME if topic == DEPTH_TOPIC else COLOR_FRAME
     image = bag.add(topic, "sensor_msgs/msg/Image")

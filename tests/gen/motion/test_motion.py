@@ -239,13 +239,12 @@ def test_nearest_surface_against_brute_force() -> None:
 def test_clearance_of_a_line_before_a_wall() -> None:
     settings = {**LINE, "position": (0.0, 1.0, 0.0), "target": (0.0, 1.0, -1.0)}
     wall = np.array([[[-5, -5, -0.4], [5, -5, -0.4], [0, 9, -0.4]]], float)
-    trajectory = made(settings, STILL)
-    assert clearance(trajectory, wall) == pytest.approx(0.4, abs=1e-9)
-    assert clearance(fit_spline(trajectory).spline, wall) == pytest.approx(0.4, abs=1e-6)
-    assert clearance(trajectory, wall, reach_m=0.3) == math.inf
-    check_clearance(trajectory, wall, 0.39)
+    spline = fit_spline(made(settings, STILL)).spline
+    assert clearance(spline, wall) == pytest.approx(0.4, abs=1e-6)
+    assert clearance(spline, wall, reach_m=0.3) == math.inf
+    check_clearance(spline, wall, 0.39)
     with pytest.raises(UserError, match=r"comes within 0\.400 m of a surface at .* s, at \[.*\]; clearance_m is 0\.41"):
-        check_clearance(trajectory, wall, 0.41)
+        check_clearance(spline, wall, 0.41)
 
 
 def distance_to(mesh: trimesh.Trimesh, tour: tuple[Waypoint, ...], closed: bool = True) -> float:
