@@ -145,14 +145,21 @@ def to_recorded(config: dict[str, Any], faults: FaultsConfig) -> dict[str, Any]:
     """The inverse: a config as sequence.yaml records it. Values that are not set are left out where they came later."""
     for name in STREAMS:
         driver = getattr(faults, name)
-        config[name]["driver"] = None if driver is None else driver.model_dump(mode="json")
-        if driver is not None and not driver.blackouts:
-            del config[name]["driver"]["blackouts"]
+        recorded = None if driver is None else driver.model_dump(mode="json")
+        if recorded is not None and not driver.blackouts:
+            del recorded["blackouts"]
+        config[name] = _inserted(config[name], "scan", "driver", recorded)
     if faults.declared is not None:
-        config["declared"] = faults.declared.model_dump(mode="json")
+        config = _inserted(config, "mocap", "declared", faults.declared.model_dump(mode="json"))
     if faults.imu is not None and config["imu"] is not None:
         config["imu"] |= faults.imu.model_dump(mode="json", exclude_defaults=True)
     return config
+
+
+def _inserted(section: dict[str, Any], after: str, name: str, value: Any) -> dict[str, Any]:
+    """The section with one entry more, where recordings have always had it: sequence.yaml stays the same bytes."""
+    before = list(section)[: list(section).index(after) + 1]
+    return {key: section[key] for key in before} | {name: value} | section
 
 
 def as_declared(stream: StreamT, stated: DeclaredStream | None) -> StreamT:
