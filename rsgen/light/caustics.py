@@ -22,7 +22,7 @@ from rsgen.device.arrays import aligned, rows_of
 from rsgen.light.interpolation import thin
 from rsgen.light.sampling import CHANNELS, about_normal, in_channels, rotation, sampler_at, shaded_nearby
 from rsgen.light.specular_paths import SPECULAR, casts_caustics, caustic_radiance, transmitted
-from rsgen.light.surface_points import SurfacePoints
+from rsgen.light.surface_points import SamplePoints
 from rsgen.render.irradiance import at_triangles, registry_id
 from rsgen.render.meshes import mesh_arrays
 
@@ -39,7 +39,7 @@ _NEAR = 8  # cells that each is shared out among
 
 
 def caustic_light(
-    scene: Any, points: SurfacePoints, which: IntArray, area: FloatArray, texel_m: float, samples: int, follow: bool
+    scene: Any, points: SamplePoints, which: IntArray, area: FloatArray, texel_m: float, samples: int, follow: bool
 ) -> Float32Array:
     """Irradiance (n, 4) that lamps and sky send to the points `which` (n,) by way of lacquer and brushed metal.
 
@@ -92,7 +92,7 @@ def _shares(tree: cKDTree, places: FloatArray) -> tuple[IntArray, FloatArray]:
     return near, weights / weights.sum(axis=1, keepdims=True)
 
 
-def gathered_caustics(scene: Any, points: SurfacePoints, which: IntArray, samples: int) -> Float32Array:
+def gathered_caustics(scene: Any, points: SamplePoints, which: IntArray, samples: int) -> Float32Array:
     """The same looked for from where it lands, in means of two halves (2, n, 4): it scatters, but blurs nothing."""
 
     def sample(at: Sequence[Any], _: IntArray, begin: int, count: int) -> Any:

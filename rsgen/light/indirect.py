@@ -29,7 +29,7 @@ from rsgen.light.sampling import (
     visible_error,
 )
 from rsgen.light.specular_paths import shines, surface_radiance
-from rsgen.light.surface_points import SurfacePoints
+from rsgen.light.surface_points import SamplePoints
 from rsgen.render.irradiance import IrradianceField, Lattice, make_field
 
 _COARSE_TEXELS = 3.0  # light off surfaces is gathered at points about this far apart
@@ -52,7 +52,7 @@ class Surfaces:
 
     scene: Any
     lattice: Lattice
-    points: SurfacePoints
+    points: SamplePoints
     index: IntArray
     reach: tuple[NDArray[np.uint32], NDArray[np.uint32]]
     follow: bool
@@ -75,7 +75,7 @@ class Surfaces:
         return front, back
 
 
-def gathering(scene: Any, field: IrradianceField, points: SurfacePoints, which: IntArray) -> Sampler:
+def gathering(scene: Any, field: IrradianceField, points: SamplePoints, which: IntArray) -> Sampler:
     """Samples the irradiance that arrives from other surfaces, each lit as `field` states, but no emitter's own.
 
     By way of panes and whatever mirrors too.

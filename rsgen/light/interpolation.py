@@ -10,7 +10,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from rsgen.array_types import Float32Array, FloatArray, IntArray
-from rsgen.light.surface_points import SurfacePoints, in_order, row_hash
+from rsgen.light.surface_points import SamplePoints, in_order, row_hash
 
 _NEIGHBOURS = 8
 _SMOOTHING = 0.3  # spacings: closer sources than this count alike
@@ -22,7 +22,7 @@ _DENOISING_CHUNK = 1 << 17
 
 
 def thin(
-    points: SurfacePoints, spacing: float, among: IntArray | None = None, steps: bool = False
+    points: SamplePoints, spacing: float, among: IntArray | None = None, steps: bool = False
 ) -> tuple[IntArray, IntArray]:
     """Of `among` (default: all), one in each cell of `spacing` metres, of like normals on one piece of surface.
 
@@ -58,7 +58,7 @@ class Interpolation:
     weights: Float32Array
 
     @classmethod
-    def between(cls, points: SurfacePoints, sources: NDArray, targets: NDArray, spacing: float) -> Interpolation:
+    def between(cls, points: SamplePoints, sources: NDArray, targets: NDArray, spacing: float) -> Interpolation:
         """By distance in position (in units of `spacing` metres) and normal together, within one piece of surface.
 
         The dark inside of a thin sheet is a millimetre from its lit outside and has the normal of the other outside.
@@ -96,7 +96,7 @@ class Interpolation:
 
 
 def denoised(
-    points: SurfacePoints, which: IntArray, halves: NDArray, sigma: FloatArray, spacing: float, noisy: IntArray
+    points: SamplePoints, which: IntArray, halves: NDArray, sigma: FloatArray, spacing: float, noisy: IntArray
 ) -> Float32Array:
     """Mean (n, 4) of two independent estimates (2, n, 4) of irradiance, smoothed where noise hides any difference.
 

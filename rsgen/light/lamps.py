@@ -33,7 +33,7 @@ from rsgen.light.sampling import (
     sampler_at,
 )
 from rsgen.light.specular_paths import first_scatterer, transmitted
-from rsgen.light.surface_points import SurfacePoints
+from rsgen.light.surface_points import SamplePoints
 from rsgen.render.irradiance import registry_id
 from rsgen.render.rays import RAY_OFFSET_M
 
@@ -60,7 +60,7 @@ def lamps_of(scene: Any) -> list[Any]:
 
 
 def first_look(
-    scene: Any, points: SurfacePoints, which: IntArray, follow: bool, report: Callable[[float], None]
+    scene: Any, points: SamplePoints, which: IntArray, follow: bool, report: Callable[[float], None]
 ) -> Float32Array:
     """Direct irradiance (n, 4) from all lamps by a sample of each, or by the second where the first found none."""
     kinds = _kinds(scene)
@@ -78,7 +78,7 @@ def first_look(
 
 
 def lamp_light(
-    scene: Any, points: SurfacePoints, which: IntArray, patch: IntArray, samples: int, follow: bool,
+    scene: Any, points: SamplePoints, which: IntArray, patch: IntArray, samples: int, follow: bool,
     light: FloatArray, scatter: float, report: Callable[[float], None],
 ) -> tuple[Float32Array, FloatArray]:  # fmt: skip
     """Direct irradiance from all lamps but the sky, with `follow` through thin panes too.
@@ -147,7 +147,7 @@ def _registry_id(emitter: Any) -> int:
     return int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0])
 
 
-def _draw(scene: Any, emitter: Any, dimension: int, points: SurfacePoints, which: IntArray, follow: bool) -> Any:
+def _draw(scene: Any, emitter: Any, dimension: int, points: SamplePoints, which: IntArray, follow: bool) -> Any:
     def sample(at: Sequence[Any], _: IntArray, begin: int, count: int) -> Any:
         return _from_emitter(scene, emitter, *at, begin, count, dimension, follow)
 

@@ -24,7 +24,7 @@ from rsgen.light.lamps import lamp_light
 from rsgen.light.sampling import typical
 from rsgen.light.sky import LESS, has_sky_light, sky_light
 from rsgen.light.specular_paths import first_scatterer, passes_light_on, shines
-from rsgen.light.surface_points import SurfacePoints
+from rsgen.light.surface_points import SamplePoints
 from rsgen.render.irradiance import IrradianceField
 from rsgen.render.rays import rays_from
 
@@ -77,7 +77,7 @@ def _db(square: float) -> float:
 
 def _seen(
     scene: Any, field: IrradianceField, eye: FloatArray, direction: FloatArray
-) -> tuple[SurfacePoints, FloatArray, BoolArray]:
+) -> tuple[SamplePoints, FloatArray, BoolArray]:
     """Places seen, through panes and in mirrors too, as they face the eye, the irradiance (n, 3) baked there, and
     whether it is beneath lacquer (n,).
     """
@@ -94,10 +94,10 @@ def _seen(
     there: BoolArray = np.broadcast_to(np.array(shown).astype(bool), (len(eye),))
     p, n, g, e = (rows_of(v)[there] for v in (si.p, normal, si.n * towards, light))
     coat: BoolArray = np.broadcast_to(np.array(lacquered).astype(bool), (len(eye),))
-    return SurfacePoints(p, n, g, np.zeros(len(p), np.int64)), e.astype(np.float64), coat[there]
+    return SamplePoints(p, n, g, np.zeros(len(p), np.int64)), e.astype(np.float64), coat[there]
 
 
-def _computed(scene: Any, field: IrradianceField, points: SurfacePoints, texel_m: float) -> NDArray[np.float64]:
+def _computed(scene: Any, field: IrradianceField, points: SamplePoints, texel_m: float) -> NDArray[np.float64]:
     """Irradiance (2, n, 4), see `in_channels`, at each of the points for itself, by two halves of many samples."""
     everywhere = np.arange(len(points.position))
     dark = np.zeros(len(everywhere))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.device.arrays import aligned
-from rsgen.light.surface_points import SurfacePoints
+from rsgen.light.surface_points import SamplePoints
 
 CHANNELS = 4  # of light: see `in_channels`
 _ETA = 1.5  # of lacquer
@@ -70,7 +70,7 @@ def about_normal(p, n, number, begin, count, dimension, light_along):
     return even, odd
 
 
-def shaded_nearby(scene: Any, points: SurfacePoints, which: NDArray, within_m: float, rays: int) -> FloatArray:
+def shaded_nearby(scene: Any, points: SamplePoints, which: NDArray, within_m: float, rays: int) -> FloatArray:
     """Part (n,) of the light from all sides that things less than `within_m` away would take, the farther the less."""
     within, out = dr.opaque(mi.Float, within_m), np.zeros(len(which))
 
@@ -86,7 +86,7 @@ def shaded_nearby(scene: Any, points: SurfacePoints, which: NDArray, within_m: f
 
 
 def chunks(
-    points: SurfacePoints, which: NDArray, report: Callable[[float], None], size: int = _CHUNK
+    points: SamplePoints, which: NDArray, report: Callable[[float], None], size: int = _CHUNK
 ) -> Iterator[tuple[int, NDArray, Any, Any, Any]]:
     """(first of them, their numbers, ray origins, normals and numbers on the device) of `which`, `size` at a time."""
     origin, normal = points.on_device
@@ -189,7 +189,7 @@ def sampled_adaptively(
     return np.divide(sums, drawn[:, None] / 2, out=sums), left
 
 
-def sampler_at(points: SurfacePoints, which: IntArray, sample: Callable[..., Any]) -> Sampler:
+def sampler_at(points: SamplePoints, which: IntArray, sample: Callable[..., Any]) -> Sampler:
     """A `Sampler` at the points `which`, from `sample(points on the device, their places in `which`, begin, count)`."""
 
     def draw(todo: IntArray, begin: int, count: int, report: Callable[[float], None]) -> Float32Array:

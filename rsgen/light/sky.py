@@ -19,7 +19,7 @@ from rsgen.device.arrays import aligned
 from rsgen.light.interpolation import thin
 from rsgen.light.sampling import chunks, in_channels, r2, rotation, sampled_adaptively, sampler_at
 from rsgen.light.specular_paths import first_scatterer, passes_light_on
-from rsgen.light.surface_points import SurfacePoints
+from rsgen.light.surface_points import SamplePoints
 
 _CELL_M = 0.5  # parts of the scene that have one histogram, of like normals on one piece of surface
 _FIRST_LOOK_TEXELS, _FIRST_LOOK_SAMPLES = 3.0, 64
@@ -42,7 +42,7 @@ def has_sky_light(scene: Any) -> bool:
 
 
 def sky_light(
-    scene: Any, points: SurfacePoints, which: IntArray, patch: IntArray, texel_m: float, samples: int,
+    scene: Any, points: SamplePoints, which: IntArray, patch: IntArray, texel_m: float, samples: int,
     beside: FloatArray, scatter: float, report: Callable[[float], None],
 ) -> tuple[Float32Array, FloatArray]:  # fmt: skip
     """Irradiance from the sky and from lamps by ways with turns: off mirrors and through thick glass.
@@ -63,7 +63,7 @@ def sky_light(
 
 
 def _learned(
-    scene: Any, points: SurfacePoints, which: IntArray, cell: IntArray, texel_m: float, follow: bool
+    scene: Any, points: SamplePoints, which: IntArray, cell: IntArray, texel_m: float, follow: bool
 ) -> Guide:  # fmt: skip
     coarse = thin(points, _FIRST_LOOK_TEXELS * texel_m, which)[0]
     seen = np.zeros((int(cell.max()) + 1, BINS), np.float32)

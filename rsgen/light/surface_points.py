@@ -28,7 +28,7 @@ _CHUNK = 1 << 20  # points looked at in one launch
 
 
 @dataclass(frozen=True)
-class SurfacePoints:
+class SamplePoints:
     """Unique sample points: position on the surface, shading normal, geometric normal, (n, 3) float32 each, and (n,)
     the number of the piece of surface that each lies on: one side of a connected part of a mesh that
     nothing stands on (see `barriers`).
@@ -55,7 +55,7 @@ class SurfacePoints:
 
 def sample_points(
     scene: Any, lattice: Lattice, texel_m: float
-) -> tuple[SurfacePoints, IntArray, tuple[NDArray, NDArray]]:  # fmt: skip
+) -> tuple[SamplePoints, IntArray, tuple[NDArray, NDArray]]:  # fmt: skip
     """Unique points of both sides of the lattice, the (2, points) index of each lattice point's front and back one, and
     how far these count on either side (see `barriers.Barriers`).
     """
@@ -69,7 +69,7 @@ def sample_points(
     within = min(_COVERED_TEXELS * texel_m, _COVERED_M)
     covered = find_covered(scene, position[first], unique_geometric, within)[index]
     barriers = find_barriers(scene, lattice, position, geometric, index, place, (covered[0], covered[1]), texel_m)
-    points = SurfacePoints(position[first], sign * normal[first], unique_geometric, barriers.piece)
+    points = SamplePoints(position[first], sign * normal[first], unique_geometric, barriers.piece)
     return points, index, barriers.reach
 
 

@@ -13,35 +13,17 @@ from xml.sax.saxutils import quoteattr
 import cv2
 import numpy as np
 
+from rsgen.render.meshes import ply_bytes
 from scenes.kit.materials import Material, texture
 from scenes.kit.shapes import Mesh, Parts, merge
 
 Point = tuple[float, float, float]
 ICL_FOV = float(np.degrees(2 * np.arctan(320 / 481.2)))  # width of ICL-NUIM's image, degrees
-_HEADER = """ply
-format binary_little_endian 1.0
-element vertex {vertices}
-property float x
-property float y
-property float z
-property float nx
-property float ny
-property float nz
-property float u
-property float v
-element face {faces}
-property list uchar int vertex_indices
-end_header
-"""
 
 
 def write_ply(path: Path, mesh: Mesh, tile: tuple[float, float]) -> None:
     """Binary PLY with normals and texture coordinates (metres / tile; v downwards, as Mitsuba's bitmaps want it)."""
-    table = np.concatenate([mesh.v, mesh.n, mesh.uv / np.asarray(tile)], axis=1).astype("<f4")
-    faces = np.empty(len(mesh.f), dtype=[("n", "u1"), ("i", "<i4", 3)])
-    faces["n"], faces["i"] = 3, mesh.f
-    head = _HEADER.format(vertices=len(table), faces=len(faces)).encode()
-    path.write_bytes(head + table.tobytes() + faces.tobytes())
+    path.write_bytes(ply_bytes(mesh.v, mesh.f, mesh.n, mesh.uv / np.asarray(tile)))
 
 
 def write_pfm(path: Path, image: np.ndarray) -> None:

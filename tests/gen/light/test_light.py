@@ -31,7 +31,7 @@ from rsgen.light.interpolation import denoised, thin
 from rsgen.light.lamps import left_to_rays, near_lamps
 from rsgen.light.sampling import CHANNELS, PATCH, about_normal, sampled_adaptively, standard_error, visible_error
 from rsgen.light.sky import BINS, Guide, bin_of
-from rsgen.light.surface_points import SurfacePoints
+from rsgen.light.surface_points import SamplePoints
 from rsgen.render.baked import BakedIntegrator
 from rsgen.render.images import ColorRenderer
 from rsgen.render.irradiance import make_field, make_lattice
@@ -89,7 +89,7 @@ def test_rays_are_drawn_where_lamps_leave_them_something(tmp_path: Path, lamp: s
     )
     xyz = floor_grid(0.9, 40).astype(np.float32)
     up = np.tile(np.float32([0, 0, 1]), (len(xyz), 1))
-    points = SurfacePoints(xyz, up, up, np.zeros(len(xyz), np.int64))
+    points = SamplePoints(xyz, up, up, np.zeros(len(xyz), np.int64))
     which = np.arange(len(xyz))
     origin, normal = points.on_device
     rays = about_normal(origin, normal, mi.UInt32(which), 0, 256, 111, left_to_rays(scene, origin, normal, False))
@@ -200,7 +200,7 @@ def test_noise_is_smoothed_and_edges_of_shadows_are_not() -> None:
     x, y = (k.ravel() for k in np.meshgrid(*2 * [0.01 * np.arange(80)], indexing="ij"))
     position = np.column_stack([x, y, np.zeros_like(x)]).astype(np.float32)
     normal = np.tile(np.float32([0, 0, 1]), (len(x), 1))
-    points = SurfacePoints(position, normal, normal, np.zeros(len(x), np.int64))
+    points = SamplePoints(position, normal, normal, np.zeros(len(x), np.int64))
     true = np.where(x < 0.405, 1.0, 0.2)
     halves = true[None, :, None] * (1 + rng.normal(scale=0.05, size=(2, len(x), 1))) * np.ones(3)
     which = np.arange(len(x))

@@ -16,7 +16,7 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.light.caustics import gathered_caustics
 from rsgen.light.indirect import gathering
-from rsgen.light.surface_points import SurfacePoints
+from rsgen.light.surface_points import SamplePoints
 from rsgen.render.baked import BakedIntegrator
 from rsgen.render.images import ColorRenderer
 from rsgen.render.irradiance import make_field, make_lattice
@@ -51,11 +51,11 @@ def on_lamp(count: int) -> tuple[np.ndarray, float]:
     return np.stack([np.full(y.size, LAMP_X), y.ravel(), z.ravel()], axis=-1), 0.4 * 0.2 / count**2
 
 
-def repeated(xyz: np.ndarray, times: int) -> SurfacePoints:
+def repeated(xyz: np.ndarray, times: int) -> SamplePoints:
     """Points of the floor, each so many times, side by side, to be drawn at with other random numbers."""
     position = np.repeat(xyz, times, axis=0).astype(np.float32)
     up = np.tile(np.array([0, 0, 1], np.float32), (len(position), 1))
-    return SurfacePoints(position, up, up, np.zeros(len(position), np.int64))
+    return SamplePoints(position, up, up, np.zeros(len(position), np.int64))
 
 
 def fresnel(cosine: np.ndarray, ior: float) -> np.ndarray:

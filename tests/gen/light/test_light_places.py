@@ -30,7 +30,7 @@ from rsgen.light import cache as lighting
 from rsgen.light.barriers import find_covered
 from rsgen.light.interpolation import Interpolation, thin
 from rsgen.light.quality import estimated_quality
-from rsgen.light.surface_points import SurfacePoints, sample_points
+from rsgen.light.surface_points import SamplePoints, sample_points
 from rsgen.render.irradiance import lattice_area, lattice_barycentric, make_field, make_lattice
 from rsgen.render.meshes import surface
 
@@ -136,7 +136,7 @@ def test_lookup_reproduces_a_linear_function_on_both_sides(shapes: Any, spacing:
 def test_interpolation_is_a_mean_of_what_is_near() -> None:
     rng = np.random.default_rng(7)
     position, normal = rng.random((500, 3), np.float32), np.tile(np.float32([0, 0, 1]), (500, 1))
-    points = SurfacePoints(position, normal, normal, np.zeros(500, np.int64))
+    points = SamplePoints(position, normal, normal, np.zeros(500, np.int64))
     sources = np.arange(0, 500, 3)
     between = Interpolation.between(points, sources, np.arange(500), 0.1)
     values = rng.random((len(sources), 3), np.float32)
@@ -151,7 +151,7 @@ def test_a_groove_lends_nothing_to_the_panel_that_it_is_in() -> None:
     groove = np.abs(x - 0.3) < 0.012
     position = np.column_stack([x, y, np.where(groove, 0.03, 0.045)]).astype(np.float32)
     normal = np.tile(np.float32([0, 0, 1]), (len(x), 1))
-    points = SurfacePoints(position, normal, normal, np.zeros(len(x), np.int64))
+    points = SamplePoints(position, normal, normal, np.zeros(len(x), np.int64))
     sources = thin(points, 0.06, steps=True)[0]
     light = np.where(groove, 0.2, 1.0).astype(np.float32)
     got = Interpolation.between(points, sources, np.arange(len(x)), 0.06)(light[sources, None])[:, 0]
