@@ -55,6 +55,8 @@ from rstrack.bench.record import CellRecord
 PAIRED_FROM = 10
 """Runs from which these are compared one by one: fewer cannot be told from chance by ranks (2⁻¹⁰ at the least)."""
 _DIGITS = 6
+_FAILED, _OTHERWISE = "failed", "defined otherwise now, not compared"
+_FATES = (_FAILED, "not run", "skipped", "not finished", _OTHERWISE, "new", "had failed before")
 
 
 @dataclass(frozen=True)
@@ -112,9 +114,6 @@ def compare(old: Mapping[str, CellRecord], new: Mapping[str, CellRecord]) -> Rec
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-
-_FAILED, _OTHERWISE = "failed", "defined otherwise now, not compared"
-_FATES = (_FAILED, "not run", "skipped", "not finished", _OTHERWISE, "new", "had failed before")
 
 
 def _fate(before: CellRecord | None, after: CellRecord | None) -> str:

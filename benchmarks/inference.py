@@ -21,6 +21,8 @@ from rstrack.bench.figures import FigureInfo, figure_of
 from rstrack.bench.record import CellRecord
 
 _NEWTON = 50
+# Deviates are finite, to eight sigma.
+_LEAST_P = 1e-15
 
 
 @dataclass(frozen=True)
@@ -129,10 +131,6 @@ def _inverse_trigamma(value: float) -> float:
         if abs(step) < 1e-9 * x:
             break
     return x
-
-
-# Deviates are finite, to eight sigma.
-_LEAST_P = 1e-15
 
 
 def signed_rank_p(differences: Sequence[float]) -> float:

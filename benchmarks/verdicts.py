@@ -1,4 +1,8 @@
-"""Where ours is not the best: every case and error in which a peer, or the paper, beats `rs-pg`."""
+"""Two sections of docs/results.md that judge: where ours is not the best, and the cliff test.
+
+Ours is not the best in every case and error in which a peer, or the paper, beats `rs-pg`. The cliff test shows whether
+the track falls off where a camera file is a little wrong.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +18,14 @@ from rstrack.bench.record import CellRecord, figure, methods_in_order
 from rstrack.bench.tables import ERRORS, Records, of_measure
 
 OURS = "rs-pg"
+FAMILY = "cliff"
+"""The family's name in the definitions, and so the group of its cells."""
+_LEAST_TRACKED = 0.99
+_MEDIANS, _MORE_MM = 2.5, 5.0
+_ABOUT = """\
+{methods} with one thing of the camera file a little wrong, begun at several frames: the least share of frames with a
+pose, how many cells have less than 99 %, their median ATE, and how many are far off: more than 2.5 medians + 5 mm, or
+most frames lost."""
 
 
 @dataclass(frozen=True)
@@ -116,16 +128,6 @@ def _of_paper(ours: CellRecord, name: str) -> list[tuple[float, str, int]]:
     if ours.case != ours.sequence:  # its figures are of whole sequences
         return []
     return [(figures[name], "the paper", 0) for (case, _), figures in paper.FIGURES.items() if case == ours.case]
-
-
-FAMILY = "cliff"
-"""The family's name in the definitions, and so the group of its cells."""
-_LEAST_TRACKED = 0.99
-_MEDIANS, _MORE_MM = 2.5, 5.0
-_ABOUT = """\
-{methods} with one thing of the camera file a little wrong, begun at several frames: the least share of frames with a
-pose, how many cells have less than 99 %, their median ATE, and how many are far off: more than 2.5 medians + 5 mm, or
-most frames lost."""
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,9 @@ _UNKNOWNS = (
     ("rx", "deg", _DEG), ("ry", "deg", _DEG), ("rz", "deg", _DEG),
 )  # fmt: skip
 
+# How wrong lenses are stated: parts, px of 640, and σ of distortion as OpenCV counts it.
+_FOCAL, _CENTER_PX, _DISTORTION = 0.03, 15.0, (0.06, 0.06, 0.002, 0.002, 0.06)
+
 
 class CalibrationSettings(StrictModel):
     """starts: wrong cameras at each distance. factors: distances in units of 50 % of readouts, 15 ms, 5 mm, 0.5 deg."""
@@ -183,11 +186,6 @@ def _trial(task: Task, stated: Dataset, truth: Parameters, factor: float) -> Cal
     errors = np.where(np.isfinite(sigmas), found.values.since(truth)[:POSES], np.nan)
     sigmas = np.where(sigmas > 0.0, sigmas, np.nan)
     return CalibrationTrial(factor, errors, sigmas, found.solution.is_settled, seconds=found.seconds)
-
-
-# How wrong lenses are stated: parts, px of 640, and σ of distortion as OpenCV counts it.
-_FOCAL, _CENTER_PX, _DISTORTION = 0.03, 15.0, (0.06, 0.06, 0.002, 0.002, 0.06)
-_WITHIN = 2.0
 
 
 class LensSettings(StrictModel):

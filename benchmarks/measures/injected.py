@@ -29,6 +29,9 @@ from rstrack.metrics.association import true_poses, truth_of
 # Frames before the fault, for the tracker to begin with, and after it, to be found again.
 _BEFORE, _AFTER = 12, 12
 _MOST_FRAMES = 60
+Make = Callable[[Dataset, int, int, np.random.Generator], Dataset]
+# Inverse depths that interpolation mixes belong to one surface if they differ by less than this part.
+_ONE_SURFACE = 0.03
 
 
 @dataclass(frozen=True)
@@ -151,7 +154,6 @@ def _mismatched(dataset: Dataset, first: int, count: int, rng: np.random.Generat
     return mismatched(dataset, first, count, shift if first < len(dataset) // 2 else -shift)
 
 
-Make = Callable[[Dataset, int, int, np.random.Generator], Dataset]
 KINDS: dict[str, Make] = {
     "kidnapped": lambda d, first, count, _: kidnapped(d, first, count),
     "blacked out": lambda d, first, count, _: blacked_out(d, first, count),
@@ -183,10 +185,6 @@ def _with_colors(dataset: Dataset, first: int, count: int, change: Callable[[Byt
     _check(dataset, first, count)
     touched = frozenset(i for group in dataset.groups[first : first + count] for i in group)
     return with_color(dataset, lambda i, pixels: change(pixels) if i in touched else pixels)
-
-
-# Inverse depths that interpolation mixes belong to one surface if they differ by less than this part.
-_ONE_SURFACE = 0.03
 
 
 def vibrating(dataset: Dataset, first: int, count: int, swing: FloatArray, hertz: float) -> Dataset:

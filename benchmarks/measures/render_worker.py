@@ -35,6 +35,15 @@ from rsgen.geometry.shutter import Shutter
 from rsgen.produce.parts import lines_of_sight, load_motion, load_scene, mirrored_samples, surfaces_hash
 from rstrack.bench.machine import peak_mb, reset_peak
 
+MODES = ("still", "rs-blur", "path", "rows", "averaged")
+BLUR_S, READOUT_S = 0.020, 0.028
+AVERAGED = 64  # sharp renders in the place of a blurred one
+# Modes that are divided by others than the still.
+_RATIOS = (("path", "rs-blur"), ("rows", "rs-blur"), ("averaged", "rs-blur"))
+_ROWS = 32  # rows measured of mode 'rows'; the others cost the same
+_PATH_SHARE = 4  # path tracing is slow and its time proportional to its samples: a quarter of them is measured
+_ROUNDS = 4  # of the modes that are compared most closely, after one to warm up: what ran before leaves caches cold
+
 
 def light_figures(config: Config, settings: Mapping[str, Any], progress: Progress) -> dict[str, float]:
     """The figures of the measure `light`, with its settings, `seed` of what is rendered and `picture`, a file to write.
@@ -73,16 +82,6 @@ def light_figures(config: Config, settings: Mapping[str, Any], progress: Progres
         "estimate_least_db": estimate.at_least_db,
         "peak_mb": peak_mb(),
     }
-
-
-MODES = ("still", "rs-blur", "path", "rows", "averaged")
-BLUR_S, READOUT_S = 0.020, 0.028
-AVERAGED = 64  # sharp renders in the place of a blurred one
-# Modes that are divided by others than the still.
-_RATIOS = (("path", "rs-blur"), ("rows", "rs-blur"), ("averaged", "rs-blur"))
-_ROWS = 32  # rows measured of mode 'rows'; the others cost the same
-_PATH_SHARE = 4  # path tracing is slow and its time proportional to its samples: a quarter of them is measured
-_ROUNDS = 4  # of the modes that are compared most closely, after one to warm up: what ran before leaves caches cold
 
 
 @dataclass(frozen=True)

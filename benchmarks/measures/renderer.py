@@ -24,6 +24,7 @@ from rstrack.bench.record import Figures
 from rstrack.bench.task import Task, settings_of
 
 _ROOT = Path(__file__).parents[2]
+ModeName = Literal["still", "rs-blur", "path", "rows", "averaged"]
 
 
 def rendered(task: Task, what: str, settings: Mapping[str, Any], progress: Progress) -> Figures:
@@ -85,9 +86,6 @@ def light_cell(task: Task, progress: Progress) -> Figures:
     settings = settings_of(task, LightSettings).model_dump()
     task.out.mkdir(parents=True, exist_ok=True)
     return rendered(task, "light", settings | {"seed": task.seed, "picture": str(task.out / "light.png")}, progress)
-
-
-ModeName = Literal["still", "rs-blur", "path", "rows", "averaged"]
 
 
 class RenderSettings(StrictModel):

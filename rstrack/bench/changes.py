@@ -28,6 +28,8 @@ from rstrack.metrics.association import true_poses, truth_of
 
 ColorChange = Callable[[int, ByteArray], ByteArray]
 DepthChange = Callable[[int, Float32Array], Float32Array]
+# Blocks of missing depth are this part of an image's width.
+_BLOCK = 0.05
 
 
 @dataclass(frozen=True)
@@ -74,8 +76,8 @@ def reordered(
 ) -> Dataset:
     """Frames shown (n,) of a dataset, any number of times and in any order, under new stamps (n,) that increase, s.
 
-    A frame's colour images go with it, as long before or after its depth image as they were. colors: frames (n,) whose
-    colour images are taken instead. The truth of a frame is that of its depth image, wherever that was taken.
+    A frame's colour images go with it, as long before or after its depth image as they were; colors: frames (n,) whose
+    ones are taken instead. The truth of a frame is that of its depth image, wherever that was taken.
     """
     colors = shown if colors is None else colors
     chosen: list[int] = []
@@ -88,13 +90,8 @@ def reordered(
         color_stamps += [stamp + dataset.color_stamps[i] - dataset.stamps[source] for i in group]
     images = _ChangedImages(dataset.images, tuple(chosen), tuple(shown))
     moved = _with_truth(dataset, dataset.stamps[np.asarray(shown, int)], stamps)
-    return replace(
-        moved,
-        stamps=np.asarray(stamps, float),
-        color_stamps=np.array(color_stamps),
-        groups=tuple(groups),
-        images=images,
-    )
+    times = np.asarray(stamps, float)
+    return replace(moved, stamps=times, color_stamps=np.array(color_stamps), groups=tuple(groups), images=images)
 
 
 def reduced(dataset: Dataset, factor: int) -> Dataset:
@@ -150,10 +147,6 @@ def _reduced(camera: Camera, shutter: Shutter, factor: int, centre: float) -> tu
     slow = replace(shutter, readout_s=delay * factor * shutter.line_count(small))
     corners = centre + factor * np.array([[0.0, 0.0], [width - 1.0, height - 1.0]])
     return small, slow, float(delay * shutter.line_of_pixel(corners, camera).min())
-
-
-# Blocks of missing depth are this part of an image's width.
-_BLOCK = 0.05
 
 
 def changed(dataset: Dataset, name: str, seed: int, arguments: Mapping[str, Any]) -> Dataset:

@@ -17,6 +17,7 @@ from typing import Literal
 
 Better = Literal["less", "more", "nominal", "unjudged"]
 Scale = Literal["log", "linear", "count"]
+_IN_NAMES = {"%": "pct", "dB": "db", "MB": "mb", "Msamples/s": "msamples_s"}
 
 
 @dataclass(frozen=True)
@@ -137,8 +138,6 @@ FIGURES: tuple[FigureInfo, ...] = (
     FigureInfo("*_deg_*x", "", "deg", "less", "log"),
     FigureInfo("*_ms_*x", "", "ms", "less", "log"),
 )
-
-_IN_NAMES = {"%": "pct", "dB": "db", "MB": "mb", "Msamples/s": "msamples_s"}
 
 
 @cache

@@ -1,4 +1,4 @@
-"""What a cell of a benchmark came to, and where: one record, JSON on disk; many of them in one file.
+"""What a cell of a benchmark came to: one record, JSON on disk; many of them in one file.
 
 records = read_records(Path("benchmarks/results/gate.json"))
 print(records["track/demo/rs-pg"].figures["ate_mm"])

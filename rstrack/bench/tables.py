@@ -1,4 +1,4 @@
-"""Records as the tables show them: triples of errors, averages over groups, methods' rows."""
+"""Records as tables: which records, their texts, averages over groups, and the files that are written of them."""
 
 from __future__ import annotations
 

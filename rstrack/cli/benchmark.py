@@ -120,7 +120,7 @@ def bench(
     elif "methods" not in text and ({"motion", "trajectory"} & set(text)):
         given |= {"--sequence": sequence, "--readout": narrowed.readout, "--seeds": narrowed.seeds}
         _refuse("a stress test", given, frames)
-        experiment = _blur(config, narrowed, tracker, frames, method or ())
+        experiment = _stress(config, narrowed, tracker, frames, method or ())
         folder = "out/stress"
     else:
         if narrowed != Narrowed():
@@ -167,14 +167,14 @@ def _readout(
     return ReadoutExperiment(chosen, tracker)
 
 
-def _blur(
+def _stress(
     config: Path, narrowed: Narrowed, tracker: Options, frames: slice | None, methods: tuple[str, ...]
 ) -> Experiment:
-    from rstrack.bench.experiments.blur import StressOptions
-    from rstrack.bench.experiments.blur_results import BlurExperiment
+    from rstrack.bench.experiments.stress import StressOptions
+    from rstrack.bench.experiments.stress_results import StressExperiment
 
     if len(methods) > 1 or not {*methods} <= {*METHODS}:
         raise UserError(f"--method {' '.join(methods)}: the stress test has one method of {', '.join(METHODS)}")
     tracker = Options(**asdict(tracker) | ({"method": methods[0]} if methods else {}))
     options = StressOptions(frames=None if frames is None else frames.stop, width=narrowed.width, tracker=tracker)
-    return BlurExperiment(config, replace(options, exposures_s=narrowed.exposure) if narrowed.exposure else options)
+    return StressExperiment(config, replace(options, exposures_s=narrowed.exposure) if narrowed.exposure else options)

@@ -45,6 +45,10 @@ _BASELINE_M = 0.0745
 # Of the images that the vocabulary is learnt from.
 _MOST_IMAGES = 120
 _WORKER = "rstrack.peers.orb_slam3_worker"
+BYTES = 32
+"""Of a descriptor: 256 bits."""
+_ROUNDS = 8
+_FEATURES = 500
 
 
 def run_orb_slam3(
@@ -122,12 +126,6 @@ def _write_frames(folder: Path, dataset: Dataset, chosen: range, images: Iterabl
         raise UserError(f"{dataset.root}: {NAME} finds no feature in the images")
     else:
         write_vocabulary(folder / "vocabulary.txt", train_vocabulary(learnt_from, seed=seed))
-
-
-BYTES = 32
-"""Of a descriptor: 256 bits."""
-_ROUNDS = 8
-_FEATURES = 500
 
 
 @dataclass(frozen=True)

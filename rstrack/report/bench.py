@@ -1,4 +1,8 @@
-"""The report of a benchmark: tables beside the paper's, bars, and every sequence's paths and errors."""
+"""The reports of a benchmark and of a blur stress test.
+
+A benchmark's has tables beside the paper's, bars, and every sequence's paths and errors. A stress test's has what the
+weights gain by exposure and speed, one keyframe, depth and tracking.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +11,17 @@ from pathlib import Path
 from rsgen.console.progress import Progress, no_progress
 from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
-from rstrack.bench.experiments.blur import PATHS, StressResult, read_stress
-from rstrack.bench.experiments.blur_results import (
+from rstrack.bench.experiments.method_results import AVERAGE, RESULTS, Results, read_results
+from rstrack.bench.experiments.method_tables import notes, sequence_table
+from rstrack.bench.experiments.pictures import ate_chart, read_picture, shown_runs
+from rstrack.bench.experiments.stress import PATHS, StressResult, read_stress
+from rstrack.bench.experiments.stress_results import (
     color_charts,
     color_tables,
     depth_tables,
     tracking_chart,
     tracking_table,
 )
-from rstrack.bench.experiments.method_results import AVERAGE, RESULTS, Results, read_results
-from rstrack.bench.experiments.method_tables import notes, sequence_table
-from rstrack.bench.experiments.pictures import ate_chart, read_picture, shown_runs
 from rstrack.bench.figures import figure_of
 from rstrack.bench.measures.blur import PANELS, read_panels
 from rstrack.bench.tables import ERRORS
@@ -56,6 +60,9 @@ _MAPS = (
     "blurs. Maps are aligned as for the ATE, by the camera's positions alone, so that after a short path one may be "
     "tilted as a whole."
 )
+
+# σ of the headline in px: the paper's.
+_SIGMA_PX = 1.0
 
 
 def bench_page(folder: Path, progress: Progress = no_progress) -> Page:
@@ -176,10 +183,6 @@ def _sequence_plots(runs: dict[str, Tracked]) -> tuple[Block, ...]:
         return (Note("No run of this sequence can be compared with the truth.", is_warning=True),)
     errors = [compared_errors(shown)] if has_truth else []
     return plots([path_chart(shown), *errors], _POINTS)
-
-
-# σ of the headline in px: the paper's.
-_SIGMA_PX = 1.0
 
 
 def stress_page(folder: Path) -> Page:

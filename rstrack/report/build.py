@@ -12,8 +12,8 @@ from pathlib import Path
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, write_error
-from rstrack.bench.experiments.blur import STRESS
 from rstrack.bench.experiments.method_results import RESULTS
+from rstrack.bench.experiments.stress import STRESS
 from rstrack.calibration.record import read_record
 from rstrack.data.estimate import TRAJECTORY
 from rstrack.metrics.clock import TruthOffset

@@ -1,4 +1,4 @@
-"""The report of a calibration: values with their errors, residuals, what determined them, and the camera file."""
+"""The report of a calibration: values with their errors, residuals, its charts, and the camera file."""
 
 from __future__ import annotations
 

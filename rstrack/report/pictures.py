@@ -27,6 +27,10 @@ from rstrack.view.viewer import jpeg, world_points
 _SLIDER_WIDTH = 720
 
 _TWINS = {"global_middle": "middle", "global_first": "first", "global_last": "last"}
+# Where nothing was measured.
+_NOTHING = 128
+# Pixels between the samples of a coarser depth image, which are filled from their neighbours.
+_FILL_STEPS = 3
 
 
 def frame_panels(tracked: Tracked, dataset: Dataset, width: int = 640) -> tuple[Block, ...]:
@@ -167,12 +171,6 @@ def _fastest(dataset: Dataset, among: npt.NDArray[np.int64], motion: Spline | No
     velocity = motion.velocity(middle)
     shift = np.linalg.norm(velocity[:, :3], axis=1) / 2.0 + np.linalg.norm(velocity[:, 3:], axis=1)
     return int(among[np.argmax(shift)])
-
-
-# Where nothing was measured.
-_NOTHING = 128
-# Pixels between the samples of a coarser depth image, which are filled from their neighbours.
-_FILL_STEPS = 3
 
 
 def jpeg_uri(image: npt.NDArray[np.uint8], width: int = 640) -> str:

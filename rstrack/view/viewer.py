@@ -44,6 +44,9 @@ _RECENT = 16
 # Depth residuals from minus to plus so many of the track's σ, blue to red.
 _SIGMAS = 3.0
 _PATH_COLOR, _TRUE_COLOR = [230, 120, 30], [90, 160, 90]
+_ROW_ITERATIONS = 3
+# Neighbours whose depths differ by more than this part are on two sides of an edge.
+_EDGE = 0.1
 
 
 @contextmanager
@@ -201,11 +204,6 @@ def _diverging(x: FloatArray) -> ByteArray:
     x = np.clip(x, -1.0, 1.0)
     rgb = np.stack([1.0 + np.minimum(x, 0.0), 1.0 - np.abs(x), 1.0 - np.maximum(x, 0.0)], axis=-1)
     return np.where(np.isnan(x)[..., None], 40, 255.0 * np.nan_to_num(rgb)).astype(np.uint8)
-
-
-_ROW_ITERATIONS = 3
-# Neighbours whose depths differ by more than this part are on two sides of an edge.
-_EDGE = 0.1
 
 
 def world_points(spline: Spline, camera: Camera, shutter: Shutter, image: Image, stride: int) -> FloatArray:

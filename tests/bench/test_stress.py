@@ -25,7 +25,7 @@ from rsgen.produce.writer import SequenceWriter
 from rsgen.sequence.format import stream_stamps
 from rsgen.sequence.trajectory import read_trajectory
 from rsgen.srgb import encode
-from rstrack.bench.experiments.blur import (
+from rstrack.bench.experiments.stress import (
     PATHS,
     StressOptions,
     StressResult,
@@ -34,7 +34,7 @@ from rstrack.bench.experiments.blur import (
     stress_benchmark,
     stress_result,
 )
-from rstrack.bench.experiments.blur_results import draw_stress, write_stress
+from rstrack.bench.experiments.stress_results import draw_stress, write_stress
 from rstrack.bench.measures import blur
 from rstrack.bench.record import CellRecord
 from rstrack.bench.runner import run_cells

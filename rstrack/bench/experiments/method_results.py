@@ -1,4 +1,4 @@
-"""What `rstrack bench` found: a view on its records, their averages, and results.json, written and read again here."""
+"""What `rstrack bench` found: a view on its records, their averages, and how results.json is read again."""
 
 from __future__ import annotations
 

@@ -38,6 +38,7 @@ from rstrack.options import METHODS, PEERS, Options
 
 MAPPED = ("rs-pg", "gs-pg", "baseline")
 """The methods whose maps are compared: ours, the same without its model of the shutter, and the classical way."""
+_FUSE, _NO_FUSE = "-fuse", "-no-fuse"
 
 
 class Quick(StrictModel):
@@ -191,9 +192,6 @@ def _kept(dataset: Dataset, command: str, frames: slice) -> range:
     if not len(chosen):
         raise UserError(f"{dataset.root}: has no frame {frames.start}: its frames are 0 to {len(dataset) - 1}")
     return chosen
-
-
-_FUSE, _NO_FUSE = "-fuse", "-no-fuse"
 
 
 def variants(method: str, fuse: bool | None) -> tuple[str, ...]:

@@ -1,4 +1,7 @@
-"""The pictures of `rstrack bench`: bars of the ATE, and for each sequence the paths and the errors over time."""
+"""The pictures of `rstrack bench`: bars of the ATE, of each sequence the paths and the errors over time, and maps.
+
+A map is what a method's trajectory makes of a room, seen from above; those of several methods are side by side.
+"""
 
 from __future__ import annotations
 
@@ -25,6 +28,13 @@ from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.mapping.map import run_map
 from rstrack.metrics.tracked import Tracked, load_run
 from rstrack.options import MapOptions
+
+MESH = "mesh.ply"
+# Beside a mesh: what it was made from.
+_MADE_FROM = "mesh.json"
+# Enough to cover what a whole sequence saw; more frames cost time and change little.
+_FRAMES = 80
+_PANEL_PX = (720, 540)
 
 
 def draw_plots(results: Results, out: Path, progress: Progress, warn: Callable[[str], None]) -> list[Path]:
@@ -86,15 +96,6 @@ def shown_runs(
             except UserError as error:
                 warn(f"No plots of {method} on {sequence.name}: {error}.")
     return runs
-
-
-MESH = "mesh.ply"
-# Beside a mesh: what it was made from.
-_MADE_FROM = "mesh.json"
-
-# Enough to cover what a whole sequence saw; more frames cost time and change little.
-_FRAMES = 80
-_PANEL_PX = (720, 540)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import pytest
 from report_util import NASTY, Parsed, make_stress, parse, picture
 
 from rsgen.errors import UserError
-from rstrack.bench.experiments.blur import StressResult, read_stress
+from rstrack.bench.experiments.stress import StressResult, read_stress
 from rstrack.report.build import write_report
 
 PANELS = Path("cells/blur/exposure_20ms/rs-pg-mid-exposure/panels")

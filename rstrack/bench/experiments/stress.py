@@ -1,7 +1,9 @@
-"""The cells of the blur stress test: one motion at several exposures and speeds, and what tracks it.
+"""The blur stress test: one motion at several exposures and speeds, what tracks it, and its records read again.
+
+result = read_stress(Path("runs/stress"))
 
 Exposures differ in nothing but their blur: the colour camera's clock is shifted by half the exposure, so that every
-line's mid-exposure, and with it its pose, its depth image and the sharp truth stay the same.
+row's mid-exposure, and with it its pose, its depth image and the sharp truth stay the same.
 """
 
 from __future__ import annotations
@@ -155,7 +157,7 @@ def _sped_up(config: Path, text: dict[str, Any], speed: float, slow: Path) -> Pa
 
 
 @dataclass(frozen=True)
-class Tested:
+class StressCell:
     """A cell. case: its sequence. variant: which photometric term. sigmas_px: of the weights (None: constant ones)."""
 
     case: str
@@ -186,7 +188,7 @@ class StressResult:
     """Everything that was measured, by speed and exposure, the motion's own speed first."""
 
     motion: str
-    cells: tuple[Tested, ...]
+    cells: tuple[StressCell, ...]
 
     @property
     def failed(self) -> list[str]:
@@ -194,7 +196,7 @@ class StressResult:
         return failures(cell.record for cell in self.cells)
 
     @property
-    def pictured(self) -> Tested | None:
+    def pictured(self) -> StressCell | None:
         """The cell whose keyframe is shown, of which `panels` has the pictures."""
         found = [cell for cell in self.fused("true") if cell.speed == 1.0]
         return min(found, key=lambda cell: abs(cell.exposure_s - _SHOWN_S), default=None)
@@ -204,7 +206,7 @@ class StressResult:
         """Folder of the pictures of one keyframe, relative to the test's."""
         return None if self.pictured is None else Path("cells", self.pictured.record.cell, "panels")
 
-    def fused(self, poses: str) -> list[Tested]:
+    def fused(self, poses: str) -> list[StressCell]:
         """The cells that have keyframes fused along a path."""
         return [cell for cell in self.cells if cell.figures.get(f"keyframes_{poses}")]
 
@@ -222,7 +224,7 @@ def stress_result(records: Iterable[CellRecord]) -> StressResult:
         about: dict[str, Any] = r.settings["settings"]
         sigmas = (None, *map(float, about["sigmas_px"])) if r.measure == "blur" else ()
         motion, at = str(about["motion"]), (str(about["sequence"]), float(about["speed"]), float(about["exposure_s"]))
-        cells.append(Tested(*at, str(about["variant"]), sigmas, r.figures, r))
+        cells.append(StressCell(*at, str(about["variant"]), sigmas, r.figures, r))
     cells.sort(key=lambda cell: (cell.speed != 1.0, cell.speed, cell.exposure_s, cell.record.cell))
     return StressResult(motion, tuple(cells))
 

@@ -1,7 +1,4 @@
-"""What the blur stress test found, read from its records: tables and charts.
-
-result = read_stress(Path("runs/stress"))
-"""
+"""What the blur stress test found: tables, charts and files."""
 
 from __future__ import annotations
 
@@ -14,16 +11,16 @@ from typing import Any
 from rsgen.console.progress import Progress
 from rsgen.console.tables import Entry, Table, fixed
 from rstrack.bench.cells import Benchmark
-from rstrack.bench.experiments.blur import (
+from rstrack.bench.experiments.run import Written
+from rstrack.bench.experiments.stress import (
     PATHS,
     STRESS,
+    StressCell,
     StressOptions,
     StressResult,
-    Tested,
     stress_benchmark,
     stress_result,
 )
-from rstrack.bench.experiments.run import Written
 from rstrack.bench.measures.blur import read_panels
 from rstrack.bench.record import CellRecord, write_records
 from rstrack.bench.runner import Outcome
@@ -39,7 +36,7 @@ _SCORES = (
     ("ssim", "Structural similarity (SSIM)", 4, 1.0),
     ("gradient", "Gradient energy over that of the sharp view", 3, 1.0),
 )
-_Value = Callable[["Tested", float | None], float | None]
+_Value = Callable[["StressCell", float | None], float | None]
 
 
 def stress_tables(result: StressResult) -> list[Table]:
@@ -62,8 +59,8 @@ def color_tables(result: StressResult, poses: str) -> list[Table]:
 
 
 def _color_table(
-    cells: Mapping[str, Tested], sigmas: Mapping[str, float | None], poses: str, score: str, title: str, digits: int,
-    ideal: float,
+    cells: Mapping[str, StressCell], sigmas: Mapping[str, float | None], poses: str, score: str, title: str,
+    digits: int, ideal: float,
 ) -> Table:  # fmt: skip
     def value(label: str, weights: str) -> float | None:
         return cells[label].score(score, poses, sigmas[weights])
@@ -130,7 +127,7 @@ def weights_name(sigma_px: float | None) -> str:
 
 
 @dataclass(frozen=True)
-class BlurExperiment:
+class StressExperiment:
     """One motion at several exposures and speeds; constant against blur-aware weights."""
 
     config: Path
@@ -183,7 +180,7 @@ def color_charts(result: StressResult, poses: str) -> list[Chart]:
     fast = {cell.exposure_s for cell in cells if cell.speed != 1.0}
     by_speed = [cell for cell in cells if cell.exposure_s in fast]
 
-    def chart(title: str, unit: str, along: Sequence[Tested], value: _Value, note: str = "") -> Chart:
+    def chart(title: str, unit: str, along: Sequence[StressCell], value: _Value, note: str = "") -> Chart:
         x = numbers([cell.speed if along is by_speed else 1e3 * cell.exposure_s for cell in along])
         lines = []
         for k, sigma in enumerate(result.sigmas_px):
@@ -194,7 +191,7 @@ def color_charts(result: StressResult, poses: str) -> list[Chart]:
         x_label = "speed, times" if along is by_speed else "exposure, ms"
         return Chart(title, unit, x_label, tuple(lines), from_zero=False, note=note)
 
-    def gain(cell: Tested, sigma_px: float | None) -> float | None:
+    def gain(cell: StressCell, sigma_px: float | None) -> float | None:
         return cell.gain_db(poses, sigma_px)
 
     charts = []
