@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -10,6 +11,11 @@ if TYPE_CHECKING:
 
 class UserError(Exception):
     """Bad input (file, config, machine set-up). Command line tools print it as one line and exit with status 2."""
+
+
+def first_few(names: Sequence[str], most: int = 3) -> str:
+    """'a, b, c and 2 more': at most so many of the names."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def first_problem(error: ValidationError, *within: str) -> str:

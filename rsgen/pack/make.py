@@ -81,7 +81,9 @@ def make_pack(
         folder = out / f"{index:06d}"
         if not folder.is_dir():
             key = fingerprint(identities[one.config])
-            config = _for_other_processes(configs[one.config], identities[one.config]["versions"])
+            config, variant = configs[one.config], identities[one.config]["versions"]["variant"]
+            scene = config.scene.model_copy(update={"file": config.scene.file.absolute()})  # for other processes
+            config = config.model_copy(update={"scene": scene, "backend": variant.partition("_")[0]})
             jobs.append(PackJob(config, key, motions[one.config].spline, one, options, folder.resolve()))
     done = 0
     # The first one of each scene alone: it bakes the light, if need be, and the others find it in the cache.
@@ -155,11 +157,6 @@ def _open(out: Path, identities: Sequence[dict[str, Any]], options: PackOptions,
     except OSError as error:
         raise write_error(out, error) from None
     atomic_write(out / PACK, encode_yaml(content))
-
-
-def _for_other_processes(config: Config, versions: dict[str, str]) -> Config:
-    scene = config.scene.model_copy(update={"file": config.scene.file.absolute()})
-    return config.model_copy(update={"scene": scene, "backend": versions["variant"].partition("_")[0]})
 
 
 # Scene and light that this process rendered last, by what they were made from.

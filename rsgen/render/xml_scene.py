@@ -18,14 +18,13 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from rsgen.errors import UserError
+from rsgen.errors import UserError, first_few
 from rsgen.formats import xml_helper
 from rsgen.inputs import MOST_BYTES, MOST_PIXELS, image_size
 from rsgen.render.xml_shapes import children, flatten
 
 log = logging.getLogger("rsgen")
 
-_MOST_LISTED = 3
 # In these a JPEG with a preview in front of it has stated its size.
 _HEADER_BYTES = 1 << 20
 _UNKNOWN = re.compile(r'(\w+) plugin of type "(\w+)":|- \w+ "(\w+)"')
@@ -236,11 +235,7 @@ def log_renamed(path: Path, renamed: Mapping[str, str]) -> None:
     """Log in a line which files of the scene `path` were found under other names than its own, if any."""
     pairs = [f"'{name}' is '{file}'" for name, file in sorted(renamed.items())]
     if pairs:
-        more = f" and {len(pairs) - _MOST_LISTED} more" if len(pairs) > _MOST_LISTED else ""
-        log.warning(
-            "scene %s: found files by names that differ in case or slashes: %s%s",
-            path, ", ".join(pairs[:_MOST_LISTED]), more,
-        )  # fmt: skip
+        log.warning("scene %s: found files by names that differ in case or slashes: %s", path, first_few(pairs))
 
 
 def _alike(folder: Path, name: str) -> list[Path]:

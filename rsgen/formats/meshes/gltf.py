@@ -110,7 +110,8 @@ def _refuse_constant(name: str) -> None:
 
 
 def _refuse_unknown(path: Path, header: dict[str, Any], primitives: list[dict[str, Any]]) -> None:
-    required = [name for name in header.get("extensionsRequired", []) if not _is_known(name)]
+    required = header.get("extensionsRequired", [])
+    required = [name for name in required if name not in _KNOWN and not name.startswith("KHR_materials_")]
     if required:
         raise UserError(f"scene {path}: needs {', '.join(required)}, which is not read here: export it without")
     used = {i for p in primitives for i in (*p["attributes"].values(), p.get("indices", -1))}
@@ -118,22 +119,13 @@ def _refuse_unknown(path: Path, header: dict[str, Any], primitives: list[dict[st
         raise UserError(f"scene {path}: has sparse accessors, which are not read here: export it without")
 
 
-def _is_known(extension: str) -> bool:
-    return extension in _KNOWN or extension.startswith("KHR_materials_")
-
-
-def _texture_infos(material: dict[str, Any]) -> list[dict[str, Any]]:
-    pbr = material.get("pbrMetallicRoughness", {})
-    places = [(pbr, "baseColorTexture"), (pbr, "metallicRoughnessTexture"), (material, "emissiveTexture")]
-    return [where[key] for where, key in [*places, (material, "normalTexture")] if key in where]
-
-
 def _coordinate_set(material: dict[str, Any]) -> int:
     """Number of the texture coordinates that the first of a material's textures takes; they then serve all of them."""
-    for info in _texture_infos(material):
-        how = info.get("extensions", {}).get("KHR_texture_transform", {})
-        return int(how.get("texCoord", info.get("texCoord", 0)))
-    return 0
+    both = material.get("pbrMetallicRoughness", {}) | material
+    names = ("baseColorTexture", "metallicRoughnessTexture", "emissiveTexture", "normalTexture")
+    info: dict[str, Any] = next((both[name] for name in names if name in both), {})
+    how = info.get("extensions", {}).get("KHR_texture_transform", {})
+    return int(how.get("texCoord", info.get("texCoord", 0)))
 
 
 def _roots(header: dict[str, Any]) -> list[int]:

@@ -18,6 +18,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from rsgen.array_types import FloatArray, IntArray
+from rsgen.errors import first_few
 from rsgen.formats.meshes.mesh_file import from_srgb, given_normals
 from rsgen.formats.polygons import is_convex, triangulated
 from rsgen.render.meshes import joined_triangles, ply_bytes
@@ -54,7 +55,8 @@ def with_triangles(data: bytes) -> bytes | None:
             words = polygon[1].split()
             corners = positions[_indices(words, int(np.searchsorted(places, polygon.start())), len(positions))]
             needed |= len(polygon[0]) > _MOST_CHARACTERS or not is_convex(corners)
-            text += [data[end : polygon.start()], _face_lines(words, corners)]
+            faces = [b"f " + b" ".join(words[k] for k in triangle) for triangle in triangulated(corners)]
+            text += [data[end : polygon.start()], b"\n".join(faces)]
             end = polygon.end()
     except (ValueError, IndexError):
         return None
@@ -68,10 +70,6 @@ def _indices(words: list[bytes], before: int, count: int) -> list[int]:
     if min(found) < 0 or max(found) >= count:
         raise IndexError
     return found
-
-
-def _face_lines(words: list[bytes], corners: FloatArray) -> bytes:
-    return b"\n".join(b"f " + b" ".join(words[k] for k in triangle) for triangle in triangulated(corners))
 
 
 log = logging.getLogger("rsgen")
@@ -108,8 +106,7 @@ def read_refused(mi: Any, state: Any, path: Path, scratch: Path) -> bool:
             node.props = _as_ply(mi, node.props, _stored(mesh, scratch, f"read{number}.ply"))
             names.append(name)
     if names:
-        more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-        log.info("scene %s: read by trimesh, Mitsuba does not: %s%s", path, ", ".join(names[:3]), more)
+        log.info("scene %s: read by trimesh, Mitsuba does not: %s", path, first_few(names))
     return bool(names)
 
 

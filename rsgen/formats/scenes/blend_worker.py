@@ -13,6 +13,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from rsgen.errors import first_few
+
 _SURFACES = ("MESH", "CURVE", "SURFACE", "FONT", "META")
 _COLORS = ("Base Color", "Color")
 
@@ -27,18 +29,18 @@ def main(file: Path, folder: Path) -> None:
     if missing := [
         i.name for i in bpy.data.images if i.source == "FILE" and not i.packed_file and not _is_there(bpy, i)
     ]:
-        notes.append(f"images missing, their colour is left out: {_listed(missing)}")
+        notes.append(f"images missing, their colour is left out: {first_few(missing)}")
     shown = [o for o in scene.objects if not o.hide_render]
     lights = [light for o in shown if o.type == "LIGHT" for light in _light(o, notes)]
     lights += _sky(bpy, scene.world, folder, notes)
     if cameras := [o.name for o in scene.objects if o.type == "CAMERA"]:
-        notes.append(f"cameras left out: {_listed(cameras)}")
+        notes.append(f"cameras left out: {first_few(cameras)}")
     if others := [
         f"{o.name} ({o.type.lower()})" for o in shown if o.type in ("VOLUME", "CURVES", "GPENCIL", "POINTCLOUD")
     ]:
-        notes.append(f"left out: {_listed(others)}")
+        notes.append(f"left out: {first_few(others)}")
     if hair := [o.name for o in shown if any(p.settings.type == "HAIR" for p in o.particle_systems)]:
-        notes.append(f"hair left out: {_listed(hair)}")
+        notes.append(f"hair left out: {first_few(hair)}")
     if any(o.animation_data or o.rigid_body for o in shown):
         notes.append(f"things that move: taken as they are at frame {scene.frame_current}")
     for material in {slot.material for o in shown for slot in o.material_slots if slot.material}:
@@ -140,10 +142,6 @@ def _nodes(owner: Any, kind: str) -> list[Any]:
 
 def _is_there(bpy: Any, image: Any) -> bool:
     return bool(image.packed_file) or Path(bpy.path.abspath(image.filepath, library=image.library)).is_file()
-
-
-def _listed(names: list[str]) -> str:
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 if __name__ == "__main__":

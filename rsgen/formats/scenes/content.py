@@ -11,11 +11,10 @@ from typing import Any, Literal
 import numpy as np
 
 from rsgen.array_types import FloatArray
-from rsgen.errors import UserError
+from rsgen.errors import UserError, first_few
 from rsgen.formats.meshes.parts import Part
 
 MOST_TRIANGLES = 30_000_000
-_NAMED = 3
 
 Kind = Literal["rectangle", "disk", "sphere", "point", "spot", "directional", "sky"]
 
@@ -67,12 +66,7 @@ class Notes:
 
     def lines(self) -> list[str]:
         """A line a remark."""
-        return [f"{remark}: {_listed(names)}" for remark, names in self._names.items()]
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = len(names) - _NAMED
-    return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")
+        return [f"{remark}: {first_few(names)}" for remark, names in self._names.items()]
 
 
 _TURN = np.diag([1.0, -1.0, -1.0, 1.0])  # Mitsuba's lights shine along z, USD's and Blender's along -z

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 
-from rsgen.errors import UserError
+from rsgen.errors import UserError, first_few
 from rstrack.formats.bags.bag import BagReader
 
 IMAGE, COMPRESSED, INFO, IMU = (
@@ -133,7 +133,4 @@ def _only(
 
 
 def _some(topics: Sequence[str]) -> str:
-    if not topics:
-        return "there is none"
-    more = f" and {len(topics) - _MOST_NAMED} more" if len(topics) > _MOST_NAMED else ""
-    return f"there are {', '.join(topics[:_MOST_NAMED])}{more}"
+    return f"there are {first_few(topics, _MOST_NAMED)}" if topics else "there is none"
