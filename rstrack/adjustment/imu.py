@@ -21,7 +21,7 @@ from rstrack.data.imu.recording import ImuRecording
 from rstrack.inertial.band import MotionBand
 from rstrack.inertial.estimate import STRENGTH, ImuEstimate, bias_walk
 from rstrack.inertial.factor import ImuFactor, motion
-from rstrack.inertial.residuals import ImuReadings
+from rstrack.inertial.residuals import ImuReadings, guessed_gravity, reading_sigmas
 
 # About how far apart the biases' knots are, s.
 _KNOT_S = 1.0
@@ -130,8 +130,7 @@ class ImuTerm:
         if recording.gyro is None or not inside.any():
             return None
         samples = ImuReadings(samples.t[inside], samples.values[inside], samples.counts[inside])
-        band, root = MotionBand.of(recording), np.sqrt(recording.rate_hz)
-        noise = np.array([recording.noise.gyro_density, recording.noise.accel_density]) * root
+        band, noise = MotionBand.of(recording), reading_sigmas(recording)
         sigma = np.hypot(noise, band.scatter(spline.dt))
         per = max(1, round(_KNOT_S / spline.dt))
         return cls(recording, samples, noise, sigma, band.allowed, int(spline.locate(samples.t[0])[0]), per)
@@ -139,9 +138,7 @@ class ImuTerm:
     def start(self, spline: Spline) -> ImuState:
         """No biases, and gravity along what the mean force would be if it were nothing else."""
         last = int(spline.locate(self.samples.t[-1])[0])
-        R = spline.pose(self.samples.t)[:, :3, :3] @ self.recording.T_imu_depth[:3, :3].T
-        up = (R @ self.samples.values[:, 3:, None])[..., 0].sum(axis=0)
-        gravity = -self.recording.gravity * up / max(1e-9, float(np.linalg.norm(up)))
+        gravity = guessed_gravity(spline, self.samples, self.recording)
         biases = np.zeros(((last - self.segment) // self.per + 2, 6))
         return ImuState(biases, gravity, self.recording.T_imu_depth)
 

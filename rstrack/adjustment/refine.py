@@ -33,28 +33,24 @@ from rstrack.options import Options
 
 # Of the distance and angle at which a tracker leaves a keyframe: no two are nearer, and frames within see it.
 _GRID, _SEEN = 0.5, 1.0
-# Keyframes that a frame is aligned to, at most: the nearest.
-_MOST = 4
-# Weight of a fused pixel in measurements: all of a recording's count alike.
-_FUSED = 1e4
+# Keyframes that a frame is aligned to, at most: the nearest. Weight of a fused pixel in measurements: all count alike.
+_MOST, _FUSED = 4, 1e4
 # Part of the keyframe's pixels that an image has to see, of those compared that must not be outliers, and scale of the
-# residuals over the usual.
+# residuals over the typical one.
 _LEAST_SHARE, _LEAST_FIT, _WORST = 0.15, 0.6, 2.5
 # Gain or offset that have changed by more call for another look, of so many at most.
 _BRIGHTER, _LOOKS = 0.004, 5
-# By how much colours may be drawn along, of what the way to the keyframe moves the picture: what shines shows things
-# that lie behind it, which move less (measured on a lacquered table, docs/notebook/hand-held.md).
-_SHINE = 3e-4
-# Information (m⁻², rad⁻²) of a frame that has not moved from its keyframe that its colours are not drawn along.
-_UNMOVED = 1e14
+# Bias of a colour image by reflections, as a part of what the way to the keyframe moves the image: they show things
+# behind the surface, which move less (on a lacquered table, docs/notebook/hand-held.md); and information (m⁻², rad⁻²)
+# of a frame that has not moved from its keyframe.
+_SHINE, _UNMOVED = 3e-4, 1e14
 # Furthest that a pose moves (m) in a round after which no other is worth it.
 _STILL = 2e-5
 # Steps of one round beside an IMU, and of control points and keyframes (m, rad) after which no other is worth it.
 _STEPS, _SETTLED = 5, 1e-6
 
-
-# A keyframe that a frame is near, by its number, and the weight of what the frame says against it.
 Near = list[tuple[int, float]]
+"""Keyframes that a frame is near, by their numbers, and the weights of the frame against them."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +63,8 @@ class TypicalScales:
 
 @dataclass(frozen=True)
 class Round:
-    """What a round did. moved_m: the furthest that a frame's pose moved; pairs: of a frame and a keyframe."""
+    """What a round did, as run.json has it. moved_m: the furthest that a frame's pose moved; pairs: of a frame and a
+    keyframe; usual: scales of residuals."""
 
     moved_m: float
     keyframes: int
@@ -79,9 +76,9 @@ class Round:
 class Refiner:
     """Refines the spline of a recording.
 
-    frames, times: numbers of the frames within the spline, and their mid readouts (n,) s. begin: when (s)
-    the camera stays where it was. load: frames by their numbers, on the device. usual: scales of residuals to begin
-    with. imu: an IMU beside the camera; found: what has been learnt of it.
+    frames, times: numbers of the frames within the spline, and their mid readouts (n,) s. begin: when (s) the camera
+    stays where it was. load: frames by their numbers, on the device. scales: of residuals to begin with. imu: an IMU
+    beside the camera; found: its estimate.
     """
 
     terms: Terms
@@ -91,7 +88,7 @@ class Refiner:
     times: FloatArray
     begin: float
     load: Callable[[Sequence[int]], Iterator[DeviceFrame]]
-    usual: TypicalScales
+    scales: TypicalScales
     imu: ImuTerm | None = None
     found: ImuResult | None = None
     _inflations: tuple[float, float] = field(default=(1.0, 1.0))
@@ -107,21 +104,21 @@ class Refiner:
         done: list[Round] = []
         while len(done) < rounds and (not done or done[-1].moved_m >= _STILL):
 
-            def told(part: float, note: str) -> None:
+            def show(part: float, note: str) -> None:
                 progress("refining", (len(done) + part) / rounds, f"round {len(done) + 1} of {rounds}, {note}")
 
-            spline, result = self._round(spline, told)
+            spline, result = self._round(spline, show)
             done.append(result)
         progress("refining", 1.0, f"{len(done)} rounds")
         return spline, done
 
-    def _round(self, spline: Spline, told: Callable[[float, str], None]) -> tuple[Spline, Round]:
+    def _round(self, spline: Spline, show: Callable[[float, str], None]) -> tuple[Spline, Round]:
         anchors, near = _grid(spline.pose(self.times), self.options)
         self._sharing = sum(map(len, near)) / len(anchors)
-        keyframes = self._fused(spline, anchors, near, told)
+        keyframes = self._fused(spline, anchors, near, show)
         state = SplineState(spline)
         against: dict[int, _Against] = {}
-        kept: list[_Figures] = []
+        scales: tuple[list[tuple[float, float]], ...] = ([], [])
         pairs = 0
         for n, frame in enumerate(self.load(self.frames)):
             for k, weight in near[n]:
@@ -129,14 +126,15 @@ class Refiner:
                 pairs += bool(good)
                 for o in good:
                     against.setdefault(k, _Against()).add(self._model(o, state, frame).scaled(weight))
-                    kept.append(_Figures.of(o))
-            told(0.5 + 0.5 * (n + 1) / len(self.frames), f"{pairs} pairs")
+                    sigma = o.lin.next_sigma / (_spread(o) if o.is_depth else 1.0)
+                    scales[not o.is_depth].append((sigma, o.inflation))
+            show(0.5 + 0.5 * (n + 1) / len(self.frames), f"{pairs} pairs")
         at = State(spline, {k: keyframes[k].T_world_base for k in sorted(against)}, self._imu_state(spline))
         seen = [against[k].seen(k) for k in at.keyframes]
         moved = self._solved(at, seen).spline
         shift = np.linalg.norm((moved.pose(self.times) - spline.pose(self.times))[:, :3, 3], axis=1)
-        self._learn(kept)
-        return moved, Round(float(shift.max()), len(seen), pairs, self.usual)
+        self._learn(*scales)
+        return moved, Round(float(shift.max()), len(seen), pairs, self.scales)
 
     def _solved(self, at: State, seen: Sequence[KeyframeModel]) -> State:
         """Where control points and keyframes belong.
@@ -167,7 +165,7 @@ class Refiner:
         return state.placed(before.spline.pose(self.begin) @ se3.inverse(state.spline.pose(self.begin)))
 
     def _fused(
-        self, spline: Spline, anchors: IntArray, near: list[Near], told: Callable[[float, str], None]
+        self, spline: Spline, anchors: IntArray, near: list[Near], show: Callable[[float, str], None]
     ) -> list[Reference]:
         """A keyframe of each anchor, with the depth of all frames near it, wherever these come in the recording."""
         numbers = [self.frames[a] for a in anchors]
@@ -179,13 +177,13 @@ class Refiner:
             for k, _ in near[n]:
                 if made[k].index != frame.index:
                     fused[k] = self.maker.fused(fused[k], frame.depth, spline, _FUSED)
-            told(0.4 * (n + 1) / len(self.frames), note)
+            show(0.4 * (n + 1) / len(self.frames), note)
         done = []
         shape = made[0].lens.camera.height, made[0].lens.camera.width
         for k, frame in enumerate(self.load(numbers)):
             rho, weight = (self.maker.e.download(a, shape) for a in (fused[k].inverse_depth, fused[k].weight))
             done.append(self.maker.with_depth(made[k], frame.depth, frame.colors, spline, rho, weight))
-            told(0.4 + 0.1 * (k + 1) / len(numbers), note)
+            show(0.4 + 0.1 * (k + 1) / len(numbers), note)
         return done
 
     def _linearised(self, frame: DeviceFrame, ref: Reference, state: SplineState) -> list[Observation]:
@@ -212,10 +210,9 @@ class Refiner:
         return good
 
     def _model(self, o: Observation, state: SplineState, frame: DeviceFrame) -> Quadratic:
-        """The model of an image against a keyframe; colours may be drawn along by it, as are all that see it.
+        """The model of an image against a keyframe; reflections may bias a colour image as one body.
 
-        What all n images of a keyframe have in common in their errors does not average out: with a covariance n times
-        as large for each it does not.
+        That error is common to all n images of a keyframe and does not average out, so each has n times its covariance.
         """
         model = o.model(state)
         if o.is_depth:
@@ -228,14 +225,13 @@ class Refiner:
         return doubted(model, se3.adjoint(T_world_cam), information)
 
     def _usual(self, o: Observation) -> float:
-        return self.usual.depth * _spread(o) if o.is_depth else self.usual.intensity
+        return self.scales.depth * _spread(o) if o.is_depth else self.scales.intensity
 
-    def _learn(self, kept: list[_Figures]) -> None:
-        depth, color = ([f for f in kept if f.is_depth is is_depth] for is_depth in (True, False))
-        self.usual = TypicalScales(
-            _median([f.sigma for f in depth], self.usual.depth), _median([f.sigma for f in color], self.usual.intensity)
-        )
-        one, other = (max(1.0, _median([f.inflation for f in some], 1.0)) for some in (depth, color))
+    def _learn(self, depth: list[tuple[float, float]], color: list[tuple[float, float]]) -> None:
+        """From the scales, of depth at one metre, and inflations of the images that fitted."""
+        depth_sigma = _median([sigma for sigma, _ in depth], self.scales.depth)
+        self.scales = TypicalScales(depth_sigma, _median([sigma for sigma, _ in color], self.scales.intensity))
+        one, other = (max(1.0, _median([inflation for _, inflation in some], 1.0)) for some in (depth, color))
         self._inflations = one, other
 
 
@@ -269,19 +265,6 @@ def doubted(model: Quadratic, to_world: FloatArray, information: FloatArray) -> 
     solved = np.linalg.solve(information + together.T @ HB, np.column_stack([HB.T, together.T @ model.g]))
     H = model.H - HB @ solved[:, :-1]
     return Quadratic(model.first, 0.5 * (H + H.T), model.g - HB @ solved[:, -1])
-
-
-@dataclass(frozen=True)
-class _Figures:
-    """Of an observation: σ, of depth at one metre, and inflation."""
-
-    is_depth: bool
-    sigma: float
-    inflation: float
-
-    @classmethod
-    def of(cls, o: Observation) -> _Figures:
-        return cls(o.is_depth, o.lin.next_sigma / (_spread(o) if o.is_depth else 1.0), o.inflation)
 
 
 def _grid(T: FloatArray, options: Options) -> tuple[IntArray, list[Near]]:

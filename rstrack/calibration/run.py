@@ -38,7 +38,7 @@ from rstrack.calibration.parameters import (
 from rstrack.calibration.result import CameraCalibration
 from rstrack.calibration.solve import solve
 from rstrack.calibration.stages import StageResult, in_stages, progress_watch
-from rstrack.calibration.start import RoughTrack, first_track, load_window
+from rstrack.calibration.start import TrackedSpline, first_track, load_window
 from rstrack.data.dataset import Dataset
 from rstrack.options import Options
 
@@ -200,7 +200,7 @@ def _trusted(dataset: Dataset, windows: Sequence[RecordingWindow], terms: PairTe
     return kept
 
 
-def _windows(dataset: Dataset, chosen: range, track: RoughTrack) -> list[range]:
+def _windows(dataset: Dataset, chosen: range, track: TrackedSpline) -> list[range]:
     """Frames in a row that were followed, with colour images; of many those that move most."""
     runs = track.frames(dataset, chosen)
     total = sum(len(run) for run in runs)

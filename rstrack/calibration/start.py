@@ -32,8 +32,8 @@ _GAP = 2.5
 
 
 @dataclass(frozen=True)
-class RoughTrack:
-    """A rough T_world_depth(t), and the times (begin, end) in s within which it was followed."""
+class TrackedSpline:
+    """T_world_depth(t), and the times (begin, end) in s within which it was followed."""
 
     spline: Spline
     valid: tuple[tuple[float, float], ...]
@@ -61,7 +61,7 @@ class RoughTrack:
         return runs
 
 
-def first_track(dataset: Dataset, chosen: range, options: Options, progress: Progress) -> RoughTrack:
+def first_track(dataset: Dataset, chosen: range, options: Options, progress: Progress) -> TrackedSpline:
     """Of the frames of a dataset. Raises UserError: nothing can be followed."""
     whole, best = dataset.stamps[chosen[-1]] - dataset.stamps[chosen[0]], None
     for method in _METHODS:
@@ -75,10 +75,10 @@ def first_track(dataset: Dataset, chosen: range, options: Options, progress: Pro
     return best
 
 
-def _tracked(dataset: Dataset, chosen: range, options: Options, progress: Progress) -> RoughTrack | None:
+def _tracked(dataset: Dataset, chosen: range, options: Options, progress: Progress) -> TrackedSpline | None:
     tracker = rough_track(dataset, chosen, options, lambda done: progress(f"first track ({options.method})", done, ""))
     if tracker.spline is not None and tracker.spline_valid:
-        return RoughTrack(tracker.spline, tuple(tracker.spline_valid))
+        return TrackedSpline(tracker.spline, tuple(tracker.spline_valid))
     stamps, poses = tracker.trajectory
     if len(stamps) < 2:
         return None
@@ -89,7 +89,7 @@ def _tracked(dataset: Dataset, chosen: range, options: Options, progress: Progre
     knots = np.asarray(t0 + (np.arange(int((stamps[-1] - t0) / dt) + 5) - 1) * dt, np.float64)
     breaks = np.flatnonzero(np.diff(stamps) > _GAP * period) + 1
     spans = tuple((float(part[0]), float(part[-1])) for part in np.split(stamps, breaks))
-    return RoughTrack(through(se3.interpolated(stamps, poses, knots), t0, dt), spans)
+    return TrackedSpline(through(se3.interpolated(stamps, poses, knots), t0, dt), spans)
 
 
 # Seconds before the first and after the last line for which a window has spline: times move while they are estimated.

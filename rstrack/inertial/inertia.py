@@ -14,7 +14,7 @@ from rstrack.alignment.spline_state import SplineState
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.inertial.band import MotionBand
 from rstrack.inertial.estimate import GRAVITY, GYRO, SIZE, ImuEstimate
-from rstrack.inertial.residuals import ImuReadings, ImuResiduals
+from rstrack.inertial.residuals import ImuReadings, ImuResiduals, guessed_gravity, reading_sigmas
 from rstrack.inertial.smoother import ReusedPrior, Smoother
 
 # σ of the mean acceleration of a track's first moments, m/s².
@@ -46,10 +46,8 @@ class Inertia:
     def __init__(self, recording: ImuRecording) -> None:
         self.recording, self.samples = recording, ImuReadings.of(recording)
         self.usable_s = self.determined_s = float("nan")
-        noise, root = recording.noise, np.sqrt(recording.rate_hz)
-        self._noise = np.array([noise.gyro_density, noise.accel_density]) * root
-        walks = np.repeat([noise.gyro_walk, noise.accel_walk, _DRIFT, 0.0], 3)
-        self._walk = walks**2
+        self._noise = reading_sigmas(recording)
+        self._walk = np.repeat([recording.noise.gyro_walk, recording.noise.accel_walk, _DRIFT, 0.0], 3) ** 2
         self._band, self._dt = MotionBand.of(recording), 0.0
         self.common = self._band.allowed if self.is_informative else ACCELERATION
         self.sigma, self._told = self._noise, np.zeros(2)
@@ -85,10 +83,8 @@ class Inertia:
         """The world is another one from now on; biases and turn stay what they are."""
         if self._smoother is None:
             return
-        start, own = (
-            ImuEstimate.initial(np.array([0.0, self.recording.gravity, 0.0])),
-            np.delete(np.arange(SIZE), GRAVITY),
-        )
+        start = ImuEstimate.initial(np.array([0.0, self.recording.gravity, 0.0]))
+        own = np.delete(np.arange(SIZE), GRAVITY)
         start.information[np.ix_(own, own)] = np.linalg.inv(self.estimate.covariance[np.ix_(own, own)])
         start.mean[own] = self.estimate.mean[own]
         self.estimate, self._smoother = start, None
@@ -134,7 +130,7 @@ class Inertia:
         if not self.is_usable:
             # An estimate that is still wrong would draw the spline and confirm itself. Readings then only say how the
             # motion changes, and a hand accelerates little in the mean where images leave that open.
-            estimate = ImuEstimate.initial(self._guessed(spline, samples))
+            estimate = ImuEstimate.initial(guessed_gravity(spline, samples, self.recording))
             estimate.information[GRAVITY, GRAVITY] = np.eye(3) / _MEAN_ACCELERATION**2
         numbers = estimate.mean
 
@@ -258,14 +254,8 @@ class Inertia:
         fresh = self.samples.between(begin, spline.t_end)
         if not len(fresh):
             return None
-        self.estimate.mean[GRAVITY] = self._guessed(spline, fresh)
+        self.estimate.mean[GRAVITY] = guessed_gravity(spline, fresh, self.recording)
         return Smoother.start(self.estimate)
-
-    def _guessed(self, spline: Spline, samples: ImuReadings) -> FloatArray:
-        """Gravity in the world (3,), m/s², if the samples' mean force were nothing else."""
-        R = spline.pose(samples.t)[:, :3, :3] @ self.recording.T_imu_depth[:3, :3].T
-        up = (R @ samples.values[:, 3:, None])[..., 0].sum(axis=0)
-        return np.asarray(-self.recording.gravity * up / max(1e-9, float(np.linalg.norm(up))))
 
     def _regular(self, smoother: Smoother, spline: Spline) -> float:
         """Add the weak prior of accelerations for control points that have come anew; its cost."""
@@ -294,12 +284,10 @@ class Inertia:
     def _learn_sigma(self, r: FloatArray, counts: FloatArray, dt: float) -> None:
         # Of noise a spline follows a part; what it cannot follow is all in the residuals.
         followed = min(1.0, 1.0 / (self.recording.rate_hz * dt)) * self._noise**2
-        squares, number = (r**2 * counts).reshape(-1, 2, 3).sum(axis=(0, 2)), counts.reshape(-1, 2, 3).sum(axis=(0, 2))
-        known = number > 0.0
+        squares, number = (each.reshape(-1, 2, 3).sum(axis=(0, 2)) for each in (r**2 * counts, counts))
         self._told = np.minimum(self._told + number / 3.0, _MEMORY)
         weight = np.minimum(1.0, number / (3.0 * self._told))
         seen = squares / np.maximum(1.0, number) + followed
-        # One blow must not blind it for long.
-        seen = np.minimum(seen, 25.0 * self.sigma**2)
-        mean = np.where(known, (1.0 - weight) * self.sigma**2 + weight * seen, self.sigma**2)
+        seen = np.minimum(seen, 25.0 * self.sigma**2)  # one blow must not blind it for long
+        mean = np.where(number > 0.0, (1.0 - weight) * self.sigma**2 + weight * seen, self.sigma**2)
         self.sigma = np.maximum(self._noise, np.sqrt(mean))

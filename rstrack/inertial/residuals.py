@@ -36,8 +36,7 @@ class ImuReadings:
         gyro = np.full_like(imu.accel, np.nan) if imu.gyro is None else imu.gyro
         values = np.concatenate([gyro, imu.accel], axis=1)
         limits = [np.inf if r is None else _SATURATED * r for r in (imu.noise.gyro_range, imu.noise.accel_range)]
-        root = np.sqrt(imu.rate_hz)
-        parts = (gyro, imu.noise.gyro_density * root), (imu.accel, imu.noise.accel_density * root)
+        parts = zip((gyro, imu.accel), reading_sigmas(imu), strict=True)
         with np.errstate(invalid="ignore"):
             counts = np.isfinite(values) & (np.abs(values) < np.repeat(limits, 3))
             counts &= ~np.concatenate([outliers(part, sigma) for part, sigma in parts], axis=1)
@@ -174,3 +173,16 @@ def outliers(values: FloatArray, sigma: float) -> BoolArray:
     usual = np.abs(b - a) + np.abs(c - b) + np.abs(d - c)
     found[2:-2] = np.abs(x - 0.5 * (b + c)) > _SIGMAS * sigma + _TIMES * usual
     return found
+
+
+def reading_sigmas(recording: ImuRecording) -> FloatArray:
+    """σ (2,) of a gyroscope's reading (rad/s) and of an accelerometer's (m/s²), as stated."""
+    noise, root = recording.noise, np.sqrt(recording.rate_hz)
+    return np.array([noise.gyro_density, noise.accel_density]) * root
+
+
+def guessed_gravity(spline: Spline, readings: ImuReadings, recording: ImuRecording) -> FloatArray:
+    """Gravity in the world (3,), m/s², if the mean force were nothing else."""
+    R = spline.pose(readings.t)[:, :3, :3] @ recording.T_imu_depth[:3, :3].T
+    up = (R @ readings.values[:, 3:, None])[..., 0].sum(axis=0)
+    return np.asarray(-recording.gravity * up / max(1e-9, float(np.linalg.norm(up))))

@@ -7,7 +7,7 @@ Path("imu.yaml").write_text(found.imu_file())
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.calibration.imu.model import CorrectedTrack, ImuUnknowns
 from rstrack.calibration.imu.result import ImuCalibration
 from rstrack.calibration.imu.solve import ImuData, solve
+from rstrack.calibration.start import TrackedSpline
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import read_estimate
 from rstrack.options import Options
@@ -39,34 +40,26 @@ _GRID_HZ, _FARTHEST_S = 200.0, 1.0
 _SECOND, _ALIKE = 0.02, 0.6
 
 
-@dataclass(frozen=True)
-class Followed:
-    """A track: T_world_depth(t), and the times (begin, end) in s within which it means something."""
-
-    spline: Spline
-    valid: tuple[tuple[float, float], ...]
-
-
-def track_of_run(folder: Path) -> Followed:
+def track_of_run(folder: Path) -> TrackedSpline:
     """Of what 'rstrack track' wrote. Raises UserError: it has no spline."""
     estimate = read_estimate(folder)
     if estimate.spline is None:
         raise UserError(f"{folder}: has no spline: track it with a spline method, for example rs-pg")
     valid = estimate.info.get("spline_valid") or [[estimate.spline.t_begin, estimate.spline.t_end]]
-    return Followed(estimate.spline, tuple((float(a), float(b)) for a, b in valid))
+    return TrackedSpline(estimate.spline, tuple((float(a), float(b)) for a, b in valid))
 
 
-def track_of(dataset: Dataset, frames: slice, options: Options, progress: Progress) -> Followed:
+def track_of(dataset: Dataset, frames: slice, options: Options, progress: Progress) -> TrackedSpline:
     """By tracking a dataset's frames with depth and colour. Raises UserError: nothing was followed."""
     chosen = range(len(dataset))[frames]
     how = replace(options, method="rs-pg")
     tracker = rough_track(dataset, chosen, how, lambda done: progress("tracking", done, ""))
     if tracker.spline is None or not tracker.spline_valid:
         raise UserError(f"{dataset.root}: these frames give no track: choose --frames with more to see")
-    return Followed(tracker.spline, tuple(tracker.spline_valid))
+    return TrackedSpline(tracker.spline, tuple(tracker.spline_valid))
 
 
-def calibrate_imu(dataset: Dataset, followed: Followed, progress: Progress = no_progress) -> ImuCalibration:
+def calibrate_imu(dataset: Dataset, followed: TrackedSpline, progress: Progress = no_progress) -> ImuCalibration:
     """Place, clock, biases and gyroscope's scale of a dataset's IMU, by the longest segment of a track.
 
     Raises UserError, one line: no IMU, no gyroscope, too short a track, too little motion.

@@ -28,8 +28,9 @@ from rstrack.calibration.imu.model import (
     hats,
 )
 from rstrack.calibration.imu.result import ImuCalibration
-from rstrack.calibration.imu.run import Followed, begin, calibrate_imu
+from rstrack.calibration.imu.run import begin, calibrate_imu
 from rstrack.calibration.imu.solve import _alike
+from rstrack.calibration.start import TrackedSpline
 from rstrack.cli.main import main
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.inertial.factor import BodyMotion
@@ -115,7 +116,7 @@ def test_a_corrected_motion_is_that_of_the_corrected_poses() -> None:
     np.testing.assert_allclose(at.rate, (after - before) / (2 * h), rtol=1e-3, atol=2e-3)
 
 
-def tracked(noise: float, seed: int = 0, dt: float = 0.025) -> Followed:
+def tracked(noise: float, seed: int = 0, dt: float = 0.025) -> TrackedSpline:
     """The true motion with knots of its own, which do not meet the true ones, and errors as a tracker's."""
     knots = np.arange(0.3 * dt, SECONDS, dt)
     points = TRUE.pose(np.clip(knots, TRUE.t_begin, TRUE.t_end))
@@ -128,7 +129,7 @@ def tracked(noise: float, seed: int = 0, dt: float = 0.025) -> Followed:
         fitted = se3.orthonormalise(fitted)
     shaken = fitted @ se3.exp(noise * np.random.default_rng(seed).normal(size=(len(fitted), 6)))
     spline = Spline(shaken, knots[1], dt)
-    return Followed(spline, ((spline.t_begin, spline.t_end),))
+    return TrackedSpline(spline, ((spline.t_begin, spline.t_end),))
 
 
 @pytest.fixture(scope="module")
@@ -191,7 +192,7 @@ def test_a_track_that_errs_more_tells_less(found: ImuCalibration, dataset: Datas
 def test_what_tells_nothing_is_one_line(dataset: Dataset, tmp_path: Path) -> None:
     track = tracked(0.0)
     with pytest.raises(UserError, match="followed in a row"):
-        calibrate_imu(dataset, Followed(track.spline, ((1.0, 4.0),)))
+        calibrate_imu(dataset, TrackedSpline(track.spline, ((1.0, 4.0),)))
     with pytest.raises(UserError, match="has no IMU"):
         calibrate_imu(replace(dataset, imu_files=None), track)
     other = simulate_imu(swung(40.0), CONFIG, 27.0, 27.0 + SECONDS, 0, FAULTS)
