@@ -1,6 +1,6 @@
 """What is published of cameras' shutters, with where that was found: a calibration may start from it.
 
-No number stands here without a source; where no more than "rolling" was found, nothing is said of the time.
+No number stands here without a source; where no more than "rolling" was found, no time is stated.
 docs/recordings.md has the same table.
 """
 
@@ -17,7 +17,7 @@ from rstrack.calibration.parameters import COUNT, NAMES, Known, Parameters
 
 # σ of the readout of a shutter that is published to be global, s.
 _GLOBAL_SIGMA_S = 1e-4
-# σ of readouts that makers give as a time of a line: how many lines are read beside those of the image is not said, s.
+# σ of readouts that makers give as a time of a line: how many are read beside those of the image is not stated, s.
 _LINE_TIME_SIGMA_S = 1e-3
 # Part of what the device's σ was that is left where the recording adds little.
 _ADDS_LITTLE = 0.7
@@ -85,7 +85,7 @@ def device_notes(device: Device, before: Known, used: Known, sigmas: Iterable[fl
         if not np.isfinite(kept):
             notes.append(f"{name}: this recording contradicts the device's, which was not used: is it another mode?")
         elif sigma > _ADDS_LITTLE * known:
-            notes.append(f"{name}: told by the device rather than by this recording")
+            notes.append(f"{name}: determined by the device rather than by this recording")
     return tuple(notes)
 
 
@@ -154,4 +154,4 @@ DEVICES = (
     _zed2("720p, 60 Hz", 720, 15.7e-6),
     _zed2("1080p, 30 Hz", 1080, 25.6e-6),
 )  # fmt: skip
-"""All that --device knows."""
+"""All cameras of --device."""

@@ -50,9 +50,9 @@ _SIZES: tuple[tuple[Group, int], ...] = (
     ("readout", 2), ("offset", 2), ("extrinsics", 6), ("intrinsics", 2 * len(LENS)), ("depth", len(DEPTH)),
 )  # fmt: skip
 _GROUP_OF = tuple(group for group, size in _SIZES for _ in range(size))
-# How far off a camera file's lens usually is (σ): a principal point that is said to be the middle by 8 of 525 px, and
-# elements are centred, so that tangential distortion stays small. A recording that hardly turns about some axis tells
-# no principal point from tangential distortion and a turn; what lenses are like then does.
+# How far off a camera file's lens usually is (σ): a principal point stated as the middle by 8 of 525 px, and
+# elements are centred, so that tangential distortion stays small. A recording that hardly turns about some axis does
+# not separate a principal point from tangential distortion and a turn; what lenses are like then does.
 LENS_SIGMA = np.array([0.03, 0.03, 0.015, 0.015, 0.2, 0.5, 3e-3, 3e-3, 1.0])
 # And its pixels are as wide as high.
 ASPECT_SIGMA = 3e-3
@@ -87,7 +87,7 @@ NEEDS = (
     *(("turning about all axes, so that all of the image sees texture",) * len(LENS)),
     *(("surfaces near and far, seen from near and far",) * 3),
 )  # fmt: skip
-"""What a recording needs to tell it."""
+"""What a recording needs to determine it."""
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ def free_of(groups: Sequence[str]) -> BoolArray:
     return np.array([group in groups for group in _GROUP_OF])
 
 
-# How far, in σ, what a recording says may lie from what was known before it is taken to contradict it.
+# How far, in σ, the estimate of a recording may lie from what was known before it is taken to contradict it.
 _CONTRADICTS = 3.0
 # The part of what was known by which a solution has to move at least, over that many σ, to count as moved.
 _LEAST = 0.1

@@ -1,4 +1,4 @@
-"""calibration.json, read back: what `CameraCalibration.as_dict` says and `rstrack report` shows."""
+"""calibration.json, read back: `CameraCalibration.as_dict`, which `rstrack report` shows."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Parameter(_Stored):
 
     @property
     def is_found(self) -> bool:
-        """Whether the recording tells it."""
+        """Whether the recording determines it."""
         return self.sigma is not None
 
 
@@ -112,7 +112,7 @@ class CalibrationRecord(_Stored):
 
     @property
     def undetermined(self) -> dict[str, Parameter]:
-        """Those that the recording does not tell."""
+        """Those that the recording does not determine."""
         return {name: each for name, each in self.parameters.items() if not each.is_found}
 
 

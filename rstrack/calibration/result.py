@@ -48,13 +48,12 @@ _OPPOSITE: dict[str, Scan] = {
 
 @dataclass(frozen=True)
 class CameraCalibration:
-    """start: the values before; asked (31,): which might change; parts: the windows of frames that told.
+    """start: the values before; asked (31,): which might change; parts: the windows of frames that were used.
 
-    residuals: of a few windows, with the values before along the first track, and with those found. pace: by the
-    first track.
-    device_notes: what became of what is published of the device, if one was named. kept_lens: another was asked for,
-    but explains the images no better than the file's. clocks: of several recordings together, by their folders' names,
-    offset (s) and drift of each one's colour; else empty.
+    residuals: of a few windows, with the values before along the first track, and with those found. pace: by the first
+    track. device_notes: what became of what is published of the device, if one was named. keeps_file_lens: another lens
+    was asked for, but explains the images no better than the file's. clocks: of several recordings together, by their
+    folders' names, offset (s) and drift of each one's colour; else empty.
     """
 
     dataset: Dataset
@@ -67,12 +66,12 @@ class CameraCalibration:
     residuals: tuple[ResidualScales, ResidualScales]
     pace: Pace
     device_notes: tuple[str, ...] = ()
-    kept_lens: bool = False
+    keeps_file_lens: bool = False
     clocks: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def undetermined(self) -> BoolArray:
-        """Which (31,) were asked for but are not told by this recording: they have the values that they had."""
+        """Which (31,) were asked for but are not determined by this recording: they have the values that they had."""
         return self.asked & ~self.solution.free
 
     @property
@@ -103,7 +102,7 @@ class CameraCalibration:
         return found_dataset.with_color_offset(found.color_offset_s, drift=found.color_drift)
 
     def text(self) -> str:
-        """A table of the values with their σ, what could not be told and why, and what comes with it."""
+        """A table of the values with their σ, what could not be determined and why, and notes."""
         sigmas, absolute, before = self.absolute_sigmas, self._absolute(self.values), self._absolute(self.start)
         lines = [f"{'':<28}{'found':>10}   {'2 sigma':>9}   {'from':>10}"]
         for i, (name, unit, factor) in enumerate(SHOWN):
@@ -260,18 +259,18 @@ class CameraCalibration:
             if scan != before.scan:
                 notes.append(f"{name} is read {scan}, not {before.scan}")
             elif sigma > 0.0 and abs(readout) < 2.0 * sigma:
-                notes.append(f"{name} has a global shutter, as far as can be told")
+                notes.append(f"{name} has a global shutter, as far as can be determined")
         readout, sigma = abs(self.values.depth_readout_s), self.sigmas[0]
         if self.dataset.rig.is_registered and sigma > 0.0 and readout > 2.0 * sigma:
             far = f"{readout / sigma:.0f} sigma"
             notes.append(f"registered depth has kept its rows' times: one time for all of them is {far} off")
-        if self.kept_lens:
+        if self.keeps_file_lens:
             notes.append("the lens is the file's: another explains these images no better than chance does")
         notes += [f"colour's clock in {name}: {1e3 * offset:+.3f} ms" for name, (offset, _) in self.clocks.items()]
         if self.asked[2] or self.clocks:
-            notes.append("a delay of both streams alike cannot be told from images: offsets are against depth's stamps")
+            notes.append("a delay of both streams alike does not show in images: offsets are against depth's stamps")
         if self.asked[DEPTH_ERROR].any():
-            notes.append("depth's scale cannot be told from images: path, map and extrinsics grow with it")
+            notes.append("depth's scale cannot be determined from images: path, map and extrinsics grow with it")
         if not self.solution.finished:
             notes.append("interrupted before it had converged")
         elif not self.solution.is_settled:

@@ -113,8 +113,8 @@ def calibrate(
         if stage.solution.finished and contradicted.any():
             known = known.without(contradicted)
             stage = staged(known, stage.solution.values)
-    solution, kept_lens = stage.solution, stage.kept_lens
-    free[LENSES] &= not kept_lens
+    solution, keeps_file_lens = stage.solution, stage.keeps_file_lens
+    free[LENSES] &= not keeps_file_lens
     progress("calibrating", 1.0, "done")
     free[DRIFT] &= stage.drifts
     motion = motion_of(dataset, parts, track.spline)
@@ -122,7 +122,7 @@ def calibrate(
     pace = pace_of(dataset, track.frames(dataset, chosen), track.spline)
     both, seconds = (residuals, residuals_now(some_of(stage.windows))), time.perf_counter() - begun
     return CameraCalibration(
-        dataset, start, solution, free, tuple(parts), motion, seconds, both, pace, notes, kept_lens
+        dataset, start, solution, free, tuple(parts), motion, seconds, both, pace, notes, keeps_file_lens
     )
 
 
@@ -148,7 +148,7 @@ def _oriented(
 ) -> Dataset:
     """The dataset with images that are read by rows or by columns, whichever fits better after some steps.
 
-    Which of the two ways round is told by the readout's sign.
+    Which of the two ways round follows from the readout's sign.
     """
     few = [replace(each, is_rough=True) for each in windows[:: -(-len(windows) // _TRIED)]]
     free, found = free_of(("readout", "offset")), []
@@ -239,7 +239,7 @@ def _free(dataset: Dataset, groups: Sequence[str], parts: Sequence[range]) -> Bo
 
 
 def _usual(dataset: Dataset) -> tuple[str, ...]:
-    """What can be told of a recording: of registered depth, which the driver has moved, nothing about where it was.
+    """What a recording determines: of registered depth, which the driver has moved, nothing about where it was.
 
     Its lens then, where it is not exact as a rendering's is. Two lenses, which makers measure, and depth on request.
     """
@@ -259,4 +259,4 @@ def _check(dataset: Dataset, groups: Sequence[str], frames: slice) -> None:
             f"{dataset.root}: {count} frames are too few to calibrate from: {needed} or more are needed, 300 are good"
         )
     if not any(dataset.groups[k] for k in range(len(dataset))[frames]):
-        raise UserError(f"{dataset.root}: these frames have no colour images, which clocks and extrinsics are told by")
+        raise UserError(f"{dataset.root}: these frames have no colour images, which determine clocks and extrinsics")

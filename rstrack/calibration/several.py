@@ -33,15 +33,15 @@ def check_alike(datasets: Sequence[Dataset]) -> None:
             raise UserError(f"{other.root}: has other cameras than {first.root}: give one --camera for all of them")
     names = [dataset.name for dataset in datasets]
     if len(set(names)) < len(names):
-        raise UserError(f"{', '.join(names)}: recordings of one name, by which their clocks are told: rename them")
+        raise UserError(f"{', '.join(names)}: recordings of one name, by which their clocks are named: rename them")
 
 
 def together(found: Sequence[CameraCalibration]) -> CameraCalibration:
-    """What recordings say together of one camera, each calibrated by itself from the same camera file.
+    """One camera from several recordings, each calibrated by itself from the same camera file.
 
     Their windows' normal equations stand side by side, each recording's clock eliminated, and are solved once more,
-    with the same prior: what one recording does not tell another may. Recordings have clocks of their own still, at the
-    camera that all have found. Raises UserError: it was read by rows here and by columns there.
+    with the same prior: what one recording does not determine another may. Recordings have clocks of their own still,
+    at the camera that all have found. Raises UserError: it was read by rows here and by columns there.
     """
     first = found[0]
     scans = {each.dataset.rig.color_shutter.scan for each in found}
@@ -70,7 +70,8 @@ def together(found: Sequence[CameraCalibration]) -> CameraCalibration:
     asked = np.logical_or.reduce([each.asked for each in found]) & ~_CLOCK
     return replace(
         first, solution=solution, asked=asked, parts=tuple(part for each in found for part in each.parts),
-        seconds=sum(each.seconds for each in found), clocks=clocks, kept_lens=all(each.kept_lens for each in found),
+        seconds=sum(each.seconds for each in found), clocks=clocks,
+        keeps_file_lens=all(each.keeps_file_lens for each in found),
     )  # fmt: skip
 
 

@@ -31,7 +31,7 @@ _MOVES[:DRIFT] = 0.0075
 _ROUNDS = 3
 
 Watch = Callable[[int, int, Parameters], None]
-"""Told the level, the step and the values; may raise KeyboardInterrupt."""
+"""Given the level, the step and the values; may raise KeyboardInterrupt."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Solution:
 
     @property
     def unsure(self) -> FloatArray:
-        """How much less sure the parameters (31,) are than is of use: above 1 they are not told; 0 of what is not free.
+        """How much less sure the parameters (31,) are than is of use: above 1 undetermined; 0 of what is not free.
 
         By σ, and by how far a change that is just of use would move residuals, in the mean over pixels and with all
         else moved to make up for it: what moves them by less than a hundredth of their noise is at the mercy of a
@@ -120,7 +120,7 @@ class Solution:
 
     @property
     def shares(self) -> FloatArray:
-        """Part (s, 31) of what is known of each parameter that each window tells, all others known."""
+        """Part (s, 31) of the information on each parameter that each window has, all others known."""
         own = np.einsum("snn->sn", self.A)
         shares = np.zeros((len(own), COUNT))
         shares[:, self.free] = own / np.maximum(own.sum(axis=0), 1e-300)
@@ -136,7 +136,7 @@ def solve(
     free (31,): which parameters may change; the others stay at `start`, to which weak ones are held by PRIOR, and to
     what is `known` as firmly as that is. depth_counts: see `RecordingWindow.sums`. Where `watch` raises
     KeyboardInterrupt, what has been found so far is returned, `finished` False. Raises numpy.linalg.LinAlgError where
-    images say nothing.
+    images determine nothing.
     """
     known = known or Known.nothing(start)
     p, acceleration, finished, step = start, AndersonMixing(), True, np.zeros(COUNT)
@@ -212,8 +212,8 @@ def _step(
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     """The step (31,) of the parameters, and the standard errors of the free ones.
 
-    Gauss-Newton's, accelerated, the prior against as much as A says too much in the mean. Without `acceleration` the
-    last one, against what A says too much in each direction: that only shows where gradients add up to nothing.
+    Gauss-Newton's, accelerated, the prior against as much as A overcounts in the mean. Without `acceleration` the
+    last one, against what A overcounts in each direction: that only shows where gradients add up to nothing.
     """
     A, b = _of_free(reduced, free)
     weak, information = np.diag(PRIOR[free] ** -2.0), known.information[np.ix_(free, free)]
@@ -223,9 +223,9 @@ def _step(
     if acceleration is None:
         step[free] = -C @ (gain @ b.sum(axis=0) + drawn)
     elif free.any():
-        told = A.sum(axis=0) + counted * (weak + information)
-        plain = -np.linalg.solve(told, b.sum(axis=0) + counted * drawn)
-        step[free] = acceleration.extrapolated(p.since(start)[free], plain, told)
+        total = A.sum(axis=0) + counted * (weak + information)
+        plain = -np.linalg.solve(total, b.sum(axis=0) + counted * drawn)
+        step[free] = acceleration.extrapolated(p.since(start)[free], plain, total)
     return step, np.sqrt(np.diag(C))
 
 
@@ -240,19 +240,19 @@ def posterior(A: FloatArray, b: FloatArray, prior: FloatArray) -> tuple[FloatArr
     large A is in the mean.
 
     At the solution the windows' gradients add up to nothing; how far each is from nothing shows N (the "sandwich" of
-    White, Econometrica 1980, by clusters, of which a window is one). A says far too little: a frame counts in several
+    White, Econometrica 1980, by clusters, of which a window is one). A alone is far too sure: a frame counts in several
     pairs, pixels are not independent, and what no model has is in all of them. The scatter of few windows is shrunk
     towards A times what the two differ by in the mean over parameters.
     """
-    told, dof = A.sum(axis=0), max(1.0, len(b) - 1.0)
-    unit = 1.0 / np.sqrt(np.maximum(np.diag(told), 1e-300))
-    told, scatter = told * np.outer(unit, unit), (b - b.mean(axis=0)) * unit
+    total, dof = A.sum(axis=0), max(1.0, len(b) - 1.0)
+    unit = 1.0 / np.sqrt(np.maximum(np.diag(total), 1e-300))
+    total, scatter = total * np.outer(unit, unit), (b - b.mean(axis=0)) * unit
     scatter = scatter.T @ scatter * (len(b) / dof)
-    inverse = np.linalg.pinv(told, hermitian=True)
+    inverse = np.linalg.pinv(total, hermitian=True)
     formal, shown = np.diag(inverse), np.diag(inverse @ scatter @ inverse)
     ratio = np.divide(shown, formal, out=np.ones(len(formal)), where=formal > 0.0)
     counted = max(1.0, float(np.exp(np.mean(np.log(np.maximum(ratio, 1e-6)))))) if len(ratio) else 1.0
-    N = (_POOLED * counted * told + dof * scatter) / (_POOLED + dof)
-    gain = told @ np.linalg.pinv(N, hermitian=True)
-    C = np.linalg.pinv(gain @ told + prior * np.outer(unit, unit), hermitian=True)
+    N = (_POOLED * counted * total + dof * scatter) / (_POOLED + dof)
+    gain = total @ np.linalg.pinv(N, hermitian=True)
+    C = np.linalg.pinv(gain @ total + prior * np.outer(unit, unit), hermitian=True)
     return np.outer(unit, unit) * C, gain * unit / unit[:, None], counted

@@ -2,7 +2,7 @@
 
 A depth camera is off by the same amount over whole regions of its image, in every image. That bends all poses that
 depth has a say in, and a lens bends with them: by 2 % of the focal length on a rendering of a Kinect. So where depth is
-not exact colour alone finds the poses and the lens first. How far depth contradicts these poses says how many of its
+not exact colour alone finds the poses and the lens first. How far depth contradicts these poses shows how many of its
 pixels count, and with so many the lens is found again. Clocks, which errors that stay where they are do not resemble,
 are then found with all of them.
 """
@@ -38,12 +38,12 @@ _FEW_STEPS = 4
 
 @dataclass(frozen=True)
 class StageResult:
-    """What is found so far. drifts: colour's clock may drift; kept_lens: another explains no more than the file's."""
+    """What is found so far. drifts: colour's clock may drift; keeps_file_lens: another explains no more than that."""
 
     windows: Sequence[RecordingWindow]
     solution: Solution
     drifts: bool
-    kept_lens: bool
+    keeps_file_lens: bool
 
 
 def in_stages(
@@ -59,19 +59,19 @@ def in_stages(
         solution, drifts = _solved(windows, terms, known, p, free, _NONE, progress)
         if not solution.finished or not solution.free[LENSES].any():
             return StageResult(windows, solution, drifts, False)
-        windows, solution, kept_lens = _paid(windows, terms, known, solution, _NONE, progress)
-        return StageResult(windows, solution, drifts, kept_lens)
+        windows, solution, keeps_file_lens = _paid(windows, terms, known, solution, _NONE, progress)
+        return StageResult(windows, solution, drifts, keeps_file_lens)
     watch = progress_watch(progress, 0.3)
     lens = solve(windows, terms, p, free & BY_COLOR, _FINE, watch, known, _FEW_STEPS, _HARDLY)
     counts = 1.0 / max(1.0, lens.depth_overcounts)
     if lens.finished:
         lens, _ = _solved(windows, terms, known, lens.values, free & BY_COLOR, ~BY_COLOR, progress, counts)
-    windows, lens, kept_lens = _paid(windows, terms, known, lens, ~LENSES, progress, counts)
+    windows, lens, keeps_file_lens = _paid(windows, terms, known, lens, ~LENSES, progress, counts)
     if not lens.finished:
-        return StageResult(windows, lens, True, kept_lens)
-    held, rest = (_NONE, free & ~LENSES) if kept_lens else (lens.free, free & ~BY_COLOR)
+        return StageResult(windows, lens, True, keeps_file_lens)
+    held, rest = (_NONE, free & ~LENSES) if keeps_file_lens else (lens.free, free & ~BY_COLOR)
     solution, drifts = _solved(windows, terms_of(rest), known, lens.values, rest, held, progress)
-    return StageResult(windows, solution if kept_lens else joined(lens, solution), drifts, kept_lens)
+    return StageResult(windows, solution if keeps_file_lens else joined(lens, solution), drifts, keeps_file_lens)
 
 
 def progress_watch(progress: Progress, begin: float) -> Watch:
@@ -94,7 +94,7 @@ def _solved(
     windows: Sequence[RecordingWindow], terms: PairTerms, known: Known, p: Parameters, free: BoolArray,
     held: BoolArray, progress: Progress, depth_counts: float = 1.0,
 ) -> tuple[Solution, bool]:  # fmt: skip
-    """With all that may change, those `held` (31,) at `p`, then without what the recording does not tell.
+    """With all that may change, those `held` (31,) at `p`, then without what the recording does not determine.
 
     And whether colour's clock may drift: one that is within its error of the file's is held there, since it would take
     colour away at both ends of the recording.
@@ -109,7 +109,7 @@ def _solved(
         if free[DRIFT] and abs(p.color_drift - file.color_drift) < 2.0 * solution.sigmas[DRIFT]:
             drifts, free = False, free & (np.arange(COUNT) != DRIFT)
         elif unsure.max() > 1.0:
-            # What is told least drags others along: they may be told once it is held.
+            # The least determined biases the others, which may be determined once it is held.
             free = free & (unsure <= max(1.0, _DRAGS * unsure.max()))
         else:
             return solution, drifts
@@ -119,10 +119,10 @@ def _paid(
     windows: Sequence[RecordingWindow], terms: PairTerms, known: Known, solution: Solution, held: BoolArray,
     progress: Progress, depth_counts: float = 1.0,
 ) -> tuple[Sequence[RecordingWindow], Solution, bool]:  # fmt: skip
-    """The solution with the lens that was found, or that with the file's where another does not pay, and which.
+    """The solution with the lens that was found, or that with the file's where another is not significant, and which.
 
-    It pays if chance makes the images so much more likely in one of a thousand recordings at most. How likely the
-    file's lens makes them is found out unless it is plain. held (31,): what stays as it is beside the lens.
+    It is significant if chance makes the images so much more likely in one of a thousand recordings at most. How likely
+    the file's lens makes them is found out unless it is plain. held (31,): what stays as it is beside the lens.
     """
     plainly = solution.chance(solution.gain_over(known.values, LENSES), LENSES) < _CHANCE**2
     if plainly or not solution.finished:

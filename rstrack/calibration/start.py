@@ -94,7 +94,7 @@ def _tracked(dataset: Dataset, chosen: range, options: Options, progress: Progre
 
 # Seconds before the first and after the last line for which a window has spline: times move while they are estimated.
 _MARGIN_S = 0.08
-# What the colour camera may be further away than the file says, m.
+# What the colour camera may be further away than the file states, m.
 _BASELINE_M = 0.01
 # Rounds of correction of a spline that is to pass through poses.
 _ROUNDS = 6

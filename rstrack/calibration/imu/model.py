@@ -189,8 +189,8 @@ class ImuPrediction:
     def by_imu(self) -> FloatArray:
         """(n, 6, 13 + 6 m): by a step of the unknowns.
 
-        The clock is the gyroscope's to tell. An acceleration bends where the motion's knots are, or jerks start; what
-        the corrections' knots miss of that would draw the samples towards them: half a millisecond on table1.
+        The gyroscope alone determines the clock. An acceleration bends where the motion's knots are, or jerks start;
+        what the corrections' knots miss of that would bias the clock: half a millisecond on table1.
         """
         imu, at = self.imu, self._factor
         J = np.zeros((len(self.t), 6, imu.size))

@@ -50,7 +50,7 @@ class ImuCalibration:
 
     @property
     def undetermined(self) -> BoolArray:
-        """Which (13,) the recording does not tell."""
+        """Which (13,) the recording does not determine."""
         return np.asarray(self.sigmas > USEFUL)
 
     @property

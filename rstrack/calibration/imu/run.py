@@ -36,7 +36,7 @@ _MOST_PARTS = 8
 _SATURATED = 0.999
 # Where it begins: both clocks may be this far apart, s, looked for on so fine a grid.
 _GRID_HZ, _FARTHEST_S = 200.0, 1.0
-# Of what turning about one axis alone is told, the axes are not: the second largest part, and the correlation.
+# Turning about one axis alone does not determine the axes: least part of the second largest; and least correlation.
 _SECOND, _ALIKE = 0.02, 0.6
 
 
@@ -70,7 +70,7 @@ def calibrate_imu(dataset: Dataset, followed: TrackedSpline, progress: Progress 
     read = dataset.imu_files.read(dataset.stamps, dataset.middle, dataset.rig.T_color_depth, np.eye(4))
     imu = read.recording
     if imu.gyro is None:
-        raise UserError(f"{dataset.root}: an accelerometer alone tells no clock and no axes: a gyroscope is needed")
+        raise UserError(f"{dataset.root}: an accelerometer alone has no clock and no axes: a gyroscope is needed")
     first, last = max(followed.valid, key=lambda part: part[1] - part[0])
     first, last = max(first, followed.spline.t_begin), min(last, followed.spline.t_end)
     if last - first < _LEAST_S:
@@ -122,7 +122,9 @@ def begin(
     seen = np.column_stack([np.interp(t - offset, stamps, gyro[:, i]) for i in range(3)])
     U, sizes, Vt = np.linalg.svd((seen - seen.mean(axis=0)).T @ (turns - turns.mean(axis=0)))
     if sizes[1] < _SECOND * sizes[0]:
-        raise UserError("IMU: the camera turns about one axis only, which tells no axes: record turns about all three")
+        raise UserError(
+            "IMU: the camera turns about one axis only, which does not determine its axes: record turns about all three"
+        )
     R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
     bias = (seen - turns @ R.T).mean(axis=0)
     force = np.column_stack([np.interp(t - offset, stamps, accel[:, i]) for i in range(3)])

@@ -23,7 +23,7 @@ from rstrack.inertial.estimate import bias_walk
 
 _BAND = 24  # of four control points of six
 _HUBER = 2.5
-# Held so where nothing tells them, σ: corrections (rad, m); of the IMU's NAMES rad, m, s, s/s, parts, rad; biases.
+# Held so where nothing observes them, σ: corrections (rad, m); of the IMU's NAMES rad, m, s, s/s, parts, rad; biases.
 _FREE = (0.02, 0.05)
 _PRIOR = np.array([*(1.0,) * 3, *(0.5,) * 3, 0.2, 5e-4, *(0.05,) * 3, *(1.0,) * 2])
 _BIAS = np.array([*(0.3,) * 3, *(1.0,) * 3])
@@ -37,7 +37,7 @@ _POSES, _STEPS = (3e-4, 5e-4), (3e-4, 5e-4)
 _LEAST = (1e-5, 1e-5)
 # Frames over which errors of poses may be alike.
 _LAGS = 8
-_TELLS_LITTLE = "IMU: the recording tells too little of it: record 20 s with turns about all axes, or track it better"
+_TOO_LITTLE = "IMU: the recording is too poor for it: record 20 s with turns about all axes, or track it better"
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class ImuSolution:
 
 
 def solve(data: ImuData, imu: ImuUnknowns, done: Callable[[int], None] = lambda _: None) -> ImuSolution:
-    """From a start on. done: told of each step. Raises UserError: it does not settle, or too little is told."""
+    """From a start on. done: called at each step. Raises UserError: it does not settle, or too little is determined."""
     x = np.zeros((data.track.count, 6))
     R_frames = data.track.spline.pose(data.frame_times)[:, :3, :3]
     at_frames = data.track.corrections(data.frame_times)
@@ -126,7 +126,7 @@ def solve(data: ImuData, imu: ImuUnknowns, done: Callable[[int], None] = lambda 
             inner = cho_solve_banded((factor, True), np.column_stack([normal.C, normal.a]))
             lower = np.linalg.cholesky(D - normal.C.T @ inner[:, :-1])
         except np.linalg.LinAlgError:
-            raise UserError(_TELLS_LITTLE) from None
+            raise UserError(_TOO_LITTLE) from None
         step = cho_solve((lower, True), b - normal.C.T @ inner[:, -1])
         covariance = np.asarray(cho_solve((lower, True), np.eye(len(D))[:, :size]))[:size]
         imu = imu.moved(step[:size])
@@ -140,7 +140,7 @@ def solve(data: ImuData, imu: ImuUnknowns, done: Callable[[int], None] = lambda 
             break
         if iteration > 3 and moved.max() < _SETTLED and sizes.like(before, _SAME):
             return ImuSolution(imu, covariance, x, sizes, iteration)
-    raise UserError(f"{_TELLS_LITTLE} (no solution after {_MOST} steps)")
+    raise UserError(f"{_TOO_LITTLE} (no solution after {_MOST} steps)")
 
 
 def _samples(data: ImuData, imu: ImuUnknowns, x: FloatArray, sizes: ErrorSizes) -> BorderedSystem:
@@ -159,7 +159,7 @@ def _tracked_poses(
     at_frames: Corrections, R_frames: FloatArray, x: FloatArray, slow: FloatArray, weights: FloatArray,
     sizes: ErrorSizes, size: int,
 ) -> BorderedSystem:  # fmt: skip
-    """Of the track's poses about its drift, and of corrections that nothing tells.
+    """Of the track's poses about its drift, and of corrections that nothing observes.
 
     R_frames (frames, 3, 3): R_world_depth. slow (m, 6): the drift; weights (frames, m): of its values at the frames;
     size: of the IMU's step.

@@ -4,7 +4,7 @@ Depth: the geometric term of `alignment.residuals` against a reference that keep
 reference's depth looked up in both colour images, each by its own lines. How the point itself was placed hardly matters
 then, since both images see it move alike, and the derivative is taken half from each image (as in efficient
 second-order minimisation, Benhimane and Malis, IROS 2004): the noise of one image's gradient alone would pass for
-information about the extrinsics. What lenses and depth do, where they are unknown, is told by how the same unknown
+information about the extrinsics. What lenses and depth do, where they are unknown, follows from how the same unknown
 moves a point in either camera (`optics.moves`); depth's own error by depth alone.
 """
 
@@ -39,7 +39,7 @@ class ColorPairInput:
     """Device arrays of the colour kernel.
 
     depth: z of the reference's depth image (m, 0: none); rays_*: its normalised coordinates; to_base: poses of its
-    lines; error: `error_table`. image, from_base: current intensities, NaN where they tell nothing, and the colour
+    lines; error: `error_table`. image, from_base: current intensities, NaN where they are unusable, and the colour
     camera's lines; ref_*: the reference's; camera: `camera_table`. constants: those of `Scaling`, gain and offset of
     the current image against the reference's, units of the unknown lens.
     """

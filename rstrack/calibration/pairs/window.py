@@ -1,4 +1,4 @@
-"""A window of a recording: a spline of its own, and what its images say of that and of the parameters."""
+"""A window of a recording: its own spline, and the normal equations of its images for that and the parameters."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from rstrack.calibration.parameters import COUNT, POSES, Parameters
 # σ of accelerations (m/s², rad/s²), looser than the tracker's.
 _ACCELERATION = 3.0 * ACCELERATION
 _GAUGE = np.full(6, 1e-6)
-# Frames between those that are compared: near ones tell the clocks, far ones the extrinsics.
+# Frames between those that are compared: near ones determine the clocks, far ones the extrinsics.
 _APART = (1, 4, 9, 16)
 # σ of gain and offset of an image against another, and the least and the most that they become.
 _BRIGHTNESS, _BRIGHTNESS_BOUNDS = np.array([0.3, 0.15]), (-0.7, 2.0)
@@ -35,7 +35,7 @@ _BRIGHTNESS, _BRIGHTNESS_BOUNDS = np.array([0.3, 0.15]), (-0.7, 2.0)
 class WindowFrame:
     """A frame on the device: its depth, as z (m) and as a surface, and the colour image that goes with it, if any.
 
-    levels: intensities of the pyramid's levels, NaN where they tell nothing. bound: see `intensity_bound`.
+    levels: intensities of the pyramid's levels, NaN where they are unusable. bound: see `intensity_bound`.
     """
 
     depth: ImageTiming
@@ -48,7 +48,7 @@ class WindowFrame:
 
 @dataclass(frozen=True)
 class WindowSums:
-    """What a window says at some spline and parameters, as least squares: H, g over [control points, parameters].
+    """Normal equations of a window at some spline and parameters: H, g over [control points, parameters].
 
     cost: negative log-likelihood but for its constant; pixels: that were compared. depth_overcounts: see `overcounted`;
     1 where all of depth's pixels count.
@@ -88,7 +88,7 @@ class RecordingWindow:
 
     @property
     def is_new(self) -> bool:
-        """Whether nothing says yet how large its errors are."""
+        """Whether the scales of its errors have not been estimated yet."""
         return self.sigma == (START_DEPTH, START_INTENSITY)
 
     def sums(self, terms: PairTerms, p: Parameters, level: int, depth_counts: float = 1.0) -> WindowSums:
@@ -189,16 +189,16 @@ class RecordingWindow:
             g[at] += model.g
 
 
-def overcounted(H: FloatArray, g: FloatArray, told: FloatArray) -> float:
+def overcounted(H: FloatArray, g: FloatArray, information: FloatArray) -> float:
     """How many times too much a term counts by its H and g (see `WindowSums`), around control points known otherwise.
 
     gᵀ H⁺ g is in the mean the rank of H times that, and what these points are off by: tr(H C), C their covariance by
-    what is `told` of them (like H). All of the control points alone. 1 where its pixels are independent.
+    their `information` (like H). All of the control points alone. 1 where its pixels are independent.
     """
     x = len(g) - COUNT
     own = H[:x, :x]
     inverse = np.linalg.pinv(own, rcond=1e-6, hermitian=True)
-    off = float(np.trace(np.linalg.solve(told[:x, :x], own)))
+    off = float(np.trace(np.linalg.solve(information[:x, :x], own)))
     return (float(g[:x] @ inverse @ g[:x]) - off) / max(1.0, float(np.trace(inverse @ own)))
 
 

@@ -20,7 +20,6 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.calibration import run as calibration_run
 from rstrack.calibration import solve as calibration_solve
-from rstrack.calibration.pairs import window
 from rstrack.calibration.pairs.terms import pair_terms
 from rstrack.calibration.pairs.trust import trust_in
 from rstrack.calibration.parameters import (
@@ -37,12 +36,7 @@ from rstrack.data.image_files import NoisyImages, with_noise
 from rstrack.data.rig import DepthError
 from rstrack.options import Options
 
-
-@pytest.fixture(autouse=True)
-def few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A quarter of the pairs of frames, and one coarse level: what all find stands beside the derivatives."""
-    monkeypatch.setattr(window, "_APART", (5,))
-    monkeypatch.setattr(calibration_run, "_COARSE", (1,))
+pytestmark = pytest.mark.usefixtures("few_pairs")
 
 
 def test_a_lens_and_depth_are_put_right(shaken: Dataset) -> None:
@@ -60,14 +54,14 @@ def test_a_lens_and_depth_are_put_right(shaken: Dataset) -> None:
     np.testing.assert_allclose(made.depth(30), shaken.depth(30), atol=4e-3)
     assert found.values.error.offset_m == pytest.approx(0.02, abs=1e-3)
     text = found.text()
-    assert "colour fx" in text and "depth offset" in text and "depth's scale cannot be told" in text
+    assert "colour fx" in text and "depth offset" in text and "depth's scale cannot be determined" in text
 
 
 def test_a_lens_that_is_right_is_left_as_it_is_and_noise_makes_sigmas_grow(shaken: Dataset) -> None:
     noisy = replace(shaken, images=NoisyImages(shaken.images, 1.2e-3, 0.01, 1))
     plain = calibrate(shaken, ("readout",), SHORT, OPTIONS)
     grown = calibrate(noisy, ("readout", "intrinsics"), SHORT, OPTIONS)
-    assert grown.kept_lens and not grown.asked[LENSES].any() and grown.asked[:2].all()
+    assert grown.keeps_file_lens and not grown.asked[LENSES].any() and grown.asked[:2].all()
     assert pytest.approx(shaken.rig.color_camera.K) == grown.calibrated().rig.color_camera.K
     assert "the lens is the file's" in grown.text()
     assert (grown.sigmas[:2] > 2.0 * plain.sigmas[:2]).all()

@@ -13,7 +13,6 @@ from shaken_recording import FRAMES, OPTIONS, PACE, RATE_HZ, READOUT_S, RESIDUAL
 
 from rstrack.calibration import run as calibration_run
 from rstrack.calibration.devices import Device, PublishedShutter
-from rstrack.calibration.pairs import window
 from rstrack.calibration.parameters import (
     COUNT,
     DEPTH_ERROR,
@@ -32,12 +31,7 @@ from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.rig import DepthError
 from rstrack.data.timing import Timing, stream_timing
 
-
-@pytest.fixture(autouse=True)
-def few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A quarter of the pairs of frames, and one coarse level: what all find stands beside the derivatives."""
-    monkeypatch.setattr(window, "_APART", (5,))
-    monkeypatch.setattr(calibration_run, "_COARSE", (1,))
+pytestmark = pytest.mark.usefixtures("few_pairs")
 
 
 def test_lines_that_are_read_the_other_way_are_seen_to_be(tmp_path: Path) -> None:

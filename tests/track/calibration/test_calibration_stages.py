@@ -11,8 +11,6 @@ import yaml
 from shaken_recording import OPTIONS, READOUT_S, SHORT
 
 from rsgen.array_types import ByteArray, Float32Array
-from rstrack.calibration import run as calibration_run
-from rstrack.calibration.pairs import window
 from rstrack.calibration.pairs.window import overcounted
 from rstrack.calibration.parameters import BY_COLOR, COUNT, NAMES, Parameters
 from rstrack.calibration.run import calibrate
@@ -41,10 +39,7 @@ class UnevenDepth:
         return np.where(z > 0, 1 / (1 / np.maximum(z, 1e-3) + self.by * wave), 0.0).astype(np.float32)
 
 
-@pytest.fixture(autouse=True)
-def few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(window, "_APART", (5,))
-    monkeypatch.setattr(calibration_run, "_COARSE", (1,))
+pytestmark = pytest.mark.usefixtures("few_pairs")
 
 
 def uneven(dataset: Dataset, sigma: float) -> Dataset:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from util import numeric_jacobian
 
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
@@ -13,7 +14,7 @@ from rsgen.sensors.imu import exact_imu
 from rstrack.data.imu.description import ImuNoise
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.inertial.estimate import SIZE, ImuEstimate
-from rstrack.inertial.factor import motion
+from rstrack.inertial.factor import ImuFactor, motion
 from rstrack.inertial.residuals import ImuReadings, ImuResiduals
 
 T_IMU_DEPTH = se3.exp([0.03, -0.02, 0.05, 0.3, -1.2, 0.7])
@@ -22,7 +23,7 @@ BIAS = np.array([0.01, -0.02, 0.03, 0.1, 0.2, -0.3])
 TURN = np.array([0.2, -0.1, 0.15])
 
 
-def wild_spline(seed: int = 0, count: int = 9, first: int = 0) -> Spline:
+def random_motion(seed: int = 0, count: int = 9, first: int = 0) -> Spline:
     rng = np.random.default_rng(seed)
     points = [np.eye(4)]
     for _ in range(count - 1):
@@ -39,68 +40,53 @@ def recording(spline: Spline, t: FloatArray, noise: ImuNoise | None = None) -> I
     return ImuRecording(t, gyro + BIAS[:3], accel + BIAS[3:], noise, T_IMU_DEPTH, 200.0)
 
 
-def moved(spline: Spline, number: int, axis: int, step: float) -> Spline:
-    points = spline.control_points.copy()
-    increment = np.zeros(6)
-    increment[axis] = step
-    points[number] = se3.exp(increment) @ points[number]
-    return Spline(points, spline.t0, spline.dt, spline.first)
-
-
 def test_motion_is_the_splines() -> None:
-    spline = wild_spline(first=5)
+    spline = random_motion(first=5)
     t = np.linspace(spline.t_begin, spline.t_end, 23)
     at = motion(spline, t)
     np.testing.assert_allclose(at.twist, spline.velocity(t), atol=1e-12)
     np.testing.assert_allclose(at.rate, spline.acceleration(t), atol=1e-10)
     np.testing.assert_allclose(at.rotation, spline.pose(t)[:, :3, :3], atol=1e-14)
-    J = np.moveaxis(spline.pose_jacobian(t)[1][:, :, 3:], 1, 2).reshape(len(t), 3, 24)
-    np.testing.assert_allclose(at.by_turn, J, atol=1e-11)
 
 
-def test_residuals_vanish_at_the_truth() -> None:
-    spline = wild_spline()
-    imu = recording(spline, np.linspace(spline.t_begin, spline.t_end, 40))
-    r = ImuResiduals.of(spline, ImuReadings.of(imu), T_IMU_DEPTH, np.concatenate([BIAS, GRAVITY, TURN])).r
-    assert np.abs(r).max() < 1e-11
+def test_derivatives_of_the_factor_are_finite_differences() -> None:
+    """By the control points, T_imu_depth's left increment, gravity, and of the gyroscope by time."""
+    spline, n = random_motion(3), len(random_motion(3).control_points)
+    t = spline.t_begin + 0.05 * np.repeat(np.arange(5), 3) + np.tile([0.005, 0.025, 0.045], 5)
 
+    def factor(x: FloatArray) -> ImuFactor:
+        points, place, gravity, late = np.split(x, [6 * n, 6 * n + 6, 6 * n + 9])
+        there = Spline(se3.exp(points.reshape(n, 6)) @ spline.control_points, spline.t0, spline.dt)
+        return ImuFactor(motion(there, t + late), se3.exp(place) @ T_IMU_DEPTH, GRAVITY + gravity)
 
-def test_derivatives_by_control_points_are_finite_differences() -> None:
-    spline = wild_spline(3)
-    t = np.linspace(spline.t_begin, spline.t_end, 13)
-    samples, estimate = ImuReadings.of(recording(wild_spline(4), t)), np.concatenate([BIAS, GRAVITY, TURN])
-    rows = ImuResiduals.of(spline, samples, T_IMU_DEPTH, estimate)
-    J, first = rows.J, rows.first
-    step, worst = 1e-5, np.zeros(2)
-    for number in range(len(spline.control_points)):
-        for axis in range(6):
-            ends = [
-                ImuResiduals.of(moved(spline, number, axis, s * step), samples, T_IMU_DEPTH, estimate).r
-                for s in (-1, 1)
-            ]
-            told = np.zeros((len(t), 6))
-            for k in np.flatnonzero((first <= number) & (number < first + 4)):
-                told[k] = J[k, :, 6 * (number - first[k]) + axis]
-            off = np.abs((ends[1] - ends[0]) / (2 * step) - told)
-            worst = np.maximum(worst, [off[:, :3].max(), off[:, 3:].max()])
+    numeric = numeric_jacobian(lambda x: factor(x).readings, 6 * n + 10, 1e-4)
+    at = factor(np.zeros(6 * n + 10))
+    by_points = np.zeros((len(t), 6, 6 * n))
+    for k, first in enumerate(at.motion.first):
+        by_points[k, :, 6 * first : 6 * first + 24] = at.by_motion[k]
+    J = np.concatenate([by_points, at.by_translation, at.by_rotation, at.by_gravity], axis=2)
     # Rates go with 1/dt, accelerations with 1/dt²: 20 and 400.
-    assert (worst < [1e-6, 2e-5]).all() and np.abs(J[:, 3:, :24]).max() > 100.0
+    np.testing.assert_allclose(J[:, :3], numeric[:, :3, :-1], atol=1e-7)
+    np.testing.assert_allclose(J[:, 3:], numeric[:, 3:, :-1], atol=1e-5)
+    np.testing.assert_allclose(at.gyro_by_time, numeric[:, :3, -1], atol=1e-5)
+    assert np.abs(at.by_motion[:, 3:]).max() > 100.0
 
 
-def test_derivatives_by_a_belief_are_finite_differences() -> None:
-    spline = wild_spline(3)
-    samples = ImuReadings.of(recording(spline, np.linspace(spline.t_begin, spline.t_end, 13)))
-    estimate = np.concatenate([BIAS, GRAVITY, TURN])
-    J = ImuResiduals.of(spline, samples, T_IMU_DEPTH, estimate).J
-    for i, e in enumerate(np.eye(SIZE)):
-        step = 1.0 if i < 9 else 1e-4  # all but the turn are linear
-        ends = [ImuResiduals.of(spline, samples, T_IMU_DEPTH, estimate + s * step * e).r for s in (-0.5, 0.5)]
-        np.testing.assert_allclose((ends[1] - ends[0]) / step, J[:, :, 24 + i], atol=1e-9 if i < 9 else 1e-7)
+def test_residuals_vanish_at_the_truth_and_have_the_derivatives_by_an_estimate() -> None:
+    spline, estimate = random_motion(), np.concatenate([BIAS, GRAVITY, TURN])
+    readings = ImuReadings.of(recording(spline, np.linspace(spline.t_begin, spline.t_end, 40)))
+
+    def residuals(x: FloatArray) -> ImuResiduals:
+        return ImuResiduals.of(spline, readings, T_IMU_DEPTH, estimate + x)
+
+    at = residuals(np.zeros(SIZE))
+    assert np.abs(at.r).max() < 1e-11
+    np.testing.assert_allclose(at.J[:, :, 24:], numeric_jacobian(lambda x: residuals(x).r, SIZE), atol=1e-7)
 
 
 def test_sums_are_the_dense_least_squares() -> None:
-    spline = wild_spline(3)
-    samples = ImuReadings.of(recording(wild_spline(4), np.linspace(spline.t_begin + 0.06, spline.t_end, 50)))
+    spline = random_motion(3)
+    samples = ImuReadings.of(recording(random_motion(4), np.linspace(spline.t_begin + 0.06, spline.t_end, 50)))
     estimate, sigma = ImuEstimate.initial(GRAVITY), np.array([0.01, 0.2])
     rows = ImuResiduals.of(spline, samples, T_IMU_DEPTH, estimate.mean)
     joint, scatter = rows.summed(sigma)
@@ -120,8 +106,8 @@ def test_sums_are_the_dense_least_squares() -> None:
 
 
 def test_belief_is_eliminated_as_if_it_were_solved_for() -> None:
-    spline = wild_spline(3)
-    samples = ImuReadings.of(recording(wild_spline(4), np.linspace(spline.t_begin, spline.t_end, 50)))
+    spline = random_motion(3)
+    samples = ImuReadings.of(recording(random_motion(4), np.linspace(spline.t_begin, spline.t_end, 50)))
     rng, estimate = np.random.default_rng(0), ImuEstimate.initial(GRAVITY)
     at = estimate.mean + rng.normal(0.0, 0.1, SIZE)
     joint, _ = ImuResiduals.of(spline, samples, T_IMU_DEPTH, at).summed(np.array([0.01, 0.2]))
@@ -161,7 +147,7 @@ def test_gravity_of_a_known_strength_is_on_its_sphere() -> None:
 
 def test_rows_are_moved_as_if_they_were_linearised_anew() -> None:
     """To second order: steps half as long are off by a quarter."""
-    spline = wild_spline(3)
+    spline = random_motion(3)
     imu = recording(spline, np.linspace(spline.t_begin, spline.t_end, 40))
     estimate = np.concatenate([BIAS, GRAVITY, TURN])
     rows = ImuResiduals.of(spline, ImuReadings.of(imu), T_IMU_DEPTH, estimate)
